@@ -1,0 +1,70 @@
+"""Pinhole camera with Brown-Conrady distortion, and its mount in the body."""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """Pixels of the stored frames; ``distortion`` in OpenCV order (k1 k2 p1 p2 k3 ...), empty = none."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def matrix(self) -> np.ndarray:
+        """K (3x3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def normalise(self, px: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) -> undistorted normalised coordinates (N, 2)."""
+        if not self.distortion:
+            return (px - (self.cx, self.cy)) / (self.fx, self.fy)
+        points = np.ascontiguousarray(px, dtype=np.float64).reshape(-1, 1, 2)
+        return np.asarray(cv2.undistortPoints(points, self.matrix(), np.array(self.distortion))).reshape(-1, 2)
+
+    def project(self, p_in_c: np.ndarray) -> np.ndarray:
+        """Points in the camera frame (N, 3), z > 0 -> distorted pixels (N, 2)."""
+        if not self.distortion:
+            return p_in_c[:, :2] / p_in_c[:, 2:] * (self.fx, self.fy) + (self.cx, self.cy)
+        zero = np.zeros(3)
+        px, _ = cv2.projectPoints(np.ascontiguousarray(p_in_c), zero, zero, self.matrix(), np.array(self.distortion))
+        return np.asarray(px).reshape(-1, 2)
+
+    def scaled(self, factor: float) -> "CameraCalibration":
+        """The same camera on frames resized by ``factor`` (pixel centres at integer + 0.5)."""
+        return CameraCalibration(
+            round(self.width * factor),
+            round(self.height * factor),
+            self.fx * factor,
+            self.fy * factor,
+            (self.cx + 0.5) * factor - 0.5,
+            (self.cy + 0.5) * factor - 0.5,
+            self.distortion,
+        )
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Camera in the body: yaw, then pitch (-90 = straight down, image top forward), then roll; degrees."""
+
+    yaw_deg: float = 0.0
+    pitch_deg: float = -90.0
+    roll_deg: float = 0.0
+    tolerance_deg: float = 5.0  # 1-sigma of the real tilt around the nominal one
+
+    def r_b_c(self) -> np.ndarray:
+        """R_b_c (3x3): camera coordinates into body FRD."""
+        y, p, r = (math.radians(v) for v in (self.yaw_deg, self.pitch_deg, self.roll_deg))
+        rz = np.array([[math.cos(y), -math.sin(y), 0], [math.sin(y), math.cos(y), 0], [0, 0, 1.0]])
+        ry = np.array([[math.cos(p), 0, math.sin(p)], [0, 1.0, 0], [-math.sin(p), 0, math.cos(p)]])
+        rx = np.array([[1.0, 0, 0], [0, math.cos(r), -math.sin(r)], [0, math.sin(r), math.cos(r)]])
+        forward_looking = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # camera z = body x, camera x = body y
+        return rz @ ry @ rx @ forward_looking

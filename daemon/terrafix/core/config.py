@@ -1,0 +1,111 @@
+"""Configuration: strict, bounded, read once. The defaults here and in config/default.toml are the same (tested).
+
+A key that is not here is an error that proposes the nearest name. What a user cannot sensibly choose is a
+constant in the code, not a key."""
+
+import difflib
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from terrafix.core.errors import ConfigError
+
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of every section."""
+
+
+class Map(Section, frozen=True, kw_only=True):
+    path: str = ""  # map package or GeoTIFF; the command line wins
+    registration_sigma_m: Annotated[float, Meta(ge=0, le=100)] = 4.0
+
+
+class Models(Section, frozen=True, kw_only=True):
+    xfeat: str = ""  # path of xfeat.onnx; empty = weights-free
+
+
+class LinkSection(Section, frozen=True, kw_only=True):
+    device: str = "udpout:127.0.0.1:14550"
+    baud: Annotated[int, Meta(ge=9600, le=3_000_000)] = 921_600
+    sysid: Annotated[int, Meta(ge=1, le=255)] = 1
+    compid: Annotated[int, Meta(ge=1, le=255)] = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+    gps_id: Annotated[int, Meta(ge=0, le=3)] = 0
+    rate_hz: Annotated[float, Meta(ge=5, le=20)] = 10.0
+
+
+class RecorderSection(Section, frozen=True, kw_only=True):
+    thumbnails: bool = True
+    thumbnail_width_px: Annotated[int, Meta(ge=64, le=1920)] = 320
+    budget_mb: Annotated[int, Meta(ge=64)] = 64_000
+
+
+class HealthSection(Section, frozen=True, kw_only=True):
+    sysfs_root: str = "/sys"
+    hot_c: Annotated[float, Meta(ge=30, le=120)] = 80.0
+    critical_c: Annotated[float, Meta(ge=30, le=120)] = 95.0
+    hysteresis_c: Annotated[float, Meta(ge=0, le=30)] = 5.0
+
+
+class Source(Section, frozen=True, kw_only=True):
+    path: str = ""  # flight folder, photo folder, video file, /dev/video* or a GStreamer pipeline
+    realtime: bool = True  # play a recorded source at its own pace (live shell only)
+
+
+class LogSection(Section, frozen=True, kw_only=True):
+    level: Literal["DEBUG", "INFO", "WARN", "ERROR"] = "INFO"
+
+
+class Config(Section, frozen=True, kw_only=True):
+    map: Map = Map()
+    models: Models = Models()
+    source: Source = Source()
+    link: LinkSection = LinkSection()
+    recorder: RecorderSection = RecorderSection()
+    health: HealthSection = HealthSection()
+    log: LogSection = LogSection()
+
+
+def load(paths: list[Path]) -> Config:
+    """Defaults, then each file over the last, key by key. Raises ConfigError with file, key and what to do."""
+    merged: dict[str, dict[str, object]] = {}
+    for path in paths:
+        for name, table in _read(path).items():
+            if not isinstance(table, dict):
+                raise ConfigError(f"{path}: '{name}' stands outside any section; write it under a [section]")
+            merged.setdefault(name, {}).update(table)
+        try:
+            msgspec.convert(merged, Config)
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"{path}: {_explain(str(error))}") from None
+    return msgspec.convert(merged, Config)
+
+
+def _read(path: Path) -> dict[str, object]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such configuration file; check the path given to --config") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML ({error})") from None
+
+
+def _explain(text: str) -> str:
+    """Adds the nearest known name to msgspec's message about an unknown key."""
+    unknown = re.search(r"unknown field `(.+?)`(?: - at `\$\.?(.*?)`)?", text)
+    if not unknown:
+        return text.replace("`$.", "`")
+    key, where = unknown.group(1), unknown.group(2) or ""
+    section = getattr(Config(), where, None) if where else Config()
+    known = [f.name for f in msgspec.structs.fields(type(section))] if isinstance(section, Section) else []
+    near = difflib.get_close_matches(key, known, 1, cutoff=0.5)
+    place = f"in [{where}]" if where else "as a section"
+    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+    return f"unknown key '{key}' {place}; {hint}"

@@ -1,0 +1,93 @@
+"""WGS84 to local metres and back."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pyproj import CRS, Transformer
+
+
+def local_crs(lat_deg: float, lon_deg: float) -> CRS:
+    """Transverse Mercator with its centre and unit scale at the origin: metres, true north at the origin.
+
+    Scale error is below 1e-6 within 9 km of the central meridian (Snyder, USGS PP 1395, eq. 8-11)."""
+    return CRS.from_proj4(
+        f"+proj=tmerc +lat_0={lat_deg:.9f} +lon_0={lon_deg:.9f} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m"
+    )
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """East and north in metres around (lat_deg, lon_deg). Up stays AMSL and does not pass through here."""
+
+    lat_deg: float
+    lon_deg: float
+    _forward: Transformer = field(init=False, repr=False, compare=False)
+    _inverse: Transformer = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        crs = local_crs(self.lat_deg, self.lon_deg)
+        wgs84 = CRS.from_epsg(4326)
+        object.__setattr__(self, "_forward", Transformer.from_crs(wgs84, crs, always_xy=True))
+        object.__setattr__(self, "_inverse", Transformer.from_crs(crs, wgs84, always_xy=True))
+
+    def to_local(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:
+        """-> (e_m, n_m)"""
+        e_m, n_m = self._forward.transform(lon_deg, lat_deg)
+        return float(e_m), float(n_m)
+
+    def to_wgs84(self, e_m: float, n_m: float) -> tuple[float, float]:
+        """-> (lat_deg, lon_deg)"""
+        lon_deg, lat_deg = self._inverse.transform(e_m, n_m)
+        return float(lat_deg), float(lon_deg)
+
+
+def rot_w_b(yaw_rad: float, pitch_rad: float, roll_rad: float) -> np.ndarray:
+    """R_w_b (3x3): body FRD into world ENU, from the aerospace angles (yaw clockwise from north, Z-Y-X)."""
+    cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
+    cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
+    cr, sr = math.cos(roll_rad), math.sin(roll_rad)
+    r_ned_b = np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+    r_enu_ned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return r_enu_ned @ r_ned_b
+
+
+def yaw_of(r_w_b: np.ndarray) -> float:
+    """Heading of the body's forward axis, radians clockwise from north, in (-pi, pi]."""
+    return math.atan2(float(r_w_b[0, 0]), float(r_w_b[1, 0]))
+
+
+def quat_from_rot(r: np.ndarray) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (3x3). Shepperd's method."""
+    k = np.array([r[0, 0] + r[1, 1] + r[2, 2], r[0, 0], r[1, 1], r[2, 2]])
+    i = int(np.argmax(k))
+    if i == 0:
+        q = np.array([1.0 + k[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    elif i == 1:
+        q = np.array([r[2, 1] - r[1, 2], 1.0 + 2 * r[0, 0] - k[0], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]])
+    elif i == 2:
+        q = np.array([r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1.0 + 2 * r[1, 1] - k[0], r[1, 2] + r[2, 1]])
+    else:
+        q = np.array([r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 + 2 * r[2, 2] - k[0]])
+    q = q / np.linalg.norm(q)
+    if q[0] < 0:
+        q = -q
+    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
+
+
+def rot_from_quat(q: tuple[float, float, float, float]) -> np.ndarray:
+    """Rotation matrix (3x3) of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,322 @@
+"""What is said between the processes: every message, with units, frames and who says it.
+
+Conventions that hold everywhere
+--------------------------------
+* ``t_ns`` is the time of the *measurement* on the one monotonic clock, in nanoseconds.
+* World frame ``w``: local east, north, up (ENU) in metres around the flight's origin (``Origin``);
+  up is height above mean sea level (AMSL).
+* Body frame ``b``: forward, right, down (FRD). Camera frame ``c``: OpenCV (x right, y down, z into the scene).
+* ``q_a_b`` is a unit quaternion (w, x, y, z) that takes b coordinates into a.
+* Covariances 6x6 are row-major, order (east, north, up, rotation about east, north, up), m^2 and rad^2.
+* A field that is ``None`` is not known; absence is a state, not an error.
+"""
+
+from enum import StrEnum
+
+import msgspec
+
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+Quat = tuple[float, float, float, float]
+Mat2 = tuple[float, float, float, float]
+Mat6 = tuple[float, ...]
+
+
+class SourceLabel(StrEnum):
+    """Where a position comes from (AC-12)."""
+
+    SATELLITE_ANCHORED = "satellite_anchored"  # a map match entered within the last keyframes
+    VISUAL_PROPAGATED = "visual_propagated"  # odometry since the last map match
+    DEAD_RECKONED = "dead_reckoned"  # neither map nor odometry: growing covariance only
+
+
+class CovarianceMode(StrEnum):
+    """How the 6x6 covariance was computed (ON-2)."""
+
+    MARGINALS = "marginals"
+    JACOBIAN = "jacobian"
+
+
+class ThermalBand(StrEnum):
+    NORMAL = "normal"
+    HOT = "hot"  # throttling or close to it: the cheap covariance is used
+    CRITICAL = "critical"
+
+
+class Verdict(StrEnum):
+    """The answer to every measurement; anything but ACCEPTED names the reason of the rejection."""
+
+    ACCEPTED = "accepted"
+    BAD_IMAGE = "bad_image"  # unreadable, truncated, wrong size
+    NO_FEATURES = "no_features"  # nothing to track
+    FEW_INLIERS = "few_inliers"
+    NO_PREDICTION = "no_prediction"  # nobody knows where to look
+    OUTSIDE_MAP = "outside_map"
+    TOO_LOW = "too_low"  # the footprint is too small to be matched
+    AMBIGUOUS = "ambiguous"  # more than one place fits
+    WEAK_PEAK = "weak_peak"
+    PNP_FAILED = "pnp_failed"
+    HIGH_REPROJECTION = "high_reprojection"
+    DEGENERATE = "degenerate"
+    INNOVATION = "innovation"  # disagrees with the estimate by more than both claim
+    STALE = "stale"
+    IMPLAUSIBLE = "implausible"  # jump, speed or height that cannot be
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
+    """Base of all messages."""
+
+    t_ns: int
+
+
+# --- from the source of a flight -----------------------------------------------------------------
+
+
+class Camera(msgspec.Struct, frozen=True, kw_only=True):
+    """Pinhole camera of the stored frames (pixels) and its mount in the body (degrees)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()  # OpenCV order: k1 k2 p1 p2 k3 ...
+    mount_yaw_deg: float = 0.0
+    mount_pitch_deg: float = -90.0  # straight down, image top forward
+    mount_roll_deg: float = 0.0
+    mount_tolerance_deg: float = 5.0  # 1-sigma of the real tilt around the nominal one
+
+
+class Origin(Message, frozen=True, kw_only=True):
+    """Said once by whoever opens the source: camera, frame of reference and start of the flight."""
+
+    camera: Camera
+    lat_deg: float
+    lon_deg: float
+    ground_amsl_m: float | None  # AMSL height of the ground at the origin
+    start_sigma_m: float  # 1-sigma of the start coordinate, per horizontal axis
+    yaw_sigma_deg: float
+    agl_sigma_m: float
+    attitude_sigma_deg: float  # roll and pitch, when they are reported
+
+
+class Frame(Message, frozen=True, kw_only=True):
+    """A camera frame exists; its pixels are in the frame store under ``frame_id``."""
+
+    frame_id: int
+    file: str  # name in the source ("" for a live camera)
+    width: int
+    height: int
+    error: str = ""  # not empty: there are no pixels, and this says why
+
+
+class VehicleState(Message, frozen=True, kw_only=True):
+    """Attitude, height and velocity as an autopilot reports them, at ``t_ns``.
+
+    ``yaw_rad`` clockwise from true north; ``agl_m`` above ground (or take-off); never GNSS position."""
+
+    source: str  # "frames.csv", "mavlink", "exif"
+    yaw_rad: float | None = None
+    pitch_rad: float | None = None
+    roll_rad: float | None = None
+    agl_m: float | None = None
+    velocity_enu_mps: Vec3 | None = None
+
+
+class SourceEnded(Message, frozen=True, kw_only=True):
+    """The source has no more frames."""
+
+    frames: int
+
+
+# --- vision ---------------------------------------------------------------------------------------
+
+
+class Odometry(Message, frozen=True, kw_only=True):
+    """Motion of frame ``frame_id`` against keyframe ``keyframe_id``, as matched rays.
+
+    ``pairs``: (x_kf, y_kf, x, y) in undistorted normalised image coordinates (tan of the angle) of
+    features on the ground seen in both, RANSAC inliers, spread over the image. Metric scale comes
+    later, from the height that the estimator knows."""
+
+    frame_id: int
+    keyframe_id: int
+    verdict: Verdict
+    pairs: list[tuple[float, float, float, float]] = []
+    sigma_norm: float = 0.0  # 1-sigma of one coordinate, normalised units
+    inliers: int = 0
+    tracked: int = 0
+    becomes_keyframe: bool = False  # following frames refer to this frame
+    process_ms: float = 0.0
+
+
+# --- estimator to anchor --------------------------------------------------------------------------
+
+
+class Prediction(Message, frozen=True, kw_only=True):
+    """Where the estimator believes that the camera was at frame ``frame_id``, before any map match of it."""
+
+    frame_id: int
+    p_c_in_w_m: Vec3
+    q_w_c: Quat
+    cov: Mat6  # of the camera pose
+    agl_m: float  # height of the camera above the ground beneath it
+    agl_sigma_m: float
+    step_m: Vec2  # camera motion (east, north) since the previous Prediction, by odometry alone
+    step_cov_m2: Mat2  # its covariance (ee, en, ne, nn)
+
+
+# --- anchor ---------------------------------------------------------------------------------------
+
+
+class MapMatch(Message, frozen=True, kw_only=True):
+    """A frame against the map: 2D-3D matches, the camera pose that they give, and how sure the belief is."""
+
+    frame_id: int
+    verdict: Verdict
+    matcher: str  # "gradient", "xfeat"
+    matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight
+    p_c_in_w_m: Vec3 | None = None
+    q_w_c: Quat | None = None
+    cov: Mat6 | None = None
+    inliers: int = 0
+    reprojection_px: float = 0.0
+    margin: float = 0.0  # best peak over the best rival, in standard deviations of the surface
+    mode_mass: float = 0.0  # share of the belief that sits in the winning mode, 0..1
+    mode_e_m: float = 0.0  # centre of the winning mode
+    mode_n_m: float = 0.0
+    belief_cov_m2: Mat2 = (0.0, 0.0, 0.0, 0.0)  # of the whole belief, all modes
+    process_ms: float = 0.0
+
+
+# --- estimator ------------------------------------------------------------------------------------
+
+
+class NavEstimate(Message, frozen=True, kw_only=True):
+    """The product: where the vehicle was at ``t_ns`` and how well that is known (AC-12, ON-1)."""
+
+    frame_id: int
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+    agl_m: float
+    velocity_enu_mps: Vec3
+    velocity_sigma_mps: float
+    q_w_b: Quat
+    cov: Mat6  # of the body pose
+    source_label: SourceLabel
+    covariance_mode: CovarianceMode
+    last_anchor_age_ms: int  # -1: never anchored
+    emitted_at_ns: int
+
+
+class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
+    frame_id: int
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+    sigma_e_m: float
+    sigma_n_m: float
+
+
+class Refinement(Message, frozen=True, kw_only=True):
+    """Better positions of past frames, after later anchors (AC-8)."""
+
+    poses: list[RefinedPose]
+
+
+class MeasurementVerdict(Message, frozen=True, kw_only=True):
+    """What the estimator did with one measurement (law: every measurement gets one)."""
+
+    frame_id: int
+    measurement: str  # "odometry", "map", "attitude", "height"
+    verdict: Verdict
+    detail: str = ""
+    mahalanobis2: float | None = None
+
+
+# --- link -----------------------------------------------------------------------------------------
+
+
+class GpsInput(Message, frozen=True, kw_only=True):
+    """What was sent to the autopilot as MAVLink GPS_INPUT (232); units of this record are SI."""
+
+    fix_type: int
+    time_week: int
+    time_week_ms: int
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+    hdop: float
+    vdop: float
+    vn_mps: float
+    ve_mps: float
+    vd_mps: float
+    speed_accuracy_mps: float
+    horiz_accuracy_m: float
+    vert_accuracy_m: float
+    satellites_visible: int
+    estimate_age_ms: float  # age of the estimate that this was carried forward from; -1: none
+    reason: str = ""  # why fix_type is not 3
+
+
+class LinkStatus(Message, frozen=True, kw_only=True):
+    """1 Hz: the state of the MAVLink connection."""
+
+    connected: bool
+    autopilot: str  # "ardupilot", "px4", "none", ...
+    sysid: int
+    sent: int
+    received: int
+    bad: int
+    time_offset_ms: float | None
+    detail: str = ""
+
+
+# --- health and the shell -------------------------------------------------------------------------
+
+
+class Health(Message, frozen=True, kw_only=True):
+    """1 Hz: temperature, throttle and disk."""
+
+    band: ThermalBand
+    temperature_c: float | None  # hottest zone; None: no zone readable
+    throttled: bool
+    disk_free_mb: int | None
+    cause: str  # why the band is what it is
+
+
+class ProcessEvent(Message, frozen=True, kw_only=True):
+    """Said by the supervisor: a process started, died, was restarted or gave up."""
+
+    process: str
+    event: str  # "started", "died", "stuck", "restarted", "gave_up", "stopped"
+    detail: str = ""
+
+
+class Dropped(Message, frozen=True, kw_only=True):
+    """Said by the shell: a queue overflowed and messages were lost."""
+
+    process: str
+    message: str
+    count: int
+
+
+AnyMessage = (
+    Origin
+    | Frame
+    | VehicleState
+    | SourceEnded
+    | Odometry
+    | Prediction
+    | MapMatch
+    | NavEstimate
+    | Refinement
+    | MeasurementVerdict
+    | GpsInput
+    | LinkStatus
+    | Health
+    | ProcessEvent
+    | Dropped
+)

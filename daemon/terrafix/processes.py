@@ -1,0 +1,68 @@
+"""Who runs and who hears what: the process table.
+
+A process is a node (a function of messages) in a shell that owns clock, sockets and files. ``module`` is
+named by string and imported in the child, so that one broken import cannot take the supervisor down."""
+
+from dataclasses import dataclass
+
+from terrafix import messages as m
+
+
+@dataclass(frozen=True)
+class Process:
+    name: str
+    module: str  # has make_node(ctx: NodeContext) -> Node; may have make_edge(ctx) -> Edge (its sockets and files)
+    hears: tuple[type[m.Message], ...]
+    says: tuple[type[m.Message], ...]
+    tick_hz: float  # how often tick() is called; 0 = only messages
+    stuck_after_s: float  # no progress for this long counts as dead
+
+
+EVERYTHING: tuple[type[m.Message], ...] = (
+    m.Origin,
+    m.Frame,
+    m.VehicleState,
+    m.SourceEnded,
+    m.Odometry,
+    m.Prediction,
+    m.MapMatch,
+    m.NavEstimate,
+    m.Refinement,
+    m.MeasurementVerdict,
+    m.GpsInput,
+    m.LinkStatus,
+    m.Health,
+    m.ProcessEvent,
+    m.Dropped,
+)
+
+# Start order is this order; stop order is the reverse, so the recorder hears the last word of everybody.
+PROCESSES: tuple[Process, ...] = (
+    Process("recorder", "terrafix.recorder.node", EVERYTHING, (), 1.0, 15.0),
+    Process("health", "terrafix.health.node", (), (m.Health,), 1.0, 15.0),
+    Process(
+        "link",
+        "terrafix.link.node",
+        (m.Origin, m.NavEstimate, m.Health, m.ProcessEvent),
+        (m.VehicleState, m.GpsInput, m.LinkStatus),
+        50.0,  # GPS_INPUT leaves at 10 Hz; the finer tick keeps its interval steady
+        2.0,
+    ),
+    Process(
+        "estimator",
+        "terrafix.estimator.node",
+        (m.Origin, m.Frame, m.VehicleState, m.Odometry, m.MapMatch, m.Health, m.SourceEnded),
+        (m.Prediction, m.NavEstimate, m.Refinement, m.MeasurementVerdict),
+        0.0,
+        20.0,
+    ),
+    Process("anchor", "terrafix.anchor.node", (m.Origin, m.Prediction), (m.MapMatch,), 0.0, 30.0),
+    Process(
+        "vision",
+        "terrafix.vision.node",
+        (m.Frame,),
+        (m.Origin, m.Frame, m.VehicleState, m.SourceEnded, m.Odometry),
+        0.0,
+        30.0,
+    ),
+)

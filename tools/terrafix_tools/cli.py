@@ -1,0 +1,126 @@
+"""The command line `terrafix`. Every command imports what it needs when it is called, so that --help is fast."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from terrafix.core.errors import TerrafixError
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
+map_app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
+app.add_typer(map_app, name="map")
+
+ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")]
+
+
+@app.command()
+def run(
+    source: Annotated[str, typer.Option(help="Flight folder, photos, video, /dev/video0 or GStreamer pipeline.")] = "",
+    map_path: Annotated[Path | None, typer.Option("--map", help="Map package or GeoTIFF.")] = None,
+    link: Annotated[str, typer.Option(help="udpin:H:P, udpout:H:P, tcp:H:P or a serial device.")] = "",
+    out: Annotated[Path, typer.Option(help="Folder for the flight record.")] = Path("out/run"),
+    config: ConfigOption = None,
+) -> None:
+    """Fly: start the processes under the supervisor until stopped."""
+    from terrafix.supervisor import run as run_supervised
+
+    raise typer.Exit(run_supervised(source=source, map_path=map_path, link=link, out_dir=out, configs=config or []))
+
+
+@app.command()
+def replay(
+    flight: Annotated[Path, typer.Argument(help="Flight folder, photo folder or video.")],
+    map_path: Annotated[Path | None, typer.Option("--map", help="Map package or GeoTIFF; default: the flight's.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for estimates.csv, flight.mcap, summary.json.")] = Path("out/replay"),
+    model: Annotated[list[str] | None, typer.Option(help="NAME=PATH, for example xfeat=models/xfeat.onnx.")] = None,
+    config: ConfigOption = None,
+    quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
+) -> None:
+    """Fly a recorded flight as fast as this machine can; the same input gives the same output."""
+    from terrafix_tools.replay import replay as run_replay
+
+    run_replay(flight, map_path, out, models=model or [], configs=config or [], progress=not quiet)
+
+
+@app.command()
+def evaluate(
+    folder: Annotated[Path, typer.Argument(help="Output of replay.")],
+    truth: Annotated[Path, typer.Option(help="truth.csv: file, lat_deg, lon_deg.")],
+    json_only: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Compare estimates with ground truth; writes evaluation.json."""
+    from terrafix_tools.evaluate import evaluate as run_evaluate
+
+    run_evaluate(folder, truth, json_only=json_only)
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="Output of replay, run or demo.")],
+    truth: Annotated[Path | None, typer.Option(help="truth.csv, when there is one.")] = None,
+    map_path: Annotated[Path | None, typer.Option("--map", help="Map package; default: the one in summary.json.")] = None,
+) -> None:
+    """One self-contained HTML page about a flight: FOLDER/report.html."""
+    from terrafix_tools.report import report as run_report
+
+    run_report(folder, truth, map_path)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for everything that the demo makes.")] = Path("out/demo"),
+    seed: Annotated[int, typer.Option(help="Seed of the world and of the noise.")] = 1,
+    duration: Annotated[float, typer.Option(help="Seconds of flight.")] = 90.0,
+) -> None:
+    """A flight over a generated world with the real processes and an autopilot peer, ending in a report."""
+    from terrafix_tools.demo import demo as run_demo
+
+    raise typer.Exit(run_demo(out, seed=seed, duration_s=duration))
+
+
+@map_app.command("build")
+def map_build(
+    imagery: Annotated[Path, typer.Argument(help="GeoTIFF in any projected CRS (or EPSG:4326).")],
+    out: Annotated[Path, typer.Option(help="Map package to write (.gpkg).")],
+    dem: Annotated[Path | None, typer.Option(help="Elevation GeoTIFF, metres AMSL.")] = None,
+    date: Annotated[str, typer.Option(help="Date of the imagery, YYYY-MM-DD.")] = "",
+    licence: Annotated[str, typer.Option(help="Licence text of the imagery.")] = "",
+) -> None:
+    """GeoTIFF -> map package."""
+    from terrafix_tools.map_build import build
+
+    build(imagery, out, dem=dem, date=date, licence=licence, progress=True)
+
+
+@map_app.command("info")
+def map_info(package: Annotated[Path, typer.Argument(help="Map package.")]) -> None:
+    """What is in a map package, as JSON."""
+    from terrafix_tools.map_build import info
+
+    info(package)
+
+
+@app.command()
+def bench(
+    data: Annotated[Path, typer.Option(help="Folder with flights/ and models/.")] = Path("../shared/data"),
+    out: Annotated[Path, typer.Option(help="JSON to write.")] = Path("out/bench.json"),
+) -> None:
+    """Time per frame and accuracy beside a SIFT + RANSAC baseline measured in the same run."""
+    from terrafix_tools.bench import bench as run_bench
+
+    run_bench(data, out)
+
+
+def main() -> None:
+    """The one funnel for errors: a user's mistake is one line and an exit code, a bug is a traceback."""
+    try:
+        app()
+    except TerrafixError as error:
+        typer.echo(f"terrafix: {error}", err=True)
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":
+    main()
