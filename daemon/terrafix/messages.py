@@ -148,7 +148,6 @@ class Odometry(Message, frozen=True, kw_only=True):
     inliers: int = 0
     tracked: int = 0
     becomes_keyframe: bool = False  # following frames refer to this frame
-    process_ms: float = 0.0
 
 
 # --- estimator to anchor --------------------------------------------------------------------------
@@ -187,7 +186,6 @@ class MapMatch(Message, frozen=True, kw_only=True):
     mode_e_m: float = 0.0  # centre of the winning mode
     mode_n_m: float = 0.0
     belief_cov_m2: Mat2 = (0.0, 0.0, 0.0, 0.0)  # of the whole belief, all modes
-    process_ms: float = 0.0
 
 
 # --- estimator ------------------------------------------------------------------------------------
@@ -274,7 +272,34 @@ class LinkStatus(Message, frozen=True, kw_only=True):
     detail: str = ""
 
 
+class WallClock(Message, frozen=True, kw_only=True):
+    """Said by the link's edge: Unix time at ``t_ns``, for the GPS week. ``unix_ns`` None: no clock is plausible."""
+
+    unix_ns: int | None
+    source: str  # "system", "autopilot", "none"
+
+
+class StatusText(Message, frozen=True, kw_only=True):
+    """A line for the pilot's screen, sent as MAVLink STATUSTEXT (253)."""
+
+    severity: int  # MAV_SEVERITY: 2 critical, 4 warning, 5 notice, 6 info
+    text: str  # at most 50 characters
+
+
 # --- health and the shell -------------------------------------------------------------------------
+
+
+class TemperatureZone(msgspec.Struct, frozen=True, kw_only=True):
+    name: str
+    temperature_c: float
+
+
+class ThermalReading(Message, frozen=True, kw_only=True):
+    """1 Hz: what the sensors of the computer say, unjudged; Health is made of it."""
+
+    zones: list[TemperatureZone]
+    throttling: list[str]  # cooling devices that slow a processor down right now
+    disk_free_mb: int | None
 
 
 class Health(Message, frozen=True, kw_only=True):
@@ -316,6 +341,9 @@ AnyMessage = (
     | MeasurementVerdict
     | GpsInput
     | LinkStatus
+    | WallClock
+    | StatusText
+    | ThermalReading
     | Health
     | ProcessEvent
     | Dropped

@@ -16,6 +16,7 @@ class Process:
     says: tuple[type[m.Message], ...]
     tick_hz: float  # how often tick() is called; 0 = only messages
     stuck_after_s: float  # no progress for this long counts as dead
+    newest: tuple[type[m.Message], ...] = ()  # a backlog of these becomes the newest one (see core/inbox.py)
 
 
 EVERYTHING: tuple[type[m.Message], ...] = (
@@ -31,6 +32,9 @@ EVERYTHING: tuple[type[m.Message], ...] = (
     m.MeasurementVerdict,
     m.GpsInput,
     m.LinkStatus,
+    m.WallClock,
+    m.StatusText,
+    m.ThermalReading,
     m.Health,
     m.ProcessEvent,
     m.Dropped,
@@ -39,12 +43,12 @@ EVERYTHING: tuple[type[m.Message], ...] = (
 # Start order is this order; stop order is the reverse, so the recorder hears the last word of everybody.
 PROCESSES: tuple[Process, ...] = (
     Process("recorder", "terrafix.recorder.node", EVERYTHING, (), 1.0, 15.0),
-    Process("health", "terrafix.health.node", (), (m.Health,), 1.0, 15.0),
+    Process("health", "terrafix.health.node", (), (m.ThermalReading, m.Health), 1.0, 15.0),
     Process(
         "link",
         "terrafix.link.node",
         (m.Origin, m.NavEstimate, m.Health, m.ProcessEvent),
-        (m.VehicleState, m.GpsInput, m.LinkStatus),
+        (m.VehicleState, m.GpsInput, m.MeasurementVerdict, m.LinkStatus, m.WallClock, m.StatusText),
         50.0,  # GPS_INPUT leaves at 10 Hz; the finer tick keeps its interval steady
         2.0,
     ),
@@ -56,11 +60,11 @@ PROCESSES: tuple[Process, ...] = (
         0.0,
         20.0,
     ),
-    Process("anchor", "terrafix.anchor.node", (m.Origin, m.Prediction), (m.MapMatch,), 0.0, 30.0),
+    Process("anchor", "terrafix.anchor.node", (m.Origin, m.Prediction), (m.MapMatch,), 0.0, 30.0, (m.Prediction,)),
     Process(
         "vision",
         "terrafix.vision.node",
-        (m.Frame,),
+        (m.Origin, m.Frame),
         (m.Origin, m.Frame, m.VehicleState, m.SourceEnded, m.Odometry),
         0.0,
         30.0,

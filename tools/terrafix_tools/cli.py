@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-
 from terrafix.core.errors import TerrafixError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
 map_app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
 app.add_typer(map_app, name="map")
 
+StartOption = Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")]
 ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")]
 
 
@@ -21,27 +21,49 @@ def run(
     map_path: Annotated[Path | None, typer.Option("--map", help="Map package or GeoTIFF.")] = None,
     link: Annotated[str, typer.Option(help="udpin:H:P, udpout:H:P, tcp:H:P or a serial device.")] = "",
     out: Annotated[Path, typer.Option(help="Folder for the flight record.")] = Path("out/run"),
+    start: StartOption = "",
+    until_end: Annotated[bool, typer.Option("--until-end", help="Stop when a recorded source has ended.")] = False,
     config: ConfigOption = None,
 ) -> None:
     """Fly: start the processes under the supervisor until stopped."""
     from terrafix.supervisor import run as run_supervised
+    from terrafix_tools.live import package_for
 
-    raise typer.Exit(run_supervised(source=source, map_path=map_path, link=link, out_dir=out, configs=config or []))
+    configs = config or []
+    raise typer.Exit(
+        run_supervised(
+            source=source,
+            start=start,
+            map_path=package_for(source, start, map_path, configs),
+            link=link,
+            out_dir=out,
+            configs=configs,
+            stop_after_source=until_end,
+        )
+    )
 
 
 @app.command()
 def replay(
     flight: Annotated[Path, typer.Argument(help="Flight folder, photo folder or video.")],
-    map_path: Annotated[Path | None, typer.Option("--map", help="Map package or GeoTIFF; default: the flight's.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for estimates.csv, flight.mcap, summary.json.")] = Path("out/replay"),
+    map_path: Annotated[
+        Path | None, typer.Option("--map", help="Map package or GeoTIFF; default: the flight's.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for estimates.csv, flight.mcap, summary.json.")] = Path(
+        "out/replay"
+    ),
     model: Annotated[list[str] | None, typer.Option(help="NAME=PATH, for example xfeat=models/xfeat.onnx.")] = None,
+    start: StartOption = "",
     config: ConfigOption = None,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
     """Fly a recorded flight as fast as this machine can; the same input gives the same output."""
+    from terrafix.vision.sources import parse_start
+
     from terrafix_tools.replay import replay as run_replay
 
-    run_replay(flight, map_path, out, models=model or [], configs=config or [], progress=not quiet)
+    at = parse_start(start)
+    run_replay(flight, map_path, out, models=model or [], configs=config or [], progress=not quiet, start=at)
 
 
 @app.command()
@@ -60,7 +82,9 @@ def evaluate(
 def report(
     folder: Annotated[Path, typer.Argument(help="Output of replay, run or demo.")],
     truth: Annotated[Path | None, typer.Option(help="truth.csv, when there is one.")] = None,
-    map_path: Annotated[Path | None, typer.Option("--map", help="Map package; default: the one in summary.json.")] = None,
+    map_path: Annotated[
+        Path | None, typer.Option("--map", help="Map package; default: the one in summary.json.")
+    ] = None,
 ) -> None:
     """One self-contained HTML page about a flight: FOLDER/report.html."""
     from terrafix_tools.report import report as run_report
@@ -100,6 +124,18 @@ def map_info(package: Annotated[Path, typer.Argument(help="Map package.")]) -> N
     from terrafix_tools.map_build import info
 
     info(package)
+
+
+@map_app.command("preview")
+def map_preview(
+    package: Annotated[Path, typer.Argument(help="Map package.")],
+    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("preview.png"),
+    size: Annotated[int, typer.Option(min=64, max=8192, help="Longer side, pixels.")] = 1024,
+) -> None:
+    """The whole map, north up, as a picture; where it is transparent the map has nothing."""
+    from terrafix_tools.map_build import preview
+
+    preview(package, out, size)
 
 
 @app.command()

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from terrafix.messages import Camera
+
 
 @dataclass(frozen=True)
 class CameraCalibration:
@@ -18,6 +20,10 @@ class CameraCalibration:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, camera: Camera) -> "CameraCalibration":
+        return cls(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion)
 
     def matrix(self) -> np.ndarray:
         """K (3x3)."""
@@ -59,6 +65,10 @@ class Mount:
     pitch_deg: float = -90.0
     roll_deg: float = 0.0
     tolerance_deg: float = 5.0  # 1-sigma of the real tilt around the nominal one
+
+    @classmethod
+    def of(cls, camera: Camera) -> "Mount":
+        return cls(camera.mount_yaw_deg, camera.mount_pitch_deg, camera.mount_roll_deg, camera.mount_tolerance_deg)
 
     def r_b_c(self) -> np.ndarray:
         """R_b_c (3x3): camera coordinates into body FRD."""

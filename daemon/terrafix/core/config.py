@@ -36,7 +36,7 @@ class LinkSection(Section, frozen=True, kw_only=True):
     sysid: Annotated[int, Meta(ge=1, le=255)] = 1
     compid: Annotated[int, Meta(ge=1, le=255)] = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
     gps_id: Annotated[int, Meta(ge=0, le=3)] = 0
-    rate_hz: Annotated[float, Meta(ge=5, le=20)] = 10.0
+    rate_hz: Annotated[float, Meta(ge=5, le=15)] = 10.0  # faster leaves gaps that the autopilot drops
 
 
 class RecorderSection(Section, frozen=True, kw_only=True):
@@ -55,6 +55,9 @@ class HealthSection(Section, frozen=True, kw_only=True):
 class Source(Section, frozen=True, kw_only=True):
     path: str = ""  # flight folder, photo folder, video file, /dev/video* or a GStreamer pipeline
     realtime: bool = True  # play a recorded source at its own pace (live shell only)
+    start: str = ""  # "LAT,LON" in degrees, over what the source says; the command line wins
+    camera: str = ""  # camera description (config/cameras); cameras need one, photos and videos may have one
+    rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0  # frames a second taken from a video or a camera
 
 
 class LogSection(Section, frozen=True, kw_only=True):

@@ -91,3 +91,9 @@ def rot_from_quat(q: tuple[float, float, float, float]) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def local_rotation_up(angle_rad: float) -> np.ndarray:
+    """Rotation (3x3) about the world's up axis, counter-clockwise seen from above."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

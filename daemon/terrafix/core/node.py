@@ -30,6 +30,7 @@ class NodeContext:
     frames: FrameStore
     map_path: Path | None  # map package (GeoPackage)
     out_dir: Path  # where the recorder writes
+    epoch_ns: int | None = None  # t_ns of this run's first Origin: set when the source's process starts again
 
 
 class Node(Protocol):

@@ -1,0 +1,88 @@
+"""Dense descriptors of the map, computed tile by tile when first needed and kept while there is room."""
+
+from collections import OrderedDict
+from typing import Protocol
+
+import numpy as np
+
+TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride
+PAD_PX = 32  # context around a tile, so that its rim is described as if there were no rim
+CACHE_BYTES = 192 * 1024 * 1024
+
+
+class MapWindows(Protocol):
+    """What is needed of the map: ``LocalMap`` of the package reader."""
+
+    gsd_m: float
+
+    def window(
+        self, e_min_m: float, n_max_m: float, width_px: int, height_px: int, gsd_m: float
+    ) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+class Describer(Protocol):
+    """Image in, dense descriptors out; one for each kind of feature."""
+
+    name: str
+    stride: int
+
+    def describe(self, image: np.ndarray) -> np.ndarray:
+        """(H, W, 3) uint8 BGR -> (C, H // stride, W // stride) float32"""
+        ...
+
+
+class MapFeatures:
+    def __init__(self, source: MapWindows, describer: Describer) -> None:
+        self._source = source
+        self._describer = describer
+        self._tiles: OrderedDict[tuple[float, int, int], tuple[np.ndarray, np.ndarray]] = OrderedDict()
+        self._bytes = 0
+
+    def window(
+        self, e_min_m: float, n_max_m: float, width: int, height: int, gsd_m: float
+    ) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """``width`` x ``height`` cells (a cell is ``stride`` pixels of ``gsd_m``) from about (e_min_m, n_max_m).
+
+        -> descriptors (C, height, width) float32, valid (height, width) bool, and the corner that was really used:
+        the nearest one on the grid of cells."""
+        cell = gsd_m * self._describer.stride
+        per_tile = TILE_CELLS_PX // self._describer.stride
+        column, row = round(e_min_m / cell), round(-n_max_m / cell)
+        valid = np.zeros((height, width), bool)
+        out: np.ndarray | None = None
+        for ty in range(row // per_tile, (row + height - 1) // per_tile + 1):
+            for tx in range(column // per_tile, (column + width - 1) // per_tile + 1):
+                tile, tile_valid = self._tile(gsd_m, tx, ty, cell, per_tile)
+                y0, x0 = ty * per_tile - row, tx * per_tile - column
+                ys = slice(max(y0, 0), min(y0 + per_tile, height))
+                xs = slice(max(x0, 0), min(x0 + per_tile, width))
+                if out is None:
+                    out = np.zeros((len(tile), height, width), np.float32)
+                from_y = slice(ys.start - y0, ys.stop - y0)
+                from_x = slice(xs.start - x0, xs.stop - x0)
+                out[:, ys, xs] = tile[:, from_y, from_x]
+                valid[ys, xs] = tile_valid[from_y, from_x]
+        assert out is not None
+        return out, valid, column * cell, -row * cell
+
+    def _tile(self, gsd_m: float, tx: int, ty: int, cell: float, per_tile: int) -> tuple[np.ndarray, np.ndarray]:
+        key = (gsd_m, tx, ty)
+        if key in self._tiles:
+            self._tiles.move_to_end(key)
+            return self._tiles[key]
+        stride = self._describer.stride
+        side = TILE_CELLS_PX + 2 * PAD_PX
+        image, ok = self._source.window(
+            tx * per_tile * cell - PAD_PX * gsd_m, -ty * per_tile * cell + PAD_PX * gsd_m, side, side, gsd_m
+        )
+        inner = slice(PAD_PX // stride, PAD_PX // stride + per_tile)
+        descriptors = self._describer.describe(image)[:, inner, inner]
+        rim = slice(PAD_PX, PAD_PX + TILE_CELLS_PX)
+        valid = ok[rim, rim].reshape(per_tile, stride, per_tile, stride).all(axis=(1, 3))
+        tile = (np.where(valid, descriptors, 0.0).astype(np.float16), valid)
+        self._tiles[key] = tile
+        self._bytes += tile[0].nbytes + valid.nbytes
+        while self._bytes > CACHE_BYTES and len(self._tiles) > 1:
+            _, (old, old_valid) = self._tiles.popitem(last=False)
+            self._bytes -= old.nbytes + old_valid.nbytes
+        return tile

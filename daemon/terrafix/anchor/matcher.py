@@ -1,0 +1,190 @@
+"""One frame against the map: the whole correlation surface first, then 2D-3D matches in the mode that the belief chose."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafix.anchor.belief import Belief, Surface
+from terrafix.anchor.correlate import Searchable, standardise
+from terrafix.anchor.map_features import Describer, MapFeatures
+from terrafix.anchor.map_package import LocalMap
+from terrafix.anchor.patches import match_patches
+from terrafix.anchor.pnp import THRESHOLD, PnpResult, solve
+from terrafix.anchor.rectify import Rectified, rectify
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.node import Image
+from terrafix.messages import Verdict
+
+# Ground sampling distance as a share of the height: coarse enough to be fast and blind to small change, fine enough
+# for houses and kerbs. Dense learned descriptors have cells of several pixels and want finer ones.
+LOOK_GSD_PER_AGL = {"gradient": 1 / 100, "xfeat": 1 / 330}
+FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330}
+GSD_STEPS_PER_OCTAVE = 2  # scales are rounded to these, so that the map's descriptors can be kept
+MAX_WINDOW_CELLS = 640  # a wider search is made on coarser cells
+PATCH_PER_AGL = 0.2  # side of a patch: 20 m at 100 m, one house and its surroundings
+MIN_PATCH_CELLS = 8
+REACH_PER_AGL = 0.07  # search of a patch around its expected place ...
+REACH_PER_TILT = 0.7  # ... and more while the tilt is not known: times height times tilt sigma
+MAX_REACH_PER_AGL = 0.2
+# Rotation and scale are searched when they are known less well than the descriptors tolerate.
+YAW_TOLERANCE_RAD = np.radians(4.0)
+YAW_STEP_RAD = np.radians(7.0)
+SCALE_TOLERANCE = 0.05
+SCALE_STEP = 0.08
+MAX_HYPOTHESES = 81
+MIN_SIDE_CELLS = 24  # of the rectified frame
+
+
+@dataclass(frozen=True)
+class View:
+    """The predicted camera: where, how turned, how high above the ground, and how well that is known."""
+
+    e_m: float
+    n_m: float
+    r_w_c: np.ndarray
+    agl_m: float
+    ground_m: float  # AMSL
+    yaw_sigma_rad: float
+    scale_sigma: float  # of the height, relative
+    tilt_sigma_rad: float
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    yaw_rad: float
+    scale: float
+
+
+@dataclass(frozen=True)
+class Look:
+    verdict: Verdict
+    surfaces: tuple[Surface, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
+    footprint_m: float = 1.0
+
+    def best_at(self, e_m: float, n_m: float) -> tuple[Hypothesis, float]:
+        """The hypothesis that fits best at a camera position, and its standardised correlation there."""
+        scores = [s.at(e_m, n_m) for s in self.surfaces]
+        best = int(np.argmax(scores))
+        return self.hypotheses[best], scores[best]
+
+
+@dataclass(frozen=True)
+class Fix:
+    """``xy`` (N, 2) normalised, ``points_w_m`` (N, 3), ``weights`` (N,), and what PnP made of them."""
+
+    xy: np.ndarray
+    points_w_m: np.ndarray
+    weights: np.ndarray
+    pnp: PnpResult
+    cell_m: float
+
+
+class FrameMatcher:
+    def __init__(self, camera: CameraCalibration, source: LocalMap, describer: Describer) -> None:
+        self._camera = camera
+        self._map = source
+        self._describer = describer
+        self._features = MapFeatures(source, describer)
+
+    def look(self, image: Image, view: View, belief: Belief) -> Look:
+        """Correlation over the belief's window, for every rotation and scale that the prediction leaves open."""
+        stride = self._describer.stride
+        gsd = self._gsd(view.agl_m, LOOK_GSD_PER_AGL)
+        hypotheses = _hypotheses(view)
+        while 2 * belief.half_m / (gsd * stride) > MAX_WINDOW_CELLS:
+            gsd *= 2.0
+        first = rectify(image, self._camera, view.r_w_c, view.agl_m, gsd, stride)
+        if first is None or min(first.mask.shape) < MIN_SIDE_CELLS * stride / 2:
+            return Look(Verdict.TOO_LOW)
+        cell = gsd * stride
+        footprint_m = float(np.sqrt(first.mask.sum())) * gsd
+        frames = [self._rectified(image, view, h, gsd) for h in hypotheses]
+        usable = [(h, f) for h, f in zip(hypotheses, frames, strict=True) if f is not None]
+        reach = [self._offsets(f) for _, f in usable]
+        e_min = belief.centre[0] - belief.half_m + min(r[0] for r in reach)
+        n_max = belief.centre[1] + belief.half_m + max(r[1] for r in reach)
+        width = int((2 * belief.half_m + max(r[2] for r in reach) - min(r[0] for r in reach)) / cell) + 2
+        height = int((2 * belief.half_m + max(r[1] for r in reach) - min(r[3] for r in reach)) / cell) + 2
+        descriptors, valid, e_min, n_max = self._features.window(e_min, n_max, width, height, gsd)
+        if not valid.any():
+            return Look(Verdict.OUTSIDE_MAP)
+        searchable = Searchable(descriptors, valid)
+        surfaces = []
+        for _, frame in usable:
+            template, mask = self._describe(frame)
+            z = standardise(searchable.search(template, mask))
+            surfaces.append(Surface(z, e_min - frame.e_min_m, n_max - frame.n_max_m, cell))
+        if not any(np.isfinite(s.z).any() for s in surfaces):
+            return Look(Verdict.OUTSIDE_MAP)
+        return Look(Verdict.ACCEPTED, tuple(surfaces), tuple(h for h, _ in usable), footprint_m)
+
+    def fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> Fix | None:
+        """2D-3D matches around a camera position, and the pose that they give. None: the ground cannot be seen."""
+        gsd = self._gsd(view.agl_m, FIX_GSD_PER_AGL)
+        cell = gsd * self._describer.stride
+        frame = self._rectified(image, view, hypothesis, gsd)
+        if frame is None:
+            return None
+        agl = view.agl_m * hypothesis.scale
+        reach_m = min(agl * (REACH_PER_AGL + REACH_PER_TILT * view.tilt_sigma_rad) + 2 * cell, MAX_REACH_PER_AGL * agl)
+        reach = max(int(np.ceil(reach_m / cell)), 3)
+        patch = max(round(PATCH_PER_AGL * agl / cell), MIN_PATCH_CELLS)
+        template, mask = self._describe(frame)
+        margin = (reach + 2) * cell
+        e_min, n_max = e_m + frame.e_min_m - margin, n_m + frame.n_max_m + margin
+        width, height = mask.shape[1] + 2 * reach + 4, mask.shape[0] + 2 * reach + 4
+        window, valid, e_min, n_max = self._features.window(e_min, n_max, width, height, gsd)
+        found = match_patches(template, frame, mask, cell, window, valid, (e_min, n_max), (e_m, n_m), patch, reach)
+        r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
+        rays = np.column_stack([found.frame_m, np.full(len(found.frame_m), -agl)]) @ r_w_c
+        xy = rays[:, :2] / rays[:, 2:]
+        up = self._map.elevation(found.map_m[:, 0], found.map_m[:, 1]) if len(xy) else None
+        up = np.full(len(xy), view.ground_m) if up is None else np.where(np.isfinite(up), up, view.ground_m)
+        points = np.column_stack([found.map_m, up])
+        chance = min(1.0, np.pi * (THRESHOLD * agl) ** 2 / (2 * reach * cell) ** 2)
+        floor = 0.3 * cell / agl  # a third of a cell: what interpolation of the peak gives at best
+        pnp = solve(points, xy, found.weight, r_w_c, agl, floor, chance, found.tried)
+        return Fix(xy, points, found.weight, pnp, cell)
+
+    def _gsd(self, agl_m: float, per_agl: dict[str, float]) -> float:
+        frame_gsd = agl_m / self._camera.fx
+        wanted = max(self._map.gsd_m, frame_gsd, agl_m * per_agl[self._describer.name])
+        return float(2.0 ** (round(np.log2(wanted) * GSD_STEPS_PER_OCTAVE) / GSD_STEPS_PER_OCTAVE))
+
+    def _rectified(self, image: Image, view: View, hypothesis: Hypothesis, gsd: float) -> Rectified | None:
+        r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
+        return rectify(image, self._camera, r_w_c, view.agl_m * hypothesis.scale, gsd, self._describer.stride)
+
+    def _describe(self, frame: Rectified) -> tuple[np.ndarray, np.ndarray]:
+        """Descriptors (C, h, w) and the cells (h, w) that lie wholly in the frame."""
+        stride = self._describer.stride
+        h, w = frame.mask.shape[0] // stride, frame.mask.shape[1] // stride
+        mask = frame.mask.reshape(h, stride, w, stride).all(axis=(1, 3))
+        return self._describer.describe(frame.image), mask
+
+    def _offsets(self, frame: Rectified) -> tuple[float, float, float, float]:
+        """Box of a rectified frame around the nadir: e_min, n_max, e_max, n_min."""
+        h, w = frame.mask.shape
+        return (
+            frame.e_min_m,
+            frame.n_max_m,
+            frame.e_min_m + w * frame.gsd_m,
+            frame.n_max_m - h * frame.gsd_m,
+        )
+
+
+def _hypotheses(view: View) -> tuple[Hypothesis, ...]:
+    """Grid over one and a half sigmas of heading and scale, as far as they are not known well enough."""
+    yaws = _grid(min(1.5 * view.yaw_sigma_rad, np.pi), YAW_TOLERANCE_RAD, YAW_STEP_RAD)
+    scales = [1.0 + s for s in _grid(min(1.5 * view.scale_sigma, 0.5), SCALE_TOLERANCE, SCALE_STEP)]
+    while len(yaws) * len(scales) > MAX_HYPOTHESES:
+        scales = scales[1:-1] if len(scales) > 3 else [1.0]
+    return tuple(Hypothesis(y, s) for y, s in itertools.product(yaws, scales))
+
+
+def _grid(half: float, tolerance: float, step: float) -> list[float]:
+    count = 0 if half <= tolerance else int(np.ceil((half - tolerance / 2) / step))
+    return [i * step for i in range(-count, count + 1)]

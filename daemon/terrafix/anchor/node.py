@@ -1,0 +1,171 @@
+"""Anchor: the newest predicted frame against the map, through the belief, into 2D-3D matches and a pose."""
+
+from collections.abc import Iterable
+
+import msgspec
+import numpy as np
+
+from terrafix.anchor.belief import Belief
+from terrafix.anchor.map_features import Describer
+from terrafix.anchor.map_package import LocalMap, MapPackage
+from terrafix.anchor.matcher import Fix, FrameMatcher, View
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.errors import ModelError
+from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
+from terrafix.core.node import FrameStore, NodeContext
+from terrafix.core.pose import tangent_to_world
+from terrafix.messages import MapMatch, Message, Origin, Prediction, Verdict
+from terrafix_engines.features import open_describer
+from terrafix_engines.runtime import ModelFileError
+
+NEW_GROUND_SHARE = 0.35  # of the footprint: after this much motion a look counts as a new one
+MIN_LOOK = 0.08  # a look at the same ground again still says this much
+MODE_MASS = 0.9  # the belief hands a fix to the graph when one mode holds this much
+MIN_AGL_M = 30.0  # below this a frame shows a few roofs and cars
+MODE_DRIFT = 0.35  # of the height: how far the pose may lie from the mode while the tilt is not yet known
+START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is not known yet
+LOST_SCORE = 2.0  # standardised correlation in the mode; a frame at the right place scores 3 to 10
+LOST_LOOKS = 4.0  # full looks below it before the search widens
+WIDEN = 1.6
+
+
+class AnchorNode:
+    def __init__(self, frames: FrameStore, package: MapPackage | None, describer: Describer) -> None:
+        self._frames = frames
+        self._package = package
+        self._describer = describer
+        self._matcher: FrameMatcher | None = None
+        self._map: LocalMap | None = None
+        self._belief: Belief | None = None
+        self._ground_m = 0.0
+        self._since_look_m = np.inf  # motion since the last look at new ground
+        self._poor_looks = 0.0
+
+    def on(self, message: Message) -> Iterable[Message]:
+        match message:
+            case Origin():
+                self._ground_m = message.ground_amsl_m or 0.0
+                self._belief = None
+                if self._package is not None:
+                    self._map = self._package.bind(LocalFrame(message.lat_deg, message.lon_deg))
+                    self._matcher = FrameMatcher(CameraCalibration.of(message.camera), self._map, self._describer)
+            case Prediction():
+                yield self._match(message)
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        return ()
+
+    def _match(self, prediction: Prediction) -> MapMatch:
+        belief = self._moved(prediction)
+        answer = MapMatch(
+            t_ns=prediction.t_ns,
+            frame_id=prediction.frame_id,
+            verdict=Verdict.OUTSIDE_MAP,
+            matcher=self._describer.name,
+        )
+        image = self._frames.get(prediction.frame_id)
+        if self._matcher is None:
+            return answer
+        if image is None:
+            return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE)
+        view = self._view(prediction)
+        if view.agl_m < MIN_AGL_M:
+            return msgspec.structs.replace(answer, verdict=Verdict.TOO_LOW)
+        look = self._matcher.look(image, view, belief)
+        if look.verdict is not Verdict.ACCEPTED:
+            return msgspec.structs.replace(answer, verdict=look.verdict)
+        weight = float(np.clip(self._since_look_m / (NEW_GROUND_SHARE * look.footprint_m), MIN_LOOK, 1.0))
+        self._since_look_m = 0.0
+        belief.update(look.surfaces, weight)
+        mode = belief.mode()
+        hypothesis, score = look.best_at(mode.e_m, mode.n_m)
+        self._watch(belief, score, weight)
+        ee, en, nn = belief.covariance()
+        answer = msgspec.structs.replace(
+            answer,
+            margin=score,
+            mode_mass=mode.mass,
+            mode_e_m=mode.e_m,
+            mode_n_m=mode.n_m,
+            belief_cov_m2=(ee, en, en, nn),
+        )
+        if mode.mass < MODE_MASS:
+            return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
+        fix = self._matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m)
+        if fix is None:
+            return msgspec.structs.replace(answer, verdict=Verdict.DEGENERATE)
+        return self._judged(answer, fix, view, belief)
+
+    def _moved(self, prediction: Prediction) -> Belief:
+        step_m = float(np.hypot(*prediction.step_m))
+        sigma_m = float(np.sqrt(max(prediction.step_cov_m2[0], prediction.step_cov_m2[3])))
+        if self._belief is None:
+            e_m, n_m, _ = prediction.p_c_in_w_m
+            start = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
+            tilt = prediction.agl_m * float(np.sqrt(max(prediction.cov[21], prediction.cov[28])))
+            self._belief = Belief(e_m, n_m, float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt)))
+        else:
+            self._belief.move(*prediction.step_m, sigma_m)
+            self._belief.fit_window(0.0)
+        self._since_look_m += float(np.hypot(step_m, sigma_m))
+        return self._belief
+
+    def _view(self, prediction: Prediction) -> View:
+        e_m, n_m, up_m = prediction.p_c_in_w_m
+        ground_m, agl_m = self._ground_m, prediction.agl_m
+        if self._map is not None:
+            elevation = self._map.elevation(np.array([e_m]), np.array([n_m]))
+            if elevation is not None and np.isfinite(elevation[0]):
+                ground_m = float(elevation[0])
+                agl_m = up_m - ground_m
+        return View(
+            e_m,
+            n_m,
+            rot_from_quat(prediction.q_w_c),
+            agl_m,
+            ground_m,
+            float(np.sqrt(prediction.cov[35])),
+            prediction.agl_sigma_m / max(agl_m, 1.0),
+            float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))),
+        )
+
+    def _watch(self, belief: Belief, score: float, weight: float) -> None:
+        """A mode that no longer fits what is seen: look wider."""
+        self._poor_looks = self._poor_looks + weight if score < LOST_SCORE else 0.0
+        if self._poor_looks >= LOST_LOOKS:
+            self._poor_looks = 0.0
+            belief.fit_window(belief.half_m * WIDEN)
+
+    def _judged(self, answer: MapMatch, fix: Fix, view: View, belief: Belief) -> MapMatch:
+        pnp = fix.pnp
+        verdict = pnp.verdict
+        if pnp.fit is None:
+            return msgspec.structs.replace(answer, verdict=verdict, inliers=int(pnp.inliers.sum()))
+        p = pnp.fit.p_c_in_w_m
+        drift = np.array([p[0] - answer.mode_e_m, p[1] - answer.mode_n_m])
+        if float(np.hypot(*drift)) > MODE_DRIFT * view.agl_m:
+            verdict = Verdict.DEGENERATE
+        matches = np.column_stack([fix.xy, fix.points_w_m, fix.weights])[pnp.inliers]
+        cov = tangent_to_world(pnp.fit.cov, pnp.fit.r_w_c)
+        return msgspec.structs.replace(
+            answer,
+            verdict=verdict,
+            matches=[(float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in matches],
+            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+            q_w_c=quat_from_rot(pnp.fit.r_w_c),
+            cov=tuple(float(v) for v in cov.ravel()),
+            inliers=int(pnp.inliers.sum()),
+            reprojection_px=float(np.sqrt(np.mean(pnp.fit.residuals**2))) * view.agl_m / fix.cell_m,
+        )
+
+
+def make_node(ctx: NodeContext) -> AnchorNode:
+    """Opens the map and the model, before take-off. Raises MapError, ModelError."""
+    package = MapPackage.open(ctx.map_path) if ctx.map_path is not None else None
+    try:
+        describer = open_describer(ctx.config.models.xfeat)
+    except ModelFileError as error:
+        raise ModelError(str(error)) from None
+    return AnchorNode(ctx.frames, package, describer)

@@ -1,0 +1,69 @@
+"""The frame as the map would show it: north-up, at a chosen scale, from attitude and height (PB-6)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.node import Image
+
+MAX_REACH = 1.6  # heights: ground farther than this from the nadir (58 degrees) is seen too flat to be matched
+MIN_DOWN = 0.3  # cosine of the ray with the vertical at that limit, with margin for the corners
+
+
+@dataclass(frozen=True)
+class Rectified:
+    """``image`` (H, W, 3) and ``mask`` (H, W) bool, north-up; the centre of pixel (r, c) lies at
+    east = e_min_m + (c + 0.5) gsd, north = n_max_m - (r + 0.5) gsd, relative to the point below the camera."""
+
+    image: np.ndarray
+    mask: np.ndarray
+    e_min_m: float
+    n_max_m: float
+    gsd_m: float
+
+
+def footprint(camera: CameraCalibration, r_w_c: np.ndarray, agl_m: float) -> tuple[float, float, float, float] | None:
+    """Outer box of the seen ground (e_min, n_min, e_max, n_max) in metres from the nadir point; None: no ground."""
+    w, h = camera.width - 1.0, camera.height - 1.0
+    rim = [(x * w, y * h) for x, y in ((0, 0), (0.5, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.5))]
+    rays = np.column_stack([camera.normalise(np.array(rim)), np.ones(len(rim))]) @ r_w_c.T
+    if float(r_w_c[2, 2]) > -MIN_DOWN:  # the optical axis looks too close to the horizon
+        return None
+    ground = rays[:, :2] / np.maximum(-rays[:, 2:], 1e-3) * agl_m
+    ground = np.clip(ground, -MAX_REACH * agl_m, MAX_REACH * agl_m)
+    low, high = ground.min(0), ground.max(0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def rectify(
+    image: Image, camera: CameraCalibration, r_w_c: np.ndarray, agl_m: float, gsd_m: float, stride: int = 1
+) -> Rectified | None:
+    """Onto flat ground ``agl_m`` below the camera. Sides are multiples of ``stride`` pixels."""
+    box = footprint(camera, r_w_c, agl_m)
+    if box is None:
+        return None
+    e_min, n_min, e_max, n_max = box
+    cell = gsd_m * stride
+    width = int(np.ceil((e_max - e_min) / cell)) * stride
+    height = int(np.ceil((n_max - n_min) / cell)) * stride
+    ground = np.array([[gsd_m, 0.0, e_min + 0.5 * gsd_m], [0.0, -gsd_m, n_max - 0.5 * gsd_m], [0.0, 0.0, -agl_m]])
+    to_camera = r_w_c.T @ ground  # rectified pixel (x, y, 1) -> ray in the camera
+    shrink = gsd_m / (agl_m / camera.fx)
+    source = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink) if shrink > 1.4 else image  # against aliasing
+    if camera.distortion:
+        x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+        rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ to_camera.T
+        px = camera.project(rays).astype(np.float32).reshape(height, width, 2)
+        flat = cv2.remap(source, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
+        inside = (px >= 0).all(-1) & (px[..., 0] <= camera.width - 1) & (px[..., 1] <= camera.height - 1)
+        behind = (rays[:, 2] <= 0).reshape(height, width)
+        mask = inside & ~behind
+    else:
+        matrix = camera.matrix() @ to_camera
+        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        flat = cv2.warpPerspective(source, matrix, (width, height), flags=how)
+        white = np.full(image.shape[:2], 255, np.uint8)
+        mask = cv2.warpPerspective(white, matrix, (width, height), flags=how) > 250
+    return Rectified(flat, mask, e_min, n_max, gsd_m)

@@ -1,0 +1,120 @@
+"""Pose from 2D-3D matches by robust Gauss-Newton, with the covariance of the result. Pure numpy.
+
+The tangent of a pose is (rotation, translation), both on the right (camera frame), the order of GTSAM's Pose3."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+HUBER_K = 1.345  # in sigmas; 95 % efficiency on Gaussian noise (Huber 1981)
+MAX_ITERATIONS = 15
+STEP_TOLERANCE = 1e-7  # rad and relative metres: below any noise here
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """``r_w_c`` (3x3), ``p_c_in_w_m`` (3,), ``cov`` (6x6, tangent order), ``residuals`` (N,) normalised units."""
+
+    r_w_c: np.ndarray
+    p_c_in_w_m: np.ndarray
+    cov: np.ndarray
+    residuals: np.ndarray
+    sigma: float  # of one coordinate, estimated from the residuals (not below the floor that was given)
+
+
+def skew(v: np.ndarray) -> np.ndarray:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def exp_so3(w: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula, (3,) -> (3x3)."""
+    angle = float(np.linalg.norm(w))
+    k = skew(w)
+    if angle < 1e-8:
+        return np.eye(3) + k
+    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * (k @ k)
+
+
+def log_so3(r: np.ndarray) -> np.ndarray:
+    """(3x3) -> (3,); good below pi."""
+    cos_angle = min(1.0, max(-1.0, (float(np.trace(r)) - 1.0) / 2.0))
+    angle = float(np.arccos(cos_angle))
+    v = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    return v / 2.0 if angle < 1e-7 else v * angle / (2.0 * np.sin(angle))
+
+
+def project_with_jacobian(
+    r_w_c: np.ndarray, p_c_in_w_m: np.ndarray, points_w_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """-> normalised coordinates (N, 2), Jacobian (N, 2, 6) by the tangent, depth (N,)."""
+    q = (points_w_m - p_c_in_w_m) @ r_w_c
+    z = np.maximum(q[:, 2], 1e-6)
+    xy = q[:, :2] / z[:, None]
+    d_q = np.zeros((len(q), 2, 3))
+    d_q[:, 0, 0] = d_q[:, 1, 1] = 1.0 / z
+    d_q[:, :, 2] = -xy / z[:, None]
+    jacobian = np.zeros((len(q), 2, 6))
+    # q = R^T (P - p); right perturbation: dq = [q]x w - v
+    qx = np.zeros((len(q), 3, 3))
+    qx[:, 0, 1], qx[:, 0, 2], qx[:, 1, 2] = -q[:, 2], q[:, 1], -q[:, 0]
+    qx[:, 1, 0], qx[:, 2, 0], qx[:, 2, 1] = q[:, 2], -q[:, 1], q[:, 0]
+    jacobian[:, :, :3] = d_q @ qx
+    jacobian[:, :, 3:] = -d_q
+    return xy, jacobian, q[:, 2]
+
+
+def fit_pose(
+    points_w_m: np.ndarray,
+    xy: np.ndarray,
+    r_w_c: np.ndarray,
+    p_c_in_w_m: np.ndarray,
+    sigma_floor: float,
+    weights: np.ndarray | None = None,
+    effective: float = 1.0,
+) -> PoseFit | None:
+    """Robust least squares on the reprojection error of points (N, 3) seen at normalised ``xy`` (N, 2).
+
+    ``effective``: share of the matches that count as independent (neighbouring patches share pixels; relief moves
+    whole blocks of them). ``None`` when the geometry does not determine a pose."""
+    weights = np.ones(len(xy)) if weights is None else weights
+    sigma = sigma_floor
+    r, p = r_w_c, p_c_in_w_m
+    hessian = np.eye(6)
+    error = np.zeros((len(xy), 2))
+    for _ in range(MAX_ITERATIONS):
+        predicted, jacobian, depth = project_with_jacobian(r, p, points_w_m)
+        if np.any(depth <= 0):
+            return None
+        error = xy - predicted
+        norm = np.linalg.norm(error, axis=1)
+        sigma = max(sigma_floor, 1.4826 * float(np.median(norm)) / 1.177)  # 1.177: median of a Rayleigh variable
+        w = weights * np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
+        hessian = np.einsum("nia,n,nib->ab", jacobian, w, jacobian)
+        gradient = np.einsum("nia,n,ni->a", jacobian, w, error)
+        scale = np.array([1.0, 1.0, 1.0, *([1.0 / float(np.median(depth))] * 3)])
+        scaled = hessian * np.outer(1 / scale, 1 / scale)
+        if np.linalg.cond(scaled) > 1e9:
+            return None
+        step = np.linalg.solve(scaled, gradient / scale) / scale
+        r = r @ exp_so3(step[:3])
+        p = p + r @ step[3:]
+        if float(np.abs(step * scale).max()) < STEP_TOLERANCE:
+            break
+    cov = sigma**2 / max(effective, 1e-6) * np.linalg.inv(hessian)
+    return PoseFit(r, p, (cov + cov.T) / 2, np.linalg.norm(error, axis=1), sigma)
+
+
+def tangent_to_world(cov: np.ndarray, r_w_c: np.ndarray) -> np.ndarray:
+    """Covariance (6x6) in the tangent order -> (position ENU, rotation about ENU axes), the order of the messages."""
+    a = np.zeros((6, 6))
+    a[:3, 3:] = r_w_c
+    a[3:, :3] = r_w_c
+    return a @ cov @ a.T
+
+
+def world_to_tangent(cov: np.ndarray, r_w_c: np.ndarray) -> np.ndarray:
+    """Inverse of ``tangent_to_world``."""
+    a = np.zeros((6, 6))
+    a[:3, 3:] = r_w_c
+    a[3:, :3] = r_w_c
+    return a.T @ cov @ a

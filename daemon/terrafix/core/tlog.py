@@ -1,0 +1,106 @@
+"""Telemetry logs (.tlog) of a ground station: MAVLink packets, each after its time of arrival.
+
+Format: a record is 8 bytes, big endian, microseconds since 1970, and one packet (MAVLink 1 or 2), as Mission
+Planner, QGroundControl and MAVProxy write it. Attitude and height are read; GNSS position and velocity never are."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from terrafix.core.errors import SourceError
+from terrafix.messages import VehicleState
+
+AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1; a tlog also holds the ground station's and the gimbal's words
+MAX_STEP_US = 24 * 3600 * 1_000_000  # a record further than a day from the last one is garbage between packets
+MIN_TIME_US = 946_684_800_000_000  # 2000-01-01; smaller numbers are not UNIX times
+_STAMP = 8  # bytes
+_WANTED = {
+    mavlink.MAVLINK_MSG_ID_ATTITUDE,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mavlink.MAVLINK_MSG_ID_ALTITUDE,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD,
+}
+# best first; VFR_HUD.alt is above sea level, so it only serves relative to the first record, which is the ground
+_HEIGHTS = ("GLOBAL_POSITION_INT", "ALTITUDE", "VFR_HUD")
+
+
+def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
+    """States in time order. ``t_ns`` is relative to ``t0_us`` (UNIX microseconds), or to the first record.
+
+    One state for each ATTITUDE (yaw, pitch, roll) and one for each height message of the best kind in the log.
+    A cut or damaged record is skipped. Raises SourceError when the file cannot be read or holds no record."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror})") from None
+    parser = mavlink.MAVLink(None)
+    heights: dict[str, list[VehicleState]] = {kind: [] for kind in _HEIGHTS}
+    attitudes: list[VehicleState] = []
+    headings: list[VehicleState] = []
+    vehicle: int | None = None
+    hud_ground_m: float | None = None
+    for t_us, packet in _records(data):
+        t0_us = t_us if t0_us is None else t0_us
+        sysid, compid, msgid = _address(packet)
+        if compid != AUTOPILOT_COMPONENT or msgid not in _WANTED or vehicle not in (None, sysid):
+            continue
+        try:
+            said = parser.decode(bytearray(packet))
+        except mavlink.MAVError:
+            continue
+        vehicle = sysid
+        t_ns = (t_us - t0_us) * 1000
+        kind = said.get_type()
+        if kind == "ATTITUDE" and _finite(said.roll, said.pitch, said.yaw):
+            attitudes.append(
+                VehicleState(t_ns=t_ns, source="mavlink", yaw_rad=said.yaw, pitch_rad=said.pitch, roll_rad=said.roll)
+            )
+        elif kind == "GLOBAL_POSITION_INT":
+            heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=said.relative_alt / 1000.0))
+        elif kind == "ALTITUDE" and _finite(said.altitude_relative):
+            heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=said.altitude_relative))
+        elif kind == "VFR_HUD" and _finite(said.alt):
+            hud_ground_m = said.alt if hud_ground_m is None else hud_ground_m
+            heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=said.alt - hud_ground_m))
+            yaw_rad = math.remainder(math.radians(said.heading), math.tau)
+            headings.append(VehicleState(t_ns=t_ns, source="mavlink", yaw_rad=yaw_rad))
+    if t0_us is None:
+        raise SourceError(f"{path}: holds no MAVLink record; is it a telemetry log (.tlog)?")
+    height = next((heights[kind] for kind in _HEIGHTS if heights[kind]), [])
+    return sorted([*(attitudes or headings), *height], key=lambda state: state.t_ns)
+
+
+def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """(time in us, packet), walking over damage byte by byte until a record fits again."""
+    at, last_us = 0, None
+    while at + _STAMP + 8 <= len(data):
+        length = _packet_length(data, at + _STAMP)
+        t_us = int.from_bytes(data[at : at + _STAMP], "big")
+        plausible = t_us > MIN_TIME_US and (last_us is None or abs(t_us - last_us) < MAX_STEP_US)
+        if length == 0 or not plausible or at + _STAMP + length > len(data):
+            at += 1
+            continue
+        yield t_us, data[at + _STAMP : at + _STAMP + length]
+        last_us = t_us
+        at += _STAMP + length
+
+
+def _packet_length(data: bytes, at: int) -> int:
+    """Bytes of the packet that begins at ``at``; 0: none begins there. MAVLink serialisation guide."""
+    if data[at] == 0xFD:
+        signature = 13 if data[at + 2] & 1 else 0
+        return 12 + data[at + 1] + signature
+    return 8 + data[at + 1] if data[at] == 0xFE else 0
+
+
+def _address(packet: bytes) -> tuple[int, int, int]:
+    """(sysid, compid, message id)"""
+    if packet[0] == 0xFD:
+        return packet[5], packet[6], int.from_bytes(packet[7:10], "little")
+    return packet[3], packet[4], packet[5]
+
+
+def _finite(*values: float) -> bool:
+    return all(math.isfinite(value) for value in values)

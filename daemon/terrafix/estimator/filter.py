@@ -1,0 +1,310 @@
+"""The estimator proper: motion, attitude, height and map fixes become nodes and factors of one graph.
+
+Everything is asked in two steps: ``advance`` takes a frame's odometry and says where the camera should be, ``fix``
+takes the frame's map match. Both answer with a verdict."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from terrafix.core.camera import Mount
+from terrafix.core.geodesy import rot_from_quat, rot_w_b
+from terrafix.core.pose import exp_so3, world_to_tangent
+from terrafix.estimator.factors import attitude_and_height_factor
+from terrafix.estimator.graph import NodeState, PoseGraph
+from terrafix.estimator.motion import RelativePose, relative_pose
+from terrafix.estimator.telemetry import Attitude
+from terrafix.messages import CovarianceMode, MapMatch, Odometry, Origin, Verdict
+
+UNKNOWN_RAD = 3.0  # sigma of a heading that nobody reports
+BIAS_SHARE, NOISE_SHARE = 0.8, 0.6  # how a stated sigma divides into what lasts and what does not (0.64 + 0.36 = 1)
+UNKNOWN_ATTITUDE_RAD = np.radians(4.0)  # sigma of roll and pitch that nobody reports: level flight and gentle turns
+DEFAULT_AGL_M = 120.0  # when nobody reports a height: the usual ceiling of small drones ...
+DEFAULT_AGL_SIGMA_M = 50.0  # ... and wide enough for all of them
+MAX_ACCELERATION_MPS2 = 3.0  # of small drones in cruise: how wrong the last velocity may become
+MAX_SPEED_SIGMA_MPS = 10.0  # per axis: of a velocity of which nothing is known
+VELOCITY_MEMORY_S = 10.0  # how long a drone keeps its course when nobody looks
+STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
+STEP_FLOOR_M = 0.5
+GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
+LOCAL_WARP_M = 1.5  # 1-sigma: orthophotos are stretched by about this over one footprint
+SAME_GROUND_SHARE = 0.5  # of the height: fixes closer together than this share their errors ...
+MIN_NEW_GROUND = 0.1  # ... and a fix over the same ground counts at least this much
+RECOVER_AFTER = 3  # fixes that agree with each other and not with the graph
+RECOVER_OVER = 0.5  # of the height: the motion they must span, so that they are not one mistake seen thrice
+RECOVER_AGREE_M = 15.0
+RECOVER_MASS = 0.97
+RESTART_INFLATION = 4.0  # of the covariance of the fix that starts the graph anew
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The camera at a frame: pose, covariance (6x6, tangent order), and which node it is."""
+
+    frame_id: int
+    t_s: float
+    pose: gtsam.Pose3
+    cov: np.ndarray
+    node: int
+
+
+@dataclass(frozen=True)
+class Advance:
+    verdict: Verdict
+    placed: Placed
+    step_m: np.ndarray  # (2,) east, north since the frame before, by odometry alone
+    step_sigma_m: float
+    first: bool
+
+
+@dataclass(frozen=True)
+class FixResult:
+    verdict: Verdict
+    mahalanobis2: float | None
+    detail: str = ""
+
+
+@dataclass
+class _Disagreement:
+    """Map fixes that the graph refused, as offsets from it."""
+
+    offsets_m: list[np.ndarray]
+    began_at_m: np.ndarray
+
+
+class Estimator:
+    def __init__(self, origin: Origin) -> None:
+        self.origin = origin
+        self.graph = PoseGraph()
+        self.velocity_mps = np.zeros(3)
+        self.velocity_sigma_mps = MAX_SPEED_SIGMA_MPS
+        self.last_fix_t_s: float | None = None
+        self.mode = CovarianceMode.MARGINALS
+        self.ground_m = origin.ground_amsl_m or 0.0  # AMSL of the ground below, from the last map match
+        self._r_b_c = Mount.of(origin.camera).r_b_c()
+        self._node_of: dict[int, int] = {}  # frame -> node
+        self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
+        self._last: Placed | None = None  # newest frame, in the graph or not
+        self._fixed_at_m: np.ndarray | None = None
+        self._refused: _Disagreement | None = None
+        self._trunk = 0  # newest node that odometry or the map vouches for; others hang on it as leaves
+
+    # --- motion ---------------------------------------------------------------------------------------------
+
+    def advance(self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude) -> Advance:
+        if self._last is None:
+            return self._begin(frame_id, t_s, attitude)
+        last = self._last
+        known = self._by_odometry(odometry)
+        if known is not None:
+            parent, motion = known
+            verdict = Verdict.ACCEPTED
+        else:
+            parent, motion = self._by_guess(t_s, attitude)
+            verdict = odometry.verdict if odometry.verdict is not Verdict.ACCEPTED else Verdict.FEW_INLIERS
+        before = self.graph.state(parent)
+        pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3(motion.r), motion.p_m))
+        last_pose = self.graph.state(last.node).pose
+        step = (pose.translation() - last_pose.translation())[:2]
+        dt_s = max(t_s - last.t_s, 1e-3)
+        if known is not None:
+            step_sigma = STEP_FLOOR_M + STEP_SHARE * float(np.hypot(*step))
+            self._learn_velocity(pose.translation() - last_pose.translation(), dt_s, step_sigma)
+        else:
+            step_sigma = self._drift_sigma(dt_s)
+            self.velocity_sigma_mps = min(MAX_SPEED_SIGMA_MPS, self.velocity_sigma_mps + MAX_ACCELERATION_MPS2 * dt_s)
+        self._cov_of[self.graph.next_node] = _compose_cov(self._covariance(parent), motion)
+        node = self.graph.extend(t_s, NodeState(pose, before.bias), parent, motion, self._attitude(attitude))
+        self._node_of[frame_id] = node
+        if known is not None or odometry.becomes_keyframe:
+            self._trunk = node
+        self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
+        return Advance(verdict, self._last, step, step_sigma, False)
+
+    def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
+        origin = self.origin
+        tolerance = np.radians(origin.camera.mount_tolerance_deg)
+        agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
+        agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
+        r_w_c = self._expected_rotation(attitude, np.zeros(4))
+        pose = gtsam.Pose3(gtsam.Rot3(r_w_c), np.array([0.0, 0.0, self.ground_m + agl]))
+        start = max(origin.start_sigma_m, 1.0)
+        wide = np.diag([1.0, 1.0, UNKNOWN_RAD, start, start, 3 * agl_sigma]) ** 2
+        cov_world = np.zeros((6, 6))
+        cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
+        yaw = np.radians(origin.yaw_sigma_deg)
+        bias_cov = np.diag([tolerance, tolerance, BIAS_SHARE * yaw, max(BIAS_SHARE * agl_sigma, 1.0)]) ** 2
+        node = self.graph.start(
+            t_s, NodeState(pose, np.zeros(4)), world_to_tangent(cov_world, r_w_c), bias_cov, self._attitude(attitude)
+        )
+        self._node_of[frame_id] = node
+        self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
+        return Advance(Verdict.ACCEPTED, self._last, np.zeros(2), 0.0, True)
+
+    def _by_odometry(self, odometry: Odometry) -> tuple[int, RelativePose] | None:
+        """The keyframe's node and the motion since, when odometry has both."""
+        if odometry.verdict is not Verdict.ACCEPTED or not odometry.pairs:
+            return None
+        parent = self._node_of.get(odometry.keyframe_id)
+        if parent is None or not self.graph.holds(parent):
+            return None
+        state = self.graph.state(parent)
+        r_w_kf = state.pose.rotation().matrix()
+        height_sigma = float(np.sqrt(r_w_kf[2] @ self._covariance(parent)[3:, 3:] @ r_w_kf[2]))
+        height = float(state.pose.translation()[2]) - self.ground_m
+        if height < 2.0:
+            return None
+        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, height, height_sigma)
+        return None if motion is None else (parent, motion)
+
+    def _by_guess(self, t_s: float, attitude: Attitude) -> tuple[int, RelativePose]:
+        """Nothing was seen: the last velocity, less certain the longer it lasts; the heading from the compass."""
+        parent = self._trunk if self.graph.holds(self._trunk) else self.graph.newest
+        state = self.graph.state(parent)
+        dt_s = max(t_s - self.graph.time_of(parent), 1e-3)
+        r_parent = state.pose.rotation().matrix()
+        r_w_c = self._expected_rotation(attitude, state.bias, r_parent)
+        sigma = self._drift_sigma(dt_s)
+        tau = VELOCITY_MEMORY_S
+        turn = UNKNOWN_ATTITUDE_RAD + (0.3 if attitude.yaw_rad is None else np.radians(self.origin.yaw_sigma_deg))
+        cov = np.diag([turn, turn, turn, sigma, sigma, sigma]) ** 2
+        step = self.velocity_mps * tau * (1 - float(np.exp(-dt_s / tau)))
+        return parent, RelativePose(r_parent.T @ r_w_c, r_parent.T @ step, cov)
+
+    def _drift_sigma(self, dt_s: float) -> float:
+        """How far a drone may be from where its last velocity would have taken it, per axis: an integrated
+        Ornstein-Uhlenbeck process, since a drone that is out of sight also turns back."""
+        tau = VELOCITY_MEMORY_S
+        wander = MAX_SPEED_SIGMA_MPS * float(np.sqrt(2 * tau * (dt_s - tau * (1 - np.exp(-dt_s / tau)))))
+        course = float(np.hypot(self.velocity_sigma_mps * dt_s, 0.5 * MAX_ACCELERATION_MPS2 * dt_s**2))
+        return max(min(course, wander), STEP_FLOOR_M)
+
+    def _covariance(self, node: int) -> np.ndarray:
+        """Of C_node, 6x6, tangent order: the smoother's marginal, or under thermal throttle what the chain of motions
+        and the inliers of the map fixes gave (O(inliers), ON-2)."""
+        if self.mode is CovarianceMode.MARGINALS or node not in self._cov_of:
+            self._cov_of[node] = self.graph.covariance(node)
+        return self._cov_of[node]
+
+    def _learn_velocity(self, step_m: np.ndarray, dt_s: float, step_sigma_m: float) -> None:
+        """Smoothed over about a second, so that the noise of one short step does not reach the autopilot."""
+        gain = 1.0 - float(np.exp(-dt_s / 1.0))
+        self.velocity_mps = self.velocity_mps + gain * (step_m / dt_s - self.velocity_mps)
+        noise = step_sigma_m / dt_s * np.sqrt(gain)
+        turning = MAX_ACCELERATION_MPS2 / 2 * min(dt_s, 2.0)
+        self.velocity_sigma_mps = min(MAX_SPEED_SIGMA_MPS, float(np.hypot(noise, turning * 0.5)))
+
+    # --- attitude and height --------------------------------------------------------------------------------
+
+    def _expected_rotation(self, attitude: Attitude, bias: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+        """R_w_c by the autopilot's attitude and the mount as it was learnt; heading as before when nobody says it."""
+        r_w_b = rot_w_b(attitude.yaw_rad or 0.0, attitude.pitch_rad or 0.0, attitude.roll_rad or 0.0)
+        if attitude.yaw_rad is None and before is not None:
+            return before
+        return exp_so3(np.array([0.0, 0.0, bias[2]])) @ r_w_b @ self._r_b_c @ exp_so3(np.array([bias[0], bias[1], 0.0]))
+
+    def _attitude(self, attitude: Attitude) -> gtsam.CustomFactor:
+        origin = self.origin
+        tilt = UNKNOWN_ATTITUDE_RAD
+        if attitude.pitch_rad is not None and attitude.roll_rad is not None:
+            tilt = np.radians(max(origin.attitude_sigma_deg, 0.3))
+        yaw = UNKNOWN_RAD * 10 if attitude.yaw_rad is None else NOISE_SHARE * np.radians(max(origin.yaw_sigma_deg, 0.5))
+        height = DEFAULT_AGL_SIGMA_M * 20 if attitude.agl_m is None else NOISE_SHARE * max(origin.agl_sigma_m, 0.5)
+        up = (origin.ground_amsl_m or 0.0) + (DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m)
+        r_w_b = rot_w_b(attitude.yaw_rad or 0.0, attitude.pitch_rad or 0.0, attitude.roll_rad or 0.0)
+        return attitude_and_height_factor(
+            *self.graph.next_keys(), np.array([tilt, tilt, yaw, height]), r_w_b, self._r_b_c, up
+        )
+
+    # --- map ------------------------------------------------------------------------------------------------
+
+    def fix(self, match: MapMatch) -> FixResult:
+        """A map match of a frame that ``advance`` has seen. Gated; enters the graph at its own node."""
+        if match.verdict is not Verdict.ACCEPTED or match.p_c_in_w_m is None or match.q_w_c is None:
+            return FixResult(match.verdict, None)
+        node = self._node_of.get(match.frame_id)
+        if node is None or not self.graph.holds(node):
+            return FixResult(Verdict.STALE, None)
+        r_w_c = rot_from_quat(match.q_w_c)
+        measured = gtsam.Pose3(gtsam.Rot3(r_w_c), np.array(match.p_c_in_w_m))
+        cov = world_to_tangent(np.array(match.cov).reshape(6, 6), r_w_c)
+        cov[3:, 3:] += LOCAL_WARP_M**2 * np.eye(3)
+        predicted = self.graph.state(node).pose
+        innovation = predicted.logmap(measured)
+        d2 = float(innovation @ np.linalg.solve(self._covariance(node) + cov, innovation))
+        if d2 > GATE_6DOF:
+            return self._refuse(match, node, measured, cov, d2)
+        self._refused = None
+        here = measured.translation()[:2]
+        new = 1.0
+        if self._fixed_at_m is not None:
+            height = max(float(measured.translation()[2]) - self.ground_m, 1.0)
+            moved = float(np.hypot(*(here - self._fixed_at_m)))
+            new = float(np.clip(moved / (SAME_GROUND_SHARE * height), MIN_NEW_GROUND, 1.0))
+        before = self._covariance(node)
+        self.graph.add_pose(node, measured, cov / new)
+        self._cov_of[node] = np.linalg.inv(np.linalg.inv(before) + np.linalg.inv(cov / new))
+        self._accepted(match, node, here)
+        return FixResult(Verdict.ACCEPTED, d2, f"new ground {new:.2f}")
+
+    def _accepted(self, match: MapMatch, node: int, here: np.ndarray) -> None:
+        self._fixed_at_m = here
+        self._trunk = max(self._trunk, node)
+        self.last_fix_t_s = self.graph.time_of(node)
+        self.ground_m = float(np.mean([m[4] for m in match.matches]))
+        last = self._last
+        if last is not None and last.frame_id in self._node_of:
+            newest = self._node_of[last.frame_id]
+            pose = self.graph.state(newest).pose
+            self._last = Placed(last.frame_id, last.t_s, pose, self._covariance(newest), newest)
+
+    def _refuse(self, match: MapMatch, node: int, measured: gtsam.Pose3, cov: np.ndarray, d2: float) -> FixResult:
+        """Refused, unless several fixes over new ground agree with each other: then the graph is the one that is lost."""
+        predicted = self.graph.state(node).pose
+        offset = (measured.translation() - predicted.translation())[:2]
+        here = predicted.translation()[:2]
+        refused = self._refused
+        if refused is None or float(np.hypot(*(offset - np.mean(refused.offsets_m, axis=0)))) > RECOVER_AGREE_M:
+            self._refused = _Disagreement([offset], here)
+        else:
+            refused.offsets_m.append(offset)
+            height = float(measured.translation()[2]) - self.ground_m
+            far = float(np.hypot(*(here - refused.began_at_m))) > RECOVER_OVER * height
+            if len(refused.offsets_m) >= RECOVER_AFTER and far and match.mode_mass >= RECOVER_MASS:
+                bias = self.graph.state(node).bias
+                bias_cov = self.graph.bias_covariance(node)
+                self.graph.restart(
+                    self.graph.time_of(node), NodeState(measured, bias), RESTART_INFLATION * cov, bias_cov
+                )
+                self._node_of[match.frame_id] = self.graph.newest
+                self._cov_of.clear()
+                self._refused = None
+                self._accepted(match, self.graph.newest, measured.translation()[:2])
+                return FixResult(Verdict.ACCEPTED, d2, f"restarted {float(np.hypot(*offset)):.0f} m away")
+        return FixResult(Verdict.INNOVATION, d2, f"{float(np.hypot(*offset)):.0f} m from the estimate")
+
+    @property
+    def last(self) -> Placed | None:
+        """The newest frame, with all that is known of it by now."""
+        return self._last
+
+    def body(self, placed: Placed) -> np.ndarray:
+        """R_w_b (3x3) of a placed frame, with the mount as it was learnt."""
+        bias = self.graph.state(placed.node).bias
+        r_b_c = self._r_b_c @ exp_so3(np.array([bias[0], bias[1], 0.0]))
+        return np.asarray(placed.pose.rotation().matrix() @ r_b_c.T)
+
+    def refine(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """frame -> position (3,) and its covariance (3x3), after a batch optimisation of the whole flight."""
+        refined = self.graph.refine()
+        return {
+            frame: (np.asarray(refined[node][0].translation()), refined[node][1])
+            for frame, node in self._node_of.items()
+        }
+
+
+def _compose_cov(cov_parent: np.ndarray, motion: RelativePose) -> np.ndarray:
+    """Covariance of parent * motion, tangent order, first order."""
+    adjoint = gtsam.Pose3(gtsam.Rot3(motion.r), motion.p_m).inverse().AdjointMap()
+    return adjoint @ cov_parent @ adjoint.T + motion.cov

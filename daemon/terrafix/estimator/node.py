@@ -1,0 +1,167 @@
+"""Estimator: odometry and map matches in; prediction, estimate and verdicts out."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from terrafix.core.geodesy import LocalFrame, quat_from_rot
+from terrafix.core.node import NodeContext
+from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.filter import Advance, Estimator, Placed
+from terrafix.estimator.telemetry import Telemetry
+from terrafix.messages import (
+    CovarianceMode,
+    Health,
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Odometry,
+    Origin,
+    Prediction,
+    RefinedPose,
+    Refinement,
+    SourceEnded,
+    SourceLabel,
+    ThermalBand,
+    VehicleState,
+    Verdict,
+)
+
+ANCHORED_FOR_S = 1.5  # after a map fix the odometry since then is too short to matter
+
+
+class EstimatorNode:
+    def __init__(self, registration_sigma_m: float) -> None:
+        self._registration_var = registration_sigma_m**2
+        self._estimator: Estimator | None = None
+        self._frame: LocalFrame | None = None
+        self._telemetry = Telemetry()
+        self._mode = CovarianceMode.MARGINALS
+        self._tracked = True
+
+    def on(self, message: Message) -> Iterable[Message]:
+        match message:
+            case Origin():
+                self._estimator = Estimator(message)
+                self._frame = LocalFrame(message.lat_deg, message.lon_deg)
+            case VehicleState():
+                self._telemetry.add(message)
+            case Health():
+                cool = message.band is ThermalBand.NORMAL
+                self._mode = CovarianceMode.MARGINALS if cool else CovarianceMode.JACOBIAN
+            case Odometry():
+                yield from self._on_odometry(message)
+            case MapMatch():
+                yield from self._on_map_match(message)
+            case SourceEnded():
+                yield from self._refine(message)
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        return ()
+
+    def _on_odometry(self, odometry: Odometry) -> Iterable[Message]:
+        estimator = self._estimator
+        if estimator is None:
+            return
+        estimator.mode = self._mode
+        attitude = self._telemetry.at(odometry.t_ns)
+        advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude)
+        self._tracked = advance.verdict is Verdict.ACCEPTED
+        yield MeasurementVerdict(
+            t_ns=odometry.t_ns, frame_id=odometry.frame_id, measurement="odometry", verdict=advance.verdict
+        )
+        if odometry.verdict is not Verdict.BAD_IMAGE:
+            yield self._prediction(odometry, advance, estimator)
+        yield self._estimate(advance.placed, odometry.t_ns)
+
+    def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
+        estimator = self._estimator
+        if estimator is None:
+            return
+        result = estimator.fix(match)
+        yield MeasurementVerdict(
+            t_ns=match.t_ns,
+            frame_id=match.frame_id,
+            measurement="map",
+            verdict=result.verdict,
+            detail=result.detail,
+            mahalanobis2=result.mahalanobis2,
+        )
+        if result.verdict is Verdict.ACCEPTED and estimator.last is not None:
+            self._tracked = True
+            yield self._estimate(estimator.last, match.t_ns)
+
+    def _prediction(self, odometry: Odometry, advance: Advance, estimator: Estimator) -> Prediction:
+        placed = advance.placed
+        r_w_c = placed.pose.rotation().matrix()
+        p = placed.pose.translation()
+        cov = tangent_to_world(placed.cov, r_w_c)
+        step_var = advance.step_sigma_m**2
+        return Prediction(
+            t_ns=odometry.t_ns,
+            frame_id=odometry.frame_id,
+            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+            q_w_c=quat_from_rot(r_w_c),
+            cov=tuple(float(v) for v in cov.ravel()),
+            agl_m=float(p[2]) - estimator.ground_m,
+            agl_sigma_m=float(np.sqrt(cov[2, 2])),
+            step_m=(float(advance.step_m[0]), float(advance.step_m[1])),
+            step_cov_m2=(step_var, 0.0, 0.0, step_var),
+        )
+
+    def _estimate(self, placed: Placed, t_ns: int) -> NavEstimate:
+        estimator, frame = self._estimator, self._frame
+        assert estimator is not None and frame is not None
+        p = placed.pose.translation()
+        cov = tangent_to_world(placed.cov, placed.pose.rotation().matrix())
+        # The map itself is off by a few metres, everywhere alike: no number of fixes averages that away.
+        cov[:3, :3] += self._registration_var * np.eye(3)
+        lat_deg, lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
+        age_ms = -1
+        if estimator.last_fix_t_s is not None:
+            age_ms = max(0, round((placed.t_s - estimator.last_fix_t_s) * 1e3))
+        label = SourceLabel.VISUAL_PROPAGATED if self._tracked else SourceLabel.DEAD_RECKONED
+        if self._tracked and 0 <= age_ms <= ANCHORED_FOR_S * 1e3:
+            label = SourceLabel.SATELLITE_ANCHORED
+        v = estimator.velocity_mps
+        return NavEstimate(
+            t_ns=round(placed.t_s * 1e9),
+            frame_id=placed.frame_id,
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            alt_amsl_m=float(p[2]),
+            agl_m=float(p[2]) - estimator.ground_m,
+            velocity_enu_mps=(float(v[0]), float(v[1]), float(v[2])),
+            velocity_sigma_mps=estimator.velocity_sigma_mps,
+            q_w_b=quat_from_rot(estimator.body(placed)),
+            cov=tuple(float(c) for c in cov.ravel()),
+            source_label=label,
+            covariance_mode=self._mode,
+            last_anchor_age_ms=age_ms,
+            emitted_at_ns=t_ns,
+        )
+
+    def _refine(self, ended: SourceEnded) -> Iterable[Message]:
+        if self._estimator is None or self._frame is None:
+            return
+        poses = []
+        for frame_id, (p, cov) in sorted(self._estimator.refine().items()):
+            lat_deg, lon_deg = self._frame.to_wgs84(float(p[0]), float(p[1]))
+            poses.append(
+                RefinedPose(
+                    frame_id=frame_id,
+                    lat_deg=lat_deg,
+                    lon_deg=lon_deg,
+                    alt_amsl_m=float(p[2]),
+                    sigma_e_m=float(np.sqrt(cov[0, 0] + self._registration_var)),
+                    sigma_n_m=float(np.sqrt(cov[1, 1] + self._registration_var)),
+                )
+            )
+        yield Refinement(t_ns=ended.t_ns, poses=poses)
+
+
+def make_node(ctx: NodeContext) -> EstimatorNode:
+    return EstimatorNode(ctx.config.map.registration_sigma_m)

@@ -1,0 +1,72 @@
+"""Health: readings become a thermal band, with hysteresis. The estimator takes the cheap covariance when it is hot."""
+
+from collections.abc import Iterable
+
+from terrafix.core.config import HealthSection
+from terrafix.core.errors import ConfigError
+from terrafix.core.node import Edge, NodeContext
+from terrafix.health.sysfs import HealthEdge
+from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, ThermalReading
+
+_RANK = {ThermalBand.NORMAL: 0, ThermalBand.HOT: 1, ThermalBand.CRITICAL: 2}
+
+
+class HealthNode:
+    """A band is entered at its limit and left ``hysteresis_c`` below it, so that it does not flutter.
+
+    Throttling has no hysteresis of ours: the kernel's governor has its own, and the cheap covariance must not
+    outlive the heat (ON-2)."""
+
+    def __init__(self, settings: HealthSection) -> None:
+        """Raises ConfigError when the limits contradict each other."""
+        if settings.critical_c <= settings.hot_c:
+            raise ConfigError(
+                f"[health] critical_c = {settings.critical_c:g} is not above hot_c = {settings.hot_c:g};"
+                " raise critical_c"
+            )
+        self._settings = settings
+        self._by_temperature = ThermalBand.NORMAL
+
+    def on(self, message: Message) -> Iterable[Message]:
+        if isinstance(message, ThermalReading):
+            yield self._judge(message)
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        return ()
+
+    def _judge(self, reading: ThermalReading) -> Health:
+        hottest = max(reading.zones, key=lambda zone: zone.temperature_c, default=None)
+        self._by_temperature, cause = self._band(hottest)
+        band = self._by_temperature
+        if reading.throttling and band is ThermalBand.NORMAL:
+            band = ThermalBand.HOT
+        if reading.throttling:
+            cause += f"; throttled by {', '.join(reading.throttling)}"
+        return Health(
+            t_ns=reading.t_ns,
+            band=band,
+            temperature_c=hottest.temperature_c if hottest else None,
+            throttled=bool(reading.throttling),
+            disk_free_mb=reading.disk_free_mb,
+            cause=cause,
+        )
+
+    def _band(self, hottest: TemperatureZone | None) -> tuple[ThermalBand, str]:
+        if hottest is None:
+            return ThermalBand.NORMAL, "no temperature zone is readable: taken for normal"
+        limits = ((ThermalBand.CRITICAL, self._settings.critical_c), (ThermalBand.HOT, self._settings.hot_c))
+        for band, enter_c in limits:
+            leave_c = enter_c - self._settings.hysteresis_c
+            inside = _RANK[self._by_temperature] >= _RANK[band]
+            temperature_c = hottest.temperature_c
+            if temperature_c >= enter_c or (inside and temperature_c > leave_c):
+                return band, f"{hottest.name} {temperature_c:.1f} C; {band} from {enter_c:g} C down to {leave_c:g} C"
+        return ThermalBand.NORMAL, f"{hottest.name} {hottest.temperature_c:.1f} C is the hottest zone"
+
+
+def make_node(ctx: NodeContext) -> HealthNode:
+    return HealthNode(ctx.config.health)
+
+
+def make_edge(ctx: NodeContext) -> Edge:
+    return HealthEdge(ctx)

@@ -1,0 +1,91 @@
+"""The edge of health: thermal zones, cooling devices and the disk, read once a second.
+
+Files: https://docs.kernel.org/driver-api/thermal/sysfs-api.html (temperatures in thousandths of a degree Celsius).
+A sensor that cannot be read (Jetson zones of powered-down units say EAGAIN) is left out, not guessed."""
+
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from terrafix.core import logs
+from terrafix.core.clock import Ticker
+from terrafix.core.node import NodeContext
+from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, ThermalReading
+
+RATE_HZ = 1.0
+PLAUSIBLE_C = (-55.0, 150.0)  # broken sensors report -256 or 255; silicon works in -40..125
+# Cooling devices that slow a processor down when their state is above 0: Jetson (cpu-throttle-alert, devfreq-...gpu),
+# generic (cpufreq-cpu0, thermal-cpufreq-0), ACPI (Processor). Fans and warnings (hot-surface-alert) do not.
+THROTTLING = ("throttle-alert", "cpufreq", "devfreq", "processor")
+
+
+class HealthEdge:
+    def __init__(self, ctx: NodeContext) -> None:
+        self._thermal = Path(ctx.config.health.sysfs_root) / "class" / "thermal"
+        self._out_dir = ctx.out_dir
+        self._ticker: Ticker | None = None
+        self._band: ThermalBand | None = None
+
+    def poll(self, now_ns: int) -> Iterable[Message]:
+        self._ticker = self._ticker or Ticker(RATE_HZ, now_ns)
+        if self._ticker.due(now_ns):
+            yield ThermalReading(
+                t_ns=now_ns,
+                zones=read_zones(self._thermal),
+                throttling=read_throttling(self._thermal),
+                disk_free_mb=read_disk_free_mb(self._out_dir),
+            )
+
+    def heard(self, message: Message) -> None:
+        """Logs every change of the band with its cause."""
+        if isinstance(message, Health) and message.band is not self._band:
+            before, self._band = self._band, message.band
+            log = logs.get().info if message.band is ThermalBand.NORMAL else logs.get().warning
+            log("thermal band", band=message.band, before=before, cause=message.cause)
+
+    def close(self) -> None:
+        pass
+
+
+def read_zones(thermal: Path) -> list[TemperatureZone]:
+    zones = []
+    for folder in sorted(thermal.glob("thermal_zone*")):
+        millidegrees = _number(folder / "temp")
+        if millidegrees is None:
+            continue
+        temperature_c = millidegrees / 1000
+        if PLAUSIBLE_C[0] < temperature_c < PLAUSIBLE_C[1]:
+            zones.append(TemperatureZone(name=_text(folder / "type") or folder.name, temperature_c=temperature_c))
+    return zones
+
+
+def read_throttling(thermal: Path) -> list[str]:
+    """Names of the cooling devices that slow a processor down right now."""
+    active = []
+    for folder in sorted(thermal.glob("cooling_device*")):
+        kind = _text(folder / "type") or ""
+        if any(word in kind.lower() for word in THROTTLING) and (_number(folder / "cur_state") or 0) > 0:
+            active.append(kind)
+    return active
+
+
+def read_disk_free_mb(folder: Path) -> int | None:
+    try:
+        return shutil.disk_usage(folder).free // 10**6
+    except OSError:
+        return None
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text(encoding="ascii", errors="replace").strip()
+    except OSError:
+        return None
+
+
+def _number(path: Path) -> int | None:
+    text = _text(path)
+    try:
+        return int(text) if text is not None else None
+    except ValueError:
+        return None

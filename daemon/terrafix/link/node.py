@@ -1,0 +1,227 @@
+"""The link's decisions: which estimate is believed, what the autopilot is told, and when. Pure; the edge sends it."""
+
+from collections.abc import Iterable, Iterator
+
+from terrafix.core.node import Edge, NodeContext
+from terrafix.link import fix, gps_time
+from terrafix.link.carry import Attitudes, Carried, carry
+from terrafix.link.gate import EstimateGate
+from terrafix.link.pacer import Pacer
+from terrafix.messages import (
+    GpsInput,
+    Health,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Origin,
+    ProcessEvent,
+    StatusText,
+    ThermalBand,
+    VehicleState,
+    Verdict,
+    WallClock,
+)
+
+TICK_HZ = 50.0  # as in the process table
+# Low on purpose: 6 passes every check of the autopilot (5 inflates its noise and fails alignment), and a real
+# receiver with a 3D fix is never outranked by number of satellites where the autopilot chooses (GPS_AUTO_SWITCH 1).
+SATELLITES = 6
+DOP_GOOD = 1.0  # copters ask for <= 1.4 (GPS_HDOP_GOOD); a position from a map has no geometry of satellites to report
+DOP_UNKNOWN = 99.99
+CLOCK_STEP_NS = 500_000_000  # a wall clock that moves less stays latched: the week keeps the monotonic clock's rhythm
+TEXT_MAX = 50  # characters of STATUSTEXT
+CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
+NOTICE_PERIOD_NS = 5_000_000_000  # a fix that flaps does not flood the pilot's screen
+
+
+def make_node(ctx: NodeContext) -> "LinkNode":
+    return LinkNode(ctx.config.link.rate_hz)
+
+
+def make_edge(ctx: NodeContext) -> Edge:
+    """Raises LinkError when the device cannot be opened."""
+    from terrafix.link.edge import open_edge  # replay has no edge and need not load MAVLink
+
+    return open_edge(ctx.config.link)
+
+
+class LinkNode:
+    """Hears estimates, says GpsInput at ``rate_hz``."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._pacer = Pacer(rate_hz, TICK_HZ)
+        self._gate = EstimateGate()
+        self._fix = fix.FixGate()
+        self._attitudes = Attitudes()
+        self._now_ns = 0
+        self._ground_amsl_m: float | None = None
+        self._unix_minus_monotonic_ns: int | None = None
+        self._heard_ns: int | None = None  # newest time of any plausible estimate: somebody has something to say
+        self._anchored_ns: int | None = None  # time of the last map fix
+        self._estimator_gone = ""
+        self._band = ThermalBand.NORMAL
+        self._rung = 0
+        self._silent = False
+        self._told_fix: bool | None = None
+        self._told_fix_ns = -NOTICE_PERIOD_NS
+
+    def on(self, message: Message) -> Iterable[Message]:
+        match message:
+            case NavEstimate():
+                return [self._on_estimate(message)]
+            case VehicleState():
+                self._attitudes.add(message)
+            case Origin():
+                self._ground_amsl_m = message.ground_amsl_m
+            case WallClock():
+                self._on_wall_clock(message)
+            case ProcessEvent(process="estimator"):
+                return self._on_estimator_event(message)
+            case Health():
+                return self._on_health(message)
+        return []
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        self._now_ns = now_ns
+        return self._send(now_ns) if self._pacer.due(now_ns) else ()
+
+    def _on_estimate(self, estimate: NavEstimate) -> MeasurementVerdict:
+        now_ns = max(self._now_ns, estimate.emitted_at_ns)  # the last tick may be older than the estimate
+        verdict, detail = self._gate.consider(estimate, now_ns, self._attitudes, self._ground_amsl_m)
+        if verdict is Verdict.ACCEPTED or (self._gate.holding and detail == self._gate.holding):
+            self._heard_ns = max(self._heard_ns or 0, estimate.t_ns)
+        if verdict is Verdict.ACCEPTED:
+            age_ms = estimate.last_anchor_age_ms
+            if age_ms >= 0:
+                self._anchored_ns = max(self._anchored_ns or 0, estimate.t_ns - age_ms * 1_000_000)
+            elif self._anchored_ns is None:
+                self._anchored_ns = estimate.t_ns  # never anchored: the start coordinate is the map fix of this flight
+        return MeasurementVerdict(
+            t_ns=estimate.t_ns, frame_id=estimate.frame_id, measurement="estimate", verdict=verdict, detail=detail
+        )
+
+    def _on_wall_clock(self, clock: WallClock) -> None:
+        if clock.unix_ns is None:
+            return
+        offset_ns = clock.unix_ns - clock.t_ns
+        latched = self._unix_minus_monotonic_ns
+        if latched is None or abs(offset_ns - latched) > CLOCK_STEP_NS:
+            self._unix_minus_monotonic_ns = offset_ns
+
+    def _on_estimator_event(self, event: ProcessEvent) -> list[Message]:
+        if event.event in ("died", "stuck", "gave_up"):
+            self._estimator_gone = f"estimator {event.event.replace('_', ' ')}"
+            return [_text(event.t_ns, CRITICAL, self._estimator_gone)]
+        if event.event in ("started", "restarted"):
+            self._estimator_gone = ""
+        return []
+
+    def _on_health(self, health: Health) -> list[Message]:
+        if health.band is self._band:
+            return []
+        self._band = health.band
+        severity = {ThermalBand.NORMAL: INFO, ThermalBand.HOT: NOTICE, ThermalBand.CRITICAL: WARNING}[health.band]
+        degrees = "" if health.temperature_c is None else f", {health.temperature_c:.0f} C"
+        return [_text(health.t_ns, severity, f"computer is {health.band}{degrees}")]
+
+    def _send(self, now_ns: int) -> Iterator[Message]:
+        yield from self._climb_ladder(now_ns)
+        silent = self._heard_ns is not None and now_ns - self._heard_ns > fix.SILENT_AFTER_NS
+        if silent != self._silent:
+            self._silent = silent
+            if silent:
+                yield _text(now_ns, CRITICAL, f"silent: no estimate for {fix.SILENT_AFTER_NS / 1e9:.0f} s")
+        if silent:
+            self._fix.lower()
+            return
+        gps = self._gps_input(now_ns)
+        yield gps
+        good = gps.fix_type >= fix.FIX_3D
+        if good != self._told_fix and now_ns - self._told_fix_ns >= NOTICE_PERIOD_NS:
+            self._told_fix, self._told_fix_ns = good, now_ns
+            yield _text(now_ns, INFO, "3D fix") if good else _text(now_ns, WARNING, f"no fix: {gps.reason}")
+
+    def _climb_ladder(self, now_ns: int) -> Iterator[StatusText]:
+        step = 0 if self._anchored_ns is None else fix.rung((now_ns - self._anchored_ns) * 1e-9)
+        if step > self._rung:
+            after_s, _, severity = fix.LADDER[step]
+            yield _text(now_ns, severity, f"no map fix for {after_s:.0f} s")
+        elif step < self._rung and step == 0:
+            yield _text(now_ns, INFO, "map fix again")
+        self._rung = step
+
+    def _gps_input(self, now_ns: int) -> GpsInput:
+        estimate = self._gate.accepted
+        if estimate is None:
+            return self._no_fix(now_ns, self._estimator_gone or "no estimate yet", -1.0)
+        carried = carry(estimate, now_ns, self._attitudes)
+        horizontal_m, vertical_m, speed_mps = fix.reported_accuracy(carried, self._rung)
+        if self._gate.holding:
+            reason = self._gate.holding
+            self._fix.lower()
+        else:
+            reason = self._fix.judge(carried, horizontal_m, self._rung, estimate.source_label)
+            if reason and self._estimator_gone:
+                reason = self._estimator_gone
+        if reason:
+            return self._no_fix(now_ns, reason, carried.age_s * 1e3)
+        return self._with_fix(carried, (horizontal_m, vertical_m, speed_mps))
+
+    def _with_fix(self, carried: Carried, accuracy: tuple[float, float, float]) -> GpsInput:
+        week, week_ms = self._week(carried.t_ns)
+        ve, vn, vu = carried.velocity_enu_mps
+        return GpsInput(
+            t_ns=carried.t_ns,
+            fix_type=fix.FIX_3D,
+            time_week=week,
+            time_week_ms=week_ms,
+            lat_deg=carried.lat_deg,
+            lon_deg=carried.lon_deg,
+            alt_amsl_m=carried.alt_amsl_m,
+            hdop=DOP_GOOD,
+            vdop=DOP_GOOD,
+            vn_mps=vn,
+            ve_mps=ve,
+            vd_mps=-vu,
+            speed_accuracy_mps=accuracy[2],
+            horiz_accuracy_m=fix.bounded(accuracy[0]),
+            vert_accuracy_m=fix.bounded(accuracy[1]),
+            satellites_visible=SATELLITES,
+            estimate_age_ms=carried.age_s * 1e3,
+        )
+
+    def _no_fix(self, now_ns: int, reason: str, age_ms: float) -> GpsInput:
+        """Fix type 1 carries no position: what is not known now is not shown, on no screen and in no log.
+
+        The height stays a plausible constant, since an autopilot takes a missing one for 0 m AMSL."""
+        week, week_ms = self._week(now_ns)
+        return GpsInput(
+            t_ns=now_ns,
+            fix_type=fix.NO_FIX,
+            time_week=week,
+            time_week_ms=week_ms,
+            lat_deg=0.0,
+            lon_deg=0.0,
+            alt_amsl_m=self._ground_amsl_m or 0.0,
+            hdop=DOP_UNKNOWN,
+            vdop=DOP_UNKNOWN,
+            vn_mps=0.0,
+            ve_mps=0.0,
+            vd_mps=0.0,
+            speed_accuracy_mps=fix.MAX_ACCURACY_M,
+            horiz_accuracy_m=fix.MAX_ACCURACY_M,
+            vert_accuracy_m=fix.MAX_ACCURACY_M,
+            satellites_visible=0,
+            estimate_age_ms=age_ms,
+            reason=reason,
+        )
+
+    def _week(self, t_ns: int) -> tuple[int, int]:
+        """(0, 0), "use the time of arrival", while no wall clock is plausible: a wrong week would set its clock."""
+        if self._unix_minus_monotonic_ns is None:
+            return 0, 0
+        return gps_time.week_and_ms(t_ns + self._unix_minus_monotonic_ns)
+
+
+def _text(t_ns: int, severity: int, text: str) -> StatusText:
+    return StatusText(t_ns=t_ns, severity=severity, text=f"Terrafix: {text}"[:TEXT_MAX])

@@ -1,0 +1,82 @@
+"""Channels of the flight record: one per message type, JSON with a JSON schema, so that Foxglove opens it."""
+
+from typing import Any
+
+import msgspec
+
+from terrafix import messages as m
+from terrafix.messages import Message
+
+MESSAGE_TYPES: dict[str, type[Message]] = {t.__name__: t for t in m.AnyMessage.__args__}
+THUMBNAIL_TOPIC = "/thumbnail"
+THUMBNAIL_SCHEMA_NAME = "foxglove.CompressedImage"  # a schema name that Foxglove's image panel knows
+
+THUMBNAIL_SCHEMA: dict[str, Any] = {
+    "title": THUMBNAIL_SCHEMA_NAME,
+    "type": "object",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "title": "time",
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        },
+        "frame_id": {"type": "string"},
+        "data": {"type": "string", "contentEncoding": "base64"},
+        "format": {"type": "string"},
+    },
+}
+
+
+class Stamp(msgspec.Struct, frozen=True, kw_only=True):
+    sec: int
+    nsec: int
+
+
+class Thumbnail(msgspec.Struct, frozen=True, kw_only=True):
+    """A small JPEG of a frame, in the shape of foxglove.CompressedImage; ``frame_id`` is our frame id as text."""
+
+    timestamp: Stamp
+    frame_id: str
+    data: bytes  # base64 in JSON
+    format: str = "jpeg"
+
+
+def topic_of(message_type: type[Message]) -> str:
+    """NavEstimate -> /nav_estimate"""
+    name = message_type.__name__
+    return "/" + "".join(("_" if i and c.isupper() else "") + c.lower() for i, c in enumerate(name))
+
+
+TYPE_BY_TOPIC: dict[str, type[Message]] = {topic_of(t): t for t in MESSAGE_TYPES.values()}
+
+
+def schema_of(message_type: type[Message]) -> bytes:
+    """JSON schema in the plain subset that viewers read: no references, unions or arrays of arrays.
+
+    Arrays of arrays (matched points) are in the data but not in the schema, which does not forbid them."""
+    full = msgspec.json.schema(message_type)
+    plain = _plain(full, full["$defs"])
+    if plain is None:
+        raise TypeError(f"{message_type.__name__} has no JSON schema")
+    return msgspec.json.encode(plain)
+
+
+def _plain(node: dict[str, Any], defs: dict[str, Any]) -> dict[str, Any] | None:
+    """One schema node without references and unions; None when a viewer could not show it."""
+    if "$ref" in node:
+        return _plain(defs[node["$ref"].rsplit("/", 1)[-1]], defs)
+    if "anyOf" in node:
+        known = [n for n in node["anyOf"] if n.get("type") != "null"]
+        return _plain(known[0], defs) if len(known) == 1 else None
+    if "enum" in node:
+        return {"type": "string", "description": ", ".join(node["enum"])}
+    kind = node.get("type")
+    if kind == "array":
+        parts = node.get("prefixItems") or ([node["items"]] if isinstance(node.get("items"), dict) else [])
+        item = _plain(parts[0], defs) if parts else {"type": "number"}
+        return None if item is None or item["type"] == "array" else {"type": "array", "items": item}
+    if kind == "object":
+        fields = {name: _plain(child, defs) for name, child in node.get("properties", {}).items()}
+        shown = {name: child for name, child in fields.items() if child is not None}
+        return {"type": "object", "title": node.get("title", ""), "properties": shown}
+    return {"type": kind}

@@ -1,0 +1,138 @@
+"""One MCAP file of the flight record: full header first, then messages, flushed so that a kill costs little."""
+
+import base64
+import platform
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from terrafix.core.config import Config
+from terrafix.core.errors import OutputError
+from terrafix.messages import Message
+from terrafix.recorder.schema import (
+    MESSAGE_TYPES,
+    THUMBNAIL_SCHEMA,
+    THUMBNAIL_SCHEMA_NAME,
+    THUMBNAIL_TOPIC,
+    Stamp,
+    Thumbnail,
+    schema_of,
+    topic_of,
+)
+
+CHUNK_BYTES = 128 * 1024  # what a kill may cost at most between two calls of flush(); also the unit of compression
+JPEG_QUALITY = 70  # a thumbnail is for a person's glance
+GIT_TIMEOUT_S = 2.0
+RECORD_FORMAT = "terrafix-flight/1"
+HEADER_NAME = "terrafix"
+_END_CHUNK = "_Writer__finalize_chunk"  # mcap ends a chunk by size only; by time needs this name (tested)
+_VERSIONED = ("terrafix", "numpy", "gtsam", "opencv-python-headless", "onnxruntime", "pymavlink", "mcap", "msgspec")
+
+_encoder = msgspec.json.Encoder()
+
+
+def versions() -> dict[str, str]:
+    """Versions of this program and of what it computes with; empty text where one is not installed."""
+    found = {"python": sys.version.split()[0], "platform": platform.platform(), "git": git_describe()}
+    for name in _VERSIONED:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = ""
+    return found
+
+
+def git_describe() -> str:
+    """Commit of the source tree that runs, or empty text when it does not run from one."""
+    root = Path(__file__).resolve().parents[3]
+    if not (root / ".git").exists():
+        return ""
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--tags"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=GIT_TIMEOUT_S, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip()
+
+
+def header(config: Config) -> dict[str, str]:
+    """What stands at the start of every file of the record: format, configuration echo, versions."""
+    return {
+        "format": RECORD_FORMAT,
+        "config": _encoder.encode(config).decode(),
+        "versions": _encoder.encode(versions()).decode(),
+    }
+
+
+def thumbnail_jpeg(image: np.ndarray, width_px: int) -> bytes:
+    """(H, W, 3) uint8 BGR -> JPEG of that width (never enlarged)."""
+    factor = min(1.0, width_px / image.shape[1])
+    size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    _, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return bytes(coded)
+
+
+class FlightWriter:
+    """Writes one file. Not thread-safe; raises OutputError when the file cannot be made."""
+
+    def __init__(self, path: Path, head: dict[str, str]) -> None:
+        self.path = path
+        try:
+            # A raw (unbuffered) file would be wrapped in a buffer by mcap that nobody can flush.
+            self._file = path.open("wb")
+        except OSError as error:
+            raise OutputError(
+                f"{path}: cannot be written ({error.strerror}); check the folder given to --out"
+            ) from None
+        self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._mcap.start(profile="", library=f"terrafix {version('terrafix')}")
+        self._mcap.add_metadata(HEADER_NAME, head)
+        self._channels: dict[str, int] = {}
+        self._sequence = 0
+        for message_type in MESSAGE_TYPES.values():
+            self._register(topic_of(message_type), f"terrafix.{message_type.__name__}", schema_of(message_type))
+        self._register(THUMBNAIL_TOPIC, THUMBNAIL_SCHEMA_NAME, _encoder.encode(THUMBNAIL_SCHEMA))
+        self.flush()
+
+    def write(self, message: Message, heard_ns: int) -> None:
+        """log_time is the time of the measurement, publish_time the time at which the recorder heard of it."""
+        self._add(topic_of(type(message)), _encoder.encode(message), message.t_ns, heard_ns)
+
+    def write_thumbnail(self, t_ns: int, frame_id: int, jpeg: bytes) -> None:
+        stamp = Stamp(sec=t_ns // 1_000_000_000, nsec=t_ns % 1_000_000_000)
+        data = _encoder.encode(Thumbnail(timestamp=stamp, frame_id=str(frame_id), data=jpeg))
+        self._add(THUMBNAIL_TOPIC, data, t_ns, t_ns)
+
+    def size_bytes(self) -> int:
+        return self._file.tell()
+
+    def flush(self) -> None:
+        """Everything written so far is with the operating system: kill -9 of this process does not lose it."""
+        getattr(self._mcap, _END_CHUNK)()
+        self._file.flush()
+
+    def close(self) -> None:
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+        self._file.close()
+
+    def _register(self, topic: str, schema_name: str, schema: bytes) -> None:
+        schema_id = self._mcap.register_schema(schema_name, "jsonschema", schema)
+        self._channels[topic] = self._mcap.register_channel(topic, "json", schema_id)
+
+    def _add(self, topic: str, data: bytes, log_ns: int, publish_ns: int) -> None:
+        self._sequence += 1
+        # MCAP times are unsigned; a clock that starts below zero would not be writable.
+        self._mcap.add_message(self._channels[topic], max(0, log_ns), data, max(0, publish_ns), self._sequence)
+
+
+def decode_thumbnail(data: bytes) -> tuple[int, bytes]:
+    """-> (frame id, JPEG)"""
+    raw = msgspec.json.decode(data)
+    return int(raw["frame_id"]), base64.b64decode(raw["data"])

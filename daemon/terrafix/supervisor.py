@@ -1,0 +1,258 @@
+"""The supervisor: starts the processes in table order, watches their progress, restarts them, stops them in reverse.
+
+The only code that talks to systemd. Its own loop does little, so that it can be trusted to go on: what flies is in
+the processes. Only the link is worth taking the unit down; when another process gives up, the rest flies on and
+says so."""
+
+import contextlib
+import os
+import signal
+import socket
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import zmq
+
+from terrafix.child import spec_of
+from terrafix.children import Child, Event, State
+from terrafix.core import config as configuration
+from terrafix.core import logs
+from terrafix.core.bus import Publisher, Subscriber
+from terrafix.core.clock import Ticker, now_ns
+from terrafix.core.config import Config
+from terrafix.core.errors import MapError, OutputError
+from terrafix.core.rundir import OwnedRunDir, RunDir
+from terrafix.core.shell import SUPERVISOR
+from terrafix.messages import Origin, ProcessEvent, SourceEnded
+from terrafix.processes import PROCESSES, Process
+
+VITAL = "link"  # without it nothing leaves for the autopilot: systemd shall start everything anew
+LOOP_MS = 50  # a death is noticed within this time
+SOURCE_WAIT_NS = 20_000_000_000  # the source is opened when all others are ready, or after this long
+QUIET_NS = 1_000_000_000  # the source has ended and everybody was idle for this long: all is said
+DRAIN_LIMIT_NS = 60_000_000_000  # ... or this long has passed since it ended
+FRESH_NS = 500_000_000  # a progress stamp that is older belongs to a process in the middle of its work
+NOTIFY_HZ = 2.0  # WATCHDOG=1; the unit's WatchdogSec is several times longer
+SQLITE_MAGIC = b"SQLite format 3\0"  # a map package is a GeoPackage, and that is SQLite
+
+
+def run(
+    *,
+    source: str,
+    map_path: Path | None,
+    link: str,
+    out_dir: Path,
+    configs: list[Path],
+    start: str = "",
+    stop_after_source: bool = False,
+    on_event: Callable[[ProcessEvent], None] | None = None,
+    on_epoch: Callable[[int], None] | None = None,
+    stop: threading.Event | None = None,
+    log_to: Path | None = None,
+    table: tuple[Process, ...] = PROCESSES,
+) -> int:
+    """Flies until a signal, until ``stop`` is set, or (``stop_after_source``) until the source has ended.
+
+    ``source``, ``map_path`` (a map package), ``link``, ``start`` ("LAT,LON"): win over the configuration when not
+    empty. ``on_event`` gets everything that happens to the processes, ``on_epoch`` once the t_ns of the first Origin: the zero of a recorded
+    source on the monotonic clock. ``log_to``: file for all logs and tracebacks instead of stdout and stderr.
+    Returns 0, or 1 when the link gave up, or the exit code of a process that could not start for a reason that the
+    user can mend (its message is on stderr). Raises ConfigError, MapError, OutputError before anything is started."""
+    config = _with_overrides(configuration.load(configs), source, start, map_path, link)
+    out_dir = _writable(out_dir)
+    package = _map_package(config.map.path)
+    stop = stop or threading.Event()
+    with contextlib.ExitStack() as stack:
+        output = stack.enter_context(log_to.open("a", encoding="utf-8")) if log_to else None
+        stack.enter_context(contextlib.closing(logs.configure(config.log.level, SUPERVISOR, output)))
+        logs.get().info("start", config=msgspec.to_builtins(config), map=str(package), out_dir=str(out_dir))
+        owned = OwnedRunDir()
+        stack.callback(owned.remove)
+        owned.run_dir.spec.write_bytes(msgspec.json.encode(spec_of(table, config, package, out_dir)))
+        stack.enter_context(_signals_set(stop))
+        context = stack.enter_context(zmq.Context())
+        children = [Child(process, owned.run_dir, output) for process in table]
+        publisher = Publisher(context, owned.run_dir.address(SUPERVISOR))
+        stack.callback(publisher.close)
+        subscriber = Subscriber(context, [owned.run_dir.address(p.name) for p in table], (SourceEnded,))
+        stack.callback(subscriber.close)
+        supervisor = Supervisor(children, publisher, subscriber, stop, stop_after_source, on_event)
+        if on_epoch:
+            supervisor.tell_epoch(owned.run_dir, on_epoch)
+        return supervisor.run()
+
+
+class Supervisor:
+    def __init__(
+        self,
+        children: list[Child],
+        publisher: Publisher,
+        subscriber: Subscriber,
+        stop: threading.Event,
+        stop_after_source: bool,
+        on_event: Callable[[ProcessEvent], None] | None,
+    ) -> None:
+        self._children = children
+        self._publisher = publisher
+        self._subscriber = subscriber
+        self._stop = stop
+        self._stop_after_source = stop_after_source
+        self._on_event = on_event
+        self._look_for_epoch: Callable[[], bool] | None = None  # False: found, look no more
+        self._begin_ns = now_ns()
+        self._ended_ns: int | None = None  # the source has ended
+        self._busy_ns = 0  # somebody was last seen at work
+        self._ready_said = False
+        self._notify_ticker = Ticker(NOTIFY_HZ, self._begin_ns)
+
+    def tell_epoch(self, run_dir: RunDir, on_epoch: Callable[[int], None]) -> None:
+        """``on_epoch`` will be called once, from the loop."""
+
+        def look() -> bool:
+            epoch_ns = run_dir.epoch_ns
+            if epoch_ns is not None:
+                on_epoch(epoch_ns)
+            return epoch_ns is None
+
+        self._look_for_epoch = look
+
+    def run(self) -> int:
+        """The loop, and the ordered stop after it."""
+        try:
+            while (code := self._watch(now_ns())) is None:
+                self._subscriber.socket.poll(LOOP_MS)
+            return code
+        finally:
+            sd_notify("STOPPING=1")
+            for child in reversed(self._children):
+                event = child.stop()
+                if event:
+                    self._say(child, event)
+                child.progress.close()
+
+    def _watch(self, now: int) -> int | None:
+        """One look at everything; an exit code ends the run."""
+        for child in self._children:
+            if self._may_start(child, now):
+                for event in child.check(now):
+                    self._say(child, event)
+            if child.user_mistake is not None:
+                return child.user_mistake
+            if child.process.name == VITAL and child.state in (State.GAVE_UP, State.FINISHED):
+                return 1
+        if self._look_for_epoch and not self._look_for_epoch():
+            self._look_for_epoch = None
+        self._publisher.serve()
+        for _ in self._subscriber.receive():  # SourceEnded is all that the supervisor hears
+            self._ended_ns = self._ended_ns or now
+        self._notify(now)
+        if self._stop.is_set() or (self._stop_after_source and self._is_drained(now)):
+            return 0
+        return None
+
+    def _may_start(self, child: Child, now: int) -> bool:
+        """Whoever opens the source starts last: what it says first, all must hear."""
+        if Origin not in child.process.says or child.state is not State.WAITING:
+            return True
+        others_ready = all(c.settled for c in self._children if c is not child)
+        return others_ready or now - self._begin_ns > SOURCE_WAIT_NS
+
+    def _is_drained(self, now: int) -> bool:
+        """Everything that the source gave has been worked on. Processes that tick are never done: they do not count."""
+        if self._ended_ns is None:
+            return False
+        workers = [c for c in self._children if c.process.tick_hz == 0 and c.state is State.RUNNING]
+        if not all(c.progress.idle and now - c.progress.stamp_ns < FRESH_NS for c in workers):
+            self._busy_ns = now
+        return now - max(self._busy_ns, self._ended_ns) > QUIET_NS or now - self._ended_ns > DRAIN_LIMIT_NS
+
+    def _say(self, child: Child, event: Event) -> None:
+        log = logs.get().info if event.name in ("started", "stopped") else logs.get().warning
+        if event.name == "gave_up":
+            log = logs.get().error
+        log("process " + event.name, child=child.process.name, detail=event.detail)
+        message = ProcessEvent(t_ns=now_ns(), process=child.process.name, event=event.name, detail=event.detail)
+        self._publisher.say(message)
+        if self._on_event:
+            self._on_event(message)
+
+    def _notify(self, now: int) -> None:
+        if not self._notify_ticker.due(now):
+            return
+        if not self._ready_said and all(c.settled for c in self._children):
+            self._ready_said = True
+            sd_notify("READY=1")
+        if self._ready_said and self._makes_progress(now):
+            down = [c.process.name for c in self._children if c.state is not State.RUNNING]
+            sd_notify("WATCHDOG=1\nSTATUS=" + (f"flying without {', '.join(down)}" if down else "flying"))
+
+    def _makes_progress(self, now: int) -> bool:
+        """The link does (every process does, in a table without a link)."""
+        vital = [c for c in self._children if c.process.name == VITAL] or self._children
+        return all(now - c.progress.stamp_ns < c.process.stuck_after_s * 1e9 for c in vital)
+
+
+def sd_notify(state: str) -> None:
+    """sd_notify(3) by hand: a datagram, and nothing without systemd."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if not address:
+        return
+    if address.startswith("@"):
+        address = "\0" + address[1:]  # abstract namespace
+    kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
+    # A systemd that does not listen must not end a flight; its watchdog is the check on that.
+    with socket.socket(socket.AF_UNIX, kind) as sock, contextlib.suppress(OSError):
+        sock.sendto(state.encode(), address)
+
+
+@contextlib.contextmanager
+def _signals_set(stop: threading.Event) -> Iterator[None]:
+    """SIGTERM and SIGINT ask for the ordered stop. (Only the main thread may have signal handlers.)"""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _with_overrides(config: Config, source: str, start: str, map_path: Path | None, link: str) -> Config:
+    replace = msgspec.structs.replace
+    if source:
+        config = replace(config, source=replace(config.source, path=source))
+    if start:
+        config = replace(config, source=replace(config.source, start=start))
+    if map_path:
+        config = replace(config, map=replace(config.map, path=str(map_path)))
+    if link:
+        config = replace(config, link=replace(config.link, device=link))
+    return config
+
+
+def _writable(out_dir: Path) -> Path:
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out_dir):
+            pass
+    except OSError as error:
+        raise OutputError(f"{out_dir}: cannot be written ({error.strerror}); give another folder with --out") from None
+    return out_dir.resolve()
+
+
+def _map_package(path: str) -> Path | None:
+    if not path:
+        return None
+    try:
+        with Path(path).open("rb") as file:
+            start = file.read(len(SQLITE_MAGIC))
+    except OSError as error:
+        raise MapError(f"{path}: map cannot be read ({error.strerror}); check --map or [map] path") from None
+    if start != SQLITE_MAGIC:
+        raise MapError(f"{path}: not a map package; make one with 'terrafix map build {path} --out MAP.gpkg'")
+    return Path(path).resolve()

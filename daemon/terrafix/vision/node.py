@@ -1,0 +1,54 @@
+"""Vision: every frame becomes an Odometry, or the reason why there is none."""
+
+from collections.abc import Iterable
+
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.node import Edge, FrameStore, NodeContext
+from terrafix.messages import Frame, Message, Odometry, Origin, Verdict
+from terrafix.vision.edge import make_edge as make_source_edge
+from terrafix.vision.odometry import FrameTracker
+
+
+class VisionNode:
+    def __init__(self, frames: FrameStore) -> None:
+        self._frames = frames
+        self._tracker: FrameTracker | None = None
+
+    def on(self, message: Message) -> Iterable[Message]:
+        match message:
+            case Origin():
+                self._tracker = FrameTracker(CameraCalibration.of(message.camera))
+            case Frame():
+                yield self._odometry(message)
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        return ()
+
+    def _odometry(self, frame: Frame) -> Odometry:
+        image = None if frame.error else self._frames.get(frame.frame_id)
+        if image is None or self._tracker is None:
+            return Odometry(
+                t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.BAD_IMAGE
+            )
+        motion = self._tracker.track(frame.frame_id, image)
+        return Odometry(
+            t_ns=frame.t_ns,
+            frame_id=frame.frame_id,
+            keyframe_id=motion.keyframe_id,
+            verdict=motion.verdict,
+            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in motion.pairs],
+            sigma_norm=motion.sigma_norm,
+            inliers=motion.inliers,
+            tracked=motion.tracked,
+            becomes_keyframe=motion.becomes_keyframe,
+        )
+
+
+def make_node(ctx: NodeContext) -> VisionNode:
+    return VisionNode(ctx.frames)
+
+
+def make_edge(ctx: NodeContext) -> Edge:
+    return make_source_edge(ctx)

@@ -1,0 +1,204 @@
+"""Frame-to-keyframe motion: KLT while the overlap is large, SIFT when it is not, one RANSAC homography either way.
+
+The ground is close to a plane seen from flying height, so a homography holds the matches together; what stands
+above it is left out by the RANSAC threshold or enters as noise, which the covariance states."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.node import Image
+from terrafix.messages import Verdict
+
+WORK_WIDTH_PX = 720  # wide enough for 0.2 m detail at 100 m, small enough for 10 frames a second on two cores
+MAX_CORNERS = 400
+MIN_CORNER_DISTANCE_PX = 12
+MIN_CORNERS = 40
+KLT_WINDOW_PX = 21
+KLT_LEVELS = 4
+FORWARD_BACKWARD_PX = 1.0  # a track that does not come back to where it began is wrong (Kalal 2010)
+RANSAC_PX = 2.5  # 0.4 m at 100 m: what stands above the ground is left out
+MIN_INLIERS = 20
+MIN_INLIER_SHARE = 0.35
+MIN_SPREAD = 0.12  # inliers must span this share of the image's width and height, else the pose is not determined
+MIN_INLIERS_FEATURES = 15  # chance gives 4 to 8 of 100 wrong matches
+MIN_INLIER_SHARE_FEATURES = 0.15
+KEYFRAME_SHIFT = 0.22  # of the image width: the next keyframe is due while three quarters are still shared
+KEYFRAME_TRACKED = 0.45  # share of the keyframe's corners still tracked
+KEYFRAME_MAX_AGE = 10  # frames; half the estimator's window, so that the keyframe is still in it
+MAX_MISSES = 5  # frames that may fail against one keyframe before a new fragment starts (PB-5)
+MAX_PAIRS = 80
+SIFT_FEATURES = 1500
+SIFT_RATIO = 0.8  # Lowe 2004
+
+
+@dataclass
+class _Keyframe:
+    frame_id: int
+    gray: np.ndarray
+    corners: np.ndarray  # (N, 2) px
+    sift: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 2) px, descriptors; made when first needed
+    age: int = 0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Matches of a frame with its keyframe; ``pairs`` (N, 4) normalised (x_kf, y_kf, x, y)."""
+
+    keyframe_id: int
+    verdict: Verdict
+    pairs: np.ndarray
+    sigma_norm: float
+    inliers: int
+    tracked: int
+    becomes_keyframe: bool
+
+
+class FrameTracker:
+    """Feed frames in order; keeps one keyframe and the last tracked frame."""
+
+    def __init__(self, camera: CameraCalibration) -> None:
+        self._scale = min(1.0, WORK_WIDTH_PX / camera.width)
+        self._camera = camera.scaled(self._scale)
+        self._keyframe: _Keyframe | None = None
+        self._last_gray: np.ndarray | None = None  # newest frame that was tracked
+        self._last_points = np.zeros((0, 2), np.float32)  # where the keyframe's corners are in it
+        self._last_index = np.zeros(0, int)  # which corners these are
+        self._misses = 0
+        self._missed: _Keyframe | None = None  # the frame that failed last: the first of a new fragment, perhaps
+        self._sift = cv2.SIFT_create(nfeatures=SIFT_FEATURES)
+
+    def track(self, frame_id: int, image: Image) -> Motion:
+        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if self._scale < 1.0:
+            gray = cv2.resize(gray, (self._camera.width, self._camera.height), interpolation=cv2.INTER_AREA)
+        keyframe = self._keyframe
+        if keyframe is None:
+            return self._new_fragment(frame_id, gray)
+        keyframe.age += 1
+        points_kf, points, tracked = self._follow(keyframe, gray)
+        inlier = _homography_inliers(points_kf, points)
+        if self._good(points_kf, points, inlier, MIN_INLIERS, MIN_INLIER_SHARE):
+            return self._accept(keyframe, frame_id, gray, points_kf[inlier], points[inlier], tracked)
+        # Against the keyframe by features, and if that fails against the frame that failed before this one: two that
+        # agree with each other are a new fragment, one that agrees with nobody is a foreign frame.
+        here = _Keyframe(frame_id, gray, _NO_POINTS, self._describe(gray))
+        for candidate in (keyframe, self._missed):
+            if candidate is None:
+                continue
+            points_kf, points = self._match_features(candidate, here)
+            inlier = _homography_inliers(points_kf, points)
+            if self._good(points_kf, points, inlier, MIN_INLIERS_FEATURES, MIN_INLIER_SHARE_FEATURES):
+                self._last_gray = None  # the KLT chain is broken; it starts again from this frame
+                return self._accept(candidate, frame_id, gray, points_kf[inlier], points[inlier], len(points))
+        return self._miss(keyframe, here, tracked)
+
+    def _follow(self, keyframe: _Keyframe, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+        """KLT from the last tracked frame. -> points in the keyframe, points here, tracked."""
+        if self._last_gray is None or len(self._last_points) < MIN_INLIERS:
+            return _NO_POINTS, _NO_POINTS, 0
+        window = (KLT_WINDOW_PX, KLT_WINDOW_PX)
+        start = self._last_points.reshape(-1, 1, 2)
+        ahead, ok, _ = cv2.calcOpticalFlowPyrLK(
+            self._last_gray, gray, start, np.zeros_like(start), winSize=window, maxLevel=KLT_LEVELS
+        )
+        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
+            gray, self._last_gray, ahead, start.copy(), winSize=window, maxLevel=KLT_LEVELS
+        )
+        closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < FORWARD_BACKWARD_PX
+        keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed
+        here = ahead.reshape(-1, 2)[keep]
+        index = self._last_index[keep]
+        if len(here) >= MIN_INLIERS:
+            inlier = _homography_inliers(keyframe.corners[index], here)
+            if inlier.sum() >= MIN_INLIERS:
+                self._last_points, self._last_index, self._last_gray = here[inlier], index[inlier], gray
+        return keyframe.corners[index], here, int(keep.sum())
+
+    def _match_features(self, keyframe: _Keyframe, here: _Keyframe) -> tuple[np.ndarray, np.ndarray]:
+        """SIFT: large steps and turns between frames. -> points in the keyframe, points here."""
+        if keyframe.sift is None:
+            keyframe.sift = self._describe(keyframe.gray)
+        (points_kf, descriptors_kf), (points, descriptors) = keyframe.sift, here.sift or self._describe(here.gray)
+        if len(points_kf) < 2 or len(points) < 2:
+            return _NO_POINTS, _NO_POINTS
+        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors_kf, descriptors, k=2)
+        good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < SIFT_RATIO * p[1].distance]
+        if not good:
+            return _NO_POINTS, _NO_POINTS
+        return points_kf[[m.queryIdx for m in good]], points[[m.trainIdx for m in good]]
+
+    def _describe(self, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        keypoints, descriptors = self._sift.detectAndCompute(gray, None)
+        if descriptors is None:
+            return _NO_POINTS, np.zeros((0, 128), np.float32)
+        return np.array([k.pt for k in keypoints], np.float32), descriptors
+
+    def _good(self, a: np.ndarray, b: np.ndarray, inlier: np.ndarray, at_least: int, share: float) -> bool:
+        if inlier.sum() < at_least or inlier.mean() < share:
+            return False
+        size = (self._camera.width, self._camera.height)
+        return all(bool(np.all(np.ptp(p[inlier], axis=0) > np.multiply(size, MIN_SPREAD))) for p in (a, b))
+
+    def _accept(
+        self, keyframe: _Keyframe, frame_id: int, gray: np.ndarray, a: np.ndarray, b: np.ndarray, tracked: int
+    ) -> Motion:
+        self._misses, self._missed = 0, None
+        shift = float(np.median(np.linalg.norm(a - b, axis=1))) / self._camera.width
+        due = (
+            shift > KEYFRAME_SHIFT
+            or len(a) < KEYFRAME_TRACKED * max(len(keyframe.corners), 1)
+            or keyframe.age >= KEYFRAME_MAX_AGE
+            or self._last_gray is not gray
+        )
+        if due:
+            self._start_keyframe(frame_id, gray)
+        pick = _spread(a, MAX_PAIRS)
+        pairs = np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])])
+        sigma = 0.7 * RANSAC_PX / self._camera.fx  # relief and tracking together; the estimator looks at the residuals
+        return Motion(keyframe.frame_id, Verdict.ACCEPTED, pairs, sigma, len(a), tracked, due)
+
+    def _miss(self, keyframe: _Keyframe, here: _Keyframe, tracked: int) -> Motion:
+        self._misses += 1
+        if self._misses >= MAX_MISSES or keyframe.age >= KEYFRAME_MAX_AGE:
+            return self._new_fragment(here.frame_id, here.gray)
+        self._missed = here
+        return Motion(keyframe.frame_id, Verdict.FEW_INLIERS, np.zeros((0, 4)), 0.0, 0, tracked, False)
+
+    def _new_fragment(self, frame_id: int, gray: np.ndarray) -> Motion:
+        """The frame stands alone: no motion is known, later frames refer to it."""
+        self._start_keyframe(frame_id, gray)
+        self._misses, self._missed = 0, None
+        return Motion(frame_id, Verdict.ACCEPTED, np.zeros((0, 4)), 0.0, 0, 0, True)
+
+    def _start_keyframe(self, frame_id: int, gray: np.ndarray) -> None:
+        corners = cv2.goodFeaturesToTrack(gray, MAX_CORNERS, 0.005, MIN_CORNER_DISTANCE_PX)
+        found = corners.reshape(-1, 2).astype(np.float32) if corners is not None else _NO_POINTS
+        self._keyframe = _Keyframe(frame_id, gray, found)
+        self._last_gray, self._last_points, self._last_index = gray, found, np.arange(len(found))
+
+
+_NO_POINTS = np.zeros((0, 2), np.float32)
+
+
+def _homography_inliers(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Which of the matches (N, 2), (N, 2) one homography explains: (N,) bool."""
+    if len(a) < 8:
+        return np.zeros(len(a), bool)
+    _, mask = cv2.findHomography(a, b, cv2.RANSAC, RANSAC_PX, maxIters=1500, confidence=0.999)
+    return np.zeros(len(a), bool) if mask is None else mask.ravel().astype(bool)
+
+
+def _spread(points: np.ndarray, limit: int) -> np.ndarray:
+    """Indices of at most ``limit`` points, round-robin over an 8 x 6 grid, so that no corner of the image wins."""
+    if len(points) <= limit:
+        return np.arange(len(points))
+    low, span = points.min(0), np.maximum(np.ptp(points, axis=0), 1.0)
+    cell = np.minimum((points - low) / span * (8, 6), (7, 5)).astype(int)
+    key = cell[:, 1] * 8 + cell[:, 0]
+    order = np.argsort(key, kind="stable")
+    first = np.r_[True, np.diff(key[order]) > 0]
+    rank = np.arange(len(order)) - np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))
+    return np.sort(order[np.argsort(rank, kind="stable")[:limit]])

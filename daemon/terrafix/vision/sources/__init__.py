@@ -1,0 +1,97 @@
+"""Sources of a flight: one small contract (``Source``), five kinds behind it, one door (``open_source``)."""
+
+import os
+from pathlib import Path
+
+from terrafix.core.config import Source as SourceSection
+from terrafix.core.errors import SourceError, UsageError
+from terrafix.vision.sources.contract import Shot, Source
+from terrafix.vision.sources.images import IMAGE_SUFFIXES
+
+__all__ = ["VIDEO_SUFFIXES", "Shot", "Source", "open_configured", "open_source", "parse_start"]
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".ts", ".webm", ".mpg", ".mpeg"})
+
+
+def open_source(
+    spec: str,
+    *,
+    start: tuple[float, float] | None = None,
+    camera: Path | None = None,
+    rate_hz: float = 2.0,
+    wait_for_camera: bool = False,
+) -> Source:
+    """Opens a flight folder, a folder of photos, a video file, a V4L2 device or a GStreamer pipeline.
+
+    ``start`` (lat_deg, lon_deg) wins over what the source says. ``camera``: a camera description; live cameras
+    need it, for photos and videos it wins over theirs. ``rate_hz``: frames per second taken from a video or camera.
+    ``wait_for_camera``: a camera that is not there is waited for in ``shots`` (a restart in flight), not an error.
+    Raises SourceError, one line that says what to do."""
+    if not spec.strip():
+        raise SourceError("no source given; name a flight folder, photos, a video, /dev/videoN or a GStreamer pipeline")
+    on_disk = os.path.exists(os.path.expanduser(spec)) and not spec.startswith("/dev/")
+    if not on_disk and (spec.isdecimal() or spec.startswith("/dev/") or "!" in spec):
+        from terrafix.vision.sources.camera import LiveCamera
+
+        return LiveCamera(spec, start, camera, rate_hz, wait=wait_for_camera)
+    if not on_disk:
+        raise SourceError(f"{spec}: no such flight folder, photo folder, video or camera; check the path")
+    path = Path(spec).expanduser()
+    if path.name == "flight.toml" and path.is_file():
+        path = path.parent
+    if path.is_dir():
+        return _open_folder(path, start, camera)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        from terrafix.vision.sources.video import Video
+
+        return Video(path, start, camera, rate_hz)
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise SourceError(f"{spec}: a single image is not a flight; name the folder that it lies in")
+    raise SourceError(f"{spec}: not a kind of source that is known; videos end in {', '.join(sorted(VIDEO_SUFFIXES))}")
+
+
+def open_configured(
+    wanted: SourceSection,
+    spec: str = "",
+    start: tuple[float, float] | None = None,
+    *,
+    wait_for_camera: bool = False,
+) -> Source:
+    """open_source with the [source] section of the configuration; ``spec`` and ``start`` win when they are given."""
+    return open_source(
+        spec or wanted.path,
+        start=start or parse_start(wanted.start),
+        camera=Path(wanted.camera).expanduser() if wanted.camera else None,
+        rate_hz=wanted.rate_hz,
+        wait_for_camera=wait_for_camera,
+    )
+
+
+def parse_start(text: str) -> tuple[float, float] | None:
+    """'LAT,LON' in degrees -> (lat_deg, lon_deg); '' -> None. Raises UsageError."""
+    if not text.strip():
+        return None
+    try:
+        lat_deg, lon_deg = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"start '{text}': write LAT,LON in degrees, for example 48.8584,2.2945") from None
+    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+        raise UsageError(f"start '{text}': latitude is within +-90 and longitude within +-180 degrees, in this order")
+    return lat_deg, lon_deg
+
+
+def _open_folder(folder: Path, start: tuple[float, float] | None, camera: Path | None) -> Source:
+    try:
+        names = set(os.listdir(folder))
+    except OSError as error:
+        raise SourceError(f"{folder}: cannot be read ({error.strerror})") from None
+    photos = any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names)
+    if "frames.csv" in names or "frames" in names or ("flight.toml" in names and not photos):
+        from terrafix.vision.sources.flight_folder import FlightFolder
+
+        return FlightFolder(folder, start)
+    if photos:
+        from terrafix.vision.sources.photos import Photos
+
+        return Photos(folder, start, camera)
+    raise SourceError(f"{folder}: neither a flight folder (flight.toml, frames.csv, frames/) nor a folder of photos")

@@ -1,0 +1,165 @@
+"""A live camera: a V4L2 device or a GStreamer pipeline. Unplugged, it is waited for; it never ends by itself."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+
+from terrafix.core.clock import now_ns
+from terrafix.core.errors import SourceError
+from terrafix.messages import Camera, Frame, Origin
+from terrafix.vision.sources.contract import Shot
+from terrafix.vision.sources.description import camera_of, origin_of, read_description
+
+RECONNECT_S = 1.0  # a USB camera needs about this long to come back
+READ_TIMEOUT_MS = 2000  # OpenCV's own 10 s would hold up the end of the process
+MAX_DRIVER_AGE_NS = 1_000_000_000  # an older stamp of the driver is of another clock
+
+
+class Capture(Protocol):
+    """What is used of cv2.VideoCapture."""
+
+    def grab(self) -> bool: ...
+
+    def retrieve(self) -> tuple[bool, Any]: ...
+
+    def get(self, prop: int) -> float: ...
+
+    def release(self) -> None: ...
+
+
+class LiveCamera:
+    """Frames with ``t_ns`` on the monotonic clock: the driver's stamp where it has one, else the time of arrival."""
+
+    live = True
+
+    def __init__(
+        self,
+        spec: str,
+        start: tuple[float, float] | None = None,
+        camera: Path | None = None,
+        rate_hz: float = 2.0,
+        *,
+        wait: bool = False,
+        open_capture: Callable[[str, Camera], Capture | None] | None = None,
+        reconnect_s: float = RECONNECT_S,
+    ) -> None:
+        """``wait``: no error when the device is not there now. ``open_capture(spec, camera)`` -> None: it is not."""
+        if camera is None:
+            raise SourceError(
+                f"{spec}: a camera does not say its own focal length; set [source] camera in the configuration to a "
+                "camera description (config/cameras has an example)"
+            )
+        self.spec = f"/dev/video{spec}" if spec.isdecimal() else spec
+        self._description = read_description(camera)
+        self._origin = origin_of(camera, self._description, camera_of(camera, self._description), start)
+        self._period_ns = round(1e9 / rate_hz)
+        self._open = open_capture or _open_capture
+        self._reconnect_s = reconnect_s
+        self._closed = threading.Event()
+        self._streaming = False
+        self._capture = self._open(self.spec, self._origin.camera)
+        if self._capture is not None:
+            self._check_size(self._capture)
+        elif not wait:
+            raise SourceError(f"{self.spec}: the camera cannot be opened; is it plugged in, and free?")
+
+    def origin(self) -> Origin:
+        return self._origin
+
+    def length(self) -> int | None:
+        return None
+
+    def name(self) -> str:
+        return self._description.name or self.spec
+
+    def map_hint(self) -> Path | None:
+        return None
+
+    def close(self) -> None:
+        """Ends ``shots``, from any thread; the thread that runs it gives the device back."""
+        self._closed.set()
+        if not self._streaming:
+            self._disconnect()
+
+    def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
+        """A camera has no past: ``from_s`` does not matter."""
+        frame_id, due_ns = 0, 0
+        self._streaming = True
+        try:
+            while not self._closed.is_set():
+                capture = self._connected()
+                if capture is None:
+                    continue
+                if not capture.grab():
+                    self._disconnect()
+                    continue
+                t_ns = _stamp(capture, now_ns())
+                if t_ns < due_ns:
+                    continue
+                due_ns = max(due_ns + self._period_ns, t_ns + self._period_ns // 2)  # keeps the mean, no bursts
+                yield self._shot(capture, frame_id, t_ns)
+                frame_id += 1
+        finally:
+            self._streaming = False
+            self._disconnect()
+
+    def _shot(self, capture: Capture, frame_id: int, t_ns: int) -> Shot:
+        camera = self._origin.camera
+        whole, image = capture.retrieve()
+        error = "" if whole else "cannot be decoded"
+        if whole and image.shape != (camera.height, camera.width, 3):
+            error = f"wrong size: {image.shape[1]}x{image.shape[0]}, the camera says {camera.width}x{camera.height}"
+        frame = Frame(t_ns=t_ns, frame_id=frame_id, file="", width=camera.width, height=camera.height, error=error)
+        return Shot(frame, (), None if error else image)
+
+    def _connected(self) -> Capture | None:
+        """The capture, opened again when it was lost; None after a wait in vain."""
+        if self._capture is None and not self._closed.wait(self._reconnect_s):
+            self._capture = self._open(self.spec, self._origin.camera)
+        return self._capture
+
+    def _disconnect(self) -> None:
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+    def _check_size(self, capture: Capture) -> None:
+        camera = self._origin.camera
+        size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if size != (camera.width, camera.height):
+            self._disconnect()
+            raise SourceError(
+                f"{self.spec}: the camera gives {size[0]}x{size[1]}, its description says "
+                f"{camera.width}x{camera.height}; choose a mode that it has"
+            )
+
+
+def _stamp(capture: Capture, arrival_ns: int) -> int:
+    """V4L2 stamps a buffer on the monotonic clock (V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC); OpenCV shows it as POS_MSEC."""
+    driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+    return driver_ns if 0 <= arrival_ns - driver_ns <= MAX_DRIVER_AGE_NS else arrival_ns
+
+
+def _open_capture(spec: str, camera: Camera) -> Capture | None:
+    if "!" in spec:
+        if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
+            raise SourceError(
+                f"'{spec}': this OpenCV was built without GStreamer; use a /dev/video device, or install an OpenCV "
+                "with GStreamer (JetPack brings one)"
+            )
+        capture = cv2.VideoCapture(spec, cv2.CAP_GSTREAMER)
+    else:
+        if not Path(spec).exists():
+            return None
+        capture = cv2.VideoCapture(spec, cv2.CAP_V4L2)
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not the oldest one
+    capture.set(cv2.CAP_PROP_READ_TIMEOUT_MSEC, READ_TIMEOUT_MS)
+    if not capture.isOpened():
+        capture.release()
+        return None
+    return capture

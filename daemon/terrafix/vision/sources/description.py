@@ -1,0 +1,192 @@
+"""flight.toml and camera descriptions: who took the pictures, from where, and how good the telemetry is.
+
+One format for three places: ``flight.toml`` in a flight folder, the sidecar of a video, and a camera
+description in ``config/cameras`` (no [start]). Strict: a key that is not here is an error with the nearest name."""
+
+import difflib
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from terrafix.core.errors import SourceError
+from terrafix.messages import Camera, Origin
+
+START_SIGMA_M = 10.0  # a coordinate read off a map or a phone before take-off
+YAW_SIGMA_DEG = 5.0  # compass of a small multirotor near its motors
+AGL_SIGMA_M = 5.0  # barometer drift over a flight, and ground that is not as flat as at take-off
+ATTITUDE_SIGMA_DEG = 2.0  # EKF attitude under acceleration
+DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)  # what OpenCV's projectPoints takes
+
+Positive = Annotated[float, Meta(gt=0)]
+Degrees = Annotated[float, Meta(ge=-360, le=360)]
+
+
+class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    pass
+
+
+class CameraTable(_Table, frozen=True, kw_only=True):
+    """Pinhole camera in pixels of the stored frames."""
+
+    width: Annotated[int, Meta(ge=16, le=65_535)]
+    height: Annotated[int, Meta(ge=16, le=65_535)]
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    model: Literal["pinhole"] = "pinhole"
+    distortion: tuple[float, ...] = ()
+
+
+class MountTable(_Table, frozen=True, kw_only=True):
+    yaw_deg: Degrees = 0.0
+    pitch_deg: Degrees = -90.0
+    roll_deg: Degrees = 0.0
+    tolerance_deg: Annotated[float, Meta(gt=0, le=90)] = 5.0
+
+
+class StartTable(_Table, frozen=True, kw_only=True):
+    lat_deg: Annotated[float, Meta(ge=-90, le=90)]
+    lon_deg: Annotated[float, Meta(ge=-180, le=180)]
+    ground_amsl_m: Annotated[float, Meta(ge=-500, le=9000)] | None = None
+    alt_amsl_m: Annotated[float, Meta(ge=-500, le=9000)] | None = None  # another name for ground_amsl_m
+    sigma_m: Annotated[float, Meta(gt=0, le=100_000)] = START_SIGMA_M
+
+
+class TelemetryTable(_Table, frozen=True, kw_only=True):
+    yaw_sigma_deg: Positive = YAW_SIGMA_DEG
+    agl_sigma_m: Positive = AGL_SIGMA_M
+    attitude_sigma_deg: Positive = ATTITUDE_SIGMA_DEG
+    tlog_t0_us: int | None = None  # UNIX microseconds of t_s = 0; absent: the first record of the log
+
+
+class Description(_Table, frozen=True, kw_only=True):
+    """A whole file. ``truth`` is for the evaluation and is not looked into."""
+
+    version: Literal[1] = 1
+    name: str = ""
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    license: str = ""
+    map: str = ""
+    camera: CameraTable | None = None
+    mount: MountTable = MountTable()
+    start: StartTable | None = None
+    telemetry: TelemetryTable = TelemetryTable()
+    truth: dict[str, Any] = {}
+
+
+def read_description(path: Path) -> Description:
+    """Raises SourceError: missing or broken file, unknown key, value out of bounds."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise SourceError(f"{path}: no such file; docs/flight-folder.md shows what belongs in it") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SourceError(f"{path}: not valid TOML ({error})") from None
+    try:
+        read = msgspec.convert(table, Description)
+    except msgspec.ValidationError as error:
+        raise SourceError(f"{path}: {_explain(str(error))}") from None
+    _check_numbers(path, table)
+    camera = read.camera
+    if camera and len(camera.distortion) not in DISTORTION_LENGTHS:
+        raise SourceError(
+            f"{path}: [camera] distortion has {len(camera.distortion)} numbers; OpenCV takes 0, 4, 5, 8, 12 or 14"
+        )
+    if camera and not (0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height):
+        raise SourceError(
+            f"{path}: [camera] cx, cy ({camera.cx:g}, {camera.cy:g}) lies outside the {camera.width}x{camera.height} "
+            "image; all of [camera] is in pixels of the stored frames"
+        )
+    if read.start and read.start.ground_amsl_m is not None and read.start.alt_amsl_m is not None:
+        raise SourceError(f"{path}: [start] has both ground_amsl_m and alt_amsl_m; they mean the same, keep one")
+    return read
+
+
+def camera_of(path: Path, read: Description) -> Camera:
+    """Camera and mount of the description in ``path``. SourceError when there is no [camera]."""
+    if read.camera is None:
+        raise SourceError(f"{path}: there is no [camera]; add one with width, height, fx, fy, cx, cy in pixels")
+    c, m = read.camera, read.mount
+    return Camera(
+        width=c.width,
+        height=c.height,
+        fx=c.fx,
+        fy=c.fy,
+        cx=c.cx,
+        cy=c.cy,
+        distortion=c.distortion,
+        mount_yaw_deg=m.yaw_deg,
+        mount_pitch_deg=m.pitch_deg,
+        mount_roll_deg=m.roll_deg,
+        mount_tolerance_deg=m.tolerance_deg,
+    )
+
+
+def origin_of(path: Path | str, read: Description, camera: Camera, start: tuple[float, float] | None) -> Origin:
+    """The flight's Origin at t 0. ``start`` (lat_deg, lon_deg) wins over [start]; SourceError when there is neither."""
+    if read.start is None and start is None:
+        raise SourceError(
+            f"{path}: there is no start coordinate; add [start] with lat_deg and lon_deg, or pass --start LAT,LON"
+        )
+    lat_deg, lon_deg = start if start else (read.start.lat_deg, read.start.lon_deg) if read.start else (0.0, 0.0)
+    ground_m = None
+    if read.start:
+        ground_m = read.start.ground_amsl_m if read.start.ground_amsl_m is not None else read.start.alt_amsl_m
+    return Origin(
+        t_ns=0,
+        camera=camera,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        ground_amsl_m=ground_m,
+        start_sigma_m=read.start.sigma_m if read.start else START_SIGMA_M,
+        yaw_sigma_deg=read.telemetry.yaw_sigma_deg,
+        agl_sigma_m=read.telemetry.agl_sigma_m,
+        attitude_sigma_deg=read.telemetry.attitude_sigma_deg,
+    )
+
+
+def _check_numbers(path: Path, table: dict[str, Any], where: str = "") -> None:
+    """TOML knows nan and inf; no key here can mean anything with them."""
+    for key, value in table.items():
+        if where == "" and key == "truth":
+            continue
+        if isinstance(value, dict):
+            _check_numbers(path, value, key)
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, float) and not math.isfinite(number):
+                raise SourceError(f"{path}: [{where}] {key} is {number}; write a number, or leave the key out")
+
+
+def _explain(text: str) -> str:
+    """msgspec's message in the words of the file, with the nearest known key."""
+    missing = re.search(r"missing required field `(.+?)`(?: - at `\$\.?(.*?)`)?", text)
+    if missing:
+        return f"[{missing.group(2)}] has no '{missing.group(1)}'; add it"
+    unknown = re.search(r"unknown field `(.+?)`(?: - at `\$\.?(.*?)`)?", text)
+    if unknown:
+        key, where = unknown.group(1), unknown.group(2) or ""
+        tables: dict[str, type[_Table]] = {
+            "camera": CameraTable,
+            "mount": MountTable,
+            "start": StartTable,
+            "telemetry": TelemetryTable,
+        }
+        known = [field.name for field in msgspec.structs.fields(tables.get(where, Description))]
+        near = difflib.get_close_matches(key, known, 1, cutoff=0.5)
+        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+        return f"unknown key '{key}' {f'in [{where}]' if where else 'at the top'}; {hint}"
+    at = re.search(r"(.*) - at `\$\.?(\w*)\.?(.*)`", text)
+    if not at:
+        return text
+    place = f"[{at.group(2)}] {at.group(3)}" if at.group(3) else f"'{at.group(2)}'"
+    return f"{place}: {at.group(1)[0].lower()}{at.group(1)[1:]}"

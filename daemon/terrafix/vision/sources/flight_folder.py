@@ -1,0 +1,107 @@
+"""A flight folder: flight.toml, frames.csv, frames/ and optionally telemetry.tlog (docs/flight-folder.md).
+
+truth.csv may lie there too; nothing here opens it."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from terrafix.core.errors import SourceError
+from terrafix.core.tlog import read_tlog
+from terrafix.messages import Frame, Origin, VehicleState
+from terrafix.vision.sources.contract import Shot
+from terrafix.vision.sources.description import camera_of, origin_of, read_description
+from terrafix.vision.sources.images import WRONG_SIZE, read_image
+from terrafix.vision.sources.table import Row, read_table
+
+
+class FlightFolder:
+    """Opens everything but the pixels, so that a mistake is found before the flight and not in it."""
+
+    live = False
+
+    def __init__(self, folder: Path, start: tuple[float, float] | None = None) -> None:
+        self.folder = folder
+        toml = folder / "flight.toml"
+        self._description = read_description(toml)
+        self._origin = origin_of(toml, self._description, camera_of(toml, self._description), start)
+        self._rows = read_table(folder / "frames.csv", "frames.csv", with_file=True)
+        self._check_files()
+        self._check_size()
+        self._states = self._telemetry()
+
+    def origin(self) -> Origin:
+        return self._origin
+
+    def length(self) -> int | None:
+        return len(self._rows)
+
+    def name(self) -> str:
+        return self._description.name or self.folder.name
+
+    def map_hint(self) -> Path | None:
+        return (self.folder / self._description.map).resolve() if self._description.map else None
+
+    def close(self) -> None:
+        """Nothing stays open between shots."""
+
+    def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
+        from_ns = round(from_s * 1e9)
+        camera = self._origin.camera
+        at = 0
+        for frame_id, row in enumerate(self._rows):
+            states: list[VehicleState] = []
+            while at < len(self._states) and self._states[at].t_ns <= row.t_ns:
+                states.append(self._states[at])
+                at += 1
+            if row.t_ns < from_ns:
+                continue
+            image, error = read_image(self.folder / "frames" / row.file, camera.width, camera.height)
+            frame = Frame(
+                t_ns=row.t_ns,
+                frame_id=frame_id,
+                file=row.file,
+                width=camera.width,
+                height=camera.height,
+                error=error,
+            )
+            yield Shot(frame, tuple(s for s in states if s.t_ns >= from_ns), image)
+
+    def _check_files(self) -> None:
+        table, frames = self.folder / "frames.csv", self.folder / "frames"
+        if not frames.is_dir():
+            raise SourceError(f"{frames}: no such folder; the images that frames.csv names belong in it")
+        for row in self._rows:
+            parts = PurePosixPath(row.file.replace("\\", "/"))
+            if parts.is_absolute() or ".." in parts.parts:
+                raise SourceError(f"{table} row {row.number}: '{row.file}' leaves frames/; name files inside it")
+            if not os.path.isfile(frames / row.file):
+                raise SourceError(
+                    f"{table} row {row.number}: frames/{row.file} does not exist{_count_missing(frames, self._rows)}; "
+                    "add the image or remove the row"
+                )
+
+    def _check_size(self) -> None:
+        """One frame of another size is a bad frame; the first, the middle and the last are a wrong [camera]."""
+        camera = self._origin.camera
+        for row in (self._rows[0], self._rows[len(self._rows) // 2], self._rows[-1]):
+            _, error = read_image(self.folder / "frames" / row.file, camera.width, camera.height)
+            if not error.startswith(WRONG_SIZE):
+                return
+        raise SourceError(
+            f"{self.folder}: the frames have the {error}; write [camera] of flight.toml in pixels of the stored frames"
+        )
+
+    def _telemetry(self) -> list[VehicleState]:
+        """States of frames.csv and of telemetry.tlog in time order. A tlog starts before the first frame or after."""
+        states = [row.state for row in self._rows if row.state is not None]
+        log = self.folder / "telemetry.tlog"
+        if log.is_file():
+            states += read_tlog(log, self._description.telemetry.tlog_t0_us)
+            states.sort(key=lambda state: state.t_ns)
+        return states
+
+
+def _count_missing(frames: Path, rows: list[Row]) -> str:
+    missing = sum(not os.path.isfile(frames / row.file) for row in rows)
+    return f" (and {missing - 1} more)" if missing > 1 else ""

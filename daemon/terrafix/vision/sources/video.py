@@ -1,0 +1,129 @@
+"""A video file with a description beside it: VIDEO.toml or flight.toml, optionally VIDEO.csv and VIDEO.tlog."""
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+
+from terrafix.core.errors import SourceError
+from terrafix.core.tlog import read_tlog
+from terrafix.messages import Frame, Origin, VehicleState
+from terrafix.vision.sources.contract import Shot
+from terrafix.vision.sources.description import camera_of, origin_of, read_description
+from terrafix.vision.sources.table import read_table
+
+FFMPEG_QUIET = "-8"  # AV_LOG_QUIET: a damaged picture would print one line for every block
+
+
+class Video:
+    """Takes ``rate_hz`` pictures a second. Times are the container's; ids count the pictures taken."""
+
+    live = False
+
+    def __init__(
+        self,
+        path: Path,
+        start: tuple[float, float] | None = None,
+        camera: Path | None = None,
+        rate_hz: float = 2.0,
+    ) -> None:
+        self.path = path
+        where = camera or self._find_description()
+        self._description = read_description(where)
+        self._map_base = where.parent
+        self._origin = origin_of(where, self._description, camera_of(where, self._description), start)
+        self._states = self._telemetry()
+        self._period_s = 1.0 / rate_hz
+        capture = self._open()
+        self._fps = capture.get(cv2.CAP_PROP_FPS)
+        self._frames = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        capture.release()
+        ours = self._origin.camera
+        if size != (ours.width, ours.height):
+            raise SourceError(
+                f"{path}: the video is {size[0]}x{size[1]}, [camera] in {where} says {ours.width}x{ours.height}; "
+                "describe the camera in pixels of this video"
+            )
+
+    def origin(self) -> Origin:
+        return self._origin
+
+    def length(self) -> int | None:
+        if not (self._fps > 0 and self._frames > 0):
+            return None
+        return min(int(self._frames), math.ceil(self._frames / self._fps / self._period_s))
+
+    def name(self) -> str:
+        return self._description.name or self.path.stem
+
+    def map_hint(self) -> Path | None:
+        return (self._map_base / self._description.map).resolve() if self._description.map else None
+
+    def close(self) -> None:
+        """Nothing stays open between shots."""
+
+    def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
+        capture = self._open()
+        try:
+            yield from self._shots(capture, from_s)
+        finally:
+            capture.release()
+
+    def _shots(self, capture: cv2.VideoCapture, from_s: float) -> Iterator[Shot]:
+        camera = self._origin.camera
+        step_s = 1.0 / self._fps if self._fps > 0 else self._period_s
+        frame_id, at, t_s, due_s = 0, 0, -step_s, 0.0
+        while capture.grab():
+            said_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            t_s = said_s if said_s > t_s else t_s + step_s  # some containers carry no times
+            if t_s < due_s - step_s / 2:
+                continue
+            due_s += self._period_s * max(1, math.ceil((t_s + step_s / 2 - due_s) / self._period_s))
+            t_ns = round(t_s * 1e9)
+            states: list[VehicleState] = []
+            while at < len(self._states) and self._states[at].t_ns <= t_ns:
+                states.append(self._states[at])
+                at += 1
+            if t_s >= from_s:
+                whole, image = capture.retrieve()
+                frame = Frame(
+                    t_ns=t_ns,
+                    frame_id=frame_id,
+                    file=f"{self.path.name}@{t_s:.3f}",
+                    width=camera.width,
+                    height=camera.height,
+                    error="" if whole else "cannot be decoded",
+                )
+                kept = tuple(s for s in states if s.t_ns >= round(from_s * 1e9))
+                yield Shot(frame, kept, image if whole else None)
+            frame_id += 1
+
+    def _find_description(self) -> Path:
+        for where in (self.path.with_suffix(".toml"), self.path.with_name("flight.toml")):
+            if where.is_file():
+                return where
+        raise SourceError(
+            f"{self.path}: a video does not say which camera took it; write {self.path.stem}.toml beside it with "
+            "[camera] and [start]"
+        )
+
+    def _telemetry(self) -> list[VehicleState]:
+        table, log = self.path.with_suffix(".csv"), self.path.with_suffix(".tlog")
+        states: list[VehicleState] = []
+        if table.is_file():
+            rows = read_table(table, table.name, with_file=False)
+            states += [row.state for row in rows if row.state is not None]
+        if log.is_file():
+            states += read_tlog(log, self._description.telemetry.tlog_t0_us)
+        return sorted(states, key=lambda state: state.t_ns)
+
+    def _open(self) -> cv2.VideoCapture:
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", FFMPEG_QUIET)
+        capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        if not capture.isOpened():
+            raise SourceError(f"{self.path}: cannot be opened as a video; is it complete, and a format FFmpeg knows?")
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # pixels as they are stored
+        return capture

@@ -1,0 +1,62 @@
+#!/bin/sh
+# Installs Terrafix as a systemd service: virtual environment in /opt/terrafix, settings in /etc/terrafix.
+#
+#   sudo systemd/install.sh [--python /path/to/python3.11] [--prefix DIR] [--no-pip]
+#
+# Run it again to upgrade: an existing /etc/terrafix/terrafix.toml stays as it is. --prefix installs the files below
+# DIR without starting anything (for images and tests); --no-pip leaves the virtual environment alone.
+set -eu
+
+here=$(cd "$(dirname "$0")" && pwd)
+python=${PYTHON:-}
+prefix=
+pip=yes
+while [ $# -gt 0 ]; do
+    case $1 in
+        --python) python=$2; shift 2 ;;
+        --prefix) prefix=$2; shift 2 ;;
+        --no-pip) pip=no; shift ;;
+        *) echo "install.sh: unknown option $1; see the head of this file" >&2; exit 2 ;;
+    esac
+done
+if [ -z "$prefix" ] && [ "$(id -u)" -ne 0 ]; then
+    echo "install.sh: must be root; run it with sudo (or give --prefix)" >&2
+    exit 2
+fi
+
+# gtsam 4.3 has wheels from Python 3.11 on; JetPack 6 brings 3.10 (docs/jetson.md says how to get a newer one).
+if [ "$pip" = yes ]; then
+    for candidate in $python python3.12 python3.11 python3; do
+        if command -v "$candidate" >/dev/null 2>&1 &&
+            "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+            chosen=$candidate
+            break
+        fi
+    done
+    if [ -z "${chosen:-}" ]; then
+        echo "install.sh: no Python 3.11 or newer found; see docs/jetson.md, then give --python PATH" >&2
+        exit 1
+    fi
+    "$chosen" -m venv "$prefix/opt/terrafix/venv"
+    "$prefix/opt/terrafix/venv/bin/pip" install --upgrade "$here/.."
+fi
+
+install -D -m 0644 "$here/terrafix.service" "$prefix/etc/systemd/system/terrafix.service"
+install -D -m 0644 "$here/terrafix.sysusers.conf" "$prefix/usr/lib/sysusers.d/terrafix.conf"
+install -D -m 0644 "$here/terrafix.tmpfiles.conf" "$prefix/usr/lib/tmpfiles.d/terrafix.conf"
+install -D -m 0644 "$here/../config/default.toml" "$prefix/opt/terrafix/share/default.toml"
+install -D -m 0644 "$here/../docs/jetson.md" "$prefix/opt/terrafix/share/jetson.md"
+settings=$prefix/etc/terrafix/terrafix.toml
+if [ -e "$settings" ]; then
+    echo "kept $settings; all keys are explained in /opt/terrafix/share/default.toml"
+else
+    install -D -m 0644 "$here/../config/default.toml" "$settings"
+fi
+
+if [ -z "$prefix" ]; then
+    systemd-sysusers terrafix.conf
+    systemd-tmpfiles --create terrafix.conf
+    systemctl daemon-reload
+    echo "Next: set [source], [map] and [link] in /etc/terrafix/terrafix.toml, put the map into /var/lib/terrafix/maps,"
+    echo "then: systemctl enable --now terrafix && journalctl -fu terrafix"
+fi

@@ -1,0 +1,50 @@
+"""Small generated GeoTIFFs for the tests of the map builder and reader."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from rasterio.transform import Affine
+
+
+def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
+    """(3, height, width) uint8 RGB, smooth and rich, never 0 or 255."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((height, width, 3), np.float32)
+    for sigma_px, weight in ((2.5, 1.0), (12.0, 1.2), (40.0, 1.0)):
+        layer = cv2.GaussianBlur(rng.normal(size=(height, width, 3)).astype(np.float32), (0, 0), sigma_px)
+        image += weight * layer / layer.std()
+    scaled = np.clip(128 + 30 * image, 5, 250).astype(np.uint8)
+    return np.ascontiguousarray(scaled.transpose(2, 0, 1))
+
+
+def write_tif(path: Path, bands: np.ndarray, crs: str | None, transform: Affine | None, **profile: Any) -> Path:
+    """Writes (count, height, width); what `colorinterp`, `colormap` and `nodata` say goes into the file."""
+    interpretation = profile.pop("colorinterp", None)
+    palette = profile.pop("colormap", None)
+    if transform is not None:
+        profile["transform"] = transform
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        width=bands.shape[2],
+        height=bands.shape[1],
+        count=bands.shape[0],
+        dtype=bands.dtype,
+        crs=crs,
+        **profile,
+    ) as file:
+        file.write(bands)
+        if interpretation is not None:
+            file.colorinterp = interpretation
+        if palette is not None:
+            file.write_colormap(1, palette)
+    return path
+
+
+def utm(path: Path, bands: np.ndarray, crs: str = "EPSG:32651", pixel_m: float = 0.5, **profile: Any) -> Path:
+    """A GeoTIFF whose top left corner is at 300 km, 2 600 km of its zone."""
+    return write_tif(path, bands, crs, Affine(pixel_m, 0, 300_000.0, 0, -pixel_m, 2_600_000.0), **profile)

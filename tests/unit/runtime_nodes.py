@@ -1,0 +1,157 @@
+"""Small nodes for the tests of shell and supervisor; children import this module by name (see `table`)."""
+
+import os
+import sys
+import threading
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from terrafix import messages as m
+from terrafix.core.codec import encode_json
+from terrafix.core.errors import LinkError
+from terrafix.core.frames import FrameWriter
+from terrafix.core.node import Edge, Node, NodeContext
+from terrafix.processes import EVERYTHING, Process
+
+CAMERA = m.Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
+ORIGIN = m.Origin(
+    t_ns=0,
+    camera=CAMERA,
+    lat_deg=48.0,
+    lon_deg=11.0,
+    ground_amsl_m=500.0,
+    start_sigma_m=10.0,
+    yaw_sigma_deg=3.0,
+    agl_sigma_m=2.0,
+    attitude_sigma_deg=2.0,
+)
+FRAME_PERIOD_NS = 20_000_000
+
+
+def image_of(frame_id: int) -> np.ndarray:
+    return np.full((48, 64, 3), frame_id % 251, np.uint8)
+
+
+class Silent:
+    def on(self, message: m.Message) -> Iterable[m.Message]:
+        return ()
+
+    def tick(self, now_ns: int) -> Iterable[m.Message]:
+        return ()
+
+
+class SourceEdge:
+    """Origin, then frames at 50 Hz: as many as ``config.link.baud`` less 9600 (a number that tests may choose)."""
+
+    def __init__(self, ctx: NodeContext) -> None:
+        assert isinstance(ctx.frames, FrameWriter)
+        self._frames = ctx.frames
+        self._count = ctx.config.link.baud - 9600
+        self._epoch_ns = ctx.epoch_ns
+        self._next_id = -1
+        self._next_ns = 0
+
+    def poll(self, now_ns: int) -> Iterable[m.Message]:
+        if now_ns < self._next_ns or self._next_id > self._count:
+            return
+        if self._next_id < 0:
+            yield msgspec.structs.replace(ORIGIN, t_ns=now_ns if self._epoch_ns is None else self._epoch_ns)
+        elif self._next_id < self._count:
+            self._frames.put(self._next_id, image_of(self._next_id))
+            yield m.Frame(t_ns=now_ns, frame_id=self._next_id, file="", width=64, height=48)
+        else:
+            yield m.SourceEnded(t_ns=now_ns, frames=self._count)
+        self._next_id += 1
+        self._next_ns = now_ns + FRAME_PERIOD_NS
+
+    def heard(self, message: m.Message) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class Worker(Silent):
+    """Says for every frame whether it knows the origin and sees the right pixels. ``TROUBLE`` makes it ill once."""
+
+    def __init__(self, ctx: NodeContext) -> None:
+        self._ctx = ctx
+        self._origin: m.Origin | None = None
+
+    def on(self, message: m.Message) -> Iterable[m.Message]:
+        if isinstance(message, m.Origin):
+            self._origin = message
+        if isinstance(message, m.Frame):
+            self._maybe_trouble(message.frame_id)
+            image = self._ctx.frames.get(message.frame_id)
+            seen = image is not None and np.array_equal(image, image_of(message.frame_id))
+            verdict = m.Verdict.ACCEPTED if seen and self._origin is not None else m.Verdict.BAD_IMAGE
+            yield m.MeasurementVerdict(
+                t_ns=message.t_ns,
+                frame_id=message.frame_id,
+                measurement="test",
+                verdict=verdict,
+                detail=f"pid {os.getpid()} origin {self._origin is not None} pixels {seen}",
+            )
+
+    def _maybe_trouble(self, frame_id: int) -> None:
+        trouble = os.environ.get("TROUBLE")
+        once = self._ctx.out_dir / "trouble"
+        if trouble is None or frame_id < 10 or once.exists():
+            return
+        once.touch()
+        if trouble == "stuck":
+            threading.Event().wait()
+        raise ZeroDivisionError("a bug for the test")
+
+
+class Link(Silent):
+    def tick(self, now_ns: int) -> Iterable[m.Message]:
+        yield m.LinkStatus(
+            t_ns=now_ns, connected=True, autopilot="none", sysid=1, sent=0, received=0, bad=0, time_offset_ms=None
+        )
+
+
+class FileEdge:
+    """Writes every message that it hears as a line, at once."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("ab", buffering=0)
+
+    def poll(self, now_ns: int) -> Iterable[m.Message]:
+        return ()
+
+    def heard(self, message: m.Message) -> None:
+        self._file.write(encode_json(message) + b"\n")
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def make_node(ctx: NodeContext) -> Node:
+    role = process_name()
+    if role == "link" and ctx.config.link.device == "broken":
+        raise LinkError("broken: no such device; check --link")
+    return {"estimator": lambda: Worker(ctx), "link": Link}.get(role, Silent)()
+
+
+def make_edge(ctx: NodeContext) -> Edge | None:
+    edges = {"vision": lambda: SourceEdge(ctx), "recorder": lambda: FileEdge(ctx.out_dir / "heard.jsonl")}
+    return edges[process_name()]() if process_name() in edges else None
+
+
+def process_name() -> str:
+    """One module stands for all processes: their name is the first argument of child.py."""
+    return sys.argv[1]
+
+
+_BASE = Process("", "runtime_nodes", (), (), 0.0, 5.0)
+TABLE: tuple[Process, ...] = (
+    replace(_BASE, name="recorder", hears=EVERYTHING, tick_hz=1.0),
+    replace(_BASE, name="link", hears=(m.Origin,), says=(m.LinkStatus,), tick_hz=50.0, stuck_after_s=1.0),
+    replace(_BASE, name="estimator", hears=(m.Origin, m.Frame), says=(m.MeasurementVerdict,), stuck_after_s=0.7),
+    replace(_BASE, name="vision", says=(m.Origin, m.Frame, m.SourceEnded)),
+)

@@ -1,0 +1,220 @@
+"""Estimates against ground truth: evaluation.json. Every definition is in docs/outputs.md."""
+
+import json
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+from pyproj import Geod
+from rich.console import Console
+from rich.table import Table
+from terrafix.core.errors import EvaluationError, OutputError
+
+from terrafix_tools.estimates import Row, number, read_rows, read_table
+
+LIMITS_M = (5, 10, 20, 50)
+ELLIPSE95 = 5.991  # chi-square with 2 degrees of freedom, 95 %
+FALSE_FIX_ERROR_M = 50.0
+FALSE_FIX_MAHALANOBIS2 = 9.0  # "> 3 sigma": the squared Mahalanobis distance in the claimed 2x2 is above 3^2
+_GEOD = Geod(ellps="WGS84")
+
+
+@dataclass(frozen=True)
+class Truth:
+    lat_deg: float
+    lon_deg: float
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One input frame that has truth; errors are estimate minus truth, None where there is no position."""
+
+    row: Row
+    truth: Truth
+    error_e_m: float | None
+    error_n_m: float | None
+    error_m: float | None
+    refined_error_m: float | None  # horizontal distance of the refined position
+    mahalanobis2: float | None  # squared, in the claimed covariance; None also where that is not positive definite
+
+
+def read_truth(path: Path) -> dict[str, Truth]:
+    """Truth by file name. Raises EvaluationError."""
+    truth: dict[str, Truth] = {}
+    for line, row in read_table(path, ("file", "lat_deg", "lon_deg"), "give the truth.csv of this flight"):
+        lat_deg = number(path, line, "lat_deg", row["lat_deg"])
+        lon_deg = number(path, line, "lon_deg", row["lon_deg"])
+        if lat_deg is None or lon_deg is None:
+            continue  # a frame without truth
+        if not (-90.0 <= lat_deg <= 90.0 and -180.0 <= lon_deg <= 180.0):
+            raise EvaluationError(f"{path}, line {line}: {lat_deg}, {lon_deg} is no place on earth; columns swapped?")
+        truth[row["file"]] = Truth(lat_deg, lon_deg)
+    if not truth:
+        raise EvaluationError(f"{path}: no row with a position")
+    return truth
+
+
+def offset_m(truth: Truth, lat_deg: float, lon_deg: float) -> tuple[float, float]:
+    """East and north from truth to the position, metres along the WGS84 geodesic."""
+    azimuth_deg, _, distance_m = _GEOD.inv(truth.lon_deg, truth.lat_deg, lon_deg, lat_deg)
+    azimuth = math.radians(azimuth_deg)
+    return distance_m * math.sin(azimuth), distance_m * math.cos(azimuth)
+
+
+def mahalanobis2(row: Row, e_m: float, n_m: float, extra_sigma_m: float = 0.0) -> float | None:
+    """Squared Mahalanobis distance of (e_m, n_m) in the row's claimed 2x2, or None when that is not a covariance."""
+    if row.sigma_e_m is None or row.sigma_n_m is None or row.cov_en_m2 is None:
+        return None
+    ee, nn, en = row.sigma_e_m**2 + extra_sigma_m**2, row.sigma_n_m**2 + extra_sigma_m**2, row.cov_en_m2
+    det = ee * nn - en * en
+    if ee <= 0 or nn <= 0 or det <= 0:
+        return None
+    return (nn * e_m * e_m - 2 * en * e_m * n_m + ee * n_m * n_m) / det
+
+
+def compare(rows: list[Row], truth: dict[str, Truth]) -> list[Compared]:
+    """The input frames that have truth, in input order."""
+    compared = []
+    for row in rows:
+        if (true := truth.get(row.file)) is None:
+            continue
+        e_m = n_m = error_m = refined_m = distance2 = None
+        if row.lat_deg is not None and row.lon_deg is not None:
+            e_m, n_m = offset_m(true, row.lat_deg, row.lon_deg)
+            error_m = math.hypot(e_m, n_m)
+            distance2 = mahalanobis2(row, e_m, n_m)
+        if row.refined_lat_deg is not None and row.refined_lon_deg is not None:
+            refined_m = math.hypot(*offset_m(true, row.refined_lat_deg, row.refined_lon_deg))
+        compared.append(Compared(row, true, e_m, n_m, error_m, refined_m, distance2))
+    return compared
+
+
+def _errors(errors_m: list[float], frames: int, prefix: str) -> dict[str, float | None]:
+    out: dict[str, float | None] = {
+        f"{prefix}within_{limit}m": sum(e <= limit for e in errors_m) / frames for limit in LIMITS_M
+    }
+    out[f"{prefix}median_m"] = float(np.median(errors_m)) if errors_m else None
+    out[f"{prefix}p95_m"] = float(np.percentile(errors_m, 95)) if errors_m else None
+    out[f"{prefix}max_m"] = max(errors_m) if errors_m else None
+    return out
+
+
+def _odometry_rate(summary: dict[str, Any]) -> float | None:
+    """Frames that odometry registered, of those that could be (all but the first)."""
+    registered, frames = summary.get("odometry_frames"), summary.get("frames")
+    if not isinstance(registered, int) or not isinstance(frames, int) or frames < 2:
+        return None
+    return min(1.0, registered / (frames - 1))
+
+
+def metrics(
+    rows: list[Row], truth: dict[str, Truth], summary: dict[str, Any], truth_sigma_m: float | None
+) -> dict[str, Any]:
+    """The numbers of evaluation.json. ``rows`` and ``truth`` must share a file name (EvaluationError)."""
+    compared = compare(rows, truth)
+    if not compared:
+        here, there = (rows[0].file if rows else "nothing"), next(iter(truth))
+        raise EvaluationError(
+            f"no frame stands in both: estimates have '{here}' ..., truth has '{there}' ...; same flight?"
+        )
+    frames = len(compared)
+    located = [c for c in compared if c.error_m is not None]
+    errors_m = [c.error_m for c in compared if c.error_m is not None]
+    refined_m = [c.refined_error_m for c in compared if c.refined_error_m is not None]
+    nees = [c.mahalanobis2 for c in located if c.mahalanobis2 is not None]
+    times_ms = [r.process_ms for r in rows if r.process_ms is not None]
+    result: dict[str, Any] = {"frames": frames, "localised": len(located)}
+    result |= _errors(errors_m, frames, "") | _errors(refined_m, frames, "refined_")
+    result |= {
+        "ellipse95_coverage": sum(v <= ELLIPSE95 for v in nees) / len(located) if located else None,
+        "mean_nees": float(np.mean(nees)) if nees else None,
+        "false_fixes": sum(
+            c.error_m > FALSE_FIX_ERROR_M and (c.mahalanobis2 is None or c.mahalanobis2 > FALSE_FIX_MAHALANOBIS2)
+            for c in located
+            if c.error_m is not None
+        ),
+        "anchor_rate": sum(c.row.anchor_age_ms == 0 for c in compared) / frames,
+        "odometry_rate": _odometry_rate(summary),
+        "frame_ms_median": float(np.median(times_ms)) if times_ms else None,
+        "frame_ms_p95": float(np.percentile(times_ms, 95)) if times_ms else None,
+        # Beyond the contract:
+        "refined": len(refined_m),
+        "frames_without_truth": len(rows) - frames,
+        "covariance_invalid": len(located) - len(nees),
+    }
+    if truth_sigma_m is not None:
+        wide = [mahalanobis2(c.row, c.error_e_m or 0.0, c.error_n_m or 0.0, truth_sigma_m) for c in located]
+        inside = sum(v is not None and v <= ELLIPSE95 for v in wide)
+        result["truth_sigma_m"] = truth_sigma_m
+        result["ellipse95_coverage_with_truth_sigma"] = inside / len(located) if located else None
+    return {key: round(value, 6) if isinstance(value, float) else value for key, value in result.items()}
+
+
+def truth_sigma_of(truth_path: Path) -> float | None:
+    """[truth] sigma_m of the flight.toml beside truth.csv, when there is one."""
+    try:
+        table = tomllib.loads((truth_path.parent / "flight.toml").read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return None
+    section = table.get("truth")
+    sigma_m = section.get("sigma_m") if isinstance(section, dict) else None
+    return float(sigma_m) if isinstance(sigma_m, int | float) and sigma_m >= 0 else None
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """summary.json, or nothing when it is not there."""
+    path = folder / "summary.json"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{path}: cannot be read ({error})") from None
+    if not isinstance(summary, dict):
+        raise EvaluationError(f"{path}: not a summary of a replay; run 'terrafix replay' again")
+    return summary
+
+
+def evaluate(folder: Path, truth_path: Path, *, json_only: bool = False) -> dict[str, Any]:
+    """Writes FOLDER/evaluation.json and prints it. Raises EvaluationError, OutputError."""
+    rows = read_rows(folder / "estimates.csv")
+    result = metrics(rows, read_truth(truth_path), read_summary(folder), truth_sigma_of(truth_path))
+    text = json.dumps(result, indent=2, allow_nan=False)
+    try:
+        (folder / "evaluation.json").write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder / 'evaluation.json'}: cannot be written ({error.strerror})") from None
+    if json_only:
+        typer.echo(text)
+    else:
+        Console().print(_table(result, folder))
+    return result
+
+
+def _shown(key: str, value: float | int | None) -> str:
+    if value is None:
+        return "-"
+    if "within" in key or key.endswith("_rate") or "coverage" in key:
+        return f"{100 * value:.1f} %"
+    if key.endswith("_m"):
+        return f"{value:.1f} m"
+    if key.endswith(("_ms", "_median", "_p95")):
+        return f"{value:.0f} ms"
+    return f"{value:.2f}" if isinstance(value, float) else str(value)
+
+
+def _table(result: dict[str, Any], folder: Path) -> Table:
+    table = Table(title=f"{folder}: {result['localised']} of {result['frames']} frames localised", title_justify="left")
+    table.add_column("")
+    table.add_column("immediate", justify="right")
+    table.add_column("refined", justify="right")
+    for key, value in result.items():
+        if key.startswith("refined_") or key in ("frames", "localised"):
+            continue
+        refined = f"refined_{key}"
+        table.add_row(key, _shown(key, value), _shown(refined, result[refined]) if refined in result else "")
+    return table

@@ -1,0 +1,47 @@
+"""What `terrafix run` does on the ground before the supervisor starts: the map, as a package, and under the start."""
+
+import os
+from pathlib import Path
+
+from terrafix.anchor.map_package import MapPackage
+from terrafix.core.config import load
+from terrafix.core.errors import MapError
+from terrafix.vision.sources import open_configured, parse_start
+
+
+def package_for(source: str, start: str, map_path: Path | None, configs: list[Path]) -> Path:
+    """The map package to fly with: ``map_path``, or the one of the configuration, or the one that the source names.
+
+    A GeoTIFF is made into a package (kept in the cache folder). A recorded source is opened once, to see that the map
+    covers its start; a live camera is not, since only one process can hold it.
+    Raises ConfigError, SourceError, UsageError, MapError."""
+    config = load(configs)
+    spec = source or config.source.path
+    given = map_path or (Path(config.map.path) if config.map.path else None)
+    place: tuple[float, float] | None = parse_start(start or config.source.start)
+    if not spec or os.path.exists(os.path.expanduser(spec)) and not spec.startswith("/dev/"):
+        opened = open_configured(config.source, spec, place)
+        given = given or opened.map_hint()
+        origin = opened.origin()
+        place = (origin.lat_deg, origin.lon_deg)
+        opened.close()
+    if given is None:
+        raise MapError("no map: give one with --map (GeoTIFF or map package) or [map] path")
+    package = given if given.suffix.lower() == ".gpkg" else _built(given)
+    with_map = MapPackage.open(package)
+    try:
+        if place is not None and not with_map.covers(*place):
+            raise MapError(
+                f"{package}: has no imagery at the start {place[0]:.6f}, {place[1]:.6f}; use another --map or check it"
+            )
+    finally:
+        with_map.close()
+    return package
+
+
+def _built(geotiff: Path) -> Path:
+    # Only here: on the vehicle there is a package, and the libraries that read GeoTIFFs are not installed.
+    from terrafix_tools.map_build import ensure_package
+    from terrafix_tools.replay import map_cache_dir
+
+    return ensure_package(geotiff, map_cache_dir(), progress=True)

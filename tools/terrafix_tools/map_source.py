@@ -1,0 +1,216 @@
+"""Imagery and elevation files for the map builder: any GDAL raster becomes north-up 8-bit BGR windows with a mask."""
+
+import math
+import warnings
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import rasterio
+from pyproj import CRS, Geod, Transformer
+from rasterio.enums import ColorInterp, Resampling
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.transform import Affine
+from rasterio.vrt import WarpedVRT
+from rasterio.windows import Window
+from terrafix.core.errors import MapError
+
+SAMPLE_PX = 1024  # side of the reduced picture from which the stretch of deep pixels is taken
+STRETCH_PERCENT = (0.5, 99.5)  # of the sample; outside it 16-bit and float pixels saturate
+
+
+class ImagerySource:
+    """North-up view of an image: pixel (r, c) covers [x_min + c px, y_max - r py) in `crs`. A context manager."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = open_raster(path)
+        self._data: Any = self._file
+        crs = crs_of(self._file, path)
+        transform: Affine = self._file.transform
+        self.warped = not (transform.b == 0 and transform.d == 0 and transform.a > 0 and transform.e < 0)
+        if crs.is_geographic:
+            crs, self.warped = _utm_of(self._file, crs), True
+        self.crs = crs
+        self._colours = self._colour_table()
+        if self.warped:
+            self._data = self._north_up(crs)
+        self.width_px, self.height_px = int(self._data.width), int(self._data.height)
+        self.pixel_x, self.pixel_y = float(self._data.transform.a), -float(self._data.transform.e)
+        self.x_min, self.y_max = float(self._data.transform.c), float(self._data.transform.f)
+        self.bands = self._choose_bands()
+        # A mask of the file's own (alpha, nodata, mask band) is believed; without one a black collar is looked for.
+        flags = [f for band in self._file.mask_flag_enums for f in band]
+        self.has_mask = self.warped or any(f.name != "all_valid" for f in flags)
+        self._stretch = self._find_stretch()
+
+    def __enter__(self) -> "ImagerySource":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._data is not self._file:
+            self._data.close()
+        self._file.close()
+
+    @property
+    def transform(self) -> Affine:
+        return Affine(self.pixel_x, 0, self.x_min, 0, -self.pixel_y, self.y_max)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, y_min, x_max, y_max in the CRS."""
+        return (
+            self.x_min,
+            self.y_max - self.height_px * self.pixel_y,
+            self.x_min + self.width_px * self.pixel_x,
+            self.y_max,
+        )
+
+    @property
+    def gsd_m(self) -> float:
+        """Ground metres per pixel at the centre, on the ellipsoid: EPSG:3857 pixels are smaller than they claim."""
+        x = self.x_min + 0.5 * self.width_px * self.pixel_x
+        y = self.y_max - 0.5 * self.height_px * self.pixel_y
+        return ground_pixel_m(self.crs, x, y, self.pixel_x, self.pixel_y)
+
+    def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+        """(height, width, 3) uint8 BGR and (height, width) uint8 mask of 0 and 255, of a window inside the image."""
+        window = Window(column, row, width, height)
+        try:
+            bands = self._data.read(self.bands, window=window)
+            mask = self._data.dataset_mask(window=window)
+        except RasterioError as error:
+            raise MapError(f"{self.path}: cannot be read near column {column}, row {row} ({error})") from None
+        image = np.moveaxis(self._to_bytes(bands), 0, 2)
+        if np.issubdtype(bands.dtype, np.floating):
+            mask = np.where(np.isfinite(bands).all(axis=0), mask, 0).astype(np.uint8)
+        if image.shape[2] == 1:
+            image = np.repeat(image, 3, axis=2)
+        return np.ascontiguousarray(image[:, :, ::-1]), np.where(mask > 0, 255, 0).astype(np.uint8)
+
+    def _to_bytes(self, bands: np.ndarray) -> np.ndarray:
+        if self._colours is not None:
+            return self._colours[bands[0].astype(np.uint8)].transpose(2, 0, 1)
+        if self._stretch is None:
+            return bands.astype(np.uint8)
+        low, high = self._stretch
+        scaled = (np.nan_to_num(bands.astype(np.float32), nan=low) - low) * (255.0 / (high - low))
+        return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
+
+    def _north_up(self, crs: CRS) -> Any:
+        """The image resampled to a north-up grid of equal ground sampling."""
+        source = self._file
+        geo_crs = CRS.from_user_input(source.crs.to_wkt())
+        a = source.transform
+        half_columns, half_rows = source.width / 2, source.height / 2
+        centre_x = a.a * half_columns + a.b * half_rows + a.c
+        centre_y = a.d * half_columns + a.e * half_rows + a.f
+        step_m = min(
+            ground_distance_m(geo_crs, (centre_x, centre_y), (centre_x + a.a, centre_y + a.d)),
+            ground_distance_m(geo_crs, (centre_x, centre_y), (centre_x + a.b, centre_y + a.e)),
+        )
+        change = Transformer.from_crs(geo_crs, crs, always_xy=True)
+        edge = np.linspace(0.0, 1.0, 21)
+        columns = np.concatenate([edge, edge, np.zeros(21), np.ones(21)]) * source.width
+        rows = np.concatenate([np.zeros(21), np.ones(21), edge, edge]) * source.height
+        x, y = change.transform(a.a * columns + a.b * rows + a.c, a.d * columns + a.e * rows + a.f)
+        middle_x, middle_y = float(np.mean([x.min(), x.max()])), float(np.mean([y.min(), y.max()]))
+        pixel = step_m / ground_pixel_m(crs, middle_x, middle_y, 1.0, 1.0)
+        x_min = math.floor(float(x.min()) / pixel) * pixel
+        y_max = math.ceil(float(y.max()) / pixel) * pixel
+        return WarpedVRT(
+            source,
+            crs=crs.to_wkt(),
+            transform=Affine(pixel, 0, x_min, 0, -pixel, y_max),
+            width=math.ceil((float(x.max()) - x_min) / pixel),
+            height=math.ceil((y_max - float(y.min())) / pixel),
+            resampling=Resampling.nearest if self._colours is not None else Resampling.bilinear,
+            add_alpha=ColorInterp.alpha not in source.colorinterp and source.nodata is None,
+        )
+
+    def _colour_table(self) -> np.ndarray | None:
+        """(256, 3) RGB of a palette image."""
+        if self._file.colorinterp[0] != ColorInterp.palette:
+            return None
+        table = np.zeros((256, 3), np.uint8)
+        for index, colour in self._file.colormap(1).items():
+            if index < 256:
+                table[index] = colour[:3]
+        return table
+
+    def _choose_bands(self) -> list[int]:
+        names = list(self._file.colorinterp)
+        if all(c in names for c in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)):
+            return [names.index(c) + 1 for c in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
+        colours = [i + 1 for i, c in enumerate(names) if c != ColorInterp.alpha]
+        if not colours:
+            raise MapError(f"{self.path}: has no picture band, only alpha; give an image with 1, 3 or more bands")
+        return colours[:3] if len(colours) >= 3 else colours[:1]
+
+    def _find_stretch(self) -> tuple[float, float] | None:
+        """Value range that becomes 0..255, one for all bands so that colours keep their balance; None = bytes."""
+        kind = np.dtype(self._file.dtypes[self.bands[0] - 1])
+        if kind == np.uint8:
+            return None
+        if kind.kind == "c":
+            raise MapError(f"{self.path}: complex pixels are no picture; give an image with 8, 16 bit or float bands")
+        shrink = max(1.0, max(self.width_px, self.height_px) / SAMPLE_PX)
+        shape = (max(1, int(self.height_px / shrink)), max(1, int(self.width_px / shrink)))
+        sample = self._data.read(self.bands, out_shape=(len(self.bands), *shape)).astype(np.float64)
+        mask = self._data.dataset_mask(out_shape=shape) > 0
+        values = sample[:, mask]
+        values = values[np.isfinite(values)]
+        if values.size == 0:
+            raise MapError(f"{self.path}: no valid pixel in the whole image")
+        low, high = (float(v) for v in np.percentile(values, STRETCH_PERCENT))
+        return (low, high) if high > low else (low, low + 1.0)
+
+
+def open_raster(path: Path) -> Any:
+    """Dataset, or MapError."""
+    if not path.is_file():
+        raise MapError(f"{path}: no such file; check the path of the imagery")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)  # said below, as an error
+            return rasterio.open(path)
+    except RasterioError:
+        raise MapError(f"{path}: not an image that GDAL can read; give a GeoTIFF") from None
+
+
+def ground_pixel_m(crs: CRS, x: float, y: float, pixel_x: float, pixel_y: float) -> float:
+    """Geometric mean of a pixel's sides on the ground, metres, at (x, y) of the CRS."""
+    across_m = ground_distance_m(crs, (x - 50 * pixel_x, y), (x + 50 * pixel_x, y)) / 100
+    down_m = ground_distance_m(crs, (x, y - 50 * pixel_y), (x, y + 50 * pixel_y)) / 100
+    return math.sqrt(across_m * down_m)
+
+
+def ground_distance_m(crs: CRS, a: tuple[float, float], b: tuple[float, float]) -> float:
+    lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform([a[0], b[0]], [a[1], b[1]])
+    return float(Geod(ellps="WGS84").inv(lon_deg[0], lat_deg[0], lon_deg[1], lat_deg[1])[2])
+
+
+def crs_of(dataset: Any, path: Path) -> CRS:
+    """Horizontal CRS of a raster. Raises MapError when it is not placed on the earth."""
+    if dataset.transform == Affine.identity():
+        raise MapError(f"{path}: has no georeference; give a GeoTIFF, or add one with gdal_translate -a_ullr -a_srs")
+    if dataset.crs is None:
+        raise MapError(f"{path}: has no coordinate system; add it with gdal_translate -a_srs EPSG:nnnnn IN OUT")
+    authority = dataset.crs.to_authority()
+    crs = CRS.from_authority(*authority) if authority else CRS.from_wkt(dataset.crs.to_wkt())
+    if crs.is_compound:
+        crs = crs.sub_crs_list[0]
+    if not (crs.is_projected or crs.is_geographic):
+        raise MapError(f"{path}: coordinate system '{crs.name}' is not on the earth; reproject with gdalwarp -t_srs")
+    return crs
+
+
+def _utm_of(dataset: Any, crs: CRS) -> CRS:
+    """UTM zone of the centre: EPSG 326zz north, 327zz south."""
+    west, south, east, north = dataset.bounds
+    lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform((west + east) / 2, (south + north) / 2)
+    zone = int((lon_deg + 180.0) // 6.0) % 60 + 1
+    return CRS.from_epsg((32600 if lat_deg >= 0 else 32700) + zone)

@@ -1,0 +1,205 @@
+"""`terrafix replay`: a recorded flight through the same nodes that fly, as fast as this machine can."""
+
+import importlib
+import json
+import math
+import os
+import resource
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from terrafix.anchor.map_package import MapPackage
+from terrafix.core.config import Config, load
+from terrafix.core.errors import MapError, ModelError, UsageError
+from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import Node, NodeContext
+from terrafix.core.shell import InProcessShell
+from terrafix.messages import Message, Origin, SourceEnded
+from terrafix.processes import PROCESSES
+from terrafix.recorder.writer import versions
+from terrafix.vision.sources import Source, open_source
+
+from terrafix_tools.map_build import ensure_package
+from terrafix_tools.replay_output import ReplayOutput
+
+FLOWN = ("vision", "anchor", "estimator")  # processes that decide; link, health and recorder need a live world
+FRAMES_KEPT = 32  # what a node may still ask for; as many as the live ring has
+
+MakeNodes = Callable[[NodeContext], Mapping[str, Node]]
+
+
+def make_nodes(ctx: NodeContext) -> dict[str, Node]:
+    """The deciding nodes of the process table."""
+    return {p.name: importlib.import_module(p.module).make_node(ctx) for p in PROCESSES if p.name in FLOWN}
+
+
+def replay(
+    flight: Path | str,
+    map_path: Path | None,
+    out: Path,
+    *,
+    models: list[str] | None = None,
+    configs: list[Path] | None = None,
+    progress: bool = False,
+    start: tuple[float, float] | None = None,
+    nodes: MakeNodes = make_nodes,
+) -> dict[str, Any]:
+    """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
+
+    ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg) instead of the source's. Raises the TerrafixError family."""
+    began_s = time.perf_counter()
+    config = _with_models(load(configs or []), models or [])
+    source = open_source(str(flight), start=start)
+    if source.live:
+        raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
+    package = ensure_package(_map_of(map_path, config, source), map_cache_dir(), progress=progress)
+    origin, map_summary = _check_map(package, source.origin())
+    with ReplayOutput(out, config) as output:
+        frames = MemoryFrameStore(FRAMES_KEPT)
+        ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
+        heard: list[Message] = []
+        shell = InProcessShell(nodes(ctx), lambda _who, message: heard.append(message))
+        _fly(source, origin, shell, frames, heard, output, progress)
+        source.close()
+        summary = {
+            "flight": source.name(),
+            "source": str(flight),
+            "map": map_summary,
+            "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v},
+            "config": msgspec.to_builtins(config),
+            "versions": versions(),
+            **output.counts(),
+            # The peak of the whole process: kilobytes on Linux (getrusage(2)).
+            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "wall_s": round(time.perf_counter() - began_s, 2),
+        }
+        output.finish(summary)
+    if progress:
+        Console(stderr=True).print(_last_line(summary, out))
+    return summary
+
+
+def map_cache_dir() -> Path:
+    """Where packages made from GeoTIFFs are kept between runs."""
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "terrafix" / "maps"
+
+
+def _fly(
+    source: Source,
+    origin: Origin,
+    shell: InProcessShell,
+    frames: MemoryFrameStore,
+    heard: list[Message],
+    output: ReplayOutput,
+    progress: bool,
+) -> None:
+    """One frame after the other. Recording stands outside the measured time: in flight it is another process."""
+    shell.feed(origin)
+    output.take(heard)
+    heard.clear()
+    count, last_ns = 0, origin.t_ns
+    shots = source.shots()
+    with _bar(progress, source.length()) as step:
+        while True:
+            began_s = time.perf_counter()
+            shot = next(shots, None)  # reads and decodes the image
+            if shot is None:
+                break
+            if shot.image is not None:
+                frames.put(shot.frame.frame_id, shot.image)
+            for state in shot.states:
+                shell.feed(state)
+            shell.feed(shot.frame)
+            process_ms = (time.perf_counter() - began_s) * 1e3
+            output.take(heard)
+            output.frame_done(shot.frame, shot.image, process_ms)
+            heard.clear()
+            count, last_ns = count + 1, shot.frame.t_ns
+            step()
+    shell.feed(SourceEnded(t_ns=last_ns, frames=count))
+    output.take(heard)
+
+
+def _with_models(config: Config, models: list[str]) -> Config:
+    """The configuration with NAME=PATH of the command line in its [models]; every named file must exist."""
+    known = [f.name for f in msgspec.structs.fields(type(config.models))]
+    given: dict[str, str] = {}
+    for text in models:
+        name, equals, path = text.partition("=")
+        if not equals or not path:
+            raise UsageError(f"--model '{text}': write NAME=PATH, for example xfeat=models/xfeat.onnx")
+        if name not in known:
+            raise UsageError(f"--model '{text}': no model is called '{name}'; known: {', '.join(known)}")
+        given[name] = path
+    chosen = msgspec.structs.replace(config.models, **given)
+    for name, path in msgspec.to_builtins(chosen).items():
+        if path and not Path(path).is_file():
+            raise ModelError(
+                f"{path}: no such model file ({name}); check the path, or leave it out to fly without weights"
+            )
+    return msgspec.structs.replace(config, models=chosen)
+
+
+def _map_of(given: Path | None, config: Config, source: Source) -> Path:
+    chosen = given or (Path(config.map.path) if config.map.path else None) or source.map_hint()
+    if chosen is None:
+        raise MapError(f"{source.name()}: the flight names no map; give one with --map (GeoTIFF or map package)")
+    return chosen
+
+
+def _check_map(package: Path, origin: Origin) -> tuple[Origin, dict[str, Any]]:
+    """-> the origin with the height of its ground, where the map knows it; what the summary says of the map."""
+    opened = MapPackage.open(package)
+    try:
+        frame = LocalFrame(origin.lat_deg, origin.lon_deg)
+        local = opened.bind(frame)
+        if not opened.covers(origin.lat_deg, origin.lon_deg):
+            raise MapError(f"{package}: {_not_covered(origin, local.bounds_m)}; use another --map or check the start")
+        if origin.ground_amsl_m is None:
+            elevation = local.elevation(*frame.to_local(origin.lat_deg, origin.lon_deg))  # type: ignore[arg-type]
+            if elevation is not None and math.isfinite(float(elevation)):
+                origin = msgspec.structs.replace(origin, ground_amsl_m=float(elevation))
+        manifest = opened.manifest
+        return origin, {
+            "path": str(package),
+            "source": manifest.source,
+            "checksum": manifest.checksum,
+            "gsd_m": manifest.gsd_m,
+            "date": manifest.date,
+            "has_dem": manifest.has_dem,
+        }
+    finally:
+        opened.close()
+
+
+def _not_covered(origin: Origin, bounds_m: tuple[float, float, float, float]) -> str:
+    e_min, n_min, e_max, n_max = bounds_m
+    away_m = math.hypot(max(e_min, -e_max, 0.0), max(n_min, -n_max, 0.0))
+    place = f"start {origin.lat_deg:.6f}, {origin.lon_deg:.6f}"
+    if away_m == 0.0:
+        return f"has no imagery at the {place}"
+    distance = f"{away_m / 1000:.1f} km" if away_m >= 1000 else f"{away_m:.0f} m"
+    return f"does not cover the {place}; its nearest edge is {distance} away"
+
+
+@contextmanager
+def _bar(shown: bool, total: int | None) -> Iterator[Callable[[], None]]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+        task = progress.add_task("replay", total=total)
+        yield lambda: progress.advance(task)
+
+
+def _last_line(summary: dict[str, Any], out: Path) -> str:
+    timing = json.dumps(summary["frame_ms_median"])
+    return (
+        f"{summary['localised']} of {summary['frames']} frames localised, median {timing} ms a frame; written to {out}"
+    )

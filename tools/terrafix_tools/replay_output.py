@@ -1,0 +1,112 @@
+"""What a replay leaves behind: rows, record and summary, under temporary names until the flight is over."""
+
+import json
+from collections import Counter, defaultdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+import numpy as np
+from terrafix.core.config import Config
+from terrafix.core.errors import OutputError
+from terrafix.core.node import Image
+from terrafix.messages import Frame, MapMatch, MeasurementVerdict, Message, Odometry, Verdict
+from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
+
+from terrafix_tools.estimates import RowTable, write_rows
+
+ESTIMATES, RECORD, SUMMARY = "estimates.csv", "flight.mcap", "summary.json"
+DERIVED = ("evaluation.json", "report.html")  # made of the three above: those of an earlier replay would lie
+PARTIAL = ".partial"  # appended to a name until the flight is over
+
+
+class ReplayOutput:
+    """Use as a context: leaving it with an error keeps the partial files, which are readable."""
+
+    def __init__(self, out: Path, config: Config) -> None:
+        self._out = out
+        self._config = config
+        self._table = RowTable()
+        self._verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self._matcher: Counter[str] = Counter()
+        self._registered: dict[int, bool] = {}
+
+    def __enter__(self) -> Self:
+        """Raises OutputError when the folder cannot be written."""
+        try:
+            self._out.mkdir(parents=True, exist_ok=True)
+            for name in (ESTIMATES, RECORD, SUMMARY, *DERIVED):
+                (self._out / name).unlink(missing_ok=True)
+                (self._out / (name + PARTIAL)).unlink(missing_ok=True)
+            self._csv: TextIO = (self._out / (ESTIMATES + PARTIAL)).open("w", encoding="utf-8", newline="")
+        except OSError as error:
+            where = f"{self._out}: cannot be written ({error.strerror})"
+            raise OutputError(f"{where}; choose a folder that you may write with --out") from None
+        write_rows(self._csv, [])
+        self._record = FlightWriter(self._out / (RECORD + PARTIAL), header(self._config))
+        return self
+
+    def take(self, messages: list[Message]) -> None:
+        for message in messages:
+            self._record.write(message, message.t_ns)
+            self._table.take(message)
+            self._count(message)
+
+    def frame_done(self, frame: Frame, image: Image | None, process_ms: float) -> None:
+        """The row of the frame goes to the disk now, its refinement comes with the last word."""
+        settings = self._config.recorder
+        if settings.thumbnails and image is not None:
+            self._record.write_thumbnail(frame.t_ns, frame.frame_id, thumbnail_jpeg(image, settings.thumbnail_width_px))
+        self._record.flush()
+        row = self._table.rows[frame.frame_id]
+        row.process_ms = process_ms
+        write_rows(self._csv, [row], head=False)
+        self._csv.flush()
+
+    def counts(self) -> dict[str, Any]:
+        """Frames, verdicts and times, as summary.json has them."""
+        rows = list(self._table.rows.values())
+        times_ms = [r.process_ms for r in rows if r.process_ms is not None]
+        return {
+            "frames": len(rows),
+            "localised": sum(r.localised for r in rows),
+            "refined": sum(r.refined_lat_deg is not None for r in rows),
+            "odometry_frames": sum(self._registered.values()),
+            "verdicts": {what: dict(sorted(c.items())) for what, c in sorted(self._verdicts.items())},
+            "matcher_verdicts": dict(sorted(self._matcher.items())),
+            "frame_ms_median": round(float(np.median(times_ms)), 1) if times_ms else None,
+            "frame_ms_p95": round(float(np.percentile(times_ms, 95)), 1) if times_ms else None,
+        }
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Writes the refined rows and the summary, and gives everything its name."""
+        self._csv.close()
+        self._record.close()
+        try:
+            with (self._out / (ESTIMATES + PARTIAL)).open("w", encoding="utf-8", newline="") as stream:
+                write_rows(stream, self._table.rows.values())
+            text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+            (self._out / (SUMMARY + PARTIAL)).write_text(text, encoding="utf-8")
+            for name in (ESTIMATES, RECORD, SUMMARY):
+                (self._out / (name + PARTIAL)).replace(self._out / name)
+        except OSError as error:
+            raise OutputError(f"{self._out}: cannot be written ({error.strerror}); is the disk full?") from None
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._csv.closed:
+            self._csv.close()
+            self._record.close()
+
+    def _count(self, message: Message) -> None:
+        if isinstance(message, MeasurementVerdict):
+            self._verdicts[message.measurement][str(message.verdict)] += 1
+            if message.measurement == "odometry" and message.verdict is not Verdict.ACCEPTED:
+                self._registered[message.frame_id] = False
+        elif isinstance(message, MapMatch):
+            self._matcher[str(message.verdict)] += 1
+        elif isinstance(message, Odometry):
+            # A frame that starts a fragment refers to itself: that is no registration.
+            moved = message.verdict is Verdict.ACCEPTED and message.keyframe_id != message.frame_id
+            self._registered[message.frame_id] = moved

@@ -1,0 +1,142 @@
+"""`terrafix report`: one self-contained HTML page about a flight."""
+
+import json
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+
+from terrafix.core.errors import OutputError
+
+from terrafix_tools.estimates import Row
+from terrafix_tools.map_build import ensure_package
+from terrafix_tools.replay import map_cache_dir
+from terrafix_tools.report_charts import clock
+from terrafix_tools.report_data import FlightView, gather, radius95_m
+from terrafix_tools.report_map import map_svg
+from terrafix_tools.report_sections import accuracy, states, verdicts
+from terrafix_tools.report_sections_run import link, pictures, provenance, timing
+from terrafix_tools.report_text import figures, moments, stamp
+
+NAME = "report.html"
+
+
+def report(folder: Path, truth_path: Path | None = None, map_path: Path | None = None) -> Path:
+    """Writes FOLDER/report.html and returns its path. Raises the TerrafixError family.
+
+    Without ``truth_path`` a truth.csv in the folder is taken; without ``map_path`` the map that the flight used."""
+    view = gather(folder, truth_path)
+    page = _page(view, _map_package(folder, view, map_path))
+    target = folder / NAME
+    partial = folder / (NAME + ".partial")
+    try:
+        partial.write_text(page, encoding="utf-8")
+        partial.replace(target)
+    except OSError as error:
+        raise OutputError(f"{target}: cannot be written ({error.strerror})") from None
+    return target
+
+
+def _map_package(folder: Path, view: FlightView, given: Path | None) -> Path | None:
+    """The map given, or the one that the summary, the recorded configuration or the folder itself names."""
+    if given is not None:
+        return ensure_package(given, map_cache_dir())
+    config = view.header.get("config", {})
+    named = [view.summary.get("map", {}).get("path", ""), config.get("map", {}).get("path", "")]
+    candidates = [Path(name) for name in named if name.endswith(".gpkg")] + sorted(folder.glob("*.gpkg"))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _page(view: FlightView, map_path: Path | None) -> str:
+    sections = [
+        _stage(view, map_path),
+        _moments(view),
+        accuracy(view),
+        states(view),
+        verdicts(view),
+        timing(view),
+        link(view),
+        pictures(view),
+        provenance(view),
+    ]
+    data = json.dumps([{"t": round(r.t_s, 3), "h": _tip(view, r)} for r in view.rows]).replace("</", "<\\/")
+    assets = files("terrafix_tools") / "assets"
+    style = (assets / "report.css").read_text(encoding="utf-8")
+    script = (assets / "report.js").read_text(encoding="utf-8")
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{escape(view.title)} - flight report</title><style>{style}</style></head><body><main>"
+        f'{_head(view)}{"".join(sections)}</main><div id="tip"></div>'
+        f'<script type="application/json" id="frames">{data}</script><script>{script}</script></body></html>\n'
+    )
+
+
+def _head(view: FlightView) -> str:
+    kind = "live record" if view.live else "replay"
+    named = view.summary.get("map", {})
+    facts = [
+        f"{len(view.rows)} frames in {clock(round(view.duration_s))}",
+        f"map {Path(named['source']).stem}" if named.get("source") else "",
+        ", ".join(view.summary.get("models", {})) or ("" if view.live else "no learned model"),
+    ]
+    tiles = "".join(
+        f'<div><b class="{f.mood}">{escape(f.value)}<small>{escape(f.unit)}</small></b>'
+        f"<span>{escape(f.name)}</span></div>"
+        for f in figures(view)
+    )
+    line = " · ".join(escape(fact) for fact in facts if fact)
+    return (
+        f'<header><div class="eyebrow">Terrafix flight report, {kind}</div><h1>{escape(view.title)}</h1>'
+        f'<p>{line}</p></header><section class="figures">{tiles}</section>'
+    )
+
+
+def _stage(view: FlightView, map_path: Path | None) -> str:
+    svg = map_svg(view, map_path)
+    labels = {row.source_label for row in view.rows}
+    keys = [
+        ("k-sat", "map match", "satellite_anchored"),
+        ("k-vis", "carried by odometry", "visual_propagated"),
+        ("k-dead", "dead reckoning", "dead_reckoned"),
+    ]
+    shown = "".join(f'<span><i class="key {css}"></i> {text}</span>&ensp;' for css, text, key in keys if key in labels)
+    layers = [("estimates", shown or "estimates", True)]
+    if view.truth_track:
+        layers.append(("truth", '<i class="key k-truth"></i> ground truth', True))
+    if any(row.refined_lat_deg is not None for row in view.rows):
+        layers.append(("refined", '<i class="key k-refined"></i> refined afterwards', False))
+    layers.append(("ellipses", "95 % ellipses", True))
+    boxes = "".join(
+        f'<label><input type="checkbox" data-layer="{name}"{" checked" if on else ""}>{text}</label>'
+        for name, text, on in layers
+    )
+    buttons = (
+        '<div class="zoom"><button data-k=".6" aria-label="nearer">+</button>'
+        '<button data-k="1.667" aria-label="farther">−</button></div>'
+    )
+    return f'<div class="stage">{svg}{buttons}</div><div class="legend">{boxes}</div>'
+
+
+def _moments(view: FlightView) -> str:
+    rows = "".join(f"<li><time>{stamp(t)}</time><span>{escape(text)}</span></li>" for t, text in moments(view))
+    return f'<h2>What happened</h2><ol class="moments">{rows}</ol>'
+
+
+def _tip(view: FlightView, row: Row) -> str:
+    """What the pointer reads about a frame; HTML."""
+    lines = [f"<b>{escape(row.file) or 'frame'}</b> <span>{clock(round(row.t_s, 1))}</span>"]
+    if not row.localised:
+        lines.append("no position")
+    else:
+        lines.append(escape(row.source_label.replace("_", " ")))
+        if (error := view.error_m(row)) is not None:
+            lines.append(f"error <b>{error:.1f} m</b>")
+        if (radius := radius95_m(row)) is not None:
+            lines.append(f"claimed 95 % radius {radius:.1f} m")
+        if row.anchor_age_ms is not None and row.anchor_age_ms >= 0:
+            lines.append(f"last map match {row.anchor_age_ms / 1000:.1f} s ago")
+        if row.agl_m is not None:
+            lines.append(f"{row.agl_m:.0f} m above ground")
+    if row.process_ms is not None:
+        lines.append(f"<span>{row.process_ms:.0f} ms</span>")
+    return "<br>".join(lines)

@@ -1,0 +1,195 @@
+"""Charts of the report as plain SVG: no library, no script needed to read them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from html import escape
+
+WIDTH = 1000  # of a chart over the whole page, in its own units
+HALF_WIDTH = 540  # of a chart in a column
+GUTTER = 58  # left, for the labels of the y axis
+RIGHT = 14
+TOP = 12
+AXIS = 26  # bottom, for the labels of the x axis
+TICKS_X = 9
+
+Point = tuple[float, float | None]
+
+
+@dataclass
+class Chart:
+    """A frame with axes; marks are added in order and drawn in that order. x is linear, y linear or logarithmic."""
+
+    x_max: float
+    y_min: float
+    y_max: float
+    height: int = 250
+    width: int = WIDTH
+    x_min: float = 0.0
+    log_x: bool = False
+    log_y: bool = False
+    x_unit: str = "s"
+    y_unit: str = "m"
+    follow: bool = True  # the pointer's moment is marked in this chart
+    marks: list[str] = field(default_factory=list)
+
+    def x(self, value: float) -> float:
+        span = self.width - GUTTER - RIGHT
+        if self.log_x:
+            low, high = math.log10(self.x_min), math.log10(self.x_max)
+            share = (math.log10(max(value, self.x_min)) - low) / (high - low)
+        else:
+            share = (value - self.x_min) / max(self.x_max - self.x_min, 1e-9)
+        return GUTTER + span * min(1.0, max(0.0, share))
+
+    def y(self, value: float) -> float:
+        span = self.height - TOP - AXIS
+        if self.log_y:
+            low, high = math.log10(self.y_min), math.log10(self.y_max)
+            share = (math.log10(max(value, self.y_min)) - low) / (high - low)
+        else:
+            share = (value - self.y_min) / max(self.y_max - self.y_min, 1e-9)
+        return self.height - AXIS - span * min(1.0, max(0.0, share))
+
+    def line(self, points: Sequence[Point], css: str) -> None:
+        """A line that breaks where a value is None."""
+        for run in _runs(points):
+            text = " ".join(f"{self.x(a):.1f},{self.y(b):.1f}" for a, b in run)
+            self.marks.append(f'<polyline class="line {css}" points="{text}"/>')
+
+    def area(self, points: Sequence[Point], css: str) -> None:
+        """Filled from the bottom of the chart up to the line."""
+        floor = self.height - AXIS
+        for run in _runs(points):
+            text = " ".join(f"{self.x(a):.1f},{self.y(b):.1f}" for a, b in run)
+            left, right = self.x(run[0][0]), self.x(run[-1][0])
+            self.marks.append(f'<polygon class="area {css}" points="{left:.1f},{floor} {text} {right:.1f},{floor}"/>')
+
+    def bar(self, x_low: float, x_high: float, value: float, css: str, tip: str) -> None:
+        left, right, top = self.x(x_low), self.x(x_high), self.y(value)
+        self.marks.append(
+            f'<rect class="bar {css}" x="{left + 0.5:.1f}" y="{top:.1f}" width="{max(1.0, right - left - 1):.1f}" '
+            f'height="{max(0.0, self.height - AXIS - top):.1f}"><title>{escape(tip)}</title></rect>'
+        )
+
+    def upright(self, value: float, text: str, row: int = 0) -> None:
+        """A vertical line with words in the ``row``-th line of text beside it; rows keep neighbours apart."""
+        x = self.x(value)
+        anchor, dx = ("end", -5) if x > self.width * 0.6 else ("start", 5)
+        self.marks.append(
+            f'<line class="upright" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{self.height - AXIS}"/>'
+            f'<text class="note" x="{x + dx:.1f}" y="{TOP + 10 + 16 * row}" text-anchor="{anchor}">'
+            f"{escape(text)}</text>"
+        )
+
+    def level(self, value: float, text: str = "") -> None:
+        """A horizontal line, with a word at its right end."""
+        y = self.y(value)
+        self.marks.append(
+            f'<line class="level" x1="{GUTTER}" x2="{self.width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<text class="note" x="{self.width - RIGHT - 4}" y="{y - 4:.1f}" text-anchor="end">{escape(text)}</text>'
+        )
+
+    def svg(self, label: str) -> str:
+        cursor = f'<line class="cursor" y1="{TOP}" y2="{self.height - AXIS}"/>' if self.follow else ""
+        data = f' data-x0="{GUTTER}" data-x1="{self.width - RIGHT}" data-t1="{self.x_max:.3f}"' if self.follow else ""
+        return (
+            f'<svg class="chart" viewBox="0 0 {self.width} {self.height}" role="img"{data} '
+            f'aria-label="{escape(label)}">'
+            f"{self._grid()}{''.join(self.marks)}{cursor}</svg>"
+        )
+
+    def _grid(self) -> str:
+        parts = []
+        floor = self.height - AXIS
+        for value in ticks(self.y_min, self.y_max, 5, self.log_y):
+            y = self.y(value)
+            parts.append(f'<line class="grid" x1="{GUTTER}" x2="{self.width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
+            text = escape(f"{value:g} {self.y_unit}".strip())
+            parts.append(f'<text x="{GUTTER - 8}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
+        for value in ticks(self.x_min, self.x_max, TICKS_X * self.width // WIDTH, self.log_x, self.x_unit == "s"):
+            text = clock(value) if self.x_unit == "s" else f"{value:g} {self.x_unit}"
+            parts.append(f'<text x="{self.x(value):.1f}" y="{floor + 18}" text-anchor="middle">{escape(text)}</text>')
+        return "".join(parts)
+
+
+@dataclass
+class Band:
+    """One row of a strip: (from, to, css class, what the pointer reads)."""
+
+    name: str
+    spans: list[tuple[float, float, str, str]]
+
+
+def strips(bands: Sequence[Band], x_max: float, label: str) -> str:
+    """Rows of coloured spans over one time axis."""
+    row, gap = 20, 8
+    height = len(bands) * (row + gap) + AXIS
+    axis = Chart(x_max=x_max, y_min=0, y_max=1, height=height)
+    parts = []
+    for i, band in enumerate(bands):
+        top = i * (row + gap)
+        parts.append(f'<text x="{GUTTER - 8}" y="{top + 14}" text-anchor="end">{escape(band.name)}</text>')
+        parts.append(f'<rect class="rail" x="{GUTTER}" y="{top}" width="{WIDTH - GUTTER - RIGHT}" height="{row}"/>')
+        for low, high, css, tip in band.spans:
+            left, right = axis.x(low), axis.x(high)
+            parts.append(
+                f'<rect class="{css}" x="{left:.1f}" y="{top}" width="{max(0.8, right - left):.1f}" height="{row}">'
+                f"<title>{escape(tip)}</title></rect>"
+            )
+    for value in ticks(0.0, x_max, TICKS_X, sixties=True):
+        parts.append(f'<text x="{axis.x(value):.1f}" y="{height - 8}" text-anchor="middle">{clock(value)}</text>')
+    parts.append(f'<line class="cursor" y1="0" y2="{height - AXIS}"/>')
+    data = f'data-x0="{GUTTER}" data-x1="{WIDTH - RIGHT}" data-t1="{x_max:.3f}"'
+    return (
+        f'<svg class="chart strips" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(label)}" {data}>'
+        f"{''.join(parts)}</svg>"
+    )
+
+
+def ticks(low: float, high: float, count: int, log: bool = False, sixties: bool = False) -> list[float]:
+    """Round values inside [low, high]; ``sixties``: round as minutes are."""
+    if log:
+        decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+        return [v for d in decades for v in (10.0**d, 2 * 10.0**d, 5 * 10.0**d) if low <= v <= high]
+    span = high - low
+    if span <= 0:
+        return [low]
+    raw = span / count
+    power = 10 ** math.floor(math.log10(raw))
+    steps = (1, 1.5, 3, 6, 12) if sixties and raw >= 10 else (1, 2, 5, 10)
+    step = next(s * power for s in steps if s * power >= raw)
+    first = math.ceil(low / step)
+    return [round(i * step, 9) for i in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def clock(seconds: float) -> str:
+    """75 -> 1:15"""
+    whole = round(seconds)
+    if abs(seconds - whole) > 1e-6 and seconds < 60:
+        return f"{seconds:g} s"
+    hours, rest = divmod(whole, 3600)
+    minutes, rest = divmod(rest, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def spans_of(samples: Sequence[tuple[float, str]], end: float) -> list[tuple[float, float, str]]:
+    """Samples of a state -> stretches of one state, each until the next sample."""
+    spans: list[tuple[float, float, str]] = []
+    for i, (at, state) in enumerate(samples):
+        until = samples[i + 1][0] if i + 1 < len(samples) else max(end, at)
+        if spans and spans[-1][2] == state and abs(spans[-1][1] - at) < 1e-9:
+            spans[-1] = (spans[-1][0], until, state)
+        else:
+            spans.append((at, until, state))
+    return spans
+
+
+def _runs(points: Sequence[Point]) -> list[list[tuple[float, float]]]:
+    runs: list[list[tuple[float, float]]] = [[]]
+    for a, b in points:
+        if b is None:
+            runs.append([])
+        else:
+            runs[-1].append((a, b))
+    return [run for run in runs if run]

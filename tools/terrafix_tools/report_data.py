@@ -1,0 +1,180 @@
+"""What a report shows, gathered from the folder of a replay or of a live run."""
+
+import json
+import math
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from terrafix.core.errors import EvaluationError, SourceError
+from terrafix.messages import (
+    Dropped,
+    GpsInput,
+    Health,
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Origin,
+    ProcessEvent,
+    StatusText,
+)
+from terrafix.recorder.reader import ReadResult, read_flight, read_thumbnails
+
+from terrafix_tools.estimates import NS, Row, RowTable, read_rows
+from terrafix_tools.evaluate import (
+    ELLIPSE95,
+    Compared,
+    Truth,
+    compare,
+    metrics,
+    read_summary,
+    read_truth,
+    truth_sigma_of,
+)
+
+
+@dataclass
+class FlightView:
+    """Everything in order of time; times in seconds from the first frame."""
+
+    title: str
+    rows: list[Row]
+    frame_ids: list[int]
+    origin: Origin | None = None
+    live: bool = False  # from a record of the live processes; process_ms is then the delay of the estimate
+    summary: dict[str, Any] = field(default_factory=dict)
+    header: dict[str, Any] = field(default_factory=dict)
+    verdicts: dict[str, Counter[str]] = field(default_factory=dict)
+    map_verdict: dict[int, str] = field(default_factory=dict)  # by frame id
+    health: list[tuple[float, str, float | None]] = field(default_factory=list)  # t_s, band, temperature
+    gps: list[tuple[float, GpsInput]] = field(default_factory=list)
+    events: list[tuple[float, ProcessEvent]] = field(default_factory=list)
+    pilot_texts: list[tuple[float, StatusText]] = field(default_factory=list)
+    dropped: Counter[str] = field(default_factory=Counter)  # "process: message"
+    thumbnails: dict[int, bytes] = field(default_factory=dict)
+    compared: dict[str, Compared] = field(default_factory=dict)  # by file, when there is truth
+    truth_track: list[Truth] = field(default_factory=list)
+    evaluation: dict[str, Any] | None = None
+    peer: dict[str, Any] = field(default_factory=dict)  # what the simulated autopilot noted
+    cut_off: int = 0  # record files without their end
+
+    @property
+    def duration_s(self) -> float:
+        ends = [self.rows[-1].t_s] if self.rows else []
+        ends += [series[-1][0] for series in (self.gps, self.health) if series]
+        return max(ends, default=0.0)
+
+    def error_m(self, row: Row) -> float | None:
+        found = self.compared.get(row.file)
+        return found.error_m if found else None
+
+    def refined_error_m(self, row: Row) -> float | None:
+        found = self.compared.get(row.file)
+        return found.refined_error_m if found else None
+
+
+def radius95_m(row: Row) -> float | None:
+    """Longer half axis of the claimed 95 % ellipse."""
+    axes = ellipse95(row)
+    return axes[0] if axes else None
+
+
+def ellipse95(row: Row) -> tuple[float, float, float] | None:
+    """Half axes a >= b (m) and the direction of a (radians from east towards north) of the claimed 95 % ellipse."""
+    if row.sigma_e_m is None or row.sigma_n_m is None or row.cov_en_m2 is None:
+        return None
+    ee, nn, en = row.sigma_e_m**2, row.sigma_n_m**2, row.cov_en_m2
+    middle, spread = (ee + nn) / 2, math.hypot((ee - nn) / 2, en)
+    angle = math.atan2(2 * en, ee - nn) / 2
+    return math.sqrt(ELLIPSE95 * (middle + spread)), math.sqrt(ELLIPSE95 * max(0.0, middle - spread)), angle
+
+
+def gather(folder: Path, truth_path: Path | None) -> FlightView:
+    """Raises SourceError when the folder holds no flight, EvaluationError for a truth that does not fit."""
+    if not folder.is_dir():
+        raise SourceError(f"{folder}: no such folder; give the output of replay, run or demo")
+    summary = read_summary(folder)
+    table, zero_ns, view = _read_record(folder)
+    if (folder / "estimates.csv").is_file():
+        view.rows = read_rows(folder / "estimates.csv")
+    else:
+        view.live = True
+        view.rows = list(table.rows.values())
+    view.frame_ids = list(table.rows)
+    if not view.rows:
+        raise SourceError(f"{folder}: the record holds no frame; was the source of the flight opened?")
+    for row in view.rows:
+        row.t_s -= zero_ns / NS
+    view.summary = summary
+    view.title = str(summary.get("flight") or folder.resolve().name)
+    view.thumbnails = dict(read_thumbnails(folder))
+    view.peer = _read_peer(folder / "peer.json")
+    beside = folder / "truth.csv"
+    if truth_path is None and beside.is_file():
+        truth_path = beside
+    if truth_path is not None:
+        _add_truth(view, truth_path)
+    return view
+
+
+def _add_truth(view: FlightView, truth_path: Path) -> None:
+    truth = read_truth(truth_path)
+    view.compared = {c.row.file: c for c in compare(view.rows, truth)}
+    view.evaluation = metrics(view.rows, truth, view.summary, truth_sigma_of(truth_path))
+    view.truth_track = [c.truth for c in view.compared.values()]
+
+
+def _read_peer(path: Path) -> dict[str, Any]:
+    try:
+        noted = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{path}: cannot be read ({error})") from None
+    return noted if isinstance(noted, dict) else {}
+
+
+def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
+    """One pass over the record. -> rows, time of the first frame, the rest of the view."""
+    result = ReadResult()
+    table = RowTable()
+    view = FlightView(title="", rows=[], frame_ids=[])
+    verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    sent_ns: dict[int, int] = {}
+    timed: list[tuple[int, Message]] = []
+    for _, t_ns, message in read_flight(folder, result):
+        table.take(message)
+        if isinstance(message, NavEstimate):
+            sent_ns.setdefault(message.frame_id, message.emitted_at_ns - message.t_ns)
+        elif isinstance(message, MeasurementVerdict):
+            verdicts[message.measurement][str(message.verdict)] += 1
+            if message.measurement == "map":
+                view.map_verdict[message.frame_id] = str(message.verdict)
+        elif isinstance(message, MapMatch):
+            view.map_verdict.setdefault(message.frame_id, str(message.verdict))
+        elif isinstance(message, Origin):
+            view.origin = message
+        elif isinstance(message, Dropped):
+            view.dropped[f"{message.process}: {message.message}"] += message.count
+        elif isinstance(message, Health | GpsInput | ProcessEvent | StatusText):
+            timed.append((t_ns, message))
+    for frame_id, row in table.rows.items():
+        if frame_id in sent_ns:
+            row.process_ms = sent_ns[frame_id] / 1e6
+    zero_ns = round(min((row.t_s for row in table.rows.values()), default=0.0) * NS)
+    for t_ns, message in sorted(timed, key=lambda item: item[0]):
+        t_s = (t_ns - zero_ns) / NS
+        if isinstance(message, Health):
+            view.health.append((t_s, str(message.band), message.temperature_c))
+        elif isinstance(message, GpsInput):
+            view.gps.append((t_s, message))
+        elif isinstance(message, ProcessEvent):
+            view.events.append((t_s, message))
+        elif isinstance(message, StatusText):
+            view.pilot_texts.append((t_s, message))
+    view.verdicts = dict(sorted(verdicts.items()))
+    view.header = result.header
+    view.cut_off = len(result.cut_off)
+    return table, zero_ns, view
