@@ -1,6 +1,7 @@
 """Entry of every process of the daemon: ``python -m terrafix.child NAME RUN_DIR SUPERVISOR_PID``.
 
-A user's mistake is one line and the exit code of its kind; a bug is a traceback; both are the supervisor's to judge."""
+A user's mistake is one line and the exit code of its kind, a bug is a traceback; the supervisor decides what
+follows."""
 
 import ctypes
 import faulthandler
@@ -104,7 +105,8 @@ def main(arguments: list[str]) -> int:
     try:
         run_process(name, ctx, run_dir, stopping=stopping.is_set, table=table)
     except TerrafixError as error:
-        sys.stderr.write(f"terrafix {name}: {error}\n")
+        run_dir.mistake(name).write_text(str(error), encoding="utf-8")
+        logs.get().error("cannot go on", reason=str(error))
         return error.exit_code
     return 0
 

@@ -36,6 +36,14 @@ class Event:
     detail: str = ""
 
 
+@dataclass(frozen=True)
+class Mistake:
+    """Why a process could not even start, when that is something the user can mend."""
+
+    exit_code: int
+    text: str
+
+
 class State(Enum):
     WAITING = "waiting"  # to be started, now or after a pause
     STARTING = "starting"  # no progress stamp yet
@@ -63,7 +71,7 @@ class Child:
         """``output``: where stdout and stderr of the process go; None: where ours go."""
         self.process = process
         self.state = State.WAITING
-        self.user_mistake: int | None = None  # exit code, when it could not even start for something the user can mend
+        self.mistake: Mistake | None = None
         self.progress = Progress.create(run_dir.progress(process.name))
         self._run_dir = run_dir
         self._output = output
@@ -139,8 +147,10 @@ class Child:
         if not self._killed:
             yield Event("died", describe(code))
         if code in USER_MISTAKES and not self._was_ready:
-            self.state, self.user_mistake = State.GAVE_UP, code
-            yield Event("gave_up", "cannot start: see its message")
+            file = self._run_dir.mistake(self.process.name)
+            self.mistake = Mistake(code, file.read_text(encoding="utf-8") if file.exists() else "no reason given")
+            self.state = State.GAVE_UP
+            yield Event("gave_up", f"cannot start: {self.mistake.text}")
             return
         pause_ns = self._window.died(now_ns)
         if pause_ns is None:

@@ -175,6 +175,7 @@ class MapMatch(Message, frozen=True, kw_only=True):
     frame_id: int
     verdict: Verdict
     matcher: str  # "gradient", "xfeat"
+    coarse: bool = False  # position of the belief's mode alone: no 2D-3D matches agreed
     matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight
     p_c_in_w_m: Vec3 | None = None
     q_w_c: Quat | None = None

@@ -8,6 +8,7 @@ import contextlib
 import os
 import signal
 import socket
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -57,10 +58,12 @@ def run(
     """Flies until a signal, until ``stop`` is set, or (``stop_after_source``) until the source has ended.
 
     ``source``, ``map_path`` (a map package), ``link``, ``start`` ("LAT,LON"): win over the configuration when not
-    empty. ``on_event`` gets everything that happens to the processes, ``on_epoch`` once the t_ns of the first Origin: the zero of a recorded
-    source on the monotonic clock. ``log_to``: file for all logs and tracebacks instead of stdout and stderr.
+    empty. ``on_event`` gets everything that happens to the processes, ``on_epoch`` once the t_ns of the first Origin:
+    the zero of a recorded source on the monotonic clock. ``log_to``: file for all logs and tracebacks instead of
+    stdout and stderr.
     Returns 0, or 1 when the link gave up, or the exit code of a process that could not start for a reason that the
-    user can mend (its message is on stderr). Raises ConfigError, MapError, OutputError before anything is started."""
+    user can mend (said on stderr, in one line, at the end). Raises ConfigError, MapError, OutputError before anything
+    is started."""
     config = _with_overrides(configuration.load(configs), source, start, map_path, link)
     out_dir = _writable(out_dir)
     package = _map_package(config.map.path)
@@ -82,7 +85,10 @@ def run(
         supervisor = Supervisor(children, publisher, subscriber, stop, stop_after_source, on_event)
         if on_epoch:
             supervisor.tell_epoch(owned.run_dir, on_epoch)
-        return supervisor.run()
+        code = supervisor.run()
+        for mistake in (child.mistake for child in children if child.mistake):
+            sys.stderr.write(f"terrafix: {mistake.text}\n")  # the last word, after all logs
+        return code
 
 
 class Supervisor:
@@ -139,8 +145,8 @@ class Supervisor:
             if self._may_start(child, now):
                 for event in child.check(now):
                     self._say(child, event)
-            if child.user_mistake is not None:
-                return child.user_mistake
+            if child.mistake is not None:
+                return child.mistake.exit_code
             if child.process.name == VITAL and child.state in (State.GAVE_UP, State.FINISHED):
                 return 1
         if self._look_for_epoch and not self._look_for_epoch():

@@ -100,7 +100,7 @@ class Worker(Silent):
     def _maybe_trouble(self, frame_id: int) -> None:
         trouble = os.environ.get("TROUBLE")
         once = self._ctx.out_dir / "trouble"
-        if trouble is None or frame_id < 10 or once.exists():
+        if trouble not in ("stuck", "bug") or frame_id < 10 or once.exists():
             return
         once.touch()
         if trouble == "stuck":
@@ -133,6 +133,8 @@ class FileEdge:
 
 def make_node(ctx: NodeContext) -> Node:
     role = process_name()
+    if os.environ.get("TROUBLE") == f"{role} always":
+        raise ZeroDivisionError("a bug at every start")
     if role == "link" and ctx.config.link.device == "broken":
         raise LinkError("broken: no such device; check --link")
     return {"estimator": lambda: Worker(ctx), "link": Link}.get(role, Silent)()

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from flight_records import frame, live_messages, origin, write_record, write_truth
 from terrafix.core.errors import SourceError
+from terrafix_tools.estimates import Row, write_rows
 from terrafix_tools.report import report
 from terrafix_tools.report_charts import clock, spans_of, ticks
 
@@ -71,6 +72,13 @@ def test_a_record_that_was_cut_off_is_reported_and_said_so(tmp_path: Path) -> No
     data = (tmp_path / "flight-000.mcap").read_bytes()
     (tmp_path / "flight-000.mcap").write_bytes(data[: len(data) * 3 // 4])
     assert "1 file(s) of the record end abruptly" in page_of(tmp_path).text
+
+
+def test_a_replay_that_was_killed(tmp_path: Path) -> None:
+    write_record(tmp_path / "flight.mcap.partial", live_messages())
+    with (tmp_path / "estimates.csv.partial").open("w") as stream:
+        write_rows(stream, [Row(file="0000.jpg", t_s=0.0), Row(file="0001.jpg", t_s=0.5)])
+    assert "replay, unfinished" in page_of(tmp_path).text
 
 
 def test_a_flight_without_any_position(tmp_path: Path) -> None:

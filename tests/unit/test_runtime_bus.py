@@ -66,6 +66,22 @@ def test_late_comers_get_the_origin_and_others_do_not_get_it_twice(
         side.close()
 
 
+def test_events_of_processes_are_said_again_while_they_are_news(
+    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+) -> None:
+    clock_ns = [0]
+    publisher = Publisher(context, run_dir.address("supervisor"), clock=lambda: clock_ns[0])
+    for second in (0, 15, 16):
+        clock_ns[0] = second * 1_000_000_000
+        publisher.say(m.ProcessEvent(t_ns=clock_ns[0], process="anchor", event="died"))
+    clock_ns[0] = 20_000_000_000
+    late = Subscriber(context, [run_dir.address("supervisor")], (m.ProcessEvent,))
+    got = collect(late, publisher, lambda got: len(got) == 2)
+    assert [e.t_ns for e in got] == [15_000_000_000, 16_000_000_000]
+    late.close()
+    publisher.close()
+
+
 def test_a_restarted_publisher_is_found_again_and_its_origin_counts(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:

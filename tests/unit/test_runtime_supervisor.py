@@ -160,12 +160,31 @@ def test_a_stuck_child_is_noticed_says_where_and_is_restarted(tmp_path: Path, mo
     assert f.names("link") == ["started", "stopped"]
 
 
-def test_a_mistake_of_the_user_is_one_line_and_its_exit_code(tmp_path: Path) -> None:
+def test_a_mistake_of_the_user_is_one_line_and_its_exit_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with flight(tmp_path, link="broken") as f:
         f.wait(within_s=10)
     assert f.code == 7
-    lines = [line for line in f.log.read_text().splitlines() if not line.startswith("{")]
-    assert lines == ["terrafix link: broken: no such device; check --link"]
+    assert capsys.readouterr().err == "terrafix: broken: no such device; check --link\n"
+    assert all(line.startswith("{") for line in f.log.read_text().splitlines()), "no traceback"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ill", "code"), [("estimator", 0), ("link", 1)])
+def test_only_a_link_that_gives_up_ends_the_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ill: str, code: int
+) -> None:
+    monkeypatch.setenv("TROUBLE", f"{ill} always")
+    with flight(tmp_path) as f:
+        eventually(lambda: "gave_up" in f.names(ill), 30)
+        if ill == "link":
+            f.wait(within_s=20)
+        else:
+            count = len(f.heard())
+            eventually(lambda: sum(isinstance(e, m.Frame) for e in f.heard()[count:]) > 5, 10)
+    assert f.code == code
+    assert f.names(ill) == ["started", *["died", "restarted"] * RESTART_LIMIT, "died", "gave_up"]
 
 
 RUNNER = """

@@ -27,6 +27,7 @@ def run(
 ) -> None:
     """Fly: start the processes under the supervisor until stopped."""
     from terrafix.supervisor import run as run_supervised
+
     from terrafix_tools.live import package_for
 
     configs = config or []

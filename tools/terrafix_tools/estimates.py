@@ -58,6 +58,8 @@ DIGITS: dict[str, int] = {
 _TEXT = ("file", "source_label", "covariance_mode")
 _REQUIRED = ("file", "lat_deg", "lon_deg", "sigma_e_m", "sigma_n_m", "cov_en_m2")
 NS = 1_000_000_000
+ESTIMATES = "estimates.csv"
+PARTIAL = ".partial"  # appended to the name of an output until the flight is over
 
 
 def yaw_deg_of(estimate: NavEstimate) -> float:

@@ -19,7 +19,7 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     spec = source or config.source.path
     given = map_path or (Path(config.map.path) if config.map.path else None)
     place: tuple[float, float] | None = parse_start(start or config.source.start)
-    if not spec or os.path.exists(os.path.expanduser(spec)) and not spec.startswith("/dev/"):
+    if not spec or (os.path.exists(os.path.expanduser(spec)) and not spec.startswith("/dev/")):
         opened = open_configured(config.source, spec, place)
         given = given or opened.map_hint()
         origin = opened.origin()

@@ -1,24 +1,20 @@
 """An autopilot on a local UDP port that really consumes GPS_INPUT: ArduPilot's rules, a course to fly, a report.
 
-``AutopilotPeer`` runs in a thread; ``python -m terrafix_tools.peer COURSE.csv --port N --out peer.json`` is the same
-in a process of its own, stopped by SIGTERM or SIGINT. It stands in for a flight controller; it is not one."""
+``AutopilotPeer`` runs in a thread; peer_process.py is the same in a process of its own. It stands in for a flight
+controller; it is not one."""
 
 import select
-import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from terrafix.core.errors import LinkError, TerrafixError
+from terrafix.core.errors import LinkError
 from terrafix.link.carry import distance_m
 
-from terrafix_tools.peer_course import Course, PeerState, read_course
+from terrafix_tools.peer_course import Course, PeerState
 from terrafix_tools.peer_filter import Fusion, PositionFilter
 from terrafix_tools.peer_gps import TYPE_MAV, Fix, GpsDriver
 from terrafix_tools.peer_report import PeerReport, quantile
@@ -272,35 +268,3 @@ class AutopilotPeer:
         report.position_error_final_m = self._errors[-1] if self._errors else None
         report.horiz_accuracy_median_m = quantile(self._accuracies, 0.5)
         return report
-
-
-def fly_course(
-    course: Annotated[Path, typer.Argument(help="Course: CSV as peer_course.py writes it.")],
-    port: Annotated[int, typer.Option(help="UDP port on 127.0.0.1; 0 takes a free one.")] = 14550,
-    out: Annotated[Path, typer.Option(help="Report to write at the end.")] = Path("peer.json"),
-    start_ns: Annotated[int, typer.Option(help="Monotonic time of second 0 of the course; default: now.")] = 0,
-    seed: Annotated[int, typer.Option(help="Seed of the sensor noise.")] = 0,
-    aligned: Annotated[bool, typer.Option(help="Starts in the air, position known.")] = True,
-) -> None:
-    """Flies until SIGTERM or SIGINT, then writes the report."""
-    stopping = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopping.set())
-    zero_ns = start_ns or time.monotonic_ns()
-    peer = AutopilotPeer(seed=seed, aligned=aligned)
-    used = peer.start(port, read_course(course), lambda: (time.monotonic_ns() - zero_ns) * 1e-9)
-    typer.echo(f"autopilot peer on udp 127.0.0.1:{used}")
-    stopping.wait()
-    peer.stop().write(out)
-
-
-def main() -> None:
-    try:
-        typer.run(fly_course)
-    except TerrafixError as error:
-        typer.echo(f"terrafix peer: {error}", err=True)
-        sys.exit(error.exit_code)
-
-
-if __name__ == "__main__":
-    main()

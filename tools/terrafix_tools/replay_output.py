@@ -13,11 +13,10 @@ from terrafix.core.node import Image
 from terrafix.messages import Frame, MapMatch, MeasurementVerdict, Message, Odometry, Verdict
 from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
 
-from terrafix_tools.estimates import RowTable, write_rows
+from terrafix_tools.estimates import ESTIMATES, PARTIAL, RowTable, write_rows
 
-ESTIMATES, RECORD, SUMMARY = "estimates.csv", "flight.mcap", "summary.json"
+RECORD, SUMMARY = "flight.mcap", "summary.json"
 DERIVED = ("evaluation.json", "report.html")  # made of the three above: those of an earlier replay would lie
-PARTIAL = ".partial"  # appended to a name until the flight is over
 
 
 class ReplayOutput:

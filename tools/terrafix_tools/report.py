@@ -18,6 +18,7 @@ from terrafix_tools.report_sections_run import link, pictures, provenance, timin
 from terrafix_tools.report_text import figures, moments, stamp
 
 NAME = "report.html"
+ONE_ROW = 7  # so many figures fit beside each other; more are set in two even rows
 
 
 def report(folder: Path, truth_path: Path | None = None, map_path: Path | None = None) -> Path:
@@ -72,22 +73,24 @@ def _page(view: FlightView, map_path: Path | None) -> str:
 
 
 def _head(view: FlightView) -> str:
-    kind = "live record" if view.live else "replay"
+    kind = "live record" if view.live else "replay, unfinished" if view.unfinished else "replay"
     named = view.summary.get("map", {})
     facts = [
         f"{len(view.rows)} frames in {clock(round(view.duration_s))}",
         f"map {Path(named['source']).stem}" if named.get("source") else "",
         ", ".join(view.summary.get("models", {})) or ("" if view.live else "no learned model"),
     ]
+    shown = figures(view)
     tiles = "".join(
         f'<div><b class="{f.mood}">{escape(f.value)}<small>{escape(f.unit)}</small></b>'
         f"<span>{escape(f.name)}</span></div>"
-        for f in figures(view)
+        for f in shown
     )
+    wide = " wide" if len(shown) > ONE_ROW else ""
     line = " · ".join(escape(fact) for fact in facts if fact)
     return (
         f'<header><div class="eyebrow">Terrafix flight report, {kind}</div><h1>{escape(view.title)}</h1>'
-        f'<p>{line}</p></header><section class="figures">{tiles}</section>'
+        f'<p>{line}</p></header><section class="figures{wide}">{tiles}</section>'
     )
 
 

@@ -7,7 +7,7 @@ from html import escape
 
 WIDTH = 1000  # of a chart over the whole page, in its own units
 HALF_WIDTH = 540  # of a chart in a column
-GUTTER = 58  # left, for the labels of the y axis
+GUTTER = 70  # left, for the labels of the y axis
 RIGHT = 14
 TOP = 12
 AXIS = 26  # bottom, for the labels of the x axis

@@ -20,9 +20,9 @@ from terrafix.messages import (
     ProcessEvent,
     StatusText,
 )
-from terrafix.recorder.reader import ReadResult, read_flight, read_thumbnails
+from terrafix.recorder.reader import ReadResult, read_heard, read_thumbnails
 
-from terrafix_tools.estimates import NS, Row, RowTable, read_rows
+from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, Row, RowTable, read_rows
 from terrafix_tools.evaluate import (
     ELLIPSE95,
     Compared,
@@ -43,6 +43,7 @@ class FlightView:
     rows: list[Row]
     frame_ids: list[int]
     origin: Origin | None = None
+    unfinished: bool = False  # a replay that was killed
     live: bool = False  # from a record of the live processes; process_ms is then the delay of the estimate
     summary: dict[str, Any] = field(default_factory=dict)
     header: dict[str, Any] = field(default_factory=dict)
@@ -97,8 +98,10 @@ def gather(folder: Path, truth_path: Path | None) -> FlightView:
         raise SourceError(f"{folder}: no such folder; give the output of replay, run or demo")
     summary = read_summary(folder)
     table, zero_ns, view = _read_record(folder)
-    if (folder / "estimates.csv").is_file():
-        view.rows = read_rows(folder / "estimates.csv")
+    tables = [path for name in (ESTIMATES, ESTIMATES + PARTIAL) if (path := folder / name).is_file()]
+    if tables:
+        view.rows = read_rows(tables[0])
+        view.unfinished = tables[0].name != ESTIMATES
     else:
         view.live = True
         view.rows = list(table.rows.values())
@@ -144,10 +147,11 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
     verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     sent_ns: dict[int, int] = {}
     timed: list[tuple[int, Message]] = []
-    for _, t_ns, message in read_flight(folder, result):
+    for _, t_ns, heard_ns, message in read_heard(folder, result):
         table.take(message)
         if isinstance(message, NavEstimate):
-            sent_ns.setdefault(message.frame_id, message.emitted_at_ns - message.t_ns)
+            # Of the estimate that the row shows, the last one; the recorder looks at its clock every 10 ms.
+            sent_ns[message.frame_id] = heard_ns - message.t_ns
         elif isinstance(message, MeasurementVerdict):
             verdicts[message.measurement][str(message.verdict)] += 1
             if message.measurement == "map":

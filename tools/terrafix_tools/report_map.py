@@ -20,7 +20,8 @@ MIN_SPAN_M = 160.0  # a hovering flight still gets some ground around it
 ASPECT = (1.25, 2.0)  # narrowest and widest picture (width over height)
 JPEG_QUALITY = 80
 VOID_BGR = (226, 230, 230)  # where the map has nothing
-ELLIPSES = 45  # about so many over the flight; more hide the ground
+ELLIPSE_SPACING = 1.1  # distance of ellipses in their own lengths: they tile the track and do not hide it
+SMALLEST_SPACING_PX = 24.0
 SCALE_BAR_SHARE = 0.22  # of the picture's width, at most
 LABELS = ("satellite_anchored", "visual_propagated", "dead_reckoned")
 
@@ -116,13 +117,17 @@ def _line(points: list[tuple[float, float]], css: str) -> str:
 
 
 def _ellipses(view: FlightView, picture: Picture) -> str:
-    step = max(1, len(view.rows) // ELLIPSES)
     parts = []
-    for row in view.rows[::step]:
+    last, reach_px = (-math.inf, -math.inf), 0.0
+    for row in view.rows:
         place, axes = _xy(row, picture), ellipse95(row)
         if place is None or axes is None:
             continue
         a, b, angle = axes
+        spacing_px = max(SMALLEST_SPACING_PX, ELLIPSE_SPACING * (reach_px + a / picture.gsd_m))
+        if math.dist(place, last) < spacing_px:
+            continue
+        last, reach_px = place, a / picture.gsd_m
         # SVG's y points down, so an angle towards north turns the other way.
         parts.append(
             f'<ellipse rx="{a / picture.gsd_m:.1f}" ry="{b / picture.gsd_m:.1f}" '

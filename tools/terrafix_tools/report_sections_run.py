@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from collections import Counter
 from html import escape
 from itertools import pairwise
@@ -15,6 +16,7 @@ from terrafix_tools.report_sections import WORDS, end_s, spans, table
 from terrafix_tools.report_text import FIX_3D, GAP_S, UNPLANNED, gps_stats
 
 PICTURES = 8
+NUMBER = re.compile(r"\d+(\.\d+)?")  # reasons that differ in their numbers only are one reason
 BINS = 40
 
 
@@ -71,8 +73,10 @@ def link(view: FlightView) -> str:
     )
     bands: list[Band] = []
     if stats is not None:
-        fixes = [(t, str(min(3, max(1, g.fix_type)))) for t, g in view.gps]
-        bands.append(Band("fix type", spans(fixes, end, "f-fix", {"1": "no fix", "2": "2D fix", "3": "3D fix"})))
+        fixes = _fixes(view)
+        bands.append(
+            Band("fix type", spans(fixes, end, "f-fix", {"1": "no fix", "2": "2D fix", "3": "3D fix", "": "silent"}))
+        )
     by_process: dict[str, list[tuple[float, float, str, str]]] = {}
     for t_s, event in view.events:
         css = "f-bad" if event.event in UNPLANNED else "f-good"
@@ -82,7 +86,7 @@ def link(view: FlightView) -> str:
     parts.append(f'<div class="scroll">{strips(bands, end, "Link and processes over time")}</div>')
     if stats is not None:
         parts.append(_intervals(view, end))
-        reasons = Counter(g.reason for _, g in view.gps if g.fix_type < FIX_3D and g.reason)
+        reasons = Counter(NUMBER.sub("…", g.reason) for _, g in view.gps if g.fix_type < FIX_3D and g.reason)
         rows = [
             ("messages", f"{stats.count}"),
             ("rate", f"{stats.rate_hz:.2f} Hz"),
@@ -92,7 +96,10 @@ def link(view: FlightView) -> str:
             ("gaps", str(stats.gaps)),
         ]
         rows += [(f"no 3D fix: {reason}", f"{count}") for reason, count in reasons.most_common(6)]
-        heard = [(k.replace("_", " "), f"{v:.3g}" if isinstance(v, float) else str(v)) for k, v in _scalars(view.peer)]
+        heard = [
+            (k.replace("_", " "), f"{round(v, 3):g}" if isinstance(v, float) else str(v))
+            for k, v in _scalars(view.peer)
+        ]
         second = f"<div><h3>What the autopilot heard</h3>{table(heard)}</div>" if heard else ""
         parts.append(
             f'<div class="two" style="margin-top:24px"><div><h3>What was sent</h3>{table(rows)}</div>{second}</div>'
@@ -105,11 +112,21 @@ def link(view: FlightView) -> str:
     return "".join(parts)
 
 
+def _fixes(view: FlightView) -> list[tuple[float, str]]:
+    """(time, "1".."3" or "" from where a silence is long enough to be noticed)."""
+    fixes: list[tuple[float, str]] = []
+    for t_s, sent in view.gps:
+        if fixes and t_s - fixes[-1][0] > GAP_S:
+            fixes.append((fixes[-1][0] + GAP_S, ""))
+        fixes.append((t_s, str(min(3, max(1, sent.fix_type)))))
+    return fixes
+
+
 def _intervals(view: FlightView, end: float) -> str:
     times = [t for t, _ in view.gps]
     steps: list[Point] = [(b, 1000 * (b - a)) for a, b in pairwise(times)]
     top = max(v for _, v in steps if v is not None)
-    chart = Chart(x_max=end, y_min=10.0, y_max=max(300.0, top * 1.2), height=170, log_y=True, y_unit="ms")
+    chart = Chart(x_max=end, y_min=20.0, y_max=max(300.0, top * 1.2), height=170, log_y=True, y_unit="ms")
     chart.level(1000 * GAP_S, f"{1000 * GAP_S:.0f} ms")
     chart.line(steps, "error")
     return f'<div class="scroll" style="margin-top:18px">{chart.svg("Interval of GPS_INPUT")}</div>'

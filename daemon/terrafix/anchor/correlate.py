@@ -6,6 +6,8 @@ import numpy as np
 MIN_OVERLAP = 0.6  # of the template over valid map; less says nothing about a place
 FLAT_VARIANCE = 0.05  # of the texture that the template has: water and fields without texture must not be amplified
 
+TAIL, TAIL_SIGMAS = 0.995, 2.576  # upper quantile of the surface and what it is for a normal variable
+
 
 class Searchable:
     """A map window whose transforms are shared by all templates that are searched in it."""
@@ -42,10 +44,13 @@ class Searchable:
 
 
 def standardise(surface: np.ndarray) -> np.ndarray:
-    """Surface in robust standard deviations from its median: what chance alignment gives here is 0 +- 1."""
+    """Surface in robust standard deviations from its median: what chance alignment gives here is 0 +- 1.
+
+    Streets and rows agree with many wrong places, so the spread is that of the bulk or that of the upper tail,
+    whichever is wider; the peak itself is too small to count in it."""
     finite = surface[np.isfinite(surface)]
     if finite.size < 100:
         return np.full_like(surface, np.nan)
-    median = float(np.median(finite))
-    spread = 1.4826 * float(np.median(np.abs(finite - median)))
-    return (surface - median) / max(spread, 1e-4)
+    low, median, high, tail = np.quantile(finite, (0.25, 0.5, 0.75, TAIL))
+    spread = max((high - low) / 1.349, (tail - median) / TAIL_SIGMAS)
+    return (surface - median) / max(float(spread), 1e-4)

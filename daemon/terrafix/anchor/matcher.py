@@ -1,7 +1,7 @@
-"""One frame against the map: the whole correlation surface first, then 2D-3D matches in the mode that the belief chose."""
+"""One frame against the map: the whole correlation surface, then 2D-3D matches in the mode that the belief chose."""
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,11 +23,11 @@ LOOK_GSD_PER_AGL = {"gradient": 1 / 100, "xfeat": 1 / 330}
 FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330}
 GSD_STEPS_PER_OCTAVE = 2  # scales are rounded to these, so that the map's descriptors can be kept
 MAX_WINDOW_CELLS = 640  # a wider search is made on coarser cells
-PATCH_PER_AGL = 0.2  # side of a patch: 20 m at 100 m, one house and its surroundings
+PATCH_PER_AGL = 0.25  # side of a patch: 25 m at 100 m, one house and its surroundings
 MIN_PATCH_CELLS = 8
-REACH_PER_AGL = 0.07  # search of a patch around its expected place ...
-REACH_PER_TILT = 0.7  # ... and more while the tilt is not known: times height times tilt sigma
-MAX_REACH_PER_AGL = 0.2
+REACH = 0.08  # search of a patch around its expected place, share of the height
+FIRST_REACH, FIRST_THRESHOLD = 0.2, 0.05  # of the first pass, while the tilt is not known
+WELL_KNOWN_RAD = np.radians(3.0)
 # Rotation and scale are searched when they are known less well than the descriptors tolerate.
 YAW_TOLERANCE_RAD = np.radians(4.0)
 YAW_STEP_RAD = np.radians(7.0)
@@ -122,31 +122,51 @@ class FrameMatcher:
         return Look(Verdict.ACCEPTED, tuple(surfaces), tuple(h for h, _ in usable), footprint_m)
 
     def fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> Fix | None:
-        """2D-3D matches around a camera position, and the pose that they give. None: the ground cannot be seen."""
+        """2D-3D matches around a camera position, and the pose that they give. None: the ground cannot be seen.
+
+        A pose that is not known well is found in two passes: a wide search with a generous threshold, then a narrow one
+        on the frame rectified with what the first one found."""
+        start = replace(
+            view,
+            e_m=e_m,
+            n_m=n_m,
+            r_w_c=local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c,
+            agl_m=view.agl_m * hypothesis.scale,
+        )
+        if view.tilt_sigma_rad > WELL_KNOWN_RAD:
+            first = self._patch_fix(image, start, FIRST_REACH, FIRST_THRESHOLD)
+            if first is None or first.pnp.fit is None:
+                return first
+            p = first.pnp.fit.p_c_in_w_m
+            start = replace(
+                start, e_m=p[0], n_m=p[1], r_w_c=first.pnp.fit.r_w_c, agl_m=p[2] - float(first.points_w_m[:, 2].mean())
+            )
+        return self._patch_fix(image, start, REACH, THRESHOLD)
+
+    def _patch_fix(self, image: Image, view: View, reach_share: float, threshold: float) -> Fix | None:
         gsd = self._gsd(view.agl_m, FIX_GSD_PER_AGL)
         cell = gsd * self._describer.stride
-        frame = self._rectified(image, view, hypothesis, gsd)
+        frame = rectify(image, self._camera, view.r_w_c, view.agl_m, gsd, self._describer.stride)
         if frame is None:
             return None
-        agl = view.agl_m * hypothesis.scale
-        reach_m = min(agl * (REACH_PER_AGL + REACH_PER_TILT * view.tilt_sigma_rad) + 2 * cell, MAX_REACH_PER_AGL * agl)
-        reach = max(int(np.ceil(reach_m / cell)), 3)
-        patch = max(round(PATCH_PER_AGL * agl / cell), MIN_PATCH_CELLS)
+        reach = max(int(np.ceil(reach_share * view.agl_m / cell)), 3)
+        patch = max(round(PATCH_PER_AGL * view.agl_m / cell), MIN_PATCH_CELLS)
         template, mask = self._describe(frame)
         margin = (reach + 2) * cell
-        e_min, n_max = e_m + frame.e_min_m - margin, n_m + frame.n_max_m + margin
+        e_min, n_max = view.e_m + frame.e_min_m - margin, view.n_m + frame.n_max_m + margin
         width, height = mask.shape[1] + 2 * reach + 4, mask.shape[0] + 2 * reach + 4
         window, valid, e_min, n_max = self._features.window(e_min, n_max, width, height, gsd)
-        found = match_patches(template, frame, mask, cell, window, valid, (e_min, n_max), (e_m, n_m), patch, reach)
-        r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
-        rays = np.column_stack([found.frame_m, np.full(len(found.frame_m), -agl)]) @ r_w_c
+        found = match_patches(
+            template, frame, mask, cell, window, valid, (e_min, n_max), (view.e_m, view.n_m), patch, reach
+        )
+        rays = np.column_stack([found.frame_m, np.full(len(found.frame_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
         up = self._map.elevation(found.map_m[:, 0], found.map_m[:, 1]) if len(xy) else None
         up = np.full(len(xy), view.ground_m) if up is None else np.where(np.isfinite(up), up, view.ground_m)
         points = np.column_stack([found.map_m, up])
-        chance = min(1.0, np.pi * (THRESHOLD * agl) ** 2 / (2 * reach * cell) ** 2)
-        floor = 0.3 * cell / agl  # a third of a cell: what interpolation of the peak gives at best
-        pnp = solve(points, xy, found.weight, r_w_c, agl, floor, chance, found.tried)
+        floor = 0.3 * cell / view.agl_m  # a third of a cell: what interpolation of the peak gives at best
+        reach_share = reach * cell / view.agl_m
+        pnp = solve(points, xy, found.weight, view.r_w_c, view.agl_m, floor, threshold, reach_share)
         return Fix(xy, points, found.weight, pnp, cell)
 
     def _gsd(self, agl_m: float, per_agl: dict[str, float]) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
-from terrafix.anchor.belief import Belief
+from terrafix.anchor.belief import CELL_M, Belief, Mode
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import Fix, FrameMatcher, View
@@ -21,6 +21,13 @@ from terrafix_engines.runtime import ModelFileError
 NEW_GROUND_SHARE = 0.35  # of the footprint: after this much motion a look counts as a new one
 MIN_LOOK = 0.08  # a look at the same ground again still says this much
 MODE_MASS = 0.9  # the belief hands a fix to the graph when one mode holds this much
+# A pose on which many patches agree is evidence of its own: found at most right places, at hardly any wrong one.
+POSE_LIKELIHOOD_RATIO = 20.0
+MODE_TRIED = 0.5  # modes below this are not tried at all
+COARSE_TILT_RAD = np.radians(10.0)  # a coarse fix says nothing of attitude: as good as unknown
+COARSE_HEIGHT_M = 100.0  # ... nor of height
+COARSE_SIGMA = 0.03  # of the height: buildings that lean and a scale that is not quite right shift the whole picture
+COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in this very frame
 MIN_AGL_M = 30.0  # below this a frame shows a few roofs and cars
 MODE_DRIFT = 0.35  # of the height: how far the pose may lie from the mode while the tilt is not yet known
 START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is not known yet
@@ -91,12 +98,18 @@ class AnchorNode:
             mode_n_m=mode.n_m,
             belief_cov_m2=(ee, en, en, nn),
         )
-        if mode.mass < MODE_MASS:
+        if mode.mass < MODE_TRIED:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
         fix = self._matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m)
-        if fix is None:
-            return msgspec.structs.replace(answer, verdict=Verdict.DEGENERATE)
-        return self._judged(answer, fix, view, belief)
+        answer = self._judged(answer, fix, view)
+        if answer.verdict is Verdict.ACCEPTED:
+            belief.confirm(mode, POSE_LIKELIHOOD_RATIO)
+            mass = belief.mode().mass
+            enough = Verdict.ACCEPTED if mass >= MODE_MASS else Verdict.AMBIGUOUS
+            return msgspec.structs.replace(answer, verdict=enough, mode_mass=mass)
+        if mode.mass < MODE_MASS:
+            return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
+        return self._coarse(answer, mode, view) if score >= COARSE_SCORE else answer
 
     def _moved(self, prediction: Prediction) -> Belief:
         step_m = float(np.hypot(*prediction.step_m))
@@ -138,7 +151,29 @@ class AnchorNode:
             self._poor_looks = 0.0
             belief.fit_window(belief.half_m * WIDEN)
 
-    def _judged(self, answer: MapMatch, fix: Fix, view: View, belief: Belief) -> MapMatch:
+    def _coarse(self, answer: MapMatch, mode: Mode, view: View) -> MapMatch:
+        """The position of the mode, as a pose factor. What is seen is the place of the ground, so the camera's position
+        goes with its tilt: p_e moves by +h, p_n by -h per radian of rotation about north and east."""
+        lever = np.zeros((2, 2))
+        lever[0, 1], lever[1, 0] = view.agl_m, -view.agl_m
+        tilt = COARSE_TILT_RAD**2 * np.eye(2)
+        cov = np.diag([0.0, 0.0, COARSE_HEIGHT_M**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2])
+        sigma2 = mode.var_m2 + CELL_M**2 + (COARSE_SIGMA * view.agl_m) ** 2
+        cov[:2, :2] = lever @ tilt @ lever.T + sigma2 * np.eye(2)
+        cov[:2, 3:5] = lever @ tilt
+        cov[3:5, :2] = cov[:2, 3:5].T
+        return msgspec.structs.replace(
+            answer,
+            verdict=Verdict.ACCEPTED,
+            coarse=True,
+            p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + view.agl_m),
+            q_w_c=quat_from_rot(view.r_w_c),
+            cov=tuple(float(v) for v in cov.ravel()),
+        )
+
+    def _judged(self, answer: MapMatch, fix: Fix | None, view: View) -> MapMatch:
+        if fix is None:
+            return msgspec.structs.replace(answer, verdict=Verdict.DEGENERATE)
         pnp = fix.pnp
         verdict = pnp.verdict
         if pnp.fit is None:

@@ -21,7 +21,6 @@ class PatchMatches:
     frame_m: np.ndarray
     map_m: np.ndarray
     weight: np.ndarray
-    tried: int
 
 
 def match_patches(
@@ -44,7 +43,7 @@ def match_patches(
     column0 = round(((camera_m[0] + rectified.e_min_m) - window_corner_m[0]) / cell_m)
     corners = _choose(template, cells_mask, valid, patch_cells, reach_cells, row0, column0)
     if len(corners) == 0:
-        return PatchMatches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), 0)
+        return PatchMatches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     surfaces = _correlate(template, window, corners, patch_cells, reach_cells, row0, column0)
     frame_m, map_m, weights = [], [], []
     for (r, c), surface in zip(corners, surfaces, strict=True):
@@ -61,9 +60,7 @@ def match_patches(
             )
         )
         weights.append(weight)
-    return PatchMatches(
-        np.array(frame_m).reshape(-1, 2), np.array(map_m).reshape(-1, 2), np.array(weights), len(corners)
-    )
+    return PatchMatches(np.array(frame_m).reshape(-1, 2), np.array(map_m).reshape(-1, 2), np.array(weights))
 
 
 def _choose(

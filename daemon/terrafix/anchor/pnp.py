@@ -10,9 +10,9 @@ from terrafix.messages import Verdict
 
 RANSAC_ITERATIONS = 300
 CONFIDENCE = 0.999
-THRESHOLD = 0.025  # of the height: relief, leaning buildings and the map's own warps stay below this
+THRESHOLD = 0.03  # of the height: relief, leaning buildings and the map's own warps stay below this
 MIN_INLIERS = 8
-MIN_INLIER_SHARE = 0.3
+MIN_INLIER_SHARE = 0.35
 # Patches overlap by half and relief moves several together.
 INDEPENDENT_SHARE = 0.25
 MAX_TILT_CHANGE_RAD = np.radians(20.0)  # from the prediction; more is the mirror solution of a flat scene
@@ -33,14 +33,15 @@ def solve(
     r_w_c: np.ndarray,
     agl_m: float,
     sigma_floor: float,
-    chance: float,
-    tried: int,
+    threshold: float,
+    reach: float,
 ) -> PnpResult:
-    """``points_w_m`` (N, 3), ``xy`` (N, 2) normalised; ``r_w_c`` predicted. ``chance``: probability that a patch that
-    was matched at random agrees with a pose; ``tried``: patches searched."""
+    """``points_w_m`` (N, 3), ``xy`` (N, 2) normalised; ``r_w_c`` predicted. ``threshold`` of an inlier and
+    ``reach`` of the search as shares of the height."""
     n = len(xy)
+    chance = min(1.0, np.pi * threshold**2 / (2 * reach) ** 2)  # that a patch that was matched at random agrees
     none = np.zeros(n, bool)
-    needed = max(MIN_INLIERS, MIN_INLIER_SHARE * tried, tried * chance + 4.0 * float(np.sqrt(tried * chance)) + 3.0)
+    needed = max(MIN_INLIERS, MIN_INLIER_SHARE * n, n * chance + 3.0 * float(np.sqrt(n * chance)) + 2.0)
     if n < needed:
         return PnpResult(Verdict.FEW_INLIERS, None, none)
     centre = points_w_m.mean(0)
@@ -54,7 +55,7 @@ def solve(
         np.eye(3),
         np.zeros(4),
         iterationsCount=RANSAC_ITERATIONS,
-        reprojectionError=THRESHOLD,
+        reprojectionError=threshold,
         confidence=CONFIDENCE,
         flags=cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP,
     )
@@ -62,7 +63,7 @@ def solve(
         return PnpResult(Verdict.FEW_INLIERS, None, none)
     r_c_w = exp_so3(np.asarray(rvec).ravel())
     p = centre - r_c_w.T @ np.asarray(tvec).ravel()
-    fit, inlier = _refine(points_w_m, xy, weights, r_c_w.T, p, np.asarray(index).ravel(), sigma_floor)
+    fit, inlier = _refine(points_w_m, xy, weights, r_c_w.T, p, np.asarray(index).ravel(), sigma_floor, threshold)
     if fit is None or inlier.sum() < needed:
         return PnpResult(Verdict.FEW_INLIERS if fit else Verdict.DEGENERATE, None, inlier)
     tilt = np.asarray(log_so3(r_w_c.T @ fit.r_w_c))[:2]
@@ -79,6 +80,7 @@ def _refine(
     p: np.ndarray,
     index: np.ndarray,
     sigma_floor: float,
+    threshold: float,
 ) -> tuple[PoseFit | None, np.ndarray]:
     """Twice: on RANSAC's inliers, then on all that agree with that pose."""
     inlier = np.zeros(len(xy), bool)
@@ -91,7 +93,7 @@ def _refine(
         r_w_c, p = fit.r_w_c, fit.p_c_in_w_m
         q = (points - p) @ r_w_c
         error = np.linalg.norm(xy - q[:, :2] / np.maximum(q[:, 2:], 1e-6), axis=1)
-        inlier = (error < THRESHOLD) & (q[:, 2] > 0)
+        inlier = (error < threshold) & (q[:, 2] > 0)
         if inlier.sum() < MIN_INLIERS:
             return None, inlier
     return fit, inlier

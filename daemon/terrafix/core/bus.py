@@ -12,11 +12,13 @@ sees every subscription (XPUB). The others see them twice and know it by the cou
 import os
 import struct
 from collections import Counter, defaultdict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
 import zmq
 
 from terrafix.core import codec
+from terrafix.core.clock import now_ns
 from terrafix.messages import Message, Origin, ProcessEvent, SourceEnded
 
 QUEUE_LENGTH = 1000  # messages per connection and side; then the newest are lost, and counted by the reader
@@ -25,8 +27,21 @@ LINGER_MS = 200  # last words, at most this long
 BURST = 500  # messages taken from the socket at once, so that a flood cannot keep a process from its ticks
 HEADER = struct.Struct(">QQ")  # life of the publisher, count in the topic
 
-# What late comers get again, and how many of the last of it.
-RETAINED: dict[type[Message], int] = {Origin: 1, SourceEnded: 1, ProcessEvent: 100}
+ALWAYS_NS = 2**63
+
+
+class Retention(NamedTuple):
+    last: int  # how many
+    max_age_ns: int
+
+
+# What late comers get again. Events of processes: what happened while the recorder was started (again), but not the
+# old deaths, which would be news to a link that has just been restarted.
+RETAINED: dict[type[Message], Retention] = {
+    Origin: Retention(1, ALWAYS_NS),
+    SourceEnded: Retention(1, ALWAYS_NS),
+    ProcessEvent: Retention(100, 10_000_000_000),
+}
 
 
 def topic(kind: type[Message]) -> bytes:
@@ -34,7 +49,10 @@ def topic(kind: type[Message]) -> bytes:
 
 
 class Publisher:
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], address: str) -> None:
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], address: str, clock: Callable[[], int] = now_ns
+    ) -> None:
+        self._clock = clock
         self.socket = context.socket(zmq.XPUB)
         self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # every subscription, not only the first to a topic
         self.socket.setsockopt(zmq.SNDHWM, QUEUE_LENGTH)
@@ -43,9 +61,10 @@ class Publisher:
         self._life = int.from_bytes(os.urandom(8), "big")
         self._count: Counter[bytes] = Counter()
         self._subscriptions: Counter[bytes] = Counter()
-        self._retained: dict[bytes, deque[list[bytes]]] = {
-            topic(kind): deque(maxlen=length) for kind, length in RETAINED.items()
+        self._retained: dict[bytes, deque[tuple[int, list[bytes]]]] = {
+            topic(kind): deque(maxlen=retention.last) for kind, retention in RETAINED.items()
         }
+        self._max_age_ns = {topic(kind): retention.max_age_ns for kind, retention in RETAINED.items()}
 
     def say(self, message: Message) -> None:
         self.serve()
@@ -53,7 +72,7 @@ class Publisher:
         self._count[name] += 1
         parts = [name, HEADER.pack(self._life, self._count[name]), codec.encode(message)]
         if name in self._retained:
-            self._retained[name].append(parts)
+            self._retained[name].append((self._clock(), parts))
         self.socket.send_multipart(parts)
 
     def serve(self) -> None:
@@ -63,8 +82,9 @@ class Publisher:
             name = request[1:]
             if request[:1] == b"\x01":
                 self._subscriptions[name] += 1
-                for parts in self._retained.get(name, ()):
-                    self.socket.send_multipart(parts)
+                for said_ns, parts in self._retained.get(name, ()):
+                    if self._clock() - said_ns <= self._max_age_ns[name]:
+                        self.socket.send_multipart(parts)
 
     def subscriptions(self, kind: type[Message]) -> int:
         """How many subscriptions to this type have come so far."""

@@ -24,6 +24,10 @@ class RunDir:
     def progress(self, process: str) -> Path:
         return self.path / f"{process}.progress"
 
+    def mistake(self, process: str) -> Path:
+        """Why ``process`` ended, when that is something the user can mend: one line."""
+        return self.path / f"{process}.mistake"
+
     @property
     def frames(self) -> Path:
         return self.path / "frames"

@@ -15,7 +15,7 @@ LAG_NODES = 20.0  # ON-3: 10-20 keyframes
 ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits in the tail pulls less
 # Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), compass, barometer and
 # the terrain under it.
-WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.2), 0.3])
+WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(1.0), 0.5])
 REBUILD_INFLATION = 4.0  # of the covariance, when the graph starts again from its last good state
 
 

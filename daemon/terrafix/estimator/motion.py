@@ -14,7 +14,7 @@ MIN_PAIRS = 8
 
 @dataclass(frozen=True)
 class RelativePose:
-    """Camera k in the camera of the keyframe: ``r`` (3x3), ``p_m`` (3,), ``cov`` 6x6 (tangent: rotation, translation)."""
+    """Camera k in the camera of the keyframe: ``r`` (3x3), ``p_m`` (3,), ``cov`` 6x6 (tangent order)."""
 
     r: np.ndarray
     p_m: np.ndarray

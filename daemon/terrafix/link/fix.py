@@ -18,7 +18,7 @@ SILENT_AFTER_NS = 35_000_000_000  # the last rung of the ladder: every vehicle h
 MAX_HORIZONTAL_SIGMA_M = 50.0  # the autopilot's gate is 7 times this: wider, it would take any position for true
 MAX_SPEED_SIGMA_MPS = 1.5  # its filter calls the GPS glitching above
 BACK_HORIZONTAL_SIGMA_M = 40.0  # hysteresis: the way back to 3 is narrower than the way out
-BACK_SPEED_SIGMA_MPS = 1.2
+BACK_SPEED_SIGMA_MPS = 1.45
 # Reported accuracy passes a peak hold of 5 s time constant: one bad report keeps the gate open for ~15 s. A sudden
 # spike is therefore answered with the fix type, and becomes a number only if it lasts.
 SPIKE_RATIO = 3.0

@@ -49,7 +49,8 @@ class RecorderEdge:
 
     def heard(self, message: Message) -> None:
         try:
-            self._queue.put_nowait((self._now_ns, message))
+            # Before the first poll the message's own time is the best guess.
+            self._queue.put_nowait((self._now_ns or message.t_ns, message))
         except queue.Full:
             with self._dropped_lock:
                 self._dropped[type(message).__name__] += 1

@@ -45,7 +45,8 @@ def flight_files(path: Path) -> list[Path]:
         return [path]
     segments = sorted((int(hit.group(1)), p) for p in path.glob("flight-*.mcap") if (hit := _SEGMENT.search(p.name)))
     files = [p for _, p in segments]
-    files += [p for p in (path / "flight.mcap",) if p.is_file()]
+    # A replay: its record, or what a killed one left.
+    files += [p for name in ("flight.mcap", "flight.mcap.partial") if (p := path / name).is_file()][:1]
     if not files:
         raise SourceError(
             f"{path}: no flight record here (flight.mcap or flight-000.mcap); give a replay or run folder"
@@ -55,6 +56,12 @@ def flight_files(path: Path) -> list[Path]:
 
 def read_flight(path: Path, result: ReadResult | None = None) -> Iterator[tuple[str, int, Message]]:
     """Yields (topic, log_time_ns, message) in the order heard, over all files; thumbnails are left out."""
+    for topic, log_ns, _, message in read_heard(path, result):
+        yield topic, log_ns, message
+
+
+def read_heard(path: Path, result: ReadResult | None = None) -> Iterator[tuple[str, int, int, Message]]:
+    """Like read_flight, with the time at which the recorder heard it: (topic, log_time_ns, heard_ns, message)."""
     found = ReadResult() if result is None else result
     for channel, record in _records(path, found):
         decoder = _decoders.get(channel.topic)
@@ -65,7 +72,7 @@ def read_flight(path: Path, result: ReadResult | None = None) -> Iterator[tuple[
         except msgspec.MsgspecError:
             found.undecodable += 1
             continue
-        yield channel.topic, record.log_time, message
+        yield channel.topic, record.log_time, record.publish_time, message
 
 
 def read_thumbnails(path: Path) -> Iterator[tuple[int, bytes]]:

@@ -75,4 +75,4 @@ class SegmentRing:
     def _segments(self) -> list[Path]:
         if not any(self._folder.glob("flight-*.mcap")):
             return []
-        return [p for p in flight_files(self._folder) if p.name != "flight.mcap"]
+        return [p for p in flight_files(self._folder) if not p.name.startswith("flight.mcap")]

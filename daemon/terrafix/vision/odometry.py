@@ -30,6 +30,7 @@ KEYFRAME_TRACKED = 0.45  # share of the keyframe's corners still tracked
 KEYFRAME_MAX_AGE = 10  # frames; half the estimator's window, so that the keyframe is still in it
 MAX_MISSES = 5  # frames that may fail against one keyframe before a new fragment starts (PB-5)
 MAX_PAIRS = 80
+SIGMA_PX = 1.0  # of a matched coordinate: tracking a tenth of that, the rest is relief that the plane does not hold
 SIFT_FEATURES = 1500
 SIFT_RATIO = 0.8  # Lowe 2004
 
@@ -157,7 +158,8 @@ class FrameTracker:
             self._start_keyframe(frame_id, gray)
         pick = _spread(a, MAX_PAIRS)
         pairs = np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])])
-        sigma = 0.7 * RANSAC_PX / self._camera.fx  # relief and tracking together; the estimator looks at the residuals
+        # A consensus that few of the matches share may be a roof instead of the ground: less is claimed for it.
+        sigma = SIGMA_PX / self._camera.fx / float(np.sqrt(len(a) / max(tracked, len(a))))
         return Motion(keyframe.frame_id, Verdict.ACCEPTED, pairs, sigma, len(a), tracked, due)
 
     def _miss(self, keyframe: _Keyframe, here: _Keyframe, tracked: int) -> Motion:
