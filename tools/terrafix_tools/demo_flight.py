@@ -14,7 +14,8 @@ from terrafix_tools.peer_course import PeerState
 from terrafix_tools.peer_report import PeerReport
 from terrafix_tools.world_flight import Flight
 
-LOOK_S = 1.0  # between two progress lines
+LOOK_S = 1.0  # between two looks at the autopilot
+LOG_S = 15.0  # between two lines where lines cannot be rewritten
 
 
 class FlightClock:
@@ -37,7 +38,8 @@ class FlightClock:
 
 
 class Course:
-    """Seconds of the flight -> truth for the peer. Attitude has the errors of the flight's sensors.
+    """Seconds of the flight -> truth for the peer. Attitude has the noise of the flight's sensors; a constant heading
+    error is the peer's own.
 
     At time zero the vehicle is held in the air: the clock does not run while the processes start."""
 
@@ -54,7 +56,7 @@ class Course:
             lon_deg=lon_deg,
             amsl_m=up_m,
             agl_m=truth.agl_m,
-            yaw_rad=said.yaw_rad,
+            yaw_rad=said.yaw_rad - self._flight.sensors.yaw_bias_rad,
             pitch_rad=said.pitch_rad,
             roll_rad=said.roll_rad,
             vn_mps=vn,
@@ -111,6 +113,7 @@ def _watch(
     peer: AutopilotPeer, clock: FlightClock, duration_s: float, landed: threading.Event, console: Console
 ) -> None:
     """A line that is rewritten: the time, and what the autopilot has and believes."""
+    said_s = 0.0
     with console.status("flight: the processes start") as status:
         while not landed.wait(LOOK_S):
             if not clock.runs:
@@ -118,4 +121,8 @@ def _watch(
             fix_type, error_m = peer.glance()
             fix = "3D fix" if fix_type >= 3 else "no fix"
             error = "" if error_m is None else f", its position is off by {error_m:.1f} m"
-            status.update(f"flight: {min(clock(), duration_s):.0f} of {duration_s:.0f} s; autopilot: {fix}{error}")
+            line = f"flight: {min(clock(), duration_s):.0f} of {duration_s:.0f} s; autopilot: {fix}{error}"
+            status.update(line)
+            if not console.is_terminal and clock() - said_s >= LOG_S:
+                said_s = clock()
+                console.print(line, highlight=False, soft_wrap=True)

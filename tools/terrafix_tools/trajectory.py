@@ -123,7 +123,7 @@ class Sensors:
     def __init__(self, trajectory: Trajectory, take_off_amsl_m: float, *, seed: int = 0) -> None:
         rng = np.random.default_rng([seed, 31])
         self._trajectory, self._take_off_amsl_m = trajectory, take_off_amsl_m
-        self._yaw_bias_rad = math.radians(2.0) * float(rng.choice([-1.0, 1.0]))
+        self.yaw_bias_rad = math.radians(2.0) * float(rng.choice([-1.0, 1.0]))
         self._height_bias_m = float(rng.normal(0.0, 2.0))
         self._waves = rng.uniform((0.15, 0.0), (1.1, 2 * math.pi), (7, 3, 2))  # smooth noise: sums of slow sines
 
@@ -133,7 +133,7 @@ class Sensors:
         yaw, pitch, roll, up, ve, vn, vu = (self._noise(i, t_s) for i in range(7))
         v = truth.velocity_enu_mps
         return Report(
-            yaw_rad=math.remainder(truth.yaw_rad + self._yaw_bias_rad + math.radians(0.7) * yaw, 2.0 * math.pi),
+            yaw_rad=math.remainder(truth.yaw_rad + self.yaw_bias_rad + math.radians(0.7) * yaw, 2.0 * math.pi),
             pitch_rad=truth.pitch_rad + math.radians(0.5) * pitch,
             roll_rad=truth.roll_rad + math.radians(0.5) * roll,
             agl_m=float(truth.p_b_in_w_m[2]) - self._take_off_amsl_m + self._height_bias_m + 0.7 * up,

@@ -3,6 +3,7 @@
 Everything is asked in two steps: ``advance`` takes a frame's odometry and says where the camera should be, ``fix``
 takes the frame's map match. Both answer with a verdict."""
 
+from collections import deque
 from dataclasses import dataclass
 
 import gtsam
@@ -27,7 +28,11 @@ DEFAULT_AGL_M = 120.0  # when nobody reports a height: the usual ceiling of smal
 DEFAULT_AGL_SIGMA_M = 50.0  # ... and wide enough for all of them
 MAX_ACCELERATION_MPS2 = 3.0  # of small drones in cruise: how wrong the last velocity may become
 MAX_SPEED_SIGMA_MPS = 10.0  # per axis: of a velocity of which nothing is known
+MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
 VELOCITY_MEMORY_S = 10.0  # how long a drone keeps its course when nobody looks
+VELOCITY_SPAN_S = 0.9  # a velocity is measured over about a second: shorter is noise, longer misses turns
+VELOCITY_FLOOR_M, VELOCITY_SHARE = 0.15, 0.02  # error of the relative position of two nodes that close
+BEND_SHARE = 0.5  # of the change of velocity that is carried on: the turn may have ended
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
@@ -92,7 +97,7 @@ class Estimator:
         self._last: Placed | None = None  # newest frame, in the graph or not
         self._fixed_at_m: np.ndarray | None = None
         self._refused: _Disagreement | None = None
-        self._trunk = 0  # newest node that odometry or the map vouches for; others hang on it as leaves
+        self._trunk = deque([0], maxlen=40)  # nodes that odometry or the map vouches for; others hang on it as leaves
 
     # --- motion ---------------------------------------------------------------------------------------------
 
@@ -100,7 +105,7 @@ class Estimator:
         if self._last is None:
             return self._begin(frame_id, t_s, attitude)
         last = self._last
-        known = self._by_odometry(odometry)
+        known = self._by_odometry(odometry, attitude)
         if known is not None:
             parent, motion = known
             verdict = Verdict.ACCEPTED
@@ -108,14 +113,13 @@ class Estimator:
             parent, motion = self._by_guess(t_s, attitude)
             verdict = odometry.verdict if odometry.verdict is not Verdict.ACCEPTED else Verdict.FEW_INLIERS
         before = self.graph.state(parent)
-        pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3(motion.r), motion.p_m))
+        pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m))
         last_pose = self.graph.state(last.node).pose
         step = (pose.translation() - last_pose.translation())[:2]
         dt_s = max(t_s - last.t_s, 1e-3)
         if known is not None:
             spread = float(np.sqrt(np.trace(motion.cov[3:, 3:]) / 3.0))
             step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * float(np.hypot(*step)), spread))
-            self._learn_velocity(pose.translation() - last_pose.translation(), dt_s, step_sigma)
         else:
             step_sigma = self._drift_sigma(dt_s)
             self.velocity_sigma_mps = min(MAX_SPEED_SIGMA_MPS, self.velocity_sigma_mps + MAX_ACCELERATION_MPS2 * dt_s)
@@ -123,7 +127,9 @@ class Estimator:
         node = self.graph.extend(t_s, NodeState(pose, before.bias), parent, motion, self._attitude(attitude))
         self._node_of[frame_id] = node
         if known is not None or odometry.becomes_keyframe:
-            self._trunk = node
+            self._trunk.append(node)
+        if known is not None:
+            self._learn_velocity(node)
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
         return Advance(verdict, self._last, step, step_sigma, False)
 
@@ -133,7 +139,7 @@ class Estimator:
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
         r_w_c = self._expected_rotation(attitude, np.zeros(4))
-        pose = gtsam.Pose3(gtsam.Rot3(r_w_c), np.array([0.0, 0.0, self.ground_m + agl]))
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([0.0, 0.0, self.ground_m + agl]))
         start = max(origin.start_sigma_m, 1.0)
         wide = np.diag([1.0, 1.0, UNKNOWN_RAD, start, start, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
@@ -147,7 +153,7 @@ class Estimator:
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
         return Advance(Verdict.ACCEPTED, self._last, np.zeros(2), 0.0, True)
 
-    def _by_odometry(self, odometry: Odometry) -> tuple[int, RelativePose] | None:
+    def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | None:
         """The keyframe's node and the motion since, when odometry has both."""
         if odometry.verdict is not Verdict.ACCEPTED or not odometry.pairs:
             return None
@@ -160,12 +166,19 @@ class Estimator:
         height = float(state.pose.translation()[2]) - self.ground_m
         if height < 2.0:
             return None
-        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, height, height_sigma)
-        return None if motion is None else (parent, motion)
+        r_w_k = self._expected_rotation(attitude, state.bias, r_w_kf)
+        if attitude.pitch_rad is None or attitude.roll_rad is None:
+            r_w_k = r_w_kf  # nobody knows of a change of tilt
+        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, height, height_sigma)
+        if motion is None:
+            return None
+        dt_s = max(odometry.t_ns * 1e-9 - self.graph.time_of(parent), 1e-3)
+        possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + height
+        return (parent, motion) if possible else None
 
     def _by_guess(self, t_s: float, attitude: Attitude) -> tuple[int, RelativePose]:
         """Nothing was seen: the last velocity, less certain the longer it lasts; the heading from the compass."""
-        parent = self._trunk if self.graph.holds(self._trunk) else self.graph.newest
+        parent = self._trunk[-1] if self.graph.holds(self._trunk[-1]) else self.graph.newest
         state = self.graph.state(parent)
         dt_s = max(t_s - self.graph.time_of(parent), 1e-3)
         r_parent = state.pose.rotation().matrix()
@@ -192,13 +205,32 @@ class Estimator:
             self._cov_of[node] = self.graph.covariance(node)
         return self._cov_of[node]
 
-    def _learn_velocity(self, step_m: np.ndarray, dt_s: float, step_sigma_m: float) -> None:
-        """Smoothed over about a second, so that the noise of one short step does not reach the autopilot."""
-        gain = 1.0 - float(np.exp(-dt_s / 1.0))
-        self.velocity_mps = self.velocity_mps + gain * (step_m / dt_s - self.velocity_mps)
-        noise = step_sigma_m / dt_s * np.sqrt(gain)
-        turning = MAX_ACCELERATION_MPS2 / 2 * min(dt_s, 2.0)
-        self.velocity_sigma_mps = min(MAX_SPEED_SIGMA_MPS, float(np.hypot(noise, turning * 0.5)))
+    def _learn_velocity(self, node: int) -> None:
+        """From the newest nodes: mean velocity of the last second and of the one before, carried on to now."""
+        now_s = self.graph.time_of(node)
+        middle = self._trunk_before(now_s - VELOCITY_SPAN_S)
+        if middle is None:
+            return
+        p = self.graph.state(node).pose.translation()
+        p1 = self.graph.state(middle).pose.translation()
+        span_s = now_s - self.graph.time_of(middle)
+        v1 = (p - p1) / span_s
+        noise = (VELOCITY_FLOOR_M + VELOCITY_SHARE * float(np.linalg.norm(p - p1))) / span_s
+        bend = np.zeros(3)
+        first = self._trunk_before(self.graph.time_of(middle) - VELOCITY_SPAN_S)
+        if first is not None:
+            before_s = self.graph.time_of(middle) - self.graph.time_of(first)
+            v0 = (p1 - self.graph.state(first).pose.translation()) / before_s
+            bend = (v1 - v0) * span_s / (span_s + before_s)
+        self.velocity_mps = v1 + bend
+        unseen = MAX_ACCELERATION_MPS2 * max(span_s - 2 * VELOCITY_SPAN_S, 0.0) / 2  # a span too long to follow turns
+        self.velocity_sigma_mps = min(
+            MAX_SPEED_SIGMA_MPS, float(np.sqrt(1.5 * noise**2 + unseen**2 + (BEND_SHARE * np.linalg.norm(bend)) ** 2))
+        )
+
+    def _trunk_before(self, t_s: float) -> int | None:
+        """Newest node that odometry or the map vouches for at or before a time, within the window."""
+        return next((n for n in reversed(self._trunk) if self.graph.holds(n) and self.graph.time_of(n) <= t_s), None)
 
     # --- attitude and height --------------------------------------------------------------------------------
 
@@ -232,7 +264,7 @@ class Estimator:
         if node is None or not self.graph.holds(node):
             return FixResult(Verdict.STALE, None)
         r_w_c = rot_from_quat(match.q_w_c)
-        measured = gtsam.Pose3(gtsam.Rot3(r_w_c), np.array(match.p_c_in_w_m))
+        measured = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array(match.p_c_in_w_m))
         cov = world_to_tangent(np.array(match.cov).reshape(6, 6), r_w_c)
         height = max(match.p_c_in_w_m[2] - self.ground_m, 1.0)
         warp = np.diag([LOCAL_WARP_M, LOCAL_WARP_M, ROOFS * height]) ** 2
@@ -256,7 +288,8 @@ class Estimator:
 
     def _accepted(self, match: MapMatch, node: int, here: np.ndarray) -> None:
         self._fixed_at_m = here
-        self._trunk = max(self._trunk, node)
+        if node > self._trunk[-1]:
+            self._trunk.append(node)
         self.last_fix_t_s = self.graph.time_of(node)
         if match.matches:
             self.ground_m = float(np.mean([m[4] for m in match.matches]))
@@ -313,5 +346,5 @@ class Estimator:
 
 def _compose_cov(cov_parent: np.ndarray, motion: RelativePose) -> np.ndarray:
     """Covariance of parent * motion, tangent order, first order."""
-    adjoint = gtsam.Pose3(gtsam.Rot3(motion.r), motion.p_m).inverse().AdjointMap()
+    adjoint = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m).inverse().AdjointMap()
     return adjoint @ cov_parent @ adjoint.T + motion.cov

@@ -48,7 +48,10 @@ class PoseGraph:
     def state(self, node: int) -> NodeState:
         """Newest estimate of a node, in the window or before it."""
         values = self._smoother.calculateEstimate() if node in self._times else self.all_values
-        return NodeState(values.atPose3(C(node)), values.atVector(B(node)))
+        pose = values.atPose3(C(node))
+        # Rounding makes rotations drift off SO(3), and every frame builds on the last one: the drift would double.
+        upright = gtsam.Pose3(gtsam.Rot3.ClosestTo(pose.rotation().matrix()), pose.translation())
+        return NodeState(upright, values.atVector(B(node)))
 
     def covariance(self, node: int) -> np.ndarray:
         """Marginal of C_node, 6x6, tangent order (rotation, translation); asked of the smoother itself."""
@@ -94,7 +97,7 @@ class PoseGraph:
         newest = self.newest
         dt_s = max(t_s - self._times[newest], 1e-3)
         factors = gtsam.NonlinearFactorGraph()
-        between = gtsam.Pose3(gtsam.Rot3(motion.r), motion.p_m)
+        between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
         factors.add(gtsam.BetweenFactorPose3(C(parent), C(node), between, _robust(motion.cov)))
         walk = gtsam.noiseModel.Diagonal.Sigmas(WALK_SIGMAS * np.sqrt(dt_s))
         factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(4), walk))
@@ -150,9 +153,10 @@ class PoseGraph:
         try:
             self._smoother.update(factors, values, stamps)
             self._smoother.update()  # a second pass relinearises what the first one moved
-        except RuntimeError:
-            # Indeterminate or inconsistent system: start again from the newest state that was good (libraries: GTSAM
-            # throws IndeterminantLinearSystemException as RuntimeError).
+            healthy = bool(np.isfinite(self.state(self.newest).pose.matrix()).all())
+        except RuntimeError:  # how GTSAM says that a system is indeterminate
+            healthy = False
+        if not healthy:
             self._rebuild()
 
     def _rebuild(self) -> None:

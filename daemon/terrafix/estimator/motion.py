@@ -2,14 +2,15 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from terrafix.core.pose import exp_so3, fit_pose
+from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.pose import fit_pose
 
 EFFECTIVE_PAIRS = 10.0  # relief moves whole blocks of matches together: never more independent ones than this
 SCALE_SIGMA = 0.02  # houses and trees lift the mean ground by this share of the height, beyond the height's own error
 MIN_PAIRS = 8
+MIN_DOWN = -0.2  # up component of a unit-depth ray that meets the ground no farther than five heights away
 
 
 @dataclass(frozen=True)
@@ -22,46 +23,43 @@ class RelativePose:
 
 
 def relative_pose(
-    pairs: np.ndarray, sigma_norm: float, r_w_kf: np.ndarray, height_m: float, height_sigma_m: float
+    pairs: np.ndarray,
+    sigma_norm: float,
+    r_w_kf: np.ndarray,
+    r_w_k: np.ndarray,
+    height_m: float,
+    height_sigma_m: float,
 ) -> RelativePose | None:
     """``pairs`` (N, 4) normalised (x_kf, y_kf, x, y); ``r_w_kf`` gives the direction of the ground plane, ``height_m``
-    its distance. ``None`` when the matches do not determine the motion."""
+    its distance; ``r_w_k`` is a first guess of the new camera, whose tilt must be roughly right: a plane seen from two
+    places has a mirror solution. ``None`` when the matches do not determine the motion."""
     if len(pairs) < MIN_PAIRS:
         return None
-    rays = np.column_stack([pairs[:, :2], np.ones(len(pairs))])
-    down = (rays @ r_w_kf.T)[:, 2]
-    ahead = down < -0.2  # rays that meet the ground no farther than five heights away
+    rays_w = np.column_stack([pairs[:, :2], np.ones(len(pairs))]) @ r_w_kf.T
+    rays_k = np.column_stack([pairs[:, 2:], np.ones(len(pairs))]) @ r_w_k.T
+    ahead = (rays_w[:, 2] < MIN_DOWN) & (rays_k[:, 2] < MIN_DOWN)
     if ahead.sum() < MIN_PAIRS:
         return None
-    rays, xy = rays[ahead], pairs[ahead, 2:]
-    points_kf = rays * (-height_m / down[ahead])[:, None]
-    start = _initial(points_kf, xy, r_w_kf)
-    if start is None:
-        return None
-    fit = fit_pose(points_kf, xy, *start, sigma_floor=sigma_norm, effective=min(1.0, EFFECTIVE_PAIRS / len(xy)))
+    points = rays_w[ahead] * (-height_m / rays_w[ahead, 2])[:, None]  # world axes, from the keyframe's camera
+    seen = rays_k[ahead, :2] / -rays_k[ahead, 2:] * height_m
+    turn, scale, shift = _similarity(seen, points[:, :2])
+    start = np.array([*shift, height_m * (scale - 1.0)])
+    effective = min(1.0, EFFECTIVE_PAIRS / len(points))
+    fit = fit_pose(points, pairs[ahead, 2:], turn @ r_w_k, start, sigma_norm, effective=effective)
     if fit is None:
         return None
     cov = fit.cov.copy()
     # A wrong height scales the translation; the tangent's translation is in the new camera's axes.
     t_new = fit.r_w_c.T @ fit.p_c_in_w_m
     cov[3:, 3:] += np.outer(t_new, t_new) * ((height_sigma_m / height_m) ** 2 + SCALE_SIGMA**2)
-    return RelativePose(fit.r_w_c, fit.p_c_in_w_m, cov)
+    return RelativePose(r_w_kf.T @ fit.r_w_c, r_w_kf.T @ fit.p_c_in_w_m, cov)
 
 
-def _initial(points_kf: np.ndarray, xy: np.ndarray, r_w_kf: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Planar PnP (IPPE, Collins & Bartoli 2014) on the ground plane; of its two solutions the one that fits better.
-
-    -> r_kf_k (3x3), p_k_in_kf (3,)"""
-    in_w = points_kf @ r_w_kf.T
-    centre = in_w.mean(0)
-    flat = in_w - centre
-    flat[:, 2] = 0.0
-    ok, rvecs, tvecs, errors = cv2.solvePnPGeneric(
-        flat, np.ascontiguousarray(xy), np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
-    )
-    if not ok:
-        return None
-    best = int(np.argmin(np.asarray(errors).ravel()))
-    r_k_w = exp_so3(np.asarray(rvecs[best]).ravel())
-    p_k_in_w = centre - r_k_w.T @ np.asarray(tvecs[best]).ravel()
-    return r_w_kf.T @ r_k_w.T, r_w_kf.T @ p_k_in_w
+def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """b = scale * turn * a + shift by least squares (Umeyama 1991) in the plane; turn as (3x3) about up."""
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    za, zb = (a - mean_a) @ (1, 1j), (b - mean_b) @ (1, 1j)
+    ratio = complex(np.vdot(za, zb) / max(float(np.vdot(za, za).real), 1e-12))
+    turn = local_rotation_up(float(np.angle(ratio)))
+    scale = abs(ratio)
+    return turn, scale, mean_b - scale * turn[:2, :2] @ mean_a

@@ -1,0 +1,89 @@
+"""The demo as a stranger runs it: one command, the real processes, an autopilot that must be served."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "demo"]
+DURATION_S = 45.0
+RESUMES_WITHIN_S = 2.0
+
+
+def children_of(pid: int) -> dict[str, int]:
+    """Names of the daemon's processes -> pid."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            words = (entry / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue  # ended meanwhile
+        if parent == pid and b"terrafix.child" in words:
+            found[words[words.index(b"terrafix.child") + 1].decode()] = int(entry.name)
+    return found
+
+
+@pytest.mark.slow
+def test_the_autopilot_is_served(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    began_s = time.monotonic()
+    done = subprocess.run(
+        [*COMMAND, "--out", str(out), "--duration", str(DURATION_S)], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert time.monotonic() - began_s < 90.0 + DURATION_S
+    peer = json.loads((out / "peer.json").read_text())
+    assert peer["accepted"] > 5 * DURATION_S
+    assert peer["healthy_share"] > 0.95 and peer["longest_gap_ms"] < 245.0
+    assert peer["gps_error_median_m"] < 20.0
+    evaluation = json.loads((out / "evaluation.json").read_text())
+    assert evaluation["false_fixes"] == 0 and evaluation["within_50m"] > 0.95
+    page = (out / "report.html").read_text()
+    assert "<svg" in page and not re.search(r'(src|href)="https?://', page)  # one file, works offline
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", ["link", "estimator", "anchor", "vision"])
+def test_a_killed_process_comes_back(victim: str, tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    with subprocess.Popen(
+        [*COMMAND, "--out", str(out), "--duration", str(DURATION_S)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    ) as running:
+        deadline_s = time.monotonic() + 120.0
+        while victim not in children_of(running.pid) or "vision" not in children_of(running.pid):
+            assert time.monotonic() < deadline_s and running.poll() is None, "the flight did not begin"
+            time.sleep(0.2)
+        time.sleep(20.0)
+        os.kill(children_of(running.pid)[victim], signal.SIGKILL)
+        said = running.communicate(timeout=240)[0].decode()
+    assert f"{victim} died: killed by SIGKILL" in said and f"{victim} restarted" in said, said
+    peer = json.loads((out / "peer.json").read_text())
+    if victim == "link":
+        assert peer["longest_gap_ms"] < 1e3 * RESUMES_WITHIN_S
+    else:
+        assert peer["longest_gap_ms"] < 245.0  # the link goes on whatever happens to the others
+    assert victim in (out / "report.html").read_text()
+
+
+def test_a_folder_that_no_demo_made_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("precious")
+    done = subprocess.run([*COMMAND, "--out", str(tmp_path)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 6
+    assert done.stderr.strip().count("\n") == 0 and "no demo made" in done.stderr
+    assert (tmp_path / "thesis.txt").read_text() == "precious"
+
+
+def test_an_impossible_duration_is_one_clear_line(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    done = subprocess.run([*COMMAND, "--out", str(out), "--duration", "1"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "--duration 1" in done.stderr
+    assert not out.exists()
