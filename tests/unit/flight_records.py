@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+
 from terrafix import messages as m
 from terrafix.core.config import Config
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+
 from terrafix import messages as m
 from terrafix.core.codec import encode_json
 from terrafix.core.errors import LinkError

@@ -6,6 +6,7 @@ from typing import get_type_hints
 
 import msgspec
 import pytest
+
 from terrafix.core.config import Config, Section, load
 from terrafix.core.errors import ConfigError
 

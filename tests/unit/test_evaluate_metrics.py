@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from flight_records import ORIGIN
+
 from terrafix.core.errors import EvaluationError
 from terrafix_tools.estimates import COLUMNS, Row, write_rows
 from terrafix_tools.evaluate import evaluate, offset_m, read_truth

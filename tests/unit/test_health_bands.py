@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
+
 from terrafix.core import logs
 from terrafix.core.config import Config, HealthSection
 from terrafix.core.errors import ConfigError

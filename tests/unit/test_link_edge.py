@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_rig import ALT, MS, S, estimate, live
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError

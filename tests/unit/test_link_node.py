@@ -21,6 +21,7 @@ from link_rig import (
     gps,
     texts,
 )
+
 from terrafix import messages as m
 from terrafix.core.geodesy import LocalFrame
 from terrafix.link import fix

@@ -16,6 +16,7 @@ import msgspec
 import pytest
 from link_rig import ALT, LAT, LON, MS, SPEED_EAST, S, covariance, estimate, every, fly, gps, live
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError, SourceError

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import pytest
 from link_rig import MS, TICK_NS, S
+
 from terrafix.link import gps_time
 from terrafix.link.pacer import Pacer
 from terrafix.link.timesync import TimeSync

@@ -17,6 +17,7 @@ import rasterio
 import rasterio.warp
 from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
+
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError, TerrafixError, UsageError
 from terrafix.core.geodesy import LocalFrame

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import map_rasters
 import pytest
+
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame

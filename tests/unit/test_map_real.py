@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import rasterio
+
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.map_build import build

@@ -12,6 +12,7 @@ from pyproj import Transformer
 from rasterio.enums import Resampling
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
+
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.core.geodesy import LocalFrame, local_crs
 from terrafix_tools.map_build import build

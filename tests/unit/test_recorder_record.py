@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from flight_records import estimate, frame, live_messages, origin, write_record
 from mcap.reader import make_reader
+
 from terrafix import messages as m
 from terrafix.core.config import Config
 from terrafix.core.errors import OutputError, SourceError

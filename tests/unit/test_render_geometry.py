@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 from rasterio.transform import Affine
+
 from terrafix import messages as m
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.render import Film, Renderer, drape

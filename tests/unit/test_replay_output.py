@@ -13,6 +13,7 @@ import rasterio
 from flight_records import ORIGIN, estimate
 from rasterio.transform import Affine
 from source_folders import TOML, flight
+
 from terrafix import messages as m
 from terrafix.core.errors import ConfigError, MapError, ModelError, OutputError, UsageError
 from terrafix.core.node import Node, NodeContext

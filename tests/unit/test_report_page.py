@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from flight_records import frame, live_messages, origin, write_record, write_truth
+
 from terrafix.core.errors import SourceError
 from terrafix_tools.estimates import Row, write_rows
 from terrafix_tools.report import report

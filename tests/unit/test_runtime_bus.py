@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 from runtime_nodes import ORIGIN
+
 from terrafix import messages as m
 from terrafix.core import bus
 from terrafix.core.bus import Publisher, Subscriber

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from terrafix.core import frames as frames_module
 from terrafix.core.errors import OutputError
 from terrafix.core.frames import FrameWriter, MemoryFrameStore, SharedFrameStore

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
 from terrafix.core.errors import MapError, SourceError, UsageError
 from terrafix_tools.live import package_for
 

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from runtime_nodes import ORIGIN
+
 from terrafix import messages as m
 from terrafix.core import codec
 from terrafix.core.clock import Ticker

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from runtime_nodes import TABLE
+
 from terrafix import messages as m
 from terrafix.children import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, describe
 from terrafix.core import rundir

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from source_folders import flight, picture
+
 from terrafix.core.clock import now_ns
 from terrafix.core.config import Config, Source
 from terrafix.core.errors import SourceError, UsageError

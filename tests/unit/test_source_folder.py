@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from source_folders import HEADER, TOML, flight, jpeg, picture
+
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources import open_source, parse_start
 

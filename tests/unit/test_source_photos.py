@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 from source_folders import jpeg, picture
+
 from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import rot_w_b

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from source_folders import HEIGHT, TOML, WIDTH, flight, picture
+
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
 from terrafix.core.tlog import read_tlog

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from terrafix.core.errors import OutputError
 from terrafix.vision.sources import open_source
 from terrafix_tools import world

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+
 from terrafix.core.errors import OutputError
 from terrafix_tools import world
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+
 from terrafix.core.errors import TerrafixError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
@@ -27,7 +28,6 @@ def run(
 ) -> None:
     """Fly: start the processes under the supervisor until stopped."""
     from terrafix.supervisor import run as run_supervised
-
     from terrafix_tools.live import package_for
 
     configs = config or []
@@ -60,7 +60,6 @@ def replay(
 ) -> None:
     """Fly a recorded flight as fast as this machine can; the same input gives the same output."""
     from terrafix.vision.sources import parse_start
-
     from terrafix_tools.replay import replay as run_replay
 
     at = parse_start(start)

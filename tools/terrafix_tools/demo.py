@@ -13,8 +13,8 @@ from typing import Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from terrafix.core.errors import EvaluationError, OutputError, SourceError, UsageError
 
+from terrafix.core.errors import EvaluationError, OutputError, SourceError, UsageError
 from terrafix_tools import world
 from terrafix_tools.demo_flight import fly
 from terrafix_tools.map_build import build

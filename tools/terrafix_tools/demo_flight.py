@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
+
 from terrafix import supervisor
 from terrafix.messages import ProcessEvent
-
 from terrafix_tools.peer import AutopilotPeer
 from terrafix_tools.peer_course import PeerState
 from terrafix_tools.peer_report import PeerReport

@@ -12,8 +12,8 @@ import typer
 from pyproj import Geod
 from rich.console import Console
 from rich.table import Table
-from terrafix.core.errors import EvaluationError, OutputError
 
+from terrafix.core.errors import EvaluationError, OutputError
 from terrafix_tools.estimates import Row, number, read_rows, read_table
 
 LIMITS_M = (5, 10, 20, 50)

@@ -18,11 +18,11 @@ import typer
 from pyproj import Transformer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
 from terrafix.anchor.map_format import FORMAT_VERSION, TILE_PX, Level, Manifest
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError, UsageError
 from terrafix.core.geodesy import LocalFrame
-
 from terrafix_tools.map_collar import BLEED_PX, TRIM_PX, Collar, find_collar
 from terrafix_tools.map_dem import DemSource
 from terrafix_tools.map_gpkg import GpkgWriter, new_package

@@ -12,9 +12,9 @@ from rasterio.enums import Resampling
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
+
 from terrafix.anchor.map_format import DEM_TILE_PX, DemGrid
 from terrafix.core.errors import MapError
-
 from terrafix_tools.map_gpkg import GpkgWriter
 from terrafix_tools.map_source import SAMPLE_PX, crs_of, ground_distance_m, ground_pixel_m, open_raster
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pyproj import CRS
 from pyproj.enums import WktVersion
+
 from terrafix.anchor.map_format import (
     APPLICATION_ID,
     DEM_TABLE,

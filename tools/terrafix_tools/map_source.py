@@ -14,6 +14,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
+
 from terrafix.core.errors import MapError
 
 SAMPLE_PX = 1024  # side of the reduced picture from which the stretch of deep pixels is taken

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from terrafix.core.errors import LinkError
 from terrafix.link.carry import distance_m
-
 from terrafix_tools.peer_course import Course, PeerState
 from terrafix_tools.peer_filter import Fusion, PositionFilter
 from terrafix_tools.peer_gps import TYPE_MAV, Fix, GpsDriver

@@ -9,7 +9,6 @@ from collections import deque
 from enum import StrEnum
 
 from terrafix.link.carry import distance_m, offset
-
 from terrafix_tools.peer_gps import Fix
 
 GATE_SIGMAS = 5.0  # EK3_POS_I_GATE and EK3_VEL_I_GATE 500

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from terrafix.core.errors import TerrafixError
 
+from terrafix.core.errors import TerrafixError
 from terrafix_tools.peer import AutopilotPeer
 from terrafix_tools.peer_course import read_course
 

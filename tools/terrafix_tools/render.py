@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from pyproj import CRS, Transformer
 from rasterio.transform import Affine
+
 from terrafix import messages as m
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, local_crs
-
 from terrafix_tools.noise import periodic_noise
 
 GRID_PX = 12  # spacing of the rays; the ground between them is nearly flat

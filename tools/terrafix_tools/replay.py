@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, ModelError, UsageError
@@ -25,7 +26,6 @@ from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.writer import versions
 from terrafix.vision.sources import Source, open_source
-
 from terrafix_tools.map_build import ensure_package
 from terrafix_tools.replay_output import ReplayOutput
 

@@ -7,12 +7,12 @@ from types import TracebackType
 from typing import Any, Self, TextIO
 
 import numpy as np
+
 from terrafix.core.config import Config
 from terrafix.core.errors import OutputError
 from terrafix.core.node import Image
 from terrafix.messages import Frame, MapMatch, MeasurementVerdict, Message, Odometry, Verdict
 from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
-
 from terrafix_tools.estimates import ESTIMATES, PARTIAL, RowTable, write_rows
 
 RECORD, SUMMARY = "flight.mcap", "summary.json"

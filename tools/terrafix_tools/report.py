@@ -6,7 +6,6 @@ from importlib.resources import files
 from pathlib import Path
 
 from terrafix.core.errors import OutputError
-
 from terrafix_tools.estimates import Row
 from terrafix_tools.map_build import ensure_package
 from terrafix_tools.replay import map_cache_dir

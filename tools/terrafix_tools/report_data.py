@@ -21,7 +21,6 @@ from terrafix.messages import (
     StatusText,
 )
 from terrafix.recorder.reader import ReadResult, read_heard, read_thumbnails
-
 from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, Row, RowTable, read_rows
 from terrafix_tools.evaluate import (
     ELLIPSE95,

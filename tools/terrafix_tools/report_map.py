@@ -7,10 +7,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
-
 from terrafix_tools.estimates import Row
 from terrafix_tools.report_data import FlightView, ellipse95
 

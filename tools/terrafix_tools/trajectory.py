@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
 from terrafix.core.geodesy import rot_w_b
 
 GRAVITY_MPS2 = 9.81

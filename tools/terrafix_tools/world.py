@@ -10,8 +10,8 @@ import numpy as np
 import rasterio
 from pyproj import CRS, Transformer
 from rasterio.transform import Affine
-from terrafix.core.errors import OutputError
 
+from terrafix.core.errors import OutputError
 from terrafix_tools.world_layout import DEM_MARGIN_M, DEM_POST_M, Layout, plan
 from terrafix_tools.world_paint import paint
 from terrafix_tools.world_season import SEASONS

@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from pyproj import CRS
+
 from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.errors import OutputError
 from terrafix.core.geodesy import LocalFrame
-
 from terrafix_tools.render import Film, Ground, Renderer, drape
 from terrafix_tools.trajectory import Sensors, State, Trajectory
 from terrafix_tools.world import EPSG, World

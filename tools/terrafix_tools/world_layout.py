@@ -21,7 +21,8 @@ HEDGED = {"road": 0.4, "track": 0.35, "border": 0.45}  # share of the lines with
 DEM_POST_M = 10.0
 DEM_MARGIN_M = 300.0  # the DEM reaches beyond the image, as real ones do
 GROUND_AMSL_M = 320.0
-RELIEF_M = 45.0  # from the river to the hills
+RELIEF_M = 34.0  # from the river to the hills
+VALLEY_M = 620.0  # half width: slopes of a few per cent, as farmland has them
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,6 @@ def _dem(rng: np.random.Generator, river: np.ndarray, width_m: float, height_m: 
     points = np.round((river[:, :2] + DEM_MARGIN_M) / DEM_POST_M).astype(np.int32)
     cv2.polylines(dry, [points], False, 0, 2)
     distance_m = cv2.distanceTransform(dry, cv2.DIST_L2, 5) * DEM_POST_M
-    valley = 1.0 - np.exp(-((distance_m / 350.0) ** 2))
-    height = RELIEF_M * valley * (0.5 + 0.22 * hills) + 1.0 * hills
+    valley = 1.0 - np.exp(-((distance_m / VALLEY_M) ** 2))
+    height = RELIEF_M * (valley * (0.75 + 0.15 * hills) + 0.08 * hills)
     return (GROUND_AMSL_M + cv2.GaussianBlur(height, (0, 0), 3.0)).astype(np.float32)
