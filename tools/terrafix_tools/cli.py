@@ -142,11 +142,16 @@ def map_preview(
 def bench(
     data: Annotated[Path, typer.Option(help="Folder with flights/ and models/.")] = Path("../shared/data"),
     out: Annotated[Path, typer.Option(help="JSON to write.")] = Path("out/bench.json"),
+    flight: Annotated[
+        list[str] | None, typer.Option(help="Name in flights/, or 'generated'; may be given several times.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(help="Only so many frames of each flight.")] = None,
+    xfeat: Annotated[bool, typer.Option(help="Also with XFeat, when models/xfeat.onnx is there.")] = True,
 ) -> None:
     """Time per frame and accuracy beside a SIFT + RANSAC baseline measured in the same run."""
     from terrafix_tools.bench import bench as run_bench
 
-    run_bench(data, out)
+    run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat)
 
 
 def main() -> None:

@@ -123,7 +123,7 @@ def _field(canvas: Canvas, parcel: Parcel) -> None:
         return
     window, mask = found
     canvas.colour[window][mask] = np.round(mean).astype(np.uint8)
-    soil_gain, grain_gain = rng.choice([-0.6, 0.6, 0.9]), rng.uniform(0.25, 0.5)
+    soil_gain, grain_gain = rng.choice([-0.7, 0.7]), rng.uniform(0.25, 0.5)
     soil, grain = canvas.soil[window], canvas.grain[window]
     patch = cv2.addWeighted(soil, soil_gain, grain, grain_gain, NEUTRAL * (1.0 - soil_gain - grain_gain))
     if rows:

@@ -78,7 +78,7 @@ class MapFeatures:
         inner = slice(PAD_PX // stride, PAD_PX // stride + per_tile)
         descriptors = self._describer.describe(image)[:, inner, inner]
         rim = slice(PAD_PX, PAD_PX + TILE_CELLS_PX)
-        valid = ok[rim, rim].reshape(per_tile, stride, per_tile, stride).all(axis=(1, 3))
+        valid = np.asarray(ok[rim, rim].reshape(per_tile, stride, per_tile, stride).all(axis=(1, 3)))
         tile = (np.where(valid, descriptors, 0.0).astype(np.float16), valid)
         self._tiles[key] = tile
         self._bytes += tile[0].nbytes + valid.nbytes

@@ -182,7 +182,7 @@ class FrameMatcher:
         """Descriptors (C, h, w) and the cells (h, w) that lie wholly in the frame."""
         stride = self._describer.stride
         h, w = frame.mask.shape[0] // stride, frame.mask.shape[1] // stride
-        mask = frame.mask.reshape(h, stride, w, stride).all(axis=(1, 3))
+        mask = np.asarray(frame.mask.reshape(h, stride, w, stride).all(axis=(1, 3)))
         return self._describer.describe(frame.image), mask
 
     def _offsets(self, frame: Rectified) -> tuple[float, float, float, float]:

@@ -44,13 +44,15 @@ class AnchorNode:
         self._matcher: FrameMatcher | None = None
         self._map: LocalMap | None = None
         self._belief: Belief | None = None
+        self._origin: Origin | None = None
         self._ground_m = 0.0
         self._since_look_m = np.inf  # motion since the last look at new ground
         self._poor_looks = 0.0
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
-            case Origin():
+            case Origin() if message != self._origin:  # said again after a restart of the source
+                self._origin = message
                 self._ground_m = message.ground_amsl_m or 0.0
                 self._belief = None
                 if self._package is not None:

@@ -4,6 +4,7 @@ A node is a frame that moved on: C_k, the camera pose in the world, and B_k, the
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
 import numpy as np
@@ -140,7 +141,10 @@ class PoseGraph:
         self.all_values.insert(values)
         self._next += 1
         self._times[node] = t_s
-        stamps = {C(node): float(node), B(node): float(node)}
+        stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = {
+            C(node): float(node),
+            B(node): float(node),
+        }
         leaving = [n for n in self._times if n < node - LAG_NODES]
         if leaving:
             self._remember(leaving)
@@ -148,7 +152,12 @@ class PoseGraph:
         for n in leaving:
             del self._times[n]
 
-    def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: Mapping[int, float]) -> None:
+    def _update(
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        stamps: Mapping[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex],
+    ) -> None:
         self.all_factors.push_back(factors)
         try:
             self._smoother.update(factors, values, stamps)

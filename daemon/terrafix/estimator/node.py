@@ -42,7 +42,7 @@ class EstimatorNode:
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
-            case Origin():
+            case Origin() if self._estimator is None or message != self._estimator.origin:  # said again after a restart
                 self._estimator = Estimator(message)
                 self._frame = LocalFrame(message.lat_deg, message.lon_deg)
             case VehicleState():

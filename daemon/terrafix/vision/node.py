@@ -12,11 +12,13 @@ from terrafix.vision.odometry import FrameTracker
 class VisionNode:
     def __init__(self, frames: FrameStore) -> None:
         self._frames = frames
+        self._origin: Origin | None = None
         self._tracker: FrameTracker | None = None
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
-            case Origin():
+            case Origin() if message != self._origin:  # said again after a restart of the source
+                self._origin = message
                 self._tracker = FrameTracker(CameraCalibration.of(message.camera))
             case Frame():
                 yield self._odometry(message)

@@ -69,7 +69,7 @@ class FrameTracker:
         self._last_index = np.zeros(0, int)  # which corners these are
         self._misses = 0
         self._missed: _Keyframe | None = None  # the frame that failed last: the first of a new fragment, perhaps
-        self._sift = cv2.SIFT_create(nfeatures=SIFT_FEATURES)
+        self._sift = cv2.SIFT.create(nfeatures=SIFT_FEATURES)
 
     def track(self, frame_id: int, image: Image) -> Motion:
         gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

@@ -1,0 +1,215 @@
+"""`terrafix bench`: time, memory and accuracy of whole replays, beside a SIFT + RANSAC baseline on the same frames.
+
+Every measurement is a process of its own, one after the other. Milliseconds depend on the machine and on what else it
+does; the ratio to the baseline, measured minutes apart on the same machine, hardly does: that is the headline."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
+from terrafix.recorder.writer import versions
+from terrafix_tools import bench_baseline, bench_micro, bench_run, world
+from terrafix_tools.map_build import build, ensure_package
+from terrafix_tools.replay import map_cache_dir
+from terrafix_tools.world_flight import plan_flight, write_flight
+
+FLIGHTS = ("village-1", "town-a")
+GENERATED = "generated"
+GENERATED_S, GENERATED_SEED = 20.0, 3  # seconds of flight; any seed will do
+GENERATED_SIZE_M = (1600.0, 1200.0)
+WEIGHTS_FREE, XFEAT = "weights-free", "xfeat"
+_MISTAKES = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}
+
+
+def bench(
+    data: Path, out: Path, *, flights: list[str] | None = None, frames: int | None = None, xfeat: bool = True
+) -> dict[str, Any]:
+    """Writes ``out`` (JSON), prints tables, returns what it wrote.
+
+    ``data``: folder with flights/ and models/. ``flights``: names in it, or "generated"; default: FLIGHTS, or the
+    generated one when the data are absent. ``frames``: only so many of each. Raises the TerrafixError family."""
+    if frames is not None and frames < 2:
+        raise UsageError(f"--frames {frames}: two frames are the least that can be measured")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.touch()
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+    console = Console(stderr=True)
+    missing: list[str] = []
+    model = _model(data, missing) if xfeat else None
+    names = _present(data, flights or list(FLIGHTS), missing)
+    if not names and not flights:
+        names = [GENERATED]
+    if not names:
+        raise SourceError(f"{data / 'flights'}: none of {', '.join(flights or [])} is there; check --data and --flight")
+    for what in missing:
+        console.print(f"NOT MEASURED: {what}", style="bold yellow", highlight=False, soft_wrap=True)
+    result: dict[str, Any] = {"machine": machine(), "missing": missing, "flights": {}, "micro": {}}
+    with tempfile.TemporaryDirectory(prefix="terrafix-bench-") as temporary:
+        for name in names:
+            work = Path(temporary) / name
+            flight, package = _prepare(data, name, work, frames, console)
+            measured = _flight(flight, package, work, model, console)
+            if not result["micro"]:
+                result["micro"] = {"flight": name, **_part(bench_micro, flight, package, work / WEIGHTS_FREE, model)}
+            result["flights"][name] = measured
+    result["machine"]["load_average_after"] = os.getloadavg()
+    try:
+        out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+    _show(result, out)
+    return result
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers were measured on."""
+    info = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    model = next((line.partition(":")[2].strip() for line in info if line.startswith("model name")), "")
+    memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
+    return {
+        "cpu": model or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_mb": memory_mb,
+        "load_average_before": os.getloadavg(),
+        "versions": versions(),
+    }
+
+
+def _model(data: Path, missing: list[str]) -> Path | None:
+    path = data / "models" / "xfeat.onnx"
+    if path.is_file():
+        return path.resolve()
+    missing.append(f"XFeat: {path} is not there")
+    return None
+
+
+def _present(data: Path, wanted: list[str], missing: list[str]) -> list[str]:
+    found = [name for name in wanted if name == GENERATED or (data / "flights" / name / "flight.toml").is_file()]
+    missing += [f"flight {name}: not in {data / 'flights'}" for name in wanted if name not in found]
+    return found
+
+
+def _prepare(data: Path, name: str, work: Path, frames: int | None, console: Console) -> tuple[Path, Path]:
+    """A flight folder with only the wanted frames, and the package of its map."""
+    work.mkdir()
+    if name == GENERATED:
+        with console.status("a place and a flight over it"):
+            flight, package = _generate(work)
+    else:
+        flight = (data / "flights" / name).resolve()
+        table = tomllib.loads((flight / "flight.toml").read_text(encoding="utf-8"))
+        if "map" not in table:
+            raise SourceError(f"{flight / 'flight.toml'}: names no map, and the benchmark needs one")
+        package = ensure_package(flight / str(table["map"]), map_cache_dir(), progress=True)
+    short = work / "flight"
+    if frames is None:
+        return flight, package.resolve()
+    short.mkdir()
+    for entry in flight.iterdir():
+        if entry.name != "frames.csv":
+            (short / entry.name).symlink_to(entry)
+    lines = (flight / "frames.csv").read_text(encoding="utf-8").splitlines()
+    (short / "frames.csv").write_text("\n".join(lines[: frames + 1]) + "\n", encoding="utf-8")
+    return short, package.resolve()
+
+
+def _generate(work: Path) -> tuple[Path, Path]:
+    place = world.generate(GENERATED_SEED, width_m=GENERATED_SIZE_M[0], height_m=GENERATED_SIZE_M[1])
+    world.write_image(work / "map.tif", place, place.look("summer"))
+    world.write_dem(work / "dem.tif", place)
+    package = build(work / "map.tif", work / "map.gpkg", dem=work / "dem.tif")
+    flight = plan_flight(place, place.look("autumn"), GENERATED_S)
+    write_flight(work / GENERATED, flight, "../map.gpkg", seed=GENERATED_SEED)
+    return work / GENERATED, package
+
+
+def _flight(flight: Path, package: Path, work: Path, model: Path | None, console: Console) -> dict[str, Any]:
+    runs: dict[str, Any] = {}
+    for kind in (WEIGHTS_FREE, XFEAT) if model else (WEIGHTS_FREE,):
+        with console.status(f"{work.name}: {kind}"):
+            runs[kind] = _part(bench_run, flight, package, work / kind, model if kind == XFEAT else None)
+    with console.status(f"{work.name}: {bench_baseline.METHOD}"):
+        baseline = _part(bench_baseline, flight, package, work / WEIGHTS_FREE, None)
+    ratios = {kind: _ratios(run, baseline) for kind, run in runs.items()}
+    return {"frames": baseline["frames"], "runs": runs, "baseline": baseline, "ratios": ratios}
+
+
+def _ratios(run: dict[str, Any], baseline: dict[str, Any]) -> dict[str, float | None]:
+    """Ours by the baseline's: below 1 is faster, above 1 is more frames."""
+    theirs_ms = baseline["frame_ms"]["median"] if baseline["frame_ms"] else None
+    out: dict[str, float | None] = {"frame_ms": round(run["frame_ms"]["median"] / theirs_ms, 3) if theirs_ms else None}
+    for key in ("within_20m", "within_50m"):
+        theirs = baseline["accuracy"][key]
+        out[key] = round(run["accuracy"][key] / theirs, 3) if theirs else None
+    return out
+
+
+def _part(module: Any, flight: Path, package: Path, out: Path, model: Path | None) -> dict[str, Any]:
+    """Runs one measurement in a process of its own; what it says on stderr is what went wrong."""
+    arguments = [str(path) for path in (flight, package, out, model) if path is not None]
+    done = subprocess.run([sys.executable, "-m", module.__name__, *arguments], stderr=subprocess.PIPE, text=True)
+    if kind := _MISTAKES.get(done.returncode):
+        raise kind(done.stderr.strip())
+    if done.returncode != 0:
+        raise RuntimeError(f"{module.__name__} failed with exit code {done.returncode}:\n{done.stderr}")
+    result: dict[str, Any] = json.loads((out / module.RESULT).read_text(encoding="utf-8"))
+    return result
+
+
+def _show(result: dict[str, Any], out: Path) -> None:
+    console, m = Console(), result["machine"]
+    load = "/".join(f"{v:.1f}" for v in (m["load_average_before"][0], m["load_average_after"][0]))
+    console.print(f"{m['cpu']}, {m['cores']} cores, load {load} (before/after)", highlight=False)
+    for name, flight in result["flights"].items():
+        table = Table(title=f"{name}, {flight['frames']} frames", title_justify="left")
+        runs, baseline = flight["runs"], flight["baseline"]
+        table.add_column("")
+        for kind in (*runs, baseline["method"]):
+            table.add_column(kind, justify="right")
+        ratio = (_times(flight["ratios"][kind]["frame_ms"]) for kind in runs)
+        table.add_row("time by the baseline's", *ratio, "1", style="bold")
+        table.add_row(
+            "frame, ms (median / p95)", *(_pair(r["frame_ms"]) for r in runs.values()), _pair(baseline["frame_ms"])
+        )
+        for stage in next(iter(runs.values()))["stage_ms"]:
+            table.add_row(f"  {stage}", *(_pair(r["stage_ms"][stage]) for r in runs.values()), "")
+        for key in ("within_20m", "within_50m"):
+            cells = [_percent(r["accuracy"][key]) for r in (*runs.values(), baseline)]
+            table.add_row(key.replace("_", " ").replace("m", " m"), *cells)
+        cells = ["-" if (v := r["accuracy"]["median_m"]) is None else f"{v:.1f} m" for r in (*runs.values(), baseline)]
+        table.add_row("median error", *cells)
+        table.add_row("peak memory", *(f"{r['peak_memory_mb']:.0f} MB" for r in runs.values()), "")
+        console.print(table)
+    micro = {part: times for part, times in result["micro"].items() if isinstance(times, dict)}
+    table = Table(title=f"parts, on {result['micro']['flight']}", title_justify="left")
+    table.add_column("")
+    table.add_column("ms (median / p95)", justify="right")
+    for part, times in micro.items():
+        table.add_row(part, _pair(times))
+    console.print(table)
+    typer.echo(f"written to {out}")
+
+
+def _pair(times: dict[str, float] | None) -> str:
+    return f"{times['median']:.1f} / {times['p95']:.1f}" if times else "-"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
+
+
+def _times(ratio: float | None) -> str:
+    return "-" if ratio is None else f"x {ratio:.2f}"

@@ -1,0 +1,120 @@
+"""The baseline of the benchmark: what most people try first. python -m terrafix_tools.bench_baseline FLIGHT MAP OUT.
+
+The frame, rectified with the same prediction as the matcher gets, against the map around the predicted place: SIFT,
+Lowe's ratio test, a homography by RANSAC; the point under the camera, carried over by it, is the position. It is
+given the estimator's prediction, which has seen all frames before; alone it would have less."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from terrafix.anchor.map_package import LocalMap, MapPackage
+from terrafix.anchor.rectify import rectify
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.node import Image
+from terrafix.messages import Origin, Prediction
+from terrafix.recorder.reader import read_flight
+from terrafix.vision.sources import open_source
+from terrafix_tools.bench_run import run_part, spread
+from terrafix_tools.evaluate import offset_m, read_truth
+
+HALF_WINDOW_M = 70.0  # around the predicted footprint: the prior of the probes that this is compared with
+RATIO = 0.8  # Lowe 2004
+RANSAC_PX = 5.0  # generous: relief and leaning houses
+MIN_INLIERS = 8  # chance gives 4 to 7; fewer is no answer
+METHOD = "SIFT, ratio test 0.8, RANSAC homography"
+RESULT = "baseline.json"
+
+
+class SiftBaseline:
+    def __init__(self, camera: CameraCalibration, local: LocalMap) -> None:
+        self._camera, self._map = camera, local
+        self._sift = cv2.SIFT.create()
+        self._matcher = cv2.BFMatcher(cv2.NORM_L2)
+
+    def locate(self, image: Image, prediction: Prediction) -> tuple[float, float] | None:
+        """-> (e_m, n_m) of the camera, or None when nothing agreed."""
+        e_m, n_m, _ = prediction.p_c_in_w_m
+        gsd_m = max(self._map.gsd_m, prediction.agl_m / self._camera.fx)  # the finest that both sides have
+        frame = rectify(image, self._camera, rot_from_quat(prediction.q_w_c), prediction.agl_m, gsd_m)
+        if frame is None:
+            return None
+        h, w = frame.mask.shape
+        margin = round(HALF_WINDOW_M / gsd_m)
+        west, north = e_m + frame.e_min_m - margin * gsd_m, n_m + frame.n_max_m + margin * gsd_m
+        window, valid = self._map.window(west, north, w + 2 * margin, h + 2 * margin, gsd_m)
+        seen, seen_at = self._describe(frame.image, frame.mask)
+        known, known_at = self._describe(window, valid)
+        if len(seen_at) < MIN_INLIERS or len(known_at) < MIN_INLIERS:
+            return None
+        pairs = [p for p in self._matcher.knnMatch(seen, known, k=2) if len(p) == 2]
+        good = [a for a, b in pairs if a.distance < RATIO * b.distance]
+        if len(good) < MIN_INLIERS:
+            return None
+        here, there = seen_at[[g.queryIdx for g in good]], known_at[[g.trainIdx for g in good]]
+        matrix, inliers = cv2.findHomography(here, there, cv2.RANSAC, RANSAC_PX)
+        if matrix is None or int(inliers.sum()) < MIN_INLIERS:
+            return None
+        nadir_px = np.array([-frame.e_min_m / gsd_m - 0.5, frame.n_max_m / gsd_m - 0.5, 1.0])
+        x, y, scale = matrix @ nadir_px
+        if abs(scale) < 1e-9:
+            return None
+        at_e_m, at_n_m = west + (float(x / scale) + 0.5) * gsd_m, north - (float(y / scale) + 0.5) * gsd_m
+        inside = max(abs(at_e_m - e_m), abs(at_n_m - n_m)) <= HALF_WINDOW_M
+        return (at_e_m, at_n_m) if inside else None
+
+    def _describe(self, image: Image, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Descriptors (N, 128) and where they are (N, 2) px."""
+        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        keypoints, descriptors = self._sift.detectAndCompute(gray, mask.astype(np.uint8) * 255)
+        if descriptors is None:
+            return np.zeros((0, 128), np.float32), np.zeros((0, 2), np.float32)
+        return descriptors, np.array([k.pt for k in keypoints], np.float32)
+
+
+def measure(flight: Path, map_path: Path, replayed: Path, _xfeat: Path | None = None) -> dict[str, Any]:
+    """The baseline on every frame of ``flight`` for which the replay in ``replayed`` had a prediction."""
+    said = [message for _, _, message in read_flight(replayed)]
+    origin = next(message for message in said if isinstance(message, Origin))
+    predictions = {message.frame_id: message for message in said if isinstance(message, Prediction)}
+    place = LocalFrame(origin.lat_deg, origin.lon_deg)
+    truth = read_truth(flight / "truth.csv")
+    package = MapPackage.open(map_path)
+    baseline = SiftBaseline(CameraCalibration.of(origin.camera), package.bind(place))
+    times_ms, errors_m, frames = [], [], 0
+    source = open_source(str(flight))
+    shots = source.shots()
+    while True:
+        began_s = time.perf_counter()
+        shot = next(shots, None)  # reads and decodes the image, which is in our own time per frame, too
+        if shot is None:
+            break
+        prediction = predictions.get(shot.frame.frame_id)
+        if shot.image is None or prediction is None or shot.frame.file not in truth:
+            continue
+        found = baseline.locate(shot.image, prediction)
+        times_ms.append((time.perf_counter() - began_s) * 1e3)
+        frames += 1
+        if found is not None:
+            errors_m.append(float(np.hypot(*offset_m(truth[shot.frame.file], *place.to_wgs84(*found)))))
+    source.close()
+    package.close()
+    return {
+        "method": METHOD,
+        "frames": frames,
+        "answered": len(errors_m),
+        "frame_ms": spread(times_ms) if times_ms else None,
+        "accuracy": {
+            "within_20m": sum(e <= 20.0 for e in errors_m) / frames if frames else None,
+            "within_50m": sum(e <= 50.0 for e in errors_m) / frames if frames else None,
+            "median_m": round(float(np.median(errors_m)), 3) if errors_m else None,
+        },
+    }
+
+
+if __name__ == "__main__":
+    run_part(measure, RESULT)

@@ -1,0 +1,132 @@
+"""The parts of the benchmark one by one, on a recorded flight: python -m terrafix_tools.bench_micro FLIGHT MAP OUT.
+
+Every part is given what it was given in flight, taken from the record of a replay."""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from terrafix.anchor.belief import Belief
+from terrafix.anchor.map_package import MapPackage
+from terrafix.anchor.matcher import FrameMatcher, View
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.config import Config
+from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.node import Image
+from terrafix.estimator.node import EstimatorNode
+from terrafix.messages import Health, MapMatch, Message, Odometry, Origin, Prediction, ThermalBand, VehicleState
+from terrafix.recorder.reader import read_flight
+from terrafix.vision.odometry import FrameTracker
+from terrafix.vision.sources import open_source
+from terrafix_engines.features import open_describer
+from terrafix_tools.bench_run import run_part, spread
+
+RESULT = "micro.json"
+FRAMES = 40  # of the flight's beginning
+LOOKS = 10  # of these, spread over them, for what takes long
+NODES = 20  # the estimator's window: from here on it is full
+BELIEF_SIGMA_M = 20.0  # start of the belief that is looked with: a usual one
+
+
+def measure(flight: Path, map_path: Path, replayed: Path, xfeat: Path | None) -> dict[str, Any]:
+    """-> part -> {median, p95} in ms."""
+    said = [message for _, _, message in read_flight(replayed)]
+    origin = next(message for message in said if isinstance(message, Origin))
+    camera = CameraCalibration.of(origin.camera)
+    images = _images(flight)
+    tracker = FrameTracker(camera)
+    result = {"odometry": spread([_ms(partial(tracker.track, i, p)) for i, p in images.items()])}
+    package = MapPackage.open(map_path)
+    local = package.bind(LocalFrame(origin.lat_deg, origin.lon_deg))
+    predictions = [m for m in said if isinstance(m, Prediction) and m.frame_id in images]
+    chosen = predictions[:: max(1, len(predictions) // LOOKS)]
+    for model in ("", str(xfeat)) if xfeat else ("",):
+        matcher = FrameMatcher(camera, local, open_describer(model))
+        result |= _looks(matcher, chosen, images, origin.ground_amsl_m or 0.0, " (xfeat)" if model else "")
+    package.close()
+    for band, name in ((ThermalBand.NORMAL, "marginals"), (ThermalBand.HOT, "jacobian")):
+        times_ms = _estimator(said, band)
+        result[f"estimator frame, {NODES} nodes, {name}"] = spread(times_ms) if times_ms else {}
+    return result
+
+
+def _looks(
+    matcher: FrameMatcher, predictions: list[Prediction], images: dict[int, Image], ground_m: float, suffix: str
+) -> dict[str, Any]:
+    look_ms, update_ms, fix_ms = [], [], []
+    for prediction in predictions:
+        image, view = images[prediction.frame_id], _view(prediction, ground_m)
+        belief = Belief(view.e_m, view.n_m, BELIEF_SIGMA_M)
+        matcher.look(image, view, belief)  # the map's descriptors are there from the frame before
+        began_s = time.perf_counter()
+        look = matcher.look(image, view, belief)
+        look_ms.append((time.perf_counter() - began_s) * 1e3)
+        if not look.surfaces:
+            continue
+        update_ms.append(_ms(partial(belief.update, look.surfaces, 1.0)))
+        mode = belief.mode()
+        hypothesis, _ = look.best_at(mode.e_m, mode.n_m)
+        matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m)
+        fix_ms.append(_ms(partial(matcher.fix, image, view, hypothesis, mode.e_m, mode.n_m)))
+    parts = {"look (search)": look_ms, "belief update": update_ms, "fix (patches + PnP)": fix_ms}
+    return {name + suffix: spread(values) for name, values in parts.items() if values}
+
+
+def _estimator(said: list[Message], band: ThermalBand) -> list[float]:
+    """Time for each frame once the window is full: odometry in, prediction and estimate out, map match in, estimate
+    out; covariance included."""
+    node = EstimatorNode(Config().map.registration_sigma_m)
+    list(node.on(Health(t_ns=0, band=band, temperature_c=None, throttled=False, disk_free_mb=None, cause="benchmark")))
+    times: dict[int, float] = {}
+    for message in said:
+        if isinstance(message, Origin | VehicleState):
+            list(node.on(message))
+        elif isinstance(message, Odometry | MapMatch):
+            elapsed = _ms(partial(_all_said, node, message))
+            times[message.frame_id] = times.get(message.frame_id, 0.0) + elapsed
+    return list(times.values())[NODES:]
+
+
+def _all_said(node: EstimatorNode, message: Message) -> list[Message]:
+    return list(node.on(message))
+
+
+def _view(prediction: Prediction, ground_m: float) -> View:
+    e_m, n_m, _ = prediction.p_c_in_w_m
+    cov = np.array(prediction.cov).reshape(6, 6)
+    return View(
+        e_m=e_m,
+        n_m=n_m,
+        r_w_c=rot_from_quat(prediction.q_w_c),
+        agl_m=prediction.agl_m,
+        ground_m=ground_m,
+        yaw_sigma_rad=float(np.sqrt(cov[5, 5])),
+        scale_sigma=prediction.agl_sigma_m / max(prediction.agl_m, 1.0),
+        tilt_sigma_rad=float(np.sqrt(max(cov[3, 3], cov[4, 4]))),
+    )
+
+
+def _images(flight: Path) -> dict[int, Image]:
+    source = open_source(str(flight))
+    found: dict[int, Image] = {}
+    for shot in source.shots():
+        if shot.image is not None:
+            found[shot.frame.frame_id] = shot.image
+        if len(found) >= FRAMES:
+            break
+    source.close()
+    return found
+
+
+def _ms(work: Callable[[], object]) -> float:
+    began_s = time.perf_counter()
+    work()
+    return (time.perf_counter() - began_s) * 1e3
+
+
+if __name__ == "__main__":
+    run_part(measure, RESULT)

@@ -1,0 +1,121 @@
+"""One timed replay in a process of its own, so that its peak memory is its own: python -m terrafix_tools.bench_run.
+
+The nodes are those that fly, each behind a stopwatch; frames are those of the flight folder."""
+
+import json
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+
+from terrafix.core.errors import TerrafixError
+from terrafix.core.node import Node, NodeContext
+from terrafix.messages import Frame, Message, SourceEnded
+from terrafix_tools.estimates import ESTIMATES, read_rows
+from terrafix_tools.evaluate import metrics, read_summary, read_truth, truth_sigma_of
+from terrafix_tools.replay import FLOWN, make_nodes, replay
+
+RESULT = "bench.json"
+WARM_UP_FRAMES = 1  # the first frame pays for opening the map's first tiles and the libraries' first calls
+
+
+class StageTimes:
+    """Milliseconds of every stage for every frame; the refinement after the last frame has a row of its own."""
+
+    def __init__(self) -> None:
+        self.frames: list[defaultdict[str, float]] = []
+        self.refine_ms = 0.0
+        self._frame_id = -1
+        self._landed = False
+
+    def begin(self, message: Message) -> None:
+        """Every node that hears of a frame says so; the first one counts."""
+        if isinstance(message, Frame) and message.frame_id != self._frame_id:
+            self._frame_id = message.frame_id
+            self.frames.append(defaultdict(float))
+        elif isinstance(message, SourceEnded):
+            self._landed = True
+
+    def add(self, stage: str, elapsed_ms: float) -> None:
+        if self._landed:
+            self.refine_ms += elapsed_ms
+        elif self.frames:
+            self.frames[-1][stage] += elapsed_ms
+
+
+class TimedNode:
+    """A node and the time that it takes; what it says is said when it is done."""
+
+    def __init__(self, name: str, node: Node, times: StageTimes) -> None:
+        self._name, self._node, self._times = name, node, times
+
+    def on(self, message: Message) -> Iterable[Message]:
+        self._times.begin(message)
+        began_s = time.perf_counter()
+        said = list(self._node.on(message))
+        self._times.add(self._name, (time.perf_counter() - began_s) * 1e3)
+        return said
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        return self._node.tick(now_ns)
+
+
+def measure(flight: Path, map_path: Path, out: Path, xfeat: Path | None) -> dict[str, Any]:
+    """Replays ``flight`` into ``out``. -> times per frame and stage, memory, accuracy. Raises the TerrafixError
+    family."""
+    times = StageTimes()
+
+    def nodes(ctx: NodeContext) -> dict[str, Node]:
+        return {name: TimedNode(name, node, times) for name, node in make_nodes(ctx).items()}
+
+    replay(flight, map_path, out, models=[f"xfeat={xfeat}"] if xfeat else [], nodes=nodes)
+    rows = read_rows(out / ESTIMATES)
+    truth = flight / "truth.csv"
+    whole_ms = [row.process_ms or 0.0 for row in rows]
+    stages = {name: [frame[name] for frame in times.frames] for name in FLOWN}
+    decode_ms = [whole - sum(frame.values()) for whole, frame in zip(whole_ms, times.frames, strict=True)]
+    result: dict[str, Any] = {
+        "frame_ms": spread(whole_ms),
+        "stage_ms": {"decode": spread(decode_ms)} | {name: spread(values) for name, values in stages.items()},
+        "refine_ms": round(times.refine_ms, 1),
+        "peak_memory_mb": peak_memory_mb(),
+    }
+    if truth.is_file():
+        found = metrics(rows, read_truth(truth), read_summary(out), truth_sigma_of(truth))
+        kept = ("within_20m", "within_50m", "median_m", "p95_m", "ellipse95_coverage", "false_fixes", "localised")
+        result["accuracy"] = {key: found[key] for key in (*kept, "refined_within_20m", "refined_median_m")}
+    return result
+
+
+def spread(values_ms: list[float]) -> dict[str, float]:
+    """Median and 95th percentile, without the warm-up."""
+    used = values_ms[WARM_UP_FRAMES:] or values_ms
+    return {"median": round(float(np.median(used)), 2), "p95": round(float(np.percentile(used, 95)), 2)}
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this program. Not getrusage: that counts what forked it, too (execve(2))."""
+    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        if line.startswith("VmHWM:"):
+            return round(int(line.split()[1]) / 1024, 1)
+    raise RuntimeError("/proc/self/status has no VmHWM")
+
+
+def run_part(measure: Callable[[Path, Path, Path, Path | None], dict[str, Any]], result: str) -> None:
+    """FLIGHT MAP OUT [XFEAT] on the command line: writes OUT/``result``. A user's mistake is one line."""
+    flight, map_path, out, *model = (Path(text) for text in sys.argv[1:])
+    try:
+        found = measure(flight, map_path, out, model[0] if model else None)
+    except TerrafixError as error:
+        typer.echo(str(error), err=True)
+        sys.exit(error.exit_code)
+    (out / result).write_text(json.dumps(found), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    run_part(measure, RESULT)
