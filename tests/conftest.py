@@ -1,7 +1,9 @@
 """Fixtures for all tests."""
 
 import os
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -29,3 +31,31 @@ def data_set(data_dir: Path) -> Callable[[str], Path]:
         return path
 
     return find
+
+
+# Sleeps and looks how much later than asked for it woke up; says the worst when its input ends.
+SLEEPER = """
+import select, sys, time
+worst_s, step_s = 0.0, 0.005
+while True:
+    began_s = time.monotonic()
+    ended = select.select([sys.stdin], [], [], step_s)[0]
+    if ended:
+        break
+    worst_s = max(worst_s, time.monotonic() - began_s - step_s)
+print(1e3 * worst_s)
+"""
+
+
+@pytest.fixture
+def stall_ms() -> Iterator[Callable[[], float]]:
+    """``stall_ms()``: how late, at worst, this machine woke a process that only sleeps, since the test began.
+
+    A promise about time can be kept to the machine's own delay, not better. That process is one of its own: what is
+    tested cannot excuse itself with a delay that it made."""
+    with subprocess.Popen(
+        [sys.executable, "-c", SLEEPER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as sleeper:
+        assert sleeper.stdin is not None
+        yield lambda: float(sleeper.communicate(timeout=60)[0])
+        sleeper.stdin.close()

@@ -187,6 +187,9 @@ class MapMatch(Message, frozen=True, kw_only=True):
     mode_e_m: float = 0.0  # centre of the winning mode
     mode_n_m: float = 0.0
     belief_cov_m2: Mat2 = (0.0, 0.0, 0.0, 0.0)  # of the whole belief, all modes
+    ground: Vec3 | None = (
+        None  # plane of the ground below, from the map's DEM: AMSL at p_c_in_w_m, slope east, slope north
+    )
 
 
 # --- estimator ------------------------------------------------------------------------------------

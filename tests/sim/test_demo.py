@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -33,7 +34,7 @@ def children_of(pid: int) -> dict[str, int]:
 
 
 @pytest.mark.slow
-def test_the_autopilot_is_served(tmp_path: Path) -> None:
+def test_the_autopilot_is_served(tmp_path: Path, stall_ms: Callable[[], float]) -> None:
     out = tmp_path / "demo"
     began_s = time.monotonic()
     done = subprocess.run(
@@ -43,7 +44,7 @@ def test_the_autopilot_is_served(tmp_path: Path) -> None:
     assert time.monotonic() - began_s < 90.0 + DURATION_S
     peer = json.loads((out / "peer.json").read_text())
     assert peer["accepted"] > 5 * DURATION_S
-    assert peer["healthy_share"] > 0.95 and peer["longest_gap_ms"] < 245.0
+    assert peer["healthy_share"] > 0.95 and peer["longest_gap_ms"] < 245.0 + stall_ms()
     assert peer["gps_error_median_m"] < 20.0
     evaluation = json.loads((out / "evaluation.json").read_text())
     assert evaluation["false_fixes"] == 0 and evaluation["within_50m"] > 0.95
@@ -53,7 +54,7 @@ def test_the_autopilot_is_served(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", ["link", "estimator", "anchor", "vision"])
-def test_a_killed_process_comes_back(victim: str, tmp_path: Path) -> None:
+def test_a_killed_process_comes_back(victim: str, tmp_path: Path, stall_ms: Callable[[], float]) -> None:
     out = tmp_path / "demo"
     with subprocess.Popen(
         [*COMMAND, "--out", str(out), "--duration", str(DURATION_S)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -70,7 +71,7 @@ def test_a_killed_process_comes_back(victim: str, tmp_path: Path) -> None:
     if victim == "link":
         assert peer["longest_gap_ms"] < 1e3 * RESUMES_WITHIN_S
     else:
-        assert peer["longest_gap_ms"] < 245.0  # the link goes on whatever happens to the others
+        assert peer["longest_gap_ms"] < 245.0 + stall_ms()  # the link goes on whatever happens to the others
     assert victim in (out / "report.html").read_text()
 
 

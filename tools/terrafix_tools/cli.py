@@ -6,7 +6,9 @@ from typing import Annotated
 
 import typer
 
-from terrafix.core.errors import TerrafixError
+from terrafix.core.errors import TerrafixError, UsageError
+
+ON_THE_GROUND = ("rasterio",)  # the extra `ground`: a vehicle need not have it
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
 map_app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
@@ -161,6 +163,11 @@ def main() -> None:
     except TerrafixError as error:
         typer.echo(f"terrafix: {error}", err=True)
         sys.exit(error.exit_code)
+    except ModuleNotFoundError as error:
+        if error.name not in ON_THE_GROUND:
+            raise
+        typer.echo(f"terrafix: this command needs {error.name}; install it: pip install 'terrafix[ground]'", err=True)
+        sys.exit(UsageError.exit_code)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from terrafix.core.errors import ModelError
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
 from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.pose import tangent_to_world
-from terrafix.messages import MapMatch, Message, Origin, Prediction, Verdict
+from terrafix.messages import MapMatch, Message, Origin, Prediction, Vec3, Verdict
 from terrafix_engines.features import open_describer
 from terrafix_engines.runtime import ModelFileError
 
@@ -79,7 +79,8 @@ class AnchorNode:
             return answer
         if image is None:
             return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE)
-        view = self._view(prediction)
+        view, ground = self._view(prediction)
+        answer = msgspec.structs.replace(answer, ground=ground)
         if view.agl_m < MIN_AGL_M:
             return msgspec.structs.replace(answer, verdict=Verdict.TOO_LOW)
         look = self._matcher.look(image, view, belief)
@@ -127,24 +128,35 @@ class AnchorNode:
         self._since_look_m += float(np.hypot(step_m, sigma_m))
         return self._belief
 
-    def _view(self, prediction: Prediction) -> View:
+    def _view(self, prediction: Prediction) -> tuple[View, Vec3 | None]:
+        """The predicted camera over the ground as the DEM has it, and the plane of that ground (None: no DEM)."""
         e_m, n_m, up_m = prediction.p_c_in_w_m
-        ground_m, agl_m = self._ground_m, prediction.agl_m
-        if self._map is not None:
-            elevation = self._map.elevation(np.array([e_m]), np.array([n_m]))
-            if elevation is not None and np.isfinite(elevation[0]):
-                ground_m = float(elevation[0])
-                agl_m = up_m - ground_m
-        return View(
+        ground = self._plane(e_m, n_m, prediction.agl_m) if self._map is not None else None
+        agl_m = prediction.agl_m if ground is None else up_m - ground[0]
+        view = View(
             e_m,
             n_m,
             rot_from_quat(prediction.q_w_c),
             agl_m,
-            ground_m,
+            self._ground_m if ground is None else ground[0],
             float(np.sqrt(prediction.cov[35])),
             prediction.agl_sigma_m / max(agl_m, 1.0),
             float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))),
         )
+        return view, ground
+
+    def _plane(self, e_m: float, n_m: float, agl_m: float) -> Vec3 | None:
+        """Least squares over the ground that is seen: AMSL below the camera, slope east, slope north."""
+        assert self._map is not None
+        axis = np.linspace(-0.7, 0.7, 7) * agl_m
+        de, dn = (a.ravel() for a in np.meshgrid(axis, axis))
+        up = self._map.elevation(e_m + de, n_m + dn)
+        if up is None or np.isfinite(up).sum() < len(de) / 2:
+            return None
+        known = np.isfinite(up)
+        design = np.column_stack([np.ones(known.sum()), de[known], dn[known]])
+        (level, slope_e, slope_n), *_ = np.linalg.lstsq(design, up[known], rcond=None)
+        return float(level), float(slope_e), float(slope_n)
 
     def _watch(self, belief: Belief, score: float, weight: float) -> None:
         """A mode that no longer fits what is seen: look wider."""

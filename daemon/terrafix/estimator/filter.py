@@ -14,7 +14,7 @@ from terrafix.core.geodesy import rot_from_quat, rot_w_b
 from terrafix.core.pose import exp_so3, world_to_tangent
 from terrafix.estimator.factors import attitude_and_height_factor
 from terrafix.estimator.graph import NodeState, PoseGraph
-from terrafix.estimator.motion import RelativePose, relative_pose
+from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.telemetry import Attitude
 from terrafix.messages import CovarianceMode, MapMatch, Odometry, Origin, Verdict
 
@@ -30,6 +30,8 @@ MAX_ACCELERATION_MPS2 = 3.0  # of small drones in cruise: how wrong the last vel
 MAX_SPEED_SIGMA_MPS = 10.0  # per axis: of a velocity of which nothing is known
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
 VELOCITY_MEMORY_S = 10.0  # how long a drone keeps its course when nobody looks
+# 1-sigma of the slope of the ground: fields and towns without a DEM; what a DEM of 30 m leaves with one
+SLOPE_SIGMA_FLAT, SLOPE_SIGMA_DEM = 0.03, 0.015
 VELOCITY_SPAN_S = 0.9  # a velocity is measured over about a second: shorter is noise, longer misses turns
 VELOCITY_FLOOR_M, VELOCITY_SHARE = 0.15, 0.02  # error of the relative position of two nodes that close
 BEND_SHARE = 0.5  # of the change of velocity that is carried on: the turn may have ended
@@ -90,7 +92,8 @@ class Estimator:
         self.velocity_sigma_mps = MAX_SPEED_SIGMA_MPS
         self.last_fix_t_s: float | None = None
         self.mode = CovarianceMode.MARGINALS
-        self.ground_m = origin.ground_amsl_m or 0.0  # AMSL of the ground below, from the last map match
+        self.ground_m = origin.ground_amsl_m or 0.0  # AMSL of the ground below, from the map's DEM
+        self._slope: tuple[float, float] | None = None  # of the ground, east and north; None: no DEM
         self._r_b_c = Mount.of(origin.camera).r_b_c()
         self._node_of: dict[int, int] = {}  # frame -> node
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
@@ -169,7 +172,10 @@ class Estimator:
         r_w_k = self._expected_rotation(attitude, state.bias, r_w_kf)
         if attitude.pitch_rad is None or attitude.roll_rad is None:
             r_w_k = r_w_kf  # nobody knows of a change of tilt
-        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, height, height_sigma)
+        known_slope = self._slope is not None
+        slope_e, slope_n = self._slope or (0.0, 0.0)
+        ground = Ground(height, height_sigma, slope_e, slope_n, SLOPE_SIGMA_DEM if known_slope else SLOPE_SIGMA_FLAT)
+        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, ground)
         if motion is None:
             return None
         dt_s = max(odometry.t_ns * 1e-9 - self.graph.time_of(parent), 1e-3)
@@ -258,6 +264,8 @@ class Estimator:
 
     def fix(self, match: MapMatch) -> FixResult:
         """A map match of a frame that ``advance`` has seen. Gated; enters the graph at its own node."""
+        if match.ground is not None:
+            self.ground_m, self._slope = match.ground[0], match.ground[1:]
         if match.verdict is not Verdict.ACCEPTED or match.p_c_in_w_m is None or match.q_w_c is None:
             return FixResult(match.verdict, None)
         node = self._node_of.get(match.frame_id)
@@ -291,8 +299,6 @@ class Estimator:
         if node > self._trunk[-1]:
             self._trunk.append(node)
         self.last_fix_t_s = self.graph.time_of(node)
-        if match.matches:
-            self.ground_m = float(np.mean([m[4] for m in match.matches]))
         last = self._last
         if last is not None and last.frame_id in self._node_of:
             newest = self._node_of[last.frame_id]

@@ -22,16 +22,26 @@ class RelativePose:
     cov: np.ndarray
 
 
+@dataclass(frozen=True)
+class Ground:
+    """The plane under the keyframe: its distance straight down, and its slope towards east and north."""
+
+    height_m: float
+    height_sigma_m: float
+    slope_e: float = 0.0
+    slope_n: float = 0.0
+    slope_sigma: float = 0.0
+
+
 def relative_pose(
     pairs: np.ndarray,
     sigma_norm: float,
     r_w_kf: np.ndarray,
     r_w_k: np.ndarray,
-    height_m: float,
-    height_sigma_m: float,
+    ground: Ground,
 ) -> RelativePose | None:
-    """``pairs`` (N, 4) normalised (x_kf, y_kf, x, y); ``r_w_kf`` gives the direction of the ground plane, ``height_m``
-    its distance; ``r_w_k`` is a first guess of the new camera, whose tilt must be roughly right: a plane seen from two
+    """``pairs`` (N, 4) normalised (x_kf, y_kf, x, y); ``r_w_kf`` and ``ground`` give the plane that is seen;
+    ``r_w_k`` is a first guess of the new camera, whose tilt must be roughly right: a plane seen from two
     places has a mirror solution. ``None`` when the matches do not determine the motion."""
     if len(pairs) < MIN_PAIRS:
         return None
@@ -40,7 +50,10 @@ def relative_pose(
     ahead = (rays_w[:, 2] < MIN_DOWN) & (rays_k[:, 2] < MIN_DOWN)
     if ahead.sum() < MIN_PAIRS:
         return None
-    points = rays_w[ahead] * (-height_m / rays_w[ahead, 2])[:, None]  # world axes, from the keyframe's camera
+    slope = np.array([ground.slope_e, ground.slope_n])
+    height_m = ground.height_m
+    depth = height_m / np.maximum(rays_w[ahead, :2] @ slope - rays_w[ahead, 2], -MIN_DOWN / 2)
+    points = rays_w[ahead] * depth[:, None]  # world axes, from the keyframe's camera
     seen = rays_k[ahead, :2] / -rays_k[ahead, 2:] * height_m
     turn, scale, shift = _similarity(seen, points[:, :2])
     start = np.array([*shift, height_m * (scale - 1.0)])
@@ -51,7 +64,9 @@ def relative_pose(
     cov = fit.cov.copy()
     # A wrong height scales the translation; the tangent's translation is in the new camera's axes.
     t_new = fit.r_w_c.T @ fit.p_c_in_w_m
-    cov[3:, 3:] += np.outer(t_new, t_new) * ((height_sigma_m / height_m) ** 2 + SCALE_SIGMA**2)
+    cov[3:, 3:] += np.outer(t_new, t_new) * ((ground.height_sigma_m / height_m) ** 2 + SCALE_SIGMA**2)
+    # A wrong slope of the plane turns the camera by about slope times base over height.
+    cov[:3, :3] += (ground.slope_sigma * float(np.linalg.norm(t_new)) / height_m) ** 2 * np.eye(3)
     return RelativePose(r_w_kf.T @ fit.r_w_c, r_w_kf.T @ fit.p_c_in_w_m, cov)
 
 

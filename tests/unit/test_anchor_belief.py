@@ -1,0 +1,182 @@
+"""The belief over the map: what every look, motion and blur does to the mass, hypothesis by hypothesis."""
+
+import numpy as np
+import pytest
+
+from terrafix.anchor.belief import CELL_M, MODE_RADIUS_M, Belief, Surface, _blurred
+
+HALF_M = 200.0
+
+
+def surface(peaks: list[tuple[float, float, float]], seed: int = 0, cell_m: float = 1.0) -> Surface:
+    """Chance everywhere, and peaks (e_m, n_m, z) as wide as a real one."""
+    rng = np.random.default_rng(seed)
+    side = round(2 * HALF_M / cell_m) + 1
+    axis = np.arange(side) * cell_m - HALF_M
+    z = rng.normal(0.0, 1.0, (side, side)).clip(-3.0, 3.0).astype(np.float32)
+    for e_m, n_m, height in peaks:
+        near = np.exp(-((axis[None, :] - e_m) ** 2 + (-axis[:, None] - n_m) ** 2) / (2 * 3.0**2))
+        z = np.maximum(z, (height * near).astype(np.float32))
+    return Surface(z, -HALF_M, HALF_M, cell_m)
+
+
+def flat(value: float = 0.0) -> Surface:
+    return Surface(np.full((401, 401), value, np.float32), -HALF_M, HALF_M, 1.0)
+
+
+def mass_of(belief: Belief) -> float:
+    return float(belief._mass.sum())
+
+
+def test_starts_at_the_place_with_the_sigma_that_it_is_given() -> None:
+    belief = Belief(30.0, -20.0, 15.0)
+    mode = belief.mode()
+    assert (mode.e_m, mode.n_m) == pytest.approx((30.0, -20.0), abs=CELL_M)
+    ee, en, nn = belief.covariance()
+    assert (ee**0.5, nn**0.5) == pytest.approx((15.0, 15.0), rel=0.05)
+    assert abs(en) < 1.0
+
+
+def test_mass_is_conserved_whatever_happens() -> None:
+    belief = Belief(0.0, 0.0, 20.0)
+    for i in range(40):
+        belief.move(3.0, -2.0, (0.0, 1.0, 30.0, 200.0)[i % 4])
+        belief.update((surface([(0.0, 0.0, 4.0)], i),), 0.5)
+        belief.fit_window(0.0)
+        assert mass_of(belief) == pytest.approx(1.0, abs=1e-9)
+        assert belief._mass.min() >= 0.0
+        assert 0.0 < belief.mode().mass <= 1.0
+
+
+def test_a_look_finds_the_place() -> None:
+    belief = Belief(0.0, 0.0, 25.0)
+    for i in range(3):
+        belief.update((surface([(34.0, -22.0, 6.0)], i),), 1.0)
+    mode = belief.mode()
+    assert (mode.e_m, mode.n_m) == pytest.approx((34.0, -22.0), abs=3.0)
+    assert mode.mass > 0.95
+
+
+def test_two_places_that_look_alike_stay_two_modes() -> None:
+    belief = Belief(0.0, 0.0, 40.0)
+    for i in range(5):
+        belief.update((surface([(40.0, 0.0, 6.0), (-40.0, 0.0, 6.0)], i),), 1.0)
+    mode = belief.mode()
+    assert 0.3 < mode.mass < 0.7
+    assert mode.rival > 0.25
+    ee, _, nn = belief.covariance()
+    assert ee**0.5 > 25.0 > nn**0.5  # the whole belief knows of both
+
+
+def test_the_next_frame_decides_between_them() -> None:
+    belief = Belief(0.0, 0.0, 40.0)
+    belief.update((surface([(40.0, 0.0, 6.0), (-40.0, 0.0, 6.0)]),), 1.0)
+    belief.move(20.0, 10.0, 1.0)
+    belief.update((surface([(-20.0, 10.0, 6.0)], 1),), 1.0)
+    mode = belief.mode()
+    assert (mode.e_m, mode.n_m) == pytest.approx((-20.0, 10.0), abs=4.0)
+    assert mode.mass > 0.9
+
+
+@pytest.mark.parametrize(("east_m", "north_m"), [(7.0, 0.0), (0.0, -13.0), (131.3, 77.7)])
+def test_motion_moves_it(east_m: float, north_m: float) -> None:
+    belief = Belief(5.0, 5.0, 10.0)
+    before = belief.covariance()
+    belief.move(east_m, north_m, 0.0)
+    mode = belief.mode()
+    assert (mode.e_m, mode.n_m) == pytest.approx((5.0 + east_m, 5.0 + north_m), abs=0.2)
+    assert belief.covariance() == pytest.approx(before)
+
+
+@pytest.mark.parametrize("sigma_m", [3.0, 12.0, 40.0, 90.0])
+def test_uncertain_motion_spreads_it(sigma_m: float) -> None:
+    belief = Belief(0.0, 0.0, 10.0)
+    belief.fit_window(400.0)
+    belief.move(0.0, 0.0, sigma_m)
+    ee, _, nn = belief.covariance()
+    assert (ee**0.5, nn**0.5) == pytest.approx([np.hypot(10.0, sigma_m)] * 2, rel=0.08)
+
+
+def test_a_wide_blur_is_a_narrow_one_many_times() -> None:
+    mass = np.zeros((241, 241))
+    mass[100, 130], mass[140, 90] = 0.6, 0.4
+    wide = _blurred(mass, 24.0)
+    narrow = mass
+    for _ in range(16):
+        narrow = _blurred(narrow, 6.0)  # sigma^2 adds up: 16 x 36 = 24^2
+    wide, narrow = wide / wide.sum(), narrow / narrow.sum()
+    assert np.abs(wide - narrow).sum() / 2 < 0.03  # total variation
+
+    def centre(m: np.ndarray) -> tuple[float, float]:
+        return float((m.sum(1) * np.arange(241)).sum()), float((m.sum(0) * np.arange(241)).sum())
+
+    assert centre(wide) == pytest.approx(centre(mass), abs=0.3)
+
+
+def test_nothing_is_ever_excluded() -> None:
+    """Sure of the wrong place, then shown the right one: the belief comes back."""
+    belief = Belief(0.0, 0.0, 10.0)
+    for i in range(20):
+        belief.update((surface([(0.0, 0.0, 6.0)], i),), 1.0)
+    assert belief.mode().mass > 0.99
+    looks = 0
+    while np.hypot(belief.mode().e_m - 80.0, belief.mode().n_m - 50.0) > 5.0:
+        belief.update((surface([(80.0, 50.0, 5.0)], 100 + looks),), 1.0)
+        looks += 1
+        assert looks < 10
+    assert looks >= 2  # but not at once
+
+
+def test_the_same_ground_again_proves_little() -> None:
+    full, repeated = Belief(0.0, 0.0, 40.0), Belief(0.0, 0.0, 40.0)
+    peaks = [(40.0, 0.0, 5.0), (-40.0, 0.0, 4.0)]
+    full.update((surface(peaks),), 1.0)
+    repeated.update((surface(peaks),), 0.1)
+    assert repeated.covariance()[0] > 2 * full.covariance()[0] or repeated.mode().mass < 0.5 * full.mode().mass
+
+
+def test_outside_the_map_is_a_little_worse_than_chance_not_impossible() -> None:
+    belief = Belief(0.0, 0.0, 30.0)
+    z = flat().z.copy()
+    z[:, :200] = np.nan  # the west is off the map
+    belief.update((Surface(z, -HALF_M, HALF_M, 1.0),), 1.0)
+    west = float(belief._mass[:, : belief._mass.shape[1] // 2].sum())
+    assert 0.05 < west < 0.95
+
+
+def test_surfaces_of_several_hypotheses_count_by_their_best() -> None:
+    belief = Belief(0.0, 0.0, 25.0)
+    belief.update((flat(), surface([(20.0, 20.0, 6.0)]), flat(-2.0)), 1.0)
+    assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((20.0, 20.0), abs=4.0)
+
+
+@pytest.mark.parametrize("cell_m", [0.5, 1.0, 2.0, 5.0])
+def test_cells_of_any_size_put_the_peak_in_the_same_place(cell_m: float) -> None:
+    belief = Belief(0.0, 0.0, 25.0)
+    for i in range(3):
+        belief.update((surface([(30.0, -10.0, 7.0)], i, cell_m),), 1.0)
+    assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((30.0, -10.0), abs=max(3.0, cell_m))
+
+
+def test_confirmation_lifts_the_mode_and_no_other() -> None:
+    belief = Belief(0.0, 0.0, 40.0)
+    belief.update((surface([(40.0, 0.0, 5.0), (-40.0, 0.0, 5.0)]),), 1.0)
+    before = belief.mode()
+    belief.confirm(before, 20.0)
+    after = belief.mode()
+    assert after.mass > before.mass and after.rival < before.rival
+    assert (after.e_m, after.n_m) == pytest.approx((before.e_m, before.n_m), abs=MODE_RADIUS_M / 2)
+    assert mass_of(belief) == pytest.approx(1.0)
+
+
+def test_the_window_follows_and_is_bounded() -> None:
+    belief = Belief(0.0, 0.0, 20.0)
+    for _ in range(60):
+        belief.move(50.0, 0.0, 60.0)
+        belief.fit_window(0.0)
+    assert belief.half_m <= 1502.0
+    assert len(belief._mass) <= 1503
+    mode_e, _ = belief.centre
+    assert mode_e == pytest.approx(3000.0, abs=10.0)
+    belief.update((Surface(np.full((5, 5), np.nan, np.float32), 0.0, 0.0, 1.0),), 1.0)  # knows nothing at all
+    assert mass_of(belief) == pytest.approx(1.0)
