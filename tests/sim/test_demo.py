@@ -48,6 +48,8 @@ def test_the_autopilot_is_served(tmp_path: Path, stall_ms: Callable[[], float]) 
     assert peer["gps_error_median_m"] < 20.0
     evaluation = json.loads((out / "evaluation.json").read_text())
     assert evaluation["false_fixes"] == 0 and evaluation["within_50m"] > 0.95
+    frames = (out / "flight" / "frames.csv").read_text()
+    assert frames.startswith("file,t_s,yaw_deg,pitch_deg,roll_deg,agl_m\n")  # the folder can be replayed
     page = (out / "report.html").read_text()
     assert "<svg" in page and not re.search(r'(src|href)="https?://', page)  # one file, works offline
 

@@ -85,11 +85,11 @@ def measure(flight: Path, map_path: Path, replayed: Path, _xfeat: Path | None = 
     truth = read_truth(flight / "truth.csv")
     package = MapPackage.open(map_path)
     baseline = SiftBaseline(CameraCalibration.of(origin.camera), package.bind(place))
-    times_ms, errors_m, frames = [], [], 0
+    times_ms, cpu_ms, errors_m, frames = [], [], [], 0
     source = open_source(str(flight))
     shots = source.shots()
     while True:
-        began_s = time.perf_counter()
+        began_s, cpu_s = time.perf_counter(), time.process_time()
         shot = next(shots, None)  # reads and decodes the image, which is in our own time per frame, too
         if shot is None:
             break
@@ -98,6 +98,7 @@ def measure(flight: Path, map_path: Path, replayed: Path, _xfeat: Path | None = 
             continue
         found = baseline.locate(shot.image, prediction)
         times_ms.append((time.perf_counter() - began_s) * 1e3)
+        cpu_ms.append((time.process_time() - cpu_s) * 1e3)
         frames += 1
         if found is not None:
             errors_m.append(float(np.hypot(*offset_m(truth[shot.frame.file], *place.to_wgs84(*found)))))
@@ -108,6 +109,7 @@ def measure(flight: Path, map_path: Path, replayed: Path, _xfeat: Path | None = 
         "frames": frames,
         "answered": len(errors_m),
         "frame_ms": spread(times_ms) if times_ms else None,
+        "cpu_ms": spread(cpu_ms) if cpu_ms else None,
         "accuracy": {
             "within_20m": sum(e <= 20.0 for e in errors_m) / frames if frames else None,
             "within_50m": sum(e <= 50.0 for e in errors_m) / frames if frames else None,

@@ -21,7 +21,7 @@ from terrafix_tools.map_build import build
 from terrafix_tools.peer_report import PeerReport
 from terrafix_tools.report import report
 from terrafix_tools.report_data import gather
-from terrafix_tools.world_flight import Flight, plan_flight, write_flight
+from terrafix_tools.world_flight import Flight, add_telemetry, plan_flight, write_flight
 
 MARK = "demo.json"  # a folder with this file in it is ours to empty
 SHORTEST_S, LONGEST_S = 10.0, 1800.0
@@ -62,6 +62,7 @@ def demo(out: Path, *, seed: int, duration_s: float) -> int:
         )
         return exit_code
     shutil.copyfile(made.folder / "truth.csv", out / "truth.csv")
+    add_telemetry(made.folder, made.flight)  # only now: in flight it came over MAVLink
     with console.status("writing the report"):
         try:
             evaluation = gather(out, out / "truth.csv").evaluation or {}

@@ -97,18 +97,33 @@ def write_flight(
             name = f"{i + 1:04d}.jpg"
             image = renderer.frame(*flight.camera_pose(state), i)
             _write_jpeg(folder / "frames" / name, image)
-            said.append([name, f"{t_s:.3f}", *(_telemetry(flight, t_s) if telemetry else ())])
+            said.append([name, f"{t_s:.3f}"])
             lat_deg, lon_deg = flight.frame.to_wgs84(float(state.p_b_in_w_m[0]), float(state.p_b_in_w_m[1]))
             yaw_deg = math.degrees(state.yaw_rad) % 360.0
             truth.append([name, f"{lat_deg:.7f}", f"{lon_deg:.7f}", f"{state.agl_m:.2f}", f"{yaw_deg:.2f}"])
             if progress:
                 progress(i + 1, len(times))
-        columns = ["file", "t_s"] + (["yaw_deg", "pitch_deg", "roll_deg", "agl_m"] if telemetry else [])
-        _write_csv(folder / "frames.csv", columns, said)
+        _write_csv(folder / "frames.csv", ["file", "t_s"], said)
         _write_csv(folder / "truth.csv", ["file", "lat_deg", "lon_deg", "agl_m", "yaw_deg"], truth)
         (folder / "flight.toml").write_text(_toml(flight, map_name), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error}); choose another --out") from None
+    if telemetry:
+        add_telemetry(folder, flight)
+
+
+def add_telemetry(folder: Path, flight: Flight) -> None:
+    """Into frames.csv what the autopilot says of attitude and height: the folder can be replayed without it.
+
+    Raises OutputError."""
+    path = folder / "frames.csv"
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            frames = [(row["file"], row["t_s"]) for row in csv.DictReader(file)]
+        rows = [[name, t_s, *_telemetry(flight, float(t_s))] for name, t_s in frames]
+        _write_csv(path, ["file", "t_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m"], rows)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error}); choose another --out") from None
 
 
 def _telemetry(flight: Flight, t_s: float) -> list[str]:

@@ -1,17 +1,19 @@
-"""The one factor that GTSAM lacks: what an autopilot says of attitude and height, seen through the camera's mount.
+"""The two factors that GTSAM lacks: what an autopilot says of attitude and height, seen through the camera's mount,
+and two cameras that look at the same ground.
 
 Variables of a node k: C_k, the camera pose in the world (Pose3), and B_k, a vector of four slow errors
 (mount tilt about the camera's x and y axes [rad], heading bias [rad], height bias [m])."""
 
-from collections.abc import Callable
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from terrafix.core.pose import exp_so3, log_so3
+from terrafix.core.pose import exp_so3, log_so3, project_with_jacobian, skew
+from terrafix.estimator.motion import EFFECTIVE_PAIRS, Ground
 
 BIAS_SIZE = 4
+BLOCK_HUBER_K = 1.5
 
 
 def attitude_and_height_residual(
@@ -50,5 +52,69 @@ def attitude_and_height_factor(
             jacobians[1] = np.asfortranarray(by_bias)
         return residual
 
-    callback: Callable[..., np.ndarray] = error
-    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), [pose_key, bias_key], callback)
+    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), [pose_key, bias_key], error)
+
+
+def same_ground_residual(
+    keyframe: gtsam.Pose3, pose: gtsam.Pose3, pairs: np.ndarray, normal: np.ndarray, offset: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rays of the keyframe meet the plane ``normal . X = offset`` and are projected into the other camera.
+
+    -> residual (2N,) normalised, Jacobians by both poses (2N x 6), the points X (N, 3), and the change of the residual
+    by the height of the plane at each point (2N,). Both cameras move the points: a tilt of the keyframe that is wrong
+    must not turn into a turn of the next camera."""
+    r_kf, p_kf = keyframe.rotation().matrix(), keyframe.translation()
+    r_k, p_k = pose.rotation().matrix(), pose.translation()
+    rays = np.column_stack([pairs[:, :2], np.ones(len(pairs))])
+    d = rays @ r_kf.T
+    along = d @ normal
+    along = np.where(np.abs(along) < 1e-3, -1e-3, along)
+    depth = (offset - float(normal @ p_kf)) / along
+    points = p_kf + d * depth[:, None]
+    predicted, by_pose, _ = project_with_jacobian(r_k, p_k, points)
+    residual = (predicted - pairs[:, 2:]).ravel()
+    # Moving the point X moves its image like moving the camera the other way: d(image)/dX = -by_pose[translation] R^T.
+    by_point = -by_pose[:, :, 3:] @ r_k.T
+    slide = np.eye(3) - np.einsum("ni,j->nij", d / along[:, None], normal)  # along the ray, back onto the plane
+    by_ray = by_point @ slide
+    cross = np.array([skew(ray) for ray in rays])
+    by_keyframe = np.concatenate([-depth[:, None, None] * (by_ray @ r_kf @ cross), by_ray @ r_kf], axis=2)
+    by_height = np.einsum("nij,nj->ni", by_point, d / along[:, None])
+    n = 2 * len(pairs)
+    return residual, by_keyframe.reshape(n, 6), by_pose.reshape(n, 6), points, by_height.ravel()
+
+
+def same_ground_factor(
+    keyframe_key: int,
+    pose_key: int,
+    keyframe: gtsam.Pose3,
+    pose: gtsam.Pose3,
+    pairs: np.ndarray,
+    sigma: float,
+    ground: Ground,
+) -> gtsam.CustomFactor:
+    """``pairs`` (N, 4) normalised with the 1-sigma ``sigma`` of a coordinate. The plane below the keyframe is not known
+    exactly: what its height and slope leave open is in the noise of the factor."""
+    normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
+    p = keyframe.translation()
+    offset = float(p[2]) - ground.height_m - ground.slope_e * float(p[0]) - ground.slope_n * float(p[1])
+    _, _, _, points, by_height = same_ground_residual(keyframe, pose, pairs, normal, offset)
+    away = np.repeat(points[:, :2] - p[:2], 2, axis=0)
+    by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
+    plane = np.diag([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) ** 2
+    noise = gtsam.noiseModel.Gaussian.Covariance(
+        sigma**2 * np.eye(2 * len(pairs)) + by_plane @ plane @ by_plane.T, False
+    )
+
+    def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        residual, by_keyframe, by_pose, _, _ = same_ground_residual(
+            values.atPose3(keyframe_key), values.atPose3(pose_key), pairs, normal, offset
+        )
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(by_keyframe)
+            jacobians[1] = np.asfortranarray(by_pose)
+        return residual
+
+    # Huber on the whole block: its whitened norm is about sqrt(2 * EFFECTIVE_PAIRS) when all is well.
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(BLOCK_HUBER_K * float(np.sqrt(2 * EFFECTIVE_PAIRS)))
+    return gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(huber, noise), [keyframe_key, pose_key], error)

@@ -174,7 +174,9 @@ class Estimator:
             r_w_k = r_w_kf  # nobody knows of a change of tilt
         known_slope = self._slope is not None
         slope_e, slope_n = self._slope or (0.0, 0.0)
-        ground = Ground(height, height_sigma, slope_e, slope_n, SLOPE_SIGMA_DEM if known_slope else SLOPE_SIGMA_FLAT)
+        slope_sigma = SLOPE_SIGMA_DEM if known_slope else SLOPE_SIGMA_FLAT
+        share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
+        ground = Ground(height, height_sigma, slope_e, slope_n, slope_sigma, share)
         motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, ground)
         if motion is None:
             return None

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C
 
+from terrafix.estimator.factors import same_ground_factor
 from terrafix.estimator.motion import RelativePose
 
 LAG_NODES = 20.0  # ON-3: 10-20 keyframes
@@ -98,8 +99,14 @@ class PoseGraph:
         newest = self.newest
         dt_s = max(t_s - self._times[newest], 1e-3)
         factors = gtsam.NonlinearFactorGraph()
-        between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
-        factors.add(gtsam.BetweenFactorPose3(C(parent), C(node), between, _robust(motion.cov)))
+        if motion.seen is None:
+            between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
+            factors.add(gtsam.BetweenFactorPose3(C(parent), C(node), between, _robust(motion.cov)))
+        else:
+            seen, keyframe = motion.seen, self.state(parent).pose
+            factors.add(
+                same_ground_factor(C(parent), C(node), keyframe, state.pose, seen.pairs, seen.sigma, seen.ground)
+            )
         walk = gtsam.noiseModel.Diagonal.Sigmas(WALK_SIGMAS * np.sqrt(dt_s))
         factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(4), walk))
         if attitude is not None:

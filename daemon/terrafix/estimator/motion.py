@@ -9,8 +9,18 @@ from terrafix.core.pose import fit_pose
 
 EFFECTIVE_PAIRS = 10.0  # relief moves whole blocks of matches together: never more independent ones than this
 SCALE_SIGMA = 0.02  # houses and trees lift the mean ground by this share of the height, beyond the height's own error
+ROOF_SCALE_SIGMA = 0.12  # ... and by this when hardly any match lies on the plane: tall buildings at 100 m
 MIN_PAIRS = 8
 MIN_DOWN = -0.2  # up component of a unit-depth ray that meets the ground no farther than five heights away
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Matched rays (N, 4), the 1-sigma of a coordinate with all that makes them less independent, and their plane."""
+
+    pairs: np.ndarray
+    sigma: float
+    ground: "Ground"
 
 
 @dataclass(frozen=True)
@@ -20,6 +30,7 @@ class RelativePose:
     r: np.ndarray
     p_m: np.ndarray
     cov: np.ndarray
+    seen: "Seen | None" = None  # what it was computed from; None: a guess
 
 
 @dataclass(frozen=True)
@@ -31,6 +42,12 @@ class Ground:
     slope_e: float = 0.0
     slope_n: float = 0.0
     slope_sigma: float = 0.0
+    share: float = 1.0  # of the matches that agreed: a plane that few share may be a roof instead of the ground
+
+    @property
+    def level_sigma_m(self) -> float:
+        """Of the plane, beyond what is wrong with the height itself."""
+        return (SCALE_SIGMA + ROOF_SCALE_SIGMA * (1.0 - self.share) ** 2) * self.height_m
 
 
 def relative_pose(
@@ -54,8 +71,8 @@ def relative_pose(
     height_m = ground.height_m
     depth = height_m / np.maximum(rays_w[ahead, :2] @ slope - rays_w[ahead, 2], -MIN_DOWN / 2)
     points = rays_w[ahead] * depth[:, None]  # world axes, from the keyframe's camera
-    seen = rays_k[ahead, :2] / -rays_k[ahead, 2:] * height_m
-    turn, scale, shift = _similarity(seen, points[:, :2])
+    offsets = rays_k[ahead, :2] / -rays_k[ahead, 2:] * height_m
+    turn, scale, shift = _similarity(offsets, points[:, :2])
     start = np.array([*shift, height_m * (scale - 1.0)])
     effective = min(1.0, EFFECTIVE_PAIRS / len(points))
     fit = fit_pose(points, pairs[ahead, 2:], turn @ r_w_k, start, sigma_norm, effective=effective)
@@ -64,10 +81,11 @@ def relative_pose(
     cov = fit.cov.copy()
     # A wrong height scales the translation; the tangent's translation is in the new camera's axes.
     t_new = fit.r_w_c.T @ fit.p_c_in_w_m
-    cov[3:, 3:] += np.outer(t_new, t_new) * ((ground.height_sigma_m / height_m) ** 2 + SCALE_SIGMA**2)
+    cov[3:, 3:] += np.outer(t_new, t_new) * (ground.height_sigma_m**2 + ground.level_sigma_m**2) / height_m**2
     # A wrong slope of the plane turns the camera by about slope times base over height.
     cov[:3, :3] += (ground.slope_sigma * float(np.linalg.norm(t_new)) / height_m) ** 2 * np.eye(3)
-    return RelativePose(r_w_kf.T @ fit.r_w_c, r_w_kf.T @ fit.p_c_in_w_m, cov)
+    seen = Seen(pairs[ahead], fit.sigma / float(np.sqrt(effective)), ground)
+    return RelativePose(r_w_kf.T @ fit.r_w_c, r_w_kf.T @ fit.p_c_in_w_m, cov, seen)
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:

@@ -1,0 +1,146 @@
+"""A frame against the map: rotations and scales that are tried, and what look and fix make of a known place."""
+
+import numpy as np
+import pytest
+from ground import PINHOLE, FlatMap, rotation, texture, view
+
+from terrafix.anchor.belief import Belief
+from terrafix.anchor.matcher import MAX_HYPOTHESES, FrameMatcher, Hypothesis, View, _hypotheses
+from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.pose import exp_so3, log_so3
+from terrafix.messages import Verdict
+from terrafix_engines.features.gradient import GradientDescriber
+
+AGL_M = 100.0
+TRUE_M = np.array([22.0, -31.0, AGL_M])
+TRUE_R = rotation(40.0)
+
+
+def seen_from(
+    e_m: float = 0.0,
+    n_m: float = 0.0,
+    *,
+    r: np.ndarray = TRUE_R,
+    agl_m: float = AGL_M,
+    yaw_sigma_deg: float = 1.0,
+    scale_sigma: float = 0.02,
+    tilt_sigma_deg: float = 1.0,
+) -> View:
+    return View(
+        e_m, n_m, r, agl_m, 0.0, float(np.radians(yaw_sigma_deg)), scale_sigma, float(np.radians(tilt_sigma_deg))
+    )
+
+
+@pytest.fixture(scope="module")
+def ground() -> np.ndarray:
+    return texture(8, 480.0)
+
+
+@pytest.fixture(scope="module")
+def frame(ground: np.ndarray) -> np.ndarray:
+    return view(ground, PINHOLE, TRUE_R, TRUE_M)
+
+
+@pytest.fixture(scope="module")
+def matcher(ground: np.ndarray) -> FrameMatcher:
+    return FrameMatcher(PINHOLE, FlatMap(ground), GradientDescriber())  # type: ignore[arg-type]
+
+
+# --- the grid of hypotheses -----------------------------------------------------------------------
+
+
+def test_what_is_known_is_not_searched() -> None:
+    assert _hypotheses(seen_from(yaw_sigma_deg=1.0, scale_sigma=0.02)) == (Hypothesis(0.0, 1.0),)
+
+
+@pytest.mark.parametrize(("yaw_sigma_deg", "scale_sigma"), [(3.0, 0.03), (8.0, 0.02), (2.0, 0.1), (10.0, 0.08)])
+def test_the_grid_covers_one_and_a_half_sigmas(yaw_sigma_deg: float, scale_sigma: float) -> None:
+    grid = _hypotheses(seen_from(yaw_sigma_deg=yaw_sigma_deg, scale_sigma=scale_sigma))
+    yaws, scales = sorted({h.yaw_rad for h in grid}), sorted({h.scale for h in grid})
+    assert len(grid) == len(yaws) * len(scales)  # every rotation with every scale
+    assert Hypothesis(0.0, 1.0) in grid
+    tolerated_deg = 4.0  # what the descriptors bear
+    assert np.degrees(yaws[-1]) + tolerated_deg >= 1.5 * yaw_sigma_deg
+    assert scales[-1] + 0.05 >= 1.0 + 1.5 * scale_sigma
+    assert np.degrees(np.diff(yaws)).max(initial=0.0) <= 2 * tolerated_deg
+    assert yaws == pytest.approx([-y for y in reversed(yaws)])
+
+
+def test_no_compass_means_all_round_and_stays_affordable() -> None:
+    grid = _hypotheses(seen_from(yaw_sigma_deg=170.0, scale_sigma=0.4))
+    assert len(grid) <= MAX_HYPOTHESES
+    yaws = np.sort(np.degrees([h.yaw_rad for h in grid if h.scale == 1.0]))
+    assert yaws[0] <= -172.0 and yaws[-1] >= 172.0 and np.diff(yaws).max() <= 8.0
+
+
+# --- looking ------------------------------------------------------------------------------------------
+
+
+def test_the_place_stands_out(matcher: FrameMatcher, frame: np.ndarray) -> None:
+    belief = Belief(0.0, 0.0, 25.0)
+    look = matcher.look(frame, seen_from(), belief)
+    assert look.verdict is Verdict.ACCEPTED and len(look.surfaces) == len(look.hypotheses) == 1
+    _, here = look.best_at(*TRUE_M[:2])
+    _, elsewhere = look.best_at(-40.0, 50.0)
+    assert here > 5.0 > elsewhere
+    belief.update(look.surfaces, 1.0)
+    mode = belief.mode()
+    assert (mode.e_m, mode.n_m) == pytest.approx(tuple(TRUE_M[:2]), abs=4.0)
+
+
+def test_heading_and_scale_are_found_with_the_place(matcher: FrameMatcher, frame: np.ndarray) -> None:
+    off = local_rotation_up(np.radians(-14.0)) @ TRUE_R
+    wrong = seen_from(r=off, agl_m=AGL_M / 1.08, yaw_sigma_deg=12.0, scale_sigma=0.08)
+    belief = Belief(0.0, 0.0, 25.0)
+    look = matcher.look(frame, wrong, belief)
+    hypothesis, score = look.best_at(*TRUE_M[:2])
+    assert score > 5.0
+    assert np.degrees(hypothesis.yaw_rad) == pytest.approx(14.0, abs=4.0)
+    assert hypothesis.scale == pytest.approx(1.08, abs=0.05)
+
+
+def test_looking_off_the_map(matcher: FrameMatcher, frame: np.ndarray) -> None:
+    assert matcher.look(frame, seen_from(5000.0, 0.0), Belief(5000.0, 0.0, 20.0)).verdict is Verdict.OUTSIDE_MAP
+
+
+def test_looking_at_the_sky(matcher: FrameMatcher, frame: np.ndarray) -> None:
+    up = seen_from(r=rotation(0.0, 150.0))
+    assert matcher.look(frame, up, Belief(0.0, 0.0, 20.0)).verdict is Verdict.TOO_LOW
+    assert matcher.fix(frame, up, Hypothesis(0.0, 1.0), 0.0, 0.0) is None
+
+
+# --- the fix --------------------------------------------------------------------------------------------
+
+
+def test_the_pose_of_a_known_place(matcher: FrameMatcher, frame: np.ndarray) -> None:
+    fix = matcher.fix(frame, seen_from(), Hypothesis(0.0, 1.0), float(TRUE_M[0]) + 3.0, float(TRUE_M[1]) - 2.0)
+    assert fix is not None and fix.pnp.fit is not None and fix.pnp.verdict is Verdict.ACCEPTED
+    assert np.linalg.norm(fix.pnp.fit.p_c_in_w_m - TRUE_M) < 1.5
+    assert np.degrees(np.linalg.norm(log_so3(TRUE_R.T @ fix.pnp.fit.r_w_c))) < 0.6
+    assert fix.pnp.inliers.mean() > 0.9
+    assert fix.xy.shape == (len(fix.weights), 2) and fix.points_w_m.shape == (len(fix.weights), 3)
+
+
+def test_a_tilt_that_nobody_knew_is_found(ground: np.ndarray, matcher: FrameMatcher) -> None:
+    """Nine degrees, worth 16 m at this height: the camera is elsewhere than the picture seems to say."""
+    tilted = TRUE_R @ exp_so3(np.radians([9.0, 0.0, 0.0]))
+    picture = view(ground, PINHOLE, tilted, TRUE_M)
+    apparent = TRUE_M[:2] + (tilted[:2, 2] / -tilted[2, 2]) * AGL_M  # where a level camera would see the same
+    fix = matcher.fix(picture, seen_from(tilt_sigma_deg=12.0), Hypothesis(0.0, 1.0), *apparent.tolist())
+    assert fix is not None and fix.pnp.fit is not None
+    assert np.degrees(np.linalg.norm(log_so3(tilted.T @ fix.pnp.fit.r_w_c))) < 1.5
+    assert np.linalg.norm(fix.pnp.fit.p_c_in_w_m[:2] - TRUE_M[:2]) < 3.0
+
+
+def test_a_wrong_place_gives_no_pose(matcher: FrameMatcher, frame: np.ndarray) -> None:
+    accepted = 0
+    for e_m, n_m in ((-60.0, 40.0), (60.0, 60.0), (-50.0, -70.0), (80.0, -20.0), (0.0, 90.0)):
+        fix = matcher.fix(frame, seen_from(), Hypothesis(0.0, 1.0), e_m, n_m)
+        accepted += fix is not None and fix.pnp.verdict is Verdict.ACCEPTED
+    assert accepted == 0
+
+
+def test_twice_the_same(matcher: FrameMatcher, frame: np.ndarray) -> None:
+    looks = [matcher.look(frame, seen_from(yaw_sigma_deg=8.0), Belief(0.0, 0.0, 25.0)) for _ in range(2)]
+    for a, b in zip(looks[0].surfaces, looks[1].surfaces, strict=True):
+        assert np.array_equal(a.z, b.z, equal_nan=True)
