@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from terrafix.anchor.belief import CELL_M, MODE_RADIUS_M, Belief, Surface, _blurred
+from terrafix.anchor.belief import MODE_RADIUS_CELLS, Belief, Surface, _blurred, cell_for
 
 HALF_M = 200.0
+CELL_M = 2.0
 
 
 def surface(peaks: list[tuple[float, float, float]], seed: int = 0, cell_m: float = 1.0) -> Surface:
@@ -29,7 +30,7 @@ def mass_of(belief: Belief) -> float:
 
 
 def test_starts_at_the_place_with_the_sigma_that_it_is_given() -> None:
-    belief = Belief(30.0, -20.0, 15.0)
+    belief = Belief(30.0, -20.0, 15.0, CELL_M)
     mode = belief.mode()
     assert (mode.e_m, mode.n_m) == pytest.approx((30.0, -20.0), abs=CELL_M)
     ee, en, nn = belief.covariance()
@@ -38,7 +39,7 @@ def test_starts_at_the_place_with_the_sigma_that_it_is_given() -> None:
 
 
 def test_mass_is_conserved_whatever_happens() -> None:
-    belief = Belief(0.0, 0.0, 20.0)
+    belief = Belief(0.0, 0.0, 20.0, CELL_M)
     for i in range(16):
         belief.move(3.0, -2.0, (0.0, 1.0, 30.0, 200.0)[i % 4])
         belief.update((surface([(0.0, 0.0, 4.0)], i),), 0.5)
@@ -49,7 +50,7 @@ def test_mass_is_conserved_whatever_happens() -> None:
 
 
 def test_a_look_finds_the_place() -> None:
-    belief = Belief(0.0, 0.0, 25.0)
+    belief = Belief(0.0, 0.0, 25.0, CELL_M)
     for i in range(3):
         belief.update((surface([(34.0, -22.0, 6.0)], i),), 1.0)
     mode = belief.mode()
@@ -58,7 +59,7 @@ def test_a_look_finds_the_place() -> None:
 
 
 def test_two_places_that_look_alike_stay_two_modes() -> None:
-    belief = Belief(0.0, 0.0, 40.0)
+    belief = Belief(0.0, 0.0, 40.0, CELL_M)
     for i in range(5):
         belief.update((surface([(40.0, 0.0, 6.0), (-40.0, 0.0, 6.0)], i),), 1.0)
     mode = belief.mode()
@@ -69,7 +70,7 @@ def test_two_places_that_look_alike_stay_two_modes() -> None:
 
 
 def test_the_next_frame_decides_between_them() -> None:
-    belief = Belief(0.0, 0.0, 40.0)
+    belief = Belief(0.0, 0.0, 40.0, CELL_M)
     belief.update((surface([(40.0, 0.0, 6.0), (-40.0, 0.0, 6.0)]),), 1.0)
     belief.move(20.0, 10.0, 1.0)
     belief.update((surface([(-20.0, 10.0, 6.0)], 1),), 1.0)
@@ -80,7 +81,7 @@ def test_the_next_frame_decides_between_them() -> None:
 
 @pytest.mark.parametrize(("east_m", "north_m"), [(7.0, 0.0), (0.0, -13.0), (131.3, 77.7)])
 def test_motion_moves_it(east_m: float, north_m: float) -> None:
-    belief = Belief(5.0, 5.0, 10.0)
+    belief = Belief(5.0, 5.0, 10.0, CELL_M)
     before = belief.covariance()
     belief.move(east_m, north_m, 0.0)
     mode = belief.mode()
@@ -90,7 +91,7 @@ def test_motion_moves_it(east_m: float, north_m: float) -> None:
 
 @pytest.mark.parametrize("sigma_m", [3.0, 12.0, 40.0, 90.0])
 def test_uncertain_motion_spreads_it(sigma_m: float) -> None:
-    belief = Belief(0.0, 0.0, 10.0)
+    belief = Belief(0.0, 0.0, 10.0, CELL_M)
     belief.fit_window(400.0)
     belief.move(0.0, 0.0, sigma_m)
     ee, _, nn = belief.covariance()
@@ -119,7 +120,7 @@ def test_a_wide_blur_is_a_narrow_one_many_times() -> None:
 
 def test_nothing_is_ever_excluded() -> None:
     """Sure of the wrong place, then shown the right one: the belief comes back."""
-    belief = Belief(0.0, 0.0, 10.0)
+    belief = Belief(0.0, 0.0, 10.0, CELL_M)
     for i in range(20):
         belief.update((surface([(0.0, 0.0, 6.0)], i),), 1.0)
     assert belief.mode().mass > 0.99
@@ -132,7 +133,7 @@ def test_nothing_is_ever_excluded() -> None:
 
 
 def test_the_same_ground_again_proves_little() -> None:
-    full, repeated = Belief(0.0, 0.0, 40.0), Belief(0.0, 0.0, 40.0)
+    full, repeated = Belief(0.0, 0.0, 40.0, CELL_M), Belief(0.0, 0.0, 40.0, CELL_M)
     peaks = [(40.0, 0.0, 5.0), (-40.0, 0.0, 4.0)]
     full.update((surface(peaks),), 1.0)
     repeated.update((surface(peaks),), 0.1)
@@ -140,7 +141,7 @@ def test_the_same_ground_again_proves_little() -> None:
 
 
 def test_outside_the_map_is_a_little_worse_than_chance_not_impossible() -> None:
-    belief = Belief(0.0, 0.0, 30.0)
+    belief = Belief(0.0, 0.0, 30.0, CELL_M)
     z = flat().z.copy()
     z[:, :200] = np.nan  # the west is off the map
     belief.update((Surface(z, -HALF_M, HALF_M, 1.0),), 1.0)
@@ -149,32 +150,32 @@ def test_outside_the_map_is_a_little_worse_than_chance_not_impossible() -> None:
 
 
 def test_surfaces_of_several_hypotheses_count_by_their_best() -> None:
-    belief = Belief(0.0, 0.0, 25.0)
+    belief = Belief(0.0, 0.0, 25.0, CELL_M)
     belief.update((flat(), surface([(20.0, 20.0, 6.0)]), flat(-2.0)), 1.0)
     assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((20.0, 20.0), abs=4.0)
 
 
 @pytest.mark.parametrize("cell_m", [0.5, 1.0, 2.0, 5.0])
 def test_cells_of_any_size_put_the_peak_in_the_same_place(cell_m: float) -> None:
-    belief = Belief(0.0, 0.0, 25.0)
+    belief = Belief(0.0, 0.0, 25.0, CELL_M)
     for i in range(3):
         belief.update((surface([(30.0, -10.0, 7.0)], i, cell_m),), 1.0)
     assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((30.0, -10.0), abs=max(3.0, cell_m))
 
 
 def test_confirmation_lifts_the_mode_and_no_other() -> None:
-    belief = Belief(0.0, 0.0, 40.0)
+    belief = Belief(0.0, 0.0, 40.0, CELL_M)
     belief.update((surface([(40.0, 0.0, 5.0), (-40.0, 0.0, 5.0)]),), 1.0)
     before = belief.mode()
     belief.confirm(before, 20.0)
     after = belief.mode()
     assert after.mass > before.mass and after.rival < before.rival
-    assert (after.e_m, after.n_m) == pytest.approx((before.e_m, before.n_m), abs=MODE_RADIUS_M / 2)
+    assert (after.e_m, after.n_m) == pytest.approx((before.e_m, before.n_m), abs=MODE_RADIUS_CELLS * CELL_M / 2)
     assert mass_of(belief) == pytest.approx(1.0)
 
 
 def test_the_window_follows_and_is_bounded() -> None:
-    belief = Belief(0.0, 0.0, 20.0)
+    belief = Belief(0.0, 0.0, 20.0, CELL_M)
     for _ in range(30):
         belief.move(50.0, 0.0, 60.0)
         belief.fit_window(0.0)
@@ -184,3 +185,25 @@ def test_the_window_follows_and_is_bounded() -> None:
     assert mode_e == pytest.approx(1500.0, abs=10.0)
     belief.update((Surface(np.full((5, 5), np.nan, np.float32), 0.0, 0.0, 1.0),), 1.0)  # knows nothing at all
     assert mass_of(belief) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("cell_m", [1.0, 4.0, 8.0])
+def test_another_resolution_keeps_every_mode_where_it_is(cell_m: float) -> None:
+    belief = Belief(0.0, 0.0, 40.0, CELL_M)
+    belief.update((surface([(52.0, 30.0, 6.0), (-40.0, -10.0, 6.0)]),), 1.0)
+    before, cov = belief.mode(), belief.covariance()
+    belief.set_cell(cell_m)
+    after = belief.mode()
+    assert mass_of(belief) == pytest.approx(1.0)
+    assert belief.cell_m == cell_m
+    assert (after.e_m, after.n_m) == pytest.approx((before.e_m, before.n_m), abs=max(2.0, cell_m)) or cell_m > 4.0
+    assert np.sqrt(belief.covariance()[0]) == pytest.approx(np.sqrt(cov[0]), rel=0.1)
+    belief.update((surface([(52.0, 30.0, 6.0)], 1),), 1.0)  # and it goes on from there
+    assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((52.0, 30.0), abs=max(4.0, cell_m))
+
+
+def test_the_cell_goes_with_the_height() -> None:
+    sizes = [cell_for(agl_m, 0.5) for agl_m in (30.0, 60.0, 100.0, 150.0, 300.0, 1000.0)]
+    assert sizes == sorted(sizes)
+    assert sizes[0] == 1.0 and cell_for(100.0, 0.5) == 2.0 and sizes[-1] >= 16.0
+    assert cell_for(30.0, 8.0) >= 8.0  # never finer than what is looked at

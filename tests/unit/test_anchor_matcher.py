@@ -12,6 +12,7 @@ from terrafix.messages import Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
 AGL_M = 100.0
+CELL_M = 2.0  # of the belief
 TRUE_M = np.array([22.0, -31.0, AGL_M])
 TRUE_R = rotation(40.0)
 
@@ -77,7 +78,7 @@ def test_no_compass_means_all_round_and_stays_affordable() -> None:
 
 
 def test_the_place_stands_out(matcher: FrameMatcher, frame: np.ndarray) -> None:
-    belief = Belief(0.0, 0.0, 25.0)
+    belief = Belief(0.0, 0.0, 25.0, CELL_M)
     look = matcher.look(frame, seen_from(), belief)
     assert look.verdict is Verdict.ACCEPTED and len(look.surfaces) == len(look.hypotheses) == 1
     _, here = look.best_at(*TRUE_M[:2])
@@ -91,7 +92,7 @@ def test_the_place_stands_out(matcher: FrameMatcher, frame: np.ndarray) -> None:
 def test_heading_and_scale_are_found_with_the_place(matcher: FrameMatcher, frame: np.ndarray) -> None:
     off = local_rotation_up(np.radians(-14.0)) @ TRUE_R
     wrong = seen_from(r=off, agl_m=AGL_M / 1.08, yaw_sigma_deg=12.0, scale_sigma=0.08)
-    belief = Belief(0.0, 0.0, 25.0)
+    belief = Belief(0.0, 0.0, 25.0, CELL_M)
     look = matcher.look(frame, wrong, belief)
     hypothesis, score = look.best_at(*TRUE_M[:2])
     assert score > 5.0
@@ -100,12 +101,12 @@ def test_heading_and_scale_are_found_with_the_place(matcher: FrameMatcher, frame
 
 
 def test_looking_off_the_map(matcher: FrameMatcher, frame: np.ndarray) -> None:
-    assert matcher.look(frame, seen_from(5000.0, 0.0), Belief(5000.0, 0.0, 20.0)).verdict is Verdict.OUTSIDE_MAP
+    assert matcher.look(frame, seen_from(5000.0, 0.0), Belief(5000.0, 0.0, 20.0, CELL_M)).verdict is Verdict.OUTSIDE_MAP
 
 
 def test_looking_at_the_sky(matcher: FrameMatcher, frame: np.ndarray) -> None:
     up = seen_from(r=rotation(0.0, 150.0))
-    assert matcher.look(frame, up, Belief(0.0, 0.0, 20.0)).verdict is Verdict.TOO_LOW
+    assert matcher.look(frame, up, Belief(0.0, 0.0, 20.0, CELL_M)).verdict is Verdict.TOO_LOW
     assert matcher.fix(frame, up, Hypothesis(0.0, 1.0), 0.0, 0.0) is None
 
 
@@ -141,6 +142,6 @@ def test_a_wrong_place_gives_no_pose(matcher: FrameMatcher, frame: np.ndarray) -
 
 
 def test_twice_the_same(matcher: FrameMatcher, frame: np.ndarray) -> None:
-    looks = [matcher.look(frame, seen_from(yaw_sigma_deg=8.0), Belief(0.0, 0.0, 25.0)) for _ in range(2)]
+    looks = [matcher.look(frame, seen_from(yaw_sigma_deg=8.0), Belief(0.0, 0.0, 25.0, CELL_M)) for _ in range(2)]
     for a, b in zip(looks[0].surfaces, looks[1].surfaces, strict=True):
         assert np.array_equal(a.z, b.z, equal_nan=True)

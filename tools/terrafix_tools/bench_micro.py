@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from terrafix.anchor.belief import Belief
+from terrafix.anchor.belief import Belief, cell_for
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.matcher import FrameMatcher, View
 from terrafix.core.camera import CameraCalibration
@@ -60,7 +60,7 @@ def _looks(
     look_ms, update_ms, fix_ms = [], [], []
     for prediction in predictions:
         image, view = images[prediction.frame_id], _view(prediction, ground_m)
-        belief = Belief(view.e_m, view.n_m, BELIEF_SIGMA_M)
+        belief = Belief(view.e_m, view.n_m, BELIEF_SIGMA_M, cell_for(view.agl_m, matcher.look_cell_m(view.agl_m)))
         matcher.look(image, view, belief)  # the map's descriptors are there from the frame before
         began_s = time.perf_counter()
         look = matcher.look(image, view, belief)

@@ -15,11 +15,19 @@ LLR_SLOPE = 3.0
 LLR_ZERO_Z = 1.9
 LLR_MIN, LLR_MAX = -3.0, 9.0
 LEAK = 0.004  # share of the mass that is spread over the window each full look: nothing is ever quite excluded
-CELL_M = 2.0
-MIN_HALF_M = 120.0  # the window never shrinks below this: the next error must still lie inside
-MAX_HALF_M = 1500.0
+CELL_PER_AGL = 1 / 50  # a cell is 2 m at 100 m: two pixels of the look
+MIN_CELL_M = 1.0
+MIN_HALF_CELLS = 60  # the window never shrinks below this: the next error must still lie inside
+MAX_HALF_CELLS = 750
+MARGIN_CELLS = 30  # of the window beyond three or four sigmas of the belief
 WIDE_BLUR_CELLS = 6.0  # a blur wider than this is made at lower resolution
-MODE_RADIUS_M = 14.0  # mass within this radius counts as one mode
+MODE_RADIUS_CELLS = 7  # mass within this radius counts as one mode
+
+
+def cell_for(agl_m: float, look_cell_m: float) -> float:
+    """Size of a belief cell, in steps of an octave: a share of the height, and not finer than what is looked at."""
+    wanted = max(agl_m * CELL_PER_AGL, look_cell_m, MIN_CELL_M)
+    return float(2.0 ** round(np.log2(wanted)))
 
 
 @dataclass(frozen=True)
@@ -41,10 +49,10 @@ class Surface:
     n0_m: float
     cell_m: float
 
-    def at(self, e_m: float, n_m: float) -> float:
-        """Best value within one belief cell of a position; -9 outside."""
+    def at(self, e_m: float, n_m: float, reach_m: float) -> float:
+        """Best value within ``reach_m`` of a position; -9 outside."""
         r, c = (self.n0_m - n_m) / self.cell_m, (e_m - self.e0_m) / self.cell_m
-        k = max(CELL_M / self.cell_m, 1.0)
+        k = max(reach_m / self.cell_m, 1.0)
         rows = slice(max(round(r - k), 0), max(round(r + k) + 1, 0))
         columns = slice(max(round(c - k), 0), max(round(c + k) + 1, 0))
         near = np.nan_to_num(self.z[rows, columns], nan=-9.0)
@@ -54,12 +62,13 @@ class Surface:
 class Belief:
     """Mass over camera positions (east, north). The grid travels with the camera, so motion costs no resampling."""
 
-    def __init__(self, e_m: float, n_m: float, sigma_m: float) -> None:
-        half = min(max(4.0 * sigma_m + 60.0, MIN_HALF_M), MAX_HALF_M)
-        cells = 2 * int(np.ceil(half / CELL_M)) + 1
-        self._e0 = e_m - (cells // 2) * CELL_M  # position of column 0
-        self._n0 = n_m + (cells // 2) * CELL_M  # position of row 0
-        axis = (np.arange(cells) - cells // 2) * CELL_M
+    def __init__(self, e_m: float, n_m: float, sigma_m: float, cell_m: float) -> None:
+        self.cell_m = cell_m
+        half = min(max(4.0 * sigma_m / cell_m + MARGIN_CELLS, MIN_HALF_CELLS), MAX_HALF_CELLS)
+        cells = 2 * int(np.ceil(half)) + 1
+        self._e0 = e_m - (cells // 2) * self.cell_m  # position of column 0
+        self._n0 = n_m + (cells // 2) * self.cell_m  # position of row 0
+        axis = (np.arange(cells) - cells // 2) * self.cell_m
         log = -0.5 * (axis**2) / sigma_m**2
         self._mass = np.exp(log[:, None] + log[None, :])
         self._mass = self._mass / self._mass.sum()
@@ -68,9 +77,9 @@ class Belief:
         """Odometry: shift by the step, spread by its error."""
         self._e0 += east_m
         self._n0 += north_m
-        cells = min(sigma_m, MAX_HALF_M / 3) / CELL_M
+        cells = min(sigma_m / self.cell_m, MAX_HALF_CELLS / 3)
         if cells * 6 > len(self._mass) // 2:
-            self._resize(min(MAX_HALF_M, 4.0 * sigma_m + self.half_m))
+            self._resize(4.0 * cells + len(self._mass) // 2)
         if cells > 0.05:
             self._mass = np.maximum(_blurred(self._mass, cells), 0.0)
             self._mass /= self._mass.sum()
@@ -87,10 +96,10 @@ class Belief:
     def _log_likelihood(self, surface: Surface) -> np.ndarray:
         """On the belief's grid; what is not known counts as a little worse than chance."""
         z = np.nan_to_num(surface.z, nan=-9.0).astype(np.float32)
-        if surface.cell_m < CELL_M:  # the best of the finer cells stands for the coarse one
-            k = int(np.ceil(CELL_M / surface.cell_m)) | 1
+        if surface.cell_m < self.cell_m:  # the best of the finer cells stands for the coarse one
+            k = int(np.ceil(self.cell_m / surface.cell_m)) | 1
             z = cv2.dilate(z, np.ones((k, k), np.uint8))
-        axis = np.arange(len(self._mass)) * CELL_M
+        axis = np.arange(len(self._mass)) * self.cell_m
         map_x, map_y = np.meshgrid(
             ((self._e0 - surface.e0_m + axis) / surface.cell_m).astype(np.float32),
             ((surface.n0_m - self._n0 + axis) / surface.cell_m).astype(np.float32),
@@ -100,7 +109,7 @@ class Belief:
 
     def mode(self) -> Mode:
         """The heaviest mode: centroid and mass within MODE_RADIUS_M, and the mass of its best rival."""
-        radius = int(MODE_RADIUS_M / CELL_M)
+        radius = MODE_RADIUS_CELLS
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)).astype(np.float64)
         gathered = cv2.filter2D(self._mass, -1, disc, borderType=cv2.BORDER_CONSTANT)
         r, c = np.unravel_index(int(np.argmax(gathered)), gathered.shape)
@@ -108,22 +117,24 @@ class Belief:
         distance2 = (rows - r) ** 2 + (columns - c) ** 2
         near = np.where(distance2 <= radius**2, self._mass, 0.0)
         mass = float(near.sum())
-        e_m = self._e0 + float((near.sum(0) * np.arange(len(self._mass))).sum()) / mass * CELL_M
-        n_m = self._n0 - float((near.sum(1) * np.arange(len(self._mass))).sum()) / mass * CELL_M
+        e_m = self._e0 + float((near.sum(0) * np.arange(len(self._mass))).sum()) / mass * self.cell_m
+        n_m = self._n0 - float((near.sum(1) * np.arange(len(self._mass))).sum()) / mass * self.cell_m
         rival = float(np.where(distance2 > (2 * radius) ** 2, gathered, 0.0).max())
-        var = float((near * distance2).sum()) / mass / 2 * CELL_M**2
+        var = float((near * distance2).sum()) / mass / 2 * self.cell_m**2
         return Mode(e_m, n_m, min(mass, 1.0), rival, var)
 
     def confirm(self, mode: Mode, likelihood_ratio: float) -> None:
         """Evidence from another source that the camera is in this mode."""
-        axis = np.arange(len(self._mass)) * CELL_M
+        axis = np.arange(len(self._mass)) * self.cell_m
         distance2 = (self._n0 - axis - mode.n_m)[:, None] ** 2 + (self._e0 + axis - mode.e_m)[None, :] ** 2
-        self._mass = np.where(distance2 <= MODE_RADIUS_M**2, self._mass * likelihood_ratio, self._mass)
+        self._mass = np.where(
+            distance2 <= (MODE_RADIUS_CELLS * self.cell_m) ** 2, self._mass * likelihood_ratio, self._mass
+        )
         self._mass /= self._mass.sum()
 
     def covariance(self) -> tuple[float, float, float]:
         """(ee, en, nn) in m^2 of the whole belief, all modes."""
-        axis = np.arange(len(self._mass)) * CELL_M
+        axis = np.arange(len(self._mass)) * self.cell_m
         p_e, p_n = self._mass.sum(0), self._mass.sum(1)
         mean_e, mean_n = float(p_e @ axis), float(p_n @ axis)
         en = -float((axis - mean_n) @ self._mass @ (axis - mean_e))
@@ -137,18 +148,30 @@ class Belief:
     def fit_window(self, at_least_half_m: float) -> None:
         """Window around the mean, as wide as the belief needs."""
         ee, _, nn = self.covariance()
-        self._resize(min(MAX_HALF_M, max(MIN_HALF_M, at_least_half_m, 3.0 * float(np.sqrt(max(ee, nn))) + 60.0)))
+        spread = 3.0 * float(np.sqrt(max(ee, nn))) / self.cell_m + MARGIN_CELLS
+        self._resize(max(MIN_HALF_CELLS, at_least_half_m / self.cell_m, spread))
+
+    def set_cell(self, cell_m: float) -> None:
+        """Another resolution, when the height has changed much."""
+        scale = self.cell_m / cell_m
+        half = int(np.ceil(len(self._mass) // 2 * scale))
+        e_m, n_m = self.centre
+        side = 2 * half + 1
+        self._mass = np.maximum(cv2.resize(self._mass, (side, side), interpolation=cv2.INTER_AREA), 1e-15)
+        self._mass /= self._mass.sum()
+        self.cell_m = cell_m
+        self._e0, self._n0 = e_m - half * cell_m, n_m + half * cell_m
 
     @property
     def half_m(self) -> float:
-        return len(self._mass) // 2 * CELL_M
+        return len(self._mass) // 2 * self.cell_m
 
     @property
     def centre(self) -> tuple[float, float]:
         return self._e0 + self.half_m, self._n0 - self.half_m
 
-    def _resize(self, half_m: float) -> None:
-        cells = 2 * int(np.ceil(half_m / CELL_M)) + 1
+    def _resize(self, half_cells: float) -> None:
+        cells = 2 * int(np.ceil(min(half_cells, MAX_HALF_CELLS))) + 1
         p_e, p_n = self._mass.sum(0), self._mass.sum(1)
         mean_c, mean_r = round(float(p_e @ np.arange(len(p_e)))), round(float(p_n @ np.arange(len(p_n))))
         new = np.full((cells, cells), 1e-12 / cells**2)
@@ -157,8 +180,8 @@ class Belief:
         cs = slice(max(c0, 0), min(c0 + len(self._mass), cells))
         new[rs, cs] += self._mass[rs.start - r0 : rs.stop - r0, cs.start - c0 : cs.stop - c0]
         self._mass = new / new.sum()
-        self._e0 -= c0 * CELL_M
-        self._n0 += r0 * CELL_M
+        self._e0 -= c0 * self.cell_m
+        self._n0 += r0 * self.cell_m
 
 
 def _blurred(mass: np.ndarray, sigma: float) -> np.ndarray:

@@ -63,10 +63,11 @@ class Look:
     surfaces: tuple[Surface, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
     footprint_m: float = 1.0
+    cell_m: float = 1.0
 
     def best_at(self, e_m: float, n_m: float) -> tuple[Hypothesis, float]:
         """The hypothesis that fits best at a camera position, and its standardised correlation there."""
-        scores = [s.at(e_m, n_m) for s in self.surfaces]
+        scores = [s.at(e_m, n_m, 2.0 * self.cell_m) for s in self.surfaces]
         best = int(np.argmax(scores))
         return self.hypotheses[best], scores[best]
 
@@ -88,6 +89,9 @@ class FrameMatcher:
         self._map = source
         self._describer = describer
         self._features = MapFeatures(source, describer)
+
+    def look_cell_m(self, agl_m: float) -> float:
+        return self._gsd(agl_m, LOOK_GSD_PER_AGL) * self._describer.stride
 
     def look(self, image: Image, view: View, belief: Belief) -> Look:
         """Correlation over the belief's window, for every rotation and scale that the prediction leaves open."""
@@ -119,7 +123,7 @@ class FrameMatcher:
             surfaces.append(Surface(z, e_min - frame.e_min_m, n_max - frame.n_max_m, cell))
         if not any(np.isfinite(s.z).any() for s in surfaces):
             return Look(Verdict.OUTSIDE_MAP)
-        return Look(Verdict.ACCEPTED, tuple(surfaces), tuple(h for h, _ in usable), footprint_m)
+        return Look(Verdict.ACCEPTED, tuple(surfaces), tuple(h for h, _ in usable), footprint_m, cell)
 
     def fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> Fix | None:
         """2D-3D matches around a camera position, and the pose that they give. None: the ground cannot be seen.

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
-from terrafix.anchor.belief import CELL_M, Belief, Mode
+from terrafix.anchor.belief import Belief, Mode, cell_for
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import Fix, FrameMatcher, View
@@ -67,7 +67,6 @@ class AnchorNode:
         return ()
 
     def _match(self, prediction: Prediction) -> MapMatch:
-        belief = self._moved(prediction)
         answer = MapMatch(
             t_ns=prediction.t_ns,
             frame_id=prediction.frame_id,
@@ -77,6 +76,7 @@ class AnchorNode:
         image = self._frames.get(prediction.frame_id)
         if self._matcher is None:
             return answer
+        belief = self._moved(prediction, cell_for(prediction.agl_m, self._matcher.look_cell_m(prediction.agl_m)))
         if image is None:
             return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE)
         view, ground = self._view(prediction)
@@ -112,19 +112,21 @@ class AnchorNode:
             return msgspec.structs.replace(answer, verdict=enough, mode_mass=mass)
         if mode.mass < MODE_MASS:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
-        return self._coarse(answer, mode, view) if score >= COARSE_SCORE else answer
+        return self._coarse(answer, mode, belief, view) if score >= COARSE_SCORE else answer
 
-    def _moved(self, prediction: Prediction) -> Belief:
+    def _moved(self, prediction: Prediction, cell_m: float) -> Belief:
         step_m = float(np.hypot(*prediction.step_m))
         sigma_m = float(np.sqrt(max(prediction.step_cov_m2[0], prediction.step_cov_m2[3])))
         if self._belief is None:
             e_m, n_m, _ = prediction.p_c_in_w_m
             start = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
             tilt = prediction.agl_m * float(np.sqrt(max(prediction.cov[21], prediction.cov[28])))
-            self._belief = Belief(e_m, n_m, float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt)))
+            self._belief = Belief(e_m, n_m, float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt)), cell_m)
         else:
             self._belief.move(*prediction.step_m, sigma_m)
             self._belief.fit_window(0.0)
+            if not 0.4 < cell_m / self._belief.cell_m < 2.5:  # an octave is left alone: no flicker at its edge
+                self._belief.set_cell(cell_m)
         self._since_look_m += float(np.hypot(step_m, sigma_m))
         return self._belief
 
@@ -165,14 +167,14 @@ class AnchorNode:
             self._poor_looks = 0.0
             belief.fit_window(belief.half_m * WIDEN)
 
-    def _coarse(self, answer: MapMatch, mode: Mode, view: View) -> MapMatch:
+    def _coarse(self, answer: MapMatch, mode: Mode, belief: Belief, view: View) -> MapMatch:
         """The position of the mode, as a pose factor. What is seen is the place of the ground, so the camera's position
         goes with its tilt: p_e moves by +h, p_n by -h per radian of rotation about north and east."""
         lever = np.zeros((2, 2))
         lever[0, 1], lever[1, 0] = view.agl_m, -view.agl_m
         tilt = COARSE_TILT_RAD**2 * np.eye(2)
         cov = np.diag([0.0, 0.0, COARSE_HEIGHT_M**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2])
-        sigma2 = mode.var_m2 + CELL_M**2 + (COARSE_SIGMA * view.agl_m) ** 2
+        sigma2 = mode.var_m2 + belief.cell_m**2 + (COARSE_SIGMA * view.agl_m) ** 2
         cov[:2, :2] = lever @ tilt @ lever.T + sigma2 * np.eye(2)
         cov[:2, 3:5] = lever @ tilt
         cov[3:5, :2] = cov[:2, 3:5].T

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.camera import Mount
-from terrafix.core.geodesy import rot_from_quat, rot_w_b
+from terrafix.core.geodesy import rot_from_quat, rot_w_b, yaw_of
 from terrafix.core.pose import exp_so3, world_to_tangent
 from terrafix.estimator.factors import attitude_and_height_factor
 from terrafix.estimator.graph import NodeState, PoseGraph
@@ -127,11 +127,12 @@ class Estimator:
             step_sigma = self._drift_sigma(dt_s)
             self.velocity_sigma_mps = min(MAX_SPEED_SIGMA_MPS, self.velocity_sigma_mps + MAX_ACCELERATION_MPS2 * dt_s)
         self._cov_of[self.graph.next_node] = _compose_cov(self._covariance(parent), motion)
-        node = self.graph.extend(t_s, NodeState(pose, before.bias), parent, motion, self._attitude(attitude))
+        node = self.graph.extend(
+            t_s, NodeState(pose, before.bias), parent, motion, self._attitude(attitude, pose.rotation().matrix())
+        )
         self._node_of[frame_id] = node
-        if known is not None or odometry.becomes_keyframe:
-            self._trunk.append(node)
         if known is not None:
+            self._trunk.append(node)
             self._learn_velocity(node)
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
         return Advance(verdict, self._last, step, step_sigma, False)
@@ -150,7 +151,11 @@ class Estimator:
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
         bias_cov = np.diag([tolerance, tolerance, yaw, float(np.hypot(agl_sigma, HEIGHT_BIAS * agl))]) ** 2
         node = self.graph.start(
-            t_s, NodeState(pose, np.zeros(4)), world_to_tangent(cov_world, r_w_c), bias_cov, self._attitude(attitude)
+            t_s,
+            NodeState(pose, np.zeros(4)),
+            world_to_tangent(cov_world, r_w_c),
+            bias_cov,
+            self._attitude(attitude, r_w_c),
         )
         self._node_of[frame_id] = node
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
@@ -187,6 +192,7 @@ class Estimator:
     def _by_guess(self, t_s: float, attitude: Attitude) -> tuple[int, RelativePose]:
         """Nothing was seen: the last velocity, less certain the longer it lasts; the heading from the compass."""
         parent = self._trunk[-1] if self.graph.holds(self._trunk[-1]) else self.graph.newest
+        self.graph.keep(parent)  # a long silence is one long guess from here, not a chain of short ones
         state = self.graph.state(parent)
         dt_s = max(t_s - self.graph.time_of(parent), 1e-3)
         r_parent = state.pose.rotation().matrix()
@@ -202,7 +208,8 @@ class Estimator:
         """How far a drone may be from where its last velocity would have taken it, per axis: an integrated
         Ornstein-Uhlenbeck process, since a drone that is out of sight also turns back."""
         tau = VELOCITY_MEMORY_S
-        wander = MAX_SPEED_SIGMA_MPS * float(np.sqrt(2 * tau * (dt_s - tau * (1 - np.exp(-dt_s / tau)))))
+        speed = max(MAX_SPEED_SIGMA_MPS, float(np.linalg.norm(self.velocity_mps)))
+        wander = speed * float(np.sqrt(2 * tau * (dt_s - tau * (1 - np.exp(-dt_s / tau)))))
         course = float(np.hypot(self.velocity_sigma_mps * dt_s, 0.5 * MAX_ACCELERATION_MPS2 * dt_s**2))
         return max(min(course, wander), STEP_FLOOR_M)
 
@@ -249,17 +256,20 @@ class Estimator:
             return before
         return exp_so3(np.array([0.0, 0.0, bias[2]])) @ r_w_b @ self._r_b_c @ exp_so3(np.array([bias[0], bias[1], 0.0]))
 
-    def _attitude(self, attitude: Attitude) -> gtsam.CustomFactor:
+    def _attitude(self, attitude: Attitude, r_w_c: np.ndarray) -> gtsam.CustomFactor:
+        """``r_w_c``: the predicted camera, whose heading stands in for one that nobody reports."""
         origin = self.origin
         tilt = UNKNOWN_ATTITUDE_RAD
         if attitude.pitch_rad is not None and attitude.roll_rad is not None:
             tilt = np.radians(max(origin.attitude_sigma_deg, 0.3))
-        yaw = UNKNOWN_RAD * 10 if attitude.yaw_rad is None else np.radians(max(origin.yaw_sigma_deg, 1.0))
+        yaw_rad, yaw_sigma = attitude.yaw_rad, np.radians(max(origin.yaw_sigma_deg, 1.0))
+        if yaw_rad is None:
+            yaw_rad, yaw_sigma = yaw_of(r_w_c @ self._r_b_c.T), UNKNOWN_RAD * 10
         height = DEFAULT_AGL_SIGMA_M * 20 if attitude.agl_m is None else max(origin.agl_sigma_m, 0.5)
         up = (origin.ground_amsl_m or 0.0) + (DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m)
-        r_w_b = rot_w_b(attitude.yaw_rad or 0.0, attitude.pitch_rad or 0.0, attitude.roll_rad or 0.0)
+        r_w_b = rot_w_b(yaw_rad, attitude.pitch_rad or 0.0, attitude.roll_rad or 0.0)
         return attitude_and_height_factor(
-            *self.graph.next_keys(), np.array([tilt, tilt, yaw, height]), r_w_b, self._r_b_c, up
+            *self.graph.next_keys(), np.array([tilt, tilt, yaw_sigma, height]), r_w_b, self._r_b_c, up
         )
 
     # --- map ------------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ class PoseGraph:
         self.rebuilds = 0
         self._smoother = _smoother()
         self._times: dict[int, float] = {}  # nodes in the window: measurement time, s
+        self._stamps: dict[int, int] = {}  # node -> the node at whose arrival it was new, or kept
         self._next = 0
 
     @property
@@ -89,6 +90,7 @@ class PoseGraph:
         self._keep_window()
         self._smoother = _smoother()
         self._times.clear()
+        self._stamps.clear()
         return self.start(t_s, state, cov, bias_cov)
 
     def extend(
@@ -120,6 +122,10 @@ class PoseGraph:
         factors.add(gtsam.PriorFactorPose3(C(node), pose, _robust(cov)))
         self._update(factors, gtsam.Values(), {})
 
+    def keep(self, node: int) -> None:
+        """Holds a node of the window in it for another full lag."""
+        self._stamps[node] = self.newest
+
     def next_keys(self) -> tuple[int, int]:
         return C(self._next), B(self._next)
 
@@ -148,16 +154,16 @@ class PoseGraph:
         self.all_values.insert(values)
         self._next += 1
         self._times[node] = t_s
+        self._stamps[node] = node
         stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = {
-            C(node): float(node),
-            B(node): float(node),
+            key(n): float(at) for n, at in self._stamps.items() for key in (C, B)
         }
-        leaving = [n for n in self._times if n < node - LAG_NODES]
+        leaving = [n for n, at in self._stamps.items() if at < node - LAG_NODES]
         if leaving:
             self._remember(leaving)
         self._update(factors, values, stamps)
         for n in leaving:
-            del self._times[n]
+            del self._times[n], self._stamps[n]
 
     def _update(
         self,
@@ -181,7 +187,7 @@ class PoseGraph:
         state = NodeState(self.all_values.atPose3(C(node)), self.all_values.atVector(B(node)))
         self._smoother = _smoother()
         t_s = self._times[node]
-        self._times = {node: t_s}
+        self._times, self._stamps = {node: t_s}, {node: node}
         factors = gtsam.NonlinearFactorGraph()
         wide = np.array([0.1, 0.1, 0.2, 50.0, 50.0, 20.0])
         factors.add(gtsam.PriorFactorPose3(C(node), state.pose, gtsam.noiseModel.Diagonal.Sigmas(wide)))
