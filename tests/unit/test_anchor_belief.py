@@ -187,16 +187,16 @@ def test_the_window_follows_and_is_bounded() -> None:
     assert mass_of(belief) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("cell_m", [1.0, 4.0, 8.0])
+@pytest.mark.parametrize("cell_m", [1.0, 4.0])
 def test_another_resolution_keeps_every_mode_where_it_is(cell_m: float) -> None:
     belief = Belief(0.0, 0.0, 40.0, CELL_M)
-    belief.update((surface([(52.0, 30.0, 6.0), (-40.0, -10.0, 6.0)]),), 1.0)
+    belief.update((surface([(52.0, 30.0, 6.0), (-40.0, -10.0, 5.5)]),), 1.0)
     before, cov = belief.mode(), belief.covariance()
     belief.set_cell(cell_m)
     after = belief.mode()
     assert mass_of(belief) == pytest.approx(1.0)
     assert belief.cell_m == cell_m
-    assert (after.e_m, after.n_m) == pytest.approx((before.e_m, before.n_m), abs=max(2.0, cell_m)) or cell_m > 4.0
+    assert (after.e_m, after.n_m) == pytest.approx((before.e_m, before.n_m), abs=max(2.0, cell_m))
     assert np.sqrt(belief.covariance()[0]) == pytest.approx(np.sqrt(cov[0]), rel=0.1)
     belief.update((surface([(52.0, 30.0, 6.0)], 1),), 1.0)  # and it goes on from there
     assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((52.0, 30.0), abs=max(4.0, cell_m))

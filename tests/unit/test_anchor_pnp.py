@@ -59,7 +59,7 @@ def test_few_matches_are_no_pose(count: int) -> None:
     assert (found.verdict, found.fit) == (Verdict.FEW_INLIERS, None)
 
 
-def test_a_quarter_of_right_matches_is_not_enough() -> None:
+def test_of_a_quarter_of_right_matches_comes_no_wrong_pose() -> None:
     rng = np.random.default_rng(1)
     points, xy = scene(rng, 48, 0.0)
     points[12:, :2] += rng.uniform(-2 * REACH, 2 * REACH, (36, 2)) * AGL_M

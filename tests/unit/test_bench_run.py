@@ -4,10 +4,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from ground import PINHOLE, FlatMap, rotation, texture, view
 
 from terrafix.core.errors import OutputError, SourceError, UsageError
+from terrafix.core.geodesy import quat_from_rot
+from terrafix.messages import Prediction
 from terrafix_tools.bench import bench
+from terrafix_tools.bench_baseline import SiftBaseline
 
 FRAMES = 3
 
@@ -79,3 +84,23 @@ def test_bad_arguments(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
         bench(tmp_path, tmp_path / "file" / "b.json")
+
+
+def test_the_baseline_is_right_where_it_can_be() -> None:
+    """The same picture on both sides, where SIFT cannot fail: an unfair baseline would be worth nothing."""
+    ground, r, p = texture(3, 420.0), rotation(35.0, 3.0, -2.0), np.array([12.0, -20.0, 100.0])
+    baseline = SiftBaseline(PINHOLE, FlatMap(ground))  # type: ignore[arg-type]
+    predicted = Prediction(
+        t_ns=0,
+        frame_id=0,
+        p_c_in_w_m=(-10.0, 5.0, 100.0),
+        q_w_c=quat_from_rot(rotation(38.0, 3.0, -2.0)),
+        cov=(0.0,) * 36,
+        agl_m=98.0,
+        agl_sigma_m=3.0,
+        step_m=(0.0, 0.0),
+        step_cov_m2=(0.0,) * 4,
+    )
+    found = baseline.locate(view(ground, PINHOLE, r, p), predicted)
+    assert found == pytest.approx((12.0, -20.0), abs=1.5)
+    assert baseline.locate(view(texture(50, 420.0), PINHOLE, r, p), predicted) is None

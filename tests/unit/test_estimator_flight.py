@@ -358,7 +358,7 @@ def test_jacobian_claims_about_what_marginals_do(long_flight: Flight) -> None:
     hot.hear([health(ThermalBand.HOT)])
     for run in (cool, hot):
         run.fly(long_flight, 0, 120)
-    assert {run.estimate(i).covariance_mode for i in range(120) for run in (cool,)} == {CovarianceMode.MARGINALS}
+    assert {cool.estimate(i).covariance_mode for i in range(120)} == {CovarianceMode.MARGINALS}
     assert {hot.estimate(i).covariance_mode for i in range(120)} == {CovarianceMode.JACOBIAN}
     ratios = np.array([sigma_m(hot.estimate(i)) / sigma_m(cool.estimate(i)) for i in range(10, 120)])
     assert ratios.min() > 0.5 and ratios.max() < 2.0

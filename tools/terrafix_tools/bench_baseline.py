@@ -23,6 +23,7 @@ from terrafix_tools.bench_run import run_part, spread
 from terrafix_tools.evaluate import offset_m, read_truth
 
 HALF_WINDOW_M = 70.0  # around the predicted footprint: the prior of the probes that this is compared with
+GSD_PER_AGL = 1 / 200  # the scale of our own fixes; at a finer one SIFT is slower, and the ratio would flatter us
 RATIO = 0.8  # Lowe 2004
 RANSAC_PX = 5.0  # generous: relief and leaning houses
 MIN_INLIERS = 8  # chance gives 4 to 7; fewer is no answer
@@ -39,7 +40,7 @@ class SiftBaseline:
     def locate(self, image: Image, prediction: Prediction) -> tuple[float, float] | None:
         """-> (e_m, n_m) of the camera, or None when nothing agreed."""
         e_m, n_m, _ = prediction.p_c_in_w_m
-        gsd_m = max(self._map.gsd_m, prediction.agl_m / self._camera.fx)  # the finest that both sides have
+        gsd_m = max(self._map.gsd_m, prediction.agl_m / self._camera.fx, prediction.agl_m * GSD_PER_AGL)
         frame = rectify(image, self._camera, rot_from_quat(prediction.q_w_c), prediction.agl_m, gsd_m)
         if frame is None:
             return None
