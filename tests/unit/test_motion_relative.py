@@ -11,6 +11,7 @@ from terrafix.vision.odometry import FrameTracker
 
 AGL_M = 100.0
 SIGMA = 1.0 / 380.0  # one pixel
+TILT_SIGMA_RAD = np.radians(30.0)  # nothing is known of the new tilt
 FLAT = Ground(AGL_M, 2.0)
 Pose = tuple[np.ndarray, np.ndarray]
 
@@ -43,7 +44,9 @@ def test_rotation_and_metric_translation(name: str) -> None:
     second = SECOND[name]
     r_true, p_true = between(FIRST, second)
     pairs = pairs_between(FIRST, second, 80, rng, 1e-5)
-    motion = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], FLAT)  # nothing is known of the new attitude
+    motion = relative_pose(
+        pairs, SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, FLAT
+    )  # nothing is known of the new attitude
     assert motion is not None
     assert np.degrees(np.linalg.norm(log_so3(r_true.T @ motion.r))) < 0.02
     assert np.linalg.norm(motion.p_m - p_true) < 0.05
@@ -55,7 +58,7 @@ def test_from_pictures(name: str) -> None:
     tracker = FrameTracker(PINHOLE)
     tracker.track(0, view(ground, PINHOLE, *FIRST))
     seen = tracker.track(1, view(ground, PINHOLE, *second))
-    motion = relative_pose(seen.pairs, seen.sigma_norm, FIRST[0], second[0], FLAT)
+    motion = relative_pose(seen.pairs, seen.sigma_norm, FIRST[0], second[0], TILT_SIGMA_RAD, FLAT)
     assert motion is not None
     r_true, p_true = between(FIRST, second)
     assert np.degrees(np.linalg.norm(log_so3(r_true.T @ motion.r))) < 0.5
@@ -76,7 +79,7 @@ def test_the_mirror_solution_is_not_taken(guess_error_deg: float) -> None:
         r_true, p_true = between(first, second)
         guess = second[0] @ exp_so3(np.radians(guess_error_deg) * rng.choice([-1.0, 1.0], 3) / np.sqrt(3.0))
         pairs = pairs_between(first, second, 80, rng, 0.3 * SIGMA)
-        motion = relative_pose(pairs, SIGMA, first[0], guess, FLAT)
+        motion = relative_pose(pairs, SIGMA, first[0], guess, TILT_SIGMA_RAD, FLAT)
         assert motion is not None
         assert np.degrees(np.linalg.norm(log_so3(r_true.T @ motion.r))) < 1.0
         assert np.linalg.norm(motion.p_m - p_true) < 2.0
@@ -87,7 +90,7 @@ def test_a_wrong_height_scales_the_step_and_the_sigma_says_so() -> None:
     second = SECOND["forward"]
     _, p_true = between(FIRST, second)
     pairs = pairs_between(FIRST, second, 80, rng, 1e-5)
-    low = relative_pose(pairs, 1e-5, FIRST[0], FIRST[0], Ground(0.9 * AGL_M, 0.1 * AGL_M))
+    low = relative_pose(pairs, 1e-5, FIRST[0], FIRST[0], TILT_SIGMA_RAD, Ground(0.9 * AGL_M, 0.1 * AGL_M))
     assert low is not None
     assert low.p_m == pytest.approx(0.9 * p_true, abs=0.02)
     error = low.r.T @ (low.p_m - p_true)
@@ -102,7 +105,7 @@ def test_the_covariance_holds_the_errors() -> None:
     nees = []
     for _ in range(200):
         pairs = pairs_between(FIRST, second, 10, rng, SIGMA)  # so few that each counts as independent
-        motion = relative_pose(pairs, SIGMA, FIRST[0], second[0], Ground(AGL_M, 0.0))
+        motion = relative_pose(pairs, SIGMA, FIRST[0], second[0], TILT_SIGMA_RAD, Ground(AGL_M, 0.0))
         assert motion is not None
         error = np.concatenate([log_so3(r_true.T @ motion.r), motion.r.T @ (motion.p_m - p_true)])
         nees.append(error @ np.linalg.solve(motion.cov, error))
@@ -120,10 +123,10 @@ def test_sloping_ground(slope: tuple[float, float]) -> None:
     in_k = (points - p) @ r
     pairs = np.hstack([seen[:, :2], in_k[:, :2] / in_k[:, 2:]])
     r_true, p_true = between(FIRST, (r, p))
-    known = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], Ground(AGL_M, 2.0, *slope))
+    known = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, Ground(AGL_M, 2.0, *slope))
     assert known is not None
     assert np.linalg.norm(log_so3(r_true.T @ known.r)) < 1e-4 and np.linalg.norm(known.p_m - p_true) < 0.02
-    unknown = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], Ground(AGL_M, 2.0, 0.0, 0.0, 0.15))
+    unknown = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, Ground(AGL_M, 2.0, 0.0, 0.0, 0.15))
     assert unknown is not None
     error = np.concatenate([log_so3(r_true.T @ unknown.r), unknown.r.T @ (unknown.p_m - p_true)])
     assert error @ np.linalg.solve(unknown.cov, error) < 22.5
@@ -132,11 +135,11 @@ def test_sloping_ground(slope: tuple[float, float]) -> None:
 def test_what_cannot_be_known_is_none() -> None:
     rng = np.random.default_rng(6)
     pairs = pairs_between(FIRST, SECOND["forward"], 80, rng, 1e-4)
-    assert relative_pose(pairs[:5], SIGMA, FIRST[0], FIRST[0], FLAT) is None
-    assert relative_pose(np.zeros((0, 4)), SIGMA, FIRST[0], FIRST[0], FLAT) is None
-    assert relative_pose(np.repeat(pairs[:1], 30, axis=0), SIGMA, FIRST[0], FIRST[0], FLAT) is None
+    assert relative_pose(pairs[:5], SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, FLAT) is None
+    assert relative_pose(np.zeros((0, 4)), SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, FLAT) is None
+    assert relative_pose(np.repeat(pairs[:1], 30, axis=0), SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, FLAT) is None
     sky = rotation(30.0, 130.0)  # the camera looks up: no ground ahead
-    assert relative_pose(pairs, SIGMA, sky, sky, FLAT) is None
+    assert relative_pose(pairs, SIGMA, sky, sky, TILT_SIGMA_RAD, FLAT) is None
 
 
 def test_two_thousand_steps_keep_the_rotation_a_rotation() -> None:
@@ -148,7 +151,7 @@ def test_two_thousand_steps_keep_the_rotation_a_rotation() -> None:
         level = rotation(np.degrees(yaw_of(turned @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]))))
         after: Pose = (level, np.array([4.0, 1.0, AGL_M]))
         pairs = pairs_between(now, after, 12, rng, 1e-4)
-        motion: RelativePose | None = relative_pose(pairs, SIGMA, now[0], now[0], FLAT)
+        motion: RelativePose | None = relative_pose(pairs, SIGMA, now[0], now[0], TILT_SIGMA_RAD, FLAT)
         assert motion is not None
         r_chain = r_chain @ motion.r
         now = (after[0], np.array([0.0, 0.0, AGL_M]))

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-MIN_OVERLAP = 0.6  # of the template over valid map; less says nothing about a place
+MIN_OVERLAP = 0.8  # of the template over valid map; less says nothing about a place
 FLAT_VARIANCE = 0.05  # of the texture that the template has: water and fields without texture must not be amplified
 
 TAIL, TAIL_SIGMAS = 0.995, 2.576  # upper quantile of the surface and what it is for a normal variable
@@ -37,7 +37,7 @@ class Searchable:
         product = back((self._channels * np.fft.rfft2(centred, self._fft_shape).conj()).sum(0))
         sums = back(self._channels * m)
         variance = back(self._energy * m) - (sums**2).sum(0) / count
-        surface = product / np.sqrt(np.maximum(variance, FLAT_VARIANCE * own) * max(own, 1e-9))
+        surface = product / np.sqrt(np.maximum(np.maximum(variance, FLAT_VARIANCE * own) * own, 1e-12))
         if self._valid is not None:
             surface[back(self._valid * m) < MIN_OVERLAP * count] = np.nan
         return surface.astype(np.float32)

@@ -25,6 +25,7 @@ class Describer(Protocol):
 
     name: str
     stride: int
+    channels: int
 
     def describe(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR -> (C, H // stride, W // stride) float32"""

@@ -22,7 +22,8 @@ from terrafix.messages import Verdict
 LOOK_GSD_PER_AGL = {"gradient": 1 / 100, "xfeat": 1 / 330}
 FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330}
 GSD_STEPS_PER_OCTAVE = 2  # scales are rounded to these, so that the map's descriptors can be kept
-MAX_WINDOW_CELLS = 640  # a wider search is made on coarser cells
+# A wider search is made on coarser cells: 640 x 640 cells of 8 channels, fewer of more channels.
+MAX_WINDOW_VALUES = 8 * 640**2
 PATCH_PER_AGL = 0.25  # side of a patch: 25 m at 100 m, one house and its surroundings
 MIN_PATCH_CELLS = 8
 REACH = 0.08  # search of a patch around its expected place, share of the height
@@ -98,7 +99,8 @@ class FrameMatcher:
         stride = self._describer.stride
         gsd = self._gsd(view.agl_m, LOOK_GSD_PER_AGL)
         hypotheses = _hypotheses(view)
-        while 2 * belief.half_m / (gsd * stride) > MAX_WINDOW_CELLS:
+        most = float(np.sqrt(MAX_WINDOW_VALUES / self._describer.channels))
+        while 2 * belief.half_m / (gsd * stride) > most:
             gsd *= 2.0
         first = rectify(image, self._camera, view.r_w_c, view.agl_m, gsd, stride)
         if first is None or min(first.mask.shape) < MIN_SIDE_CELLS * stride / 2:

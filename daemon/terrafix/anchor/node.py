@@ -48,6 +48,7 @@ class AnchorNode:
         self._ground_m = 0.0
         self._since_look_m = np.inf  # motion since the last look at new ground
         self._poor_looks = 0.0
+        self._variance_m2 = 0.0  # of the last prediction
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
@@ -116,7 +117,11 @@ class AnchorNode:
 
     def _moved(self, prediction: Prediction, cell_m: float) -> Belief:
         step_m = float(np.hypot(*prediction.step_m))
-        sigma_m = float(np.sqrt(max(prediction.step_cov_m2[0], prediction.step_cov_m2[3])))
+        # Blind, the error of the position grows faster than the steps' own errors add up: with that of the velocity.
+        variance = max(prediction.cov[0], prediction.cov[7])
+        grown = variance - self._variance_m2
+        self._variance_m2 = variance
+        sigma_m = float(np.sqrt(max(prediction.step_cov_m2[0], prediction.step_cov_m2[3], grown)))
         if self._belief is None:
             e_m, n_m, _ = prediction.p_c_in_w_m
             start = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))

@@ -126,7 +126,7 @@ def _correlate(
     energy = _box(np.einsum("nkhw,nkhw->nhw", large, large), patch)
     variance = energy - (sums**2).sum(1) / count
     floor = 0.05 * own[:, None, None]
-    return product / np.sqrt(np.maximum(variance, floor) * np.maximum(own, 1e-9)[:, None, None])
+    return product / np.sqrt(np.maximum(np.maximum(variance, floor) * own[:, None, None], 1e-12))
 
 
 def _box(x: np.ndarray, patch: int) -> np.ndarray:

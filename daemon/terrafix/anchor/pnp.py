@@ -41,7 +41,7 @@ def solve(
     n = len(xy)
     chance = min(1.0, np.pi * threshold**2 / (2 * reach) ** 2)  # that a patch that was matched at random agrees
     none = np.zeros(n, bool)
-    needed = max(MIN_INLIERS, MIN_INLIER_SHARE * n, n * chance + 3.0 * float(np.sqrt(n * chance)) + 2.0)
+    needed = max(MIN_INLIERS, MIN_INLIER_SHARE * n, n * chance + 4.0 * float(np.sqrt(n * chance)) + 3.0)
     if n < needed:
         return PnpResult(Verdict.FEW_INLIERS, None, none)
     centre = points_w_m.mean(0)

@@ -71,11 +71,13 @@ def fit_pose(
     sigma_floor: float,
     weights: np.ndarray | None = None,
     effective: float = 1.0,
+    tilt_sigma_rad: float | None = None,
 ) -> PoseFit | None:
     """Robust least squares on the reprojection error of points (N, 3) seen at normalised ``xy`` (N, 2).
 
     ``effective``: share of the matches that count as independent (neighbouring patches share pixels; relief moves
-    whole blocks of them). ``None`` when the geometry does not determine a pose."""
+    whole blocks of them). ``tilt_sigma_rad``: how well the tilt of the given ``r_w_c`` is known, when it is to be a
+    prior: matches in a narrow band trade tilt for translation. ``None`` when the geometry does not determine a pose."""
     weights = np.ones(len(xy)) if weights is None else weights
     sigma = sigma_floor
     r, p = r_w_c, p_c_in_w_m
@@ -87,10 +89,14 @@ def fit_pose(
             return None
         error = xy - predicted
         norm = np.linalg.norm(error, axis=1)
-        sigma = max(sigma_floor, 1.4826 * float(np.median(norm)) / 1.177)  # 1.177: median of a Rayleigh variable
+        sigma = max(sigma_floor, float(np.median(norm)) / 1.177)  # the median of a Rayleigh variable is 1.177 sigma
         w = weights * np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
         hessian = np.einsum("nia,n,nib->ab", jacobian, w, jacobian)
         gradient = np.einsum("nia,n,ni->a", jacobian, w, error)
+        if tilt_sigma_rad is not None:
+            stiffness = sigma**2 / effective / tilt_sigma_rad**2 * np.array([1.0, 1.0])
+            hessian[[0, 1], [0, 1]] += stiffness
+            gradient[:2] -= stiffness * log_so3(r_w_c.T @ r)[:2]
         scale = np.array([1.0, 1.0, 1.0, *([1.0 / float(np.median(depth))] * 3)])
         scaled = hessian * np.outer(1 / scale, 1 / scale)
         if np.linalg.cond(scaled) > 1e9:

@@ -11,7 +11,7 @@ import numpy as np
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_from_quat, rot_w_b, yaw_of
-from terrafix.core.pose import exp_so3, world_to_tangent
+from terrafix.core.pose import exp_so3, tangent_to_world, world_to_tangent
 from terrafix.estimator.factors import attitude_and_height_factor
 from terrafix.estimator.graph import NodeState, PoseGraph
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
@@ -30,11 +30,13 @@ MAX_ACCELERATION_MPS2 = 3.0  # of small drones in cruise: how wrong the last vel
 MAX_SPEED_SIGMA_MPS = 10.0  # per axis: of a velocity of which nothing is known
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
 VELOCITY_MEMORY_S = 10.0  # how long a drone keeps its course when nobody looks
-# 1-sigma of the slope of the ground: fields and towns without a DEM; what a DEM of 30 m leaves with one
-SLOPE_SIGMA_FLAT, SLOPE_SIGMA_DEM = 0.03, 0.015
+# 1-sigma of the slope and of the level (share of the height) of the ground that is seen: fields and towns without a
+# DEM; what houses and trees leave with one.
+FLAT_SIGMAS, DEM_SIGMAS = (0.03, 0.02), (0.015, 0.01)
 VELOCITY_SPAN_S = 0.9  # a velocity is measured over about a second: shorter is noise, longer misses turns
-VELOCITY_FLOOR_M, VELOCITY_SHARE = 0.15, 0.02  # error of the relative position of two nodes that close
-BEND_SHARE = 0.5  # of the change of velocity that is carried on: the turn may have ended
+VELOCITY_FLOOR_M = 0.15  # error of the relative position of two nodes that close, at best
+VELOCITY_SHARE = 0.03  # ... of their distance, when the graph is not asked (cheap mode)
+BEND_SHARE = 0.4  # of the change of velocity that is carried on: the turn may have ended
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
@@ -42,6 +44,7 @@ LOCAL_WARP_M = 1.5  # 1-sigma: orthophotos are stretched by about this over one 
 ROOFS = 0.03  # of the height, 1-sigma: roofs and crowns lift the ground that is seen, and with it the height
 SAME_GROUND_SHARE = 0.5  # of the height: fixes closer together than this share their errors ...
 MIN_NEW_GROUND = 0.1  # ... and a fix over the same ground counts at least this much
+COARSE_CONTINUES = 0.5  # of the height: sigma of the estimate up to which the belief's mode alone is taken as a fix
 RECOVER_AFTER = 3  # fixes that agree with each other and not with the graph
 RECOVER_OVER = 0.5  # of the height: the motion they must span, so that they are not one mistake seen thrice
 RECOVER_AGREE_M = 15.0
@@ -175,14 +178,15 @@ class Estimator:
         if height < 2.0:
             return None
         r_w_k = self._expected_rotation(attitude, state.bias, r_w_kf)
+        tilt_sigma = np.radians(max(self.origin.attitude_sigma_deg, 1.0))
         if attitude.pitch_rad is None or attitude.roll_rad is None:
-            r_w_k = r_w_kf  # nobody knows of a change of tilt
+            r_w_k, tilt_sigma = r_w_kf, UNKNOWN_ATTITUDE_RAD  # nobody knows of a change of tilt
         known_slope = self._slope is not None
         slope_e, slope_n = self._slope or (0.0, 0.0)
-        slope_sigma = SLOPE_SIGMA_DEM if known_slope else SLOPE_SIGMA_FLAT
+        slope_sigma, level_share = DEM_SIGMAS if known_slope else FLAT_SIGMAS
         share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
-        ground = Ground(height, height_sigma, slope_e, slope_n, slope_sigma, share)
-        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, ground)
+        ground = Ground(height, height_sigma, slope_e, slope_n, slope_sigma, level_share, share)
+        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
         if motion is None:
             return None
         dt_s = max(odometry.t_ns * 1e-9 - self.graph.time_of(parent), 1e-3)
@@ -230,7 +234,7 @@ class Estimator:
         p1 = self.graph.state(middle).pose.translation()
         span_s = now_s - self.graph.time_of(middle)
         v1 = (p - p1) / span_s
-        noise = (VELOCITY_FLOOR_M + VELOCITY_SHARE * float(np.linalg.norm(p - p1))) / span_s
+        noise = max(VELOCITY_FLOOR_M, self._relative_sigma(middle, node)) / span_s
         bend = np.zeros(3)
         first = self._trunk_before(self.graph.time_of(middle) - VELOCITY_SPAN_S)
         if first is not None:
@@ -242,6 +246,13 @@ class Estimator:
         self.velocity_sigma_mps = min(
             MAX_SPEED_SIGMA_MPS, float(np.sqrt(1.5 * noise**2 + unseen**2 + (BEND_SHARE * np.linalg.norm(bend)) ** 2))
         )
+
+    def _relative_sigma(self, a: int, b: int) -> float:
+        """1-sigma per horizontal axis of the way between two nodes of the window, metres."""
+        if self.mode is CovarianceMode.JACOBIAN:
+            way = self.graph.state(b).pose.translation() - self.graph.state(a).pose.translation()
+            return VELOCITY_SHARE * float(np.linalg.norm(way))
+        return float(np.sqrt(np.trace(self.graph.relative_covariance(a, b)[:2, :2]) / 2.0))
 
     def _trunk_before(self, t_s: float) -> int | None:
         """Newest node that odometry or the map vouches for at or before a time, within the window."""
@@ -290,6 +301,9 @@ class Estimator:
         warp = np.diag([LOCAL_WARP_M, LOCAL_WARP_M, ROOFS * height]) ** 2
         cov[3:, 3:] += r_w_c.T @ warp @ r_w_c
         predicted = self.graph.state(node).pose
+        spread = float(np.sqrt(np.max(np.diag(tangent_to_world(self._covariance(node), r_w_c))[:2])))
+        if match.coarse and spread > COARSE_CONTINUES * height:
+            return FixResult(Verdict.AMBIGUOUS, None, "a coarse fix continues a track, it does not find one")
         innovation = predicted.logmap(measured)
         d2 = float(innovation @ np.linalg.solve(self._covariance(node) + cov, innovation))
         if d2 > GATE_6DOF:

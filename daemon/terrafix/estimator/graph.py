@@ -60,6 +60,16 @@ class PoseGraph:
         """Marginal of C_node, 6x6, tangent order (rotation, translation); asked of the smoother itself."""
         return self._smoother.marginalCovariance(C(node))
 
+    def relative_covariance(self, a: int, b: int) -> np.ndarray:
+        """Of the way from node a to node b, 3x3, world axes: what their common error leaves."""
+        joint = self._smoother.getISAM2().jointMarginalCovariance([C(a), C(b)])
+        r_a = self.state(a).pose.rotation().matrix()
+        r_b = self.state(b).pose.rotation().matrix()
+        cross = r_a @ joint.at(C(a), C(b))[3:, 3:] @ r_b.T
+        own_a = r_a @ joint.at(C(a), C(a))[3:, 3:] @ r_a.T
+        own_b = r_b @ joint.at(C(b), C(b))[3:, 3:] @ r_b.T
+        return np.asarray(own_a + own_b - cross - cross.T)
+
     def bias_covariance(self, node: int) -> np.ndarray:
         return self._smoother.marginalCovariance(B(node))
 

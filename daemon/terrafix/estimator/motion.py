@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.geodesy import local_rotation_up
-from terrafix.core.pose import fit_pose
+from terrafix.core.pose import fit_pose, log_so3
 
-EFFECTIVE_PAIRS = 10.0  # relief moves whole blocks of matches together: never more independent ones than this
+EFFECTIVE_PAIRS = 16.0  # relief moves whole blocks of matches together: never more independent ones than this
 SCALE_SIGMA = 0.02  # houses and trees lift the mean ground by this share of the height, beyond the height's own error
 ROOF_SCALE_SIGMA = 0.12  # ... and by this when hardly any match lies on the plane: tall buildings at 100 m
 MIN_PAIRS = 8
+MAX_TILT_CHANGE_RAD = np.radians(15.0)  # beyond the guess: matches in a narrow band trade translation for tilt
 MIN_DOWN = -0.2  # up component of a unit-depth ray that meets the ground no farther than five heights away
 
 
@@ -42,12 +43,13 @@ class Ground:
     slope_e: float = 0.0
     slope_n: float = 0.0
     slope_sigma: float = 0.0
+    level_share: float = SCALE_SIGMA  # 1-sigma of the mean plane, share of the height
     share: float = 1.0  # of the matches that agreed: a plane that few share may be a roof instead of the ground
 
     @property
     def level_sigma_m(self) -> float:
         """Of the plane, beyond what is wrong with the height itself."""
-        return (SCALE_SIGMA + ROOF_SCALE_SIGMA * (1.0 - self.share) ** 2) * self.height_m
+        return (self.level_share + ROOF_SCALE_SIGMA * (1.0 - self.share) ** 2) * self.height_m
 
 
 def relative_pose(
@@ -55,10 +57,11 @@ def relative_pose(
     sigma_norm: float,
     r_w_kf: np.ndarray,
     r_w_k: np.ndarray,
+    tilt_sigma_rad: float,
     ground: Ground,
 ) -> RelativePose | None:
     """``pairs`` (N, 4) normalised (x_kf, y_kf, x, y); ``r_w_kf`` and ``ground`` give the plane that is seen;
-    ``r_w_k`` is a first guess of the new camera, whose tilt must be roughly right: a plane seen from two
+    ``r_w_k`` is a first guess of the new camera, whose tilt is known to ``tilt_sigma_rad``: a plane seen from two
     places has a mirror solution. ``None`` when the matches do not determine the motion."""
     if len(pairs) < MIN_PAIRS:
         return None
@@ -75,8 +78,10 @@ def relative_pose(
     turn, scale, shift = _similarity(offsets, points[:, :2])
     start = np.array([*shift, height_m * (scale - 1.0)])
     effective = min(1.0, EFFECTIVE_PAIRS / len(points))
-    fit = fit_pose(points, pairs[ahead, 2:], turn @ r_w_k, start, sigma_norm, effective=effective)
-    if fit is None:
+    fit = fit_pose(
+        points, pairs[ahead, 2:], turn @ r_w_k, start, sigma_norm, effective=effective, tilt_sigma_rad=tilt_sigma_rad
+    )
+    if fit is None or float(np.linalg.norm(log_so3((turn @ r_w_k).T @ fit.r_w_c)[:2])) > MAX_TILT_CHANGE_RAD:
         return None
     cov = fit.cov.copy()
     # A wrong height scales the translation; the tangent's translation is in the new camera's axes.

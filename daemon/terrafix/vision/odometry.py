@@ -30,7 +30,7 @@ KEYFRAME_TRACKED = 0.45  # share of the keyframe's corners still tracked
 KEYFRAME_MAX_AGE = 10  # frames; half the estimator's window, so that the keyframe is still in it
 MAX_MISSES = 5  # frames that may fail against one keyframe before a new fragment starts (PB-5)
 MAX_PAIRS = 48
-SIGMA_PX = 1.0  # of a matched coordinate: tracking a tenth of that, the rest is relief that the plane does not hold
+SIGMA_PX = 0.5  # of a matched coordinate, at best; the residuals say more where relief does not fit the plane
 SIFT_FEATURES = 1500
 SIFT_RATIO = 0.8  # Lowe 2004
 
@@ -69,7 +69,7 @@ class FrameTracker:
         self._last_index = np.zeros(0, int)  # which corners these are
         self._misses = 0
         self._missed: _Keyframe | None = None  # the frame that failed last: the first of a new fragment, perhaps
-        self._sift = cv2.SIFT.create(nfeatures=SIFT_FEATURES)
+        self._sift = cv2.SIFT.create(nfeatures=SIFT_FEATURES, enable_precise_upscale=True)
 
     def track(self, frame_id: int, image: Image) -> Motion:
         gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

@@ -13,6 +13,7 @@ SATURATION = 4.0  # grey levels of gradient: weaker texture than sensor noise fa
 
 class GradientDescriber:
     name = "gradient"
+    channels = CHANNELS
     stride = 1  # descriptor cells per image pixel: one
 
     def describe(self, image: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ MULTIPLE = 32  # the network needs sides that are multiples of this
 class XFeatDescriber:
     name = "xfeat"
     stride = STRIDE
+    channels = 64
 
     def __init__(self, path: Path) -> None:
         self._model = Model(path, inputs=("input",), outputs=("descriptors",))
