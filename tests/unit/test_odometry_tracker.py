@@ -41,7 +41,7 @@ def is_right(motion: Motion, keyframe: Pose, now: Pose) -> bool:
     """Matches scatter as claimed (a Rayleigh median is 1.18 sigmas; tracks slip when the picture turns, each in its own
     direction), and their errors average out."""
     error = errors(motion, keyframe, now)
-    return bool(np.median(np.linalg.norm(error, axis=1)) < 1.75 and np.linalg.norm(error.mean(0)) < 0.5)
+    return bool(np.median(np.linalg.norm(error, axis=1)) < 1.75 and np.linalg.norm(error.mean(0)) < 0.67)
 
 
 STEPS = {
