@@ -108,7 +108,7 @@ class Belief:
         return np.where(here < -5.0, -1.0, np.clip(LLR_SLOPE * (here - LLR_ZERO_Z), LLR_MIN, LLR_MAX))
 
     def mode(self) -> Mode:
-        """The heaviest mode: centroid and mass within MODE_RADIUS_M, and the mass of its best rival."""
+        """The heaviest mode: centroid and mass within MODE_RADIUS_CELLS, and the mass of its best rival."""
         radius = MODE_RADIUS_CELLS
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)).astype(np.float64)
         gathered = cv2.filter2D(self._mass, -1, disc, borderType=cv2.BORDER_CONSTANT)
@@ -139,11 +139,6 @@ class Belief:
         mean_e, mean_n = float(p_e @ axis), float(p_n @ axis)
         en = -float((axis - mean_n) @ self._mass @ (axis - mean_e))
         return float(p_e @ (axis - mean_e) ** 2), en, float(p_n @ (axis - mean_n) ** 2)
-
-    def recentre(self, east_m: float, north_m: float) -> None:
-        """The tilt of the camera was learnt: the same ground belongs to another camera position."""
-        self._e0 += east_m
-        self._n0 += north_m
 
     def fit_window(self, at_least_half_m: float) -> None:
         """Window around the mean, as wide as the belief needs."""

@@ -59,6 +59,9 @@ class Hypothesis:
     scale: float
 
 
+AS_PREDICTED = Hypothesis(0.0, 1.0)
+
+
 @dataclass(frozen=True)
 class Look:
     verdict: Verdict
@@ -116,7 +119,7 @@ class FrameMatcher:
             return Look(Verdict.TOO_LOW)
         cell = gsd * stride
         footprint_m = float(np.sqrt(first.mask.sum())) * gsd
-        frames = [self._rectified(image, view, h, gsd, stride) for h in hypotheses]
+        frames = [first if h == AS_PREDICTED else self._rectified(image, view, h, gsd, stride) for h in hypotheses]
         usable = [(h, f) for h, f in zip(hypotheses, frames, strict=True) if f is not None]
         reach = [self._offsets(f) for _, f in usable]
         e_min = belief.centre[0] - belief.half_m + min(r[0] for r in reach)

@@ -69,7 +69,6 @@ class Advance:
     placed: Placed
     step_m: np.ndarray  # (2,) east, north since the frame before, by odometry alone
     step_sigma_m: float
-    first: bool
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ class Estimator:
         self._r_b_c = Mount.of(origin.camera).r_b_c()
         self._node_of: dict[int, int] = {}  # frame -> node
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
-        self._last: Placed | None = None  # newest frame, in the graph or not
+        self._last: Placed | None = None  # newest frame
         self._fixed_at_m: np.ndarray | None = None
         self._refused: _Disagreement | None = None
         self._trunk = deque([0], maxlen=40)  # nodes that odometry or the map vouches for; others hang on it as leaves
@@ -138,7 +137,7 @@ class Estimator:
             self._trunk.append(node)
             self._learn_velocity(node)
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
-        return Advance(verdict, self._last, step, step_sigma, False)
+        return Advance(verdict, self._last, step, step_sigma)
 
     def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
         origin = self.origin
@@ -162,7 +161,7 @@ class Estimator:
         )
         self._node_of[frame_id] = node
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
-        return Advance(Verdict.ACCEPTED, self._last, np.zeros(2), 0.0, True)
+        return Advance(Verdict.ACCEPTED, self._last, np.zeros(2), 0.0)
 
     def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | None:
         """The keyframe's node and the motion since, when odometry has both."""

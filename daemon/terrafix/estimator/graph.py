@@ -18,7 +18,6 @@ ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits
 # Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), compass, barometer and
 # the terrain under it.
 WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(1.0), 0.5])
-REBUILD_INFLATION = 4.0  # of the covariance, when the graph starts again from its last good state
 
 
 @dataclass(frozen=True)

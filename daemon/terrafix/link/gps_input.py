@@ -4,7 +4,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.messages import GpsInput
 
-NOTHING_IGNORED = 0  # velocity above all: an ignored one stays at its last value and is fused for ever (issue 19633)
+NOTHING_IGNORED = (
+    0  # velocity above all: an ignored one stays at its last value and is fused for ever (ArduPilot #19633)
+)
 YAW_UNKNOWN = 0  # 0 is "none", north would be 36000
 
 
