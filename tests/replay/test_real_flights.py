@@ -95,7 +95,7 @@ def test_the_same_flight_twice_is_the_same_to_the_byte(data_set: DataSet, tmp_pa
 
 def test_memory_stays_below_a_gigabyte(data_set: DataSet, tmp_path: Path) -> None:
     """In a process of its own: the peak of this one has seen other tests."""
-    from terrafix_tools.bench import bench
+    from terrafix_tools.bench.run import bench
 
     data_set("flights/town-a")
     root = data_set("flights").parent

@@ -11,8 +11,8 @@ from ground import PINHOLE, FlatMap, rotation, texture, view
 from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import Prediction
-from terrafix_tools.bench import bench
-from terrafix_tools.bench_baseline import SiftBaseline
+from terrafix_tools.bench.baseline import SiftBaseline
+from terrafix_tools.bench.run import bench
 
 FRAMES = 3
 

@@ -25,10 +25,10 @@ from terrafix.link import gps_input
 from terrafix.link.carry import offset
 from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
-from terrafix_tools.peer import PARAMETERS, AutopilotPeer
-from terrafix_tools.peer_course import PeerState, read_course, write_course
-from terrafix_tools.peer_filter import Fusion, PositionFilter
-from terrafix_tools.peer_gps import Fix, GpsDriver, JitterCorrection
+from terrafix_tools.sim.peer import PARAMETERS, AutopilotPeer
+from terrafix_tools.sim.peer_course import PeerState, read_course, write_course
+from terrafix_tools.sim.peer_filter import Fusion, PositionFilter
+from terrafix_tools.sim.peer_gps import Fix, GpsDriver, JitterCorrection
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
@@ -439,7 +439,7 @@ def test_the_peer_in_a_process_of_its_own(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
-        "terrafix_tools.peer_process",
+        "terrafix_tools.sim.peer_process",
         str(tmp_path / "course.csv"),
         "--port",
         "0",

@@ -21,7 +21,7 @@ from rasterio.transform import Affine
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError, TerrafixError, UsageError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.map_build import build, ensure_package
+from terrafix_tools.mapping.build import build, ensure_package
 
 
 def finest(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -270,7 +270,7 @@ def test_an_interrupted_build_leaves_nothing(tmp_path: Path) -> None:
     out = tmp_path / "out" / "m.gpkg"
     program = f"""import signal
 from pathlib import Path
-from terrafix_tools.map_build import build
+from terrafix_tools.mapping.build import build
 signal.signal(signal.SIGINT, signal.default_int_handler)
 build(Path({str(tif)!r}), Path({str(out)!r}))"""
     child = subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.DEVNULL)

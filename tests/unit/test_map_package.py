@@ -9,7 +9,7 @@ import pytest
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.map_build import build
+from terrafix_tools.mapping.build import build
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import rasterio
 
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.map_build import build
+from terrafix_tools.mapping.build import build
 
 FAST = ["imagery/joplin/before.tif", "imagery/prairie/20120731.tif", "imagery/swellendam/ortho.tif"]
 SLOW = [

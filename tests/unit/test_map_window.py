@@ -15,7 +15,7 @@ from rasterio.vrt import WarpedVRT
 
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.core.geodesy import LocalFrame, local_crs
-from terrafix_tools.map_build import build
+from terrafix_tools.mapping.build import build
 
 SIDE_PX = 900
 

@@ -140,7 +140,7 @@ def test_a_replay_that_dies_leaves_what_it_had(folder: Path, tmp_path: Path) -> 
 
 
 def test_height_of_the_ground_comes_from_the_map(folder: Path, tmp_path: Path) -> None:
-    from terrafix_tools.map_build import build
+    from terrafix_tools.mapping.build import build
 
     dem = tmp_path / "dem.tif"
     place = Affine(0.001, 0.0, 10.99, 0.0, -0.001, 48.01)

@@ -9,8 +9,8 @@ from flight_records import frame, live_messages, origin, write_record, write_tru
 
 from terrafix.core.errors import SourceError
 from terrafix_tools.estimates import Row, write_rows
-from terrafix_tools.report import report
-from terrafix_tools.report_charts import clock, spans_of, ticks
+from terrafix_tools.report.charts import clock, spans_of, ticks
+from terrafix_tools.report.page import report
 
 
 class Page(HTMLParser):

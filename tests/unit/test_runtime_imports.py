@@ -17,8 +17,8 @@ PACKAGES = {
 # library -> the modules (and what is below them) that may import it
 OWNERS = {
     "gtsam": ("terrafix.estimator",),
-    "pymavlink": ("terrafix.link", "terrafix_tools.peer", "terrafix.core.tlog"),  # tlog: reads recorded telemetry
-    "serial": ("terrafix.link", "terrafix_tools.peer"),
+    "pymavlink": ("terrafix.link", "terrafix_tools.sim.peer", "terrafix.core.tlog"),  # tlog: reads recorded telemetry
+    "serial": ("terrafix.link", "terrafix_tools.sim.peer"),
     "onnxruntime": ("terrafix_engines",),
     "faiss": ("terrafix.anchor",),
     "systemd": ("terrafix.supervisor",),

@@ -11,9 +11,9 @@ import pytest
 
 from terrafix.core.errors import OutputError
 from terrafix.vision.sources import open_source
-from terrafix_tools import world
-from terrafix_tools.trajectory import AIRSPEED_MPS
-from terrafix_tools.world_flight import FRAME_HZ, Flight, plan_flight, write_flight
+from terrafix_tools.sim import world
+from terrafix_tools.sim.trajectory import AIRSPEED_MPS
+from terrafix_tools.sim.world_flight import FRAME_HZ, Flight, plan_flight, write_flight
 
 DURATION_S = 90.0
 

@@ -8,7 +8,7 @@ import pytest
 import rasterio
 
 from terrafix.core.errors import OutputError
-from terrafix_tools import world
+from terrafix_tools.sim import world
 
 SMALL = {"width_m": 900.0, "height_m": 700.0}
 

@@ -89,7 +89,7 @@ def report(
     ] = None,
 ) -> None:
     """One self-contained HTML page about a flight: FOLDER/report.html."""
-    from terrafix_tools.report import report as run_report
+    from terrafix_tools.report.page import report as run_report
 
     run_report(folder, truth, map_path)
 
@@ -101,7 +101,7 @@ def demo(
     duration: Annotated[float, typer.Option(help="Seconds of flight.")] = 90.0,
 ) -> None:
     """A flight over a generated world with the real processes and an autopilot peer, ending in a report."""
-    from terrafix_tools.demo import demo as run_demo
+    from terrafix_tools.sim.demo import demo as run_demo
 
     raise typer.Exit(run_demo(out, seed=seed, duration_s=duration))
 
@@ -115,7 +115,7 @@ def map_build(
     licence: Annotated[str, typer.Option(help="Licence text of the imagery.")] = "",
 ) -> None:
     """GeoTIFF -> map package."""
-    from terrafix_tools.map_build import build
+    from terrafix_tools.mapping.build import build
 
     build(imagery, out, dem=dem, date=date, licence=licence, progress=True)
 
@@ -123,7 +123,7 @@ def map_build(
 @map_app.command("info")
 def map_info(package: Annotated[Path, typer.Argument(help="Map package.")]) -> None:
     """What is in a map package, as JSON."""
-    from terrafix_tools.map_build import info
+    from terrafix_tools.mapping.build import info
 
     info(package)
 
@@ -135,7 +135,7 @@ def map_preview(
     size: Annotated[int, typer.Option(min=64, max=8192, help="Longer side, pixels.")] = 1024,
 ) -> None:
     """The whole map, north up, as a picture; where it is transparent the map has nothing."""
-    from terrafix_tools.map_build import preview
+    from terrafix_tools.mapping.build import preview
 
     preview(package, out, size)
 
@@ -151,7 +151,7 @@ def bench(
     xfeat: Annotated[bool, typer.Option(help="Also with XFeat, when models/xfeat.onnx is there.")] = True,
 ) -> None:
     """Time per frame and accuracy beside a SIFT + RANSAC baseline measured in the same run."""
-    from terrafix_tools.bench import bench as run_bench
+    from terrafix_tools.bench.run import bench as run_bench
 
     run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat)
 

@@ -41,7 +41,7 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
 
 def _built(geotiff: Path) -> Path:
     # Only here: on the vehicle there is a package, and the libraries that read GeoTIFFs are not installed.
-    from terrafix_tools.map_build import ensure_package
+    from terrafix_tools.mapping.build import ensure_package
     from terrafix_tools.replay import map_cache_dir
 
     return ensure_package(geotiff, map_cache_dir(), progress=True)

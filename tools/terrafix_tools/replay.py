@@ -26,7 +26,7 @@ from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.writer import versions
 from terrafix.vision.sources import Source, open_source
-from terrafix_tools.map_build import ensure_package
+from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay_output import ReplayOutput
 
 FLOWN = ("vision", "anchor", "estimator")  # processes that decide; link, health and recorder need a live world

@@ -9,10 +9,10 @@ from rich.console import Console
 
 from terrafix import supervisor
 from terrafix.messages import ProcessEvent
-from terrafix_tools.peer import AutopilotPeer
-from terrafix_tools.peer_course import PeerState
-from terrafix_tools.peer_report import PeerReport
-from terrafix_tools.world_flight import Flight
+from terrafix_tools.sim.peer import AutopilotPeer
+from terrafix_tools.sim.peer_course import PeerState
+from terrafix_tools.sim.peer_report import PeerReport
+from terrafix_tools.sim.world_flight import Flight
 
 LOOK_S = 1.0  # between two looks at the autopilot
 LOG_S = 15.0  # between two lines where lines cannot be rewritten

@@ -6,7 +6,7 @@ import math
 import cv2
 import numpy as np
 
-from terrafix_tools.world_shapes import House, Line, Parcel, Warp, densify, divide, long_axis
+from terrafix_tools.sim.world_shapes import House, Line, Parcel, Warp, densify, divide, long_axis
 
 LOT_AREA_M2 = (700.0, 1_300.0)  # a house with its garden
 TREE_SPACING_M = 6.5  # in a wood

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from terrafix_tools.noise import periodic_noise
-from terrafix_tools.world_layout import DEM_MARGIN_M, DEM_POST_M, Layout
-from terrafix_tools.world_season import Bgr, Season
-from terrafix_tools.world_shapes import House, Line, Parcel
-from terrafix_tools.world_sprites import crown_sprites, stamp_cars, stamp_houses, stamp_trees
+from terrafix_tools.sim.noise import periodic_noise
+from terrafix_tools.sim.world_layout import DEM_MARGIN_M, DEM_POST_M, Layout
+from terrafix_tools.sim.world_season import Bgr, Season
+from terrafix_tools.sim.world_shapes import House, Line, Parcel
+from terrafix_tools.sim.world_sprites import crown_sprites, stamp_cars, stamp_houses, stamp_trees
 
 SHIFT = 4  # sub-pixel bits of OpenCV's drawing coordinates
 TILE_PX = 1024  # noise repeats after this many pixels

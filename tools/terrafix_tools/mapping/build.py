@@ -23,10 +23,10 @@ from terrafix.anchor.map_format import FORMAT_VERSION, TILE_PX, Level, Manifest
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError, UsageError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.map_collar import BLEED_PX, TRIM_PX, Collar, find_collar
-from terrafix_tools.map_dem import DemSource
-from terrafix_tools.map_gpkg import GpkgWriter, new_package
-from terrafix_tools.map_source import ImagerySource
+from terrafix_tools.mapping.collar import BLEED_PX, TRIM_PX, Collar, find_collar
+from terrafix_tools.mapping.dem import DemSource
+from terrafix_tools.mapping.gpkg import GpkgWriter, new_package
+from terrafix_tools.mapping.source import ImagerySource
 
 JPEG_QUALITY = 95  # 8-11 MB/km2 at 0.3 m/px on aerial photographs; artefacts stay below a grey level or two
 PNG_LEVEL = 6  # partly valid tiles only, so that the mask stays exact

@@ -9,7 +9,7 @@ from collections import deque
 from enum import StrEnum
 
 from terrafix.link.carry import distance_m, offset
-from terrafix_tools.peer_gps import Fix
+from terrafix_tools.sim.peer_gps import Fix
 
 GATE_SIGMAS = 5.0  # EK3_POS_I_GATE and EK3_VEL_I_GATE 500
 RESET_AFTER_S = 10.0

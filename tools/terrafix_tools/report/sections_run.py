@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from terrafix_tools.report_charts import HALF_WIDTH, Band, Chart, Point, clock, strips
-from terrafix_tools.report_data import FlightView, radius95_m
-from terrafix_tools.report_sections import WORDS, end_s, spans, table
-from terrafix_tools.report_text import FIX_3D, GAP_S, UNPLANNED, gps_stats
+from terrafix_tools.report.charts import HALF_WIDTH, Band, Chart, Point, clock, strips
+from terrafix_tools.report.data import FlightView, radius95_m
+from terrafix_tools.report.sections import WORDS, end_s, spans, table
+from terrafix_tools.report.text import FIX_3D, GAP_S, UNPLANNED, gps_stats
 
 PICTURES = 8
 NUMBER = re.compile(r"\d+(\.\d+)?")  # reasons that differ in their numbers only are one reason

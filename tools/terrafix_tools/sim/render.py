@@ -15,7 +15,7 @@ from rasterio.transform import Affine
 from terrafix import messages as m
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, local_crs
-from terrafix_tools.noise import periodic_noise
+from terrafix_tools.sim.noise import periodic_noise
 
 GRID_PX = 12  # spacing of the rays; the ground between them is nearly flat
 ITERATIONS = 8  # of ray against DEM; slope x tangent of the view angle is far below one

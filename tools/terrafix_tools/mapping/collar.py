@@ -9,7 +9,7 @@ import numpy as np
 import rasterio
 from rasterio.windows import Window
 
-from terrafix_tools.map_source import ImagerySource
+from terrafix_tools.mapping.source import ImagerySource
 
 BLOCK_PX = 2048  # labelled at a time
 MIN_COLLAR_PX = 256  # less than this at the border is shadow, glare or compression noise

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from terrafix_tools.world_places import farms, orchard, row_of_trees, scattered, village, wood
-from terrafix_tools.world_shapes import House, Line, Parcel, Warp, densify, divide, long_axis
+from terrafix_tools.sim.world_places import farms, orchard, row_of_trees, scattered, village, wood
+from terrafix_tools.sim.world_shapes import House, Line, Parcel, Warp, densify, divide, long_axis
 
 FIELD_AREA_M2 = (5_000.0, 32_000.0)  # parcels of a small-scale European farmland
 VILLAGE_RADIUS_M = (130.0, 190.0)

@@ -15,8 +15,8 @@ from rasterio.windows import Window
 
 from terrafix.anchor.map_format import DEM_TILE_PX, DemGrid
 from terrafix.core.errors import MapError
-from terrafix_tools.map_gpkg import GpkgWriter
-from terrafix_tools.map_source import SAMPLE_PX, crs_of, ground_distance_m, ground_pixel_m, open_raster
+from terrafix_tools.mapping.gpkg import GpkgWriter
+from terrafix_tools.mapping.source import SAMPLE_PX, crs_of, ground_distance_m, ground_pixel_m, open_raster
 
 PLAUSIBLE_M = (-500.0, 9000.0)  # the shore of the Dead Sea is at -430 m, Everest at 8849 m; the rest is void
 FINEST_M = 1.0  # finer elevation than this adds megabytes, not accuracy

@@ -1,4 +1,4 @@
-"""The parts of the benchmark one by one, on a recorded flight: python -m terrafix_tools.bench_micro FLIGHT MAP OUT.
+"""The parts of the benchmark one by one, on a recorded flight: python -m terrafix_tools.bench.micro FLIGHT MAP OUT.
 
 Every part is given what it was given in flight, taken from the record of a replay."""
 
@@ -23,7 +23,7 @@ from terrafix.recorder.reader import read_flight
 from terrafix.vision.odometry import FrameTracker
 from terrafix.vision.sources import open_source
 from terrafix_engines.features import open_describer
-from terrafix_tools.bench_run import run_part, spread
+from terrafix_tools.bench.flights import run_part, spread
 
 RESULT = "micro.json"
 FRAMES = 40  # of the flight's beginning

@@ -5,8 +5,8 @@ import math
 import cv2
 import numpy as np
 
-from terrafix_tools.world_season import Bgr
-from terrafix_tools.world_shapes import House, Line
+from terrafix_tools.sim.world_season import Bgr
+from terrafix_tools.sim.world_shapes import House, Line
 
 ROOFS: tuple[Bgr, ...] = (
     (72, 86, 168),  # new tiles

@@ -20,10 +20,13 @@ from rich.table import Table
 
 from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
 from terrafix.recorder.writer import versions
-from terrafix_tools import bench_baseline, bench_micro, bench_run, world
-from terrafix_tools.map_build import build, ensure_package
+from terrafix_tools.bench import baseline as bench_baseline
+from terrafix_tools.bench import flights as bench_run
+from terrafix_tools.bench import micro as bench_micro
+from terrafix_tools.mapping.build import build, ensure_package
 from terrafix_tools.replay import map_cache_dir
-from terrafix_tools.world_flight import FRAME_HZ, plan_flight, write_flight
+from terrafix_tools.sim import world
+from terrafix_tools.sim.world_flight import FRAME_HZ, plan_flight, write_flight
 
 FLIGHTS = ("village-1", "town-a")
 GENERATED = "generated"

@@ -5,9 +5,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix_tools.peer_course import PeerState
-from terrafix_tools.peer_filter import PositionFilter
-from terrafix_tools.peer_gps import GpsDriver
+from terrafix_tools.sim.peer_course import PeerState
+from terrafix_tools.sim.peer_filter import PositionFilter
+from terrafix_tools.sim.peer_gps import GpsDriver
 
 RATES_HZ = {  # before anybody asks
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,

@@ -12,7 +12,7 @@ from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.estimates import Row
-from terrafix_tools.report_data import FlightView, ellipse95
+from terrafix_tools.report.data import FlightView, ellipse95
 
 WIDTH_PX = 1280  # of the inlined picture: sharp on a laptop, about 300 kB
 MARGIN = 0.12  # of the track's extent, around it

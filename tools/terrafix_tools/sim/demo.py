@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from terrafix.core.errors import EvaluationError, OutputError, SourceError, UsageError
-from terrafix_tools import world
-from terrafix_tools.demo_flight import fly
-from terrafix_tools.map_build import build
-from terrafix_tools.peer_report import PeerReport
-from terrafix_tools.report import report
-from terrafix_tools.report_data import gather
-from terrafix_tools.world_flight import Flight, add_telemetry, plan_flight, write_flight
+from terrafix_tools.mapping.build import build
+from terrafix_tools.report.data import gather
+from terrafix_tools.report.page import report
+from terrafix_tools.sim import world
+from terrafix_tools.sim.demo_flight import fly
+from terrafix_tools.sim.peer_report import PeerReport
+from terrafix_tools.sim.world_flight import Flight, add_telemetry, plan_flight, write_flight
 
 MARK = "demo.json"  # a folder with this file in it is ours to empty
 SHORTEST_S, LONGEST_S = 10.0, 1800.0

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix_tools.report_charts import clock
-from terrafix_tools.report_data import FlightView, radius95_m
+from terrafix_tools.report.charts import clock
+from terrafix_tools.report.data import FlightView, radius95_m
 
 GAP_S = 0.245  # AC-14: a longer silence is a gap that an autopilot may notice
 FIX_3D = 3

@@ -1,4 +1,4 @@
-"""One timed replay in a process of its own, so that its peak memory is its own: python -m terrafix_tools.bench_run.
+"""One timed replay in a process of its own, so that its peak memory is its own: python -m terrafix_tools.bench.flights.
 
 The nodes are those that fly, each behind a stopwatch; frames are those of the flight folder."""
 

@@ -12,9 +12,9 @@ from pyproj import CRS, Transformer
 from rasterio.transform import Affine
 
 from terrafix.core.errors import OutputError
-from terrafix_tools.world_layout import DEM_MARGIN_M, DEM_POST_M, Layout, plan
-from terrafix_tools.world_paint import paint
-from terrafix_tools.world_season import SEASONS
+from terrafix_tools.sim.world_layout import DEM_MARGIN_M, DEM_POST_M, Layout, plan
+from terrafix_tools.sim.world_paint import paint
+from terrafix_tools.sim.world_season import SEASONS
 
 WIDTH_M, HEIGHT_M = 3000.0, 2000.0
 GSD_M = 0.5

@@ -14,9 +14,9 @@ from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.errors import OutputError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.render import Film, Ground, Renderer, drape
-from terrafix_tools.trajectory import Sensors, State, Trajectory
-from terrafix_tools.world import EPSG, World
+from terrafix_tools.sim.render import Film, Ground, Renderer, drape
+from terrafix_tools.sim.trajectory import Sensors, State, Trajectory
+from terrafix_tools.sim.world import EPSG, World
 
 CAMERA = m.Camera(width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, mount_tolerance_deg=1.0)
 FRAME_HZ = 2.0

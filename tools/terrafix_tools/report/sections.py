@@ -3,8 +3,8 @@
 from html import escape
 from typing import Any
 
-from terrafix_tools.report_charts import HALF_WIDTH, Band, Chart, Point, clock, spans_of, strips
-from terrafix_tools.report_data import FlightView, radius95_m
+from terrafix_tools.report.charts import HALF_WIDTH, Band, Chart, Point, clock, spans_of, strips
+from terrafix_tools.report.data import FlightView, radius95_m
 
 ERROR_FLOOR_M = 0.5  # of the logarithmic axis; smaller errors are not told apart by any truth that we have
 WORDS = {

@@ -1,4 +1,4 @@
-"""The autopilot peer in a process of its own: ``python -m terrafix_tools.peer_process COURSE.csv --port N``."""
+"""The autopilot peer in a process of its own: ``python -m terrafix_tools.sim.peer_process COURSE.csv --port N``."""
 
 import signal
 import sys
@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from terrafix.core.errors import TerrafixError
-from terrafix_tools.peer import AutopilotPeer
-from terrafix_tools.peer_course import read_course
+from terrafix_tools.sim.peer import AutopilotPeer
+from terrafix_tools.sim.peer_course import read_course
 
 
 def fly_course(

@@ -14,11 +14,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import LinkError
 from terrafix.link.carry import distance_m
-from terrafix_tools.peer_course import Course, PeerState
-from terrafix_tools.peer_filter import Fusion, PositionFilter
-from terrafix_tools.peer_gps import TYPE_MAV, Fix, GpsDriver
-from terrafix_tools.peer_report import PeerReport, quantile
-from terrafix_tools.peer_streams import RATES_HZ, PeerStreams
+from terrafix_tools.sim.peer_course import Course, PeerState
+from terrafix_tools.sim.peer_filter import Fusion, PositionFilter
+from terrafix_tools.sim.peer_gps import TYPE_MAV, Fix, GpsDriver
+from terrafix_tools.sim.peer_report import PeerReport, quantile
+from terrafix_tools.sim.peer_streams import RATES_HZ, PeerStreams
 
 STEP_S = 0.01  # prediction and the finest stream
 PARAMETERS = {  # those that decide about GPS_INPUT; the values of config/vehicles/copter.param

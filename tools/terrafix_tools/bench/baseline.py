@@ -1,4 +1,4 @@
-"""The baseline of the benchmark: what most people try first. python -m terrafix_tools.bench_baseline FLIGHT MAP OUT.
+"""The baseline of the benchmark: what most people try first. python -m terrafix_tools.bench.baseline FLIGHT MAP OUT.
 
 The frame, rectified with the same prediction as the matcher gets, against the map around the predicted place: SIFT,
 Lowe's ratio test, a homography by RANSAC; the point under the camera, carried over by it, is the position. It is
@@ -19,7 +19,7 @@ from terrafix.core.node import Image
 from terrafix.messages import Origin, Prediction
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import open_source
-from terrafix_tools.bench_run import run_part, spread
+from terrafix_tools.bench.flights import run_part, spread
 from terrafix_tools.evaluate import offset_m, read_truth
 
 HALF_WINDOW_M = 70.0  # around the predicted footprint: the prior of the probes that this is compared with

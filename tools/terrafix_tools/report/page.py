@@ -7,14 +7,14 @@ from pathlib import Path
 
 from terrafix.core.errors import OutputError
 from terrafix_tools.estimates import Row
-from terrafix_tools.map_build import ensure_package
+from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay import map_cache_dir
-from terrafix_tools.report_charts import clock
-from terrafix_tools.report_data import FlightView, gather, radius95_m
-from terrafix_tools.report_map import map_svg
-from terrafix_tools.report_sections import accuracy, states, verdicts
-from terrafix_tools.report_sections_run import link, pictures, provenance, timing
-from terrafix_tools.report_text import figures, moments, stamp
+from terrafix_tools.report.charts import clock
+from terrafix_tools.report.data import FlightView, gather, radius95_m
+from terrafix_tools.report.map_picture import map_svg
+from terrafix_tools.report.sections import accuracy, states, verdicts
+from terrafix_tools.report.sections_run import link, pictures, provenance, timing
+from terrafix_tools.report.text import figures, moments, stamp
 
 NAME = "report.html"
 ONE_ROW = 7  # so many figures fit beside each other; more are set in two even rows
