@@ -7,12 +7,14 @@ from typing import Annotated
 import typer
 
 from terrafix.core.errors import TerrafixError, UsageError
+from terrafix_tools.sim.cli import app as sim_app
 
 ON_THE_GROUND = ("rasterio",)  # the extra `ground`: a vehicle need not have it
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
 map_app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
 app.add_typer(map_app, name="map")
+app.add_typer(sim_app, name="sim")
 
 StartOption = Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")]
 ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")]
