@@ -190,6 +190,7 @@ class MapMatch(Message, frozen=True, kw_only=True):
     ground: Vec3 | None = (
         None  # plane of the ground below, from the map's DEM: AMSL at p_c_in_w_m, slope east, slope north
     )
+    map_sigma_m: float = 0.0  # error of the map itself, 1-sigma per horizontal axis: common to all matches
 
 
 # --- estimator ------------------------------------------------------------------------------------
@@ -210,7 +211,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     source_label: SourceLabel
     covariance_mode: CovarianceMode
     last_anchor_age_ms: int  # -1: never anchored
-    emitted_at_ns: int
+    emitted_at_ns: int  # when it was said; in a replay, the time of the frame that it answers
 
 
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):

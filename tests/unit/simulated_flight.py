@@ -12,7 +12,7 @@ from ground import apply, homography
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
 from terrafix.core.pose import exp_so3
-from terrafix.estimator.filter import LOCAL_WARP_M, ROOFS
+from terrafix.estimator.filter import ROOFS
 from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import (
     Camera,
@@ -104,7 +104,7 @@ class Flight:
 
     def fix(self, i: int, offset_m: tuple[float, float] = (0.0, 0.0)) -> MapMatch:
         """A map match of frame i, off by what it claims and by ``offset_m``."""
-        warp = np.array([LOCAL_WARP_M, LOCAL_WARP_M, ROOFS * self.p_m[i, 2], 0.0, 0.0, 0.0])
+        warp = np.array([0.0, 0.0, ROOFS * self.p_m[i, 2], 0.0, 0.0, 0.0])
         error = self.rng_of.normal(0.0, np.hypot(FIX_SIGMAS, warp))
         p = self.p_m[i] + error[:3] + (*offset_m, 0.0)
         return MapMatch(
@@ -166,8 +166,8 @@ class Flight:
 class Listener:
     """Feeds a node and keeps what it says."""
 
-    def __init__(self, registration_sigma_m: float = 0.0) -> None:
-        self.node = EstimatorNode(registration_sigma_m)
+    def __init__(self) -> None:
+        self.node = EstimatorNode()
         self.said: list[Message] = []
 
     def hear(self, messages: Iterable[Message]) -> list[Message]:

@@ -402,3 +402,21 @@ def test_another_origin_begins_another_flight() -> None:
     run.hear(without_fix(flight.messages(20)))
     said = run.estimate(20)
     assert said.last_anchor_age_ms == -1 and sigma_m(said) > 10.0
+
+
+def test_the_error_of_the_map_is_added_once_a_map_has_placed_us() -> None:
+    """... in position, whole, and not before: a start coordinate does not come from the map."""
+    flight = Flight(30)
+    exact, off = Listener(), Listener()
+    for run, map_sigma_m in ((exact, 0.0), (off, 5.0)):
+        run.hear([ORIGIN])
+        for i in range(30):
+            said = flight.messages(i)
+            run.hear(
+                msgspec.structs.replace(m, map_sigma_m=map_sigma_m) if isinstance(m, MapMatch) else m for m in said
+            )
+    first = [next(m for m in run.said if isinstance(m, NavEstimate)) for run in (exact, off)]
+    assert first[0].cov == first[1].cov
+    added = cov_of(off.estimate(29)) - cov_of(exact.estimate(29))
+    assert added[0, 0] == pytest.approx(added[1, 1], rel=0.05)
+    assert 25.0 <= added[0, 0] < 30.0  # and a little for what that error bends within one picture

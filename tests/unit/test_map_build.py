@@ -67,6 +67,14 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b", "i.tif", "m.gpkg"]
 
 
+def test_the_stated_accuracy_is_kept_and_none_is_none(tmp_path: Path) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 500))
+    for ce90_m in (5.0, None):
+        package = MapPackage.open(build(tif, tmp_path / "m.gpkg", ce90_m=ce90_m))
+        assert package.manifest.ce90_m == ce90_m
+        package.close()
+
+
 def gray(rgb: np.ndarray) -> np.ndarray:
     return rgb[:1]
 

@@ -115,11 +115,15 @@ def map_build(
     dem: Annotated[Path | None, typer.Option(help="Elevation GeoTIFF, metres AMSL.")] = None,
     date: Annotated[str, typer.Option(help="Date of the imagery, YYYY-MM-DD.")] = "",
     licence: Annotated[str, typer.Option(help="Licence text of the imagery.")] = "",
+    ce90: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=200.0, help="Stated position error of the imagery: radius of 90 %, metres."),
+    ] = None,
 ) -> None:
     """GeoTIFF -> map package."""
     from terrafix_tools.mapping.build import build
 
-    build(imagery, out, dem=dem, date=date, licence=licence, progress=True)
+    build(imagery, out, dem=dem, date=date, licence=licence, ce90_m=ce90, progress=True)
 
 
 @map_app.command("info")

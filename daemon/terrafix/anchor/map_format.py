@@ -48,6 +48,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     dem: DemGrid | None
     tiles: int  # imagery and elevation tiles together
     checksum: str  # sha256 over the other rows and every tile's sha256
+    ce90_m: float | None = None  # radius that holds 90 % of the errors of position of this map; None: not stated
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,8 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
     fields: dict[str, Any] = {}
     try:
         for field in msgspec.structs.fields(Manifest):
+            if field.name not in rows and not field.required:
+                continue
             text = rows[field.name]
             fields[field.name] = text if field.type is str else msgspec.json.decode(text, type=field.type)
     except (KeyError, msgspec.DecodeError) as error:

@@ -34,13 +34,17 @@ START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is 
 LOST_SCORE = 2.0  # standardised correlation in the mode; a frame at the right place scores 3 to 10
 LOST_LOOKS = 4.0  # full looks below it before the search widens
 WIDEN = 1.6
+CE90_SIGMAS = 2.1460  # of a circular normal error: sqrt(-2 ln 0.1)
 
 
 class AnchorNode:
-    def __init__(self, frames: FrameStore, package: MapPackage | None, describer: Describer) -> None:
+    def __init__(
+        self, frames: FrameStore, package: MapPackage | None, describer: Describer, map_sigma_m: float
+    ) -> None:
         self._frames = frames
         self._package = package
         self._describer = describer
+        self._map_sigma_m = map_sigma_m
         self._matcher: FrameMatcher | None = None
         self._map: LocalMap | None = None
         self._belief: Belief | None = None
@@ -73,6 +77,7 @@ class AnchorNode:
             frame_id=prediction.frame_id,
             verdict=Verdict.OUTSIDE_MAP,
             matcher=self._describer.name,
+            map_sigma_m=self._map_sigma_m,
         )
         image = self._frames.get(prediction.frame_id)
         if self._matcher is None:
@@ -224,4 +229,6 @@ def make_node(ctx: NodeContext) -> AnchorNode:
         describer = open_describer(ctx.config.models.xfeat)
     except ModelFileError as error:
         raise ModelError(str(error)) from None
-    return AnchorNode(ctx.frames, package, describer)
+    stated = None if package is None else package.manifest.ce90_m
+    ce90_m = ctx.config.map.ce90_m if stated is None else stated
+    return AnchorNode(ctx.frames, package, describer, ce90_m / CE90_SIGMAS)

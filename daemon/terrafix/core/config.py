@@ -23,7 +23,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 class Map(Section, frozen=True, kw_only=True):
     path: str = ""  # map package or GeoTIFF; the command line wins
-    registration_sigma_m: Annotated[float, Meta(ge=0, le=100)] = 4.6
+    ce90_m: Annotated[float, Meta(ge=0, le=200)] = 10.0  # of a package that states none
 
 
 class Models(Section, frozen=True, kw_only=True):

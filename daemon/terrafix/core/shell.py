@@ -7,6 +7,7 @@ import importlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 
+import msgspec
 import zmq
 
 from terrafix.core.bus import Publisher, Subscriber
@@ -15,7 +16,7 @@ from terrafix.core.inbox import Inbox
 from terrafix.core.node import Edge, Node, NodeContext
 from terrafix.core.progress import Progress
 from terrafix.core.rundir import RunDir
-from terrafix.messages import Dropped, Message, Origin, ProcessEvent
+from terrafix.messages import Dropped, Message, NavEstimate, Origin, ProcessEvent
 from terrafix.processes import PROCESSES, Process
 
 SOURCE = "source"  # who "says" what is fed into the in-process shell
@@ -170,6 +171,8 @@ class LiveShell:
 
     def _say(self, messages: Iterable[Message]) -> None:
         for message in messages:
+            if isinstance(message, NavEstimate):  # a node has no clock to say when it spoke
+                message = msgspec.structs.replace(message, emitted_at_ns=now_ns())
             if self._edge is not None:
                 self._edge.heard(message)  # first: what is sent to the autopilot does not wait for the bus
             self._publisher.say(message)

@@ -40,7 +40,7 @@ BEND_SHARE = 0.4  # of the change of velocity that is carried on: the turn may h
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
-LOCAL_WARP_M = 1.5  # 1-sigma: orthophotos are stretched by about this over one footprint
+LOCAL_WARP = 0.33  # of the map's own error: by so much orthophotos are stretched over one footprint
 ROOFS = 0.03  # of the height, 1-sigma: roofs and crowns lift the ground that is seen, and with it the height
 SAME_GROUND_SHARE = 0.5  # of the height: fixes closer together than this share their errors ...
 MIN_NEW_GROUND = 0.1  # ... and a fix over the same ground counts at least this much
@@ -94,6 +94,7 @@ class Estimator:
         self.velocity_sigma_mps = MAX_SPEED_SIGMA_MPS
         self.last_fix_t_s: float | None = None
         self.mode = CovarianceMode.MARGINALS
+        self.map_sigma_m = 0.0  # of the map that placed us; nothing until it did
         self.ground_m = origin.ground_amsl_m or 0.0  # AMSL of the ground below, from the map's DEM
         self._slope: tuple[float, float] | None = None  # of the ground, east and north; None: no DEM
         self._r_b_c = Mount.of(origin.camera).r_b_c()
@@ -297,7 +298,8 @@ class Estimator:
         measured = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array(match.p_c_in_w_m))
         cov = world_to_tangent(np.array(match.cov).reshape(6, 6), r_w_c)
         height = max(match.p_c_in_w_m[2] - self.ground_m, 1.0)
-        warp = np.diag([LOCAL_WARP_M, LOCAL_WARP_M, ROOFS * height]) ** 2
+        local_m = LOCAL_WARP * match.map_sigma_m
+        warp = np.diag([local_m, local_m, ROOFS * height]) ** 2
         cov[3:, 3:] += r_w_c.T @ warp @ r_w_c
         predicted = self.graph.state(node).pose
         spread = float(np.sqrt(np.max(np.diag(tangent_to_world(self._covariance(node), r_w_c))[:2])))
@@ -321,6 +323,7 @@ class Estimator:
 
     def _accepted(self, match: MapMatch, node: int, here: np.ndarray) -> None:
         self._fixed_at_m = here
+        self.map_sigma_m = match.map_sigma_m
         if node > self._trunk[-1]:
             self._trunk.append(node)
         self.last_fix_t_s = self.graph.time_of(node)

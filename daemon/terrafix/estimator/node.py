@@ -32,8 +32,7 @@ ANCHORED_FOR_S = 1.5  # after a map fix the odometry since then is too short to 
 
 
 class EstimatorNode:
-    def __init__(self, registration_sigma_m: float) -> None:
-        self._registration_var = registration_sigma_m**2
+    def __init__(self) -> None:
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
@@ -118,7 +117,7 @@ class EstimatorNode:
         p = placed.pose.translation()
         cov = tangent_to_world(placed.cov, placed.pose.rotation().matrix())
         # The map itself is off by a few metres, everywhere alike: no number of fixes averages that away.
-        cov[:3, :3] += self._registration_var * np.eye(3)
+        cov[:3, :3] += estimator.map_sigma_m**2 * np.eye(3)
         lat_deg, lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
         age_ms = -1
         if estimator.last_fix_t_s is not None:
@@ -141,13 +140,14 @@ class EstimatorNode:
             source_label=label,
             covariance_mode=self._mode,
             last_anchor_age_ms=age_ms,
-            emitted_at_ns=t_ns,
+            emitted_at_ns=t_ns,  # the live shell puts the time of saying here
         )
 
     def _refine(self, ended: SourceEnded) -> Iterable[Message]:
         if self._estimator is None or self._frame is None:
             return
         poses = []
+        map_var = self._estimator.map_sigma_m**2
         for frame_id, (p, cov) in sorted(self._estimator.refine().items()):
             lat_deg, lon_deg = self._frame.to_wgs84(float(p[0]), float(p[1]))
             poses.append(
@@ -156,12 +156,12 @@ class EstimatorNode:
                     lat_deg=lat_deg,
                     lon_deg=lon_deg,
                     alt_amsl_m=float(p[2]),
-                    sigma_e_m=float(np.sqrt(cov[0, 0] + self._registration_var)),
-                    sigma_n_m=float(np.sqrt(cov[1, 1] + self._registration_var)),
+                    sigma_e_m=float(np.sqrt(cov[0, 0] + map_var)),
+                    sigma_n_m=float(np.sqrt(cov[1, 1] + map_var)),
                 )
             )
         yield Refinement(t_ns=ended.t_ns, poses=poses)
 
 
 def make_node(ctx: NodeContext) -> EstimatorNode:
-    return EstimatorNode(ctx.config.map.registration_sigma_m)
+    return EstimatorNode()

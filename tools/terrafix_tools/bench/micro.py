@@ -14,7 +14,6 @@ from terrafix.anchor.belief import Belief, cell_for
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.matcher import FrameMatcher, View
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.config import Config
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.node import Image
 from terrafix.estimator.node import EstimatorNode
@@ -79,7 +78,7 @@ def _looks(
 def _estimator(said: list[Message], band: ThermalBand) -> list[float]:
     """Time for each frame once the window is full: odometry in, prediction and estimate out, map match in, estimate
     out; covariance included."""
-    node = EstimatorNode(Config().map.registration_sigma_m)
+    node = EstimatorNode()
     list(node.on(Health(t_ns=0, band=band, temperature_c=None, throttled=False, disk_free_mb=None, cause="benchmark")))
     times: dict[int, float] = {}
     for message in said:

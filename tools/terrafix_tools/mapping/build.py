@@ -40,9 +40,18 @@ Step = Callable[[], None]
 
 
 def build(
-    imagery: Path, out: Path, *, dem: Path | None = None, date: str = "", licence: str = "", progress: bool = False
+    imagery: Path,
+    out: Path,
+    *,
+    dem: Path | None = None,
+    date: str = "",
+    licence: str = "",
+    ce90_m: float | None = None,
+    progress: bool = False,
 ) -> Path:
     """Writes the package `out` from `imagery` (any GDAL raster with a CRS) and an elevation raster in metres AMSL.
+
+    ``ce90_m``: radius that holds 90 % of the imagery's errors of position, as its producer states it.
 
     The same input gives the same bytes. Nothing is left at `out` or beside it when this fails or is interrupted.
     Raises MapError (imagery or elevation unusable) and OutputError."""
@@ -61,7 +70,7 @@ def build(
             collar = None if source.has_mask else find_collar(source, scratch / "collar.tif", bar("collar", None))
             if collar:
                 stack.callback(collar.close)
-            _write(part, source, heights, collar, imagery, out.stem, date, licence, bar)
+            _write(part, source, heights, collar, imagery, out.stem, date, licence, ce90_m, bar)
             with part.open("rb") as file:
                 os.fsync(file.fileno())
             part.replace(out)
@@ -132,6 +141,7 @@ def _write(
     name: str,
     date: str,
     licence: str,
+    ce90_m: float | None,
     bar: Callable[[str, int | None], Step],
 ) -> None:
     levels = _levels(source)
@@ -164,6 +174,7 @@ def _write(
                 dem=heights.grid if heights else None,
                 tiles=writer.tiles,
                 checksum="",
+                ce90_m=ce90_m,
             )
         )
 
