@@ -38,7 +38,7 @@ if [ "$pip" = yes ]; then
         exit 1
     fi
     "$chosen" -m venv "$prefix/opt/terrafix/venv"
-    "$prefix/opt/terrafix/venv/bin/pip" install --upgrade "$here/.."
+    "$prefix/opt/terrafix/venv/bin/pip" install --upgrade --constraint "$here/../requirements.lock" "$here/.."
 fi
 
 install -D -m 0644 "$here/terrafix.service" "$prefix/etc/systemd/system/terrafix.service"

@@ -48,9 +48,12 @@ class Spec(msgspec.Struct, frozen=True, kw_only=True):
     config: Config
     map_path: str | None
     out_dir: str
+    ground_amsl_m: float | None
 
 
-def spec_of(table: tuple[Process, ...], config: Config, map_path: Path | None, out_dir: Path) -> Spec:
+def spec_of(
+    table: tuple[Process, ...], config: Config, map_path: Path | None, out_dir: Path, ground_amsl_m: float | None = None
+) -> Spec:
     rows = [
         ProcessSpec(
             name=p.name,
@@ -63,7 +66,8 @@ def spec_of(table: tuple[Process, ...], config: Config, map_path: Path | None, o
         )
         for p in table
     ]
-    return Spec(table=rows, config=config, map_path=str(map_path) if map_path else None, out_dir=str(out_dir))
+    package = str(map_path) if map_path else None
+    return Spec(table=rows, config=config, map_path=package, out_dir=str(out_dir), ground_amsl_m=ground_amsl_m)
 
 
 def table_of(spec: Spec) -> tuple[Process, ...]:
@@ -99,6 +103,7 @@ def main(arguments: list[str]) -> int:
         frames=SharedFrameStore(run_dir.frames, writer=Frame in process.says),
         map_path=Path(spec.map_path) if spec.map_path else None,
         out_dir=Path(spec.out_dir),
+        ground_amsl_m=spec.ground_amsl_m,
         epoch_ns=run_dir.epoch_ns,
     )
     gc.freeze()  # what is imported lives for ever: collections need not look at it

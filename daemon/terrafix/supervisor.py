@@ -48,6 +48,7 @@ def run(
     out_dir: Path,
     configs: list[Path],
     start: str = "",
+    ground_amsl_m: float | None = None,
     stop_after_source: bool = False,
     on_event: Callable[[ProcessEvent], None] | None = None,
     on_epoch: Callable[[int], None] | None = None,
@@ -58,7 +59,8 @@ def run(
     """Flies until a signal, until ``stop`` is set, or (``stop_after_source``) until the source has ended.
 
     ``source``, ``map_path`` (a map package), ``link``, ``start`` ("LAT,LON"): win over the configuration when not
-    empty. ``on_event`` gets everything that happens to the processes, ``on_epoch`` once the t_ns of the first Origin:
+    empty. ``ground_amsl_m``: the map's ground at the start, for a source that does not know it.
+    ``on_event`` gets everything that happens to the processes, ``on_epoch`` once the t_ns of the first Origin:
     the zero of a recorded source on the monotonic clock. ``log_to``: file for all logs and tracebacks instead of
     stdout and stderr.
     Returns 0, or 1 when the link gave up, or the exit code of a process that could not start for a reason that the
@@ -74,7 +76,7 @@ def run(
         logs.get().info("start", config=msgspec.to_builtins(config), map=str(package), out_dir=str(out_dir))
         owned = OwnedRunDir()
         stack.callback(owned.remove)
-        owned.run_dir.spec.write_bytes(msgspec.json.encode(spec_of(table, config, package, out_dir)))
+        owned.run_dir.spec.write_bytes(msgspec.json.encode(spec_of(table, config, package, out_dir, ground_amsl_m)))
         stack.enter_context(_signals_set(stop))
         context = stack.enter_context(zmq.Context())
         children = [Child(process, owned.run_dir, output) for process in table]

@@ -179,6 +179,7 @@ def test_elevation_is_bilinear_with_voids(tmp_path: Path) -> None:
     assert found is not None
     expected = 100 + 0.05 * (places[:, 0] - 300_000) - 0.02 * (places[:, 1] - 2_600_000)
     assert found == pytest.approx(expected, abs=0.02)
+    assert package.ground_amsl_m(frame.lat_deg, frame.lon_deg) == pytest.approx(110.5, abs=0.02)
     void = frame.to_local(*_wgs84(300_115.0, 2_599_885.0))
     answer = local.elevation(np.array([void[0], 1e6, np.inf]), np.array([void[1], 0.0, 0.0]))
     assert answer is not None and np.isnan(answer).all()
@@ -190,6 +191,7 @@ def test_elevation_is_bilinear_with_voids(tmp_path: Path) -> None:
     package.close()
     without = MapPackage.open(build(tif, tmp_path / "n.gpkg"))
     assert without.bind(frame).elevation(np.zeros(1), np.zeros(1)) is None
+    assert without.ground_amsl_m(frame.lat_deg, frame.lon_deg) is None
     without.close()
 
 

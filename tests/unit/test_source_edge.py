@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 from source_folders import flight, picture
 
@@ -164,3 +165,17 @@ def test_make_edge_reads_the_configuration(tmp_path: Path, closing: list[SourceE
         make_edge(context(path=folder, start="here"))
     with pytest.raises(SourceError, match="no source given"):
         make_edge(context())
+
+
+@pytest.mark.parametrize(("own", "said"), [(None, 612.0), (40.0, 40.0)])
+def test_the_ground_of_the_map_stands_in_for_one_that_the_source_does_not_know(
+    tmp_path: Path, closing: list[SourceEdge], own: float | None, said: float
+) -> None:
+    source = open_source(str(flight(tmp_path / "f")))
+    known = msgspec.structs.replace(source.origin(), ground_amsl_m=own)
+    source.origin = lambda: known  # type: ignore[method-assign]
+    edge = SourceEdge(source, MemoryFrameStore(), None, False, 612.0)
+    closing.append(edge)
+    listener = Listener(edge)
+    listener.until(listener.ended)
+    assert isinstance(listener.said[0], Origin) and listener.said[0].ground_amsl_m == said

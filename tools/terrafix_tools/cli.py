@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from terrafix.core.errors import TerrafixError, UsageError
+from terrafix_tools.accept.cli import accept
 from terrafix_tools.sim.cli import app as sim_app
 
 ON_THE_GROUND = ("rasterio",)  # the extra `ground`: a vehicle need not have it
@@ -15,6 +16,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position wit
 map_app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
 app.add_typer(map_app, name="map")
 app.add_typer(sim_app, name="sim")
+app.command()(accept)
 
 StartOption = Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")]
 ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")]
@@ -35,11 +37,13 @@ def run(
     from terrafix_tools.live import package_for
 
     configs = config or []
+    package, ground_amsl_m = package_for(source, start, map_path, configs)
     raise typer.Exit(
         run_supervised(
             source=source,
             start=start,
-            map_path=package_for(source, start, map_path, configs),
+            map_path=package,
+            ground_amsl_m=ground_amsl_m,
             link=link,
             out_dir=out,
             configs=configs,
@@ -93,7 +97,7 @@ def report(
     """One self-contained HTML page about a flight: FOLDER/report.html."""
     from terrafix_tools.report.page import report as run_report
 
-    run_report(folder, truth, map_path)
+    typer.echo(run_report(folder, truth, map_path))
 
 
 @app.command()

@@ -9,8 +9,10 @@ from terrafix.core.errors import MapError
 from terrafix.vision.sources import open_configured, parse_start
 
 
-def package_for(source: str, start: str, map_path: Path | None, configs: list[Path]) -> Path:
-    """The map package to fly with: ``map_path``, or the one of the configuration, or the one that the source names.
+def package_for(source: str, start: str, map_path: Path | None, configs: list[Path]) -> tuple[Path, float | None]:
+    """The map package to fly with, and the height of its ground at the start (AMSL; None: not known).
+
+    It is ``map_path``, or the one of the configuration, or the one that the source names.
 
     A GeoTIFF is made into a package (kept in the cache folder). A recorded source is opened once, to see that the map
     covers its start; a live camera is not, since only one process can hold it.
@@ -29,14 +31,17 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
         raise MapError("no map: give one with --map (GeoTIFF or map package) or [map] path")
     package = given if given.suffix.lower() == ".gpkg" else _built(given)
     with_map = MapPackage.open(package)
+    ground_amsl_m = None
     try:
         if place is not None and not with_map.covers(*place):
             raise MapError(
                 f"{package}: has no imagery at the start {place[0]:.6f}, {place[1]:.6f}; use another --map or check it"
             )
+        if place is not None:
+            ground_amsl_m = with_map.ground_amsl_m(*place)
     finally:
         with_map.close()
-    return package
+    return package, ground_amsl_m
 
 
 def _built(geotiff: Path) -> Path:

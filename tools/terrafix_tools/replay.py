@@ -33,6 +33,7 @@ FLOWN = ("vision", "anchor", "estimator")  # processes that decide; link, health
 FRAMES_KEPT = 32  # what a node may still ask for; as many as the live ring has
 
 MakeNodes = Callable[[NodeContext], Mapping[str, Node]]
+MakeSource = Callable[[Source], Source]
 
 
 def make_nodes(ctx: NodeContext) -> dict[str, Node]:
@@ -50,13 +51,15 @@ def replay(
     progress: bool = False,
     start: tuple[float, float] | None = None,
     nodes: MakeNodes = make_nodes,
+    altered: MakeSource = lambda source: source,
 ) -> dict[str, Any]:
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
-    ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg) instead of the source's. Raises the TerrafixError family."""
+    ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg) instead of the source's. ``nodes`` and ``altered`` put something
+    between flight and nodes (a stopwatch, a fault). Raises the TerrafixError family."""
     began_s = time.perf_counter()
     config = _with_models(load(configs or []), models or [])
-    source = open_source(str(flight), start=start)
+    source = altered(open_source(str(flight), start=start))
     if source.live:
         raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
     package = ensure_package(_map_of(map_path, config, source), map_cache_dir(), progress=progress)
@@ -164,9 +167,8 @@ def _check_map(package: Path, origin: Origin) -> tuple[Origin, dict[str, Any]]:
         if not opened.covers(origin.lat_deg, origin.lon_deg):
             raise MapError(f"{package}: {_not_covered(origin, local.bounds_m)}; use another --map or check the start")
         if origin.ground_amsl_m is None:
-            elevation = local.elevation(*frame.to_local(origin.lat_deg, origin.lon_deg))  # type: ignore[arg-type]
-            if elevation is not None and math.isfinite(float(elevation)):
-                origin = msgspec.structs.replace(origin, ground_amsl_m=float(elevation))
+            ground_m = opened.ground_amsl_m(origin.lat_deg, origin.lon_deg)
+            origin = msgspec.structs.replace(origin, ground_amsl_m=ground_m)
         manifest = opened.manifest
         return origin, {
             "path": str(package),

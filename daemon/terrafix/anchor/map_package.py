@@ -96,6 +96,12 @@ class MapPackage:
         """(zoom, column, row) of the tiles wanted so far that are not what was written; zoom -1 = elevation."""
         return self.tiles.damaged
 
+    def ground_amsl_m(self, lat_deg: float, lon_deg: float) -> float | None:
+        """Height of the ground at a place; None where the package does not know it."""
+        here = np.zeros(1)
+        up = self.bind(LocalFrame(lat_deg, lon_deg)).elevation(here, here)
+        return float(up[0]) if up is not None and np.isfinite(up[0]) else None
+
     def covers(self, lat_deg: float, lon_deg: float) -> bool:
         """Whether the place lies in valid imagery."""
         x, y = self._from_wgs84.transform(lon_deg, lat_deg)

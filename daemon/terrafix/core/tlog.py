@@ -72,6 +72,16 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
     return sorted([*(attitudes or headings), *height], key=lambda state: state.t_ns)
 
 
+def record(t_us: int, packets: bytes) -> bytes:
+    """The records of whole packets that arrived together at ``t_us``, UNIX microseconds."""
+    made, at = [], 0
+    while at < len(packets):
+        length = _packet_length(packets, at)
+        made.append(t_us.to_bytes(_STAMP, "big") + packets[at : at + length])
+        at += length
+    return b"".join(made)
+
+
 def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
     """(time in us, packet), walking over damage byte by byte until a record fits again."""
     at, last_us = 0, None

@@ -26,10 +26,18 @@ OVERTAKEN = "overtaken: a newer frame was there first"
 class SourceEdge:
     """``poll`` gives at most one frame with pixels; what was overtaken is a Frame with an error."""
 
-    def __init__(self, source: Source, frames: FrameWriter, epoch_ns: int | None, realtime: bool) -> None:
+    def __init__(
+        self,
+        source: Source,
+        frames: FrameWriter,
+        epoch_ns: int | None,
+        realtime: bool,
+        ground_amsl_m: float | None = None,
+    ) -> None:
         self._source = source
         self._frames = frames
         self._realtime = realtime
+        self._ground_amsl_m = ground_amsl_m  # where the source does not know it
         self._epoch_ns = epoch_ns
         self._zero_ns = 0  # of the source's clock; set when the reader starts
         self._first_id = 0
@@ -45,7 +53,9 @@ class SourceEdge:
     def poll(self, now_ns: int) -> Iterable[Message]:
         if self._reading is None:
             self._reading = self._start(now_ns)
-            return [msgspec.structs.replace(self._source.origin(), t_ns=self._zero_ns)]
+            origin = self._source.origin()
+            ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
+            return [msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m)]
         ended = self._reading.done()
         with self._changed:
             said = list(self._overtaken)
@@ -125,4 +135,4 @@ def make_edge(ctx: NodeContext) -> Edge:
         raise TypeError("the process that opens the source needs a frame store to write to")
     wanted = ctx.config.source
     source = open_configured(wanted, wait_for_camera=ctx.epoch_ns is not None)
-    return SourceEdge(source, ctx.frames, ctx.epoch_ns, wanted.realtime)
+    return SourceEdge(source, ctx.frames, ctx.epoch_ns, wanted.realtime, ctx.ground_amsl_m)

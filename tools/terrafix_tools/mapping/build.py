@@ -67,7 +67,7 @@ def build(
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.")))
             part = scratch / "part.gpkg"
             bar = stack.enter_context(_progress_bar(progress))
-            collar = None if source.has_mask else find_collar(source, scratch / "collar.tif", bar("collar", None))
+            collar = None if source.has_mask else find_collar(source, scratch / "collar.tif", bar)
             if collar:
                 stack.callback(collar.close)
             _write(part, source, heights, collar, imagery, out.stem, date, licence, ce90_m, bar)

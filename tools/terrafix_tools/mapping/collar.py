@@ -1,5 +1,6 @@
 """Finds the collar of an image without a mask: pure black or white areas that are connected to its border."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -44,11 +45,14 @@ class Collar:
         self._file.close()
 
 
-def find_collar(source: ImagerySource, scratch: Path, on_step: Callable[[], None]) -> Collar | None:
-    """Collar of an image, or None when there is none. Writes and leaves `scratch`."""
+def find_collar(
+    source: ImagerySource, scratch: Path, bar: Callable[[str, int | None], Callable[[], None]]
+) -> Collar | None:
+    """Collar of an image, or None when there is none. Writes and leaves `scratch`. ``bar(name, steps) -> step()``."""
     if not _border_is_empty(source):
         return None
     width, height = source.width_px, source.height_px
+    on_step = bar("collar", math.ceil(width / BLOCK_PX) * math.ceil(height / BLOCK_PX))
     sets = _DisjointSets()
     above: dict[int, np.ndarray] = {}  # labels of the last line of the block row above, by block column
     for block_row in range(0, height, BLOCK_PX):
