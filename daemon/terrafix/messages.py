@@ -48,6 +48,7 @@ class Verdict(StrEnum):
 
     ACCEPTED = "accepted"
     BAD_IMAGE = "bad_image"  # unreadable, truncated, wrong size
+    STALLED = "stalled"  # the camera repeats its last picture, bit for bit
     NO_FEATURES = "no_features"  # nothing to track
     FEW_INLIERS = "few_inliers"
     NO_PREDICTION = "no_prediction"  # nobody knows where to look
@@ -190,6 +191,7 @@ class MapMatch(Message, frozen=True, kw_only=True):
     ground: Vec3 | None = (
         None  # plane of the ground below, from the map's DEM: AMSL at p_c_in_w_m, slope east, slope north
     )
+    relief_m: float = 0.0  # what the ground that is seen departs from that plane, root mean square
     map_sigma_m: float = 0.0  # error of the map itself, 1-sigma per horizontal axis: common to all matches
 
 

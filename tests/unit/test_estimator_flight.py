@@ -420,3 +420,21 @@ def test_the_error_of_the_map_is_added_once_a_map_has_placed_us() -> None:
     added = cov_of(off.estimate(29)) - cov_of(exact.estimate(29))
     assert added[0, 0] == pytest.approx(added[1, 1], rel=0.05)
     assert 25.0 <= added[0, 0] < 30.0  # and a little for what that error bends within one picture
+
+
+def test_over_hills_odometry_is_trusted_less() -> None:
+    """What the ground departs from the plane moves all tracked points together: it does not average out."""
+    flight = Flight(30)
+    claims = []
+    for relief_m in (0.0, 8.0):
+        run = Listener()
+        run.hear([ORIGIN])
+        for i in range(30):
+            said = flight.messages(i)
+            kept = [m for m in said if i < 10 or not isinstance(m, MapMatch)]
+            run.hear(
+                msgspec.structs.replace(m, ground=(0.0, 0.0, 0.0), relief_m=relief_m) if isinstance(m, MapMatch) else m
+                for m in kept
+            )
+        claims.append(sigma_m(run.estimate(29)))
+    assert claims[1] > 1.3 * claims[0]

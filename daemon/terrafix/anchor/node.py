@@ -85,8 +85,8 @@ class AnchorNode:
         belief = self._moved(prediction, cell_for(prediction.agl_m, self._matcher.look_cell_m(prediction.agl_m)))
         if image is None:
             return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE)
-        view, ground = self._view(prediction)
-        answer = msgspec.structs.replace(answer, ground=ground)
+        view, ground, relief_m = self._view(prediction)
+        answer = msgspec.structs.replace(answer, ground=ground, relief_m=relief_m)
         if view.agl_m < MIN_AGL_M:
             return msgspec.structs.replace(answer, verdict=Verdict.TOO_LOW)
         look = self._matcher.look(image, view, belief)
@@ -140,10 +140,11 @@ class AnchorNode:
         self._since_look_m += float(np.hypot(step_m, sigma_m))
         return self._belief
 
-    def _view(self, prediction: Prediction) -> tuple[View, Vec3 | None]:
-        """The predicted camera over the ground as the DEM has it, and the plane of that ground (None: no DEM)."""
+    def _view(self, prediction: Prediction) -> tuple[View, Vec3 | None, float]:
+        """The predicted camera over the ground as the DEM has it, the plane of that ground (None: no DEM), and what the
+        ground departs from it (rms)."""
         e_m, n_m, up_m = prediction.p_c_in_w_m
-        ground = self._plane(e_m, n_m, prediction.agl_m) if self._map is not None else None
+        ground, relief_m = self._plane(e_m, n_m, prediction.agl_m)
         agl_m = prediction.agl_m if ground is None else up_m - ground[0]
         view = View(
             e_m,
@@ -155,20 +156,23 @@ class AnchorNode:
             prediction.agl_sigma_m / max(agl_m, 1.0),
             float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))),
         )
-        return view, ground
+        return view, ground, relief_m
 
-    def _plane(self, e_m: float, n_m: float, agl_m: float) -> Vec3 | None:
-        """Least squares over the ground that is seen: AMSL below the camera, slope east, slope north."""
-        assert self._map is not None
+    def _plane(self, e_m: float, n_m: float, agl_m: float) -> tuple[Vec3 | None, float]:
+        """Least squares over the ground that is seen: AMSL below the camera, slope east, slope north; and what is left
+        (rms)."""
+        if self._map is None:
+            return None, 0.0
         axis = np.linspace(-0.7, 0.7, 7) * agl_m
         de, dn = (a.ravel() for a in np.meshgrid(axis, axis))
         up = self._map.elevation(e_m + de, n_m + dn)
         if up is None or np.isfinite(up).sum() < len(de) / 2:
-            return None
+            return None, 0.0
         known = np.isfinite(up)
         design = np.column_stack([np.ones(known.sum()), de[known], dn[known]])
-        (level, slope_e, slope_n), *_ = np.linalg.lstsq(design, up[known], rcond=None)
-        return float(level), float(slope_e), float(slope_n)
+        plane = np.linalg.lstsq(design, up[known], rcond=None)[0]
+        relief_m = float(np.sqrt(np.mean((up[known] - design @ plane) ** 2)))
+        return (float(plane[0]), float(plane[1]), float(plane[2])), relief_m
 
     def _watch(self, belief: Belief, score: float, weight: float) -> None:
         """A mode that no longer fits what is seen: look wider."""

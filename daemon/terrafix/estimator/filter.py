@@ -20,8 +20,9 @@ from terrafix.messages import CovarianceMode, MapMatch, Odometry, Origin, Verdic
 
 UNKNOWN_RAD = 3.0  # sigma of a heading that nobody reports
 # What an autopilot's own sigma leaves out: a compass beside motors and wires, a barometer over sloping ground, a focal
-# length that is a few per cent off. On real flights the heading was 12 degrees and the scale 8 % away from the log.
-COMPASS_BIAS_RAD = np.radians(6.0)
+# length that is a few per cent off. On real flights the heading was 12 degrees and the scale 8 % away from the log, and
+# a compass that is 15 degrees off must still be inside the search (1.5 sigma).
+COMPASS_BIAS_RAD = np.radians(10.0)
 HEIGHT_BIAS = 0.05  # of the height
 UNKNOWN_ATTITUDE_RAD = np.radians(4.0)  # sigma of roll and pitch that nobody reports: level flight and gentle turns
 DEFAULT_AGL_M = 120.0  # when nobody reports a height: the usual ceiling of small drones ...
@@ -33,6 +34,7 @@ VELOCITY_MEMORY_S = 10.0  # how long a drone keeps its course when nobody looks
 # 1-sigma of the slope and of the level (share of the height) of the ground that is seen: fields and towns without a
 # DEM; what houses and trees leave with one.
 FLAT_SIGMAS, DEM_SIGMAS = (0.03, 0.02), (0.015, 0.01)
+RELIEF_SLOPE = 2.0  # a plane that misses the ground by this share of the height misses its slope by so much more
 VELOCITY_SPAN_S = 0.9  # a velocity is measured over about a second: shorter is noise, longer misses turns
 VELOCITY_FLOOR_M = 0.15  # error of the relative position of two nodes that close, at best
 VELOCITY_SHARE = 0.03  # ... of their distance, when the graph is not asked (cheap mode)
@@ -96,6 +98,7 @@ class Estimator:
         self.mode = CovarianceMode.MARGINALS
         self.map_sigma_m = 0.0  # of the map that placed us; nothing until it did
         self.ground_m = origin.ground_amsl_m or 0.0  # AMSL of the ground below, from the map's DEM
+        self._relief_m = 0.0  # how far the ground departs from a plane
         self._slope: tuple[float, float] | None = None  # of the ground, east and north; None: no DEM
         self._r_b_c = Mount.of(origin.camera).r_b_c()
         self._node_of: dict[int, int] = {}  # frame -> node
@@ -184,6 +187,9 @@ class Estimator:
         known_slope = self._slope is not None
         slope_e, slope_n = self._slope or (0.0, 0.0)
         slope_sigma, level_share = DEM_SIGMAS if known_slope else FLAT_SIGMAS
+        # Over hills the tracked points lie off the plane, all on one side for a while.
+        slope_sigma = float(np.hypot(slope_sigma, RELIEF_SLOPE * self._relief_m / height))
+        level_share = float(np.hypot(level_share, self._relief_m / height))
         share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
         ground = Ground(height, height_sigma, slope_e, slope_n, slope_sigma, level_share, share)
         motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
@@ -288,7 +294,7 @@ class Estimator:
     def fix(self, match: MapMatch) -> FixResult:
         """A map match of a frame that ``advance`` has seen. Gated; enters the graph at its own node."""
         if match.ground is not None:
-            self.ground_m, self._slope = match.ground[0], match.ground[1:]
+            self.ground_m, self._slope, self._relief_m = match.ground[0], match.ground[1:], match.relief_m
         if match.verdict is not Verdict.ACCEPTED or match.p_c_in_w_m is None or match.q_w_c is None:
             return FixResult(match.verdict, None)
         node = self._node_of.get(match.frame_id)

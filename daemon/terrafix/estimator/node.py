@@ -72,7 +72,7 @@ class EstimatorNode:
         yield MeasurementVerdict(
             t_ns=odometry.t_ns, frame_id=odometry.frame_id, measurement="odometry", verdict=advance.verdict
         )
-        if odometry.verdict is not Verdict.BAD_IMAGE:
+        if odometry.verdict not in (Verdict.BAD_IMAGE, Verdict.STALLED):
             yield self._prediction(odometry, advance, estimator)
         yield self._estimate(advance.placed, odometry.t_ns)
 

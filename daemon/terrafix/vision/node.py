@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.node import Edge, FrameStore, NodeContext
+from terrafix.core.node import Edge, FrameStore, Image, NodeContext
 from terrafix.messages import Frame, Message, Odometry, Origin, Verdict
 from terrafix.vision.edge import make_edge as make_source_edge
 from terrafix.vision.odometry import FrameTracker
@@ -14,6 +16,7 @@ class VisionNode:
         self._frames = frames
         self._origin: Origin | None = None
         self._tracker: FrameTracker | None = None
+        self._last: Image | None = None
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
@@ -33,6 +36,14 @@ class VisionNode:
         if image is None or self._tracker is None:
             return Odometry(
                 t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.BAD_IMAGE
+            )
+        # A sensor's noise makes no two pictures alike. A driver that hangs repeats one, and tracker and map would then
+        # agree that the vehicle stands still.
+        stalled = self._last is not None and np.array_equal(image, self._last)
+        self._last = image
+        if stalled:
+            return Odometry(
+                t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.STALLED
             )
         motion = self._tracker.track(frame.frame_id, image)
         return Odometry(
