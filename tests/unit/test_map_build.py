@@ -46,7 +46,7 @@ def test_the_package_is_a_geopackage_that_gdal_reads(tmp_path: Path) -> None:
     assert db.execute("PRAGMA user_version").fetchone()[0] == 10300
     assert db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
     assert db.execute("PRAGMA foreign_key_check").fetchall() == []
-    assert {r[0] for r in db.execute("SELECT srs_id FROM gpkg_spatial_ref_sys")} == {-1, 0, 4326, 32651}
+    assert {r[0] for r in db.execute("SELECT srs_id FROM gpkg_spatial_ref_sys")} == {-1, 0, 4326, 4979, 32651}
     width, height = db.execute("SELECT max_x - min_x, max_y - min_y FROM gpkg_tile_matrix_set").fetchone()
     for row in db.execute("SELECT matrix_width, pixel_x_size, matrix_height, pixel_y_size FROM gpkg_tile_matrix"):
         assert row[0] * row[1] * 256 == pytest.approx(width) and row[2] * row[3] * 256 == pytest.approx(height)
@@ -290,3 +290,99 @@ build(Path({str(tif)!r}), Path({str(out)!r}))"""
     child.send_signal(signal.SIGINT)
     assert child.wait(timeout=30) != 0
     assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.slow
+def test_the_number_of_workers_changes_no_byte(tmp_path: Path) -> None:
+    """Enough chunks that two processes are used, and a border without picture, so that there is a collar to share."""
+    bands = np.tile(map_rasters.texture(500, 500), (1, 13, 9))
+    bands[:, :300] = 0
+    tif = map_rasters.utm(tmp_path / "i.tif", bands, tiled=True)
+    (tmp_path / "b").mkdir()
+    one, two = build(tif, tmp_path / "m.gpkg", workers=1), build(tif, tmp_path / "b" / "m.gpkg", workers=2)
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_a_worker_says_what_is_wrong_with_the_imagery(tmp_path: Path) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 13, 13)), tiled=True)
+    tif.write_bytes(tif.read_bytes()[:60_000_000])
+    with pytest.raises(MapError, match=r"i\.tif: cannot be read near column"):
+        build(tif, tmp_path / "m.gpkg", workers=2)
+    assert [p.name for p in tmp_path.iterdir()] == ["i.tif"]
+
+
+def test_no_space_on_the_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    """A limit on the size of files stands for a full disk: the same error comes from the system."""
+    tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 4, 4)))
+    program = f"""import resource
+from pathlib import Path
+from terrafix.core.errors import OutputError
+from terrafix_tools.mapping.build import build
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+try:
+    build(Path({str(tif)!r}), Path({str(tmp_path / "out" / "m.gpkg")!r}))
+except OutputError as error:
+    print(error)"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert "m.gpkg: cannot be written" in done.stdout and done.stdout.count("\n") == 1, done.stderr
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def alive_in_group(group: int) -> list[str]:
+    """Processes of a group that still run; proc_pid_stat(5): pid (comm) state ppid pgrp."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            name, fields = path.read_text().rsplit(")", 1)
+        except OSError:  # it has just ended
+            continue
+        state, _, pgrp = fields.split()[:3]
+        if int(pgrp) == group and state != "Z":
+            found.append(name)
+    return found
+
+
+@pytest.mark.slow
+def test_ctrl_c_with_workers_leaves_nothing_and_nobody(tmp_path: Path) -> None:
+    """As a terminal does it: the interrupt reaches the whole group of processes."""
+    tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 20, 20)), tiled=True)
+    script = tmp_path / "program.py"
+    script.write_text(f"""from pathlib import Path
+from terrafix_tools.mapping.build import build
+if __name__ == "__main__":
+    build(Path({str(tif)!r}), Path({str(tmp_path / "out" / "m.gpkg")!r}), workers=2)""")
+    child = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, start_new_session=True)
+    deadline_s = time.monotonic() + 60
+    while time.monotonic() < deadline_s and child.poll() is None:
+        parts = list(tmp_path.glob("out/.m.gpkg.*/part.gpkg"))
+        if parts and parts[0].stat().st_size > 1_000_000:
+            break
+        time.sleep(0.02)
+    os.killpg(child.pid, signal.SIGINT)
+    _, said = child.communicate(timeout=60)
+    assert child.returncode != 0 and said.count(b"Traceback") <= 1  # the parent's own, no worker's
+    assert list((tmp_path / "out").iterdir()) == []
+    deadline_s = time.monotonic() + 30
+    while time.monotonic() < deadline_s and alive_in_group(child.pid):
+        time.sleep(0.05)
+    assert alive_in_group(child.pid) == []
+
+
+@pytest.mark.parametrize("date", ["2024-13-01", "2024-1-1", "20240101", "2024-02-30"])
+def test_dates_that_are_none(tmp_path: Path, date: str) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
+    with pytest.raises(UsageError, match="YYYY-MM-DD"):
+        build(tif, tmp_path / "m.gpkg", date=date)
+
+
+def test_a_coordinate_system_that_leads_nowhere(tmp_path: Path) -> None:
+    local = 'ENGCRS["Site",EDATUM["Pole"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+    corner = Affine(1, 0, 5, 0, -1, 5)
+    tif = map_rasters.write_tif(tmp_path / "i.tif", map_rasters.texture(64, 64), local, corner)
+    with pytest.raises(MapError, match=r"i\.tif: .*(not on the earth|no coordinate system)"):
+        build(tif, tmp_path / "m.gpkg")
+    far = Affine(1, 0, 3e9, 0, -1, 5e9)  # UTM coordinates that are nowhere
+    tif = map_rasters.write_tif(tmp_path / "j.tif", map_rasters.texture(64, 64), "EPSG:32651", far)
+    with pytest.raises(MapError, match=r"j\.tif"):
+        build(tif, tmp_path / "m.gpkg")
+    assert not (tmp_path / "m.gpkg").exists()

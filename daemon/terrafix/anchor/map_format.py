@@ -1,24 +1,25 @@
-"""The format of a map package: tables, manifest, checksum, and the checks at opening."""
+"""The format of a map package: tables, manifest, checksum. What is written here is what is signed."""
 
 import hashlib
-import sqlite3
+import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-from urllib.parse import quote
 
 import msgspec
 
-from terrafix.core.errors import MapError
-
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 1: one imagery layer, elevation in a table of its own, placement outside the checksum
 APPLICATION_ID = 0x47504B47  # "GPKG", OGC 12-128r18 requirement 2
-IMAGERY_TABLE = "imagery"
+IMAGERY_TABLE = "imagery"  # the first layer; further ones are imagery_2, imagery_3, ...
+ELEVATION_TABLE = "elevation"
 MANIFEST_TABLE = "terrafix_manifest"
-HASH_TABLE = "terrafix_tile_hash"
-DEM_TABLE = "terrafix_dem"
+HASH_TABLE = "terrafix_hash"
+SIGNATURE_TABLE = "terrafix_signature"
 TILE_PX = 256
-DEM_TILE_PX = 256  # plus one column and row of the next tile, so that bilinear interpolation stays inside a tile
+DEM_TILE_PX = 256
+DEM_NULL = 65535  # void in a 16-bit elevation tile
+SIGNED_AS = b"terrafix map package\n"  # before the checksum in what is signed: the key may sign other things too
+
+HashRow = tuple[str, int, int, int, bytes]  # table, zoom, column, row, sha256
 
 
 class DemGrid(msgspec.Struct, frozen=True, kw_only=True):
@@ -29,26 +30,8 @@ class DemGrid(msgspec.Struct, frozen=True, kw_only=True):
     pixel: float  # CRS units
     width_px: int
     height_px: int
-
-
-class Manifest(msgspec.Struct, frozen=True, kw_only=True):
-    """What the package says about itself; one row each in the table terrafix_manifest."""
-
-    format_version: int
-    name: str
-    gsd_m: float  # ground metres per pixel of the finest level at the centre of the map
-    crs: str  # "EPSG:32651", or WKT
-    bounds_wgs84: tuple[float, float, float, float]  # west, south, east, north, degrees
-    date: str  # of the imagery, YYYY-MM-DD; empty = unknown
-    licence: str
-    source: str  # file name
-    source_sha256: str
-    built_with: str
-    has_dem: bool
-    dem: DemGrid | None
-    tiles: int  # imagery and elevation tiles together
-    checksum: str  # sha256 over the other rows and every tile's sha256
-    ce90_m: float | None = None  # radius that holds 90 % of the errors of position of this map; None: not stated
+    source: str = ""
+    licence: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,6 +45,59 @@ class Level:
     rows: int
 
 
+class Layer(msgspec.Struct, frozen=True, kw_only=True):
+    """One imagery layer: one date, one pixel grid. Layers of a package may differ in CRS."""
+
+    table: str
+    date: str  # of the imagery, YYYY-MM-DD; empty = unknown
+    licence: str
+    source: str  # file name
+    source_sha256: str
+    ce90_m: float | None  # radius that holds 90 % of the errors of position; None: not stated
+    gsd_m: float  # ground metres per pixel of the finest level at the centre of the layer
+    crs: str  # "EPSG:32651", or WKT
+    x_min: float  # corner of the tile matrices, CRS units
+    y_max: float
+    bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max of the imagery; the matrices reach beyond
+    levels: tuple[Level, ...]  # coarse to fine
+    tiles: int
+
+
+class VectorTable(msgspec.Struct, frozen=True, kw_only=True):
+    """A table of features; sha256 is over all its rows."""
+
+    table: str
+    features: int
+    sha256: str
+    source: str
+    date: str
+    licence: str
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True):
+    """What the package says about itself; one row each in the table terrafix_manifest.
+
+    What is said of imagery at the top is said of the newest layer, the one that is used when none is named."""
+
+    format_version: int
+    name: str
+    gsd_m: float
+    crs: str  # of the newest layer and of the elevation
+    bounds_wgs84: tuple[float, float, float, float]  # west, south, east, north, degrees
+    date: str
+    licence: str
+    source: str
+    source_sha256: str
+    built_with: str
+    has_dem: bool
+    dem: DemGrid | None
+    tiles: int  # of imagery and elevation together
+    checksum: str  # sha256 over the other rows and every tile's sha256
+    ce90_m: float | None = None
+    layers: tuple[Layer, ...] = ()  # newest first
+    vectors: tuple[VectorTable, ...] = ()
+
+
 def manifest_rows(manifest: Manifest) -> list[tuple[str, str]]:
     """(key, value) rows of the table: text as it is, everything else as JSON."""
     rows = []
@@ -71,62 +107,36 @@ def manifest_rows(manifest: Manifest) -> list[tuple[str, str]]:
     return rows
 
 
-def checksum_of(rows: list[tuple[str, str]], hashes: list[tuple[int, int, int, bytes]]) -> str:
-    """sha256 over the manifest rows but `checksum`, and over (zoom, column, row, sha256) of every tile, sorted."""
+def checksum_of(rows: Iterable[tuple[str, str]], hashes: Iterable[HashRow]) -> str:
+    """sha256 over the manifest rows but `checksum`, and over table, place and sha256 of every tile; both sorted."""
     digest = hashlib.sha256()
     for key, value in sorted(rows):
         if key != "checksum":
             digest.update(f"{key}={value}\n".encode())
-    for zoom, column, row, tile_hash in sorted(hashes):
-        digest.update(f"{zoom}/{column}/{row}:".encode() + tile_hash)
+    for table, zoom, column, row, tile_hash in sorted(hashes):
+        digest.update(f"{table}/{zoom}/{column}/{row}:".encode() + tile_hash)
     return digest.hexdigest()
 
 
-def connect(path: Path) -> sqlite3.Connection:
-    """Read-only connection after the checks that need no SQL."""
-    if not path.is_file():
-        raise MapError(f"{path}: no such map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'")
-    try:
-        with path.open("rb") as file:
-            head = file.read(100)
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read ({error.strerror})") from None
-    if head[:16] != b"SQLite format 3\x00" or len(head) < 100:
-        raise MapError(f"{path}: not a map package; make one with 'terrafix map build {path.name} --out MAP.gpkg'")
-    page = int.from_bytes(head[16:18], "big")
-    expected = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")  # sqlite.org/fileformat2.html
-    actual = path.stat().st_size
-    if actual < expected:
-        raise MapError(f"{path}: truncated map package ({actual} of {expected} bytes); copy or build it again")
-    # immutable: no locks and no journal beside the file, so that a read-only medium will do.
-    return sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)
+def tile_sha256(data: bytes, scale: float | None = None, offset: float | None = None) -> bytes:
+    """What is recorded of a tile; of an elevation tile with the scale and the offset that make metres of it."""
+    digest = hashlib.sha256(data)
+    if scale is not None and offset is not None:
+        digest.update(struct.pack("<dd", scale, offset))
+    return digest.digest()
 
 
-def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
-    tables = {row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    if db.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID or MANIFEST_TABLE not in tables:
-        raise MapError(f"{path}: not a Terrafix map package; make one with 'terrafix map build {path.name} --out ...'")
-    rows: dict[str, str] = dict(db.execute(f"SELECT key, value FROM {MANIFEST_TABLE}"))
-    version = rows.get("format_version", "")
-    if version.isdigit() and int(version) > FORMAT_VERSION:
-        raise MapError(
-            f"{path}: map package of format {version}, this Terrafix reads up to {FORMAT_VERSION}; update Terrafix"
-        )
-    fields: dict[str, Any] = {}
-    try:
-        for field in msgspec.structs.fields(Manifest):
-            if field.name not in rows and not field.required:
-                continue
-            text = rows[field.name]
-            fields[field.name] = text if field.type is str else msgspec.json.decode(text, type=field.type)
-    except (KeyError, msgspec.DecodeError) as error:
-        raise MapError(f"{path}: damaged manifest ({error}); build or copy the package again") from None
-    manifest = Manifest(**fields)
-    needed = {"gpkg_contents", "gpkg_tile_matrix", "gpkg_tile_matrix_set", IMAGERY_TABLE, HASH_TABLE}
-    missing = needed - tables
-    if missing:
-        raise MapError(f"{path}: damaged map package (no table {min(missing)}); build or copy it again")
-    hashes = db.execute(f"SELECT zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}").fetchall()
-    if len(hashes) != manifest.tiles or checksum_of(list(rows.items()), hashes) != manifest.checksum:
-        raise MapError(f"{path}: checksum mismatch, the package was altered; build or copy it again")
-    return manifest
+def features_sha256(rows: Iterable[tuple[int, bytes, str, str, str]]) -> str:
+    """sha256 over the rows (fid, geom, kind, name, attributes) of a table of features, in the order of their fid."""
+    digest = hashlib.sha256()
+    for fid, geometry, *texts in rows:
+        digest.update(struct.pack("<qI", fid, len(geometry)) + geometry)
+        for text in texts:
+            coded = (text or "").encode()
+            digest.update(struct.pack("<I", len(coded)) + coded)
+    return digest.hexdigest()
+
+
+def signed_bytes(checksum: str) -> bytes:
+    """What the signature of a package is over."""
+    return SIGNED_AS + checksum.encode()

@@ -1,27 +1,37 @@
 """Tiles of an open map package: fetched, checked against their sha256, decoded and kept in a bounded cache."""
 
-import hashlib
 import sqlite3
-import zlib
 from collections import OrderedDict
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 
-from terrafix.anchor.map_format import DEM_TABLE, DEM_TILE_PX, HASH_TABLE, IMAGERY_TABLE, TILE_PX, Level
+from terrafix.anchor import map_format1
+from terrafix.anchor.map_format import (
+    DEM_NULL,
+    DEM_TILE_PX,
+    ELEVATION_TABLE,
+    HASH_TABLE,
+    TILE_PX,
+    HashRow,
+    Level,
+    tile_sha256,
+)
 
 CACHE_BYTES = 100_000_000  # decoded tiles; about 500, a window of 1 km at 0.5 m/px needs about 100
 VOID_BYTES = 100  # what a void costs in the cache, so that a walk through nothing is bounded too
 
-Key = tuple[int, int, int]  # zoom (-1 = elevation), column, row
+Key = tuple[str, int, int, int]  # table, zoom, column, row
 Tile = tuple[np.ndarray, np.ndarray | None]  # pixels; mask of 0 and 255, or None when every pixel is valid
 
 
 class TileStore:
     """Decoded tiles. A tile that is damaged is void and listed in ``damaged``."""
 
-    def __init__(self, db: sqlite3.Connection) -> None:
+    def __init__(self, db: sqlite3.Connection, format_version: int) -> None:
         self._db = db
+        self._first_format = format_version == 1
         self.damaged: set[Key] = set()
         self._cache: OrderedDict[Key, Tile | None] = OrderedDict()
         self._cached_bytes = 0
@@ -29,7 +39,7 @@ class TileStore:
     def tile(self, key: Key) -> Tile | None:
         """(256, 256, 3) uint8 BGR and (256, 256) uint8 mask or None; None = nothing there.
 
-        Elevation (zoom -1): (257, 257) float32 metres AMSL, NaN = void, and no mask."""
+        Of the elevation table: (256, 256) float32 metres AMSL, NaN = void, and no mask."""
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]
@@ -40,7 +50,7 @@ class TileStore:
             self._cached_bytes -= _size(self._cache.popitem(last=False)[1])
         return tile
 
-    def mosaic(self, level: Level, u_0: int, v_0: int, width: int, height: int) -> Tile:
+    def mosaic(self, table: str, level: Level, u_0: int, v_0: int, width: int, height: int) -> Tile:
         """Pixels [v_0, v_0 + height) x [u_0, u_0 + width) of a level and their mask, or None when all are valid."""
         image = np.empty((height, width, 3), np.uint8)
         mask: np.ndarray | None = None
@@ -52,7 +62,7 @@ class TileStore:
                     slice(max(left, 0), min(left + TILE_PX, width)),
                 )
                 inside = 0 <= column < level.columns and 0 <= row < level.rows
-                tile = self.tile((level.zoom, column, row)) if inside else None
+                tile = self.tile((table, level.zoom, column, row)) if inside else None
                 if mask is None and (tile is None or tile[1] is not None):
                     mask = np.full((height, width), 255, np.uint8)
                 if tile is None:
@@ -69,39 +79,82 @@ class TileStore:
                     mask[target] = tile[1][part]
         return image, mask
 
-    def blob(self, key: Key) -> bytes | None:
-        """The bytes as stored."""
-        args: tuple[int, ...] = key
-        if key[0] < 0:
-            query, args = f"SELECT tile_data FROM {DEM_TABLE} WHERE tile_column = ? AND tile_row = ?", key[1:]
-        else:
-            query = f"SELECT tile_data FROM {IMAGERY_TABLE} WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
-        found = self._db.execute(query, args).fetchone()
-        return None if found is None else found[0]
+    def hashes(self) -> Iterator[HashRow]:
+        """What is recorded of every tile, in order."""
+        if self._first_format:
+            yield from sorted(map_format1.hashes(self._db))
+            return
+        yield from self._db.execute(f"SELECT table_name, zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}")
+
+    def is_whole(self, key: Key, sha256: bytes) -> bool:
+        """Whether the tile is there and is what was written."""
+        found = self._stored(key)
+        return found is not None and tile_sha256(*found) == sha256
 
     def clear(self) -> None:
         self._cache.clear()
         self._cached_bytes = 0
 
+    def _stored(self, key: Key) -> tuple[bytes, float | None, float | None] | None:
+        """Bytes as stored; with scale and offset for elevation."""
+        table, zoom, column, row = key
+        if table != ELEVATION_TABLE:
+            found = self._db.execute(
+                f'SELECT CAST(tile_data AS BLOB) FROM "{table}"'
+                " WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?",
+                (zoom, column, row),
+            ).fetchone()
+        elif self._first_format:
+            found = self._db.execute(
+                f"SELECT CAST(tile_data AS BLOB) FROM {map_format1.DEM_TABLE} WHERE tile_column = ? AND tile_row = ?",
+                (column, row),
+            ).fetchone()
+        else:
+            found = self._db.execute(
+                f"SELECT CAST(tile_data AS BLOB), scale, offset FROM {ELEVATION_TABLE}"
+                " JOIN gpkg_2d_gridded_tile_ancillary"
+                f" ON tpudt_name = '{ELEVATION_TABLE}' AND tpudt_id = {ELEVATION_TABLE}.id"
+                " WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?",
+                (zoom, column, row),
+            ).fetchone()
+            return None if found is None else (found[0], float(found[1]), float(found[2]))
+        return None if found is None else (found[0], None, None)
+
+    def _recorded(self, key: Key) -> bytes | None:
+        if self._first_format:
+            where = (-1 if key[0] == ELEVATION_TABLE else key[1], key[2], key[3])
+            found = self._db.execute(
+                f"SELECT sha256 FROM {map_format1.HASH_TABLE}"
+                " WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?",
+                where,
+            ).fetchone()
+        else:
+            found = self._db.execute(
+                f"SELECT sha256 FROM {HASH_TABLE}"
+                " WHERE table_name = ? AND zoom_level = ? AND tile_column = ? AND tile_row = ?",
+                key,
+            ).fetchone()
+        return None if found is None else found[0]
+
     def _decode(self, key: Key) -> Tile | None:
         try:
-            row = self._db.execute(
-                f"SELECT sha256 FROM {HASH_TABLE} WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?", key
-            ).fetchone()
-            data = self.blob(key)
-        except sqlite3.DatabaseError:  # a bad page on the disk
+            recorded, stored = self._recorded(key), self._stored(key)
+        except (sqlite3.DatabaseError, ValueError):  # a bad page on the disk
             self.damaged.add(key)
             return None
-        if row is None and data is None:
+        if recorded is None and stored is None:
             return None
-        if row is None or data is None or hashlib.sha256(data).digest() != row[0]:
+        if recorded is None or stored is None or tile_sha256(*stored) != recorded:
             self.damaged.add(key)
             return None
-        if key[0] < 0:
-            side = DEM_TILE_PX + 1
-            return np.frombuffer(zlib.decompress(data), dtype="<f4").reshape(side, side), None
+        data, scale, offset = stored
+        if key[0] == ELEVATION_TABLE and self._first_format:
+            return map_format1.heights(data), None
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         assert image is not None, f"tile {key} has its sha256 and does not decode"
+        if scale is not None and offset is not None:
+            assert image.shape == (DEM_TILE_PX, DEM_TILE_PX) and image.dtype == np.uint16
+            return np.where(image == DEM_NULL, np.nan, image * scale + offset).astype(np.float32), None
         if image.shape[2] == 4:
             return np.ascontiguousarray(image[:, :, :3]), np.where(image[:, :, 3] > 0, 255, 0).astype(np.uint8)
         return image, None

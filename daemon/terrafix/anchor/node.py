@@ -14,6 +14,7 @@ from terrafix.core.errors import ModelError
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
 from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.pose import tangent_to_world
+from terrafix.core.signature import trusted_keys
 from terrafix.messages import MapMatch, Message, Origin, Prediction, Vec3, Verdict
 from terrafix_engines.features import open_describer
 from terrafix_engines.runtime import ModelFileError
@@ -227,8 +228,10 @@ class AnchorNode:
 
 
 def make_node(ctx: NodeContext) -> AnchorNode:
-    """Opens the map and the model, before take-off. Raises MapError, ModelError."""
-    package = MapPackage.open(ctx.map_path) if ctx.map_path is not None else None
+    """Opens the map and the model, before take-off. Raises ConfigError, MapError, ModelError."""
+    wanted = ctx.config.map
+    trusted = trusted_keys(wanted.trusted_keys, required=wanted.require_signature)
+    package = MapPackage.open(ctx.map_path, trusted=trusted) if ctx.map_path is not None else None
     try:
         describer = open_describer(ctx.config.models.xfeat)
     except ModelFileError as error:

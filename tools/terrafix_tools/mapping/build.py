@@ -1,42 +1,38 @@
-"""Builds a map package from a GeoTIFF: tiles at several scales, elevation, manifest. Streams; any size."""
+"""Builds a map package: imagery layers as tiles at several scales, elevation, vectors, manifest. Streams; any size."""
 
 import contextlib
+import datetime
 import hashlib
-import math
 import os
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Generator, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import msgspec
-import numpy as np
 import rasterio
-import typer
 from pyproj import Transformer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rasterio.errors import RasterioError
 
-from terrafix.anchor.map_format import FORMAT_VERSION, TILE_PX, Level, Manifest
+from terrafix.anchor.map_format import FORMAT_VERSION, IMAGERY_TABLE, DemGrid, Layer, Manifest, VectorTable
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mapping.collar import BLEED_PX, TRIM_PX, Collar, find_collar
-from terrafix_tools.mapping.dem import DemSource
+from terrafix_tools.mapping.collar import find_collar
+from terrafix_tools.mapping.dem import DemSource, level_of, write_elevation
 from terrafix_tools.mapping.gpkg import GpkgWriter, new_package
+from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
+from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, render_chunks
+from terrafix_tools.mapping.progress import Bar, progress_bar
+from terrafix_tools.mapping.pyramid import Chunk, Pyramid, levels_of, open_renderer
 from terrafix_tools.mapping.source import ImagerySource
+from terrafix_tools.mapping.vectors import write_vectors
 
-JPEG_QUALITY = 95  # 8-11 MB/km2 at 0.3 m/px on aerial photographs; artefacts stay below a grey level or two
-PNG_LEVEL = 6  # partly valid tiles only, so that the mask stays exact
-CHUNK_LEVELS = 3  # the source is read in chunks of 2^3 tiles a side (2048 px)
 HASH_CHUNK = 1 << 20
-GDAL_CACHE_MB = 256  # GDAL's own choice is 5 % of the machine's memory
 
 BUILT_WITH = f"terrafix {version('terrafix')}, GDAL {rasterio.__gdal_version__}, OpenCV {cv2.__version__}"
-
-Step = Callable[[], None]
 
 
 def build(
@@ -47,33 +43,67 @@ def build(
     date: str = "",
     licence: str = "",
     ce90_m: float | None = None,
+    workers: int = 1,
     progress: bool = False,
 ) -> Path:
-    """Writes the package `out` from `imagery` (any GDAL raster with a CRS) and an elevation raster in metres AMSL.
+    """``build_package`` of one image (any GDAL raster with a CRS) and an elevation raster in metres AMSL."""
+    _check_out(out, imagery)
+    layer = layer_of(imagery, date=date, licence=licence, ce90_m=ce90_m)
+    elevation = ElevationInput(partial(DemSource, dem), source=dem.name) if dem else None
+    return build_package([layer], out, elevation=elevation, workers=workers, progress=progress)
 
-    ``ce90_m``: radius that holds 90 % of the imagery's errors of position, as its producer states it.
+
+def layer_of(imagery: Path, *, date: str = "", licence: str = "", ce90_m: float | None = None) -> LayerInput:
+    """An image as a layer. ``ce90_m``: radius that holds 90 % of its errors of position, as its producer states it.
+
+    Raises MapError and UsageError."""
+    with ImagerySource(imagery):  # says what is wrong with it before it is read to the end
+        pass
+    return LayerInput(
+        open=partial(ImagerySource, imagery),
+        source=imagery.name,
+        source_sha256=_sha256(imagery),
+        where=str(imagery),
+        date=date,
+        licence=licence,
+        ce90_m=ce90_m,
+    )
+
+
+def build_package(
+    layers: Sequence[LayerInput],
+    out: Path,
+    *,
+    elevation: ElevationInput | None = None,
+    vectors: VectorInput | None = None,
+    workers: int = 1,
+    progress: bool = False,
+) -> Path:
+    """Writes the package `out`. ``workers``: processes that read and encode imagery; their number changes no byte.
 
     The same input gives the same bytes. Nothing is left at `out` or beside it when this fails or is interrupted.
-    Raises MapError (imagery or elevation unusable) and OutputError."""
-    _check_date(date)
-    if out.is_dir():
-        raise OutputError(f"{out}: is a folder; give the name of a file to write, for example {out / 'map.gpkg'}")
-    if out.exists() and out.samefile(imagery):
-        raise OutputError(f"{out}: would overwrite the imagery; give another --out")
-    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), ImagerySource(imagery) as source, contextlib.ExitStack() as stack:
-        heights = stack.enter_context(DemSource(dem, source.crs, source.bounds)) if dem else None
+    With several workers this must be called from a program that may be imported again (``multiprocessing`` spawn).
+    Raises MapError (something that goes in is unusable), UsageError and OutputError."""
+    for layer in layers:
+        _check_date(layer.date)
+    _check_out(out)
+    # Newest first; unknown dates last, and in the order given.
+    ordered = sorted(layers, key=lambda layer: layer.date, reverse=True)
+    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), contextlib.ExitStack() as stack:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.")))
+            bar = stack.enter_context(progress_bar(progress))
             part = scratch / "part.gpkg"
-            bar = stack.enter_context(_progress_bar(progress))
-            collar = None if source.has_mask else find_collar(source, scratch / "collar.tif", bar)
-            if collar:
-                stack.callback(collar.close)
-            _write(part, source, heights, collar, imagery, out.stem, date, licence, ce90_m, bar)
+            with new_package(part) as (writer, db):
+                _Build(writer, db, scratch, out.stem, workers, bar).write(ordered, elevation, vectors)
             with part.open("rb") as file:
                 os.fsync(file.fileno())
             part.replace(out)
+        except RasterioError as error:  # some of them are OSErrors, too
+            raise MapError(
+                f"{out}: not built, a raster cannot be read or kept ({error}); check it, and space"
+            ) from None
         except OSError as error:
             raise OutputError(f"{out}: cannot be written ({error.strerror or error}); check folder and space") from None
         except sqlite3.OperationalError as error:
@@ -107,181 +137,113 @@ def ensure_package(
     return build(path, cached, dem=dem, date=date, licence=licence, progress=progress)
 
 
-def info(package: Path) -> None:
-    """Prints the manifest as JSON, after a check of every tile. Raises MapError."""
-    opened = MapPackage.open(package, verify=True)
-    text = msgspec.json.format(msgspec.json.encode(opened.manifest), indent=2).decode()
-    opened.close()
-    typer.echo(text)
+class _Build:
+    """One package while it is written."""
 
+    def __init__(
+        self, writer: GpkgWriter, db: sqlite3.Connection, scratch: Path, name: str, workers: int, bar: Bar
+    ) -> None:
+        self._writer, self._db, self._scratch, self._name = writer, db, scratch, name
+        self._workers, self._bar = workers, bar
 
-def preview(package: Path, out: Path, size_px: int) -> None:
-    """Writes the whole map, north up, as a PNG with transparent voids. Raises MapError, OutputError."""
-    opened = MapPackage.open(package)
-    west, south, east, north = opened.manifest.bounds_wgs84
-    local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
-    e_min, n_min, e_max, n_max = local.bounds_m
-    gsd_m = max(e_max - e_min, n_max - n_min) / size_px
-    shape = max(1, round((e_max - e_min) / gsd_m)), max(1, round((n_max - n_min) / gsd_m))
-    image, valid = local.window(e_min, n_max, *shape, gsd_m)
-    opened.close()
-    png = cv2.imencode(".png", np.dstack([image, np.where(valid, 255, 0).astype(np.uint8)]))[1]
-    try:
-        out.write_bytes(png.tobytes())
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
+    def write(self, layers: list[LayerInput], elevation: ElevationInput | None, vectors: VectorInput | None) -> None:
+        written: list[Layer] = []
+        dem: DemGrid | None = None
+        for number, given in enumerate(layers, start=1):
+            table = IMAGERY_TABLE if number == 1 else f"{IMAGERY_TABLE}_{number}"
+            with given.open() as source:
+                written.append(self._layer(given, source, table))
+                if number == 1 and elevation:
+                    dem = self._elevation(elevation, source)
+        tables: tuple[VectorTable, ...] = ()
+        if vectors:
+            tables = write_vectors(self._writer, self._db, vectors)
+        self._manifest(written, dem, tables)
 
-
-def _write(
-    part: Path,
-    source: ImagerySource,
-    heights: DemSource | None,
-    collar: Collar | None,
-    imagery: Path,
-    name: str,
-    date: str,
-    licence: str,
-    ce90_m: float | None,
-    bar: Callable[[str, int | None], Step],
-) -> None:
-    levels = _levels(source)
-    with new_package(part) as writer:
-        writer.add_imagery_tables(source.crs, levels, source.bounds, name, date, licence)
-        chunk_px = TILE_PX << CHUNK_LEVELS
-        chunks = math.ceil(source.width_px / chunk_px) * math.ceil(source.height_px / chunk_px)
-        pyramid = _Pyramid(source, collar, writer, levels, bar("imagery", chunks))
-        pyramid.write()
-        if not pyramid.any_valid:
-            raise MapError(f"{imagery}: no valid pixel in the whole image")
-        if heights:
-            heights.write(writer, bar("elevation", heights.tile_count))
-        to_wgs84 = Transformer.from_crs(source.crs, 4326, always_xy=True)
-        bounds = tuple(round(float(v), 9) for v in to_wgs84.transform_bounds(*source.bounds, densify_pts=51))
+    def _layer(self, given: LayerInput, source: Imagery, table: str) -> Layer:
+        levels = levels_of(source)
         authority = source.crs.to_authority(min_confidence=100)
-        writer.add_manifest(
+        layer = Layer(
+            table=table,
+            date=given.date,
+            licence=given.licence,
+            source=given.source,
+            source_sha256=given.source_sha256,
+            ce90_m=given.ce90_m,
+            gsd_m=source.gsd_m,
+            crs=":".join(authority) if authority else source.crs.to_wkt(),
+            x_min=source.x_min,
+            y_max=source.y_max,
+            bounds=source.bounds,
+            levels=levels,
+            tiles=0,
+        )
+        self._writer.add_imagery_table(layer, self._name)
+        collar_file = self._scratch / f"{table}-collar.tif"
+        collar = None if source.has_mask else find_collar(source, collar_file, self._bar)
+        if collar:
+            collar.close()
+        opener = partial(open_renderer, given.open, collar_file if collar else None, levels[-1].zoom)
+        pyramid = Pyramid(source, levels, table, self._writer)
+        places = pyramid.places()
+        step = self._bar(table, len(places))
+
+        def counted() -> Generator[Chunk, None, None]:
+            for chunk in render_chunks(opener, places, self._workers):
+                step()
+                yield chunk
+
+        with contextlib.closing(counted()) as chunks:
+            if not pyramid.write(chunks):
+                raise MapError(f"{given.where or given.source}: no valid pixel in the whole image")
+        return msgspec.structs.replace(layer, tiles=self._writer.tiles[table])
+
+    def _elevation(self, given: ElevationInput, source: Imagery) -> DemGrid:
+        with given.open(source.crs, source.bounds) as elevation:
+            level = level_of(elevation.grid)
+            step = self._bar("elevation", level.columns * level.rows)
+            return write_elevation(self._writer, given, elevation, source.crs, step)
+
+    def _manifest(self, layers: list[Layer], dem: DemGrid | None, vectors: tuple[VectorTable, ...]) -> None:
+        newest = layers[0]
+        to_wgs84 = Transformer.from_crs(newest.crs, 4326, always_xy=True)
+        bounds = tuple(round(float(v), 9) for v in to_wgs84.transform_bounds(*newest.bounds, densify_pts=51))
+        self._writer.add_manifest(
             Manifest(
                 format_version=FORMAT_VERSION,
-                name=name,
-                gsd_m=source.gsd_m,
-                crs=":".join(authority) if authority else source.crs.to_wkt(),
+                name=self._name,
+                gsd_m=newest.gsd_m,
+                crs=newest.crs,
                 bounds_wgs84=(bounds[0], bounds[1], bounds[2], bounds[3]),
-                date=date,
-                licence=licence,
-                source=imagery.name,
-                source_sha256=_sha256(imagery),
+                date=newest.date,
+                licence=newest.licence,
+                source=newest.source,
+                source_sha256=newest.source_sha256,
                 built_with=BUILT_WITH,
-                has_dem=heights is not None,
-                dem=heights.grid if heights else None,
-                tiles=writer.tiles,
+                has_dem=dem is not None,
+                dem=dem,
+                tiles=sum(self._writer.tiles.values()),
                 checksum="",
-                ce90_m=ce90_m,
+                ce90_m=newest.ce90_m,
+                layers=tuple(layers),
+                vectors=vectors,
             )
         )
 
 
-def _levels(source: ImagerySource) -> list[Level]:
-    """Levels from one tile to the source's own pixels; every matrix covers the same area (requirement 45)."""
-    steps = max(0, math.ceil(math.log2(max(source.width_px, source.height_px) / TILE_PX)))
-    columns = math.ceil(source.width_px / (TILE_PX << steps))
-    rows = math.ceil(source.height_px / (TILE_PX << steps))
-    return [
-        Level(z, source.pixel_x * 2 ** (steps - z), source.pixel_y * 2 ** (steps - z), columns << z, rows << z)
-        for z in range(steps + 1)
-    ]
-
-
-class _Pyramid:
-    """Tiles of all levels, depth first: a tile is the mean of its four children, so only a path is in memory."""
-
-    def __init__(
-        self, source: ImagerySource, collar: Collar | None, writer: GpkgWriter, levels: list[Level], on_chunk: Step
-    ) -> None:
-        self._source, self._collar, self._writer, self._on_chunk = source, collar, writer, on_chunk
-        self._finest = levels[-1].zoom
-        self._root = levels[0]
-        self.any_valid = False
-
-    def write(self) -> None:
-        for row in range(self._root.rows):
-            for column in range(self._root.columns):
-                self._tile(0, column, row, None)
-
-    def _tile(self, zoom: int, column: int, row: int, chunk: np.ndarray | None) -> np.ndarray | None:
-        """(256, 256, 4) uint8 BGR and mask of a tile, after writing it and all below it; None = nothing there.
-
-        `chunk`: the source's pixels under this tile, once read."""
-        depth = self._finest - zoom
-        side = TILE_PX << depth
-        if column * side >= self._source.width_px or row * side >= self._source.height_px:
-            return None
-        if chunk is None and depth <= CHUNK_LEVELS:
-            chunk = self._read(column * side, row * side, side)
-            self._on_chunk()
-        if chunk is not None and not chunk[:, :, 3].any():
-            return None
-        if depth == 0:
-            assert chunk is not None
-            tile = chunk
-        else:
-            merged = np.zeros((2 * TILE_PX, 2 * TILE_PX, 4), np.uint8)
-            half = side // 2
-            for r in (0, 1):
-                for c in (0, 1):
-                    part = None
-                    if chunk is not None:
-                        part = chunk[r * half : (r + 1) * half, c * half : (c + 1) * half]
-                    child = self._tile(zoom + 1, 2 * column + c, 2 * row + r, part)
-                    if child is not None:
-                        merged[r * TILE_PX : (r + 1) * TILE_PX, c * TILE_PX : (c + 1) * TILE_PX] = child
-            tile = halve(merged)
-            if not tile[:, :, 3].any():
-                return None
-        self.any_valid = True
-        self._writer.add_tile(zoom, column, row, encode(tile))
-        return tile
-
-    def _read(self, column: int, row: int, side: int) -> np.ndarray:
-        """(side, side, 4) uint8: BGR, zero where invalid, and the mask."""
-        out = np.zeros((side, side, 4), np.uint8)
-        right, bottom = min(column + side, self._source.width_px), min(row + side, self._source.height_px)
-        margin = BLEED_PX + TRIM_PX if self._collar else 0
-        left, top = max(0, column - margin), max(0, row - margin)
-        width = min(right + margin, self._source.width_px) - left
-        height = min(bottom + margin, self._source.height_px) - top
-        image, mask = self._source.read(left, top, width, height)
-        if self._collar:
-            self._collar.remove(image, mask, left, top)
-        image[mask == 0] = 0
-        inner = slice(row - top, bottom - top), slice(column - left, right - left)
-        out[: bottom - row, : right - column, :3] = image[inner]
-        out[: bottom - row, : right - column, 3] = mask[inner]
-        return out
-
-
-def halve(tile: np.ndarray) -> np.ndarray:
-    """(2h, 2w, 4) -> (h, w, 4): mean of the valid ones of four pixels; valid when at least two of them are."""
-    parts = tile.reshape(tile.shape[0] // 2, 2, tile.shape[1] // 2, 2, 4).astype(np.uint16)
-    total = parts[..., :3].sum(axis=(1, 3))  # invalid pixels are zero
-    count = (parts[..., 3] > 0).sum(axis=(1, 3)).astype(np.uint16)
-    out = np.zeros((*count.shape, 4), np.uint8)
-    weight = np.maximum(count, 1)[..., None]
-    valid = count >= 2
-    out[..., :3] = np.where(valid[..., None], (total + weight // 2) // weight, 0)
-    out[..., 3] = np.where(valid, 255, 0)
-    return out
-
-
-def encode(tile: np.ndarray) -> bytes:
-    """JPEG when every pixel is valid, else PNG with alpha, both of which any GeoPackage reader knows."""
-    if tile[:, :, 3].all():
-        return cv2.imencode(".jpg", tile[:, :, :3], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-    return cv2.imencode(".png", tile, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
+def _check_out(out: Path, imagery: Path | None = None) -> None:
+    if out.is_dir():
+        raise OutputError(f"{out}: is a folder; give the name of a file to write, for example {out / 'map.gpkg'}")
+    if imagery is not None and out.exists() and imagery.exists() and out.samefile(imagery):
+        raise OutputError(f"{out}: would overwrite the imagery; give another --out")
 
 
 def _check_date(date: str) -> None:
-    parts = date.split("-")
-    sizes = [len(p) for p in parts]
-    if date and not (sizes == [4, 2, 2] and all(p.isdigit() for p in parts)):
+    try:
+        good = not date or datetime.date.fromisoformat(date).isoformat() == date
+    except ValueError:
+        good = False
+    if not good:
         raise UsageError(f"date '{date}' of the imagery: write it YYYY-MM-DD")
 
 
@@ -291,16 +253,3 @@ def _sha256(path: Path) -> str:
         while chunk := file.read(HASH_CHUNK):
             digest.update(chunk)
     return digest.hexdigest()
-
-
-@contextlib.contextmanager
-def _progress_bar(shown: bool) -> Iterator[Callable[[str, int | None], Step]]:
-    """Gives a function (name, steps or None) -> step()."""
-    columns = (TextColumn("{task.description:>9}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
-
-        def start(name: str, total: int | None) -> Step:
-            task = progress.add_task(name, total=total)
-            return lambda: progress.advance(task)
-
-        yield start

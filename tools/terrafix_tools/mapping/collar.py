@@ -8,9 +8,10 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from terrafix_tools.mapping.source import ImagerySource
+from terrafix_tools.mapping.layers import Imagery
 
 BLOCK_PX = 2048  # labelled at a time
 MIN_COLLAR_PX = 256  # less than this at the border is shadow, glare or compression noise
@@ -45,14 +46,12 @@ class Collar:
         self._file.close()
 
 
-def find_collar(
-    source: ImagerySource, scratch: Path, bar: Callable[[str, int | None], Callable[[], None]]
-) -> Collar | None:
+def find_collar(source: Imagery, scratch: Path, bar: Callable[[str, int | None], Callable[[], None]]) -> Collar | None:
     """Collar of an image, or None when there is none. Writes and leaves `scratch`. ``bar(name, steps) -> step()``."""
     if not _border_is_empty(source):
         return None
     width, height = source.width_px, source.height_px
-    on_step = bar("collar", math.ceil(width / BLOCK_PX) * math.ceil(height / BLOCK_PX))
+    on_step = bar("collar", 2 * math.ceil(width / BLOCK_PX) * math.ceil(height / BLOCK_PX))
     sets = _DisjointSets()
     above: dict[int, np.ndarray] = {}  # labels of the last line of the block row above, by block column
     for block_row in range(0, height, BLOCK_PX):
@@ -76,8 +75,9 @@ def find_collar(
     chosen = sets.collar()
     if not chosen.any():
         return None
+    placement = Affine(source.pixel_x, 0, source.x_min, 0, -source.pixel_y, source.y_max)
     profile: dict[str, Any] = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "uint8"}
-    profile |= {"crs": source.crs.to_wkt(), "transform": source.transform, "tiled": True, "blockxsize": 256}
+    profile |= {"crs": source.crs.to_wkt(), "transform": placement, "tiled": True, "blockxsize": 256}
     profile |= {"blockysize": 256, "compress": "deflate", "nbits": 1, "BIGTIFF": "IF_SAFER"}
     numbering = _DisjointSets()
     with rasterio.open(scratch, "w", **profile) as out:
@@ -92,10 +92,12 @@ def find_collar(
 
 def _empty(image: np.ndarray, tolerance: int) -> np.ndarray:
     """(h, w) uint8, 1 where a BGR pixel is black or white within the tolerance."""
-    return ((image.max(axis=2) <= tolerance) | (image.min(axis=2) >= 255 - tolerance)).astype(np.uint8)
+    black = cv2.inRange(image, (0, 0, 0), (tolerance,) * 3)
+    white = cv2.inRange(image, (255 - tolerance,) * 3, (255,) * 3)
+    return ((black > 0) | (white > 0)).astype(np.uint8)
 
 
-def _border_is_empty(source: ImagerySource) -> bool:
+def _border_is_empty(source: Imagery) -> bool:
     width, height = source.width_px, source.height_px
     edges = ((0, 0, width, 1), (0, height - 1, width, 1), (0, 0, 1, height), (width - 1, 0, 1, height))
     return any(bool(_empty(source.read(*edge)[0], 0).any()) for edge in edges)
@@ -140,7 +142,7 @@ class _DisjointSets:
         return np.array([label > 0 and self.find(label) in roots for label in range(len(self.parent))])
 
 
-def _labels(source: ImagerySource, column: int, row: int, sets: _DisjointSets) -> np.ndarray:
+def _labels(source: Imagery, column: int, row: int, sets: _DisjointSets) -> np.ndarray:
     """(h, w) int32 labels of the empty areas of one block, numbered on through all blocks; 0 = picture."""
     width, height = min(BLOCK_PX, source.width_px - column), min(BLOCK_PX, source.height_px - row)
     empty = _empty(source.read(column, row, width, height)[0], 0)

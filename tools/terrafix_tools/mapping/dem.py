@@ -1,34 +1,39 @@
-"""Elevation for a map package: a raster of metres AMSL, resampled to the map's CRS in tiles."""
+"""Elevation for a map package: a raster of metres AMSL, resampled to the map's CRS in tiles of 16 bits."""
 
 import math
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
+import cv2
 import numpy as np
 from pyproj import CRS, Transformer
 from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
-from terrafix.anchor.map_format import DEM_TILE_PX, DemGrid
+from terrafix.anchor.map_format import DEM_NULL, DEM_TILE_PX, DemGrid, Level
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping.gpkg import GpkgWriter
+from terrafix_tools.mapping.layers import Bounds, Elevation, ElevationInput
 from terrafix_tools.mapping.source import SAMPLE_PX, crs_of, ground_distance_m, ground_pixel_m, open_raster
 
 PLAUSIBLE_M = (-500.0, 9000.0)  # the shore of the Dead Sea is at -430 m, Everest at 8849 m; the rest is void
 FINEST_M = 1.0  # finer elevation than this adds megabytes, not accuracy
 OVERSAMPLING = 2  # bilinear twice on one grid rounds off ridges: 0.7 m rms on 90 m posts in mountains, 0.2 m this way
 MARGIN_M = 500.0  # beyond the imagery: an oblique ray may meet the ground outside it
-ZLIB_LEVEL = 6
+STEP_M = 0.01  # of the stored heights; a tile with more than 655 m between its lowest and highest has coarser ones
+PNG_LEVEL = 6
 
 
 class DemSource:
-    """Elevation on a square north-up grid in the map's CRS. A context manager."""
+    """Elevation on a square north-up grid in the map's CRS, from any GDAL raster. A context manager.
 
-    def __init__(self, path: Path, crs: CRS, bounds: tuple[float, float, float, float]) -> None:
+    Raises MapError: not a raster, not placed on the earth, or nowhere near the map."""
+
+    def __init__(self, path: Path, crs: CRS, bounds: Bounds) -> None:
         self.path = path
         self._file = open_raster(path)
         dem_crs = crs_of(self._file, path)
@@ -45,16 +50,14 @@ class DemSource:
             width_px=math.ceil((x_max - x_min + 2 * margin) / pixel) + 1,
             height_px=math.ceil((y_max - y_min + 2 * margin) / pixel) + 1,
         )
-        self._columns = math.ceil(self.grid.width_px / DEM_TILE_PX)
-        self._rows = math.ceil(self.grid.height_px / DEM_TILE_PX)
-        self.tile_count = self._columns * self._rows
+        level = level_of(self.grid)
         self._data = WarpedVRT(
             self._file,
             src_crs=dem_crs.to_wkt(),
             crs=crs.to_wkt(),
             transform=Affine(pixel, 0, self.grid.x_min, 0, -pixel, self.grid.y_max),
-            width=self._columns * DEM_TILE_PX + 1,
-            height=self._rows * DEM_TILE_PX + 1,
+            width=level.columns * DEM_TILE_PX,
+            height=level.rows * DEM_TILE_PX,
             resampling=Resampling.bilinear,
             src_nodata=self._void_value(),
             nodata=math.nan,
@@ -70,21 +73,16 @@ class DemSource:
         self._data.close()
         self._file.close()
 
-    def write(self, writer: GpkgWriter, on_tile: Callable[[], None]) -> None:
-        """All tiles that know something, row by row. Raises MapError when none does."""
-        written = 0
-        for row in range(self._rows):
-            for column in range(self._columns):
-                window = Window(column * DEM_TILE_PX, row * DEM_TILE_PX, DEM_TILE_PX + 1, DEM_TILE_PX + 1)
-                height_m = self._data.read(1, window=window)
-                plausible = (height_m >= PLAUSIBLE_M[0]) & (height_m <= PLAUSIBLE_M[1])
-                height_m = np.where(plausible, height_m, np.float32(np.nan))
-                on_tile()
-                if plausible.any():
-                    writer.add_tile(-1, column, row, zlib.compress(height_m.astype("<f4").tobytes(), ZLIB_LEVEL))
-                    written += 1
-        if not written:
-            raise MapError(f"{self.path}: no elevation under the imagery; give a DEM that covers it")
+    def read_tile(self, column: int, row: int) -> np.ndarray:
+        """As ``Elevation``. Raises MapError: the file is damaged."""
+        window = Window(column * DEM_TILE_PX, row * DEM_TILE_PX, DEM_TILE_PX, DEM_TILE_PX)
+        try:
+            return self._data.read(1, window=window)
+        except RasterioError as error:
+            raise self._unreadable(error) from None
+
+    def _unreadable(self, error: RasterioError) -> MapError:
+        return MapError(f"{self.path}: elevation cannot be read ({error}); check or download the file again")
 
     def _native_pixel_m(self, crs: CRS, dem_crs: CRS, x: float, y: float) -> float:
         """Finer side of the DEM's pixel on the ground, metres, near (x, y) of the map's CRS."""
@@ -103,9 +101,64 @@ class DemSource:
             return float(self._file.nodata)
         shrink = max(1.0, max(self._file.width, self._file.height) / SAMPLE_PX)
         shape = (max(1, int(self._file.height / shrink)), max(1, int(self._file.width / shrink)))
-        sample = self._file.read(1, out_shape=shape)
+        try:
+            sample = self._file.read(1, out_shape=shape)
+        except RasterioError as error:
+            raise self._unreadable(error) from None
         wrong = sample[np.isfinite(sample) & ((sample < PLAUSIBLE_M[0]) | (sample > PLAUSIBLE_M[1]))]
         if wrong.size == 0:
             return None
         values, counts = np.unique(wrong, return_counts=True)
         return float(values[np.argmax(counts)])
+
+
+def level_of(grid: DemGrid) -> Level:
+    """The one tile matrix of an elevation grid."""
+    return Level(
+        0, grid.pixel, grid.pixel, math.ceil(grid.width_px / DEM_TILE_PX), math.ceil(grid.height_px / DEM_TILE_PX)
+    )
+
+
+def write_elevation(
+    writer: GpkgWriter, given: ElevationInput, elevation: Elevation, crs: CRS, on_tile: Callable[[], None]
+) -> DemGrid:
+    """All tiles that know something, row by row; returns the grid as the manifest says it.
+
+    Raises MapError when no tile knows anything."""
+    plain = elevation.grid
+    grid = DemGrid(
+        x_min=plain.x_min,
+        y_max=plain.y_max,
+        pixel=plain.pixel,
+        width_px=plain.width_px,
+        height_px=plain.height_px,
+        source=given.source,
+        licence=given.licence,
+    )
+    level = level_of(grid)
+    writer.add_elevation_table(grid, crs, level, STEP_M)
+    written = 0
+    for row in range(level.rows):
+        for column in range(level.columns):
+            height_m = elevation.read_tile(column, row)
+            plausible = (height_m >= PLAUSIBLE_M[0]) & (height_m <= PLAUSIBLE_M[1])  # NaN is not
+            on_tile()
+            if not plausible.any():
+                continue
+            data, scale, offset = encode_heights(height_m, plausible)
+            known = height_m[plausible].astype(np.float64)
+            statistics = (float(known.min()), float(known.max()), float(known.mean()), float(known.std()))
+            writer.add_elevation_tile(column, row, data, scale, offset, statistics)
+            written += 1
+    if not written:
+        raise MapError(f"{given.source}: no elevation under the imagery; give a DEM that covers it")
+    return grid
+
+
+def encode_heights(height_m: np.ndarray, known: np.ndarray) -> tuple[bytes, float, float]:
+    """16-bit PNG, and the scale and offset that make metres of its values; void where not ``known``."""
+    low, high = float(height_m[known].min()), float(height_m[known].max())
+    scale = max(STEP_M, (high - low) / (DEM_NULL - 1))
+    steps = np.rint((np.where(known, height_m, low).astype(np.float64) - low) / scale)
+    coded = np.where(known, steps, DEM_NULL).astype(np.uint16)
+    return cv2.imencode(".png", coded, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes(), scale, low

@@ -1,6 +1,7 @@
-"""The GeoPackage file itself: OGC tables (OGC 12-128r18, version 1.3) and ours, written the same way every time."""
+"""Writes the GeoPackage file: tables of the standard and ours, the same bytes every time."""
 
-import hashlib
+import json
+import re
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,51 +12,29 @@ from pyproj.enums import WktVersion
 
 from terrafix.anchor.map_format import (
     APPLICATION_ID,
-    DEM_TABLE,
+    DEM_NULL,
+    DEM_TILE_PX,
+    ELEVATION_TABLE,
     HASH_TABLE,
-    IMAGERY_TABLE,
     MANIFEST_TABLE,
+    SIGNATURE_TABLE,
     TILE_PX,
+    DemGrid,
+    Layer,
     Level,
     Manifest,
     checksum_of,
     manifest_rows,
+    tile_sha256,
 )
+from terrafix_tools.mapping import gpkg_schema
+from terrafix_tools.mapping.layers import Bounds
 
 GPKG_VERSION = 10300  # requirement 2: user_version MMmmPP
-CUSTOM_SRS_ID = 100_000  # a CRS without an EPSG code
+WGS84, WGS84_3D = 4326, 4979
+CUSTOM_SRS_ID = 100_000  # the first CRS without an EPSG code
 UNDATED = "1970-01-01"  # last_change must be set, and must not make two builds of one input differ
-
-SCHEMA = f"""
-CREATE TABLE gpkg_spatial_ref_sys (
-  srs_name TEXT NOT NULL, srs_id INTEGER NOT NULL PRIMARY KEY, organization TEXT NOT NULL,
-  organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
-CREATE TABLE gpkg_contents (
-  table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE, description TEXT DEFAULT '',
-  last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
-  min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER,
-  CONSTRAINT fk_gc_r_srs_id FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
-CREATE TABLE gpkg_tile_matrix_set (
-  table_name TEXT NOT NULL PRIMARY KEY, srs_id INTEGER NOT NULL,
-  min_x DOUBLE NOT NULL, min_y DOUBLE NOT NULL, max_x DOUBLE NOT NULL, max_y DOUBLE NOT NULL,
-  CONSTRAINT fk_gtms_table_name FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name),
-  CONSTRAINT fk_gtms_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
-CREATE TABLE gpkg_tile_matrix (
-  table_name TEXT NOT NULL, zoom_level INTEGER NOT NULL, matrix_width INTEGER NOT NULL, matrix_height INTEGER NOT NULL,
-  tile_width INTEGER NOT NULL, tile_height INTEGER NOT NULL, pixel_x_size DOUBLE NOT NULL, pixel_y_size DOUBLE NOT NULL,
-  CONSTRAINT pk_ttm PRIMARY KEY (table_name, zoom_level),
-  CONSTRAINT fk_tmm_table_name FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name));
-CREATE TABLE {IMAGERY_TABLE} (
-  id INTEGER PRIMARY KEY AUTOINCREMENT, zoom_level INTEGER NOT NULL, tile_column INTEGER NOT NULL,
-  tile_row INTEGER NOT NULL, tile_data BLOB NOT NULL, UNIQUE (zoom_level, tile_column, tile_row));
-CREATE TABLE {MANIFEST_TABLE} (id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL UNIQUE, value TEXT NOT NULL);
-CREATE TABLE {HASH_TABLE} (
-  zoom_level INTEGER NOT NULL, tile_column INTEGER NOT NULL, tile_row INTEGER NOT NULL, sha256 BLOB NOT NULL,
-  PRIMARY KEY (zoom_level, tile_column, tile_row)) WITHOUT ROWID;
-CREATE TABLE {DEM_TABLE} (
-  tile_column INTEGER NOT NULL, tile_row INTEGER NOT NULL, tile_data BLOB NOT NULL,
-  PRIMARY KEY (tile_column, tile_row));
-"""
+DUBLIN_CORE = "http://purl.org/dc/terms/"
 
 
 class GpkgWriter:
@@ -63,91 +42,157 @@ class GpkgWriter:
 
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
-        self.tiles = 0
-        self.tile_bytes = 0
+        self._srs: dict[str, int] = {}
+        self.tiles: dict[str, int] = {}  # by table
         db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         db.execute(f"PRAGMA user_version = {GPKG_VERSION}")
-        for statement in SCHEMA.split(";\n"):
+        self.create(gpkg_schema.CORE)
+        self.add_extension("gpkg_spatial_ref_sys", "definition_12_063", "gpkg_crs_wkt")
+        self.add_extension("gpkg_metadata", None, "gpkg_metadata")
+        self.add_extension("gpkg_metadata_reference", None, "gpkg_metadata")
+        self._add_undefined_srs()
+        self.add_contents(MANIFEST_TABLE, "attributes", "", "What this map is; written by Terrafix", None, None)
+        self.add_contents(SIGNATURE_TABLE, "attributes", "", "Who vouches for it; written by Terrafix", None, None)
+        self.add_extension(HASH_TABLE, None, "terrafix_map")
+
+    def create(self, statements: str) -> None:
+        for statement in re.split(r";\n(?=CREATE|$)", statements.strip() + "\n"):
             if statement.strip():
-                db.execute(statement)
+                self._db.execute(statement)
 
-    def add_tile(self, zoom: int, column: int, row: int, data: bytes) -> None:
-        """An imagery tile (JPEG or PNG), or with zoom -1 an elevation tile."""
-        if zoom < 0:
-            self._db.execute(f"INSERT INTO {DEM_TABLE} VALUES (?, ?, ?)", (column, row, data))
-        else:
-            self._db.execute(
-                f"INSERT INTO {IMAGERY_TABLE} (zoom_level, tile_column, tile_row, tile_data) VALUES (?, ?, ?, ?)",
-                (zoom, column, row, data),
-            )
-        digest = hashlib.sha256(data).digest()
-        self._db.execute(f"INSERT INTO {HASH_TABLE} VALUES (?, ?, ?, ?)", (zoom, column, row, digest))
-        self.tiles += 1
-        self.tile_bytes += len(data)
-
-    def add_imagery_tables(
-        self,
-        crs: CRS,
-        levels: list[Level],
-        bounds: tuple[float, float, float, float],
-        name: str,
-        date: str,
-        licence: str,
+    def add_contents(
+        self, table: str, kind: str, date: str, description: str, bounds: Bounds | None, srs_id: int | None
     ) -> None:
-        """Spatial reference, contents and tile matrices. `bounds`: x_min, y_min, x_max, y_max of the imagery."""
-        srs_id = self._add_srs(crs)
         changed = f"{date or UNDATED}T00:00:00.000Z"
-        self._db.execute(
-            "INSERT INTO gpkg_contents VALUES (?, 'tiles', ?, ?, ?, ?, ?, ?, ?, ?)",
-            (IMAGERY_TABLE, name, licence, changed, *bounds, srs_id),
-        )
-        self._db.execute(
-            "INSERT INTO gpkg_contents VALUES (?, 'attributes', ?, ?, ?, NULL, NULL, NULL, NULL, NULL)",
-            (MANIFEST_TABLE, MANIFEST_TABLE, "What this map is; written by Terrafix", changed),
-        )
-        finest = levels[-1]
-        x_min, y_max = bounds[0], bounds[3]
-        x_max = x_min + finest.columns * TILE_PX * finest.pixel_x
-        y_min = y_max - finest.rows * TILE_PX * finest.pixel_y
-        self._db.execute(
-            "INSERT INTO gpkg_tile_matrix_set VALUES (?, ?, ?, ?, ?, ?)",
-            (IMAGERY_TABLE, srs_id, x_min, y_min, x_max, y_max),
-        )
-        for level in levels:
-            self._db.execute(
-                "INSERT INTO gpkg_tile_matrix VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                (IMAGERY_TABLE, level.zoom, level.columns, level.rows, TILE_PX, TILE_PX, level.pixel_x, level.pixel_y),
-            )
+        box = bounds or (None, None, None, None)
+        row = (table, kind, table, description, changed, *box, srs_id)
+        self._db.execute("INSERT INTO gpkg_contents VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
 
-    def add_manifest(self, manifest: Manifest) -> Manifest:
-        """Writes the manifest with its checksum; returns what was written."""
-        hashes = self._db.execute(f"SELECT zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}").fetchall()
+    def add_extension(self, table: str, column: str | None, name: str) -> None:
+        row = (table, column, name, *gpkg_schema.EXTENSIONS[name])
+        self._db.execute("INSERT INTO gpkg_extensions VALUES (?, ?, ?, ?, ?)", row)
+
+    def add_metadata(self, table: str, title: str, date: str, licence: str, source: str) -> None:
+        """What a person wants to know of a table, in the words of Dublin Core."""
+        text = json.dumps({"title": title, "date": date, "license": licence, "source": source}, ensure_ascii=False)
+        md_id = self._db.execute(
+            "INSERT INTO gpkg_metadata (md_scope, md_standard_uri, mime_type, metadata) VALUES (?, ?, ?, ?)",
+            ("dataset", DUBLIN_CORE, "application/json", text),
+        ).lastrowid
+        row = ("table", table, None, None, f"{date or UNDATED}T00:00:00.000Z", md_id, None)
+        self._db.execute("INSERT INTO gpkg_metadata_reference VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+
+    def add_imagery_table(self, layer: Layer, title: str) -> None:
+        """Contents, tile matrices and the empty table of a layer."""
+        srs_id = self.srs_id(CRS.from_user_input(layer.crs))
+        description = ", ".join(text for text in (layer.date, layer.licence) if text)
+        self._add_matrix(layer.table, "tiles", layer.date, description, layer.bounds, srs_id, layer.levels)
+        self.add_metadata(layer.table, title, layer.date, layer.licence, layer.source)
+
+    def add_elevation_table(self, grid: DemGrid, crs: CRS, level: Level, precision_m: float) -> None:
+        """Contents, tile matrix, coverage and the empty table of the elevation (OGC 17-066r1)."""
+        bounds = (
+            grid.x_min,
+            grid.y_max - grid.height_px * grid.pixel,
+            grid.x_min + grid.width_px * grid.pixel,
+            grid.y_max,
+        )
+        what = "Height above mean sea level, metres"
+        self._add_matrix(ELEVATION_TABLE, "2d-gridded-coverage", "", what, bounds, self.srs_id(crs), (level,))
+        self.create(gpkg_schema.COVERAGE)
+        self._db.execute(
+            "INSERT INTO gpkg_2d_gridded_coverage_ancillary (tile_matrix_set_name, datatype, scale, offset, precision,"
+            " data_null, grid_cell_encoding, uom, field_name, quantity_definition)"
+            " VALUES (?, 'integer', 1.0, 0.0, ?, ?, 'grid-value-is-center', 'm', 'Height', ?)",
+            (ELEVATION_TABLE, precision_m, DEM_NULL, what),
+        )
+        for table in ("gpkg_2d_gridded_coverage_ancillary", "gpkg_2d_gridded_tile_ancillary"):
+            self.add_extension(table, None, "gpkg_2d_gridded_coverage")
+        self.add_extension(ELEVATION_TABLE, "tile_data", "gpkg_2d_gridded_coverage")
+        self.add_metadata(ELEVATION_TABLE, what, "", grid.licence, grid.source)
+
+    def add_tile(self, table: str, zoom: int, column: int, row: int, data: bytes) -> None:
+        """An imagery tile (JPEG or PNG)."""
+        self._add_tile(table, zoom, column, row, data, tile_sha256(data))
+
+    def add_elevation_tile(
+        self, column: int, row: int, data: bytes, scale: float, offset: float, statistics: tuple[float, ...]
+    ) -> None:
+        """A 16-bit PNG; ``statistics``: min, max, mean, standard deviation in metres."""
+        tile_id = self._add_tile(ELEVATION_TABLE, 0, column, row, data, tile_sha256(data, scale, offset))
+        self._db.execute(
+            "INSERT INTO gpkg_2d_gridded_tile_ancillary (tpudt_name, tpudt_id, scale, offset, min, max, mean, std_dev)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (ELEVATION_TABLE, tile_id, scale, offset, *statistics),
+        )
+
+    def add_manifest(self, manifest: Manifest) -> None:
+        """Writes the manifest with its checksum."""
+        hashes = self._db.execute(f"SELECT table_name, zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}")
         rows = dict(manifest_rows(manifest))
-        rows["checksum"] = checksum_of(list(rows.items()), hashes)
+        rows["checksum"] = checksum_of(rows.items(), hashes.fetchall())
         self._db.executemany(f"INSERT INTO {MANIFEST_TABLE} (key, value) VALUES (?, ?)", rows.items())
-        return manifest
 
-    def _add_srs(self, crs: CRS) -> int:
-        wgs84 = CRS.from_epsg(4326).to_wkt(WktVersion.WKT1_GDAL)
-        rows: list[tuple[str, int, str, int, str, str]] = [
-            ("Undefined Cartesian SRS", -1, "NONE", -1, "undefined", "undefined Cartesian"),
-            ("Undefined geographic SRS", 0, "NONE", 0, "undefined", "undefined geographic"),
-            ("WGS 84 geodetic", 4326, "EPSG", 4326, wgs84, "longitude/latitude on the WGS 84 ellipsoid"),
-        ]
+    def srs_id(self, crs: CRS) -> int:
+        """Identifier of a CRS, after writing it when it is new."""
         authority = crs.to_authority(min_confidence=100)
         wkt = crs.to_wkt(WktVersion.WKT1_GDAL)
-        if authority and authority[0] == "EPSG":
-            srs_id = int(authority[1])
-            rows.append((crs.name, srs_id, "EPSG", srs_id, wkt, ""))
-        else:
-            srs_id = CUSTOM_SRS_ID
-            rows.append((crs.name, srs_id, "NONE", srs_id, wkt, ""))
-        self._db.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", rows)
-        return srs_id
+        if wkt not in self._srs:
+            if authority and authority[0] == "EPSG":
+                srs_id, organisation = int(authority[1]), "EPSG"
+            else:
+                srs_id, organisation = CUSTOM_SRS_ID + len(self._srs), "NONE"
+            self._srs[wkt] = srs_id
+            row = (crs.name, srs_id, organisation, srs_id, wkt, "", crs.to_wkt(WktVersion.WKT2_2015))
+            self._db.execute("INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        return self._srs[wkt]
+
+    def _add_undefined_srs(self) -> None:
+        """Requirement 11 of the core, and the row that the gridded coverage asks for."""
+        for name, srs_id in (("Undefined Cartesian SRS", -1), ("Undefined geographic SRS", 0)):
+            row = (name, srs_id, "NONE", srs_id, "undefined", name.lower(), "undefined")
+            self._db.execute("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        self.srs_id(CRS.from_epsg(WGS84))
+        wkt2 = CRS.from_epsg(WGS84_3D).to_wkt(WktVersion.WKT2_2015)
+        row = ("WGS 84 3D", WGS84_3D, "EPSG", WGS84_3D, "undefined", "longitude, latitude and ellipsoidal height", wkt2)
+        self._db.execute("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+
+    def _add_matrix(
+        self,
+        table: str,
+        kind: str,
+        date: str,
+        description: str,
+        bounds: Bounds,
+        srs_id: int,
+        levels: tuple[Level, ...],
+    ) -> None:
+        self.create(gpkg_schema.TILES.format(table=table))
+        self.tiles[table] = 0
+        self.add_contents(table, kind, date, description, bounds, srs_id)
+        finest = levels[-1]
+        x_max = bounds[0] + finest.columns * TILE_PX * finest.pixel_x
+        y_min = bounds[3] - finest.rows * TILE_PX * finest.pixel_y
+        row = (table, srs_id, bounds[0], y_min, x_max, bounds[3])
+        self._db.execute("INSERT INTO gpkg_tile_matrix_set VALUES (?, ?, ?, ?, ?, ?)", row)
+        side = DEM_TILE_PX if table == ELEVATION_TABLE else TILE_PX
+        for level in levels:
+            matrix = (table, level.zoom, level.columns, level.rows, side, side, level.pixel_x, level.pixel_y)
+            self._db.execute("INSERT INTO gpkg_tile_matrix VALUES (?, ?, ?, ?, ?, ?, ?, ?)", matrix)
+
+    def _add_tile(self, table: str, zoom: int, column: int, row: int, data: bytes, sha256: bytes) -> int:
+        added = self._db.execute(
+            f'INSERT INTO "{table}" (zoom_level, tile_column, tile_row, tile_data) VALUES (?, ?, ?, ?)',
+            (zoom, column, row, data),
+        )
+        self._db.execute(f"INSERT INTO {HASH_TABLE} VALUES (?, ?, ?, ?, ?)", (table, zoom, column, row, sha256))
+        self.tiles[table] += 1
+        assert added.lastrowid is not None
+        return added.lastrowid
 
 
 @contextmanager
-def new_package(path: Path) -> Iterator[GpkgWriter]:
+def new_package(path: Path) -> Iterator[tuple[GpkgWriter, sqlite3.Connection]]:
     """A writer on a new file; commits at the end. The caller throws the file away when this fails."""
     db = sqlite3.connect(path, isolation_level=None)
     try:
@@ -155,7 +200,7 @@ def new_package(path: Path) -> Iterator[GpkgWriter]:
         for pragma in ("page_size = 8192", "journal_mode = OFF", "synchronous = OFF", "locking_mode = EXCLUSIVE"):
             db.execute(f"PRAGMA {pragma}")
         db.execute("BEGIN")
-        yield GpkgWriter(db)
+        yield GpkgWriter(db), db
         db.execute("COMMIT")
     finally:
         db.close()

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import rasterio
 from pyproj import CRS, Geod, Transformer
+from pyproj.exceptions import ProjError
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine
@@ -31,6 +32,7 @@ class ImagerySource:
         crs = crs_of(self._file, path)
         transform: Affine = self._file.transform
         self.warped = not (transform.b == 0 and transform.d == 0 and transform.a > 0 and transform.e < 0)
+        _check_place(self._file, crs, path)
         if crs.is_geographic:
             crs, self.warped = _utm_of(self._file, crs), True
         self.crs = crs
@@ -160,8 +162,11 @@ class ImagerySource:
             raise MapError(f"{self.path}: complex pixels are no picture; give an image with 8, 16 bit or float bands")
         shrink = max(1.0, max(self.width_px, self.height_px) / SAMPLE_PX)
         shape = (max(1, int(self.height_px / shrink)), max(1, int(self.width_px / shrink)))
-        sample = self._data.read(self.bands, out_shape=(len(self.bands), *shape)).astype(np.float64)
-        mask = self._data.dataset_mask(out_shape=shape) > 0
+        try:
+            sample = self._data.read(self.bands, out_shape=(len(self.bands), *shape)).astype(np.float64)
+            mask = self._data.dataset_mask(out_shape=shape) > 0
+        except RasterioError as error:
+            raise MapError(f"{self.path}: cannot be read ({error}); check or download the file again") from None
         values = sample[:, mask]
         values = values[np.isfinite(values)]
         if values.size == 0:
@@ -207,6 +212,23 @@ def crs_of(dataset: Any, path: Path) -> CRS:
     if not (crs.is_projected or crs.is_geographic):
         raise MapError(f"{path}: coordinate system '{crs.name}' is not on the earth; reproject with gdalwarp -t_srs")
     return crs
+
+
+def _check_place(dataset: Any, crs: CRS, path: Path) -> None:
+    """Raises MapError when the centre of a raster has no place on the earth: there and back leads elsewhere."""
+    x, y = dataset.transform @ (dataset.width / 2, dataset.height / 2)
+    step = math.hypot(dataset.transform.a, dataset.transform.d)
+    try:
+        lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform(x, y)
+        back_x, back_y = Transformer.from_crs(4326, crs, always_xy=True).transform(lon_deg, lat_deg)
+    except ProjError as error:
+        raise MapError(
+            f"{path}: no way from '{crs.name}' to WGS 84 ({error}); reproject with gdalwarp -t_srs"
+        ) from None
+    if not math.hypot(back_x - x, back_y - y) <= step:  # also when they are not finite
+        raise MapError(
+            f"{path}: its coordinates ({x:.6g}, {y:.6g}) lie outside the area of '{crs.name}'; check its georeference"
+        )
 
 
 def _utm_of(dataset: Any, crs: CRS) -> CRS:

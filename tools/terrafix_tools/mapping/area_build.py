@@ -1,0 +1,174 @@
+"""`terrafix map build`: area, sources, estimate, downloads, elevation, vectors, package."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from terrafix.core.errors import MapError, OutputError, UsageError
+from terrafix_tools.mapping.area import Area
+from terrafix_tools.mapping.area_checks import check_area
+from terrafix_tools.mapping.area_files import DEFAULT_BUFFER_KM, is_line, read_area
+from terrafix_tools.mapping.build import build_package, layer_of
+from terrafix_tools.mapping.dem import DemSource
+from terrafix_tools.mapping.fetch_progress import shown
+from terrafix_tools.mapping.heights import to_amsl
+from terrafix_tools.mapping.heights_datum import Datum
+from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
+from terrafix_tools.mapping.sources import glo30
+from terrafix_tools.mapping.sources.prepare import Preparation, Request
+from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
+from terrafix_tools.mapping.vectors_source_overpass import PUBLIC, fetch_overpass, overpass_features
+from terrafix_tools.mapping.vectors_source_pbf import pbf_features
+from terrafix_tools.mapping.vectors_source_tags import LICENCE as OSM_LICENCE
+
+OVERPASS = "overpass"
+OFFERED_CORRIDOR_KM = 2.0
+FINEST_GSD_M, COARSEST_GSD_M = 0.01, 100.0
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a person asks for on the command line; the names are those of the options."""
+
+    out: Path
+    area: str = ""
+    buffer_km: float | None = None
+    corridor_km: float | None = None
+    source: Sequence[str] = ()
+    sources: Path | None = None
+    gsd_m: float | None = None
+    dem: str = ""
+    dem_datum: Datum = Datum.EGM96
+    geoid: Path | None = None
+    osm: str = ""
+    date: str = ""
+    licence: str = ""
+    ce90_m: float | None = None
+    rate: float | None = None
+    workers: int = 1
+    cache: Path | None = None
+    agreed: bool = False
+    estimate_only: bool = False
+    say: Console = field(default_factory=lambda: Console(stderr=True, soft_wrap=True))
+
+    @property
+    def cache_dir(self) -> Path:
+        """Where downloads stay between runs (freedesktop.org, XDG base directories)."""
+        return self.cache or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "terrafix"
+
+
+def build_order(order: Order) -> Path | None:
+    """Writes the package and returns its path; None when only an estimate was asked for.
+
+    Raises UsageError, ConfigError, SourceError, MapError, OutputError: one line each."""
+    _check_files(order)
+    with contextlib.ExitStack() as stack:
+        if not order.area:
+            layers, area = [_whole_image(order)], None
+        else:
+            area = read_area(order.area, buffer_km=order.buffer_km, corridor_km=order.corridor_km)
+            found = _layers(order, area)
+            if found is None:
+                return None
+            layers = found
+        try:
+            order.out.parent.mkdir(parents=True, exist_ok=True)
+            made = tempfile.TemporaryDirectory(dir=order.out.parent, prefix=f".{order.out.name}.")
+        except OSError as error:
+            raise OutputError(f"{order.out}: cannot be written ({error.strerror}); choose another --out") from None
+        scratch = stack.enter_context(made)
+        elevation = _elevation(order, area, Path(scratch))
+        vectors = _vectors(order, area)
+        return build_package(
+            layers, order.out, elevation=elevation, vectors=vectors, workers=order.workers, progress=True
+        )
+
+
+def _check_files(order: Order) -> None:
+    """Before hours of download: are the files there that are needed after it?"""
+    for option, text in (("--dem", order.dem), ("--osm", order.osm), ("--geoid", str(order.geoid or ""))):
+        if text and text not in (glo30.NAME, OVERPASS) and "://" not in text and not Path(text).is_file():
+            raise MapError(f"{text}: no such file; check {option}")
+
+
+def _whole_image(order: Order) -> LayerInput:
+    if len(order.source) != 1 or order.sources or "://" in order.source[0]:
+        raise UsageError("give one image (it is taken whole), or --area with --source for several or for the network")
+    if order.osm or order.dem == glo30.NAME or order.gsd_m or order.buffer_km or order.corridor_km:
+        raise UsageError("--osm, --dem glo-30, --gsd, --buffer and --corridor need --area, for example W,S,E,N")
+    imagery = Path(order.source[0])
+    if order.out.exists() and imagery.exists() and order.out.samefile(imagery):
+        raise OutputError(f"{order.out}: would overwrite the imagery; give another --out")
+    return layer_of(imagery, date=order.date, licence=order.licence, ce90_m=order.ce90_m)
+
+
+def _layers(order: Order, area: Area) -> list[LayerInput] | None:
+    if order.gsd_m is not None and not FINEST_GSD_M <= order.gsd_m <= COARSEST_GSD_M:
+        raise UsageError(f"--gsd {order.gsd_m:g}: give metres per pixel between {FINEST_GSD_M} and {COARSEST_GSD_M:g}")
+    specs = _specs(order)
+    size_km2 = check_area(area)
+    order.say.print(f"{area.name}: {size_km2:,.1f} km2 with its buffer", highlight=False)
+    if order.buffer_km is None and order.corridor_km is None:
+        order.say.print(_smaller(order.area), highlight=False)
+    preparation = Preparation(Request(area, specs, order.cache_dir, order.out, order.gsd_m), order.say)
+    estimates = preparation.estimate()
+    if order.estimate_only:
+        return None
+    preparation.fetch(estimates, agreed=order.agreed)
+    return preparation.layers()
+
+
+def _smaller(area: str) -> str:
+    """What else a person could have asked for, when nothing was said about the buffer."""
+    if not is_line(area):
+        return f"the buffer is {DEFAULT_BUFFER_KM:g} km, for an open search; --buffer KM sets it, 0 is the area itself"
+    size_km2 = read_area(area, corridor_km=OFFERED_CORRIDOR_KM).size_km2()
+    return (
+        f"the buffer is {DEFAULT_BUFFER_KM:g} km, for an open search; "
+        f"--corridor {OFFERED_CORRIDOR_KM:g} along the mission would be {size_km2:,.1f} km2"
+    )
+
+
+def _specs(order: Order) -> list[SourceSpec]:
+    specs = parse_sources(
+        list(order.source), licence=order.licence, date=order.date, ce90_m=order.ce90_m, rate=order.rate
+    )
+    if order.sources:
+        specs += read_sources(order.sources)
+    if not specs:
+        raise UsageError("--area says where; --source says from what: a GeoTIFF, .mbtiles, a {z}/{x}/{y} address, ...")
+    return specs
+
+
+def _elevation(order: Order, area: Area | None, scratch: Path) -> ElevationInput | None:
+    if not order.dem:
+        return None
+    datum, licence, path = order.dem_datum, "", Path(order.dem)
+    if order.dem == glo30.NAME:
+        assert area is not None
+        datum, licence = Datum.EGM2008, glo30.LICENCE
+        with shown(order.say, glo30.NAME) as on_progress:
+            path = glo30.fetch_glo30(area, order.cache_dir, on_progress)
+    used, note = to_amsl(path, datum, scratch / "amsl.tif", order.geoid)
+    if datum is not Datum.EGM96:
+        order.say.print(f"{order.dem}: {note}", highlight=False)
+    return ElevationInput(partial(DemSource, used), source=path.name, licence=licence)
+
+
+def _vectors(order: Order, area: Area | None) -> VectorInput | None:
+    if not order.osm:
+        return None
+    assert area is not None
+    if order.osm == OVERPASS or "://" in order.osm:
+        url = PUBLIC if order.osm == OVERPASS else order.osm
+        with shown(order.say, "OpenStreetMap") as on_progress:
+            paths = fetch_overpass(url, area, order.cache_dir, on_progress)
+        return VectorInput(overpass_features(paths, area), source=url, licence=OSM_LICENCE)
+    path = Path(order.osm)
+    return VectorInput(pbf_features(path, area), source=path.name, licence=OSM_LICENCE)

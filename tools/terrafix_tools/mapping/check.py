@@ -1,0 +1,181 @@
+"""`terrafix map check`: will this map do for this camera, this height and this mission?"""
+
+import datetime
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from terrafix.anchor.map_format import Layer
+from terrafix.anchor.map_package import LocalMap, MapPackage
+from terrafix.anchor.matcher import MIN_SIDE_CELLS, FrameMatcher
+from terrafix.anchor.node import CE90_SIGMAS, MIN_AGL_M
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.config import Map
+from terrafix.core.errors import UsageError
+from terrafix.core.geodesy import LocalFrame
+from terrafix.vision.sources.description import camera_of, read_description
+from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.mapping.check_mission import Stretch, Way, blind, height_of, sight_along, uncovered, way_of
+from terrafix_tools.mapping.check_sight import Looker, Sight, SightGrid, sight_grid
+from terrafix_tools.mapping.progress import progress_bar
+from terrafix_tools.mission.file import read_mission
+
+DEFAULT_AGL_M = 100.0
+DEFAULT_CAMERA = CameraCalibration(1280, 720, 914.0, 914.0, 640.0, 360.0)  # 70 degrees wide, as many are
+MOST_CELLS = 1500  # of the picture: about half a minute
+OLD_YEARS = 5.0
+MATCH_CELLS = 1.0  # expected error of a match: 1.0 m at cells of 1 m over the generated world of the demo
+MEDIAN_SIGMAS = 1.1774  # of a circular normal error: sqrt(2 ln 2)
+FEW_CELLS = 48  # of the frame's shorter side; the matcher refuses below MIN_SIDE_CELLS
+
+
+class MissionCheck(msgspec.Struct, frozen=True, kw_only=True):
+    file: str
+    length_m: float
+    outside: list[Stretch]  # of the map, longest first
+    blind: list[Stretch]  # no fix to be expected: blind, or less than a frame from the map's edge
+    seen_share: float  # of the way: sees or weak
+
+
+class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
+    """What `terrafix map check --json` prints. Shares are of the ground over which a whole frame lies on the map."""
+
+    package: str
+    layer: str
+    date: str
+    age_years: float | None  # None: the package does not say when the imagery was taken
+    licence: str
+    signed_by: tuple[str, ...]
+    map_gsd_m: float
+    frame_gsd_m: float
+    cell_m: float  # of the matcher
+    agl_m: float
+    camera: str
+    frame_cells: int  # the frame's shorter side
+    has_elevation: bool
+    sees: float
+    weak: float
+    blind: float
+    cell_step_m: float
+    expected_error_m: float  # median, horizontal, where it sees
+    ce90_m: float
+    ce90_is_stated: bool
+    warnings: list[str]
+    mission: MissionCheck | None
+
+
+@dataclass(frozen=True)
+class Checked:
+    """The check with what the page draws."""
+
+    said: MapCheck
+    grid: SightGrid
+    local: LocalMap
+    way: Way | None
+    way_sight: np.ndarray | None
+
+
+def check(
+    package: MapPackage,
+    *,
+    mission: Path | None = None,
+    camera: Path | None = None,
+    agl_m: float | None = None,
+    layer: str | None = None,
+    progress: bool = False,
+) -> Checked:
+    """Looks at the whole map and at the mission. Raises MapError, SourceError (mission or camera), UsageError."""
+    found = package.layer(layer)
+    lens, lens_name = _camera(camera)
+    plan = read_mission(mission) if mission else None
+    if agl_m is None:
+        agl_m = (plan and height_of(plan)) or DEFAULT_AGL_M
+    if agl_m < MIN_AGL_M:
+        raise UsageError(f"{agl_m:.0f} m above ground: no fix is tried below {MIN_AGL_M:.0f} m; give another --agl")
+    west, south, east, north = package.manifest.bounds_wgs84
+    frame = LocalFrame((south + north) / 2, (west + east) / 2)
+    local = package.bind(frame, layer)
+    cell_m = FrameMatcher(lens, local, GradientDescriber()).look_cell_m(agl_m)
+    frame_m = lens.width * agl_m / lens.fx, lens.height * agl_m / lens.fy
+    looker = Looker(local, cell_m, math.sqrt(frame_m[0] * frame_m[1]))
+    e_min, n_min, e_max, n_max = local.bounds_m
+    step_m = max(math.sqrt(frame_m[0] * frame_m[1]) / 2, math.sqrt((e_max - e_min) * (n_max - n_min) / MOST_CELLS))
+    with progress_bar(progress) as bar:
+        grid = sight_grid(local, looker, step_m, bar)
+    way = way_of(plan, frame) if plan else None
+    way_sight = sight_along(way, looker) if way else None
+    mission_said = None
+    if way is not None and way_sight is not None:
+        mission_said = MissionCheck(
+            file=str(mission),
+            length_m=float(way.along_m[-1]),
+            outside=way.stretches(uncovered(way, package, found.table)),
+            blind=way.stretches(blind(way_sight)),
+            seen_share=float(np.mean(~blind(way_sight))),
+        )
+    ce90_m = found.ce90_m if found.ce90_m is not None else Map().ce90_m
+    said = MapCheck(
+        package=str(package.path),
+        layer=found.table,
+        date=found.date,
+        age_years=_age_years(found.date),
+        licence=found.licence,
+        signed_by=package.signed_by,
+        map_gsd_m=found.gsd_m,
+        frame_gsd_m=agl_m / lens.fx,
+        cell_m=cell_m,
+        agl_m=agl_m,
+        camera=lens_name,
+        frame_cells=int(min(frame_m) / cell_m),
+        has_elevation=package.manifest.has_dem,
+        sees=grid.share(Sight.SEES),
+        weak=grid.share(Sight.WEAK),
+        blind=grid.share(Sight.BLIND),
+        cell_step_m=step_m,
+        expected_error_m=MEDIAN_SIGMAS * math.hypot(ce90_m / CE90_SIGMAS, MATCH_CELLS * cell_m / MEDIAN_SIGMAS),
+        ce90_m=ce90_m,
+        ce90_is_stated=found.ce90_m is not None,
+        warnings=_warnings(found, int(min(frame_m) / cell_m), package.manifest.has_dem, cell_m, agl_m),
+        mission=mission_said,
+    )
+    return Checked(said, grid, local, way, way_sight)
+
+
+def _camera(path: Path | None) -> tuple[CameraCalibration, str]:
+    if path is None:
+        return DEFAULT_CAMERA, "1280 x 720 px, 70 degrees wide (assumed; give --camera)"
+    read = read_description(path)
+    return CameraCalibration.of(camera_of(path, read)), read.name or path.name
+
+
+def _age_years(date: str) -> float | None:
+    try:
+        return (datetime.date.today() - datetime.date.fromisoformat(date)).days / 365.25
+    except ValueError:  # empty, or from a package of format 1, which took any digits
+        return None
+
+
+def _warnings(layer: Layer, frame_cells: int, has_elevation: bool, cell_m: float, agl_m: float) -> list[str]:
+    said = []
+    age_years = _age_years(layer.date)
+    if age_years is None:
+        said.append("the package does not say when the imagery was taken; build it with --date")
+    elif age_years > OLD_YEARS:
+        said.append(f"the imagery is {age_years:.0f} years old; new buildings and other crops make fixes fewer")
+    if frame_cells < MIN_SIDE_CELLS:
+        said.append(
+            f"no fix will come: at {agl_m:.0f} m a frame spans {frame_cells} cells of {cell_m:.2f} m, and the matcher "
+            f"needs {MIN_SIDE_CELLS}; take a finer map, or fly higher"
+        )
+    elif frame_cells < FEW_CELLS:
+        said.append(
+            f"a frame spans only {frame_cells} cells of {cell_m:.2f} m; a finer map or more height would be better"
+        )
+    if not has_elevation:
+        said.append("no elevation: the ground is taken for flat; over hills build the package with --dem")
+    if layer.ce90_m is None:
+        said.append(f"the map's own accuracy is not stated; {Map().ce90_m:.0f} m (CE90) is assumed")
+    return said

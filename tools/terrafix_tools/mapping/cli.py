@@ -1,0 +1,82 @@
+"""The commands `terrafix map ...`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from terrafix_tools.mapping import cli_package
+from terrafix_tools.mapping.heights_datum import Datum
+
+app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
+
+
+@app.command("build")
+def map_build(
+    imagery: Annotated[Path | None, typer.Argument(help="GeoTIFF or any GDAL raster; all of it, or --area.")] = None,
+    *,
+    out: Annotated[Path, typer.Option(help="Map package to write (.gpkg).")],
+    area: Annotated[
+        str, typer.Option(help="W,S,E,N in degrees, .kml, .geojson, QGroundControl .plan or ArduPilot .waypoints.")
+    ] = "",
+    buffer: Annotated[float | None, typer.Option(help="Kilometres around the area; 20 when nothing is said.")] = None,
+    corridor: Annotated[
+        float | None, typer.Option(help="Kilometres to either side of a mission: the sensible choice for one.")
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(help="File, {z}/{x}/{y} address or sentinel-2; may be repeated, the first with a pixel wins."),
+    ] = None,
+    sources: Annotated[Path | None, typer.Option(help="TOML file of sources, after those of --source.")] = None,
+    gsd: Annotated[
+        float | None,
+        typer.Option(help="Metres per pixel wanted: chooses the zoom of tiles, makes finer images coarser."),
+    ] = None,
+    dem: Annotated[str, typer.Option(help="Elevation raster, metres AMSL; or glo-30 (Copernicus).")] = "",
+    dem_datum: Annotated[Datum, typer.Option(help="What the heights of --dem count from.")] = Datum.EGM96,
+    geoid: Annotated[Path | None, typer.Option(help="Grid of the geoid EGM96, where PROJ has none.")] = None,
+    osm: Annotated[str, typer.Option(help="Roads, water, buildings: an .osm.pbf, 'overpass' or its address.")] = "",
+    date: Annotated[str, typer.Option(help="Date of the imagery, YYYY-MM-DD.")] = "",
+    licence: Annotated[str, typer.Option(help="Licence of the imagery; needed for what comes over a network.")] = "",
+    ce90: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=200.0, help="Stated position error of the imagery: radius of 90 %, metres."),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Requests a second that the servers of --source allow; 5 when nothing is said.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, max=64, help="Processes that read and encode imagery.")] = 1,
+    cache: Annotated[Path | None, typer.Option(help="Folder that keeps downloads; default ~/.cache/terrafix.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Agree to a large download.")] = False,
+    estimate: Annotated[bool, typer.Option("--estimate", help="Say what would be downloaded, and stop.")] = False,
+) -> None:
+    """Imagery, elevation and vectors -> map package: of a whole image, or of an area from several sources."""
+    from terrafix_tools.mapping.area_build import Order, build_order
+
+    build_order(
+        Order(
+            out=out,
+            area=area,
+            buffer_km=buffer,
+            corridor_km=corridor,
+            source=[*([str(imagery)] if imagery else []), *(source or [])],
+            sources=sources,
+            gsd_m=gsd,
+            dem=dem,
+            dem_datum=dem_datum,
+            geoid=geoid,
+            osm=osm,
+            date=date,
+            licence=licence,
+            ce90_m=ce90,
+            rate=rate,
+            workers=workers,
+            cache=cache,
+            agreed=yes,
+            estimate_only=estimate,
+        )
+    )
+
+
+for command in (cli_package.info, cli_package.check, cli_package.preview, cli_package.keygen, cli_package.sign):
+    app.command()(command)

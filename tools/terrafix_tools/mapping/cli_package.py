@@ -1,0 +1,80 @@
+"""The commands `terrafix map info|check|preview|sign|keygen`: what one does with a package that exists."""
+
+import getpass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+PackageArgument = Annotated[Path, typer.Argument(help="Map package.")]
+MissionOption = Annotated[
+    Path | None, typer.Option(help="QGroundControl plan or waypoint file that is to be flown over the map.")
+]
+CameraOption = Annotated[Path | None, typer.Option(help="Camera description (config/cameras) or flight.toml.")]
+AglOption = Annotated[
+    float | None,
+    typer.Option(min=1.0, max=5000.0, help="Height above ground, metres. Default: the mission's, else 100."),
+]
+LayerOption = Annotated[str | None, typer.Option(help="Layer of the package. Default: the newest.")]
+
+
+def info(package: PackageArgument) -> None:
+    """What is in a map package, as JSON, after a check of every tile."""
+    from terrafix_tools.mapping.preview import info
+
+    info(package)
+
+
+def check(
+    package: PackageArgument,
+    mission: MissionOption = None,
+    camera: CameraOption = None,
+    agl: AglOption = None,
+    layer: LayerOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+) -> None:
+    """Will this map do? Coverage, detail, age, and where the camera will see. Fails when the mission leaves the map."""
+    from terrafix_tools.mapping.preview import say_check
+
+    say_check(package, mission, camera, agl, layer, as_json=as_json)
+
+
+def preview(
+    package: PackageArgument,
+    out: Annotated[Path, typer.Option(help="PNG (the map), or HTML (with where the camera will see).")] = Path(
+        "preview.png"
+    ),
+    size: Annotated[int, typer.Option(min=64, max=8192, help="Longer side of the PNG, pixels.")] = 1024,
+    mission: MissionOption = None,
+    camera: CameraOption = None,
+    agl: AglOption = None,
+    layer: LayerOption = None,
+) -> None:
+    """The whole map, north up, as a picture or a page; where it is transparent the map has nothing."""
+    from terrafix_tools.mapping.preview import preview, preview_page
+
+    if out.suffix.lower() in (".html", ".htm"):
+        preview_page(package, out, mission, camera, agl, layer)
+    else:
+        preview(package, out, size, layer)
+
+
+def keygen(
+    out: Annotated[Path, typer.Option(help="Names of the two files without their endings: OUT.key and OUT.pub.")],
+    owner: Annotated[str, typer.Option(help="Who signs with it; a remark in OUT.pub.")] = "",
+) -> None:
+    """A new pair of keys for signing map packages. Keep OUT.key to yourself; vehicles get OUT.pub."""
+    from terrafix.core.signature import generate
+
+    private, public = out.with_name(f"{out.name}.key"), out.with_name(f"{out.name}.pub")
+    key = generate(private, public, owner or getpass.getuser())
+    typer.echo(f"{private} (secret) and {public}: key {key.key_id}")
+
+
+def sign(
+    package: PackageArgument, key: Annotated[Path, typer.Option(help="Private key of `terrafix map keygen`.")]
+) -> None:
+    """Sign a map package, after a check of every tile."""
+    from terrafix_tools.mapping.sign import sign_package
+
+    typer.echo(f"{package}: signed by key {sign_package(package, key).key_id}")

@@ -1,0 +1,79 @@
+"""What a package is and what it looks like: `terrafix map info`, `check` and `preview`."""
+
+import sys
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import typer
+
+from terrafix.anchor.map_package import MapPackage
+from terrafix.core.errors import MapError, OutputError
+from terrafix.core.geodesy import LocalFrame
+from terrafix_tools.mapping.check import check
+from terrafix_tools.mapping.check_text import lines_of, where
+from terrafix_tools.mapping.preview_page import write_page
+
+
+def info(package: Path) -> None:
+    """Prints the manifest as JSON, after a check of every tile. Raises MapError."""
+    opened = MapPackage.open(package, verify=True)
+    said = msgspec.to_builtins(opened.manifest) | {"signed_by": opened.signed_by, "bytes": package.stat().st_size}
+    opened.close()
+    _print_json(said)
+
+
+def say_check(
+    package: Path, mission: Path | None, camera: Path | None, agl_m: float | None, layer: str | None, *, as_json: bool
+) -> None:
+    """Prints the check, then raises MapError when the mission leaves the map. Raises as ``check`` does, too."""
+    opened = MapPackage.open(package, verify=True)
+    try:
+        said = check(
+            opened, mission=mission, camera=camera, agl_m=agl_m, layer=layer, progress=sys.stderr.isatty()
+        ).said
+    finally:
+        opened.close()
+    if as_json:
+        _print_json(msgspec.to_builtins(said))
+    else:
+        for what, text in lines_of(said):
+            typer.echo(f"{what:>8}  {text}")
+    if said.mission is not None and said.mission.outside:
+        first = said.mission.outside[0]
+        raise MapError(f"{mission}: leaves the map for {where(first)}; move the mission, or build a larger map")
+
+
+def preview_page(
+    package: Path, out: Path, mission: Path | None, camera: Path | None, agl_m: float | None, layer: str | None
+) -> None:
+    """Writes the HTML page. Raises as ``check`` does, and OutputError."""
+    opened = MapPackage.open(package)
+    try:
+        write_page(
+            check(opened, mission=mission, camera=camera, agl_m=agl_m, layer=layer, progress=sys.stderr.isatty()), out
+        )
+    finally:
+        opened.close()
+
+
+def preview(package: Path, out: Path, size_px: int, layer: str | None = None) -> None:
+    """Writes a whole layer, north up, as a PNG with transparent voids. Raises MapError, OutputError."""
+    opened = MapPackage.open(package)
+    west, south, east, north = opened.manifest.bounds_wgs84
+    local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2), layer)
+    e_min, n_min, e_max, n_max = local.bounds_m
+    gsd_m = max(e_max - e_min, n_max - n_min) / size_px
+    shape = max(1, round((e_max - e_min) / gsd_m)), max(1, round((n_max - n_min) / gsd_m))
+    image, valid = local.window(e_min, n_max, *shape, gsd_m)
+    opened.close()
+    png = cv2.imencode(".png", np.dstack([image, np.where(valid, 255, 0).astype(np.uint8)]))[1]
+    try:
+        out.write_bytes(png.tobytes())
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
+
+
+def _print_json(said: object) -> None:
+    typer.echo(msgspec.json.format(msgspec.json.encode(said), indent=2).decode())

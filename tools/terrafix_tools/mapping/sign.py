@@ -1,0 +1,50 @@
+"""Signs a map package: an Ed25519 signature over its checksum, put into the package itself."""
+
+import sqlite3
+from pathlib import Path
+
+from terrafix.anchor.map_format import FORMAT_VERSION, SIGNATURE_TABLE, signed_bytes
+from terrafix.anchor.map_package import MapPackage
+from terrafix.core.errors import MapError, OutputError
+from terrafix.core.signature import TrustedKey, sign
+
+
+def sign_package(package: Path, private_key: Path) -> TrustedKey:
+    """Reads every tile first: what is signed is whole. Returns the public key. A second signature of one key replaces
+    its first; those of other keys stay. Raises MapError, UsageError, OutputError."""
+    _finish_interrupted(package)
+    opened = MapPackage.open(package, verify=True)
+    manifest = opened.manifest
+    opened.close()
+    if manifest.format_version < FORMAT_VERSION:
+        raise MapError(
+            f"{package}: of format {manifest.format_version}, whose checksum leaves out where the imagery lies; "
+            "build it again and sign that"
+        )
+    key, signature = sign(private_key, signed_bytes(manifest.checksum))
+    try:
+        db = sqlite3.connect(package)
+        try:
+            with db:  # one transaction: an interrupted one is rolled back
+                db.execute(
+                    f"INSERT OR REPLACE INTO {SIGNATURE_TABLE} (key_id, public_key, signature) VALUES (?, ?, ?)",
+                    (key.key_id, key.raw, signature),
+                )
+        finally:
+            db.close()
+    except sqlite3.OperationalError as error:
+        raise OutputError(f"{package}: cannot be written ({error}); check permissions and space") from None
+    MapPackage.open(package, trusted=[key]).close()
+    return key
+
+
+def _finish_interrupted(package: Path) -> None:
+    """Takes back what an interrupted signing has left: SQLite does that when it opens the file for writing."""
+    if package.with_name(f"{package.name}-journal").exists():
+        db = sqlite3.connect(package)
+        try:
+            db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        except sqlite3.DatabaseError:
+            pass  # said by the opening that follows
+        finally:
+            db.close()

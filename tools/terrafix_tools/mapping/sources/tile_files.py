@@ -1,0 +1,123 @@
+"""Local files of tiles: MBTiles (1.3, which the store of downloads is too) and PMTiles (version 3)."""
+
+import gzip
+import mmap
+import sqlite3
+import struct
+import zlib
+from functools import lru_cache
+from pathlib import Path
+from urllib.parse import quote
+
+from pmtiles.tile import (
+    Compression,
+    Entry,
+    MagicNumberNotFound,
+    SpecVersionUnsupported,
+    TileType,
+    deserialize_directory,
+    deserialize_header,
+    find_tile,
+    zxy_to_tileid,
+)
+
+from terrafix.core.errors import MapError
+from terrafix_tools.mapping.sources.tile_grid import Tile
+from terrafix_tools.mapping.sources.tile_store import flipped
+
+PICTURES = (TileType.PNG, TileType.JPEG, TileType.WEBP)
+DIRECTORIES = 64  # of a PMTiles file, kept unpacked
+HEADER_BYTES = 127
+DEEPEST = 4  # a PMTiles directory is at most three levels below the root
+
+
+class MbtilesReader:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_file():
+            raise MapError(f"{path}: no such file; check the path of the source")
+        try:
+            self._db = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)
+            rows = self._db.execute("SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level").fetchall()
+        except sqlite3.DatabaseError as error:
+            raise MapError(f"{path}: not an MBTiles file ({error}); check the source") from None
+        self.zooms = [int(row[0]) for row in rows]
+        if not self.zooms:
+            raise MapError(f"{path}: holds no tile; check the source")
+
+    def get(self, tile: Tile) -> bytes | None:
+        query = "SELECT tile_data FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
+        try:
+            found = self._db.execute(query, (tile.zoom, tile.column, flipped(tile.zoom, tile.row))).fetchone()
+        except sqlite3.DatabaseError as error:
+            raise MapError(f"{self.path}: damaged near tile {tile} ({error}); copy or download it again") from None
+        return found[0] if found else None
+
+    def first(self, zoom: int) -> bytes:
+        """Any tile of the zoom."""
+        found = self._db.execute("SELECT tile_data FROM tiles WHERE zoom_level = ? LIMIT 1", (zoom,)).fetchone()
+        return bytes(found[0])
+
+    def close(self) -> None:
+        self._db.close()
+
+
+class PmtilesReader:
+    """Directories stay unpacked: the library's own reader unpacks them again for every tile."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            with path.open("rb") as file:
+                self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            header = deserialize_header(self._bytes(0, HEADER_BYTES))
+        except FileNotFoundError:
+            raise MapError(f"{path}: no such file; check the path of the source") from None
+        except (OSError, ValueError, struct.error, MagicNumberNotFound, SpecVersionUnsupported):
+            raise MapError(f"{path}: not a PMTiles file of version 3; check the source") from None
+        if header["tile_type"] not in PICTURES:
+            raise MapError(f"{path}: holds no pictures but {header['tile_type'].name} tiles; give imagery")
+        if header["internal_compression"] != Compression.GZIP:
+            raise MapError(f"{path}: its directories are not gzip; write it again with the pmtiles program")
+        self._header = header
+        self.zooms = list(range(header["min_zoom"], header["max_zoom"] + 1))
+        self._directory = lru_cache(maxsize=DIRECTORIES)(self._read_directory)
+
+    def get(self, tile: Tile) -> bytes | None:
+        wanted = zxy_to_tileid(*tile)
+        offset, length = self._header["root_offset"], self._header["root_length"]
+        for _ in range(DEEPEST):
+            entry = find_tile(self._directory(offset, length), wanted)
+            if entry is None:
+                return None
+            if entry.run_length:
+                return self._unpacked(self._bytes(self._header["tile_data_offset"] + entry.offset, entry.length))
+            offset, length = self._header["leaf_directory_offset"] + entry.offset, entry.length
+        raise MapError(f"{self.path}: damaged directory near tile {tile}; copy or download it again")
+
+    def first(self, zoom: int) -> bytes:
+        """Any tile: PMTiles of pictures have one size."""
+        entry = self._directory(self._header["root_offset"], self._header["root_length"])[0]
+        while not entry.run_length:
+            entry = self._directory(self._header["leaf_directory_offset"] + entry.offset, entry.length)[0]
+        return self._unpacked(self._bytes(self._header["tile_data_offset"] + entry.offset, entry.length))
+
+    def close(self) -> None:
+        self._map.close()
+
+    def _bytes(self, offset: int, length: int) -> bytes:
+        return self._map[offset : offset + length]
+
+    def _read_directory(self, offset: int, length: int) -> list[Entry]:
+        try:
+            return deserialize_directory(self._bytes(offset, length))
+        except (OSError, EOFError, ValueError, IndexError, zlib.error) as error:
+            raise MapError(f"{self.path}: damaged directory ({error}); copy or download it again") from None
+
+    def _unpacked(self, data: bytes) -> bytes:
+        return gzip.decompress(data) if self._header["tile_compression"] == Compression.GZIP else data
+
+
+def open_tiles(path: Path) -> MbtilesReader | PmtilesReader:
+    """By the file's name. Raises MapError."""
+    return PmtilesReader(path) if path.suffix.lower() == ".pmtiles" else MbtilesReader(path)
