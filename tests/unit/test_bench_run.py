@@ -48,7 +48,8 @@ def test_times_memory_and_accuracy_of_the_replay(measured: dict[str, Any]) -> No
         assert 0.0 < times["median"] <= times["p95"]
     parts = sum(times["median"] for times in run["stage_ms"].values())
     assert parts == pytest.approx(run["frame_ms"]["median"], rel=0.3)
-    assert run["first_frame_ms"] > 0.0
+    assert run["first_frame_ms"] > 0.0 and run["start_up_s"] > 0.0
+    assert run["frames_per_s"] == pytest.approx(1e3 / run["frame_ms"]["median"], rel=0.9)  # the first frame counts here
     assert 50.0 < run["peak_memory_mb"] < 4000.0
     assert run["accuracy"]["localised"] == FRAMES
     assert 0.0 <= run["accuracy"]["within_20m"] <= run["accuracy"]["within_50m"] <= 1.0
@@ -67,7 +68,7 @@ def test_the_baseline_and_the_ratios_to_it(measured: dict[str, Any]) -> None:
 def test_the_parts(measured: dict[str, Any]) -> None:
     micro = measured["micro"]
     assert micro["flight"] == "generated"
-    for part in ("odometry", "look (search)", "belief update", "fix (patches + PnP)"):
+    for part in ("odometry", "look (search)", "belief update", "fix (patches + PnP)", "link, one second"):
         assert micro[part]["median"] > 0.0
     for mode in ("marginals", "jacobian"):
         assert f"estimator frame, 20 nodes, {mode}" in micro  # empty: three frames do not fill the window

@@ -3,6 +3,7 @@
 The nodes are those that fly, each behind a stopwatch; frames are those of the flight folder."""
 
 import json
+import os
 import sys
 import time
 from collections import defaultdict
@@ -31,6 +32,7 @@ class StageTimes:
         self.frames: list[defaultdict[str, float]] = []
         self.cpu_ms: list[float] = []  # of all threads, for each frame; other programs do not lengthen it
         self.refine_ms = 0.0
+        self.start_up_s = 0.0  # age of the program at its first frame
         self._frame_id = -1
         self._landed = False
 
@@ -38,6 +40,7 @@ class StageTimes:
         """Every node that hears of a frame says so; the first one counts."""
         if isinstance(message, Frame) and message.frame_id != self._frame_id:
             self._frame_id = message.frame_id
+            self.start_up_s = self.start_up_s or program_age_s()
             self.frames.append(defaultdict(float))
             self.cpu_ms.append(0.0)
         elif isinstance(message, SourceEnded):
@@ -83,6 +86,8 @@ def measure(flight: Path, map_path: Path, out: Path, xfeat: Path | None) -> dict
     stages = {name: [frame[name] for frame in times.frames] for name in FLOWN}
     decode_ms = [whole - sum(frame.values()) for whole, frame in zip(whole_ms, times.frames, strict=True)]
     result: dict[str, Any] = {
+        "start_up_s": round(times.start_up_s, 2),
+        "frames_per_s": round(1e3 * len(whole_ms) / sum(whole_ms), 2),
         "frame_ms": spread(whole_ms),
         "first_frame_ms": round(whole_ms[0], 1),
         "stage_ms": {"decode": spread(decode_ms)} | {name: spread(values) for name, values in stages.items()},
@@ -109,6 +114,12 @@ def peak_memory_mb() -> float:
         if line.startswith("VmHWM:"):
             return round(int(line.split()[1]) / 1024, 1)
     raise RuntimeError("/proc/self/status has no VmHWM")
+
+
+def program_age_s() -> float:
+    """Since this process was started; proc(5): field 22 of stat, in clock ticks after boot."""
+    started = int(Path("/proc/self/stat").read_text(encoding="ascii").rpartition(")")[2].split()[19])
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - started / os.sysconf("SC_CLK_TCK")
 
 
 def run_part(measure: Callable[[Path, Path, Path, Path | None], dict[str, Any]], result: str) -> None:

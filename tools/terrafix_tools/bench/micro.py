@@ -14,10 +14,23 @@ from terrafix.anchor.belief import Belief, cell_for
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.matcher import FrameMatcher, View
 from terrafix.core.camera import CameraCalibration
+from terrafix.core.config import Config
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.node import Image
 from terrafix.estimator.node import EstimatorNode
-from terrafix.messages import Health, MapMatch, Message, Odometry, Origin, Prediction, ThermalBand, VehicleState
+from terrafix.link.node import TICK_HZ, LinkNode
+from terrafix.messages import (
+    Health,
+    MapMatch,
+    Message,
+    NavEstimate,
+    Odometry,
+    Origin,
+    Prediction,
+    ThermalBand,
+    VehicleState,
+    WallClock,
+)
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.odometry import FrameTracker
 from terrafix.vision.sources import open_source
@@ -28,6 +41,7 @@ RESULT = "micro.json"
 FRAMES = 40  # of the flight's beginning
 LOOKS = 10  # of these, spread over them, for what takes long
 NODES = 20  # the estimator's window: from here on it is full
+UNIX_NS = 1_750_000_000 * 10**9  # of the link's wall clock: any time since GPS began
 BELIEF_SIGMA_M = 20.0  # start of the belief that is looked with: a usual one
 
 
@@ -50,6 +64,7 @@ def measure(flight: Path, map_path: Path, replayed: Path, xfeat: Path | None) ->
     for band, name in ((ThermalBand.NORMAL, "marginals"), (ThermalBand.HOT, "jacobian")):
         times_ms = _estimator(said, band)
         result[f"estimator frame, {NODES} nodes, {name}"] = spread(times_ms) if times_ms else {}
+    result["link, one second"] = spread(_link(said))
     return result
 
 
@@ -88,6 +103,21 @@ def _estimator(said: list[Message], band: ThermalBand) -> list[float]:
             elapsed = _ms(partial(_all_said, node, message))
             times[message.frame_id] = times.get(message.frame_id, 0.0) + elapsed
     return list(times.values())[NODES:]
+
+
+def _link(said: list[Message]) -> list[float]:
+    """The ticks of each second of the flight, at the link's own rate, with the estimates as they came."""
+    node = LinkNode(Config().link.rate_hz)
+    list(node.on(WallClock(t_ns=0, unix_ns=UNIX_NS, source="system")))  # without one there is nothing to send
+    times_ms, now_ns = [], 0
+    for message in said:
+        if isinstance(message, Origin | NavEstimate | VehicleState):
+            while now_ns < message.t_ns:
+                now_ns += round(1e9 / TICK_HZ)
+                times_ms.append(_ms(lambda: list(node.tick(now_ns))))  # noqa: B023
+            list(node.on(message))
+    second = round(TICK_HZ)
+    return [sum(times_ms[i : i + second]) for i in range(0, len(times_ms), second)]
 
 
 def _all_said(node: EstimatorNode, message: Message) -> list[Message]:

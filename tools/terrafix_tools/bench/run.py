@@ -23,10 +23,11 @@ from terrafix.recorder.writer import versions
 from terrafix_tools.bench import baseline as bench_baseline
 from terrafix_tools.bench import flights as bench_run
 from terrafix_tools.bench import micro as bench_micro
+from terrafix_tools.bench import scaling
 from terrafix_tools.mapping.build import build, ensure_package
 from terrafix_tools.replay import map_cache_dir
-from terrafix_tools.sim import world
-from terrafix_tools.sim.world_flight import FRAME_HZ, plan_flight, write_flight
+from terrafix_tools.sim.flights.folder import FRAME_HZ, plan_flight, write_flight
+from terrafix_tools.sim.world import place as world
 
 FLIGHTS = ("village-1", "town-a")
 GENERATED = "generated"
@@ -37,12 +38,19 @@ _MISTAKES = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}
 
 
 def bench(
-    data: Path, out: Path, *, flights: list[str] | None = None, frames: int | None = None, xfeat: bool = True
+    data: Path,
+    out: Path,
+    *,
+    flights: list[str] | None = None,
+    frames: int | None = None,
+    xfeat: bool = True,
+    growing: bool = False,
 ) -> dict[str, Any]:
     """Writes ``out`` (JSON), prints tables, returns what it wrote.
 
     ``data``: folder with flights/ and models/. ``flights``: names in it, or "generated"; default: FLIGHTS, or the
-    generated one when the data are absent. ``frames``: only so many of each. Raises the TerrafixError family."""
+    generated one when the data are absent. ``frames``: only so many of each. ``growing``: also the cost of larger maps
+    and longer flights. Raises the TerrafixError family."""
     if frames is not None and frames < 2:
         raise UsageError(f"--frames {frames}: two frames are the least that can be measured")
     try:
@@ -69,6 +77,8 @@ def bench(
             if not result["micro"]:
                 result["micro"] = {"flight": name, **_part(bench_micro, flight, package, work / WEIGHTS_FREE, model)}
             result["flights"][name] = measured
+        if growing:
+            result["growth"] = scaling.measure(Path(temporary), console)
     result["machine"]["load_average_after"] = os.getloadavg()
     try:
         out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
@@ -197,6 +207,8 @@ def _show(result: dict[str, Any], out: Path) -> None:
             table.add_row(key.replace("_", " ").replace("m", " m"), *cells)
         cells = ["-" if (v := r["accuracy"]["median_m"]) is None else f"{v:.1f} m" for r in (*runs.values(), baseline)]
         table.add_row("median error", *cells)
+        table.add_row("frames a second", *(f"{r['frames_per_s']:.1f}" for r in runs.values()), "")
+        table.add_row("start-up", *(f"{r['start_up_s']:.1f} s" for r in runs.values()), "")
         table.add_row("peak memory", *(f"{r['peak_memory_mb']:.0f} MB" for r in runs.values()), "")
         console.print(table)
     micro = {part: times for part, times in result["micro"].items() if isinstance(times, dict)}
@@ -206,6 +218,8 @@ def _show(result: dict[str, Any], out: Path) -> None:
     for part, times in micro.items():
         table.add_row(part, _pair(times))
     console.print(table)
+    if "growth" in result:
+        scaling.show(result["growth"], console)
     typer.echo(f"written to {out}")
 
 

@@ -1,0 +1,48 @@
+"""`terrafix accept` as a person runs it: killed in the middle, resumed, and judged to the end."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "accept"]
+SCENARIOS = ("baseline", "foreign frame", "350 m outlier fix")
+
+
+@pytest.mark.slow
+def test_killed_and_resumed(tmp_path: Path) -> None:
+    out = tmp_path / "accept"
+    command = [*COMMAND, "--quick", "--out", str(out), *(word for name in SCENARIOS for word in ("--scenario", name))]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True) as running:
+        deadline_s = time.monotonic() + 1200.0
+        while not list(out.glob("*/result.json")):
+            assert time.monotonic() < deadline_s and running.poll() is None, "no scenario came to its end"
+            time.sleep(0.5)
+        os.killpg(running.pid, signal.SIGKILL)
+    kept = {path: path.stat().st_mtime_ns for path in out.glob("*/result.json")}
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=1200)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept  # not flown again
+    table = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
+    assert [result["scenario"] for result in table["results"]] == list(SCENARIOS)
+    assert done.returncode == (1 if table["broken"] else 0), done.stderr
+    rows = {(row["scenario"], row["what"]): row for row in table["rows"]}
+    for name in SCENARIOS:
+        assert rows[name, "frames within 50 m"]["verdict"] == "pass"
+        assert rows[name, "frames wrong by over 50 m and sure of it"]["measured"] == 0.0
+    assert rows["foreign frame", "wrong frames or fixes rejected"]["measured"] == 1.0
+    assert rows["350 m outlier fix", "wrong frames or fixes rejected"]["measured"] == 1.0
+    page = (out / "acceptance.html").read_text(encoding="utf-8")
+    assert page.count("<figure") == len(SCENARIOS) and not re.search(r'(src|href)="', page)
+
+
+def test_a_scenario_that_does_not_exist_is_one_clear_line(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [*COMMAND, "--scenario", "moon", "--out", str(tmp_path)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2 and done.stderr.strip().count("\n") == 0 and "'moon': not a scenario" in done.stderr

@@ -1,0 +1,113 @@
+"""A made-up flight for the tests of acceptance: straight north, estimates with known errors, a record that says so."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.core.config import Config
+from terrafix.core.geodesy import LocalFrame
+from terrafix.messages import (
+    Camera,
+    CovarianceMode,
+    Frame,
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Odometry,
+    Origin,
+    Prediction,
+    RefinedPose,
+    Refinement,
+    SourceLabel,
+    Verdict,
+)
+from terrafix.recorder.writer import FlightWriter, header
+from terrafix_tools.accept.evidence import Evidence, gather
+from terrafix_tools.accept.judged import Marks
+from terrafix_tools.estimates import ESTIMATES, RowTable, write_rows
+from terrafix_tools.evaluate import Truth
+
+PLACE = LocalFrame(48.0, 11.0)
+CAMERA = Camera(width=960, height=540, fx=500.0, fy=500.0, cx=479.5, cy=269.5)
+STEP_M, STEP_S = 10.0, 0.5
+UNMARKED = Marks()
+LEVEL = (0.0, 1.0, 0.0, 0.0)  # some rotation: straight down
+
+
+@dataclass(frozen=True)
+class Said:
+    """What was said of one frame."""
+
+    error_m: float = 1.0  # east
+    sigma_m: float = 5.0
+    label: SourceLabel = SourceLabel.SATELLITE_ANCHORED
+    fixed: bool = True
+    predicted_error_m: float = 0.0  # east, before the fix
+    mode: CovarianceMode = CovarianceMode.MARGINALS
+    odometry: Verdict = Verdict.ACCEPTED
+
+
+def file_of(i: int) -> str:
+    return f"{i:04d}.jpg"
+
+
+def true_m(i: int) -> tuple[float, float]:
+    return 0.0, i * STEP_M
+
+
+def evidence(out: Path, frames: Sequence[Said], marks: Marks = UNMARKED, **gathered: object) -> Evidence:
+    """As a replay would have left it."""
+    out.mkdir(exist_ok=True)
+    messages: list[Message] = [
+        Origin(
+            t_ns=0, camera=CAMERA, lat_deg=48.0, lon_deg=11.0, ground_amsl_m=0.0, start_sigma_m=10.0,
+            yaw_sigma_deg=3.0, agl_sigma_m=3.0, attitude_sigma_deg=1.0)
+    ]  # fmt: skip
+    for i, said in enumerate(frames):
+        messages += _frame(i, said)
+    poses = [
+        RefinedPose(frame_id=i, lat_deg=48.0, lon_deg=11.0, alt_amsl_m=0.0, sigma_e_m=1.0, sigma_n_m=1.0)
+        for i in range(len(frames))
+    ]
+    messages.append(Refinement(t_ns=0, poses=poses))
+    table = RowTable()
+    writer = FlightWriter(out / "flight.mcap", header(Config()))
+    for message in messages:
+        writer.write(message, message.t_ns)
+        table.take(message)
+    writer.close()
+    for row in table.rows.values():
+        row.process_ms = 100.0
+    with (out / ESTIMATES).open("w", encoding="utf-8", newline="") as stream:
+        write_rows(stream, table.rows.values())
+    accepted = sum(f.odometry is Verdict.ACCEPTED for f in frames)
+    summary = {"frames": len(frames), "odometry_frames": accepted - 1, "peak_memory_mb": 321.0}
+    (out / "summary.json").write_text(json.dumps(summary))
+    truth = {file_of(i): Truth(*PLACE.to_wgs84(*true_m(i))) for i in range(len(frames))}
+    return gather(out, truth, marks, **gathered)  # type: ignore[arg-type]
+
+
+def _frame(i: int, said: Said) -> list[Message]:
+    t_ns = round(i * STEP_S * 1e9)
+    e_m, n_m = true_m(i)
+    lat_deg, lon_deg = PLACE.to_wgs84(e_m + said.error_m, n_m)
+    answer = Verdict.ACCEPTED if said.fixed else Verdict.WEAK_PEAK
+    cov = tuple(float(v) for v in (np.eye(6) * said.sigma_m**2).ravel())
+    return [
+        Frame(t_ns=t_ns, frame_id=i, file=file_of(i), width=960, height=540),
+        Odometry(t_ns=t_ns, frame_id=i, keyframe_id=0, verdict=said.odometry),
+        MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="odometry", verdict=said.odometry),
+        Prediction(
+            t_ns=t_ns, frame_id=i, p_c_in_w_m=(e_m + said.predicted_error_m, n_m, 100.0), q_w_c=LEVEL, cov=cov,
+            agl_m=100.0, agl_sigma_m=2.0, step_m=(0.0, STEP_M), step_cov_m2=(1.0, 0.0, 0.0, 1.0)),
+        MapMatch(t_ns=t_ns, frame_id=i, verdict=answer, matcher="gradient"),
+        MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="map", verdict=answer),
+        NavEstimate(
+            t_ns=t_ns, frame_id=i, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=100.0, agl_m=100.0,
+            velocity_enu_mps=(0.0, 20.0, 0.0), velocity_sigma_mps=1.0, q_w_b=(1.0, 0.0, 0.0, 0.0), cov=cov,
+            source_label=said.label, covariance_mode=said.mode, last_anchor_age_ms=0, emitted_at_ns=t_ns),
+    ]  # fmt: skip

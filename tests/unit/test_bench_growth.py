@@ -1,0 +1,53 @@
+"""Cost as map and flight grow: the synthetic flight is a possible one, and every field is there."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.estimator.filter import Estimator
+from terrafix.estimator.telemetry import Telemetry
+from terrafix_tools.bench import growth, map_size
+from terrafix_tools.bench.stream import FIX_EVERY, FRAME_S, LEG_FRAMES, ORIGIN, SPEED_MPS, spoken
+
+
+def test_the_estimator_follows_the_synthetic_flight() -> None:
+    """Through the first turn: what is said belongs to one motion, or the times would be those of a lost estimator."""
+    estimator, telemetry = Estimator(ORIGIN), Telemetry()
+    frames = LEG_FRAMES + 20
+    refused = 0
+    for said in spoken(frames):
+        telemetry.add(said.state)
+        t_ns = said.odometry.t_ns
+        placed = estimator.advance(said.odometry.frame_id, t_ns * 1e-9, said.odometry, telemetry.at(t_ns)).placed
+        if said.match is not None:
+            refused += estimator.fix(said.match).verdict != "accepted"
+    step_m = FRAME_S * SPEED_MPS
+    expected = np.array([20 * step_m, (LEG_FRAMES - 1) * step_m])  # the first 119 steps go north
+    assert np.hypot(*(placed.pose.translation()[:2] - expected)) < 5.0
+    assert refused <= 0.05 * frames / FIX_EVERY
+
+
+def test_every_field_of_a_longer_flight() -> None:
+    found = growth.measure(30)
+    assert found["frames"] == 30 and found["peak_memory_mb"] >= found["memory_in_flight_mb"] > 50.0
+    assert list(found["covariance_cpu_ms"]) == [
+        "of the smoother", "gtsam.Marginals, window", "gtsam.Marginals, whole flight"
+    ]  # fmt: skip
+    assert found["frame_cpu_ms"]["median"] > 0.0
+
+
+def test_every_field_of_a_larger_map(tmp_path: Path) -> None:
+    built = map_size.measure(0.25, tmp_path)
+    assert built["area_km2"] == 0.25 and built["package_mb"] > 0.05 and not (tmp_path / "map.tif").exists()
+    found = map_size.search(tmp_path / "map.gpkg")
+    json.dumps(built | found, allow_nan=False)
+    assert set(found["look_cpu_ms"]) == {"in flight", "lost"}
+    assert all(0.0 < look["median"] <= look["p95"] for look in found["look_cpu_ms"].values())
+
+
+def test_the_noise_is_different_everywhere() -> None:
+    first, second = (map_size._block(np.random.default_rng([0, i * map_size.BLOCK_PX]))[..., 1] for i in (0, 1))
+    agree = float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
+    assert abs(agree) < 0.2 and math.isfinite(agree) and first.std() > 20.0

@@ -1,0 +1,86 @@
+"""What acceptance says of one number: measured, floor, goal, verdict. The words of docs/acceptance.md."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import msgspec
+
+
+class Verdict(StrEnum):
+    PASS = "pass"
+    BELOW = "below floor"
+    NOT_BUILT = "not built"  # counts like a broken floor: the promise is not kept
+    NOT_MEASURABLE = "not measurable here"
+
+
+BROKEN = (Verdict.BELOW, Verdict.NOT_BUILT)
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Limits of a number, both included; None: no limit on that side."""
+
+    low: float | None = None
+    high: float | None = None
+
+    def holds(self, value: float) -> bool:
+        return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
+
+    def text(self, unit: str) -> str:
+        """ ">= 80 %", "<= 50 m", "93 to 98 %", "0"."""
+        if self.low is not None and self.high is not None:
+            if self.low == self.high:
+                return shown(self.low, unit)
+            return f"{shown(self.low, '%' if unit == '%' else '').removesuffix(' %')} to {shown(self.high, unit)}"
+        if self.low is not None:
+            return f">= {shown(self.low, unit)}"
+        return f"<= {shown(self.high, unit)}"
+
+
+class Span(msgspec.Struct, frozen=True):
+    """A stretch of the flight in which something is wrong, seconds from its zero."""
+
+    from_s: float
+    to_s: float
+    text: str
+
+    def has(self, t_s: float) -> bool:
+        return self.from_s <= t_s <= self.to_s
+
+
+class Marks(msgspec.Struct, frozen=True, kw_only=True):
+    """What a scenario did to the flight, for the judge and for the picture."""
+
+    spans: tuple[Span, ...] = ()
+    wrong_files: frozenset[str] = frozenset()  # frames that are foreign, or whose map fix was made wrong
+    breaks_s: tuple[float, ...] = ()  # the first frame after each gap in the overlap
+
+
+class JudgedRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One line of the table."""
+
+    scenario: str
+    ac: str
+    what: str
+    measured: float | None
+    unit: str  # "%", "m", "s", "ms", "px", "MB" or ""; shares are 0..1
+    floor: str
+    goal: str
+    verdict: Verdict
+    goal_met: bool | None  # None: no goal beyond the floor, or nothing measured
+    why: str = ""
+
+
+def shown(value: float | None, unit: str) -> str:
+    """A number with its unit, as people read it; shares as per cent."""
+    if value is None:
+        return "-"
+    if unit == "%":
+        return f"{_short(100 * value)} %"
+    return f"{_short(value)} {unit}".strip()
+
+
+def _short(value: float) -> str:
+    if abs(value - round(value)) < 1e-9:
+        return f"{round(value)}"
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"

@@ -1,0 +1,276 @@
+"""One function for each number of the acceptance table. Each says what it measured, or why it could not."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.messages import CovarianceMode, NavEstimate, SourceLabel
+from terrafix.messages import Verdict as Answer
+from terrafix_tools.accept.evidence import Evidence, Seen
+from terrafix_tools.accept.judged import Span, Verdict
+
+NEAR_M = 50.0  # AC-1; also what counts as right after something went wrong (AC-3)
+MIN_WAY_M = 100.0  # a share of a shorter way than this says nothing
+SETTLE_S = 10.0  # after a stretch without sight, before frames count again as outside of it
+
+
+@dataclass(frozen=True)
+class Measured:
+    """``value`` None: nothing to measure, unless ``verdict`` says what that means."""
+
+    value: float | None
+    why: str = ""
+    verdict: Verdict | None = None
+
+
+def within_50m(e: Evidence) -> Measured:
+    return Measured(e.metrics["within_50m"])
+
+
+def within_20m(e: Evidence) -> Measured:
+    return Measured(e.metrics["within_20m"])
+
+
+def within_50m_outside(e: Evidence) -> Measured:
+    spans = [Span(s.from_s, s.to_s + SETTLE_S, s.text) for s in e.marks.spans]
+    frames = [f for f in e.frames if f.compared and not any(s.has(f.t_s) for s in spans)]
+    return _share([_near(f) for f in frames], f"from {SETTLE_S:.0f} s after it on; {len(frames)} frames")
+
+
+def wrong_rejected(e: Evidence) -> Measured:
+    wrong = [f for f in e.frames if f.row.file in e.marks.wrong_files]
+    return _share([not f.fixed for f in wrong], f"{sum(not f.fixed for f in wrong)} of {len(wrong)}")
+
+
+def error_after_wrong(e: Evidence) -> Measured:
+    after = [b for a, b in pairwise(e.frames) if a.row.file in e.marks.wrong_files]
+    errors = [f.error_m for f in after if f.compared]
+    if any(error is None for error in errors):
+        return Measured(None, "a frame after a wrong one has no position", Verdict.BELOW)
+    known = [error for error in errors if error is not None]
+    return Measured(max(known)) if known else Measured(None, "no truth for the frames after the wrong ones")
+
+
+def fragments_alive(e: Evidence) -> Measured:
+    """A fragment survives when it has frames that the map holds."""
+    parts = _fragments(e)
+    alive = sum(any(f.fixed and _near(f) for f in part) for part in parts)
+    return Measured(alive / len(parts), f"{alive} of {len(parts)}")
+
+
+def worst_fragment(e: Evidence) -> Measured:
+    shares = [float(np.mean([_near(f) for f in part if f.compared])) for part in _fragments(e)]
+    return Measured(min(shares), ", ".join(f"{100 * s:.0f} %" for s in shares))
+
+
+def not_localised(e: Evidence) -> Measured:
+    """Of the frames that have truth: no position at all, or one by dead reckoning alone."""
+    frames = [f for f in e.frames if f.compared]
+    lost = [not f.row.localised or f.row.source_label == SourceLabel.DEAD_RECKONED for f in frames]
+    return _share(lost, "no position, or dead reckoning alone")
+
+
+def says_so_after(e: Evidence) -> Measured:
+    """From the first frame of the marked time on; the label must leave satellite_anchored and stay away."""
+    frames = e.within(0)
+    if not frames:
+        return Measured(None, "no frame in the marked time")
+    anchored = [f.t_s for f in frames if f.row.source_label == SourceLabel.SATELLITE_ANCHORED]
+    if not anchored:
+        return Measured(0.0)
+    # Said anchored until here: the next frame is the first that says otherwise.
+    later = [f.t_s for f in frames if f.t_s > anchored[-1]]
+    return Measured((later[0] if later else frames[-1].t_s) - frames[0].t_s, "" if later else "it never says so")
+
+
+def asks(_: Evidence) -> Measured:
+    return Measured(None, "there is no request for a coarse position yet, nor a way to give one", Verdict.NOT_BUILT)
+
+
+def latency_p95(e: Evidence) -> Measured:
+    return Measured(e.metrics["frame_ms_p95"])
+
+
+def both_estimates(e: Evidence) -> Measured:
+    return _share([f.row.localised and f.row.refined_lat_deg is not None for f in e.frames])
+
+
+def odometry_rate(e: Evidence) -> Measured:
+    return Measured(e.metrics["odometry_rate"])
+
+
+def odometry_px(e: Evidence) -> Measured:
+    """Of the matched points that were said, after a homography of their own by least squares; pixels of the frames."""
+    means = []
+    for frame in e.frames:
+        if frame.odometry is not None and len(frame.odometry.pairs) >= 8:
+            pairs = np.array(frame.odometry.pairs) * e.origin.camera.fx
+            means.append(float(np.linalg.norm(_homography_residuals(pairs[:, :2], pairs[:, 2:]), axis=1).mean()))
+    return Measured(float(np.mean(means)), "pixels of the stored frames") if means else Measured(None, "no odometry")
+
+
+def map_px(e: Evidence) -> Measured:
+    """Of the matched points of accepted fixes, projected by the pose that was said; pixels of the frames."""
+    means = []
+    for frame in e.frames:
+        match = frame.match
+        if frame.fixed and match is not None and match.matches and match.p_c_in_w_m and match.q_w_c:
+            points = np.array(match.matches)
+            in_c = (points[:, 2:5] - np.array(match.p_c_in_w_m)) @ rot_from_quat(match.q_w_c)
+            off = (in_c[:, :2] / in_c[:, 2:] - points[:, :2]) * e.origin.camera.fx
+            means.append(float(np.linalg.norm(off, axis=1).mean()))
+    return Measured(float(np.mean(means)), "pixels of the stored frames") if means else Measured(None, "no map fix")
+
+
+def drift(e: Evidence) -> Measured:
+    ways = _ways(e)
+    if not ways:
+        return Measured(None, "no two map fixes with odometry all the way between them")
+    off_m, way_m = max(ways)
+    return Measured(off_m, f"over {way_m:.0f} m")
+
+
+def drift_share(e: Evidence) -> Measured:
+    ways = _ways(e)
+    off_m, way_m = max(ways, key=lambda way: way[1], default=(0.0, 0.0))
+    if way_m < MIN_WAY_M:
+        return Measured(None, f"the longest way between two fixes is {way_m:.0f} m")
+    return Measured(off_m / way_m, f"{off_m:.0f} m over {way_m:.0f} m")
+
+
+def complete_claims(e: Evidence) -> Measured:
+    said = [estimate for frame in e.frames for estimate in frame.estimates]
+    return _share([_complete(estimate) for estimate in said], f"{len(said)} estimates")
+
+
+def coverage(e: Evidence) -> Measured:
+    """One flight's errors are of one piece (the map is off everywhere alike): the upper limit is for all flights."""
+    nees = e.metrics["mean_nees"]
+    return Measured(e.metrics["ellipse95_coverage"], "" if nees is None else f"mean NEES {nees:.2f}")
+
+
+def false_fixes(e: Evidence) -> Measured:
+    return Measured(float(e.metrics["false_fixes"]))
+
+
+def first_position_s(e: Evidence) -> Measured:
+    first = next((f for f in e.frames if f.fixed and _near(f)), None)
+    if first is None:
+        return Measured(None, "never", Verdict.BELOW)
+    in_flight_s = first.t_s - e.frames[0].t_s
+    return Measured(e.start_up_s + in_flight_s, f"{e.start_up_s:.1f} s to start, {in_flight_s:.1f} s of flight")
+
+
+def found_again_s(e: Evidence) -> Measured:
+    """From the end of the (last) marked time, or from the start of the flight, to where it stays near for 5 frames."""
+    end_s = e.marks.spans[-1].to_s if e.marks.spans else e.frames[0].t_s
+    after = [f for f in e.frames if f.t_s >= end_s and f.compared]
+    for i, frame in enumerate(after):
+        if all(_near(f) for f in after[i : i + 5]):
+            return Measured(frame.t_s - end_s)
+    return Measured(None, "never", Verdict.BELOW) if after else Measured(None, "the flight ends before")
+
+
+def memory_mb(e: Evidence) -> Measured:
+    return Measured(e.summary["peak_memory_mb"], "vision, anchor and estimator in one process")
+
+
+def right_mode(e: Evidence) -> Measured:
+    said = [estimate for frame in e.frames for estimate in frame.estimates]
+    right = [
+        (estimate.covariance_mode is CovarianceMode.JACOBIAN) == (estimate.emitted_at_ns in e.hot) for estimate in said
+    ]
+    return _share(right, f"{len(e.hot)} of {len(e.frames)} frames hot")
+
+
+def gps_interval_p99_ms(e: Evidence) -> Measured:
+    return _of_peer(e, "interval_p99_ms", "in simulated time")
+
+
+def gps_longest_gap_ms(e: Evidence) -> Measured:
+    return _of_peer(e, "longest_gap_ms", "in simulated time")
+
+
+def vehicle_error_m(e: Evidence) -> Measured:
+    return _of_peer(e, "position_error_max_m", "what it steers by, against the truth")
+
+
+def failsafes(e: Evidence) -> Measured:
+    return _of_peer(e, "failsafes", "")
+
+
+def _of_peer(e: Evidence, key: str, why: str) -> Measured:
+    value = e.peer.get(key)
+    return Measured(None, "the autopilot did not say") if value is None else Measured(float(value), why)
+
+
+def _near(frame: Seen) -> bool:
+    return frame.error_m is not None and frame.error_m <= NEAR_M
+
+
+def _share(values: list[bool], why: str = "") -> Measured:
+    return Measured(sum(values) / len(values), why) if values else Measured(None, "no such frame in this flight")
+
+
+def _fragments(e: Evidence) -> list[list[Seen]]:
+    edges = [-np.inf, *e.marks.breaks_s, np.inf]
+    parts = ([f for f in e.frames if low <= f.t_s < high] for low, high in pairwise(edges))
+    return [part for part in parts if part]
+
+
+def _ways(e: Evidence) -> list[tuple[float, float]]:
+    """(drift, way) in metres for each pair of successive fixes with odometry in every frame between them.
+
+    Drift: the motion from the estimate at the one fix to the prediction at the next, less the true motion."""
+    place = LocalFrame(e.origin.lat_deg, e.origin.lon_deg)
+    ways: list[tuple[float, float]] = []
+    from_m = true_from_m = true_last_m = None
+    way_m = 0.0
+    for frame in e.frames:
+        true_m = e.local_truth_m(frame)
+        if true_m is None or frame.odometry_verdict is not Answer.ACCEPTED:
+            from_m = None
+            continue
+        way_m += 0.0 if true_last_m is None else float(np.hypot(*(true_m - true_last_m)))
+        true_last_m = true_m
+        if not frame.fixed:
+            continue
+        if from_m is not None and true_from_m is not None and frame.prediction is not None:
+            motion = np.array(frame.prediction.p_c_in_w_m[:2]) - from_m
+            ways.append((float(np.hypot(*(motion - (true_m - true_from_m)))), way_m))
+        from_m = None
+        if frame.row.lat_deg is not None and frame.row.lon_deg is not None:
+            from_m = np.array(place.to_local(frame.row.lat_deg, frame.row.lon_deg), dtype=float)
+        true_from_m, way_m = true_m, 0.0
+    return ways
+
+
+def _complete(estimate: NavEstimate) -> bool:
+    cov = np.array(estimate.cov).reshape(6, 6) if len(estimate.cov) == 36 else np.full((6, 6), np.nan)
+    finite = bool(np.isfinite(cov).all()) and bool(np.allclose(cov, cov.T, rtol=1e-6, atol=1e-9))
+    return finite and bool(np.linalg.eigvalsh(cov)[0] > 0.0) and estimate.last_anchor_age_ms >= -1
+
+
+def _homography_residuals(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N, 2): b less a carried over by the homography that fits best (DLT, Hartley and Zisserman 4.1, normalised)."""
+    (a1, _), (b1, back) = _normalised(a), _normalised(b)
+    zero, one = np.zeros(len(a)), np.ones(len(a))
+    x, y = a1.T
+    u, v = b1.T
+    design = np.vstack(
+        [
+            np.column_stack([-x, -y, -one, zero, zero, zero, u * x, u * y, u]),
+            np.column_stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v]),
+        ]
+    )
+    matrix = np.linalg.svd(design, full_matrices=False)[2][-1].reshape(3, 3)
+    there = np.column_stack([a1, one]) @ matrix.T
+    return (b1 - there[:, :2] / there[:, 2:]) * back
+
+
+def _normalised(points: np.ndarray) -> tuple[np.ndarray, float]:
+    middle = points.mean(axis=0)
+    scale = float(np.linalg.norm(points - middle, axis=1).mean()) or 1.0
+    return (points - middle) / scale, scale

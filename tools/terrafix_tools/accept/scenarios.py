@@ -1,0 +1,238 @@
+"""The named scenarios: which ground, what goes wrong, what is promised. In words: docs/acceptance.md."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.core.node import Node, NodeContext
+from terrafix.messages import Origin
+from terrafix_tools.accept import faults
+from terrafix_tools.accept.criteria import EVERYWHERE
+from terrafix_tools.accept.fault_nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_tools.accept.flight import Flight
+from terrafix_tools.accept.judged import Marks, Span
+from terrafix_tools.accept.stale_map import stale_along
+from terrafix_tools.replay import MakeNodes, make_nodes
+
+BLACKOUT_S, STALL_S = 60.0, 10.0
+BEFORE_S, AFTER_S = 20.0, 25.0  # of flight, around a blackout
+UNMATCHABLE = (0.40, 0.60)  # of the frames: a fifth of the route
+HOT = (1 / 3, 2 / 3)
+LONG_FRAMES = 1500
+OUTLIER_EVERY = 10  # up to 10 % wrong map matches do no harm (AC-5)
+KIDNAPPED_M = (700.0, 700.0)  # east, north: 990 m, while the start claims some tens
+
+WITH_SPAN = ("claims", "coverage", "false fixes", "both estimates", "within 50 m outside", "says so", "found again")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How one flight becomes the scenario."""
+
+    edit: faults.Edit = faults.same
+    start: Callable[[Origin], Origin] = faults.same_origin
+    nodes: MakeNodes = make_nodes
+    other_map: Callable[[Path, Path], str] | None = None  # (map of the flight, map to write) -> why not, or ""
+    long_route: bool = False
+    marks: Marks = field(default_factory=Marks)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    name: str
+    promise: str
+    criteria: tuple[str, ...]
+    plan: Callable[[Flight], Plan | str]  # a text: why it cannot be flown with this flight
+    ground: str = "base"  # of the generated world; a flight that is given has only "base"
+    frames: int = 160  # of a generated flight
+
+
+def _as_it_is(_: Flight) -> Plan:
+    return Plan()
+
+
+def _foreign_frame(flight: Flight) -> Plan | str:
+    if len(flight.stops) < 8:
+        return f"the flight has only {len(flight.stops)} frames"
+    before = frozenset(flight.stops[flight.at(share)].file for share in (0.3, 0.55, 0.8))
+    return Plan(faults.foreign_frames(before), marks=Marks(wrong_files=frozenset(map(faults.foreign_name, before))))
+
+
+def _outlier_fix(flight: Flight) -> Plan:
+    wrong = frozenset(s.file for s in flight.stops[OUTLIER_EVERY // 2 :: OUTLIER_EVERY])
+
+    def nodes(ctx: NodeContext) -> Mapping[str, Node]:
+        made = make_nodes(ctx)
+        anchor = WrongFixes(made["anchor"], wrong, seed=1)
+        return made | {"anchor": anchor, "vision": FrameNames(made["vision"], anchor)}
+
+    return Plan(nodes=nodes, marks=Marks(wrong_files=wrong))
+
+
+def _gap(flight: Flight, low: int, high: int, turning: bool) -> tuple[int, int] | str:
+    """(first, end) of the frames to delete so that the frames around them share no ground.
+
+    Between the frames ``low`` and ``high``, where the track turns most, or (``turning`` False) the shortest gap."""
+    track = flight.track_m()
+    best: tuple[float, int, int] | None = None
+    for first in range(low + 1, high):
+        away = np.hypot(*(track[first:high] - track[first - 1]).T)
+        far = np.flatnonzero(away >= flight.footprint_m)
+        if not len(far) or first + int(far[0]) + 1 >= high:
+            continue
+        end = first + int(far[0])
+        before, after = track[first - 1] - track[first - 2], track[end + 1] - track[end]
+        turn = abs(float(np.arctan2(before[0] * after[1] - before[1] * after[0], before @ after)))
+        worth = turn if turning else float(first - end)
+        if best is None or worth > best[0]:
+            best = (worth, first, end)
+    return (best[1], best[2]) if best else "no part of the flight is long enough to leave ground out"
+
+
+def _gaps(flight: Flight, parts: tuple[tuple[float, float], ...], turning: bool) -> Plan | str:
+    gone: set[str] = set()
+    spans, breaks = [], []
+    for low, high in parts:
+        gap = _gap(flight, max(2, flight.at(low)), flight.at(high), turning)
+        if isinstance(gap, str):
+            return gap
+        gone |= {s.file for s in flight.stops[gap[0] : gap[1]]}
+        breaks.append(flight.stops[gap[1]].t_s)
+        spans.append(Span(flight.stops[gap[0]].t_s, breaks[-1], "no frames"))
+    return Plan(faults.without(frozenset(gone)), marks=Marks(spans=tuple(spans), breaks_s=tuple(breaks)))
+
+
+def _sharp_turn(flight: Flight) -> Plan | str:
+    return _gaps(flight, ((0.25, 0.75),), turning=True)
+
+
+def _three_fragments(flight: Flight) -> Plan | str:
+    return _gaps(flight, ((0.15, 0.5), (0.5, 0.85)), turning=False)
+
+
+def _share_of(flight: Flight, shares: tuple[float, float], text: str) -> Span:
+    return Span(flight.stops[flight.at(shares[0])].t_s, flight.stops[flight.at(shares[1])].t_s, text)
+
+
+def _unmatchable(flight: Flight) -> Plan | str:
+    if flight.map_path is None or flight.map_path.suffix.lower() == ".gpkg":
+        return "needs the map as a GeoTIFF, to make it stale along a fifth of the route"
+    first, last = (flight.at(share) for share in UNMATCHABLE)
+    stretch = [flight.truth[s.file] for s in flight.stops[first : last + 1] if s.file in flight.truth]
+
+    def other_map(given: Path, out: Path) -> str:
+        return stale_along(given, out, stretch, flight.footprint_m)
+
+    return Plan(other_map=other_map, marks=Marks(spans=(_share_of(flight, UNMATCHABLE, "the map shows other ground"),)))
+
+
+def _long_route(_: Flight) -> Plan:
+    return Plan(long_route=True)
+
+
+def _blackout(flight: Flight) -> Plan | str:
+    needed_s = BEFORE_S + BLACKOUT_S + AFTER_S
+    if flight.duration_s < needed_s:
+        return f"the flight lasts {flight.duration_s:.0f} s, and {needed_s:.0f} s are needed"
+    from_s = flight.stops[0].t_s + (flight.duration_s - BLACKOUT_S) * BEFORE_S / (BEFORE_S + AFTER_S)
+    span = Span(from_s, from_s + BLACKOUT_S, "black pictures")
+    return Plan(faults.dark(span), marks=Marks(spans=(span,)))
+
+
+def _stall(flight: Flight) -> Plan | str:
+    if flight.duration_s < 3 * STALL_S:
+        return f"the flight lasts only {flight.duration_s:.0f} s"
+    from_s = flight.stops[flight.at(0.5)].t_s
+    span = Span(from_s, from_s + STALL_S, "the same picture again and again")
+    return Plan(faults.frozen(span), marks=Marks(spans=(span,)))
+
+
+def _over_water(flight: Flight) -> Plan:
+    from terrafix_tools.accept.generated import WATER  # only generated ground has it
+
+    return Plan(marks=Marks(spans=(_share_of(flight, WATER, "over open water"),)))
+
+
+def _height_wrong(_: Flight) -> Plan:
+    return Plan(faults.height_times(1.10))
+
+
+def _compass_wrong(_: Flight) -> Plan:
+    return Plan(faults.yaw_plus(15.0))
+
+
+def _heading_unknown(_: Flight) -> Plan:
+    return Plan(faults.yaw_unknown())
+
+
+def _kidnapped(_: Flight) -> Plan:
+    return Plan(start=faults.start_moved(*KIDNAPPED_M))
+
+
+def _hot_day(flight: Flight) -> Plan:
+    span = _share_of(flight, HOT, "thermal throttle")
+
+    def nodes(ctx: NodeContext) -> Mapping[str, Node]:
+        made = make_nodes(ctx)
+        return made | {"estimator": HotComputer(made["estimator"], span)}
+
+    return Plan(nodes=nodes, marks=Marks(spans=(span,)))
+
+
+CLOSED_LOOP = "closed loop"  # over the base ground
+IN_THE_LOOP = (
+    "within 50 m", "within 20 m", "not localised", "claims", "coverage", "false fixes",
+    "interval", "gap", "vehicle error", "failsafes",
+)  # fmt: skip
+BASELINE = (
+    *EVERYWHERE, "latency", "odometry", "odometry px", "map px", "drift", "drift share", "first position", "memory"
+)  # fmt: skip
+SCENARIOS: tuple[Scenario, ...] = (
+    Scenario("baseline", "A flight as it should be.", BASELINE, _as_it_is),
+    Scenario(
+        "foreign frame", "Three pictures of another place among the frames: rejected, and nothing follows from them.",
+        (*EVERYWHERE, "wrong ones rejected", "next frame"), _foreign_frame),
+    Scenario(
+        "350 m outlier fix", "Every tenth map fix is wrong by 350 m and sure of itself: refused.",
+        (*EVERYWHERE, "wrong ones rejected", "next frame"), _outlier_fix),
+    Scenario(
+        "sharp turn", "Frames are missing where the track turns most, no ground is shared: a new fragment.",
+        (*EVERYWHERE, "fragments", "fragments accurate"), _sharp_turn),
+    Scenario(
+        "three fragments", "Two such gaps: three fragments, merged through geography.",
+        (*EVERYWHERE, "fragments", "fragments accurate"), _three_fragments),
+    Scenario(
+        "20 % unmatchable", "The map shows other ground along a fifth of the route: odometry carries on, and says so.",
+        (*EVERYWHERE, "says so", "asks", "drift", "drift share", "found again"), _unmatchable),
+    Scenario(
+        "long route", "1500 frames.", (*EVERYWHERE, "odometry", "drift", "memory"), _long_route, frames=LONG_FRAMES),
+    Scenario(
+        "60 s blackout", "Black pictures for 60 s: never sure and wrong, and found again afterwards.",
+        (*WITH_SPAN, "asks"), _blackout, frames=270),
+    Scenario(
+        "GNSS jam", "Jammed after 40 s, with Terrafix as second GPS: the aircraft flies on. Closed loop.",
+        IN_THE_LOOP, _as_it_is, ground=CLOSED_LOOP),
+    Scenario(
+        "slow spoof", "GNSS is right for 40 s, then walks off at 2 m/s: the aircraft is not led astray. Closed loop.",
+        IN_THE_LOOP, _as_it_is, ground=CLOSED_LOOP, frames=300),
+    Scenario(
+        "season change", "Camera and map in the two seasons that differ most.", EVERYWHERE, _as_it_is, ground="season"),
+    Scenario("low texture", "Ground of an eighth of the contrast.", EVERYWHERE, _as_it_is, ground="low texture"),
+    Scenario(
+        "water", "A third of the route over open water: no fix there, and none that is wrong.",
+        WITH_SPAN, _over_water, ground="water"),
+    Scenario("hill country", "Relief of some 300 m, a kilometre wide.", EVERYWHERE, _as_it_is, ground="hills"),
+    Scenario("height wrong by 10 %", "The reported height is 10 % too large.", EVERYWHERE, _height_wrong),
+    Scenario("compass wrong by 15 degrees", "The reported heading is off by 15 degrees.", EVERYWHERE, _compass_wrong),
+    Scenario("heading unknown", "No heading is reported.", EVERYWHERE, _heading_unknown),
+    Scenario(
+        "kidnapped", "The start coordinate is wrong by a kilometre and claims some tens of metres.",
+        ("claims", "coverage", "false fixes", "found again", "asks"), _kidnapped),
+    Scenario(
+        "hot day", "The computer throttles in the middle third: the cheap covariance, and back.",
+        (*EVERYWHERE, "mode"), _hot_day),
+    Scenario("camera stall", "The camera repeats one picture for 10 s.", WITH_SPAN, _stall),
+)  # fmt: skip
+BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}

@@ -1,0 +1,141 @@
+"""The whole table: rows of all scenarios, what holds over all of them, and acceptance.json and acceptance.md."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from terrafix.core.errors import OutputError
+from terrafix_tools.accept.fly import Result
+from terrafix_tools.accept.judged import BROKEN, Bounds, JudgedRow, Verdict, shown
+from terrafix_tools.accept.page import page
+from terrafix_tools.bench.run import machine
+from terrafix_tools.evaluate import ELLIPSE95
+
+NAME = "acceptance"
+OVERALL = "all scenarios"
+COVERAGE = Bounds(0.93, 0.98)
+NEES_QUANTILES = (-1.959964, 1.959964)  # of the normal distribution: 2.5 and 97.5 %
+LEAST_FLIGHTS = 5  # fewer draws of the map's error cannot tell an honest claim from a modest one
+
+
+class Acceptance(msgspec.Struct, frozen=True, kw_only=True):
+    """acceptance.json."""
+
+    flight: str
+    map: str
+    quick: bool
+    seed: int | None
+    machine: dict[str, Any]
+    broken: int  # rows below their floor, or not built
+    rows: list[JudgedRow]
+    results: list[Result]
+
+
+def conclude(
+    results: list[Result], *, flight: str, map_path: str, quick: bool, seed: int | None, whole: bool
+) -> Acceptance:
+    """``whole``: all scenarios were wanted; then the rows that belong to no scenario are there, too."""
+    overall = [_honest(results)] + (_elsewhere() if whole else [])
+    rows = [row for result in results for row in result.rows] + overall
+    return Acceptance(
+        flight=flight,
+        map=map_path,
+        quick=quick,
+        seed=seed,
+        machine=machine(),
+        broken=sum(row.verdict in BROKEN for row in rows),
+        rows=rows,
+        results=results,
+    )
+
+
+def nees_band(flights: int) -> tuple[float, float]:
+    """95 % of the means of ``flights`` independent squared Mahalanobis distances with 2 degrees of freedom each.
+
+    Chi-square quantiles by Wilson and Hilferty (1931), good to a few per mille from 10 degrees of freedom on."""
+    dof = 2.0 * flights
+    low, high = (
+        dof * max(0.0, 1.0 - 2.0 / (9.0 * dof) + z * math.sqrt(2.0 / (9.0 * dof))) ** 3 / flights
+        for z in NEES_QUANTILES
+    )
+    return low, high
+
+
+def _honest(results: list[Result]) -> JudgedRow:
+    """AC-13 over all flights: every flight counts once, because its errors are of one piece."""
+    flown = [r.nees for r in results if r.nees]
+    row = {
+        "scenario": OVERALL,
+        "ac": "AC-13",
+        "what": "truth inside the 95 % ellipse, every flight counted once",
+        "unit": "%",
+        "floor": COVERAGE.text("%"),
+        "goal": "",
+        "goal_met": None,
+    }
+    if len(flown) < LEAST_FLIGHTS:
+        why = f"{len(flown)} flights; {LEAST_FLIGHTS} are the least that can tell"
+        return JudgedRow(**row, measured=None, verdict=Verdict.NOT_MEASURABLE, why=why)  # type: ignore[arg-type]
+    inside = sum(sum(v <= ELLIPSE95 for v in nees) / len(nees) for nees in flown) / len(flown)
+    mean = sum(sum(nees) / len(nees) for nees in flown) / len(flown)
+    low, high = nees_band(len(flown))
+    holds = COVERAGE.holds(inside) and low <= mean <= high
+    why = f"{len(flown)} flights; mean NEES {mean:.2f}, its 95 % band {low:.2f} to {high:.2f}"
+    if not holds:
+        why += "; too modest" if mean < low or (mean <= high and inside > 0.98) else "; too sure"
+    verdict = Verdict.PASS if holds else Verdict.BELOW
+    return JudgedRow(**row, measured=round(inside, 6), verdict=verdict, why=why)  # type: ignore[arg-type]
+
+
+def _elsewhere() -> list[JudgedRow]:
+    """Rows that no replay can show."""
+    return [
+        JudgedRow(
+            scenario=OVERALL, ac="AC-17", what="object in a frame to position", measured=None, unit="m",
+            floor="<= 20 m", goal="", verdict=Verdict.NOT_BUILT, goal_met=None, why="there is no such function yet"),
+    ]  # fmt: skip
+
+
+def write(acceptance: Acceptance, out: Path) -> None:
+    """acceptance.json, acceptance.md, acceptance.html. Raises OutputError."""
+    text = {
+        "json": json.dumps(msgspec.to_builtins(acceptance), indent=1, allow_nan=False) + "\n",
+        "md": markdown(acceptance),
+        "html": page(acceptance),
+    }
+    for suffix, content in text.items():
+        target, part = out / f"{NAME}.{suffix}", out / f"{NAME}.{suffix}.partial"
+        try:
+            part.write_text(content, encoding="utf-8")
+            part.replace(target)
+        except OSError as error:
+            raise OutputError(f"{target}: cannot be written ({error.strerror}); choose another --out") from None
+
+
+def markdown(acceptance: Acceptance) -> str:
+    """The table, row by row."""
+    lines = [
+        f"# Acceptance: {acceptance.flight}",
+        "",
+        f"{headline(acceptance)}",
+        "",
+        "| scenario | row | what | measured | floor | goal | verdict | |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in acceptance.rows:
+        verdict = row.verdict + (", goal met" if row.goal_met else "")
+        verdict = f"**{verdict}**" if row.verdict in BROKEN else verdict
+        cells = (row.scenario, row.ac, row.what, shown(row.measured, row.unit), row.floor, row.goal, verdict, row.why)
+        lines.append("| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def headline(acceptance: Acceptance) -> str:
+    """One line: how many rows hold."""
+    counts = {verdict: sum(row.verdict is verdict for row in acceptance.rows) for verdict in Verdict}
+    flown = sum(bool(result.points) for result in acceptance.results)
+    words = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    return f"{flown} scenarios flown: {words}."

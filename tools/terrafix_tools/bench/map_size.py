@@ -1,0 +1,117 @@
+"""Cost as the map grows: build, open, search. python -m terrafix_tools.bench.map_size KM2 WORK OUT.
+
+The ground is coloured noise of many sizes, a metre a pixel, different everywhere; the frame is a piece of it. Times are
+those of the processor, all threads."""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from rasterio.transform import Affine
+from rasterio.windows import Window
+
+from terrafix.anchor.belief import Belief, cell_for
+from terrafix.anchor.map_package import LocalMap, MapPackage
+from terrafix.anchor.matcher import FrameMatcher, View
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.geodesy import LocalFrame
+from terrafix_engines.features import open_describer
+from terrafix_tools.bench.flights import peak_memory_mb, spread
+from terrafix_tools.mapping.build import build
+
+GSD_M = 1.0
+BLOCK_PX = 512
+AGL_M = 150.0
+CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
+EPSG, WEST_M, NORTH_M = 32632, 690_000.0, 5_330_000.0
+BELIEFS_M = {"in flight": 20.0, "lost": 300.0}  # sigma of the belief that is looked with
+LOOKS = 8
+
+
+def measure(area_km2: float, work: Path) -> dict[str, Any]:
+    """-> seconds to build, size, milliseconds to open and to search, memory of the search."""
+    side_px = round(math.sqrt(area_km2) * 1000.0 / GSD_M)
+    image, package = work / "map.tif", work / "map.gpkg"
+    _draw(image, side_px)
+    began_s = time.process_time()
+    build(image, package)
+    build_s = time.process_time() - began_s
+    image.unlink()
+    size_mb = package.stat().st_size / 2**20
+    return {"area_km2": area_km2, "gsd_m": GSD_M, "build_cpu_s": round(build_s, 2), "package_mb": round(size_mb, 1)}
+
+
+def search(package: Path) -> dict[str, Any]:
+    """In a process of its own: what a vehicle pays for a map of this size."""
+    before_mb = peak_memory_mb()
+    began_s = time.process_time()
+    opened = MapPackage.open(package)
+    place = _middle(opened)
+    local = opened.bind(place)
+    open_ms = (time.process_time() - began_s) * 1e3
+    matcher = FrameMatcher(CAMERA, local, open_describer(""))
+    frame = _frame(local)
+    view = View(0.0, 0.0, np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), AGL_M, 0.0, 0.03, 0.02, 0.02)
+    looks = {}
+    for name, sigma_m in BELIEFS_M.items():
+        belief = Belief(0.0, 0.0, sigma_m, cell_for(AGL_M, matcher.look_cell_m(AGL_M)))
+        looks[name] = spread([_ms(partial(matcher.look, frame, view, belief)) for _ in range(LOOKS)])
+    opened.close()
+    grown_mb = peak_memory_mb() - before_mb
+    return {"open_cpu_ms": round(open_ms, 1), "look_cpu_ms": looks, "memory_mb": round(grown_mb, 1)}
+
+
+def _middle(package: MapPackage) -> LocalFrame:
+    west, south, east, north = package.manifest.bounds_wgs84
+    return LocalFrame((south + north) / 2, (west + east) / 2)
+
+
+def _frame(local: LocalMap) -> np.ndarray:
+    """What CAMERA sees straight down, north up."""
+    gsd_m = AGL_M / CAMERA.fx
+    image, _ = local.window(-CAMERA.width / 2 * gsd_m, CAMERA.height / 2 * gsd_m, CAMERA.width, CAMERA.height, gsd_m)
+    return image
+
+
+def _draw(path: Path, side_px: int) -> None:
+    """Block by block: a hundred square kilometres are never in memory."""
+    profile = {
+        "driver": "GTiff", "width": side_px, "height": side_px, "count": 3, "dtype": "uint8", "crs": f"EPSG:{EPSG}",
+        "transform": Affine(GSD_M, 0.0, WEST_M, 0.0, -GSD_M, NORTH_M), "tiled": True,
+        "compress": "JPEG", "photometric": "YCBCR", "blockxsize": BLOCK_PX, "blockysize": BLOCK_PX,
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as file:
+        for row in range(0, side_px, BLOCK_PX):
+            for column in range(0, side_px, BLOCK_PX):
+                size = (min(BLOCK_PX, side_px - column), min(BLOCK_PX, side_px - row))
+                block = _block(np.random.default_rng([row, column]))[: size[1], : size[0]]
+                window = Window(column, row, *size)
+                file.write(np.moveaxis(block, 2, 0), window=window)
+
+
+def _block(rng: np.random.Generator) -> np.ndarray:
+    image = np.full((BLOCK_PX, BLOCK_PX), 120.0, np.float32)
+    for cells, contrast in ((5, 25.0), (20, 20.0), (70, 16.0), (200, 10.0)):
+        noise = rng.normal(0.0, contrast, (cells, cells)).astype(np.float32)
+        image += cv2.resize(noise, (BLOCK_PX, BLOCK_PX), interpolation=cv2.INTER_CUBIC)
+    return cv2.merge([np.clip(image * k, 0, 255).astype(np.uint8) for k in (0.9, 1.0, 1.05)])
+
+
+def _ms(work: Callable[[], object]) -> float:
+    began_s = time.process_time()
+    work()
+    return (time.process_time() - began_s) * 1e3
+
+
+if __name__ == "__main__":
+    _what, _folder, _out = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
+    _found = search(_folder / "map.gpkg") if _what == "search" else measure(float(_what), _folder)
+    _out.write_text(json.dumps(_found), encoding="utf-8")

@@ -1,0 +1,74 @@
+"""What grows with the map and with the flight: each size in a process of its own, so that its memory is its own."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from terrafix_tools.bench import growth, map_size, rendering
+
+AREAS_KM2 = (1.0, 10.0, 100.0)
+FLIGHTS_FRAMES = (100, 1000, 3000)
+
+
+def measure(
+    work: Path,
+    console: Console,
+    *,
+    areas_km2: tuple[float, ...] = AREAS_KM2,
+    flights_frames: tuple[int, ...] = FLIGHTS_FRAMES,
+) -> dict[str, Any]:
+    """-> "map": one entry for each area, "flight": one for each length, "render": one frame of the simulator."""
+    maps, flights = [], []
+    for area_km2 in areas_km2:
+        folder = work / f"map-{area_km2:g}"
+        folder.mkdir()
+        with console.status(f"a map of {area_km2:g} km2"):
+            built = _run(map_size.__name__, f"{area_km2:g}", str(folder), out=folder / "built.json")
+            searched = _run(map_size.__name__, "search", str(folder), out=folder / "searched.json")
+        (folder / "map.gpkg").unlink()
+        maps.append(built | searched)
+    for frames in flights_frames:
+        with console.status(f"a flight of {frames} frames"):
+            flights.append(_run(growth.__name__, str(frames), out=work / f"flight-{frames}.json"))
+    with console.status("frames of the simulator"):
+        rendered = _run(rendering.__name__, out=work / "render.json")
+    return {"map": maps, "flight": flights, "render": rendered}
+
+
+def show(grown: dict[str, Any], console: Console) -> None:
+    """Two tables: what grows with the map, what with the flight. Times are processor times."""
+    table = Table(title="as the map grows (processor time)", title_justify="left")
+    for column in ("km2", "build", "size", "open", "look in flight", "look when lost", "memory"):
+        table.add_column(column, justify="right")
+    for one in grown["map"]:
+        looks = (f"{one['look_cpu_ms'][name]['median']:.0f} ms" for name in map_size.BELIEFS_M)
+        table.add_row(
+            f"{one['area_km2']:g}", f"{one['build_cpu_s']:.0f} s", f"{one['package_mb']:.0f} MB",
+            f"{one['open_cpu_ms']:.0f} ms", *looks, f"{one['memory_mb']:.0f} MB")  # fmt: skip
+    console.print(table)
+    table = Table(title="as the flight grows (processor time, estimator alone)", title_justify="left")
+    queries = list(grown["flight"][0]["covariance_cpu_ms"])
+    for column in ("frames", "one frame", *(f"covariance: {name}" for name in queries), "refinement", "memory"):
+        table.add_column(column, justify="right")
+    for one in grown["flight"]:
+        asked = (f"{one['covariance_cpu_ms'][name]['median']:.2f} ms" for name in queries)
+        table.add_row(
+            str(one["frames"]), f"{one['frame_cpu_ms']['median']:.1f} ms", *asked, f"{one['refine_cpu_s']:.1f} s",
+            f"{one['peak_memory_mb']:.0f} MB")  # fmt: skip
+    console.print(table)
+    one = grown["render"]
+    size = f"{one['width_px']}x{one['height_px']}"
+    console.print(f"a simulated frame of {size}: {one['cpu_ms']['median']:.0f} ms of processor time", highlight=False)
+
+
+def _run(module: str, *arguments: str, out: Path) -> dict[str, Any]:
+    done = subprocess.run([sys.executable, "-m", module, *arguments, str(out)], stderr=subprocess.PIPE, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(f"{module} failed with exit code {done.returncode}:\n{done.stderr}")
+    found: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
+    return found
