@@ -123,6 +123,7 @@ class VehicleState(Message, frozen=True, kw_only=True):
     roll_rad: float | None = None
     agl_m: float | None = None
     velocity_enu_mps: Vec3 | None = None
+    armed: bool | None = None  # motors may turn; a vehicle that is not armed stands
 
 
 class SourceEnded(Message, frozen=True, kw_only=True):

@@ -438,3 +438,17 @@ def test_over_hills_odometry_is_trusted_less() -> None:
             )
         claims.append(sigma_m(run.estimate(29)))
     assert claims[1] > 1.3 * claims[0]
+
+
+def test_a_vehicle_that_is_not_armed_stays_where_it_was() -> None:
+    """Nothing can be tracked on the ground; a minute there must not look like a minute of flight."""
+    claims = {}
+    for armed in (False, True):
+        run = Listener()
+        run.hear([ORIGIN])
+        for i in range(120):
+            state = VehicleState(t_ns=t_ns(i), source="mavlink", yaw_rad=0.3, pitch_rad=0.0, roll_rad=0.0, armed=armed)
+            run.hear([state, Odometry(t_ns=t_ns(i), frame_id=i, keyframe_id=i, verdict=Verdict.NO_FEATURES)])
+        claims[armed] = sigma_m(run.estimate(119))
+    assert claims[False] < ORIGIN.start_sigma_m + 2.0
+    assert claims[True] > 3.0 * claims[False]

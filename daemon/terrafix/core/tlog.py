@@ -17,6 +17,7 @@ MAX_STEP_US = 24 * 3600 * 1_000_000  # a record further than a day from the last
 MIN_TIME_US = 946_684_800_000_000  # 2000-01-01; smaller numbers are not UNIX times
 _STAMP = 8  # bytes
 _WANTED = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
     mavlink.MAVLINK_MSG_ID_ATTITUDE,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
     mavlink.MAVLINK_MSG_ID_ALTITUDE,
@@ -41,6 +42,7 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
     headings: list[VehicleState] = []
     vehicle: int | None = None
     hud_ground_m: float | None = None
+    armed: bool | None = None
     for t_us, packet in _records(data):
         t0_us = t_us if t0_us is None else t0_us
         sysid, compid, msgid = _address(packet)
@@ -53,9 +55,18 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
         vehicle = sysid
         t_ns = (t_us - t0_us) * 1000
         kind = said.get_type()
-        if kind == "ATTITUDE" and _finite(said.roll, said.pitch, said.yaw):
+        if kind == "HEARTBEAT":
+            armed = bool(said.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        elif kind == "ATTITUDE" and _finite(said.roll, said.pitch, said.yaw):
             attitudes.append(
-                VehicleState(t_ns=t_ns, source="mavlink", yaw_rad=said.yaw, pitch_rad=said.pitch, roll_rad=said.roll)
+                VehicleState(
+                    t_ns=t_ns,
+                    source="mavlink",
+                    yaw_rad=said.yaw,
+                    pitch_rad=said.pitch,
+                    roll_rad=said.roll,
+                    armed=armed,
+                )
             )
         elif kind == "GLOBAL_POSITION_INT":
             heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=said.relative_alt / 1000.0))

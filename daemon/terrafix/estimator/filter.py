@@ -3,6 +3,7 @@
 Everything is asked in two steps: ``advance`` takes a frame's odometry and says where the camera should be, ``fix``
 takes the frame's map match. Both answer with a verdict."""
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.camera import Mount
-from terrafix.core.geodesy import rot_from_quat, rot_w_b, yaw_of
+from terrafix.core.geodesy import local_rotation_up, rot_from_quat, rot_w_b, yaw_of
 from terrafix.core.pose import exp_so3, tangent_to_world, world_to_tangent
 from terrafix.estimator.factors import attitude_and_height_factor
 from terrafix.estimator.graph import NodeState, PoseGraph
@@ -35,10 +36,13 @@ VELOCITY_MEMORY_S = 10.0  # how long a drone keeps its course when nobody looks
 # DEM; what houses and trees leave with one.
 FLAT_SIGMAS, DEM_SIGMAS = (0.03, 0.02), (0.015, 0.01)
 RELIEF_SLOPE = 2.0  # a plane that misses the ground by this share of the height misses its slope by so much more
+STANDING_M, STANDING_MPS = 0.3, 0.1  # 1-sigma of a vehicle whose motors may not turn
 VELOCITY_SPAN_S = 0.9  # a velocity is measured over about a second: shorter is noise, longer misses turns
 VELOCITY_FLOOR_M = 0.15  # error of the relative position of two nodes that close, at best
 VELOCITY_SHARE = 0.03  # ... of their distance, when the graph is not asked (cheap mode)
-BEND_SHARE = 0.4  # of the change of velocity that is carried on: the turn may have ended
+BEND_SHARE = 0.4  # of the change of velocity that is carried on: the turn may have ended ...
+TURN_SHARE = 0.15  # ... which a nose that turned with it up to now denies
+TURN_AGREES = 0.5  # of the change of velocity: so close must the turn of the nose explain it
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
@@ -130,8 +134,9 @@ class Estimator:
             spread = float(np.sqrt(np.trace(motion.cov[3:, 3:]) / 3.0))
             step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * float(np.hypot(*step)), spread))
         else:
-            step_sigma = self._drift_sigma(dt_s)
-            self.velocity_sigma_mps = min(MAX_SPEED_SIGMA_MPS, self.velocity_sigma_mps + MAX_ACCELERATION_MPS2 * dt_s)
+            step_sigma = STANDING_M if attitude.stands else self._drift_sigma(dt_s)
+            grown = min(MAX_SPEED_SIGMA_MPS, self.velocity_sigma_mps + MAX_ACCELERATION_MPS2 * dt_s)
+            self.velocity_sigma_mps = STANDING_MPS if attitude.stands else grown
         self._cov_of[self.graph.next_node] = _compose_cov(self._covariance(parent), motion)
         node = self.graph.extend(
             t_s, NodeState(pose, before.bias), parent, motion, self._attitude(attitude, pose.rotation().matrix())
@@ -208,6 +213,8 @@ class Estimator:
         r_parent = state.pose.rotation().matrix()
         r_w_c = self._expected_rotation(attitude, state.bias, r_parent)
         sigma = self._drift_sigma(dt_s)
+        if attitude.stands:
+            self.velocity_mps, sigma = np.zeros(3), STANDING_M
         tau = VELOCITY_MEMORY_S
         turn = UNKNOWN_ATTITUDE_RAD + (0.3 if attitude.yaw_rad is None else np.radians(self.origin.yaw_sigma_deg))
         cov = np.diag([turn, turn, turn, sigma, sigma, sigma]) ** 2
@@ -248,10 +255,19 @@ class Estimator:
             v0 = (p1 - self.graph.state(first).pose.translation()) / before_s
             bend = (v1 - v0) * span_s / (span_s + before_s)
         self.velocity_mps = v1 + bend
+        share = TURN_SHARE if self._turning(middle, node, v1, bend) else BEND_SHARE
         unseen = MAX_ACCELERATION_MPS2 * max(span_s - 2 * VELOCITY_SPAN_S, 0.0) / 2  # a span too long to follow turns
         self.velocity_sigma_mps = min(
-            MAX_SPEED_SIGMA_MPS, float(np.sqrt(1.5 * noise**2 + unseen**2 + (BEND_SHARE * np.linalg.norm(bend)) ** 2))
+            MAX_SPEED_SIGMA_MPS, float(np.sqrt(1.5 * noise**2 + unseen**2 + (share * np.linalg.norm(bend)) ** 2))
         )
+
+    def _turning(self, a: int, b: int, velocity_mps: np.ndarray, bend_mps: np.ndarray) -> bool:
+        """Whether the turn of the nose between two nodes explains how the velocity changed from their middle to now:
+        the banked turn of an aircraft that flies where its nose points."""
+        nose_a, nose_b = (yaw_of(self.graph.state(n).pose.rotation().matrix() @ self._r_b_c.T) for n in (a, b))
+        half = local_rotation_up(-0.5 * math.remainder(nose_b - nose_a, math.tau))  # yaw runs clockwise
+        left = bend_mps - (half @ velocity_mps - velocity_mps)
+        return float(np.linalg.norm(left[:2])) < TURN_AGREES * float(np.linalg.norm(bend_mps[:2]))
 
     def _relative_sigma(self, a: int, b: int) -> float:
         """1-sigma per horizontal axis of the way between two nodes of the window, metres."""

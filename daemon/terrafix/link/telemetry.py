@@ -30,6 +30,7 @@ class Telemetry:
         self._heartbeat_ns: int | None = None
         self._height: tuple[int, float] | None = None  # (arrival, metres above take-off)
         self._boot_ms = 0
+        self._armed: bool | None = None
         self._unix_minus_monotonic_ns: int | None = None
         self.autopilot = "none"
         self.sysid = 0
@@ -67,6 +68,7 @@ class Telemetry:
             return  # another vehicle on the same network
         self.autopilot = NAMES.get(message.autopilot, f"autopilot {message.autopilot}")
         self.sysid = message.get_srcSystem()
+        self._armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         self._heartbeat_ns = now_ns
 
     def _take_height(self, height_m: float, now_ns: int) -> None:
@@ -89,6 +91,7 @@ class Telemetry:
             pitch_rad=message.pitch,
             roll_rad=message.roll,
             agl_m=height[1] if height is not None and now_ns - height[0] < HEIGHT_FRESH_NS else None,
+            armed=self._armed if self.connected(now_ns) else None,
         )
 
     def _measured_ns(self, boot_ms: int, now_ns: int) -> int:
