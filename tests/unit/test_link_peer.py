@@ -25,10 +25,10 @@ from terrafix.link import gps_input
 from terrafix.link.carry import offset
 from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
-from terrafix_tools.sim.peer import PARAMETERS, AutopilotPeer
-from terrafix_tools.sim.peer_course import PeerState, read_course, write_course
-from terrafix_tools.sim.peer_filter import Fusion, PositionFilter
-from terrafix_tools.sim.peer_gps import Fix, GpsDriver, JitterCorrection
+from terrafix_tools.sim.autopilot.course import PeerState, read_course, write_course
+from terrafix_tools.sim.autopilot.gps import GpsInputDriver, JitterCorrection
+from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, GPS_INPUT_ALONE, NO_DCM
+from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
@@ -58,7 +58,7 @@ def message(**changes: Any) -> Any:
     return mavlink.MAVLink_gps_input_message(**(fields | changes))
 
 
-def fed(driver: GpsDriver, period_s: float, count: int, start_s: float = 0.0, **changes: Any) -> float:
+def fed(driver: GpsInputDriver, period_s: float, count: int, start_s: float = 0.0, **changes: Any) -> float:
     for i in range(count):
         driver.take(message(**changes), start_s + i * period_s)
     return start_s + (count - 1) * period_s
@@ -69,12 +69,12 @@ def fed(driver: GpsDriver, period_s: float, count: int, start_s: float = 0.0, **
 
 @pytest.mark.parametrize(("rate_hz", "healthy"), [(10, True), (5, True), (4, False), (3, False), (1, False)])
 def test_fact_needs_a_mean_interval_below_215_ms(rate_hz: float, healthy: bool) -> None:
-    driver = GpsDriver(0, 5.0)
+    driver = GpsInputDriver(0, 5.0)
     assert driver.healthy(fed(driver, 1 / rate_hz, 300)) is healthy
 
 
 def test_fact_one_gap_over_245_ms_is_forgiven_two_in_a_row_are_not() -> None:
-    driver = GpsDriver(0, 5.0)
+    driver = GpsInputDriver(0, 5.0)
     now = fed(driver, 0.1, 100)
     driver.take(message(), now + 0.3)
     assert driver.healthy(now + 0.3)
@@ -84,7 +84,7 @@ def test_fact_one_gap_over_245_ms_is_forgiven_two_in_a_row_are_not() -> None:
 
 def test_fact_silence_of_a_minute_spoils_the_mean_for_half_a_minute_at_5_hz_a_quarter_of_it_at_10() -> None:
     def recovery_s(rate_hz: float) -> float:
-        driver = GpsDriver(0, 5.0)
+        driver = GpsInputDriver(0, 5.0)
         start = fed(driver, 1 / rate_hz, 100) + 60.0
         driver.look(start - 1.0)
         for i in range(1000):
@@ -98,7 +98,7 @@ def test_fact_silence_of_a_minute_spoils_the_mean_for_half_a_minute_at_5_hz_a_qu
 
 
 def test_fact_after_4_s_of_silence_the_receiver_is_gone() -> None:
-    driver = GpsDriver(0, 5.0)
+    driver = GpsInputDriver(0, 5.0)
     now = fed(driver, 0.1, 50)
     driver.look(now + 3.9)
     assert (driver.fix_type, driver.satellites) == (3, 6)
@@ -109,19 +109,13 @@ def test_fact_after_4_s_of_silence_the_receiver_is_gone() -> None:
 # --- facts: fields ---
 
 
-def test_fact_another_gps_id_is_ignored() -> None:
-    driver = GpsDriver(0, 5.0)
-    assert driver.take(message(gps_id=1), 0.0) is None
-    assert (driver.other_instance, driver.fix_type) == (1, 1)
-
-
 @pytest.mark.parametrize("fix_type", [0, 1, 2])
 def test_fact_below_3d_nothing_reaches_the_filter(fix_type: int) -> None:
-    assert GpsDriver(0, 5.0).take(message(fix_type=fix_type), 0.0) is None
+    assert GpsInputDriver(0, 5.0).take(message(fix_type=fix_type), 0.0) is None
 
 
 def test_fact_an_ignored_velocity_stays_at_its_last_value() -> None:
-    driver = GpsDriver(0, 5.0)
+    driver = GpsInputDriver(0, 5.0)
     never = driver.take(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.0)
     driver.take(message(vn=5.0), 0.1)
     stuck = driver.take(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.2)
@@ -132,7 +126,7 @@ def test_fact_an_ignored_velocity_stays_at_its_last_value() -> None:
 
 def test_fact_the_driver_takes_a_fix_for_200_ms_old_unless_told_otherwise() -> None:
     for delay_ms, lag_s in ((0.0, 0.2), (5.0, 0.005), (100.0, 0.1), (900.0, 0.25)):
-        fix = GpsDriver(0, delay_ms).take(message(), 10.0)
+        fix = GpsInputDriver(0, delay_ms).take(message(), 10.0)
         assert fix is not None
         assert 10.0 - fix.t_s == pytest.approx(lag_s)
 
@@ -144,103 +138,10 @@ def test_fact_the_week_takes_out_variations_of_latency_and_not_its_mean() -> Non
     assert all(c == pytest.approx(0.02, abs=1e-6) for c in corrected[1:])
 
 
-@pytest.mark.parametrize(
-    ("changes", "ready"),
-    [
-        ({}, True),
-        ({"satellites_visible": 5}, False),
-        ({"hdop": 3.0}, False),
-        ({"ignore_flags": mavlink.GPS_INPUT_IGNORE_FLAG_HDOP}, False),  # 99.99
-        ({"horiz_accuracy": 6.0}, False),
-        ({"vert_accuracy": 8.0}, False),
-        ({"speed_accuracy": 1.5}, False),
-    ],
-)
-def test_fact_checks_must_hold_for_10_s_before_first_use(changes: dict[str, Any], ready: bool) -> None:
-    driver = GpsDriver(0, 5.0)
-    answers = []
-    for i in range(110):
-        fix = driver.take(message(**changes), i * 0.1)
-        assert fix is not None
-        answers.append(driver.aligned(fix, i * 0.1, 31, 100.0))
-    assert answers.index(True) == 100 if ready else not any(answers)
-
-
-def test_fact_an_honest_sigma_over_5_m_aligns_only_with_the_position_check_cleared() -> None:
-    for check, scale, ready in ((31, 100.0, False), (31, 200.0, True), (23, 100.0, True)):
-        driver = GpsDriver(0, 5.0)
-        for i in range(110):
-            fix = driver.take(message(horiz_accuracy=8.0), i * 0.1)
-            assert fix is not None
-            aligned = driver.aligned(fix, i * 0.1, check, scale)
-        assert aligned is ready
-
-
-# --- facts: the filter ---
-
-# Error in metres that the firmware itself took over 5, 12 and 30 s after a step, by (step m, horiz_accuracy m).
-MEASURED: dict[tuple[float, float], tuple[float, float, float]] = {
-    (30, 5): (3.9, 10.6, 22.8),
-    (30, 10): (1.1, 3.5, 11.5),
-    (30, 30): (0.1, 0.4, 1.8),
-    (60, 5): (0.0, 60.0, 60.0),
-    (60, 10): (2.2, 7.0, 22.9),
-    (60, 20): (0.5, 1.8, 7.5),
-    (60, 50): (0.1, 0.3, 1.3),
-    (120, 10): (0.0, 120.0, 120.0),
-    (120, 20): (1.1, 3.8, 15.2),
-    (120, 50): (0.2, 0.6, 2.7),
-    (120, 100): (0.0, 0.2, 0.7),
-    (200, 1): (0.0, 200.0, 200.0),
-    (200, 100): (0.1, 0.2, 0.5),
-}
-
-
-def fix_at(t_s: float, north_m: float, accuracy_m: float) -> Fix:
-    lat, lon = offset(LAT, LON, 0.0, north_m)
-    return Fix(t_s, lat, lon, 500.0, (0.0, 0.0, 0.0), accuracy_m, 3.0, 0.3, 6, 1.0)
-
-
-@pytest.mark.parametrize(("step_m", "accuracy_m"), MEASURED)
-def test_fact_steps_are_taken_over_as_fast_as_the_firmware_did(step_m: float, accuracy_m: float) -> None:
-    hover = PositionFilter(LAT, LON, (0.0, 0.0), seed=0)
-    found = []
-    for i in range(1, 95 * 50):
-        t_s = i * 0.02
-        hover.predict(t_s, 0.02, (0.0, 0.0))
-        if i % 10 == 0:
-            hover.fuse(fix_at(t_s, *((step_m, accuracy_m) if t_s >= 60.0 else (0.0, 1.0))), t_s)
-        if i in (65 * 50, 72 * 50, 90 * 50):
-            found.append(hover.error_m(LAT, LON))
-    assert found == pytest.approx(MEASURED[step_m, accuracy_m], rel=0.35, abs=0.8)
-
-
-def test_fact_a_persistent_wrong_fix_wins_after_10_s_by_a_reset() -> None:
-    hover = PositionFilter(LAT, LON, (0.0, 0.0), seed=0)
-    outcomes = []
-    for i in range(1, 300):
-        hover.predict(i * 0.1, 0.1, (0.0, 0.0))
-        outcomes.append(hover.fuse(fix_at(i * 0.1, 200.0 if i > 100 else 0.0, 1.0), i * 0.1))
-    assert outcomes[100:200] == [Fusion.REJECTED] * 100
-    assert outcomes.index(Fusion.RESET) in (200, 201)
-
-
-def test_fact_bad_accuracy_is_held_and_leaves_the_gate_open() -> None:
-    def outcome(spike_m: float) -> Fusion:
-        hover = PositionFilter(LAT, LON, (0.0, 0.0), seed=0)
-        for i in range(1, 400):
-            hover.predict(i * 0.1, 0.1, (0.0, 0.0))
-            hover.fuse(fix_at(i * 0.1, 0.0, spike_m if i == 350 else 1.0), i * 0.1)
-        hover.predict(40.0, 0.1, (0.0, 0.0))
-        return hover.fuse(fix_at(40.0, 60.0, 1.0), 40.0)
-
-    assert outcome(1.0) is Fusion.REJECTED
-    assert outcome(80.0) is Fusion.FUSED  # 5 s after a single report
-
-
 def test_the_course_survives_its_file(tmp_path: Path) -> None:
     rows = [
-        (t / 2, PeerState(48 + t * 1e-5, 11.0, 600, 100, 3.1 if t % 2 else -3.1, 0, 0.1, 1.0, 2, 0)) for t in range(9)
+        (t / 2, PeerState(48 + t * 1e-5, 11.0, 600, 100, 3.1 if t % 2 else -3.1, 0, 0.1, 1.0, 2, 0, 9.0))
+        for t in range(9)
     ]
     write_course(tmp_path / "course.csv", rows)
     course = read_course(tmp_path / "course.csv")
@@ -254,12 +155,21 @@ def test_the_course_survives_its_file(tmp_path: Path) -> None:
             read_course(tmp_path / name)
 
 
-def test_parameters_of_the_peer_are_those_of_the_vehicle_files() -> None:
-    for name in ("copter", "plane"):
-        lines = (CONFIG / "vehicles" / f"{name}.param").read_text().splitlines()
-        values = dict(line.split(",") for line in lines if line and not line.startswith("#"))
-        assert {k: float(values[k]) for k in PARAMETERS} == PARAMETERS
-        assert values["EK3_SRC1_VELXY"] == values["EK3_SRC1_VELZ"] == "3"  # we send velocity
+def in_file(name: str) -> dict[str, float]:
+    lines = (CONFIG / "vehicles" / f"{name}.param").read_text().splitlines()
+    rows = (line.split(",") for line in lines if line and not line.startswith("#"))
+    return {key: float(value) for key, value in rows}
+
+
+def test_parameters_of_the_simulated_autopilot_are_those_of_the_vehicle_files() -> None:
+    """What a file sets beyond them does not decide about GPS and is not simulated."""
+
+    def simulated(name: str) -> dict[str, float]:
+        return {key: value for key, value in in_file(name).items() if key in FIRMWARE}
+
+    assert simulated("copter") == GPS_INPUT_ALONE
+    assert simulated("plane") == GPS_INPUT_ALONE | NO_DCM
+    assert simulated("second-gps") == BESIDE_A_RECEIVER | NO_DCM
 
 
 # --- facts: what the link sends, against the contract ---
@@ -417,7 +327,7 @@ def test_the_peer_answers_parameters_and_refuses_what_it_cannot() -> None:
             found += mav.parse_buffer(wire.recv(4096)) or []
         return [x for x in found if x.get_type() == kind]
 
-    assert len(ask(mavlink.MAVLink_param_request_list_message(1, 1), "PARAM_VALUE")) == len(PARAMETERS)
+    assert len(ask(mavlink.MAVLink_param_request_list_message(1, 1), "PARAM_VALUE")) == len(FIRMWARE)
     (value,) = ask(mavlink.MAVLink_param_request_read_message(1, 1, b"GPS1_TYPE", -1), "PARAM_VALUE")
     assert (value.param_id, value.param_value) == ("GPS1_TYPE", 14.0)
     (ack,) = ask(mavlink.MAVLink_command_long_message(1, 1, 400, 0, *(0.0,) * 7), "COMMAND_ACK")
@@ -439,7 +349,7 @@ def test_the_peer_in_a_process_of_its_own(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
-        "terrafix_tools.sim.peer_process",
+        "terrafix_tools.sim.autopilot.process",
         str(tmp_path / "course.csv"),
         "--port",
         "0",

@@ -51,14 +51,14 @@ def test_what_flies_imports_only_the_core_dependencies() -> None:
 
 
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
-    declared = modules(CORE) | modules(EXTRAS["ground"])
+    declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
 
 
 def test_every_dependency_has_a_range() -> None:
-    for requirement in [*CORE.values(), *EXTRAS["ground"].values()]:
+    for requirement in [*CORE.values(), *EXTRAS["ground"].values(), *EXTRAS["sim"].values()]:
         operators = {specifier.operator for specifier in requirement.specifier}
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"
 
@@ -96,7 +96,7 @@ def test_the_packages_say_that_they_are_typed(package: str) -> None:
     assert list(ROOT.glob(f"*/{package}/py.typed"))
 
 
-@pytest.mark.parametrize("command", ["replay /nowhere", "map info /nowhere.gpkg"])
+@pytest.mark.parametrize("command", ["replay /nowhere", "map build /nowhere.tif --out /nowhere.gpkg"])
 def test_without_the_ground_tools_one_line_says_what_to_install(command: str) -> None:
     """As on a vehicle: the core dependencies only."""
     code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"

@@ -93,8 +93,8 @@ def test_commands_of_the_readme_exist() -> None:
 
     from terrafix_tools.cli import app
 
-    used = re.findall(r"^\.venv/bin/terrafix (map \w+|\w+)(.*)$", README, flags=re.M)
-    assert {command for command, _ in used} == {"map build", "replay", "evaluate", "report", "run"}
+    used = re.findall(r"^\.venv/bin/terrafix ((?:map |sim )?\w+)(.*)$", README, flags=re.M)
+    assert {command for command, _ in used} == {"map build", "replay", "evaluate", "report", "run", "accept", "sim fly"}
     for command, rest in used:
         shown = CliRunner().invoke(app, [*command.split(), "--help"], env={"COLUMNS": "300"})
         assert shown.exit_code == 0

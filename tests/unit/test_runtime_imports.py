@@ -16,9 +16,16 @@ PACKAGES = {
 }
 # library -> the modules (and what is below them) that may import it
 OWNERS = {
-    "gtsam": ("terrafix.estimator",),
-    "pymavlink": ("terrafix.link", "terrafix_tools.sim.peer", "terrafix.core.tlog"),  # tlog: reads recorded telemetry
-    "serial": ("terrafix.link", "terrafix_tools.sim.peer"),
+    "gtsam": ("terrafix.estimator", "terrafix_tools.bench.growth"),
+    "pymavlink": (
+        "terrafix.link",
+        "terrafix_tools.sim.autopilot",
+        "terrafix.core.tlog",
+        "terrafix_tools.sim.flights.log",
+        "terrafix_tools.sim.sitl",
+    ),  # tlog: reads recorded telemetry
+    "mavsdk": ("terrafix_tools.sim.sitl",),
+    "serial": ("terrafix.link",),
     "onnxruntime": ("terrafix_engines",),
     "faiss": ("terrafix.anchor",),
     "systemd": ("terrafix.supervisor",),

@@ -8,12 +8,12 @@ import typer
 
 from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
+from terrafix_tools.mapping.cli import app as map_app
 from terrafix_tools.sim.cli import app as sim_app
 
-ON_THE_GROUND = ("rasterio",)  # the extra `ground`: a vehicle need not have it
+ON_THE_GROUND = ("rasterio", "urllib3", "pmtiles", "osmium")  # the extra `ground`: a vehicle need not have it
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
-map_app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
 app.add_typer(map_app, name="map")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
@@ -107,47 +107,9 @@ def demo(
     duration: Annotated[float, typer.Option(help="Seconds of flight.")] = 90.0,
 ) -> None:
     """A flight over a generated world with the real processes and an autopilot peer, ending in a report."""
-    from terrafix_tools.sim.demo import demo as run_demo
+    from terrafix_tools.sim.demo.demo import demo as run_demo
 
     raise typer.Exit(run_demo(out, seed=seed, duration_s=duration))
-
-
-@map_app.command("build")
-def map_build(
-    imagery: Annotated[Path, typer.Argument(help="GeoTIFF in any projected CRS (or EPSG:4326).")],
-    out: Annotated[Path, typer.Option(help="Map package to write (.gpkg).")],
-    dem: Annotated[Path | None, typer.Option(help="Elevation GeoTIFF, metres AMSL.")] = None,
-    date: Annotated[str, typer.Option(help="Date of the imagery, YYYY-MM-DD.")] = "",
-    licence: Annotated[str, typer.Option(help="Licence text of the imagery.")] = "",
-    ce90: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=200.0, help="Stated position error of the imagery: radius of 90 %, metres."),
-    ] = None,
-) -> None:
-    """GeoTIFF -> map package."""
-    from terrafix_tools.mapping.build import build
-
-    build(imagery, out, dem=dem, date=date, licence=licence, ce90_m=ce90, progress=True)
-
-
-@map_app.command("info")
-def map_info(package: Annotated[Path, typer.Argument(help="Map package.")]) -> None:
-    """What is in a map package, as JSON."""
-    from terrafix_tools.mapping.build import info
-
-    info(package)
-
-
-@map_app.command("preview")
-def map_preview(
-    package: Annotated[Path, typer.Argument(help="Map package.")],
-    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("preview.png"),
-    size: Annotated[int, typer.Option(min=64, max=8192, help="Longer side, pixels.")] = 1024,
-) -> None:
-    """The whole map, north up, as a picture; where it is transparent the map has nothing."""
-    from terrafix_tools.mapping.build import preview
-
-    preview(package, out, size)
 
 
 @app.command()
@@ -159,11 +121,12 @@ def bench(
     ] = None,
     frames: Annotated[int | None, typer.Option(help="Only so many frames of each flight.")] = None,
     xfeat: Annotated[bool, typer.Option(help="Also with XFeat, when models/xfeat.onnx is there.")] = True,
+    growing: Annotated[bool, typer.Option(help="Also larger maps (to 100 km2) and longer flights.")] = True,
 ) -> None:
-    """Time per frame and accuracy beside a SIFT + RANSAC baseline measured in the same run."""
+    """Time, memory and accuracy beside baselines measured in the same run, and how they grow."""
     from terrafix_tools.bench.run import bench as run_bench
 
-    run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat)
+    run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat, growing=growing)
 
 
 def main() -> None:
@@ -174,9 +137,10 @@ def main() -> None:
         typer.echo(f"terrafix: {error}", err=True)
         sys.exit(error.exit_code)
     except ModuleNotFoundError as error:
-        if error.name not in ON_THE_GROUND:
+        missing = (error.name or "").split(".")[0]
+        if missing not in ON_THE_GROUND:
             raise
-        typer.echo(f"terrafix: this command needs {error.name}; install it: pip install 'terrafix[ground]'", err=True)
+        typer.echo(f"terrafix: this command needs {missing}; install it: pip install 'terrafix[ground]'", err=True)
         sys.exit(UsageError.exit_code)
 
 

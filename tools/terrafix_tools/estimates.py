@@ -132,8 +132,12 @@ def read_rows(path: Path) -> list[Row]:
     return rows
 
 
-def read_table(path: Path, required: tuple[str, ...], hint: str) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yields (line number, cells by column). Raises EvaluationError: file or columns missing, torn line, file twice."""
+def read_table(
+    path: Path, required: tuple[str, ...], hint: str, *, key: str = "file"
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yields (line number, cells by column); no two rows have the same ``key``.
+
+    Raises EvaluationError: file or columns missing, torn line, key twice."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -155,7 +159,7 @@ def read_table(path: Path, required: tuple[str, ...], hint: str) -> Iterator[tup
         if len(raw) != len(head):
             raise EvaluationError(f"{path}, line {line}: {len(raw)} cells where the head has {len(head)}")
         row = {name: cell.strip() for name, cell in zip(head, raw, strict=True)}
-        file = row["file"]
+        file = row[key]
         if file in seen:
             raise EvaluationError(
                 f"{path}, line {line}: '{file}' stands there a second time (first in line {seen[file]})"

@@ -6,6 +6,7 @@ from pathlib import Path
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import load
 from terrafix.core.errors import MapError
+from terrafix.core.signature import trusted_keys
 from terrafix.vision.sources import open_configured, parse_start
 
 
@@ -30,7 +31,9 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     if given is None:
         raise MapError("no map: give one with --map (GeoTIFF or map package) or [map] path")
     package = given if given.suffix.lower() == ".gpkg" else _built(given)
-    with_map = MapPackage.open(package)
+    # Where signatures are required every tile is read now, on the ground: in flight each is checked when it is used.
+    trusted = trusted_keys(config.map.trusted_keys, required=config.map.require_signature)
+    with_map = MapPackage.open(package, verify=trusted is not None, trusted=trusted)
     ground_amsl_m = None
     try:
         if place is not None and not with_map.covers(*place):

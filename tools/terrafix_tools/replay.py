@@ -55,8 +55,8 @@ def replay(
 ) -> dict[str, Any]:
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
-    ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg) instead of the source's. ``nodes`` and ``altered`` put something
-    between flight and nodes (a stopwatch, a fault). Raises the TerrafixError family."""
+    ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg) instead of the source's. ``nodes`` and ``altered`` put
+    something between flight and nodes (a stopwatch, a fault). Raises the TerrafixError family."""
     began_s = time.perf_counter()
     config = _with_models(load(configs or []), models or [])
     source = altered(open_source(str(flight), start=start))

@@ -12,6 +12,7 @@ RIGHT = 14
 TOP = 12
 AXIS = 26  # bottom, for the labels of the x axis
 TICKS_X = 9
+MOST_LOG_TICKS = 10  # of 1, 2, 5, 10 ...; beyond, only the powers of ten
 
 Point = tuple[float, float | None]
 
@@ -70,6 +71,21 @@ class Chart:
         self.marks.append(
             f'<rect class="bar {css}" x="{left + 0.5:.1f}" y="{top:.1f}" width="{max(1.0, right - left - 1):.1f}" '
             f'height="{max(0.0, self.height - AXIS - top):.1f}"><title>{escape(tip)}</title></rect>'
+        )
+
+    def band(self, x_low: float, x_high: float, css: str, tip: str) -> None:
+        """A stretch of the x axis, from the top of the chart to its bottom."""
+        self._block(x_low, x_high, TOP, self.height - AXIS, css, tip)
+
+    def foot(self, x_low: float, x_high: float, css: str, tip: str, height: int) -> None:
+        """A stretch of the x axis, as a strip on the bottom of the chart."""
+        self._block(x_low, x_high, self.height - AXIS - height, self.height - AXIS, css, tip)
+
+    def _block(self, x_low: float, x_high: float, top: int, bottom: int, css: str, tip: str) -> None:
+        left, right = self.x(x_low), self.x(x_high)
+        self.marks.append(
+            f'<rect class="{css}" x="{left:.1f}" y="{top}" width="{max(0.8, right - left):.1f}" '
+            f'height="{bottom - top}"><title>{escape(tip)}</title></rect>'
         )
 
     def upright(self, value: float, text: str, row: int = 0) -> None:
@@ -151,7 +167,8 @@ def ticks(low: float, high: float, count: int, log: bool = False, sixties: bool 
     """Round values inside [low, high]; ``sixties``: round as minutes are."""
     if log:
         decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-        return [v for d in decades for v in (10.0**d, 2 * 10.0**d, 5 * 10.0**d) if low <= v <= high]
+        values = [v for d in decades for v in (10.0**d, 2 * 10.0**d, 5 * 10.0**d) if low <= v <= high]
+        return values if len(values) <= MOST_LOG_TICKS else [10.0**d for d in decades if low <= 10.0**d <= high]
     span = high - low
     if span <= 0:
         return [low]

@@ -43,6 +43,13 @@ class Navigation:
     airspeed_mps: float
 
 
+def navigation_of(state: State) -> Navigation:
+    """What an autopilot believes that knows the truth."""
+    return Navigation(
+        state.p_b_in_w_m, state.velocity_enu_mps, state.yaw_rad, state.pitch_rad, state.roll_rad, state.airspeed_mps
+    )
+
+
 @dataclass(frozen=True)
 class GnssFix:
     """A receiver's fix; with ``fix_type`` below 3 the rest means nothing."""

@@ -21,16 +21,18 @@ def open_source(
     rate_hz: float = 2.0,
     wait_for_camera: bool = False,
 ) -> Source:
-    """Opens a flight folder, a folder of photos, a video file, a V4L2 device or a GStreamer pipeline.
+    """Opens a flight folder, photos, a video file, a V4L2 device, a GStreamer pipeline or MJPEG over HTTP.
 
     ``start`` (lat_deg, lon_deg) wins over what the source says. ``camera``: a camera description; live cameras
     need it, for photos and videos it wins over theirs. ``rate_hz``: frames per second taken from a video or camera.
     ``wait_for_camera``: a camera that is not there is waited for in ``shots`` (a restart in flight), not an error.
     Raises SourceError, one line that says what to do."""
     if not spec.strip():
-        raise SourceError("no source given; name a flight folder, photos, a video, /dev/videoN or a GStreamer pipeline")
+        raise SourceError(
+            "no source given; name a flight folder, photos, a video, /dev/videoN, http://... or a GStreamer pipeline"
+        )
     on_disk = os.path.exists(os.path.expanduser(spec)) and not spec.startswith("/dev/")
-    if not on_disk and (spec.isdecimal() or spec.startswith("/dev/") or "!" in spec):
+    if not on_disk and (spec.isdecimal() or spec.startswith(("/dev/", "http://", "https://")) or "!" in spec):
         from terrafix.vision.sources.camera import LiveCamera
 
         return LiveCamera(spec, start, camera, rate_hz, wait=wait_for_camera)

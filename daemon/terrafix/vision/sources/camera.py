@@ -1,4 +1,4 @@
-"""A live camera: a V4L2 device or a GStreamer pipeline. Unplugged, it is waited for; it never ends by itself."""
+"""A live camera: V4L2 device, GStreamer pipeline, MJPEG over HTTP. Lost, it is waited for; it never ends by itself."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -7,11 +7,13 @@ from typing import Any, Protocol
 
 import cv2
 
+from terrafix.core import logs
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
 from terrafix.messages import Camera, Frame, Origin
 from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
+from terrafix.vision.sources.mjpeg import MjpegCapture
 
 RECONNECT_S = 1.0  # a USB camera needs about this long to come back
 READ_TIMEOUT_MS = 2000  # OpenCV's own 10 s would hold up the end of the process
@@ -60,7 +62,7 @@ class LiveCamera:
         self._reconnect_s = reconnect_s
         self._closed = threading.Event()
         self._streaming = False
-        self._capture = self._open(self.spec, self._origin.camera)
+        self._capture = self._reopened() if wait else self._open(self.spec, self._origin.camera)
         if self._capture is not None:
             self._check_size(self._capture)
         elif not wait:
@@ -95,6 +97,8 @@ class LiveCamera:
                     continue
                 if not capture.grab():
                     self._disconnect()
+                    if not self._closed.is_set():
+                        logs.get().warning("camera lost; it is waited for", source=self.spec)
                     continue
                 t_ns = _stamp(capture, now_ns())
                 if t_ns < due_ns:
@@ -118,8 +122,18 @@ class LiveCamera:
     def _connected(self) -> Capture | None:
         """The capture, opened again when it was lost; None after a wait in vain."""
         if self._capture is None and not self._closed.wait(self._reconnect_s):
-            self._capture = self._open(self.spec, self._origin.camera)
+            self._capture = self._reopened()
+            if self._capture is not None:
+                logs.get().info("camera is there", source=self.spec)
         return self._capture
+
+    def _reopened(self) -> Capture | None:
+        """In mid-flight a camera that cannot be opened now is not a mistake of the user's."""
+        try:
+            return self._open(self.spec, self._origin.camera)
+        except SourceError as error:
+            logs.get().debug("camera not there yet", source=self.spec, why=str(error))
+            return None
 
     def _disconnect(self) -> None:
         if self._capture is not None:
@@ -129,7 +143,8 @@ class LiveCamera:
     def _check_size(self, capture: Capture) -> None:
         camera = self._origin.camera
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if size != (camera.width, camera.height):
+        unknown = size == (0, 0)  # a stream does not say its size before the first picture
+        if not unknown and size != (camera.width, camera.height):
             self._disconnect()
             raise SourceError(
                 f"{self.spec}: the camera gives {size[0]}x{size[1]}, its description says "
@@ -137,13 +152,22 @@ class LiveCamera:
             )
 
 
+def is_address(spec: str) -> bool:
+    """Whether ``spec`` is the URL of a stream; a pipeline may hold one."""
+    return spec.startswith(("http://", "https://")) and "!" not in spec
+
+
 def _stamp(capture: Capture, arrival_ns: int) -> int:
     """V4L2 stamps a buffer on the monotonic clock (V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC); OpenCV shows it as POS_MSEC."""
+    if isinstance(capture, MjpegCapture):
+        return capture.stamp_ns or arrival_ns
     driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
     return driver_ns if 0 <= arrival_ns - driver_ns <= MAX_DRIVER_AGE_NS else arrival_ns
 
 
 def _open_capture(spec: str, camera: Camera) -> Capture | None:
+    if is_address(spec):
+        return MjpegCapture(spec)
     if "!" in spec:
         if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
             raise SourceError(

@@ -1,0 +1,173 @@
+"""A smooth way through a recorded truth, and the telemetry of an autopilot that flew it."""
+
+import csv
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from terrafix.core.errors import EvaluationError, OutputError, SourceError
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.tlog import read_tlog
+from terrafix.vision.sources import open_source
+from terrafix_tools.sim.flights.recorded import read_recorded, write_recorded
+from terrafix_tools.sim.flights.smooth import smooth
+
+DataSet = Callable[[str], Path]
+PLACE = LocalFrame(47.0, 8.0)
+G = 9.80665
+
+
+def true_way(t_s: np.ndarray) -> np.ndarray:
+    """(N, 2): a circle of 60 m at 8 m/s."""
+    return 60.0 * np.column_stack([np.sin(t_s * 8.0 / 60.0), np.cos(t_s * 8.0 / 60.0)])
+
+
+def test_a_polynomial_of_fifth_degree_between_two_states_is_met_exactly() -> None:
+    """Samples of a parabola: the smoothest way through them is the parabola, and its derivatives are known."""
+    t_s = np.array([0.0, 1.0, 2.5, 3.0, 7.0, 8.0])
+    found = smooth(t_s, (3.0 - 2.0 * t_s + 0.5 * t_s**2)[:, None], 10.0).at(np.array([0.3, 2.0, 5.5, 8.0]))[:, :, 0]
+    at = np.array([0.3, 2.0, 5.5, 8.0])
+    assert found[:, 0] == pytest.approx(3.0 - 2.0 * at + 0.5 * at**2, abs=1e-3)
+    assert found[:, 1] == pytest.approx(-2.0 + at, abs=1e-2)
+    assert found[:, 2] == pytest.approx(1.0, abs=0.05)
+
+
+def test_rate_and_acceleration_are_the_derivatives_of_the_way() -> None:
+    rng = np.random.default_rng(1)
+    t_s = np.cumsum(rng.uniform(0.3, 2.0, 60))
+    curve = smooth(t_s, rng.normal(0.0, 5.0, (60, 2)).cumsum(axis=0), 4.0)
+    fine = np.arange(t_s[0], t_s[-1], 0.005)
+    value, rate, bend = curve.at(fine).transpose(1, 0, 2)
+    assert np.abs(np.gradient(value, 0.005, axis=0) - rate)[1:-1].max() < 1e-2
+    inside = np.abs(np.gradient(rate, 0.005, axis=0) - bend)[1:-1]
+    assert np.quantile(inside, 0.99) < 0.05  # the third derivative may jump at a sample
+
+
+def test_noise_of_a_truth_does_not_become_g_forces() -> None:
+    """Samples at 2 Hz with 2 m of noise: differences would shake with 16 m/s^2 and more."""
+    t_s = np.arange(0.0, 60.0, 0.5)
+    noisy = true_way(t_s) + np.random.default_rng(2).normal(0.0, 2.0, (120, 2))
+    assert np.abs(np.diff(noisy, 2, axis=0) / 0.25).max() > 16.0
+    found = smooth(t_s, noisy, 3.0).at(np.arange(0.0, 59.5, 0.02))
+    assert np.linalg.norm(found[:, 2], axis=1).max() < 3.05
+    off = np.linalg.norm(found[:, 0] - true_way(np.arange(0.0, 59.5, 0.02)), axis=1)
+    assert np.median(off) < 1.6  # nearer to the truth than its samples
+
+
+def test_outside_its_samples_the_rate_stays() -> None:
+    t_s = np.arange(0.0, 5.0)
+    after = smooth(t_s, (2.0 * t_s)[:, None], 5.0).at(np.array([-1.0, 6.0]))[:, :, 0]
+    assert after[:, 0] == pytest.approx([-2.0, 12.0], abs=1e-3)
+    assert after[:, 2] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    """A circle, 12 s long, without a ground height, heading along the way."""
+    folder = tmp_path / "flight"
+    (folder / "frames").mkdir(parents=True)
+    t_s = np.arange(0.0, 12.1, 0.5)
+    times, truth = [["file", "t_s", "yaw_deg"]], [["file", "lat_deg", "lon_deg", "agl_m", "yaw_deg"]]
+    for i, (t, (e_m, n_m)) in enumerate(zip(t_s, true_way(t_s), strict=True)):
+        cv2.imwrite(str(folder / "frames" / f"{i}.png"), np.full((48, 64, 3), 90, np.uint8))
+        lat_deg, lon_deg = PLACE.to_wgs84(float(e_m), float(n_m))
+        yaw_deg = math.degrees(math.pi / 2 + t * 8.0 / 60.0) % 360.0
+        times.append([f"{i}.png", f"{t:.3f}", f"{yaw_deg:.1f}"])
+        truth.append([f"{i}.png", f"{lat_deg:.8f}", f"{lon_deg:.8f}", f"{80.0 + 0.5 * t:.3f}", f"{yaw_deg:.3f}"])
+    for name, rows in (("frames.csv", times), ("truth.csv", truth)):
+        with (folder / name).open("w", newline="") as file:
+            csv.writer(file).writerows(rows)
+    (folder / "flight.toml").write_text(
+        'map = "../map.tif"\n[camera]\nwidth = 64\nheight = 48\nfx = 50.0\nfy = 50.0\ncx = 32.0\ncy = 24.0\n'
+        "[start]\nlat_deg = 47.0\nlon_deg = 8.0\n[truth]\nsigma_m = 1.5\n"
+    )
+    return folder
+
+
+def packets(path: Path) -> list[tuple[float, object]]:
+    """(seconds, message) of a tlog, read with pymavlink's own parser."""
+    data, out = path.read_bytes(), []
+    parser = mavlink.MAVLink(None)
+    at, first = 0, None
+    while at < len(data):
+        t_us = int.from_bytes(data[at : at + 8], "big")
+        length = 12 + data[at + 9]
+        first = t_us if first is None else first
+        out.append(((t_us - first) / 1e6, parser.decode(bytearray(data[at + 8 : at + 8 + length]))))
+        at += 8 + length
+    return out
+
+
+def test_the_folder_flies_with_imu(recorded: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    way = write_recorded(recorded, out, seed=3)
+    assert way.level.off < 0.05
+    assert (out / "truth.csv").read_bytes() == (recorded / "truth.csv").read_bytes()
+    source = open_source(str(out))
+    shots = list(source.shots())
+    source.close()
+    assert len(shots) == 25 and not any(shot.frame.error for shot in shots)
+    assert source.map_hint() == (tmp_path / "map.tif").resolve()
+    assert source.origin().camera.fx == 50.0
+    said = packets(out / "telemetry.tlog")
+    kinds = [message.get_type() for _, message in said]  # type: ignore[attr-defined]
+    for kind, least in (("ATTITUDE", 590), ("RAW_IMU", 590), ("GLOBAL_POSITION_INT", 115), ("HEARTBEAT", 12)):
+        assert kinds.count(kind) >= least, kind
+    assert {"SCALED_PRESSURE", "GPS_RAW_INT", "SYSTEM_TIME"} <= set(kinds)
+
+
+def test_its_imu_is_that_of_the_circle(recorded: Path, tmp_path: Path) -> None:
+    """8 m/s around 60 m to the right: 1.07 m/s^2 to the right, 0.133 rad/s of yaw, and gravity."""
+    write_recorded(recorded, tmp_path / "out", seed=3)
+    imu = [m for t, m in packets(tmp_path / "out" / "telemetry.tlog") if m.get_type() == "RAW_IMU" and 2 < t < 10]  # type: ignore[attr-defined]
+    mean = np.array([[m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro] for m in imu]).mean(axis=0)  # type: ignore[attr-defined]
+    assert mean[:3] * G / 1e3 == pytest.approx([0.0, 64.0 / 60.0, -G], abs=0.2)
+    assert mean[3:] / 1e3 == pytest.approx([0.0, 0.0, 8.0 / 60.0], abs=0.012)
+
+
+def test_its_attitude_and_height_are_those_of_the_truth(recorded: Path, tmp_path: Path) -> None:
+    write_recorded(recorded, tmp_path / "out", seed=3)
+    states = read_tlog(tmp_path / "out" / "telemetry.tlog")
+    heights = [(s.t_ns / 1e9, s.agl_m) for s in states if s.agl_m is not None]
+    assert max(abs(agl_m - 80.0 - 0.5 * t) for t, agl_m in heights) < 6.0
+    turns = [math.remainder(s.yaw_rad - math.pi / 2 - s.t_ns / 1e9 * 8 / 60, math.tau) for s in states if s.yaw_rad]
+    assert np.degrees(np.abs(turns)).max() < 12.0
+    assert np.degrees(np.std(turns)) < 3.0
+
+
+def test_the_same_seed_writes_the_same_log(recorded: Path, tmp_path: Path) -> None:
+    logs = []
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        write_recorded(recorded, tmp_path / name, seed=seed)
+        logs.append((tmp_path / name / "telemetry.tlog").read_bytes())
+    assert logs[0] == logs[1] != logs[2]
+
+
+def test_what_cannot_be_is_one_clear_line(recorded: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="choose another --out"):
+        write_recorded(recorded, recorded, seed=1)
+    lines = (recorded / "truth.csv").read_text().splitlines()
+    (recorded / "truth.csv").write_text("\n".join(lines[:4]) + "\n")
+    with pytest.raises(SourceError, match="3 rows are complete"):
+        write_recorded(recorded, tmp_path / "out", seed=1)
+    (recorded / "truth.csv").write_text("file,lat_deg,lon_deg\n0.png,47,8\n")
+    with pytest.raises(EvaluationError, match="agl_m, yaw_deg missing"):
+        write_recorded(recorded, tmp_path / "out", seed=1)
+    (recorded / "truth.csv").unlink()
+    with pytest.raises(EvaluationError, match="give a flight that has one"):
+        write_recorded(recorded, tmp_path / "out", seed=1)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("name", "off_m"), [("village-1", 3.0), ("town-a", 1.0)])
+def test_real_flights_get_a_way_near_their_truth(name: str, off_m: float, data_set: DataSet) -> None:
+    way, _ = read_recorded(data_set(f"flights/{name}"))
+    assert way.level.off < off_m
+    path = way.path(float(way.level.t_s[-1]))
+    bend = np.gradient(path[:, 3:5], 0.02, axis=0)
+    assert np.linalg.norm(bend, axis=1).max() < 6.5

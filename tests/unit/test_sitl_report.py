@@ -1,0 +1,210 @@
+"""What the observer notes and what the report makes of it, from packets and courses made by hand."""
+
+import json
+import math
+import socket
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from terrafix_tools.sim.sitl.firmware import Home
+from terrafix_tools.sim.sitl.observer import (
+    SO_TIMESTAMPNS,
+    Belief,
+    Notes,
+    Observer,
+    Said,
+    Truth,
+    arrival_ns,
+    between,
+    take,
+)
+from terrafix_tools.sim.sitl.report import Times, figures, verdicts, write_report, write_texts, write_truth
+
+EAST_DEG_PER_M = 1.0 / (111_319.49 * math.cos(math.radians(48.0)))  # WGS84's equatorial radius: good to 0.5 %
+LAT_DEG, LON_DEG, HOME_AMSL_M = 48.0, 14.0, 320.0
+S = 1_000_000_000
+TIMES = Times(armed_ns=10 * S, lost_ns=60 * S, landed_ns=380 * S)
+
+
+def state(t_s: float, east_m: float) -> Truth:
+    up_m = HOME_AMSL_M + 120.0 if t_s < 360.0 else HOME_AMSL_M
+    return Truth(round(t_s * S), LAT_DEG, LON_DEG + east_m * EAST_DEG_PER_M, up_m, (0.0, 20.0, 0.0), 0.0, 0.0, 1.57)
+
+
+def good_flight() -> Notes:
+    """20 m/s to the east from the loss at 60 s on, for 300 s; its own position is 3 m off; it lands 10 m too far."""
+    notes = Notes()
+    notes.truth = [state(t, 20.0 * min(300.0, max(0.0, t - 60.0))) for t in range(381)]
+    notes.beliefs = [Belief(t * S, LAT_DEG, LON_DEG + (20.0 * (t - 60) + 3.0) * EAST_DEG_PER_M) for t in range(61, 360)]
+    notes.fix_types[0].extend((t * S, 6 if t < 60 else 1) for t in range(5, 360))
+    notes.fix_types[1].extend((t * S, 3) for t in range(30, 360))
+    notes.gps_healthy = [(t * S, True) for t in range(5, 360)]
+    return notes
+
+
+def landing(error_m: float = 10.0) -> Home:
+    return Home(LAT_DEG, LON_DEG + (6000.0 - error_m) * EAST_DEG_PER_M, HOME_AMSL_M, 90.0)
+
+
+def test_a_good_flight_passes_everything() -> None:
+    flown = figures(good_flight(), TIMES, landing())
+    assert flown.flown_m == pytest.approx(6000.0, rel=0.006)
+    assert flown.landing_error_m == pytest.approx(10.0, rel=0.01) and flown.touchdown_m == flown.landing_error_m
+    assert flown.belief_touchdown_m == pytest.approx(3.0, rel=0.02)
+    assert flown.belief_median_m == pytest.approx(3.0, rel=0.02) and flown.without_gnss_s == pytest.approx(300.0)
+    assert flown.gps_input_fix_share == 1.0 and flown.gps_input_longest_gap_s == 0.0
+    assert all(verdicts(flown, 5000.0).values())
+
+
+def failing(notes: Notes, times: Times = TIMES, error_m: float = 10.0) -> set[str]:
+    return {what for what, good in verdicts(figures(notes, times, landing(error_m)), 5000.0).items() if not good}
+
+
+def test_each_failure_is_seen() -> None:
+    said = good_flight()
+    said.said.append(Said(100 * S, 2, "PreArm: GPS 2: not healthy"))
+    assert failing(said) == {"no 'GPS not healthy'"}
+    sick = good_flight()
+    sick.gps_healthy[150] = (155 * S, False)
+    assert failing(sick) == {"no 'GPS not healthy'"}
+    led = good_flight()
+    led.said.append(Said(100 * S, 1, "EKF Failsafe: changed to LAND Mode"))
+    assert failing(led) == {"no EKF failsafe"}
+    cheated = good_flight()
+    cheated.fix_types[0].append((200 * S, 3))
+    assert failing(cheated) == {"5 km on GPS_INPUT alone"}
+    blind = good_flight()
+    blind.fix_types[0][10] = (15 * S, 1)
+    assert failing(blind) == {"take-off on GNSS"}
+    assert failing(good_flight(), error_m=31.0) == {"landing within 30 m"}
+    assert failing(good_flight(), replace(TIMES, landed_ns=None)) == {"landed", "landing within 30 m"}
+    rolling = good_flight()
+    rolling.truth.append(state(400.0, 6050.0))
+    assert failing(rolling, replace(TIMES, landed_ns=400 * S)) == {"landing within 30 m"}
+    aloft = good_flight()
+    aloft.truth = [one for one in aloft.truth if one.t_ns < 360 * S]
+    assert failing(aloft, replace(TIMES, landed_ns=None)) == {"landed", "landing within 30 m"}
+
+
+def test_what_was_before_arming_or_before_the_loss_does_not_count() -> None:
+    notes = good_flight()
+    notes.said += [Said(5 * S, 2, "PreArm: GPS 2: not healthy"), Said(6 * S, 6, "AHRS: DCM active")]
+    notes.gps_healthy[0] = (5 * S, False)
+    assert failing(notes) == set()
+
+
+def test_a_gps_without_a_fix_or_on_the_ground_is_not_sick() -> None:
+    notes = good_flight()
+    notes.gps_healthy[150] = (155 * S, False)
+    fixes = notes.fix_types[1]
+    fixes[fixes.index((155 * S, 3))] = (155 * S, 1)
+    notes.gps_healthy.append((370 * S, False))
+    assert failing(notes) == set()
+
+
+def test_a_failsafe_on_the_ground_is_told_apart() -> None:
+    notes = good_flight()
+    notes.said += [Said(361 * S, 2, "EKF variance"), Said(390 * S, 2, "EKF variance")]
+    flown = figures(notes, TIMES, landing())
+    assert (flown.ekf_failsafes, flown.ekf_failsafes_on_ground) == (0, 1)
+
+
+def test_a_failsafe_that_is_cleared_counts_once() -> None:
+    notes = good_flight()
+    notes.said += [Said(90 * S, 1, "EKF Failsafe: changed to LAND Mode"), Said(95 * S, 1, "EKF Failsafe Cleared")]
+    assert figures(notes, TIMES, landing()).ekf_failsafes == 1
+
+
+def test_gaps_of_gps_input() -> None:
+    notes = good_flight()
+    fixes = notes.fix_types[1]
+    for i, (t_ns, _) in enumerate(fixes):
+        if 100 * S <= t_ns <= 104 * S:
+            fixes[i] = (t_ns, 1)
+    flown = figures(notes, TIMES, landing())
+    assert flown.gps_input_longest_gap_s == 4.0
+    assert flown.gps_input_fix_share == pytest.approx(1.0 - 5 / 300, abs=1e-3)
+
+
+def test_a_flight_that_never_began() -> None:
+    flown = figures(Notes(), Times(), landing())
+    assert flown.flown_m == 0.0 and flown.landing_error_m is None
+    held = verdicts(flown, 5000.0)
+    assert not held["take-off on GNSS"] and not held["5 km on GPS_INPUT alone"] and not held["landed"]
+
+
+def test_files(tmp_path: Path) -> None:
+    notes = good_flight()
+    notes.said.append(Said(100 * S, 6, "EKF3 IMU0 is using GPS"))
+    flown = figures(notes, TIMES, landing())
+    write_report(tmp_path / "a.json", {"vehicle": "plane"}, flown, 5000.0)
+    write_texts(tmp_path / "texts.log", notes)
+    write_truth(tmp_path / "truth.csv", notes)
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert report["passed"] is True and report["vehicle"] == "plane"
+    assert report["figures"]["landing_error_m"] == flown.landing_error_m
+    assert (tmp_path / "texts.log").read_text() == "   100.00 INFO      EKF3 IMU0 is using GPS\n"
+    rows = (tmp_path / "truth.csv").read_text().splitlines()
+    assert len(rows) == 382 and rows[-1].startswith("380000000000,48.0000000,14.08")
+
+
+def test_packets_become_notes() -> None:
+    """Through the wire format: what is noted is what was packed."""
+    sender, receiver = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
+    zeros = [0.0] * 6
+    sent = [
+        mavlink.MAVLink_sim_state_message(
+            1, 0, 0, 0, 0.1, -0.2, 1.5, *zeros, 0, 0, 412.5, 0, 0, 3, -4, 0.5, 481234567, 141234567
+        ),
+        mavlink.MAVLink_gps_raw_int_message(0, 1, 481234567, 141234567, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_sys_status_message(0, 0, mavlink.MAV_SYS_STATUS_SENSOR_GPS, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_statustext_message(4, b"GPS Glitch"),
+        mavlink.MAVLink_autopilot_version_message(0, 0x040603FF, 0, 0, 0, list(b"3fc7011a"), [0] * 8, [0] * 8, 0, 0, 0),
+        mavlink.MAVLink_heartbeat_message(1, 3, mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 0, 0, 3),
+    ]
+    notes = Notes()
+    for message in receiver.parse_buffer(b"".join(one.pack(sender) for one in sent)) or []:
+        take(notes, message, 7)
+    truth = notes.truth[0]
+    assert (truth.lat_deg, truth.lon_deg) == pytest.approx((48.1234567, 14.1234567), abs=1e-9)
+    assert truth.amsl_m == 412.5 and truth.velocity_ned_mps == (3.0, -4.0, 0.5)
+    assert (truth.roll_rad, truth.pitch_rad, truth.yaw_rad) == pytest.approx((0.1, -0.2, 1.5), abs=1e-6)
+    assert notes.fix_types[0] == [(7, 1)] and notes.gps_healthy == [(7, True)] and notes.armed == [(7, True)]
+    assert notes.said == [Said(7, 4, "GPS Glitch")] and notes.version == "4.6.3 (3fc7011a)"
+
+
+def test_truth_between_two_states() -> None:
+    before, after = replace(state(1.0, 0.0), yaw_rad=3.1), replace(state(2.0, 20.0), yaw_rad=-3.1, roll_rad=0.4)
+    middle = between(before, after, 1_500_000_000)
+    assert middle.lon_deg == pytest.approx(LON_DEG + 10.0 * EAST_DEG_PER_M, abs=1e-12)
+    assert math.cos(middle.yaw_rad) == pytest.approx(-1.0) and middle.roll_rad == pytest.approx(0.2)
+
+
+def test_truth_is_not_guessed() -> None:
+    observer = Observer(0)
+    observer.notes.truth = [state(1.0, 0.0), state(2.0, 20.0)]
+    assert observer.truth_at(S - 1) is None and observer.truth_at(2 * S + 1) is None
+    assert observer.truth_at(S) == state(1.0, 0.0)
+    with observer:
+        pass  # closes the port
+
+
+def test_a_late_reader_does_not_make_the_truth_late() -> None:
+    """The kernel stamped the datagram when it came, not when somebody looked."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as to,
+    ):
+        ours.bind(("127.0.0.1", 0))
+        ours.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        before_ns = time.monotonic_ns()
+        to.sendto(b"x", ours.getsockname())
+        after_ns = time.monotonic_ns()
+        time.sleep(0.2)
+        extra = ours.recvmsg(16, 256)[1]
+    assert before_ns - 5_000_000 <= arrival_ns(extra) <= after_ns + 5_000_000
+    assert arrival_ns([]) >= after_ns + 200_000_000

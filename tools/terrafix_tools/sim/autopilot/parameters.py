@@ -1,0 +1,72 @@
+"""Parameters of the simulated autopilot: those that decide about GPS, with ArduPilot's defaults, names and meanings."""
+
+from enum import StrEnum
+
+from terrafix.core.errors import UsageError
+
+
+class Kind(StrEnum):
+    """Which firmware is simulated."""
+
+    PLANE = "plane"
+    COPTER = "copter"
+
+
+class Gps(StrEnum):
+    """What the autopilot has besides Terrafix."""
+
+    SECOND = "second"  # a real receiver is GPS1, Terrafix is GPS2 (config/vehicles/second-gps.param)
+    ALONE = "alone"  # Terrafix is the only GPS (plane.param, copter.param)
+
+
+FIRMWARE = {  # ArduPilot 4.6 as it comes
+    "AHRS_OPTIONS": 0.0,  # bit 0: no fall-back to DCM in a fixed wing
+    "ARMING_CHECK": 1.0,  # bit 0 all, bit 3 GPS
+    "ARSPD_USE": 1.0,
+    "EK3_CHECK_SCALE": 100.0,  # per cent of the limits below
+    "EK3_GPS_CHECK": 31.0,  # bits: satellites, HDOP, speed accuracy, position accuracy, yaw
+    "EK3_SRC1_POSXY": 3.0,  # 0 none, 3 GPS
+    "EK3_SRC1_VELXY": 3.0,
+    "EK3_SRC1_POSZ": 1.0,
+    "EK3_SRC1_VELZ": 3.0,
+    "EK3_SRC2_POSXY": 0.0,
+    "EK3_SRC2_VELXY": 0.0,
+    "EK3_SRC3_POSXY": 0.0,
+    "EK3_SRC3_VELXY": 0.0,
+    "GPS1_TYPE": 1.0,
+    "GPS1_DELAY_MS": 0.0,
+    "GPS2_TYPE": 0.0,
+    "GPS2_DELAY_MS": 0.0,
+    "GPS_AUTO_SWITCH": 1.0,  # 0 the primary alone, 1 the best, 2 blend, 4 the primary if it has a 3D fix
+    "GPS_PRIMARY": 0.0,
+}
+OF_PLANE = {"EK3_CHECK_SCALE": 150.0}  # where the plane's defaults differ
+
+# config/vehicles: what docs/link.md recommends; a test compares with the files.
+GPS_INPUT_ALONE = {
+    "GPS1_TYPE": 14.0,
+    "GPS1_DELAY_MS": 5.0,
+    "EK3_SRC1_POSXY": 3.0,
+    "EK3_SRC1_VELXY": 3.0,
+    "EK3_SRC1_POSZ": 1.0,
+    "EK3_SRC1_VELZ": 3.0,
+    "EK3_GPS_CHECK": 23.0,
+    "EK3_CHECK_SCALE": 100.0,
+}
+BESIDE_A_RECEIVER = {
+    "GPS2_TYPE": 14.0,
+    "GPS2_DELAY_MS": 5.0,
+    "GPS_AUTO_SWITCH": 4.0,
+    "GPS_PRIMARY": 0.0,
+    "ARMING_CHECK": 1048566.0,
+}
+NO_DCM = {"AHRS_OPTIONS": 1.0}  # plane.param
+
+
+def parameters_of(kind: Kind, changes: dict[str, float] | None = None) -> dict[str, float]:
+    """The firmware's defaults with ``changes``. Raises UsageError for a name that is not simulated."""
+    defaults = FIRMWARE | (OF_PLANE if kind is Kind.PLANE else {})
+    unknown = set(changes or {}) - set(defaults)
+    if unknown:
+        raise UsageError(f"parameter {', '.join(sorted(unknown))}: not simulated; known: {', '.join(defaults)}")
+    return defaults | (changes or {})

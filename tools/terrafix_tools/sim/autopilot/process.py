@@ -1,0 +1,46 @@
+"""The autopilot peer in a process of its own: ``python -m terrafix_tools.sim.autopilot.process COURSE.csv``."""
+
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from terrafix.core.errors import TerrafixError
+from terrafix_tools.sim.autopilot.course import read_course
+from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+
+
+def fly_course(
+    course: Annotated[Path, typer.Argument(help="Course: CSV as peer_course.py writes it.")],
+    port: Annotated[int, typer.Option(help="UDP port on 127.0.0.1; 0 takes a free one.")] = 14550,
+    out: Annotated[Path, typer.Option(help="Report to write at the end.")] = Path("peer.json"),
+    start_ns: Annotated[int, typer.Option(help="Monotonic time of second 0 of the course; default: now.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the sensor noise.")] = 0,
+    aligned: Annotated[bool, typer.Option(help="Starts in the air, position known.")] = True,
+) -> None:
+    """Flies until SIGTERM or SIGINT, then writes the report."""
+    stopping = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopping.set())
+    zero_ns = start_ns or time.monotonic_ns()
+    peer = AutopilotPeer(seed=seed, aligned=aligned)
+    used = peer.start(port, read_course(course), lambda: (time.monotonic_ns() - zero_ns) * 1e-9)
+    typer.echo(f"autopilot peer on udp 127.0.0.1:{used}")
+    stopping.wait()
+    peer.stop().write(out)
+
+
+def main() -> None:
+    try:
+        typer.run(fly_course)
+    except TerrafixError as error:
+        typer.echo(f"terrafix peer: {error}", err=True)
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":
+    main()

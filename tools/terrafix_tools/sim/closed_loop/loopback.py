@@ -1,0 +1,30 @@
+"""A wire in memory between the companion's MAVLink edge and an autopilot in the same process."""
+
+
+class Loopback:
+    """The companion's ``Transport`` (link/transport.py) on one side, bytes for the autopilot on the other."""
+
+    def __init__(self) -> None:
+        self._to_companion: list[bytes] = []
+        self._to_autopilot: list[bytes] = []
+
+    def read(self) -> list[bytes]:
+        packets, self._to_companion = self._to_companion, []
+        return packets
+
+    def write(self, packet: bytes) -> bool:
+        self._to_autopilot.append(packet)
+        return True
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def give(self, packets: bytes) -> None:
+        """From the autopilot."""
+        if packets:
+            self._to_companion.append(packets)
+
+    def take(self) -> bytes:
+        """For the autopilot, since the last call."""
+        packets, self._to_autopilot = self._to_autopilot, []
+        return b"".join(packets)

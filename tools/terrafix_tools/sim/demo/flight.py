@@ -1,0 +1,128 @@
+"""The flight of the demo: the real supervisor and processes on one side, the autopilot peer on the other."""
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from terrafix import supervisor
+from terrafix.messages import ProcessEvent
+from terrafix_tools.sim.autopilot.course import PeerState
+from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+from terrafix_tools.sim.autopilot.report import PeerReport
+from terrafix_tools.sim.flights.folder import Flight
+
+LOOK_S = 1.0  # between two looks at the autopilot
+LOG_S = 15.0  # between two lines where lines cannot be rewritten
+
+
+class FlightClock:
+    """Seconds of the flight. They begin with the source's clock, which is known when the source is opened."""
+
+    def __init__(self) -> None:
+        self._epoch_ns: int | None = None
+
+    def begin(self, epoch_ns: int) -> None:
+        """``epoch_ns``: the source's zero on the monotonic clock; the peer lives on the same."""
+        self._epoch_ns = epoch_ns
+
+    @property
+    def runs(self) -> bool:
+        return self._epoch_ns is not None
+
+    def __call__(self) -> float:
+        """Zero until it runs."""
+        return 0.0 if self._epoch_ns is None else max(0.0, (time.monotonic_ns() - self._epoch_ns) / 1e9)
+
+
+class Course:
+    """Seconds of the flight -> truth for the peer, whose sensors have errors of their own.
+
+    At time zero the vehicle is held in the air: the clock does not run while the processes start."""
+
+    def __init__(self, flight: Flight) -> None:
+        self._flight = flight
+
+    def __call__(self, t_s: float) -> PeerState:
+        truth = self._flight.path.state(t_s)
+        e_m, n_m, up_m = (float(v) for v in truth.p_b_in_w_m)
+        ve, vn, vu = (float(v) for v in truth.velocity_enu_mps)
+        lat_deg, lon_deg = self._flight.frame.to_wgs84(e_m, n_m)
+        state = PeerState(
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            amsl_m=up_m,
+            agl_m=truth.agl_m,
+            yaw_rad=truth.yaw_rad,
+            pitch_rad=truth.pitch_rad,
+            roll_rad=truth.roll_rad,
+            vn_mps=vn,
+            ve_mps=ve,
+            vd_mps=-vu,
+            airspeed_mps=truth.airspeed_mps,
+        )
+        return state if t_s > 0.0 else replace(state, vn_mps=0.0, ve_mps=0.0, vd_mps=0.0, airspeed_mps=0.0)
+
+
+def fly(
+    flight: Flight, folder: Path, map_path: Path, out: Path, *, seed: int, console: Console
+) -> tuple[int, PeerReport]:
+    """Flies ``folder`` over ``map_path`` in real time. -> exit code of the supervisor, what the peer noted."""
+    clock = FlightClock()
+    peer = AutopilotPeer(seed=seed, home_amsl_m=flight.ground_amsl_m)
+    landed = threading.Event()
+    reports: list[PeerReport] = []
+
+    def land() -> None:
+        if not reports:
+            reports.append(peer.stop())
+            landed.set()
+
+    def on_event(event: ProcessEvent) -> None:
+        if event.event == "stopped":
+            land()  # the processes end one after the other: what the peer hears from here on is not the flight
+        elif event.event != "started":
+            console.print(f"         {event.process} {event.event}: {event.detail}", highlight=False)
+
+    port = peer.start(0, Course(flight), clock)
+    watcher = threading.Thread(
+        target=_watch, args=(peer, clock, flight.duration_s, landed, console), name="demo-progress", daemon=True
+    )
+    watcher.start()
+    try:
+        exit_code = supervisor.run(
+            source=str(folder),
+            map_path=map_path,
+            link=f"udpout:127.0.0.1:{port}",
+            out_dir=out,
+            configs=[],
+            stop_after_source=True,
+            on_event=on_event,
+            on_epoch=clock.begin,
+            log_to=out / "terrafix.log",
+        )
+    finally:
+        land()
+        watcher.join()
+    return exit_code, reports[0]
+
+
+def _watch(
+    peer: AutopilotPeer, clock: FlightClock, duration_s: float, landed: threading.Event, console: Console
+) -> None:
+    """A line that is rewritten: the time, and what the autopilot has and believes."""
+    said_s = 0.0
+    with console.status("flight: the processes start") as status:
+        while not landed.wait(LOOK_S):
+            if not clock.runs:
+                continue
+            fix_type, error_m = peer.glance()
+            fix = "3D fix" if fix_type >= 3 else "no fix"
+            error = "" if error_m is None else f", its position is off by {error_m:.1f} m"
+            line = f"flight: {min(clock(), duration_s):.0f} of {duration_s:.0f} s; autopilot: {fix}{error}"
+            status.update(line)
+            if not console.is_terminal and clock() - said_s >= LOG_S:
+                said_s = clock()
+                console.print(line, highlight=False, soft_wrap=True)

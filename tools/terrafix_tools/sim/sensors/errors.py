@@ -1,0 +1,44 @@
+"""How wrong the sensors of a small autopilot are. 1-sigma over many vehicles where a seed draws one of them.
+
+Inertial noise and scale: InvenSense ICM-42688-P data sheet (DS-000347); an ArduCopter's log at 49 Hz shows the same
+noise at rest (0.0004 rad/s, 0.008 to 0.011 m/s^2) and, in flight, the vibration below (0.2 to 0.3 m/s^2, 0.03)."""
+
+import math
+from dataclasses import dataclass
+
+GRAVITY_MG = 9.80665e-3  # m/s^2
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """Every field can be set to make a vehicle worse, or perfect (zero)."""
+
+    gyro_noise: float = math.radians(0.0028)  # rad/s per root hertz
+    gyro_bias_radps: float = math.radians(0.1)  # turn-on, after the calibration on the ground
+    gyro_walk: float = math.radians(0.002)  # rad/s per root second
+    gyro_scale: float = 0.003
+    accel_noise: float = 70e-6 * 9.80665  # m/s^2 per root hertz
+    accel_bias_mps2: float = 5.0 * GRAVITY_MG
+    accel_walk: float = 0.02 * GRAVITY_MG  # m/s^2 per root second
+    accel_scale: float = 0.003
+    vibration_mps2: float = 0.25  # only with the motor on: in the air
+    vibration_radps: float = 0.02
+    yaw_constant_rad: float | None = None  # None: drawn with the sigma below
+    yaw_sigma_rad: float = math.radians(2.0)
+    yaw_by_heading_rad: float = math.radians(1.5)  # amplitude of what iron on board does, once and twice a turn
+    yaw_noise_rad: float = math.radians(0.5)
+    attitude_level_rad: float = math.radians(0.3)  # board not level in the frame
+    attitude_slow_rad: float = math.radians(0.4)  # of the attitude filter, wandering
+    attitude_slow_s: float = 15.0
+    baro_bias_m: float = 1.5
+    baro_walk: float = 0.04  # m per root second: weather, temperature
+    baro_scale: float = 0.005  # of the height over take-off: air that is not standard
+    baro_noise_m: float = 0.12
+    airspeed_scale: float = 0.02
+    airspeed_noise_mps: float = 0.25
+    range_noise_m: float = 0.05
+    range_limits_m: tuple[float, float] = (0.2, 60.0)
+    range_dropout: float = 0.02  # share of readings that fail
+
+
+TYPICAL = SensorErrors()

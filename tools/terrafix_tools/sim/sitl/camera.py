@@ -1,0 +1,64 @@
+"""The camera of a vehicle on ArduPilot's firmware: pictures of the generated world at the simulator's true pose."""
+
+import threading
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from terrafix.core.camera import Mount
+from terrafix.core.geodesy import LocalFrame, rot_w_b
+from terrafix_tools.sim.camera.render import Renderer
+from terrafix_tools.sim.camera.stream import FrameStream
+from terrafix_tools.sim.flights.folder import CAMERA, FRAME_HZ
+from terrafix_tools.sim.ground.ground import Ground
+from terrafix_tools.sim.sitl.observer import Truth
+
+DEVELOP_NS = 60_000_000  # the pose of a moment is known when the states around it have arrived; they come at 40 Hz
+LENS_M = 0.3  # above the ground when the vehicle stands: the simulator's flat ground is not the world's
+
+
+class SimulatedCamera:
+    """Pushes pictures into ``stream`` at FRAME_HZ, exposed at the moment that their stamp says. A context manager."""
+
+    def __init__(
+        self,
+        stream: FrameStream,
+        ground: Ground,
+        frame: LocalFrame,
+        truth_at: Callable[[int], Truth | None],
+        seed: int,
+    ) -> None:
+        self._stream, self._ground, self._frame, self._truth_at = stream, ground, frame, truth_at
+        self._renderer = Renderer(ground, CAMERA, seed=seed)
+        self._r_b_c = Mount(CAMERA.mount_yaw_deg, CAMERA.mount_pitch_deg, CAMERA.mount_roll_deg).r_b_c()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sitl-camera", daemon=True)
+        self.frames = 0
+
+    def pose(self, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
+        """-> p_c_in_w_m (3,), R_w_c (3, 3)"""
+        e_m, n_m = self._frame.to_local(truth.lat_deg, truth.lon_deg)
+        ground_m = float(self._ground.height_amsl_m(np.array([[e_m]]), np.array([[n_m]]))[0, 0])
+        r_w_b = rot_w_b(truth.yaw_rad, truth.pitch_rad, truth.roll_rad)
+        return np.array([e_m, n_m, max(truth.amsl_m, ground_m + LENS_M)]), r_w_b @ self._r_b_c
+
+    def __enter__(self) -> "SimulatedCamera":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        cv2.setNumThreads(1)  # the daemon's processes need the cores
+        period_ns = round(1e9 / FRAME_HZ)
+        due_ns = time.monotonic_ns()
+        while not self._stopping.wait(max(0, due_ns + DEVELOP_NS - time.monotonic_ns()) / 1e9):
+            truth = self._truth_at(due_ns)
+            if truth is not None:
+                self._stream.push(self._renderer.frame(*self.pose(truth), self.frames), due_ns)
+                self.frames += 1
+            due_ns += period_ns * max(1, (time.monotonic_ns() - due_ns) // period_ns)

@@ -1,0 +1,133 @@
+"""ArduPilot's own firmware, built for software-in-the-loop: found, checked, started in a folder of its own, ended.
+
+It speaks MAVLink over three of its serial ports, each a UDP connection to a port of this machine that somebody of ours
+listens on. Options: `arduplane --help`, and "Using SITL" in ArduPilot's developer documentation."""
+
+import contextlib
+import os
+import socket
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+from terrafix.core.errors import OutputError, UsageError
+from terrafix_tools.sim.autopilot.parameters import Kind
+
+BINARY_VARIABLE = "TERRAFIX_ARDUPILOT_SITL"
+HELP = "docs/sitl.md says how to get one"
+STOP_S = 5.0  # it ends within a tick of its own clock; a process that hangs is killed
+CONSOLE = "firmware.log"
+TAIL_CHARS = 160  # of the console's last line, in a message
+
+
+MODELS = {Kind.PLANE: "plane", Kind.COPTER: "quad"}  # flight models that the firmware brings with it
+
+
+@dataclass(frozen=True)
+class Ports:
+    """UDP ports on 127.0.0.1."""
+
+    ground: int  # SERIAL0: the ground station
+    companion: int  # SERIAL1: Terrafix
+    observer: int  # SERIAL2: who takes notes
+    rc_in: int  # the firmware listens here for a radio; its fixed default would let one flight at a time
+
+
+@dataclass(frozen=True)
+class Home:
+    """Where the vehicle stands at the start."""
+
+    lat_deg: float
+    lon_deg: float
+    amsl_m: float
+    heading_deg: float
+
+
+def find_binary(given: Path | None) -> Path:
+    """``given``, else what the environment variable names. Raises UsageError: none, not there, cannot be run."""
+    named = given or (Path(os.environ[BINARY_VARIABLE]) if os.environ.get(BINARY_VARIABLE) else None)
+    if named is None:
+        raise UsageError(f"no ArduPilot binary: give --binary, or set {BINARY_VARIABLE}; {HELP}")
+    path = named.expanduser()
+    if not path.is_file():
+        raise UsageError(f"{path}: no such ArduPilot binary; {HELP}")
+    if not os.access(path, os.X_OK):
+        raise UsageError(f"{path}: may not be executed; chmod +x it if it is an ArduPilot SITL binary ({HELP})")
+    return path.resolve()
+
+
+def kind_of(binary: Path, given: Kind | None) -> Kind:
+    """``given``, else by the file's name. Raises UsageError: the name does not say it."""
+    named = [kind for kind in Kind if kind in binary.name.lower()]
+    if given is None and len(named) != 1:
+        raise UsageError(f"{binary}: the name does not say plane or copter; give --vehicle")
+    return given or named[0]
+
+
+def take_ports(first: int = 0) -> Ports:
+    """``first`` and the three after it, or with 0 free ones. Raises UsageError: taken.
+
+    They are free at this moment; whoever listens on them opens them right after."""
+    numbers = [0] * 4 if first == 0 else [first + i for i in range(4)]
+    taken = []
+    with contextlib.ExitStack() as stack:
+        for number in numbers:
+            probe = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            try:
+                probe.bind(("127.0.0.1", number))
+            except (OSError, OverflowError):
+                raise UsageError(f"UDP port {number} is in use or not allowed; choose another --port, or 0") from None
+            taken.append(int(probe.getsockname()[1]))
+    return Ports(*taken)
+
+
+class Firmware:
+    """The running firmware. A context manager; its files (parameters, logs) stay in ``folder``."""
+
+    def __init__(
+        self, binary: Path, kind: Kind, folder: Path, home: Home, ports: Ports, parameters: list[Path]
+    ) -> None:
+        """``parameters``: files in this order, the later wins. Raises UsageError: no program; OutputError: folder."""
+        self._console = folder / CONSOLE
+        command = [str(binary), "--model", MODELS[kind], "--speedup", "1", "--rc-in-port", str(ports.rc_in)]
+        command += ["--home", f"{home.lat_deg:.8f},{home.lon_deg:.8f},{home.amsl_m:.2f},{home.heading_deg:.1f}"]
+        command += ["--defaults", ",".join(str(path.resolve()) for path in parameters)]
+        for serial, port in enumerate((ports.ground, ports.companion, ports.observer)):
+            command += [f"--serial{serial}", f"udpclient:127.0.0.1:{port}"]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with self._console.open("wb") as console:
+                self._process = subprocess.Popen(
+                    command, cwd=folder, stdin=subprocess.DEVNULL, stdout=console, stderr=subprocess.STDOUT
+                )
+        except OSError as error:
+            if error.filename == str(binary) or isinstance(error, PermissionError) or error.filename is None:
+                raise UsageError(f"{binary}: cannot be run on this machine ({error.strerror}); {HELP}") from None
+            raise OutputError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
+
+    def check(self) -> None:
+        """Raises UsageError when it has ended by itself, with the last thing that it said."""
+        code = self._process.poll()
+        if code is None:
+            return
+        lines = self._console.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        said = lines[-1].strip()[:TAIL_CHARS] if lines else "nothing"
+        raise UsageError(f"the firmware ended with code {code} and said: {said}; see {self._console}")
+
+    def stop(self) -> None:
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+
+    def __enter__(self) -> "Firmware":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()

@@ -1,0 +1,186 @@
+"""The stages of a flight on ArduPilot's firmware, from the boot to the landing, and Terrafix beside it."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from rich.console import Console
+
+from terrafix import supervisor
+from terrafix.core.errors import LinkError, OutputError
+from terrafix.vision.sources.description import CameraTable, Description, MountTable, StartTable, TelemetryTable
+from terrafix_tools.sim.flights.description import write_toml
+from terrafix_tools.sim.flights.folder import AGL_SIGMA_M, ATTITUDE_SIGMA_DEG, CAMERA, YAW_SIGMA_DEG
+from terrafix_tools.sim.sitl.firmware import Firmware, Home
+from terrafix_tools.sim.sitl.ground_side import Ground
+from terrafix_tools.sim.sitl.observer import Observer
+from terrafix_tools.sim.sitl.report import FIX_3D, Times
+from terrafix_tools.sim.sitl.scene import Scene
+
+GPS_ID = 1  # Terrafix is the second GPS
+BOOT_S = 120.0  # until the filter has a position
+READY_S = 60.0  # until the first GPS_INPUT
+ARM_S = 120.0  # until the pre-arm checks pass
+ARM_AGAIN_S = 3.0
+TAKE_OVER_S = 240.0  # from arming until Terrafix has a 3D fix at SAFE_M
+SAFE_M = 80.0  # height above home from which the GNSS may be lost: above what Terrafix needs to see
+SETTLED_S = 10.0  # Terrafix had its fix for so long
+LOSS_S = 10.0
+LOOK_S = 0.2
+GNSS_OFF = (("SIM_GPS_DISABLE", 1), ("SIM_GPS1_ENABLE", 0))  # ArduPilot 4.6 and before, later
+NO_FIX = 1  # GPS_INPUT comes, without a fix
+
+
+class NotFlown(Exception):
+    """The flight cannot go on: not a mistake of the user but a result."""
+
+
+class Daemon:
+    """The supervisor and its processes; ``start`` once. A context manager that stops them."""
+
+    def __init__(self, out: Path, scene: Scene, source: str, link: str) -> None:
+        """Raises OutputError."""
+        self._code: int | None = None
+        self._stop = threading.Event()
+        self._log = out / "terrafix.log"
+        camera, config = out / "camera.toml", out / "terrafix.toml"
+        write_toml(camera, _description(scene.home), "The camera of the simulated vehicle.")
+        try:
+            config.write_text(f'[source]\ncamera = "{camera}"\n[link]\ngps_id = {GPS_ID}\n', encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+
+        def run() -> None:
+            self._code = supervisor.run(
+                source=source,
+                map_path=scene.map_path,
+                link=link,
+                out_dir=out / "record",
+                configs=[config],
+                stop=self._stop,
+                log_to=self._log,
+            )
+
+        self._thread = threading.Thread(target=run, name="sitl-daemon", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def check(self) -> None:
+        """Raises NotFlown when it has ended."""
+        if self._thread.ident is not None and not self._thread.is_alive():
+            raise NotFlown(f"Terrafix ended with exit code {self._code}; see {self._log}")
+
+    def __enter__(self) -> "Daemon":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+
+class Stages:
+    """One method a stage, in this order. Raises NotFlown when a stage does not come to its end."""
+
+    def __init__(
+        self, firmware: Firmware, station: Ground, observer: Observer, daemon: Daemon, scene: Scene, console: Console
+    ) -> None:
+        self._firmware, self._station, self._observer = firmware, station, observer
+        self._daemon, self._scene, self._console = daemon, scene, console
+        self.times = Times()
+
+    def get_ready(self) -> None:
+        """The autopilot has a position by GNSS; then Terrafix starts, as by a pilot who is about to take off."""
+        self._wait("a position by GNSS", BOOT_S, self._has_position)
+        self._station.upload(self._scene.mission)
+        self._daemon.start()
+        self._wait("the first GPS_INPUT", READY_S, lambda: self._fix(GPS_ID) >= NO_FIX)
+        self._say("autopilot and Terrafix are ready")
+
+    def take_off(self) -> None:
+        """Armed as soon as the checks allow it, and off."""
+        deadline_s = time.monotonic() + ARM_S
+        while True:
+            try:
+                self._station.arm()
+                self._station.start_mission()  # only now: MAVSDK arms in a mode of its own choice
+                break
+            except LinkError as error:
+                if time.monotonic() > deadline_s:
+                    raise NotFlown(f"{error}; last text: {self._last_text()}") from None
+                self._pause(ARM_AGAIN_S)
+        self.times = replace(self.times, armed_ns=time.monotonic_ns())
+        self._say("armed; take-off on GNSS")
+
+    def lose_gnss(self) -> None:
+        """When the vehicle is high enough and Terrafix had a 3D fix for a while."""
+        self._wait(f"{SAFE_M:.0f} m above home and a 3D fix of Terrafix", TAKE_OVER_S, self._may_lose)
+        for name, value in GNSS_OFF:
+            with contextlib.suppress(LinkError):  # another firmware's name
+                self._station.set_parameter(name, value)
+                break
+        self._wait("the loss of the GNSS", LOSS_S, lambda: self._fix(0) < FIX_3D)
+        fixes = self._observer.notes.fix_types[0]
+        lost_ns = next(t_ns for t_ns, fix in reversed(fixes) if fix < FIX_3D)
+        self.times = replace(self.times, lost_ns=lost_ns)
+        self._say("GNSS lost; GPS_INPUT alone")
+
+    def land(self, limit_s: float) -> None:
+        """The rest of the mission; it disarms by itself when it stands."""
+        self._wait("the landing", limit_s, lambda: not self._observer.notes.armed[-1][1])
+        self.times = replace(self.times, landed_ns=time.monotonic_ns())
+        self._say("landed")
+
+    def _has_position(self) -> bool:
+        flags = self._observer.notes.ekf_flags
+        return bool(flags) and bool(flags[-1][1] & mavlink.EKF_POS_HORIZ_ABS)
+
+    def _may_lose(self) -> bool:
+        fixes, truth = self._observer.notes.fix_types[GPS_ID], self._observer.notes.truth[-1]
+        since_ns = time.monotonic_ns() - round(SETTLED_S * 1e9)
+        recent = [fix for t_ns, fix in fixes[-200:] if t_ns >= since_ns]
+        high = truth.amsl_m - self._scene.home.amsl_m >= SAFE_M
+        return high and len(recent) >= SETTLED_S and min(recent) >= FIX_3D
+
+    def _fix(self, gps: int) -> int:
+        fixes = self._observer.notes.fix_types[gps]
+        return fixes[-1][1] if fixes else 0
+
+    def _last_text(self) -> str:
+        said = self._observer.notes.said
+        return said[-1].text if said else "none"
+
+    def _wait(self, what: str, limit_s: float, until: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + limit_s
+        while not until():
+            if time.monotonic() > deadline_s:
+                raise NotFlown(f"{what} did not come within {limit_s:.0f} s; last text: {self._last_text()}")
+            self._pause(LOOK_S)
+
+    def _pause(self, pause_s: float) -> None:
+        time.sleep(pause_s)
+        self._firmware.check()
+        self._daemon.check()
+
+    def _say(self, text: str) -> None:
+        self._console.print(text, highlight=False)
+
+
+def _description(home: Home) -> Description:
+    """What the pilot knows: the camera, and where the vehicle stands."""
+    return Description(
+        name="ardupilot",
+        camera=CameraTable(
+            width=CAMERA.width, height=CAMERA.height, fx=CAMERA.fx, fy=CAMERA.fy, cx=CAMERA.cx, cy=CAMERA.cy
+        ),
+        mount=MountTable(pitch_deg=CAMERA.mount_pitch_deg, tolerance_deg=CAMERA.mount_tolerance_deg),
+        start=StartTable(lat_deg=home.lat_deg, lon_deg=home.lon_deg, ground_amsl_m=round(home.amsl_m, 1)),
+        telemetry=TelemetryTable(
+            yaw_sigma_deg=YAW_SIGMA_DEG, agl_sigma_m=AGL_SIGMA_M, attitude_sigma_deg=ATTITUDE_SIGMA_DEG
+        ),
+    )

@@ -1,0 +1,171 @@
+"""Guidance of the multicopter: the velocity that brings it along its mission, by what it believes of itself."""
+
+import math
+
+from terrafix.core.geodesy import LocalFrame
+from terrafix_tools.mission.mission import Do, HeightOf, Mission, Target, targets
+from terrafix_tools.sim.interfaces import Navigation
+
+GAIN_PER_S = 0.8  # velocity for a metre beside the leg, or above it
+CLIMB_MPS, SINK_MPS, SLOW_SINK_MPS = 2.5, 1.5, 0.5  # WPNAV_SPEED_UP, WPNAV_SPEED_DN, LAND_SPEED
+SLOW_BELOW_M = 10.0  # LAND_ALT_LOW
+CORNER_MPS = 3.0  # speed in the corner between two legs
+REACHED_M = 4.0
+HOVER_REACHED_M = 2.0  # where it is to stop (WPNAV_RADIUS)
+LOITER_RADIUS_M = 20.0
+RETURN_HEIGHT_M = 15.0  # RTL_ALT: at least so high above home
+GROUND_EVERY_S = 0.2
+
+
+class Guidance:
+    """Knows nothing but the mission and what it is told in ``step``."""
+
+    def __init__(
+        self, mission: Mission, frame: LocalFrame, height: HeightOf, cruise_mps: float, brake_mps2: float
+    ) -> None:
+        self._targets = targets(mission, frame, height)
+        self._height = height
+        self._home = frame.to_local(mission.home_lat_deg, mission.home_lon_deg)
+        self._home_amsl_m = height(*self._home)
+        self._on_ground = mission.starts_on_ground()
+        self._speed_mps, self._brake_mps2 = cruise_mps, brake_mps2
+        self._at = 0
+        self._over = False  # the last item is done
+        self._goal_up_m, self._over_ground = math.nan, False
+        self._arrived_s: float | None = None
+        self._bearing_rad = self._turned_rad = 0.0
+        self._ground_m, self._ground_at_s, self._t_s = self._home_amsl_m, -math.inf, 0.0
+        e_m, n_m, _ = self.start()
+        self._from = (e_m, n_m)
+
+    @property
+    def finished(self) -> bool:
+        """Nothing new will happen: the last item is done, or it hovers where it is to stay."""
+        return self._over or (self._targets[self._at].do is Do.LOITER and self._arrived_s is not None)
+
+    @property
+    def landing(self) -> bool:
+        return not self._over and self._targets[self._at].do in (Do.LAND, Do.RETURN)
+
+    def start(self) -> tuple[float, float, float]:
+        """-> east, north [m] and heading [rad] of the vehicle at time zero."""
+        places = [(t.e_m, t.n_m) for t in self._targets if not math.isnan(t.e_m)]
+        begin = self._home if self._on_ground else places[0]
+        ahead = next((p for p in places if math.dist(p, begin) > 1.0), (begin[0], begin[1] + 1.0))
+        return *begin, math.atan2(ahead[0] - begin[0], ahead[1] - begin[1])
+
+    def first_height_m(self, ground_m: float) -> float:
+        """AMSL of a vehicle that begins in the air over ground of this height."""
+        heights = (t.up_m(ground_m) for t in self._targets if not math.isnan(t.height_m))
+        return next(heights, ground_m + RETURN_HEIGHT_M)
+
+    def step(self, dt_s: float, seen: Navigation, agl_m: float) -> tuple[float, float, float]:
+        """-> wished velocity east, north, up [m/s]. ``agl_m`` (a rangefinder's) serves the landing alone."""
+        self._t_s += dt_s
+        e, n, up = seen.p_b_in_w_m.tolist()
+        if self._t_s - self._ground_at_s >= GROUND_EVERY_S:
+            self._ground_m, self._ground_at_s = self._height(e, n), self._t_s
+        while not self._over and self._done(self._targets[self._at], e, n, up):
+            self._next(e, n)
+        if self._over:
+            return *self._toward(self._from, e, n, True), self._climb(up)
+        target = self._targets[self._at]
+        place = self._place(target)
+        if target.do is Do.RETURN and math.dist(place, (e, n)) < HOVER_REACHED_M:
+            self._from = place
+            return *self._toward(place, e, n, True), self._sink(agl_m)
+        if target.do is Do.LAND:
+            there = math.dist(place, (e, n)) < HOVER_REACHED_M
+            return *self._toward(place, e, n, True), self._sink(agl_m) if there else self._climb(up)
+        if target.do is Do.LOITER_TURNS:
+            return *self._circle(target, e, n), self._climb(up)
+        stop = target.do is not Do.WAYPOINT or target.amount > 0.0 or self._at + 1 == len(self._targets)
+        return *self._toward(place, e, n, stop), self._climb(up)
+
+    # --- how ---
+
+    def _toward(self, place: tuple[float, float], e: float, n: float, stop: bool) -> tuple[float, float]:
+        """Along the leg to ``place``, braking in time, and back to its line."""
+        east, north = place[0] - self._from[0], place[1] - self._from[1]
+        length = math.hypot(east, north)
+        if length < 1.0:
+            gap = math.hypot(place[0] - e, place[1] - n)
+            fast = min(self._speed_mps, GAIN_PER_S * gap) / max(gap, 1e-6)
+            return fast * (place[0] - e), fast * (place[1] - n)
+        east, north = east / length, north / length
+        to_go = (place[0] - e) * east + (place[1] - n) * north
+        beside = (place[0] - e) * north - (place[1] - n) * east
+        last_mps = 0.0 if stop else CORNER_MPS
+        along = min(self._speed_mps, math.sqrt(last_mps**2 + self._brake_mps2 * abs(to_go)))
+        if stop:
+            along = min(along, GAIN_PER_S * abs(to_go))
+        along = math.copysign(along, to_go)
+        aside = min(max(GAIN_PER_S * beside, -self._speed_mps / 2), self._speed_mps / 2)
+        return along * east + aside * north, along * north - aside * east
+
+    def _circle(self, target: Target, e: float, n: float) -> tuple[float, float]:
+        radius_m, sense = abs(target.radius_m) or LOITER_RADIUS_M, math.copysign(1.0, target.radius_m)
+        east, north = e - target.e_m, n - target.n_m
+        gap = max(0.1, math.hypot(east, north))
+        if abs(gap - radius_m) > 0.5 * radius_m:
+            fast = min(self._speed_mps, abs(gap - radius_m)) * (1.0 if gap < radius_m else -1.0) / gap
+            return fast * east, fast * north
+        bearing = math.atan2(east, north)
+        if self._arrived_s is None:
+            self._arrived_s, self._turned_rad = self._t_s, 0.0
+        else:
+            self._turned_rad += sense * math.remainder(bearing - self._bearing_rad, math.tau)
+        self._bearing_rad = bearing
+        speed = min(self._speed_mps, math.sqrt(self._brake_mps2 * radius_m))
+        back = GAIN_PER_S * (radius_m - gap)
+        return (
+            sense * speed * north / gap + back * east / gap,
+            -sense * speed * east / gap + back * north / gap,
+        )
+
+    def _climb(self, up: float) -> float:
+        goal_m = self._goal_up_m + (self._ground_m if self._over_ground else 0.0)
+        return 0.0 if math.isnan(goal_m) else min(max(GAIN_PER_S * (goal_m - up), -SINK_MPS), CLIMB_MPS)
+
+    @staticmethod
+    def _sink(agl_m: float) -> float:
+        return -SLOW_SINK_MPS if agl_m < SLOW_BELOW_M else -SINK_MPS
+
+    # --- what next ---
+
+    def _done(self, target: Target, e: float, n: float, up: float) -> bool:
+        if not math.isnan(target.height_m) and target.do is not Do.LAND:
+            self._goal_up_m, self._over_ground = target.height_m, target.over_ground
+        goal_m = self._goal_up_m + (self._ground_m if self._over_ground else 0.0)
+        match target.do:
+            case Do.SPEED:
+                self._speed_mps = target.amount
+                return True
+            case Do.TAKE_OFF | Do.ALTITUDE:
+                return math.isnan(goal_m) or abs(up - goal_m) < HOVER_REACHED_M
+            case Do.WAYPOINT if target.amount == 0.0 and self._at + 1 < len(self._targets):
+                return math.dist((e, n), (target.e_m, target.n_m)) < REACHED_M
+            case Do.WAYPOINT | Do.LOITER_TIME:
+                return self._waited(target, e, n)
+            case Do.LOITER:
+                self._waited(target, e, n)
+            case Do.LOITER_TURNS:
+                return self._turned_rad >= math.tau * target.amount
+            case Do.RETURN:
+                self._over_ground = False
+                self._goal_up_m = max(self._goal_up_m, self._home_amsl_m + RETURN_HEIGHT_M)
+        return False
+
+    def _waited(self, target: Target, e: float, n: float) -> bool:
+        if self._arrived_s is None and math.dist((e, n), (target.e_m, target.n_m)) < HOVER_REACHED_M:
+            self._arrived_s = self._t_s
+        return self._arrived_s is not None and self._t_s - self._arrived_s >= target.amount
+
+    def _next(self, e: float, n: float) -> None:
+        self._from = self._place(self._targets[self._at]) if self._targets[self._at].do is Do.WAYPOINT else (e, n)
+        self._arrived_s, self._turned_rad = None, 0.0
+        self._at += 1
+        self._over = self._at >= len(self._targets)
+
+    def _place(self, target: Target) -> tuple[float, float]:
+        return self._from if math.isnan(target.e_m) else (target.e_m, target.n_m)
