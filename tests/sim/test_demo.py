@@ -48,33 +48,35 @@ def test_the_autopilot_is_served(tmp_path: Path, stall_ms: Callable[[], float]) 
     assert peer["gps_error_median_m"] < 20.0
     evaluation = json.loads((out / "evaluation.json").read_text())
     assert evaluation["false_fixes"] == 0 and evaluation["within_50m"] > 0.95
-    frames = (out / "flight" / "frames.csv").read_text()
-    assert frames.startswith("file,t_s,yaw_deg,pitch_deg,roll_deg,agl_m\n")  # the folder can be replayed
+    assert (out / "flight" / "telemetry.tlog").stat().st_size > 0  # the folder can be replayed
     page = (out / "report.html").read_text()
     assert "<svg" in page and not re.search(r'(src|href)="https?://', page)  # one file, works offline
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", ["link", "estimator", "anchor", "vision"])
-def test_a_killed_process_comes_back(victim: str, tmp_path: Path, stall_ms: Callable[[], float]) -> None:
+@pytest.mark.parametrize("victims", [("link",), ("estimator", "anchor", "vision")], ids=["the link", "the others"])
+def test_killed_processes_come_back(victims: tuple[str, ...], tmp_path: Path, stall_ms: Callable[[], float]) -> None:
     out = tmp_path / "demo"
     with subprocess.Popen(
         [*COMMAND, "--out", str(out), "--duration", str(DURATION_S)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     ) as running:
         deadline_s = time.monotonic() + 120.0
-        while victim not in children_of(running.pid) or "vision" not in children_of(running.pid):
+        while not {*victims, "vision"} <= set(children_of(running.pid)):
             assert time.monotonic() < deadline_s and running.poll() is None, "the flight did not begin"
             time.sleep(0.2)
-        time.sleep(20.0)
-        os.kill(children_of(running.pid)[victim], signal.SIGKILL)
+        time.sleep(15.0)
+        for victim in victims:
+            os.kill(children_of(running.pid)[victim], signal.SIGKILL)
+            time.sleep(8.0)
         said = running.communicate(timeout=240)[0].decode()
-    assert f"{victim} died: killed by SIGKILL" in said and f"{victim} restarted" in said, said
+    for victim in victims:
+        assert f"{victim} died: killed by SIGKILL" in said and f"{victim} restarted" in said, said
+        assert victim in (out / "report.html").read_text()
     peer = json.loads((out / "peer.json").read_text())
-    if victim == "link":
+    if "link" in victims:
         assert peer["longest_gap_ms"] < 1e3 * RESUMES_WITHIN_S
     else:
         assert peer["longest_gap_ms"] < 245.0 + stall_ms()  # the link goes on whatever happens to the others
-    assert victim in (out / "report.html").read_text()
 
 
 def test_a_folder_that_no_demo_made_is_left_alone(tmp_path: Path) -> None:

@@ -166,3 +166,12 @@ def test_positions_far_from_the_origin_stay_right() -> None:
     assert math.dist(rig.truth(rig.t_s)[:2], (0.0, 0.0)) > 200.0
     assert rig.error_m() < 1.0
     assert rig.last("GLOBAL_POSITION_INT").lon * 1e-7 > LON
+
+
+def test_a_push_beyond_any_sensor_fills_the_message_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight that is let go in mid-air gains its speed within a step."""
+    rig = Rig(Kind.PLANE)
+    shown = rig._readings
+    monkeypatch.setattr(rig, "_readings", lambda: replace(shown(), accel_b_mps2=np.array([2400.0, 0.0, -2400.0])))
+    rig.fly(0.5)
+    assert (rig.last("RAW_IMU").xacc, rig.last("RAW_IMU").zacc) == (32767, -32768)

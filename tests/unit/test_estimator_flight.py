@@ -452,3 +452,18 @@ def test_a_vehicle_that_is_not_armed_stays_where_it_was() -> None:
         claims[armed] = sigma_m(run.estimate(119))
     assert claims[False] < ORIGIN.start_sigma_m + 2.0
     assert claims[True] > 3.0 * claims[False]
+
+
+def test_telemetry_that_begins_after_the_first_frame_is_a_new_beginning() -> None:
+    """At a start in the air the first picture may come before the autopilot's first words."""
+    flight = Flight(40, seed=5)
+    run = Listener()
+    run.hear([ORIGIN])
+    for i in range(40):
+        said = flight.messages(i)
+        if i == 0:
+            said = [m for m in said if not isinstance(m, VehicleState | MapMatch)]
+        run.hear(without_fix(said) if i < 3 else said)
+    errors = [float(np.linalg.norm(error_m(run.estimate(i), flight)[:2])) for i in range(10, 40)]
+    heights = [abs(error_m(run.estimate(i), flight)[2]) for i in range(1, 40)]
+    assert max(errors) < 15.0 and max(heights) < 30.0

@@ -110,12 +110,16 @@ class Estimator:
         self._last: Placed | None = None  # newest frame
         self._fixed_at_m: np.ndarray | None = None
         self._refused: _Disagreement | None = None
-        self._trunk = deque([0], maxlen=40)  # nodes that odometry or the map vouches for; others hang on it as leaves
+        self._began_with = (False, False)  # heading, height
+        self._began_s: float | None = None
+        self._trunk: deque[int] = deque(
+            maxlen=40
+        )  # nodes that odometry or the map vouches for; others hang on it as leaves
 
     # --- motion ---------------------------------------------------------------------------------------------
 
     def advance(self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude) -> Advance:
-        if self._last is None:
+        if self._last is None or self._knows_more(attitude):
             return self._begin(frame_id, t_s, attitude)
         last = self._last
         known = self._by_odometry(odometry, attitude)
@@ -148,19 +152,30 @@ class Estimator:
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
         return Advance(verdict, self._last, step, step_sigma)
 
+    def _knows_more(self, attitude: Attitude) -> bool:
+        """The first words of the autopilot came after the first frame, before the first fix. No linear graph recovers
+        from a heading that turns out to be 70 degrees off what was assumed, so it begins again."""
+        heading = not self._began_with[0] and attitude.yaw_rad is not None
+        height = not self._began_with[1] and attitude.agl_m is not None
+        return self.last_fix_t_s is None and (heading or height)
+
     def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
         origin = self.origin
+        self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
+        waited_s = 0.0 if self._began_s is None else t_s - self._began_s
+        self._began_s = t_s - waited_s
         tolerance = np.radians(origin.camera.mount_tolerance_deg)
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
         r_w_c = self._expected_rotation(attitude, np.zeros(4))
         pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([0.0, 0.0, self.ground_m + agl]))
-        start = max(origin.start_sigma_m, 1.0)
+        start = float(np.hypot(max(origin.start_sigma_m, 1.0), self._drift_sigma(waited_s) if waited_s > 0.0 else 0.0))
         wide = np.diag([1.0, 1.0, UNKNOWN_RAD, start, start, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
         bias_cov = np.diag([tolerance, tolerance, yaw, float(np.hypot(agl_sigma, HEIGHT_BIAS * agl))]) ** 2
+        self._trunk.clear()
         node = self.graph.start(
             t_s,
             NodeState(pose, np.zeros(4)),
@@ -168,9 +183,12 @@ class Estimator:
             bias_cov,
             self._attitude(attitude, r_w_c),
         )
+        self._trunk.append(node)
         self._node_of[frame_id] = node
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
-        return Advance(Verdict.ACCEPTED, self._last, np.zeros(2), 0.0)
+        return Advance(
+            Verdict.ACCEPTED, self._last, np.zeros(2), self._drift_sigma(waited_s) if waited_s > 0.0 else 0.0
+        )
 
     def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | None:
         """The keyframe's node and the motion since, when odometry has both."""
@@ -370,9 +388,7 @@ class Estimator:
             if len(refused.offsets_m) >= RECOVER_AFTER and far and match.mode_mass >= RECOVER_MASS:
                 bias = self.graph.state(node).bias
                 bias_cov = self.graph.bias_covariance(node)
-                self.graph.restart(
-                    self.graph.time_of(node), NodeState(measured, bias), RESTART_INFLATION * cov, bias_cov
-                )
+                self.graph.start(self.graph.time_of(node), NodeState(measured, bias), RESTART_INFLATION * cov, bias_cov)
                 self._node_of[match.frame_id] = self.graph.newest
                 self._cov_of.clear()
                 self._refused = None
@@ -397,6 +413,7 @@ class Estimator:
         return {
             frame: (np.asarray(refined[node][0].translation()), refined[node][1])
             for frame, node in self._node_of.items()
+            if node in refined
         }
 
 

@@ -84,7 +84,13 @@ class PoseGraph:
         bias_cov: np.ndarray,
         attitude: gtsam.CustomFactor | None = None,
     ) -> int:
-        """First node, or the first after a loss: priors on C (tangent covariance 6x6) and B (4x4)."""
+        """First node, or the first after a loss: priors on C (tangent covariance 6x6) and B (4x4).
+
+        The past stays as it was estimated."""
+        self._keep_window()
+        self._smoother = _smoother()
+        self._times.clear()
+        self._stamps.clear()
         factors = gtsam.NonlinearFactorGraph()
         node = self._next
         factors.add(gtsam.PriorFactorPose3(C(node), state.pose, gtsam.noiseModel.Gaussian.Covariance(cov)))
@@ -93,14 +99,6 @@ class PoseGraph:
             factors.add(attitude)
         self._insert(t_s, state, factors)
         return node
-
-    def restart(self, t_s: float, state: NodeState, cov: np.ndarray, bias_cov: np.ndarray) -> int:
-        """Leaves the past as it was estimated and begins anew here."""
-        self._keep_window()
-        self._smoother = _smoother()
-        self._times.clear()
-        self._stamps.clear()
-        return self.start(t_s, state, cov, bias_cov)
 
     def extend(
         self, t_s: float, state: NodeState, parent: int, motion: RelativePose, attitude: gtsam.CustomFactor | None
@@ -146,8 +144,11 @@ class PoseGraph:
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(30)
         params.setLinearSolverType("MULTIFRONTAL_QR")
-        values = gtsam.LevenbergMarquardtOptimizer(self.all_factors, self.all_values, params).optimize()
-        marginals = gtsam.Marginals(self.all_factors, values)
+        try:
+            values = gtsam.LevenbergMarquardtOptimizer(self.all_factors, self.all_values, params).optimize()
+            marginals = gtsam.Marginals(self.all_factors, values)
+        except RuntimeError:  # how GTSAM says that a system is indeterminate: what was said in flight stands
+            return {}
         refined = {}
         for node in range(self._next):
             pose = values.atPose3(C(node))

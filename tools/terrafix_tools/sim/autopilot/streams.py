@@ -136,7 +136,12 @@ def _gps_raw(now: Snapshot, instance: int) -> Any | None:
 
 
 def _raw_imu(now: Snapshot) -> Any:
-    """Units of ArduPilot's RAW_IMU: milli-g and milliradians per second."""
-    milli_g = (round(float(a) / GRAVITY_MPS2 * 1e3) for a in now.readings.accel_b_mps2)
-    milli_rad = (round(float(w) * 1e3) for w in now.readings.gyro_b_radps)
+    """Units of ArduPilot's RAW_IMU: milli-g and milliradians per second, as far as 16 bits reach."""
+    milli_g = (_int16(float(a) / GRAVITY_MPS2 * 1e3) for a in now.readings.accel_b_mps2)
+    milli_rad = (_int16(float(w) * 1e3) for w in now.readings.gyro_b_radps)
     return mavlink.MAVLink_raw_imu_message(now.boot_ns // 1000, *milli_g, *milli_rad, 0, 0, 0)
+
+
+def _int16(value: float) -> int:
+    """A vehicle that is let go in mid-air is pushed by more than any sensor shows."""
+    return max(-32768, min(32767, round(value)))

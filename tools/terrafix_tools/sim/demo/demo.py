@@ -83,7 +83,8 @@ def _generate(out: Path, seed: int, duration_s: float, console: Console) -> Made
         place = world.generate(seed)
         world.write_image(out / "map.tif", place, place.look(MAP_SEASON))
         world.write_dem(out / "dem.tif", place)
-        build(out / "map.tif", map_path, dem=out / "dem.tif", date=MAP_DATE, licence=MAP_LICENCE)
+        ce90_m = world.MAP_CE90_M
+        build(out / "map.tif", map_path, dem=out / "dem.tif", date=MAP_DATE, licence=MAP_LICENCE, ce90_m=ce90_m)
     with console.status("the same place in autumn, for the camera"):
         flight = plan_flight(place, place.look(CAMERA_SEASON), duration_s)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))

@@ -99,7 +99,7 @@ def write_map(package: Path, wanted: Wanted, place: world.World | None) -> None:
     image, dem = package.with_name("map.tif"), package.with_name("dem.tif")
     place.write_look(image, MAP_SEASON)
     world.write_dem(dem, place)
-    build(image, package, dem=dem, date=MAP_DATE, licence=MAP_LICENCE)
+    build(image, package, dem=dem, date=MAP_DATE, licence=MAP_LICENCE, ce90_m=world.MAP_CE90_M)
 
 
 def gnss_events(wanted: Wanted) -> tuple[AnyEvent, ...]:
