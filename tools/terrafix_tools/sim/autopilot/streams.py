@@ -27,6 +27,7 @@ RATES_HZ = {  # before anybody asks; 0: only when asked for
     mavlink.MAVLINK_MSG_ID_TIMESYNC: 0.1,
 }
 HEADING_UNKNOWN = 65535
+_UINT16_MAX = 65535
 DOP_UNKNOWN = 9999
 # International Standard Atmosphere below 11 km (ICAO Doc 7488): pressure at height.
 ISA_HPA, ISA_M, ISA_EXPONENT = 1013.25, 44330.77, 5.25588
@@ -104,7 +105,7 @@ def _global_position(now: Snapshot) -> Any:
         up_m = float(now.navigation.p_b_in_w_m[2])
         ve, vn, vu = (float(v) for v in now.navigation.velocity_enu_mps)
     heights = (round(up_m * 1e3), round((up_m - now.home_amsl_m) * 1e3))
-    speeds = (round(vn * 100), round(ve * 100), round(-vu * 100))
+    speeds = (_int16(vn * 100), _int16(ve * 100), _int16(-vu * 100))
     return mavlink.MAVLink_global_position_int_message(now.boot_ms, lat, lon, *heights, *speeds, HEADING_UNKNOWN)
 
 
@@ -126,7 +127,7 @@ def _gps_raw(now: Snapshot, instance: int) -> Any | None:
         place, speed, h_mm, v_mm = (0, 0, 0), 0, 0, 0
     else:
         place = (round(fix.lat_deg * 1e7), round(fix.lon_deg * 1e7), round(fix.alt_amsl_m * 1e3))
-        speed = round(100 * math.hypot(*fix.velocity_ned_mps[:2]))
+        speed = min(_UINT16_MAX, round(100 * math.hypot(*fix.velocity_ned_mps[:2])))
         h_mm, v_mm = (round(1e3 * (a or 0.0)) for a in (fix.horizontal_m, fix.vertical_m))
     dop = DOP_UNKNOWN if fix is None else min(DOP_UNKNOWN, round(fix.hdop * 100))
     head = (now.boot_ns // 1000, gps.fix_type, *place, dop, DOP_UNKNOWN, speed, 0, gps.satellites)
