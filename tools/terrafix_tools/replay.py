@@ -88,10 +88,11 @@ def replay(
 
 
 def peak_memory_mb() -> float:
-    """Of this process. Not getrusage's: that remembers the size of the process that started this one (proc(5))."""
-    status = Path("/proc/self/status").read_text(encoding="utf-8")
-    kilobytes = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:"))
-    return round(int(kilobytes) / 1024, 1)
+    """Largest resident memory of this program. Not getrusage: that counts what forked it, too (execve(2))."""
+    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        if line.startswith("VmHWM:"):
+            return round(int(line.split()[1]) / 1024, 1)
+    raise RuntimeError("/proc/self/status has no VmHWM")
 
 
 def map_cache_dir() -> Path:

@@ -112,9 +112,8 @@ class Estimator:
         self._refused: _Disagreement | None = None
         self._began_with = (False, False)  # heading, height
         self._began_s: float | None = None
-        self._trunk: deque[int] = deque(
-            maxlen=40
-        )  # nodes that odometry or the map vouches for; others hang on it as leaves
+        # Nodes that odometry or the map vouches for; others hang on it as leaves.
+        self._trunk: deque[int] = deque(maxlen=40)
 
     # --- motion ---------------------------------------------------------------------------------------------
 
@@ -164,12 +163,13 @@ class Estimator:
         self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
         waited_s = 0.0 if self._began_s is None else t_s - self._began_s
         self._began_s = t_s - waited_s
+        drift_m = self._drift_sigma(waited_s) if waited_s > 0.0 else 0.0
         tolerance = np.radians(origin.camera.mount_tolerance_deg)
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
         r_w_c = self._expected_rotation(attitude, np.zeros(4))
         pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([0.0, 0.0, self.ground_m + agl]))
-        start = float(np.hypot(max(origin.start_sigma_m, 1.0), self._drift_sigma(waited_s) if waited_s > 0.0 else 0.0))
+        start = float(np.hypot(max(origin.start_sigma_m, 1.0), drift_m))
         wide = np.diag([1.0, 1.0, UNKNOWN_RAD, start, start, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
@@ -186,9 +186,7 @@ class Estimator:
         self._trunk.append(node)
         self._node_of[frame_id] = node
         self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
-        return Advance(
-            Verdict.ACCEPTED, self._last, np.zeros(2), self._drift_sigma(waited_s) if waited_s > 0.0 else 0.0
-        )
+        return Advance(Verdict.ACCEPTED, self._last, np.zeros(2), drift_m)
 
     def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | None:
         """The keyframe's node and the motion since, when odometry has both."""

@@ -19,7 +19,7 @@ from terrafix.core.node import Node, NodeContext
 from terrafix.messages import Frame, Message, SourceEnded
 from terrafix_tools.estimates import ESTIMATES, read_rows
 from terrafix_tools.evaluate import metrics, read_summary, read_truth, truth_sigma_of
-from terrafix_tools.replay import FLOWN, make_nodes, replay
+from terrafix_tools.replay import FLOWN, make_nodes, peak_memory_mb, replay
 
 RESULT = "bench.json"
 WARM_UP_FRAMES = 1  # the first frame searches wide and pays for the first tiles of the map: it is told apart
@@ -106,14 +106,6 @@ def spread(values_ms: list[float]) -> dict[str, float]:
     """Median and 95th percentile, without the warm-up."""
     used = values_ms[WARM_UP_FRAMES:] or values_ms
     return {"median": round(float(np.median(used)), 2), "p95": round(float(np.percentile(used, 95)), 2)}
-
-
-def peak_memory_mb() -> float:
-    """Largest resident memory of this program. Not getrusage: that counts what forked it, too (execve(2))."""
-    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-        if line.startswith("VmHWM:"):
-            return round(int(line.split()[1]) / 1024, 1)
-    raise RuntimeError("/proc/self/status has no VmHWM")
 
 
 def program_age_s() -> float:

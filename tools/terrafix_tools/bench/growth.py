@@ -16,8 +16,9 @@ import gtsam
 
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.telemetry import Telemetry
-from terrafix_tools.bench.flights import peak_memory_mb, spread
+from terrafix_tools.bench.flights import spread
 from terrafix_tools.bench.stream import ORIGIN, spoken
+from terrafix_tools.replay import peak_memory_mb
 
 RESULT = "growth.json"
 LAST = 80  # frames at the end of the flight, over which the time of one is taken

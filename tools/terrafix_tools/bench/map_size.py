@@ -24,8 +24,9 @@ from terrafix.anchor.matcher import FrameMatcher, View
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix_engines.features import open_describer
-from terrafix_tools.bench.flights import peak_memory_mb, spread
+from terrafix_tools.bench.flights import spread
 from terrafix_tools.mapping.build import build
+from terrafix_tools.replay import peak_memory_mb
 
 GSD_M = 1.0
 BLOCK_PX = 512
