@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.real_time
+
 COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "demo"]
 DURATION_S = 45.0
 RESUMES_WITHIN_S = 2.0

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.telemetry import Telemetry
@@ -29,6 +30,7 @@ def test_the_estimator_follows_the_synthetic_flight() -> None:
     assert refused <= 0.05 * frames / FIX_EVERY
 
 
+@pytest.mark.slow
 def test_every_field_of_a_longer_flight() -> None:
     found = growth.measure(30)
     assert found["frames"] == 30 and found["peak_memory_mb"] >= found["memory_in_flight_mb"] > 50.0
@@ -38,6 +40,7 @@ def test_every_field_of_a_longer_flight() -> None:
     assert found["frame_cpu_ms"]["median"] > 0.0
 
 
+@pytest.mark.slow
 def test_every_field_of_a_larger_map(tmp_path: Path) -> None:
     built = map_size.measure(0.25, tmp_path)
     assert built["area_km2"] == 0.25 and built["package_mb"] > 0.05 and not (tmp_path / "map.tif").exists()

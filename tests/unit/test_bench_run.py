@@ -27,11 +27,13 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return written
 
 
+@pytest.mark.slow
 def test_what_could_not_be_measured_is_named(measured: dict[str, Any]) -> None:
     assert [text.split(":")[0] for text in measured["missing"]] == ["XFeat", "flight village-1", "flight town-a"]
     assert list(measured["flights"]) == ["generated"]
 
 
+@pytest.mark.slow
 def test_the_machine_is_described(measured: dict[str, Any]) -> None:
     machine = measured["machine"]
     assert machine["cores"] >= 1 and machine["memory_mb"] > 100 and machine["cpu"]
@@ -39,6 +41,7 @@ def test_the_machine_is_described(measured: dict[str, Any]) -> None:
     assert machine["versions"]["numpy"] and machine["versions"]["python"]
 
 
+@pytest.mark.slow
 def test_times_memory_and_accuracy_of_the_replay(measured: dict[str, Any]) -> None:
     flight = measured["flights"]["generated"]
     assert flight["frames"] == FRAMES and list(flight["runs"]) == ["weights-free"]
@@ -55,6 +58,7 @@ def test_times_memory_and_accuracy_of_the_replay(measured: dict[str, Any]) -> No
     assert 0.0 <= run["accuracy"]["within_20m"] <= run["accuracy"]["within_50m"] <= 1.0
 
 
+@pytest.mark.slow
 def test_the_baseline_and_the_ratios_to_it(measured: dict[str, Any]) -> None:
     flight = measured["flights"]["generated"]
     baseline, ratios = flight["baseline"], flight["ratios"]["weights-free"]
@@ -65,6 +69,7 @@ def test_the_baseline_and_the_ratios_to_it(measured: dict[str, Any]) -> None:
     assert set(ratios) == {"frame_ms", "cpu_ms", "within_20m", "within_50m"}
 
 
+@pytest.mark.slow
 def test_the_parts(measured: dict[str, Any]) -> None:
     micro = measured["micro"]
     assert micro["flight"] == "generated"

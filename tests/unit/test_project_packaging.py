@@ -22,7 +22,7 @@ EXTRAS = {
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
 IMPORTED_AS = {"opencv-python-headless": "cv2", "pyserial": "serial", "pyzmq": "zmq", "pillow": "PIL"}
-COMMANDS = {"ruff", "mypy", "types-pyserial"}  # used by scripts/check, imported by nobody
+COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist"}  # used by scripts/check, imported by nobody
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools"}
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
@@ -51,14 +51,17 @@ def test_what_flies_imports_only_the_core_dependencies() -> None:
 
 
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
-    declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"])
+    declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
 
 
 def test_every_dependency_has_a_range() -> None:
-    for requirement in [*CORE.values(), *EXTRAS["ground"].values(), *EXTRAS["sim"].values()]:
+    for requirement in [
+        *CORE.values(),
+        *(one for extra in ("ground", "sim", "cluster") for one in EXTRAS[extra].values()),
+    ]:
         operators = {specifier.operator for specifier in requirement.specifier}
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"
 

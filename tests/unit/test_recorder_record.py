@@ -25,6 +25,8 @@ from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 from terrafix.recorder.segments import MEGABYTE, SegmentRing
 from terrafix.recorder.writer import header
 
+pytestmark = pytest.mark.real_time
+
 WRITER = """
 import sys, time
 from pathlib import Path

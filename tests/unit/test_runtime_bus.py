@@ -19,6 +19,8 @@ from terrafix.core.rundir import RunDir
 from terrafix.core.shell import LiveShell
 from terrafix.processes import EVERYTHING, Process
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.fixture
 def context() -> Iterator["zmq.Context[zmq.Socket[bytes]]"]:

@@ -21,6 +21,8 @@ from terrafix.core.codec import decode_json
 from terrafix.core.errors import ConfigError, MapError, OutputError
 from terrafix.supervisor import run, sd_notify
 
+pytestmark = pytest.mark.real_time
+
 UNIT = Path(__file__).parent
 FOREVER = 100_000  # frames
 

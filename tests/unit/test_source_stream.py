@@ -16,6 +16,8 @@ from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources import Shot, Source, open_source
 from terrafix_tools.sim.camera.stream import FrameStream
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.fixture
 def description(tmp_path: Path) -> Path:
