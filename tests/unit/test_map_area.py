@@ -123,6 +123,47 @@ def test_a_plan_of_qgroundcontrol_is_a_mission(tmp_path: Path) -> None:
     assert area.bounds_deg[0] == pytest.approx(away(13.1, 47.0, 270, 2000)[0], abs=0.001)
 
 
+def write_plan(path: Path, *items: dict[str, object]) -> Path:
+    mission = {"plannedHomePosition": [47.0, 13.0, 400], "items": items, "version": 2}
+    path.write_text(json.dumps({"fileType": "Plan", "mission": mission}), encoding="utf-8")
+    return path
+
+
+def simple(lat: float, lon: float, command: int = 16) -> dict[str, object]:
+    return {"type": "SimpleItem", "command": command, "frame": 3, "params": [0, 0, 0, None, lat, lon, 80]}
+
+
+PLOT = [[47.1, 13.2], [47.1, 13.21], [47.11, 13.21], [47.11, 13.2]]
+TRIGGER = {"type": "SimpleItem", "command": 206, "frame": 2, "params": [25, 0, 1, 0, 0, 0, 0]}
+LINES = {"Items": [simple(47.1, 13.2), TRIGGER, simple(47.11, 13.25)], "VisualTransectPoints": []}
+COMPLEX = {  # as QGroundControl 4 writes them, without what says nothing about places -> the place that it goes to
+    "survey": ({"TransectStyleComplexItem": LINES, "polygon": PLOT, "angle": 0}, (13.25, 47.11)),
+    "CorridorScan": ({"TransectStyleComplexItem": LINES, "polyline": PLOT[:2], "CorridorWidth": 50}, (13.25, 47.11)),
+    "StructureScan": ({"polygon": PLOT, "CameraCalc": {"DistanceToSurface": 1000}, "EntranceAltitude": 50},
+                      (13.2205, 47.1155)),
+    "fwLandingPattern": ({"landingApproachCoordinate": [47.2, 13.3, 40], "landCoordinate": [47.21, 13.31, 0]},
+                         (13.31, 47.21)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", COMPLEX)
+def test_complex_items_of_a_plan_are_where_they_fly(tmp_path: Path, kind: str) -> None:
+    fields, (lon, lat) = COMPLEX[kind]
+    path = write_plan(
+        tmp_path / "m.plan", simple(47.0, 13.1), {"type": "ComplexItem", "complexItemType": kind} | fields
+    )
+    area = read_area(str(path), corridor_km=0.3)
+    assert inside(area, lon, lat) and inside(area, 13.05, 47.0)
+    assert not inside(area, *away(lon, lat, 60.0, 500.0))
+
+
+@pytest.mark.parametrize("kind", COMPLEX)
+def test_complex_items_without_places_are_named(tmp_path: Path, kind: str) -> None:
+    path = write_plan(tmp_path / "m.plan", simple(47.0, 13.1), {"type": "ComplexItem", "complexItemType": kind})
+    with pytest.raises(SourceError, match=f"item 2: a '{kind}' without"):
+        read_area(str(path), corridor_km=0.3)
+
+
 def test_a_mission_of_one_place_gets_a_circle(tmp_path: Path) -> None:
     path = write_waypoints(tmp_path / "m.waypoints", [(13.0, 47.0)])
     assert check_area(read_area(str(path), buffer_km=3.0)) == pytest.approx(math.pi * 9.0, rel=0.015)

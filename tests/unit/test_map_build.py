@@ -386,3 +386,27 @@ def test_a_coordinate_system_that_leads_nowhere(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"j\.tif"):
         build(tif, tmp_path / "m.gpkg")
     assert not (tmp_path / "m.gpkg").exists()
+
+
+def test_images_over_the_antimeridian_and_at_the_pole_are_refused(tmp_path: Path) -> None:
+    """There west is east of east, and what asks for the middle of the map would look on the other side of the earth."""
+    bands = map_rasters.texture(64, 64)
+    places = {
+        "antimeridian": ("EPSG:4326", Affine(0.01, 0, 179.7, 0, -0.01, 10.0)),
+        "84": ("EPSG:3413", Affine(10.0, 0, -300.0, 0, -10.0, 300.0)),
+    }
+    for reason, (crs, corner) in places.items():
+        with pytest.raises(MapError, match=rf"i\.tif: .*{reason}.*--area"):
+            build(map_rasters.write_tif(tmp_path / "i.tif", bands, crs, corner), tmp_path / "m.gpkg")
+    assert [path.name for path in tmp_path.iterdir()] == ["i.tif"]
+
+
+def test_an_output_that_is_no_file_is_left_alone(tmp_path: Path) -> None:
+    """A rename would replace it: a device, a pipe."""
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
+    os.mkfifo(tmp_path / "pipe.gpkg")
+    with pytest.raises(OutputError, match="is no file"):
+        build(tif, tmp_path / "pipe.gpkg")
+    assert (tmp_path / "pipe.gpkg").is_fifo()
+    with pytest.raises(OutputError, match=r"end in \.gpkg"):
+        build(tif, tmp_path / "m.tif")

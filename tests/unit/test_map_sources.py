@@ -1,6 +1,8 @@
 """Sources of imagery: what a person may write, and files of tiles."""
 
+import contextlib
 import gzip
+import sqlite3
 from pathlib import Path
 
 import cv2
@@ -19,7 +21,7 @@ from terrafix_tools.mapping.sources.tile_files import open_tiles
 from terrafix_tools.mapping.sources.tile_grid import Tile, ground_pixel_m, tiles_of, zoom_for
 from terrafix_tools.mapping.sources.tile_imagery import TileImagery
 from terrafix_tools.mapping.sources.tile_job import tile_file_opener
-from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode
+from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode, picture_side
 from terrafix_tools.mapping.sources.tile_store import TileStore
 from terrafix_tools.mapping.sources.url_template import UrlTemplate
 
@@ -177,6 +179,17 @@ def test_files_that_are_no_tiles(tmp_path: Path) -> None:
     (tmp_path / "c.pmtiles").write_bytes(bytes(data))
     with pytest.raises(MapError, match="damaged"):
         open_tiles(tmp_path / "c.pmtiles").get(Tile(16, WORLD.column, WORLD.row))
+
+
+def test_a_file_of_empty_tiles_is_named(tmp_path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(tmp_path / "a.mbtiles")) as db:
+        db.execute("CREATE TABLE tiles (zoom_level INTEGER, tile_column INTEGER, tile_row INTEGER, tile_data BLOB)")
+        db.execute("INSERT INTO tiles VALUES (16, 1, 1, x'')")
+        db.commit()
+    reader = open_tiles(tmp_path / "a.mbtiles")
+    with pytest.raises(MapError, match=r"a\.mbtiles: its tiles are no square pictures"):
+        picture_side(reader.first(16), tmp_path / "a.mbtiles")
+    reader.close()
 
 
 def test_a_damaged_tile_in_a_file_is_named(tmp_path: Path) -> None:

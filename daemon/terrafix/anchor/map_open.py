@@ -35,7 +35,7 @@ def connect(path: Path) -> sqlite3.Connection:
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from None
     if head[:16] != b"SQLite format 3\x00" or len(head) < 100:
-        raise MapError(f"{path}: not a map package; make one with 'terrafix map build {path.name} --out MAP.gpkg'")
+        raise MapError(f"{path}: not a map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'")
     page = int.from_bytes(head[16:18], "big")
     expected = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")  # sqlite.org/fileformat2.html
     actual = path.stat().st_size
@@ -51,7 +51,9 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
     """The manifest after its checksum over itself and the list of tiles was found right. Raises MapError."""
     tables = {row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if db.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID or MANIFEST_TABLE not in tables:
-        raise MapError(f"{path}: not a Terrafix map package; make one with 'terrafix map build {path.name} --out ...'")
+        raise MapError(
+            f"{path}: not a Terrafix map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'"
+        )
     rows: dict[str, str] = dict(db.execute(f"SELECT key, value FROM {MANIFEST_TABLE}"))
     version = rows.get("format_version", "")
     if version.isdigit() and int(version) > FORMAT_VERSION:

@@ -19,6 +19,9 @@ from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame, local_crs
 from terrafix.core.signature import TrustedKey
 
+# What SQLite says of a damaged file may quote it, and then it is no text either.
+UNREADABLE = (sqlite3.DatabaseError, UnicodeDecodeError)
+
 
 class MapPackage:
     """An open package, read only. One thread at a time.
@@ -51,7 +54,7 @@ class MapPackage:
             package.signed_by = check_signature(path, db, manifest, trusted)
             if verify:
                 package.verify()
-        except sqlite3.DatabaseError as error:
+        except UNREADABLE as error:
             db.close()
             raise MapError(f"{path}: damaged map package ({error}); build or copy it again") from None
         except (MapError, CRSError) as error:
@@ -70,7 +73,7 @@ class MapPackage:
                     )
             for vectors in self.manifest.vectors:
                 self._check_vectors(vectors.table)
-        except sqlite3.DatabaseError as error:
+        except UNREADABLE as error:
             raise MapError(f"{self.path}: damaged map package ({error}); build or copy it again") from None
 
     @property
@@ -92,8 +95,11 @@ class MapPackage:
         Raises MapError: not what was written."""
         for vectors in self.manifest.vectors:
             if vectors.table == table:
-                self._check_vectors(table)
-                return read_features(self._db, vectors, west, south, east, north)
+                try:
+                    self._check_vectors(table)
+                    return read_features(self._db, vectors, west, south, east, north)
+                except UNREADABLE as error:
+                    raise MapError(f"{self.path}: features of {table} are damaged ({error}); copy it again") from None
         return []
 
     def ground_amsl_m(self, lat_deg: float, lon_deg: float) -> float | None:
@@ -116,7 +122,7 @@ class MapPackage:
         tile = self.tiles.tile((found.table, level.zoom, column_px // TILE_PX, row_px // TILE_PX))
         if tile is None:
             return False
-        return tile[1] is None or bool(tile[1][row_px % TILE_PX, column_px % TILE_PX])
+        return bool(tile[0][row_px % TILE_PX, column_px % TILE_PX, 3])
 
     def bind(self, frame: LocalFrame, layer: str | None = None) -> "LocalMap":
         """The same map in the metres of a local frame, windows of ``layer`` unless they name one; None: the newest.

@@ -19,11 +19,11 @@ from terrafix.anchor.map_format import (
     tile_sha256,
 )
 
-CACHE_BYTES = 100_000_000  # decoded tiles; about 500, a window of 1 km at 0.5 m/px needs about 100
+CACHE_BYTES = 100_000_000  # decoded tiles; about 380, a window of 1 km at 0.5 m/px needs about 80, at 0.3 m/px 200
 VOID_BYTES = 100  # what a void costs in the cache, so that a walk through nothing is bounded too
 
 Key = tuple[str, int, int, int]  # table, zoom, column, row
-Tile = tuple[np.ndarray, np.ndarray | None]  # pixels; mask of 0 and 255, or None when every pixel is valid
+Tile = tuple[np.ndarray, bool]  # pixels; whether all of them are valid
 
 
 class TileStore:
@@ -37,9 +37,9 @@ class TileStore:
         self._cached_bytes = 0
 
     def tile(self, key: Key) -> Tile | None:
-        """(256, 256, 3) uint8 BGR and (256, 256) uint8 mask or None; None = nothing there.
+        """(256, 256, 4) uint8 BGR and mask of 0 and 255, and whether the mask is 255 everywhere; None = nothing there.
 
-        Of the elevation table: (256, 256) float32 metres AMSL, NaN = void, and no mask."""
+        Of the elevation table: (256, 256) float32 metres AMSL, NaN = void."""
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]
@@ -51,33 +51,26 @@ class TileStore:
         return tile
 
     def mosaic(self, table: str, level: Level, u_0: int, v_0: int, width: int, height: int) -> Tile:
-        """Pixels [v_0, v_0 + height) x [u_0, u_0 + width) of a level and their mask, or None when all are valid."""
-        image = np.empty((height, width, 3), np.uint8)
-        mask: np.ndarray | None = None
+        """Pixels [v_0, v_0 + height) x [u_0, u_0 + width) of a level: (height, width, 4), and whether all are valid."""
+        image = np.empty((height, width, 4), np.uint8)
+        whole = True
         for row in range(v_0 // TILE_PX, (v_0 + height - 1) // TILE_PX + 1):
+            top = row * TILE_PX - v_0
+            rows = slice(max(top, 0), min(top + TILE_PX, height))
             for column in range(u_0 // TILE_PX, (u_0 + width - 1) // TILE_PX + 1):
-                left, top = column * TILE_PX - u_0, row * TILE_PX - v_0
-                target = (
-                    slice(max(top, 0), min(top + TILE_PX, height)),
-                    slice(max(left, 0), min(left + TILE_PX, width)),
-                )
+                left = column * TILE_PX - u_0
+                columns = slice(max(left, 0), min(left + TILE_PX, width))
                 inside = 0 <= column < level.columns and 0 <= row < level.rows
                 tile = self.tile((table, level.zoom, column, row)) if inside else None
-                if mask is None and (tile is None or tile[1] is not None):
-                    mask = np.full((height, width), 255, np.uint8)
                 if tile is None:
-                    image[target] = 0
-                    assert mask is not None
-                    mask[target] = 0
-                    continue
-                part = (
-                    slice(target[0].start - top, target[0].stop - top),
-                    slice(target[1].start - left, target[1].stop - left),
-                )
-                image[target] = tile[0][part]
-                if mask is not None and tile[1] is not None:
-                    mask[target] = tile[1][part]
-        return image, mask
+                    image[rows, columns] = 0
+                    whole = False
+                else:
+                    image[rows, columns] = tile[0][
+                        rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
+                    ]
+                    whole &= tile[1]
+        return image, whole
 
     def hashes(self) -> Iterator[HashRow]:
         """What is recorded of every tile, in order."""
@@ -149,18 +142,21 @@ class TileStore:
             return None
         data, scale, offset = stored
         if key[0] == ELEVATION_TABLE and self._first_format:
-            return map_format1.heights(data), None
+            return _heights(map_format1.heights(data))
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         assert image is not None, f"tile {key} has its sha256 and does not decode"
         if scale is not None and offset is not None:
             assert image.shape == (DEM_TILE_PX, DEM_TILE_PX) and image.dtype == np.uint16
-            return np.where(image == DEM_NULL, np.nan, image * scale + offset).astype(np.float32), None
+            return _heights(np.where(image == DEM_NULL, np.nan, image * scale + offset).astype(np.float32))
         if image.shape[2] == 4:
-            return np.ascontiguousarray(image[:, :, :3]), np.where(image[:, :, 3] > 0, 255, 0).astype(np.uint8)
-        return image, None
+            image[:, :, 3] = np.where(image[:, :, 3] > 0, 255, 0)
+            return image, bool((image[:, :, 3] == 255).all())
+        return cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), True
+
+
+def _heights(height_m: np.ndarray) -> Tile:
+    return height_m, bool(np.isfinite(height_m).all())
 
 
 def _size(tile: Tile | None) -> int:
-    if tile is None:
-        return VOID_BYTES
-    return tile[0].nbytes + (0 if tile[1] is None else tile[1].nbytes)
+    return VOID_BYTES if tile is None else tile[0].nbytes

@@ -1,6 +1,7 @@
 """One imagery layer seen in the metres of a local frame: windows at any scale."""
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +15,29 @@ BLOCK_PX = 512  # a window is rendered in blocks that stay in the cache, each wi
 MIN_BLOCK_PX = 64
 AFFINE_TOLERANCE_PX = 0.02  # split a block until its affine map is this close to the projection, in pixels of the level
 BLUR_MIN_SCALE = 1.17  # below this reduction the bilinear kernel is filter enough
+
+# The corners of a block, the middles of its sides and its centre, as (s, t, 1) with s and t from 0 to 1; and what takes
+# nine values there to the affine map that is nearest to them.
+KNOTS = np.array([(s, t, 1.0) for t in (0.0, 0.5, 1.0) for s in (0.0, 0.5, 1.0)])
+FIT = np.linalg.pinv(KNOTS)
+
+
+class Block(NamedTuple):
+    """A part of a window, pixels."""
+
+    row: int
+    column: int
+    height: int
+    width: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
+
+    def quarters(self) -> list["Block"]:
+        """Two when one side is too short to be halved."""
+        rows = _halves(self.row, self.height)
+        return [Block(r, c, h, w) for r, h in rows for c, w in _halves(self.column, self.width)]
 
 
 class LayerView:
@@ -33,10 +57,23 @@ class LayerView:
         image = np.zeros((height_px, width_px, 3), np.uint8)
         mask = np.zeros((height_px, width_px), np.uint8)
         level = self._level_for(gsd_m)
-        for row in range(0, height_px, BLOCK_PX):
-            for column in range(0, width_px, BLOCK_PX):
-                part = (slice(row, min(row + BLOCK_PX, height_px)), slice(column, min(column + BLOCK_PX, width_px)))
-                self._render(image[part], mask[part], e_min_m + column * gsd_m, n_max_m - row * gsd_m, gsd_m, level)
+        blocks = [
+            Block(row, column, min(BLOCK_PX, height_px - row), min(BLOCK_PX, width_px - column))
+            for row in range(0, height_px, BLOCK_PX)
+            for column in range(0, width_px, BLOCK_PX)
+        ]
+        while blocks:
+            uv = self._project(blocks, e_min_m, n_max_m, gsd_m, level)
+            affine = FIT @ uv
+            error_px = np.abs(KNOTS @ affine - uv).max(axis=(1, 2))  # NaN beyond the projection: nothing there
+            crooked: list[Block] = []
+            for i, block in enumerate(blocks):
+                if error_px[i] > AFFINE_TOLERANCE_PX and max(block.height, block.width) > MIN_BLOCK_PX:
+                    crooked += block.quarters()
+                elif np.isfinite(uv[i]).all():
+                    place = block.slices
+                    self._draw(image[place], mask[place], affine[i], uv[i], level)
+            blocks = crooked
         return image, mask.view(bool)
 
     def _level_for(self, gsd_m: float) -> Level:
@@ -46,30 +83,22 @@ class LayerView:
                 return level
         return self._layer.levels[-1]
 
-    def _render(
-        self, image: np.ndarray, mask: np.ndarray, e_min_m: float, n_max_m: float, gsd_m: float, level: Level
-    ) -> None:
-        """Fills one block (views into the window), splitting it until an affine map is exact enough."""
-        height_px, width_px = mask.shape
-        knots = np.array([0.0, 0.5, 1.0])
-        c, r = (a.ravel() for a in np.meshgrid(knots * width_px - 0.5, knots * height_px - 0.5))
-        x, y = self._to_crs.transform(e_min_m + (c + 0.5) * gsd_m, n_max_m - (r + 0.5) * gsd_m)
-        if not (np.isfinite(x).all() and np.isfinite(y).all()):
-            return
-        # Pixel coordinates of the level, with integers at pixel centres as OpenCV has it.
+    def _project(self, blocks: list[Block], e_min_m: float, n_max_m: float, gsd_m: float, level: Level) -> np.ndarray:
+        """(blocks, 9, 2): column and row of the level under the knots of each block, whole numbers at pixel centres."""
+        places = np.array([(b.column, b.row) for b in blocks])[:, None]
+        sizes = np.array([(b.width, b.height) for b in blocks])[:, None]
+        pixels = places + KNOTS[:, :2] * sizes
+        x, y = self._to_crs.transform(e_min_m + pixels[..., 0] * gsd_m, n_max_m - pixels[..., 1] * gsd_m)
         u = (x - self._layer.x_min) / level.pixel_x - 0.5
         v = (self._layer.y_max - y) / level.pixel_y - 0.5
-        design = np.stack([c, r, np.ones_like(c)], axis=1)
-        uv = np.stack([u, v], axis=1)
-        affine = np.linalg.lstsq(design, uv, rcond=None)[0]  # (3, 2)
-        error_px = float(np.abs(design @ affine - uv).max())
-        if error_px > AFFINE_TOLERANCE_PX and max(width_px, height_px) > MIN_BLOCK_PX:
-            for rows in _halves(height_px):
-                for columns in _halves(width_px):
-                    e_m, n_m = e_min_m + columns.start * gsd_m, n_max_m - rows.start * gsd_m
-                    self._render(image[rows, columns], mask[rows, columns], e_m, n_m, gsd_m, level)
-            return
-        scale = math.sqrt(abs(np.linalg.det(affine[:2])))
+        return np.stack([u, v], axis=2)
+
+    def _draw(self, image: np.ndarray, mask: np.ndarray, affine: np.ndarray, uv: np.ndarray, level: Level) -> None:
+        """Fills one block (views into the window) through ``affine``, which takes (s, t, 1), both 0 to 1 over the
+        block, to column and row of the level."""
+        height_px, width_px = mask.shape
+        across, down = affine[0] / width_px, affine[1] / height_px
+        scale = math.sqrt(abs(float(across[0] * down[1] - across[1] * down[0])))
         sigma_px = 0.5 * math.sqrt(scale * scale - 1.0) if scale > BLUR_MIN_SCALE else 0.0
         margin = 2 + math.ceil(3 * sigma_px)
         low = np.floor(uv.min(axis=0)).astype(int) - margin
@@ -78,32 +107,30 @@ class LayerView:
         if (start >= end).any():
             return
         (u_0, v_0), (width, height) = (int(v) for v in start), (int(v) for v in end - start)
-        source, source_mask = self._tiles.mosaic(self._layer.table, level, u_0, v_0, width, height)
-        if source_mask is None and ((start != low).any() or (end != high).any()):
-            source_mask = np.full(source.shape[:2], 255, np.uint8)  # the window reaches beyond the tiles
-        if source_mask is not None and not source_mask.any():
+        source, whole = self._tiles.mosaic(self._layer.table, level, u_0, v_0, width, height)
+        whole &= bool((start == low).all() and (end == high).all())  # else the window reaches beyond the tiles
+        if not whole and not source[:, :, 3].any():
             return
         if sigma_px > 0:
             side = 2 * max(1, round(2.5 * sigma_px)) + 1
+            valid = None if whole else cv2.erode(cv2.extractChannel(source, 3), np.ones((side, side), np.uint8))
             source = cv2.GaussianBlur(source, (side, side), sigma_px)
-            if source_mask is not None:
-                source_mask = cv2.erode(source_mask, np.ones((side, side), np.uint8))
-        matrix = affine.T - np.array([[0.0, 0.0, u_0], [0.0, 0.0, v_0]])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            if valid is not None:
+                cv2.insertChannel(valid, source, 3)
+        # From pixel centres of the block, as OpenCV has them.
+        corner = affine[2] + (across + down) / 2 - (u_0, v_0)
         # Four channels: OpenCV warps them in half the time of three, and the fourth carries the mask.
-        four = cv2.cvtColor(source, cv2.COLOR_BGR2BGRA)
-        if source_mask is not None:
-            cv2.insertChannel(source_mask, four, 3)
-        warped = cv2.warpAffine(four, matrix, (width_px, height_px), flags=flags)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        warped = cv2.warpAffine(source, np.stack([across, down, corner], axis=1), (width_px, height_px), flags=flags)
         cv2.cvtColor(warped, cv2.COLOR_BGRA2BGR, dst=image)
-        if source_mask is None:
+        if whole:
             mask[:] = 1
             return
-        mask[:] = warped[:, :, 3] == 255  # every pixel that was blended is valid
+        np.equal(cv2.extractChannel(warped, 3), 255, out=mask.view(bool))  # every pixel that was blended is valid
         image[mask == 0] = 0
 
 
-def _halves(size: int) -> list[slice]:
-    """One slice, or two when the block is large enough to split."""
+def _halves(start: int, size: int) -> list[tuple[int, int]]:
+    """(start, size), or two when it is long enough to be halved."""
     half = size // 2
-    return [slice(0, size)] if size <= MIN_BLOCK_PX else [slice(0, half), slice(half, size)]
+    return [(start, size)] if size <= MIN_BLOCK_PX else [(start, half), (start + half, size - half)]

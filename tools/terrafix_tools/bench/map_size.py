@@ -1,8 +1,10 @@
-"""Cost as the map grows: build, open, search. python -m terrafix_tools.bench.map_size KM2 WORK OUT.
+"""Cost as the map grows: build, open, read, search. python -m terrafix_tools.bench.map_size KM2 WORK OUT.
 
 The ground is coloured noise of many sizes, a metre a pixel, different everywhere; the frame is a piece of it. Times are
-those of the processor, all threads."""
+those of the processor, all threads; the gain by several processes is by the clock."""
 
+import contextlib
+import itertools
 import json
 import math
 import sys
@@ -19,6 +21,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from terrafix.anchor.belief import Belief, cell_for
+from terrafix.anchor.map_format import TILE_PX
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import FrameMatcher, View
 from terrafix.core.camera import CameraCalibration
@@ -26,6 +29,9 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix_engines.features import open_describer
 from terrafix_tools.bench.flights import spread
 from terrafix_tools.mapping.build import build
+from terrafix_tools.mapping.parallel import render_chunks
+from terrafix_tools.mapping.pyramid import CHUNK_LEVELS, levels_of, open_renderer
+from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.replay import peak_memory_mb
 
 GSD_M = 1.0
@@ -35,6 +41,8 @@ CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
 EPSG, WEST_M, NORTH_M = 32632, 690_000.0, 5_330_000.0
 BELIEFS_M = {"in flight": 20.0, "lost": 300.0}  # sigma of the belief that is looked with
 LOOKS = 8
+WORKERS, CHUNKS, FIRST_CHUNKS = 4, 60, 12
+WINDOW_GSD_M, WINDOWS = (0.5, 1.0, 1.3, 2.0, 3.0, 4.0), 30
 
 
 def measure(area_km2: float, work: Path) -> dict[str, Any]:
@@ -45,9 +53,32 @@ def measure(area_km2: float, work: Path) -> dict[str, Any]:
     began_s = time.process_time()
     build(image, package)
     build_s = time.process_time() - began_s
+    speed_up = _chunks_per_s(image, WORKERS) / _chunks_per_s(image, 1)
     image.unlink()
     size_mb = package.stat().st_size / 2**20
-    return {"area_km2": area_km2, "gsd_m": GSD_M, "build_cpu_s": round(build_s, 2), "package_mb": round(size_mb, 1)}
+    return {
+        "area_km2": area_km2,
+        "gsd_m": GSD_M,
+        "build_cpu_s": round(build_s, 2),
+        "speed_up": round(speed_up, 2),
+        "package_mb": round(size_mb, 1),
+    }
+
+
+def _chunks_per_s(image: Path, workers: int) -> float:
+    """By a clock: reading, reducing and encoding, without the start of the processes; pieces of the map in turn."""
+    with ImagerySource(image) as source:
+        finest = levels_of(source)[-1].zoom
+        count = math.ceil(source.width_px / (TILE_PX << CHUNK_LEVELS))
+    pieces = [(column, row) for row in range(count) for column in range(count)]
+    places = list(itertools.islice(itertools.cycle(pieces), CHUNKS + FIRST_CHUNKS))
+    opener = partial(open_renderer, partial(ImagerySource, image), None, finest)
+    with contextlib.closing(render_chunks(opener, places, workers)) as chunks:
+        for _ in itertools.islice(chunks, FIRST_CHUNKS):
+            pass
+        began_s = time.monotonic()
+        rendered = sum(1 for _ in chunks)
+    return rendered / (time.monotonic() - began_s)
 
 
 def search(package: Path) -> dict[str, Any]:
@@ -65,9 +96,25 @@ def search(package: Path) -> dict[str, Any]:
     for name, sigma_m in BELIEFS_M.items():
         belief = Belief(0.0, 0.0, sigma_m, cell_for(AGL_M, matcher.look_cell_m(AGL_M)))
         looks[name] = spread([_ms(partial(matcher.look, frame, view, belief)) for _ in range(LOOKS)])
-    opened.close()
     grown_mb = peak_memory_mb() - before_mb
-    return {"open_cpu_ms": round(open_ms, 1), "look_cpu_ms": looks, "memory_mb": round(grown_mb, 1)}
+    windows = {f"{gsd_m:g} m/px": spread(_windows_ms(local, gsd_m)) for gsd_m in WINDOW_GSD_M}
+    opened.close()
+    return {
+        "open_cpu_ms": round(open_ms, 1),
+        "window_cpu_ms": windows,
+        "look_cpu_ms": looks,
+        "memory_mb": round(grown_mb, 1),
+    }
+
+
+def _windows_ms(local: LocalMap, gsd_m: float) -> list[float]:
+    """Of windows of a kilometre around the middle, once their tiles are there."""
+    side_px = round(1000.0 / gsd_m)
+    shifts_m = np.random.default_rng(5).uniform(-100.0, 100.0, (WINDOWS, 2)).tolist()
+    reads = [partial(local.window, e_m - 500.0, n_m + 500.0, side_px, side_px, gsd_m) for e_m, n_m in shifts_m]
+    for read in reads:
+        read()
+    return [_ms(read) for read in reads]
 
 
 def _middle(package: MapPackage) -> LocalFrame:

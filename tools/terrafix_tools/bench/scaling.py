@@ -43,13 +43,25 @@ def measure(
 def show(grown: dict[str, Any], console: Console) -> None:
     """Two tables: what grows with the map, what with the flight. Times are processor times."""
     table = Table(title="as the map grows (processor time)", title_justify="left")
-    for column in ("km2", "build", "size", "open", "look in flight", "look when lost", "memory"):
+    for column in (
+        "km2",
+        "build",
+        f"{map_size.WORKERS} workers",
+        "size",
+        "open",
+        "1 km, p95",
+        "look in flight",
+        "when lost",
+        "memory",
+    ):
         table.add_column(column, justify="right")
     for one in grown["map"]:
         looks = (f"{one['look_cpu_ms'][name]['median']:.0f} ms" for name in map_size.BELIEFS_M)
+        read_ms = max(window["p95"] for window in one["window_cpu_ms"].values())
         table.add_row(
-            f"{one['area_km2']:g}", f"{one['build_cpu_s']:.0f} s", f"{one['package_mb']:.0f} MB",
-            f"{one['open_cpu_ms']:.0f} ms", *looks, f"{one['memory_mb']:.0f} MB")  # fmt: skip
+            f"{one['area_km2']:g}", f"{one['build_cpu_s']:.0f} s",
+            f"x {one['speed_up']:.1f}", f"{one['package_mb']:.0f} MB",
+            f"{one['open_cpu_ms']:.0f} ms", f"{read_ms:.0f} ms", *looks, f"{one['memory_mb']:.0f} MB")  # fmt: skip
     console.print(table)
     table = Table(title="as the flight grows (processor time, estimator alone)", title_justify="left")
     queries = list(grown["flight"][0]["covariance_cpu_ms"])

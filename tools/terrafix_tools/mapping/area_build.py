@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -20,12 +21,16 @@ from terrafix_tools.mapping.fetch_progress import shown
 from terrafix_tools.mapping.heights import to_amsl
 from terrafix_tools.mapping.heights_datum import Datum
 from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
+from terrafix_tools.mapping.parallel import usual_workers
 from terrafix_tools.mapping.sources import glo30
 from terrafix_tools.mapping.sources.prepare import Preparation, Request
 from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
 from terrafix_tools.mapping.vectors_source_overpass import PUBLIC, fetch_overpass, overpass_features
 from terrafix_tools.mapping.vectors_source_pbf import pbf_features
 from terrafix_tools.mapping.vectors_source_tags import LICENCE as OSM_LICENCE
+
+if TYPE_CHECKING:
+    from terrafix_tools.mapping.parallel_cluster import DaskCluster
 
 OVERPASS = "overpass"
 OFFERED_CORRIDOR_KM = 2.0
@@ -51,7 +56,8 @@ class Order:
     licence: str = ""
     ce90_m: float | None = None
     rate: float | None = None
-    workers: int = 1
+    workers: int | None = None  # None: as many as are sensible
+    scheduler: str = ""
     cache: Path | None = None
     agreed: bool = False
     estimate_only: bool = False
@@ -69,6 +75,7 @@ def build_order(order: Order) -> Path | None:
     Raises UsageError, ConfigError, SourceError, MapError, OutputError: one line each."""
     _check_files(order)
     with contextlib.ExitStack() as stack:
+        cluster = stack.enter_context(_cluster(order.scheduler)) if order.scheduler else None
         if not order.area:
             layers, area = [_whole_image(order)], None
         else:
@@ -86,8 +93,23 @@ def build_order(order: Order) -> Path | None:
         elevation = _elevation(order, area, Path(scratch))
         vectors = _vectors(order, area)
         return build_package(
-            layers, order.out, elevation=elevation, vectors=vectors, workers=order.workers, progress=True
+            layers,
+            order.out,
+            elevation=elevation,
+            vectors=vectors,
+            workers=order.workers or usual_workers(),
+            cluster=cluster,
+            progress=True,
         )
+
+
+def _cluster(address: str) -> "DaskCluster":
+    """Before hours of download: does the scheduler answer? Raises UsageError."""
+    try:
+        from terrafix_tools.mapping.parallel_cluster import DaskCluster
+    except ModuleNotFoundError as error:
+        raise UsageError(f"--scheduler needs {error.name}; install it: pip install 'terrafix[cluster]'") from None
+    return DaskCluster(address)
 
 
 def _check_files(order: Order) -> None:

@@ -19,7 +19,7 @@ def check_ring(where: str, points: np.ndarray) -> np.ndarray:
     keep = np.abs(points - np.roll(points, 1, axis=0)).max(axis=1) > LEAST_DEG
     ring = points[keep]
     if len(ring) < 3:
-        raise UsageError(f"{where}: a polygon without area ({len(ring)} different points); draw at least three")
+        raise UsageError(f"{where}: a polygon without area (fewer than three different points); draw at least three")
     crossing = _crossing(ring)
     if crossing is not None:
         lon_deg, lat_deg = crossing

@@ -1,17 +1,14 @@
 """Builds a map package: imagery layers as tiles at several scales, elevation, vectors, manifest. Streams; any size."""
 
 import contextlib
-import datetime
 import hashlib
 import os
 import sqlite3
 import tempfile
 from collections.abc import Generator, Sequence
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
-import cv2
 import msgspec
 import rasterio
 from pyproj import Transformer
@@ -19,20 +16,19 @@ from rasterio.errors import RasterioError
 
 from terrafix.anchor.map_format import FORMAT_VERSION, IMAGERY_TABLE, DemGrid, Layer, Manifest, VectorTable
 from terrafix.anchor.map_package import MapPackage
-from terrafix.core.errors import MapError, OutputError, UsageError
+from terrafix.core.errors import MapError, OutputError
+from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
 from terrafix_tools.mapping.collar import find_collar
 from terrafix_tools.mapping.dem import DemSource, level_of, write_elevation
 from terrafix_tools.mapping.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
-from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, render_chunks
+from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Cluster, render_chunks
 from terrafix_tools.mapping.progress import Bar, progress_bar
-from terrafix_tools.mapping.pyramid import Chunk, Pyramid, levels_of, open_renderer
+from terrafix_tools.mapping.pyramid import BUILT_WITH, Chunk, Pyramid, levels_of, open_renderer
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.vectors import write_vectors
 
 HASH_CHUNK = 1 << 20
-
-BUILT_WITH = f"terrafix {version('terrafix')}, GDAL {rasterio.__gdal_version__}, OpenCV {cv2.__version__}"
 
 
 def build(
@@ -47,7 +43,7 @@ def build(
     progress: bool = False,
 ) -> Path:
     """``build_package`` of one image (any GDAL raster with a CRS) and an elevation raster in metres AMSL."""
-    _check_out(out, imagery)
+    check_out(out, imagery)
     layer = layer_of(imagery, date=date, licence=licence, ce90_m=ce90_m)
     elevation = ElevationInput(partial(DemSource, dem), source=dem.name) if dem else None
     return build_package([layer], out, elevation=elevation, workers=workers, progress=progress)
@@ -57,10 +53,10 @@ def layer_of(imagery: Path, *, date: str = "", licence: str = "", ce90_m: float 
     """An image as a layer. ``ce90_m``: radius that holds 90 % of its errors of position, as its producer states it.
 
     Raises MapError and UsageError."""
-    with ImagerySource(imagery):  # says what is wrong with it before it is read to the end
-        pass
+    with ImagerySource(imagery) as source:  # says what is wrong with it before it is read to the end
+        check_reach(imagery, source)
     return LayerInput(
-        open=partial(ImagerySource, imagery),
+        open=partial(ImagerySource, imagery.absolute()),  # a worker may stand in another folder
         source=imagery.name,
         source_sha256=_sha256(imagery),
         where=str(imagery),
@@ -77,16 +73,18 @@ def build_package(
     elevation: ElevationInput | None = None,
     vectors: VectorInput | None = None,
     workers: int = 1,
+    cluster: Cluster | None = None,
     progress: bool = False,
 ) -> Path:
-    """Writes the package `out`. ``workers``: processes that read and encode imagery; their number changes no byte.
+    """Writes the package `out`. ``workers``: processes that read and encode imagery; ``cluster``: other computers that
+    do so in their place. Neither changes a byte.
 
     The same input gives the same bytes. Nothing is left at `out` or beside it when this fails or is interrupted.
     With several workers this must be called from a program that may be imported again (``multiprocessing`` spawn).
     Raises MapError (something that goes in is unusable), UsageError and OutputError."""
     for layer in layers:
-        _check_date(layer.date)
-    _check_out(out)
+        check_date(layer.date)
+    check_out(out)
     # Newest first; unknown dates last, and in the order given.
     ordered = sorted(layers, key=lambda layer: layer.date, reverse=True)
     with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), contextlib.ExitStack() as stack:
@@ -96,7 +94,7 @@ def build_package(
             bar = stack.enter_context(progress_bar(progress))
             part = scratch / "part.gpkg"
             with new_package(part) as (writer, db):
-                _Build(writer, db, scratch, out.stem, workers, bar).write(ordered, elevation, vectors)
+                _Build(writer, db, scratch, out.stem, workers, cluster, bar).write(ordered, elevation, vectors)
             with part.open("rb") as file:
                 os.fsync(file.fileno())
             part.replace(out)
@@ -141,10 +139,17 @@ class _Build:
     """One package while it is written."""
 
     def __init__(
-        self, writer: GpkgWriter, db: sqlite3.Connection, scratch: Path, name: str, workers: int, bar: Bar
+        self,
+        writer: GpkgWriter,
+        db: sqlite3.Connection,
+        scratch: Path,
+        name: str,
+        workers: int,
+        cluster: Cluster | None,
+        bar: Bar,
     ) -> None:
-        self._writer, self._db, self._scratch, self._name = writer, db, scratch, name
-        self._workers, self._bar = workers, bar
+        self._writer, self._db, self._scratch, self._name = writer, db, scratch.absolute(), name
+        self._workers, self._cluster, self._bar = workers, cluster, bar
 
     def write(self, layers: list[LayerInput], elevation: ElevationInput | None, vectors: VectorInput | None) -> None:
         written: list[Layer] = []
@@ -189,7 +194,7 @@ class _Build:
         step = self._bar(table, len(places))
 
         def counted() -> Generator[Chunk, None, None]:
-            for chunk in render_chunks(opener, places, self._workers):
+            for chunk in render_chunks(opener, places, self._workers, self._cluster):
                 step()
                 yield chunk
 
@@ -229,22 +234,6 @@ class _Build:
                 vectors=vectors,
             )
         )
-
-
-def _check_out(out: Path, imagery: Path | None = None) -> None:
-    if out.is_dir():
-        raise OutputError(f"{out}: is a folder; give the name of a file to write, for example {out / 'map.gpkg'}")
-    if imagery is not None and out.exists() and imagery.exists() and out.samefile(imagery):
-        raise OutputError(f"{out}: would overwrite the imagery; give another --out")
-
-
-def _check_date(date: str) -> None:
-    try:
-        good = not date or datetime.date.fromisoformat(date).isoformat() == date
-    except ValueError:
-        good = False
-    if not good:
-        raise UsageError(f"date '{date}' of the imagery: write it YYYY-MM-DD")
 
 
 def _sha256(path: Path) -> str:

@@ -45,7 +45,11 @@ def map_build(
     rate: Annotated[
         float | None, typer.Option(help="Requests a second that the servers of --source allow; 5 when nothing is said.")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Processes that read and encode imagery.")] = 1,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=64, help="Processes that read and encode imagery; default: one a core, at most 8."),
+    ] = None,
+    scheduler: Annotated[str, typer.Option(help="tcp://host:port of a Dask cluster that does so instead.")] = "",
     cache: Annotated[Path | None, typer.Option(help="Folder that keeps downloads; default ~/.cache/terrafix.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Agree to a large download.")] = False,
     estimate: Annotated[bool, typer.Option("--estimate", help="Say what would be downloaded, and stop.")] = False,
@@ -71,6 +75,7 @@ def map_build(
             ce90_m=ce90,
             rate=rate,
             workers=workers,
+            scheduler=scheduler,
             cache=cache,
             agreed=yes,
             estimate_only=estimate,

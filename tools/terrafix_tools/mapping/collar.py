@@ -1,6 +1,5 @@
 """Finds the collar of an image without a mask: pure black or white areas that are connected to its border."""
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,14 @@ from rasterio.windows import Window
 from terrafix_tools.mapping.layers import Imagery
 
 BLOCK_PX = 2048  # labelled at a time
+SIDES = ((-1, 0), (1, 0), (0, -1), (0, 1))  # left, right, above, below a block
 MIN_COLLAR_PX = 256  # less than this at the border is shadow, glare or compression noise
 GAP_PX = 9  # a white collar inside a black one is parted from it by a smeared line, narrower than this
 BLEED_PX = 16  # lossy compression smears the edge of a collar over its block (JPEG in YCbCr 4:2:0: 16 px)
 TRIM_PX = 4  # and mixes the last pixels before the edge with it, whatever they look like
 BLEED_LEVEL = 16  # smeared pixels are still this close to black or white
+
+Block = tuple[int, int]  # column and row of a block; also a step to the next
 
 
 class Collar:
@@ -48,46 +50,73 @@ class Collar:
 
 def find_collar(source: Imagery, scratch: Path, bar: Callable[[str, int | None], Callable[[], None]]) -> Collar | None:
     """Collar of an image, or None when there is none. Writes and leaves `scratch`. ``bar(name, steps) -> step()``."""
-    if not _border_is_empty(source):
+    rim = _rim(source)
+    if not rim:
         return None
-    width, height = source.width_px, source.height_px
-    on_step = bar("collar", 2 * math.ceil(width / BLOCK_PX) * math.ceil(height / BLOCK_PX))
-    sets = _DisjointSets()
-    above: dict[int, np.ndarray] = {}  # labels of the last line of the block row above, by block column
-    for block_row in range(0, height, BLOCK_PX):
-        left: np.ndarray | None = None
-        for block_column in range(0, width, BLOCK_PX):
-            labels = _labels(source, block_column, block_row, sets)
-            on_step()
-            if block_column == 0:
-                sets.touch_border(labels[:, 0])
-            if block_row == 0:
-                sets.touch_border(labels[0])
-            if block_column + labels.shape[1] == width:
-                sets.touch_border(labels[:, -1])
-            if block_row + labels.shape[0] == height:
-                sets.touch_border(labels[-1])
-            if left is not None:
-                sets.join(left, labels[:, 0])
-            if block_row > 0:
-                sets.join(above[block_column], labels[0])
-            left, above[block_column] = labels[:, -1].copy(), labels[-1].copy()
-    chosen = sets.collar()
+    blocks = _Reached(source, rim, bar)
+    chosen = blocks.sets.collar()
     if not chosen.any():
         return None
     placement = Affine(source.pixel_x, 0, source.x_min, 0, -source.pixel_y, source.y_max)
-    profile: dict[str, Any] = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "uint8"}
-    profile |= {"crs": source.crs.to_wkt(), "transform": placement, "tiled": True, "blockxsize": 256}
-    profile |= {"blockysize": 256, "compress": "deflate", "nbits": 1, "BIGTIFF": "IF_SAFER"}
-    numbering = _DisjointSets()
+    profile: dict[str, Any] = {"driver": "GTiff", "width": source.width_px, "height": source.height_px, "count": 1}
+    profile |= {"dtype": "uint8", "crs": source.crs.to_wkt(), "transform": placement, "tiled": True, "nbits": 1}
+    profile |= {"blockxsize": 256, "blockysize": 256, "compress": "deflate", "BIGTIFF": "IF_SAFER", "SPARSE_OK": True}
     with rasterio.open(scratch, "w", **profile) as out:
-        for block_row in range(0, height, BLOCK_PX):
-            for block_column in range(0, width, BLOCK_PX):
-                labels = _labels(source, block_column, block_row, numbering)  # the same numbers as before
-                window = Window(block_column, block_row, labels.shape[1], labels.shape[0])
-                out.write(chosen[labels].astype(np.uint8), 1, window=window)
-                on_step()
+        for place, first in blocks.first.items():
+            labels = _labels(source, place, first)[0]
+            x, y = place[0] * BLOCK_PX, place[1] * BLOCK_PX
+            out.write(chosen[labels].astype(np.uint8), 1, window=Window(x, y, labels.shape[1], labels.shape[0]))
     return Collar(scratch)
+
+
+class _Reached:
+    """The blocks that empty areas at the image's border reach into: the others are not read at all."""
+
+    def __init__(self, source: Imagery, rim: set[Block], bar: Callable[[str, int | None], Callable[[], None]]) -> None:
+        self.sets = _DisjointSets()
+        self.first: dict[Block, int] = {}  # what is added to the labels of a block
+        self._lines: dict[tuple[Block, Block], np.ndarray] = {}  # labels of a block's side, by block and direction
+        self._columns, self._rows = -(-source.width_px // BLOCK_PX), -(-source.height_px // BLOCK_PX)
+        on_step = bar("collar", None)
+        wanted = sorted(rim)
+        while wanted:
+            for place in wanted:
+                self._add(source, place)
+                on_step()
+            wanted = sorted(self._next())
+
+    def _add(self, source: Imagery, place: Block) -> None:
+        self.first[place] = len(self.sets.parent) - 1
+        labels, sizes_px = _labels(source, place, self.first[place])
+        self.sets.add(sizes_px)
+        for side in SIDES:
+            line = _line(labels, side).copy()
+            self._lines[place, side] = line
+            beside = place[0] + side[0], place[1] + side[1]
+            if not (0 <= beside[0] < self._columns and 0 <= beside[1] < self._rows):
+                self.sets.touch_border(line)
+            elif beside in self.first:
+                self.sets.join(line, self._lines[beside, (-side[0], -side[1])])
+
+    def _next(self) -> set[Block]:
+        """Blocks not yet read, over whose side an area goes that touches the border."""
+        roots = self.sets.border_roots()
+        found: set[Block] = set()
+        for (place, side), line in self._lines.items():
+            beside = place[0] + side[0], place[1] + side[1]
+            inside = 0 <= beside[0] < self._columns and 0 <= beside[1] < self._rows
+            if not inside or beside in self.first or beside in found:
+                continue
+            if any(self.sets.find(int(label)) in roots for label in np.unique(line) if label):
+                found.add(beside)
+        return found
+
+
+def _line(labels: np.ndarray, side: Block) -> np.ndarray:
+    """First or last column or row of a block."""
+    if side[0]:
+        return labels[:, 0 if side[0] < 0 else -1]
+    return labels[0 if side[1] < 0 else -1]
 
 
 def _empty(image: np.ndarray, tolerance: int) -> np.ndarray:
@@ -97,10 +126,25 @@ def _empty(image: np.ndarray, tolerance: int) -> np.ndarray:
     return ((black > 0) | (white > 0)).astype(np.uint8)
 
 
-def _border_is_empty(source: Imagery) -> bool:
+def _rim(source: Imagery) -> set[Block]:
+    """Blocks at the image's border with something empty there; none when no pixel of the border itself is."""
     width, height = source.width_px, source.height_px
-    edges = ((0, 0, width, 1), (0, height - 1, width, 1), (0, 0, 1, height), (width - 1, 0, 1, height))
-    return any(bool(_empty(source.read(*edge)[0], 0).any()) for edge in edges)
+    deep = min(GAP_PX // 2 + 1, width, height)  # an area that is nearer than the gap is closed up to the border
+    bands = (
+        (0, 0, width, deep),
+        (0, height - deep, width, deep),
+        (0, 0, deep, height),
+        (width - deep, 0, deep, height),
+    )
+    found: set[Block] = set()
+    touched = False
+    for column, row, across, down in bands:
+        empty = _empty(source.read(column, row, across, down)[0], 0)
+        rows, columns = np.nonzero(empty)
+        rows, columns = rows + row, columns + column
+        touched |= bool(((rows == 0) | (rows == height - 1) | (columns == 0) | (columns == width - 1)).any())
+        found |= set(zip((columns // BLOCK_PX).tolist(), (rows // BLOCK_PX).tolist(), strict=True))
+    return found if touched else set()
 
 
 class _DisjointSets:
@@ -111,12 +155,11 @@ class _DisjointSets:
         self.size_px = [0]
         self._border: set[int] = set()
 
-    def add(self, sizes_px: np.ndarray) -> int:
-        """Registers the labels of a block; returns the number to add to them."""
-        first = len(self.parent) - 1
-        self.parent.extend(range(first + 1, first + 1 + len(sizes_px)))
+    def add(self, sizes_px: np.ndarray) -> None:
+        """Registers the labels of a block, in their order."""
+        first = len(self.parent)
+        self.parent.extend(range(first, first + len(sizes_px)))
         self.size_px.extend(int(s) for s in sizes_px)
-        return first
 
     def find(self, label: int) -> int:
         while self.parent[label] != label:
@@ -135,18 +178,21 @@ class _DisjointSets:
     def touch_border(self, labels: np.ndarray) -> None:
         self._border.update(int(label) for label in np.unique(labels) if label)
 
+    def border_roots(self) -> set[int]:
+        """Of the areas that touch the border of the image."""
+        return {self.find(label) for label in self._border}
+
     def collar(self) -> np.ndarray:
         """(labels,) bool: belongs to an empty area at the border that is large enough."""
-        roots = {self.find(label) for label in self._border}
-        roots = {root for root in roots if self.size_px[root] >= MIN_COLLAR_PX}
+        roots = {root for root in self.border_roots() if self.size_px[root] >= MIN_COLLAR_PX}
         return np.array([label > 0 and self.find(label) in roots for label in range(len(self.parent))])
 
 
-def _labels(source: Imagery, column: int, row: int, sets: _DisjointSets) -> np.ndarray:
-    """(h, w) int32 labels of the empty areas of one block, numbered on through all blocks; 0 = picture."""
+def _labels(source: Imagery, place: Block, first: int) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w) int32 labels of the empty areas of a block, numbered from first + 1, 0 = picture; and their sizes, px."""
+    column, row = place[0] * BLOCK_PX, place[1] * BLOCK_PX
     width, height = min(BLOCK_PX, source.width_px - column), min(BLOCK_PX, source.height_px - row)
     empty = _empty(source.read(column, row, width, height)[0], 0)
     closed = cv2.morphologyEx(empty, cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
-    first = sets.add(stats[1:, cv2.CC_STAT_AREA])
-    return np.where(labels > 0, labels + first, 0) if count > 1 else labels
+    return np.where(labels > 0, labels + first, 0) if count > 1 else labels, stats[1:, cv2.CC_STAT_AREA]

@@ -82,32 +82,20 @@ CREATE VIRTUAL TABLE "rtree_{table}_geom" USING rtree(id, minx, maxx, miny, maxy
 """
 
 _NEW = "VALUES (NEW.fid, ST_MinX(NEW.geom), ST_MaxX(NEW.geom), ST_MinY(NEW.geom), ST_MaxY(NEW.geom))"
-_FULL_NEW, _FULL_OLD = (
-    "(NEW.geom NOTNULL AND NOT ST_IsEmpty(NEW.geom))",
-    "(OLD.geom NOTNULL AND NOT ST_IsEmpty(OLD.geom))",
-)
-_EMPTY_NEW, _EMPTY_OLD = "(NEW.geom ISNULL OR ST_IsEmpty(NEW.geom))", "(OLD.geom ISNULL OR ST_IsEmpty(OLD.geom))"
+_FULL, _EMPTY = "(NEW.geom NOTNULL AND NOT ST_IsEmpty(NEW.geom))", "(NEW.geom ISNULL OR ST_IsEmpty(NEW.geom))"
 
-# Extension gpkg_rtree_index, as of version 1.4 of the standard; they run in programs that edit the package.
+# Extension gpkg_rtree_index (12-128r18, F.3); they run in programs that edit the package.
 RTREE_TRIGGERS = f"""
-CREATE TRIGGER "rtree_{{table}}_geom_insert" AFTER INSERT ON "{{table}}" WHEN {_FULL_NEW}
+CREATE TRIGGER "rtree_{{table}}_geom_insert" AFTER INSERT ON "{{table}}" WHEN {_FULL}
   BEGIN INSERT OR REPLACE INTO "rtree_{{table}}_geom" {_NEW}; END;
-CREATE TRIGGER "rtree_{{table}}_geom_update6" AFTER UPDATE OF geom ON "{{table}}"
-  WHEN OLD.fid = NEW.fid AND {_FULL_NEW} AND {_FULL_OLD}
-  BEGIN UPDATE "rtree_{{table}}_geom" SET minx = ST_MinX(NEW.geom), maxx = ST_MaxX(NEW.geom),
-  miny = ST_MinY(NEW.geom), maxy = ST_MaxY(NEW.geom) WHERE id = NEW.fid; END;
-CREATE TRIGGER "rtree_{{table}}_geom_update7" AFTER UPDATE OF geom ON "{{table}}"
-  WHEN OLD.fid = NEW.fid AND {_FULL_NEW} AND {_EMPTY_OLD}
-  BEGIN INSERT INTO "rtree_{{table}}_geom" {_NEW}; END;
-CREATE TRIGGER "rtree_{{table}}_geom_update2" AFTER UPDATE OF geom ON "{{table}}"
-  WHEN OLD.fid = NEW.fid AND {_EMPTY_NEW}
+CREATE TRIGGER "rtree_{{table}}_geom_update1" AFTER UPDATE OF geom ON "{{table}}" WHEN OLD.fid = NEW.fid AND {_FULL}
+  BEGIN INSERT OR REPLACE INTO "rtree_{{table}}_geom" {_NEW}; END;
+CREATE TRIGGER "rtree_{{table}}_geom_update2" AFTER UPDATE OF geom ON "{{table}}" WHEN OLD.fid = NEW.fid AND {_EMPTY}
   BEGIN DELETE FROM "rtree_{{table}}_geom" WHERE id = OLD.fid; END;
-CREATE TRIGGER "rtree_{{table}}_geom_update5" AFTER UPDATE ON "{{table}}"
-  WHEN OLD.fid != NEW.fid AND {_FULL_NEW}
+CREATE TRIGGER "rtree_{{table}}_geom_update3" AFTER UPDATE ON "{{table}}" WHEN OLD.fid != NEW.fid AND {_FULL}
   BEGIN DELETE FROM "rtree_{{table}}_geom" WHERE id = OLD.fid;
   INSERT OR REPLACE INTO "rtree_{{table}}_geom" {_NEW}; END;
-CREATE TRIGGER "rtree_{{table}}_geom_update4" AFTER UPDATE ON "{{table}}"
-  WHEN OLD.fid != NEW.fid AND {_EMPTY_NEW}
+CREATE TRIGGER "rtree_{{table}}_geom_update4" AFTER UPDATE ON "{{table}}" WHEN OLD.fid != NEW.fid AND {_EMPTY}
   BEGIN DELETE FROM "rtree_{{table}}_geom" WHERE id IN (OLD.fid, NEW.fid); END;
 CREATE TRIGGER "rtree_{{table}}_geom_delete" AFTER DELETE ON "{{table}}" WHEN OLD.geom NOT NULL
   BEGIN DELETE FROM "rtree_{{table}}_geom" WHERE id = OLD.fid; END;

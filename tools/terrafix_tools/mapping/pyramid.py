@@ -3,10 +3,12 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import numpy as np
+import rasterio
 
 from terrafix.anchor.map_format import TILE_PX, Level
 from terrafix_tools.mapping.collar import BLEED_PX, TRIM_PX, Collar
@@ -16,6 +18,9 @@ from terrafix_tools.mapping.layers import Imagery
 JPEG_QUALITY = 95  # 8-11 MB/km2 at 0.3 m/px on aerial photographs; artefacts stay below a grey level or two
 PNG_LEVEL = 6  # partly valid tiles only, so that the mask stays exact
 CHUNK_LEVELS = 3  # the source is read in chunks of 2^3 tiles a side (2048 px)
+
+# With the input it decides about every byte.
+BUILT_WITH = f"terrafix {version('terrafix')}, GDAL {rasterio.__gdal_version__}, OpenCV {cv2.__version__}"
 
 Place = tuple[int, int]  # column, row of a chunk at the zoom of chunks
 

@@ -4,7 +4,7 @@ import sqlite3
 from pathlib import Path
 
 from terrafix.anchor.map_format import FORMAT_VERSION, SIGNATURE_TABLE, signed_bytes
-from terrafix.anchor.map_package import MapPackage
+from terrafix.anchor.map_package import UNREADABLE, MapPackage
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.signature import TrustedKey, sign
 
@@ -44,7 +44,7 @@ def _finish_interrupted(package: Path) -> None:
         db = sqlite3.connect(package)
         try:
             db.execute("SELECT count(*) FROM sqlite_master").fetchone()
-        except sqlite3.DatabaseError:
+        except UNREADABLE:
             pass  # said by the opening that follows
         finally:
             db.close()

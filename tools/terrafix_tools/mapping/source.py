@@ -6,6 +6,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import cv2
 import numpy as np
 import rasterio
 from pyproj import CRS, Geod, Transformer
@@ -84,21 +85,22 @@ class ImagerySource:
         window = Window(column, row, width, height)
         try:
             bands = self._data.read(self.bands, window=window)
-            mask = self._data.dataset_mask(window=window)
-        except RasterioError as error:
-            raise MapError(f"{self.path}: cannot be read near column {column}, row {row} ({error})") from None
-        image = np.moveaxis(self._to_bytes(bands), 0, 2)
+            valid = self._data.dataset_mask(window=window) > 0 if self.has_mask else np.ones((height, width), bool)
+        except RasterioError:
+            raise MapError(
+                f"{self.path}: cannot be read near column {column}, row {row}; check or download the file again"
+            ) from None
         if np.issubdtype(bands.dtype, np.floating):
-            mask = np.where(np.isfinite(bands).all(axis=0), mask, 0).astype(np.uint8)
-        if image.shape[2] == 1:
-            image = np.repeat(image, 3, axis=2)
-        return np.ascontiguousarray(image[:, :, ::-1]), np.where(mask > 0, 255, 0).astype(np.uint8)
+            valid &= np.isfinite(bands).all(axis=0)
+        picture = self._to_bytes(bands)
+        image = cv2.merge([picture[-1], picture[len(picture) // 2], picture[0]])  # three bands or one; BGR
+        return image, np.multiply(valid, 255, dtype=np.uint8)
 
     def _to_bytes(self, bands: np.ndarray) -> np.ndarray:
         if self._colours is not None:
             return self._colours[bands[0].astype(np.uint8)].transpose(2, 0, 1)
         if self._stretch is None:
-            return bands.astype(np.uint8)
+            return bands.astype(np.uint8, copy=False)
         low, high = self._stretch
         scaled = (np.nan_to_num(bands.astype(np.float32), nan=low) - low) * (255.0 / (high - low))
         return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)

@@ -10,6 +10,7 @@ from typing import Any
 
 from terrafix.core.errors import OutputError, SourceError
 from terrafix_tools.mission.mission import PLACED, Above, Do, Item, Mission
+from terrafix_tools.mission.plan_complex import simple_items
 
 HEADER = "QGC WPL 110"
 COMMANDS = {
@@ -112,15 +113,16 @@ def _plan(path: Path, text: str) -> Mission:
         ) from None
     items = []
     for number, entry in enumerate(entries, start=1):
-        items.append(_simple(path, number, entry))
+        is_complex = isinstance(entry, dict) and entry.get("type") == "ComplexItem"
+        parts = simple_items(f"{path} item {number}", entry) if is_complex else [entry]
+        items += [_simple(path, number, part) for part in parts]
     return _mission(path, place, items)
 
 
 def _simple(path: Path, number: int, entry: Any) -> Item | None:
     kind = entry.get("type") if isinstance(entry, dict) else None
     if kind != "SimpleItem":
-        name = entry.get("complexItemType", kind) if isinstance(entry, dict) else kind
-        raise SourceError(f"{path} item {number}: '{name}' is not supported; put waypoints in its place")
+        raise SourceError(f"{path} item {number}: '{kind}' is not supported; put waypoints in its place")
     try:
         values = [math.nan if value is None else float(value) for value in entry["params"]]
         command, frame = int(entry["command"]), int(entry["frame"])

@@ -45,6 +45,7 @@ class Collared(ImagerySource):
 
 def raster_opener(path: Path, cache: Path, bar: Bar) -> Opener:
     """Raises MapError: not an image, or not placed on the earth."""
+    path, cache = path.absolute(), cache.absolute()  # a worker may stand in another folder
     with ImagerySource(path) as source:
         if source.has_mask:
             return partial(ImagerySource, path)

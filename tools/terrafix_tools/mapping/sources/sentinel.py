@@ -87,7 +87,7 @@ class SentinelJob:
         fetch_chunks(self._copernicus, self._raster, wanted, on_progress)
 
     def openers(self) -> list[Opener]:
-        return [partial(ImagerySource, path) for path in self._chunks]
+        return [partial(ImagerySource, path.absolute()) for path in self._chunks]
 
     def _missing(self) -> dict[Path, Chunk]:
         return {path: chunk for path, chunk in self._chunks.items() if not path.is_file()}

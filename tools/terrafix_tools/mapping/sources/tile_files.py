@@ -54,9 +54,10 @@ class MbtilesReader:
         return found[0] if found else None
 
     def first(self, zoom: int) -> bytes:
-        """Any tile of the zoom."""
-        found = self._db.execute("SELECT tile_data FROM tiles WHERE zoom_level = ? LIMIT 1", (zoom,)).fetchone()
-        return bytes(found[0])
+        """Any tile of the zoom that is not empty; nothing when all are."""
+        query = "SELECT tile_data FROM tiles WHERE zoom_level = ? AND length(tile_data) > 0 LIMIT 1"
+        found = self._db.execute(query, (zoom,)).fetchone()
+        return bytes(found[0]) if found else b""
 
     def close(self) -> None:
         self._db.close()

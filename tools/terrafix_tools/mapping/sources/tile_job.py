@@ -72,7 +72,7 @@ class TileJob:
                 raise MapError(f"{self.spec.title}: the server has no tile of zoom {self.zoom} here; try another zoom")
 
     def openers(self) -> list[Opener]:
-        return [partial(open_tile_imagery, self.path, self.zoom, self.tile_px, self._area)]
+        return [partial(open_tile_imagery, self.path.absolute(), self.zoom, self.tile_px, self._area)]
 
     @property
     def date(self) -> str:
@@ -110,7 +110,7 @@ def tile_file_opener(spec: SourceSpec, area: Area, gsd_m: float | None) -> Opene
             zoom = spec.zoom
     finally:
         reader.close()
-    return partial(open_tile_imagery, path, zoom, tile_px, area)
+    return partial(open_tile_imagery, path.absolute(), zoom, tile_px, area)
 
 
 def _capabilities(spec: SourceSpec) -> bytes:

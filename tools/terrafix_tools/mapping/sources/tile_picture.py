@@ -55,7 +55,7 @@ def decode(data: bytes, side_px: int) -> np.ndarray:
 
 def picture_side(data: bytes, path: Path) -> int:
     """Side of a tile, px. Raises MapError."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None or image.shape[0] != image.shape[1]:
         raise MapError(f"{path}: its tiles are no square pictures (JPEG, PNG or WebP); check the source")
     return int(image.shape[0])
