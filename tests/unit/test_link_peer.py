@@ -25,10 +25,13 @@ from terrafix.link import gps_input
 from terrafix.link.carry import offset
 from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
+from terrafix.link.streams import STREAMS_HZ
 from terrafix_tools.sim.autopilot.course import PeerState, read_course, write_course
 from terrafix_tools.sim.autopilot.gps import GpsInputDriver, JitterCorrection
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, GPS_INPUT_ALONE, NO_DCM
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+
+pytestmark = pytest.mark.real_time
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
@@ -270,7 +273,7 @@ def test_the_peer_flies_on_what_the_link_sends(tmp_path: Path) -> None:
     assert report.gps_error_median_m < 1.0
     assert report.position_error_median_m is not None
     assert report.position_error_median_m < 1.0
-    assert report.message_intervals_set == 3
+    assert report.message_intervals_set == len(STREAMS_HZ)
     assert report.timesync_requests >= 5
     assert report.companion_heartbeats in (3, 4)
     assert "Terrafix: 3D fix" in report.status_texts

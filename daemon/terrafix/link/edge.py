@@ -1,6 +1,5 @@
 """The link's side of the world: MAVLink 2 over UDP, TCP or serial. Decides nothing about position."""
 
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -8,46 +7,34 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
-from terrafix.core.errors import LinkError
-from terrafix.link import gps_input, gps_time
-from terrafix.link.telemetry import AUTOPILOT_COMPONENT, Telemetry
+from terrafix.link import gps_time
+from terrafix.link.budget import LineBudget
+from terrafix.link.connection import Connection
+from terrafix.link.diagnosis import Heard, why_no_autopilot
+from terrafix.link.local_pose import Place
+from terrafix.link.named_values import NamedValues
+from terrafix.link.outputs import Outputs
+from terrafix.link.partner import Partner
+from terrafix.link.side_output import open_side_outputs
+from terrafix.link.source_switch import SourceSwitch
+from terrafix.link.streams import STREAMS_HZ, Streams
+from terrafix.link.telemetry import AUTOPILOT_COMPONENT
 from terrafix.link.timesync import TimeSync
-from terrafix.link.transport import Transport, open_transport
-from terrafix.messages import GpsInput, LinkStatus, Message, StatusText, WallClock
+from terrafix.link.transport import Transport, open_at_start
+from terrafix.messages import GpsInput, LinkStatus, Message, Origin, PositionSource, StatusText, WallClock
 
 NS_PER_S = 1_000_000_000
 HEARTBEAT_NS = NS_PER_S
 STATUS_NS = NS_PER_S
-REOPEN_NS = NS_PER_S
 WALL_CLOCK_NS = 10 * NS_PER_S
 TIMESYNC_NS = NS_PER_S
 TIMESYNC_FAST_NS = 100_000_000  # until the first answers are in
 TIMESYNC_FAST_COUNT = 10
-STREAM_LOST_NS = 3 * NS_PER_S  # a stream that was asked for and does not come is asked for again, this often
-# Attitude at 25 Hz interpolates a turn for the frames; height at 5 Hz follows the barometer; time once a second.
-STREAMS_HZ = {
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: 25.0,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,  # for relative_alt alone
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
-}
 
 
 def open_edge(config: LinkSection) -> "MavlinkEdge":
-    """Opens the device of the configuration. Raises LinkError with what to check."""
-    return MavlinkEdge(config, _open(config), time.time_ns)
-
-
-def _open(config: LinkSection) -> Transport:
-    try:
-        return open_transport(config.device, config.baud, wait=True)
-    except OSError as error:
-        advice = {
-            "udpin": "is the port taken by another program?",
-            "udpout": "is there a network?",
-            "tcp": "is the other side listening?",
-        }.get(config.device.partition(":")[0], "is it plugged in, free, and may this user read and write it?")
-        why = os.strerror(error.errno) if error.errno else str(error)  # pyserial wraps the text into its own
-        raise LinkError(f"link '{config.device}' cannot be opened ({why}); {advice}") from None
+    """Opens the device of the configuration. Raises LinkError with what to check, ConfigError for a signing key."""
+    return MavlinkEdge(config, open_at_start(config.device, config.baud), time.time_ns)
 
 
 class MavlinkEdge:
@@ -55,53 +42,62 @@ class MavlinkEdge:
 
     def __init__(self, config: LinkSection, transport: Transport, wall_clock_ns: Callable[[], int]) -> None:
         self._config = config
-        self._transport: Transport | None = transport
         self._wall_clock_ns = wall_clock_ns
-        self._mav = self._new_mav()
+        self._connection = Connection(config, transport, wall_clock_ns)
         self._timesync = TimeSync()
-        self._telemetry = Telemetry(self._timesync)
+        self._partner = Partner(self._timesync, config.autopilot_sysid)
+        baud = config.baud if config.device.startswith("/") else None
+        self._budget = LineBudget(baud, signed=self._connection.signed)
+        self._streams = Streams(self._budget.fitting(STREAMS_HZ))
+        self._outputs = Outputs(config.outputs, config.gps_id)
+        self._side_outputs = open_side_outputs(config)
+        self._switch = SourceSwitch(config.gps_id)
+        self._named_values = NamedValues()
+        self._start: Place | None = None  # of the flight
+        self._heard = Heard()
         self._due_ns: dict[str, int] = {}
-        self._asked_ns: dict[int, int] = {}
-        self._refused: set[int] = set()
         self._answers = 0
-        self._sent = self._received = self._bad = self._dropped = self._reopened = 0
-        self._down = ""  # why there is no transport
+        self._opened = 0  # connections that the streams were asked on, besides the first
 
     def poll(self, now_ns: int) -> Iterable[Message]:
-        if self._transport is None:
-            self._reopen(now_ns)
-        said = list(self._read(now_ns))
+        said: list[Message] = []
+        for message in self._connection.messages(now_ns):
+            said += self._take(message, now_ns)
+        if self._connection.reopened != self._opened:  # a new connection: everything is asked for again
+            self._opened = self._connection.reopened
+            self._streams = Streams(self._streams.wanted_hz)
         if self._due("heartbeat", HEARTBEAT_NS, now_ns):
             self._heartbeat()
         fast = self._answers < TIMESYNC_FAST_COUNT
         if self._due("timesync", TIMESYNC_FAST_NS if fast else TIMESYNC_NS, now_ns):
             self._send(mavlink.MAVLink_timesync_message(0, self._timesync.request(now_ns)))
-        if self._telemetry.connected(now_ns):
-            self._ask_for_streams(now_ns)
+        if self._partner.telemetry.connected(now_ns):
+            for request in self._requests(now_ns):
+                self._send(request)
         if self._due("wall clock", WALL_CLOCK_NS, now_ns):
             said.append(self._wall_clock(now_ns))
         if self._due("status", STATUS_NS, now_ns):
-            said.append(self._status(now_ns))
+            said.append(self.status(now_ns))
         return said
 
     def heard(self, message: Message) -> None:
         match message:
             case GpsInput():
-                self._send(gps_input.encode(message, self._config.gps_id))
+                self._send_position(message)
+            case Origin():
+                if message.ground_amsl_m is not None:
+                    self._start = Place(message.lat_deg, message.lon_deg, message.ground_amsl_m)
+            case PositionSource():
+                self._switch.order(message, self._outputs.names(self._partner.firmware))
             case StatusText():
                 self._send(
                     mavlink.MAVLink_statustext_message(message.severity, message.text.encode("ascii", "replace"))
                 )
 
     def close(self) -> None:
-        if self._transport is not None:
-            self._transport.close()
-            self._transport = None
-
-    def _new_mav(self) -> mavlink.MAVLink:
-        mav = mavlink.MAVLink(None, srcSystem=self._config.sysid, srcComponent=self._config.compid)
-        mav.robust_parsing = True  # what is damaged comes out as BAD_DATA and is counted
-        return mav
+        self._connection.close()
+        for output in self._side_outputs:
+            output.close()
 
     def _due(self, what: str, period_ns: int, now_ns: int) -> bool:
         if now_ns < self._due_ns.get(what, now_ns):
@@ -111,58 +107,52 @@ class MavlinkEdge:
 
     # --- in ---
 
-    def _read(self, now_ns: int) -> Iterator[Message]:
-        if self._transport is None:
-            return
-        try:
-            chunks = self._transport.read()
-        except OSError as error:
-            self._lost(error)
-            return
-        for chunk in chunks:
-            for message in self._mav.parse_buffer(chunk) or ():
-                yield from self._take(message, now_ns)
-
     def _take(self, message: Any, now_ns: int) -> Iterator[Message]:
+        self._heard.packets += 1
+        self._heard.take(message)
         kind = message.get_type()
-        if kind == "BAD_DATA":
-            self._bad += 1
-            return
-        self._received += 1
         if kind == "TIMESYNC":
             self._take_timesync(message, now_ns)
-        elif kind == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            if message.result not in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS):
-                self._refused.add(message.result)
-        else:
-            state = self._telemetry.take(message, now_ns)
-            if state is not None:
-                yield state
+            return
+        yield from self._partner.take(message, now_ns, self._our_receiver())
+        if not self._partner.is_it(message):
+            return
+        self._streams.heard(message.get_msgId())
+        self._switch.heard(message)
+        if kind == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            self._streams.answered(message.result)
+
+    def _our_receiver(self) -> int | None:
+        """Which of the autopilot's receivers we are."""
+        return self._config.gps_id if "gps_input" in self._outputs.names(self._partner.firmware) else None
 
     def _take_timesync(self, message: Any, now_ns: int) -> None:
         if message.tc1 == 0:
             self._send(mavlink.MAVLink_timesync_message(now_ns, message.ts1))
-        elif message.get_srcSystem() == self._telemetry.sysid and message.get_srcComponent() == AUTOPILOT_COMPONENT:
+        elif self._partner.is_it(message):
             self._answers += 1
             self._timesync.answer(message.tc1, message.ts1, now_ns)
 
     # --- out ---
 
     def _send(self, message: Any) -> None:
-        """Packs and sends now, or not at all."""
-        packet = bytes(message.pack(self._mav))
-        self._mav.seq = (self._mav.seq + 1) % 256
-        if self._transport is None:
-            self._dropped += 1
-            return
-        try:
-            if self._transport.write(packet):
-                self._sent += 1
-            else:
-                self._dropped += 1
-        except OSError as error:
-            self._dropped += 1
-            self._lost(error)
+        self._connection.send(message)
+
+    def _send_position(self, gps: GpsInput) -> None:
+        """First of all to the autopilot: nothing may delay it."""
+        for packet in self._outputs.messages(gps, self._partner.now(gps.t_ns)):
+            self._send(packet)
+        for output in self._side_outputs:
+            output.send(gps, gps.t_ns)
+        if self._partner.telemetry.connected(gps.t_ns):
+            for value in self._named_values.messages(gps):
+                self._send(value)
+
+    def _requests(self, now_ns: int) -> Iterator[Any]:
+        sysid = self._partner.sysid
+        yield from self._streams.requests(sysid, AUTOPILOT_COMPONENT, now_ns)
+        yield from self._outputs.requests(self._start, self._partner.now(now_ns), now_ns)
+        yield from self._switch.requests(sysid, now_ns)
 
     def _heartbeat(self) -> None:
         self._send(
@@ -176,79 +166,60 @@ class MavlinkEdge:
             )
         )
 
-    def _ask_for_streams(self, now_ns: int) -> None:
-        for message_id, rate_hz in STREAMS_HZ.items():
-            last_ns = max(self._telemetry.seen_ns.get(message_id, 0), self._asked_ns.get(message_id, 0))
-            # The first time at once, even if it already comes: its rate is another's choice.
-            if message_id in self._asked_ns and now_ns - last_ns < STREAM_LOST_NS:
-                continue
-            self._asked_ns[message_id] = now_ns
-            self._send(
-                mavlink.MAVLink_command_long_message(
-                    self._telemetry.sysid,
-                    AUTOPILOT_COMPONENT,
-                    mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
-                    0,
-                    float(message_id),
-                    1e6 / rate_hz,
-                    *(0.0,) * 5,
-                )
-            )
-
-    # --- the connection and its state ---
-
-    def _lost(self, error: OSError) -> None:
-        self._down = f"connection lost ({error.strerror or error}); opening again"
-        self.close()
-
-    def _reopen(self, now_ns: int) -> None:
-        if not self._due("reopen", REOPEN_NS, now_ns):
-            return
-        try:
-            self._transport = open_transport(self._config.device, self._config.baud, wait=False)
-        except (OSError, LinkError) as error:  # LinkError: a host name that cannot be resolved just now
-            self._down = f"cannot be opened again ({error})"
-            return
-        self._mav = self._new_mav()  # half a packet of the old connection must not swallow one of the new
-        self._asked_ns.clear()
-        self._down = ""
-        self._reopened += 1
+    # --- the state of it ---
 
     def _wall_clock(self, now_ns: int) -> WallClock:
         """Ours when it can be right, else the autopilot's: a board without a battery wakes up in 1970."""
-        for source, unix_ns in (("system", self._wall_clock_ns()), ("autopilot", self._telemetry.unix_ns(now_ns))):
+        for source, unix_ns in (
+            ("system", self._wall_clock_ns()),
+            ("autopilot", self._partner.telemetry.unix_ns(now_ns)),
+        ):
             if unix_ns is not None and gps_time.plausible(unix_ns):
                 return WallClock(t_ns=now_ns, unix_ns=unix_ns, source=source)
         self._due_ns["wall clock"] = now_ns + STATUS_NS  # the autopilot may know soon
         return WallClock(t_ns=now_ns, unix_ns=None, source="none")
 
-    def _status(self, now_ns: int) -> LinkStatus:
-        connected = self._telemetry.connected(now_ns)
+    def status(self, now_ns: int) -> LinkStatus:
+        connected = self._partner.telemetry.connected(now_ns)
         offset_ns = self._timesync.offset_at(now_ns) if connected else None
+        wire = self._connection
+        load = self._budget.load(now_ns, wire.heard_bytes, wire.sent_bytes)
         return LinkStatus(
             t_ns=now_ns,
             connected=connected,
-            autopilot=self._telemetry.autopilot if connected else "none",
-            sysid=self._telemetry.sysid if connected else 0,
-            sent=self._sent,
-            received=self._received,
-            bad=self._bad,
+            autopilot=self._partner.firmware if connected else "none",
+            sysid=self._partner.sysid if connected else 0,
+            sent=wire.sent,
+            received=self._heard.packets,
+            bad=wire.skipped_bytes,
+            refused=wire.refused,
             time_offset_ms=None if offset_ns is None else offset_ns / 1e6,
-            detail=self._detail(connected),
+            detail="; ".join(note for note in (*self._notes(connected), load) if note),
         )
 
-    def _detail(self, connected: bool) -> str:
-        notes = [self._down] if self._down else []
-        if not connected and not self._down:
-            notes.append(f"no heartbeat of an autopilot on {self._config.device}")
-        if connected and self._telemetry.autopilot == "px4":
-            notes.append("PX4 does not take GPS_INPUT")
-        if self._refused:
-            notes.append(f"message rates refused (MAV_RESULT {', '.join(map(str, sorted(self._refused)))})")
-        if self._dropped:
-            notes.append(f"{self._dropped} not sent")
-        if self._reopened:
-            notes.append(f"opened again {self._reopened} times")
-        if self._timesync.resets:
-            notes.append(f"autopilot clock restarted {self._timesync.resets} times")
-        return "; ".join(notes)
+    def _notes(self, connected: bool) -> Iterator[str]:
+        wire, outputs = self._connection, self._outputs.names(self._partner.firmware)
+        yield wire.down
+        if not connected and not wire.down:
+            yield self._why_no_autopilot()
+        if self._partner.firmware == "px4" and "gps_input" in outputs:
+            yield "PX4 does not take GPS_INPUT; empty link.outputs"
+        yield from (self._outputs.waits_for, self._switch.problem, *(o.problem for o in self._side_outputs))
+        others = [str(sysid) for sysid in self._heard.autopilots() if sysid != self._partner.sysid]
+        if connected and others and not self._config.autopilot_sysid:
+            yield (
+                f"more than one autopilot: {self._partner.sysid} is served, {', '.join(others)} is not; "
+                "name yours in link.autopilot_sysid"
+            )
+        if connected:
+            yield self._streams.problem()
+        yield self._budget.too_slow(self._streams.wanted_hz, outputs, self._config.rate_hz)
+        yield f"{wire.refused} unsigned or wrongly signed packets ignored" if wire.refused else ""
+        yield f"{wire.dropped} not sent" if wire.dropped else ""
+        yield f"opened again {wire.reopened} times" if wire.reopened else ""
+        yield f"autopilot clock restarted {self._timesync.resets} times" if self._timesync.resets else ""
+
+    def _why_no_autopilot(self) -> str:
+        self._heard.bytes, self._heard.refused = self._connection.heard_bytes, self._connection.refused
+        why = why_no_autopilot(self._heard, self._config.device, self._config.baud, self._config.autopilot_sysid)
+        return why or f"no heartbeat of the autopilot on {self._config.device} any more"

@@ -5,6 +5,7 @@ so 1 says "no fix" at no cost. Silence does the same to the filter, is seen only
 on return; it is kept for when nobody has said anything for so long that a live GPS would be a lie."""
 
 import math
+from dataclasses import dataclass
 
 from terrafix.link.carry import Carried
 from terrafix.messages import SourceLabel
@@ -37,6 +38,14 @@ def rung(unanchored_s: float) -> int:
     return sum(unanchored_s >= after_s for after_s, _, _ in LADDER) - 1
 
 
+@dataclass(frozen=True)
+class Why:
+    """Why there is no fix: ``text`` for the record, ``short`` for the pilot's screen (40 characters at most)."""
+
+    text: str
+    short: str
+
+
 class FixGate:
     """Decides the fix type at every send; remembers only what hysteresis and the spike hold need."""
 
@@ -49,38 +58,40 @@ class FixGate:
         """There is no estimate to judge."""
         self.good = False
 
-    def judge(self, carried: Carried, accuracy_m: float, step: int, label: SourceLabel) -> str:
-        """Why fix_type is not 3; empty when it is. ``accuracy_m`` is what would be sent, ``step`` the ladder's rung."""
-        reason = self._judge(carried, accuracy_m, step, label)
-        self.good = not reason
+    def judge(self, carried: Carried, accuracy_m: float, step: int, label: SourceLabel) -> Why | None:
+        """Why fix_type is not 3; None when it is. ``accuracy_m`` is what would be sent, ``step`` the ladder's rung."""
+        why = self._judge(carried, accuracy_m, step, label)
+        self.good = why is None
         if self.good:
             self._sent_accuracy_m = accuracy_m
-        return reason
+        return why
 
-    def _judge(self, carried: Carried, accuracy_m: float, step: int, label: SourceLabel) -> str:
+    def _judge(self, carried: Carried, accuracy_m: float, step: int, label: SourceLabel) -> Why | None:
         if carried.age_s * 1e9 > MAX_AGE_NS:
-            return f"estimate is {carried.age_s:.1f} s old"
+            return Why(f"estimate is {carried.age_s:.1f} s old", "the estimate is too old")
         if step == len(LADDER) - 1 and label is SourceLabel.DEAD_RECKONED:
-            return f"no map and no odometry, {LADDER[-1][0]:.0f} s without a map fix"
+            text = f"no map and no odometry, {LADDER[-1][0]:.0f} s without a map fix"
+            return Why(text, "neither map nor odometry")
         limit_m = MAX_HORIZONTAL_SIGMA_M if self.good else BACK_HORIZONTAL_SIGMA_M
         if accuracy_m > limit_m:
-            return f"accuracy {accuracy_m:.0f} m is worse than {limit_m:.0f} m"
+            return Why(f"accuracy {accuracy_m:.0f} m is worse than {limit_m:.0f} m", f"worse than {limit_m:.0f} m")
         limit_mps = MAX_SPEED_SIGMA_MPS if self.good else BACK_SPEED_SIGMA_MPS
         if carried.speed_sigma_mps > limit_mps:
-            return f"speed accuracy {carried.speed_sigma_mps:.1f} m/s is worse than {limit_mps:.1f} m/s"
+            text = f"speed accuracy {carried.speed_sigma_mps:.1f} m/s is worse than {limit_mps:.1f} m/s"
+            return Why(text, "the speed is too uncertain")
         return self._spike(carried.t_ns, accuracy_m)
 
-    def _spike(self, now_ns: int, accuracy_m: float) -> str:
+    def _spike(self, now_ns: int, accuracy_m: float) -> Why | None:
         before_m = self._sent_accuracy_m
         if before_m is None or accuracy_m <= max(SPIKE_FLOOR_M, SPIKE_RATIO * before_m):
             self._spike_since_ns = None
-            return ""
+            return None
         if self._spike_since_ns is None:
             self._spike_since_ns = now_ns
         if now_ns - self._spike_since_ns >= SPIKE_HOLD_NS:
             self._spike_since_ns = None
-            return ""
-        return f"accuracy went from {before_m:.0f} to {accuracy_m:.0f} m at once"
+            return None
+        return Why(f"accuracy went from {before_m:.0f} to {accuracy_m:.0f} m at once", "suddenly less accurate")
 
 
 def reported_accuracy(carried: Carried, step: int) -> tuple[float, float, float]:

@@ -53,3 +53,12 @@ def week_and_ms(unix_ns: int) -> tuple[int, int]:
     unix_s = unix_ns // NS_PER_S
     gps_ns = unix_ns + (gps_minus_utc_s(unix_s) - GPS_EPOCH_UNIX_S) * NS_PER_S
     return divmod(gps_ns // 1_000_000, WEEK_MS)
+
+
+def unix_ms(week: int, week_ms: int) -> int | None:
+    """The way back: GPS week and millisecond -> Unix milliseconds; None for week 0, "not known"."""
+    if week == 0:
+        return None
+    gps_ms = week * WEEK_MS + week_ms + GPS_EPOCH_UNIX_S * 1000
+    leap_s = gps_minus_utc_s(gps_ms // 1000)
+    return gps_ms - gps_minus_utc_s(gps_ms // 1000 - leap_s) * 1000

@@ -2,12 +2,16 @@
 
 from collections.abc import Iterable, Iterator
 
+from terrafix.core.config import GnssMode
 from terrafix.core.node import Edge, NodeContext
 from terrafix.link import fix, gps_time
+from terrafix.link.announce import Announcer
 from terrafix.link.carry import Attitudes, Carried, carry
 from terrafix.link.gate import EstimateGate
+from terrafix.link.gnss_watch import GnssWatch
 from terrafix.link.pacer import Pacer
 from terrafix.messages import (
+    GnssReading,
     GpsInput,
     Health,
     MeasurementVerdict,
@@ -29,13 +33,12 @@ SATELLITES = 6
 DOP_GOOD = 1.0  # copters ask for <= 1.4 (GPS_HDOP_GOOD); a position from a map has no geometry of satellites to report
 DOP_UNKNOWN = 99.99
 CLOCK_STEP_NS = 500_000_000  # a wall clock that moves less stays latched: the week keeps the monotonic clock's rhythm
-TEXT_MAX = 50  # characters of STATUSTEXT
+
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
-NOTICE_PERIOD_NS = 5_000_000_000  # a fix that flaps does not flood the pilot's screen
 
 
 def make_node(ctx: NodeContext) -> "LinkNode":
-    return LinkNode(ctx.config.link.rate_hz)
+    return LinkNode(ctx.config.link.rate_hz, ctx.config.link.gnss)
 
 
 def make_edge(ctx: NodeContext) -> Edge:
@@ -48,11 +51,12 @@ def make_edge(ctx: NodeContext) -> Edge:
 class LinkNode:
     """Hears estimates, says GpsInput at ``rate_hz``."""
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, gnss: GnssMode = "advise") -> None:
         self._pacer = Pacer(rate_hz, TICK_HZ)
         self._gate = EstimateGate()
         self._fix = fix.FixGate()
         self._attitudes = Attitudes()
+        self._gnss = GnssWatch(gnss)
         self._now_ns = 0
         self._ground_amsl_m: float | None = None
         self._unix_minus_monotonic_ns: int | None = None
@@ -62,8 +66,11 @@ class LinkNode:
         self._band = ThermalBand.NORMAL
         self._rung = 0
         self._silent = False
-        self._told_fix: bool | None = None
-        self._told_fix_ns = -NOTICE_PERIOD_NS
+        self._no_fix_because: fix.Why | None = None
+        self._said_fix = Announcer[bool]()
+        self._said_rung = Announcer[int]()
+        self._said_rung.told = 0
+        self._climbed = 0  # the highest rung since the last map fix
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
@@ -71,6 +78,9 @@ class LinkNode:
                 return [self._on_estimate(message)]
             case VehicleState():
                 self._attitudes.add(message)
+                self._gnss.vehicle(message)
+            case GnssReading():
+                return list(self._gnss.reading(message, self._attitudes))
             case Origin():
                 self._ground_amsl_m = message.ground_amsl_m
             case WallClock():
@@ -91,6 +101,7 @@ class LinkNode:
         if verdict is Verdict.ACCEPTED or (self._gate.holding and detail == self._gate.holding):
             self._heard_ns = max(self._heard_ns or 0, estimate.t_ns)
         if verdict is Verdict.ACCEPTED:
+            self._gnss.accepted(estimate, self._attitudes)
             age_ms = estimate.last_anchor_age_ms
             if age_ms >= 0:
                 self._anchored_ns = max(self._anchored_ns or 0, estimate.t_ns - age_ms * 1_000_000)
@@ -133,38 +144,53 @@ class LinkNode:
                 yield _text(now_ns, CRITICAL, f"silent: no estimate for {fix.SILENT_AFTER_NS / 1e9:.0f} s")
         if silent:
             self._fix.lower()
+            yield from self._gnss.tick(now_ns, good=False)
             return
         gps = self._gps_input(now_ns)
         yield gps
-        good = gps.fix_type >= fix.FIX_3D
-        if good != self._told_fix and now_ns - self._told_fix_ns >= NOTICE_PERIOD_NS:
-            self._told_fix, self._told_fix_ns = good, now_ns
-            yield _text(now_ns, INFO, "3D fix") if good else _text(now_ns, WARNING, f"no fix: {gps.reason}")
+        yield from self._gnss.tick(now_ns, good=gps.fix_type >= fix.FIX_3D)
+        good = self._no_fix_because is None
+        if self._said_fix.due(good, now_ns):
+            because = self._no_fix_because
+            yield (
+                _text(now_ns, INFO, "3D fix") if because is None else _text(now_ns, WARNING, f"no fix: {because.short}")
+            )
 
     def _climb_ladder(self, now_ns: int) -> Iterator[StatusText]:
-        step = 0 if self._anchored_ns is None else fix.rung((now_ns - self._anchored_ns) * 1e-9)
-        if step > self._rung:
-            after_s, _, severity = fix.LADDER[step]
-            yield _text(now_ns, severity, f"no map fix for {after_s:.0f} s")
-        elif step < self._rung and step == 0:
-            yield _text(now_ns, INFO, "map fix again")
-        self._rung = step
+        age_s = self._unanchored_s(now_ns)
+        self._rung = 0 if age_s is None else fix.rung(age_s)
+        after_s, _, severity = fix.LADDER[self._rung]
+        if self._rung > self._climbed:
+            urgent = severity <= WARNING
+            if self._said_rung.due(self._rung, now_ns, urgent=urgent):
+                yield _text(now_ns, severity, f"no map fix for {after_s:.0f} s")
+            self._climbed = self._rung
+        elif self._rung == 0:
+            self._climbed = 0
+            if self._said_rung.due(0, now_ns):
+                yield _text(now_ns, INFO, "map fix again")
+
+    def _unanchored_s(self, now_ns: int) -> float | None:
+        """Seconds without a map fix; None: nothing was ever believed."""
+        return None if self._anchored_ns is None else (now_ns - self._anchored_ns) * 1e-9
 
     def _gps_input(self, now_ns: int) -> GpsInput:
         estimate = self._gate.accepted
         if estimate is None:
-            return self._no_fix(now_ns, self._estimator_gone or "no estimate yet", -1.0)
+            nobody = self._estimator_gone or "no estimate yet"
+            return self._no_fix(now_ns, fix.Why(nobody, nobody), -1.0)
         carried = carry(estimate, now_ns, self._attitudes)
         horizontal_m, vertical_m, speed_mps = fix.reported_accuracy(carried, self._rung)
         if self._gate.holding:
-            reason = self._gate.holding
+            why: fix.Why | None = fix.Why(self._gate.holding, "the position has jumped")
             self._fix.lower()
         else:
-            reason = self._fix.judge(carried, horizontal_m, self._rung, estimate.source_label)
-            if reason and self._estimator_gone:
-                reason = self._estimator_gone
-        if reason:
-            return self._no_fix(now_ns, reason, carried.age_s * 1e3)
+            why = self._fix.judge(carried, horizontal_m, self._rung, estimate.source_label)
+            if why is not None and self._estimator_gone:
+                why = fix.Why(self._estimator_gone, self._estimator_gone)
+        if why is not None:
+            return self._no_fix(now_ns, why, carried.age_s * 1e3)
+        self._no_fix_because = None
         return self._with_fix(carried, (horizontal_m, vertical_m, speed_mps))
 
     def _with_fix(self, carried: Carried, accuracy: tuple[float, float, float]) -> GpsInput:
@@ -188,12 +214,15 @@ class LinkNode:
             vert_accuracy_m=fix.bounded(accuracy[1]),
             satellites_visible=SATELLITES,
             estimate_age_ms=carried.age_s * 1e3,
+            caution=self._rung,
+            unanchored_s=self._unanchored_s(carried.t_ns),
         )
 
-    def _no_fix(self, now_ns: int, reason: str, age_ms: float) -> GpsInput:
+    def _no_fix(self, now_ns: int, why: fix.Why, age_ms: float) -> GpsInput:
         """Fix type 1 carries no position: what is not known now is not shown, on no screen and in no log.
 
         The height stays a plausible constant, since an autopilot takes a missing one for 0 m AMSL."""
+        self._no_fix_because = why
         week, week_ms = self._week(now_ns)
         return GpsInput(
             t_ns=now_ns,
@@ -213,7 +242,9 @@ class LinkNode:
             vert_accuracy_m=fix.MAX_ACCURACY_M,
             satellites_visible=0,
             estimate_age_ms=age_ms,
-            reason=reason,
+            caution=self._rung,
+            unanchored_s=self._unanchored_s(now_ns),
+            reason=why.text,
         )
 
     def _week(self, t_ns: int) -> tuple[int, int]:
@@ -224,4 +255,4 @@ class LinkNode:
 
 
 def _text(t_ns: int, severity: int, text: str) -> StatusText:
-    return StatusText(t_ns=t_ns, severity=severity, text=f"Terrafix: {text}"[:TEXT_MAX])
+    return StatusText(t_ns=t_ns, severity=severity, text=f"Terrafix: {text}")

@@ -1,4 +1,4 @@
-"""What the autopilot says about itself, put together: who it is, attitude, height, its idea of wall time.
+"""What the autopilot says about itself, put together: who it is, attitude, height, IMU, its idea of wall time.
 
 Its position and velocity are not read. They come out of the filter that hears us (or a spoofed receiver), so they
 are never truth and never an independent measurement."""
@@ -8,25 +8,32 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core.imu import KINDS, Chooser, boot_ns, readings_of
+from terrafix.link.diagnosis import NAMES
 from terrafix.link.timesync import TimeSync
-from terrafix.messages import VehicleState
+from terrafix.messages import Imu, ImuSample, VehicleState
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000  # three of its heartbeats
 HEIGHT_FRESH_NS = 1_000_000_000  # an older height is not the height of this attitude
 MAX_TRANSPORT_NS = 500_000_000  # a mapped time further from its arrival than this is a wrong mapping
+BOOT_WRAP_NS = 2**32 * 1_000_000  # time_boot_ms has 32 bits: after 49.7 days it begins anew
 REBOOT_BACK_MS = 1_000  # boot time that steps back by more is a new boot
 ATTITUDE_MAX_RAD = 4 * math.pi  # roll, pitch and yaw beyond any convention are garbage
 HEIGHT_MAX_M = 20_000.0
-NAMES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
+# Readings are said in batches: at 50 Hz two or three a message. A frame's estimate waits for none of them, so that a
+# batch is not longer than the way of a picture through vision.
+IMU_BATCH_NS = 40_000_000
 # A ground station, a camera or another companion has a heartbeat too; an autopilot names its firmware.
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 
 class Telemetry:
-    """``take`` each decoded message; a VehicleState comes out with each ATTITUDE."""
+    """``take`` each decoded message; a VehicleState comes out with each ATTITUDE, an Imu with every few readings."""
 
-    def __init__(self, timesync: TimeSync) -> None:
+    def __init__(self, timesync: TimeSync, only_sysid: int = 0) -> None:
+        """``only_sysid``: the autopilot's system id; 0: the first autopilot that is heard."""
         self._timesync = timesync
+        self._only_sysid = only_sysid
         self._heartbeat_ns: int | None = None
         self._height: tuple[int, float] | None = None  # (arrival, metres above take-off)
         self._boot_ms = 0
@@ -34,7 +41,8 @@ class Telemetry:
         self._unix_minus_monotonic_ns: int | None = None
         self.autopilot = "none"
         self.sysid = 0
-        self.seen_ns: dict[int, int] = {}  # message id -> arrival, of the streams asked for
+        self._imu_of = Chooser()
+        self._imu: list[tuple[int, tuple[float, ...]]] = []  # (t_ns, readings) not said yet
 
     def connected(self, now_ns: int) -> bool:
         return self._heartbeat_ns is not None and now_ns - self._heartbeat_ns < HEARTBEAT_TIMEOUT_NS
@@ -43,16 +51,17 @@ class Telemetry:
         """Wall time by the autopilot; it has one only after a GNSS fix or a ground station told it."""
         return None if self._unix_minus_monotonic_ns is None else now_ns + self._unix_minus_monotonic_ns
 
-    def take(self, message: Any, now_ns: int) -> VehicleState | None:
+    def take(self, message: Any, now_ns: int) -> VehicleState | Imu | None:
         kind = message.get_type()
         if kind == "HEARTBEAT":
             self._take_heartbeat(message, now_ns)
             return None
         if message.get_srcSystem() != self.sysid or message.get_srcComponent() != AUTOPILOT_COMPONENT:
             return None
-        self.seen_ns[message.get_msgId()] = now_ns
         if kind == "ATTITUDE":
             return self._vehicle_state(message, now_ns)
+        if kind in KINDS:
+            return self._take_imu(message, kind, now_ns)
         if kind == "GLOBAL_POSITION_INT":
             self._take_height(message.relative_alt / 1000.0, now_ns)
         elif kind == "ALTITUDE":
@@ -63,6 +72,8 @@ class Telemetry:
 
     def _take_heartbeat(self, message: Any, now_ns: int) -> None:
         if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.get_srcComponent() != AUTOPILOT_COMPONENT:
+            return
+        if self._only_sysid and message.get_srcSystem() != self._only_sysid:
             return
         if self.connected(now_ns) and message.get_srcSystem() != self.sysid:
             return  # another vehicle on the same network
@@ -85,7 +96,7 @@ class Telemetry:
         self._boot_ms = message.time_boot_ms
         height = self._height
         return VehicleState(
-            t_ns=self._measured_ns(message.time_boot_ms, now_ns),
+            t_ns=self._measured_ns(message.time_boot_ms * 1_000_000, now_ns),
             source="mavlink",
             yaw_rad=math.remainder(message.yaw, math.tau),
             pitch_rad=message.pitch,
@@ -94,9 +105,27 @@ class Telemetry:
             armed=self._armed if self.connected(now_ns) else None,
         )
 
-    def _measured_ns(self, boot_ms: int, now_ns: int) -> int:
+    def _take_imu(self, message: Any, kind: str, now_ns: int) -> Imu | None:
+        readings = readings_of(message)
+        if readings is None or not self._imu_of.takes(kind, now_ns):
+            return None
+        since_boot_ns = boot_ns(message)
+        t_ns = now_ns if since_boot_ns is None else self._measured_ns(since_boot_ns, now_ns)
+        if self._imu and t_ns <= self._imu[-1][0]:
+            return None  # repeated, or the mapping of the clocks has just moved
+        self._imu.append((t_ns, readings))
+        if t_ns - self._imu[0][0] < IMU_BATCH_NS:
+            return None
+        samples: list[ImuSample] = [(t_ns - at_ns, *said) for at_ns, said in self._imu]  # type: ignore[misc]
+        self._imu.clear()
+        return Imu(t_ns=t_ns, source="mavlink", samples=samples)
+
+    def _measured_ns(self, since_boot_ns: int, now_ns: int) -> int:
         """When it was measured, on our clock; the time of arrival while the clocks are not in step."""
-        ours_ns = self._timesync.to_ours(boot_ms * 1_000_000)
-        if ours_ns is None or abs(now_ns - ours_ns) > MAX_TRANSPORT_NS:
+        ours_ns = self._timesync.to_ours(since_boot_ns)
+        if ours_ns is None:
+            return now_ns
+        ours_ns += round((now_ns - ours_ns) / BOOT_WRAP_NS) * BOOT_WRAP_NS
+        if abs(now_ns - ours_ns) > MAX_TRANSPORT_NS:
             return now_ns
         return min(ours_ns, now_ns)

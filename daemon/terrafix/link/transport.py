@@ -34,6 +34,20 @@ class Transport(Protocol):
     def close(self) -> None: ...
 
 
+def open_at_start(device: str, baud: int) -> Transport:
+    """As ``open_transport``, waiting for a TCP peer. Raises LinkError with what to check."""
+    try:
+        return open_transport(device, baud, wait=True)
+    except OSError as error:
+        advice = {
+            "udpin": "is the port taken by another program?",
+            "udpout": "is there a network?",
+            "tcp": "is the other side listening?",
+        }.get(device.partition(":")[0], "is it plugged in, free, and may this user read and write it?")
+        why = os.strerror(error.errno) if error.errno else str(error)  # pyserial wraps the text into its own
+        raise LinkError(f"link '{device}' cannot be opened ({why}); {advice}") from None
+
+
 def open_transport(device: str, baud: int, *, wait: bool) -> Transport:
     """``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or the path of a serial device.
 

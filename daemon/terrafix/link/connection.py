@@ -1,0 +1,106 @@
+"""The connection: bytes to messages and back, signed where that is asked for, opened again when it was lost."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from terrafix.core.config import LinkSection
+from terrafix.core.errors import LinkError
+from terrafix.link.framing import Framer
+from terrafix.link.signing import Signing, read_key
+from terrafix.link.transport import Transport, open_transport
+
+REOPEN_NS = 1_000_000_000
+
+
+class Connection:
+    """Never waits, and never raises for what the wire does."""
+
+    def __init__(self, config: LinkSection, transport: Transport, wall_clock_ns: Callable[[], int]) -> None:
+        """Raises ConfigError: the signing key."""
+        self._config = config
+        self._transport: Transport | None = transport
+        self._wall_clock_ns = wall_clock_ns
+        self._signing = Signing(read_key(Path(config.signing_key))) if config.signing_key else None
+        self._mav = mavlink.MAVLink(None, srcSystem=config.sysid, srcComponent=config.compid)  # packs what is sent
+        self._framer = Framer()
+        self._try_ns = 0
+        self.sent = self.sent_bytes = self.dropped = self.reopened = 0
+        self.down = ""  # why there is no transport
+
+    @property
+    def heard_bytes(self) -> int:
+        return self._framer.heard
+
+    @property
+    def skipped_bytes(self) -> int:
+        """That belonged to no packet."""
+        return self._framer.skipped
+
+    @property
+    def signed(self) -> bool:
+        return self._signing is not None
+
+    @property
+    def refused(self) -> int:
+        """Packets without the signature that is asked for."""
+        return 0 if self._signing is None else self._signing.refused
+
+    def messages(self, now_ns: int) -> Iterator[Any]:
+        """What has come; opens again first when there is nothing to read from."""
+        if self._transport is None:
+            self._reopen(now_ns)
+        if self._transport is None:
+            return
+        try:
+            chunks = self._transport.read()
+        except OSError as error:
+            self._lost(error)
+            return
+        for chunk in chunks:
+            for message in self._framer.packets(chunk):
+                if self._signing is None or self._signing.accepts(message, self._wall_clock_ns()):
+                    yield message
+
+    def send(self, message: Any) -> None:
+        """Packs, signs and sends now, or not at all."""
+        if self._signing is not None:
+            self._signing.prepare(self._mav, self._wall_clock_ns())
+        packet = bytes(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) % 256
+        if self._transport is None:
+            self.dropped += 1
+            return
+        try:
+            if self._transport.write(packet):
+                self.sent += 1
+                self.sent_bytes += len(packet)
+            else:
+                self.dropped += 1
+        except OSError as error:
+            self.dropped += 1
+            self._lost(error)
+
+    def close(self) -> None:
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+
+    def _lost(self, error: OSError) -> None:
+        self.down = f"connection lost ({error.strerror or error}); opening again"
+        self.close()
+
+    def _reopen(self, now_ns: int) -> None:
+        if now_ns < self._try_ns:
+            return
+        self._try_ns = now_ns + REOPEN_NS
+        try:
+            self._transport = open_transport(self._config.device, self._config.baud, wait=False)
+        except (OSError, LinkError) as error:  # LinkError: a host name that cannot be resolved just now
+            self.down = f"cannot be opened again ({error})"
+            return
+        self._framer.reset()  # half a packet of the old connection must not swallow one of the new
+        self.down = ""
+        self.reopened += 1

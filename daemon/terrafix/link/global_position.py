@@ -1,0 +1,50 @@
+"""The position on the globe: GLOBAL_POSITION_SENSOR (296) and MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003)."""
+
+import math
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from terrafix.messages import GpsInput
+
+UNKNOWN_E7 = 2**31 - 1  # "invalid" of latitude and longitude in message 296
+PROCESSING = 0  # what is sent was carried to the moment of sending
+
+
+def global_position_sensor(gps: GpsInput, sysid: int) -> mavlink.MAVLink_global_position_sensor_message:
+    """For PX4 (EKF2_AGP_*), and ArduPilot once it takes it. Without a fix: marked unhealthy, without a position."""
+    good = gps.fix_type >= 3
+    return mavlink.MAVLink_global_position_sensor_message(
+        sysid,
+        mavlink.MAV_COMP_ID_AUTOPILOT1,
+        0,
+        gps.t_ns // 1000,
+        PROCESSING,
+        mavlink.GLOBAL_POSITION_SRC_VISION,
+        0 if good else mavlink.GLOBAL_POSITION_UNHEALTHY,
+        round(gps.lat_deg * 1e7) if good else UNKNOWN_E7,
+        round(gps.lon_deg * 1e7) if good else UNKNOWN_E7,
+        math.nan,  # above the ellipsoid: a map has heights above mean sea level
+        gps.alt_amsl_m if good else math.nan,
+        gps.horiz_accuracy_m if good else math.nan,
+        gps.vert_accuracy_m if good else math.nan,
+    )
+
+
+def external_position_estimate(gps: GpsInput, sysid: int) -> mavlink.MAVLink_command_int_message:
+    """ArduPilot takes it only as a COMMAND_INT, in a global frame, without a height (z NaN), and only while it has had
+    no position for a second. It is a hard reset of its filter, behind no gate."""
+    return mavlink.MAVLink_command_int_message(
+        sysid,
+        mavlink.MAV_COMP_ID_AUTOPILOT1,
+        mavlink.MAV_FRAME_GLOBAL,
+        mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
+        0,
+        0,
+        gps.t_ns * 1e-9,  # time of sending, seconds on our clock
+        float(PROCESSING),
+        gps.horiz_accuracy_m,
+        0.0,
+        round(gps.lat_deg * 1e7),
+        round(gps.lon_deg * 1e7),
+        math.nan,
+    )

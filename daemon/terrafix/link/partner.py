@@ -1,0 +1,57 @@
+"""The autopilot that we talk to: what it says becomes messages, and what is known of it is kept for what is sent."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from terrafix.link.gnss import RECEIVERS, reading_of
+from terrafix.link.local_pose import Attitude, Place
+from terrafix.link.outputs import Autopilot
+from terrafix.link.telemetry import AUTOPILOT_COMPONENT, Telemetry
+from terrafix.link.timesync import TimeSync
+from terrafix.messages import Message, VehicleState
+
+ATTITUDE_FRESH_NS = 500_000_000
+
+
+class Partner:
+    """``take`` every message of the wire."""
+
+    def __init__(self, timesync: TimeSync, only_sysid: int) -> None:
+        """``only_sysid``: its system id; 0: the first autopilot that is heard."""
+        self.telemetry = Telemetry(timesync, only_sysid)
+        self._state: VehicleState | None = None  # the newest
+        self._origin: Place | None = None  # of its filter
+
+    @property
+    def sysid(self) -> int:
+        return self.telemetry.sysid
+
+    @property
+    def firmware(self) -> str:
+        return self.telemetry.autopilot
+
+    def is_it(self, message: Any) -> bool:
+        """Not another vehicle, a gimbal or a ground station."""
+        return (message.get_srcSystem(), message.get_srcComponent()) == (self.sysid, AUTOPILOT_COMPONENT)
+
+    def take(self, message: Any, now_ns: int, our_receiver: int | None) -> Iterator[Message]:
+        """``our_receiver``: the GPS that is we ourselves, and no receiver; None: none is."""
+        state = self.telemetry.take(message, now_ns)
+        if state is not None:
+            if isinstance(state, VehicleState):
+                self._state = state
+            yield state
+        kind = message.get_type()
+        if not self.is_it(message):
+            return
+        if kind in RECEIVERS and RECEIVERS[kind] != our_receiver:
+            yield reading_of(message, now_ns)
+        elif kind == "GPS_GLOBAL_ORIGIN":
+            self._origin = Place(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+
+    def now(self, now_ns: int) -> Autopilot:
+        state, attitude = self._state, None
+        if state is not None and now_ns - state.t_ns < ATTITUDE_FRESH_NS:
+            angles = [a for a in (state.roll_rad, state.pitch_rad, state.yaw_rad) if a is not None]
+            attitude = Attitude(*angles) if len(angles) == 3 else None
+        return Autopilot(self.firmware, self.sysid, attitude, self._origin)

@@ -1,0 +1,144 @@
+"""Growing caution, visible everywhere: record, screen, named values; whole sentences, and no flood of them."""
+
+import math
+import random
+import re
+
+import msgspec
+import pytest
+from link_rig import MS, S, estimate, every, fly, gps, texts
+from link_wire import MemoryWire, heartbeat, packed
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from terrafix import messages as m
+from terrafix.core.config import LinkSection
+from terrafix.link.announce import CALM_NS, LONGEST_NS, Announcer
+from terrafix.link.edge import MavlinkEdge
+from terrafix.link.node import LinkNode
+
+SCREEN = 50  # characters of STATUSTEXT
+SENTENCES = [  # everything that Terrafix can say to a pilot; a new text belongs here
+    r"3D fix",
+    r"no fix: (the estimate is too old|neither map nor odometry|worse than \d+ m|the speed is too uncertain)",
+    r"no fix: (suddenly less accurate|the position has jumped|no estimate yet|estimator (died|stuck|gave up))",
+    r"no map fix for (5|15|35) s",
+    r"map fix again",
+    r"silent: no estimate for 35 s",
+    r"estimator (died|stuck|gave up)",
+    r"computer is (normal|hot|critical)(, -?\d+ C)?",
+    r"GPS \d is \d+ m off the map",
+    r"GPS \d and the map disagree",
+    r"GPS \d is lost",
+    r"GPS \d agrees with the map again",
+    r"flying on the (map|GPS) now",
+]
+
+
+def whole(text: str) -> bool:
+    return len(text) <= SCREEN and any(re.fullmatch(f"Terrafix: {sentence}", text) for sentence in SENTENCES)
+
+
+def test_whatever_happens_the_pilot_reads_whole_sentences() -> None:
+    draw = random.Random(4)
+    labels = list(m.SourceLabel)
+    said: list[m.Message] = []
+    for _ in range(12):
+        node = LinkNode(10.0, "act")
+        sigma, velocity, east, label = 4.0, 0.5, 0.0, labels[0]
+        for step in range(0, 60 * 50, 5):
+            now_ns = step * 20 * MS
+            if step % 500 == 0:
+                sigma, velocity = draw.choice((4.0, 20.0, 60.0, 3000.0)), draw.choice((0.5, 2.0))
+                east, label = draw.choice((0.0, 60.0, 5000.0)), draw.choice(labels)
+            age_ms = draw.choice((0, 6_000, 16_000, 40_000))
+            if draw.random() < 0.2:
+                claims = {"velocity_sigma": velocity, "anchor_age_ms": age_ms, "source_label": label}
+                said += node.on(estimate(now_ns - 100 * MS, sigma_m=sigma, east_m=east, **claims))  # type: ignore[arg-type]
+            if draw.random() < 0.01:
+                event = draw.choice(("died", "stuck", "gave_up", "restarted"))
+                said += node.on(m.ProcessEvent(t_ns=now_ns, process="estimator", event=event))
+            if draw.random() < 0.01:
+                band = draw.choice(list(m.ThermalBand))
+                said += node.on(
+                    m.Health(
+                        t_ns=now_ns,
+                        band=band,
+                        temperature_c=105.4,
+                        throttled=True,
+                        disk_free_mb=None,
+                        cause="a long cause",
+                    )
+                )
+            said += node.tick(now_ns)
+    heard = set(texts(said))
+    assert len(heard) >= 12
+    assert [text for text in heard if not whole(text)] == []
+
+
+def test_the_record_has_the_rung_and_the_seconds() -> None:
+    feed = every(200 * MS, lambda t: estimate(t, anchor_age_ms=t // MS), late_ns=20 * MS)
+    sent = gps(fly(LinkNode(10.0), 0, 40 * S, feed))
+    for seconds, rung in ((3, 0), (10, 1), (20, 2), (38, 3)):
+        at = next(g for g in sent if g.t_ns >= seconds * S)
+        assert at.caution == rung
+        assert at.unanchored_s == pytest.approx(seconds, abs=0.3)
+
+
+def test_before_anything_is_known_nothing_is_claimed_about_the_map() -> None:
+    (first,) = gps(list(LinkNode(10.0).tick(0)))
+    assert (first.caution, first.unanchored_s) == (0, None)
+
+
+def test_a_ladder_that_is_climbed_again_and_again_becomes_quiet() -> None:
+    feed = every(200 * MS, lambda t: estimate(t, anchor_age_ms=t // MS % 6500), late_ns=20 * MS)  # 5 s, again and again
+    said = fly(LinkNode(10.0), 0, 300 * S, feed)
+    about_the_map = [t for t in texts(said) if "map fix" in t]
+    assert 2 <= len(about_the_map) <= 14  # it went up and down 46 times
+
+
+def test_warnings_of_the_ladder_do_not_wait() -> None:
+    feed = every(200 * MS, lambda t: estimate(t, anchor_age_ms=t // MS % 40_000), late_ns=20 * MS)
+    said = fly(LinkNode(10.0), 0, 130 * S, feed)
+    for seconds in (15, 35):
+        at = [x.t_ns / S for x in said if isinstance(x, m.StatusText) and f"for {seconds} s" in x.text]
+        assert at == pytest.approx([seconds, seconds + 40, seconds + 80], abs=0.5)
+
+
+def test_the_last_word_is_always_true() -> None:
+    draw = random.Random(1)
+    for _ in range(50):
+        announcer, told, now_ns, state = Announcer[bool](), None, 0, False
+        for _ in range(200):
+            now_ns += draw.randint(1, 20) * S
+            state = draw.random() < 0.5
+            told = state if announcer.due(state, now_ns) else told
+        assert announcer.due(state, now_ns + LONGEST_NS) or told == state
+
+
+def test_calm_makes_the_first_word_quick_again() -> None:
+    announcer = Announcer[int]()
+    assert [announcer.due(i, i * 6 * S) for i in range(4)] == [True, True, False, True]
+    assert announcer.due(9, 18 * S + CALM_NS)
+    assert announcer.due(8, 18 * S + CALM_NS + 5 * S)
+
+
+def test_named_values_once_a_second_and_only_to_an_autopilot() -> None:
+    wire = MemoryWire()
+    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
+    (sent,) = gps(list(LinkNode(10.0).tick(0)))
+    known = msgspec.structs.replace(sent, fix_type=3, horiz_accuracy_m=6.5, caution=1, unanchored_s=7.25)
+    for tenth in range(20):
+        edge.heard(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
+    assert wire.take("NAMED_VALUE_FLOAT") == []
+    wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)))
+    list(edge.poll(0))
+    for tenth in range(25):
+        edge.heard(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
+    values = [(x.name, x.value) for x in wire.take("NAMED_VALUE_FLOAT")]
+    assert values == [("TFX_FIX", 3.0), ("TFX_ACC_M", 6.5), ("TFX_MAP_S", 7.25), ("TFX_CAUT", 1.0)] * 2
+    wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)))
+    list(edge.poll(4 * S))
+    edge.heard(msgspec.structs.replace(sent, t_ns=5 * S))
+    lost = {x.name: x.value for x in wire.take("NAMED_VALUE_FLOAT")}
+    assert lost["TFX_FIX"] == 1.0
+    assert math.isnan(lost["TFX_ACC_M"]) and math.isnan(lost["TFX_MAP_S"])

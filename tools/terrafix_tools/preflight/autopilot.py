@@ -1,0 +1,204 @@
+"""A conversation with an autopilot on the ground: who is there, its parameters, its mission. Waits; not for flight."""
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from terrafix.core.config import LinkSection
+from terrafix.core.errors import LinkError
+from terrafix.link.diagnosis import Heard, why_no_autopilot
+from terrafix.link.framing import Framer
+from terrafix.link.signing import Signing, read_key
+from terrafix.link.transport import Transport, open_at_start
+from terrafix_tools.preflight.lines import number
+
+HEARTBEAT_S = 1.0
+LOOK_S = 0.005  # between two looks at the wire
+CONNECT_S = 8.0
+OTHERS_S = 1.5  # after the first autopilot: is there another one?
+ROUNDS, QUIET_S = 4, 0.7  # a parameter is asked for so often; a round ends when nothing came for so long
+BATCH = 8  # requests at once: a slow line has a short queue
+ANSWER_S = 2.0
+TRIPS = 10
+AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
+PLANES = {mavlink.MAV_TYPE_FIXED_WING, *range(19, 26)}  # 19 to 25 are VTOLs, which fly ArduPlane
+
+
+class Autopilot:
+    """``connect`` first. A context manager."""
+
+    def __init__(
+        self, config: LinkSection, transport: Transport | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Raises LinkError: the device cannot be opened; ConfigError: the signing key."""
+        self._config, self._clock = config, clock
+        self._signing = Signing(read_key(Path(config.signing_key))) if config.signing_key else None
+        self._transport = transport or open_at_start(config.device, config.baud)
+        self._mav = mavlink.MAVLink(None, srcSystem=config.sysid, srcComponent=config.compid)
+        self._framer, self._heard = Framer(), Heard()
+        self._beat_s = -HEARTBEAT_S
+        self._types: dict[str, int] = {}
+        self.sysid = 0
+        self.plane = False
+        self.armed = False
+        self.newest: dict[tuple[str, int], Any] = {}  # (kind, system id) -> message
+
+    def __enter__(self) -> "Autopilot":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._transport.close()
+
+    def connect(self, wait_s: float | None = None) -> None:
+        """Raises LinkError: nobody there, several, another system id, not ArduPilot; each says what to do."""
+        wait_s = CONNECT_S if wait_s is None else wait_s
+        until = self._clock() + wait_s
+        for _ in self._listen(wait_s):
+            there = self._heard.autopilots()
+            if there and (self._config.autopilot_sysid in (0, *there)):
+                until = min(until, self._clock() + OTHERS_S)
+            if self._clock() >= until:
+                break
+        self._heard.bytes = self._framer.heard
+        self._heard.refused = 0 if self._signing is None else self._signing.refused
+        device = self._config.device
+        why = why_no_autopilot(self._heard, device, self._config.baud, self._config.autopilot_sysid)
+        if why:
+            raise LinkError(why)
+        there = self._heard.autopilots()
+        if len(there) > 1 and not self._config.autopilot_sysid:
+            raise LinkError(
+                f"{len(there)} autopilots on {device}, system ids {', '.join(map(str, there))}; "
+                "name yours in link.autopilot_sysid"
+            )
+        self.sysid = self._config.autopilot_sysid or next(iter(there))
+        if there[self.sysid] != "ardupilot":
+            raise LinkError(
+                f"the autopilot on {device} is {there[self.sysid]}, not ArduPilot; others' parameters are not known"
+            )
+        beat = self.newest["HEARTBEAT", self.sysid]
+        self.plane = beat.type in PLANES
+        self.armed = bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    def read(self, names: list[str]) -> dict[str, float]:
+        """The parameters that it has among ``names``. Raises LinkError when it answers to none."""
+        found: dict[str, float] = {}
+        for _ in range(ROUNDS):
+            missing = [name for name in names if name not in found]
+            for first in range(0, len(missing), BATCH):
+                for name in missing[first : first + BATCH]:
+                    self._send(mavlink.MAVLink_param_request_read_message(self.sysid, AUTOPILOT, name.encode(), -1))
+                self._take_values(found, set(missing[first : first + BATCH]))
+            if not missing:
+                break
+        if names and not found:
+            raise LinkError(
+                f"the autopilot on {self._config.device} does not answer requests for parameters; "
+                "is the link one way, or is a router in between that does not forward them?"
+            )
+        return {name: found[name] for name in names if name in found}
+
+    def write(self, name: str, value: float) -> None:
+        """Raises LinkError when the autopilot does not have the value afterwards."""
+        for _ in range(ROUNDS):
+            kind = self._types.get(name, mavlink.MAV_PARAM_TYPE_REAL32)
+            self._send(mavlink.MAVLink_param_set_message(self.sysid, AUTOPILOT, name.encode(), value, kind))
+            found: dict[str, float] = {}
+            self._take_values(found, {name})
+            if name in found and abs(found[name] - value) <= 1e-6 * max(1.0, abs(value)):
+                return
+        raise LinkError(
+            f"{name} could not be set to {number(value)}; is the autopilot armed, or the parameter read-only?"
+        )
+
+    def ask(self, message_id: int, kind: str) -> Any | None:
+        """One message on request; None when it does not come."""
+        no = (0.0,) * 6
+        request = mavlink.MAV_CMD_REQUEST_MESSAGE
+        self._send(mavlink.MAVLink_command_long_message(self.sysid, AUTOPILOT, request, 0, float(message_id), *no))
+        return next((m for m in self._listen(ANSWER_S) if m is not None and m.get_type() == kind), None)
+
+    def round_trip_ms(self) -> float | None:
+        """Median of some TIMESYNC round trips; None when nothing answers."""
+        trips = []
+        for _ in range(TRIPS):
+            sent_s = self._clock()
+            stamp = round(sent_s * 1e9)
+            self._send(mavlink.MAVLink_timesync_message(0, stamp))
+            for message in self._listen(ANSWER_S / TRIPS):
+                if message is not None and message.get_type() == "TIMESYNC" and message.ts1 == stamp and message.tc1:
+                    trips.append((self._clock() - sent_s) * 1e3)
+                    break
+        return statistics.median(trips) if trips else None
+
+    def mission(self) -> list[Any]:
+        """MISSION_ITEM_INT of the mission on board, home first; empty when there is none. Raises LinkError."""
+        self._send(mavlink.MAVLink_mission_request_list_message(self.sysid, AUTOPILOT))
+        count = next((m.count for m in self._listen(ANSWER_S) if m is not None and m.get_type() == "MISSION_COUNT"), 0)
+        return [self._mission_item(seq) for seq in range(count)]
+
+    def hear(self, seconds: float) -> None:
+        """Listens, so that ``newest`` has what comes by itself."""
+        for _ in self._listen(seconds):
+            pass
+
+    def _mission_item(self, seq: int) -> Any:
+        for _ in range(ROUNDS):
+            self._send(mavlink.MAVLink_mission_request_int_message(self.sysid, AUTOPILOT, seq))
+            for message in self._listen(ANSWER_S):
+                if message is not None and message.get_type() == "MISSION_ITEM_INT" and message.seq == seq:
+                    return message
+        raise LinkError(f"item {seq} of the mission cannot be read from the autopilot; try again")
+
+    def _take_values(self, found: dict[str, float], wanted: set[str]) -> None:
+        """Until all are there, or nothing more comes."""
+        last_s = self._clock()
+        for message in self._listen(ANSWER_S):
+            if message is not None and message.get_type() == "PARAM_VALUE":
+                found[message.param_id] = message.param_value
+                self._types[message.param_id] = message.param_type
+                last_s = self._clock()
+            if wanted <= found.keys() or self._clock() - last_s > QUIET_S:
+                return
+
+    def _listen(self, seconds: float) -> Iterator[Any | None]:
+        """What the autopilot says for so long; None now and then, so that the hearer can look at the clock."""
+        until = self._clock() + seconds
+        while self._clock() < until:
+            if self._clock() >= self._beat_s + HEARTBEAT_S:
+                self._beat_s = self._clock()
+                kind, no = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
+                self._send(mavlink.MAVLink_heartbeat_message(kind, no, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
+            yield from self._arrived()
+            yield None
+            time.sleep(LOOK_S)
+
+    def _arrived(self) -> Iterator[Any]:
+        try:
+            chunks = self._transport.read()
+        except OSError as error:
+            raise LinkError(f"{self._config.device}: connection lost ({error.strerror or error}); try again") from None
+        for chunk in chunks:
+            for message in self._framer.packets(chunk):
+                if self._signing is not None and not self._signing.accepts(message, time.time_ns()):
+                    continue
+                self._heard.packets += 1
+                self._heard.take(message)
+                if message.get_srcComponent() == AUTOPILOT:
+                    self.newest[message.get_type(), message.get_srcSystem()] = message
+                    if self.sysid in (0, message.get_srcSystem()):
+                        yield message
+
+    def _send(self, message: Any) -> None:
+        if self._signing is not None:
+            self._signing.prepare(self._mav, time.time_ns())
+        packet = bytes(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) % 256
+        try:
+            self._transport.write(packet)
+        except OSError as error:
+            raise LinkError(f"{self._config.device}: connection lost ({error.strerror or error}); try again") from None

@@ -1,0 +1,178 @@
+"""What is checked on this computer: map, camera, models, clock, disk, temperature."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from terrafix.anchor.map_package import MapPackage
+from terrafix.core.config import Config
+from terrafix.core.errors import TerrafixError
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.signature import trusted_keys
+from terrafix.health.sysfs import read_disk_free_mb, read_throttling, read_zones
+from terrafix.link import gps_time
+from terrafix.vision.sources import open_configured, parse_start
+from terrafix_engines.features import open_describer
+from terrafix_tools.mapping.check_mission import uncovered, way_of
+from terrafix_tools.mapping.check_text import where
+from terrafix_tools.mission.file import read_mission
+from terrafix_tools.preflight.lines import Line, fail, ok, warn
+
+FRAMES = 3
+FREE_MB = 2000  # a flight of an hour with thumbnails
+DARK, BRIGHT = 15.0, 240.0  # mean of 255
+FLAT = 6.0  # standard deviation: a lens cap, a wall, fog
+BLURRED = 0.08  # share of the contrast that lies within two pixels; sharp pictures of ground have 0.2 and more
+LIVE = ("/dev/", "http://", "https://")
+
+
+def about(config: Config, mission: Path | None, out: Path) -> Iterator[Line]:
+    yield from _map(config, mission)
+    yield from _camera(config)
+    yield _models(config)
+    yield _clock()
+    yield _disk(config, out)
+    yield _temperature(config)
+
+
+def _map(config: Config, mission: Path | None) -> Iterator[Line]:
+    if not config.map.path:
+        yield fail("map", "the configuration names none", "set [map] path, or give --map")
+        return
+    required = config.map.require_signature
+    try:
+        trusted = trusted_keys(config.map.trusted_keys, required=required)
+        package = MapPackage.open(Path(config.map.path), verify=True, trusted=trusted)
+    except TerrafixError as error:
+        yield fail("map", *_told(error))
+        return
+    try:
+        newest = package.layer(None)
+        signed = f"signed by {', '.join(package.signed_by)}" if package.signed_by else "not signed"
+        yield ok(
+            "map", f"{package.path.name}: every tile is whole; {signed}; imagery of {newest.date or 'unknown date'}"
+        )
+        place = parse_start(config.source.start)
+        if place is not None:
+            covered = package.covers(*place)
+            at = f"{place[0]:.6f}, {place[1]:.6f}"
+            yield (
+                ok("start", f"{at} lies on the map")
+                if covered
+                else fail("start", f"{at} does not lie on the map", "correct [source] start, or take another map")
+            )
+        if mission is not None:
+            yield _cover(package, mission)
+    except TerrafixError as error:
+        yield fail("map", *_told(error))
+    finally:
+        package.close()
+
+
+def _cover(package: MapPackage, mission: Path) -> Line:
+    plan = read_mission(mission)
+    west, south, east, north = package.manifest.bounds_wgs84
+    way = way_of(plan, LocalFrame((south + north) / 2, (west + east) / 2))
+    outside = way.stretches(uncovered(way, package, package.layer(None).table))
+    if outside:
+        return fail("mission", f"leaves the map for {where(outside[0])}", "move the mission, or build a larger map")
+    return ok("mission", f"its {way.along_m[-1] / 1000:.1f} km lie on the map")
+
+
+def _camera(config: Config) -> Iterator[Line]:
+    spec = config.source.path
+    if not spec:
+        yield fail("camera", "the configuration names no source", "set [source] path")
+        return
+    if not (spec.startswith(LIVE) or "!" in spec or spec.isdecimal()):
+        yield warn("camera", f"{spec} is a recording, not a camera", "for a flight set [source] path to the camera")
+        return
+    try:
+        source = open_configured(config.source)
+        try:
+            images = []
+            for shot in source.shots():
+                if shot.image is None:
+                    yield fail("camera", f"a frame cannot be used: {shot.frame.error}", "check cable and driver")
+                    return
+                images.append(shot.image)
+                if len(images) == FRAMES:
+                    break
+        finally:
+            source.close()
+    except TerrafixError as error:
+        yield fail("camera", *_told(error))
+        return
+    yield picture(images)
+
+
+def picture(images: list[np.ndarray]) -> Line:
+    """A line about a few frames (H, W, 3) in a row."""
+    if len(images) < FRAMES:
+        return fail("camera", f"only {len(images)} frames came", "check cable and driver")
+    if all(np.array_equal(images[0], image) for image in images[1:]):
+        return fail("camera", "repeats the same picture", "start the camera again")
+    grey = cv2.cvtColor(images[-1], cv2.COLOR_BGR2GRAY).astype(np.float32)
+    size = f"{grey.shape[1]} x {grey.shape[0]} px"
+    mean, spread = float(grey.mean()), float(grey.std())
+    if not DARK <= mean <= BRIGHT or spread < FLAT:
+        return warn("camera", f"{size}, but the picture is empty (mean {mean:.0f}, spread {spread:.0f})", "lens cap?")
+    fine = float((grey - cv2.GaussianBlur(grey, (0, 0), 2.0)).std()) / spread
+    if fine < BLURRED:
+        return warn("camera", f"{size}, but it looks blurred", "point it at something 10 m away or more, and focus")
+    return ok("camera", f"{size}, sharp, and it moves on")
+
+
+def _models(config: Config) -> Line:
+    if not config.models.xfeat:
+        return ok("models", "none: matching without weights")
+    try:
+        open_describer(config.models.xfeat)
+    except (TerrafixError, ValueError, OSError) as error:
+        return fail("models", str(error), "correct [models] xfeat, or empty it")
+    return ok("models", f"{config.models.xfeat} can be run")
+
+
+def _clock() -> Line:
+    if gps_time.plausible(time.time_ns()):
+        return ok("clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()))
+    text = f"says {time.strftime('%Y', time.gmtime())}: the GPS week will be left out"
+    return warn("clock", text, "set it (timedatectl set-time), or give the board a battery")
+
+
+def _disk(config: Config, out: Path) -> Line:
+    folder = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
+    free_mb = read_disk_free_mb(folder)
+    if free_mb is None:
+        return warn("disk", f"{folder}: free space cannot be read", "check the file system")
+    if free_mb < FREE_MB:
+        return fail("disk", f"{free_mb} MB free in {folder}, a flight may need {FREE_MB}", "delete old records")
+    if free_mb < config.recorder.budget_mb:
+        text = f"{free_mb} MB free in {folder}, below [recorder] budget_mb = {config.recorder.budget_mb}"
+        return warn("disk", text, "delete old records, or lower the budget")
+    return ok("disk", f"{free_mb} MB free in {folder}")
+
+
+def _temperature(config: Config) -> Line:
+    thermal = Path(config.health.sysfs_root) / "class" / "thermal"
+    zones, throttling = read_zones(thermal), read_throttling(thermal)
+    if throttling:
+        return warn("temperature", f"throttled by {', '.join(throttling)}", "let it cool, and check the fan")
+    if not zones:
+        return warn(
+            "temperature", f"no zone can be read in {thermal}", "heat will not be noticed; set [health] sysfs_root"
+        )
+    hottest = max(zones, key=lambda zone: zone.temperature_c)
+    text = f"{hottest.temperature_c:.0f} C ({hottest.name})"
+    if hottest.temperature_c >= config.health.hot_c:
+        return warn("temperature", f"{text}, on the ground already", "let it cool, and check the fan")
+    return ok("temperature", text)
+
+
+def _told(error: TerrafixError) -> tuple[str, str]:
+    """Text and fix: what stands behind the last semicolon of a message says what to do."""
+    text, _, todo = str(error).rpartition("; ")
+    return (text, todo) if text else (str(error), "")

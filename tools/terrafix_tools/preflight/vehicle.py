@@ -1,0 +1,91 @@
+"""What is asked of the autopilot besides its parameters: firmware, clock, telemetry, the mission on board."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from terrafix.core.config import LinkSection
+from terrafix_tools.preflight.autopilot import Autopilot
+from terrafix_tools.preflight.lines import Line, fail, ok, warn
+
+OLDEST = (4, 6)  # the firmware whose behaviour is known
+CLOCK_S = 2.0
+SLOW_MS = 100.0
+WIRE_BYTES = 80  # GPS_INPUT, signed 93
+BITS_PER_BYTE = 10  # 8N1
+DELAY_LEAST_MS, DELAY_MOST_MS = 5, 50
+HEAR_S = 2.5
+LOOPBACK = ("127.", "localhost")
+
+
+def delay_advice_ms(link: LinkSection, round_trip_ms: float | None) -> int:
+    """For GPSn_DELAY_MS: what is left between sending and reading: half a measured round trip, or the line's time."""
+    wire_ms = WIRE_BYTES * BITS_PER_BYTE / link.baud * 1e3 if link.device.startswith("/") else 0.0
+    one_way_ms = max(wire_ms, (round_trip_ms or 0.0) / 2)
+    return min(DELAY_MOST_MS, max(DELAY_LEAST_MS, round(one_way_ms)))
+
+
+def about(autopilot: Autopilot, link: LinkSection, round_trip_ms: float | None) -> Iterator[Line]:
+    version = autopilot.ask(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, "AUTOPILOT_VERSION")
+    kind = "ArduPlane" if autopilot.plane else "ArduCopter"
+    yield _firmware(kind, autopilot.sysid, version)
+    autopilot.hear(HEAR_S)
+    if round_trip_ms is None:
+        yield fail("time", "no answer to TIMESYNC", "is the link one way, or a router in between?")
+    elif round_trip_ms > SLOW_MS:
+        yield warn("time", f"a round trip takes {round_trip_ms:.0f} ms", "take a faster line, not a radio")
+    else:
+        yield ok("time", f"a round trip takes {round_trip_ms:.1f} ms")
+    yield _clock(autopilot.newest.get(("SYSTEM_TIME", autopilot.sysid)))
+    yield _signing(link)
+    if autopilot.armed:
+        yield warn("armed", "the autopilot is armed", "disarm before parameters are changed")
+
+
+def save_mission(autopilot: Autopilot, path: Path) -> Line | None:
+    """The mission on board into ``path``, a waypoint file; None when there is one, else the line that says no."""
+    items = autopilot.mission()
+    if len(items) < 2:  # item 0 is home
+        return warn("mission", "there is none on board", "load one, or give --mission, and its map is checked")
+    rows = ["QGC WPL 110"]
+    for i in items:
+        place = (f"{i.x / 1e7:.8f}", f"{i.y / 1e7:.8f}", f"{i.z:.3f}")
+        cells = (i.seq, i.current, i.frame, i.command, i.param1, i.param2, i.param3, i.param4, *place, i.autocontinue)
+        rows.append("\t".join(map(str, cells)))
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return None
+
+
+def _firmware(kind: str, sysid: int, version: Any) -> Line:
+    if version is None:
+        return warn("firmware", f"{kind}, system {sysid}, does not say its version", "is it ArduPilot 4.6 or later?")
+    number = version.flight_sw_version
+    numbers = (number >> 24, number >> 16 & 0xFF, number >> 8 & 0xFF)
+    text = f"{kind} {'.'.join(map(str, numbers))}, system {sysid}"
+    if numbers[:2] < OLDEST:
+        return fail("firmware", f"{text}: names and behaviour differ before 4.6", "update the autopilot")
+    return ok("firmware", text)
+
+
+def _clock(said: Any) -> Line:
+    if said is None or said.time_unix_usec == 0:
+        return ok("autopilot clock", "has no date yet; it will take ours with the first fix")
+    ahead_s = said.time_unix_usec / 1e6 - time.time()
+    if abs(ahead_s) <= CLOCK_S:
+        return ok("autopilot clock", f"agrees with ours within {CLOCK_S:.0f} s")
+    text = f"differs from ours by {ahead_s:+.0f} s"
+    return warn("autopilot clock", text, "set this computer's clock (timedatectl), it gives the GPS week")
+
+
+def _signing(link: LinkSection) -> Line:
+    kind, _, rest = link.device.partition(":")
+    wire = link.device.startswith("/") or rest.startswith(LOOPBACK)
+    if link.signing_key:
+        return ok("signing", "packets are signed, and the autopilot answers")
+    if wire:
+        return ok("signing", "off, on a wire of its own")
+    text = f"off, on a network ({kind}): anybody there can send the autopilot a position"
+    return warn("signing", text, "set link.signing_key, or take a serial line")

@@ -1,0 +1,175 @@
+"""One flight for the GNSS judge, as messages: a receiver that something happens to, and estimates with honest errors.
+
+The receiver is that of the simulated vehicles (sim/sensors/gnss.py). The estimate's error has a part that stays (the
+map) and a part that wanders, together as large as it claims; in some flights it is dead reckoned for a while."""
+
+import math
+import random
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from terrafix.core.geodesy import LocalFrame
+from terrafix.link.node import LinkNode
+from terrafix.messages import (
+    CovarianceMode,
+    GnssReading,
+    GnssState,
+    GnssVerdict,
+    NavEstimate,
+    SourceLabel,
+    VehicleState,
+)
+from terrafix_tools.sim.interfaces import GnssFix, State
+from terrafix_tools.sim.sensors.gnss import DELAY_S, Gnss
+from terrafix_tools.sim.sensors.gnss_events import AnyEvent
+
+STEP_S = 0.2  # readings, attitude and the link's tick
+ESTIMATES_S = 0.4
+ESTIMATE_LATE_S = 0.3
+NS_PER_S = 1_000_000_000
+GRAVITY_MPS2 = 9.81
+FRAME = LocalFrame(48.0, 11.0)
+ALT_M = 620.0
+
+
+@dataclass(frozen=True)
+class Vision:
+    """How good the estimate is: 1-sigma per axis, and how its error is made up."""
+
+    sigma_m: float
+    steady_share: float = 0.5  # of the variance: the map's own error over the flight
+    wander_s: float = 20.0  # correlation of the rest
+    velocity_sigma_mps: float = 0.7
+    gap: tuple[float, float] = (0.0, 0.0)  # from, to, s: neither map nor odometry
+    gap_mps: float = 0.5  # 1-sigma per axis of the drift in it
+
+
+@dataclass
+class Told:
+    """What the judge said, with the second."""
+
+    states: list[tuple[float, GnssState]] = field(default_factory=list)
+    lost_fix_s: float | None = None  # when the receiver's own fix was gone
+
+    def first(self, after_s: float, *wanted: GnssState) -> float | None:
+        return next((t for t, state in self.states if t >= after_s and state in wanted), None)
+
+
+def fly(duration_s: float, vision: Vision, events: tuple[AnyEvent, ...], seed: int) -> Told:
+    draw = random.Random(f"{seed} judge")
+    gnss = Gnss(FRAME, seed=seed, events=events)
+    node = LinkNode(10.0)
+    course, estimator, told = _Course(draw), _Estimator(vision, draw), Told()
+    coming: list[tuple[float, NavEstimate]] = []
+    before: GnssState | None = None
+    began_s = min((event.start_s for event in events), default=math.inf)
+    for step in range(round(duration_s / STEP_S)):
+        t_s = step * STEP_S
+        state = course.step(t_s)
+        fix = gnss.read(state)  # 0.2 s old, by the step; the judge takes a reading for 0.15 s old
+        if fix is not None and fix.fix_type < 3 and told.lost_fix_s is None and t_s >= began_s:
+            told.lost_fix_s = t_s - DELAY_S
+        if step % round(ESTIMATES_S / STEP_S) == 0:
+            coming.append((t_s + ESTIMATE_LATE_S, estimator.say(state)))
+        said = []
+        while coming and coming[0][0] <= t_s:
+            node.on(coming.pop(0)[1])
+        now_ns = round(t_s * NS_PER_S)
+        node.on(_attitude(state, now_ns))
+        if fix is not None:
+            said += list(node.on(_reading(fix, now_ns)))
+        said += list(node.tick(now_ns))
+        for message in said:
+            if isinstance(message, GnssVerdict) and message.state is not before:
+                before = message.state
+                told.states.append((t_s, message.state))
+    return told
+
+
+class _Course:
+    """Straight legs and turns at one speed."""
+
+    def __init__(self, draw: random.Random) -> None:
+        self._draw = draw
+        self._speed = draw.uniform(12.0, 28.0)
+        self._yaw = draw.uniform(-math.pi, math.pi)
+        self._p = np.array([0.0, 0.0, ALT_M])
+        self._rate, self._until_s = 0.0, 0.0
+
+    def step(self, t_s: float) -> State:
+        if t_s >= self._until_s:
+            turning = self._rate == 0.0 and t_s > 0
+            self._rate = self._draw.choice((-1, 1)) * self._draw.uniform(0.05, 0.25) if turning else 0.0
+            self._until_s = t_s + (self._draw.uniform(4.0, 14.0) if turning else self._draw.uniform(20.0, 120.0))
+        v = self._speed * np.array([math.sin(self._yaw), math.cos(self._yaw), 0.0])
+        roll = math.atan2(self._speed * self._rate, GRAVITY_MPS2)
+        zero = np.zeros(3)
+        state = State(t_s, self._p.copy(), v, self._yaw, 0.0, roll, 120.0, zero, zero, self._speed)
+        self._p += v * STEP_S
+        self._yaw = math.remainder(self._yaw + self._rate * STEP_S, math.tau)
+        return state
+
+
+class _Estimator:
+    def __init__(self, vision: Vision, draw: random.Random) -> None:
+        self._vision, self._gauss = vision, draw.gauss
+        steady = vision.sigma_m * math.sqrt(vision.steady_share)
+        self._steady = np.array([self._gauss(0.0, steady), self._gauss(0.0, steady)])
+        self._wander_sigma = vision.sigma_m * math.sqrt(1.0 - vision.steady_share)
+        self._wander = np.array([self._gauss(0.0, self._wander_sigma) for _ in range(2)])
+        self._velocity = np.zeros(2)
+        self._drift_mps = np.array([self._gauss(0.0, vision.gap_mps) for _ in range(2)])
+
+    def say(self, state: State) -> NavEstimate:
+        self._wander = self._walk(self._wander, self._wander_sigma, self._vision.wander_s)
+        self._velocity = self._walk(self._velocity, self._vision.velocity_sigma_mps, 2.0)
+        from_s, to_s = self._vision.gap
+        blind_s = state.t_s - from_s if from_s <= state.t_s < to_s else 0.0
+        e, n = state.p_b_in_w_m[:2] + self._steady + self._wander + self._drift_mps * blind_s
+        lat, lon = FRAME.to_wgs84(float(e), float(n))
+        t_ns = round(state.t_s * NS_PER_S)
+        cov = [0.0] * 36
+        cov[0] = cov[7] = self._vision.sigma_m**2 + (self._vision.gap_mps * blind_s) ** 2
+        cov[14] = 9.0
+        ve, vn = state.velocity_enu_mps[:2] + self._velocity
+        return NavEstimate(
+            t_ns=t_ns,
+            frame_id=t_ns,
+            lat_deg=lat,
+            lon_deg=lon,
+            alt_amsl_m=ALT_M,
+            agl_m=120.0,
+            velocity_enu_mps=(float(ve), float(vn), 0.0),
+            velocity_sigma_mps=self._vision.velocity_sigma_mps,
+            q_w_b=(1.0, 0.0, 0.0, 0.0),
+            cov=tuple(cov),
+            source_label=SourceLabel.DEAD_RECKONED if blind_s else SourceLabel.SATELLITE_ANCHORED,
+            covariance_mode=CovarianceMode.MARGINALS,
+            last_anchor_age_ms=round(blind_s * 1000),
+            emitted_at_ns=t_ns + round(ESTIMATE_LATE_S * NS_PER_S),
+        )
+
+    def _walk(self, value: np.ndarray, sigma: float, time_s: float) -> np.ndarray:
+        """A Gauss-Markov process, one estimate on."""
+        keep = math.exp(-ESTIMATES_S / time_s)
+        kick = sigma * math.sqrt(1.0 - keep * keep)
+        return keep * value + np.array([self._gauss(0.0, kick), self._gauss(0.0, kick)])
+
+
+def _attitude(state: State, now_ns: int) -> VehicleState:
+    return VehicleState(t_ns=now_ns, source="mavlink", yaw_rad=state.yaw_rad, pitch_rad=0.0, roll_rad=state.roll_rad)
+
+
+def _reading(fix: GnssFix, now_ns: int) -> GnssReading:
+    good = fix.fix_type >= 3
+    return GnssReading(
+        t_ns=now_ns,
+        receiver=0,
+        fix_type=fix.fix_type,
+        lat_deg=fix.lat_deg if good else None,
+        lon_deg=fix.lon_deg if good else None,
+        horizontal_m=fix.horizontal_m if good else None,
+        speed_mps=math.hypot(*fix.velocity_ned_mps[:2]) if good else None,
+        satellites=fix.satellites,
+    )
