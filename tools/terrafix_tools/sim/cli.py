@@ -8,6 +8,23 @@ import typer
 from terrafix.core.errors import UsageError
 from terrafix_tools.sim.autopilot.parameters import Gps, Kind
 
+# What `make` and `fly` have in common.
+Seed = Annotated[int, typer.Option(help="Of the generated place, of the course and of all errors.")]
+SizeKm = Annotated[float | None, typer.Option(help="Side of the generated place; default: 3 by 2 km.")]
+Image = Annotated[Path | None, typer.Option(help="GeoTIFF that the camera sees; default: a generated place.")]
+Map = Annotated[
+    Path | None,
+    typer.Option("--map", help="GeoTIFF or map package of the same place, of another date; default: --image."),
+]
+Dem = Annotated[Path | None, typer.Option(help="Elevation GeoTIFF under --image; default: flat at 0 m.")]
+Vehicle = Annotated[Kind, typer.Option(help="Who flies.")]
+MissionFile = Annotated[
+    Path | None, typer.Option(help="QGroundControl .plan or waypoint file; default: a closed course.")
+]
+Agl = Annotated[float, typer.Option(help="Height of that course above ground, metres.")]
+Duration = Annotated[float | None, typer.Option(help="Seconds; default: until the mission is flown.")]
+Events = Annotated[Path | None, typer.Option(help="TOML with [[gnss]] tables: outage, jam, jump, drag.")]
+
 app = typer.Typer(
     no_args_is_help=True, help="Simulated flights: generated or real ground, vehicle, sensors, autopilot."
 )
@@ -51,28 +68,24 @@ def ardupilot(
 @app.command()
 def fly(
     out: Annotated[Path, typer.Option(help="Folder for everything that the flight makes.")] = Path("out/fly"),
-    seed: Annotated[int, typer.Option(help="Seed of the generated place, of the course and of all errors.")] = 1,
-    size_km: Annotated[float | None, typer.Option(help="Side of the generated place; default: 3 by 2 km.")] = None,
-    image: Annotated[
-        Path | None, typer.Option(help="GeoTIFF that the camera sees; default: a generated place.")
-    ] = None,
-    map_path: Annotated[
-        Path | None, typer.Option("--map", help="GeoTIFF or map package of the same place, of another date.")
-    ] = None,
-    dem: Annotated[Path | None, typer.Option(help="Elevation of both; default: flat at 0 m.")] = None,
-    vehicle: Annotated[Kind, typer.Option(help="Who flies.")] = Kind.PLANE,
+    seed: Seed = 1,
+    size_km: SizeKm = None,
+    image: Image = None,
+    map_path: Map = None,
+    dem: Dem = None,
+    vehicle: Vehicle = Kind.PLANE,
     gps: Annotated[Gps, typer.Option(help="Terrafix beside a real receiver, or as the only GPS.")] = Gps.SECOND,
-    mission: Annotated[Path | None, typer.Option(help="QGroundControl .plan or waypoint file.")] = None,
-    length_km: Annotated[float | None, typer.Option(help="Length without --mission; default 10.")] = None,
-    agl: Annotated[float, typer.Option(help="Metres above ground, without --mission.")] = 130.0,
-    duration: Annotated[float | None, typer.Option(help="Seconds; default: until the mission is flown.")] = None,
+    mission: MissionFile = None,
+    length_km: Annotated[float | None, typer.Option(help="Length of that course; default 10.")] = None,
+    agl: Agl = 130.0,
+    duration: Duration = None,
     frame_hz: Annotated[float, typer.Option(help="Frames a second.")] = 1.5,
     jam_after: Annotated[
         float | None, typer.Option(help="Seconds until GNSS is jammed; default 60 without --spoof-after or --events.")
     ] = None,
     spoof_after: Annotated[float | None, typer.Option(help="Seconds until a spoofer drags GNSS off.")] = None,
     spoof_mps: Annotated[float, typer.Option(help="... so fast, to the east.")] = 2.0,
-    events: Annotated[Path | None, typer.Option(help="TOML with [[gnss]] tables: outage, jam, jump, drag.")] = None,
+    events: Events = None,
 ) -> None:
     """Fly in closed loop: the vehicle steers by what the autopilot believes, the autopilot by GPS_INPUT."""
     from terrafix_tools.sim.closed_loop.command import Request, run
@@ -98,24 +111,18 @@ def fly(
 @app.command()
 def make(
     out: Annotated[Path, typer.Option(help="Flight folder to write; new or empty.")],
-    seed: Annotated[int, typer.Option(help="Decides about everything that is drawn.")] = 1,
-    size_km: Annotated[float | None, typer.Option(help="Side of the generated place; default: 3 by 2 km.")] = None,
-    image: Annotated[
-        Path | None, typer.Option(help="GeoTIFF that the camera sees; without it a place is generated.")
-    ] = None,
-    map_path: Annotated[
-        Path | None, typer.Option("--map", help="GeoTIFF of another date for the map; default: --image.")
-    ] = None,
-    dem: Annotated[Path | None, typer.Option(help="Elevation GeoTIFF under --image; default: flat.")] = None,
-    vehicle: Annotated[Kind, typer.Option(help="Who flies.")] = Kind.PLANE,
-    mission: Annotated[
-        Path | None, typer.Option(help="QGroundControl .plan or waypoint file; default: a closed course.")
-    ] = None,
+    seed: Seed = 1,
+    size_km: SizeKm = None,
+    image: Image = None,
+    map_path: Map = None,
+    dem: Dem = None,
+    vehicle: Vehicle = Kind.PLANE,
+    mission: MissionFile = None,
     length_km: Annotated[float | None, typer.Option(help="Length of that course.")] = None,
     from_ground: Annotated[bool, typer.Option("--from-ground", help="That course has take-off and landing.")] = False,
-    duration: Annotated[float | None, typer.Option(help="Seconds; default: until the mission is done.")] = None,
-    agl: Annotated[float, typer.Option(help="Height of that course above ground, metres.")] = 130.0,
-    events: Annotated[Path | None, typer.Option(help="TOML file with [[gnss]] outages, jamming, spoofing.")] = None,
+    duration: Duration = None,
+    agl: Agl = 130.0,
+    events: Events = None,
     jam_after: Annotated[float | None, typer.Option(help="GNSS is jammed from this second on.")] = None,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:

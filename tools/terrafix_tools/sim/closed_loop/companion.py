@@ -19,6 +19,7 @@ from terrafix.messages import (
     Message,
     NavEstimate,
     Origin,
+    PositionSource,
     Prediction,
     SourceEnded,
     StatusText,
@@ -153,7 +154,7 @@ class Companion:
 
     def _sink(self, _who: str, message: Message) -> None:
         self._heard.append(message)
-        if isinstance(message, GpsInput | StatusText):
+        if isinstance(message, GpsInput | PositionSource | StatusText):
             self._edge.heard(message)
         elif isinstance(message, NavEstimate):
             self.said_ns[message.frame_id] = self._now_ns

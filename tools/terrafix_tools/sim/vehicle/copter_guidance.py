@@ -3,8 +3,9 @@
 import math
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mission.mission import Do, HeightOf, Mission, Target, targets
+from terrafix_tools.mission.mission import Do, HeightOf, Mission, Target
 from terrafix_tools.sim.interfaces import Navigation
+from terrafix_tools.sim.vehicle.guided import Guided
 
 GAIN_PER_S = 0.8  # velocity for a metre beside the leg, or above it
 CLIMB_MPS, SINK_MPS, SLOW_SINK_MPS = 2.5, 1.5, 0.5  # WPNAV_SPEED_UP, WPNAV_SPEED_DN, LAND_SPEED
@@ -14,29 +15,20 @@ REACHED_M = 4.0
 HOVER_REACHED_M = 2.0  # where it is to stop (WPNAV_RADIUS)
 LOITER_RADIUS_M = 20.0
 RETURN_HEIGHT_M = 15.0  # RTL_ALT: at least so high above home
-GROUND_EVERY_S = 0.2
 
 
-class Guidance:
-    """Knows nothing but the mission and what it is told in ``step``."""
+class Guidance(Guided):
+    """Of the multicopter; see Guided."""
+
+    return_height_m = RETURN_HEIGHT_M
 
     def __init__(
         self, mission: Mission, frame: LocalFrame, height: HeightOf, cruise_mps: float, brake_mps2: float
     ) -> None:
-        self._targets = targets(mission, frame, height)
-        self._height = height
-        self._home = frame.to_local(mission.home_lat_deg, mission.home_lon_deg)
-        self._home_amsl_m = height(*self._home)
-        self._on_ground = mission.starts_on_ground()
-        self._speed_mps, self._brake_mps2 = cruise_mps, brake_mps2
-        self._at = 0
-        self._over = False  # the last item is done
-        self._goal_up_m, self._over_ground = math.nan, False
+        super().__init__(mission, frame, height, cruise_mps)
+        self._brake_mps2 = brake_mps2
         self._arrived_s: float | None = None
         self._bearing_rad = self._turned_rad = 0.0
-        self._ground_m, self._ground_at_s, self._t_s = self._home_amsl_m, -math.inf, 0.0
-        e_m, n_m, _ = self.start()
-        self._from = (e_m, n_m)
 
     @property
     def finished(self) -> bool:
@@ -47,24 +39,10 @@ class Guidance:
     def landing(self) -> bool:
         return not self._over and self._targets[self._at].do in (Do.LAND, Do.RETURN)
 
-    def start(self) -> tuple[float, float, float]:
-        """-> east, north [m] and heading [rad] of the vehicle at time zero."""
-        places = [(t.e_m, t.n_m) for t in self._targets if not math.isnan(t.e_m)]
-        begin = self._home if self._on_ground else places[0]
-        ahead = next((p for p in places if math.dist(p, begin) > 1.0), (begin[0], begin[1] + 1.0))
-        return *begin, math.atan2(ahead[0] - begin[0], ahead[1] - begin[1])
-
-    def first_height_m(self, ground_m: float) -> float:
-        """AMSL of a vehicle that begins in the air over ground of this height."""
-        heights = (t.up_m(ground_m) for t in self._targets if not math.isnan(t.height_m))
-        return next(heights, ground_m + RETURN_HEIGHT_M)
-
     def step(self, dt_s: float, seen: Navigation, agl_m: float) -> tuple[float, float, float]:
         """-> wished velocity east, north, up [m/s]. ``agl_m`` (a rangefinder's) serves the landing alone."""
-        self._t_s += dt_s
         e, n, up = seen.p_b_in_w_m.tolist()
-        if self._t_s - self._ground_at_s >= GROUND_EVERY_S:
-            self._ground_m, self._ground_at_s = self._height(e, n), self._t_s
+        self._pass_time(dt_s, e, n)
         while not self._over and self._done(self._targets[self._at], e, n, up):
             self._next(e, n)
         if self._over:
@@ -124,7 +102,7 @@ class Guidance:
         )
 
     def _climb(self, up: float) -> float:
-        goal_m = self._goal_up_m + (self._ground_m if self._over_ground else 0.0)
+        goal_m = self._goal_up_m
         return 0.0 if math.isnan(goal_m) else min(max(GAIN_PER_S * (goal_m - up), -SINK_MPS), CLIMB_MPS)
 
     @staticmethod
@@ -134,9 +112,9 @@ class Guidance:
     # --- what next ---
 
     def _done(self, target: Target, e: float, n: float, up: float) -> bool:
-        if not math.isnan(target.height_m) and target.do is not Do.LAND:
-            self._goal_up_m, self._over_ground = target.height_m, target.over_ground
-        goal_m = self._goal_up_m + (self._ground_m if self._over_ground else 0.0)
+        if target.do is not Do.LAND:
+            self._want_height(target)
+        goal_m = self._goal_up_m
         match target.do:
             case Do.SPEED:
                 self._speed_mps = target.amount
@@ -153,7 +131,7 @@ class Guidance:
                 return self._turned_rad >= math.tau * target.amount
             case Do.RETURN:
                 self._over_ground = False
-                self._goal_up_m = max(self._goal_up_m, self._home_amsl_m + RETURN_HEIGHT_M)
+                self._wanted_m = max(self._wanted_m, self._home_amsl_m + RETURN_HEIGHT_M)
         return False
 
     def _waited(self, target: Target, e: float, n: float) -> bool:

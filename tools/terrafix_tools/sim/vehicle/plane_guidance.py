@@ -7,8 +7,9 @@ import math
 from dataclasses import dataclass
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mission.mission import Do, HeightOf, Mission, Target, targets
+from terrafix_tools.mission.mission import Do, HeightOf, Mission, Target
 from terrafix_tools.sim.interfaces import Navigation
+from terrafix_tools.sim.vehicle.guided import Guided
 from terrafix_tools.sim.vehicle.motion import GRAVITY_MPS2
 
 LOOK_AHEAD_S = 4.2  # ArduPlane: NAVL1_PERIOD 17 s, damping 0.75 -> 0.75 * 17 / pi
@@ -20,7 +21,6 @@ RETURN_HEIGHT_M = 100.0  # above home (ArduPlane RTL_ALTITUDE)
 GLIDE = 0.09  # height lost per metre on the way to the landing point
 FLOAT_M = 8.0  # flown in the flare
 TAKE_OFF_AHEAD_M = 3000.0  # the runway's line goes on until the height is reached
-GROUND_EVERY_S = 0.2  # between two looks at the ground, for heights that count from it
 
 
 @dataclass(frozen=True)
@@ -31,27 +31,19 @@ class Wish:
     landing: bool = False
 
 
-class Guidance:
-    """Knows nothing but the mission and what it is told in ``step``."""
+class Guidance(Guided):
+    """Of the fixed wing; see Guided."""
+
+    return_height_m = RETURN_HEIGHT_M
 
     def __init__(
         self, mission: Mission, frame: LocalFrame, height: HeightOf, cruise_mps: float, bank_rad: float
     ) -> None:
-        self._targets = targets(mission, frame, height)
-        self._height = height
-        self._home = frame.to_local(mission.home_lat_deg, mission.home_lon_deg)
-        self._home_amsl_m = height(*self._home)
-        self._on_ground = mission.starts_on_ground()
-        self._speed_mps, self._bank_rad = cruise_mps, bank_rad
-        self._at = 0
-        self._over = False  # the last item is done
-        self._goal_up_m, self._over_ground = math.nan, False
+        super().__init__(mission, frame, height, cruise_mps)
+        self._bank_rad = bank_rad
         self._since_s = self._turned_rad = 0.0
         self._bearing_rad: float | None = None  # from the centre of the circle that is flown
-        self._ground_m, self._ground_at_s, self._t_s = self._home_amsl_m, -math.inf, 0.0
-        e_m, n_m, heading = self.start()
-        self._from = (e_m, n_m)
-        self._course_rad = heading
+        self._course_rad = self.start()[2]
         if not self._on_ground:
             self._skip_first()
 
@@ -62,32 +54,18 @@ class Guidance:
             return True
         return self._targets[self._at].do in (Do.LOITER, Do.RETURN) and self._bearing_rad is not None
 
-    def start(self) -> tuple[float, float, float]:
-        """-> east, north [m] and heading [rad] of the vehicle at time zero."""
-        places = [(t.e_m, t.n_m) for t in self._targets if not math.isnan(t.e_m)]
-        begin = self._home if self._on_ground else places[0]
-        ahead = next((p for p in places if math.dist(p, begin) > 1.0), (begin[0], begin[1] + 1.0))
-        return *begin, math.atan2(ahead[0] - begin[0], ahead[1] - begin[1])
-
-    def first_height_m(self, ground_m: float) -> float:
-        """AMSL of a vehicle that begins in the air over ground of this height."""
-        heights = (t.up_m(ground_m) for t in self._targets if not math.isnan(t.height_m))
-        return next(heights, ground_m + RETURN_HEIGHT_M)
-
     def step(self, dt_s: float, seen: Navigation) -> Wish:
-        self._t_s += dt_s
-        self._since_s += dt_s
         e, n, up = seen.p_b_in_w_m.tolist()
         ve, vn, _ = seen.velocity_enu_mps.tolist()
-        if self._t_s - self._ground_at_s >= GROUND_EVERY_S:
-            self._ground_m, self._ground_at_s = self._height(e, n), self._t_s
+        self._pass_time(dt_s, e, n)
+        self._since_s += dt_s
         while not self._over and self._done(self._targets[self._at], e, n, up):
             self._next()
         aim = self._aim(e, n, math.hypot(ve, vn))
         landing = not self._over and self._targets[self._at].do is Do.LAND
         if landing:
-            self._goal_up_m = self._glide_m(self._targets[self._at], e, n, up)
-        goal_m = self._goal_up_m + (self._ground_m if self._over_ground and not landing else 0.0)
+            self._wanted_m, self._over_ground = self._glide_m(self._targets[self._at], e, n, up), False
+        goal_m = self._goal_up_m
         climb_mps = 0.0 if math.isnan(goal_m) else (goal_m - up) * CLIMB_GAIN_PER_S
         if landing and goal_m < up:  # on the slope: it sinks with it
             climb_mps -= GLIDE * math.hypot(ve, vn)
@@ -156,7 +134,7 @@ class Guidance:
                 return True
             case Do.TAKE_OFF | Do.ALTITUDE:
                 self._want_height(target)
-                goal = self._goal_up_m + (self._ground_m if self._over_ground else 0.0)
+                goal = self._goal_up_m
                 return math.isnan(goal) or (
                     up > goal - REACHED_M and (target.do is Do.TAKE_OFF or up < goal + REACHED_M)
                 )
@@ -174,7 +152,7 @@ class Guidance:
             case Do.LOITER:
                 self._want_height(target)
             case Do.RETURN:
-                self._goal_up_m, self._over_ground = self._home_amsl_m + RETURN_HEIGHT_M, False
+                self._wanted_m, self._over_ground = self._home_amsl_m + RETURN_HEIGHT_M, False
                 if not math.isnan(target.height_m):
                     self._want_height(target)
         return False
@@ -190,10 +168,6 @@ class Guidance:
         east, north = target.e_m - self._from[0], target.n_m - self._from[1]
         by = (e - target.e_m) * east + (n - target.n_m) * north > 0.0
         return by or math.hypot(e - target.e_m, n - target.n_m) < near_m
-
-    def _want_height(self, target: Target) -> None:
-        if not math.isnan(target.height_m):
-            self._goal_up_m, self._over_ground = target.height_m, target.over_ground
 
     def _next(self) -> None:
         target = self._targets[self._at]

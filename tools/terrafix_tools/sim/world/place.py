@@ -36,7 +36,6 @@ WEST_M, NORTH_M = (
 SMALLEST_M, LARGEST_KM2 = 100.0, 100.0
 PIECE_PX = 2048  # a whole look is painted in pieces of this size; a multiple of the blocks of a GeoTIFF
 COARSE = 3  # level of the view that is painted anew: from high up the country is drawn coarser, not made smaller
-MAP_CE90_M = 1.0  # map and view are drawn from one plan: exact but for the pixels
 JPEG_QUALITY = 90  # of the map's tiles: invisible, and a tenth of the size
 
 
