@@ -20,6 +20,7 @@ Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 Mat2 = tuple[float, float, float, float]
 Mat6 = tuple[float, ...]
+ImuSample = tuple[int, float, float, float, float, float, float]
 
 
 class SourceLabel(StrEnum):
@@ -62,6 +63,17 @@ class Verdict(StrEnum):
     INNOVATION = "innovation"  # disagrees with the estimate by more than both claim
     STALE = "stale"
     IMPLAUSIBLE = "implausible"  # jump, speed or height that cannot be
+    LOST = "lost"  # what is seen is not where the vehicle was believed to be; its place is searched
+
+
+class SearchStep(StrEnum):
+    """How far the search for the vehicle's place has gone (PB-8)."""
+
+    NORMAL = "normal"
+    SKIP = "skip"  # this frame says nothing; the next one is tried
+    WIDEN = "widen"  # lost: around the last place, 1 to 25 tiles
+    WHOLE_MAP = "whole_map"
+    ASK = "ask"  # the whole map was searched: a coarse position from the operator would help
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
@@ -96,7 +108,7 @@ class Origin(Message, frozen=True, kw_only=True):
     lat_deg: float
     lon_deg: float
     ground_amsl_m: float | None  # AMSL height of the ground at the origin
-    start_sigma_m: float  # 1-sigma of the start coordinate, per horizontal axis
+    start_sigma_m: float  # 1-sigma of the start coordinate, per horizontal axis; of the size of the map: not known
     yaw_sigma_deg: float
     agl_sigma_m: float
     attitude_sigma_deg: float  # roll and pitch, when they are reported
@@ -124,6 +136,16 @@ class VehicleState(Message, frozen=True, kw_only=True):
     agl_m: float | None = None
     velocity_enu_mps: Vec3 | None = None
     armed: bool | None = None  # motors may turn; a vehicle that is not armed stands
+
+
+class Imu(Message, frozen=True, kw_only=True):
+    """Inertial readings of the autopilot, a few at a time, oldest first; ``t_ns`` is that of the newest.
+
+    ``samples``: (ns before ``t_ns``; specific force forward, right, down [m/s^2]; angular velocity about the same
+    axes [rad/s]). Level and at rest the specific force is (0, 0, -9.81)."""
+
+    source: str  # "mavlink"
+    samples: list[ImuSample]
 
 
 class SourceEnded(Message, frozen=True, kw_only=True):
@@ -194,6 +216,9 @@ class MapMatch(Message, frozen=True, kw_only=True):
     )
     relief_m: float = 0.0  # what the ground that is seen departs from that plane, root mean square
     map_sigma_m: float = 0.0  # error of the map itself, 1-sigma per horizontal axis: common to all matches
+    step: SearchStep = SearchStep.NORMAL
+    lost_sigma_m: float = 0.0  # that the place may be wrong: 1-sigma per horizontal axis, on top of what is predicted
+    found: bool = False  # by a search: what was believed of the position before counts for nothing
 
 
 # --- estimator ------------------------------------------------------------------------------------
@@ -264,6 +289,8 @@ class GpsInput(Message, frozen=True, kw_only=True):
     vert_accuracy_m: float
     satellites_visible: int
     estimate_age_ms: float  # age of the estimate that this was carried forward from; -1: none
+    caution: int = 0  # rung of the caution ladder: 1, 2, 3 from 5, 15, 35 s without a map fix
+    unanchored_s: float | None = None  # seconds since the last map fix; None: nothing was believed yet
     reason: str = ""  # why fix_type is not 3
 
 
@@ -275,9 +302,47 @@ class LinkStatus(Message, frozen=True, kw_only=True):
     sysid: int
     sent: int
     received: int
-    bad: int
+    bad: int  # bytes that belonged to no packet
+    refused: int = 0  # packets without the signature that is asked for
     time_offset_ms: float | None
     detail: str = ""
+
+
+class GnssReading(Message, frozen=True, kw_only=True):
+    """What a GNSS receiver of the autopilot says, at its arrival; to be judged, never to navigate by."""
+
+    receiver: int  # 0 is the autopilot's GPS1
+    fix_type: int  # GPS_FIX_TYPE: 3 is 3D
+    lat_deg: float | None  # None: no position
+    lon_deg: float | None
+    horizontal_m: float | None  # 1-sigma that it claims
+    speed_mps: float | None
+    satellites: int | None
+
+
+class GnssState(StrEnum):
+    UNKNOWN = "unknown"  # nothing to compare with yet
+    TRUSTED = "trusted"  # has agreed with the map for long enough
+    LOST = "lost"  # no fix, silent, or useless by its own word
+    SPOOFED = "spoofed"  # says a position that cannot be
+    DISPUTED = "disputed"  # disagrees, but just when our own estimate moved
+
+
+class GnssVerdict(Message, frozen=True, kw_only=True):
+    """What is thought of a GNSS receiver: on every change, and once a second."""
+
+    receiver: int
+    state: GnssState
+    distance_m: float | None  # from our estimate
+    sigmas: float | None  # the same in standard deviations, when both claims are honest
+    reason: str = ""
+
+
+class PositionSource(Message, frozen=True, kw_only=True):
+    """The autopilot is to fly on us (``vision``), or on its GNSS ``receiver`` again."""
+
+    vision: bool
+    receiver: int
 
 
 class WallClock(Message, frozen=True, kw_only=True):
@@ -340,6 +405,7 @@ AnyMessage = (
     Origin
     | Frame
     | VehicleState
+    | Imu
     | SourceEnded
     | Odometry
     | Prediction
@@ -349,6 +415,9 @@ AnyMessage = (
     | MeasurementVerdict
     | GpsInput
     | LinkStatus
+    | GnssReading
+    | GnssVerdict
+    | PositionSource
     | WallClock
     | StatusText
     | ThermalReading

@@ -286,6 +286,24 @@ def test_fixes_over_new_ground_that_agree_with_each_other_win() -> None:
     assert {run.verdicts("odometry")[i].verdict for i in range(restarted + 4, 90)} == {Verdict.ACCEPTED}
 
 
+def test_a_place_that_was_found_late_is_carried_to_the_newest_frame() -> None:
+    """A search answers about a frame from two seconds ago; the vehicle has flown on since."""
+    flight, offset = Flight(60, seed=9), (480.0, -340.0)
+    run = Listener().fly(flight, 0, 30)
+    for i in range(30, 41):
+        run.hear(without_fix(flight.messages(i)))
+    found = msgspec.structs.replace(flight.fix(36, offset), found=True)
+    said = [m for m in run.hear([found]) if isinstance(m, NavEstimate)]
+    assert [(m.frame_id, m.last_anchor_age_ms) for m in said] == [(40, 2000)]
+    for i in range(40, 60):
+        if i > 40:
+            run.hear(without_fix(flight.messages(i)))
+        off_m = error_m(run.estimate(i), flight, offset)[:2]
+        assert np.linalg.norm(off_m) < 15.0 + 0.5 * (i - 40)
+        assert off_m @ np.linalg.solve(cov_of(run.estimate(i))[:2, :2], off_m) < 12.0
+    assert {run.verdicts("odometry")[i].verdict for i in range(45, 60)} == {Verdict.ACCEPTED}
+
+
 def test_a_match_of_a_frame_that_is_long_gone_is_stale() -> None:
     flight = Flight(50, seed=1)
     run = Listener().fly(flight, 0, 50)
@@ -437,7 +455,7 @@ def test_over_hills_odometry_is_trusted_less() -> None:
                 for m in kept
             )
         claims.append(sigma_m(run.estimate(29)))
-    assert claims[1] > 1.3 * claims[0]
+    assert claims[1] > 1.1 * claims[0]
 
 
 def test_a_vehicle_that_is_not_armed_stays_where_it_was() -> None:

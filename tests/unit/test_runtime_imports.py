@@ -23,6 +23,7 @@ OWNERS = {
         "terrafix.core.tlog",
         "terrafix_tools.sim.flights.log",
         "terrafix_tools.sim.sitl",
+        "terrafix_tools.preflight",
     ),  # tlog: reads recorded telemetry
     "mavsdk": ("terrafix_tools.sim.sitl",),
     "serial": ("terrafix.link",),

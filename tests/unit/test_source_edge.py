@@ -17,6 +17,8 @@ from terrafix.messages import Frame, Message, Origin, SourceEnded, VehicleState
 from terrafix.vision.edge import OVERTAKEN, SourceEdge, make_edge
 from terrafix.vision.sources import Shot, open_source
 
+pytestmark = pytest.mark.real_time
+
 
 class Listener:
     """Polls an edge until something is true, as the live shell would."""

@@ -10,6 +10,7 @@ import pytest
 from source_folders import HEADER, TOML, flight, jpeg, picture
 
 from terrafix.core.errors import SourceError, UsageError
+from terrafix.core.start import start_is_unknown
 from terrafix.vision.sources import open_source, parse_start
 
 
@@ -42,13 +43,12 @@ def test_going_on_in_the_middle_keeps_ids_and_times(tmp_path: Path) -> None:
     assert len(shots[0].states) == 1
 
 
-def test_start_on_the_command_line_wins_and_stands_in(tmp_path: Path) -> None:
+def test_start_on_the_command_line_wins_and_may_be_missing(tmp_path: Path) -> None:
     without = TOML.replace("[start]\nlat_deg = 48.0\nlon_deg = 2.0\n", "")
     folder = str(flight(tmp_path / "f", toml=without))
     assert open_source(folder, start=(1.0, 2.0)).origin().lat_deg == 1.0
-    with pytest.raises(SourceError) as error:
-        open_source(folder)
-    assert "[start]" in one_line(error) and "--start LAT,LON" in str(error.value)
+    assert start_is_unknown(open_source(folder).origin())
+    assert not start_is_unknown(open_source(folder, start=(1.0, 2.0)).origin())
     assert open_source(str(flight(tmp_path / "g")), start=(1.0, 2.0)).origin().lon_deg == 2.0
 
 

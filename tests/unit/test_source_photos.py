@@ -11,6 +11,7 @@ from source_folders import jpeg, picture
 from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import rot_w_b
+from terrafix.core.start import start_is_unknown
 from terrafix.vision.sources import open_source
 from terrafix.vision.sources.photos import body_of_gimbal
 
@@ -64,10 +65,9 @@ def test_a_broken_photo_costs_that_photo_only(tmp_path: Path) -> None:
     assert shots[0].frame.t_ns < shots[1].frame.t_ns < shots[2].frame.t_ns
 
 
-def test_without_coordinate_or_focal_length_it_says_what_to_do(tmp_path: Path) -> None:
+def test_without_coordinate_the_start_is_unknown_and_without_focal_length_it_says_what_to_do(tmp_path: Path) -> None:
     photo(tmp_path / "a.jpg", gps=False)
-    with pytest.raises(SourceError, match="pass --start LAT,LON"):
-        open_source(str(tmp_path))
+    assert start_is_unknown(open_source(str(tmp_path)).origin())
     assert open_source(str(tmp_path), start=(3.0, 4.0)).origin().lon_deg == 4.0
     (tmp_path / "a.jpg").write_bytes(jpeg(0))
     with pytest.raises(SourceError, match="no photo says its focal length"):

@@ -9,6 +9,8 @@ import typer
 from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
 from terrafix_tools.mapping.cli import app as map_app
+from terrafix_tools.montecarlo.cli import montecarlo
+from terrafix_tools.preflight.cli import preflight
 from terrafix_tools.sim.cli import app as sim_app
 
 ON_THE_GROUND = ("rasterio", "urllib3", "pmtiles", "osmium")  # the extra `ground`: a vehicle need not have it
@@ -17,6 +19,8 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position wit
 app.add_typer(map_app, name="map")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
+app.command()(preflight)
+app.command()(montecarlo)
 
 StartOption = Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")]
 ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")]

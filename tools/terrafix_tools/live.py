@@ -7,6 +7,7 @@ from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import load
 from terrafix.core.errors import MapError
 from terrafix.core.signature import trusted_keys
+from terrafix.core.start import middle_of, start_is_unknown
 from terrafix.vision.sources import open_configured, parse_start
 
 
@@ -21,12 +22,14 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     config = load(configs)
     spec = source or config.source.path
     given = map_path or (Path(config.map.path) if config.map.path else None)
+    unknown = False
     place: tuple[float, float] | None = parse_start(start or config.source.start)
     if not spec or (os.path.exists(os.path.expanduser(spec)) and not spec.startswith("/dev/")):
         opened = open_configured(config.source, spec, place)
         given = given or opened.map_hint()
         origin = opened.origin()
-        place = (origin.lat_deg, origin.lon_deg)
+        unknown = start_is_unknown(origin)
+        place = None if unknown else (origin.lat_deg, origin.lon_deg)
         opened.close()
     if given is None:
         raise MapError("no map: give one with --map (GeoTIFF or map package) or [map] path")
@@ -42,6 +45,8 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
             )
         if place is not None:
             ground_amsl_m = with_map.ground_amsl_m(*place)
+        elif unknown:
+            ground_amsl_m = with_map.ground_amsl_m(*middle_of(with_map.manifest.bounds_wgs84))
     finally:
         with_map.close()
     return package, ground_amsl_m

@@ -21,6 +21,7 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Node, NodeContext
 from terrafix.core.shell import InProcessShell
+from terrafix.core.start import placed, start_is_unknown
 from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.writer import versions
@@ -124,8 +125,8 @@ def _fly(
                 break
             if shot.image is not None:
                 frames.put(shot.frame.frame_id, shot.image)
-            for state in shot.states:
-                shell.feed(state)
+            for said in (*shot.imu, *shot.states):
+                shell.feed(said)
             shell.feed(shot.frame)
             process_ms = (time.perf_counter() - began_s) * 1e3
             output.take(heard)
@@ -168,9 +169,11 @@ def _check_map(package: Path, origin: Origin) -> tuple[Origin, dict[str, Any]]:
     """-> the origin with the height of its ground, where the map knows it; what the summary says of the map."""
     opened = MapPackage.open(package)
     try:
+        unknown = start_is_unknown(origin)
+        origin = placed(origin, opened.manifest.bounds_wgs84)
         frame = LocalFrame(origin.lat_deg, origin.lon_deg)
         local = opened.bind(frame)
-        if not opened.covers(origin.lat_deg, origin.lon_deg):
+        if not unknown and not opened.covers(origin.lat_deg, origin.lon_deg):
             raise MapError(f"{package}: {_not_covered(origin, local.bounds_m)}; use another --map or check the start")
         if origin.ground_amsl_m is None:
             ground_m = opened.ground_amsl_m(origin.lat_deg, origin.lon_deg)

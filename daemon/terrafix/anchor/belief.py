@@ -49,14 +49,22 @@ class Surface:
     n0_m: float
     cell_m: float
 
-    def at(self, e_m: float, n_m: float, reach_m: float) -> float:
-        """Best value within ``reach_m`` of a position; -9 outside."""
+    def best(self, e_m: float, n_m: float, reach_m: float) -> tuple[float, float, float]:
+        """Best value within ``reach_m`` of a position, and where (east, north); -9 outside."""
         r, c = (self.n0_m - n_m) / self.cell_m, (e_m - self.e0_m) / self.cell_m
         k = max(reach_m / self.cell_m, 1.0)
         rows = slice(max(round(r - k), 0), max(round(r + k) + 1, 0))
         columns = slice(max(round(c - k), 0), max(round(c + k) + 1, 0))
         near = np.nan_to_num(self.z[rows, columns], nan=-9.0)
-        return float(near.max()) if near.size else -9.0
+        if not near.size:
+            return -9.0, e_m, n_m
+        dr, dc = np.unravel_index(int(np.argmax(near)), near.shape)
+        there_e_m = self.e0_m + (columns.start + int(dc)) * self.cell_m
+        return float(near[dr, dc]), there_e_m, self.n0_m - (rows.start + int(dr)) * self.cell_m
+
+    def at(self, e_m: float, n_m: float, reach_m: float) -> float:
+        """Best value within ``reach_m`` of a position; -9 outside."""
+        return self.best(e_m, n_m, reach_m)[0]
 
 
 class Belief:
@@ -84,14 +92,18 @@ class Belief:
             self._mass = np.maximum(_blurred(self._mass, cells), 0.0)
             self._mass /= self._mass.sum()
 
-    def update(self, surfaces: tuple[Surface, ...], weight: float) -> None:
+    def update(self, surfaces: tuple[Surface, ...], weight: float) -> float:
         """One frame's surfaces, one for each rotation and scale that was tried; ``weight`` 0..1: share of the look that
-        is new ground (the same ground seen again proves little)."""
+        is new ground (the same ground seen again proves little).
+
+        -> log likelihood ratio of the belief as a whole, "the camera is where it says against elsewhere"."""
         llr = np.maximum.reduce([self._log_likelihood(s) for s in surfaces])
         self._mass = self._mass * np.exp(weight * llr)
-        self._mass /= self._mass.sum()
+        total = float(self._mass.sum())
+        self._mass /= total
         leak = LEAK * weight
         self._mass = (1 - leak) * self._mass + leak / self._mass.size
+        return float(np.log(total))
 
     def _log_likelihood(self, surface: Surface) -> np.ndarray:
         """On the belief's grid; what is not known counts as a little worse than chance."""
@@ -105,7 +117,7 @@ class Belief:
             ((surface.n0_m - self._n0 + axis) / surface.cell_m).astype(np.float32),
         )
         here = cv2.remap(z, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-9.0)
-        return np.where(here < -5.0, -1.0, np.clip(LLR_SLOPE * (here - LLR_ZERO_Z), LLR_MIN, LLR_MAX))
+        return log_likelihood_ratio(here)
 
     def mode(self) -> Mode:
         """The heaviest mode: centroid and mass within MODE_RADIUS_CELLS, and the mass of its best rival."""
@@ -177,6 +189,13 @@ class Belief:
         self._mass = new / new.sum()
         self._e0 -= c0 * self.cell_m
         self._n0 += r0 * self.cell_m
+
+
+def log_likelihood_ratio(z: np.ndarray) -> np.ndarray:
+    """Of a standardised correlation, "here against elsewhere"; what is not known (NaN or below -5) counts as a little
+    worse than chance."""
+    known = np.nan_to_num(z, nan=-9.0)
+    return np.where(known < -5.0, -1.0, np.clip(LLR_SLOPE * (known - LLR_ZERO_Z), LLR_MIN, LLR_MAX))
 
 
 def _blurred(mass: np.ndarray, sigma: float) -> np.ndarray:

@@ -2,10 +2,11 @@
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
-from terrafix.anchor.belief import Belief, Surface
+from terrafix.anchor.belief import Surface
 from terrafix.anchor.correlate import Searchable, standardise
 from terrafix.anchor.map_features import Describer, MapFeatures
 from terrafix.anchor.map_package import LocalMap
@@ -35,6 +36,7 @@ YAW_TOLERANCE_RAD = np.radians(4.0)
 YAW_STEP_RAD = np.radians(7.0)
 SCALE_TOLERANCE = 0.05
 SCALE_STEP = 0.08
+WIDE_YAW_RAD, WIDE_SCALE = np.radians(13.0), 0.10  # the same steps on the coarse cells of a search over the whole map
 MAX_HYPOTHESES = 81
 MIN_SIDE_CELLS = 24  # of the rectified frame
 
@@ -51,6 +53,16 @@ class View:
     yaw_sigma_rad: float
     scale_sigma: float  # of the height, relative
     tilt_sigma_rad: float
+
+
+class Window(Protocol):
+    """Camera positions to be looked at: a square. A belief is one."""
+
+    @property
+    def centre(self) -> tuple[float, float]: ...
+
+    @property
+    def half_m(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -101,7 +113,19 @@ class FrameMatcher:
     def look_cell_m(self, agl_m: float) -> float:
         return self._gsd(agl_m, LOOK_GSD_PER_AGL, self._describer) * self._describer.stride
 
-    def look(self, image: Image, view: View, belief: Belief) -> Look:
+    def cell_m(self, agl_m: float, per_agl: float) -> float:
+        """Size of a cell that is a share of the height, not finer than map and frame, in steps of half an octave."""
+        wanted = max(self._map.gsd_m, agl_m / self._camera.fx, agl_m * per_agl)
+        return float(2.0 ** (round(np.log2(wanted) * GSD_STEPS_PER_OCTAVE) / GSD_STEPS_PER_OCTAVE))
+
+    def wide_hypotheses(self, view: View) -> tuple[Hypothesis, ...]:
+        """Headings and scales for a search over the whole map."""
+        return _hypotheses(view, WIDE_YAW_RAD, WIDE_SCALE)
+
+    def rectified(self, image: Image, view: View, hypothesis: Hypothesis, gsd_m: float) -> Rectified | None:
+        return self._rectified(image, view, hypothesis, gsd_m, 1)
+
+    def look(self, image: Image, view: View, belief: Window) -> Look:
         """Correlation over the belief's window, for every rotation and scale that the prediction leaves open."""
         describer, features = self._describer, self._features
         hypotheses = _hypotheses(view)
@@ -188,9 +212,7 @@ class FrameMatcher:
         return Fix(xy, points, found.weight, pnp, cell)
 
     def _gsd(self, agl_m: float, per_agl: dict[str, float], describer: Describer) -> float:
-        frame_gsd = agl_m / self._camera.fx
-        wanted = max(self._map.gsd_m, frame_gsd, agl_m * per_agl[describer.name])
-        return float(2.0 ** (round(np.log2(wanted) * GSD_STEPS_PER_OCTAVE) / GSD_STEPS_PER_OCTAVE))
+        return self.cell_m(agl_m, per_agl[describer.name])
 
     def _rectified(self, image: Image, view: View, hypothesis: Hypothesis, gsd: float, stride: int) -> Rectified | None:
         r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
@@ -215,10 +237,12 @@ def _describe(frame: Rectified, describer: Describer) -> tuple[np.ndarray, np.nd
     return describer.describe(frame.image), mask
 
 
-def _hypotheses(view: View) -> tuple[Hypothesis, ...]:
+def _hypotheses(
+    view: View, yaw_step_rad: float = YAW_STEP_RAD, scale_step: float = SCALE_STEP
+) -> tuple[Hypothesis, ...]:
     """Grid over one and a half sigmas of heading and scale, as far as they are not known well enough."""
-    yaws = _grid(min(1.5 * view.yaw_sigma_rad, np.pi), YAW_TOLERANCE_RAD, YAW_STEP_RAD)
-    scales = [1.0 + s for s in _grid(min(1.5 * view.scale_sigma, 0.5), SCALE_TOLERANCE, SCALE_STEP)]
+    yaws = _grid(min(1.5 * view.yaw_sigma_rad, np.pi), YAW_TOLERANCE_RAD, yaw_step_rad)
+    scales = [1.0 + s for s in _grid(min(1.5 * view.scale_sigma, 0.5), SCALE_TOLERANCE, scale_step)]
     while len(yaws) * len(scales) > MAX_HYPOTHESES:
         scales = scales[1:-1] if len(scales) > 3 else [1.0]
     return tuple(Hypothesis(y, s) for y, s in itertools.product(yaws, scales))

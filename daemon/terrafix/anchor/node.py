@@ -5,17 +5,21 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
-from terrafix.anchor.belief import Belief, Mode, cell_for
+from terrafix.anchor.answer import coarse, judged
+from terrafix.anchor.belief import Belief, cell_for
+from terrafix.anchor.lost import LostWatch
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.matcher import Fix, FrameMatcher, View
+from terrafix.anchor.matcher import FrameMatcher
+from terrafix.anchor.retrieval import MapSearch
+from terrafix.anchor.views import ground_plane, view_of
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import ModelError
-from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
-from terrafix.core.node import FrameStore, NodeContext
-from terrafix.core.pose import tangent_to_world
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import FrameStore, Image, NodeContext
 from terrafix.core.signature import trusted_keys
-from terrafix.messages import MapMatch, Message, Origin, Prediction, Vec3, Verdict
+from terrafix.core.start import SEARCHED_START_M
+from terrafix.messages import MapMatch, Message, Origin, Prediction, SearchStep, Verdict
 from terrafix_engines.features import open_describer
 from terrafix_engines.runtime import ModelFileError
 
@@ -25,16 +29,15 @@ MODE_MASS = 0.9  # the belief hands a fix to the graph when one mode holds this 
 # A pose on which many patches agree is evidence of its own: found at most right places, at hardly any wrong one.
 POSE_LIKELIHOOD_RATIO = 20.0
 MODE_TRIED = 0.5  # modes below this are not tried at all
-COARSE_TILT_RAD = np.radians(10.0)  # a coarse fix says nothing of attitude: as good as unknown
-COARSE_HEIGHT_M = 100.0  # ... nor of height
-COARSE_SIGMA = 0.03  # of the height: buildings that lean and a scale that is not quite right shift the whole picture
 COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in this very frame
 MIN_AGL_M = 30.0  # below this a frame shows a few roofs and cars
-MODE_DRIFT = 0.35  # of the height: how far the pose may lie from the mode while the tilt is not yet known
 START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is not known yet
-LOST_SCORE = 2.0  # standardised correlation in the mode; a frame at the right place scores 3 to 10
-LOST_LOOKS = 4.0  # full looks below it before the search widens
+POOR_SCORE = 2.0  # standardised correlation in the mode; a frame at the right place scores 3 to 10
+POOR_LOOKS = 4.0  # full looks below it before the search widens
 WIDEN = 1.6
+LOST_SIGMA_M = 1000.0  # 1-sigma of a position that is not known, at least; more on a larger map
+FOUND_SIGMA_M = 10.0  # of the place that a search has found, for the belief that follows it
+SCALE_CHANGED = 1.5  # ratio of heights beyond which a search begins anew
 CE90_SIGMAS = 2.1460  # of a circular normal error: sqrt(-2 ln 0.1)
 
 
@@ -54,13 +57,16 @@ class AnchorNode:
         self._since_look_m = np.inf  # motion since the last look at new ground
         self._poor_looks = 0.0
         self._variance_m2 = 0.0  # of the last prediction
+        self._watch = LostWatch()
+        self._search: MapSearch | None = None  # while lost
+        self._lost_sigma_m = 0.0
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
             case Origin() if message != self._origin:  # said again after a restart of the source
                 self._origin = message
                 self._ground_m = message.ground_amsl_m or 0.0
-                self._belief = None
+                self._belief, self._search, self._watch = None, None, LostWatch()
                 if self._package is not None:
                     self._map = self._package.bind(LocalFrame(message.lat_deg, message.lon_deg))
                     self._matcher = FrameMatcher(CameraCalibration.of(message.camera), self._map, self._describer)
@@ -79,26 +85,32 @@ class AnchorNode:
             verdict=Verdict.OUTSIDE_MAP,
             matcher=self._describer.name,
             map_sigma_m=self._map_sigma_m,
+            lost_sigma_m=self._lost_sigma_m,
         )
         image = self._frames.get(prediction.frame_id)
-        if self._matcher is None:
+        if self._matcher is None or self._map is None or self._origin is None:
             return answer
-        belief = self._moved(prediction, cell_for(prediction.agl_m, self._matcher.look_cell_m(prediction.agl_m)))
+        belief = self._moved(prediction, self._map, self._matcher, self._origin)
+        if self._search is not None:
+            return self._searched(answer, prediction, image, self._search, self._map, self._matcher)
         if image is None:
-            return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE)
-        view, ground, relief_m = self._view(prediction)
+            return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE, step=SearchStep.SKIP)
+        e_m, n_m, _ = prediction.p_c_in_w_m
+        ground, relief_m = ground_plane(self._map, e_m, n_m, prediction.agl_m)
+        view = view_of(prediction, ground, self._ground_m)
         answer = msgspec.structs.replace(answer, ground=ground, relief_m=relief_m)
         if view.agl_m < MIN_AGL_M:
             return msgspec.structs.replace(answer, verdict=Verdict.TOO_LOW)
         look = self._matcher.look(image, view, belief)
         if look.verdict is not Verdict.ACCEPTED:
             return msgspec.structs.replace(answer, verdict=look.verdict)
-        weight = float(np.clip(self._since_look_m / (NEW_GROUND_SHARE * look.footprint_m), MIN_LOOK, 1.0))
+        new = min(self._since_look_m / (NEW_GROUND_SHARE * look.footprint_m), 1.0)
+        weight = max(new, MIN_LOOK)
         self._since_look_m = 0.0
-        belief.update(look.surfaces, weight)
+        gain = belief.update(look.surfaces, weight)
         mode = belief.mode()
         hypothesis, score = look.best_at(mode.e_m, mode.n_m)
-        self._watch(belief, score, weight)
+        self._widen(belief, score, weight)
         ee, en, nn = belief.covariance()
         answer = msgspec.structs.replace(
             answer,
@@ -108,10 +120,19 @@ class AnchorNode:
             mode_n_m=mode.n_m,
             belief_cov_m2=(ee, en, en, nn),
         )
-        if mode.mass < MODE_TRIED:
+        tried = mode.mass >= MODE_TRIED
+        if tried:
+            answer = judged(answer, self._matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
+        claimed_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
+        inliers = answer.inliers if answer.verdict is Verdict.ACCEPTED else 0
+        self._watch.looked(gain, weight, new, inliers, claimed_m, view.agl_m)
+        # Of the mixture "where it is believed to be, or anywhere": the variance that the second part adds.
+        self._lost_sigma_m = float(np.sqrt(self._watch.doubt)) * _anywhere_m(self._map)
+        answer = msgspec.structs.replace(answer, lost_sigma_m=self._lost_sigma_m)
+        if self._watch.lost:
+            return self._lost(answer, prediction, self._map, self._matcher)
+        if not tried:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
-        fix = self._matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m)
-        answer = self._judged(answer, fix, view)
         if answer.verdict is Verdict.ACCEPTED:
             belief.confirm(mode, POSE_LIKELIHOOD_RATIO)
             mass = belief.mode().mass
@@ -119,9 +140,10 @@ class AnchorNode:
             return msgspec.structs.replace(answer, verdict=enough, mode_mass=mass)
         if mode.mass < MODE_MASS:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
-        return self._coarse(answer, mode, belief, view) if score >= COARSE_SCORE else answer
+        return coarse(answer, mode, belief.cell_m, view) if score >= COARSE_SCORE else answer
 
-    def _moved(self, prediction: Prediction, cell_m: float) -> Belief:
+    def _moved(self, prediction: Prediction, source: LocalMap, matcher: FrameMatcher, origin: Origin) -> Belief:
+        cell_m = cell_for(prediction.agl_m, matcher.look_cell_m(prediction.agl_m))
         step_m = float(np.hypot(*prediction.step_m))
         # Blind, the error of the position grows faster than the steps' own errors add up: with that of the velocity.
         variance = max(prediction.cov[0], prediction.cov[7])
@@ -133,6 +155,12 @@ class AnchorNode:
             start = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
             tilt = prediction.agl_m * float(np.sqrt(max(prediction.cov[21], prediction.cov[28])))
             self._belief = Belief(e_m, n_m, float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt)), cell_m)
+            # A prediction that is better than that start was found before: this process was started again in flight.
+            if origin.start_sigma_m > SEARCHED_START_M and start > 0.5 * SEARCHED_START_M:
+                hint = self._start_hint(e_m, n_m, origin.start_sigma_m, source)
+                self._begin_search(MapSearch(source, matcher, prediction.agl_m, hint), source)
+        elif self._search is not None:
+            self._search.move(*prediction.step_m, sigma_m)
         else:
             self._belief.move(*prediction.step_m, sigma_m)
             self._belief.fit_window(0.0)
@@ -141,90 +169,77 @@ class AnchorNode:
         self._since_look_m += float(np.hypot(step_m, sigma_m))
         return self._belief
 
-    def _view(self, prediction: Prediction) -> tuple[View, Vec3 | None, float]:
-        """The predicted camera over the ground as the DEM has it, the plane of that ground (None: no DEM), and what the
-        ground departs from it (rms)."""
-        e_m, n_m, up_m = prediction.p_c_in_w_m
-        ground, relief_m = self._plane(e_m, n_m, prediction.agl_m)
-        agl_m = prediction.agl_m if ground is None else up_m - ground[0]
-        view = View(
-            e_m,
-            n_m,
-            rot_from_quat(prediction.q_w_c),
-            agl_m,
-            self._ground_m if ground is None else ground[0],
-            float(np.sqrt(prediction.cov[35])),
-            prediction.agl_sigma_m / max(agl_m, 1.0),
-            float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))),
+    def _start_hint(self, e_m: float, n_m: float, sigma_m: float, source: LocalMap) -> tuple[float, float] | None:
+        """Where the search begins: around a start that says something, None when it says no more than the map."""
+        e_min, n_min, e_max, n_max = source.bounds_m
+        return (e_m, n_m) if sigma_m < 0.25 * max(e_max - e_min, n_max - n_min) else None
+
+    def _lost(self, answer: MapMatch, prediction: Prediction, source: LocalMap, matcher: FrameMatcher) -> MapMatch:
+        """Nothing speaks for the place that was believed any more: the position is withdrawn and searched."""
+        search = MapSearch(source, matcher, prediction.agl_m, prediction.p_c_in_w_m[:2])
+        self._begin_search(search, source)
+        return self._searching(answer, search)
+
+    def _begin_search(self, search: MapSearch, source: LocalMap) -> None:
+        self._search = search
+        self._lost_sigma_m = _anywhere_m(source)
+
+    def _searching(self, answer: MapMatch, search: MapSearch) -> MapMatch:
+        return msgspec.structs.replace(
+            answer,
+            verdict=Verdict.LOST,
+            matches=[],
+            p_c_in_w_m=None,
+            q_w_c=None,
+            cov=None,
+            inliers=0,
+            step=search.step,
+            lost_sigma_m=self._lost_sigma_m,
         )
-        return view, ground, relief_m
 
-    def _plane(self, e_m: float, n_m: float, agl_m: float) -> tuple[Vec3 | None, float]:
-        """Least squares over the ground that is seen: AMSL below the camera, slope east, slope north; and what is left
-        (rms)."""
-        if self._map is None:
-            return None, 0.0
-        axis = np.linspace(-0.7, 0.7, 7) * agl_m
-        de, dn = (a.ravel() for a in np.meshgrid(axis, axis))
-        up = self._map.elevation(e_m + de, n_m + dn)
-        if up is None or np.isfinite(up).sum() < len(de) / 2:
-            return None, 0.0
-        known = np.isfinite(up)
-        design = np.column_stack([np.ones(known.sum()), de[known], dn[known]])
-        plane = np.linalg.lstsq(design, up[known], rcond=None)[0]
-        relief_m = float(np.sqrt(np.mean((up[known] - design @ plane) ** 2)))
-        return (float(plane[0]), float(plane[1]), float(plane[2])), relief_m
+    def _searched(
+        self,
+        answer: MapMatch,
+        prediction: Prediction,
+        image: Image | None,
+        search: MapSearch,
+        source: LocalMap,
+        matcher: FrameMatcher,
+    ) -> MapMatch:
+        """One look of the search; ACCEPTED and ``found`` when it has come to an end."""
+        if not 1 / SCALE_CHANGED < prediction.agl_m / search.agl_m < SCALE_CHANGED:
+            search = self._search = MapSearch(source, matcher, prediction.agl_m, None)
+        if image is None or prediction.agl_m < MIN_AGL_M:
+            return self._searching(answer, search)
+        view = view_of(prediction, None, self._ground_m)
+        found = search.look(image, view)
+        if found is None:
+            return self._searching(answer, search)
+        e_m, n_m = found.track.e_m, found.track.n_m
+        ground, relief_m = ground_plane(source, e_m, n_m, view.agl_m)
+        answer = msgspec.structs.replace(
+            answer, mode_e_m=e_m, mode_n_m=n_m, mode_mass=1.0, ground=ground, relief_m=relief_m, found=True
+        )
+        answer = judged(answer, found.fix, view)
+        if answer.verdict is not Verdict.ACCEPTED:
+            return self._searching(msgspec.structs.replace(answer, found=False), search)
+        self._search, self._lost_sigma_m, self._watch = None, 0.0, LostWatch()
+        answer = msgspec.structs.replace(answer, lost_sigma_m=0.0)
+        self._belief = Belief(e_m, n_m, FOUND_SIGMA_M, cell_for(view.agl_m, matcher.look_cell_m(view.agl_m)))
+        return answer
 
-    def _watch(self, belief: Belief, score: float, weight: float) -> None:
+    def _widen(self, belief: Belief, score: float, weight: float) -> None:
         """A mode that no longer fits what is seen: look wider."""
-        self._poor_looks = self._poor_looks + weight if score < LOST_SCORE else 0.0
-        if self._poor_looks >= LOST_LOOKS:
+        self._poor_looks = self._poor_looks + weight if score < POOR_SCORE else 0.0
+        if self._poor_looks >= POOR_LOOKS:
             self._poor_looks = 0.0
             belief.fit_window(belief.half_m * WIDEN)
 
-    def _coarse(self, answer: MapMatch, mode: Mode, belief: Belief, view: View) -> MapMatch:
-        """The position of the mode, as a pose factor. What is seen is the place of the ground, so the camera's position
-        goes with its tilt: p_e moves by +h, p_n by -h per radian of rotation about north and east."""
-        lever = np.zeros((2, 2))
-        lever[0, 1], lever[1, 0] = view.agl_m, -view.agl_m
-        tilt = COARSE_TILT_RAD**2 * np.eye(2)
-        cov = np.diag([0.0, 0.0, COARSE_HEIGHT_M**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2])
-        sigma2 = mode.var_m2 + belief.cell_m**2 + (COARSE_SIGMA * view.agl_m) ** 2
-        cov[:2, :2] = lever @ tilt @ lever.T + sigma2 * np.eye(2)
-        cov[:2, 3:5] = lever @ tilt
-        cov[3:5, :2] = cov[:2, 3:5].T
-        return msgspec.structs.replace(
-            answer,
-            verdict=Verdict.ACCEPTED,
-            coarse=True,
-            p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + view.agl_m),
-            q_w_c=quat_from_rot(view.r_w_c),
-            cov=tuple(float(v) for v in cov.ravel()),
-        )
 
-    def _judged(self, answer: MapMatch, fix: Fix | None, view: View) -> MapMatch:
-        if fix is None:
-            return msgspec.structs.replace(answer, verdict=Verdict.DEGENERATE)
-        pnp = fix.pnp
-        verdict = pnp.verdict
-        if pnp.fit is None:
-            return msgspec.structs.replace(answer, verdict=verdict, inliers=int(pnp.inliers.sum()))
-        p = pnp.fit.p_c_in_w_m
-        drift = np.array([p[0] - answer.mode_e_m, p[1] - answer.mode_n_m])
-        if float(np.hypot(*drift)) > MODE_DRIFT * view.agl_m:
-            verdict = Verdict.DEGENERATE
-        matches = np.column_stack([fix.xy, fix.points_w_m, fix.weights])[pnp.inliers]
-        cov = tangent_to_world(pnp.fit.cov, pnp.fit.r_w_c)
-        return msgspec.structs.replace(
-            answer,
-            verdict=verdict,
-            matches=[(float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in matches],
-            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-            q_w_c=quat_from_rot(pnp.fit.r_w_c),
-            cov=tuple(float(v) for v in cov.ravel()),
-            inliers=int(pnp.inliers.sum()),
-            reprojection_px=float(np.sqrt(np.mean(pnp.fit.residuals**2))) * view.agl_m / fix.cell_m,
-        )
+def _anywhere_m(source: LocalMap) -> float:
+    """1-sigma per axis of a position of which nothing is known."""
+    e_min, n_min, e_max, n_max = source.bounds_m
+    return max(LOST_SIGMA_M, 0.5 * (e_max - e_min), 0.5 * (n_max - n_min))
 
 
 def make_node(ctx: NodeContext) -> AnchorNode:

@@ -15,6 +15,9 @@ from msgspec import Meta
 from terrafix.core.errors import ConfigError
 
 Positive = Annotated[float, Meta(gt=0)]
+OutputName = Literal["gps_input", "odometry", "vision_position", "external_position", "global_position"]
+GnssMode = Literal["off", "advise", "act"]
+Baud = Annotated[int, Meta(ge=9600, le=3_000_000)]
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -34,11 +37,19 @@ class Models(Section, frozen=True, kw_only=True):
 
 class LinkSection(Section, frozen=True, kw_only=True):
     device: str = "udpout:127.0.0.1:14550"
-    baud: Annotated[int, Meta(ge=9600, le=3_000_000)] = 921_600
+    baud: Baud = 921_600
     sysid: Annotated[int, Meta(ge=1, le=255)] = 1
     compid: Annotated[int, Meta(ge=1, le=255)] = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+    autopilot_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: the first autopilot that is heard
+    signing_key: str = ""  # file with the MAVLink 2 signing key; empty: neither signed nor checked
     gps_id: Annotated[int, Meta(ge=0, le=3)] = 0
     rate_hz: Annotated[float, Meta(ge=5, le=15)] = 10.0  # faster leaves gaps that the autopilot drops
+    outputs: list[OutputName] = []  # empty: by the autopilot, gps_input for ArduPilot, global_position for PX4
+    gnss: GnssMode = "advise"  # what follows when a receiver disagrees with the map
+    nmea_device: str = ""  # also NMEA 0183 to this device
+    nmea_baud: Baud = 115_200
+    msp_device: str = ""  # also MSP2_SENSOR_GPS to this device
+    msp_baud: Baud = 115_200
 
 
 class RecorderSection(Section, frozen=True, kw_only=True):

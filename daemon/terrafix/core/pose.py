@@ -8,7 +8,8 @@ import numpy as np
 
 HUBER_K = 1.345  # in sigmas; 95 % efficiency on Gaussian noise (Huber 1981)
 MAX_ITERATIONS = 15
-STEP_TOLERANCE = 1e-7  # rad and relative metres: below any noise here
+MAX_CONDITION = 1e9  # of the normal equations, in units in which a perfect geometry has a few
+STEP_TOLERANCE = 1e-5  # rad and relative metres: a hundredth of a pixel, below any noise here
 
 
 @dataclass(frozen=True)
@@ -72,17 +73,20 @@ def fit_pose(
     weights: np.ndarray | None = None,
     effective: float = 1.0,
     tilt_sigma_rad: float | None = None,
+    tolerance: float = STEP_TOLERANCE,
 ) -> PoseFit | None:
     """Robust least squares on the reprojection error of points (N, 3) seen at normalised ``xy`` (N, 2).
 
     ``effective``: share of the matches that count as independent (neighbouring patches share pixels; relief moves
     whole blocks of them). ``tilt_sigma_rad``: how well the tilt of the given ``r_w_c`` is known, when it is to be a
-    prior: matches in a narrow band trade tilt for translation. ``None`` when the geometry does not determine a pose."""
+    prior: matches in a narrow band trade tilt for translation. ``tolerance``: of the last step, rad and relative
+    metres. ``None`` when the geometry does not determine a pose."""
     weights = np.ones(len(xy)) if weights is None else weights
     sigma = sigma_floor
     r, p = r_w_c, p_c_in_w_m
     hessian = np.eye(6)
     error = np.zeros((len(xy), 2))
+    scale = np.ones(6)
     for _ in range(MAX_ITERATIONS):
         predicted, jacobian, depth = project_with_jacobian(r, p, points_w_m)
         if np.any(depth <= 0):
@@ -91,20 +95,22 @@ def fit_pose(
         norm = np.linalg.norm(error, axis=1)
         sigma = max(sigma_floor, float(np.median(norm)) / 1.177)  # the median of a Rayleigh variable is 1.177 sigma
         w = weights * np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
-        hessian = np.einsum("nia,n,nib->ab", jacobian, w, jacobian)
-        gradient = np.einsum("nia,n,ni->a", jacobian, w, error)
+        flat, weighted = jacobian.reshape(-1, 6), (jacobian * w[:, None, None]).reshape(-1, 6)
+        hessian = weighted.T @ flat
+        gradient = weighted.T @ error.ravel()
         if tilt_sigma_rad is not None:
             stiffness = sigma**2 / effective / tilt_sigma_rad**2 * np.array([1.0, 1.0])
             hessian[[0, 1], [0, 1]] += stiffness
             gradient[:2] -= stiffness * log_so3(r_w_c.T @ r)[:2]
-        scale = np.array([1.0, 1.0, 1.0, *([1.0 / float(np.median(depth))] * 3)])
+        scale[3:] = len(depth) / float(depth.sum())
         scaled = hessian * np.outer(1 / scale, 1 / scale)
-        if np.linalg.cond(scaled) > 1e9:
+        eigenvalues = np.linalg.eigvalsh(scaled)
+        if not eigenvalues[0] * MAX_CONDITION > eigenvalues[-1]:  # written so that a NaN fails, too
             return None
         step = np.linalg.solve(scaled, gradient / scale) / scale
         r = r @ exp_so3(step[:3])
         p = p + r @ step[3:]
-        if float(np.abs(step * scale).max()) < STEP_TOLERANCE:
+        if float(np.abs(step * scale).max()) < tolerance:
             break
     cov = sigma**2 / max(effective, 1e-6) * np.linalg.inv(hessian)
     return PoseFit(r, p, (cov + cov.T) / 2, np.linalg.norm(error, axis=1), sigma)

@@ -1,0 +1,21 @@
+"""Names that other components use."""
+
+from terrafix.estimator.pose_estimator import (
+    CovarianceDegradedWarning,
+    MatchResult,
+    PnpFailureError,
+    PoseEstimate,
+    PoseEstimator,
+    ThermalState,
+)
+from terrafix.messages import CovarianceMode
+
+__all__ = [
+    "CovarianceDegradedWarning",
+    "CovarianceMode",
+    "MatchResult",
+    "PnpFailureError",
+    "PoseEstimate",
+    "PoseEstimator",
+    "ThermalState",
+]

@@ -1,19 +1,39 @@
-"""The two factors that GTSAM lacks: what an autopilot says of attitude and height, seen through the camera's mount,
-and two cameras that look at the same ground.
+"""The factors that GTSAM lacks: what an autopilot says of attitude and height, seen through the camera's mount; two
+cameras that look at the same ground; and the way from one node to the next by velocity and acceleration.
 
-Variables of a node k: C_k, the camera pose in the world (Pose3), and B_k, a vector of four slow errors
-(mount tilt about the camera's x and y axes [rad], heading bias [rad], height bias [m])."""
+Variables of a node k: C_k, the camera pose in the world (Pose3); B_k, a vector of four slow errors (mount tilt about
+the camera's x and y axes [rad], heading bias [rad], height bias [m]); V_k, velocity and the acceleration that nobody
+measured (velocity.py)."""
 
+import math
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from terrafix.core.pose import exp_so3, log_so3, project_with_jacobian, skew
+from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.pose import log_so3, project_with_jacobian
 from terrafix.estimator.motion import EFFECTIVE_PAIRS, Ground
+from terrafix.estimator.velocity import Leg
 
 BIAS_SIZE = 4
 BLOCK_HUBER_K = 1.5
+REDUCED = 11  # residuals of a pair of cameras above a plane, after the reduction
+
+
+def tilted(x_rad: float, y_rad: float) -> np.ndarray:
+    """R (3x3) of a mount that is tilted about the camera's x and y axes; Rodrigues' formula."""
+    angle2 = x_rad * x_rad + y_rad * y_rad
+    angle = math.sqrt(angle2)
+    s = math.sin(angle) / angle if angle > 1e-9 else 1.0
+    c = (1.0 - math.cos(angle)) / angle2 if angle > 1e-9 else 0.5
+    return np.array(
+        [
+            [1.0 - c * y_rad * y_rad, c * x_rad * y_rad, s * y_rad],
+            [c * x_rad * y_rad, 1.0 - c * x_rad * x_rad, -s * x_rad],
+            [-s * y_rad, s * x_rad, 1.0 - c * angle2],
+        ]
+    )
 
 
 def attitude_and_height_residual(
@@ -23,10 +43,9 @@ def attitude_and_height_residual(
 
     Jacobians are those of small residuals: exact enough below 15 degrees, and the graph relinearises."""
     r_w_c = pose.rotation().matrix()
-    heading = exp_so3(np.array([0.0, 0.0, bias[2]]))  # a positive bias reads too far clockwise: turn it back
-    tilt = exp_so3(np.array([bias[0], bias[1], 0.0]))
-    expected = heading @ r_w_b @ r_b_c @ tilt
-    rotation_w = r_w_c @ log_so3(expected.T @ r_w_c)
+    heading = local_rotation_up(float(bias[2]))  # a positive bias reads too far clockwise: turn it back
+    expected = heading @ r_w_b @ r_b_c @ tilted(float(bias[0]), float(bias[1]))
+    rotation_w = log_so3(r_w_c @ expected.T)
     height = float(pose.translation()[2]) - (up_m - bias[3])
     by_pose = np.zeros((4, 6))
     by_pose[:3, :3] = r_w_c
@@ -77,7 +96,9 @@ def same_ground_residual(
     by_point = -by_pose[:, :, 3:] @ r_k.T
     slide = np.eye(3) - np.einsum("ni,j->nij", d / along[:, None], normal)  # along the ray, back onto the plane
     by_ray = by_point @ slide
-    cross = np.array([skew(ray) for ray in rays])
+    cross = np.zeros((len(rays), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -1.0, rays[:, 1], -rays[:, 0]
+    cross[:, 1, 0], cross[:, 2, 0], cross[:, 2, 1] = 1.0, -rays[:, 1], rays[:, 0]
     by_keyframe = np.concatenate([-depth[:, None, None] * (by_ray @ r_kf @ cross), by_ray @ r_kf], axis=2)
     by_height = np.einsum("nij,nj->ni", by_point, d / along[:, None])
     n = 2 * len(pairs)
@@ -94,27 +115,109 @@ def same_ground_factor(
     ground: Ground,
 ) -> gtsam.CustomFactor:
     """``pairs`` (N, 4) normalised with the 1-sigma ``sigma`` of a coordinate. The plane below the keyframe is not known
-    exactly: what its height and slope leave open is in the noise of the factor."""
+    exactly: what its height and slope leave open is in the noise of the factor.
+
+    Two cameras above a plane are ten numbers: one in the other, the keyframe's tilt against the plane, and its height.
+    In these the residuals of all pairs are linear enough to be reduced by QR, here, to eleven that have the same norm
+    (the last is what no motion explains). Where north is and where the cameras are does not enter, so that a heading or
+    a position that is corrected later does no harm."""
     normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
     p = keyframe.translation()
     offset = float(p[2]) - ground.height_m - ground.slope_e * float(p[0]) - ground.slope_n * float(p[1])
-    _, _, _, points, by_height = same_ground_residual(keyframe, pose, pairs, normal, offset)
-    away = np.repeat(points[:, :2] - p[:2], 2, axis=0)
-    by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
-    plane = np.diag([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) ** 2
-    noise = gtsam.noiseModel.Gaussian.Covariance(
-        sigma**2 * np.eye(2 * len(pairs)) + by_plane @ plane @ by_plane.T, False
-    )
+    seen, tilt, height = _reduced(keyframe, pose, pairs, sigma, ground, normal, offset)
+    at_first = keyframe.between(pose)
+    up_first = keyframe.rotation().matrix().T @ normal
+    up_unit = up_first / float(np.linalg.norm(up_first))
+    height_first = float(normal @ p)
+    turned = tilt @ (np.eye(3) - np.outer(up_unit, up_unit))
 
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
-        residual, by_keyframe, by_pose, _, _ = same_ground_residual(
-            values.atPose3(keyframe_key), values.atPose3(pose_key), pairs, normal, offset
+        c0, c1 = values.atPose3(keyframe_key), values.atPose3(pose_key)
+        r0, step = c0.rotation().matrix(), c0.between(c1)
+        up = r0.T @ normal
+        # Small rotations w of the keyframe change up by up x w: turned back into w, without the part about up itself.
+        back = np.array(
+            [
+                up[1] * up_unit[2] - up[2] * up_unit[1],
+                up[2] * up_unit[0] - up[0] * up_unit[2],
+                up[0] * up_unit[1] - up[1] * up_unit[0],
+            ]
         )
+        by_step = seen[:, :6]
+        risen = float(normal @ c0.translation()) - height_first
+        residual = seen[:, 6] + by_step @ at_first.logmap(step) + tilt @ back + height * risen
         if jacobians is not None:
-            jacobians[0] = np.asfortranarray(by_keyframe)
-            jacobians[1] = np.asfortranarray(by_pose)
-        return residual
+            by_c0 = -by_step @ step.inverse().AdjointMap()
+            by_c0[:, :3] += turned
+            by_c0[:, 3:] += np.outer(height, up)
+            jacobians[0] = np.asfortranarray(by_c0)
+            jacobians[1] = np.asfortranarray(by_step)
+        return np.asarray(residual)
 
     # Huber on the whole block: its whitened norm is about sqrt(2 * EFFECTIVE_PAIRS) when all is well.
     huber = gtsam.noiseModel.mEstimator.Huber.Create(BLOCK_HUBER_K * float(np.sqrt(2 * EFFECTIVE_PAIRS)))
-    return gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(huber, noise), [keyframe_key, pose_key], error)
+    noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(REDUCED))
+    return gtsam.CustomFactor(noise, [keyframe_key, pose_key], error)
+
+
+def _reduced(
+    keyframe: gtsam.Pose3,
+    pose: gtsam.Pose3,
+    pairs: np.ndarray,
+    sigma: float,
+    ground: Ground,
+    normal: np.ndarray,
+    offset: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whitened residuals, REDUCED of them: by the step and constant (R, 7), by the tilt (R, 3), by the height (R,)."""
+    residual, by_keyframe, by_pose, points, by_height = same_ground_residual(keyframe, pose, pairs, normal, offset)
+    # The keyframe alone, while the other camera keeps its place in it.
+    by_both = by_keyframe + by_pose @ keyframe.between(pose).inverse().AdjointMap()
+    by_up = by_both[:, 3:] @ keyframe.rotation().matrix()[2]
+    full = np.column_stack([by_pose, by_both[:, :3], by_up, residual]) / sigma
+    away = np.repeat(points[:, :2] - keyframe.translation()[:2], 2, axis=0)
+    by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
+    by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
+    # (1 + P P^T)^(-1/2) from the singular values of P: only three directions of the noise are not white.
+    u, s, _ = np.linalg.svd(by_plane, full_matrices=False)
+    full -= u @ ((1.0 - 1.0 / np.sqrt(1.0 + s**2))[:, None] * (u.T @ full))
+    r = np.asarray(np.linalg.qr(full, mode="r"))
+    return r[:, [0, 1, 2, 3, 4, 5, 10]], r[:, 6:9], r[:, 9]
+
+
+def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, leg: Leg) -> gtsam.CustomFactor:
+    """``before`` and ``after``: keys of C and V; ``bias_key``: of B at the end, whose heading turns what was felt.
+
+    Linear but for the heading, and for the axes of the poses."""
+    by_before, by_after = -leg.by_before(), np.zeros((9, 6))
+    by_after[3:, :] = np.eye(6)
+    by_pose = np.zeros((9, 6))
+    felt = np.concatenate([leg.way_m, leg.gain_mps])
+
+    def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        c0, c1 = values.atPose3(before[0]), values.atPose3(after[0])
+        v0, v1 = values.atVector(before[1]), values.atVector(after[1])
+        turn = float(values.atVector(bias_key)[2]) if leg.inertial else 0.0
+        c, s = math.cos(turn), math.sin(turn)
+        turned = np.array(
+            [
+                c * felt[0] - s * felt[1], s * felt[0] + c * felt[1], felt[2],
+                c * felt[3] - s * felt[4], s * felt[3] + c * felt[4], felt[5],
+            ]
+        )  # fmt: skip
+        residual = by_before @ v0
+        residual[:6] -= turned
+        residual[:3] += c1.translation() - c0.translation()
+        residual[3:] += v1
+        if jacobians is not None:
+            by_c0, by_c1, by_bias = by_pose.copy(), by_pose.copy(), np.zeros((9, BIAS_SIZE))
+            by_c0[:3, 3:] = -c0.rotation().matrix()
+            by_c1[:3, 3:] = c1.rotation().matrix()
+            if leg.inertial:
+                by_bias[:6, 2] = turned[1], -turned[0], 0.0, turned[4], -turned[3], 0.0
+            for i, jacobian in enumerate((by_c0, by_before, by_c1, by_after, by_bias)):
+                jacobians[i] = np.asfortranarray(jacobian)
+        return residual
+
+    noise = gtsam.noiseModel.Gaussian.Covariance(leg.cov, False)
+    return gtsam.CustomFactor(noise, [*before, *after, bias_key], error)

@@ -3,20 +3,35 @@
 Everything is asked in two steps: ``advance`` takes a frame's odometry and says where the camera should be, ``fix``
 takes the frame's map match. Both answer with a verdict."""
 
-import math
-from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from terrafix.core.camera import Mount
-from terrafix.core.geodesy import local_rotation_up, rot_from_quat, rot_w_b, yaw_of
+from terrafix.core.geodesy import rot_w_b, yaw_of
 from terrafix.core.pose import exp_so3, tangent_to_world, world_to_tangent
+from terrafix.core.start import SEARCHED_START_M
+from terrafix.estimator.doubt import Doubt
 from terrafix.estimator.factors import attitude_and_height_factor
 from terrafix.estimator.graph import NodeState, PoseGraph
+from terrafix.estimator.matched import determined, measured_pose
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
+from terrafix.estimator.rival import Rival
 from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.velocity import (
+    STANDING_M,
+    TYPICAL_SPEED_MPS,
+    Felt,
+    Leg,
+    believed,
+    leg,
+    spread_after,
+    standing_cov,
+    unknown_cov,
+    wandered_m,
+)
 from terrafix.messages import CovarianceMode, MapMatch, Odometry, Origin, Verdict
 
 UNKNOWN_RAD = 3.0  # sigma of a heading that nobody reports
@@ -28,26 +43,16 @@ HEIGHT_BIAS = 0.05  # of the height
 UNKNOWN_ATTITUDE_RAD = np.radians(4.0)  # sigma of roll and pitch that nobody reports: level flight and gentle turns
 DEFAULT_AGL_M = 120.0  # when nobody reports a height: the usual ceiling of small drones ...
 DEFAULT_AGL_SIGMA_M = 50.0  # ... and wide enough for all of them
-MAX_ACCELERATION_MPS2 = 3.0  # of small drones in cruise: how wrong the last velocity may become
-MAX_SPEED_SIGMA_MPS = 10.0  # per axis: of a velocity of which nothing is known
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
-VELOCITY_MEMORY_S = 10.0  # how long a drone keeps its course when nobody looks
 # 1-sigma of the slope and of the level (share of the height) of the ground that is seen: fields and towns without a
 # DEM; what houses and trees leave with one.
 FLAT_SIGMAS, DEM_SIGMAS = (0.03, 0.02), (0.015, 0.01)
 RELIEF_SLOPE = 2.0  # a plane that misses the ground by this share of the height misses its slope by so much more
-STANDING_M, STANDING_MPS = 0.3, 0.1  # 1-sigma of a vehicle whose motors may not turn
-VELOCITY_SPAN_S = 0.9  # a velocity is measured over about a second: shorter is noise, longer misses turns
-VELOCITY_FLOOR_M = 0.15  # error of the relative position of two nodes that close, at best
-VELOCITY_SHARE = 0.03  # ... of their distance, when the graph is not asked (cheap mode)
-BEND_SHARE = 0.4  # of the change of velocity that is carried on: the turn may have ended ...
-TURN_SHARE = 0.15  # ... which a nose that turned with it up to now denies
-TURN_AGREES = 0.5  # of the change of velocity: so close must the turn of the nose explain it
+# ... and one hill is seen by some fifteen keyframes in a row, each with the same mistake: root of that many.
+RELIEF_REPEATS = 4.0
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
-LOCAL_WARP = 0.33  # of the map's own error: by so much orthophotos are stretched over one footprint
-ROOFS = 0.03  # of the height, 1-sigma: roofs and crowns lift the ground that is seen, and with it the height
 SAME_GROUND_SHARE = 0.5  # of the height: fixes closer together than this share their errors ...
 MIN_NEW_GROUND = 0.1  # ... and a fix over the same ground counts at least this much
 COARSE_CONTINUES = 0.5  # of the height: sigma of the estimate up to which the belief's mode alone is taken as a fix
@@ -58,14 +63,23 @@ RECOVER_MASS = 0.97
 RESTART_INFLATION = 4.0  # of the covariance of the fix that starts the graph anew
 
 
+Feel = Callable[[int, int], Felt | None]
+
+
+def nothing_felt(_t0_ns: int, _t1_ns: int) -> None:
+    """There are no inertial readings."""
+
+
 @dataclass(frozen=True)
 class Placed:
-    """The camera at a frame: pose, covariance (6x6, tangent order), and which node it is."""
+    """The camera at a frame: pose, covariance (6x6, tangent order), velocity with covariance (3x3), and its node."""
 
     frame_id: int
     t_s: float
     pose: gtsam.Pose3
     cov: np.ndarray
+    velocity_mps: np.ndarray
+    velocity_cov: np.ndarray
     node: int
 
 
@@ -96,60 +110,100 @@ class Estimator:
     def __init__(self, origin: Origin) -> None:
         self.origin = origin
         self.graph = PoseGraph()
-        self.velocity_mps = np.zeros(3)
-        self.velocity_sigma_mps = MAX_SPEED_SIGMA_MPS
         self.last_fix_t_s: float | None = None
         self.mode = CovarianceMode.MARGINALS
+        self.doubt = Doubt.of(origin)
+        self.rival = Rival()
+        self._torn: dict[int, np.ndarray] = {}  # frame -> spread (2, 2) of the two places between which it was
         self.map_sigma_m = 0.0  # of the map that placed us; nothing until it did
         self.ground_m = origin.ground_amsl_m or 0.0  # AMSL of the ground below, from the map's DEM
+        self._ground_at_m = np.zeros(2)  # where that is so
         self._relief_m = 0.0  # how far the ground departs from a plane
         self._slope: tuple[float, float] | None = None  # of the ground, east and north; None: no DEM
         self._r_b_c = Mount.of(origin.camera).r_b_c()
         self._node_of: dict[int, int] = {}  # frame -> node
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
+        self._velocity_cov = np.zeros((6, 6))  # of V of the newest node
+        self._pace_mps = TYPICAL_SPEED_MPS  # how fast it was when it was last seen to fly
+        self._felt: bool | None = None  # whether the last leg was measured; None: there was none
+        self._stood_at: int | None = None  # node at which a vehicle stands, motors off
         self._last: Placed | None = None  # newest frame
         self._fixed_at_m: np.ndarray | None = None
         self._refused: _Disagreement | None = None
         self._began_with = (False, False)  # heading, height
         self._began_s: float | None = None
-        # Nodes that odometry or the map vouches for; others hang on it as leaves.
-        self._trunk: deque[int] = deque(maxlen=40)
+        self._tilt_said = False  # the autopilot reports roll and pitch
+
+    def ground_below(self, p_m: np.ndarray) -> float:
+        """AMSL of the ground under (east, north), on the plane that the map's elevation gave last."""
+        slope = np.array(self._slope or (0.0, 0.0))
+        return self.ground_m + float(slope @ (p_m[:2] - self._ground_at_m))
 
     # --- motion ---------------------------------------------------------------------------------------------
 
-    def advance(self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude) -> Advance:
+    def advance(
+        self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude, felt: Feel = nothing_felt
+    ) -> Advance:
+        """``felt(t0_ns, t1_ns)``: acceleration between two times, where the inertial readings cover them."""
         if self._last is None or self._knows_more(attitude):
             return self._begin(frame_id, t_s, attitude)
-        last = self._last
+        newest = self.graph.newest
+        before = self.graph.state(newest)
         known = self._by_odometry(odometry, attitude)
+        way = None if attitude.stands else self._leg(t_s, before, attitude, felt)
+        spread = spread_after(way, self._velocity_cov)
+        led_to, velocity = before.pose.translation(), np.zeros(6)
+        if way is not None:
+            led_to, velocity = way.predicted(led_to, before.velocity, float(before.bias[2]))
         if known is not None:
             parent, motion = known
             verdict = Verdict.ACCEPTED
         else:
-            parent, motion = self._by_guess(t_s, attitude)
+            parent, motion = self._by_guess(attitude, way is None, led_to, spread)
             verdict = odometry.verdict if odometry.verdict is not Verdict.ACCEPTED else Verdict.FEW_INLIERS
-        before = self.graph.state(parent)
-        pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m))
-        last_pose = self.graph.state(last.node).pose
-        step = (pose.translation() - last_pose.translation())[:2]
-        dt_s = max(t_s - last.t_s, 1e-3)
+        pose = self.graph.state(parent).pose.compose(gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m))
+        r_w_c, p = pose.rotation().matrix(), np.asarray(pose.translation())
+        step = (p - before.pose.translation())[:2]
+        step_sigma = STANDING_M if way is None else float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1]))
         if known is not None:
-            spread = float(np.sqrt(np.trace(motion.cov[3:, 3:]) / 3.0))
-            step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * float(np.hypot(*step)), spread))
-        else:
-            step_sigma = STANDING_M if attitude.stands else self._drift_sigma(dt_s)
-            grown = min(MAX_SPEED_SIGMA_MPS, self.velocity_sigma_mps + MAX_ACCELERATION_MPS2 * dt_s)
-            self.velocity_sigma_mps = STANDING_MPS if attitude.stands else grown
-        self._cov_of[self.graph.next_node] = _compose_cov(self._covariance(parent), motion)
-        node = self.graph.extend(
-            t_s, NodeState(pose, before.bias), parent, motion, self._attitude(attitude, pose.rotation().matrix())
-        )
+            seen = r_w_c @ motion.cov[3:, 3:] @ r_w_c.T
+            step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), np.sqrt(np.trace(seen) / 3.0)))
+            if way is not None:
+                way, spread = believed(way, p - led_to, spread, seen)
+        if self.mode is CovarianceMode.JACOBIAN:
+            self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
+        state = NodeState(pose, before.bias, velocity)
+        node = self.graph.extend(t_s, state, parent, motion, way, self._attitude(attitude, r_w_c))
+        self._felt = None if way is None else way.inertial
+        if not attitude.stands:
+            self._stood_at = None
+        elif self._stood_at is None:
+            self._stood_at = node
         self._node_of[frame_id] = node
+        self._cov_of = {n: cov for n, cov in self._cov_of.items() if self.graph.holds(n)}
+        self._velocity_cov = spread[3:, 3:]
+        self._last = self._placed(frame_id, t_s, node)
         if known is not None:
-            self._trunk.append(node)
-            self._learn_velocity(node)
-        self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
+            v = self._last.velocity_mps[:2]
+            self._pace_mps = float(np.sqrt(v @ v + np.trace(self._last.velocity_cov[:2, :2])))
+        self._note_rival(frame_id)
         return Advance(verdict, self._last, step, step_sigma)
+
+    def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Leg:
+        """From the newest node to now."""
+        from_s = self.graph.time_of(self.graph.newest)
+        measured = felt(round(from_s * 1e9), round(t_s * 1e9))
+        r_w_c = before.pose.rotation().matrix()
+        yaws = tuple(yaw_of(r @ self._r_b_c.T) for r in (r_w_c, self._expected_rotation(attitude, before.bias, r_w_c)))
+        return leg(
+            max(t_s - from_s, 1e-3),
+            measured,
+            (yaws[0], yaws[1]),
+            float(before.bias[2]),
+            self._pace_mps,
+            np.radians(self.origin.attitude_sigma_deg),
+            same_kind=self._felt is (measured is not None),
+        )
 
     def _knows_more(self, attitude: Attitude) -> bool:
         """The first words of the autopilot came after the first frame, before the first fix. No linear graph recovers
@@ -163,29 +217,30 @@ class Estimator:
         self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
         waited_s = 0.0 if self._began_s is None else t_s - self._began_s
         self._began_s = t_s - waited_s
-        drift_m = self._drift_sigma(waited_s) if waited_s > 0.0 else 0.0
+        drift_m = wandered_m(waited_s) if waited_s > 0.0 else 0.0
         tolerance = np.radians(origin.camera.mount_tolerance_deg)
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
         r_w_c = self._expected_rotation(attitude, np.zeros(4))
         pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([0.0, 0.0, self.ground_m + agl]))
-        start = float(np.hypot(max(origin.start_sigma_m, 1.0), drift_m))
+        start = float(np.hypot(min(max(origin.start_sigma_m, 1.0), SEARCHED_START_M), drift_m))
         wide = np.diag([1.0, 1.0, UNKNOWN_RAD, start, start, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
         bias_cov = np.diag([tolerance, tolerance, yaw, float(np.hypot(agl_sigma, HEIGHT_BIAS * agl))]) ** 2
-        self._trunk.clear()
+        self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
+        self._felt = self._stood_at = None
         node = self.graph.start(
             t_s,
-            NodeState(pose, np.zeros(4)),
+            NodeState(pose, np.zeros(4), np.zeros(6)),
             world_to_tangent(cov_world, r_w_c),
             bias_cov,
+            self._velocity_cov,
             self._attitude(attitude, r_w_c),
         )
-        self._trunk.append(node)
         self._node_of[frame_id] = node
-        self._last = Placed(frame_id, t_s, self.graph.state(node).pose, self._covariance(node), node)
+        self._last = self._placed(frame_id, t_s, node)
         return Advance(Verdict.ACCEPTED, self._last, np.zeros(2), drift_m)
 
     def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | None:
@@ -197,8 +252,9 @@ class Estimator:
             return None
         state = self.graph.state(parent)
         r_w_kf = state.pose.rotation().matrix()
-        height_sigma = float(np.sqrt(r_w_kf[2] @ self._covariance(parent)[3:, 3:] @ r_w_kf[2]))
-        height = float(state.pose.translation()[2]) - self.ground_m
+        height_sigma = float(np.sqrt(r_w_kf[2] @ self._cov_of[parent][3:, 3:] @ r_w_kf[2]))
+        p = state.pose.translation()
+        height = float(p[2]) - self.ground_below(p)
         if height < 2.0:
             return None
         r_w_k = self._expected_rotation(attitude, state.bias, r_w_kf)
@@ -209,8 +265,9 @@ class Estimator:
         slope_e, slope_n = self._slope or (0.0, 0.0)
         slope_sigma, level_share = DEM_SIGMAS if known_slope else FLAT_SIGMAS
         # Over hills the tracked points lie off the plane, all on one side for a while.
-        slope_sigma = float(np.hypot(slope_sigma, RELIEF_SLOPE * self._relief_m / height))
-        level_share = float(np.hypot(level_share, self._relief_m / height))
+        relief_share = RELIEF_REPEATS * self._relief_m / height
+        slope_sigma = float(np.hypot(slope_sigma, RELIEF_SLOPE * relief_share))
+        level_share = float(np.hypot(level_share, relief_share))
         share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
         ground = Ground(height, height_sigma, slope_e, slope_n, slope_sigma, level_share, share)
         motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
@@ -220,31 +277,30 @@ class Estimator:
         possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + height
         return (parent, motion) if possible else None
 
-    def _by_guess(self, t_s: float, attitude: Attitude) -> tuple[int, RelativePose]:
-        """Nothing was seen: the last velocity, less certain the longer it lasts; the heading from the compass."""
-        parent = self._trunk[-1] if self.graph.holds(self._trunk[-1]) else self.graph.newest
-        self.graph.keep(parent)  # a long silence is one long guess from here, not a chain of short ones
+    def _by_guess(
+        self, attitude: Attitude, stands: bool, led_to_m: np.ndarray, spread: np.ndarray
+    ) -> tuple[int, RelativePose]:
+        """Nothing was seen: where velocity leads; the heading from the compass. A vehicle that stands is where it was
+        when that began: a long silence is one guess from there, not a chain of short ones."""
+        parent = self.graph.newest
+        if stands and self._stood_at is not None and self.graph.holds(self._stood_at):
+            parent = self._stood_at
+            self.graph.keep(parent)
         state = self.graph.state(parent)
-        dt_s = max(t_s - self.graph.time_of(parent), 1e-3)
         r_parent = state.pose.rotation().matrix()
         r_w_c = self._expected_rotation(attitude, state.bias, r_parent)
-        sigma = self._drift_sigma(dt_s)
-        if attitude.stands:
-            self.velocity_mps, sigma = np.zeros(3), STANDING_M
-        tau = VELOCITY_MEMORY_S
         turn = UNKNOWN_ATTITUDE_RAD + (0.3 if attitude.yaw_rad is None else np.radians(self.origin.yaw_sigma_deg))
-        cov = np.diag([turn, turn, turn, sigma, sigma, sigma]) ** 2
-        step = self.velocity_mps * tau * (1 - float(np.exp(-dt_s / tau)))
+        cov = np.diag([turn, turn, turn, 0.0, 0.0, 0.0]) ** 2
+        cov[3:, 3:] = r_w_c.T @ spread[:3, :3] @ r_w_c
+        step = np.zeros(3) if stands else led_to_m - state.pose.translation()
         return parent, RelativePose(r_parent.T @ r_w_c, r_parent.T @ step, cov)
 
-    def _drift_sigma(self, dt_s: float) -> float:
-        """How far a drone may be from where its last velocity would have taken it, per axis: an integrated
-        Ornstein-Uhlenbeck process, since a drone that is out of sight also turns back."""
-        tau = VELOCITY_MEMORY_S
-        speed = max(MAX_SPEED_SIGMA_MPS, float(np.linalg.norm(self.velocity_mps)))
-        wander = speed * float(np.sqrt(2 * tau * (dt_s - tau * (1 - np.exp(-dt_s / tau)))))
-        course = float(np.hypot(self.velocity_sigma_mps * dt_s, 0.5 * MAX_ACCELERATION_MPS2 * dt_s**2))
-        return max(min(course, wander), STEP_FLOOR_M)
+    def _placed(self, frame_id: int, t_s: float, node: int) -> Placed:
+        if self.mode is CovarianceMode.MARGINALS and node == self.graph.newest:
+            self._velocity_cov = self.graph.velocity_covariance(node)
+        state = self.graph.state(node)
+        velocity = state.velocity[:3]
+        return Placed(frame_id, t_s, state.pose, self._covariance(node), velocity, self._velocity_cov[:3, :3], node)
 
     def _covariance(self, node: int) -> np.ndarray:
         """Of C_node, 6x6, tangent order: the smoother's marginal, or under thermal throttle what the chain of motions
@@ -252,49 +308,6 @@ class Estimator:
         if self.mode is CovarianceMode.MARGINALS or node not in self._cov_of:
             self._cov_of[node] = self.graph.covariance(node)
         return self._cov_of[node]
-
-    def _learn_velocity(self, node: int) -> None:
-        """From the newest nodes: mean velocity of the last second and of the one before, carried on to now."""
-        now_s = self.graph.time_of(node)
-        middle = self._trunk_before(now_s - VELOCITY_SPAN_S)
-        if middle is None:
-            return
-        p = self.graph.state(node).pose.translation()
-        p1 = self.graph.state(middle).pose.translation()
-        span_s = now_s - self.graph.time_of(middle)
-        v1 = (p - p1) / span_s
-        noise = max(VELOCITY_FLOOR_M, self._relative_sigma(middle, node)) / span_s
-        bend = np.zeros(3)
-        first = self._trunk_before(self.graph.time_of(middle) - VELOCITY_SPAN_S)
-        if first is not None:
-            before_s = self.graph.time_of(middle) - self.graph.time_of(first)
-            v0 = (p1 - self.graph.state(first).pose.translation()) / before_s
-            bend = (v1 - v0) * span_s / (span_s + before_s)
-        self.velocity_mps = v1 + bend
-        share = TURN_SHARE if self._turning(middle, node, v1, bend) else BEND_SHARE
-        unseen = MAX_ACCELERATION_MPS2 * max(span_s - 2 * VELOCITY_SPAN_S, 0.0) / 2  # a span too long to follow turns
-        self.velocity_sigma_mps = min(
-            MAX_SPEED_SIGMA_MPS, float(np.sqrt(1.5 * noise**2 + unseen**2 + (share * np.linalg.norm(bend)) ** 2))
-        )
-
-    def _turning(self, a: int, b: int, velocity_mps: np.ndarray, bend_mps: np.ndarray) -> bool:
-        """Whether the turn of the nose between two nodes explains how the velocity changed from their middle to now:
-        the banked turn of an aircraft that flies where its nose points."""
-        nose_a, nose_b = (yaw_of(self.graph.state(n).pose.rotation().matrix() @ self._r_b_c.T) for n in (a, b))
-        half = local_rotation_up(-0.5 * math.remainder(nose_b - nose_a, math.tau))  # yaw runs clockwise
-        left = bend_mps - (half @ velocity_mps - velocity_mps)
-        return float(np.linalg.norm(left[:2])) < TURN_AGREES * float(np.linalg.norm(bend_mps[:2]))
-
-    def _relative_sigma(self, a: int, b: int) -> float:
-        """1-sigma per horizontal axis of the way between two nodes of the window, metres."""
-        if self.mode is CovarianceMode.JACOBIAN:
-            way = self.graph.state(b).pose.translation() - self.graph.state(a).pose.translation()
-            return VELOCITY_SHARE * float(np.linalg.norm(way))
-        return float(np.sqrt(np.trace(self.graph.relative_covariance(a, b)[:2, :2]) / 2.0))
-
-    def _trunk_before(self, t_s: float) -> int | None:
-        """Newest node that odometry or the map vouches for at or before a time, within the window."""
-        return next((n for n in reversed(self._trunk) if self.graph.holds(n) and self.graph.time_of(n) <= t_s), None)
 
     # --- attitude and height --------------------------------------------------------------------------------
 
@@ -309,7 +322,8 @@ class Estimator:
         """``r_w_c``: the predicted camera, whose heading stands in for one that nobody reports."""
         origin = self.origin
         tilt = UNKNOWN_ATTITUDE_RAD
-        if attitude.pitch_rad is not None and attitude.roll_rad is not None:
+        self._tilt_said = attitude.pitch_rad is not None and attitude.roll_rad is not None
+        if self._tilt_said:
             tilt = np.radians(max(origin.attitude_sigma_deg, 0.3))
         yaw_rad, yaw_sigma = attitude.yaw_rad, np.radians(max(origin.yaw_sigma_deg, 1.0))
         if yaw_rad is None:
@@ -327,18 +341,25 @@ class Estimator:
         """A map match of a frame that ``advance`` has seen. Gated; enters the graph at its own node."""
         if match.ground is not None:
             self.ground_m, self._slope, self._relief_m = match.ground[0], match.ground[1:], match.relief_m
-        if match.verdict is not Verdict.ACCEPTED or match.p_c_in_w_m is None or match.q_w_c is None:
+            seen = self._node_of.get(match.frame_id)
+            if seen is not None and self.graph.holds(seen):
+                self._ground_at_m = self.graph.state(seen).pose.translation()[:2]
+        lost = self.doubt.hear(match)
+        if lost:
+            return FixResult(Verdict.LOST, None, lost)
+        if match.verdict is not Verdict.ACCEPTED:
             return FixResult(match.verdict, None)
+        if not determined(match):
+            return FixResult(Verdict.DEGENERATE, None)
         node = self._node_of.get(match.frame_id)
         if node is None or not self.graph.holds(node):
             return FixResult(Verdict.STALE, None)
-        r_w_c = rot_from_quat(match.q_w_c)
-        measured = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array(match.p_c_in_w_m))
-        cov = world_to_tangent(np.array(match.cov).reshape(6, 6), r_w_c)
-        height = max(match.p_c_in_w_m[2] - self.ground_m, 1.0)
-        local_m = LOCAL_WARP * match.map_sigma_m
-        warp = np.diag([local_m, local_m, ROOFS * height]) ** 2
-        cov[3:, 3:] += r_w_c.T @ warp @ r_w_c
+        measured, cov = measured_pose(match, self.ground_m)
+        r_w_c = measured.rotation().matrix()
+        height = max(float(measured.translation()[2]) - self.ground_m, 1.0)
+        if match.found:  # by a search, over several frames: it outweighs whatever the graph believes
+            self.rival = Rival()
+            return self._restart(match, node, measured, cov, "found")
         predicted = self.graph.state(node).pose
         spread = float(np.sqrt(np.max(np.diag(tangent_to_world(self._covariance(node), r_w_c))[:2])))
         if match.coarse and spread > COARSE_CONTINUES * height:
@@ -353,23 +374,21 @@ class Estimator:
         if self._fixed_at_m is not None:
             moved = float(np.hypot(*(here - self._fixed_at_m)))
             new = float(np.clip(moved / (SAME_GROUND_SHARE * height), MIN_NEW_GROUND, 1.0))
-        before = self._covariance(node)
+            if not match.coarse:
+                self.rival.fade(moved / height)
         self.graph.add_pose(node, measured, cov / new)
-        self._cov_of[node] = np.linalg.inv(np.linalg.inv(before) + np.linalg.inv(cov / new))
-        self._accepted(match, node, here)
+        if self.mode is CovarianceMode.JACOBIAN:
+            self._cov_of[node] = np.linalg.inv(np.linalg.inv(self._cov_of[node]) + np.linalg.inv(cov / new))
+        self._accepted(match, self.graph.time_of(node), here)
         return FixResult(Verdict.ACCEPTED, d2, f"new ground {new:.2f}")
 
-    def _accepted(self, match: MapMatch, node: int, here: np.ndarray) -> None:
+    def _accepted(self, match: MapMatch, t_s: float, here: np.ndarray) -> None:
         self._fixed_at_m = here
+        self.doubt.start_m = 0.0
         self.map_sigma_m = match.map_sigma_m
-        if node > self._trunk[-1]:
-            self._trunk.append(node)
-        self.last_fix_t_s = self.graph.time_of(node)
-        last = self._last
-        if last is not None and last.frame_id in self._node_of:
-            newest = self._node_of[last.frame_id]
-            pose = self.graph.state(newest).pose
-            self._last = Placed(last.frame_id, last.t_s, pose, self._covariance(newest), newest)
+        self.last_fix_t_s = t_s
+        assert self._last is not None
+        self._last = self._placed(self._last.frame_id, self._last.t_s, self.graph.newest)
 
     def _refuse(self, match: MapMatch, node: int, measured: gtsam.Pose3, cov: np.ndarray, d2: float) -> FixResult:
         """Refused, unless several fixes over new ground agree with each other: then it is the graph that is lost."""
@@ -381,23 +400,58 @@ class Estimator:
             self._refused = _Disagreement([offset], here)
         else:
             refused.offsets_m.append(offset)
+            self.rival.disagreed(refused.offsets_m)
             height = float(measured.translation()[2]) - self.ground_m
             far = float(np.hypot(*(here - refused.began_at_m))) > RECOVER_OVER * height
             if len(refused.offsets_m) >= RECOVER_AFTER and far and match.mode_mass >= RECOVER_MASS:
-                bias = self.graph.state(node).bias
-                bias_cov = self.graph.bias_covariance(node)
-                self.graph.start(self.graph.time_of(node), NodeState(measured, bias), RESTART_INFLATION * cov, bias_cov)
-                self._node_of[match.frame_id] = self.graph.newest
-                self._cov_of.clear()
-                self._refused = None
-                self._accepted(match, self.graph.newest, measured.translation()[:2])
-                return FixResult(Verdict.ACCEPTED, d2, f"restarted {float(np.hypot(*offset)):.0f} m away")
+                self.rival.left(offset)
+                return self._restart(match, node, measured, cov, "restarted")
         return FixResult(Verdict.INNOVATION, d2, f"{float(np.hypot(*offset)):.0f} m from the estimate")
+
+    def _restart(self, match: MapMatch, node: int, measured: gtsam.Pose3, cov: np.ndarray, how: str) -> FixResult:
+        """The graph begins anew: where the map says that the camera was, and since a match comes late, from there by
+        what the graph has of the way to the newest frame."""
+        was, now = self.graph.state(node), self.graph.state(self.graph.newest)
+        fixed_s, now_s = self.graph.time_of(node), self.graph.time_of(self.graph.newest)
+        offset = (measured.translation() - was.pose.translation())[:2]
+        onward = was.pose.between(now.pose)
+        moved = onward.inverse().AdjointMap()
+        cov = RESTART_INFLATION * moved @ cov @ moved.T
+        velocity_sigma = float(np.sqrt(np.linalg.eigvalsh(self._velocity_cov[:3, :3])[-1]))
+        way_m = float(np.linalg.norm(onward.translation()))
+        cov[3:, 3:] += np.hypot(STEP_SHARE * way_m, velocity_sigma * (now_s - fixed_s)) ** 2 * np.eye(3)
+        bias = now.bias.copy()
+        if match.found:  # the ground there lies at another height than the one that was assumed
+            bias[3] -= float(measured.translation()[2] - was.pose.translation()[2])
+        bias_cov = self.graph.bias_covariance(self.graph.newest)
+        self._velocity_cov = RESTART_INFLATION * self.graph.velocity_covariance(self.graph.newest)
+        self.graph.start(
+            now_s, NodeState(measured.compose(onward), bias, now.velocity), cov, bias_cov, self._velocity_cov
+        )
+        assert self._last is not None
+        self._felt = self._stood_at = None
+        self._node_of[self._last.frame_id] = self.graph.newest
+        self._cov_of.clear()
+        self._refused = None
+        self.doubt = Doubt()
+        self._accepted(match, fixed_s, measured.translation()[:2])
+        return FixResult(Verdict.ACCEPTED, None, f"{how} {float(np.hypot(*offset)):.0f} m away")
+
+    def _note_rival(self, frame_id: int) -> None:
+        """For the refinement, which cannot tell a wrong stretch from a right one either."""
+        if self.rival.probability > 0.0:
+            self._torn[frame_id] = self.rival.spread_m2()
 
     @property
     def last(self) -> Placed | None:
         """The newest frame, with all that is known of it by now."""
         return self._last
+
+    @property
+    def body_sigma_rad(self) -> float:
+        """Of the body in the camera: an attitude that is off for long cannot be told from a mount that is."""
+        said = self._tilt_said
+        return float(np.radians(self.origin.attitude_sigma_deg if said else self.origin.camera.mount_tolerance_deg))
 
     def body(self, placed: Placed) -> np.ndarray:
         """R_w_b (3x3) of a placed frame, with the mount as it was learnt."""
@@ -408,11 +462,15 @@ class Estimator:
     def refine(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """frame -> position (3,) and its covariance (3x3), after a batch optimisation of the whole flight."""
         refined = self.graph.refine()
-        return {
-            frame: (np.asarray(refined[node][0].translation()), refined[node][1])
-            for frame, node in self._node_of.items()
-            if node in refined
-        }
+        result = {}
+        for frame, node in self._node_of.items():
+            if node in refined:
+                pose, cov = refined[node]
+                if frame in self._torn:
+                    cov = cov.copy()
+                    cov[:2, :2] += self._torn[frame]
+                result[frame] = (np.asarray(pose.translation()), cov)
+        return result
 
 
 def _compose_cov(cov_parent: np.ndarray, motion: RelativePose) -> np.ndarray:

@@ -11,6 +11,7 @@ EFFECTIVE_PAIRS = 16.0  # relief moves whole blocks of matches together: never m
 SCALE_SIGMA = 0.02  # houses and trees lift the mean ground by this share of the height, beyond the height's own error
 ROOF_SCALE_SIGMA = 0.12  # ... and by this when hardly any match lies on the plane: tall buildings at 100 m
 MIN_PAIRS = 8
+FIRST_TOLERANCE = 1e-3  # rad and relative metres; the graph solves for the motion again, from the same rays
 MAX_TILT_CHANGE_RAD = np.radians(15.0)  # beyond the guess: matches in a narrow band trade translation for tilt
 MIN_DOWN = -0.2  # up component of a unit-depth ray that meets the ground no farther than five heights away
 
@@ -79,7 +80,14 @@ def relative_pose(
     start = np.array([*shift, height_m * (scale - 1.0)])
     effective = min(1.0, EFFECTIVE_PAIRS / len(points))
     fit = fit_pose(
-        points, pairs[ahead, 2:], turn @ r_w_k, start, sigma_norm, effective=effective, tilt_sigma_rad=tilt_sigma_rad
+        points,
+        pairs[ahead, 2:],
+        turn @ r_w_k,
+        start,
+        sigma_norm,
+        effective=effective,
+        tilt_sigma_rad=tilt_sigma_rad,
+        tolerance=FIRST_TOLERANCE,
     )
     if fit is None or float(np.linalg.norm(log_so3((turn @ r_w_k).T @ fit.r_w_c)[:2])) > MAX_TILT_CHANGE_RAD:
         return None

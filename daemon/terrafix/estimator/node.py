@@ -12,6 +12,7 @@ from terrafix.estimator.telemetry import Telemetry
 from terrafix.messages import (
     CovarianceMode,
     Health,
+    Imu,
     MapMatch,
     MeasurementVerdict,
     Message,
@@ -39,6 +40,15 @@ class EstimatorNode:
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
 
+    @property
+    def origin(self) -> Origin | None:
+        return None if self._estimator is None else self._estimator.origin
+
+    @property
+    def mode(self) -> CovarianceMode:
+        """Of the next estimate."""
+        return self._mode
+
     def on(self, message: Message) -> Iterable[Message]:
         match message:
             case Origin() if self._estimator is None or message != self._estimator.origin:  # said again after a restart
@@ -46,6 +56,8 @@ class EstimatorNode:
                 self._frame = LocalFrame(message.lat_deg, message.lon_deg)
             case VehicleState():
                 self._telemetry.add(message)
+            case Imu():
+                self._telemetry.add_imu(message)
             case Health():
                 cool = message.band is ThermalBand.NORMAL
                 self._mode = CovarianceMode.MARGINALS if cool else CovarianceMode.JACOBIAN
@@ -67,7 +79,7 @@ class EstimatorNode:
             return
         estimator.mode = self._mode
         attitude = self._telemetry.at(odometry.t_ns)
-        advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude)
+        advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, self._telemetry.felt)
         self._tracked = advance.verdict is Verdict.ACCEPTED
         yield MeasurementVerdict(
             t_ns=odometry.t_ns, frame_id=odometry.frame_id, measurement="odometry", verdict=advance.verdict
@@ -80,6 +92,7 @@ class EstimatorNode:
         estimator = self._estimator
         if estimator is None:
             return
+        estimator.mode = self._mode
         result = estimator.fix(match)
         yield MeasurementVerdict(
             t_ns=match.t_ns,
@@ -89,8 +102,9 @@ class EstimatorNode:
             detail=result.detail,
             mahalanobis2=result.mahalanobis2,
         )
-        if result.verdict is Verdict.ACCEPTED and estimator.last is not None:
-            self._tracked = True
+        torn = result.verdict is Verdict.INNOVATION and estimator.rival.probability > 0.0
+        if (torn or result.verdict in (Verdict.ACCEPTED, Verdict.LOST)) and estimator.last is not None:
+            self._tracked = self._tracked or result.verdict is Verdict.ACCEPTED
             yield self._estimate(estimator.last, match.t_ns)
 
     def _prediction(self, odometry: Odometry, advance: Advance, estimator: Estimator) -> Prediction:
@@ -105,7 +119,7 @@ class EstimatorNode:
             p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
             q_w_c=quat_from_rot(r_w_c),
             cov=tuple(float(v) for v in cov.ravel()),
-            agl_m=float(p[2]) - estimator.ground_m,
+            agl_m=float(p[2]) - estimator.ground_below(p),
             agl_sigma_m=float(np.sqrt(cov[2, 2])),
             step_m=(float(advance.step_m[0]), float(advance.step_m[1])),
             step_cov_m2=(step_var, 0.0, 0.0, step_var),
@@ -118,6 +132,8 @@ class EstimatorNode:
         cov = tangent_to_world(placed.cov, placed.pose.rotation().matrix())
         # The map itself is off by a few metres, everywhere alike: no number of fixes averages that away.
         cov[:3, :3] += estimator.map_sigma_m**2 * np.eye(3)
+        cov[3:5, 3:5] += estimator.body_sigma_rad**2 * np.eye(2)
+        cov = estimator.rival.added(estimator.doubt.added(cov))
         lat_deg, lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
         age_ms = -1
         if estimator.last_fix_t_s is not None:
@@ -125,16 +141,16 @@ class EstimatorNode:
         label = SourceLabel.VISUAL_PROPAGATED if self._tracked else SourceLabel.DEAD_RECKONED
         if self._tracked and 0 <= age_ms <= ANCHORED_FOR_S * 1e3:
             label = SourceLabel.SATELLITE_ANCHORED
-        v = estimator.velocity_mps
+        v = placed.velocity_mps
         return NavEstimate(
             t_ns=round(placed.t_s * 1e9),
             frame_id=placed.frame_id,
             lat_deg=lat_deg,
             lon_deg=lon_deg,
             alt_amsl_m=float(p[2]),
-            agl_m=float(p[2]) - estimator.ground_m,
+            agl_m=float(p[2]) - estimator.ground_below(p),
             velocity_enu_mps=(float(v[0]), float(v[1]), float(v[2])),
-            velocity_sigma_mps=estimator.velocity_sigma_mps,
+            velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(placed.velocity_cov)[-1])),  # of the worst direction
             q_w_b=quat_from_rot(estimator.body(placed)),
             cov=tuple(float(c) for c in cov.ravel()),
             source_label=label,

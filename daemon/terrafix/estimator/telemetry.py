@@ -1,14 +1,21 @@
-"""What the autopilot said around a frame's time: attitude, height, each with its absence."""
+"""What the autopilot said around a frame's time: attitude, height, inertial readings, each with its absence."""
 
+from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
 
-from terrafix.messages import VehicleState
+import numpy as np
+
+from terrafix.estimator.velocity import GRAVITY_MPS2, Felt
+from terrafix.messages import Imu, VehicleState
 
 KEPT = 400  # states; 8 s at 50 Hz
+KEPT_READINGS = 2000  # 10 s at 200 Hz
 STANDS_BELOW_M = 10.0  # what a barometer may have drifted before take-off
 MAX_GAP_NS = 1_000_000_000  # older than this against the frame says nothing about it
+# Between readings, and from the last one to the frame: the acceleration is taken to go straight from one to the next.
+MAX_READING_GAP_NS = 120_000_000
+MAX_ATTITUDE_GAP_NS = 260_000_000  # ATTITUDE at 4 Hz, ArduPilot's own rate, turns a vehicle too far between two
 
 
 @dataclass(frozen=True)
@@ -28,15 +35,82 @@ class Attitude:
 class Telemetry:
     def __init__(self) -> None:
         self._states: deque[VehicleState] = deque(maxlen=KEPT)
+        self._turns: deque[tuple[int, float, float, float]] = deque(maxlen=KEPT)  # t_ns, yaw, pitch, roll
+        self._forces: deque[tuple[int, float, float, float]] = deque(maxlen=KEPT_READINGS)  # t_ns, forward, right, down
 
     def add(self, state: VehicleState) -> None:
         self._states.append(state)
+        if state.yaw_rad is None or state.pitch_rad is None or state.roll_rad is None:
+            return
+        if not self._turns or state.t_ns > self._turns[-1][0]:
+            self._turns.append((state.t_ns, state.yaw_rad, state.pitch_rad, state.roll_rad))
+
+    def add_imu(self, imu: Imu) -> None:
+        for before_ns, forward, right, down, *_ in imu.samples:
+            t_ns = imu.t_ns - before_ns
+            if not self._forces or t_ns > self._forces[-1][0]:
+                self._forces.append((t_ns, forward, right, down))
 
     def at(self, t_ns: int) -> Attitude:
         """Field by field the value measured nearest to ``t_ns``; ``None`` where nobody said it within a second."""
+        best: dict[str, tuple[int, float | bool]] = {}
+        for state in reversed(self._states):
+            away_ns = abs(state.t_ns - t_ns)
+            if away_ns > MAX_GAP_NS:
+                if state.t_ns < t_ns - 2 * MAX_GAP_NS:
+                    break  # they come in order of time, to a moment
+                continue
+            for name in ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed"):
+                value = getattr(state, name)
+                if value is not None and (name not in best or away_ns <= best[name][0]):
+                    best[name] = (away_ns, value)
+        said = {name: value for name, (_, value) in best.items()}
+        return Attitude(*(said.get(name) for name in ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed")))  # type: ignore[arg-type]
 
-        def nearest(name: str) -> Any:
-            known = [s for s in self._states if getattr(s, name) is not None and abs(s.t_ns - t_ns) <= MAX_GAP_NS]
-            return getattr(min(known, key=lambda s: abs(s.t_ns - t_ns)), name) if known else None
+    def felt(self, t0_ns: int, t1_ns: int) -> Felt | None:
+        """Acceleration from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that."""
+        forces, turns = _around(self._forces, t0_ns, t1_ns), _around(self._turns, t0_ns, t1_ns)
+        if t1_ns <= t0_ns or forces is None or turns is None:
+            return None
+        (t_f, f), (t_a, angles) = forces, turns
+        if not (_covers(t_f, t0_ns, t1_ns, MAX_READING_GAP_NS) and _covers(t_a, t0_ns, t1_ns, MAX_ATTITUDE_GAP_NS)):
+            return None
+        inside = t_f[(t_f > t0_ns) & (t_f < t1_ns)]
+        t = np.concatenate([[t0_ns], inside, [t1_ns]])
+        f_b = np.column_stack([np.interp(t, t_f, f[:, i]) for i in range(3)])
+        yaw = np.interp(t, t_a, np.unwrap(angles[:, 0]))
+        pitch, roll = (np.interp(t, t_a, np.unwrap(angles[:, i])) for i in (1, 2))
+        accel = _in_world(f_b, yaw, pitch, roll)
+        accel[:, 2] -= GRAVITY_MPS2
+        # What the readings scatter from one to the next is vibration, whatever its frequency was.
+        spacing_s = (t_f[-1] - t_f[0]) * 1e-9 / (len(t_f) - 1)
+        scatter = float(np.mean(np.square(np.diff(f, 2, axis=0)))) / 6.0 if len(f) > 3 else 0.0
+        unfelt_s = max(0.0, (t1_ns - int(t_f[-1])) * 1e-9)
+        return Felt((t - t0_ns) * 1e-9, accel, yaw, float(np.sqrt(scatter * spacing_s)), unfelt_s)
 
-        return Attitude(*(nearest(name) for name in ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed")))
+
+def _around(
+    said: deque[tuple[int, float, float, float]], t0_ns: int, t1_ns: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Times (N,) and values (N, 3) from the last one before ``t0_ns`` to the first one after ``t1_ns``."""
+    first = max(0, bisect_right(said, t0_ns, key=lambda s: s[0]) - 1)
+    last = min(len(said), bisect_left(said, t1_ns, key=lambda s: s[0]) + 1)
+    if last - first < 2:
+        return None
+    chosen = [said[i] for i in range(first, last)]
+    return np.array([s[0] for s in chosen]), np.array([s[1:] for s in chosen])
+
+
+def _covers(t_ns: np.ndarray, t0_ns: int, t1_ns: int, gap_ns: int) -> bool:
+    edges = t_ns[0] <= t0_ns + gap_ns and t_ns[-1] >= t1_ns - gap_ns
+    return bool(edges and np.diff(t_ns).max() <= gap_ns)
+
+
+def _in_world(f_b: np.ndarray, yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """(N, 3) from body FRD into world ENU; ``rot_w_b`` for many at once."""
+    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
+    x, y, z = f_b.T
+    ahead = cp * x + sp * (sr * y + cr * z)  # level axes of the heading: forward, right
+    right = cr * y - sr * z
+    down = -sp * x + cp * (sr * y + cr * z)
+    return np.column_stack([sy * ahead + cy * right, cy * ahead - sy * right, -down])

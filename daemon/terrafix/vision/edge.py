@@ -12,8 +12,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import msgspec
 
 from terrafix.core.clock import now_ns
+from terrafix.core.errors import SourceError
 from terrafix.core.frames import FrameWriter
 from terrafix.core.node import Edge, NodeContext
+from terrafix.core.start import Bounds, map_bounds, placed, start_is_unknown
 from terrafix.messages import Message, SourceEnded
 from terrafix.vision.sources import Shot, Source, open_configured
 
@@ -33,11 +35,13 @@ class SourceEdge:
         epoch_ns: int | None,
         realtime: bool,
         ground_amsl_m: float | None = None,
+        bounds: Bounds | None = None,
     ) -> None:
         self._source = source
         self._frames = frames
         self._realtime = realtime
         self._ground_amsl_m = ground_amsl_m  # where the source does not know it
+        self._bounds = bounds  # of the map, for a source that knows no start
         self._epoch_ns = epoch_ns
         self._zero_ns = 0  # of the source's clock; set when the reader starts
         self._first_id = 0
@@ -53,7 +57,7 @@ class SourceEdge:
     def poll(self, now_ns: int) -> Iterable[Message]:
         if self._reading is None:
             self._reading = self._start(now_ns)
-            origin = self._source.origin()
+            origin = self._source.origin() if self._bounds is None else placed(self._source.origin(), self._bounds)
             ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
             return [msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m)]
         ended = self._reading.done()
@@ -65,7 +69,7 @@ class SourceEdge:
         if shot is not None:
             if shot.image is not None:
                 self._frames.put(shot.frame.frame_id, shot.image)
-            said += [*shot.states, shot.frame]
+            said += [*shot.imu, *shot.states, shot.frame]
         elif ended and not self._said_end:
             self._reading.result()  # a bug in the thread is a bug of this process
             self._said_end = True
@@ -115,7 +119,8 @@ class SourceEdge:
             shot.frame, t_ns=shot.frame.t_ns + shift_ns, frame_id=shot.frame.frame_id + self._first_id
         )
         states = tuple(msgspec.structs.replace(state, t_ns=state.t_ns + shift_ns) for state in shot.states)
-        return Shot(frame, states, shot.image)
+        imu = tuple(msgspec.structs.replace(said, t_ns=said.t_ns + shift_ns) for said in shot.imu)
+        return Shot(frame, states, shot.image, imu)
 
     def _push(self, shot: Shot) -> None:
         with self._changed:
@@ -125,14 +130,20 @@ class SourceEdge:
             self._shots.append(shot)
             if len(self._shots) > QUEUE_SHOTS:
                 old = self._shots.popleft()
-                self._overtaken.extend(old.states)
+                self._overtaken.extend((*old.imu, *old.states))
                 self._overtaken.append(msgspec.structs.replace(old.frame, error=old.frame.error or OVERTAKEN))
 
 
 def make_edge(ctx: NodeContext) -> Edge:
-    """Opens the source that the configuration names. Raises SourceError, UsageError (start)."""
+    """Opens the source that the configuration names. Raises SourceError, UsageError (start), MapError."""
     if not isinstance(ctx.frames, FrameWriter):
         raise TypeError("the process that opens the source needs a frame store to write to")
     wanted = ctx.config.source
     source = open_configured(wanted, wait_for_camera=ctx.epoch_ns is not None)
-    return SourceEdge(source, ctx.frames, ctx.epoch_ns, wanted.realtime, ctx.ground_amsl_m)
+    if ctx.map_path is None and start_is_unknown(source.origin()):
+        source.close()
+        raise SourceError(
+            f"{source.name()}: neither a start coordinate nor a map to search; give --map, or --start LAT,LON"
+        )
+    bounds = map_bounds(ctx.map_path) if ctx.map_path is not None and start_is_unknown(source.origin()) else None
+    return SourceEdge(source, ctx.frames, ctx.epoch_ns, wanted.realtime, ctx.ground_amsl_m, bounds)

@@ -72,7 +72,7 @@ def _window(estimator: Estimator) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Val
     """The factors among the nodes of the window, with a prior on the oldest in place of what lies before."""
     graph = estimator.graph
     nodes = [n for n in range(graph.newest + 1) if graph.holds(n)]
-    keys = {key for n in nodes for key in (_camera(n), _bias(n))}
+    keys = {key for n in nodes for key in (_camera(n), _bias(n), _velocity(n))}
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for i in range(graph.all_factors.size()):
         factor = graph.all_factors.at(i)
@@ -83,9 +83,11 @@ def _window(estimator: Estimator) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Val
         state = graph.state(n)
         values.insert(_camera(n), state.pose)
         values.insert(_bias(n), state.bias)
+        values.insert(_velocity(n), state.velocity)
     oldest = graph.state(nodes[0])
     factors.add(gtsam.PriorFactorPose3(_camera(nodes[0]), oldest.pose, gtsam.noiseModel.Isotropic.Sigma(6, 1.0)))
     factors.add(gtsam.PriorFactorVector(_bias(nodes[0]), oldest.bias, gtsam.noiseModel.Isotropic.Sigma(4, 1.0)))
+    factors.add(gtsam.PriorFactorVector(_velocity(nodes[0]), oldest.velocity, gtsam.noiseModel.Isotropic.Sigma(6, 1.0)))
     return factors, values
 
 
@@ -95,6 +97,10 @@ def _camera(node: int) -> int:
 
 def _bias(node: int) -> int:
     return int(gtsam.symbol("b", node))
+
+
+def _velocity(node: int) -> int:
+    return int(gtsam.symbol("v", node))
 
 
 def _ms(work: Callable[[], object]) -> float:

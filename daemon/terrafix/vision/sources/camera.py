@@ -56,7 +56,7 @@ class LiveCamera:
             )
         self.spec = f"/dev/video{spec}" if spec.isdecimal() else spec
         self._description = read_description(camera)
-        self._origin = origin_of(camera, self._description, camera_of(camera, self._description), start)
+        self._origin = origin_of(self._description, camera_of(camera, self._description), start)
         self._period_ns = round(1e9 / rate_hz)
         self._open = open_capture or _open_capture
         self._reconnect_s = reconnect_s

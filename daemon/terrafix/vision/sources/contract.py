@@ -1,13 +1,15 @@
 """The source contract: what every flight, photo folder, video and camera looks like to the rest."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from terrafix.messages import Frame, Origin, VehicleState
+from terrafix.messages import Frame, Imu, Origin, VehicleState
+
+Said = TypeVar("Said", VehicleState, Imu)
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,21 @@ class Shot:
     frame: Frame  # frame.error is set and image is None when the pixels cannot be trusted
     states: tuple[VehicleState, ...]  # measured since the previous shot, up to this frame, in time order
     image: np.ndarray | None  # (H, W, 3) uint8 BGR
+    imu: tuple[Imu, ...] = ()  # inertial readings of the same time
+
+
+class UpTo(Generic[Said]):
+    """What was said since the last call, up to a time. ``said`` in time order; what is before ``from_ns`` falls out."""
+
+    def __init__(self, said: Sequence[Said], from_ns: int) -> None:
+        self._said: Sequence[Said] = said
+        self._from_ns, self._at = from_ns, 0
+
+    def __call__(self, t_ns: int) -> tuple[Said, ...]:
+        first = self._at
+        while self._at < len(self._said) and self._said[self._at].t_ns <= t_ns:
+            self._at += 1
+        return tuple(m for m in self._said[first : self._at] if m.t_ns >= self._from_ns)
 
 
 class Source(Protocol):

@@ -132,12 +132,10 @@ def camera_of(path: Path, read: Description) -> Camera:
     )
 
 
-def origin_of(path: Path | str, read: Description, camera: Camera, start: tuple[float, float] | None) -> Origin:
-    """The flight's Origin at t 0. ``start`` (lat_deg, lon_deg) wins over [start]; SourceError when there is neither."""
-    if read.start is None and start is None:
-        raise SourceError(
-            f"{path}: there is no start coordinate; add [start] with lat_deg and lon_deg, or pass --start LAT,LON"
-        )
+def origin_of(read: Description, camera: Camera, start: tuple[float, float] | None) -> Origin:
+    """The flight's Origin at t 0. ``start`` (lat_deg, lon_deg) wins over [start]; with neither the start is unknown
+    (``core.start``)."""
+    known = read.start is not None or start is not None
     lat_deg, lon_deg = start if start else (read.start.lat_deg, read.start.lon_deg) if read.start else (0.0, 0.0)
     ground_m = None
     if read.start:
@@ -148,7 +146,7 @@ def origin_of(path: Path | str, read: Description, camera: Camera, start: tuple[
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         ground_amsl_m=ground_m,
-        start_sigma_m=read.start.sigma_m if read.start else START_SIGMA_M,
+        start_sigma_m=read.start.sigma_m if read.start else START_SIGMA_M if known else math.inf,
         yaw_sigma_deg=read.telemetry.yaw_sigma_deg,
         agl_sigma_m=read.telemetry.agl_sigma_m,
         attitude_sigma_deg=read.telemetry.attitude_sigma_deg,

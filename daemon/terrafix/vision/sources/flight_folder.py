@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from terrafix.core.errors import SourceError
-from terrafix.core.tlog import read_tlog
-from terrafix.messages import Frame, Origin, VehicleState
-from terrafix.vision.sources.contract import Shot
+from terrafix.core.tlog import read_imu, read_tlog
+from terrafix.messages import Frame, Imu, Origin, VehicleState
+from terrafix.vision.sources.contract import Shot, UpTo
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
 from terrafix.vision.sources.images import WRONG_SIZE, read_image
 from terrafix.vision.sources.table import Row, read_table
@@ -24,11 +24,12 @@ class FlightFolder:
         self.folder = folder
         toml = folder / "flight.toml"
         self._description = read_description(toml)
-        self._origin = origin_of(toml, self._description, camera_of(toml, self._description), start)
+        self._origin = origin_of(self._description, camera_of(toml, self._description), start)
         self._rows = read_table(folder / "frames.csv", "frames.csv", with_file=True)
         self._check_files()
         self._check_size()
         self._states = self._telemetry()
+        self._imu = self._inertial()
 
     def origin(self) -> Origin:
         return self._origin
@@ -48,12 +49,9 @@ class FlightFolder:
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         from_ns = round(from_s * 1e9)
         camera = self._origin.camera
-        at = 0
+        states_of, imu_of = UpTo(self._states, from_ns), UpTo(self._imu, from_ns)
         for frame_id, row in enumerate(self._rows):
-            states: list[VehicleState] = []
-            while at < len(self._states) and self._states[at].t_ns <= row.t_ns:
-                states.append(self._states[at])
-                at += 1
+            states, imu = states_of(row.t_ns), imu_of(row.t_ns)
             if row.t_ns < from_ns:
                 continue
             image, error = read_image(self.folder / "frames" / row.file, camera.width, camera.height)
@@ -65,7 +63,7 @@ class FlightFolder:
                 height=camera.height,
                 error=error,
             )
-            yield Shot(frame, tuple(s for s in states if s.t_ns >= from_ns), image)
+            yield Shot(frame, states, image, imu)
 
     def _check_files(self) -> None:
         table, frames = self.folder / "frames.csv", self.folder / "frames"
@@ -95,11 +93,19 @@ class FlightFolder:
     def _telemetry(self) -> list[VehicleState]:
         """States of frames.csv and of telemetry.tlog in time order. A tlog starts before the first frame or after."""
         states = [row.state for row in self._rows if row.state is not None]
-        log = self.folder / "telemetry.tlog"
-        if log.is_file():
+        log = self._log()
+        if log is not None:
             states += read_tlog(log, self._description.telemetry.tlog_t0_us)
             states.sort(key=lambda state: state.t_ns)
         return states
+
+    def _inertial(self) -> list[Imu]:
+        log = self._log()
+        return [] if log is None else read_imu(log, self._description.telemetry.tlog_t0_us)
+
+    def _log(self) -> Path | None:
+        log = self.folder / "telemetry.tlog"
+        return log if log.is_file() else None
 
 
 def _count_missing(frames: Path, rows: list[Row]) -> str:

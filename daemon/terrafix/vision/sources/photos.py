@@ -82,13 +82,9 @@ class Photos:
     def _make_origin(self, first: PhotoInfo, start: tuple[float, float] | None) -> Origin:
         written = self._description
         camera = camera_of(self._where, written) if written.camera else self._camera_of_exif(first)
-        if start is None and written.start is None:
-            if first.lat_deg is None or first.lon_deg is None:
-                raise SourceError(
-                    f"{self.folder}: the first photo carries no GPS coordinate to start from; pass --start LAT,LON"
-                )
+        if start is None and written.start is None and first.lat_deg is not None and first.lon_deg is not None:
             written = _with_start(written, first.lat_deg, first.lon_deg)
-        return origin_of(self.folder, written, camera, start)
+        return origin_of(written, camera, start)
 
     def _camera_of_exif(self, first: PhotoInfo) -> Camera:
         source = next((info for _, info, _ in self._photos if info is not None and info.focal_px), None)

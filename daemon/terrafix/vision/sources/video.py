@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 
 from terrafix.core.errors import SourceError
-from terrafix.core.tlog import read_tlog
-from terrafix.messages import Frame, Origin, VehicleState
-from terrafix.vision.sources.contract import Shot
+from terrafix.core.tlog import read_imu, read_tlog
+from terrafix.messages import Frame, Imu, Origin, VehicleState
+from terrafix.vision.sources.contract import Shot, UpTo
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
 from terrafix.vision.sources.table import read_table
 
@@ -33,8 +33,9 @@ class Video:
         where = camera or self._find_description()
         self._description = read_description(where)
         self._map_base = where.parent
-        self._origin = origin_of(where, self._description, camera_of(where, self._description), start)
+        self._origin = origin_of(self._description, camera_of(where, self._description), start)
         self._states = self._telemetry()
+        self._imu = self._inertial()
         self._period_s = 1.0 / rate_hz
         capture = self._open()
         self._fps = capture.get(cv2.CAP_PROP_FPS)
@@ -75,7 +76,9 @@ class Video:
     def _shots(self, capture: cv2.VideoCapture, from_s: float) -> Iterator[Shot]:
         camera = self._origin.camera
         step_s = 1.0 / self._fps if self._fps > 0 else self._period_s
-        frame_id, at, t_s, due_s = 0, 0, -step_s, 0.0
+        from_ns = round(from_s * 1e9)
+        states_of, imu_of = UpTo(self._states, from_ns), UpTo(self._imu, from_ns)
+        frame_id, t_s, due_s = 0, -step_s, 0.0
         while capture.grab():
             said_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
             t_s = said_s if said_s > t_s else t_s + step_s  # some containers carry no times
@@ -83,10 +86,7 @@ class Video:
                 continue
             due_s += self._period_s * max(1, math.ceil((t_s + step_s / 2 - due_s) / self._period_s))
             t_ns = round(t_s * 1e9)
-            states: list[VehicleState] = []
-            while at < len(self._states) and self._states[at].t_ns <= t_ns:
-                states.append(self._states[at])
-                at += 1
+            states, imu = states_of(t_ns), imu_of(t_ns)
             if t_s >= from_s:
                 whole, image = capture.retrieve()
                 frame = Frame(
@@ -97,8 +97,7 @@ class Video:
                     height=camera.height,
                     error="" if whole else "cannot be decoded",
                 )
-                kept = tuple(s for s in states if s.t_ns >= round(from_s * 1e9))
-                yield Shot(frame, kept, image if whole else None)
+                yield Shot(frame, states, image if whole else None, imu)
             frame_id += 1
 
     def _find_description(self) -> Path:
@@ -111,14 +110,22 @@ class Video:
         )
 
     def _telemetry(self) -> list[VehicleState]:
-        table, log = self.path.with_suffix(".csv"), self.path.with_suffix(".tlog")
+        table, log = self.path.with_suffix(".csv"), self._log()
         states: list[VehicleState] = []
         if table.is_file():
             rows = read_table(table, table.name, with_file=False)
             states += [row.state for row in rows if row.state is not None]
-        if log.is_file():
+        if log is not None:
             states += read_tlog(log, self._description.telemetry.tlog_t0_us)
         return sorted(states, key=lambda state: state.t_ns)
+
+    def _inertial(self) -> list[Imu]:
+        log = self._log()
+        return [] if log is None else read_imu(log, self._description.telemetry.tlog_t0_us)
+
+    def _log(self) -> Path | None:
+        log = self.path.with_suffix(".tlog")
+        return log if log.is_file() else None
 
     def _open(self) -> cv2.VideoCapture:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", FFMPEG_QUIET)

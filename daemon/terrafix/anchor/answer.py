@@ -1,0 +1,62 @@
+"""What the matcher found, as MapMatch says it: a pose from 2D-3D matches, or the position of the mode alone."""
+
+import msgspec
+import numpy as np
+
+from terrafix.anchor.belief import Mode
+from terrafix.anchor.matcher import Fix, View
+from terrafix.core.geodesy import quat_from_rot
+from terrafix.core.pose import tangent_to_world
+from terrafix.messages import MapMatch, Verdict
+
+COARSE_TILT_RAD = np.radians(10.0)  # a coarse fix says nothing of attitude: as good as unknown
+COARSE_HEIGHT_M = 100.0  # ... nor of height
+COARSE_SIGMA = 0.03  # of the height: buildings that lean and a scale that is not quite right shift the whole picture
+MODE_DRIFT = 0.35  # of the height: how far the pose may lie from the mode while the tilt is not yet known
+
+
+def coarse(answer: MapMatch, mode: Mode, cell_m: float, view: View) -> MapMatch:
+    """The position of the mode, as a pose factor. What is seen is the place of the ground, so the camera's position
+    goes with its tilt: p_e moves by +h, p_n by -h per radian of rotation about north and east."""
+    lever = np.zeros((2, 2))
+    lever[0, 1], lever[1, 0] = view.agl_m, -view.agl_m
+    tilt = COARSE_TILT_RAD**2 * np.eye(2)
+    cov = np.diag([0.0, 0.0, COARSE_HEIGHT_M**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2])
+    sigma2 = mode.var_m2 + cell_m**2 + (COARSE_SIGMA * view.agl_m) ** 2
+    cov[:2, :2] = lever @ tilt @ lever.T + sigma2 * np.eye(2)
+    cov[:2, 3:5] = lever @ tilt
+    cov[3:5, :2] = cov[:2, 3:5].T
+    return msgspec.structs.replace(
+        answer,
+        verdict=Verdict.ACCEPTED,
+        coarse=True,
+        p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + view.agl_m),
+        q_w_c=quat_from_rot(view.r_w_c),
+        cov=tuple(float(v) for v in cov.ravel()),
+    )
+
+
+def judged(answer: MapMatch, fix: Fix | None, view: View) -> MapMatch:
+    """The pose of a fix with its matches and its verdict. ``answer`` has the mode that it was looked for in."""
+    if fix is None:
+        return msgspec.structs.replace(answer, verdict=Verdict.DEGENERATE)
+    pnp = fix.pnp
+    verdict = pnp.verdict
+    if pnp.fit is None:
+        return msgspec.structs.replace(answer, verdict=verdict, inliers=int(pnp.inliers.sum()))
+    p = pnp.fit.p_c_in_w_m
+    drift = np.array([p[0] - answer.mode_e_m, p[1] - answer.mode_n_m])
+    if float(np.hypot(*drift)) > MODE_DRIFT * view.agl_m:
+        verdict = Verdict.DEGENERATE
+    matches = np.column_stack([fix.xy, fix.points_w_m, fix.weights])[pnp.inliers]
+    cov = tangent_to_world(pnp.fit.cov, pnp.fit.r_w_c)
+    return msgspec.structs.replace(
+        answer,
+        verdict=verdict,
+        matches=[(float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in matches],
+        p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+        q_w_c=quat_from_rot(pnp.fit.r_w_c),
+        cov=tuple(float(v) for v in cov.ravel()),
+        inliers=int(pnp.inliers.sum()),
+        reprojection_px=float(np.sqrt(np.mean(pnp.fit.residuals**2))) * view.agl_m / fix.cell_m,
+    )

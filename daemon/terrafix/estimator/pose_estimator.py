@@ -1,0 +1,85 @@
+"""The estimator as a function call: a match goes in, a pose comes out. Beside the messages, for who has none.
+
+It drives the node that flies: the same graph, gates and verdicts. Where a node says a verdict, a call raises."""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafix.core.camera import CameraCalibration
+from terrafix.estimator.node import EstimatorNode
+from terrafix.messages import (
+    CovarianceMode,
+    Health,
+    MapMatch,
+    MeasurementVerdict,
+    NavEstimate,
+    SourceLabel,
+    Verdict,
+)
+
+MatchResult = MapMatch  # 2D-3D matches of a frame, and the camera pose that PnP made of them
+ThermalState = Health
+
+
+class PnpFailureError(Exception):
+    """This match gave no pose: PnP failed, its geometry is degenerate, or the graph refused it. ``verdict`` says which.
+
+    The estimator goes on with odometry."""
+
+    def __init__(self, verdict: Verdict, detail: str) -> None:
+        super().__init__(f"{verdict.value}: {detail}" if detail else verdict.value)
+        self.verdict = verdict
+
+
+class CovarianceDegradedWarning(UserWarning):
+    """The computer is hot: the covariance is the one from inliers, not from the marginals of the graph."""
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    frame_id: int
+    position_wgs84: tuple[float, float, float]  # latitude, longitude [deg], height above mean sea level [m]
+    orientation_world_T_body: tuple[float, float, float, float]
+    covariance_6x6: np.ndarray  # (6, 6) position, then orientation; axes east, north, up; m^2 and rad^2
+    covariance_mode: CovarianceMode
+    source_label: SourceLabel
+    last_satellite_anchor_age_ms: int
+    emitted_at: int  # monotonic, ns
+
+
+class PoseEstimator:
+    """``node`` has heard Origin and hears the odometry of each frame; this adds the matches to its graph."""
+
+    def __init__(self, node: EstimatorNode) -> None:
+        self._node = node
+
+    def current_covariance_mode(self) -> CovarianceMode:
+        return self._node.mode
+
+    def estimate(self, match: MatchResult, camera: CameraCalibration, thermal: ThermalState) -> PoseEstimate:
+        """The newest pose, after the factor of ``match`` entered the graph. The mode is that of ``thermal``.
+
+        ``camera`` must be the one that Origin named (ValueError). Raises PnpFailureError; warns with
+        CovarianceDegradedWarning."""
+        origin = self._node.origin
+        if origin is None or camera != CameraCalibration.of(origin.camera):
+            raise ValueError("the camera is not the one that Origin named")
+        answers = [*self._node.on(thermal), *self._node.on(match)]
+        verdict = next(a for a in answers if isinstance(a, MeasurementVerdict))
+        said = next((a for a in answers if isinstance(a, NavEstimate)), None)
+        if verdict.verdict is not Verdict.ACCEPTED or said is None:
+            raise PnpFailureError(verdict.verdict, verdict.detail)
+        if said.covariance_mode is CovarianceMode.JACOBIAN:
+            warnings.warn(f"covariance from inliers: {thermal.cause}", CovarianceDegradedWarning, stacklevel=2)
+        return PoseEstimate(
+            frame_id=said.frame_id,
+            position_wgs84=(said.lat_deg, said.lon_deg, said.alt_amsl_m),
+            orientation_world_T_body=said.q_w_b,
+            covariance_6x6=np.array(said.cov).reshape(6, 6),
+            covariance_mode=said.covariance_mode,
+            source_label=said.source_label,
+            last_satellite_anchor_age_ms=said.last_anchor_age_ms,
+            emitted_at=said.emitted_at_ns,
+        )

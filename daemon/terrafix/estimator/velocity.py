@@ -1,0 +1,242 @@
+"""How velocity and position follow from one node to the next: by what the IMU felt, or by what drones do.
+
+One model for both, with the state (position, velocity, acceleration that nobody measured). Without an IMU the last is
+the whole acceleration; with an IMU it is what is wrong with the measured one: its bias and, mostly, gravity that a
+wrong tilt lets in (one degree: 0.17 m/s^2). It is a first-order Gauss-Markov process (Singer 1970, "Estimating optimal
+tracking filter performance for manned maneuvering targets") in the axes of the heading, where the pull of a turn and
+the error of a tilt stay what they are while the vehicle turns."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from terrafix.core.geodesy import local_rotation_up
+
+V_SIZE = 6  # of the variable V_k: velocity in the world [m/s], unmeasured acceleration in axes of the heading [m/s^2]
+MAX_SPEED_SIGMA_MPS = np.array([15.0, 15.0, 3.0])  # of a velocity of which nothing is known, in the air
+GRAVITY_MPS2 = 9.81
+# Without IMU: what a small drone does in cruise, more for a fast one, for about as long as a manoeuvre takes. The
+# course is forgotten meanwhile (course_memory_s), since a drone that is out of sight also turns back.
+MANOEUVRE_MPS2, MANOEUVRE_PER_SPEED, CLIMB_MPS2 = 1.0, 0.08, 0.7
+MANOEUVRE_S = 3.0
+LEAST_SPEED_MPS = 5.0  # one that hovers may have begun to fly
+TYPICAL_SPEED_MPS = 10.0  # of one that has not been seen to fly: for how it manoeuvres
+# With IMU: bias and scale of small accelerometers after calibration, 5 mg and 0.3 % (InvenSense DS-000347), beside the
+# tilt of the autopilot's attitude; how long an attitude filter stays wrong in one direction.
+ACCELEROMETER_MPS2 = 0.07
+TILT_S = 15.0
+NOISE_FLOOR_MPS2 = 0.03  # per root hertz: interpolated attitude, readings that are not taken at one time
+UNFELT_MPS2 = 2.0  # by how much acceleration changes within a tenth of a second
+FOREVER_S = 1e6
+STANDING_M, STANDING_MPS = 0.3, 0.1  # 1-sigma of a vehicle whose motors may not turn
+# Odometry that differs by more from where velocity leads shows what velocity did not know: a gust, a manoeuvre, a
+# picture whose time is not its own.
+LEG_GATE = 16.3  # chi-square, 3 degrees of freedom, 99.9 %
+CLOCK_JITTER_S = 0.005  # of a picture's time against the autopilot's
+POINTS = 9  # between two nodes, when nothing was measured there
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+@dataclass(frozen=True)
+class Felt:
+    """Acceleration between two times, by the accelerometers and the autopilot's attitude.
+
+    ``s_s`` (N,) seconds since the first time, from 0 to the whole span; ``accel_w_mps2`` (N, 3) without gravity and
+    ``yaw_rad`` (N,), both by the autopilot's heading; ``noise_mps2`` per root hertz; ``unfelt_s`` at the end for which
+    no readings had come yet, so that the last one stands."""
+
+    s_s: np.ndarray
+    accel_w_mps2: np.ndarray
+    yaw_rad: np.ndarray
+    noise_mps2: float
+    unfelt_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Leg:
+    """p1 = p0 + reach_s v0 + way_m + way_by_accel a0;  v1 = keep v0 + gain_mps + gain_by_accel a0;  a1 = lasting a0.
+
+    ``cov`` (9, 9) of what that leaves out: position, velocity (both world axes), acceleration (heading's axes).
+    ``inertial``: way and gain were measured, and turn with the heading bias."""
+
+    reach_s: float
+    keep: float
+    way_m: np.ndarray
+    gain_mps: np.ndarray
+    way_by_accel: np.ndarray
+    gain_by_accel: np.ndarray
+    lasting: float
+    cov: np.ndarray
+    inertial: bool
+
+    def predicted(self, p_m: np.ndarray, v: np.ndarray, heading_bias_rad: float) -> tuple[np.ndarray, np.ndarray]:
+        """-> position (3,) and V (6,) at the end, from those at the beginning."""
+        turn = local_rotation_up(heading_bias_rad if self.inertial else 0.0)
+        p1 = p_m + self.reach_s * v[:3] + turn @ self.way_m + self.way_by_accel @ v[3:]
+        v1 = self.keep * v[:3] + turn @ self.gain_mps + self.gain_by_accel @ v[3:]
+        return p1, np.concatenate([v1, self.lasting * v[3:]])
+
+    def by_before(self) -> np.ndarray:
+        """(9, 6): of position, velocity and acceleration at the end by V at the beginning."""
+        by = np.zeros((9, 6))
+        by[:3, :3], by[:3, 3:] = self.reach_s * np.eye(3), self.way_by_accel
+        by[3:6, :3], by[3:6, 3:] = self.keep * np.eye(3), self.gain_by_accel
+        by[6:, 3:] = self.lasting * np.eye(3)
+        return by
+
+
+def unmeasured_sigma(felt: bool, speed_mps: float, tilt_sigma_rad: float) -> np.ndarray:
+    """(3,) 1-sigma of the acceleration that nobody measured, m/s^2."""
+    if not felt:
+        level = max(MANOEUVRE_MPS2, MANOEUVRE_PER_SPEED * speed_mps)
+        return np.array([level, level, CLIMB_MPS2])
+    level = float(np.hypot(GRAVITY_MPS2 * tilt_sigma_rad, ACCELEROMETER_MPS2))
+    return np.array([level, level, ACCELEROMETER_MPS2])
+
+
+def course_memory_s(speed_mps: float) -> float:
+    """How long a drone keeps its course when nobody measures: so long that its manoeuvres leave its speed what it is,
+    and take only the direction. 6 s at 5 m/s, 30 s for a fast one.
+
+    The stationary variance of a velocity with memory T, driven by an acceleration of variance a^2 and memory M, is
+    a^2 T^2 M / (T + M) for each of two axes; this solves it for T."""
+    speed = max(speed_mps, LEAST_SPEED_MPS)
+    share = float(unmeasured_sigma(False, speed, 0.0)[0] / speed) ** 2
+    half = 0.25 / MANOEUVRE_S
+    return (half + float(np.sqrt(half**2 + 0.5 * share))) / share
+
+
+def leg(
+    dt_s: float,
+    felt: Felt | None,
+    yaws_rad: tuple[float, float],
+    heading_bias_rad: float,
+    speed_mps: float,
+    tilt_sigma_rad: float,
+    same_kind: bool,
+) -> Leg:
+    """``yaws_rad``: true headings at both ends, used when nothing was felt. ``same_kind``: the leg before was measured,
+    or not, like this one; else its acceleration says nothing about this one's."""
+    memory_s, course_s = (MANOEUVRE_S, course_memory_s(speed_mps)) if felt is None else (TILT_S, FOREVER_S)
+    if felt is None:
+        s = np.linspace(0.0, dt_s, POINTS)
+        turned = (yaws_rad[1] - yaws_rad[0] + np.pi) % (2 * np.pi) - np.pi
+        yaw = yaws_rad[0] + turned * s / dt_s
+        accel, noise = np.zeros((POINTS, 3)), 0.0
+    else:
+        s, accel, noise = felt.s_s, felt.accel_w_mps2, max(felt.noise_mps2, NOISE_FLOOR_MPS2)
+        yaw = felt.yaw_rad - heading_bias_rad
+    weight = np.zeros(len(s))  # trapezoids
+    weight[1:] += 0.5 * np.diff(s)
+    weight[:-1] += 0.5 * np.diff(s)
+    to_way, to_gain = weight * _reach(dt_s - s, course_s), weight * np.exp(-(dt_s - s) / course_s)
+    lasts = np.exp(-s / memory_s)
+    sigma = unmeasured_sigma(felt is not None, speed_mps, tilt_sigma_rad)
+    cov = _left_out(dt_s, memory_s, course_s, sigma, noise, float(yaw[-1]), speed_mps)
+    if felt is not None:
+        cov[3:6, 3:6] += (UNFELT_MPS2 * felt.unfelt_s) ** 2 * np.eye(3)
+    result = Leg(
+        reach_s=float(_reach(np.array(dt_s), course_s)),
+        keep=float(np.exp(-dt_s / course_s)),
+        way_m=to_way @ accel,
+        gain_mps=to_gain @ accel,
+        way_by_accel=_turned(to_way * lasts, yaw),
+        gain_by_accel=_turned(to_gain * lasts, yaw),
+        lasting=float(np.exp(-dt_s / memory_s)),
+        cov=cov,
+        inertial=felt is not None,
+    )
+    return result if same_kind else _without_memory(result, sigma)
+
+
+def unknown_cov() -> np.ndarray:
+    """(6, 6) of V of a vehicle in the air of whose motion nothing is known."""
+    return np.diag([*MAX_SPEED_SIGMA_MPS, *unmeasured_sigma(False, 0.0, 0.0)]) ** 2
+
+
+def standing_cov() -> np.ndarray:
+    """(6, 6) of V of a vehicle whose motors may not turn."""
+    return STANDING_MPS**2 * np.eye(V_SIZE)
+
+
+def wandered_m(dt_s: float) -> float:
+    """1-sigma of the way, for each axis, of a vehicle of whose motion nothing is known."""
+    way = leg(dt_s, None, (0.0, 0.0), 0.0, TYPICAL_SPEED_MPS, 0.0, same_kind=False)
+    return float(np.hypot(way.reach_s * MAX_SPEED_SIGMA_MPS[0], np.sqrt(way.cov[0, 0])))
+
+
+def spread_after(way: Leg | None, velocity_cov: np.ndarray) -> np.ndarray:
+    """Covariance (9, 9) of the step, and of V at its end, from that of V before it; ``way`` None: it stands."""
+    if way is None:
+        return np.diag([STANDING_M] * 3 + [STANDING_MPS] * V_SIZE) ** 2
+    by_before = way.by_before()
+    return np.asarray(by_before @ velocity_cov @ by_before.T + way.cov)
+
+
+def believed(way: Leg, off_m: np.ndarray, spread: np.ndarray, seen: np.ndarray) -> tuple[Leg, np.ndarray]:
+    """The leg as far as odometry bears it out, and the covariance (9, 9) that both together leave.
+
+    Odometry ended ``off_m`` (3,) from where the leg led; ``spread`` is the leg's, ``seen`` (3, 3) that of odometry."""
+    d2 = float(off_m @ np.linalg.solve(spread[:3, :3] + seen, off_m))
+    if d2 > LEG_GATE:
+        wider = (d2 / LEG_GATE - 1.0) * way.cov
+        way, spread = replace(way, cov=way.cov + wider), spread + wider
+    gain = np.linalg.solve(spread[:3, :3] + seen, spread[:3, :]).T
+    return way, spread - gain @ spread[:3, :]
+
+
+def _without_memory(known: Leg, sigma: np.ndarray) -> Leg:
+    by_accel = known.by_before()[:, 3:]
+    zero = np.zeros((3, 3))
+    return Leg(
+        known.reach_s,
+        known.keep,
+        known.way_m,
+        known.gain_mps,
+        zero,
+        zero,
+        0.0,
+        known.cov + by_accel @ np.diag(sigma**2) @ by_accel.T,
+        known.inertial,
+    )
+
+
+def _reach(t_s: np.ndarray, memory_s: float) -> np.ndarray:
+    return np.asarray(-np.expm1(-t_s / memory_s) * memory_s)
+
+
+def _turned(weights: np.ndarray, yaw_rad: np.ndarray) -> np.ndarray:
+    """Sum of weighted rotations from the heading's axes into the world (3x3)."""
+    c, s = float(weights @ np.cos(yaw_rad)), float(weights @ np.sin(yaw_rad))
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, float(weights.sum())]])
+
+
+def _left_out(
+    dt_s: float,
+    memory_s: float,
+    course_s: float,
+    sigma: np.ndarray,
+    noise_mps2: float,
+    yaw_end_rad: float,
+    speed_mps: float,
+) -> np.ndarray:
+    """Covariance of a leg (9, 9), by quadrature over the moments at which the noise enters."""
+    panels = int(np.ceil(dt_s / (2.0 * memory_s)))
+    half_s = 0.5 * dt_s / panels
+    t = (half_s * (_NODES + 1.0) + 2.0 * half_s * np.arange(panels)[:, None]).ravel()
+    w = np.tile(half_s * _WEIGHTS, panels)
+    rate = 1.0 / memory_s - 1.0 / course_s
+    kick = np.array(  # of position, velocity, acceleration, t seconds after a unit kick of the acceleration
+        [
+            (_reach(t, course_s) - _reach(t, memory_s)) / rate,
+            (np.exp(-t / course_s) - np.exp(-t / memory_s)) / rate,
+            np.exp(-t / memory_s),
+        ]
+    )
+    push = np.array([_reach(t, course_s), np.exp(-t / course_s), np.zeros(len(t))])  # ... after one of the velocity
+    by_kick, by_push = (kick * w) @ kick.T * (2.0 / memory_s), (push * w) @ push.T
+    cov = np.kron(by_kick, np.diag(sigma**2)) + np.kron(by_push, noise_mps2**2 * np.eye(3))
+    cov[:3, :3] += (0.02**2 + (CLOCK_JITTER_S * speed_mps) ** 2) * np.eye(3)
+    to_heading = np.eye(9)
+    to_heading[6:, 6:] = local_rotation_up(-yaw_end_rad).T
+    return np.asarray(to_heading @ cov @ to_heading.T)

@@ -1,0 +1,117 @@
+"""What the anchor says when it is lost, or was never anywhere."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from ground import PINHOLE, FlatMap, rotation, texture, view
+
+from terrafix.anchor.lost import LostWatch
+from terrafix.anchor.node import LOST_SIGMA_M, AnchorNode
+from terrafix.anchor.retrieval import MapSearch
+from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.geodesy import quat_from_rot
+from terrafix.messages import Camera, MapMatch, Origin, Prediction, SearchStep, Verdict
+from terrafix_engines.features.gradient import GradientDescriber
+
+AGL_M = 100.0
+SIDE_M = 400.0
+R = rotation(40.0)
+TRUE_M = np.array([20.0, -10.0, AGL_M])
+
+
+class OnlyMap(FlatMap):
+    """A package and what it is bound to in one."""
+
+    bounds_m = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
+
+    def bind(self, _frame: object) -> "OnlyMap":
+        return self
+
+
+@pytest.fixture(scope="module")
+def ground() -> np.ndarray:
+    return texture(8, SIDE_M)
+
+
+def started(ground: np.ndarray, start_sigma_m: float = 10.0) -> tuple[AnchorNode, MemoryFrameStore]:
+    package: Any = OnlyMap(ground)
+    frames = MemoryFrameStore(8)
+    node = AnchorNode(frames, package, GradientDescriber(), 1.0)
+    camera = Camera(width=640, height=360, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=319.5, cy=179.5)
+    origin = Origin(
+        t_ns=0, camera=camera, lat_deg=48.0, lon_deg=11.0, ground_amsl_m=0.0, start_sigma_m=start_sigma_m,
+        yaw_sigma_deg=2.0, agl_sigma_m=2.0, attitude_sigma_deg=1.0,
+    )  # fmt: skip
+    assert list(node.on(origin)) == []
+    return node, frames
+
+
+def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TRUE_M) -> MapMatch:
+    cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
+    (answer,) = node.on(
+        Prediction(
+            t_ns=frame_id * 10**9,
+            frame_id=frame_id,
+            p_c_in_w_m=(float(at_m[0]), float(at_m[1]), float(at_m[2])),
+            q_w_c=quat_from_rot(R),
+            cov=tuple(float(v) for v in cov.ravel()),
+            agl_m=AGL_M,
+            agl_sigma_m=2.0,
+            step_m=(0.0, 0.0),
+            step_cov_m2=(1.0, 0.0, 0.0, 1.0),
+        )
+    )
+    assert isinstance(answer, MapMatch)
+    return answer
+
+
+def test_a_place_that_is_right_is_tracked(ground: np.ndarray) -> None:
+    node, frames = started(ground)
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    said = match(node, 1, 10.0)
+    assert said.verdict is Verdict.ACCEPTED and not said.coarse and not said.found
+    assert (said.step, said.lost_sigma_m) == (SearchStep.NORMAL, 0.0)
+
+
+def test_an_unusable_picture_is_skipped(ground: np.ndarray) -> None:
+    node, _ = started(ground)
+    said = match(node, 1, 10.0)
+    assert (said.verdict, said.step) == (Verdict.BAD_IMAGE, SearchStep.SKIP)
+
+
+def test_a_start_that_is_not_known_is_searched_on_the_whole_map(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MapSearch, "look", lambda *_: None)
+    node, frames = started(ground, 5000.0)
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    said = match(node, 1, 100.0)
+    assert (said.verdict, said.step, said.lost_sigma_m) == (Verdict.LOST, SearchStep.WHOLE_MAP, LOST_SIGMA_M)
+    assert said.p_c_in_w_m is None and said.cov is None and not said.found
+
+
+def test_an_anchor_that_starts_again_in_flight_does_not_search_what_was_found(ground: np.ndarray) -> None:
+    node, frames = started(ground, 5000.0)
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    assert match(node, 1, 10.0).verdict is Verdict.ACCEPTED
+
+
+def test_a_hint_is_searched_from_where_it_points_unless_it_says_no_more_than_the_map(ground: np.ndarray) -> None:
+    node, _ = started(ground)
+    source: Any = OnlyMap(ground)
+    source.bounds_m = (-4000.0, -1000.0, 4000.0, 1000.0)
+    assert node._start_hint(30.0, 40.0, 1500.0, source) == (30.0, 40.0)
+    assert node._start_hint(30.0, 40.0, 2500.0, source) is None
+
+
+def test_a_place_that_nothing_speaks_for_is_withdrawn_and_said(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node, frames = started(ground)
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    monkeypatch.setattr(LostWatch, "lost", True)
+    said = match(node, 1, 10.0)
+    assert (said.verdict, said.step, said.lost_sigma_m) == (Verdict.LOST, SearchStep.WIDEN, LOST_SIGMA_M)
+    assert said.matches == [] and said.p_c_in_w_m is None
+    assert match(node, 2, 10.0).verdict is Verdict.LOST  # also without a picture

@@ -1,0 +1,235 @@
+"""Velocity and position from one node to the next: against plain integration, against sampled motion, and in flight."""
+
+import math
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, C, V
+from inertial_flight import InertialFlight, flown
+
+from terrafix.core.geodesy import rot_w_b
+from terrafix.estimator.factors import leg_factor
+from terrafix.estimator.telemetry import Telemetry
+from terrafix.estimator.velocity import MANOEUVRE_S, Felt, course_memory_s, leg
+from terrafix.messages import CovarianceMode, Imu, SourceLabel, ThermalBand, VehicleState
+
+G = 9.81
+S = 1_000_000_000
+
+
+def told(seconds: float, rate_hz: float = 50.0, attitude_hz: float = 25.0, turn_radps: float = 0.2) -> Telemetry:
+    """A coordinated turn at constant speed, from time 0 on: 0.2 rad/s at 20 m/s is 4 m/s^2 to the right."""
+    telemetry = Telemetry()
+    aside = 20.0 * turn_radps
+    bank = math.atan2(aside, G)
+    for i in range(round(seconds * attitude_hz) + 1):
+        t = i / attitude_hz
+        yaw = math.remainder(1.0 + turn_radps * t, math.tau)
+        telemetry.add(VehicleState(t_ns=round(t * S), source="test", yaw_rad=yaw, pitch_rad=0.0, roll_rad=bank))
+    down = -math.hypot(aside, G)  # all of the force is along the body's down axis
+    for i in range(round(seconds * rate_hz) + 1):
+        sample = (0, 0.0, 0.0, down, 0.0, 0.0, 0.0)
+        telemetry.add_imu(Imu(t_ns=round(i / rate_hz * S), source="test", samples=[sample]))
+    return telemetry
+
+
+# --- what was felt --------------------------------------------------------------------------------------------
+
+
+def test_a_banked_turn_is_felt_as_one() -> None:
+    felt = told(6.0).felt(round(1.005 * S), round(4.0 * S))
+    assert felt is not None
+    assert (felt.s_s[0], felt.s_s[-1]) == (0.0, pytest.approx(2.995))
+    yaw = 1.0 + 0.2 * (1.005 + felt.s_s)
+    right = 4.0 * np.column_stack([np.cos(yaw), -np.sin(yaw), np.zeros(len(yaw))])
+    assert felt.accel_w_mps2 == pytest.approx(right, abs=0.03)
+    assert felt.noise_mps2 < 1e-3  # nothing shakes
+
+
+def test_vibration_is_in_the_noise() -> None:
+    telemetry, rng = told(0.0), np.random.default_rng(1)
+    for i in range(1, 200):
+        telemetry.add(VehicleState(t_ns=i * S // 50, source="test", yaw_rad=0.0, pitch_rad=0.0, roll_rad=0.0))
+        force = rng.normal((0.0, 0.0, -G), 0.5)
+        sample = (0, float(force[0]), float(force[1]), float(force[2]), 0.0, 0.0, 0.0)
+        telemetry.add_imu(Imu(t_ns=i * S // 50, source="test", samples=[sample]))
+    felt = telemetry.felt(S, 3 * S)
+    assert felt is not None and felt.noise_mps2 == pytest.approx(0.5 * math.sqrt(0.02), rel=0.2)
+
+
+def test_readings_that_do_not_cover_the_time_are_none() -> None:
+    assert told(3.0).felt(S, 2 * S) is not None
+    assert told(3.0).felt(2 * S, round(3.1 * S)) is not None  # the newest batch is still on its way
+    assert told(3.0).felt(2 * S, 4 * S) is None  # silence
+    assert told(3.0, rate_hz=4.0).felt(S, 2 * S) is None  # too slow
+    assert told(3.0, attitude_hz=2.0).felt(S, 2 * S) is None  # the attitude is
+    assert told(3.0).felt(2 * S, 2 * S) is None
+    assert Telemetry().felt(0, S) is None
+
+
+def test_a_batch_is_its_readings_one_by_one() -> None:
+    one, batch = told(0.0), told(0.0)
+    samples = [(40_000_000, 1.0, 2.0, -9.0, 0.0, 0.0, 0.0), (0, 3.0, 2.0, -9.0, 0.0, 0.0, 0.0)]
+    for i in range(1, 60):
+        t_ns = i * 80_000_000
+        for telemetry in (one, batch):
+            telemetry.add(VehicleState(t_ns=t_ns, source="test", yaw_rad=0.1, pitch_rad=0.0, roll_rad=0.2))
+        batch.add_imu(Imu(t_ns=t_ns, source="test", samples=samples))
+        for before_ns, *rest in samples:
+            one.add_imu(Imu(t_ns=t_ns - before_ns, source="test", samples=[(0, *rest)]))  # type: ignore[list-item]
+    a, b = (t.felt(S, 2 * S) for t in (one, batch))
+    assert a is not None and b is not None
+    assert (a.accel_w_mps2 == b.accel_w_mps2).all() and (a.s_s == b.s_s).all()
+
+
+# --- one leg ----------------------------------------------------------------------------------------------------
+
+
+def test_a_measured_leg_is_the_integral() -> None:
+    felt = told(6.0).felt(S, 3 * S)
+    way = leg(2.0, felt, (0.0, 0.0), 0.0, 20.0, 0.01, same_kind=True)
+    start, end = (20.0 * np.array([math.sin(y), math.cos(y), 0.0]) for y in (1.2, 1.6))
+    p, v = way.predicted(np.zeros(3), np.concatenate([start, np.zeros(3)]), 0.0)
+    assert v[:3] == pytest.approx(end, abs=0.05)
+    # The chord of the turn: 100 m radius about the point to the right of the start.
+    assert p == pytest.approx(
+        100.0 * np.array([math.cos(1.2) - math.cos(1.6), math.sin(1.6) - math.sin(1.2), 0.0]), abs=0.05
+    )
+
+
+def test_a_heading_that_reads_too_far_clockwise_is_turned_back() -> None:
+    true, read = (told(6.0).felt(S, 3 * S), told(6.0).felt(S, 3 * S))
+    assert true is not None and read is not None
+    turned = Felt(read.s_s, read.accel_w_mps2 @ rot_up(0.1), read.yaw_rad + 0.1, read.noise_mps2)
+    v = np.array([10.0, 5.0, 0.0, 0.3, -0.2, 0.1])
+    a = leg(2.0, true, (0.0, 0.0), 0.0, 20.0, 0.01, same_kind=True).predicted(np.zeros(3), v, 0.0)
+    b = leg(2.0, turned, (0.0, 0.0), 0.1, 20.0, 0.01, same_kind=True).predicted(np.zeros(3), v, 0.1)
+    assert a[0] == pytest.approx(b[0]) and a[1] == pytest.approx(b[1])
+
+
+def rot_up(angle_rad: float) -> np.ndarray:
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_the_covariance_of_a_leg_is_that_of_sampled_motion(measured: bool) -> None:
+    """Monte Carlo of the process itself, in small steps: acceleration that wanders, in axes that turn.
+
+    The leg takes its noise for what it would be in the axes of its end: a turn of 11 degrees hardly shows."""
+    dt, steps, runs = 2.0, 400, 4000
+    rng = np.random.default_rng(2)
+    t = np.linspace(0.0, dt, steps + 1)
+    turn = 0.1
+    felt = Felt(t, np.zeros((steps + 1, 3)), 0.4 + turn * t, 0.1) if measured else None
+    way = leg(dt, felt, (0.4, 0.4 + turn * dt), 0.0, 20.0, 0.02, same_kind=True)
+    memory, course = (15.0, 1e6) if measured else (MANOEUVRE_S, course_memory_s(20.0))
+    sigma = math.hypot(G * 0.02, 0.07) if measured else 1.6
+    h = dt / steps
+    a, v, p = (np.zeros((runs, 2)) for _ in range(3))
+    for i in range(steps):
+        yaw = 0.4 + turn * t[i]
+        world = a @ np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        p += v * h
+        v += (world - v / course) * h + (0.1 if measured else 0.0) * math.sqrt(h) * rng.normal(size=(runs, 2))
+        a += -a / memory * h + sigma * math.sqrt(2 * h / memory) * rng.normal(size=(runs, 2))
+    sampled = np.cov(np.hstack([p, v, a]).T)
+    claimed = way.cov[np.ix_([0, 1, 3, 4, 6, 7], [0, 1, 3, 4, 6, 7])].copy()
+    claimed[:2, :2] -= (0.02**2 + (0.005 * 20.0) ** 2) * np.eye(2)  # clocks
+    scale = np.sqrt(np.diag(sampled))
+    assert np.abs((claimed - sampled) / np.outer(scale, scale)).max() < 0.12
+
+
+@pytest.mark.parametrize("speed_mps", [5.0, 12.0, 25.0])
+def test_a_drone_out_of_sight_keeps_its_speed_and_loses_its_course(speed_mps: float) -> None:
+    """The covariance of velocity, stationary, is that of the speed in an unknown direction."""
+    way = leg(1000.0, None, (0.0, 0.0), 0.0, speed_mps, 0.0, same_kind=True)
+    assert way.keep < 1e-6
+    assert np.sqrt(way.cov[3, 3] + way.cov[4, 4]) == pytest.approx(speed_mps, rel=0.02)
+    assert course_memory_s(5.0) < course_memory_s(12.0) < course_memory_s(25.0) < 40.0
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_the_factor_knows_its_own_derivatives(measured: bool) -> None:
+    felt = told(6.0).felt(S, 2 * S) if measured else None
+    way = leg(1.0, felt, (1.2, 1.4), 0.05, 20.0, 0.01, same_kind=True)
+    values = gtsam.Values()
+    for node, (yaw, at) in enumerate(((1.2, (0.0, 0.0, 100.0)), (1.4, (18.0, 6.0, 101.0)))):
+        values.insert(C(node), gtsam.Pose3(gtsam.Rot3(rot_w_b(yaw, 0.1, 0.2)), np.array(at)))
+        values.insert(V(node), np.array([18.0, 7.0, 0.5, 0.1, -0.2, 0.05]))
+        values.insert(B(node), np.array([0.01, 0.02, 0.05, 1.0]))
+    factor = leg_factor((C(0), V(0)), (C(1), V(1)), B(1), way)
+    whitened = np.linalg.inv(np.linalg.cholesky(way.cov))
+    analytic, _ = factor.linearize(values).jacobian()
+    numeric = []
+    for key in (C(0), V(0), C(1), V(1), B(1)):
+        for i in range(4 if key == B(1) else 6):
+            step = np.zeros(4 if key == B(1) else 6)
+            step[i] = 1e-5
+            moved = gtsam.VectorValues()
+            moved.insert(key, step)
+            numeric.append((factor.unwhitenedError(values.retract(moved)) - factor.unwhitenedError(values)) / 1e-5)
+    numeric_w = whitened @ np.array(numeric).T
+    assert analytic.T @ analytic == pytest.approx(numeric_w.T @ numeric_w, rel=1e-3, abs=1e-2 * np.abs(analytic).max())
+
+
+# --- in flight ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plane() -> InertialFlight:
+    return InertialFlight(seed=3)
+
+
+@pytest.mark.parametrize(
+    ("imu", "band", "rms_mps", "claim_mps"),
+    [
+        (True, ThermalBand.NORMAL, 0.45, 0.8),
+        (True, ThermalBand.HOT, 0.6, 1.2),
+        (False, ThermalBand.NORMAL, 1.0, 1.8),
+        (False, ThermalBand.HOT, 1.3, 2.6),
+    ],
+)
+def test_velocity_is_right_and_its_sigma_honest(
+    plane: InertialFlight, imu: bool, band: ThermalBand, rms_mps: float, claim_mps: float
+) -> None:
+    run = flown(plane, imu=imu, band=band)
+    mode = CovarianceMode.MARGINALS if band is ThermalBand.NORMAL else CovarianceMode.JACOBIAN
+    assert {said.covariance_mode for said in run.said[1:]} == {mode}
+    errors, sigma = run.velocity_error_mps[10:], run.velocity_sigma_mps[10:]
+    assert np.sqrt(np.mean(np.square(errors[:, :2]))) < rms_mps
+    assert np.median(sigma) < claim_mps
+    assert (np.abs(errors) < 1.96 * sigma[:, None]).mean() > 0.95
+    assert np.abs(errors / sigma[:, None]).max() < 3.5
+
+
+def test_inertial_readings_carry_a_blind_vehicle(plane: InertialFlight) -> None:
+    """Half a minute of a plane that turns, without a picture: tens of metres, and no more than it claims."""
+    blind = (20, 50)
+    with_imu, without = (flown(plane, imu=imu, blind=blind) for imu in (True, False))
+    assert {with_imu.said[i].source_label for i in range(*blind)} == {SourceLabel.DEAD_RECKONED}
+    for run in (with_imu, without):
+        assert (np.abs(run.position_error_m / run.position_sigma_m) < 3.5).all()
+    at = blind[1] - 1
+    assert with_imu.position_sigma_m[at].max() < 90.0 and np.abs(with_imu.position_error_m[at]).max() < 70.0
+    assert without.position_sigma_m[at].min() > 2.0 * with_imu.position_sigma_m[at].max()
+    assert (np.abs(with_imu.position_error_m[-1]) < 10.0).all()  # the next fix finds it where it is
+
+
+def test_a_blind_start_in_the_air_does_not_claim_to_know_the_velocity() -> None:
+    run = flown(InertialFlight(seed=4, seconds=20), imu=True, blind=(0, 20))
+    assert (np.abs(run.position_error_m / run.position_sigma_m) < 3.0).all()
+    assert (np.abs(run.velocity_error_mps[:, :2] / run.velocity_sigma_mps[:, None]) < 3.0).all()
+
+
+def test_readings_that_come_late_or_not_at_all_for_a_while_do_no_harm(plane: InertialFlight) -> None:
+    gap = flown(plane, imu=True, no_imu=(15.0, 25.0))
+    errors, sigma = gap.velocity_error_mps[10:], gap.velocity_sigma_mps[10:]
+    assert np.abs(errors / sigma[:, None]).max() < 3.5
+    assert sigma[10] > 1.5 * sigma[25]  # between 15 and 25 s nothing is felt
+
+
+def test_two_runs_say_the_same(plane: InertialFlight) -> None:
+    a, b = (flown(plane, imu=True, frames=30) for _ in range(2))
+    assert a.said == b.said

@@ -1,0 +1,84 @@
+"""Monte Carlo statistics against independent computation: tables, simulation, closed forms."""
+
+import numpy as np
+import pytest
+
+from terrafix_tools.montecarlo.endurance import slopes
+from terrafix_tools.montecarlo.statistics import band, chi2, draws_in, floors, nees_of, whitened
+
+Z975 = 1.959964
+
+
+@pytest.mark.parametrize(
+    ("freedom", "low", "high"), [(2, 0.0506, 7.378), (10, 3.247, 20.483), (100, 74.222, 129.561), (1000, 914.3, 1089.5)]
+)
+def test_chi_square_quantiles_are_those_of_the_tables(freedom: int, low: float, high: float) -> None:
+    assert chi2(freedom, -Z975) == pytest.approx(low, rel=0.01, abs=0.04)
+    assert chi2(freedom, Z975) == pytest.approx(high, rel=0.01)
+
+
+def test_nees_is_the_mahalanobis_distance_and_no_covariance_is_infinite() -> None:
+    cov = np.array([[[4.0, 1.0], [1.0, 2.0]], [[1.0, 2.0], [2.0, 1.0]], [[np.nan, 0.0], [0.0, 1.0]]])
+    error = np.array([[2.0, -1.0], [0.1, 0.1], [0.0, 0.0]])
+    by_hand = (2.0 * 4.0 - 2.0 * 1.0 * -2.0 + 4.0 * 1.0) / 7.0  # adjugate over determinant
+    assert nees_of(error, cov)[0] == pytest.approx(by_hand)
+    assert np.isinf(nees_of(error, cov)[1:]).all()
+
+
+def test_whitened_errors_have_the_length_of_the_nees() -> None:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(20, 6, 6))
+    cov, error = root @ root.transpose(0, 2, 1), rng.normal(size=(20, 6))
+    assert (whitened(error, cov) ** 2).sum(axis=1) == pytest.approx(nees_of(error, cov))
+
+
+def test_white_errors_are_as_many_draws_as_frames_and_a_constant_is_one() -> None:
+    white = np.random.default_rng(2).normal(size=(2000, 2))
+    assert 1500 < draws_in([white]) <= 2000
+    assert draws_in([np.ones((2000, 2))]) == pytest.approx(1.0, rel=0.2)
+
+
+def test_correlated_errors_are_as_many_draws_as_their_squares_are_worth() -> None:
+    """First-order process: the squares are correlated by rho^(2 lag), n (1 - rho^2) / (1 + rho^2) are left."""
+    rho, rng = 0.9, np.random.default_rng(3)
+    x = np.zeros((20000, 2))
+    for i in range(1, len(x)):
+        x[i] = rho * x[i - 1] + np.sqrt(1 - rho**2) * rng.normal(size=2)
+    assert draws_in([x]) == pytest.approx(20000 * (1 - rho**2) / (1 + rho**2), rel=0.2)
+
+
+def test_the_band_holds_95_of_100_honest_runs_and_no_run_that_claims_too_little() -> None:
+    """Runs of 20 flights whose error has a constant part, as a map's registration makes it."""
+    rng = np.random.default_rng(4)
+    held = overconfident = 0
+    for _ in range(100):
+        flights = [np.sqrt(0.5) * (rng.normal(size=2) + rng.normal(size=(200, 2))) for _ in range(20)]
+        nees, draws = [(error**2).sum(axis=1) for error in flights], draws_in(flights)
+        held += band(nees, draws, 2).holds
+        overconfident += band([3.0 * v for v in nees], draws, 2).holds
+    assert 86 <= held <= 100
+    assert overconfident == 0
+
+
+def test_floors_name_what_is_broken() -> None:
+    good = {"coverage": 0.95, "coverage_refined": 0.96, "false_fixes": 0, "nees": {"holds": True}}
+    assert all(floors(good).values())
+    for key, bad in (("coverage", 0.99), ("coverage", 0.9), ("coverage_refined", None), ("false_fixes", 1)):
+        assert sum(not holds for holds in floors({**good, key: bad}).values()) == 1
+    assert not all(floors({**good, "nees": {"holds": False}}).values())
+
+
+@pytest.mark.parametrize(
+    ("growth_ms_per_h", "growth_mb_per_h", "flat"), [(0.0, 0.5, True), (0.3, 0.0, False), (0.0, 60.0, False)]
+)
+def test_slopes_are_those_of_the_line_whatever_the_machine_did_meanwhile(
+    growth_ms_per_h: float, growth_mb_per_h: float, flat: bool
+) -> None:
+    rng, t_s = np.random.default_rng(5), np.arange(7200.0)
+    busy = np.where(rng.uniform(size=7200) < 0.05, 30.0, 0.0)
+    slower = 1.0 + 0.2 * t_s / 3600.0
+    cpu_ms = slower * (10.0 + growth_ms_per_h * t_s / 3600.0 + busy + 0.5 * rng.normal(size=7200))
+    found = slopes(t_s, cpu_ms, slower * (8.0 + 0.5 * rng.normal(size=7200)), 200.0 + growth_mb_per_h * t_s / 3600.0)
+    assert found["cpu_share_per_h"] == pytest.approx(growth_ms_per_h / 10.0, abs=0.009)
+    assert found["memory_mb_per_h"] == pytest.approx(growth_mb_per_h)
+    assert found["flat"] is flat

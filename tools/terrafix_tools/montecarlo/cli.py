@@ -1,0 +1,37 @@
+"""The command `terrafix montecarlo`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from terrafix_tools.montecarlo.plan import Fault
+
+BROKEN_FLOOR = 1  # exit code
+
+
+def montecarlo(
+    out: Annotated[Path, typer.Option(help="Folder for montecarlo.json and montecarlo.png.")] = Path("out/montecarlo"),
+    flights: Annotated[int, typer.Option(help="How many.")] = 100,
+    first: Annotated[int, typer.Option(help="Number of the first flight: --first 17 --flights 1 flies that one.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 1,
+    duration: Annotated[float, typer.Option(help="Seconds of every flight.")] = 600.0,
+    fault: Annotated[Fault | None, typer.Option(help="Only this one, in every flight.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes; default: one for each processor.")] = None,
+    long: Annotated[
+        bool, typer.Option("--endurance", help="Instead one flight of two hours: are time and memory flat?")
+    ] = False,
+) -> None:
+    """Many simulated flights, as messages, through the real estimator: is it as good as it says?
+
+    Exit code 0: all floors hold; 1: one does not."""
+    from terrafix_tools.montecarlo.endurance import endurance
+    from terrafix_tools.montecarlo.run import Wanted
+    from terrafix_tools.montecarlo.run import montecarlo as run
+
+    if long:
+        raise typer.Exit(0 if endurance(seed)["flat"] else BROKEN_FLOOR)
+    wanted = Wanted(out, flights, first, seed, duration, fault, workers)
+    result = run(wanted)
+    typer.echo(f"Written to {out}")
+    raise typer.Exit(0 if all(result["floors"].values()) else BROKEN_FLOOR)

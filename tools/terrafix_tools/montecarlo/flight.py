@@ -1,0 +1,166 @@
+"""One flight of the run: messages into the real EstimatorNode, one after the other as in the in-process shell."""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.pose import log_so3
+from terrafix.estimator.node import EstimatorNode
+from terrafix.messages import (
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Prediction,
+    Refinement,
+    SourceEnded,
+    Verdict,
+)
+from terrafix_tools.montecarlo.faults import Faults
+from terrafix_tools.montecarlo.flown import Flown, fly
+from terrafix_tools.montecarlo.ground import MapError, Terrain
+from terrafix_tools.montecarlo.lens import Lens
+from terrafix_tools.montecarlo.matches import MapMatches
+from terrafix_tools.montecarlo.plan import FlightPlan
+from terrafix_tools.montecarlo.sightings import Sightings
+
+
+@dataclass
+class Record:
+    """What a flight gave. Arrays have a row for each frame, of the last estimate that was said of it."""
+
+    plan: FlightPlan
+    t_s: np.ndarray
+    way_m: np.ndarray  # (N,) flown over ground
+    truth_m: np.ndarray  # (N, 2)
+    error_m: np.ndarray  # (N, 6): east, north, up [m], rotation about them [rad]; estimate minus truth
+    cov: np.ndarray  # (N, 6, 6) as claimed
+    velocity_error_mps: np.ndarray  # (N, 3)
+    velocity_sigma_mps: np.ndarray  # (N,)
+    anchor_age_ms: np.ndarray  # (N,)
+    refined_error_m: np.ndarray  # (N, 2); nan: not refined
+    refined_sigma_m: np.ndarray  # (N, 2)
+    cpu_ms: np.ndarray  # (N,) of the estimator
+    yardstick_ms: np.ndarray  # (N,) of the simulation of the same frame, which never grows
+    memory_mb: np.ndarray  # (N,) of this process
+    refine_cpu_s: float = 0.0
+    rebuilds: int = 0
+    restarts: int = 0
+    fixes: dict[str, int] = field(default_factory=dict)  # verdicts on map matches
+
+
+def run(plan: FlightPlan, *, refine: bool = True) -> Record:
+    """Deterministic but for times and memory."""
+    return _Run(plan, fly(plan, Terrain(plan.seed, plan.hills_m, plan.settled))).record(refine)
+
+
+class _Run:
+    def __init__(self, plan: FlightPlan, flown: Flown) -> None:
+        self._plan, self._flown = plan, flown
+        self._node = EstimatorNode()
+        self._frame = LocalFrame(flown.origin.lat_deg, flown.origin.lon_deg)
+        self._page_mb = os.sysconf("SC_PAGE_SIZE") / 2**20
+        n = len(flown.frames)
+        self._record = Record(
+            plan=plan,
+            t_s=np.array([shot.t_s for shot in flown.frames]),
+            way_m=flown.way_m,
+            truth_m=np.array([shot.p_m[:2] for shot in flown.frames]),
+            error_m=np.full((n, 6), np.nan),
+            cov=np.full((n, 6, 6), np.nan),
+            velocity_error_mps=np.full((n, 3), np.nan),
+            velocity_sigma_mps=np.full(n, np.nan),
+            anchor_age_ms=np.full(n, -1),
+            refined_error_m=np.full((n, 2), np.nan),
+            refined_sigma_m=np.full((n, 2), np.nan),
+            cpu_ms=np.zeros(n),
+            yardstick_ms=np.zeros(n),
+            memory_mb=np.full(n, np.nan),
+        )
+
+    def record(self, refine: bool) -> Record:
+        plan, flown, record = self._plan, self._flown, self._record
+        lens = Lens(CameraCalibration.of(plan.camera), plan.focal_error, plan.k1_error)
+        sightings = Sightings(lens, flown.terrain, plan.seed)
+        matches = MapMatches(
+            lens,
+            flown.terrain,
+            MapError(plan.seed, np.array(plan.map_offset_m)),
+            has_dem=plan.has_dem,
+            map_sigma_m=plan.map_sigma_m,
+            seed=plan.seed,
+        )
+        faults = Faults(plan.fault, plan.duration_s, plan.seed)
+        self._tell(flown.origin)
+        late: list[tuple[int, MapMatch]] = []  # frame at which it is heard
+        for i, shot in enumerate(flown.frames):
+            with self._stopwatch(record.yardstick_ms, i):
+                odometry = sightings.see(i, shot, blind=faults.blind(shot.t_s))
+            with self._stopwatch(record.cpu_ms, i):
+                for state in flown.telemetry[i]:
+                    self._tell(state)
+                said = self._tell(odometry)
+            with self._stopwatch(record.yardstick_ms, i):
+                late += [
+                    (i + faults.late_frames(), faults.alter(matches.match(prediction, shot), shot))
+                    for prediction in said
+                    if isinstance(prediction, Prediction)
+                ]
+            with self._stopwatch(record.cpu_ms, i):
+                for due, match in late:
+                    if due <= i:
+                        self._tell(match)
+            late = [(due, match) for due, match in late if due > i]
+            record.memory_mb[i] = self._page_mb * int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        if refine:
+            refine_ms = np.zeros(1)
+            with self._stopwatch(refine_ms, 0):
+                self._tell(SourceEnded(t_ns=round(flown.frames[-1].t_s * 1e9), frames=len(flown.frames)))
+            record.refine_cpu_s = 1e-3 * float(refine_ms[0])
+        estimator = self._node._estimator  # what no message says
+        record.rebuilds = estimator.graph.rebuilds if estimator is not None else 0
+        return record
+
+    @contextmanager
+    def _stopwatch(self, into_ms: np.ndarray, i: int) -> Iterator[None]:
+        """Adds the processor time of what is done inside."""
+        began_s = time.process_time()
+        yield
+        into_ms[i] += 1e3 * (time.process_time() - began_s)
+
+    def _tell(self, message: Message) -> list[Message]:
+        said = list(self._node.on(message))
+        for answer in said:
+            match answer:
+                case NavEstimate():
+                    self._estimate(answer)
+                case MeasurementVerdict(measurement="map"):
+                    fixes = self._record.fixes
+                    fixes[str(answer.verdict)] = fixes.get(str(answer.verdict), 0) + 1
+                    restarted = answer.verdict is Verdict.ACCEPTED and answer.detail.startswith("restarted")
+                    self._record.restarts += restarted
+                case Refinement():
+                    for pose in answer.poses:
+                        at = self._frame.to_local(pose.lat_deg, pose.lon_deg)
+                        truth_m = self._flown.frames[pose.frame_id].p_m[:2]
+                        self._record.refined_error_m[pose.frame_id] = np.array(at) - truth_m
+                        self._record.refined_sigma_m[pose.frame_id] = pose.sigma_e_m, pose.sigma_n_m
+        return said
+
+    def _estimate(self, said: NavEstimate) -> None:
+        i, record = said.frame_id, self._record
+        shot = self._flown.frames[i]
+        e_m, n_m = self._frame.to_local(said.lat_deg, said.lon_deg)
+        record.error_m[i, :3] = np.array([e_m, n_m, said.alt_amsl_m]) - shot.p_m
+        record.error_m[i, 3:] = log_so3(rot_from_quat(said.q_w_b) @ shot.r_w_b.T)
+        record.cov[i] = np.array(said.cov).reshape(6, 6)
+        record.velocity_error_mps[i] = np.array(said.velocity_enu_mps) - shot.velocity_mps
+        record.velocity_sigma_mps[i] = said.velocity_sigma_mps
+        record.anchor_age_ms[i] = said.last_anchor_age_ms

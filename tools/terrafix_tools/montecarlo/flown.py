@@ -1,0 +1,153 @@
+"""A flight flown on the truth, with what its autopilot says meanwhile.
+
+World: east, north, up AMSL in metres around the start coordinate as the pilot gave it, the estimator's own frame. The
+ground here is flat as the estimator's world is; geodesy plays no part in this."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from terrafix.core.camera import Mount
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.pose import exp_so3
+from terrafix.messages import Imu, Message, Origin, VehicleState
+from terrafix_tools.mission.course import course
+from terrafix_tools.mission.mission import Box, Mission
+from terrafix_tools.montecarlo.ground import Terrain
+from terrafix_tools.montecarlo.plan import FlightPlan
+from terrafix_tools.sim.autopilot.parameters import Kind
+from terrafix_tools.sim.camera.mount import Fixed, Gimbal
+from terrafix_tools.sim.interfaces import Readings
+from terrafix_tools.sim.sensors.errors import SensorErrors
+from terrafix_tools.sim.sensors.suite import VehicleSensors
+from terrafix_tools.sim.vehicle.copter import Copter, CopterLimits
+from terrafix_tools.sim.vehicle.plane import Plane, PlaneLimits
+
+LAT_DEG, LON_DEG = 48.0, 11.0  # anywhere: only the estimator's way there and back passes through them
+STEP_S = 0.02
+HALF_BOX_M = 1500.0
+SPARE = 1.2  # the course is longer than what is flown of it
+CLIMBS = 0.25  # 1-sigma of a waypoint's height, share of the flight's
+LEAST_AGL_M = 60.0
+TELEMETRY_EVERY, SLOW_EVERY = 2, 5  # steps: attitude at 25 Hz beside inertial readings, 10 Hz without
+IMU_BATCH = 5  # readings in a message, at 50 Hz
+YAW_SIGMA_DEG, AGL_SIGMA_M, ATTITUDE_SIGMA_DEG = 3.0, 3.0, 0.7  # as `terrafix sim make` claims them
+
+
+@dataclass(frozen=True)
+class Shot:
+    """The truth of one frame."""
+
+    t_s: float
+    p_m: np.ndarray  # (3,) of the camera, which is at the vehicle's place
+    r_w_c: np.ndarray  # (3, 3)
+    r_w_b: np.ndarray  # (3, 3) of what the camera is mounted on: the body, or the frame of a gimbal
+    velocity_mps: np.ndarray  # (3,)
+
+
+@dataclass(frozen=True)
+class Flown:
+    origin: Origin
+    frames: list[Shot]
+    telemetry: list[list[Message]]  # before each frame
+    way_m: np.ndarray  # (N,) flown over ground up to each frame
+    terrain: Terrain  # in the estimator's world
+
+
+def fly(plan: FlightPlan, terrain: Terrain) -> Flown:
+    """``terrain`` in the frame of the mission."""
+    frame = LocalFrame(LAT_DEG, LON_DEG)
+    vehicle = _vehicle(plan, terrain, frame)
+    errors = SensorErrors(yaw_constant_rad=plan.compass_rad)
+    sensors = VehicleSensors(frame, seed=plan.seed, errors=errors, airspeed=plan.kind is Kind.PLANE)
+    hanging = Gimbal(seed=plan.seed) if plan.gimbal else Fixed()
+    r_b_c = Mount.of(plan.camera).r_b_c()
+    tilt = exp_so3(np.array([*plan.mount_error_rad, 0.0]))
+    first = vehicle.state
+    claimed = first.p_b_in_w_m[:2] + np.array(plan.start_error_m)
+    home_m = terrain.bare_at_m(float(claimed[0]), float(claimed[1]))
+    every = TELEMETRY_EVERY if plan.has_imu else SLOW_EVERY
+    frame_every = round(1.0 / (plan.frame_hz * STEP_S))
+    frames: list[Shot] = []
+    telemetry: list[list[Message]] = []
+    waiting: list[Message] = []
+    batch: list[Readings] = []
+    way_m, way = 0.0, []
+    state = first
+    for i in range(math.floor(plan.duration_s / STEP_S)):
+        if i:
+            state = vehicle.step(STEP_S, None)
+            way_m += float(np.hypot(*state.velocity_enu_mps[:2])) * STEP_S
+        if plan.has_imu or i % every == 0:
+            readings = sensors.read(state)
+            if i % every == 0:
+                waiting.append(_said(plan, readings, home_m))
+            if plan.has_imu:
+                batch.append(readings)
+        if len(batch) == IMU_BATCH:
+            waiting.append(_inertial(batch))
+            batch = []
+        if i % frame_every == 0:
+            held = hanging.r_w_c(state)
+            p_m = state.p_b_in_w_m - np.array([*claimed, 0.0])
+            frames.append(Shot(state.t_s, p_m, held @ tilt, held @ r_b_c.T, state.velocity_enu_mps))
+            telemetry.append(waiting)
+            waiting = []
+            way.append(way_m)
+    return Flown(_origin(plan, home_m), frames, telemetry, np.array(way), terrain.seen_from(claimed))
+
+
+def _vehicle(plan: FlightPlan, terrain: Terrain, frame: LocalFrame) -> Plane | Copter:
+    mission, height = _mission(plan, frame), terrain.bare_at_m
+    if plan.kind is Kind.PLANE:
+        quick = PlaneLimits(cruise_mps=plan.cruise_mps)
+        return Plane(mission, frame, height, wind=plan.wind, seed=plan.seed, limits=quick)
+    slow = CopterLimits(cruise_mps=plan.cruise_mps)
+    return Copter(mission, frame, height, wind=plan.wind, seed=plan.seed, limits=slow)
+
+
+def _mission(plan: FlightPlan, frame: LocalFrame) -> Mission:
+    """A closed course with a height of its own at every corner."""
+    box = Box(-HALF_BOX_M, -HALF_BOX_M, HALF_BOX_M, HALF_BOX_M)
+    length_m = SPARE * (plan.cruise_mps + plan.wind.speed_mps()) * plan.duration_s
+    drawn = course(plan.seed, length_m, box, frame, agl_m=plan.agl_m)
+    heights = np.random.default_rng([plan.seed, 54]).normal(1.0, CLIMBS, len(drawn.items))
+    items = [
+        replace(item, height_m=max(LEAST_AGL_M, plan.agl_m * float(share)))
+        for item, share in zip(drawn.items, heights, strict=True)
+    ]
+    return replace(drawn, items=tuple(items))
+
+
+def _said(plan: FlightPlan, readings: Readings, home_m: float) -> VehicleState:
+    """As the link says it; with a gimbal nobody knows the camera's roll and pitch."""
+    return VehicleState(
+        t_ns=round(readings.t_s * 1e9),
+        source="montecarlo",
+        yaw_rad=readings.yaw_rad,
+        pitch_rad=None if plan.gimbal else readings.pitch_rad,
+        roll_rad=None if plan.gimbal else readings.roll_rad,
+        agl_m=plan.height_scale * (readings.baro_amsl_m - home_m),
+        armed=True,
+    )
+
+
+def _inertial(batch: list[Readings]) -> Imu:
+    newest_ns = round(batch[-1].t_s * 1e9)
+    samples = [(newest_ns - round(r.t_s * 1e9), *r.accel_b_mps2.tolist(), *r.gyro_b_radps.tolist()) for r in batch]
+    return Imu(t_ns=newest_ns, source="montecarlo", samples=samples)
+
+
+def _origin(plan: FlightPlan, home_m: float) -> Origin:
+    return Origin(
+        t_ns=0,
+        camera=plan.camera,
+        lat_deg=LAT_DEG,
+        lon_deg=LON_DEG,
+        ground_amsl_m=home_m,
+        start_sigma_m=plan.start_sigma_m,
+        yaw_sigma_deg=YAW_SIGMA_DEG,
+        agl_sigma_m=AGL_SIGMA_M,
+        attitude_sigma_deg=ATTITUDE_SIGMA_DEG,
+    )

@@ -1,0 +1,196 @@
+"""Consistency of many flights: NEES and its chi-square band, coverage, false fixes, velocity, drift.
+
+NEES: normalised estimation error squared, the squared Mahalanobis distance of the error in the claimed covariance; its
+mean is the number of dimensions when the claims are true (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
+Tracking and Navigation", 2001, 5.4). Errors of one flight follow each other closely, so N frames are not N draws: the
+band is that of as many draws as the autocorrelation of the normalised error leaves."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from terrafix_tools.evaluate import ELLIPSE95, FALSE_FIX_ERROR_M, FALSE_FIX_MAHALANOBIS2
+from terrafix_tools.montecarlo.flight import Record
+from terrafix_tools.montecarlo.plan import Fault
+
+POSE95 = 12.592  # chi-square with 6 degrees of freedom, 95 %
+NORMAL95 = 1.959964  # two-sided
+FARTHEST = 4.0  # sigmas: errors beyond count as so large for the correlation
+LEAST_DRIFT_M = 1000.0  # of way since the last map fix: shorter says nothing about per cent
+COVERAGE_FLOORS = (0.93, 0.98)
+
+
+@dataclass(frozen=True)
+class Nees:
+    mean: float
+    low: float  # the 95 % band of the mean when the claims are true
+    high: float
+    draws: float  # independent ones
+
+    @property
+    def holds(self) -> bool:
+        return self.low <= self.mean <= self.high
+
+
+def nees_of(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """(N, k), (N, k, k) -> (N,); inf where the claim is no covariance."""
+    out = np.full(len(error), math.inf)
+    sound = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+    sound[sound] &= np.linalg.eigvalsh(cov[sound])[:, 0] > 0.0
+    out[sound] = np.einsum("ni,ni->n", error[sound], np.linalg.solve(cov[sound], error[sound][..., None])[..., 0])
+    return out
+
+
+def band(flights: Sequence[np.ndarray], draws: float, dimensions: int) -> Nees:
+    """Mean over the frames of all flights (N,), and the band of a mean of so many independent draws."""
+    values = np.concatenate(flights) if flights else np.zeros(0)
+    freedom = max(draws * dimensions, 1.0)
+    low, high = (chi2(freedom, z) / max(draws, 1.0 / dimensions) for z in (-NORMAL95, NORMAL95))
+    return Nees(float(values.mean()) if len(values) else math.nan, low, high, draws)
+
+
+def chi2(freedom: float, z: float) -> float:
+    """Quantile of chi-square at the normal quantile ``z`` (Wilson and Hilferty 1931; good to 1 %)."""
+    a = 2.0 / (9.0 * freedom)
+    return freedom * max(0.0, 1.0 - a + z * math.sqrt(a)) ** 3
+
+
+def draws_in(flights: Sequence[np.ndarray]) -> float:
+    """Independent draws in some flights together: each ``whitened`` (N, k), in order of time.
+
+    The squares of a Gaussian process with correlation r are correlated by r squared. The mean of the errors is known,
+    zero, and not estimated: an error that holds for a whole flight leaves one draw. One flight cannot tell a constant
+    that happens to be small from none, so the correlation is that of all flights together."""
+    longest = max((len(w) for w in flights), default=0)
+    size = 1 << (2 * max(longest, 1) - 1).bit_length()
+    products, pairs = np.zeros(longest), np.zeros(longest)
+    for w in flights:
+        length = np.linalg.norm(w, axis=1, keepdims=True)
+        held = w * np.minimum(1.0, FARTHEST / np.maximum(length, FARTHEST))  # one lost flight must not stand for all
+        spectrum = np.fft.rfft(held, size, axis=0)
+        n = len(w)
+        products[:n] += np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=1), size)[:n]
+        pairs[:n] += np.arange(n, 0, -1)
+    if longest < 2 or products[0] <= 0.0:
+        return float(pairs[0]) if longest else 0.0
+    r2 = (products / pairs / (products[0] / pairs[0])) ** 2
+    noise = r2 < 4.0 / pairs  # what the square of an estimated zero may be
+    first = int(np.argmax(noise)) if noise.any() else longest
+    share = pairs[1:first] / pairs[0]  # of the frames that have another one so much later
+    return float(pairs[0] / (1.0 + 2.0 * float((r2[1:first] * share).sum())))
+
+
+def whitened(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """(N, k): the error in units of its claim, uncorrelated."""
+    return np.linalg.solve(np.linalg.cholesky(cov), error[..., None])[..., 0]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What counts of one flight."""
+
+    record: Record
+    distance_m: np.ndarray  # (N,) horizontal error
+    nees: np.ndarray  # (N,) position, against the earth
+    map_nees: np.ndarray  # (N,) position, against the map: without the map's own error on either side
+    pose_nees: np.ndarray  # (N,) six dimensions
+    whitened: tuple[np.ndarray, np.ndarray, np.ndarray]  # the errors of the three, in units of their claims
+
+    @classmethod
+    def of(cls, record: Record) -> "Seen":
+        error, cov = record.error_m, record.cov
+        placed = record.anchor_age_ms >= 0
+        map_cov = cov[:, :2, :2] - (placed * record.plan.map_sigma_m**2)[:, None, None] * np.eye(2)
+        on_map = error[:, :2] - np.array(record.plan.map_offset_m)
+        flights = ((error[:, :2], cov[:, :2, :2]), (on_map, map_cov), (error, cov))
+        nees = [nees_of(e, c) for e, c in flights]
+        white = [whitened(e[s], c[s]) for (e, c), s in zip(flights, map(np.isfinite, nees), strict=True)]
+        return cls(record, np.hypot(*error[:, :2].T), nees[0], nees[1], nees[2], (white[0], white[1], white[2]))
+
+    @property
+    def false_fixes(self) -> int:
+        return int(((self.distance_m > FALSE_FIX_ERROR_M) & (self.nees > FALSE_FIX_MAHALANOBIS2)).sum())
+
+    def refined_nees(self) -> np.ndarray:
+        """Of the frames that were refined."""
+        nees = ((self.record.refined_error_m / self.record.refined_sigma_m) ** 2).sum(axis=1)
+        return np.asarray(nees[np.isfinite(nees)])
+
+    def velocity_share(self) -> np.ndarray:
+        """(2N,) horizontal velocity errors in units of the claim."""
+        return np.asarray((self.record.velocity_error_mps[:, :2] / self.record.velocity_sigma_mps[:, None]).ravel())
+
+    def drift(self) -> float | None:
+        """Error since the last map fix, share of the way since; None where the map never went away for long."""
+        fixed = np.flatnonzero(self.record.anchor_age_ms == 0)
+        if self.record.plan.fault is not Fault.DRIFT or not len(fixed):
+            return None
+        way_m = float(self.record.way_m[-1] - self.record.way_m[fixed[-1]])
+        grown = self.record.error_m[-1, :2] - self.record.error_m[fixed[-1], :2]
+        return float(np.hypot(*grown)) / way_m if way_m >= LEAST_DRIFT_M else None
+
+
+def summary(flights: list[Seen]) -> dict[str, Any]:
+    """The row of a table: over all frames of some flights."""
+    nees = np.concatenate([f.nees for f in flights])
+    refined = np.concatenate([f.refined_nees() for f in flights])
+    on_map = np.concatenate([f.map_nees for f in flights])
+    pose = np.concatenate([f.pose_nees for f in flights])
+    distance = np.concatenate([f.distance_m for f in flights])
+    refined_m = np.concatenate([np.hypot(*f.record.refined_error_m.T) for f in flights])
+    refined_m = refined_m[np.isfinite(refined_m)]
+    velocity = np.abs(np.concatenate([f.velocity_share() for f in flights]))
+    cpu = np.concatenate([f.record.cpu_ms for f in flights])
+    bands = [
+        band([getattr(f, name) for f in flights], draws_in([f.whitened[i] for f in flights]), size)
+        for i, (name, size) in enumerate((("nees", 2), ("map_nees", 2), ("pose_nees", 6)))
+    ]
+    drifts = [d for f in flights if (d := f.drift()) is not None]
+    return {
+        "flights": len(flights),
+        "frames": len(nees),
+        "median_m": float(np.median(distance)),
+        "p95_m": float(np.percentile(distance, 95)),
+        "max_m": float(distance.max()),
+        "refined_median_m": float(np.median(refined_m)) if len(refined_m) else None,
+        "false_fixes": sum(f.false_fixes for f in flights),
+        "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
+        "coverage": float((nees <= ELLIPSE95).mean()),
+        "coverage_refined": float((refined <= ELLIPSE95).mean()) if len(refined) else None,
+        "coverage_on_map": float((on_map <= ELLIPSE95).mean()),
+        "coverage_pose": float((pose <= POSE95).mean()),
+        "nees": _row(bands[0]),
+        "nees_on_map": _row(bands[1]),
+        "nees_pose": _row(bands[2]),
+        "velocity_coverage": float((velocity <= NORMAL95).mean()),
+        "velocity_share_p95": float(np.percentile(velocity, 95)),
+        "velocity_rms_mps": float(
+            np.sqrt(np.mean([(f.record.velocity_error_mps[:, :2] ** 2).mean() for f in flights]))
+        ),
+        "velocity_sigma_median_mps": float(np.median(np.concatenate([f.record.velocity_sigma_mps for f in flights]))),
+        "drift_median": float(np.median(drifts)) if drifts else None,
+        "drift_p95": float(np.percentile(drifts, 95)) if drifts else None,
+        "cpu_ms_median": float(np.median(cpu)),
+        "cpu_ms_p99": float(np.percentile(cpu, 99)),
+        "refine_cpu_s_max": max(f.record.refine_cpu_s for f in flights),
+        "rebuilds": sum(f.record.rebuilds for f in flights),
+        "restarts": sum(f.record.restarts for f in flights),
+    }
+
+
+def _row(nees: Nees) -> dict[str, float | bool]:
+    return {"mean": nees.mean, "low": nees.low, "high": nees.high, "draws": nees.draws, "holds": nees.holds}
+
+
+def floors(total: dict[str, Any]) -> dict[str, bool]:
+    """Whether each floor holds, by what it says."""
+    low, high = COVERAGE_FLOORS
+    return {
+        "95 % ellipse holds 93 to 98 % of the positions": low <= total["coverage"] <= high,
+        "95 % ellipse holds 93 to 98 % of the refined positions": low <= (total["coverage_refined"] or 0.0) <= high,
+        "no false fix (beyond 50 m and 3 sigma)": total["false_fixes"] == 0,
+        "mean NEES of the position in its 95 % band": total["nees"]["holds"],
+    }
