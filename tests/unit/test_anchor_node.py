@@ -1,7 +1,9 @@
 """What the anchor says when it is lost, or was never anywhere."""
 
+from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
@@ -20,12 +22,26 @@ R = rotation(40.0)
 TRUE_M = np.array([20.0, -10.0, AGL_M])
 
 
+ORIGIN = Origin(
+    t_ns=0,
+    camera=Camera(width=640, height=360, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=319.5, cy=179.5),
+    lat_deg=48.0,
+    lon_deg=11.0,
+    ground_amsl_m=0.0,
+    start_sigma_m=10.0,
+    yaw_sigma_deg=2.0,
+    agl_sigma_m=2.0,
+    attitude_sigma_deg=1.0,
+)
+
+
 class OnlyMap(FlatMap):
     """A package and what it is bound to in one."""
 
     bounds_m = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
+    manifest = SimpleNamespace(layers=(SimpleNamespace(table="imagery", ce90_m=None),))
 
-    def bind(self, _frame: object) -> "OnlyMap":
+    def bind(self, _frame: object, _layer: str) -> "OnlyMap":
         return self
 
 
@@ -38,16 +54,12 @@ def started(ground: np.ndarray, start_sigma_m: float = 10.0) -> tuple[AnchorNode
     package: Any = OnlyMap(ground)
     frames = MemoryFrameStore(8)
     node = AnchorNode(frames, package, GradientDescriber(), 1.0)
-    camera = Camera(width=640, height=360, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=319.5, cy=179.5)
-    origin = Origin(
-        t_ns=0, camera=camera, lat_deg=48.0, lon_deg=11.0, ground_amsl_m=0.0, start_sigma_m=start_sigma_m,
-        yaw_sigma_deg=2.0, agl_sigma_m=2.0, attitude_sigma_deg=1.0,
-    )  # fmt: skip
+    origin = msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m)
     assert list(node.on(origin)) == []
     return node, frames
 
 
-def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TRUE_M) -> MapMatch:
+def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TRUE_M, step_m: float = 0.0) -> MapMatch:
     cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
     (answer,) = node.on(
         Prediction(
@@ -58,7 +70,7 @@ def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TR
             cov=tuple(float(v) for v in cov.ravel()),
             agl_m=AGL_M,
             agl_sigma_m=2.0,
-            step_m=(0.0, 0.0),
+            step_m=(step_m, 0.0),
             step_cov_m2=(1.0, 0.0, 0.0, 1.0),
         )
     )
@@ -115,3 +127,33 @@ def test_a_place_that_nothing_speaks_for_is_withdrawn_and_said(
     assert (said.verdict, said.step, said.lost_sigma_m) == (Verdict.LOST, SearchStep.WIDEN, LOST_SIGMA_M)
     assert said.matches == [] and said.p_c_in_w_m is None
     assert match(node, 2, 10.0).verdict is Verdict.LOST  # also without a picture
+
+
+class TwoDates:
+    """The newest layer shows other ground, as after building works; the older one is right, and states its accuracy."""
+
+    manifest = SimpleNamespace(
+        layers=(SimpleNamespace(table="new", ce90_m=None), SimpleNamespace(table="old", ce90_m=5.0))
+    )
+
+    def __init__(self, ground: np.ndarray) -> None:
+        self._maps = {"new": OnlyMap(texture(77, SIDE_M)), "old": OnlyMap(ground)}
+
+    def bind(self, _frame: object, layer: str) -> OnlyMap:
+        return self._maps[layer]
+
+
+def test_the_layer_that_fits_is_learnt(ground: np.ndarray) -> None:
+    package: Any = TwoDates(ground)
+    frames = MemoryFrameStore(8)
+    node = AnchorNode(frames, package, GradientDescriber(), 10.0)
+    list(node.on(ORIGIN))
+    said = []
+    for frame_id in range(1, 9):
+        at_m = TRUE_M + np.array([15.0 * (frame_id - 4), 0.0, 0.0])
+        frames.put(frame_id, view(ground, PINHOLE, R, at_m))
+        said.append(match(node, frame_id, 10.0, at_m, step_m=15.0 if frame_id > 1 else 0.0))
+    assert said[0].verdict is not Verdict.ACCEPTED and said[0].map_sigma_m == pytest.approx(10.0 / 2.146)
+    assert [m.verdict for m in said[-2:]] == [Verdict.ACCEPTED] * 2
+    assert said[-1].map_sigma_m == pytest.approx(5.0 / 2.146)
+    assert said[-1].p_c_in_w_m is not None and np.hypot(*(np.array(said[-1].p_c_in_w_m) - at_m)[:2]) < 3.0

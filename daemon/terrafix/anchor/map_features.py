@@ -33,11 +33,11 @@ class Describer(Protocol):
 
 
 class MapFeatures:
-    def __init__(self, source: MapWindows, describer: Describer) -> None:
+    def __init__(self, source: MapWindows, describer: Describer, cache_bytes: int = CACHE_BYTES) -> None:
         self._source = source
         self._describer = describer
         self._tiles: OrderedDict[tuple[float, int, int], tuple[np.ndarray, np.ndarray]] = OrderedDict()
-        self._bytes = 0
+        self._bytes, self._most_bytes = 0, cache_bytes
 
     def window(
         self, e_min_m: float, n_max_m: float, width: int, height: int, gsd_m: float
@@ -83,7 +83,7 @@ class MapFeatures:
         tile = (np.where(valid, descriptors, 0.0).astype(np.float16), valid)
         self._tiles[key] = tile
         self._bytes += tile[0].nbytes + valid.nbytes
-        while self._bytes > CACHE_BYTES and len(self._tiles) > 1:
+        while self._bytes > self._most_bytes and len(self._tiles) > 1:
             _, (old, old_valid) = self._tiles.popitem(last=False)
             self._bytes -= old.nbytes + old_valid.nbytes
         return tile

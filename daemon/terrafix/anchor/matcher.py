@@ -8,7 +8,7 @@ import numpy as np
 
 from terrafix.anchor.belief import Surface
 from terrafix.anchor.correlate import Searchable, standardise
-from terrafix.anchor.map_features import Describer, MapFeatures
+from terrafix.anchor.map_features import CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.map_package import LocalMap
 from terrafix.anchor.patches import match_patches
 from terrafix.anchor.pnp import THRESHOLD, PnpResult, solve
@@ -101,14 +101,18 @@ class Fix:
 
 
 class FrameMatcher:
-    def __init__(self, camera: CameraCalibration, source: LocalMap, describer: Describer) -> None:
+    """``cache_bytes``: of the map's descriptors, kept once they were computed."""
+
+    def __init__(
+        self, camera: CameraCalibration, source: LocalMap, describer: Describer, cache_bytes: int = CACHE_BYTES
+    ) -> None:
         self._camera = camera
         self._map = source
         self._describer = describer
-        self._features = MapFeatures(source, describer)
+        self._features = MapFeatures(source, describer, cache_bytes)
         # Many channels over a wide window are slow; oriented gradients find the place as well, at a tenth of the cost.
         self._wide = describer if describer.stride == 1 else GradientDescriber()
-        self._wide_features = self._features if describer.stride == 1 else MapFeatures(source, self._wide)
+        self._wide_features = self._features if describer.stride == 1 else MapFeatures(source, self._wide, cache_bytes)
 
     def look_cell_m(self, agl_m: float) -> float:
         return self._gsd(agl_m, LOOK_GSD_PER_AGL, self._describer) * self._describer.stride

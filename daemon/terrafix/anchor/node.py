@@ -7,6 +7,7 @@ import numpy as np
 
 from terrafix.anchor.answer import coarse, judged
 from terrafix.anchor.belief import Belief, cell_for
+from terrafix.anchor.layers import Layers
 from terrafix.anchor.lost import LostWatch
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import LocalMap, MapPackage
@@ -38,19 +39,15 @@ WIDEN = 1.6
 LOST_SIGMA_M = 1000.0  # 1-sigma of a position that is not known, at least; more on a larger map
 FOUND_SIGMA_M = 10.0  # of the place that a search has found, for the belief that follows it
 SCALE_CHANGED = 1.5  # ratio of heights beyond which a search begins anew
-CE90_SIGMAS = 2.1460  # of a circular normal error: sqrt(-2 ln 0.1)
 
 
 class AnchorNode:
-    def __init__(
-        self, frames: FrameStore, package: MapPackage | None, describer: Describer, map_sigma_m: float
-    ) -> None:
+    def __init__(self, frames: FrameStore, package: MapPackage | None, describer: Describer, ce90_m: float) -> None:
         self._frames = frames
         self._package = package
         self._describer = describer
-        self._map_sigma_m = map_sigma_m
-        self._matcher: FrameMatcher | None = None
-        self._map: LocalMap | None = None
+        self._ce90_m = ce90_m  # of imagery that does not state its own
+        self._layers: Layers | None = None
         self._belief: Belief | None = None
         self._origin: Origin | None = None
         self._ground_m = 0.0
@@ -68,8 +65,8 @@ class AnchorNode:
                 self._ground_m = message.ground_amsl_m or 0.0
                 self._belief, self._search, self._watch = None, None, LostWatch()
                 if self._package is not None:
-                    self._map = self._package.bind(LocalFrame(message.lat_deg, message.lon_deg))
-                    self._matcher = FrameMatcher(CameraCalibration.of(message.camera), self._map, self._describer)
+                    frame, camera = LocalFrame(message.lat_deg, message.lon_deg), CameraCalibration.of(message.camera)
+                    self._layers = Layers(self._package, frame, camera, self._describer, self._ce90_m)
             case Prediction():
                 yield self._match(message)
             case _:
@@ -84,28 +81,31 @@ class AnchorNode:
             frame_id=prediction.frame_id,
             verdict=Verdict.OUTSIDE_MAP,
             matcher=self._describer.name,
-            map_sigma_m=self._map_sigma_m,
             lost_sigma_m=self._lost_sigma_m,
         )
         image = self._frames.get(prediction.frame_id)
-        if self._matcher is None or self._map is None or self._origin is None:
+        if self._layers is None or self._origin is None:
             return answer
-        belief = self._moved(prediction, self._map, self._matcher, self._origin)
+        best = self._layers.best
+        answer = msgspec.structs.replace(answer, map_sigma_m=best.sigma_m)
+        belief = self._moved(prediction, best.map, best.matcher, self._origin)
         if self._search is not None:
-            return self._searched(answer, prediction, image, self._search, self._map, self._matcher)
+            return self._searched(answer, prediction, image, self._search, best.map, best.matcher)
         if image is None:
             return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE, step=SearchStep.SKIP)
         e_m, n_m, _ = prediction.p_c_in_w_m
-        ground, relief_m = ground_plane(self._map, e_m, n_m, prediction.agl_m)
+        ground, relief_m = ground_plane(best.map, e_m, n_m, prediction.agl_m)
         view = view_of(prediction, ground, self._ground_m)
         answer = msgspec.structs.replace(answer, ground=ground, relief_m=relief_m)
         if view.agl_m < MIN_AGL_M:
             return msgspec.structs.replace(answer, verdict=Verdict.TOO_LOW)
-        look = self._matcher.look(image, view, belief)
+        looks = self._layers.looks(image, view, belief)
+        new = min(self._since_look_m / (NEW_GROUND_SHARE * max(look.footprint_m for look in looks.values())), 1.0)
+        weight = max(new, MIN_LOOK)
+        used, look = self._layers.chosen(looks, belief.mode(), weight)
+        answer = msgspec.structs.replace(answer, map_sigma_m=used.sigma_m)
         if look.verdict is not Verdict.ACCEPTED:
             return msgspec.structs.replace(answer, verdict=look.verdict)
-        new = min(self._since_look_m / (NEW_GROUND_SHARE * look.footprint_m), 1.0)
-        weight = max(new, MIN_LOOK)
         self._since_look_m = 0.0
         gain = belief.update(look.surfaces, weight)
         mode = belief.mode()
@@ -122,15 +122,15 @@ class AnchorNode:
         )
         tried = mode.mass >= MODE_TRIED
         if tried:
-            answer = judged(answer, self._matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
+            answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
         claimed_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
         inliers = answer.inliers if answer.verdict is Verdict.ACCEPTED else 0
         self._watch.looked(gain, weight, new, inliers, claimed_m, view.agl_m)
         # Of the mixture "where it is believed to be, or anywhere": the variance that the second part adds.
-        self._lost_sigma_m = float(np.sqrt(self._watch.doubt)) * _anywhere_m(self._map)
+        self._lost_sigma_m = float(np.sqrt(self._watch.doubt)) * _anywhere_m(best.map)
         answer = msgspec.structs.replace(answer, lost_sigma_m=self._lost_sigma_m)
         if self._watch.lost:
-            return self._lost(answer, prediction, self._map, self._matcher)
+            return self._lost(answer, prediction, best.map, best.matcher)
         if not tried:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
         if answer.verdict is Verdict.ACCEPTED:
@@ -251,6 +251,4 @@ def make_node(ctx: NodeContext) -> AnchorNode:
         describer = open_describer(ctx.config.models.xfeat)
     except ModelFileError as error:
         raise ModelError(str(error)) from None
-    stated = None if package is None else package.manifest.ce90_m
-    ce90_m = ctx.config.map.ce90_m if stated is None else stated
-    return AnchorNode(ctx.frames, package, describer, ce90_m / CE90_SIGMAS)
+    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m)

@@ -8,10 +8,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from terrafix.anchor.layers import CE90_SIGMAS
 from terrafix.anchor.map_format import Layer
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import MIN_SIDE_CELLS, FrameMatcher
-from terrafix.anchor.node import CE90_SIGMAS, MIN_AGL_M
+from terrafix.anchor.node import MIN_AGL_M
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Map
 from terrafix.core.errors import UsageError

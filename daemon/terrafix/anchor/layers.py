@@ -1,0 +1,58 @@
+"""The layers of a map as the anchor sees them: a map and a matcher for every date of the place, and which is in use."""
+
+from dataclasses import dataclass
+
+from terrafix.anchor.belief import Belief, Mode
+from terrafix.anchor.map_features import CACHE_BYTES, Describer
+from terrafix.anchor.map_layers import LayerChoice
+from terrafix.anchor.map_package import LocalMap, MapPackage
+from terrafix.anchor.matcher import FrameMatcher, Look, View
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import Image
+from terrafix.messages import Verdict
+
+CE90_SIGMAS = 2.1460  # of a circular normal error: sqrt(-2 ln 0.1)
+
+
+@dataclass(frozen=True)
+class Dated:
+    """One layer. ``sigma_m``: error of its position, 1-sigma per horizontal axis."""
+
+    map: LocalMap
+    matcher: FrameMatcher
+    sigma_m: float
+
+
+class Layers:
+    """``ce90_m`` counts for the layers that state none."""
+
+    def __init__(
+        self, package: MapPackage, frame: LocalFrame, camera: CameraCalibration, describer: Describer, ce90_m: float
+    ) -> None:
+        layers = package.manifest.layers
+        self._all: dict[str, Dated] = {}
+        for layer in layers:
+            bound = package.bind(frame, layer.table)
+            matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers))
+            stated = ce90_m if layer.ce90_m is None else layer.ce90_m
+            self._all[layer.table] = Dated(bound, matcher, stated / CE90_SIGMAS)
+        self._choice = LayerChoice([layer.table for layer in layers])
+
+    @property
+    def best(self) -> Dated:
+        return self._all[self._choice.best]
+
+    def looks(self, image: Image, view: View, belief: Belief) -> dict[str, Look]:
+        """The best layer's look, first, and now and then another one's."""
+        return {table: self._all[table].matcher.look(image, view, belief) for table in self._choice.wanted()}
+
+    def chosen(self, looks: dict[str, Look], mode: Mode, weight: float) -> tuple[Dated, Look]:
+        """The layer to use for this frame. ``mode``: what was believed before the looks, so that none of them is asked
+        about itself; ``weight`` of the looks (new ground)."""
+        scores = {
+            table: look.best_at(mode.e_m, mode.n_m)[1] if look.verdict is Verdict.ACCEPTED else None
+            for table, look in looks.items()
+        }
+        used = self._choice.looked(scores, weight) or next(iter(looks))
+        return self._all[used], looks[used]
