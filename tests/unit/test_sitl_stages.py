@@ -57,7 +57,7 @@ class Daemon:
 
 @pytest.fixture(autouse=True)
 def no_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("BOOT_S", "READY_S", "TAKE_OVER_S", "LOSS_S"):
+    for name in ("BOOT_S", "READY_S", "STREAMS_S", "TAKE_OVER_S", "LOSS_S"):
         monkeypatch.setattr(sitl_stages, name, 0.05)
     monkeypatch.setattr(sitl_stages, "ARM_S", 0.2)
     monkeypatch.setattr(sitl_stages, "ARM_AGAIN_S", 0.01)

@@ -50,6 +50,7 @@ FLAT_SIGMAS, DEM_SIGMAS = (0.03, 0.02), (0.015, 0.01)
 RELIEF_SLOPE = 2.0  # a plane that misses the ground by this share of the height misses its slope by so much more
 # ... and one hill is seen by some fifteen keyframes in a row, each with the same mistake: root of that many.
 RELIEF_REPEATS = 4.0
+FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
@@ -127,6 +128,8 @@ class Estimator:
         self._pace_mps = TYPICAL_SPEED_MPS  # how fast it was when it was last seen to fly
         self._felt: bool | None = None  # whether the last leg was measured; None: there was none
         self._stood_at: int | None = None  # node at which a vehicle stands, motors off
+        self._launching = False  # it stood, and was not seen to fly since ...
+        self._blind = False  # ... nor felt
         self._last: Placed | None = None  # newest frame
         self._fixed_at_m: np.ndarray | None = None
         self._refused: _Disagreement | None = None
@@ -150,11 +153,16 @@ class Estimator:
         newest = self.graph.newest
         before = self.graph.state(newest)
         known = self._by_odometry(odometry, attitude)
+        self._launching = attitude.stands or self._launching
         way = None if attitude.stands else self._leg(t_s, before, attitude, felt)
         spread = spread_after(way, self._velocity_cov)
         led_to, velocity = before.pose.translation(), np.zeros(6)
         if way is not None:
             led_to, velocity = way.predicted(led_to, before.velocity, float(before.bias[2]))
+        if self._has_taken_off_blind(known is not None, way, led_to):
+            cov = tangent_to_world(self._covariance(newest), before.pose.rotation().matrix())
+            sigma_m = float(np.sqrt(np.linalg.eigvalsh((cov[:3, :3] + spread[:3, :3])[:2, :2])[-1]))
+            return self._begin(frame_id, t_s, attitude, led_to[:2], sigma_m)
         if known is not None:
             parent, motion = known
             verdict = Verdict.ACCEPTED
@@ -203,7 +211,19 @@ class Estimator:
             self._pace_mps,
             np.radians(self.origin.attitude_sigma_deg),
             same_kind=self._felt is (measured is not None),
+            launching=self._launching,
         )
+
+    def _has_taken_off_blind(self, seen: bool, way: Leg | None, led_to_m: np.ndarray) -> bool:
+        """It is seen to fly after a take-off that nothing measured. Told of the speed at both ends, a graph would
+        make up the way between them and be too sure of it: it begins again, where and as sure as it is."""
+        if not self._launching or way is None:
+            return False
+        self._blind = self._blind or not way.inertial
+        if not seen or float(led_to_m[2]) - self.ground_m < FLYING_M:
+            return False
+        blind, self._launching, self._blind = self._blind, False, False
+        return blind
 
     def _knows_more(self, attitude: Attitude) -> bool:
         """The first words of the autopilot came after the first frame, before the first fix. No linear graph recovers
@@ -212,7 +232,15 @@ class Estimator:
         height = not self._began_with[1] and attitude.agl_m is not None
         return self.last_fix_t_s is None and (heading or height)
 
-    def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
+    def _begin(
+        self,
+        frame_id: int,
+        t_s: float,
+        attitude: Attitude,
+        at_m: np.ndarray | None = None,
+        sigma_m: float = 0.0,
+    ) -> Advance:
+        """At the flight's start, less sure the longer that was ago; or at ``at_m`` (east, north) with its 1-sigma."""
         origin = self.origin
         self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
         waited_s = 0.0 if self._began_s is None else t_s - self._began_s
@@ -222,8 +250,11 @@ class Estimator:
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
         r_w_c = self._expected_rotation(attitude, np.zeros(4))
-        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([0.0, 0.0, self.ground_m + agl]))
+        e_m, n_m = (0.0, 0.0) if at_m is None else at_m
         start = float(np.hypot(min(max(origin.start_sigma_m, 1.0), SEARCHED_START_M), drift_m))
+        if at_m is not None:
+            start = drift_m = sigma_m
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([e_m, n_m, self.ground_m + agl]))
         wide = np.diag([1.0, 1.0, UNKNOWN_RAD, start, start, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]

@@ -19,6 +19,8 @@ GRAVITY_MPS2 = 9.81
 # course is forgotten meanwhile (course_memory_s), since a drone that is out of sight also turns back.
 MANOEUVRE_MPS2, MANOEUVRE_PER_SPEED, CLIMB_MPS2 = 1.0, 0.08, 0.7
 MANOEUVRE_S = 3.0
+# ... and of one that stood a moment ago: a take-off run, a throw, a climb that begins (a simulated plane: 10 m/s^2).
+LAUNCH_MPS2 = np.array([6.0, 6.0, 5.0])
 LEAST_SPEED_MPS = 5.0  # one that hovers may have begun to fly
 TYPICAL_SPEED_MPS = 10.0  # of one that has not been seen to fly: for how it manoeuvres
 # With IMU: bias and scale of small accelerometers after calibration, 5 mg and 0.3 % (InvenSense DS-000347), beside the
@@ -85,8 +87,10 @@ class Leg:
         return by
 
 
-def unmeasured_sigma(felt: bool, speed_mps: float, tilt_sigma_rad: float) -> np.ndarray:
-    """(3,) 1-sigma of the acceleration that nobody measured, m/s^2."""
+def unmeasured_sigma(felt: bool, speed_mps: float, tilt_sigma_rad: float, launching: bool = False) -> np.ndarray:
+    """(3,) 1-sigma of the acceleration that nobody measured, m/s^2. ``launching``: it has not been seen to fly yet."""
+    if not felt and launching:
+        return LAUNCH_MPS2
     if not felt:
         level = max(MANOEUVRE_MPS2, MANOEUVRE_PER_SPEED * speed_mps)
         return np.array([level, level, CLIMB_MPS2])
@@ -114,6 +118,7 @@ def leg(
     speed_mps: float,
     tilt_sigma_rad: float,
     same_kind: bool,
+    launching: bool = False,
 ) -> Leg:
     """``yaws_rad``: true headings at both ends, used when nothing was felt. ``same_kind``: the leg before was measured,
     or not, like this one; else its acceleration says nothing about this one's."""
@@ -131,7 +136,7 @@ def leg(
     weight[:-1] += 0.5 * np.diff(s)
     to_way, to_gain = weight * _reach(dt_s - s, course_s), weight * np.exp(-(dt_s - s) / course_s)
     lasts = np.exp(-s / memory_s)
-    sigma = unmeasured_sigma(felt is not None, speed_mps, tilt_sigma_rad)
+    sigma = unmeasured_sigma(felt is not None, speed_mps, tilt_sigma_rad, launching)
     cov = _left_out(dt_s, memory_s, course_s, sigma, noise, float(yaw[-1]), speed_mps)
     if felt is not None:
         cov[3:6, 3:6] += (UNFELT_MPS2 * felt.unfelt_s) ** 2 * np.eye(3)

@@ -24,6 +24,7 @@ from terrafix_tools.sim.sitl.scene import Scene
 GPS_ID = 1  # Terrafix is the second GPS
 BOOT_S = 120.0  # until the filter has a position
 READY_S = 60.0  # until the first GPS_INPUT
+STREAMS_S = 10.0  # until the IMU comes at the rate that was asked for: a take-off that it felt is one that is known
 ARM_S = 120.0  # until the pre-arm checks pass
 ARM_AGAIN_S = 3.0
 TAKE_OVER_S = 240.0  # from arming until Terrafix has a 3D fix at SAFE_M
@@ -100,6 +101,7 @@ class Stages:
         self._station.upload(self._scene.mission)
         self._daemon.start()
         self._wait("the first GPS_INPUT", READY_S, lambda: self._fix(GPS_ID) >= NO_FIX)
+        self._pause(STREAMS_S)
         self._say("autopilot and Terrafix are ready")
 
     def take_off(self) -> None:
