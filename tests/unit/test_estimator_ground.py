@@ -43,3 +43,22 @@ def test_the_body_is_known_no_better_than_who_tells_it_from_the_mount(
 ) -> None:
     estimator = begun(Attitude(0.0, pitch_rad, pitch_rad, 100.0))
     assert estimator.body_sigma_rad == pytest.approx(np.radians(sigma_deg))
+
+
+def unseen(t_s: float) -> Odometry:
+    frame_id = round(2 * t_s)
+    return Odometry(t_ns=round(t_s * 1e9), frame_id=frame_id, keyframe_id=0, verdict=Verdict.FEW_INLIERS)
+
+
+def test_a_take_off_that_nobody_measured_is_claimed_to_be_one() -> None:
+    """Off the runway at 8 m/s^2, without IMU: 6 s later it is 102 m away."""
+    estimator = begun(Attitude(0.0, 0.0, 0.0, 0.0, armed=False))
+    for t_s in np.arange(0.5, 60.0, 0.5):
+        waiting = estimator.advance(round(2 * t_s), t_s, unseen(t_s), Attitude(0.0, 0.0, 0.0, 0.0, armed=False))
+    assert np.sqrt(waiting.placed.cov[3, 3]) < 6.0  # it stands: the start is what it was
+    for t_s in np.arange(60.0, 66.0, 0.5):
+        height_m = max(0.0, 5.0 * (t_s - 64.0))
+        off = estimator.advance(round(2 * t_s), t_s, unseen(t_s), Attitude(0.0, 0.1, 0.0, height_m, armed=True))
+    position = np.sqrt(np.linalg.eigvalsh(off.placed.cov[3:, 3:])[-1])
+    assert 102.0 / 3.0 < position < 150.0
+    assert 22.0 / 3.0 < np.sqrt(off.placed.velocity_cov[0, 0]) < 40.0
