@@ -122,7 +122,7 @@ def test_the_gnss_is_kept_while_terrafix_is_not_ready(height_m: float, fix_since
 @pytest.mark.parametrize("known", ["SIM_GPS_DISABLE", "SIM_GPS1_ENABLE"])
 def test_the_receiver_is_switched_off_by_the_name_that_the_firmware_has(known: str) -> None:
     notes = flying()
-    notes.fix_types[0].extend([(7, 6), (8, 1)])
+    notes.fix_types[0].extend([(6, 1), (7, 6), (8, 1), (9, 1)])  # two reports before anybody looked
     stages, station, _ = made(notes, Station(known=(known,)))
     stages.lose_gnss()
     assert station.done == [(known, 1 if known == "SIM_GPS_DISABLE" else 0)] and stages.times.lost_ns == 8

@@ -14,11 +14,12 @@ PATIENCE = 5  # asked so often in vain: from then on
 SELDOM_NS = 30 * NS_PER_S
 ENOUGH = 0.7  # share of the rate below which it counts as too slow: ArduPilot rounds intervals to its loop
 OLD_AFTER = 2  # windows without any effect or answer, after which the old request is tried too
-# Attitude at 25 Hz interpolates a turn for the frames and levels the IMU, of which 50 Hz are 2 kB/s; height at 5 Hz
+# Attitude at 25 Hz interpolates a turn for the frames and levels the IMU. Of that 33 Hz are 1.3 kB/s, and what a plane
+# can give: ArduPilot sends nothing faster than 0.8 of its main loop (plane: 50 Hz), in whole loops. Height at 5 Hz
 # follows the barometer; time once a second; receivers at 5 Hz, that a spoofed one is seen within a second.
 STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 25.0,
-    mavlink.MAVLINK_MSG_ID_RAW_IMU: 50.0,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: 33.0,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,  # for relative_alt alone
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,

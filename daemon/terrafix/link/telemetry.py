@@ -20,7 +20,7 @@ BOOT_WRAP_NS = 2**32 * 1_000_000  # time_boot_ms has 32 bits: after 49.7 days it
 REBOOT_BACK_MS = 1_000  # boot time that steps back by more is a new boot
 ATTITUDE_MAX_RAD = 4 * math.pi  # roll, pitch and yaw beyond any convention are garbage
 HEIGHT_MAX_M = 20_000.0
-# Readings are said in batches: at 50 Hz two or three a message. A frame's estimate waits for none of them, so that a
+# Readings are said in batches: at 33 Hz one or two a message. A frame's estimate waits for none of them, so that a
 # batch is not longer than the way of a picture through vision.
 IMU_BATCH_NS = 40_000_000
 # A ground station, a camera or another companion has a heartbeat too; an autopilot names its firmware.

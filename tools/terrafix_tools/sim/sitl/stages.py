@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -127,8 +128,9 @@ class Stages:
                 self._station.set_parameter(name, value)
                 break
         self._wait("the loss of the GNSS", LOSS_S, lambda: self._fix(0) < FIX_3D)
-        fixes = self._observer.notes.fix_types[0]
-        lost_ns = next(t_ns for t_ns, fix in reversed(fixes) if fix < FIX_3D)
+        # The first report without a fix: a busy machine looks only after several of them have come.
+        without = takewhile(lambda report: report[1] < FIX_3D, reversed(self._observer.notes.fix_types[0]))
+        *_, (lost_ns, _fix) = without
         self.times = replace(self.times, lost_ns=lost_ns)
         self._say("GNSS lost; GPS_INPUT alone")
 
