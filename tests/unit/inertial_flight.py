@@ -3,9 +3,11 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from ground import apply, homography
 from simulated_flight import CAMERA, FIX_SIGMAS, PAIRS, PLACE, ROOFS, SIGMA_NORM
+from simulated_flight import ORIGIN as STEADY_ORIGIN
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import quat_from_rot
@@ -19,7 +21,6 @@ from terrafix.messages import (
     Message,
     NavEstimate,
     Odometry,
-    Origin,
     ThermalBand,
     VehicleState,
     Verdict,
@@ -33,17 +34,7 @@ from terrafix_tools.sim.vehicle.wind import Wind
 STEP_S, FRAME_EVERY, STATE_EVERY, BATCH = 0.02, 50, 2, 3
 FIX_EVERY = 4
 KEYFRAME_EVERY = 3
-ORIGIN = Origin(
-    t_ns=0,
-    camera=CAMERA,
-    lat_deg=PLACE.lat_deg,
-    lon_deg=PLACE.lon_deg,
-    ground_amsl_m=0.0,
-    start_sigma_m=15.0,
-    yaw_sigma_deg=3.0,
-    agl_sigma_m=3.0,
-    attitude_sigma_deg=0.7,
-)
+ORIGIN = msgspec.structs.replace(STEADY_ORIGIN, yaw_sigma_deg=3.0, agl_sigma_m=3.0, attitude_sigma_deg=0.7)
 
 
 class InertialFlight:

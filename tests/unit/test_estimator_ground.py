@@ -29,12 +29,12 @@ def begun(attitude: Attitude) -> Estimator:
 
 def test_the_plane_of_the_ground_is_that_of_the_place_where_it_was_fitted() -> None:
     estimator = begun(Attitude(0.0, 0.0, 0.0, 100.0))
-    assert estimator.ground_below(np.array([300.0, -200.0, 140.0])) == 40.0  # flat until a map says otherwise
+    assert estimator.terrain.below(np.array([300.0, -200.0, 140.0])) == 40.0  # flat until a map says otherwise
     match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient", ground=(50.0, 0.1, -0.05))
     estimator.fix(match)
-    assert estimator.ground_below(np.array([0.0, 0.0, 140.0])) == pytest.approx(50.0, abs=0.5)
-    here = estimator.ground_below(np.array([0.0, 0.0, 140.0]))
-    assert estimator.ground_below(np.array([20.0, 10.0, 140.0])) - here == pytest.approx(20.0 * 0.1 - 10.0 * 0.05)
+    assert estimator.terrain.below(np.array([0.0, 0.0, 140.0])) == pytest.approx(50.0, abs=0.5)
+    here = estimator.terrain.below(np.array([0.0, 0.0, 140.0]))
+    assert estimator.terrain.below(np.array([20.0, 10.0, 140.0])) - here == pytest.approx(20.0 * 0.1 - 10.0 * 0.05)
 
 
 @pytest.mark.parametrize(("pitch_rad", "sigma_deg"), [(0.0, 0.7), (None, 2.0)])

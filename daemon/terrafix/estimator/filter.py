@@ -17,9 +17,10 @@ from terrafix.estimator.doubt import Doubt
 from terrafix.estimator.factors import attitude_and_height_factor
 from terrafix.estimator.graph import NodeState, PoseGraph
 from terrafix.estimator.matched import determined, measured_pose
-from terrafix.estimator.motion import Ground, RelativePose, relative_pose
+from terrafix.estimator.motion import RelativePose, relative_pose
 from terrafix.estimator.rival import Rival
 from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.terrain import Terrain
 from terrafix.estimator.velocity import (
     STANDING_M,
     TYPICAL_SPEED_MPS,
@@ -44,12 +45,6 @@ UNKNOWN_ATTITUDE_RAD = np.radians(4.0)  # sigma of roll and pitch that nobody re
 DEFAULT_AGL_M = 120.0  # when nobody reports a height: the usual ceiling of small drones ...
 DEFAULT_AGL_SIGMA_M = 50.0  # ... and wide enough for all of them
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
-# 1-sigma of the slope and of the level (share of the height) of the ground that is seen: fields and towns without a
-# DEM; what houses and trees leave with one.
-FLAT_SIGMAS, DEM_SIGMAS = (0.03, 0.02), (0.015, 0.01)
-RELIEF_SLOPE = 2.0  # a plane that misses the ground by this share of the height misses its slope by so much more
-# ... and one hill is seen by some fifteen keyframes in a row, each with the same mistake: root of that many.
-RELIEF_REPEATS = 4.0
 FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
@@ -117,10 +112,7 @@ class Estimator:
         self.rival = Rival()
         self._torn: dict[int, np.ndarray] = {}  # frame -> spread (2, 2) of the two places between which it was
         self.map_sigma_m = 0.0  # of the map that placed us; nothing until it did
-        self.ground_m = origin.ground_amsl_m or 0.0  # AMSL of the ground below, from the map's DEM
-        self._ground_at_m = np.zeros(2)  # where that is so
-        self._relief_m = 0.0  # how far the ground departs from a plane
-        self._slope: tuple[float, float] | None = None  # of the ground, east and north; None: no DEM
+        self.terrain = Terrain(origin.ground_amsl_m or 0.0)
         self._r_b_c = Mount.of(origin.camera).r_b_c()
         self._node_of: dict[int, int] = {}  # frame -> node
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
@@ -136,11 +128,6 @@ class Estimator:
         self._began_with = (False, False)  # heading, height
         self._began_s: float | None = None
         self._tilt_said = False  # the autopilot reports roll and pitch
-
-    def ground_below(self, p_m: np.ndarray) -> float:
-        """AMSL of the ground under (east, north), on the plane that the map's elevation gave last."""
-        slope = np.array(self._slope or (0.0, 0.0))
-        return self.ground_m + float(slope @ (p_m[:2] - self._ground_at_m))
 
     # --- motion ---------------------------------------------------------------------------------------------
 
@@ -161,8 +148,9 @@ class Estimator:
             led_to, velocity = way.predicted(led_to, before.velocity, float(before.bias[2]))
         if self._has_taken_off_blind(known is not None, way, led_to):
             cov = tangent_to_world(self._covariance(newest), before.pose.rotation().matrix())
-            sigma_m = float(np.sqrt(np.linalg.eigvalsh((cov[:3, :3] + spread[:3, :3])[:2, :2])[-1]))
-            return self._begin(frame_id, t_s, attitude, led_to[:2], sigma_m)
+            sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2] + spread[:2, :2])[-1]))
+            placed = self._start_graph(frame_id, t_s, attitude, led_to[:2], sigma_m)
+            return Advance(Verdict.ACCEPTED, placed, (led_to - before.pose.translation())[:2], sigma_m)
         if known is not None:
             parent, motion = known
             verdict = Verdict.ACCEPTED
@@ -220,7 +208,7 @@ class Estimator:
         if not self._launching or way is None:
             return False
         self._blind = self._blind or not way.inertial
-        if not seen or float(led_to_m[2]) - self.ground_m < FLYING_M:
+        if not seen or float(led_to_m[2]) - self.terrain.ground_m < FLYING_M:
             return False
         blind, self._launching, self._blind = self._blind, False, False
         return blind
@@ -232,30 +220,25 @@ class Estimator:
         height = not self._began_with[1] and attitude.agl_m is not None
         return self.last_fix_t_s is None and (heading or height)
 
-    def _begin(
-        self,
-        frame_id: int,
-        t_s: float,
-        attitude: Attitude,
-        at_m: np.ndarray | None = None,
-        sigma_m: float = 0.0,
-    ) -> Advance:
-        """At the flight's start, less sure the longer that was ago; or at ``at_m`` (east, north) with its 1-sigma."""
-        origin = self.origin
+    def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
+        """At the flight's start, less sure the longer that was ago."""
         self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
         waited_s = 0.0 if self._began_s is None else t_s - self._began_s
         self._began_s = t_s - waited_s
         drift_m = wandered_m(waited_s) if waited_s > 0.0 else 0.0
+        start_m = float(np.hypot(min(max(self.origin.start_sigma_m, 1.0), SEARCHED_START_M), drift_m))
+        placed = self._start_graph(frame_id, t_s, attitude, np.zeros(2), start_m)
+        return Advance(Verdict.ACCEPTED, placed, np.zeros(2), drift_m)
+
+    def _start_graph(self, frame_id: int, t_s: float, attitude: Attitude, at_m: np.ndarray, sigma_m: float) -> Placed:
+        """Anew at ``at_m`` (east, north), known to ``sigma_m``; all else as the autopilot says it."""
+        origin = self.origin
         tolerance = np.radians(origin.camera.mount_tolerance_deg)
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
         r_w_c = self._expected_rotation(attitude, np.zeros(4))
-        e_m, n_m = (0.0, 0.0) if at_m is None else at_m
-        start = float(np.hypot(min(max(origin.start_sigma_m, 1.0), SEARCHED_START_M), drift_m))
-        if at_m is not None:
-            start = drift_m = sigma_m
-        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([e_m, n_m, self.ground_m + agl]))
-        wide = np.diag([1.0, 1.0, UNKNOWN_RAD, start, start, 3 * agl_sigma]) ** 2
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([*at_m, self.terrain.ground_m + agl]))
+        wide = np.diag([1.0, 1.0, UNKNOWN_RAD, sigma_m, sigma_m, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
@@ -272,7 +255,7 @@ class Estimator:
         )
         self._node_of[frame_id] = node
         self._last = self._placed(frame_id, t_s, node)
-        return Advance(Verdict.ACCEPTED, self._last, np.zeros(2), drift_m)
+        return self._last
 
     def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | None:
         """The keyframe's node and the motion since, when odometry has both."""
@@ -285,22 +268,15 @@ class Estimator:
         r_w_kf = state.pose.rotation().matrix()
         height_sigma = float(np.sqrt(r_w_kf[2] @ self._cov_of[parent][3:, 3:] @ r_w_kf[2]))
         p = state.pose.translation()
-        height = float(p[2]) - self.ground_below(p)
+        height = float(p[2]) - self.terrain.below(p)
         if height < 2.0:
             return None
         r_w_k = self._expected_rotation(attitude, state.bias, r_w_kf)
         tilt_sigma = np.radians(max(self.origin.attitude_sigma_deg, 1.0))
         if attitude.pitch_rad is None or attitude.roll_rad is None:
             r_w_k, tilt_sigma = r_w_kf, UNKNOWN_ATTITUDE_RAD  # nobody knows of a change of tilt
-        known_slope = self._slope is not None
-        slope_e, slope_n = self._slope or (0.0, 0.0)
-        slope_sigma, level_share = DEM_SIGMAS if known_slope else FLAT_SIGMAS
-        # Over hills the tracked points lie off the plane, all on one side for a while.
-        relief_share = RELIEF_REPEATS * self._relief_m / height
-        slope_sigma = float(np.hypot(slope_sigma, RELIEF_SLOPE * relief_share))
-        level_share = float(np.hypot(level_share, relief_share))
         share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
-        ground = Ground(height, height_sigma, slope_e, slope_n, slope_sigma, level_share, share)
+        ground = self.terrain.seen_from(height, height_sigma, share)
         motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
         if motion is None:
             return None
@@ -370,11 +346,10 @@ class Estimator:
 
     def fix(self, match: MapMatch) -> FixResult:
         """A map match of a frame that ``advance`` has seen. Gated; enters the graph at its own node."""
-        if match.ground is not None:
-            self.ground_m, self._slope, self._relief_m = match.ground[0], match.ground[1:], match.relief_m
-            seen = self._node_of.get(match.frame_id)
-            if seen is not None and self.graph.holds(seen):
-                self._ground_at_m = self.graph.state(seen).pose.translation()[:2]
+        node = self._node_of.get(match.frame_id)
+        if node is not None and not self.graph.holds(node):
+            node = None
+        self.terrain.hear(match, None if node is None else self.graph.state(node).pose.translation())
         lost = self.doubt.hear(match)
         if lost:
             return FixResult(Verdict.LOST, None, lost)
@@ -382,12 +357,11 @@ class Estimator:
             return FixResult(match.verdict, None)
         if not determined(match):
             return FixResult(Verdict.DEGENERATE, None)
-        node = self._node_of.get(match.frame_id)
-        if node is None or not self.graph.holds(node):
+        if node is None:
             return FixResult(Verdict.STALE, None)
-        measured, cov = measured_pose(match, self.ground_m)
+        measured, cov = measured_pose(match, self.terrain.ground_m)
         r_w_c = measured.rotation().matrix()
-        height = max(float(measured.translation()[2]) - self.ground_m, 1.0)
+        height = max(float(measured.translation()[2]) - self.terrain.ground_m, 1.0)
         if match.found:  # by a search, over several frames: it outweighs whatever the graph believes
             self.rival = Rival()
             return self._restart(match, node, measured, cov, "found")
@@ -432,7 +406,7 @@ class Estimator:
         else:
             refused.offsets_m.append(offset)
             self.rival.disagreed(refused.offsets_m)
-            height = float(measured.translation()[2]) - self.ground_m
+            height = float(measured.translation()[2]) - self.terrain.ground_m
             far = float(np.hypot(*(here - refused.began_at_m))) > RECOVER_OVER * height
             if len(refused.offsets_m) >= RECOVER_AFTER and far and match.mode_mass >= RECOVER_MASS:
                 self.rival.left(offset)

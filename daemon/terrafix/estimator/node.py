@@ -119,7 +119,7 @@ class EstimatorNode:
             p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
             q_w_c=quat_from_rot(r_w_c),
             cov=tuple(float(v) for v in cov.ravel()),
-            agl_m=float(p[2]) - estimator.ground_below(p),
+            agl_m=float(p[2]) - estimator.terrain.below(p),
             agl_sigma_m=float(np.sqrt(cov[2, 2])),
             step_m=(float(advance.step_m[0]), float(advance.step_m[1])),
             step_cov_m2=(step_var, 0.0, 0.0, step_var),
@@ -148,7 +148,7 @@ class EstimatorNode:
             lat_deg=lat_deg,
             lon_deg=lon_deg,
             alt_amsl_m=float(p[2]),
-            agl_m=float(p[2]) - estimator.ground_below(p),
+            agl_m=float(p[2]) - estimator.terrain.below(p),
             velocity_enu_mps=(float(v[0]), float(v[1]), float(v[2])),
             velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(placed.velocity_cov)[-1])),  # of the worst direction
             q_w_b=quat_from_rot(estimator.body(placed)),

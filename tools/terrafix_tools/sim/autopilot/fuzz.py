@@ -29,11 +29,11 @@ from terrafix_tools.sim.autopilot.fuzz_wire import (
     YAW,
     Autopilot,
     BadWire,
-    Memory,
     cut,
     mixed,
     through,
 )
+from terrafix_tools.sim.closed_loop.loopback import Loopback
 
 S = 1_000_000_000
 STEP_NS = round(S / TICK_HZ)
@@ -65,8 +65,8 @@ def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) 
         key = Path(folder) / "key"
         key.touch(mode=0o600)
         key.write_bytes(KEY)
-        memory = Memory()
-        edge = MavlinkEdge(LinkSection(signing_key=str(key) if signed else ""), memory, lambda: UNIX_NS)
+        loopback = Loopback()
+        edge = MavlinkEdge(LinkSection(signing_key=str(key) if signed else ""), loopback, lambda: UNIX_NS)
     node, autopilot, draw = LinkNode(10.0), Autopilot(signed), random.Random(seed)
     result = Result(seconds=seconds, wire=asdict(wire))
     steps = round(seconds * TICK_HZ)
@@ -74,13 +74,13 @@ def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) 
     last_sent_ns: int | None = None
     for step in range(steps):
         now_ns = step * STEP_NS
-        true = autopilot.packets(step, now_ns, memory.sent)
-        memory.sent = []
+        true = autopilot.packets(step, now_ns, loopback.take())
         arriving, held = through(wire, true, held, draw)
         garbage = wire.garbage_bytes * (step + 1) // steps - wire.garbage_bytes * step // steps
         chunk = mixed(arriving, garbage, autopilot.examples, draw)
         result.bytes += len(chunk)
-        memory.coming = cut(chunk, draw)
+        for piece in cut(chunk, draw):
+            loopback.give(piece)
         if step % 25 == 5:
             _tell(node, _estimate(now_ns - 100 * MS, now_ns))
         for message in edge.poll(now_ns):

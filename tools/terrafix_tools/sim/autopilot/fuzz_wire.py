@@ -24,25 +24,6 @@ class BadWire:
     late: float = 0.0  # comes after the packets of the next step
 
 
-class Memory:
-    """The Transport between."""
-
-    def __init__(self) -> None:
-        self.coming: list[bytes] = []
-        self.sent: list[bytes] = []
-
-    def read(self) -> list[bytes]:
-        coming, self.coming = self.coming, []
-        return coming
-
-    def write(self, packet: bytes) -> bool:
-        self.sent.append(packet)
-        return True
-
-    def close(self) -> None:
-        pass
-
-
 class Autopilot:
     """The true telemetry of a vehicle that flies east."""
 
@@ -54,7 +35,7 @@ class Autopilot:
         self._ear = mavlink.MAVLink(None)
         self.examples: list[bytes] = []  # what garbage is made of
 
-    def packets(self, step: int, now_ns: int, asked: list[bytes]) -> list[bytes]:
+    def packets(self, step: int, now_ns: int, asked: bytes) -> list[bytes]:
         boot_ms = (now_ns + BOOT_AHEAD_NS) // MS
         due: list[Any] = []
         if step % 50 == 0:
@@ -66,8 +47,7 @@ class Autopilot:
         if step % 10 == 0:
             due.append(mavlink.MAVLink_global_position_int_message(boot_ms, 1, 2, 3, 120_000, 4, 5, 6, 7))
             due.append(mavlink.MAVLink_gps_raw_int_message(boot_ms * 1000, 1, 0, 0, 0, 9999, 9999, 0, 0, 0))
-        for packet in asked:
-            message = self._ear.decode(bytearray(packet))
+        for message in self._ear.parse_buffer(asked) or ():
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                 due.append(mavlink.MAVLink_timesync_message(now_ns + BOOT_AHEAD_NS, message.ts1))
         packets = []

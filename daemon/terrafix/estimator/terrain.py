@@ -1,0 +1,46 @@
+"""The ground under the vehicle, as the map's elevation gave it last: a plane, and how far it is from being one."""
+
+import numpy as np
+
+from terrafix.estimator.motion import Ground
+from terrafix.messages import MapMatch
+
+# 1-sigma of the slope and of the level (share of the height) of the ground that is seen: fields and towns without a
+# DEM; what houses and trees leave with one.
+FLAT_SIGMAS, DEM_SIGMAS = (0.03, 0.02), (0.015, 0.01)
+RELIEF_SLOPE = 2.0  # a plane that misses the ground by this share of the height misses its slope by so much more
+# ... and one hill is seen by some fifteen keyframes in a row, each with the same mistake: root of that many.
+RELIEF_REPEATS = 4.0
+
+
+class Terrain:
+    """``ground_m``: AMSL of the ground below. Flat at the start's height until a match says more."""
+
+    def __init__(self, ground_m: float) -> None:
+        self.ground_m = ground_m
+        self._at_m = np.zeros(2)  # where that is so
+        self._relief_m = 0.0  # how far the ground departs from a plane
+        self._slope: tuple[float, float] | None = None  # of the ground, east and north; None: no DEM
+
+    def hear(self, match: MapMatch, at_m: np.ndarray | None) -> None:
+        """``at_m`` (east, north, ...): the camera of the match; None: the graph no longer has it."""
+        if match.ground is None:
+            return
+        self.ground_m, self._slope, self._relief_m = match.ground[0], match.ground[1:], match.relief_m
+        if at_m is not None:
+            self._at_m = at_m[:2]
+
+    def below(self, p_m: np.ndarray) -> float:
+        """AMSL of the ground under (east, north, ...)."""
+        slope = np.array(self._slope or (0.0, 0.0))
+        return self.ground_m + float(slope @ (p_m[:2] - self._at_m))
+
+    def seen_from(self, height_m: float, height_sigma_m: float, share: float) -> Ground:
+        """The plane that odometry measures against. ``share`` of its matches agreed."""
+        slope_e, slope_n = self._slope or (0.0, 0.0)
+        slope_sigma, level_share = FLAT_SIGMAS if self._slope is None else DEM_SIGMAS
+        # Over hills the tracked points lie off the plane, all on one side for a while.
+        relief_share = RELIEF_REPEATS * self._relief_m / height_m
+        slope_sigma = float(np.hypot(slope_sigma, RELIEF_SLOPE * relief_share))
+        level_share = float(np.hypot(level_share, relief_share))
+        return Ground(height_m, height_sigma_m, slope_e, slope_n, slope_sigma, level_share, share)
