@@ -63,6 +63,7 @@ class Verdict(StrEnum):
     INNOVATION = "innovation"  # disagrees with the estimate by more than both claim
     STALE = "stale"
     IMPLAUSIBLE = "implausible"  # jump, speed or height that cannot be
+    MODEL_FAILED = "model_failed"  # the learned model gave no usable answer; ModelEvent has the reason
     LOST = "lost"  # what is seen is not where the vehicle was believed to be; its place is searched
 
 
@@ -221,6 +222,52 @@ class MapMatch(Message, frozen=True, kw_only=True):
     found: bool = False  # by a search: what was believed of the position before counts for nothing
 
 
+class SearchState(Message, frozen=True, kw_only=True):
+    """Said on every change: how far the search for the vehicle's place has gone; ``normal`` when there is none."""
+
+    step: SearchStep
+
+
+class PositionHint(Message, frozen=True, kw_only=True):
+    """A coarse position of the vehicle that a person gave: where a search begins, never the truth.
+
+    ``radius_m``: it is so near, in 95 of 100 cases; at ``t_ns``, when the hint was given."""
+
+    lat_deg: float
+    lon_deg: float
+    radius_m: float
+    source: str  # "ground station 255", "command line"
+
+
+class HintVerdict(Message, frozen=True, kw_only=True):
+    """What became of a PositionHint, said with the first frame after it.
+
+    ACCEPTED: a search begins there, or it agrees with the position that the map holds; INNOVATION: it does not agree,
+    and changes nothing; OUTSIDE_MAP."""
+
+    hint_t_ns: int  # t_ns of the hint
+    verdict: Verdict
+    distance_m: float | None  # from the position that was believed; None: none was
+    sigma_m: float | None  # what that one claimed, 1-sigma per horizontal axis
+    text: str  # for the operator, at most 40 characters
+
+
+class ModelChange(StrEnum):
+    OPENED = "opened"
+    PROVIDER = "provider"  # the one that ran it failed; the next one does from now on
+    FAILED = "failed"  # no usable answer to this frame
+    GIVEN_UP = "given_up"  # matching goes on without weights
+
+
+class ModelEvent(Message, frozen=True, kw_only=True):
+    """What became of the learned model that map matching uses: said at the start, and on every change."""
+
+    model: str  # "xfeat"
+    change: ModelChange
+    provider: str  # "TensorRT", "CUDA", "CPU"; empty: none
+    detail: str  # checksum and why better providers were passed over; or the reason of the change
+
+
 # --- estimator ------------------------------------------------------------------------------------
 
 
@@ -345,6 +392,14 @@ class PositionSource(Message, frozen=True, kw_only=True):
     receiver: int
 
 
+class FilterStatus(Message, frozen=True, kw_only=True):
+    """What ArduPilot's own filter says of itself (EKF_STATUS_REPORT): whether our position arrives in it."""
+
+    flags: int  # EKF_STATUS_FLAGS
+    position_ratio: float  # horizontal innovation by its gate: 1 is the limit
+    velocity_ratio: float
+
+
 class WallClock(Message, frozen=True, kw_only=True):
     """Said by the link's edge: Unix time at ``t_ns``, for the GPS week. ``unix_ns`` None: no clock is plausible."""
 
@@ -410,6 +465,10 @@ AnyMessage = (
     | Odometry
     | Prediction
     | MapMatch
+    | ModelEvent
+    | SearchState
+    | PositionHint
+    | HintVerdict
     | NavEstimate
     | Refinement
     | MeasurementVerdict
@@ -418,6 +477,7 @@ AnyMessage = (
     | GnssReading
     | GnssVerdict
     | PositionSource
+    | FilterStatus
     | WallClock
     | StatusText
     | ThermalReading

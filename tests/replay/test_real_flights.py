@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from terrafix_tools.evaluate import evaluate
+from terrafix_tools.finalise.run import finalise
 from terrafix_tools.replay import replay
 
 pytestmark = pytest.mark.slow
@@ -52,6 +53,16 @@ def check_floors(found: dict[str, Any], frames: int) -> None:
     assert found["refined"] / frames > 0.80
 
 
+def check_finalised(flight: Path, out: Path, refined_median_m: float) -> None:
+    """After landing: no worse than what was refined in flight, and honest."""
+    finalise(out)
+    found = evaluate(out, flight / "truth.csv")
+    assert found["finalised"] == found["frames"]
+    assert found["finalised_median_m"] <= 1.05 * refined_median_m  # again: decimetres are the truth's
+    assert found["finalised_within_20m"] >= found["refined_within_20m"]
+    assert found["finalised_false_fixes"] == 0 and found["finalised_ellipse95_coverage"] >= 0.90
+
+
 def check_none_unlocalised_after_the_first_anchor(out: Path) -> None:
     rows = rows_of(out)
     first = next(i for i, row in enumerate(rows) if row["anchor_age_ms"] == "0")
@@ -66,6 +77,7 @@ def test_the_floors_without_weights(name: str, data_set: DataSet, tmp_path: Path
     check_floors(found, len(rows_of(tmp_path)))
     check_none_unlocalised_after_the_first_anchor(tmp_path)
     assert found["odometry_rate"] > 0.95 or name == "town-a"  # photos with 55 % overlap
+    check_finalised(flight, tmp_path, found["refined_median_m"])
 
 
 @pytest.mark.parametrize("name", ["village-1", "town-a"])

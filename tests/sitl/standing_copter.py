@@ -34,8 +34,11 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
 
 
 @contextmanager
-def copter(folder: Path, parameters: dict[str, float], companion: int, base: int) -> Iterator[None]:
-    """The firmware on the ground; its SERIAL1 speaks to ``companion``, SERIAL3 and 4 listen at ``base`` + 3 and 4."""
+def copter(
+    folder: Path, parameters: dict[str, float], companion: int, base: int, ground: int | None = None
+) -> Iterator[None]:
+    """The firmware on the ground; its SERIAL1 speaks to ``companion``, SERIAL0 to ``ground`` (None: nobody),
+    SERIAL3 and 4 listen at ``base`` + 3 and 4."""
     if BINARY is None or not BINARY.is_file():
         pytest.skip(f"SITL MISSING: set {BINARY_VARIABLE} to an ArduPilot binary, docs/sitl.md says how to get one")
     write_parameters(folder / "vehicle.param", Kind.COPTER)
@@ -43,7 +46,7 @@ def copter(folder: Path, parameters: dict[str, float], companion: int, base: int
     command = [str(BINARY), "--model", "quad", "--speedup", "1", "--rc-in-port", str(free_port())]
     command += ["--base-port", str(base), "--home", f"{HOME[0]},{HOME[1]},{HOME[2]},0"]
     command += ["--defaults", f"{folder / 'vehicle.param'},{folder / 'more.param'}"]
-    for serial, target in ((0, free_port()), (1, companion), (2, free_port())):
+    for serial, target in ((0, ground or free_port()), (1, companion), (2, free_port())):
         command += [f"--serial{serial}", f"udpclient:127.0.0.1:{target}"]
     if "SERIAL4_PROTOCOL" in parameters:  # else SERIAL3 stays what it is: the simulated receiver
         command += ["--serial3", "tcp:3", "--serial4", "tcp:4"]
@@ -83,6 +86,7 @@ class Heard:
     def __init__(self, edge: MavlinkEdge) -> None:
         self.newest: dict[str, Any] = {}
         self.texts: list[str] = []
+        self.hints: list[m.PositionHint] = []
         self.send = edge._send  # orders to the firmware
         take = edge._take
 
@@ -111,6 +115,7 @@ def stand(config: LinkSection, until: Callable[[Heard], bool], place: tuple[floa
         while time.monotonic() - began < WAIT_S and not until(heard):
             now_ns = time.monotonic_ns()
             for message in edge.poll(now_ns):
+                heard.hints += [message] if isinstance(message, m.PositionHint) else []
                 for said in node.on(message):
                     edge.heard(said)
             if now_ns >= next_estimate_ns:

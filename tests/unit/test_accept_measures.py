@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from accept_case import Said, evidence, file_of
 
+from terrafix.link.asking import Asking
 from terrafix.messages import CovarianceMode, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept import measures as of
@@ -141,6 +142,18 @@ def test_reprojection_of_odometry_is_what_noise_leaves(tmp_path: Path) -> None:
         frame.odometry = type(frame.odometry)(t_ns=0, frame_id=0, keyframe_id=0, verdict=Answer.ACCEPTED, pairs=pairs)
     expected = 0.8 * np.sqrt(np.pi / 2) * np.sqrt(1 - 8 / 96)
     assert of.odometry_px(found).value == pytest.approx(expected, rel=0.08)
+
+
+def test_who_is_lost_must_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lost = [Said(fixed=False, sigma_m=800.0)] * 20
+    asked = of.asks(evidence(tmp_path / "a", [*[Said()] * 4, *lost]))
+    assert asked.value == pytest.approx(0.0, abs=0.5)  # it may take a frame
+    assert asked.why == "asked 4 s into the flight"  # lost from frame 4, at 2 s; 3 frames and 2 s later
+    for short in ([Said()] * 10, [*[Said()] * 4, *lost[:4], *[Said()] * 4]):
+        found = of.asks(evidence(tmp_path / f"b{len(short)}", short))
+        assert (found.value, found.verdict) == (None, None) and "never lost" in found.why
+    monkeypatch.setattr(Asking, "due", lambda *_: "")
+    assert of.asks(evidence(tmp_path / "c", lost)).verdict is Verdict.BELOW
 
 
 def test_bounds_and_words() -> None:

@@ -61,7 +61,7 @@ def started(ground: np.ndarray, start_sigma_m: float = 10.0) -> tuple[AnchorNode
 
 def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TRUE_M, step_m: float = 0.0) -> MapMatch:
     cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
-    (answer,) = node.on(
+    answer, *_ = node.on(
         Prediction(
             t_ns=frame_id * 10**9,
             frame_id=frame_id,

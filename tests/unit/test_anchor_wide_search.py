@@ -42,8 +42,8 @@ def place_of(block: Block, z: np.ndarray) -> tuple[float, float]:
 
 def test_the_place_stands_out(ground: np.ndarray, search: WideSearch) -> None:
     (look,) = search.look([search.describe(seen(ground))], [HERE], CELL_M)
-    assert place_of(HERE, look.z) == pytest.approx(tuple(TRUE_M[:2]), abs=2 * CELL_M)
-    assert np.nanmax(look.z) > 5.0
+    assert place_of(HERE, look.correlation) == pytest.approx(tuple(TRUE_M[:2]), abs=2 * CELL_M)
+    assert np.nanmax(standardise(look.correlation)) > 5.0
 
 
 def test_it_measures_what_the_exact_correlation_measures(ground: np.ndarray, search: WideSearch) -> None:
@@ -54,16 +54,17 @@ def test_it_measures_what_the_exact_correlation_measures(ground: np.ndarray, sea
     window, valid, e_m, n_m = MapFeatures(FlatMap(ground), GradientDescriber()).window(e_m, n_m, width, height, CELL_M)
     exact = standardise(Searchable(window, valid).search(search.describe(frame).descriptors, frame.mask))
     exact = exact[:BLOCK_CELLS, :BLOCK_CELLS]
-    both = np.isfinite(exact) & np.isfinite(look.z)
+    z = standardise(look.correlation)
+    both = np.isfinite(exact) & np.isfinite(z)
     assert both.mean() > 0.1
-    assert np.corrcoef(exact[both], look.z[both])[0, 1] > 0.95
-    assert np.nanmax(look.z) == pytest.approx(float(np.nanmax(exact)), rel=0.25)
+    assert np.corrcoef(exact[both], z[both])[0, 1] > 0.95
+    assert np.nanmax(z) == pytest.approx(float(np.nanmax(exact)), rel=0.25)
 
 
 def test_it_says_which_heading_and_scale_fit(ground: np.ndarray, search: WideSearch) -> None:
     tried = [(-20.0, 1.0), (0.0, 0.8), (0.0, 1.0), (20.0, 1.0)]
     (look,) = search.look([search.describe(seen(ground, *t)) for t in tried], [HERE], CELL_M)
-    best = np.unravel_index(int(np.nanargmax(look.z)), look.z.shape)
+    best = np.unravel_index(int(np.nanargmax(look.correlation)), look.correlation.shape)
     assert tried[int(look.index[best])] == (0.0, 1.0)
 
 
@@ -74,12 +75,14 @@ def test_more_templates_than_are_held_at_a_time(
     (whole,) = search.look(templates, [HERE], CELL_M)
     monkeypatch.setattr("terrafix.anchor.wide_search.AT_ONCE", 2)
     (parted,) = search.look(templates, [HERE], CELL_M)
-    assert np.array_equal(whole.z, parted.z, equal_nan=True) and np.array_equal(whole.index, parted.index)
+    assert np.array_equal(whole.correlation, parted.correlation, equal_nan=True) and np.array_equal(
+        whole.index, parted.index
+    )
 
 
 def test_off_the_map_nothing_is_known(ground: np.ndarray, search: WideSearch) -> None:
     (look,) = search.look([search.describe(seen(ground))], [Block(5000, 5000)], CELL_M)
-    assert np.isnan(look.z).all()
+    assert np.isnan(look.correlation).all()
 
 
 def test_blocks_cover_the_bounds_once() -> None:

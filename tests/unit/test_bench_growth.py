@@ -9,24 +9,28 @@ import pytest
 
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.telemetry import Telemetry
+from terrafix.messages import Imu
 from terrafix_tools.bench import growth, map_size
-from terrafix_tools.bench.stream import FIX_EVERY, FRAME_S, LEG_FRAMES, ORIGIN, SPEED_MPS, spoken
+from terrafix_tools.bench.stream import FIX_EVERY, FRAME_S, LEG_S, ORIGIN, spoken
 
 
 def test_the_estimator_follows_the_synthetic_flight() -> None:
     """Through the first turn: what is said belongs to one motion, or the times would be those of a lost estimator."""
     estimator, telemetry = Estimator(ORIGIN), Telemetry()
-    frames = LEG_FRAMES + 20
-    refused = 0
+    frames, refused, inertial = round((LEG_S + 10.0) / FRAME_S), 0, 0
     for said in spoken(frames):
-        telemetry.add(said.state)
+        for message in said.telemetry:
+            (telemetry.add_imu if isinstance(message, Imu) else telemetry.add)(message)  # type: ignore[operator]
         t_ns = said.odometry.t_ns
-        placed = estimator.advance(said.odometry.frame_id, t_ns * 1e-9, said.odometry, telemetry.at(t_ns)).placed
+        advance = estimator.advance(
+            said.odometry.frame_id, t_ns * 1e-9, said.odometry, telemetry.at(t_ns), telemetry.felt
+        )
+        inertial += telemetry.felt(t_ns - round(FRAME_S * 1e9), t_ns) is not None
         if said.match is not None:
             refused += estimator.fix(said.match).verdict != "accepted"
-    step_m = FRAME_S * SPEED_MPS
-    expected = np.array([20 * step_m, (LEG_FRAMES - 1) * step_m])  # the first 119 steps go north
-    assert np.hypot(*(placed.pose.translation()[:2] - expected)) < 5.0
+        off_m = advance.placed.pose.translation() - said.p_m
+        assert np.hypot(*off_m[:2]) < (40.0 if said.odometry.frame_id < 5 else 6.0)
+    assert inertial == frames - 1
     assert refused <= 0.05 * frames / FIX_EVERY
 
 
@@ -43,6 +47,7 @@ def test_every_field_of_a_longer_flight() -> None:
 @pytest.mark.slow
 def test_every_field_of_a_larger_map(tmp_path: Path) -> None:
     built = map_size.measure(0.25, tmp_path)
+    assert built["render_cpu_s"] > 0.0 and built["write_cpu_s"] >= 0.0 and built["speed_up"] > 0.0
     assert built["area_km2"] == 0.25 and built["package_mb"] > 0.05 and not (tmp_path / "map.tif").exists()
     found = map_size.search(tmp_path / "map.gpkg")
     json.dumps(built | found, allow_nan=False)

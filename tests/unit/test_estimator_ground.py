@@ -1,10 +1,16 @@
 """The ground under a vehicle that flies on along a slope, and the attitude of the body behind a learnt mount."""
 
+import gtsam
 import numpy as np
 import pytest
 
+from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.factors import same_ground_factor
 from terrafix.estimator.filter import Estimator
+from terrafix.estimator.matched import measured_pose
+from terrafix.estimator.motion import Ground
 from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.terrain import Terrain
 from terrafix.messages import Camera, MapMatch, Odometry, Origin, Verdict
 
 ORIGIN = Origin(
@@ -37,12 +43,92 @@ def test_the_plane_of_the_ground_is_that_of_the_place_where_it_was_fitted() -> N
     assert estimator.terrain.below(np.array([20.0, 10.0, 140.0])) - here == pytest.approx(20.0 * 0.1 - 10.0 * 0.05)
 
 
+def test_a_slope_ends_where_nobody_fitted_it() -> None:
+    """A minute in the dark at 17 m/s: a hillside that went on for a kilometre would be 100 m high."""
+    terrain = Terrain(40.0)
+    match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", ground=(50.0, 0.1, 0.0))
+    terrain.hear(match, np.zeros(3))
+    assert terrain.below(np.array([100.0, 0.0, 0.0])) == pytest.approx(60.0)
+    assert terrain.below(np.array([1000.0, 0.0, 0.0])) == pytest.approx(65.0)
+    near, far = (terrain.seen_from(np.array([e_m, 0.0, 0.0]), 130.0, 2.0, 1.0) for e_m in (100.0, 1000.0))
+    assert near.level_share * 130.0 == pytest.approx(np.hypot(1.3, 1.2))
+    assert far.level_share * 130.0 == pytest.approx(0.3 * np.sqrt(850.0), rel=0.03)
+    low = terrain.seen_from(np.zeros(3), 10.0, 0.5, 1.0)
+    assert low.level_share == pytest.approx(0.12, rel=0.01)  # near the ground a metre of a DEM is much
+
+
+def test_without_elevation_nobody_knows_how_the_ground_rises() -> None:
+    terrain = Terrain(40.0)
+    assert terrain.rise_sigma_m(100.0) == pytest.approx(3.0)
+    assert terrain.slope_sigma(100.0) == pytest.approx(0.03)
+    match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", ground=(50.0, 0.1, 0.0))
+    terrain.hear(match, np.zeros(3))
+    assert terrain.rise_sigma_m(100.0) == terrain.slope_sigma(100.0) == 0.0
+
+
+def test_a_slope_that_nobody_knows_looks_like_a_tilt_about_the_ground() -> None:
+    """The pose that PnP finds over ground that rises by 3 %, taken for flat, is within its claim."""
+    known = Terrain(0.0)
+    known.hear(MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", ground=(0.0, 0.0, 0.0)), None)
+    exact = np.diag([0.01, 0.01, 0.01, 1e-6, 1e-6, 1e-6])
+    match = MapMatch(
+        t_ns=0,
+        frame_id=0,
+        verdict=Verdict.ACCEPTED,
+        matcher="gradient",
+        p_c_in_w_m=(0.0, 0.0, 100.0),
+        q_w_c=(0.0, 1.0, 0.0, 0.0),
+        cov=tuple(exact.ravel()),
+    )
+    sloped = np.array([3.0, 0.0, 0.0, 0.0, 0.03, 0.0])  # east by a turn about north; the order of the messages
+    for terrain, low, high in ((known, 100.0, np.inf), (Terrain(0.0), 0.0, 2.0)):
+        pose, cov = measured_pose(match, terrain)
+        world = tangent_to_world(cov, pose.rotation().matrix())
+        assert low < float(sloped @ np.linalg.solve(world, sloped)) < high
+
+
 @pytest.mark.parametrize(("pitch_rad", "sigma_deg"), [(0.0, 0.7), (None, 2.0)])
 def test_the_body_is_known_no_better_than_who_tells_it_from_the_mount(
     pitch_rad: float | None, sigma_deg: float
 ) -> None:
     estimator = begun(Attitude(0.0, pitch_rad, pitch_rad, 100.0))
-    assert estimator.body_sigma_rad == pytest.approx(np.radians(sigma_deg))
+    assert estimator.camera.body_sigma_rad == pytest.approx(np.radians(sigma_deg))
+
+
+def test_a_slope_does_not_say_where_a_lost_camera_is() -> None:
+    """A plane fitted under one place was taken for the ground everywhere: height told position, and a camera that was
+    110 m off after a take-off claimed 22 m."""
+    looks_down = np.diag([1.0, -1.0, -1.0])
+    keyframe = gtsam.Pose3(gtsam.Rot3(looks_down), np.array([0.0, 0.0, 100.0]))
+    pose = gtsam.Pose3(gtsam.Rot3(looks_down), np.array([10.0, 5.0, 101.0]))
+    seen = np.random.default_rng(1).uniform(-0.4, 0.4, (40, 2))
+    sloping = Ground(100.0, 2.0, slope_e=0.15, slope_n=-0.1, slope_sigma=0.01)
+    depth = 100.0 / (1.0 + seen @ (0.15, 0.1))  # rays (x, -y, -1) meet the plane up = 0.15 east - 0.1 north
+    points = np.column_stack([seen[:, 0] * depth, -seen[:, 1] * depth, 100.0 - depth])
+    in_pose = (points - pose.translation()) @ looks_down
+    pairs = np.column_stack([seen, in_pose[:, :2] / in_pose[:, 2:]])
+    factor = same_ground_factor(0, 1, keyframe, pose, pairs, 1e-3, sloping)
+
+    def error(moved_m: tuple[float, float, float]) -> float:
+        values = gtsam.Values()
+        for key, camera in ((0, keyframe), (1, pose)):
+            values.insert(key, gtsam.Pose3(camera.rotation(), camera.translation() + moved_m))
+        return float(factor.error(values))
+
+    assert error((0.0, 0.0, 0.0)) < 1e-6
+    assert error((60.0, -40.0, 0.0)) < 1e-6  # where both are
+    assert error((0.0, 0.0, 5.0)) > 1.0  # how high both are above what they see
+
+
+def test_ground_on_a_slope_is_known_as_well_as_the_place() -> None:
+    estimator = begun(Attitude(0.0, 0.0, 0.0, 100.0))
+    match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient", ground=(40.0, 0.1, 0.0))
+    estimator.fix(match)
+    found, lost = (
+        estimator._ground(np.array([0.0, 0.0, 140.0]), 100.0, np.diag([sigma_m, sigma_m, 3.0]) ** 2, 1.0).level_sigma_m
+        for sigma_m in (1.0, 60.0)
+    )
+    assert found < 1.8 and lost == pytest.approx(4.0 * 6.0, rel=0.05)
 
 
 def unseen(t_s: float) -> Odometry:

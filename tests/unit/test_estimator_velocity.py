@@ -3,16 +3,37 @@
 import math
 
 import gtsam
+import msgspec
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C, V
-from inertial_flight import InertialFlight, flown
+from inertial_flight import ORIGIN, InertialFlight, flown
 
 from terrafix.core.geodesy import rot_w_b
 from terrafix.estimator.factors import leg_factor
+from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.telemetry import Telemetry
-from terrafix.estimator.velocity import MANOEUVRE_S, Felt, course_memory_s, leg
-from terrafix.messages import CovarianceMode, Imu, SourceLabel, ThermalBand, VehicleState
+from terrafix.estimator.velocity import (
+    MANOEUVRE_S,
+    STEADY_MPS2,
+    V_SIZE,
+    Felt,
+    course_memory_s,
+    leg,
+    spread_after,
+    unknown_cov,
+)
+from terrafix.messages import (
+    CovarianceMode,
+    Imu,
+    MapMatch,
+    Odometry,
+    Prediction,
+    SourceLabel,
+    ThermalBand,
+    VehicleState,
+    Verdict,
+)
 
 G = 9.81
 S = 1_000_000_000
@@ -90,7 +111,7 @@ def test_a_measured_leg_is_the_integral() -> None:
     felt = told(6.0).felt(S, 3 * S)
     way = leg(2.0, felt, (0.0, 0.0), 0.0, 20.0, 0.01, same_kind=True)
     start, end = (20.0 * np.array([math.sin(y), math.cos(y), 0.0]) for y in (1.2, 1.6))
-    p, v = way.predicted(np.zeros(3), np.concatenate([start, np.zeros(3)]), 0.0)
+    p, v = way.predicted(np.zeros(3), np.concatenate([start, np.zeros(5)]), 0.0)
     assert v[:3] == pytest.approx(end, abs=0.05)
     # The chord of the turn: 100 m radius about the point to the right of the start.
     assert p == pytest.approx(
@@ -102,7 +123,7 @@ def test_a_heading_that_reads_too_far_clockwise_is_turned_back() -> None:
     true, read = (told(6.0).felt(S, 3 * S), told(6.0).felt(S, 3 * S))
     assert true is not None and read is not None
     turned = Felt(read.s_s, read.accel_w_mps2 @ rot_up(0.1), read.yaw_rad + 0.1, read.noise_mps2)
-    v = np.array([10.0, 5.0, 0.0, 0.3, -0.2, 0.1])
+    v = np.array([10.0, 5.0, 0.0, 0.3, -0.2, 0.1, 0.05, -0.03])
     a = leg(2.0, true, (0.0, 0.0), 0.0, 20.0, 0.01, same_kind=True).predicted(np.zeros(3), v, 0.0)
     b = leg(2.0, turned, (0.0, 0.0), 0.1, 20.0, 0.01, same_kind=True).predicted(np.zeros(3), v, 0.1)
     assert a[0] == pytest.approx(b[0]) and a[1] == pytest.approx(b[1])
@@ -125,7 +146,7 @@ def test_the_covariance_of_a_leg_is_that_of_sampled_motion(measured: bool) -> No
     felt = Felt(t, np.zeros((steps + 1, 3)), 0.4 + turn * t, 0.1) if measured else None
     way = leg(dt, felt, (0.4, 0.4 + turn * dt), 0.0, 20.0, 0.02, same_kind=True)
     memory, course = (15.0, 1e6) if measured else (MANOEUVRE_S, course_memory_s(20.0))
-    sigma = math.hypot(G * 0.02, 0.07) if measured else 1.6
+    sigma = G * 0.02 * math.sqrt(0.5) if measured else 1.6  # the other half of the tilt is steady
     h = dt / steps
     a, v, p = (np.zeros((runs, 2)) for _ in range(3))
     for i in range(steps):
@@ -139,6 +160,35 @@ def test_the_covariance_of_a_leg_is_that_of_sampled_motion(measured: bool) -> No
     claimed[:2, :2] -= (0.02**2 + (0.005 * 20.0) ** 2) * np.eye(2)  # clocks
     scale = np.sqrt(np.diag(sampled))
     assert np.abs((claimed - sampled) / np.outer(scale, scale)).max() < 0.12
+
+
+def test_a_board_that_is_not_level_leads_astray_by_the_square_of_the_time_until_it_is_known() -> None:
+    """A minute on dead reckoning, straight on: position errors by a steady error of the accelerometers alone are
+    a t^2 / 2, and nothing of it is left when the error is known."""
+    cov = np.zeros((V_SIZE, V_SIZE))
+    cov[6:, 6:] = unknown_cov()[6:, 6:]
+    t = np.linspace(0.0, 1.0, 50)
+    way = leg(1.0, Felt(t, np.zeros((50, 3)), np.zeros(50), 0.0), (0.0, 0.0), 0.0, 20.0, 0.0, same_kind=True)
+    place, total = np.zeros((3, 3)), np.zeros((11, 11))
+    total[3:, 3:] = cov
+    for _ in range(60):
+        by = np.zeros((11, 11))
+        by[:3, :3], by[:, 3:] = np.eye(3), way.by_before()
+        total = by @ total @ by.T
+        place = total[:3, :3]
+    steady = 600.0 * (1.0 - math.exp(-60.0 / 600.0))  # s; the error fades over ten minutes
+    reached = STEADY_MPS2 * 600.0 * (60.0 - steady)
+    assert np.sqrt(np.diag(place)[:2]) == pytest.approx(reached, rel=0.02)
+    assert reached == pytest.approx(0.5 * STEADY_MPS2 * 60.0**2, rel=0.05)
+    assert place[2, 2] == 0.0
+    known = spread_after(way, np.zeros((V_SIZE, V_SIZE)))
+    assert np.sqrt(known[0, 0]) < 0.2
+
+
+def test_a_steady_error_does_not_move_who_is_not_led_by_the_imu() -> None:
+    way = leg(2.0, None, (0.3, 0.3), 0.0, 20.0, 0.01, same_kind=True)
+    assert not way.way_by_accel[:, 3:].any() and not way.gain_by_accel[:, 3:].any()
+    assert way.lasting[3:] == pytest.approx(math.exp(-2.0 / 600.0))  # it is still there when readings come again
 
 
 @pytest.mark.parametrize("speed_mps", [5.0, 12.0, 25.0])
@@ -157,15 +207,16 @@ def test_the_factor_knows_its_own_derivatives(measured: bool) -> None:
     values = gtsam.Values()
     for node, (yaw, at) in enumerate(((1.2, (0.0, 0.0, 100.0)), (1.4, (18.0, 6.0, 101.0)))):
         values.insert(C(node), gtsam.Pose3(gtsam.Rot3(rot_w_b(yaw, 0.1, 0.2)), np.array(at)))
-        values.insert(V(node), np.array([18.0, 7.0, 0.5, 0.1, -0.2, 0.05]))
+        values.insert(V(node), np.array([18.0, 7.0, 0.5, 0.1, -0.2, 0.05, 0.03, -0.04]))
         values.insert(B(node), np.array([0.01, 0.02, 0.05, 1.0]))
     factor = leg_factor((C(0), V(0)), (C(1), V(1)), B(1), way)
     whitened = np.linalg.inv(np.linalg.cholesky(way.cov))
     analytic, _ = factor.linearize(values).jacobian()
     numeric = []
     for key in (C(0), V(0), C(1), V(1), B(1)):
-        for i in range(4 if key == B(1) else 6):
-            step = np.zeros(4 if key == B(1) else 6)
+        size = {C(0): 6, C(1): 6, B(1): 4}.get(key, V_SIZE)
+        for i in range(size):
+            step = np.zeros(size)
             step[i] = 1e-5
             moved = gtsam.VectorValues()
             moved.insert(key, step)
@@ -233,3 +284,25 @@ def test_readings_that_come_late_or_not_at_all_for_a_while_do_no_harm(plane: Ine
 def test_two_runs_say_the_same(plane: InertialFlight) -> None:
     a, b = (flown(plane, imu=True, frames=30) for _ in range(2))
     assert a.said == b.said
+
+
+def test_after_pictures_that_showed_nothing_the_anchor_is_told_of_the_whole_way(plane: InertialFlight) -> None:
+    """Without Predictions nobody moves the anchor's belief: the next one carries what it has missed."""
+    node, first, end = EstimatorNode(), 20, 40
+    list(node.on(ORIGIN))
+    said: dict[int, Prediction] = {}
+    for i, heard in enumerate(plane.said[: end + 3]):
+        for message in heard:
+            if first <= i < end and isinstance(message, MapMatch):
+                continue
+            if first <= i < end and isinstance(message, Odometry):
+                message = Odometry(t_ns=message.t_ns, frame_id=i, keyframe_id=i, verdict=Verdict.STALLED)
+            if i >= end and isinstance(message, Odometry) and message.keyframe_id < end:
+                message = msgspec.structs.replace(message, verdict=Verdict.FEW_INLIERS, pairs=[])
+            said |= {m.frame_id: m for m in node.on(message) if isinstance(m, Prediction)}
+    assert not said.keys() & set(range(first, end))
+    flown_m = plane.poses[end][1][:2] - plane.poses[first - 1][1][:2]
+    assert np.hypot(*flown_m) > 150.0
+    assert np.hypot(*(said[end].step_m - flown_m)) < 60.0
+    step_m = plane.poses[end + 1][1][:2] - plane.poses[end][1][:2]
+    assert np.hypot(*(said[end + 1].step_m - step_m)) < 10.0  # and the one after it the way since this one

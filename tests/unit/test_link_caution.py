@@ -31,6 +31,11 @@ SENTENCES = [  # everything that Terrafix can say to a pilot; a new text belongs
     r"GPS \d is lost",
     r"GPS \d agrees with the map again",
     r"flying on the (map|GPS) now",
+    r"lost, send a position hint",
+    r"whole map searched, send a hint",
+    r"hint (taken, searching within|agrees,|is|not used,) [\d.]+ k?m( from us| off, searching| outside the map)?",
+    r"hint is no position, not used",
+    r"autopilot (does not use the position|uses a position again)",
 ]
 
 

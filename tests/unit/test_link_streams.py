@@ -107,7 +107,7 @@ OTHER = {(4, 1): mavlink.MAV_AUTOPILOT_PX4}
     [
         (Heard(), "/dev/ttyTHS1", "nothing heard on /dev/ttyTHS1; are RX and TX crossed"),
         (Heard(), "udpin:0.0.0.0:14550", "address and port"),
-        (Heard(bytes=4000), "/dev/ttyTHS1", "link.baud is 57600, compare SERIALn_BAUD"),
+        (Heard(bytes=4000), "/dev/ttyTHS1", "link.baud is 57600: is that the speed of SERIALn_BAUD"),
         (Heard(bytes=4000), "tcp:fc:5760", "bytes but no MAVLink on tcp:fc:5760; its SERIALn_PROTOCOL"),
         (Heard(bytes=4000, packets=9), "tcp:fc:5760", "no heartbeat"),
         (Heard(bytes=4000, packets=9, heartbeats=GCS), "tcp:fc:5760", "only system 255 component 190"),

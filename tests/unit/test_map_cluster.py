@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 from map_cluster import local_cluster
 
+from terrafix.anchor.map_package import MapPackage
 from terrafix_tools.mapping.build import build
+from terrafix_tools.mapping.dem import TILES_PER_WORKER, height_places
 
 ENOUGH = 600_000  # bytes of the package that is being written: some chunks are in it, more are to come
 
 
-def command(tif: Path, out: Path, address: str) -> list[str]:
+def command(tif: Path, out: Path, address: str, *more: str) -> list[str]:
     terrafix = "import sys; from terrafix_tools.cli import main; main()"
-    return [sys.executable, "-c", terrafix, "map", "build", str(tif), "--out", str(out), "--scheduler", address]
+    return [sys.executable, "-c", terrafix, "map", "build", str(tif), "--out", str(out), "--scheduler", address, *more]
 
 
 def written(out: Path) -> int:
@@ -32,11 +34,18 @@ def test_a_cluster_gives_the_same_bytes_also_when_a_worker_is_killed(tmp_path: P
     bands = np.tile(map_rasters.texture(500, 500), (1, 17, 13))
     bands[:, :300] = 0  # a collar, which the workers read from a file
     tif = map_rasters.utm(tmp_path / "i.tif", bands, tiled=True)
+    heights = np.tile(map_rasters.texture(500, 500, seed=1)[:1], (1, 6, 5)).astype(np.float32)
+    dem = map_rasters.utm(tmp_path / "d.tif", heights, pixel_m=2.0)
     (tmp_path / "cluster").mkdir()
     here, there = tmp_path / "here" / "m.gpkg", tmp_path / "there" / "m.gpkg"
-    build(tif, here)
+    build(tif, here, dem=dem)
+    grid = MapPackage.open(here).manifest.dem
+    assert grid and len(height_places(grid)) >= TILES_PER_WORKER  # else the cluster has no part in them
     with local_cluster(tmp_path / "cluster", workers=3) as cluster:
-        building = subprocess.Popen(command(tif, there, cluster.address), stderr=subprocess.PIPE, cwd=tmp_path)
+        line = command(
+            tif, there, cluster.address, "--dem", dem.name
+        )  # seen from the folder of the command, not theirs
+        building = subprocess.Popen(line, stderr=subprocess.PIPE, cwd=tmp_path)
         while written(there) < ENOUGH and building.poll() is None:
             time.sleep(0.02)
         assert building.poll() is None, building.communicate()[1]

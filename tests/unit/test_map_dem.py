@@ -14,6 +14,8 @@ from rasterio.transform import Affine
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
+from terrafix_tools.mapping import build as build_module
+from terrafix_tools.mapping import parallel
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.dem import encode_heights
 
@@ -101,6 +103,20 @@ def test_heights_survive_their_encoding(low: float, span: float) -> None:
     assert (coded[:3] == 65535).all() and (coded[3:] < 65535).all()
     back = coded.astype(np.float64) * scale + offset
     assert np.abs(back - height_m)[known].max() <= max(0.0051, span / 65534)
+
+
+@pytest.mark.slow
+def test_several_processes_write_the_same_heights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build_module, "TILES_PER_WORKER", 4)
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(700, 900))
+    corner = Affine(5, 0, 299_500, 0, -5, 2_600_500)
+    dem = map_rasters.write_tif(tmp_path / "d.tif", mountains(), "EPSG:32651", corner, nodata=-32768)
+    started: list[int] = []
+    processes = parallel._processes
+    monkeypatch.setattr(parallel, "_processes", lambda opener, n: (started.append(n), processes(opener, n))[1])
+    (tmp_path / "b").mkdir()
+    one, two = build(tif, tmp_path / "m.gpkg", dem=dem), build(tif, tmp_path / "b" / "m.gpkg", dem=dem, workers=2)
+    assert started == [2] and one.read_bytes() == two.read_bytes()
 
 
 def test_an_altered_scale_of_a_tile_is_noticed(package: Path) -> None:

@@ -53,7 +53,8 @@ def test_the_newest_is_first_and_each_layer_says_what_it_is(package: Path) -> No
     assert (manifest.date, manifest.licence, manifest.ce90_m) == ("2023-06-01", "CC0", 3.0)
     assert (manifest.crs, manifest.layers[1].crs) == ("EPSG:3857", "EPSG:32651")
     assert manifest.layers[0].gsd_m == pytest.approx(np.cos(np.radians(LAT_DEG)), rel=5e-3)
-    assert manifest.tiles == sum(layer.tiles for layer in manifest.layers)
+    described = [layer.descriptors.tiles for layer in manifest.layers if layer.descriptors]
+    assert manifest.tiles == sum(layer.tiles for layer in manifest.layers) + sum(described)
     opened.close()
 
 

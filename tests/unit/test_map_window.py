@@ -130,7 +130,7 @@ def test_reduced_windows_do_not_alias(tmp_path: Path) -> None:
     package = MapPackage.open(build(map_rasters.utm(tmp_path / "fine.tif", bands), tmp_path / "fine.gpkg"))
     west, south, east, north = package.manifest.bounds_wgs84
     local = package.bind(LocalFrame((south + north) / 2, (west + east) / 2))
-    for factor in (1.8, 2.5, 4.0, 7.3):
+    for factor in (1.5, 1.8, 2.5, 4.0, 7.3):
         image, valid = local.window(-100.0, 100.0, round(400 / factor), round(400 / factor), local.gsd_m * factor)
         assert valid.all()
         assert image.std() < 12

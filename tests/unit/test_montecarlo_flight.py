@@ -49,6 +49,14 @@ def test_registration_errors_of_a_hundred_maps_are_those_that_the_maps_state() -
     assert np.abs(np.mean([np.array(p.map_offset_m) / p.map_sigma_m for p in drawn], axis=0)).max() < 0.1
 
 
+def test_a_map_is_stretched_as_measured_and_more_when_it_states_more() -> None:
+    """0.8 m on village-1, whatever a better map states; a third of what a worse one states. 0.35 m are detail."""
+    places = np.random.default_rng(2).uniform(-3000.0, 3000.0, (4000, 2))
+    for sigma_m, warp_m in ((1.0, 0.8), (2.0, 0.8), (6.0, 2.0)):
+        errors = [MapError(seed, np.array([3.0, 1.0]), sigma_m).at(places) - (3.0, 1.0) for seed in range(6)]
+        assert np.std(errors) == pytest.approx(np.hypot(warp_m, 0.35), rel=0.15)
+
+
 def test_the_ground_is_the_same_from_another_origin() -> None:
     terrain, moved = Terrain(1, 20.0, 0.3), np.array([700.0, -300.0])
     places = np.random.default_rng(1).uniform(-1000.0, 1000.0, (500, 2))
@@ -172,7 +180,7 @@ def test_what_cannot_be_flown_is_said_in_a_line(tmp_path: Path, wrong: dict[str,
 
 def _matches(drawn: FlightPlan, flight: Flown, offset_m: np.ndarray) -> MapMatches:
     lens = Lens(CameraCalibration.of(drawn.camera))
-    error = MapError(drawn.seed, offset_m)
+    error = MapError(drawn.seed, offset_m, 2.0)
     return MapMatches(lens, flight.terrain, error, has_dem=True, map_sigma_m=2.0, seed=drawn.seed)
 
 

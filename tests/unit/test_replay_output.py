@@ -178,10 +178,13 @@ def test_no_map_anywhere(folder: Path, tmp_path: Path) -> None:
         replay(folder, tmp_path / "none.tif", tmp_path / "out", nodes=nodes)
 
 
-def test_models_are_checked_before_the_flight(folder: Path, tmp_path: Path) -> None:
+def test_models_are_checked_before_the_flight(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERRAFIX_MODELS", str(tmp_path / "models"))
     for text, error, says in (
         ("xfeat=none.onnx", ModelError, "none.onnx: no such model file"),
-        ("xfeat", UsageError, "write NAME=PATH"),
+        ("xfeat", ModelError, r"models/xfeat\.onnx: no such model file \(xfeat\); terrafix models fetch xfeat"),
+        ("xfeat=", UsageError, "write NAME=PATH, or NAME alone"),
+        ("xfeat=lighterglue-l3", ModelError, "'lighterglue-l3' cannot be used as xfeat"),
         ("superglue=a.onnx", UsageError, "no model is called 'superglue'; known: xfeat"),
     ):
         with pytest.raises(error, match=says):

@@ -16,7 +16,7 @@ PACKAGES = {
 }
 # library -> the modules (and what is below them) that may import it
 OWNERS = {
-    "gtsam": ("terrafix.estimator", "terrafix_tools.bench.growth"),
+    "gtsam": ("terrafix.estimator", "terrafix_tools.bench.growth", "terrafix_tools.bench.merging_baseline"),
     "pymavlink": (
         "terrafix.link",
         "terrafix_tools.sim.autopilot",

@@ -8,7 +8,10 @@ import typer
 
 from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
+from terrafix_tools.finalise.cli import finalise
+from terrafix_tools.hint.cli import CONTEXT, hint
 from terrafix_tools.mapping.cli import app as map_app
+from terrafix_tools.models.cli import app as models_app
 from terrafix_tools.montecarlo.cli import montecarlo
 from terrafix_tools.preflight.cli import preflight
 from terrafix_tools.sim.cli import app as sim_app
@@ -17,9 +20,12 @@ ON_THE_GROUND = ("rasterio", "urllib3", "pmtiles", "osmium")  # the extra `groun
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
 app.add_typer(map_app, name="map")
+app.add_typer(models_app, name="models")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
+app.command()(finalise)
 app.command()(preflight)
+app.command(context_settings=CONTEXT)(hint)
 app.command()(montecarlo)
 
 StartOption = Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")]
@@ -65,7 +71,7 @@ def replay(
     out: Annotated[Path, typer.Option(help="Folder for estimates.csv, flight.mcap, summary.json.")] = Path(
         "out/replay"
     ),
-    model: Annotated[list[str] | None, typer.Option(help="NAME=PATH, for example xfeat=models/xfeat.onnx.")] = None,
+    model: Annotated[list[str] | None, typer.Option(help="Name of a fetched model (xfeat), or NAME=PATH.")] = None,
     start: StartOption = "",
     config: ConfigOption = None,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from terrafix.core.errors import EvaluationError, OutputError
 from terrafix_tools.estimates import Row, number, read_rows, read_table
+from terrafix_tools.finalise.output import TABLE as FINALISED
 
 LIMITS_M = (5, 10, 20, 50)
 ELLIPSE95 = 5.991  # chi-square with 2 degrees of freedom, 95 %
@@ -154,6 +155,14 @@ def metrics(
     return {key: round(value, 6) if isinstance(value, float) else value for key, value in result.items()}
 
 
+def finalised_metrics(rows: list[Row], truth: dict[str, Truth]) -> dict[str, Any]:
+    """The same of finalised.csv, where that is defined; every key begins with ``finalised``."""
+    whole = metrics(rows, truth, {}, None)
+    kept = ("median_m", "p95_m", "max_m", "ellipse95_coverage", "mean_nees", "false_fixes")
+    names = [name for name in whole if name.startswith("within_") or name in kept]
+    return {"finalised": whole["localised"], **{f"finalised_{name}": whole[name] for name in names}}
+
+
 def truth_sigma_of(truth_path: Path) -> float | None:
     """[truth] sigma_m of the flight.toml beside truth.csv, when there is one."""
     try:
@@ -182,7 +191,10 @@ def read_summary(folder: Path) -> dict[str, Any]:
 def evaluate(folder: Path, truth_path: Path, *, json_only: bool = False) -> dict[str, Any]:
     """Writes FOLDER/evaluation.json and prints it. Raises EvaluationError, OutputError."""
     rows = read_rows(folder / "estimates.csv")
-    result = metrics(rows, read_truth(truth_path), read_summary(folder), truth_sigma_of(truth_path))
+    truth = read_truth(truth_path)
+    result = metrics(rows, truth, read_summary(folder), truth_sigma_of(truth_path))
+    if (folder / FINALISED).is_file():
+        result |= finalised_metrics(read_rows(folder / FINALISED), truth)
     text = json.dumps(result, indent=2, allow_nan=False)
     try:
         (folder / "evaluation.json").write_text(text + "\n", encoding="utf-8")
@@ -212,9 +224,11 @@ def _table(result: dict[str, Any], folder: Path) -> Table:
     table.add_column("")
     table.add_column("immediate", justify="right")
     table.add_column("refined", justify="right")
+    if "finalised" in result:
+        table.add_column("finalised", justify="right")
     for key, value in result.items():
-        if key.startswith("refined_") or key in ("frames", "localised"):
+        if key.startswith(("refined_", "finalised")) or key in ("frames", "localised"):
             continue
-        refined = f"refined_{key}"
-        table.add_row(key, _shown(key, value), _shown(refined, result[refined]) if refined in result else "")
+        others = [f"{stage}_{key}" for stage in ("refined", "finalised")]
+        table.add_row(key, _shown(key, value), *(_shown(o, result[o]) if o in result else "" for o in others))
     return table

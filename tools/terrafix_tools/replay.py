@@ -26,10 +26,13 @@ from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.writer import versions
 from terrafix.vision.sources import Source, open_source
+from terrafix_engines.runtime import ModelFileError
+from terrafix_engines.store import Stored, find, models_folder
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay_output import ReplayOutput
 
 FLOWN = ("vision", "anchor", "estimator")  # processes that decide; link, health and recorder need a live world
+FOLDER = "folder"  # the key of [models] that is no model
 FRAMES_KEPT = 32  # what a node may still ask for; as many as the live ring has
 
 MakeNodes = Callable[[NodeContext], Mapping[str, Node]]
@@ -75,7 +78,7 @@ def replay(
             "flight": source.name(),
             "source": str(flight),
             "map": map_summary,
-            "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v},
+            "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v and k != FOLDER},
             "config": msgspec.to_builtins(config),
             "versions": versions(),
             **output.counts(),
@@ -139,23 +142,37 @@ def _fly(
 
 
 def _with_models(config: Config, models: list[str]) -> Config:
-    """The configuration with NAME=PATH of the command line in its [models]; every named file must exist."""
-    known = [f.name for f in msgspec.structs.fields(type(config.models))]
+    """The configuration with NAME=PATH, or NAME alone for one that was fetched, of the command line in its [models];
+    every file must exist."""
+    known = [f.name for f in msgspec.structs.fields(type(config.models)) if f.name != FOLDER]
     given: dict[str, str] = {}
     for text in models:
         name, equals, path = text.partition("=")
-        if not equals or not path:
-            raise UsageError(f"--model '{text}': write NAME=PATH, for example xfeat=models/xfeat.onnx")
+        if equals and not path:
+            raise UsageError(f"--model '{text}': write NAME=PATH, or NAME alone for a model that was fetched")
         if name not in known:
             raise UsageError(f"--model '{text}': no model is called '{name}'; known: {', '.join(known)}")
-        given[name] = path
+        given[name] = path or name
     chosen = msgspec.structs.replace(config.models, **given)
-    for name, path in msgspec.to_builtins(chosen).items():
-        if path and not Path(path).is_file():
-            raise ModelError(
-                f"{path}: no such model file ({name}); check the path, or leave it out to fly without weights"
-            )
+    for name in known:
+        if wanted := getattr(chosen, name):
+            _check_model(wanted, name, models_folder(chosen.folder))
     return msgspec.structs.replace(config, models=chosen)
+
+
+def _check_model(wanted: str, name: str, folder: Path) -> None:
+    try:
+        found = find(wanted, name, folder)
+        there = found.is_there() if isinstance(found, Stored) else os.path.isfile(found)
+    except ModelFileError as error:
+        raise ModelError(str(error)) from None
+    if not there:
+        path, todo = (
+            (found.path, f"terrafix models fetch {found.manifest.name}")
+            if isinstance(found, Stored)
+            else (found, "check the path")
+        )
+        raise ModelError(f"{path}: no such model file ({name}); {todo}, or leave it out to fly without weights")
 
 
 def _map_of(given: Path | None, config: Config, source: Source) -> Path:

@@ -14,9 +14,12 @@ from terrafix.core.node import Image
 from terrafix.messages import Frame, MapMatch, MeasurementVerdict, Message, Odometry, Verdict
 from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
 from terrafix_tools.estimates import ESTIMATES, PARTIAL, RowTable, write_rows
+from terrafix_tools.finalise.output import SUMMARY as FINALISED_SUMMARY
+from terrafix_tools.finalise.output import TABLE as FINALISED_TABLE
 
 RECORD, SUMMARY = "flight.mcap", "summary.json"
-DERIVED = ("evaluation.json", "report.html")  # made of the three above: those of an earlier replay would lie
+# Made of the three above: those of an earlier replay would lie.
+DERIVED = ("evaluation.json", "report.html", FINALISED_TABLE, FINALISED_SUMMARY)
 
 
 class ReplayOutput:

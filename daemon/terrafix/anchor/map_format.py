@@ -45,6 +45,20 @@ class Level:
     rows: int
 
 
+class DescriptorTable(msgspec.Struct, frozen=True, kw_only=True):
+    """Descriptors for the search of a place that nobody knows: of the tiles of some levels of a layer, the same tiles.
+
+    A tile is a PNG of 8 bits: ``channels`` pictures of cells below each other, 255 for 1, and one that is 255 where all
+    of a cell is valid."""
+
+    table: str
+    name: str  # of the describer, with its version
+    pool: int  # pixels of a cell's side
+    channels: int
+    zooms: tuple[int, ...]
+    tiles: int
+
+
 class Layer(msgspec.Struct, frozen=True, kw_only=True):
     """One imagery layer: one date, one pixel grid. Layers of a package may differ in CRS."""
 
@@ -61,6 +75,7 @@ class Layer(msgspec.Struct, frozen=True, kw_only=True):
     bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max of the imagery; the matrices reach beyond
     levels: tuple[Level, ...]  # coarse to fine
     tiles: int
+    descriptors: DescriptorTable | None = None
 
 
 class VectorTable(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,7 +106,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     built_with: str
     has_dem: bool
     dem: DemGrid | None
-    tiles: int  # of imagery and elevation together
+    tiles: int  # of imagery, descriptors and elevation together
     checksum: str  # sha256 over the other rows and every tile's sha256
     ce90_m: float | None = None
     layers: tuple[Layer, ...] = ()  # newest first

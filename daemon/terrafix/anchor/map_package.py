@@ -9,6 +9,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
+from terrafix.anchor.map_descriptors import StoredDescriptors
 from terrafix.anchor.map_elevation import ElevationView
 from terrafix.anchor.map_format import TILE_PX, Layer, Manifest
 from terrafix.anchor.map_open import check_signature, connect, read_manifest
@@ -173,6 +174,14 @@ class LocalMap:
         if found.table not in self._views:
             self._views[found.table] = LayerView(found, self._package.tiles, self._local)
         return self._views[found.table].window(e_min_m, n_max_m, width_px, height_px, gsd_m)
+
+    def descriptors(self, name: str) -> StoredDescriptors | None:
+        """Descriptors of this name that the bound layer has; None: it has none."""
+        layer = self._package.layer(self._default)
+        if layer.descriptors is None or layer.descriptors.name != name:
+            return None
+        view = self._views[layer.table]
+        return StoredDescriptors(layer, layer.descriptors, self._package.tiles, view.to_crs, view.unit_m)
 
     def elevation(self, e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray | None:
         """Metres AMSL (float64, shape of e_m), bilinear; NaN where unknown; None when the package has no elevation."""

@@ -39,7 +39,8 @@ class TileStore:
     def tile(self, key: Key) -> Tile | None:
         """(256, 256, 4) uint8 BGR and mask of 0 and 255, and whether the mask is 255 everywhere; None = nothing there.
 
-        Of the elevation table: (256, 256) float32 metres AMSL, NaN = void."""
+        Of the elevation table: (256, 256) float32 metres AMSL, NaN = void; of a table of descriptors: (height, width)
+        uint8 as stored (``map_format.DescriptorTable``)."""
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]
@@ -148,6 +149,8 @@ class TileStore:
         if scale is not None and offset is not None:
             assert image.shape == (DEM_TILE_PX, DEM_TILE_PX) and image.dtype == np.uint16
             return _heights(np.where(image == DEM_NULL, np.nan, image * scale + offset).astype(np.float32))
+        if image.ndim == 2:
+            return image, True
         if image.shape[2] == 4:
             image[:, :, 3] = np.where(image[:, :, 3] > 0, 255, 0)
             return image, bool((image[:, :, 3] == 255).all())

@@ -14,7 +14,9 @@ COARSER_ALLOWED = 1.1  # a level up to 10 % coarser than asked is used rather th
 BLOCK_PX = 512  # a window is rendered in blocks that stay in the cache, each with an affine map of its own
 MIN_BLOCK_PX = 64
 AFFINE_TOLERANCE_PX = 0.02  # split a block until its affine map is this close to the projection, in pixels of the level
-BLUR_MIN_SCALE = 1.17  # below this reduction the bilinear kernel is filter enough
+# A reduction by s wants a low-pass of variance (s^2 - 1) / 4 px^2. [1 2 1] / 4 has 0.5 and costs a quarter of any other
+# kernel: up to a reduction by two the nearer of it and none is used.
+BLUR_MIN_SCALE, BLUR_FAST_SCALE = math.sqrt(2.0), 2.0
 
 # The corners of a block, the middles of its sides and its centre, as (s, t, 1) with s and t from 0 to 1; and what takes
 # nine values there to the affine map that is nearest to them.
@@ -44,11 +46,11 @@ class LayerView:
     def __init__(self, layer: Layer, tiles: TileStore, local: CRS) -> None:
         self._layer = layer
         self._tiles = tiles
-        self._to_crs = Transformer.from_crs(local, layer.crs, always_xy=True)
+        self.to_crs = Transformer.from_crs(local, layer.crs, always_xy=True)
         to_local = Transformer.from_crs(layer.crs, local, always_xy=True)
         self.bounds_m: tuple[float, float, float, float] = to_local.transform_bounds(*layer.bounds, densify_pts=51)
         # Ground size of one CRS unit at the centre of the layer, to choose a level in metres.
-        self._unit_m = layer.gsd_m / math.sqrt(layer.levels[-1].pixel_x * layer.levels[-1].pixel_y)
+        self.unit_m = layer.gsd_m / math.sqrt(layer.levels[-1].pixel_x * layer.levels[-1].pixel_y)
 
     def window(
         self, e_min_m: float, n_max_m: float, width_px: int, height_px: int, gsd_m: float
@@ -79,7 +81,7 @@ class LayerView:
     def _level_for(self, gsd_m: float) -> Level:
         """The coarsest level that still has the detail asked for."""
         for level in self._layer.levels:
-            if math.sqrt(level.pixel_x * level.pixel_y) * self._unit_m <= gsd_m * COARSER_ALLOWED:
+            if math.sqrt(level.pixel_x * level.pixel_y) * self.unit_m <= gsd_m * COARSER_ALLOWED:
                 return level
         return self._layer.levels[-1]
 
@@ -88,7 +90,7 @@ class LayerView:
         places = np.array([(b.column, b.row) for b in blocks])[:, None]
         sizes = np.array([(b.width, b.height) for b in blocks])[:, None]
         pixels = places + KNOTS[:, :2] * sizes
-        x, y = self._to_crs.transform(e_min_m + pixels[..., 0] * gsd_m, n_max_m - pixels[..., 1] * gsd_m)
+        x, y = self.to_crs.transform(e_min_m + pixels[..., 0] * gsd_m, n_max_m - pixels[..., 1] * gsd_m)
         u = (x - self._layer.x_min) / level.pixel_x - 0.5
         v = (self._layer.y_max - y) / level.pixel_y - 0.5
         return np.stack([u, v], axis=2)
@@ -99,8 +101,8 @@ class LayerView:
         height_px, width_px = mask.shape
         across, down = affine[0] / width_px, affine[1] / height_px
         scale = math.sqrt(abs(float(across[0] * down[1] - across[1] * down[0])))
-        sigma_px = 0.5 * math.sqrt(scale * scale - 1.0) if scale > BLUR_MIN_SCALE else 0.0
-        margin = 2 + math.ceil(3 * sigma_px)
+        side, sigma_px = _low_pass(scale)
+        margin = 2 + side // 2
         low = np.floor(uv.min(axis=0)).astype(int) - margin
         high = np.ceil(uv.max(axis=0)).astype(int) + margin + 1
         start, end = np.maximum(low, 0), np.minimum(high, [level.columns * TILE_PX, level.rows * TILE_PX])
@@ -111,8 +113,7 @@ class LayerView:
         whole &= bool((start == low).all() and (end == high).all())  # else the window reaches beyond the tiles
         if not whole and not source[:, :, 3].any():
             return
-        if sigma_px > 0:
-            side = 2 * max(1, round(2.5 * sigma_px)) + 1
+        if side > 1:
             valid = None if whole else cv2.erode(cv2.extractChannel(source, 3), np.ones((side, side), np.uint8))
             source = cv2.GaussianBlur(source, (side, side), sigma_px)
             if valid is not None:
@@ -128,6 +129,14 @@ class LayerView:
             return
         np.equal(cv2.extractChannel(warped, 3), 255, out=mask.view(bool))  # every pixel that was blended is valid
         image[mask == 0] = 0
+
+
+def _low_pass(scale: float) -> tuple[int, float]:
+    """Side of the Gaussian kernel and its sigma, pixels; side 1: none, sigma 0: OpenCV's own for the side."""
+    if scale <= BLUR_FAST_SCALE:
+        return (3, 0.0) if scale > BLUR_MIN_SCALE else (1, 0.0)
+    sigma_px = 0.5 * math.sqrt(scale * scale - 1.0)
+    return 2 * round(2.5 * sigma_px) + 1, sigma_px
 
 
 def _halves(start: int, size: int) -> list[tuple[int, int]]:

@@ -30,13 +30,16 @@ PATCH_PER_AGL = 0.25  # side of a patch: 25 m at 100 m, one house and its surrou
 MIN_PATCH_CELLS = 8
 REACH = 0.08  # search of a patch around its expected place, share of the height
 FIRST_REACH, FIRST_THRESHOLD = 0.2, 0.05  # of the first pass, while the tilt is not known
+# Of a place that a search proposes, in one pass: measured on maps of other seasons and after a disaster, a pose stands
+# twice as often as in two passes, because the first one's tilt would spoil the picture for the second.
+SEARCHED_REACH, SEARCHED_THRESHOLD, SEARCHED_COARSER = 0.12, 0.04, 2.0
 WELL_KNOWN_RAD = np.radians(3.0)
 # Rotation and scale are searched when they are known less well than the descriptors tolerate.
 YAW_TOLERANCE_RAD = np.radians(4.0)
 YAW_STEP_RAD = np.radians(7.0)
 SCALE_TOLERANCE = 0.05
 SCALE_STEP = 0.08
-WIDE_YAW_RAD, WIDE_SCALE = np.radians(13.0), 0.10  # the same steps on the coarse cells of a search over the whole map
+WIDE_YAW_RAD, WIDE_SCALE = np.radians(13.0), 0.10  # at most, on the coarse cells of a search over the whole map
 MAX_HYPOTHESES = 81
 MIN_SIDE_CELLS = 24  # of the rectified frame
 
@@ -123,11 +126,15 @@ class FrameMatcher:
         return float(2.0 ** (round(np.log2(wanted) * GSD_STEPS_PER_OCTAVE) / GSD_STEPS_PER_OCTAVE))
 
     def wide_hypotheses(self, view: View) -> tuple[Hypothesis, ...]:
-        """Headings and scales for a search over the whole map."""
-        return _hypotheses(view, WIDE_YAW_RAD, WIDE_SCALE)
+        """Headings and scales for a search over the whole map: as many as its steps ask for, spread evenly."""
+        yaws = _spread(min(1.5 * view.yaw_sigma_rad, np.pi), YAW_TOLERANCE_RAD, WIDE_YAW_RAD)
+        scales = [1.0 + s for s in _spread(min(1.5 * view.scale_sigma, 0.5), SCALE_TOLERANCE, WIDE_SCALE)]
+        return _pairs(yaws, scales)
 
-    def rectified(self, image: Image, view: View, hypothesis: Hypothesis, gsd_m: float) -> Rectified | None:
-        return self._rectified(image, view, hypothesis, gsd_m, 1)
+    def rectified(
+        self, image: Image, view: View, hypothesis: Hypothesis, gsd_m: float, stride: int
+    ) -> Rectified | None:
+        return self._rectified(image, view, hypothesis, gsd_m, stride)
 
     def look(self, image: Image, view: View, belief: Window) -> Look:
         """Correlation over the belief's window, for every rotation and scale that the prediction leaves open."""
@@ -172,25 +179,27 @@ class FrameMatcher:
 
         A pose that is not known well is found in two passes: a wide search with a generous threshold, then a narrow one
         on the frame rectified with what the first one found."""
-        start = replace(
-            view,
-            e_m=e_m,
-            n_m=n_m,
-            r_w_c=local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c,
-            agl_m=view.agl_m * hypothesis.scale,
-        )
+        start = _at(view, hypothesis, e_m, n_m)
         if view.tilt_sigma_rad > WELL_KNOWN_RAD:
-            first = self._patch_fix(image, start, FIRST_REACH, FIRST_THRESHOLD)
+            first = self._patch_fix(image, start, FIRST_REACH, FIRST_THRESHOLD, 1.0)
             if first is None or first.pnp.fit is None:
                 return first
-            p = first.pnp.fit.p_c_in_w_m
-            start = replace(
-                start, e_m=p[0], n_m=p[1], r_w_c=first.pnp.fit.r_w_c, agl_m=p[2] - float(first.points_w_m[:, 2].mean())
-            )
-        return self._patch_fix(image, start, REACH, THRESHOLD)
+            start = _from(start, first)
+        return self._patch_fix(image, start, REACH, THRESHOLD, 1.0)
 
-    def _patch_fix(self, image: Image, view: View, reach_share: float, threshold: float) -> Fix | None:
-        gsd = self._gsd(view.agl_m, FIX_GSD_PER_AGL, self._describer)
+    def searched_fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> Fix | None:
+        """As ``fix``, at a place that a search proposes: on larger cells, for which changes and leaning buildings
+        matter less, and then on those of a flight where a pose stands on these, too."""
+        start = _at(view, hypothesis, e_m, n_m)
+        first = self._patch_fix(image, start, SEARCHED_REACH, SEARCHED_THRESHOLD, SEARCHED_COARSER)
+        if first is None or first.pnp.fit is None:
+            return first
+        finer = self._patch_fix(image, _from(start, first), REACH, THRESHOLD, 1.0)
+        return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else first
+
+    def _patch_fix(self, image: Image, view: View, reach_share: float, threshold: float, coarser: float) -> Fix | None:
+        per_agl = FIX_GSD_PER_AGL[self._describer.name]
+        gsd = self.cell_m(view.agl_m, per_agl * coarser if self._describer.stride == 1 else per_agl)
         cell = gsd * self._describer.stride
         frame = rectify(image, self._camera, view.r_w_c, view.agl_m, gsd, self._describer.stride)
         if frame is None:
@@ -233,6 +242,19 @@ class FrameMatcher:
         )
 
 
+def _at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:
+    r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
+    return replace(view, e_m=e_m, n_m=n_m, r_w_c=r_w_c, agl_m=view.agl_m * hypothesis.scale)
+
+
+def _from(view: View, fix: Fix) -> View:
+    """The camera as a pose has it."""
+    assert fix.pnp.fit is not None
+    p = fix.pnp.fit.p_c_in_w_m
+    agl_m = float(p[2]) - float(fix.points_w_m[:, 2].mean())
+    return replace(view, e_m=float(p[0]), n_m=float(p[1]), r_w_c=fix.pnp.fit.r_w_c, agl_m=agl_m)
+
+
 def _describe(frame: Rectified, describer: Describer) -> tuple[np.ndarray, np.ndarray]:
     """Descriptors (C, h, w) and the cells (h, w) that lie wholly in the frame."""
     stride = describer.stride
@@ -241,12 +263,14 @@ def _describe(frame: Rectified, describer: Describer) -> tuple[np.ndarray, np.nd
     return describer.describe(frame.image), mask
 
 
-def _hypotheses(
-    view: View, yaw_step_rad: float = YAW_STEP_RAD, scale_step: float = SCALE_STEP
-) -> tuple[Hypothesis, ...]:
+def _hypotheses(view: View) -> tuple[Hypothesis, ...]:
     """Grid over one and a half sigmas of heading and scale, as far as they are not known well enough."""
-    yaws = _grid(min(1.5 * view.yaw_sigma_rad, np.pi), YAW_TOLERANCE_RAD, yaw_step_rad)
-    scales = [1.0 + s for s in _grid(min(1.5 * view.scale_sigma, 0.5), SCALE_TOLERANCE, scale_step)]
+    yaws = _grid(min(1.5 * view.yaw_sigma_rad, np.pi), YAW_TOLERANCE_RAD, YAW_STEP_RAD)
+    scales = [1.0 + s for s in _grid(min(1.5 * view.scale_sigma, 0.5), SCALE_TOLERANCE, SCALE_STEP)]
+    return _pairs(yaws, scales)
+
+
+def _pairs(yaws: list[float], scales: list[float]) -> tuple[Hypothesis, ...]:
     while len(yaws) * len(scales) > MAX_HYPOTHESES:
         scales = scales[1:-1] if len(scales) > 3 else [1.0]
     return tuple(Hypothesis(y, s) for y, s in itertools.product(yaws, scales))
@@ -255,3 +279,9 @@ def _hypotheses(
 def _grid(half: float, tolerance: float, step: float) -> list[float]:
     count = 0 if half <= tolerance else int(np.ceil((half - tolerance / 2) / step))
     return [i * step for i in range(-count, count + 1)]
+
+
+def _spread(half: float, tolerance: float, step: float) -> list[float]:
+    """As many as ``_grid``, from one end to the other."""
+    count = len(_grid(half, tolerance, step)) // 2
+    return [i * (half - tolerance / 2) / max(count, 1) for i in range(-count, count + 1)]

@@ -7,11 +7,13 @@ import numpy as np
 
 from terrafix.anchor.answer import coarse, judged
 from terrafix.anchor.belief import Belief, cell_for
+from terrafix.anchor.hint import SIGMAS_95, Believed, radius_now_m, weigh
 from terrafix.anchor.layers import Layers
 from terrafix.anchor.lost import LostWatch
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import FrameMatcher
+from terrafix.anchor.model_watch import ModelWatch
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.anchor.views import ground_plane, view_of
 from terrafix.core.camera import CameraCalibration
@@ -20,9 +22,20 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import FrameStore, Image, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.core.start import SEARCHED_START_M
-from terrafix.messages import MapMatch, Message, Origin, Prediction, SearchStep, Verdict
+from terrafix.messages import (
+    HintVerdict,
+    MapMatch,
+    Message,
+    Origin,
+    PositionHint,
+    Prediction,
+    SearchState,
+    SearchStep,
+    Verdict,
+)
 from terrafix_engines.features import open_describer
-from terrafix_engines.runtime import ModelFileError
+from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_engines.runtime import ModelFileError, ModelRunError
 
 NEW_GROUND_SHARE = 0.35  # of the footprint: after this much motion a look counts as a new one
 MIN_LOOK = 0.08  # a look at the same ground again still says this much
@@ -42,10 +55,18 @@ SCALE_CHANGED = 1.5  # ratio of heights beyond which a search begins anew
 
 
 class AnchorNode:
-    def __init__(self, frames: FrameStore, package: MapPackage | None, describer: Describer, ce90_m: float) -> None:
+    def __init__(
+        self,
+        frames: FrameStore,
+        package: MapPackage | None,
+        describer: Describer,
+        ce90_m: float,
+        model: ModelWatch | None = None,
+    ) -> None:
         self._frames = frames
         self._package = package
         self._describer = describer
+        self._model = model or ModelWatch(describer)
         self._ce90_m = ce90_m  # of imagery that does not state its own
         self._layers: Layers | None = None
         self._belief: Belief | None = None
@@ -57,6 +78,9 @@ class AnchorNode:
         self._watch = LostWatch()
         self._search: MapSearch | None = None  # while lost
         self._lost_sigma_m = 0.0
+        self._hint: PositionHint | None = None  # not answered yet
+        self._answers: list[Message] = []
+        self._said_step = SearchStep.NORMAL
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
@@ -64,16 +88,59 @@ class AnchorNode:
                 self._origin = message
                 self._ground_m = message.ground_amsl_m or 0.0
                 self._belief, self._search, self._watch = None, None, LostWatch()
-                if self._package is not None:
-                    frame, camera = LocalFrame(message.lat_deg, message.lon_deg), CameraCalibration.of(message.camera)
-                    self._layers = Layers(self._package, frame, camera, self._describer, self._ce90_m)
+                self._open_layers(message)
+                yield from self._model.opened(message.t_ns)
+            case PositionHint():
+                self._hint = message  # height and place come with the next frame
             case Prediction():
-                yield self._match(message)
+                match = self._contained(message)
+                yield match
+                yield from self._answers
+                self._answers.clear()
+                step = match.step if match.verdict is Verdict.LOST else SearchStep.NORMAL
+                if step is not self._said_step:
+                    self._said_step = step
+                    yield SearchState(t_ns=message.t_ns, step=step)
             case _:
                 pass
 
     def tick(self, now_ns: int) -> Iterable[Message]:
         return ()
+
+    def _open_layers(self, origin: Origin) -> None:
+        if self._package is not None:
+            frame, camera = LocalFrame(origin.lat_deg, origin.lon_deg), CameraCalibration.of(origin.camera)
+            self._layers = Layers(self._package, frame, camera, self._describer, self._ce90_m)
+
+    def _contained(self, prediction: Prediction) -> MapMatch:
+        """A learned model that has no answer costs this frame; one that has none for many is given up."""
+        try:
+            match = self._match(prediction)
+        except ModelRunError as error:
+            self._answers += self._model.failed(prediction.t_ns, str(error))
+            if self._model.given_up:
+                self._without_weights(prediction)
+            answer = MapMatch(
+                t_ns=prediction.t_ns,
+                frame_id=prediction.frame_id,
+                verdict=Verdict.MODEL_FAILED,
+                matcher=self._describer.name,
+                step=SearchStep.SKIP,
+                lost_sigma_m=self._lost_sigma_m,
+            )
+            return answer if self._search is None else self._searching(answer, self._search)
+        self._answers += self._model.answered(prediction.t_ns)
+        return match
+
+    def _without_weights(self, prediction: Prediction) -> None:
+        """From here on; what is believed stays, a search that is under way begins anew."""
+        self._describer = GradientDescriber()
+        self._model = ModelWatch(self._describer)
+        if self._origin is not None and self._layers is not None:
+            self._open_layers(self._origin)
+            best = self._layers.best
+            if self._search is not None:
+                self._begin_search(MapSearch(best.map, best.matcher, prediction.agl_m, None), best.map)
 
     def _match(self, prediction: Prediction) -> MapMatch:
         answer = MapMatch(
@@ -89,6 +156,9 @@ class AnchorNode:
         best = self._layers.best
         answer = msgspec.structs.replace(answer, map_sigma_m=best.sigma_m)
         belief = self._moved(prediction, best.map, best.matcher, self._origin)
+        if self._hint is not None:
+            self._heed(self._hint, self._origin, prediction, best.map, best.matcher)
+            self._hint = None
         if self._search is not None:
             return self._searched(answer, prediction, image, self._search, best.map, best.matcher)
         if image is None:
@@ -169,6 +239,33 @@ class AnchorNode:
         self._since_look_m += float(np.hypot(step_m, sigma_m))
         return self._belief
 
+    def _heed(
+        self, hint: PositionHint, origin: Origin, prediction: Prediction, source: LocalMap, matcher: FrameMatcher
+    ) -> None:
+        """The operator's hint: where the search goes on, or a comparison with what is believed."""
+        e_m, n_m = LocalFrame(origin.lat_deg, origin.lon_deg).to_local(hint.lat_deg, hint.lon_deg)
+        radius_m = radius_now_m(hint.radius_m, (prediction.t_ns - hint.t_ns) * 1e-9)
+        sigma_m = float(np.hypot(np.sqrt(max(prediction.cov[0], prediction.cov[7])), self._lost_sigma_m))
+        believed = Believed(*prediction.p_c_in_w_m[:2], sigma_m, self._watch.odds)
+        weighed = weigh((e_m, n_m), radius_m, believed, source.bounds_m, searching=self._search is not None)
+        tracks = self._search.tracks.all if self._search is not None else []
+        follows = any(t.poses and np.hypot(t.e_m - e_m, t.n_m - n_m) <= radius_m for t in tracks)
+        around = self._start_hint(e_m, n_m, radius_m / SIGMAS_95, source)
+        # What a search knows by now is kept where poses speak for a place within the hint, and where the hint says no
+        # more than the map.
+        if weighed.begins_search and not follows and (around is not None or self._search is None):
+            self._begin_search(MapSearch(source, matcher, prediction.agl_m, around), source)
+        self._answers.append(
+            HintVerdict(
+                t_ns=prediction.t_ns,
+                hint_t_ns=hint.t_ns,
+                verdict=weighed.verdict,
+                distance_m=weighed.distance_m,
+                sigma_m=sigma_m,
+                text=weighed.text,
+            )
+        )
+
     def _start_hint(self, e_m: float, n_m: float, sigma_m: float, source: LocalMap) -> tuple[float, float] | None:
         """Where the search begins: around a start that says something, None when it says no more than the map."""
         e_min, n_min, e_max, n_max = source.bounds_m
@@ -243,12 +340,17 @@ def _anywhere_m(source: LocalMap) -> float:
 
 
 def make_node(ctx: NodeContext) -> AnchorNode:
-    """Opens the map and the model, before take-off. Raises ConfigError, MapError, ModelError."""
+    """Opens the map and the model, before take-off. Raises ConfigError, MapError, ModelError; in flight, when this
+    process was started again, a model that cannot be opened any more is done without."""
     wanted = ctx.config.map
     trusted = trusted_keys(wanted.trusted_keys, required=wanted.require_signature)
     package = MapPackage.open(ctx.map_path, trusted=trusted) if ctx.map_path is not None else None
+    models = ctx.config.models
+    not_opened = ""
     try:
-        describer = open_describer(ctx.config.models.xfeat)
+        describer: Describer = open_describer(models.xfeat, models.folder)
     except ModelFileError as error:
-        raise ModelError(str(error)) from None
-    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m)
+        if ctx.epoch_ns is None:
+            raise ModelError(str(error)) from None
+        describer, not_opened = GradientDescriber(), str(error)
+    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, ModelWatch(describer, not_opened))

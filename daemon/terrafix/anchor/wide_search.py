@@ -1,8 +1,9 @@
 """One frame against a whole region of the map: every place, heading and scale on coarse cells, block by block.
 
-The measurement is that of the belief (dense oriented gradients, zero-mean normalised correlation), made cheap: the
-denominator is a box sum that all headings and scales share, a block of the map is transformed once for all of them,
-and of the surfaces only the best value of each cell is kept."""
+The measurement is that of the belief (zero-mean normalised correlation), of gradients pooled over cells and made cheap:
+the denominator is a box sum that all headings and scales share, a block of the map is transformed once for all of them,
+and of the surfaces only the best value of each cell is kept. Correlations are comparable over the whole map; in
+standard deviations of its own block a dull block would look like a bright one."""
 
 import itertools
 from collections.abc import Sequence
@@ -11,9 +12,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from terrafix.anchor.correlate import FLAT_VARIANCE, MIN_OVERLAP, standardise
-from terrafix.anchor.map_features import Describer, MapFeatures, MapWindows
+from terrafix.anchor.correlate import FLAT_VARIANCE, MIN_OVERLAP
+from terrafix.anchor.map_features import Describer, MapWindows
 from terrafix.anchor.rectify import Rectified
+from terrafix.anchor.tile_index import TileIndex
 
 BLOCK_CELLS = 256  # side of a block of camera positions: the tile of the search
 AT_ONCE = 16  # templates whose transforms are held at a time: a few MB each
@@ -21,11 +23,13 @@ AT_ONCE = 16  # templates whose transforms are held at a time: a few MB each
 
 @dataclass(frozen=True)
 class Template:
-    """A rectified frame as descriptors (C, h, w) with its mask (h, w), for one heading and scale."""
+    """Ground as descriptors (C, h, w) with its mask (h, w), for one heading and scale; its corner lies at
+    (e_min_m, n_max_m) from the point below the camera."""
 
     descriptors: np.ndarray
     mask: np.ndarray
-    frame: Rectified
+    e_min_m: float
+    n_max_m: float
 
 
 @dataclass(frozen=True)
@@ -39,10 +43,10 @@ class Block:
 
 @dataclass(frozen=True)
 class BlockLook:
-    """``z``, ``index`` (BLOCK_CELLS, BLOCK_CELLS): best standardised correlation of each cell, and the template that
-    gave it; NaN and 0 where the map does not cover the frame."""
+    """``correlation``, ``index`` (BLOCK_CELLS, BLOCK_CELLS): the best one of each cell, and the template that gave it;
+    NaN and 0 where the map does not cover the ground."""
 
-    z: np.ndarray
+    correlation: np.ndarray
     index: np.ndarray
 
 
@@ -69,15 +73,22 @@ def blocks_of(bounds_m: tuple[float, float, float, float], cell_m: float) -> lis
 class WideSearch:
     def __init__(self, source: MapWindows, describer: Describer) -> None:
         self._describer = describer
-        self._features = MapFeatures(source, describer)
+        self._features = TileIndex(source, describer)
+        self.stride = describer.stride  # pixels of a cell's side
+
+    def cell_m(self, wanted_m: float) -> float:
+        """Of the cells that cost least near the wanted size."""
+        return self._features.gsd_m(wanted_m / self.stride) * self.stride
 
     def describe(self, frame: Rectified) -> Template:
-        return Template(self._describer.describe(frame.image), frame.mask, frame)
+        h, w = (side // self.stride for side in frame.mask.shape)
+        mask = np.asarray(frame.mask.reshape(h, self.stride, w, self.stride).all(axis=(1, 3)))
+        return Template(self._describer.describe(frame.image), mask, frame.e_min_m, frame.n_max_m)
 
     def look(self, templates: Sequence[Template], blocks: Sequence[Block], cell_m: float) -> list[BlockLook]:
-        """One answer for each block. All templates are rectified at ``cell_m``."""
+        """One answer for each block. All templates are rectified with ``stride`` pixels to ``cell_m``."""
         # What a template covers while the camera is in the first cell of a block: rows and columns from that cell.
-        corners = [(round(-t.frame.n_max_m / cell_m), round(t.frame.e_min_m / cell_m)) for t in templates]
+        corners = [(round(-t.n_max_m / cell_m), round(t.e_min_m / cell_m)) for t in templates]
         ends = [(r + t.mask.shape[0], c + t.mask.shape[1]) for t, (r, c) in zip(templates, corners, strict=True)]
         low_r, low_c = (min(corner[axis] for corner in corners) for axis in (0, 1))
         height, width = (BLOCK_CELLS + max(end[k] for end in ends) - low for k, low in ((0, low_r), (1, low_c)))
@@ -88,16 +99,16 @@ class WideSearch:
             prepared = [_prepare(templates[i], (corners[i][0] - low_r, corners[i][1] - low_c), fft) for i in chunk]
             for look, block in zip(found, blocks, strict=True):
                 e_min_m, n_max_m = (block.column + low_c) * cell_m, -(block.row + low_r) * cell_m
-                descriptors, valid, _, _ = self._features.window(e_min_m, n_max_m, width, height, cell_m)
+                descriptors, valid, _, _ = self._features.window(e_min_m, n_max_m, width, height, cell_m / self.stride)
                 if not valid.any():
                     continue
                 spectrum = np.fft.rfft2(descriptors, fft)
                 under = _box_sums(descriptors, valid, prepared[0].count)
                 for i, template in zip(chunk, prepared, strict=True):
                     product = np.fft.irfft2(np.einsum("kij,kij->ij", spectrum, template.transform), fft)
-                    z = _standardised(product, template, under)
-                    better = (z > look.z) | np.isnan(look.z)
-                    look.z[better], look.index[better] = z[better], i
+                    correlation = _normalised(product, template, under)
+                    better = (correlation > look.correlation) | np.isnan(look.correlation)
+                    look.correlation[better], look.index[better] = correlation[better], i
         return found
 
 
@@ -121,9 +132,9 @@ def _prepare(template: Template, corner: tuple[int, int], fft: tuple[int, int]) 
     )
 
 
-def _standardised(product: np.ndarray, template: _Prepared, under: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Zero-mean normalised correlation of each camera position of the block, in standard deviations. ``under``: of
-    ``_box_sums``, read where the middle of the template lies."""
+def _normalised(product: np.ndarray, template: _Prepared, under: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Zero-mean normalised correlation of each camera position of the block. ``under``: of ``_box_sums``, read where
+    the middle of the template lies."""
     (r, c), (rm, cm) = template.corner, template.middle
     middle = (slice(rm, rm + BLOCK_CELLS), slice(cm, cm + BLOCK_CELLS))
     energy, squares, known = (sums[middle] for sums in under)
@@ -132,7 +143,7 @@ def _standardised(product: np.ndarray, template: _Prepared, under: tuple[np.ndar
         np.maximum(variance * template.own, 1e-12)
     )
     correlation[known < MIN_OVERLAP] = np.nan
-    return standardise(correlation)
+    return np.asarray(correlation)
 
 
 def _box_sums(descriptors: np.ndarray, valid: np.ndarray, count: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

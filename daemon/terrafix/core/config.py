@@ -32,12 +32,16 @@ class Map(Section, frozen=True, kw_only=True):
 
 
 class Models(Section, frozen=True, kw_only=True):
-    xfeat: str = ""  # path of xfeat.onnx; empty = weights-free
+    xfeat: str = ""  # name of a fetched model, or path of an ONNX file; empty: weights-free
+    folder: str = ""  # of fetched models; empty: TERRAFIX_MODELS, or the user's data folder
 
 
 class LinkSection(Section, frozen=True, kw_only=True):
     device: str = "udpout:127.0.0.1:14550"
     baud: Baud = 921_600
+    ground_devices: list[str] = []  # ground stations besides what the autopilot forwards; nothing is forwarded here
+    ground_baud: Baud = 57_600
+    view_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # shows our position there as a vehicle of its own; 0: no
     sysid: Annotated[int, Meta(ge=1, le=255)] = 1
     compid: Annotated[int, Meta(ge=1, le=255)] = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
     autopilot_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: the first autopilot that is heard

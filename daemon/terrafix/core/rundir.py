@@ -55,7 +55,7 @@ class OwnedRunDir:
     """The supervisor's view: made, locked, and removed by it."""
 
     def __init__(self, parent: Path | None = None) -> None:
-        parent = parent or (SHM if os.access(SHM, os.W_OK) else Path(tempfile.gettempdir()))
+        parent = parent or _default_parent()
         sweep(parent)
         self.run_dir = RunDir(Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent)))
         # An exclusive lock dies with its holder, however that dies.
@@ -65,6 +65,30 @@ class OwnedRunDir:
     def remove(self) -> None:
         shutil.rmtree(self.run_dir.path, ignore_errors=True)
         os.close(self._lock_fd)
+
+
+def _default_parent() -> Path:
+    return SHM if os.access(SHM, os.W_OK) else Path(tempfile.gettempdir())
+
+
+def living(parent: Path | None = None) -> list[RunDir]:
+    """The folders of supervisors that live. Another user's cannot be looked into, and counts as living."""
+    folders = sorted((parent or _default_parent()).glob(f"{PREFIX}*"))
+    return [RunDir(folder) for folder in folders if not os.access(folder, os.X_OK) or _is_held(folder / "lock")]
+
+
+def _is_held(lock: Path) -> bool:
+    try:
+        fd = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return False  # gone meanwhile
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False
 
 
 def sweep(parent: Path) -> None:

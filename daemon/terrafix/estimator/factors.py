@@ -14,7 +14,7 @@ import numpy as np
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import log_so3, project_with_jacobian
 from terrafix.estimator.motion import EFFECTIVE_PAIRS, Ground
-from terrafix.estimator.velocity import Leg
+from terrafix.estimator.velocity import V_SIZE, Leg
 
 BIAS_SIZE = 4
 BLOCK_HUBER_K = 1.5
@@ -128,7 +128,6 @@ def same_ground_factor(
     at_first = keyframe.between(pose)
     up_first = keyframe.rotation().matrix().T @ normal
     up_unit = up_first / float(np.linalg.norm(up_first))
-    height_first = float(normal @ p)
     turned = tilt @ (np.eye(3) - np.outer(up_unit, up_unit))
 
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
@@ -144,12 +143,14 @@ def same_ground_factor(
             ]
         )
         by_step = seen[:, :6]
-        risen = float(normal @ c0.translation()) - height_first
+        # The plane was fitted to the ground at one place and lies as high wherever the camera turns out to be: on its
+        # slope a camera that is lost by a hillside would seem to read its position from its height.
+        risen = float(c0.translation()[2] - p[2])
         residual = seen[:, 6] + by_step @ at_first.logmap(step) + tilt @ back + height * risen
         if jacobians is not None:
             by_c0 = -by_step @ step.inverse().AdjointMap()
             by_c0[:, :3] += turned
-            by_c0[:, 3:] += np.outer(height, up)
+            by_c0[:, 3:] += np.outer(height, r0[2])
             jacobians[0] = np.asfortranarray(by_c0)
             jacobians[1] = np.asfortranarray(by_step)
         return np.asarray(residual)
@@ -178,9 +179,10 @@ def _reduced(
     away = np.repeat(points[:, :2] - keyframe.translation()[:2], 2, axis=0)
     by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
     by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
-    # (1 + P P^T)^(-1/2) from the singular values of P: only three directions of the noise are not white.
-    u, s, _ = np.linalg.svd(by_plane, full_matrices=False)
-    full -= u @ ((1.0 - 1.0 / np.sqrt(1.0 + s**2))[:, None] * (u.T @ full))
+    # (1 + P P^T)^(-1/2), where only three directions of the noise are not white: from the eigenvalues of P^T P.
+    s2, v = np.linalg.eigh(by_plane.T @ by_plane)
+    root = np.sqrt(1.0 + s2)
+    full -= by_plane @ ((v / (root * (1.0 + root))) @ (v.T @ (by_plane.T @ full)))
     r = np.asarray(np.linalg.qr(full, mode="r"))
     return r[:, [0, 1, 2, 3, 4, 5, 10]], r[:, 6:9], r[:, 9]
 
@@ -189,9 +191,10 @@ def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, l
     """``before`` and ``after``: keys of C and V; ``bias_key``: of B at the end, whose heading turns what was felt.
 
     Linear but for the heading, and for the axes of the poses."""
-    by_before, by_after = -leg.by_before(), np.zeros((9, 6))
-    by_after[3:, :] = np.eye(6)
-    by_pose = np.zeros((9, 6))
+    rows = 3 + V_SIZE
+    by_before, by_after = -leg.by_before(), np.zeros((rows, V_SIZE))
+    by_after[3:, :] = np.eye(V_SIZE)
+    by_pose = np.zeros((rows, 6))
     felt = np.concatenate([leg.way_m, leg.gain_mps])
 
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
@@ -210,7 +213,7 @@ def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, l
         residual[:3] += c1.translation() - c0.translation()
         residual[3:] += v1
         if jacobians is not None:
-            by_c0, by_c1, by_bias = by_pose.copy(), by_pose.copy(), np.zeros((9, BIAS_SIZE))
+            by_c0, by_c1, by_bias = by_pose.copy(), by_pose.copy(), np.zeros((rows, BIAS_SIZE))
             by_c0[:3, 3:] = -c0.rotation().matrix()
             by_c1[:3, 3:] = c1.rotation().matrix()
             if leg.inertial:

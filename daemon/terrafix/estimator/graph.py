@@ -2,15 +2,16 @@
 
 A node is a frame: C_k, the camera pose in the world, B_k, the slow errors, and V_k, the velocity (see factors.py)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import SupportsFloat, SupportsIndex, SupportsInt
+from functools import partial
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator.factors import leg_factor, same_ground_factor
+from terrafix.estimator.lag import FixedLag
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.past import Past
 from terrafix.estimator.velocity import V_SIZE, Leg, standing_cov, unknown_cov
@@ -20,30 +21,27 @@ from terrafix.estimator.velocity import V_SIZE, Leg, standing_cov, unknown_cov
 LAG_NODES, BATCH_NODES = 15, 5
 ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits in the tail pulls less
 LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
-# Steps from which a factor is linearised anew. Angles bend the geometry; metres and metres per second hardly do.
-RELINEARIZE = {
-    "c": np.array([0.03, 0.03, 0.03, 1.0, 1.0, 1.0]),
-    "b": np.array([0.03, 0.03, 0.03, 10.0]),
-    "v": np.full(V_SIZE, 100.0),
-}
-# Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), compass, barometer and
-# the terrain under it.
-WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(1.0), 0.5])
+# Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), heading (a gyro drifts),
+# barometer and the terrain under it.
+WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.5])
+COMPASS_BY_TURN_RAD = np.radians(2.5)  # ... and of the compass per square root of a radian turned: iron on board
 
 
 @dataclass(frozen=True)
 class NodeState:
     pose: gtsam.Pose3
     bias: np.ndarray  # (4,)
-    velocity: np.ndarray  # (6,) V_k
+    velocity: np.ndarray  # (8,) V_k
 
 
 class PoseGraph:
-    def __init__(self) -> None:
-        self._past = Past()
+    def __init__(self, past: Past | None = None) -> None:
+        self._past = past or Past()
+        self._kept = gtsam.Values()  # the window, as it was before the last nodes came
         self.rebuilds = 0
-        self._smoother = _smoother()
-        self._values: gtsam.Values | None = None  # estimate of the window; None: not computed since the last update
+        self._smoother = FixedLag()
+        self._states: dict[int, NodeState] = {}  # asked for since the last update
+        self._marginals: dict[int, np.ndarray] = {}  # the same, by key
         self._times: dict[int, float] = {}  # nodes in the window: measurement time, s
         self._stamps: dict[int, int] = {}  # node -> batch at whose arrival it was new, or kept
         self._next = 0
@@ -53,17 +51,6 @@ class PoseGraph:
         return self._next - 1
 
     @property
-    def all_factors(self) -> gtsam.NonlinearFactorGraph:
-        """Of the whole flight."""
-        return self._past.all_factors()
-
-    @property
-    def all_values(self) -> gtsam.Values:
-        """Newest estimate of every node."""
-        self._keep_window()
-        return self._past.values
-
-    @property
     def next_node(self) -> int:
         return self._next
 
@@ -71,29 +58,30 @@ class PoseGraph:
         return node in self._times
 
     def state(self, node: int) -> NodeState:
-        """Newest estimate of a node, in the window or before it."""
-        values = self._estimate() if node in self._times else self._past.values
-        pose = values.atPose3(C(node))
-        # Rounding makes rotations drift off SO(3), and every frame builds on the last one: the drift would double.
-        upright = gtsam.Pose3(gtsam.Rot3.ClosestTo(pose.rotation().matrix()), pose.translation())
-        return NodeState(upright, values.atVector(B(node)), values.atVector(V(node)))
-
-    def _estimate(self) -> gtsam.Values:
-        """Of the whole window, computed once after each update."""
-        if self._values is None:
-            self._values = self._smoother.calculateEstimate()
-        return self._values
+        """Newest estimate of a node in the window."""
+        if node not in self._states:
+            pose = self._smoother.pose(node)
+            # Rounding makes rotations drift off SO(3), and every frame builds on the last one: the drift would double.
+            upright = gtsam.Pose3(gtsam.Rot3.ClosestTo(pose.rotation().matrix()), pose.translation())
+            bias, velocity = (self._smoother.vector(key(node)) for key in (B, V))
+            self._states[node] = NodeState(upright, bias, velocity)
+        return self._states[node]
 
     def covariance(self, node: int) -> np.ndarray:
         """Marginal of C_node, 6x6, tangent order (rotation, translation); asked of the smoother itself."""
-        return self._smoother.marginalCovariance(C(node))
+        return self._marginal(C(node))
 
     def velocity_covariance(self, node: int) -> np.ndarray:
-        """Marginal of V_node, 6x6."""
-        return self._smoother.marginalCovariance(V(node))
+        """Marginal of V_node, 8x8."""
+        return self._marginal(V(node))
 
     def bias_covariance(self, node: int) -> np.ndarray:
-        return self._smoother.marginalCovariance(B(node))
+        return self._marginal(B(node))
+
+    def _marginal(self, key: int) -> np.ndarray:
+        if key not in self._marginals:
+            self._marginals[key] = self._smoother.marginal(key)
+        return self._marginals[key].copy()
 
     def time_of(self, node: int) -> float:
         """Measurement time of a node in the window, s."""
@@ -108,20 +96,13 @@ class PoseGraph:
         velocity_cov: np.ndarray,
         attitude: gtsam.CustomFactor | None = None,
     ) -> int:
-        """First node, or the first after a loss: priors on C (tangent covariance 6x6), B (4x4) and V (6x6).
+        """First node, or the first after a loss: priors on C (tangent covariance 6x6), B (4x4) and V (8x8).
 
         The past stays as it was estimated."""
-        self._keep_window()
-        self._smoother, self._values = _smoother(), None
-        self._times.clear()
-        self._stamps.clear()
-        factors = gtsam.NonlinearFactorGraph()
         node = self._next
-        factors.add(gtsam.PriorFactorPose3(C(node), state.pose, gtsam.noiseModel.Gaussian.Covariance(cov)))
-        factors.add(gtsam.PriorFactorVector(B(node), state.bias, gtsam.noiseModel.Gaussian.Covariance(bias_cov)))
-        factors.add(
-            gtsam.PriorFactorVector(V(node), state.velocity, gtsam.noiseModel.Gaussian.Covariance(velocity_cov))
-        )
+        self._leave_all()
+        self._renew()
+        factors = _priors(node, state, cov, bias_cov, velocity_cov)
         if attitude is not None:
             factors.add(attitude)
         self._insert(t_s, state, factors)
@@ -135,8 +116,10 @@ class PoseGraph:
         motion: RelativePose,
         leg: Leg | None,
         attitude: gtsam.CustomFactor | None,
+        rise_sigma_m: float = 0.0,
     ) -> int:
-        """A node that follows ``parent`` (in the window) by ``motion``, and the newest by ``leg``; None: it stands."""
+        """A node that follows ``parent`` (in the window) by ``motion``, and the newest by ``leg``; None: it stands.
+        ``rise_sigma_m``: of the ground since the newest, when no map tells."""
         node = self._next
         newest = self.newest
         dt_s = max(t_s - self._times[newest], 1e-3)
@@ -157,7 +140,11 @@ class PoseGraph:
         else:
             standing = gtsam.noiseModel.Gaussian.Covariance(standing_cov())
             factors.add(gtsam.PriorFactorVector(V(node), np.zeros(V_SIZE), standing))
-        walk = gtsam.noiseModel.Diagonal.Sigmas(WALK_SIGMAS * np.sqrt(dt_s))
+        sigmas = WALK_SIGMAS * np.sqrt(dt_s)
+        turned = state.pose.rotation().compose(self.state(newest).pose.rotation().inverse())
+        sigmas[2] = np.hypot(sigmas[2], COMPASS_BY_TURN_RAD * np.sqrt(abs(gtsam.Rot3.Logmap(turned)[2])))
+        sigmas[3] = np.hypot(sigmas[3], rise_sigma_m)
+        walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(4), walk))
         if attitude is not None:
             factors.add(attitude)
@@ -168,7 +155,8 @@ class PoseGraph:
         """A map fix of a node in the window: camera pose with its covariance (tangent order)."""
         factors = gtsam.NonlinearFactorGraph()
         factors.add(gtsam.PriorFactorPose3(C(node), pose, _robust(cov)))
-        self._update(factors, gtsam.Values(), {})
+        self._past.add(factors)
+        self._update(partial(self._smoother.add, factors))
 
     def keep(self, node: int) -> None:
         """Holds a node of the window in it for another full lag."""
@@ -177,44 +165,35 @@ class PoseGraph:
     def next_keys(self) -> tuple[int, int]:
         return C(self._next), B(self._next)
 
-    def refine(self) -> dict[int, tuple[gtsam.Pose3, np.ndarray]]:
-        """All nodes after a batch optimisation over every factor: pose and position covariance (3x3, world)."""
-        if self._next == 0:
-            return {}
-        self._keep_window()
-        return self._past.refine(self._next)
+    def refine(self) -> tuple[np.ndarray, np.ndarray]:
+        """After landing: positions (N, 3) of all nodes by all that was measured, covariances (N, 3, 3), world axes;
+        nan where that is indeterminate."""
+        self._leave_all()
+        return self._past.refine()
 
     def _insert(self, t_s: float, state: NodeState, factors: gtsam.NonlinearFactorGraph) -> None:
         node = self._next
         leaving = [n for n, at in self._stamps.items() if at < _stamp(node) - LAG_NODES]
         if leaving:
-            self._keep_window()
-            self._past.leave(leaving)
-        values = gtsam.Values()
-        values.insert(C(node), state.pose)
-        values.insert(B(node), state.bias)
-        values.insert(V(node), state.velocity)
-        self._past.values.insert(values)
+            self._kept = self._smoother.estimate()
+            self._past.leave(leaving, self._kept)
+        else:
+            self._past.tidy()
+        values = _values(node, state)
+        self._kept.insert(values)
         self._next += 1
         self._times[node] = t_s
         self._stamps[node] = _stamp(node)
-        stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = {
-            key(n): float(at) for n, at in self._stamps.items() for key in (C, B, V)
-        }
-        self._update(factors, values, stamps)
         for n in leaving:
             del self._times[n], self._stamps[n]
-
-    def _update(
-        self,
-        factors: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        stamps: Mapping[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex],
-    ) -> None:
         self._past.add(factors)
-        self._values = None
+        self._update(partial(self._smoother.insert, node, factors, values, leaving))
+
+    def _update(self, work: Callable[[], None]) -> None:
+        self._states.clear()
+        self._marginals.clear()
         try:
-            self._smoother.update(factors, values, stamps)
+            work()
             healthy = bool(np.isfinite(self.state(self.newest).pose.matrix()).all())
         except RuntimeError:  # how GTSAM says that a system is indeterminate
             healthy = False
@@ -222,52 +201,57 @@ class PoseGraph:
             self._rebuild()
 
     def _rebuild(self) -> None:
+        """From the last good estimate, with little confidence."""
         self.rebuilds += 1
         node = self.newest
-        self._values = None
-        kept = self._past.values
-        state = NodeState(kept.atPose3(C(node)), kept.atVector(B(node)), kept.atVector(V(node)))
-        self._smoother = _smoother()
-        t_s = self._times[node]
-        self._times, self._stamps = {node: t_s}, {node: _stamp(node)}
-        factors = gtsam.NonlinearFactorGraph()
+        state = NodeState(self._kept.atPose3(C(node)), self._kept.atVector(B(node)), self._kept.atVector(V(node)))
+        self._past.leave([n for n in self._times if n != node], self._kept)
+        self._past.begin(node)
+        self._renew()
+        self._times, self._stamps = {node: self._times[node]}, {node: _stamp(node)}
         wide = np.array([0.1, 0.1, 0.2, 50.0, 50.0, 20.0])
-        factors.add(gtsam.PriorFactorPose3(C(node), state.pose, gtsam.noiseModel.Diagonal.Sigmas(wide)))
-        slow = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.1, 0.1, 0.1, 5.0]))
-        factors.add(gtsam.PriorFactorVector(B(node), state.bias, slow))
-        speed = gtsam.noiseModel.Gaussian.Covariance(unknown_cov())
-        factors.add(gtsam.PriorFactorVector(V(node), state.velocity, speed))
-        values = gtsam.Values()
-        values.insert(C(node), state.pose)
-        values.insert(B(node), state.bias)
-        values.insert(V(node), state.velocity)
-        self._smoother.update(factors, values, {key(node): float(_stamp(node)) for key in (C, B, V)})
+        slow = np.array([0.1, 0.1, 0.1, 5.0])
+        factors = _priors(node, state, np.diag(wide**2), np.diag(slow**2), unknown_cov())
+        self._past.add(factors)
+        self._smoother.insert(node, factors, _values(node, state))
 
-    def _keep_window(self) -> None:
-        """The estimate of the window, among those of the whole flight."""
-        if not self._times:
-            return
-        estimate, kept = self._estimate(), self._past.values
-        for node in self._times:
-            kept.update(C(node), estimate.atPose3(C(node)))
-            kept.update(B(node), estimate.atVector(B(node)))
-            kept.update(V(node), estimate.atVector(V(node)))
+    def _renew(self) -> None:
+        self._smoother = FixedLag()
+        self._states.clear()
+        self._marginals.clear()
+
+    def _leave_all(self) -> None:
+        """The window becomes the past."""
+        if self._times:
+            self._past.leave(list(self._times), self._smoother.estimate())
+        self._past.begin(self._next)
+        self._times.clear()
+        self._stamps.clear()
+
+
+def _priors(
+    node: int, state: NodeState, cov: np.ndarray, bias_cov: np.ndarray, velocity_cov: np.ndarray
+) -> gtsam.NonlinearFactorGraph:
+    """``cov`` 6x6, tangent order; ``bias_cov`` 4x4; ``velocity_cov`` 8x8."""
+    gaussian = gtsam.noiseModel.Gaussian.Covariance
+    factors = gtsam.NonlinearFactorGraph()
+    factors.add(gtsam.PriorFactorPose3(C(node), state.pose, gaussian(cov)))
+    factors.add(gtsam.PriorFactorVector(B(node), state.bias, gaussian(bias_cov)))
+    factors.add(gtsam.PriorFactorVector(V(node), state.velocity, gaussian(velocity_cov)))
+    return factors
+
+
+def _values(node: int, state: NodeState) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(C(node), state.pose)
+    values.insert(B(node), state.bias)
+    values.insert(V(node), state.velocity)
+    return values
 
 
 def _stamp(node: int) -> int:
     """Nodes of one batch leave the window together."""
     return node - node % BATCH_NODES
-
-
-def _smoother() -> gtsam.IncrementalFixedLagSmoother:
-    params = gtsam.ISAM2Params()
-    params.setFactorization("QR")  # Cholesky gives up on long stretches without an absolute fix
-    thresholds = gtsam.ISAM2ThresholdMap()
-    for letter, limits in RELINEARIZE.items():
-        thresholds.insert((letter, limits))
-    params.setRelinearizeThreshold(thresholds)
-    params.relinearizeSkip = 1  # looked for at every update; the thresholds make it rare
-    return gtsam.IncrementalFixedLagSmoother(float(LAG_NODES), params)
 
 
 def _robust(cov: np.ndarray) -> gtsam.noiseModel.Robust:

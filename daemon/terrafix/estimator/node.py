@@ -7,8 +7,9 @@ import numpy as np
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
 from terrafix.core.node import NodeContext
 from terrafix.core.pose import tangent_to_world
-from terrafix.estimator.filter import Advance, Estimator, Placed
+from terrafix.estimator.filter import Estimator
 from terrafix.estimator.telemetry import Telemetry
+from terrafix.estimator.tracker import Advance, Placed
 from terrafix.messages import (
     CovarianceMode,
     Health,
@@ -39,6 +40,8 @@ class EstimatorNode:
         self._telemetry = Telemetry()
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
+        self._predicted: int | None = None  # frame of the newest Prediction ...
+        self._from_m = np.zeros(2)  # ... and where it was, with its map match
 
     @property
     def origin(self) -> Origin | None:
@@ -79,13 +82,18 @@ class EstimatorNode:
             return
         estimator.mode = self._mode
         attitude = self._telemetry.at(odometry.t_ns)
+        before = estimator.last
+        seen = before is not None and before.frame_id == self._predicted
+        if before is not None and seen:
+            self._from_m = np.array(before.pose.translation()[:2])
         advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, self._telemetry.felt)
         self._tracked = advance.verdict is Verdict.ACCEPTED
         yield MeasurementVerdict(
             t_ns=odometry.t_ns, frame_id=odometry.frame_id, measurement="odometry", verdict=advance.verdict
         )
         if odometry.verdict not in (Verdict.BAD_IMAGE, Verdict.STALLED):
-            yield self._prediction(odometry, advance, estimator)
+            yield self._prediction(odometry, advance, estimator, seen)
+            self._predicted = odometry.frame_id
         yield self._estimate(advance.placed, odometry.t_ns)
 
     def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
@@ -104,15 +112,19 @@ class EstimatorNode:
         )
         torn = result.verdict is Verdict.INNOVATION and estimator.rival.probability > 0.0
         if (torn or result.verdict in (Verdict.ACCEPTED, Verdict.LOST)) and estimator.last is not None:
-            self._tracked = self._tracked or result.verdict is Verdict.ACCEPTED
+            own = match.frame_id == estimator.last.frame_id  # an older frame's match does not see this one's motion
+            self._tracked = self._tracked or (own and result.verdict is Verdict.ACCEPTED)
             yield self._estimate(estimator.last, match.t_ns)
 
-    def _prediction(self, odometry: Odometry, advance: Advance, estimator: Estimator) -> Prediction:
+    def _prediction(self, odometry: Odometry, advance: Advance, estimator: Estimator, seen: bool) -> Prediction:
+        """``seen``: the frame before had a Prediction, too. After some that had none, what is known by now of the way
+        since the last one counts: odometry that begins again tells of the velocity in between."""
         placed = advance.placed
         r_w_c = placed.pose.rotation().matrix()
         p = placed.pose.translation()
         cov = tangent_to_world(placed.cov, r_w_c)
         step_var = advance.step_sigma_m**2
+        step = advance.step_m if seen or self._predicted is None else np.asarray(p[:2]) - self._from_m
         return Prediction(
             t_ns=odometry.t_ns,
             frame_id=odometry.frame_id,
@@ -121,7 +133,7 @@ class EstimatorNode:
             cov=tuple(float(v) for v in cov.ravel()),
             agl_m=float(p[2]) - estimator.terrain.below(p),
             agl_sigma_m=float(np.sqrt(cov[2, 2])),
-            step_m=(float(advance.step_m[0]), float(advance.step_m[1])),
+            step_m=(float(step[0]), float(step[1])),
             step_cov_m2=(step_var, 0.0, 0.0, step_var),
         )
 
@@ -132,12 +144,12 @@ class EstimatorNode:
         cov = tangent_to_world(placed.cov, placed.pose.rotation().matrix())
         # The map itself is off by a few metres, everywhere alike: no number of fixes averages that away.
         cov[:3, :3] += estimator.map_sigma_m**2 * np.eye(3)
-        cov[3:5, 3:5] += estimator.body_sigma_rad**2 * np.eye(2)
+        cov[3:5, 3:5] += estimator.camera.body_sigma_rad**2 * np.eye(2)
         cov = estimator.rival.added(estimator.doubt.added(cov))
         lat_deg, lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
         age_ms = -1
-        if estimator.last_fix_t_s is not None:
-            age_ms = max(0, round((placed.t_s - estimator.last_fix_t_s) * 1e3))
+        if estimator.last_fix_s is not None:
+            age_ms = max(0, round((placed.t_s - estimator.last_fix_s) * 1e3))
         label = SourceLabel.VISUAL_PROPAGATED if self._tracked else SourceLabel.DEAD_RECKONED
         if self._tracked and 0 <= age_ms <= ANCHORED_FOR_S * 1e3:
             label = SourceLabel.SATELLITE_ANCHORED
@@ -156,7 +168,7 @@ class EstimatorNode:
             source_label=label,
             covariance_mode=self._mode,
             last_anchor_age_ms=age_ms,
-            emitted_at_ns=t_ns,  # the live shell puts the time of saying here
+            emitted_at_ns=max(t_ns, round(placed.t_s * 1e9)),  # the live shell puts the time of saying here
         )
 
     def _refine(self, ended: SourceEnded) -> Iterable[Message]:

@@ -78,8 +78,7 @@ class Telemetry:
         inside = t_f[(t_f > t0_ns) & (t_f < t1_ns)]
         t = np.concatenate([[t0_ns], inside, [t1_ns]])
         f_b = np.column_stack([np.interp(t, t_f, f[:, i]) for i in range(3)])
-        yaw = np.interp(t, t_a, np.unwrap(angles[:, 0]))
-        pitch, roll = (np.interp(t, t_a, np.unwrap(angles[:, i])) for i in (1, 2))
+        yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in np.unwrap(angles, axis=0).T)
         accel = _in_world(f_b, yaw, pitch, roll)
         accel[:, 2] -= GRAVITY_MPS2
         # What the readings scatter from one to the next is vibration, whatever its frequency was.

@@ -8,9 +8,15 @@ from terrafix.messages import MapMatch
 # 1-sigma of the slope and of the level (share of the height) of the ground that is seen: fields and towns without a
 # DEM; what houses and trees leave with one.
 FLAT_SIGMAS, DEM_SIGMAS = (0.03, 0.02), (0.015, 0.01)
+# ... and at any height: what a DEM misses from one place to the next (Copernicus DEM handbook: 2 m, 90 %, relative).
+LEVEL_M = 1.2
 RELIEF_SLOPE = 2.0  # a plane that misses the ground by this share of the height misses its slope by so much more
 # ... and one hill is seen by some fifteen keyframes in a row, each with the same mistake: root of that many.
 RELIEF_REPEATS = 4.0
+# 1-sigma by which ground that no DEM tells rises, for the root of a metre of way: relief is close to a random walk.
+# Gentle country, 3 m over 100 m; the mountains of an SRTM tile have ten times as much.
+UNKNOWN_RISE = 0.3
+SLOPE_REACH_M = 150.0  # from where a plane was fitted: farther away it says nothing
 
 
 class Terrain:
@@ -31,16 +37,27 @@ class Terrain:
             self._at_m = at_m[:2]
 
     def below(self, p_m: np.ndarray) -> float:
-        """AMSL of the ground under (east, north, ...)."""
-        slope = np.array(self._slope or (0.0, 0.0))
-        return self.ground_m + float(slope @ (p_m[:2] - self._at_m))
+        """AMSL of the ground under (east, north, ...). A slope is that of one footprint: hills end."""
+        slope, away_m = np.array(self._slope or (0.0, 0.0)), p_m[:2] - self._at_m
+        reach_m = float(np.hypot(*away_m))
+        return self.ground_m + float(slope @ away_m) * min(1.0, SLOPE_REACH_M / max(reach_m, 1.0))
 
-    def seen_from(self, height_m: float, height_sigma_m: float, share: float) -> Ground:
-        """The plane that odometry measures against. ``share`` of its matches agreed."""
+    def rise_sigma_m(self, way_m: float) -> float:
+        """By which the ground may have risen or fallen over a way, without anybody telling."""
+        return 0.0 if self._slope is not None else UNKNOWN_RISE * float(np.sqrt(way_m))
+
+    def slope_sigma(self, height_m: float) -> float:
+        """Of the ground that a frame shows from this height, where nobody tells it."""
+        return self.rise_sigma_m(height_m) / height_m
+
+    def seen_from(self, p_m: np.ndarray, height_m: float, height_sigma_m: float, share: float) -> Ground:
+        """The plane for odometry seen at ``p_m`` (east, north, ...), of whose matches this ``share`` agreed."""
         slope_e, slope_n = self._slope or (0.0, 0.0)
         slope_sigma, level_share = FLAT_SIGMAS if self._slope is None else DEM_SIGMAS
         # Over hills the tracked points lie off the plane, all on one side for a while.
         relief_share = RELIEF_REPEATS * self._relief_m / height_m
         slope_sigma = float(np.hypot(slope_sigma, RELIEF_SLOPE * relief_share))
-        level_share = float(np.hypot(level_share, relief_share))
+        untold_m = 0.0 if self._slope is None else max(0.0, float(np.hypot(*(p_m[:2] - self._at_m))) - SLOPE_REACH_M)
+        level_m = np.hypot(LEVEL_M, UNKNOWN_RISE * np.sqrt(untold_m))
+        level_share = float(np.sqrt(level_share**2 + relief_share**2 + (level_m / height_m) ** 2))
         return Ground(height_m, height_sigma_m, slope_e, slope_n, slope_sigma, level_share, share)

@@ -1,10 +1,12 @@
 """How velocity and position follow from one node to the next: by what the IMU felt, or by what drones do.
 
 One model for both, with the state (position, velocity, acceleration that nobody measured). Without an IMU the last is
-the whole acceleration; with an IMU it is what is wrong with the measured one: its bias and, mostly, gravity that a
-wrong tilt lets in (one degree: 0.17 m/s^2). It is a first-order Gauss-Markov process (Singer 1970, "Estimating optimal
-tracking filter performance for manned maneuvering targets") in the axes of the heading, where the pull of a turn and
-the error of a tilt stay what they are while the vehicle turns."""
+the whole acceleration; with an IMU it is what is wrong with the measured one, mostly gravity that a wrong tilt lets in
+(one degree: 0.17 m/s^2). It is a first-order Gauss-Markov process (Singer 1970, "Estimating optimal tracking filter
+performance for manned maneuvering targets") in the axes of the heading, where the pull of a turn and the error of a
+tilt stay what they are while the vehicle turns. A second one, for the IMU alone, hardly changes in a flight: the bias
+of the accelerometers, and a board that is not level in the frame. Fixes teach it, and a flight on dead reckoning then
+drifts by what wanders only; while it is not known its error grows with the square of the time."""
 
 from dataclasses import dataclass, replace
 
@@ -12,7 +14,9 @@ import numpy as np
 
 from terrafix.core.geodesy import local_rotation_up
 
-V_SIZE = 6  # of the variable V_k: velocity in the world [m/s], unmeasured acceleration in axes of the heading [m/s^2]
+# Of the variable V_k: velocity in the world [m/s]; in axes of the heading the acceleration that nobody measured (right,
+# ahead, up) [m/s^2], and what of that is steady (right, ahead) [m/s^2].
+V_SIZE = 8
 MAX_SPEED_SIGMA_MPS = np.array([15.0, 15.0, 3.0])  # of a velocity of which nothing is known, in the air
 GRAVITY_MPS2 = 9.81
 # Without IMU: what a small drone does in cruise, more for a fast one, for about as long as a manoeuvre takes. The
@@ -23,10 +27,13 @@ MANOEUVRE_S = 3.0
 LAUNCH_MPS2 = np.array([6.0, 6.0, 5.0])
 LEAST_SPEED_MPS = 5.0  # one that hovers may have begun to fly
 TYPICAL_SPEED_MPS = 10.0  # of one that has not been seen to fly: for how it manoeuvres
-# With IMU: bias and scale of small accelerometers after calibration, 5 mg and 0.3 % (InvenSense DS-000347), beside the
-# tilt of the autopilot's attitude; how long an attitude filter stays wrong in one direction.
-ACCELEROMETER_MPS2 = 0.07
+# With IMU: half the variance of the autopilot's attitude wanders, and so long an attitude filter stays wrong in one
+# direction. The other half is a board that is not level. Bias and scale of small accelerometers after calibration are
+# 5 mg and 0.3 % (InvenSense DS-000347); with half a degree of the board they make the steady error.
+WANDERING_SHARE = 0.5
 TILT_S = 15.0
+ACCELEROMETER_MPS2 = 0.07
+STEADY_MPS2, STEADY_S = 0.11, 600.0
 NOISE_FLOOR_MPS2 = 0.03  # per root hertz: interpolated attitude, readings that are not taken at one time
 UNFELT_MPS2 = 2.0  # by how much acceleration changes within a tenth of a second
 FOREVER_S = 1e6
@@ -58,7 +65,8 @@ class Felt:
 class Leg:
     """p1 = p0 + reach_s v0 + way_m + way_by_accel a0;  v1 = keep v0 + gain_mps + gain_by_accel a0;  a1 = lasting a0.
 
-    ``cov`` (9, 9) of what that leaves out: position, velocity (both world axes), acceleration (heading's axes).
+    a0 (5,) are both accelerations of V. ``cov`` (11, 11) of what that leaves out: position, velocity (both world axes),
+    accelerations (heading's axes).
     ``inertial``: way and gain were measured, and turn with the heading bias."""
 
     reach_s: float
@@ -67,24 +75,31 @@ class Leg:
     gain_mps: np.ndarray
     way_by_accel: np.ndarray
     gain_by_accel: np.ndarray
-    lasting: float
+    lasting: np.ndarray
     cov: np.ndarray
     inertial: bool
 
     def predicted(self, p_m: np.ndarray, v: np.ndarray, heading_bias_rad: float) -> tuple[np.ndarray, np.ndarray]:
-        """-> position (3,) and V (6,) at the end, from those at the beginning."""
+        """-> position (3,) and V at the end, from those at the beginning."""
         turn = local_rotation_up(heading_bias_rad if self.inertial else 0.0)
         p1 = p_m + self.reach_s * v[:3] + turn @ self.way_m + self.way_by_accel @ v[3:]
         v1 = self.keep * v[:3] + turn @ self.gain_mps + self.gain_by_accel @ v[3:]
         return p1, np.concatenate([v1, self.lasting * v[3:]])
 
     def by_before(self) -> np.ndarray:
-        """(9, 6): of position, velocity and acceleration at the end by V at the beginning."""
-        by = np.zeros((9, 6))
+        """(11, 8): of position and V at the end by V at the beginning."""
+        by = np.zeros((3 + V_SIZE, V_SIZE))
         by[:3, :3], by[:3, 3:] = self.reach_s * np.eye(3), self.way_by_accel
         by[3:6, :3], by[3:6, 3:] = self.keep * np.eye(3), self.gain_by_accel
-        by[6:, 3:] = self.lasting * np.eye(3)
+        by[6:, 3:] = np.diag(self.lasting)
         return by
+
+    def without_a_say(self, speed_mps: float, dt_s: float) -> "Leg":
+        """The same for a vehicle that may have flown with any speed up to this."""
+        cov = self.cov.copy()
+        cov[:3, :3] += (speed_mps * dt_s) ** 2 * np.eye(3)
+        cov[3:6, 3:6] += speed_mps**2 * np.eye(3)
+        return replace(self, cov=cov)
 
 
 def unmeasured_sigma(felt: bool, speed_mps: float, tilt_sigma_rad: float, launching: bool = False) -> np.ndarray:
@@ -94,7 +109,7 @@ def unmeasured_sigma(felt: bool, speed_mps: float, tilt_sigma_rad: float, launch
     if not felt:
         level = max(MANOEUVRE_MPS2, MANOEUVRE_PER_SPEED * speed_mps)
         return np.array([level, level, CLIMB_MPS2])
-    level = float(np.hypot(GRAVITY_MPS2 * tilt_sigma_rad, ACCELEROMETER_MPS2))
+    level = GRAVITY_MPS2 * tilt_sigma_rad * float(np.sqrt(WANDERING_SHARE))
     return np.array([level, level, ACCELEROMETER_MPS2])
 
 
@@ -140,14 +155,15 @@ def leg(
     cov = _left_out(dt_s, memory_s, course_s, sigma, noise, float(yaw[-1]), speed_mps)
     if felt is not None:
         cov[3:6, 3:6] += (UNFELT_MPS2 * felt.unfelt_s) ** 2 * np.eye(3)
+    steady = float(felt is not None)  # an error of the IMU: it moves nobody who is not led by one
     result = Leg(
         reach_s=float(_reach(np.array(dt_s), course_s)),
         keep=float(np.exp(-dt_s / course_s)),
         way_m=to_way @ accel,
         gain_mps=to_gain @ accel,
-        way_by_accel=_turned(to_way * lasts, yaw),
-        gain_by_accel=_turned(to_gain * lasts, yaw),
-        lasting=float(np.exp(-dt_s / memory_s)),
+        way_by_accel=np.hstack([_turned(to_way * lasts, yaw), steady * _turned(to_way, yaw)[:, :2]]),
+        gain_by_accel=np.hstack([_turned(to_gain * lasts, yaw), steady * _turned(to_gain, yaw)[:, :2]]),
+        lasting=np.exp(-dt_s / np.array([memory_s] * 3 + [STEADY_S] * 2)),
         cov=cov,
         inertial=felt is not None,
     )
@@ -155,13 +171,13 @@ def leg(
 
 
 def unknown_cov() -> np.ndarray:
-    """(6, 6) of V of a vehicle in the air of whose motion nothing is known."""
-    return np.diag([*MAX_SPEED_SIGMA_MPS, *unmeasured_sigma(False, 0.0, 0.0)]) ** 2
+    """(8, 8) of V of a vehicle in the air of whose motion nothing is known."""
+    return np.diag([*MAX_SPEED_SIGMA_MPS, *unmeasured_sigma(False, 0.0, 0.0), STEADY_MPS2, STEADY_MPS2]) ** 2
 
 
 def standing_cov() -> np.ndarray:
-    """(6, 6) of V of a vehicle whose motors may not turn."""
-    return STANDING_MPS**2 * np.eye(V_SIZE)
+    """(8, 8) of V of a vehicle whose motors may not turn."""
+    return np.diag([STANDING_MPS] * 6 + [STEADY_MPS2] * 2) ** 2
 
 
 def wandered_m(dt_s: float) -> float:
@@ -171,15 +187,17 @@ def wandered_m(dt_s: float) -> float:
 
 
 def spread_after(way: Leg | None, velocity_cov: np.ndarray) -> np.ndarray:
-    """Covariance (9, 9) of the step, and of V at its end, from that of V before it; ``way`` None: it stands."""
+    """Covariance (11, 11) of the step, and of V at its end, from that of V before it; ``way`` None: it stands."""
     if way is None:
-        return np.diag([STANDING_M] * 3 + [STANDING_MPS] * V_SIZE) ** 2
+        cov = np.zeros((3 + V_SIZE, 3 + V_SIZE))
+        cov[:3, :3], cov[3:, 3:] = STANDING_M**2 * np.eye(3), standing_cov()
+        return cov
     by_before = way.by_before()
     return np.asarray(by_before @ velocity_cov @ by_before.T + way.cov)
 
 
 def believed(way: Leg, off_m: np.ndarray, spread: np.ndarray, seen: np.ndarray) -> tuple[Leg, np.ndarray]:
-    """The leg as far as odometry bears it out, and the covariance (9, 9) that both together leave.
+    """The leg as far as odometry bears it out, and the covariance (11, 11) that both together leave.
 
     Odometry ended ``off_m`` (3,) from where the leg led; ``spread`` is the leg's, ``seen`` (3, 3) that of odometry."""
     d2 = float(off_m @ np.linalg.solve(spread[:3, :3] + seen, off_m))
@@ -191,18 +209,14 @@ def believed(way: Leg, off_m: np.ndarray, spread: np.ndarray, seen: np.ndarray) 
 
 
 def _without_memory(known: Leg, sigma: np.ndarray) -> Leg:
-    by_accel = known.by_before()[:, 3:]
-    zero = np.zeros((3, 3))
-    return Leg(
-        known.reach_s,
-        known.keep,
-        known.way_m,
-        known.gain_mps,
-        zero,
-        zero,
-        0.0,
-        known.cov + by_accel @ np.diag(sigma**2) @ by_accel.T,
-        known.inertial,
+    by_accel = known.by_before()[:, 3:6]
+    steady = np.array([0.0, 0.0, 0.0, 1.0, 1.0])
+    return replace(
+        known,
+        way_by_accel=known.way_by_accel * steady,
+        gain_by_accel=known.gain_by_accel * steady,
+        lasting=known.lasting * steady,
+        cov=known.cov + by_accel @ np.diag(sigma**2) @ by_accel.T,
     )
 
 
@@ -225,7 +239,7 @@ def _left_out(
     yaw_end_rad: float,
     speed_mps: float,
 ) -> np.ndarray:
-    """Covariance of a leg (9, 9), by quadrature over the moments at which the noise enters."""
+    """Covariance of a leg (11, 11), by quadrature over the moments at which the noise enters."""
     panels = int(np.ceil(dt_s / (2.0 * memory_s)))
     half_s = 0.5 * dt_s / panels
     t = (half_s * (_NODES + 1.0) + 2.0 * half_s * np.arange(panels)[:, None]).ravel()
@@ -240,8 +254,11 @@ def _left_out(
     )
     push = np.array([_reach(t, course_s), np.exp(-t / course_s), np.zeros(len(t))])  # ... after one of the velocity
     by_kick, by_push = (kick * w) @ kick.T * (2.0 / memory_s), (push * w) @ push.T
-    cov = np.kron(by_kick, np.diag(sigma**2)) + np.kron(by_push, noise_mps2**2 * np.eye(3))
-    cov[:3, :3] += (0.02**2 + (CLOCK_JITTER_S * speed_mps) ** 2) * np.eye(3)
+    wandering = np.kron(by_kick, np.diag(sigma**2)) + np.kron(by_push, noise_mps2**2 * np.eye(3))
+    wandering[:3, :3] += (0.02**2 + (CLOCK_JITTER_S * speed_mps) ** 2) * np.eye(3)
     to_heading = np.eye(9)
     to_heading[6:, 6:] = local_rotation_up(-yaw_end_rad).T
-    return np.asarray(to_heading @ cov @ to_heading.T)
+    cov = np.zeros((3 + V_SIZE, 3 + V_SIZE))
+    cov[:9, :9] = to_heading @ wandering @ to_heading.T
+    cov[9:, 9:] = -(STEADY_MPS2**2) * np.expm1(-2.0 * dt_s / STEADY_S) * np.eye(2)
+    return cov

@@ -18,12 +18,21 @@ REOPEN_NS = 1_000_000_000
 class Connection:
     """Never waits, and never raises for what the wire does."""
 
-    def __init__(self, config: LinkSection, transport: Transport, wall_clock_ns: Callable[[], int]) -> None:
-        """Raises ConfigError: the signing key."""
+    def __init__(
+        self,
+        config: LinkSection,
+        transport: Transport | None,
+        wall_clock_ns: Callable[[], int],
+        *,
+        link_id: int = 0,
+    ) -> None:
+        """``transport`` None: it is opened when it can be. ``link_id``: of the signatures, one for each connection.
+
+        Raises ConfigError: the signing key."""
         self._config = config
-        self._transport: Transport | None = transport
+        self._transport = transport
         self._wall_clock_ns = wall_clock_ns
-        self._signing = Signing(read_key(Path(config.signing_key))) if config.signing_key else None
+        self._signing = Signing(read_key(Path(config.signing_key)), link_id) if config.signing_key else None
         self._mav = mavlink.MAVLink(None, srcSystem=config.sysid, srcComponent=config.compid)  # packs what is sent
         self._framer = Framer()
         self._try_ns = 0
@@ -64,12 +73,13 @@ class Connection:
                 if self._signing is None or self._signing.accepts(message, self._wall_clock_ns()):
                     yield message
 
-    def send(self, message: Any) -> None:
-        """Packs, signs and sends now, or not at all."""
+    def send(self, message: Any, sender: mavlink.MAVLink | None = None) -> None:
+        """Packs, signs and sends now, or not at all. ``sender``: somebody else than we (system and component)."""
+        mav = sender or self._mav
         if self._signing is not None:
-            self._signing.prepare(self._mav, self._wall_clock_ns())
-        packet = bytes(message.pack(self._mav))
-        self._mav.seq = (self._mav.seq + 1) % 256
+            self._signing.prepare(mav, self._wall_clock_ns())
+        packet = bytes(message.pack(mav))
+        mav.seq = (mav.seq + 1) % 256
         if self._transport is None:
             self.dropped += 1
             return
@@ -77,7 +87,7 @@ class Connection:
             if self._transport.write(packet):
                 self.sent += 1
                 self.sent_bytes += len(packet)
-            else:
+            elif self.heard_bytes:  # before anybody was heard there may be nobody to send to
                 self.dropped += 1
         except OSError as error:
             self.dropped += 1

@@ -32,6 +32,16 @@ class Heard:
         }
 
 
+def heard_on_ground(autopilots: dict[str, list[int]]) -> str:
+    """``autopilots``: devices of ground links with the system ids that are heard there; empty when there is none."""
+    for device, sysids in autopilots.items():
+        return (
+            f"the autopilot (system {sysids[0]}) is heard on {device}, which is in link.ground_devices; "
+            "the one that leads to it belongs into link.device"
+        )
+    return ""
+
+
 def why_no_autopilot(heard: Heard, device: str, baud: int, wanted_sysid: int) -> str:
     """Why there is no autopilot to talk to, and what to do; empty when there is one (or the one that is wanted)."""
     serial = device.startswith("/")
@@ -53,7 +63,7 @@ def why_no_autopilot(heard: Heard, device: str, baud: int, wanted_sysid: int) ->
         others = ", ".join(f"system {s} component {c}" for s, c in sorted(heard.heartbeats))
         return f"no autopilot on {device}, only {others}; is this the autopilot's link, and is it forwarded?"
     if heard.bytes >= FEW_BYTES and not heard.packets:
-        what = f"wrong speed? link.baud is {baud}, compare SERIALn_BAUD; and " if serial else ""
+        what = f"link.baud is {baud}: is that the speed of SERIALn_BAUD? And " if serial else ""
         return f"bytes but no MAVLink on {device}; {what}{SERIAL_PROTOCOL}"
     if heard.packets:
         return f"MAVLink but no heartbeat on {device}; is the autopilot still starting?"

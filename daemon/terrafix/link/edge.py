@@ -10,18 +10,30 @@ from terrafix.core.config import LinkSection
 from terrafix.link import gps_time
 from terrafix.link.budget import LineBudget
 from terrafix.link.connection import Connection
-from terrafix.link.diagnosis import Heard, why_no_autopilot
+from terrafix.link.diagnosis import Heard
+from terrafix.link.ground_links import GroundLinks
+from terrafix.link.hints import Hints
 from terrafix.link.local_pose import Place
 from terrafix.link.named_values import NamedValues
 from terrafix.link.outputs import Outputs
 from terrafix.link.partner import Partner
 from terrafix.link.side_output import open_side_outputs
 from terrafix.link.source_switch import SourceSwitch
+from terrafix.link.status import Status, StatusLog
 from terrafix.link.streams import STREAMS_HZ, Streams
 from terrafix.link.telemetry import AUTOPILOT_COMPONENT
 from terrafix.link.timesync import TimeSync
 from terrafix.link.transport import Transport, open_at_start
-from terrafix.messages import GpsInput, LinkStatus, Message, Origin, PositionSource, StatusText, WallClock
+from terrafix.messages import (
+    GpsInput,
+    LinkStatus,
+    Message,
+    Origin,
+    PositionHint,
+    PositionSource,
+    StatusText,
+    WallClock,
+)
 
 NS_PER_S = 1_000_000_000
 HEARTBEAT_NS = NS_PER_S
@@ -34,14 +46,24 @@ TIMESYNC_FAST_COUNT = 10
 
 def open_edge(config: LinkSection) -> "MavlinkEdge":
     """Opens the device of the configuration. Raises LinkError with what to check, ConfigError for a signing key."""
-    return MavlinkEdge(config, open_at_start(config.device, config.baud), time.time_ns)
+    transport = open_at_start(config.device, config.baud)
+    return MavlinkEdge(config, transport, time.time_ns, tell=StatusLog().tell)
 
 
 class MavlinkEdge:
     """Polled by the live shell; see core/node.py. Never waits, and in flight never raises for what the wire does."""
 
-    def __init__(self, config: LinkSection, transport: Transport, wall_clock_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        config: LinkSection,
+        transport: Transport,
+        wall_clock_ns: Callable[[], int],
+        *,
+        tell: Callable[[LinkStatus], None] = lambda _: None,
+    ) -> None:
+        """``tell`` gets every LinkStatus, for the log."""
         self._config = config
+        self._tell = tell
         self._wall_clock_ns = wall_clock_ns
         self._connection = Connection(config, transport, wall_clock_ns)
         self._timesync = TimeSync()
@@ -51,10 +73,25 @@ class MavlinkEdge:
         self._streams = Streams(self._budget.fitting(STREAMS_HZ))
         self._outputs = Outputs(config.outputs, config.gps_id)
         self._side_outputs = open_side_outputs(config)
+        self._hints = Hints(config.sysid, config.compid)
+        self._ground = GroundLinks(config, wall_clock_ns, self._hints)
         self._switch = SourceSwitch(config.gps_id)
         self._named_values = NamedValues()
         self._start: Place | None = None  # of the flight
         self._heard = Heard()
+        self.status = Status(
+            config=config,
+            wire=self._connection,
+            partner=self._partner,
+            timesync=self._timesync,
+            streams=self._streams,
+            budget=self._budget,
+            outputs=self._outputs,
+            side_outputs=self._side_outputs,
+            switch=self._switch,
+            ground=self._ground,
+            heard=self._heard,
+        )
         self._due_ns: dict[str, int] = {}
         self._answers = 0
         self._opened = 0  # connections that the streams were asked on, besides the first
@@ -63,9 +100,10 @@ class MavlinkEdge:
         said: list[Message] = []
         for message in self._connection.messages(now_ns):
             said += self._take(message, now_ns)
+        said += self._ground.poll(now_ns, self._partner.sysid)
         if self._connection.reopened != self._opened:  # a new connection: everything is asked for again
             self._opened = self._connection.reopened
-            self._streams = Streams(self._streams.wanted_hz)
+            self._streams.restart()
         if self._due("heartbeat", HEARTBEAT_NS, now_ns):
             self._heartbeat()
         fast = self._answers < TIMESYNC_FAST_COUNT
@@ -77,7 +115,9 @@ class MavlinkEdge:
         if self._due("wall clock", WALL_CLOCK_NS, now_ns):
             said.append(self._wall_clock(now_ns))
         if self._due("status", STATUS_NS, now_ns):
-            said.append(self.status(now_ns))
+            status = self.status.at(now_ns)
+            self._tell(status)
+            said.append(status)
         return said
 
     def heard(self, message: Message) -> None:
@@ -90,12 +130,12 @@ class MavlinkEdge:
             case PositionSource():
                 self._switch.order(message, self._outputs.names(self._partner.firmware))
             case StatusText():
-                self._send(
-                    mavlink.MAVLink_statustext_message(message.severity, message.text.encode("ascii", "replace"))
-                )
+                text = message.text.encode("ascii", "replace")
+                self._say_to_people(mavlink.MAVLink_statustext_message(message.severity, text))
 
     def close(self) -> None:
         self._connection.close()
+        self._ground.close()
         for output in self._side_outputs:
             output.close()
 
@@ -109,11 +149,19 @@ class MavlinkEdge:
 
     def _take(self, message: Any, now_ns: int) -> Iterator[Message]:
         self._heard.packets += 1
+        if self._config.view_sysid and message.get_srcSystem() == self._config.view_sysid:
+            self.status.heard_view = True
+            return  # our own view, by way of some router: not an autopilot
         self._heard.take(message)
         kind = message.get_type()
         if kind == "TIMESYNC":
             self._take_timesync(message, now_ns)
             return
+        for said in self._hints.take(message, now_ns, {self._partner.sysid} - {0}):
+            if isinstance(said, PositionHint):
+                yield said
+            else:
+                self._send(said)
         yield from self._partner.take(message, now_ns, self._our_receiver())
         if not self._partner.is_it(message):
             return
@@ -138,15 +186,23 @@ class MavlinkEdge:
     def _send(self, message: Any) -> None:
         self._connection.send(message)
 
+    def _say_to_people(self, message: Any) -> None:
+        """The autopilot hands it on to its ground stations; ours have their own links."""
+        self._send(message)
+        self._ground.say(message)
+
     def _send_position(self, gps: GpsInput) -> None:
         """First of all to the autopilot: nothing may delay it."""
         for packet in self._outputs.messages(gps, self._partner.now(gps.t_ns)):
             self._send(packet)
         for output in self._side_outputs:
             output.send(gps, gps.t_ns)
-        if self._partner.telemetry.connected(gps.t_ns):
-            for value in self._named_values.messages(gps):
+        connected = self._partner.telemetry.connected(gps.t_ns)
+        for value in self._named_values.messages(gps) if connected or len(self._ground) else ():
+            if connected:
                 self._send(value)
+            self._ground.say(value)
+        self._ground.position(gps)
 
     def _requests(self, now_ns: int) -> Iterator[Any]:
         sysid = self._partner.sysid
@@ -155,7 +211,8 @@ class MavlinkEdge:
         yield from self._switch.requests(sysid, now_ns)
 
     def _heartbeat(self) -> None:
-        self._send(
+        self._ground.heartbeat(self._partner.telemetry.vehicle_type)
+        self._say_to_people(
             mavlink.MAVLink_heartbeat_message(
                 type=mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
                 autopilot=mavlink.MAV_AUTOPILOT_INVALID,
@@ -178,48 +235,3 @@ class MavlinkEdge:
                 return WallClock(t_ns=now_ns, unix_ns=unix_ns, source=source)
         self._due_ns["wall clock"] = now_ns + STATUS_NS  # the autopilot may know soon
         return WallClock(t_ns=now_ns, unix_ns=None, source="none")
-
-    def status(self, now_ns: int) -> LinkStatus:
-        connected = self._partner.telemetry.connected(now_ns)
-        offset_ns = self._timesync.offset_at(now_ns) if connected else None
-        wire = self._connection
-        load = self._budget.load(now_ns, wire.heard_bytes, wire.sent_bytes)
-        return LinkStatus(
-            t_ns=now_ns,
-            connected=connected,
-            autopilot=self._partner.firmware if connected else "none",
-            sysid=self._partner.sysid if connected else 0,
-            sent=wire.sent,
-            received=self._heard.packets,
-            bad=wire.skipped_bytes,
-            refused=wire.refused,
-            time_offset_ms=None if offset_ns is None else offset_ns / 1e6,
-            detail="; ".join(note for note in (*self._notes(connected), load) if note),
-        )
-
-    def _notes(self, connected: bool) -> Iterator[str]:
-        wire, outputs = self._connection, self._outputs.names(self._partner.firmware)
-        yield wire.down
-        if not connected and not wire.down:
-            yield self._why_no_autopilot()
-        if self._partner.firmware == "px4" and "gps_input" in outputs:
-            yield "PX4 does not take GPS_INPUT; empty link.outputs"
-        yield from (self._outputs.waits_for, self._switch.problem, *(o.problem for o in self._side_outputs))
-        others = [str(sysid) for sysid in self._heard.autopilots() if sysid != self._partner.sysid]
-        if connected and others and not self._config.autopilot_sysid:
-            yield (
-                f"more than one autopilot: {self._partner.sysid} is served, {', '.join(others)} is not; "
-                "name yours in link.autopilot_sysid"
-            )
-        if connected:
-            yield self._streams.problem()
-        yield self._budget.too_slow(self._streams.wanted_hz, outputs, self._config.rate_hz)
-        yield f"{wire.refused} unsigned or wrongly signed packets ignored" if wire.refused else ""
-        yield f"{wire.dropped} not sent" if wire.dropped else ""
-        yield f"opened again {wire.reopened} times" if wire.reopened else ""
-        yield f"autopilot clock restarted {self._timesync.resets} times" if self._timesync.resets else ""
-
-    def _why_no_autopilot(self) -> str:
-        self._heard.bytes, self._heard.refused = self._connection.heard_bytes, self._connection.refused
-        why = why_no_autopilot(self._heard, self._config.device, self._config.baud, self._config.autopilot_sysid)
-        return why or f"no heartbeat of the autopilot on {self._config.device} any more"

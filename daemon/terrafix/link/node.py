@@ -4,21 +4,26 @@ from collections.abc import Iterable, Iterator
 
 from terrafix.core.config import GnssMode
 from terrafix.core.node import Edge, NodeContext
-from terrafix.link import fix, gps_time
+from terrafix.link import fix, gps_time, record
 from terrafix.link.announce import Announcer
-from terrafix.link.carry import Attitudes, Carried, carry
+from terrafix.link.asking import Asking
+from terrafix.link.carry import Attitudes, carry
+from terrafix.link.filter_watch import FilterWatch
 from terrafix.link.gate import EstimateGate
 from terrafix.link.gnss_watch import GnssWatch
 from terrafix.link.pacer import Pacer
 from terrafix.messages import (
+    FilterStatus,
     GnssReading,
     GpsInput,
     Health,
+    HintVerdict,
     MeasurementVerdict,
     Message,
     NavEstimate,
     Origin,
     ProcessEvent,
+    SearchState,
     StatusText,
     ThermalBand,
     VehicleState,
@@ -27,11 +32,6 @@ from terrafix.messages import (
 )
 
 TICK_HZ = 50.0  # as in the process table
-# Low on purpose: 6 passes every check of the autopilot (5 inflates its noise and fails alignment), and a real
-# receiver with a 3D fix is never outranked by number of satellites where the autopilot chooses (GPS_AUTO_SWITCH 1).
-SATELLITES = 6
-DOP_GOOD = 1.0  # copters ask for <= 1.4 (GPS_HDOP_GOOD); a position from a map has no geometry of satellites to report
-DOP_UNKNOWN = 99.99
 CLOCK_STEP_NS = 500_000_000  # a wall clock that moves less stays latched: the week keeps the monotonic clock's rhythm
 
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
@@ -42,10 +42,13 @@ def make_node(ctx: NodeContext) -> "LinkNode":
 
 
 def make_edge(ctx: NodeContext) -> Edge:
-    """Raises LinkError when the device cannot be opened."""
+    """For a process of its own. Raises LinkError when the device cannot be opened, ConfigError."""
     from terrafix.link.edge import open_edge  # replay has no edge and need not load MAVLink
+    from terrafix.link.priority import first_in_line
 
-    return open_edge(ctx.config.link)
+    edge = open_edge(ctx.config.link)
+    first_in_line()
+    return edge
 
 
 class LinkNode:
@@ -57,6 +60,9 @@ class LinkNode:
         self._fix = fix.FixGate()
         self._attitudes = Attitudes()
         self._gnss = GnssWatch(gnss)
+        self._asking = Asking()
+        self._filter = FilterWatch()
+        self._armed: bool | None = None
         self._now_ns = 0
         self._ground_amsl_m: float | None = None
         self._unix_minus_monotonic_ns: int | None = None
@@ -79,6 +85,7 @@ class LinkNode:
             case VehicleState():
                 self._attitudes.add(message)
                 self._gnss.vehicle(message)
+                self._armed = message.armed
             case GnssReading():
                 return list(self._gnss.reading(message, self._attitudes))
             case Origin():
@@ -89,6 +96,12 @@ class LinkNode:
                 return self._on_estimator_event(message)
             case Health():
                 return self._on_health(message)
+            case FilterStatus():
+                self._filter.status(message)
+            case SearchState():
+                self._asking.step = message.step
+            case HintVerdict():
+                return [self._on_hint(message)]
         return []
 
     def tick(self, now_ns: int) -> Iterable[Message]:
@@ -100,6 +113,7 @@ class LinkNode:
         verdict, detail = self._gate.consider(estimate, now_ns, self._attitudes, self._ground_amsl_m)
         if verdict is Verdict.ACCEPTED or (self._gate.holding and detail == self._gate.holding):
             self._heard_ns = max(self._heard_ns or 0, estimate.t_ns)
+            self._asking.estimate(estimate)
         if verdict is Verdict.ACCEPTED:
             self._gnss.accepted(estimate, self._attitudes)
             age_ms = estimate.last_anchor_age_ms
@@ -135,8 +149,15 @@ class LinkNode:
         degrees = "" if health.temperature_c is None else f", {health.temperature_c:.0f} C"
         return [_text(health.t_ns, severity, f"computer is {health.band}{degrees}")]
 
+    def _on_hint(self, hint: HintVerdict) -> StatusText:
+        if hint.verdict is Verdict.ACCEPTED:
+            self._asking.hinted(hint.t_ns)
+        return _text(hint.t_ns, INFO if hint.verdict is Verdict.ACCEPTED else WARNING, hint.text)
+
     def _send(self, now_ns: int) -> Iterator[Message]:
         yield from self._climb_ladder(now_ns)
+        if self._armed is not False and (question := self._asking.due(now_ns)):  # on the ground nobody is lost
+            yield _text(now_ns, WARNING, question)
         silent = self._heard_ns is not None and now_ns - self._heard_ns > fix.SILENT_AFTER_NS
         if silent != self._silent:
             self._silent = silent
@@ -148,8 +169,10 @@ class LinkNode:
             return
         gps = self._gps_input(now_ns)
         yield gps
-        yield from self._gnss.tick(now_ns, good=gps.fix_type >= fix.FIX_3D)
         good = self._no_fix_because is None
+        yield from self._gnss.tick(now_ns, good=good)
+        for uses, text in self._filter.look(now_ns, good=good):
+            yield _text(now_ns, INFO if uses else WARNING, text)
         if self._said_fix.due(good, now_ns):
             because = self._no_fix_because
             yield (
@@ -191,61 +214,13 @@ class LinkNode:
         if why is not None:
             return self._no_fix(now_ns, why, carried.age_s * 1e3)
         self._no_fix_because = None
-        return self._with_fix(carried, (horizontal_m, vertical_m, speed_mps))
-
-    def _with_fix(self, carried: Carried, accuracy: tuple[float, float, float]) -> GpsInput:
-        week, week_ms = self._week(carried.t_ns)
-        ve, vn, vu = carried.velocity_enu_mps
-        return GpsInput(
-            t_ns=carried.t_ns,
-            fix_type=fix.FIX_3D,
-            time_week=week,
-            time_week_ms=week_ms,
-            lat_deg=carried.lat_deg,
-            lon_deg=carried.lon_deg,
-            alt_amsl_m=carried.alt_amsl_m,
-            hdop=DOP_GOOD,
-            vdop=DOP_GOOD,
-            vn_mps=vn,
-            ve_mps=ve,
-            vd_mps=-vu,
-            speed_accuracy_mps=accuracy[2],
-            horiz_accuracy_m=fix.bounded(accuracy[0]),
-            vert_accuracy_m=fix.bounded(accuracy[1]),
-            satellites_visible=SATELLITES,
-            estimate_age_ms=carried.age_s * 1e3,
-            caution=self._rung,
-            unanchored_s=self._unanchored_s(carried.t_ns),
-        )
+        caution = record.Caution(self._rung, self._unanchored_s(now_ns))
+        return record.with_fix(carried, (horizontal_m, vertical_m, speed_mps), self._week(carried.t_ns), caution)
 
     def _no_fix(self, now_ns: int, why: fix.Why, age_ms: float) -> GpsInput:
-        """Fix type 1 carries no position: what is not known now is not shown, on no screen and in no log.
-
-        The height stays a plausible constant, since an autopilot takes a missing one for 0 m AMSL."""
         self._no_fix_because = why
-        week, week_ms = self._week(now_ns)
-        return GpsInput(
-            t_ns=now_ns,
-            fix_type=fix.NO_FIX,
-            time_week=week,
-            time_week_ms=week_ms,
-            lat_deg=0.0,
-            lon_deg=0.0,
-            alt_amsl_m=self._ground_amsl_m or 0.0,
-            hdop=DOP_UNKNOWN,
-            vdop=DOP_UNKNOWN,
-            vn_mps=0.0,
-            ve_mps=0.0,
-            vd_mps=0.0,
-            speed_accuracy_mps=fix.MAX_ACCURACY_M,
-            horiz_accuracy_m=fix.MAX_ACCURACY_M,
-            vert_accuracy_m=fix.MAX_ACCURACY_M,
-            satellites_visible=0,
-            estimate_age_ms=age_ms,
-            caution=self._rung,
-            unanchored_s=self._unanchored_s(now_ns),
-            reason=why.text,
-        )
+        caution = record.Caution(self._rung, self._unanchored_s(now_ns))
+        return record.no_fix(now_ns, why.text, age_ms, self._ground_amsl_m, self._week(now_ns), caution)
 
     def _week(self, t_ns: int) -> tuple[int, int]:
         """(0, 0), "use the time of arrival", while no wall clock is plausible: a wrong week would set its clock."""

@@ -1,5 +1,6 @@
 """The autopilot that we talk to: what it says becomes messages, and what is known of it is kept for what is sent."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,7 +9,7 @@ from terrafix.link.local_pose import Attitude, Place
 from terrafix.link.outputs import Autopilot
 from terrafix.link.telemetry import AUTOPILOT_COMPONENT, Telemetry
 from terrafix.link.timesync import TimeSync
-from terrafix.messages import Message, VehicleState
+from terrafix.messages import FilterStatus, Message, VehicleState
 
 ATTITUDE_FRESH_NS = 500_000_000
 
@@ -48,6 +49,8 @@ class Partner:
             yield reading_of(message, now_ns)
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._origin = Place(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+        elif kind == "EKF_STATUS_REPORT":
+            yield from _filter_status(message, now_ns)
 
     def now(self, now_ns: int) -> Autopilot:
         state, attitude = self._state, None
@@ -55,3 +58,9 @@ class Partner:
             angles = [a for a in (state.roll_rad, state.pitch_rad, state.yaw_rad) if a is not None]
             attitude = Attitude(*angles) if len(angles) == 3 else None
         return Autopilot(self.firmware, self.sysid, attitude, self._origin)
+
+
+def _filter_status(message: Any, now_ns: int) -> Iterator[FilterStatus]:
+    ratios = (message.pos_horiz_variance, message.velocity_variance)  # "variance" by name, test ratios in truth
+    if all(math.isfinite(ratio) for ratio in ratios):
+        yield FilterStatus(t_ns=now_ns, flags=message.flags, position_ratio=ratios[0], velocity_ratio=ratios[1])

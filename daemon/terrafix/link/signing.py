@@ -17,7 +17,6 @@ from terrafix.core.errors import ConfigError
 from terrafix.link.framing import SIGNATURE, SIGNED, V2
 
 KEY_BYTES = 32
-LINK_ID = 0  # we have one link
 EPOCH_UNIX_NS = 1_420_070_400 * 1_000_000_000  # 2015-01-01 00:00:00 UTC
 UNIT_NS = 10_000
 NEW_STREAM_BEHIND = 6_000_000  # a stream not heard before may be this far behind our time: one minute (the guide)
@@ -50,8 +49,9 @@ def timestamp(unix_ns: int) -> int:
 class Signing:
     """One key: ``prepare`` what sends, ask ``accepts`` for what has come."""
 
-    def __init__(self, key: bytes) -> None:
-        self._key = key
+    def __init__(self, key: bytes, link_id: int = 0) -> None:
+        """``link_id``: each of our links has its own, and with it its own stream of times."""
+        self._key, self._link_id = key, link_id
         self._time = 0  # the latest of our clock and of what true packets have said
         self._streams: dict[tuple[int, int, int], int] = {}  # (link id, system, component) -> newest time
         self.refused = 0
@@ -59,7 +59,7 @@ class Signing:
     def prepare(self, mav: mavlink.MAVLink, unix_ns: int) -> None:
         """The next packet of ``mav`` is signed, with the time of now or, if that is later, the one after the last."""
         self._time = max(self._time + 1, timestamp(unix_ns))
-        mav.signing.secret_key, mav.signing.link_id, mav.signing.sign_outgoing = self._key, LINK_ID, True
+        mav.signing.secret_key, mav.signing.link_id, mav.signing.sign_outgoing = self._key, self._link_id, True
         mav.signing.timestamp = self._time
 
     def accepts(self, message: Any, unix_ns: int) -> bool:

@@ -24,8 +24,12 @@ STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5.0,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 1.0,  # whether its filter uses our position
 }
-OPTIONAL = {mavlink.MAVLINK_MSG_ID_GPS2_RAW}  # not there without a second receiver
+OPTIONAL = {  # not there without a second receiver; not on PX4
+    mavlink.MAVLINK_MSG_ID_GPS2_RAW,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+}
 GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_ parameters)
     mavlink.MAVLINK_MSG_ID_ATTITUDE: mavlink.MAV_DATA_STREAM_EXTRA1,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: mavlink.MAV_DATA_STREAM_RAW_SENSORS,
@@ -33,6 +37,7 @@ GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: mavlink.MAV_DATA_STREAM_EXTRA3,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: mavlink.MAV_DATA_STREAM_EXTENDED_STATUS,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: mavlink.MAV_DATA_STREAM_EXTENDED_STATUS,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: mavlink.MAV_DATA_STREAM_EXTRA3,
 }
 
 
@@ -41,6 +46,10 @@ class Streams:
 
     def __init__(self, wanted_hz: dict[int, float]) -> None:
         self.wanted_hz = wanted_hz
+        self.restart()
+
+    def restart(self) -> None:
+        """Also for a new connection: everything is asked for again."""
         self._counts: dict[int, int] = {}
         self._window_ns: int | None = None
         self._rates_hz: dict[int, float] = {}  # of the last whole window

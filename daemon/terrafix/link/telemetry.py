@@ -41,6 +41,7 @@ class Telemetry:
         self._unix_minus_monotonic_ns: int | None = None
         self.autopilot = "none"
         self.sysid = 0
+        self.vehicle_type = int(mavlink.MAV_TYPE_GENERIC)
         self._imu_of = Chooser()
         self._imu: list[tuple[int, tuple[float, ...]]] = []  # (t_ns, readings) not said yet
 
@@ -79,6 +80,7 @@ class Telemetry:
             return  # another vehicle on the same network
         self.autopilot = NAMES.get(message.autopilot, f"autopilot {message.autopilot}")
         self.sysid = message.get_srcSystem()
+        self.vehicle_type = int(message.type)
         self._armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         self._heartbeat_ns = now_ns
 

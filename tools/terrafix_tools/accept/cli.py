@@ -26,7 +26,7 @@ def accept(
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Keep the results that are in --out already.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the generated world and of the map's error.")] = 1,
-    model: Annotated[list[str] | None, typer.Option(help="NAME=PATH, for example xfeat=models/xfeat.onnx.")] = None,
+    model: Annotated[list[str] | None, typer.Option(help="Name of a fetched model (xfeat), or NAME=PATH.")] = None,
     config: Annotated[
         list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")
     ] = None,

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from terrafix.core.config import Config, LinkSection
 from terrafix_tools.accept.evidence import Evidence, gather
 from terrafix_tools.accept.generated import KINDS
 from terrafix_tools.accept.judged import Marks, Span
@@ -27,7 +28,9 @@ SPEED_MPS = 26.0  # over ground, more than any leg: the course is longer than th
 def fly_closed(
     scenario: str, package: Path, out: Path, *, seed: int, frames: int, truth_offset_m: tuple[float, float]
 ) -> Evidence:
-    """A plane over the base ground, with a real receiver as first GPS and Terrafix as second. Raises OutputError."""
+    """A plane over the base ground, with a real receiver as first GPS and Terrafix as second, which may switch over.
+
+    Raises OutputError."""
     event, text = EVENTS[scenario]
     place = world.generate(seed)
     scene = scene_of_world(place, place.look(KINDS["base"].looks[1]))
@@ -39,6 +42,7 @@ def fly_closed(
         length_m=SPEED_MPS * duration_s,
         duration_s=duration_s,
         conditions=Conditions(events=(event,)),
+        config=Config(link=LinkSection(gnss="act")),
     )
     fly(plan, out)
     zero_s = read_rows(out / ESTIMATES)[0].t_s  # the first picture is taken at the start

@@ -16,6 +16,7 @@ from terrafix.messages import (
     Odometry,
     Origin,
     Prediction,
+    SearchState,
     Verdict,
 )
 from terrafix.recorder.reader import read_flight
@@ -62,6 +63,7 @@ class Evidence:
     hot: set[int]  # t_ns at which the computer was said to be hot
     start_up_s: float  # from the start of the program to its first frame
     peer: dict[str, Any]  # peer.json of a closed loop; empty for a replay
+    searches: list[SearchState] = field(default_factory=list)  # changes of the search, in order
 
     @property
     def span_s(self) -> float:
@@ -111,7 +113,7 @@ def gather(
     compared = {c.row.file: c for c in compare(rows, truth)}
     frames = [Seen(row, compared.get(row.file)) for row in rows]
     by_id: dict[int, Seen] = {}  # rows are in the order in which frames were said
-    origin, hot = None, set()
+    origin, hot, searches = None, set(), []
     for _, _, message in read_flight(out):
         match message:
             case Origin():
@@ -130,9 +132,12 @@ def gather(
                 by_id[message.frame_id].odometry_verdict = message.verdict
             case MeasurementVerdict(measurement="map"):
                 by_id[message.frame_id].map_verdict = message.verdict
+            case SearchState():
+                searches.append(message)
             case Health() if message.throttled:
                 hot.add(message.t_ns)
             case _:
                 pass
     assert origin is not None
-    return Evidence(origin, frames, marks, metrics(rows, truth, summary, None), summary, hot, start_up_s, peer or {})
+    of_all = metrics(rows, truth, summary, None)
+    return Evidence(origin, frames, marks, of_all, summary, hot, start_up_s, peer or {}, searches)

@@ -6,6 +6,8 @@ from itertools import pairwise
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.start import SEARCHED_START_M
+from terrafix.link.asking import Asking
 from terrafix.messages import CovarianceMode, NavEstimate, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.evidence import Evidence, Seen
@@ -13,6 +15,7 @@ from terrafix_tools.accept.judged import Span, Verdict
 
 NEAR_M = 50.0  # AC-1; also what counts as right after something went wrong (AC-3)
 MIN_WAY_M = 100.0  # a share of a shorter way than this says nothing
+ASK_FRAMES, ASK_S = 3, 2.0  # AC-6
 SETTLE_S = 10.0  # after a stretch without sight, before frames count again as outside of it
 
 
@@ -85,8 +88,23 @@ def says_so_after(e: Evidence) -> Measured:
     return Measured((later[0] if later else frames[-1].t_s) - frames[0].t_s, "" if later else "it never says so")
 
 
-def asks(_: Evidence) -> Measured:
-    return Measured(None, "there is no request for a coarse position yet, nor a way to give one", Verdict.NOT_BUILT)
+def asks(e: Evidence) -> Measured:
+    """From where AC-6 wants it (the place not known for 3 frames and 2 s) to where the link's own code asks."""
+    said = [estimate for frame in e.frames for estimate in frame.estimates]
+    wanted_ns = _lost_ns(e)
+    if wanted_ns is None:
+        worst_m = max((_worst_sigma_m(estimate) for estimate in said), default=0.0)
+        return Measured(None, f"its place was never lost: it claims {worst_m:.0f} m at worst")
+    asking, searches = Asking(), list(e.searches)
+    for estimate in said:
+        while searches and searches[0].t_ns <= estimate.t_ns:
+            asking.step = searches.pop(0).step
+        asking.estimate(estimate)
+        if asking.due(estimate.t_ns):
+            return Measured(
+                (estimate.t_ns - wanted_ns) * 1e-9, f"asked {_in_flight_s(e, estimate.t_ns):.0f} s into the flight"
+            )
+    return Measured(None, f"lost {_in_flight_s(e, wanted_ns):.0f} s into the flight, and never asks", Verdict.BELOW)
 
 
 def latency_p95(e: Evidence) -> Measured:
@@ -199,6 +217,28 @@ def vehicle_error_m(e: Evidence) -> Measured:
 
 def failsafes(e: Evidence) -> Measured:
     return _of_peer(e, "failsafes", "")
+
+
+def _lost_ns(e: Evidence) -> int | None:
+    """When three frames in a row and two seconds had claimed a place worse than a search would begin with."""
+    since: list[int] = []
+    for frame in e.frames:
+        if not frame.estimates:
+            continue
+        first = frame.estimates[0]
+        since = [*since, first.t_ns] if min(map(_worst_sigma_m, frame.estimates)) > SEARCHED_START_M else []
+        if len(since) >= ASK_FRAMES and since[-1] - since[0] >= ASK_S * 1e9:
+            return since[-1]
+    return None
+
+
+def _worst_sigma_m(estimate: NavEstimate) -> float:
+    cov = np.array(estimate.cov).reshape(6, 6)[:2, :2]
+    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(cov)[-1])))
+
+
+def _in_flight_s(e: Evidence, t_ns: int) -> float:
+    return (t_ns - next(f.estimates[0].t_ns for f in e.frames if f.estimates)) * 1e-9
 
 
 def _of_peer(e: Evidence, key: str, why: str) -> Measured:

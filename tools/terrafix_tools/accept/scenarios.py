@@ -22,7 +22,7 @@ UNMATCHABLE = (0.40, 0.60)  # of the frames: a fifth of the route
 HOT = (1 / 3, 2 / 3)
 LONG_FRAMES = 1500
 OUTLIER_EVERY = 10  # up to 10 % wrong map matches do no harm (AC-5)
-KIDNAPPED_M = (700.0, 700.0)  # east, north: 990 m, while the start claims some tens
+KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the other way: 990 m, while the start claims some tens
 
 WITH_SPAN = ("claims", "coverage", "false fixes", "both estimates", "within 50 m outside", "says so", "found again")
 
@@ -167,8 +167,10 @@ def _heading_unknown(_: Flight) -> Plan:
     return Plan(faults.yaw_unknown())
 
 
-def _kidnapped(_: Flight) -> Plan:
-    return Plan(start=faults.start_moved(*KIDNAPPED_M))
+def _kidnapped(flight: Flight) -> Plan:
+    # Towards the middle of the flight: the map is there.
+    ahead = np.where(np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0)
+    return Plan(start=faults.start_moved(*(ahead * KIDNAPPED_M).tolist()))
 
 
 def _hot_day(flight: Flight) -> Plan:

@@ -10,6 +10,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix_engines.features import open_describer
 from terrafix_tools.bench.flights import spread
 from terrafix_tools.mapping.build import build
-from terrafix_tools.mapping.parallel import render_chunks
+from terrafix_tools.mapping.parallel import render_pieces
 from terrafix_tools.mapping.pyramid import CHUNK_LEVELS, levels_of, open_renderer
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.replay import peak_memory_mb
@@ -45,40 +46,52 @@ WORKERS, CHUNKS, FIRST_CHUNKS = 4, 60, 12
 WINDOW_GSD_M, WINDOWS = (0.5, 1.0, 1.3, 2.0, 3.0, 4.0), 30
 
 
+@dataclass(frozen=True)
+class _Rendered:
+    """``chunks_per_s`` by the clock; ``map_cpu_s``: processor time of this process for every piece of the map once."""
+
+    chunks_per_s: float
+    map_cpu_s: float
+
+
 def measure(area_km2: float, work: Path) -> dict[str, Any]:
-    """-> seconds to build, size, milliseconds to open and to search, memory of the search."""
+    """-> seconds to build, and of these what several processes share (rendering) and what one writes; their gain;
+    size."""
     side_px = round(math.sqrt(area_km2) * 1000.0 / GSD_M)
     image, package = work / "map.tif", work / "map.gpkg"
     _draw(image, side_px)
     began_s = time.process_time()
     build(image, package)
     build_s = time.process_time() - began_s
-    speed_up = _chunks_per_s(image, WORKERS) / _chunks_per_s(image, 1)
+    alone, together = _render(image, 1), _render(image, WORKERS)
     image.unlink()
     size_mb = package.stat().st_size / 2**20
     return {
         "area_km2": area_km2,
         "gsd_m": GSD_M,
         "build_cpu_s": round(build_s, 2),
-        "speed_up": round(speed_up, 2),
+        "render_cpu_s": round(alone.map_cpu_s, 2),
+        "write_cpu_s": round(max(build_s - alone.map_cpu_s, 0.0), 2),
+        "speed_up": round(together.chunks_per_s / alone.chunks_per_s, 2),
         "package_mb": round(size_mb, 1),
     }
 
 
-def _chunks_per_s(image: Path, workers: int) -> float:
-    """By a clock: reading, reducing and encoding, without the start of the processes; pieces of the map in turn."""
+def _render(image: Path, workers: int) -> _Rendered:
+    """Reading, reducing and encoding, without the start of the processes; all pieces of the map, several times."""
     with ImagerySource(image) as source:
         finest = levels_of(source)[-1].zoom
         count = math.ceil(source.width_px / (TILE_PX << CHUNK_LEVELS))
     pieces = [(column, row) for row in range(count) for column in range(count)]
-    places = list(itertools.islice(itertools.cycle(pieces), CHUNKS + FIRST_CHUNKS))
+    times = math.ceil(CHUNKS / len(pieces))
+    places = list(itertools.islice(itertools.cycle(pieces), times * len(pieces) + FIRST_CHUNKS))
     opener = partial(open_renderer, partial(ImagerySource, image), None, finest)
-    with contextlib.closing(render_chunks(opener, places, workers)) as chunks:
+    with contextlib.closing(render_pieces(opener, places, workers)) as chunks:
         for _ in itertools.islice(chunks, FIRST_CHUNKS):
             pass
-        began_s = time.monotonic()
+        began_s, cpu_s = time.monotonic(), time.process_time()
         rendered = sum(1 for _ in chunks)
-    return rendered / (time.monotonic() - began_s)
+    return _Rendered(rendered / (time.monotonic() - began_s), (time.process_time() - cpu_s) / times)
 
 
 def search(package: Path) -> dict[str, Any]:

@@ -9,10 +9,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from terrafix_tools.bench import growth, map_size, rendering
+from terrafix_tools.bench import growth, map_size, merging, rendering
 
 AREAS_KM2 = (1.0, 10.0, 100.0)
 FLIGHTS_FRAMES = (100, 1000, 3000)
+MERGED_KEYFRAMES = 3000
 
 
 def measure(
@@ -22,7 +23,8 @@ def measure(
     areas_km2: tuple[float, ...] = AREAS_KM2,
     flights_frames: tuple[int, ...] = FLIGHTS_FRAMES,
 ) -> dict[str, Any]:
-    """-> "map": one entry for each area, "flight": one for each length, "render": one frame of the simulator."""
+    """-> "map": one entry for each area, "flight": one for each length, "merge": of the fragments of a torn flight,
+    "render": one frame of the simulator."""
     maps, flights = [], []
     for area_km2 in areas_km2:
         folder = work / f"map-{area_km2:g}"
@@ -35,18 +37,21 @@ def measure(
     for frames in flights_frames:
         with console.status(f"a flight of {frames} frames"):
             flights.append(_run(growth.__name__, str(frames), out=work / f"flight-{frames}.json"))
+    with console.status(f"a merge of {MERGED_KEYFRAMES} keyframes"):
+        merged = _run(merging.__name__, str(MERGED_KEYFRAMES), out=work / "merging.json")
     with console.status("frames of the simulator"):
         rendered = _run(rendering.__name__, out=work / "render.json")
-    return {"map": maps, "flight": flights, "render": rendered}
+    return {"map": maps, "flight": flights, "merge": merged, "render": rendered}
 
 
 def show(grown: dict[str, Any], console: Console) -> None:
-    """Two tables: what grows with the map, what with the flight. Times are processor times."""
+    """Tables: what grows with the map, what with the flight, the merge. Times are processor times."""
     table = Table(title="as the map grows (processor time)", title_justify="left")
     for column in (
         "km2",
         "build",
-        f"{map_size.WORKERS} workers",
+        "of it rendering",
+        f"rendering with {map_size.WORKERS} workers, by the clock",
         "size",
         "open",
         "1 km, p95",
@@ -59,7 +64,7 @@ def show(grown: dict[str, Any], console: Console) -> None:
         looks = (f"{one['look_cpu_ms'][name]['median']:.0f} ms" for name in map_size.BELIEFS_M)
         read_ms = max(window["p95"] for window in one["window_cpu_ms"].values())
         table.add_row(
-            f"{one['area_km2']:g}", f"{one['build_cpu_s']:.0f} s",
+            f"{one['area_km2']:g}", f"{one['build_cpu_s']:.0f} s", f"{one['render_cpu_s']:.0f} s",
             f"x {one['speed_up']:.1f}", f"{one['package_mb']:.0f} MB",
             f"{one['open_cpu_ms']:.0f} ms", f"{read_ms:.0f} ms", *looks, f"{one['memory_mb']:.0f} MB")  # fmt: skip
     console.print(table)
@@ -73,6 +78,7 @@ def show(grown: dict[str, Any], console: Console) -> None:
             str(one["frames"]), f"{one['frame_cpu_ms']['median']:.1f} ms", *asked, f"{one['refine_cpu_s']:.1f} s",
             f"{one['peak_memory_mb']:.0f} MB")  # fmt: skip
     console.print(table)
+    merging.show(grown["merge"], console)
     one = grown["render"]
     size = f"{one['width_px']}x{one['height_px']}"
     console.print(f"a simulated frame of {size}: {one['cpu_ms']['median']:.0f} ms of processor time", highlight=False)

@@ -1,7 +1,7 @@
-"""What vision and anchor would say of a long flight, without a picture: for what grows with the flight.
+"""What vision, anchor and autopilot would say of a long flight, without a picture: for what grows with the flight.
 
-Straight legs over flat ground, 12 m/s, two frames a second, a map fix at every second frame. Errors are drawn from
-what the messages claim."""
+Straight legs over flat ground and level turns, 12 m/s, two frames a second, a map fix at every second frame, inertial
+readings at 100 Hz and attitudes at 50 Hz. Errors are drawn from what the messages claim."""
 
 import math
 from collections.abc import Iterator
@@ -11,10 +11,13 @@ import numpy as np
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
-from terrafix.messages import Camera, MapMatch, Odometry, Origin, VehicleState, Verdict
+from terrafix.core.imu import GRAVITY_MPS2
+from terrafix.messages import Camera, Imu, ImuSample, MapMatch, Odometry, Origin, VehicleState, Verdict
 
 FRAME_S, SPEED_MPS, HEIGHT_M = 0.5, 12.0, 100.0
-LEG_FRAMES = 120  # then a right turn
+LEG_S, TURN_S, TURN_RADPS = 60.0, 6.0, math.radians(15.0)  # a right turn ends each leg
+IMU_S, STATE_EVERY, IMU_BATCH = 0.01, 2, 5  # readings: every second with an attitude, five in a message
+FORCE_NOISE_MPS2, FORCE_BIAS_MPS2 = 0.3, 0.05  # of a reading: vibration, and what calibration left
 KEYFRAME_EVERY, FIX_EVERY = 3, 2
 PAIRS, SIGMA_NORM = 48, 1 / 560  # as many as odometry says at most
 FIX_SIGMA_M, FIX_SIGMA_RAD = 2.0, math.radians(1.0)
@@ -36,34 +39,51 @@ ORIGIN = Origin(
 class Spoken:
     """Of one frame, in the order in which it is said."""
 
-    state: VehicleState
+    telemetry: list[VehicleState | Imu]  # since the frame before
     odometry: Odometry
     match: MapMatch | None
+    p_m: np.ndarray  # (3,) the truth: east, north, up
 
 
 def spoken(frames: int, seed: int = 0) -> Iterator[Spoken]:
-    """Frame by frame. The truth is a camera level at HEIGHT_M, image top along the leg."""
+    """Frame by frame. The truth is a level camera at HEIGHT_M, image top ahead."""
     rng = np.random.default_rng([seed, 100])
     mount = Mount.of(CAMERA).r_b_c()
-    p_m, poses = np.array([0.0, 0.0, HEIGHT_M]), list[tuple[np.ndarray, np.ndarray]]()
-    for i in range(frames):
-        yaw = (i // LEG_FRAMES) * math.pi / 2
-        if i:
-            p_m = p_m + FRAME_S * SPEED_MPS * np.array([math.sin(yaw), math.cos(yaw), 0.0])
-        r_w_c = rot_w_b(yaw, 0.0, 0.0) @ mount
-        poses.append((r_w_c, p_m))
-        t_ns = round(i * FRAME_S * 1e9)
-        state = VehicleState(
-            t_ns=t_ns,
-            source="benchmark",
-            yaw_rad=math.remainder(yaw + math.radians(1.0) * float(rng.normal()), math.tau),
-            pitch_rad=math.radians(0.5) * float(rng.normal()),
-            roll_rad=math.radians(0.5) * float(rng.normal()),
-            agl_m=HEIGHT_M + float(rng.normal()),
-        )
-        keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
-        odometry = _odometry(i, keyframe, t_ns, poses[keyframe], poses[i], rng)
-        yield Spoken(state, odometry, _fix(i, t_ns, p_m, r_w_c, rng) if i % FIX_EVERY == 0 else None)
+    p_m, yaw, i = np.array([0.0, 0.0, HEIGHT_M]), 0.0, 0
+    keyframe, seen = 0, (np.eye(3), p_m)
+    waiting, batch = list[VehicleState | Imu](), list[ImuSample]()
+    for step in range((frames - 1) * round(FRAME_S / IMU_S) + 1):
+        t_s, t_ns = step * IMU_S, round(step * IMU_S * 1e9)
+        turning = TURN_RADPS if t_s % LEG_S >= LEG_S - TURN_S else 0.0
+        force = (0.0, SPEED_MPS * turning, -GRAVITY_MPS2) + FORCE_NOISE_MPS2 * rng.normal(size=3) + FORCE_BIAS_MPS2
+        before_ns = round((IMU_BATCH - 1 - len(batch)) * IMU_S * 1e9)
+        batch.append((before_ns, *force.tolist(), 0.0, 0.0, turning))
+        if len(batch) == IMU_BATCH:
+            waiting.append(Imu(t_ns=t_ns, source="benchmark", samples=batch))
+            batch = []
+        if step % STATE_EVERY == 0:
+            waiting.append(_state(t_ns, yaw, rng))
+        if step % round(FRAME_S / IMU_S) == 0:
+            now = (rot_w_b(yaw, 0.0, 0.0) @ mount, p_m)
+            odometry = _odometry(i, keyframe, t_ns, seen, now, rng)
+            if odometry.becomes_keyframe:
+                keyframe, seen = i, now
+            yield Spoken(waiting, odometry, _fix(i, t_ns, p_m, now[0], rng) if i % FIX_EVERY == 0 else None, p_m)
+            waiting, i = [], i + 1
+        middle = yaw + 0.5 * turning * IMU_S
+        p_m = p_m + IMU_S * SPEED_MPS * np.array([math.sin(middle), math.cos(middle), 0.0])
+        yaw += turning * IMU_S
+
+
+def _state(t_ns: int, yaw_rad: float, rng: np.random.Generator) -> VehicleState:
+    return VehicleState(
+        t_ns=t_ns,
+        source="benchmark",
+        yaw_rad=math.remainder(yaw_rad + math.radians(0.2) * float(rng.normal()), math.tau),
+        pitch_rad=math.radians(0.1) * float(rng.normal()),
+        roll_rad=math.radians(0.1) * float(rng.normal()),
+        agl_m=HEIGHT_M + float(rng.normal()),
+    )
 
 
 def _odometry(

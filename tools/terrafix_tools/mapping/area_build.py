@@ -17,6 +17,7 @@ from terrafix_tools.mapping.area_checks import check_area
 from terrafix_tools.mapping.area_files import DEFAULT_BUFFER_KM, is_line, read_area
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.dem import DemSource
+from terrafix_tools.mapping.descriptors_kind import Descriptors
 from terrafix_tools.mapping.fetch_progress import shown
 from terrafix_tools.mapping.heights import to_amsl
 from terrafix_tools.mapping.heights_datum import Datum
@@ -55,6 +56,7 @@ class Order:
     date: str = ""
     licence: str = ""
     ce90_m: float | None = None
+    descriptors: Descriptors = Descriptors.WEIGHTS_FREE
     rate: float | None = None
     workers: int | None = None  # None: as many as are sensible
     scheduler: str = ""
@@ -97,6 +99,7 @@ def build_order(order: Order) -> Path | None:
             order.out,
             elevation=elevation,
             vectors=vectors,
+            descriptors=order.descriptors,
             workers=order.workers or usual_workers(),
             cluster=cluster,
             progress=True,
@@ -180,7 +183,7 @@ def _elevation(order: Order, area: Area | None, scratch: Path) -> ElevationInput
     used, note = to_amsl(path, datum, scratch / "amsl.tif", order.geoid)
     if datum is not Datum.EGM96:
         order.say.print(f"{order.dem}: {note}", highlight=False)
-    return ElevationInput(partial(DemSource, used), source=path.name, licence=licence)
+    return ElevationInput(partial(DemSource, used.absolute()), source=path.name, licence=licence)
 
 
 def _vectors(order: Order, area: Area | None) -> VectorInput | None:

@@ -2,10 +2,11 @@
 
 import contextlib
 import hashlib
+import math
 import os
 import sqlite3
 import tempfile
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,14 +18,17 @@ from rasterio.errors import RasterioError
 from terrafix.anchor.map_format import FORMAT_VERSION, IMAGERY_TABLE, DemGrid, Layer, Manifest, VectorTable
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError
+from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
 from terrafix_tools.mapping.collar import find_collar
-from terrafix_tools.mapping.dem import DemSource, level_of, write_elevation
+from terrafix_tools.mapping.dem import TILES_PER_WORKER, DemSource, height_places, open_heights, write_elevation
+from terrafix_tools.mapping.descriptors import write_descriptors
+from terrafix_tools.mapping.descriptors_kind import Descriptors
 from terrafix_tools.mapping.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
-from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Cluster, render_chunks
+from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Cluster, Piece, render_pieces
 from terrafix_tools.mapping.progress import Bar, progress_bar
-from terrafix_tools.mapping.pyramid import BUILT_WITH, Chunk, Pyramid, levels_of, open_renderer
+from terrafix_tools.mapping.pyramid import BUILT_WITH, Pyramid, levels_of, open_renderer
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.vectors import write_vectors
 
@@ -45,7 +49,7 @@ def build(
     """``build_package`` of one image (any GDAL raster with a CRS) and an elevation raster in metres AMSL."""
     check_out(out, imagery)
     layer = layer_of(imagery, date=date, licence=licence, ce90_m=ce90_m)
-    elevation = ElevationInput(partial(DemSource, dem), source=dem.name) if dem else None
+    elevation = ElevationInput(partial(DemSource, dem.absolute()), source=dem.name) if dem else None
     return build_package([layer], out, elevation=elevation, workers=workers, progress=progress)
 
 
@@ -72,12 +76,13 @@ def build_package(
     *,
     elevation: ElevationInput | None = None,
     vectors: VectorInput | None = None,
+    descriptors: Descriptors = Descriptors.WEIGHTS_FREE,
     workers: int = 1,
     cluster: Cluster | None = None,
     progress: bool = False,
 ) -> Path:
-    """Writes the package `out`. ``workers``: processes that read and encode imagery; ``cluster``: other computers that
-    do so in their place. Neither changes a byte.
+    """Writes the package `out`. ``workers``: processes that read and encode imagery and elevation; ``cluster``: other
+    computers that do so in their place. Neither changes a byte.
 
     The same input gives the same bytes. Nothing is left at `out` or beside it when this fails or is interrupted.
     With several workers this must be called from a program that may be imported again (``multiprocessing`` spawn).
@@ -94,7 +99,8 @@ def build_package(
             bar = stack.enter_context(progress_bar(progress))
             part = scratch / "part.gpkg"
             with new_package(part) as (writer, db):
-                _Build(writer, db, scratch, out.stem, workers, cluster, bar).write(ordered, elevation, vectors)
+                one = _Build(writer, db, scratch, out.stem, descriptors, workers, cluster, bar)
+                one.write(ordered, elevation, vectors)
             with part.open("rb") as file:
                 os.fsync(file.fileno())
             part.replace(out)
@@ -119,7 +125,7 @@ def ensure_package(
         return path
     if not path.is_file():
         raise MapError(f"{path}: no such map; give a map package (.gpkg) or a GeoTIFF")
-    key = hashlib.sha256(f"{FORMAT_VERSION}|{date}|{licence}".encode())
+    key = hashlib.sha256(f"{FORMAT_VERSION}|{PooledGradientDescriber.name}|{date}|{licence}".encode())
     for source in (path, dem):
         if source and source.is_file():
             stat = source.stat()
@@ -144,11 +150,13 @@ class _Build:
         db: sqlite3.Connection,
         scratch: Path,
         name: str,
+        descriptors: Descriptors,
         workers: int,
         cluster: Cluster | None,
         bar: Bar,
     ) -> None:
         self._writer, self._db, self._scratch, self._name = writer, db, scratch.absolute(), name
+        self._descriptors = descriptors
         self._workers, self._cluster, self._bar = workers, cluster, bar
 
     def write(self, layers: list[LayerInput], elevation: ElevationInput | None, vectors: VectorInput | None) -> None:
@@ -191,23 +199,27 @@ class _Build:
         opener = partial(open_renderer, given.open, collar_file if collar else None, levels[-1].zoom)
         pyramid = Pyramid(source, levels, table, self._writer)
         places = pyramid.places()
-        step = self._bar(table, len(places))
-
-        def counted() -> Generator[Chunk, None, None]:
-            for chunk in render_chunks(opener, places, self._workers, self._cluster):
-                step()
-                yield chunk
-
-        with contextlib.closing(counted()) as chunks:
+        rendered = render_pieces(opener, places, self._workers, self._cluster)
+        with contextlib.closing(_counted(rendered, self._bar(table, len(places)))) as chunks:
             if not pyramid.write(chunks):
                 raise MapError(f"{given.where or given.source}: no valid pixel in the whole image")
-        return msgspec.structs.replace(layer, tiles=self._writer.tiles[table])
+        described = None
+        if self._descriptors is Descriptors.WEIGHTS_FREE:
+            finest = levels[-1]
+            unit_m = source.gsd_m / math.sqrt(finest.pixel_x * finest.pixel_y)
+            described = write_descriptors(self._writer, self._db, layer, unit_m, self._bar)
+        return msgspec.structs.replace(layer, tiles=self._writer.tiles[table], descriptors=described)
 
     def _elevation(self, given: ElevationInput, source: Imagery) -> DemGrid:
-        with given.open(source.crs, source.bounds) as elevation:
-            level = level_of(elevation.grid)
-            step = self._bar("elevation", level.columns * level.rows)
-            return write_elevation(self._writer, given, elevation, source.crs, step)
+        with given.open(source.crs, source.bounds) as elevation:  # says what is wrong with it
+            grid = elevation.grid
+        places = height_places(grid)
+        # A small one is not worth a cluster, whose computers would have to have its file.
+        cluster = self._cluster if len(places) >= TILES_PER_WORKER else None
+        opener = partial(open_heights, given.open, source.crs, source.bounds)
+        tiles = render_pieces(opener, places, self._workers, cluster, per_worker=TILES_PER_WORKER)
+        with contextlib.closing(_counted(tiles, self._bar("elevation", len(places)))) as counted:
+            return write_elevation(self._writer, given, grid, source.crs, counted)
 
     def _manifest(self, layers: list[Layer], dem: DemGrid | None, vectors: tuple[VectorTable, ...]) -> None:
         newest = layers[0]
@@ -234,6 +246,13 @@ class _Build:
                 vectors=vectors,
             )
         )
+
+
+def _counted(pieces: Generator[Piece, None, None], step: Callable[[], None]) -> Generator[Piece, None, None]:
+    with contextlib.closing(pieces):
+        for piece in pieces:
+            step()
+            yield piece
 
 
 def _sha256(path: Path) -> str:

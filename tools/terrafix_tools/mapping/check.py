@@ -13,12 +13,15 @@ from terrafix.anchor.map_format import Layer
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import MIN_SIDE_CELLS, FrameMatcher
 from terrafix.anchor.node import MIN_AGL_M
+from terrafix.anchor.retrieval import CELL_PER_AGL
+from terrafix.anchor.tile_index import is_kept
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Map
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.sources.description import camera_of, read_description
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.check_mission import Stretch, Way, blind, height_of, sight_along, uncovered, way_of
 from terrafix_tools.mapping.check_sight import Looker, Sight, SightGrid, sight_grid
 from terrafix_tools.mapping.progress import progress_bar
@@ -30,6 +33,7 @@ MOST_CELLS = 1500  # of the picture: about half a minute
 OLD_YEARS = 5.0
 MATCH_CELLS = 1.0  # expected error of a match: 1.0 m at cells of 1 m over the generated world of the demo
 MEDIAN_SIGMAS = 1.1774  # of a circular normal error: sqrt(2 ln 2)
+DESCRIBE_S_PER_PX, WORTH_SAYING_S = 2e-7, 2.0  # 100 km2 at 2 m/px: 5 s of one core
 FEW_CELLS = 48  # of the frame's shorter side; the matcher refuses below MIN_SIDE_CELLS
 
 
@@ -99,7 +103,8 @@ def check(
     west, south, east, north = package.manifest.bounds_wgs84
     frame = LocalFrame((south + north) / 2, (west + east) / 2)
     local = package.bind(frame, layer)
-    cell_m = FrameMatcher(lens, local, GradientDescriber()).look_cell_m(agl_m)
+    matcher = FrameMatcher(lens, local, GradientDescriber())
+    cell_m = matcher.look_cell_m(agl_m)
     frame_m = lens.width * agl_m / lens.fx, lens.height * agl_m / lens.fy
     looker = Looker(local, cell_m, math.sqrt(frame_m[0] * frame_m[1]))
     e_min, n_min, e_max, n_max = local.bounds_m
@@ -139,7 +144,10 @@ def check(
         expected_error_m=MEDIAN_SIGMAS * math.hypot(ce90_m / CE90_SIGMAS, MATCH_CELLS * cell_m / MEDIAN_SIGMAS),
         ce90_m=ce90_m,
         ce90_is_stated=found.ce90_m is not None,
-        warnings=_warnings(found, int(min(frame_m) / cell_m), package.manifest.has_dem, cell_m, agl_m),
+        warnings=[
+            *_warnings(found, int(min(frame_m) / cell_m), package.manifest.has_dem, cell_m, agl_m),
+            *_search_warnings(local, matcher, agl_m),
+        ],
         mission=mission_said,
     )
     return Checked(said, grid, local, way, way_sight)
@@ -180,3 +188,18 @@ def _warnings(layer: Layer, frame_cells: int, has_elevation: bool, cell_m: float
     if layer.ce90_m is None:
         said.append(f"the map's own accuracy is not stated; {Map().ce90_m:.0f} m (CE90) is assumed")
     return said
+
+
+def _search_warnings(local: LocalMap, matcher: FrameMatcher, agl_m: float) -> list[str]:
+    """What a search of the whole map would have to compute in flight."""
+    wanted_m = matcher.cell_m(agl_m, CELL_PER_AGL / PooledGradientDescriber.stride)
+    if is_kept(local, PooledGradientDescriber.name, wanted_m):
+        return []
+    e_min, n_min, e_max, n_max = local.bounds_m
+    extra_s = (e_max - e_min) * (n_max - n_min) / wanted_m**2 * DESCRIBE_S_PER_PX
+    if extra_s < WORTH_SAYING_S:
+        return []
+    return [
+        f"no descriptors for a search at {agl_m:.0f} m: the first look of a vehicle that is lost takes about "
+        f"{extra_s:.0f} s longer; build the map with --descriptors weights-free"
+    ]

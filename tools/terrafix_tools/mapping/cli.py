@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from terrafix_tools.mapping import cli_package
+from terrafix_tools.mapping.descriptors_kind import Descriptors
 from terrafix_tools.mapping.heights_datum import Datum
 
 app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
@@ -42,12 +43,15 @@ def map_build(
         float | None,
         typer.Option(min=0.0, max=200.0, help="Stated position error of the imagery: radius of 90 %, metres."),
     ] = None,
+    descriptors: Annotated[
+        Descriptors, typer.Option(help="Of the ground, for the search of a vehicle that is lost.")
+    ] = Descriptors.WEIGHTS_FREE,
     rate: Annotated[
         float | None, typer.Option(help="Requests a second that the servers of --source allow; 5 when nothing is said.")
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, max=64, help="Processes that read and encode imagery; default: one a core, at most 8."),
+        typer.Option(min=1, max=64, help="Processes that read and encode; default: one a core, at most 8."),
     ] = None,
     scheduler: Annotated[str, typer.Option(help="tcp://host:port of a Dask cluster that does so instead.")] = "",
     cache: Annotated[Path | None, typer.Option(help="Folder that keeps downloads; default ~/.cache/terrafix.")] = None,
@@ -73,6 +77,7 @@ def map_build(
             date=date,
             licence=licence,
             ce90_m=ce90,
+            descriptors=descriptors,
             rate=rate,
             workers=workers,
             scheduler=scheduler,

@@ -1,11 +1,13 @@
 """Elevation for a map package: a raster of metres AMSL, resampled to the map's CRS in tiles of 16 bits."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
 import cv2
+import msgspec
 import numpy as np
 from pyproj import CRS, Transformer
 from rasterio.enums import Resampling
@@ -18,6 +20,7 @@ from terrafix.anchor.map_format import DEM_NULL, DEM_TILE_PX, DemGrid, Level
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping.gpkg import GpkgWriter
 from terrafix_tools.mapping.layers import Bounds, Elevation, ElevationInput
+from terrafix_tools.mapping.pyramid import Place
 from terrafix_tools.mapping.source import SAMPLE_PX, crs_of, ground_distance_m, ground_pixel_m, open_raster
 
 PLAUSIBLE_M = (-500.0, 9000.0)  # the shore of the Dead Sea is at -430 m, Everest at 8849 m; the rest is void
@@ -26,6 +29,9 @@ OVERSAMPLING = 2  # bilinear twice on one grid rounds off ridges: 0.7 m rms on 9
 MARGIN_M = 500.0  # beyond the imagery: an oblique ray may meet the ground outside it
 STEP_M = 0.01  # of the stored heights; a tile with more than 655 m between its lowest and highest has coarser ones
 PNG_LEVEL = 6
+TILES_PER_WORKER = (
+    300  # ten milliseconds each: with fewer, a process is not worth the two seconds that it takes to start
+)
 
 
 class DemSource:
@@ -119,36 +125,56 @@ def level_of(grid: DemGrid) -> Level:
     )
 
 
+@dataclass(frozen=True)
+class HeightTile:
+    """A tile as it is stored; ``statistics``: min, max, mean, standard deviation in metres."""
+
+    data: bytes
+    scale: float
+    offset: float
+    statistics: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class HeightRenderer:
+    """Makes tiles from open elevation: what a worker process does. ``open_heights`` makes one from what can be sent."""
+
+    elevation: Elevation
+
+    def render(self, place: Place) -> HeightTile | None:
+        """None: nothing is known there."""
+        height_m = self.elevation.read_tile(*place)
+        plausible = (height_m >= PLAUSIBLE_M[0]) & (height_m <= PLAUSIBLE_M[1])  # NaN is not
+        if not plausible.any():
+            return None
+        known = height_m[plausible].astype(np.float64)
+        statistics = (float(known.min()), float(known.max()), float(known.mean()), float(known.std()))
+        return HeightTile(*encode_heights(height_m, plausible), statistics)
+
+
+def open_heights(open_elevation: Callable[[CRS, Bounds], Elevation], crs: CRS, bounds: Bounds) -> HeightRenderer:
+    """Opens the elevation, which stays open as long as the process lives."""
+    return HeightRenderer(open_elevation(crs, bounds).__enter__())
+
+
+def height_places(grid: DemGrid) -> list[Place]:
+    """Column and row of all tiles, row by row."""
+    level = level_of(grid)
+    return [(column, row) for row in range(level.rows) for column in range(level.columns)]
+
+
 def write_elevation(
-    writer: GpkgWriter, given: ElevationInput, elevation: Elevation, crs: CRS, on_tile: Callable[[], None]
+    writer: GpkgWriter, given: ElevationInput, plain: DemGrid, crs: CRS, tiles: Iterable[HeightTile | None]
 ) -> DemGrid:
-    """All tiles that know something, row by row; returns the grid as the manifest says it.
+    """``tiles`` in the order of ``height_places``; returns the grid as the manifest says it.
 
     Raises MapError when no tile knows anything."""
-    plain = elevation.grid
-    grid = DemGrid(
-        x_min=plain.x_min,
-        y_max=plain.y_max,
-        pixel=plain.pixel,
-        width_px=plain.width_px,
-        height_px=plain.height_px,
-        source=given.source,
-        licence=given.licence,
-    )
-    level = level_of(grid)
-    writer.add_elevation_table(grid, crs, level, STEP_M)
+    grid = msgspec.structs.replace(plain, source=given.source, licence=given.licence)
+    writer.add_elevation_table(grid, crs, level_of(grid), STEP_M)
     written = 0
-    for row in range(level.rows):
-        for column in range(level.columns):
-            height_m = elevation.read_tile(column, row)
-            plausible = (height_m >= PLAUSIBLE_M[0]) & (height_m <= PLAUSIBLE_M[1])  # NaN is not
-            on_tile()
-            if not plausible.any():
-                continue
-            data, scale, offset = encode_heights(height_m, plausible)
-            known = height_m[plausible].astype(np.float64)
-            statistics = (float(known.min()), float(known.max()), float(known.mean()), float(known.std()))
-            writer.add_elevation_tile(column, row, data, scale, offset, statistics)
+    for (column, row), tile in zip(height_places(grid), tiles, strict=True):
+        if tile is not None:
+            writer.add_elevation_tile(column, row, tile.data, tile.scale, tile.offset, tile.statistics)
             written += 1
     if not written:
         raise MapError(f"{given.source}: no elevation under the imagery; give a DEM that covers it")

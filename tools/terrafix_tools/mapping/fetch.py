@@ -72,7 +72,7 @@ class Client:
                         check(answer)
                     return answer
             except (urllib3.exceptions.HTTPError, OSError) as error:
-                reason = _plain(error)
+                reason = plain(error)
                 continue
             except Damaged as damage:
                 reason = str(damage)
@@ -112,11 +112,8 @@ class Client:
         return response.status, b"".join(parts), response.headers.get("Retry-After", "")
 
     def _pool(self, url: str) -> urllib3.PoolManager:
-        """Through the proxy of the environment (HTTPS_PROXY, NO_PROXY) where there is one."""
-        parts = urlsplit(url)
-        proxy = urllib.request.getproxies().get(parts.scheme, "")
-        if proxy and urllib.request.proxy_bypass(parts.netloc):
-            proxy = ""
+        """Through the proxy of the environment where there is one."""
+        proxy = proxy_of(url)
         if proxy not in self._pools:
             options = {"maxsize": self.limits.connections, "block": True}
             self._pools[proxy] = (
@@ -146,13 +143,20 @@ class Client:
         self.pace.hold(max(wait_s, 0.0))
 
 
+def proxy_of(url: str) -> str:
+    """What the environment (HTTPS_PROXY, NO_PROXY) says for this address; empty: none."""
+    parts = urlsplit(url)
+    proxy = urllib.request.getproxies().get(parts.scheme, "")
+    return "" if proxy and urllib.request.proxy_bypass(parts.netloc) else proxy
+
+
 def _advice(status: int) -> str:
     if status in (401, 403):
         return "check key, credentials and the terms of use"
     return "check the address of the source"
 
 
-def _plain(error: Exception) -> str:
+def plain(error: Exception) -> str:
     """What an exception of the network says, in a line."""
     if isinstance(error, urllib3.exceptions.MaxRetryError) and error.reason is not None:
         error = error.reason

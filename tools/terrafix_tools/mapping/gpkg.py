@@ -111,8 +111,16 @@ class GpkgWriter:
         self.add_extension(ELEVATION_TABLE, "tile_data", "gpkg_2d_gridded_coverage")
         self.add_metadata(ELEVATION_TABLE, what, "", grid.licence, grid.source)
 
+    def add_descriptor_table(self, table: str, layer: Layer, name: str) -> None:
+        """Contents and the empty table of the descriptors of a layer."""
+        self.create(gpkg_schema.DESCRIPTORS.format(table=table))
+        self.tiles[table] = 0
+        self.add_contents(table, "attributes", layer.date, f"Descriptors of {layer.table}: {name}", None, None)
+        self.add_extension(table, "tile_data", "terrafix_descriptors")
+        self.add_metadata(table, f"Descriptors: {name}", layer.date, layer.licence, layer.source)
+
     def add_tile(self, table: str, zoom: int, column: int, row: int, data: bytes) -> None:
-        """An imagery tile (JPEG or PNG)."""
+        """A tile of imagery (JPEG or PNG) or of its descriptors (PNG)."""
         self._add_tile(table, zoom, column, row, data, tile_sha256(data))
 
     def add_elevation_tile(

@@ -49,6 +49,13 @@ CREATE TABLE "{table}" (
   tile_row INTEGER NOT NULL, tile_data BLOB NOT NULL, UNIQUE (zoom_level, tile_column, tile_row));
 """
 
+# Tiles that are no pictures for other programs: attributes, whose one INTEGER is the key.
+DESCRIPTORS = """
+CREATE TABLE "{table}" (
+  id INTEGER PRIMARY KEY AUTOINCREMENT, zoom_level MEDIUMINT NOT NULL, tile_column MEDIUMINT NOT NULL,
+  tile_row MEDIUMINT NOT NULL, tile_data BLOB NOT NULL, UNIQUE (zoom_level, tile_column, tile_row));
+"""
+
 # OGC 17-066r1, tables 1 and 2.
 COVERAGE = """
 CREATE TABLE gpkg_2d_gridded_coverage_ancillary (
@@ -107,5 +114,6 @@ EXTENSIONS = {  # name -> definition, scope
     "gpkg_metadata": ("http://www.geopackage.org/spec120/#extension_metadata", "read-write"),
     "gpkg_2d_gridded_coverage": (_COVERAGE_SPEC, "read-write"),
     "gpkg_rtree_index": ("http://www.geopackage.org/spec120/#extension_rtree", "write-only"),
+    "terrafix_descriptors": ("docs/map-package.md of Terrafix", "read-write"),
     "terrafix_map": ("docs/map-package.md of Terrafix", "write-only"),
 }

@@ -1,6 +1,6 @@
-"""Renders the chunks of a layer on a Dask cluster: any number of computers that see the same files.
+"""Renders the pieces of a table on a Dask cluster: any number of computers that see the same files.
 
-A worker that dies costs only its own chunks: the scheduler gives them to another one. The bytes are those of a build
+A worker that dies costs only its own pieces: the scheduler gives them to another one. The bytes are those of a build
 on one computer, because a worker with other versions of what reads and encodes is refused."""
 
 import contextlib
@@ -12,6 +12,7 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator
+from typing import Any, Generic
 
 import cv2
 import rasterio
@@ -19,8 +20,8 @@ from distributed import CancelledError, Client, Future, KilledWorker
 from distributed.comm.core import CommClosedError
 
 from terrafix.core.errors import MapError, UsageError
-from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Hands, OpenRenderer, Pending
-from terrafix_tools.mapping.pyramid import BUILT_WITH, Chunk, ChunkRenderer, Place
+from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Hands, OpenRenderer, Pending, Piece, Renderer
+from terrafix_tools.mapping.pyramid import BUILT_WITH, Place
 
 CONNECT_S = 10.0  # a scheduler that is there answers in less
 WORKERS_S = 60.0  # without any worker for so long: nobody will come
@@ -58,12 +59,12 @@ class DaskCluster:
         self._client.close()
 
     @contextlib.contextmanager
-    def hands(self, open_renderer: OpenRenderer) -> Iterator[Hands]:
+    def hands(self, open_renderer: OpenRenderer[Piece]) -> Iterator[Hands[Piece]]:
         """As ``parallel.Cluster``. Raises MapError: workers that die or are unfit, or the scheduler is lost."""
-        layer = uuid.uuid4().hex
+        table = uuid.uuid4().hex
         try:
-            yield _Remote(self._client, self._address, layer, open_renderer)
-            self._client.run(_forget, layer, on_error="ignore")
+            yield _Remote(self._client, self._address, table, open_renderer)
+            self._client.run(_forget, table, on_error="ignore")
         except KilledWorker:
             raise MapError(
                 f"{self._address}: workers died again and again at one piece, perhaps for want of memory; "
@@ -78,17 +79,17 @@ class DaskCluster:
             ) from None
 
 
-class _Remote:
+class _Remote(Generic[Piece]):
     """Has the contract of ``parallel.Hands``."""
 
-    def __init__(self, client: Client, address: str, layer: str, open_renderer: OpenRenderer) -> None:
-        self._client, self._address, self._layer = client, address, layer
+    def __init__(self, client: Client, address: str, table: str, open_renderer: OpenRenderer[Piece]) -> None:
+        self._client, self._address, self._table = client, address, table
         # A task, not scattered data: these are lost with the worker that holds them.
-        self._open_renderer = client.submit(_same, open_renderer, key=f"terrafix-{layer}")
+        self._open_renderer = client.submit(_same, open_renderer, key=f"terrafix-{table}")
 
-    def submit(self, place: Place) -> Pending:
-        key = f"terrafix-{self._layer}-{place[0]}-{place[1]}"
-        task = self._client.submit(_render, self._layer, self._open_renderer, place, _built_with(), key=key)
+    def submit(self, place: Place) -> Pending[Piece]:
+        key = f"terrafix-{self._table}-{place[0]}-{place[1]}"
+        task = self._client.submit(_render, self._table, self._open_renderer, place, _built_with(), key=key)
         return _Task(task, self)
 
     def count(self) -> int:
@@ -103,11 +104,11 @@ class _Remote:
             time.sleep(LOOK_S)
 
 
-class _Task:
-    def __init__(self, future: "Future[Chunk]", remote: _Remote) -> None:
+class _Task(Generic[Piece]):
+    def __init__(self, future: "Future[Piece]", remote: _Remote[Piece]) -> None:
         self._future, self._remote = future, remote
 
-    def result(self) -> Chunk:
+    def result(self) -> Piece:
         while True:
             with contextlib.suppress(TimeoutError):
                 return self._future.result(timeout=LOOK_S)
@@ -130,29 +131,29 @@ def _built_with() -> str:
 
 
 # What follows runs on the workers. GDAL's datasets belong to one thread; a worker may have several.
-_renderers: dict[int, tuple[str, ChunkRenderer]] = {}  # by thread: layer, renderer
+_renderers: dict[int, tuple[str, Renderer[Any]]] = {}  # by thread: table, renderer
 
 
-def _same(open_renderer: OpenRenderer) -> OpenRenderer:
+def _same(open_renderer: OpenRenderer[Piece]) -> OpenRenderer[Piece]:
     return open_renderer
 
 
-def _render(layer: str, open_renderer: OpenRenderer, place: Place, built_with: str) -> Chunk:
+def _render(table: str, open_renderer: OpenRenderer[Any], place: Place, built_with: str) -> Any:
     thread = threading.get_ident()
     try:
-        if _renderers.get(thread, ("",))[0] != layer:
+        if _renderers.get(thread, ("",))[0] != table:
             if built_with != _built_with():
                 raise MapError(f"has {_built_with()}, the computer that builds has {built_with}; make them the same")
             cv2.setNumThreads(1)  # the worker's threads share the cores already
             with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
-                _renderers[thread] = layer, open_renderer()
+                _renderers[thread] = table, open_renderer()
         return _renderers[thread][1].render(place)
     except MapError as error:
         raise MapError(f"worker on {platform.node()}: {error}; workers need the same files at the same paths") from None
 
 
-def _forget(layer: str) -> None:
-    """Closes what was opened for a layer; after a failure that waits until the thread opens another one."""
+def _forget(table: str) -> None:
+    """Closes what was opened for a table; after a failure that waits until the thread opens another one."""
     for thread, (kept, _) in list(_renderers.items()):
-        if kept == layer:
+        if kept == table:
             del _renderers[thread]

@@ -92,7 +92,7 @@ class _Run:
         matches = MapMatches(
             lens,
             flown.terrain,
-            MapError(plan.seed, np.array(plan.map_offset_m)),
+            MapError(plan.seed, np.array(plan.map_offset_m), plan.map_sigma_m),
             has_dem=plan.has_dem,
             map_sigma_m=plan.map_sigma_m,
             seed=plan.seed,

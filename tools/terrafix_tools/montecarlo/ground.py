@@ -10,8 +10,10 @@ import numpy as np
 WAVES = 24  # of the relief
 RELIEF_WAVES_M = (300.0, 3000.0)
 # How two orthophotos of one place differ, beyond a constant: 25 m patches of the two dates of the village map were
-# matched with each other. Covariance 1.1 m^2 at 50 m, 0.6 at 100 m, 0.2 at 160 m, 0 beyond; half of it is one map's.
-WARP_M, WARP_WAVES_M = 0.8, (200.0, 700.0)
+# matched with each other. Covariance 1.1 m^2 at 50 m, 0.6 at 100 m, 0.2 at 160 m, 0 beyond; half of it is one map's,
+# and that is the least: what both dates share, as the elevation model under them, does not show. So a map that states
+# a large error is stretched in proportion, as the estimator has to expect of it.
+WARP_M, WARP_SHARE, WARP_WAVES_M = 0.8, 0.33, (200.0, 700.0)
 # What is left of map matches after the pose, on real flights: 0.5 % of the height in each coordinate, four fifths of it
 # the same when the ground is seen again half a second later, unrelated beyond a tenth of the height.
 DETAIL_M, DETAIL_WAVES_M = 0.35, (25.0, 60.0)
@@ -100,14 +102,18 @@ class Terrain:
 class MapError:
     """Where the map shows a place, minus where it is: a constant of the map, a slow warp, and fine detail."""
 
-    def __init__(self, seed: int, offset_m: np.ndarray) -> None:
-        """``offset_m`` (2,): the registration error of the map, the same everywhere."""
+    def __init__(self, seed: int, offset_m: np.ndarray, sigma_m: float) -> None:
+        """``offset_m`` (2,): the registration error of the map, the same everywhere; ``sigma_m`` is what the map
+        states of it, for each axis."""
         rng = np.random.default_rng([seed, 52])
         self.offset_m = offset_m
+        self._warp_m = max(WARP_M, WARP_SHARE * sigma_m)
         self._warp = (_Waves(rng, WARP_WAVES_M), _Waves(rng, WARP_WAVES_M))
         self._detail = (_Waves(rng, DETAIL_WAVES_M), _Waves(rng, DETAIL_WAVES_M))
 
     def at(self, places_m: np.ndarray) -> np.ndarray:
         """(N, 2) -> (N, 2) metres."""
-        fields = [WARP_M * w(places_m) + DETAIL_M * d(places_m) for w, d in zip(self._warp, self._detail, strict=True)]
+        fields = [
+            self._warp_m * w(places_m) + DETAIL_M * d(places_m) for w, d in zip(self._warp, self._detail, strict=True)
+        ]
         return self.offset_m + np.stack(fields, 1)

@@ -78,7 +78,8 @@ class Autopilot:
         self.sysid = self._config.autopilot_sysid or next(iter(there))
         if there[self.sysid] != "ardupilot":
             raise LinkError(
-                f"the autopilot on {device} is {there[self.sysid]}, not ArduPilot; others' parameters are not known"
+                f"the autopilot on {device} is {there[self.sysid]}, not ArduPilot; "
+                "preflight knows ArduPilot's parameters alone, docs/autopilot.md says what other firmware takes"
             )
         beat = self.newest["HEARTBEAT", self.sysid]
         self.plane = beat.type in PLANES

@@ -16,6 +16,9 @@ from terrafix.health.sysfs import read_disk_free_mb, read_throttling, read_zones
 from terrafix.link import gps_time
 from terrafix.vision.sources import open_configured, parse_start
 from terrafix_engines.features import open_describer
+from terrafix_engines.features.xfeat import XFeatDescriber
+from terrafix_engines.providers import short
+from terrafix_engines.runtime import ModelFileError
 from terrafix_tools.mapping.check_mission import uncovered, way_of
 from terrafix_tools.mapping.check_text import where
 from terrafix_tools.mission.file import read_mission
@@ -130,10 +133,11 @@ def _models(config: Config) -> Line:
     if not config.models.xfeat:
         return ok("models", "none: matching without weights")
     try:
-        open_describer(config.models.xfeat)
-    except (TerrafixError, ValueError, OSError) as error:
+        describer = open_describer(config.models.xfeat, config.models.folder)
+    except ModelFileError as error:
         return fail("models", str(error), "correct [models] xfeat, or empty it")
-    return ok("models", f"{config.models.xfeat} can be run")
+    by = f" by {short(describer.model.provider)}" if isinstance(describer, XFeatDescriber) else ""
+    return ok("models", f"{config.models.xfeat} can be run{by}")
 
 
 def _clock() -> Line:

@@ -9,7 +9,7 @@ import typer
 
 from terrafix.core.config import Config, load
 from terrafix.core.errors import LinkError, OutputError, UsageError
-from terrafix_tools.preflight import computer, vehicle
+from terrafix_tools.preflight import computer, ground, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
 from terrafix_tools.preflight.judge import changes_of, judge, names_of
 from terrafix_tools.preflight.lines import Change, Line, Status, fail, number
@@ -74,7 +74,7 @@ def preflight(
                 show(lines)
         shown = len(lines)
         if with_computer:
-            lines += computer.about(config, mission, out)
+            lines += [*ground.about(config.link), *computer.about(config, mission, out)]
     said = Preflight(
         ready=all(
             line.status is not Status.FAIL for line in lines if line.change not in written or line.change is None

@@ -32,6 +32,8 @@ from terrafix_tools.evaluate import (
     read_truth,
     truth_sigma_of,
 )
+from terrafix_tools.finalise.output import TABLE as FINALISED
+from terrafix_tools.finalise.output import read_track
 
 
 @dataclass
@@ -56,6 +58,7 @@ class FlightView:
     thumbnails: dict[int, bytes] = field(default_factory=dict)
     compared: dict[str, Compared] = field(default_factory=dict)  # by file, when there is truth
     truth_track: list[Truth] = field(default_factory=list)
+    finalised: list[tuple[float, float]] = field(default_factory=list)  # latitude, longitude of finalised.csv
     evaluation: dict[str, Any] | None = None
     peer: dict[str, Any] = field(default_factory=dict)  # what the simulated autopilot noted
     cut_off: int = 0  # record files without their end
@@ -113,6 +116,8 @@ def gather(folder: Path, truth_path: Path | None) -> FlightView:
     view.title = str(summary.get("flight") or folder.resolve().name)
     view.thumbnails = dict(read_thumbnails(folder))
     view.peer = _read_peer(folder / "peer.json")
+    if (folder / FINALISED).is_file():
+        view.finalised = read_track(folder / FINALISED)
     beside = folder / "truth.csv"
     if truth_path is None and beside.is_file():
         truth_path = beside

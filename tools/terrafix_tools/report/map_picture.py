@@ -57,6 +57,7 @@ def map_svg(view: FlightView, map_path: Path | None) -> str:
         _ellipses(view, picture),
         _estimates(view, picture),
         _refined(view, picture),
+        _finalised(view, picture),
         _truth(view, picture),
         _dots(view, picture, u),
         _ends(view, picture, u),
@@ -150,6 +151,11 @@ def _refined(view: FlightView, picture: Picture) -> str:
         if r.refined_lat_deg is not None and r.refined_lon_deg is not None
     ]
     return f'<g class="layer refined">{_line(points, "casing")}{_line(points, "")}</g>' if points else ""
+
+
+def _finalised(view: FlightView, picture: Picture) -> str:
+    points = [picture.at(*at) for at in view.finalised]
+    return f'<g class="layer finalised">{_line(points, "casing")}{_line(points, "")}</g>' if points else ""
 
 
 def _estimates(view: FlightView, picture: Picture) -> str:

@@ -107,6 +107,8 @@ def _stage(view: FlightView, map_path: Path | None) -> str:
         layers.append(("truth", '<i class="key k-truth"></i> ground truth', True))
     if any(row.refined_lat_deg is not None for row in view.rows):
         layers.append(("refined", '<i class="key k-refined"></i> refined afterwards', False))
+    if view.finalised:
+        layers.append(("finalised", '<i class="key k-finalised"></i> finalised after landing', True))
     layers.append(("ellipses", "95 % ellipses", True))
     boxes = "".join(
         f'<label><input type="checkbox" data-layer="{name}"{" checked" if on else ""}>{text}</label>'

@@ -95,7 +95,7 @@ def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) 
                 if last_sent_ns is not None:
                     result.longest_gap_ms = max(result.longest_gap_ms, (now_ns - last_sent_ns) / MS)
                 last_sent_ns = now_ns
-    status = edge.status(steps * STEP_NS)
+    status = edge.status.at(steps * STEP_NS)
     result.packets_taken, result.bytes_skipped, result.refused = status.received, status.bad, status.refused
     return result
 

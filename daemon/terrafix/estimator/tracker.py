@@ -1,0 +1,324 @@
+"""From frame to frame: odometry, inertial readings, attitude and height become nodes and factors of the graph."""
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from terrafix.core.pose import tangent_to_world, world_to_tangent
+from terrafix.core.start import SEARCHED_START_M
+from terrafix.estimator.graph import NodeState, PoseGraph
+from terrafix.estimator.motion import Ground, RelativePose, relative_pose
+from terrafix.estimator.mounted import (
+    DEFAULT_AGL_M,
+    DEFAULT_AGL_SIGMA_M,
+    UNKNOWN_ATTITUDE_RAD,
+    UNKNOWN_RAD,
+    MountedCamera,
+)
+from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
+from terrafix.estimator.velocity import (
+    STANDING_M,
+    TYPICAL_SPEED_MPS,
+    V_SIZE,
+    Felt,
+    Leg,
+    believed,
+    leg,
+    spread_after,
+    standing_cov,
+    unknown_cov,
+    wandered_m,
+)
+from terrafix.messages import CovarianceMode, Odometry, Origin, Verdict
+
+# What an autopilot's own sigma leaves out: a compass beside motors and wires, a barometer over sloping ground, a focal
+# length that is a few per cent off. On real flights the heading was 12 degrees and the scale 8 % away from the log, and
+# a compass that is 15 degrees off must still be inside the search (1.5 sigma).
+COMPASS_BIAS_RAD = np.radians(10.0)
+HEIGHT_BIAS = 0.05  # of the height
+MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
+OPEN_HEIGHT = 0.2  # 1-sigma, share of the height, beyond which nobody knows it; a map match leaves a few hundredths
+FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
+STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
+STEP_FLOOR_M = 0.5
+
+Feel = Callable[[int, int], Felt | None]
+
+
+def nothing_felt(_t0_ns: int, _t1_ns: int) -> None:
+    """There are no inertial readings."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The camera at a frame: pose, covariance (6x6, tangent order), velocity with covariance (3x3), and its node."""
+
+    frame_id: int
+    t_s: float
+    pose: gtsam.Pose3
+    cov: np.ndarray
+    velocity_mps: np.ndarray
+    velocity_cov: np.ndarray
+    node: int
+
+
+@dataclass(frozen=True)
+class Advance:
+    verdict: Verdict
+    placed: Placed
+    step_m: np.ndarray  # (2,) east, north since the frame before, by odometry alone
+    step_sigma_m: float
+
+
+class Tracker:
+    """``last_fix_s``: time of the newest frame that was fixed on the map; None: none was."""
+
+    def __init__(self, origin: Origin) -> None:
+        self.origin = origin
+        self.graph = PoseGraph()
+        self.camera = MountedCamera(origin)
+        self.terrain = Terrain(origin.ground_amsl_m or 0.0)
+        self.mode = CovarianceMode.MARGINALS
+        self.last_fix_s: float | None = None
+        self._node_of: dict[int, int] = {}  # frame -> node, of those in the graph's window
+        self._frames = array("q")  # of each node
+        self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
+        self._velocity_cov = np.zeros((V_SIZE, V_SIZE))  # of V of the newest node
+        self._pace_mps = TYPICAL_SPEED_MPS  # how fast it was when it was last seen to fly
+        self._felt: bool | None = None  # whether the last leg was measured; None: there was none
+        self._stood_at: int | None = None  # node at which a vehicle stands, motors off
+        self._launching = False  # it stood, and was not seen to fly since ...
+        self._blind = False  # ... nor felt
+        self._last: Placed | None = None  # newest frame
+        self._began_with = (False, False)  # heading, height
+        self._began_s: float | None = None
+
+    @property
+    def last(self) -> Placed | None:
+        """The newest frame, with all that is known of it by now."""
+        return self._last
+
+    def body(self, placed: Placed) -> np.ndarray:
+        """R_w_b (3x3) of a placed frame, with the mount as it was learnt."""
+        return self.camera.body(placed.pose.rotation().matrix(), self.graph.state(placed.node).bias)
+
+    def advance(
+        self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude, felt: Feel = nothing_felt
+    ) -> Advance:
+        """``felt(t0_ns, t1_ns)``: acceleration between two times, where the inertial readings cover them."""
+        if self._last is None or self._knows_more(attitude):
+            return self._begin(frame_id, t_s, attitude)
+        newest = self.graph.newest
+        before = self.graph.state(newest)
+        known = self._by_odometry(odometry, attitude)
+        self._launching = attitude.stands or self._launching
+        way = None if attitude.stands else self._leg(t_s, before, attitude, felt)
+        spread = spread_after(way, self._velocity_cov)
+        led_to, velocity = before.pose.translation(), np.zeros(V_SIZE)
+        if way is not None:
+            led_to, velocity = way.predicted(led_to, before.velocity, float(before.bias[2]))
+        if self._has_taken_off_blind(known is not None, way, led_to):
+            cov = tangent_to_world(self._covariance(newest), before.pose.rotation().matrix())
+            sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2] + spread[:2, :2])[-1]))
+            placed = self._start_graph(frame_id, t_s, attitude, led_to[:2], sigma_m)
+            return Advance(Verdict.ACCEPTED, placed, (led_to - before.pose.translation())[:2], sigma_m)
+        if known is not None:
+            parent, motion = known
+            verdict = Verdict.ACCEPTED
+        else:
+            parent, motion = self._by_guess(attitude, way is None, led_to, spread)
+            verdict = odometry.verdict if odometry.verdict is not Verdict.ACCEPTED else Verdict.FEW_INLIERS
+        pose = self.graph.state(parent).pose.compose(gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m))
+        r_w_c, p = pose.rotation().matrix(), np.asarray(pose.translation())
+        step = (p - before.pose.translation())[:2]
+        step_sigma = STANDING_M if way is None else float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1]))
+        if known is not None:
+            seen = r_w_c @ motion.cov[3:, 3:] @ r_w_c.T
+            step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), np.sqrt(np.trace(seen) / 3.0)))
+            if way is not None:
+                way, spread = believed(way, p - led_to, spread, seen)
+                if self._height_is_open(attitude, before):
+                    way = way.without_a_say(MAX_SPEED_MPS, max(t_s - self.graph.time_of(newest), 1e-3))
+        if self.mode is CovarianceMode.JACOBIAN:
+            self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
+        state = NodeState(pose, before.bias, velocity)
+        said = self.camera.factor(self.graph.next_keys(), attitude, r_w_c)
+        rise_m = self.terrain.rise_sigma_m(float(np.hypot(*step)))
+        node = self.graph.extend(t_s, state, parent, motion, way, said, rise_m)
+        self._felt = None if way is None else way.inertial
+        if not attitude.stands:
+            self._stood_at = None
+        elif self._stood_at is None:
+            self._stood_at = node
+        self._is_frame(node, frame_id)
+        self._cov_of = {n: cov for n, cov in self._cov_of.items() if self.graph.holds(n)}
+        self._velocity_cov = spread[3:, 3:]
+        self._last = self._placed(frame_id, t_s, node)
+        if known is not None:
+            v = self._last.velocity_mps[:2]
+            self._pace_mps = float(np.sqrt(v @ v + np.trace(self._last.velocity_cov[:2, :2])))
+        return Advance(verdict, self._last, step, step_sigma)
+
+    def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Leg:
+        """From the newest node to now."""
+        from_s = self.graph.time_of(self.graph.newest)
+        measured = felt(round(from_s * 1e9), round(t_s * 1e9))
+        r_w_c = before.pose.rotation().matrix()
+        yaws = tuple(self.camera.yaw_rad(r) for r in (r_w_c, self.camera.expected(attitude, before.bias, r_w_c)))
+        return leg(
+            max(t_s - from_s, 1e-3),
+            measured,
+            (yaws[0], yaws[1]),
+            float(before.bias[2]),
+            self._pace_mps,
+            np.radians(self.origin.attitude_sigma_deg),
+            same_kind=self._felt is (measured is not None),
+            launching=self._launching,
+        )
+
+    def _height_is_open(self, attitude: Attitude, before: NodeState) -> bool:
+        """No autopilot and no map match says how high it flies: nobody knows how long the ways are that are seen. Legs
+        must not choose: all of them agree best with no way at all, and the height would fall to the ground."""
+        if attitude.agl_m is not None:
+            return False
+        p, r_w_c = before.pose.translation(), before.pose.rotation().matrix()
+        sigma_m = float(np.sqrt(r_w_c[2] @ self._covariance(self.graph.newest)[3:, 3:] @ r_w_c[2]))
+        return sigma_m > OPEN_HEIGHT * max(float(p[2]) - self.terrain.below(p), 1.0)
+
+    def _has_taken_off_blind(self, seen: bool, way: Leg | None, led_to_m: np.ndarray) -> bool:
+        """It is seen to fly after a take-off that nothing measured. Told of the speed at both ends, a graph would
+        make up the way between them and be too sure of it: it begins again, where and as sure as it is."""
+        if not self._launching or way is None:
+            return False
+        self._blind = self._blind or not way.inertial
+        if not seen or float(led_to_m[2]) - self.terrain.ground_m < FLYING_M:
+            return False
+        blind, self._launching, self._blind = self._blind, False, False
+        return blind
+
+    def _knows_more(self, attitude: Attitude) -> bool:
+        """The first words of the autopilot came after the first frame, before the first fix. No linear graph recovers
+        from a heading that turns out to be 70 degrees off what was assumed, so it begins again."""
+        heading = not self._began_with[0] and attitude.yaw_rad is not None
+        height = not self._began_with[1] and attitude.agl_m is not None
+        return self.last_fix_s is None and (heading or height)
+
+    def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
+        """At the flight's start, less sure the longer that was ago."""
+        self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
+        waited_s = 0.0 if self._began_s is None else t_s - self._began_s
+        self._began_s = t_s - waited_s
+        drift_m = wandered_m(waited_s) if waited_s > 0.0 else 0.0
+        start_m = float(np.hypot(min(max(self.origin.start_sigma_m, 1.0), SEARCHED_START_M), drift_m))
+        placed = self._start_graph(frame_id, t_s, attitude, np.zeros(2), start_m)
+        return Advance(Verdict.ACCEPTED, placed, np.zeros(2), drift_m)
+
+    def _start_graph(self, frame_id: int, t_s: float, attitude: Attitude, at_m: np.ndarray, sigma_m: float) -> Placed:
+        """Anew at ``at_m`` (east, north), known to ``sigma_m``; all else as the autopilot says it."""
+        origin = self.origin
+        tolerance = np.radians(origin.camera.mount_tolerance_deg)
+        agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
+        agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
+        r_w_c = self.camera.expected(attitude, np.zeros(4))
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([*at_m, self.terrain.ground_m + agl]))
+        wide = np.diag([1.0, 1.0, UNKNOWN_RAD, sigma_m, sigma_m, 3 * agl_sigma]) ** 2
+        cov_world = np.zeros((6, 6))
+        cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
+        yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
+        bias_cov = np.diag([tolerance, tolerance, yaw, float(np.hypot(agl_sigma, HEIGHT_BIAS * agl))]) ** 2
+        self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
+        self._felt = self._stood_at = None
+        node = self.graph.start(
+            t_s,
+            NodeState(pose, np.zeros(4), np.zeros(V_SIZE)),
+            world_to_tangent(cov_world, r_w_c),
+            bias_cov,
+            self._velocity_cov,
+            self.camera.factor(self.graph.next_keys(), attitude, r_w_c),
+        )
+        self._is_frame(node, frame_id)
+        self._last = self._placed(frame_id, t_s, node)
+        return self._last
+
+    def _is_frame(self, node: int, frame_id: int) -> None:
+        """The newest node."""
+        self._node_of = {frame: n for frame, n in self._node_of.items() if self.graph.holds(n)}
+        self._node_of[frame_id] = node
+        self._frames.append(frame_id)
+
+    def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | None:
+        """The keyframe's node and the motion since, when odometry has both."""
+        if odometry.verdict is not Verdict.ACCEPTED or not odometry.pairs:
+            return None
+        parent = self._node_of.get(odometry.keyframe_id)
+        if parent is None or not self.graph.holds(parent):
+            return None
+        state = self.graph.state(parent)
+        r_w_kf = state.pose.rotation().matrix()
+        place_cov = r_w_kf @ self._cov_of[parent][3:, 3:] @ r_w_kf.T
+        p = state.pose.translation()
+        height = float(p[2]) - self.terrain.below(p)
+        if height < 2.0:
+            return None
+        r_w_k = self.camera.expected(attitude, state.bias, r_w_kf)
+        tilt_sigma = np.radians(max(self.origin.attitude_sigma_deg, 1.0))
+        if attitude.pitch_rad is None or attitude.roll_rad is None:
+            r_w_k, tilt_sigma = r_w_kf, UNKNOWN_ATTITUDE_RAD  # nobody knows of a change of tilt
+        share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
+        ground = self._ground(p, height, place_cov, share)
+        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
+        if motion is None:
+            return None
+        dt_s = max(odometry.t_ns * 1e-9 - self.graph.time_of(parent), 1e-3)
+        possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + height
+        return (parent, motion) if possible else None
+
+    def _ground(self, p_m: np.ndarray, height_m: float, place_cov: np.ndarray, share: float) -> Ground:
+        """The plane under a camera at ``p_m`` (3,), known to ``place_cov`` (3x3). ``share`` of the matches agreed."""
+        ground = self.terrain.seen_from(p_m, height_m, float(np.sqrt(place_cov[2, 2])), share)
+        # Its slope was fitted at one place: where the camera may be elsewhere, the ground may lie higher or lower.
+        slope = np.array([ground.slope_e, ground.slope_n])
+        level_m = RELIEF_REPEATS * float(np.sqrt(slope @ place_cov[:2, :2] @ slope))
+        return replace(ground, level_share=float(np.hypot(ground.level_share, level_m / height_m)))
+
+    def _by_guess(
+        self, attitude: Attitude, stands: bool, led_to_m: np.ndarray, spread: np.ndarray
+    ) -> tuple[int, RelativePose]:
+        """Nothing was seen: where velocity leads; the heading from the compass. A vehicle that stands is where it was
+        when that began: a long silence is one guess from there, not a chain of short ones."""
+        parent = self.graph.newest
+        if stands and self._stood_at is not None and self.graph.holds(self._stood_at):
+            parent = self._stood_at
+            self.graph.keep(parent)
+        state = self.graph.state(parent)
+        r_parent = state.pose.rotation().matrix()
+        r_w_c = self.camera.expected(attitude, state.bias, r_parent)
+        turn = UNKNOWN_ATTITUDE_RAD + (0.3 if attitude.yaw_rad is None else np.radians(self.origin.yaw_sigma_deg))
+        cov = np.diag([turn, turn, turn, 0.0, 0.0, 0.0]) ** 2
+        cov[3:, 3:] = r_w_c.T @ spread[:3, :3] @ r_w_c
+        step = np.zeros(3) if stands else led_to_m - state.pose.translation()
+        return parent, RelativePose(r_parent.T @ r_w_c, r_parent.T @ step, cov)
+
+    def _placed(self, frame_id: int, t_s: float, node: int) -> Placed:
+        if self.mode is CovarianceMode.MARGINALS and node == self.graph.newest:
+            self._velocity_cov = self.graph.velocity_covariance(node)
+        state = self.graph.state(node)
+        velocity = state.velocity[:3]
+        return Placed(frame_id, t_s, state.pose, self._covariance(node), velocity, self._velocity_cov[:3, :3], node)
+
+    def _covariance(self, node: int) -> np.ndarray:
+        """Of C_node, 6x6, tangent order: the smoother's marginal, or under thermal throttle what the chain of motions
+        and the inliers of the map fixes gave (O(inliers), ON-2)."""
+        if self.mode is CovarianceMode.MARGINALS or node not in self._cov_of:
+            self._cov_of[node] = self.graph.covariance(node)
+        return self._cov_of[node]
+
+
+def _compose_cov(cov_parent: np.ndarray, motion: RelativePose) -> np.ndarray:
+    """Covariance of parent * motion, tangent order, first order."""
+    adjoint = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m).inverse().AdjointMap()
+    return adjoint @ cov_parent @ adjoint.T + motion.cov

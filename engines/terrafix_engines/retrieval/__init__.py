@@ -1,0 +1,1 @@
+"""Descriptors of ground for place recognition."""

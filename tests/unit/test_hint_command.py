@@ -1,0 +1,123 @@
+"""`terrafix hint`: from the command line over the bus to whoever hears it, and the answer back."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+
+from terrafix.core import rundir
+from terrafix.core.bus import Publisher, Subscriber
+from terrafix.core.errors import LinkError, UsageError
+from terrafix.core.rundir import OwnedRunDir, RunDir, living
+from terrafix.core.shell import OPERATOR
+from terrafix.messages import HintVerdict, PositionHint, Verdict
+from terrafix_tools.hint import send
+from terrafix_tools.hint.send import HEARERS, hint
+
+pytestmark = pytest.mark.real_time
+
+
+class Flying:
+    """Stands for the processes that hear a hint; the anchor among them answers with ``verdict``."""
+
+    def __init__(self, run: RunDir, verdict: Verdict | None) -> None:
+        self._run, self._verdict = run, verdict
+        self.heard: list[PositionHint] = []
+        self._stop, self._ready = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._live, daemon=True)
+        self._thread.start()
+        self._ready.wait(5.0)
+
+    def _live(self) -> None:
+        with zmq.Context() as context:
+            says = Publisher(context, self._run.address("anchor"))
+            hears = [Subscriber(context, [self._run.address(OPERATOR)], (PositionHint,)) for _ in HEARERS]
+            self._ready.set()
+            while not self._stop.is_set():
+                says.serve()
+                for i, subscriber in enumerate(hears):
+                    subscriber.socket.poll(5)
+                    for message in subscriber.receive():
+                        if i == 0 and isinstance(message, PositionHint):
+                            self.heard.append(message)
+                            self._answer(says, message)
+            for socket in (says, *hears):
+                socket.close()
+
+    def _answer(self, says: Publisher, said: PositionHint) -> None:
+        for of in (said.t_ns - 1, said.t_ns):  # the first one answers somebody else
+            if self._verdict is not None:
+                text = "hint not used, 12 km from us" if of == said.t_ns else "of another"
+                says.say(
+                    HintVerdict(t_ns=of, hint_t_ns=of, verdict=self._verdict, distance_m=1.0, sigma_m=1.0, text=text)
+                )
+
+    def land(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunDir]:
+    monkeypatch.setattr(rundir, "SHM", tmp_path)
+    owned = OwnedRunDir()
+    yield owned.run_dir
+    owned.remove()
+
+
+@pytest.mark.parametrize("verdict", [Verdict.ACCEPTED, Verdict.INNOVATION])
+def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verdict) -> None:
+    flying = Flying(run, verdict)
+    try:
+        assert hint(48.1, -11.5, 3000.0) == "hint not used, 12 km from us"
+    finally:
+        flying.land()
+    (heard,) = flying.heard
+    assert (heard.lat_deg, heard.lon_deg, heard.radius_m, heard.source) == (48.1, -11.5, 3000.0, "command line")
+
+
+def test_without_a_frame_it_says_that_the_hint_waits(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(send, "ANSWER_S", 0.1)
+    flying = Flying(run, None)
+    try:
+        assert "waits for the next one" in hint(48.1, 11.5, 3000.0, str(run.path))
+    finally:
+        flying.land()
+
+
+def test_processes_that_do_not_listen_yet_are_said(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(send, "HEARD_S", 0.1)
+    with pytest.raises(LinkError, match="is Terrafix still starting"):
+        hint(48.1, 11.5, 3000.0)
+
+
+def test_nobody_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rundir, "SHM", tmp_path)
+    (tmp_path / "terrafix-dead").mkdir()
+    (tmp_path / "terrafix-dead" / "lock").touch()
+    with pytest.raises(LinkError, match="no Terrafix flies on this computer"):
+        hint(48.1, 11.5, 3000.0)
+    with pytest.raises(UsageError, match="no such folder"):
+        hint(48.1, 11.5, 3000.0, str(tmp_path / "nothing"))
+
+
+def test_of_several_one_must_be_named(run: RunDir) -> None:
+    other = OwnedRunDir()
+    try:
+        assert {r.path for r in living()} == {run.path, other.run_dir.path}
+        with pytest.raises(UsageError, match="several fly here; name one: --run "):
+            hint(48.1, 11.5, 3000.0)
+    finally:
+        other.remove()
+    assert [r.path for r in living()] == [run.path]
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon", "radius", "text"),
+    [(91.0, 0.0, 5000.0, "is no place"), (0.0, 181.0, 5000.0, "is no place"), (48.0, 11.0, 10.0, "--radius 10")],
+)
+def test_what_cannot_be_is_said(lat: float, lon: float, radius: float, text: str) -> None:
+    with pytest.raises(UsageError, match=text):
+        hint(lat, lon, radius)

@@ -1,0 +1,134 @@
+"""ONNX files of a few nodes, written byte by byte (onnx.proto3, protocol buffers): no test needs real weights."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+Shape = list[int | str]
+TYPES = {"float32": 1, "int32": 6, "int64": 7, "float16": 10}
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    value &= (1 << 64) - 1
+    while value >= 0x80:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def _number(field: int, value: int) -> bytes:
+    return _varint(field << 3) + _varint(value)
+
+
+def _block(field: int, content: bytes | str) -> bytes:
+    content = content.encode() if isinstance(content, str) else content
+    return _varint(field << 3 | 2) + _varint(len(content)) + content
+
+
+def tensor(name: str, array: np.ndarray) -> bytes:
+    """An initializer."""
+    dims = b"".join(_number(1, size) for size in array.shape)
+    return dims + _number(2, TYPES[array.dtype.name]) + _block(8, name) + _block(9, array.tobytes())
+
+
+def node(kind: str, inputs: list[str], outputs: list[str], **ints: int | list[int]) -> bytes:
+    """Attributes are whole numbers or lists of them."""
+    body = b"".join(_block(1, name) for name in inputs) + b"".join(_block(2, name) for name in outputs)
+    body += _block(4, kind)
+    for name, value in ints.items():
+        if isinstance(value, int):
+            attribute = _block(1, name) + _number(3, value) + _number(20, 2)
+        else:
+            attribute = _block(1, name) + b"".join(_number(8, one) for one in value) + _number(20, 7)
+        body += _block(5, attribute)
+    return body
+
+
+def value(name: str, shape: Shape, dtype: str = "float32") -> bytes:
+    """An input or an output."""
+    dims = b"".join(_block(1, _number(1, s) if isinstance(s, int) else _block(2, s)) for s in shape)
+    return _block(1, name) + _block(2, _block(1, _number(1, TYPES[dtype]) + _block(2, dims)))
+
+
+def model(nodes: list[bytes], initializers: list[bytes], inputs: list[bytes], outputs: list[bytes]) -> bytes:
+    """A file of opset 17."""
+    graph = b"".join(_block(1, one) for one in nodes) + _block(2, "tiny")
+    graph += b"".join(_block(5, one) for one in initializers)
+    graph += b"".join(_block(11, one) for one in inputs) + b"".join(_block(12, one) for one in outputs)
+    return _number(1, 8) + _block(7, graph) + _block(8, _number(2, 17))
+
+
+def xfeat_like(nan: str = "never") -> bytes:
+    """Tensors of XFeat, one convolution each. ``nan``: "never", "always", or "blue": where a cell is pure blue."""
+    rng = np.random.default_rng(1)
+    weights = {name: rng.normal(size=(c, 3, 8, 8)).astype(np.float32) for name, c in (("d", 64), ("k", 65), ("r", 1))}
+    red = np.zeros((1, 3, 8, 8), np.float32)
+    red[0, 0], red[0, 2] = 1 / 64, -1 / 64  # of the mean of a cell, more than blue
+    least = np.array({"never": 9.0, "blue": 0.5, "always": -9.0}[nan], np.float32)
+    convolution = {"kernel_shape": [8, 8], "strides": [8, 8]}
+    nodes = [
+        node("Conv", ["input", "d"], ["plain"], **convolution),
+        node("Conv", ["input", "k"], ["keypoint_logits"], **convolution),
+        node("Conv", ["input", "r"], ["reliability"], **convolution),
+        node("Conv", ["input", "red"], ["redder"], **convolution),
+        node("Add", ["redder", "least"], ["above"]),
+        node("Sqrt", ["above"], ["root"]),
+        node("Mul", ["root", "zero"], ["nothing"]),
+        node("Add", ["plain", "nothing"], ["descriptors"]),
+    ]
+    initializers = [tensor(n, a) for n, a in weights.items()]
+    initializers += [tensor("red", red), tensor("least", least), tensor("zero", np.array(0.0, np.float32))]
+    outputs = [
+        value(n, ["b", c, "h", "w"]) for n, c in (("descriptors", 64), ("keypoint_logits", 65), ("reliability", 1))
+    ]
+    return model(nodes, initializers, [value("input", ["batch", 3, "height", "width"])], outputs)
+
+
+def constants(inputs: dict[str, tuple[Shape, str]], outputs: dict[str, np.ndarray]) -> bytes:
+    """Gives the same whatever goes in."""
+    nodes = [node("Identity", [f"{name}_is"], [name]) for name in outputs]
+    return model(
+        nodes,
+        [tensor(f"{name}_is", array) for name, array in outputs.items()],
+        [value(name, shape, dtype) for name, (shape, dtype) in inputs.items()],
+        [value(name, list(array.shape), array.dtype.name) for name, array in outputs.items()],
+    )
+
+
+def write(folder: Path, manifest: str, content: bytes) -> Path:
+    """The model NAME.onnx and its manifest, which gets file, sha256 and size. -> the model."""
+    name = next(line.split('"')[1] for line in manifest.splitlines() if line.startswith("name = "))
+    path = folder / f"{name}.onnx"
+    path.write_bytes(content)
+    head = f'file = "{path.name}"\nsha256 = "{hashlib.sha256(content).hexdigest()}"\nsize_bytes = {len(content)}\n'
+    (folder / f"{name}.toml").write_text(head + manifest)
+    return path
+
+
+XFEAT_LIKE = """name = "tiny"
+title = "tensors of XFeat"
+role = "dense"
+licence = "CC0"
+[image]
+input = "input"
+colour = "rgb"
+multiple = 8
+[[inputs]]
+name = "input"
+shape = ["batch", 3, "height", "width"]
+[[outputs]]
+name = "descriptors"
+shape = ["batch", 64, "height/8", "width/8"]
+[[outputs]]
+name = "keypoint_logits"
+shape = ["batch", 65, "height/8", "width/8"]
+[[outputs]]
+name = "reliability"
+shape = ["batch", 1, "height/8", "width/8"]
+[[presets]]
+sizes = { batch = 1, height = 32, width = 64 }
+[[presets]]
+sizes = { batch = 1, height = 64, width = 64 }
+"""

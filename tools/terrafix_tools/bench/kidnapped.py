@@ -1,0 +1,173 @@
+"""Kidnapped starts: from the middle of a flight, without any position. How soon is the place found, and is it right?
+
+python -m terrafix_tools.bench.kidnapped FLIGHT [FLIGHT ...] [--map MAP] [--tries 20] [--frames 10] [--stride 1]
+
+Each try begins at another frame of the flight, one in each stretch, with the processes of ``terrafix replay`` just
+started and no start coordinate. ``--map`` of another place is a test, too: there nothing may be found."""
+
+import argparse
+import csv
+import itertools
+import json
+import random
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import msgspec
+import typer
+
+from terrafix.anchor.map_package import MapPackage
+from terrafix.core.config import load
+from terrafix.core.errors import SourceError, TerrafixError, UsageError
+from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import NodeContext
+from terrafix.core.shell import InProcessShell
+from terrafix.core.start import placed
+from terrafix.messages import MapMatch, Message, NavEstimate, Origin
+from terrafix.vision.sources import Source, open_source
+from terrafix_tools.mapping.build import ensure_package
+from terrafix_tools.replay import FRAMES_KEPT, make_nodes, map_cache_dir
+
+RIGHT_M, RIGHT_PER_AGL = 50.0, 0.1  # a place is right within this, or within this share of the height if that is more
+CLAIM_SIGMAS = 3.2  # an error beyond this many claimed sigmas, and not right: a wrong place was announced
+CLAIMED_FIX = 1.0  # heights: a 1-sigma below this claims a place
+
+Truth = dict[str, tuple[float, float]]  # file -> (lat_deg, lon_deg)
+
+
+@dataclass(frozen=True)
+class Try:
+    """One kidnapped start. ``found_after``: frames, None if it was not found; ``wrong``: frames on which a wrong place
+    was announced."""
+
+    first: int
+    found_after: int | None
+    error_m: float | None
+    wrong: int
+    frames: int
+    way_agl: float  # flown within the frames, in heights
+    cpu_s_a_frame: float
+
+
+def attempt(source: Source, package: Path, truth: Truth, first: int, frames: int, stride: int, compass: bool) -> Try:
+    """The processes from frame ``first`` on, for ``frames`` frames."""
+    store, heard = MemoryFrameStore(FRAMES_KEPT), list[Message]()
+    with tempfile.TemporaryDirectory(prefix="terrafix-kidnapped-") as out:
+        ctx = NodeContext(config=load([]), frames=store, map_path=package.resolve(), out_dir=Path(out))
+        shell = InProcessShell(make_nodes(ctx), lambda _who, message: heard.append(message))
+    shell.feed(_nowhere(source, package))
+    found_after, error_m, wrong, used, way_agl, cpu_s = None, None, 0, 0, 0.0, 0.0
+    before: tuple[float, float] | None = None
+    for i, shot in enumerate(itertools.islice(source.shots(), first, first + frames * stride)):
+        for state in shot.states:
+            shell.feed(state if compass else msgspec.structs.replace(state, yaw_rad=None))
+        for readings in shot.imu:
+            shell.feed(readings)
+        if i % stride:
+            continue
+        if shot.image is not None:
+            store.put(shot.frame.frame_id, shot.image)
+        heard.clear()
+        began_s = time.process_time()
+        shell.feed(shot.frame)
+        cpu_s += time.process_time() - began_s
+        used += 1
+        here = truth.get(shot.frame.file)
+        estimates = [m for m in heard if isinstance(m, NavEstimate)]
+        if here is None or not estimates:
+            continue
+        estimate = estimates[-1]
+        way_agl += 0.0 if before is None else _apart_m(before, here) / estimate.agl_m
+        before = here
+        off_m = _apart_m(here, (estimate.lat_deg, estimate.lon_deg))
+        right = off_m <= max(RIGHT_M, RIGHT_PER_AGL * estimate.agl_m)
+        sigma_m = max(estimate.cov[0], estimate.cov[7]) ** 0.5
+        found = any(m.found for m in heard if isinstance(m, MapMatch))
+        if found and right and found_after is None:
+            found_after, error_m = used, off_m
+        claims = sigma_m < CLAIMED_FIX * estimate.agl_m and off_m > CLAIM_SIGMAS * sigma_m
+        wrong += not right and (found or claims)
+    return Try(first, found_after, error_m, wrong, used, round(way_agl, 2), round(cpu_s / max(used, 1), 2))
+
+
+def measure(
+    flight: str, map_path: Path | None, tries: int, frames: int, stride: int, seed: int, compass: bool
+) -> list[Try]:
+    """Raises the TerrafixError family."""
+    source = open_source(flight)
+    wanted = map_path or source.map_hint()
+    if wanted is None:
+        raise UsageError(f"{flight}: the flight names no map; give one with --map")
+    package = ensure_package(wanted, map_cache_dir())
+    truth = _truth(Path(flight))
+    starts = max(1, (source.length() or 0) - frames * stride + 1)
+    draw = random.Random(seed)
+    drawn = {min(int((k + draw.random()) * starts / tries), starts - 1) for k in range(tries)}
+    return [attempt(source, package, truth, first, frames, stride, compass) for first in sorted(drawn)]
+
+
+def _nowhere(source: Source, package: Path) -> Origin:
+    """The origin of the source without its start: the middle of the map, as wide as the map."""
+    opened = MapPackage.open(package)
+    unknown = msgspec.structs.replace(source.origin(), start_sigma_m=float("inf"))
+    origin = placed(unknown, opened.manifest.bounds_wgs84)
+    return msgspec.structs.replace(origin, ground_amsl_m=opened.ground_amsl_m(origin.lat_deg, origin.lon_deg))
+
+
+def _truth(flight: Path) -> Truth:
+    path = flight / "truth.csv"
+    try:
+        with path.open(encoding="utf-8") as lines:
+            return {r["file"]: (float(r["lat_deg"]), float(r["lon_deg"])) for r in csv.DictReader(lines)}
+    except (OSError, KeyError, ValueError) as error:
+        raise SourceError(f"{path}: no usable truth ({error}); kidnapped starts need one") from None
+
+
+def _apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:
+    e_m, n_m = LocalFrame(*a).to_local(*b)
+    return float((e_m**2 + n_m**2) ** 0.5)
+
+
+def row(name: str, tries: list[Try]) -> str:
+    found = sorted(t.found_after for t in tries if t.found_after is not None)
+    after = f"after {statistics.median(found):.0f} (worst {found[-1]})" if found else "never"
+    return (
+        f"{name:28} {len(tries):5} {len(found):5}  {after:22} {sum(t.wrong > 0 for t in tries):5}"
+        f" {statistics.median(t.way_agl for t in tries):8.1f} {statistics.mean(t.cpu_s_a_frame for t in tries):8.2f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("flights", nargs="+", metavar="FLIGHT")
+    parser.add_argument("--map", type=Path, help="instead of the one that each flight names")
+    parser.add_argument("--tries", type=int, default=20)
+    parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--stride", type=int, default=1, help="uses every so-manieth frame")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--no-compass", action="store_true")
+    parser.add_argument("--json", type=Path, help="writes every try")
+    given = parser.parse_args()
+    typer.echo(f"{'flight':28} tries found  {'frames, median':22} wrong  heights  CPU s a frame")
+    all_tries: dict[str, list[Try]] = {}
+    try:
+        for flight in given.flights:
+            name = Path(flight).name
+            all_tries[name] = measure(
+                flight, given.map, given.tries, given.frames, given.stride, given.seed, not given.no_compass
+            )
+            typer.echo(row(name, all_tries[name]))
+    except TerrafixError as error:
+        sys.exit(f"{error}")
+    if given.json is not None:
+        written = {name: [asdict(t) for t in tries] for name, tries in all_tries.items()}
+        given.json.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""finalised.csv: one row for each frame of a record, by all that was measured; docs/finalise.md has the columns."""
+
+import csv
+import json
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from terrafix.core.errors import OutputError
+from terrafix_tools.estimates import PARTIAL, number, read_table
+
+TABLE, SUMMARY = "finalised.csv", "finalised.json"
+
+
+@dataclass
+class FinalRow:
+    """``None`` is an empty cell: not known. Field order is column order; names are those of estimates.csv."""
+
+    file: str
+    t_s: float
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    alt_amsl_m: float | None = None
+    sigma_e_m: float | None = None
+    sigma_n_m: float | None = None
+    cov_en_m2: float | None = None
+    sigma_u_m: float | None = None
+    yaw_deg: float | None = None
+
+
+# Digits after the point: fixed, so that the same record gives the same bytes. 1e-8 degree is 1 mm.
+DIGITS = {"t_s": 3, "lat_deg": 8, "lon_deg": 8, "cov_en_m2": 5, "alt_amsl_m": 3, "yaw_deg": 3}
+OTHER_DIGITS = 4
+
+
+def write(folder: Path, rows: list[FinalRow], summary: dict[str, Any]) -> None:
+    """Raises OutputError. Both files get their names when they are whole."""
+    try:
+        with (folder / (TABLE + PARTIAL)).open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(f.name for f in fields(FinalRow))
+            writer.writerows(_cells(row) for row in rows)
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        (folder / (SUMMARY + PARTIAL)).write_text(text, encoding="utf-8")
+        for name in (TABLE, SUMMARY):
+            (folder / (name + PARTIAL)).replace(folder / name)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror}); is the disk full, or read-only?") from None
+
+
+def read_track(path: Path) -> list[tuple[float, float]]:
+    """Latitude and longitude of the rows that have them. Raises EvaluationError. Frames of a live camera have no file
+    name: here a row is known by its time."""
+    track = []
+    for line, row in read_table(path, ("t_s", "lat_deg", "lon_deg"), "write it with 'terrafix finalise'", key="t_s"):
+        lat_deg, lon_deg = (number(path, line, name, row[name]) for name in ("lat_deg", "lon_deg"))
+        if lat_deg is not None and lon_deg is not None:
+            track.append((lat_deg, lon_deg))
+    return track
+
+
+def _cells(row: FinalRow) -> list[str]:
+    cells = [row.file]
+    for field in fields(FinalRow)[1:]:
+        value = getattr(row, field.name)
+        if value is None:
+            cells.append("")
+            continue
+        digits = DIGITS.get(field.name, OTHER_DIGITS)
+        rounded = round(value, digits)
+        cells.append(f"{rounded if rounded or math.isnan(rounded) else 0.0:.{digits}f}")  # no minus zero
+    return cells

@@ -1,0 +1,170 @@
+"""`terrafix finalise`: the record of a flight, smoothed as a whole after landing."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from terrafix.core.camera import Mount
+from terrafix.core.errors import SourceError
+from terrafix.core.geodesy import LocalFrame, yaw_of
+from terrafix.core.pose import exp_so3, tangent_to_world
+from terrafix.estimator.smoothing import Smoothed, smooth
+from terrafix.estimator.whole import Retold, Storyteller
+from terrafix.messages import Frame, SourceEnded
+from terrafix.processes import PROCESSES
+from terrafix.recorder.reader import ReadResult, read_flight
+from terrafix.recorder.writer import RECORD_FORMAT, versions
+from terrafix_tools.estimates import NS
+from terrafix_tools.finalise.output import TABLE, FinalRow, write
+
+# What the estimator decided by; its own refinement at the end is what this is to be better than.
+HEARD = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.hears if t is not SourceEnded)
+
+Step = Callable[[str, int, int | None], None]
+
+
+def finalise(folder: Path, *, progress: bool = False) -> dict[str, Any]:
+    """Writes finalised.csv and finalised.json beside the record and returns the summary (docs/finalise.md).
+
+    ``folder``: of a replay or of a live run, or a record file in it. Raises SourceError, OutputError."""
+    began_s = time.process_time()
+    result = ReadResult()
+    with _bar(progress) as step:
+        rows, flights = _told(folder, result, step)
+        summary: dict[str, Any] = {
+            "record": [path.name for path in result.files],
+            "cut_off": [path.name for path in result.cut_off],
+            "undecodable": result.undecodable,
+            "frames": len(rows),
+            "versions": versions(),
+            "flights": [_smoothed(flight, rows, step) for flight in flights],
+        }
+    summary["finalised"] = sum(row.lat_deg is not None for row in rows.values())
+    summary["cpu_s"] = round(time.process_time() - began_s, 2)
+    write(folder if folder.is_dir() else folder.parent, list(rows.values()), summary)
+    return summary
+
+
+def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
+    """What a person should know of it."""
+    for name in summary["cut_off"]:
+        yield f"{name} ends in the middle of a record: what came before was used."
+    if summary["undecodable"]:
+        yield f"{summary['undecodable']} messages are of another version of this program, and were left out."
+    for flight in summary["flights"]:
+        fixes = flight["map_matches"]
+        if not fixes["believed"]:
+            yield "No map match is believed: the track hangs on the start coordinate and on odometry alone."
+        for why in flight["not_placed"]:
+            yield f"{why['frames']} frames have no place: {why['why']}."
+    found = [f["map_matches"] for f in summary["flights"]]
+    yield (
+        f"{summary['finalised']} of {summary['frames']} frames placed by {sum(f['believed'] for f in found)} map "
+        f"matches ({sum(f['refused'] for f in found)} refused); written to {folder / TABLE}"
+    )
+
+
+def _told(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, FinalRow], list[Retold]]:
+    """-> a row for every frame, in order of arrival; the flights of the record."""
+    storyteller = Storyteller()
+    rows: dict[int, FinalRow] = {}
+    for _, _, message in read_flight(folder, result):
+        if isinstance(message, Frame):
+            rows.setdefault(message.frame_id, FinalRow(message.file, message.t_ns / NS))
+            step("read", len(rows), None)
+        if isinstance(message, HEARD):
+            storyteller.on(message)
+    where = ", ".join(path.name for path in result.files)
+    if not result.header:
+        raise SourceError(f"{folder}: {where} is not a flight record, or ends before its head; give another")
+    if result.header["format"] != RECORD_FORMAT:
+        raise SourceError(
+            f"{folder}: {where} is a record of format '{result.header['format']}', and this program reads "
+            f"'{RECORD_FORMAT}'; finalise it with the version that wrote it"
+        )
+    if not storyteller.flights or not rows:
+        missing = "no frame" if storyteller.flights else "no origin of a flight"
+        also = f" ({result.undecodable} messages are of another version)" if result.undecodable else ""
+        raise SourceError(f"{folder}: {where} has {missing}{also}; was the source of the flight opened?")
+    for flight in storyteller.flights:
+        flight.graph.remember()
+    return rows, [flight for flight in storyteller.flights if flight.node_of]
+
+
+def _smoothed(flight: Retold, rows: dict[int, FinalRow], step: Step) -> dict[str, Any]:
+    """Fills the rows of one flight. -> what the summary says of it."""
+    try:
+        found = smooth(flight, lambda done, of: step("smooth", done, of))
+    except RuntimeError as error:  # how GTSAM says that a system is indeterminate
+        reason = f"what was measured leaves the track open ({str(error).strip().splitlines()[0]})"
+        return _said(flight, None, [{"frames": len(flight.node_of), "why": reason}])
+    frame = LocalFrame(flight.origin.lat_deg, flight.origin.lon_deg)
+    r_b_c = Mount.of(flight.origin.camera).r_b_c()
+    lost: Counter[int] = Counter()
+    for frame_id, node in flight.node_of.items():
+        if not found.placed[node]:
+            lost[int(found.begins[node])] += 1
+        elif frame_id in rows:
+            _fill(rows[frame_id], found, node, frame, r_b_c)
+    why = "no map match is believed there, and where it began is not known"
+    return _said(flight, found, [{"frames": count, "why": why} for count in lost.values()])
+
+
+def _fill(row: FinalRow, found: Smoothed, node: int, frame: LocalFrame, r_b_c: np.ndarray) -> None:
+    pose = found.poses[node]
+    r_w_c, p = pose.rotation().matrix(), pose.translation()
+    cov = tangent_to_world(found.covs[node], r_w_c)
+    tilt = exp_so3(np.array([*found.bias[node][:2], 0.0]))
+    row.lat_deg, row.lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
+    row.alt_amsl_m = float(p[2])
+    row.sigma_e_m, row.sigma_n_m, row.sigma_u_m = (math.sqrt(float(cov[i, i])) for i in range(3))
+    row.cov_en_m2 = float(cov[0, 1])
+    row.yaw_deg = math.degrees(yaw_of(r_w_c @ (r_b_c @ tilt).T)) % 360.0
+
+
+def _said(flight: Retold, found: Smoothed | None, not_placed: list[dict[str, Any]]) -> dict[str, Any]:
+    believed = int(found.believed.sum()) if found else 0
+    offsets = found.map_offset_m if found else {}
+    tilt_deg = np.degrees(np.median(found.bias[:, :2], axis=0)) if found else None
+    return {
+        "frames": len(flight.node_of),
+        "map_matches": {
+            "believed": believed,
+            "refused": len(flight.fixes) - believed,
+            "none": dict(sorted(flight.refused.items())),
+        },
+        "pieces": len(set(found.begins.tolist())) if found else 0,
+        "starts_believed": sum(found.start_believed.values()) if found else 0,
+        "mount_tilt_deg": None if tilt_deg is None else [round(float(v), 3) for v in tilt_deg],
+        "map_offset_m": [
+            {
+                "map_sigma_m": round(sigma_m, 3),
+                "offset_m": [round(float(v), 3) for v in offset[:2]],
+                "sigma_m": [round(float(v), 3) for v in sigmas[:2]],
+            }
+            for sigma_m, (offset, sigmas) in offsets.items()
+        ],
+        "not_placed": not_placed,
+    }
+
+
+@contextmanager
+def _bar(shown: bool) -> Iterator[Step]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not shown, transient=True) as bar:
+        tasks: dict[str, Any] = {}
+
+        def step(name: str, done: int, of: int | None) -> None:
+            if name not in tasks:
+                tasks[name] = bar.add_task(name, total=of)
+            bar.update(tasks[name], completed=done, total=of)
+
+        yield step

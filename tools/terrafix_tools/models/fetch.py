@@ -1,0 +1,115 @@
+"""`terrafix models fetch`: weights into the models folder, whole or not at all.
+
+What has come stands in NAME.part, and the next try goes on with it (HTTP range). A file gets its own name when its
+checksum is right."""
+
+import fcntl
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+from terrafix.core.errors import ModelError, OutputError
+from terrafix_engines.manifest import Manifest
+from terrafix_engines.store import State, Stored, sha256_of
+from terrafix_tools.models.known import chosen, state_of
+
+OnBytes = Callable[[int], None]  # all that is there so far
+
+
+def fetch_all(names: list[str], source: str, folder: str) -> None:
+    """Raises ModelError (no such model, network, checksum) and OutputError (folder cannot be written)."""
+    for model in chosen(names, folder):
+        m = model.manifest
+        if state_of(model) is State.READY:
+            typer.echo(f"{m.name}: is there already, as published ({model.path})")
+            continue
+        origin = _origin(m, source)
+        typer.echo(f"{m.name}: {m.title}, {m.size_bytes / 1e6:.1f} MB, licence {m.licence}")
+        if m.credit:
+            typer.echo(f"{m.name}: {m.credit}")
+        typer.echo(f"{m.name}: from {origin}")
+        try:
+            _fetch(model, origin)
+        except OSError as error:
+            raise OutputError(f"{error.filename or model.path}: {error.strerror}; the model was not fetched") from None
+        typer.echo(f"{m.name}: sha256 is right; {model.path}")
+
+
+def _origin(manifest: Manifest, source: str) -> str | Path:
+    """An address, or a file that exists. Raises ModelError."""
+    if not source:
+        if not manifest.source:
+            raise ModelError(f"{manifest.name}: is not to be had from a network; give the file with --from")
+        return manifest.source
+    if source.startswith(("http://", "https://")):
+        return source + manifest.file if source.endswith("/") else source
+    path = Path(source).expanduser()
+    path = path / manifest.file if path.is_dir() else path
+    if not path.is_file():
+        raise ModelError(f"{path}: no such file; --from is a file, the folder that has it, or an http(s) address")
+    return path
+
+
+def _fetch(model: Stored, origin: str | Path) -> None:
+    m = model.manifest
+    model.path.parent.mkdir(parents=True, exist_ok=True)
+    part = model.path.with_name(model.path.name + ".part")
+    with part.open("ab") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ModelError(f"{part}: another terrafix is fetching this model; wait for it") from None
+        try:
+            with _bar(m) as seen:
+                _bring(m, origin, part, seen)
+            found = sha256_of(part)
+            if found != m.sha256:
+                os.truncate(part, 0)
+                raise ModelError(
+                    f"{origin}: not the published file (sha256 {found[:12]}..., expected {m.sha256[:12]}...); "
+                    "it was not taken, try another --from"
+                )
+            os.fsync(lock.fileno())
+            part.replace(model.path)
+        finally:
+            if part.exists() and part.stat().st_size == 0:
+                part.unlink()
+
+
+def _bring(manifest: Manifest, origin: str | Path, part: Path, seen: OnBytes) -> None:
+    """Raises ModelError and OSError."""
+    if isinstance(origin, Path):
+        _copy(origin, part, seen)
+        return
+    from terrafix_tools.models.download import download  # needs urllib3, which a vehicle has not
+
+    went_on = part.stat().st_size > 0
+    download(manifest, origin, part, seen)
+    if went_on and sha256_of(part) != manifest.sha256:  # what was there before may be of another file
+        os.truncate(part, 0)
+        download(manifest, origin, part, seen)
+
+
+def _copy(origin: Path, part: Path, seen: OnBytes) -> None:
+    """Raises ModelError when the file cannot be read."""
+    try:
+        with origin.open("rb") as file, part.open("wb") as out:
+            shutil.copyfileobj(file, out)
+            seen(out.tell())
+    except PermissionError as error:
+        raise ModelError(f"{error.filename}: cannot be read ({error.strerror}); check its permissions") from None
+
+
+@contextmanager
+def _bar(manifest: Manifest) -> Iterator[OnBytes]:
+    console = Console(stderr=True)
+    columns = (TextColumn(manifest.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(manifest.name, total=manifest.size_bytes)
+        yield lambda there: progress.update(task, completed=there)

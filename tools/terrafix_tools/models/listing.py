@@ -1,0 +1,86 @@
+"""`terrafix models list` and `terrafix models verify`."""
+
+import json
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from terrafix.core.errors import ModelError
+from terrafix_engines import providers
+from terrafix_engines.runtime import Model, ModelFileError
+from terrafix_engines.store import State, Stored, models_folder
+from terrafix_tools.models.known import chosen, fetched, state_of
+
+
+def show(folder: str, *, as_json: bool) -> None:
+    """Every model that is known. Raises ModelError."""
+    models = [(model, state_of(model)) for model in chosen([], folder)]
+    if as_json:
+        rows = [_row(model, state) for model, state in models]
+        typer.echo(json.dumps({"folder": str(models_folder(folder)), "providers": usable(), "models": rows}, indent=2))
+        return
+    table = Table()
+    for title in ("name", "what", "state", "MB", "licence"):
+        table.add_column(title, justify="right" if title == "MB" else "left")
+    for model, state in models:
+        m = model.manifest
+        table.add_row(m.name, m.title, state.value, f"{m.size_bytes / 1e6:.1f}", m.licence)
+    console = Console()
+    console.print(table)
+    console.print(f"folder: {models_folder(folder)}", highlight=False, soft_wrap=True)
+    for provider, reason in usable().items():
+        console.print(f"{provider}: {reason or 'can be used'}", highlight=False, soft_wrap=True)
+
+
+def usable() -> dict[str, str]:
+    """Provider -> why not; empty: it can be used."""
+    found = {}
+    for provider in providers.PREFERENCE:
+        try:
+            providers.check(provider)
+            found[providers.short(provider)] = ""
+        except providers.UnavailableError as error:
+            found[providers.short(provider)] = str(error)
+    return found
+
+
+def verify_all(names: list[str], folder: str) -> None:
+    """A line for each model. Raises ModelError when one of them cannot be used."""
+    models = fetched(names, folder)
+    bad = 0
+    for model in models:
+        try:
+            opened = opened_whole(model)
+        except ModelFileError as error:
+            bad += 1
+            typer.echo(f"{model.manifest.name}: {error}")
+            continue
+        over = "".join(f"; not by {one}" for one in opened.passed_over)
+        typer.echo(f"{model.manifest.name}: as published, run by {providers.short(opened.provider)}{over}")
+    if bad:
+        raise ModelError(f"{bad} of {len(models)} models cannot be used")
+
+
+def opened_whole(model: Stored, *, prefer: tuple[str, ...] = providers.PREFERENCE, build: bool = False) -> Model:
+    """With all inputs and outputs that its manifest states. Raises ModelFileError."""
+    inputs = tuple(tensor.name for tensor in model.manifest.inputs)
+    outputs = tuple(tensor.name for tensor in model.manifest.outputs)
+    return model.open(inputs, outputs, prefer=prefer, build=build)
+
+
+def _row(model: Stored, state: State) -> dict[str, Any]:
+    m = model.manifest
+    return {
+        "name": m.name,
+        "title": m.title,
+        "role": m.role,
+        "state": state.value,
+        "path": str(model.path),
+        "size_bytes": m.size_bytes,
+        "sha256": m.sha256,
+        "licence": m.licence,
+        "credit": m.credit,
+        "source": m.source,
+    }

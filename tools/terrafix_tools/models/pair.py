@@ -1,0 +1,205 @@
+"""How well features find a place: a picture of it at one date, a map of another.
+
+A patch is cut from the first image, turned and scaled by a little that nobody tells the methods, and looked for in a
+window of the second one. What correlates densely tries a few turns and scales; what joins points is given the patch."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from terrafix.anchor.correlate import Searchable
+from terrafix.anchor.map_features import Describer
+from terrafix.core.errors import MapError
+from terrafix_engines.features import open_describer, open_detector, open_matcher
+from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_engines.features.keypoints import Detector, MutualNearest, PairMatcher
+from terrafix_engines.features.xfeat import XFeatDescriber
+from terrafix_engines.store import Stored
+from terrafix_tools.mapping.source import ImagerySource
+
+PATCH_PX, WINDOW_PX = 400, 700
+TURN_DEG, SCALE, SHIFT_PX = 5.0, 0.05, 120  # what is not known, to either side, evenly spread
+TURNS_DEG, SCALES = (-3.3, 0.0, 3.3), (0.967, 1.0, 1.033)  # of the dense methods: 1.7 degrees and 1.7 % remain
+POINTS = 1024  # of each picture
+RANSAC_PX, FEWEST_INLIERS = 3.0, 8
+NEAR_PX, FAR_PX = 5.0, 20.0
+SEED = 5
+EMPTY_SHARE = 0.02  # of pixels without imagery, at most
+
+Find = Callable[
+    [np.ndarray, np.ndarray], tuple[float, float] | None
+]  # patch, window -> the patch's middle in the window
+
+
+def measure_pair(models: list[Stored], first: Path, second: Path, trials: int) -> dict[str, Any]:
+    """-> method -> shares, errors, times. Raises MapError, ModelFileError, ModelRunError."""
+    camera, ground = _same_grid(first, second)
+    methods = _methods(models)
+    results: dict[str, dict[str, list[float]]] = {name: {"error_px": [], "cpu_ms": []} for name in methods}
+    rng = np.random.default_rng(SEED)
+    for _ in track(range(trials), "places", console=Console(stderr=True), transient=True):
+        patch, window, true_px = _place(camera, ground, rng)
+        for name, find in methods.items():
+            cpu_s = time.process_time()
+            found = find(patch, window)
+            results[name]["cpu_ms"].append((time.process_time() - cpu_s) * 1e3)
+            error_px = np.inf if found is None else float(np.hypot(found[0] - true_px[0], found[1] - true_px[1]))
+            results[name]["error_px"].append(error_px)
+    return {
+        "first": str(first),
+        "second": str(second),
+        "trials": trials,
+        "methods": {name: _summary(**one) for name, one in results.items()},
+    }
+
+
+def show_pair(result: dict[str, Any]) -> None:
+    names = f"{Path(result['first']).name} on {Path(result['second']).name}"
+    table = Table(title=f"{names}, {result['trials']} places", title_justify="left")
+    for title in ("method", f"<= {NEAR_PX:g} px", f"<= {FAR_PX:g} px", "none", "median", "cpu"):
+        table.add_column(title, justify="left" if title == "method" else "right", no_wrap=True)
+    for name, one in result["methods"].items():
+        error = "-" if one["median_px"] is None else f"{one['median_px']:.1f} px"
+        shares = (f"{100 * one[key]:.0f} %" for key in ("near", "far", "no_answer"))
+        table.add_row(name, *shares, error, f"{one['cpu_ms']:.0f} ms")
+    Console().print(table)
+
+
+def _methods(models: list[Stored]) -> dict[str, Find]:
+    """Without weights, and by every model that is there."""
+    methods: dict[str, Find] = {"SIFT": _sift, "gradients, dense": dense(GradientDescriber())}
+    detectors: dict[str, Detector] = {}
+    for model in models:
+        m = model.manifest
+        if m.role == "dense":
+            describer = open_describer(m.name, str(model.path.parent))
+            assert isinstance(describer, XFeatDescriber)
+            methods[f"{m.name}, dense"] = dense(describer)
+        if m.role in ("dense", "keypoints"):
+            detectors[m.name] = open_detector(model)
+            methods[f"{m.name}, nearest"] = sparse(detectors[m.name], MutualNearest())
+    for model in models:
+        if (spec := model.manifest.matcher) and spec.features in detectors:
+            methods[f"{spec.features}, {model.manifest.name}"] = sparse(detectors[spec.features], open_matcher(model))
+    return methods
+
+
+def dense(describer: Describer) -> Find:
+    """The correlation of the map matcher, over a grid of turns and scales."""
+    stride = describer.stride
+
+    def find(patch: np.ndarray, window: np.ndarray) -> tuple[float, float] | None:
+        side = WINDOW_PX // stride
+        searchable = Searchable(
+            describer.describe(window[: side * stride, : side * stride]), np.ones((side, side), bool)
+        )
+        best, at = -1.0, None
+        for turn in TURNS_DEG:
+            for scale in SCALES:
+                matrix = cv2.getRotationMatrix2D(((PATCH_PX - 1) / 2, (PATCH_PX - 1) / 2), turn, scale)
+                turned = cv2.warpAffine(patch, matrix, (PATCH_PX, PATCH_PX))
+                there = cv2.warpAffine(np.full(patch.shape[:2], 255, np.uint8), matrix, (PATCH_PX, PATCH_PX)) == 255
+                cells = PATCH_PX // stride
+                mask = np.asarray(there.reshape(cells, stride, cells, stride).all(axis=(1, 3)))
+                surface = searchable.search(describer.describe(turned), mask)
+                r, c = (int(v) for v in np.unravel_index(int(np.nanargmax(surface)), surface.shape))
+                if surface[r, c] > best:
+                    best, at = float(surface[r, c]), (c + _vertex(surface[r], c), r + _vertex(surface[:, c], r))
+        middle = (PATCH_PX - 1) / 2
+        return None if at is None else (at[0] * stride + middle, at[1] * stride + middle)
+
+    return find
+
+
+def sparse(detector: Detector, matcher: PairMatcher) -> Find:
+    """Points of both pictures, joined, and the similarity on which most of them agree."""
+
+    def find(patch: np.ndarray, window: np.ndarray) -> tuple[float, float] | None:
+        first, second = detector.detect(patch, POINTS), detector.detect(window, POINTS)
+        pairs, _ = matcher.match(first, second)
+        return _agreed(first.xy_px[pairs[:, 0]], second.xy_px[pairs[:, 1]])
+
+    return find
+
+
+def _sift(patch: np.ndarray, window: np.ndarray) -> tuple[float, float] | None:
+    sift = cv2.SIFT.create(2 * POINTS)
+    (k0, d0), (k1, d1) = (sift.detectAndCompute(cv2.cvtColor(p, cv2.COLOR_BGR2GRAY), None) for p in (patch, window))
+    if d0 is None or d1 is None or len(d1) < 2:
+        return None
+    good = [m for m, n in cv2.BFMatcher().knnMatch(d0, d1, k=2) if m.distance < 0.8 * n.distance]
+    first, second = [k0[m.queryIdx].pt for m in good], [k1[m.trainIdx].pt for m in good]
+    return _agreed(np.array(first, np.float32).reshape(-1, 2), np.array(second, np.float32).reshape(-1, 2))
+
+
+def _agreed(first: np.ndarray, second: np.ndarray) -> tuple[float, float] | None:
+    if len(first) < FEWEST_INLIERS:
+        return None
+    cv2.setRNGSeed(SEED)
+    matrix, inliers = cv2.estimateAffinePartial2D(first, second, method=cv2.RANSAC, ransacReprojThreshold=RANSAC_PX)
+    if matrix is None or int(inliers.sum()) < FEWEST_INLIERS:
+        return None
+    middle = (PATCH_PX - 1) / 2
+    x, y = matrix @ np.array([middle, middle, 1.0])
+    return float(x), float(y)
+
+
+def _vertex(line: np.ndarray, at: int) -> float:
+    """Extremum of the parabola through a place and its neighbours, in cells from it."""
+    if not 0 < at < len(line) - 1:
+        return 0.0
+    before, here, after = (float(v) for v in line[at - 1 : at + 2])
+    curvature = before - 2.0 * here + after
+    return 0.5 * (before - after) / curvature if curvature < -1e-9 else 0.0
+
+
+def _place(
+    camera: np.ndarray, ground: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A patch (PATCH_PX), a window (WINDOW_PX), and where the patch's middle lies in the window."""
+    height, width = ground.shape[:2]
+    for _ in range(1000):
+        corner = rng.integers(0, (width - WINDOW_PX + 1, height - WINDOW_PX + 1))
+        true_px = (WINDOW_PX - 1) / 2 + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
+        turn_deg, scale = rng.uniform(-TURN_DEG, TURN_DEG), 1.0 + rng.uniform(-SCALE, SCALE)
+        matrix = cv2.getRotationMatrix2D((0.0, 0.0), turn_deg, scale)
+        matrix[:, 2] = (PATCH_PX - 1) / 2 - matrix[:, :2] @ (corner + true_px)
+        patch = cv2.warpAffine(camera, matrix, (PATCH_PX, PATCH_PX), flags=cv2.INTER_AREA)
+        window = ground[corner[1] : corner[1] + WINDOW_PX, corner[0] : corner[0] + WINDOW_PX]
+        if max(np.mean(part.max(axis=2) == 0) for part in (patch, window)) <= EMPTY_SHARE:
+            return patch, window, true_px
+    raise MapError("the two images have no place in common that is large enough; choose another --pair")
+
+
+def _same_grid(first: Path, second: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Both images on the grid of the second one, (H, W, 3) uint8 BGR."""
+    with ImagerySource(first) as one, ImagerySource(second) as two:
+        if one.crs != two.crs:
+            raise MapError(f"{first}: another coordinate system than {second}; bring it into that one with gdalwarp")
+        if min(two.width_px, two.height_px) < WINDOW_PX:
+            raise MapError(f"{second}: {two.width_px} x {two.height_px} px, less than the {WINDOW_PX} px of a window")
+        camera, ground = (image.read(0, 0, image.width_px, image.height_px)[0] for image in (one, two))
+        wider, higher = one.pixel_x / two.pixel_x, one.pixel_y / two.pixel_y
+        east_px, south_px = (one.x_min - two.x_min) / two.pixel_x, (two.y_max - one.y_max) / two.pixel_y
+        # Corners of pixels lie so; OpenCV counts from their middles.
+        matrix = np.array([[wider, 0, east_px + 0.5 * wider - 0.5], [0, higher, south_px + 0.5 * higher - 0.5]])
+    return cv2.warpAffine(camera, matrix, (ground.shape[1], ground.shape[0]), flags=cv2.INTER_LINEAR), ground
+
+
+def _summary(error_px: list[float], cpu_ms: list[float]) -> dict[str, Any]:
+    errors = np.array(error_px)
+    answered = errors[np.isfinite(errors)]
+    return {
+        "near": float(np.mean(errors <= NEAR_PX)),
+        "far": float(np.mean(errors <= FAR_PX)),
+        "no_answer": float(np.mean(~np.isfinite(errors))),
+        "median_px": float(np.median(answered)) if len(answered) else None,
+        "cpu_ms": float(np.median(cpu_ms)),
+    }
