@@ -6,43 +6,16 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from ground import PINHOLE, FlatMap, rotation, texture, view
+from ground import PINHOLE, texture, view
+from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
 
 from terrafix.anchor.lost import LostWatch
 from terrafix.anchor.node import LOST_SIGMA_M, AnchorNode
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.messages import Camera, MapMatch, Origin, Prediction, SearchStep, Verdict
+from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
-
-AGL_M = 100.0
-SIDE_M = 400.0
-R = rotation(40.0)
-TRUE_M = np.array([20.0, -10.0, AGL_M])
-
-
-ORIGIN = Origin(
-    t_ns=0,
-    camera=Camera(width=640, height=360, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=319.5, cy=179.5),
-    lat_deg=48.0,
-    lon_deg=11.0,
-    ground_amsl_m=0.0,
-    start_sigma_m=10.0,
-    yaw_sigma_deg=2.0,
-    agl_sigma_m=2.0,
-    attitude_sigma_deg=1.0,
-)
-
-
-class OnlyMap(FlatMap):
-    """A package and what it is bound to in one."""
-
-    bounds_m = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
-    manifest = SimpleNamespace(layers=(SimpleNamespace(table="imagery", ce90_m=None),))
-
-    def bind(self, _frame: object, _layer: str) -> "OnlyMap":
-        return self
 
 
 @pytest.fixture(scope="module")

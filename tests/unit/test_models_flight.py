@@ -1,14 +1,14 @@
 """A learned model that fails in flight: contained, said, recorded, and in the end done without."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 import tiny_onnx
-from ground import PINHOLE, FlatMap, rotation, texture, view
+from ground import PINHOLE, texture, view
+from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
 
 from terrafix.anchor.model_watch import FAILURES
 from terrafix.anchor.node import LOST_SIGMA_M, AnchorNode, make_node
@@ -19,12 +19,10 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.node import NodeContext
 from terrafix.messages import (
-    Camera,
     MapMatch,
     Message,
     ModelChange,
     ModelEvent,
-    Origin,
     Prediction,
     SearchStep,
     Verdict,
@@ -34,32 +32,8 @@ from terrafix_engines.features.xfeat import XFeatDescriber
 from terrafix_engines.providers import CUDA, PassedOver
 from terrafix_engines.runtime import ModelRunError
 
-AGL_M = 100.0
-SIDE_M = 400.0
-R = rotation(40.0)
-TRUE_M = np.array([20.0, -10.0, AGL_M])
 BLUE = np.full((360, 640, 3), (255, 0, 0), np.uint8)
-ORIGIN = Origin(
-    t_ns=7,
-    camera=Camera(width=640, height=360, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=319.5, cy=179.5),
-    lat_deg=48.0,
-    lon_deg=11.0,
-    ground_amsl_m=0.0,
-    start_sigma_m=10.0,
-    yaw_sigma_deg=2.0,
-    agl_sigma_m=2.0,
-    attitude_sigma_deg=1.0,
-)
-
-
-class OnlyMap(FlatMap):
-    """A package and what it is bound to in one."""
-
-    bounds_m = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
-    manifest = SimpleNamespace(layers=(SimpleNamespace(table="imagery", ce90_m=None),))
-
-    def bind(self, _frame: object, _layer: str) -> "OnlyMap":
-        return self
+STARTED = msgspec.structs.replace(ORIGIN, t_ns=7)
 
 
 class Flight:
@@ -73,7 +47,7 @@ class Flight:
         self.seen = view(ground, PINHOLE, R, TRUE_M)
         package: Any = OnlyMap(ground)
         self.node = AnchorNode(self.frames, package, describer, 1.0)
-        self.begun = list(self.node.on(msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m)))
+        self.begun = list(self.node.on(msgspec.structs.replace(STARTED, start_sigma_m=start_sigma_m)))
 
     def frame(self, image: np.ndarray, sigma_m: float = 10.0) -> tuple[MapMatch, list[ModelEvent]]:
         self.frame_id += 1
@@ -176,6 +150,6 @@ def test_a_model_that_cannot_be_opened_is_refused_on_the_ground_and_done_without
 
     with pytest.raises(ModelError, match=r"xfeat\.onnx: cannot be run"):
         make_node(context(None))
-    (event,) = make_node(context(5)).on(ORIGIN)
+    (event,) = make_node(context(5)).on(STARTED)
     assert isinstance(event, ModelEvent)
     assert (event.change, event.model) == (ModelChange.GIVEN_UP, "gradient") and "cannot be run" in event.detail
