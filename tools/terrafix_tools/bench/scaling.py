@@ -46,42 +46,48 @@ def measure(
 
 def show(grown: dict[str, Any], console: Console) -> None:
     """Tables: what grows with the map, what with the flight, the merge. Times are processor times."""
-    table = Table(title="as the map grows (processor time)", title_justify="left")
-    for column in (
-        "km2",
-        "build",
-        "of it rendering",
-        f"rendering with {map_size.WORKERS} workers, by the clock",
-        "size",
-        "open",
-        "1 km, p95",
-        "look in flight",
-        "when lost",
-        "memory",
-    ):
-        table.add_column(column, justify="right")
+    by_size = []
     for one in grown["map"]:
-        looks = (f"{one['look_cpu_ms'][name]['median']:.0f} ms" for name in map_size.BELIEFS_M)
+        looks = {f"look {name}": f"{one['look_cpu_ms'][name]['median']:.0f} ms" for name in map_size.BELIEFS_M}
         read_ms = max(window["p95"] for window in one["window_cpu_ms"].values())
-        table.add_row(
-            f"{one['area_km2']:g}", f"{one['build_cpu_s']:.0f} s", f"{one['render_cpu_s']:.0f} s",
-            f"x {one['speed_up']:.1f}", f"{one['package_mb']:.0f} MB",
-            f"{one['open_cpu_ms']:.0f} ms", f"{read_ms:.0f} ms", *looks, f"{one['memory_mb']:.0f} MB")  # fmt: skip
-    console.print(table)
-    table = Table(title="as the flight grows (processor time, estimator alone)", title_justify="left")
-    queries = list(grown["flight"][0]["covariance_cpu_ms"])
-    for column in ("frames", "one frame", *(f"covariance: {name}" for name in queries), "refinement", "memory"):
-        table.add_column(column, justify="right")
+        by_size.append({
+            "": f"{one['area_km2']:g} km2",
+            "build": f"{one['build_cpu_s']:.0f} s",
+            "of it rendering": f"{one['render_cpu_s']:.0f} s",
+            f"rendering with {map_size.WORKERS} workers, by the clock": f"x {one['speed_up']:.1f}",
+            "size": f"{one['package_mb']:.0f} MB",
+            "open": f"{one['open_cpu_ms']:.0f} ms",
+            "window of 1 km, p95": f"{read_ms:.0f} ms",
+            **looks,
+            "memory": f"{one['memory_mb']:.0f} MB",
+        })  # fmt: skip
+    console.print(_side_by_side("as the map grows (processor time)", by_size))
+    by_length = []
     for one in grown["flight"]:
-        asked = (f"{one['covariance_cpu_ms'][name]['median']:.2f} ms" for name in queries)
-        table.add_row(
-            str(one["frames"]), f"{one['frame_cpu_ms']['median']:.1f} ms", *asked, f"{one['refine_cpu_s']:.1f} s",
-            f"{one['peak_memory_mb']:.0f} MB")  # fmt: skip
-    console.print(table)
+        asked = {f"covariance: {name}": f"{ms['median']:.2f} ms" for name, ms in one["covariance_cpu_ms"].items()}
+        by_length.append({
+            "": f"{one['frames']} frames",
+            "one frame": f"{one['frame_cpu_ms']['median']:.1f} ms",
+            **asked,
+            "refinement": f"{one['refine_cpu_s']:.1f} s",
+            "memory": f"{one['peak_memory_mb']:.0f} MB",
+        })  # fmt: skip
+    console.print(_side_by_side("as the flight grows (processor time, estimator alone)", by_length))
     merging.show(grown["merge"], console)
     one = grown["render"]
     size = f"{one['width_px']}x{one['height_px']}"
     console.print(f"a simulated frame of {size}: {one['cpu_ms']['median']:.0f} ms of processor time", highlight=False)
+
+
+def _side_by_side(title: str, cases: list[dict[str, str]]) -> Table:
+    """A column for each case, a row for each quantity."""
+    table = Table(title=title, title_justify="left")
+    for i, head in enumerate(["", *(case[""] for case in cases)]):
+        table.add_column(head, justify="right" if i else "left")
+    for name in cases[0]:
+        if name:
+            table.add_row(name, *(case[name] for case in cases))
+    return table
 
 
 def _run(module: str, *arguments: str, out: Path) -> dict[str, Any]:
