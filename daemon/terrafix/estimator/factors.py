@@ -18,6 +18,9 @@ from terrafix.estimator.velocity import V_SIZE, Leg
 
 BIAS_SIZE = 4
 BLOCK_HUBER_K = 1.5
+# 1-sigma of the first radial coefficient of a lens that was calibrated once. What it bends is alike in every frame and
+# looks like a climb or a tilt: nine keyframes make the same mistake, and the root of that many.
+LENS_SIGMA, LENS_REPEATS = 0.005, 3.0
 REDUCED = 11  # residuals of a pair of cameras above a plane, after the reduction
 
 
@@ -179,7 +182,9 @@ def _reduced(
     away = np.repeat(points[:, :2] - keyframe.translation()[:2], 2, axis=0)
     by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
     by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
-    # (1 + P P^T)^(-1/2), where only three directions of the noise are not white: from the eigenvalues of P^T P.
+    bent = [np.sum(np.square(xy), axis=1, keepdims=True) * xy for xy in (pairs[:, :2], pairs[:, 2:])]
+    by_plane = np.column_stack([by_plane, LENS_REPEATS * LENS_SIGMA / sigma * (bent[0] - bent[1]).ravel()])
+    # (1 + P P^T)^(-1/2), where only four directions of the noise are not white: from the eigenvalues of P^T P.
     s2, v = np.linalg.eigh(by_plane.T @ by_plane)
     root = np.sqrt(1.0 + s2)
     full -= by_plane @ ((v / (root * (1.0 + root))) @ (v.T @ (by_plane.T @ full)))

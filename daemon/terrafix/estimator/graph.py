@@ -22,9 +22,10 @@ LAG_NODES, BATCH_NODES = 15, 5
 ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits in the tail pulls less
 LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
 # Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), heading (a gyro drifts),
-# barometer and the terrain under it.
-WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.5])
+# barometer (a front brings 1 hPa, 8 m, in an hour). A looser one lets minutes of dead reckoning carry the height off.
+WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.15])
 COMPASS_BY_TURN_RAD = np.radians(2.5)  # ... and of the compass per square root of a radian turned: iron on board
+HEIGHT_BY_CLIMB = 0.05  # ... and of the height by what was climbed: air that is not standard, a scale that is wrong
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,8 @@ class PoseGraph:
         sigmas = WALK_SIGMAS * np.sqrt(dt_s)
         turned = state.pose.rotation().compose(self.state(newest).pose.rotation().inverse())
         sigmas[2] = np.hypot(sigmas[2], COMPASS_BY_TURN_RAD * np.sqrt(abs(gtsam.Rot3.Logmap(turned)[2])))
-        sigmas[3] = np.hypot(sigmas[3], rise_sigma_m)
+        climbed_m = float(state.pose.translation()[2] - self.state(newest).pose.translation()[2])
+        sigmas[3] = np.linalg.norm([sigmas[3], HEIGHT_BY_CLIMB * climbed_m, rise_sigma_m])
         walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(4), walk))
         if attitude is not None:
