@@ -19,8 +19,8 @@ from terrafix.estimator.velocity import V_SIZE, Leg
 BIAS_SIZE = 4
 BLOCK_HUBER_K = 1.5
 # 1-sigma of the first radial coefficient of a lens that was calibrated once. What it bends is alike in every frame and
-# looks like a climb or a tilt: nine keyframes make the same mistake, and the root of that many.
-LENS_SIGMA, LENS_REPEATS = 0.005, 3.0
+# looks like a climb or a tilt: the next keyframe makes the same mistake.
+LENS_SIGMA, LENS_REPEATS = 0.005, 1.5
 REDUCED = 11  # residuals of a pair of cameras above a plane, after the reduction
 
 
