@@ -9,9 +9,10 @@ from terrafix.estimator.factors import same_ground_factor
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.matched import measured_pose
 from terrafix.estimator.motion import Ground
+from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import Terrain
-from terrafix.messages import Camera, MapMatch, Odometry, Origin, Verdict
+from terrafix.messages import Camera, MapMatch, NavEstimate, Odometry, Origin, VehicleState, Verdict
 
 ORIGIN = Origin(
     t_ns=0,
@@ -148,3 +149,17 @@ def test_a_take_off_that_nobody_measured_is_claimed_to_be_one() -> None:
     position = np.sqrt(np.linalg.eigvalsh(off.placed.cov[3:, 3:])[-1])
     assert 102.0 / 3.0 < position < 150.0
     assert 22.0 / 3.0 < np.sqrt(off.placed.velocity_cov[0, 0]) < 40.0
+
+
+@pytest.mark.parametrize(("began_ns", "low_m", "high_m"), [(None, 4.0, 30.0), (0, 100.0, 1000.0)])
+def test_an_estimator_that_was_started_again_knows_that_it_has_flown_on(
+    began_ns: int | None, low_m: float, high_m: float
+) -> None:
+    """Killed 15 s after the start it began there once more, 280 m behind, and was as sure as on the ground."""
+    node = EstimatorNode(began_ns)
+    list(node.on(ORIGIN))
+    state = VehicleState(t_ns=15_000_000_000, source="x", yaw_rad=0.0, pitch_rad=0.0, roll_rad=0.0, agl_m=100.0)
+    list(node.on(state))
+    seen = Odometry(t_ns=15_000_000_000, frame_id=30, keyframe_id=30, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
+    (said,) = (m for m in node.on(seen) if isinstance(m, NavEstimate))
+    assert low_m < np.sqrt(said.cov[0]) < high_m

@@ -39,8 +39,8 @@ class FixResult:
 
 
 class Estimator(Tracker):
-    def __init__(self, origin: Origin) -> None:
-        super().__init__(origin)
+    def __init__(self, origin: Origin, began_s: float | None = None) -> None:
+        super().__init__(origin, began_s)
         self.doubt = Doubt.of(origin)
         self.rival = Rival()
         self.map_sigma_m = 0.0  # of the map that placed us; nothing until it did

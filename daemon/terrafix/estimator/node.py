@@ -34,7 +34,10 @@ ANCHORED_FOR_S = 1.5  # after a map fix the odometry since then is too short to 
 
 
 class EstimatorNode:
-    def __init__(self) -> None:
+    """``began_ns``: of the flight, when this process was started again in it: since then the vehicle has flown on."""
+
+    def __init__(self, began_ns: int | None = None) -> None:
+        self._began_s = None if began_ns is None else began_ns * 1e-9
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
@@ -55,7 +58,7 @@ class EstimatorNode:
     def on(self, message: Message) -> Iterable[Message]:
         match message:
             case Origin() if self._estimator is None or message != self._estimator.origin:  # said again after a restart
-                self._estimator = Estimator(message)
+                self._estimator = Estimator(message, self._began_s)
                 self._frame = LocalFrame(message.lat_deg, message.lon_deg)
             case VehicleState():
                 self._telemetry.add(message)
@@ -192,4 +195,4 @@ class EstimatorNode:
 
 
 def make_node(ctx: NodeContext) -> EstimatorNode:
-    return EstimatorNode()
+    return EstimatorNode(ctx.epoch_ns)

@@ -75,9 +75,11 @@ class Advance:
 
 
 class Tracker:
-    """``last_fix_s``: time of the newest frame that was fixed on the map; None: none was."""
+    """``last_fix_s``: time of the newest frame that was fixed on the map; None: none was.
 
-    def __init__(self, origin: Origin) -> None:
+    ``began_s``: when the flight was at its start, if that is not now: this process was started again in flight."""
+
+    def __init__(self, origin: Origin, began_s: float | None = None) -> None:
         self.origin = origin
         self.graph = PoseGraph()
         self.camera = MountedCamera(origin)
@@ -95,7 +97,7 @@ class Tracker:
         self._blind = False  # ... nor felt
         self._last: Placed | None = None  # newest frame
         self._began_with = (False, False)  # heading, height
-        self._began_s: float | None = None
+        self._began_s = began_s
 
     @property
     def last(self) -> Placed | None:
