@@ -120,17 +120,20 @@ class AnchorNode:
             self._answers += self._model.failed(prediction.t_ns, str(error))
             if self._model.given_up:
                 self._without_weights(prediction)
-            answer = MapMatch(
-                t_ns=prediction.t_ns,
-                frame_id=prediction.frame_id,
-                verdict=Verdict.MODEL_FAILED,
-                matcher=self._describer.name,
-                step=SearchStep.SKIP,
-                lost_sigma_m=self._lost_sigma_m,
-            )
+            answer = msgspec.structs.replace(self._nothing(prediction, Verdict.MODEL_FAILED), step=SearchStep.SKIP)
             return answer if self._search is None else self._searching(answer, self._search)
         self._answers += self._model.answered(prediction.t_ns)
         return match
+
+    def _nothing(self, prediction: Prediction, verdict: Verdict) -> MapMatch:
+        """The answer while nothing was found."""
+        return MapMatch(
+            t_ns=prediction.t_ns,
+            frame_id=prediction.frame_id,
+            verdict=verdict,
+            matcher=self._describer.name,
+            lost_sigma_m=self._lost_sigma_m,
+        )
 
     def _without_weights(self, prediction: Prediction) -> None:
         """From here on; what is believed stays, a search that is under way begins anew."""
@@ -143,13 +146,7 @@ class AnchorNode:
                 self._begin_search(MapSearch(best.map, best.matcher, prediction.agl_m, None), best.map)
 
     def _match(self, prediction: Prediction) -> MapMatch:
-        answer = MapMatch(
-            t_ns=prediction.t_ns,
-            frame_id=prediction.frame_id,
-            verdict=Verdict.OUTSIDE_MAP,
-            matcher=self._describer.name,
-            lost_sigma_m=self._lost_sigma_m,
-        )
+        answer = self._nothing(prediction, Verdict.OUTSIDE_MAP)
         image = self._frames.get(prediction.frame_id)
         if self._layers is None or self._origin is None:
             return answer
