@@ -104,6 +104,7 @@ def main(arguments: list[str]) -> int:
         map_path=Path(spec.map_path) if spec.map_path else None,
         out_dir=Path(spec.out_dir),
         ground_amsl_m=spec.ground_amsl_m,
+        kept=run_dir.kept(name),
         epoch_ns=run_dir.epoch_ns,
     )
     gc.freeze()  # what is imported lives for ever: collections need not look at it

@@ -117,6 +117,7 @@ class InertialFlight:
             mode_mass=0.99,
             mode_e_m=float(p[0]),
             mode_n_m=float(p[1]),
+            ground=(0.0, 0.0, 0.0),
         )
 
 

@@ -1,6 +1,7 @@
 """What vision, autopilot and anchor would say of a flight whose truth is known: messages for the estimator.
 
-Flat ground at height zero; every error is drawn from the distribution that its message claims."""
+Flat ground at height zero, or hills that no map tells; every error is drawn from the distribution that its message
+claims."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -57,6 +58,9 @@ class Flight:
     fix_every: int = 9  # 54 m: new ground each time
     knows: frozenset[str] = frozenset({"yaw", "attitude", "height"})
     speed_mps: float = SPEED_MPS
+    dem: bool = False  # the map tells that the ground is flat
+    hills_m: float = 0.0  # 1-sigma of ground that rises and falls over a kilometre
+    ground_m: np.ndarray = field(init=False, repr=False)
     rng_of: np.random.Generator = field(init=False, repr=False)
     p_m: np.ndarray = field(init=False, repr=False)
     r_w_b: list[np.ndarray] = field(init=False, repr=False)
@@ -70,12 +74,15 @@ class Flight:
         steps = self.speed_mps * FRAME_S * np.column_stack([np.sin(heading), np.cos(heading)])
         start = rng.normal(0.0, ORIGIN.start_sigma_m, 2)
         xy = start + np.vstack([np.zeros(2), np.cumsum(steps[:-1], axis=0)])
-        up = 100.0 + 8.0 * np.sin(t_s / 17.0)
+        way = np.arange(self.frames) * self.speed_mps * FRAME_S
+        ground = math.sqrt(2.0) * self.hills_m * (np.cos(way / 160.0 + self.seed) - math.cos(self.seed))
+        up = 100.0 + 8.0 * np.sin(t_s / 17.0) + ground  # it follows the ground that it sees
         angles = np.radians(np.column_stack([2.0 * np.sin(t_s / 1.7), 2.5 * np.sin(t_s / 2.3)]))
         tilt = np.radians(rng.normal(0.0, CAMERA.mount_tolerance_deg / 2, 2))
         mount = Mount.of(CAMERA).r_b_c() @ exp_so3(np.array([*tilt, 0.0]))
         r_w_b = [rot_w_b(float(h), float(p), float(r)) for h, (p, r) in zip(heading, angles, strict=True)]
         for name, value in (
+            ("ground_m", ground),
             ("rng_of", rng),
             ("p_m", np.column_stack([xy, up])),
             ("r_w_b", r_w_b),
@@ -104,9 +111,10 @@ class Flight:
 
     def fix(self, i: int, offset_m: tuple[float, float] = (0.0, 0.0)) -> MapMatch:
         """A map match of frame i, off by what it claims and by ``offset_m``."""
-        warp = np.array([0.0, 0.0, ROOFS * self.p_m[i, 2], 0.0, 0.0, 0.0])
+        height_m = self.p_m[i, 2] - self.ground_m[i]  # what a picture tells; the map believes the ground to be flat
+        warp = np.array([0.0, 0.0, ROOFS * height_m, 0.0, 0.0, 0.0])
         error = self.rng_of.normal(0.0, np.hypot(FIX_SIGMAS, warp))
-        p = self.p_m[i] + error[:3] + (*offset_m, 0.0)
+        p = np.array([*self.p_m[i, :2], height_m]) + error[:3] + (*offset_m, 0.0)
         return MapMatch(
             t_ns=t_ns(i),
             frame_id=i,
@@ -119,6 +127,7 @@ class Flight:
             mode_mass=0.99,
             mode_e_m=float(p[0]),
             mode_n_m=float(p[1]),
+            ground=(0.0, 0.0, 0.0) if self.dem else None,
         )
 
     def _state(self, i: int, yaw_rad: float, angles: np.ndarray, agl_m: float) -> VehicleState:
@@ -148,7 +157,8 @@ class Flight:
             return Odometry(t_ns=0, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
         rng = self.rng_of
         seen = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
-        matrix = homography((self.r_w_c[keyframe], self.p_m[keyframe]), (self.r_w_c[i], self.p_m[i]))
+        below = np.array([0.0, 0.0, self.ground_m[keyframe]])
+        matrix = homography((self.r_w_c[keyframe], self.p_m[keyframe] - below), (self.r_w_c[i], self.p_m[i] - below))
         there = apply(matrix, seen) + rng.normal(0.0, SIGMA_NORM, seen.shape)
         return Odometry(
             t_ns=t_ns(i),

@@ -50,7 +50,7 @@ def test_lost_means_that_the_position_claims_nothing() -> None:
 
 
 def test_what_a_search_found_replaces_it_at_once() -> None:
-    flight = Flight(60, seed=3)
+    flight = Flight(60, seed=3, dem=True)
     run = flown_wrong(flight)
     found = msgspec.structs.replace(flight.fix(40, WRONG_M), found=True)
     run.hear(with_map(flight, 40, found))

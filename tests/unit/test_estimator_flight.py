@@ -370,7 +370,8 @@ def test_nothing_is_said_before_the_origin() -> None:
 # --- covariance modes -------------------------------------------------------------------------------------------
 
 
-def test_jacobian_claims_about_what_marginals_do(long_flight: Flight) -> None:
+def test_jacobian_claims_about_what_marginals_do() -> None:
+    long_flight = Flight(120, seed=3, dem=True)
     cool, hot = Listener(), Listener()
     cool.hear([health(ThermalBand.NORMAL)])
     hot.hear([health(ThermalBand.HOT)])

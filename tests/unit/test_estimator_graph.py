@@ -6,6 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import B, C, V
 from simulated_flight import Flight, Listener, cov_of, error_m, sigma_m, t_ns
 
+from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.graph import BATCH_NODES, LAG_NODES, PoseGraph
 from terrafix.estimator.lag import FixedLag
 from terrafix.estimator.velocity import V_SIZE
@@ -48,7 +49,7 @@ def test_marginalising_changes_no_estimate() -> None:
     unit = gtsam.noiseModel.Unit.Create
     for i in range(40):
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for key, size in ((B(i), 4), (V(i), V_SIZE)):
+        for key, size in ((B(i), BIAS_SIZE), (V(i), V_SIZE)):
             values.insert(key, np.zeros(size))
             factors.add(gtsam.PriorFactorVector(key, rng.normal(size=size), unit(size)))
             if i:

@@ -5,14 +5,17 @@ import numpy as np
 import pytest
 
 from terrafix.core.pose import tangent_to_world
-from terrafix.estimator.factors import same_ground_factor
+from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.matched import measured_pose
 from terrafix.estimator.motion import Ground
 from terrafix.estimator.node import EstimatorNode
+from terrafix.estimator.ruggedness import CANDIDATES, PRIOR
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import Terrain
 from terrafix.messages import Camera, MapMatch, NavEstimate, Odometry, Origin, VehicleState, Verdict
+
+RISE = float(PRIOR @ CANDIDATES)  # before anything was seen
 
 ORIGIN = Origin(
     t_ns=0,
@@ -53,15 +56,15 @@ def test_a_slope_ends_where_nobody_fitted_it() -> None:
     assert terrain.below(np.array([1000.0, 0.0, 0.0])) == pytest.approx(65.0)
     near, far = (terrain.seen_from(np.array([e_m, 0.0, 0.0]), 130.0, 2.0, 1.0) for e_m in (100.0, 1000.0))
     assert near.level_share * 130.0 == pytest.approx(np.hypot(1.3, 1.2))
-    assert far.level_share * 130.0 == pytest.approx(0.3 * np.sqrt(850.0), rel=0.03)
+    assert far.level_share * 130.0 == pytest.approx(RISE * np.sqrt(850.0), rel=0.03)
     low = terrain.seen_from(np.zeros(3), 10.0, 0.5, 1.0)
     assert low.level_share == pytest.approx(0.12, rel=0.01)  # near the ground a metre of a DEM is much
 
 
 def test_without_elevation_nobody_knows_how_the_ground_rises() -> None:
     terrain = Terrain(40.0)
-    assert terrain.rise_sigma_m(100.0) == pytest.approx(3.0)
-    assert terrain.slope_sigma(100.0) == pytest.approx(0.03)
+    assert terrain.rise_sigma_m(100.0) == pytest.approx(10.0 * RISE)
+    assert terrain.slope_sigma(100.0) == pytest.approx(0.1 * RISE)
     match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", ground=(50.0, 0.1, 0.0))
     terrain.hear(match, np.zeros(3))
     assert terrain.rise_sigma_m(100.0) == terrain.slope_sigma(100.0) == 0.0
@@ -108,10 +111,11 @@ def test_a_slope_does_not_say_where_a_lost_camera_is() -> None:
     points = np.column_stack([seen[:, 0] * depth, -seen[:, 1] * depth, 100.0 - depth])
     in_pose = (points - pose.translation()) @ looks_down
     pairs = np.column_stack([seen, in_pose[:, :2] / in_pose[:, 2:]])
-    factor = same_ground_factor(0, 1, keyframe, pose, pairs, 1e-3, sloping)
+    factor = same_ground_factor(0, 1, 2, keyframe, pose, pairs, 1e-3, sloping)
 
     def error(moved_m: tuple[float, float, float]) -> float:
         values = gtsam.Values()
+        values.insert(2, np.zeros(BIAS_SIZE))
         for key, camera in ((0, keyframe), (1, pose)):
             values.insert(key, gtsam.Pose3(camera.rotation(), camera.translation() + moved_m))
         return float(factor.error(values))

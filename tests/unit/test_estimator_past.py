@@ -6,6 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator import past as past_module
+from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.lag import FixedLag
 from terrafix.estimator.linear import NODE, IndeterminateError, Linear, eliminate, solve
 from terrafix.estimator.past import MOST_OPEN, Past
@@ -91,11 +92,15 @@ class Chain:
                 self.steps.append((parent, poses[parent].between(poses[i]).compose(noise)))
                 odometry = gtsam.noiseModel.Diagonal.Sigmas(ODOMETRY)
                 graph.add(gtsam.BetweenFactorPose3(C(parent), C(i), self.steps[i][1], odometry))
-                graph.add(gtsam.BetweenFactorVector(B(i - 1), B(i), np.zeros(4), gtsam.noiseModel.Unit.Create(4)))
+                graph.add(
+                    gtsam.BetweenFactorVector(
+                        B(i - 1), B(i), np.zeros(BIAS_SIZE), gtsam.noiseModel.Unit.Create(BIAS_SIZE)
+                    )
+                )
                 graph.add(
                     gtsam.BetweenFactorVector(V(i - 1), V(i), np.zeros(V_SIZE), gtsam.noiseModel.Unit.Create(V_SIZE))
                 )
-            graph.add(gtsam.PriorFactorVector(B(i), np.zeros(4), gtsam.noiseModel.Unit.Create(4)))
+            graph.add(gtsam.PriorFactorVector(B(i), np.zeros(BIAS_SIZE), gtsam.noiseModel.Unit.Create(BIAS_SIZE)))
             graph.add(gtsam.PriorFactorVector(V(i), np.zeros(V_SIZE), gtsam.noiseModel.Unit.Create(V_SIZE)))
             if i in fixes:
                 fix = poses[i].compose(gtsam.Pose3.Expmap(FIX * rng.normal(size=6)))
@@ -113,7 +118,7 @@ class Chain:
                 past.leave(leaving, self._noted(lag, window))
             values = gtsam.Values()
             values.insert(C(i), lag.pose(parent).compose(motion) if i else motion)
-            values.insert(B(i), np.zeros(4))
+            values.insert(B(i), np.zeros(BIAS_SIZE))
             values.insert(V(i), np.zeros(V_SIZE))
             lag.insert(i, factors, values, leaving)
             window = [n for n in window if n not in leaving] + [i]

@@ -67,7 +67,7 @@ def test_a_blackout_is_bridged_from_both_sides() -> None:
 def test_what_was_flown_before_the_place_was_found_is_put_right(knows: set[str]) -> None:
     """The start coordinate is 900 m off, and without a compass the whole track is turned by 150 degrees, for so long
     that downhill from there is no way."""
-    flight = Flight(150, seed=3, knows=frozenset(knows))
+    flight = Flight(150, seed=3, knows=frozenset(knows), dem=True)
     turn = local_rotation_up(0.0 if "yaw" in knows else np.radians(150.0))
     moved, first = (800.0, 400.0), 108
 

@@ -28,6 +28,10 @@ class RunDir:
         """Why ``process`` ended, when that is something the user can mend: one line."""
         return self.path / f"{process}.mistake"
 
+    def kept(self, process: str) -> Path:
+        """What ``process`` leaves to the one that is started in its place."""
+        return self.path / f"{process}.kept"
+
     @property
     def frames(self) -> Path:
         return self.path / "frames"

@@ -1,9 +1,9 @@
 """The factors that GTSAM lacks: what an autopilot says of attitude and height, seen through the camera's mount; two
 cameras that look at the same ground; and the way from one node to the next by velocity and acceleration.
 
-Variables of a node k: C_k, the camera pose in the world (Pose3); B_k, a vector of four slow errors (mount tilt about
-the camera's x and y axes [rad], heading bias [rad], height bias [m]); V_k, velocity and the acceleration that nobody
-measured (velocity.py)."""
+Variables of a node k: C_k, the camera pose in the world (Pose3); B_k, a vector of five slow errors (mount tilt about
+the camera's x and y axes [rad], heading bias [rad], height bias [m], and of the lens the first radial coefficient, less
+what its description says); V_k, velocity and the acceleration that nobody measured (velocity.py)."""
 
 import math
 from typing import Any
@@ -16,12 +16,14 @@ from terrafix.core.pose import log_so3, project_with_jacobian
 from terrafix.estimator.motion import EFFECTIVE_PAIRS, Ground
 from terrafix.estimator.velocity import V_SIZE, Leg
 
-BIAS_SIZE = 4
+BIAS_SIZE = 5
+LENS = 4  # of B
 BLOCK_HUBER_K = 1.5
-# 1-sigma of the first radial coefficient of a lens that was calibrated once. What it bends is alike in every frame and
-# looks like a climb or a tilt: the next keyframe makes the same mistake.
-LENS_SIGMA, LENS_REPEATS = 0.005, 1.5
-REDUCED = 11  # residuals of a pair of cameras above a plane, after the reduction
+# 1-sigma of the first radial coefficient, less what the description of the lens says: 0.005 after a calibration, 0.03
+# where its maker's focal length is all that is known. What it bends is alike in every frame and looks like a tilt that
+# grows with the way, so it is learnt in flight. The higher coefficients are noise, as large as this of the first.
+LENS_SIGMA, LENS_REST = 0.02, 0.0015
+REDUCED = 12  # residuals of a pair of cameras above a plane, after the reduction
 
 
 def tilted(x_rad: float, y_rad: float) -> np.ndarray:
@@ -42,7 +44,7 @@ def tilted(x_rad: float, y_rad: float) -> np.ndarray:
 def attitude_and_height_residual(
     pose: gtsam.Pose3, bias: np.ndarray, r_w_b: np.ndarray, r_b_c: np.ndarray, up_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """-> residual (4,): rotation about east, north, up [rad] and height [m]; Jacobians by C_k (4x6) and B_k (4x4).
+    """-> residual (4,): rotation about east, north, up [rad] and height [m]; Jacobians by C_k (4x6) and B_k (4x5).
 
     Jacobians are those of small residuals: exact enough below 15 degrees, and the graph relinearises."""
     r_w_c = pose.rotation().matrix()
@@ -111,6 +113,7 @@ def same_ground_residual(
 def same_ground_factor(
     keyframe_key: int,
     pose_key: int,
+    bias_key: int,
     keyframe: gtsam.Pose3,
     pose: gtsam.Pose3,
     pairs: np.ndarray,
@@ -120,14 +123,16 @@ def same_ground_factor(
     """``pairs`` (N, 4) normalised with the 1-sigma ``sigma`` of a coordinate. The plane below the keyframe is not known
     exactly: what its height and slope leave open is in the noise of the factor.
 
-    Two cameras above a plane are ten numbers: one in the other, the keyframe's tilt against the plane, and its height.
-    In these the residuals of all pairs are linear enough to be reduced by QR, here, to eleven that have the same norm
-    (the last is what no motion explains). Where north is and where the cameras are does not enter, so that a heading or
-    a position that is corrected later does no harm."""
+    Two cameras above a plane are ten numbers: one in the other, the keyframe's tilt against the plane, and its height;
+    what the lens bends is one more. In these the residuals of all pairs are linear enough to be reduced by QR, here, to
+    twelve that have the same norm (the last is what nothing explains). Where north is and where the cameras are does
+    not enter, so that a heading or a position that is corrected later does no harm."""
     normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
     p = keyframe.translation()
     offset = float(p[2]) - ground.height_m - ground.slope_e * float(p[0]) - ground.slope_n * float(p[1])
-    seen, tilt, height = _reduced(keyframe, pose, pairs, sigma, ground, normal, offset)
+    seen, tilt, height, lens = _reduced(keyframe, pose, pairs, sigma, ground, normal, offset)
+    by_bias = np.zeros((REDUCED, BIAS_SIZE), order="F")
+    by_bias[:, LENS] = lens
     at_first = keyframe.between(pose)
     up_first = keyframe.rotation().matrix().T @ normal
     up_unit = up_first / float(np.linalg.norm(up_first))
@@ -149,19 +154,21 @@ def same_ground_factor(
         # The plane was fitted to the ground at one place and lies as high wherever the camera turns out to be: on its
         # slope a camera that is lost by a hillside would seem to read its position from its height.
         risen = float(c0.translation()[2] - p[2])
-        residual = seen[:, 6] + by_step @ at_first.logmap(step) + tilt @ back + height * risen
+        bent = float(values.atVector(bias_key)[LENS])
+        residual = seen[:, 6] + by_step @ at_first.logmap(step) + tilt @ back + height * risen + lens * bent
         if jacobians is not None:
             by_c0 = -by_step @ step.inverse().AdjointMap()
             by_c0[:, :3] += turned
             by_c0[:, 3:] += np.outer(height, r0[2])
             jacobians[0] = np.asfortranarray(by_c0)
             jacobians[1] = np.asfortranarray(by_step)
+            jacobians[2] = by_bias
         return np.asarray(residual)
 
     # Huber on the whole block: its whitened norm is about sqrt(2 * EFFECTIVE_PAIRS) when all is well.
     huber = gtsam.noiseModel.mEstimator.Huber.Create(BLOCK_HUBER_K * float(np.sqrt(2 * EFFECTIVE_PAIRS)))
     noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(REDUCED))
-    return gtsam.CustomFactor(noise, [keyframe_key, pose_key], error)
+    return gtsam.CustomFactor(noise, [keyframe_key, pose_key, bias_key], error)
 
 
 def _reduced(
@@ -172,30 +179,47 @@ def _reduced(
     ground: Ground,
     normal: np.ndarray,
     offset: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whitened residuals, REDUCED of them: by the step and constant (R, 7), by the tilt (R, 3), by the height (R,)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Whitened residuals, REDUCED of them: by the step and constant (R, 7), by the tilt (R, 3), by the height (R,), by
+    the radial coefficient (R,)."""
     residual, by_keyframe, by_pose, points, by_height = same_ground_residual(keyframe, pose, pairs, normal, offset)
     # The keyframe alone, while the other camera keeps its place in it.
     by_both = by_keyframe + by_pose @ keyframe.between(pose).inverse().AdjointMap()
     by_up = by_both[:, 3:] @ keyframe.rotation().matrix()[2]
-    full = np.column_stack([by_pose, by_both[:, :3], by_up, residual]) / sigma
+    by_lens = _by_lens(keyframe, pairs, residual, by_keyframe, points)
+    full = np.column_stack([by_pose, by_both[:, :3], by_up, by_lens, residual]) / sigma
     away = np.repeat(points[:, :2] - keyframe.translation()[:2], 2, axis=0)
     by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
     by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
-    bent = [np.sum(np.square(xy), axis=1, keepdims=True) * xy for xy in (pairs[:, :2], pairs[:, 2:])]
-    by_plane = np.column_stack([by_plane, LENS_REPEATS * LENS_SIGMA / sigma * (bent[0] - bent[1]).ravel()])
-    # (1 + P P^T)^(-1/2), where only four directions of the noise are not white: from the eigenvalues of P^T P.
+    risen = by_pose[:, 3:] @ pose.rotation().matrix()[2] * (ground.rise_sigma_m / sigma)
+    by_plane = np.column_stack([by_plane, risen, LENS_REST / sigma * by_lens])
+    # (1 + P P^T)^(-1/2), where only five directions of the noise are not white: from the eigenvalues of P^T P.
     s2, v = np.linalg.eigh(by_plane.T @ by_plane)
     root = np.sqrt(1.0 + s2)
     full -= by_plane @ ((v / (root * (1.0 + root))) @ (v.T @ (by_plane.T @ full)))
     r = np.asarray(np.linalg.qr(full, mode="r"))
-    return r[:, [0, 1, 2, 3, 4, 5, 10]], r[:, 6:9], r[:, 9]
+    return r[:, [0, 1, 2, 3, 4, 5, 11]], r[:, 6:9], r[:, 9], r[:, 10]
+
+
+def _by_lens(
+    keyframe: gtsam.Pose3, pairs: np.ndarray, residual: np.ndarray, by_keyframe: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """(2N,) the change of the residual by the first radial coefficient: both cameras see farther out what it bends. A
+    ray of the keyframe that turns moves its point as the camera would, by the depth as much.
+
+    The other camera's rays are taken where they should be and not where they were seen, noise and all: what noise does
+    to both sides of an equation looks like a lens."""
+    there = pairs[:, 2:] + residual.reshape(-1, 2)
+    bent = [np.sum(np.square(xy), axis=1, keepdims=True) * xy for xy in (pairs[:, :2], there)]
+    depth = (points - keyframe.translation()) @ keyframe.rotation().matrix()[:, 2]
+    by_ray = by_keyframe.reshape(-1, 2, 6)[:, :, 3:5] * depth[:, None, None]
+    return np.asarray((bent[1] - np.einsum("nij,nj->ni", by_ray, bent[0])).ravel())
 
 
 def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, leg: Leg) -> gtsam.CustomFactor:
     """``before`` and ``after``: keys of C and V; ``bias_key``: of B at the end, whose heading turns what was felt.
 
-    Linear but for the heading, and for the axes of the poses."""
+    Linear but for the heading, the axes of the poses, and the height that a leg is told in (``Leg.over``)."""
     rows = 3 + V_SIZE
     by_before, by_after = -leg.by_before(), np.zeros((rows, V_SIZE))
     by_after[3:, :] = np.eye(V_SIZE)
@@ -217,15 +241,21 @@ def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, l
         residual[:6] -= turned
         residual[:3] += c1.translation() - c0.translation()
         residual[3:] += v1
+        unit = 1.0
+        if leg.over is not None:
+            height_m, ground_m = leg.over
+            unit = height_m / max(float(c1.translation()[2]) - ground_m, 1.0)
         if jacobians is not None:
             by_c0, by_c1, by_bias = by_pose.copy(), by_pose.copy(), np.zeros((rows, BIAS_SIZE))
             by_c0[:3, 3:] = -c0.rotation().matrix()
             by_c1[:3, 3:] = c1.rotation().matrix()
             if leg.inertial:
                 by_bias[:6, 2] = turned[1], -turned[0], 0.0, turned[4], -turned[3], 0.0
+            if leg.over is not None:
+                by_c1[:, 3:] -= np.outer(residual, c1.rotation().matrix()[2]) * (unit / leg.over[0])
             for i, jacobian in enumerate((by_c0, by_before, by_c1, by_after, by_bias)):
-                jacobians[i] = np.asfortranarray(jacobian)
-        return residual
+                jacobians[i] = np.asfortranarray(unit * jacobian)
+        return unit * residual
 
     noise = gtsam.noiseModel.Gaussian.Covariance(leg.cov, False)
     return gtsam.CustomFactor(noise, [*before, *after, bias_key], error)

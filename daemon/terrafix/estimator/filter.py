@@ -14,6 +14,7 @@ from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.doubt import Doubt
 from terrafix.estimator.graph import NodeState
 from terrafix.estimator.matched import determined, measured_pose
+from terrafix.estimator.resume import Known
 from terrafix.estimator.rival import Rival
 from terrafix.estimator.seen_ground import SeenGround
 from terrafix.estimator.telemetry import Attitude
@@ -39,8 +40,8 @@ class FixResult:
 
 
 class Estimator(Tracker):
-    def __init__(self, origin: Origin, began_s: float | None = None) -> None:
-        super().__init__(origin, began_s)
+    def __init__(self, origin: Origin, known: Known | None = None) -> None:
+        super().__init__(origin, known)
         self.doubt = Doubt.of(origin)
         self.rival = Rival()
         self.map_sigma_m = 0.0  # of the map that placed us; nothing until it did
@@ -95,6 +96,10 @@ class Estimator(Tracker):
             return self._refuse(match, node, measured, cov, d2)
         self._refused.clear()
         here = measured.translation()[:2]
+        if not match.coarse and self.measures_height and not self.terrain.is_told:
+            up_m = self.graph.state(node).pose.translation()[2] + self.graph.state(node).bias[3]  # by the barometer
+            sigma_m = float(np.sqrt(tangent_to_world(cov, r_w_c)[2, 2]))
+            self.terrain.ruggedness.measured(here, height, float(up_m - measured.translation()[2]), sigma_m)
         fixed_s = self.graph.time_of(node)
         if not match.coarse and self._seen.newest_s is not None:
             self.rival.fade(self._seen.new_m(fixed_s, here, math.inf) / height)

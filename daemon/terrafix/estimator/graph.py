@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
-from terrafix.estimator.factors import leg_factor, same_ground_factor
+from terrafix.estimator.factors import BIAS_SIZE, LENS_SIGMA, leg_factor, same_ground_factor
 from terrafix.estimator.lag import FixedLag
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.past import Past
@@ -22,8 +22,9 @@ LAG_NODES, BATCH_NODES = 15, 5
 ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits in the tail pulls less
 LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
 # Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), heading (a gyro drifts),
-# barometer (a front brings 1 hPa, 8 m, in an hour). A looser one lets minutes of dead reckoning carry the height off.
-WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.15])
+# barometer (a front brings 1 hPa, 8 m, in an hour), lens (it warms up: a tenth of its error in ten minutes). A looser
+# barometer lets minutes of dead reckoning carry the height off.
+WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.15, 2e-5])
 COMPASS_BY_TURN_RAD = np.radians(2.5)  # ... and of the compass per square root of a radian turned: iron on board
 HEIGHT_BY_CLIMB = 0.05  # ... and of the height by what was climbed: air that is not standard, a scale that is wrong
 
@@ -31,7 +32,7 @@ HEIGHT_BY_CLIMB = 0.05  # ... and of the height by what was climbed: air that is
 @dataclass(frozen=True)
 class NodeState:
     pose: gtsam.Pose3
-    bias: np.ndarray  # (4,)
+    bias: np.ndarray  # (5,) B_k
     velocity: np.ndarray  # (8,) V_k
 
 
@@ -97,7 +98,7 @@ class PoseGraph:
         velocity_cov: np.ndarray,
         attitude: gtsam.CustomFactor | None = None,
     ) -> int:
-        """First node, or the first after a loss: priors on C (tangent covariance 6x6), B (4x4) and V (8x8).
+        """First node, or the first after a loss: priors on C (tangent covariance 6x6), B (5x5) and V (8x8).
 
         The past stays as it was estimated."""
         node = self._next
@@ -134,7 +135,9 @@ class PoseGraph:
         else:
             seen, keyframe = motion.seen, self.state(parent).pose
             factors.add(
-                same_ground_factor(C(parent), C(node), keyframe, state.pose, seen.pairs, seen.sigma, seen.ground)
+                same_ground_factor(
+                    C(parent), C(node), B(node), keyframe, state.pose, seen.pairs, seen.sigma, seen.ground
+                )
             )
         if leg is not None:
             factors.add(leg_factor((C(newest), V(newest)), (C(node), V(node)), B(node), leg))
@@ -147,7 +150,7 @@ class PoseGraph:
         climbed_m = float(state.pose.translation()[2] - self.state(newest).pose.translation()[2])
         sigmas[3] = np.linalg.norm([sigmas[3], HEIGHT_BY_CLIMB * climbed_m, rise_sigma_m])
         walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(4), walk))
+        factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(BIAS_SIZE), walk))
         if attitude is not None:
             factors.add(attitude)
         self._insert(t_s, state, factors)
@@ -212,7 +215,7 @@ class PoseGraph:
         self._renew()
         self._times, self._stamps = {node: self._times[node]}, {node: _stamp(node)}
         wide = np.array([0.1, 0.1, 0.2, 50.0, 50.0, 20.0])
-        slow = np.array([0.1, 0.1, 0.1, 5.0])
+        slow = np.array([0.1, 0.1, 0.1, 5.0, LENS_SIGMA])
         factors = _priors(node, state, np.diag(wide**2), np.diag(slow**2), unknown_cov())
         self._past.add(factors)
         self._smoother.insert(node, factors, _values(node, state))
@@ -234,7 +237,7 @@ class PoseGraph:
 def _priors(
     node: int, state: NodeState, cov: np.ndarray, bias_cov: np.ndarray, velocity_cov: np.ndarray
 ) -> gtsam.NonlinearFactorGraph:
-    """``cov`` 6x6, tangent order; ``bias_cov`` 4x4; ``velocity_cov`` 8x8."""
+    """``cov`` 6x6, tangent order; ``bias_cov`` 5x5; ``velocity_cov`` 8x8."""
     gaussian = gtsam.noiseModel.Gaussian.Covariance
     factors = gtsam.NonlinearFactorGraph()
     factors.add(gtsam.PriorFactorPose3(C(node), state.pose, gaussian(cov)))

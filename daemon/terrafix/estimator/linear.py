@@ -9,10 +9,11 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
+from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.velocity import V_SIZE
 
-NODE = 10 + V_SIZE
-_PLACES = ((C, 0, 6), (B, 6, 4), (V, 10, V_SIZE))
+NODE = 6 + BIAS_SIZE + V_SIZE
+_PLACES = ((C, 0, 6), (B, 6, BIAS_SIZE), (V, 6 + BIAS_SIZE, V_SIZE))
 LEAST_ROOT = 1e-9  # of the information, per metre and radian: below, nothing holds a node
 
 

@@ -45,6 +45,7 @@ class Ground:
     slope_n: float = 0.0
     slope_sigma: float = 0.0
     level_share: float = SCALE_SIGMA  # 1-sigma of the mean plane, share of the height
+    rise_sigma_m: float = 0.0  # from the ground below the keyframe to that below the other camera, where nobody tells
     share: float = 1.0  # of the matches that agreed: a plane that few share may be a roof instead of the ground
 
     @property
@@ -95,6 +96,8 @@ def relative_pose(
     # A wrong height scales the translation; the tangent's translation is in the new camera's axes.
     t_new = fit.r_w_c.T @ fit.p_c_in_w_m
     cov[3:, 3:] += np.outer(t_new, t_new) * (ground.height_sigma_m**2 + ground.level_sigma_m**2) / height_m**2
+    up = fit.r_w_c[2]
+    cov[3:, 3:] += ground.rise_sigma_m**2 * np.outer(up, up)
     # A wrong slope of the plane turns the camera by about slope times base over height.
     cov[:3, :3] += (ground.slope_sigma * float(np.linalg.norm(t_new)) / height_m) ** 2 * np.eye(3)
     seen = Seen(pairs[ahead], fit.sigma / float(np.sqrt(effective)), ground)

@@ -5,9 +5,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
-from terrafix.core.node import NodeContext
+from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter import Estimator
+from terrafix.estimator.resume import Keeper, Known, kept
 from terrafix.estimator.telemetry import Telemetry
 from terrafix.estimator.tracker import Advance, Placed
 from terrafix.messages import (
@@ -34,10 +35,11 @@ ANCHORED_FOR_S = 1.5  # after a map fix the odometry since then is too short to 
 
 
 class EstimatorNode:
-    """``began_ns``: of the flight, when this process was started again in it: since then the vehicle has flown on."""
+    """``began_ns``: of the flight, when this process was started again in it: since then the vehicle has flown on.
+    ``last``: what the process before it said last."""
 
-    def __init__(self, began_ns: int | None = None) -> None:
-        self._began_s = None if began_ns is None else began_ns * 1e-9
+    def __init__(self, began_ns: int | None = None, last: NavEstimate | None = None) -> None:
+        self._began_ns, self._resumed_from = began_ns, last
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
@@ -58,8 +60,8 @@ class EstimatorNode:
     def on(self, message: Message) -> Iterable[Message]:
         match message:
             case Origin() if self._estimator is None or message != self._estimator.origin:  # said again after a restart
-                self._estimator = Estimator(message, self._began_s)
                 self._frame = LocalFrame(message.lat_deg, message.lon_deg)
+                self._estimator = Estimator(message, self._known(message, self._frame))
             case VehicleState():
                 self._telemetry.add(message)
             case Imu():
@@ -78,6 +80,13 @@ class EstimatorNode:
 
     def tick(self, now_ns: int) -> Iterable[Message]:
         return ()
+
+    def _known(self, origin: Origin, frame: LocalFrame) -> Known | None:
+        if self._began_ns is None:
+            return None
+        if self._resumed_from is not None:
+            return Known.of(self._resumed_from, frame)
+        return Known.start(origin, self._began_ns * 1e-9)
 
     def _on_odometry(self, odometry: Odometry) -> Iterable[Message]:
         estimator = self._estimator
@@ -149,6 +158,8 @@ class EstimatorNode:
         cov[:3, :3] += estimator.map_sigma_m**2 * np.eye(3)
         cov[3:5, 3:5] += estimator.camera.body_sigma_rad**2 * np.eye(2)
         cov = estimator.rival.added(estimator.doubt.added(cov))
+        alt_amsl_m, drift_m = estimator.amsl(placed)
+        cov[2, 2] += drift_m**2
         lat_deg, lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
         age_ms = -1
         if estimator.last_fix_s is not None:
@@ -162,7 +173,7 @@ class EstimatorNode:
             frame_id=placed.frame_id,
             lat_deg=lat_deg,
             lon_deg=lon_deg,
-            alt_amsl_m=float(p[2]),
+            alt_amsl_m=alt_amsl_m,
             agl_m=float(p[2]) - estimator.terrain.below(p),
             velocity_enu_mps=(float(v[0]), float(v[1]), float(v[2])),
             velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(placed.velocity_cov)[-1])),  # of the worst direction
@@ -195,4 +206,8 @@ class EstimatorNode:
 
 
 def make_node(ctx: NodeContext) -> EstimatorNode:
-    return EstimatorNode(ctx.epoch_ns)
+    return EstimatorNode(ctx.epoch_ns, None if ctx.kept is None else kept(ctx.kept))
+
+
+def make_edge(ctx: NodeContext) -> Edge | None:
+    return None if ctx.kept is None else Keeper(ctx.kept)

@@ -60,6 +60,8 @@ class Past:
             self._keep(node)
             return True
         if len(self._kept) > MOST_KEPT and (node := self._least_kept()) is not None:
+            # One that was held was kept beside its neighbour, and their factors may not be linear yet.
+            self._linearise({node}, self._kept[bisect_right(self._kept, node)])
             self._take_out([node])
             self._kept.remove(node)
             return True

@@ -13,7 +13,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, C, M, V
 
 from terrafix.core.start import SEARCHED_START_M
-from terrafix.estimator.factors import same_ground_factor
+from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
 from terrafix.estimator.fixes import doubted, new_ground, torn
 from terrafix.estimator.graduated import Covariances, Doubtful, marginals, settle, solve, weighted
 from terrafix.estimator.pieces import placed_states
@@ -121,7 +121,7 @@ class _Smoothing:
         fallen = seen.ground.slope_e * (now[0] - then[0]) + seen.ground.slope_n * (now[1] - then[1])
         height_m = seen.ground.height_m + float(now[2] - then[2]) - float(fallen)
         ground = replace(seen.ground, height_m=max(height_m, 1.0))
-        yield same_ground_factor(C(node.parent), C(i), keyframe, pose, seen.pairs, seen.sigma, ground)
+        yield same_ground_factor(C(node.parent), C(i), B(i), keyframe, pose, seen.pairs, seen.sigma, ground)
 
     def _linear(self, factor: gtsam.CustomFactor) -> gtsam.NonlinearFactor:
         around = gtsam.Values()
@@ -212,7 +212,7 @@ class _Smoothing:
         return Smoothed(
             poses,
             covs,
-            np.array([self._values.atVector(B(i)) for i in range(n)]).reshape(n, 4),
+            np.array([self._values.atVector(B(i)) for i in range(n)]).reshape(n, BIAS_SIZE),
             placed,
             believed[: len(fixes)],
             offsets,

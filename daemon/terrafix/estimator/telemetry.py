@@ -13,6 +13,7 @@ KEPT = 400  # states; 8 s at 50 Hz
 KEPT_READINGS = 2000  # 10 s at 200 Hz
 STANDS_BELOW_M = 10.0  # what a barometer may have drifted before take-off
 MAX_GAP_NS = 1_000_000_000  # older than this against the frame says nothing about it
+MOMENT_NS = 200_000_000  # by which states may come out of order
 # Between readings, and from the last one to the frame: the acceleration is taken to go straight from one to the next.
 MAX_READING_GAP_NS = 120_000_000
 MAX_ATTITUDE_GAP_NS = 260_000_000  # ATTITUDE at 4 Hz, ArduPilot's own rate, turns a vehicle too far between two
@@ -30,6 +31,9 @@ class Attitude:
     def stands(self) -> bool:
         """On the ground, motors off. An autopilot that reports a height is not believed to be off in the air."""
         return self.armed is False and (self.agl_m is None or self.agl_m < STANDS_BELOW_M)
+
+
+_FIELDS = ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed")
 
 
 class Telemetry:
@@ -54,18 +58,23 @@ class Telemetry:
     def at(self, t_ns: int) -> Attitude:
         """Field by field the value measured nearest to ``t_ns``; ``None`` where nobody said it within a second."""
         best: dict[str, tuple[int, float | bool]] = {}
+        unsettled = list(_FIELDS)
         for state in reversed(self._states):
             away_ns = abs(state.t_ns - t_ns)
             if away_ns > MAX_GAP_NS:
                 if state.t_ns < t_ns - 2 * MAX_GAP_NS:
                     break  # they come in order of time, to a moment
                 continue
-            for name in ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed"):
+            for name in unsettled.copy():
                 value = getattr(state, name)
                 if value is not None and (name not in best or away_ns <= best[name][0]):
                     best[name] = (away_ns, value)
+                elif name in best and state.t_ns + MOMENT_NS < t_ns - best[name][0]:
+                    unsettled.remove(name)  # whatever is left is farther away
+            if not unsettled:
+                break
         said = {name: value for name, (_, value) in best.items()}
-        return Attitude(*(said.get(name) for name in ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed")))  # type: ignore[arg-type]
+        return Attitude(*(said.get(name) for name in _FIELDS))  # type: ignore[arg-type]
 
     def felt(self, t0_ns: int, t1_ns: int) -> Felt | None:
         """Acceleration from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that."""

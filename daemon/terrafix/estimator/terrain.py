@@ -3,6 +3,7 @@
 import numpy as np
 
 from terrafix.estimator.motion import Ground
+from terrafix.estimator.ruggedness import Ruggedness
 from terrafix.messages import MapMatch
 
 # 1-sigma of the slope and of the level (share of the height) of the ground that is seen: fields and towns without a
@@ -13,9 +14,6 @@ LEVEL_M = 1.2
 RELIEF_SLOPE = 2.0  # a plane that misses the ground by this share of the height misses its slope by so much more
 # ... and one hill is seen by some fifteen keyframes in a row, each with the same mistake: root of that many.
 RELIEF_REPEATS = 4.0
-# 1-sigma by which ground that no DEM tells rises, for the root of a metre of way: relief is close to a random walk.
-# Gentle country, 3 m over 100 m; the mountains of an SRTM tile have ten times as much.
-UNKNOWN_RISE = 0.3
 SLOPE_REACH_M = 150.0  # from where a plane was fitted: farther away it says nothing
 
 
@@ -27,6 +25,7 @@ class Terrain:
         self._at_m = np.zeros(2)  # where that is so
         self._relief_m = 0.0  # how far the ground departs from a plane
         self._slope: tuple[float, float] | None = None  # of the ground, east and north; None: no DEM
+        self.ruggedness = Ruggedness()
 
     def hear(self, match: MapMatch, at_m: np.ndarray | None) -> None:
         """``at_m`` (east, north, ...): the camera of the match; None: the graph no longer has it."""
@@ -36,6 +35,11 @@ class Terrain:
         if at_m is not None:
             self._at_m = at_m[:2]
 
+    @property
+    def is_told(self) -> bool:
+        """A DEM tells the ground. Else heights are above whatever ground is seen, as if all of it were at one level."""
+        return self._slope is not None
+
     def below(self, p_m: np.ndarray) -> float:
         """AMSL of the ground under (east, north, ...). A slope is that of one footprint: hills end."""
         slope, away_m = np.array(self._slope or (0.0, 0.0)), p_m[:2] - self._at_m
@@ -44,7 +48,7 @@ class Terrain:
 
     def rise_sigma_m(self, way_m: float) -> float:
         """By which the ground may have risen or fallen over a way, without anybody telling."""
-        return 0.0 if self._slope is not None else UNKNOWN_RISE * float(np.sqrt(way_m))
+        return 0.0 if self.is_told else self.ruggedness.rise * float(np.sqrt(way_m))
 
     def slope_sigma(self, height_m: float) -> float:
         """Of the ground that a frame shows from this height, where nobody tells it."""
@@ -54,10 +58,11 @@ class Terrain:
         """The plane for odometry seen at ``p_m`` (east, north, ...), of whose matches this ``share`` agreed."""
         slope_e, slope_n = self._slope or (0.0, 0.0)
         slope_sigma, level_share = FLAT_SIGMAS if self._slope is None else DEM_SIGMAS
+        slope_sigma = max(slope_sigma, self.slope_sigma(height_m))
         # Over hills the tracked points lie off the plane, all on one side for a while.
         relief_share = RELIEF_REPEATS * self._relief_m / height_m
         slope_sigma = float(np.hypot(slope_sigma, RELIEF_SLOPE * relief_share))
         untold_m = 0.0 if self._slope is None else max(0.0, float(np.hypot(*(p_m[:2] - self._at_m))) - SLOPE_REACH_M)
-        level_m = np.hypot(LEVEL_M, UNKNOWN_RISE * np.sqrt(untold_m))
+        level_m = np.hypot(LEVEL_M, self.ruggedness.rise * np.sqrt(untold_m))
         level_share = float(np.sqrt(level_share**2 + relief_share**2 + (level_m / height_m) ** 2))
         return Ground(height_m, height_sigma_m, slope_e, slope_n, slope_sigma, level_share, share)

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from terrafix.core.pose import tangent_to_world, world_to_tangent
-from terrafix.core.start import SEARCHED_START_M
-from terrafix.estimator.graph import NodeState, PoseGraph
+from terrafix.estimator.factors import BIAS_SIZE, LENS_SIGMA
+from terrafix.estimator.graph import HEIGHT_BY_CLIMB, WALK_SIGMAS, NodeState, PoseGraph
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.mounted import (
     DEFAULT_AGL_M,
@@ -18,6 +18,7 @@ from terrafix.estimator.mounted import (
     UNKNOWN_RAD,
     MountedCamera,
 )
+from terrafix.estimator.resume import Known
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
 from terrafix.estimator.velocity import (
@@ -31,7 +32,6 @@ from terrafix.estimator.velocity import (
     spread_after,
     standing_cov,
     unknown_cov,
-    wandered_m,
 )
 from terrafix.messages import CovarianceMode, Odometry, Origin, Verdict
 
@@ -45,6 +45,7 @@ OPEN_HEIGHT = 0.2  # 1-sigma, share of the height, beyond which nobody knows it;
 FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
+RISE_SHARED = float(np.sqrt(3.0))
 
 Feel = Callable[[int, int], Felt | None]
 
@@ -77,9 +78,9 @@ class Advance:
 class Tracker:
     """``last_fix_s``: time of the newest frame that was fixed on the map; None: none was.
 
-    ``began_s``: when the flight was at its start, if that is not now: this process was started again in flight."""
+    ``known``: where the flight was known last, if that is not its start now: this process was started in flight."""
 
-    def __init__(self, origin: Origin, began_s: float | None = None) -> None:
+    def __init__(self, origin: Origin, known: Known | None = None) -> None:
         self.origin = origin
         self.graph = PoseGraph()
         self.camera = MountedCamera(origin)
@@ -97,7 +98,8 @@ class Tracker:
         self._blind = False  # ... nor felt
         self._last: Placed | None = None  # newest frame
         self._began_with = (False, False)  # heading, height
-        self._began_s = began_s
+        self._known = known
+        self._first_s = 0.0  # when the graph began first
 
     @property
     def last(self) -> Placed | None:
@@ -107,6 +109,22 @@ class Tracker:
     def body(self, placed: Placed) -> np.ndarray:
         """R_w_b (3x3) of a placed frame, with the mount as it was learnt."""
         return self.camera.body(placed.pose.rotation().matrix(), self.graph.state(placed.node).bias)
+
+    @property
+    def measures_height(self) -> bool:
+        """The autopilot says how high it flies."""
+        return self._began_with[1]
+
+    def amsl(self, placed: Placed) -> tuple[float, float]:
+        """Of the camera, and the 1-sigma by which the barometer may be off, 0 where it is not needed: without a DEM
+        the graph has the height above whatever ground it sees, and the barometer how high that lies."""
+        up_m = float(placed.pose.translation()[2])
+        if self.terrain.is_told or not self.measures_height:
+            return up_m, 0.0
+        up_m += float(self.graph.state(placed.node).bias[3])
+        drift_m = WALK_SIGMAS[3] * np.sqrt(placed.t_s - self._first_s)
+        climb_m = HEIGHT_BY_CLIMB * (up_m - (self.origin.ground_amsl_m or 0.0))
+        return up_m, float(np.linalg.norm([self.origin.agl_sigma_m, drift_m, climb_m]))
 
     def advance(
         self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude, felt: Feel = nothing_felt
@@ -149,7 +167,10 @@ class Tracker:
             self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
         state = NodeState(pose, before.bias, velocity)
         said = self.camera.factor(self.graph.next_keys(), attitude, r_w_c)
-        rise_m = self.terrain.rise_sigma_m(float(np.hypot(*step)))
+        rise_m = self._rise_sigma_m(step)
+        if way is not None:
+            ground_m = self.terrain.below(p)
+            way = way.above(max(float(p[2]) - ground_m, 1.0), ground_m, rise_m)
         node = self.graph.extend(t_s, state, parent, motion, way, said, rise_m)
         self._felt = None if way is None else way.inertial
         if not attitude.stands:
@@ -182,6 +203,12 @@ class Tracker:
             launching=self._launching,
         )
 
+    def _rise_sigma_m(self, way_m: np.ndarray) -> float:
+        """Of the ground over a way (east, north, ...), where nobody tells. Heights are above that ground. The motion
+        that was seen, the leg and the barometer do not know of its rise, all three by the same error: three times the
+        variance for each, so that together they do not know it better than one."""
+        return RISE_SHARED * self.terrain.rise_sigma_m(float(np.hypot(way_m[0], way_m[1])))
+
     def _height_is_open(self, attitude: Attitude, before: NodeState) -> bool:
         """No autopilot and no map match says how high it flies: nobody knows how long the ways are that are seen. Legs
         must not choose: all of them agree best with no way at all, and the height would fall to the ground."""
@@ -210,14 +237,14 @@ class Tracker:
         return self.last_fix_s is None and (heading or height)
 
     def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
-        """At the flight's start, less sure the longer that was ago."""
+        """Where the flight was known last, and has flown on since."""
         self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
-        waited_s = 0.0 if self._began_s is None else t_s - self._began_s
-        self._began_s = t_s - waited_s
-        drift_m = wandered_m(waited_s) if waited_s > 0.0 else 0.0
-        start_m = float(np.hypot(min(max(self.origin.start_sigma_m, 1.0), SEARCHED_START_M), drift_m))
-        placed = self._start_graph(frame_id, t_s, attitude, np.zeros(2), start_m)
-        return Advance(Verdict.ACCEPTED, placed, np.zeros(2), drift_m)
+        self._known = known = self._known or Known.start(self.origin, t_s)
+        self._first_s = known.t_s
+        way_m, drift_m = known.later(t_s)
+        sigma_m = float(np.hypot(known.sigma_m, drift_m))
+        placed = self._start_graph(frame_id, t_s, attitude, known.at_m + way_m, sigma_m)
+        return Advance(Verdict.ACCEPTED, placed, way_m, drift_m)
 
     def _start_graph(self, frame_id: int, t_s: float, attitude: Attitude, at_m: np.ndarray, sigma_m: float) -> Placed:
         """Anew at ``at_m`` (east, north), known to ``sigma_m``; all else as the autopilot says it."""
@@ -225,18 +252,19 @@ class Tracker:
         tolerance = np.radians(origin.camera.mount_tolerance_deg)
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
-        r_w_c = self.camera.expected(attitude, np.zeros(4))
+        r_w_c = self.camera.expected(attitude, np.zeros(BIAS_SIZE))
         pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([*at_m, self.terrain.ground_m + agl]))
         wide = np.diag([1.0, 1.0, UNKNOWN_RAD, sigma_m, sigma_m, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
-        bias_cov = np.diag([tolerance, tolerance, yaw, float(np.hypot(agl_sigma, HEIGHT_BIAS * agl))]) ** 2
+        height = float(np.hypot(agl_sigma, HEIGHT_BIAS * agl))
+        bias_cov = np.diag([tolerance, tolerance, yaw, height, LENS_SIGMA]) ** 2
         self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
         self._felt = self._stood_at = None
         node = self.graph.start(
             t_s,
-            NodeState(pose, np.zeros(4), np.zeros(V_SIZE)),
+            NodeState(pose, np.zeros(BIAS_SIZE), np.zeros(V_SIZE)),
             world_to_tangent(cov_world, r_w_c),
             bias_cov,
             self._velocity_cov,
@@ -272,6 +300,9 @@ class Tracker:
             r_w_k, tilt_sigma = r_w_kf, UNKNOWN_ATTITUDE_RAD  # nobody knows of a change of tilt
         share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
         ground = self._ground(p, height, place_cov, share)
+        newest = self.graph.state(self.graph.newest)
+        onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - self.graph.time_of(self.graph.newest))
+        ground = replace(ground, rise_sigma_m=self._rise_sigma_m(newest.pose.translation() + onward - p))
         motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
         if motion is None:
             return None

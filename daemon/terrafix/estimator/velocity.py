@@ -67,7 +67,9 @@ class Leg:
 
     a0 (5,) are both accelerations of V. ``cov`` (11, 11) of what that leaves out: position, velocity (both world axes),
     accelerations (heading's axes).
-    ``inertial``: way and gain were measured, and turn with the heading bias."""
+    ``inertial``: way and gain were measured, and turn with the heading bias.
+    ``over``: height of the end above the ground, and AMSL of that ground, both as they were believed; all of the leg is
+    in units of the height, and what it says is true of any. None: it is in metres."""
 
     reach_s: float
     keep: float
@@ -78,6 +80,7 @@ class Leg:
     lasting: np.ndarray
     cov: np.ndarray
     inertial: bool
+    over: tuple[float, float] | None = None
 
     def predicted(self, p_m: np.ndarray, v: np.ndarray, heading_bias_rad: float) -> tuple[np.ndarray, np.ndarray]:
         """-> position (3,) and V at the end, from those at the beginning."""
@@ -93,6 +96,16 @@ class Leg:
         by[3:6, :3], by[3:6, 3:] = self.keep * np.eye(3), self.gain_by_accel
         by[6:, 3:] = np.diag(self.lasting)
         return by
+
+    def above(self, height_m: float, ground_m: float, rise_sigma_m: float) -> "Leg":
+        """The same with its end at such a height above ground of this AMSL, which rose by this, 1-sigma, on the way.
+
+        A camera measures ways in heights. Told in metres, whatever the camera misjudges weighs the less in a leg the
+        lower the flight is believed to be, and it sinks: to the ground where nobody felt the leg, by metres in minutes
+        where an IMU did. In units of the height such noise is the same at any. What was felt still tells of metres."""
+        cov = self.cov.copy()
+        cov[2, 2] += rise_sigma_m**2
+        return replace(self, cov=cov, over=(height_m, ground_m))
 
     def without_a_say(self, speed_mps: float, dt_s: float) -> "Leg":
         """The same for a vehicle that may have flown with any speed up to this."""
@@ -178,12 +191,6 @@ def unknown_cov() -> np.ndarray:
 def standing_cov() -> np.ndarray:
     """(8, 8) of V of a vehicle whose motors may not turn."""
     return np.diag([STANDING_MPS] * 6 + [STEADY_MPS2] * 2) ** 2
-
-
-def wandered_m(dt_s: float) -> float:
-    """1-sigma of the way, for each axis, of a vehicle of whose motion nothing is known."""
-    way = leg(dt_s, None, (0.0, 0.0), 0.0, TYPICAL_SPEED_MPS, 0.0, same_kind=False)
-    return float(np.hypot(way.reach_s * MAX_SPEED_SIGMA_MPS[0], np.sqrt(way.cov[0, 0])))
 
 
 def spread_after(way: Leg | None, velocity_cov: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
+from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph
 from terrafix.estimator.matched import determined, measured_pose
 from terrafix.estimator.motion import RelativePose
@@ -63,7 +64,7 @@ class WholeGraph(PoseGraph):
     def __init__(self) -> None:
         super().__init__()
         self.nodes: list[WholeNode] = []
-        self._noted = WholeNode(0.0, NodeState(gtsam.Pose3(), np.zeros(4), np.zeros(V_SIZE)), [])
+        self._noted = WholeNode(0.0, NodeState(gtsam.Pose3(), np.zeros(BIAS_SIZE), np.zeros(V_SIZE)), [])
 
     def start(
         self,
@@ -123,7 +124,7 @@ def _same_frame(first: int, second: int) -> list[gtsam.NonlinearFactor]:
     slow = gtsam.noiseModel.Diagonal.Sigmas(SPLIT * WALK_SIGMAS)
     return [
         gtsam.BetweenFactorPose3(C(first), C(second), gtsam.Pose3(), same(6, SAME_M)),
-        gtsam.BetweenFactorVector(B(first), B(second), np.zeros(4), slow),
+        gtsam.BetweenFactorVector(B(first), B(second), np.zeros(BIAS_SIZE), slow),
         gtsam.BetweenFactorVector(V(first), V(second), np.zeros(V_SIZE), same(V_SIZE, SAME_MPS)),
     ]
 

@@ -1,0 +1,70 @@
+"""Ground that rises and falls by tens of metres in a kilometre, and no map tells."""
+
+import numpy as np
+import pytest
+from simulated_flight import Flight, Listener, cov_of, error_m
+
+from terrafix.estimator.ruggedness import CANDIDATES, Ruggedness
+
+FRAMES = 240
+
+
+@pytest.fixture(scope="module", params=[0.0, 8.0, 25.0], ids=lambda hills_m: f"{hills_m:.0f} m")
+def run(request: pytest.FixtureRequest) -> tuple[Flight, Listener]:
+    flight = Flight(FRAMES, seed=5, hills_m=request.param)
+    return flight, Listener().fly(flight, 0, FRAMES)
+
+
+def test_the_claim_holds_over_them(run: tuple[Flight, Listener]) -> None:
+    flight, told = run
+    errors = np.array([error_m(told.estimate(i), flight)[:2] for i in range(10, FRAMES)])
+    covs = np.array([cov_of(told.estimate(i))[:2, :2] for i in range(10, FRAMES)])
+    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covs), errors)
+    assert (nees < 5.99).mean() > 0.9
+    assert np.median(np.hypot(*errors.T)) < 6.0 and np.hypot(*errors.T).max() < 30.0
+
+
+def test_heights_above_ground_and_sea_are_two(run: tuple[Flight, Listener]) -> None:
+    """The one from pictures, the other from the barometer: the ground between them is not known."""
+    flight, told = run
+    height_m = flight.p_m[:, 2] - flight.ground_m
+    said = [told.estimate(i) for i in range(10, FRAMES)]
+    agl_off = np.array([one.agl_m - height_m[one.frame_id] for one in said])
+    amsl_off = np.array([error_m(one, flight)[2] for one in said])
+    sigma = np.sqrt([cov_of(one)[2, 2] for one in said])
+    assert np.median(np.abs(agl_off)) < 8.0 and (np.abs(agl_off) < 3.0 * sigma).all()
+    assert np.median(np.abs(amsl_off)) < 4.0 and (np.abs(amsl_off) < 3.0 * sigma).all()
+
+
+def walked(rise: float, metres: float, told: Ruggedness, seed: int) -> list[float]:
+    """What it takes the ground for that is measured to 4 m, every 60 m."""
+    rng = np.random.default_rng(seed)
+    at_m = np.arange(0.0, metres, 60.0)
+    level_m = np.cumsum(rng.normal(0.0, rise * np.sqrt(60.0), len(at_m)))
+    taken_for = []
+    for at, level in zip(at_m, level_m, strict=True):
+        told.measured(np.array([0.0, at]), 100.0, float(level + rng.normal(0.0, 4.0)), 4.0)
+        taken_for.append(told.rise)
+    return taken_for
+
+
+@pytest.mark.parametrize("rise", CANDIDATES)
+def test_it_learns_how_rugged_the_ground_is(rise: float) -> None:
+    ends = [np.mean(walked(rise, 6000.0, Ruggedness(), seed)[-20:]) for seed in range(8)]
+    assert 0.7 * rise < np.median(ends) < 2.0 * rise
+
+
+def test_where_hills_begin_it_forgets_the_plain() -> None:
+    hills = []
+    for seed in range(8):
+        told = Ruggedness()
+        assert 0.3 < walked(0.0, 5000.0, told, seed)[-1] < 0.6
+        hills.append(max(walked(3.0, 1000.0, told, seed)))
+    assert np.median(hills) > 1.5
+
+
+def test_levels_of_the_same_ground_are_one() -> None:
+    told = Ruggedness()
+    for i in range(50):
+        told.measured(np.array([0.0, 0.5 * i]), 100.0, 20.0 * (i % 2), 4.0)
+    assert told.rise == Ruggedness().rise
