@@ -229,14 +229,14 @@ class SearchState(Message, frozen=True, kw_only=True):
 
 
 class PositionHint(Message, frozen=True, kw_only=True):
-    """A coarse position of the vehicle that a person gave: where a search begins, never the truth.
+    """A coarse position from a person, or after a restart in flight from the autopilot: where a search begins.
 
     ``radius_m``: it is so near, in 95 of 100 cases; at ``t_ns``, when the hint was given."""
 
     lat_deg: float
     lon_deg: float
     radius_m: float
-    source: str  # "ground station 255", "command line"
+    source: str  # "ground station 255", "command line", "autopilot"
 
 
 class HintVerdict(Message, frozen=True, kw_only=True):

@@ -88,7 +88,7 @@ PROCESSES: tuple[Process, ...] = (
         (m.Origin, m.Prediction, m.PositionHint),
         (m.MapMatch, m.ModelEvent, m.SearchState, m.HintVerdict),
         0.0,
-        30.0,
+        90.0,  # one look over a large map takes seconds, and half a minute on a computer that is ten times as busy
         (m.Prediction,),
     ),
     Process(

@@ -16,8 +16,18 @@ SHIPPED = Path(__file__).parent / "models"
 Size = Annotated[int, Meta(ge=1)] | Annotated[str, Meta(pattern=r"^[A-Za-z_]\w*(/[1-9][0-9]*)?$")]
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
 File = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]  # no folder: it stands in the models folder
+# Of points in a picture. pixels: of the input, the middle of the first pixel is 0; signed (-1 to 1) and unit (0 to 1):
+# from the middle of the first pixel to that of the last one.
+Coordinates = Literal["pixels", "signed", "unit"]
 
 
+# Sections that a role needs.
+SECTIONS = {
+    "dense": ("image",),
+    "keypoints": ("image", "keypoints"),
+    "matcher": ("matcher",),
+    "pair": ("image", "pair"),
+}
 DENSE_INPUT, DENSE_OUTPUTS = "input", ("descriptors", "keypoint_logits", "reliability")  # what "dense" means
 
 
@@ -60,9 +70,7 @@ class KeypointOutputs(Section, frozen=True, kw_only=True):
     keypoints: str  # (N, 2), x then y
     scores: str  # (N,)
     descriptors: str  # (N, C), or (C, N) with channels_first
-    # pixels: of the input, the middle of the first pixel is 0; signed (-1 to 1) and unit (0 to 1): from the middle of
-    # the first pixel to that of the last one
-    coordinates: Literal["pixels", "signed", "unit"] = "pixels"
+    coordinates: Coordinates = "pixels"
     channels_first: bool = False
 
 
@@ -79,12 +87,22 @@ class MatcherTensors(Section, frozen=True, kw_only=True):
     form: Literal["pairs", "index"] = "pairs"
 
 
+class PairTensors(Section, frozen=True, kw_only=True):
+    """Names of the tensors of a model that is given two pictures; the first one goes into the input of [image]."""
+
+    second: str  # input of the second picture, of the same shape
+    keypoints: tuple[str, str]  # outputs (N, 2), x then y: what was found in the first picture, and in the second
+    scores: str  # (N,), 0 to 1
+    coordinates: Coordinates = "pixels"
+
+
 class Manifest(Section, frozen=True, kw_only=True):
-    """``role``: "dense" gives the maps of XFeat, "keypoints" points, "matcher" joins the points of two pictures."""
+    """``role``: "dense" gives the maps of XFeat, "keypoints" points, "matcher" joins the points of two pictures, "pair"
+    is given the two pictures themselves."""
 
     name: Name
     title: str
-    role: Literal["dense", "keypoints", "matcher"]
+    role: Literal["dense", "keypoints", "matcher", "pair"]
     file: File
     sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     size_bytes: Annotated[int, Meta(ge=1)]
@@ -97,6 +115,7 @@ class Manifest(Section, frozen=True, kw_only=True):
     image: ImageInput | None = None
     keypoints: KeypointOutputs | None = None
     matcher: MatcherTensors | None = None
+    pair: PairTensors | None = None
 
     def tensors(self, names: tuple[str, ...]) -> tuple[Tensor, ...]:
         """Those inputs and outputs, in this order."""
@@ -177,8 +196,7 @@ def _contradiction(manifest: Manifest) -> str:
     """What does not fit together, or ""."""
     inputs, outputs = {t.name for t in manifest.inputs}, {t.name for t in manifest.outputs}
     free = {size for t in manifest.inputs for size in t.shape if isinstance(size, str)}
-    wants = {"dense": ("image",), "keypoints": ("image", "keypoints"), "matcher": ("matcher",)}[manifest.role]
-    for section in wants:
+    for section in SECTIONS[manifest.role]:
         if getattr(manifest, section) is None:
             return f"a model with the role '{manifest.role}' needs a section [{section}]"
     if manifest.source and not manifest.source.startswith(("https://", "http://")):
@@ -192,6 +210,9 @@ def _contradiction(manifest: Manifest) -> str:
     if matcher := manifest.matcher:
         used_in |= {*matcher.keypoints, *matcher.descriptors}
         used_out |= {matcher.matches, matcher.scores}
+    if pair := manifest.pair:
+        used_in |= {pair.second}
+        used_out |= {*pair.keypoints, pair.scores}
     for name in sorted((used_in - inputs) | (used_out - outputs)):
         return f"'{name}' is used, but neither an input nor an output of that name is stated"
     parts = [str(size).partition("/") for t in (*manifest.inputs, *manifest.outputs) for size in t.shape]
@@ -199,16 +220,21 @@ def _contradiction(manifest: Manifest) -> str:
         return f"'{name}' is divided in a shape, but is no size of an input"
     if manifest.image and not _is_picture(manifest):
         return f'the shape of \'{manifest.image.input}\' must end with "height", "width", or with two numbers'
+    if (image := manifest.image) and pair and _shape(manifest, pair.second) != _shape(manifest, image.input):
+        return f"'{pair.second}' must have the shape of '{image.input}'"
     for preset in manifest.presets:
         if missing := free - set(preset.sizes):
             return f"a preset has no size for '{min(missing)}'"
     return ""
 
 
+def _shape(manifest: Manifest, name: str) -> list[Size]:
+    return manifest.tensors((name,))[0].shape
+
+
 def _is_picture(manifest: Manifest) -> bool:
     assert manifest.image is not None
-    (tensor,) = manifest.tensors((manifest.image.input,))
-    if len(tensor.shape) != 4:
+    if len(_shape(manifest, manifest.image.input)) != 4:
         return False
     size = manifest.picture_size()
     return size == ("height", "width") or all(isinstance(side, int) for side in size)

@@ -23,6 +23,7 @@ class GroundAutopilot:
         loses: int = 0,
         armed: bool = False,
         mission: tuple[tuple[int, float, float, float], ...] = (),
+        home: tuple[float, float] = (48.0, 11.0),
     ) -> None:
         """``also``: system ids of other autopilots on the wire. ``loses``: so many answers about parameters are lost.
         ``mission``: (command, latitude, longitude, height) of items after home."""
@@ -31,7 +32,7 @@ class GroundAutopilot:
         self._ear = mavlink.MAVLink(None)
         self._beat = mavlink.MAVLink_heartbeat_message(kind, firmware, 128 * armed, 0, mavlink.MAV_STATE_ACTIVE, 3)
         self._also, self._read_only, self._loses, self._version = also, read_only, loses, version
-        self._mission = ((16, 48.0, 11.0, 0.0), *mission) if mission else ()
+        self._mission = ((16, *home, 0.0), *mission) if mission else ()
         self._coming: list[bytes] = []
         self.was_set: list[str] = []
 

@@ -1,6 +1,7 @@
 """What scenarios do to a flight: exactly what they say, and nothing else."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -79,13 +80,14 @@ def test_only_so_many_frames_and_numbers_from_zero() -> None:
     assert [len(s.states) for s in shots] == [1, 3, 1, 1]  # the autopilot went on reporting
 
 
-def test_a_foreign_frame_is_mirrored_and_between_two_others() -> None:
-    shots = altered(faults.foreign_frames(frozenset({"5.jpg"})))
+def test_a_foreign_frame_comes_between_two_others() -> None:
+    stranger = np.full((4, 8, 3), 99, np.uint8)
+    shots = altered(faults.foreign_frames({"5.jpg": stranger}))
     assert len(shots) == FRAMES + 1
     foreign = shots[5]
     assert foreign.frame.file == faults.foreign_name("5.jpg") and shots[6].frame.file == "5.jpg"
     assert shots[4].frame.t_ns < foreign.frame.t_ns < shots[6].frame.t_ns
-    assert foreign.image is not None and grey(foreign) == 0 and foreign.image[0, 7, 0] == 1  # the first one, mirrored
+    assert foreign.image is stranger and foreign.states == ()
 
 
 def test_dark_and_frozen_pictures() -> None:
@@ -178,6 +180,22 @@ def test_the_gap_is_where_the_track_turns_and_shares_no_ground() -> None:
     assert before < 20 <= after  # the corner is frame 20
     track = flight.track_m()
     assert np.hypot(*(track[after] - track[before])) >= 100.0
+
+
+def test_a_far_frame_is_350_m_from_where_it_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = straight()
+    monkeypatch.setattr(Flight, "picture", lambda _, number: np.full((4, 8, 3), number, np.uint8))
+    plan = BY_NAME["350 m frame"].plan(flight)
+    assert isinstance(plan, Plan) and len(plan.marks.wrong_files) == 3
+    track = flight.track_m()
+    own = (Frame(t_ns=i, frame_id=i, file=stop.file, width=8, height=4) for i, stop in enumerate(flight.stops))
+    shots = list(plan.edit(Shot(frame, (), None) for frame in own))
+    assert len(shots) == len(flight.stops) + 3
+    for before, shot in pairwise(shots):
+        if before.frame.file in plan.marks.wrong_files:
+            away = np.hypot(*(track - track[shot.frame.frame_id]).T)
+            assert away[grey(before)] == min(away[away >= 350.0])
+    assert "350 m apart" in str(BY_NAME["350 m frame"].plan(straight(frames=10)))
 
 
 def test_a_flight_that_is_too_short_is_said_to_be() -> None:

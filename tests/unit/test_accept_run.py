@@ -151,9 +151,9 @@ def flight_folder(folder: Path, *, with_map: bool) -> None:
 
 def test_every_scenario_of_the_requirements_is_there() -> None:
     wanted = (
-        "baseline", "foreign frame", "350 m outlier fix", "sharp turn", "three fragments", "20 % unmatchable",
-        "long route", "60 s blackout", "GNSS jam", "slow spoof", "season change", "low texture", "water",
-        "hill country",
+        "baseline", "foreign frame", "350 m frame", "350 m outlier fix", "sharp turn", "three fragments",
+        "20 % unmatchable", "long route", "60 s blackout", "GNSS jam", "slow spoof", "season change", "low texture",
+        "water", "hill country",
         "height wrong by 10 %", "compass wrong by 15 degrees", "heading unknown",
         "kidnapped", "hot day", "camera stall",
     )  # fmt: skip

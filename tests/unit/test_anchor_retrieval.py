@@ -7,10 +7,26 @@ import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.lost import MOST_ODDS, LostWatch
+from terrafix.anchor.agreement import Agreement
+from terrafix.anchor.lost import MOST_ODDS, LostWatch, pose_gain
 from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
-from terrafix.anchor.retrieval import LOOK_EVERY, MapSearch
-from terrafix.anchor.tracks import ENOUGH, LEADS, NEEDED, Found, Track, Tracks, pose_gain
+from terrafix.anchor.retrieval import MapSearch
+from terrafix.anchor.tracks import (
+    AHEAD,
+    CHANCE_MEAN,
+    CHANCE_PATCHES,
+    ENOUGH,
+    LEADS,
+    LLR_MAX,
+    LLR_MIN,
+    MIN_FRAMES,
+    NEW_EVIDENCE,
+    SPEAKS,
+    Found,
+    Track,
+    Tracks,
+    evidence,
+)
 from terrafix.messages import SearchStep
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import POOL
@@ -72,16 +88,16 @@ def test_a_place_of_which_nothing_is_known_is_found(ground: np.ndarray) -> None:
     assert np.linalg.norm(found.fix.pnp.fit.p_c_in_w_m - p_m) < 5.0
     assert np.hypot(found.track.e_m - p_m[0], found.track.n_m - p_m[1]) < 8.0
     assert np.degrees(found.track.hypothesis.yaw_rad) == pytest.approx(HEADING_ERROR_DEG, abs=3.0)
-    # Never on one frame: it takes a second joint look, over new ground.
-    assert (after - 1) * float(np.hypot(*STEP_M)) >= LOOK_EVERY * AGL_M
+    assert MIN_FRAMES <= after <= 4
 
 
 def test_one_frame_is_never_enough_however_often_it_is_seen(ground: np.ndarray) -> None:
     search = searched(BoundedMap(ground), None)
     picture, _ = next(frames(ground, 1))
-    for _ in range(2):
+    for _ in range(20):
         assert search.look(picture, predicted()) is None
-        search.move(0.0, 0.0, 4.0)  # nothing says how far it went
+        search.move(0.0, 0.0, 4.0)  # it hovers, and odometry knows no better
+    assert search.tracks.all[0].frames == 1
 
 
 def test_what_is_not_on_the_map_is_not_found_there() -> None:
@@ -132,55 +148,71 @@ def test_a_way_that_nobody_saw_ends_the_tracks(ground: np.ndarray) -> None:
     assert not search.tracks.all
 
 
-def test_odometry_moves_a_track_and_its_last_pose() -> None:
-    track = Track(10.0, 20.0, Hypothesis(0.0, 1.0), last_p_m=np.array([12.0, 19.0]))
+def test_odometry_moves_a_track() -> None:
+    track = Track(10.0, 20.0, Hypothesis(0.0, 1.0))
     track.moved(np.array([3.0, -4.0]))
-    assert (track.e_m, track.n_m) == (13.0, 16.0) and track.last_p_m is not None
-    assert track.last_p_m.tolist() == [15.0, 15.0]
+    assert (track.e_m, track.n_m) == (13.0, 16.0)
 
 
-def track_of(leads: tuple[float, ...], poses: int, span_m: float, score: float = 20.0) -> Track:
-    return Track(0.0, 0.0, Hypothesis(0.0, 1.0), score, poses, 0.0, span_m, leads=leads)
+def test_a_proposal_near_a_track_replaces_it_until_a_frame_has_spoken_for_it(ground: np.ndarray) -> None:
+    tracks = searched(BoundedMap(ground), None).tracks
+    for e_m in (0.0, 0.3 * AGL_M):
+        tracks.propose(e_m, 0.0, Hypothesis(0.0, 1.0), AGL_M)
+    assert [t.e_m for t in tracks.all] == [0.3 * AGL_M]
+    tracks.all[0].score = 1.0
+    tracks.propose(0.0, 0.0, Hypothesis(0.0, 1.0), AGL_M)
+    assert [t.e_m for t in tracks.all] == [0.3 * AGL_M]
+    tracks.propose(-0.2 * AGL_M, 0.0, Hypothesis(0.0, 1.0), AGL_M)
+    assert len(tracks.all) == 2
+
+
+def track_of(score: float, leads: tuple[float, ...] = (), frames: int = MIN_FRAMES, e_m: float = 0.0) -> Track:
+    return Track(e_m, 0.0, Hypothesis(0.0, 1.0), score, frames, leads=leads)
 
 
 @pytest.mark.parametrize(
-    ("leads", "poses", "span_m", "found"),
+    ("best", "rivals", "found"),
     [
-        ((2.6, 3.0), 1, 0.0, True),  # far ahead of every other place in two joint looks: one pose confirms it
-        ((2.6, 3.0), 0, 0.0, False),  # looks alone never do
-        ((3.0, 2.0), 1, 0.0, False),  # the worse of the two counts
-        ((9.0,), 1, 0.0, False),  # one look may be chance
-        ((1.3, 1.3), 2, 20.0, True),
-        ((1.3, 1.3), 2, 10.0, False),
-        ((-1.0, -1.0), 2, 50.0, False),
-        ((-1.0, -1.0), 3, 50.0, True),  # poses alone, over new ground
-        ((-1.0, -1.0), 3, 30.0, False),
+        (track_of(ENOUGH + 0.1), [], True),
+        (track_of(ENOUGH - 0.1), [], False),
+        (track_of(ENOUGH + 0.1, frames=MIN_FRAMES - 1), [], False),
+        (track_of(LLR_MIN, leads=(5.0, 5.0), frames=0), [], False),  # looks alone never do
+        (track_of(ENOUGH - 2.0, leads=(1.0, 1.0)), [], True),
+        (track_of(ENOUGH - 2.0, leads=(9.0,)), [], False),  # one look may be chance
+        (track_of(ENOUGH - 2.0, leads=(9.0, -1.0)), [], False),
+        (track_of(ENOUGH + 4.0), [track_of(ENOUGH, e_m=200.0)], False),  # the ground repeats
+        (track_of(ENOUGH + AHEAD + 0.1), [track_of(ENOUGH, e_m=200.0)], True),
     ],
 )
-def test_the_further_a_place_leads_the_fewer_poses_it_needs(
-    ground: np.ndarray, leads: tuple[float, ...], poses: int, span_m: float, found: bool
+def test_what_is_found_has_enough_and_is_ahead(
+    ground: np.ndarray, best: Track, rivals: list[Track], found: bool
 ) -> None:
     tracks = searched(BoundedMap(ground), None).tracks
-    tracks.all = [track_of(leads, poses, span_m)]
-    assert tracks._is_found(tracks.all[0], predicted()) is found
+    tracks.all = [best, *rivals]
+    assert tracks._is_found(best) is found
 
 
-def test_evidence_outweighs_the_number_of_places_and_every_rival(ground: np.ndarray) -> None:
-    tracks = searched(BoundedMap(ground), None).tracks
-    places = SIDE_M**2 / (0.4 * AGL_M) ** 2
-    enough = float(np.log(places)) + ENOUGH
-    few, plenty = (track_of((0.0, 0.0), 5, 90.0, score) for score in (enough - 0.1, enough + 0.1))
-    rival = Track(200.0, 0.0, Hypothesis(0.0, 1.0), enough - 1.0, leads=(0.0, 0.0))
-    tracks.all = [few]
-    assert not tracks._is_found(few, predicted())
-    tracks.all = [plenty]
-    assert tracks._is_found(plenty, predicted())
-    tracks.all = [plenty, rival]
-    assert not tracks._is_found(plenty, predicted())
+def test_one_piece_of_ground_counts_once() -> None:
+    """However many frames show it; and what speaks against a place does so once."""
+    track = Track(0.0, 0.0, Hypothesis(0.0, 1.0))
+    for i in range(11):
+        track.checked(LLR_MAX, i * 0.1 * NEW_EVIDENCE * AGL_M, AGL_M)
+    assert track.score == pytest.approx(2.0 * LLR_MAX) and track.frames == 11
+    for i in range(30):
+        track.checked(LLR_MIN, (1 + i) * NEW_EVIDENCE * AGL_M, AGL_M)
+    assert track.score == LLR_MIN
+
+
+def test_a_frame_that_says_next_to_nothing_does_not_speak_for_a_place() -> None:
+    track = Track(0.0, 0.0, Hypothesis(0.0, 1.0))
+    track.checked(SPEAKS - 0.1, 0.0, AGL_M)
+    assert track.score > 0.0 and track.frames == 0
+    track.checked(SPEAKS + 0.1, AGL_M, AGL_M)
+    assert track.frames == 1
 
 
 def test_a_lead_counts_once_it_has_lasted() -> None:
-    track = track_of((), 0, 0.0, 0.0)
+    track = track_of(0.0)
     assert track.lead == track.odds == 0.0
     track.looked_at(4.0)
     assert track.lead == 0.0
@@ -190,10 +222,15 @@ def test_a_lead_counts_once_it_has_lasted() -> None:
     assert track.lead == -2.0 and track.odds < 0.0 and len(track.leads) == LEADS
 
 
-def test_what_is_needed_grows_as_the_lead_shrinks() -> None:
-    leads, poses, spans = zip(*NEEDED, strict=True)
-    assert sorted(leads, reverse=True) == list(leads)
-    assert sorted(poses) == list(poses) and sorted(spans) == list(spans) and min(poses) >= 1
+def test_what_chance_comes_to_is_no_evidence() -> None:
+    def of(llr: float, patches: int) -> float:
+        none = np.zeros(patches, bool)
+        return evidence(Agreement(llr, np.zeros(6), np.zeros((patches, 2)), none))
+
+    assert of(CHANCE_MEAN, CHANCE_PATCHES) == LLR_MIN < 0.0 < of(2.0 * CHANCE_MEAN, CHANCE_PATCHES)
+    assert of(40.0, CHANCE_PATCHES) == LLR_MAX
+    assert of(0.25 * CHANCE_MEAN, CHANCE_PATCHES // 4) < 0.0  # fewer patches: by chance they come to less, too
+    assert of(CHANCE_MEAN, CHANCE_PATCHES // 4) > of(CHANCE_MEAN, CHANCE_PATCHES)
 
 
 def test_more_patches_say_more() -> None:

@@ -362,6 +362,7 @@ def test_damaged_packets_are_counted_and_the_next_good_one_is_read(station: Stat
         ("tcp:127.0.0.1:1", "is the other side listening?"),
         ("udpout:no.such.host.invalid:14550", "is not known"),
         ("serial:ttyUSB0:57600", "not understood"),
+        ("ttyUSB0", "not understood"),
         ("/dev/no-such-device", "is it plugged in"),
         ("/dev/null", "is it plugged in"),
     ],

@@ -157,6 +157,12 @@ def test_when_we_ourselves_have_just_moved_it_is_a_dispute() -> None:
     assert "Terrafix: GPS 1 and the map disagree" in [x.text for x in moved if isinstance(x, m.StatusText)]
 
 
+def test_before_the_first_map_fix_nobody_is_accused_and_nobody_trusted() -> None:
+    """The start coordinate may be that of another start: a computer that was started again in flight."""
+    heard = watched(LinkNode(10.0), 60.0, lambda _: (2000.0, 0.0), anchor_age_ms=-1)
+    assert {s for _, s in verdicts(heard)} == {GnssState.UNKNOWN}
+
+
 # --- what follows ---
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from link_rig import S, covariance, estimate, every, fly, texts
-from link_wire import MemoryWire, heartbeat, packed
+from link_wire import MemoryWire, attitude, heartbeat, packed
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
@@ -199,3 +199,56 @@ def test_an_estimator_that_has_fallen_silent_is_another_matter() -> None:
         asking.estimate(estimate(frame * S, cov=covariance(1000.0)))
     assert asking.due(4 * S) and not asking.due(4 * S)
     assert asking.due(40 * S) == ""
+
+
+# --- started again in flight ---
+
+
+def position(lat_deg: float, lon_deg: float, above_m: float = 100.0) -> Any:
+    place = (round(lat_deg * 1e7), round(lon_deg * 1e7))
+    return mavlink.MAVLink_global_position_int_message(1, *place, 600_000, round(above_m * 1e3), 0, 0, 0, 0)
+
+
+class Restarted:
+    """Edge and node that begin beside an autopilot that is in the air, and believes to be at LAT, LON."""
+
+    def __init__(self, *, armed: bool = True) -> None:
+        self.wire, self.node = MemoryWire(), LinkNode(10.0)
+        self.edge = MavlinkEdge(LinkSection(), self.wire, lambda: 0)
+        self._autopilot = mavlink.MAVLink(None, 1, 1)
+        self._beat = heartbeat()
+        self._beat.base_mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
+        self.seconds = 0
+
+    def hints(self, seconds: int, *, anchor_age_ms: int | None = -1, above_m: float = 100.0) -> list[m.PositionHint]:
+        """``anchor_age_ms`` of estimates every half second; None: there are none yet."""
+        found: list[m.PositionHint] = []
+        for step in range(self.seconds * 50, (self.seconds + seconds) * 50):
+            now_ns = step * S // 50
+            if step % 25 == 0:
+                said = (self._beat, attitude(now_ns // 10**6), position(LAT, LON, above_m))
+                self.wire.arrive(*(packed(x, self._autopilot) for x in said))
+                if anchor_age_ms is not None:
+                    list(self.node.on(estimate(now_ns, late_ns=0, anchor_age_ms=anchor_age_ms)))
+            for message in self.edge.poll(now_ns):
+                list(self.node.on(message))
+                found += [message] if isinstance(message, m.PositionHint) else []
+            for message in self.node.tick(now_ns):
+                self.edge.heard(message)
+        self.seconds += seconds
+        return found
+
+
+def test_after_a_restart_in_flight_the_search_begins_where_the_autopilot_is() -> None:
+    flying = Restarted()
+    assert flying.hints(5, anchor_age_ms=None) == []  # the others are still starting, and would not hear it
+    (hint,) = flying.hints(10)
+    assert (hint.lat_deg, hint.lon_deg, hint.radius_m) == pytest.approx((LAT, LON, 300.0), abs=1e-7)
+    assert hint.source == "autopilot"
+    assert len(flying.hints(120)) == 2  # and no more than three
+
+
+def test_no_hint_of_the_autopilot_when_it_is_not_needed() -> None:
+    assert Restarted().hints(10, anchor_age_ms=0) == []  # the link alone was started again
+    assert Restarted(armed=False).hints(10) == []
+    assert Restarted().hints(10, above_m=5.0) == []

@@ -253,6 +253,28 @@ def test_dead_reckoning_on_the_last_rung_has_no_fix() -> None:
     assert {g.fix_type for g in sent if g.t_ns > 36 * S} == {1}
 
 
+def armed(t_ns: int, yes: bool | None) -> m.VehicleState:
+    return m.VehicleState(t_ns=t_ns, source="mavlink", armed=yes)
+
+
+@pytest.mark.parametrize(
+    ("first_seen", "fix_type"),
+    [(True, 1), (False, 3), (None, 3)],
+    ids=["in flight", "on the ground", "no autopilot"],
+)
+def test_a_start_coordinate_is_no_fix_for_a_vehicle_that_already_flies(first_seen: bool | None, fix_type: int) -> None:
+    """The computer was started again in the air: it begins where the flight began, and claims to be good."""
+    node = LinkNode(10.0)
+    list(node.on(armed(0, first_seen)))
+    if first_seen is False:
+        list(node.on(armed(1, True)))  # and then it took off
+    unproved = fly(node, 0, 5 * S, every(500 * MS, lambda t: estimate(t, anchor_age_ms=-1)))
+    assert {g.fix_type for g in reported(unproved, S)} == {fix_type}
+    assert (texts(unproved).count("Terrafix: started in flight, searching the map") == 1) == (fix_type == 1)
+    found = fly(node, 5 * S, 8 * S, every(500 * MS, lambda t: estimate(t, anchor_age_ms=200)))
+    assert {g.fix_type for g in reported(found, 6 * S)} == {3}
+
+
 def test_pilot_hears_fix_lost_and_found_without_a_flood() -> None:
     feed = every(200 * MS, lambda t: estimate(t, sigma_m=4.0 if (t // S) % 2 else 90.0, anchor_age_ms=0))
     said = fly(LinkNode(10.0), 0, 60 * S, feed)

@@ -123,6 +123,29 @@ def test_a_wrong_file_is_one_clear_line(text: str, said: str, tmp_path: Path) ->
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
+def test_where_a_mission_leads_is_read_from_items_that_nobody_here_can_fly(tmp_path: Path) -> None:
+    """As ArduPilot has them: a jump, a spline, the start of a landing, a look, a waypoint at 0, 0 (where it is)."""
+    rows = [
+        "3 84 0 0 0 0 48.0 11.0 50",  # VTOL take-off: from home
+        "3 82 0 0 0 0 48.1 11.1 100",  # spline
+        "3 177 2 3 0 0 0 0 0",  # jump
+        "3 178 0 -1 50 0 0 0 0",  # speed: as it was
+        "3 195 0 0 0 0 47.0 10.0 0",  # look there
+        "3 16 0 0 0 0 0 0 80",
+        "3 189 0 0 0 0 48.2 11.2 60",
+        "7 16 0 0 0 0 48.3 11.3 40",  # a frame that is new
+        "3 85 0 0 0 0 48.4 11.4 0",  # VTOL landing
+        "3 20 0 0 0 0 0 0 0",
+    ]
+    path = tmp_path / "m.waypoints"
+    path.write_text(HEAD + "\n".join(f"{i} 0 {row} 1" for i, row in enumerate(rows, start=1)))
+    with pytest.raises(SourceError, match="item 1: MAVLink command 84"):
+        read_mission(path)
+    read = read_mission(path, way_only=True)
+    assert read.starts_on_ground() and read.items[-1].do is Do.RETURN
+    assert [(i.number, i.lat_deg) for i in read.items[1:-1]] == [(2, 48.1), (7, 48.2), (8, 48.3), (9, 48.4)]
+
+
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no such mission file"):
         read_mission(tmp_path / "nope.plan")

@@ -10,13 +10,13 @@ import tiny_onnx
 from ground import texture
 
 from terrafix_engines import manifest
-from terrafix_engines.features import open_describer, open_detector, open_matcher
+from terrafix_engines.features import open_describer, open_detector, open_matcher, open_picture_matcher
 from terrafix_engines.features.exported import in_pixels
 from terrafix_engines.features.image_input import image_tensor
 from terrafix_engines.features.keypoints import Keypoints, MutualNearest, PairMatcher, best_of, unit
 from terrafix_engines.features.lightglue import as_pairs, placed
 from terrafix_engines.features.xfeat import XFeatDescriber, probabilities, sample
-from terrafix_engines.manifest import ImageInput, KeypointOutputs, MatcherTensors
+from terrafix_engines.manifest import Coordinates, ImageInput, MatcherTensors
 from terrafix_engines.runtime import ModelRunError
 from terrafix_engines.store import Stored, stored
 
@@ -78,6 +78,34 @@ dtype = "int64"
 name = "s"
 shape = [1, "matches"]
 """
+SEMI_DENSE = """name = "both"
+title = "an export that is given two pictures"
+role = "pair"
+licence = "CC0"
+[image]
+input = "image0"
+colour = "gray"
+multiple = 8
+[pair]
+second = "image1"
+keypoints = ["mkpts0", "mkpts1"]
+scores = "mconf"
+[[inputs]]
+name = "image0"
+shape = [1, 1, "height", "width"]
+[[inputs]]
+name = "image1"
+shape = [1, 1, "height", "width"]
+[[outputs]]
+name = "mkpts0"
+shape = ["pairs", 2]
+[[outputs]]
+name = "mkpts1"
+shape = ["pairs", 2]
+[[outputs]]
+name = "mconf"
+shape = ["pairs"]
+"""
 DataSet = Callable[[str], Path]
 
 
@@ -127,9 +155,10 @@ def test_maps_are_read_where_their_cells_lie() -> None:
 def test_coordinates_of_other_exports_become_pixels() -> None:
     corners = np.array([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0]], np.float32)
     expected = [[0, 0], [639, 479], [319.5, 239.5]]
-    for coordinates, given in (("signed", corners), ("unit", (corners + 1) / 2), ("pixels", np.array(expected))):
-        spec = KeypointOutputs(keypoints="k", scores="s", descriptors="d", coordinates=coordinates)
-        assert np.allclose(in_pixels(given, spec, (480, 640)), expected)
+    given: tuple[tuple[Coordinates, np.ndarray], ...]
+    given = (("signed", corners), ("unit", (corners + 1) / 2), ("pixels", np.array(expected)))
+    for coordinates, xy in given:
+        assert np.allclose(in_pixels(xy, coordinates, (480, 640)), expected)
 
 
 def test_the_best_points_within_the_picture_are_kept() -> None:
@@ -223,6 +252,38 @@ def test_a_manifest_that_mixes_its_outputs_up_is_told(tmp_path: Path) -> None:
     detector = open_detector(kept(tmp_path, text, content))
     with pytest.raises(ModelRunError, match=r"points: 3 keypoints, 3 scores, 4 descriptors; check \[keypoints\]"):
         detector.detect(np.zeros((64, 64, 3), np.uint8), 10)
+
+
+def test_a_model_that_is_given_both_pictures_says_what_is_the_same_in_them(tmp_path: Path) -> None:
+    """The graph answers with the brightest pixel of each row of either picture: known without it."""
+    first, second = np.zeros((8, 20, 3), np.uint8), np.zeros((6, 24, 3), np.uint8)
+    for row, (x0, x1) in enumerate(((3, 5), (19, 23), (0, 11), (7, 9), (2, 1), (4, 6))):
+        first[row, x0], second[row, x1] = 51 * row, 255
+    matcher = open_picture_matcher(kept(tmp_path, SEMI_DENSE, tiny_onnx.brightest_of_rows()))
+    found = matcher.match(first, second)
+    # Both are filled up to 24 x 8. Rows 6 and 7 of the second one are filling, and bright: they are left out.
+    assert matcher.name == "both"
+    assert found.first_px.tolist() == [[0, 0], [19, 1], [0, 2], [7, 3], [2, 4], [4, 5]]
+    assert found.second_px.tolist() == [[5, 0], [23, 1], [11, 2], [9, 3], [1, 4], [6, 5]]
+    assert np.allclose(found.confidence, [0, 0.2, 0.4, 0.6, 0.8, 1.0])
+
+
+def test_a_manifest_that_mixes_the_two_pictures_up_is_told(tmp_path: Path) -> None:
+    other = SEMI_DENSE.replace('name = "image1"\nshape = [1, 1,', 'name = "image1"\nshape = [1, 3,')
+    for text, says in (
+        (other, "'image1' must have the shape of 'image0'"),
+        (SEMI_DENSE.replace('second = "image1"', 'second = "right"'), "'right' is used, but neither"),
+        (SEMI_DENSE.split("[pair]")[0] + "[[inputs]]" + SEMI_DENSE.split("[[inputs]]", 1)[1], r"a section \[pair\]"),
+    ):
+        with pytest.raises(manifest.ManifestError, match=says):
+            kept(tmp_path, text, b"no model")
+    outputs = {"mkpts0": np.zeros((3, 2)), "mkpts1": np.zeros((3, 2)), "mconf": np.zeros(2)}
+    pictures: dict[str, tuple[tiny_onnx.Shape, str]] = {f"image{k}": ([1, 1, "h", "w"], "float32") for k in (0, 1)}
+    content = tiny_onnx.constants(pictures, {k: v.astype(np.float32) for k, v in outputs.items()})
+    stated = SEMI_DENSE.replace('name = "mconf"\nshape = ["pairs"]', 'name = "mconf"\nshape = ["scores"]')
+    matcher = open_picture_matcher(kept(tmp_path, stated, content))
+    with pytest.raises(ModelRunError, match=r"both: 3 and 3 points, 2 scores; check \[pair\]"):
+        matcher.match(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8, 3), np.uint8))
 
 
 @pytest.fixture

@@ -56,9 +56,15 @@ AS_IT_COMES = FIRMWARE | {
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulated autopilot answers at once; silence need not be waited for as long as on a radio."""
-    for name, value in {"LOOK_S": 0.0, "QUIET_S": 0.02, "ANSWER_S": 0.1, "OTHERS_S": 0.05, "CONNECT_S": 0.1}.items():
+    for name, value in {
+        "LOOK_S": 0.0,
+        "QUIET_S": 0.02,
+        "ANSWER_S": 0.1,
+        "OTHERS_S": 0.05,
+        "CONNECT_S": 0.1,
+        "RATES_S": 0.01,
+    }.items():
         monkeypatch.setattr(conversation, name, value)
-    monkeypatch.setattr(vehicle, "HEAR_S", 0.01)
 
 
 def preset(name: str) -> dict[str, float]:
@@ -224,6 +230,49 @@ def test_who_is_there_may_be_wrong(there: GroundAutopilot, link: dict[str, Any],
     assert "\n" not in str(caught.value)
 
 
+class Streaming(GroundAutopilot):
+    """On a clock of its own (s), and sends what is asked for at ``share`` of its rate."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__({})
+        self._share, self._asked, self.now_s = share, dict[int, float](), 0.0
+
+    def clock(self) -> float:
+        self.now_s += 0.001
+        return self.now_s
+
+    def write(self, packet: bytes) -> bool:
+        said = self._ear.decode(bytearray(packet))
+        if said.get_type() == "COMMAND_LONG" and said.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            self._asked[int(said.param1)] = 1e6 / said.param2
+            return True
+        return super().write(packet)
+
+    def read(self) -> list[bytes]:
+        before_s, self._read_s = getattr(self, "_read_s", 0.0), self.now_s
+        for message_id, rate_hz in self._asked.items():
+            each = rate_hz * self._share
+            for _ in range(int(each * self.now_s) - int(each * before_s)):
+                kind = mavlink.mavlink_map[message_id]
+                self._say(kind(*([0] * n if n else 0 for n in kind.array_lengths)))
+        return super().read()
+
+
+@pytest.mark.parametrize(
+    ("share", "status", "says"),
+    [(1.0, "ok", "attitude 25 Hz, IMU 33 Hz"), (0.5, "warn", "too slow: ATTITUDE 12.")],
+)
+def test_what_the_link_will_ask_for_is_asked_for_and_counted(
+    share: float, status: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conversation, "RATES_S", 6.5)
+    there = Streaming(share)
+    with Autopilot(LinkSection(), there, there.clock) as asked:
+        asked.connect(0.3)
+        line = vehicle.rates(asked.rates())
+    assert (line.status, says in line.text) == (status, True), line.text
+
+
 def test_parameters_that_cannot_be_read_are_one_line() -> None:
     with talk(GroundAutopilot({})) as asked:
         asked.connect(0.3)
@@ -314,6 +363,22 @@ def test_a_mission_on_board_becomes_a_file(tmp_path: Path) -> None:
     assert plan.items[-1].height_m == 120.0
 
 
+def test_a_mission_on_board_is_checked_against_the_map_whatever_is_in_it(tmp_path: Path, wired: Any) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=1.0)
+    package = build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
+    opened = MapPackage.open(package)
+    west, south, east, north = opened.manifest.bounds_wgs84
+    opened.close()
+    lat, lon = (south + north) / 2, (west + east) / 2
+    on_it = ((189, lat, lon, 60.0), (177, 0.0, 0.0, 0.0), (82, lat + 1e-4, lon, 60.0))  # landing from, jump, spline
+    for items, status in ((on_it, "ok"), ((*on_it, (82, north + 0.01, lon, 60.0)), "fail")):
+        wired(GroundAutopilot(AS_IT_COMES, mission=items, home=(lat, lon)))
+        arguments = ["preflight", "--link", "udpout:127.0.0.1:9", "--map", str(package), "--json"]
+        done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
+        lines = {line["check"]: line for line in json.loads(done.output)["lines"]}
+        assert lines["mission"]["status"] == status, lines["mission"]
+
+
 # --- this computer ---
 
 
@@ -364,6 +429,10 @@ def test_map_start_and_mission_belong_together(tmp_path: Path) -> None:
 
     good = lines((0.0, 0.0), (-50.0, 0.0), (50.0, 50.0))
     assert [good[check].status for check in ("map", "start", "mission")] == ["ok"] * 3
+    config = Config(map=MapSection(path=str(package)))
+    unknown = {line.check: line for line in computer.about(config, tmp_path / "none.plan", tmp_path)}
+    assert [unknown[check].status for check in ("map", "start", "mission")] == ["ok", "warn", "fail"]
+    assert "no such mission file" in unknown["mission"].text
     bad = lines((900.0, 0.0), (0.0, 0.0), (400.0, 0.0))
     assert (bad["start"].status, bad["mission"].status) == ("fail", "fail")
     assert "leaves the map" in bad["mission"].text

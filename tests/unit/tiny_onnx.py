@@ -86,6 +86,30 @@ def xfeat_like(nan: str = "never") -> bytes:
     return model(nodes, initializers, [value("input", ["batch", 3, "height", "width"])], outputs)
 
 
+def brightest_of_rows() -> bytes:
+    """Two pictures in, a pair for each row out: its brightest pixel in each, and how bright that is in the first."""
+    nodes, outputs = [], [value("mkpts0", ["n", 2]), value("mkpts1", ["n", 2]), value("mconf", ["n"])]
+    for k in "01":
+        nodes += [
+            node("ArgMax", [f"image{k}"], [f"where{k}"], axis=3, keepdims=0),
+            node("Cast", [f"where{k}"], [f"float{k}"], to=TYPES["float32"]),
+            node("Reshape", [f"float{k}", "column"], [f"x{k}"]),
+            node("Mul", [f"x{k}", "zero"], [f"none{k}"]),
+            node("Add", [f"none{k}", "one"], [f"ones{k}"]),
+            node("CumSum", [f"ones{k}", "axis"], [f"counted{k}"]),
+            node("Sub", [f"counted{k}", "one"], [f"y{k}"]),
+            node("Concat", [f"x{k}", f"y{k}"], [f"mkpts{k}"], axis=1),
+        ]
+    nodes += [
+        node("ReduceMax", ["image0"], ["bright"], axes=[3], keepdims=0),
+        node("Reshape", ["bright", "flat"], ["mconf"]),
+    ]
+    known = {"column": np.array([-1, 1]), "flat": np.array([-1]), "axis": np.array(0)}
+    known |= {"zero": np.array(0.0, np.float32), "one": np.array(1.0, np.float32)}
+    pictures = [value(f"image{k}", [1, 1, "height", "width"]) for k in "01"]
+    return model(nodes, [tensor(n, a) for n, a in known.items()], pictures, outputs)
+
+
 def constants(inputs: dict[str, tuple[Shape, str]], outputs: dict[str, np.ndarray]) -> bytes:
     """Gives the same whatever goes in."""
     nodes = [node("Identity", [f"{name}_is"], [name]) for name in outputs]

@@ -5,8 +5,6 @@ say for the belief as a whole is less, and no camera pose stands."""
 
 import numpy as np
 
-from terrafix.anchor.tracks import pose_gain
-
 START_ODDS = 6.0  # log odds of a start coordinate: one in 400 is wrong by far more than it claims
 MOST_ODDS = 20.0  # of a place that poses have confirmed: bare ground, or a map of other years, may last for a kilometre
 # What a full look says for the belief, in nats: 4 to 9 where it is right, -0.4 to 3 where it is not (measured on real
@@ -16,6 +14,9 @@ MOST_ODDS = 20.0  # of a place that poses have confirmed: bare ground, or a map 
 CHANCE = 3.0
 LOOK_MIN, LOOK_MAX = -0.4, 2.0
 DOUBT_ODDS = 2.94  # 5 %: from here on a 95 % ellipse around the place would not be one
+# What a pose says, by the patches that agree. Measured on nine flights and maps: at 70 right places a pose was found on
+# 25 to 90 % of the frames, with 20 inliers in the median; at 930 wrong ones on 0.5 %, with 9 to 11 (one had 20).
+POSE_LLR = ((8, 3.0), (12, 5.0), (20, 6.0))  # inliers, gain
 WIDE, WIDE_M = 0.5, 40.0  # share of the height, and metres: a 1-sigma above both claims little
 
 
@@ -46,3 +47,8 @@ class LostWatch:
         if inliers:
             self.odds += weight * pose_gain(inliers)
         self.odds = min(self.odds, MOST_ODDS)
+
+
+def pose_gain(inliers: int) -> float:
+    """Log likelihood ratio, "here against elsewhere", of a pose on which so many patches agree."""
+    return max((gain for least, gain in POSE_LLR if inliers >= least), default=0.0)

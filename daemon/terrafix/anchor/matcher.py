@@ -30,9 +30,6 @@ PATCH_PER_AGL = 0.25  # side of a patch: 25 m at 100 m, one house and its surrou
 MIN_PATCH_CELLS = 8
 REACH = 0.08  # search of a patch around its expected place, share of the height
 FIRST_REACH, FIRST_THRESHOLD = 0.2, 0.05  # of the first pass, while the tilt is not known
-# Of a place that a search proposes, in one pass: measured on maps of other seasons and after a disaster, a pose stands
-# twice as often as in two passes, because the first one's tilt would spoil the picture for the second.
-SEARCHED_REACH, SEARCHED_THRESHOLD, SEARCHED_COARSER = 0.12, 0.04, 2.0
 WELL_KNOWN_RAD = np.radians(3.0)
 # Rotation and scale are searched when they are known less well than the descriptors tolerate.
 YAW_TOLERANCE_RAD = np.radians(4.0)
@@ -109,20 +106,22 @@ class FrameMatcher:
     def __init__(
         self, camera: CameraCalibration, source: LocalMap, describer: Describer, cache_bytes: int = CACHE_BYTES
     ) -> None:
-        self._camera = camera
+        self.camera = camera
         self._map = source
         self._describer = describer
         self._features = MapFeatures(source, describer, cache_bytes)
         # Many channels over a wide window are slow; oriented gradients find the place as well, at a tenth of the cost.
-        self._wide = describer if describer.stride == 1 else GradientDescriber()
-        self._wide_features = self._features if describer.stride == 1 else MapFeatures(source, self._wide, cache_bytes)
+        self.gradients = describer if describer.stride == 1 else GradientDescriber()
+        self.gradient_features = (
+            self._features if describer.stride == 1 else MapFeatures(source, self.gradients, cache_bytes)
+        )
 
     def look_cell_m(self, agl_m: float) -> float:
         return self._gsd(agl_m, LOOK_GSD_PER_AGL, self._describer) * self._describer.stride
 
     def cell_m(self, agl_m: float, per_agl: float) -> float:
         """Size of a cell that is a share of the height, not finer than map and frame, in steps of half an octave."""
-        wanted = max(self._map.gsd_m, agl_m / self._camera.fx, agl_m * per_agl)
+        wanted = max(self._map.gsd_m, agl_m / self.camera.fx, agl_m * per_agl)
         return float(2.0 ** (round(np.log2(wanted) * GSD_STEPS_PER_OCTAVE) / GSD_STEPS_PER_OCTAVE))
 
     def wide_hypotheses(self, view: View) -> tuple[Hypothesis, ...]:
@@ -143,13 +142,13 @@ class FrameMatcher:
         gsd = self._gsd(view.agl_m, LOOK_GSD_PER_AGL, describer)
         most = float(np.sqrt(MAX_WINDOW_VALUES / describer.channels))
         if len(hypotheses) > 1 or 2 * belief.half_m / (gsd * describer.stride) > most:
-            describer, features = self._wide, self._wide_features
+            describer, features = self.gradients, self.gradient_features
             gsd = self._gsd(view.agl_m, LOOK_GSD_PER_AGL, describer)
             most = float(np.sqrt(MAX_WINDOW_VALUES / describer.channels))
         stride = describer.stride
         while 2 * belief.half_m / (gsd * stride) > most:
             gsd *= 2.0
-        first = rectify(image, self._camera, view.r_w_c, view.agl_m, gsd, stride)
+        first = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, stride)
         if first is None or min(first.mask.shape) < MIN_SIDE_CELLS * stride / 2:
             return Look(Verdict.TOO_LOW)
         cell = gsd * stride
@@ -181,27 +180,24 @@ class FrameMatcher:
         on the frame rectified with what the first one found."""
         start = _at(view, hypothesis, e_m, n_m)
         if view.tilt_sigma_rad > WELL_KNOWN_RAD:
-            first = self._patch_fix(image, start, FIRST_REACH, FIRST_THRESHOLD, 1.0)
+            first = self._patch_fix(image, start, FIRST_REACH, FIRST_THRESHOLD)
             if first is None or first.pnp.fit is None:
                 return first
             start = _from(start, first)
-        return self._patch_fix(image, start, REACH, THRESHOLD, 1.0)
+        return self._patch_fix(image, start, REACH, THRESHOLD)
 
-    def searched_fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> Fix | None:
-        """As ``fix``, at a place that a search proposes: on larger cells, for which changes and leaning buildings
-        matter less, and then on those of a flight where a pose stands on these, too."""
-        start = _at(view, hypothesis, e_m, n_m)
-        first = self._patch_fix(image, start, SEARCHED_REACH, SEARCHED_THRESHOLD, SEARCHED_COARSER)
-        if first is None or first.pnp.fit is None:
-            return first
-        finer = self._patch_fix(image, _from(start, first), REACH, THRESHOLD, 1.0)
-        return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else first
+    def refined(self, image: Image, view: View, fix: Fix) -> Fix:
+        """The pose of a place that a search has found, on the cells of a flight, if one stands on these."""
+        if fix.pnp.fit is None:
+            return fix
+        finer = self._patch_fix(image, _from(view, fix), REACH, THRESHOLD)
+        return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else fix
 
-    def _patch_fix(self, image: Image, view: View, reach_share: float, threshold: float, coarser: float) -> Fix | None:
+    def _patch_fix(self, image: Image, view: View, reach_share: float, threshold: float) -> Fix | None:
         per_agl = FIX_GSD_PER_AGL[self._describer.name]
-        gsd = self.cell_m(view.agl_m, per_agl * coarser if self._describer.stride == 1 else per_agl)
+        gsd = self.cell_m(view.agl_m, per_agl)
         cell = gsd * self._describer.stride
-        frame = rectify(image, self._camera, view.r_w_c, view.agl_m, gsd, self._describer.stride)
+        frame = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, self._describer.stride)
         if frame is None:
             return None
         reach = max(int(np.ceil(reach_share * view.agl_m / cell)), 3)
@@ -229,7 +225,7 @@ class FrameMatcher:
 
     def _rectified(self, image: Image, view: View, hypothesis: Hypothesis, gsd: float, stride: int) -> Rectified | None:
         r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
-        return rectify(image, self._camera, r_w_c, view.agl_m * hypothesis.scale, gsd, stride)
+        return rectify(image, self.camera, r_w_c, view.agl_m * hypothesis.scale, gsd, stride)
 
     def _offsets(self, frame: Rectified) -> tuple[float, float, float, float]:
         """Box of a rectified frame around the nadir: e_min, n_max, e_max, n_min."""

@@ -246,7 +246,7 @@ class AnchorNode:
         believed = Believed(*prediction.p_c_in_w_m[:2], sigma_m, self._watch.odds)
         weighed = weigh((e_m, n_m), radius_m, believed, source.bounds_m, searching=self._search is not None)
         tracks = self._search.tracks.all if self._search is not None else []
-        follows = any(t.poses and np.hypot(t.e_m - e_m, t.n_m - n_m) <= radius_m for t in tracks)
+        follows = any(t.frames and np.hypot(t.e_m - e_m, t.n_m - n_m) <= radius_m for t in tracks)
         around = self._start_hint(e_m, n_m, radius_m / SIGMAS_95, source)
         # What a search knows by now is kept where poses speak for a place within the hint, and where the hint says no
         # more than the map.

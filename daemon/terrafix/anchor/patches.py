@@ -41,10 +41,9 @@ def match_patches(
     # Cell of the window on which the template's corner is expected to lie.
     row0 = round((window_corner_m[1] - (camera_m[1] + rectified.n_max_m)) / cell_m)
     column0 = round(((camera_m[0] + rectified.e_min_m) - window_corner_m[0]) / cell_m)
-    corners = _choose(template, cells_mask, valid, patch_cells, reach_cells, row0, column0)
+    corners, surfaces = correlated_patches(template, cells_mask, window, valid, patch_cells, reach_cells, row0, column0)
     if len(corners) == 0:
         return PatchMatches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-    surfaces = _correlate(template, window, corners, patch_cells, reach_cells, row0, column0)
     frame_m, map_m, weights = [], [], []
     for (r, c), surface in zip(corners, surfaces, strict=True):
         peak = _peak(surface)
@@ -61,6 +60,25 @@ def match_patches(
         )
         weights.append(weight)
     return PatchMatches(np.array(frame_m).reshape(-1, 2), np.array(map_m).reshape(-1, 2), np.array(weights))
+
+
+def correlated_patches(
+    template: np.ndarray,
+    mask: np.ndarray,
+    window: np.ndarray,
+    valid: np.ndarray,
+    patch: int,
+    reach: int,
+    row0: int,
+    column0: int,
+) -> tuple[list[tuple[int, int]], np.ndarray]:
+    """Corners (row, column) of patches of the template, and their surfaces (N, 2 reach + 1, 2 reach + 1) around
+    where the template's corner on cell (row0, column0) of the window puts them."""
+    corners = _choose(template, mask, valid, patch, reach, row0, column0)
+    side = 2 * reach + 1
+    if not corners:
+        return corners, np.zeros((0, side, side))
+    return corners, _correlate(template, window, corners, patch, reach, row0, column0)
 
 
 def _choose(
@@ -120,24 +138,20 @@ def _correlate(
     spectrum = np.fft.rfft2(large, (fft, fft))
     spectrum *= np.fft.rfft2(small, (fft, fft)).conj()
     product = np.fft.irfft2(spectrum.sum(1), (fft, fft))[:, :n, :n]
-    # Box sums by running totals: energy and channel means of the map under every placement of the patch.
+    # Energy and channel means of the map under every placement of a patch, by sums over boxes of the whole window.
     count = patch * patch
-    sums = _box(large, patch)
-    energy = _box(np.einsum("nkhw,nkhw->nhw", large, large), patch)
-    variance = energy - (sums**2).sum(1) / count
+    variance = _box_sums(np.einsum("khw,khw->hw", window, window), patch)
+    for channel in window:
+        variance -= _box_sums(channel, patch) ** 2 / count
+    under = np.stack([variance[row0 + r - reach :, column0 + c - reach :][:n, :n] for r, c in corners])
     floor = 0.05 * own[:, None, None]
-    return product / np.sqrt(np.maximum(np.maximum(variance, floor) * own[:, None, None], 1e-12))
+    return product / np.sqrt(np.maximum(np.maximum(under, floor) * own[:, None, None], 1e-12))
 
 
-def _box(x: np.ndarray, patch: int) -> np.ndarray:
-    total = np.cumsum(np.cumsum(x, axis=-1, dtype=np.float64), axis=-2)
-    total = np.pad(total, [(0, 0)] * (x.ndim - 2) + [(1, 0), (1, 0)])
-    return (
-        total[..., patch:, patch:]
-        - total[..., :-patch, patch:]
-        - total[..., patch:, :-patch]
-        + total[..., :-patch, :-patch]
-    )
+def _box_sums(x: np.ndarray, side: int) -> np.ndarray:
+    """(H, W): sum over the square of this side whose corner is the cell, as far as it lies inside."""
+    box = (side, side)
+    return cv2.boxFilter(x, cv2.CV_64F, box, anchor=(0, 0), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
 def _peak(surface: np.ndarray) -> tuple[float, float, float] | None:

@@ -31,8 +31,9 @@ RINGS = (1, 4, 9, 16, 25)  # blocks of each step of the search, nearest first; t
 LOOKS_PER_RING = 0.5  # full looks without a track before the next step
 LOOKS_TO_ASK = 6.0  # full looks at the whole map before the operator is asked
 DRIFT = 0.06  # of the height: frames that odometry places less well than this are not joined
+UNSEEN = 0.1  # of the height: where odometry knows less, the ground may be another; hovering is no way
 JOINED = 2.0  # heights: frames farther away than this are not joined; the cost of a look grows with what is
-PROPOSED = 5  # places that a look may propose
+PROPOSED = 12  # places that a look may propose
 LEAD_REACH = 0.2  # of the height: a track's place in the joint look is the best within this
 UNKNOWN = -9.0  # standard deviations, where the map does not cover the frames
 
@@ -84,7 +85,7 @@ class MapSearch:
         nothing is known, all evidence before it is of another place and counts no more."""
         self._p_m += (east_m, north_m)
         self._var_m2 += sigma_m**2
-        self._way_m += float(np.hypot(np.hypot(east_m, north_m), sigma_m))
+        self._way_m += float(np.hypot(np.hypot(east_m, north_m), sigma_m if sigma_m > UNSEEN * self.agl_m else 0.0))
         self.tracks.move(np.array([east_m, north_m]))
         if sigma_m > NEAR * self.agl_m:
             self.tracks.all = []
@@ -118,7 +119,7 @@ class MapSearch:
             correlation[at], index[at] = found.correlation, found.index
         self._judge(np.nan_to_num(standardise(correlation), nan=UNKNOWN), index, view.agl_m)
         self._ring_looks += new
-        follows = any(track.poses for track in self.tracks.all)
+        follows = any(track.frames for track in self.tracks.all)
         if self.tiles < len(self._blocks) and self._ring_looks >= LOOKS_PER_RING and not follows:
             self._ring, self._ring_looks = self._ring + 1, 0.0
 

@@ -93,7 +93,7 @@ def fit_pose(
             return None
         error = xy - predicted
         norm = np.linalg.norm(error, axis=1)
-        sigma = max(sigma_floor, float(np.median(norm)) / 1.177)  # the median of a Rayleigh variable is 1.177 sigma
+        sigma = max(sigma_floor, _median(norm) / 1.177)  # the median of a Rayleigh variable is 1.177 sigma
         w = weights * np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
         flat, weighted = jacobian.reshape(-1, 6), (jacobian * w[:, None, None]).reshape(-1, 6)
         hessian = weighted.T @ flat
@@ -114,6 +114,12 @@ def fit_pose(
             break
     cov = sigma**2 / max(effective, 1e-6) * np.linalg.inv(hessian)
     return PoseFit(r, p, (cov + cov.T) / 2, np.linalg.norm(error, axis=1), sigma)
+
+
+def _median(values: np.ndarray) -> float:
+    """numpy's own takes ten times as long for so few."""
+    ordered = np.sort(values)
+    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def tangent_to_world(cov: np.ndarray, r_w_c: np.ndarray) -> np.ndarray:

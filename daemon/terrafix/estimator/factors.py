@@ -237,25 +237,30 @@ def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, l
                 c * felt[3] - s * felt[4], s * felt[3] + c * felt[4], felt[5],
             ]
         )  # fmt: skip
-        residual = by_before @ v0
-        residual[:6] -= turned
-        residual[:3] += c1.translation() - c0.translation()
-        residual[3:] += v1
-        unit = 1.0
+        start = by_before @ v0
+        start[:6] -= turned
+        start[:3] += c1.translation() - c0.translation()
+        unit0, unit1 = 1.0, 1.0  # of what is told in the height at the beginning, and at the end
         if leg.over is not None:
             height_m, ground_m = leg.over
-            unit = height_m / max(float(c1.translation()[2]) - ground_m, 1.0)
+            unit1 = height_m / max(float(c1.translation()[2]) - ground_m, 1.0)
+            unit0 = unit1 if leg.inertial else height_m / max(float(c0.translation()[2]) - ground_m, 1.0)
+        residual = unit0 * start
+        residual[3:] += unit1 * v1
         if jacobians is not None:
             by_c0, by_c1, by_bias = by_pose.copy(), by_pose.copy(), np.zeros((rows, BIAS_SIZE))
-            by_c0[:3, 3:] = -c0.rotation().matrix()
-            by_c1[:3, 3:] = c1.rotation().matrix()
+            by_c0[:3, 3:] = -unit0 * c0.rotation().matrix()
+            by_c1[:3, 3:] = unit0 * c1.rotation().matrix()
             if leg.inertial:
-                by_bias[:6, 2] = turned[1], -turned[0], 0.0, turned[4], -turned[3], 0.0
+                by_bias[:6, 2] = unit0 * np.array([turned[1], -turned[0], 0.0, turned[4], -turned[3], 0.0])
             if leg.over is not None:
-                by_c1[:, 3:] -= np.outer(residual, c1.rotation().matrix()[2]) * (unit / leg.over[0])
-            for i, jacobian in enumerate((by_c0, by_before, by_c1, by_after, by_bias)):
-                jacobians[i] = np.asfortranarray(unit * jacobian)
-        return unit * residual
+                up0, up1 = c0.rotation().matrix()[2], c1.rotation().matrix()[2]
+                of_start, above = (by_c1, up1) if leg.inertial else (by_c0, up0)
+                of_start[:, 3:] -= np.outer(start, above) * (unit0**2 / leg.over[0])
+                by_c1[3:, 3:] -= np.outer(v1, up1) * (unit1**2 / leg.over[0])
+            for i, jacobian in enumerate((by_c0, unit0 * by_before, by_c1, unit1 * by_after, by_bias)):
+                jacobians[i] = np.asfortranarray(jacobian)
+        return residual
 
     noise = gtsam.noiseModel.Gaussian.Covariance(leg.cov, False)
     return gtsam.CustomFactor(noise, [*before, *after, bias_key], error)

@@ -102,7 +102,10 @@ class Leg:
 
         A camera measures ways in heights. Told in metres, whatever the camera misjudges weighs the less in a leg the
         lower the flight is believed to be, and it sinks: to the ground where nobody felt the leg, by metres in minutes
-        where an IMU did. In units of the height such noise is the same at any. What was felt still tells of metres."""
+        where an IMU did. In units of the height such noise is the same at any. What was felt still tells of metres. A
+        leg that nobody felt compares heights a second with heights a second: one that forgets its course would have
+        the vehicle slower at its end, and so nearer to the ground.
+        """
         cov = self.cov.copy()
         cov[2, 2] += rise_sigma_m**2
         return replace(self, cov=cov, over=(height_m, ground_m))

@@ -17,6 +17,7 @@ from terrafix.link.local_pose import Place
 from terrafix.link.named_values import NamedValues
 from terrafix.link.outputs import Outputs
 from terrafix.link.partner import Partner
+from terrafix.link.resume import Resume
 from terrafix.link.side_output import open_side_outputs
 from terrafix.link.source_switch import SourceSwitch
 from terrafix.link.status import Status, StatusLog
@@ -76,6 +77,7 @@ class MavlinkEdge:
         self._hints = Hints(config.sysid, config.compid)
         self._ground = GroundLinks(config, wall_clock_ns, self._hints)
         self._switch = SourceSwitch(config.gps_id)
+        self._resume = Resume()
         self._named_values = NamedValues()
         self._start: Place | None = None  # of the flight
         self._heard = Heard()
@@ -124,6 +126,7 @@ class MavlinkEdge:
         match message:
             case GpsInput():
                 self._send_position(message)
+                self._resume.said(message)
             case Origin():
                 if message.ground_amsl_m is not None:
                     self._start = Place(message.lat_deg, message.lon_deg, message.ground_amsl_m)
@@ -167,6 +170,9 @@ class MavlinkEdge:
             return
         self._streams.heard(message.get_msgId())
         self._switch.heard(message)
+        hint = self._resume.take(message, now_ns)
+        if hint is not None:
+            yield hint
         if kind == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             self._streams.answered(message.result)
 

@@ -46,6 +46,10 @@ class Why:
     short: str
 
 
+# The computer was started again in the air: its start coordinate is where the flight began, and claims to be good.
+STARTED_IN_FLIGHT = Why("started in flight, and no map fix yet", "the map must confirm the start")
+
+
 class FixGate:
     """Decides the fix type at every send; remembers only what hysteresis and the spike hold need."""
 

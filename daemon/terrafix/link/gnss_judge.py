@@ -1,18 +1,20 @@
 """Is a GNSS receiver to be believed? Its position against the vision estimate, both with what they claim.
 
-The distance in units of its standard deviation is looked at in runs of readings (a sequential test):
+Two tests, each on runs of readings:
 
-* beyond 5 sigma in three readings in a row: a sudden spoofer, within a second;
-* beyond 4.5 sigma for a second: a slow drag-off.
+* the distance, beyond 5.5 sigma of what both claim, in three readings in a row: a sudden spoofer, within a second;
+* its change: where the receiver should be by how it was so far in this flight (gnss_forecast.py), and is not, for a
+  second: a slow drag-off.
 
 Errors of both sides last for seconds to minutes (a map fix, the map itself, multipath). For such errors a cumulative
-sum (Page 1954) was measured and is worse: where it sees a drag-off as early, it has ten times the false alarms. What
-these tests reach is in docs/autopilot.md, "The GNSS judge"."""
+sum of the distance (Page 1954) was measured and is worse: where it sees a drag-off as early, it has ten times the false
+alarms. What these tests reach is in docs/autopilot.md, "The GNSS judge"."""
 
 import math
 from dataclasses import dataclass
 
 from terrafix.link.carry import Carried, distance_m
+from terrafix.link.gnss_forecast import OffsetForecast
 from terrafix.messages import GnssReading, GnssState
 
 FIX_3D = 3
@@ -23,10 +25,11 @@ UNKNOWN_M = 5.0  # of a receiver that claims nothing
 DELAY_S, DELAY_SIGMA_S = 0.15, 0.1  # age of a reading on arrival: receiver, autopilot, stream
 VISION_OLD_S = 2.0  # an estimate that is older says nothing about a receiver
 VISION_VAGUE_M = 50.0
-JUMP_SIGMAS, JUMP_READINGS = 5.0, 3
-DRAG_SIGMAS, DRAG_S, DRAG_READINGS = 4.5, 0.8, 3  # the fifth reading at 5 Hz
+JUMP_SIGMAS, JUMP_READINGS = 5.5, 3
+DRAG_CHANCE = 5e-5  # of being so far from the forecast, while nothing happens ...
+DRAG_S, DRAG_READINGS = 0.8, 3  # ... for so long: the fifth reading at 5 Hz
 READING_MAX_S = 1.0  # a reading counts for the time since the last one, not for a gap
-AGREE_SIGMAS = 3.0
+AGREE_SIGMAS, AGREE_CHANCE = 3.0, 1e-3
 AGREE_VAGUE_M = 20.0  # 1-sigma of the distance: agreement within more proves nothing
 FIRST_TRUST_S, AFTER_LOSS_S, AFTER_SPOOFING_S = 10.0, 30.0, 60.0  # of agreement without a break
 DISPUTE_SHARE = 0.5  # a step of our own this large against the distance: it may be we who are wrong
@@ -40,6 +43,16 @@ class Opinion:
     distance_m: float | None = None  # from the vision estimate
     sigmas: float | None = None  # the same in standard deviations, when both are honest
     reason: str = ""
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Of a receiver from the estimate."""
+
+    metres: complex  # east + j north
+    sigma_m: float  # 1-sigma per axis that both claim, across the track
+    along_sigma_m: float  # and along it, where the age of the reading adds, which is not known
+    sigmas: float  # the distance in standard deviations
 
 
 class Run:
@@ -62,6 +75,7 @@ class ReceiverJudge:
         self._heard_ns: int | None = None
         self._jumped = Run()
         self._dragged = Run()
+        self._forecast = OffsetForecast()
         self._agreed_s = 0.0
         self._trust_after_s = FIRST_TRUST_S
 
@@ -75,36 +89,46 @@ class ReceiverJudge:
         if lost:
             return self._lose(lost)
         if vision is None or reading.lat_deg is None or reading.lon_deg is None:
+            self._forecast.pause()
             return self._keep()
-        return self._compare(*_distance(reading, vision), dt_s, own_step_m)
+        return self._compare(_offset(reading, vision), dt_s, own_step_m)
 
     def look(self, now_ns: int) -> Opinion:
         if self._heard_ns is not None and now_ns - self._heard_ns > SILENT_NS:
             return self._lose("silent")
         return self.opinion
 
-    def _compare(self, away_m: float, sigmas: float, sigma_m: float, dt_s: float, own_step_m: float) -> Opinion:
-        self._jumped.take(sigmas > JUMP_SIGMAS, dt_s)
-        self._dragged.take(sigmas > DRAG_SIGMAS, dt_s)
-        if sigmas >= AGREE_SIGMAS:
+    def _compare(self, offset: Offset, dt_s: float, own_step_m: float) -> Opinion:
+        bad = self.opinion.state in (GnssState.SPOOFED, GnssState.DISPUTED)
+        chance, off_m = self._forecast.take(offset.metres, offset.along_sigma_m, dt_s, learn=not bad)
+        if off_m is not None and not bad and own_step_m > DISPUTE_SHARE * off_m and chance < DRAG_CHANCE:
+            self._forecast, chance = OffsetForecast(), 1.0  # it was we who moved: what is usual has to be learnt anew
+        away_m = abs(offset.metres)
+        self._jumped.take(offset.sigmas > JUMP_SIGMAS, dt_s)
+        self._dragged.take(chance < DRAG_CHANCE, dt_s)
+        if offset.sigmas >= AGREE_SIGMAS or chance < AGREE_CHANCE:
             self._agreed_s = 0.0
-        elif sigma_m < AGREE_VAGUE_M:
+        elif offset.sigma_m < AGREE_VAGUE_M:
             self._agreed_s += dt_s
         state, reason = self._keep().state, self.opinion.reason
         dragged = self._dragged.count >= DRAG_READINGS and self._dragged.seconds >= DRAG_S
         if self._jumped.count >= JUMP_READINGS or dragged:
             mine = state is not GnssState.SPOOFED and own_step_m > DISPUTE_SHARE * away_m
             state = GnssState.DISPUTED if mine else GnssState.SPOOFED
-            reason = f"{away_m:.0f} m away, {sigmas:.1f} sigma"
+            reason = f"{away_m:.0f} m away, {offset.sigmas:.1f} sigma"
+            if dragged and off_m is not None:
+                reason += f", {off_m:.0f} m from where it should be"
+            self._forecast.pause()
             self._trust_after_s = AFTER_SPOOFING_S
         elif state is not GnssState.TRUSTED and self._agreed_s >= self._trust_after_s:
             state, reason = GnssState.TRUSTED, ""
-        self.opinion = Opinion(state, away_m, sigmas, reason)
+        self.opinion = Opinion(state, away_m, offset.sigmas, reason)
         return self.opinion
 
     def _lose(self, reason: str) -> Opinion:
         """A receiver that was spoofed and goes silent stays spoofed: it has to earn its way back all the same."""
         self._jumped, self._dragged, self._agreed_s = Run(), Run(), 0.0
+        self._forecast.pause()
         if self.opinion.state is not GnssState.SPOOFED:
             if self.opinion.state is GnssState.TRUSTED:
                 self._trust_after_s = max(self._trust_after_s, AFTER_LOSS_S)
@@ -126,10 +150,7 @@ def _why_lost(reading: GnssReading) -> str:
     return ""
 
 
-def _distance(reading: GnssReading, vision: Carried) -> tuple[float, float, float]:
-    """-> (metres, standard deviations, 1-sigma in metres across the track).
-
-    Along the track the age of the reading, which is not known, adds to both claims."""
+def _offset(reading: GnssReading, vision: Carried) -> Offset:
     assert reading.lat_deg is not None and reading.lon_deg is not None
     east, north = (
         math.copysign(distance_m(vision.lat_deg, vision.lon_deg, lat, lon), sign)
@@ -142,8 +163,8 @@ def _distance(reading: GnssReading, vision: Carried) -> tuple[float, float, floa
     sigma_m = math.hypot(vision.horizontal_sigma_m, receiver_m)
     ve, vn, _ = vision.velocity_enu_mps
     speed_mps = math.hypot(ve, vn)
-    away_m = math.hypot(east, north)
     along_m = (east * ve + north * vn) / speed_mps if speed_mps > 0.0 else 0.0
-    across_m2 = max(0.0, away_m**2 - along_m**2)
+    across_m2 = max(0.0, east**2 + north**2 - along_m**2)
     along_sigma_m = math.hypot(sigma_m, DELAY_SIGMA_S * speed_mps)
-    return away_m, math.sqrt((along_m / along_sigma_m) ** 2 + across_m2 / sigma_m**2), sigma_m
+    sigmas = math.sqrt((along_m / along_sigma_m) ** 2 + across_m2 / sigma_m**2)
+    return Offset(complex(east, north), sigma_m, along_sigma_m, sigmas)

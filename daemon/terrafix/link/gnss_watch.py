@@ -72,8 +72,9 @@ class GnssWatch:
             yield from self._switch(now_ns)
 
     def _vision(self, now_ns: int, attitudes: Attitudes) -> Carried | None:
-        """Our estimate at the time of a reading that has just come."""
-        if self._estimate is None:
+        """Our estimate at the time of a reading that has just come. Before the first map fix it is a start coordinate,
+        perhaps that of another start: no witness."""
+        if self._estimate is None or self._estimate.last_anchor_age_ms < 0:
             return None
         carried = carry(self._estimate, now_ns - round(DELAY_S * NS_PER_S), attitudes)
         vague = carried.horizontal_sigma_m > VISION_VAGUE_M

@@ -63,6 +63,7 @@ class LinkNode:
         self._asking = Asking()
         self._filter = FilterWatch()
         self._armed: bool | None = None
+        self._start_holds = False  # the vehicle was seen on the ground, or the map has confirmed where it is
         self._now_ns = 0
         self._ground_amsl_m: float | None = None
         self._unix_minus_monotonic_ns: int | None = None
@@ -73,6 +74,7 @@ class LinkNode:
         self._rung = 0
         self._silent = False
         self._no_fix_because: fix.Why | None = None
+        self._said_started = False
         self._said_fix = Announcer[bool]()
         self._said_rung = Announcer[int]()
         self._said_rung.told = 0
@@ -86,6 +88,7 @@ class LinkNode:
                 self._attitudes.add(message)
                 self._gnss.vehicle(message)
                 self._armed = message.armed
+                self._start_holds = self._start_holds or message.armed is False
             case GnssReading():
                 return list(self._gnss.reading(message, self._attitudes))
             case Origin():
@@ -118,6 +121,7 @@ class LinkNode:
             self._gnss.accepted(estimate, self._attitudes)
             age_ms = estimate.last_anchor_age_ms
             if age_ms >= 0:
+                self._start_holds = True
                 self._anchored_ns = max(self._anchored_ns or 0, estimate.t_ns - age_ms * 1_000_000)
             elif self._anchored_ns is None:
                 self._anchored_ns = estimate.t_ns  # never anchored: the start coordinate is the map fix of this flight
@@ -171,6 +175,9 @@ class LinkNode:
         yield gps
         good = self._no_fix_because is None
         yield from self._gnss.tick(now_ns, good=good)
+        if self._no_fix_because is fix.STARTED_IN_FLIGHT and not self._said_started:
+            self._said_started = True
+            yield _text(now_ns, WARNING, "started in flight, searching the map")
         for uses, text in self._filter.look(now_ns, good=good):
             yield _text(now_ns, INFO if uses else WARNING, text)
         if self._said_fix.due(good, now_ns):
@@ -206,6 +213,9 @@ class LinkNode:
         horizontal_m, vertical_m, speed_mps = fix.reported_accuracy(carried, self._rung)
         if self._gate.holding:
             why: fix.Why | None = fix.Why(self._gate.holding, "the position has jumped")
+            self._fix.lower()
+        elif self._armed and not self._start_holds:
+            why = fix.STARTED_IN_FLIGHT
             self._fix.lower()
         else:
             why = self._fix.judge(carried, horizontal_m, self._rung, estimate.source_label)

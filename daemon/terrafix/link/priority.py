@@ -16,6 +16,7 @@ def first_in_line() -> bool:
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
     except OSError as error:
-        logs.get().warning("no real-time priority: GPS_INPUT may be late under load", why=error.strerror)
+        what_to_do = "allow it (systemd: LimitRTPRIO=1); docs/link.md has more"
+        logs.get().warning("no real-time priority: GPS_INPUT may be late under load", why=error.strerror, do=what_to_do)
         return False
     return True

@@ -52,7 +52,7 @@ class Streams:
         """Also for a new connection: everything is asked for again."""
         self._counts: dict[int, int] = {}
         self._window_ns: int | None = None
-        self._rates_hz: dict[int, float] = {}  # of the last whole window
+        self.rates_hz: dict[int, float] = {}  # of the last whole window
         self._asked_ns: dict[int, int] = {}
         self._asked: dict[int, int] = {}  # how often, since it last came as wanted
         self._old_way = False
@@ -95,9 +95,9 @@ class Streams:
     def problem(self) -> str:
         """Which streams are too slow; empty when all is well."""
         slow = [
-            f"{mavlink.mavlink_map[i].msgname} {self._rates_hz[i]:.1f} of {wanted:g} Hz"
+            f"{mavlink.mavlink_map[i].msgname} {self.rates_hz[i]:.1f} of {wanted:g} Hz"
             for i, wanted in self.wanted_hz.items()
-            if i in self._rates_hz and i not in OPTIONAL and self._rates_hz[i] < ENOUGH * wanted
+            if i in self.rates_hz and i not in OPTIONAL and self.rates_hz[i] < ENOUGH * wanted
         ]
         notes = [f"too slow: {', '.join(slow)}"] if slow else []
         if self._refused:
@@ -110,10 +110,10 @@ class Streams:
         elapsed_ns = now_ns - self._window_ns
         if elapsed_ns < WINDOW_NS:
             return
-        self._rates_hz = {i: self._counts.get(i, 0) * 1e9 / elapsed_ns for i in self.wanted_hz}
+        self.rates_hz = {i: self._counts.get(i, 0) * 1e9 / elapsed_ns for i in self.wanted_hz}
         self._counts.clear()
         self._window_ns = now_ns
-        for message_id, rate_hz in self._rates_hz.items():
+        for message_id, rate_hz in self.rates_hz.items():
             if rate_hz >= ENOUGH * self.wanted_hz[message_id]:
                 self._asked[message_id] = 0
 
@@ -123,6 +123,6 @@ class Streams:
         if asked_ns is None:
             return True
         wait_ns = WINDOW_NS if self._asked.get(message_id, 0) < PATIENCE else SELDOM_NS
-        if now_ns - asked_ns < wait_ns or message_id not in self._rates_hz:
+        if now_ns - asked_ns < wait_ns or message_id not in self.rates_hz:
             return False
-        return self._rates_hz[message_id] < ENOUGH * self.wanted_hz[message_id]
+        return self.rates_hz[message_id] < ENOUGH * self.wanted_hz[message_id]

@@ -1,7 +1,7 @@
 """What the autopilot says about itself, put together: who it is, attitude, height, IMU, its idea of wall time.
 
-Its position and velocity are not read. They come out of the filter that hears us (or a spoofed receiver), so they
-are never truth and never an independent measurement."""
+Its position and velocity are not read here. They come out of the filter that hears us (or a spoofed receiver), so they
+are never truth and never an independent measurement; resume.py makes a hint of the position."""
 
 import math
 from typing import Any

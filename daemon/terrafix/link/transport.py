@@ -59,7 +59,7 @@ def open_transport(device: str, baud: int, *, wait: bool) -> Transport:
         if kind == "tcp":
             return Tcp(address, wait=wait)
         return UdpIn(address) if kind == "udpin" else UdpOut(address)
-    if rest and not device.startswith("/"):
+    if not device.startswith("/"):
         raise LinkError(
             f"link '{device}': not understood; write udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/..."
         )

@@ -7,6 +7,7 @@ from terrafix_engines.features.exported import ExportedDetector
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.features.keypoints import Detector
 from terrafix_engines.features.lightglue import LightGlueMatcher
+from terrafix_engines.features.semidense import SemiDenseMatcher
 from terrafix_engines.features.xfeat import XFeatDescriber, XFeatDetector
 from terrafix_engines.manifest import DENSE_OUTPUTS, ManifestError, named
 from terrafix_engines.runtime import Model, ModelFileError
@@ -35,6 +36,11 @@ def open_detector(model: Stored) -> Detector:
 def open_matcher(model: Stored) -> LightGlueMatcher:
     """Of a model whose role is "matcher". Raises ModelFileError."""
     return LightGlueMatcher(model.open(*LightGlueMatcher.names(model.manifest)), model.manifest)
+
+
+def open_picture_matcher(model: Stored) -> SemiDenseMatcher:
+    """Of a model whose role is "pair". Raises ModelFileError."""
+    return SemiDenseMatcher(model.open(*SemiDenseMatcher.names(model.manifest)), model.manifest)
 
 
 def _own_xfeat(path: Path, folder: Path) -> XFeatDescriber:

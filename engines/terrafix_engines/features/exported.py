@@ -4,7 +4,7 @@ import numpy as np
 
 from terrafix_engines.features.image_input import image_tensor
 from terrafix_engines.features.keypoints import Keypoints, best_of, unit
-from terrafix_engines.manifest import KeypointOutputs, Manifest
+from terrafix_engines.manifest import Coordinates, Manifest
 from terrafix_engines.runtime import Model, ModelRunError
 
 
@@ -36,15 +36,15 @@ class ExportedDetector:
                 f"{self.name}: {keypoints.size // 2} keypoints, {count} scores, {len(descriptors)} descriptors; "
                 "check [keypoints] of its manifest"
             )
-        xy_px = in_pixels(keypoints.reshape(-1, 2).astype(np.float32), self._points, filled)
+        xy_px = in_pixels(keypoints.reshape(-1, 2).astype(np.float32), self._points.coordinates, filled)
         kept = best_of(xy_px, scores, (width, height), most)
         return Keypoints(xy_px[kept], scores[kept], unit(descriptors[kept]), size_px=(width, height))
 
 
-def in_pixels(xy: np.ndarray, spec: KeypointOutputs, filled: tuple[int, int]) -> np.ndarray:
+def in_pixels(xy: np.ndarray, coordinates: Coordinates, filled: tuple[int, int]) -> np.ndarray:
     """(N, 2) as the model says them -> pixels of its input, which has ``filled`` (height, width)."""
     last = np.array([filled[1] - 1, filled[0] - 1], np.float32)
-    match spec.coordinates:
+    match coordinates:
         case "signed":
             return np.asarray((xy + 1.0) / 2.0 * last, dtype=np.float32)
         case "unit":

@@ -4,7 +4,7 @@ The flight on the disk is never copied or changed. An edit is a function over th
 applies it and gives the frames new numbers."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import Image
 from terrafix.messages import Origin, VehicleState
 from terrafix.vision.sources import Shot, Source
 from terrafix_tools.accept.flight import Stop
@@ -111,18 +112,16 @@ def _moved(state: VehicleState, t_ns: int, backwards: bool) -> VehicleState:
     return msgspec.structs.replace(state, t_ns=t_ns, velocity_enu_mps=velocity)
 
 
-def foreign_frames(before: frozenset[str]) -> Edit:
-    """Before each of these files comes a picture that is nowhere on the map: the first one of the flight, mirrored."""
+def foreign_frames(pictures: Mapping[str, Image]) -> Edit:
+    """Before each of these files comes a picture that does not belong there."""
 
     def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
-        picture, last_ns = None, 0
+        last_ns = 0
         for shot in shots:
-            if picture is None and shot.image is not None:
-                picture = np.ascontiguousarray(shot.image[:, ::-1])
-            if shot.frame.file in before:
+            if shot.frame.file in pictures:
                 t_ns = (last_ns + shot.frame.t_ns) // 2
                 frame = msgspec.structs.replace(shot.frame, t_ns=t_ns, file=foreign_name(shot.frame.file))
-                yield Shot(frame, (), picture)
+                yield Shot(frame, (), pictures[shot.frame.file])
             last_ns = shot.frame.t_ns
             yield shot
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import Image
 from terrafix.messages import VehicleState
 from terrafix.vision.sources import open_source
 from terrafix_tools.estimates import number, read_table
@@ -49,6 +50,14 @@ class Flight:
         place = LocalFrame(first.lat_deg, first.lon_deg)
         known = [self.truth.get(stop.file) for stop in self.stops]
         return np.array([(np.nan, np.nan) if t is None else place.to_local(t.lat_deg, t.lon_deg) for t in known], float)
+
+    def picture(self, number: int) -> Image:
+        """Of this frame, or of the first one after it that can be read."""
+        source = open_source(self.source)
+        shots = source.shots(from_s=self.stops[number].t_s)
+        image = next(shot.image for shot in shots if shot.image is not None)
+        source.close()
+        return image
 
 
 def open_flight(source: str, map_path: Path | None, dem: Path | None, truth: Path, frames: int | None) -> Flight:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.core.node import Node, NodeContext
+from terrafix.core.node import Image, Node, NodeContext
 from terrafix.messages import Origin
 from terrafix_tools.accept import faults
 from terrafix_tools.accept.criteria import EVERYWHERE
@@ -16,6 +16,8 @@ from terrafix_tools.accept.judged import Marks, Span
 from terrafix_tools.accept.stale_map import stale_along
 from terrafix_tools.replay import MakeNodes, make_nodes
 
+FOREIGN_AT = (0.3, 0.55, 0.8)  # of the frames
+FAR_M = 350.0
 BLACKOUT_S, STALL_S = 60.0, 10.0
 BEFORE_S, AFTER_S = 20.0, 25.0  # of flight, around a blackout
 UNMATCHABLE = (0.40, 0.60)  # of the frames: a fifth of the route
@@ -56,8 +58,23 @@ def _as_it_is(_: Flight) -> Plan:
 def _foreign_frame(flight: Flight) -> Plan | str:
     if len(flight.stops) < 8:
         return f"the flight has only {len(flight.stops)} frames"
-    before = frozenset(flight.stops[flight.at(share)].file for share in (0.3, 0.55, 0.8))
-    return Plan(faults.foreign_frames(before), marks=Marks(wrong_files=frozenset(map(faults.foreign_name, before))))
+    mirrored = np.ascontiguousarray(flight.picture(0)[:, ::-1])
+    return _foreign({flight.stops[flight.at(share)].file: mirrored for share in FOREIGN_AT})
+
+
+def _far_frame(flight: Flight) -> Plan | str:
+    track = flight.track_m()
+    away = np.hypot(*(track[:, None] - track[None, :]).transpose(2, 0, 1))
+    there = np.where(away >= FAR_M, away, np.inf).argmin(axis=1)  # the nearest one that is far enough
+    has = np.flatnonzero((away[np.arange(len(track)), there] >= FAR_M) & (np.arange(len(track)) > 0))
+    if len(has) < len(FOREIGN_AT):
+        return f"no two places of the flight are {FAR_M:.0f} m apart"
+    at = [int(has[round(share * (len(has) - 1))]) for share in FOREIGN_AT]
+    return _foreign({flight.stops[i].file: flight.picture(int(there[i])) for i in at})
+
+
+def _foreign(pictures: dict[str, Image]) -> Plan:
+    return Plan(faults.foreign_frames(pictures), marks=Marks(wrong_files=frozenset(map(faults.foreign_name, pictures))))
 
 
 def _outlier_fix(flight: Flight) -> Plan:
@@ -196,6 +213,9 @@ SCENARIOS: tuple[Scenario, ...] = (
     Scenario(
         "foreign frame", "Three pictures of another place among the frames: rejected, and nothing follows from them.",
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _foreign_frame),
+    Scenario(
+        "350 m frame", "Three frames come again, 350 m from where they belong: rejected, and the next one is right.",
+        (*EVERYWHERE, "wrong ones rejected", "next frame"), _far_frame),
     Scenario(
         "350 m outlier fix", "Every tenth map fix is wrong by 350 m and sure of itself: refused.",
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _outlier_fix),

@@ -1,9 +1,11 @@
 """Kidnapped starts: from the middle of a flight, without any position. How soon is the place found, and is it right?
 
-python -m terrafix_tools.bench.kidnapped FLIGHT [FLIGHT ...] [--map MAP] [--tries 20] [--frames 10] [--stride 1]
+python -m terrafix_tools.bench.kidnapped FLIGHT [FLIGHT ...] [--map MAP] [--mirrored] [--tries 20] [--frames 10]
+    [--stride 1] [--seed 1] [--no-compass] [--json FILE]
 
 Each try begins at another frame of the flight, one in each stretch, with the processes of ``terrafix replay`` just
-started and no start coordinate. ``--map`` of another place is a test, too: there nothing may be found."""
+started and no start coordinate. In two tests nothing may be found: ``--map`` of another place; and ``--mirrored``: with
+left and right exchanged a frame shows ground of the same kind that is nowhere on the map."""
 
 import argparse
 import csv
@@ -18,6 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import typer
 
 from terrafix.anchor.map_package import MapPackage
@@ -41,6 +44,16 @@ Truth = dict[str, tuple[float, float]]  # file -> (lat_deg, lon_deg)
 
 
 @dataclass(frozen=True)
+class How:
+    """How a try is flown: ``frames``, of which every ``stride``-th counts; with the heading of the autopilot or not."""
+
+    frames: int
+    stride: int
+    compass: bool
+    mirrored: bool
+
+
+@dataclass(frozen=True)
 class Try:
     """One kidnapped start. ``found_after``: frames, None if it was not found; ``wrong``: frames on which a wrong place
     was announced."""
@@ -54,8 +67,8 @@ class Try:
     cpu_s_a_frame: float
 
 
-def attempt(source: Source, package: Path, truth: Truth, first: int, frames: int, stride: int, compass: bool) -> Try:
-    """The processes from frame ``first`` on, for ``frames`` frames."""
+def attempt(source: Source, package: Path, truth: Truth, first: int, how: How) -> Try:
+    """The processes from frame ``first`` on."""
     store, heard = MemoryFrameStore(FRAMES_KEPT), list[Message]()
     with tempfile.TemporaryDirectory(prefix="terrafix-kidnapped-") as out:
         ctx = NodeContext(config=load([]), frames=store, map_path=package.resolve(), out_dir=Path(out))
@@ -63,15 +76,15 @@ def attempt(source: Source, package: Path, truth: Truth, first: int, frames: int
     shell.feed(_nowhere(source, package))
     found_after, error_m, wrong, used, way_agl, cpu_s = None, None, 0, 0, 0.0, 0.0
     before: tuple[float, float] | None = None
-    for i, shot in enumerate(itertools.islice(source.shots(), first, first + frames * stride)):
+    for i, shot in enumerate(itertools.islice(source.shots(), first, first + how.frames * how.stride)):
         for state in shot.states:
-            shell.feed(state if compass else msgspec.structs.replace(state, yaw_rad=None))
+            shell.feed(state if how.compass else msgspec.structs.replace(state, yaw_rad=None))
         for readings in shot.imu:
             shell.feed(readings)
-        if i % stride:
+        if i % how.stride:
             continue
         if shot.image is not None:
-            store.put(shot.frame.frame_id, shot.image)
+            store.put(shot.frame.frame_id, np.ascontiguousarray(shot.image[:, ::-1]) if how.mirrored else shot.image)
         heard.clear()
         began_s = time.process_time()
         shell.feed(shot.frame)
@@ -85,7 +98,7 @@ def attempt(source: Source, package: Path, truth: Truth, first: int, frames: int
         way_agl += 0.0 if before is None else _apart_m(before, here) / estimate.agl_m
         before = here
         off_m = _apart_m(here, (estimate.lat_deg, estimate.lon_deg))
-        right = off_m <= max(RIGHT_M, RIGHT_PER_AGL * estimate.agl_m)
+        right = not how.mirrored and off_m <= max(RIGHT_M, RIGHT_PER_AGL * estimate.agl_m)
         sigma_m = max(estimate.cov[0], estimate.cov[7]) ** 0.5
         found = any(m.found for m in heard if isinstance(m, MapMatch))
         if found and right and found_after is None:
@@ -95,9 +108,7 @@ def attempt(source: Source, package: Path, truth: Truth, first: int, frames: int
     return Try(first, found_after, error_m, wrong, used, round(way_agl, 2), round(cpu_s / max(used, 1), 2))
 
 
-def measure(
-    flight: str, map_path: Path | None, tries: int, frames: int, stride: int, seed: int, compass: bool
-) -> list[Try]:
+def measure(flight: str, map_path: Path | None, tries: int, seed: int, how: How) -> list[Try]:
     """Raises the TerrafixError family."""
     source = open_source(flight)
     wanted = map_path or source.map_hint()
@@ -105,10 +116,10 @@ def measure(
         raise UsageError(f"{flight}: the flight names no map; give one with --map")
     package = ensure_package(wanted, map_cache_dir())
     truth = _truth(Path(flight))
-    starts = max(1, (source.length() or 0) - frames * stride + 1)
+    starts = max(1, (source.length() or 0) - how.frames * how.stride + 1)
     draw = random.Random(seed)
     drawn = {min(int((k + draw.random()) * starts / tries), starts - 1) for k in range(tries)}
-    return [attempt(source, package, truth, first, frames, stride, compass) for first in sorted(drawn)]
+    return [attempt(source, package, truth, first, how) for first in sorted(drawn)]
 
 
 def _nowhere(source: Source, package: Path) -> Origin:
@@ -146,6 +157,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("flights", nargs="+", metavar="FLIGHT")
     parser.add_argument("--map", type=Path, help="instead of the one that each flight names")
+    parser.add_argument("--mirrored", action="store_true", help="left and right exchanged: nothing may be found")
     parser.add_argument("--tries", type=int, default=20)
     parser.add_argument("--frames", type=int, default=10)
     parser.add_argument("--stride", type=int, default=1, help="uses every so-manieth frame")
@@ -153,14 +165,13 @@ def main() -> None:
     parser.add_argument("--no-compass", action="store_true")
     parser.add_argument("--json", type=Path, help="writes every try")
     given = parser.parse_args()
+    how = How(given.frames, given.stride, compass=not given.no_compass, mirrored=given.mirrored)
     typer.echo(f"{'flight':28} tries found  {'frames, median':22} wrong  heights  CPU s a frame")
     all_tries: dict[str, list[Try]] = {}
     try:
         for flight in given.flights:
             name = Path(flight).name
-            all_tries[name] = measure(
-                flight, given.map, given.tries, given.frames, given.stride, given.seed, not given.no_compass
-            )
+            all_tries[name] = measure(flight, given.map, given.tries, given.seed, how)
             typer.echo(row(name, all_tries[name]))
     except TerrafixError as error:
         sys.exit(f"{error}")

@@ -11,7 +11,7 @@ from terrafix.messages import HintVerdict, PositionHint
 from terrafix.processes import PROCESSES
 
 HEARERS = [process.name for process in PROCESSES if PositionHint in process.hears]
-HEARD_S = 3.0  # they look for an operator several times a second
+HEARD_S = 20.0  # they look for an operator several times a second, an anchor that searches between two looks
 ANSWER_S = 10.0  # comes with the next frame
 RADIUS_M = (100.0, 100_000.0)
 

@@ -33,13 +33,20 @@ FRAMES = {
     10: Above.GROUND,
     11: Above.GROUND,
 }
+WAYPOINT, RETURN, TAKE_OFF, VTOL_TAKE_OFF = 16, 20, 22, 84
+LAST_WAY = 95  # MAV_CMD_NAV_LAST: commands up to it are flown to where they have a place
+LAND_START = 189  # DO_LAND_START: where a landing begins, on the way like any other
+LOOK_AT = 80  # NAV_ROI: a place that is looked at, not flown to
 STAY = {93, 201, 203, 205, 206, 530, 1000, 2000, 2001, 2500, 2501}  # delays of payload, camera, gimbal: nothing moves
 AMOUNT_MAX = 86_400.0  # a day of waiting, or as many turns, is a mistake
 HEIGHT_M = (-500.0, 9000.0)
 
 
-def read_mission(path: Path) -> Mission:
-    """Raises SourceError: not readable, neither format, an item that no vehicle here can fly."""
+def read_mission(path: Path, *, way_only: bool = False) -> Mission:
+    """``way_only``: what is asked is where it leads, not how it is flown: an item that no vehicle here can fly is a
+    waypoint where it has a place, and left out where it has none.
+
+    Raises SourceError: not readable, neither format, an item that no vehicle here can fly."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -47,9 +54,9 @@ def read_mission(path: Path) -> Mission:
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(f"{path}: cannot be read as a mission ({error})") from None
     if text.startswith(HEADER):
-        return _waypoints(path, text)
+        return _waypoints(path, text, way_only)
     if text.lstrip().startswith("{"):
-        return _plan(path, text)
+        return _plan(path, text, way_only)
     raise SourceError(
         f"{path}: neither a QGroundControl plan (JSON) nor a waypoint file ('{HEADER}' in its first line)"
     )
@@ -59,7 +66,7 @@ def write_mission(path: Path, mission: Mission) -> None:
     """As a waypoint file, for a ground station or an autopilot. Raises OutputError."""
     numbers = {do: number for number, do in COMMANDS.items()}
     frames = {Above.SEA: 0, Above.HOME: 3, Above.GROUND: 10}
-    lines = [HEADER, _line(0, 1, 0, 16, (0.0, 0.0, 0.0, 0.0), mission.home_lat_deg, mission.home_lon_deg, 0.0)]
+    lines = [HEADER, _line(0, 1, 0, WAYPOINT, (0.0, 0.0, 0.0, 0.0), mission.home_lat_deg, mission.home_lon_deg, 0.0)]
     for i, item in enumerate(mission.items, start=1):
         amounts = (1.0, item.amount, -1.0, 0.0) if item.do is Do.SPEED else (item.amount, 0.0, item.radius_m, 0.0)
         place = item.lat_deg or 0.0, item.lon_deg or 0.0, item.height_m or 0.0
@@ -76,7 +83,7 @@ def _line(i: int, current: int, frame: int, command: int, params: tuple[float, .
     return "\t".join(str(cell) for cell in cells)
 
 
-def _waypoints(path: Path, text: str) -> Mission:
+def _waypoints(path: Path, text: str, way_only: bool) -> Mission:
     """Row 0 is home."""
     rows: list[list[float]] = []
     for line_number, line in enumerate(text.splitlines()[1:], start=2):
@@ -94,11 +101,12 @@ def _waypoints(path: Path, text: str) -> Mission:
         rows.append(row)
     if len(rows) < 2:
         raise SourceError(f"{path}: holds no mission; the first row is home, items follow it")
-    items = [_item(path, int(row[0]), int(row[3]), int(row[2]), row[4:11]) for row in rows[1:]]
+    read = _place if way_only else _item
+    items = [read(path, int(row[0]), int(row[3]), int(row[2]), row[4:11]) for row in rows[1:]]
     return _mission(path, (rows[0][8], rows[0][9]), items)
 
 
-def _plan(path: Path, text: str) -> Mission:
+def _plan(path: Path, text: str, way_only: bool) -> Mission:
     try:
         mission = json.loads(text)["mission"]
         home, entries = mission["plannedHomePosition"], mission["items"]
@@ -115,11 +123,11 @@ def _plan(path: Path, text: str) -> Mission:
     for number, entry in enumerate(entries, start=1):
         is_complex = isinstance(entry, dict) and entry.get("type") == "ComplexItem"
         parts = simple_items(f"{path} item {number}", entry) if is_complex else [entry]
-        items += [_simple(path, number, part) for part in parts]
+        items += [_simple(path, number, part, way_only) for part in parts]
     return _mission(path, place, items)
 
 
-def _simple(path: Path, number: int, entry: Any) -> Item | None:
+def _simple(path: Path, number: int, entry: Any, way_only: bool) -> Item | None:
     kind = entry.get("type") if isinstance(entry, dict) else None
     if kind != "SimpleItem":
         raise SourceError(f"{path} item {number}: '{kind}' is not supported; put waypoints in its place")
@@ -130,7 +138,7 @@ def _simple(path: Path, number: int, entry: Any) -> Item | None:
         raise SourceError(f"{path} item {number}: command, frame or params is missing or not a number") from None
     if len(values) != 7:
         raise SourceError(f"{path} item {number}: {len(values)} params; a mission item has 7")
-    return _item(path, number, command, frame, values)
+    return (_place if way_only else _item)(path, number, command, frame, values)
 
 
 def _item(path: Path, number: int, command: int, frame: int, values: list[float]) -> Item | None:
@@ -169,6 +177,18 @@ def _item(path: Path, number: int, command: int, frame: int, values: list[float]
         amount=amount,
         radius_m=p[2] if do in (Do.LOITER, Do.LOITER_TURNS, Do.LOITER_TIME) else 0.0,
     )
+
+
+def _place(path: Path, number: int, command: int, frame: int, values: list[float]) -> Item | None:
+    """The same of an item of which is only asked where it leads. None: nowhere, or where the vehicle is by then."""
+    if command == VTOL_TAKE_OFF:
+        command = TAKE_OFF
+    placed = all(map(math.isfinite, values[4:6])) and (values[4], values[5]) != (0.0, 0.0)
+    flown = (command <= LAST_WAY and command not in (LOOK_AT, *STAY)) or command == LAND_START
+    if command not in (TAKE_OFF, RETURN) and not (placed and flown):
+        return None
+    known = command in COMMANDS and frame in FRAMES
+    return _item(path, number, command if known else WAYPOINT, frame if known else 0, values)
 
 
 def _mission(path: Path, home: tuple[float, float], items: list[Item | None]) -> Mission:

@@ -77,10 +77,12 @@ def _rows(model: Model, manifest: Manifest, runs: int) -> list[dict[str, Any]]:
 
 
 def _baseline(manifest: Manifest, sizes: dict[str, int]) -> tuple[str, Callable[[], object]] | None:
-    """What does the same work without weights, for an input of the same size."""
+    """What does the same work without weights, for an input of the same size; None: nothing does."""
     if manifest.role == "matcher":
         points = [_points(count) for name, count in sorted(sizes.items()) if name != "batch"]
         return "nearest", lambda: MutualNearest().match(points[0], points[-1])
+    if manifest.role == "pair":
+        return None
     rng = np.random.default_rng(0)
     height, width = (sizes[side] if isinstance(side, str) else side for side in manifest.picture_size())
     image = rng.integers(0, 255, (height, width, 3), np.uint8)

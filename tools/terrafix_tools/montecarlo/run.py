@@ -183,5 +183,7 @@ def show(result: dict[str, Any], console: Console) -> None:
         f"{result['wall_s']:.0f} s",
         highlight=False,
     )
+    shares = ", ".join(f"{name.replace('_', ' and ')} {share:.2f}" for name, share in total["parts"].items())
+    console.print(f"squared error over claim, 1 when true: {shares}", highlight=False)
     for floor, holds in result["floors"].items():
         console.print(f"{'holds ' if holds else 'BROKEN'}  {floor}", style="" if holds else "bold red", highlight=False)

@@ -133,6 +133,15 @@ class Seen:
         return float(np.hypot(*grown)) / way_m if way_m >= LEAST_DRIFT_M else None
 
 
+def parts(flights: list[Seen]) -> dict[str, float]:
+    """Mean squared error over its claimed variance, of each kind of number alone: one when the claims are true. The
+    claim of a velocity is that of its worst direction."""
+    ratio = np.concatenate([f.record.error_m**2 / np.einsum("nii->ni", f.record.cov) for f in flights])
+    velocity = np.concatenate([f.velocity_share() for f in flights])
+    numbers = {"east_north": ratio[:, :2], "up": ratio[:, 2], "tilt": ratio[:, 3:5], "heading": ratio[:, 5]}
+    return {name: float(np.mean(values)) for name, values in {**numbers, "velocity": velocity**2}.items()}
+
+
 def summary(flights: list[Seen]) -> dict[str, Any]:
     """The row of a table: over all frames of some flights."""
     nees = np.concatenate([f.nees for f in flights])
@@ -165,6 +174,7 @@ def summary(flights: list[Seen]) -> dict[str, Any]:
         "nees": _row(bands[0]),
         "nees_on_map": _row(bands[1]),
         "nees_pose": _row(bands[2]),
+        "parts": parts(flights),
         "velocity_coverage": float((velocity <= NORMAL95).mean()),
         "velocity_share_p95": float(np.percentile(velocity, 95)),
         "velocity_rms_mps": float(

@@ -10,9 +10,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
+from terrafix.link.budget import LineBudget
 from terrafix.link.diagnosis import Heard, why_no_autopilot
 from terrafix.link.framing import Framer
 from terrafix.link.signing import Signing, read_key
+from terrafix.link.streams import STREAMS_HZ, Streams
 from terrafix.link.transport import Transport, open_at_start
 from terrafix_tools.preflight.lines import number
 
@@ -24,6 +26,7 @@ ROUNDS, QUIET_S = 4, 0.7  # a parameter is asked for so often; a round ends when
 BATCH = 8  # requests at once: a slow line has a short queue
 ANSWER_S = 2.0
 TRIPS = 10
+RATES_S = 6.5  # two windows of Streams: in the first one the autopilot begins
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 PLANES = {mavlink.MAV_TYPE_FIXED_WING, *range(19, 26)}  # 19 to 25 are VTOLs, which fly ArduPlane
 
@@ -136,16 +139,25 @@ class Autopilot:
                     break
         return statistics.median(trips) if trips else None
 
+    def rates(self) -> Streams:
+        """The messages that the link will ask for are asked for, and counted for RATES_S."""
+        baud = self._config.baud if self._config.device.startswith("/") else None
+        budget = LineBudget(baud, signed=self._signing is not None)
+        streams = Streams(budget.fitting(STREAMS_HZ))
+        for message in self._listen(RATES_S):
+            if message is not None:
+                streams.heard(message.get_msgId())
+                if message.get_type() == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+                    streams.answered(message.result)
+            for request in streams.requests(self.sysid, AUTOPILOT, round(self._clock() * 1e9)):
+                self._send(request)
+        return streams
+
     def mission(self) -> list[Any]:
         """MISSION_ITEM_INT of the mission on board, home first; empty when there is none. Raises LinkError."""
         self._send(mavlink.MAVLink_mission_request_list_message(self.sysid, AUTOPILOT))
         count = next((m.count for m in self._listen(ANSWER_S) if m is not None and m.get_type() == "MISSION_COUNT"), 0)
         return [self._mission_item(seq) for seq in range(count)]
-
-    def hear(self, seconds: float) -> None:
-        """Listens, so that ``newest`` has what comes by itself."""
-        for _ in self._listen(seconds):
-            pass
 
     def _mission_item(self, seq: int) -> Any:
         for _ in range(ROUNDS):

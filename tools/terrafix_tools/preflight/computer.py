@@ -15,6 +15,7 @@ from terrafix.core.signature import trusted_keys
 from terrafix.health.sysfs import read_disk_free_mb, read_throttling, read_zones
 from terrafix.link import gps_time
 from terrafix.vision.sources import open_configured, parse_start
+from terrafix.vision.sources.description import read_description
 from terrafix_engines.features import open_describer
 from terrafix_engines.features.xfeat import XFeatDescriber
 from terrafix_engines.providers import short
@@ -53,36 +54,54 @@ def _map(config: Config, mission: Path | None) -> Iterator[Line]:
         yield fail("map", *_told(error))
         return
     try:
-        newest = package.layer(None)
-        signed = f"signed by {', '.join(package.signed_by)}" if package.signed_by else "not signed"
-        yield ok(
-            "map", f"{package.path.name}: every tile is whole; {signed}; imagery of {newest.date or 'unknown date'}"
-        )
-        place = parse_start(config.source.start)
-        if place is not None:
-            covered = package.covers(*place)
-            at = f"{place[0]:.6f}, {place[1]:.6f}"
-            yield (
-                ok("start", f"{at} lies on the map")
-                if covered
-                else fail("start", f"{at} does not lie on the map", "correct [source] start, or take another map")
-            )
+        yield from _checked("map", _whole(package))
+        yield from _checked("start", _start(package, config))
         if mission is not None:
-            yield _cover(package, mission)
-    except TerrafixError as error:
-        yield fail("map", *_told(error))
+            yield from _checked("mission", _cover(package, mission))
     finally:
         package.close()
 
 
-def _cover(package: MapPackage, mission: Path) -> Line:
-    plan = read_mission(mission)
+def _checked(check: str, lines: Iterator[Line]) -> Iterator[Line]:
+    """What cannot be read is a failure of its own check, and not the end of the others."""
+    try:
+        yield from lines
+    except TerrafixError as error:
+        yield fail(check, *_told(error))
+
+
+def _whole(package: MapPackage) -> Iterator[Line]:
+    newest = package.layer(None)
+    signed = f"signed by {', '.join(package.signed_by)}" if package.signed_by else "not signed"
+    yield ok("map", f"{package.path.name}: every tile is whole; {signed}; imagery of {newest.date or 'unknown date'}")
+
+
+def _start(package: MapPackage, config: Config) -> Iterator[Line]:
+    """As the flight will take it: of the configuration, else of the camera's description."""
+    place = parse_start(config.source.start)
+    if place is None and config.source.camera:
+        described = read_description(Path(config.source.camera).expanduser()).start
+        place = None if described is None else (described.lat_deg, described.lon_deg)
+    if place is None:
+        text = "not known: the whole map is searched for the first position"
+        yield warn("start", text, "set [source] start, or [start] in the description of the camera")
+        return
+    at = f"{place[0]:.6f}, {place[1]:.6f}"
+    if package.covers(*place):
+        yield ok("start", f"{at} lies on the map")
+    else:
+        yield fail("start", f"{at} does not lie on the map", "correct the start, or take another map")
+
+
+def _cover(package: MapPackage, mission: Path) -> Iterator[Line]:
+    plan = read_mission(mission, way_only=True)
     west, south, east, north = package.manifest.bounds_wgs84
     way = way_of(plan, LocalFrame((south + north) / 2, (west + east) / 2))
     outside = way.stretches(uncovered(way, package, package.layer(None).table))
     if outside:
-        return fail("mission", f"leaves the map for {where(outside[0])}", "move the mission, or build a larger map")
-    return ok("mission", f"its {way.along_m[-1] / 1000:.1f} km lie on the map")
+        yield fail("mission", f"leaves the map for {where(outside[0])}", "move the mission, or build a larger map")
+    else:
+        yield ok("mission", f"its {way.along_m[-1] / 1000:.1f} km lie on the map")
 
 
 def _camera(config: Config) -> Iterator[Line]:

@@ -138,4 +138,10 @@ def _conclude(said: Preflight) -> None:
     if said.written:
         typer.echo(f"\n{len(said.written)} parameters set; their old values are in {said.saved_to}")
         typer.echo("Restart the autopilot, and run this again.")
-    typer.echo(f"\n{count[Status.OK]} ok, {count[Status.WARN]} warnings, {count[Status.FAIL]} failures")
+    typer.echo(
+        f"\n{count[Status.OK]} ok, {_many(count[Status.WARN], 'warning')}, {_many(count[Status.FAIL], 'failure')}"
+    )
+
+
+def _many(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -8,6 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
+from terrafix.link.streams import Streams
 from terrafix_tools.preflight.autopilot import Autopilot
 from terrafix_tools.preflight.lines import Line, fail, ok, warn
 
@@ -17,7 +18,6 @@ SLOW_MS = 100.0
 WIRE_BYTES = 80  # GPS_INPUT, signed 93
 BITS_PER_BYTE = 10  # 8N1
 DELAY_LEAST_MS, DELAY_MOST_MS = 5, 50
-HEAR_S = 2.5
 LOOPBACK = ("127.", "localhost")
 
 
@@ -32,7 +32,7 @@ def about(autopilot: Autopilot, link: LinkSection, round_trip_ms: float | None) 
     version = autopilot.ask(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, "AUTOPILOT_VERSION")
     kind = "ArduPlane" if autopilot.plane else "ArduCopter"
     yield _firmware(kind, autopilot.sysid, version)
-    autopilot.hear(HEAR_S)
+    yield rates(autopilot.rates())
     if round_trip_ms is None:
         yield fail("time", "no answer to TIMESYNC", "is the link one way, or a router in between?")
     elif round_trip_ms > SLOW_MS:
@@ -68,6 +68,15 @@ def _firmware(kind: str, sysid: int, version: Any) -> Line:
     if numbers[:2] < OLDEST:
         return fail("firmware", f"{text}: names and behaviour differ before 4.6", "update the autopilot")
     return ok("firmware", text)
+
+
+def rates(streams: Streams) -> Line:
+    problem = streams.problem()
+    if problem:
+        return warn("stream rates", problem, "is the line full, or does a router or a ground station set rates, too?")
+    attitude = streams.rates_hz.get(mavlink.MAVLINK_MSG_ID_ATTITUDE, 0.0)
+    imu = streams.rates_hz.get(mavlink.MAVLINK_MSG_ID_RAW_IMU, 0.0)
+    return ok("stream rates", f"everything comes as asked for: attitude {attitude:.0f} Hz, IMU {imu:.0f} Hz")
 
 
 def _clock(said: Any) -> Line:

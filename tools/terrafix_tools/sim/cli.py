@@ -44,6 +44,7 @@ def ardupilot(
     parameters: Annotated[
         list[Path] | None, typer.Option(help="Parameter file of the vehicle; default: second-gps.param.")
     ] = None,
+    kill: Annotated[bool, typer.Option("--kill", help="Kill Terrafix without GNSS, and start it again.")] = False,
 ) -> None:
     """ArduPilot's own firmware flies a mission on Terrafix' GPS_INPUT, in real time."""
     try:
@@ -61,6 +62,7 @@ def ardupilot(
         length_m=length * 1e3,
         port=port,
         parameters=parameters,
+        kill=kill,
     )
     raise typer.Exit(code)
 

@@ -31,6 +31,9 @@ class Times:
     armed_ns: int | None = None
     lost_ns: int | None = None  # the receiver had no 3D fix any more
     landed_ns: int | None = None  # disarmed
+    killed_ns: int | None = None  # all of Terrafix, where that was asked for
+    restarted_ns: int | None = None
+    back_ns: int | None = None  # its first 3D fix after that
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,8 @@ class Figures:
     belief_median_m: float | None  # distance of the autopilot's own position from the truth
     belief_p95_m: float | None
     belief_max_m: float | None
+    seen_lost_s: float | None  # from the kill until the firmware said that GPS_INPUT has no fix
+    back_s: float | None  # from the restart to the first 3D fix
 
 
 def figures(notes: Notes, times: Times, home: Home) -> Figures:
@@ -90,7 +95,17 @@ def figures(notes: Notes, times: Times, home: Home) -> Figures:
         belief_median_m=float(np.median(errors)) if errors else None,
         belief_p95_m=float(np.quantile(errors, 0.95)) if errors else None,
         belief_max_m=max(errors) if errors else None,
+        seen_lost_s=_since_s(times.killed_ns, next((t for t, fix in fixes if _after(t, times.killed_ns, fix)), None)),
+        back_s=_since_s(times.restarted_ns, times.back_ns),
     )
+
+
+def _after(t_ns: int, killed_ns: int | None, fix: int) -> bool:
+    return killed_ns is not None and t_ns > killed_ns and fix < FIX_3D
+
+
+def _since_s(from_ns: int | None, to_ns: int | None) -> float | None:
+    return None if from_ns is None or to_ns is None else (to_ns - from_ns) / 1e9
 
 
 def verdicts(flown: Figures, asked_m: float) -> dict[str, bool]:

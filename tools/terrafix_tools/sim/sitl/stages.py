@@ -1,7 +1,8 @@
 """The stages of a flight on ArduPilot's firmware, from the boot to the landing, and Terrafix beside it."""
 
 import contextlib
-import threading
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +12,6 @@ from pathlib import Path
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from rich.console import Console
 
-from terrafix import supervisor
 from terrafix.core.errors import LinkError, OutputError
 from terrafix.vision.sources.description import CameraTable, Description, MountTable, StartTable, TelemetryTable
 from terrafix_tools.sim.flights.description import write_toml
@@ -35,6 +35,9 @@ LOSS_S = 10.0
 LOOK_S = 0.2
 GNSS_OFF = (("SIM_GPS_DISABLE", 1), ("SIM_GPS1_ENABLE", 0))  # ArduPilot 4.6 and before, later
 NO_FIX = 1  # GPS_INPUT comes, without a fix
+KILL_AFTER_S = 30.0  # without GNSS
+DOWN_S = 5.0  # the firmware notices after 4 s
+BACK_S = 120.0  # from the restart to a 3D fix
 
 
 class NotFlown(Exception):
@@ -42,12 +45,11 @@ class NotFlown(Exception):
 
 
 class Daemon:
-    """The supervisor and its processes; ``start`` once. A context manager that stops them."""
+    """`terrafix run` as on a vehicle, a program of its own: begun by ``start``, ended by ``kill`` or this context."""
 
     def __init__(self, out: Path, scene: Scene, source: str, link: str) -> None:
         """Raises OutputError."""
-        self._code: int | None = None
-        self._stop = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
         self._log = out / "terrafix.log"
         camera, config = out / "camera.toml", out / "terrafix.toml"
         write_toml(camera, _description(scene.home), "The camera of the simulated vehicle.")
@@ -55,35 +57,34 @@ class Daemon:
             config.write_text(f'[source]\ncamera = "{camera}"\n[link]\ngps_id = {GPS_ID}\n', encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-
-        def run() -> None:
-            self._code = supervisor.run(
-                source=source,
-                map_path=scene.map_path,
-                link=link,
-                out_dir=out / "record",
-                configs=[config],
-                stop=self._stop,
-                log_to=self._log,
-            )
-
-        self._thread = threading.Thread(target=run, name="sitl-daemon", daemon=True)
+        self._command = [sys.executable, "-m", "terrafix_tools.cli", "run", "--config", str(config), "--source", source]
+        self._command += ["--map", str(scene.map_path), "--link", link, "--out", str(out / "record")]
 
     def start(self) -> None:
-        self._thread.start()
+        with self._log.open("ab") as log:
+            self._process = subprocess.Popen(
+                self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+            )
+
+    def kill(self) -> None:
+        """Without a word, and all of it: its processes die with their supervisor."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
 
     def check(self) -> None:
         """Raises NotFlown when it has ended."""
-        if self._thread.ident is not None and not self._thread.is_alive():
-            raise NotFlown(f"Terrafix ended with exit code {self._code}; see {self._log}")
+        if self._process is not None and self._process.poll() is not None:
+            raise NotFlown(f"Terrafix ended with exit code {self._process.returncode}; see {self._log}")
 
     def __enter__(self) -> "Daemon":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join()
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
 
 
 class Stages:
@@ -133,6 +134,25 @@ class Stages:
         *_, (lost_ns, _fix) = without
         self.times = replace(self.times, lost_ns=lost_ns)
         self._say("GNSS lost; GPS_INPUT alone")
+
+    def kill_terrafix(self) -> None:
+        """All of it, and started again as systemd would."""
+        self._pause(KILL_AFTER_S)
+        self._daemon.kill()
+        self.times = replace(self.times, killed_ns=time.monotonic_ns())
+        self._pause(DOWN_S)
+        self._daemon.start()
+        restarted_ns = time.monotonic_ns()
+        self.times = replace(self.times, restarted_ns=restarted_ns)
+        self._say("Terrafix was killed, and started again")
+
+        def first(fix: int) -> int | None:
+            reports = self._observer.notes.fix_types[GPS_ID]
+            return next((t_ns for t_ns, said in reports if t_ns > restarted_ns and said >= fix), None)
+
+        self._wait("a 3D fix after the restart", BACK_S, lambda: first(FIX_3D) is not None)
+        self.times = replace(self.times, back_ns=first(FIX_3D))
+        self._say("it has a 3D fix again")
 
     def land(self, limit_s: float) -> None:
         """The rest of the mission; it disarms by itself when it stands."""

@@ -1,0 +1,74 @@
+"""What the patches of a frame say for a place: under one motion of the camera, and against chance."""
+
+import numpy as np
+import pytest
+
+from terrafix.anchor.agreement import agreement
+
+CELL = 0.01  # of the height
+REACH = 16
+TILT_SIGMA = 0.1
+ACROSS = np.linspace(-0.5, 0.5, 7)
+GROUND = np.array([(x, y) for x in ACROSS for y in 0.7 * ACROSS])
+
+
+def moved(motion: tuple[float, ...]) -> np.ndarray:
+    """Where the ground at GROUND comes to lie, (N, 2), for a motion (east, north, heading, scale, tilt, tilt): by
+    projecting it, not by a Jacobian."""
+    east, north, yaw, scale, tilt_e, tilt_n = motion
+    turned = (1.0 + scale) * GROUND @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    rays = np.column_stack([turned, -np.ones(len(turned))])
+    for angle, axes in ((tilt_e, (0, 2)), (tilt_n, (1, 2))):
+        a, b = rays[:, axes[0]].copy(), rays[:, axes[1]].copy()
+        rays[:, axes[0]] = np.cos(angle) * a - np.sin(angle) * b
+        rays[:, axes[1]] = np.sin(angle) * a + np.cos(angle) * b
+    return rays[:, :2] / -rays[:, 2:] + (east, north) - GROUND
+
+
+def surfaces(offsets: np.ndarray, right: np.ndarray, seed: int = 1) -> np.ndarray:
+    """Smooth noise as wrong places give it, with a peak at ``offsets`` (N, 2) for the patches that are ``right``."""
+    rng, side = np.random.default_rng(seed), 2 * REACH + 1
+    rows, columns = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1] * CELL
+    out = np.zeros((len(offsets), side, side))
+    for i, (east, north) in enumerate(offsets):
+        for _ in range(60):
+            e, n = rng.uniform(-REACH * CELL, REACH * CELL, 2)
+            out[i] += rng.normal() * np.exp(-((columns - e) ** 2 + (rows + n) ** 2) / (2 * 0.02**2))
+        out[i] /= out[i].std()
+        if right[i]:
+            out[i] += 4.0 * np.exp(-((columns - east) ** 2 + (rows + north) ** 2) / (2 * 0.02**2))
+    return out
+
+
+ALL, NONE = np.ones(len(GROUND), bool), np.zeros(len(GROUND), bool)
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (0.06, -0.04, 0.0, 0.0, 0.0, 0.0),
+        (0.02, 0.03, 0.10, 0.0, 0.0, 0.0),
+        (-0.03, 0.01, 0.0, -0.06, 0.0, 0.0),
+        (0.0, 0.0, 0.05, 0.04, 0.08, -0.05),
+    ],
+)
+def test_the_motion_is_found(motion: tuple[float, ...]) -> None:
+    offsets = moved(motion)
+    found = agreement(surfaces(offsets, ALL), GROUND, CELL, TILT_SIGMA)
+    assert found.agrees.mean() > 0.8
+    assert np.median(np.linalg.norm(found.offsets - offsets, axis=1)) < 1.5 * CELL
+    assert found.motion[2:4] == pytest.approx(motion[2:4], abs=0.015)
+    assert found.motion[:2] + found.motion[4:] == pytest.approx(np.add(motion[:2], motion[4:]), abs=0.015)
+
+
+def test_chance_says_little_and_ground_that_has_changed_takes_away_only_its_own_share() -> None:
+    offsets = moved((0.03, 0.02, 0.04, 0.02, 0.0, 0.0))
+    half = GROUND[:, 0] + GROUND[:, 1] > 0.0
+    right, changed, wrong = (
+        [agreement(surfaces(offsets, which, seed), GROUND, CELL, TILT_SIGMA).llr for seed in range(5)]
+        for which in (ALL, half, NONE)
+    )
+    assert min(right) > 2.0 * max(wrong)
+    assert min(changed) > max(wrong)
+    assert np.mean(right) > np.mean(changed)
