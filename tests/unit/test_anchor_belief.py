@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.anchor.belief import MODE_RADIUS_CELLS, Belief, Surface, _blurred, cell_for
+from terrafix.anchor.belief import MAX_HALF_CELLS, MODE_RADIUS_CELLS, Belief, Surface, _blurred, cell_for
 
 HALF_M = 200.0
 CELL_M = 2.0
@@ -207,3 +207,11 @@ def test_the_cell_goes_with_the_height() -> None:
     assert sizes == sorted(sizes)
     assert sizes[0] == 1.0 and cell_for(100.0, 0.5) == 2.0 and sizes[-1] >= 16.0
     assert cell_for(30.0, 8.0) >= 8.0  # never finer than what is looked at
+
+
+def test_a_wide_window_gets_no_finer_cells_than_it_can_have() -> None:
+    """A height that fell to nearly nothing under a belief as wide as the map asked for 133 GB."""
+    belief = Belief(0.0, 0.0, 300.0, 8.0)
+    half_m = belief.half_m
+    belief.set_cell(0.05)
+    assert belief.half_m == pytest.approx(half_m, rel=0.02) and belief.half_m / belief.cell_m <= MAX_HALF_CELLS + 1

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from simulated_flight import Flight, Listener, cov_of, error_m
+from simulated_flight import ORIGIN, Flight, Listener, cov_of, error_m
 
 from terrafix.estimator.ruggedness import CANDIDATES, Ruggedness
+from terrafix.messages import MapMatch
 
 FRAMES = 240
 
@@ -34,6 +35,23 @@ def test_heights_above_ground_and_sea_are_two(run: tuple[Flight, Listener]) -> N
     sigma = np.sqrt([cov_of(one)[2, 2] for one in said])
     assert np.median(np.abs(agl_off)) < 8.0 and (np.abs(agl_off) < 3.0 * sigma).all()
     assert np.median(np.abs(amsl_off)) < 4.0 and (np.abs(amsl_off) < 3.0 * sigma).all()
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_without_map_fixes_the_height_does_not_sink(seed: int) -> None:
+    """Two minutes by odometry alone: factors in metres pulled the camera down to half of its height, and claimed to
+    know it to 8 %."""
+    flight = Flight(300, seed=seed)
+    told = Listener()
+    told.hear([ORIGIN])
+    for i in range(flight.frames):
+        told.hear(m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i > 60))
+    for i in range(60, flight.frames, 20):
+        said = told.estimate(i)
+        assert abs(said.agl_m - flight.p_m[i, 2]) < 3.0 * np.sqrt(said.cov[14])
+        off_m = error_m(said, flight)[:2]
+        assert off_m @ np.linalg.solve(cov_of(said)[:2, :2], off_m) < 13.8  # chi-square, 2 degrees of freedom, 99.9 %
+    assert abs(told.estimate(299).agl_m - flight.p_m[299, 2]) < 25.0
 
 
 def walked(rise: float, metres: float, told: Ruggedness, seed: int) -> list[float]:

@@ -1,6 +1,5 @@
 """An estimator that was killed in flight: the next one begins where it left off, as sure as that allows."""
 
-
 import numpy as np
 import pytest
 from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, Flight, Listener, blind, error_m, sigma_m

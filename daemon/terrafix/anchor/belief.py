@@ -159,7 +159,11 @@ class Belief:
         self._resize(max(MIN_HALF_CELLS, at_least_half_m / self.cell_m, spread))
 
     def set_cell(self, cell_m: float) -> None:
-        """Another resolution, when the height has changed much."""
+        """Another resolution, when the height has changed much; as fine as so wide a window can have."""
+        while self.half_m / cell_m > MAX_HALF_CELLS:
+            cell_m *= 2.0
+        if cell_m == self.cell_m:
+            return
         scale = self.cell_m / cell_m
         half = int(np.ceil(len(self._mass) // 2 * scale))
         e_m, n_m = self.centre

@@ -17,13 +17,13 @@ from terrafix.estimator.motion import EFFECTIVE_PAIRS, Ground
 from terrafix.estimator.velocity import V_SIZE, Leg
 
 BIAS_SIZE = 5
-LENS = 4  # of B
+HEIGHT, LENS = 3, 4  # of B
 BLOCK_HUBER_K = 1.5
 # 1-sigma of the first radial coefficient, less what the description of the lens says: 0.005 after a calibration, 0.03
 # where its maker's focal length is all that is known. What it bends is alike in every frame and looks like a tilt that
 # grows with the way, so it is learnt in flight. The higher coefficients are noise, as large as this of the first.
 LENS_SIGMA, LENS_REST = 0.02, 0.0015
-REDUCED = 12  # residuals of a pair of cameras above a plane, after the reduction
+REDUCED = 11  # residuals of a pair of cameras above a plane, after the reduction
 
 
 def tilted(x_rad: float, y_rad: float) -> np.ndarray:
@@ -119,18 +119,22 @@ def same_ground_factor(
     pairs: np.ndarray,
     sigma: float,
     ground: Ground,
+    keyframe_bias_key: int | None = None,
 ) -> gtsam.CustomFactor:
     """``pairs`` (N, 4) normalised with the 1-sigma ``sigma`` of a coordinate. The plane below the keyframe is not known
     exactly: what its height and slope leave open is in the noise of the factor.
 
-    Two cameras above a plane are ten numbers: one in the other, the keyframe's tilt against the plane, and its height;
-    what the lens bends is one more. In these the residuals of all pairs are linear enough to be reduced by QR, here, to
-    twelve that have the same norm (the last is what nothing explains). Where north is and where the cameras are does
-    not enter, so that a heading or a position that is corrected later does no harm."""
+    Two cameras above a plane are nine numbers: one in the other, its way in units of the keyframe's height, and the
+    keyframe's tilt against the plane; what the lens bends is one more. In these the residuals of all pairs are linear
+    enough to be reduced by QR, here, to eleven that have the same norm (the last is what nothing explains). Where north
+    is and where the cameras are does not enter, so that a heading or a position that is corrected later does no harm.
+    With a way in metres what the pairs leave unexplained would weigh less the lower the camera is, and pull it down.
+
+    ``keyframe_bias_key``: of B of the keyframe, where heights are above ground that no map tells (``leg_factor``)."""
     normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
     p = keyframe.translation()
     offset = float(p[2]) - ground.height_m - ground.slope_e * float(p[0]) - ground.slope_n * float(p[1])
-    seen, tilt, height, lens = _reduced(keyframe, pose, pairs, sigma, ground, normal, offset)
+    seen, tilt, lens = _reduced(keyframe, pose, pairs, sigma, ground, normal, offset)
     by_bias = np.zeros((REDUCED, BIAS_SIZE), order="F")
     by_bias[:, LENS] = lens
     at_first = keyframe.between(pose)
@@ -140,7 +144,16 @@ def same_ground_factor(
 
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
         c0, c1 = values.atPose3(keyframe_key), values.atPose3(pose_key)
-        r0, step = c0.rotation().matrix(), c0.between(c1)
+        bias, r0 = values.atVector(bias_key), c0.rotation().matrix()
+        if keyframe_bias_key is not None:
+            risen_m = float(bias[HEIGHT] - values.atVector(keyframe_bias_key)[HEIGHT])
+            c1 = gtsam.Pose3(c1.rotation(), c1.translation() + np.array([0.0, 0.0, risen_m]))
+        # The plane was fitted to the ground at one place and lies as high wherever the camera turns out to be: on its
+        # slope a camera that is lost by a hillside would seem to read its position from its height.
+        height_m = max(ground.height_m + float(c0.translation()[2] - p[2]), 1.0)
+        unit = ground.height_m / height_m
+        way = c0.between(c1)
+        step = gtsam.Pose3(way.rotation(), unit * way.translation())
         up = r0.T @ normal
         # Small rotations w of the keyframe change up by up x w: turned back into w, without the part about up itself.
         back = np.array(
@@ -151,24 +164,27 @@ def same_ground_factor(
             ]
         )
         by_step = seen[:, :6]
-        # The plane was fitted to the ground at one place and lies as high wherever the camera turns out to be: on its
-        # slope a camera that is lost by a hillside would seem to read its position from its height.
-        risen = float(c0.translation()[2] - p[2])
-        bent = float(values.atVector(bias_key)[LENS])
-        residual = seen[:, 6] + by_step @ at_first.logmap(step) + tilt @ back + height * risen + lens * bent
+        residual = seen[:, 6] + by_step @ at_first.logmap(step) + tilt @ back + lens * bias[LENS]
         if jacobians is not None:
-            by_c0 = -by_step @ step.inverse().AdjointMap()
+            by_way = np.hstack([by_step[:, :3], unit * by_step[:, 3:]])
+            by_c0 = -by_way @ way.inverse().AdjointMap()
             by_c0[:, :3] += turned
-            by_c0[:, 3:] += np.outer(height, r0[2])
+            by_height = by_way[:, 3:] @ way.rotation().matrix().T @ way.translation() / -height_m
+            by_c0[:, 3:] += np.outer(by_height, r0[2])
             jacobians[0] = np.asfortranarray(by_c0)
-            jacobians[1] = np.asfortranarray(by_step)
+            jacobians[1] = np.asfortranarray(by_way)
             jacobians[2] = by_bias
+            if keyframe_bias_key is not None:
+                by_rise = np.zeros_like(by_bias)
+                by_rise[:, HEIGHT] = by_way[:, 3:] @ c1.rotation().matrix()[2]
+                jacobians[2], jacobians[3] = np.asfortranarray(by_bias + by_rise), np.asfortranarray(-by_rise)
         return np.asarray(residual)
 
     # Huber on the whole block: its whitened norm is about sqrt(2 * EFFECTIVE_PAIRS) when all is well.
     huber = gtsam.noiseModel.mEstimator.Huber.Create(BLOCK_HUBER_K * float(np.sqrt(2 * EFFECTIVE_PAIRS)))
     noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(REDUCED))
-    return gtsam.CustomFactor(noise, [keyframe_key, pose_key, bias_key], error)
+    keys = [keyframe_key, pose_key, bias_key]
+    return gtsam.CustomFactor(noise, keys if keyframe_bias_key is None else [*keys, keyframe_bias_key], error)
 
 
 def _reduced(
@@ -179,26 +195,24 @@ def _reduced(
     ground: Ground,
     normal: np.ndarray,
     offset: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Whitened residuals, REDUCED of them: by the step and constant (R, 7), by the tilt (R, 3), by the height (R,), by
-    the radial coefficient (R,)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whitened residuals, REDUCED of them: by the step and constant (R, 7), by the tilt (R, 3), by the radial
+    coefficient (R,)."""
     residual, by_keyframe, by_pose, points, by_height = same_ground_residual(keyframe, pose, pairs, normal, offset)
     # The keyframe alone, while the other camera keeps its place in it.
     by_both = by_keyframe + by_pose @ keyframe.between(pose).inverse().AdjointMap()
-    by_up = by_both[:, 3:] @ keyframe.rotation().matrix()[2]
     by_lens = _by_lens(keyframe, pairs, residual, by_keyframe, points)
-    full = np.column_stack([by_pose, by_both[:, :3], by_up, by_lens, residual]) / sigma
+    full = np.column_stack([by_pose, by_both[:, :3], by_lens, residual]) / sigma
     away = np.repeat(points[:, :2] - keyframe.translation()[:2], 2, axis=0)
     by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
     by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
-    risen = by_pose[:, 3:] @ pose.rotation().matrix()[2] * (ground.rise_sigma_m / sigma)
-    by_plane = np.column_stack([by_plane, risen, LENS_REST / sigma * by_lens])
-    # (1 + P P^T)^(-1/2), where only five directions of the noise are not white: from the eigenvalues of P^T P.
+    by_plane = np.column_stack([by_plane, LENS_REST / sigma * by_lens])
+    # (1 + P P^T)^(-1/2), where only four directions of the noise are not white: from the eigenvalues of P^T P.
     s2, v = np.linalg.eigh(by_plane.T @ by_plane)
     root = np.sqrt(1.0 + s2)
     full -= by_plane @ ((v / (root * (1.0 + root))) @ (v.T @ (by_plane.T @ full)))
     r = np.asarray(np.linalg.qr(full, mode="r"))
-    return r[:, [0, 1, 2, 3, 4, 5, 11]], r[:, 6:9], r[:, 9], r[:, 10]
+    return r[:, [0, 1, 2, 3, 4, 5, 10]], r[:, 6:9], r[:, 9]
 
 
 def _by_lens(
@@ -216,8 +230,14 @@ def _by_lens(
     return np.asarray((bent[1] - np.einsum("nij,nj->ni", by_ray, bent[0])).ravel())
 
 
-def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, leg: Leg) -> gtsam.CustomFactor:
-    """``before`` and ``after``: keys of C and V; ``bias_key``: of B at the end, whose heading turns what was felt.
+def leg_factor(
+    before: tuple[int, int], after: tuple[int, int], bias_keys: tuple[int, int], leg: Leg
+) -> gtsam.CustomFactor:
+    """``before`` and ``after``: keys of C and V; ``bias_keys``: of B at both ends. The heading bias at the end turns
+    what was felt.
+
+    Where no map tells the ground (``Leg.lifted``), C is above whatever ground is seen, as if all of it were at one
+    level, and its rise is in the height bias, which the barometer shows: how far the vehicle rose is what both say.
 
     Linear but for the heading, the axes of the poses, and the height that a leg is told in (``Leg.over``)."""
     rows = 3 + V_SIZE
@@ -229,7 +249,8 @@ def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, l
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
         c0, c1 = values.atPose3(before[0]), values.atPose3(after[0])
         v0, v1 = values.atVector(before[1]), values.atVector(after[1])
-        turn = float(values.atVector(bias_key)[2]) if leg.inertial else 0.0
+        b1 = values.atVector(bias_keys[1])
+        turn = float(b1[2]) if leg.inertial else 0.0
         c, s = math.cos(turn), math.sin(turn)
         turned = np.array(
             [
@@ -240,6 +261,8 @@ def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, l
         start = by_before @ v0
         start[:6] -= turned
         start[:3] += c1.translation() - c0.translation()
+        if leg.lifted:
+            start[2] += float(b1[HEIGHT] - values.atVector(bias_keys[0])[HEIGHT])
         unit0, unit1 = 1.0, 1.0  # of what is told in the height at the beginning, and at the end
         if leg.over is not None:
             height_m, ground_m = leg.over
@@ -258,9 +281,14 @@ def leg_factor(before: tuple[int, int], after: tuple[int, int], bias_key: int, l
                 of_start, above = (by_c1, up1) if leg.inertial else (by_c0, up0)
                 of_start[:, 3:] -= np.outer(start, above) * (unit0**2 / leg.over[0])
                 by_c1[3:, 3:] -= np.outer(v1, up1) * (unit1**2 / leg.over[0])
+            if leg.lifted:
+                by_bias[2, HEIGHT] += unit0
+                jacobians[5] = np.zeros((rows, BIAS_SIZE), order="F")
+                jacobians[5][2, HEIGHT] = -unit0
             for i, jacobian in enumerate((by_c0, unit0 * by_before, by_c1, unit1 * by_after, by_bias)):
                 jacobians[i] = np.asfortranarray(jacobian)
         return residual
 
     noise = gtsam.noiseModel.Gaussian.Covariance(leg.cov, False)
-    return gtsam.CustomFactor(noise, [*before, *after, bias_key], error)
+    keys = [*before, *after, bias_keys[1]]
+    return gtsam.CustomFactor(noise, [*keys, bias_keys[0]] if leg.lifted else keys, error)

@@ -136,11 +136,19 @@ class PoseGraph:
             seen, keyframe = motion.seen, self.state(parent).pose
             factors.add(
                 same_ground_factor(
-                    C(parent), C(node), B(node), keyframe, state.pose, seen.pairs, seen.sigma, seen.ground
+                    C(parent),
+                    C(node),
+                    B(node),
+                    keyframe,
+                    state.pose,
+                    seen.pairs,
+                    seen.sigma,
+                    seen.ground,
+                    B(parent) if seen.ground.rise_sigma_m else None,
                 )
             )
         if leg is not None:
-            factors.add(leg_factor((C(newest), V(newest)), (C(node), V(node)), B(node), leg))
+            factors.add(leg_factor((C(newest), V(newest)), (C(node), V(node)), (B(newest), B(node)), leg))
         else:
             standing = gtsam.noiseModel.Gaussian.Covariance(standing_cov())
             factors.add(gtsam.PriorFactorVector(V(node), np.zeros(V_SIZE), standing))

@@ -45,7 +45,6 @@ OPEN_HEIGHT = 0.2  # 1-sigma, share of the height, beyond which nobody knows it;
 FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
-RISE_SHARED = float(np.sqrt(3.0))
 
 Feel = Callable[[int, int], Felt | None]
 
@@ -167,10 +166,12 @@ class Tracker:
             self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
         state = NodeState(pose, before.bias, velocity)
         said = self.camera.factor(self.graph.next_keys(), attitude, r_w_c)
-        rise_m = self._rise_sigma_m(step)
+        rise_m = self.terrain.rise_sigma_m(float(np.hypot(*step)))
         if way is not None:
-            ground_m = self.terrain.below(p)
-            way = way.above(max(float(p[2]) - ground_m, 1.0), ground_m, rise_m)
+            way = replace(way, lifted=not self.terrain.is_told)
+            if known is not None:
+                ground_m = self.terrain.below(p)
+                way = way.above(max(float(p[2]) - ground_m, 1.0), ground_m)
         node = self.graph.extend(t_s, state, parent, motion, way, said, rise_m)
         self._felt = None if way is None else way.inertial
         if not attitude.stands:
@@ -202,12 +203,6 @@ class Tracker:
             same_kind=self._felt is (measured is not None),
             launching=self._launching,
         )
-
-    def _rise_sigma_m(self, way_m: np.ndarray) -> float:
-        """Of the ground over a way (east, north, ...), where nobody tells. Heights are above that ground. The motion
-        that was seen, the leg and the barometer do not know of its rise, all three by the same error: three times the
-        variance for each, so that together they do not know it better than one."""
-        return RISE_SHARED * self.terrain.rise_sigma_m(float(np.hypot(way_m[0], way_m[1])))
 
     def _height_is_open(self, attitude: Attitude, before: NodeState) -> bool:
         """No autopilot and no map match says how high it flies: nobody knows how long the ways are that are seen. Legs
@@ -302,7 +297,8 @@ class Tracker:
         ground = self._ground(p, height, place_cov, share)
         newest = self.graph.state(self.graph.newest)
         onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - self.graph.time_of(self.graph.newest))
-        ground = replace(ground, rise_sigma_m=self._rise_sigma_m(newest.pose.translation() + onward - p))
+        way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
+        ground = replace(ground, rise_sigma_m=self.terrain.rise_sigma_m(way_m))
         motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
         if motion is None:
             return None

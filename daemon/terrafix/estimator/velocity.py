@@ -81,6 +81,7 @@ class Leg:
     cov: np.ndarray
     inertial: bool
     over: tuple[float, float] | None = None
+    lifted: bool = False  # heights are above ground that no map tells, whose rise is in the height bias (factors.py)
 
     def predicted(self, p_m: np.ndarray, v: np.ndarray, heading_bias_rad: float) -> tuple[np.ndarray, np.ndarray]:
         """-> position (3,) and V at the end, from those at the beginning."""
@@ -97,18 +98,15 @@ class Leg:
         by[6:, 3:] = np.diag(self.lasting)
         return by
 
-    def above(self, height_m: float, ground_m: float, rise_sigma_m: float) -> "Leg":
-        """The same with its end at such a height above ground of this AMSL, which rose by this, 1-sigma, on the way.
+    def above(self, height_m: float, ground_m: float) -> "Leg":
+        """The same with its end at such a height above ground of this AMSL, of a camera that sees its way.
 
         A camera measures ways in heights. Told in metres, whatever the camera misjudges weighs the less in a leg the
         lower the flight is believed to be, and it sinks: to the ground where nobody felt the leg, by metres in minutes
         where an IMU did. In units of the height such noise is the same at any. What was felt still tells of metres. A
         leg that nobody felt compares heights a second with heights a second: one that forgets its course would have
-        the vehicle slower at its end, and so nearer to the ground.
-        """
-        cov = self.cov.copy()
-        cov[2, 2] += rise_sigma_m**2
-        return replace(self, cov=cov, over=(height_m, ground_m))
+        the vehicle slower at its end, and so nearer to the ground."""
+        return replace(self, over=(height_m, ground_m))
 
     def without_a_say(self, speed_mps: float, dt_s: float) -> "Leg":
         """The same for a vehicle that may have flown with any speed up to this."""
