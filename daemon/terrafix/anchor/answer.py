@@ -10,18 +10,22 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.messages import MapMatch, Verdict
 
 COARSE_TILT_RAD = np.radians(10.0)  # a coarse fix says nothing of attitude: as good as unknown
-COARSE_HEIGHT_M = 100.0  # ... nor of height
+COARSE_HEIGHT_M = 100.0  # ... nor of height, unless several scales were looked at: the best of these is right to
+COARSE_SCALE = 0.05  # this share of it, their steps (matcher.SCALE_STEP) and their width
 COARSE_SIGMA = 0.03  # of the height: buildings that lean and a scale that is not quite right shift the whole picture
 MODE_DRIFT = 0.35  # of the height: how far the pose may lie from the mode while the tilt is not yet known
 
 
-def coarse(answer: MapMatch, mode: Mode, cell_m: float, view: View) -> MapMatch:
+def coarse(answer: MapMatch, mode: Mode, cell_m: float, view: View, scale: float | None) -> MapMatch:
     """The position of the mode, as a pose factor. What is seen is the place of the ground, so the camera's position
-    goes with its tilt: p_e moves by +h, p_n by -h per radian of rotation about north and east."""
+    goes with its tilt: p_e moves by +h, p_n by -h per radian of rotation about north and east. ``scale``: the best of
+    several, against the height that was predicted."""
+    agl_m = view.agl_m * (scale or 1.0)
+    height_m = COARSE_HEIGHT_M if scale is None else COARSE_SCALE * agl_m
     lever = np.zeros((2, 2))
     lever[0, 1], lever[1, 0] = view.agl_m, -view.agl_m
     tilt = COARSE_TILT_RAD**2 * np.eye(2)
-    cov = np.diag([0.0, 0.0, COARSE_HEIGHT_M**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2])
+    cov = np.diag([0.0, 0.0, height_m**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2, COARSE_TILT_RAD**2])
     sigma2 = mode.var_m2 + cell_m**2 + (COARSE_SIGMA * view.agl_m) ** 2
     cov[:2, :2] = lever @ tilt @ lever.T + sigma2 * np.eye(2)
     cov[:2, 3:5] = lever @ tilt
@@ -30,7 +34,7 @@ def coarse(answer: MapMatch, mode: Mode, cell_m: float, view: View) -> MapMatch:
         answer,
         verdict=Verdict.ACCEPTED,
         coarse=True,
-        p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + view.agl_m),
+        p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + agl_m),
         q_w_c=quat_from_rot(view.r_w_c),
         cov=tuple(float(v) for v in cov.ravel()),
     )

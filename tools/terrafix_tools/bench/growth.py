@@ -139,9 +139,8 @@ def _window(
         values.insert(_velocity(n), all_values.atVector(_velocity(n)))
     first, unit = min(nodes), gtsam.noiseModel.Isotropic.Sigma
     factors.add(gtsam.PriorFactorPose3(_camera(first), values.atPose3(_camera(first)), unit(6, 1.0)))
-    factors.add(gtsam.PriorFactorVector(_bias(first), values.atVector(_bias(first)), unit(4, 1.0)))
-    speed = values.atVector(_velocity(first))
-    factors.add(gtsam.PriorFactorVector(_velocity(first), speed, unit(len(speed), 1.0)))
+    for key in (_bias(first), _velocity(first)):
+        factors.add(gtsam.PriorFactorVector(key, values.atVector(key), unit(len(values.atVector(key)), 1.0)))
     return factors, values
 
 
