@@ -75,7 +75,7 @@ class MapMatches:
         answer = judged(answer, self._fix(shot, good, view), view)
         if answer.verdict is Verdict.ACCEPTED or score < COARSE_SCORE:
             return answer
-        return coarse(answer, mode, cell_for(agl_m, 0.0), view)
+        return coarse(answer, mode, cell_for(agl_m, 0.0), view, None)
 
     def _fix(self, shot: Shot, good: float, view: View) -> Fix:
         xy, points = self._patches(shot, good)
