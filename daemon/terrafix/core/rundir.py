@@ -50,9 +50,14 @@ class RunDir:
         """The first one counts."""
         file = self.path / "epoch_ns"
         if not file.exists():
-            fresh = file.with_suffix(".new")
-            fresh.write_text(str(t_ns))
-            fresh.replace(file)  # whole or not at all, also when this process is killed right now
+            write_whole(file, str(t_ns).encode())
+
+
+def write_whole(file: Path, data: bytes) -> None:
+    """Whole or not at all, also when this process is killed right now."""
+    fresh = file.with_suffix(".new")
+    fresh.write_bytes(data)
+    fresh.replace(file)
 
 
 class OwnedRunDir:

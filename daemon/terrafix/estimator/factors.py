@@ -51,14 +51,14 @@ def attitude_and_height_residual(
     heading = local_rotation_up(float(bias[2]))  # a positive bias reads too far clockwise: turn it back
     expected = heading @ r_w_b @ r_b_c @ tilted(float(bias[0]), float(bias[1]))
     rotation_w = log_so3(r_w_c @ expected.T)
-    height = float(pose.translation()[2]) - (up_m - bias[3])
+    height = float(pose.translation()[2]) - (up_m - bias[HEIGHT])
     by_pose = np.zeros((4, 6))
     by_pose[:3, :3] = r_w_c
     by_pose[3, 3:] = r_w_c[2]
     by_bias = np.zeros((4, BIAS_SIZE))
     by_bias[:3, :2] = -r_w_c[:, :2]
     by_bias[2, 2] = -1.0
-    by_bias[3, 3] = 1.0
+    by_bias[3, HEIGHT] = 1.0
     return np.array([*rotation_w, height]), by_pose, by_bias
 
 

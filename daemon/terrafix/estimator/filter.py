@@ -12,6 +12,7 @@ import numpy as np
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.doubt import Doubt
+from terrafix.estimator.factors import HEIGHT
 from terrafix.estimator.graph import NodeState
 from terrafix.estimator.matched import determined, measured_pose
 from terrafix.estimator.resume import Known
@@ -97,7 +98,7 @@ class Estimator(Tracker):
         self._refused.clear()
         here = measured.translation()[:2]
         if not match.coarse and self.measures_height and not self.terrain.is_told:
-            up_m = self.graph.state(node).pose.translation()[2] + self.graph.state(node).bias[3]  # by the barometer
+            up_m = self.graph.state(node).up_by_barometer_m
             sigma_m = float(np.sqrt(tangent_to_world(cov, r_w_c)[2, 2]))
             self.terrain.ruggedness.measured(here, height, float(up_m - measured.translation()[2]), sigma_m)
         fixed_s = self.graph.time_of(node)
@@ -147,7 +148,7 @@ class Estimator(Tracker):
         cov[3:, 3:] += np.hypot(STEP_SHARE * way_m, velocity_sigma * (now_s - fixed_s)) ** 2 * np.eye(3)
         bias = now.bias.copy()
         if match.found:  # the ground there lies at another height than the one that was assumed
-            bias[3] -= float(measured.translation()[2] - was.pose.translation()[2])
+            bias[HEIGHT] -= float(measured.translation()[2] - was.pose.translation()[2])
         bias_cov = self.graph.bias_covariance(self.graph.newest)
         self._velocity_cov = RESTART_INFLATION * self.graph.velocity_covariance(self.graph.newest)
         self.graph.start(

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
-from terrafix.estimator.factors import BIAS_SIZE, LENS_SIGMA, leg_factor, same_ground_factor
+from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA, leg_factor, same_ground_factor
 from terrafix.estimator.lag import FixedLag
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.past import Past
@@ -34,6 +34,11 @@ class NodeState:
     pose: gtsam.Pose3
     bias: np.ndarray  # (5,) B_k
     velocity: np.ndarray  # (8,) V_k
+
+    @property
+    def up_by_barometer_m(self) -> float:
+        """AMSL, where no map tells the ground and C is above whatever ground is seen (``leg_factor``)."""
+        return float(self.pose.translation()[2] + self.bias[HEIGHT])
 
 
 class PoseGraph:
@@ -156,7 +161,7 @@ class PoseGraph:
         turned = state.pose.rotation().compose(self.state(newest).pose.rotation().inverse())
         sigmas[2] = np.hypot(sigmas[2], COMPASS_BY_TURN_RAD * np.sqrt(abs(gtsam.Rot3.Logmap(turned)[2])))
         climbed_m = float(state.pose.translation()[2] - self.state(newest).pose.translation()[2])
-        sigmas[3] = np.linalg.norm([sigmas[3], HEIGHT_BY_CLIMB * climbed_m, rise_sigma_m])
+        sigmas[HEIGHT] = np.linalg.norm([sigmas[HEIGHT], HEIGHT_BY_CLIMB * climbed_m, rise_sigma_m])
         walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(BIAS_SIZE), walk))
         if attitude is not None:

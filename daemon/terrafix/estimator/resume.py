@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.rundir import write_whole
 from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.velocity import MAX_SPEED_SIGMA_MPS, TYPICAL_SPEED_MPS, leg
 from terrafix.messages import Message, NavEstimate, Origin
@@ -60,9 +61,7 @@ class Keeper:
     def heard(self, message: Message) -> None:
         if isinstance(message, NavEstimate) and message.t_ns - self._kept_ns >= KEPT_EVERY_NS:
             self._kept_ns = message.t_ns
-            fresh = self._file.with_suffix(".new")
-            fresh.write_bytes(msgspec.msgpack.encode(message))
-            fresh.replace(self._file)  # whole or not at all, also when this process is killed right now
+            write_whole(self._file, msgspec.msgpack.encode(message))
 
     def close(self) -> None:
         pass

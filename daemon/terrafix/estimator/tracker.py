@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.pose import tangent_to_world, world_to_tangent
-from terrafix.estimator.factors import BIAS_SIZE, LENS_SIGMA
+from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA
 from terrafix.estimator.graph import HEIGHT_BY_CLIMB, WALK_SIGMAS, NodeState, PoseGraph
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.mounted import (
@@ -117,11 +117,10 @@ class Tracker:
     def amsl(self, placed: Placed) -> tuple[float, float]:
         """Of the camera, and the 1-sigma by which the barometer may be off, 0 where it is not needed: without a DEM
         the graph has the height above whatever ground it sees, and the barometer how high that lies."""
-        up_m = float(placed.pose.translation()[2])
         if self.terrain.is_told or not self.measures_height:
-            return up_m, 0.0
-        up_m += float(self.graph.state(placed.node).bias[3])
-        drift_m = WALK_SIGMAS[3] * np.sqrt(placed.t_s - self._first_s)
+            return float(placed.pose.translation()[2]), 0.0
+        up_m = self.graph.state(placed.node).up_by_barometer_m
+        drift_m = WALK_SIGMAS[HEIGHT] * np.sqrt(placed.t_s - self._first_s)
         climb_m = HEIGHT_BY_CLIMB * (up_m - (self.origin.ground_amsl_m or 0.0))
         return up_m, float(np.linalg.norm([self.origin.agl_sigma_m, drift_m, climb_m]))
 

@@ -1,5 +1,6 @@
 """The flight that scenarios are made of: where its frames are, when they were taken, and the truth."""
 
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -53,11 +54,9 @@ class Flight:
 
     def picture(self, number: int) -> Image:
         """Of this frame, or of the first one after it that can be read."""
-        source = open_source(self.source)
-        shots = source.shots(from_s=self.stops[number].t_s)
-        image = next(shot.image for shot in shots if shot.image is not None)
-        source.close()
-        return image
+        with closing(open_source(self.source)) as source:
+            shots = source.shots(from_s=self.stops[number].t_s)
+            return next(shot.image for shot in shots if shot.image is not None)
 
 
 def open_flight(source: str, map_path: Path | None, dem: Path | None, truth: Path, frames: int | None) -> Flight:
