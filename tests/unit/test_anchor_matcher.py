@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.belief import Belief
-from terrafix.anchor.matcher import MAX_HYPOTHESES, FrameMatcher, Hypothesis, View, _hypotheses
+from terrafix.anchor.belief import Belief, Surface
+from terrafix.anchor.matcher import MAX_HYPOTHESES, FrameMatcher, Hypothesis, Look, View, _hypotheses
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Verdict
@@ -139,6 +139,33 @@ def test_a_wrong_place_gives_no_pose(matcher: FrameMatcher, frame: np.ndarray) -
         fix = matcher.fix(frame, seen_from(), Hypothesis(0.0, 1.0), e_m, n_m)
         accepted += fix is not None and fix.pnp.verdict is Verdict.ACCEPTED
     assert accepted == 0
+
+
+def scales_scored(**z: float) -> Look:
+    """A look at scales of 0.92, 1 and 1.08 that fit as well as this at every position."""
+    scored = {"small": 0.92, "same": 1.0, "large": 1.08}
+    surfaces = tuple(Surface(np.full((5, 5), z[name], np.float32), -4.0, 4.0, 2.0) for name in scored)
+    hypotheses = tuple(Hypothesis(0.0, scale) for scale in scored.values())
+    return Look(Verdict.ACCEPTED, surfaces, hypotheses, 100.0, 2.0)
+
+
+def test_the_scale_that_fits_is_told_as_well_as_the_others_fit_worse() -> None:
+    sharp, leaning = scales_scored(small=2.0, same=5.0, large=2.0), scales_scored(small=3.0, same=5.0, large=4.9)
+    mean, variance = sharp.scale_at(0.0, 0.0) or (0.0, 0.0)
+    assert mean == pytest.approx(1.0, abs=1e-3) and np.sqrt(variance) < 0.03  # a third of a step: it lies within half
+    mean, less_sure = leaning.scale_at(0.0, 0.0) or (0.0, 0.0)
+    assert 1.02 < mean < 1.04 and less_sure > 2.0 * variance
+
+
+def test_scales_that_all_fit_alike_tell_next_to_nothing() -> None:
+    """It is the prediction that chose them: taken for a measurement it would confirm itself look after look."""
+    told = scales_scored(small=4.99, same=5.0, large=4.99).scale_at(0.0, 0.0)
+    assert told is None or np.sqrt(told[1]) > 0.5
+
+
+def test_a_scale_at_the_end_of_those_that_were_tried_is_not_told() -> None:
+    assert scales_scored(small=3.0, same=4.0, large=5.0).scale_at(0.0, 0.0) is None
+    assert scales_scored(small=5.0, same=4.0, large=3.0).scale_at(0.0, 0.0) is None
 
 
 def test_twice_the_same(matcher: FrameMatcher, frame: np.ndarray) -> None:

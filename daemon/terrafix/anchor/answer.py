@@ -10,18 +10,20 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.messages import MapMatch, Verdict
 
 COARSE_TILT_RAD = np.radians(10.0)  # a coarse fix says nothing of attitude: as good as unknown
-COARSE_HEIGHT_M = 100.0  # ... nor of height, unless several scales were looked at: the best of these is right to
-COARSE_SCALE = 0.05  # this share of it, their steps (matcher.SCALE_STEP) and their width
+COARSE_HEIGHT_M = 100.0  # ... nor of height, unless several scales were looked at, and one between them fits best
+COARSE_SCALE = 0.05  # ... to this share of it, and what they leave open: what is seen lies above the ground, or below
 COARSE_SIGMA = 0.03  # of the height: buildings that lean and a scale that is not quite right shift the whole picture
 MODE_DRIFT = 0.35  # of the height: how far the pose may lie from the mode while the tilt is not yet known
 
 
-def coarse(answer: MapMatch, mode: Mode, cell_m: float, view: View, scale: float | None) -> MapMatch:
+def coarse(answer: MapMatch, mode: Mode, cell_m: float, view: View, scale: tuple[float, float] | None) -> MapMatch:
     """The position of the mode, as a pose factor. What is seen is the place of the ground, so the camera's position
-    goes with its tilt: p_e moves by +h, p_n by -h per radian of rotation about north and east. ``scale``: the best of
-    several, against the height that was predicted."""
-    agl_m = view.agl_m * (scale or 1.0)
-    height_m = COARSE_HEIGHT_M if scale is None else COARSE_SCALE * agl_m
+    goes with its tilt: p_e moves by +h, p_n by -h per radian of rotation about north and east. ``scale``: of the height
+    that was predicted, and its variance."""
+    agl_m, height_m = view.agl_m, COARSE_HEIGHT_M
+    if scale is not None:
+        agl_m *= scale[0]
+        height_m = float(np.hypot(COARSE_SCALE, np.sqrt(scale[1]))) * agl_m
     lever = np.zeros((2, 2))
     lever[0, 1], lever[1, 0] = view.agl_m, -view.agl_m
     tilt = COARSE_TILT_RAD**2 * np.eye(2)

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from terrafix.anchor.belief import Surface
+from terrafix.anchor.belief import LLR_SLOPE, Surface
 from terrafix.anchor.correlate import Searchable, standardise
 from terrafix.anchor.map_features import CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.map_package import LocalMap
@@ -87,6 +87,24 @@ class Look:
         scores = [s.at(e_m, n_m, 2.0 * self.cell_m) for s in self.surfaces]
         best = int(np.argmax(scores))
         return self.hypotheses[best], scores[best]
+
+    def scale_at(self, e_m: float, n_m: float) -> tuple[float, float] | None:
+        """Scale of the height that fits at a camera position and the variance of this measurement, by how likely those
+        are that were tried. None: they tell nothing, or the best is the first or the last: it may lie beyond them."""
+        z: dict[float, float] = {}
+        for surface, hypothesis in zip(self.surfaces, self.hypotheses, strict=True):
+            z[hypothesis.scale] = max(z.get(hypothesis.scale, -np.inf), surface.at(e_m, n_m, 2.0 * self.cell_m))
+        scales = np.array(sorted(z))
+        scores = np.array([z[s] for s in scales])
+        if int(np.argmax(scores)) in (0, len(scales) - 1):
+            return None
+        likelihood = np.exp(LLR_SLOPE * (scores - scores.max()))
+        likelihood /= likelihood.sum()
+        mean = float(likelihood @ scales)
+        # Less what "one of those that were tried" says already: the prediction chose them.
+        told = 1.0 / float(likelihood @ (scales - mean) ** 2 + SCALE_STEP**2 / 12)
+        told -= 1.0 / float(np.var(scales) + SCALE_STEP**2 / 12)
+        return (mean, 1.0 / told) if told > 0.0 else None
 
 
 @dataclass(frozen=True)

@@ -207,8 +207,9 @@ class AnchorNode:
             return msgspec.structs.replace(answer, verdict=enough, mode_mass=mass)
         if mode.mass < MODE_MASS:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
-        scale = hypothesis.scale if len({h.scale for h in look.hypotheses}) > 1 else None
-        return coarse(answer, mode, belief.cell_m, view, scale) if score >= COARSE_SCORE else answer
+        if score < COARSE_SCORE:
+            return answer
+        return coarse(answer, mode, belief.cell_m, view, look.scale_at(mode.e_m, mode.n_m))
 
     def _moved(self, prediction: Prediction, source: LocalMap, matcher: FrameMatcher, origin: Origin) -> Belief:
         cell_m = cell_for(prediction.agl_m, matcher.look_cell_m(prediction.agl_m))

@@ -1,6 +1,6 @@
 """Camera pose from 2D-3D matches with the map: IPPE inside RANSAC, then robust refinement (ON-1)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -69,7 +69,16 @@ def solve(
     tilt = np.asarray(log_so3(r_w_c.T @ fit.r_w_c))[:2]
     if float(np.linalg.norm(tilt)) > MAX_TILT_CHANGE_RAD:
         return PnpResult(Verdict.DEGENERATE, None, inlier)
-    return PnpResult(Verdict.ACCEPTED, fit, inlier)
+    return PnpResult(Verdict.ACCEPTED, replace(fit, cov=fit.cov * _by_chance(n, int(inlier.sum()), chance)), inlier)
+
+
+def _by_chance(matches: int, inliers: int, chance: float) -> float:
+    """Factor on the covariance for inliers that are none: of the wrong matches a share of ``chance`` agrees with any
+    pose. They say nothing of it, and it leans to where there are most of them: over a background of wrong ones a
+    truncated mean of n has the variance that the right ones alone would give, times n over these (Huber 1981, "Robust
+    statistics", section 3.2: E psi^2 over (E psi')^2; the background adds to the first and takes from the second)."""
+    wrong = (matches - inliers) / (1.0 - chance) * chance
+    return float(inliers / max(inliers - wrong, 1.0)) ** 2
 
 
 def _refine(
