@@ -123,7 +123,7 @@ class MapPackage:
         tile = self.tiles.tile((found.table, level.zoom, column_px // TILE_PX, row_px // TILE_PX))
         if tile is None:
             return False
-        return bool(tile[0][row_px % TILE_PX, column_px % TILE_PX, 3])
+        return tile[1] or bool(tile[0][row_px % TILE_PX, column_px % TILE_PX, 3])
 
     def bind(self, frame: LocalFrame, layer: str | None = None) -> "LocalMap":
         """The same map in the metres of a local frame, windows of ``layer`` unless they name one; None: the newest.

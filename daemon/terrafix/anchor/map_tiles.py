@@ -19,11 +19,12 @@ from terrafix.anchor.map_format import (
     tile_sha256,
 )
 
-CACHE_BYTES = 100_000_000  # decoded tiles; about 380, a window of 1 km at 0.5 m/px needs about 80, at 0.3 m/px 200
+CACHE_BYTES = 100_000_000  # decoded tiles; about 500, a window of 1 km at 0.5 m/px needs 80, at 0.24 m/px 320
 VOID_BYTES = 100  # what a void costs in the cache, so that a walk through nothing is bounded too
 
 Key = tuple[str, int, int, int]  # table, zoom, column, row
 Tile = tuple[np.ndarray, bool]  # pixels; whether all of them are valid
+Part = tuple[slice, slice]  # rows and columns
 
 
 class TileStore:
@@ -37,7 +38,8 @@ class TileStore:
         self._cached_bytes = 0
 
     def tile(self, key: Key) -> Tile | None:
-        """(256, 256, 4) uint8 BGR and mask of 0 and 255, and whether the mask is 255 everywhere; None = nothing there.
+        """(256, 256, 3) uint8 BGR and True when all is valid, else (256, 256, 4) with a mask of 0 and 255 and False.
+        None: nothing there.
 
         Of the elevation table: (256, 256) float32 metres AMSL, NaN = void; of a table of descriptors: (height, width)
         uint8 as stored (``map_format.DescriptorTable``)."""
@@ -67,9 +69,8 @@ class TileStore:
                     image[rows, columns] = 0
                     whole = False
                 else:
-                    image[rows, columns] = tile[0][
-                        rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
-                    ]
+                    across = slice(columns.start - left, columns.stop - left)
+                    put_picture(tile, (slice(rows.start - top, rows.stop - top), across), image[rows, columns])
                     whole &= tile[1]
         return image, whole
 
@@ -144,17 +145,38 @@ class TileStore:
         data, scale, offset = stored
         if key[0] == ELEVATION_TABLE and self._first_format:
             return _heights(map_format1.heights(data))
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        assert image is not None, f"tile {key} has its sha256 and does not decode"
         if scale is not None and offset is not None:
+            image = _decoded(data)
             assert image.shape == (DEM_TILE_PX, DEM_TILE_PX) and image.dtype == np.uint16
             return _heights(np.where(image == DEM_NULL, np.nan, image * scale + offset).astype(np.float32))
-        if image.ndim == 2:
-            return image, True
-        if image.shape[2] == 4:
-            image[:, :, 3] = np.where(image[:, :, 3] > 0, 255, 0)
-            return image, bool((image[:, :, 3] == 255).all())
-        return cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), True
+        return picture_of(data)
+
+
+def picture_of(data: bytes) -> Tile:
+    """Pixels of a whole tile of imagery or descriptors, as ``TileStore.tile``."""
+    image = _decoded(data)
+    if image.ndim == 2:
+        return image, True
+    if image.shape[2] == 4:
+        image[:, :, 3] = np.where(image[:, :, 3] > 0, 255, 0)
+        whole = bool((image[:, :, 3] == 255).all())
+        return (np.ascontiguousarray(image[:, :, :3]), True) if whole else (image, False)
+    return image, True
+
+
+def put_picture(tile: Tile, part: Part, out: np.ndarray) -> None:
+    """Copies a part of a tile of imagery into ``out`` (h, w, 4)."""
+    pixels, whole = tile
+    if whole:
+        cv2.cvtColor(pixels[part], cv2.COLOR_BGR2BGRA, dst=out)
+    else:
+        out[:] = pixels[part]
+
+
+def _decoded(data: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None, "a tile has its sha256 and does not decode"
+    return image
 
 
 def _heights(height_m: np.ndarray) -> Tile:

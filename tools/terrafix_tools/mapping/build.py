@@ -26,7 +26,7 @@ from terrafix_tools.mapping.descriptors import write_descriptors
 from terrafix_tools.mapping.descriptors_kind import Descriptors
 from terrafix_tools.mapping.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
-from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Cluster, Piece, render_pieces
+from terrafix_tools.mapping.parallel import CHUNKS_PER_WORKER, GDAL_CACHE_MB, Crew, Piece, Processes, render_pieces
 from terrafix_tools.mapping.progress import Bar, progress_bar
 from terrafix_tools.mapping.pyramid import BUILT_WITH, Pyramid, levels_of, open_renderer
 from terrafix_tools.mapping.source import ImagerySource
@@ -78,14 +78,14 @@ def build_package(
     vectors: VectorInput | None = None,
     descriptors: Descriptors = Descriptors.WEIGHTS_FREE,
     workers: int = 1,
-    cluster: Cluster | None = None,
+    cluster: Crew | None = None,
     progress: bool = False,
 ) -> Path:
-    """Writes the package `out`. ``workers``: processes that read and encode imagery and elevation; ``cluster``: other
-    computers that do so in their place. Neither changes a byte.
+    """Writes the package `out`. ``workers``: processes that read and encode imagery and elevation and describe the
+    imagery; ``cluster``: other computers that do so in their place. Neither changes a byte.
 
     The same input gives the same bytes. Nothing is left at `out` or beside it when this fails or is interrupted.
-    With several workers this must be called from a program that may be imported again (``multiprocessing`` spawn).
+    With several workers this must be called from a program that may be imported again (``multiprocessing`` forkserver).
     Raises MapError (something that goes in is unusable), UsageError and OutputError."""
     for layer in layers:
         check_date(layer.date)
@@ -97,9 +97,10 @@ def build_package(
             out.parent.mkdir(parents=True, exist_ok=True)
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.")))
             bar = stack.enter_context(progress_bar(progress))
+            crew = cluster or stack.enter_context(Processes(workers))
             part = scratch / "part.gpkg"
             with new_package(part) as (writer, db):
-                one = _Build(writer, db, scratch, out.stem, descriptors, workers, cluster, bar)
+                one = _Build(writer, db, scratch, out.stem, descriptors, crew, bar)
                 one.write(ordered, elevation, vectors)
             with part.open("rb") as file:
                 os.fsync(file.fileno())
@@ -151,13 +152,11 @@ class _Build:
         scratch: Path,
         name: str,
         descriptors: Descriptors,
-        workers: int,
-        cluster: Cluster | None,
+        crew: Crew,
         bar: Bar,
     ) -> None:
         self._writer, self._db, self._scratch, self._name = writer, db, scratch.absolute(), name
-        self._descriptors = descriptors
-        self._workers, self._cluster, self._bar = workers, cluster, bar
+        self._descriptors, self._crew, self._bar = descriptors, crew, bar
 
     def write(self, layers: list[LayerInput], elevation: ElevationInput | None, vectors: VectorInput | None) -> None:
         written: list[Layer] = []
@@ -192,14 +191,15 @@ class _Build:
             tiles=0,
         )
         self._writer.add_imagery_table(layer, self._name)
+        pyramid = Pyramid(source, levels, table, self._writer)
+        places = pyramid.places()
+        self._crew.get_ready(len(places), CHUNKS_PER_WORKER)
         collar_file = self._scratch / f"{table}-collar.tif"
         collar = None if source.has_mask else find_collar(source, collar_file, self._bar)
         if collar:
             collar.close()
         opener = partial(open_renderer, given.open, collar_file if collar else None, levels[-1].zoom)
-        pyramid = Pyramid(source, levels, table, self._writer)
-        places = pyramid.places()
-        rendered = render_pieces(opener, places, self._workers, self._cluster)
+        rendered = render_pieces(opener, places, len(places), self._crew)
         with contextlib.closing(_counted(rendered, self._bar(table, len(places)))) as chunks:
             if not pyramid.write(chunks):
                 raise MapError(f"{given.where or given.source}: no valid pixel in the whole image")
@@ -207,17 +207,15 @@ class _Build:
         if self._descriptors is Descriptors.WEIGHTS_FREE:
             finest = levels[-1]
             unit_m = source.gsd_m / math.sqrt(finest.pixel_x * finest.pixel_y)
-            described = write_descriptors(self._writer, self._db, layer, unit_m, self._bar)
+            described = write_descriptors(self._writer, self._db, layer, unit_m, self._crew, self._bar)
         return msgspec.structs.replace(layer, tiles=self._writer.tiles[table], descriptors=described)
 
     def _elevation(self, given: ElevationInput, source: Imagery) -> DemGrid:
         with given.open(source.crs, source.bounds) as elevation:  # says what is wrong with it
             grid = elevation.grid
         places = height_places(grid)
-        # A small one is not worth a cluster, whose computers would have to have its file.
-        cluster = self._cluster if len(places) >= TILES_PER_WORKER else None
         opener = partial(open_heights, given.open, source.crs, source.bounds)
-        tiles = render_pieces(opener, places, self._workers, cluster, per_worker=TILES_PER_WORKER)
+        tiles = render_pieces(opener, places, len(places), self._crew, per_worker=TILES_PER_WORKER)
         with contextlib.closing(_counted(tiles, self._bar("elevation", len(places)))) as counted:
             return write_elevation(self._writer, given, grid, source.crs, counted)
 

@@ -20,8 +20,8 @@ from distributed import CancelledError, Client, Future, KilledWorker
 from distributed.comm.core import CommClosedError
 
 from terrafix.core.errors import MapError, UsageError
-from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Hands, OpenRenderer, Pending, Piece, Renderer
-from terrafix_tools.mapping.pyramid import BUILT_WITH, Place
+from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Hands, OpenRenderer, Pending, Piece, Renderer, Wanted
+from terrafix_tools.mapping.pyramid import BUILT_WITH
 
 CONNECT_S = 10.0  # a scheduler that is there answers in less
 WORKERS_S = 60.0  # without any worker for so long: nobody will come
@@ -58,9 +58,16 @@ class DaskCluster:
     def __exit__(self, *_: object) -> None:
         self._client.close()
 
+    def worth(self, pieces: int, per_worker: int) -> bool:
+        """As ``parallel.Crew.worth``: what is small is not worth that other computers must have its file."""
+        return pieces >= per_worker
+
+    def get_ready(self, pieces: int, per_worker: int) -> None:
+        """As ``parallel.Crew.get_ready``."""
+
     @contextlib.contextmanager
-    def hands(self, open_renderer: OpenRenderer[Piece]) -> Iterator[Hands[Piece]]:
-        """As ``parallel.Cluster``. Raises MapError: workers that die or are unfit, or the scheduler is lost."""
+    def hands(self, open_renderer: OpenRenderer[Wanted, Piece]) -> Iterator[Hands[Wanted, Piece]]:
+        """As ``parallel.Crew.hands``. Raises MapError: workers that die or are unfit, or the scheduler is lost."""
         table = uuid.uuid4().hex
         try:
             yield _Remote(self._client, self._address, table, open_renderer)
@@ -79,17 +86,19 @@ class DaskCluster:
             ) from None
 
 
-class _Remote(Generic[Piece]):
+class _Remote(Generic[Wanted, Piece]):
     """Has the contract of ``parallel.Hands``."""
 
-    def __init__(self, client: Client, address: str, table: str, open_renderer: OpenRenderer[Piece]) -> None:
+    def __init__(self, client: Client, address: str, table: str, open_renderer: OpenRenderer[Wanted, Piece]) -> None:
         self._client, self._address, self._table = client, address, table
+        self._submitted = 0
         # A task, not scattered data: these are lost with the worker that holds them.
         self._open_renderer = client.submit(_same, open_renderer, key=f"terrafix-{table}")
 
-    def submit(self, place: Place) -> Pending[Piece]:
-        key = f"terrafix-{self._table}-{place[0]}-{place[1]}"
-        task = self._client.submit(_render, self._table, self._open_renderer, place, _built_with(), key=key)
+    def submit(self, wanted: Wanted) -> Pending[Piece]:
+        self._submitted += 1
+        key = f"terrafix-{self._table}-{self._submitted}"
+        task = self._client.submit(_render, self._table, self._open_renderer, wanted, _built_with(), key=key)
         return _Task(task, self)
 
     def count(self) -> int:
@@ -105,7 +114,7 @@ class _Remote(Generic[Piece]):
 
 
 class _Task(Generic[Piece]):
-    def __init__(self, future: "Future[Piece]", remote: _Remote[Piece]) -> None:
+    def __init__(self, future: "Future[Piece]", remote: _Remote[Any, Piece]) -> None:
         self._future, self._remote = future, remote
 
     def result(self) -> Piece:
@@ -131,14 +140,14 @@ def _built_with() -> str:
 
 
 # What follows runs on the workers. GDAL's datasets belong to one thread; a worker may have several.
-_renderers: dict[int, tuple[str, Renderer[Any]]] = {}  # by thread: table, renderer
+_renderers: dict[int, tuple[str, Renderer[Any, Any]]] = {}  # by thread: table, renderer
 
 
-def _same(open_renderer: OpenRenderer[Piece]) -> OpenRenderer[Piece]:
+def _same(open_renderer: OpenRenderer[Wanted, Piece]) -> OpenRenderer[Wanted, Piece]:
     return open_renderer
 
 
-def _render(table: str, open_renderer: OpenRenderer[Any], place: Place, built_with: str) -> Any:
+def _render(table: str, open_renderer: OpenRenderer[Any, Any], wanted: Any, built_with: str) -> Any:
     thread = threading.get_ident()
     try:
         if _renderers.get(thread, ("",))[0] != table:
@@ -147,7 +156,7 @@ def _render(table: str, open_renderer: OpenRenderer[Any], place: Place, built_wi
             cv2.setNumThreads(1)  # the worker's threads share the cores already
             with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
                 _renderers[thread] = table, open_renderer()
-        return _renderers[thread][1].render(place)
+        return _renderers[thread][1].render(wanted)
     except MapError as error:
         raise MapError(f"worker on {platform.node()}: {error}; workers need the same files at the same paths") from None
 
