@@ -181,6 +181,7 @@ REFUSED = {
     "date.kml": (kml(kml_polygon([[179.9, 10], [-179.9, 10], [-179.9, 10.1], [179.9, 10.1]])), "antimeridian"),
     "not.geojson": ("{", "not valid JSON"),
     "list.geojson": ("[1, 2]", "not GeoJSON"),
+    "deep.geojson": ("[" * 100_000, "not valid JSON"),
     "bare.geojson": ('{"type": "Feature"}', "holds no polygon"),
     "flat.geojson": ('{"type": "Polygon", "coordinates": [[1, 2, 3]]}', "no list of"),
     "topo.geojson": ('{"type": "Topology", "coordinates": []}', "is no area"),

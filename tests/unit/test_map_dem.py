@@ -139,3 +139,14 @@ def test_a_dem_that_breaks_off_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="not an image"):
         build(tif, tmp_path / "m.gpkg", dem=dem)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d.tif", "i.tif"]
+
+
+def test_pictures_and_heights_are_not_taken_for_each_other(tmp_path: Path) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
+    dem = map_rasters.utm(tmp_path / "d.tif", mountains())
+    with pytest.raises(MapError, match=r"i\.tif: has 3 bands, elevation has one"):
+        build(tif, tmp_path / "m.gpkg", dem=tif)
+    for heights in (dem, map_rasters.utm(tmp_path / "e.tif", mountains().astype(np.int16))):
+        with pytest.raises(MapError, match=r"one band of (float32|int16) is elevation"):
+            build(heights, tmp_path / "m.gpkg")
+    assert not (tmp_path / "m.gpkg").exists()

@@ -170,9 +170,10 @@ def test_files_that_are_no_tiles(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"something else that is long enough" * 10)
         with pytest.raises(MapError, match=r"not an? (MBTiles|PMTiles) file"):
             open_tiles(tmp_path / name)
-    (tmp_path / "b.pmtiles").write_bytes(b"")
-    with pytest.raises(MapError, match="not a PMTiles file"):
-        open_tiles(tmp_path / "b.pmtiles")
+    for start in (b"", b"PMTiles\x03" + bytes(60)):
+        (tmp_path / "b.pmtiles").write_bytes(start)
+        with pytest.raises(MapError, match="not a PMTiles file"):
+            open_tiles(tmp_path / "b.pmtiles")
     write_pmtiles(tmp_path / "c.pmtiles")
     data = bytearray((tmp_path / "c.pmtiles").read_bytes())
     data[130:170] = bytes(40)
@@ -184,12 +185,14 @@ def test_files_that_are_no_tiles(tmp_path: Path) -> None:
 def test_a_file_of_empty_tiles_is_named(tmp_path: Path) -> None:
     with contextlib.closing(sqlite3.connect(tmp_path / "a.mbtiles")) as db:
         db.execute("CREATE TABLE tiles (zoom_level INTEGER, tile_column INTEGER, tile_row INTEGER, tile_data BLOB)")
-        db.execute("INSERT INTO tiles VALUES (16, 1, 1, x'')")
-        db.commit()
-    reader = open_tiles(tmp_path / "a.mbtiles")
-    with pytest.raises(MapError, match=r"a\.mbtiles: its tiles are no square pictures"):
-        picture_side(reader.first(16), tmp_path / "a.mbtiles")
-    reader.close()
+        db.execute("INSERT INTO tiles VALUES (16, 1, 1, NULL)")
+        for tile in ("x''", "'text'"):
+            db.execute(f"UPDATE tiles SET tile_data = {tile}")
+            db.commit()
+            reader = open_tiles(tmp_path / "a.mbtiles")
+            with pytest.raises(MapError, match=r"a\.mbtiles: its tiles are no square pictures"):
+                picture_side(reader.first(16), tmp_path / "a.mbtiles")
+            reader.close()
 
 
 def test_a_damaged_tile_in_a_file_is_named(tmp_path: Path) -> None:

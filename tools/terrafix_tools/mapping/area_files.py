@@ -72,7 +72,7 @@ def _read(text: str) -> list[Outline]:
     except FileNotFoundError:
         raise UsageError(f"{path}: no such file; check --area") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: cannot be read as an area ({error})") from None
+        raise UsageError(f"{path}: cannot be read as an area ({error}); save it as text in UTF-8") from None
     outlines = _kml(path, content) if suffix == ".kml" else _geojson(path, content)
     if not outlines:
         raise UsageError(f"{path}: holds no polygon and no line; draw the area as a polygon and save it again")
@@ -131,8 +131,8 @@ def _kml_points(where: str, text: str) -> np.ndarray:
 def _geojson(path: Path, content: str) -> list[Outline]:
     try:
         document = json.loads(content)
-    except json.JSONDecodeError as error:
-        raise UsageError(f"{path}: not valid JSON ({error})") from None
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise UsageError(f"{path}: not valid JSON ({error}); export the area again") from None
     if isinstance(document, dict) and document.get("fileType") == "Plan":
         raise UsageError(f"{path}: a QGroundControl plan; name it .plan, so that it is read as a mission")
     outlines: list[Outline] = []

@@ -42,6 +42,8 @@ class DemSource:
     def __init__(self, path: Path, crs: CRS, bounds: Bounds) -> None:
         self.path = path
         self._file = open_raster(path)
+        if self._file.count >= 3:  # a second band may be alpha
+            raise MapError(f"{path}: has {self._file.count} bands, elevation has one; give a DEM")
         dem_crs = crs_of(self._file, path)
         x_min, y_min, x_max, y_max = bounds
         x_mid, y_mid = (x_min + x_max) / 2, (y_min + y_max) / 2

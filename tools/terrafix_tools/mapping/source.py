@@ -153,6 +153,11 @@ class ImagerySource:
         colours = [i + 1 for i, c in enumerate(names) if c != ColorInterp.alpha]
         if not colours:
             raise MapError(f"{self.path}: has no picture band, only alpha; give an image with 1, 3 or more bands")
+        if len(colours) < 3 and np.dtype(self._file.dtypes[colours[0] - 1]).kind in "if":
+            raise MapError(
+                f"{self.path}: one band of {self._file.dtypes[colours[0] - 1]} is elevation (give it as --dem) or a "
+                "measurement; make a picture of it first: gdal_translate -ot Byte -scale"
+            )
         return colours[:3] if len(colours) >= 3 else colours[:1]
 
     def _find_stretch(self) -> tuple[float, float] | None:

@@ -46,7 +46,7 @@ class MbtilesReader:
             raise MapError(f"{path}: holds no tile; check the source")
 
     def get(self, tile: Tile) -> bytes | None:
-        query = "SELECT tile_data FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
+        query = "SELECT CAST(tile_data AS BLOB) FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
         try:
             found = self._db.execute(query, (tile.zoom, tile.column, flipped(tile.zoom, tile.row))).fetchone()
         except sqlite3.DatabaseError as error:
@@ -55,8 +55,11 @@ class MbtilesReader:
 
     def first(self, zoom: int) -> bytes:
         """Any tile of the zoom that is not empty; nothing when all are."""
-        query = "SELECT tile_data FROM tiles WHERE zoom_level = ? AND length(tile_data) > 0 LIMIT 1"
-        found = self._db.execute(query, (zoom,)).fetchone()
+        query = "SELECT CAST(tile_data AS BLOB) FROM tiles WHERE zoom_level = ? AND length(tile_data) > 0 LIMIT 1"
+        try:
+            found = self._db.execute(query, (zoom,)).fetchone()
+        except sqlite3.DatabaseError as error:
+            raise MapError(f"{self.path}: damaged ({error}); copy or download it again") from None
         return bytes(found[0]) if found else b""
 
     def close(self) -> None:
@@ -74,7 +77,7 @@ class PmtilesReader:
             header = deserialize_header(self._bytes(0, HEADER_BYTES))
         except FileNotFoundError:
             raise MapError(f"{path}: no such file; check the path of the source") from None
-        except (OSError, ValueError, struct.error, MagicNumberNotFound, SpecVersionUnsupported):
+        except (OSError, ValueError, IndexError, struct.error, MagicNumberNotFound, SpecVersionUnsupported):
             raise MapError(f"{path}: not a PMTiles file of version 3; check the source") from None
         if header["tile_type"] not in PICTURES:
             raise MapError(f"{path}: holds no pictures but {header['tile_type'].name} tiles; give imagery")
@@ -116,7 +119,12 @@ class PmtilesReader:
             raise MapError(f"{self.path}: damaged directory ({error}); copy or download it again") from None
 
     def _unpacked(self, data: bytes) -> bytes:
-        return gzip.decompress(data) if self._header["tile_compression"] == Compression.GZIP else data
+        if self._header["tile_compression"] != Compression.GZIP:
+            return data
+        try:
+            return gzip.decompress(data)
+        except (OSError, EOFError, zlib.error) as error:
+            raise MapError(f"{self.path}: damaged tile ({error}); copy or download it again") from None
 
 
 def open_tiles(path: Path) -> MbtilesReader | PmtilesReader:
