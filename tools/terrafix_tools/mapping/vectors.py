@@ -1,6 +1,7 @@
 """Feature tables of a map package: roads, water, buildings, with an R-tree each."""
 
 import json
+import math
 import re
 import sqlite3
 import struct
@@ -12,7 +13,7 @@ from terrafix.anchor.map_vectors import features_sha256_of, wkb_parts
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping import gpkg_schema
 from terrafix_tools.mapping.gpkg import WGS84, GpkgWriter
-from terrafix_tools.mapping.layers import VectorInput
+from terrafix_tools.mapping.layers import Bounds, VectorInput
 
 TABLE_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 TAKEN = re.compile(r"(imagery|elevation|gpkg|terrafix|rtree|sqlite)")
@@ -21,7 +22,7 @@ LITTLE_ENDIAN_XY_ENVELOPE = 0b0000_0011  # flags of a GeoPackage geometry's head
 
 def write_vectors(writer: GpkgWriter, db: sqlite3.Connection, given: VectorInput) -> tuple[VectorTable, ...]:
     """All features, each into its table in the order given. Raises MapError: a geometry or name that cannot be kept."""
-    boxes: dict[str, np.ndarray] = {}  # min and max of longitude and latitude
+    boxes: dict[str, Bounds] = {}
     counts: dict[str, int] = {}
     for table, wkb, attributes in given.features:
         if table not in boxes:
@@ -29,27 +30,27 @@ def write_vectors(writer: GpkgWriter, db: sqlite3.Connection, given: VectorInput
             if not boxes:
                 writer.create(gpkg_schema.GEOMETRY_COLUMNS)
             writer.create(gpkg_schema.FEATURES.format(table=table))
-            boxes[table], counts[table] = np.array([[np.inf, np.inf], [-np.inf, -np.inf]]), 0
+            boxes[table], counts[table] = (math.inf, math.inf, -math.inf, -math.inf), 0
         try:
             parts = [part for part in wkb_parts(wkb) if len(part)]
         except MapError as error:
             raise MapError(f"{given.source}: {error}") from None
         if not parts:
             continue
-        low = np.min([part.min(axis=0) for part in parts], axis=0)
-        high = np.max([part.max(axis=0) for part in parts], axis=0)
-        boxes[table] = np.array([np.minimum(boxes[table][0], low), np.maximum(boxes[table][1], high)])
-        header = struct.pack("<2sBBi4d", b"GP", 0, LITTLE_ENDIAN_XY_ENVELOPE, WGS84, low[0], high[0], low[1], high[1])
+        points = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        (west, south), (east, north) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        box = boxes[table]
+        boxes[table] = min(box[0], west), min(box[1], south), max(box[2], east), max(box[3], north)
+        header = struct.pack("<2sBBi4d", b"GP", 0, LITTLE_ENDIAN_XY_ENVELOPE, WGS84, west, east, south, north)
         text = json.dumps(dict(attributes), ensure_ascii=False, sort_keys=True)
         fid = db.execute(
             f'INSERT INTO "{table}" (geom, kind, name, attributes) VALUES (?, ?, ?, ?)',
             (header + wkb, attributes.get("kind", ""), attributes.get("name", ""), text),
         ).lastrowid
-        db.execute(f'INSERT INTO "rtree_{table}_geom" VALUES (?, ?, ?, ?, ?)', (fid, low[0], high[0], low[1], high[1]))
+        db.execute(f'INSERT INTO "rtree_{table}_geom" VALUES (?, ?, ?, ?, ?)', (fid, west, east, south, north))
         counts[table] += 1
     for table, box in boxes.items():
-        whole = tuple(float(v) for v in box.ravel()) if counts[table] else None
-        writer.add_contents(table, "features", given.date, given.licence, whole, WGS84)  # type: ignore[arg-type]
+        writer.add_contents(table, "features", given.date, given.licence, box if counts[table] else None, WGS84)
         row = (table, "geom", "GEOMETRY", WGS84, 0, 0)
         db.execute("INSERT INTO gpkg_geometry_columns VALUES (?, ?, ?, ?, ?, ?)", row)
         writer.create(gpkg_schema.RTREE_TRIGGERS.format(table=table))

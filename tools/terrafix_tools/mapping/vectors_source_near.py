@@ -1,5 +1,7 @@
 """Which features of a large extract lie in the area of a map."""
 
+import math
+
 import numpy as np
 from pyproj import CRS
 from rasterio.transform import Affine
@@ -23,6 +25,8 @@ class Nearby:
 
     def has(self, points: Ring, *, surface: bool = False) -> bool:
         """Whether a line, or with ``surface`` what it goes around, shares a cell with the area."""
+        if self._holds(*points[0]):  # nearly every feature of an extract that was cut to the area, thirty times as fast
+            return True
         lon_lat = np.asarray(points, float)
         steps = np.abs(np.diff(lon_lat, axis=0)) / (self._step_x, self._step_y)
         at = np.concatenate([[0.0], np.cumsum(np.ceil(steps.max(axis=1)).clip(1.0))])
@@ -33,6 +37,11 @@ class Nearby:
         rows = np.floor((self._north - np.interp(every, at, lon_lat[:, 1])) / self._step_y).astype(int)
         on = (columns >= 0) & (columns < GRID_PX) & (rows >= 0) & (rows < GRID_PX)
         return bool(self._inside[rows[on], columns[on]].any()) or (surface and holds(points, self._point))
+
+    def _holds(self, lon_deg: float, lat_deg: float) -> bool:
+        column = math.floor((lon_deg - self._west) / self._step_x)
+        row = math.floor((self._north - lat_deg) / self._step_y)
+        return 0 <= column < GRID_PX and 0 <= row < GRID_PX and bool(self._inside[row, column])
 
     def meets(self, west: float, south: float, east: float, north: float) -> bool:
         """Whether a box of degrees shares a cell with the area."""
