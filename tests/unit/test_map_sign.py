@@ -11,6 +11,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from terrafix.anchor.map_package import MapPackage
+from terrafix.anchor.map_seal import write_seal
 from terrafix.core.errors import ConfigError, MapError, OutputError, UsageError
 from terrafix.core.signature import TrustedKey, generate, is_signed, read_public, trusted_keys
 from terrafix_tools.live import package_for
@@ -106,6 +107,7 @@ def test_somebody_who_makes_the_checksum_right_again_cannot_make_the_signature_r
     # A key of the attacker's under the name of the trusted one.
     mine, _, attacker = keys(tmp_path, "attacker")
     change(other, "DELETE FROM terrafix_signature")
+    write_seal(other)  # needs no key: the seal is against accidents
     sign_package(other, mine)
     change(other, "UPDATE terrafix_signature SET key_id = ?", key.key_id)
     with pytest.raises(MapError, match="wrong signature"):

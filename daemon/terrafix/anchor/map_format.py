@@ -14,6 +14,7 @@ ELEVATION_TABLE = "elevation"
 MANIFEST_TABLE = "terrafix_manifest"
 HASH_TABLE = "terrafix_hash"
 SIGNATURE_TABLE = "terrafix_signature"
+SEAL_TABLE = "terrafix_seal"
 TILE_PX = 256
 DEM_TILE_PX = 256
 DEM_NULL = 65535  # void in a 16-bit elevation tile
@@ -111,6 +112,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     ce90_m: float | None = None
     layers: tuple[Layer, ...] = ()  # newest first
     vectors: tuple[VectorTable, ...] = ()
+    sealed: bool = False  # whether the file has a seal (``map_seal.py``)
 
 
 def manifest_rows(manifest: Manifest) -> list[tuple[str, str]]:

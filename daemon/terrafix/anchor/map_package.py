@@ -13,6 +13,7 @@ from terrafix.anchor.map_descriptors import StoredDescriptors
 from terrafix.anchor.map_elevation import ElevationView
 from terrafix.anchor.map_format import TILE_PX, Layer, Manifest
 from terrafix.anchor.map_open import check_signature, connect, read_manifest
+from terrafix.anchor.map_seal import is_sealed
 from terrafix.anchor.map_tiles import Key, TileStore
 from terrafix.anchor.map_vectors import Feature, features_sha256_of, read_features
 from terrafix.anchor.map_window import LayerView
@@ -64,7 +65,9 @@ class MapPackage:
         return package
 
     def verify(self) -> None:
-        """Reads every tile and feature and compares it with its recorded sha256. Raises MapError naming the first."""
+        """Compares every tile and feature with its recorded sha256, then every byte of the file with the seal.
+
+        Raises MapError naming the first that is not what was written."""
         try:
             for table, zoom, column, row, expected in self.tiles.hashes():
                 if not self.tiles.is_whole((table, zoom, column, row), expected):
@@ -74,8 +77,14 @@ class MapPackage:
                     )
             for vectors in self.manifest.vectors:
                 self._check_vectors(vectors.table)
-        except UNREADABLE as error:
+            sealed = not self.manifest.sealed or is_sealed(self.path)
+        except (*UNREADABLE, OSError) as error:
             raise MapError(f"{self.path}: damaged map package ({error}); build or copy it again") from None
+        if not sealed:
+            raise MapError(
+                f"{self.path}: the file was altered since it was built or signed, outside of tiles and manifest; "
+                "build or copy the package again"
+            )
 
     @property
     def damaged_tiles(self) -> set[Key]:

@@ -242,6 +242,7 @@ class _Build:
                 ce90_m=newest.ce90_m,
                 layers=tuple(layers),
                 vectors=vectors,
+                sealed=True,
             )
         )
 

@@ -17,6 +17,7 @@ from terrafix.anchor.map_format import (
     ELEVATION_TABLE,
     HASH_TABLE,
     MANIFEST_TABLE,
+    SEAL_TABLE,
     SIGNATURE_TABLE,
     TILE_PX,
     DemGrid,
@@ -27,6 +28,7 @@ from terrafix.anchor.map_format import (
     manifest_rows,
     tile_sha256,
 )
+from terrafix.anchor.map_seal import BLANK, write_seal
 from terrafix_tools.mapping import gpkg_schema
 from terrafix_tools.mapping.layers import Bounds
 
@@ -54,6 +56,8 @@ class GpkgWriter:
         self.add_contents(MANIFEST_TABLE, "attributes", "", "What this map is; written by Terrafix", None, None)
         self.add_contents(SIGNATURE_TABLE, "attributes", "", "Who vouches for it; written by Terrafix", None, None)
         self.add_extension(HASH_TABLE, None, "terrafix_map")
+        self.add_extension(SEAL_TABLE, None, "terrafix_map")
+        db.execute(f"INSERT INTO {SEAL_TABLE} (seal) VALUES (?)", (BLANK,))
 
     def create(self, statements: str) -> None:
         for statement in re.split(r";\n(?=CREATE|$)", statements.strip() + "\n"):
@@ -201,7 +205,7 @@ class GpkgWriter:
 
 @contextmanager
 def new_package(path: Path) -> Iterator[tuple[GpkgWriter, sqlite3.Connection]]:
-    """A writer on a new file; commits at the end. The caller throws the file away when this fails."""
+    """A writer on a new file; commits and seals at the end. The caller throws the file away when this fails."""
     db = sqlite3.connect(path, isolation_level=None)
     try:
         # The file is private until it is complete, so that a journal would protect nothing.
@@ -212,3 +216,4 @@ def new_package(path: Path) -> Iterator[tuple[GpkgWriter, sqlite3.Connection]]:
         db.execute("COMMIT")
     finally:
         db.close()
+    write_seal(path)

@@ -1,6 +1,6 @@
 """SQL of the tables of a package: OGC 12-128r18 (version 1.3), its extensions, and ours."""
 
-from terrafix.anchor.map_format import HASH_TABLE, MANIFEST_TABLE, SIGNATURE_TABLE
+from terrafix.anchor.map_format import HASH_TABLE, MANIFEST_TABLE, SEAL_TABLE, SIGNATURE_TABLE
 
 CORE = f"""
 CREATE TABLE gpkg_spatial_ref_sys (
@@ -41,6 +41,7 @@ CREATE TABLE {HASH_TABLE} (
 CREATE TABLE {SIGNATURE_TABLE} (
   id INTEGER PRIMARY KEY AUTOINCREMENT, key_id TEXT NOT NULL UNIQUE, public_key BLOB NOT NULL,
   signature BLOB NOT NULL);
+CREATE TABLE {SEAL_TABLE} (id INTEGER PRIMARY KEY AUTOINCREMENT, seal BLOB NOT NULL);
 """
 
 TILES = """

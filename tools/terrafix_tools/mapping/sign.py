@@ -3,8 +3,9 @@
 import sqlite3
 from pathlib import Path
 
-from terrafix.anchor.map_format import FORMAT_VERSION, SIGNATURE_TABLE, signed_bytes
+from terrafix.anchor.map_format import FORMAT_VERSION, SEAL_TABLE, SIGNATURE_TABLE, signed_bytes
 from terrafix.anchor.map_package import UNREADABLE, MapPackage
+from terrafix.anchor.map_seal import BLANK, write_seal
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.signature import TrustedKey, sign
 
@@ -30,9 +31,13 @@ def sign_package(package: Path, private_key: Path) -> TrustedKey:
                     f"INSERT OR REPLACE INTO {SIGNATURE_TABLE} (key_id, public_key, signature) VALUES (?, ?, ?)",
                     (key.key_id, key.raw, signature),
                 )
+                if manifest.sealed:  # an interruption after this leaves a blank seal and a good signature
+                    db.execute(f"UPDATE {SEAL_TABLE} SET seal = ?", (BLANK,))
         finally:
             db.close()
-    except sqlite3.OperationalError as error:
+        if manifest.sealed:
+            write_seal(package)
+    except (sqlite3.OperationalError, OSError) as error:
         raise OutputError(f"{package}: cannot be written ({error}); check permissions and space") from None
     MapPackage.open(package, trusted=[key]).close()
     return key
