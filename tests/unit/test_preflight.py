@@ -344,6 +344,14 @@ def test_nobody_there_is_a_line_and_the_rest_is_checked(tmp_path: Path) -> None:
     assert {"map", "camera", "models", "clock", "disk", "temperature"} <= lines.keys()
 
 
+@pytest.mark.parametrize("device", ["udpin:127.0.0.1", "udpin:127.0.0.1:70000", "127.0.0.1:14550", "tcp:127.0.0.1:9"])
+def test_a_device_that_cannot_be_is_said_once_with_what_to_do(device: str, tmp_path: Path) -> None:
+    arguments = ["preflight", "--json", "--autopilot-only", "--link", device, "--out", str(tmp_path)]
+    (line,) = json.loads(CliRunner().invoke(app, arguments).output)["lines"]
+    assert device in line["text"]
+    assert line["fix"] and line["fix"] not in line["text"]
+
+
 def test_an_old_firmware_fails(wired: Any, tmp_path: Path) -> None:
     there = GroundAutopilot(AS_IT_COMES | preset("plane"), version=4 << 24 | 5 << 16)
     with talk(there) as asked:

@@ -128,7 +128,7 @@ def _check(config: LinkSection) -> None:
         kind, _, rest = device.partition(":")
         if kind in ("udpin", "udpout", "tcp") and not _is_address(rest.rpartition(":")[0]):
             raise LinkError(
-                f"ground link '{device}': write an address, not a name: in flight nobody waits for a name server"
+                f"ground link '{device}' has a name: in flight nobody waits for a name server; write its address"
             )
 
 

@@ -70,7 +70,7 @@ def open_transport(device: str, baud: int, *, wait: bool) -> Transport:
 def _address(device: str, rest: str) -> tuple[str, int]:
     host, _, port = rest.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65_536:
-        raise LinkError(f"link '{device}': needs HOST:PORT, for example {device.split(':')[0]}:127.0.0.1:14550")
+        raise LinkError(f"link '{device}': needs HOST:PORT; write for example {device.split(':')[0]}:127.0.0.1:14550")
     try:
         return socket.gethostbyname(host), int(port)
     except socket.gaierror:

@@ -68,8 +68,8 @@ def preflight(
         except LinkError as error:
             if written or saved_to:
                 raise
-            text, _, todo = str(error).rpartition("; ")
-            lines.append(fail("autopilot", text or str(error), todo))
+            text, _, todo = str(error).partition("; ")
+            lines.append(fail("autopilot", text, todo))
             if not as_json:
                 show(lines)
         shown = len(lines)
