@@ -117,12 +117,15 @@ def test_a_firmware_that_nobody_knows_is_said() -> None:
 def test_the_link_goes_before_others_where_that_is_allowed_and_says_so_where_it_is_not() -> None:
     """In a process of its own: this one stays as it is. Without the right (a limit of 0) nothing changes."""
     program = (
-        "import os, resource, sys\n"
+        "import os, resource, sys, threading\n"
         "from terrafix.link.priority import first_in_line\n"
+        "threading.Thread(target=threading.Event().wait, daemon=True).start()\n"  # as the one that writes the log
         "if sys.argv[1] == 'no':\n"
         "    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))\n"
         "    os.getuid() == 0 and os.setuid(65534)\n"
-        "print(first_in_line(), os.sched_getscheduler(0) == os.SCHED_RR)\n"
+        "threads = os.listdir('/proc/self/task')\n"
+        "assert len(threads) == 2\n"
+        "print(first_in_line(), all(os.sched_getscheduler(int(t)) == os.SCHED_RR for t in threads))\n"
     )
     for may in ("yes", "no"):
         done = subprocess.run([sys.executable, "-c", program, may], capture_output=True, text=True, check=True)
