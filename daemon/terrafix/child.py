@@ -5,7 +5,6 @@ follows."""
 
 import ctypes
 import faulthandler
-import gc
 import os
 import signal
 import sys
@@ -107,7 +106,6 @@ def main(arguments: list[str]) -> int:
         kept=run_dir.kept(name),
         epoch_ns=run_dir.epoch_ns,
     )
-    gc.freeze()  # what is imported lives for ever: collections need not look at it
     try:
         run_process(name, ctx, run_dir, stopping=stopping.is_set, table=table)
     except TerrafixError as error:

@@ -3,6 +3,7 @@
 A node does not know which one it is in. The live shell owns what the node may not have: the clock, the sockets, the
 edge. One thread: what is slow delays only its own process."""
 
+import gc
 import importlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
@@ -85,6 +86,7 @@ def run_process(
     node: Node = module.make_node(ctx)
     make_edge: Callable[[NodeContext], Edge] | None = getattr(module, "make_edge", None)
     edge = make_edge(ctx) if make_edge else None
+    gc.freeze()  # what is imported and opened by now lives for ever: collections need not look at it
     with zmq.Context() as context:
         shell = LiveShell(process, table, node, edge, endpoints, context)
         try:
