@@ -74,9 +74,11 @@ def run(
         output = stack.enter_context(log_to.open("a", encoding="utf-8")) if log_to else None
         stack.enter_context(contextlib.closing(logs.configure(config.log.level, SUPERVISOR, output)))
         logs.get().info("start", config=msgspec.to_builtins(config), map=str(package), out_dir=str(out_dir))
-        owned = OwnedRunDir()
+        spec = msgspec.json.encode(spec_of(table, config, package, out_dir, ground_amsl_m))
+        owned = OwnedRunDir(spec=spec, goes_on=_is_camera(config.source.path))
         stack.callback(owned.remove)
-        owned.run_dir.spec.write_bytes(msgspec.json.encode(spec_of(table, config, package, out_dir, ground_amsl_m)))
+        if owned.run_dir.epoch_ns is not None:
+            logs.get().warning("goes on from a run that was killed", epoch_ns=owned.run_dir.epoch_ns)
         stack.enter_context(_signals_set(stop))
         context = stack.enter_context(zmq.Context())
         children = [Child(process, owned.run_dir, output) for process in table]
@@ -241,6 +243,11 @@ def _with_overrides(config: Config, source: str, start: str, map_path: Path | No
     if link:
         config = replace(config, link=replace(config.link, device=link))
     return config
+
+
+def _is_camera(source: str) -> bool:
+    """A recording is not flown on with: it begins anew."""
+    return source.startswith("/dev/") or not os.path.exists(os.path.expanduser(source))
 
 
 def _writable(out_dir: Path) -> Path:

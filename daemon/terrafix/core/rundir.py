@@ -1,6 +1,7 @@
 """The folder in shared memory through which the processes of one run meet: sockets, frames, progress, what to run.
 
-It exists as long as its supervisor: a lock tells a living folder from one that a killed supervisor left behind."""
+It exists as long as its supervisor: a lock tells a living folder from one that a killed supervisor left behind. Who is
+started in the place of one that was killed in flight goes on from what lies there."""
 
 import fcntl
 import os
@@ -9,8 +10,12 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from terrafix.core.clock import now_ns
+from terrafix.core.progress import Progress
+
 SHM = Path("/dev/shm")  # memory, not disk: frames and progress stamps never wait for storage
 PREFIX = "terrafix-"
+SAME_FLIGHT_NS = 60_000_000_000  # a run that lived so lately was killed in the flight that goes on now
 
 
 @dataclass(frozen=True)
@@ -43,14 +48,33 @@ class RunDir:
     @property
     def epoch_ns(self) -> int | None:
         """``t_ns`` of the first Origin of this run: a source that is opened again goes on on the same time."""
-        file = self.path / "epoch_ns"
-        return int(file.read_text()) if file.exists() else None
+        return int(self._epoch.read_text()) if self._epoch.exists() else None
 
     def set_epoch(self, t_ns: int) -> None:
         """The first one counts."""
-        file = self.path / "epoch_ns"
-        if not file.exists():
-            write_whole(file, str(t_ns).encode())
+        if not self._epoch.exists():
+            write_whole(self._epoch, str(t_ns).encode())
+
+    @property
+    def _epoch(self) -> Path:
+        return self.path / "epoch_ns"
+
+    def goes_on_from(self, dead: "RunDir") -> None:
+        """What the processes of ``dead`` knew last, if they were run for the same and lived until just now."""
+        same = dead.spec.is_file() and dead.spec.read_bytes() == self.spec.read_bytes()
+        if not same or not dead._epoch.exists() or now_ns() - dead._lived_ns() > SAME_FLIGHT_NS:
+            return
+        for file in (dead._epoch, *dead.path.glob("*.kept")):
+            write_whole(self.path / file.name, file.read_bytes())
+
+    def _lived_ns(self) -> int:
+        """The newest stamp of any of its processes; 0: none has one."""
+        newest_ns = 0
+        for file in self.path.glob("*.progress"):
+            progress = Progress(file)
+            newest_ns = max(newest_ns, progress.stamp_ns)
+            progress.close()
+        return newest_ns
 
 
 def write_whole(file: Path, data: bytes) -> None:
@@ -63,13 +87,15 @@ def write_whole(file: Path, data: bytes) -> None:
 class OwnedRunDir:
     """The supervisor's view: made, locked, and removed by it."""
 
-    def __init__(self, parent: Path | None = None) -> None:
+    def __init__(self, parent: Path | None = None, spec: bytes = b"", *, goes_on: bool = False) -> None:
+        """``spec``: what to run. ``goes_on``: from where a run of the same was killed, if that was just now."""
         parent = parent or _default_parent()
-        sweep(parent)
         self.run_dir = RunDir(Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent)))
         # An exclusive lock dies with its holder, however that dies.
         self._lock_fd = os.open(self.run_dir.path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._lock_fd, fcntl.LOCK_EX)
+        self.run_dir.spec.write_bytes(spec)
+        sweep(parent, self.run_dir if goes_on else None)
 
     def remove(self) -> None:
         shutil.rmtree(self.run_dir.path, ignore_errors=True)
@@ -100,8 +126,8 @@ def _is_held(lock: Path) -> bool:
     return False
 
 
-def sweep(parent: Path) -> None:
-    """Removes the folders of supervisors that are gone."""
+def sweep(parent: Path, heir: RunDir | None = None) -> None:
+    """Removes the folders of supervisors that are gone, when ``heir`` has taken from them what goes on."""
     for lock in parent.glob(f"{PREFIX}*/lock"):
         try:
             fd = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
@@ -112,6 +138,8 @@ def sweep(parent: Path) -> None:
         except BlockingIOError:
             continue  # alive
         else:
+            if heir is not None:
+                heir.goes_on_from(RunDir(lock.parent))
             shutil.rmtree(lock.parent, ignore_errors=True)
         finally:
             os.close(fd)
