@@ -30,6 +30,7 @@ from terrafix.core.shell import SUPERVISOR
 from terrafix.messages import Origin, ProcessEvent, SourceEnded
 from terrafix.processes import PROCESSES, Process
 
+LINK_GAVE_UP = 1  # exit code
 VITAL = "link"  # without it nothing leaves for the autopilot: systemd shall start everything anew
 LOOP_MS = 50  # a death is noticed within this time
 SOURCE_WAIT_NS = 20_000_000_000  # the source is opened when all others are ready, or after this long
@@ -89,7 +90,9 @@ def run(
         supervisor = Supervisor(children, publisher, subscriber, stop, stop_after_source, on_event)
         if on_epoch:
             supervisor.tell_epoch(owned.run_dir, on_epoch)
+        owned.left = True  # after a bug, too
         code = supervisor.run()
+        owned.left = code == LINK_GAVE_UP
         for mistake in (child.mistake for child in children if child.mistake):
             sys.stderr.write(f"terrafix: {mistake.text}\n")  # the last word, after all logs
         return code
@@ -152,7 +155,7 @@ class Supervisor:
             if child.mistake is not None:
                 return child.mistake.exit_code
             if child.process.name == VITAL and child.state in (State.GAVE_UP, State.FINISHED):
-                return 1
+                return LINK_GAVE_UP
         if self._look_for_epoch and not self._look_for_epoch():
             self._look_for_epoch = None
         self._publisher.serve()

@@ -45,6 +45,20 @@ def test_it_goes_on_from_a_run_of_the_same_that_was_killed_just_now(
         owned.remove()
 
 
+def test_a_supervisor_that_ended_without_being_asked_leaves_it_too(tmp_path: Path) -> None:
+    first = OwnedRunDir(tmp_path, b"this map")
+    first.run_dir.set_epoch(7)
+    progress = Progress.create(first.run_dir.progress("link"))
+    progress.stamp(time.monotonic_ns())
+    progress.close()
+    first.left = True
+    first.remove()
+    second = OwnedRunDir(tmp_path, b"this map", goes_on=True)
+    assert second.run_dir.epoch_ns == 7
+    second.remove()
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_recording_is_no_camera(tmp_path: Path) -> None:
     assert _is_camera("/dev/video0")
     assert _is_camera("http://127.0.0.1:80/stream")

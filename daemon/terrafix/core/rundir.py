@@ -85,7 +85,9 @@ def write_whole(file: Path, data: bytes) -> None:
 
 
 class OwnedRunDir:
-    """The supervisor's view: made, locked, and removed by it."""
+    """The supervisor's view: made, locked, and removed by it, unless it is ``left`` to the one that is started next."""
+
+    left = False
 
     def __init__(self, parent: Path | None = None, spec: bytes = b"", *, goes_on: bool = False) -> None:
         """``spec``: what to run. ``goes_on``: from where a run of the same was killed, if that was just now."""
@@ -98,7 +100,8 @@ class OwnedRunDir:
         sweep(parent, self.run_dir if goes_on else None)
 
     def remove(self) -> None:
-        shutil.rmtree(self.run_dir.path, ignore_errors=True)
+        if not self.left:
+            shutil.rmtree(self.run_dir.path, ignore_errors=True)
         os.close(self._lock_fd)
 
 
