@@ -1,14 +1,23 @@
 """Where a receiver should be against our estimate, by where it was so far in this flight.
 
 Most of their disagreement stays for a flight, or comes and goes in minutes: the map's own error, the receiver's. A
-drag-off shows long before it is larger than all of that. So the offset is forecast LAG_S ahead, by a first-order
-autoregression about its mean (Box and Jenkins, Time Series Analysis, 3.2), and a forecast's error is judged by the
-errors of earlier forecasts. What both sides claim is the prior of their variance, so that the chance of an error is
-that of a bivariate Student t (Gelman et al., Bayesian Data Analysis, 3.2), and little is accused that little is known
-of. Constants were chosen on flights of other seeds than those of docs/autopilot.md, "The GNSS judge"."""
+drag-off shows long before it is larger than all of that. So the offset is forecast LAG_S ahead, in two ways:
+
+* by what it was: a first-order autoregression about its mean (Box and Jenkins, Time Series Analysis, 3.2), which errs
+  as our position does;
+* by what it was then and the receiver's slip since: how much further it has moved than our velocity says, which should
+  be nothing, and errs as our velocity does.
+
+A drag-off is in the errors of both, in full, and little else is. They are combined with the weights that leave the
+least variance (Bates and Granger, The combination of forecasts, 1969), and the error of that is judged by the errors of
+earlier forecasts. What both sides claim is the prior of their variance, so that the chance of an error is that of a
+bivariate Student t (Gelman et al., Bayesian Data Analysis, 3.2), and little is accused that little is known of.
+Constants were chosen on flights of other seeds than those of docs/autopilot.md, "The GNSS judge"."""
 
 from collections import deque
 from dataclasses import dataclass
+
+from terrafix.link.gnss_scatter import Errors, Scatter
 
 SAMPLE_S = 1.0
 SMOOTH_S = 2.0  # the offset is averaged over so long: readings and estimates are noisy
@@ -16,9 +25,7 @@ LAG_S = 30.0  # nothing that is younger is learnt: a drag-off must not become wh
 MEMORY_S = 600.0  # of the mean
 FORGET_S = 1800.0  # of how good forecasts are
 INDEPENDENT_S = 15.0  # errors so far apart count as one sample each
-PRIOR_SAMPLES = 6.0  # that the claims are worth
 RIDGE = 10.0  # keeps the coefficient at zero (forecast: the mean) until the flight has shown another
-LEAST_SCALE = 0.8  # of the claims: a flight that was better than claimed so far may become as bad as claimed
 VAGUER = 1.3  # a forecast from an offset that was claimed so much worse than now is none
 
 
@@ -28,70 +35,76 @@ class _Past:
 
     offset_m: complex
     variance_m2: float
+    slipped_m: complex  # by then, since the beginning
     from_m: complex  # the offset that it was forecast from
     mean_m: complex  # as it was then
-    error_m: float | None  # of that forecast
+    errors: Errors | None  # of that forecast
 
 
 class OffsetForecast:
     """``take`` every offset of receiver and estimate; ``pause`` when there is none, or none to learn from."""
 
     def __init__(self) -> None:
-        self._offset_m = 0j  # now, smoothed
+        self._offset_m = self._slipped_m = 0j  # now, smoothed
+        self._slip_m = 0j  # all of it, as it came
         self._variance_m2 = 0.0
         self._smooth = False
         self._mean_m = 0j
         self._weight = 0.0
-        self._samples = self._squares = 0.0
+        self._scatter = Scatter()
         self._xx = self._xy = 0.0  # of the regression
         self._past: deque[_Past] = deque()
         self._since_s = 0.0
 
-    def take(self, offset_m: complex, sigma_m: float, dt_s: float, *, learn: bool) -> tuple[float, float | None]:
-        """``offset_m``: east + j north. ``sigma_m``: 1-sigma per axis of it, as claimed. ``dt_s``: since the last one.
+    def take(
+        self, offset_m: complex, sigma_m: float, slip_m: complex, slip_sigma_m: float, dt_s: float, *, learn: bool
+    ) -> tuple[float, float | None]:
+        """``offset_m``: east + j north; ``slip_m``: in the ``dt_s`` since the last one. ``sigma_m``: 1-sigma per axis
+        of the offset, ``slip_sigma_m``: of the slip in LAG_S, both as claimed.
 
         -> (chance of being so far from the forecast, the distance [m]); (1, None): there is no forecast yet."""
         share = min(1.0, dt_s / SMOOTH_S) if self._smooth else 1.0
         self._smooth = True
+        self._slip_m += slip_m
         self._offset_m += share * (offset_m - self._offset_m)
+        self._slipped_m += share * (self._slip_m - self._slipped_m)
         self._variance_m2 += share * (sigma_m**2 - self._variance_m2)
         variance_m2 = max(sigma_m**2, self._variance_m2)  # after a vague stretch the average is vague for a while
         from_m = self._from(variance_m2)
-        error_m = abs(self._offset_m - self._mean_m - self._coefficient() * (from_m - self._mean_m))
+        forecast_m = self._mean_m + self._coefficient() * (from_m - self._mean_m)
+        slipped_m = self._slipped_m - self._past[0].slipped_m if self._is_full() else None
+        errors = Errors(self._offset_m - forecast_m, variance_m2**0.5, slipped_m, slip_sigma_m)
         known = self._weight > 0.0
         self._since_s += dt_s
         if learn and self._since_s >= SAMPLE_S:
             self._since_s = 0.0
-            sample = _Past(self._offset_m, variance_m2, from_m, self._mean_m, error_m if known else None)
-            self._past.append(sample)
+            past = _Past(self._offset_m, variance_m2, self._slipped_m, from_m, self._mean_m, errors if known else None)
+            self._past.append(past)
             if len(self._past) > LAG_S / SAMPLE_S:
                 self._learn(self._past.popleft())
-        return (self._chance(error_m, variance_m2), error_m) if known else (1.0, None)
+        return self._scatter.chance(errors) if known else (1.0, None)
 
     def pause(self) -> None:
         self._past.clear()
         self._smooth = False
 
+    def _is_full(self) -> bool:
+        return len(self._past) >= LAG_S / SAMPLE_S
+
     def _from(self, variance_m2: float) -> complex:
         """The offset LAG_S ago; without one that is good enough the mean."""
-        if len(self._past) < LAG_S / SAMPLE_S or self._past[0].variance_m2 > VAGUER**2 * variance_m2:
+        if not self._is_full() or self._past[0].variance_m2 > VAGUER**2 * variance_m2:
             return self._mean_m
         return self._past[0].offset_m
 
     def _coefficient(self) -> float:
         return min(1.0, max(0.0, self._xy / (self._xx + RIDGE)))
 
-    def _chance(self, error_m: float, variance_m2: float) -> float:
-        scale2 = max(LEAST_SCALE**2, (PRIOR_SAMPLES + self._squares) / (PRIOR_SAMPLES + self._samples))
-        freedom = 2.0 * (PRIOR_SAMPLES + self._samples)  # two axes
-        return float((1.0 + error_m**2 / (scale2 * variance_m2 * freedom)) ** (-freedom / 2.0))
-
     def _learn(self, past: _Past) -> None:
-        if past.error_m is not None:
-            gain, keep = SAMPLE_S / INDEPENDENT_S, 1.0 - SAMPLE_S / FORGET_S
+        gain, keep = SAMPLE_S / INDEPENDENT_S, 1.0 - SAMPLE_S / FORGET_S
+        if past.errors is not None:
             x, y = past.from_m - past.mean_m, past.offset_m - past.mean_m
-            self._samples = keep * (self._samples + gain)
-            self._squares = keep * (self._squares + gain * past.error_m**2 / past.variance_m2 / 2.0)
+            self._scatter.learn(past.errors, gain, keep)
             self._xx = keep * (self._xx + gain * abs(x) ** 2 / past.variance_m2)
             self._xy = keep * (self._xy + gain * (x * y.conjugate()).real / past.variance_m2)
         weight = 1.0 / past.variance_m2

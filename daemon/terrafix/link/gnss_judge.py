@@ -3,8 +3,8 @@
 Two tests, each on runs of readings:
 
 * the distance, beyond 5.5 sigma of what both claim, in three readings in a row: a sudden spoofer, within a second;
-* its change: where the receiver should be by how it was so far in this flight (gnss_forecast.py), and is not, for a
-  second: a slow drag-off.
+* its change: where the receiver should be by how it was so far in this flight, and by our velocity (gnss_forecast.py),
+  and is not, for a second: a slow drag-off.
 
 Errors of both sides last for seconds to minutes (a map fix, the map itself, multipath). For such errors a cumulative
 sum of the distance (Page 1954) was measured and is worse: where it sees a drag-off as early, it has ten times the false
@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 
 from terrafix.link.carry import Carried, distance_m
-from terrafix.link.gnss_forecast import OffsetForecast
+from terrafix.link.gnss_forecast import LAG_S, OffsetForecast
 from terrafix.messages import GnssReading, GnssState
 
 FIX_3D = 3
@@ -53,6 +53,18 @@ class Offset:
     sigma_m: float  # 1-sigma per axis that both claim, across the track
     along_sigma_m: float  # and along it, where the age of the reading adds, which is not known
     sigmas: float  # the distance in standard deviations
+    slip_m: complex  # how much further the receiver has moved since its last reading than our velocity says
+    slip_sigma_m: float  # 1-sigma per axis of all slip in LAG_S
+
+
+@dataclass(frozen=True)
+class _Last:
+    """A reading that was compared: when and where it came, and our velocity (east + j north)."""
+
+    t_ns: int
+    lat_deg: float
+    lon_deg: float
+    velocity_mps: complex
 
 
 class Run:
@@ -76,6 +88,7 @@ class ReceiverJudge:
         self._jumped = Run()
         self._dragged = Run()
         self._forecast = OffsetForecast()
+        self._last: _Last | None = None
         self._agreed_s = 0.0
         self._trust_after_s = FIRST_TRUST_S
 
@@ -90,8 +103,13 @@ class ReceiverJudge:
             return self._lose(lost)
         if vision is None or reading.lat_deg is None or reading.lon_deg is None:
             self._forecast.pause()
+            self._last = None
             return self._keep()
-        return self._compare(_offset(reading, vision), dt_s, own_step_m)
+        velocity_mps = complex(*vision.velocity_enu_mps[:2])
+        here = _Last(reading.t_ns, reading.lat_deg, reading.lon_deg, velocity_mps)
+        offset = _offset(here, reading.horizontal_m, vision, self._last)
+        self._last = here
+        return self._compare(offset, dt_s, own_step_m)
 
     def look(self, now_ns: int) -> Opinion:
         if self._heard_ns is not None and now_ns - self._heard_ns > SILENT_NS:
@@ -100,7 +118,8 @@ class ReceiverJudge:
 
     def _compare(self, offset: Offset, dt_s: float, own_step_m: float) -> Opinion:
         bad = self.opinion.state in (GnssState.SPOOFED, GnssState.DISPUTED)
-        chance, off_m = self._forecast.take(offset.metres, offset.along_sigma_m, dt_s, learn=not bad)
+        claimed = offset.along_sigma_m, offset.slip_m, offset.slip_sigma_m
+        chance, off_m = self._forecast.take(offset.metres, *claimed, dt_s, learn=not bad)
         if off_m is not None and not bad and own_step_m > DISPUTE_SHARE * off_m and chance < DRAG_CHANCE:
             self._forecast, chance = OffsetForecast(), 1.0  # it was we who moved: what is usual has to be learnt anew
         away_m = abs(offset.metres)
@@ -129,6 +148,7 @@ class ReceiverJudge:
         """A receiver that was spoofed and goes silent stays spoofed: it has to earn its way back all the same."""
         self._jumped, self._dragged, self._agreed_s = Run(), Run(), 0.0
         self._forecast.pause()
+        self._last = None
         if self.opinion.state is not GnssState.SPOOFED:
             if self.opinion.state is GnssState.TRUSTED:
                 self._trust_after_s = max(self._trust_after_s, AFTER_LOSS_S)
@@ -150,21 +170,28 @@ def _why_lost(reading: GnssReading) -> str:
     return ""
 
 
-def _offset(reading: GnssReading, vision: Carried) -> Offset:
-    assert reading.lat_deg is not None and reading.lon_deg is not None
-    east, north = (
-        math.copysign(distance_m(vision.lat_deg, vision.lon_deg, lat, lon), sign)
-        for lat, lon, sign in (
-            (vision.lat_deg, reading.lon_deg, math.remainder(reading.lon_deg - vision.lon_deg, 360.0)),
-            (reading.lat_deg, vision.lon_deg, reading.lat_deg - vision.lat_deg),
-        )
-    )
-    receiver_m = UNKNOWN_M if reading.horizontal_m is None else max(LEAST_M, reading.horizontal_m)
+def _offset(here: _Last, claimed_m: float | None, vision: Carried, last: _Last | None) -> Offset:
+    """``claimed_m``: 1-sigma of the receiver, by its own word. ``last``: the reading before."""
+    metres = _metres(vision.lat_deg, vision.lon_deg, here.lat_deg, here.lon_deg)
+    receiver_m = UNKNOWN_M if claimed_m is None else max(LEAST_M, claimed_m)
     sigma_m = math.hypot(vision.horizontal_sigma_m, receiver_m)
-    ve, vn, _ = vision.velocity_enu_mps
-    speed_mps = math.hypot(ve, vn)
-    along_m = (east * ve + north * vn) / speed_mps if speed_mps > 0.0 else 0.0
-    across_m2 = max(0.0, east**2 + north**2 - along_m**2)
+    speed_mps = abs(here.velocity_mps)
+    along_m = (metres * here.velocity_mps.conjugate()).real / speed_mps if speed_mps > 0.0 else 0.0
+    across_m2 = max(0.0, abs(metres) ** 2 - along_m**2)
     along_sigma_m = math.hypot(sigma_m, DELAY_SIGMA_S * speed_mps)
     sigmas = math.sqrt((along_m / along_sigma_m) ** 2 + across_m2 / sigma_m**2)
-    return Offset(complex(east, north), sigma_m, along_sigma_m, sigmas)
+    slip_m = 0j
+    if last is not None:
+        way_m = 0.5 * (last.velocity_mps + here.velocity_mps) * ((here.t_ns - last.t_ns) * 1e-9)
+        slip_m = _metres(last.lat_deg, last.lon_deg, here.lat_deg, here.lon_deg) - way_m
+    at_its_ends_m = math.sqrt(2.0) * math.hypot(receiver_m, DELAY_SIGMA_S * speed_mps)
+    slip_sigma_m = math.hypot(LAG_S * vision.speed_sigma_mps, at_its_ends_m)
+    return Offset(metres, sigma_m, along_sigma_m, sigmas, slip_m, slip_sigma_m)
+
+
+def _metres(from_lat_deg: float, from_lon_deg: float, lat_deg: float, lon_deg: float) -> complex:
+    """From one place to another: east + j north."""
+    east_m = distance_m(from_lat_deg, from_lon_deg, from_lat_deg, lon_deg)
+    north_m = distance_m(from_lat_deg, from_lon_deg, lat_deg, from_lon_deg)
+    eastward = math.remainder(lon_deg - from_lon_deg, 360.0)
+    return complex(math.copysign(east_m, eastward), math.copysign(north_m, lat_deg - from_lat_deg))
