@@ -23,7 +23,7 @@ from terrafix.core.node import FrameStore, Image
 MAGIC = 0x31465852_52455431  # layout version 1
 BUDGET_BYTES = 192 * 2**20  # a tenth of the memory goal; 31 full-HD frames, 3 s at 10 Hz
 MAX_SLOTS = 32  # nobody is later than this many frames and still useful
-MIN_SLOTS = 4  # 6252x4168 photos (78 MB each) exceed the budget, but come slowly
+MIN_SLOTS = 4  # frames of 26 megapixels (78 MB each) exceed the budget, but come slowly
 CHANNELS = 3  # BGR
 _PAGE = 4096
 _SLOT_HEADER_WORDS = 8
@@ -39,7 +39,8 @@ class FrameWriter(FrameStore, Protocol):
 
 
 class MemoryFrameStore:
-    """The newest ``capacity`` frames of this process. What it returns is read-only: all readers share it."""
+    """The newest frames of this process: ``capacity`` of them, fewer of large ones, as in the live ring. What it
+    returns is read-only: all readers share it."""
 
     def __init__(self, capacity: int = MAX_SLOTS) -> None:
         self._capacity = capacity
@@ -50,7 +51,7 @@ class MemoryFrameStore:
         shared.flags.writeable = False
         self._frames.pop(frame_id, None)
         self._frames[frame_id] = shared
-        while len(self._frames) > self._capacity:
+        while len(self._frames) > min(self._capacity, _slots_for(image.nbytes)):
             self._frames.popitem(last=False)
 
     def get(self, frame_id: int) -> Image | None:

@@ -11,7 +11,7 @@ from terrafix.core.tlog import read_imu, read_tlog
 from terrafix.messages import Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, UpTo
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
-from terrafix.vision.sources.images import WRONG_SIZE, read_image
+from terrafix.vision.sources.images import WRONG_SIZE, read_image, reduced
 from terrafix.vision.sources.table import Row, read_table
 
 
@@ -24,7 +24,8 @@ class FlightFolder:
         self.folder = folder
         toml = folder / "flight.toml"
         self._description = read_description(toml)
-        self._origin = origin_of(self._description, camera_of(toml, self._description), start)
+        self._stored = camera_of(toml, self._description)
+        self._origin = origin_of(self._description, reduced(self._stored), start)
         self._rows = read_table(folder / "frames.csv", "frames.csv", with_file=True)
         self._check_files()
         self._check_size()
@@ -48,13 +49,13 @@ class FlightFolder:
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         from_ns = round(from_s * 1e9)
-        camera = self._origin.camera
+        camera, stored = self._origin.camera, self._stored
         states_of, imu_of = UpTo(self._states, from_ns), UpTo(self._imu, from_ns)
         for frame_id, row in enumerate(self._rows):
             states, imu = states_of(row.t_ns), imu_of(row.t_ns)
             if row.t_ns < from_ns:
                 continue
-            image, error = read_image(self.folder / "frames" / row.file, camera.width, camera.height)
+            image, error = read_image(self.folder / "frames" / row.file, stored.width, stored.height)
             frame = Frame(
                 t_ns=row.t_ns,
                 frame_id=frame_id,
@@ -81,9 +82,9 @@ class FlightFolder:
 
     def _check_size(self) -> None:
         """One frame of another size is a bad frame; the first, the middle and the last are a wrong [camera]."""
-        camera = self._origin.camera
+        stored = self._stored
         for row in (self._rows[0], self._rows[len(self._rows) // 2], self._rows[-1]):
-            _, error = read_image(self.folder / "frames" / row.file, camera.width, camera.height)
+            _, error = read_image(self.folder / "frames" / row.file, stored.width, stored.height)
             if not error.startswith(WRONG_SIZE):
                 return
         raise SourceError(

@@ -17,7 +17,7 @@ from terrafix.messages import Camera, Frame, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import Description, StartTable, camera_of, origin_of, read_description
 from terrafix.vision.sources.exif import PhotoInfo, read_info
-from terrafix.vision.sources.images import IMAGE_SUFFIXES, read_image
+from terrafix.vision.sources.images import IMAGE_SUFFIXES, read_image, reduced
 
 GIMBAL_TOLERANCE_DEG = 3.0  # a stabilised gimbal that says where it points
 UNKNOWN_TOLERANCE_DEG = 10.0  # nothing says how the camera hangs
@@ -42,7 +42,8 @@ class Photos:
         self._photos = in_time_order(infos)
         self._description, self._where = self._describe(camera)
         first = next(info for _, info, _ in self._photos if info is not None)
-        self._origin = self._make_origin(first, start)
+        self._stored = camera_of(self._where, self._description) if self._description.camera else self._of_exif(first)
+        self._origin = self._make_origin(first, reduced(self._stored), start)
 
     def origin(self) -> Origin:
         return self._origin
@@ -60,12 +61,12 @@ class Photos:
         """Nothing stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
-        camera = self._origin.camera
+        camera, stored = self._origin.camera, self._stored
         for frame_id, (path, info, t_s) in enumerate(self._photos):
             if t_s < from_s:
                 continue
             t_ns = round(t_s * 1e9)
-            image, error = read_image(path, camera.width, camera.height)
+            image, error = read_image(path, stored.width, stored.height)
             frame = Frame(
                 t_ns=t_ns, frame_id=frame_id, file=path.name, width=camera.width, height=camera.height, error=error
             )
@@ -79,14 +80,13 @@ class Photos:
             return read_description(camera), camera
         return (read_description(beside), beside) if beside.is_file() else (Description(), beside)
 
-    def _make_origin(self, first: PhotoInfo, start: tuple[float, float] | None) -> Origin:
+    def _make_origin(self, first: PhotoInfo, camera: Camera, start: tuple[float, float] | None) -> Origin:
         written = self._description
-        camera = camera_of(self._where, written) if written.camera else self._camera_of_exif(first)
         if start is None and written.start is None and first.lat_deg is not None and first.lon_deg is not None:
             written = _with_start(written, first.lat_deg, first.lon_deg)
         return origin_of(written, camera, start)
 
-    def _camera_of_exif(self, first: PhotoInfo) -> Camera:
+    def _of_exif(self, first: PhotoInfo) -> Camera:
         source = next((info for _, info, _ in self._photos if info is not None and info.focal_px), None)
         if source is None or source.focal_px is None:
             raise SourceError(
