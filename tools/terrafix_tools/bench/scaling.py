@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from terrafix_tools.bench import growth, map_size, merging, rendering
+from terrafix_tools.bench import growth, map_size, merging, photos, rendering
 
 AREAS_KM2 = (1.0, 10.0, 100.0)
 FLIGHTS_FRAMES = (100, 1000, 3000)
@@ -24,7 +24,7 @@ def measure(
     flights_frames: tuple[int, ...] = FLIGHTS_FRAMES,
 ) -> dict[str, Any]:
     """-> "map": one entry for each area, "flight": one for each length, "merge": of the fragments of a torn flight,
-    "render": one frame of the simulator."""
+    "render": one frame of the simulator, "photos": the first position of photos of 26 megapixels."""
     maps, flights = [], []
     for area_km2 in areas_km2:
         folder = work / f"map-{area_km2:g}"
@@ -41,7 +41,9 @@ def measure(
         merged = _run(merging.__name__, str(MERGED_KEYFRAMES), out=work / "merging.json")
     with console.status("frames of the simulator"):
         rendered = _run(rendering.__name__, out=work / "render.json")
-    return {"map": maps, "flight": flights, "merge": merged, "render": rendered}
+    with console.status("photos of 26 megapixels"):
+        large = _run(photos.__name__, out=work / "photos.json")
+    return {"map": maps, "flight": flights, "merge": merged, "render": rendered, "photos": large}
 
 
 def show(grown: dict[str, Any], console: Console) -> None:
@@ -77,6 +79,13 @@ def show(grown: dict[str, Any], console: Console) -> None:
     one = grown["render"]
     size = f"{one['width_px']}x{one['height_px']}"
     console.print(f"a simulated frame of {size}: {one['cpu_ms']['median']:.0f} ms of processor time", highlight=False)
+    one = grown["photos"]
+    size, first_s, memory_mb = f"{one['width_px']}x{one['height_px']}", one["first_position_s"], one["peak_memory_mb"]
+    console.print(
+        f"photos of {size}: first position {first_s:.1f} s after the start of the program, then "
+        f"{one['frame_ms']['median']:.0f} ms a photo; {memory_mb:.0f} MB",
+        highlight=False,
+    )
 
 
 def _side_by_side(title: str, cases: list[dict[str, str]]) -> Table:
