@@ -1,11 +1,13 @@
 """One frame over imagery of another date: how often does the anchor find the place, and is it ever sure of a wrong one?
 
 python -m terrafix_tools.bench.two_dates FIRST.tif SECOND.tif [--places 100] [--elsewhere 250] [--json OUT]
+    [--model xfeat] [--model own.onnx]
 
 A camera looks down on the first image, the second one is the map. All that flies takes part: package, look, belief,
 pose and their gates (``AnchorNode``). It is told a place, a heading and a height that are all off, and nothing came
 before. The frames of ``--elsewhere`` are of ground far from where they are said to be: what is accepted is wrong; a
-coarse fix, without a pose, goes no further than the estimator, which takes it only to continue a track."""
+coarse fix, without a pose, goes no further than the estimator, which takes it only to continue a track. With
+``--model`` the same frames are seen by each of these, too: the name of a fetched model, or a file of one's own."""
 
 import argparse
 import json
@@ -27,7 +29,8 @@ from terrafix.core.errors import MapError, TerrafixError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import local_crs, quat_from_rot, rot_from_quat
 from terrafix.messages import Camera, MapMatch, Origin, Prediction, Verdict
-from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_engines.features import open_describer
+from terrafix_engines.runtime import ModelFileError
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.models.pair import same_grid
@@ -133,9 +136,13 @@ class Places:
         return origin, prediction
 
 
-def measure(first: Path, second: Path, places: int, elsewhere: int) -> tuple[list[Answer], list[Answer]]:
-    """Answers to frames of about the place that was told, and to frames from elsewhere. Raises MapError."""
+def measure(
+    first: Path, second: Path, places: int, elsewhere: int, model: str = ""
+) -> tuple[list[Answer], list[Answer]]:
+    """Answers to frames of about the place that was told, and to frames from elsewhere. ``model``: as [models] xfeat
+    has it; empty: without weights. Raises MapError, ModelFileError."""
     drawn, frames = Places(first, second), MemoryFrameStore(1)
+    describer = open_describer(model)
     package = MapPackage.open(ensure_package(second, map_cache_dir()))
     ce90_m = load([]).map.ce90_m
 
@@ -143,7 +150,7 @@ def measure(first: Path, second: Path, places: int, elsewhere: int) -> tuple[lis
         picture, true_px, told_px = drawn.draw(from_elsewhere)
         origin, prediction = drawn.told(told_px)
         frames.put(prediction.frame_id, picture)
-        anchor = AnchorNode(frames, package, GradientDescriber(), ce90_m)
+        anchor = AnchorNode(frames, package, describer, ce90_m)
         list(anchor.on(origin))
         began_s = time.process_time()
         match = next(m for m in anchor.on(prediction) if isinstance(m, MapMatch))
@@ -182,7 +189,7 @@ def row(name: str, places: list[Answer], elsewhere: list[Answer]) -> str:
     inside = f"{100 * np.mean([a.inside for a in sure]):.0f} %" if sure else "-"
     cpu_ms = np.median([a.cpu_ms for a in places])
     return (
-        f"{name:24} {len(places):6} {near:6.0f} % {far:6.0f} % {len(sure):6} {sum(a.error_px > FAR_PX for a in sure):6}"
+        f"{name:40} {len(places):6} {near:6.0f} % {far:6.0f} % {len(sure):6} {sum(a.error_px > FAR_PX for a in sure):6}"
         f" {inside:>7} {len(elsewhere):10} {len(wrong) - coarse:6} {coarse:7} {cpu_ms:7.0f} ms"
     )
 
@@ -194,18 +201,23 @@ def main() -> None:
     parser.add_argument("--places", type=int, default=100)
     parser.add_argument("--elsewhere", type=int, default=250)
     parser.add_argument("--json", type=Path, help="writes every answer")
+    parser.add_argument("--model", action="append", default=[], metavar="NAME or FILE", help="beside none; repeatable")
     given = parser.parse_args()
-    try:
-        answers = measure(given.first, given.second, given.places, given.elsewhere)
-    except TerrafixError as error:
-        sys.exit(f"{error}")
     typer.echo(
-        f"{'camera on map':24} places {f'<= {NEAR_PX:g}px':>8} {f'<= {FAR_PX:g}px':>8}   sure  wrong  inside  elsewhere"
+        f"{'camera on map':40} places {f'<= {NEAR_PX:g}px':>8} {f'<= {FAR_PX:g}px':>8}   sure  wrong  inside  elsewhere"
         "  wrong  coarse      CPU"
     )
-    typer.echo(row(f"{given.first.stem} on {given.second.stem}", *answers))
+    written = {}
+    for model in ["", *given.model]:
+        try:
+            answers = measure(given.first, given.second, given.places, given.elsewhere, model)
+        except (TerrafixError, ModelFileError) as error:
+            sys.exit(f"{error}")
+        by = Path(model).stem if model else "no weights"
+        typer.echo(row(f"{given.first.stem} on {given.second.stem}, {by}", *answers))
+        kinds = zip(("places", "elsewhere"), answers, strict=True)
+        written[by] = {name: [asdict(a) for a in one] for name, one in kinds}
     if given.json is not None:
-        written = {name: [asdict(a) for a in one] for name, one in zip(("places", "elsewhere"), answers, strict=True)}
         given.json.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
 
 
