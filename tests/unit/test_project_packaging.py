@@ -23,16 +23,20 @@ EXTRAS = {
 }
 IMPORTED_AS = {"opencv-python-headless": "cv2", "pyserial": "serial", "pyzmq": "zmq", "pillow": "PIL"}
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist"}  # used by scripts/check, imported by nobody
+TRAINING = ROOT / "engines" / "terrafix_engines" / "train"  # beside the engines, and stays on the ground
+EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools"}
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 
-def imported(*folders: str) -> set[str]:
-    """First names of all third-party modules that are imported below the folders."""
+def imported(*folders: str, training: bool = True) -> set[str]:
+    """First names of all third-party modules that are imported below the folders; with or without the training."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
         for path in (ROOT / folder).rglob("*.py"):
+            if not training and TRAINING in path.parents:
+                continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Import):
                     found |= {alias.name.split(".")[0] for alias in node.names}
@@ -47,11 +51,12 @@ def modules(requirements: dict[str, Requirement]) -> set[str]:
 
 
 def test_what_flies_imports_only_the_core_dependencies() -> None:
-    assert imported("daemon", "engines") <= modules(CORE)
+    assert imported("daemon", "engines", training=False) <= modules(CORE)
 
 
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
+    declared |= modules(EXTRAS["train"]) - EXPORTER
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
@@ -60,17 +65,18 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
 def test_every_dependency_has_a_range() -> None:
     for requirement in [
         *CORE.values(),
-        *(one for extra in ("ground", "sim", "cluster") for one in EXTRAS[extra].values()),
+        *(one for extra in ("ground", "sim", "cluster", "train") for one in EXTRAS[extra].values()),
     ]:
         operators = {specifier.operator for specifier in requirement.specifier}
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"
 
 
 def test_the_lock_holds_every_dependency_within_its_range() -> None:
+    """But for the training: its PyTorch is that of the GPU's driver."""
     locked: dict[str, list[str]] = {}
     for name, version in re.findall(r"^([\w.-]+)==([^\s;]+)", LOCK, flags=re.M):
         locked.setdefault(canonicalize_name(name), []).append(version)
-    for requirements in (CORE, *EXTRAS.values()):
+    for requirements in (CORE, *(EXTRAS[extra] for extra in EXTRAS if extra != "train")):
         for name, requirement in requirements.items():
             assert name in locked, f"{name} is not in requirements.lock: run scripts/lock"
             for version in locked[name]:

@@ -28,6 +28,7 @@ OWNERS = {
     "mavsdk": ("terrafix_tools.sim.sitl",),
     "serial": ("terrafix.link",),
     "onnxruntime": ("terrafix_engines",),
+    "torch": ("terrafix_engines.train",),
     "faiss": ("terrafix.anchor",),
     "systemd": ("terrafix.supervisor",),
     "zmq": ("terrafix.core", "terrafix.supervisor"),

@@ -1,0 +1,102 @@
+"""The list of places that is trained on: aligned by their georeference, and held out as wholes. Needs no PyTorch."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine
+
+from terrafix_engines.train.errors import TrainingError
+from terrafix_engines.train.ground import Place, read_list, read_places
+
+GSD_M = 0.5
+
+
+def geotiff(path: Path, picture: np.ndarray, west_m: float, north_m: float, gsd_m: float = GSD_M) -> None:
+    """``picture`` (H, W, 3) RGB."""
+    transform = Affine(gsd_m, 0, west_m, 0, -gsd_m, north_m)
+    size = {"height": picture.shape[0], "width": picture.shape[1], "count": 3}
+    with rasterio.open(path, "w", driver="GTiff", dtype="uint8", crs="EPSG:32633", transform=transform, **size) as file:
+        file.write(picture.transpose(2, 0, 1))
+
+
+def ground(seed: int, height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
+
+
+def test_dates_of_a_place_are_cut_to_what_all_of_them_show(tmp_path: Path) -> None:
+    whole = ground(1, 800, 900)
+    geotiff(tmp_path / "a.tif", whole[:700, :850], 1000.0, 5000.0)
+    geotiff(tmp_path / "b.tif", whole[20:, 31:], 1000.0 + 31 * GSD_M, 5000.0 - 20 * GSD_M)
+    levels = read_places([Place(name="here", pictures=["a.tif", "b.tif"])], tmp_path)
+    assert levels[0].pictures.shape == (2, 3, 680, 819)
+    expected = whole[20:700, 31:850].transpose(2, 0, 1)
+    np.testing.assert_array_equal(levels[0].pictures[0], expected)
+    np.testing.assert_array_equal(levels[0].pictures[1], expected)
+
+
+def test_a_large_place_has_several_scales(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), ground(1, 1400, 1300))
+    levels = read_places([Place(name="here", pictures=["a.png"])], tmp_path)
+    assert [level.pictures.shape for level in levels] == [(1, 3, 1400, 1300), (1, 3, 700, 650)]
+
+
+@pytest.mark.parametrize(
+    "second, said",
+    [
+        ({"west_m": 1000.0, "gsd_m": 0.6}, "another size"),
+        ({"west_m": 1000.0 + 500 * GSD_M}, "less than 640 px"),
+        ({"west_m": 90_000.0}, "less than 640 px"),
+    ],
+)
+def test_dates_that_do_not_fit_are_refused(tmp_path: Path, second: dict[str, float], said: str) -> None:
+    geotiff(tmp_path / "a.tif", ground(1, 800, 800), 1000.0, 5000.0)
+    geotiff(tmp_path / "b.tif", ground(2, 800, 800), north_m=5000.0, **second)
+    with pytest.raises(TrainingError, match=said):
+        read_places([Place(name="here", pictures=["a.tif", "b.tif"])], tmp_path)
+
+
+def test_pictures_without_a_place_must_be_of_one_size(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), ground(1, 800, 800))
+    cv2.imwrite(str(tmp_path / "b.png"), ground(1, 800, 801))
+    with pytest.raises(TrainingError, match="not georeferenced"):
+        read_places([Place(name="here", pictures=["a.png", "b.png"])], tmp_path)
+
+
+def listed(*places: tuple[str, str, bool]) -> str:
+    return "".join(
+        f'[[place]]\nname = "{name}"\npictures = ["{picture}"]\nheld_out = {str(held_out).lower()}\n'
+        for name, picture, held_out in places
+    )
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        (listed(("a", "a.tif", False), ("b", "b.tif", False)), "held_out = true"),
+        (listed(("a", "a.tif", True)), "to train on"),
+        (listed(("a", "a.tif", False), ("a", "b.tif", True)), "one name"),
+        (listed(("a", "a.tif", False), ("b", "a.tif", True)), "a.tif is trained on and held out"),
+        ("[[place]]\nname = 'a'\n", "pictures"),
+        ("[place", "no list of places"),
+    ],
+)
+def test_a_list_that_would_measure_what_it_trained_on_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "places.toml"
+    path.write_text(text)
+    with pytest.raises(TrainingError, match=said):
+        read_list(path)
+
+
+def test_without_pytorch_one_line_says_what_to_install() -> None:
+    code = (
+        "import runpy, sys; sys.modules['torch'] = None; sys.argv = ['train', 'x.toml', '--out', 'y'];"
+        "runpy.run_module('terrafix_engines.train', run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr == "training needs PyTorch; install it: pip install 'terrafix[train]'\n"
