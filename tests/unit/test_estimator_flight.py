@@ -118,6 +118,15 @@ def velocity_errors(flight: Flight, run: Listener) -> np.ndarray:
     return np.array([run.estimate(i).velocity_enu_mps for i in range(20, 299)]) - true
 
 
+def test_a_step_is_claimed_as_well_as_it_is_seen(long_flight: Flight, long_run: Listener) -> None:
+    """The anchor's belief and searches live on it. How the ground rises, which no map tells here, is no part of it."""
+    said = [m for m in long_run.said if isinstance(m, Prediction) and m.frame_id > 20]
+    sigmas_m = np.sqrt([m.step_cov_m2[0] for m in said])
+    errors_m = [m.step_m - np.diff(long_flight.p_m[m.frame_id - 1 : m.frame_id + 1], axis=0)[0, :2] for m in said]
+    assert np.mean(np.square(errors_m) / sigmas_m[:, None] ** 2) < 1.5
+    assert np.median(sigmas_m) < 0.2 * SPEED_MPS * FRAME_S
+
+
 def test_refined_positions_are_no_worse(long_flight: Flight, long_run: Listener) -> None:
     last = [m for m in long_run.said if isinstance(m, Refinement)][-1]
     assert sorted(p.frame_id for p in last.poses) == list(range(300))

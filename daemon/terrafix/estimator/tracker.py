@@ -156,7 +156,9 @@ class Tracker:
         step_sigma = STANDING_M if way is None else float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1]))
         if known is not None:
             seen = r_w_c @ motion.cov[3:, 3:] @ r_w_c.T
-            step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), np.sqrt(np.trace(seen) / 3.0)))
+            # Of the step over the ground: where no map tells how that rises, the height is known far less well.
+            aside_m = np.sqrt(np.linalg.eigvalsh(seen[:2, :2])[-1])
+            step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), aside_m))
             if way is not None:
                 way, spread = believed(way, p - led_to, spread, seen)
                 if self._height_is_open(attitude, before):
