@@ -206,6 +206,18 @@ def test_a_flight_that_is_too_short_is_said_to_be() -> None:
     assert "GeoTIFF" in str(BY_NAME["20 % unmatchable"].plan(straight(map_path=Path("map.gpkg"))))
 
 
+def test_the_unmatchable_fifth_is_where_the_flight_does_not_come_again() -> None:
+    """Two thirds of it go round and round over one place; a map that is stale there would be so for all of them."""
+    place, frames = LocalFrame(48.0, 11.0), 60
+    turns = [(50.0 * np.sin(i), 50.0 * np.cos(i)) for i in range(40)]
+    at = [*turns, *((100.0 * (i + 1), 0.0) for i in range(20))]
+    truth = {f"{i}.jpg": Truth(*place.to_wgs84(*p)) for i, p in enumerate(at)}
+    stops = [Stop(f"{i}.jpg", i * 0.5, None) for i in range(frames)]
+    plan = BY_NAME["20 % unmatchable"].plan(Flight("flight", Path("map.tif"), None, truth, stops, footprint_m=100.0))
+    assert isinstance(plan, Plan)
+    assert plan.marks.spans[0].from_s >= 0.5 * 40 and plan.marks.spans[0].to_s < 0.5 * 58
+
+
 def test_a_stale_map_differs_along_the_stretch_only(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (3, 400, 600), dtype=np.uint8)

@@ -10,7 +10,8 @@ import numpy as np
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.rundir import write_whole
 from terrafix.core.start import SEARCHED_START_M
-from terrafix.estimator.velocity import MAX_SPEED_SIGMA_MPS, TYPICAL_SPEED_MPS, leg
+from terrafix.estimator.pace import TYPICAL_SPEED_MPS
+from terrafix.estimator.velocity import MAX_SPEED_SIGMA_MPS, leg
 from terrafix.messages import Message, NavEstimate, Origin
 
 KEPT_EVERY_NS = 200_000_000

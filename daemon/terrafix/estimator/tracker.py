@@ -18,12 +18,12 @@ from terrafix.estimator.mounted import (
     UNKNOWN_RAD,
     MountedCamera,
 )
+from terrafix.estimator.pace import Pace
 from terrafix.estimator.resume import Known
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
 from terrafix.estimator.velocity import (
     STANDING_M,
-    TYPICAL_SPEED_MPS,
     V_SIZE,
     Felt,
     Leg,
@@ -40,9 +40,8 @@ from terrafix.messages import CovarianceMode, Odometry, Origin, Verdict
 # a compass that is 15 degrees off must still be inside the search (1.5 sigma).
 COMPASS_BIAS_RAD = np.radians(10.0)
 HEIGHT_BIAS = 0.05  # of the height
-MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
-OPEN_HEIGHT = 0.2  # 1-sigma, share of the height, beyond which nobody knows it; a map match leaves a few hundredths
 FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
+MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 
@@ -90,7 +89,7 @@ class Tracker:
         self._frames = array("q")  # of each node
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
         self._velocity_cov = np.zeros((V_SIZE, V_SIZE))  # of V of the newest node
-        self._pace_mps = TYPICAL_SPEED_MPS  # how fast it was when it was last seen to fly
+        self._pace = Pace()
         self._felt: bool | None = None  # whether the last leg was measured; None: there was none
         self._stood_at: int | None = None  # node at which a vehicle stands, motors off
         self._launching = False  # it stood, and was not seen to fly since ...
@@ -161,8 +160,6 @@ class Tracker:
             step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), aside_m))
             if way is not None:
                 way, spread = believed(way, p - led_to, spread, seen)
-                if self._height_is_open(attitude, before):
-                    way = way.without_a_say(MAX_SPEED_MPS, max(t_s - self.graph.time_of(newest), 1e-3))
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
         state = NodeState(pose, before.bias, velocity)
@@ -184,8 +181,7 @@ class Tracker:
         self._velocity_cov = spread[3:, 3:]
         self._last = self._placed(frame_id, t_s, node)
         if known is not None:
-            v = self._last.velocity_mps[:2]
-            self._pace_mps = float(np.sqrt(v @ v + np.trace(self._last.velocity_cov[:2, :2])))
+            self._pace.seen(self._last.velocity_mps, self._last.velocity_cov, t_s - self.graph.time_of(newest))
         return Advance(verdict, self._last, step, step_sigma)
 
     def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Leg:
@@ -199,20 +195,11 @@ class Tracker:
             measured,
             (yaws[0], yaws[1]),
             float(before.bias[2]),
-            self._pace_mps,
+            self._pace.mps,
             np.radians(self.origin.attitude_sigma_deg),
             same_kind=self._felt is (measured is not None),
             launching=self._launching,
         )
-
-    def _height_is_open(self, attitude: Attitude, before: NodeState) -> bool:
-        """No autopilot and no map match says how high it flies: nobody knows how long the ways are that are seen. Legs
-        must not choose: all of them agree best with no way at all, and the height would fall to the ground."""
-        if attitude.agl_m is not None:
-            return False
-        p, r_w_c = before.pose.translation(), before.pose.rotation().matrix()
-        sigma_m = float(np.sqrt(r_w_c[2] @ self._covariance(self.graph.newest)[3:, 3:] @ r_w_c[2]))
-        return sigma_m > OPEN_HEIGHT * max(float(p[2]) - self.terrain.below(p), 1.0)
 
     def _has_taken_off_blind(self, seen: bool, way: Leg | None, led_to_m: np.ndarray) -> bool:
         """It is seen to fly after a take-off that nothing measured. Told of the speed at both ends, a graph would

@@ -26,7 +26,6 @@ MANOEUVRE_S = 3.0
 # ... and of one that stood a moment ago: a take-off run, a throw, a climb that begins (a simulated plane: 10 m/s^2).
 LAUNCH_MPS2 = np.array([6.0, 6.0, 5.0])
 LEAST_SPEED_MPS = 5.0  # one that hovers may have begun to fly
-TYPICAL_SPEED_MPS = 10.0  # of one that has not been seen to fly: for how it manoeuvres
 # With IMU: half the variance of the autopilot's attitude wanders, and so long an attitude filter stays wrong in one
 # direction. The other half is a board that is not level. Bias and scale of small accelerometers after calibration are
 # 5 mg and 0.3 % (InvenSense DS-000347); with half a degree of the board they make the steady error.
@@ -107,13 +106,6 @@ class Leg:
         leg that nobody felt compares heights a second with heights a second: one that forgets its course would have
         the vehicle slower at its end, and so nearer to the ground."""
         return replace(self, over=(height_m, ground_m))
-
-    def without_a_say(self, speed_mps: float, dt_s: float) -> "Leg":
-        """The same for a vehicle that may have flown with any speed up to this."""
-        cov = self.cov.copy()
-        cov[:3, :3] += (speed_mps * dt_s) ** 2 * np.eye(3)
-        cov[3:6, 3:6] += speed_mps**2 * np.eye(3)
-        return replace(self, cov=cov)
 
 
 def unmeasured_sigma(felt: bool, speed_mps: float, tilt_sigma_rad: float, launching: bool = False) -> np.ndarray:

@@ -13,14 +13,15 @@ from terrafix_tools.accept.criteria import EVERYWHERE
 from terrafix_tools.accept.fault_nodes import FrameNames, HotComputer, WrongFixes
 from terrafix_tools.accept.flight import Flight
 from terrafix_tools.accept.judged import Marks, Span
-from terrafix_tools.accept.stale_map import stale_along
+from terrafix_tools.accept.stale_map import REACH, stale_along
 from terrafix_tools.replay import MakeNodes, make_nodes
 
 FOREIGN_AT = (0.3, 0.55, 0.8)  # of the frames
 FAR_M = 350.0
 BLACKOUT_S, STALL_S = 60.0, 10.0
 BEFORE_S, AFTER_S = 20.0, 25.0  # of flight, around a blackout
-UNMATCHABLE = (0.40, 0.60)  # of the frames: a fifth of the route
+UNMATCHABLE, UNMATCHABLE_WITHIN = 0.20, (0.10, 0.90)  # of the frames: a fifth of the route, neither end of it
+UNMATCHABLE_STEP = 0.05
 HOT = (1 / 3, 2 / 3)
 LONG_FRAMES = 1500
 OUTLIER_EVERY = 10  # up to 10 % wrong map matches do no harm (AC-5)
@@ -136,13 +137,29 @@ def _share_of(flight: Flight, shares: tuple[float, float], text: str) -> Span:
 def _unmatchable(flight: Flight) -> Plan | str:
     if flight.map_path is None or flight.map_path.suffix.lower() == ".gpkg":
         return "needs the map as a GeoTIFF, to make it stale along a fifth of the route"
-    first, last = (flight.at(share) for share in UNMATCHABLE)
+    shares = _fifth(flight)
+    first, last = (flight.at(share) for share in shares)
     stretch = [flight.truth[s.file] for s in flight.stops[first : last + 1] if s.file in flight.truth]
 
     def other_map(given: Path, out: Path) -> str:
         return stale_along(given, out, stretch, flight.footprint_m)
 
-    return Plan(other_map=other_map, marks=Marks(spans=(_share_of(flight, UNMATCHABLE, "the map shows other ground"),)))
+    return Plan(other_map=other_map, marks=Marks(spans=(_share_of(flight, shares, "the map shows other ground"),)))
+
+
+def _fifth(flight: Flight) -> tuple[float, float]:
+    """Where it begins and ends, as shares of the frames: the fifth of whose ground the other frames see least.
+
+    A flight that circles over a stretch would find no map at all."""
+    track, seen = flight.track_m(), {}
+    for begin in np.arange(UNMATCHABLE_WITHIN[0], UNMATCHABLE_WITHIN[1] - UNMATCHABLE + 1e-6, UNMATCHABLE_STEP):
+        first, end = flight.at(begin), flight.at(begin + UNMATCHABLE) + 1
+        others = np.delete(track, np.s_[first:end], axis=0)
+        away = np.hypot(*(others[:, None] - track[None, first:end]).transpose(2, 0, 1))
+        near = np.nan_to_num(away, nan=np.inf).min(axis=1) < REACH * flight.footprint_m
+        seen[float(begin)] = int(near.sum())
+    begin = min(seen, key=seen.__getitem__)
+    return begin, begin + UNMATCHABLE
 
 
 def _long_route(_: Flight) -> Plan:
