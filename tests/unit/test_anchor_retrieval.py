@@ -8,13 +8,12 @@ import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
 from terrafix.anchor.agreement import Agreement
+from terrafix.anchor.chance import COARSE, PATCHES, Chance
 from terrafix.anchor.lost import MOST_ODDS, LostWatch, pose_gain
 from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.anchor.tracks import (
     AHEAD,
-    CHANCE_MEAN,
-    CHANCE_PATCHES,
     ENOUGH,
     LEADS,
     LLR_MAX,
@@ -156,14 +155,31 @@ def test_odometry_moves_a_track() -> None:
 
 def test_a_proposal_near_a_track_replaces_it_until_a_frame_has_spoken_for_it(ground: np.ndarray) -> None:
     tracks = searched(BoundedMap(ground), None).tracks
-    for e_m in (0.0, 0.3 * AGL_M):
+    for e_m in (0.0, 0.15 * AGL_M):
         tracks.propose(e_m, 0.0, Hypothesis(0.0, 1.0), AGL_M)
-    assert [t.e_m for t in tracks.all] == [0.3 * AGL_M]
+    assert [t.e_m for t in tracks.all] == [0.15 * AGL_M]
     tracks.all[0].score = 1.0
     tracks.propose(0.0, 0.0, Hypothesis(0.0, 1.0), AGL_M)
-    assert [t.e_m for t in tracks.all] == [0.3 * AGL_M]
-    tracks.propose(-0.2 * AGL_M, 0.0, Hypothesis(0.0, 1.0), AGL_M)
+    assert [t.e_m for t in tracks.all] == [0.15 * AGL_M]
+    tracks.propose(-0.1 * AGL_M, 0.0, Hypothesis(0.0, 1.0), AGL_M)
     assert len(tracks.all) == 2
+
+
+def test_the_next_row_of_houses_is_followed_too(ground: np.ndarray) -> None:
+    """The best place of a look has a lesser one beside it: both are tracks, and lead other places."""
+    search = searched(BoundedMap(ground), None)
+    picture, _ = next(frames(ground, 1))
+    search.look(picture, predicted())
+    search.tracks.all = []
+    z = np.zeros(search._shape, np.float32)
+    row, column = (side // 2 for side in search._shape)
+    beside = round(0.3 * AGL_M / search._cell_m)
+    z[row, column], z[row, column + beside], z[row + 3 * beside, column] = 9.0, 8.0, 5.0
+    search._judge(z, np.zeros(search._shape, np.uint8), AGL_M)
+    best, second = sorted(search.tracks.all, key=lambda t: -t.leads[-1])[:2]
+    assert second.e_m - best.e_m == pytest.approx(0.3 * AGL_M, abs=search._cell_m)
+    assert best.leads[-1] == pytest.approx(9.0 - 5.0)
+    assert second.leads[-1] == pytest.approx(8.0 - 5.0 - (9.0 - 8.0))
 
 
 def track_of(score: float, leads: tuple[float, ...] = (), frames: int = MIN_FRAMES, e_m: float = 0.0) -> Track:
@@ -222,15 +238,31 @@ def test_a_lead_counts_once_it_has_lasted() -> None:
     assert track.lead == -2.0 and track.odds < 0.0 and len(track.leads) == LEADS
 
 
-def test_what_chance_comes_to_is_no_evidence() -> None:
-    def of(llr: float, patches: int) -> float:
-        none = np.zeros(patches, bool)
-        return evidence(Agreement(llr, np.zeros(6), np.zeros((patches, 2)), none))
+def of(llr: float, patches: int = PATCHES) -> Agreement:
+    return Agreement(llr, np.zeros(6), np.zeros((patches, 2)), np.zeros(patches, bool))
 
-    assert of(CHANCE_MEAN, CHANCE_PATCHES) == LLR_MIN < 0.0 < of(2.0 * CHANCE_MEAN, CHANCE_PATCHES)
-    assert of(40.0, CHANCE_PATCHES) == LLR_MAX
-    assert of(0.25 * CHANCE_MEAN, CHANCE_PATCHES // 4) < 0.0  # fewer patches: by chance they come to less, too
-    assert of(CHANCE_MEAN, CHANCE_PATCHES // 4) > of(CHANCE_MEAN, CHANCE_PATCHES)
+
+def test_what_chance_comes_to_is_no_evidence() -> None:
+    chance, by_chance = Chance(), COARSE[0]
+
+    def gain(llr: float, patches: int) -> float:
+        return evidence(chance.sigmas(of(llr, patches), fine=False))
+
+    assert gain(by_chance, PATCHES) == LLR_MIN < 0.0 < gain(2.0 * by_chance, PATCHES)
+    assert gain(40.0, PATCHES) == LLR_MAX
+    assert gain(0.25 * by_chance, PATCHES // 4) < 0.0  # fewer patches: by chance they come to less, too
+    assert gain(by_chance, PATCHES // 4) > gain(by_chance, PATCHES)
+
+
+def test_ground_that_repeats_has_to_say_more() -> None:
+    """What its wrong places come to is chance there, on the cells on which it was seen."""
+    chance = Chance()
+    before = chance.sigmas(of(16.0), fine=True)
+    for llr in np.random.default_rng(1).normal(12.0, 2.7, 200):
+        chance.learn(of(float(llr)), fine=True)
+        chance.learn(of(60.0, PATCHES // 2), fine=True)  # half of them beyond the map
+    assert before > 2.5 and chance.sigmas(of(16.0), fine=True) == pytest.approx(1.55, abs=0.3)
+    assert chance.sigmas(of(16.0), fine=False) == Chance().sigmas(of(16.0), fine=False)
 
 
 def test_more_patches_say_more() -> None:

@@ -13,6 +13,9 @@ COARSE_TILT_RAD = np.radians(10.0)  # a coarse fix says nothing of attitude: as 
 COARSE_HEIGHT_M = 100.0  # ... nor of height, unless several scales were looked at, and one between them fits best
 COARSE_SCALE = 0.05  # ... to this share of it, and what they leave open: what is seen lies above the ground, or below
 COARSE_SIGMA = 0.03  # of the height: buildings that lean and a scale that is not quite right shift the whole picture
+# Of the height, for each axis: what a whole place may be aside. The patches that a pose stands on lean and have changed
+# together, and their scatter does not show it. Measured at places that searches found: docs/search.md.
+FOUND_SIGMA = 0.02
 MODE_DRIFT = 0.35  # of the height: how far the pose may lie from the mode while the tilt is not yet known
 
 
@@ -66,3 +69,15 @@ def judged(answer: MapMatch, fix: Fix | None, view: View) -> MapMatch:
         inliers=int(pnp.inliers.sum()),
         reprojection_px=float(np.sqrt(np.mean(pnp.fit.residuals**2))) * view.agl_m / fix.cell_m,
     )
+
+
+def found(answer: MapMatch, fix: Fix, view: View, jump_m: tuple[float, float]) -> MapMatch:
+    """As ``judged``, of a place that a search has found: its first pose, which nothing that came before holds.
+    ``jump_m``: east and north, of its frame against where the frames before have it. Where patches say little, they
+    agree with a wrong motion as well, and those of the next frame with another one."""
+    said = judged(msgspec.structs.replace(answer, found=True), fix, view)
+    if said.cov is None:
+        return said
+    cov = np.array(said.cov).reshape(6, 6)
+    cov[:2, :2] += (FOUND_SIGMA * view.agl_m) ** 2 * np.eye(2) + np.outer(jump_m, jump_m)
+    return msgspec.structs.replace(said, cov=tuple(float(v) for v in cov.ravel()))

@@ -18,7 +18,7 @@ from terrafix.messages import Verdict
 
 # Finer cells tell the right place from chance better (measured: by a fourth in standard deviations), at twice the cost.
 CELL_PER_AGL, FINE_PER_AGL = 1 / 100, 1 / 140
-REACH = 0.16  # of the height: what heading, scale and tilt may do at the rim, and the place itself
+REACH = 0.2  # of the height: what heading, scale and tilt may do at the rim, and the place itself
 SIGMA_FLOOR = 0.02  # of the height: leaning buildings and changes take patches aside together
 
 

@@ -12,7 +12,7 @@ from terrafix.anchor.correlate import standardise
 from terrafix.anchor.map_package import LocalMap
 from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.mosaic import Mosaic
-from terrafix.anchor.tracks import NEAR, Found, Tracks
+from terrafix.anchor.tracks import NEAR, SAME, Found, Tracks
 from terrafix.anchor.wide_search import BLOCK_CELLS, Block, WideSearch, blocks_of
 from terrafix.core.node import Image
 from terrafix.messages import SearchStep
@@ -34,6 +34,7 @@ DRIFT = 0.06  # of the height: frames that odometry places less well than this a
 UNSEEN = 0.1  # of the height: where odometry knows less, the ground may be another; hovering is no way
 JOINED = 2.0  # heights: frames farther away than this are not joined; the cost of a look grows with what is
 PROPOSED = 12  # places that a look may propose
+NEIGHBOURS = 4  # of the best of them that also propose the best place beside them
 LEAD_REACH = 0.2  # of the height: a track's place in the joint look is the best within this
 UNKNOWN = -9.0  # standard deviations, where the map does not cover the frames
 
@@ -157,18 +158,33 @@ class MapSearch:
 
     def _judge(self, z: np.ndarray, index: np.ndarray, agl_m: float) -> None:
         """How far each track leads all other places, and the best places as tracks, unless one is followed there."""
-        near, reach = (max(round(share * agl_m / self._cell_m), 1) for share in (NEAR, LEAD_REACH))
-        left, peaks = z.copy(), []
-        for _ in range(PROPOSED):
-            r, c = (int(v) for v in np.unravel_index(int(np.argmax(left)), left.shape))
-            peaks.append(Peak(r, c, float(left[r, c]), self._hypotheses[int(index[r, c])]))
+        near, same, reach = (max(round(share * agl_m / self._cell_m), 1) for share in (NEAR, SAME, LEAD_REACH))
+        left, peaks, beside = z.copy(), list[Peak](), list[Peak]()
+
+        def best_of(region: np.ndarray, r0: int = 0, c0: int = 0) -> Peak:
+            r, c = (int(v) for v in np.unravel_index(int(np.argmax(region)), region.shape))
+            return Peak(r0 + r, c0 + c, float(region[r, c]), self._hypotheses[int(index[r0 + r, c0 + c])])
+
+        for k in range(PROPOSED):
+            peaks.append(best_of(left))
+            r, c = peaks[-1].row, peaks[-1].column
+            if k < NEIGHBOURS:
+                left[max(r - same, 0) : r + same + 1, max(c - same, 0) : c + same + 1] = UNKNOWN
+                r0, c0 = max(r - near, 0), max(c - near, 0)
+                beside.append(best_of(left[r0 : r + near + 1, c0 : c + near + 1], r0, c0))
             left[max(r - near, 0) : r + near + 1, max(c - near, 0) : c + near + 1] = UNKNOWN
-            e_m, n_m = (c + self._column0 + 0.5) * self._cell_m, -(r + self._row0 + 0.5) * self._cell_m
-            if peaks[-1].z > UNKNOWN:
-                self.tracks.propose(e_m, n_m, peaks[-1].hypothesis, agl_m)
+        for peak in (*peaks, *beside):
+            e_m = (peak.column + self._column0 + 0.5) * self._cell_m
+            n_m = -(peak.row + self._row0 + 0.5) * self._cell_m
+            if peak.z > UNKNOWN:
+                self.tracks.propose(e_m, n_m, peak.hypothesis, agl_m)
         for track in self.tracks.all:
             r = round(-track.n_m / self._cell_m - 0.5) - self._row0
             c = round(track.e_m / self._cell_m - 0.5) - self._column0
-            here = z[max(r - reach, 0) : max(r + reach + 1, 0), max(c - reach, 0) : max(c + reach + 1, 0)]
+            here, beside_it = (
+                float(z[max(r - k, 0) : max(r + k + 1, 0), max(c - k, 0) : max(c + k + 1, 0)].max(initial=UNKNOWN))
+                for k in (reach, near)
+            )
             rivals = [p.z for p in peaks if np.hypot(p.row - r, p.column - c) > near]
-            track.looked_at(float(here.max(initial=UNKNOWN)) - max(rivals, default=UNKNOWN))
+            # What is better beside it counts against it, and not for it.
+            track.looked_at(here - max(rivals, default=UNKNOWN) - (beside_it - here))
