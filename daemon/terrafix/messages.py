@@ -72,6 +72,8 @@ class SearchStep(StrEnum):
 
     NORMAL = "normal"
     SKIP = "skip"  # this frame says nothing; the next one is tried
+    NEW_FRAGMENT = "new_fragment"  # nothing joins this frame to the one before
+    MERGE = "merge"  # the map joins what was flown since then to what came before, or a search has found the place
     WIDEN = "widen"  # lost: around the last place, 1 to 25 tiles
     WHOLE_MAP = "whole_map"
     ASK = "ask"  # the whole map was searched: a coarse position from the operator would help

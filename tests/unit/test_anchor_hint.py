@@ -10,6 +10,7 @@ from test_anchor_node import AGL_M, ORIGIN, TRUE_M, OnlyMap, R, ground, started
 from terrafix.anchor.hint import SPEED_MPS, Believed, length, radius_now_m, weigh
 from terrafix.anchor.lost import MOST_ODDS, START_ODDS
 from terrafix.anchor.node import AnchorNode
+from terrafix.anchor.place_search import PlaceSearch
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
@@ -139,7 +140,8 @@ def test_the_state_of_the_search_is_said_when_it_changes(ground: np.ndarray, mon
     assert [m.step for m in said_at(node, 1, 100.0) if isinstance(m, SearchState)] == [SearchStep.WHOLE_MAP]
     monkeypatch.setattr(MapSearch, "step", SearchStep.ASK)
     assert [m.step for m in said_at(node, 2, 100.0) if isinstance(m, SearchState)] == [SearchStep.ASK]
-    node._search = None
+    node._search = PlaceSearch()
+    frames.put(3, view(ground, PINHOLE, R, TRUE_M))
     assert [m.step for m in said_at(node, 3) if isinstance(m, SearchState)] == [SearchStep.NORMAL]
 
 
@@ -160,10 +162,10 @@ def test_what_a_search_knows_is_kept_when_the_hint_says_no_more_than_the_map(
     node, frames = started(ground, 5000.0)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     said_at(node, 1, 100.0)
-    search = node._search
+    search = node._search._search
     list(node.on(hint_at(0.0, 0.0, 5000.0)))
     assert [m.verdict for m in said_at(node, 2, 100.0) if isinstance(m, HintVerdict)] == [Verdict.ACCEPTED]
-    assert search is not None and node._search is search
+    assert search is not None and node._search._search is search
     list(node.on(hint_at(50.0, 0.0, 150.0)))  # this one does: the map is 400 m wide
     said_at(node, 3, 100.0)
-    assert node._search is not search
+    assert node._search._search is not search

@@ -10,11 +10,12 @@ from ground import PINHOLE, texture, view
 from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
 
 from terrafix.anchor.lost import LostWatch
-from terrafix.anchor.node import LOST_SIGMA_M, AnchorNode
+from terrafix.anchor.node import AnchorNode
+from terrafix.anchor.place_search import LOST_SIGMA_M, start_around
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
+from terrafix.messages import MapMatch, Prediction, SearchState, SearchStep, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
 
@@ -32,21 +33,25 @@ def started(ground: np.ndarray, start_sigma_m: float = 10.0) -> tuple[AnchorNode
     return node, frames
 
 
-def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TRUE_M, step_m: float = 0.0) -> MapMatch:
+def predicted(
+    frame_id: int, sigma_m: float, step_sigma_m: float = 1.0, at_m: np.ndarray = TRUE_M, step_m: float = 0.0
+) -> Prediction:
     cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
-    answer, *_ = node.on(
-        Prediction(
-            t_ns=frame_id * 10**9,
-            frame_id=frame_id,
-            p_c_in_w_m=(float(at_m[0]), float(at_m[1]), float(at_m[2])),
-            q_w_c=quat_from_rot(R),
-            cov=tuple(float(v) for v in cov.ravel()),
-            agl_m=AGL_M,
-            agl_sigma_m=2.0,
-            step_m=(step_m, 0.0),
-            step_cov_m2=(1.0, 0.0, 0.0, 1.0),
-        )
+    return Prediction(
+        t_ns=frame_id * 10**9,
+        frame_id=frame_id,
+        p_c_in_w_m=(float(at_m[0]), float(at_m[1]), float(at_m[2])),
+        q_w_c=quat_from_rot(R),
+        cov=tuple(float(v) for v in cov.ravel()),
+        agl_m=AGL_M,
+        agl_sigma_m=2.0,
+        step_m=(step_m, 0.0),
+        step_cov_m2=(step_sigma_m**2, 0.0, 0.0, step_sigma_m**2),
     )
+
+
+def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TRUE_M, step_m: float = 0.0) -> MapMatch:
+    answer, *_ = node.on(predicted(frame_id, sigma_m, at_m=at_m, step_m=step_m))
     assert isinstance(answer, MapMatch)
     return answer
 
@@ -83,11 +88,10 @@ def test_an_anchor_that_starts_again_in_flight_does_not_search_what_was_found(gr
 
 
 def test_a_hint_is_searched_from_where_it_points_unless_it_says_no_more_than_the_map(ground: np.ndarray) -> None:
-    node, _ = started(ground)
     source: Any = OnlyMap(ground)
     source.bounds_m = (-4000.0, -1000.0, 4000.0, 1000.0)
-    assert node._start_hint(30.0, 40.0, 1500.0, source) == (30.0, 40.0)
-    assert node._start_hint(30.0, 40.0, 2500.0, source) is None
+    assert start_around(30.0, 40.0, 1500.0, source) == (30.0, 40.0)
+    assert start_around(30.0, 40.0, 2500.0, source) is None
 
 
 def test_a_place_that_nothing_speaks_for_is_withdrawn_and_said(
@@ -100,6 +104,50 @@ def test_a_place_that_nothing_speaks_for_is_withdrawn_and_said(
     assert (said.verdict, said.step, said.lost_sigma_m) == (Verdict.LOST, SearchStep.WIDEN, LOST_SIGMA_M)
     assert said.matches == [] and said.p_c_in_w_m is None
     assert match(node, 2, 10.0).verdict is Verdict.LOST  # also without a picture
+
+
+def test_every_step_of_the_escalation_is_said(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    node, frames = started(ground)
+    picture = view(ground, PINHOLE, R, TRUE_M)
+    said: list[SearchStep] = []
+
+    def fly(frame_id: int, image: np.ndarray | None, step_sigma_m: float = 1.0) -> None:
+        if image is not None:
+            frames.put(frame_id, image)
+        said.extend(m.step for m in node.on(predicted(frame_id, 10.0, step_sigma_m)) if isinstance(m, SearchState))
+
+    fly(1, picture)
+    fly(2, None)
+    fly(3, picture)
+    fly(4, picture, step_sigma_m=60.0)
+    fly(5, picture)
+    fly(6, picture)
+    assert said == [
+        SearchStep.SKIP,
+        SearchStep.NORMAL,
+        SearchStep.NEW_FRAGMENT,
+        SearchStep.MERGE,
+        SearchStep.NORMAL,
+    ]
+    said.clear()
+    with monkeypatch.context() as patched:
+        patched.setattr(LostWatch, "lost", True)
+        patched.setattr(MapSearch, "look", lambda *_: None)
+        fly(7, picture)
+        patched.setattr(MapSearch, "step", SearchStep.ASK)
+        fly(8, picture)
+    assert said == [SearchStep.WIDEN, SearchStep.ASK]
+
+
+def test_another_flight_begins_with_nothing_of_the_last_one(ground: np.ndarray) -> None:
+    node, frames = started(ground)
+    fresh = vars(started(ground)[0])
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    match(node, 1, 10.0)
+    node._poor_looks = 3.0
+    list(node.on(msgspec.structs.replace(ORIGIN, t_ns=1)))
+    for name in ("_belief", "_since_look_m", "_poor_looks", "_variance_m2", "_torn", "_apart"):
+        assert vars(node)[name] == fresh[name], name
 
 
 class TwoDates:

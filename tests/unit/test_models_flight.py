@@ -11,7 +11,8 @@ from ground import PINHOLE, texture, view
 from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
 
 from terrafix.anchor.model_watch import FAILURES
-from terrafix.anchor.node import LOST_SIGMA_M, AnchorNode, make_node
+from terrafix.anchor.node import AnchorNode, make_node
+from terrafix.anchor.place_search import LOST_SIGMA_M
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.core.config import Config, Models
 from terrafix.core.errors import ModelError
