@@ -12,6 +12,7 @@ from pathlib import Path
 
 import map_rasters
 import numpy as np
+import pyogrio
 import pytest
 import rasterio
 import rasterio.warp
@@ -38,6 +39,9 @@ def test_the_package_is_a_geopackage_that_gdal_reads(tmp_path: Path) -> None:
         assert (file.width, file.height) == (900, 700)
         assert file.transform.almost_equals(Affine(0.5, 0, 300_000, 0, -0.5, 2_600_000))
         assert len(file.overviews(1)) == 2
+    tables = {"terrafix_manifest", "terrafix_signature", "imagery_descriptors"}
+    assert {name for name, _ in pyogrio.list_layers(out)} == tables  # a warning would be an error
+    assert pyogrio.read_info(out, layer="terrafix_manifest")["features"] > 15
     image, valid = finest(out)
     assert valid.all()
     assert np.abs(image.astype(float) - bands.transpose(1, 2, 0)).mean() < 3.0

@@ -2,6 +2,7 @@
 
 from terrafix.anchor.map_format import HASH_TABLE, MANIFEST_TABLE, SEAL_TABLE, SIGNATURE_TABLE
 
+# Geometry columns also where there are no features: without that table GDAL opens no table of attributes.
 CORE = f"""
 CREATE TABLE gpkg_spatial_ref_sys (
   srs_name TEXT NOT NULL, srs_id INTEGER NOT NULL PRIMARY KEY, organization TEXT NOT NULL,
@@ -34,6 +35,12 @@ CREATE TABLE gpkg_metadata_reference (
   md_parent_id INTEGER,
   CONSTRAINT crmr_mfi_fk FOREIGN KEY (md_file_id) REFERENCES gpkg_metadata(id),
   CONSTRAINT crmr_mpi_fk FOREIGN KEY (md_parent_id) REFERENCES gpkg_metadata(id));
+CREATE TABLE gpkg_geometry_columns (
+  table_name TEXT NOT NULL, column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL,
+  z TINYINT NOT NULL, m TINYINT NOT NULL,
+  CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name), CONSTRAINT uk_gc_table_name UNIQUE (table_name),
+  CONSTRAINT fk_gc_tn FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name),
+  CONSTRAINT fk_gc_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys (srs_id));
 CREATE TABLE {MANIFEST_TABLE} (id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL UNIQUE, value TEXT NOT NULL);
 CREATE TABLE {HASH_TABLE} (
   table_name TEXT NOT NULL, zoom_level INTEGER NOT NULL, tile_column INTEGER NOT NULL, tile_row INTEGER NOT NULL,
@@ -74,15 +81,6 @@ CREATE TABLE gpkg_2d_gridded_tile_ancillary (
   UNIQUE (tpudt_name, tpudt_id));
 """
 
-GEOMETRY_COLUMNS = """
-CREATE TABLE gpkg_geometry_columns (
-  table_name TEXT NOT NULL, column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL,
-  z TINYINT NOT NULL, m TINYINT NOT NULL,
-  CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name), CONSTRAINT uk_gc_table_name UNIQUE (table_name),
-  CONSTRAINT fk_gc_tn FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name),
-  CONSTRAINT fk_gc_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys (srs_id));
-"""
-
 FEATURES = """
 CREATE TABLE "{table}" (
   fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom GEOMETRY, kind TEXT, name TEXT, attributes TEXT);
@@ -115,6 +113,6 @@ EXTENSIONS = {  # name -> definition, scope
     "gpkg_metadata": ("http://www.geopackage.org/spec120/#extension_metadata", "read-write"),
     "gpkg_2d_gridded_coverage": (_COVERAGE_SPEC, "read-write"),
     "gpkg_rtree_index": ("http://www.geopackage.org/spec120/#extension_rtree", "write-only"),
-    "terrafix_descriptors": ("docs/map-package.md of Terrafix", "read-write"),
+    "terrafix_descriptors": ("docs/map-package.md of Terrafix", "write-only"),
     "terrafix_map": ("docs/map-package.md of Terrafix", "write-only"),
 }

@@ -27,8 +27,6 @@ def write_vectors(writer: GpkgWriter, db: sqlite3.Connection, given: VectorInput
     for table, wkb, attributes in given.features:
         if table not in boxes:
             _check_name(table, given.source)
-            if not boxes:
-                writer.create(gpkg_schema.GEOMETRY_COLUMNS)
             writer.create(gpkg_schema.FEATURES.format(table=table))
             boxes[table], counts[table] = (math.inf, math.inf, -math.inf, -math.inf), 0
         try:
