@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from types import TracebackType
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -174,6 +174,7 @@ class _Hands(Generic[Wanted, Piece]):
 def _no_interrupt() -> Iterator[None]:
     """Ctrl-C reaches all processes, and the parent ends the others: one that is started within never sees it, not even
     while it imports. In the parent it waits for the end."""
+    resource_tracker.ensure_running()  # else it is started within, and that lets interrupts through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
