@@ -44,6 +44,9 @@ MODE_TRIED = 0.5  # modes below this are not tried at all
 COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in this very frame
 MIN_AGL_M = 30.0  # below this a frame shows a few roofs and cars
 START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is not known yet
+# Of the height: what the belief follows is the place from which a picture seems to be taken, and a tilt that is a
+# degree more than in the frame before moves it.
+SWAY = 0.02
 POOR_SCORE = 2.0  # standardised correlation in the mode; a frame at the right place scores 3 to 10
 POOR_LOOKS = 4.0  # full looks below it before the search widens
 WIDEN = 1.6
@@ -251,7 +254,7 @@ class AnchorNode:
         elif self._search.is_on:
             self._search.move(prediction.step_m, sigma_m)
         else:
-            self._belief.move(*prediction.step_m, sigma_m)
+            self._belief.move(*prediction.step_m, float(np.hypot(sigma_m, SWAY * prediction.agl_m)))
             self._belief.fit_window(0.0)
             if not 0.4 < cell_m / self._belief.cell_m < 2.5:  # an octave is left alone: no flicker at its edge
                 self._belief.set_cell(cell_m)
