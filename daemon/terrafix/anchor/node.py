@@ -244,7 +244,7 @@ class AnchorNode:
         self._torn = self._belief is not None and sigma_m > NEAR * prediction.agl_m
         if self._belief is None:
             e_m, n_m, _ = prediction.p_c_in_w_m
-            start = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
+            start = float(np.sqrt(variance))
             tilt = prediction.agl_m * float(np.sqrt(max(prediction.cov[21], prediction.cov[28])))
             self._belief = Belief(e_m, n_m, float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt)), cell_m)
             # A prediction that is better than that start was found before: this process was started again in flight.

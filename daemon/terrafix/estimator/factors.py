@@ -130,7 +130,9 @@ def same_ground_factor(
     is and where the cameras are does not enter, so that a heading or a position that is corrected later does no harm.
     With a way in metres what the pairs leave unexplained would weigh less the lower the camera is, and pull it down.
 
-    ``keyframe_bias_key``: of B of the keyframe, where heights are above ground that no map tells (``leg_factor``)."""
+    ``keyframe_bias_key``: of B of the keyframe; it counts where ``ground`` rises and no map tells (``leg_factor``)."""
+    if not ground.rise_sigma_m:
+        keyframe_bias_key = None
     normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
     p = keyframe.translation()
     offset = float(p[2]) - ground.height_m - ground.slope_e * float(p[0]) - ground.slope_n * float(p[1])

@@ -149,7 +149,7 @@ class PoseGraph:
                     seen.pairs,
                     seen.sigma,
                     seen.ground,
-                    B(parent) if seen.ground.rise_sigma_m else None,
+                    B(parent),
                 )
             )
         if leg is not None:

@@ -121,8 +121,8 @@ class _Smoothing:
         fallen = seen.ground.slope_e * (now[0] - then[0]) + seen.ground.slope_n * (now[1] - then[1])
         height_m = seen.ground.height_m + float(now[2] - then[2]) - float(fallen)
         ground = replace(seen.ground, height_m=max(height_m, 1.0))
-        lifted = B(node.parent) if ground.rise_sigma_m else None
-        yield same_ground_factor(C(node.parent), C(i), B(i), keyframe, pose, seen.pairs, seen.sigma, ground, lifted)
+        keys = C(node.parent), C(i), B(i)
+        yield same_ground_factor(*keys, keyframe, pose, seen.pairs, seen.sigma, ground, B(node.parent))
 
     def _linear(self, factor: gtsam.CustomFactor) -> gtsam.NonlinearFactor:
         around = gtsam.Values()
