@@ -98,6 +98,7 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True):
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()  # OpenCV order: k1 k2 p1 p2 k3 ...
+    focal_sigma: float = 0.1  # 1-sigma of the focal length, a share of it
     mount_yaw_deg: float = 0.0
     mount_pitch_deg: float = -90.0  # straight down, image top forward
     mount_roll_deg: float = 0.0

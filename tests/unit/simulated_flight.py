@@ -59,6 +59,7 @@ class Flight:
     knows: frozenset[str] = frozenset({"yaw", "attitude", "height"})
     speed_mps: float = SPEED_MPS
     dem: bool = False  # the map tells that the ground is flat
+    climbs_m: float = 8.0  # half of what it rises and sinks
     hills_m: float = 0.0  # 1-sigma of ground that rises and falls over a kilometre
     ground_m: np.ndarray = field(init=False, repr=False)
     rng_of: np.random.Generator = field(init=False, repr=False)
@@ -76,7 +77,7 @@ class Flight:
         xy = start + np.vstack([np.zeros(2), np.cumsum(steps[:-1], axis=0)])
         way = np.arange(self.frames) * self.speed_mps * FRAME_S
         ground = math.sqrt(2.0) * self.hills_m * (np.cos(way / 160.0 + self.seed) - math.cos(self.seed))
-        up = 100.0 + 8.0 * np.sin(t_s / 17.0) + ground  # it follows the ground that it sees
+        up = 100.0 + self.climbs_m * np.sin(t_s / 17.0) + ground  # it follows the ground that it sees
         angles = np.radians(np.column_stack([2.0 * np.sin(t_s / 1.7), 2.5 * np.sin(t_s / 2.3)]))
         tilt = np.radians(rng.normal(0.0, CAMERA.mount_tolerance_deg / 2, 2))
         mount = Mount.of(CAMERA).r_b_c() @ exp_so3(np.array([*tilt, 0.0]))

@@ -1,9 +1,10 @@
 """The factors that GTSAM lacks: what an autopilot says of attitude and height, seen through the camera's mount; two
 cameras that look at the same ground; and the way from one node to the next by velocity and acceleration.
 
-Variables of a node k: C_k, the camera pose in the world (Pose3); B_k, a vector of five slow errors (mount tilt about
-the camera's x and y axes [rad], heading bias [rad], height bias [m], and of the lens the first radial coefficient, less
-what its description says); V_k, velocity and the acceleration that nobody measured (velocity.py)."""
+Variables of a node k: C_k, the camera pose in the world (Pose3); B_k, a vector of six slow errors (mount tilt about
+the camera's x and y axes [rad], heading bias [rad], height bias [m], of the lens the first radial coefficient, less
+what its description says, and the logarithm of heights that are told over heights that are seen); V_k, velocity and
+the acceleration that nobody measured (velocity.py)."""
 
 import math
 from typing import Any
@@ -16,13 +17,16 @@ from terrafix.core.pose import log_so3, project_with_jacobian
 from terrafix.estimator.motion import EFFECTIVE_PAIRS, Ground
 from terrafix.estimator.velocity import V_SIZE, Leg
 
-BIAS_SIZE = 5
-HEIGHT, LENS = 3, 4  # of B
+BIAS_SIZE = 6
+HEIGHT, LENS, SCALE = 3, 4, 5  # of B
 BLOCK_HUBER_K = 1.5
 # 1-sigma of the first radial coefficient, less what the description of the lens says: 0.005 after a calibration, 0.03
 # where its maker's focal length is all that is known. What it bends is alike in every frame and looks like a tilt that
 # grows with the way, so it is learnt in flight. The higher coefficients are noise, as large as this of the first.
 LENS_SIGMA, LENS_REST = 0.02, 0.0015
+# 1-sigma of the part of SCALE that is the barometer's: air that is 14 degrees warmer than the standard atmosphere makes
+# all its heights 5 % too small. The other part is the focal length's: what is seen over it is the height that is seen.
+BAROMETER_SCALE = 0.05
 REDUCED = 11  # residuals of a pair of cameras above a plane, after the reduction
 
 
@@ -42,34 +46,44 @@ def tilted(x_rad: float, y_rad: float) -> np.ndarray:
 
 
 def attitude_and_height_residual(
-    pose: gtsam.Pose3, bias: np.ndarray, r_w_b: np.ndarray, r_b_c: np.ndarray, up_m: float
+    pose: gtsam.Pose3, bias: np.ndarray, r_w_b: np.ndarray, r_b_c: np.ndarray, up_m: float, ground_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """-> residual (4,): rotation about east, north, up [rad] and height [m]; Jacobians by C_k (4x6) and B_k (4x5).
+    """-> residual (4,): rotation about east, north, up [rad] and height [m]; Jacobians by C_k (4x6) and B_k (4x6).
+
+    ``up_m`` is told, AMSL, and ``ground_m`` the level above which heights are stretched. The height bias is one of the
+    height that is seen, like the rise of ground that no map tells.
 
     Jacobians are those of small residuals: exact enough below 15 degrees, and the graph relinearises."""
     r_w_c = pose.rotation().matrix()
     heading = local_rotation_up(float(bias[2]))  # a positive bias reads too far clockwise: turn it back
     expected = heading @ r_w_b @ r_b_c @ tilted(float(bias[0]), float(bias[1]))
     rotation_w = log_so3(r_w_c @ expected.T)
-    height = float(pose.translation()[2]) - (up_m - bias[HEIGHT])
+    stretch, seen_m = math.exp(float(bias[SCALE])), float(pose.translation()[2] + bias[HEIGHT]) - ground_m
+    height = stretch * seen_m - (up_m - ground_m)
     by_pose = np.zeros((4, 6))
     by_pose[:3, :3] = r_w_c
-    by_pose[3, 3:] = r_w_c[2]
+    by_pose[3, 3:] = stretch * r_w_c[2]
     by_bias = np.zeros((4, BIAS_SIZE))
     by_bias[:3, :2] = -r_w_c[:, :2]
     by_bias[2, 2] = -1.0
-    by_bias[3, HEIGHT] = 1.0
+    by_bias[3, HEIGHT], by_bias[3, SCALE] = stretch, stretch * seen_m
     return np.array([*rotation_w, height]), by_pose, by_bias
 
 
 def attitude_and_height_factor(
-    pose_key: int, bias_key: int, sigmas: np.ndarray, r_w_b: np.ndarray, r_b_c: np.ndarray, up_m: float
+    pose_key: int,
+    bias_key: int,
+    sigmas: np.ndarray,
+    r_w_b: np.ndarray,
+    r_b_c: np.ndarray,
+    up_m: float,
+    ground_m: float,
 ) -> gtsam.CustomFactor:
     """``sigmas`` (4,): rotation about east, north, up [rad], height [m]; large where nothing is known."""
 
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
         residual, by_pose, by_bias = attitude_and_height_residual(
-            values.atPose3(pose_key), values.atVector(bias_key), r_w_b, r_b_c, up_m
+            values.atPose3(pose_key), values.atVector(bias_key), r_w_b, r_b_c, up_m, ground_m
         )
         if jacobians is not None:
             jacobians[0] = np.asfortranarray(by_pose)

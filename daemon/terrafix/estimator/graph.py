@@ -22,22 +22,21 @@ LAG_NODES, BATCH_NODES = 15, 5
 ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits in the tail pulls less
 LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
 # Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), heading (a gyro drifts),
-# barometer (a front brings 1 hPa, 8 m, in an hour), lens (it warms up: a tenth of its error in ten minutes). A looser
-# barometer lets minutes of dead reckoning carry the height off.
-WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.15, 2e-5])
+# barometer (a front brings 1 hPa, 8 m, in an hour), lens (it warms up: a tenth of its error in ten minutes), scale
+# (air warms up by 4 degrees an hour, 1.5 %). A looser barometer lets minutes of dead reckoning carry the height off.
+WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.15, 2e-5, 2.5e-4])
 COMPASS_BY_TURN_RAD = np.radians(2.5)  # ... and of the compass per square root of a radian turned: iron on board
-HEIGHT_BY_CLIMB = 0.05  # ... and of the height by what was climbed: air that is not standard, a scale that is wrong
 
 
 @dataclass(frozen=True)
 class NodeState:
     pose: gtsam.Pose3
-    bias: np.ndarray  # (5,) B_k
+    bias: np.ndarray  # (6,) B_k
     velocity: np.ndarray  # (8,) V_k
 
     @property
     def up_by_barometer_m(self) -> float:
-        """AMSL, where no map tells the ground and C is above whatever ground is seen (``leg_factor``)."""
+        """AMSL as seen heights have it, where no map tells the ground and C is above whatever is seen."""
         return float(self.pose.translation()[2] + self.bias[HEIGHT])
 
 
@@ -103,7 +102,7 @@ class PoseGraph:
         velocity_cov: np.ndarray,
         attitude: gtsam.CustomFactor | None = None,
     ) -> int:
-        """First node, or the first after a loss: priors on C (tangent covariance 6x6), B (5x5) and V (8x8).
+        """First node, or the first after a loss: priors on C (tangent covariance 6x6), B (6x6) and V (8x8).
 
         The past stays as it was estimated."""
         node = self._next
@@ -160,8 +159,7 @@ class PoseGraph:
         sigmas = WALK_SIGMAS * np.sqrt(dt_s)
         turned = state.pose.rotation().compose(self.state(newest).pose.rotation().inverse())
         sigmas[2] = np.hypot(sigmas[2], COMPASS_BY_TURN_RAD * np.sqrt(abs(gtsam.Rot3.Logmap(turned)[2])))
-        climbed_m = float(state.pose.translation()[2] - self.state(newest).pose.translation()[2])
-        sigmas[HEIGHT] = np.linalg.norm([sigmas[HEIGHT], HEIGHT_BY_CLIMB * climbed_m, rise_sigma_m])
+        sigmas[HEIGHT] = np.hypot(sigmas[HEIGHT], rise_sigma_m)
         walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(BIAS_SIZE), walk))
         if attitude is not None:
@@ -228,7 +226,7 @@ class PoseGraph:
         self._renew()
         self._times, self._stamps = {node: self._times[node]}, {node: _stamp(node)}
         wide = np.array([0.1, 0.1, 0.2, 50.0, 50.0, 20.0])
-        slow = np.array([0.1, 0.1, 0.1, 5.0, LENS_SIGMA])
+        slow = np.array([0.1, 0.1, 0.1, 5.0, LENS_SIGMA, 0.1])
         factors = _priors(node, state, np.diag(wide**2), np.diag(slow**2), unknown_cov())
         self._past.add(factors)
         self._smoother.insert(node, factors, _values(node, state))
@@ -250,7 +248,7 @@ class PoseGraph:
 def _priors(
     node: int, state: NodeState, cov: np.ndarray, bias_cov: np.ndarray, velocity_cov: np.ndarray
 ) -> gtsam.NonlinearFactorGraph:
-    """``cov`` 6x6, tangent order; ``bias_cov`` 5x5; ``velocity_cov`` 8x8."""
+    """``cov`` 6x6, tangent order; ``bias_cov`` 6x6; ``velocity_cov`` 8x8."""
     gaussian = gtsam.noiseModel.Gaussian.Covariance
     factors = gtsam.NonlinearFactorGraph()
     factors.add(gtsam.PriorFactorPose3(C(node), state.pose, gaussian(cov)))

@@ -14,7 +14,7 @@ from terrafix.estimator.velocity import V_SIZE
 # Steps from which a factor is linearised anew. Angles bend the geometry; metres and metres per second hardly do.
 RELINEARIZE = {
     "c": np.array([0.03, 0.03, 0.03, 1.0, 1.0, 1.0]),
-    "b": np.array([0.03, 0.03, 0.03, 10.0, 1.0]),
+    "b": np.array([0.03, 0.03, 0.03, 10.0, 1.0, 0.05]),
     "v": np.full(V_SIZE, 100.0),
 }
 _LEAVING, _STAYING, _NEWEST = 0, 1, 2  # groups in the order of elimination

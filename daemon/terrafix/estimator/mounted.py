@@ -17,7 +17,7 @@ DEFAULT_AGL_SIGMA_M = 50.0  # ... and wide enough for all of them
 
 
 class MountedCamera:
-    """``bias`` is B_k of factors.py: tilt of the mount, heading, height."""
+    """``bias`` is B_k of factors.py: tilt of the mount, heading, and what does not count here."""
 
     def __init__(self, origin: Origin) -> None:
         self._origin = origin
@@ -35,8 +35,11 @@ class MountedCamera:
             return before
         return exp_so3(np.array([0.0, 0.0, bias[2]])) @ r_w_b @ self._r_b_c @ exp_so3(np.array([bias[0], bias[1], 0.0]))
 
-    def factor(self, keys: tuple[int, int], attitude: Attitude, r_w_c: np.ndarray) -> gtsam.CustomFactor:
-        """``keys`` of C and B; ``r_w_c``: the predicted camera, whose heading stands in for one that nobody reports."""
+    def factor(
+        self, keys: tuple[int, int], attitude: Attitude, r_w_c: np.ndarray, ground_m: float
+    ) -> gtsam.CustomFactor:
+        """``keys`` of C and B; ``r_w_c``: the predicted camera, whose heading stands in for one that nobody reports;
+        ``ground_m``: AMSL, below it."""
         origin = self._origin
         tilt = UNKNOWN_ATTITUDE_RAD
         self._tilt_said = attitude.pitch_rad is not None and attitude.roll_rad is not None
@@ -48,7 +51,8 @@ class MountedCamera:
         height = DEFAULT_AGL_SIGMA_M * 20 if attitude.agl_m is None else max(origin.agl_sigma_m, 0.5)
         up = (origin.ground_amsl_m or 0.0) + (DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m)
         r_w_b = rot_w_b(yaw_rad, attitude.pitch_rad or 0.0, attitude.roll_rad or 0.0)
-        return attitude_and_height_factor(*keys, np.array([tilt, tilt, yaw_sigma, height]), r_w_b, self._r_b_c, up)
+        sigmas = np.array([tilt, tilt, yaw_sigma, height])
+        return attitude_and_height_factor(*keys, sigmas, r_w_b, self._r_b_c, up, ground_m)
 
     @property
     def body_sigma_rad(self) -> float:

@@ -158,8 +158,9 @@ class EstimatorNode:
         cov[:3, :3] += estimator.map_sigma_m**2 * np.eye(3)
         cov[3:5, 3:5] += estimator.camera.body_sigma_rad**2 * np.eye(2)
         cov = estimator.rival.added(estimator.doubt.added(cov))
-        alt_amsl_m, drift_m = estimator.amsl(placed)
-        cov[2, 2] += drift_m**2
+        alt_amsl_m, more_m = estimator.amsl(placed)
+        stretch, _ = estimator.stretch(placed.node)
+        cov[2, 2] += more_m**2
         lat_deg, lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
         age_ms = -1
         if estimator.last_fix_s is not None:
@@ -174,8 +175,8 @@ class EstimatorNode:
             lat_deg=lat_deg,
             lon_deg=lon_deg,
             alt_amsl_m=alt_amsl_m,
-            agl_m=float(p[2]) - estimator.terrain.below(p),
-            velocity_enu_mps=(float(v[0]), float(v[1]), float(v[2])),
+            agl_m=stretch * (float(p[2]) - estimator.terrain.below(p)),
+            velocity_enu_mps=(float(v[0]), float(v[1]), stretch * float(v[2])),
             velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(placed.velocity_cov)[-1])),  # of the worst direction
             q_w_b=quat_from_rot(estimator.body(placed)),
             cov=tuple(float(c) for c in cov.ravel()),

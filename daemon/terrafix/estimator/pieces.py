@@ -9,7 +9,7 @@ import numpy as np
 from terrafix.estimator.fragments import Anchor, Fragment, Join
 from terrafix.estimator.graph import NodeState
 from terrafix.estimator.similarity import merge
-from terrafix.estimator.tracker import HEIGHT_BIAS
+from terrafix.estimator.tracker import HEIGHT_BIAS, scale_sigma
 from terrafix.estimator.whole import SAME_M, Retold, WholeNode
 
 # How fast the unit of a piece changes from frame to frame, share: a height that is known drifts; one that is guessed
@@ -26,8 +26,8 @@ def placed_states(flight: Retold) -> list[NodeState]:
         return states
     firsts = [i for i, node in enumerate(nodes) if node.parent < 0 or node.again]
     ends = [*firsts[1:], len(nodes)]
-    scale_sigma = HEIGHT_BIAS if flight.has_height else None
-    fragments = [_fragment(nodes[a:b], a, scale_sigma) for a, b in zip(firsts, ends, strict=True)]
+    sigma = float(np.hypot(HEIGHT_BIAS, scale_sigma(flight.origin.camera))) if flight.has_height else None
+    fragments = [_fragment(nodes[a:b], a, sigma) for a, b in zip(firsts, ends, strict=True)]
     piece_of = np.repeat(np.arange(len(firsts)), np.diff([*firsts, len(nodes)]))
     anchors = [
         Anchor(int(piece_of[f.node]), f.node - firsts[piece_of[f.node]], f.pose.rotation().matrix(),

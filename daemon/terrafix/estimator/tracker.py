@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from terrafix.core.pose import tangent_to_world, world_to_tangent
-from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA
-from terrafix.estimator.graph import HEIGHT_BY_CLIMB, WALK_SIGMAS, NodeState, PoseGraph
+from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS_SIGMA, SCALE
+from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.mounted import (
     DEFAULT_AGL_M,
@@ -33,11 +33,11 @@ from terrafix.estimator.velocity import (
     standing_cov,
     unknown_cov,
 )
-from terrafix.messages import CovarianceMode, Odometry, Origin, Verdict
+from terrafix.messages import Camera, CovarianceMode, Odometry, Origin, Verdict
 
-# What an autopilot's own sigma leaves out: a compass beside motors and wires, a barometer over sloping ground, a focal
-# length that is a few per cent off. On real flights the heading was 12 degrees and the scale 8 % away from the log, and
-# a compass that is 15 degrees off must still be inside the search (1.5 sigma).
+# What an autopilot's own sigma leaves out: a compass beside motors and wires, a barometer over ground that is higher or
+# lower than at take-off. On real flights the heading was 12 degrees and the height 8 % away from the log, and a compass
+# that is 15 degrees off must still be inside the search (1.5 sigma).
 COMPASS_BIAS_RAD = np.radians(10.0)
 HEIGHT_BIAS = 0.05  # of the height
 FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
@@ -113,15 +113,30 @@ class Tracker:
         """The autopilot says how high it flies."""
         return self._began_with[1]
 
+    def stretch(self, node: int) -> tuple[float, float]:
+        """Heights over heights as they are seen, and the 1-sigma of that (relative): of what the barometer tells
+        otherwise, the part that is the focal length's."""
+        focal = self.origin.camera.focal_sigma
+        if not self.measures_height:
+            return 1.0, focal
+        both = scale_sigma(self.origin.camera)
+        part = (focal / both) ** 2 * float(self.graph.state(node).bias[SCALE])
+        return float(np.exp(part)), focal * BAROMETER_SCALE / both
+
     def amsl(self, placed: Placed) -> tuple[float, float]:
-        """Of the camera, and the 1-sigma by which the barometer may be off, 0 where it is not needed: without a DEM
-        the graph has the height above whatever ground it sees, and the barometer how high that lies."""
+        """Of the camera, and the 1-sigma of it beyond what the graph claims. Without a DEM the graph has the height
+        above whatever ground it sees, and the barometer how high that lies."""
+        p = placed.pose.translation()
+        stretch, sigma = self.stretch(placed.node)
         if self.terrain.is_told or not self.measures_height:
-            return float(placed.pose.translation()[2]), 0.0
-        up_m = self.graph.state(placed.node).up_by_barometer_m
+            ground_m = self.terrain.below(p)
+            seen_m = float(p[2]) - ground_m
+            return ground_m + stretch * seen_m, sigma * seen_m
+        seen_m = self.graph.state(placed.node).up_by_barometer_m - self.terrain.ground_m
         drift_m = WALK_SIGMAS[HEIGHT] * np.sqrt(placed.t_s - self._first_s)
-        climb_m = HEIGHT_BY_CLIMB * (up_m - (self.origin.ground_amsl_m or 0.0))
-        return up_m, float(np.linalg.norm([self.origin.agl_sigma_m, drift_m, climb_m]))
+        return self.terrain.ground_m + stretch * seen_m, float(
+            np.linalg.norm([self.origin.agl_sigma_m, drift_m, sigma * seen_m])
+        )
 
     def advance(
         self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude, felt: Feel = nothing_felt
@@ -163,7 +178,7 @@ class Tracker:
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
         state = NodeState(pose, before.bias, velocity)
-        said = self.camera.factor(self.graph.next_keys(), attitude, r_w_c)
+        said = self.camera.factor(self.graph.next_keys(), attitude, r_w_c, self.terrain.below(p))
         rise_m = self.terrain.rise_sigma_m(float(np.hypot(*step)))
         if way is not None:
             way = replace(way, lifted=not self.terrain.is_told)
@@ -242,7 +257,7 @@ class Tracker:
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
         height = float(np.hypot(agl_sigma, HEIGHT_BIAS * agl))
-        bias_cov = np.diag([tolerance, tolerance, yaw, height, LENS_SIGMA]) ** 2
+        bias_cov = np.diag([tolerance, tolerance, yaw, height, LENS_SIGMA, scale_sigma(origin.camera)]) ** 2
         self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
         self._felt = self._stood_at = None
         node = self.graph.start(
@@ -251,7 +266,7 @@ class Tracker:
             world_to_tangent(cov_world, r_w_c),
             bias_cov,
             self._velocity_cov,
-            self.camera.factor(self.graph.next_keys(), attitude, r_w_c),
+            self.camera.factor(self.graph.next_keys(), attitude, r_w_c, self.terrain.ground_m),
         )
         self._is_frame(node, frame_id)
         self._last = self._placed(frame_id, t_s, node)
@@ -333,6 +348,11 @@ class Tracker:
         if self.mode is CovarianceMode.MARGINALS or node not in self._cov_of:
             self._cov_of[node] = self.graph.covariance(node)
         return self._cov_of[node]
+
+
+def scale_sigma(camera: Camera) -> float:
+    """1-sigma of SCALE before anything was seen."""
+    return float(np.hypot(camera.focal_sigma, BAROMETER_SCALE))
 
 
 def _compose_cov(cov_parent: np.ndarray, motion: RelativePose) -> np.ndarray:

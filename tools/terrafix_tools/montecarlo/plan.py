@@ -96,6 +96,7 @@ def plan(run_seed: int, number: int, *, fault: Fault | None = None, duration_s: 
         fy=focal,
         cx=(width - 1) / 2,
         cy=(height - 1) / 2,
+        focal_sigma=FOCAL_SIGMA,
         mount_tolerance_deg=tolerance_deg,
     )
     tilt = np.radians(tolerance_deg) * rng.normal(size=2)

@@ -20,6 +20,7 @@ from terrafix.vision.sources.exif import PhotoInfo, read_info
 from terrafix.vision.sources.images import IMAGE_SUFFIXES, read_image, reduced
 
 GIMBAL_TOLERANCE_DEG = 3.0  # a stabilised gimbal that says where it points
+EXIF_FOCAL_SIGMA = 0.03  # in EXIF it is rounded, or that of a film camera; and lenses bend
 UNKNOWN_TOLERANCE_DEG = 10.0  # nothing says how the camera hangs
 UNTIMED_STEP_S = 1.0  # photos without any time: order by name, one a second
 EXIF_STEP_S = 1.0  # resolution of an EXIF time without SubSecTime
@@ -101,6 +102,7 @@ class Photos:
             fy=source.focal_px / scale,
             cx=source.xmp.get("CalibratedOpticalCenterX", source.width / 2) / scale,
             cy=source.xmp.get("CalibratedOpticalCenterY", source.height / 2) / scale,
+            focal_sigma=EXIF_FOCAL_SIGMA,
             mount_tolerance_deg=GIMBAL_TOLERANCE_DEG if pointed else UNKNOWN_TOLERANCE_DEG,
         )
 

@@ -40,7 +40,9 @@ from terrafix_tools.sim.vehicle.plane import Plane
 from terrafix_tools.sim.vehicle.wind import BREEZE, Wind
 from terrafix_tools.sim.world.place import World
 
-CAMERA = m.Camera(width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, mount_tolerance_deg=1.0)
+CAMERA = m.Camera(
+    width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, focal_sigma=0.01, mount_tolerance_deg=1.0
+)
 FRAME_HZ = 2.0
 JPEG_QUALITY = 92
 AGL_M = 130.0
@@ -202,7 +204,7 @@ def _describe(flight: Flight, map_name: str) -> Description:
     return Description(
         name=f"simulated {flight.kind}",
         map=map_name,
-        camera=CameraTable(width=c.width, height=c.height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy, distortion=c.distortion),
+        camera=CameraTable.of(c),
         mount=MountTable(tolerance_deg=c.mount_tolerance_deg),
         start=StartTable(
             lat_deg=lat_deg, lon_deg=lon_deg, ground_amsl_m=round(flight.ground_amsl_m, 1), sigma_m=START_SIGMA_M

@@ -199,9 +199,7 @@ def _description(home: Home) -> Description:
     """What the pilot knows: the camera, and where the vehicle stands."""
     return Description(
         name="ardupilot",
-        camera=CameraTable(
-            width=CAMERA.width, height=CAMERA.height, fx=CAMERA.fx, fy=CAMERA.fy, cx=CAMERA.cx, cy=CAMERA.cy
-        ),
+        camera=CameraTable.of(CAMERA),
         mount=MountTable(pitch_deg=CAMERA.mount_pitch_deg, tolerance_deg=CAMERA.mount_tolerance_deg),
         start=StartTable(lat_deg=home.lat_deg, lon_deg=home.lon_deg, ground_amsl_m=round(home.amsl_m, 1)),
         telemetry=TelemetryTable(
