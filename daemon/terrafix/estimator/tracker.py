@@ -40,6 +40,7 @@ from terrafix.messages import Camera, CovarianceMode, Odometry, Origin, Verdict
 # that is 15 degrees off must still be inside the search (1.5 sigma).
 COMPASS_BIAS_RAD = np.radians(10.0)
 HEIGHT_BIAS = 0.05  # of the height
+TAKE_OFF_AWAY = 5.0  # heights: from where it took off to where it is first seen in the air, a climb at 20 %
 FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
@@ -256,7 +257,8 @@ class Tracker:
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
-        height = float(np.hypot(agl_sigma, HEIGHT_BIAS * agl))
+        below_m = self.terrain.rise_sigma_m(TAKE_OFF_AWAY * agl)  # the ground, over that of the take-off
+        height = float(np.linalg.norm([agl_sigma, HEIGHT_BIAS * agl, below_m]))
         bias_cov = np.diag([tolerance, tolerance, yaw, height, LENS_SIGMA, scale_sigma(origin.camera)]) ** 2
         self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
         self._felt = self._stood_at = None
