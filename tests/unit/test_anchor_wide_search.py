@@ -85,6 +85,20 @@ def test_off_the_map_nothing_is_known(ground: np.ndarray, search: WideSearch) ->
     assert np.isnan(look.correlation).all()
 
 
+def test_what_lies_beside_the_map_is_not_described(ground: np.ndarray) -> None:
+    class Counting(GradientDescriber):
+        described = 0
+
+        def describe(self, image: np.ndarray) -> np.ndarray:
+            self.described += 1
+            return super().describe(image)
+
+    features = MapFeatures(FlatMap(ground), counting := Counting())
+    beside, valid, _, _ = features.window(5000.0, 0.0, 300, 200, CELL_M)
+    assert counting.described == 0 and not valid.any() and not beside.any() and beside.shape == (8, 200, 300)
+    assert features.window(0.0, 0.0, 300, 200, CELL_M)[1].any() and counting.described > 0
+
+
 def test_blocks_cover_the_bounds_once() -> None:
     bounds_m = (-700.0, -300.0, 900.0, 1100.0)
     blocks = blocks_of(bounds_m, CELL_M)

@@ -1,7 +1,8 @@
 """Zero-mean normalised cross-correlation of dense descriptors by FFT: the whole surface, not its peak."""
 
-import cv2
 import numpy as np
+
+from terrafix.anchor.spectrum import spectra, transform_shape
 
 MIN_OVERLAP = 0.8  # of the template over valid map; less says nothing about a place
 FLAT_VARIANCE = 0.05  # of the texture that the template has: water and fields without texture must not be amplified
@@ -15,10 +16,10 @@ class Searchable:
     def __init__(self, descriptors: np.ndarray, valid: np.ndarray) -> None:
         """``descriptors`` (C, H, W) float32, ``valid`` (H, W) bool."""
         self._shape = descriptors.shape[1:]
-        self._fft_shape = tuple(cv2.getOptimalDFTSize(s) for s in self._shape)
-        self._channels = np.fft.rfft2(descriptors, self._fft_shape)
-        self._energy = np.fft.rfft2(np.einsum("khw,khw->hw", descriptors, descriptors), self._fft_shape)
-        self._valid = None if valid.all() else np.fft.rfft2(valid.astype(np.float32), self._fft_shape)
+        self._fft_shape = transform_shape(*self._shape)
+        self._channels = spectra(descriptors, self._fft_shape)
+        self._energy = spectra(np.einsum("khw,khw->hw", descriptors, descriptors), self._fft_shape)
+        self._valid = None if valid.all() else spectra(valid.astype(np.float32), self._fft_shape)
 
     def search(self, template: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """``template`` (C, h, w), ``mask`` (h, w) bool -> correlation (H - h + 1, W - w + 1) in [-1, 1];
@@ -29,12 +30,12 @@ class Searchable:
         centred = (template - ((template * weight).sum((1, 2)) / count)[:, None, None]) * weight
         own = float((centred**2).sum())
         rows, columns = height - h + 1, width - w + 1
-        m = np.fft.rfft2(weight, self._fft_shape).conj()
+        m = spectra(weight, self._fft_shape).conj()
 
         def back(spectrum: np.ndarray) -> np.ndarray:
             return np.fft.irfft2(spectrum, self._fft_shape)[..., :rows, :columns]
 
-        product = back((self._channels * np.fft.rfft2(centred, self._fft_shape).conj()).sum(0))
+        product = back((self._channels * spectra(centred, self._fft_shape).conj()).sum(0))
         sums = back(self._channels * m)
         variance = back(self._energy * m) - (sums**2).sum(0) / count
         surface = product / np.sqrt(np.maximum(np.maximum(variance, FLAT_VARIANCE * own) * own, 1e-12))

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride
-PAD_PX = 32  # context around a tile, so that its rim is described as if there were no rim
+PAD_PX = 32  # context around a tile, so that its rim is described as if there were no rim; a multiple of every stride
 CACHE_BYTES = 192 * 1024 * 1024
 
 
@@ -33,9 +33,12 @@ class Describer(Protocol):
 
 
 class MapFeatures:
-    def __init__(self, source: MapWindows, describer: Describer, cache_bytes: int = CACHE_BYTES) -> None:
+    def __init__(
+        self, source: MapWindows, describer: Describer, cache_bytes: int = CACHE_BYTES, pad_px: int = PAD_PX
+    ) -> None:
         self._source = source
         self._describer = describer
+        self._pad_px = pad_px
         self._tiles: OrderedDict[tuple[float, int, int], tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._bytes, self._most_bytes = 0, cache_bytes
 
@@ -71,16 +74,19 @@ class MapFeatures:
         if key in self._tiles:
             self._tiles.move_to_end(key)
             return self._tiles[key]
-        stride = self._describer.stride
-        side = TILE_CELLS_PX + 2 * PAD_PX
+        stride, pad_px = self._describer.stride, self._pad_px
+        side = TILE_CELLS_PX + 2 * pad_px
         image, ok = self._source.window(
-            tx * per_tile * cell - PAD_PX * gsd_m, -ty * per_tile * cell + PAD_PX * gsd_m, side, side, gsd_m
+            tx * per_tile * cell - pad_px * gsd_m, -ty * per_tile * cell + pad_px * gsd_m, side, side, gsd_m
         )
-        inner = slice(PAD_PX // stride, PAD_PX // stride + per_tile)
-        descriptors = self._describer.describe(image)[:, inner, inner]
-        rim = slice(PAD_PX, PAD_PX + TILE_CELLS_PX)
+        inner = slice(pad_px // stride, pad_px // stride + per_tile)
+        rim = slice(pad_px, pad_px + TILE_CELLS_PX)
         valid = np.asarray(ok[rim, rim].reshape(per_tile, stride, per_tile, stride).all(axis=(1, 3)))
-        tile = (np.where(valid, descriptors, 0.0).astype(np.float16), valid)
+        if valid.any():
+            descriptors = self._describer.describe(image)[:, inner, inner]
+            tile = (np.where(valid, descriptors, 0.0).astype(np.float16), valid)
+        else:  # beside the map
+            tile = (np.zeros((self._describer.channels, *valid.shape), np.float16), valid)
         self._tiles[key] = tile
         self._bytes += tile[0].nbytes + valid.nbytes
         while self._bytes > self._most_bytes and len(self._tiles) > 1:

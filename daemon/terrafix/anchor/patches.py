@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from terrafix.anchor.rectify import Rectified
+from terrafix.anchor.spectrum import spectra, transform_shape
 
 MAX_PATCHES = 48
 MIN_CORRELATION = 0.2  # a patch that agrees less than this with its best place is noise
@@ -124,7 +125,7 @@ def _correlate(
 ) -> np.ndarray:
     """Zero-mean normalised correlation of every patch, (N, 2 reach + 1, 2 reach + 1)."""
     side = patch + 2 * reach
-    fft = cv2.getOptimalDFTSize(side)
+    fft = transform_shape(side, side)
     small = np.stack([template[:, r : r + patch, c : c + patch] for r, c in corners])
     small = small - small.mean(axis=(2, 3), keepdims=True)
     own = (small**2).sum(axis=(1, 2, 3))
@@ -135,9 +136,9 @@ def _correlate(
         ]
     )
     n = 2 * reach + 1
-    spectrum = np.fft.rfft2(large, (fft, fft))
-    spectrum *= np.fft.rfft2(small, (fft, fft)).conj()
-    product = np.fft.irfft2(spectrum.sum(1), (fft, fft))[:, :n, :n]
+    spectrum = spectra(large, fft)
+    spectrum *= spectra(small, fft).conj()
+    product = np.fft.irfft2(spectrum.sum(1), fft)[:, :n, :n]
     # Energy and channel means of the map under every placement of a patch, by sums over boxes of the whole window.
     count = patch * patch
     variance = _box_sums(np.einsum("khw,khw->hw", window, window), patch)

@@ -11,6 +11,7 @@ from terrafix.anchor.map_descriptors import StoredDescriptors
 from terrafix.anchor.map_features import Describer, MapFeatures, MapWindows
 from terrafix.anchor.map_package import LocalMap
 
+PAD_PX = 8  # context of a tile: gradients and their blur reach six pixels, and a whole map has many rims
 OCTAVES = 0.6  # between the scale that is wanted and one that the package has: beyond this it is computed
 
 
@@ -18,7 +19,7 @@ class TileIndex:
     """Has the contract of ``MapFeatures``, for pixels of ``gsd_m(wanted)`` only."""
 
     def __init__(self, source: MapWindows, describer: Describer) -> None:
-        self._computed = MapFeatures(source, describer)
+        self._computed = MapFeatures(source, describer, pad_px=PAD_PX)
         self._stored = source.descriptors(describer.name) if isinstance(source, LocalMap) else None
 
     def gsd_m(self, wanted_m: float) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from terrafix.anchor.correlate import FLAT_VARIANCE, MIN_OVERLAP
 from terrafix.anchor.map_features import Describer, MapWindows
 from terrafix.anchor.rectify import Rectified
+from terrafix.anchor.spectrum import spectra, transform_shape
 from terrafix.anchor.tile_index import TileIndex
 
 BLOCK_CELLS = 256  # side of a block of camera positions: the tile of the search
@@ -92,7 +93,7 @@ class WideSearch:
         ends = [(r + t.mask.shape[0], c + t.mask.shape[1]) for t, (r, c) in zip(templates, corners, strict=True)]
         low_r, low_c = (min(corner[axis] for corner in corners) for axis in (0, 1))
         height, width = (BLOCK_CELLS + max(end[k] for end in ends) - low for k, low in ((0, low_r), (1, low_c)))
-        fft = (cv2.getOptimalDFTSize(height), cv2.getOptimalDFTSize(width))
+        fft = transform_shape(height, width)
         found = [_nothing() for _ in blocks]
         for begin in range(0, len(templates), AT_ONCE):
             chunk = range(begin, min(begin + AT_ONCE, len(templates)))
@@ -102,19 +103,22 @@ class WideSearch:
                 descriptors, valid, _, _ = self._features.window(e_min_m, n_max_m, width, height, cell_m / self.stride)
                 if not valid.any():
                     continue
-                spectrum = np.fft.rfft2(descriptors, fft)
+                spectrum = spectra(descriptors, fft)
                 under = _box_sums(descriptors, valid, prepared[0].count)
                 for i, template in zip(chunk, prepared, strict=True):
-                    product = np.fft.irfft2(np.einsum("kij,kij->ij", spectrum, template.transform), fft)
+                    product = np.fft.irfft2((spectrum * template.transform).sum(0), fft)
                     correlation = _normalised(product, template, under)
-                    better = (correlation > look.correlation) | np.isnan(look.correlation)
-                    look.correlation[better], look.index[better] = correlation[better], i
+                    better = correlation > look.correlation
+                    np.copyto(look.correlation, correlation, where=better)
+                    np.copyto(look.index, np.uint8(i), where=better)
+        for look in found:
+            look.correlation[np.isneginf(look.correlation)] = np.nan
         return found
 
 
 def _nothing() -> BlockLook:
     side = (BLOCK_CELLS, BLOCK_CELLS)
-    return BlockLook(np.full(side, np.nan, np.float32), np.zeros(side, np.uint8))
+    return BlockLook(np.full(side, -np.inf, np.float32), np.zeros(side, np.uint8))
 
 
 def _prepare(template: Template, corner: tuple[int, int], fft: tuple[int, int]) -> _Prepared:
@@ -124,7 +128,7 @@ def _prepare(template: Template, corner: tuple[int, int], fft: tuple[int, int]) 
     centred = (template.descriptors - mean[:, None, None]) * weight
     middle = tuple(round(float(v.mean())) for v in np.nonzero(template.mask))
     return _Prepared(
-        np.fft.rfft2(centred, fft).conj(),
+        spectra(centred, fft).conj(),
         count,
         float((centred**2).sum()),
         corner,
@@ -134,7 +138,7 @@ def _prepare(template: Template, corner: tuple[int, int], fft: tuple[int, int]) 
 
 def _normalised(product: np.ndarray, template: _Prepared, under: tuple[np.ndarray, ...]) -> np.ndarray:
     """Zero-mean normalised correlation of each camera position of the block. ``under``: of ``_box_sums``, read where
-    the middle of the template lies."""
+    the middle of the template lies. -inf where the map does not cover the ground."""
     (r, c), (rm, cm) = template.corner, template.middle
     middle = (slice(rm, rm + BLOCK_CELLS), slice(cm, cm + BLOCK_CELLS))
     energy, squares, known = (sums[middle] for sums in under)
@@ -142,7 +146,7 @@ def _normalised(product: np.ndarray, template: _Prepared, under: tuple[np.ndarra
     correlation = product[r : r + BLOCK_CELLS, c : c + BLOCK_CELLS] / np.sqrt(
         np.maximum(variance * template.own, 1e-12)
     )
-    correlation[known < MIN_OVERLAP] = np.nan
+    correlation[known < MIN_OVERLAP] = -np.inf
     return np.asarray(correlation)
 
 

@@ -18,16 +18,21 @@ class GradientDescriber:
 
     def describe(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR -> (CHANNELS, H, W) float32, each pixel's vector of norm below 1."""
-        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         dx = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
         dy = cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
         magnitude, angle = cv2.cartToPolar(dx, dy)
-        position = np.mod(angle, np.float32(np.pi)) * np.float32(CHANNELS / np.pi)
+        position = angle
+        position *= np.float32(CHANNELS / np.pi)
+        np.subtract(position, CHANNELS, out=position, where=position >= CHANNELS)
         channels = np.empty((CHANNELS, *gray.shape), np.float32)
+        share = np.empty_like(magnitude)  # in place throughout: a large map is described in flight
         for k in range(CHANNELS):
-            distance = np.abs(position - k)
-            share = np.maximum(1.0 - np.minimum(distance, CHANNELS - distance), 0.0)
-            channels[k] = cv2.GaussianBlur(share * magnitude, (0, 0), SMOOTH_SIGMA_PX)
+            np.abs(np.subtract(position, k, out=share), out=share)
+            if k == 0:  # from the other side, too
+                np.minimum(share, CHANNELS - share, out=share)
+            np.maximum(np.subtract(1.0, share, out=share), 0.0, out=share)
+            cv2.GaussianBlur(np.multiply(share, magnitude, out=share), (0, 0), SMOOTH_SIGMA_PX, channels[k])
         norm = np.sqrt(np.einsum("khw,khw->hw", channels, channels))
-        channels /= norm + SATURATION * 0.25
+        channels /= norm + np.float32(SATURATION * 0.25)
         return channels
