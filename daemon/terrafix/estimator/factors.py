@@ -15,6 +15,7 @@ import numpy as np
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import log_so3, project_with_jacobian
 from terrafix.estimator.motion import EFFECTIVE_PAIRS, Ground
+from terrafix.estimator.remembered import custom_factor
 from terrafix.estimator.velocity import V_SIZE, Leg
 
 BIAS_SIZE = 6
@@ -90,7 +91,7 @@ def attitude_and_height_factor(
             jacobians[1] = np.asfortranarray(by_bias)
         return residual
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), [pose_key, bias_key], error)
+    return custom_factor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), [pose_key, bias_key], error)
 
 
 def same_ground_residual(
@@ -200,7 +201,7 @@ def same_ground_factor(
     huber = gtsam.noiseModel.mEstimator.Huber.Create(BLOCK_HUBER_K * float(np.sqrt(2 * EFFECTIVE_PAIRS)))
     noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(REDUCED))
     keys = [keyframe_key, pose_key, bias_key]
-    return gtsam.CustomFactor(noise, keys if keyframe_bias_key is None else [*keys, keyframe_bias_key], error)
+    return custom_factor(noise, keys if keyframe_bias_key is None else [*keys, keyframe_bias_key], error)
 
 
 def _reduced(
@@ -307,4 +308,4 @@ def leg_factor(
 
     noise = gtsam.noiseModel.Gaussian.Covariance(leg.cov, False)
     keys = [*before, *after, bias_keys[1]]
-    return gtsam.CustomFactor(noise, [*keys, bias_keys[0]] if leg.lifted else keys, error)
+    return custom_factor(noise, [*keys, bias_keys[0]] if leg.lifted else keys, error)
