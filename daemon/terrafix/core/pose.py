@@ -2,6 +2,7 @@
 
 The tangent of a pose is (rotation, translation), both on the right (camera frame), the order of GTSAM's Pose3."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,25 +24,27 @@ class PoseFit:
     sigma: float  # of one coordinate, estimated from the residuals (not below the floor that was given)
 
 
-def skew(v: np.ndarray) -> np.ndarray:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
 def exp_so3(w: np.ndarray) -> np.ndarray:
     """Rodrigues' formula, (3,) -> (3x3)."""
-    angle = float(np.linalg.norm(w))
-    k = skew(w)
-    if angle < 1e-8:
-        return np.eye(3) + k
-    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * (k @ k)
+    x, y, z = w.tolist()
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
+    a, b = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2) if angle >= 1e-8 else (1.0, 0.0)
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
 
 
 def log_so3(r: np.ndarray) -> np.ndarray:
     """(3x3) -> (3,); good below pi."""
-    cos_angle = min(1.0, max(-1.0, (float(np.trace(r)) - 1.0) / 2.0))
-    angle = float(np.arccos(cos_angle))
-    v = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    return v / 2.0 if angle < 1e-7 else v * angle / (2.0 * np.sin(angle))
+    (a, b, c), (d, e, f), (g, h, i) = r.tolist()
+    angle = math.acos(min(1.0, max(-1.0, (a + e + i - 1.0) / 2.0)))
+    half = 0.5 if angle < 1e-7 else angle / (2.0 * math.sin(angle))
+    return half * np.array([h - f, c - g, d - b])
 
 
 def project_with_jacobian(
@@ -51,16 +54,14 @@ def project_with_jacobian(
     q = (points_w_m - p_c_in_w_m) @ r_w_c
     z = np.maximum(q[:, 2], 1e-6)
     xy = q[:, :2] / z[:, None]
-    d_q = np.zeros((len(q), 2, 3))
-    d_q[:, 0, 0] = d_q[:, 1, 1] = 1.0 / z
-    d_q[:, :, 2] = -xy / z[:, None]
+    # q = R^T (P - p); right perturbation: dq = [q]x w - v. Row by row, of x = q_x / z and y = q_y / z:
+    x, y = xy.T
     jacobian = np.zeros((len(q), 2, 6))
-    # q = R^T (P - p); right perturbation: dq = [q]x w - v
-    qx = np.zeros((len(q), 3, 3))
-    qx[:, 0, 1], qx[:, 0, 2], qx[:, 1, 2] = -q[:, 2], q[:, 1], -q[:, 0]
-    qx[:, 1, 0], qx[:, 2, 0], qx[:, 2, 1] = q[:, 2], -q[:, 1], q[:, 0]
-    jacobian[:, :, :3] = d_q @ qx
-    jacobian[:, :, 3:] = -d_q
+    jacobian[:, 0, 0], jacobian[:, 1, 1] = x * y, -x * y
+    jacobian[:, 0, 1], jacobian[:, 1, 0] = -(q[:, 2] / z + x * x), q[:, 2] / z + y * y
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = y, -x
+    jacobian[:, 0, 3] = jacobian[:, 1, 4] = -1.0 / z
+    jacobian[:, :, 5] = xy / z[:, None]
     return xy, jacobian, q[:, 2]
 
 
@@ -81,29 +82,31 @@ def fit_pose(
     whole blocks of them). ``tilt_sigma_rad``: how well the tilt of the given ``r_w_c`` is known, when it is to be a
     prior: matches in a narrow band trade tilt for translation. ``tolerance``: of the last step, rad and relative
     metres. ``None`` when the geometry does not determine a pose."""
-    weights = np.ones(len(xy)) if weights is None else weights
     sigma = sigma_floor
     r, p = r_w_c, p_c_in_w_m
     hessian = np.eye(6)
-    error = np.zeros((len(xy), 2))
+    norm = np.zeros(len(xy))
     scale = np.ones(6)
     for _ in range(MAX_ITERATIONS):
         predicted, jacobian, depth = project_with_jacobian(r, p, points_w_m)
-        if np.any(depth <= 0):
+        if depth.min() <= 0:
             return None
         error = xy - predicted
-        norm = np.linalg.norm(error, axis=1)
+        norm = np.sqrt(np.einsum("ni,ni->n", error, error))
         sigma = max(sigma_floor, _median(norm) / 1.177)  # the median of a Rayleigh variable is 1.177 sigma
-        w = weights * np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
-        flat, weighted = jacobian.reshape(-1, 6), (jacobian * w[:, None, None]).reshape(-1, 6)
-        hessian = weighted.T @ flat
-        gradient = weighted.T @ error.ravel()
+        w = np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
+        if weights is not None:
+            w *= weights
+        flat = jacobian.reshape(-1, 6)
+        weighted = flat.T * np.repeat(w, 2)
+        hessian = weighted @ flat
+        gradient = weighted @ error.ravel()
         if tilt_sigma_rad is not None:
-            stiffness = sigma**2 / effective / tilt_sigma_rad**2 * np.array([1.0, 1.0])
+            stiffness = sigma**2 / effective / tilt_sigma_rad**2
             hessian[[0, 1], [0, 1]] += stiffness
             gradient[:2] -= stiffness * log_so3(r_w_c.T @ r)[:2]
         scale[3:] = len(depth) / float(depth.sum())
-        scaled = hessian * np.outer(1 / scale, 1 / scale)
+        scaled = hessian / scale / scale[:, None]
         eigenvalues = np.linalg.eigvalsh(scaled)
         if not eigenvalues[0] * MAX_CONDITION > eigenvalues[-1]:  # written so that a NaN fails, too
             return None
@@ -113,7 +116,7 @@ def fit_pose(
         if float(np.abs(step * scale).max()) < tolerance:
             break
     cov = sigma**2 / max(effective, 1e-6) * np.linalg.inv(hessian)
-    return PoseFit(r, p, (cov + cov.T) / 2, np.linalg.norm(error, axis=1), sigma)
+    return PoseFit(r, p, (cov + cov.T) / 2, norm, sigma)
 
 
 def _median(values: np.ndarray) -> float:

@@ -114,13 +114,13 @@ def same_ground_residual(
     residual = (predicted - pairs[:, 2:]).ravel()
     # Moving the point X moves its image like moving the camera the other way: d(image)/dX = -by_pose[translation] R^T.
     by_point = -by_pose[:, :, 3:] @ r_k.T
-    slide = np.eye(3) - np.einsum("ni,j->nij", d / along[:, None], normal)  # along the ray, back onto the plane
-    by_ray = by_point @ slide
-    cross = np.zeros((len(rays), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -1.0, rays[:, 1], -rays[:, 0]
-    cross[:, 1, 0], cross[:, 2, 0], cross[:, 2, 1] = 1.0, -rays[:, 1], rays[:, 0]
-    by_keyframe = np.concatenate([-depth[:, None, None] * (by_ray @ r_kf @ cross), by_ray @ r_kf], axis=2)
     by_height = np.einsum("nij,nj->ni", by_point, d / along[:, None])
+    x, y, z = np.moveaxis((by_point - by_height[:, :, None] * normal) @ r_kf, 2, 0)  # along the ray, back to the plane
+    by_keyframe = np.empty_like(by_pose)
+    by_keyframe[:, :, 0] = depth[:, None] * (z * rays[:, 1:2] - y)  # of a turn: the cross product with the ray
+    by_keyframe[:, :, 1] = depth[:, None] * (x - z * rays[:, :1])
+    by_keyframe[:, :, 2] = depth[:, None] * (y * rays[:, :1] - x * rays[:, 1:2])
+    by_keyframe[:, :, 3:] = np.stack([x, y, z], 2)
     n = 2 * len(pairs)
     return residual, by_keyframe.reshape(n, 6), by_pose.reshape(n, 6), points, by_height.ravel()
 

@@ -39,21 +39,18 @@ _FIELDS = ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed")
 class Telemetry:
     def __init__(self) -> None:
         self._states: deque[VehicleState] = deque(maxlen=KEPT)
-        self._turns: deque[tuple[int, float, float, float]] = deque(maxlen=KEPT)  # t_ns, yaw, pitch, roll
-        self._forces: deque[tuple[int, float, float, float]] = deque(maxlen=KEPT_READINGS)  # t_ns, forward, right, down
+        self._turns = _Series(KEPT)  # yaw, pitch, roll
+        self._forces = _Series(KEPT_READINGS)  # forward, right, down
 
     def add(self, state: VehicleState) -> None:
         self._states.append(state)
         if state.yaw_rad is None or state.pitch_rad is None or state.roll_rad is None:
             return
-        if not self._turns or state.t_ns > self._turns[-1][0]:
-            self._turns.append((state.t_ns, state.yaw_rad, state.pitch_rad, state.roll_rad))
+        self._turns.add(state.t_ns, state.yaw_rad, state.pitch_rad, state.roll_rad)
 
     def add_imu(self, imu: Imu) -> None:
         for before_ns, forward, right, down, *_ in imu.samples:
-            t_ns = imu.t_ns - before_ns
-            if not self._forces or t_ns > self._forces[-1][0]:
-                self._forces.append((t_ns, forward, right, down))
+            self._forces.add(imu.t_ns - before_ns, forward, right, down)
 
     def at(self, t_ns: int) -> Attitude:
         """Field by field the value measured nearest to ``t_ns``; ``None`` where nobody said it within a second."""
@@ -78,7 +75,7 @@ class Telemetry:
 
     def felt(self, t0_ns: int, t1_ns: int) -> Felt | None:
         """Acceleration from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that."""
-        forces, turns = _around(self._forces, t0_ns, t1_ns), _around(self._turns, t0_ns, t1_ns)
+        forces, turns = self._forces.around(t0_ns, t1_ns), self._turns.around(t0_ns, t1_ns)
         if t1_ns <= t0_ns or forces is None or turns is None:
             return None
         (t_f, f), (t_a, angles) = forces, turns
@@ -86,27 +83,47 @@ class Telemetry:
             return None
         inside = t_f[(t_f > t0_ns) & (t_f < t1_ns)]
         t = np.concatenate([[t0_ns], inside, [t1_ns]])
-        f_b = np.column_stack([np.interp(t, t_f, f[:, i]) for i in range(3)])
-        yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in np.unwrap(angles, axis=0).T)
+        f_b = [np.interp(t, t_f, axis) for axis in f]
+        yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
         accel = _in_world(f_b, yaw, pitch, roll)
         accel[:, 2] -= GRAVITY_MPS2
         # What the readings scatter from one to the next is vibration, whatever its frequency was.
         spacing_s = (t_f[-1] - t_f[0]) * 1e-9 / (len(t_f) - 1)
-        scatter = float(np.mean(np.square(np.diff(f, 2, axis=0)))) / 6.0 if len(f) > 3 else 0.0
+        scatter = float(np.mean(np.square(np.diff(f, 2)))) / 6.0 if f.shape[1] > 3 else 0.0
         unfelt_s = max(0.0, (t1_ns - int(t_f[-1])) * 1e-9)
         return Felt((t - t0_ns) * 1e-9, accel, yaw, float(np.sqrt(scatter * spacing_s)), unfelt_s)
 
 
-def _around(
-    said: deque[tuple[int, float, float, float]], t0_ns: int, t1_ns: int
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Times (N,) and values (N, 3) from the last one before ``t0_ns`` to the first one after ``t1_ns``."""
-    first = max(0, bisect_right(said, t0_ns, key=lambda s: s[0]) - 1)
-    last = min(len(said), bisect_left(said, t1_ns, key=lambda s: s[0]) + 1)
-    if last - first < 2:
-        return None
-    chosen = [said[i] for i in range(first, last)]
-    return np.array([s[0] for s in chosen]), np.array([s[1:] for s in chosen])
+class _Series:
+    """The newest ``kept`` readings of three axes, in order of time; older than the newest is not taken."""
+
+    def __init__(self, kept: int) -> None:
+        self._kept = kept
+        self._t_ns: list[int] = []
+        self._axes: tuple[list[float], list[float], list[float]] = ([], [], [])
+
+    def add(self, t_ns: int, x: float, y: float, z: float) -> None:
+        if self._t_ns and t_ns <= self._t_ns[-1]:
+            return
+        self._t_ns.append(t_ns)
+        for axis, value in zip(self._axes, (x, y, z), strict=True):
+            axis.append(value)
+        if len(self._t_ns) > 2 * self._kept:
+            for column in (self._t_ns, *self._axes):
+                del column[: -self._kept]
+
+    def around(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Times (N,) and values (3, N) from the last one before ``t0_ns`` to the first one after ``t1_ns``."""
+        first = max(0, bisect_right(self._t_ns, t0_ns) - 1)
+        last = min(len(self._t_ns), bisect_left(self._t_ns, t1_ns) + 1)
+        if last - first < 2:
+            return None
+        return np.array(self._t_ns[first:last]), np.array([axis[first:last] for axis in self._axes])
+
+
+def _unwrapped(angles: np.ndarray) -> np.ndarray:
+    """(3, N); numpy's own takes long to find that nothing turns over."""
+    return np.unwrap(angles, axis=1) if np.abs(np.diff(angles, axis=1)).max() >= np.pi else angles
 
 
 def _covers(t_ns: np.ndarray, t0_ns: int, t1_ns: int, gap_ns: int) -> bool:
@@ -114,10 +131,10 @@ def _covers(t_ns: np.ndarray, t0_ns: int, t1_ns: int, gap_ns: int) -> bool:
     return bool(edges and np.diff(t_ns).max() <= gap_ns)
 
 
-def _in_world(f_b: np.ndarray, yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """(N, 3) from body FRD into world ENU; ``rot_w_b`` for many at once."""
+def _in_world(f_b: list[np.ndarray], yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Three axes (N,) of body FRD -> (N, 3) in world ENU; ``rot_w_b`` for many at once."""
     (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
-    x, y, z = f_b.T
+    x, y, z = f_b
     ahead = cp * x + sp * (sr * y + cr * z)  # level axes of the heading: forward, right
     right = cr * y - sr * z
     down = -sp * x + cp * (sr * y + cr * z)

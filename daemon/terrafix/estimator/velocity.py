@@ -157,6 +157,7 @@ def leg(
     weight[:-1] += 0.5 * np.diff(s)
     to_way, to_gain = weight * _reach(dt_s - s, course_s), weight * np.exp(-(dt_s - s) / course_s)
     lasts = np.exp(-s / memory_s)
+    heading = np.array([np.cos(yaw), np.sin(yaw), np.ones(len(yaw))])
     sigma = unmeasured_sigma(felt is not None, speed_mps, tilt_sigma_rad, launching)
     cov = _left_out(dt_s, memory_s, course_s, sigma, noise, float(yaw[-1]), speed_mps)
     if felt is not None:
@@ -167,8 +168,8 @@ def leg(
         keep=float(np.exp(-dt_s / course_s)),
         way_m=to_way @ accel,
         gain_mps=to_gain @ accel,
-        way_by_accel=np.hstack([_turned(to_way * lasts, yaw), steady * _turned(to_way, yaw)[:, :2]]),
-        gain_by_accel=np.hstack([_turned(to_gain * lasts, yaw), steady * _turned(to_gain, yaw)[:, :2]]),
+        way_by_accel=_turned(heading @ (to_way * lasts), steady * (heading @ to_way)),
+        gain_by_accel=_turned(heading @ (to_gain * lasts), steady * (heading @ to_gain)),
         lasting=np.exp(-dt_s / np.array([memory_s] * 3 + [STEADY_S] * 2)),
         cov=cov,
         inertial=felt is not None,
@@ -224,10 +225,11 @@ def _reach(t_s: np.ndarray, memory_s: float) -> np.ndarray:
     return np.asarray(-np.expm1(-t_s / memory_s) * memory_s)
 
 
-def _turned(weights: np.ndarray, yaw_rad: np.ndarray) -> np.ndarray:
-    """Sum of weighted rotations from the heading's axes into the world (3x3)."""
-    c, s = float(weights @ np.cos(yaw_rad)), float(weights @ np.sin(yaw_rad))
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, float(weights.sum())]])
+def _turned(wandering: np.ndarray, steady: np.ndarray) -> np.ndarray:
+    """(3, 5): sums of weighted rotations from the heading's axes into the world, of which each (3,) is the sum of the
+    cosines, of the sines, and of the weights."""
+    (c, s, w), (c_steady, s_steady, _) = wandering.tolist(), steady.tolist()
+    return np.array([[c, s, 0.0, c_steady, s_steady], [-s, c, 0.0, -s_steady, c_steady], [0.0, 0.0, w, 0.0, 0.0]])
 
 
 def _left_out(
@@ -245,16 +247,14 @@ def _left_out(
     t = (half_s * (_NODES + 1.0) + 2.0 * half_s * np.arange(panels)[:, None]).ravel()
     w = np.tile(half_s * _WEIGHTS, panels)
     rate = 1.0 / memory_s - 1.0 / course_s
-    kick = np.array(  # of position, velocity, acceleration, t seconds after a unit kick of the acceleration
-        [
-            (_reach(t, course_s) - _reach(t, memory_s)) / rate,
-            (np.exp(-t / course_s) - np.exp(-t / memory_s)) / rate,
-            np.exp(-t / memory_s),
-        ]
-    )
-    push = np.array([_reach(t, course_s), np.exp(-t / course_s), np.zeros(len(t))])  # ... after one of the velocity
+    fading, keeping, reach = np.exp(-t / memory_s), np.exp(-t / course_s), _reach(t, course_s)
+    # Of position, velocity, acceleration: t seconds after a unit kick of the acceleration, and a push of the velocity.
+    kick = np.array([(reach - _reach(t, memory_s)) / rate, (keeping - fading) / rate, fading])
+    push = np.array([reach, keeping, np.zeros(len(t))])
     by_kick, by_push = (kick * w) @ kick.T * (2.0 / memory_s), (push * w) @ push.T
-    wandering = np.kron(by_kick, np.diag(sigma**2)) + np.kron(by_push, noise_mps2**2 * np.eye(3))
+    by_kick, by_push = by_kick[:, None, :, None], by_push[:, None, :, None]  # times (3, 1, 3): Kronecker's product
+    wandering = by_kick * np.diag(sigma**2)[:, None] + by_push * (noise_mps2**2 * np.eye(3))[:, None]
+    wandering = wandering.reshape(9, 9)
     wandering[:3, :3] += (0.02**2 + (CLOCK_JITTER_S * speed_mps) ** 2) * np.eye(3)
     to_heading = np.eye(9)
     to_heading[6:, 6:] = local_rotation_up(-yaw_end_rad).T
