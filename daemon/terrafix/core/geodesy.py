@@ -2,15 +2,20 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pyproj import CRS, Transformer
+
+if TYPE_CHECKING:
+    from pyproj import CRS, Transformer
 
 
-def local_crs(lat_deg: float, lon_deg: float) -> CRS:
+def local_crs(lat_deg: float, lon_deg: float) -> "CRS":
     """Transverse Mercator with its centre and unit scale at the origin: metres, true north at the origin.
 
     Scale error is below 1e-6 within 9 km of the central meridian (Snyder, USGS PP 1395, eq. 8-11)."""
+    from pyproj import CRS  # only here: link and vision turn vectors, and shall be there soon after a restart
+
     return CRS.from_proj4(
         f"+proj=tmerc +lat_0={lat_deg:.9f} +lon_0={lon_deg:.9f} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m"
     )
@@ -22,10 +27,12 @@ class LocalFrame:
 
     lat_deg: float
     lon_deg: float
-    _forward: Transformer = field(init=False, repr=False, compare=False)
-    _inverse: Transformer = field(init=False, repr=False, compare=False)
+    _forward: "Transformer" = field(init=False, repr=False, compare=False)
+    _inverse: "Transformer" = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        from pyproj import CRS, Transformer
+
         crs = local_crs(self.lat_deg, self.lon_deg)
         wgs84 = CRS.from_epsg(4326)
         object.__setattr__(self, "_forward", Transformer.from_crs(wgs84, crs, always_xy=True))

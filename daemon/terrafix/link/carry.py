@@ -1,4 +1,4 @@
-"""Carries an estimate forward to now: constant velocity, the turn that the attitude shows, covariance grown with age.
+"""Carries an estimate forward to now, by what the inertial sensors felt since (felt.py), covariance grown with age.
 
 The autopilot's own velocity is not used: it comes from the filter that this position is sent to, and feeding it
 back with the delay of the camera path closes a loop that can oscillate. Attitude comes from the gyroscopes."""
@@ -8,13 +8,19 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from terrafix.messages import NavEstimate, VehicleState
+from terrafix.core.geodesy import rot_from_quat, yaw_of
+from terrafix.link.felt import Felt
+from terrafix.messages import Imu, NavEstimate, VehicleState
 
 GRAVITY_MPS2 = 9.81
 WGS84_A_M = 6_378_137.0  # semi-major axis (NIMA TR8350.2)
 WGS84_E2 = 6.694379990141e-3  # first eccentricity squared
-# 1-sigma of the acceleration that constant velocity leaves out: gusts and speed changes when the turn is known
-# from the attitude, half a standard-rate turn at 20 m/s (1 m/s^2) when it is not.
+# 1-sigma of the acceleration that is left out. Felt: an attitude that is 2 degrees off lets so much of gravity in, and
+# the heading's error turns what was felt. Only the turn is known, from the attitude: a plane's gusts and changes of
+# speed; a copter that leans to a corner does ten times that, and is the reason why its readings are asked for. Nothing:
+# half a standard-rate turn at 20 m/s.
+ACCEL_SIGMA_FELT_MPS2 = 0.4
+HEADING_SIGMA_RAD = math.radians(5.0)
 ACCEL_SIGMA_MPS2 = 0.5
 ACCEL_SIGMA_BLIND_MPS2 = 1.0
 ATTITUDE_MEMORY_NS = 4_000_000_000  # longer than any carry (fix.MAX_AGE_NS)
@@ -37,14 +43,30 @@ class Carried:
 
 
 class Attitudes:
-    """Yaw and roll of the last seconds, for the turn between an estimate and now."""
+    """Yaw and roll of the last seconds, for the turn between an estimate and now; and what was felt (felt.py)."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, float, float]] = deque()
+        self._felt = Felt()
+
+    def add_imu(self, imu: Imu) -> None:
+        self._felt.add(imu)
+
+    def gained(self, estimate: NavEstimate, now_ns: int) -> tuple[tuple[float, float, float], ...] | None:
+        """Velocity and way (east, north, up) that were felt since ``estimate``, by its heading; None: unknown."""
+        said = min(self._samples, key=lambda s: abs(s[0] - estimate.t_ns), default=None)
+        felt = self._felt.since(estimate.t_ns, now_ns)
+        if felt is None or said is None:
+            return None
+        # The autopilot's heading is its compass; the estimate's is what map and odometry made of that.
+        turn_rad = yaw_of(rot_from_quat(estimate.q_w_b)) - said[1]
+        c, s = math.cos(turn_rad), math.sin(turn_rad)
+        return tuple((c * e + s * n, c * n - s * e, u) for e, n, u in felt)
 
     def add(self, state: VehicleState) -> None:
         if state.yaw_rad is None or state.roll_rad is None:
             return
+        self._felt.turn(state)
         if self._samples and state.t_ns <= self._samples[-1][0]:
             return
         self._samples.append((state.t_ns, state.yaw_rad, state.roll_rad))
@@ -73,27 +95,30 @@ def carry(estimate: NavEstimate, now_ns: int, attitudes: Attitudes) -> Carried:
     """``estimate`` (at its ``t_ns``) -> the same vehicle at ``now_ns``, less certain by what is not known since."""
     age_s = max(0.0, (now_ns - estimate.t_ns) * 1e-9)
     ve, vn, vu = estimate.velocity_enu_mps
-    turn = attitudes.lateral_accel(estimate.t_ns, now_ns, math.hypot(ve, vn))
-    accel_sigma = ACCEL_SIGMA_BLIND_MPS2 if turn is None else ACCEL_SIGMA_MPS2
-    right, heading = turn if turn is not None else (0.0, 0.0)
-    ae, an = right * math.cos(heading), -right * math.sin(heading)  # right of the heading, in east and north
-    lat_deg, lon_deg = offset(
-        estimate.lat_deg,
-        estimate.lon_deg,
-        ve * age_s + 0.5 * ae * age_s**2,
-        vn * age_s + 0.5 * an * age_s**2,
-    )
-    grown_m2 = (estimate.velocity_sigma_mps * age_s) ** 2 + (0.5 * accel_sigma * age_s**2) ** 2
+    felt = attitudes.gained(estimate, now_ns) if age_s > 0.0 else None
+    turned_mps = turned_m = 0.0
+    if felt is not None:
+        gain, way = felt
+        accel_sigma = ACCEL_SIGMA_FELT_MPS2
+        turned_mps, turned_m = (HEADING_SIGMA_RAD * math.hypot(v[0], v[1]) for v in felt)
+    else:
+        turn = attitudes.lateral_accel(estimate.t_ns, now_ns, math.hypot(ve, vn))
+        accel_sigma = ACCEL_SIGMA_BLIND_MPS2 if turn is None else ACCEL_SIGMA_MPS2
+        right, heading = turn if turn is not None else (0.0, 0.0)
+        ae, an = right * math.cos(heading), -right * math.sin(heading)  # right of the heading, in east and north
+        gain, way = (ae * age_s, an * age_s, 0.0), (0.5 * ae * age_s**2, 0.5 * an * age_s**2, 0.0)
+    lat_deg, lon_deg = offset(estimate.lat_deg, estimate.lon_deg, ve * age_s + way[0], vn * age_s + way[1])
+    grown_m2 = (estimate.velocity_sigma_mps * age_s) ** 2 + (0.5 * accel_sigma * age_s**2) ** 2 + turned_m**2
     return Carried(
         t_ns=now_ns,
         age_s=age_s,
         lat_deg=lat_deg,
         lon_deg=lon_deg,
-        alt_amsl_m=estimate.alt_amsl_m + vu * age_s,
-        velocity_enu_mps=(ve + ae * age_s, vn + an * age_s, vu),
+        alt_amsl_m=estimate.alt_amsl_m + vu * age_s + way[2],
+        velocity_enu_mps=(ve + gain[0], vn + gain[1], vu + gain[2]),
         horizontal_sigma_m=math.sqrt(worst_horizontal_variance(estimate.cov) + grown_m2),
         vertical_sigma_m=math.sqrt(max(0.0, estimate.cov[14]) + grown_m2),
-        speed_sigma_mps=math.hypot(estimate.velocity_sigma_mps, accel_sigma * age_s),
+        speed_sigma_mps=math.hypot(estimate.velocity_sigma_mps, accel_sigma * age_s, turned_mps),
     )
 
 

@@ -18,6 +18,7 @@ from terrafix.messages import (
     GpsInput,
     Health,
     HintVerdict,
+    Imu,
     MeasurementVerdict,
     Message,
     NavEstimate,
@@ -89,6 +90,8 @@ class LinkNode:
                 self._gnss.vehicle(message)
                 self._armed = message.armed
                 self._start_holds = self._start_holds or message.armed is False
+            case Imu():
+                self._attitudes.add_imu(message)
             case GnssReading():
                 return list(self._gnss.reading(message, self._attitudes))
             case Origin():
