@@ -292,6 +292,16 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     emitted_at_ns: int  # when it was said; in a replay, the time of the frame that it answers
 
 
+class SlowErrors(Message, frozen=True, kw_only=True):
+    """Once a second: what was learnt by now of what is off for a whole flight: mount, compass, barometer, lens."""
+
+    frame_id: int
+    # Tilt of the mount about the camera's x and y [rad], heading [rad], height [m], first radial coefficient [-],
+    # logarithm of heights told over heights seen [-]
+    error: tuple[float, float, float, float, float, float]
+    cov: tuple[float, ...]  # 6x6, row-major
+
+
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
     frame_id: int
     lat_deg: float
@@ -473,6 +483,7 @@ AnyMessage = (
     | PositionHint
     | HintVerdict
     | NavEstimate
+    | SlowErrors
     | Refinement
     | MeasurementVerdict
     | GpsInput

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, Flight, Listener, blind, error_m, sigma_m
 
+from terrafix.core.geodesy import rot_from_quat
+from terrafix.core.pose import log_so3
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.resume import Keeper, kept
-from terrafix.messages import NavEstimate, Odometry, Prediction
+from terrafix.estimator.resume import Keeper, Last, kept
+from terrafix.messages import Odometry, Prediction, VehicleState
 
 KILLED, BACK = 60, 66  # frames: three seconds
 
@@ -17,19 +19,19 @@ def flight() -> Flight:
 
 
 @pytest.fixture(scope="module")
-def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> NavEstimate:
+def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Last:
     """What it said last, through the file."""
     file = tmp_path_factory.mktemp("run") / "estimator.kept"
     assert kept(file) is None
     keeper = Keeper(file)
-    for message in Listener().fly(flight, 0, KILLED).said:
+    for message in [flight.fix(KILLED - 2), *Listener().fly(flight, 0, KILLED).said]:
         keeper.heard(message)
     last = kept(file)
-    assert last is not None and last.frame_id == KILLED - 1
+    assert last is not None and last.estimate.frame_id == KILLED - 1
     return last
 
 
-def resumed(flight: Flight, last: NavEstimate | None) -> Listener:
+def resumed(flight: Flight, last: Last | None) -> Listener:
     run = Listener()
     run.node = EstimatorNode(0, last)
     run.hear([ORIGIN])
@@ -41,18 +43,18 @@ def resumed(flight: Flight, last: NavEstimate | None) -> Listener:
     return run
 
 
-def test_it_goes_on_from_there(flight: Flight, killed: NavEstimate) -> None:
+def test_it_goes_on_from_there(flight: Flight, killed: Last) -> None:
     run = resumed(flight, killed)
     first = run.estimate(BACK)
     assert np.linalg.norm(error_m(first, flight)[:2]) < 25.0
-    assert sigma_m(killed) < sigma_m(first) < 40.0
+    assert sigma_m(killed.estimate) < sigma_m(first) < 40.0
     for i in range(BACK, flight.frames):
         said = run.estimate(i)
         assert np.linalg.norm(error_m(said, flight)[:2]) < 3.5 * np.sqrt(2.0) * sigma_m(said)
     assert sigma_m(run.estimate(flight.frames - 1)) < 10.0
 
 
-def test_the_anchor_is_told_of_the_way_in_between(flight: Flight, killed: NavEstimate) -> None:
+def test_the_anchor_is_told_of_the_way_in_between(flight: Flight, killed: Last) -> None:
     told = next(m for m in resumed(flight, killed).said if isinstance(m, Prediction))
     flown_m = flight.p_m[BACK, :2] - flight.p_m[KILLED - 1, :2]
     assert np.linalg.norm(told.step_m - flown_m) < 20.0 < np.linalg.norm(flown_m)
@@ -62,3 +64,45 @@ def test_without_what_it_left_it_knows_the_start_only(flight: Flight) -> None:
     """Half a minute ago, and so it claims little."""
     first = resumed(flight, None).estimate(BACK)
     assert sigma_m(first) > 0.5 * SPEED_MPS * FRAME_S * BACK
+
+
+def heading_and_scale_sigma(run: Listener) -> tuple[float, float]:
+    """Of the first Prediction: what the anchor has to look through."""
+    first = next(m for m in run.said if isinstance(m, Prediction))
+    return float(np.sqrt(first.cov[35])), first.agl_sigma_m / first.agl_m
+
+
+def test_what_was_learnt_of_compass_and_barometer_holds_on(flight: Flight, killed: Last) -> None:
+    assert killed.slow is not None and killed.estimate.t_ns - killed.slow.t_ns < 1_500_000_000
+    with_it = heading_and_scale_sigma(resumed(flight, killed))
+    without = heading_and_scale_sigma(resumed(flight, Last(killed.estimate, match=killed.match)))
+    assert with_it[0] < 0.6 * without[0] and with_it[1] <= without[1]
+    # And it was learnt right: the heading that is begun with is no farther off than it claims.
+    first = resumed(flight, killed).estimate(BACK)
+    turned = rot_from_quat(first.q_w_b) @ flight.r_w_b[BACK].T
+    assert abs(log_so3(turned)[2]) < 3.0 * with_it[0]
+
+
+def test_frames_wait_for_the_words_to_which_belongs_what_was_learnt(flight: Flight, killed: Last) -> None:
+    """Vision is there before the link: a graph that began blind would begin anew, and lose its keyframe."""
+    node = EstimatorNode(0, killed)
+    said = list(node.on(ORIGIN))
+    frames = [next(m for m in flight.messages(i) if isinstance(m, Odometry)) for i in (BACK, BACK + 1)]
+    frames[0] = blind(frames[0])
+    for odometry in frames:
+        said += node.on(odometry)
+    assert not said
+    words = [m for i in (BACK, BACK + 1) for m in flight.messages(i) if isinstance(m, VehicleState)]
+    for message in words:
+        said += node.on(message)
+    first = next(m for m in said if isinstance(m, Prediction))
+    assert first.frame_id == BACK and np.sqrt(first.cov[35]) < 0.1
+    assert sum(isinstance(m, Prediction) for m in said) == 2
+
+
+def test_an_autopilot_that_says_nothing_is_not_waited_for(flight: Flight, killed: Last) -> None:
+    node = EstimatorNode(0, killed)
+    said = list(node.on(ORIGIN))
+    for i in range(BACK, BACK + 5):
+        said += [x for m in flight.messages(i) if isinstance(m, Odometry) for x in node.on(blind(m))]
+    assert sum(isinstance(m, Prediction) for m in said) >= 4

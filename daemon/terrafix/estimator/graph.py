@@ -28,6 +28,14 @@ WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.1
 COMPASS_BY_TURN_RAD = np.radians(2.5)  # ... and of the compass per square root of a radian turned: iron on board
 
 
+def walk_sigmas(dt_s: float, turned_rad: float, rise_sigma_m: float) -> np.ndarray:
+    """1-sigma (6,) of what the slow errors have changed by. ``rise_sigma_m``: of the ground, when no map tells."""
+    sigmas = WALK_SIGMAS * np.sqrt(dt_s)
+    sigmas[2] = np.hypot(sigmas[2], COMPASS_BY_TURN_RAD * np.sqrt(abs(turned_rad)))
+    sigmas[HEIGHT] = np.hypot(sigmas[HEIGHT], rise_sigma_m)
+    return sigmas
+
+
 @dataclass(frozen=True)
 class NodeState:
     pose: gtsam.Pose3
@@ -156,10 +164,8 @@ class PoseGraph:
         else:
             standing = gtsam.noiseModel.Gaussian.Covariance(standing_cov())
             factors.add(gtsam.PriorFactorVector(V(node), np.zeros(V_SIZE), standing))
-        sigmas = WALK_SIGMAS * np.sqrt(dt_s)
         turned = state.pose.rotation().compose(self.state(newest).pose.rotation().inverse())
-        sigmas[2] = np.hypot(sigmas[2], COMPASS_BY_TURN_RAD * np.sqrt(abs(gtsam.Rot3.Logmap(turned)[2])))
-        sigmas[HEIGHT] = np.hypot(sigmas[HEIGHT], rise_sigma_m)
+        sigmas = walk_sigmas(dt_s, float(gtsam.Rot3.Logmap(turned)[2]), rise_sigma_m)
         walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(BIAS_SIZE), walk))
         if attitude is not None:

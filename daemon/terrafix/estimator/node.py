@@ -8,7 +8,7 @@ from terrafix.core.geodesy import LocalFrame, quat_from_rot
 from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter import Estimator
-from terrafix.estimator.resume import Keeper, Known, kept
+from terrafix.estimator.resume import Keeper, Known, Last, kept
 from terrafix.estimator.telemetry import Telemetry
 from terrafix.estimator.tracker import Advance, Placed
 from terrafix.messages import (
@@ -24,6 +24,7 @@ from terrafix.messages import (
     Prediction,
     RefinedPose,
     Refinement,
+    SlowErrors,
     SourceEnded,
     SourceLabel,
     ThermalBand,
@@ -32,19 +33,23 @@ from terrafix.messages import (
 )
 
 ANCHORED_FOR_S = 1.5  # after a map fix the odometry since then is too short to matter
+SLOW_EVERY_NS = 1_000_000_000
+WORDS_WAIT_NS = 1_000_000_000  # the autopilot's heartbeat comes once a second
 
 
 class EstimatorNode:
     """``began_ns``: of the flight, when this process was started again in it: since then the vehicle has flown on.
     ``last``: what the process before it said last."""
 
-    def __init__(self, began_ns: int | None = None, last: NavEstimate | None = None) -> None:
+    def __init__(self, began_ns: int | None = None, last: Last | None = None) -> None:
         self._began_ns, self._resumed_from = began_ns, last
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
+        self._said_slow_ns = 0
+        self._waiting: list[Odometry] = []  # for the autopilot's words, to which belongs what was learnt
         self._predicted: int | None = None  # frame of the newest Prediction ...
         self._from_m = np.zeros(2)  # ... and where it was, with its map match
 
@@ -64,13 +69,15 @@ class EstimatorNode:
                 self._estimator = Estimator(message, self._known(message, self._frame))
             case VehicleState():
                 self._telemetry.add(message)
+                yield from self._begun()
             case Imu():
                 self._telemetry.add_imu(message)
             case Health():
                 cool = message.band is ThermalBand.NORMAL
                 self._mode = CovarianceMode.MARGINALS if cool else CovarianceMode.JACOBIAN
             case Odometry():
-                yield from self._on_odometry(message)
+                self._waiting.append(message)
+                yield from self._begun()
             case MapMatch():
                 yield from self._on_map_match(message)
             case SourceEnded():
@@ -87,6 +94,22 @@ class EstimatorNode:
         if self._resumed_from is not None:
             return Known.of(self._resumed_from, frame)
         return Known.start(origin, self._began_ns * 1e-9)
+
+    def _begun(self) -> Iterable[Message]:
+        """All frames that wait, when the first of them can be begun with. Vision may be there before the link is, after
+        a restart; a graph that began without heading and height would have to begin anew."""
+        if not self._waiting:
+            return
+        begins = self._estimator is not None and self._estimator.last is None
+        if begins and self._resumed_from is not None and self._resumed_from.slow is not None:
+            first = self._waiting[0].t_ns
+            said = self._telemetry.at(first)
+            known = said.yaw_rad is not None and said.agl_m is not None
+            if not known and self._waiting[-1].t_ns - first < WORDS_WAIT_NS:
+                return
+        waiting, self._waiting = self._waiting, []
+        for odometry in waiting:
+            yield from self._on_odometry(odometry)
 
     def _on_odometry(self, odometry: Odometry) -> Iterable[Message]:
         estimator = self._estimator
@@ -106,7 +129,25 @@ class EstimatorNode:
         if odometry.verdict not in (Verdict.BAD_IMAGE, Verdict.STALLED):
             yield self._prediction(odometry, advance, estimator, seen)
             self._predicted = odometry.frame_id
+        yield from self._slow_errors(advance.placed, estimator)
         yield self._estimate(advance.placed, odometry.t_ns)
+
+    def _slow_errors(self, placed: Placed, estimator: Estimator) -> Iterable[SlowErrors]:
+        """Not before a map fix: until then they are what was assumed. Not for a computer that is hot."""
+        t_ns = round(placed.t_s * 1e9)
+        hot = self._mode is CovarianceMode.JACOBIAN
+        if hot or estimator.last_fix_s is None or t_ns - self._said_slow_ns < SLOW_EVERY_NS:
+            return
+        self._said_slow_ns = t_ns
+        error = estimator.graph.state(placed.node).bias
+        cov = estimator.graph.bias_covariance(placed.node)
+        tilt_x, tilt_y, heading, height, lens, scale = (float(e) for e in error)
+        yield SlowErrors(
+            t_ns=t_ns,
+            frame_id=placed.frame_id,
+            error=(tilt_x, tilt_y, heading, height, lens, scale),
+            cov=tuple(float(c) for c in cov.ravel()),
+        )
 
     def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
         estimator = self._estimator

@@ -9,7 +9,7 @@ import numpy as np
 
 from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS_SIGMA, SCALE
-from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph
+from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sigmas
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.mounted import (
     DEFAULT_AGL_M,
@@ -19,7 +19,7 @@ from terrafix.estimator.mounted import (
     MountedCamera,
 )
 from terrafix.estimator.pace import Pace
-from terrafix.estimator.resume import Known
+from terrafix.estimator.resume import Known, Learnt
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
 from terrafix.estimator.velocity import (
@@ -47,6 +47,7 @@ STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for t
 STEP_FLOOR_M = 0.5
 
 Feel = Callable[[int, int], Felt | None]
+Slow = tuple[np.ndarray, np.ndarray]  # slow errors (6,), covariance (6x6)
 
 
 def nothing_felt(_t0_ns: int, _t1_ns: int) -> None:
@@ -240,31 +241,57 @@ class Tracker:
         self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
         self._known = known = self._known or Known.start(self.origin, t_s)
         self._first_s = known.t_s
+        if known.match is not None:
+            self.terrain.hear(known.match, np.array([known.match.mode_e_m, known.match.mode_n_m]))
         way_m, drift_m = known.later(t_s)
         sigma_m = float(np.hypot(known.sigma_m, drift_m))
-        placed = self._start_graph(frame_id, t_s, attitude, known.at_m + way_m, sigma_m)
+        slow = self._slow_now(known.learnt, t_s, attitude, float(np.hypot(*way_m)) + drift_m)
+        placed = self._start_graph(frame_id, t_s, attitude, known.at_m + way_m, sigma_m, slow)
         return Advance(Verdict.ACCEPTED, placed, way_m, drift_m)
 
-    def _start_graph(self, frame_id: int, t_s: float, attitude: Attitude, at_m: np.ndarray, sigma_m: float) -> Placed:
-        """Anew at ``at_m`` (east, north), known to ``sigma_m``; all else as the autopilot says it."""
+    def _slow_now(self, learnt: Learnt | None, t_s: float, attitude: Attitude, way_m: float) -> Slow | None:
+        """What was learnt before this process was started holds on, but for what has changed since. None: nothing was,
+        or a word is missing now to which it belongs."""
+        if learnt is None or attitude.yaw_rad is None or attitude.agl_m is None:
+            return None
+        turned_rad = np.angle(np.exp(1j * (attitude.yaw_rad - learnt.yaw_rad)))
+        rise_m = self.terrain.rise_sigma_m(way_m)
+        sigmas = walk_sigmas(max(t_s - learnt.t_s, 0.0), float(turned_rad), rise_m)
+        return learnt.error, learnt.cov + np.diag(sigmas**2)
+
+    def _start_graph(
+        self,
+        frame_id: int,
+        t_s: float,
+        attitude: Attitude,
+        at_m: np.ndarray,
+        sigma_m: float,
+        slow: Slow | None = None,
+    ) -> Placed:
+        """Anew at ``at_m`` (east, north), known to ``sigma_m``; all else as the autopilot says it, less ``slow``."""
         origin = self.origin
         tolerance = np.radians(origin.camera.mount_tolerance_deg)
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
-        r_w_c = self.camera.expected(attitude, np.zeros(BIAS_SIZE))
-        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([*at_m, self.terrain.ground_m + agl]))
-        wide = np.diag([1.0, 1.0, UNKNOWN_RAD, sigma_m, sigma_m, 3 * agl_sigma]) ** 2
-        cov_world = np.zeros((6, 6))
-        cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
         below_m = self.terrain.rise_sigma_m(TAKE_OFF_AWAY * agl)  # the ground, over that of the take-off
         height = float(np.linalg.norm([agl_sigma, HEIGHT_BIAS * agl, below_m]))
-        bias_cov = np.diag([tolerance, tolerance, yaw, height, LENS_SIGMA, scale_sigma(origin.camera)]) ** 2
+        assumed = np.diag([tolerance, tolerance, yaw, height, LENS_SIGMA, scale_sigma(origin.camera)]) ** 2
+        bias, bias_cov = (np.zeros(BIAS_SIZE), assumed) if slow is None else slow
+        r_w_c = self.camera.expected(attitude, bias)
+        up_m = self.terrain.ground_m + agl
+        if slow is not None:  # seen heights, from the one that is told above the barometer's zero
+            told_m = (origin.ground_amsl_m or 0.0) + agl - self.terrain.ground_m
+            up_m = self.terrain.ground_m + told_m * float(np.exp(-bias[SCALE])) - float(bias[HEIGHT])
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array([*at_m, up_m]))
+        wide = np.diag([1.0, 1.0, UNKNOWN_RAD, sigma_m, sigma_m, 3 * agl_sigma]) ** 2
+        cov_world = np.zeros((6, 6))
+        cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
         self._felt = self._stood_at = None
         node = self.graph.start(
             t_s,
-            NodeState(pose, np.zeros(BIAS_SIZE), np.zeros(V_SIZE)),
+            NodeState(pose, bias, np.zeros(V_SIZE)),
             world_to_tangent(cov_world, r_w_c),
             bias_cov,
             self._velocity_cov,
