@@ -27,13 +27,12 @@ from terrafix.core.config import Config
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.rundir import OwnedRunDir, RunDir
 from terrafix.core.shell import SUPERVISOR
-from terrafix.messages import Origin, ProcessEvent, SourceEnded
+from terrafix.messages import ProcessEvent, SourceEnded
 from terrafix.processes import PROCESSES, Process
 
 LINK_GAVE_UP = 1  # exit code
 VITAL = "link"  # without it nothing leaves for the autopilot: systemd shall start everything anew
 LOOP_MS = 50  # a death is noticed within this time
-SOURCE_WAIT_NS = 20_000_000_000  # the source is opened when all others are ready, or after this long
 QUIET_NS = 1_000_000_000  # the source has ended and everybody was idle for this long: all is said
 DRAIN_LIMIT_NS = 60_000_000_000  # ... or this long has passed since it ended
 FRESH_NS = 500_000_000  # a progress stamp that is older belongs to a process in the middle of its work
@@ -115,11 +114,10 @@ class Supervisor:
         self._stop_after_source = stop_after_source
         self._on_event = on_event
         self._look_for_epoch: Callable[[], bool] | None = None  # False: found, look no more
-        self._begin_ns = now_ns()
         self._ended_ns: int | None = None  # the source has ended
         self._busy_ns = 0  # somebody was last seen at work
         self._ready_said = False
-        self._notify_ticker = Ticker(NOTIFY_HZ, self._begin_ns)
+        self._notify_ticker = Ticker(NOTIFY_HZ, now_ns())
 
     def tell_epoch(self, run_dir: RunDir, on_epoch: Callable[[int], None]) -> None:
         """``on_epoch`` will be called once, from the loop."""
@@ -149,9 +147,8 @@ class Supervisor:
     def _watch(self, now: int) -> int | None:
         """One look at everything; an exit code ends the run."""
         for child in self._children:
-            if self._may_start(child, now):
-                for event in child.check(now):
-                    self._say(child, event)
+            for event in child.check(now):
+                self._say(child, event)
             if child.mistake is not None:
                 return child.mistake.exit_code
             if child.process.name == VITAL and child.state in (State.GAVE_UP, State.FINISHED):
@@ -165,13 +162,6 @@ class Supervisor:
         if self._stop.is_set() or (self._stop_after_source and self._is_drained(now)):
             return 0
         return None
-
-    def _may_start(self, child: Child, now: int) -> bool:
-        """Whoever opens the source starts last: what it says first, all must hear."""
-        if Origin not in child.process.says or child.state is not State.WAITING:
-            return True
-        others_ready = all(c.settled for c in self._children if c is not child)
-        return others_ready or now - self._begin_ns > SOURCE_WAIT_NS
 
     def _is_drained(self, now: int) -> bool:
         """Everything that the source gave has been worked on. Processes that tick are never done: they do not count."""

@@ -26,7 +26,7 @@ OPERATOR = "operator"  # a command on this computer that says PositionHint; seld
 EDGE_PERIOD_NS = 10_000_000  # an edge is looked at this often at least; 100 idle turns a second cost 1 % of a core
 IDLE_NS = 50_000_000  # a process that waits for messages shows this often that it is not stuck
 DROPPED_PERIOD_NS = 1_000_000_000  # losses are said at most this often
-HEARERS_WAIT_S = 2.0  # the source waits this long for those who must not miss Origin and the first frame
+HEARERS_WAIT_NS = 20_000_000_000  # the source waits this long for those who must not miss Origin and first frames
 STOP_DRAIN_NS = 2_000_000_000  # at a stop, what is queued is still worked on, for at most this long
 STOP_QUIET_MS = 100  # nothing more comes when this long nothing came
 
@@ -130,7 +130,7 @@ class LiveShell:
 
     def run(self, stopping: Callable[[], bool]) -> None:
         self._progress.stamp(now_ns())
-        self._wait_for_hearers()
+        self._wait_for_hearers(stopping)
         while not stopping():
             self._progress.begin()
             worked = self._turn()
@@ -201,10 +201,11 @@ class LiveShell:
         if until > now:
             self._poller.poll(-((now - until) // 1_000_000))  # rounded up: too early would be a turn for nothing
 
-    def _wait_for_hearers(self) -> None:
-        """Whoever opens the source says Origin once and then frames: those who need them connect first."""
-        until = now_ns() + round(HEARERS_WAIT_S * 1e9)
-        while self._hearers > self._publisher.subscriptions(Origin) and now_ns() < until:
+    def _wait_for_hearers(self, stopping: Callable[[], bool]) -> None:
+        """Whoever opens the source says Origin once and then frames: those who need them connect first. All are
+        started together; who opens a large map, or builds the engine of a model, takes longer."""
+        until = now_ns() + HEARERS_WAIT_NS
+        while self._hearers > self._publisher.subscriptions(Origin) and now_ns() < until and not stopping():
             self._publisher.serve()
             self._poller.poll(10)
             self._progress.stamp(now_ns())

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -13,6 +14,7 @@ from terrafix.link.connection import Connection
 from terrafix.link.diagnosis import Heard
 from terrafix.link.ground_links import GroundLinks
 from terrafix.link.hints import Hints
+from terrafix.link.kept import AutopilotKeeper
 from terrafix.link.local_pose import Place
 from terrafix.link.named_values import NamedValues
 from terrafix.link.outputs import Outputs
@@ -45,10 +47,11 @@ TIMESYNC_FAST_NS = 100_000_000  # until the first answers are in
 TIMESYNC_FAST_COUNT = 10
 
 
-def open_edge(config: LinkSection) -> "MavlinkEdge":
-    """Opens the device of the configuration. Raises LinkError with what to check, ConfigError for a signing key."""
+def open_edge(config: LinkSection, kept: Path | None = None) -> "MavlinkEdge":
+    """Opens the device of the configuration. ``kept``: see AutopilotKeeper. Raises LinkError with what to check,
+    ConfigError for a signing key."""
     transport = open_at_start(config.device, config.baud)
-    return MavlinkEdge(config, transport, time.time_ns, tell=StatusLog().tell)
+    return MavlinkEdge(config, transport, time.time_ns, tell=StatusLog().tell, keeper=AutopilotKeeper(kept))
 
 
 class MavlinkEdge:
@@ -61,8 +64,11 @@ class MavlinkEdge:
         wall_clock_ns: Callable[[], int],
         *,
         tell: Callable[[LinkStatus], None] = lambda _: None,
+        keeper: AutopilotKeeper | None = None,
     ) -> None:
         """``tell`` gets every LinkStatus, for the log."""
+        self._keeper = keeper or AutopilotKeeper(None)
+        self._takes_over = self._keeper.found is not None
         self._config = config
         self._tell = tell
         self._wall_clock_ns = wall_clock_ns
@@ -100,6 +106,9 @@ class MavlinkEdge:
 
     def poll(self, now_ns: int) -> Iterable[Message]:
         said: list[Message] = []
+        if self._takes_over and self._keeper.found is not None:
+            self._takes_over = False
+            self._partner.telemetry.served(self._keeper.found, now_ns)
         for message in self._connection.messages(now_ns):
             said += self._take(message, now_ns)
         said += self._ground.poll(now_ns, self._partner.sysid)
@@ -168,6 +177,8 @@ class MavlinkEdge:
         yield from self._partner.take(message, now_ns, self._our_receiver())
         if not self._partner.is_it(message):
             return
+        if kind == "HEARTBEAT":
+            self._keeper.heard(self._partner.telemetry.armed_autopilot)
         self._streams.heard(message.get_msgId())
         self._switch.heard(message)
         hint = self._resume.take(message, now_ns)

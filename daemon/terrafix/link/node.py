@@ -47,7 +47,7 @@ def make_edge(ctx: NodeContext) -> Edge:
     from terrafix.link.edge import open_edge  # replay has no edge and need not load MAVLink
     from terrafix.link.priority import first_in_line
 
-    edge = open_edge(ctx.config.link)
+    edge = open_edge(ctx.config.link, ctx.kept)
     first_in_line()
     return edge
 

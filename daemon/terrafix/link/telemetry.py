@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.imu import KINDS, Chooser, boot_ns, readings_of
 from terrafix.link.diagnosis import NAMES
+from terrafix.link.kept import ArmedAutopilot
 from terrafix.link.timesync import TimeSync
 from terrafix.messages import Imu, ImuSample, VehicleState
 
@@ -38,6 +39,7 @@ class Telemetry:
         self._height: tuple[int, float] | None = None  # (arrival, metres above take-off)
         self._boot_ms = 0
         self._armed: bool | None = None
+        self._serves: ArmedAutopilot | None = None
         self._unix_minus_monotonic_ns: int | None = None
         self.autopilot = "none"
         self.sysid = 0
@@ -71,6 +73,20 @@ class Telemetry:
             self._unix_minus_monotonic_ns = message.time_unix_usec * 1000 - now_ns
         return None
 
+    def served(self, autopilot: ArmedAutopilot, now_ns: int) -> None:
+        """By the link before this one, until a moment ago: as if its heartbeat had come now."""
+        if self._only_sysid in (0, autopilot.sysid):
+            self._is_there(autopilot, now_ns, armed=True)
+
+    @property
+    def armed_autopilot(self) -> ArmedAutopilot | None:
+        return self._serves if self._armed else None
+
+    def _is_there(self, autopilot: ArmedAutopilot, now_ns: int, *, armed: bool) -> None:
+        self._serves, self._armed, self._heartbeat_ns = autopilot, armed, now_ns
+        self.autopilot = NAMES.get(autopilot.firmware, f"autopilot {autopilot.firmware}")
+        self.sysid, self.vehicle_type = autopilot.sysid, autopilot.vehicle
+
     def _take_heartbeat(self, message: Any, now_ns: int) -> None:
         if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.get_srcComponent() != AUTOPILOT_COMPONENT:
             return
@@ -78,11 +94,8 @@ class Telemetry:
             return
         if self.connected(now_ns) and message.get_srcSystem() != self.sysid:
             return  # another vehicle on the same network
-        self.autopilot = NAMES.get(message.autopilot, f"autopilot {message.autopilot}")
-        self.sysid = message.get_srcSystem()
-        self.vehicle_type = int(message.type)
-        self._armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        self._heartbeat_ns = now_ns
+        heard = ArmedAutopilot(message.get_srcSystem(), int(message.autopilot), int(message.type))
+        self._is_there(heard, now_ns, armed=bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED))
 
     def _take_height(self, height_m: float, now_ns: int) -> None:
         """Above take-off, by the barometer: without a sensor nobody knows the height above the ground beneath."""

@@ -1,6 +1,7 @@
 """The live edge of the vision process: a source in a thread of its own, paced by its times, newest frame first.
 
-A recorded source plays on a clock whose zero is the first poll, and ``Origin.t_ns`` says so. A vision process that is
+A recorded source plays on a clock whose zero is the first poll, a camera on one that began when it was opened, and
+``Origin.t_ns`` says so. A vision process that is
 started again in mid-flight is given that time as ``NodeContext.epoch_ns``: it goes on where the flight is now, with the
 same frame ids, and waits for a camera that is not there."""
 
@@ -52,11 +53,15 @@ class SourceEdge:
         self._count = 0
         self._said_end = False
         self._reader = ThreadPoolExecutor(1, "source")
-        self._reading: Future[None] | None = None
+        # A camera has pictures now, before anybody is there who takes them: when all are, the newest wait for them.
+        self._reading: Future[None] | None = self._start(now_ns()) if source.live else None
+        self._said_origin = False
 
     def poll(self, now_ns: int) -> Iterable[Message]:
         if self._reading is None:
             self._reading = self._start(now_ns)
+        if not self._said_origin:
+            self._said_origin = True
             origin = self._source.origin() if self._bounds is None else placed(self._source.origin(), self._bounds)
             ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
             return [msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m)]
@@ -87,7 +92,7 @@ class SourceEdge:
         self._reader.shutdown(wait=True)
 
     def _start(self, now_ns: int) -> Future[None]:
-        """At the first poll, not before: until then nobody takes the frames."""
+        """Of a recording: at the first poll, not before, until then nobody takes the frames."""
         self._zero_ns = now_ns if self._epoch_ns is None else self._epoch_ns
         # A camera counts from 0 each time it is opened; ids must still grow over a restart: at most 1000 a second.
         self._first_id = max(0, (now_ns - self._zero_ns) // 1_000_000) if self._source.live else 0

@@ -1,0 +1,39 @@
+"""What a link leaves to the one that is started in its place: which autopilot it served, while that was armed.
+
+An autopilot says who it is once a second, and its attitude long before. Who knows it already can say where it leans
+with the first packet, which is what the estimator waits for after a restart in flight."""
+
+from pathlib import Path
+
+import msgspec
+
+from terrafix.core.rundir import write_whole
+
+
+class ArmedAutopilot(msgspec.Struct, frozen=True):
+    """Of its HEARTBEAT: system id, MAV_AUTOPILOT, MAV_TYPE."""
+
+    sysid: int
+    firmware: int
+    vehicle: int
+
+
+class AutopilotKeeper:
+    """``heard`` after every HEARTBEAT of the autopilot. One that is not armed is not kept: a vehicle on the ground
+    stands where its flight begins, and nobody may believe that of one that has taken off meanwhile."""
+
+    def __init__(self, file: Path | None) -> None:
+        """``file`` None: nothing is kept."""
+        self._file = file
+        self.found = msgspec.json.decode(file.read_bytes(), type=ArmedAutopilot) if file and file.is_file() else None
+        self._kept = self.found
+
+    def heard(self, autopilot: ArmedAutopilot | None) -> None:
+        """None: it is not armed."""
+        if self._file is None or autopilot == self._kept:
+            return
+        self._kept = autopilot
+        if autopilot is None:
+            self._file.unlink(missing_ok=True)
+        else:
+            write_whole(self._file, msgspec.json.encode(autopilot))
