@@ -29,7 +29,8 @@ FOREVER = 100_000  # frames
 
 @pytest.fixture(autouse=True)
 def children_find_the_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(UNIT))
+    also = os.environ.get("PYTHONPATH")  # of a tree that is not installed
+    monkeypatch.setenv("PYTHONPATH", f"{UNIT}{os.pathsep}{also}" if also else str(UNIT))
 
 
 class Flight:
