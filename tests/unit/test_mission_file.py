@@ -95,6 +95,7 @@ HEAD = "QGC WPL 110\n0 1 0 16 0 0 0 0 48.0 11.0 500 1\n"
     [
         ("hello", "neither"),
         ("{", "not valid JSON"),
+        ('{"mission": ' + 100_000 * "[", "not valid JSON"),
         ('{"mission": {}}', "not a QGroundControl plan"),
         (plan([{"type": "ComplexItem", "complexItemType": "survey"}]), "item 1: a 'survey' without its places"),
         (plan([{"type": "ComplexItem", "complexItemType": "dance"}]), "item 1: 'dance' is not supported"),

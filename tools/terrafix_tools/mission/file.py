@@ -113,7 +113,7 @@ def _plan(path: Path, text: str, way_only: bool) -> Mission:
         place = float(home[0]), float(home[1])
         if not isinstance(entries, list) or not all(map(math.isfinite, place)):
             raise TypeError
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         raise SourceError(f"{path}: not valid JSON ({error})") from None
     except (KeyError, TypeError, IndexError, ValueError):
         raise SourceError(
