@@ -8,7 +8,7 @@ import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
 from terrafix.anchor.agreement import Agreement
-from terrafix.anchor.chance import COARSE, PATCHES, Chance
+from terrafix.anchor.chance import COARSE, PATCHES, PRIOR_PLACES, Chance
 from terrafix.anchor.lost import MOST_ODDS, LostWatch, pose_gain
 from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.retrieval import MapSearch
@@ -255,14 +255,24 @@ def test_what_chance_comes_to_is_no_evidence() -> None:
 
 
 def test_ground_that_repeats_has_to_say_more() -> None:
-    """What its wrong places come to is chance there, on the cells on which it was seen."""
+    """What its wrong places come to is chance there, on cells of either kind."""
     chance = Chance()
     before = chance.sigmas(of(16.0), fine=True)
     for llr in np.random.default_rng(1).normal(12.0, 2.7, 200):
         chance.learn(of(float(llr)), fine=True)
         chance.learn(of(60.0, PATCHES // 2), fine=True)  # half of them beyond the map
     assert before > 2.5 and chance.sigmas(of(16.0), fine=True) == pytest.approx(1.55, abs=0.3)
-    assert chance.sigmas(of(16.0), fine=False) == Chance().sigmas(of(16.0), fine=False)
+    assert chance.sigmas(of(16.0), fine=False) < Chance().sigmas(of(16.0), fine=False) - 1.0
+
+
+def test_a_place_without_rivals_is_weighed_against_places_that_are_none(ground: np.ndarray) -> None:
+    tracks, (picture, p_m) = searched(BoundedMap(ground), None).tracks, next(frames(ground, 1))
+    for k, e_m in enumerate((0.0, -0.5, 0.5, -1.0)):
+        tracks.propose(float(p_m[0]) + e_m * AGL_M, float(p_m[1]), Hypothesis(0.0, 1.0), AGL_M)
+        tracks.all[-1].looked_at(-9.0 if k else 2.0)
+    tracks.look(picture, predicted(), 0.0)
+    assert len(tracks.all) == 1 and tracks._chance._sums[0] == PRIOR_PLACES + 3.0
+    assert not tracks._chance.is_known
 
 
 def test_more_patches_say_more() -> None:

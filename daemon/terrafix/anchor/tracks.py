@@ -116,9 +116,14 @@ class Tracks:
 
     def look(self, image: Image, view: View, way_m: float) -> Found | None:
         """The frame at the tracks; the one that is found by now, with its pose in this frame."""
+        hopeless = [t for t in self.all if not t.is_open and t.scored_way_m == -np.inf]
         kept_m = NEW_EVIDENCE * view.agl_m  # a place that was given up is not proposed again over the same ground
         self.all = [t for t in self.all if t.is_open or way_m - t.scored_way_m < kept_m]
         tried = sorted((t for t in self.all if t.is_open), key=lambda t: (t.score <= 0.0, -t.odds))[:AT_A_TIME]
+        if not self._chance.is_known:  # a place far ahead has hardly a rival to learn from, and may yet be wrong
+            for track in hopeless[: AT_A_TIME - len(tried)]:
+                if (found := self._check.at(image, self._at(track, view), CELL_PER_AGL)) is not None:
+                    self._chance.learn(found.agreement, fine=False)
         fixes = [(track, self._checked(track, image, view, way_m)) for track in tried]
         self.all.sort(key=lambda t: -t.odds)
         self.all = [t for i, t in enumerate(self.all) if not self._is_second(t, self.all[:i], view)]
@@ -127,10 +132,9 @@ class Tracks:
         fix = next((fix for track, fix in fixes if track is self.all[0]), None)
         return None if fix is None else Found(self.all[0], self._matcher.refined(image, view, fix))
 
-    def _checked(self, track: Track, image: Image, view: View, way_m: float) -> Fix | None:
-        """What the frame says for the track, which moves to where it fits best; None: nothing, or no pose."""
+    def _at(self, track: Track, view: View) -> View:
         up = self._map.elevation(np.array([track.e_m]), np.array([track.n_m]))
-        here = replace(
+        return replace(
             view,
             e_m=track.e_m,
             n_m=track.n_m,
@@ -138,6 +142,10 @@ class Tracks:
             agl_m=view.agl_m * track.hypothesis.scale,
             ground_m=view.ground_m if up is None or not np.isfinite(up[0]) else float(up[0]),
         )
+
+    def _checked(self, track: Track, image: Image, view: View, way_m: float) -> Fix | None:
+        """What the frame says for the track, which moves to where it fits best; None: nothing, or no pose."""
+        here = self._at(track, view)
         speaks = track.score > 0.0 or track.lead >= LEADING
         found = self._check.at(image, here, FINE_PER_AGL if speaks else CELL_PER_AGL)
         if found is None:  # hardly any of it lies on the map

@@ -4,7 +4,8 @@ python -m terrafix_tools.bench.kidnapped FLIGHT [FLIGHT ...] [--map MAP] [--mirr
     [--stride 1] [--seed 1] [--no-compass] [--json FILE]
 
 Each try begins at another frame of the flight, one in each stretch, with the processes of ``terrafix replay`` just
-started and no start coordinate. In two tests nothing may be found: ``--map`` of another place; and ``--mirrored``: with
+started and no start coordinate; it takes 5 to 15 s of one core. A row is printed, and --json written, when a flight is
+through. In two tests nothing may be found: ``--map`` of another place; and ``--mirrored``: with
 left and right exchanged a frame shows ground of the same kind that is nowhere on the map."""
 
 import argparse
@@ -173,11 +174,15 @@ def main() -> None:
             name = Path(flight).name
             all_tries[name] = measure(flight, given.map, given.tries, given.seed, how)
             typer.echo(row(name, all_tries[name]))
+            if given.json is not None:  # after each flight: an hour's work may be stopped
+                _write(given.json, all_tries)
     except TerrafixError as error:
         sys.exit(f"{error}")
-    if given.json is not None:
-        written = {name: [asdict(t) for t in tries] for name, tries in all_tries.items()}
-        given.json.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+
+
+def _write(path: Path, all_tries: dict[str, list[Try]]) -> None:
+    written = {name: [asdict(t) for t in tries] for name, tries in all_tries.items()}
+    path.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
