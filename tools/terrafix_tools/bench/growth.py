@@ -8,11 +8,13 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gtsam
+import numpy as np
 
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.graph import PoseGraph
@@ -25,8 +27,35 @@ from terrafix_tools.replay import peak_memory_mb
 
 RESULT = "growth.json"
 LAST = 80  # frames at the end of the flight, over which the time of one is taken
+LATER = 500  # ... and over which that of the graph alone, whose rare long ones are asked for
 QUERIES = 10  # of a covariance from scratch
 ASKED_BEFORE = 10  # nodes before the newest: the middle of the window
+
+
+class _TimedGraph(PoseGraph):
+    """``spent_ms`` since it was set to zero: nodes and map fixes put in, iSAM2's update, the covariances asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spent_ms = 0.0
+
+    def extend(self, *node: Any, **more: Any) -> int:
+        with self._stopwatch():
+            return super().extend(*node, **more)
+
+    def add_pose(self, *fix: Any) -> None:
+        with self._stopwatch():
+            super().add_pose(*fix)
+
+    def _marginal(self, key: int) -> np.ndarray:
+        with self._stopwatch():
+            return super()._marginal(key)
+
+    @contextmanager
+    def _stopwatch(self) -> Iterator[None]:
+        began_s = time.process_time()
+        yield
+        self.spent_ms += (time.process_time() - began_s) * 1e3
 
 
 class _WholeFlight(Past):
@@ -63,19 +92,27 @@ class _WholeFlight(Past):
 
 def measure(frames: int) -> dict[str, Any]:
     """-> time for each of the last frames, of the refinement after landing, of covariance queries; memory."""
-    estimator = Estimator(ORIGIN)
+    estimator, graph = Estimator(ORIGIN), _TimedGraph()
+    estimator.graph = graph
     times_ms: list[float] = []
+    update_ms: list[float] = []
     query_ms: list[float] = []
     for frame_ms in _flown(estimator, frames):
         times_ms.append(frame_ms)
+        update_ms.append(graph.spent_ms)
         # Not of the newest: the smoother still has that one from this very frame.
         query_ms.append(_ms(partial(estimator.graph.covariance, max(0, estimator.graph.newest - ASKED_BEFORE))))
+        graph.spent_ms = 0.0
     in_flight_mb = peak_memory_mb()
     began_s = time.process_time()
     estimator.refine()
     return {
         "frames": frames,
         "frame_cpu_ms": spread(times_ms[-LAST:]),
+        "update_cpu_ms": {
+            name: round(float(np.percentile(update_ms[-LATER:], share)), 2)
+            for name, share in (("median", 50), ("p99", 99))
+        },
         "refine_cpu_s": round(time.process_time() - began_s, 2),
         "memory_in_flight_mb": in_flight_mb,
         "peak_memory_mb": peak_memory_mb(),

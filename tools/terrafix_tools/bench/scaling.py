@@ -67,9 +67,11 @@ def show(grown: dict[str, Any], console: Console) -> None:
     by_length = []
     for one in grown["flight"]:
         asked = {f"covariance: {name}": f"{ms['median']:.2f} ms" for name, ms in one["covariance_cpu_ms"].items()}
+        update = one["update_cpu_ms"]
         by_length.append({
             "": f"{one['frames']} frames",
             "one frame": f"{one['frame_cpu_ms']['median']:.1f} ms",
+            "of it the graph (median / p99)": f"{update['median']:.1f} / {update['p99']:.1f} ms",
             **asked,
             "refinement": f"{one['refine_cpu_s']:.1f} s",
             "memory": f"{one['peak_memory_mb']:.0f} MB",
