@@ -4,9 +4,9 @@ python -m terrafix_tools.bench.kidnapped FLIGHT [FLIGHT ...] [--map MAP] [--mirr
     [--stride 1] [--seed 1] [--no-compass] [--json FILE]
 
 Each try begins at another frame of the flight, one in each stretch, with the processes of ``terrafix replay`` just
-started and no start coordinate; it takes 5 to 15 s of one core. A row is printed, and --json written, when a flight is
-through. In two tests nothing may be found: ``--map`` of another place; and ``--mirrored``: with
-left and right exchanged a frame shows ground of the same kind that is nowhere on the map."""
+started and no start coordinate; it takes 4 to 10 s of one core. A row is printed, and --json written, when a flight is
+through. In two tests nothing may be found: ``--map`` of another place; and ``--mirrored``: with left and right
+exchanged a frame shows ground of the same kind that is nowhere on the map."""
 
 import argparse
 import csv
