@@ -45,7 +45,8 @@ COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in th
 MIN_AGL_M = 30.0  # below this a frame shows a few roofs and cars
 START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is not known yet
 # Of the height: what the belief follows is the place from which a picture seems to be taken, and a tilt that is a
-# degree more than in the frame before moves it.
+# degree more than in the frame before moves it. At most: whose tilt is known better sways less. Every frame adds it,
+# and a slow copter at two frames a second sees little new ground that would take it away again.
 SWAY = 0.02
 POOR_SCORE = 2.0  # standardised correlation in the mode; a frame at the right place scores 3 to 10
 POOR_LOOKS = 4.0  # full looks below it before the search widens
@@ -254,7 +255,8 @@ class AnchorNode:
         elif self._search.is_on:
             self._search.move(prediction.step_m, sigma_m)
         else:
-            self._belief.move(*prediction.step_m, float(np.hypot(sigma_m, SWAY * prediction.agl_m)))
+            sway = min(SWAY, float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))))
+            self._belief.move(*prediction.step_m, float(np.hypot(sigma_m, sway * prediction.agl_m)))
             self._belief.fit_window(0.0)
             if not 0.4 < cell_m / self._belief.cell_m < 2.5:  # an octave is left alone: no flicker at its edge
                 self._belief.set_cell(cell_m)
