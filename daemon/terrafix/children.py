@@ -150,11 +150,13 @@ class Child:
             file = self._run_dir.mistake(self.process.name)
             self.mistake = Mistake(code, file.read_text(encoding="utf-8") if file.exists() else "no reason given")
             self.state = State.GAVE_UP
+            self._run_dir.gave_up(self.process.name).touch()
             yield Event("gave_up", f"cannot start: {self.mistake.text}")
             return
         pause_ns = self._window.died(now_ns)
         if pause_ns is None:
             self.state = State.GAVE_UP
+            self._run_dir.gave_up(self.process.name).touch()
             yield Event("gave_up", f"died more than {RESTART_LIMIT} times in {RESTART_WINDOW_NS // 10**9} s")
         else:
             self.state, self._start_at_ns = State.WAITING, now_ns + pause_ns

@@ -33,6 +33,10 @@ class RunDir:
         """Why ``process`` ended, when that is something the user can mend: one line."""
         return self.path / f"{process}.mistake"
 
+    def gave_up(self, process: str) -> Path:
+        """It is there when ``process`` will not be started again."""
+        return self.path / f"{process}.gave_up"
+
     def kept(self, process: str) -> Path:
         """What ``process`` leaves to the one that is started in its place."""
         return self.path / f"{process}.kept"

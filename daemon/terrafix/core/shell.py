@@ -117,7 +117,8 @@ class LiveShell:
             speakers.append(SUPERVISOR)
         if PositionHint in process.hears:
             speakers.append(OPERATOR)
-        self._hearers = sum(Origin in p.hears for p in table if p is not process) if Origin in process.says else 0
+        opens_source = Origin in process.says
+        self._hearers = [p.name for p in table if opens_source and Origin in p.hears and p is not process]
         self._publisher = Publisher(context, endpoints.address(process.name))
         self._subscriber = Subscriber(context, [endpoints.address(s) for s in speakers], process.hears)
         self._inbox = Inbox(process.newest)
@@ -205,10 +206,14 @@ class LiveShell:
         """Whoever opens the source says Origin once and then frames: those who need them connect first. All are
         started together; who opens a large map, or builds the engine of a model, takes longer."""
         until = now_ns() + HEARERS_WAIT_NS
-        while self._hearers > self._publisher.subscriptions(Origin) and now_ns() < until and not stopping():
+        while self._missing_hearers() > 0 and now_ns() < until and not stopping():
             self._publisher.serve()
             self._poller.poll(10)
             self._progress.stamp(now_ns())
+
+    def _missing_hearers(self) -> int:
+        living = sum(not self._endpoints.gave_up(name).exists() for name in self._hearers)
+        return living - self._publisher.subscriptions(Origin)
 
     def _drain(self) -> None:
         until = now_ns() + STOP_DRAIN_NS
