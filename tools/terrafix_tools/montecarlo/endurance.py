@@ -9,7 +9,8 @@ from terrafix_tools.montecarlo.flight import run
 from terrafix_tools.montecarlo.plan import Fault, plan
 
 HOURS = 2.0
-SETTLED_S = 300.0  # at first caches and windows fill
+# At first caches and windows fill, and what is kept for the refinement: 256 nodes, five frames apart at least.
+SETTLED_S = 1800.0
 BLOCK = 60  # frames: their median is a point of the line, so that a busy machine bends it little
 TIME_SHARE_PER_H = 0.01  # of the time for one frame
 MEMORY_MB_PER_H = 2.0
