@@ -103,7 +103,7 @@ def test_of_two_matches_the_newer_one_knows_the_ground_below() -> None:
     run.hear([high])
     above_m = run.estimate(39).agl_m
     run.hear([low])
-    assert run.estimate(39).agl_m == pytest.approx(above_m, abs=1.0)
+    assert run.estimate(39).agl_m == pytest.approx(above_m, abs=2.0)  # a fix moves it, too; the ground would by 8 m
     assert {run.verdicts("map")[i].verdict for i in (36, 39)} == {Verdict.ACCEPTED}
 
 
