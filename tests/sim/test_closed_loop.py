@@ -47,6 +47,7 @@ def track(out: Path) -> dict[str, np.ndarray]:
     return {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
 
 
+@pytest.mark.slow
 def test_a_spoofed_position_moves_the_aircraft_the_other_way(place: Place, tmp_path: Path) -> None:
     pulled = Conditions(events=(Drag(start_s=20.0, east_mps=4.0),))
     flown(place, tmp_path / "honest", duration_s=60.0)
@@ -61,6 +62,7 @@ def test_a_spoofed_position_moves_the_aircraft_the_other_way(place: Place, tmp_p
     assert (honest["east_m"] - spoofed["east_m"])[-1] > 60.0
 
 
+@pytest.mark.slow
 def test_without_gnss_and_camera_a_plane_dead_reckons_and_a_copter_fails_safe(place: Place, tmp_path: Path) -> None:
     lost = Conditions(events=(Outage(start_s=30.0),))
     plane = flown(place, tmp_path / "plane", duration_s=60.0, conditions=lost)

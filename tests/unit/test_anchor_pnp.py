@@ -67,6 +67,7 @@ def test_of_a_quarter_of_right_matches_comes_no_wrong_pose() -> None:
     assert found.fit is None or found.inliers[:12].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("relief_m", [0.0, 6.0])
 def test_random_matches_are_refused(relief_m: float) -> None:
     """What patches at a wrong place say: anything within their reach. At most one of a hundred may pass."""

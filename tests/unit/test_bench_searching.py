@@ -10,6 +10,7 @@ from terrafix_tools.bench import map_size, searching
 from terrafix_tools.mapping.build import build
 
 
+@pytest.mark.slow
 def test_every_line_is_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -63,6 +63,7 @@ def long_run(long_flight: Flight) -> Listener:
     return run
 
 
+@pytest.mark.slow
 def test_the_position_is_right_all_the_way(long_flight: Flight, long_run: Listener) -> None:
     errors = [np.linalg.norm(error_m(long_run.estimate(i), long_flight)[:2]) for i in range(20, 300)]
     assert np.median(errors) < 4.0 and max(errors) < 15.0
@@ -211,6 +212,7 @@ def test_after_a_gap_a_fix_brings_it_back() -> None:
     assert found < 8.0 and (found < lost or lost < 8.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", [Verdict.BAD_IMAGE, Verdict.FEW_INLIERS, Verdict.NO_FEATURES])
 def test_a_bad_frame_costs_that_frame_only(bad: Verdict) -> None:
     flight = Flight(40, seed=4)

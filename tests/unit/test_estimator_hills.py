@@ -16,6 +16,7 @@ def run(request: pytest.FixtureRequest) -> tuple[Flight, Listener]:
     return flight, Listener().fly(flight, 0, FRAMES)
 
 
+@pytest.mark.slow
 def test_the_claim_holds_over_them(run: tuple[Flight, Listener]) -> None:
     flight, told = run
     errors = np.array([error_m(told.estimate(i), flight)[:2] for i in range(10, FRAMES)])
@@ -37,6 +38,7 @@ def test_heights_above_ground_and_sea_are_two(run: tuple[Flight, Listener]) -> N
     assert np.median(np.abs(amsl_off)) < 4.0 and (np.abs(amsl_off) < 3.0 * sigma).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3])
 def test_without_map_fixes_the_height_does_not_sink(seed: int) -> None:
     """Two minutes by odometry alone: factors in metres pulled the camera down to half of its height, and claimed to

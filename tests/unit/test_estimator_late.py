@@ -45,6 +45,7 @@ def test_the_same_odd_order_gives_the_same_bytes() -> None:
     assert msgspec.json.encode(runs[0].said) == msgspec.json.encode(runs[1].said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_late_matches_are_worth_as_much_as_those_in_time(seed: int) -> None:
     """Once they are heard: within a fifth of what both claim, and the claims within a tenth."""

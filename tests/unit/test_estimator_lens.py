@@ -42,6 +42,7 @@ def test_a_lens_that_bends_explains_what_no_motion_does(turned_rad: float) -> No
     assert error(0.0) > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k1", [-0.01, 0.0])
 def test_a_lens_is_learnt_in_flight_and_noise_is_not_taken_for_one(k1: float) -> None:
     flight, run = Flight(200, seed=2), Listener()

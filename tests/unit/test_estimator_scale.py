@@ -44,6 +44,7 @@ def learnt(run: Listener) -> tuple[float, float]:
     return float(graph.state(graph.newest).bias[SCALE]), float(np.sqrt(cov[SCALE, SCALE]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dem", [False, True])
 @pytest.mark.parametrize("focal", [0.8, 1.0])
 def test_it_is_learnt_from_climbs(focal: float, dem: bool) -> None:
@@ -53,6 +54,7 @@ def test_it_is_learnt_from_climbs(focal: float, dem: bool) -> None:
     assert abs(scale - np.log(focal)) < 3.0 * sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dem", [False, True])
 @pytest.mark.parametrize("focal", [0.8, 1.25])
 def test_a_climb_in_the_dark_ends_where_the_claim_says(focal: float, dem: bool) -> None:

@@ -18,6 +18,7 @@ def median_m(off: np.ndarray) -> float:
     return float(np.median(np.hypot(off[:, 0], off[:, 1])))
 
 
+@pytest.mark.slow
 def test_it_is_better_than_in_flight_and_claims_what_it_is() -> None:
     squares, better = [], []
     for seed in range(6):
@@ -33,6 +34,7 @@ def test_it_is_better_than_in_flight_and_claims_what_it_is() -> None:
     assert np.mean(np.concatenate(squares) < 5.991) > 0.88
 
 
+@pytest.mark.slow
 def test_wrong_matches_are_refused_even_three_that_agree() -> None:
     flight = Flight(90, seed=3, fix_every=5)
     wrong = {20: FAR_M, 45: (40.0, 30.0), 50: (40.0, 30.0), 55: (40.0, 30.0), 80: (-90.0, 200.0)}
@@ -61,6 +63,7 @@ def test_a_blackout_is_bridged_from_both_sides() -> None:
     assert np.hypot(*off[60:].T).max() < 8.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "knows", [{"yaw", "attitude", "height"}, {"attitude", "height"}, {"attitude"}], ids=["all", "no yaw", "no height"]
 )

@@ -59,6 +59,7 @@ def shift_px(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.hypot(dx, dy))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("e_m", "n_m", "agl_m", "yaw_deg", "tilt_deg"),
     [(0, 0, 120, 0, 0), (90, -60, 120, 37, 5), (-110, 80, 90, -121, -9), (20, 30, 330, 200, 3), (0, -60, 150, 0, 35)],

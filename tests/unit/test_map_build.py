@@ -129,6 +129,7 @@ def test_palette_and_nodata(tmp_path: Path) -> None:
     assert not valid[:50].any() and valid[50:].mean() > 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("empty", [0, 255])
 def test_a_collar_without_a_mask_is_invalid_and_shadows_are_not(tmp_path: Path, empty: int) -> None:
     height, width = 700, 2200  # more than one block of the search

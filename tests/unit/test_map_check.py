@@ -118,6 +118,7 @@ def test_a_mission_that_leaves_the_map_is_told_where(tmp_path: Path, package: Pa
     opened.close()
 
 
+@pytest.mark.slow
 def test_the_command_fails_with_its_reason(tmp_path: Path, package: Path) -> None:
     _, frame = opened_with_frame(package)
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-400.0, 300.0))
@@ -148,6 +149,7 @@ def test_loiters_and_returns_are_part_of_the_way(package: Path) -> None:
     assert np.hypot(*np.diff(way.points_m, axis=0).T).max() <= 22
 
 
+@pytest.mark.slow
 def test_a_map_that_is_too_coarse_and_a_height_that_is_too_low(tmp_path: Path, package: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=10.0)
     coarse = MapPackage.open(build(tif, tmp_path / "m.gpkg"))

@@ -168,6 +168,7 @@ def test_nobody_there(tmp_path: Path) -> None:
         download(server, tmp_path / "s.mbtiles")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_date", [False, True])
 def test_a_server_that_asks_for_patience_gets_it_from_all_connections(tmp_path: Path, as_date: bool) -> None:
     said_s: list[float] = []
@@ -254,6 +255,7 @@ t.download(Far(), Path(sys.argv[2]), t.Limits(100.0, 4), t.wanted(t.MANY))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_download_killed_half_way_goes_on_where_it_was(tmp_path: Path, how: signal.Signals) -> None:
     store = tmp_path / "s.mbtiles"

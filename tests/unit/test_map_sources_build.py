@@ -51,6 +51,7 @@ def assert_shows_the_world(package: Path, most: float = 2.7) -> None:
     assert np.abs(image[:, 1:].astype(float) - truth[:, :-1])[valid[:, 1:]].mean() > 1.5 * most
 
 
+@pytest.mark.slow
 def test_a_tile_server_becomes_a_package_and_the_second_time_nothing_is_fetched(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server:
         said = io.StringIO()
@@ -92,6 +93,7 @@ def test_a_download_that_fails_half_way_leaves_no_package_and_goes_on_later(tmp_
     assert_shows_the_world(tmp_path / "m.gpkg")
 
 
+@pytest.mark.slow
 def test_several_sources_and_several_dates_from_a_file(tmp_path: Path) -> None:
     """A local image first, a server for the rest of the place; and an old layer beside them."""
     with serving(WORLD.answer) as server:
@@ -145,11 +147,13 @@ def test_what_a_person_forgets_is_said_before_anything_is_fetched(tmp_path: Path
     assert not list(tmp_path.glob("*.gpkg"))
 
 
+@pytest.mark.slow
 def test_a_large_download_waits_for_a_yes(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server, pytest.raises(UsageError, match="add --yes"):
         build_order(order(tmp_path, server.url, buffer_km=20.0, rate=5.0))
 
 
+@pytest.mark.slow
 def test_the_command_line(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server:
         command = [sys.executable, "-m", "terrafix_tools.cli", "map", "build", "--area", WORLD.box_deg(1.6)]
@@ -163,6 +167,7 @@ def test_the_command_line(tmp_path: Path) -> None:
     assert done.returncode == 2 and done.stderr.startswith("terrafix: --buffer and --corridor exclude")
 
 
+@pytest.mark.slow
 def test_workers_change_no_byte_and_a_mission_is_offered_a_corridor(tmp_path: Path) -> None:
     west, south, east, north = (float(v) for v in WORLD.box_deg(1.0).split(","))
     item = {"type": "SimpleItem", "command": 16, "frame": 3, "params": [0, 0, 0, None, north, east, 80]}

@@ -57,6 +57,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_everything_together_keeps_the_standard(package: Path) -> None:
     assert violations(package) == []
 

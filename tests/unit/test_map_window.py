@@ -60,6 +60,7 @@ def render(local: LocalMap, gsd_m: float, side_px: int) -> tuple[np.ndarray, flo
     return image, e_min_m, n_max_m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("crs", "lat_deg", "lon_deg"),
     [

@@ -110,6 +110,7 @@ def test_one_that_ends_by_itself_is_quoted(tmp_path: Path) -> None:
             firmware.check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -93,6 +93,7 @@ def test_the_start_is_off_by_what_it_claims_at_most(flight: Flight) -> None:
     assert 0.1 < math.dist(start, flight.path.states[0].p_b_in_w_m[:2]) < 75.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("telemetry", [True, False])
 def test_the_folder_is_complete_and_agrees_with_the_truth(small: Scene, telemetry: bool, tmp_path: Path) -> None:
     short = flight_over(small, seed=2, duration_s=2.0)

@@ -76,6 +76,7 @@ def test_the_ground_of_a_flight_is_the_look(place: world.World, looks: tuple[np.
     assert (x[0], y[0]) == pytest.approx((899.5, 699.5), abs=0.01)
 
 
+@pytest.mark.slow
 def test_every_season_is_another_picture_of_one_place(place: world.World) -> None:
     pictures = {name: place.look(name).astype(float).mean(axis=2).ravel() for name in SEASONS}
     assert len(pictures) >= 3
@@ -151,6 +152,7 @@ def found(surface: np.ndarray, margin: int) -> bool:
     return bool(np.hypot(x - margin, y - margin) <= 10)
 
 
+@pytest.mark.slow
 def test_two_dates_agree_in_structure_but_not_in_brightness(looks: tuple[np.ndarray, np.ndarray]) -> None:
     summer, autumn = (cv2.cvtColor(look, cv2.COLOR_BGR2GRAY) for look in looks)
     assert abs(float(np.corrcoef(summer.ravel(), autumn.ravel())[0, 1])) < 0.5
