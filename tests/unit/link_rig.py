@@ -1,5 +1,6 @@
 """What the link's tests share: estimates of a vehicle on a straight line, and the shell's loop in a few lines."""
 
+import gc
 import math
 import time
 from collections.abc import Callable
@@ -94,6 +95,8 @@ def east_error_m(sent: m.GpsInput) -> float:
 
 def live(node: LinkNode, edge: MavlinkEdge, seconds: float, feed: Feed = lambda _: []) -> list[m.Message]:
     """The live shell's loop in small: real time, the real edge. -> all that was said and read."""
+    gc.collect()
+    gc.freeze()  # as the shell does: to collect all that a run of tests has made would stop the loop for 150 ms
     said: list[m.Message] = []
     until_ns = time.monotonic_ns() + round(seconds * S)
     next_tick_ns = 0
@@ -107,6 +110,7 @@ def live(node: LinkNode, edge: MavlinkEdge, seconds: float, feed: Feed = lambda 
             next_tick_ns = now_ns - now_ns % TICK_NS + TICK_NS
             said += _offer(edge, list(node.tick(now_ns)))
         time.sleep(0.001)
+    gc.unfreeze()
     return said
 
 
