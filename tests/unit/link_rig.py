@@ -95,7 +95,6 @@ def east_error_m(sent: m.GpsInput) -> float:
 
 def live(node: LinkNode, edge: MavlinkEdge, seconds: float, feed: Feed = lambda _: []) -> list[m.Message]:
     """The live shell's loop in small: real time, the real edge. -> all that was said and read."""
-    gc.collect()
     gc.freeze()  # as the shell does: to collect all that a run of tests has made would stop the loop for 150 ms
     said: list[m.Message] = []
     until_ns = time.monotonic_ns() + round(seconds * S)
