@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from terrafix.core.geodesy import rot_from_quat, yaw_of
-from terrafix.link.felt import Felt
+from terrafix.link.felt import GRAVITY_MPS2, MEMORY_NS, Felt
 from terrafix.messages import Imu, NavEstimate, VehicleState
 
-GRAVITY_MPS2 = 9.81
 WGS84_A_M = 6_378_137.0  # semi-major axis (NIMA TR8350.2)
 WGS84_E2 = 6.694379990141e-3  # first eccentricity squared
 # 1-sigma of the acceleration that is left out. Felt: an attitude that is 2 degrees off lets so much of gravity in, and
@@ -23,7 +22,6 @@ ACCEL_SIGMA_FELT_MPS2 = 0.4
 HEADING_SIGMA_RAD = math.radians(5.0)
 ACCEL_SIGMA_MPS2 = 0.5
 ACCEL_SIGMA_BLIND_MPS2 = 1.0
-ATTITUDE_MEMORY_NS = 4_000_000_000  # longer than any carry (fix.MAX_AGE_NS)
 MIN_TURN_BASE_NS = 50_000_000  # below this, yaw noise over the time base is not a turn rate
 
 
@@ -70,7 +68,7 @@ class Attitudes:
         if self._samples and state.t_ns <= self._samples[-1][0]:
             return
         self._samples.append((state.t_ns, state.yaw_rad, state.roll_rad))
-        while self._samples[-1][0] - self._samples[0][0] > ATTITUDE_MEMORY_NS:
+        while self._samples[-1][0] - self._samples[0][0] > MEMORY_NS:
             self._samples.popleft()
 
     def lateral_accel(self, since_ns: int, now_ns: int, speed_mps: float) -> tuple[float, float] | None:
