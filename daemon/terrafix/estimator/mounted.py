@@ -11,7 +11,10 @@ from terrafix.estimator.telemetry import Attitude
 from terrafix.messages import Origin
 
 UNKNOWN_RAD = 3.0  # sigma of a heading that nobody reports
-UNKNOWN_ATTITUDE_RAD = np.radians(4.0)  # sigma of roll and pitch that nobody reports: level flight and gentle turns
+# Roll and pitch that nobody reports: a copter in cruise leans by 10 to 20 degrees, a plane in a turn banks as much ...
+UNKNOWN_ATTITUDE_RAD = np.radians(8.0)
+# ... and for about so long in one direction: that it is level is said once in this time, however many frames it has.
+LEAN_S = 5.0
 DEFAULT_AGL_M = 120.0  # when nobody reports a height: the usual ceiling of small drones ...
 DEFAULT_AGL_SIGMA_M = 50.0  # ... and wide enough for all of them
 
@@ -36,12 +39,12 @@ class MountedCamera:
         return exp_so3(np.array([0.0, 0.0, bias[2]])) @ r_w_b @ self._r_b_c @ exp_so3(np.array([bias[0], bias[1], 0.0]))
 
     def factor(
-        self, keys: tuple[int, int], attitude: Attitude, r_w_c: np.ndarray, ground_m: float
+        self, keys: tuple[int, int], attitude: Attitude, r_w_c: np.ndarray, ground_m: float, since_s: float = np.inf
     ) -> gtsam.CustomFactor:
         """``keys`` of C and B; ``r_w_c``: the predicted camera, whose heading stands in for one that nobody reports;
-        ``ground_m``: AMSL, below it."""
+        ``ground_m``: AMSL, below it; ``since_s``: since the last one."""
         origin = self._origin
-        tilt = UNKNOWN_ATTITUDE_RAD
+        tilt = UNKNOWN_ATTITUDE_RAD * np.sqrt(max(LEAN_S / since_s, 1.0))
         self._tilt_said = attitude.pitch_rad is not None and attitude.roll_rad is not None
         if self._tilt_said:
             tilt = np.radians(max(origin.attitude_sigma_deg, 0.3))
