@@ -82,3 +82,21 @@ def test_numbers_that_break_cost_confidence_and_nothing_else() -> None:
     run.hear([SourceEnded(t_ns=t_ns(89), frames=90)])
     refined = [m for m in run.said if isinstance(m, Refinement)][-1]
     assert [p.frame_id for p in refined.poses] == list(range(90))
+
+
+def test_a_frame_that_breaks_the_graph_is_where_it_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight(60, seed=6)
+    run = Listener().fly(flight, 0, 45)
+    graph, before = graph_of(run), sigma_m(run.estimate(44))
+
+    def indeterminate(*_: object) -> None:
+        raise RuntimeError
+
+    monkeypatch.setattr(graph._smoother, "insert", indeterminate)  # which is thrown away with it
+    run.hear([m for m in flight.messages(45) if not isinstance(m, MapMatch)])
+    assert graph.rebuilds == 1 and graph.newest == 45
+    assert sigma_m(run.estimate(45)) > 5.0 * before
+    run.fly(flight, 46, 60)
+    assert graph.rebuilds == 1
+    error = error_m(run.estimate(59), flight)[:2]
+    assert error @ np.linalg.solve(cov_of(run.estimate(59))[:2, :2], error) < 13.8  # chi-square, 99.9 %

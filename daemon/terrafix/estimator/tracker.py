@@ -147,7 +147,7 @@ class Tracker:
         if self._last is None or self._knows_more(attitude):
             return self._begin(frame_id, t_s, attitude)
         newest = self.graph.newest
-        before = self.graph.state(newest)
+        before, dt_s = self.graph.state(newest), t_s - self.graph.time_of(newest)
         known = self._by_odometry(odometry, attitude)
         self._launching = attitude.stands or self._launching
         way = None if attitude.stands else self._leg(t_s, before, attitude, felt)
@@ -199,7 +199,7 @@ class Tracker:
         self._velocity_cov = spread[3:, 3:]
         self._last = self._placed(frame_id, t_s, node)
         if known is not None:
-            self._pace.seen(self._last.velocity_mps, self._last.velocity_cov, t_s - self.graph.time_of(newest))
+            self._pace.seen(self._last.velocity_mps, self._last.velocity_cov, dt_s)
         return Advance(verdict, self._last, step, step_sigma)
 
     def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Leg:
