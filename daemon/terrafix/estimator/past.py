@@ -114,6 +114,8 @@ class Past:
         """The next node that parts what is before it from what comes after: no factor reaches across."""
         last = self._kept[-1]
         open_nodes = [n for n in self._left if n > last]
+        if not open_nodes or (open_nodes[-1] - last < SPACING and self._held.isdisjoint(open_nodes)):
+            return None  # which saves a look at every factor in most frames
         reach = dict.fromkeys(open_nodes, 0)
         for nodes in (*(f.nodes for f in self._linear), *(nodes for _, nodes in self._window)):
             for node in nodes:
