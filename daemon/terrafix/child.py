@@ -1,14 +1,15 @@
-"""Entry of every process of the daemon: ``python -m terrafix.child NAME RUN_DIR SUPERVISOR_PID``.
+"""Entry of every process of the daemon: the nursery (nursery.py), and what it forks.
 
-A user's mistake is one line and the exit code of its kind, a bug is a traceback; the supervisor decides what
-follows."""
+``python -m terrafix.child SOCKET SUPERVISOR_PID``. A user's mistake is one line and the exit code of its kind, a bug is
+a traceback; the supervisor decides what follows."""
 
-import ctypes
 import faulthandler
 import os
 import signal
+import socket
 import sys
 import threading
+import time
 from pathlib import Path
 
 import msgspec
@@ -22,9 +23,12 @@ from terrafix.core.node import NodeContext
 from terrafix.core.rundir import RunDir
 from terrafix.core.shell import run_process
 from terrafix.messages import Frame, Message
+from terrafix.nursery import WORDS, prctl
 from terrafix.processes import Process
 
 PR_SET_PDEATHSIG = 1  # prctl(2)
+REQUEST_BYTES = 8192  # a name and a path
+ADOPTION_S = 0.0002  # between two looks
 WHERE_SIGNAL = signal.SIGUSR2  # "where are you?": the supervisor asks a stuck process for its tracebacks
 
 
@@ -85,12 +89,37 @@ def _kinds(names: list[str]) -> tuple[type[Message], ...]:
 
 
 def main(arguments: list[str]) -> int:
-    name, run_dir, supervisor_pid = arguments[0], RunDir(Path(arguments[1])), int(arguments[2])
-    if not _die_with(supervisor_pid):
-        return 1
+    descriptor, supervisor_pid = int(arguments[0]), int(arguments[1])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the supervisor, which stops all in order
+    with socket.socket(fileno=descriptor) as asked:
+        wanted = serve(asked, supervisor_pid)
+    return 0 if wanted is None else run(*wanted)
+
+
+def serve(asked: socket.socket, supervisor_pid: int) -> tuple[str, RunDir] | None:
+    """Forks a process for each request, and returns in each of them who it is; in the nursery None, at the end."""
+    while request := asked.recv(REQUEST_BYTES):
+        between = os.fork()
+        if between == 0:
+            between = os.getpid()
+            if os.fork() != 0:
+                os._exit(0)  # so that the supervisor is the next of kin
+            while os.getppid() == between:
+                time.sleep(ADOPTION_S)
+            if not _die_with(supervisor_pid):
+                os._exit(1)
+            asked.send(str(os.getpid()).encode())
+            name, run_dir = request.decode().split(WORDS)
+            return name, RunDir(Path(run_dir))
+        os.waitpid(between, 0)
+    return None
+
+
+def run(name: str, run_dir: RunDir) -> int:
+    """The process ``name``, to its end; -> exit code."""
+    Path("/proc/self/comm").write_text(name)  # for `ps` and `top`: the command line is the nursery's
     stopping = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stopping.set())
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the supervisor, which stops all in order
     faulthandler.enable()
     faulthandler.register(WHERE_SIGNAL, all_threads=True)
     spec = msgspec.json.decode(run_dir.spec.read_bytes(), type=Spec)
@@ -117,9 +146,7 @@ def main(arguments: list[str]) -> int:
 
 def _die_with(supervisor_pid: int) -> bool:
     """Asks the kernel to kill this process when its supervisor dies. False: it is dead already."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     return os.getppid() == supervisor_pid
 
 

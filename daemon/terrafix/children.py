@@ -1,20 +1,17 @@
 """One supervised process: started, watched by its progress, restarted within limits, stopped."""
 
-import os
 import signal
-import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import IO
 
 from terrafix.child import WHERE_SIGNAL
 from terrafix.core.errors import TerrafixError
 from terrafix.core.progress import Progress
 from terrafix.core.rundir import RunDir
+from terrafix.nursery import Forked, Nursery
 from terrafix.processes import Process
 
 RESTART_LIMIT = 5  # deaths in the window; more is not bad luck but a fault that a restart does not cure
@@ -67,15 +64,14 @@ class RestartWindow:
 
 
 class Child:
-    def __init__(self, process: Process, run_dir: RunDir, output: IO[str] | None) -> None:
-        """``output``: where stdout and stderr of the process go; None: where ours go."""
+    def __init__(self, process: Process, run_dir: RunDir, nursery: Nursery) -> None:
         self.process = process
         self.state = State.WAITING
         self.mistake: Mistake | None = None
         self.progress = Progress.create(run_dir.progress(process.name))
         self._run_dir = run_dir
-        self._output = output
-        self._popen: subprocess.Popen[bytes] | None = None
+        self._nursery = nursery
+        self._forked: Forked | None = None
         self._start_at_ns = 0
         self._started_ns = 0
         self._lives = 0
@@ -85,7 +81,7 @@ class Child:
 
     @property
     def pid(self) -> int | None:
-        return self._popen.pid if self._popen else None
+        return self._forked.pid if self._forked else None
 
     @property
     def settled(self) -> bool:
@@ -97,8 +93,8 @@ class Child:
         if self.state is State.WAITING:
             if now_ns >= self._start_at_ns:
                 yield self._start(now_ns)
-        elif self._popen is not None:
-            code = self._popen.poll()
+        elif self._forked is not None:
+            code = self._forked.poll()
             if code is not None:
                 yield from self._ended(code, now_ns)
             elif not self._killed and self._is_stuck(now_ns):
@@ -110,36 +106,32 @@ class Child:
 
     def stop(self) -> Event | None:
         """SIGTERM, and SIGKILL if that does not help. None: it did not run."""
-        if self._popen is None:
+        if self._forked is None:
             return None
-        self._popen.terminate()
+        self._forked.terminate()
         try:
-            detail = describe(self._popen.wait(STOP_LIMIT_S))
-        except subprocess.TimeoutExpired:
+            detail = describe(self._forked.wait(STOP_LIMIT_S))
+        except TimeoutError:
             self._show_traceback_and_kill()
             detail = f"killed: still there {STOP_LIMIT_S:.0f} s after SIGTERM"
             try:
-                self._popen.wait(KILL_LIMIT_S)
-            except subprocess.TimeoutExpired:
+                self._forked.wait(KILL_LIMIT_S)
+            except TimeoutError:
                 detail += "; it hangs in the kernel"
-        self._popen = None
+        self._forked = None
         return Event("stopped", detail)
 
     def _start(self, now_ns: int) -> Event:
         self.progress.reset()
-        command = [sys.executable, "-m", "terrafix.child", self.process.name, str(self._run_dir.path), str(os.getpid())]
-        environment = {k: v for k, v in os.environ.items() if k not in ("NOTIFY_SOCKET", "WATCHDOG_USEC")}
-        self._popen = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=self._output, stderr=self._output, env=environment
-        )
+        self._forked = self._nursery.fork(self.process.name, self._run_dir)
         self.state = State.STARTING
         self._killed = False
         self._started_ns = now_ns
         self._lives += 1
-        return Event("started" if self._lives == 1 else "restarted", f"pid {self._popen.pid}")
+        return Event("started" if self._lives == 1 else "restarted", f"pid {self._forked.pid}")
 
     def _ended(self, code: int, now_ns: int) -> Iterator[Event]:
-        self._popen = None
+        self._forked = None
         if code == 0:
             self.state = State.FINISHED
             yield Event("stopped", "finished by itself")
@@ -173,10 +165,10 @@ class Child:
         return now_ns - self._progress_ns() > limit_ns
 
     def _show_traceback_and_kill(self) -> None:
-        assert self._popen is not None
-        self._popen.send_signal(WHERE_SIGNAL)
+        assert self._forked is not None
+        self._forked.send_signal(WHERE_SIGNAL)
         threading.Event().wait(TRACEBACK_S)
-        self._popen.kill()
+        self._forked.kill()
         self._killed = True
 
 

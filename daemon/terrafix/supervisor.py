@@ -28,6 +28,7 @@ from terrafix.core.errors import MapError, OutputError
 from terrafix.core.rundir import OwnedRunDir, RunDir
 from terrafix.core.shell import SUPERVISOR
 from terrafix.messages import ProcessEvent, SourceEnded
+from terrafix.nursery import Nursery
 from terrafix.processes import PROCESSES, Process
 
 LINK_GAVE_UP = 1  # exit code
@@ -55,6 +56,7 @@ def run(
     stop: threading.Event | None = None,
     log_to: Path | None = None,
     table: tuple[Process, ...] = PROCESSES,
+    nursery: Nursery | None = None,
 ) -> int:
     """Flies until a signal, until ``stop`` is set, or (``stop_after_source``) until the source has ended.
 
@@ -62,7 +64,7 @@ def run(
     empty. ``ground_amsl_m``: the map's ground at the start, for a source that does not know it.
     ``on_event`` gets everything that happens to the processes, ``on_epoch`` once the t_ns of the first Origin:
     the zero of a recorded source on the monotonic clock. ``log_to``: file for all logs and tracebacks instead of
-    stdout and stderr.
+    stdout and stderr. ``nursery``: one that has been started before, by whom it will be closed; None: one of its own.
     Returns 0, or 1 when the link gave up, or the exit code of a process that could not start for a reason that the
     user can mend (said on stderr, in one line, at the end). Raises ConfigError, MapError, OutputError before anything
     is started."""
@@ -81,7 +83,8 @@ def run(
             logs.get().warning("goes on from a run that was killed", epoch_ns=owned.run_dir.epoch_ns)
         stack.enter_context(_signals_set(stop))
         context = stack.enter_context(zmq.Context())
-        children = [Child(process, owned.run_dir, output) for process in table]
+        nursery = nursery or stack.enter_context(Nursery(output))
+        children = [Child(process, owned.run_dir, nursery) for process in table]
         publisher = Publisher(context, owned.run_dir.address(SUPERVISOR))
         stack.callback(publisher.close)
         subscriber = Subscriber(context, [owned.run_dir.address(p.name) for p in table], (SourceEnded,))

@@ -20,18 +20,18 @@ RESUMES_WITHIN_S = 2.0
 
 
 def children_of(pid: int) -> dict[str, int]:
-    """Names of the daemon's processes -> pid."""
+    """Names of the daemon's processes (as `ps` shows them) -> pid; among them what else the program has started."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
             continue
         try:
             parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            words = (entry / "cmdline").read_bytes().split(b"\0")
+            name = (entry / "comm").read_text().strip()
         except OSError:
             continue  # ended meanwhile
-        if parent == pid and b"terrafix.child" in words:
-            found[words[words.index(b"terrafix.child") + 1].decode()] = int(entry.name)
+        if parent == pid:
+            found[name] = int(entry.name)
     return found
 
 

@@ -1,7 +1,6 @@
 """Small nodes for the tests of shell and supervisor; children import this module by name (see `table`)."""
 
 import os
-import sys
 import threading
 from collections.abc import Iterable
 from dataclasses import replace
@@ -147,8 +146,8 @@ def make_edge(ctx: NodeContext) -> Edge | None:
 
 
 def process_name() -> str:
-    """One module stands for all processes: their name is the first argument of child.py."""
-    return sys.argv[1]
+    """One module stands for all processes: their name is what `ps` shows."""
+    return Path("/proc/self/comm").read_text().strip()
 
 
 _BASE = Process("", "runtime_nodes", (), (), 0.0, 5.0)

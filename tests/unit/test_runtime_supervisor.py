@@ -1,5 +1,6 @@
 """The supervisor with real processes: kills, hangs, bugs, mistakes, and the ordered stop."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -19,6 +20,7 @@ from terrafix.children import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, d
 from terrafix.core import rundir
 from terrafix.core.codec import decode_json
 from terrafix.core.errors import ConfigError, MapError, OutputError
+from terrafix.nursery import Forked
 from terrafix.supervisor import run, sd_notify
 
 pytestmark = pytest.mark.real_time
@@ -211,8 +213,13 @@ def supervisor_process(out_dir: Path, **environment: str) -> Iterator[subprocess
             process.kill()
 
 
-def children_of(pid: int) -> list[int]:
-    return [int(p) for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+def children_of(pid: int) -> dict[str, int]:
+    """Name, as `ps` shows it -> pid; the nursery has that of the interpreter."""
+    found = {}
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        with contextlib.suppress(FileNotFoundError):  # ended meanwhile
+            found[Path(f"/proc/{child}/comm").read_text().strip()] = int(child)
+    return found
 
 
 def is_gone(pid: int) -> bool:
@@ -230,10 +237,9 @@ def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tm
         with supervisor_process(tmp_path / "out", NOTIFY_SOCKET=str(tmp_path / "notify")) as process:
             assert systemd.recv(1000) == b"READY=1"
             assert systemd.recv(1000).startswith(b"WATCHDOG=1\nSTATUS=flying")
-            for pid in children_of(process.pid):
+            for pid in children_of(process.pid).values():
                 assert b"NOTIFY_SOCKET" not in Path(f"/proc/{pid}/environ").read_bytes()
-            link = next(p for p in children_of(process.pid) if b"link" in Path(f"/proc/{p}/cmdline").read_bytes())
-            os.kill(link, signal.SIGSTOP)  # alive and not making progress
+            os.kill(children_of(process.pid)["link"], signal.SIGSTOP)  # alive and not making progress
             systemd.settimeout(0.65)  # WATCHDOG comes every 0.5 s; a stuck link is noticed after 1 s, and soon back
             with pytest.raises(TimeoutError):
                 for _ in range(10):
@@ -251,19 +257,47 @@ def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tm
 
 
 def test_children_die_with_a_killed_supervisor_and_its_leftovers_are_swept(tmp_path: Path) -> None:
+    others = {run.path for run in rundir.living()}
     with supervisor_process(tmp_path / "out") as process:
-        eventually(lambda: len(children_of(process.pid)) == len(TABLE), 15)
+        eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
         children = children_of(process.pid)
-        folder = Path(f"/proc/{children[0]}/cmdline").read_bytes().split(b"\0")[4].decode()
+        (folder,) = {run.path for run in rundir.living()} - others
         process.kill()
-        eventually(lambda: all(is_gone(pid) for pid in children), 2)
-    assert Path(folder).exists()
+        eventually(lambda: all(is_gone(pid) for pid in children.values()), 2)
+    assert folder.exists()
     living = rundir.OwnedRunDir()
-    assert not Path(folder).exists(), "the next start removes what the killed one left"
+    assert not folder.exists(), "the next start removes what the killed one left"
     rundir.OwnedRunDir().remove()
     assert living.run_dir.path.exists(), "the folder of a living supervisor stays"
     living.remove()
     assert not living.run_dir.path.exists()
+
+
+def test_a_nursery_that_dies_takes_nobody_with_it_and_another_is_there_when_it_is_wanted(tmp_path: Path) -> None:
+    names = {p.name for p in TABLE}
+    with supervisor_process(tmp_path / "out") as process:
+        eventually(lambda: names <= set(children_of(process.pid)), 15)
+        before = children_of(process.pid)
+        (nursery,) = (pid for name, pid in before.items() if name not in names)
+        os.kill(nursery, signal.SIGKILL)
+        os.kill(before["estimator"], signal.SIGKILL)
+        eventually(lambda: children_of(process.pid).get("estimator", before["estimator"]) != before["estimator"], 5)
+        after = children_of(process.pid)
+        assert {name: after[name] for name in names - {"estimator"}} == {n: before[n] for n in names - {"estimator"}}
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(15) == 0
+    assert all(is_gone(pid) for pid in {*before.values(), *after.values()})
+
+
+def test_who_was_forked_is_waited_for_no_longer_than_wanted_and_ended() -> None:
+    asleep = Forked(os.posix_spawn("/bin/sleep", ["sleep", "30"], os.environ))
+    assert asleep.poll() is None
+    with pytest.raises(TimeoutError):
+        asleep.wait(0.05)
+    asleep.terminate()
+    assert asleep.wait(5.0) == -signal.SIGTERM
+    asleep.kill()  # its number may be another's by now
+    assert asleep.poll() == -signal.SIGTERM
 
 
 def test_restart_window_pauses_longer_and_gives_up() -> None:

@@ -43,13 +43,15 @@ def run(
     config: ConfigOption = None,
 ) -> None:
     """Fly: start the processes under the supervisor until stopped."""
-    from terrafix.supervisor import run as run_supervised
-    from terrafix_tools.live import package_for
+    from terrafix.nursery import Nursery
 
-    configs = config or []
-    package, ground_amsl_m = package_for(source, start, map_path, configs)
-    raise typer.Exit(
-        run_supervised(
+    with Nursery() as nursery:  # first: it imports what the processes need while the map is looked at
+        from terrafix.supervisor import run as run_supervised
+        from terrafix_tools.live import package_for
+
+        configs = config or []
+        package, ground_amsl_m = package_for(source, start, map_path, configs)
+        code = run_supervised(
             source=source,
             start=start,
             map_path=package,
@@ -58,8 +60,9 @@ def run(
             out_dir=out,
             configs=configs,
             stop_after_source=until_end,
+            nursery=nursery,
         )
-    )
+    raise typer.Exit(code)
 
 
 @app.command()
