@@ -5,8 +5,10 @@ import math
 import socket
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -157,6 +159,7 @@ def test_packets_become_notes() -> None:
     sender, receiver = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
     zeros = [0.0] * 6
     sent = [
+        mavlink.MAVLink_system_time_message(0, 0),
         mavlink.MAVLink_sim_state_message(
             1, 0, 0, 0, 0.1, -0.2, 1.5, *zeros, 0, 0, 412.5, 0, 0, 3, -4, 0.5, 481234567, 141234567
         ),
@@ -175,6 +178,34 @@ def test_packets_become_notes() -> None:
     assert (truth.roll_rad, truth.pitch_rad, truth.yaw_rad) == pytest.approx((0.1, -0.2, 1.5), abs=1e-6)
     assert notes.fix_types[0] == [(7, 1)] and notes.gps_healthy == [(7, True)] and notes.armed == [(7, True)]
     assert notes.said == [Said(7, 4, "GPS Glitch")] and notes.version == "4.6.3 (3fc7011a)"
+
+
+def test_the_truth_has_the_time_of_the_firmware_however_it_comes() -> None:
+    """Bursts, a machine that was busy, a state of another turn than the time before it, a clock that lost 50 ms."""
+    rng = np.random.default_rng(3)
+    notes, apart_ns = Notes(), 1000 * S
+
+    def say(boot_ms: int, late_ms: float, turn_ms: float = 0.05) -> None:
+        arrival_ns = boot_ms * 1_000_000 + apart_ns + round(late_ms * 1e6)
+        take(notes, mavlink.MAVLink_system_time_message(0, boot_ms), arrival_ns)
+        take(notes, mavlink.MAVLink_global_position_int_message(boot_ms, 0, boot_ms, 0, 0, 0, 0, 0, 0), arrival_ns)
+        state = mavlink.MAVLink_sim_state_message(*[0.0] * 15, boot_ms * 0.02, *[0.0] * 5, 0, 0)
+        take(notes, state, arrival_ns + round(turn_ms * 1e6))
+
+    late_ms = rng.uniform(-3.0, 3.0, 200) + np.where(rng.random(200) < 0.2, 20.0, 0.0)
+    for i, late in enumerate(late_ms):
+        say(25 * i, late, turn_ms=5.0 if i % 10 == 9 else 0.05)
+    assert len(notes.truth) == 180, "of a state from another turn nobody knows when it was"
+    settled = [one for one in notes.truth if one.t_ns > apart_ns + 2 * S]
+    true_ns = [one.amsl_m / 0.02 * 1e6 + apart_ns for one in settled]
+    off_ms = (np.array([one.t_ns for one in settled]) - true_ns) / 1e6
+    assert abs(off_ms.mean()) < 2.0 and np.ptp(off_ms) < 2.0
+    assert notes.beliefs[-1].t_ns - notes.beliefs[-2].t_ns == pytest.approx(25e6, abs=1e6)
+    apart_ns += 50_000_000
+    for i in range(200, 300):
+        say(25 * i, 0.0)
+    assert all(b.t_ns > a.t_ns for a, b in pairwise(notes.truth))
+    assert notes.truth[-1].t_ns == 25 * 299 * 1_000_000 + apart_ns
 
 
 def test_truth_between_two_states() -> None:

@@ -15,7 +15,8 @@ from terrafix_tools.sim.flights.folder import CAMERA, FRAME_HZ
 from terrafix_tools.sim.ground.ground import Ground
 from terrafix_tools.sim.sitl.observer import Truth
 
-DEVELOP_NS = 60_000_000  # the pose of a moment is known when the states around it have arrived; they come at 40 Hz
+DEVELOP_NS = 60_000_000  # the pose of a moment is known when the states around it have arrived; they come at 40 Hz,
+AGAIN_S = 0.01  # or later, from a firmware that has to wait for its processor
 LENS_M = 0.3  # above the ground when the vehicle stands: the simulator's flat ground is not the world's
 
 
@@ -58,6 +59,8 @@ class SimulatedCamera:
         due_ns = time.monotonic_ns()
         while not self._stopping.wait(max(0, due_ns + DEVELOP_NS - time.monotonic_ns()) / 1e9):
             truth = self._truth_at(due_ns)
+            while truth is None and time.monotonic_ns() < due_ns + period_ns and not self._stopping.wait(AGAIN_S):
+                truth = self._truth_at(due_ns)
             if truth is not None:
                 self._stream.push(self._renderer.frame(*self.pose(truth), self.frames), due_ns)
                 self.frames += 1

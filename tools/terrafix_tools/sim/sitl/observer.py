@@ -5,9 +5,11 @@ It listens on a MAVLink port of its own and asks for streams there; it says noth
 import bisect
 import math
 import socket
+import statistics
 import struct
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,9 +21,12 @@ DATAGRAM_MAX = 4096
 SO_TIMESTAMPNS = 35  # Linux, asm-generic/socket.h; Python has no name for it
 TIMESPEC = struct.Struct("@ll")
 LISTEN_S = 0.1  # between two looks whether to stop
+TIMES_KEPT = 80  # of the firmware's clock: two seconds
+TOGETHER_NS = 1_000_000  # what is said in one turn of its loop comes in a burst
 ASK_AGAIN_S = 2.0  # requests are UDP datagrams and may come before the firmware listens
 RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_SIM_STATE: 40,  # of a plane's 50 Hz loop no stream gets more than 80 %
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 40,  # the same rate: it comes right before the state, which has no time itself
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5,
@@ -37,7 +42,7 @@ AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 @dataclass(frozen=True)
 class Truth:
-    """Where the simulated vehicle is; ``t_ns`` is the moment of arrival on the monotonic clock."""
+    """Where the simulated vehicle is; ``t_ns`` is on the monotonic clock (SimulatedTime)."""
 
     t_ns: int
     lat_deg: float
@@ -67,9 +72,36 @@ class Belief:
     lon_deg: float
 
 
+class SimulatedTime:
+    """The firmware's clock, by which its world moves, on ours.
+
+    It calculates ahead and then waits, and is late when the machine is busy: what it says comes up to some 20 ms aside
+    of where its clock would have it, in which a plane flies half a metre. A picture of the state that had come by then
+    would jump by as much, as no camera in the air does. What the last seconds have in common is how far the clocks are
+    apart."""
+
+    def __init__(self) -> None:
+        self._apart_ns: deque[int] = deque(maxlen=TIMES_KEPT)
+        self._boot_ms, self._arrival_ns = 0, 0  # of its clock, when it was said last
+
+    def heard(self, boot_ms: int, arrival_ns: int) -> None:
+        """A SYSTEM_TIME."""
+        self._apart_ns.append(arrival_ns - boot_ms * 1_000_000)
+        self._boot_ms, self._arrival_ns = boot_ms, arrival_ns
+
+    def ours_ns(self, boot_ms: int) -> int | None:
+        """On the monotonic clock; None before the first time."""
+        return boot_ms * 1_000_000 + round(statistics.median(self._apart_ns)) if self._apart_ns else None
+
+    def of_this_turn_ns(self, arrival_ns: int) -> int | None:
+        """When it was, by its clock, for a message without a time. None: its clock was not said in the same turn."""
+        return self.ours_ns(self._boot_ms) if arrival_ns - self._arrival_ns < TOGETHER_NS else None
+
+
 @dataclass
 class Notes:
-    """Everything that was heard, in order of arrival. ``(t_ns, value)`` where there is no name."""
+    """Everything that was heard, in order of arrival. ``(t_ns, value)`` where there is no name; ``t_ns`` is that of the
+    arrival where it is not that of the firmware's clock."""
 
     truth: list[Truth] = field(default_factory=list)
     said: list[Said] = field(default_factory=list)
@@ -79,6 +111,7 @@ class Notes:
     ekf_flags: list[tuple[int, int]] = field(default_factory=list)
     version: str = ""  # of the firmware, with the start of its commit
     armed: list[tuple[int, bool]] = field(default_factory=list)  # from its heartbeats
+    time: SimulatedTime = field(default_factory=SimulatedTime)
 
 
 class Observer:
@@ -161,16 +194,22 @@ def arrival_ns(extra: list[tuple[int, int, bytes]]) -> int:
 
 
 def take(notes: Notes, message: Any, now_ns: int) -> None:
-    """One decoded message into ``notes``."""
+    """One decoded message, that came at ``now_ns``, into ``notes``."""
     kind = message.get_type()
-    if kind == "SIM_STATE":
-        place = message.lat_int * 1e-7, message.lon_int * 1e-7, message.alt
-        velocity = message.vn, message.ve, message.vd
-        notes.truth.append(Truth(now_ns, *place, velocity, message.roll, message.pitch, message.yaw))
+    if kind == "SYSTEM_TIME":
+        notes.time.heard(message.time_boot_ms, now_ns)
+    elif kind == "SIM_STATE":
+        t_ns = notes.time.of_this_turn_ns(now_ns)
+        if t_ns is not None and (not notes.truth or t_ns > notes.truth[-1].t_ns):
+            place = message.lat_int * 1e-7, message.lon_int * 1e-7, message.alt
+            velocity = message.vn, message.ve, message.vd
+            notes.truth.append(Truth(t_ns, *place, velocity, message.roll, message.pitch, message.yaw))
     elif kind == "STATUSTEXT":
         notes.said.append(Said(now_ns, message.severity, message.text))
     elif kind == "GLOBAL_POSITION_INT":
-        notes.beliefs.append(Belief(now_ns, message.lat * 1e-7, message.lon * 1e-7))
+        t_ns = notes.time.ours_ns(message.time_boot_ms)
+        if t_ns is not None:
+            notes.beliefs.append(Belief(t_ns, message.lat * 1e-7, message.lon * 1e-7))
     elif kind == "GPS_RAW_INT":
         notes.fix_types[0].append((now_ns, message.fix_type))
     elif kind == "GPS2_RAW":
