@@ -17,7 +17,7 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from terrafix.child import spec_of
+from terrafix.child import Spec, spec_of
 from terrafix.children import Child, Event, State
 from terrafix.core import config as configuration
 from terrafix.core import logs
@@ -25,7 +25,7 @@ from terrafix.core.bus import Publisher, Subscriber
 from terrafix.core.clock import Ticker, now_ns
 from terrafix.core.config import Config
 from terrafix.core.errors import MapError, OutputError
-from terrafix.core.rundir import OwnedRunDir, RunDir
+from terrafix.core.rundir import OwnedRunDir, RunDir, killed_in_flight
 from terrafix.core.shell import SUPERVISOR
 from terrafix.messages import ProcessEvent, SourceEnded
 from terrafix.nursery import Nursery
@@ -98,6 +98,24 @@ def run(
         for mistake in (child.mistake for child in children if child.mistake):
             sys.stderr.write(f"terrafix: {mistake.text}\n")  # the last word, after all logs
         return code
+
+
+def killed_just_now(
+    *, source: str, map_path: Path | None, link: str, out_dir: Path, configs: list[Path], start: str = ""
+) -> Spec | None:
+    """What a run of the same (as for ``run``) flew with, if it was killed in the flight that goes on now: the map, as
+    it was looked at on the ground, need not be looked at again while a vehicle waits. None: there was none.
+    Raises ConfigError."""
+    config = _with_overrides(configuration.load(configs), source, start, map_path, link)
+    if not config.map.path or not _is_camera(config.source.path):
+        return None
+    for dead in killed_in_flight():
+        with contextlib.suppress(OSError, msgspec.DecodeError):  # it is being removed; of another version
+            spec = msgspec.json.decode(dead.spec.read_bytes(), type=Spec)
+            package = Path(config.map.path).resolve()
+            if spec == spec_of(PROCESSES, config, package, out_dir.resolve(), spec.ground_amsl_m):
+                return spec
+    return None
 
 
 class Supervisor:

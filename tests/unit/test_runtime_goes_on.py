@@ -1,13 +1,20 @@
 """All of Terrafix was killed in flight and is started again: what it takes from the run before."""
 
+import fcntl
+import shutil
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from terrafix.child import spec_of
+from terrafix.core import rundir
+from terrafix.core.config import Config, LinkSection, Map, Source
 from terrafix.core.progress import Progress
 from terrafix.core.rundir import PREFIX, OwnedRunDir, RunDir
-from terrafix.supervisor import _is_camera
+from terrafix.processes import PROCESSES
+from terrafix.supervisor import _is_camera, killed_just_now
 
 
 def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
@@ -57,6 +64,40 @@ def test_a_supervisor_that_ended_without_being_asked_leaves_it_too(tmp_path: Pat
     assert second.run_dir.epoch_ns == 7
     second.remove()
     assert not list(tmp_path.iterdir())
+
+
+CAMERA = "http://127.0.0.1:80/stream"
+
+
+def test_a_map_that_was_looked_at_is_not_looked_at_again_while_a_vehicle_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rundir, "SHM", tmp_path)
+    package, out = tmp_path / "a.gpkg", tmp_path / "out"
+    config = Config(map=Map(path=str(package)), source=Source(path=CAMERA), link=LinkSection(device="udpin:h:1"))
+    spec = msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5))
+
+    def found(source: str = CAMERA, map_path: Path = package, link: str = "udpin:h:1") -> float | None:
+        before = killed_just_now(source=source, map_path=map_path, link=link, out_dir=out, configs=[])
+        return None if before is None else before.ground_amsl_m
+
+    assert found() is None
+    dead = killed(tmp_path, spec, 5.0)
+    assert found() == 412.5
+    assert found(map_path=tmp_path / "b.gpkg") is None
+    assert found(link="udpin:h:2") is None
+    config = msgspec.structs.replace(config, source=Source(path=str(tmp_path)))
+    dead.spec.write_bytes(msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5)))
+    assert found(source=str(tmp_path)) is None, "a recording begins anew"
+    dead.spec.write_bytes(b'{"of another version": 1}')
+    assert found() is None
+    dead.spec.write_bytes(spec)
+    with (dead.path / "lock").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert found() is None, "it lives"
+    shutil.rmtree(dead.path)
+    killed(tmp_path, spec, 61.0)
+    assert found() is None
 
 
 def test_a_recording_is_no_camera(tmp_path: Path) -> None:

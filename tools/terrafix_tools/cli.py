@@ -46,11 +46,17 @@ def run(
     from terrafix.nursery import Nursery
 
     with Nursery() as nursery:  # first: it imports what the processes need while the map is looked at
+        from terrafix.supervisor import killed_just_now
         from terrafix.supervisor import run as run_supervised
-        from terrafix_tools.live import package_for
 
         configs = config or []
-        package, ground_amsl_m = package_for(source, start, map_path, configs)
+        before = killed_just_now(source=source, start=start, map_path=map_path, link=link, out_dir=out, configs=configs)
+        if before is not None:
+            package, ground_amsl_m = map_path, before.ground_amsl_m
+        else:
+            from terrafix_tools.live import package_for
+
+            package, ground_amsl_m = package_for(source, start, map_path, configs)
         code = run_supervised(
             source=source,
             start=start,

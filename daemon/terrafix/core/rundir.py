@@ -66,10 +66,14 @@ class RunDir:
     def goes_on_from(self, dead: "RunDir") -> None:
         """What the processes of ``dead`` knew last, if they were run for the same and lived until just now."""
         same = dead.spec.is_file() and dead.spec.read_bytes() == self.spec.read_bytes()
-        if not same or not dead._epoch.exists() or now_ns() - dead._lived_ns() > SAME_FLIGHT_NS:
+        if not same or not dead.flew_just_now():
             return
         for file in (dead._epoch, *dead.path.glob("*.kept")):
             write_whole(self.path / file.name, file.read_bytes())
+
+    def flew_just_now(self) -> bool:
+        """Its source was open, and it lived until just now."""
+        return self._epoch.exists() and now_ns() - self._lived_ns() <= SAME_FLIGHT_NS
 
     def _lived_ns(self) -> int:
         """The newest stamp of any of its processes; 0: none has one."""
@@ -117,6 +121,15 @@ def living(parent: Path | None = None) -> list[RunDir]:
     """The folders of supervisors that live. Another user's cannot be looked into, and counts as living."""
     folders = sorted((parent or _default_parent()).glob(f"{PREFIX}*"))
     return [RunDir(folder) for folder in folders if not os.access(folder, os.X_OK) or _is_held(folder / "lock")]
+
+
+def killed_in_flight(parent: Path | None = None) -> list[RunDir]:
+    """Whose supervisor is gone, in the flight that goes on now; this user's."""
+    folders = sorted(
+        folder for folder in (parent or _default_parent()).glob(f"{PREFIX}*") if os.access(folder, os.X_OK)
+    )
+    dead = (RunDir(folder) for folder in folders if not _is_held(folder / "lock"))
+    return [run for run in dead if run.flew_just_now()]
 
 
 def _is_held(lock: Path) -> bool:
