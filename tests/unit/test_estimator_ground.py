@@ -37,6 +37,16 @@ def begun(attitude: Attitude) -> Estimator:
     return estimator
 
 
+@pytest.mark.parametrize("armed", [True, False, None])
+def test_a_height_below_the_ground_that_it_stands_on_is_one_to_begin_with(armed: bool | None) -> None:
+    """As barometers say it: 4 cm too low."""
+    below = Attitude(0.0, 0.0, 0.0, -0.04, armed=armed)
+    estimator = begun(below)
+    for frame in (1, 2, 3):
+        advance = estimator.advance(frame, 0.5 * frame, unseen(0.5 * frame), below)
+        assert advance.placed is not None and np.isfinite(advance.placed.cov).all()
+
+
 def test_the_plane_of_the_ground_is_that_of_the_place_where_it_was_fitted() -> None:
     estimator = begun(Attitude(0.0, 0.0, 0.0, 100.0))
     assert estimator.terrain.below(np.array([300.0, -200.0, 140.0])) == 40.0  # flat until a map says otherwise

@@ -275,7 +275,8 @@ class Tracker:
         agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
         agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
         yaw = float(np.hypot(np.radians(origin.yaw_sigma_deg), COMPASS_BIAS_RAD))
-        below_m = self.terrain.rise_sigma_m(TAKE_OFF_AWAY * agl)  # the ground, over that of the take-off
+        # The ground, over that of the take-off; where the vehicle stands on it a barometer may say less than none.
+        below_m = self.terrain.rise_sigma_m(TAKE_OFF_AWAY * max(agl, 0.0))
         height = float(np.linalg.norm([agl_sigma, HEIGHT_BIAS * agl, below_m]))
         assumed = np.diag([tolerance, tolerance, yaw, height, LENS_SIGMA, scale_sigma(origin.camera)]) ** 2
         bias, bias_cov = (np.zeros(BIAS_SIZE), assumed) if slow is None else slow
