@@ -47,7 +47,7 @@ class MountedCamera:
         tilt = UNKNOWN_ATTITUDE_RAD * np.sqrt(max(LEAN_S / since_s, 1.0))
         self._tilt_said = attitude.pitch_rad is not None and attitude.roll_rad is not None
         if self._tilt_said:
-            tilt = np.radians(max(origin.attitude_sigma_deg, 0.3))
+            tilt = float(np.hypot(np.radians(max(origin.attitude_sigma_deg, 0.3)), attitude.righted_rad))
         yaw_rad, yaw_sigma = attitude.yaw_rad, np.radians(max(origin.yaw_sigma_deg, 1.0))
         if yaw_rad is None:
             yaw_rad, yaw_sigma = self.yaw_rad(r_w_c), UNKNOWN_RAD * 10

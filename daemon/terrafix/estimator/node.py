@@ -1,6 +1,8 @@
 """Estimator: odometry and map matches in; prediction, estimate and verdicts out."""
 
+import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,6 +11,7 @@ from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.resume import Keeper, Known, Last, kept
+from terrafix.estimator.righted import Righted
 from terrafix.estimator.telemetry import Telemetry
 from terrafix.estimator.tracker import Advance, Placed
 from terrafix.messages import (
@@ -46,6 +49,7 @@ class EstimatorNode:
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
+        self._righted = Righted()
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
         self._said_slow_ns = 0
@@ -116,7 +120,9 @@ class EstimatorNode:
         if estimator is None:
             return
         estimator.mode = self._mode
-        attitude = self._telemetry.at(odometry.t_ns)
+        sigma_rad = math.radians(estimator.origin.attitude_sigma_deg)
+        righted_rad = self._righted.rad(odometry.t_ns, self._telemetry, sigma_rad)
+        attitude = replace(self._telemetry.at(odometry.t_ns), righted_rad=righted_rad)
         before = estimator.last
         seen = before is not None and before.frame_id == self._predicted
         if before is not None and seen:

@@ -26,6 +26,7 @@ class Attitude:
     roll_rad: float | None
     agl_m: float | None
     armed: bool | None = None
+    righted_rad: float = 0.0  # by how much tilt may be off beyond what is always said of it (righted.py)
 
     @property
     def stands(self) -> bool:
@@ -41,6 +42,7 @@ class Telemetry:
         self._states: deque[VehicleState] = deque(maxlen=KEPT)
         self._turns = _Series(KEPT)  # yaw, pitch, roll
         self._forces = _Series(KEPT_READINGS)  # forward, right, down
+        self._rates = _Series(KEPT_READINGS)  # about the same axes
 
     def add(self, state: VehicleState) -> None:
         self._states.append(state)
@@ -49,8 +51,9 @@ class Telemetry:
         self._turns.add(state.t_ns, state.yaw_rad, state.pitch_rad, state.roll_rad)
 
     def add_imu(self, imu: Imu) -> None:
-        for before_ns, forward, right, down, *_ in imu.samples:
+        for before_ns, forward, right, down, *rates in imu.samples:
             self._forces.add(imu.t_ns - before_ns, forward, right, down)
+            self._rates.add(imu.t_ns - before_ns, *rates)
 
     def at(self, t_ns: int) -> Attitude:
         """Field by field the value measured nearest to ``t_ns``; ``None`` where nobody said it within a second."""
@@ -92,6 +95,27 @@ class Telemetry:
         scatter = float(np.mean(np.square(np.diff(f, 2)))) / 6.0 if f.shape[1] > 3 else 0.0
         unfelt_s = max(0.0, (t1_ns - int(t_f[-1])) * 1e-9)
         return Felt((t - t0_ns) * 1e-9, accel, yaw, float(np.sqrt(scatter * spacing_s)), unfelt_s)
+
+    def turned_otherwise(self, t0_ns: int, t1_ns: int) -> np.ndarray | None:
+        """The tilt (2,) about east and north by which the attitude turned from ``t0_ns`` to ``t1_ns`` and gyroscopes
+        did not [rad]; None when readings or attitudes do not cover that."""
+        rates, turns = self._rates.around(t0_ns, t1_ns), self._turns.around(t0_ns, t1_ns)
+        if t1_ns <= t0_ns or rates is None or turns is None:
+            return None
+        (t_g, w), (t_a, angles) = rates, turns
+        if not (_covers(t_g, t0_ns, t1_ns, MAX_READING_GAP_NS) and _covers(t_a, t0_ns, t1_ns, MAX_ATTITUDE_GAP_NS)):
+            return None
+        inside = t_a[(t_a > t0_ns) & (t_a < t1_ns)]
+        t = np.concatenate([[t0_ns], inside, [t1_ns]])
+        yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
+        r_w_b = np.stack([_in_world([*axis], yaw, pitch, roll) for axis in np.eye(3)], axis=2)
+        step = np.einsum("nij,nkj->nik", r_w_b[1:], r_w_b[:-1])
+        turned = 0.5 * np.column_stack([step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0]])
+        # The integral of the rates, from one attitude to the next, in the world by the attitude between them.
+        summed = [np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t_g) * 1e-9)]) for a in w]
+        felt = [np.diff(np.interp(t, t_g, axis)) for axis in summed]
+        between = (0.5 * (angle[1:] + angle[:-1]) for angle in (yaw, pitch, roll))
+        return np.asarray(turned.sum(axis=0) - _in_world(felt, *between)[:, :2].sum(axis=0))
 
 
 class _Series:

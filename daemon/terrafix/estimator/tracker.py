@@ -214,7 +214,7 @@ class Tracker:
             (yaws[0], yaws[1]),
             float(before.bias[2]),
             self._pace.mps,
-            np.radians(self.origin.attitude_sigma_deg),
+            float(np.hypot(np.radians(self.origin.attitude_sigma_deg), attitude.righted_rad)),
             same_kind=self._felt is (measured is not None),
             launching=self._launching,
         )
