@@ -25,8 +25,9 @@ def moved(motion: tuple[float, ...]) -> np.ndarray:
     return rays[:, :2] / -rays[:, 2:] + (east, north) - GROUND
 
 
-def surfaces(offsets: np.ndarray, right: np.ndarray, seed: int = 1) -> np.ndarray:
-    """Smooth noise as wrong places give it, with a peak at ``offsets`` (N, 2) for the patches that are ``right``."""
+def surfaces(offsets: np.ndarray, right: np.ndarray, seed: int = 1, height: float = 4.0) -> np.ndarray:
+    """Smooth noise as wrong places give it, with a peak at ``offsets`` (N, 2), of so many standard deviations, for the
+    patches that are ``right``."""
     rng, side = np.random.default_rng(seed), 2 * REACH + 1
     rows, columns = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1] * CELL
     out = np.zeros((len(offsets), side, side))
@@ -36,7 +37,7 @@ def surfaces(offsets: np.ndarray, right: np.ndarray, seed: int = 1) -> np.ndarra
             out[i] += rng.normal() * np.exp(-((columns - e) ** 2 + (rows + n) ** 2) / (2 * 0.02**2))
         out[i] /= out[i].std()
         if right[i]:
-            out[i] += 4.0 * np.exp(-((columns - east) ** 2 + (rows + north) ** 2) / (2 * 0.02**2))
+            out[i] += height * np.exp(-((columns - east) ** 2 + (rows + north) ** 2) / (2 * 0.02**2))
     return out
 
 
@@ -60,6 +61,14 @@ def test_the_motion_is_found(motion: tuple[float, ...]) -> None:
     assert np.median(np.linalg.norm(found.offsets - offsets, axis=1)) < 1.5 * CELL
     assert found.motion[2:4] == pytest.approx(motion[2:4], abs=0.015)
     assert found.motion[:2] + found.motion[4:] == pytest.approx(np.add(motion[:2], motion[4:]), abs=0.015)
+
+
+def test_clear_peaks_are_found_where_they_are() -> None:
+    """Around them several cells are worth the most that a patch can be."""
+    offsets = moved((0.03, 0.02, 0.0, 0.0, 0.0, 0.0))
+    found = agreement(surfaces(offsets, ALL, height=12.0), GROUND, CELL, TILT_SIGMA)
+    assert np.abs((found.offsets - offsets).mean(0)).max() < 0.15 * CELL
+    assert found.motion[:2] == pytest.approx((0.03, 0.02), abs=0.15 * CELL)
 
 
 def test_chance_says_little_and_ground_that_has_changed_takes_away_only_its_own_share() -> None:

@@ -40,17 +40,18 @@ def agreement(surfaces: np.ndarray, ground: np.ndarray, cell: float, tilt_sigma_
     """``surfaces`` (N, 2R + 1, 2R + 1): correlation, rows southwards and columns eastwards around the expected place;
     ``ground`` (N, 2): middle of each patch, east and north of the nadir, and ``cell``, both in heights."""
     mean, spread = surfaces.mean(axis=(1, 2), keepdims=True), surfaces.std(axis=(1, 2), keepdims=True)
-    llr = _log_likelihood_ratio(((surfaces - mean) / np.maximum(spread, 1e-6)).astype(np.float32))
+    z = ((surfaces - mean) / np.maximum(spread, 1e-6)).astype(np.float32)
+    llr = _log_likelihood_ratio(z)
     jacobian = _jacobian(ground)
     motion = _best_of_grid(llr, jacobian, cell)
     sigma = np.array([np.inf, np.inf, YAW_SIGMA_RAD, SCALE_SIGMA, tilt_sigma_rad, tilt_sigma_rad])
     information = INDEPENDENT / SPREAD**2
     for reach in NARROWING:
-        offsets, value = _nearest(llr, jacobian @ motion, cell, reach)
+        offsets, value = _nearest(z, llr, jacobian @ motion, cell, reach)
         weighted = jacobian * (information * np.maximum(value, 0.0) / MOST_LLR)[:, None, None]
         hessian = np.einsum("nki,nkj->ij", weighted, jacobian) + np.diag(1.0 / sigma**2 + 1e-6)
         motion = np.linalg.solve(hessian, np.einsum("nki,nk->i", weighted, offsets))
-    offsets, value = _nearest(llr, jacobian @ motion, cell, SPREAD)
+    offsets, value = _nearest(z, llr, jacobian @ motion, cell, SPREAD)
     prior = 0.5 * float(((motion / sigma) ** 2).sum())
     return Agreement(INDEPENDENT * float(value.sum()) - prior, motion, offsets, value > 0.0)
 
@@ -95,18 +96,21 @@ def _best_of_grid(llr: np.ndarray, jacobian: np.ndarray, cell: float) -> np.ndar
     return best_motion
 
 
-def _nearest(llr: np.ndarray, expected: np.ndarray, cell: float, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(
+    z: np.ndarray, llr: np.ndarray, expected: np.ndarray, cell: float, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The best place of each patch within ``reach`` of its ``expected`` offset (N, 2), and what it is worth (N,); 0
-    beyond the surface."""
+    beyond the surface. Best by ``z``: around a clear peak several cells are worth the most that a patch can be, and the
+    first of them lies north-west of it."""
     side = llr.shape[1]
     k = max(round(reach / cell), 1)
     offsets, value = expected.copy(), np.zeros(len(llr))
-    for i, (surface, (e, n)) in enumerate(zip(llr, expected, strict=True)):
+    for i, (surface, (e, n)) in enumerate(zip(z, expected, strict=True)):
         r, c = round(side // 2 - n / cell), round(side // 2 + e / cell)
         if 0 <= r < side and 0 <= c < side:
             top, left = max(r - k, 0), max(c - k, 0)
             near = surface[top : r + k + 1, left : c + k + 1]
             dr, dc = np.unravel_index(int(np.argmax(near)), near.shape)
-            value[i] = near[dr, dc]
+            value[i] = llr[i, top + int(dr), left + int(dc)]
             offsets[i] = (left + int(dc) - side // 2) * cell, (side // 2 - top - int(dr)) * cell
     return offsets, value
