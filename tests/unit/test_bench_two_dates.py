@@ -52,6 +52,18 @@ def test_what_is_told_of_a_place_is_where_it_is(dates: tuple[Path, Path]) -> Non
     assert (origin.camera.fx, origin.camera.cx) == (FOCAL_PX, 199.5)
 
 
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_where_the_map_is_empty_nothing_is_asked(dates: tuple[Path, Path], tmp_path: Path, *, elsewhere: bool) -> None:
+    """The right half of the second image holds no imagery: no place of the first one there, and none told there."""
+    ground = np.ascontiguousarray(texture(6, 300.0)[:880])
+    half = ground.shape[1] // 2
+    ground[:, half:] = 0
+    second = map_rasters.utm(tmp_path / "half.tif", ground[:, :, ::-1].transpose(2, 0, 1))
+    places = Places(dates[0], second)
+    drawn = [places.draw(elsewhere)[2 if elsewhere else 1] for _ in range(5)]
+    assert max(px[0] for px in drawn) < half - 180
+
+
 def test_the_covariance_of_the_middle_is_that_of_many_cameras() -> None:
     rng = np.random.default_rng(1)
     half = rng.normal(size=(6, 6)) * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])[:, None]

@@ -44,7 +44,7 @@ EVEN = 1 / math.sqrt(3.0)  # 1-sigma of such a spread
 TILT_SIGMA_DEG = 1.0
 ELSEWHERE_PX = 500.0  # from the right place: beyond three and a half sigmas of what is told
 RIM = 0.55  # of a picture's side: it lies on the images in any case
-EMPTY_SHARE = 0.02  # of its pixels without imagery, at most
+EMPTY_SHARE = 0.02  # of its pixels without imagery, at most, and of those of the map under it
 NEAR_PX, FAR_PX = 5.0, 20.0
 INSIDE_95 = 5.991  # chi-square, two degrees of freedom
 SEED = 5
@@ -67,7 +67,7 @@ class Places:
 
     def __init__(self, first: Path, second: Path) -> None:
         """Raises MapError."""
-        self._camera, _ = same_grid(first, second)
+        self._camera, self._map = same_grid(first, second)
         height, width = self._camera.shape[:2]
         with ImagerySource(second) as source:
             self._crs_from_px, crs = source.transform, source.crs
@@ -89,9 +89,16 @@ class Places:
             matrix = cv2.getRotationMatrix2D((0.0, 0.0), turn_deg, scale)
             matrix[:, 2] = (SIDE_PX - 1) / 2 - matrix[:, :2] @ true_px
             picture = cv2.warpAffine(self._camera, matrix, (SIDE_PX, SIDE_PX), flags=cv2.INTER_AREA)
-            if np.mean(picture.max(axis=2) == 0) <= EMPTY_SHARE:
+            on_map = self._on_map(told_px if elsewhere else true_px)
+            if max(_empty(picture), _empty(on_map)) <= EMPTY_SHARE:
                 return picture, true_px, told_px
         raise MapError("the two images have too little ground in common; choose larger ones")
+
+    def _on_map(self, px: np.ndarray) -> np.ndarray:
+        """As much of the map around a pixel as a picture shows: what is not on the map cannot be found there, and where
+        nothing is on it nothing wrong can be found."""
+        column, row = (round(float(v)) - SIDE_PX // 2 for v in px)
+        return self._map[row : row + SIDE_PX, column : column + SIDE_PX]
 
     def local_m(self, px: np.ndarray) -> np.ndarray:
         """(2,) east, north of a pixel of the map; whole numbers are the middles."""
@@ -134,6 +141,11 @@ class Places:
             step_cov_m2=(0.0, 0.0, 0.0, 0.0),
         )
         return origin, prediction
+
+
+def _empty(picture: np.ndarray) -> float:
+    """Share of its pixels without imagery."""
+    return float(np.mean(picture.max(axis=2) == 0))
 
 
 def measure(
