@@ -100,7 +100,8 @@ def moments(view: FlightView) -> list[tuple[float | None, str]]:
     if view.dropped:
         total = sum(view.dropped.values())
         worst = ", ".join(name for name, _ in view.dropped.most_common(3))
-        said.append((None, f"{total} messages were dropped on the way ({worst})."))
+        were = "message was" if total == 1 else "messages were"
+        said.append((None, f"{total} {were} dropped on the way ({worst})."))
     if view.cut_off:
         said.append((None, f"{view.cut_off} file(s) of the record end abruptly; all before their end is shown."))
     return sorted(said, key=lambda m: math.inf if m[0] is None else m[0])
