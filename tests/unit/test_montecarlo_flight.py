@@ -12,13 +12,14 @@ from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
 from terrafix.messages import MapMatch, Prediction, Verdict
+from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.faults import JUMP_M, JUMPS, Faults
 from terrafix_tools.montecarlo.flight import run
 from terrafix_tools.montecarlo.flown import Flown, Shot, fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens
 from terrafix_tools.montecarlo.matches import MapMatches
-from terrafix_tools.montecarlo.plan import Fault, FlightPlan, plan
+from terrafix_tools.montecarlo.plan import FlightPlan, plan
 from terrafix_tools.montecarlo.run import PICTURE, RESULT, Wanted, montecarlo
 from terrafix_tools.montecarlo.sightings import Sightings
 from terrafix_tools.montecarlo.statistics import Seen

@@ -111,3 +111,15 @@ print(*sorted({"cv2", "gtsam", "onnxruntime", "faiss", "scipy", "matplotlib"} & 
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == []
+
+
+def test_the_command_line_loads_nothing_that_computes() -> None:
+    """`--help` is fast, and so is a restart in flight."""
+    code = """
+import sys
+import terrafix_tools.cli, terrafix.nursery
+print(*sorted({"numpy", "cv2", "pyproj", "zmq", "structlog"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from terrafix_tools.montecarlo.plan import Fault
+from terrafix_tools.montecarlo.fault import Fault
 
 BROKEN_FLOOR = 1  # exit code
 

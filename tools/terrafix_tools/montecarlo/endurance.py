@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import run
-from terrafix_tools.montecarlo.plan import Fault, plan
+from terrafix_tools.montecarlo.plan import plan
 
 HOURS = 2.0
 # At first caches and windows fill, and what is kept for the refinement: 256 nodes, five frames apart at least.

@@ -7,8 +7,8 @@ import numpy as np
 
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import MapMatch, Verdict
+from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flown import Shot
-from terrafix_tools.montecarlo.plan import Fault
 
 WRONG_SHARE, WRONG_M = 0.10, (30.0, 400.0)
 JUMP_M, JUMPS = 350.0, 6

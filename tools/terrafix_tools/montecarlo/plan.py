@@ -2,11 +2,11 @@
 
 import math
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 
 from terrafix.messages import Camera
+from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.vehicle.wind import Wind
 
@@ -17,21 +17,6 @@ HALTON = (5, 7)  # bases of the map errors' sequence (Halton 1960); they share n
 CAMERAS = ((1280, 720, 684.0), (1600, 900, 1164.4), (960, 540, 560.0))
 FLAT_M = 2.0  # 1-sigma of the relief over which a map without elevation may be flown: the ground must be flat then
 FOCAL_SIGMA, K1_SIGMA = 0.01, 0.005  # of a lens that was calibrated once, or whose maker's numbers were taken
-
-
-class Fault(StrEnum):
-    """One kind of trouble; a flight has one, or none."""
-
-    NONE = "none"
-    WRONG = "10 % wrong matches"  # each somewhere else
-    JUMPS = "350 m jumps"
-    BLACKOUT = "60 s blackouts"  # nothing is seen at all
-    HEIGHT = "height 10 % wrong"
-    COMPASS = "compass 10-15 deg off"
-    ROWS = "repeated rows"  # wrong matches that agree with each other for half a minute
-    LATE = "matches 0-2 s late"  # and out of order
-    DRIFT = "no map after 90 s"  # odometry alone
-    HILLS = "hills without elevation"  # against the rules; only when asked for
 
 
 # Of twelve flights. A third are without fault: rates there are what a customer sees.

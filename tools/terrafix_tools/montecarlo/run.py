@@ -18,9 +18,10 @@ from rich.table import Table
 
 from terrafix.core.errors import OutputError, UsageError
 from terrafix.recorder.writer import versions
+from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Record, run
 from terrafix_tools.montecarlo.picture import draw
-from terrafix_tools.montecarlo.plan import DURATION_S, Fault, plan
+from terrafix_tools.montecarlo.plan import DURATION_S, plan
 from terrafix_tools.montecarlo.statistics import Seen, floors, summary
 
 TABLE_WIDTH = 130  # a narrower terminal breaks lines; so does a file

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from terrafix_tools.evaluate import ELLIPSE95, FALSE_FIX_ERROR_M, FALSE_FIX_MAHALANOBIS2
+from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Record
-from terrafix_tools.montecarlo.plan import Fault
 
 POSE95 = 12.592  # chi-square with 6 degrees of freedom, 95 %
 NORMAL95 = 1.959964  # two-sided

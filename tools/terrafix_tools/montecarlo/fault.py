@@ -1,0 +1,18 @@
+"""What may go wrong in a flight of the Monte Carlo run. The command line knows it without all that it takes to fly."""
+
+from enum import StrEnum
+
+
+class Fault(StrEnum):
+    """One kind of trouble; a flight has one, or none."""
+
+    NONE = "none"
+    WRONG = "10 % wrong matches"  # each somewhere else
+    JUMPS = "350 m jumps"
+    BLACKOUT = "60 s blackouts"  # nothing is seen at all
+    HEIGHT = "height 10 % wrong"
+    COMPASS = "compass 10-15 deg off"
+    ROWS = "repeated rows"  # wrong matches that agree with each other for half a minute
+    LATE = "matches 0-2 s late"  # and out of order
+    DRIFT = "no map after 90 s"  # odometry alone
+    HILLS = "hills without elevation"  # against the rules; only when asked for
