@@ -239,13 +239,20 @@ def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tm
             assert systemd.recv(1000).startswith(b"WATCHDOG=1\nSTATUS=flying")
             for pid in children_of(process.pid).values():
                 assert b"NOTIFY_SOCKET" not in Path(f"/proc/{pid}/environ").read_bytes()
-            os.kill(children_of(process.pid)["link"], signal.SIGSTOP)  # alive and not making progress
-            systemd.settimeout(0.65)  # WATCHDOG comes every 0.5 s; a stuck link is noticed after 1 s, and soon back
-            with pytest.raises(TimeoutError):
-                for _ in range(10):
+            systemd.settimeout(0.05)
+            heard_s = began_s = time.monotonic()
+            stopped: set[int] = set()
+            while time.monotonic() - heard_s < 1.2:  # WATCHDOG comes every 0.5 s, a traceback holds it up by 0.2 s
+                assert time.monotonic() - began_s < 10.0, "fed while no link makes progress"
+                link = children_of(process.pid).get("link")
+                if link is not None and link not in stopped:  # alive and not making progress, and the next one, too
+                    os.kill(link, signal.SIGSTOP)
+                    stopped.add(link)
+                with contextlib.suppress(TimeoutError):
                     systemd.recv(1000)
+                    heard_s = time.monotonic()
             systemd.settimeout(5)
-            assert systemd.recv(1000).startswith(b"WATCHDOG=1"), "fed again after the stuck link was restarted"
+            assert systemd.recv(1000).startswith(b"WATCHDOG=1"), "fed again after the stuck links were restarted"
             process.send_signal(signal.SIGTERM)
             assert process.wait(15) == 0
             rest = []
