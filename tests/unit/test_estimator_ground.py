@@ -80,6 +80,16 @@ def test_without_elevation_nobody_knows_how_the_ground_rises() -> None:
     assert terrain.rise_sigma_m(100.0) == terrain.slope_sigma(100.0) == 0.0
 
 
+def test_an_unknown_slope_is_no_news_while_it_is_in_sight() -> None:
+    """Some fifteen keyframes see it: each is told of a slope as much larger as their number makes it."""
+    learnt = Terrain(40.0)
+    unknown = learnt.seen_from(np.zeros(3), 100.0, 2.0, 1.0)
+    assert unknown.slope_sigma == pytest.approx(4.0 * learnt.slope_sigma(100.0), rel=0.01)
+    for north_m in np.arange(0.0, 3000.0, 60.0):
+        learnt.ruggedness.measured(np.array([0.0, north_m]), 100.0, 0.0, 3.0)
+    assert learnt.seen_from(np.zeros(3), 100.0, 2.0, 1.0).slope_sigma < 0.4 * unknown.slope_sigma
+
+
 def test_a_slope_that_nobody_knows_looks_like_a_tilt_about_the_ground() -> None:
     """The pose that PnP finds over ground that rises by 3 %, taken for flat, is within its claim."""
     known = Terrain(0.0)

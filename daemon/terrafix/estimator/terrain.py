@@ -58,8 +58,8 @@ class Terrain:
         """The plane for odometry seen at ``p_m`` (east, north, ...), of whose matches this ``share`` agreed."""
         slope_e, slope_n = self._slope or (0.0, 0.0)
         slope_sigma, level_share = FLAT_SIGMAS if self._slope is None else DEM_SIGMAS
-        slope_sigma = max(slope_sigma, self.slope_sigma(height_m))
-        # Over hills the tracked points lie off the plane, all on one side for a while.
+        # A slope that nobody knows is in sight for a while, as are points off the plane, all on one side of it.
+        slope_sigma = float(np.hypot(slope_sigma, RELIEF_REPEATS * self.slope_sigma(height_m)))
         relief_share = RELIEF_REPEATS * self._relief_m / height_m
         slope_sigma = float(np.hypot(slope_sigma, RELIEF_SLOPE * relief_share))
         untold_m = 0.0 if self._slope is None else max(0.0, float(np.hypot(*(p_m[:2] - self._at_m))) - SLOPE_REACH_M)
