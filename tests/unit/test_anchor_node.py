@@ -9,7 +9,9 @@ import pytest
 from ground import PINHOLE, texture, view
 from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
 
+from terrafix.anchor.agreed import AgreedPose
 from terrafix.anchor.lost import LostWatch
+from terrafix.anchor.matcher import FrameMatcher
 from terrafix.anchor.node import AnchorNode
 from terrafix.anchor.place_search import LOST_SIGMA_M, start_around
 from terrafix.anchor.retrieval import MapSearch
@@ -62,6 +64,24 @@ def test_a_place_that_is_right_is_tracked(ground: np.ndarray) -> None:
     said = match(node, 1, 10.0)
     assert said.verdict is Verdict.ACCEPTED and not said.coarse and not said.found
     assert (said.step, said.lost_sigma_m) == (SearchStep.NORMAL, 0.0)
+
+
+def test_where_no_patch_finds_its_spot_alone_all_of_them_together_give_the_pose(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And do not count as a confirmation, which would keep a wrong place for long."""
+    heard = list[int]()
+    monkeypatch.setattr(FrameMatcher, "fix", lambda *_: None)
+    monkeypatch.setattr(LostWatch, "looked", lambda _self, _gain, _weight, _new, inliers, *_: heard.append(inliers))
+    node, frames = started(ground)
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    said = match(node, 1, 10.0)
+    assert said.verdict is Verdict.ACCEPTED and not said.coarse and said.p_c_in_w_m is not None
+    assert np.linalg.norm(np.array(said.p_c_in_w_m) - TRUE_M) < 3.0
+    assert heard == [0]
+    monkeypatch.setattr(AgreedPose, "at", lambda *_: None)  # and without these the place of the belief remains
+    frames.put(2, view(ground, PINHOLE, R, TRUE_M))
+    assert match(node, 2, 10.0).coarse
 
 
 def test_an_unusable_picture_is_skipped(ground: np.ndarray) -> None:

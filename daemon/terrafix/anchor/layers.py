@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from terrafix.anchor.agreed import AgreedPose
 from terrafix.anchor.belief import Belief, Mode
 from terrafix.anchor.map_features import CACHE_BYTES, Describer
 from terrafix.anchor.map_layers import LayerChoice
@@ -21,6 +22,7 @@ class Dated:
 
     map: LocalMap
     matcher: FrameMatcher
+    agreed: AgreedPose
     sigma_m: float
 
 
@@ -36,7 +38,7 @@ class Layers:
             bound = package.bind(frame, layer.table)
             matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers))
             stated = ce90_m if layer.ce90_m is None else layer.ce90_m
-            self._all[layer.table] = Dated(bound, matcher, stated / CE90_SIGMAS)
+            self._all[layer.table] = Dated(bound, matcher, AgreedPose(bound, matcher), stated / CE90_SIGMAS)
         self._choice = LayerChoice([layer.table for layer in layers])
 
     @property

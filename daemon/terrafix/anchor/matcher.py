@@ -196,19 +196,19 @@ class FrameMatcher:
 
         A pose that is not known well is found in two passes: a wide search with a generous threshold, then a narrow one
         on the frame rectified with what the first one found."""
-        start = _at(view, hypothesis, e_m, n_m)
+        start = view_at(view, hypothesis, e_m, n_m)
         if view.tilt_sigma_rad > WELL_KNOWN_RAD:
             first = self._patch_fix(image, start, FIRST_REACH, FIRST_THRESHOLD)
             if first is None or first.pnp.fit is None:
                 return first
-            start = _from(start, first)
+            start = view_from(start, first)
         return self._patch_fix(image, start, REACH, THRESHOLD)
 
     def refined(self, image: Image, view: View, fix: Fix) -> Fix:
         """The pose of a place that a search has found, on the cells of a flight, if one stands on these."""
         if fix.pnp.fit is None:
             return fix
-        finer = self._patch_fix(image, _from(view, fix), REACH, THRESHOLD)
+        finer = self._patch_fix(image, view_from(view, fix), REACH, THRESHOLD)
         return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else fix
 
     def _patch_fix(self, image: Image, view: View, reach_share: float, threshold: float) -> Fix | None:
@@ -256,12 +256,12 @@ class FrameMatcher:
         )
 
 
-def _at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:
+def view_at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:
     r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
     return replace(view, e_m=e_m, n_m=n_m, r_w_c=r_w_c, agl_m=view.agl_m * hypothesis.scale)
 
 
-def _from(view: View, fix: Fix) -> View:
+def view_from(view: View, fix: Fix) -> View:
     """The camera as a pose has it."""
     assert fix.pnp.fit is not None
     p = fix.pnp.fit.p_c_in_w_m

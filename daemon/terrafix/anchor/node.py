@@ -11,6 +11,7 @@ from terrafix.anchor.layers import Dated, Layers
 from terrafix.anchor.lost import LostWatch
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import MapPackage
+from terrafix.anchor.matcher import view_at
 from terrafix.anchor.model_watch import ModelWatch
 from terrafix.anchor.place_search import PlaceSearch, anywhere_m, start_around
 from terrafix.anchor.tracks import NEAR
@@ -210,10 +211,15 @@ class AnchorNode:
             belief_cov_m2=(ee, en, en, nn),
         )
         tried = mode.mass >= MODE_TRIED
+        inliers = 0
         if tried:
             answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
+            inliers = answer.inliers if answer.verdict is Verdict.ACCEPTED else 0
+            if answer.verdict is not Verdict.ACCEPTED:
+                agreed = used.agreed.at(image, view_at(view, hypothesis, mode.e_m, mode.n_m))
+                together = answer if agreed is None else judged(answer, agreed, view)
+                answer = together if together.verdict is Verdict.ACCEPTED else answer
         claimed_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
-        inliers = answer.inliers if answer.verdict is Verdict.ACCEPTED else 0
         self._watch.looked(gain, weight, new, inliers, claimed_m, view.agl_m)
         # Of the mixture "where it is believed to be, or anywhere": the variance that the second part adds.
         self._search.sigma_m = float(np.sqrt(self._watch.doubt)) * anywhere_m(best.map)

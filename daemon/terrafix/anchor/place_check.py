@@ -1,6 +1,6 @@
 """A place that a search proposes, checked with one frame: the evidence of its patches, and the pose that they give."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,6 +20,8 @@ from terrafix.messages import Verdict
 CELL_PER_AGL, FINE_PER_AGL = 1 / 100, 1 / 140
 REACH = 0.2  # of the height: what heading, scale and tilt may do at the rim, and the place itself
 SIGMA_FLOOR = 0.02  # of the height: leaning buildings and changes take patches aside together
+PATCH_SIGMA = 0.005  # of the height: one that is aside by more than the others counts for less. Where the tilt is held
+# to a prior, patches are weighed against it by what they share, and count alike.
 
 
 @dataclass(frozen=True)
@@ -36,14 +38,17 @@ class PlaceCheck:
         self._image: Image | None = None
         self._small: tuple[Image, CameraCalibration] | None = None
 
-    def at(self, image: Image, view: View, cell_per_agl: float) -> Checked | None:
-        """``view``: place, heading and height above ground as proposed. None: too little lies on the map."""
+    def at(
+        self, image: Image, view: View, cell_per_agl: float, reach_per_agl: float = REACH, *, tilt_prior: bool = True
+    ) -> Checked | None:
+        """``view``: place, heading and height above ground as proposed. ``tilt_prior``: the pose holds the tilt of the
+        view to what is known of it. None: too little lies on the map."""
         cell_m = self._matcher.cell_m(view.agl_m, cell_per_agl)
         small, camera = self._shrunk(image, view.agl_m)
         frame = rectify(small, camera, view.r_w_c, view.agl_m, cell_m)
         if frame is None:
             return None
-        reach, patch = round(REACH * view.agl_m / cell_m), round(PATCH_PER_AGL * view.agl_m / cell_m)
+        reach, patch = round(reach_per_agl * view.agl_m / cell_m), round(PATCH_PER_AGL * view.agl_m / cell_m)
         (h, w), margin = frame.mask.shape, reach + 2
         window, valid, e_min_m, n_max_m = self._matcher.gradient_features.window(
             view.e_m + frame.e_min_m - margin * cell_m,
@@ -65,7 +70,9 @@ class PlaceCheck:
         on_map_m = np.column_stack(
             [e_min_m + (column0 + middle[:, 1]) * cell_m, n_max_m - (row0 + middle[:, 0]) * cell_m]
         )
-        return Checked(found, self._pose(view, ground_m, on_map_m + found.offsets * view.agl_m, found, cell_m))
+        tilt_sigma_rad = view.tilt_sigma_rad if tilt_prior else None
+        found_m = on_map_m + found.offsets * view.agl_m
+        return Checked(found, self._pose(view, ground_m, found_m, found, cell_m, tilt_sigma_rad))
 
     def _shrunk(self, image: Image, agl_m: float) -> tuple[Image, CameraCalibration]:
         """The frame with about two pixels to a fine cell, made once for all places."""
@@ -76,7 +83,15 @@ class PlaceCheck:
             self._image, self._small = image, (cv2.resize(image, size, interpolation=cv2.INTER_AREA), camera)
         return self._small
 
-    def _pose(self, view: View, ground_m: np.ndarray, map_m: np.ndarray, found: Agreement, cell_m: float) -> Fix:
+    def _pose(
+        self,
+        view: View,
+        ground_m: np.ndarray,
+        map_m: np.ndarray,
+        found: Agreement,
+        cell_m: float,
+        tilt_sigma_rad: float | None,
+    ) -> Fix:
         rays = np.column_stack([ground_m, np.full(len(ground_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
         up = self._map.elevation(map_m[:, 0], map_m[:, 1])
@@ -90,9 +105,11 @@ class PlaceCheck:
                 xy[found.agrees],
                 view.r_w_c,
                 start,
-                SIGMA_FLOOR,
+                PATCH_SIGMA if tilt_sigma_rad is None else SIGMA_FLOOR,
                 effective=0.25,
-                tilt_sigma_rad=view.tilt_sigma_rad,
+                tilt_sigma_rad=tilt_sigma_rad,
             )
+        if fit is not None:  # what one patch scatters by weighs them; what they share is claimed
+            fit = replace(fit, cov=fit.cov * max(SIGMA_FLOOR / fit.sigma, 1.0) ** 2)
         verdict = Verdict.FEW_INLIERS if fit is None else Verdict.ACCEPTED
         return Fix(xy, points, weights, PnpResult(verdict, fit, found.agrees), cell_m)
