@@ -214,8 +214,9 @@ class AnchorNode:
         inliers = 0
         if tried:
             answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
-            inliers = answer.inliers if answer.verdict is Verdict.ACCEPTED else 0
-            if answer.verdict is not Verdict.ACCEPTED:
+            if answer.verdict is Verdict.ACCEPTED:
+                inliers = answer.inliers
+            else:
                 agreed = used.agreed.at(image, view_at(view, hypothesis, mode.e_m, mode.n_m))
                 together = answer if agreed is None else judged(answer, agreed, view)
                 answer = together if together.verdict is Verdict.ACCEPTED else answer

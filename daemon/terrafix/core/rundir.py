@@ -119,17 +119,19 @@ def _default_parent() -> Path:
 
 def living(parent: Path | None = None) -> list[RunDir]:
     """The folders of supervisors that live. Another user's cannot be looked into, and counts as living."""
-    folders = sorted((parent or _default_parent()).glob(f"{PREFIX}*"))
+    folders = _folders(parent)
     return [RunDir(folder) for folder in folders if not os.access(folder, os.X_OK) or _is_held(folder / "lock")]
 
 
 def killed_in_flight(parent: Path | None = None) -> list[RunDir]:
     """Whose supervisor is gone, in the flight that goes on now; this user's."""
-    folders = sorted(
-        folder for folder in (parent or _default_parent()).glob(f"{PREFIX}*") if os.access(folder, os.X_OK)
-    )
-    dead = (RunDir(folder) for folder in folders if not _is_held(folder / "lock"))
+    seen = (folder for folder in _folders(parent) if os.access(folder, os.X_OK))
+    dead = (RunDir(folder) for folder in seen if not _is_held(folder / "lock"))
     return [run for run in dead if run.flew_just_now()]
+
+
+def _folders(parent: Path | None) -> list[Path]:
+    return sorted((parent or _default_parent()).glob(f"{PREFIX}*"))
 
 
 def _is_held(lock: Path) -> bool:

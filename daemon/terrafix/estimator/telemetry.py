@@ -19,6 +19,9 @@ MAX_READING_GAP_NS = 120_000_000
 MAX_ATTITUDE_GAP_NS = 260_000_000  # ATTITUDE at 4 Hz, ArduPilot's own rate, turns a vehicle too far between two
 
 
+Timed = tuple[np.ndarray, np.ndarray]  # times (N,) [ns], values (3, N)
+
+
 @dataclass(frozen=True)
 class Attitude:
     yaw_rad: float | None
@@ -78,12 +81,10 @@ class Telemetry:
 
     def felt(self, t0_ns: int, t1_ns: int) -> Felt | None:
         """Acceleration from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that."""
-        forces, turns = self._forces.around(t0_ns, t1_ns), self._turns.around(t0_ns, t1_ns)
-        if t1_ns <= t0_ns or forces is None or turns is None:
+        known = self._with_attitudes(self._forces, t0_ns, t1_ns)
+        if known is None:
             return None
-        (t_f, f), (t_a, angles) = forces, turns
-        if not (_covers(t_f, t0_ns, t1_ns, MAX_READING_GAP_NS) and _covers(t_a, t0_ns, t1_ns, MAX_ATTITUDE_GAP_NS)):
-            return None
+        (t_f, f), (t_a, angles) = known
         inside = t_f[(t_f > t0_ns) & (t_f < t1_ns)]
         t = np.concatenate([[t0_ns], inside, [t1_ns]])
         f_b = [np.interp(t, t_f, axis) for axis in f]
@@ -99,12 +100,10 @@ class Telemetry:
     def turned_otherwise(self, t0_ns: int, t1_ns: int) -> np.ndarray | None:
         """The tilt (2,) about east and north by which the attitude turned from ``t0_ns`` to ``t1_ns`` and gyroscopes
         did not [rad]; None when readings or attitudes do not cover that."""
-        rates, turns = self._rates.around(t0_ns, t1_ns), self._turns.around(t0_ns, t1_ns)
-        if t1_ns <= t0_ns or rates is None or turns is None:
+        known = self._with_attitudes(self._rates, t0_ns, t1_ns)
+        if known is None:
             return None
-        (t_g, w), (t_a, angles) = rates, turns
-        if not (_covers(t_g, t0_ns, t1_ns, MAX_READING_GAP_NS) and _covers(t_a, t0_ns, t1_ns, MAX_ATTITUDE_GAP_NS)):
-            return None
+        (t_g, w), (t_a, angles) = known
         inside = t_a[(t_a > t0_ns) & (t_a < t1_ns)]
         t = np.concatenate([[t0_ns], inside, [t1_ns]])
         yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
@@ -116,6 +115,14 @@ class Telemetry:
         felt = [np.diff(np.interp(t, t_g, axis)) for axis in summed]
         between = (0.5 * (angle[1:] + angle[:-1]) for angle in (yaw, pitch, roll))
         return np.asarray(turned.sum(axis=0) - _in_world(felt, *between)[:, :2].sum(axis=0))
+
+    def _with_attitudes(self, readings: "_Series", t0_ns: int, t1_ns: int) -> tuple[Timed, Timed] | None:
+        """Readings and attitudes around a span; None when they do not cover it."""
+        read, turns = readings.around(t0_ns, t1_ns), self._turns.around(t0_ns, t1_ns)
+        if t1_ns <= t0_ns or read is None or turns is None:
+            return None
+        covered = _covers(read[0], t0_ns, t1_ns, MAX_READING_GAP_NS)
+        return (read, turns) if covered and _covers(turns[0], t0_ns, t1_ns, MAX_ATTITUDE_GAP_NS) else None
 
 
 class _Series:
@@ -136,7 +143,7 @@ class _Series:
             for column in (self._t_ns, *self._axes):
                 del column[: -self._kept]
 
-    def around(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def around(self, t0_ns: int, t1_ns: int) -> Timed | None:
         """Times (N,) and values (3, N) from the last one before ``t0_ns`` to the first one after ``t1_ns``."""
         first = max(0, bisect_right(self._t_ns, t0_ns) - 1)
         last = min(len(self._t_ns), bisect_left(self._t_ns, t1_ns) + 1)

@@ -180,8 +180,7 @@ class Tracker:
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
         state = NodeState(pose, before.bias, velocity)
-        since_s = t_s - self.graph.time_of(newest)
-        said = self.camera.factor(self.graph.next_keys(), attitude, r_w_c, self.terrain.below(p), since_s)
+        said = self.camera.factor(self.graph.next_keys(), attitude, r_w_c, self.terrain.below(p), dt_s)
         rise_m = self.terrain.rise_sigma_m(float(np.hypot(*step)))
         if way is not None:
             way = replace(way, lifted=not self.terrain.is_told)
