@@ -12,10 +12,11 @@ CRUISE_MPS, FRAME_S = 14.0, 0.5
 
 def flown(*legs: tuple[float, float], cov: np.ndarray = SURE) -> Pace:
     """Legs of so many seconds at a speed."""
-    pace = Pace()
+    pace, t_s = Pace(), 0.0
     for duration_s, speed_mps in legs:
         for _ in range(round(duration_s / FRAME_S)):
-            pace.seen(np.array([0.0, speed_mps, 0.0]), cov, FRAME_S)
+            t_s += FRAME_S
+            pace.seen(t_s, np.array([0.0, speed_mps, 0.0]), cov)
     return pace
 
 
@@ -35,8 +36,15 @@ def test_one_that_hovers_may_fly_on_and_is_forgotten_to_have_flown() -> None:
 def test_a_velocity_that_is_not_known_is_not_remembered() -> None:
     pace = flown((5.0, 0.0), cov=15.0**2 * np.eye(3))
     assert pace.mps > 20.0  # as long as it is not known
-    pace.seen(np.zeros(3), SURE, FRAME_S)
+    pace.seen(5.0 + FRAME_S, np.zeros(3), SURE)
     assert pace.mps <= TYPICAL_SPEED_MPS
+
+
+def test_a_frame_that_is_told_twice_is_forgotten_once() -> None:
+    pace = flown((60.0, CRUISE_MPS))
+    for _ in range(1000):
+        pace.seen(60.0, np.zeros(3), SURE)
+    assert pace.mps > 0.9 * CRUISE_MPS
 
 
 def test_a_hover_that_ends_unseen_is_inside_the_claim() -> None:

@@ -139,11 +139,12 @@ def rot_up(angle_rad: float) -> np.ndarray:
 def test_the_covariance_of_a_leg_is_that_of_sampled_motion(measured: bool) -> None:
     """Monte Carlo of the process itself, in small steps: acceleration that wanders, in axes that turn.
 
-    The leg takes its noise for what it would be in the axes of its end: a turn of 11 degrees hardly shows."""
+    The leg takes its noise for what it would be in the axes of its end: a turn of 11 degrees hardly shows. Without
+    inertial readings so large a one would say that the course turns, too."""
     dt, steps, runs = 2.0, 400, 4000
     rng = np.random.default_rng(2)
     t = np.linspace(0.0, dt, steps + 1)
-    turn = 0.1
+    turn = 0.1 if measured else 0.04
     felt = Felt(t, np.zeros((steps + 1, 3)), 0.4 + turn * t, 0.1) if measured else None
     way = leg(dt, felt, (0.4, 0.4 + turn * dt), 0.0, 20.0, 0.02, same_kind=True)
     memory, course = (15.0, 1e6) if measured else (MANOEUVRE_S, course_memory_s(20.0))
@@ -161,6 +162,22 @@ def test_the_covariance_of_a_leg_is_that_of_sampled_motion(measured: bool) -> No
     claimed[:2, :2] -= (0.02**2 + (0.005 * 20.0) ** 2) * np.eye(2)  # clocks
     scale = np.sqrt(np.diag(sampled))
     assert np.abs((claimed - sampled) / np.outer(scale, scale)).max() < 0.12
+
+
+def test_a_turn_of_the_heading_may_be_one_of_the_course() -> None:
+    """A plane at 22 m/s turns by 90 degrees between two photos, evenly: a circle of 70 m radius."""
+    speed, dt, turn = 22.0, 5.0, 0.5 * math.pi
+    radius = speed * dt / turn
+    off = np.array([radius, radius - speed * dt])  # east, north, from where it would be straight on; it flew north
+    spread = [
+        spread_after(leg(dt, None, yaws, 0.0, speed, 0.02, same_kind=True), 0.1 * np.eye(V_SIZE))[:2, :2]
+        for yaws in ((0.5 * math.pi, 0.5 * math.pi), (0.5 * math.pi, 0.5 * math.pi - turn))
+    ]
+    straight, turned = (float(off @ np.linalg.solve(cov, off)) for cov in spread)
+    assert turned < 5.99 < 10.0 < straight
+    wander = math.radians(4.0)  # of a compass: no reason to doubt a course
+    as_before = spread_after(leg(dt, None, (0.0, wander), 0.0, speed, 0.02, same_kind=True), 0.1 * np.eye(V_SIZE))
+    assert np.allclose(np.diag(as_before[:2, :2]), np.diag(spread[0]), rtol=0.01)
 
 
 def test_a_board_that_is_not_level_leads_astray_by_the_square_of_the_time_until_it_is_known() -> None:

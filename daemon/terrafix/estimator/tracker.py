@@ -198,7 +198,7 @@ class Tracker:
         self._velocity_cov = spread[3:, 3:]
         self._last = self._placed(frame_id, t_s, node)
         if known is not None:
-            self._pace.seen(self._last.velocity_mps, self._last.velocity_cov, dt_s)
+            self._pace.seen(t_s, self._last.velocity_mps, self._last.velocity_cov)
         return Advance(verdict, self._last, step, step_sigma)
 
     def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Leg:

@@ -23,6 +23,7 @@ GRAVITY_MPS2 = 9.81
 # course is forgotten meanwhile (course_memory_s), since a drone that is out of sight also turns back.
 MANOEUVRE_MPS2, MANOEUVRE_PER_SPEED, CLIMB_MPS2 = 1.0, 0.08, 0.7
 MANOEUVRE_S = 3.0
+TURN_RAD = np.radians(5.0)  # a heading that changed by less may be a compass that wanders; by more, the course may turn
 # ... and of one that stood a moment ago: a take-off run, a throw, a climb that begins (a simulated plane: 10 m/s^2).
 LAUNCH_MPS2 = np.array([6.0, 6.0, 5.0])
 LEAST_SPEED_MPS = 5.0  # one that hovers may have begun to fly
@@ -108,12 +109,15 @@ class Leg:
         return replace(self, over=(height_m, ground_m))
 
 
-def unmeasured_sigma(felt: bool, speed_mps: float, tilt_sigma_rad: float, launching: bool = False) -> np.ndarray:
-    """(3,) 1-sigma of the acceleration that nobody measured, m/s^2. ``launching``: it has not been seen to fly yet."""
+def unmeasured_sigma(
+    felt: bool, speed_mps: float, tilt_sigma_rad: float, launching: bool = False, turn_radps: float = 0.0
+) -> np.ndarray:
+    """(3,) 1-sigma of the acceleration that nobody measured, m/s^2. ``launching``: it has not been seen to fly yet.
+    ``turn_radps``: of the heading. The course of a plane turns with it, that of a copter need not."""
     if not felt and launching:
         return LAUNCH_MPS2
     if not felt:
-        level = max(MANOEUVRE_MPS2, MANOEUVRE_PER_SPEED * speed_mps)
+        level = float(np.hypot(max(MANOEUVRE_MPS2, MANOEUVRE_PER_SPEED * speed_mps), turn_radps * speed_mps))
         return np.array([level, level, CLIMB_MPS2])
     level = GRAVITY_MPS2 * tilt_sigma_rad * float(np.sqrt(WANDERING_SHARE))
     return np.array([level, level, ACCELEROMETER_MPS2])
@@ -144,9 +148,11 @@ def leg(
     """``yaws_rad``: true headings at both ends, used when nothing was felt. ``same_kind``: the leg before was measured,
     or not, like this one; else its acceleration says nothing about this one's."""
     memory_s, course_s = (MANOEUVRE_S, course_memory_s(speed_mps)) if felt is None else (TILT_S, FOREVER_S)
+    turn_radps = 0.0
     if felt is None:
         s = np.linspace(0.0, dt_s, POINTS)
         turned = (yaws_rad[1] - yaws_rad[0] + np.pi) % (2 * np.pi) - np.pi
+        turn_radps = max(abs(turned) - TURN_RAD, 0.0) / dt_s
         yaw = yaws_rad[0] + turned * s / dt_s
         accel, noise = np.zeros((POINTS, 3)), 0.0
     else:
@@ -158,7 +164,7 @@ def leg(
     to_way, to_gain = weight * _reach(dt_s - s, course_s), weight * np.exp(-(dt_s - s) / course_s)
     lasts = np.exp(-s / memory_s)
     heading = np.array([np.cos(yaw), np.sin(yaw), np.ones(len(yaw))])
-    sigma = unmeasured_sigma(felt is not None, speed_mps, tilt_sigma_rad, launching)
+    sigma = unmeasured_sigma(felt is not None, speed_mps, tilt_sigma_rad, launching, turn_radps)
     cov = _left_out(dt_s, memory_s, course_s, sigma, noise, float(yaw[-1]), speed_mps)
     if felt is not None:
         cov[3:6, 3:6] += (UNFELT_MPS2 * felt.unfelt_s) ** 2 * np.eye(3)

@@ -15,4 +15,5 @@ class Fault(StrEnum):
     ROWS = "repeated rows"  # wrong matches that agree with each other for half a minute
     LATE = "matches 0-2 s late"  # and out of order
     DRIFT = "no map after 90 s"  # odometry alone
-    HILLS = "hills without elevation"  # against the rules; only when asked for
+    HILLS = "hills without elevation"  # against the rules; this and the next only when asked for
+    PHOTOS = "photos 5 s apart"  # that hardly overlap, with what the autopilot said at each and nothing between

@@ -14,6 +14,7 @@ from terrafix.core.pose import exp_so3
 from terrafix.messages import Imu, Message, Origin, VehicleState
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.mission import Box, Mission
+from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.plan import FlightPlan
 from terrafix_tools.sim.autopilot.parameters import Kind
@@ -92,7 +93,7 @@ def fly(plan: FlightPlan, terrain: Terrain) -> Flown:
             held = hanging.r_w_c(state)
             p_m = state.p_b_in_w_m - np.array([*claimed, 0.0])
             frames.append(Shot(state.t_s, p_m, held @ tilt, held @ r_b_c.T, state.velocity_enu_mps))
-            telemetry.append(waiting)
+            telemetry.append(waiting[-1:] if plan.fault is Fault.PHOTOS else waiting)
             waiting = []
             way.append(way_m)
     return Flown(_origin(plan, home_m), frames, telemetry, np.array(way), terrain.seen_from(claimed))

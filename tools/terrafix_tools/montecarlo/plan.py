@@ -16,6 +16,7 @@ HALTON = (5, 7)  # bases of the map errors' sequence (Halton 1960); they share n
 # Cameras of the real flights and of the simulated ones: width, height, focal length in pixels.
 CAMERAS = ((1280, 720, 684.0), (1600, 900, 1164.4), (960, 540, 560.0))
 FLAT_M = 2.0  # 1-sigma of the relief over which a map without elevation may be flown: the ground must be flat then
+PHOTOS_HZ = 0.2
 FOCAL_SIGMA, K1_SIGMA = 0.01, 0.005  # of a lens that was calibrated once, or whose maker's numbers were taken
 
 
@@ -118,6 +119,8 @@ def plan(run_seed: int, number: int, *, fault: Fault | None = None, duration_s: 
     )
     if chosen is Fault.HILLS:
         return replace(drawn, hills_m=20.0, has_dem=False)
+    if chosen is Fault.PHOTOS:
+        return replace(drawn, frame_hz=PHOTOS_HZ, has_imu=False)
     if chosen is Fault.HEIGHT:
         return replace(drawn, height_scale=1.0 + sign * 0.1)
     if chosen is Fault.COMPASS:
