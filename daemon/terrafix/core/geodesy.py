@@ -65,6 +65,12 @@ def rot_w_b(yaw_rad: float, pitch_rad: float, roll_rad: float) -> np.ndarray:
     return r_enu_ned @ r_ned_b
 
 
+def angles_of(r_w_b: np.ndarray) -> tuple[float, float, float]:
+    """Yaw, pitch and roll [rad] of R_w_b (3x3): what ``rot_w_b`` makes it of."""
+    pitch_rad = math.asin(max(-1.0, min(1.0, float(r_w_b[2, 0]))))
+    return yaw_of(r_w_b), pitch_rad, math.atan2(-float(r_w_b[2, 1]), -float(r_w_b[2, 2]))
+
+
 def yaw_of(r_w_b: np.ndarray) -> float:
     """Heading of the body's forward axis, radians clockwise from north, in (-pi, pi]."""
     return math.atan2(float(r_w_b[0, 0]), float(r_w_b[1, 0]))

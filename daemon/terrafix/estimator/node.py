@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 
@@ -49,7 +48,7 @@ class EstimatorNode:
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
-        self._righted = Righted()
+        self._righted = Righted(self._telemetry)
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
         self._said_slow_ns = 0
@@ -120,14 +119,14 @@ class EstimatorNode:
         if estimator is None:
             return
         estimator.mode = self._mode
-        sigma_rad = math.radians(estimator.origin.attitude_sigma_deg)
-        righted_rad = self._righted.rad(odometry.t_ns, self._telemetry, sigma_rad)
-        attitude = replace(self._telemetry.at(odometry.t_ns), righted_rad=righted_rad)
+        origin = estimator.origin
+        sigmas_rad = math.radians(origin.attitude_sigma_deg), math.radians(origin.yaw_sigma_deg)
+        attitude = self._righted.look(odometry.t_ns, *sigmas_rad)
         before = estimator.last
         seen = before is not None and before.frame_id == self._predicted
         if before is not None and seen:
             self._from_m = np.array(before.pose.translation()[:2])
-        advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, self._telemetry.felt)
+        advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, self._righted.felt)
         self._tracked = advance.verdict is Verdict.ACCEPTED
         yield MeasurementVerdict(
             t_ns=odometry.t_ns, frame_id=odometry.frame_id, measurement="odometry", verdict=advance.verdict

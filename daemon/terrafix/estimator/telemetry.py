@@ -79,8 +79,9 @@ class Telemetry:
         said = {name: value for name, (_, value) in best.items()}
         return Attitude(*(said.get(name) for name in _FIELDS))  # type: ignore[arg-type]
 
-    def felt(self, t0_ns: int, t1_ns: int) -> Felt | None:
-        """Acceleration from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that."""
+    def felt(self, t0_ns: int, t1_ns: int, turned: np.ndarray | None = None) -> Felt | None:
+        """Acceleration from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that. ``turned``
+        (3, 2): by how much attitudes are turned about east, north and up at both ends [rad], which is taken out."""
         known = self._with_attitudes(self._forces, t0_ns, t1_ns)
         if known is None:
             return None
@@ -90,6 +91,11 @@ class Telemetry:
         f_b = [np.interp(t, t_f, axis) for axis in f]
         yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
         accel = _in_world(f_b, yaw, pitch, roll)
+        if turned is not None:
+            away = np.column_stack([np.interp(t, [t0_ns, t1_ns], axis) for axis in turned])
+            first = np.cross(away, accel)
+            accel = accel - first + 0.5 * np.cross(away, first)  # turned back, to the second order
+            yaw = yaw + away[:, 2]  # clockwise
         accel[:, 2] -= GRAVITY_MPS2
         # What the readings scatter from one to the next is vibration, whatever its frequency was.
         spacing_s = (t_f[-1] - t_f[0]) * 1e-9 / (len(t_f) - 1)
@@ -97,9 +103,10 @@ class Telemetry:
         unfelt_s = max(0.0, (t1_ns - int(t_f[-1])) * 1e-9)
         return Felt((t - t0_ns) * 1e-9, accel, yaw, float(np.sqrt(scatter * spacing_s)), unfelt_s)
 
-    def turned_otherwise(self, t0_ns: int, t1_ns: int) -> np.ndarray | None:
-        """The tilt (2,) about east and north by which the attitude turned from ``t0_ns`` to ``t1_ns`` and gyroscopes
-        did not [rad]; None when readings or attitudes do not cover that."""
+    def turned_otherwise(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
+        """The turn (3,) about east, north and up by which the attitude turned from ``t0_ns`` to ``t1_ns`` and
+        gyroscopes did not, and by how much these turned at all [rad]; None when readings or attitudes do not cover
+        that."""
         known = self._with_attitudes(self._rates, t0_ns, t1_ns)
         if known is None:
             return None
@@ -109,12 +116,13 @@ class Telemetry:
         yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
         r_w_b = np.stack([_in_world([*axis], yaw, pitch, roll) for axis in np.eye(3)], axis=2)
         step = np.einsum("nij,nkj->nik", r_w_b[1:], r_w_b[:-1])
-        turned = 0.5 * np.column_stack([step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0]])
+        turned = 0.5 * np.column_stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
         # The integral of the rates, from one attitude to the next, in the world by the attitude between them.
         summed = [np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t_g) * 1e-9)]) for a in w]
         felt = [np.diff(np.interp(t, t_g, axis)) for axis in summed]
         between = (0.5 * (angle[1:] + angle[:-1]) for angle in (yaw, pitch, roll))
-        return np.asarray(turned.sum(axis=0) - _in_world(felt, *between)[:, :2].sum(axis=0))
+        apart = turned.sum(axis=0) - _in_world(felt, *between).sum(axis=0)
+        return apart, float(np.linalg.norm(felt, axis=0).sum())
 
     def _with_attitudes(self, readings: "_Series", t0_ns: int, t1_ns: int) -> tuple[Timed, Timed] | None:
         """Readings and attitudes around a span; None when they do not cover it."""

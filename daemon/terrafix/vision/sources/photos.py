@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.errors import SourceError
-from terrafix.core.geodesy import rot_w_b, yaw_of
+from terrafix.core.geodesy import angles_of, rot_w_b
 from terrafix.messages import Camera, Frame, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import Description, StartTable, camera_of, origin_of, read_description
@@ -135,10 +135,8 @@ def state_of(info: PhotoInfo, t_ns: int) -> VehicleState | None:
 def body_of_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
     """(yaw, pitch, roll) in rad of a body whose camera is mounted at pitch -90, from the gimbal's Z-Y-X angles."""
     r_w_gimbal = rot_w_b(math.radians(yaw_deg), math.radians(pitch_deg), math.radians(roll_deg))
-    r_gimbal_b = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # Ry(+90): undoes the mount
-    r_w_b = r_w_gimbal @ r_gimbal_b
-    pitch_rad = math.asin(max(-1.0, min(1.0, float(r_w_b[2, 0]))))
-    return yaw_of(r_w_b), pitch_rad, math.atan2(-float(r_w_b[2, 1]), -float(r_w_b[2, 2]))
+    r_gimbal_b = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # Ry(+90)
+    return angles_of(r_w_gimbal @ r_gimbal_b)  # undoes the mount
 
 
 def in_time_order(photos: list[tuple[Path, PhotoInfo | None]]) -> list[tuple[Path, PhotoInfo | None, float]]:
