@@ -1,5 +1,7 @@
 """An estimator that was killed in flight: the next one begins where it left off, as sure as that allows."""
 
+import math
+
 import numpy as np
 import pytest
 from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, Flight, Listener, blind, error_m, sigma_m
@@ -7,10 +9,11 @@ from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, Flight, Listener, blind
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.pose import log_so3
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.resume import Keeper, Last, kept
+from terrafix.estimator.resume import Keeper, Known, Last, Learnt, kept
 from terrafix.messages import Odometry, Prediction, VehicleState
 
 KILLED, BACK = 60, 66  # frames: three seconds
+PLANE_MPS, DOWN_S, BANK_DEG = 22.0, 7.0, 42.0
 
 
 @pytest.fixture(scope="module")
@@ -106,3 +109,49 @@ def test_an_autopilot_that_says_nothing_is_not_waited_for(flight: Flight, killed
     for i in range(BACK, BACK + 5):
         said += [x for m in flight.messages(i) if isinstance(m, Odometry) for x in node.on(blind(m))]
     assert sum(isinstance(m, Prediction) for m in said) >= 4
+
+
+def flown_on(turned_deg: float, from_s: float) -> np.ndarray:
+    """Way (2,) of a plane that heads east, banks after ``from_s``, and has turned to the left by so much in the end."""
+    rate = math.copysign(9.81 * math.tan(math.radians(BANK_DEG)) / PLANE_MPS, turned_deg)
+    t = np.linspace(0.0, DOWN_S, 2001)
+    course = np.sign(rate) * np.clip(abs(rate) * (t - from_s), 0.0, math.radians(abs(turned_deg)))
+    return PLANE_MPS * np.trapezoid([np.cos(course), np.sin(course)], t)
+
+
+def plane(heads_rad: float = math.radians(90.0), learnt: Learnt | None = None) -> Known:
+    """Flies east."""
+    return Known(0.0, np.zeros(2), 5.0, np.array([PLANE_MPS, 0.0]), 0.4, heads_rad, learnt)
+
+
+@pytest.mark.parametrize("turned_deg", [-110.0, -40.0, 90.0, 110.0])
+@pytest.mark.parametrize("from_s", [0.0, 2.0])
+def test_a_turn_that_nobody_saw_is_in_the_heading_after_it(turned_deg: float, from_s: float) -> None:
+    """A plane that was killed in a bank of 42 degrees was 140 m from where it would have been straight on."""
+    way_m, sigma_m = plane().later(DOWN_S, math.radians(90.0 - turned_deg))
+    true_m = flown_on(turned_deg, from_s)
+    off_m, straight_m = np.linalg.norm(way_m - true_m), np.linalg.norm([PLANE_MPS * DOWN_S, 0.0] - true_m)
+    assert off_m < 2.0 * sigma_m and sigma_m < 60.0
+    assert off_m < 0.5 * straight_m
+
+
+def test_who_heads_as_before_flew_straight_on() -> None:
+    way_m, sigma_m = plane().later(DOWN_S, math.radians(90.0))
+    assert way_m == pytest.approx([PLANE_MPS * DOWN_S, 0.0], abs=0.1)
+    forgotten_m, wider_m = plane().later(DOWN_S, None)
+    assert forgotten_m[0] < 0.9 * way_m[0] and forgotten_m[1] == 0.0
+    assert wider_m == pytest.approx(sigma_m, rel=0.1)
+
+
+def test_a_compass_that_is_off_as_it_was_learnt_has_not_turned() -> None:
+    off_rad = math.radians(8.0)
+    learnt = Learnt(0.0, np.array([0.0, 0.0, off_rad, 0.0, 0.0, 0.0]), np.eye(6), math.radians(90.0))
+    way_m, _ = plane(learnt=learnt).later(DOWN_S, math.radians(90.0) + off_rad)
+    assert way_m == pytest.approx([PLANE_MPS * DOWN_S, 0.0], abs=0.1)
+
+
+def test_the_heading_of_a_copter_that_flies_sideways_tells_nothing() -> None:
+    sideways = plane(heads_rad=0.0)
+    assert np.array_equal(sideways.later(DOWN_S, 1.0)[0], sideways.later(DOWN_S, None)[0])
+    hovers = Known(0.0, np.zeros(2), 5.0, np.array([1.0, 0.0]), 0.4, math.radians(90.0))
+    assert np.array_equal(hovers.later(DOWN_S, 0.0)[0], hovers.later(DOWN_S, None)[0])

@@ -12,11 +12,14 @@ from terrafix.core.rundir import write_whole
 from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.pace import TYPICAL_SPEED_MPS
-from terrafix.estimator.velocity import MAX_SPEED_SIGMA_MPS, leg
+from terrafix.estimator.velocity import LEAST_SPEED_MPS, MAX_SPEED_SIGMA_MPS, leg
 from terrafix.messages import MapMatch, Message, NavEstimate, Origin, SlowErrors
 
 KEPT_EVERY_NS = 200_000_000
 SLOW_AGE_NS = 5_000_000_000  # learnt longer before the estimate (the computer was hot): heading and height were others
+FLIES_AHEAD = 0.8  # cosine between course and heading: the wind sets a plane off by 30 degrees at most
+TURN_MPS2 = 8.0  # across the course: a bank of 40 degrees
+BEGINS = (np.arange(8) + 0.5) / 8  # of a turn, in shares of the time that it leaves
 
 
 class Last(msgspec.Struct, frozen=True):
@@ -40,14 +43,15 @@ class Learnt:
 
 @dataclass(frozen=True)
 class Known:
-    """A position that is known: time, east and north with their 1-sigma, velocity with its 1-sigma (each axis), and
-    what was learnt of the slow errors and of the ground."""
+    """A position that is known: time, east and north with their 1-sigma, velocity with its 1-sigma (each axis), heading
+    of the vehicle (None: unknown), and what was learnt of the slow errors and of the ground."""
 
     t_s: float
     at_m: np.ndarray
     sigma_m: float
     velocity_mps: np.ndarray
     velocity_sigma_mps: float
+    yaw_rad: float | None = None
     learnt: Learnt | None = None
     match: MapMatch | None = None
 
@@ -63,21 +67,48 @@ class Known:
         at_m = np.array(frame.to_local(said.lat_deg, said.lon_deg))
         sigma_m = float(np.sqrt(max(said.cov[0], said.cov[7])))
         t_s, velocity_mps = said.t_ns * 1e-9, np.array(said.velocity_enu_mps[:2])
-        learnt = None
+        learnt, yaw_rad = None, yaw_of(rot_from_quat(said.q_w_b))
         if slow is not None and said.t_ns - slow.t_ns <= SLOW_AGE_NS:
-            yaw_rad = yaw_of(rot_from_quat(said.q_w_b))
             cov = np.array(slow.cov).reshape(BIAS_SIZE, BIAS_SIZE)
             learnt = Learnt(slow.t_ns * 1e-9, np.array(slow.error), cov, yaw_rad)
-        return cls(t_s, at_m, sigma_m, velocity_mps, said.velocity_sigma_mps, learnt, last.match)
+        return cls(t_s, at_m, sigma_m, velocity_mps, said.velocity_sigma_mps, yaw_rad, learnt, last.match)
 
-    def later(self, t_s: float) -> tuple[np.ndarray, float]:
-        """-> way (2,) since then, and the 1-sigma of each axis of it: nobody looked."""
-        if t_s <= self.t_s:
+    def later(self, t_s: float, yaw_rad: float | None) -> tuple[np.ndarray, float]:
+        """-> way (2,) since then, and the 1-sigma of each axis of it: nobody looked. ``yaw_rad``: where it heads now,
+        as the autopilot says. By as much as that is another heading it has turned, at any moment: the mean of the ways
+        that this gives, and how far their ends are apart."""
+        dt_s = t_s - self.t_s
+        if dt_s <= 0.0:
             return np.zeros(2), 0.0
         speed_mps = max(float(np.hypot(*self.velocity_mps)), TYPICAL_SPEED_MPS)
-        way = leg(t_s - self.t_s, None, (0.0, 0.0), 0.0, speed_mps, 0.0, same_kind=False)
-        sigma_m = np.hypot(way.reach_s * self.velocity_sigma_mps, np.sqrt(way.cov[0, 0]))
-        return way.reach_s * self.velocity_mps, float(sigma_m)
+        way = leg(dt_s, None, (0.0, 0.0), 0.0, speed_mps, 0.0, same_kind=False)
+        turned_rad = self._turned(yaw_rad)
+        reach_s = (
+            way.reach_s if turned_rad is None else dt_s
+        )  # a heading that is known is a course that is not forgotten
+        ends_m = _ways(complex(*self.velocity_mps), turned_rad or 0.0, dt_s) * (reach_s / dt_s)
+        apart_m = float(np.sqrt(np.linalg.eigvalsh(np.cov(ends_m.real, ends_m.imag))[-1].clip(0.0)))
+        sigma_m = np.linalg.norm([reach_s * self.velocity_sigma_mps, np.sqrt(way.cov[0, 0]), apart_m])
+        return np.array([ends_m.real.mean(), ends_m.imag.mean()]), float(sigma_m)
+
+    def _turned(self, yaw_rad: float | None) -> float | None:
+        """Of the course, towards north from east [rad]. None: unknown, or it does not fly where it heads."""
+        east, north = self.velocity_mps
+        if yaw_rad is None or self.yaw_rad is None or np.hypot(east, north) < LEAST_SPEED_MPS:
+            return None
+        if np.cos(np.arctan2(east, north) - self.yaw_rad) < FLIES_AHEAD:
+            return None
+        bias_rad = 0.0 if self.learnt is None else float(self.learnt.error[2])
+        return float(np.angle(np.exp(1j * (self.yaw_rad - yaw_rad + bias_rad))))
+
+
+def _ways(velocity_mps: complex, turned_rad: float, dt_s: float) -> np.ndarray:
+    """(N,) east + j north, flown in ``dt_s`` with a turn that begins at any moment."""
+    turning_s = min(dt_s, abs(turned_rad * velocity_mps) / TURN_MPS2)
+    before_s = (dt_s - turning_s) * BEGINS
+    turn = np.exp(1j * turned_rad)
+    arc_s = (turn - 1.0) / (1j * turned_rad) * turning_s if turned_rad else 0.0
+    return np.asarray(velocity_mps * (before_s + arc_s + (dt_s - turning_s - before_s) * turn))
 
 
 class Keeper:

@@ -243,7 +243,7 @@ class Tracker:
         self._first_s = known.t_s
         if known.match is not None:
             self.terrain.hear(known.match, np.array([known.match.mode_e_m, known.match.mode_n_m]))
-        way_m, drift_m = known.later(t_s)
+        way_m, drift_m = known.later(t_s, attitude.yaw_rad)
         sigma_m = float(np.hypot(known.sigma_m, drift_m))
         slow = self._slow_now(known.learnt, t_s, attitude, float(np.hypot(*way_m)) + drift_m)
         placed = self._start_graph(frame_id, t_s, attitude, known.at_m + way_m, sigma_m, slow)
