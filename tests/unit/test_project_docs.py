@@ -53,6 +53,15 @@ def test_files_named_in_the_architecture_exist() -> None:
         assert any((ROOT / folder / name).is_file() for folder in ("daemon/terrafix", "engines", "tools")), name
 
 
+def test_every_fact_about_autopilots_names_its_test_and_every_such_test_is_named() -> None:
+    named = set(re.findall(r"`(test_\w+)`", (ROOT / "docs" / "autopilot-facts.md").read_text(encoding="utf-8")))
+    tests = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    there = set(re.findall(r"^def (test_\w+)", tests, flags=re.M))
+    assert named <= there, sorted(named - there)
+    facts = {name for name in there if name.startswith("test_fact_")}
+    assert facts <= named, sorted(facts - named)
+
+
 def test_no_path_of_a_machine_of_ours() -> None:
     for path in [*SOURCES, *PAGES, ROOT / "pyproject.toml", ROOT / "requirements.lock"]:
         try:
