@@ -101,6 +101,20 @@ def test_a_start_that_is_not_known_is_searched_on_the_whole_map(
     assert said.p_c_in_w_m is None and said.cov is None and not said.found
 
 
+def test_a_search_joins_frames_by_their_steps_however_the_unknown_place_grows_worse(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A heading that is known to ten degrees makes it worse by metres a frame; a search tries the headings itself."""
+    steps_m = list[float]()
+    monkeypatch.setattr(MapSearch, "look", lambda *_: None)
+    monkeypatch.setattr(MapSearch, "move", lambda _self, _east, _north, sigma_m: steps_m.append(sigma_m))
+    node, frames = started(ground, 5000.0)
+    for i, sigma_m in enumerate((100.0, 100.5, 101.0)):
+        frames.put(i, view(ground, PINHOLE, R, TRUE_M))
+        list(node.on(predicted(i, sigma_m, step_sigma_m=1.0, step_m=10.0)))
+    assert steps_m == [1.0, 1.0]
+
+
 def test_an_anchor_that_starts_again_in_flight_does_not_search_what_was_found(ground: np.ndarray) -> None:
     node, frames = started(ground, 5000.0)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))

@@ -128,6 +128,18 @@ def test_a_step_is_claimed_as_well_as_it_is_seen(long_flight: Flight, long_run: 
     assert np.median(sigmas_m) < 0.2 * SPEED_MPS * FRAME_S
 
 
+def test_a_step_is_claimed_no_wider_for_lying_far_from_its_keyframe() -> None:
+    """What stretches all of the way since the keyframe (here a height known to a fifth, no map) stretches a step by its
+    own share: steps that are alike are claimed alike."""
+    flight, run = Flight(9, seed=4), Listener()
+    run.hear([msgspec.structs.replace(ORIGIN, agl_sigma_m=20.0)])
+    for i in range(9):
+        run.hear(without_fix(list(flight.messages(i))))
+    sigmas_m = [m.step_cov_m2[0] ** 0.5 for m in run.said if isinstance(m, Prediction) and m.frame_id]
+    assert max(sigmas_m) < 1.3 * min(sigmas_m)
+    assert min(sigmas_m) > 0.15 * SPEED_MPS * FRAME_S  # that fifth is claimed
+
+
 def test_refined_positions_are_no_worse(long_flight: Flight, long_run: Listener) -> None:
     last = [m for m in long_run.said if isinstance(m, Refinement)][-1]
     assert sorted(p.frame_id for p in last.poses) == list(range(300))

@@ -246,9 +246,10 @@ class AnchorNode:
         step_m = float(np.hypot(*prediction.step_m))
         # Blind, the error of the position grows faster than the steps' own errors add up: with that of the velocity.
         variance = max(prediction.cov[0], prediction.cov[7])
+        step_var = max(prediction.step_cov_m2[0], prediction.step_cov_m2[3])
         grown = variance - self._variance_m2
         self._variance_m2 = variance
-        sigma_m = float(np.sqrt(max(prediction.step_cov_m2[0], prediction.step_cov_m2[3], grown)))
+        sigma_m = float(np.sqrt(max(step_var, grown)))
         self._torn = self._belief is not None and sigma_m > NEAR * prediction.agl_m
         if self._belief is None:
             e_m, n_m, _ = prediction.p_c_in_w_m
@@ -260,7 +261,8 @@ class AnchorNode:
                 around_m = start_around(e_m, n_m, origin.start_sigma_m, best.map)
                 self._search.begin(best, prediction.agl_m, around_m)
         elif self._search.is_on:
-            self._search.move(prediction.step_m, sigma_m)
+            # Heading and scale, by which an unknown position grows worse, are what the search tries itself.
+            self._search.move(prediction.step_m, float(np.sqrt(step_var)))
         else:
             sway = min(SWAY, float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))))
             self._belief.move(*prediction.step_m, float(np.hypot(sigma_m, sway * prediction.agl_m)))

@@ -92,6 +92,7 @@ class Tracker:
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
         self._velocity_cov = np.zeros((V_SIZE, V_SIZE))  # of V of the newest node
         self._pace = Pace()
+        self._seen_from: int | None = None  # node of the keyframe that odometry saw the newest frame from
         self._felt: bool | None = None  # whether the last leg was measured; None: there was none
         self._stood_at: int | None = None  # node at which a vehicle stands, motors off
         self._launching = False  # it stood, and was not seen to fly since ...
@@ -172,8 +173,12 @@ class Tracker:
         step_sigma = STANDING_M if way is None else float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1]))
         if known is not None:
             seen = r_w_c @ motion.cov[3:, 3:] @ r_w_c.T
-            # Of the step over the ground: where no map tells how that rises, the height is known far less well.
+            # Of the step over the ground: where no map tells how that rises, the height is known far less well. A
+            # wrong height stretches all of the way since the keyframe alike; the frame before had its part of that.
             aside_m = np.sqrt(np.linalg.eigvalsh(seen[:2, :2])[-1])
+            if parent == self._seen_from:
+                way_m = np.hypot(*(p - self.graph.state(parent).pose.translation())[:2])
+                aside_m *= min(np.hypot(*step) / max(way_m, STEP_FLOOR_M), 1.0)
             step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), aside_m))
             if way is not None:
                 way, spread = believed(way, p - led_to, spread, seen)
@@ -194,6 +199,7 @@ class Tracker:
         elif self._stood_at is None:
             self._stood_at = node
         self._is_frame(node, frame_id)
+        self._seen_from = None if known is None else parent
         self._cov_of = {n: cov for n, cov in self._cov_of.items() if self.graph.holds(n)}
         self._velocity_cov = spread[3:, 3:]
         self._last = self._placed(frame_id, t_s, node)
