@@ -14,6 +14,7 @@ from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.anchor.tracks import (
     AHEAD,
+    CLEAR_LEAD,
     ENOUGH,
     LEADS,
     LLR_MAX,
@@ -24,6 +25,7 @@ from terrafix.anchor.tracks import (
     Found,
     Track,
     Tracks,
+    _off_sigmas2,
     evidence,
 )
 from terrafix.messages import SearchStep
@@ -97,6 +99,17 @@ def test_one_frame_is_never_enough_however_often_it_is_seen(ground: np.ndarray) 
         assert search.look(picture, predicted()) is None
         search.move(0.0, 0.0, 4.0)  # it hovers, and odometry knows no better
     assert search.tracks.all[0].frames == 1
+
+
+def test_a_look_is_a_wide_one_once_it_joins_new_ground(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Tracks, "look", lambda *_: None)
+    search, wide = searched(BoundedMap(ground), None), list[bool]()
+    for i, (picture, _) in enumerate(frames(ground, 5)):
+        if i:
+            search.move(float(STEP_M[0]), float(STEP_M[1]), 1.0)
+        search.look(picture, predicted())
+        wide.append(search.tracks.all[0].wide)
+    assert wide == [False, False, False, False, True]  # 15 m a frame
 
 
 def test_what_is_not_on_the_map_is_not_found_there() -> None:
@@ -182,8 +195,10 @@ def test_the_next_row_of_houses_is_followed_too(ground: np.ndarray) -> None:
     assert second.leads[-1] == pytest.approx(8.0 - 5.0 - (9.0 - 8.0))
 
 
-def track_of(score: float, leads: tuple[float, ...] = (), frames: int = MIN_FRAMES, e_m: float = 0.0) -> Track:
-    return Track(e_m, 0.0, Hypothesis(0.0, 1.0), score, frames, leads=leads)
+def track_of(
+    score: float, leads: tuple[float, ...] = (), frames: int = MIN_FRAMES, e_m: float = 0.0, *, wide: bool = False
+) -> Track:
+    return Track(e_m, 0.0, Hypothesis(0.0, 1.0), score, frames, leads=leads, wide=wide)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +207,9 @@ def track_of(score: float, leads: tuple[float, ...] = (), frames: int = MIN_FRAM
         (track_of(ENOUGH + 0.1), [], True),
         (track_of(ENOUGH - 0.1), [], False),
         (track_of(ENOUGH + 0.1, frames=MIN_FRAMES - 1), [], False),
-        (track_of(LLR_MIN, leads=(5.0, 5.0), frames=0), [], False),  # looks alone never do
+        (track_of(ENOUGH + 0.1, leads=(2.0,), frames=MIN_FRAMES - 1, wide=True), [], True),  # the look is the other
+        (track_of(ENOUGH + 0.1, leads=(2.0,), frames=0, wide=True), [], False),  # looks alone never do
+        (track_of(LLR_MIN, leads=(5.0, 5.0), frames=0), [], False),
         (track_of(ENOUGH - 2.0, leads=(1.0, 1.0)), [], True),
         (track_of(ENOUGH - 2.0, leads=(9.0,)), [], False),  # one look may be chance
         (track_of(ENOUGH - 2.0, leads=(9.0, -1.0)), [], False),
@@ -230,12 +247,38 @@ def test_a_frame_that_says_next_to_nothing_does_not_speak_for_a_place() -> None:
 def test_a_lead_counts_once_it_has_lasted() -> None:
     track = track_of(0.0)
     assert track.lead == track.odds == 0.0
-    track.looked_at(4.0)
+    track.looked_at(4.0, wide=False)
     assert track.lead == 0.0
-    track.looked_at(1.0)
+    track.looked_at(1.0, wide=False)
     assert track.lead == 1.0 < track.odds
-    track.looked_at(-2.0)
+    track.looked_at(-2.0, wide=False)
     assert track.lead == -2.0 and track.odds < 0.0 and len(track.leads) == LEADS
+
+
+def test_a_lead_in_a_wide_look_counts_at_once_and_as_a_witness() -> None:
+    track = track_of(ENOUGH)
+    track.frames = 1
+    track.looked_at(CLEAR_LEAD, wide=False)
+    track.looked_at(CLEAR_LEAD, wide=False)
+    assert (track.lead, track.witnesses) == (CLEAR_LEAD, 1)
+    track.looked_at(2.0, wide=True)
+    assert (track.lead, track.witnesses) == (2.0, 2)
+    track.looked_at(CLEAR_LEAD - 0.1, wide=True)
+    assert track.witnesses == 1
+
+
+def test_a_heading_and_a_height_that_are_as_predicted_speak_for_a_place_and_others_against_it() -> None:
+    track, view = track_of(0.0), replace(predicted(), yaw_sigma_rad=0.1, scale_sigma=0.1)
+    assert track.odds == 0.0  # nothing is known yet
+    for hypothesis, speaks in (
+        (Hypothesis(0.0, 1.0), True),
+        (Hypothesis(0.35, 1.0), False),
+        (Hypothesis(0.0, 0.7), False),
+    ):
+        track.off_sigmas2 = _off_sigmas2(hypothesis, view)
+        assert (track.odds > 0.0) is speaks
+    known = replace(view, yaw_sigma_rad=0.0, scale_sigma=0.0)
+    assert 1.0 < _off_sigmas2(Hypothesis(0.1, 1.0), known) < 2.0  # patches leave some degrees open
 
 
 def of(llr: float, patches: int = PATCHES) -> Agreement:
@@ -269,7 +312,7 @@ def test_a_place_without_rivals_is_weighed_against_places_that_are_none(ground: 
     tracks, (picture, p_m) = searched(BoundedMap(ground), None).tracks, next(frames(ground, 1))
     for k, e_m in enumerate((0.0, -0.5, 0.5, -1.0)):
         tracks.propose(float(p_m[0]) + e_m * AGL_M, float(p_m[1]), Hypothesis(0.0, 1.0), AGL_M)
-        tracks.all[-1].looked_at(-9.0 if k else 2.0)
+        tracks.all[-1].looked_at(-9.0 if k else 2.0, wide=False)
     tracks.look(picture, predicted(), 0.0)
     assert len(tracks.all) == 1 and tracks._chance._sums[0] == PRIOR_PLACES + 3.0
     assert not tracks._chance.is_known

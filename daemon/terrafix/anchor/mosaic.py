@@ -35,6 +35,11 @@ class Mosaic:
         ][1 - MOST_FRAMES :]
         self._kept.append((p_m.copy(), var_m2, templates))
 
+    @property
+    def length_m(self) -> float:
+        """From the newest frame to the farthest one that is joined to it."""
+        return max((float(np.hypot(*(self._kept[-1][0] - p_m))) for p_m, _, _ in self._kept), default=0.0)
+
     def templates(self) -> list[Template]:
         """All frames as seen from the last one, one template per hypothesis, on the cells of the map."""
         return [self._joined(k, h) for k, h in enumerate(self._hypotheses)]

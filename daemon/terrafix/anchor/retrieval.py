@@ -26,7 +26,7 @@ CELL_PER_AGL = 1 / 13  # of pooled cells
 MAX_WORK = 35e6  # cells times headings times scales of one look: about 2 s of one core. A larger map gets larger cells
 LOOK_EVERY = 0.15  # of the height: motion between two looks at the whole region
 VERIFY_EVERY = 0.03  # ... and between two attempts at a pose
-NEW_GROUND = 0.6  # of the height: after this much motion a look counts as a new one
+NEW_GROUND = 0.6  # of the height: after this much motion a look counts as a new one; one that joins it is a wide one
 RINGS = (1, 4, 9, 16, 25)  # blocks of each step of the search, nearest first; then the whole map
 LOOKS_PER_RING = 0.5  # full looks without a track before the next step
 LOOKS_TO_ASK = 6.0  # full looks at the whole map before the operator is asked
@@ -178,6 +178,7 @@ class MapSearch:
             n_m = -(peak.row + self._row0 + 0.5) * self._cell_m
             if peak.z > UNKNOWN:
                 self.tracks.propose(e_m, n_m, peak.hypothesis, agl_m)
+        wide = self._mosaic.length_m >= NEW_GROUND * agl_m
         for track in self.tracks.all:
             r = round(-track.n_m / self._cell_m - 0.5) - self._row0
             c = round(track.e_m / self._cell_m - 0.5) - self._column0
@@ -187,4 +188,4 @@ class MapSearch:
             )
             rivals = [p.z for p in peaks if np.hypot(p.row - r, p.column - c) > near]
             # What is better beside it counts against it, and not for it.
-            track.looked_at(here - max(rivals, default=UNKNOWN) - (beside_it - here))
+            track.looked_at(here - max(rivals, default=UNKNOWN) - (beside_it - here), wide=wide)

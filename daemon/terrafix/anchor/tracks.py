@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from terrafix.anchor.agreement import SCALE_SIGMA, YAW_SIGMA_RAD
 from terrafix.anchor.chance import Chance
 from terrafix.anchor.map_package import LocalMap
 from terrafix.anchor.matcher import Fix, FrameMatcher, Hypothesis, View
@@ -32,12 +33,16 @@ ENOUGH = 10.0  # some 60 places are looked at in a search, 4 nats, and one in fo
 AHEAD = 5.0  # of the best other track
 SPEAKS = 2.0  # nats of a frame that speaks for its place
 MIN_FRAMES = 2  # that must speak for it: what chance gave in one frame is gone in the next
-LEADS = 2  # joint looks in which it must lead; one alone may be chance
+LEADS = 2  # joint looks in which it must lead; one alone may be chance, unless it is a wide one
 # Nats for each standard deviation of lead, up to so many. By how much the best wrong place leads the next one falls off
 # as an exponential does, by 0.2 to 0.3 standard deviations: 3.3 to 5 nats for each, measured over 487 looks. The frames
 # know the same ground.
 LEAD_LLR, LEAD_MOST = 3.0, 3.0
 LEADING = 0.5  # standard deviations: a place that leads by this is followed, whatever single frames say
+# Nats for a heading and a height as predicted: a search tries them evenly over one and a half sigmas, and what wrong
+# places come to is spread as wide and wider.
+AS_PREDICTED_LLR = 2.0 * float(np.log(3.0 / np.sqrt(2.0 * np.pi)))
+CLEAR_LEAD = 1.0  # of a wide look: speaks for a place as one more frame does
 HOPELESS = -2.5  # standard deviations behind the best place of the joint look
 
 
@@ -52,21 +57,32 @@ class Track:
     frames: int = 0
     scored_way_m: float = -np.inf
     leads: tuple[float, ...] = ()
+    wide: bool = False  # the last joint look: no single frame decides it
+    off_sigmas2: float = 2.0 * AS_PREDICTED_LLR  # heading and height against the prediction, squares added
     jump_m: tuple[float, float] = (0.0, 0.0)  # of the last frame, against where those before and odometry had it
 
-    def looked_at(self, lead: float) -> None:
+    def looked_at(self, lead: float, *, wide: bool) -> None:
         """``lead`` over all other places in a joint look, in standard deviations."""
-        self.leads = (*self.leads, lead)[-LEADS:]
+        self.leads, self.wide = (*self.leads, lead)[-LEADS:], wide
 
     @property
     def lead(self) -> float:
-        """In the worst of the last joint looks."""
+        """In the last joint look, if that is a wide one; else in the worst of the last ones."""
+        if self.wide:
+            return self.leads[-1]
         return min(self.leads) if len(self.leads) == LEADS else min((0.0, *self.leads))
 
     @property
+    def witnesses(self) -> int:
+        """Frames that spoke for it, and a wide look in which it leads clearly."""
+        return self.frames + (self.wide and self.lead >= CLEAR_LEAD)
+
+    @property
     def odds(self) -> float:
-        """What speaks for it: its own frames, and how the joint look compares it with all other places."""
-        return self.score + LEAD_LLR * float(np.clip(self.lead, -LEAD_MOST, LEAD_MOST))
+        """What speaks for it: its own frames, how the joint look compares it with all other places, and whether heading
+        and height are as predicted."""
+        predicted = AS_PREDICTED_LLR - 0.5 * self.off_sigmas2
+        return self.score + LEAD_LLR * float(np.clip(self.lead, -LEAD_MOST, LEAD_MOST)) + predicted
 
     @property
     def is_open(self) -> bool:
@@ -157,6 +173,7 @@ class Tracks:
             self._chance.learn(found.agreement, fine=speaks)
         gain, placed = evidence(z), track.frames > 0
         track.checked(gain, way_m, view.agl_m)
+        track.off_sigmas2 = _off_sigmas2(track.hypothesis, view)
         if gain <= 0.0:
             return None
         east, north, yaw_rad, scale, tilt_e, tilt_n = (float(v) for v in found.agreement.motion)
@@ -164,6 +181,7 @@ class Tracks:
         track.e_m, track.n_m = track.e_m + moved_m[0], track.n_m + moved_m[1]
         track.jump_m = moved_m if placed else (0.0, 0.0)
         track.hypothesis = Hypothesis(track.hypothesis.yaw_rad + yaw_rad, track.hypothesis.scale * (1.0 + scale))
+        track.off_sigmas2 = _off_sigmas2(track.hypothesis, view)
         return found.fix if found.fix.pnp.fit is not None else None
 
     def _is_second(self, track: Track, better: list[Track], view: View) -> bool:
@@ -171,9 +189,15 @@ class Tracks:
 
     def _is_found(self, best: Track) -> bool:
         rivals = self.all[1:]
-        return best.frames >= MIN_FRAMES and best.odds >= max(
+        return best.witnesses >= MIN_FRAMES and best.odds >= max(
             ENOUGH, max((t.odds for t in rivals), default=0.0) + AHEAD
         )
+
+
+def _off_sigmas2(hypothesis: Hypothesis, view: View) -> float:
+    """How far heading and height are from the prediction, by what that and the patches of one frame leave open."""
+    yaw = hypothesis.yaw_rad / np.hypot(view.yaw_sigma_rad, YAW_SIGMA_RAD)
+    return float(yaw**2 + ((hypothesis.scale - 1.0) / np.hypot(view.scale_sigma, SCALE_SIGMA)) ** 2)
 
 
 def evidence(z: float) -> float:
