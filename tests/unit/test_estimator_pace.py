@@ -47,6 +47,14 @@ def test_a_frame_that_is_told_twice_is_forgotten_once() -> None:
     assert pace.mps > 0.9 * CRUISE_MPS
 
 
+def test_a_first_fix_tells_no_pace_and_two_do() -> None:
+    pace = Pace()
+    pace.fixed(0.0, np.zeros(3), 15.0**2 * np.eye(3))
+    assert pace.mps == TYPICAL_SPEED_MPS
+    pace.fixed(5.0, np.array([0.0, 20.0, 0.0]), 3.0**2 * np.eye(3))
+    assert pace.mps > 20.0
+
+
 def test_a_hover_that_ends_unseen_is_inside_the_claim() -> None:
     """Twenty seconds without a picture, flown at cruising speed: 280 m."""
     pace = flown((60.0, CRUISE_MPS), (5.0, 0.0))

@@ -119,7 +119,7 @@ class Estimator(Tracker):
         self.map_sigma_m = match.map_sigma_m
         assert self._last is not None
         self._last = self._placed(self._last.frame_id, self._last.t_s, self.graph.newest)
-        self._pace.seen(self._last.t_s, self._last.velocity_mps, self._last.velocity_cov)
+        self._pace.fixed(self._last.t_s, self._last.velocity_mps, self._last.velocity_cov)
 
     def _refuse(self, match: MapMatch, node: int, measured: gtsam.Pose3, cov: np.ndarray, d2: float) -> FixResult:
         """Refused, unless several fixes over new ground agree with each other: then it is the graph that is lost."""

@@ -83,9 +83,8 @@ class Known:
         speed_mps = max(float(np.hypot(*self.velocity_mps)), TYPICAL_SPEED_MPS)
         way = leg(dt_s, None, (0.0, 0.0), 0.0, speed_mps, 0.0, same_kind=False)
         turned_rad = self._turned(yaw_rad)
-        reach_s = (
-            way.reach_s if turned_rad is None else dt_s
-        )  # a heading that is known is a course that is not forgotten
+        # A heading that is known is a course that is not forgotten.
+        reach_s = way.reach_s if turned_rad is None else dt_s
         ends_m = _ways(complex(*self.velocity_mps), turned_rad or 0.0, dt_s) * (reach_s / dt_s)
         apart_m = float(np.sqrt(np.linalg.eigvalsh(np.cov(ends_m.real, ends_m.imag))[-1].clip(0.0)))
         sigma_m = np.linalg.norm([reach_s * self.velocity_sigma_mps, np.sqrt(way.cov[0, 0]), apart_m])
