@@ -141,6 +141,9 @@ def test_who_heads_as_before_flew_straight_on() -> None:
     forgotten_m, wider_m = plane().later(DOWN_S, None)
     assert forgotten_m[0] < 0.9 * way_m[0] and forgotten_m[1] == 0.0
     assert wider_m == pytest.approx(sigma_m, rel=0.1)
+    long_m, long_sigma_m = plane().later(60.0, math.radians(90.0))
+    back_m, _ = plane().later(60.0, None)
+    assert long_m[0] - back_m[0] < 2.0 * long_sigma_m  # it may have turned away and back
 
 
 def test_a_compass_that_is_off_as_it_was_learnt_has_not_turned() -> None:
