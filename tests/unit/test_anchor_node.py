@@ -10,6 +10,7 @@ from ground import PINHOLE, texture, view
 from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
 
 from terrafix.anchor.agreed import AgreedPose
+from terrafix.anchor.answer import ground_sigma_m
 from terrafix.anchor.lost import LostWatch
 from terrafix.anchor.matcher import FrameMatcher
 from terrafix.anchor.node import AnchorNode
@@ -82,6 +83,33 @@ def test_where_no_patch_finds_its_spot_alone_all_of_them_together_give_the_pose(
     monkeypatch.setattr(AgreedPose, "at", lambda *_: None)  # and without these the place of the belief remains
     frames.put(2, view(ground, PINHOLE, R, TRUE_M))
     assert match(node, 2, 10.0).coarse
+
+
+@pytest.mark.parametrize(("sigma_m", "asked"), [(0.019 * AGL_M, False), (0.021 * AGL_M, True)])
+def test_a_pose_of_single_patches_that_claims_little_is_one_of_all_patches(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch, sigma_m: float, asked: bool
+) -> None:
+    heard, together = list[bool](), AgreedPose.at
+    monkeypatch.setattr("terrafix.anchor.node.ground_sigma_m", lambda *_: sigma_m)
+    monkeypatch.setattr(AgreedPose, "at", lambda *of: heard.append(True) or together(*of))
+    node, frames = started(ground)
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    said = match(node, 1, 10.0)
+    assert said.verdict is Verdict.ACCEPTED and not said.coarse
+    assert np.linalg.norm(np.array(said.p_c_in_w_m) - TRUE_M) < 3.0
+    assert bool(heard) is asked
+    monkeypatch.setattr(AgreedPose, "at", lambda *_: None)  # where these say nothing the first one stays
+    frames.put(2, view(ground, PINHOLE, R, TRUE_M))
+    assert not match(node, 2, 10.0).coarse
+
+
+def test_what_tilt_and_position_trade_does_not_move_the_ground_that_is_seen() -> None:
+    lever = np.zeros((6, 1))
+    lever[0], lever[4] = AGL_M, 1.0  # east, and as much about north as takes the ground back
+    cov = np.diag([4.0, 1.0, 9.0, 1e-12, 1e-12, 1e-4]) + lever @ lever.T * np.radians(10.0) ** 2
+    said = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="", cov=tuple(cov.ravel()))
+    assert ground_sigma_m(said, AGL_M) == pytest.approx(2.0, abs=1e-3)
+    assert ground_sigma_m(msgspec.structs.replace(said, cov=None), AGL_M) == np.inf
 
 
 def test_an_unusable_picture_is_skipped(ground: np.ndarray) -> None:

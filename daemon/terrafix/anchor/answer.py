@@ -1,5 +1,7 @@
 """What the matcher found, as MapMatch says it: a pose from 2D-3D matches, or the position of the mode alone."""
 
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 
@@ -69,6 +71,21 @@ def judged(answer: MapMatch, fix: Fix | None, view: View) -> MapMatch:
         inliers=int(pnp.inliers.sum()),
         reprojection_px=float(np.sqrt(np.mean(pnp.fit.residuals**2))) * view.agl_m / fix.cell_m,
     )
+
+
+def ground_cov_m2(cov: Sequence[float], agl_m: float) -> np.ndarray:
+    """(2, 2), east and north, of the ground that a pose shows below the camera. ``cov`` (36,) of the pose, in the order
+    of the messages: what tilt and position trade against each other does not move that ground."""
+    # A rotation about north moves what is seen to the west, one about east to the north.
+    lever = np.hstack([np.eye(2), np.zeros((2, 1)), agl_m * np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])])
+    return np.asarray(lever @ np.reshape(cov, (6, 6)) @ lever.T)
+
+
+def ground_sigma_m(answer: MapMatch, agl_m: float) -> float:
+    """1-sigma of that ground, in the worst direction; infinite without a pose."""
+    if answer.cov is None:
+        return float(np.inf)
+    return float(np.sqrt(np.linalg.eigvalsh(ground_cov_m2(answer.cov, agl_m))[-1]))
 
 
 def found(answer: MapMatch, fix: Fix, view: View, jump_m: tuple[float, float]) -> MapMatch:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
-from terrafix.anchor.answer import coarse, judged
+from terrafix.anchor.answer import coarse, ground_sigma_m, judged
 from terrafix.anchor.belief import Belief, cell_for
 from terrafix.anchor.layers import Dated, Layers
 from terrafix.anchor.lost import LostWatch
@@ -13,6 +13,7 @@ from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.matcher import view_at
 from terrafix.anchor.model_watch import ModelWatch
+from terrafix.anchor.place_check import SIGMA_FLOOR
 from terrafix.anchor.place_search import PlaceSearch, anywhere_m, start_around
 from terrafix.anchor.tracks import NEAR
 from terrafix.anchor.views import ground_plane, view_of
@@ -216,7 +217,8 @@ class AnchorNode:
             answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
             if answer.verdict is Verdict.ACCEPTED:
                 inliers = answer.inliers
-            else:
+            # Single patches that say less than all of them may be aside together: these know it better.
+            if answer.verdict is not Verdict.ACCEPTED or ground_sigma_m(answer, view.agl_m) > SIGMA_FLOOR * view.agl_m:
                 agreed = used.agreed.at(image, view_at(view, hypothesis, mode.e_m, mode.n_m))
                 together = answer if agreed is None else judged(answer, agreed, view)
                 answer = together if together.verdict is Verdict.ACCEPTED else answer

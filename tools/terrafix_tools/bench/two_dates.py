@@ -22,6 +22,7 @@ import numpy as np
 import typer
 from pyproj import Transformer
 
+from terrafix.anchor.answer import ground_cov_m2
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.node import AnchorNode
 from terrafix.core.config import load
@@ -188,9 +189,7 @@ def middle_of(match: MapMatch) -> tuple[np.ndarray, np.ndarray]:
         believed = np.array([match.mode_e_m, match.mode_n_m]), np.reshape(match.belief_cov_m2, (2, 2))
         return believed[0], believed[1] + map_m2 + 1e-6 * np.eye(2)
     p, axis = np.array(match.p_c_in_w_m), rot_from_quat(match.q_w_c)[:, 2]
-    # A rotation about north moves what is seen to the west, one about east to the north.
-    lever = np.hstack([np.eye(2), np.zeros((2, 1)), p[2] * np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])])
-    return (p - axis * (p[2] / axis[2]))[:2], lever @ np.reshape(match.cov, (6, 6)) @ lever.T + map_m2
+    return (p - axis * (p[2] / axis[2]))[:2], ground_cov_m2(match.cov, p[2]) + map_m2
 
 
 def row(name: str, places: list[Answer], elsewhere: list[Answer]) -> str:
