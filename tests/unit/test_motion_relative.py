@@ -157,3 +157,7 @@ def test_two_thousand_steps_keep_the_rotation_a_rotation() -> None:
         now = (after[0], np.array([0.0, 0.0, AGL_M]))
     assert r_chain.T @ r_chain == pytest.approx(np.eye(3), abs=1e-9)
     assert np.linalg.det(r_chain) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_wrong_height_stretches_a_way_by_its_share() -> None:
+    assert Ground(100.0, 3.0, level_share=0.04).stretch_sigma == pytest.approx(0.05)

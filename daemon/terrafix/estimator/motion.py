@@ -53,6 +53,11 @@ class Ground:
         """Of the plane, beyond what is wrong with the height itself."""
         return (self.level_share + ROOF_SCALE_SIGMA * (1.0 - self.share) ** 2) * self.height_m
 
+    @property
+    def stretch_sigma(self) -> float:
+        """Of a way over it, a share of that."""
+        return float(np.hypot(self.height_sigma_m, self.level_sigma_m)) / self.height_m
+
 
 def relative_pose(
     pairs: np.ndarray,
@@ -95,7 +100,7 @@ def relative_pose(
     cov = fit.cov.copy()
     # A wrong height scales the translation; the tangent's translation is in the new camera's axes.
     t_new = fit.r_w_c.T @ fit.p_c_in_w_m
-    cov[3:, 3:] += np.outer(t_new, t_new) * (ground.height_sigma_m**2 + ground.level_sigma_m**2) / height_m**2
+    cov[3:, 3:] += np.outer(t_new, t_new) * ground.stretch_sigma**2
     up = fit.r_w_c[2]
     cov[3:, 3:] += ground.rise_sigma_m**2 * np.outer(up, up)
     # A wrong slope of the plane turns the camera by about slope times base over height.

@@ -173,13 +173,14 @@ class Tracker:
         step_sigma = STANDING_M if way is None else float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1]))
         if known is not None:
             seen = r_w_c @ motion.cov[3:, 3:] @ r_w_c.T
-            # Of the step over the ground: where no map tells how that rises, the height is known far less well. A
-            # wrong height stretches all of the way since the keyframe alike; the frame before had its part of that.
-            aside_m = np.sqrt(np.linalg.eigvalsh(seen[:2, :2])[-1])
-            if parent == self._seen_from:
-                way_m = np.hypot(*(p - self.graph.state(parent).pose.translation())[:2])
-                aside_m *= min(np.hypot(*step) / max(way_m, STEP_FLOOR_M), 1.0)
-            step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), aside_m))
+            # Of the step over the ground: where no map tells how that rises, the height is known far less well.
+            aside_m2 = float(np.linalg.eigvalsh(seen[:2, :2])[-1])
+            if parent == self._seen_from and motion.seen is not None:
+                # A wrong height stretches all of the way since the keyframe alike; the frame before had its part of it.
+                way_m2 = float(np.sum((p - self.graph.state(parent).pose.translation())[:2] ** 2))
+                stretch2 = motion.seen.ground.stretch_sigma**2
+                aside_m2 = max(aside_m2 - way_m2 * stretch2, 0.0) + float(step @ step) * stretch2
+            step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), np.sqrt(aside_m2)))
             if way is not None:
                 way, spread = believed(way, p - led_to, spread, seen)
         if self.mode is CovarianceMode.JACOBIAN:
