@@ -158,6 +158,9 @@ def test_outside_is_zero_and_invalid_and_edges_are_sharp(tmp_path: Path, height:
     assert package.covers((south + north) / 2, (west + east) / 2)
     assert not package.covers(south - 0.01, west)
     assert not package.covers(-80.0, 10.0)
+    beyond = LocalFrame((south + north) / 2, (west + east) / 2).to_wgs84(0.0, n_max + 80.0)
+    assert not package.covers(*beyond)
+    assert package.covers_start(*beyond, 60.0) and not package.covers_start(*beyond, 10.0)
     package.close()
 
 

@@ -9,6 +9,7 @@ from terrafix.core.errors import MapError
 from terrafix.core.signature import trusted_keys
 from terrafix.core.start import middle_of, start_is_unknown
 from terrafix.vision.sources import open_configured, parse_start
+from terrafix.vision.sources.description import START_SIGMA_M
 
 
 def package_for(source: str, start: str, map_path: Path | None, configs: list[Path]) -> tuple[Path, float | None]:
@@ -24,12 +25,13 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     given = map_path or (Path(config.map.path) if config.map.path else None)
     unknown = False
     place: tuple[float, float] | None = parse_start(start or config.source.start)
+    sigma_m = START_SIGMA_M
     if not spec or (os.path.exists(os.path.expanduser(spec)) and not spec.startswith("/dev/")):
         opened = open_configured(config.source, spec, place)
         given = given or opened.map_hint()
         origin = opened.origin()
         unknown = start_is_unknown(origin)
-        place = None if unknown else (origin.lat_deg, origin.lon_deg)
+        place, sigma_m = None if unknown else (origin.lat_deg, origin.lon_deg), origin.start_sigma_m
         opened.close()
     if given is None:
         raise MapError("no map: give one with --map (GeoTIFF or map package) or [map] path")
@@ -39,7 +41,7 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     with_map = MapPackage.open(package, verify=trusted is not None, trusted=trusted)
     ground_amsl_m = None
     try:
-        if place is not None and not with_map.covers(*place):
+        if place is not None and not with_map.covers_start(*place, sigma_m):
             raise MapError(
                 f"{package}: has no imagery at the start {place[0]:.6f}, {place[1]:.6f}; use another --map or check it"
             )

@@ -190,7 +190,7 @@ def _check_map(package: Path, origin: Origin) -> tuple[Origin, dict[str, Any]]:
         origin = placed(origin, opened.manifest.bounds_wgs84)
         frame = LocalFrame(origin.lat_deg, origin.lon_deg)
         local = opened.bind(frame)
-        if not unknown and not opened.covers(origin.lat_deg, origin.lon_deg):
+        if not unknown and not opened.covers_start(origin.lat_deg, origin.lon_deg, origin.start_sigma_m):
             raise MapError(f"{package}: {_not_covered(origin, local.bounds_m)}; use another --map or check the start")
         if origin.ground_amsl_m is None:
             ground_m = opened.ground_amsl_m(origin.lat_deg, origin.lon_deg)

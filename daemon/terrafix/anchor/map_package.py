@@ -118,6 +118,16 @@ class MapPackage:
         up = self.bind(LocalFrame(lat_deg, lon_deg)).elevation(here, here)
         return float(up[0]) if up is not None and np.isfinite(up[0]) else None
 
+    def covers_start(self, lat_deg: float, lon_deg: float, sigma_m: float) -> bool:
+        """Whether a start that is known to ``sigma_m`` may lie in valid imagery: somewhere within three of them."""
+        frame = LocalFrame(lat_deg, lon_deg)
+        ways_m = [(0.0, 0.0)] + [
+            (k * sigma_m * math.sin(math.radians(course_deg)), k * sigma_m * math.cos(math.radians(course_deg)))
+            for k in (1, 2, 3)
+            for course_deg in range(0, 360, 30)
+        ]
+        return any(self.covers(*frame.to_wgs84(e_m, n_m)) for e_m, n_m in ways_m)
+
     def covers(self, lat_deg: float, lon_deg: float, layer: str | None = None) -> bool:
         """Whether the place lies in valid imagery of a layer; None: the newest."""
         found = self.layer(layer)
