@@ -166,6 +166,13 @@ def test_odometry_moves_a_track() -> None:
     assert (track.e_m, track.n_m) == (13.0, 16.0)
 
 
+def test_a_track_moves_by_its_own_heading_and_height() -> None:
+    """Odometry tells steps as the predicted heading and height have them; a search has others."""
+    track = Track(10.0, 20.0, Hypothesis(np.pi / 2, 1.5))
+    track.moved(np.array([4.0, 0.0]))  # east, and a quarter turn counter-clockwise of that is north
+    assert (track.e_m, track.n_m) == pytest.approx((10.0, 26.0))
+
+
 def test_a_proposal_near_a_track_replaces_it_until_a_frame_has_spoken_for_it(ground: np.ndarray) -> None:
     tracks = searched(BoundedMap(ground), None).tracks
     for e_m in (0.0, 0.15 * AGL_M):

@@ -90,6 +90,8 @@ class Track:
         return self.lead >= LEADING or (self.score > WORST and max(self.leads[-1:], default=0.0) > HOPELESS)
 
     def moved(self, step_m: np.ndarray) -> None:
+        """``step_m`` (2,): east, north, by odometry, as the predicted heading and height have it."""
+        step_m = self.hypothesis.scale * local_rotation_up(self.hypothesis.yaw_rad)[:2, :2] @ step_m
         self.e_m += float(step_m[0])
         self.n_m += float(step_m[1])
 
