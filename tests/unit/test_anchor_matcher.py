@@ -67,11 +67,30 @@ def test_the_grid_covers_one_and_a_half_sigmas(yaw_sigma_deg: float, scale_sigma
     assert yaws == pytest.approx([-y for y in reversed(yaws)])
 
 
-def test_no_compass_means_all_round_and_stays_affordable() -> None:
-    grid = _hypotheses(seen_from(yaw_sigma_deg=170.0, scale_sigma=0.4))
+def test_no_compass_means_all_round() -> None:
+    grid = _hypotheses(seen_from(yaw_sigma_deg=170.0, scale_sigma=0.02))
     assert len(grid) <= MAX_HYPOTHESES
     yaws = np.sort(np.degrees([h.yaw_rad for h in grid if h.scale == 1.0]))
     assert yaws[0] <= -172.0 and yaws[-1] >= 172.0 and np.diff(yaws).max() <= 8.0
+
+
+def test_neither_compass_nor_height_means_every_heading_at_every_height() -> None:
+    grid = _hypotheses(seen_from(yaw_sigma_deg=170.0, scale_sigma=0.4))
+    yaws, scales = sorted({h.yaw_rad for h in grid}), sorted({h.scale for h in grid})
+    assert MAX_HYPOTHESES < len(grid) == len(yaws) * len(scales) < 350
+    assert yaws[0] <= np.radians(-172.0) and yaws[-1] >= np.radians(172.0) and np.diff(yaws).max() <= np.radians(13.0)
+    assert scales[0] <= 0.63 and scales[-1] >= 1.6 and 1.0 in scales
+    assert np.diff(np.log(scales)).max() <= 0.101
+
+
+def test_one_frame_looks_at_no_more_than_it_can_pay_for_and_the_next_at_the_rest(matcher: FrameMatcher) -> None:
+    grid = _hypotheses(seen_from(yaw_sigma_deg=170.0, scale_sigma=0.4))
+    turns = [matcher._in_turn(grid) for _ in range(4)]
+    assert max(len(turn) for turn in turns) < 1.1 * MAX_HYPOTHESES
+    assert sorted((h.yaw_rad, h.scale) for turn in turns for h in turn) == sorted((h.yaw_rad, h.scale) for h in grid)
+    assert 1.0 in {h.scale for h in turns[0]} and matcher._in_turn(grid) == turns[0]
+    few = _hypotheses(seen_from(yaw_sigma_deg=8.0, scale_sigma=0.1))
+    assert matcher._in_turn(few) == few == matcher._in_turn(few)
 
 
 # --- looking ------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """One frame against the map: the whole correlation surface, then 2D-3D matches in the mode that the belief chose."""
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -127,6 +128,7 @@ class FrameMatcher:
         self.camera = camera
         self._map = source
         self._describer = describer
+        self._turn = 0
         self._features = MapFeatures(source, describer, cache_bytes)
         # Many channels over a wide window are slow; oriented gradients find the place as well, at a tenth of the cost.
         self.gradients = describer if describer.stride == 1 else GradientDescriber()
@@ -156,7 +158,7 @@ class FrameMatcher:
     def look(self, image: Image, view: View, belief: Window) -> Look:
         """Correlation over the belief's window, for every rotation and scale that the prediction leaves open."""
         describer, features = self._describer, self._features
-        hypotheses = _hypotheses(view)
+        hypotheses = self._in_turn(_hypotheses(view))
         gsd = self._gsd(view.agl_m, LOOK_GSD_PER_AGL, describer)
         most = float(np.sqrt(MAX_WINDOW_VALUES / describer.channels))
         if len(hypotheses) > 1 or 2 * belief.half_m / (gsd * describer.stride) > most:
@@ -238,6 +240,16 @@ class FrameMatcher:
         pnp = solve(points, xy, found.weight, view.r_w_c, view.agl_m, floor, threshold, reach_share)
         return Fix(xy, points, found.weight, pnp, cell)
 
+    def _in_turn(self, hypotheses: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
+        """As many as one frame can pay for: some of the heights, that of the prediction among the first, and others in
+        the next frame. A height that does not fit says nothing of any place: the belief waits for one that does."""
+        turns = math.ceil(len(hypotheses) / MAX_HYPOTHESES)
+        scales = sorted({h.scale for h in hypotheses})
+        middle = scales.index(1.0)
+        chosen = {scale for i, scale in enumerate(scales) if (i - middle - self._turn) % turns == 0}
+        self._turn = (self._turn + 1) % turns
+        return tuple(h for h in hypotheses if h.scale in chosen)
+
     def _gsd(self, agl_m: float, per_agl: dict[str, float], describer: Describer) -> float:
         return self.cell_m(agl_m, per_agl[describer.name])
 
@@ -278,10 +290,15 @@ def _describe(frame: Rectified, describer: Describer) -> tuple[np.ndarray, np.nd
 
 
 def _hypotheses(view: View) -> tuple[Hypothesis, ...]:
-    """Grid over one and a half sigmas of heading and scale, as far as they are not known well enough."""
-    yaws = _grid(min(1.5 * view.yaw_sigma_rad, np.pi), YAW_TOLERANCE_RAD, YAW_STEP_RAD)
-    scales = [1.0 + s for s in _grid(min(1.5 * view.scale_sigma, 0.5), SCALE_TOLERANCE, SCALE_STEP)]
-    return _pairs(yaws, scales)
+    """Grid over one and a half sigmas of heading and scale, as far as they are not known well enough. Where both are
+    open, all of both on coarser steps: no heading fits at a height that was not tried."""
+    half_yaw, half_scale = min(1.5 * view.yaw_sigma_rad, np.pi), min(1.5 * view.scale_sigma, 0.5)
+    yaws = _grid(half_yaw, YAW_TOLERANCE_RAD, YAW_STEP_RAD)
+    scales = [1.0 + s for s in _grid(half_scale, SCALE_TOLERANCE, SCALE_STEP)]
+    if len(yaws) * len(scales) > MAX_HYPOTHESES:
+        yaws = _spread(half_yaw, YAW_TOLERANCE_RAD, WIDE_YAW_RAD)
+        scales = [float(np.exp(s)) for s in _spread(half_scale, SCALE_TOLERANCE, WIDE_SCALE)]
+    return tuple(Hypothesis(y, s) for y, s in itertools.product(yaws, scales))
 
 
 def _pairs(yaws: list[float], scales: list[float]) -> tuple[Hypothesis, ...]:
