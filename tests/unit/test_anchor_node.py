@@ -11,6 +11,7 @@ from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
 
 from terrafix.anchor.agreed import AgreedPose
 from terrafix.anchor.answer import ground_sigma_m
+from terrafix.anchor.belief import Belief
 from terrafix.anchor.lost import LostWatch
 from terrafix.anchor.matcher import FrameMatcher
 from terrafix.anchor.node import AnchorNode
@@ -20,6 +21,8 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import MapMatch, Prediction, SearchState, SearchStep, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
+
+CELL_M = 2.0  # of a belief
 
 
 @pytest.fixture(scope="module")
@@ -199,6 +202,42 @@ def test_every_step_of_the_escalation_is_said(ground: np.ndarray, monkeypatch: p
         patched.setattr(MapSearch, "step", SearchStep.ASK)
         fly(8, picture)
     assert said == [SearchStep.WIDEN, SearchStep.ASK]
+
+
+@pytest.mark.parametrize(("heading_sigma_rad", "spreads"), [(0.03, False), (3.0, True)])
+def test_without_a_heading_a_step_leads_anywhere(ground: np.ndarray, heading_sigma_rad: float, spreads: bool) -> None:
+    node, _ = started(ground)
+    for frame_id, step_m in ((1, 0.0), (2, 30.0)):
+        said = predicted(frame_id, 10.0, step_m=step_m)
+        list(node.on(msgspec.structs.replace(said, cov=(*said.cov[:35], heading_sigma_rad**2))))
+    belief = node._belief
+    assert belief is not None and (np.sqrt(belief.covariance()[2]) > 25.0) == spreads
+
+
+@pytest.mark.parametrize(("heading_sigma_rad", "tried"), [(0.03, False), (3.0, True)])
+def test_without_a_heading_a_pose_is_tried_at_any_mode(
+    ground: np.ndarray, heading_sigma_rad: float, tried: bool
+) -> None:
+    node, frames = started(ground)
+    said = predicted(1, 10.0)
+    said = msgspec.structs.replace(said, cov=(*said.cov[:35], heading_sigma_rad**2))
+    list(node.on(said))  # the belief begins
+    node._belief = Belief(float(TRUE_M[0]), float(TRUE_M[1]), 80.0, CELL_M)
+    node._since_look_m = 0.0  # ground that was just seen counts little
+    frames.put(2, view(ground, PINHOLE, R, TRUE_M))
+    answer, *_ = node.on(msgspec.structs.replace(said, frame_id=2))
+    assert isinstance(answer, MapMatch) and answer.verdict is Verdict.AMBIGUOUS
+    assert (answer.inliers > 0) == tried
+
+
+def test_a_search_goes_on_along_chosen_axes(ground: np.ndarray) -> None:
+    """Its places move by their own headings: what the position owes to the heading says nothing of the step."""
+    node, frames = started(ground, start_sigma_m=500.0)
+    for frame_id, sigma_m in ((1, 500.0), (2, 600.0)):
+        frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
+        said = predicted(frame_id, sigma_m, step_m=5.0)
+        list(node.on(msgspec.structs.replace(said, cov=(*said.cov[:35], 9.0))))
+    assert not node._torn
 
 
 def test_another_flight_begins_with_nothing_of_the_last_one(ground: np.ndarray) -> None:

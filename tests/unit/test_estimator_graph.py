@@ -84,13 +84,16 @@ def test_numbers_that_break_cost_confidence_and_nothing_else() -> None:
     assert [p.frame_id for p in refined.poses] == list(range(90))
 
 
-def test_a_frame_that_breaks_the_graph_is_where_it_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("said", [RuntimeError, OverflowError])
+def test_a_frame_that_breaks_the_graph_is_where_it_begins_anew(
+    monkeypatch: pytest.MonkeyPatch, said: type[Exception]
+) -> None:
     flight = Flight(60, seed=6)
     run = Listener().fly(flight, 0, 45)
     graph, before = graph_of(run), sigma_m(run.estimate(44))
 
     def indeterminate(*_: object) -> None:
-        raise RuntimeError
+        raise said
 
     monkeypatch.setattr(graph._smoother, "insert", indeterminate)  # which is thrown away with it
     run.hear([m for m in flight.messages(45) if not isinstance(m, MapMatch)])

@@ -92,6 +92,16 @@ def test_what_was_flown_before_the_place_was_found_is_put_right(knows: set[str])
     assert found.placed.all() and found.believed.all()
 
 
+def test_a_start_whose_heading_nobody_knows_is_a_start_all_the_same() -> None:
+    """In flight its heading was chosen; here it is open, and the coordinate agrees with the map."""
+    flight = Flight(60, seed=4, knows=frozenset({"attitude", "height"}), dem=True)
+    retold = told(flight, lambda m: unmatched(m) if isinstance(m, MapMatch) and m.frame_id < 27 else m)
+    found = smooth(retold)
+    assert found.start_believed == {0: True}
+    poses = [found.poses[retold.node_of[i]].translation() for i in range(flight.frames)]
+    assert np.hypot(*(np.array(poses) - flight.p_m)[:, :2].T).max() < 15.0
+
+
 def test_a_doubt_that_nothing_ended_is_kept() -> None:
     """The map said that the vehicle is not where it is believed to be, and its place was not found again."""
     flight = Flight(60, seed=9)

@@ -50,6 +50,7 @@ START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is 
 # degree more than in the frame before moves it. At most: whose tilt is known better sways less. Every frame adds it,
 # and a slow copter at two frames a second sees little new ground that would take it away again.
 SWAY = 0.02
+UNKNOWN_HEADING_RAD = 1.5  # 1-sigma from which a heading says nothing
 POOR_SCORE = 2.0  # standardised correlation in the mode; a frame at the right place scores 3 to 10
 POOR_LOOKS = 4.0  # full looks below it before the search widens
 WIDEN = 1.6
@@ -211,7 +212,8 @@ class AnchorNode:
             mode_n_m=mode.n_m,
             belief_cov_m2=(ee, en, en, nn),
         )
-        tried = mode.mass >= MODE_TRIED
+        # Without a heading the belief spreads as fast as frames narrow it, until a pose tells the heading.
+        tried = mode.mass >= MODE_TRIED or heading_is_open(prediction)
         inliers = 0
         if tried:
             answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
@@ -251,7 +253,8 @@ class AnchorNode:
         step_var = max(prediction.step_cov_m2[0], prediction.step_cov_m2[3])
         grown = variance - self._variance_m2
         self._variance_m2 = variance
-        sigma_m = float(np.sqrt(max(step_var, grown)))
+        turned = heading_is_open(prediction)  # a step may lead anywhere
+        sigma_m = float(np.sqrt(step_var if turned else max(step_var, grown)))
         self._torn = self._belief is not None and sigma_m > NEAR * prediction.agl_m
         if self._belief is None:
             e_m, n_m, _ = prediction.p_c_in_w_m
@@ -263,9 +266,12 @@ class AnchorNode:
                 around_m = start_around(e_m, n_m, origin.start_sigma_m, best.map)
                 self._search.begin(best, prediction.agl_m, around_m)
         elif self._search.is_on:
-            # Heading and scale, by which an unknown position grows worse, are what the search tries itself.
+            # Heading and scale, by which an unknown position grows worse, are what the search tries itself: it moves each
+            # place by its own.
             self._search.move(prediction.step_m, float(np.sqrt(step_var)))
         else:
+            if turned:
+                sigma_m = float(np.sqrt(max(step_var + step_m**2, grown)))
             sway = min(SWAY, float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))))
             self._belief.move(*prediction.step_m, float(np.hypot(sigma_m, sway * prediction.agl_m)))
             self._belief.fit_window(0.0)
@@ -280,6 +286,11 @@ class AnchorNode:
         if self._poor_looks >= POOR_LOOKS:
             self._poor_looks = 0.0
             belief.fit_window(belief.half_m * WIDEN)
+
+
+def heading_is_open(prediction: Prediction) -> bool:
+    """Nobody knows it."""
+    return prediction.cov[35] > UNKNOWN_HEADING_RAD**2
 
 
 def make_node(ctx: NodeContext) -> AnchorNode:

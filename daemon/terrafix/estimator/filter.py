@@ -20,6 +20,7 @@ from terrafix.estimator.rival import Rival
 from terrafix.estimator.seen_ground import SeenGround
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.tracker import STEP_SHARE, Advance, Feel, Tracker, nothing_felt
+from terrafix.estimator.velocity import V_SIZE, unknown_cov
 from terrafix.messages import CovarianceMode, MapMatch, Odometry, Origin, Verdict
 
 GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
@@ -83,6 +84,10 @@ class Estimator(Tracker):
         if match.found:  # by a search, over several frames: it outweighs whatever the graph believes
             self.rival = Rival()
             return self._restart(match, node, measured, cov, "found")
+        if self._turns_about_m is not None:
+            if match.coarse:  # its heading is one of those that were tried
+                return FixResult(Verdict.AMBIGUOUS, None, "a coarse fix does not tell the heading")
+            return self._restart(match, node, measured, cov, "heading found")
         predicted = self.graph.state(node).pose
         spread = float(np.sqrt(np.max(np.diag(tangent_to_world(self._covariance(node), r_w_c))[:2])))
         if match.coarse and spread > COARSE_CONTINUES * height:
@@ -151,10 +156,11 @@ class Estimator(Tracker):
         if match.found:  # the ground there lies at another height than the one that was assumed
             bias[HEIGHT] -= float(measured.translation()[2] - was.pose.translation()[2])
         bias_cov = self.graph.bias_covariance(self.graph.newest)
+        velocity = now.velocity
         self._velocity_cov = RESTART_INFLATION * self.graph.velocity_covariance(self.graph.newest)
-        self.graph.start(
-            now_s, NodeState(measured.compose(onward), bias, now.velocity), cov, bias_cov, self._velocity_cov
-        )
+        if self._turns_about_m is not None:  # it was one along axes that nobody knew
+            velocity, self._velocity_cov, self._turns_about_m = np.zeros(V_SIZE), unknown_cov(), None
+        self.graph.start(now_s, NodeState(measured.compose(onward), bias, velocity), cov, bias_cov, self._velocity_cov)
         assert self._last is not None
         self._felt = self._stood_at = None
         self._is_frame(self.graph.newest, self._last.frame_id)

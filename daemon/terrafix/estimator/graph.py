@@ -109,14 +109,16 @@ class PoseGraph:
         bias_cov: np.ndarray,
         velocity_cov: np.ndarray,
         attitude: gtsam.CustomFactor | None = None,
+        held: np.ndarray | None = None,
     ) -> int:
         """First node, or the first after a loss: priors on C (tangent covariance 6x6), B (6x6) and V (8x8).
+        ``held`` stands for that of C here, when part of the pose is not known but chosen.
 
         The past stays as it was estimated."""
         node = self._next
         self._leave_all()
         self._renew()
-        factors = _priors(node, state, cov, bias_cov, velocity_cov)
+        factors = _priors(node, state, cov if held is None else held, bias_cov, velocity_cov)
         if attitude is not None:
             factors.add(attitude)
         self._insert(t_s, state, factors)
@@ -217,7 +219,7 @@ class PoseGraph:
         try:
             work()
             healthy = bool(np.isfinite(self.state(self.newest).pose.matrix()).all())
-        except RuntimeError:  # how GTSAM says that a system is indeterminate
+        except (RuntimeError, OverflowError):  # how GTSAM, and a factor, say that a system is indeterminate
             healthy = False
         if not healthy:
             self._rebuild()

@@ -42,6 +42,7 @@ COMPASS_BIAS_RAD = np.radians(10.0)
 HEIGHT_BIAS = 0.05  # of the height
 TAKE_OFF_AWAY = 5.0  # heights: from where it took off to where it is first seen in the air, a climb at 20 %
 FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
+CHOSEN_RAD = np.radians(1.0)  # 1-sigma of a heading that is chosen, in axes of its own
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
@@ -99,6 +100,7 @@ class Tracker:
         self._blind = False  # ... nor felt
         self._last: Placed | None = None  # newest frame
         self._began_with = (False, False)  # heading, height
+        self._turns_about_m: np.ndarray | None = None  # (2,) nobody said the heading: all may turn about this start
         self._known = known
         self._first_s = 0.0  # when the graph began first
 
@@ -295,6 +297,12 @@ class Tracker:
         wide = np.diag([1.0, 1.0, UNKNOWN_RAD, sigma_m, sigma_m, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
+        # A heading that nobody says is a choice of axes, not something to be estimated: no pair and no leg tells it.
+        # A graph that leaves it open is soon sure of a wrong one, because it is linearised at another one each time.
+        self._turns_about_m = np.array(at_m) if attitude.yaw_rad is None else None
+        held = cov_world.copy()
+        if self._turns_about_m is not None:
+            held[5, 5] = CHOSEN_RAD**2
         self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
         self._felt = self._stood_at = None
         node = self.graph.start(
@@ -304,6 +312,7 @@ class Tracker:
             bias_cov,
             self._velocity_cov,
             self.camera.factor(self.graph.next_keys(), attitude, r_w_c, self.terrain.ground_m),
+            world_to_tangent(held, r_w_c),
         )
         self._is_frame(node, frame_id)
         self._last = self._placed(frame_id, t_s, node)
@@ -376,8 +385,16 @@ class Tracker:
         if self.mode is CovarianceMode.MARGINALS and node == self.graph.newest:
             self._velocity_cov = self.graph.velocity_covariance(node)
         state = self.graph.state(node)
-        velocity = state.velocity[:3]
-        return Placed(frame_id, t_s, state.pose, self._covariance(node), velocity, self._velocity_cov[:3, :3], node)
+        velocity, velocity_cov, cov = state.velocity[:3], self._velocity_cov[:3, :3], self._covariance(node)
+        if self._turns_about_m is not None:
+            r_w_c, p = state.pose.rotation().matrix(), state.pose.translation()
+            level = np.diag([1.0, 1.0, 0.0])
+            turned = np.zeros((6, 6))
+            turned[:3, :3] = float(np.sum((p[:2] - self._turns_about_m) ** 2)) * level
+            turned[5, 5] = UNKNOWN_RAD**2
+            cov = cov + world_to_tangent(turned, r_w_c)
+            velocity_cov = velocity_cov + float(velocity[:2] @ velocity[:2]) * level
+        return Placed(frame_id, t_s, state.pose, cov, velocity, velocity_cov, node)
 
     def _covariance(self, node: int) -> np.ndarray:
         """Of C_node, 6x6, tangent order: the smoother's marginal, or under thermal throttle what the chain of motions

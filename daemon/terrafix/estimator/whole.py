@@ -74,6 +74,7 @@ class WholeGraph(PoseGraph):
         bias_cov: np.ndarray,
         velocity_cov: np.ndarray,
         attitude: gtsam.CustomFactor | None = None,
+        held: np.ndarray | None = None,
     ) -> int:
         self.remember()
         self._noted = WholeNode(t_s, state, [])
@@ -83,7 +84,7 @@ class WholeGraph(PoseGraph):
             self._noted.parent, self._noted.again = self.newest, True
         else:
             self._noted.prior = state.pose, cov
-        node = super().start(t_s, state, cov, bias_cov, velocity_cov, attitude)
+        node = super().start(t_s, state, cov, bias_cov, velocity_cov, attitude, held)
         if again:
             self.nodes[node].factors = _same_frame(node - 1, node)
         else:
