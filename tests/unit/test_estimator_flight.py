@@ -309,6 +309,20 @@ def test_fixes_over_new_ground_that_agree_with_each_other_win() -> None:
     assert {run.verdicts("odometry")[i].verdict for i in range(restarted + 4, 90)} == {Verdict.ACCEPTED}
 
 
+@pytest.mark.parametrize(("inliers", "second"), [(30, Verdict.ACCEPTED), (15, Verdict.INNOVATION)])
+def test_a_start_that_nothing_confirmed_is_left_for_two_clear_poses(inliers: int, second: Verdict) -> None:
+    flight, offset = Flight(40, seed=9, speed_mps=3.0), (120.0, -90.0)
+    run = Listener()
+    run.hear([ORIGIN])
+    for i in range(40):
+        fixes = [msgspec.structs.replace(flight.fix(i, offset), inliers=inliers)] if i in (20, 22) else []
+        run.hear([*without_fix(flight.messages(i)), *fixes])
+    assert run.verdicts("map")[20].verdict is Verdict.INNOVATION and run.verdicts("map")[22].verdict is second
+    error = error_m(run.estimate(39), flight, offset)[:2]
+    assert (np.linalg.norm(error) < 15.0) == (second is Verdict.ACCEPTED)
+    assert sigma_m(run.estimate(39)) > 50.0  # it may still be the other one
+
+
 def test_a_place_that_was_found_late_is_carried_to_the_newest_frame() -> None:
     """A search answers about a frame from two seconds ago; the vehicle has flown on since."""
     flight, offset = Flight(60, seed=9), (480.0, -340.0)

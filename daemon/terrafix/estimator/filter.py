@@ -16,7 +16,7 @@ from terrafix.estimator.factors import HEIGHT
 from terrafix.estimator.graph import NodeState
 from terrafix.estimator.matched import determined, measured_pose
 from terrafix.estimator.resume import Known
-from terrafix.estimator.rival import Rival
+from terrafix.estimator.rival import AGREEING, Rival
 from terrafix.estimator.seen_ground import SeenGround
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.tracker import STEP_SHARE, Advance, Feel, Tracker, nothing_felt
@@ -31,6 +31,8 @@ COARSE_FINDS_AFTER, COARSE_FINDS_OVER = 6, 1.0  # ... and so many that agree, ov
 RECOVER_AFTER = 3  # fixes that agree with each other and not with the graph
 RECOVER_OVER = 0.5  # of the height: the motion they must span, so that they are not one mistake seen thrice
 RECOVER_MASS = 0.97
+# Patches: of 930 wrong places one gave a pose on so many, and of 400 starts one is wrong (anchor/lost.py).
+OUTWEIGHS_START = 20
 RESTART_INFLATION = 4.0  # of the covariance of the fix that starts the graph anew
 
 
@@ -135,7 +137,10 @@ class Estimator(Tracker):
         if len(self._refused.offsets_m) > 1:
             self.rival.disagreed(self._refused.offsets_m)
             height = float(measured.translation()[2]) - self.terrain.ground_m
-            if self._refused.holds(RECOVER_AFTER, RECOVER_OVER * height) and match.mode_mass >= RECOVER_MASS:
+            # Before the first fix only the start coordinate speaks for the graph: as much as one such pose against it.
+            first = self.last_fix_s is None and match.inliers >= OUTWEIGHS_START
+            needed = (AGREEING, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
+            if self._refused.holds(*needed) and match.mode_mass >= RECOVER_MASS:
                 self.rival.left(offset)
                 return self._restart(match, node, measured, cov, "restarted")
         return FixResult(Verdict.INNOVATION, d2, f"{float(np.hypot(*offset)):.0f} m from the estimate")
