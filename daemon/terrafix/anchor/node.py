@@ -266,8 +266,7 @@ class AnchorNode:
                 around_m = start_around(e_m, n_m, origin.start_sigma_m, best.map)
                 self._search.begin(best, prediction.agl_m, around_m)
         elif self._search.is_on:
-            # Heading and scale, by which an unknown position grows worse, are what the search tries itself: it moves each
-            # place by its own.
+            # Heading and scale, by which an unknown position grows worse, are the search's own for each place.
             self._search.move(prediction.step_m, float(np.sqrt(step_var)))
         else:
             if turned:
