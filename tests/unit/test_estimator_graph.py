@@ -7,8 +7,8 @@ from gtsam.symbol_shorthand import B, C, V
 from simulated_flight import Flight, Listener, cov_of, error_m, sigma_m, t_ns
 
 from terrafix.estimator.factors import BIAS_SIZE
-from terrafix.estimator.graph import BATCH_NODES, LAG_NODES, PoseGraph
-from terrafix.estimator.lag import FixedLag
+from terrafix.estimator.graph import PoseGraph
+from terrafix.estimator.lag import BATCH_NODES, LAG_NODES, FixedLag
 from terrafix.estimator.velocity import V_SIZE
 from terrafix.messages import MapMatch, Refinement, SourceEnded, Verdict
 
@@ -41,27 +41,43 @@ def test_queries_are_of_the_newest_update() -> None:
     assert graph.covariance(37) == pytest.approx(graph._smoother.marginal(C(37)))
 
 
-def test_marginalising_changes_no_estimate() -> None:
-    """Three chains of numbers, against a solution of everything at once."""
-    rng = np.random.default_rng(4)
+@pytest.mark.parametrize("seed", range(6))
+def test_marginalising_changes_no_estimate(seed: int) -> None:
+    """Numbers that hang on the ones before and on those of a keyframe, on one that is held for long, and some of which
+    are told late, against a solution of everything at once."""
+    rng = np.random.default_rng([seed, 4])
     lag, everything = FixedLag(), gtsam.NonlinearFactorGraph()
     start = gtsam.Values()
     unit = gtsam.noiseModel.Unit.Create
-    for i in range(40):
+    for i in range(90):
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for key, size in ((B(i), BIAS_SIZE), (V(i), V_SIZE)):
-            values.insert(key, np.zeros(size))
-            factors.add(gtsam.PriorFactorVector(key, rng.normal(size=size), unit(size)))
-            if i:
-                factors.add(gtsam.BetweenFactorVector(key - 1, key, rng.normal(size=size), unit(size)))
+        stands = 30 <= i < 65
+        keyframe = 29 if stands else max(0, i - int(rng.integers(1, 5)))
+        if stands:
+            lag.keep(keyframe)
+        for key, size in ((B, BIAS_SIZE), (V, V_SIZE)):
+            values.insert(key(i), np.zeros(size))
+            if i == 0 or rng.random() < 0.2:
+                factors.add(gtsam.PriorFactorVector(key(i), rng.normal(size=size), unit(size)))
+            for before in {keyframe, max(0, i - 1)} - {i}:
+                factors.add(gtsam.BetweenFactorVector(key(before), key(i), rng.normal(size=size), unit(size)))
         values.insert(C(i), gtsam.Pose3())
         factors.add(gtsam.PriorFactorPose3(C(i), gtsam.Pose3(), unit(6)))
+        lag.insert(i, factors, values)
+        if i > LAG_NODES and rng.random() < 0.4:
+            late = gtsam.NonlinearFactorGraph()
+            node = i - int(rng.integers(0, LAG_NODES))
+            late.add(gtsam.PriorFactorVector(V(node), rng.normal(size=V_SIZE), unit(V_SIZE)))
+            if not stands or i < 30 + LAG_NODES:
+                lag.add(late)
+                factors.push_back(late)
         everything.push_back(factors)
         start.insert(values)
-        lag.insert(i, factors, values, range(i - 15, i - 10) if i % 5 == 0 and i >= 15 else ())
     exact = gtsam.LevenbergMarquardtOptimizer(everything, start).optimize()
     marginals = gtsam.Marginals(everything, exact)
-    for key in (B(39), V(39), V(35)):
+    held = [n for n in range(90) if lag.holds(n)]
+    assert len(held) >= LAG_NODES
+    for key in [variable(n) for n in held for variable in (B, V)]:
         assert lag.vector(key) == pytest.approx(exact.atVector(key), abs=1e-6)
         assert lag.marginal(key) == pytest.approx(marginals.marginalCovariance(key), rel=1e-6, abs=1e-9)
 

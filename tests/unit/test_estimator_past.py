@@ -15,7 +15,6 @@ from terrafix.estimator.velocity import V_SIZE
 STEP_M, TURN_RAD = np.array([6.0, 0.0, 0.0]), 0.02
 ODOMETRY = np.array([0.003, 0.003, 0.006, 0.3, 0.3, 0.3])  # 1-sigma
 FIX = np.array([0.02, 0.02, 0.02, 2.0, 2.0, 2.0])
-LAG, BATCH = 15, 5
 
 
 def random_chain(nodes: int, rng: np.random.Generator) -> list[Linear]:
@@ -112,15 +111,16 @@ class Chain:
         past.begin(0)
         lag, window = FixedLag(), list[int]()
         for i, (factors, (parent, motion)) in enumerate(zip(self.factors, self.steps, strict=True)):
-            held = self.stands[:1] if i in self.stands else range(0)
-            leaving = [n for n in window if n < i - LAG and n not in held] if i % BATCH == 0 else []
+            if i in self.stands[1:]:
+                lag.keep(self.stands.start)
+            leaving = lag.leaving(i)
             if leaving:
                 past.leave(leaving, self._noted(lag, window))
             values = gtsam.Values()
             values.insert(C(i), lag.pose(parent).compose(motion) if i else motion)
             values.insert(B(i), np.zeros(BIAS_SIZE))
             values.insert(V(i), np.zeros(V_SIZE))
-            lag.insert(i, factors, values, leaving)
+            lag.insert(i, factors, values)
             window = [n for n in window if n not in leaving] + [i]
             past.add(factors)
             past.tidy()

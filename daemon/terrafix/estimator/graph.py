@@ -16,9 +16,6 @@ from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.past import Past
 from terrafix.estimator.velocity import V_SIZE, Leg, standing_cov, unknown_cov
 
-# ON-3: 10-20 keyframes. So many, and up to a batch more: marginalising the oldest makes iSAM2 eliminate nearly the
-# whole window anew, so that it is done for several nodes at a time.
-LAG_NODES, BATCH_NODES = 15, 5
 ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits in the tail pulls less
 LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
 # Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), heading (a gyro drifts),
@@ -57,7 +54,6 @@ class PoseGraph:
         self._states: dict[int, NodeState] = {}  # asked for since the last update
         self._marginals: dict[int, np.ndarray] = {}  # the same, by key
         self._times: dict[int, float] = {}  # nodes in the window: measurement time, s
-        self._stamps: dict[int, int] = {}  # node -> batch at whose arrival it was new, or kept
         self._next = 0
 
     @property
@@ -184,7 +180,7 @@ class PoseGraph:
 
     def keep(self, node: int) -> None:
         """Holds a node of the window in it for another full lag."""
-        self._stamps[node] = _stamp(self.newest)
+        self._smoother.keep(node)
 
     def next_keys(self) -> tuple[int, int]:
         return C(self._next), B(self._next)
@@ -197,7 +193,7 @@ class PoseGraph:
 
     def _insert(self, t_s: float, state: NodeState, factors: gtsam.NonlinearFactorGraph) -> None:
         node = self._next
-        leaving = [n for n, at in self._stamps.items() if at < _stamp(node) - LAG_NODES]
+        leaving = self._smoother.leaving(node)
         if leaving:
             self._kept = self._smoother.estimate()
             self._past.leave(leaving, self._kept)
@@ -207,11 +203,10 @@ class PoseGraph:
         self._kept.insert(values)
         self._next += 1
         self._times[node] = t_s
-        self._stamps[node] = _stamp(node)
         for n in leaving:
-            del self._times[n], self._stamps[n]
+            del self._times[n]
         self._past.add(factors)
-        self._update(partial(self._smoother.insert, node, factors, values, leaving))
+        self._update(partial(self._smoother.insert, node, factors, values))
 
     def _update(self, work: Callable[[], None]) -> None:
         self._states.clear()
@@ -232,7 +227,7 @@ class PoseGraph:
         self._past.leave([n for n in self._times if n != node], self._kept)
         self._past.begin(node)
         self._renew()
-        self._times, self._stamps = {node: self._times[node]}, {node: _stamp(node)}
+        self._times = {node: self._times[node]}
         wide = np.array([0.1, 0.1, 0.2, 50.0, 50.0, 20.0])
         slow = np.array([0.1, 0.1, 0.1, 5.0, LENS_SIGMA, 0.1])
         factors = _priors(node, state, np.diag(wide**2), np.diag(slow**2), unknown_cov())
@@ -250,7 +245,6 @@ class PoseGraph:
             self._past.leave(list(self._times), self._smoother.estimate())
         self._past.begin(self._next)
         self._times.clear()
-        self._stamps.clear()
 
 
 def _priors(
@@ -271,11 +265,6 @@ def _values(node: int, state: NodeState) -> gtsam.Values:
     values.insert(B(node), state.bias)
     values.insert(V(node), state.velocity)
     return values
-
-
-def _stamp(node: int) -> int:
-    """Nodes of one batch leave the window together."""
-    return node - node % BATCH_NODES
 
 
 def _robust(cov: np.ndarray) -> gtsam.noiseModel.Robust:

@@ -1,9 +1,8 @@
 """iSAM2 over the newest nodes; what leaves is marginalised.
 
 GTSAM's IncrementalFixedLagSmoother does the same, but its order of elimination puts the newest variables anywhere when
-others leave: the two updates after that eliminate nearly everything again. Here they stay at the root of the tree."""
-
-from collections.abc import Iterable
+others leave: the two updates after that eliminate nearly everything again. Here older nodes are always eliminated
+before newer ones, so that those that leave are the leaves of the tree, and nothing else is asked again."""
 
 import gtsam
 import numpy as np
@@ -11,13 +10,16 @@ from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator.velocity import V_SIZE
 
+# ON-3: 10-20 keyframes. So many, and up to a batch more: iSAM2 takes nodes out, and puts them in order, by the batch.
+LAG_NODES, BATCH_NODES = 15, 5
 # Steps from which a factor is linearised anew. Angles bend the geometry; metres and metres per second hardly do.
 RELINEARIZE = {
     "c": np.array([0.03, 0.03, 0.03, 1.0, 1.0, 1.0]),
     "b": np.array([0.03, 0.03, 0.03, 10.0, 1.0, 0.05]),
     "v": np.full(V_SIZE, 100.0),
 }
-_LEAVING, _STAYING, _NEWEST = 0, 1, 2  # groups in the order of elimination
+# A change below which iSAM2 looks at no older variable. Its own 0.001 is 0.06 degrees: a fifth of what headings err by.
+WILDFIRE = 1e-6
 
 
 class FixedLag:
@@ -25,6 +27,9 @@ class FixedLag:
 
     def __init__(self) -> None:
         params = gtsam.ISAM2Params()
+        exact = gtsam.ISAM2GaussNewtonParams()
+        exact.setWildfireThreshold(WILDFIRE)
+        params.setOptimizationParams(exact)
         params.setFactorization("QR")  # Cholesky gives up on long stretches without an absolute fix
         thresholds = gtsam.ISAM2ThresholdMap()
         for letter, limits in RELINEARIZE.items():
@@ -33,32 +38,56 @@ class FixedLag:
         params.findUnusedFactorSlots = True  # or its lists of factors grow with the flight
         params.relinearizeSkip = 1  # looked for at every update; the thresholds make it rare
         self._isam = gtsam.ISAM2(params)
-        self._nodes: set[int] = set()
+        self._batches: dict[int, int] = {}  # node -> in which it came, or was kept
+        self._again: set[int] = set()  # nodes whose place in the order has changed
+
+    def holds(self, node: int) -> bool:
+        return node in self._batches
+
+    def leaving(self, node: int) -> list[int]:
+        """The nodes that leave when ``node`` comes."""
+        first = (node // BATCH_NODES) - LAG_NODES // BATCH_NODES
+        return [n for n, batch in self._batches.items() if batch < first]
+
+    def keep(self, node: int) -> None:
+        """Holds it for another full lag."""
+        newest = max(self._batches.values())
+        if self._batches[node] != newest:
+            self._batches[node] = newest
+            self._again.add(node)
 
     def add(self, factors: gtsam.NonlinearFactorGraph) -> None:
         """Of nodes that are there."""
-        self._isam.update(factors, gtsam.Values())
+        self._update(factors, gtsam.Values())
 
-    def insert(
-        self, node: int, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, leaving: Iterable[int] = ()
-    ) -> None:
-        """The newest node, with its factors; ``leaving`` are marginalised."""
-        gone = set(leaving)
-        if not gone:
-            self._isam.update(factors, values)
-            self._nodes.add(node)
-            return
-        groups, again, leaves = gtsam.KeyGroupMap(), gtsam.KeyList(), gtsam.KeyList()
-        for n in self._nodes | {node}:
-            for key in (C(n), B(n), V(n)):
-                groups.insert2(key, _LEAVING if n in gone else _NEWEST if n == node else _STAYING)
-                if n != node:
-                    again.push_back(key)  # all are eliminated anew: where they hang on those that leave is not asked
-                if n in gone:
+    def insert(self, node: int, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """The newest node, with its factors. Others leave (``leaving``)."""
+        leaving = self.leaving(node)
+        self._batches[node] = node // BATCH_NODES
+        self._update(factors, values)
+        if leaving:
+            leaves = gtsam.KeyList()
+            for n in leaving:
+                del self._batches[n]
+                for key in _keys(n):
                     leaves.push_back(key)
+            self._isam.marginalizeLeaves(leaves)
+
+    def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """What is eliminated again is put in the order of the batches, the newest node last, of which most is asked.
+        So nothing but what came in its own batch or an older one is ever below a node in the tree, and leaves with it.
+
+        The two newest nodes are always among it: COLAMD takes no more groups than there are variables."""
+        oldest = min(self._batches.values())
+        before, newest = sorted(self._batches)[-2:] if len(self._batches) > 1 else (-1, max(self._batches))
+        groups, again = gtsam.KeyGroupMap(), gtsam.KeyList()
+        for n, batch in self._batches.items():
+            for key in _keys(n):
+                groups.insert2(key, batch - oldest + (n == newest))
+                if (n in (before, newest) or n in self._again) and not values.exists(key):
+                    again.push_back(key)
+        self._again.clear()
         self._isam.update(factors, values, [], groups, None, again)
-        self._isam.marginalizeLeaves(leaves)
-        self._nodes = (self._nodes | {node}) - gone
 
     def estimate(self) -> gtsam.Values:
         """Of everything."""
@@ -72,3 +101,7 @@ class FixedLag:
 
     def marginal(self, key: int) -> np.ndarray:
         return self._isam.marginalCovariance(key)
+
+
+def _keys(node: int) -> tuple[int, int, int]:
+    return C(node), B(node), V(node)

@@ -38,6 +38,7 @@ class Past:
         self._left: dict[int, State] = {}  # of kept nodes and newer ones: where the linear factors are linear
         self._held: set[int] = set()  # of these: still in the window, while newer ones have left
         self._kept: list[int] = []
+        self._between: list[int] = []  # nodes between the two newest kept ones: linear, and not taken out yet
         self._begins = {0}  # nodes that nothing ties to the one before
         self._track = Track()
 
@@ -56,6 +57,10 @@ class Past:
     def tidy(self) -> bool:
         """A small part of what is left to do with nodes that have left; called often, so that no frame takes long.
         -> whether there was something."""
+        if self._between:
+            self._take_out(self._between)
+            self._between = []
+            return True
         if self._kept and (node := self._next_kept()) is not None:
             self._keep(node)
             return True
@@ -87,6 +92,7 @@ class Past:
             pass
         if self._track.size and self._track.size - 1 > self._kept[-1]:
             self._keep(self._track.size - 1)
+            self.tidy()
         self._linearise(set(), self._track.size)
 
     def _solved(self) -> dict[int, Known]:
@@ -130,11 +136,10 @@ class Past:
 
     def _keep(self, node: int) -> None:
         """Of the nodes since the last kept one only this remains."""
-        between = [n for n in self._left if self._kept[-1] < n < node]
+        self._between = [n for n in self._left if self._kept[-1] < n < node]
         self._kept.append(node)
-        if between:
-            self._linearise(set(between), node)
-            self._take_out(between)
+        if self._between:
+            self._linearise(set(self._between), node)
 
     def _linearise(self, gone: set[int], last: int) -> None:
         """The factors of nodes that will be taken out, as one, and those among nodes before ``last``. What reaches from
