@@ -149,3 +149,16 @@ def test_ground_far_away_is_all_new() -> None:
     assert seen.new_m(500.0, np.array([1e5, 0.0]), 50.0) == 50.0
     assert seen.new_m(500.0, np.array([1e5, 0.0]), math.inf) > 8e4
     assert len(seen._fixes) == KEPT
+
+
+@pytest.mark.parametrize("hz", [0.5, 2.0, 5.0, 30.0])
+def test_more_frames_a_second_over_the_same_ground_do_not_tell_more(hz: float) -> None:
+    """A vehicle that hovers for half a minute, 100 m up, after its first fix."""
+    seen, counted = SeenGround(), 0.0
+    seen.add(0.0, np.zeros(2))
+    for t_s in np.arange(1, 30 * hz) / hz:
+        counted += seen.share(float(t_s), np.zeros(2), 100.0)
+        seen.add(float(t_s), np.zeros(2))
+    assert counted == pytest.approx(30 * min(0.2, 0.1 * hz), rel=0.1)
+    assert seen.share(30.0, np.array([25.0, 0.0]), 100.0) == pytest.approx(0.5)  # half of its ground is new
+    assert seen.share(30.0, np.array([80.0, 0.0]), 100.0) == 1.0

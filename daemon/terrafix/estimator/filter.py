@@ -24,8 +24,6 @@ from terrafix.estimator.velocity import V_SIZE, unknown_cov
 from terrafix.messages import CovarianceMode, MapMatch, Odometry, Origin, Verdict
 
 GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
-SAME_GROUND_SHARE = 0.5  # of the height: fixes closer together than this share their errors ...
-MIN_NEW_GROUND = 0.1  # ... and a fix over the same ground counts at least this much
 COARSE_CONTINUES = 0.5  # of the height: sigma of the estimate up to which the belief's mode alone is taken as a fix
 COARSE_FINDS_AFTER, COARSE_FINDS_OVER = 6, 1.0  # ... and so many that agree, over so many heights, find a position
 RECOVER_AFTER = 3  # fixes that agree with each other and not with the graph
@@ -111,8 +109,7 @@ class Estimator(Tracker):
         fixed_s = self.graph.time_of(node)
         if not match.coarse and self._seen.newest_s is not None:
             self.rival.fade(self._seen.new_m(fixed_s, here, math.inf) / height)
-        reach_m = SAME_GROUND_SHARE * height
-        new = max(self._seen.new_m(fixed_s, here, reach_m) / reach_m, MIN_NEW_GROUND)
+        new = self._seen.share(fixed_s, here, height)
         self.graph.add_pose(node, measured, cov / new)
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[node] = np.linalg.inv(np.linalg.inv(self._cov_of[node]) + np.linalg.inv(cov / new))

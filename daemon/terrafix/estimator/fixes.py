@@ -6,7 +6,6 @@ import gtsam
 import numpy as np
 
 from terrafix.estimator.agreement import AGREE_M
-from terrafix.estimator.filter import MIN_NEW_GROUND, SAME_GROUND_SHARE
 from terrafix.estimator.rival import Rival
 from terrafix.estimator.seen_ground import SeenGround
 from terrafix.estimator.whole import Fix, Retold
@@ -19,8 +18,7 @@ def new_ground(flight: Retold) -> list[float]:
     for i in sorted(range(len(shares)), key=lambda i: flight.fixes[i].node):
         fix = flight.fixes[i]
         here, t_s = np.asarray(fix.pose.translation()), flight.graph.nodes[fix.node].t_s
-        reach_m = SAME_GROUND_SHARE * max(float(here[2]) - ground_m, 1.0)
-        shares[i] = max(seen.new_m(t_s, here[:2], reach_m) / reach_m, MIN_NEW_GROUND)
+        shares[i] = seen.share(t_s, here[:2], max(float(here[2]) - ground_m, 1.0))
         seen.add(t_s, here[:2])
     return shares
 

@@ -5,6 +5,10 @@ from bisect import bisect_left
 import numpy as np
 
 KEPT = 40  # fixes: more than there are nodes in the graph, to which a late one can belong
+SAME_GROUND_SHARE = 0.5  # of the height: fixes closer together than this share their errors ...
+# ... and a fix over ground that was seen counts at least this much, but no more in a second, however many there are:
+# of light, wind and the camera's own noise, which change, a second of five frames has not more than one of two.
+MIN_NEW, MIN_NEW_PER_S, LEAST = 0.1, 0.2, 1e-3
 
 
 class SeenGround:
@@ -30,6 +34,14 @@ class SeenGround:
         if after in (0, len(self._fixes)):
             return ways_m[0]
         return max(0.0, sum(ways_m) - min(float(np.hypot(*(beside[1] - beside[0]))), most_m))
+
+    def share(self, t_s: float, place_m: np.ndarray, height_m: float) -> float:
+        """What a fix there, so high above the ground, counts: the rest of it was said by others."""
+        reach_m = SAME_GROUND_SHARE * height_m
+        after = bisect_left(self._fixes, t_s, key=lambda fix: fix[0])
+        since_s = min((abs(t_s - other_s) for other_s, _ in self._fixes[max(0, after - 1) : after + 1]), default=np.inf)
+        least = min(MIN_NEW, MIN_NEW_PER_S * since_s)
+        return max(self.new_m(t_s, place_m, reach_m) / reach_m, least, LEAST)
 
     def add(self, t_s: float, place_m: np.ndarray) -> None:
         self._fixes.insert(bisect_left(self._fixes, t_s, key=lambda fix: fix[0]), (t_s, place_m))
