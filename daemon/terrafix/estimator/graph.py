@@ -196,7 +196,7 @@ class PoseGraph:
         leaving = self._smoother.leaving(node)
         if leaving:
             self._kept = self._smoother.estimate()
-            self._past.leave(leaving, self._kept)
+            self._past.leave(leaving, self._smoother.linear_around())
         else:
             self._past.tidy()
         values = _values(node, state)

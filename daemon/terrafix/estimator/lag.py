@@ -93,6 +93,10 @@ class FixedLag:
         """Of everything."""
         return self._isam.calculateEstimate()
 
+    def linear_around(self) -> gtsam.Values:
+        """Where its factors are linear: nearer to the estimate than RELINEARIZE says."""
+        return self._isam.getLinearizationPoint()
+
     def pose(self, node: int) -> gtsam.Pose3:
         return self._isam.calculateEstimatePose3(C(node))
 

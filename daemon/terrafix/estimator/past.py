@@ -1,9 +1,9 @@
 """What has left the window of the graph, kept for the refinement after landing in as little as that needs.
 
-A factor that leaves becomes linear, around the estimate with which its nodes left. Of the nodes only some are kept as
-unknowns: what lies between two kept ones is taken out of the linear system, exactly, and follows these from then on
-(track.py). When too many are kept, more are taken out. So the cost of a frame does not grow with the flight, and its
-memory by some 270 bytes a frame."""
+A factor that leaves becomes linear, around the values that its nodes left with: those at which iSAM2 had it linear, so
+that it remembers the answer (remembered.py). Of the nodes only some are kept as unknowns: what lies between two kept
+ones is taken out of the linear system, exactly, and follows these from then on (track.py). When too many are kept, more
+are taken out. So the cost of a frame does not grow with the flight, and its memory by some 270 bytes a frame."""
 
 from bisect import bisect_left, bisect_right
 from contextlib import suppress
@@ -45,14 +45,14 @@ class Past:
     def add(self, factors: gtsam.NonlinearFactorGraph) -> None:
         self._window += [(f, nodes_of(f)) for f in map(factors.at, range(factors.size()))]
 
-    def leave(self, nodes: list[int], estimate: gtsam.Values) -> None:
-        """These nodes leave the window, in which ``estimate`` has them."""
+    def leave(self, nodes: list[int], around: gtsam.Values) -> None:
+        """These nodes leave the window; their factors are, or will be, linear ``around`` these values."""
         if not nodes:
             return
         passed = set(range(self._track.size, max(nodes)))
         self._held = (self._held | passed) - set(nodes)
         for node in sorted(passed | set(nodes)):
-            self._freeze(node, estimate)
+            self._freeze(node, around)
 
     def tidy(self) -> bool:
         """A small part of what is left to do with nodes that have left; called often, so that no frame takes long.
@@ -104,9 +104,8 @@ class Past:
                 solved |= solve([f for f in self._linear if first <= f.nodes[0] < end])
         return solved
 
-    def _freeze(self, node: int, estimate: gtsam.Values) -> None:
-        """The state around which its factors are, or will be, linear."""
-        state = (estimate.atPose3(C(node)), estimate.atVector(B(node)), estimate.atVector(V(node)))
+    def _freeze(self, node: int, around: gtsam.Values) -> None:
+        state = (around.atPose3(C(node)), around.atVector(B(node)), around.atVector(V(node)))
         before = self._left.get(node)
         self._left[node] = state
         if before is not None:  # it was held
