@@ -148,7 +148,7 @@ def test_who_heads_as_before_flew_straight_on() -> None:
 
 def test_a_compass_that_is_off_as_it_was_learnt_has_not_turned() -> None:
     off_rad = math.radians(8.0)
-    learnt = Learnt(0.0, np.array([0.0, 0.0, off_rad, 0.0, 0.0, 0.0]), np.eye(6), math.radians(90.0))
+    learnt = Learnt(0.0, np.array([0.0, 0.0, off_rad, 0.0, 0.0, 0.0]), np.eye(6))
     way_m, _ = plane(learnt=learnt).later(DOWN_S, math.radians(90.0) + off_rad)
     assert way_m == pytest.approx([PLANE_MPS * DOWN_S, 0.0], abs=0.1)
 

@@ -10,7 +10,7 @@ from inertial_flight import InertialFlight, flown
 
 from terrafix.core.geodesy import rot_w_b
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.estimator.righted import GYROSCOPE_RADPS, Righted
+from terrafix.estimator.righted import ORDINARY_RADPS, Righted
 from terrafix.estimator.telemetry import Attitude, Telemetry
 from terrafix.estimator.velocity import TILT_S
 from terrafix.messages import Imu, VehicleState
@@ -93,7 +93,7 @@ def farthest_deg(seconds: float, off: Callable[[float], float]) -> list[float]:
 
 
 def test_a_correction_counts_when_it_is_more_than_the_claim_and_the_gyroscopes_explain() -> None:
-    assert max(farthest_deg(8.0, lambda t: 0.9 * GYROSCOPE_RADPS * t)) == 0.0
+    assert max(farthest_deg(8.0, lambda t: 0.9 * ORDINARY_RADPS * t)) == 0.0
     assert max(farthest_deg(8.0, lambda t: 0.9 * 2.0 * SIGMA_RAD * math.sin(min(t, 1.5)))) == 0.0
     moved = farthest_deg(8.0, lambda t: math.radians(6.0) * min(max(t - 3.0, 0.0), 1.0))
     assert max(moved[:7]) == 0.0 and moved[8] == pytest.approx(4.3, abs=0.4)  # of 6: it banks meanwhile

@@ -33,12 +33,11 @@ class Last(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Learnt:
-    """Slow errors (6,) with their covariance (6x6), and where they were learnt: time, heading."""
+    """Slow errors (6,) with their covariance (6x6), and when they were learnt."""
 
     t_s: float
     error: np.ndarray
     cov: np.ndarray
-    yaw_rad: float
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class Known:
         learnt, yaw_rad = None, yaw_of(rot_from_quat(said.q_w_b))
         if slow is not None and said.t_ns - slow.t_ns <= SLOW_AGE_NS:
             cov = np.array(slow.cov).reshape(BIAS_SIZE, BIAS_SIZE)
-            learnt = Learnt(slow.t_ns * 1e-9, np.array(slow.error), cov, yaw_rad)
+            learnt = Learnt(slow.t_ns * 1e-9, np.array(slow.error), cov)
         return cls(t_s, at_m, sigma_m, velocity_mps, said.velocity_sigma_mps, yaw_rad, learnt, last.match)
 
     def later(self, t_s: float, yaw_rad: float | None) -> tuple[np.ndarray, float]:

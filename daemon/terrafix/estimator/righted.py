@@ -23,7 +23,7 @@ from terrafix.estimator.velocity import TILT_S, Felt
 # DS-000347: 0.2 degrees a second) and what an attitude filter mends in ordinary flight (at 0.2 for both together,
 # simulated planes drifted twice as far on dead reckoning); and the share that their scale leaves out, and their axes,
 # which are those of the board: an attitude is that of the vehicle (ArduPilot's AHRS_TRIM).
-GYROSCOPE_RADPS = math.radians(0.5)
+ORDINARY_RADPS = math.radians(0.5)
 MISALIGNED = 0.03
 FRAMES_KEPT = 64  # whose correction is known: a leg begins at the frame before
 
@@ -48,7 +48,7 @@ class Righted:
         else:
             apart, turned_rad = way
             dt_s = (t_ns - since_ns) * 1e-9
-            explained_rad = GYROSCOPE_RADPS * dt_s + MISALIGNED * turned_rad
+            explained_rad = ORDINARY_RADPS * dt_s + MISALIGNED * turned_rad
             apart = max(0.0, 1.0 - explained_rad / max(float(np.linalg.norm(apart)), 1e-9)) * apart
             self._unfelt = math.exp(-dt_s / TILT_S) * self._unfelt + apart
             self._lately.append((since_ns * 1e-9, np.zeros(2)))

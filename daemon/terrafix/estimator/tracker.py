@@ -19,7 +19,7 @@ from terrafix.estimator.mounted import (
     MountedCamera,
 )
 from terrafix.estimator.pace import Pace
-from terrafix.estimator.resume import Known, Learnt
+from terrafix.estimator.resume import Known
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
 from terrafix.estimator.velocity import (
@@ -254,16 +254,17 @@ class Tracker:
             self.terrain.hear(known.match, np.array([known.match.mode_e_m, known.match.mode_n_m]))
         way_m, drift_m = known.later(t_s, attitude.yaw_rad)
         sigma_m = float(np.hypot(known.sigma_m, drift_m))
-        slow = self._slow_now(known.learnt, t_s, attitude, float(np.hypot(*way_m)) + drift_m)
+        slow = self._slow_now(known, t_s, attitude, float(np.hypot(*way_m)) + drift_m)
         placed = self._start_graph(frame_id, t_s, attitude, known.at_m + way_m, sigma_m, slow)
         return Advance(Verdict.ACCEPTED, placed, way_m, drift_m)
 
-    def _slow_now(self, learnt: Learnt | None, t_s: float, attitude: Attitude, way_m: float) -> Slow | None:
+    def _slow_now(self, known: Known, t_s: float, attitude: Attitude, way_m: float) -> Slow | None:
         """What was learnt before this process was started holds on, but for what has changed since. None: nothing was,
         or a word is missing now to which it belongs."""
-        if learnt is None or attitude.yaw_rad is None or attitude.agl_m is None:
+        learnt = known.learnt
+        if learnt is None or known.yaw_rad is None or attitude.yaw_rad is None or attitude.agl_m is None:
             return None
-        turned_rad = np.angle(np.exp(1j * (attitude.yaw_rad - learnt.yaw_rad)))
+        turned_rad = np.angle(np.exp(1j * (attitude.yaw_rad - known.yaw_rad)))
         rise_m = self.terrain.rise_sigma_m(way_m)
         sigmas = walk_sigmas(max(t_s - learnt.t_s, 0.0), float(turned_rad), rise_m)
         return learnt.error, learnt.cov + np.diag(sigmas**2)
