@@ -80,6 +80,12 @@ def test_readings_come_in_short_batches() -> None:
     assert said[0].samples[0][1:] == pytest.approx((0.1 * G, -0.02 * G, -G, 0.01, -0.02, 0.5))
 
 
+def forces(messages: list[tuple[int, Any]]) -> list[tuple[int, float]]:
+    """(time, force forward [G]) of every reading that is said: 0.1 is of RAW_IMU, 0.3 of SCALED_IMU and SCALED_IMU2."""
+    batches = [(imu.t_ns, imu.samples) for imu in heard(messages)]
+    return [(t_ns - before_ns, round(force / G, 1)) for t_ns, batch in batches for before_ns, force, *_ in batch]
+
+
 def test_one_stream_is_heard_and_another_when_it_falls_silent() -> None:
     messages: list[tuple[int, Any]] = []
     for i in range(1, 200):
@@ -87,10 +93,26 @@ def test_one_stream_is_heard_and_another_when_it_falls_silent() -> None:
         if now_ns < S:
             messages.append((now_ns, raw(0)))
         messages.append((now_ns, scaled(0)))
-    said = heard(messages)
-    forward = [(imu.t_ns - before_ns, force) for imu in said for before_ns, force, *_ in imu.samples]
-    assert {round(force / G, 1) for t_ns, force in forward if t_ns < 1.9 * S} == {0.1}
-    assert {round(force / G, 1) for t_ns, force in forward if t_ns > 2.1 * S} == {0.3}
+    said = forces(messages)
+    assert {force for t_ns, force in said if t_ns < S} == {0.1}
+    assert {force for t_ns, force in said if t_ns > 1.1 * S} == {0.3}
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_a_slow_stream_that_comes_first_is_left_for_a_fast_one(second: bool) -> None:
+    messages: list[tuple[int, Any]] = []
+    for i in range(300):
+        if i % 33 == 0:
+            messages.append((i * 30 * MS, scaled(0, second)))
+        messages.append((i * 30 * MS + MS, raw(0)))
+    said = forces(messages)
+    assert [force for _, force in said].count(0.3) == 1  # the very first
+    assert {force for t_ns, force in said if t_ns > 200 * MS} == {0.1}
+
+
+def test_streams_that_are_as_fast_do_not_take_turns() -> None:
+    messages = [(i * 30 * MS, [raw(0), scaled(0), scaled(0, second=True)][i % 3]) for i in range(300)]
+    assert {force for _, force in forces(messages)} == {0.1}
 
 
 def test_another_vehicle_is_not_heard() -> None:

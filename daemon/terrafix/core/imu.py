@@ -1,5 +1,6 @@
 """Inertial messages of MAVLink in SI units. Knows the fields, not the wire: live link and recorded logs share it."""
 
+from collections import Counter
 from typing import Any
 
 GRAVITY_MPS2 = 9.80665  # of a milli-g in MAVLink's scaled messages
@@ -32,18 +33,23 @@ def boot_ns(message: Any) -> int | None:
 
 
 class Chooser:
-    """One inertial stream of those that come: the first that is heard, another when it falls silent."""
+    """One inertial stream of those that come: the first that is heard, until another comes that much more often.
 
-    SILENT_NS = 1_000_000_000
+    ArduPilot sends its other IMUs at 1 Hz unless somebody asks for more. One of them may be the first that is heard,
+    and with one reading a second a whole flight has no IMU."""
+
+    AHEAD = 3  # readings of another stream between two of the chosen one, which is slower then, or gone
 
     def __init__(self) -> None:
         self._kind = ""
-        self._heard_ns = 0
+        self._since: Counter[str] = Counter()  # of the others, since the chosen one was heard
 
-    def takes(self, kind: str, now_ns: int) -> bool:
+    def takes(self, kind: str) -> bool:
         if kind not in KINDS:
             return False
-        if kind != self._kind and self._kind and now_ns - self._heard_ns < self.SILENT_NS:
+        self._since[kind] += 1
+        if self._kind and kind != self._kind and self._since[kind] < self.AHEAD:
             return False
-        self._kind, self._heard_ns = kind, now_ns
+        self._kind = kind
+        self._since.clear()
         return True

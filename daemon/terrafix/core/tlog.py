@@ -87,7 +87,7 @@ def read_imu(path: Path, t0_us: int | None = None) -> list[Imu]:
     for t_us, said in messages:
         arrived_ns = (t_us - t0_us) * 1000
         readings = readings_of(said)
-        if readings is None or not chooser.takes(said.get_type(), arrived_ns):
+        if readings is None or not chooser.takes(said.get_type()):
             continue
         since_boot_ns = boot_ns(said)
         measured_ns = arrived_ns if since_boot_ns is None else since_boot_ns

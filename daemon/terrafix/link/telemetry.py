@@ -122,7 +122,7 @@ class Telemetry:
 
     def _take_imu(self, message: Any, kind: str, now_ns: int) -> Imu | None:
         readings = readings_of(message)
-        if readings is None or not self._imu_of.takes(kind, now_ns):
+        if readings is None or not self._imu_of.takes(kind):
             return None
         since_boot_ns = boot_ns(message)
         t_ns = now_ns if since_boot_ns is None else self._measured_ns(since_boot_ns, now_ns)
