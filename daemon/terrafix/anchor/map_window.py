@@ -47,8 +47,9 @@ class LayerView:
         self._layer = layer
         self._tiles = tiles
         self.to_crs = Transformer.from_crs(local, layer.crs, always_xy=True)
-        to_local = Transformer.from_crs(layer.crs, local, always_xy=True)
-        self.bounds_m: tuple[float, float, float, float] = to_local.transform_bounds(*layer.bounds, densify_pts=51)
+        self.bounds_m: tuple[float, float, float, float] = self.to_crs.transform_bounds(
+            *layer.bounds, densify_pts=51, direction="INVERSE"
+        )
         # Ground size of one CRS unit at the centre of the layer, to choose a level in metres.
         self.unit_m = layer.gsd_m / math.sqrt(layer.levels[-1].pixel_x * layer.levels[-1].pixel_y)
 
