@@ -8,8 +8,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import onnxruntime as ort
-
 from terrafix_engines import gpu
 from terrafix_engines.manifest import Preset, Tensor, shape_of
 
@@ -45,6 +43,8 @@ def short(provider: str) -> str:
 
 def check(provider: str) -> None:
     """Raises UnavailableError when this computer cannot use the provider for any model."""
+    import onnxruntime as ort  # only where a model is opened (runtime.py)
+
     available = ort.get_available_providers()
     if provider not in available:
         has = ", ".join(short(p) for p in PREFERENCE if p in available)
@@ -67,6 +67,8 @@ def chain(provider: str, options: dict[str, str] | None = None) -> Chain:
 
 def engine_folder(root: Path, sha256: str, preset: Preset) -> Path:
     """Where the engine of a model with this checksum lies: below ``root``, one folder for each thing that it fits."""
+    import onnxruntime as ort
+
     gpu_name = re.sub(r"[^A-Za-z0-9]+", "-", gpu.gpu_name() or "none")
     sizes = "x".join(str(preset.sizes[name]) for name in sorted(preset.sizes))
     key = f"trt{gpu.tensorrt_version()}-ort{ort.__version__}-{gpu_name}-{preset.precision}-{sizes}"

@@ -3,13 +3,12 @@
 Nothing is built or tried for the first time in flight: opening warms up every size that is known, and takes an engine
 of TensorRT only where one was built before."""
 
+import functools
 import hashlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
-from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
 
 from terrafix_engines import providers
 from terrafix_engines.manifest import Manifest, Preset, Tensor, shape_of, sizes_of
@@ -17,14 +16,6 @@ from terrafix_engines.providers import CPU, PREFERENCE, TENSORRT, PassedOver, Sh
 
 WARM_UP_SIZE = 512  # of a side or a number of points that no preset names: enough for exports that want so many points
 ANY: Shapes = ()  # key of a session that takes every size
-
-# They share no base class but Exception, and new ones come with new versions.
-_ORT_ERRORS: list[type[Exception]] = [
-    kind for kind in vars(ort_state).values() if isinstance(kind, type) and issubclass(kind, Exception)
-]
-_RUN_ERRORS: tuple[type[Exception], ...] = (*_ORT_ERRORS, RuntimeError, MemoryError, UnavailableError)
-_OPEN_ERRORS: tuple[type[Exception], ...] = (*_RUN_ERRORS, ValueError, OSError)
-_INVALID_ARGUMENT: type[Exception] = ort_state.InvalidArgument
 
 
 class ModelFileError(Exception):
@@ -89,9 +80,9 @@ class Model:
                 results = self._answer(tensors)
                 self.answers += 1
                 return results
-            except _INVALID_ARGUMENT as error:  # the input is wrong for every provider
+            except _invalid_argument() as error:  # the input is wrong for every provider
                 raise ModelRunError(f"{self.path.name}: {_line(error)}") from None
-            except _RUN_ERRORS as error:
+            except _run_errors() as error:
                 if not self._left:
                     raise ModelRunError(f"{self.path.name}: {_line(error)}") from None
                 self.passed_over.append(PassedOver(self.provider, f"failed while it ran: {_line(error)}"))
@@ -132,7 +123,7 @@ class Model:
                 self._open()
                 self._warm_up()
                 return
-            except _OPEN_ERRORS as error:
+            except _open_errors() as error:
                 reason = _line(error)
                 self._sessions = {}
                 self.passed_over.append(PassedOver(self.provider, reason))
@@ -159,6 +150,8 @@ class Model:
                 providers.mark_ready(folder, preset)
 
     def _session(self, chain: providers.Chain) -> Any:
+        import onnxruntime as ort  # only here: a vehicle without a model shall be there soon after a restart
+
         options = ort.SessionOptions()
         options.log_severity_level = 3
         # Threads that spin after an answer take the cores from the estimator and the link.
@@ -186,7 +179,7 @@ class Model:
             self._answer(tuple(noise(tensor, chosen) for tensor in inputs))
 
     def _answer(self, tensors: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-        """Raises _RUN_ERRORS; UnavailableError when the provider answers nonsense."""
+        """Raises ``_run_errors``; UnavailableError when the provider answers nonsense."""
         sizes: dict[str, int] = {}
         feed = dict(zip(self._inputs, tensors, strict=True))
         for tensor in self._manifest.tensors(self._inputs) if self._manifest else ():
@@ -210,6 +203,25 @@ class Model:
                     raise UnavailableError(f"output '{name}' is not a number in places (NaN or infinite)")
                 results[k] = array.astype(np.float32, copy=False)
         return results
+
+
+@functools.cache
+def _run_errors() -> tuple[type[Exception], ...]:
+    """Those of ONNX Runtime share no base class but Exception, and new ones come with new versions."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
+
+    own = [kind for kind in vars(ort_state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    return (*own, RuntimeError, MemoryError, UnavailableError)
+
+
+def _open_errors() -> tuple[type[Exception], ...]:
+    return (*_run_errors(), ValueError, OSError)
+
+
+def _invalid_argument() -> type[Exception]:
+    from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
+
+    return ort_state.InvalidArgument
 
 
 def default_sizes(inputs: tuple[Tensor, ...]) -> dict[str, int]:

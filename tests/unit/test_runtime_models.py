@@ -8,6 +8,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 import tiny_onnx
+from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
 
 from terrafix_engines import gpu, manifest, providers, runtime
 from terrafix_engines.providers import CPU, CUDA, TENSORRT
@@ -149,13 +150,13 @@ class Machine:
                     owner.ran += [one.shape for one in feed.values()]
                 match owner.fails.get(self.name):
                     case "memory":
-                        raise runtime.ort_state.Fail("Failed to allocate memory for requested buffer of size 99")
+                        raise ort_state.Fail("Failed to allocate memory for requested buffer of size 99")
                     case "nonsense":
                         return [np.full_like(one, np.inf) for one in self.real.run(names, feed)]
                 return self.real.run(names, feed)
 
-        patch.setattr(runtime.ort, "InferenceSession", Session)
-        patch.setattr(providers.ort, "get_available_providers", lambda: [TENSORRT, CUDA, CPU])
+        patch.setattr(ort, "InferenceSession", Session)
+        patch.setattr(ort, "get_available_providers", lambda: [TENSORRT, CUDA, CPU])
         patch.setattr(gpu, "gpu_name", lambda: "Orin (nvgpu)")
         patch.setattr(gpu, "tensorrt_version", lambda: "100300")
 

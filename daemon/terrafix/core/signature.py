@@ -1,4 +1,6 @@
-"""Ed25519 keys and signatures (RFC 8032) of what is prepared on the ground and trusted in flight."""
+"""Ed25519 keys and signatures (RFC 8032) of what is prepared on the ground and trusted in flight.
+
+The library is imported where it computes: the map is opened after a restart in flight, too, and most need no key."""
 
 import base64
 import binascii
@@ -8,16 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-
-from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    PublicFormat,
-    load_pem_private_key,
-)
 
 from terrafix.core.errors import ConfigError, OutputError, UsageError
 
@@ -40,6 +32,9 @@ class TrustedKey:
 
 def is_signed(key: TrustedKey, message: bytes, signature: bytes) -> bool:
     """Whether ``signature`` is that of the key's owner over ``message``. A malformed key or signature is not."""
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
     try:
         Ed25519PublicKey.from_public_bytes(key.raw).verify(signature, message)
     except (InvalidSignature, ValueError, TypeError):
@@ -49,8 +44,12 @@ def is_signed(key: TrustedKey, message: bytes, signature: bytes) -> bool:
 
 def sign(private_key: Path, message: bytes) -> tuple[TrustedKey, bytes]:
     """-> the public key and the signature. Raises UsageError: no private key in the file."""
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
     try:
-        key = load_pem_private_key(private_key.read_bytes(), password=None)
+        key = serialization.load_pem_private_key(private_key.read_bytes(), password=None)
     except OSError as error:
         raise UsageError(
             f"{private_key}: key cannot be read ({error.strerror}); make one: terrafix map keygen"
@@ -61,13 +60,16 @@ def sign(private_key: Path, message: bytes) -> tuple[TrustedKey, bytes]:
         raise UsageError(
             f"{private_key}: not an Ed25519 private key in PEM without password; make one: terrafix map keygen"
         )
-    return TrustedKey(key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)), key.sign(message)
+    return TrustedKey(key.public_key().public_bytes_raw()), key.sign(message)
 
 
 def generate(private_key: Path, public_key: Path, owner: str) -> TrustedKey:
     """Writes a new pair of keys, the private one readable by its owner only. Raises OutputError; overwrites nothing."""
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
     key = Ed25519PrivateKey.generate()
-    public = TrustedKey(key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw))
+    public = TrustedKey(key.public_key().public_bytes_raw())
     pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     line = f"{PUBLIC_PREFIX}{base64.b64encode(public.raw).decode()} {owner}\n"
     for path, content, mode in ((private_key, pem, 0o600), (public_key, line.encode(), 0o644)):
