@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
-from terrafix.child import WHERE_SIGNAL
 from terrafix.core.errors import TerrafixError
 from terrafix.core.progress import Progress
 from terrafix.core.rundir import RunDir
-from terrafix.nursery import Forked, Nursery
+from terrafix.nursery import WHERE_SIGNAL, Forked, Nursery
 from terrafix.processes import Process
 
 RESTART_LIMIT = 5  # deaths in the window; more is not bad luck but a fault that a restart does not cure

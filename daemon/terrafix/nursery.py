@@ -20,6 +20,7 @@ from terrafix.core.rundir import RunDir
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2): a process whose parent ended becomes ours
 READY_LIMIT_S = 10.0  # imports, on a computer that is very busy
 TRIES = 2  # a nursery that was killed is found dead when the next process is wanted
+WHERE_SIGNAL = signal.SIGUSR2  # "where are you?": the supervisor asks a stuck process for its tracebacks
 WORDS = "\0"  # between the words of a request: a path has none
 
 

@@ -19,6 +19,11 @@ class Process:
     newest: tuple[type[m.Message], ...] = ()  # a backlog of these becomes the newest one (see core/inbox.py)
 
 
+# Who else speaks.
+SOURCE = "source"  # who "says" what is fed into the in-process shell
+SUPERVISOR = "supervisor"  # says ProcessEvent
+OPERATOR = "operator"  # a command on this computer that says PositionHint; seldom there
+
 EVERYTHING: tuple[type[m.Message], ...] = (
     m.Origin,
     m.Frame,

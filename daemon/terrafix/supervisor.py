@@ -17,7 +17,6 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from terrafix.child import Spec, spec_of
 from terrafix.children import Child, Event, State
 from terrafix.core import config as configuration
 from terrafix.core import logs
@@ -26,10 +25,10 @@ from terrafix.core.clock import Ticker, now_ns
 from terrafix.core.config import Config
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.rundir import OwnedRunDir, RunDir, killed_in_flight
-from terrafix.core.shell import SUPERVISOR
 from terrafix.messages import ProcessEvent, SourceEnded
 from terrafix.nursery import Nursery
-from terrafix.processes import PROCESSES, Process
+from terrafix.processes import PROCESSES, SUPERVISOR, Process
+from terrafix.spec import Spec, spec_of
 
 LINK_GAVE_UP = 1  # exit code
 VITAL = "link"  # without it nothing leaves for the autopilot: systemd shall start everything anew

@@ -6,8 +6,7 @@ from pathlib import Path
 import msgspec
 
 from terrafix import messages
-from terrafix.core.shell import SUPERVISOR
-from terrafix.processes import EVERYTHING, PROCESSES
+from terrafix.processes import EVERYTHING, PROCESSES, SUPERVISOR
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "architecture.md"
 # Said by the shell and the supervisor, which are not processes of the table.

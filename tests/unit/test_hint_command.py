@@ -11,8 +11,8 @@ from terrafix.core import rundir
 from terrafix.core.bus import Publisher, Subscriber
 from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.rundir import OwnedRunDir, RunDir, living
-from terrafix.core.shell import OPERATOR
 from terrafix.messages import HintVerdict, PositionHint, Verdict
+from terrafix.processes import OPERATOR
 from terrafix_tools.hint import send
 from terrafix_tools.hint.send import HEARERS, hint
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from terrafix.child import spec_of
 from terrafix.core import rundir
 from terrafix.core.config import Config, LinkSection, Map, Source
 from terrafix.core.progress import Progress
 from terrafix.core.rundir import PREFIX, OwnedRunDir, RunDir
 from terrafix.processes import PROCESSES
+from terrafix.spec import spec_of
 from terrafix.supervisor import _is_camera, killed_just_now
 
 

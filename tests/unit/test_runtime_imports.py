@@ -123,3 +123,17 @@ print(*sorted({"numpy", "cv2", "pyproj", "zmq", "structlog"} & set(sys.modules))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == []
+
+
+def loaded(modules: str, named: set[str]) -> set[str]:
+    """Which of ``named`` an interpreter of its own has after importing ``modules``."""
+    code = f"import sys, {modules}; print(*sorted({named!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+def test_a_restart_in_flight_waits_for_nothing_that_it_does_not_need() -> None:
+    """The supervisor has no arrays; the anchor opens a model, or checks a signature, where one is configured."""
+    assert loaded("terrafix.supervisor", {"numpy", "cv2", "pyproj"}) == set()
+    assert loaded("terrafix.child, terrafix.anchor.node", {"onnxruntime", "cryptography"}) == set()

@@ -11,8 +11,8 @@ from terrafix import messages as m
 from terrafix.core import codec
 from terrafix.core.clock import Ticker
 from terrafix.core.inbox import Inbox
-from terrafix.core.shell import SOURCE, InProcessShell
-from terrafix.processes import EVERYTHING, PROCESSES, Process
+from terrafix.core.shell import InProcessShell
+from terrafix.processes import EVERYTHING, PROCESSES, SOURCE, Process
 
 
 def frame(frame_id: int) -> m.Frame:

@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,9 @@ from terrafix_tools.models.cli import app as models_app
 from terrafix_tools.montecarlo.cli import montecarlo
 from terrafix_tools.preflight.cli import preflight
 from terrafix_tools.sim.cli import app as sim_app
+
+if TYPE_CHECKING:
+    from terrafix.nursery import Nursery
 
 ON_THE_GROUND = ("rasterio", "urllib3", "pmtiles", "osmium")  # the extra `ground`: a vehicle need not have it
 
@@ -34,6 +37,7 @@ ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML 
 
 @app.command()
 def run(
+    context: typer.Context,
     source: Annotated[str, typer.Option(help="Flight folder, photos, video, /dev/video0 or GStreamer pipeline.")] = "",
     map_path: Annotated[Path | None, typer.Option("--map", help="Map package or GeoTIFF.")] = None,
     link: Annotated[str, typer.Option(help="udpin:H:P, udpout:H:P, tcp:H:P or a serial device.")] = "",
@@ -43,31 +47,28 @@ def run(
     config: ConfigOption = None,
 ) -> None:
     """Fly: start the processes under the supervisor until stopped."""
-    from terrafix.nursery import Nursery
+    from terrafix.supervisor import killed_just_now
+    from terrafix.supervisor import run as run_supervised
 
-    with Nursery() as nursery:  # first: it imports what the processes need while the map is looked at
-        from terrafix.supervisor import killed_just_now
-        from terrafix.supervisor import run as run_supervised
+    configs = config or []
+    before = killed_just_now(source=source, start=start, map_path=map_path, link=link, out_dir=out, configs=configs)
+    if before is not None:
+        package, ground_amsl_m = map_path, before.ground_amsl_m
+    else:
+        from terrafix_tools.live import package_for
 
-        configs = config or []
-        before = killed_just_now(source=source, start=start, map_path=map_path, link=link, out_dir=out, configs=configs)
-        if before is not None:
-            package, ground_amsl_m = map_path, before.ground_amsl_m
-        else:
-            from terrafix_tools.live import package_for
-
-            package, ground_amsl_m = package_for(source, start, map_path, configs)
-        code = run_supervised(
-            source=source,
-            start=start,
-            map_path=package,
-            ground_amsl_m=ground_amsl_m,
-            link=link,
-            out_dir=out,
-            configs=configs,
-            stop_after_source=until_end,
-            nursery=nursery,
-        )
+        package, ground_amsl_m = package_for(source, start, map_path, configs)
+    code = run_supervised(
+        source=source,
+        start=start,
+        map_path=package,
+        ground_amsl_m=ground_amsl_m,
+        link=link,
+        out_dir=out,
+        configs=configs,
+        stop_after_source=until_end,
+        nursery=context.obj,
+    )
     raise typer.Exit(code)
 
 
@@ -148,10 +149,12 @@ def bench(
     run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat, growing=growing)
 
 
-def main() -> None:
-    """The one funnel for errors: a user's mistake is one line and an exit code, a bug is a traceback."""
+def main(nursery: "Nursery | None" = None) -> None:
+    """The one funnel for errors: a user's mistake is one line and an exit code, a bug is a traceback.
+
+    ``nursery``: for `run`, one that was begun already (program.py)."""
     try:
-        app()
+        app(obj=nursery)
     except TerrafixError as error:
         typer.echo(f"terrafix: {error}", err=True)
         sys.exit(error.exit_code)

@@ -3,13 +3,14 @@
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from terrafix.messages import AnyMessage, Message
 
 
 def _plain(value: Any) -> Any:
     """numpy scalars that slipped into a message become plain numbers; anything else is a bug of the sayer."""
+    import numpy as np  # only here: the supervisor speaks, too, and has no arrays
+
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} cannot be part of a message")

@@ -7,8 +7,8 @@ import zmq
 
 from terrafix.core.bus import Publisher, Subscriber
 from terrafix.core.rundir import RunDir
-from terrafix.core.shell import OPERATOR
 from terrafix.messages import Message
+from terrafix.processes import OPERATOR
 
 LOOK_MS = 20
 

@@ -18,11 +18,8 @@ from terrafix.core.node import Edge, Node, NodeContext
 from terrafix.core.progress import Progress
 from terrafix.core.rundir import RunDir
 from terrafix.messages import Dropped, Message, NavEstimate, Origin, PositionHint, ProcessEvent
-from terrafix.processes import PROCESSES, Process
+from terrafix.processes import OPERATOR, PROCESSES, SOURCE, SUPERVISOR, Process
 
-SOURCE = "source"  # who "says" what is fed into the in-process shell
-SUPERVISOR = "supervisor"  # says ProcessEvent
-OPERATOR = "operator"  # a command on this computer that says PositionHint; seldom there
 EDGE_PERIOD_NS = 10_000_000  # an edge is looked at this often at least; 100 idle turns a second cost 1 % of a core
 IDLE_NS = 50_000_000  # a process that waits for messages shows this often that it is not stuck
 DROPPED_PERIOD_NS = 1_000_000_000  # losses are said at most this often

@@ -57,8 +57,9 @@ class Daemon:
             config.write_text(f'[source]\ncamera = "{camera}"\n[link]\ngps_id = {GPS_ID}\n', encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-        self._command = [sys.executable, "-m", "terrafix_tools.cli", "run", "--config", str(config), "--source", source]
-        self._command += ["--map", str(scene.map_path), "--link", link, "--out", str(out / "record")]
+        self._command = [sys.executable, "-m", "terrafix_tools.program", "run", "--config", str(config)]
+        self._command += ["--source", source, "--map", str(scene.map_path)]
+        self._command += ["--link", link, "--out", str(out / "record")]
 
     def start(self) -> None:
         with self._log.open("ab") as log:
