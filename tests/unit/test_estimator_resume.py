@@ -103,6 +103,20 @@ def test_frames_wait_for_the_words_to_which_belongs_what_was_learnt(flight: Flig
     assert sum(isinstance(m, Prediction) for m in said) == 2
 
 
+def test_a_picture_that_is_older_than_the_first_words_is_not_begun_with(flight: Flight, killed: Last) -> None:
+    """A camera has buffers. Begun with it, the graph was blind, and the anchor looked at all headings for 8 s."""
+    node = EstimatorNode(0, killed)
+    said = list(node.on(ORIGIN))
+    old, new = BACK, BACK + 4  # two seconds
+    for message in [m for m in flight.messages(new) if isinstance(m, VehicleState)]:
+        said += node.on(message)
+    for i in (old, new, new + 1):
+        said += [x for m in flight.messages(i) if isinstance(m, Odometry) for x in node.on(blind(m))]
+    told = [m for m in said if isinstance(m, Prediction)]
+    assert [m.frame_id for m in told] == [new, new + 1]
+    assert np.sqrt(told[0].cov[35]) < 0.1
+
+
 def test_an_autopilot_that_says_nothing_is_not_waited_for(flight: Flight, killed: Last) -> None:
     node = EstimatorNode(0, killed)
     said = list(node.on(ORIGIN))

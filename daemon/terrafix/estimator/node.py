@@ -100,15 +100,17 @@ class EstimatorNode:
 
     def _begun(self) -> Iterable[Message]:
         """All frames that wait, when the first of them can be begun with. Vision may be there before the link is, after
-        a restart; a graph that began without heading and height would have to begin anew."""
+        a restart; a graph that began without heading and height would have to begin anew, and the anchor look at all
+        of both for seconds. So a picture that is older than the first words is left out where a newer one is not."""
         if not self._waiting:
             return
         begins = self._estimator is not None and self._estimator.last is None
         if begins and self._resumed_from is not None and self._resumed_from.slow is not None:
-            first = self._waiting[0].t_ns
-            said = self._telemetry.at(first)
-            known = said.yaw_rad is not None and said.agl_m is not None
-            if not known and self._waiting[-1].t_ns - first < WORDS_WAIT_NS:
+            said = [self._telemetry.at(odometry.t_ns) for odometry in self._waiting]
+            known = [one.yaw_rad is not None and one.agl_m is not None for one in said]
+            if any(known):
+                del self._waiting[: known.index(True)]
+            elif self._waiting[-1].t_ns - self._waiting[0].t_ns < WORDS_WAIT_NS:
                 return
         waiting, self._waiting = self._waiting, []
         for odometry in waiting:
