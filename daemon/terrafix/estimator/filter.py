@@ -84,7 +84,7 @@ class Estimator(Tracker):
         if match.found:  # by a search, over several frames: it outweighs whatever the graph believes
             self.rival = Rival()
             return self._restart(match, node, measured, cov, "found")
-        if self._turns_about_m is not None:
+        if self._open is not None:
             if match.coarse:  # its heading is one of those that were tried
                 return FixResult(Verdict.AMBIGUOUS, None, "a coarse fix does not tell the heading")
             return self._restart(match, node, measured, cov, "heading found")
@@ -160,8 +160,8 @@ class Estimator(Tracker):
         bias_cov = self.graph.bias_covariance(self.graph.newest)
         velocity = now.velocity
         self._velocity_cov = RESTART_INFLATION * self.graph.velocity_covariance(self.graph.newest)
-        if self._turns_about_m is not None:  # it was one along axes that nobody knew
-            velocity, self._velocity_cov, self._turns_about_m = np.zeros(V_SIZE), unknown_cov(), None
+        if self._open is not None:  # it was one along axes that nobody knew
+            velocity, self._velocity_cov, self._open = np.zeros(V_SIZE), unknown_cov(), None
         self.graph.start(now_s, NodeState(measured.compose(onward), bias, velocity), cov, bias_cov, self._velocity_cov)
         assert self._last is not None
         self._felt = self._stood_at = None

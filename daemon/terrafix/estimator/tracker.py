@@ -8,8 +8,10 @@ import gtsam
 import numpy as np
 
 from terrafix.core.pose import tangent_to_world, world_to_tangent
+from terrafix.estimator.beginning import Beginning, Slow, TakeOff
 from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS_SIGMA, SCALE
-from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sigmas
+from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph
+from terrafix.estimator.heading import OpenHeading
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.mounted import (
     DEFAULT_AGL_M,
@@ -41,14 +43,11 @@ from terrafix.messages import Camera, CovarianceMode, Odometry, Origin, Verdict
 COMPASS_BIAS_RAD = np.radians(10.0)
 HEIGHT_BIAS = 0.05  # of the height
 TAKE_OFF_AWAY = 5.0  # heights: from where it took off to where it is first seen in the air, a climb at 20 %
-FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off
-CHOSEN_RAD = np.radians(1.0)  # 1-sigma of a heading that is chosen, in axes of its own
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 
 Feel = Callable[[int, int], Felt | None]
-Slow = tuple[np.ndarray, np.ndarray]  # slow errors (6,), covariance (6x6)
 
 
 def nothing_felt(_t0_ns: int, _t1_ns: int) -> None:
@@ -96,13 +95,10 @@ class Tracker:
         self._seen_from: int | None = None  # node of the keyframe that odometry saw the newest frame from
         self._felt: bool | None = None  # whether the last leg was measured; None: there was none
         self._stood_at: int | None = None  # node at which a vehicle stands, motors off
-        self._launching = False  # it stood, and was not seen to fly since ...
-        self._blind = False  # ... nor felt
+        self._take_off = TakeOff()
         self._last: Placed | None = None  # newest frame
-        self._began_with = (False, False)  # heading, height
-        self._turns_about_m: np.ndarray | None = None  # (2,) nobody said the heading: all may turn about this start
-        self._known = known
-        self._first_s = 0.0  # when the graph began first
+        self._beginning = Beginning(origin, known)
+        self._open: OpenHeading | None = None  # None: the heading is known
 
     @property
     def last(self) -> Placed | None:
@@ -116,7 +112,7 @@ class Tracker:
     @property
     def measures_height(self) -> bool:
         """The autopilot says how high it flies."""
-        return self._began_with[1]
+        return self._beginning.has_height
 
     def stretch(self, node: int) -> tuple[float, float]:
         """Heights over heights as they are seen, and the 1-sigma of that (relative): of what the barometer tells
@@ -138,7 +134,7 @@ class Tracker:
             seen_m = float(p[2]) - ground_m
             return ground_m + stretch * seen_m, sigma * seen_m
         seen_m = self.graph.state(placed.node).up_by_barometer_m - self.terrain.ground_m
-        drift_m = WALK_SIGMAS[HEIGHT] * np.sqrt(placed.t_s - self._first_s)
+        drift_m = WALK_SIGMAS[HEIGHT] * np.sqrt(placed.t_s - self._beginning.t_s)
         return self.terrain.ground_m + stretch * seen_m, float(
             np.linalg.norm([self.origin.agl_sigma_m, drift_m, sigma * seen_m])
         )
@@ -147,18 +143,23 @@ class Tracker:
         self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude, felt: Feel = nothing_felt
     ) -> Advance:
         """``felt(t0_ns, t1_ns)``: acceleration between two times, where the inertial readings cover them."""
-        if self._last is None or self._knows_more(attitude):
+        if self._last is None or (self.last_fix_s is None and self._beginning.is_told_more(attitude)):
+            # No linear graph recovers from a heading that turns out to be 70 degrees off what was assumed.
             return self._begin(frame_id, t_s, attitude)
         newest = self.graph.newest
         before, dt_s = self.graph.state(newest), t_s - self.graph.time_of(newest)
         known = self._by_odometry(odometry, attitude)
-        self._launching = attitude.stands or self._launching
+        if attitude.stands:
+            self._take_off.stood()
         way = None if attitude.stands else self._leg(t_s, before, attitude, felt)
         spread = spread_after(way, self._velocity_cov)
         led_to, velocity = before.pose.translation(), np.zeros(V_SIZE)
         if way is not None:
             led_to, velocity = way.predicted(led_to, before.velocity, float(before.bias[2]))
-        if self._has_taken_off_blind(known is not None, way, led_to):
+        above_m = None if known is None else float(led_to[2]) - self.terrain.ground_m
+        if self._take_off.was_blind(way, above_m):
+            # Told of the speed at both ends, a graph would make up the way between them and be too sure of it: it
+            # begins again, where and as sure as it is.
             cov = tangent_to_world(self._covariance(newest), before.pose.rotation().matrix())
             sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2] + spread[:2, :2])[-1]))
             placed = self._start_graph(frame_id, t_s, attitude, led_to[:2], sigma_m)
@@ -224,50 +225,13 @@ class Tracker:
             self._pace.mps,
             float(np.hypot(np.radians(self.origin.attitude_sigma_deg), attitude.righted_rad)),
             same_kind=self._felt is (measured is not None),
-            launching=self._launching,
+            launching=self._take_off.launching,
         )
 
-    def _has_taken_off_blind(self, seen: bool, way: Leg | None, led_to_m: np.ndarray) -> bool:
-        """It is seen to fly after a take-off that nothing measured. Told of the speed at both ends, a graph would
-        make up the way between them and be too sure of it: it begins again, where and as sure as it is."""
-        if not self._launching or way is None:
-            return False
-        self._blind = self._blind or not way.inertial
-        if not seen or float(led_to_m[2]) - self.terrain.ground_m < FLYING_M:
-            return False
-        blind, self._launching, self._blind = self._blind, False, False
-        return blind
-
-    def _knows_more(self, attitude: Attitude) -> bool:
-        """The first words of the autopilot came after the first frame, before the first fix. No linear graph recovers
-        from a heading that turns out to be 70 degrees off what was assumed, so it begins again."""
-        heading = not self._began_with[0] and attitude.yaw_rad is not None
-        height = not self._began_with[1] and attitude.agl_m is not None
-        return self.last_fix_s is None and (heading or height)
-
     def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
-        """Where the flight was known last, and has flown on since."""
-        self._began_with = (attitude.yaw_rad is not None, attitude.agl_m is not None)
-        self._known = known = self._known or Known.start(self.origin, t_s)
-        self._first_s = known.t_s
-        if known.match is not None:
-            self.terrain.hear(known.match, np.array([known.match.mode_e_m, known.match.mode_n_m]))
-        way_m, drift_m = known.later(t_s, attitude.yaw_rad)
-        sigma_m = float(np.hypot(known.sigma_m, drift_m))
-        slow = self._slow_now(known, t_s, attitude, float(np.hypot(*way_m)) + drift_m)
-        placed = self._start_graph(frame_id, t_s, attitude, known.at_m + way_m, sigma_m, slow)
-        return Advance(Verdict.ACCEPTED, placed, way_m, drift_m)
-
-    def _slow_now(self, known: Known, t_s: float, attitude: Attitude, way_m: float) -> Slow | None:
-        """What was learnt before this process was started holds on, but for what has changed since. None: nothing was,
-        or a word is missing now to which it belongs."""
-        learnt = known.learnt
-        if learnt is None or known.yaw_rad is None or attitude.yaw_rad is None or attitude.agl_m is None:
-            return None
-        turned_rad = np.angle(np.exp(1j * (attitude.yaw_rad - known.yaw_rad)))
-        rise_m = self.terrain.rise_sigma_m(way_m)
-        sigmas = walk_sigmas(max(t_s - learnt.t_s, 0.0), float(turned_rad), rise_m)
-        return learnt.error, learnt.cov + np.diag(sigmas**2)
+        begun = self._beginning.begun(t_s, attitude, self.terrain)
+        placed = self._start_graph(frame_id, t_s, attitude, begun.at_m, begun.sigma_m, begun.slow)
+        return Advance(Verdict.ACCEPTED, placed, begun.way_m, begun.way_sigma_m)
 
     def _start_graph(
         self,
@@ -298,12 +262,8 @@ class Tracker:
         wide = np.diag([1.0, 1.0, UNKNOWN_RAD, sigma_m, sigma_m, 3 * agl_sigma]) ** 2
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
-        # A heading that nobody says is a choice of axes, not something to be estimated: no pair and no leg tells it.
-        # A graph that leaves it open is soon sure of a wrong one, because it is linearised at another one each time.
-        self._turns_about_m = np.array(at_m) if attitude.yaw_rad is None else None
-        held = cov_world.copy()
-        if self._turns_about_m is not None:
-            held[5, 5] = CHOSEN_RAD**2
+        self._open = OpenHeading(at_m) if attitude.yaw_rad is None else None
+        held = cov_world if self._open is None else self._open.chosen(cov_world)
         self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
         self._felt = self._stood_at = None
         node = self.graph.start(
@@ -387,14 +347,8 @@ class Tracker:
             self._velocity_cov = self.graph.velocity_covariance(node)
         state = self.graph.state(node)
         velocity, velocity_cov, cov = state.velocity[:3], self._velocity_cov[:3, :3], self._covariance(node)
-        if self._turns_about_m is not None:
-            r_w_c, p = state.pose.rotation().matrix(), state.pose.translation()
-            level = np.diag([1.0, 1.0, 0.0])
-            turned = np.zeros((6, 6))
-            turned[:3, :3] = float(np.sum((p[:2] - self._turns_about_m) ** 2)) * level
-            turned[5, 5] = UNKNOWN_RAD**2
-            cov = cov + world_to_tangent(turned, r_w_c)
-            velocity_cov = velocity_cov + float(velocity[:2] @ velocity[:2]) * level
+        if self._open is not None:
+            cov, velocity_cov = self._open.opened(state.pose, cov, velocity, velocity_cov)
         return Placed(frame_id, t_s, state.pose, cov, velocity, velocity_cov, node)
 
     def _covariance(self, node: int) -> np.ndarray:

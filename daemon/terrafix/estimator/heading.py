@@ -1,0 +1,35 @@
+"""A heading that nobody says, until a pose on the map tells it."""
+
+import gtsam
+import numpy as np
+
+from terrafix.core.pose import world_to_tangent
+from terrafix.estimator.mounted import UNKNOWN_RAD
+
+CHOSEN_RAD = np.radians(1.0)  # 1-sigma of a heading that is chosen, in axes of its own
+
+
+class OpenHeading:
+    """A heading that nobody says is a choice of axes, not something to be estimated: no pair and no leg tells it. A
+    graph that leaves it open is soon sure of a wrong one, because it is linearised at another one each time. So it is
+    chosen there, and what is said has it open: all may turn about a place (2,), east and north."""
+
+    def __init__(self, about_m: np.ndarray) -> None:
+        self._about_m = about_m.copy()
+
+    def chosen(self, cov_world: np.ndarray) -> np.ndarray:
+        """``cov_world`` (6, 6) of the camera's pose, position first, in the axes that were chosen."""
+        cov = cov_world.copy()
+        cov[5, 5] = CHOSEN_RAD**2
+        return cov
+
+    def opened(
+        self, pose: gtsam.Pose3, cov: np.ndarray, velocity_mps: np.ndarray, velocity_cov: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What is known of a pose and its velocity in no axes: covariances (6, 6), tangent order, and (3, 3)."""
+        level = np.diag([1.0, 1.0, 0.0])
+        turned = np.zeros((6, 6))
+        turned[:3, :3] = float(np.sum((pose.translation()[:2] - self._about_m) ** 2)) * level
+        turned[5, 5] = UNKNOWN_RAD**2
+        cov = cov + world_to_tangent(turned, pose.rotation().matrix())
+        return cov, velocity_cov + float(velocity_mps[:2] @ velocity_mps[:2]) * level
