@@ -7,6 +7,7 @@ from ground import PINHOLE, apply, homography, rotation, texture, view
 from terrafix.core.geodesy import yaw_of
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
+from terrafix.estimator.mounted import UNKNOWN_ATTITUDE_RAD
 from terrafix.vision.odometry import FrameTracker
 
 AGL_M = 100.0
@@ -130,6 +131,20 @@ def test_sloping_ground(slope: tuple[float, float]) -> None:
     assert unknown is not None
     error = np.concatenate([log_so3(r_true.T @ unknown.r), unknown.r.T @ (unknown.p_m - p_true)])
     assert error @ np.linalg.solve(unknown.cov, error) < 22.5
+
+
+def test_a_lean_into_a_turn_is_a_motion_unless_the_tilt_is_told_otherwise() -> None:
+    rng = np.random.default_rng(6)
+    leaning = (rotation(-10.0, 5.0, 22.0), np.array([3.0, 5.0, AGL_M]))
+    r_true, p_true = between(FIRST, leaning)
+    pairs = pairs_between(FIRST, leaning, 80, rng, 1e-4)
+    untold = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], UNKNOWN_ATTITUDE_RAD, FLAT)
+    assert untold is not None
+    assert np.degrees(np.linalg.norm(log_so3(r_true.T @ untold.r))) < 0.5
+    assert np.linalg.norm(untold.p_m - p_true) < 1.0
+    assert relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], np.radians(2.0), FLAT) is None
+    wavy = pairs + rng.normal(0.0, 3.0 * SIGMA, pairs.shape)  # a plane that they do not fit
+    assert relative_pose(wavy, SIGMA, FIRST[0], FIRST[0], UNKNOWN_ATTITUDE_RAD, FLAT) is None
 
 
 def test_what_cannot_be_known_is_none() -> None:

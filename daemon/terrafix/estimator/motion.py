@@ -12,7 +12,11 @@ SCALE_SIGMA = 0.02  # houses and trees lift the mean ground by this share of the
 ROOF_SCALE_SIGMA = 0.12  # ... and by this when hardly any match lies on the plane: tall buildings at 100 m
 MIN_PAIRS = 8
 FIRST_TOLERANCE = 1e-3  # rad and relative metres; the graph solves for the motion again, from the same rays
-MAX_TILT_CHANGE_RAD = np.radians(15.0)  # beyond the guess: matches in a narrow band trade translation for tilt
+# Beyond the guess: matches in a narrow band trade translation for tilt, and a wrong tilt rarely fits. One that fits as
+# well as the matches are good may be larger where nobody reports tilt: a vehicle leans into a turn.
+MAX_TILT_CHANGE_RAD = np.radians(15.0)
+TILT_SIGMAS = 5.2  # chi-square, 2 degrees of freedom, 99.9 %, of the difference of two leans that are known as well
+FITS = 1.3  # of the sigma that matches claim: three sigmas of the median of 48
 MIN_DOWN = -0.2  # up component of a unit-depth ray that meets the ground no farther than five heights away
 
 
@@ -95,7 +99,11 @@ def relative_pose(
         tilt_sigma_rad=tilt_sigma_rad,
         tolerance=FIRST_TOLERANCE,
     )
-    if fit is None or float(np.linalg.norm(log_so3((turn @ r_w_k).T @ fit.r_w_c)[:2])) > MAX_TILT_CHANGE_RAD:
+    if fit is None:
+        return None
+    tilted_rad = float(np.linalg.norm(log_so3((turn @ r_w_k).T @ fit.r_w_c)[:2]))
+    possible_rad = TILT_SIGMAS * tilt_sigma_rad if fit.sigma < FITS * sigma_norm else 0.0
+    if tilted_rad > max(MAX_TILT_CHANGE_RAD, possible_rad):
         return None
     cov = fit.cov.copy()
     # A wrong height scales the translation; the tangent's translation is in the new camera's axes.
