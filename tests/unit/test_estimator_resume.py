@@ -10,7 +10,7 @@ from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.pose import log_so3
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.resume import Keeper, Known, Last, Learnt, kept
-from terrafix.messages import Odometry, Prediction, VehicleState
+from terrafix.messages import MeasurementVerdict, Odometry, Prediction, VehicleState, Verdict
 
 KILLED, BACK = 60, 66  # frames: three seconds
 PLANE_MPS, DOWN_S, BANK_DEG = 22.0, 7.0, 42.0
@@ -114,6 +114,8 @@ def test_a_picture_that_is_older_than_the_first_words_is_not_begun_with(flight: 
         said += [x for m in flight.messages(i) if isinstance(m, Odometry) for x in node.on(blind(m))]
     told = [m for m in said if isinstance(m, Prediction)]
     assert [m.frame_id for m in told] == [new, new + 1]
+    verdicts = {m.frame_id: m.verdict for m in said if isinstance(m, MeasurementVerdict)}
+    assert verdicts.pop(old) is Verdict.STALE and sorted(verdicts) == [new, new + 1]
     assert np.sqrt(told[0].cov[35]) < 0.1
 
 

@@ -37,6 +37,7 @@ from terrafix.messages import (
 ANCHORED_FOR_S = 1.5  # after a map fix the odometry since then is too short to matter
 SLOW_EVERY_NS = 1_000_000_000
 WORDS_WAIT_NS = 1_000_000_000  # the autopilot's heartbeat comes once a second
+BEFORE_WORDS = "older than the autopilot's first words after the restart"
 
 
 class EstimatorNode:
@@ -109,7 +110,8 @@ class EstimatorNode:
             said = [self._telemetry.at(odometry.t_ns) for odometry in self._waiting]
             known = [one.yaw_rad is not None and one.agl_m is not None for one in said]
             if any(known):
-                del self._waiting[: known.index(True)]
+                older, self._waiting = self._waiting[: known.index(True)], self._waiting[known.index(True) :]
+                yield from (_odometry_verdict(odometry, Verdict.STALE, BEFORE_WORDS) for odometry in older)
             elif self._waiting[-1].t_ns - self._waiting[0].t_ns < WORDS_WAIT_NS:
                 return
         waiting, self._waiting = self._waiting, []
@@ -130,9 +132,7 @@ class EstimatorNode:
             self._from_m = np.array(before.pose.translation()[:2])
         advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, self._righted.felt)
         self._tracked = advance.verdict is Verdict.ACCEPTED
-        yield MeasurementVerdict(
-            t_ns=odometry.t_ns, frame_id=odometry.frame_id, measurement="odometry", verdict=advance.verdict
-        )
+        yield _odometry_verdict(odometry, advance.verdict)
         if odometry.verdict not in (Verdict.BAD_IMAGE, Verdict.STALLED):
             yield self._prediction(odometry, advance, estimator, seen)
             self._predicted = odometry.frame_id
@@ -252,6 +252,11 @@ class EstimatorNode:
                 )
             )
         yield Refinement(t_ns=ended.t_ns, poses=poses)
+
+
+def _odometry_verdict(odometry: Odometry, verdict: Verdict, detail: str = "") -> MeasurementVerdict:
+    t_ns, frame_id = odometry.t_ns, odometry.frame_id
+    return MeasurementVerdict(t_ns=t_ns, frame_id=frame_id, measurement="odometry", verdict=verdict, detail=detail)
 
 
 def make_node(ctx: NodeContext) -> EstimatorNode:
