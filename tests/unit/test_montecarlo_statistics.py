@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from terrafix_tools.montecarlo.endurance import slopes
+from terrafix_tools.montecarlo.endurance import OldAndYoung, slopes
+from terrafix_tools.montecarlo.fault import Fault
+from terrafix_tools.montecarlo.flight import run
+from terrafix_tools.montecarlo.plan import plan
 from terrafix_tools.montecarlo.statistics import band, chi2, draws_in, floors, nees_of, whitened
 
 Z975 = 1.959964
@@ -69,16 +72,28 @@ def test_floors_name_what_is_broken() -> None:
 
 
 @pytest.mark.parametrize(
-    ("growth_ms_per_h", "growth_mb_per_h", "flat"), [(0.0, 0.5, True), (0.3, 0.0, False), (0.0, 60.0, False)]
+    ("growth_per_h", "growth_mb_per_h", "flat"), [(0.0, 0.5, True), (0.03, 0.0, False), (0.0, 60.0, False)]
 )
-def test_slopes_are_those_of_the_line_whatever_the_machine_did_meanwhile(
-    growth_ms_per_h: float, growth_mb_per_h: float, flat: bool
+def test_slopes_are_those_of_the_estimator_whatever_the_machine_did_meanwhile(
+    growth_per_h: float, growth_mb_per_h: float, flat: bool
 ) -> None:
     rng, t_s = np.random.default_rng(5), np.arange(7200.0)
-    busy = np.where(rng.uniform(size=7200) < 0.05, 30.0, 0.0)
-    slower = 1.0 + 0.2 * t_s / 3600.0
-    cpu_ms = slower * (10.0 + growth_ms_per_h * t_s / 3600.0 + busy + 0.5 * rng.normal(size=7200))
-    found = slopes(t_s, cpu_ms, slower * (8.0 + 0.5 * rng.normal(size=7200)), 200.0 + growth_mb_per_h * t_s / 3600.0)
-    assert found["cpu_share_per_h"] == pytest.approx(growth_ms_per_h / 10.0, abs=0.009)
+    busy = np.where(rng.uniform(size=1200) < 0.05, 30.0, 0.0) + 5.0 * np.linspace(1.0, 2.0, 1200)
+    compared_ms = np.column_stack([(1.0 + 1.5 * growth_per_h) * busy, busy]) * (1.0 + 0.05 * rng.normal(size=(1200, 2)))
+    found = slopes(t_s, 200.0 + growth_mb_per_h * t_s / 3600.0, compared_ms, 1.5)
+    assert found["cpu_share_per_h"] == pytest.approx(growth_per_h, abs=3.0 * found["cpu_share_sigma"])
+    assert found["cpu_share_sigma"] < 0.005
     assert found["memory_mb_per_h"] == pytest.approx(growth_mb_per_h)
     assert found["flat"] is flat
+
+
+def test_a_young_estimator_hears_what_an_old_one_does_and_is_where_it_is() -> None:
+    flight = OldAndYoung(plan(1, 0, fault=Fault.NONE, duration_s=60.0), 30.0)
+    alone = run(plan(1, 0, fault=Fault.NONE, duration_s=60.0), refine=False)
+    record = flight.record(refine=False)
+    np.testing.assert_array_equal(record.error_m, alone.error_m)  # nobody changed what the old one says
+    spent_ms = np.array(flight.frames_ms)
+    assert len(spent_ms) == (record.t_s > 30.0).sum() and (spent_ms > 0.0).all()
+    old, young = flight._node._estimator, flight._young._estimator  # type: ignore[union-attr]
+    apart_m = old.last.pose.translation() - young.last.pose.translation()  # type: ignore[union-attr]
+    assert np.hypot(*apart_m[:2]) < 3.0
