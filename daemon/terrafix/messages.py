@@ -192,6 +192,7 @@ class Prediction(Message, frozen=True, kw_only=True):
     agl_sigma_m: float
     step_m: Vec2  # camera motion (east, north) since the previous Prediction, by odometry alone
     step_cov_m2: Mat2  # its covariance (ee, en, ne, nn)
+    start_ns: int = 0  # t_ns of the Start from which all this is known; 0: none was said
 
 
 # --- anchor ---------------------------------------------------------------------------------------
@@ -253,6 +254,18 @@ class HintVerdict(Message, frozen=True, kw_only=True):
     distance_m: float | None  # from the position that was believed; None: none was
     sigma_m: float | None  # what that one claimed, 1-sigma per horizontal axis
     text: str  # for the operator, at most 40 characters
+
+
+class Start(Message, frozen=True, kw_only=True):
+    """Where the flight begins, if its Origin does not say so: the answer to a GnssStart, with the ground of the map.
+
+    ``t_ns`` is that of the GnssStart. OUTSIDE_MAP: not taken. Without a place (None) the start is not known."""
+
+    verdict: Verdict
+    lat_deg: float | None
+    lon_deg: float | None
+    sigma_m: float | None  # 1-sigma per horizontal axis
+    ground_amsl_m: float | None  # AMSL height of the ground there; None: the map does not tell
 
 
 class ModelChange(StrEnum):
@@ -369,7 +382,7 @@ class LinkStatus(Message, frozen=True, kw_only=True):
 
 
 class GnssReading(Message, frozen=True, kw_only=True):
-    """What a GNSS receiver of the autopilot says, at its arrival; to be judged, never to navigate by."""
+    """What a GNSS receiver of the autopilot says, at its arrival; to be judged, and never to navigate by in flight."""
 
     receiver: int  # 0 is the autopilot's GPS1
     fix_type: int  # GPS_FIX_TYPE: 3 is 3D
@@ -378,6 +391,17 @@ class GnssReading(Message, frozen=True, kw_only=True):
     horizontal_m: float | None  # 1-sigma that it claims
     speed_mps: float | None
     satellites: int | None
+
+
+class GnssStart(Message, frozen=True, kw_only=True):
+    """Where a receiver says that the vehicle stands before take-off, until it is armed; repeated once a second.
+
+    ``t_ns`` is that of the reading, and of its repetitions. Without a place (None) the one before is withdrawn."""
+
+    lat_deg: float | None
+    lon_deg: float | None
+    sigma_m: float | None  # 1-sigma per horizontal axis
+    receiver: int  # 0 is the autopilot's GPS1
 
 
 class GnssState(StrEnum):
@@ -482,6 +506,7 @@ AnyMessage = (
     | SearchState
     | PositionHint
     | HintVerdict
+    | Start
     | NavEstimate
     | SlowErrors
     | Refinement
@@ -489,6 +514,7 @@ AnyMessage = (
     | GpsInput
     | LinkStatus
     | GnssReading
+    | GnssStart
     | GnssVerdict
     | PositionSource
     | FilterStatus

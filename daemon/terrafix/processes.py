@@ -37,6 +37,7 @@ EVERYTHING: tuple[type[m.Message], ...] = (
     m.SearchState,
     m.PositionHint,
     m.HintVerdict,
+    m.Start,
     m.NavEstimate,
     m.SlowErrors,
     m.Refinement,
@@ -44,6 +45,7 @@ EVERYTHING: tuple[type[m.Message], ...] = (
     m.GpsInput,
     m.LinkStatus,
     m.GnssReading,
+    m.GnssStart,
     m.GnssVerdict,
     m.PositionSource,
     m.FilterStatus,
@@ -62,7 +64,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "link",
         "terrafix.link.node",
-        (m.Origin, m.NavEstimate, m.SearchState, m.HintVerdict, m.Health, m.ProcessEvent),
+        (m.Origin, m.NavEstimate, m.SearchState, m.HintVerdict, m.Start, m.Health, m.ProcessEvent),
         (
             m.VehicleState,
             m.Imu,
@@ -71,6 +73,7 @@ PROCESSES: tuple[Process, ...] = (
             m.MeasurementVerdict,
             m.LinkStatus,
             m.GnssReading,
+            m.GnssStart,
             m.GnssVerdict,
             m.PositionSource,
             m.FilterStatus,
@@ -83,7 +86,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "estimator",
         "terrafix.estimator.node",
-        (m.Origin, m.Frame, m.VehicleState, m.Imu, m.Odometry, m.MapMatch, m.Health, m.SourceEnded),
+        (m.Origin, m.Start, m.Frame, m.VehicleState, m.Imu, m.Odometry, m.MapMatch, m.Health, m.SourceEnded),
         (m.Prediction, m.NavEstimate, m.SlowErrors, m.Refinement, m.MeasurementVerdict),
         0.0,
         20.0,
@@ -91,8 +94,8 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "anchor",
         "terrafix.anchor.node",
-        (m.Origin, m.Prediction, m.PositionHint),
-        (m.MapMatch, m.ModelEvent, m.SearchState, m.HintVerdict),
+        (m.Origin, m.Prediction, m.PositionHint, m.GnssStart),
+        (m.MapMatch, m.ModelEvent, m.SearchState, m.HintVerdict, m.Start),
         0.0,
         90.0,  # one look over a large map takes seconds, and half a minute on a computer that is ten times as busy
         (m.Prediction,),

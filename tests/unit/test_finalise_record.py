@@ -71,7 +71,10 @@ def test_a_torn_record_is_used_as_far_as_it_goes(flown: Path, tmp_path: Path) ->
     whole = (flown / "flight.mcap").read_bytes()
     (tmp_path / "flight.mcap.partial").write_bytes(whole[: len(whole) * 2 // 3])
     summary = finalise(tmp_path)
-    assert 5 < summary["frames"] < FRAMES and summary["finalised"] == summary["frames"]
+    assert 5 < summary["frames"] < FRAMES
+    assert (
+        summary["finalised"] >= summary["frames"] - 1
+    )  # of the last frame there may be no more than that it was taken
     assert any("ends in the middle" in line for line in last_lines(summary, tmp_path))
 
 

@@ -441,6 +441,10 @@ def test_map_start_and_mission_belong_together(tmp_path: Path) -> None:
     unknown = {line.check: line for line in computer.about(config, tmp_path / "none.plan", tmp_path)}
     assert [unknown[check].status for check in ("map", "start", "mission")] == ["ok", "warn", "fail"]
     assert "no such mission file" in unknown["mission"].text
+    assert "autopilot's GNSS" in unknown["start"].text and "whole map" in unknown["start"].text
+    config = Config(map=MapSection(path=str(package)), link=LinkSection(gnss_start=False))
+    searched = {line.check: line for line in computer.about(config, tmp_path / "none.plan", tmp_path)}
+    assert "GNSS" not in searched["start"].text and "whole map" in searched["start"].text
     bad = lines((900.0, 0.0), (0.0, 0.0), (400.0, 0.0))
     assert (bad["start"].status, bad["mission"].status) == ("fail", "fail")
     assert "leaves the map" in bad["mission"].text

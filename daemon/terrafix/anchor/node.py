@@ -15,6 +15,7 @@ from terrafix.anchor.matcher import view_at
 from terrafix.anchor.model_watch import ModelWatch
 from terrafix.anchor.place_check import SIGMA_FLOOR
 from terrafix.anchor.place_search import PlaceSearch, anywhere_m, start_around
+from terrafix.anchor.start import answered
 from terrafix.anchor.tracks import NEAR
 from terrafix.anchor.views import ground_plane, view_of
 from terrafix.core.camera import CameraCalibration
@@ -24,6 +25,7 @@ from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.core.start import SEARCHED_START_M
 from terrafix.messages import (
+    GnssStart,
     MapMatch,
     Message,
     Origin,
@@ -31,6 +33,7 @@ from terrafix.messages import (
     Prediction,
     SearchState,
     SearchStep,
+    Start,
     Verdict,
 )
 from terrafix_engines.features import open_describer
@@ -75,6 +78,8 @@ class AnchorNode:
         self._origin: Origin | None = None
         self._ground_m = 0.0
         self._hint: PositionHint | None = None  # not answered yet
+        self._start: Start | None = None  # the newest answer to a GnssStart
+        self._start_ns = 0  # of the Start from which the predictions come
         self._answers: list[Message] = []
         self._said_step = SearchStep.NORMAL
         self._begin()
@@ -100,7 +105,14 @@ class AnchorNode:
                 yield from self._model.opened(message.t_ns)
             case PositionHint():
                 self._hint = message  # height and place come with the next frame
+            case GnssStart():
+                if self._start is None or self._start.t_ns != message.t_ns:
+                    self._start = answered(message, self._package)
+                yield self._start
             case Prediction():
+                if message.start_ns > self._start_ns:  # what was believed before was somewhere else
+                    self._start_ns = message.start_ns
+                    self._begin()
                 match = self._named(self._contained(message))
                 yield match
                 yield from self._answers

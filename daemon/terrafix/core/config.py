@@ -50,6 +50,7 @@ class LinkSection(Section, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(ge=5, le=15)] = 10.0  # faster leaves gaps that the autopilot drops
     outputs: list[OutputName] = []  # empty: by the autopilot, gps_input for ArduPilot, global_position for PX4
     gnss: GnssMode = "advise"  # what follows when a receiver disagrees with the map
+    gnss_start: bool = True  # a receiver says where the flight begins, if nobody else does
     nmea_device: str = ""  # also NMEA 0183 to this device
     nmea_baud: Baud = 115_200
     msp_device: str = ""  # also MSP2_SENSOR_GPS to this device

@@ -27,6 +27,7 @@ def fold_prediction(older: Message, newer: Message) -> Message:
         agl_sigma_m=b.agl_sigma_m,
         step_m=step_m,
         step_cov_m2=(cov[0], cov[1], cov[2], cov[3]),
+        start_ns=b.start_ns,
     )
 
 

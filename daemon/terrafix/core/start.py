@@ -8,7 +8,7 @@ import msgspec
 
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
-from terrafix.messages import Origin
+from terrafix.messages import Origin, Start
 
 SEARCHED_START_M = 100.0  # 1-sigma: a start that is known less well is searched on the map, not assumed
 
@@ -33,6 +33,15 @@ def placed(origin: Origin, bounds: Bounds) -> Origin:
     lat_deg, lon_deg = middle_of(bounds)
     half_m = max(LocalFrame(lat_deg, lon_deg).to_local(bounds[3], bounds[2]))
     return msgspec.structs.replace(origin, lat_deg=lat_deg, lon_deg=lon_deg, start_sigma_m=half_m)
+
+
+def begun(origin: Origin, start: Start | None) -> Origin:
+    """The origin, as it is when the flight begins at ``start`` of it: how well that is known, and the height of the
+    ground there. The frame of reference stays where it was."""
+    if start is None or start.sigma_m is None:
+        return origin
+    ground_m = origin.ground_amsl_m if start.ground_amsl_m is None else start.ground_amsl_m
+    return msgspec.structs.replace(origin, start_sigma_m=start.sigma_m, ground_amsl_m=ground_m)
 
 
 def map_bounds(package: Path) -> Bounds:

@@ -8,6 +8,7 @@ import numpy as np
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
 from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
+from terrafix.core.start import begun
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.resume import Keeper, Known, Last, kept
 from terrafix.estimator.righted import Righted
@@ -29,6 +30,7 @@ from terrafix.messages import (
     SlowErrors,
     SourceEnded,
     SourceLabel,
+    Start,
     ThermalBand,
     VehicleState,
     Verdict,
@@ -46,6 +48,10 @@ class EstimatorNode:
 
     def __init__(self, began_ns: int | None = None, last: Last | None = None) -> None:
         self._began_ns, self._resumed_from = began_ns, last
+        self._origin: Origin | None = None  # as it was said
+        self._start = None if last is None else last.start  # ... and what was said of the start since
+        self._starts = False  # there, with the next frame ...
+        self._started_with = 0  # ... which is this one
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
@@ -68,9 +74,12 @@ class EstimatorNode:
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
-            case Origin() if self._estimator is None or message != self._estimator.origin:  # said again after a restart
+            case Origin() if message != self._origin:  # said again after a restart
+                self._origin = message
                 self._frame = LocalFrame(message.lat_deg, message.lon_deg)
-                self._estimator = Estimator(message, self._known(message, self._frame))
+                self._begin(begun(message, self._start), self._known(message, self._frame))
+            case Start() if not self._on_map and (self._start is None or message.t_ns != self._start.t_ns):
+                self._start, self._starts = message, True
             case VehicleState():
                 self._telemetry.add(message)
                 yield from self._begun()
@@ -91,6 +100,25 @@ class EstimatorNode:
 
     def tick(self, now_ns: int) -> Iterable[Message]:
         return ()
+
+    def _begin(self, origin: Origin, known: Known | None) -> Estimator:
+        """Anew."""
+        self._estimator = Estimator(origin, known)
+        return self._estimator
+
+    @property
+    def _on_map(self) -> bool:
+        """The map has told the place: no start counts any more."""
+        if self._estimator is not None and self._estimator.last_fix_s is not None:
+            return True
+        return self._resumed_from is not None and self._resumed_from.estimate.last_anchor_age_ms >= 0
+
+    def _started(self, start: Start, frame_id: int, t_ns: int, *, stands: bool) -> Estimator:
+        """With the first frame after a Start. A vehicle that still stands is where that says; another one was there."""
+        assert self._origin is not None and self._frame is not None
+        self._starts, self._predicted, self._started_with = False, None, frame_id
+        known = Known.told(start, self._frame, (t_ns if stands else start.t_ns) * 1e-9)
+        return self._begin(begun(self._origin, start), known)
 
     def _known(self, origin: Origin, frame: LocalFrame) -> Known | None:
         if self._began_ns is None:
@@ -122,10 +150,12 @@ class EstimatorNode:
         estimator = self._estimator
         if estimator is None:
             return
-        estimator.mode = self._mode
         origin = estimator.origin
         sigmas_rad = math.radians(origin.attitude_sigma_deg), math.radians(origin.yaw_sigma_deg)
         attitude = self._righted.look(odometry.t_ns, *sigmas_rad)
+        if self._starts and self._start is not None:
+            estimator = self._started(self._start, odometry.frame_id, odometry.t_ns, stands=attitude.stands)
+        estimator.mode = self._mode
         before = estimator.last
         seen = before is not None and before.frame_id == self._predicted
         if before is not None and seen:
@@ -159,6 +189,9 @@ class EstimatorNode:
     def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
         estimator = self._estimator
         if estimator is None:
+            return
+        if match.frame_id < self._started_with:  # of ground, and of doubt, elsewhere
+            yield MeasurementVerdict(t_ns=match.t_ns, frame_id=match.frame_id, measurement="map", verdict=Verdict.STALE)
             return
         estimator.mode = self._mode
         result = estimator.fix(match)
@@ -195,6 +228,7 @@ class EstimatorNode:
             agl_sigma_m=float(np.sqrt(cov[2, 2])),
             step_m=(float(step[0]), float(step[1])),
             step_cov_m2=(step_var, 0.0, 0.0, step_var),
+            start_ns=0 if self._start is None else self._start.t_ns,
         )
 
     def _estimate(self, placed: Placed, t_ns: int) -> NavEstimate:

@@ -13,7 +13,7 @@ from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.pace import TYPICAL_SPEED_MPS
 from terrafix.estimator.velocity import LEAST_SPEED_MPS, MAX_SPEED_SIGMA_MPS, leg
-from terrafix.messages import MapMatch, Message, NavEstimate, Origin, SlowErrors
+from terrafix.messages import MapMatch, Message, NavEstimate, Origin, SlowErrors, Start
 
 KEPT_EVERY_NS = 200_000_000
 SLOW_AGE_NS = 5_000_000_000  # learnt longer before the estimate (the computer was hot): heading and height were others
@@ -24,11 +24,12 @@ BEGINS = (np.arange(8) + 0.5) / 8  # of a turn, in shares of the time that it le
 
 class Last(msgspec.Struct, frozen=True):
     """What an estimator said last. ``slow`` None: it had learnt nothing yet. ``match``: the last one that told the
-    ground, without its points; None: no map tells it."""
+    ground, without its points; None: no map tells it. ``start``: where it began, if its Origin did not say so."""
 
     estimate: NavEstimate
     slow: SlowErrors | None = None
     match: MapMatch | None = None
+    start: Start | None = None
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,14 @@ class Known:
         """The start coordinate, of a vehicle of whose motion nothing is known."""
         sigma_m = min(max(origin.start_sigma_m, 1.0), SEARCHED_START_M)
         return cls(t_s, np.zeros(2), sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
+
+    @classmethod
+    def told(cls, start: Start, frame: LocalFrame, t_s: float) -> "Known | None":
+        """The place where the vehicle was at ``t_s``, by a Start; None when that says none."""
+        if start.lat_deg is None or start.lon_deg is None or start.sigma_m is None:
+            return None
+        at_m = np.array(frame.to_local(start.lat_deg, start.lon_deg))
+        return cls(t_s, at_m, start.sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
 
     @classmethod
     def of(cls, last: Last, frame: LocalFrame) -> "Known":
@@ -117,6 +126,8 @@ class Keeper:
         self._kept_ns = -KEPT_EVERY_NS
         self._slow: SlowErrors | None = None
         self._match: MapMatch | None = None
+        last = kept(file)
+        self._start = None if last is None else last.start  # said once, before take-off
 
     def poll(self, now_ns: int) -> Iterable[Message]:
         return ()
@@ -124,11 +135,13 @@ class Keeper:
     def heard(self, message: Message) -> None:
         if isinstance(message, SlowErrors):
             self._slow = message
+        elif isinstance(message, Start):
+            self._start = message
         elif isinstance(message, MapMatch) and message.ground is not None and message.mode_mass > 0.0:
             self._match = msgspec.structs.replace(message, matches=[])
         elif isinstance(message, NavEstimate) and message.t_ns - self._kept_ns >= KEPT_EVERY_NS:
             self._kept_ns = message.t_ns
-            write_whole(self._file, msgspec.msgpack.encode(Last(message, self._slow, self._match)))
+            write_whole(self._file, msgspec.msgpack.encode(Last(message, self._slow, self._match, self._start)))
 
     def close(self) -> None:
         pass

@@ -11,10 +11,12 @@ import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator.factors import BIAS_SIZE
+from terrafix.estimator.filter import Estimator
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph
 from terrafix.estimator.matched import determined, measured_pose
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.node import EstimatorNode
+from terrafix.estimator.resume import Known
 from terrafix.estimator.terrain import Terrain
 from terrafix.estimator.velocity import V_SIZE, Leg
 from terrafix.messages import (
@@ -144,20 +146,24 @@ class Retold:
 
 
 class Storyteller(EstimatorNode):
-    """Hears a record, message after message, as the estimator did. ``flights``: one for each Origin that it heard."""
+    """Hears a record, message after message, as the estimator did. ``flights``: one for each Origin, and each Start,
+    from which it began."""
 
     def __init__(self) -> None:
         super().__init__()
         self.flights: list[Retold] = []
+
+    def _begin(self, origin: Origin, known: Known | None) -> Estimator:
+        estimator = super()._begin(origin, known)
+        self.flights.append(Retold(origin))
+        estimator.graph = self.flights[-1].graph
+        return estimator
 
     def on(self, message: Message) -> Iterable[Message]:
         said = list(super().on(message))
         estimator = self._estimator
         if estimator is None:
             return said
-        if isinstance(message, Origin) and (not self.flights or self.flights[-1].origin != message):
-            self.flights.append(Retold(message))
-            estimator.graph = self.flights[-1].graph
         flight = self.flights[-1]
         if isinstance(message, VehicleState):
             flight.has_height = flight.has_height or message.agl_m is not None

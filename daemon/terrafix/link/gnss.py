@@ -1,4 +1,4 @@
-"""What the autopilot's GNSS receivers say, from GPS_RAW_INT and GPS2_RAW. Read to be judged, never to navigate by."""
+"""What the autopilot's GNSS receivers say, from GPS_RAW_INT and GPS2_RAW. Never to navigate by."""
 
 from typing import Any
 

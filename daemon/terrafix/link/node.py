@@ -10,6 +10,7 @@ from terrafix.link.asking import Asking
 from terrafix.link.carry import Attitudes, carry
 from terrafix.link.filter_watch import FilterWatch
 from terrafix.link.gate import EstimateGate
+from terrafix.link.gnss_start import GnssStarts
 from terrafix.link.gnss_watch import GnssWatch
 from terrafix.link.pacer import Pacer
 from terrafix.messages import (
@@ -25,6 +26,7 @@ from terrafix.messages import (
     Origin,
     ProcessEvent,
     SearchState,
+    Start,
     StatusText,
     ThermalBand,
     VehicleState,
@@ -39,7 +41,8 @@ CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
 
 
 def make_node(ctx: NodeContext) -> "LinkNode":
-    return LinkNode(ctx.config.link.rate_hz, ctx.config.link.gnss)
+    link = ctx.config.link
+    return LinkNode(link.rate_hz, link.gnss, gnss_start=link.gnss_start)
 
 
 def make_edge(ctx: NodeContext) -> Edge:
@@ -55,12 +58,13 @@ def make_edge(ctx: NodeContext) -> Edge:
 class LinkNode:
     """Hears estimates, says GpsInput at ``rate_hz``."""
 
-    def __init__(self, rate_hz: float, gnss: GnssMode = "advise") -> None:
+    def __init__(self, rate_hz: float, gnss: GnssMode = "advise", *, gnss_start: bool = True) -> None:
         self._pacer = Pacer(rate_hz, TICK_HZ)
         self._gate = EstimateGate()
         self._fix = fix.FixGate()
         self._attitudes = Attitudes()
         self._gnss = GnssWatch(gnss)
+        self._starts = GnssStarts(wanted=gnss_start)
         self._asking = Asking()
         self._filter = FilterWatch()
         self._armed: bool | None = None
@@ -88,14 +92,19 @@ class LinkNode:
             case VehicleState():
                 self._attitudes.add(message)
                 self._gnss.vehicle(message)
+                self._starts.vehicle(message.armed)
                 self._armed = message.armed
                 self._start_holds = self._start_holds or message.armed is False
             case Imu():
                 self._attitudes.add_imu(message)
             case GnssReading():
-                return list(self._gnss.reading(message, self._attitudes))
+                return [*self._gnss.reading(message, self._attitudes), *self._starts.reading(message)]
             case Origin():
                 self._ground_amsl_m = message.ground_amsl_m
+                self._starts.origin(message)
+            case Start():
+                text = self._starts.answer(message)
+                return [] if text is None else [text]
             case WallClock():
                 self._on_wall_clock(message)
             case ProcessEvent(process="estimator"):
@@ -125,6 +134,7 @@ class LinkNode:
             age_ms = estimate.last_anchor_age_ms
             if age_ms >= 0:
                 self._start_holds = True
+                self._starts.anchored()
                 self._anchored_ns = max(self._anchored_ns or 0, estimate.t_ns - age_ms * 1_000_000)
             elif self._anchored_ns is None:
                 self._anchored_ns = estimate.t_ns  # never anchored: the start coordinate is the map fix of this flight

@@ -83,7 +83,8 @@ def _start(package: MapPackage, config: Config) -> Iterator[Line]:
         described = read_description(Path(config.source.camera).expanduser()).start
         place = None if described is None else (described.lat_deg, described.lon_deg)
     if place is None:
-        text = "not known: the whole map is searched for the first position"
+        receiver = "where the autopilot's GNSS says before arming, or else " if config.link.gnss_start else ""
+        text = f"not said: {receiver}the whole map is searched for the first position"
         yield warn("start", text, "set [source] start, or [start] in the description of the camera")
         return
     at = f"{place[0]:.6f}, {place[1]:.6f}"
