@@ -80,7 +80,9 @@ def test_the_anchor_is_told_from_which_start_a_prediction_comes() -> None:
 
 
 def test_a_ground_that_the_map_does_not_tell_stays_as_it_was() -> None:
-    assert stood(start=said_at(TOLD_AT, ground_m=None)).estimate(9).alt_amsl_m == pytest.approx(0.4, abs=1.0)
+    run = Listener()
+    run.hear([msgspec.structs.replace(UNKNOWN, ground_amsl_m=25.0), said_at(0, ground_m=None), *standing(0)])
+    assert run.estimate(0).alt_amsl_m == pytest.approx(25.4, abs=1.0)
 
 
 def test_said_again_it_changes_nothing_and_elsewhere_it_begins_there() -> None:

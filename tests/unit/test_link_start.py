@@ -180,6 +180,32 @@ def test_a_car_ride_without_reception_is_no_jump() -> None:
     assert not [t for t in texts(said) if "jumped" in t]
 
 
+@pytest.mark.parametrize(("from_s", "until_s"), [(3.0, 3.2), (1.0, 6.0)])
+def test_five_seconds_are_counted_without_a_break(from_s: float, until_s: float) -> None:
+    broken = stood(lambda t: None if from_s <= t < until_s else here(t))
+    assert [start.t_ns / S for start in starts(broken)] == [pytest.approx(until_s + STEADY_NS / S, abs=0.01)]
+
+
+def test_five_seconds_of_silence_are_not_five_seconds_of_readings() -> None:
+    node = LinkNode(10.0)
+    said = [x for message in (origin(), state(0, armed=False)) for x in node.on(message)]
+    for now_ns in (0, 200 * MS, 6 * S, 6200 * MS):
+        said += node.on(reading(now_ns, here(0.0)))
+    assert not starts(said)
+
+
+def test_a_receiver_that_has_died_contradicts_nobody() -> None:
+    """The other one was carried on, and is heard."""
+    node = LinkNode(10.0)
+    said = [x for message in (origin(), state(0, armed=False)) for x in node.on(message)]
+    for step in range(250):
+        now_ns, on_m = step * 200 * MS, min(max(step - 60, 0) * 2.0, 200.0)
+        said += node.on(reading(now_ns, (300.0 + on_m, -200.0), 1, speed_mps=10.0 if 0.0 < on_m < 200.0 else 0.0))
+        said += node.on(reading(now_ns, here(0.0))) if step < 50 else []
+    assert away_m(starts(said)[-1], (500.0, -200.0)) < 0.1
+    assert not [text for text in texts(said) if "disagree" in text]
+
+
 def test_what_was_said_holds_when_the_receiver_is_jammed_afterwards() -> None:
     said = stood(lambda t: here(t) if t < 10.0 else None, 60.0)
     assert len(starts(said)) == 1
@@ -188,8 +214,8 @@ def test_what_was_said_holds_when_the_receiver_is_jammed_afterwards() -> None:
 
 def test_two_receivers_that_contradict_each_other_say_nothing() -> None:
     said = stood(second=lambda _: (300.0, -100.0), seconds=60.0)
-    assert [start.lat_deg for start in starts(said)][-1] is None
-    assert starts(said)[-1].t_ns < STEADY_NS + S
+    first, gone = starts(said)  # of the same moment, and told apart
+    assert first.lat_deg is not None and gone.lat_deg is None and STEADY_NS == first.t_ns < gone.t_ns < STEADY_NS + S
     assert [t for t in texts(said) if "GPS" in t] == ["Terrafix: GPS 1 and GPS 2 disagree: no start"]
     (agreed,) = starts(stood(second=lambda _: (304.0, -200.0), seconds=60.0))
     assert away_m(agreed, here(0.0)) < 5.0

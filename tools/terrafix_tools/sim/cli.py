@@ -45,6 +45,9 @@ def ardupilot(
         list[Path] | None, typer.Option(help="Parameter file of the vehicle; default: second-gps.param.")
     ] = None,
     kill: Annotated[bool, typer.Option("--kill", help="Kill Terrafix without GNSS, and start it again.")] = False,
+    gnss_start: Annotated[
+        bool, typer.Option("--gnss-start", help="Nobody says where it begins but the autopilot's GNSS, on the ground.")
+    ] = False,
 ) -> None:
     """ArduPilot's own firmware flies a mission on Terrafix' GPS_INPUT, in real time."""
     try:
@@ -63,6 +66,7 @@ def ardupilot(
         port=port,
         parameters=parameters,
         kill=kill,
+        gnss_start=gnss_start,
     )
     raise typer.Exit(code)
 

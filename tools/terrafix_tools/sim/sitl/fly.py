@@ -40,11 +40,12 @@ def fly(
     port: int = 0,
     parameters: list[Path] | None = None,
     kill: bool = False,
+    gnss_start: bool = False,
 ) -> int:
     """Everything into ``out``: map, firmware/, record/, statustext.log, truth.csv, ardupilot.json.
 
     ``parameters``: what the vehicle has of Terrafix; default: config/vehicles/second-gps.param. ``kill``: Terrafix is
-    killed in flight, and started again.
+    killed in flight, and started again. ``gnss_start``: its configuration does not say where the flight begins.
     -> exit code: 0 when every verdict holds, else 1. Raises UsageError, OutputError, LinkError."""
     program = find_binary(binary)
     kind = kind_of(program, vehicle)
@@ -65,7 +66,7 @@ def fly(
         Firmware(program, kind, out / "firmware", scene.home, ports, [out / "vehicle.param", *files]) as firmware,
         connected(ports.ground) as station,
         SimulatedCamera(stream, scene.ground, scene.frame, observer.truth_at, seed),
-        Daemon(out, scene, stream.url, f"udpin:127.0.0.1:{ports.companion}") as daemon,
+        Daemon(out, scene, stream.url, f"udpin:127.0.0.1:{ports.companion}", says_start=not gnss_start) as daemon,
     ):
         stages = Stages(firmware, station, observer, daemon, scene, console)
         try:

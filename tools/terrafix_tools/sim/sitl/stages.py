@@ -16,7 +16,7 @@ from terrafix.core.errors import LinkError, OutputError
 from terrafix.vision.sources.description import CameraTable, Description, MountTable, StartTable, TelemetryTable
 from terrafix_tools.sim.flights.description import write_toml
 from terrafix_tools.sim.flights.folder import AGL_SIGMA_M, ATTITUDE_SIGMA_DEG, CAMERA, YAW_SIGMA_DEG
-from terrafix_tools.sim.sitl.firmware import Firmware, Home
+from terrafix_tools.sim.sitl.firmware import Firmware
 from terrafix_tools.sim.sitl.ground_side import Ground
 from terrafix_tools.sim.sitl.observer import Observer
 from terrafix_tools.sim.sitl.report import FIX_3D, Times
@@ -47,12 +47,14 @@ class NotFlown(Exception):
 class Daemon:
     """`terrafix run` as on a vehicle, a program of its own: begun by ``start``, ended by ``kill`` or this context."""
 
-    def __init__(self, out: Path, scene: Scene, source: str, link: str) -> None:
-        """Raises OutputError."""
+    def __init__(self, out: Path, scene: Scene, source: str, link: str, *, says_start: bool = True) -> None:
+        """``says_start``: the description of the camera does. Raises OutputError."""
         self._process: subprocess.Popen[bytes] | None = None
         self._log = out / "terrafix.log"
         camera, config = out / "camera.toml", out / "terrafix.toml"
-        write_toml(camera, _description(scene.home), "The camera of the simulated vehicle.")
+        home = scene.home
+        start = StartTable(lat_deg=home.lat_deg, lon_deg=home.lon_deg, ground_amsl_m=round(home.amsl_m, 1))
+        write_toml(camera, _description(start if says_start else None), "The camera of the simulated vehicle.")
         try:
             config.write_text(f'[source]\ncamera = "{camera}"\n[link]\ngps_id = {GPS_ID}\n', encoding="utf-8")
         except OSError as error:
@@ -196,13 +198,13 @@ class Stages:
         self._console.print(text, highlight=False)
 
 
-def _description(home: Home) -> Description:
+def _description(start: StartTable | None) -> Description:
     """What the pilot knows: the camera, and where the vehicle stands."""
     return Description(
         name="ardupilot",
         camera=CameraTable.of(CAMERA),
         mount=MountTable(pitch_deg=CAMERA.mount_pitch_deg, tolerance_deg=CAMERA.mount_tolerance_deg),
-        start=StartTable(lat_deg=home.lat_deg, lon_deg=home.lon_deg, ground_amsl_m=round(home.amsl_m, 1)),
+        start=start,
         telemetry=TelemetryTable(
             yaw_sigma_deg=YAW_SIGMA_DEG, agl_sigma_m=AGL_SIGMA_M, attitude_sigma_deg=ATTITUDE_SIGMA_DEG
         ),
