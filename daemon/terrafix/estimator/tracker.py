@@ -10,7 +10,7 @@ import numpy as np
 from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.estimator.beginning import Beginning, Slow, TakeOff
 from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS_SIGMA, SCALE
-from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph
+from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sigmas
 from terrafix.estimator.heading import OpenHeading
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.mounted import (
@@ -164,12 +164,18 @@ class Tracker:
             sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2] + spread[:2, :2])[-1]))
             placed = self._start_graph(frame_id, t_s, attitude, led_to[:2], sigma_m)
             return Advance(Verdict.ACCEPTED, placed, (led_to - before.pose.translation())[:2], sigma_m)
-        if known is not None:
-            parent, motion = known
-            verdict = Verdict.ACCEPTED
-        else:
-            parent, motion = self._by_guess(attitude, way is None, led_to, spread)
+        verdict = Verdict.ACCEPTED
+        if known is None:
             verdict = odometry.verdict if odometry.verdict is not Verdict.ACCEPTED else Verdict.FEW_INLIERS
+        unseen = known is None and way is not None and attitude.yaw_rad is None
+        told = self._open is not None and attitude.yaw_rad is not None
+        if told or (unseen and (self._open is None or not self._open.dark)):
+            return self._begin_again(frame_id, t_s, attitude, led_to, velocity, spread, verdict)
+        if unseen and self._open is not None:  # all of a dark stretch is one turn
+            self._open = self._open.after_unseen(dt_s)
+        elif known is not None and self._open is not None:
+            self._open.dark = False
+        parent, motion = known or self._by_guess(attitude, way is None, led_to, spread)
         pose = self.graph.state(parent).pose.compose(gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m))
         r_w_c, p = pose.rotation().matrix(), np.asarray(pose.translation())
         step = (p - before.pose.translation())[:2]
@@ -232,6 +238,51 @@ class Tracker:
         begun = self._beginning.begun(t_s, attitude, self.terrain)
         placed = self._start_graph(frame_id, t_s, attitude, begun.at_m, begun.sigma_m, begun.slow)
         return Advance(Verdict.ACCEPTED, placed, begun.way_m, begun.way_sigma_m)
+
+    def _begin_again(
+        self,
+        frame_id: int,
+        t_s: float,
+        attitude: Attitude,
+        led_to_m: np.ndarray,
+        velocity: np.ndarray,
+        spread: np.ndarray,
+        verdict: Verdict,
+    ) -> Advance:
+        """Where velocity leads, as sure as it is of that, with a heading that is told now, or that is open: a vehicle
+        that nobody saw may have turned, and the graph would take its course for a witness of how far."""
+        assert self._last is not None
+        dt_s = t_s - self._last.t_s
+        before, bias_cov = self.graph.state(self._last.node), self.graph.bias_covariance(self._last.node)
+        r_before = before.pose.rotation().matrix()
+        r_w_c = self.camera.expected(attitude, before.bias, r_before)
+        step, level = (led_to_m - before.pose.translation())[:2], np.diag([1.0, 1.0, 0.0])
+        cov = tangent_to_world(self._last.cov, r_before)
+        cov[:3, :3] += spread[:3, :3]
+        if self._open is not None:  # led along axes that were chosen
+            cov[:3, :3] += self._open.share**2 * float(step @ step) * level
+        cov[3:, 3:] += np.diag([UNKNOWN_ATTITUDE_RAD, UNKNOWN_ATTITUDE_RAD, UNKNOWN_RAD]) ** 2
+        was = self._open or OpenHeading(led_to_m[:2], 0.0)
+        now = was.after_unseen(dt_s, led_to_m[:2])
+        self._open = now if attitude.yaw_rad is None else None
+        rise_m = self.terrain.rise_sigma_m(float(np.hypot(*step)))
+        bias_cov += np.diag(walk_sigmas(dt_s, 0.0, rise_m) ** 2)
+        self._velocity_cov = spread[3:, 3:].copy()
+        self._velocity_cov[:3, :3] += now.share**2 * float(velocity[:2] @ velocity[:2]) * level
+        self._felt = self._stood_at = self._seen_from = None
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), led_to_m)
+        node = self.graph.start(
+            t_s,
+            NodeState(pose, before.bias, velocity),
+            world_to_tangent(cov, r_w_c),
+            bias_cov,
+            self._velocity_cov,
+            self.camera.factor(self.graph.next_keys(), attitude, r_w_c, self.terrain.below(led_to_m)),
+            world_to_tangent(cov if self._open is None else self._open.chosen(cov), r_w_c),
+        )
+        self._is_frame(node, frame_id)
+        self._last = self._placed(frame_id, t_s, node)
+        return Advance(verdict, self._last, step, float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])))
 
     def _start_graph(
         self,
