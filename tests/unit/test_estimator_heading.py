@@ -133,3 +133,23 @@ def test_a_heading_that_is_told_at_last_closes_it() -> None:
     for m in said:
         assert m.cov[35] < math.radians(20.0) ** 2
         assert abs(math.remainder(yaw_rad[m.frame_id] - truth_rad[m.frame_id], math.tau)) < math.radians(15.0)
+
+
+def test_one_match_far_from_where_it_can_be_does_not_tell_the_heading() -> None:
+    """A wrong one would take the whole graph along; three that agree over new ground do, as ever."""
+    far, listener = Flight(TURN + 42, seed=1, turns_rad=math.radians(90.0)), Listener()
+    listener.hear([ORIGIN])
+    for i in range(TURN + 4):
+        messages = [m for m in far.messages(i) if not (isinstance(m, MapMatch) and i >= TURN)]
+        if i >= TURN:
+            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
+        if i == TURN + 3:
+            messages.append(moved(far.fix(i), 600.0))
+        listener.hear([without_heading(m) if isinstance(m, VehicleState) else m for m in messages])
+    assert listener.verdicts("map")[TURN + 3].verdict is Verdict.INNOVATION
+
+
+def moved(match: MapMatch, east_m: float) -> MapMatch:
+    assert match.p_c_in_w_m is not None
+    e_m, n_m, up_m = match.p_c_in_w_m
+    return msgspec.structs.replace(match, p_c_in_w_m=(e_m + east_m, n_m, up_m))

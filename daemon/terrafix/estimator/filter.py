@@ -23,7 +23,7 @@ from terrafix.estimator.tracker import STEP_SHARE, Advance, Feel, Tracker, nothi
 from terrafix.estimator.velocity import V_SIZE, unknown_cov
 from terrafix.messages import CovarianceMode, MapMatch, Odometry, Origin, Verdict
 
-GATE_6DOF = 22.5  # chi-square, 6 degrees of freedom, 99.9 %
+GATE_6DOF, GATE_2DOF = 22.5, 13.8  # chi-square, 6 and 2 degrees of freedom, 99.9 %
 COARSE_CONTINUES = 0.5  # of the height: sigma of the estimate up to which the belief's mode alone is taken as a fix
 COARSE_FINDS_AFTER, COARSE_FINDS_OVER = 6, 1.0  # ... and so many that agree, over so many heights, find a position
 RECOVER_AFTER = 3  # fixes that agree with each other and not with the graph
@@ -87,6 +87,9 @@ class Estimator(Tracker):
         if self._open is not None:
             if match.coarse:  # its heading is one of those that were tried
                 return FixResult(Verdict.AMBIGUOUS, None, "a coarse fix does not tell the heading")
+            away2 = self._away2(match.frame_id, node, measured, cov)
+            if away2 > GATE_2DOF:
+                return self._refuse(match, node, measured, cov, away2)
             return self._restart(match, node, measured, cov, "heading found")
         predicted = self.graph.state(node).pose
         spread = float(np.sqrt(np.max(np.diag(tangent_to_world(self._covariance(node), r_w_c))[:2])))
@@ -115,6 +118,15 @@ class Estimator(Tracker):
             self._cov_of[node] = np.linalg.inv(np.linalg.inv(self._cov_of[node]) + np.linalg.inv(cov / new))
         self._accepted(match, fixed_s, here)
         return FixResult(Verdict.ACCEPTED, d2, f"new ground {new:.2f}")
+
+    def _away2(self, frame_id: int, node: int, measured: gtsam.Pose3, cov: np.ndarray) -> float:
+        """Squared Mahalanobis distance (2 degrees of freedom) of a place from where the camera can be, whatever its
+        heading is."""
+        placed = self._placed(frame_id, self.graph.time_of(node), node)
+        spread = tangent_to_world(placed.cov, placed.pose.rotation().matrix())
+        spread = (spread + tangent_to_world(cov, measured.rotation().matrix()))[:2, :2]
+        offset = (measured.translation() - placed.pose.translation())[:2]
+        return float(offset @ np.linalg.solve(spread, offset))
 
     def _accepted(self, match: MapMatch, t_s: float, here: np.ndarray) -> None:
         self._seen.add(t_s, here)
