@@ -42,7 +42,7 @@ def test_the_autopilot_is_served(tmp_path: Path, stall_ms: Callable[[], float]) 
     done = subprocess.run(
         [*COMMAND, "--out", str(out), "--duration", str(DURATION_S)], capture_output=True, text=True, timeout=300
     )
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.returncode == 0 and " died: " not in done.stdout, done.stdout + done.stderr
     assert time.monotonic() - began_s < 90.0 + DURATION_S
     peer = json.loads((out / "peer.json").read_text())
     assert peer["accepted"] > 5 * DURATION_S

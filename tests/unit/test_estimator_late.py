@@ -129,6 +129,17 @@ def test_one_that_is_too_old_says_so_and_changes_nothing() -> None:
     assert not any(isinstance(m, NavEstimate) for m in answers) and run.estimate(59) == before
 
 
+def test_one_that_comes_after_the_flight_says_so() -> None:
+    """The anchor is still at its last picture when the source has ended."""
+    flight = Flight(60, seed=3)
+    run = Listener().fly(flight, 0, 59)
+    run.hear([m for m in flight.messages(59) if not isinstance(m, MapMatch)])
+    run.hear([SourceEnded(t_ns=t_ns(59), frames=60)])
+    answers = run.hear([flight.fix(59)])
+    assert run.verdicts("map")[59].verdict is Verdict.STALE
+    assert not any(isinstance(m, NavEstimate) for m in answers)
+
+
 def test_ground_counts_the_same_in_any_order() -> None:
     places = [np.array([20.0 * i, 0.0]) for i in range(4)]
     for order in ((0, 1, 2, 3), (0, 2, 1, 3), (3, 1, 0, 2), (3, 2, 1, 0)):

@@ -65,7 +65,7 @@ class PoseGraph:
         return self._next
 
     def holds(self, node: int) -> bool:
-        return self._smoother.holds(node)
+        return node in self._times
 
     def state(self, node: int) -> NodeState:
         """Newest estimate of a node in the window."""

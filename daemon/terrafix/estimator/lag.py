@@ -41,9 +41,6 @@ class FixedLag:
         self._batches: dict[int, int] = {}  # node -> in which it came, or was kept
         self._again: set[int] = set()  # nodes whose place in the order has changed
 
-    def holds(self, node: int) -> bool:
-        return node in self._batches
-
     def leaving(self, node: int) -> list[int]:
         """The nodes that leave when ``node`` comes."""
         first = (node // BATCH_NODES) - LAG_NODES // BATCH_NODES
