@@ -76,12 +76,12 @@ class FixedLag:
 
         The two newest nodes are always among it: COLAMD takes no more groups than there are variables."""
         oldest = min(self._batches.values())
-        before, newest = sorted(self._batches)[-2:] if len(self._batches) > 1 else (-1, max(self._batches))
+        newest = sorted(self._batches)[-2:]
         groups, again = gtsam.KeyGroupMap(), gtsam.KeyList()
         for n, batch in self._batches.items():
             for key in _keys(n):
-                groups.insert2(key, batch - oldest + (n == newest))
-                if (n in (before, newest) or n in self._again) and not values.exists(key):
+                groups.insert2(key, batch - oldest + (n == newest[-1]))
+                if (n in newest or n in self._again) and not values.exists(key):
                     again.push_back(key)
         self._again.clear()
         self._isam.update(factors, values, [], groups, None, again)
