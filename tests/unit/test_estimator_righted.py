@@ -10,9 +10,10 @@ from inertial_flight import InertialFlight, flown
 
 from terrafix.core.geodesy import rot_w_b
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.estimator.righted import ORDINARY_RADPS, Righted
+from terrafix.estimator.righted import AIDS_MPS, COASTS_S, ORDINARY_RADPS, UNAIDED_RAD, UNAIDED_S, Righted
 from terrafix.estimator.telemetry import Attitude, Telemetry
 from terrafix.estimator.velocity import TILT_S
+from terrafix.link.fix import MAX_SPEED_SIGMA_MPS
 from terrafix.messages import Imu, VehicleState
 
 S = 1_000_000_000
@@ -208,6 +209,30 @@ def test_who_did_not_hear_the_gyroscopes_believes_what_is_said() -> None:
     assert all(attitude == telemetry.at(round(t * S)) for t, attitude in looked(telemetry)[1])
 
 
+def test_an_autopilot_that_was_told_nothing_may_be_off_for_long() -> None:
+    righted = Righted(flew(1.0, lambda t: 0.0))
+
+    def off_rad(t_s: float, sigma_mps: float) -> float:
+        attitude = righted.look(round(t_s * S), SIGMA_RAD, YAW_SIGMA_RAD)
+        righted.told(round(t_s * S), sigma_mps)
+        return attitude.righted_rad
+
+    assert AIDS_MPS == MAX_SPEED_SIGMA_MPS, "of the link, which lets it have no other velocity"
+    assert max(off_rad(t, 9.0) for t in range(20)) == 0.0, "it flies by something else, as long as we know nothing"
+    assert max(off_rad(t, 0.4) for t in range(20, 30)) == 0.0
+    assert off_rad(30.0, 9.0) == off_rad(29.0 + COASTS_S, 9.0) == 0.0, "it coasts"
+    assert off_rad(30.0 + COASTS_S, 9.0) == pytest.approx(UNAIDED_RAD)
+    assert off_rad(90.0, 0.4) == pytest.approx(UNAIDED_RAD)
+    assert min(off_rad(90.0 + t, 0.4) for t in range(round(UNAIDED_S))) < 0.4 * UNAIDED_RAD
+
+
+def test_who_was_killed_told_it_nothing() -> None:
+    back_s = 7.0
+    for told_s, off_rad in ((back_s - 5.0, UNAIDED_RAD), (back_s - 1.0, 0.0)):
+        righted = Righted(flew(1.0, lambda t: 0.0), round(told_s * S))
+        assert righted.look(round(back_s * S), SIGMA_RAD, YAW_SIGMA_RAD).righted_rad == pytest.approx(off_rad)
+
+
 def swaying(flight: InertialFlight, sway_deg: float) -> InertialFlight:
     """From 20 s on its attitude rolls to and fro every 8 s, and it does not."""
     for said in flight.said:
@@ -232,3 +257,19 @@ def test_velocity_from_an_attitude_that_sways_claims_no_more_than_it_knows(sway_
 def test_who_is_not_put_right_is_believed_as_before() -> None:
     seen = flown(InertialFlight(1), imu=True)
     assert float(np.median(seen.velocity_sigma_mps[22:])) < 0.4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 5, 6])
+def test_velocity_claims_no_more_than_it_knows_by_an_attitude_that_was_without_a_position(seed: int) -> None:
+    """As a plane's that was off by 2.7 degrees for 15 s after Terrafix was back."""
+    blind, flight = (22, 29), InertialFlight(seed)
+    for said in flight.said[blind[1] - 3 :]:
+        for i, message in enumerate(said):
+            if isinstance(message, VehicleState) and message.roll_rad is not None:
+                said[i] = msgspec.structs.replace(message, roll_rad=message.roll_rad + math.radians(2.7))
+    seen = flown(flight, imu=True, blind=blind, no_imu=(22.0, 29.0))
+    after = slice(blind[1] + 2, blind[1] + 20)
+    error_mps, sigma_mps = np.hypot(*seen.velocity_error_mps[after, :2].T), seen.velocity_sigma_mps[after]
+    assert np.mean(np.square(error_mps / sigma_mps)) < 1.4  # 1.5 to 3.2 by the usual claim
+    assert float(np.median(sigma_mps)) < 0.6

@@ -55,7 +55,7 @@ class EstimatorNode:
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
-        self._righted = Righted(self._telemetry)
+        self._righted = Righted(self._telemetry, None if last is None else last.estimate.t_ns)
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
         self._said_slow_ns = 0
@@ -167,7 +167,10 @@ class EstimatorNode:
             yield self._prediction(odometry, advance, estimator, seen)
             self._predicted = odometry.frame_id
         yield from self._slow_errors(advance.placed, estimator)
-        yield self._estimate(advance.placed, odometry.t_ns)
+        estimate = self._estimate(advance.placed, odometry.t_ns)
+        if estimator.last_fix_s is not None:  # before that the autopilot has, or had, another position
+            self._righted.told(estimate.t_ns, estimate.velocity_sigma_mps)
+        yield estimate
 
     def _slow_errors(self, placed: Placed, estimator: Estimator) -> Iterable[SlowErrors]:
         """Not before a map fix: until then they are what was assumed. Not for a computer that is hot."""
