@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from simulated_flight import FRAME_S, Flight, Listener, blind
 
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
@@ -187,3 +188,25 @@ def test_an_estimator_that_was_started_again_knows_that_it_has_flown_on(
     seen = Odometry(t_ns=15_000_000_000, frame_id=30, keyframe_id=30, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
     (said,) = (m for m in node.on(seen) if isinstance(m, NavEstimate))
     assert low_m < np.sqrt(said.cov[0]) < high_m
+
+
+def test_who_is_lost_over_hills_claims_no_speed() -> None:
+    """The ground of the place where it was believed to be lay 60 m higher: ways were half as long, and the shorter the
+    surer, so that a plane of 20 m/s was told to fly 3 +- 3 m/s for a minute."""
+    flight = Flight(100, seed=4, dem=True)
+    run = Listener().fly(flight, 0, 20)
+    for i in range(20, flight.frames):
+        elsewhere = MapMatch(
+            t_ns=round(i * FRAME_S * 1e9),
+            frame_id=i,
+            verdict=Verdict.FEW_INLIERS,
+            matcher="gradient",
+            ground=(60.0, 0.15, 0.0),
+        )
+        heard = [m for m in flight.messages(i) if not isinstance(m, MapMatch)]
+        run.hear([blind(m) if i < 60 and isinstance(m, Odometry) else m for m in heard] + [elsewhere])
+    for i in range(62, flight.frames):
+        said = run.estimate(i)
+        flown_mps = (flight.p_m[i] - flight.p_m[i - 1]) / FRAME_S
+        off_mps = float(np.hypot(*(np.array(said.velocity_enu_mps) - flown_mps)[:2]))
+        assert off_mps < 3.0 * said.velocity_sigma_mps

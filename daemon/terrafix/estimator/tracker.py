@@ -44,6 +44,9 @@ COMPASS_BIAS_RAD = np.radians(10.0)
 HEIGHT_BIAS = 0.05  # of the height
 TAKE_OFF_AWAY = 5.0  # heights: from where it took off to where it is first seen in the air, a climb at 20 %
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
+# Of the ground below, a share of the height above it: one that is lost over hills cannot tell a way from none. A graph
+# whose noise is a share of the way that it believes in would come to believe in none.
+MAX_LEVEL_SIGMA = 0.5
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 
@@ -356,6 +359,8 @@ class Tracker:
             r_w_k, tilt_sigma = r_w_kf, UNKNOWN_ATTITUDE_RAD  # nobody knows of a change of tilt
         share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
         ground = self._ground(p, height, place_cov, share)
+        if ground.level_sigma_m > MAX_LEVEL_SIGMA * height:
+            return None
         newest = self.graph.state(self.graph.newest)
         onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - self.graph.time_of(self.graph.newest))
         way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
