@@ -1,5 +1,6 @@
 """An estimator that is started in a flight: from where the one before it left off, or from the flight's start."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +107,7 @@ class Known:
         if np.cos(np.arctan2(east, north) - self.yaw_rad) < FLIES_AHEAD:
             return None
         bias_rad = 0.0 if self.learnt is None else float(self.learnt.error[2])
-        return float(np.angle(np.exp(1j * (self.yaw_rad - yaw_rad + bias_rad))))
+        return math.remainder(self.yaw_rad - yaw_rad + bias_rad, math.tau)
 
 
 def _ways(velocity_mps: complex, turned_rad: float, dt_s: float) -> np.ndarray:

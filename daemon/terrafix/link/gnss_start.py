@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from terrafix.link.asking import NOT_KNOWN_M
 from terrafix.link.carry import distance_m
 from terrafix.link.gnss_judge import FIX_3D, JUMP_SIGMAS, LEAST_M, SILENT_NS, UNKNOWN_M
+from terrafix.link.words import INFO, WARNING, words
 from terrafix.messages import GnssReading, GnssStart, Message, Origin, Start, StatusText, Verdict
 
 GOOD_M = 10.0  # 1-sigma that it claims: twice what ArduPilot asks for before a copter is armed
@@ -21,7 +22,6 @@ AWAY_SIGMAS, AWAY_READINGS = 2.0, 3  # by what both claim: there it is no longer
 BETTER = 0.5  # of the sigma that was said: a receiver that has just woken up gets better
 CARRIED_MPS = 40.0  # by a car
 SAY_NS = 1_000_000_000
-WARNING, INFO = 4, 6  # MAV_SEVERITY
 
 
 @dataclass(frozen=True)
@@ -122,10 +122,10 @@ class GnssStarts:
             return None
         self._answered_ns = start.t_ns
         if start.verdict is not Verdict.ACCEPTED:
-            return _text(start.t_ns, WARNING, "GPS is not on the map: no start")
+            return words(start.t_ns, WARNING, "GPS is not on the map: no start")
         if start.lat_deg is None:
             return None  # why, was said with the withdrawal
-        return _text(start.t_ns, INFO, f"start from GNSS, {start.sigma_m:.0f} m")
+        return words(start.t_ns, INFO, f"start from GNSS, {start.sigma_m:.0f} m")
 
     def _look(self, now_ns: int, number: int) -> Iterator[Message]:
         jumped_m = self._receivers[number].jumped_m
@@ -174,8 +174,4 @@ class GnssStarts:
 
     def _withdraw(self, now_ns: int, number: int, text: str) -> Iterator[Message]:
         yield self._say(now_ns, number, None)
-        yield _text(now_ns, WARNING, text)
-
-
-def _text(t_ns: int, severity: int, text: str) -> StatusText:
-    return StatusText(t_ns=t_ns, severity=severity, text=f"Terrafix: {text}")
+        yield words(now_ns, WARNING, text)

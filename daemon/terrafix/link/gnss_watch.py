@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from terrafix.core.config import GnssMode
 from terrafix.link.carry import Attitudes, Carried, carry, distance_m
 from terrafix.link.gnss_judge import DELAY_S, VISION_OLD_S, VISION_VAGUE_M, Opinion, ReceiverJudge
+from terrafix.link.words import CRITICAL, INFO, NOTICE, WARNING, words
 from terrafix.messages import (
     GnssReading,
     GnssState,
@@ -13,7 +14,6 @@ from terrafix.messages import (
     Message,
     NavEstimate,
     PositionSource,
-    StatusText,
     VehicleState,
 )
 
@@ -24,7 +24,6 @@ OURS_GOOD_NS = 2 * NS_PER_S  # of 3D fixes of our own before anybody is switched
 BACK_NS = 30 * NS_PER_S  # on us for so long at least, and
 AGAIN_NS = 5 * NS_PER_S  # on the receiver for so long: who is spoofed twice need not wait
 BAD = (GnssState.LOST, GnssState.SPOOFED)
-CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
 
 
 class GnssWatch:
@@ -96,7 +95,7 @@ class GnssWatch:
         )
         text = self._text(receiver + 1, before, opinion) if changed else None
         if text is not None:
-            yield StatusText(t_ns=now_ns, severity=text[0], text=f"Terrafix: {text[1]}")
+            yield words(now_ns, *text)
 
     def _text(self, number: int, before: GnssState, opinion: Opinion) -> tuple[int, str] | None:
         """What the pilot reads; a receiver that never was there is no news."""
@@ -126,4 +125,4 @@ class GnssWatch:
         self._on_vision, self._switched_ns = vision, now_ns
         receiver = next((n for n, j in self._judges.items() if j.opinion.state is GnssState.TRUSTED), 0)
         yield PositionSource(t_ns=now_ns, vision=vision, receiver=receiver)
-        yield StatusText(t_ns=now_ns, severity=NOTICE, text=f"Terrafix: flying on the {'map' if vision else 'GPS'} now")
+        yield words(now_ns, NOTICE, f"flying on the {'map' if vision else 'GPS'} now")

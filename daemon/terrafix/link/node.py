@@ -13,6 +13,7 @@ from terrafix.link.gate import EstimateGate
 from terrafix.link.gnss_start import GnssStarts
 from terrafix.link.gnss_watch import GnssWatch
 from terrafix.link.pacer import Pacer
+from terrafix.link.words import CRITICAL, INFO, NOTICE, WARNING, words
 from terrafix.messages import (
     FilterStatus,
     GnssReading,
@@ -36,8 +37,6 @@ from terrafix.messages import (
 
 TICK_HZ = 50.0  # as in the process table
 CLOCK_STEP_NS = 500_000_000  # a wall clock that moves less stays latched: the week keeps the monotonic clock's rhythm
-
-CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
 
 
 def make_node(ctx: NodeContext) -> "LinkNode":
@@ -153,7 +152,7 @@ class LinkNode:
     def _on_estimator_event(self, event: ProcessEvent) -> list[Message]:
         if event.event in ("died", "stuck", "gave_up"):
             self._estimator_gone = f"estimator {event.event.replace('_', ' ')}"
-            return [_text(event.t_ns, CRITICAL, self._estimator_gone)]
+            return [words(event.t_ns, CRITICAL, self._estimator_gone)]
         if event.event in ("started", "restarted"):
             self._estimator_gone = ""
         return []
@@ -164,22 +163,22 @@ class LinkNode:
         self._band = health.band
         severity = {ThermalBand.NORMAL: INFO, ThermalBand.HOT: NOTICE, ThermalBand.CRITICAL: WARNING}[health.band]
         degrees = "" if health.temperature_c is None else f", {health.temperature_c:.0f} C"
-        return [_text(health.t_ns, severity, f"computer is {health.band}{degrees}")]
+        return [words(health.t_ns, severity, f"computer is {health.band}{degrees}")]
 
     def _on_hint(self, hint: HintVerdict) -> StatusText:
         if hint.verdict is Verdict.ACCEPTED:
             self._asking.hinted(hint.t_ns)
-        return _text(hint.t_ns, INFO if hint.verdict is Verdict.ACCEPTED else WARNING, hint.text)
+        return words(hint.t_ns, INFO if hint.verdict is Verdict.ACCEPTED else WARNING, hint.text)
 
     def _send(self, now_ns: int) -> Iterator[Message]:
         yield from self._climb_ladder(now_ns)
         if self._armed is not False and (question := self._asking.due(now_ns)):  # on the ground nobody is lost
-            yield _text(now_ns, WARNING, question)
+            yield words(now_ns, WARNING, question)
         silent = self._heard_ns is not None and now_ns - self._heard_ns > fix.SILENT_AFTER_NS
         if silent != self._silent:
             self._silent = silent
             if silent:
-                yield _text(now_ns, CRITICAL, f"silent: no estimate for {fix.SILENT_AFTER_NS / 1e9:.0f} s")
+                yield words(now_ns, CRITICAL, f"silent: no estimate for {fix.SILENT_AFTER_NS / 1e9:.0f} s")
         if silent:
             self._fix.lower()
             yield from self._gnss.tick(now_ns, good=False)
@@ -190,13 +189,13 @@ class LinkNode:
         yield from self._gnss.tick(now_ns, good=good)
         if self._no_fix_because is fix.STARTED_IN_FLIGHT and not self._said_started:
             self._said_started = True
-            yield _text(now_ns, WARNING, "started in flight, searching the map")
+            yield words(now_ns, WARNING, "started in flight, searching the map")
         for uses, text in self._filter.look(now_ns, good=good):
-            yield _text(now_ns, INFO if uses else WARNING, text)
+            yield words(now_ns, INFO if uses else WARNING, text)
         if self._said_fix.due(good, now_ns):
             because = self._no_fix_because
             yield (
-                _text(now_ns, INFO, "3D fix") if because is None else _text(now_ns, WARNING, f"no fix: {because.short}")
+                words(now_ns, INFO, "3D fix") if because is None else words(now_ns, WARNING, f"no fix: {because.short}")
             )
 
     def _climb_ladder(self, now_ns: int) -> Iterator[StatusText]:
@@ -206,12 +205,12 @@ class LinkNode:
         if self._rung > self._climbed:
             urgent = severity <= WARNING
             if self._said_rung.due(self._rung, now_ns, urgent=urgent):
-                yield _text(now_ns, severity, f"no map fix for {after_s:.0f} s")
+                yield words(now_ns, severity, f"no map fix for {after_s:.0f} s")
             self._climbed = self._rung
         elif self._rung == 0:
             self._climbed = 0
             if self._said_rung.due(0, now_ns):
-                yield _text(now_ns, INFO, "map fix again")
+                yield words(now_ns, INFO, "map fix again")
 
     def _unanchored_s(self, now_ns: int) -> float | None:
         """Seconds without a map fix; None: nothing was ever believed."""
@@ -250,7 +249,3 @@ class LinkNode:
         if self._unix_minus_monotonic_ns is None:
             return 0, 0
         return gps_time.week_and_ms(t_ns + self._unix_minus_monotonic_ns)
-
-
-def _text(t_ns: int, severity: int, text: str) -> StatusText:
-    return StatusText(t_ns=t_ns, severity=severity, text=f"Terrafix: {text}")
