@@ -81,6 +81,12 @@ def test_without_elevation_nobody_knows_how_the_ground_rises() -> None:
     assert terrain.rise_sigma_m(100.0) == terrain.slope_sigma(100.0) == 0.0
 
 
+def test_a_plane_that_few_matches_share_may_be_a_roof() -> None:
+    ground, roof = (Terrain(40.0).seen_from(np.zeros(3), 100.0, 2.0, share) for share in (1.0, 0.4))
+    assert ground.rise_sigma_m == roof.rise_sigma_m == 0.0
+    assert roof.level_sigma_m == pytest.approx(ground.level_sigma_m + 12.0 * 0.6**2)
+
+
 def test_an_unknown_slope_is_no_news_while_it_is_in_sight() -> None:
     """Some fifteen keyframes see it: each is told of a slope as much larger as their number makes it."""
     learnt = Terrain(40.0)

@@ -65,4 +65,4 @@ class Terrain:
         untold_m = 0.0 if self._slope is None else max(0.0, float(np.hypot(*(p_m[:2] - self._at_m))) - SLOPE_REACH_M)
         level_m = np.hypot(LEVEL_M, self.ruggedness.rise * np.sqrt(untold_m))
         level_share = float(np.sqrt(level_share**2 + relief_share**2 + (level_m / height_m) ** 2))
-        return Ground(height_m, height_sigma_m, slope_e, slope_n, slope_sigma, level_share, share)
+        return Ground(height_m, height_sigma_m, slope_e, slope_n, slope_sigma, level_share, share=share)
