@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import B, C
 from simulated_flight import FRAME_S, Flight, Listener, blind
 
 from terrafix.core.pose import tangent_to_world
@@ -16,7 +17,7 @@ from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import Terrain
 from terrafix.messages import Camera, MapMatch, NavEstimate, Odometry, Origin, VehicleState, Verdict
 
-RISE = float(PRIOR @ CANDIDATES)  # before anything was seen
+RISE = float(np.sqrt(PRIOR @ CANDIDATES**2))  # before anything was seen
 
 ORIGIN = Origin(
     t_ns=0,
@@ -76,9 +77,12 @@ def test_without_elevation_nobody_knows_how_the_ground_rises() -> None:
     terrain = Terrain(40.0)
     assert terrain.rise_sigma_m(100.0) == pytest.approx(10.0 * RISE)
     assert terrain.slope_sigma(100.0) == pytest.approx(0.1 * RISE)
+    # Half of the curvature times 50 m squared, on both sides: what a walk over 100 m rises.
+    assert terrain.bend_sigma(100.0) * 50.0**2 == pytest.approx(10.0 * RISE)
+    assert terrain.seen_from(np.zeros(3), 100.0, 2.0, 1.0).bend_sigma == terrain.bend_sigma(100.0)
     match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", ground=(50.0, 0.1, 0.0))
     terrain.hear(match, np.zeros(3))
-    assert terrain.rise_sigma_m(100.0) == terrain.slope_sigma(100.0) == 0.0
+    assert terrain.rise_sigma_m(100.0) == terrain.slope_sigma(100.0) == terrain.bend_sigma(100.0) == 0.0
 
 
 def test_a_plane_that_few_matches_share_may_be_a_roof() -> None:
@@ -94,7 +98,7 @@ def test_an_unknown_slope_is_no_news_while_it_is_in_sight() -> None:
     assert unknown.slope_sigma == pytest.approx(4.0 * learnt.slope_sigma(100.0), rel=0.01)
     for north_m in np.arange(0.0, 3000.0, 60.0):
         learnt.ruggedness.measured(np.array([0.0, north_m]), 100.0, 0.0, 3.0)
-    assert learnt.seen_from(np.zeros(3), 100.0, 2.0, 1.0).slope_sigma < 0.4 * unknown.slope_sigma
+    assert learnt.seen_from(np.zeros(3), 100.0, 2.0, 1.0).slope_sigma < 0.5 * unknown.slope_sigma
 
 
 def test_a_slope_that_nobody_knows_looks_like_a_tilt_about_the_ground() -> None:
@@ -116,6 +120,40 @@ def test_a_slope_that_nobody_knows_looks_like_a_tilt_about_the_ground() -> None:
         pose, cov = measured_pose(match, terrain)
         world = tangent_to_world(cov, pose.rotation().matrix())
         assert low < float(sloped @ np.linalg.solve(world, sloped)) < high
+    # Sixteen matches over one hill, each taken for news, know no more than one of them should.
+    once = sloped * Terrain(0.0).slope_sigma(100.0) / 0.03
+    assert 16.0 * float(once @ np.linalg.solve(world, once)) == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.parametrize("along", [(1.0, 0.0), (0.0, 1.0), (0.6, 0.8)])
+def test_ground_that_bends_may_not_turn_the_camera(along: tuple[float, float]) -> None:
+    """The slope of a valley changes by 4 % in 100 m. Flown along in steps of 25 m and taken for a plane, it turns the
+    camera at every step, the same way, by more than is claimed; not so with such a curvature in the claim."""
+    bend, course = 4e-4, np.array(along)
+    places = np.random.default_rng(1).uniform(-40.0, 40.0, (60, 2))
+    points = np.column_stack([places, 0.5 * bend * (places @ course) ** 2])
+    looks_down = gtsam.Rot3(np.diag([1.0, -1.0, -1.0]))
+    keyframe, pose = (gtsam.Pose3(looks_down, np.array([*way_m * course, 100.0])) for way_m in (0.0, 25.0))
+    in_both = [(points - camera.translation()) @ looks_down.matrix() for camera in (keyframe, pose)]
+    pairs = np.hstack([p[:, :2] / p[:, 2:] for p in in_both])
+    turned_rad, in_sigmas = [], []
+    for bend_sigma in (0.0, bend):
+        ground = Ground(100.0, 2.0, slope_sigma=0.3, bend_sigma=bend_sigma)
+        values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
+        values.insert(C(0), keyframe)
+        values.insert(C(1), pose)
+        values.insert(B(1), np.zeros(BIAS_SIZE))
+        known = gtsam.noiseModel.Isotropic.Sigma
+        graph.add(gtsam.PriorFactorPose3(C(0), keyframe, known(6, 1e-6)))
+        graph.add(gtsam.PriorFactorVector(B(1), np.zeros(BIAS_SIZE), known(BIAS_SIZE, 1e-6)))
+        graph.add(same_ground_factor(C(0), C(1), B(1), keyframe, pose, pairs, 1e-4, ground))
+        solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        turned = gtsam.Rot3.Logmap(looks_down.between(solved.atPose3(C(1)).rotation()))
+        cov = gtsam.Marginals(graph, solved).marginalCovariance(C(1))[:3, :3]
+        turned_rad.append(float(np.linalg.norm(turned)))
+        in_sigmas.append(float(np.sqrt(turned @ np.linalg.solve(cov, turned))))
+    assert in_sigmas[0] > 1.5 and in_sigmas[1] < 0.2
+    assert turned_rad[0] > 0.05 * bend * 25.0 and turned_rad[1] < 0.1 * turned_rad[0]
 
 
 @pytest.mark.parametrize(("pitch_rad", "sigma_deg"), [(0.0, 0.7), (None, 2.0)])

@@ -71,16 +71,35 @@ def walked(rise: float, metres: float, told: Ruggedness, seed: int) -> list[floa
 @pytest.mark.parametrize("rise", CANDIDATES)
 def test_it_learns_how_rugged_the_ground_is(rise: float) -> None:
     ends = [np.mean(walked(rise, 6000.0, Ruggedness(), seed)[-20:]) for seed in range(8)]
-    assert 0.7 * rise < np.median(ends) < 2.0 * rise
+    assert 0.7 * rise < np.median(ends) < 2.5 * rise
 
 
 def test_where_hills_begin_it_forgets_the_plain() -> None:
-    hills = []
+    plains, hills = [], []
     for seed in range(8):
         told = Ruggedness()
-        assert 0.3 < walked(0.0, 5000.0, told, seed)[-1] < 0.6
+        plains.append(walked(0.0, 5000.0, told, seed)[-1])
         hills.append(max(walked(3.0, 1000.0, told, seed)))
-    assert np.median(hills) > 1.5
+    assert 0.3 < np.median(plains) < 0.8 and np.median(hills) > 1.5
+
+
+def test_smooth_hills_are_hills() -> None:
+    """15 m up and down every 1500 m, slopes of 6 %: from frame to frame they rise by less than a match gets wrong, and
+    were taken for half of a plain. A walk that rises as much on 300 m rises 0.7 m for each root of a metre."""
+    taken_for = []
+    for seed in range(8):
+        told, rng = Ruggedness(), np.random.default_rng(seed)
+        for at in np.arange(0.0, 4000.0, 22.0):
+            level_m = 15.0 * np.sin(2.0 * np.pi * (at / 1500.0 + seed / 8.0)) + rng.normal(0.0, 2.0)
+            told.measured(np.array([0.0, at]), 100.0, float(level_m), 4.0)
+            if at > 1000.0:
+                taken_for.append(told.rise)
+    assert np.median(taken_for) > 0.8 and np.quantile(taken_for, 0.05) > 0.6
+
+
+def test_what_the_candidates_leave_open_is_in_the_claim() -> None:
+    """Of a rise of which nothing is known the mean square counts: mountains are rare, and high."""
+    assert Ruggedness().rise == pytest.approx(np.sqrt(0.35 * 0.3**2 + 0.5 * 1.0**2 + 0.15 * 3.0**2))
 
 
 def test_levels_of_the_same_ground_are_one() -> None:

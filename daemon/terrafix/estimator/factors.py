@@ -224,12 +224,25 @@ def _reduced(
     by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
     by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
     by_plane = np.column_stack([by_plane, LENS_REST / sigma * by_lens])
-    # (1 + P P^T)^(-1/2), where only four directions of the noise are not white: from the eigenvalues of P^T P.
+    if ground.bend_sigma:
+        by_plane = np.column_stack([by_plane, ground.bend_sigma / sigma * _by_bend(by_height, away)])
+    # (1 + P P^T)^(-1/2), where only a few directions of the noise are not white: from the eigenvalues of P^T P.
     s2, v = np.linalg.eigh(by_plane.T @ by_plane)
     root = np.sqrt(1.0 + s2)
     full -= by_plane @ ((v / (root * (1.0 + root))) @ (v.T @ (by_plane.T @ full)))
     r = np.asarray(np.linalg.qr(full, mode="r"))
     return r[:, [0, 1, 2, 3, 4, 5, 10]], r[:, 6:9], r[:, 9]
+
+
+def _by_bend(by_height: np.ndarray, away_m: np.ndarray) -> np.ndarray:
+    """(2N, 3) the change of the residual by the curvature of the ground: along east, along north, and the twist, which
+    in a field that is alike in all directions has a third of the variance. ``away_m`` (2N, 2): from the keyframe.
+
+    Ground that bends turns the camera, by a tenth or so of what its slope changes from keyframe to keyframe, and the
+    same way for as long as a hill is in sight."""
+    east_m, north_m = away_m.T
+    rises_m = np.column_stack([0.5 * east_m**2, 0.5 * north_m**2, east_m * north_m / np.sqrt(3.0)])
+    return np.asarray(by_height[:, None] * rises_m)
 
 
 def _by_lens(

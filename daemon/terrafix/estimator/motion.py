@@ -49,6 +49,7 @@ class Ground:
     slope_n: float = 0.0
     slope_sigma: float = 0.0
     level_share: float = SCALE_SIGMA  # 1-sigma of the mean plane, share of the height
+    bend_sigma: float = 0.0  # 1-sigma of its curvature in any direction, 1/m: how far it may be from being a plane
     rise_sigma_m: float = 0.0  # from the ground below the keyframe to that below the other camera, where nobody tells
     share: float = 1.0  # of the matches that agreed: a plane that few share may be a roof instead of the ground
 

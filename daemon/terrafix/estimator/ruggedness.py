@@ -8,7 +8,9 @@ import numpy as np
 CANDIDATES = np.array([0.3, 1.0, 3.0])
 PRIOR = np.array([0.35, 0.5, 0.15])
 FORGOTTEN_M = 1000.0
-APART = 0.4  # of the height: levels nearer than this come from the same patches of ground and share their errors
+# Of the height: a frame shows about so much ground, and levels of the same ground share their errors. From one such
+# piece to the next smooth hills, too, rise by more than a match gets wrong.
+APART = 1.0
 
 
 class Ruggedness:
@@ -23,8 +25,8 @@ class Ruggedness:
 
     @property
     def rise(self) -> float:
-        """1-sigma, metres for the root of a metre."""
-        return float(self._weights @ CANDIDATES)
+        """1-sigma, metres for the root of a metre, with what is open between the candidates."""
+        return float(np.sqrt(self._weights @ CANDIDATES**2))
 
     def measured(self, at_m: np.ndarray, height_m: float, level_m: float, sigma_m: float) -> None:
         """The level of the ground below ``at_m`` (east, north), seen from this height; any zero will do."""

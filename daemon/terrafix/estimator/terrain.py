@@ -54,6 +54,12 @@ class Terrain:
         """Of the ground that a frame shows from this height, where nobody tells it."""
         return self.rise_sigma_m(height_m) / height_m
 
+    def bend_sigma(self, height_m: float) -> float:
+        """Of its curvature, 1/m: by the same walk, from the middle to half of the height on both sides. What the ends
+        are above the middle, together, is a walk over both halves."""
+        reach_m = 0.5 * height_m
+        return self.rise_sigma_m(2.0 * reach_m) / reach_m**2
+
     def seen_from(self, p_m: np.ndarray, height_m: float, height_sigma_m: float, share: float) -> Ground:
         """The plane for odometry seen at ``p_m`` (east, north, ...), of whose matches this ``share`` agreed."""
         slope_e, slope_n = self._slope or (0.0, 0.0)
@@ -65,4 +71,5 @@ class Terrain:
         untold_m = 0.0 if self._slope is None else max(0.0, float(np.hypot(*(p_m[:2] - self._at_m))) - SLOPE_REACH_M)
         level_m = np.hypot(LEVEL_M, self.ruggedness.rise * np.sqrt(untold_m))
         level_share = float(np.sqrt(level_share**2 + relief_share**2 + (level_m / height_m) ** 2))
-        return Ground(height_m, height_sigma_m, slope_e, slope_n, slope_sigma, level_share, share=share)
+        bend_sigma = self.bend_sigma(height_m)
+        return Ground(height_m, height_sigma_m, slope_e, slope_n, slope_sigma, level_share, bend_sigma, share=share)
