@@ -8,8 +8,9 @@ import numpy as np
 CANDIDATES = np.array([0.3, 1.0, 3.0])
 PRIOR = np.array([0.35, 0.5, 0.15])
 FORGOTTEN_M = 1000.0
-# Of the height: a frame shows about so much ground, and levels of the same ground share their errors. From one such
-# piece to the next smooth hills, too, rise by more than a match gets wrong.
+# Of the height: a frame shows about so much ground, and levels of the same ground share their errors. Over less, relief
+# is smoother than that walk (it has breaks of scale: Mark and Aronson 1984, "Scale-dependent fractal dimensions of
+# topographic surfaces"), and rises by less than a match gets wrong: hills would be taken for plains.
 APART = 1.0
 
 
