@@ -5,7 +5,7 @@ import numpy as np
 
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.pose import MAX_CONDITION, project_with_jacobian, world_to_tangent
-from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
+from terrafix.estimator.terrain import Terrain
 from terrafix.messages import MapMatch
 
 LOCAL_WARP = 0.33  # of the map's own error: by so much orthophotos are stretched over one footprint
@@ -16,15 +16,13 @@ def measured_pose(match: MapMatch, terrain: Terrain) -> tuple[gtsam.Pose3, np.nd
     """Of a match that is ``determined``: pose and covariance (6x6, tangent order).
 
     A slope that the map does not tell looks like a tilt of the camera about the ground below it: it turns the pose and
-    moves it by the height times as much. Matches over one hill see the same slope, each as new ground: it counts as
-    often as in odometry."""
+    moves it by the height times as much."""
     assert match.p_c_in_w_m is not None and match.q_w_c is not None
     r_w_c = rot_from_quat(match.q_w_c)
     local_m, height_m = LOCAL_WARP * match.map_sigma_m, max(match.p_c_in_w_m[2] - terrain.ground_m, 1.0)
     about_north, about_east = np.zeros(6), np.zeros(6)
     about_north[[0, 4]], about_east[[1, 3]] = (height_m, 1.0), (-height_m, 1.0)
-    slope_sigma = RELIEF_REPEATS * terrain.slope_sigma(height_m)
-    slope = slope_sigma**2 * (np.outer(about_north, about_north) + np.outer(about_east, about_east))
+    slope = terrain.slope_sigma(height_m) ** 2 * (np.outer(about_north, about_north) + np.outer(about_east, about_east))
     cov = world_to_tangent(np.array(match.cov).reshape(6, 6) + slope, r_w_c)
     cov[3:, 3:] += r_w_c.T @ np.diag([local_m, local_m, ROOFS * height_m]) ** 2 @ r_w_c
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array(match.p_c_in_w_m)), cov
