@@ -64,8 +64,8 @@ def check_floors(found: dict[str, Any], flight: Path, out: Path) -> None:
     for limit in (20, 50):
         assert found[f"refined_within_{limit}m"] >= found[f"within_{limit}m"]
     # Medians move by decimetres with the noise of the truth itself (4 to 7 m). What the map is off by shows the clearer
-    # the better the rest is: the refined positions of town-a are 5 m off together, those of the flight 3 m. The median of
-    # its 31 distances is known to a tenth.
+    # the better the rest is: the refined positions of town-a are 5 m off together, those of the flight 3 m. A median
+    # of 31 distances is known to a tenth.
     assert scatter_m(flight, out, "refined_") <= 1.1 * scatter_m(flight, out)
     assert frames < FEW_FRAMES or found["refined_median_m"] <= 1.05 * found["median_m"]
     assert found["refined"] / frames > 0.80
