@@ -65,7 +65,7 @@ def _slow_now(known: Known, t_s: float, attitude: Attitude, rise_sigma_m: float)
     if learnt is None or known.yaw_rad is None or attitude.yaw_rad is None or attitude.agl_m is None:
         return None
     turned_rad = math.remainder(attitude.yaw_rad - known.yaw_rad, math.tau)
-    sigmas = walk_sigmas(max(t_s - learnt.t_s, 0.0), float(turned_rad), rise_sigma_m)
+    sigmas = walk_sigmas(max(t_s - learnt.t_s, 0.0), turned_rad, rise_sigma_m)
     return learnt.error, learnt.cov + np.diag(sigmas**2)
 
 

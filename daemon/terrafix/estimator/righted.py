@@ -98,7 +98,7 @@ class Righted:
             self._lately.popleft()
         farthest_rad = max((float(np.hypot(*turned)) for _, turned in self._lately), default=0.0)
         righted2 = max(0.0, farthest_rad**2 - 4.0 * sigma_rad**2)
-        return math.hypot(math.sqrt(righted2), self._unaided_rad(now_s))
+        return math.sqrt(righted2 + self._unaided_rad(now_s) ** 2)
 
     def _unaided_rad(self, now_s: float) -> float:
         if self._unaided_ns is None:
