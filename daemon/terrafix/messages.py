@@ -192,7 +192,7 @@ class Prediction(Message, frozen=True, kw_only=True):
     agl_sigma_m: float
     step_m: Vec2  # camera motion (east, north) since the previous Prediction, by odometry alone
     step_cov_m2: Mat2  # its covariance (ee, en, ne, nn)
-    start_ns: int = 0  # t_ns of the Start from which all this is known; 0: none was said
+    start_ns: int = 0  # t_ns of what told the place anew (a Start, a Coasted); 0: nothing did
 
 
 # --- anchor ---------------------------------------------------------------------------------------
@@ -241,6 +241,22 @@ class PositionHint(Message, frozen=True, kw_only=True):
     lon_deg: float
     radius_m: float
     source: str  # "ground station 255", "command line", "autopilot"
+
+
+class Coasted(Message, frozen=True, kw_only=True):
+    """How the autopilot's filter has moved by its own sensors alone, in ``coast_s`` from our last 3D fix to ``t_ns``.
+
+    Position and velocity with their 1-sigma per axis are those of the fix. ``gain_mps``: by how much the filter's
+    velocity changed since; ``way_m``: how much farther (east, north) it has come by that than by its velocity then."""
+
+    coast_s: float
+    lat_deg: float
+    lon_deg: float
+    velocity_enu_mps: Vec3
+    position_sigma_m: float
+    velocity_sigma_mps: float
+    way_m: tuple[float, float]
+    gain_mps: Vec3
 
 
 class HintVerdict(Message, frozen=True, kw_only=True):
@@ -505,6 +521,7 @@ AnyMessage = (
     | ModelEvent
     | SearchState
     | PositionHint
+    | Coasted
     | HintVerdict
     | Start
     | NavEstimate

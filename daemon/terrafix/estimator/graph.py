@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
+from terrafix.estimator.coasted import Carried
 from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA, leg_factor, same_ground_factor
 from terrafix.estimator.lag import FixedLag
 from terrafix.estimator.motion import RelativePose
@@ -18,6 +19,7 @@ from terrafix.estimator.velocity import V_SIZE, Leg, standing_cov, unknown_cov
 
 ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits in the tail pulls less
 LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
+UNTOLD = 1e8  # variance of what a factor says nothing of
 # Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), heading (a gyro drifts),
 # barometer (a front brings 1 hPa, 8 m, in an hour), lens (it warms up: a tenth of its error in ten minutes), scale
 # (air warms up by 4 degrees an hour, 1.5 %). A looser barometer lets minutes of dead reckoning carry the height off.
@@ -175,6 +177,20 @@ class PoseGraph:
         """A map fix of a node in the window: camera pose with its covariance (tangent order)."""
         factors = gtsam.NonlinearFactorGraph()
         factors.add(gtsam.PriorFactorPose3(C(node), pose, _robust(cov)))
+        self._past.add(factors)
+        self._update(partial(self._smoother.add, factors))
+
+    def add_motion(self, node: int, carried: Carried) -> None:
+        """Where a node in the window was led to, and how fast it was then."""
+        wide = np.diag([UNTOLD] * V_SIZE)
+        wide[:3, :3] = carried.velocity_cov
+        level = np.diag([UNTOLD] * 3)
+        level[:2, :2] = carried.cov_m2
+        gaussian = gtsam.noiseModel.Gaussian.Covariance
+        at_m, velocity = np.array([*carried.at_m, 0.0]), np.array([*carried.velocity_mps, *[0.0] * (V_SIZE - 3)])
+        factors = gtsam.NonlinearFactorGraph()
+        factors.add(gtsam.GPSFactor(C(node), at_m, gaussian(level)))
+        factors.add(gtsam.PriorFactorVector(V(node), velocity, gaussian(wide)))
         self._past.add(factors)
         self._update(partial(self._smoother.add, factors))
 

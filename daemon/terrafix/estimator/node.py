@@ -9,12 +9,14 @@ from terrafix.core.geodesy import LocalFrame, quat_from_rot
 from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
 from terrafix.core.start import begun
+from terrafix.estimator.coasted import Coast
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.resume import Keeper, Known, Last, kept
 from terrafix.estimator.righted import Righted
 from terrafix.estimator.telemetry import Telemetry
 from terrafix.estimator.tracker import Advance, Placed
 from terrafix.messages import (
+    Coasted,
     CovarianceMode,
     Health,
     Imu,
@@ -85,6 +87,9 @@ class EstimatorNode:
                 yield from self._begun()
             case Imu():
                 self._telemetry.add_imu(message)
+            case Coasted() if self._resumed_from is not None and self._estimator is not None:
+                if self._estimator.last_fix_s is None and self._frame is not None:
+                    self._estimator.coasted(Coast.of(message, self._frame))
             case Health():
                 cool = message.band is ThermalBand.NORMAL
                 self._mode = CovarianceMode.MARGINALS if cool else CovarianceMode.JACOBIAN
@@ -231,7 +236,7 @@ class EstimatorNode:
             agl_sigma_m=float(np.sqrt(cov[2, 2])),
             step_m=(float(step[0]), float(step[1])),
             step_cov_m2=(step_var, 0.0, 0.0, step_var),
-            start_ns=0 if self._start is None else self._start.t_ns,
+            start_ns=max(0 if self._start is None else self._start.t_ns, round(estimator.led_s * 1e9)),
         )
 
     def _estimate(self, placed: Placed, t_ns: int) -> NavEstimate:

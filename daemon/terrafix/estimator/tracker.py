@@ -9,6 +9,7 @@ import numpy as np
 
 from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.estimator.beginning import Beginning, Slow, TakeOff
+from terrafix.estimator.coasted import Coast, Coasts
 from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS_SIGMA, SCALE
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sigmas
 from terrafix.estimator.heading import OpenHeading
@@ -79,7 +80,8 @@ class Advance:
 
 
 class Tracker:
-    """``last_fix_s``: time of the newest frame that was fixed on the map; None: none was.
+    """``last_fix_s``: time of the newest frame that was fixed on the map; None: none was. ``led_s``: of the frame that
+    was led to its place by how the autopilot moved while nobody saw the flight; 0: none was.
 
     ``known``: where the flight was known last, if that is not its start now: this process was started in flight."""
 
@@ -90,6 +92,7 @@ class Tracker:
         self.terrain = Terrain(origin.ground_amsl_m or 0.0)
         self.mode = CovarianceMode.MARGINALS
         self.last_fix_s: float | None = None
+        self.led_s = 0.0
         self._node_of: dict[int, int] = {}  # frame -> node, of those in the graph's window
         self._frames = array("q")  # of each node
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
@@ -102,6 +105,7 @@ class Tracker:
         self._last: Placed | None = None  # newest frame
         self._beginning = Beginning(origin, known)
         self._open: OpenHeading | None = None  # None: the heading is known
+        self._coasts = Coasts()
 
     @property
     def last(self) -> Placed | None:
@@ -148,7 +152,7 @@ class Tracker:
         """``felt(t0_ns, t1_ns)``: acceleration between two times, where the inertial readings cover them."""
         if self._last is None or (self.last_fix_s is None and self._beginning.is_told_more(attitude)):
             # No linear graph recovers from a heading that turns out to be 70 degrees off what was assumed.
-            return self._begin(frame_id, t_s, attitude)
+            return self._begin(frame_id, t_s, attitude, felt)
         newest = self.graph.newest
         before, dt_s = self.graph.state(newest), t_s - self.graph.time_of(newest)
         known = self._by_odometry(odometry, attitude)
@@ -215,6 +219,7 @@ class Tracker:
         self._seen_from = None if known is None else parent
         self._cov_of = {n: cov for n, cov in self._cov_of.items() if self.graph.holds(n)}
         self._velocity_cov = spread[3:, 3:]
+        self._be_led(node, t_s, attitude, felt)
         self._last = self._placed(frame_id, t_s, node)
         if known is not None:
             self._pace.seen(t_s, self._last.velocity_mps, self._last.velocity_cov)
@@ -237,10 +242,32 @@ class Tracker:
             launching=self._take_off.launching,
         )
 
-    def _begin(self, frame_id: int, t_s: float, attitude: Attitude) -> Advance:
+    def coasted(self, coast: Coast) -> None:
+        """How the autopilot moved while nobody saw the flight."""
+        self._coasts.add(coast)
+
+    def _be_led(self, node: int, t_s: float, attitude: Attitude, felt: Feel) -> None:
+        """By how the autopilot moved, to the newest node."""
+        coast = self._coasts.taken(t_s)
+        if coast is None or attitude.yaw_rad is None or attitude.stands or self._open is not None:
+            return
+        state, tilt_rad = self.graph.state(node), np.radians(self.origin.attitude_sigma_deg)
+        tilts_rad = tilt_rad, float(np.hypot(tilt_rad, attitude.righted_rad))
+        since = felt(round(coast.t_s * 1e9), round(t_s * 1e9))
+        carried = coast.until(t_s, since, attitude.yaw_rad, float(state.bias[2]), tilts_rad)
+        cov = tangent_to_world(self.graph.covariance(node), state.pose.rotation().matrix())
+        if carried.agrees_with(state.pose.translation()[:2], cov[:2, :2]):
+            self.graph.add_motion(node, carried)
+            self._cov_of.pop(node, None)
+            self._velocity_cov = self.graph.velocity_covariance(node)
+            self.led_s = t_s
+
+    def _begin(self, frame_id: int, t_s: float, attitude: Attitude, felt: Feel) -> Advance:
         begun = self._beginning.begun(t_s, attitude, self.terrain)
         placed = self._start_graph(frame_id, t_s, attitude, begun.at_m, begun.sigma_m, begun.slow)
-        return Advance(Verdict.ACCEPTED, placed, begun.way_m, begun.way_sigma_m)
+        self._be_led(placed.node, t_s, attitude, felt)
+        self._last = self._placed(frame_id, t_s, placed.node)
+        return Advance(Verdict.ACCEPTED, self._last, begun.way_m, begun.way_sigma_m)
 
     def _begin_again(
         self,

@@ -128,7 +128,7 @@ def worst_horizontal_variance(cov: Sequence[float]) -> float:
     return max(0.0, (ee + nn) / 2 + math.hypot((ee - nn) / 2, en))
 
 
-def _metres_per_degree(lat_deg: float) -> tuple[float, float]:
+def metres_per_degree(lat_deg: float) -> tuple[float, float]:
     """-> (along the meridian, along the parallel), from the radii of curvature of WGS84 (Snyder, PP 1395, p. 24)."""
     s = math.sin(math.radians(lat_deg))
     w2 = 1.0 - WGS84_E2 * s * s
@@ -139,11 +139,11 @@ def _metres_per_degree(lat_deg: float) -> tuple[float, float]:
 
 def offset(lat_deg: float, lon_deg: float, e_m: float, n_m: float) -> tuple[float, float]:
     """A point moved by metres east and north; good to 0.1 m over the hundreds of metres it is used for."""
-    north, east = _metres_per_degree(lat_deg)
+    north, east = metres_per_degree(lat_deg)
     return lat_deg + n_m / north, math.remainder(lon_deg + e_m / east, 360.0)
 
 
 def distance_m(lat1_deg: float, lon1_deg: float, lat2_deg: float, lon2_deg: float) -> float:
     """Distance of two near points in metres; far ones come out as far, which is all that the gate asks."""
-    north, east = _metres_per_degree((lat1_deg + lat2_deg) / 2)
+    north, east = metres_per_degree((lat1_deg + lat2_deg) / 2)
     return math.hypot((lat2_deg - lat1_deg) * north, math.remainder(lon2_deg - lon1_deg, 360.0) * east)

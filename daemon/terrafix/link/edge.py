@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.core.config import LinkSection
 from terrafix.link import gps_time
 from terrafix.link.budget import LineBudget
+from terrafix.link.coast import Coast
 from terrafix.link.connection import Connection
 from terrafix.link.diagnosis import Heard
 from terrafix.link.ground_links import GroundLinks
@@ -84,6 +85,8 @@ class MavlinkEdge:
         self._ground = GroundLinks(config, wall_clock_ns, self._hints)
         self._switch = SourceSwitch(config.gps_id)
         self._resume = Resume()
+        found = self._keeper.found
+        self._coast = Coast(None if found is None else found.last, self._partner.telemetry.measured_ns)
         self._named_values = NamedValues()
         self._start: Place | None = None  # of the flight
         self._heard = Heard()
@@ -108,7 +111,7 @@ class MavlinkEdge:
         said: list[Message] = []
         if self._takes_over and self._keeper.found is not None:
             self._takes_over = False
-            self._partner.telemetry.served(self._keeper.found, now_ns)
+            self._partner.telemetry.served(self._keeper.found.autopilot, now_ns)
         for message in self._connection.messages(now_ns):
             said += self._take(message, now_ns)
         said += self._ground.poll(now_ns, self._partner.sysid)
@@ -136,6 +139,8 @@ class MavlinkEdge:
             case GpsInput():
                 self._send_position(message)
                 self._resume.said(message)
+                self._coast.sent(message)
+                self._keeper.fixed(self._coast.last)
             case Origin():
                 if message.ground_amsl_m is not None:
                     self._start = Place(message.lat_deg, message.lon_deg, message.ground_amsl_m)
@@ -184,6 +189,7 @@ class MavlinkEdge:
         hint = self._resume.take(message, now_ns)
         if hint is not None:
             yield hint
+        yield from self._coast.take(message, now_ns, self._our_receiver())
         if kind == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             self._streams.answered(message.result)
 
@@ -226,6 +232,7 @@ class MavlinkEdge:
         yield from self._streams.requests(sysid, AUTOPILOT_COMPONENT, now_ns)
         yield from self._outputs.requests(self._start, self._partner.now(now_ns), now_ns)
         yield from self._switch.requests(sysid, now_ns)
+        yield from self._coast.requests(sysid, AUTOPILOT_COMPONENT, now_ns)
 
     def _heartbeat(self) -> None:
         self._ground.heartbeat(self._partner.telemetry.vehicle_type)

@@ -1,4 +1,5 @@
-"""What a link leaves to the one that is started in its place: which autopilot it served, while that was armed.
+"""What a link leaves to the one that is started in its place: which autopilot it served, while that was armed, and
+where its filter was with our last fix (coast.py).
 
 An autopilot says who it is once a second, and its attitude long before. Who knows it already can say where it leans
 with the first packet, which is what the estimator waits for after a restart in flight."""
@@ -8,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from terrafix.core.rundir import write_whole
+from terrafix.link.coast import LastFix
 
 
 class ArmedAutopilot(msgspec.Struct, frozen=True):
@@ -18,22 +20,38 @@ class ArmedAutopilot(msgspec.Struct, frozen=True):
     vehicle: int
 
 
+class Kept(msgspec.Struct, frozen=True):
+    autopilot: ArmedAutopilot
+    last: LastFix | None = None
+
+
 class AutopilotKeeper:
-    """``heard`` after every HEARTBEAT of the autopilot. One that is not armed is not kept: a vehicle on the ground
-    stands where its flight begins, and nobody may believe that of one that has taken off meanwhile."""
+    """``heard`` after every HEARTBEAT of the autopilot, ``fixed`` with every other last fix. One that is not armed is
+    not kept: a vehicle on the ground stands where its flight begins, and nobody may believe that of one that has taken
+    off meanwhile."""
 
     def __init__(self, file: Path | None) -> None:
         """``file`` None: nothing is kept."""
         self._file = file
-        self.found = msgspec.json.decode(file.read_bytes(), type=ArmedAutopilot) if file and file.is_file() else None
+        self.found = msgspec.json.decode(file.read_bytes(), type=Kept) if file and file.is_file() else None
         self._kept = self.found
 
     def heard(self, autopilot: ArmedAutopilot | None) -> None:
         """None: it is not armed."""
-        if self._file is None or autopilot == self._kept:
-            return
-        self._kept = autopilot
         if autopilot is None:
+            self._keep(None)
+        elif self._kept is None or self._kept.autopilot != autopilot:
+            self._keep(Kept(autopilot))
+
+    def fixed(self, last: LastFix | None) -> None:
+        if self._kept is not None:
+            self._keep(Kept(self._kept.autopilot, last))
+
+    def _keep(self, kept: Kept | None) -> None:
+        if self._file is None or kept == self._kept:
+            return
+        self._kept = kept
+        if kept is None:
             self._file.unlink(missing_ok=True)
         else:
-            write_whole(self._file, msgspec.json.encode(autopilot))
+            write_whole(self._file, msgspec.json.encode(kept))

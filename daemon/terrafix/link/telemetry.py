@@ -111,7 +111,7 @@ class Telemetry:
         self._boot_ms = message.time_boot_ms
         height = self._height
         return VehicleState(
-            t_ns=self._measured_ns(message.time_boot_ms * 1_000_000, now_ns),
+            t_ns=self.measured_ns(message.time_boot_ms * 1_000_000, now_ns),
             source="mavlink",
             yaw_rad=math.remainder(message.yaw, math.tau),
             pitch_rad=message.pitch,
@@ -125,7 +125,7 @@ class Telemetry:
         if readings is None or not self._imu_of.takes(kind):
             return None
         since_boot_ns = boot_ns(message)
-        t_ns = now_ns if since_boot_ns is None else self._measured_ns(since_boot_ns, now_ns)
+        t_ns = now_ns if since_boot_ns is None else self.measured_ns(since_boot_ns, now_ns)
         if self._imu and t_ns <= self._imu[-1][0]:
             return None  # repeated, or the mapping of the clocks has just moved
         self._imu.append((t_ns, readings))
@@ -135,7 +135,7 @@ class Telemetry:
         self._imu.clear()
         return Imu(t_ns=t_ns, source="mavlink", samples=samples)
 
-    def _measured_ns(self, since_boot_ns: int, now_ns: int) -> int:
+    def measured_ns(self, since_boot_ns: int, now_ns: int) -> int:
         """When it was measured, on our clock; the time of arrival while the clocks are not in step."""
         ours_ns = self._timesync.to_ours(since_boot_ns)
         if ours_ns is None:

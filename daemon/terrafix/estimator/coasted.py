@@ -1,0 +1,87 @@
+"""A stretch that nobody saw, as the autopilot's filter coasted through it: what an estimator knows after a restart.
+
+The filter had a position until then, and its tilt and the bias of its accelerometers were known: what it lost in six
+seconds (ArduPilot's plane, 36 times, half of them in a turn) is what the autopilot's own attitude is believed to be
+off by."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from terrafix.core.geodesy import LocalFrame
+from terrafix.estimator.velocity import STEADY_MPS2, V_SIZE, Felt, leg, spread_after, unknown_cov
+from terrafix.messages import Coasted
+
+# Chi-square, 2 degrees of freedom, 99.9 %: a filter that jumped meanwhile is not believed.
+GATE = 13.8
+
+
+@dataclass(frozen=True)
+class Carried:
+    """At a frame: ``at_m`` (2,), ``velocity_mps`` (3,), each with its covariance."""
+
+    at_m: np.ndarray
+    cov_m2: np.ndarray
+    velocity_mps: np.ndarray
+    velocity_cov: np.ndarray
+
+    def agrees_with(self, at_m: np.ndarray, cov_m2: np.ndarray) -> bool:
+        """With a position (2,) that is known otherwise, to ``cov_m2`` (2, 2)."""
+        off_m = self.at_m - at_m
+        return float(off_m @ np.linalg.solve(self.cov_m2 + cov_m2, off_m)) <= GATE
+
+
+@dataclass(frozen=True)
+class Coast:
+    """``t_s``: its end, ``at_m`` (2,): its beginning."""
+
+    t_s: float
+    at_m: np.ndarray
+    said: Coasted
+
+    @classmethod
+    def of(cls, said: Coasted, frame: LocalFrame) -> "Coast":
+        return cls(said.t_ns * 1e-9, np.array(frame.to_local(said.lat_deg, said.lon_deg)), said)
+
+    def until(
+        self, t_s: float, felt: Felt | None, yaw_rad: float, heading_bias_rad: float, sigmas_rad: tuple[float, float]
+    ) -> Carried:
+        """``felt``: since its end. ``sigmas_rad``: of the attitude's tilt, in it and since."""
+        said, yaws = self.said, (yaw_rad, yaw_rad)
+        before = np.zeros(V_SIZE)
+        before[:3] = said.velocity_enu_mps
+        speed_mps = float(np.hypot(*before[:2]))
+        cov = unknown_cov()
+        cov[:3, :3] = said.velocity_sigma_mps**2 * np.eye(3)
+        cov[6:, 6:] = 0.0  # the filter knows the bias of its accelerometers
+        unknown = Felt(np.array([0.0, said.coast_s]), np.zeros((2, 3)), np.array(yaws), 0.0)
+        coast = leg(said.coast_s, unknown, yaws, heading_bias_rad, speed_mps, sigmas_rad[0], same_kind=False)
+        coast = replace(coast, way_m=np.array([*said.way_m, 0.0]), gain_mps=np.array(said.gain_mps))
+        spread = spread_after(coast, cov)
+        p, v = coast.predicted(np.array([*self.at_m, 0.0]), before, heading_bias_rad)
+        spread[9:, 9:] = STEADY_MPS2**2 * np.eye(2)
+        since = leg(max(t_s - self.t_s, 1e-3), felt, yaws, heading_bias_rad, speed_mps, sigmas_rad[1], same_kind=False)
+        p, v = since.predicted(p, v, heading_bias_rad)
+        after = spread_after(since, spread[3:, 3:])
+        both = since.reach_s * spread[:2, 3:5]  # what was wrong of the velocity by then goes on
+        way_cov = spread[:2, :2] + both + both.T + after[:2, :2]
+        return Carried(p[:2], said.position_sigma_m**2 * np.eye(2) + way_cov, v[:3], after[3:6, 3:6])
+
+
+class Coasts:
+    """What was said of it until the first picture that was taken since."""
+
+    def __init__(self) -> None:
+        self._said: list[Coast] | None = []
+
+    def add(self, coast: Coast) -> None:
+        if self._said is not None:
+            self._said.append(coast)
+
+    def taken(self, t_s: float) -> Coast | None:
+        """For a frame, once: the newest that is not newer."""
+        until = [coast for coast in self._said or () if coast.t_s <= t_s]
+        if not until:
+            return None
+        self._said = None
+        return max(until, key=lambda coast: coast.t_s)
