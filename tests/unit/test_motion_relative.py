@@ -124,10 +124,12 @@ def test_sloping_ground(slope: tuple[float, float]) -> None:
     in_k = (points - p) @ r
     pairs = np.hstack([seen[:, :2], in_k[:, :2] / in_k[:, 2:]])
     r_true, p_true = between(FIRST, (r, p))
-    known = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, Ground(AGL_M, 2.0, *slope))
+    known = relative_pose(
+        pairs, SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, Ground(AGL_M, 2.0, slope_e=slope[0], slope_n=slope[1])
+    )
     assert known is not None
     assert np.linalg.norm(log_so3(r_true.T @ known.r)) < 1e-4 and np.linalg.norm(known.p_m - p_true) < 0.02
-    unknown = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, Ground(AGL_M, 2.0, 0.0, 0.0, 0.15))
+    unknown = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, Ground(AGL_M, 2.0, slope_sigma=0.15))
     assert unknown is not None
     error = np.concatenate([log_so3(r_true.T @ unknown.r), unknown.r.T @ (unknown.p_m - p_true)])
     assert error @ np.linalg.solve(unknown.cov, error) < 22.5

@@ -1,6 +1,6 @@
 """Metric camera motion between two frames, from matched rays and the height above the ground."""
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class Ground:
 
     height_m: float
     height_sigma_m: float
+    _: KW_ONLY
     slope_e: float = 0.0
     slope_n: float = 0.0
     slope_sigma: float = 0.0

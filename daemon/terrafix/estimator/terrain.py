@@ -72,4 +72,13 @@ class Terrain:
         level_m = np.hypot(LEVEL_M, self.ruggedness.rise * np.sqrt(untold_m))
         level_share = float(np.sqrt(level_share**2 + relief_share**2 + (level_m / height_m) ** 2))
         bend_sigma = self.bend_sigma(height_m)
-        return Ground(height_m, height_sigma_m, slope_e, slope_n, slope_sigma, level_share, bend_sigma, share=share)
+        return Ground(
+            height_m,
+            height_sigma_m,
+            slope_e=slope_e,
+            slope_n=slope_n,
+            slope_sigma=slope_sigma,
+            level_share=level_share,
+            bend_sigma=bend_sigma,
+            share=share,
+        )
