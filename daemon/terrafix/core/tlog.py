@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from terrafix.core.errors import SourceError
 from terrafix.core.imu import Chooser, boot_ns, readings_of
+from terrafix.core.takeoff_height import TakeOffHeight
 from terrafix.messages import Imu, ImuSample, VehicleState
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1; a tlog also holds the ground station's and the gimbal's words
@@ -47,6 +48,7 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
     headings: list[VehicleState] = []
     hud_ground_m: float | None = None
     armed: bool | None = None
+    above = {kind: TakeOffHeight() for kind in _HEIGHTS}
     for t_us, said in messages:
         t_ns = (t_us - t0_us) * 1000
         kind = said.get_type()
@@ -64,9 +66,11 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
                 )
             )
         elif kind == "GLOBAL_POSITION_INT":
-            heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=said.relative_alt / 1000.0))
+            agl_m = above[kind].above(said.relative_alt / 1000.0, said.alt / 1000.0, armed)
+            heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=agl_m))
         elif kind == "ALTITUDE" and _finite(said.altitude_relative):
-            heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=said.altitude_relative))
+            agl_m = above[kind].above(said.altitude_relative, said.altitude_amsl, armed)
+            heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=agl_m))
         elif kind == "VFR_HUD" and _finite(said.alt):
             hud_ground_m = said.alt if hud_ground_m is None else hud_ground_m
             heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=said.alt - hud_ground_m))

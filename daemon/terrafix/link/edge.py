@@ -111,7 +111,7 @@ class MavlinkEdge:
         said: list[Message] = []
         if self._takes_over and self._keeper.found is not None:
             self._takes_over = False
-            self._partner.telemetry.served(self._keeper.found.autopilot, now_ns)
+            self._partner.telemetry.served(self._keeper.found, now_ns)
         for message in self._connection.messages(now_ns):
             said += self._take(message, now_ns)
         said += self._ground.poll(now_ns, self._partner.sysid)
@@ -140,7 +140,7 @@ class MavlinkEdge:
                 self._send_position(message)
                 self._resume.said(message)
                 self._coast.sent(message)
-                self._keeper.fixed(self._coast.last)
+                self._keeper.flies(self._coast.last, self._partner.telemetry.home_moved_m)
             case Origin():
                 if message.ground_amsl_m is not None:
                     self._start = Place(message.lat_deg, message.lon_deg, message.ground_amsl_m)

@@ -1,5 +1,5 @@
-"""What a link leaves to the one that is started in its place: which autopilot it served, while that was armed, and
-where its filter was with our last fix (coast.py).
+"""What a link leaves to the one that is started in its place: which autopilot it served, while that was armed, where
+its filter was with our last fix (coast.py), and by how much its home was moved (core/takeoff_height.py).
 
 An autopilot says who it is once a second, and its attitude long before. Who knows it already can say where it leans
 with the first packet, which is what the estimator waits for after a restart in flight."""
@@ -23,10 +23,11 @@ class ArmedAutopilot(msgspec.Struct, frozen=True):
 class Kept(msgspec.Struct, frozen=True):
     autopilot: ArmedAutopilot
     last: LastFix | None = None
+    home_moved_m: float = 0.0
 
 
 class AutopilotKeeper:
-    """``heard`` after every HEARTBEAT of the autopilot, ``fixed`` with every other last fix. One that is not armed is
+    """``heard`` after every HEARTBEAT of the autopilot, ``flies`` after each fix. One that is not armed is
     not kept: a vehicle on the ground stands where its flight begins, and nobody may believe that of one that has taken
     off meanwhile."""
 
@@ -43,9 +44,9 @@ class AutopilotKeeper:
         elif self._kept is None or self._kept.autopilot != autopilot:
             self._keep(Kept(autopilot))
 
-    def fixed(self, last: LastFix | None) -> None:
+    def flies(self, last: LastFix | None, home_moved_m: float) -> None:
         if self._kept is not None:
-            self._keep(Kept(self._kept.autopilot, last))
+            self._keep(Kept(self._kept.autopilot, last, home_moved_m))
 
     def _keep(self, kept: Kept | None) -> None:
         if self._file is None or kept == self._kept:

@@ -9,8 +9,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.imu import KINDS, Chooser, boot_ns, readings_of
+from terrafix.core.takeoff_height import TakeOffHeight
 from terrafix.link.diagnosis import NAMES
-from terrafix.link.kept import ArmedAutopilot
+from terrafix.link.kept import ArmedAutopilot, Kept
 from terrafix.link.timesync import TimeSync
 from terrafix.messages import Imu, ImuSample, VehicleState
 
@@ -37,6 +38,7 @@ class Telemetry:
         self._only_sysid = only_sysid
         self._heartbeat_ns: int | None = None
         self._height: tuple[int, float] | None = None  # (arrival, metres above take-off)
+        self._above = TakeOffHeight()
         self._boot_ms = 0
         self._armed: bool | None = None
         self._serves: ArmedAutopilot | None = None
@@ -66,17 +68,23 @@ class Telemetry:
         if kind in KINDS:
             return self._take_imu(message, kind, now_ns)
         if kind == "GLOBAL_POSITION_INT":
-            self._take_height(message.relative_alt / 1000.0, now_ns)
+            self._take_height(message.relative_alt / 1000.0, message.alt / 1000.0, now_ns)
         elif kind == "ALTITUDE":
-            self._take_height(message.altitude_relative, now_ns)
+            self._take_height(message.altitude_relative, message.altitude_amsl, now_ns)
         elif kind == "SYSTEM_TIME" and message.time_unix_usec > 0:
             self._unix_minus_monotonic_ns = message.time_unix_usec * 1000 - now_ns
         return None
 
-    def served(self, autopilot: ArmedAutopilot, now_ns: int) -> None:
+    def served(self, kept: Kept, now_ns: int) -> None:
         """By the link before this one, until a moment ago: as if its heartbeat had come now."""
-        if self._only_sysid in (0, autopilot.sysid):
-            self._is_there(autopilot, now_ns, armed=True)
+        if self._only_sysid in (0, kept.autopilot.sysid):
+            self._is_there(kept.autopilot, now_ns, armed=True)
+            self._above = TakeOffHeight(kept.home_moved_m)
+
+    @property
+    def home_moved_m(self) -> float:
+        """By how much home has risen since take-off."""
+        return self._above.moved_m
 
     @property
     def armed_autopilot(self) -> ArmedAutopilot | None:
@@ -97,17 +105,17 @@ class Telemetry:
         heard = ArmedAutopilot(message.get_srcSystem(), int(message.autopilot), int(message.type))
         self._is_there(heard, now_ns, armed=bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED))
 
-    def _take_height(self, height_m: float, now_ns: int) -> None:
+    def _take_height(self, relative_m: float, amsl_m: float, now_ns: int) -> None:
         """Above take-off, by the barometer: without a sensor nobody knows the height above the ground beneath."""
-        if math.isfinite(height_m) and abs(height_m) < HEIGHT_MAX_M:
-            self._height = (now_ns, height_m)
+        if math.isfinite(relative_m) and abs(relative_m) < HEIGHT_MAX_M:
+            self._height = (now_ns, self._above.above(relative_m, amsl_m, self._armed))
 
     def _vehicle_state(self, message: Any, now_ns: int) -> VehicleState | None:
         angles = (message.yaw, message.pitch, message.roll)
         if not all(math.isfinite(a) and abs(a) <= ATTITUDE_MAX_RAD for a in angles):
             return None
         if message.time_boot_ms < self._boot_ms - REBOOT_BACK_MS:
-            self._height = None  # take-off height of another boot
+            self._height, self._above = None, TakeOffHeight()  # take-off height of another boot
         self._boot_ms = message.time_boot_ms
         height = self._height
         return VehicleState(
