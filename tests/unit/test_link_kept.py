@@ -6,8 +6,9 @@ from link_wire import MemoryWire, attitude, packed, states
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
+from terrafix.estimator.resume import kept
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.kept import AutopilotKeeper
+from terrafix.link.kept import ArmedAutopilot, AutopilotKeeper
 
 S = 1_000_000_000
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
@@ -65,3 +66,19 @@ def test_an_autopilot_that_stands_is_not_kept(tmp_path: Path) -> None:
     edge, wire = link(kept)
     wire.arrive(packed(attitude(1000), mavlink.MAVLink(None, srcSystem=7, srcComponent=1)))
     assert not states(edge.poll(9 * S))
+
+
+def test_what_cannot_be_read_is_begun_without(tmp_path: Path) -> None:
+    for name, data in (("cut", b"\x85\xa8"), ("other", b'{"autopilot": 7}'), ("empty", b"")):
+        (tmp_path / name).write_bytes(data)
+        assert kept(tmp_path / name) is None
+        assert AutopilotKeeper(tmp_path / name).found is None
+    assert kept(tmp_path / "none") is None and kept(None) is None
+
+
+def test_nobody_dies_for_what_the_next_one_would_like_to_know(tmp_path: Path) -> None:
+    """Shared memory is full."""
+    keeper = AutopilotKeeper(tmp_path / "not there" / "link.kept")
+    keeper.heard(ArmedAutopilot(sysid=1, firmware=3, vehicle=1))
+    keeper.flies(None, 2.0)
+    keeper.heard(None)

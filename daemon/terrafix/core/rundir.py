@@ -7,12 +7,18 @@ import fcntl
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
+
+import msgspec
 
 from terrafix.core.clock import now_ns
 from terrafix.core.progress import Progress
 
+T = TypeVar("T")
 SHM = Path("/dev/shm")  # memory, not disk: frames and progress stamps never wait for storage
 PREFIX = "terrafix-"
 SAME_FLIGHT_NS = 60_000_000_000  # a run that lived so lately was killed in the flight that goes on now
@@ -90,6 +96,23 @@ def write_whole(file: Path, data: bytes) -> None:
     fresh = file.with_suffix(".new")
     fresh.write_bytes(data)
     fresh.replace(file)
+
+
+def leave(file: Path, data: bytes) -> None:
+    """For the process that is started in the place of this one. Where memory is full it finds what was left before: no
+    process dies in flight for what the next one would like to know."""
+    with suppress(OSError):
+        write_whole(file, data)
+
+
+def left(file: Path | None, decode: Callable[[bytes], T]) -> T | None:
+    """What a process left there; None: nothing, or nothing that can be read, and this one begins without."""
+    if file is None:
+        return None
+    try:
+        return decode(file.read_bytes())
+    except (OSError, msgspec.DecodeError):
+        return None
 
 
 class OwnedRunDir:

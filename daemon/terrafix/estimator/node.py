@@ -302,7 +302,7 @@ def _odometry_verdict(odometry: Odometry, verdict: Verdict, detail: str = "") ->
 
 
 def make_node(ctx: NodeContext) -> EstimatorNode:
-    return EstimatorNode(ctx.epoch_ns, None if ctx.kept is None else kept(ctx.kept))
+    return EstimatorNode(ctx.epoch_ns, kept(ctx.kept))
 
 
 def make_edge(ctx: NodeContext) -> Edge | None:

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, rot_from_quat, yaw_of
-from terrafix.core.rundir import write_whole
+from terrafix.core.rundir import leave, left
 from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.pace import TYPICAL_SPEED_MPS
@@ -142,12 +142,12 @@ class Keeper:
             self._match = msgspec.structs.replace(message, matches=[])
         elif isinstance(message, NavEstimate) and message.t_ns - self._kept_ns >= KEPT_EVERY_NS:
             self._kept_ns = message.t_ns
-            write_whole(self._file, msgspec.msgpack.encode(Last(message, self._slow, self._match, self._start)))
+            leave(self._file, msgspec.msgpack.encode(Last(message, self._slow, self._match, self._start)))
 
     def close(self) -> None:
         pass
 
 
-def kept(file: Path) -> Last | None:
+def kept(file: Path | None) -> Last | None:
     """What a ``Keeper`` kept there."""
-    return msgspec.msgpack.decode(file.read_bytes(), type=Last) if file.is_file() else None
+    return left(file, msgspec.msgpack.Decoder(Last).decode)

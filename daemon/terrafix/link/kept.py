@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from terrafix.core.rundir import write_whole
+from terrafix.core.rundir import leave, left
 from terrafix.link.coast import LastFix
 
 
@@ -34,7 +34,7 @@ class AutopilotKeeper:
     def __init__(self, file: Path | None) -> None:
         """``file`` None: nothing is kept."""
         self._file = file
-        self.found = msgspec.json.decode(file.read_bytes(), type=Kept) if file and file.is_file() else None
+        self.found = left(file, msgspec.json.Decoder(Kept).decode)
         self._kept = self.found
 
     def heard(self, autopilot: ArmedAutopilot | None) -> None:
@@ -55,4 +55,4 @@ class AutopilotKeeper:
         if kept is None:
             self._file.unlink(missing_ok=True)
         else:
-            write_whole(self._file, msgspec.json.encode(kept))
+            leave(self._file, msgspec.json.encode(kept))
