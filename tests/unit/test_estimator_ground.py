@@ -1,6 +1,7 @@
 """The ground under a vehicle that flies on along a slope, and the attitude of the body behind a learnt mount."""
 
 import gtsam
+import msgspec
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C
@@ -15,7 +16,16 @@ from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.ruggedness import CANDIDATES, PRIOR
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import Terrain
-from terrafix.messages import Camera, MapMatch, NavEstimate, Odometry, Origin, VehicleState, Verdict
+from terrafix.messages import (
+    Camera,
+    MapMatch,
+    MeasurementVerdict,
+    NavEstimate,
+    Odometry,
+    Origin,
+    VehicleState,
+    Verdict,
+)
 
 RISE = float(np.sqrt(PRIOR @ CANDIDATES**2))  # before anything was seen
 
@@ -251,3 +261,14 @@ def test_who_is_lost_over_hills_claims_no_speed() -> None:
         flown_mps = (flight.p_m[i] - flight.p_m[i - 1]) / FRAME_S
         off_mps = float(np.hypot(*(np.array(said.velocity_enu_mps) - flown_mps)[:2]))
         assert off_mps < 3.0 * said.velocity_sigma_mps
+    why = {m.verdict for m in run.said if isinstance(m, MeasurementVerdict) and m.measurement == "odometry"}
+    assert why == {Verdict.ACCEPTED, Verdict.FEW_INLIERS, Verdict.DEGENERATE}
+
+
+def test_odometry_that_does_not_count_is_told_why() -> None:
+    flight = Flight(4, dem=True)
+    run = Listener().fly(flight, 0, 3)
+    said = next(m for m in flight.messages(3) if isinstance(m, Odometry))
+    run.hear([msgspec.structs.replace(said, keyframe_id=777), msgspec.structs.replace(said, pairs=[])])
+    verdicts = [m.verdict for m in run.said if isinstance(m, MeasurementVerdict) and m.measurement == "odometry"]
+    assert verdicts[-2:] == [Verdict.STALE, Verdict.FEW_INLIERS]

@@ -154,8 +154,9 @@ class Tracker:
             # No linear graph recovers from a heading that turns out to be 70 degrees off what was assumed.
             return self._begin(frame_id, t_s, attitude, felt)
         newest = self.graph.newest
-        before, dt_s = self.graph.state(newest), t_s - self.graph.time_of(newest)
-        known = self._by_odometry(odometry, attitude)
+        before, dt_s = self.graph.state(newest), max(t_s - self.graph.time_of(newest), 1e-3)
+        answer = self._by_odometry(odometry, attitude)
+        verdict, known = (answer, None) if isinstance(answer, Verdict) else (Verdict.ACCEPTED, answer)
         if attitude.stands:
             self._take_off.stood()
         way = None if attitude.stands else self._leg(t_s, before, attitude, felt)
@@ -171,9 +172,6 @@ class Tracker:
             sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2] + spread[:2, :2])[-1]))
             placed = self._start_graph(frame_id, t_s, attitude, led_to[:2], sigma_m)
             return Advance(Verdict.ACCEPTED, placed, (led_to - before.pose.translation())[:2], sigma_m)
-        verdict = Verdict.ACCEPTED
-        if known is None:
-            verdict = odometry.verdict if odometry.verdict is not Verdict.ACCEPTED else Verdict.FEW_INLIERS
         unseen = known is None and way is not None and attitude.yaw_rad is None
         told = self._open is not None and attitude.yaw_rad is not None
         if told or (unseen and (self._open is None or not self._open.dark)):
@@ -366,20 +364,20 @@ class Tracker:
         self._node_of[frame_id] = node
         self._frames.append(frame_id)
 
-    def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | None:
-        """The keyframe's node and the motion since, when odometry has both."""
+    def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | Verdict:
+        """The keyframe's node and the motion since; or why odometry does not tell it."""
         if odometry.verdict is not Verdict.ACCEPTED or not odometry.pairs:
-            return None
+            return Verdict.FEW_INLIERS if odometry.verdict is Verdict.ACCEPTED else odometry.verdict
         parent = self._node_of.get(odometry.keyframe_id)
         if parent is None or not self.graph.holds(parent):
-            return None
+            return Verdict.STALE
         state = self.graph.state(parent)
         r_w_kf = state.pose.rotation().matrix()
         place_cov = r_w_kf @ self._cov_of[parent][3:, 3:] @ r_w_kf.T
         p = state.pose.translation()
         height = float(p[2]) - self.terrain.below(p)
         if height < 2.0:
-            return None
+            return Verdict.TOO_LOW
         r_w_k = self.camera.expected(attitude, state.bias, r_w_kf)
         tilt_sigma = np.radians(max(self.origin.attitude_sigma_deg, 1.0))
         if attitude.pitch_rad is None or attitude.roll_rad is None:
@@ -387,17 +385,17 @@ class Tracker:
         share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
         ground = self._ground(p, height, place_cov, share)
         if ground.level_sigma_m > MAX_LEVEL_SIGMA * height:
-            return None
+            return Verdict.DEGENERATE
         newest = self.graph.state(self.graph.newest)
         onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - self.graph.time_of(self.graph.newest))
         way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
         ground = replace(ground, rise_sigma_m=self.terrain.rise_sigma_m(way_m))
         motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
         if motion is None:
-            return None
+            return Verdict.FEW_INLIERS
         dt_s = max(odometry.t_ns * 1e-9 - self.graph.time_of(parent), 1e-3)
         possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + height
-        return (parent, motion) if possible else None
+        return (parent, motion) if possible else Verdict.IMPLAUSIBLE
 
     def _ground(self, p_m: np.ndarray, height_m: float, place_cov: np.ndarray, share: float) -> Ground:
         """The plane under a camera at ``p_m`` (3,), known to ``place_cov`` (3x3). ``share`` of the matches agreed."""
