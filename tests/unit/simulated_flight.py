@@ -61,6 +61,7 @@ class Flight:
     dem: bool = False  # the map tells that the ground is flat
     climbs_m: float = 8.0  # half of what it rises and sinks
     turns_rad: float = 0.0  # by which it turns after a quarter of a minute, within two seconds
+    hovers: bool = False  # every other ten seconds, at once: it brakes and flies off as hard as it can
     hills_m: float = 0.0  # 1-sigma of ground that rises and falls over a kilometre
     ground_m: np.ndarray = field(init=False, repr=False)
     rng_of: np.random.Generator = field(init=False, repr=False)
@@ -74,7 +75,8 @@ class Flight:
         t_s = np.arange(self.frames) * FRAME_S
         heading = 0.5 + np.cumsum(0.10 * np.sin(t_s / 11.0)) * FRAME_S
         heading += self.turns_rad * np.clip((t_s - 15.0) / 2.0, 0.0, 1.0)
-        steps = self.speed_mps * FRAME_S * np.column_stack([np.sin(heading), np.cos(heading)])
+        speed_mps = self.speed_mps * np.where(self.hovers & (t_s % 20.0 >= 10.0), 0.05, 1.0)
+        steps = speed_mps[:, None] * FRAME_S * np.column_stack([np.sin(heading), np.cos(heading)])
         start = rng.normal(0.0, ORIGIN.start_sigma_m, 2)
         xy = start + np.vstack([np.zeros(2), np.cumsum(steps[:-1], axis=0)])
         way = np.arange(self.frames) * self.speed_mps * FRAME_S

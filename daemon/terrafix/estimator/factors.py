@@ -21,6 +21,7 @@ from terrafix.estimator.velocity import V_SIZE, Leg
 BIAS_SIZE = 6
 HEIGHT, LENS, SCALE = 3, 4, 5  # of B
 BLOCK_HUBER_K = 1.5
+ROBUST_K = 2.0  # Huber on what is told of poses and ways: what passed its gate but sits in the tail pulls less
 # 1-sigma of the first radial coefficient, less what the description of the lens says: 0.005 after a calibration, 0.03
 # where its maker's focal length is all that is known. What it bends is alike in every frame and looks like a tilt that
 # grows with the way, so it is learnt in flight. The higher coefficients are noise, as large as this of the first.
@@ -29,6 +30,12 @@ LENS_SIGMA, LENS_REST = 0.02, 0.0015
 # all its heights 5 % too small. The other part is the focal length's: what is seen over it is the height that is seen.
 BAROMETER_SCALE = 0.05
 REDUCED = 11  # residuals of a pair of cameras above a plane, after the reduction
+
+
+def robust(cov: np.ndarray) -> gtsam.noiseModel.Robust:
+    """Gaussian noise of this covariance, with Huber's tail."""
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
+    return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov, False))
 
 
 def tilted(x_rad: float, y_rad: float) -> np.ndarray:
@@ -269,6 +276,9 @@ def leg_factor(
     Where no map tells the ground (``Leg.lifted``), C is above whatever ground is seen, as if all of it were at one
     level, and its rise is in the height bias, which the barometer shows: how far the vehicle rose is what both say.
 
+    What drones do, where nobody felt it, has a tail: they cruise for minutes and then brake as hard as they can. A leg
+    that is taken for Gaussian holds on to the cruise, and what gives way is the height, in which the camera sees it.
+
     Linear but for the heading, the axes of the poses, and the height that a leg is told in (``Leg.over``)."""
     rows = 3 + V_SIZE
     by_before, by_after = -leg.by_before(), np.zeros((rows, V_SIZE))
@@ -319,6 +329,6 @@ def leg_factor(
                 jacobians[i] = np.asfortranarray(jacobian)
         return residual
 
-    noise = gtsam.noiseModel.Gaussian.Covariance(leg.cov, False)
+    noise = gtsam.noiseModel.Gaussian.Covariance(leg.cov, False) if leg.inertial else robust(leg.cov)
     keys = [*before, *after, bias_keys[1]]
     return custom_factor(noise, [*keys, bias_keys[0]] if leg.lifted else keys, error)

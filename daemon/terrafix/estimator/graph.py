@@ -11,13 +11,12 @@ import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator.coasted import Carried
-from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA, leg_factor, same_ground_factor
+from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA, leg_factor, robust, same_ground_factor
 from terrafix.estimator.lag import FixedLag
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.past import Past
 from terrafix.estimator.velocity import V_SIZE, Leg, standing_cov, unknown_cov
 
-ROBUST_K = 2.0  # Huber on motion and map factors: what passed its gate but sits in the tail pulls less
 LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
 UNTOLD = 1e8  # variance of what a factor says nothing of
 # Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), heading (a gyro drifts),
@@ -143,7 +142,7 @@ class PoseGraph:
             cov = motion.cov.copy()
             if leg is not None:
                 cov[3:, 3:] += LEFT_TO_LEG_M**2 * np.eye(3)
-            factors.add(gtsam.BetweenFactorPose3(C(parent), C(node), between, _robust(cov)))
+            factors.add(gtsam.BetweenFactorPose3(C(parent), C(node), between, robust(cov)))
         else:
             seen, keyframe = motion.seen, self.state(parent).pose
             factors.add(
@@ -176,7 +175,7 @@ class PoseGraph:
     def add_pose(self, node: int, pose: gtsam.Pose3, cov: np.ndarray) -> None:
         """A map fix of a node in the window: camera pose with its covariance (tangent order)."""
         factors = gtsam.NonlinearFactorGraph()
-        factors.add(gtsam.PriorFactorPose3(C(node), pose, _robust(cov)))
+        factors.add(gtsam.PriorFactorPose3(C(node), pose, robust(cov)))
         self._past.add(factors)
         self._update(partial(self._smoother.add, factors))
 
@@ -281,8 +280,3 @@ def _values(node: int, state: NodeState) -> gtsam.Values:
     values.insert(B(node), state.bias)
     values.insert(V(node), state.velocity)
     return values
-
-
-def _robust(cov: np.ndarray) -> gtsam.noiseModel.Robust:
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
-    return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov))
