@@ -13,7 +13,7 @@ from terrafix_tools.sim.sensors.errors import TYPICAL, SensorErrors
 from terrafix_tools.sim.sensors.suite import VehicleSensors
 
 STEP_S = 0.02
-KEPT = {"yaw_constant_rad", "attitude_slow_s", "range_limits_m"}
+KEPT = {"yaw_constant_rad", "yaw_slow_s", "attitude_slow_s", "range_limits_m"}
 PERFECT = replace(TYPICAL, **{f.name: 0.0 for f in fields(SensorErrors) if f.name not in KEPT})
 
 
@@ -88,10 +88,32 @@ def test_the_compass_errs_by_heading_and_by_what_it_is_told() -> None:
     assert 1.5 < np.ptp(found) / 2 < 3.2
 
 
+def changes(values: np.ndarray, steps: int) -> float:
+    """Rms of what the rows of ``values`` (N, M) change by over so many steps, degrees."""
+    return math.degrees(math.sqrt(np.mean(np.square(values[:, steps:] - values[:, :-steps]))))
+
+
 def test_the_attitude_filter_errs_slowly() -> None:
-    roll = np.array([r.roll_rad for r in read(VehicleSensors(PLACE, seed=2), 400.0)])
-    assert 0.2 < np.degrees(roll.std()) < 0.7
-    assert np.degrees(np.abs(np.diff(roll)).max()) < 0.2
+    """A process of the first order, of standard deviation s and memory T, changes by s * sqrt(2 - 2 exp(-t / T))."""
+    flights = [VehicleSensors(PLACE, seed=seed) for seed in range(24)]
+    said = [[sensors.read(state(0.2 * i)) for i in range(1000)] for sensors in flights]
+    roll = np.array([[r.roll_rad for r in readings] for readings in said])
+    yaw = np.array([[r.yaw_rad for r in readings] for readings in said])
+    for t_s in (1.0, 10.0, 30.0):
+        of_roll, of_yaw = (math.sqrt(2.0 - 2.0 * math.exp(-t_s / memory_s)) for memory_s in (10.0, 15.0))
+        assert changes(roll, round(t_s / 0.2)) == pytest.approx(0.65 * of_roll, rel=0.15)
+        assert changes(yaw, round(t_s / 0.2)) == pytest.approx(1.5 * of_yaw, rel=0.15)
+
+
+def test_a_barometer_takes_a_part_of_the_dynamic_pressure_for_height() -> None:
+    """Which part is the vehicle's own; it grows with the square of the speed through the air."""
+    errors = replace(PERFECT, baro_static=0.15)
+    flights = [VehicleSensors(PLACE, seed=seed, errors=errors) for seed in range(60)]
+    speeds = (0.0, 10.0, 20.0)
+    said = np.array([[f.read(state(0.02 * v, airspeed_mps=v)).baro_amsl_m for v in speeds] for f in flights])
+    above = said[:, 1:] - said[:, :1]
+    assert np.std(above[:, 1]) == pytest.approx(0.15 * 20.0**2 / 19.6, rel=0.25)
+    assert above[:, 0] == pytest.approx(0.25 * above[:, 1])
 
 
 def test_a_wrong_scale_of_the_barometer_counts_from_the_start() -> None:

@@ -1,7 +1,9 @@
 """How wrong the sensors of a small autopilot are. 1-sigma over many vehicles where a seed draws one of them.
 
 Inertial noise and scale: InvenSense ICM-42688-P data sheet (DS-000347); an ArduCopter's log at 49 Hz shows the same
-noise at rest (0.0004 rad/s, 0.008 to 0.011 m/s^2) and, in flight, the vibration below (0.2 to 0.3 m/s^2, 0.03)."""
+noise at rest (0.0004 rad/s, 0.008 to 0.011 m/s^2) and, in flight, the vibration below (0.2 to 0.3 m/s^2, 0.03).
+
+Attitude, heading, barometer: as in that copter's flight and a fixed wing's (docs/simulated-flights.md)."""
 
 import math
 from dataclasses import dataclass
@@ -25,14 +27,18 @@ class SensorErrors:
     vibration_radps: float = 0.02
     yaw_constant_rad: float | None = None  # None: drawn with the sigma below
     yaw_sigma_rad: float = math.radians(2.0)
-    yaw_by_heading_rad: float = math.radians(1.5)  # amplitude of what iron on board does, once and twice a turn
-    yaw_noise_rad: float = math.radians(0.5)
+    # Amplitude of what iron on board does, once a turn, and half of it twice. ArduPilot takes a calibration that is off
+    # by up to 16 mGauss (AP_Compass.h), of 200 that lie level at middle latitudes: 4.6 degrees, 2.6 (rms) below that.
+    yaw_by_heading_rad: float = math.radians(2.6)
+    yaw_slow_rad: float = math.radians(1.5)  # of the attitude filter, wandering
+    yaw_slow_s: float = 15.0
     attitude_level_rad: float = math.radians(0.3)  # board not level in the frame
-    attitude_slow_rad: float = math.radians(0.4)  # of the attitude filter, wandering
-    attitude_slow_s: float = 15.0
+    attitude_slow_rad: float = math.radians(0.65)  # of the attitude filter, wandering
+    attitude_slow_s: float = 10.0
     baro_bias_m: float = 1.5
     baro_walk: float = 0.04  # m per root second: weather, temperature
     baro_scale: float = 0.005  # of the height over take-off: air that is not standard
+    baro_static: float = 0.15  # of the dynamic pressure, in what should be the static one
     baro_noise_m: float = 0.12
     airspeed_scale: float = 0.02
     airspeed_noise_mps: float = 0.25

@@ -12,9 +12,9 @@ from terrafix_tools.sim.interfaces import Readings, State
 from terrafix_tools.sim.sensors.errors import TYPICAL, SensorErrors
 from terrafix_tools.sim.sensors.gnss import Gnss
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent
+from terrafix_tools.sim.vehicle.motion import GRAVITY_MPS2
 
 BLOCK = 512  # moments for which numbers are drawn at once
-YAW_SLOW_S = 8.0
 FLYING_M = 0.5  # above this height the motor runs
 GYRO, ACCEL, GYRO_WALK, ACCEL_WALK, ATTITUDE, YAW, BARO, BARO_WALK, AIR, RANGE = (
     slice(0, 3),
@@ -60,7 +60,8 @@ class VehicleSensors:
         self._baro_scale = 1.0 + float(rng.normal(0.0, 1.0)) * errors.baro_scale
         self._air_scale = 1.0 + float(rng.normal(0.0, 1.0)) * errors.airspeed_scale
         self._slow = (rng.normal(0.0, 1.0, 2) * errors.attitude_slow_rad).tolist()
-        self._yaw_slow = float(rng.normal(0.0, 1.0)) * errors.yaw_noise_rad
+        self._yaw_slow = float(rng.normal(0.0, 1.0)) * errors.yaw_slow_rad
+        self._baro_static = float(rng.normal(0.0, 1.0)) * errors.baro_static
         self._last_s: float | None = None
         self._start_m = 0.0
         self._draws, self._at = np.empty((0, DRAWS)), 0
@@ -108,15 +109,17 @@ class VehicleSensors:
 
     def _yaw_error(self, yaw_rad: float, dt_s: float, draw: float) -> float:
         e = self._errors
-        keep = math.exp(-dt_s / YAW_SLOW_S)
-        self._yaw_slow = keep * self._yaw_slow + e.yaw_noise_rad * math.sqrt(1.0 - keep * keep) * draw
+        keep = math.exp(-dt_s / e.yaw_slow_s) if e.yaw_slow_s else 0.0
+        self._yaw_slow = keep * self._yaw_slow + e.yaw_slow_rad * math.sqrt(1.0 - keep * keep) * draw
         iron = math.sin(yaw_rad + self._iron[0]) + 0.5 * math.sin(2.0 * yaw_rad + self._iron[1])
         return self._yaw_bias_rad + e.yaw_by_heading_rad * iron + self._yaw_slow
 
     def _baro(self, state: State, draw: float, walk: float) -> float:
         self._baro_bias_m += self._errors.baro_walk * walk
         climbed_m = float(state.p_b_in_w_m[2]) - self._start_m
-        return self._start_m + self._baro_scale * climbed_m + self._baro_bias_m + self._errors.baro_noise_m * draw
+        by_wind_m = self._baro_static * state.airspeed_mps**2 / (2.0 * GRAVITY_MPS2)
+        off_m = self._baro_bias_m + by_wind_m + self._errors.baro_noise_m * draw
+        return self._start_m + self._baro_scale * climbed_m + off_m
 
     def _airspeed(self, state: State, draw: float) -> float | None:
         if not self._has_airspeed:
