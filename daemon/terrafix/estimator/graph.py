@@ -220,6 +220,8 @@ class PoseGraph:
         self._times[node] = t_s
         for n in leaving:
             del self._times[n]
+        if not any({C(node), B(node)} <= set(factors.at(i).keys()) for i in range(factors.size())):
+            factors.add(_tie(node))
         self._past.add(factors)
         self._update(partial(self._smoother.insert, node, factors, values))
 
@@ -229,7 +231,8 @@ class PoseGraph:
         try:
             work()
             healthy = bool(np.isfinite(self.state(self.newest).pose.matrix()).all())
-        except (RuntimeError, OverflowError):  # how GTSAM, and a factor, say that a system is indeterminate
+        # How GTSAM, and a factor, say that a system is indeterminate; or that the tree has lost a variable.
+        except (RuntimeError, OverflowError, ValueError, IndexError):
             healthy = False
         if not healthy:
             self._rebuild()
@@ -260,6 +263,16 @@ class PoseGraph:
             self._past.leave(list(self._times), self._smoother.estimate())
         self._past.begin(self._next)
         self._times.clear()
+
+
+def _tie(node: int) -> gtsam.LinearContainerFactor:
+    """Of C and B, and says nothing. ISAM2.marginalizeLeaves forgets a variable that leaves together with one that is
+    above it in the tree, if nothing ties the two, and raises (GTSAM 4.3: it climbs to the clique of the latter, and
+    takes out only what is below that by name). B of a node that begins a graph may be such a one."""
+    nothing = np.zeros((1, 6))
+    return gtsam.LinearContainerFactor(
+        gtsam.JacobianFactor(C(node), nothing, B(node), nothing, np.zeros(1), gtsam.noiseModel.Unit.Create(1))
+    )
 
 
 def _priors(
