@@ -1,11 +1,11 @@
 """What the covariance leaves to the other place, while map matches and graph disagree and after the graph went over."""
 
 import numpy as np
-import pytest
 
 from terrafix.estimator.rival import FORGET_OVER, Rival
 
 FROM_MAP = np.diag([4.0, 4.0, 9.0, 1e-4, 1e-4, 1e-4])
+APART = np.diag([16.0, 25.0])  # what estimate and match together do not know of the offset
 
 
 def mahalanobis2(cov: np.ndarray, error_m: np.ndarray) -> float:
@@ -14,23 +14,23 @@ def mahalanobis2(cov: np.ndarray, error_m: np.ndarray) -> float:
 
 def test_one_refused_match_is_a_mistake_and_changes_nothing() -> None:
     rival = Rival()
-    rival.disagreed([np.array([350.0, 0.0])])
+    rival.disagreed([np.array([350.0, 0.0])], APART)
     assert np.array_equal(rival.added(FROM_MAP), FROM_MAP)
 
 
 def test_two_that_agree_bring_the_other_place_into_the_ellipse_and_nothing_else() -> None:
     rival, offset = Rival(), np.array([60.0, -30.0])
-    rival.disagreed([offset + 1.0, offset - 1.0])
+    rival.disagreed([offset + 1.0, offset - 1.0], APART)
     cov = rival.added(FROM_MAP)
     assert mahalanobis2(cov, offset) < 5.991
     across = np.array([30.0, 60.0])
-    assert mahalanobis2(cov, across) == pytest.approx(mahalanobis2(FROM_MAP, across))
+    assert mahalanobis2(cov, across) > 50.0
     assert np.array_equal(cov[2:], FROM_MAP[2:])
 
 
 def test_who_went_over_keeps_the_place_that_was_left_until_new_ground_has_spoken() -> None:
     rival, offset = Rival(), np.array([0.0, 80.0])
-    rival.left(offset)
+    rival.left(offset, APART)
     assert mahalanobis2(rival.added(FROM_MAP), -offset) < 5.991
     rival.fade(0.0)  # hovering proves nothing
     assert mahalanobis2(rival.added(FROM_MAP), -offset) < 5.991
@@ -39,3 +39,16 @@ def test_who_went_over_keeps_the_place_that_was_left_until_new_ground_has_spoken
     assert mahalanobis2(rival.added(FROM_MAP), -offset) < 5.991
     rival.fade(5.0 * FORGET_OVER)
     assert np.array_equal(rival.added(FROM_MAP), FROM_MAP)
+
+
+def test_the_other_place_is_known_as_well_as_estimate_and_match_were() -> None:
+    """A plane without IMU had drifted by 8 m when it went over, and the place that was left lay aside of the offset."""
+    rival, offset = Rival(), np.array([-75.0, -3.0])
+    rival.left(offset, APART)
+    rival.fade(0.5 * FORGET_OVER)
+    aside = -offset + np.array([3.0, 7.0])
+    assert mahalanobis2(rival.added(FROM_MAP), aside) < 9.0
+    sure = Rival()
+    sure.left(offset, 0.0 * APART)
+    sure.fade(0.5 * FORGET_OVER)
+    assert mahalanobis2(sure.added(FROM_MAP), aside) > 9.0

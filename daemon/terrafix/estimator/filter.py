@@ -143,14 +143,16 @@ class Estimator(Tracker):
         offset = (measured.translation() - predicted.translation())[:2]
         here = predicted.translation()[:2]
         self._refused.add(offset, here)
+        apart = tangent_to_world(self._covariance(node), predicted.rotation().matrix())
+        apart = (apart + tangent_to_world(cov, measured.rotation().matrix()))[:2, :2]
         if len(self._refused.offsets_m) > 1:
-            self.rival.disagreed(self._refused.offsets_m)
+            self.rival.disagreed(self._refused.offsets_m, apart)
             height = float(measured.translation()[2]) - self.terrain.ground_m
             # Before the first fix only the start coordinate speaks for the graph: as much as one such pose against it.
             first = self.last_fix_s is None and match.inliers >= OUTWEIGHS_START
             needed = (AGREEING, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
             if self._refused.holds(*needed) and match.mode_mass >= RECOVER_MASS:
-                self.rival.left(offset)
+                self.rival.left(offset, apart)
                 return self._restart(match, node, measured, cov, "restarted")
         return FixResult(Verdict.INNOVATION, d2, f"{float(np.hypot(*offset)):.0f} m from the estimate")
 

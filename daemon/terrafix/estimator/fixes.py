@@ -56,6 +56,7 @@ def torn(
             offsets = [(fixes[i].pose.translation() - poses[fixes[i].node].translation())[:2] for i in outside]
             middle = np.median(offsets, axis=0) if offsets else np.zeros(2)
             rival = Rival()
-            rival.disagreed([o for o in offsets if np.hypot(*(o - middle)) <= AGREE_M])
+            # What all of them together say of the offset is far less off than they are apart.
+            rival.disagreed([o for o in offsets if np.hypot(*(o - middle)) <= AGREE_M], np.zeros((2, 2)))
             if rival.probability > 0.0:
                 yield at, rival.spread_m2()

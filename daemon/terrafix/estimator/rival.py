@@ -16,19 +16,20 @@ FORGOTTEN = 0.01
 
 @dataclass
 class Rival:
-    """``offset_m`` (2,): from the estimate to the other place; ``probability`` of it."""
+    """``offset_m`` (2,): from the estimate to the other place, known to ``cov_m2`` (2, 2); ``probability`` of it."""
 
     offset_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    cov_m2: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))
     probability: float = 0.0
 
-    def disagreed(self, offsets_m: list[np.ndarray]) -> None:
-        """Matches in a row that were refused, as offsets (2,) from the estimate."""
+    def disagreed(self, offsets_m: list[np.ndarray], cov_m2: np.ndarray) -> None:
+        """Matches in a row that were refused, as offsets (2,) from the estimate, the last one known to ``cov_m2``."""
         if len(offsets_m) >= AGREEING:
-            self.offset_m, self.probability = np.mean(offsets_m, axis=0), EVEN
+            self.offset_m, self.cov_m2, self.probability = np.mean(offsets_m, axis=0), cov_m2, EVEN
 
-    def left(self, offset_m: np.ndarray) -> None:
+    def left(self, offset_m: np.ndarray, cov_m2: np.ndarray) -> None:
         """The estimate has gone over to the other place, ``offset_m`` (2,) away: the old one is the rival now."""
-        self.offset_m, self.probability = -offset_m, EVEN
+        self.offset_m, self.cov_m2, self.probability = -offset_m, cov_m2, EVEN
 
     def fade(self, new_heights: float) -> None:
         """A match agreed with the estimate over new ground, in heights flown since the last one."""
@@ -43,5 +44,10 @@ class Rival:
         return cov
 
     def spread_m2(self) -> np.ndarray:
-        """(2, 2) of the two places about the estimate."""
-        return np.asarray(self.probability * np.outer(self.offset_m, self.offset_m))
+        """(2, 2) of the two places about the estimate.
+
+        That of the mean would shrink ``cov_m2`` with the probability, too; but if it is the other place, it lies aside
+        of the offset by as much as ever, and the ellipse would no longer reach it there."""
+        if self.probability == 0.0:
+            return np.zeros((2, 2))
+        return np.asarray(self.probability * np.outer(self.offset_m, self.offset_m) + self.cov_m2)
