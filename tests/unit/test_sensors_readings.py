@@ -150,3 +150,8 @@ def test_the_clock_of_the_autopilot_starts_and_runs_by_itself() -> None:
     assert clock.boot_ns(0.0) == 100_000_000_000
     assert clock.boot_ns(1000.0) - clock.boot_ns(0.0) == 1_000_050_000_000
     assert Clock.of(3) == Clock.of(3) != Clock.of(4)
+
+
+def test_a_course_that_does_not_tell_its_airspeed_has_a_barometer() -> None:
+    reading = VehicleSensors(PLACE, seed=1).read(state(0.0, airspeed_mps=float("nan")))
+    assert abs(reading.baro_amsl_m - 500.0) < 50.0

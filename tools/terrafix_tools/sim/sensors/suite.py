@@ -117,7 +117,9 @@ class VehicleSensors:
     def _baro(self, state: State, draw: float, walk: float) -> float:
         self._baro_bias_m += self._errors.baro_walk * walk
         climbed_m = float(state.p_b_in_w_m[2]) - self._start_m
-        by_wind_m = self._baro_static * state.airspeed_mps**2 / (2.0 * GRAVITY_MPS2)
+        over_ground_mps = float(np.linalg.norm(state.velocity_enu_mps))  # stands in for an airspeed that is not known
+        wind_mps = over_ground_mps if math.isnan(state.airspeed_mps) else state.airspeed_mps
+        by_wind_m = self._baro_static * wind_mps**2 / (2.0 * GRAVITY_MPS2)
         off_m = self._baro_bias_m + by_wind_m + self._errors.baro_noise_m * draw
         return self._start_m + self._baro_scale * climbed_m + off_m
 
