@@ -140,6 +140,7 @@ class VehicleState(Message, frozen=True, kw_only=True):
     agl_m: float | None = None
     velocity_enu_mps: Vec3 | None = None
     armed: bool | None = None  # motors may turn; a vehicle that is not armed stands
+    airspeed_mps: float | None = None  # as a sensor reads it, never computed from wind or GNSS
 
 
 class Imu(Message, frozen=True, kw_only=True):

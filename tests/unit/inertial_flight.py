@@ -66,6 +66,7 @@ class InertialFlight:
                         roll_rad=shown.roll_rad,
                         agl_m=shown.baro_amsl_m,
                         armed=True,
+                        airspeed_mps=shown.airspeed_mps,
                     )
                 )
             batch.append((t_ns, np.concatenate([shown.accel_b_mps2, shown.gyro_b_radps])))
@@ -139,6 +140,7 @@ def flown(
     band: ThermalBand = ThermalBand.NORMAL,
     blind: tuple[int, int] = (0, 0),
     no_imu: tuple[float, float] = (0.0, 0.0),
+    airspeed: bool = False,
     frames: int = 1000,
 ) -> Flown:
     """``blind``: frames in which nothing is seen. ``no_imu``: seconds of which no inertial reading came."""
@@ -149,6 +151,8 @@ def flown(
     last: dict[int, NavEstimate] = {}
     for i, said in enumerate(flight.said[:frames]):
         for message in _heard(said, imu, range(*blind), i, no_imu):
+            if isinstance(message, VehicleState) and not airspeed:
+                message = msgspec.structs.replace(message, airspeed_mps=None)
             for answer in node.on(message):
                 if isinstance(answer, NavEstimate):
                     last[answer.frame_id] = answer

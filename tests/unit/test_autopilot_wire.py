@@ -23,6 +23,7 @@ STREAMS = (
     "EKF_STATUS_REPORT",
     "RAW_IMU",
     "SCALED_PRESSURE",
+    "AIRSPEED",
     "SYSTEM_TIME",
     "TIMESYNC",
 )
@@ -53,6 +54,7 @@ def test_every_stream_comes_and_says_what_the_vehicle_does() -> None:
     assert imu.zacc == pytest.approx(-1000, abs=60)  # milli-g, down is positive
     # 620 m in the standard atmosphere: 941.0 hPa (ICAO Doc 7488, table by interpolation).
     assert rig.last("SCALED_PRESSURE").press_abs == pytest.approx(941.0, abs=0.3)
+    assert rig.last("AIRSPEED").airspeed == pytest.approx(rig.airspeed, abs=1.0)
     raw = rig.last("GPS2_RAW")
     assert (raw.fix_type, raw.satellites_visible, raw.h_acc) == (3, 10, 1000)
     assert rig.last("SYSTEM_TIME").time_unix_usec == 0  # no GPS week was ever sent

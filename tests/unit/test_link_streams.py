@@ -12,6 +12,7 @@ from terrafix.link.streams import PATIENCE, Streams
 
 S = 1_000_000_000
 ATTITUDE, HEIGHT = mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+AIRSPEED = mavlink.MAVLINK_MSG_ID_AIRSPEED
 WANTED = {ATTITUDE: 25.0, HEIGHT: 5.0}
 
 
@@ -60,10 +61,22 @@ def test_without_an_answer_both_ways_are_tried_and_then_seldom() -> None:
     assert PATIENCE < len(attitude) <= PATIENCE + 4
 
 
-def test_a_refusal_is_said() -> None:
+def test_a_refusal_is_said_where_something_comes_too_slowly() -> None:
     streams = Streams(WANTED)
     streams.answered(mavlink.MAV_RESULT_DENIED)
+    run(streams, range(5), {ATTITUDE: 25, HEIGHT: 5})
+    assert streams.problem() == ""
+    run(streams, range(5, 10), {ATTITUDE: 4, HEIGHT: 5})
     assert "message rates refused (MAV_RESULT 2)" in streams.problem()
+
+
+def test_airspeed_is_asked_for_twice_and_again_only_where_it_has_come() -> None:
+    """ArduPilot 4.5 shows its pilot a line for every request of it."""
+    without, with_one = Streams({AIRSPEED: 5.0}), Streams({AIRSPEED: 5.0})
+    assert len(run(without, range(600), {})["COMMAND_LONG"]) == 2
+    assert without.problem() == ""
+    run(with_one, range(60), {AIRSPEED: 5})
+    assert len(run(with_one, range(60, 90), {})["COMMAND_LONG"]) > 2  # the autopilot was started again
 
 
 # --- who is heard ---

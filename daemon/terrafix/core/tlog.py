@@ -1,7 +1,8 @@
 """Telemetry logs (.tlog) of a ground station: MAVLink packets, each after its time of arrival.
 
 Format: a record is 8 bytes, big endian, microseconds since 1970, and one packet (MAVLink 1 or 2), as Mission
-Planner, QGroundControl and MAVProxy write it. Attitude, height and IMU are read; GNSS position and velocity never."""
+Planner, QGroundControl and MAVProxy write it. Attitude, height, airspeed and IMU are read; GNSS position and velocity
+never."""
 
 import math
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from terrafix.core.airspeed import AirspeedReader
 from terrafix.core.errors import SourceError
 from terrafix.core.imu import Chooser, boot_ns, readings_of
 from terrafix.core.takeoff_height import TakeOffHeight
@@ -26,6 +28,7 @@ _STATES = {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
     mavlink.MAVLINK_MSG_ID_ALTITUDE,
     mavlink.MAVLINK_MSG_ID_VFR_HUD,
+    mavlink.MAVLINK_MSG_ID_AIRSPEED,
 }
 _INERTIAL = {
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
@@ -40,12 +43,14 @@ _HEIGHTS = ("GLOBAL_POSITION_INT", "ALTITUDE", "VFR_HUD")
 def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
     """States in time order. ``t_ns`` is relative to ``t0_us`` (UNIX microseconds), or to the first record.
 
-    One state for each ATTITUDE (yaw, pitch, roll) and one for each height message of the best kind in the log.
+    One state for each ATTITUDE (yaw, pitch, roll), each AIRSPEED, and each height message of the best kind in the log.
     A cut or damaged record is skipped. Raises SourceError when the file cannot be read or holds no record."""
     t0_us, messages = _messages(path, _STATES, t0_us)
     heights: dict[str, list[VehicleState]] = {kind: [] for kind in _HEIGHTS}
     attitudes: list[VehicleState] = []
     headings: list[VehicleState] = []
+    airspeeds: list[VehicleState] = []
+    airspeed_of = AirspeedReader()
     hud_ground_m: float | None = None
     armed: bool | None = None
     above = {kind: TakeOffHeight() for kind in _HEIGHTS}
@@ -68,6 +73,8 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
         elif kind == "GLOBAL_POSITION_INT":
             agl_m = above[kind].above(said.relative_alt / 1000.0, said.alt / 1000.0, armed)
             heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=agl_m))
+        elif kind == "AIRSPEED" and (airspeed_mps := airspeed_of.take(said)) is not None:
+            airspeeds.append(VehicleState(t_ns=t_ns, source="mavlink", airspeed_mps=airspeed_mps))
         elif kind == "ALTITUDE" and _finite(said.altitude_relative):
             agl_m = above[kind].above(said.altitude_relative, said.altitude_amsl, armed)
             heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=agl_m))
@@ -77,7 +84,7 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
             yaw_rad = math.remainder(math.radians(said.heading), math.tau)
             headings.append(VehicleState(t_ns=t_ns, source="mavlink", yaw_rad=yaw_rad))
     height = next((heights[kind] for kind in _HEIGHTS if heights[kind]), [])
-    return sorted([*(attitudes or headings), *height], key=lambda state: state.t_ns)
+    return sorted([*(attitudes or headings), *height, *airspeeds], key=lambda state: state.t_ns)
 
 
 def read_imu(path: Path, t0_us: int | None = None) -> list[Imu]:

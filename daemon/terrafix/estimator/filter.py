@@ -130,6 +130,7 @@ class Estimator(Tracker):
 
     def _accepted(self, match: MapMatch, t_s: float, here: np.ndarray) -> None:
         self._seen.add(t_s, here)
+        self._seen_s = max(self._seen_s, t_s)
         self.last_fix_s = self._seen.newest_s
         self.doubt.start_m = 0.0
         self.map_sigma_m = match.map_sigma_m

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
+from terrafix.estimator.air import Air, air_factor
 from terrafix.estimator.coasted import Carried
 from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA, leg_factor, robust, same_ground_factor
 from terrafix.estimator.lag import FixedLag
@@ -174,10 +175,7 @@ class PoseGraph:
 
     def add_pose(self, node: int, pose: gtsam.Pose3, cov: np.ndarray) -> None:
         """A map fix of a node in the window: camera pose with its covariance (tangent order)."""
-        factors = gtsam.NonlinearFactorGraph()
-        factors.add(gtsam.PriorFactorPose3(C(node), pose, robust(cov)))
-        self._past.add(factors)
-        self._update(partial(self._smoother.add, factors))
+        self._join(gtsam.PriorFactorPose3(C(node), pose, robust(cov)))
 
     def add_motion(self, node: int, carried: Carried) -> None:
         """Where a node in the window was led to, and how fast it was then."""
@@ -187,9 +185,19 @@ class PoseGraph:
         level[:2, :2] = carried.cov_m2
         gaussian = gtsam.noiseModel.Gaussian.Covariance
         at_m, velocity = np.array([*carried.at_m, 0.0]), np.array([*carried.velocity_mps, *[0.0] * (V_SIZE - 3)])
+        self._join(
+            gtsam.GPSFactor(C(node), at_m, gaussian(level)), gtsam.PriorFactorVector(V(node), velocity, gaussian(wide))
+        )
+
+    def add_air(self, node: int, air: Air, cov: np.ndarray) -> None:
+        """The velocity of a node in the window, by what flows past it; ``cov`` (2, 2)."""
+        self._join(air_factor(V(node), B(node), air, cov))
+
+    def _join(self, *new: gtsam.NonlinearFactor) -> None:
+        """Of nodes in the window."""
         factors = gtsam.NonlinearFactorGraph()
-        factors.add(gtsam.GPSFactor(C(node), at_m, gaussian(level)))
-        factors.add(gtsam.PriorFactorVector(V(node), velocity, gaussian(wide)))
+        for factor in new:
+            factors.add(factor)
         self._past.add(factors)
         self._update(partial(self._smoother.add, factors))
 

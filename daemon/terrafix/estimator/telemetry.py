@@ -29,6 +29,7 @@ class Attitude:
     roll_rad: float | None
     agl_m: float | None
     armed: bool | None = None
+    airspeed_mps: float | None = None
     righted_rad: float = 0.0  # by how much tilt may be off beyond what is always said of it (righted.py)
 
     @property
@@ -37,7 +38,7 @@ class Attitude:
         return self.armed is False and (self.agl_m is None or self.agl_m < STANDS_BELOW_M)
 
 
-_FIELDS = ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed")
+_FIELDS = ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed", "airspeed_mps")
 
 
 class Telemetry:

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.pose import tangent_to_world, world_to_tangent
+from terrafix.estimator.air import Wind
 from terrafix.estimator.beginning import Beginning, Slow, TakeOff
 from terrafix.estimator.coasted import Coast, Coasts
 from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS_SIGMA, SCALE
@@ -35,6 +36,7 @@ from terrafix.estimator.velocity import (
     spread_after,
     standing_cov,
     unknown_cov,
+    with_velocity,
 )
 from terrafix.messages import Camera, CovarianceMode, Odometry, Origin, Verdict
 
@@ -98,6 +100,8 @@ class Tracker:
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
         self._velocity_cov = np.zeros((V_SIZE, V_SIZE))  # of V of the newest node
         self._pace = Pace()
+        self._wind = Wind()
+        self._seen_s = 0.0  # time of the newest frame whose motion, or place, was seen
         self._seen_from: int | None = None  # node of the keyframe that odometry saw the newest frame from
         self._felt: bool | None = None  # whether the last leg was measured; None: there was none
         self._stood_at: int | None = None  # node at which a vehicle stands, motors off
@@ -218,9 +222,15 @@ class Tracker:
         self._cov_of = {n: cov for n, cov in self._cov_of.items() if self.graph.holds(n)}
         self._velocity_cov = spread[3:, 3:]
         self._be_led(node, t_s, attitude, felt)
+        if known is None and way is not None and self._be_blown(node, t_s, dt_s, attitude):
+            step = (self.graph.state(node).pose.translation() - before.pose.translation())[:2]
+            spread = with_velocity(spread, self._velocity_cov)
+            step_sigma = float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1]))
         self._last = self._placed(frame_id, t_s, node)
         if known is not None:
+            self._seen_s = t_s
             self._pace.seen(t_s, self._last.velocity_mps, self._last.velocity_cov)
+            self._learn_wind(self._last, attitude)
         return Advance(verdict, self._last, step, step_sigma)
 
     def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Leg:
@@ -259,6 +269,25 @@ class Tracker:
             self._cov_of.pop(node, None)
             self._velocity_cov = self.graph.velocity_covariance(node)
             self.led_s = t_s
+
+    def _learn_wind(self, seen: Placed, attitude: Attitude) -> None:
+        if attitude.yaw_rad is None or attitude.stands or self._open is not None:
+            return
+        yaw_rad = attitude.yaw_rad - float(self.graph.state(seen.node).bias[2])
+        self._wind.seen(seen.t_s, seen.velocity_mps, seen.velocity_cov, attitude.airspeed_mps, yaw_rad)
+
+    def _be_blown(self, node: int, t_s: float, dt_s: float, attitude: Attitude) -> bool:
+        """The newest node, that nobody saw, by airspeed and wind. -> whether these told anything."""
+        if self._open is not None:
+            return False
+        up_mps = float(self.graph.state(node).velocity[2])
+        air = self._wind.tells(t_s, attitude.airspeed_mps, attitude.yaw_rad, up_mps)
+        if air is None:
+            return False
+        self.graph.add_air(node, air, air.cov(dt_s, t_s - self._seen_s))
+        self._cov_of.pop(node, None)
+        self._velocity_cov = self.graph.velocity_covariance(node)
+        return True
 
     def _begin(self, frame_id: int, t_s: float, attitude: Attitude, felt: Feel) -> Advance:
         begun = self._beginning.begun(t_s, attitude, self.terrain)

@@ -215,6 +215,12 @@ def believed(way: Leg, off_m: np.ndarray, spread: np.ndarray, seen: np.ndarray) 
     return way, spread - gain @ spread[:3, :]
 
 
+def with_velocity(spread: np.ndarray, velocity_cov: np.ndarray) -> np.ndarray:
+    """``spread`` (11, 11) of a step and of V at its end, when V is known to ``velocity_cov`` (8, 8) after all."""
+    gain = np.linalg.solve(spread[3:, 3:], spread[3:, :]).T
+    return np.asarray(spread - gain @ (spread[3:, 3:] - velocity_cov) @ gain.T)
+
+
 def _without_memory(known: Leg, sigma: np.ndarray) -> Leg:
     by_accel = known.by_before()[:, 3:6]
     steady = np.array([0.0, 0.0, 0.0, 1.0, 1.0])

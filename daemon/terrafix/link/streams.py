@@ -25,11 +25,16 @@ STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5.0,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 1.0,  # whether its filter uses our position
+    mavlink.MAVLINK_MSG_ID_AIRSPEED: 5.0,
 }
-OPTIONAL = {  # not there without a second receiver; not on PX4
+OPTIONAL = {  # not there without a second receiver; not on PX4; not without a sensor
     mavlink.MAVLINK_MSG_ID_GPS2_RAW,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+    mavlink.MAVLINK_MSG_ID_AIRSPEED,
 }
+# ArduPilot before 4.6 refuses it, and tells its pilot so each time that it is asked: so often it is, unless it has come
+# before.
+UNKNOWN_TO_MANY = {mavlink.MAVLINK_MSG_ID_AIRSPEED: 2}
 GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_ parameters)
     mavlink.MAVLINK_MSG_ID_ATTITUDE: mavlink.MAV_DATA_STREAM_EXTRA1,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: mavlink.MAV_DATA_STREAM_RAW_SENSORS,
@@ -55,12 +60,14 @@ class Streams:
         self.rates_hz: dict[int, float] = {}  # of the last whole window
         self._asked_ns: dict[int, int] = {}
         self._asked: dict[int, int] = {}  # how often, since it last came as wanted
+        self._came: set[int] = set()
         self._old_way = False
         self._refused: set[int] = set()
 
     def heard(self, message_id: int) -> None:
         if message_id in self.wanted_hz:
             self._counts[message_id] = self._counts.get(message_id, 0) + 1
+            self._came.add(message_id)
 
     def answered(self, result: int) -> None:
         """COMMAND_ACK of SET_MESSAGE_INTERVAL; it does not say of which message."""
@@ -100,7 +107,7 @@ class Streams:
             if i in self.rates_hz and i not in OPTIONAL and self.rates_hz[i] < ENOUGH * wanted
         ]
         notes = [f"too slow: {', '.join(slow)}"] if slow else []
-        if self._refused:
+        if slow and self._refused:
             notes.append(f"message rates refused (MAV_RESULT {', '.join(map(str, sorted(self._refused)))})")
         return "; ".join(notes)
 
@@ -122,7 +129,10 @@ class Streams:
         asked_ns = self._asked_ns.get(message_id)
         if asked_ns is None:
             return True
-        wait_ns = WINDOW_NS if self._asked.get(message_id, 0) < PATIENCE else SELDOM_NS
+        asked, known = self._asked.get(message_id, 0), message_id in self._came or message_id not in UNKNOWN_TO_MANY
+        if not known and asked >= UNKNOWN_TO_MANY[message_id]:
+            return False
+        wait_ns = WINDOW_NS if known and asked < PATIENCE else SELDOM_NS
         if now_ns - asked_ns < wait_ns or message_id not in self.rates_hz:
             return False
         return self.rates_hz[message_id] < ENOUGH * self.wanted_hz[message_id]

@@ -8,6 +8,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core.airspeed import AirspeedReader
 from terrafix.core.imu import KINDS, Chooser, boot_ns, readings_of
 from terrafix.core.takeoff_height import TakeOffHeight
 from terrafix.link.diagnosis import NAMES
@@ -16,7 +17,7 @@ from terrafix.link.timesync import TimeSync
 from terrafix.messages import Imu, ImuSample, VehicleState
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000  # three of its heartbeats
-HEIGHT_FRESH_NS = 1_000_000_000  # an older height is not the height of this attitude
+FRESH_NS = 1_000_000_000  # an older height, or airspeed, is not that of this attitude
 MAX_TRANSPORT_NS = 500_000_000  # a mapped time further from its arrival than this is a wrong mapping
 BOOT_WRAP_NS = 2**32 * 1_000_000  # time_boot_ms has 32 bits: after 49.7 days it begins anew
 REBOOT_BACK_MS = 1_000  # boot time that steps back by more is a new boot
@@ -39,6 +40,8 @@ class Telemetry:
         self._heartbeat_ns: int | None = None
         self._height: tuple[int, float] | None = None  # (arrival, metres above take-off)
         self._above = TakeOffHeight()
+        self._airspeed: tuple[int, float] | None = None  # (arrival, m/s)
+        self._airspeed_of = AirspeedReader()
         self._boot_ms = 0
         self._armed: bool | None = None
         self._serves: ArmedAutopilot | None = None
@@ -71,6 +74,9 @@ class Telemetry:
             self._take_height(message.relative_alt / 1000.0, message.alt / 1000.0, now_ns)
         elif kind == "ALTITUDE":
             self._take_height(message.altitude_relative, message.altitude_amsl, now_ns)
+        elif kind == "AIRSPEED":
+            if (airspeed_mps := self._airspeed_of.take(message)) is not None:
+                self._airspeed = (now_ns, airspeed_mps)
         elif kind == "SYSTEM_TIME" and message.time_unix_usec > 0:
             self._unix_minus_monotonic_ns = message.time_unix_usec * 1000 - now_ns
         return None
@@ -117,15 +123,15 @@ class Telemetry:
         if message.time_boot_ms < self._boot_ms - REBOOT_BACK_MS:
             self._height, self._above = None, TakeOffHeight()  # take-off height of another boot
         self._boot_ms = message.time_boot_ms
-        height = self._height
         return VehicleState(
             t_ns=self.measured_ns(message.time_boot_ms * 1_000_000, now_ns),
             source="mavlink",
             yaw_rad=math.remainder(message.yaw, math.tau),
             pitch_rad=message.pitch,
             roll_rad=message.roll,
-            agl_m=height[1] if height is not None and now_ns - height[0] < HEIGHT_FRESH_NS else None,
+            agl_m=_fresh(self._height, now_ns),
             armed=self._armed if self.connected(now_ns) else None,
+            airspeed_mps=_fresh(self._airspeed, now_ns),
         )
 
     def _take_imu(self, message: Any, kind: str, now_ns: int) -> Imu | None:
@@ -152,3 +158,8 @@ class Telemetry:
         if abs(now_ns - ours_ns) > MAX_TRANSPORT_NS:
             return now_ns
         return min(ours_ns, now_ns)
+
+
+def _fresh(said: tuple[int, float] | None, now_ns: int) -> float | None:
+    """``said``: (arrival, value)"""
+    return said[1] if said is not None and now_ns - said[0] < FRESH_NS else None

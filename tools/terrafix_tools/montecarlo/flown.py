@@ -131,6 +131,7 @@ def _said(plan: FlightPlan, readings: Readings, home_m: float) -> VehicleState:
         roll_rad=None if plan.gimbal else readings.roll_rad,
         agl_m=plan.height_scale * (readings.baro_amsl_m - home_m),
         armed=True,
+        airspeed_mps=readings.airspeed_mps,
     )
 
 

@@ -24,6 +24,7 @@ RATES_HZ = {  # before anybody asks; 0: only when asked for
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 2.0,
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 2.0,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+    mavlink.MAVLINK_MSG_ID_AIRSPEED: 2.0,
     mavlink.MAVLINK_MSG_ID_TIMESYNC: 0.1,
 }
 HEADING_UNKNOWN = 65535
@@ -31,6 +32,7 @@ _UINT16_MAX = 65535
 DOP_UNKNOWN = 9999
 # International Standard Atmosphere below 11 km (ICAO Doc 7488): pressure at height.
 ISA_HPA, ISA_M, ISA_EXPONENT = 1013.25, 44330.77, 5.25588
+SEA_LEVEL_KGPM3 = 1.225
 AIR_CDEGC = 1500  # temperature of the sensor, centidegrees
 
 
@@ -83,6 +85,8 @@ def message(message_id: int, now: Snapshot) -> Any | None:
         case mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE:
             hpa = ISA_HPA * (1.0 - now.readings.baro_amsl_m / ISA_M) ** ISA_EXPONENT
             return mavlink.MAVLink_scaled_pressure_message(now.boot_ms, hpa, 0.0, AIR_CDEGC)
+        case mavlink.MAVLINK_MSG_ID_AIRSPEED:
+            return _airspeed(now)
         case mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
             return mavlink.MAVLink_system_time_message(now.unix_us, now.boot_ms)
         case _:
@@ -116,6 +120,14 @@ def _vfr_hud(now: Snapshot) -> Any:
     heading = round(math.degrees(now.readings.yaw_rad)) % 360
     speeds = (over_ground if air is None else air, over_ground)
     return mavlink.MAVLink_vfr_hud_message(*speeds, heading, 0, now.readings.baro_amsl_m, float(v[2]))
+
+
+def _airspeed(now: Snapshot) -> Any | None:
+    """Of a sensor; raw pressure in Pa, as ArduPilot has it, where air at sea level gives that speed."""
+    air_mps = now.readings.airspeed_mps
+    if air_mps is None:
+        return None
+    return mavlink.MAVLink_airspeed_message(0, air_mps, AIR_CDEGC, 0.5 * SEA_LEVEL_KGPM3 * air_mps**2, 0)
 
 
 def _gps_raw(now: Snapshot, instance: int) -> Any | None:

@@ -16,6 +16,7 @@ RATES_HZ = {  # as a companion asks for them
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 10.0,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_VFR_HUD: 4.0,
+    mavlink.MAVLINK_MSG_ID_AIRSPEED: 5.0,
 }
 T0_US = 1_717_236_000_000_000  # 2024-06-01 10:00 UTC: of t_s 0, UNIX microseconds
 COMPANION = 190  # MAV_COMP_ID_MISSIONPLANNER
