@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 
 from terrafix.estimator.factors import robust
+from terrafix.estimator.gate import GATE
 from terrafix.estimator.remembered import custom_factor
 
 LEAST_MPS = 8.0  # slower, a pitot tube reads noise, and wings do not carry
@@ -27,7 +28,6 @@ WIND_WALK, SCALE_WALK = 0.2, 5e-4  # m/s and a share, per square root of a secon
 GUSTS_LEARNT_S = 60.0
 LEARN_EVERY_S = 1.0
 TELLS_MPS = 3.0  # 1-sigma of a velocity that tells of the wind, and of one that the wind tells
-GATE = 13.8  # chi-square, 2 degrees of freedom, 99.9 %
 DISTRUST_S = 5.0  # a sensor that contradicts what is seen for so long has changed: all is learnt anew
 
 
@@ -88,7 +88,7 @@ class Wind:
         still, h = self._by_state(level, yaw_rad)
         off = velocity_mps[:2] - self._x[:2] - still
         known, seen = h @ self._p @ h.T, cov[:2, :2] + self._gust2 * np.eye(2)
-        if float(off @ np.linalg.solve(known + seen, off)) > GATE:
+        if float(off @ np.linalg.solve(known + seen, off)) > GATE[2]:
             self._refused_s = t_s if self._refused_s is None else self._refused_s
             if t_s - self._refused_s > DISTRUST_S:
                 self._forget()

@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
+from terrafix.estimator.gate import GATE
 from terrafix.estimator.velocity import STEADY_MPS2, V_SIZE, Felt, leg, spread_after, unknown_cov
 from terrafix.messages import Coasted
-
-# Chi-square, 2 degrees of freedom, 99.9 %: a filter that jumped meanwhile is not believed.
-GATE = 13.8
 
 
 @dataclass(frozen=True)
@@ -26,9 +24,9 @@ class Carried:
     velocity_cov: np.ndarray
 
     def agrees_with(self, at_m: np.ndarray, cov_m2: np.ndarray) -> bool:
-        """With a position (2,) that is known otherwise, to ``cov_m2`` (2, 2)."""
+        """With a position (2,) that is known otherwise, to ``cov_m2`` (2, 2); one that jumped does not."""
         off_m = self.at_m - at_m
-        return float(off_m @ np.linalg.solve(self.cov_m2 + cov_m2, off_m)) <= GATE
+        return float(off_m @ np.linalg.solve(self.cov_m2 + cov_m2, off_m)) <= GATE[2]
 
 
 @dataclass(frozen=True)

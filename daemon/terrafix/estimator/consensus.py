@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.estimator.fragments import Anchor, Fragment
+from terrafix.estimator.gate import GATE
 
-AGREES = 16.27  # chi-square, 3 degrees of freedom, 99.9 %: position, and likewise rotation
 PROPOSERS, PARTNERS = 16, 8  # anchors that propose, and others against which each proposes a scale: more say the same
 SCALE_BASE = 5.0  # two anchors propose a scale when they are so many of their sigmas apart
 
@@ -51,9 +51,9 @@ class _Anchored:
         stretch_var = np.abs(self.stretched - self.stretched[by]) + (self.scale_sigma or 0.0) ** 2
         drift = guess.scale**2 * np.abs(self.shifted - self.shifted[by]) + (turn_var + stretch_var) * far_m**2
         off_m = guess.position(self.p_f) - self.p_w
-        near = np.sum(off_m**2, axis=1) <= AGREES * (drift + self.place_var + self.place_var[by])
+        near = np.sum(off_m**2, axis=1) <= GATE[3] * (drift + self.place_var + self.place_var[by])
         cos = (np.einsum("nij,nij->n", self.r_w, guess.r @ self.r_f) - 1.0) / 2.0
-        aligned = np.arccos(np.clip(cos, -1.0, 1.0)) ** 2 <= AGREES * (turn_var + self.turn_var)
+        aligned = np.arccos(np.clip(cos, -1.0, 1.0)) ** 2 <= GATE[3] * (turn_var + self.turn_var)
         return int(np.sum(near & aligned))
 
     def proposed(self, by: int, scale: float) -> Similarity:

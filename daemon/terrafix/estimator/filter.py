@@ -13,6 +13,7 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.doubt import Doubt
 from terrafix.estimator.factors import HEIGHT
+from terrafix.estimator.gate import GATE
 from terrafix.estimator.graph import NodeState
 from terrafix.estimator.matched import determined, measured_pose
 from terrafix.estimator.resume import Known
@@ -23,7 +24,6 @@ from terrafix.estimator.tracker import STEP_SHARE, Advance, Feel, Tracker, nothi
 from terrafix.estimator.velocity import V_SIZE, unknown_cov
 from terrafix.messages import CovarianceMode, MapMatch, Odometry, Origin, Verdict
 
-GATE_6DOF, GATE_2DOF = 22.5, 13.8  # chi-square, 6 and 2 degrees of freedom, 99.9 %
 COARSE_CONTINUES = 0.5  # of the height: sigma of the estimate up to which the belief's mode alone is taken as a fix
 COARSE_FINDS_AFTER, COARSE_FINDS_OVER = 6, 1.0  # ... and so many that agree, over so many heights, find a position
 RECOVER_AFTER = 3  # fixes that agree with each other and not with the graph
@@ -88,7 +88,7 @@ class Estimator(Tracker):
             if match.coarse:  # its heading is one of those that were tried
                 return FixResult(Verdict.AMBIGUOUS, None, "a coarse fix does not tell the heading")
             away2 = self._away2(match.frame_id, node, measured, cov)
-            if away2 > GATE_2DOF:
+            if away2 > GATE[2]:
                 return self._refuse(match, node, measured, cov, away2)
             return self._restart(match, node, measured, cov, "heading found")
         predicted = self.graph.state(node).pose
@@ -101,7 +101,7 @@ class Estimator(Tracker):
         self._vague.clear()
         innovation = predicted.logmap(measured)
         d2 = float(innovation @ np.linalg.solve(self._covariance(node) + cov, innovation))
-        if d2 > GATE_6DOF:
+        if d2 > GATE[6]:
             return self._refuse(match, node, measured, cov, d2)
         self._refused.clear()
         here = measured.translation()[:2]
@@ -123,10 +123,8 @@ class Estimator(Tracker):
         """Squared Mahalanobis distance (2 degrees of freedom) of a place from where the camera can be, whatever its
         heading is."""
         placed = self._placed(frame_id, self.graph.time_of(node), node)
-        spread = tangent_to_world(placed.cov, placed.pose.rotation().matrix())
-        spread = (spread + tangent_to_world(cov, measured.rotation().matrix()))[:2, :2]
-        offset = (measured.translation() - placed.pose.translation())[:2]
-        return float(offset @ np.linalg.solve(spread, offset))
+        offset, apart = _offset(placed.pose, placed.cov, measured, cov)
+        return float(offset @ np.linalg.solve(apart, offset))
 
     def _accepted(self, match: MapMatch, t_s: float, here: np.ndarray) -> None:
         self._seen.add(t_s, here)
@@ -141,11 +139,8 @@ class Estimator(Tracker):
     def _refuse(self, match: MapMatch, node: int, measured: gtsam.Pose3, cov: np.ndarray, d2: float) -> FixResult:
         """Refused, unless several fixes over new ground agree with each other: then it is the graph that is lost."""
         predicted = self.graph.state(node).pose
-        offset = (measured.translation() - predicted.translation())[:2]
-        here = predicted.translation()[:2]
-        self._refused.add(offset, here)
-        apart = tangent_to_world(self._covariance(node), predicted.rotation().matrix())
-        apart = (apart + tangent_to_world(cov, measured.rotation().matrix()))[:2, :2]
+        offset, apart = _offset(predicted, self._covariance(node), measured, cov)
+        self._refused.add(offset, predicted.translation()[:2])
         if len(self._refused.offsets_m) > 1:
             self.rival.disagreed(self._refused.offsets_m, apart)
             height = float(measured.translation()[2]) - self.terrain.ground_m
@@ -197,3 +192,11 @@ class Estimator(Tracker):
                     cov[:2, :2] += self._torn[frame]
                 result[frame] = (p_m, cov)
         return result
+
+
+def _offset(
+    pose: gtsam.Pose3, pose_cov: np.ndarray, measured: gtsam.Pose3, measured_cov: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """From one pose to another, east and north (2,), and its covariance (2, 2); theirs 6x6, tangent order."""
+    both = [tangent_to_world(cov, p.rotation().matrix()) for p, cov in ((pose, pose_cov), (measured, measured_cov))]
+    return (measured.translation() - pose.translation())[:2], (both[0] + both[1])[:2, :2]

@@ -13,10 +13,9 @@ import numpy as np
 
 from terrafix.estimator.consensus import Similarity, place
 from terrafix.estimator.fragments import Anchor, Fragment, Join, Merged, Placement
+from terrafix.estimator.gate import GATE
 from terrafix.estimator.graduated import Covariances, Doubtful, marginals, settle, solve, weighted
 
-# Chi-square, 99.9 %: of an anchor (6 degrees of freedom) and of a relocalisation (7).
-ANCHOR_LIMIT, JOIN_LIMIT = 22.46, 24.32
 # Precisions of a prior on every fragment, so wide that it says nothing and so narrow that the system stays solvable
 # when nothing else is believed: sigmas of 10 rad, 1 km, and e^3 of the unit.
 LOOSE = np.array([1e-2] * 3 + [1e-6] * 3 + [0.1])
@@ -155,7 +154,7 @@ class _Merge:
             noise = gtsam.noiseModel.Gaussian.SqrtInformation(np.sqrt(weight) * square_root, False)
             return gtsam.PriorFactorSimilarity3(key, pose, noise)
 
-        return Doubtful(factor(1.0), factor, ANCHOR_LIMIT)
+        return Doubtful(factor(1.0), factor, GATE[6])
 
     def _join_factor(self, join: Join) -> Doubtful:
         (a, i), (b, j) = join.first, join.second
@@ -174,7 +173,7 @@ class _Merge:
                 *keys, step, gtsam.noiseModel.Gaussian.Covariance(cov / weight, False)
             )
 
-        return Doubtful(factor(1.0), factor, JOIN_LIMIT)
+        return Doubtful(factor(1.0), factor, GATE[7])
 
     def _allowed(self, anchor: Anchor, values: gtsam.Values, found: Covariances) -> bool:
         """Whether an anchor agrees with the rest, given how uncertain the rest is there."""
@@ -182,7 +181,7 @@ class _Merge:
         pose = gtsam.Similarity3(anchor.r_w_c, anchor.p_c_in_w_m, 1.0)
         residual = pose.localCoordinates(values.atSimilarity3(key))[:6]
         cov = found.marginalCovariance(key)[:6, :6] + anchor.cov
-        return float(residual @ np.linalg.solve(cov, residual)) <= ANCHOR_LIMIT
+        return float(residual @ np.linalg.solve(cov, residual)) <= GATE[6]
 
     # --- the answer -----------------------------------------------------------------------------------------
 

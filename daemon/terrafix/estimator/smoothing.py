@@ -15,11 +15,11 @@ from gtsam.symbol_shorthand import B, C, M, V
 from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
 from terrafix.estimator.fixes import doubted, new_ground, torn
+from terrafix.estimator.gate import GATE
 from terrafix.estimator.graduated import Covariances, Doubtful, marginals, settle, solve, weighted
 from terrafix.estimator.pieces import placed_states
 from terrafix.estimator.whole import Fix, Retold, WholeNode
 
-LIMIT = 22.46  # chi-square, 6 degrees of freedom, 99.9 %
 ROUNDS = 4  # times that what bends is made linear anew; the last one moves a flight by millimetres
 # 1-sigma: a map is shifted, not turned, and its heights are in the covariance of each fix.
 MAP_TURN_RAD, EXACT_M = 1e-6, 0.01
@@ -138,7 +138,7 @@ class _Smoothing:
             noise = gtsam.noiseModel.Gaussian.Covariance(fix.cov / (new * weight), False)
             return gtsam.BetweenFactorPose3(*keys, fix.pose, noise)
 
-        return Doubtful(factor(1.0), factor, LIMIT * new)
+        return Doubtful(factor(1.0), factor, GATE[6] * new)
 
     def _start_factor(self, i: int) -> Doubtful:
         """A start coordinate is no witness against the map: it may have been read from that very map."""
@@ -153,7 +153,7 @@ class _Smoothing:
                 return gtsam.BetweenFactorPose3(usual[0], C(i), prior[0], noise)
             return gtsam.PriorFactorPose3(C(i), prior[0], noise)
 
-        return Doubtful(factor(1.0), factor, LIMIT)
+        return Doubtful(factor(1.0), factor, GATE[6])
 
     # --- decisions ------------------------------------------------------------------------------------------
 
@@ -192,7 +192,7 @@ class _Smoothing:
         cov = by_offset @ joint.at(shifted, shifted) @ by_offset.T + joint.at(camera, camera) + fix.cov
         across = by_offset @ joint.at(shifted, camera)
         residual = fix.pose.localCoordinates(seen)
-        return float(residual @ np.linalg.solve(cov + across + across.T, residual)) <= LIMIT
+        return float(residual @ np.linalg.solve(cov + across + across.T, residual)) <= GATE[6]
 
     # --- the answer -----------------------------------------------------------------------------------------
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.core.geodesy import local_rotation_up
+from terrafix.estimator.gate import GATE
 
 # Of the variable V_k: velocity in the world [m/s]; in axes of the heading the acceleration that nobody measured (right,
 # ahead, up) [m/s^2], and what of that is steady (right, ahead) [m/s^2].
@@ -38,9 +39,6 @@ NOISE_FLOOR_MPS2 = 0.03  # per root hertz: interpolated attitude, readings that 
 UNFELT_MPS2 = 2.0  # by how much acceleration changes within a tenth of a second
 FOREVER_S = 1e6
 STANDING_M, STANDING_MPS = 0.3, 0.1  # 1-sigma of a vehicle whose motors may not turn
-# Odometry that differs by more from where velocity leads shows what velocity did not know: a gust, a manoeuvre, a
-# picture whose time is not its own.
-LEG_GATE = 16.3  # chi-square, 3 degrees of freedom, 99.9 %
 CLOCK_JITTER_S = 0.005  # of a picture's time against the autopilot's
 POINTS = 9  # between two nodes, when nothing was measured there
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -208,8 +206,8 @@ def believed(way: Leg, off_m: np.ndarray, spread: np.ndarray, seen: np.ndarray) 
 
     Odometry ended ``off_m`` (3,) from where the leg led; ``spread`` is the leg's, ``seen`` (3, 3) that of odometry."""
     d2 = float(off_m @ np.linalg.solve(spread[:3, :3] + seen, off_m))
-    if d2 > LEG_GATE:
-        wider = (d2 / LEG_GATE - 1.0) * way.cov
+    if d2 > GATE[3]:  # what velocity did not know: a gust, a manoeuvre, a picture whose time is not its own
+        wider = (d2 / GATE[3] - 1.0) * way.cov
         way, spread = replace(way, cov=way.cov + wider), spread + wider
     gain = np.linalg.solve(spread[:3, :3] + seen, spread[:3, :]).T
     return way, spread - gain @ spread[:3, :]

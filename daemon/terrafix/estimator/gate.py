@@ -1,0 +1,3 @@
+"""How far off is too far: chi-square at 99.9 %, by degrees of freedom, for squared Mahalanobis distances."""
+
+GATE = {2: 13.82, 3: 16.27, 6: 22.46, 7: 24.32}
