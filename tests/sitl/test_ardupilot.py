@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from terrafix.messages import VehicleState
+from terrafix.recorder.reader import read_flight
+
 COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "sim", "ardupilot"]
 
 
@@ -43,3 +46,7 @@ def test_five_kilometres_on_gps_input_alone(vehicle: str, tmp_path: Path) -> Non
     assert flown["not_healthy"] == 0
     assert flown["ekf_failsafes"] == 0
     assert flown["gps_input_fix_share"] > 0.9 and flown["belief_p95_m"] < 30.0
+    # AIRSPEED comes with a sensor only: the plane has one, at 22 m/s.
+    states = [said for _, _, said in read_flight(tmp_path / "record") if isinstance(said, VehicleState)]
+    airspeeds = [state.airspeed_mps for state in states if state.airspeed_mps is not None]
+    assert (len(airspeeds) > 0.9 * len(states) and max(airspeeds) > 15.0) if vehicle == "plane" else not airspeeds
