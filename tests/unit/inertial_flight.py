@@ -141,9 +141,11 @@ def flown(
     blind: tuple[int, int] = (0, 0),
     no_imu: tuple[float, float] = (0.0, 0.0),
     airspeed: bool = False,
+    iced: float = 1.0,
     frames: int = 1000,
 ) -> Flown:
-    """``blind``: frames in which nothing is seen. ``no_imu``: seconds of which no inertial reading came."""
+    """``blind``: frames in which nothing is seen. ``no_imu``: seconds of which no inertial reading came.
+    ``iced``: share of the airspeed that the sensor reads in the blind frames."""
     node = EstimatorNode()
     cause = Health(t_ns=0, band=band, temperature_c=60.0, throttled=False, disk_free_mb=1000, cause="test")
     for message in (ORIGIN, cause):
@@ -151,8 +153,9 @@ def flown(
     last: dict[int, NavEstimate] = {}
     for i, said in enumerate(flight.said[:frames]):
         for message in _heard(said, imu, range(*blind), i, no_imu):
-            if isinstance(message, VehicleState) and not airspeed:
-                message = msgspec.structs.replace(message, airspeed_mps=None)
+            if isinstance(message, VehicleState):
+                read_mps = (message.airspeed_mps or 0.0) * (iced if i in range(*blind) else 1.0)
+                message = msgspec.structs.replace(message, airspeed_mps=read_mps if airspeed else None)
             for answer in node.on(message):
                 if isinstance(answer, NavEstimate):
                     last[answer.frame_id] = answer

@@ -8,13 +8,12 @@ import pytest
 from link_rig import MS, S
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.core.airspeed import AirspeedReader
+from terrafix.core.airspeed import UNHEALTHY, USED, AirspeedReader
 from terrafix.core.tlog import read_tlog, record
 from terrafix.link.telemetry import Telemetry
 from terrafix.link.timesync import TimeSync
 from terrafix.messages import VehicleState
 
-UNHEALTHY, USED = mavlink.AIRSPEED_SENSOR_UNHEALTHY, mavlink.AIRSPEED_SENSOR_USING
 T0_US = 1_700_000_000_000_000
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(1, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4, 3)
 VFR_HUD = mavlink.MAVLink_vfr_hud_message(31.0, 25.0, 90, 50, 100.0, 0.0)
@@ -40,6 +39,10 @@ def states(messages: list[tuple[int, Any]]) -> list[VehicleState]:
     return [state for state in said if isinstance(state, VehicleState)]
 
 
+def test_flags_are_those_of_the_dialect() -> None:
+    assert (UNHEALTHY, USED) == (mavlink.AIRSPEED_SENSOR_UNHEALTHY, mavlink.AIRSPEED_SENSOR_USING)
+
+
 def test_one_sensor_is_read_until_it_fails() -> None:
     reader = AirspeedReader()
     assert reader.take(airspeed(20.0)) == 20.0
@@ -47,6 +50,14 @@ def test_one_sensor_is_read_until_it_fails() -> None:
     assert reader.take(airspeed(20.0, flags=UNHEALTHY)) is None  # the last value that it had
     assert reader.take(airspeed(25.0, sensor=1)) == 25.0
     assert reader.take(airspeed(20.0)) is None
+
+
+def test_a_sensor_that_the_autopilot_has_given_up_is_no_sensor() -> None:
+    reader = AirspeedReader()
+    assert reader.take(airspeed(20.0, flags=0)) == 20.0  # ARSPD_USE 0: good all the same
+    assert reader.take(airspeed(20.0)) == 20.0
+    assert reader.take(airspeed(1.0, flags=0)) is None  # blocked, and healthy by its own word
+    assert reader.take(airspeed(20.0)) == 20.0
 
 
 @pytest.mark.parametrize("mps", [math.nan, math.inf, -1.0, 900.0])

@@ -123,3 +123,12 @@ def test_a_plane_that_sees_nothing_for_40_s_is_where_wind_and_airspeed_say(imu: 
     assert np.mean(sigma_m) < (0.75 if imu else 0.3) * np.mean(
         [np.linalg.norm(run.position_sigma_m[109]) for run in without]
     )
+
+
+@pytest.mark.parametrize("imu", [True, False])
+@pytest.mark.parametrize("iced", [0.4, 0.7])
+def test_a_tube_that_ices_up_in_the_cloud_leads_nobody_astray(imu: bool, iced: float) -> None:
+    flight = InertialFlight(seed=4, seconds=112)
+    run = flown(flight, imu=imu, blind=(70, 110), airspeed=True, iced=iced)
+    far = np.linalg.norm(run.position_error_m, axis=1) / np.linalg.norm(run.position_sigma_m, axis=1)
+    assert np.max(far) < 2.5

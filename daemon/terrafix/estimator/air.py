@@ -28,6 +28,7 @@ WIND_WALK, SCALE_WALK = 0.2, 5e-4  # m/s and a share, per square root of a secon
 GUSTS_LEARNT_S = 60.0
 LEARN_EVERY_S = 1.0
 TELLS_MPS = 3.0  # 1-sigma of a velocity that tells of the wind, and of one that the wind tells
+HELD = 0.25  # share by which an airspeed may change unseen: autopilots hold it, a tube that ices up does not
 DISTRUST_S = 5.0  # a sensor that contradicts what is seen for so long has changed: all is learnt anew
 
 
@@ -47,6 +48,12 @@ class Air:
 
     def velocity(self, heading_bias_rad: float) -> np.ndarray:
         return self.wind_mps + self.still_mps * _ahead(self.yaw_rad - heading_bias_rad)
+
+    def agrees_with(self, velocity_mps: np.ndarray, cov: np.ndarray, heading_bias_rad: float) -> bool:
+        """With a velocity (2,) that is known otherwise, to ``cov`` (2, 2)."""
+        off_mps = velocity_mps - self.velocity(heading_bias_rad)
+        now = self.common + self.changed + self.gust2 * np.eye(2)
+        return float(off_mps @ np.linalg.solve(now + cov, off_mps)) <= GATE[2]
 
     def cov(self, dt_s: float, unseen_s: float) -> np.ndarray:
         """(2, 2) for one of the frames that come every ``dt_s``, ``unseen_s`` after the last that was seen.
@@ -70,6 +77,7 @@ class Wind:
         self._x = np.zeros(3)  # wind east, north [m/s], logarithm of the speed through the air over what is read
         self._p = np.diag([WIND_SIGMA_MPS, WIND_SIGMA_MPS, SCALE_SIGMA]) ** 2
         self._t_s: float | None = None  # of x and P
+        self._read_mps = 0.0  # then
         self._refused_s: float | None = None  # since when what is read has contradicted what is seen
 
     def seen(
@@ -77,9 +85,9 @@ class Wind:
     ) -> None:
         """``velocity_mps`` (3,) in the world with ``cov`` (3, 3); ``read_mps`` by the sensor; ``yaw_rad``: the true
         heading."""
-        level = None if read_mps is None else _level(read_mps, velocity_mps[2])
+        level = _level(read_mps, velocity_mps[2])
         since_s = None if self._t_s is None else t_s - self._t_s
-        if level is None or np.trace(cov[:2, :2]) > 2.0 * TELLS_MPS**2:
+        if read_mps is None or level is None or np.trace(cov[:2, :2]) > 2.0 * TELLS_MPS**2:
             return
         if since_s is not None and since_s < LEARN_EVERY_S:
             return
@@ -93,7 +101,7 @@ class Wind:
             if t_s - self._refused_s > DISTRUST_S:
                 self._forget()
             return
-        self._refused_s = None
+        self._refused_s, self._read_mps = None, read_mps
         if np.trace(known + cov[:2, :2]) < 2.0 * TELLS_MPS**2:
             # What is wrong of the wind is not taken off: it was learnt from these very gusts.
             now = max(float(off @ off - np.trace(cov[:2, :2])) / 2.0, 0.0)
@@ -106,14 +114,20 @@ class Wind:
 
     def tells(self, t_s: float, read_mps: float | None, yaw_rad: float | None, up_mps: float) -> Air | None:
         """``yaw_rad`` as the autopilot says it; ``up_mps``: how fast it climbs. None: too little is known."""
-        level = None if read_mps is None else _level(read_mps, up_mps)
-        if level is None or yaw_rad is None or self._t_s is None or self._refused_s is not None:
+        level = _level(read_mps, up_mps)
+        if read_mps is None or level is None or yaw_rad is None or self._t_s is None or self._refused_s is not None:
+            return None
+        if not abs(read_mps - self._read_mps) <= HELD * self._read_mps:
             return None
         _, h = self._by_state(level, yaw_rad)
         common, changed = h @ self._p @ h.T, h @ (self._later(t_s) - self._p) @ h.T
         if np.linalg.eigvalsh(common + changed)[-1] > TELLS_MPS**2:
             return None
         return Air(level * float(np.exp(self._x[2])), yaw_rad, self._x[:2].copy(), common, changed, self._gust2)
+
+    def doubt(self, t_s: float) -> None:
+        """What is told contradicts what is known otherwise: no word more before pictures bear it out."""
+        self._refused_s = t_s
 
     def _later(self, t_s: float) -> np.ndarray:
         """P at ``t_s``."""
@@ -142,9 +156,11 @@ def air_factor(velocity_key: int, bias_key: int, air: Air, cov: np.ndarray) -> g
     return custom_factor(robust(cov), [velocity_key, bias_key], error)
 
 
-def _level(read_mps: float, up_mps: float) -> float | None:
-    """Of an airspeed, the part over the ground; None: too slow to tell."""
-    return None if read_mps < LEAST_MPS else float(np.sqrt(max(read_mps**2 - up_mps**2, 0.25 * read_mps**2)))
+def _level(read_mps: float | None, up_mps: float) -> float | None:
+    """Of an airspeed, the part over the ground; None: there is none, or it is too slow to tell."""
+    if read_mps is None or read_mps < LEAST_MPS:
+        return None
+    return float(np.sqrt(max(read_mps**2 - up_mps**2, 0.25 * read_mps**2)))
 
 
 def _ahead(heading_rad: float) -> np.ndarray:

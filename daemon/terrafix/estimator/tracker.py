@@ -280,9 +280,12 @@ class Tracker:
         """The newest node, that nobody saw, by airspeed and wind. -> whether these told anything."""
         if self._open is not None:
             return False
-        up_mps = float(self.graph.state(node).velocity[2])
-        air = self._wind.tells(t_s, attitude.airspeed_mps, attitude.yaw_rad, up_mps)
+        state = self.graph.state(node)
+        air = self._wind.tells(t_s, attitude.airspeed_mps, attitude.yaw_rad, float(state.velocity[2]))
         if air is None:
+            return False
+        if not air.agrees_with(state.velocity[:2], self.graph.velocity_covariance(node)[:2, :2], float(state.bias[2])):
+            self._wind.doubt(t_s)
             return False
         self.graph.add_air(node, air, air.cov(dt_s, t_s - self._seen_s))
         self._cov_of.pop(node, None)
