@@ -142,10 +142,12 @@ def flown(
     no_imu: tuple[float, float] = (0.0, 0.0),
     airspeed: bool = False,
     iced: float = 1.0,
+    no_camera: tuple[int, int] = (0, 0),
     frames: int = 1000,
 ) -> Flown:
     """``blind``: frames in which nothing is seen. ``no_imu``: seconds of which no inertial reading came.
-    ``iced``: share of the airspeed that the sensor reads in the blind frames."""
+    ``iced``: share of the airspeed that the sensor reads in the blind frames.
+    ``no_camera``: frames that nobody took."""
     node = EstimatorNode()
     cause = Health(t_ns=0, band=band, temperature_c=60.0, throttled=False, disk_free_mb=1000, cause="test")
     for message in (ORIGIN, cause):
@@ -156,16 +158,18 @@ def flown(
             if isinstance(message, VehicleState):
                 read_mps = (message.airspeed_mps or 0.0) * (iced if i in range(*blind) else 1.0)
                 message = msgspec.structs.replace(message, airspeed_mps=read_mps if airspeed else None)
+            if i in range(*no_camera) and isinstance(message, (Odometry, MapMatch)):
+                continue
             for answer in node.on(message):
                 if isinstance(answer, NavEstimate):
                     last[answer.frame_id] = answer
-    rows = [last[i] for i in range(len(last))]
+    rows = [last[i] for i in sorted(last)]
     place = [np.array([*PLACE.to_local(e.lat_deg, e.lon_deg)]) - flight.poses[e.frame_id][1][:2] for e in rows]
     return Flown(
         rows,
         np.array(place),
         np.sqrt(np.array([[e.cov[0], e.cov[7]] for e in rows])),
-        np.array([e.velocity_enu_mps for e in rows]) - np.array(flight.velocity_mps[: len(rows)]),
+        np.array([e.velocity_enu_mps for e in rows]) - np.array([flight.velocity_mps[e.frame_id] for e in rows]),
         np.array([e.velocity_sigma_mps for e in rows]),
     )
 

@@ -364,3 +364,14 @@ def test_after_pictures_that_showed_nothing_the_anchor_is_told_of_the_whole_way(
     assert np.hypot(*(said[end].step_m - flown_m)) < 60.0
     step_m = plane.poses[end + 1][1][:2] - plane.poses[end][1][:2]
     assert np.hypot(*(said[end + 1].step_m - step_m)) < 10.0  # and the one after it the way since this one
+
+
+def test_a_camera_that_was_away_for_40_s_is_where_inertial_readings_led() -> None:
+    """No picture came, and so no frame: all of it is one leg."""
+    far, sigma_m = [], []
+    for seed in (4, 5, 6):
+        run = flown(InertialFlight(seed=seed, seconds=113), imu=True, no_camera=(70, 110))
+        after = next(i for i, said in enumerate(run.said) if said.frame_id == 110)
+        far.append(np.linalg.norm(run.position_error_m[after]) / np.linalg.norm(run.position_sigma_m[after]))
+        sigma_m.append(run.position_sigma_m[after].max())
+    assert max(far) < 2.5 and max(sigma_m) < 150.0

@@ -10,7 +10,8 @@ from terrafix.estimator.velocity import GRAVITY_MPS2, Felt
 from terrafix.messages import Imu, VehicleState
 
 KEPT = 400  # states; 8 s at 50 Hz
-KEPT_READINGS = 2000  # 10 s at 200 Hz
+# Attitudes and readings: two minutes at 25 and 50 Hz, which a camera may be away; 30 s at 200 Hz.
+KEPT_TURNS, KEPT_READINGS = 3000, 6000
 STANDS_BELOW_M = 10.0  # what a barometer may have drifted before take-off
 MAX_GAP_NS = 1_000_000_000  # older than this against the frame says nothing about it
 MOMENT_NS = 200_000_000  # by which states may come out of order
@@ -44,7 +45,7 @@ _FIELDS = ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed", "airspeed_mps")
 class Telemetry:
     def __init__(self) -> None:
         self._states: deque[VehicleState] = deque(maxlen=KEPT)
-        self._turns = _Series(KEPT)  # yaw, pitch, roll
+        self._turns = _Series(KEPT_TURNS)  # yaw, pitch, roll
         self._forces = _Series(KEPT_READINGS)  # forward, right, down
         self._rates = _Series(KEPT_READINGS)  # about the same axes
 
