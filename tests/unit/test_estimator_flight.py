@@ -436,8 +436,8 @@ def test_the_mode_changes_with_the_next_frame_and_back() -> None:
     assert set(modes[15:25]) == {CovarianceMode.JACOBIAN}
     assert set(modes[:15] + modes[25:]) == {CovarianceMode.MARGINALS}
     calm = Listener().fly(flight, 0, 40)
-    for i in range(25, 40):  # the switch leaves no trace
-        assert sigma_m(run.estimate(i)) == pytest.approx(sigma_m(calm.estimate(i)), rel=0.02)
+    for i in range(25, 40):  # the switch leaves no trace but in how far legs seemed to be in their tail meanwhile
+        assert sigma_m(run.estimate(i)) == pytest.approx(sigma_m(calm.estimate(i)), rel=0.05)
 
 
 # --- restarts ------------------------------------------------------------------------------------------------------

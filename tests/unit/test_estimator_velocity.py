@@ -19,6 +19,7 @@ from terrafix.estimator.velocity import (
     STEADY_MPS2,
     V_SIZE,
     Felt,
+    believed,
     course_memory_s,
     leg,
     spread_after,
@@ -242,7 +243,7 @@ def test_the_factor_knows_its_own_derivatives(measured: bool, above: bool) -> No
             moved.insert(key, step)
             numeric.append((factor.unwhitenedError(values.retract(moved)) - factor.unwhitenedError(values)) / 1e-5)
     off = float(np.linalg.norm(whitened @ factor.unwhitenedError(values)))
-    numeric_w = whitened @ np.array(numeric).T * (1.0 if measured else np.sqrt(min(1.0, ROBUST_K / off)))
+    numeric_w = whitened @ np.array(numeric).T * (np.sqrt(min(1.0, ROBUST_K / off)) if above and not measured else 1.0)
     assert analytic.T @ analytic == pytest.approx(numeric_w.T @ numeric_w, rel=1e-3, abs=1e-2 * np.abs(analytic).max())
 
 
@@ -263,24 +264,40 @@ def test_a_leg_that_nobody_felt_says_nothing_of_the_height() -> None:
     assert errors[True, 0.5] != pytest.approx(errors[True, 1.0], rel=0.01)
 
 
-def test_a_leg_that_nobody_felt_gives_way() -> None:
-    """Ten sigmas off: half of a hundred if it was felt, and what Huber's tail says if that is what drones do."""
-    cost = {}
-    for measured in (False, True):
-        felt = told(6.0).felt(S, 2 * S) if measured else None
-        way = leg(1.0, felt, (1.2, 1.4), 0.0, 20.0, 0.01, same_kind=True)
-        v0 = np.array([18.0, 7.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
-        p1, v1 = way.predicted(np.zeros(3), v0, 0.0)
-        sigmas = np.linalg.cholesky(way.cov)
-        values = gtsam.Values()
-        values.insert(C(0), gtsam.Pose3())
-        values.insert(V(0), v0)
-        values.insert(C(1), gtsam.Pose3(gtsam.Rot3(), p1 + sigmas[:3, 0] * 10.0))
-        values.insert(V(1), v1 + sigmas[3:, 0] * 10.0)
-        values.insert(B(1), np.zeros(BIAS_SIZE))
-        cost[measured] = leg_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), way).error(values)
-    assert cost[True] == pytest.approx(50.0)
-    assert cost[False] == pytest.approx(ROBUST_K * (10.0 - 0.5 * ROBUST_K))
+@pytest.mark.parametrize(
+    ("measured", "above", "cost"),
+    [(True, False, 50.0), (False, False, 50.0), (False, True, ROBUST_K * (10.0 - 0.5 * ROBUST_K))],
+)
+def test_a_leg_that_nobody_felt_gives_way_to_what_is_seen(measured: bool, above: bool, cost: float) -> None:
+    """Ten sigmas off: half of a hundred if it was felt, or is all that is told; what Huber's tail says if a camera saw
+    the way."""
+    felt = told(6.0).felt(S, 2 * S) if measured else None
+    way = leg(1.0, felt, (1.2, 1.4), 0.0, 20.0, 0.01, same_kind=True)
+    v0 = np.array([18.0, 7.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    p1, v1 = way.predicted(np.zeros(3), v0, 0.0)
+    sigmas = np.linalg.cholesky(way.cov)
+    end_m = p1 + sigmas[:3, 0] * 10.0
+    values = gtsam.Values()
+    values.insert(C(0), gtsam.Pose3())
+    values.insert(V(0), v0)
+    values.insert(C(1), gtsam.Pose3(gtsam.Rot3(), end_m))
+    values.insert(V(1), v1 + sigmas[3:, 0] * 10.0)
+    values.insert(B(1), np.zeros(BIAS_SIZE))
+    if above:
+        way = way.above(100.0, -100.0)
+    factor = leg_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), way)
+    assert factor.error(values) == pytest.approx(cost)
+
+
+def test_odometry_tells_the_velocity_at_the_end_of_a_leg() -> None:
+    """Half of what the way seen says of it, where leg and odometry are known alike."""
+    way = leg(1.0, None, (1.2, 1.2), 0.0, 20.0, 0.0, same_kind=True)
+    spread = spread_after(way, unknown_cov())
+    off_m = np.array([3.0, -2.0, 0.5])
+    _, left, gained = believed(way, off_m, spread, spread[:3, :3])
+    assert gained == pytest.approx(0.5 * spread[3:, :3] @ np.linalg.solve(spread[:3, :3], off_m))
+    assert left[:3, :3] == pytest.approx(0.5 * spread[:3, :3])
+    assert np.linalg.norm(gained[:3]) > 0.4 * np.linalg.norm(off_m)
 
 
 # --- in flight ----------------------------------------------------------------------------------------------------
@@ -296,7 +313,7 @@ def plane() -> InertialFlight:
     [
         (True, ThermalBand.NORMAL, 0.45, 0.8),
         (True, ThermalBand.HOT, 0.6, 1.2),
-        (False, ThermalBand.NORMAL, 1.0, 2.0),
+        (False, ThermalBand.NORMAL, 1.0, 1.7),
         (False, ThermalBand.HOT, 1.3, 2.6),
     ],
 )
@@ -323,6 +340,7 @@ def test_inertial_readings_carry_a_blind_vehicle(plane: InertialFlight) -> None:
     at = blind[1] - 1
     assert with_imu.position_sigma_m[at].max() < 90.0 and np.abs(with_imu.position_error_m[at]).max() < 70.0
     assert without.position_sigma_m[at].min() > 2.0 * with_imu.position_sigma_m[at].max()
+    assert without.position_sigma_m[blind[0] + 2].max() < 18.0  # what drones do, and no tail that nothing called for
     assert (np.abs(with_imu.position_error_m[-1]) < 10.0).all()  # the next fix finds it where it is
 
 

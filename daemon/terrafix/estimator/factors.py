@@ -278,6 +278,8 @@ def leg_factor(
 
     What drones do, where nobody felt it, has a tail: they cruise for minutes and then brake as hard as they can. A leg
     that is taken for Gaussian holds on to the cruise, and what gives way is the height, in which the camera sees it.
+    GTSAM weighs it where it is linear, before anything is solved: a velocity there that does not go with the way counts
+    like a manoeuvre. Where no camera saw the way (``Leg.over``) a leg has no tail: nothing else would have to give way.
 
     Linear but for the heading, the axes of the poses, and the height that a leg is told in (``Leg.over``)."""
     rows = 3 + V_SIZE
@@ -329,6 +331,7 @@ def leg_factor(
                 jacobians[i] = np.asfortranarray(jacobian)
         return residual
 
-    noise = gtsam.noiseModel.Gaussian.Covariance(leg.cov, False) if leg.inertial else robust(leg.cov)
+    has_tail = not leg.inertial and leg.over is not None
+    noise = robust(leg.cov) if has_tail else gtsam.noiseModel.Gaussian.Covariance(leg.cov, False)
     keys = [*before, *after, bias_keys[1]]
     return custom_factor(noise, [*keys, bias_keys[0]] if leg.lifted else keys, error)

@@ -200,7 +200,8 @@ class Tracker:
                 aside_m2 = max(aside_m2 - way_m2 * stretch2, 0.0) + float(step @ step) * stretch2
             step_sigma = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step), np.sqrt(aside_m2)))
             if way is not None:
-                way, spread = believed(way, p - led_to, spread, seen)
+                way, spread, gained = believed(way, p - led_to, spread, seen)
+                velocity = velocity + gained  # or a leg that is right would seem to be in its tail (factors.py)
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
         state = NodeState(pose, before.bias, velocity)

@@ -201,8 +201,9 @@ def spread_after(way: Leg | None, velocity_cov: np.ndarray) -> np.ndarray:
     return np.asarray(by_before @ velocity_cov @ by_before.T + way.cov)
 
 
-def believed(way: Leg, off_m: np.ndarray, spread: np.ndarray, seen: np.ndarray) -> tuple[Leg, np.ndarray]:
-    """The leg as far as odometry bears it out, and the covariance (11, 11) that both together leave.
+def believed(way: Leg, off_m: np.ndarray, spread: np.ndarray, seen: np.ndarray) -> tuple[Leg, np.ndarray, np.ndarray]:
+    """The leg as far as odometry bears it out, the covariance (11, 11) that both together leave, and by how much V (8,)
+    at its end is then other than the leg led to.
 
     Odometry ended ``off_m`` (3,) from where the leg led; ``spread`` is the leg's, ``seen`` (3, 3) that of odometry."""
     d2 = float(off_m @ np.linalg.solve(spread[:3, :3] + seen, off_m))
@@ -210,7 +211,7 @@ def believed(way: Leg, off_m: np.ndarray, spread: np.ndarray, seen: np.ndarray) 
         wider = (d2 / GATE[3] - 1.0) * way.cov
         way, spread = replace(way, cov=way.cov + wider), spread + wider
     gain = np.linalg.solve(spread[:3, :3] + seen, spread[:3, :]).T
-    return way, spread - gain @ spread[:3, :]
+    return way, spread - gain @ spread[:3, :], (gain @ off_m)[3:]
 
 
 def with_velocity(spread: np.ndarray, velocity_cov: np.ndarray) -> np.ndarray:
