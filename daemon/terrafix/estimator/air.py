@@ -27,7 +27,8 @@ LEAST_GUST_MPS = 0.5
 WIND_WALK, SCALE_WALK = 0.2, 5e-4  # m/s and a share, per square root of a second
 GUSTS_LEARNT_S = 60.0
 LEARN_EVERY_S = 1.0
-TELLS_MPS = 3.0  # 1-sigma of a velocity that tells of the wind, and of one that the wind tells
+LEARNS_FROM_MPS = 3.0  # 1-sigma of a velocity that tells of the wind, and of a wind that tells of gusts
+TELLS_MPS = 8.0  # ... and of one that the wind tells: after a straight leg it knows little of the way back
 HELD = 0.25  # share by which an airspeed may change unseen: autopilots hold it, a tube that ices up does not
 DISTRUST_S = 5.0  # a sensor that contradicts what is seen for so long has changed: all is learnt anew
 
@@ -87,7 +88,7 @@ class Wind:
         heading."""
         level = _level(read_mps, velocity_mps[2])
         since_s = None if self._t_s is None else t_s - self._t_s
-        if read_mps is None or level is None or np.trace(cov[:2, :2]) > 2.0 * TELLS_MPS**2:
+        if read_mps is None or level is None or np.trace(cov[:2, :2]) > 2.0 * LEARNS_FROM_MPS**2:
             return
         if since_s is not None and since_s < LEARN_EVERY_S:
             return
@@ -102,7 +103,7 @@ class Wind:
                 self._forget()
             return
         self._refused_s, self._read_mps = None, read_mps
-        if np.trace(known + cov[:2, :2]) < 2.0 * TELLS_MPS**2:
+        if np.trace(known + cov[:2, :2]) < 2.0 * LEARNS_FROM_MPS**2:
             # What is wrong of the wind is not taken off: it was learnt from these very gusts.
             now = max(float(off @ off - np.trace(cov[:2, :2])) / 2.0, 0.0)
             share = -np.expm1(-min(dt_s, GUST_S) / GUSTS_LEARNT_S)

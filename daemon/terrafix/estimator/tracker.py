@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.pose import tangent_to_world, world_to_tangent
-from terrafix.estimator.air import Wind
+from terrafix.estimator.air import Air, Wind
 from terrafix.estimator.beginning import Beginning, Slow, TakeOff
 from terrafix.estimator.coasted import Coast, Coasts
 from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS_SIGMA, SCALE
@@ -163,7 +163,7 @@ class Tracker:
         verdict, known = (answer, None) if isinstance(answer, Verdict) else (Verdict.ACCEPTED, answer)
         if attitude.stands:
             self._take_off.stood()
-        way = None if attitude.stands else self._leg(t_s, before, attitude, felt)
+        way = None if attitude.stands else self._leg(t_s, before, attitude, felt, seen=known is not None)
         spread = spread_after(way, self._velocity_cov)
         led_to, velocity = before.pose.translation(), np.zeros(V_SIZE)
         if way is not None:
@@ -234,7 +234,7 @@ class Tracker:
             self._learn_wind(self._last, attitude)
         return Advance(verdict, self._last, step, step_sigma)
 
-    def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Leg:
+    def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel, *, seen: bool) -> Leg:
         """From the newest node to now."""
         from_s = self.graph.time_of(self.graph.newest)
         measured = felt(round(from_s * 1e9), round(t_s * 1e9))
@@ -249,6 +249,7 @@ class Tracker:
             float(np.hypot(np.radians(self.origin.attitude_sigma_deg), attitude.righted_rad)),
             same_kind=self._felt is (measured is not None),
             launching=self._take_off.launching,
+            course_told=not seen and self._blown(t_s, before, attitude) is not None,
         )
 
     def coasted(self, coast: Coast) -> None:
@@ -277,12 +278,15 @@ class Tracker:
         yaw_rad = attitude.yaw_rad - float(self.graph.state(seen.node).bias[2])
         self._wind.seen(seen.t_s, seen.velocity_mps, seen.velocity_cov, attitude.airspeed_mps, yaw_rad)
 
+    def _blown(self, t_s: float, state: NodeState, attitude: Attitude) -> Air | None:
+        if self._open is not None:
+            return None
+        return self._wind.tells(t_s, attitude.airspeed_mps, attitude.yaw_rad, float(state.velocity[2]))
+
     def _be_blown(self, node: int, t_s: float, dt_s: float, attitude: Attitude) -> bool:
         """The newest node, that nobody saw, by airspeed and wind. -> whether these told anything."""
-        if self._open is not None:
-            return False
         state = self.graph.state(node)
-        air = self._wind.tells(t_s, attitude.airspeed_mps, attitude.yaw_rad, float(state.velocity[2]))
+        air = self._blown(t_s, state, attitude)
         if air is None:
             return False
         if not air.agrees_with(state.velocity[:2], self.graph.velocity_covariance(node)[:2, :2], float(state.bias[2])):

@@ -142,10 +142,13 @@ def leg(
     tilt_sigma_rad: float,
     same_kind: bool,
     launching: bool = False,
+    course_told: bool = False,
 ) -> Leg:
     """``yaws_rad``: true headings at both ends, used when nothing was felt. ``same_kind``: the leg before was measured,
-    or not, like this one; else its acceleration says nothing about this one's."""
+    or not, like this one; else its acceleration says nothing about this one's. ``course_told``: by something else."""
     memory_s, course_s = (MANOEUVRE_S, course_memory_s(speed_mps)) if felt is None else (TILT_S, FOREVER_S)
+    if course_told:
+        course_s = FOREVER_S
     turn_radps = 0.0
     if felt is None:
         s = np.linspace(0.0, dt_s, POINTS)
