@@ -13,6 +13,7 @@ from terrafix.estimator.coasted import Coast
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.resume import Keeper, Known, Last, kept
 from terrafix.estimator.righted import Righted
+from terrafix.estimator.stand_in import StandIn
 from terrafix.estimator.telemetry import Telemetry
 from terrafix.estimator.tracker import Advance, Placed
 from terrafix.messages import (
@@ -62,6 +63,7 @@ class EstimatorNode:
         self._tracked = True
         self._said_slow_ns = 0
         self._waiting: list[Odometry] = []  # for the autopilot's words, to which belongs what was learnt
+        self._stand_in: StandIn | None = None  # for a keyframe that was left out
         self._predicted: int | None = None  # frame of the newest Prediction ...
         self._from_m = np.zeros(2)  # ... and where it was, with its map match
 
@@ -144,12 +146,13 @@ class EstimatorNode:
             known = [one.yaw_rad is not None and one.agl_m is not None for one in said]
             if any(known):
                 older, self._waiting = self._waiting[: known.index(True)], self._waiting[known.index(True) :]
+                self._stand_in = StandIn.of(self._waiting[0], older)
                 yield from (_odometry_verdict(odometry, Verdict.STALE, BEFORE_WORDS) for odometry in older)
             elif self._waiting[-1].t_ns - self._waiting[0].t_ns < WORDS_WAIT_NS:
                 return
         waiting, self._waiting = self._waiting, []
         for odometry in waiting:
-            yield from self._on_odometry(odometry)
+            yield from self._on_odometry(self._stand_in.instead(odometry) if self._stand_in else odometry)
 
     def _on_odometry(self, odometry: Odometry) -> Iterable[Message]:
         estimator = self._estimator
