@@ -127,6 +127,17 @@ def test_calm_makes_the_first_word_quick_again() -> None:
     assert announcer.due(8, 18 * S + CALM_NS + 5 * S)
 
 
+def test_that_it_is_well_again_is_told_after_five_seconds_whatever_was_said_before() -> None:
+    announcer, now_ns = Announcer[int](), 0
+    announcer.told = 0
+    for rung in (1, 2, 3, 1, 2, 3):
+        now_ns += 15 * S
+        assert announcer.due(rung, now_ns, urgent=True)
+    assert not announcer.due(0, now_ns + 4 * S, clears=True)
+    assert announcer.due(0, now_ns + 5 * S, clears=True)
+    assert not announcer.due(1, now_ns + 10 * S)  # ... and the next bad word that is not urgent waits
+
+
 def test_named_values_once_a_second_and_only_to_an_autopilot() -> None:
     wire = MemoryWire()
     edge = MavlinkEdge(LinkSection(), wire, lambda: 0)

@@ -16,12 +16,13 @@ class Announcer(Generic[State]):
         self._told_ns: int | None = None
         self._wait_ns = FIRST_NS
 
-    def due(self, state: State, now_ns: int, *, urgent: bool = False) -> bool:
-        """Whether to say ``state`` now; then it counts as said. ``urgent``: it is new, whatever was said last."""
+    def due(self, state: State, now_ns: int, *, urgent: bool = False, clears: bool = False) -> bool:
+        """Whether to say ``state`` now; then it counts as said. ``urgent``: it is new, whatever was said last.
+        ``clears``: it takes a bad word back, which nobody should go on believing for a minute."""
         if state == self.told and not urgent:
             return False
         since_ns = None if self._told_ns is None else now_ns - self._told_ns
-        if since_ns is not None and since_ns < self._wait_ns and not urgent:
+        if since_ns is not None and since_ns < (FIRST_NS if clears else self._wait_ns) and not urgent:
             return False
         calm = since_ns is None or since_ns >= CALM_NS
         self._wait_ns = FIRST_NS if calm else min(LONGEST_NS, 2 * self._wait_ns)

@@ -35,5 +35,5 @@ class FilterWatch:
         uses = bool(status.flags & mavlink.EKF_POS_HORIZ_ABS) and not status.flags & WITHOUT
         if not uses and now_ns - self._good_since_ns < USED_AFTER_NS:
             return
-        if self._said.due(uses, now_ns):
+        if self._said.due(uses, now_ns, clears=uses):
             yield uses, "autopilot uses a position again" if uses else "autopilot does not use the position"

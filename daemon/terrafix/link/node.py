@@ -192,7 +192,7 @@ class LinkNode:
             yield words(now_ns, WARNING, "started in flight, searching the map")
         for uses, text in self._filter.look(now_ns, good=good):
             yield words(now_ns, INFO if uses else WARNING, text)
-        if self._said_fix.due(good, now_ns):
+        if self._said_fix.due(good, now_ns, clears=good):
             because = self._no_fix_because
             yield (
                 words(now_ns, INFO, "3D fix") if because is None else words(now_ns, WARNING, f"no fix: {because.short}")
@@ -209,7 +209,7 @@ class LinkNode:
             self._climbed = self._rung
         elif self._rung == 0:
             self._climbed = 0
-            if self._said_rung.due(0, now_ns):
+            if self._said_rung.due(0, now_ns, clears=True):
                 yield words(now_ns, INFO, "map fix again")
 
     def _unanchored_s(self, now_ns: int) -> float | None:
