@@ -11,7 +11,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.estimator.coasted import Coast
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.resume import Keeper, Last, kept
-from terrafix.estimator.velocity import GRAVITY_MPS2, TILT_S
+from terrafix.estimator.velocity import GRAVITY_MPS2, TILT_S, WANDERING_SHARE
 from terrafix.messages import Coasted, Odometry, Prediction
 
 KILLED, BACK = 61, 73  # frames: six seconds
@@ -115,7 +115,7 @@ def test_claims_hold_for_a_tilt_that_is_off_as_it_is_said_to_be(coast_s: float) 
         keep = math.exp(-step_s / TILT_S)
         for i in range(1, n):
             drift[i] = keep * drift[i - 1] + math.sqrt(1.0 - keep**2) * rng.normal(0.0, 1.0, 2)
-        wrong = GRAVITY_MPS2 * tilt_rad * math.sqrt(0.5) * drift
+        wrong = GRAVITY_MPS2 * tilt_rad * math.sqrt(WANDERING_SHARE) * drift
         gain = np.cumsum(wrong, axis=0) * step_s
         way = gain.sum(axis=0) * step_s
         v0_off, p0_off = rng.normal(0.0, 0.4, 2), rng.normal(0.0, 4.0, 2)

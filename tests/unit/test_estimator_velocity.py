@@ -18,6 +18,7 @@ from terrafix.estimator.velocity import (
     MANOEUVRE_S,
     STEADY_MPS2,
     V_SIZE,
+    WANDERING_SHARE,
     Felt,
     believed,
     course_memory_s,
@@ -149,7 +150,7 @@ def test_the_covariance_of_a_leg_is_that_of_sampled_motion(measured: bool) -> No
     felt = Felt(t, np.zeros((steps + 1, 3)), 0.4 + turn * t, 0.1) if measured else None
     way = leg(dt, felt, (0.4, 0.4 + turn * dt), 0.0, 20.0, 0.02, same_kind=True)
     memory, course = (15.0, 1e6) if measured else (MANOEUVRE_S, course_memory_s(20.0))
-    sigma = G * 0.02 * math.sqrt(0.5) if measured else 1.6  # the other half of the tilt is steady
+    sigma = G * 0.02 * math.sqrt(WANDERING_SHARE) if measured else 1.6  # the rest of the tilt is steady
     h = dt / steps
     a, v, p = (np.zeros((runs, 2)) for _ in range(3))
     for i in range(steps):

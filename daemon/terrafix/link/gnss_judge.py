@@ -120,7 +120,7 @@ class ReceiverJudge:
         bad = self.opinion.state in (GnssState.SPOOFED, GnssState.DISPUTED)
         claimed = offset.along_sigma_m, offset.slip_m, offset.slip_sigma_m
         chance, off_m = self._forecast.take(offset.metres, *claimed, dt_s, learn=not bad)
-        if off_m is not None and not bad and own_step_m > DISPUTE_SHARE * off_m and chance < DRAG_CHANCE:
+        if off_m is not None and not bad and own_step_m > DISPUTE_SHARE * off_m and chance < AGREE_CHANCE:
             self._forecast, chance = OffsetForecast(), 1.0  # it was we who moved: what is usual has to be learnt anew
         away_m = abs(offset.metres)
         self._jumped.take(offset.sigmas > JUMP_SIGMAS, dt_s)
