@@ -35,10 +35,10 @@ DISTRUST_S = 5.0  # a sensor that contradicts what is seen for so long has chang
 
 @dataclass(frozen=True)
 class Air:
-    """The velocity (2,) east and north [m/s] that is told through the air: ``still`` in calm air along the true heading
-    of 0 rad, ``yaw_rad`` of the autopilot, and the wind. Its covariance: ``common`` (2, 2) of what was wrong of it when
-    pictures told it last, ``changed`` (2, 2) of what has changed since, ``gust2`` (each axis) of what is forgotten in
-    GUST_S."""
+    """The velocity (2,) east and north [m/s] that is told through the air: ``still_mps`` is the speed over ground that
+    it would have in calm air, along the heading, ``yaw_rad`` by the autopilot; and the wind. Its covariance: ``common``
+    (2, 2) of what was wrong of it when pictures told it last, ``changed`` (2, 2) of what has changed since, ``gust2``
+    (each axis) of what is forgotten in GUST_S."""
 
     still_mps: float
     yaw_rad: float

@@ -32,8 +32,7 @@ OPTIONAL = {  # not there without a second receiver; not on PX4; not without a s
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
     mavlink.MAVLINK_MSG_ID_AIRSPEED,
 }
-# ArduPilot before 4.6 refuses it, and tells its pilot so each time that it is asked: so often it is, unless it has come
-# before.
+# How often what has never come is asked for: ArduPilot before 4.6 refuses it, and tells its pilot so each time.
 UNKNOWN_TO_MANY = {mavlink.MAVLINK_MSG_ID_AIRSPEED: 2}
 GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_ parameters)
     mavlink.MAVLINK_MSG_ID_ATTITUDE: mavlink.MAV_DATA_STREAM_EXTRA1,
