@@ -8,11 +8,11 @@ import pytest
 from simulated_flight import ORIGIN, PLACE, Flight, Listener, blind, error_m, sigma_m, t_ns
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix.estimator.coasted import Coast
+from terrafix.estimator.coasted import BEFORE_S, Coast
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.resume import Keeper, Last, kept
 from terrafix.estimator.velocity import GRAVITY_MPS2, TILT_S, WANDERING_SHARE
-from terrafix.messages import Coasted, Odometry, Prediction
+from terrafix.messages import Coasted, NavEstimate, Odometry, Prediction
 
 KILLED, BACK = 61, 73  # frames: six seconds
 LINK_LETS_MPS = 1.45  # velocity sigma at which the link begins to send a fix
@@ -56,7 +56,7 @@ def coasted(flight: Flight, off_m: tuple[float, float] = (0.0, 0.0)) -> Coasted:
     )
 
 
-def resumed(flight: Flight, last: Last | None, said: Coasted | None) -> Listener:
+def resumed(flight: Flight, last: Last | None, said: Coasted | None, *, heard_first: bool = True) -> Listener:
     run = Listener()
     run.node = EstimatorNode(0, last)
     run.hear([ORIGIN])
@@ -64,7 +64,8 @@ def resumed(flight: Flight, last: Last | None, said: Coasted | None) -> Listener
         messages = flight.messages(i)
         if i == BACK:
             messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
-            messages = messages if said is None else [said, *messages]
+            if said is not None:
+                messages = [said, *messages] if heard_first else [*messages, said]
         run.hear(messages)
     return run
 
@@ -81,13 +82,59 @@ def test_it_knows_place_and_velocity_with_the_first_picture(flight: Flight, kill
 
 def test_it_is_said_in_time_for_the_second_picture(flight: Flight, killed: Last) -> None:
     """The anchor, whose belief was as wide as the first one's place, is told to begin where this one is."""
-    late = msgspec.structs.replace(coasted(flight), t_ns=t_ns(BACK) + 1)
+    late = msgspec.structs.replace(coasted(flight), t_ns=t_ns(BACK) + round(BEFORE_S * 1e9) + 1)
     run = resumed(flight, killed, late)
     assert sigma_m(run.estimate(BACK)) > 15.0
     assert sigma_m(run.estimate(BACK + 1)) < 7.0
     first, second, third = [m for m in run.said if isinstance(m, Prediction)][:3]
     assert first.start_ns == 0 and second.start_ns == third.start_ns == second.t_ns
     assert second.cov[0] < 0.2 * first.cov[0]
+
+
+@pytest.mark.parametrize("heard_first", [True, False])
+def test_a_picture_that_was_taken_a_moment_before_waits_for_no_other(
+    flight: Flight, killed: Last, heard_first: bool
+) -> None:
+    moment_s = 0.2
+    said = coasted(flight)
+    way_m = (np.array(said.velocity_enu_mps) + said.gain_mps)[:2] * moment_s
+    late = msgspec.structs.replace(
+        said,
+        t_ns=said.t_ns + round(moment_s * 1e9),
+        coast_s=said.coast_s + moment_s,
+        way_m=tuple(np.add(said.way_m, way_m - np.array(said.velocity_enu_mps[:2]) * moment_s)),
+    )
+    run = resumed(flight, killed, late, heard_first=heard_first)
+    first = [m for m in run.said if isinstance(m, NavEstimate) and m.frame_id == BACK][-1]
+    assert first.t_ns == t_ns(BACK)
+    assert sigma_m(first) < 7.0 and first.velocity_sigma_mps < LINK_LETS_MPS
+    assert np.linalg.norm(error_m(first, flight)[:2]) < 3.0 * sigma_m(first)
+    off_mps = np.array(first.velocity_enu_mps) - velocity(flight, BACK)
+    assert np.linalg.norm(off_mps) < 3.0 * first.velocity_sigma_mps
+
+
+def test_backwards_and_forwards_a_coast_ends_where_it_began() -> None:
+    """As sure of it as the velocity is known: what was wrong of it is wrong of the way back, too."""
+    frame = LocalFrame(48.0, 11.0)
+    lat_deg, lon_deg = frame.to_wgs84(0.0, 0.0)
+    said = Coasted(
+        t_ns=2_000_000_000,
+        coast_s=2.0,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        velocity_enu_mps=(20.0, 0.0, 0.0),
+        position_sigma_m=4.0,
+        velocity_sigma_mps=2.0,
+        way_m=(0.0, 0.0),
+        gain_mps=(0.0, 0.0, 0.0),
+    )
+    coast = Coast.of(said, frame)
+    tilts_rad = (math.radians(0.7), math.radians(0.7))
+    back, end, on = (coast.until(2.0 + s, None, 0.3, 0.0, tilts_rad) for s in (-0.25, 0.0, 0.25))
+    assert np.allclose([back.at_m[0], end.at_m[0], on.at_m[0]], [35.0, 40.0, 45.0], atol=0.3)
+    assert np.allclose(back.velocity_mps, on.velocity_mps, atol=0.5)
+    sigmas = [float(np.sqrt(c.cov_m2[0, 0])) for c in (back, end, on)]
+    assert sigmas[0] < sigmas[1] < sigmas[2] and sigmas[0] == pytest.approx(np.hypot(4.0, 2.0 * 1.75), rel=0.1)
 
 
 def test_a_filter_that_jumped_is_not_believed(flight: Flight, killed: Last) -> None:

@@ -1,8 +1,9 @@
 """What the covariance leaves to the other place, while map matches and graph disagree and after the graph went over."""
 
 import numpy as np
+import pytest
 
-from terrafix.estimator.rival import FORGET_OVER, Rival
+from terrafix.estimator.rival import EVEN, FORGET_OVER, REACHED, Rival
 
 FROM_MAP = np.diag([4.0, 4.0, 9.0, 1e-4, 1e-4, 1e-4])
 APART = np.diag([16.0, 25.0])  # what estimate and match together do not know of the offset
@@ -14,13 +15,13 @@ def mahalanobis2(cov: np.ndarray, error_m: np.ndarray) -> float:
 
 def test_one_refused_match_is_a_mistake_and_changes_nothing() -> None:
     rival = Rival()
-    rival.disagreed([np.array([350.0, 0.0])], APART)
+    rival.disagreed([np.array([350.0, 0.0])], APART, fixed=True)
     assert np.array_equal(rival.added(FROM_MAP), FROM_MAP)
 
 
 def test_two_that_agree_bring_the_other_place_into_the_ellipse_and_nothing_else() -> None:
     rival, offset = Rival(), np.array([60.0, -30.0])
-    rival.disagreed([offset + 1.0, offset - 1.0], APART)
+    rival.disagreed([offset + 1.0, offset - 1.0], APART, fixed=True)
     cov = rival.added(FROM_MAP)
     assert mahalanobis2(cov, offset) < 5.991
     across = np.array([30.0, 60.0])
@@ -52,3 +53,34 @@ def test_the_other_place_is_known_as_well_as_estimate_and_match_were() -> None:
     sure.left(offset, 0.0 * APART)
     sure.fade(0.5 * FORGET_OVER)
     assert mahalanobis2(sure.added(FROM_MAP), aside) > 9.0
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+def test_a_place_that_the_map_told_before_and_after_is_wrong_only_if_two_patterns_repeat(fixed: bool) -> None:
+    """Rows of fields lead a flight 60 m away, and where they end it returns. A start coordinate is not the map."""
+    rival, offset = Rival(), np.array([60.0, 0.0])
+    for away in (offset, -offset + 4.0):
+        rival.disagreed([away, away], APART, fixed=fixed)
+        assert rival.probability == pytest.approx(EVEN)
+        rival.left(away, APART)
+    rival.fade(0.0)
+    assert rival.probability == pytest.approx(EVEN**2 if fixed else EVEN)
+    rival.fade(2.0 * FORGET_OVER)
+    assert (rival.probability == 0.0) == fixed
+
+
+def test_a_place_to_which_the_flight_was_led_has_the_map_on_one_side_only() -> None:
+    rival, offset = Rival(), np.array([60.0, 0.0])
+    rival.disagreed([offset, offset], APART, fixed=True)
+    rival.left(offset, APART)
+    rival.fade(0.0)
+    assert rival.probability == pytest.approx(EVEN)
+
+
+def test_an_ellipse_that_does_not_reach_the_other_place_is_not_as_wide_as_that_is_unknown() -> None:
+    rival, offset = Rival(), np.array([60.0, 0.0])
+    rival.left(offset, APART)
+    rival.fade(FORGET_OVER * np.log(EVEN / REACHED))
+    assert rival.spread_m2()[1, 1] == pytest.approx(APART[1, 1])
+    rival.fade(FORGET_OVER * np.log(2.0))
+    assert rival.spread_m2()[1, 1] == pytest.approx(APART[1, 1] / 2.0)

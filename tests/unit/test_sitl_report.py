@@ -24,7 +24,16 @@ from terrafix_tools.sim.sitl.observer import (
     between,
     take,
 )
-from terrafix_tools.sim.sitl.report import Times, figures, verdicts, write_report, write_texts, write_truth
+from terrafix_tools.sim.sitl.report import (
+    Figures,
+    Kill,
+    Times,
+    figures,
+    verdicts,
+    write_report,
+    write_texts,
+    write_truth,
+)
 
 EAST_DEG_PER_M = 1.0 / (111_319.49 * math.cos(math.radians(48.0)))  # WGS84's equatorial radius: good to 0.5 %
 LAT_DEG, LON_DEG, HOME_AMSL_M = 48.0, 14.0, 320.0
@@ -90,6 +99,26 @@ def test_each_failure_is_seen() -> None:
     aloft = good_flight()
     aloft.truth = [one for one in aloft.truth if one.t_ns < 360 * S]
     assert failing(aloft, replace(TIMES, landed_ns=None)) == {"landed", "landing within 30 m"}
+
+
+def test_every_restart_is_timed_and_the_slowest_one_counts() -> None:
+    def flown_with(*back_s: float | None) -> tuple[Figures, bool]:
+        notes, kills = good_flight(), []
+        for at_s, after_s in zip((100, 140, 180), back_s, strict=False):
+            until_s = 20.0 if after_s is None else 5.0 + after_s
+            gone = [(t_ns, fix) for t_ns, fix in notes.fix_types[1] if at_s * S + 4 * S <= t_ns < (at_s + until_s) * S]
+            for t_ns, fix in gone:
+                notes.fix_types[1][notes.fix_types[1].index((t_ns, fix))] = (t_ns, 1)
+            back_ns = None if after_s is None else round((at_s + 5.0 + after_s) * S)
+            kills.append(Kill(at_s * S, (at_s + 5) * S, back_ns))
+        flown = figures(notes, replace(TIMES, kills=tuple(kills)), landing())
+        return flown, verdicts(flown, 5000.0)["3D fix again within 2 s of each restart"]
+
+    flown, quick = flown_with(1.0, 1.5)
+    assert flown.back_s == pytest.approx([1.0, 1.5]) and flown.seen_lost_s == pytest.approx([4.0, 4.0]) and quick
+    assert flown_with(1.0, 2.5, 1.0)[1] is False
+    never, quick = flown_with(1.0, None)
+    assert never.back_s == [1.0, None] and not quick
 
 
 def test_what_was_before_arming_or_before_the_loss_does_not_count() -> None:

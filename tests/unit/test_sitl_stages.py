@@ -51,6 +51,9 @@ class Daemon:
     def start(self) -> None:
         self.started += 1
 
+    def kill(self) -> None:
+        self.started -= 1
+
     def check(self) -> None:
         """It runs."""
 
@@ -134,6 +137,31 @@ def test_a_receiver_that_stays_on_ends_the_flight() -> None:
     stages, _, _ = made(notes, Station(known=()))
     with pytest.raises(NotFlown, match="the loss of the GNSS did not come"):
         stages.lose_gnss()
+
+
+def test_kills_follow_each_other_and_each_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sitl_stages, "KILL_AFTER_S", 0.01)
+    monkeypatch.setattr(sitl_stages, "DOWN_S", 0.01)
+    monkeypatch.setattr(sitl_stages, "BACK_S", 0.05)
+    notes = flying()
+    stages, _, daemon = made(notes)
+    start = daemon.start
+
+    def back() -> None:
+        start()
+        notes.fix_types[1].append((time.monotonic_ns() + 30_000_000, 3))
+
+    daemon.start = back  # type: ignore[method-assign]
+    stages.kill_terrafix()
+    stages.kill_terrafix()
+    first, second = stages.times.kills
+    assert first.back_ns is not None and second.back_ns is not None
+    assert first.killed_ns < first.restarted_ns < first.back_ns <= second.back_ns
+    daemon.start = start  # type: ignore[method-assign]
+    time.sleep(0.05)
+    with pytest.raises(NotFlown, match="a 3D fix after the restart did not come"):
+        stages.kill_terrafix()
+    assert [kill.back_ns is None for kill in stages.times.kills] == [False, False, True]
 
 
 def test_it_has_landed_when_it_disarmed() -> None:

@@ -13,6 +13,8 @@ from terrafix.estimator.gate import GATE
 from terrafix.estimator.velocity import STEADY_MPS2, V_SIZE, Felt, leg, spread_after, unknown_cov
 from terrafix.messages import Coasted
 
+BEFORE_S = 0.3  # by which a picture may be older than what leads it there: filters tell of themselves 3 times a second
+
 
 @dataclass(frozen=True)
 class Carried:
@@ -44,7 +46,8 @@ class Coast:
     def until(
         self, t_s: float, felt: Felt | None, yaw_rad: float, heading_bias_rad: float, sigmas_rad: tuple[float, float]
     ) -> Carried:
-        """``felt``: since its end. ``sigmas_rad``: of the attitude's tilt, in it and since."""
+        """``felt``: between its end and ``t_s``, which may be before it. ``sigmas_rad``: of the attitude's tilt, in it
+        and since."""
         said, yaws = self.said, (yaw_rad, yaw_rad)
         before = np.zeros(V_SIZE)
         before[:3] = said.velocity_enu_mps
@@ -58,16 +61,22 @@ class Coast:
         spread = spread_after(coast, cov)
         p, v = coast.predicted(np.array([*self.at_m, 0.0]), before, heading_bias_rad)
         spread[9:, 9:] = STEADY_MPS2**2 * np.eye(2)
-        since = leg(max(t_s - self.t_s, 1e-3), felt, yaws, heading_bias_rad, speed_mps, sigmas_rad[1], same_kind=False)
-        p, v = since.predicted(p, v, heading_bias_rad)
+        dt_s = max(abs(t_s - self.t_s), 1e-3)
+        since = leg(dt_s, felt, yaws, heading_bias_rad, speed_mps, sigmas_rad[1], same_kind=False)
         after = spread_after(since, spread[3:, 3:])
         both = since.reach_s * spread[:2, 3:5]  # what was wrong of the velocity by then goes on
+        if t_s >= self.t_s:
+            p, v = since.predicted(p, v, heading_bias_rad)
+        else:
+            way_m, gain = since.predicted(np.zeros(3), np.zeros(V_SIZE), heading_bias_rad)
+            v = v - gain
+            p, both = p - way_m - since.reach_s * v[:3], -both
         way_cov = spread[:2, :2] + both + both.T + after[:2, :2]
         return Carried(p[:2], said.position_sigma_m**2 * np.eye(2) + way_cov, v[:3], after[3:6, 3:6])
 
 
 class Coasts:
-    """What was said of it until the first picture that was taken since."""
+    """What was said of it until the first picture that it leads."""
 
     def __init__(self) -> None:
         self._said: list[Coast] | None = []
@@ -77,9 +86,11 @@ class Coasts:
             self._said.append(coast)
 
     def taken(self, t_s: float) -> Coast | None:
-        """For a frame, once: the newest that is not newer."""
-        until = [coast for coast in self._said or () if coast.t_s <= t_s]
-        if not until:
+        """For a frame, once: the nearest, older rather than newer."""
+        said = self._said or []
+        until = [coast for coast in said if coast.t_s <= t_s]
+        soon = [coast for coast in said if t_s < coast.t_s <= t_s + BEFORE_S]
+        if not until and not soon:
             return None
         self._said = None
-        return max(until, key=lambda coast: coast.t_s)
+        return until[-1] if until else soon[0]

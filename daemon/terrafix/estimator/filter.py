@@ -142,7 +142,7 @@ class Estimator(Tracker):
         offset, apart = _offset(predicted, self._covariance(node), measured, cov)
         self._refused.add(offset, predicted.translation()[:2])
         if len(self._refused.offsets_m) > 1:
-            self.rival.disagreed(self._refused.offsets_m, apart)
+            self.rival.disagreed(self._refused.offsets_m, apart, fixed=self.last_fix_s is not None)
             height = float(measured.translation()[2]) - self.terrain.ground_m
             # Before the first fix only the start coordinate speaks for the graph: as much as one such pose against it.
             first = self.last_fix_s is None and match.inliers >= OUTWEIGHS_START

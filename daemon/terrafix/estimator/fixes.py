@@ -57,6 +57,6 @@ def torn(
             middle = np.median(offsets, axis=0) if offsets else np.zeros(2)
             rival = Rival()
             # What all of them together say of the offset is far less off than they are apart.
-            rival.disagreed([o for o in offsets if np.hypot(*(o - middle)) <= AGREE_M], np.zeros((2, 2)))
+            rival.disagreed([o for o in offsets if np.hypot(*(o - middle)) <= AGREE_M], np.zeros((2, 2)), fixed=True)
             if rival.probability > 0.0:
                 yield at, rival.spread_m2()

@@ -14,7 +14,7 @@ from terrafix.estimator.filter import Estimator
 from terrafix.estimator.resume import Keeper, Known, Last, kept
 from terrafix.estimator.righted import Righted
 from terrafix.estimator.stand_in import StandIn
-from terrafix.estimator.telemetry import Telemetry
+from terrafix.estimator.telemetry import Attitude, Telemetry
 from terrafix.estimator.tracker import Advance, Placed
 from terrafix.messages import (
     Coasted,
@@ -59,6 +59,7 @@ class EstimatorNode:
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
         self._righted = Righted(self._telemetry, None if last is None else last.estimate.t_ns)
+        self._attitude: Attitude | None = None  # at the newest frame
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
         self._said_slow_ns = 0
@@ -89,9 +90,8 @@ class EstimatorNode:
                 yield from self._begun()
             case Imu():
                 self._telemetry.add_imu(message)
-            case Coasted() if self._resumed_from is not None and self._estimator is not None:
-                if self._estimator.last_fix_s is None and self._frame is not None:
-                    self._estimator.coasted(Coast.of(message, self._frame))
+            case Coasted() if self._resumed_from is not None:
+                yield from self._on_coasted(message)
             case Health():
                 cool = message.band is ThermalBand.NORMAL
                 self._mode = CovarianceMode.MARGINALS if cool else CovarianceMode.JACOBIAN
@@ -160,7 +160,7 @@ class EstimatorNode:
             return
         origin = estimator.origin
         sigmas_rad = math.radians(origin.attitude_sigma_deg), math.radians(origin.yaw_sigma_deg)
-        attitude = self._righted.look(odometry.t_ns, *sigmas_rad)
+        attitude = self._attitude = self._righted.look(odometry.t_ns, *sigmas_rad)
         if self._starts and self._start is not None:
             estimator = self._started(self._start, odometry.frame_id, odometry.t_ns, stands=attitude.stands)
         estimator.mode = self._mode
@@ -196,6 +196,13 @@ class EstimatorNode:
             error=(tilt_x, tilt_y, heading, height, lens, scale),
             cov=tuple(float(c) for c in cov.ravel()),
         )
+
+    def _on_coasted(self, said: Coasted) -> Iterable[Message]:
+        estimator, frame = self._estimator, self._frame
+        if estimator is None or frame is None or estimator.last_fix_s is not None:
+            return
+        if estimator.coasted(Coast.of(said, frame), self._attitude, self._righted.felt) and estimator.last is not None:
+            yield self._estimate(estimator.last, said.t_ns)
 
     def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
         estimator = self._estimator

@@ -252,25 +252,33 @@ class Tracker:
             course_told=not seen and self._blown(t_s, before, attitude) is not None,
         )
 
-    def coasted(self, coast: Coast) -> None:
-        """How the autopilot moved while nobody saw the flight."""
+    def coasted(self, coast: Coast, attitude: Attitude | None, felt: Feel) -> bool:
+        """How the autopilot moved while nobody saw the flight, and the attitude at the newest frame. -> whether that is
+        led by it: a picture that was taken a moment before waits for no other."""
         self._coasts.add(coast)
+        last = self._last
+        if last is None or not self._be_led(last.node, last.t_s, attitude, felt):
+            return False
+        self._last = self._placed(last.frame_id, last.t_s, last.node)
+        return True
 
-    def _be_led(self, node: int, t_s: float, attitude: Attitude, felt: Feel) -> None:
-        """By how the autopilot moved, to the newest node."""
+    def _be_led(self, node: int, t_s: float, attitude: Attitude | None, felt: Feel) -> bool:
+        """By how the autopilot moved, to the newest node. -> whether it was."""
         coast = self._coasts.taken(t_s)
-        if coast is None or attitude.yaw_rad is None or attitude.stands or self._open is not None:
-            return
+        if coast is None or attitude is None or attitude.yaw_rad is None or attitude.stands or self._open is not None:
+            return False
         state, tilt_rad = self.graph.state(node), np.radians(self.origin.attitude_sigma_deg)
         tilts_rad = tilt_rad, float(np.hypot(tilt_rad, attitude.righted_rad))
-        since = felt(round(coast.t_s * 1e9), round(t_s * 1e9))
+        since = felt(*sorted((round(coast.t_s * 1e9), round(t_s * 1e9))))
         carried = coast.until(t_s, since, attitude.yaw_rad, float(state.bias[2]), tilts_rad)
         cov = tangent_to_world(self.graph.covariance(node), state.pose.rotation().matrix())
-        if carried.agrees_with(state.pose.translation()[:2], cov[:2, :2]):
-            self.graph.add_motion(node, carried)
-            self._cov_of.pop(node, None)
-            self._velocity_cov = self.graph.velocity_covariance(node)
-            self.led_s = t_s
+        if not carried.agrees_with(state.pose.translation()[:2], cov[:2, :2]):
+            return False
+        self.graph.add_motion(node, carried)
+        self._cov_of.pop(node, None)
+        self._velocity_cov = self.graph.velocity_covariance(node)
+        self.led_s = t_s
+        return True
 
     def _learn_wind(self, seen: Placed, attitude: Attitude) -> None:
         if attitude.yaw_rad is None or attitude.stands or self._open is not None:

@@ -44,7 +44,7 @@ def ardupilot(
     parameters: Annotated[
         list[Path] | None, typer.Option(help="Parameter file of the vehicle; default: second-gps.param.")
     ] = None,
-    kill: Annotated[bool, typer.Option("--kill", help="Kill Terrafix without GNSS, and start it again.")] = False,
+    kills: Annotated[int, typer.Option(min=0, help="Kill Terrafix so often without GNSS, and start it again.")] = 0,
     gnss_start: Annotated[
         bool, typer.Option("--gnss-start", help="Nobody says where it begins but the autopilot's GNSS, on the ground.")
     ] = False,
@@ -65,7 +65,7 @@ def ardupilot(
         length_m=length * 1e3,
         port=port,
         parameters=parameters,
-        kill=kill,
+        kills=kills,
         gnss_start=gnss_start,
     )
     raise typer.Exit(code)

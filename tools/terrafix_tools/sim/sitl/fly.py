@@ -39,13 +39,13 @@ def fly(
     length_m: float = 5000.0,
     port: int = 0,
     parameters: list[Path] | None = None,
-    kill: bool = False,
+    kills: int = 0,
     gnss_start: bool = False,
 ) -> int:
     """Everything into ``out``: map, firmware/, record/, statustext.log, truth.csv, ardupilot.json.
 
-    ``parameters``: what the vehicle has of Terrafix; default: config/vehicles/second-gps.param. ``kill``: Terrafix is
-    killed in flight, and started again. ``gnss_start``: its configuration does not say where the flight begins.
+    ``parameters``: what the vehicle has of Terrafix; default: config/vehicles/second-gps.param. ``kills``: how often
+    Terrafix is killed in flight, and started again. ``gnss_start``: its configuration does not say where it begins.
     -> exit code: 0 when every verdict holds, else 1. Raises UsageError, OutputError, LinkError."""
     program = find_binary(binary)
     kind = kind_of(program, vehicle)
@@ -73,7 +73,7 @@ def fly(
             stages.get_ready()
             stages.take_off()
             stages.lose_gnss()
-            if kill:
+            for _ in range(kills):
                 stages.kill_terrafix()
             stages.land(SLOWER * length_m / SPEED_MPS[kind] + LANDING_S)
         except NotFlown as failed:

@@ -14,6 +14,7 @@ from terrafix_tools.sim.sitl.firmware import Home
 from terrafix_tools.sim.sitl.observer import Belief, Notes, Truth
 
 LANDED_WITHIN_M = 30.0
+BACK_WITHIN_S = 2.0  # of the restart of all of Terrafix
 FIX_3D = 3
 TOUCHED_M = 1.0  # height over home at which it stands or rolls: the simulated ground is flat
 # Words of ArduPilot's texts, in lower case (libraries/AP_NavEKF3, ArduCopter/ekf_check.cpp, AP_Arming_GPS).
@@ -25,15 +26,22 @@ SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "I
 
 
 @dataclass(frozen=True)
+class Kill:
+    """All of Terrafix was killed, and started again: moments on the monotonic clock."""
+
+    killed_ns: int
+    restarted_ns: int
+    back_ns: int | None = None  # its first 3D fix after that
+
+
+@dataclass(frozen=True)
 class Times:
     """Moments of the flight on the monotonic clock; None: never came to it."""
 
     armed_ns: int | None = None
     lost_ns: int | None = None  # the receiver had no 3D fix any more
     landed_ns: int | None = None  # disarmed
-    killed_ns: int | None = None  # all of Terrafix, where that was asked for
-    restarted_ns: int | None = None
-    back_ns: int | None = None  # its first 3D fix after that
+    kills: tuple[Kill, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -57,8 +65,8 @@ class Figures:
     belief_median_m: float | None  # distance of the autopilot's own position from the truth
     belief_p95_m: float | None
     belief_max_m: float | None
-    seen_lost_s: float | None  # from the kill until the firmware said that GPS_INPUT has no fix
-    back_s: float | None  # from the restart to the first 3D fix
+    seen_lost_s: list[float | None]  # from each kill until the firmware said that GPS_INPUT has no fix
+    back_s: list[float | None]  # from each restart to the first 3D fix
 
 
 def figures(notes: Notes, times: Times, home: Home) -> Figures:
@@ -95,23 +103,24 @@ def figures(notes: Notes, times: Times, home: Home) -> Figures:
         belief_median_m=float(np.median(errors)) if errors else None,
         belief_p95_m=float(np.quantile(errors, 0.95)) if errors else None,
         belief_max_m=max(errors) if errors else None,
-        seen_lost_s=_since_s(times.killed_ns, next((t for t, fix in fixes if _after(t, times.killed_ns, fix)), None)),
-        back_s=_since_s(times.restarted_ns, times.back_ns),
+        seen_lost_s=[_since_s(kill.killed_ns, _lost_ns(fixes, kill)) for kill in times.kills],
+        back_s=[_since_s(kill.restarted_ns, kill.back_ns) for kill in times.kills],
     )
 
 
-def _after(t_ns: int, killed_ns: int | None, fix: int) -> bool:
-    return killed_ns is not None and t_ns > killed_ns and fix < FIX_3D
+def _lost_ns(fixes: list[tuple[int, int]], kill: Kill) -> int | None:
+    back_ns = math.inf if kill.back_ns is None else kill.back_ns
+    return next((t_ns for t_ns, fix in fixes if kill.killed_ns < t_ns < back_ns and fix < FIX_3D), None)
 
 
-def _since_s(from_ns: int | None, to_ns: int | None) -> float | None:
-    return None if from_ns is None or to_ns is None else (to_ns - from_ns) / 1e9
+def _since_s(from_ns: int, to_ns: int | None) -> float | None:
+    return None if to_ns is None else (to_ns - from_ns) / 1e9
 
 
 def verdicts(flown: Figures, asked_m: float) -> dict[str, bool]:
     """What was asked of the flight -> whether it held."""
     landing_m = flown.landing_error_m
-    return {
+    held = {
         "take-off on GNSS": flown.took_off_on_gnss,
         f"{asked_m / 1e3:g} km on GPS_INPUT alone": flown.flown_m >= asked_m and flown.gnss_fix_reports == 0,
         "landed": flown.landed,
@@ -119,6 +128,10 @@ def verdicts(flown: Figures, asked_m: float) -> dict[str, bool]:
         "no 'GPS not healthy'": flown.not_healthy == 0,
         "no EKF failsafe": flown.ekf_failsafes == 0,
     }
+    if flown.back_s:
+        quick = [back_s is not None and back_s <= BACK_WITHIN_S for back_s in flown.back_s]
+        held[f"3D fix again within {BACK_WITHIN_S:g} s of each restart"] = all(quick)
+    return held
 
 
 def write_report(path: Path, about: dict[str, object], flown: Figures, asked_m: float) -> None:

@@ -19,7 +19,7 @@ from terrafix_tools.sim.flights.folder import AGL_SIGMA_M, ATTITUDE_SIGMA_DEG, C
 from terrafix_tools.sim.sitl.firmware import Firmware
 from terrafix_tools.sim.sitl.ground_side import Ground
 from terrafix_tools.sim.sitl.observer import Observer
-from terrafix_tools.sim.sitl.report import FIX_3D, Times
+from terrafix_tools.sim.sitl.report import FIX_3D, Kill, Times
 from terrafix_tools.sim.sitl.scene import Scene
 
 GPS_ID = 1  # Terrafix is the second GPS
@@ -35,7 +35,7 @@ LOSS_S = 10.0
 LOOK_S = 0.2
 GNSS_OFF = (("SIM_GPS_DISABLE", 1), ("SIM_GPS1_ENABLE", 0))  # ArduPilot 4.6 and before, later
 NO_FIX = 1  # GPS_INPUT comes, without a fix
-KILL_AFTER_S = 30.0  # without GNSS
+KILL_AFTER_S = 25.0  # without GNSS, and after the one before
 DOWN_S = 5.0  # the firmware notices after 4 s
 BACK_S = 120.0  # from the restart to a 3D fix
 
@@ -142,19 +142,20 @@ class Stages:
         """All of it, and started again as systemd would."""
         self._pause(KILL_AFTER_S)
         self._daemon.kill()
-        self.times = replace(self.times, killed_ns=time.monotonic_ns())
+        killed_ns = time.monotonic_ns()
         self._pause(DOWN_S)
         self._daemon.start()
-        restarted_ns = time.monotonic_ns()
-        self.times = replace(self.times, restarted_ns=restarted_ns)
+        kill, before = Kill(killed_ns, time.monotonic_ns()), self.times.kills
+        self.times = replace(self.times, kills=(*before, kill))
         self._say("Terrafix was killed, and started again")
 
-        def first(fix: int) -> int | None:
+        def back_ns() -> int | None:
             reports = self._observer.notes.fix_types[GPS_ID]
-            return next((t_ns for t_ns, said in reports if t_ns > restarted_ns and said >= fix), None)
+            return next((t_ns for t_ns, fix in reports if t_ns > kill.restarted_ns and fix >= FIX_3D), None)
 
-        self._wait("a 3D fix after the restart", BACK_S, lambda: first(FIX_3D) is not None)
-        self.times = replace(self.times, back_ns=first(FIX_3D))
+        self._wait("a 3D fix after the restart", BACK_S, lambda: back_ns() is not None)
+        kill = replace(kill, back_ns=back_ns())
+        self.times = replace(self.times, kills=(*before, kill))
         self._say("it has a 3D fix again")
 
     def land(self, limit_s: float) -> None:
