@@ -77,6 +77,15 @@ def test_a_place_to_which_the_flight_was_led_has_the_map_on_one_side_only() -> N
     assert rival.probability == pytest.approx(EVEN)
 
 
+def test_rows_that_a_plane_crosses_for_half_a_minute_hide_no_place_that_the_map_had_told() -> None:
+    rival, offset = Rival(), np.array([26.0, 45.0])
+    rival.disagreed([offset, offset], APART, fixed=True)
+    rival.left(offset, APART)
+    for _ in range(30):
+        rival.fade(20.0 / 78.0)
+    assert mahalanobis2(rival.added(FROM_MAP), -offset) < 5.991
+
+
 def test_an_ellipse_that_does_not_reach_the_other_place_is_not_as_wide_as_that_is_unknown() -> None:
     rival, offset = Rival(), np.array([60.0, 0.0])
     rival.left(offset, APART)

@@ -13,7 +13,8 @@ from terrafix.estimator.agreement import AGREE_M
 
 AGREEING = 2  # refused matches in a row that agree with each other: one alone is a mistake
 EVEN = 0.5  # probability of the other place when nothing is known but that the two disagree
-FORGET_OVER = 5.0  # of the height: so far flies a repeating pattern, and so far the other place fades to a third
+FORGET_OVER = 5.0  # of the height: so far flies a repeating pattern, and so far the other place fades to a third ...
+TOLD_LASTS = 2.0  # ... or so much farther, if the map had told it before: a plane crosses long rows at any height
 FORGOTTEN = 0.01
 REACHED = 1 / 9  # from this probability on three sigmas reach the other place
 
@@ -53,12 +54,18 @@ class Rival:
 
     def fade(self, new_heights: float) -> None:
         """A match agreed with the estimate over new ground, in heights flown since the last one."""
-        self._repeats *= float(np.exp(-new_heights / FORGET_OVER))
-        if self._before_m is not None:
-            away_m = float(np.hypot(*self._before_m))
-            self._two = away_m <= min(AGREE_M, 0.5 * float(np.hypot(*self.offset_m)))
+        self._two = self._was_at(np.zeros(2))
+        over = FORGET_OVER * (TOLD_LASTS if self._was_at(self.offset_m) else 1.0)
+        self._repeats *= float(np.exp(-new_heights / over))
         if self.probability < FORGOTTEN:
             self._repeats = 0.0
+
+    def _was_at(self, offset_m: np.ndarray) -> bool:
+        """The map had told this one of the two places, as an offset (2,) from the estimate, before they disagreed."""
+        if self._before_m is None:
+            return False
+        off_m = float(np.hypot(*(self._before_m - offset_m)))
+        return off_m <= min(AGREE_M, 0.5 * float(np.hypot(*self.offset_m)))
 
     def added(self, cov: np.ndarray) -> np.ndarray:
         """``cov`` (6, 6), east and north first, with the spread of the two places."""
