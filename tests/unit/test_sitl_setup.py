@@ -10,7 +10,7 @@ from pyproj import Geod
 from terrafix.core.errors import UsageError
 from terrafix_tools.mission.mission import Do, Mission
 from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.sitl.setup import WORLD_M, mission_for, place_of, write_parameters
+from terrafix_tools.sim.sitl.setup import WORLD_M, laps_for, mission_for, place_of, write_parameters
 from terrafix_tools.sim.world import place as world
 
 GEOD = Geod(ellps="WGS84")
@@ -33,6 +33,8 @@ def length_m(mission: Mission) -> float:
 def test_long_enough_and_inside(place: world.World, kind: Kind, wanted_m: float) -> None:
     mission = mission_for(place, kind, wanted_m)
     assert length_m(mission) >= wanted_m + 1500.0  # what is flown before the loss is on top
+    laps, lap_m = laps_for(wanted_m)
+    assert laps * lap_m == pytest.approx(length_m(mission), rel=0.05)  # the time that a flight is given
     assert mission.items[0].do is Do.TAKE_OFF and mission.items[-1].do is Do.LAND
     last = mission.items[-1]
     assert (last.lat_deg, last.lon_deg) == place_of(place) == (mission.home_lat_deg, mission.home_lon_deg)

@@ -20,13 +20,13 @@ from terrafix_tools.sim.sitl.ground_side import connected
 from terrafix_tools.sim.sitl.observer import Observer
 from terrafix_tools.sim.sitl.report import figures, verdicts, write_report, write_texts, write_truth
 from terrafix_tools.sim.sitl.scene import generate_scene
-from terrafix_tools.sim.sitl.setup import SPEED_MPS, WORLD_M, mission_for, write_parameters
+from terrafix_tools.sim.sitl.setup import SPEED_MPS, WORLD_M, laps_for, mission_for, write_parameters
 from terrafix_tools.sim.sitl.stages import Daemon, NotFlown, Stages
 from terrafix_tools.sim.world import place as world
 
 PARAMETERS = Path(__file__).resolve().parents[4] / "config" / "vehicles" / "second-gps.param"
 REPORT = "ardupilot.json"  # a folder with this file in it is ours to empty
-SLOWER = 2.0  # the flight may take so many times what its length at cruise speed does,
+SLOWER = 2.0  # the flight may take so many times what its rounds at cruise speed do,
 LANDING_S = 240.0  # and this for climb and landing
 
 
@@ -75,7 +75,8 @@ def fly(
             stages.lose_gnss()
             for _ in range(kills):
                 stages.kill_terrafix()
-            stages.land(SLOWER * length_m / SPEED_MPS[kind] + LANDING_S)
+            laps, lap_m = laps_for(length_m)
+            stages.land(SLOWER * laps * lap_m / SPEED_MPS[kind] + LANDING_S)
         except NotFlown as failed:
             problem = str(failed)
     found = figures(observer.notes, stages.times, scene.home)

@@ -91,11 +91,17 @@ def place_of(world: World) -> tuple[float, float]:
     return world.wgs84(HOME_EAST_M, NORTH_SOUTH_M[1])
 
 
+def laps_for(length_m: float) -> tuple[int, float]:
+    """-> how many rounds of the loop ``length_m`` needs after the loss, and the length of one [m]."""
+    (west, east), (north, south) = WEST_EAST_M, NORTH_SOUTH_M
+    lap_m = 2 * (east - west) + 2 * (south - north)
+    return max(1, -int(-(length_m + LEAD_M) // lap_m)), lap_m
+
+
 def mission_for(world: World, kind: Kind, length_m: float) -> Mission:
     """Take-off, as many rounds of the loop as ``length_m`` needs after the loss, landing at home. Raises UsageError."""
     (west, east), (north, south) = WEST_EAST_M, NORTH_SOUTH_M
-    lap_m = 2 * (east - west) + 2 * (south - north)
-    laps = max(1, -int(-(length_m + LEAD_M) // lap_m))
+    laps, lap_m = laps_for(length_m)
     if length_m <= 0.0 or laps > LAPS_MAX:
         raise UsageError(f"--length {length_m / 1e3:g}: choose more than 0 and at most {LAPS_MAX * lap_m / 1e3:.0f} km")
     corners = [(east, south), (east, north), (west, north), (west, south)]

@@ -154,9 +154,8 @@ class Stages:
             return next((t_ns for t_ns, fix in reports if t_ns > kill.restarted_ns and fix >= FIX_3D), None)
 
         self._wait("a 3D fix after the restart", BACK_S, lambda: back_ns() is not None)
-        kill = replace(kill, back_ns=back_ns())
-        self.times = replace(self.times, kills=(*before, kill))
-        self._say("it has a 3D fix again")
+        self.times = replace(self.times, kills=(*before, replace(kill, back_ns=back_ns())))
+        self._say(f"3D fix again {((back_ns() or 0) - kill.restarted_ns) / 1e9:.2f} s after that")
 
     def land(self, limit_s: float) -> None:
         """The rest of the mission; it disarms by itself when it stands."""
