@@ -113,6 +113,16 @@ def test_a_picture_that_was_taken_a_moment_before_waits_for_no_other(
     assert np.linalg.norm(off_mps) < 3.0 * first.velocity_sigma_mps
 
 
+def test_it_may_be_said_before_anybody_has_said_where_the_flight_began(flight: Flight, killed: Last) -> None:
+    """The link is there before vision, and with it the Origin, is."""
+    run = Listener()
+    run.node = EstimatorNode(0, killed)
+    run.hear([coasted(flight), ORIGIN])
+    run.hear([blind(m) if isinstance(m, Odometry) else m for m in flight.messages(BACK)])
+    first = run.estimate(BACK)
+    assert sigma_m(first) < 7.0 and first.velocity_sigma_mps < LINK_LETS_MPS
+
+
 def test_backwards_and_forwards_a_coast_ends_where_it_began() -> None:
     """As sure of it as the velocity is known: what was wrong of it is wrong of the way back, too."""
     frame = LocalFrame(48.0, 11.0)

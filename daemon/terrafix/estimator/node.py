@@ -60,6 +60,7 @@ class EstimatorNode:
         self._telemetry = Telemetry()
         self._righted = Righted(self._telemetry, None if last is None else last.estimate.t_ns)
         self._attitude: Attitude | None = None  # at the newest frame
+        self._coasted: list[Coasted] = []  # before there was an Origin: the link may be there before vision is
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
         self._said_slow_ns = 0
@@ -83,6 +84,9 @@ class EstimatorNode:
                 self._origin = message
                 self._frame = LocalFrame(message.lat_deg, message.lon_deg)
                 self._begin(begun(message, self._start), self._known(message, self._frame))
+                waiting, self._coasted = self._coasted, []
+                for said in waiting:
+                    yield from self._on_coasted(said)
             case Start() if not self._on_map and (self._start is None or message.t_ns != self._start.t_ns):
                 self._start, self._starts = message, True
             case VehicleState():
@@ -199,7 +203,10 @@ class EstimatorNode:
 
     def _on_coasted(self, said: Coasted) -> Iterable[Message]:
         estimator, frame = self._estimator, self._frame
-        if estimator is None or frame is None or estimator.last_fix_s is not None:
+        if estimator is None or frame is None:
+            self._coasted.append(said)
+            return
+        if estimator.last_fix_s is not None:
             return
         if estimator.coasted(Coast.of(said, frame), self._attitude, self._righted.felt) and estimator.last is not None:
             yield self._estimate(estimator.last, said.t_ns)
