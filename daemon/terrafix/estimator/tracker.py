@@ -342,20 +342,9 @@ class Tracker:
         bias_cov += np.diag(walk_sigmas(dt_s, 0.0, rise_m) ** 2)
         self._velocity_cov = spread[3:, 3:].copy()
         self._velocity_cov[:3, :3] += now.share**2 * float(velocity[:2] @ velocity[:2]) * level
-        self._felt = self._stood_at = self._seen_from = None
-        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), led_to_m)
-        node = self.graph.start(
-            t_s,
-            NodeState(pose, before.bias, velocity),
-            world_to_tangent(cov, r_w_c),
-            bias_cov,
-            self._velocity_cov,
-            self.camera.factor(self.graph.next_keys(), attitude, r_w_c, self.terrain.below(led_to_m)),
-            world_to_tangent(cov if self._open is None else self._open.chosen(cov), r_w_c),
-        )
-        self._is_frame(node, frame_id)
-        self._last = self._placed(frame_id, t_s, node)
-        return Advance(verdict, self._last, step, float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])))
+        state = NodeState(gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), led_to_m), before.bias, velocity)
+        placed = self._new_graph(frame_id, t_s, attitude, state, cov, bias_cov, self.terrain.below(led_to_m))
+        return Advance(verdict, placed, step, float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])))
 
     def _start_graph(
         self,
@@ -387,17 +376,31 @@ class Tracker:
         cov_world = np.zeros((6, 6))
         cov_world[:3, :3], cov_world[3:, 3:] = wide[3:, 3:], wide[:3, :3]
         self._open = OpenHeading(at_m) if attitude.yaw_rad is None else None
-        held = cov_world if self._open is None else self._open.chosen(cov_world)
         self._velocity_cov = standing_cov() if attitude.stands else unknown_cov()
-        self._felt = self._stood_at = None
+        state = NodeState(pose, bias, np.zeros(V_SIZE))
+        return self._new_graph(frame_id, t_s, attitude, state, cov_world, bias_cov, self.terrain.ground_m)
+
+    def _new_graph(
+        self,
+        frame_id: int,
+        t_s: float,
+        attitude: Attitude,
+        state: NodeState,
+        cov: np.ndarray,
+        bias_cov: np.ndarray,
+        ground_m: float,
+    ) -> Placed:
+        """Of one node, whose pose is known to ``cov`` (6x6, world axes), above ground at ``ground_m``."""
+        self._felt = self._stood_at = self._seen_from = None
+        r_w_c = state.pose.rotation().matrix()
         node = self.graph.start(
             t_s,
-            NodeState(pose, bias, np.zeros(V_SIZE)),
-            world_to_tangent(cov_world, r_w_c),
+            state,
+            world_to_tangent(cov, r_w_c),
             bias_cov,
             self._velocity_cov,
-            self.camera.factor(self.graph.next_keys(), attitude, r_w_c, self.terrain.ground_m),
-            world_to_tangent(held, r_w_c),
+            self.camera.factor(self.graph.next_keys(), attitude, r_w_c, ground_m),
+            world_to_tangent(cov if self._open is None else self._open.chosen(cov), r_w_c),
         )
         self._is_frame(node, frame_id)
         self._last = self._placed(frame_id, t_s, node)
