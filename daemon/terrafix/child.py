@@ -74,6 +74,7 @@ def run(name: str, run_dir: RunDir) -> int:
         out_dir=Path(spec.out_dir),
         ground_amsl_m=spec.ground_amsl_m,
         kept=run_dir.kept(name),
+        shelf=run_dir.shelf(name),
         epoch_ns=run_dir.epoch_ns,
     )
     try:

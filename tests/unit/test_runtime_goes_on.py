@@ -24,6 +24,8 @@ def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
     dead.spec.write_bytes(spec)
     dead.set_epoch(7)
     dead.kept("estimator").write_bytes(b"the newest estimate")
+    dead.shelf("anchor").mkdir()
+    (dead.shelf("anchor") / "0 0.tile").touch()
     progress = Progress.create(dead.progress("link"))
     progress.stamp(time.monotonic_ns() - round(age_s * 1e9))
     progress.close()
@@ -47,6 +49,7 @@ def test_it_goes_on_from_a_run_of_the_same_that_was_killed_just_now(
     try:
         assert owned.run_dir.epoch_ns == (7 if goes_on else None)
         assert owned.run_dir.kept("estimator").exists() == goes_on
+        assert (owned.run_dir.shelf("anchor") / "0 0.tile").exists() == goes_on
         assert not dead.path.exists()
     finally:
         owned.remove()

@@ -1,6 +1,7 @@
 """The layers of a map as the anchor sees them: a map and a matcher for every date of the place, and which is in use."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from terrafix.anchor.agreed import AgreedPose
 from terrafix.anchor.belief import Belief, Mode
@@ -8,6 +9,7 @@ from terrafix.anchor.map_features import CACHE_BYTES, Describer
 from terrafix.anchor.map_layers import LayerChoice
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import FrameMatcher, Look, View
+from terrafix.anchor.tile_shelf import TileShelf
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
@@ -27,16 +29,23 @@ class Dated:
 
 
 class Layers:
-    """``ce90_m`` counts for the layers that state none."""
+    """``ce90_m`` counts for the layers that state none. ``shelf``: folder in memory for what was computed of them."""
 
     def __init__(
-        self, package: MapPackage, frame: LocalFrame, camera: CameraCalibration, describer: Describer, ce90_m: float
+        self,
+        package: MapPackage,
+        frame: LocalFrame,
+        camera: CameraCalibration,
+        describer: Describer,
+        ce90_m: float,
+        shelf: Path | None = None,
     ) -> None:
         layers = package.manifest.layers
         self._all: dict[str, Dated] = {}
         for layer in layers:
             bound = package.bind(frame, layer.table)
-            matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers))
+            kept = None if shelf is None else TileShelf(shelf, f"{_file(package)} {frame} {layer.table}")
+            matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers), kept)
             stated = ce90_m if layer.ce90_m is None else layer.ce90_m
             self._all[layer.table] = Dated(bound, matcher, AgreedPose(bound, matcher), stated / CE90_SIGMAS)
         self._choice = LayerChoice([layer.table for layer in layers])
@@ -58,3 +67,9 @@ class Layers:
         }
         used = self._choice.looked(scores, weight) or next(iter(looks))
         return self._all[used], looks[used]
+
+
+def _file(package: MapPackage) -> str:
+    """Which file it is: one that was built anew under the same name is another one."""
+    about = package.path.stat()
+    return f"{package.path} {about.st_size} {about.st_mtime_ns}"

@@ -5,6 +5,8 @@ from typing import Protocol
 
 import numpy as np
 
+from terrafix.anchor.tile_shelf import TileShelf
+
 TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride
 PAD_PX = 32  # context around a tile, so that its rim is described as if there were no rim; a multiple of every stride
 CACHE_BYTES = 192 * 1024 * 1024
@@ -34,11 +36,18 @@ class Describer(Protocol):
 
 class MapFeatures:
     def __init__(
-        self, source: MapWindows, describer: Describer, cache_bytes: int = CACHE_BYTES, pad_px: int = PAD_PX
+        self,
+        source: MapWindows,
+        describer: Describer,
+        cache_bytes: int = CACHE_BYTES,
+        pad_px: int = PAD_PX,
+        shelf: TileShelf | None = None,
     ) -> None:
+        """``shelf``: where they are kept for the next process, too."""
         self._source = source
         self._describer = describer
         self._pad_px = pad_px
+        self._shelf = shelf
         self._tiles: OrderedDict[tuple[float, int, int], tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._bytes, self._most_bytes = 0, cache_bytes
 
@@ -74,6 +83,20 @@ class MapFeatures:
         if key in self._tiles:
             self._tiles.move_to_end(key)
             return self._tiles[key]
+        name = f"{self._describer.name} {gsd_m!r} {tx} {ty}"
+        tile = None if self._shelf is None else self._shelf.take(name)
+        if tile is None:
+            tile = self._computed(gsd_m, tx, ty, cell, per_tile)
+            if self._shelf is not None:
+                self._shelf.put(name, *tile)
+        self._tiles[key] = tile
+        self._bytes += tile[0].nbytes + tile[1].nbytes
+        while self._bytes > self._most_bytes and len(self._tiles) > 1:
+            _, (old, old_valid) = self._tiles.popitem(last=False)
+            self._bytes -= old.nbytes + old_valid.nbytes
+        return tile
+
+    def _computed(self, gsd_m: float, tx: int, ty: int, cell: float, per_tile: int) -> tuple[np.ndarray, np.ndarray]:
         stride, pad_px = self._describer.stride, self._pad_px
         side = TILE_CELLS_PX + 2 * pad_px
         image, ok = self._source.window(
@@ -84,12 +107,5 @@ class MapFeatures:
         valid = np.asarray(ok[rim, rim].reshape(per_tile, stride, per_tile, stride).all(axis=(1, 3)))
         if valid.any():
             descriptors = self._describer.describe(image)[:, inner, inner]
-            tile = (np.where(valid, descriptors, 0.0).astype(np.float16), valid)
-        else:  # beside the map
-            tile = (np.zeros((self._describer.channels, *valid.shape), np.float16), valid)
-        self._tiles[key] = tile
-        self._bytes += tile[0].nbytes + valid.nbytes
-        while self._bytes > self._most_bytes and len(self._tiles) > 1:
-            _, (old, old_valid) = self._tiles.popitem(last=False)
-            self._bytes -= old.nbytes + old_valid.nbytes
-        return tile
+            return np.where(valid, descriptors, 0.0).astype(np.float16), valid
+        return np.zeros((self._describer.channels, *valid.shape), np.float16), valid  # beside the map

@@ -14,6 +14,7 @@ from terrafix.anchor.map_package import LocalMap
 from terrafix.anchor.patches import match_patches
 from terrafix.anchor.pnp import THRESHOLD, PnpResult, solve
 from terrafix.anchor.rectify import Rectified, rectify
+from terrafix.anchor.tile_shelf import TileShelf
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.node import Image
@@ -120,20 +121,25 @@ class Fix:
 
 
 class FrameMatcher:
-    """``cache_bytes``: of the map's descriptors, kept once they were computed."""
+    """``cache_bytes``: of the map's descriptors, kept once they were computed; ``shelf``: for the next process, too."""
 
     def __init__(
-        self, camera: CameraCalibration, source: LocalMap, describer: Describer, cache_bytes: int = CACHE_BYTES
+        self,
+        camera: CameraCalibration,
+        source: LocalMap,
+        describer: Describer,
+        cache_bytes: int = CACHE_BYTES,
+        shelf: TileShelf | None = None,
     ) -> None:
         self.camera = camera
         self._map = source
         self._describer = describer
         self._turn = 0
-        self._features = MapFeatures(source, describer, cache_bytes)
+        self._features = MapFeatures(source, describer, cache_bytes, shelf=shelf)
         # Many channels over a wide window are slow; oriented gradients find the place as well, at a tenth of the cost.
         self.gradients = describer if describer.stride == 1 else GradientDescriber()
         self.gradient_features = (
-            self._features if describer.stride == 1 else MapFeatures(source, self.gradients, cache_bytes)
+            self._features if describer.stride == 1 else MapFeatures(source, self.gradients, cache_bytes, shelf=shelf)
         )
 
     def look_cell_m(self, agl_m: float) -> float:

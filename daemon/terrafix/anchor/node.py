@@ -1,6 +1,7 @@
 """Anchor: the newest predicted frame against the map, through the belief, into 2D-3D matches and a pose."""
 
 from collections.abc import Iterable
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -68,10 +69,13 @@ class AnchorNode:
         describer: Describer,
         ce90_m: float,
         model: ModelWatch | None = None,
+        shelf: Path | None = None,
     ) -> None:
+        """``shelf``: folder in memory for what was computed of the map."""
         self._frames = frames
         self._package = package
         self._describer = describer
+        self._shelf = shelf
         self._model = model or ModelWatch(describer)
         self._ce90_m = ce90_m  # of imagery that does not state its own
         self._layers: Layers | None = None
@@ -129,7 +133,7 @@ class AnchorNode:
     def _open_layers(self, origin: Origin) -> None:
         if self._package is not None:
             frame, camera = LocalFrame(origin.lat_deg, origin.lon_deg), CameraCalibration.of(origin.camera)
-            self._layers = Layers(self._package, frame, camera, self._describer, self._ce90_m)
+            self._layers = Layers(self._package, frame, camera, self._describer, self._ce90_m, self._shelf)
 
     def _contained(self, prediction: Prediction) -> MapMatch:
         """A learned model that has no answer costs this frame; one that has none for many is given up."""
@@ -318,4 +322,4 @@ def make_node(ctx: NodeContext) -> AnchorNode:
         if ctx.epoch_ns is None:
             raise ModelError(str(error)) from None
         describer, not_opened = GradientDescriber(), str(error)
-    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, ModelWatch(describer, not_opened))
+    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, ModelWatch(describer, not_opened), ctx.shelf)

@@ -47,6 +47,10 @@ class RunDir:
         """What ``process`` leaves to the one that is started in its place."""
         return self.path / f"{process}.kept"
 
+    def shelf(self, process: str) -> Path:
+        """Folder of what ``process`` can compute anew, but not at once."""
+        return self.path / f"{process}.shelf"
+
     @property
     def frames(self) -> Path:
         return self.path / "frames"
@@ -76,6 +80,9 @@ class RunDir:
             return
         for file in (dead._epoch, *dead.path.glob("*.kept")):
             write_whole(self.path / file.name, file.read_bytes())
+        for folder in dead.path.glob("*.shelf"):
+            with suppress(OSError):  # it can be done without
+                folder.rename(self.path / folder.name)
 
     def flew_just_now(self) -> bool:
         """Its source was open, and it lived until just now."""

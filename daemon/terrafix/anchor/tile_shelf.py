@@ -1,0 +1,58 @@
+"""Descriptors of the map that outlive the process that computed them.
+
+Half of the first look of a new process is computing what the one before it had already; and after a restart in flight
+that look is what the autopilot waits for. So what was computed lies in the folder of the run, too, which is memory."""
+
+import hashlib
+from collections import deque
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from terrafix.core.rundir import leave, left
+
+MOST = 96  # of 1 MB each: what a flight in sight of one place uses is some 20
+
+
+class _Written(msgspec.Struct, frozen=True):
+    shape: tuple[int, int, int]
+    descriptors: bytes  # float16
+    valid: bytes  # bool
+
+
+class TileShelf:
+    """``of``: all that the descriptors follow from, but for who describes and which tile it is."""
+
+    def __init__(self, folder: Path, of: str) -> None:
+        self._folder = folder
+        self._prefix = hashlib.sha256(of.encode()).hexdigest()[:16]
+        with suppress(OSError):  # no room: nothing is kept
+            folder.mkdir(exist_ok=True)
+        found = folder.glob(f"{self._prefix} *.tile")
+        self._files = deque(sorted(found, key=lambda file: file.stat().st_mtime_ns))
+
+    def take(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """-> descriptors (C, n, n) float16, valid (n, n) bool; None: not here, or not whole."""
+        written = left(self._file(name), msgspec.msgpack.Decoder(_Written).decode)
+        if written is None:
+            return None
+        try:
+            descriptors = np.frombuffer(written.descriptors, np.float16).reshape(written.shape)
+            return descriptors, np.frombuffer(written.valid, bool).reshape(written.shape[1:])
+        except ValueError:
+            return None
+
+    def put(self, name: str, descriptors: np.ndarray, valid: np.ndarray) -> None:
+        """The oldest give way."""
+        c, h, w = descriptors.shape
+        file = self._file(name)
+        leave(file, msgspec.msgpack.encode(_Written((c, h, w), descriptors.tobytes(), valid.tobytes())))
+        self._files.append(file)
+        while len(self._files) > MOST:
+            with suppress(OSError):
+                self._files.popleft().unlink()
+
+    def _file(self, name: str) -> Path:
+        return self._folder / f"{self._prefix} {name}.tile"
