@@ -1,11 +1,20 @@
 """A frame against the map: rotations and scales that are tried, and what look and fix make of a known place."""
 
+import cv2
 import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
 from terrafix.anchor.belief import Belief, Surface
-from terrafix.anchor.matcher import MAX_HYPOTHESES, FrameMatcher, Hypothesis, Look, View, _hypotheses
+from terrafix.anchor.matcher import (
+    LEARNED_INLIERS,
+    MAX_HYPOTHESES,
+    FrameMatcher,
+    Hypothesis,
+    Look,
+    View,
+    _hypotheses,
+)
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Verdict
@@ -158,6 +167,44 @@ def test_a_wrong_place_gives_no_pose(matcher: FrameMatcher, frame: np.ndarray) -
         fix = matcher.fix(frame, seen_from(), Hypothesis(0.0, 1.0), e_m, n_m)
         accepted += fix is not None and fix.pnp.verdict is Verdict.ACCEPTED
     assert accepted == 0
+
+
+class Learned:
+    """Stands in for a learned model: coarse cells, and it counts how often it is asked."""
+
+    name, stride, channels = "xfeat", 8, 16
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def describe(self, image: np.ndarray) -> np.ndarray:
+        self.asked += 1
+        cells = cv2.resize(image, None, fx=1 / self.stride, fy=1 / self.stride, interpolation=cv2.INTER_AREA)
+        gray = cv2.cvtColor(cells, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        return np.stack([np.roll(gray, (i, j), (0, 1)) for i in range(-2, 2) for j in range(-2, 2)]) / 255.0
+
+
+def test_a_learned_model_is_asked_for_a_pose_where_gradients_have_none(
+    ground: np.ndarray, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned = Learned()
+    both = FrameMatcher(PINHOLE, FlatMap(ground), learned)  # type: ignore[arg-type]
+    place = seen_from(), Hypothesis(0.0, 1.0), *TRUE_M[:2].tolist()
+    fix = both.fix(frame, *place)
+    assert fix is not None and fix.pnp.verdict is Verdict.ACCEPTED and fix.cell_m < 1.0
+    assert learned.asked == 0
+    rng = np.random.default_rng(7)
+
+    def noise(_self: object, image: np.ndarray) -> np.ndarray:
+        return rng.normal(size=(8, *image.shape[:2])).astype(np.float32)
+
+    monkeypatch.setattr(GradientDescriber, "describe", noise)
+    changed = FrameMatcher(PINHOLE, FlatMap(ground), learned)  # type: ignore[arg-type]
+    fix = changed.fix(frame, *place)
+    assert learned.asked > 0
+    assert fix is not None and fix.pnp.verdict is Verdict.ACCEPTED and fix.cell_m > 2.0
+    assert fix.pnp.inliers.sum() >= LEARNED_INLIERS
+    assert fix.pnp.fit is not None and np.linalg.norm(fix.pnp.fit.p_c_in_w_m - TRUE_M) < 3.0
 
 
 def scales_scored(**z: float) -> Look:

@@ -59,6 +59,13 @@ def test_few_matches_are_no_pose(count: int) -> None:
     assert (found.verdict, found.fit) == (Verdict.FEW_INLIERS, None)
 
 
+def test_whoever_errs_more_often_is_asked_for_more_inliers() -> None:
+    points, xy = scene(np.random.default_rng(1), 18, 5.0)
+    asked = (points, xy, np.ones(len(xy)), R, AGL_M, SIGMA, THRESHOLD, REACH)
+    assert solve(*asked).verdict is Verdict.ACCEPTED
+    assert solve(*asked, least=20).verdict is Verdict.FEW_INLIERS
+
+
 def test_of_a_quarter_of_right_matches_comes_no_wrong_pose() -> None:
     rng = np.random.default_rng(1)
     points, xy = scene(rng, 48, 0.0)

@@ -12,7 +12,7 @@ from terrafix.anchor.correlate import Searchable, standardise
 from terrafix.anchor.map_features import CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.map_package import LocalMap
 from terrafix.anchor.patches import match_patches
-from terrafix.anchor.pnp import THRESHOLD, PnpResult, solve
+from terrafix.anchor.pnp import MIN_INLIERS, THRESHOLD, PnpResult, solve
 from terrafix.anchor.rectify import Rectified, rectify
 from terrafix.anchor.tile_shelf import TileShelf
 from terrafix.core.camera import CameraCalibration
@@ -31,6 +31,9 @@ MAX_WINDOW_VALUES = 8 * 640**2
 PATCH_PER_AGL = 0.25  # side of a patch: 25 m at 100 m, one house and its surroundings
 MIN_PATCH_CELLS = 8
 REACH = 0.08  # search of a patch around its expected place, share of the height
+# A cell of a learned model sees a hundred pixels around it, so that neighbours err together: at wrong places up to 17
+# patches of one pose agreed, at right ones 15 to 48.
+LEARNED_INLIERS = 20
 FIRST_REACH, FIRST_THRESHOLD = 0.2, 0.05  # of the first pass, while the tilt is not known
 WELL_KNOWN_RAD = np.radians(3.0)
 # Rotation and scale are searched when they are known less well than the descriptors tolerate.
@@ -205,34 +208,43 @@ class FrameMatcher:
         A pose that is not known well is found in two passes: a wide search with a generous threshold, then a narrow one
         on the frame rectified with what the first one found."""
         start = view_at(view, hypothesis, e_m, n_m)
+        found = self._fix_by(self.gradients, image, start)
+        if self._describer is self.gradients or (found is not None and found.pnp.verdict is Verdict.ACCEPTED):
+            return found
+        # Cells of a learned model are coarser, and it finds more patches where ground has changed or leans.
+        return self._fix_by(self._describer, image, start)
+
+    def _fix_by(self, describer: Describer, image: Image, view: View) -> Fix | None:
         if view.tilt_sigma_rad > WELL_KNOWN_RAD:
-            first = self._patch_fix(image, start, FIRST_REACH, FIRST_THRESHOLD)
+            first = self._patch_fix(describer, image, view, FIRST_REACH, FIRST_THRESHOLD)
             if first is None or first.pnp.fit is None:
                 return first
-            start = view_from(start, first)
-        return self._patch_fix(image, start, REACH, THRESHOLD)
+            view = view_from(view, first)
+        return self._patch_fix(describer, image, view, REACH, THRESHOLD)
 
     def refined(self, image: Image, view: View, fix: Fix) -> Fix:
         """The pose of a place that a search has found, on the cells of a flight, if one stands on these."""
         if fix.pnp.fit is None:
             return fix
-        finer = self._patch_fix(image, view_from(view, fix), REACH, THRESHOLD)
+        finer = self._patch_fix(self.gradients, image, view_from(view, fix), REACH, THRESHOLD)
         return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else fix
 
-    def _patch_fix(self, image: Image, view: View, reach_share: float, threshold: float) -> Fix | None:
-        per_agl = FIX_GSD_PER_AGL[self._describer.name]
-        gsd = self.cell_m(view.agl_m, per_agl)
-        cell = gsd * self._describer.stride
-        frame = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, self._describer.stride)
+    def _patch_fix(
+        self, describer: Describer, image: Image, view: View, reach_share: float, threshold: float
+    ) -> Fix | None:
+        gsd = self._gsd(view.agl_m, FIX_GSD_PER_AGL, describer)
+        cell = gsd * describer.stride
+        frame = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, describer.stride)
         if frame is None:
             return None
         reach = max(int(np.ceil(reach_share * view.agl_m / cell)), 3)
         patch = max(round(PATCH_PER_AGL * view.agl_m / cell), MIN_PATCH_CELLS)
-        template, mask = _describe(frame, self._describer)
+        template, mask = _describe(frame, describer)
         margin = (reach + 2) * cell
         e_min, n_max = view.e_m + frame.e_min_m - margin, view.n_m + frame.n_max_m + margin
         width, height = mask.shape[1] + 2 * reach + 4, mask.shape[0] + 2 * reach + 4
-        window, valid, e_min, n_max = self._features.window(e_min, n_max, width, height, gsd)
+        features = self.gradient_features if describer is self.gradients else self._features
+        window, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
         found = match_patches(
             template, frame, mask, cell, window, valid, (e_min, n_max), (view.e_m, view.n_m), patch, reach
         )
@@ -243,7 +255,8 @@ class FrameMatcher:
         points = np.column_stack([found.map_m, up])
         floor = 0.3 * cell / view.agl_m  # a third of a cell: what interpolation of the peak gives at best
         reach_share = reach * cell / view.agl_m
-        pnp = solve(points, xy, found.weight, view.r_w_c, view.agl_m, floor, threshold, reach_share)
+        least = MIN_INLIERS if describer.stride == 1 else LEARNED_INLIERS
+        pnp = solve(points, xy, found.weight, view.r_w_c, view.agl_m, floor, threshold, reach_share, least)
         return Fix(xy, points, found.weight, pnp, cell)
 
     def _in_turn(self, hypotheses: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:

@@ -35,13 +35,14 @@ def solve(
     sigma_floor: float,
     threshold: float,
     reach: float,
+    least: int = MIN_INLIERS,
 ) -> PnpResult:
     """``points_w_m`` (N, 3), ``xy`` (N, 2) normalised; ``r_w_c`` predicted. ``threshold`` of an inlier and
-    ``reach`` of the search as shares of the height."""
+    ``reach`` of the search as shares of the height. ``least`` inliers there must be."""
     n = len(xy)
     chance = min(1.0, np.pi * threshold**2 / (2 * reach) ** 2)  # that a patch that was matched at random agrees
     none = np.zeros(n, bool)
-    needed = max(MIN_INLIERS, MIN_INLIER_SHARE * n, n * chance + 4.0 * float(np.sqrt(n * chance)) + 3.0)
+    needed = max(least, MIN_INLIER_SHARE * n, n * chance + 4.0 * float(np.sqrt(n * chance)) + 3.0)
     if n < needed:
         return PnpResult(Verdict.FEW_INLIERS, None, none)
     centre = points_w_m.mean(0)
