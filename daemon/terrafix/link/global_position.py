@@ -7,16 +7,20 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.messages import GpsInput
 
 UNKNOWN_E7 = 2**31 - 1  # "invalid" of latitude and longitude in message 296
+SENSOR_ID = 1  # 0 is no sensor to PX4: a slot of its filter whose EKF2_AGPn_ID is 0 is off
 PROCESSING = 0  # what is sent was carried to the moment of sending
 
 
 def global_position_sensor(gps: GpsInput, sysid: int) -> mavlink.MAVLink_global_position_sensor_message:
-    """For PX4 (EKF2_AGP_*), and ArduPilot once it takes it. Without a fix: marked unhealthy, without a position."""
+    """For PX4 (EKF2_AGP0_*, in older versions EKF2_AGP_*), and ArduPilot once it takes it.
+
+    Without a fix: marked unhealthy, without a position and without an accuracy. The last is how PX4 knows it
+    (mavlink_receiver.cpp, handle_message_global_position_sensor: eph > 0)."""
     good = gps.fix_type >= 3
     return mavlink.MAVLink_global_position_sensor_message(
         sysid,
         mavlink.MAV_COMP_ID_AUTOPILOT1,
-        0,
+        SENSOR_ID,
         gps.t_ns // 1000,
         PROCESSING,
         mavlink.GLOBAL_POSITION_SRC_VISION,
