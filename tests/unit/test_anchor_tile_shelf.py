@@ -10,7 +10,6 @@ from ground import PINHOLE, texture, view
 from one_place import ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
 from test_anchor_node import predicted
 
-from terrafix.anchor import tile_shelf
 from terrafix.anchor.map_features import MapFeatures
 from terrafix.anchor.node import AnchorNode
 from terrafix.anchor.tile_shelf import TileShelf
@@ -75,11 +74,10 @@ def test_what_is_not_whole_is_computed_anew(read_map: ReadMap, tmp_path: Path, d
     assert described(read_map, TileShelf(tmp_path, "here"))[1] == 1
 
 
-def test_the_oldest_give_way_also_those_of_the_process_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tile_shelf, "MOST", 3)
+def test_the_oldest_give_way_also_those_of_the_process_before(tmp_path: Path) -> None:
     tile = np.zeros((2, 4, 4), np.float16), np.ones((4, 4), bool)
     for first in (0, 2):
-        shelf = TileShelf(tmp_path, "here")
+        shelf = TileShelf(tmp_path, "here", most=3)
         for i in range(first, first + 2):
             shelf.put(str(i), *tile)
     held = [i for i in range(4) if shelf.take(str(i)) is not None]

@@ -9,7 +9,7 @@ from terrafix.anchor.map_features import CACHE_BYTES, Describer
 from terrafix.anchor.map_layers import LayerChoice
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import FrameMatcher, Look, View
-from terrafix.anchor.tile_shelf import TileShelf
+from terrafix.anchor.tile_shelf import MOST, TileShelf
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
@@ -44,7 +44,9 @@ class Layers:
         self._all: dict[str, Dated] = {}
         for layer in layers:
             bound = package.bind(frame, layer.table)
-            kept = None if shelf is None else TileShelf(shelf, f"{_file(package)} {frame} {layer.table}")
+            kept = None
+            if shelf is not None:
+                kept = TileShelf(shelf, f"{_file(package)} {frame} {layer.table}", MOST // len(layers))
             matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers), kept)
             stated = ce90_m if layer.ce90_m is None else layer.ce90_m
             self._all[layer.table] = Dated(bound, matcher, AgreedPose(bound, matcher), stated / CE90_SIGMAS)

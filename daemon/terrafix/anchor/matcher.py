@@ -31,8 +31,8 @@ MAX_WINDOW_VALUES = 8 * 640**2
 PATCH_PER_AGL = 0.25  # side of a patch: 25 m at 100 m, one house and its surroundings
 MIN_PATCH_CELLS = 8
 REACH = 0.08  # search of a patch around its expected place, share of the height
-# A cell of a learned model sees a hundred pixels around it, so that neighbours err together: at wrong places up to 17
-# patches of one pose agreed, at right ones 15 to 48.
+# A cell of a learned model sees a hundred pixels around it, so that neighbours err together. With 14 asked for five of
+# 560 frames from elsewhere had a pose, with 20 none of 640; at right places 15 to 48 agree (docs/models.md).
 LEARNED_INLIERS = 20
 FIRST_REACH, FIRST_THRESHOLD = 0.2, 0.05  # of the first pass, while the tilt is not known
 WELL_KNOWN_RAD = np.radians(3.0)

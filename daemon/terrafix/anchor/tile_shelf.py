@@ -13,7 +13,7 @@ import numpy as np
 
 from terrafix.core.rundir import leave, left
 
-MOST = 96  # of 1 MB each: what a flight in sight of one place uses is some 20
+MOST = 96  # of all layers, of 1 MB each: what a flight in sight of one place uses is some 20
 
 
 class _Written(msgspec.Struct, frozen=True):
@@ -23,10 +23,11 @@ class _Written(msgspec.Struct, frozen=True):
 
 
 class TileShelf:
-    """``of``: all that the descriptors follow from, but for who describes and which tile it is."""
+    """``of``: all that the descriptors follow from, but for who describes and which tile it is. At ``most`` so many."""
 
-    def __init__(self, folder: Path, of: str) -> None:
+    def __init__(self, folder: Path, of: str, most: int = MOST) -> None:
         self._folder = folder
+        self._most = most
         self._prefix = hashlib.sha256(of.encode()).hexdigest()[:16]
         with suppress(OSError):  # no room: nothing is kept
             folder.mkdir(exist_ok=True)
@@ -50,7 +51,7 @@ class TileShelf:
         file = self._file(name)
         leave(file, msgspec.msgpack.encode(_Written((c, h, w), descriptors.tobytes(), valid.tobytes())))
         self._files.append(file)
-        while len(self._files) > MOST:
+        while len(self._files) > self._most:
             with suppress(OSError):
                 self._files.popleft().unlink()
 
