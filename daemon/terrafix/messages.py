@@ -316,6 +316,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     velocity_sigma_mps: float
     q_w_b: Quat
     cov: Mat6  # of the body pose
+    map_sigma_m: float = 0.0  # of it, per horizontal axis: the error of the map itself, as that states it
     source_label: SourceLabel
     covariance_mode: CovarianceMode
     last_anchor_age_ms: int  # -1: never anchored
@@ -381,6 +382,7 @@ class GpsInput(Message, frozen=True, kw_only=True):
     estimate_age_ms: float  # age of the estimate that this was carried forward from; -1: none
     caution: int = 0  # rung of the caution ladder: 1, 2, 3 from 5, 15, 35 s without a map fix
     unanchored_s: float | None = None  # seconds since the last map fix; None: nothing was believed yet
+    map_offset_m: tuple[float, float] = (0.0, 0.0)  # east, north: error of the map that was taken out (MapOffset)
     reason: str = ""  # why fix_type is not 3
 
 
@@ -437,6 +439,17 @@ class GnssVerdict(Message, frozen=True, kw_only=True):
     distance_m: float | None  # from our estimate
     sigmas: float | None  # the same in standard deviations, when both claims are honest
     reason: str = ""
+
+
+class MapOffset(Message, frozen=True, kw_only=True):
+    """How far off the map is, as a receiver that is trusted shows it; on every change. ``t_ns``: of what was learnt."""
+
+    map_sigma_m: float  # which map: what it states of itself, 1-sigma per horizontal axis
+    lat_deg: float  # where it was learnt last
+    lon_deg: float
+    # Error of the map east and north [m], of the receiver [m], age of its readings less what is assumed [s]
+    state: tuple[float, ...]
+    cov: tuple[float, ...]  # 5x5, row-major
 
 
 class PositionSource(Message, frozen=True, kw_only=True):
@@ -534,6 +547,7 @@ AnyMessage = (
     | GnssReading
     | GnssStart
     | GnssVerdict
+    | MapOffset
     | PositionSource
     | FilterStatus
     | WallClock

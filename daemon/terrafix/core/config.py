@@ -51,6 +51,7 @@ class LinkSection(Section, frozen=True, kw_only=True):
     outputs: list[OutputName] = []  # empty: by the autopilot, gps_input for ArduPilot, global_position for PX4
     gnss: GnssMode = "advise"  # what follows when a receiver disagrees with the map
     gnss_start: bool = True  # a receiver says where the flight begins, if nobody else does
+    map_offset: bool = True  # what a trusted receiver shows of the map's own error is taken out of what is sent
     nmea_device: str = ""  # also NMEA 0183 to this device
     nmea_baud: Baud = 115_200
     msp_device: str = ""  # also MSP2_SENSOR_GPS to this device

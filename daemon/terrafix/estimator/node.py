@@ -287,6 +287,7 @@ class EstimatorNode:
             velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(placed.velocity_cov)[-1])),  # of the worst direction
             q_w_b=quat_from_rot(estimator.body(placed)),
             cov=tuple(float(c) for c in cov.ravel()),
+            map_sigma_m=estimator.map_sigma_m,
             source_label=label,
             covariance_mode=self._mode,
             last_anchor_age_ms=age_ms,

@@ -143,7 +143,12 @@ def offset(lat_deg: float, lon_deg: float, e_m: float, n_m: float) -> tuple[floa
     return lat_deg + n_m / north, math.remainder(lon_deg + e_m / east, 360.0)
 
 
+def apart_m(start: tuple[float, float], end: tuple[float, float]) -> tuple[float, float]:
+    """From one place (latitude, longitude [deg]) to another near it: metres east and north."""
+    north, east = metres_per_degree((start[0] + end[0]) / 2)
+    return math.remainder(end[1] - start[1], 360.0) * east, (end[0] - start[0]) * north
+
+
 def distance_m(lat1_deg: float, lon1_deg: float, lat2_deg: float, lon2_deg: float) -> float:
     """Distance of two near points in metres; far ones come out as far, which is all that the gate asks."""
-    north, east = metres_per_degree((lat1_deg + lat2_deg) / 2)
-    return math.hypot((lat2_deg - lat1_deg) * north, math.remainder(lon2_deg - lon1_deg, 360.0) * east)
+    return math.hypot(*apart_m((lat1_deg, lon1_deg), (lat2_deg, lon2_deg)))

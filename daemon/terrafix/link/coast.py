@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.link.carry import metres_per_degree
+from terrafix.link.carry import metres_per_degree, offset
 from terrafix.link.fix import FIX_3D
 from terrafix.link.gnss import FIX_2D, RECEIVERS
 from terrafix.messages import Coasted, GpsInput
@@ -41,7 +41,7 @@ class Filter(msgspec.Struct, frozen=True):
 
 
 class LastFix(msgspec.Struct, frozen=True):
-    """Our last 3D fix with its 1-sigma, and the autopilot's filter at the same time."""
+    """Our last 3D fix in the frame of the map, with its 1-sigma, and the autopilot's filter at the same time."""
 
     filter: Filter
     lat_deg: float
@@ -148,7 +148,8 @@ def _moved(last: LastFix, said: Filter, t_ns: int) -> Iterator[Coasted]:
 
 
 def _place(gps: GpsInput) -> tuple[float, ...]:
-    return gps.lat_deg, gps.lon_deg, gps.ve_mps, gps.vn_mps, -gps.vd_mps
+    """On the map, as the estimator knows it, with the map's own error."""
+    return *offset(gps.lat_deg, gps.lon_deg, *gps.map_offset_m), gps.ve_mps, gps.vn_mps, -gps.vd_mps
 
 
 def _vec3(v: Sequence[float] | np.ndarray) -> Vec3:

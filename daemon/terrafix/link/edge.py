@@ -31,6 +31,7 @@ from terrafix.link.transport import Transport, open_at_start
 from terrafix.messages import (
     GpsInput,
     LinkStatus,
+    MapOffset,
     Message,
     Origin,
     PositionHint,
@@ -144,6 +145,8 @@ class MavlinkEdge:
             case Origin():
                 if message.ground_amsl_m is not None:
                     self._start = Place(message.lat_deg, message.lon_deg, message.ground_amsl_m)
+            case MapOffset():
+                self._keeper.learnt(message)
             case PositionSource():
                 self._switch.order(message, self._outputs.names(self._partner.firmware))
             case StatusText():

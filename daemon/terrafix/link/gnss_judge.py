@@ -13,7 +13,7 @@ alarms. What these tests reach is in docs/autopilot.md, "The GNSS judge"."""
 import math
 from dataclasses import dataclass
 
-from terrafix.link.carry import Carried, distance_m
+from terrafix.link.carry import Carried, apart_m
 from terrafix.link.gnss_forecast import LAG_S, OffsetForecast
 from terrafix.messages import GnssReading, GnssState
 
@@ -172,7 +172,7 @@ def _why_lost(reading: GnssReading) -> str:
 
 def _offset(here: _Last, claimed_m: float | None, vision: Carried, last: _Last | None) -> Offset:
     """``claimed_m``: 1-sigma of the receiver, by its own word. ``last``: the reading before."""
-    metres = _metres(vision.lat_deg, vision.lon_deg, here.lat_deg, here.lon_deg)
+    metres = complex(*apart_m((vision.lat_deg, vision.lon_deg), (here.lat_deg, here.lon_deg)))
     receiver_m = UNKNOWN_M if claimed_m is None else max(LEAST_M, claimed_m)
     sigma_m = math.hypot(vision.horizontal_sigma_m, receiver_m)
     speed_mps = abs(here.velocity_mps)
@@ -183,15 +183,7 @@ def _offset(here: _Last, claimed_m: float | None, vision: Carried, last: _Last |
     slip_m = 0j
     if last is not None:
         way_m = 0.5 * (last.velocity_mps + here.velocity_mps) * ((here.t_ns - last.t_ns) * 1e-9)
-        slip_m = _metres(last.lat_deg, last.lon_deg, here.lat_deg, here.lon_deg) - way_m
+        slip_m = complex(*apart_m((last.lat_deg, last.lon_deg), (here.lat_deg, here.lon_deg))) - way_m
     at_its_ends_m = math.sqrt(2.0) * math.hypot(receiver_m, DELAY_SIGMA_S * speed_mps)
     slip_sigma_m = math.hypot(LAG_S * vision.speed_sigma_mps, at_its_ends_m)
     return Offset(metres, sigma_m, along_sigma_m, sigmas, slip_m, slip_sigma_m)
-
-
-def _metres(from_lat_deg: float, from_lon_deg: float, lat_deg: float, lon_deg: float) -> complex:
-    """From one place to another: east + j north."""
-    east_m = distance_m(from_lat_deg, from_lon_deg, from_lat_deg, lon_deg)
-    north_m = distance_m(from_lat_deg, from_lon_deg, lat_deg, from_lon_deg)
-    eastward = math.remainder(lon_deg - from_lon_deg, 360.0)
-    return complex(math.copysign(east_m, eastward), math.copysign(north_m, lat_deg - from_lat_deg))

@@ -1,16 +1,19 @@
 """What follows from the judgement of the receivers: a word to the pilot, and if it may, the autopilot's switch."""
 
+import math
 from collections import deque
 from collections.abc import Iterator
 
 from terrafix.core.config import GnssMode
 from terrafix.link.carry import Attitudes, Carried, carry, distance_m
 from terrafix.link.gnss_judge import DELAY_S, VISION_OLD_S, VISION_VAGUE_M, Opinion, ReceiverJudge
+from terrafix.link.map_offset import MapOffsets
 from terrafix.link.words import CRITICAL, INFO, NOTICE, WARNING, words
 from terrafix.messages import (
     GnssReading,
     GnssState,
     GnssVerdict,
+    MapOffset,
     Message,
     NavEstimate,
     PositionSource,
@@ -23,14 +26,18 @@ STEPS_NS = 10 * NS_PER_S  # for so long a step of our own estimate makes a disag
 OURS_GOOD_NS = 2 * NS_PER_S  # of 3D fixes of our own before anybody is switched onto them
 BACK_NS = 30 * NS_PER_S  # on us for so long at least, and
 AGAIN_NS = 5 * NS_PER_S  # on the receiver for so long: who is spoofed twice need not wait
+WORTH_A_WORD_M = 3.0  # of the map's error
 BAD = (GnssState.LOST, GnssState.SPOOFED)
 
 
 class GnssWatch:
     """``accepted`` each estimate that the link believes, ``reading`` each of a receiver, ``tick`` at every send."""
 
-    def __init__(self, mode: GnssMode) -> None:
+    def __init__(self, mode: GnssMode, offsets: MapOffsets | None = None) -> None:
+        """``offsets`` None: the map's error is not learnt."""
         self._mode = mode
+        self._offsets = offsets
+        self._said_offset = False
         self._judges: dict[int, ReceiverJudge] = {}
         self._said: dict[int, tuple[GnssState, int]] = {}  # receiver -> (state, when said)
         self._estimate: NavEstimate | None = None
@@ -57,8 +64,18 @@ class GnssWatch:
         while self._steps and reading.t_ns - self._steps[0][0] > STEPS_NS:
             self._steps.popleft()
         own_step_m = max((step_m for _, step_m in self._steps), default=0.0)
-        opinion = judge.take(reading, self._vision(reading.t_ns, attitudes), own_step_m)
+        vision = self._vision(reading.t_ns, attitudes)
+        opinion = judge.take(reading, vision, own_step_m)
+        if self._offsets is not None:
+            trusted = opinion.state is GnssState.TRUSTED
+            learnt = self._offsets.take(reading, vision, self._estimate, trusted=trusted)
+            if learnt is not None:
+                yield from self._say_offset(learnt, reading)
         yield from self._say(reading.receiver, opinion, reading.t_ns)
+
+    def less_map_offset(self, estimate: NavEstimate, now_ns: int) -> tuple[NavEstimate, tuple[float, float]]:
+        """See MapOffsets.corrected."""
+        return (estimate, (0.0, 0.0)) if self._offsets is None else self._offsets.corrected(estimate, now_ns)
 
     def tick(self, now_ns: int, *, good: bool) -> Iterator[Message]:
         """``good``: we send a 3D fix now."""
@@ -96,6 +113,13 @@ class GnssWatch:
         text = self._text(receiver + 1, before, opinion) if changed else None
         if text is not None:
             yield words(now_ns, *text)
+
+    def _say_offset(self, learnt: MapOffset, reading: GnssReading) -> Iterator[Message]:
+        yield learnt
+        off_m = math.hypot(*learnt.state[:2])
+        if not self._said_offset and off_m >= WORTH_A_WORD_M:
+            self._said_offset = True
+            yield words(reading.t_ns, INFO, f"map is {off_m:.0f} m off GPS {reading.receiver + 1}")
 
     def _text(self, number: int, before: GnssState, opinion: Opinion) -> tuple[int, str] | None:
         """What the pilot reads; a receiver that never was there is no news."""

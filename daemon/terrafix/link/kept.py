@@ -1,5 +1,6 @@
 """What a link leaves to the one that is started in its place: which autopilot it served, while that was armed, where
-its filter was with our last fix (coast.py), and by how much its home was moved (core/takeoff_height.py).
+its filter was with our last fix (coast.py), by how much its home was moved (core/takeoff_height.py), and how far off
+the map is (map_offset.py).
 
 An autopilot says who it is once a second, and its attitude long before. Who knows it already can say where it leans
 with the first packet, which is what the estimator waits for after a restart in flight."""
@@ -10,6 +11,7 @@ import msgspec
 
 from terrafix.core.rundir import leave, left
 from terrafix.link.coast import LastFix
+from terrafix.messages import MapOffset
 
 
 class ArmedAutopilot(msgspec.Struct, frozen=True):
@@ -24,17 +26,24 @@ class Kept(msgspec.Struct, frozen=True):
     autopilot: ArmedAutopilot
     last: LastFix | None = None
     home_moved_m: float = 0.0
+    map_offset: MapOffset | None = None
+
+
+def kept(file: Path | None) -> Kept | None:
+    """What the link before this one left; None: there was none in this flight."""
+    return left(file, msgspec.json.Decoder(Kept).decode)
 
 
 class AutopilotKeeper:
-    """``heard`` after every HEARTBEAT of the autopilot, ``flies`` after each fix. One that is not armed is
-    not kept: a vehicle on the ground stands where its flight begins, and nobody may believe that of one that has taken
-    off meanwhile."""
+    """``heard`` after every HEARTBEAT of the autopilot, ``flies`` after each fix, ``learnt`` with each MapOffset.
+
+    One that is not armed is not kept: a vehicle on the ground stands where its flight begins, and nobody may believe
+    that of one that has taken off meanwhile."""
 
     def __init__(self, file: Path | None) -> None:
         """``file`` None: nothing is kept."""
         self._file = file
-        self.found = left(file, msgspec.json.Decoder(Kept).decode)
+        self.found = kept(file)
         self._kept = self.found
 
     def heard(self, autopilot: ArmedAutopilot | None) -> None:
@@ -46,7 +55,11 @@ class AutopilotKeeper:
 
     def flies(self, last: LastFix | None, home_moved_m: float) -> None:
         if self._kept is not None:
-            self._keep(Kept(self._kept.autopilot, last, home_moved_m))
+            self._keep(msgspec.structs.replace(self._kept, last=last, home_moved_m=home_moved_m))
+
+    def learnt(self, map_offset: MapOffset) -> None:
+        if self._kept is not None:
+            self._keep(msgspec.structs.replace(self._kept, map_offset=map_offset))
 
     def _keep(self, kept: Kept | None) -> None:
         if self._file is None or kept == self._kept:

@@ -12,6 +12,8 @@ from terrafix.link.filter_watch import FilterWatch
 from terrafix.link.gate import EstimateGate
 from terrafix.link.gnss_start import GnssStarts
 from terrafix.link.gnss_watch import GnssWatch
+from terrafix.link.kept import kept
+from terrafix.link.map_offset import MapOffsets
 from terrafix.link.pacer import Pacer
 from terrafix.link.words import CRITICAL, INFO, NOTICE, WARNING, words
 from terrafix.messages import (
@@ -40,8 +42,9 @@ CLOCK_STEP_NS = 500_000_000  # a wall clock that moves less stays latched: the w
 
 
 def make_node(ctx: NodeContext) -> "LinkNode":
-    link = ctx.config.link
-    return LinkNode(link.rate_hz, link.gnss, gnss_start=link.gnss_start)
+    link, before = ctx.config.link, kept(ctx.kept)
+    offsets = MapOffsets(None if before is None else before.map_offset) if link.map_offset else None
+    return LinkNode(link.rate_hz, link.gnss, gnss_start=link.gnss_start, map_offsets=offsets)
 
 
 def make_edge(ctx: NodeContext) -> Edge:
@@ -55,14 +58,21 @@ def make_edge(ctx: NodeContext) -> Edge:
 
 
 class LinkNode:
-    """Hears estimates, says GpsInput at ``rate_hz``."""
+    """Hears estimates, says GpsInput at ``rate_hz``. ``map_offsets`` None: the map's error is not learnt."""
 
-    def __init__(self, rate_hz: float, gnss: GnssMode = "advise", *, gnss_start: bool = True) -> None:
+    def __init__(
+        self,
+        rate_hz: float,
+        gnss: GnssMode = "advise",
+        *,
+        gnss_start: bool = True,
+        map_offsets: MapOffsets | None = None,
+    ) -> None:
         self._pacer = Pacer(rate_hz, TICK_HZ)
         self._gate = EstimateGate()
         self._fix = fix.FixGate()
         self._attitudes = Attitudes()
-        self._gnss = GnssWatch(gnss)
+        self._gnss = GnssWatch(gnss, map_offsets)
         self._starts = GnssStarts(wanted=gnss_start)
         self._asking = Asking()
         self._filter = FilterWatch()
@@ -221,7 +231,8 @@ class LinkNode:
         if estimate is None:
             nobody = self._estimator_gone or "no estimate yet"
             return self._no_fix(now_ns, fix.Why(nobody, nobody), -1.0)
-        carried = carry(estimate, now_ns, self._attitudes)
+        sent, map_offset_m = self._gnss.less_map_offset(estimate, now_ns)
+        carried = carry(sent, now_ns, self._attitudes)
         horizontal_m, vertical_m, speed_mps = fix.reported_accuracy(carried, self._rung)
         if self._gate.holding:
             why: fix.Why | None = fix.Why(self._gate.holding, "the position has jumped")
@@ -237,7 +248,8 @@ class LinkNode:
             return self._no_fix(now_ns, why, carried.age_s * 1e3)
         self._no_fix_because = None
         caution = record.Caution(self._rung, self._unanchored_s(now_ns))
-        return record.with_fix(carried, (horizontal_m, vertical_m, speed_mps), self._week(carried.t_ns), caution)
+        accuracy = horizontal_m, vertical_m, speed_mps
+        return record.with_fix(carried, accuracy, self._week(carried.t_ns), caution, map_offset_m)
 
     def _no_fix(self, now_ns: int, why: fix.Why, age_ms: float) -> GpsInput:
         self._no_fix_because = why

@@ -20,9 +20,14 @@ class Caution:
 
 
 def with_fix(
-    carried: Carried, accuracy: tuple[float, float, float], week: tuple[int, int], caution: Caution
+    carried: Carried,
+    accuracy: tuple[float, float, float],
+    week: tuple[int, int],
+    caution: Caution,
+    map_offset_m: tuple[float, float],
 ) -> GpsInput:
-    """``accuracy``: horizontal and vertical [m], speed [m/s]; ``week``: GPS week and its millisecond."""
+    """``accuracy``: horizontal and vertical [m], speed [m/s]; ``week``: GPS week and its millisecond; ``map_offset_m``:
+    what was taken out of ``carried``."""
     ve, vn, vu = carried.velocity_enu_mps
     return GpsInput(
         t_ns=carried.t_ns,
@@ -44,6 +49,7 @@ def with_fix(
         estimate_age_ms=carried.age_s * 1e3,
         caution=caution.rung,
         unanchored_s=caution.unanchored_s,
+        map_offset_m=map_offset_m,
     )
 
 

@@ -149,6 +149,11 @@ def _gps(view: FlightView) -> list[tuple[float | None, str]]:
     first = next((t for t, g in view.gps if g.fix_type >= FIX_3D), None)
     if first is not None:
         said.append((first, "First GPS_INPUT with a 3D fix."))
+    corrected = [(t, math.hypot(*g.map_offset_m)) for t, g in view.gps if any(g.map_offset_m)]
+    if corrected:
+        most_m = max(off_m for _, off_m in corrected)
+        text = f"GPS_INPUT leaves the map, which a trusted receiver shows to be off, by {most_m:.1f} m at most."
+        said.append((corrected[0][0], text + " Estimates are positions on the map."))
     return said
 
 

@@ -10,12 +10,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
+from terrafix.link.map_offset import MapOffsets
 from terrafix.link.node import LinkNode
 from terrafix.messages import (
     CovarianceMode,
     GnssReading,
     GnssState,
     GnssVerdict,
+    GpsInput,
     NavEstimate,
     SourceLabel,
     VehicleState,
@@ -51,15 +53,18 @@ class Told:
 
     states: list[tuple[float, GnssState]] = field(default_factory=list)
     lost_fix_s: float | None = None  # when the receiver's own fix was gone
+    # What was sent, once a second: time [s], error east and north, 1-sigma as it was claimed [m]
+    sent: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def first(self, after_s: float, *wanted: GnssState) -> float | None:
         return next((t for t, state in self.states if t >= after_s and state in wanted), None)
 
 
-def fly(duration_s: float, vision: Vision, events: tuple[AnyEvent, ...], seed: int) -> Told:
+def fly(duration_s: float, vision: Vision, events: tuple[AnyEvent, ...], seed: int, *, map_offset: bool = True) -> Told:
+    """``map_offset``: the map's error is learnt from the receiver."""
     draw = random.Random(f"{seed} judge")
     gnss = Gnss(FRAME, seed=seed, events=events)
-    node = LinkNode(10.0)
+    node = LinkNode(10.0, map_offsets=MapOffsets() if map_offset else None)
     course, estimator, told = _Course(draw), _Estimator(vision, draw), Told()
     coming: list[tuple[float, NavEstimate]] = []
     before: GnssState | None = None
@@ -84,6 +89,10 @@ def fly(duration_s: float, vision: Vision, events: tuple[AnyEvent, ...], seed: i
             if isinstance(message, GnssVerdict) and message.state is not before:
                 before = message.state
                 told.states.append((t_s, message.state))
+            elif isinstance(message, GpsInput) and message.fix_type >= 3 and step % round(1.0 / STEP_S) == 0:
+                e, n = FRAME.to_local(message.lat_deg, message.lon_deg)
+                off = np.array([e, n]) - state.p_b_in_w_m[:2]
+                told.sent.append((t_s, float(off[0]), float(off[1]), message.horiz_accuracy_m))
     return told
 
 
@@ -144,6 +153,7 @@ class _Estimator:
             velocity_sigma_mps=self._vision.velocity_sigma_mps,
             q_w_b=(1.0, 0.0, 0.0, 0.0),
             cov=tuple(cov),
+            map_sigma_m=self._vision.sigma_m * math.sqrt(self._vision.steady_share),
             source_label=SourceLabel.DEAD_RECKONED if blind_s else SourceLabel.SATELLITE_ANCHORED,
             covariance_mode=CovarianceMode.MARGINALS,
             last_anchor_age_ms=round(blind_s * 1000),
