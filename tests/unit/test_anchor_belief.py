@@ -1,5 +1,7 @@
 """The belief over the map: what every look, motion and blur does to the mass, hypothesis by hypothesis."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,18 @@ def test_mass_is_conserved_whatever_happens() -> None:
         assert mass_of(belief) == pytest.approx(1.0, abs=1e-9)
         assert belief._mass.min() >= 0.0
         assert 0.0 < belief.mode().mass <= 1.0
+
+
+def test_many_headings_need_no_more_memory_than_a_few() -> None:
+    belief = Belief(0.0, 0.0, 500.0, CELL_M)
+    one = surface([(0.0, 0.0, 4.0)])
+    tracemalloc.start()
+    try:
+        belief.update((one,) * 40, 0.5)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 10 * belief._mass.nbytes
 
 
 def test_a_look_finds_the_place() -> None:

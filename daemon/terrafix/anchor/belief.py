@@ -97,7 +97,9 @@ class Belief:
         is new ground (the same ground seen again proves little).
 
         -> log likelihood ratio of the belief as a whole, "the camera is where it says against elsewhere"."""
-        llr = np.maximum.reduce([self._log_likelihood(s) for s in surfaces])
+        llr = self._log_likelihood(surfaces[0])
+        for surface in surfaces[1:]:  # one at a time: of a wide window and many headings all together are a gigabyte
+            np.maximum(llr, self._log_likelihood(surface), out=llr)
         self._mass = self._mass * np.exp(weight * llr)
         total = float(self._mass.sum())
         self._mass /= total
