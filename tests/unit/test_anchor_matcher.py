@@ -56,6 +56,19 @@ def matcher(ground: np.ndarray) -> FrameMatcher:
     return FrameMatcher(PINHOLE, FlatMap(ground), GradientDescriber())  # type: ignore[arg-type]
 
 
+def test_a_frame_is_blurred_once_for_all_headings(
+    matcher: FrameMatcher, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = [matcher.rectified(frame, seen_from(), [Hypothesis(0.3 * k, 1.0)], 2.0, 1)[0] for k in range(5)]
+    blur, calls = cv2.GaussianBlur, []
+    monkeypatch.setattr(cv2, "GaussianBlur", lambda *a: calls.append(a) or blur(*a))
+    together = matcher.rectified(frame, seen_from(), [Hypothesis(0.3 * k, 1.0) for k in range(5)], 2.0, 1)
+    assert len(calls) == 1
+    for one, other in zip(alone, together, strict=True):
+        assert one is not None and other is not None
+        assert np.array_equal(one.image, other.image) and np.array_equal(one.mask, other.mask)
+
+
 # --- the grid of hypotheses -----------------------------------------------------------------------
 
 

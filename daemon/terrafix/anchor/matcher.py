@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -160,9 +161,22 @@ class FrameMatcher:
         return _pairs(yaws, scales)
 
     def rectified(
-        self, image: Image, view: View, hypothesis: Hypothesis, gsd_m: float, stride: int
-    ) -> Rectified | None:
-        return self._rectified(image, view, hypothesis, gsd_m, stride)
+        self, image: Image, view: View, hypotheses: Sequence[Hypothesis], gsd_m: float, stride: int
+    ) -> list[Rectified | None]:
+        """One for each hypothesis; None: it sees no ground."""
+        blurred: dict[float, Image] = {}
+        return [
+            rectify(
+                image,
+                self.camera,
+                local_rotation_up(h.yaw_rad) @ view.r_w_c,
+                view.agl_m * h.scale,
+                gsd_m,
+                stride,
+                blurred,
+            )
+            for h in hypotheses
+        ]
 
     def look(self, image: Image, view: View, belief: Window) -> Look:
         """Correlation over the belief's window, for every rotation and scale that the prediction leaves open."""
@@ -182,7 +196,7 @@ class FrameMatcher:
             return Look(Verdict.TOO_LOW)
         cell = gsd * stride
         footprint_m = float(np.sqrt(first.mask.sum())) * gsd
-        frames = [first if h == AS_PREDICTED else self._rectified(image, view, h, gsd, stride) for h in hypotheses]
+        frames = [first] if hypotheses == (AS_PREDICTED,) else self.rectified(image, view, hypotheses, gsd, stride)
         usable = [(h, f) for h, f in zip(hypotheses, frames, strict=True) if f is not None]
         reach = [self._offsets(f) for _, f in usable]
         e_min = belief.centre[0] - belief.half_m + min(r[0] for r in reach)
@@ -271,10 +285,6 @@ class FrameMatcher:
 
     def _gsd(self, agl_m: float, per_agl: dict[str, float], describer: Describer) -> float:
         return self.cell_m(agl_m, per_agl[describer.name])
-
-    def _rectified(self, image: Image, view: View, hypothesis: Hypothesis, gsd: float, stride: int) -> Rectified | None:
-        r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
-        return rectify(image, self.camera, r_w_c, view.agl_m * hypothesis.scale, gsd, stride)
 
     def _offsets(self, frame: Rectified) -> tuple[float, float, float, float]:
         """Box of a rectified frame around the nadir: e_min, n_max, e_max, n_min."""

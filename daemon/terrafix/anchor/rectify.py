@@ -38,9 +38,16 @@ def footprint(camera: CameraCalibration, r_w_c: np.ndarray, agl_m: float) -> tup
 
 
 def rectify(
-    image: Image, camera: CameraCalibration, r_w_c: np.ndarray, agl_m: float, gsd_m: float, stride: int = 1
+    image: Image,
+    camera: CameraCalibration,
+    r_w_c: np.ndarray,
+    agl_m: float,
+    gsd_m: float,
+    stride: int = 1,
+    blurred: dict[float, Image] | None = None,
 ) -> Rectified | None:
-    """Onto flat ground ``agl_m`` below the camera. Sides are multiples of ``stride`` pixels."""
+    """Onto flat ground ``agl_m`` below the camera. Sides are multiples of ``stride`` pixels. ``blurred``: the same
+    image by how far it was blurred, kept for other headings."""
     box = footprint(camera, r_w_c, agl_m)
     if box is None:
         return None
@@ -51,7 +58,12 @@ def rectify(
     ground = np.array([[gsd_m, 0.0, e_min + 0.5 * gsd_m], [0.0, -gsd_m, n_max - 0.5 * gsd_m], [0.0, 0.0, -agl_m]])
     to_camera = r_w_c.T @ ground  # rectified pixel (x, y, 1) -> ray in the camera
     shrink = gsd_m / (agl_m / camera.fx)
-    source = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink) if shrink > 1.4 else image  # against aliasing
+    source = image
+    if shrink > 1.4:  # against aliasing
+        blurred = {} if blurred is None else blurred
+        if shrink not in blurred:
+            blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
+        source = blurred[shrink]
     if camera.distortion:
         x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
         rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ to_camera.T

@@ -104,7 +104,7 @@ class MapSearch:
         if not self._blocks:
             self._begin(view)
         stride = self._wide.stride
-        frames = [self._matcher.rectified(image, view, h, self._cell_m / stride, stride) for h in self._hypotheses]
+        frames = self._matcher.rectified(image, view, self._hypotheses, self._cell_m / stride, stride)
         templates = [self._wide.describe(frame) for frame in frames if frame is not None]
         if len(templates) < len(frames):
             return

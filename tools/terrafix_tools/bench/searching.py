@@ -102,7 +102,7 @@ def _looks(
     turns = [Hypothesis(2.0 * math.pi * k / headings, 1.0) for k in range(headings)] if headings else None
 
     def look(frame: Image) -> None:
-        seen = [matcher.rectified(frame, view, h, cell_m, 1) for h in turns or matcher.wide_hypotheses(view)]
+        seen = matcher.rectified(frame, view, turns or matcher.wide_hypotheses(view), cell_m, 1)
         wide.look([wide.describe(one) for one in seen if one is not None], blocks[:tiles], cell_m)
 
     return [lambda frame=frame: look(frame) for frame in frames]  # type: ignore[misc]
