@@ -26,6 +26,7 @@ from terrafix.estimator.pace import Pace
 from terrafix.estimator.resume import Known
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
+from terrafix.estimator.told_height import ToldHeights
 from terrafix.estimator.velocity import (
     STANDING_M,
     V_SIZE,
@@ -79,6 +80,7 @@ class Advance:
     placed: Placed
     step_m: np.ndarray  # (2,) east, north since the frame before, by odometry alone
     step_sigma_m: float
+    height: Verdict = Verdict.ACCEPTED  # of the height that was told, if any
 
 
 class Tracker:
@@ -110,6 +112,7 @@ class Tracker:
         self._beginning = Beginning(origin, known)
         self._open: OpenHeading | None = None  # None: the heading is known
         self._coasts = Coasts()
+        self._heights = ToldHeights()
 
     @property
     def last(self) -> Placed | None:
@@ -202,6 +205,11 @@ class Tracker:
             if way is not None:
                 way, spread, gained = believed(way, p - led_to, spread, seen)
                 velocity = velocity + gained  # or a leg that is right would seem to be in its tail (factors.py)
+        height = Verdict.ACCEPTED
+        if self._cannot_be_so_high(attitude, p, before, float(spread[2, 2])):
+            if self._heights.begins and self.last_fix_s is None:
+                return self._begin(frame_id, t_s, attitude, felt)
+            attitude, height = replace(attitude, agl_m=None), Verdict.IMPLAUSIBLE
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
         state = NodeState(pose, before.bias, velocity)
@@ -232,7 +240,19 @@ class Tracker:
             self._seen_s = t_s
             self._pace.seen(t_s, self._last.velocity_mps, self._last.velocity_cov)
             self._learn_wind(self._last, attitude)
-        return Advance(verdict, self._last, step, step_sigma)
+        return Advance(verdict, self._last, step, step_sigma, height)
+
+    def _cannot_be_so_high(self, attitude: Attitude, p_m: np.ndarray, before: NodeState, moved_m2: float) -> bool:
+        """What is told of the height, with the camera predicted at ``p_m`` (3,); ``moved_m2``: variance of the way up
+        since ``before``, the newest node."""
+        if attitude.agl_m is None or attitude.stands or self._last is None:
+            return False
+        ground_m = self.terrain.below(p_m)
+        expected_m = np.exp(before.bias[SCALE]) * (float(p_m[2] + before.bias[HEIGHT]) - ground_m)
+        told_m = (self.origin.ground_amsl_m or 0.0) + attitude.agl_m - ground_m
+        cov = tangent_to_world(self._last.cov, before.pose.rotation().matrix())
+        sigma_m = float(np.sqrt(self.origin.agl_sigma_m**2 + cov[2, 2] + moved_m2))
+        return self._heights.refuses(told_m - float(expected_m), sigma_m, self.last_fix_s)
 
     def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel, *, seen: bool) -> Leg:
         """From the newest node to now."""
@@ -307,6 +327,7 @@ class Tracker:
 
     def _begin(self, frame_id: int, t_s: float, attitude: Attitude, felt: Feel) -> Advance:
         begun = self._beginning.begun(t_s, attitude, self.terrain)
+        self._heights.begun()
         placed = self._start_graph(frame_id, t_s, attitude, begun.at_m, begun.sigma_m, begun.slow)
         self._be_led(placed.node, t_s, attitude, felt)
         self._last = self._placed(frame_id, t_s, placed.node)
