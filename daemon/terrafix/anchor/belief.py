@@ -123,10 +123,23 @@ class Belief:
 
     def mode(self) -> Mode:
         """The heaviest mode: centroid and mass within MODE_RADIUS_CELLS, and the mass of its best rival."""
+        return self.modes(1)[0]
+
+    def modes(self, count: int) -> list[Mode]:
+        """The heaviest ones, apart by twice that radius."""
         radius = MODE_RADIUS_CELLS
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)).astype(np.float64)
         gathered = cv2.filter2D(self._mass, -1, disc, borderType=cv2.BORDER_CONSTANT)
-        r, c = np.unravel_index(int(np.argmax(gathered)), gathered.shape)
+        found = []
+        left = gathered.copy()
+        for _ in range(count):
+            r, c = (int(v) for v in np.unravel_index(int(np.argmax(left)), left.shape))
+            found.append(self._mode_at(r, c, gathered))
+            left[max(r - 2 * radius, 0) : r + 2 * radius + 1, max(c - 2 * radius, 0) : c + 2 * radius + 1] = 0.0
+        return found
+
+    def _mode_at(self, r: int, c: int, gathered: np.ndarray) -> Mode:
+        radius = MODE_RADIUS_CELLS
         rows, columns = np.ogrid[: len(self._mass), : len(self._mass)]
         distance2 = (rows - r) ** 2 + (columns - c) ** 2
         near = np.where(distance2 <= radius**2, self._mass, 0.0)

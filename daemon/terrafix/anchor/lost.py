@@ -40,13 +40,18 @@ class LostWatch:
 
         ``claimed_m``: 1-sigma of the position. One that claims little is not wrong by more, and over so wide a belief
         the right place gains little, too; what comes after a way that nobody saw is no surer than a start."""
-        if claimed_m > max(WIDE * agl_m, WIDE_M):
+        if claims_little(claimed_m, agl_m):
             self.odds = min(self.odds, START_ODDS)
             return
         self.odds += min(max(gain - CHANCE * weight, LOOK_MIN * new), LOOK_MAX * weight)
         if inliers:
             self.odds += weight * pose_gain(inliers)
         self.odds = min(self.odds, MOST_ODDS)
+
+
+def claims_little(sigma_m: float, agl_m: float) -> bool:
+    """A position with this 1-sigma."""
+    return sigma_m > max(WIDE * agl_m, WIDE_M)
 
 
 def pose_gain(inliers: int) -> float:

@@ -6,10 +6,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from terrafix.anchor.alone import LIKELIHOOD_RATIO, PLACES, alone
 from terrafix.anchor.answer import coarse, ground_sigma_m, judged
 from terrafix.anchor.belief import Belief, cell_for
 from terrafix.anchor.layers import Dated, Layers
-from terrafix.anchor.lost import LostWatch
+from terrafix.anchor.lost import LostWatch, claims_little
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.matcher import view_at
@@ -230,7 +231,7 @@ class AnchorNode:
         )
         # Without a heading the belief spreads as fast as frames narrow it, until a pose tells the heading.
         tried = mode.mass >= MODE_TRIED or heading_is_open(prediction)
-        inliers = 0
+        inliers, likelihood_ratio = 0, POSE_LIKELIHOOD_RATIO
         if tried:
             answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
             if answer.verdict is Verdict.ACCEPTED:
@@ -241,6 +242,13 @@ class AnchorNode:
                 together = answer if agreed is None else judged(answer, agreed, view)
                 answer = together if together.verdict is Verdict.ACCEPTED else answer
         claimed_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
+        if not tried and new >= 1.0 and claims_little(claimed_m, view.agl_m):
+            place = alone(image, view, look, belief.modes(PLACES), used.map, used.matcher)
+            if place is not None:
+                mode, fix = place
+                answer = judged(msgspec.structs.replace(answer, mode_e_m=mode.e_m, mode_n_m=mode.n_m), fix, view)
+                tried = answer.verdict is Verdict.ACCEPTED
+                likelihood_ratio = LIKELIHOOD_RATIO
         self._watch.looked(gain, weight, new, inliers, claimed_m, view.agl_m)
         # Of the mixture "where it is believed to be, or anywhere": the variance that the second part adds.
         self._search.sigma_m = float(np.sqrt(self._watch.doubt)) * anywhere_m(best.map)
@@ -251,7 +259,7 @@ class AnchorNode:
         if not tried:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
         if answer.verdict is Verdict.ACCEPTED:
-            belief.confirm(mode, POSE_LIKELIHOOD_RATIO)
+            belief.confirm(mode, likelihood_ratio)
             mass = belief.mode().mass
             enough = Verdict.ACCEPTED if mass >= MODE_MASS else Verdict.AMBIGUOUS
             return msgspec.structs.replace(answer, verdict=enough, mode_mass=mass)
