@@ -175,9 +175,10 @@ class EstimatorNode:
         advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, self._righted.felt)
         self._tracked = advance.verdict is Verdict.ACCEPTED
         yield _odometry_verdict(odometry, advance.verdict)
-        if advance.height is not Verdict.ACCEPTED:
-            t_ns, frame_id, verdict = odometry.t_ns, odometry.frame_id, advance.height
-            yield MeasurementVerdict(t_ns=t_ns, frame_id=frame_id, measurement="height", verdict=verdict)
+        for name, verdict in (("attitude", advance.heading), ("height", advance.height)):
+            if verdict is not Verdict.ACCEPTED:
+                t_ns, frame_id = odometry.t_ns, odometry.frame_id
+                yield MeasurementVerdict(t_ns=t_ns, frame_id=frame_id, measurement=name, verdict=verdict)
         if odometry.verdict not in (Verdict.BAD_IMAGE, Verdict.STALLED):
             yield self._prediction(odometry, advance, estimator, seen)
             self._predicted = odometry.frame_id

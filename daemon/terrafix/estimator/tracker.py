@@ -1,5 +1,6 @@
 """From frame to frame: odometry, inertial readings, attitude and height become nodes and factors of the graph."""
 
+import math
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ from terrafix.estimator.pace import Pace
 from terrafix.estimator.resume import Known
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
-from terrafix.estimator.told_height import ToldHeights
+from terrafix.estimator.told import Told
 from terrafix.estimator.velocity import (
     STANDING_M,
     V_SIZE,
@@ -45,6 +46,7 @@ from terrafix.messages import Camera, CovarianceMode, Odometry, Origin, Verdict
 # lower than at take-off. On real flights the heading was 12 degrees and the height 8 % away from the log, and a compass
 # that is 15 degrees off must still be inside the search (1.5 sigma).
 COMPASS_BIAS_RAD = np.radians(10.0)
+COMPASS_SWING_RAD = np.radians(5.0)  # 1-sigma, by which that changes with the heading
 HEIGHT_BIAS = 0.05  # of the height
 TAKE_OFF_AWAY = 5.0  # heights: from where it took off to where it is first seen in the air, a climb at 20 %
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
@@ -80,7 +82,8 @@ class Advance:
     placed: Placed
     step_m: np.ndarray  # (2,) east, north since the frame before, by odometry alone
     step_sigma_m: float
-    height: Verdict = Verdict.ACCEPTED  # of the height that was told, if any
+    heading: Verdict = Verdict.ACCEPTED  # what became of what was told, if it was
+    height: Verdict = Verdict.ACCEPTED
 
 
 class Tracker:
@@ -112,7 +115,7 @@ class Tracker:
         self._beginning = Beginning(origin, known)
         self._open: OpenHeading | None = None  # None: the heading is known
         self._coasts = Coasts()
-        self._heights = ToldHeights()
+        self._heights, self._headings = Told(), Told()
 
     @property
     def last(self) -> Placed | None:
@@ -164,6 +167,11 @@ class Tracker:
         before, dt_s = self.graph.state(newest), max(t_s - self.graph.time_of(newest), 1e-3)
         answer = self._by_odometry(odometry, attitude)
         verdict, known = (answer, None) if isinstance(answer, Verdict) else (Verdict.ACCEPTED, answer)
+        heading = Verdict.ACCEPTED
+        if known is not None and self._cannot_head_so(attitude, known, before):
+            if self._headings.begins and self.last_fix_s is None:
+                return self._begin(frame_id, t_s, attitude, felt)
+            attitude, heading = replace(attitude, yaw_rad=None), Verdict.IMPLAUSIBLE
         if attitude.stands:
             self._take_off.stood()
         way = None if attitude.stands else self._leg(t_s, before, attitude, felt, seen=known is not None)
@@ -240,7 +248,18 @@ class Tracker:
             self._seen_s = t_s
             self._pace.seen(t_s, self._last.velocity_mps, self._last.velocity_cov)
             self._learn_wind(self._last, attitude)
-        return Advance(verdict, self._last, step, step_sigma, height)
+        return Advance(verdict, self._last, step, step_sigma, heading, height)
+
+    def _cannot_head_so(self, attitude: Attitude, seen: tuple[int, RelativePose], before: NodeState) -> bool:
+        """What is told of the heading, with the turn that odometry saw; ``before``: the newest node."""
+        if attitude.yaw_rad is None or attitude.stands or self._last is None or self._open is not None:
+            return False
+        parent, motion = seen
+        yaw_rad = self.camera.yaw_rad(self.graph.state(parent).pose.rotation().matrix() @ motion.r)
+        told_rad = self.camera.yaw_rad(self.camera.expected(attitude, before.bias))
+        cov = tangent_to_world(self._last.cov, before.pose.rotation().matrix())
+        sigma_rad = float(np.sqrt(np.radians(self.origin.yaw_sigma_deg) ** 2 + COMPASS_SWING_RAD**2 + cov[5, 5]))
+        return self._headings.refuses(math.remainder(told_rad - yaw_rad, math.tau), sigma_rad, self.last_fix_s)
 
     def _cannot_be_so_high(self, attitude: Attitude, p_m: np.ndarray, before: NodeState, moved_m2: float) -> bool:
         """What is told of the height, with the camera predicted at ``p_m`` (3,); ``moved_m2``: variance of the way up
@@ -328,6 +347,7 @@ class Tracker:
     def _begin(self, frame_id: int, t_s: float, attitude: Attitude, felt: Feel) -> Advance:
         begun = self._beginning.begun(t_s, attitude, self.terrain)
         self._heights.begun()
+        self._headings.begun()
         placed = self._start_graph(frame_id, t_s, attitude, begun.at_m, begun.sigma_m, begun.slow)
         self._be_led(placed.node, t_s, attitude, felt)
         self._last = self._placed(frame_id, t_s, placed.node)
