@@ -1,6 +1,7 @@
 """Replay with small stand-in nodes: files, columns, determinism, and what bad input says."""
 
 import csv
+import errno
 import json
 import math
 from collections.abc import Iterable
@@ -18,6 +19,7 @@ from terrafix import messages as m
 from terrafix.core.errors import ConfigError, MapError, ModelError, OutputError, UsageError
 from terrafix.core.node import Node, NodeContext
 from terrafix.recorder.reader import read_flight
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.estimates import COLUMNS, read_rows
 from terrafix_tools.replay import replay
 
@@ -198,6 +200,17 @@ def test_bad_configuration_and_output(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
         replay(folder, None, tmp_path / "file" / "out", nodes=nodes)
+
+
+def test_a_disk_that_is_full_is_one_line(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_self: FlightWriter) -> None:
+        if (tmp_path / "out" / "estimates.csv.partial").read_text(encoding="utf-8").count("\n") > 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(FlightWriter, "flush", full)
+    with pytest.raises(OutputError, match=r"cannot be written \(No space left on device\); is the disk full"):
+        replay(folder, None, tmp_path / "out", nodes=nodes)
+    assert not (tmp_path / "out" / "estimates.csv").exists()
 
 
 def test_thumbnails_follow_the_configuration(folder: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 import json
 from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -49,21 +51,24 @@ class ReplayOutput:
         return self
 
     def take(self, messages: list[Message]) -> None:
-        for message in messages:
-            self._record.write(message, message.t_ns)
-            self._table.take(message)
-            self._count(message)
+        with self._writing():
+            for message in messages:
+                self._record.write(message, message.t_ns)
+                self._table.take(message)
+                self._count(message)
 
     def frame_done(self, frame: Frame, image: Image | None, process_ms: float) -> None:
         """The row of the frame goes to the disk now, its refinement comes with the last word."""
         settings = self._config.recorder
-        if settings.thumbnails and image is not None:
-            self._record.write_thumbnail(frame.t_ns, frame.frame_id, thumbnail_jpeg(image, settings.thumbnail_width_px))
-        self._record.flush()
         row = self._table.rows[frame.frame_id]
         row.process_ms = process_ms
-        write_rows(self._csv, [row], head=False)
-        self._csv.flush()
+        with self._writing():
+            if settings.thumbnails and image is not None:
+                jpeg = thumbnail_jpeg(image, settings.thumbnail_width_px)
+                self._record.write_thumbnail(frame.t_ns, frame.frame_id, jpeg)
+            self._record.flush()
+            write_rows(self._csv, [row], head=False)
+            self._csv.flush()
 
     def counts(self) -> dict[str, Any]:
         """Frames, verdicts and times, as summary.json has them."""
@@ -82,24 +87,30 @@ class ReplayOutput:
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Writes the refined rows and the summary, and gives everything its name."""
-        self._csv.close()
-        self._record.close()
-        try:
+        with self._writing():
+            self._csv.close()
+            self._record.close()
             with (self._out / (ESTIMATES + PARTIAL)).open("w", encoding="utf-8", newline="") as stream:
                 write_rows(stream, self._table.rows.values())
             text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
             (self._out / (SUMMARY + PARTIAL)).write_text(text, encoding="utf-8")
             for name in (ESTIMATES, RECORD, SUMMARY):
                 (self._out / (name + PARTIAL)).replace(self._out / name)
-        except OSError as error:
-            raise OutputError(f"{self._out}: cannot be written ({error.strerror}); is the disk full?") from None
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if not self._csv.closed:
-            self._csv.close()
-            self._record.close()
+            for file in (self._csv, self._record):
+                with suppress(OSError):  # of a disk that is full; the reason for leaving has been said
+                    file.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(f"{self._out}: cannot be written ({error.strerror}); is the disk full?") from None
 
     def _count(self, message: Message) -> None:
         if isinstance(message, MeasurementVerdict):
