@@ -6,7 +6,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.messages import GpsInput
 
-UNKNOWN_E7 = 2**31 - 1  # "invalid" of latitude and longitude in message 296
 SENSOR_ID = 1  # 0 is no sensor to PX4: a slot of its filter whose EKF2_AGPn_ID is 0 is off
 PROCESSING = 0  # what is sent was carried to the moment of sending
 
@@ -14,9 +13,8 @@ PROCESSING = 0  # what is sent was carried to the moment of sending
 def global_position_sensor(gps: GpsInput, sysid: int) -> mavlink.MAVLink_global_position_sensor_message:
     """For PX4 (EKF2_AGP0_*, in older versions EKF2_AGP_*), and ArduPilot once it takes it.
 
-    Without a fix: marked unhealthy, without a position and without an accuracy. The last is how PX4 knows it
-    (mavlink_receiver.cpp, handle_message_global_position_sensor: eph > 0)."""
-    good = gps.fix_type >= 3
+    Only with a 3D fix: PX4 1.18 does not read the flag "unhealthy", takes an accuracy that is NaN for the best, and
+    after 5 s resets its filter to a latitude that is "invalid" (INT32_MAX): measured, 25 798 km away."""
     return mavlink.MAVLink_global_position_sensor_message(
         sysid,
         mavlink.MAV_COMP_ID_AUTOPILOT1,
@@ -24,13 +22,13 @@ def global_position_sensor(gps: GpsInput, sysid: int) -> mavlink.MAVLink_global_
         gps.t_ns // 1000,
         PROCESSING,
         mavlink.GLOBAL_POSITION_SRC_VISION,
-        0 if good else mavlink.GLOBAL_POSITION_UNHEALTHY,
-        round(gps.lat_deg * 1e7) if good else UNKNOWN_E7,
-        round(gps.lon_deg * 1e7) if good else UNKNOWN_E7,
+        0,
+        round(gps.lat_deg * 1e7),
+        round(gps.lon_deg * 1e7),
         math.nan,  # above the ellipsoid: a map has heights above mean sea level
-        gps.alt_amsl_m if good else math.nan,
-        gps.horiz_accuracy_m if good else math.nan,
-        gps.vert_accuracy_m if good else math.nan,
+        gps.alt_amsl_m,
+        gps.horiz_accuracy_m,
+        gps.vert_accuracy_m,
     )
 
 

@@ -46,7 +46,7 @@ class Outputs:
             match name:
                 case "gps_input":
                     yield gps_input.encode(gps, self._gps_id)
-                case "global_position":
+                case "global_position" if gps.fix_type >= 3:
                     yield global_position.global_position_sensor(gps, autopilot.sysid)
                 case "external_position":
                     yield from self._external(gps, autopilot)
