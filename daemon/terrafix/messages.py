@@ -460,7 +460,8 @@ class PositionSource(Message, frozen=True, kw_only=True):
 
 
 class FilterStatus(Message, frozen=True, kw_only=True):
-    """What ArduPilot's own filter says of itself (EKF_STATUS_REPORT): whether our position arrives in it."""
+    """What the autopilot's filter says of itself (EKF_STATUS_REPORT, PX4: ESTIMATOR_STATUS): whether our position
+    arrives in it."""
 
     flags: int  # EKF_STATUS_FLAGS
     position_ratio: float  # horizontal innovation by its gate: 1 is the limit

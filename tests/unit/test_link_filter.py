@@ -1,5 +1,6 @@
 """Whether the autopilot uses what it is sent, and the connection's state in the log."""
 
+import math
 import subprocess
 import sys
 from typing import Any
@@ -65,6 +66,20 @@ def test_the_report_of_the_filter_is_asked_for_and_recorded() -> None:
     assert (status.velocity_ratio, status.position_ratio) == pytest.approx((0.2, 0.3))
     asked = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     assert mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT in asked
+
+
+def test_px4_says_it_in_its_own_words() -> None:
+    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
+    flags = USING | mavlink.ESTIMATOR_GPS_GLITCH  # the bit that says EKF_UNINITIALIZED with ArduPilot
+    report = mavlink.MAVLink_estimator_status_message(0, flags, math.nan, 0.3, 0.1, 0.1, 0.0, 0.0, 1.0, 1.0)
+    wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_PX4), autopilot), packed(report, autopilot))
+    (status,) = [x for x in edge.poll(S) if isinstance(x, m.FilterStatus)]
+    assert (status.flags, status.velocity_ratio) == (USING, 0.0)
+    assert status.position_ratio == pytest.approx(0.3)
+    asked = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    assert {mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU} <= asked
+    assert not {mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, mavlink.MAVLINK_MSG_ID_RAW_IMU} & asked
 
 
 # --- the log ---

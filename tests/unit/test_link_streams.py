@@ -8,7 +8,7 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.diagnosis import Heard, why_no_autopilot
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.streams import PATIENCE, Streams
+from terrafix.link.streams import OPTIONAL, PATIENCE, Streams, wanted_of
 
 S = 1_000_000_000
 ATTITUDE, HEIGHT = mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
@@ -77,6 +77,18 @@ def test_airspeed_is_asked_for_twice_and_again_only_where_it_has_come() -> None:
     assert without.problem() == ""
     run(with_one, range(60), {AIRSPEED: 5})
     assert len(run(with_one, range(60, 90), {})["COMMAND_LONG"]) > 2  # the autopilot was started again
+
+
+def test_px4_without_a_receiver_is_nothing_to_complain_of() -> None:
+    streams = Streams(WANTED)
+    wanted = wanted_of("px4")
+    streams.serve("px4", wanted)
+    came = {i: round(hz) for i, hz in wanted.items() if i not in OPTIONAL and i != mavlink.MAVLINK_MSG_ID_GPS_RAW_INT}
+    run(streams, range(10), came)
+    streams.serve("px4", dict(wanted))  # with every heartbeat: the counts stay
+    assert streams.problem() == "" and streams.rates_hz
+    run(streams, range(10, 20), {i: n for i, n in came.items() if i != mavlink.MAVLINK_MSG_ID_HIGHRES_IMU})
+    assert streams.problem() == "too slow: HIGHRES_IMU 0.0 of 33 Hz"
 
 
 # --- who is heard ---

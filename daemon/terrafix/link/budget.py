@@ -17,6 +17,7 @@ LEAST_HZ = {  # below this a stream is of no use; what is not named may go down 
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 2.0,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: 2.0,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 10.0,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 10.0,
 }
 # What goes out besides the position, messages a second: heartbeat, TIMESYNC (ours, and answers), named values
 BESIDES_HZ = {

@@ -24,7 +24,7 @@ from terrafix.link.resume import Resume
 from terrafix.link.side_output import open_side_outputs
 from terrafix.link.source_switch import SourceSwitch
 from terrafix.link.status import Status, StatusLog
-from terrafix.link.streams import STREAMS_HZ, Streams
+from terrafix.link.streams import STREAMS_HZ, Streams, wanted_of
 from terrafix.link.telemetry import AUTOPILOT_COMPONENT
 from terrafix.link.timesync import TimeSync
 from terrafix.link.transport import Transport, open_at_start
@@ -187,6 +187,8 @@ class MavlinkEdge:
             return
         if kind == "HEARTBEAT":
             self._keeper.heard(self._partner.telemetry.armed_autopilot)
+            firmware = self._partner.firmware
+            self._streams.serve(firmware, self._budget.fitting(wanted_of(firmware)))
         self._streams.heard(message.get_msgId())
         self._switch.heard(message)
         hint = self._resume.take(message, now_ns)

@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from terrafix.link.gnss import RECEIVERS, reading_of
 from terrafix.link.local_pose import Attitude, Place
 from terrafix.link.outputs import Autopilot
@@ -12,6 +14,7 @@ from terrafix.link.timesync import TimeSync
 from terrafix.messages import FilterStatus, Message, VehicleState
 
 ATTITUDE_FRESH_NS = 500_000_000
+SHARED_FLAGS = 2 * mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS - 1  # those below are the same as in EKF_STATUS_FLAGS
 
 
 class Partner:
@@ -51,6 +54,8 @@ class Partner:
             self._origin = Place(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
         elif kind == "EKF_STATUS_REPORT":
             yield from _filter_status(message, now_ns)
+        elif kind == "ESTIMATOR_STATUS":
+            yield _estimator_status(message, now_ns)
 
     def now(self, now_ns: int) -> Autopilot:
         state, attitude = self._state, None
@@ -64,3 +69,10 @@ def _filter_status(message: Any, now_ns: int) -> Iterator[FilterStatus]:
     ratios = (message.pos_horiz_variance, message.velocity_variance)  # "variance" by name, test ratios in truth
     if all(math.isfinite(ratio) for ratio in ratios):
         yield FilterStatus(t_ns=now_ns, flags=message.flags, position_ratio=ratios[0], velocity_ratio=ratios[1])
+
+
+def _estimator_status(message: Any, now_ns: int) -> FilterStatus:
+    """PX4's. A ratio is NaN where nothing of that kind comes in: without a receiver, that of the velocity."""
+    ratios = [ratio if math.isfinite(ratio) else 0.0 for ratio in (message.pos_horiz_ratio, message.vel_ratio)]
+    flags = message.flags & SHARED_FLAGS
+    return FilterStatus(t_ns=now_ns, flags=flags, position_ratio=ratios[0], velocity_ratio=ratios[1])

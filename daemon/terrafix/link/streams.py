@@ -27,11 +27,17 @@ STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 1.0,  # whether its filter uses our position
     mavlink.MAVLINK_MSG_ID_AIRSPEED: 5.0,
 }
-OPTIONAL = {  # not there without a second receiver; not on PX4; not without a sensor
+PX4_HAS = {  # what PX4 says instead
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+}
+OPTIONAL = {  # not there without a second receiver; not everywhere; not without a sensor
     mavlink.MAVLINK_MSG_ID_GPS2_RAW,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
     mavlink.MAVLINK_MSG_ID_AIRSPEED,
 }
+OPTIONAL_ON_PX4 = OPTIONAL | {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT}  # without a receiver it says nothing at all
 # How often what has never come is asked for: ArduPilot before 4.6 refuses it, and tells its pilot so each time.
 UNKNOWN_TO_MANY = {mavlink.MAVLINK_MSG_ID_AIRSPEED: 2}
 GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_ parameters)
@@ -45,12 +51,24 @@ GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_
 }
 
 
+def wanted_of(firmware: str) -> dict[int, float]:
+    return {PX4_HAS.get(i, i): hz for i, hz in STREAMS_HZ.items()} if firmware == "px4" else STREAMS_HZ
+
+
 class Streams:
     """``heard`` every message of the autopilot; send what ``requests`` gives."""
 
     def __init__(self, wanted_hz: dict[int, float]) -> None:
         self.wanted_hz = wanted_hz
+        self._optional = OPTIONAL
         self.restart()
+
+    def serve(self, firmware: str, wanted_hz: dict[int, float]) -> None:
+        """``wanted_hz``: of ``wanted_of`` what fits the line. Nothing happens while it is the same."""
+        if wanted_hz != self.wanted_hz:
+            self.wanted_hz = wanted_hz
+            self._optional = OPTIONAL_ON_PX4 if firmware == "px4" else OPTIONAL
+            self.restart()
 
     def restart(self) -> None:
         """Also for a new connection: everything is asked for again."""
@@ -92,7 +110,7 @@ class Streams:
                 1e6 / rate_hz,
                 *(0.0,) * 5,
             )
-            in_vain = self._asked[message_id] > OLD_AFTER and message_id not in OPTIONAL
+            in_vain = self._asked[message_id] > OLD_AFTER and message_id not in self._optional
             if (self._old_way or in_vain) and message_id in GROUPS:
                 groups[GROUPS[message_id]] = max(rate_hz, groups.get(GROUPS[message_id], 0.0))
         for group, rate_hz in groups.items():
@@ -103,7 +121,7 @@ class Streams:
         slow = [
             f"{mavlink.mavlink_map[i].msgname} {self.rates_hz[i]:.1f} of {wanted:g} Hz"
             for i, wanted in self.wanted_hz.items()
-            if i in self.rates_hz and i not in OPTIONAL and self.rates_hz[i] < ENOUGH * wanted
+            if i in self.rates_hz and i not in self._optional and self.rates_hz[i] < ENOUGH * wanted
         ]
         notes = [f"too slow: {', '.join(slow)}"] if slow else []
         if slow and self._refused:
