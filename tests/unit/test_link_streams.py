@@ -8,7 +8,7 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.diagnosis import Heard, why_no_autopilot
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.streams import OPTIONAL, PATIENCE, Streams, wanted_of
+from terrafix.link.streams import OPTIONAL_ON_PX4, PATIENCE, Streams, wanted_of
 
 S = 1_000_000_000
 ATTITUDE, HEIGHT = mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
@@ -79,11 +79,12 @@ def test_airspeed_is_asked_for_twice_and_again_only_where_it_has_come() -> None:
     assert len(run(with_one, range(60, 90), {})["COMMAND_LONG"]) > 2  # the autopilot was started again
 
 
-def test_px4_without_a_receiver_is_nothing_to_complain_of() -> None:
+def test_px4_without_a_receiver_or_a_position_is_nothing_to_complain_of() -> None:
     streams = Streams(WANTED)
     wanted = wanted_of("px4")
     streams.serve("px4", wanted)
-    came = {i: round(hz) for i, hz in wanted.items() if i not in OPTIONAL and i != mavlink.MAVLINK_MSG_ID_GPS_RAW_INT}
+    came = {i: round(hz) for i, hz in wanted.items() if i not in OPTIONAL_ON_PX4}
+    assert mavlink.MAVLINK_MSG_ID_ALTITUDE in came
     run(streams, range(10), came)
     streams.serve("px4", dict(wanted))  # with every heartbeat: the counts stay
     assert streams.problem() == "" and streams.rates_hz

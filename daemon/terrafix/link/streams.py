@@ -37,7 +37,9 @@ OPTIONAL = {  # not there without a second receiver; not everywhere; not without
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
     mavlink.MAVLINK_MSG_ID_AIRSPEED,
 }
-OPTIONAL_ON_PX4 = OPTIONAL | {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT}  # without a receiver it says nothing at all
+# Without a receiver, without a position, PX4 says nothing at all; its height above home is then in ALTITUDE.
+OPTIONAL_ON_PX4 = OPTIONAL | {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT}
+ONLY_PX4_HZ = {mavlink.MAVLINK_MSG_ID_ALTITUDE: 5.0}
 # How often what has never come is asked for: ArduPilot before 4.6 refuses it, and tells its pilot so each time.
 UNKNOWN_TO_MANY = {mavlink.MAVLINK_MSG_ID_AIRSPEED: 2}
 GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_ parameters)
@@ -52,7 +54,9 @@ GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_
 
 
 def wanted_of(firmware: str) -> dict[int, float]:
-    return {PX4_HAS.get(i, i): hz for i, hz in STREAMS_HZ.items()} if firmware == "px4" else STREAMS_HZ
+    if firmware != "px4":
+        return STREAMS_HZ
+    return {PX4_HAS.get(i, i): hz for i, hz in STREAMS_HZ.items()} | ONLY_PX4_HZ
 
 
 class Streams:
