@@ -95,3 +95,14 @@ def test_a_first_heading_that_the_second_one_contradicts_is_forgotten() -> None:
     flight, listener = flown({0: turned(150.0)}, without_fix=True)
     assert refused(listener, "attitude") == []
     assert np.linalg.norm(error_m(listener.estimate(FRAMES - 1), flight)[:2]) < 60.0
+
+
+@pytest.mark.parametrize("wrong", [(AT, AT + 1), (AT, AT + 1, AT + 2, AT + 3)])
+def test_a_flight_without_a_map_goes_on_where_it_was(wrong: tuple[int, ...]) -> None:
+    flight, listener = flown(dict.fromkeys(wrong, at_height(300.0)), without_fix=True)
+    _, plain = flown({}, without_fix=True)
+    assert refused(listener) == list(wrong)
+    here, there = listener.estimate(FRAMES - 1), plain.estimate(FRAMES - 1)
+    off = error_m(here, flight)[:2]
+    assert float(off @ np.linalg.solve(cov_of(here)[:2, :2], off)) < 13.8
+    assert here.cov[0] < 1.2 * there.cov[0]
