@@ -36,6 +36,17 @@ def test_what_comes_as_wanted_is_asked_for_once() -> None:
     assert streams.problem() == ""
 
 
+def test_what_comes_once_a_second_may_miss_a_window_of_three() -> None:
+    streams = Streams({mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0})
+    run(streams, range(4), {mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1})
+    run(streams, range(4, 5), {})
+    run(streams, range(5, 7), {mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1})
+    assert streams.rates_hz[mavlink.MAVLINK_MSG_ID_SYSTEM_TIME] == pytest.approx(0.67, abs=0.01)
+    assert streams.problem() == ""
+    run(streams, range(7, 13), {})
+    assert streams.problem() == "too slow: SYSTEM_TIME 0.0 of 1 Hz"
+
+
 def test_after_a_reboot_of_the_autopilot_the_rates_are_set_again() -> None:
     streams = Streams(WANTED)
     run(streams, range(30), {ATTITUDE: 25, HEIGHT: 5})
