@@ -192,6 +192,16 @@ def test_each_layer_of_a_map_has_its_own() -> None:
     assert at_first[0] > 2.0 and later == (0.0, 0.0)
 
 
+def test_readings_over_two_layers_are_no_batch_of_either() -> None:
+    offsets = MapOffsets()
+    for i in range(1200):
+        t_ns = i * S // 5
+        layer_m = MAP_M if i // 50 % 2 else 2.0  # ten seconds each, a batch takes twenty
+        said = estimate(t_ns - READING_AGE_NS, east_m=OFF_M, **(CLAIMS | {"map_sigma_m": layer_m}))
+        vision = carry(said, t_ns - READING_AGE_NS, Attitudes())
+        assert offsets.take(reading(t_ns, (0.0, 0.0)), vision, said, trusted=True) is None
+
+
 def test_the_next_link_goes_on_with_it(tmp_path: Path) -> None:
     heard = flown(learning(), 240.0)
     keeper = AutopilotKeeper(tmp_path / "link")

@@ -137,6 +137,7 @@ def test_what_a_person_forgets_is_said_before_anything_is_fetched(tmp_path: Path
             ({"area": "13,47,13.1,47.1", "buffer_km": None, "corridor_km": 1.0}, "no mission and no line"),
             ({"area": "10,40,12,42"}, "at most 10,000"),
             ({"area": ""}, "give one image"),
+            ({"area": "", "source": ["one.tif"], "buffer_km": None, "gsd_m": 0.0}, "need --area"),
             ({"source": [str(tmp_path / "none.tif")]}, "no such file"),
             ({"dem": "none.tif"}, "none.tif: no such file; check --dem"),
             ({"osm": "none.osm.pbf"}, "check --osm"),

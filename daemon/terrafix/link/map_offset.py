@@ -51,9 +51,10 @@ class Batch:
 
 
 class _Sum:
-    """Readings on the way to a batch."""
+    """Readings on the way to a batch, of one map."""
 
-    def __init__(self, t_ns: int) -> None:
+    def __init__(self, t_ns: int, map_sigma_m: float) -> None:
+        self.map_sigma_m = map_sigma_m
         self.from_ns = self.to_ns = t_ns
         self.count = 0
         self.total = np.zeros(SIZE)
@@ -182,8 +183,9 @@ class MapOffsets:
             return
         if estimate.map_sigma_m <= 0.0 or not 0 <= estimate.last_anchor_age_ms <= FIXED_MS:
             return
-        if self._sum is None or reading.t_ns - self._sum.to_ns > GAP_S * NS_PER_S:
-            self._sum = _Sum(reading.t_ns)
+        went_on = self._sum is not None and reading.t_ns - self._sum.to_ns <= GAP_S * NS_PER_S
+        if self._sum is None or not went_on or self._sum.map_sigma_m != estimate.map_sigma_m:
+            self._sum = _Sum(reading.t_ns, estimate.map_sigma_m)
         place = vision.lat_deg, vision.lon_deg
         receiver_m = UNKNOWN_M if reading.horizontal_m is None else reading.horizontal_m
         variance_m2 = (

@@ -125,7 +125,8 @@ def _check_files(order: Order) -> None:
 def _whole_image(order: Order) -> LayerInput:
     if len(order.source) != 1 or order.sources or "://" in order.source[0]:
         raise UsageError("give one image (it is taken whole), or --area with --source for several or for the network")
-    if order.osm or order.dem == glo30.NAME or order.gsd_m or order.buffer_km or order.corridor_km:
+    lengths = order.gsd_m, order.buffer_km, order.corridor_km
+    if order.osm or order.dem == glo30.NAME or any(length is not None for length in lengths):
         raise UsageError("--osm, --dem glo-30, --gsd, --buffer and --corridor need --area, for example W,S,E,N")
     imagery = Path(order.source[0])
     if order.out.exists() and imagery.exists() and order.out.samefile(imagery):
