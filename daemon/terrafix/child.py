@@ -8,23 +8,22 @@ import os
 import signal
 import socket
 import sys
-import threading
 import time
 from pathlib import Path
 
 import msgspec
 
 from terrafix.core import logs
+from terrafix.core.asked import Asked
 from terrafix.core.errors import TerrafixError
 from terrafix.core.frames import SharedFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.core.rundir import RunDir
 from terrafix.core.shell import run_process
 from terrafix.messages import Frame
-from terrafix.nursery import WHERE_SIGNAL, WORDS, prctl
+from terrafix.nursery import WHERE_SIGNAL, WORDS, end_with
 from terrafix.spec import Spec, table_of
 
-PR_SET_PDEATHSIG = 1  # prctl(2)
 REQUEST_BYTES = 8192  # a name and a path
 ADOPTION_S = 0.0002  # between two looks
 
@@ -47,7 +46,7 @@ def serve(asked: socket.socket, supervisor_pid: int) -> tuple[str, RunDir] | Non
                 os._exit(0)  # so that the supervisor is the next of kin
             while os.getppid() == between:
                 time.sleep(ADOPTION_S)
-            if not _die_with(supervisor_pid):
+            if not end_with(supervisor_pid, signal.SIGKILL):
                 os._exit(1)
             asked.send(str(os.getpid()).encode())
             name, run_dir = request.decode().split(WORDS)
@@ -59,8 +58,7 @@ def serve(asked: socket.socket, supervisor_pid: int) -> tuple[str, RunDir] | Non
 def run(name: str, run_dir: RunDir) -> int:
     """The process ``name``, to its end; -> exit code."""
     Path("/proc/self/comm").write_text(name)  # for `ps` and `top`: the command line is the nursery's
-    stopping = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stopping.set())
+    stopping = Asked(signal.SIGTERM)
     faulthandler.enable()
     faulthandler.register(WHERE_SIGNAL, all_threads=True)
     spec = msgspec.json.decode(run_dir.spec.read_bytes(), type=Spec)
@@ -78,18 +76,12 @@ def run(name: str, run_dir: RunDir) -> int:
         epoch_ns=run_dir.epoch_ns,
     )
     try:
-        run_process(name, ctx, run_dir, stopping=stopping.is_set, table=table)
+        run_process(name, ctx, run_dir, stopping=stopping, table=table)
     except TerrafixError as error:
         run_dir.mistake(name).write_text(str(error), encoding="utf-8")
         logs.get().error("cannot go on", reason=str(error))
         return error.exit_code
     return 0
-
-
-def _die_with(supervisor_pid: int) -> bool:
-    """Asks the kernel to kill this process when its supervisor dies. False: it is dead already."""
-    prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    return os.getppid() == supervisor_pid
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ from typing import IO
 
 from terrafix.core.rundir import RunDir
 
-PR_SET_CHILD_SUBREAPER = 36  # prctl(2): a process whose parent ended becomes ours
+PR_SET_PDEATHSIG = 1  # prctl(2): a signal for us when our parent ends
+PR_SET_CHILD_SUBREAPER = 36  # a process whose parent ended becomes ours
 READY_LIMIT_S = 10.0  # imports, on a computer that is very busy
 TRIES = 2  # a nursery that was killed is found dead when the next process is wanted
 WHERE_SIGNAL = signal.SIGUSR2  # "where are you?": the supervisor asks a stuck process for its tracebacks
@@ -113,7 +114,13 @@ class Nursery:
         self._popen.wait()
 
 
-def prctl(option: int, value: int) -> None:
+def end_with(parent_pid: int, number: signal.Signals) -> bool:
+    """Asks the kernel to send this process that signal when its parent has ended. False: it has already."""
+    _prctl(PR_SET_PDEATHSIG, number)
+    return os.getppid() == parent_pid
+
+
+def _prctl(option: int, value: int) -> None:
     """prctl(2). Raises OSError."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(option, value, 0, 0, 0) != 0:
@@ -121,4 +128,4 @@ def prctl(option: int, value: int) -> None:
 
 
 def _adopt(wanted: bool) -> None:
-    prctl(PR_SET_CHILD_SUBREAPER, int(wanted))
+    _prctl(PR_SET_CHILD_SUBREAPER, int(wanted))

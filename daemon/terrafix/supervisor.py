@@ -11,7 +11,7 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -20,6 +20,7 @@ import zmq
 from terrafix.children import Child, Event, State
 from terrafix.core import config as configuration
 from terrafix.core import logs
+from terrafix.core.asked import Asked
 from terrafix.core.bus import Publisher, Subscriber
 from terrafix.core.clock import Ticker, now_ns
 from terrafix.core.config import Config
@@ -70,7 +71,6 @@ def run(
     config = _with_overrides(configuration.load(configs), source, start, map_path, link)
     out_dir = _writable(out_dir)
     package = _map_package(config.map.path)
-    stop = stop or threading.Event()
     with contextlib.ExitStack() as stack:
         output = stack.enter_context(log_to.open("a", encoding="utf-8")) if log_to else None
         stack.enter_context(contextlib.closing(logs.configure(config.log.level, SUPERVISOR, output)))
@@ -80,7 +80,7 @@ def run(
         stack.callback(owned.remove)
         if owned.run_dir.epoch_ns is not None:
             logs.get().warning("goes on from a run that was killed", epoch_ns=owned.run_dir.epoch_ns)
-        stack.enter_context(_signals_set(stop))
+        asked = stack.enter_context(Asked(signal.SIGTERM, signal.SIGINT))  # for the ordered stop
         context = stack.enter_context(zmq.Context())
         nursery = nursery or stack.enter_context(Nursery(output))
         children = [Child(process, owned.run_dir, nursery) for process in table]
@@ -88,15 +88,22 @@ def run(
         stack.callback(publisher.close)
         subscriber = Subscriber(context, [owned.run_dir.address(p.name) for p in table], (SourceEnded,))
         stack.callback(subscriber.close)
-        supervisor = Supervisor(children, publisher, subscriber, stop, stop_after_source, on_event)
+        supervisor = Supervisor(
+            children,
+            publisher,
+            subscriber,
+            lambda: asked() or (stop is not None and stop.is_set()),
+            stop_after_source,
+            on_event,
+        )
         if on_epoch:
             supervisor.tell_epoch(owned.run_dir, on_epoch)
         owned.left = True  # after a bug, too
         code = supervisor.run()
         owned.left = code == LINK_GAVE_UP
-        for mistake in (child.mistake for child in children if child.mistake):
-            sys.stderr.write(f"terrafix: {mistake.text}\n")  # the last word, after all logs
-        return code
+    for mistake in (child.mistake for child in children if child.mistake):
+        sys.stderr.write(f"terrafix: {mistake.text}\n")  # the last word, after all logs
+    return code
 
 
 def killed_just_now(
@@ -123,14 +130,14 @@ class Supervisor:
         children: list[Child],
         publisher: Publisher,
         subscriber: Subscriber,
-        stop: threading.Event,
+        stopping: Callable[[], bool],
         stop_after_source: bool,
         on_event: Callable[[ProcessEvent], None] | None,
     ) -> None:
         self._children = children
         self._publisher = publisher
         self._subscriber = subscriber
-        self._stop = stop
+        self._stopping = stopping
         self._stop_after_source = stop_after_source
         self._on_event = on_event
         self._look_for_epoch: Callable[[], bool] | None = None  # False: found, look no more
@@ -179,7 +186,7 @@ class Supervisor:
         for _ in self._subscriber.receive():  # SourceEnded is all that the supervisor hears
             self._ended_ns = self._ended_ns or now
         self._notify(now)
-        if self._stop.is_set() or (self._stop_after_source and self._is_drained(now)):
+        if self._stopping() or (self._stop_after_source and self._is_drained(now)):
             return 0
         return None
 
@@ -229,20 +236,6 @@ def sd_notify(state: str) -> None:
     # A systemd that does not listen must not end a flight; its watchdog is the check on that.
     with socket.socket(socket.AF_UNIX, kind) as sock, contextlib.suppress(OSError):
         sock.sendto(state.encode(), address)
-
-
-@contextlib.contextmanager
-def _signals_set(stop: threading.Event) -> Iterator[None]:
-    """SIGTERM and SIGINT ask for the ordered stop. (Only the main thread may have signal handlers.)"""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _with_overrides(config: Config, source: str, start: str, map_path: Path | None, link: str) -> Config:

@@ -280,6 +280,16 @@ def test_children_die_with_a_killed_supervisor_and_its_leftovers_are_swept(tmp_p
     assert not living.run_dir.path.exists()
 
 
+def test_signals_that_come_together_do_not_wait_for_each_other(tmp_path: Path) -> None:
+    with supervisor_process(tmp_path / "out") as process:
+        eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
+        until_s = time.monotonic() + 0.5
+        while time.monotonic() < until_s and process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGTERM)
+        process.wait(15)
+
+
 def test_a_nursery_that_dies_takes_nobody_with_it_and_another_is_there_when_it_is_wanted(tmp_path: Path) -> None:
     names = {p.name for p in TABLE}
     with supervisor_process(tmp_path / "out") as process:

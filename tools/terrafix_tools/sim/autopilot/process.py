@@ -2,16 +2,18 @@
 
 import signal
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from terrafix.core.asked import Asked
 from terrafix.core.errors import TerrafixError
 from terrafix_tools.sim.autopilot.course import read_course
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+
+LOOK_S = 0.05  # between two looks whether to stop; a signal ends the sleep at once
 
 
 def fly_course(
@@ -23,14 +25,13 @@ def fly_course(
     aligned: Annotated[bool, typer.Option(help="Starts in the air, position known.")] = True,
 ) -> None:
     """Flies until SIGTERM or SIGINT, then writes the report."""
-    stopping = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopping.set())
+    stopping = Asked(signal.SIGTERM, signal.SIGINT)
     zero_ns = start_ns or time.monotonic_ns()
     peer = AutopilotPeer(seed=seed, aligned=aligned)
     used = peer.start(port, read_course(course), lambda: (time.monotonic_ns() - zero_ns) * 1e-9)
     typer.echo(f"autopilot peer on udp 127.0.0.1:{used}")
-    stopping.wait()
+    while not stopping():
+        time.sleep(LOOK_S)
     peer.stop().write(out)
 
 

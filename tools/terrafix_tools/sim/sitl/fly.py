@@ -67,6 +67,7 @@ def fly(
         connected(ports.ground) as station,
         SimulatedCamera(stream, scene.ground, scene.frame, observer.truth_at, seed),
         Daemon(out, scene, stream.url, f"udpin:127.0.0.1:{ports.companion}", says_start=not gnss_start) as daemon,
+        _undisturbed(),
     ):
         stages = Stages(firmware, station, observer, daemon, scene, console)
         try:
@@ -101,11 +102,23 @@ def _terminated_like_interrupted() -> Iterator[None]:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, interrupt), signal.SIGINT: signal.getsignal(signal.SIGINT)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """From the end of what is inside, until the signals are given back: a second Ctrl-C would break off what ends the
+    others, and they would stay behind."""
+    try:
+        yield
+    finally:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _readable(path: Path) -> Path:

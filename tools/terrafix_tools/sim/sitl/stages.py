@@ -1,6 +1,7 @@
 """The stages of a flight on ArduPilot's firmware, from the boot to the landing, and Terrafix beside it."""
 
 import contextlib
+import os
 import subprocess
 import sys
 import time
@@ -38,6 +39,7 @@ NO_FIX = 1  # GPS_INPUT comes, without a fix
 KILL_AFTER_S = 25.0  # without GNSS, and after the one before
 DOWN_S = 5.0  # the firmware notices after 4 s
 BACK_S = 120.0  # from the restart to a 3D fix
+STOP_S = 45.0  # as systemd waits for the ordered stop (TimeoutStopSec)
 
 
 class NotFlown(Exception):
@@ -45,7 +47,8 @@ class NotFlown(Exception):
 
 
 class Daemon:
-    """`terrafix run` as on a vehicle, a program of its own: begun by ``start``, ended by ``kill`` or this context."""
+    """`terrafix run` as on a vehicle, a program of its own: begun by ``start``, ended by ``kill``,
+    by this context, or with this process."""
 
     def __init__(self, out: Path, scene: Scene, source: str, link: str, *, says_start: bool = True) -> None:
         """``says_start``: the description of the camera does. Raises OutputError."""
@@ -59,7 +62,8 @@ class Daemon:
             config.write_text(f'[source]\ncamera = "{camera}"\n[link]\ngps_id = {GPS_ID}\n', encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-        self._command = [sys.executable, "-m", "terrafix_tools.program", "run", "--config", str(config)]
+        self._command = [sys.executable, "-m", "terrafix_tools.sim.sitl.tied", str(os.getpid())]
+        self._command += ["run", "--config", str(config)]
         self._command += ["--source", source, "--map", str(scene.map_path)]
         self._command += ["--link", link, "--out", str(out / "record")]
 
@@ -87,7 +91,9 @@ class Daemon:
     def __exit__(self, *_: object) -> None:
         if self._process is not None:
             self._process.terminate()
-            self._process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(STOP_S)
+            self.kill()
 
 
 class Stages:
