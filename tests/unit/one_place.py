@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 from ground import PINHOLE, FlatMap, rotation
 
-from terrafix.messages import Camera, Origin
+from terrafix.core.geodesy import quat_from_rot
+from terrafix.messages import Camera, Origin, Prediction
 
 AGL_M = 100.0
 SIDE_M = 400.0
@@ -34,3 +35,28 @@ class OnlyMap(FlatMap):
 
     def bind(self, _frame: object, _layer: str) -> "OnlyMap":
         return self
+
+
+def predicted(
+    frame_id: int,
+    sigma_m: float,
+    *,
+    at_m: np.ndarray = TRUE_M,
+    step_m: float = 0.0,
+    step_sigma_m: float = 1.0,
+    start_ns: int = 0,
+) -> Prediction:
+    """One frame a second; ``step_m`` to the east since the one before."""
+    cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
+    return Prediction(
+        t_ns=frame_id * 10**9,
+        frame_id=frame_id,
+        p_c_in_w_m=(float(at_m[0]), float(at_m[1]), float(at_m[2])),
+        q_w_c=quat_from_rot(R),
+        cov=tuple(float(v) for v in cov.ravel()),
+        agl_m=AGL_M,
+        agl_sigma_m=2.0,
+        step_m=(step_m, 0.0),
+        step_cov_m2=(step_sigma_m**2, 0.0, 0.0, step_sigma_m**2),
+        start_ns=start_ns,
+    )

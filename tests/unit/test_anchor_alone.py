@@ -5,15 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 from ground import GSD_M, PINHOLE, FlatMap, texture, view
-from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
+from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
 from terrafix.anchor.alone import alone
 from terrafix.anchor.belief import Belief, Mode
 from terrafix.anchor.matcher import AS_PREDICTED, FrameMatcher, Look, View
 from terrafix.anchor.node import AnchorNode
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.core.geodesy import quat_from_rot
-from terrafix.messages import MapMatch, Prediction, Verdict
+from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
 NEAR_M = (7.0, -5.0)  # of the mode from the truth
@@ -78,20 +77,8 @@ def test_one_look_that_does_not_decide_is_decided_by_patches_where_little_is_cla
     node = AnchorNode(frames, package, GradientDescriber(), 1.0)
     list(node.on(ORIGIN))
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
-    cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
-    said, *_ = node.on(
-        Prediction(
-            t_ns=10**9,
-            frame_id=1,
-            p_c_in_w_m=(TRUE_M[0] + NEAR_M[0], TRUE_M[1] + NEAR_M[1], AGL_M),
-            q_w_c=quat_from_rot(R),
-            cov=tuple(float(v) for v in cov.ravel()),
-            agl_m=AGL_M,
-            agl_sigma_m=2.0,
-            step_m=(0.0, 0.0),
-            step_cov_m2=(1.0, 0.0, 0.0, 1.0),
-        )
-    )
+    near = predicted(1, sigma_m, at_m=TRUE_M + np.array([*NEAR_M, 0.0]))
+    said, *_ = node.on(near)
     assert isinstance(said, MapMatch) and said.verdict is verdict
     if verdict is Verdict.ACCEPTED:
         assert said.p_c_in_w_m is not None and np.linalg.norm(np.array(said.p_c_in_w_m) - TRUE_M) < 3.0

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 from ground import PINHOLE, view
-from test_anchor_node import AGL_M, ORIGIN, TRUE_M, OnlyMap, R, ground, started
+from one_place import predicted
+from test_anchor_node import ORIGIN, TRUE_M, OnlyMap, R, ground, started
 
 from terrafix.anchor.hint import SPEED_MPS, Believed, length, radius_now_m, weigh
 from terrafix.anchor.lost import MOST_ODDS, START_ODDS
@@ -13,13 +14,12 @@ from terrafix.anchor.node import AnchorNode
 from terrafix.anchor.place_search import PlaceSearch
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.core.geodesy import LocalFrame, quat_from_rot
+from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import (
     HintVerdict,
     MapMatch,
     Message,
     PositionHint,
-    Prediction,
     SearchState,
     SearchStep,
     Verdict,
@@ -72,23 +72,7 @@ def hint_at(e_m: float, n_m: float, radius_m: float, t_ns: int = 0) -> PositionH
 
 
 def said_at(node: AnchorNode, frame_id: int, sigma_m: float = 10.0) -> list[Message]:
-    cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
-    p = tuple(float(v) for v in TRUE_M)
-    return list(
-        node.on(
-            Prediction(
-                t_ns=frame_id * 10**9,
-                frame_id=frame_id,
-                p_c_in_w_m=(p[0], p[1], p[2]),
-                q_w_c=quat_from_rot(R),
-                cov=tuple(float(v) for v in cov.ravel()),
-                agl_m=AGL_M,
-                agl_sigma_m=2.0,
-                step_m=(0.0, 0.0),
-                step_cov_m2=(1.0, 0.0, 0.0, 1.0),
-            )
-        )
-    )
+    return list(node.on(predicted(frame_id, sigma_m)))
 
 
 def kinds(said: list[Message]) -> list[type[Message]]:

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from ground import PINHOLE, texture, view
-from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
+from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
 from terrafix.anchor.agreed import AgreedPose
 from terrafix.anchor.answer import ground_sigma_m
@@ -18,8 +18,7 @@ from terrafix.anchor.node import AnchorNode
 from terrafix.anchor.place_search import LOST_SIGMA_M, start_around
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.core.geodesy import quat_from_rot
-from terrafix.messages import MapMatch, Prediction, SearchState, SearchStep, Verdict
+from terrafix.messages import MapMatch, SearchState, SearchStep, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
 CELL_M = 2.0  # of a belief
@@ -37,23 +36,6 @@ def started(ground: np.ndarray, start_sigma_m: float = 10.0) -> tuple[AnchorNode
     origin = msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m)
     assert list(node.on(origin)) == []
     return node, frames
-
-
-def predicted(
-    frame_id: int, sigma_m: float, step_sigma_m: float = 1.0, at_m: np.ndarray = TRUE_M, step_m: float = 0.0
-) -> Prediction:
-    cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
-    return Prediction(
-        t_ns=frame_id * 10**9,
-        frame_id=frame_id,
-        p_c_in_w_m=(float(at_m[0]), float(at_m[1]), float(at_m[2])),
-        q_w_c=quat_from_rot(R),
-        cov=tuple(float(v) for v in cov.ravel()),
-        agl_m=AGL_M,
-        agl_sigma_m=2.0,
-        step_m=(step_m, 0.0),
-        step_cov_m2=(step_sigma_m**2, 0.0, 0.0, step_sigma_m**2),
-    )
 
 
 def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TRUE_M, step_m: float = 0.0) -> MapMatch:
@@ -179,7 +161,9 @@ def test_every_step_of_the_escalation_is_said(ground: np.ndarray, monkeypatch: p
     def fly(frame_id: int, image: np.ndarray | None, step_sigma_m: float = 1.0) -> None:
         if image is not None:
             frames.put(frame_id, image)
-        said.extend(m.step for m in node.on(predicted(frame_id, 10.0, step_sigma_m)) if isinstance(m, SearchState))
+        said.extend(
+            m.step for m in node.on(predicted(frame_id, 10.0, step_sigma_m=step_sigma_m)) if isinstance(m, SearchState)
+        )
 
     fly(1, picture)
     fly(2, None)

@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 from ground import PINHOLE, texture, view
-from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
+from one_place import ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
 from terrafix import messages as m
 from terrafix.anchor.node import AnchorNode
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.core.geodesy import LocalFrame, quat_from_rot
+from terrafix.core.geodesy import LocalFrame
 from terrafix.core.inbox import fold_prediction
 from terrafix.core.shell import InProcessShell
 from terrafix.estimator.node import EstimatorNode
@@ -73,30 +73,13 @@ def test_a_place_beside_the_map_is_no_start_and_takes_the_one_before_with_it(gro
     assert (withdrawn.verdict, withdrawn.lat_deg, withdrawn.sigma_m) == (m.Verdict.ACCEPTED, None, None)
 
 
-def predicted(frame_id: int, sigma_m: float, start_ns: int) -> m.Prediction:
-    cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
-    p = (float(TRUE_M[0]), float(TRUE_M[1]), float(TRUE_M[2]))
-    return m.Prediction(
-        t_ns=frame_id * S,
-        frame_id=frame_id,
-        p_c_in_w_m=p,
-        q_w_c=quat_from_rot(R),
-        cov=tuple(float(v) for v in cov.ravel()),
-        agl_m=AGL_M,
-        agl_sigma_m=2.0,
-        step_m=(0.0, 0.0),
-        step_cov_m2=(1.0, 0.0, 0.0, 1.0),
-        start_ns=start_ns,
-    )
-
-
 def test_the_first_prediction_from_a_start_ends_the_search(ground: np.ndarray) -> None:
     node, frames = anchor(ground)
     list(node.on(UNKNOWN))
     steps = []
     for frame_id, sigma_m, start_ns in ((1, 100.0, 0), (2, 10.0, S), (3, 10.0, S)):
         frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
-        match, *_ = node.on(predicted(frame_id, sigma_m, start_ns))
+        match, *_ = node.on(predicted(frame_id, sigma_m, start_ns=start_ns))
         assert isinstance(match, m.MapMatch)
         steps.append((match.verdict is m.Verdict.ACCEPTED, match.step))
     assert steps == [(False, m.SearchStep.WHOLE_MAP), (True, m.SearchStep.NORMAL), (True, m.SearchStep.NORMAL)]
@@ -107,12 +90,12 @@ def test_an_estimator_that_forgot_the_start_does_not_take_the_place_from_the_anc
     list(node.on(UNKNOWN))
     for frame_id, sigma_m, start_ns in ((1, 10.0, S), (2, 100.0, 0)):
         frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
-        match, *_ = node.on(predicted(frame_id, sigma_m, start_ns))
+        match, *_ = node.on(predicted(frame_id, sigma_m, start_ns=start_ns))
         assert isinstance(match, m.MapMatch) and match.verdict is m.Verdict.ACCEPTED
 
 
 def test_a_start_is_not_lost_where_only_the_newest_prediction_counts() -> None:
-    folded = fold_prediction(predicted(1, 100.0, 0), predicted(2, 10.0, S))
+    folded = fold_prediction(predicted(1, 100.0), predicted(2, 10.0, start_ns=S))
     assert isinstance(folded, m.Prediction) and folded.start_ns == S
 
 

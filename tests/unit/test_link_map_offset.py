@@ -44,6 +44,18 @@ def learnt(heard: list[m.Message]) -> list[m.MapOffset]:
     return [x for x in heard if isinstance(x, m.MapOffset)]
 
 
+def test_at_a_place_it_is_what_the_covariance_that_is_moved_there_says() -> None:
+    known = Registration(MAP_M)
+    for i in range(8):
+        known.take(Batch(20 * i * S, (LAT, LON), np.array([3.0, 1.0]), np.array([20.0, 2.0 * i]), 0.5))
+        for way_m in (0.0, 3000.0, 40_000.0):
+            place = offset(LAT, LON, way_m, 0.0)
+            x, p = known._moved(place, 1.0)
+            off_m, variance_m2 = known.at(place)
+            assert off_m == pytest.approx(x[:2]) and variance_m2 == pytest.approx(np.linalg.eigvalsh(p[:2, :2])[-1])
+        known.other_receiver()
+
+
 def test_what_a_trusted_receiver_shows_is_taken_out_slowly_and_claimed() -> None:
     heard = flown(learning(), 240.0)
     positions = sent(heard)

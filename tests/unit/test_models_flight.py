@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny_onnx
 from ground import PINHOLE, texture, view
-from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
+from one_place import ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
 from terrafix.anchor.model_watch import FAILURES
 from terrafix.anchor.node import AnchorNode, make_node
@@ -17,14 +17,12 @@ from terrafix.anchor.retrieval import MapSearch
 from terrafix.core.config import Config, Models
 from terrafix.core.errors import ModelError
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.node import NodeContext
 from terrafix.messages import (
     MapMatch,
     Message,
     ModelChange,
     ModelEvent,
-    Prediction,
     SearchStep,
     Verdict,
 )
@@ -53,22 +51,7 @@ class Flight:
     def frame(self, image: np.ndarray, sigma_m: float = 10.0) -> tuple[MapMatch, list[ModelEvent]]:
         self.frame_id += 1
         self.frames.put(self.frame_id, image)
-        cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
-        said: list[Message] = list(
-            self.node.on(
-                Prediction(
-                    t_ns=self.frame_id * 10**9,
-                    frame_id=self.frame_id,
-                    p_c_in_w_m=tuple(TRUE_M.tolist()),
-                    q_w_c=quat_from_rot(R),
-                    cov=tuple(float(v) for v in cov.ravel()),
-                    agl_m=AGL_M,
-                    agl_sigma_m=2.0,
-                    step_m=(0.0, 0.0),
-                    step_cov_m2=(1.0, 0.0, 0.0, 1.0),
-                )
-            )
-        )
+        said: list[Message] = list(self.node.on(predicted(self.frame_id, sigma_m)))
         (match,) = (m for m in said if isinstance(m, MapMatch))
         return match, [m for m in said if isinstance(m, ModelEvent)]
 

@@ -5,7 +5,7 @@ may be too few; all patches together still say where most of the ground is."""
 
 from terrafix.anchor.chance import Chance
 from terrafix.anchor.map_package import LocalMap
-from terrafix.anchor.matcher import FIX_GSD_PER_AGL, REACH, Fix, FrameMatcher, View, view_from
+from terrafix.anchor.matcher import Fix, FrameMatcher, View
 from terrafix.anchor.place_check import CELL_PER_AGL, PlaceCheck
 from terrafix.anchor.tracks import LLR_MAX, evidence
 from terrafix.core.node import Image
@@ -17,14 +17,10 @@ class AgreedPose:
 
     def at(self, image: Image, view: View) -> Fix | None:
         """``view``: place, heading and height above ground as believed. None: the patches say less than the most that
-        one frame can say; nobody has searched, so chance is what it usually is.
-
-        The second look, on finer cells, finds the pose; it knows nothing of how the tilt was predicted, which whoever
-        takes the pose knows already."""
+        one frame can say; nobody has searched, so chance is what it usually is."""
         first = self._check.at(image, view, CELL_PER_AGL)
         if first is None or first.fix.pnp.fit is None:
             return None
         if evidence(Chance().sigmas(first.agreement, fine=False)) < LLR_MAX:
             return None
-        found = self._check.at(image, view_from(view, first.fix), FIX_GSD_PER_AGL["gradient"], REACH, tilt_prior=False)
-        return None if found is None else found.fix
+        return self._check.settled(image, view, first.fix)

@@ -11,7 +11,7 @@ import numpy as np
 from terrafix.anchor.belief import Mode
 from terrafix.anchor.chance import Chance
 from terrafix.anchor.map_package import LocalMap
-from terrafix.anchor.matcher import FIX_GSD_PER_AGL, REACH, Fix, FrameMatcher, Look, View, view_at, view_from
+from terrafix.anchor.matcher import Fix, FrameMatcher, Look, View, view_at
 from terrafix.anchor.place_check import CELL_PER_AGL, PlaceCheck
 from terrafix.anchor.tracks import AHEAD, CHANCE_MOST, LLR_MAX, LLR_SLOPE, NEAR
 from terrafix.core.node import Image
@@ -38,5 +38,5 @@ def alone(
     evidence, *rivals = (LLR_SLOPE * (chance.sigmas(c.agreement, fine=False) - CHANCE_MOST) for c in (best, *others))
     if evidence < LLR_MAX or evidence < max(rivals, default=0.0) + AHEAD:
         return None
-    found = check.at(image, view_from(view, best.fix), FIX_GSD_PER_AGL["gradient"], REACH, tilt_prior=False)
-    return None if found is None else (mode, found.fix)
+    fix = check.settled(image, view, best.fix)
+    return None if fix is None else (mode, fix)

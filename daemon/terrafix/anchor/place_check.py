@@ -7,7 +7,7 @@ import numpy as np
 
 from terrafix.anchor.agreement import Agreement, agreement
 from terrafix.anchor.map_package import LocalMap
-from terrafix.anchor.matcher import PATCH_PER_AGL, Fix, FrameMatcher, View
+from terrafix.anchor.matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, REACH, Fix, FrameMatcher, View, view_from
 from terrafix.anchor.patches import correlated_patches
 from terrafix.anchor.pnp import MIN_INLIERS, PnpResult
 from terrafix.anchor.rectify import rectify
@@ -18,7 +18,7 @@ from terrafix.messages import Verdict
 
 # Finer cells tell the right place from chance better (measured: by a fourth in standard deviations), at twice the cost.
 CELL_PER_AGL, FINE_PER_AGL = 1 / 100, 1 / 140
-REACH = 0.2  # of the height: what heading, scale and tilt may do at the rim, and the place itself
+PLACE_REACH = 0.2  # of the height: what heading, scale and tilt may do at the rim, and the place itself
 SIGMA_FLOOR = 0.02  # of the height: leaning buildings and changes take patches aside together
 PATCH_SIGMA = 0.005  # of the height: one that is aside by more than the others counts for less. Where the tilt is held
 # to a prior, patches are weighed against it by what they share, and count alike.
@@ -39,7 +39,13 @@ class PlaceCheck:
         self._small: tuple[Image, CameraCalibration] | None = None
 
     def at(
-        self, image: Image, view: View, cell_per_agl: float, reach_per_agl: float = REACH, *, tilt_prior: bool = True
+        self,
+        image: Image,
+        view: View,
+        cell_per_agl: float,
+        reach_per_agl: float = PLACE_REACH,
+        *,
+        tilt_prior: bool = True,
     ) -> Checked | None:
         """``view``: place, heading and height above ground as proposed. ``tilt_prior``: the pose holds the tilt of the
         view to what is known of it. None: too little lies on the map."""
@@ -73,6 +79,12 @@ class PlaceCheck:
         tilt_sigma_rad = view.tilt_sigma_rad if tilt_prior else None
         found_m = on_map_m + found.offsets * view.agl_m
         return Checked(found, self._pose(view, ground_m, found_m, found, cell_m, tilt_sigma_rad))
+
+    def settled(self, image: Image, view: View, first: Fix) -> Fix | None:
+        """The pose of a ``first`` look from ``view``, found again on the cells of a fix. It knows nothing of how the
+        tilt was predicted, which whoever takes the pose knows already."""
+        found = self.at(image, view_from(view, first), FIX_GSD_PER_AGL["gradient"], REACH, tilt_prior=False)
+        return None if found is None else found.fix
 
     def _shrunk(self, image: Image, agl_m: float) -> tuple[Image, CameraCalibration]:
         """The frame with about two pixels to a fine cell, made once for all places."""

@@ -14,8 +14,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from terrafix.core.gate import GATE
 from terrafix.estimator.factors import robust
-from terrafix.estimator.gate import GATE
 from terrafix.estimator.remembered import custom_factor
 
 LEAST_MPS = 8.0  # slower, a pitot tube reads noise, and wings do not carry

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from terrafix.core.gate import GATE
 from terrafix.core.geodesy import LocalFrame
-from terrafix.estimator.gate import GATE
 from terrafix.estimator.velocity import STEADY_MPS2, V_SIZE, Felt, leg, spread_after, unknown_cov
 from terrafix.messages import Coasted
 

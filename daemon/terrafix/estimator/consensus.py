@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.core.gate import GATE
 from terrafix.estimator.fragments import Anchor, Fragment
-from terrafix.estimator.gate import GATE
 
 PROPOSERS, PARTNERS = 16, 8  # anchors that propose, and others against which each proposes a scale: more say the same
 SCALE_BASE = 5.0  # two anchors propose a scale when they are so many of their sigmas apart

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from terrafix.core.gate import GATE
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.doubt import Doubt
 from terrafix.estimator.factors import HEIGHT
-from terrafix.estimator.gate import GATE
 from terrafix.estimator.graph import NodeState
 from terrafix.estimator.matched import determined, measured_pose
 from terrafix.estimator.resume import Known

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import gtsam
 import numpy as np
 
+from terrafix.core.gate import GATE
 from terrafix.estimator.consensus import Similarity, place
 from terrafix.estimator.fragments import Anchor, Fragment, Join, Merged, Placement
-from terrafix.estimator.gate import GATE
 from terrafix.estimator.graduated import Covariances, Doubtful, marginals, settle, solve, weighted
 
 # Precisions of a prior on every fragment, so wide that it says nothing and so narrow that the system stays solvable

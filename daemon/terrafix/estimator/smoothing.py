@@ -12,10 +12,10 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, M, V
 
+from terrafix.core.gate import GATE
 from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
 from terrafix.estimator.fixes import doubted, new_ground, torn
-from terrafix.estimator.gate import GATE
 from terrafix.estimator.graduated import Covariances, Doubtful, marginals, settle, solve, weighted
 from terrafix.estimator.pieces import placed_states
 from terrafix.estimator.whole import Fix, Retold, WholeNode

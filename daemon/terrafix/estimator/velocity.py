@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from terrafix.core.gate import GATE
 from terrafix.core.geodesy import local_rotation_up
-from terrafix.estimator.gate import GATE
 
 # Of the variable V_k: velocity in the world [m/s]; in axes of the heading the acceleration that nobody measured (right,
 # ahead, up) [m/s^2], and what of that is steady (right, ahead) [m/s^2].

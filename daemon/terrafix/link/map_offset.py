@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from terrafix.core.gate import GATE
 from terrafix.link.carry import Carried, apart_m, offset
 from terrafix.link.gnss_judge import DELAY_SIGMA_S, LEAST_M, UNKNOWN_M
 from terrafix.messages import GnssReading, MapOffset, NavEstimate
@@ -31,7 +32,6 @@ RECEIVER_S = 600.0  # correlation of a receiver's slow error: multipath, atmosph
 ALIKE_M = 10_000.0  # correlation of a map's error: mosaics are put together of scenes, some 15 km wide from orbit
 NOISE_M = 0.5  # of a batch, at least
 PRIOR_BATCHES = 4.0  # that claims are worth, against how far batches are off
-GATE = 13.8  # chi-square, 2 degrees of freedom, 99.9 %
 REFUSED = 3  # batches in a row, and what was learnt is forgotten
 REACH = 2.45  # sigmas of map and receiver, 95 % of a plane: further apart one of them is not what it says
 LYING = 0.25  # probability that a trusted receiver is led away too slowly to be seen: then the map was right
@@ -86,6 +86,7 @@ class Registration:
         if found is not None:
             self._x, self._p = np.array(found.state), np.array(found.cov).reshape(SIZE, SIZE)
             self._place, self._t_ns = (found.lat_deg, found.lon_deg), found.t_ns
+        self._largest_m2 = _largest(self._p)
 
     def take(self, batch: Batch) -> MapOffset | None:
         """-> what is known now; None: the batch contradicts what was known."""
@@ -98,7 +99,7 @@ class Registration:
         noise_m2 = scale * batch.variance_m2
         s = h @ self._p @ h.T + noise_m2 * np.eye(2)
         squared = float(missed @ np.linalg.solve(s, missed))
-        self._refused = self._refused + 1 if squared > GATE else 0
+        self._refused = self._refused + 1 if squared > GATE[2] else 0
         if self._refused == REFUSED:
             self._x, self._p, self._refused = np.zeros(SIZE), np.diag(self._usual), 0
         elif not self._refused:
@@ -106,7 +107,8 @@ class Registration:
             gain = np.linalg.solve(s, h @ self._p).T
             left = np.eye(SIZE) - gain @ h
             self._x, self._p = self._x + gain @ missed, left @ self._p @ left.T + noise_m2 * gain @ gain.T
-        else:
+        self._largest_m2 = _largest(self._p)
+        if self._refused:
             return None
         return MapOffset(
             t_ns=batch.t_ns,
@@ -128,16 +130,26 @@ class Registration:
         Nothing is known of it while map and receiver are further apart than both may be off: either may be wrong."""
         if float(np.hypot(*(self._x[:2] + self._x[2:4]))) > REACH * math.sqrt(self._map_m2 + LEAST_M**2):
             return np.zeros(2), self._map_m2
-        x, p = self._moved(place, 1.0)
-        return x[:2], float(np.linalg.eigvalsh(p[:2, :2])[-1])
+        near = self._near(place)  # the same for both axes, which need not be moved to be measured
+        return near * self._x[:2], near**2 * self._largest_m2 + (1.0 - near**2) * self._map_m2
 
     def _moved(self, place: tuple[float, float], alike: float) -> tuple[np.ndarray, np.ndarray]:
         """State and covariance at a ``place``, when of the receiver's error a share ``alike`` has stayed."""
         if self._place is None:
             return self._x, self._p
-        near = math.exp(-math.hypot(*apart_m(self._place, place)) / ALIKE_M)
+        near = self._near(place)
         keep = np.array([near, near, alike, alike, 1.0])
         return keep * self._x, keep[:, None] * self._p * keep + np.diag((1.0 - keep**2) * self._usual)
+
+    def _near(self, place: tuple[float, float]) -> float:
+        """The share of what was learnt that holds there."""
+        return 1.0 if self._place is None else math.exp(-math.hypot(*apart_m(self._place, place)) / ALIKE_M)
+
+
+def _largest(p: np.ndarray) -> float:
+    """Variance of the map's error along the axis that is known worst [m^2]: estimates are sent ten times a second, and
+    batches come once in BATCH_S."""
+    return float(np.linalg.eigvalsh(p[:2, :2])[-1])
 
 
 class MapOffsets:
