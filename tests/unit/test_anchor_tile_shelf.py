@@ -7,8 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from ground import PINHOLE, texture, view
-from one_place import ORIGIN, SIDE_M, TRUE_M, OnlyMap, R
-from test_anchor_node import predicted
+from one_place import ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
 from terrafix.anchor.map_features import MapFeatures
 from terrafix.anchor.node import AnchorNode
@@ -82,6 +81,16 @@ def test_the_oldest_give_way_also_those_of_the_process_before(tmp_path: Path) ->
             shelf.put(str(i), *tile)
     held = [i for i in range(4) if shelf.take(str(i)) is not None]
     assert held == [1, 2, 3]
+
+
+def test_what_is_used_again_and_again_does_not_give_way(read_map: ReadMap, tmp_path: Path) -> None:
+    features = MapFeatures(read_map, GradientDescriber(), shelf=TileShelf(tmp_path, "here", most=3))
+    for i in range(6):  # a tile further east each time, and the first one
+        for e_m in (0.0, 200.0 * i):
+            features.window(e_m, 0.0, 1, 1, 0.5)
+    before = read_map.reads
+    MapFeatures(read_map, GradientDescriber(), shelf=TileShelf(tmp_path, "here")).window(0.0, 0.0, 1, 1, 0.5)
+    assert read_map.reads == before
 
 
 def test_where_there_is_no_room_nothing_is_kept(read_map: ReadMap, tmp_path: Path) -> None:

@@ -80,10 +80,12 @@ class MapFeatures:
 
     def _tile(self, gsd_m: float, tx: int, ty: int, cell: float, per_tile: int) -> tuple[np.ndarray, np.ndarray]:
         key = (gsd_m, tx, ty)
+        name = f"{self._describer.name} {gsd_m!r} {tx} {ty}"
         if key in self._tiles:
             self._tiles.move_to_end(key)
+            if self._shelf is not None:
+                self._shelf.used(name)
             return self._tiles[key]
-        name = f"{self._describer.name} {gsd_m!r} {tx} {ty}"
         tile = None if self._shelf is None else self._shelf.take(name)
         if tile is None:
             tile = self._computed(gsd_m, tx, ty, cell, per_tile)

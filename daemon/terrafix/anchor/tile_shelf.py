@@ -4,7 +4,7 @@ Half of the first look of a new process is computing what the one before it had 
 that look is what the autopilot waits for. So what was computed lies in the folder of the run, too, which is memory."""
 
 import hashlib
-from collections import deque
+from collections import OrderedDict
 from contextlib import suppress
 from pathlib import Path
 
@@ -32,10 +32,11 @@ class TileShelf:
         with suppress(OSError):  # no room: nothing is kept
             folder.mkdir(exist_ok=True)
         found = folder.glob(f"{self._prefix} *.tile")
-        self._files = deque(sorted(found, key=lambda file: file.stat().st_mtime_ns))
+        self._files = OrderedDict.fromkeys(sorted(found, key=lambda file: file.stat().st_mtime_ns))
 
     def take(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
         """-> descriptors (C, n, n) float16, valid (n, n) bool; None: not here, or not whole."""
+        self.used(name)
         written = left(self._file(name), msgspec.msgpack.Decoder(_Written).decode)
         if written is None:
             return None
@@ -45,15 +46,23 @@ class TileShelf:
         except ValueError:
             return None
 
+    def used(self, name: str) -> None:
+        """It gives way after all that were not."""
+        file = self._file(name)
+        if file in self._files:
+            self._files.move_to_end(file)
+
     def put(self, name: str, descriptors: np.ndarray, valid: np.ndarray) -> None:
-        """The oldest give way."""
+        """Those that were not used for longest give way."""
         c, h, w = descriptors.shape
         file = self._file(name)
         leave(file, msgspec.msgpack.encode(_Written((c, h, w), descriptors.tobytes(), valid.tobytes())))
-        self._files.append(file)
+        self._files[file] = None
+        self._files.move_to_end(file)
         while len(self._files) > self._most:
+            oldest, _ = self._files.popitem(last=False)
             with suppress(OSError):
-                self._files.popleft().unlink()
+                oldest.unlink()
 
     def _file(self, name: str) -> Path:
         return self._folder / f"{self._prefix} {name}.tile"
