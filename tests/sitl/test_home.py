@@ -4,7 +4,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from pilot import HOVER_M, Pilot, fly_up, terrafix
+from pilot import HOVER_M, Pilot, end, fly_up, terrafix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from standing_copter import HOME, copter, free_port
 
@@ -37,6 +37,5 @@ def test_fact_home_that_is_moved_in_flight_moves_the_relative_height_alone(tmp_p
             assert said()[0] - before_m == pytest.approx(LOWER_M, abs=3.0)
             assert above.above(*said(), armed=True) == pytest.approx(before_m, abs=1.0)
     finally:
-        running.kill()
-        running.communicate()
+        end(running)
         pilot.close()

@@ -1,6 +1,5 @@
 """Killed and started again in flight: what ArduPilot's own firmware shows, and an external position in between."""
 
-import signal
 import socket
 import subprocess
 import sys
@@ -9,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from pilot import GUIDED, Pilot, fly_up, terrafix
+from pilot import GUIDED, Pilot, end, fly_up, terrafix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from standing_copter import HOME, SENT, Heard, copter, free_port, stand
 
@@ -45,12 +44,10 @@ def test_fact_killed_in_flight_the_fix_goes_and_is_back_two_seconds_after_the_re
             assert all(pilot.healthy) and len(pilot.healthy) > HOVER_S
             assert pilot.off_home_m() < NEAR_M
             killed_s = time.monotonic()
-            running.send_signal(signal.SIGKILL)
+            end(running)
             pilot.listen(SILENT_S)
-            running.wait()
             lost = [t_s - killed_s for t_s, fix in pilot.fixes if t_s > killed_s and fix < 3]
             assert lost and lost[0] > 3.0, "the firmware did not show the loss"
-            began(running)
             running, restarted_s = terrafix(port), time.monotonic()
             pilot.until("the fix after the restart", lambda: pilot.fix() == 3)
             back_s = pilot.fixes[-1][0]
@@ -66,8 +63,7 @@ def test_fact_killed_in_flight_the_fix_goes_and_is_back_two_seconds_after_the_re
             assert pilot.newest["HEARTBEAT"].custom_mode == GUIDED  # no failsafe
             assert not [text for text in pilot.texts if "EKF variance" in text or "Failsafe" in text], pilot.texts
     finally:
-        running.kill()
-        running.wait()
+        end(running)
         pilot.close()
 
 

@@ -117,17 +117,15 @@ def test_a_torn_tail_costs_only_the_tail(tmp_path: Path, tail: bytes) -> None:
 
 
 def test_kill_9_costs_less_than_a_second(tmp_path: Path) -> None:
-    process = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     heard: list[tuple[float, int]] = []
-    for line in process.stdout:
-        heard.append((time.monotonic(), int(line)))
-        if heard[-1][1] >= 600:
-            break
-    killed = time.monotonic()
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
+    with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            heard.append((time.monotonic(), int(line)))
+            if heard[-1][1] >= 600:
+                break
+        killed = time.monotonic()
+        os.kill(process.pid, signal.SIGKILL)
     got = [x.frames for x in read(tmp_path) if isinstance(x, m.SourceEnded)]
     assert got == list(range(len(got)))
     must_be_there = [i for at, i in heard if at < killed - 0.9]
