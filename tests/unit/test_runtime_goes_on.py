@@ -33,16 +33,17 @@ def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
 
 
 @pytest.mark.parametrize(
-    ("spec", "camera", "age_s", "goes_on"),
+    ("spec", "camera", "age_s", "goes_on", "stays"),
     [
-        (b"this map", True, 5.0, True),
-        (b"this map", False, 5.0, False),
-        (b"another map", True, 5.0, False),
-        (b"this map", True, 61.0, False),
+        (b"this map", True, 5.0, True, False),
+        (b"this map", False, 5.0, False, True),
+        (b"another map", True, 5.0, False, True),
+        (b"this map", True, 61.0, False, False),
+        (b"another map", True, 61.0, False, False),
     ],
 )
 def test_it_goes_on_from_a_run_of_the_same_that_was_killed_just_now(
-    tmp_path: Path, spec: bytes, camera: bool, age_s: float, goes_on: bool
+    tmp_path: Path, spec: bytes, camera: bool, age_s: float, goes_on: bool, stays: bool
 ) -> None:
     dead = killed(tmp_path, spec, age_s)
     owned = OwnedRunDir(tmp_path, b"this map", goes_on=camera)
@@ -50,7 +51,7 @@ def test_it_goes_on_from_a_run_of_the_same_that_was_killed_just_now(
         assert owned.run_dir.epoch_ns == (7 if goes_on else None)
         assert owned.run_dir.kept("estimator").exists() == goes_on
         assert (owned.run_dir.shelf("anchor") / "0 0.tile").exists() == goes_on
-        assert not dead.path.exists()
+        assert dead.path.exists() == stays, "what goes on another way has an heir that is still to come"
     finally:
         owned.remove()
 

@@ -269,15 +269,20 @@ def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tm
             assert rest[-1] == b"STOPPING=1"
 
 
-def test_children_die_with_a_killed_supervisor_and_its_leftovers_are_swept(tmp_path: Path) -> None:
+def test_children_die_with_a_killed_supervisor_and_its_leftovers_are_swept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     others = {run.path for run in rundir.living()}
     with supervisor_process(tmp_path / "out") as process:
         eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
         children = children_of(process.pid)
         (folder,) = {run.path for run in rundir.living()} - others
+        eventually(rundir.RunDir(folder).flew_just_now, 15)
         process.kill()
         eventually(lambda: all(is_gone(pid) for pid in children.values()), 2)
-    assert folder.exists()
+    rundir.OwnedRunDir().remove()
+    assert folder.exists(), "the one that goes on from there is still to come"
+    monkeypatch.setattr(rundir, "SAME_FLIGHT_NS", 0)
     living = rundir.OwnedRunDir()
     assert not folder.exists(), "the next start removes what the killed one left"
     rundir.OwnedRunDir().remove()

@@ -73,16 +73,18 @@ class RunDir:
     def _epoch(self) -> Path:
         return self.path / "epoch_ns"
 
-    def goes_on_from(self, dead: "RunDir") -> None:
-        """What the processes of ``dead`` knew last, if they were run for the same and lived until just now."""
+    def goes_on_from(self, dead: "RunDir") -> bool:
+        """What the processes of ``dead`` knew last. False: they were not run for the same, or have not lived until just
+        now."""
         same = dead.spec.is_file() and dead.spec.read_bytes() == self.spec.read_bytes()
         if not same or not dead.flew_just_now():
-            return
+            return False
         for file in (dead._epoch, *dead.path.glob("*.kept")):
             write_whole(self.path / file.name, file.read_bytes())
         for folder in dead.path.glob("*.shelf"):
             with suppress(OSError):  # it can be done without
                 folder.rename(self.path / folder.name)
+        return True
 
     def flew_just_now(self) -> bool:
         """Its source was open, and it lived until just now."""
@@ -179,7 +181,8 @@ def _is_held(lock: Path) -> bool:
 
 
 def sweep(parent: Path, heir: RunDir | None = None) -> None:
-    """Removes the folders of supervisors that are gone, when ``heir`` has taken from them what goes on."""
+    """Removes the folders of supervisors that are gone, when ``heir`` has taken from them what goes on. Of another run
+    that was killed in flight just now the heir is still to come."""
     for lock in parent.glob(f"{PREFIX}*/lock"):
         try:
             fd = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
@@ -190,8 +193,8 @@ def sweep(parent: Path, heir: RunDir | None = None) -> None:
         except BlockingIOError:
             continue  # alive
         else:
-            if heir is not None:
-                heir.goes_on_from(RunDir(lock.parent))
-            shutil.rmtree(lock.parent, ignore_errors=True)
+            dead = RunDir(lock.parent)
+            if (heir is not None and heir.goes_on_from(dead)) or not dead.flew_just_now():
+                shutil.rmtree(lock.parent, ignore_errors=True)
         finally:
             os.close(fd)
