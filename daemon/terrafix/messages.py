@@ -167,7 +167,11 @@ class Odometry(Message, frozen=True, kw_only=True):
 
     ``pairs``: (x_kf, y_kf, x, y) in undistorted normalised image coordinates (tan of the angle) of
     features on the ground seen in both, RANSAC inliers, spread over the image. Metric scale comes
-    later, from the height that the estimator knows."""
+    later, from the height that the estimator knows.
+
+    ``triples``: (x_before, y_before, x_kf, y_kf, x, y), of features that the keyframe before, ``before_id``, saw as
+    well; of frames that become a keyframe. They say how long the way to this frame is in units of the way before,
+    whatever the ground is like."""
 
     frame_id: int
     keyframe_id: int
@@ -177,6 +181,9 @@ class Odometry(Message, frozen=True, kw_only=True):
     inliers: int = 0
     tracked: int = 0
     becomes_keyframe: bool = False  # following frames refer to this frame
+    before_id: int = -1  # -1: there are no triples
+    triples: list[tuple[float, float, float, float, float, float]] = []
+    triples_sigma_norm: float = 0.0  # 1-sigma of one coordinate of these, normalised units
 
 
 # --- estimator to anchor --------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import pytest
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
+from terrafix.estimator.tracker import Tracker
 from terrafix.messages import MapMatch, Prediction, Verdict
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.faults import JUMP_M, JUMPS, Faults
@@ -169,6 +170,24 @@ def test_a_hillside_that_no_map_tells_is_not_taken_for_a_tilt_of_the_camera() ->
     seen = Seen.of(run(plan(1, 3, fault=Fault.HILLS, duration_s=180.0)))
     assert float(seen.map_nees[60:].mean()) < 4.0
     assert float((seen.nees < 5.991).mean()) > 0.93
+
+
+def test_three_keyframes_carry_the_way_on_over_hills_in_the_dark(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two flights over relief of 20 m, 150 s without a map."""
+    hills = [plan(1, number, fault=Fault.DRIFT, duration_s=240.0) for number in (2, 8)]
+
+    def flown_m() -> tuple[float, float]:
+        """Mean error in the dark, and the claim at its end."""
+        records = [run(one, refine=False) for one in hills]
+        errors = [float(np.hypot(*record.error_m[90:, :2].T).mean()) for record in records]
+        claims = [float(np.sqrt(np.trace(record.cov[-1, :2, :2]))) for record in records]
+        return sum(errors), sum(claims)
+
+    error_m, claim_m = flown_m()
+    monkeypatch.setattr(Tracker, "_three", lambda *_: None)
+    without_m, claim_without_m = flown_m()
+    assert error_m < 0.85 * without_m
+    assert error_m < claim_m < 0.8 * claim_without_m
 
 
 def test_photos_that_do_not_overlap_are_claimed_for_the_speed_of_what_flies_and_for_its_turns() -> None:

@@ -101,6 +101,33 @@ def test_a_long_flight_is_one_chain(ground: np.ndarray) -> None:
     assert 3 <= len(keyframes) <= 12  # not every frame, and not too few for the overlap
 
 
+def test_corners_outlive_their_keyframe_and_are_seen_by_three(ground: np.ndarray) -> None:
+    tracker, at, keyframes, seen = FrameTracker(PINHOLE), dict[int, Pose](), list[int](), 0
+    for i in range(18):
+        at[i] = pose(-80.0 + 9.0 * i, 0.4 * i, yaw_deg=2.0 * i)
+        motion = tracker.track(i, picture(ground, at[i]))
+        if len(motion.triples):
+            assert motion.becomes_keyframe and [motion.before_id, motion.keyframe_id] == keyframes[-2:]
+            views = motion.triples.reshape(-1, 3, 2)
+            for which, before in enumerate(keyframes[-2:]):
+                error = (views[:, 2] - apply(homography(at[before], at[i]), views[:, which])) * PINHOLE.fx
+                # A track from frame to frame slips by 0.3 to 0.9 px.
+                assert np.median(np.linalg.norm(error, axis=1)) < 0.4
+            seen += 1
+        if motion.becomes_keyframe:
+            keyframes.append(i)
+    assert seen == len(keyframes) - 2 > 1
+
+
+def test_a_new_fragment_knows_nothing_of_the_keyframes_before(ground: np.ndarray) -> None:
+    tracker = FrameTracker(PINHOLE)
+    for i in range(6):
+        tracker.track(i, picture(ground, pose(9.0 * i, 0.0)))
+    for i in range(MAX_MISSES + 1):
+        tracker.track(6 + i, foreign())
+    assert len(tracker.track(20, foreign()).triples) == 0
+
+
 def test_a_foreign_frame_costs_that_frame_only(ground: np.ndarray) -> None:
     tracker = FrameTracker(PINHOLE)
     track = [pose(0.0, 8.0 * i) for i in range(5)]

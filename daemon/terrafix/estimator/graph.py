@@ -16,6 +16,7 @@ from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA, leg_factor
 from terrafix.estimator.lag import FixedLag
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.past import Past
+from terrafix.estimator.structure import Structure, structure_factor
 from terrafix.estimator.velocity import V_SIZE, Leg, standing_cov, unknown_cov
 
 LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
@@ -131,9 +132,11 @@ class PoseGraph:
         leg: Leg | None,
         attitude: gtsam.CustomFactor | None,
         rise_sigma_m: float = 0.0,
+        three: tuple[int, Structure] | None = None,
     ) -> int:
         """A node that follows ``parent`` (in the window) by ``motion``, and the newest by ``leg``; None: it stands.
-        ``rise_sigma_m``: of the ground since the newest, when no map tells."""
+        ``rise_sigma_m``: of the ground since the newest, when no map tells. ``three``: what an earlier node, ``parent``
+        and this one saw together."""
         node = self._next
         newest = self.newest
         dt_s = max(t_s - self._times[newest], 1e-3)
@@ -170,6 +173,9 @@ class PoseGraph:
         factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(BIAS_SIZE), walk))
         if attitude is not None:
             factors.add(attitude)
+        if three is not None and three[0] not in self._smoother.leaving(node):
+            first, middle, last = ((C(n), B(n)) for n in (three[0], parent, node))
+            factors.add(structure_factor((first, middle, last), three[1], rises=rise_sigma_m > 0.0))
         self._insert(t_s, state, factors)
         return node
 

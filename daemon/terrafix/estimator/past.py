@@ -2,7 +2,10 @@
 
 A factor that leaves becomes linear, around the values that its nodes left with: those at which iSAM2 had it linear, so
 that it remembers the answer (remembered.py). Of the nodes only some are kept as unknowns: what lies between two kept
-ones is taken out of the linear system, exactly, and follows these from then on (track.py). When too many are kept, more
+ones is taken out of the linear system, exactly, and follows these from then on (track.py). A keyframe parts what is
+before it from what comes after, but for the one factor of three keyframes of which it is the middle one: where it is
+kept that is dropped. (To keep the keyframe before it as well was tried: covariances of a chain that hangs on two nodes,
+and these on two others, drown in rounding.) When too many are kept, more
 are taken out. So the cost of a frame does not grow with the flight, and its memory by some 270 bytes a frame."""
 
 from bisect import bisect_left, bisect_right
@@ -24,7 +27,8 @@ from terrafix.estimator.linear import (
 )
 from terrafix.estimator.track import Track
 
-SPACING = 5  # nodes from one kept node to the next, at least
+SPACING = 10  # nodes from one kept node to the next, at least
+THREE = 3  # nodes of a factor that says how one way is in units of the other
 MOST_KEPT = 256
 MOST_OPEN = 60  # nodes among which none can be kept alone: then the newest is, and what reaches beyond it is dropped
 
@@ -116,13 +120,15 @@ class Past:
         self._track.put(node, np.asarray(state[0].translation()))
 
     def _next_kept(self) -> int | None:
-        """The next node that parts what is before it from what comes after: no factor reaches across."""
+        """The next node that parts what is before it from what comes after: no factor reaches across, but for one of
+        three keyframes, which is dropped then."""
         last = self._kept[-1]
         open_nodes = [n for n in self._left if n > last]
         if not open_nodes or (open_nodes[-1] - last < SPACING and self._held.isdisjoint(open_nodes)):
             return None  # which saves a look at every factor in most frames
         reach = dict.fromkeys(open_nodes, 0)
-        for nodes in (*(f.nodes for f in self._linear), *(nodes for _, nodes in self._window)):
+        pairs = (nodes for _, nodes in self._window if len(nodes) < THREE)
+        for nodes in (*(f.nodes for f in self._linear), *pairs):
             for node in nodes:
                 if node in reach:
                     reach[node] = max(reach[node], nodes[-1])

@@ -12,7 +12,7 @@ from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.estimator.air import Air, Wind
 from terrafix.estimator.beginning import Beginning, Slow, TakeOff
 from terrafix.estimator.coasted import Coast, Coasts
-from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS_SIGMA, SCALE
+from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS, LENS_SIGMA, SCALE
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sigmas
 from terrafix.estimator.heading import OpenHeading
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
@@ -25,6 +25,7 @@ from terrafix.estimator.mounted import (
 )
 from terrafix.estimator.pace import Pace
 from terrafix.estimator.resume import Known
+from terrafix.estimator.structure import Structure, Trio, structure_of
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.terrain import RELIEF_REPEATS, Terrain
 from terrafix.estimator.told import Told
@@ -228,7 +229,8 @@ class Tracker:
             if known is not None:
                 ground_m = self.terrain.below(p)
                 way = way.above(max(float(p[2]) - ground_m, 1.0), ground_m)
-        node = self.graph.extend(t_s, state, parent, motion, way, said, rise_m)
+        three = None if known is None else self._three(odometry, parent, motion)
+        node = self.graph.extend(t_s, state, parent, motion, way, said, rise_m, three)
         self._felt = None if way is None else way.inertial
         if not attitude.stands:
             self._stood_at = None
@@ -485,6 +487,27 @@ class Tracker:
         dt_s = max(odometry.t_ns * 1e-9 - self.graph.time_of(parent), 1e-3)
         possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + height
         return (parent, motion) if possible else Verdict.IMPLAUSIBLE
+
+    def _three(self, odometry: Odometry, parent: int, motion: RelativePose) -> tuple[int, Structure] | None:
+        """What the keyframe before saw of the same points, and its node."""
+        first = self._node_of.get(odometry.before_id)
+        if not odometry.triples or first is None or not self.graph.holds(first):
+            return None
+        before, middle = self.graph.state(first), self.graph.state(parent)
+        ground_m = self.terrain.below(middle.pose.translation())
+        risen = 0.0 if self.terrain.is_told else float(before.bias[HEIGHT] - middle.bias[HEIGHT])
+        moved = gtsam.Pose3(before.pose.rotation(), before.pose.translation() + np.array([0.0, 0.0, risen]))
+        guess = Trio(
+            middle.pose.between(moved),
+            gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m),
+            float(middle.pose.translation()[2]) - ground_m,
+            ground_m,
+            float(middle.bias[LENS]),
+        )
+        seen = structure_of(
+            np.array(odometry.triples), odometry.triples_sigma_norm, guess, self.origin.camera.focal_sigma
+        )
+        return None if seen is None else (first, seen)
 
     def _ground(self, p_m: np.ndarray, height_m: float, place_cov: np.ndarray, share: float) -> Ground:
         """The plane under a camera at ``p_m`` (3,), known to ``place_cov`` (3x3). ``share`` of the matches agreed."""

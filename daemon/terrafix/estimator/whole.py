@@ -17,6 +17,7 @@ from terrafix.estimator.matched import determined, measured_pose
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.resume import Known
+from terrafix.estimator.structure import Structure
 from terrafix.estimator.terrain import Terrain
 from terrafix.estimator.velocity import V_SIZE, Leg
 from terrafix.messages import (
@@ -102,11 +103,12 @@ class WholeGraph(PoseGraph):
         leg: Leg | None,
         attitude: gtsam.CustomFactor | None,
         rise_sigma_m: float = 0.0,
+        three: tuple[int, Structure] | None = None,
     ) -> int:
         self.remember()
         keyframe_m = np.asarray(self.state(parent).pose.translation())
         self._noted = WholeNode(t_s, state, [], parent, motion, keyframe_m)
-        node = super().extend(t_s, state, parent, motion, leg, attitude, rise_sigma_m)
+        node = super().extend(t_s, state, parent, motion, leg, attitude, rise_sigma_m, three)
         if motion.seen is not None:
             self.nodes[node].factors = self.nodes[node].factors[1:]  # what was seen is made a factor again, better
         return node

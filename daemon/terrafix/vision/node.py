@@ -56,6 +56,11 @@ class VisionNode:
             inliers=motion.inliers,
             tracked=motion.tracked,
             becomes_keyframe=motion.becomes_keyframe,
+            before_id=motion.before_id,
+            triples=[
+                (float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in motion.triples
+            ],
+            triples_sigma_norm=motion.triples_sigma_norm,
         )
 
 

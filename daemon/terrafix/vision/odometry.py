@@ -3,7 +3,7 @@
 The ground is close to a plane seen from flying height, so a homography holds the matches together; what stands
 above it is left out by the RANSAC threshold or enters as noise, which the covariance states."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 from terrafix.messages import Verdict
+from terrafix.vision.realign import realigned
 
 WORK_WIDTH_PX = 720  # wide enough for 0.2 m detail at 100 m, small enough for 10 frames a second on two cores
 MAX_CORNERS = 400
@@ -33,6 +34,8 @@ MAX_PAIRS = 48
 SIGMA_PX = (
     0.75  # of a matched coordinate: tracks slip when the picture turns or the exposure steps (measured 0.4 to 0.9)
 )
+MAX_TRIPLES, MIN_TRIPLES = 96, 12
+REALIGNED_SIGMA_PX = 0.25  # of a coordinate of a corner that a new keyframe found anew (measured 0.13 to 0.6)
 SIFT_FEATURES = 1500
 SIFT_RATIO = 0.8  # Lowe 2004
 
@@ -42,13 +45,18 @@ class _Keyframe:
     frame_id: int
     gray: np.ndarray
     corners: np.ndarray  # (N, 2) px
+    before: np.ndarray  # (N, 2) px: where these are in the keyframe before; nan: not seen there
+    before_id: int  # its frame; meaningless where nothing was seen
     sift: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 2) px, descriptors; made when first needed
     age: int = 0
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Matches of a frame with its keyframe; ``pairs`` (N, 4) normalised (x_kf, y_kf, x, y)."""
+    """Matches of a frame with its keyframe; ``pairs`` (N, 4) normalised (x_kf, y_kf, x, y).
+
+    ``triples`` (N, 6) normalised (x_before, y_before, x_kf, y_kf, x, y): corners that the keyframe before, frame
+    ``before_id``, saw as well. Only of a frame that becomes a keyframe."""
 
     keyframe_id: int
     verdict: Verdict
@@ -57,6 +65,9 @@ class Motion:
     inliers: int
     tracked: int
     becomes_keyframe: bool
+    before_id: int = -1
+    triples: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    triples_sigma_norm: float = 0.0
 
 
 class FrameTracker:
@@ -87,7 +98,7 @@ class FrameTracker:
             return self._accept(keyframe, frame_id, gray, points_kf[inlier], points[inlier], tracked)
         # Against the keyframe by features, and if that fails against the frame that failed before this one: two that
         # agree with each other are a new fragment, one that agrees with nobody is a foreign frame.
-        here = _Keyframe(frame_id, gray, _NO_POINTS, self._describe(gray))
+        here = _Keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1, self._describe(gray))
         for candidate in (keyframe, self._missed):
             if candidate is None:
                 continue
@@ -156,13 +167,44 @@ class FrameTracker:
             or keyframe.age >= KEYFRAME_MAX_AGE
             or self._last_gray is not gray
         )
+        triples = np.zeros((0, 6))
         if due:
-            self._start_keyframe(frame_id, gray)
+            kept, index = self._live_on(keyframe, gray)
+            triples = self._triples(keyframe, kept, index)
+            self._start_keyframe(frame_id, gray, kept, keyframe.corners[index], keyframe.frame_id)
         pick = _spread(a, MAX_PAIRS)
         pairs = np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])])
         # A consensus that few of the matches share may be a roof instead of the ground: less is claimed for it.
         sigma = SIGMA_PX / self._camera.fx / float(np.sqrt(len(a) / max(tracked, len(a))))
-        return Motion(keyframe.frame_id, Verdict.ACCEPTED, pairs, sigma, len(a), tracked, due)
+        return Motion(
+            keyframe.frame_id,
+            Verdict.ACCEPTED,
+            pairs,
+            sigma,
+            len(a),
+            tracked,
+            due,
+            keyframe.before_id if len(triples) else -1,
+            triples,
+            REALIGNED_SIGMA_PX / self._camera.fx,
+        )
+
+    def _live_on(self, keyframe: _Keyframe, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The corners of the keyframe that are followed to here. -> points (N, 2), which corners these are."""
+        index = self._last_index
+        if self._last_gray is not gray or len(index) < MIN_INLIERS:
+            return _NO_POINTS, np.zeros(0, int)
+        here, kept = realigned(keyframe.gray, keyframe.corners[index], gray, self._last_points, RANSAC_PX)
+        return here, index[kept]
+
+    def _triples(self, keyframe: _Keyframe, here: np.ndarray, index: np.ndarray) -> np.ndarray:
+        three = np.isfinite(keyframe.before[index, 0])
+        if three.sum() < MIN_TRIPLES:
+            return np.zeros((0, 6))
+        here, index = here[three], index[three]
+        pick = _spread(keyframe.corners[index], MAX_TRIPLES)
+        views = keyframe.before[index[pick]], keyframe.corners[index[pick]], here[pick]
+        return np.hstack([self._camera.normalise(px) for px in views])
 
     def _miss(self, keyframe: _Keyframe, here: _Keyframe, tracked: int) -> Motion:
         self._misses += 1
@@ -173,14 +215,23 @@ class FrameTracker:
 
     def _new_fragment(self, frame_id: int, gray: np.ndarray) -> Motion:
         """The frame stands alone: no motion is known, later frames refer to it."""
-        self._start_keyframe(frame_id, gray)
+        self._start_keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1)
         self._misses, self._missed = 0, None
         return Motion(frame_id, Verdict.ACCEPTED, np.zeros((0, 4)), 0.0, 0, 0, True)
 
-    def _start_keyframe(self, frame_id: int, gray: np.ndarray) -> None:
-        corners = cv2.goodFeaturesToTrack(gray, MAX_CORNERS, 0.005, MIN_CORNER_DISTANCE_PX)
-        found = corners.reshape(-1, 2).astype(np.float32) if corners is not None else _NO_POINTS
-        self._keyframe = _Keyframe(frame_id, gray, found)
+    def _start_keyframe(
+        self, frame_id: int, gray: np.ndarray, kept: np.ndarray, before: np.ndarray, before_id: int
+    ) -> None:
+        """Corners that are ``kept`` (N, 2) live on, and were seen at ``before`` (N, 2); new ones fill what is empty."""
+        empty = np.full(gray.shape, 255, np.uint8)
+        for x, y in np.round(kept).astype(int):
+            cv2.circle(empty, (int(x), int(y)), MIN_CORNER_DISTANCE_PX, 0, -1)
+        wanted = MAX_CORNERS - len(kept)
+        corners = cv2.goodFeaturesToTrack(gray, wanted, 0.005, MIN_CORNER_DISTANCE_PX, mask=empty) if wanted else None
+        new = corners.reshape(-1, 2).astype(np.float32) if corners is not None else _NO_POINTS
+        found = np.vstack([kept, new])
+        unseen = np.full((len(new), 2), np.nan, np.float32)
+        self._keyframe = _Keyframe(frame_id, gray, found, np.vstack([before, unseen]), before_id)
         self._last_gray, self._last_points, self._last_index = gray, found, np.arange(len(found))
 
 

@@ -21,6 +21,9 @@ LOST_SHARE = 0.04  # of the tracks, in a frame
 GROSS_SHARE, GROSS_PX = 0.04, 25.0  # tracks that jumped to something else
 MISS_SHARE = 0.02  # frames that cannot be tracked: exposure, blur
 CANDIDATES = 900  # points of the ground among which the corners are
+# Of a coordinate of a corner that a new keyframe finds anew: median of the 1-sigma, and spread of its logarithm from
+# keyframe to keyframe; and the share of corners that find something else near by.
+REALIGNED_PX, REALIGNED_SPREAD, MISALIGNED_SHARE = 0.22, 0.45, 0.08
 
 
 @dataclass
@@ -30,6 +33,9 @@ class _Keyframe:
     px: np.ndarray  # (N, 2)
     slip_px: np.ndarray  # (N, 2)
     alive: np.ndarray  # (N,) bool
+    off_px: np.ndarray  # (N, 2): by what a corner is no longer on the point that it was on at first
+    before_px: np.ndarray  # (N, 2), in the keyframe before; nan: not seen there
+    before_id: int
     age: int = 0
 
 
@@ -67,8 +73,9 @@ class Sightings:
         )
         pick = np.linspace(0, len(a) - 1, min(len(a), real.MAX_PAIRS)).astype(int)
         pairs = np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])])
+        triples = np.zeros((0, 6))
         if due:
-            self._keyframe = self._new(frame_id, shot)
+            self._keyframe, triples = self._next(keyframe, frame_id, shot)
         return Odometry(
             t_ns=t_ns,
             frame_id=frame_id,
@@ -79,7 +86,38 @@ class Sightings:
             inliers=len(a),
             tracked=tracked,
             becomes_keyframe=due,
+            before_id=keyframe.before_id if len(triples) else -1,
+            triples=[(float(p), float(q), float(r), float(s), float(t), float(u)) for p, q, r, s, t, u in triples],
+            triples_sigma_norm=real.REALIGNED_SIGMA_PX / self._camera.fx,
         )
+
+    def _next(self, keyframe: _Keyframe, frame_id: int, shot: Shot) -> tuple[_Keyframe, np.ndarray]:
+        """The keyframe that follows, and what three saw: corners that are still tracked live on."""
+        kept = np.flatnonzero(keyframe.alive)
+        sigma_px = REALIGNED_PX * float(np.exp(REALIGNED_SPREAD * self._rng.normal()))
+        off = keyframe.off_px[kept] + sigma_px * self._rng.normal(size=(len(kept), 2))
+        wrong = self._rng.uniform(size=len(kept)) < MISALIGNED_SHARE
+        off[wrong] += real.RANSAC_PX * self._rng.uniform(-0.7, 0.7, (int(wrong.sum()), 2))
+        px, inside = self._projected(keyframe.points_m[kept], shot)
+        kept, off, px = kept[inside], off[inside], (px + off)[inside]
+        new = self._new(frame_id, shot)
+        fresh = slice(0, real.MAX_CORNERS - len(kept))
+        following = _Keyframe(
+            frame_id,
+            np.vstack([keyframe.points_m[kept], new.points_m[fresh]]),
+            np.vstack([px, new.px[fresh]]),
+            np.zeros((len(px) + len(new.px[fresh]), 2)),
+            np.ones(len(px) + len(new.px[fresh]), bool),
+            np.vstack([off, new.off_px[fresh]]),
+            np.vstack([keyframe.px[kept], new.before_px[fresh]]),
+            keyframe.frame_id,
+        )
+        three = np.flatnonzero(np.isfinite(keyframe.before_px[kept, 0]))
+        if len(three) < real.MIN_TRIPLES:
+            return following, np.zeros((0, 6))
+        pick = three[np.linspace(0, len(three) - 1, min(len(three), real.MAX_TRIPLES)).astype(int)]
+        views = keyframe.before_px[kept[pick]], keyframe.px[kept[pick]], px[pick]
+        return following, np.hstack([self._camera.normalise(view) for view in views])
 
     def _tracked(self, keyframe: _Keyframe, shot: Shot) -> tuple[np.ndarray, np.ndarray, int] | None:
         """Inliers in keyframe and frame (px), and how many were tracked; None: too few."""
@@ -90,7 +128,7 @@ class Sightings:
         noise = WHITE_PX * rng.normal(size=(n, 2))
         gross = rng.uniform(size=n) < GROSS_SHARE
         noise[gross] += GROSS_PX * rng.uniform(-1.0, 1.0, (int(gross.sum()), 2))
-        a, b = keyframe.px[keyframe.alive], (px + keyframe.slip_px + noise)[keyframe.alive]
+        a, b = keyframe.px[keyframe.alive], (px + keyframe.off_px + keyframe.slip_px + noise)[keyframe.alive]
         if len(a) < real.MIN_INLIERS:
             return None
         _, mask = cv2.findHomography(a, b, cv2.RANSAC, real.RANSAC_PX, maxIters=1500, confidence=0.999)
@@ -119,8 +157,10 @@ class Sightings:
         points = np.column_stack([places, up])
         px, inside = self._projected(points, shot)
         chosen = np.flatnonzero(inside)[: 0 if blind else real.MAX_CORNERS]
-        slip = np.zeros((len(chosen), 2))
-        return _Keyframe(frame_id, points[chosen], px[chosen], slip, np.ones(len(chosen), bool))
+        none = np.zeros((len(chosen), 2))
+        return _Keyframe(
+            frame_id, points[chosen], px[chosen], none, np.ones(len(chosen), bool), none.copy(), none + np.nan, -1
+        )
 
     def _projected(self, points_m: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
         """-> pixels (N, 2) of the working picture, and which of them lie in it."""

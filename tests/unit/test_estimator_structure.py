@@ -1,0 +1,154 @@
+"""Three keyframes that see the same points: one way in units of the other, and nothing of how long all of it is."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, C
+
+from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS
+from terrafix.estimator.structure import MIN_TRIPLES, Structure, Trio, structure_factor, structure_of
+
+DOWN = gtsam.Rot3(np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]))
+HEIGHT_M, SIGMA, FOCAL_SIGMA = 100.0, 5e-4, 0.01
+NODES = ((C(0), B(0)), (C(1), B(1)), (C(2), B(2)))
+
+
+class Flown:
+    """Three cameras over hills of ``relief_m`` (1-sigma), what they see, and a guess of where they are."""
+
+    def __init__(self, seed: int, relief_m: float = 8.0, lens: float = 0.0, *, points: int = 60) -> None:
+        self.rng = rng = np.random.default_rng(seed)
+        self.poses = [
+            gtsam.Pose3(
+                DOWN.compose(gtsam.Rot3.Expmap(rng.normal(0.0, 0.05, 3))),
+                np.array([22.0 * i, 2.0 * i * i, HEIGHT_M + 2.0 * i]),
+            )
+            for i in range(3)
+        ]
+        ground = np.column_stack(
+            [rng.uniform(-60, 110, 3000), rng.uniform(-60, 60, 3000), rng.normal(0, relief_m, 3000)]
+        )
+        views = []
+        for pose in self.poses:
+            in_c = (ground - pose.translation()) @ pose.rotation().matrix()
+            views.append(in_c[:, :2] / in_c[:, 2:])
+        inside = np.all([np.all(np.abs(xy) < (0.9, 0.5), axis=1) for xy in views], axis=0)
+        seen = np.stack(views, 1)[inside][:points]
+        seen = seen * (1.0 + lens * np.sum(seen**2, axis=2, keepdims=True))
+        self.triples = seen.reshape(-1, 6) + SIGMA * rng.normal(size=(len(seen), 6))
+
+    def guess(self, off: float = 1.0) -> Trio:
+        believed = [
+            pose.retract(off * np.concatenate([self.rng.normal(0, 0.005, 3), self.rng.normal(0, 0.5, 3)]))
+            for pose in self.poses
+        ]
+        return Trio(believed[1].between(believed[0]), believed[1].between(believed[2]), HEIGHT_M, 0.0, 0.0)
+
+    def values(self, scale: float = 1.0, lens: float = 0.0) -> gtsam.Values:
+        values = gtsam.Values()
+        bias = np.zeros(BIAS_SIZE)
+        bias[LENS] = lens
+        for i, pose in enumerate(self.poses):
+            values.insert(C(i), gtsam.Pose3(pose.rotation(), scale * pose.translation()))
+            values.insert(B(i), bias)
+        return values
+
+
+def length(pose: gtsam.Pose3) -> float:
+    return float(np.linalg.norm(pose.translation()))
+
+
+def seen_of(flown: Flown, guess: Trio | None = None) -> Structure:
+    seen = structure_of(flown.triples, SIGMA, guess or flown.guess(), FOCAL_SIGMA)
+    assert seen is not None
+    return seen
+
+
+def test_hills_do_not_change_how_long_one_way_is_in_units_of_the_other() -> None:
+    off = []
+    for seed in range(30):
+        flown = Flown(seed)
+        at = seen_of(flown).at
+        true = length(flown.poses[1].between(flown.poses[2])) / length(flown.poses[1].between(flown.poses[0]))
+        off.append(length(at.last) / length(at.first) / true - 1.0)
+    assert np.sqrt(np.mean(np.square(off))) < 0.01  # one plane through such ground is some 5 % wrong
+
+
+def test_what_it_claims_is_no_less_than_it_errs_by() -> None:
+    squares, rows = 0.0, 0
+    for seed in range(40):
+        flown = Flown(seed)
+        seen = seen_of(flown)
+        error = structure_factor(NODES, seen, rises=False).unwhitenedError(flown.values())
+        squares, rows = squares + float(error @ error), rows + len(error)
+    assert 0.02 < squares / rows < 0.5  # its points count once in three, and as no more than sixteen
+
+
+def test_it_says_nothing_of_how_long_all_of_it_is() -> None:
+    flown = Flown(3)
+    seen = seen_of(flown)
+    factor = structure_factor(NODES, seen, rises=False)
+    same, longer = (factor.unwhitenedError(flown.values(scale)) for scale in (1.0, 1.3))
+    assert longer == pytest.approx(same, abs=0.02 * float(np.linalg.norm(same)) + 1e-6)
+    assert seen.rows.shape[0] <= 12
+
+
+def test_a_lens_is_learnt_from_it() -> None:
+    flown = Flown(4, lens=-0.03)
+    factor = structure_factor(NODES, seen_of(flown, flown.guess(0.2)), rises=False)
+    square = {lens: float(np.sum(factor.unwhitenedError(flown.values(lens=lens)) ** 2)) for lens in (0.0, -0.03, -0.06)}
+    assert square[-0.03] < 0.5 * min(square[0.0], square[-0.06])
+
+
+def test_ways_that_are_too_short_or_points_that_are_too_few_tell_nothing() -> None:
+    flown = Flown(5)
+    guess = flown.guess()
+    assert structure_of(flown.triples[: MIN_TRIPLES - 1], SIGMA, guess, FOCAL_SIGMA) is None
+    short = replace(guess, last=gtsam.Pose3(guess.last.rotation(), 0.05 * guess.last.translation()))
+    assert structure_of(flown.triples, SIGMA, short, FOCAL_SIGMA) is None
+
+
+def test_points_that_are_not_the_same_tell_nothing() -> None:
+    flown = Flown(6)
+    mixed = flown.triples.copy()
+    mixed[:, 4:] = mixed[::-1, 4:]
+    assert structure_of(mixed, SIGMA, flown.guess(), FOCAL_SIGMA) is None
+
+
+def test_what_ends_far_from_all_that_the_pairs_say_is_not_believed() -> None:
+    flown = Flown(7)
+    guess = flown.guess(0.0)
+    far = replace(guess, last=guess.last.compose(gtsam.Pose3(gtsam.Rot3.Rz(0.2), np.zeros(3))))
+    assert structure_of(flown.triples, SIGMA, guess, FOCAL_SIGMA) is not None
+    assert structure_of(flown.triples, SIGMA, far, FOCAL_SIGMA) is None
+
+
+@pytest.mark.parametrize("rises", [False, True])
+def test_the_jacobians_are_the_differences(rises: bool) -> None:
+    flown = Flown(8)
+    factor = structure_factor(NODES, seen_of(flown, flown.guess(0.0)), rises=rises)
+    values = flown.values()
+    if rises:
+        for i in range(3):
+            bias = values.atVector(B(i))
+            bias[HEIGHT] = 0.3 * i
+            values.update(B(i), bias)
+    keys = list(factor.keys())
+    by, _ = factor.linearize(values).jacobian()
+    step = 1e-5
+
+    def moved(change: np.ndarray) -> np.ndarray:
+        there = gtsam.Values(values)
+        for i, key in enumerate(keys):
+            part = change[6 * i : 6 * i + 6]
+            if key in (C(0), C(1), C(2)):
+                there.update(key, values.atPose3(key).retract(part))
+            else:
+                there.update(key, values.atVector(key) + part)
+        return np.asarray(factor.unwhitenedError(there))
+
+    size = 6 * len(keys)
+    expected = np.column_stack([(moved(e) - moved(-e)) / (2 * step) for e in step * np.eye(size)])
+    assert np.abs(by - expected).max() < 0.01 * np.abs(expected).max()
