@@ -29,7 +29,7 @@ from terrafix.estimator.track import Track
 
 SPACING = 10  # nodes from one kept node to the next, at least
 THREE = 3  # nodes of a factor that says how one way is in units of the other
-MOST_KEPT = 256
+MOST_KEPT = 128
 MOST_OPEN = 60  # nodes among which none can be kept alone: then the newest is, and what reaches beyond it is dropped
 
 State = tuple[gtsam.Pose3, np.ndarray, np.ndarray]  # C, B, V of a node

@@ -21,7 +21,7 @@ from terrafix_tools.montecarlo.flight import Run
 from terrafix_tools.montecarlo.plan import FlightPlan, plan
 
 HOURS = 2.0
-# At first caches and windows fill, and what is kept for the refinement: 256 nodes, five frames apart at least.
+# At first caches and windows fill, and what is kept for the refinement: 128 nodes, ten frames apart at least.
 SETTLED_S = 1800.0
 YOUNG_FROM_S = 4500.0
 BLOCK = 30  # frames: the ratio of their sums is one of the ratios, memory a point of its line
