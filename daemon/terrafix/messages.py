@@ -200,6 +200,7 @@ class Prediction(Message, frozen=True, kw_only=True):
     agl_sigma_m: float
     step_m: Vec2  # camera motion (east, north) since the previous Prediction, by odometry alone
     step_cov_m2: Mat2  # its covariance (ee, en, ne, nn)
+    lens: float = 0.0  # what the lens bends beyond its description, as far as that is sure (core.camera.straightened)
     start_ns: int = 0  # t_ns of what told the place anew (a Start, a Coasted); 0: nothing did
 
 
@@ -217,6 +218,7 @@ class MapMatch(Message, frozen=True, kw_only=True):
     p_c_in_w_m: Vec3 | None = None
     q_w_c: Quat | None = None
     cov: Mat6 | None = None
+    lens: float = 0.0  # the frame was seen through this (as in Prediction)
     inliers: int = 0
     reprojection_px: float = 0.0
     margin: float = 0.0  # best peak over the best rival, in standard deviations of the surface

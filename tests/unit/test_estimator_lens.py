@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from simulated_flight import ORIGIN, Flight, Listener
 
-from terrafix.estimator.factors import BIAS_SIZE, LENS, LENS_SIGMA, same_ground_factor
+from terrafix.estimator.factors import BIAS_SIZE, LENS, same_ground_factor
+from terrafix.estimator.lens import LENS_SIGMA
 from terrafix.estimator.motion import Ground
 from terrafix.messages import MapMatch, Message, Odometry
 

@@ -88,6 +88,8 @@ def replay(
         output.finish(summary)
     if progress:
         Console(stderr=True).print(_last_line(summary, out))
+        if summary["lens"] is not None:
+            Console(stderr=True).print(summary["lens"], markup=False)
     return summary
 
 

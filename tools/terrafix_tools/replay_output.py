@@ -13,11 +13,12 @@ import numpy as np
 from terrafix.core.config import Config
 from terrafix.core.errors import OutputError
 from terrafix.core.node import Image
-from terrafix.messages import Frame, MapMatch, MeasurementVerdict, Message, Odometry, Verdict
+from terrafix.messages import Frame, MapMatch, MeasurementVerdict, Message, Odometry, Origin, SlowErrors, Verdict
 from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
 from terrafix_tools.estimates import ESTIMATES, PARTIAL, RowTable, write_rows
 from terrafix_tools.finalise.output import SUMMARY as FINALISED_SUMMARY
 from terrafix_tools.finalise.output import TABLE as FINALISED_TABLE
+from terrafix_tools.lens_words import lens_words
 
 RECORD, SUMMARY = "flight.mcap", "summary.json"
 # Made of the three above: those of an earlier replay would lie.
@@ -34,6 +35,8 @@ class ReplayOutput:
         self._verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._matcher: Counter[str] = Counter()
         self._registered: dict[int, bool] = {}
+        self._origin: Origin | None = None
+        self._learnt: SlowErrors | None = None
 
     def __enter__(self) -> Self:
         """Raises OutputError when the folder cannot be written."""
@@ -80,6 +83,7 @@ class ReplayOutput:
             "refined": sum(r.refined_lat_deg is not None for r in rows),
             "odometry_frames": sum(self._registered.values()),
             "verdicts": {what: dict(sorted(c.items())) for what, c in sorted(self._verdicts.items())},
+            "lens": lens_words(self._origin.camera, self._learnt) if self._origin and self._learnt else None,
             "matcher_verdicts": dict(sorted(self._matcher.items())),
             "frame_ms_median": round(float(np.median(times_ms)), 1) if times_ms else None,
             "frame_ms_p95": round(float(np.percentile(times_ms, 95)), 1) if times_ms else None,
@@ -117,6 +121,10 @@ class ReplayOutput:
             self._verdicts[message.measurement][str(message.verdict)] += 1
             if message.measurement == "odometry" and message.verdict is not Verdict.ACCEPTED:
                 self._registered[message.frame_id] = False
+        elif isinstance(message, Origin):
+            self._origin = message
+        elif isinstance(message, SlowErrors):
+            self._learnt = message
         elif isinstance(message, MapMatch):
             self._matcher[str(message.verdict)] += 1
         elif isinstance(message, Odometry):

@@ -1,6 +1,6 @@
 """The layers of a map as the anchor sees them: a map and a matcher for every date of the place, and which is in use."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from terrafix.anchor.agreed import AgreedPose
@@ -51,6 +51,11 @@ class Layers:
             stated = ce90_m if layer.ce90_m is None else layer.ce90_m
             self._all[layer.table] = Dated(bound, matcher, AgreedPose(bound, matcher), stated / CE90_SIGMAS)
         self._choice = LayerChoice([layer.table for layer in layers])
+
+    def see_through(self, bend: float) -> None:
+        """A lens that bends more than its description says, by as much."""
+        for dated in self._all.values():
+            dated.matcher.camera = replace(dated.matcher.camera, bend=bend)
 
     @property
     def best(self) -> Dated:

@@ -185,8 +185,9 @@ class AnchorNode:
         image = self._frames.get(prediction.frame_id)
         if self._layers is None or self._origin is None:
             return answer
+        self._layers.see_through(prediction.lens)
         best = self._layers.best
-        answer = msgspec.structs.replace(answer, map_sigma_m=best.sigma_m)
+        answer = msgspec.structs.replace(answer, map_sigma_m=best.sigma_m, lens=prediction.lens)
         belief = self._moved(prediction, best, self._origin)
         if self._hint is not None:
             self._answers.append(self._search.heed(self._hint, self._origin, prediction, best, self._watch.odds))

@@ -32,7 +32,6 @@ class Checked:
 
 class PlaceCheck:
     def __init__(self, source: LocalMap, matcher: FrameMatcher) -> None:
-        self._camera = matcher.camera
         self._map = source
         self._matcher = matcher
         self._image: Image | None = None
@@ -90,7 +89,7 @@ class PlaceCheck:
         """The frame with about two pixels to a fine cell, made once for all places."""
         if self._small is None or image is not self._image:
             fine_m = self._matcher.cell_m(agl_m, FINE_PER_AGL)
-            camera = self._camera.scaled(min(2.0 * (agl_m / self._camera.fx) / fine_m, 1.0))
+            camera = self._matcher.camera.scaled(min(2.0 * (agl_m / self._matcher.camera.fx) / fine_m, 1.0))
             size = (camera.width, camera.height)
             self._image, self._small = image, (cv2.resize(image, size, interpolation=cv2.INTER_AREA), camera)
         return self._small

@@ -64,7 +64,7 @@ def rectify(
         if shrink not in blurred:
             blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
         source = blurred[shrink]
-    if camera.distortion:
+    if camera.distortion or camera.bend:
         x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
         rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ to_camera.T
         px = camera.project(rays).astype(np.float32).reshape(height, width, 2)

@@ -22,10 +22,10 @@ BIAS_SIZE = 6
 HEIGHT, LENS, SCALE = 3, 4, 5  # of B
 BLOCK_HUBER_K = 1.5
 ROBUST_K = 2.0  # Huber on what is told of poses and ways: what passed its gate but sits in the tail pulls less
-# 1-sigma of the first radial coefficient, less what the description of the lens says: 0.005 after a calibration, 0.03
-# where its maker's focal length is all that is known. What it bends is alike in every frame and looks like a tilt that
-# grows with the way, so it is learnt in flight. The higher coefficients are noise, as large as this of the first.
-LENS_SIGMA, LENS_REST = 0.02, 0.0015
+# What the lens bends beyond its description (core.camera.straightened) is alike in every frame and looks like a tilt
+# that grows with the way, so it is learnt in flight. What one number does not tell of it is noise, as large as this of
+# the number itself, and as this share of what was learnt.
+LENS_REST, LENS_REST_SHARE = 0.0015, 0.05
 # 1-sigma of the part of SCALE that is the barometer's: air that is 14 degrees warmer than the standard atmosphere makes
 # all its heights 5 % too small. The other part is the focal length's: what is seen over it is the height that is seen.
 BAROMETER_SCALE = 0.05
@@ -101,6 +101,24 @@ def attitude_and_height_factor(
     return custom_factor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), [pose_key, bias_key], error)
 
 
+def map_fix_factor(
+    pose_key: int, bias_key: int, pose: gtsam.Pose3, cov: np.ndarray, by_lens: np.ndarray, seen_through: float
+) -> gtsam.CustomFactor:
+    """A camera ``pose`` with its covariance (tangent order), computed from rays through a lens that bends by
+    ``seen_through``; one that bends by one more would have moved it by ``by_lens`` (6,). All fixes are wrong by the
+    same lens: as noise of each of them it would average away."""
+    by_bias = np.zeros((6, BIAS_SIZE), order="F")
+    by_bias[:, LENS] = -by_lens
+
+    def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        moved = by_lens * (values.atVector(bias_key)[LENS] - seen_through)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = np.eye(6, order="F"), by_bias
+        return np.asarray(-values.atPose3(pose_key).localCoordinates(pose) - moved)
+
+    return custom_factor(robust(cov), [pose_key, bias_key], error)
+
+
 def same_ground_residual(
     keyframe: gtsam.Pose3, pose: gtsam.Pose3, pairs: np.ndarray, normal: np.ndarray, offset: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -142,9 +160,10 @@ def same_ground_factor(
     sigma: float,
     ground: Ground,
     keyframe_bias_key: int | None = None,
+    seen_through: float = 0.0,
 ) -> gtsam.CustomFactor:
-    """``pairs`` (N, 4) normalised with the 1-sigma ``sigma`` of a coordinate. The plane below the keyframe is not known
-    exactly: what its height and slope leave open is in the noise of the factor.
+    """``pairs`` (N, 4) normalised with the 1-sigma ``sigma`` of a coordinate, straightened by ``seen_through``. The
+    plane below the keyframe is not known exactly: what its height and slope leave open is in the noise of the factor.
 
     Two cameras above a plane are nine numbers: one in the other, its way in units of the keyframe's height, and the
     keyframe's tilt against the plane; what the lens bends is one more. In these the residuals of all pairs are linear
@@ -158,7 +177,8 @@ def same_ground_factor(
     normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
     p = keyframe.translation()
     offset = float(p[2]) - ground.height_m - ground.slope_e * float(p[0]) - ground.slope_n * float(p[1])
-    seen, tilt, lens = _reduced(keyframe, pose, pairs, sigma, ground, normal, offset)
+    rest = float(np.hypot(LENS_REST, LENS_REST_SHARE * seen_through))
+    seen, tilt, lens = _reduced(keyframe, pose, pairs, sigma, ground, normal, offset, rest)
     by_bias = np.zeros((REDUCED, BIAS_SIZE), order="F")
     by_bias[:, LENS] = lens
     at_first = keyframe.between(pose)
@@ -188,7 +208,7 @@ def same_ground_factor(
             ]
         )
         by_step = seen[:, :6]
-        residual = seen[:, 6] + by_step @ at_first.logmap(step) + tilt @ back + lens * bias[LENS]
+        residual = seen[:, 6] + by_step @ at_first.logmap(step) + tilt @ back + lens * (bias[LENS] - seen_through)
         if jacobians is not None:
             by_way = np.hstack([by_step[:, :3], unit * by_step[:, 3:]])
             by_c0 = -by_way @ way.inverse().AdjointMap()
@@ -219,9 +239,10 @@ def _reduced(
     ground: Ground,
     normal: np.ndarray,
     offset: float,
+    lens_rest: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whitened residuals, REDUCED of them: by the step and constant (R, 7), by the tilt (R, 3), by the radial
-    coefficient (R,)."""
+    coefficient (R,), of which ``lens_rest`` is noise."""
     residual, by_keyframe, by_pose, points, by_height = same_ground_residual(keyframe, pose, pairs, normal, offset)
     # The keyframe alone, while the other camera keeps its place in it.
     by_both = by_keyframe + by_pose @ keyframe.between(pose).inverse().AdjointMap()
@@ -230,7 +251,7 @@ def _reduced(
     away = np.repeat(points[:, :2] - keyframe.translation()[:2], 2, axis=0)
     by_plane = np.column_stack([by_height, by_height * away[:, 0], by_height * away[:, 1]])
     by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
-    by_plane = np.column_stack([by_plane, LENS_REST / sigma * by_lens])
+    by_plane = np.column_stack([by_plane, lens_rest / sigma * by_lens])
     if ground.bend_sigma:
         by_plane = np.column_stack([by_plane, ground.bend_sigma / sigma * _by_bend(by_height, away)])
     # (1 + P P^T)^(-1/2), where only a few directions of the noise are not white: from the eigenvalues of P^T P.

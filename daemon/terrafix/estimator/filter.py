@@ -13,9 +13,9 @@ from terrafix.core.gate import GATE
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.doubt import Doubt
-from terrafix.estimator.factors import HEIGHT
+from terrafix.estimator.factors import HEIGHT, LENS
 from terrafix.estimator.graph import NodeState
-from terrafix.estimator.matched import determined, measured_pose
+from terrafix.estimator.matched import determined, measured_pose, moved_by_lens
 from terrafix.estimator.resume import Known
 from terrafix.estimator.rival import AGREEING, Rival
 from terrafix.estimator.seen_ground import SeenGround
@@ -79,6 +79,8 @@ class Estimator(Tracker):
         if node is None:
             return FixResult(Verdict.STALE, None)
         measured, cov = measured_pose(match, self.terrain)
+        seen, seen_cov = measured, cov  # the graph hears of it as it was seen
+        measured, cov, by_lens = self.through_lens(match, seen, seen_cov)
         r_w_c = measured.rotation().matrix()
         height = max(float(measured.translation()[2]) - self.terrain.ground_m, 1.0)
         if match.found:  # by a search, over several frames: it outweighs whatever the graph believes
@@ -113,11 +115,21 @@ class Estimator(Tracker):
         if not match.coarse and self._seen.newest_s is not None:
             self.rival.fade(self._seen.new_m(fixed_s, here, math.inf) / height)
         new = self._seen.share(fixed_s, here, height)
-        self.graph.add_pose(node, measured, cov / new)
+        self.graph.add_pose(node, seen, seen_cov / new, by_lens, match.lens)
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[node] = np.linalg.inv(np.linalg.inv(self._cov_of[node]) + np.linalg.inv(cov / new))
         self._accepted(match, fixed_s, here)
         return FixResult(Verdict.ACCEPTED, d2, f"new ground {new:.2f}")
+
+    def through_lens(
+        self, match: MapMatch, seen: gtsam.Pose3, cov: np.ndarray
+    ) -> tuple[gtsam.Pose3, np.ndarray, np.ndarray | None]:
+        """The pose of a match and its covariance, through the lens as it is known by now, and ``moved_by_lens``."""
+        by_lens = moved_by_lens(match)
+        if by_lens is None:
+            return seen, cov, None
+        more = float(self.graph.state(self.graph.newest).bias[LENS]) - match.lens
+        return seen.retract(by_lens * more), cov + self._lens_sigma**2 * np.outer(by_lens, by_lens), by_lens
 
     def _away2(self, frame_id: int, node: int, measured: gtsam.Pose3, cov: np.ndarray) -> float:
         """Squared Mahalanobis distance (2 degrees of freedom) of a place from where the camera can be, whatever its

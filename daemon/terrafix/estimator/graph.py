@@ -12,8 +12,9 @@ from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator.air import Air, air_factor
 from terrafix.estimator.coasted import Carried
-from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS_SIGMA, leg_factor, robust, same_ground_factor
+from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, leg_factor, map_fix_factor, robust, same_ground_factor
 from terrafix.estimator.lag import FixedLag
+from terrafix.estimator.lens import LENS_SIGMA
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.past import Past
 from terrafix.estimator.structure import Structure, structure_factor
@@ -160,6 +161,7 @@ class PoseGraph:
                     seen.sigma,
                     seen.ground,
                     B(parent),
+                    seen.lens,
                 )
             )
         if leg is not None:
@@ -179,9 +181,15 @@ class PoseGraph:
         self._insert(t_s, state, factors)
         return node
 
-    def add_pose(self, node: int, pose: gtsam.Pose3, cov: np.ndarray) -> None:
-        """A map fix of a node in the window: camera pose with its covariance (tangent order)."""
-        self._join(gtsam.PriorFactorPose3(C(node), pose, robust(cov)))
+    def add_pose(
+        self, node: int, pose: gtsam.Pose3, cov: np.ndarray, by_lens: np.ndarray | None = None, lens: float = 0.0
+    ) -> None:
+        """A map fix of a node in the window: camera pose with its covariance (tangent order), seen through ``lens``,
+        and what one of more bend would have moved it by."""
+        if by_lens is None:
+            self._join(gtsam.PriorFactorPose3(C(node), pose, robust(cov)))
+        else:
+            self._join(map_fix_factor(C(node), B(node), pose, cov, by_lens, lens))
 
     def add_motion(self, node: int, carried: Carried) -> None:
         """Where a node in the window was led to, and how fast it was then."""

@@ -28,6 +28,22 @@ def measured_pose(match: MapMatch, terrain: Terrain) -> tuple[gtsam.Pose3, np.nd
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array(match.p_c_in_w_m)), cov
 
 
+def moved_by_lens(match: MapMatch) -> np.ndarray | None:
+    """(6,) tangent order: what the pose of a match that is ``determined`` would have moved by, had the lens one more of
+    bend than it was seen through. Around the middle of the picture that is the height; where the ground that counted
+    lies aside, it is tilt and place. None: a coarse fix, which has no points."""
+    if not match.matches:
+        return None
+    assert match.p_c_in_w_m is not None and match.q_w_c is not None
+    points = np.array(match.matches)
+    xy = points[:, :2]
+    _, jacobian, _ = project_with_jacobian(rot_from_quat(match.q_w_c), np.array(match.p_c_in_w_m), points[:, 2:5])
+    by_pose = jacobian.reshape(-1, 6)
+    by_lens = -(np.sum(np.square(xy), axis=1, keepdims=True) * xy).ravel()  # a ray is straightened by as much
+    weighted = by_pose.T * np.repeat(points[:, 5], 2)
+    return np.asarray(np.linalg.solve(weighted @ by_pose, weighted @ by_lens))
+
+
 def determined(match: MapMatch) -> bool:
     """Whether pose and covariance are numbers, and the 2D-3D matches (when it has any) fix six degrees of freedom.
 

@@ -4,6 +4,7 @@ from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
+from terrafix.core.camera import straightened
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import fit_pose, log_so3
 
@@ -22,11 +23,13 @@ MIN_DOWN = -0.2  # up component of a unit-depth ray that meets the ground no far
 
 @dataclass(frozen=True)
 class Seen:
-    """Matched rays (N, 4), the 1-sigma of a coordinate with all that makes them less independent, and their plane."""
+    """Matched rays (N, 4), the 1-sigma of a coordinate with all that makes them less independent, their plane, and
+    what of a lens they were straightened by."""
 
     pairs: np.ndarray
     sigma: float
     ground: "Ground"
+    lens: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -72,12 +75,15 @@ def relative_pose(
     r_w_k: np.ndarray,
     tilt_sigma_rad: float,
     ground: Ground,
+    lens: float = 0.0,
 ) -> RelativePose | None:
-    """``pairs`` (N, 4) normalised (x_kf, y_kf, x, y); ``r_w_kf`` and ``ground`` give the plane that is seen;
-    ``r_w_k`` is a first guess of the new camera, whose tilt is known to ``tilt_sigma_rad``: a plane seen from two
-    places has a mirror solution. ``None`` when the matches do not determine the motion."""
+    """``pairs`` (N, 4) normalised (x_kf, y_kf, x, y), as a lens that bends by ``lens`` shows them; ``r_w_kf`` and
+    ``ground`` give the plane that is seen; ``r_w_k`` is a first guess of the new camera, whose tilt is known to
+    ``tilt_sigma_rad``: a plane seen from two places has a mirror solution. ``None`` when the matches do not determine
+    the motion."""
     if len(pairs) < MIN_PAIRS:
         return None
+    pairs = np.hstack([straightened(pairs[:, :2], lens), straightened(pairs[:, 2:], lens)])
     rays_w = np.column_stack([pairs[:, :2], np.ones(len(pairs))]) @ r_w_kf.T
     rays_k = np.column_stack([pairs[:, 2:], np.ones(len(pairs))]) @ r_w_k.T
     ahead = (rays_w[:, 2] < MIN_DOWN) & (rays_k[:, 2] < MIN_DOWN)
@@ -115,7 +121,7 @@ def relative_pose(
     cov[3:, 3:] += ground.rise_sigma_m**2 * np.outer(up, up)
     # A wrong slope of the plane turns the camera by about slope times base over height.
     cov[:3, :3] += (ground.slope_sigma * float(np.linalg.norm(t_new)) / height_m) ** 2 * np.eye(3)
-    seen = Seen(pairs[ahead], fit.sigma / float(np.sqrt(effective)), ground)
+    seen = Seen(pairs[ahead], fit.sigma / float(np.sqrt(effective)), ground, lens)
     return RelativePose(r_w_kf.T @ fit.r_w_c, r_w_kf.T @ fit.p_c_in_w_m, cov, seen)
 
 

@@ -257,6 +257,7 @@ class EstimatorNode:
             agl_sigma_m=float(np.sqrt(cov[2, 2])),
             step_m=(float(step[0]), float(step[1])),
             step_cov_m2=(step_var, 0.0, 0.0, step_var),
+            lens=estimator.lens(placed.node),
             start_ns=max(0 if self._start is None else self._start.t_ns, round(estimator.led_s * 1e9)),
         )
 
@@ -267,6 +268,7 @@ class EstimatorNode:
         cov = tangent_to_world(placed.cov, placed.pose.rotation().matrix())
         # The map itself is off by a few metres, everywhere alike: no number of fixes averages that away.
         cov[:3, :3] += estimator.map_sigma_m**2 * np.eye(3)
+        cov[:2, :2] += estimator.aside_m2(p) * np.eye(2)
         cov[3:5, 3:5] += estimator.camera.body_sigma_rad**2 * np.eye(2)
         cov = estimator.rival.added(estimator.doubt.added(cov))
         alt_amsl_m, more_m = estimator.amsl(placed)
@@ -305,14 +307,15 @@ class EstimatorNode:
         map_var = self._estimator.map_sigma_m**2
         for frame_id, (p, cov) in sorted(self._estimator.refine().items()):
             lat_deg, lon_deg = self._frame.to_wgs84(float(p[0]), float(p[1]))
+            all_alike = map_var + self._estimator.aside_m2(p)
             poses.append(
                 RefinedPose(
                     frame_id=frame_id,
                     lat_deg=lat_deg,
                     lon_deg=lon_deg,
                     alt_amsl_m=float(p[2]),
-                    sigma_e_m=float(np.sqrt(cov[0, 0] + map_var)),
-                    sigma_n_m=float(np.sqrt(cov[1, 1] + map_var)),
+                    sigma_e_m=float(np.sqrt(cov[0, 0] + all_alike)),
+                    sigma_n_m=float(np.sqrt(cov[1, 1] + all_alike)),
                 )
             )
         yield Refinement(t_ns=ended.t_ns, poses=poses)

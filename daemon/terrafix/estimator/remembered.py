@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import C
 
-# As many factors remember: three for each node, of two windows. Those that left the window have no need to.
-MOST = 128
+# As many factors remember: four for each node, of two windows. Those that left the window have no need to.
+MOST = 160
 
 Error = Callable[[Any, gtsam.Values, list[np.ndarray] | None], np.ndarray]
 _answers = OrderedDict[Error, tuple[list[bytes], np.ndarray, gtsam.JacobianVector]]()  # the newest at the end

@@ -17,6 +17,7 @@ from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
 from terrafix.estimator.fixes import doubted, new_ground, torn
 from terrafix.estimator.graduated import Covariances, Doubtful, marginals, settle, solve, weighted
+from terrafix.estimator.lens import centre_sigma
 from terrafix.estimator.pieces import placed_states
 from terrafix.estimator.whole import Fix, Retold, WholeNode
 
@@ -122,7 +123,7 @@ class _Smoothing:
         height_m = seen.ground.height_m + float(now[2] - then[2]) - float(fallen)
         ground = replace(seen.ground, height_m=max(height_m, 1.0))
         keys = C(node.parent), C(i), B(i)
-        yield same_ground_factor(*keys, keyframe, pose, seen.pairs, seen.sigma, ground, B(node.parent))
+        yield same_ground_factor(*keys, keyframe, pose, seen.pairs, seen.sigma, ground, B(node.parent), seen.lens)
 
     def _linear(self, factor: gtsam.CustomFactor) -> gtsam.NonlinearFactor:
         around = gtsam.Values()
@@ -206,6 +207,13 @@ class _Smoothing:
             r = np.array([poses[i].rotation().matrix()[:2] for i in at])
             covs[at, 3:, 3:] += np.einsum("nai,ab,nbj->nij", r, spread, r)
         covs[:, 3:, 3:] += doubted(self._flight, believed[: len(fixes)], self._begins)[:, None, None] ** 2 * np.eye(3)
+        aside = centre_sigma(self._flight.origin.camera)
+        for cov, pose in zip(covs, poses, strict=True):
+            r, height_m = (
+                pose.rotation().matrix()[:2],
+                pose.translation()[2] - (self._flight.origin.ground_amsl_m or 0.0),
+            )
+            cov[3:, 3:] += (aside * height_m) ** 2 * r.T @ r
         offsets = {}
         for j, sigma_m in enumerate(self._maps):
             sigmas = np.sqrt(np.diag(found.marginalCovariance(M(j)))[3:])

@@ -12,9 +12,10 @@ from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.estimator.air import Air, Wind
 from terrafix.estimator.beginning import Beginning, Slow, TakeOff
 from terrafix.estimator.coasted import Coast, Coasts
-from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS, LENS_SIGMA, SCALE
+from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS, SCALE
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sigmas
 from terrafix.estimator.heading import OpenHeading
+from terrafix.estimator.lens import centre_sigma, lens_sigma
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.mounted import (
     DEFAULT_AGL_M,
@@ -56,6 +57,8 @@ MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for
 MAX_LEVEL_SIGMA = 0.5
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
+
+LENS_SURE = 3.0  # sigmas, from which what the lens bends is taken out of the pictures: none is straight to a last digit
 
 Feel = Callable[[int, int], Felt | None]
 
@@ -105,6 +108,7 @@ class Tracker:
         self._frames = array("q")  # of each node
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
         self._velocity_cov = np.zeros((V_SIZE, V_SIZE))  # of V of the newest node
+        self._lens_sigma = lens_sigma(origin.camera)  # of what is learnt of the lens
         self._pace = Pace()
         self._wind = Wind()
         self._seen_s = 0.0  # time of the newest frame whose motion, or place, was seen
@@ -132,6 +136,11 @@ class Tracker:
         """The autopilot says how high it flies."""
         return self._beginning.has_height
 
+    def lens(self, node: int) -> float:
+        """What the lens is known to bend beyond its description; 0 while that may be nothing."""
+        bend = float(self.graph.state(node).bias[LENS])
+        return bend if abs(bend) > LENS_SURE * self._lens_sigma else 0.0
+
     def stretch(self, node: int) -> tuple[float, float]:
         """Heights over heights as they are seen, and the 1-sigma of that (relative): of what the barometer tells
         otherwise, the part that is the focal length's."""
@@ -141,6 +150,11 @@ class Tracker:
         both = scale_sigma(self.origin.camera)
         part = (focal / both) ** 2 * float(self.graph.state(node).bias[SCALE])
         return float(np.exp(part)), focal * BAROMETER_SCALE / both
+
+    def aside_m2(self, p_m: np.ndarray) -> float:
+        """Variance, each horizontal axis, of a camera at ``p_m`` (3,): that the middle of its picture is not where its
+        description has it."""
+        return (centre_sigma(self.origin.camera) * (float(p_m[2]) - self.terrain.below(p_m))) ** 2
 
     def amsl(self, placed: Placed) -> tuple[float, float]:
         """Of the camera, and the 1-sigma of it beyond what the graph claims. Without a DEM the graph has the height
@@ -407,7 +421,9 @@ class Tracker:
         # The ground, over that of the take-off; where the vehicle stands on it a barometer may say less than none.
         below_m = self.terrain.rise_sigma_m(TAKE_OFF_AWAY * max(agl, 0.0))
         height = float(np.linalg.norm([agl_sigma, HEIGHT_BIAS * agl, below_m]))
-        assumed = np.diag([tolerance, tolerance, yaw, height, LENS_SIGMA, scale_sigma(origin.camera)]) ** 2
+        assumed = (
+            np.diag([tolerance, tolerance, yaw, height, lens_sigma(origin.camera), scale_sigma(origin.camera)]) ** 2
+        )
         bias, bias_cov = (np.zeros(BIAS_SIZE), assumed) if slow is None else slow
         r_w_c = self.camera.expected(attitude, bias)
         up_m = self.terrain.ground_m + agl
@@ -481,7 +497,15 @@ class Tracker:
         onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - self.graph.time_of(self.graph.newest))
         way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
         ground = replace(ground, rise_sigma_m=self.terrain.rise_sigma_m(way_m))
-        motion = relative_pose(np.array(odometry.pairs), odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground)
+        motion = relative_pose(
+            np.array(odometry.pairs),
+            odometry.sigma_norm,
+            r_w_kf,
+            r_w_k,
+            tilt_sigma,
+            ground,
+            float(newest.bias[LENS]),
+        )
         if motion is None:
             return Verdict.FEW_INLIERS
         dt_s = max(odometry.t_ns * 1e-9 - self.graph.time_of(parent), 1e-3)
@@ -538,6 +562,7 @@ class Tracker:
     def _placed(self, frame_id: int, t_s: float, node: int) -> Placed:
         if self.mode is CovarianceMode.MARGINALS and node == self.graph.newest:
             self._velocity_cov = self.graph.velocity_covariance(node)
+            self._lens_sigma = float(np.sqrt(self.graph.bias_covariance(node)[LENS, LENS]))
         state = self.graph.state(node)
         velocity, velocity_cov, cov = state.velocity[:3], self._velocity_cov[:3, :3], self._covariance(node)
         if self._open is not None:

@@ -18,7 +18,6 @@ from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.resume import Known
 from terrafix.estimator.structure import Structure
-from terrafix.estimator.terrain import Terrain
 from terrafix.estimator.velocity import V_SIZE, Leg
 from terrafix.messages import (
     MapMatch,
@@ -173,18 +172,18 @@ class Storyteller(EstimatorNode):
             flight.node_of[message.frame_id] = flight.graph.newest
         elif isinstance(message, MapMatch):
             verdict = next((s.verdict for s in said if isinstance(s, MeasurementVerdict)), Verdict.STALE)
-            self._note(message, verdict, estimator.terrain)
+            self._note(message, verdict, estimator)
         return said
 
-    def _note(self, match: MapMatch, verdict: Verdict, terrain: Terrain) -> None:
+    def _note(self, match: MapMatch, verdict: Verdict, estimator: Estimator) -> None:
         flight = self.flights[-1]
         node = flight.node_of.get(match.frame_id)
-        if node is not None and self._estimator is not None:
-            flight.doubt_m[node] = self._estimator.doubt.sigma_m
+        if node is not None:
+            flight.doubt_m[node] = estimator.doubt.sigma_m
         if node is None or match.verdict is not Verdict.ACCEPTED or not determined(match):
             said = match.verdict if match.verdict is not Verdict.ACCEPTED else Verdict.STALE
             flight.refused[str(said)] = flight.refused.get(str(said), 0) + 1
             return
-        pose, cov = measured_pose(match, terrain)
+        pose, cov, _ = estimator.through_lens(match, *measured_pose(match, estimator.terrain))
         tried = verdict is not Verdict.AMBIGUOUS
         flight.fixes.append(Fix(node, pose, cov, match.map_sigma_m, match.coarse, tried))

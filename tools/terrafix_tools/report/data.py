@@ -18,6 +18,7 @@ from terrafix.messages import (
     NavEstimate,
     Origin,
     ProcessEvent,
+    SlowErrors,
     StatusText,
 )
 from terrafix.recorder.reader import ReadResult, read_heard, read_thumbnails
@@ -44,6 +45,7 @@ class FlightView:
     rows: list[Row]
     frame_ids: list[int]
     origin: Origin | None = None
+    learnt: SlowErrors | None = None  # the newest
     unfinished: bool = False  # a replay that was killed
     live: bool = False  # from a record of the live processes; process_ms is then the delay of the estimate
     summary: dict[str, Any] = field(default_factory=dict)
@@ -164,6 +166,8 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
             view.map_verdict.setdefault(message.frame_id, str(message.verdict))
         elif isinstance(message, Origin):
             view.origin = message
+        elif isinstance(message, SlowErrors):
+            view.learnt = message
         elif isinstance(message, Dropped):
             view.dropped[f"{message.process}: {message.message}"] += message.count
         elif isinstance(message, Health | GpsInput | ProcessEvent | StatusText):

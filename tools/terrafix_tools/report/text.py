@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix_tools.lens_words import lens_words
 from terrafix_tools.report.charts import clock
 from terrafix_tools.report.data import FlightView, radius95_m
 
@@ -93,6 +94,9 @@ def moments(view: FlightView) -> list[tuple[float | None, str]]:
     """(time or None, sentence), in order of time; what has no time comes last."""
     said: list[tuple[float | None, str]] = []
     said += _positions(view) + _anchors(view) + _errors(view) + _gps(view)
+    lens = lens_words(view.origin.camera, view.learnt) if view.origin and view.learnt else None
+    if lens is not None:
+        said.append((None, lens))
     for t_s, event in view.events:
         if event.event in UNPLANNED or event.event == "restarted":
             detail = f" ({event.detail})" if event.detail else ""
