@@ -33,9 +33,8 @@ SPEED_MPS = 12.0
 PAIRS, SIGMA_NORM = 40, 1.0 / 560.0
 KEYFRAME_EVERY = 3
 PLACE = LocalFrame(48.0, 11.0)
-STRAIGHT = (0.0, 0.0, 0.0, 0.0)  # somebody has calibrated it, and found no distortion
-CAMERA = Camera(
-    width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, distortion=STRAIGHT, mount_tolerance_deg=4.0
+CAMERA = Camera(  # somebody has calibrated it
+    width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, focal_sigma=0.01, mount_tolerance_deg=4.0
 )
 ORIGIN = Origin(
     t_ns=0,

@@ -18,8 +18,7 @@ from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, Predicti
 from terrafix_tools.lens_words import lens_words
 
 BEND = -0.28  # an action camera
-UNCALIBRATED = msgspec.structs.replace(CAMERA, distortion=())
-CALIBRATED = msgspec.structs.replace(CAMERA, distortion=(), focal_sigma=0.01)
+UNCALIBRATED, CALIBRATED = msgspec.structs.replace(CAMERA, focal_sigma=0.1), CAMERA
 DOWN = np.diag([1.0, -1.0, -1.0])
 
 
@@ -123,7 +122,7 @@ def test_a_lens_that_nobody_stated_is_learnt_at_once() -> None:
     learnt = [m for m in said if isinstance(m, SlowErrors)][-1]
     assert abs(learnt.error[LENS] - BEND) < 3.0 * np.sqrt(learnt.cov[LENS * BIAS_SIZE + LENS])
     words = lens_words(UNCALIBRATED, learnt)
-    assert words is not None and "k1 = -0.2" in words and "distortion = [-0.2" in words
+    assert words is not None and "k1 = -0.2" in words and "distortion = [-0.2" in words and "focal_sigma = 0.1" in words
     stated = msgspec.structs.replace(UNCALIBRATED, distortion=(-0.1, 0.0, 0.0, 0.0))
     assert "calibrate it again" in (lens_words(stated, learnt) or "")
     straight = msgspec.structs.replace(learnt, error=(*learnt.error[:LENS], -0.01, learnt.error[LENS + 1]))
@@ -131,9 +130,12 @@ def test_a_lens_that_nobody_stated_is_learnt_at_once() -> None:
 
 
 def test_who_states_a_calibration_keeps_its_claims() -> None:
-    stated = msgspec.structs.replace(CAMERA, distortion=(-0.28, 0.09, 0.0, 0.0), focal_sigma=0.01)
+    stated = msgspec.structs.replace(CAMERA, distortion=(-0.28, 0.09, 0.0, 0.0))
     assert lens_sigma(stated) == lens_sigma(CALIBRATED) < lens_sigma(UNCALIBRATED)
     assert centre_sigma(stated) == centre_sigma(CALIBRATED) == 0.0
+    # Who writes down what a flight has learnt of the bend knows no more of the focal length, and of the middle.
+    learnt = msgspec.structs.replace(UNCALIBRATED, distortion=stated.distortion)
+    assert lens_sigma(learnt) == lens_sigma(stated) and centre_sigma(learnt) == centre_sigma(UNCALIBRATED)
     flight = Flight(12, seed=3)
     claimed = []
     for camera in (CALIBRATED, UNCALIBRATED):

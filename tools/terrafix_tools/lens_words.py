@@ -29,8 +29,12 @@ def lens_words(camera: Camera, learnt: SlowErrors) -> str | None:
         said, todo = "more than its distortion says", "calibrate it again"
     else:
         said = "and flight.toml states no distortion"
-        todo = f"calibrate it, or write {_distortion(straight, bend)} into [camera]"
-    return f"The lens seems to bend by k1 = {bend:+.2f}, {off_px:.0f} px at the corner, {said}: {todo}."
+        # A distortion that is stated says that somebody has calibrated the focal length as well.
+        todo = f"calibrate it, or write {_distortion(straight, bend)} and focal_sigma = {camera.focal_sigma:g}"
+        todo += " into [camera]"
+    return (
+        f"The lens seems to bend by k1 = {bend:+.2f} (+- {sigma:.2f}), {off_px:.0f} px at the corner, {said}: {todo}."
+    )
 
 
 def _distortion(straight: np.ndarray, bend: float) -> str:

@@ -23,6 +23,6 @@ def centre_sigma(camera: Camera) -> float:
 
     Rays that are all aside by as much are a place that is: no picture, and no map, tells one from the other. So no
     number of fixes makes less of it, as of the map's own error."""
-    if camera.distortion or camera.focal_sigma <= CALIBRATED:
+    if camera.focal_sigma <= CALIBRATED:
         return 0.0
     return CENTRE_PER_FOCAL_SIGMA * camera.focal_sigma * camera.width / camera.fx
