@@ -12,6 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from terrafix.core.camera import straightened
 from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS
 from terrafix.estimator.motion import EFFECTIVE_PAIRS
 from terrafix.estimator.remembered import custom_factor
@@ -41,8 +42,8 @@ SOUGHT, OTHERS = 13, 2
 
 @dataclass(frozen=True)
 class Trio:
-    """The outer cameras in the middle one, metres, and that one's height above ground at ``ground_m``. ``lens``: first
-    radial coefficient, less what its description says."""
+    """The outer cameras in the middle one, metres, and that one's height above ground at ``ground_m``. ``lens``: what
+    the lens bends beyond its description."""
 
     first: gtsam.Pose3
     last: gtsam.Pose3
@@ -80,7 +81,8 @@ def structure_of(triples: np.ndarray, sigma_norm: float, guess: Trio, focal_sigm
     ways = [float(np.linalg.norm(pose.translation())) for pose in (guess.first, guess.last)]
     if len(triples) < MIN_TRIPLES or min(ways) < MIN_WAY * guess.height_m:
         return None
-    seen = triples.reshape(-1, 3, 2)[:, [1, 0, 2]]  # the middle one comes first
+    straight = straightened(triples.reshape(-1, 2), guess.lens)
+    seen = straight.reshape(-1, 3, 2)[:, [1, 0, 2]]  # the middle one comes first
     points = np.column_stack([seen[:, 0], np.full(len(seen), 1.0 / guess.height_m)])  # x, y, 1 / depth in that
     near = np.concatenate([np.full(3, size) for way in ways for size in (NEAR_RAD, NEAR_SHARE * way)])
     unit = np.tile([1.0, 1.0, 1.0, *[guess.height_m] * 3], 2)
@@ -146,7 +148,7 @@ def _projected(points: np.ndarray, seen: np.ndarray, at: Trio) -> tuple[np.ndarr
         xy = q[:, :2] / z[:, None]
         r2 = np.sum(xy**2, axis=1, keepdims=True)
         rows = slice(2 * i, 2 * i + 2)
-        residual[:, rows] = xy * (1.0 + at.lens * r2) - seen[:, i]
+        residual[:, rows] = xy - seen[:, i]
         by_q = np.zeros((n, 2, 3))
         by_q[:, 0, 0] = by_q[:, 1, 1] = 1.0 / z
         by_q[:, :, 2] = -xy / z[:, None]
