@@ -13,9 +13,9 @@ from terrafix.core.gate import GATE
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.doubt import Doubt
-from terrafix.estimator.factors import HEIGHT, LENS
+from terrafix.estimator.factors import HEIGHT
 from terrafix.estimator.graph import NodeState
-from terrafix.estimator.matched import determined, measured_pose, moved_by_lens
+from terrafix.estimator.matched import determined, measured_pose, moved_by_lens, straightened_pose
 from terrafix.estimator.resume import Known
 from terrafix.estimator.rival import AGREEING, Rival
 from terrafix.estimator.seen_ground import SeenGround
@@ -126,10 +126,8 @@ class Estimator(Tracker):
     ) -> tuple[gtsam.Pose3, np.ndarray, np.ndarray | None]:
         """The pose of a match and its covariance, through the lens as it is known by now, and ``moved_by_lens``."""
         by_lens = moved_by_lens(match)
-        if by_lens is None:
-            return seen, cov, None
-        more = float(self.graph.state(self.graph.newest).bias[LENS]) - match.lens
-        return seen.retract(by_lens * more), cov + self._lens_sigma**2 * np.outer(by_lens, by_lens), by_lens
+        bend, sigma = self.lens_learnt
+        return *straightened_pose(seen, cov, by_lens, bend - match.lens, sigma), by_lens
 
     def _away2(self, frame_id: int, node: int, measured: gtsam.Pose3, cov: np.ndarray) -> float:
         """Squared Mahalanobis distance (2 degrees of freedom) of a place from where the camera can be, whatever its

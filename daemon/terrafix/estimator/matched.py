@@ -44,6 +44,16 @@ def moved_by_lens(match: MapMatch) -> np.ndarray | None:
     return np.asarray(np.linalg.solve(weighted @ by_pose, weighted @ by_lens))
 
 
+def straightened_pose(
+    seen: gtsam.Pose3, cov: np.ndarray, by_lens: np.ndarray | None, more: float, sigma: float
+) -> tuple[gtsam.Pose3, np.ndarray]:
+    """The pose of a match and its covariance, had the lens ``more`` of bend than it was seen through, known to
+    ``sigma``. ``by_lens``: ``moved_by_lens`` of the match."""
+    if by_lens is None:
+        return seen, cov
+    return seen.retract(by_lens * more), cov + sigma**2 * np.outer(by_lens, by_lens)
+
+
 def determined(match: MapMatch) -> bool:
     """Whether pose and covariance are numbers, and the 2D-3D matches (when it has any) fix six degrees of freedom.
 

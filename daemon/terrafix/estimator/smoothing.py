@@ -18,6 +18,7 @@ from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
 from terrafix.estimator.fixes import doubted, new_ground, torn
 from terrafix.estimator.graduated import Covariances, Doubtful, marginals, settle, solve, weighted
 from terrafix.estimator.lens import centre_sigma
+from terrafix.estimator.matched import straightened_pose
 from terrafix.estimator.pieces import placed_states
 from terrafix.estimator.whole import Fix, Retold, WholeNode
 
@@ -56,12 +57,17 @@ def smooth(flight: Retold, progress: Progress = lambda _done, _of: None) -> Smoo
 
 class _Smoothing:
     def __init__(self, flight: Retold, progress: Progress) -> None:
-        self._flight, self._progress = flight, progress
+        bend, sigma = flight.lens
+        fixes = []
+        for fix in flight.fixes:  # through the lens as it is known now
+            pose, cov = straightened_pose(fix.pose, fix.cov, fix.by_lens, bend - fix.lens, sigma)
+            fixes.append(replace(fix, pose=pose, cov=cov))
+        self._flight, self._progress = replace(flight, fixes=fixes), progress
         self._nodes = flight.graph.nodes
         self._begins = _begins(self._nodes)
         self._maps = sorted({f.map_sigma_m for f in flight.fixes})
         self._new = new_ground(flight)
-        self._doubtful = [self._fix_factor(f, new) for f, new in zip(flight.fixes, self._new, strict=True)]
+        self._doubtful = [self._fix_factor(f, new) for f, new in zip(fixes, self._new, strict=True)]
         # A start that was searched is no measurement.
         known = flight.origin.start_sigma_m <= SEARCHED_START_M
         self._starts = [i for i, node in enumerate(self._nodes) if node.prior is not None and known]

@@ -141,6 +141,11 @@ class Tracker:
         bend = float(self.graph.state(node).bias[LENS])
         return bend if abs(bend) > LENS_SURE * self._lens_sigma else 0.0
 
+    @property
+    def lens_learnt(self) -> tuple[float, float]:
+        """What the lens bends beyond its description, and the 1-sigma of that, by now."""
+        return float(self.graph.state(self.graph.newest).bias[LENS]), self._lens_sigma
+
     def stretch(self, node: int) -> tuple[float, float]:
         """Heights over heights as they are seen, and the 1-sigma of that (relative): of what the barometer tells
         otherwise, the part that is the focal length's."""

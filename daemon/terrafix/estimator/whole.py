@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import B, C, V
 from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph
-from terrafix.estimator.matched import determined, measured_pose
+from terrafix.estimator.matched import determined, measured_pose, moved_by_lens
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.resume import Known
@@ -50,13 +50,16 @@ class WholeNode:
 
 @dataclass(frozen=True)
 class Fix:
-    """A map match at ``node``: camera pose with covariance (6, 6), tangent order, and the error that the map states."""
+    """A map match at ``node``: camera pose with covariance (6, 6), tangent order, as it was seen, and the error that
+    the map states."""
 
     node: int
     pose: gtsam.Pose3
     cov: np.ndarray
     map_sigma_m: float
     coarse: bool
+    by_lens: np.ndarray | None  # what a lens of one more of bend would have moved it by (matched.py) ...
+    lens: float  # ... than the one that it was seen through
     tried: bool  # False: in flight it was too vague to find a place, and here it may only confirm one
 
 
@@ -143,6 +146,7 @@ class Retold:
     node_of: dict[int, int] = field(default_factory=dict)
     refused: dict[str, int] = field(default_factory=dict)  # map matches that are none, by verdict
     doubt_m: dict[int, float] = field(default_factory=dict)  # node -> 1-sigma that its place may have been wrong
+    lens: tuple[float, float] = 0.0, 0.0  # what was learnt of it in the end, and the 1-sigma of that
     has_height: bool = False  # the autopilot said one
 
 
@@ -170,6 +174,7 @@ class Storyteller(EstimatorNode):
             flight.has_height = flight.has_height or message.agl_m is not None
         elif isinstance(message, Odometry) and any(isinstance(s, NavEstimate) for s in said):
             flight.node_of[message.frame_id] = flight.graph.newest
+            flight.lens = estimator.lens_learnt
         elif isinstance(message, MapMatch):
             verdict = next((s.verdict for s in said if isinstance(s, MeasurementVerdict)), Verdict.STALE)
             self._note(message, verdict, estimator)
@@ -184,6 +189,8 @@ class Storyteller(EstimatorNode):
             said = match.verdict if match.verdict is not Verdict.ACCEPTED else Verdict.STALE
             flight.refused[str(said)] = flight.refused.get(str(said), 0) + 1
             return
-        pose, cov, _ = estimator.through_lens(match, *measured_pose(match, estimator.terrain))
+        pose, cov = measured_pose(match, estimator.terrain)
         tried = verdict is not Verdict.AMBIGUOUS
-        flight.fixes.append(Fix(node, pose, cov, match.map_sigma_m, match.coarse, tried))
+        flight.fixes.append(
+            Fix(node, pose, cov, match.map_sigma_m, match.coarse, moved_by_lens(match), match.lens, tried)
+        )
