@@ -13,8 +13,9 @@ CONFIDENCE = 0.999
 THRESHOLD = 0.03  # of the height: relief, leaning buildings and the map's own warps stay below this
 MIN_INLIERS = 8
 MIN_INLIER_SHARE = 0.35
-# Patches overlap by half and relief moves several together.
-INDEPENDENT_SHARE = 0.25
+# Patches that are neighbours share a third of their error, farther ones nothing (docs/monte-carlo.md): with four
+# neighbours 1 in 1 + 4/3 is independent.
+INDEPENDENT_SHARE = 3 / 7
 MAX_TILT_CHANGE_RAD = np.radians(20.0)  # from the prediction; more is the mirror solution of a flat scene
 PLANAR_RELIEF = 0.02  # of the height: flatter ground than this is treated as a plane
 
