@@ -38,10 +38,9 @@ def errors(motion: Motion, keyframe: Pose, now: Pose) -> np.ndarray:
 
 
 def is_right(motion: Motion, keyframe: Pose, now: Pose) -> bool:
-    """Matches scatter by little more than a pixel (tracks slip when the picture turns, each in its own direction; the
-    estimator takes the larger of the claimed sigma and the residuals), and their errors average out."""
+    """To the nearest pixel, as these pictures show the ground, and the errors average out."""
     error = errors(motion, keyframe, now)
-    return bool(np.median(np.linalg.norm(error, axis=1)) < 2.0 and np.linalg.norm(error.mean(0)) < 0.5)
+    return bool(np.median(np.linalg.norm(error, axis=1)) < 1.2 and np.linalg.norm(error.mean(0)) < 0.5)
 
 
 STEPS = {

@@ -39,6 +39,8 @@ REALIGNED_SIGMA_PX = 0.25  # of a coordinate of a corner that a new keyframe fou
 SIFT_FEATURES = 1500
 SIFT_RATIO = 0.8  # Lowe 2004
 
+_NO_POINTS, _NO_TRIPLES, _NONE = np.zeros((0, 2), np.float32), np.zeros((0, 6)), np.zeros(0, int)
+
 
 @dataclass
 class _Keyframe:
@@ -92,10 +94,9 @@ class FrameTracker:
         if keyframe is None:
             return self._new_fragment(frame_id, gray)
         keyframe.age += 1
-        points_kf, points, tracked = self._follow(keyframe, gray)
-        inlier = _homography_inliers(points_kf, points)
-        if self._good(points_kf, points, inlier, MIN_INLIERS, MIN_INLIER_SHARE):
-            return self._accept(keyframe, frame_id, gray, points_kf[inlier], points[inlier], tracked)
+        index, points, tracked = self._follow(keyframe, gray)
+        if self._good(keyframe.corners[index], points, tracked, MIN_INLIERS, MIN_INLIER_SHARE):
+            return self._accept_tracks(keyframe, frame_id, gray, index, points, tracked)
         # Against the keyframe by features, and if that fails against the frame that failed before this one: two that
         # agree with each other are a new fragment, one that agrees with nobody is a foreign frame.
         here = _Keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1, self._describe(gray))
@@ -103,16 +104,19 @@ class FrameTracker:
             if candidate is None:
                 continue
             points_kf, points = self._match_features(candidate, here)
-            inlier = _homography_inliers(points_kf, points)
-            if self._good(points_kf, points, inlier, MIN_INLIERS_FEATURES, MIN_INLIER_SHARE_FEATURES):
-                self._last_gray = None  # the KLT chain is broken; it starts again from this frame
-                return self._accept(candidate, frame_id, gray, points_kf[inlier], points[inlier], len(points))
+            inlier, matched = _homography_inliers(points_kf, points), len(points)
+            points_kf, points = points_kf[inlier], points[inlier]
+            if self._good(points_kf, points, matched, MIN_INLIERS_FEATURES, MIN_INLIER_SHARE_FEATURES):
+                # The KLT chain is broken; it starts again from this frame.
+                self._start_keyframe(frame_id, gray)
+                return self._said(candidate, points_kf, points, len(points), matched, due=True)
         return self._miss(keyframe, here, tracked)
 
     def _follow(self, keyframe: _Keyframe, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """KLT from the last tracked frame. -> points in the keyframe, points here, tracked."""
+        """KLT from the last tracked frame. -> which of the keyframe's corners (N,) one homography holds together, where
+        they are here (N, 2), and how many were tracked."""
         if self._last_gray is None or len(self._last_points) < MIN_INLIERS:
-            return _NO_POINTS, _NO_POINTS, 0
+            return _NONE, _NO_POINTS, 0
         window = (KLT_WINDOW_PX, KLT_WINDOW_PX)
         start = self._last_points.reshape(-1, 1, 2)
         ahead, ok, _ = cv2.calcOpticalFlowPyrLK(
@@ -123,13 +127,11 @@ class FrameTracker:
         )
         closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < FORWARD_BACKWARD_PX
         keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed
-        here = ahead.reshape(-1, 2)[keep]
-        index = self._last_index[keep]
-        if len(here) >= MIN_INLIERS:
-            inlier = _homography_inliers(keyframe.corners[index], here)
-            if inlier.sum() >= MIN_INLIERS:
-                self._last_points, self._last_index, self._last_gray = here[inlier], index[inlier], gray
-        return keyframe.corners[index], here, int(keep.sum())
+        here, index = ahead.reshape(-1, 2)[keep], self._last_index[keep]
+        inlier = _homography_inliers(keyframe.corners[index], here)
+        if inlier.sum() >= MIN_INLIERS:
+            self._last_points, self._last_index, self._last_gray = here[inlier], index[inlier], gray
+        return index[inlier], here[inlier], int(keep.sum())
 
     def _match_features(self, keyframe: _Keyframe, here: _Keyframe) -> tuple[np.ndarray, np.ndarray]:
         """SIFT: large steps and turns between frames. -> points in the keyframe, points here."""
@@ -150,61 +152,77 @@ class FrameTracker:
             return _NO_POINTS, np.zeros((0, 128), np.float32)
         return np.array([k.pt for k in keypoints], np.float32), descriptors
 
-    def _good(self, a: np.ndarray, b: np.ndarray, inlier: np.ndarray, at_least: int, share: float) -> bool:
-        if inlier.sum() < at_least or inlier.mean() < share:
-            return False
-        size = (self._camera.width, self._camera.height)
-        return all(bool(np.all(np.ptp(p[inlier], axis=0) > np.multiply(size, MIN_SPREAD))) for p in (a, b))
+    def _good(self, a: np.ndarray, b: np.ndarray, of: int, at_least: int, share: float) -> bool:
+        """The matches (N, 2), (N, 2) that agree, of so many, determine a motion."""
+        return len(a) >= at_least and len(a) >= share * of and self._spans(a) and self._spans(b)
 
-    def _accept(
-        self, keyframe: _Keyframe, frame_id: int, gray: np.ndarray, a: np.ndarray, b: np.ndarray, tracked: int
+    def _spans(self, points: np.ndarray) -> bool:
+        size = (self._camera.width, self._camera.height)
+        return bool(np.all(np.ptp(points, axis=0) > np.multiply(size, MIN_SPREAD)))
+
+    def _accept_tracks(
+        self,
+        keyframe: _Keyframe,
+        frame_id: int,
+        gray: np.ndarray,
+        index: np.ndarray,
+        points: np.ndarray,
+        tracked: int,
     ) -> Motion:
-        self._misses, self._missed = 0, None
-        shift = float(np.median(np.linalg.norm(a - b, axis=1))) / self._camera.width
+        """``points`` (N, 2): where the corners ``index`` (N,) of the keyframe were tracked to."""
+        corners = keyframe.corners[index]
+        shift = float(np.median(np.linalg.norm(corners - points, axis=1))) / self._camera.width
         due = (
             shift > KEYFRAME_SHIFT
-            or len(a) < KEYFRAME_TRACKED * max(len(keyframe.corners), 1)
+            or len(index) < KEYFRAME_TRACKED * max(len(keyframe.corners), 1)
             or keyframe.age >= KEYFRAME_MAX_AGE
-            or self._last_gray is not gray
         )
-        triples = np.zeros((0, 6))
+        here, kept = realigned(keyframe.gray, corners, gray, points, RANSAC_PX)
+        triples = _NO_TRIPLES
         if due:
-            kept, index = self._live_on(keyframe, gray)
-            triples = self._triples(keyframe, kept, index)
-            self._start_keyframe(frame_id, gray, kept, keyframe.corners[index], keyframe.frame_id)
+            triples = self._triples(keyframe, here, index[kept])
+            self._start_keyframe(frame_id, gray, here, corners[kept], keyframe.frame_id)
+        # A blurred picture lies on no patch; its tracks are there all the same.
+        if len(kept) < MIN_INLIERS or not self._spans(here):
+            here, kept = points, np.arange(len(points))
+        return self._said(keyframe, corners[kept], here, len(index), tracked, due=due, triples=triples)
+
+    def _triples(self, keyframe: _Keyframe, here: np.ndarray, index: np.ndarray) -> np.ndarray:
+        three = np.isfinite(keyframe.before[index, 0])
+        if three.sum() < MIN_TRIPLES:
+            return _NO_TRIPLES
+        here, index = here[three], index[three]
+        pick = _spread(keyframe.corners[index], MAX_TRIPLES)
+        views = keyframe.before[index[pick]], keyframe.corners[index[pick]], here[pick]
+        return np.hstack([self._camera.normalise(px) for px in views])
+
+    def _said(
+        self,
+        keyframe: _Keyframe,
+        a: np.ndarray,
+        b: np.ndarray,
+        inliers: int,
+        tracked: int,
+        *,
+        due: bool,
+        triples: np.ndarray = _NO_TRIPLES,
+    ) -> Motion:
+        """The motion that the matches (N, 2), (N, 2) tell, ``inliers`` of ``tracked`` of which agree."""
+        self._misses, self._missed = 0, None
         pick = _spread(a, MAX_PAIRS)
-        pairs = np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])])
-        # A consensus that few of the matches share may be a roof instead of the ground: less is claimed for it.
-        sigma = SIGMA_PX / self._camera.fx / float(np.sqrt(len(a) / max(tracked, len(a))))
         return Motion(
             keyframe.frame_id,
             Verdict.ACCEPTED,
-            pairs,
-            sigma,
-            len(a),
+            np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])]),
+            # A consensus that few of the matches share may be a roof instead of the ground: less is claimed for it.
+            SIGMA_PX / self._camera.fx / float(np.sqrt(inliers / tracked)),
+            inliers,
             tracked,
             due,
             keyframe.before_id if len(triples) else -1,
             triples,
             REALIGNED_SIGMA_PX / self._camera.fx,
         )
-
-    def _live_on(self, keyframe: _Keyframe, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The corners of the keyframe that are followed to here. -> points (N, 2), which corners these are."""
-        index = self._last_index
-        if self._last_gray is not gray or len(index) < MIN_INLIERS:
-            return _NO_POINTS, np.zeros(0, int)
-        here, kept = realigned(keyframe.gray, keyframe.corners[index], gray, self._last_points, RANSAC_PX)
-        return here, index[kept]
-
-    def _triples(self, keyframe: _Keyframe, here: np.ndarray, index: np.ndarray) -> np.ndarray:
-        three = np.isfinite(keyframe.before[index, 0])
-        if three.sum() < MIN_TRIPLES:
-            return np.zeros((0, 6))
-        here, index = here[three], index[three]
-        pick = _spread(keyframe.corners[index], MAX_TRIPLES)
-        views = keyframe.before[index[pick]], keyframe.corners[index[pick]], here[pick]
-        return np.hstack([self._camera.normalise(px) for px in views])
 
     def _miss(self, keyframe: _Keyframe, here: _Keyframe, tracked: int) -> Motion:
         self._misses += 1
@@ -215,12 +233,17 @@ class FrameTracker:
 
     def _new_fragment(self, frame_id: int, gray: np.ndarray) -> Motion:
         """The frame stands alone: no motion is known, later frames refer to it."""
-        self._start_keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1)
+        self._start_keyframe(frame_id, gray)
         self._misses, self._missed = 0, None
         return Motion(frame_id, Verdict.ACCEPTED, np.zeros((0, 4)), 0.0, 0, 0, True)
 
     def _start_keyframe(
-        self, frame_id: int, gray: np.ndarray, kept: np.ndarray, before: np.ndarray, before_id: int
+        self,
+        frame_id: int,
+        gray: np.ndarray,
+        kept: np.ndarray = _NO_POINTS,
+        before: np.ndarray = _NO_POINTS,
+        before_id: int = -1,
     ) -> None:
         """Corners that are ``kept`` (N, 2) live on, and were seen at ``before`` (N, 2); new ones fill what is empty."""
         empty = np.full(gray.shape, 255, np.uint8)
@@ -233,9 +256,6 @@ class FrameTracker:
         unseen = np.full((len(new), 2), np.nan, np.float32)
         self._keyframe = _Keyframe(frame_id, gray, found, np.vstack([before, unseen]), before_id)
         self._last_gray, self._last_points, self._last_index = gray, found, np.arange(len(found))
-
-
-_NO_POINTS = np.zeros((0, 2), np.float32)
 
 
 def _homography_inliers(a: np.ndarray, b: np.ndarray) -> np.ndarray:

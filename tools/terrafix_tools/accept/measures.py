@@ -10,6 +10,7 @@ from terrafix.core.start import SEARCHED_START_M
 from terrafix.link.asking import Asking
 from terrafix.messages import CovarianceMode, NavEstimate, SourceLabel
 from terrafix.messages import Verdict as Answer
+from terrafix_tools.accept.epipolar import reprojection_error
 from terrafix_tools.accept.evidence import Evidence, Seen
 from terrafix_tools.accept.judged import Span, Verdict
 
@@ -120,12 +121,12 @@ def odometry_rate(e: Evidence) -> Measured:
 
 
 def odometry_px(e: Evidence) -> Measured:
-    """Of the matched points that were said, after a homography of their own by least squares; pixels of the frames."""
-    means = []
-    for frame in e.frames:
-        if frame.odometry is not None and len(frame.odometry.pairs) >= 8:
-            pairs = np.array(frame.odometry.pairs) * e.origin.camera.fx
-            means.append(float(np.linalg.norm(_homography_residuals(pairs[:, :2], pairs[:, 2:]), axis=1).mean()))
+    """Of the matched points that were said, each with a depth of its own; pixels of the frames."""
+    means = [
+        reprojection_error(np.array(frame.odometry.pairs)) * e.origin.camera.fx
+        for frame in e.frames
+        if frame.odometry is not None and len(frame.odometry.pairs) >= 8
+    ]
     return Measured(float(np.mean(means)), "pixels of the stored frames") if means else Measured(None, "no odometry")
 
 
@@ -291,26 +292,3 @@ def _complete(estimate: NavEstimate) -> bool:
     cov = np.array(estimate.cov).reshape(6, 6) if len(estimate.cov) == 36 else np.full((6, 6), np.nan)
     finite = bool(np.isfinite(cov).all()) and bool(np.allclose(cov, cov.T, rtol=1e-6, atol=1e-9))
     return finite and bool(np.linalg.eigvalsh(cov)[0] > 0.0) and estimate.last_anchor_age_ms >= -1
-
-
-def _homography_residuals(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N, 2): b less a carried over by the homography that fits best (DLT, Hartley and Zisserman 4.1, normalised)."""
-    (a1, _), (b1, back) = _normalised(a), _normalised(b)
-    zero, one = np.zeros(len(a)), np.ones(len(a))
-    x, y = a1.T
-    u, v = b1.T
-    design = np.vstack(
-        [
-            np.column_stack([-x, -y, -one, zero, zero, zero, u * x, u * y, u]),
-            np.column_stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v]),
-        ]
-    )
-    matrix = np.linalg.svd(design, full_matrices=False)[2][-1].reshape(3, 3)
-    there = np.column_stack([a1, one]) @ matrix.T
-    return (b1 - there[:, :2] / there[:, 2:]) * back
-
-
-def _normalised(points: np.ndarray) -> tuple[np.ndarray, float]:
-    middle = points.mean(axis=0)
-    scale = float(np.linalg.norm(points - middle, axis=1).mean()) or 1.0
-    return (points - middle) / scale, scale
