@@ -5,10 +5,11 @@ import numpy as np
 from terrafix.estimator.agreement import AGREE_M, Agreement
 
 
-def row(offsets_m: list[tuple[float, float]], spacing_m: float = 20.0) -> Agreement:
+def row(offsets_m: list[tuple[float, float]], spacing_m: float = 20.0, *, coarse: int = 0) -> Agreement:
+    """``coarse``: so many of them, the first ones."""
     said = Agreement()
     for i, offset_m in enumerate(offsets_m):
-        said.add(np.array(offset_m), np.array([spacing_m * i, 0.0]))
+        said.add(np.array(offset_m), np.array([spacing_m * i, 0.0]), coarse=i < coarse)
     return said
 
 
@@ -23,12 +24,18 @@ def test_one_mistake_seen_again_and_again_does_not() -> None:
     assert not row([(100.0, 0.0)] * 10, spacing_m=0.5).holds(4, 50.0)
 
 
+def test_coarse_ones_are_none_of_the_poses() -> None:
+    said = row([(100.0, 0.0)] * 5, coarse=3)
+    assert said.holds(5, 50.0) and said.holds_poses(2, 50.0)
+    assert not said.holds_poses(3, 50.0) and not said.holds_poses(2, 80.0)
+
+
 def test_one_that_does_not_agree_begins_a_new_row() -> None:
     said = row([(100.0, 0.0)] * 5 + [(100.0, AGREE_M + 1.0)])
-    assert len(said.offsets_m) == 1 and not said.holds(1, 1.0)
+    assert len(said.offsets_m) == said.poses == 1 and not said.holds(1, 1.0)
 
 
 def test_what_was_said_can_be_forgotten() -> None:
     said = row([(100.0, 0.0)] * 5)
     said.clear()
-    assert not said.holds(1, 0.0)
+    assert not said.holds(1, 0.0) and said.poses == 0

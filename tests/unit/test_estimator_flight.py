@@ -309,6 +309,37 @@ def test_fixes_over_new_ground_that_agree_with_each_other_win() -> None:
     assert {run.verdicts("odometry")[i].verdict for i in range(restarted + 4, 90)} == {Verdict.ACCEPTED}
 
 
+def coarsely_led(last: int) -> tuple[Flight, Listener, tuple[float, float]]:
+    """Every fourth frame from 40 to ``last``, 24 m on each time, the belief's mode is elsewhere and no pose stands."""
+    flight, away_m = Flight(80, seed=9), (180.0, -140.0)
+    run = Listener().fly(flight, 0, 40)
+    for i in range(40, 80):
+        wrong: list[Message] = []
+        if i % 4 == 0 and i <= last:
+            wrong = [msgspec.structs.replace(flight.fix(i, away_m), coarse=True, inliers=0, matches=[])]
+        run.hear([*without_fix(flight.messages(i)), *wrong])
+    return flight, run, away_m
+
+
+def test_a_belief_that_went_astray_neither_moves_nor_widens_what_poses_have_placed() -> None:
+    """A plane that landed over a ploughed field lost its fix so: four coarse matches 84 to 117 m aside, three of them
+    over half a height, and below 30 m there are none that could speak against them."""
+    flight, run, _ = coarsely_led(last=56)
+    assert {run.verdicts("map")[i].verdict for i in range(40, 57, 4)} == {Verdict.INNOVATION}
+    assert np.linalg.norm(error_m(run.estimate(57), flight)[:2]) < 12.0
+    assert sigma_m(run.estimate(57)) < 15.0
+
+
+def test_coarse_matches_that_would_find_a_position_do_and_the_old_place_is_not_forgotten() -> None:
+    flight, run, away_m = coarsely_led(last=68)
+    restarted = [i for i in range(40, 69, 4) if run.verdicts("map")[i].detail.startswith("restarted")]
+    assert restarted == [60]  # the sixth, after 120 m at 100 m height
+    said = run.estimate(62)
+    assert np.linalg.norm(error_m(said, flight, away_m)[:2]) < 15.0
+    off_m = error_m(said, flight)[:2]
+    assert float(off_m @ np.linalg.solve(cov_of(said)[:2, :2], off_m)) < 9.0
+
+
 @pytest.mark.parametrize(("inliers", "second"), [(30, Verdict.ACCEPTED), (15, Verdict.INNOVATION)])
 def test_a_start_that_nothing_confirmed_is_left_for_two_clear_poses(inliers: int, second: Verdict) -> None:
     flight, offset = Flight(40, seed=9, speed_mps=3.0), (120.0, -90.0)

@@ -12,21 +12,27 @@ class Agreement:
     """Of fixes in a row, each ``offset`` (east, north) from the estimate of its frame."""
 
     offsets_m: list[np.ndarray] = field(default_factory=list)
+    poses: int = 0  # of them; the others are coarse
     _began_at_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     _reached_m: float = 0.0
 
-    def add(self, offset_m: np.ndarray, here_m: np.ndarray) -> None:
+    def add(self, offset_m: np.ndarray, here_m: np.ndarray, *, coarse: bool) -> None:
         """One more, with the estimate at ``here_m``. One that does not agree begins a new row."""
         if self.offsets_m and float(np.hypot(*(offset_m - np.mean(self.offsets_m, axis=0)))) > AGREE_M:
             self.clear()
         if not self.offsets_m:
             self._began_at_m = here_m
         self.offsets_m.append(offset_m)
+        self.poses += not coarse
         self._reached_m = float(np.hypot(*(here_m - self._began_at_m)))
 
     def holds(self, count: int, over_m: float) -> bool:
         """So many agree, over so much way that they are not one mistake seen again and again."""
         return len(self.offsets_m) >= count and self._reached_m > over_m
 
+    def holds_poses(self, count: int, over_m: float) -> bool:
+        """So many of them are poses."""
+        return self.poses >= count and self._reached_m > over_m
+
     def clear(self) -> None:
-        self.offsets_m, self._reached_m = [], 0.0
+        self.offsets_m, self.poses, self._reached_m = [], 0, 0.0

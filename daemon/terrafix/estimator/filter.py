@@ -97,7 +97,7 @@ class Estimator(Tracker):
         spread = float(np.sqrt(np.max(np.diag(tangent_to_world(self._covariance(node), r_w_c))[:2])))
         if match.coarse and spread > COARSE_CONTINUES * height:
             offset = (measured.translation() - predicted.translation())[:2]
-            self._vague.add(offset, predicted.translation()[:2])
+            self._vague.add(offset, predicted.translation()[:2], coarse=True)
             if not self._vague.holds(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height):
                 return FixResult(Verdict.AMBIGUOUS, None, "a coarse fix continues a track, several find one")
         self._vague.clear()
@@ -150,14 +150,18 @@ class Estimator(Tracker):
         """Refused, unless several fixes over new ground agree with each other: then it is the graph that is lost."""
         predicted = self.graph.state(node).pose
         offset, apart = _offset(predicted, self._covariance(node), measured, cov)
-        self._refused.add(offset, predicted.translation()[:2])
-        if len(self._refused.offsets_m) > 1:
-            self.rival.disagreed(self._refused.offsets_m, apart, fixed=self.last_fix_s is not None)
-            height = float(measured.translation()[2]) - self.terrain.ground_m
+        row = self._refused
+        row.add(offset, predicted.translation()[:2], coarse=match.coarse)
+        height = float(measured.translation()[2]) - self.terrain.ground_m
+        # A pose stands on patches of its own frame. A coarse one says what the belief remembers: one look that went
+        # astray is in all that follow, so they count against the graph when they would find a position without it.
+        found = row.holds(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height)
+        if found or row.poses >= AGREEING:
+            self.rival.disagreed(row.offsets_m, apart, fixed=self.last_fix_s is not None)
             # Before the first fix only the start coordinate speaks for the graph: as much as one such pose against it.
             first = self.last_fix_s is None and match.inliers >= OUTWEIGHS_START
             needed = (AGREEING, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
-            if self._refused.holds(*needed) and match.mode_mass >= RECOVER_MASS:
+            if (found or row.holds_poses(*needed)) and match.mode_mass >= RECOVER_MASS:
                 self.rival.left(offset, apart)
                 return self._restart(match, node, measured, cov, "restarted")
         return FixResult(Verdict.INNOVATION, d2, f"{float(np.hypot(*offset)):.0f} m from the estimate")
