@@ -26,8 +26,8 @@ def test_one_mistake_seen_again_and_again_does_not() -> None:
 
 def test_coarse_ones_are_none_of_the_poses() -> None:
     said = row([(100.0, 0.0)] * 5, coarse=3)
-    assert said.holds(5, 50.0) and said.holds_poses(2, 50.0)
-    assert not said.holds_poses(3, 50.0) and not said.holds_poses(2, 80.0)
+    assert said.holds(5, 50.0) and said.holds(2, 50.0, poses=True)
+    assert not said.holds(3, 50.0, poses=True) and not said.holds(2, 80.0, poses=True)
 
 
 def test_one_that_does_not_agree_begins_a_new_row() -> None:

@@ -340,6 +340,20 @@ def test_coarse_matches_that_would_find_a_position_do_and_the_old_place_is_not_f
     assert float(off_m @ np.linalg.solve(cov_of(said)[:2, :2], off_m)) < 9.0
 
 
+def test_coarse_matches_confirm_a_doubt_that_poses_have_raised() -> None:
+    """Rows led a flight aside, and where they end no pose stands."""
+    flight, away_m = Flight(60, seed=9), (180.0, -140.0)
+    run = Listener().fly(flight, 0, 40)
+    for i in range(40, 60):
+        wrong = flight.fix(i, away_m)
+        if i >= 42:
+            wrong = msgspec.structs.replace(wrong, coarse=True, inliers=0, matches=[])
+        run.hear([*without_fix(flight.messages(i)), wrong])
+    restarted = [i for i in range(40, 60) if run.verdicts("map")[i].detail.startswith("restarted")]
+    assert len(restarted) == 1 and 48 < restarted[0] < 52  # after half of the height
+    assert min(sigma_m(run.estimate(i)) for i in range(41, 60)) > 50.0
+
+
 @pytest.mark.parametrize(("inliers", "second"), [(30, Verdict.ACCEPTED), (15, Verdict.INNOVATION)])
 def test_a_start_that_nothing_confirmed_is_left_for_two_clear_poses(inliers: int, second: Verdict) -> None:
     flight, offset = Flight(40, seed=9, speed_mps=3.0), (120.0, -90.0)

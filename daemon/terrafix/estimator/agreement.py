@@ -26,13 +26,9 @@ class Agreement:
         self.poses += not coarse
         self._reached_m = float(np.hypot(*(here_m - self._began_at_m)))
 
-    def holds(self, count: int, over_m: float) -> bool:
-        """So many agree, over so much way that they are not one mistake seen again and again."""
-        return len(self.offsets_m) >= count and self._reached_m > over_m
-
-    def holds_poses(self, count: int, over_m: float) -> bool:
-        """So many of them are poses."""
-        return self.poses >= count and self._reached_m > over_m
+    def holds(self, count: int, over_m: float, *, poses: bool = False) -> bool:
+        """So many agree (so many ``poses``), over so much way that they are not one mistake seen again and again."""
+        return (self.poses if poses else len(self.offsets_m)) >= count and self._reached_m > over_m
 
     def clear(self) -> None:
         self.offsets_m, self.poses, self._reached_m = [], 0, 0.0

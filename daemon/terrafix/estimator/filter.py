@@ -154,14 +154,16 @@ class Estimator(Tracker):
         row.add(offset, predicted.translation()[:2], coarse=match.coarse)
         height = float(measured.translation()[2]) - self.terrain.ground_m
         # A pose stands on patches of its own frame. A coarse one says what the belief remembers: one look that went
-        # astray is in all that follow, so they count against the graph when they would find a position without it.
+        # astray is in all that follow. Where nothing is in doubt they count against the graph when they would find a
+        # position without it; where another place has spoken already they are more of what speaks for it.
+        sure = self.rival.probability == 0.0
         found = row.holds(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height)
-        if found or row.poses >= AGREEING:
+        if found or (row.poses if sure else len(row.offsets_m)) >= AGREEING:
             self.rival.disagreed(row.offsets_m, apart, fixed=self.last_fix_s is not None)
             # Before the first fix only the start coordinate speaks for the graph: as much as one such pose against it.
             first = self.last_fix_s is None and match.inliers >= OUTWEIGHS_START
             needed = (AGREEING, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
-            if (found or row.holds_poses(*needed)) and match.mode_mass >= RECOVER_MASS:
+            if (found or row.holds(*needed, poses=sure)) and match.mode_mass >= RECOVER_MASS:
                 self.rival.left(offset, apart)
                 return self._restart(match, node, measured, cov, "restarted")
         return FixResult(Verdict.INNOVATION, d2, f"{float(np.hypot(*offset)):.0f} m from the estimate")
