@@ -322,7 +322,7 @@ def coarsely_led(last: int) -> tuple[Flight, Listener, tuple[float, float]]:
 
 
 def test_a_belief_that_went_astray_neither_moves_nor_widens_what_poses_have_placed() -> None:
-    """A plane that landed over a ploughed field lost its fix so: four coarse matches 84 to 117 m aside, three of them
+    """A plane that landed over bare fields lost its fix so: four coarse matches 84 to 117 m aside, three of them
     over half a height, and below 30 m there are none that could speak against them."""
     flight, run, _ = coarsely_led(last=56)
     assert {run.verdicts("map")[i].verdict for i in range(40, 57, 4)} == {Verdict.INNOVATION}
