@@ -332,6 +332,14 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     emitted_at_ns: int  # when it was said; in a replay, the time of the frame that it answers
 
 
+class LearntLens(msgspec.Struct, frozen=True, kw_only=True):
+    """k1, k2, p1, p2, the focal length (relative, less one) and the middle of the picture (right and down of where its
+    description has it), in normalised coordinates; the inverse of their covariance."""
+
+    value: tuple[float, ...]  # 7
+    information: tuple[float, ...]  # 7x7, row-major
+
+
 class SlowErrors(Message, frozen=True, kw_only=True):
     """Once a second: what was learnt by now of what is off for a whole flight: mount, compass, barometer, lens."""
 
@@ -340,6 +348,7 @@ class SlowErrors(Message, frozen=True, kw_only=True):
     # logarithm of heights told over heights seen [-]
     error: tuple[float, float, float, float, float, float]
     cov: tuple[float, ...]  # 6x6, row-major
+    lens: LearntLens | None = None  # of a camera that nobody has calibrated; estimator/middle.py
 
 
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):

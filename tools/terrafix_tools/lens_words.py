@@ -3,15 +3,38 @@
 import numpy as np
 
 from terrafix.core.camera import bent, straightened
+from terrafix.core.gate import GATE
+from terrafix.estimator.middle import Middle
 from terrafix.messages import Camera, SlowErrors
 
 LENS = 4  # of SlowErrors.error
 SURE = 3.0  # sigmas
-LEAST_SHARE = 0.01  # of the width, by which the corner is bent: below it nobody would find the lens at fault
+LEAST_SHARE = (
+    0.01  # of the width, by which the corner is bent, or the middle aside: below it nobody would find the lens at fault
+)
 
 
 def lens_words(camera: Camera, learnt: SlowErrors) -> str | None:
-    """One sentence; None when the lens is as its description says, as far as the flight could tell."""
+    """A sentence or two; None when the lens is as its description says, as far as the flight could tell."""
+    return " ".join(said for said in (_bend(camera, learnt), _middle(camera, learnt)) if said) or None
+
+
+def _middle(camera: Camera, learnt: SlowErrors) -> str:
+    found = Middle(camera, learnt.lens)
+    px = found.offset * (camera.fx, camera.fy)
+    sigma_px = np.sqrt(np.diag(found.cov)) * (camera.fx, camera.fy)
+    if not found.offset.any() or found.offset @ np.linalg.solve(found.cov, found.offset) < GATE[2]:
+        return ""
+    if np.hypot(*px) < LEAST_SHARE * camera.width:
+        return ""
+    cx, cy = camera.cx + px[0], camera.cy + px[1]
+    return (
+        f"The middle of its picture seems to be at {cx:.0f}, {cy:.0f} px (+- {sigma_px[0]:.0f}, {sigma_px[1]:.0f}); "
+        f"that is in the positions. Calibrate it, or write cx = {cx:.0f} and cy = {cy:.0f} into [camera]."
+    )
+
+
+def _bend(camera: Camera, learnt: SlowErrors) -> str:
     bend = learnt.error[LENS]
     n = len(learnt.error)
     sigma = float(np.sqrt(learnt.cov[LENS * n + LENS]))
@@ -24,7 +47,7 @@ def lens_words(camera: Camera, learnt: SlowErrors) -> str | None:
     straight = straightened(seen, bend)
     off_px = float(np.abs(straight - seen).max()) * camera.fx
     if abs(bend) < SURE * sigma or off_px < LEAST_SHARE * camera.width:
-        return None
+        return ""
     if camera.distortion:
         said, todo = "more than its distortion says", "calibrate it again"
     else:

@@ -202,10 +202,14 @@ class Estimator(Tracker):
     def refine(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """frame -> position (3,) and its covariance (3x3), by all that was measured in the flight, after landing."""
         result = {}
-        for frame, p_m, cov in zip(self._frames, *self.graph.refine(), strict=True):
+        levers = np.array(self._levers).reshape(-1, 2, 2)
+        for frame, lever, p_m, cov in zip(self._frames, levers, *self.graph.refine(), strict=True):
             if np.isfinite(p_m).all() and np.isfinite(cov).all():
                 if frame in self._torn:
                     cov[:2, :2] += self._torn[frame]
+                aside_m, aside_cov = self.middle.aside(lever)
+                p_m[:2] += aside_m
+                cov[:2, :2] += aside_cov
                 result[frame] = (p_m, cov)
         return result
 

@@ -135,7 +135,7 @@ class EstimatorNode:
         if self._began_ns is None:
             return None
         if self._resumed_from is not None:
-            return Known.of(self._resumed_from, frame)
+            return Known.of(self._resumed_from, frame, origin.camera)
         return Known.start(origin, self._began_ns * 1e-9)
 
     def _begun(self) -> Iterable[Message]:
@@ -203,6 +203,7 @@ class EstimatorNode:
             frame_id=placed.frame_id,
             error=(tilt_x, tilt_y, heading, height, lens, scale),
             cov=tuple(float(c) for c in cov.ravel()),
+            lens=estimator.middle.learnt,
         )
 
     def _on_coasted(self, said: Coasted) -> Iterable[Message]:
@@ -268,13 +269,14 @@ class EstimatorNode:
         cov = tangent_to_world(placed.cov, placed.pose.rotation().matrix())
         # The map itself is off by a few metres, everywhere alike: no number of fixes averages that away.
         cov[:3, :3] += estimator.map_sigma_m**2 * np.eye(3)
-        cov[:2, :2] += estimator.aside_m2(p) * np.eye(2)
+        aside_m, aside_cov = estimator.middle.aside(estimator.lever(placed.pose))
+        cov[:2, :2] += aside_cov
         cov[3:5, 3:5] += estimator.camera.body_sigma_rad**2 * np.eye(2)
         cov = estimator.rival.added(estimator.doubt.added(cov))
         alt_amsl_m, more_m = estimator.amsl(placed)
         stretch, _ = estimator.stretch(placed.node)
         cov[2, 2] += more_m**2
-        lat_deg, lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
+        lat_deg, lon_deg = frame.to_wgs84(float(p[0] + aside_m[0]), float(p[1] + aside_m[1]))
         age_ms = -1
         if estimator.last_fix_s is not None:
             age_ms = max(0, round((placed.t_s - estimator.last_fix_s) * 1e3))
@@ -307,15 +309,14 @@ class EstimatorNode:
         map_var = self._estimator.map_sigma_m**2
         for frame_id, (p, cov) in sorted(self._estimator.refine().items()):
             lat_deg, lon_deg = self._frame.to_wgs84(float(p[0]), float(p[1]))
-            all_alike = map_var + self._estimator.aside_m2(p)
             poses.append(
                 RefinedPose(
                     frame_id=frame_id,
                     lat_deg=lat_deg,
                     lon_deg=lon_deg,
                     alt_amsl_m=float(p[2]),
-                    sigma_e_m=float(np.sqrt(cov[0, 0] + all_alike)),
-                    sigma_n_m=float(np.sqrt(cov[1, 1] + all_alike)),
+                    sigma_e_m=float(np.sqrt(cov[0, 0] + map_var)),
+                    sigma_n_m=float(np.sqrt(cov[1, 1] + map_var)),
                 )
             )
         yield Refinement(t_ns=ended.t_ns, poses=poses)

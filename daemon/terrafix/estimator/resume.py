@@ -12,9 +12,10 @@ from terrafix.core.geodesy import LocalFrame, rot_from_quat, yaw_of
 from terrafix.core.rundir import leave, left
 from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.factors import BIAS_SIZE
+from terrafix.estimator.middle import graph_aside
 from terrafix.estimator.pace import TYPICAL_SPEED_MPS
 from terrafix.estimator.velocity import LEAST_SPEED_MPS, MAX_SPEED_SIGMA_MPS, leg
-from terrafix.messages import MapMatch, Message, NavEstimate, Origin, SlowErrors, Start
+from terrafix.messages import Camera, LearntLens, MapMatch, Message, NavEstimate, Origin, SlowErrors, Start
 
 KEPT_EVERY_NS = 200_000_000
 SLOW_AGE_NS = 5_000_000_000  # learnt longer before the estimate (the computer was hot): heading and height were others
@@ -45,7 +46,7 @@ class Learnt:
 @dataclass(frozen=True)
 class Known:
     """A position that is known: time, east and north with their 1-sigma, velocity with its 1-sigma (each axis), heading
-    of the vehicle (None: unknown), and what was learnt of the slow errors and of the ground."""
+    of the vehicle (None: unknown), and what was learnt of the slow errors, of the ground and of the lens."""
 
     t_s: float
     at_m: np.ndarray
@@ -55,6 +56,7 @@ class Known:
     yaw_rad: float | None = None
     learnt: Learnt | None = None
     match: MapMatch | None = None
+    lens: LearntLens | None = None
 
     @classmethod
     def start(cls, origin: Origin, t_s: float) -> "Known":
@@ -71,16 +73,19 @@ class Known:
         return cls(t_s, at_m, start.sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
 
     @classmethod
-    def of(cls, last: Last, frame: LocalFrame) -> "Known":
+    def of(cls, last: Last, frame: LocalFrame, camera: Camera) -> "Known":
         said, slow = last.estimate, last.slow
         at_m = np.array(frame.to_local(said.lat_deg, said.lon_deg))
         sigma_m = float(np.sqrt(max(said.cov[0], said.cov[7])))
         t_s, velocity_mps = said.t_ns * 1e-9, np.array(said.velocity_enu_mps[:2])
         learnt, yaw_rad = None, yaw_of(rot_from_quat(said.q_w_b))
+        lens = None if slow is None else slow.lens
+        if lens is not None:
+            at_m -= graph_aside(said, camera, lens)
         if slow is not None and said.t_ns - slow.t_ns <= SLOW_AGE_NS:
             cov = np.array(slow.cov).reshape(BIAS_SIZE, BIAS_SIZE)
             learnt = Learnt(slow.t_ns * 1e-9, np.array(slow.error), cov)
-        return cls(t_s, at_m, sigma_m, velocity_mps, said.velocity_sigma_mps, yaw_rad, learnt, last.match)
+        return cls(t_s, at_m, sigma_m, velocity_mps, said.velocity_sigma_mps, yaw_rad, learnt, last.match, lens)
 
     def later(self, t_s: float, yaw_rad: float | None) -> tuple[np.ndarray, float]:
         """-> way (2,) since then, and the 1-sigma of each axis of it: nobody looked. ``yaw_rad``: where it heads now,

@@ -17,7 +17,6 @@ from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
 from terrafix.estimator.fixes import doubted, new_ground, torn
 from terrafix.estimator.graduated import Covariances, Doubtful, marginals, settle, solve, weighted
-from terrafix.estimator.lens import centre_sigma
 from terrafix.estimator.matched import straightened_pose
 from terrafix.estimator.pieces import placed_states
 from terrafix.estimator.whole import Fix, Retold, WholeNode
@@ -213,13 +212,13 @@ class _Smoothing:
             r = np.array([poses[i].rotation().matrix()[:2] for i in at])
             covs[at, 3:, 3:] += np.einsum("nai,ab,nbj->nij", r, spread, r)
         covs[:, 3:, 3:] += doubted(self._flight, believed[: len(fixes)], self._begins)[:, None, None] ** 2 * np.eye(3)
-        aside = centre_sigma(self._flight.origin.camera)
-        for cov, pose in zip(covs, poses, strict=True):
-            r, height_m = (
-                pose.rotation().matrix()[:2],
-                pose.translation()[2] - (self._flight.origin.ground_amsl_m or 0.0),
-            )
-            cov[3:, 3:] += (aside * height_m) ** 2 * r.T @ r
+        if (middle := self._flight.middle) is not None:
+            for i, pose in enumerate(poses):
+                level, p_m = pose.rotation().matrix()[:2], pose.translation()
+                height_m = p_m[2] - (self._flight.origin.ground_amsl_m or 0.0)
+                aside_m, aside_cov = middle.aside(height_m * level[:, :2])
+                poses[i] = gtsam.Pose3(pose.rotation(), p_m + np.append(aside_m, 0.0))
+                covs[i, 3:, 3:] += level.T @ aside_cov @ level
         offsets = {}
         for j, sigma_m in enumerate(self._maps):
             sigmas = np.sqrt(np.diag(found.marginalCovariance(M(j)))[3:])

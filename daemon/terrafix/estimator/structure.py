@@ -113,7 +113,7 @@ def structure_of(triples: np.ndarray, sigma_norm: float, guess: Trio, focal_sigm
 def _normal(points: np.ndarray, seen: np.ndarray, at: Trio, sigma_norm: float, focal_sigma: float) -> _Normal:
     """What nobody seeks of the lens is taken out like the points: it is open by so much. Of the points no more are
     independent than of pairs: their patches look alike, and what a lens or a shutter bends moves many of them."""
-    residual, by_cameras, by_point = _projected(points, seen, at)
+    residual, by_cameras, by_point = projected(points, seen, at)
     off = np.sqrt(np.sum(residual**2, axis=1) / 3.0)  # three of six numbers are the point's
     sigma = float(np.median(off)) / MEDIAN_OFF
     claimed = max(sigma_norm, sigma)
@@ -135,7 +135,7 @@ def _normal(points: np.ndarray, seen: np.ndarray, at: Trio, sigma_norm: float, f
     return _Normal(left, right, inner, cross[:, s], pull, sigma)
 
 
-def _projected(points: np.ndarray, seen: np.ndarray, at: Trio) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def projected(points: np.ndarray, seen: np.ndarray, at: Trio) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """-> residuals (N, 6), Jacobians by cameras and lens (N, 6, SOUGHT + OTHERS), by points (N, 6, 3)."""
     n = len(points)
     residual, by_cameras, by_point = np.zeros((n, 6)), np.zeros((n, 6, SOUGHT + OTHERS)), np.zeros((n, 6, 3))

@@ -15,7 +15,8 @@ from terrafix.estimator.coasted import Coast, Coasts
 from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS, SCALE
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sigmas
 from terrafix.estimator.heading import OpenHeading
-from terrafix.estimator.lens import centre_sigma, lens_sigma
+from terrafix.estimator.lens import lens_sigma
+from terrafix.estimator.middle import Middle
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
 from terrafix.estimator.mounted import (
     DEFAULT_AGL_M,
@@ -106,8 +107,10 @@ class Tracker:
         self.led_s = 0.0
         self._node_of: dict[int, int] = {}  # frame -> node, of those in the graph's window
         self._frames = array("q")  # of each node
+        self._levers = array("f")  # ... (2, 2), of the middle of its picture
         self._cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C, for the cheap mode
         self._velocity_cov = np.zeros((V_SIZE, V_SIZE))  # of V of the newest node
+        self.middle = Middle(origin.camera, None if known is None else known.lens)
         self._lens_sigma = lens_sigma(origin.camera)  # of what is learnt of the lens
         self._pace = Pace()
         self._wind = Wind()
@@ -156,10 +159,10 @@ class Tracker:
         part = (focal / both) ** 2 * float(self.graph.state(node).bias[SCALE])
         return float(np.exp(part)), focal * BAROMETER_SCALE / both
 
-    def aside_m2(self, p_m: np.ndarray) -> float:
-        """Variance, each horizontal axis, of a camera at ``p_m`` (3,): that the middle of its picture is not where its
-        description has it."""
-        return (centre_sigma(self.origin.camera) * (float(p_m[2]) - self.terrain.below(p_m))) ** 2
+    def lever(self, pose: gtsam.Pose3) -> np.ndarray:
+        """(2, 2) of which times the middle of the picture is how far aside the graph has a camera."""
+        p = pose.translation()
+        return np.asarray((float(p[2]) - self.terrain.below(p)) * pose.rotation().matrix()[:2, :2])
 
     def amsl(self, placed: Placed) -> tuple[float, float]:
         """Of the camera, and the 1-sigma of it beyond what the graph claims. Without a DEM the graph has the height
@@ -475,6 +478,7 @@ class Tracker:
         self._node_of = {frame: n for frame, n in self._node_of.items() if self.graph.holds(n)}
         self._node_of[frame_id] = node
         self._frames.append(frame_id)
+        self._levers.extend(self.lever(self.graph.state(node).pose).ravel())
 
     def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | Verdict:
         """The keyframe's node and the motion since; or why odometry does not tell it."""
@@ -533,10 +537,12 @@ class Tracker:
             ground_m,
             float(middle.bias[LENS]),
         )
-        seen = structure_of(
-            np.array(odometry.triples), odometry.triples_sigma_norm, guess, self.origin.camera.focal_sigma
-        )
-        return None if seen is None else (first, seen)
+        triples, sigma_norm = np.array(odometry.triples), odometry.triples_sigma_norm
+        seen = structure_of(triples, sigma_norm, guess, self.origin.camera.focal_sigma)
+        if seen is None:
+            return None
+        self.middle.see(triples, sigma_norm, seen.at)
+        return first, seen
 
     def _ground(self, p_m: np.ndarray, height_m: float, place_cov: np.ndarray, share: float) -> Ground:
         """The plane under a camera at ``p_m`` (3,), known to ``place_cov`` (3x3). ``share`` of the matches agreed."""

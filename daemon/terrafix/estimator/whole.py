@@ -14,6 +14,7 @@ from terrafix.estimator.factors import BIAS_SIZE
 from terrafix.estimator.filter import Estimator
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph
 from terrafix.estimator.matched import determined, measured_pose, moved_by_lens
+from terrafix.estimator.middle import Middle
 from terrafix.estimator.motion import RelativePose
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.resume import Known
@@ -147,6 +148,7 @@ class Retold:
     refused: dict[str, int] = field(default_factory=dict)  # map matches that are none, by verdict
     doubt_m: dict[int, float] = field(default_factory=dict)  # node -> 1-sigma that its place may have been wrong
     lens: tuple[float, float] = 0.0, 0.0  # what was learnt of it in the end, and the 1-sigma of that
+    middle: Middle | None = None  # ... and of the middle of its picture
     has_height: bool = False  # the autopilot said one
 
 
@@ -174,7 +176,7 @@ class Storyteller(EstimatorNode):
             flight.has_height = flight.has_height or message.agl_m is not None
         elif isinstance(message, Odometry) and any(isinstance(s, NavEstimate) for s in said):
             flight.node_of[message.frame_id] = flight.graph.newest
-            flight.lens = estimator.lens_learnt
+            flight.lens, flight.middle = estimator.lens_learnt, estimator.middle
         elif isinstance(message, MapMatch):
             verdict = next((s.verdict for s in said if isinstance(s, MeasurementVerdict)), Verdict.STALE)
             self._note(message, verdict, estimator)
