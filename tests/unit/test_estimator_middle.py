@@ -87,6 +87,15 @@ def test_points_that_fit_no_lens_are_left_out() -> None:
     assert np.array_equal(found.cov, before.cov) and np.array_equal(found.offset, before.offset)
 
 
+def test_what_is_no_number_changes_nothing() -> None:
+    found, before = Middle(UNCALIBRATED), Middle(UNCALIBRATED)
+    triples, at = triple(np.random.default_rng(2), BENDS, MIDDLE)
+    for wrong in (np.full_like(triples, np.nan), 1e200 * triples):
+        with np.errstate(all="ignore"):
+            found.see(wrong, NOISE, at)
+    assert np.array_equal(found.cov, before.cov) and np.array_equal(found.offset, before.offset)
+
+
 def test_what_was_learnt_outlives_the_process() -> None:
     found = learnt(1)
     again = Middle(UNCALIBRATED, found.learnt)

@@ -27,7 +27,8 @@ UNDISTORTED = 5  # steps of Newton's method from a picture to rays: good to a th
 
 
 class Middle:
-    """``offset`` (2,): normalised coordinates, right and down, of where the camera's description has the middle."""
+    """``offset`` (2,): normalised coordinates, right and down, of where the camera's description has the middle; known
+    to ``cov`` (2, 2)."""
 
     def __init__(self, camera: Camera, learnt: LearntLens | None = None) -> None:
         """``learnt``: by an estimator that was there before in this flight."""
@@ -44,15 +45,11 @@ class Middle:
         if self._learns and learnt is not None:
             self._is = np.array(learnt.value)
             self._information = np.array(learnt.information).reshape(SIZE, SIZE)
+        self.cov = self._covariance()
 
     @property
     def offset(self) -> np.ndarray:
         return self._is[MIDDLE]
-
-    @property
-    def cov(self) -> np.ndarray:
-        """(2, 2) of ``offset``."""
-        return np.linalg.inv(self._information)[MIDDLE, MIDDLE] if self._open else np.zeros((2, 2))
 
     @property
     def learnt(self) -> LearntLens | None:
@@ -66,17 +63,24 @@ class Middle:
         if not self._learns:
             return
         seen = triples.reshape(-1, 3, 2)[:, [1, 0, 2]]  # the middle one comes first
-        told = _told(seen, sigma_norm, at, self._is)
-        if told is None:
+        try:
+            told = _told(seen, sigma_norm, at, self._is)
+        except np.linalg.LinAlgError:  # a lens under way that folds the picture
+            told = None
+        if told is None or not all(np.isfinite(numbers).all() for numbers in told):
             return
         information, pull = told
         self._information = self._information + information
         self._is = self._is - np.linalg.solve(self._information, pull)
+        self.cov = self._covariance()
 
     def aside(self, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """East and north (2,) from where the graph has a camera to where it is, and the covariance (2, 2) of that.
         ``lever``: the horizontal part (2, 2) of R_w_c, times the height."""
         return lever @ self.offset, lever @ self.cov @ lever.T
+
+    def _covariance(self) -> np.ndarray:
+        return np.linalg.inv(self._information)[MIDDLE, MIDDLE] if self._open else np.zeros((2, 2))
 
 
 def graph_aside(said: NavEstimate, camera: Camera, learnt: LearntLens) -> np.ndarray:
