@@ -277,3 +277,31 @@ def test_progress_of_a_process_is_seen_from_outside(tmp_path: Path) -> None:
 def test_addresses_are_short_enough_for_unix_sockets() -> None:
     longest = RunDir(Path("/dev/shm/terrafix-abcdefgh")).address("supervisor").removeprefix("ipc://")
     assert len(os.fsencode(longest)) < 107
+
+
+def test_who_comes_while_much_is_said_hears_what_is_retained_first(
+    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+) -> None:
+    """A subscription may come inside of a send: of a thousand such late comers thirty heard a frame before Origin."""
+    over = threading.Event()
+
+    def speak() -> None:
+        publisher = Publisher(context, run_dir.address("vision"))
+        publisher.say(ORIGIN)
+        count = 0
+        while not over.is_set():
+            publisher.say(frame(count := count + 1))
+            time.sleep(0)
+        publisher.close()
+
+    speaker = threading.Thread(target=speak)
+    speaker.start()
+    try:
+        for _ in range(500):
+            late = Subscriber(context, [run_dir.address("vision")], (m.Origin, m.Frame))
+            assert late.socket.poll(5000), "nothing was heard"
+            assert next(late.receive()) == ORIGIN
+            late.socket.close()
+    finally:
+        over.set()
+        speaker.join(10)

@@ -54,7 +54,9 @@ class Publisher:
     ) -> None:
         self._clock = clock
         self.socket = context.socket(zmq.XPUB)
-        self.socket.setsockopt(zmq.XPUB_VERBOSE, 1)  # every subscription, not only the first to a topic
+        # A subscription counts from when ``serve`` has seen it, and not from some moment inside of a send: who needs
+        # what is retained would hear the message that is just being sent before it.
+        self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.SNDHWM, QUEUE_LENGTH)
         self.socket.setsockopt(zmq.LINGER, LINGER_MS)
         self.socket.bind(address)  # replaces the socket file of a killed predecessor
@@ -80,7 +82,9 @@ class Publisher:
         while self.socket.poll(0):
             request = self.socket.recv()
             name = request[1:]
-            if request[:1] == b"\x01":
+            wanted = request[:1] == b"\x01"
+            self.socket.setsockopt(zmq.SUBSCRIBE if wanted else zmq.UNSUBSCRIBE, name)
+            if wanted:
                 self._subscriptions[name] += 1
                 for said_ns, parts in self._retained.get(name, ()):
                     if self._clock() - said_ns <= self._max_age_ns[name]:
