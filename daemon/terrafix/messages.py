@@ -49,7 +49,7 @@ class Verdict(StrEnum):
 
     ACCEPTED = "accepted"
     BAD_IMAGE = "bad_image"  # unreadable, truncated, wrong size
-    STALLED = "stalled"  # the camera repeats its last picture, bit for bit
+    STALLED = "stalled"  # the camera repeats an earlier picture while the vehicle moves
     NO_FEATURES = "no_features"  # nothing to track
     FEW_INLIERS = "few_inliers"
     NO_PREDICTION = "no_prediction"  # nobody knows where to look
@@ -62,6 +62,7 @@ class Verdict(StrEnum):
     DEGENERATE = "degenerate"
     INNOVATION = "innovation"  # disagrees with the estimate by more than both claim
     STALE = "stale"
+    UNCONFIRMED = "unconfirmed"  # of a fragment that nothing has joined to the flight yet
     IMPLAUSIBLE = "implausible"  # jump, speed or height that cannot be
     MODEL_FAILED = "model_failed"  # the learned model gave no usable answer; ModelEvent has the reason
     LOST = "lost"  # what is seen is not where the vehicle was believed to be; its place is searched
@@ -184,6 +185,9 @@ class Odometry(Message, frozen=True, kw_only=True):
     before_id: int = -1  # -1: there are no triples
     triples: list[tuple[float, float, float, float, float, float]] = []
     triples_sigma_norm: float = 0.0  # 1-sigma of one coordinate of these, normalised units
+    static: bool = (
+        False  # the same view as in the frame before, to 0.006 degrees: the vehicle stands, or the camera is frozen
+    )
 
 
 # --- estimator to anchor --------------------------------------------------------------------------

@@ -140,6 +140,30 @@ def test_a_foreign_frame_costs_that_frame_only(ground: np.ndarray) -> None:
     assert tracker.track(4, picture(ground, track[4])).verdict is Verdict.ACCEPTED
 
 
+def test_a_run_of_foreign_frames_ends_where_the_flight_was(ground: np.ndarray) -> None:
+    """Foreign frames that agree with each other become the keyframe; the next own frame returns to the one before."""
+    tracker, other = FrameTracker(PINHOLE), texture(33, 190.0)
+    track = [pose(0.0, 4.0 * i) for i in range(16)]
+    for i in range(4):
+        tracker.track(i, picture(ground, track[i]))
+    theirs = [tracker.track(i, picture(other, pose(0.0, 5.0 * i))) for i in range(4, 10)]
+    assert [m.verdict for m in theirs[1:]] == [Verdict.ACCEPTED] * 5 and all(m.keyframe_id >= 4 for m in theirs[1:])
+    back = tracker.track(10, picture(ground, track[10]))
+    assert back.verdict is Verdict.ACCEPTED and back.keyframe_id < 4
+    assert is_right(back, track[back.keyframe_id], track[10])
+    assert tracker.track(11, picture(ground, track[11])).keyframe_id >= 10
+
+
+def test_a_frame_that_agreed_with_nobody_is_no_place_to_return_to(ground: np.ndarray) -> None:
+    tracker = FrameTracker(PINHOLE)
+    tracker.track(0, foreign(20))  # alone
+    for i in range(1, 4):
+        tracker.track(i, picture(ground, pose(0.0, 6.0 * i)))
+    for i in range(4, 6):
+        assert tracker.track(i, foreign(20 + i)).verdict is Verdict.FEW_INLIERS
+    assert tracker.track(6, foreign(20)).verdict is Verdict.FEW_INLIERS
+
+
 @pytest.mark.parametrize("gray_value", [0, 128, 255])
 def test_a_frame_without_anything_in_it(ground: np.ndarray, gray_value: int) -> None:
     blank = np.full((PINHOLE.height, PINHOLE.width, 3), gray_value, np.uint8)

@@ -15,6 +15,7 @@ from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.doubt import Doubt
 from terrafix.estimator.factors import HEIGHT
 from terrafix.estimator.graph import NodeState
+from terrafix.estimator.integrity.fragments import Fragment, MapHits
 from terrafix.estimator.matched import determined, measured_pose, moved_by_lens, straightened_pose
 from terrafix.estimator.resume import Known
 from terrafix.estimator.rival import AGREEING, Rival
@@ -31,6 +32,8 @@ RECOVER_OVER = 0.5  # of the height: the motion they must span, so that they are
 RECOVER_MASS = 0.97
 # Patches: of 930 wrong places one gave a pose on so many, and of 400 starts one is wrong (anchor/lost.py).
 OUTWEIGHS_START = 20
+# What the anchor says of a frame that it looked at and found no pose for.
+NOTHING_FOUND = (Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE)
 RESTART_INFLATION = 4.0  # of the covariance of the fix that starts the graph anew
 
 
@@ -49,6 +52,7 @@ class Estimator(Tracker):
         self.map_sigma_m = 0.0  # of the map that placed us; nothing until it did
         self._torn: dict[int, np.ndarray] = {}  # frame -> spread (2, 2) of the two places between which it was
         self._seen = SeenGround()
+        self._map_hits = MapHits()
         self._heard_ns = -1  # frame of the newest map match
         self._refused = Agreement()  # with each other, not with the graph
         self._vague = Agreement()  # coarse ones, of a graph that does not know where it is
@@ -72,6 +76,8 @@ class Estimator(Tracker):
             lost = self.doubt.hear(match)
             if lost:
                 return FixResult(Verdict.LOST, None, lost)
+        if node is not None and (match.coarse or match.verdict in NOTHING_FOUND):
+            self._map_hits.looked(self._fragments.of(node), found=False)
         if match.verdict is not Verdict.ACCEPTED:
             return FixResult(match.verdict, None)
         if not determined(match):
@@ -118,6 +124,8 @@ class Estimator(Tracker):
         self.graph.add_pose(node, seen, seen_cov / new, by_lens, match.lens)
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[node] = np.linalg.inv(np.linalg.inv(self._cov_of[node]) + np.linalg.inv(cov / new))
+        if not match.coarse:
+            self._map_hits.looked(self._fragments.of(node), found=True)
         self._accepted(match, fixed_s, here)
         return FixResult(Verdict.ACCEPTED, d2, f"new ground {new:.2f}")
 
@@ -191,7 +199,7 @@ class Estimator(Tracker):
         self.graph.start(now_s, NodeState(measured.compose(onward), bias, velocity), cov, bias_cov, self._velocity_cov)
         assert self._last is not None
         self._felt = self._stood_at = None
-        self._is_frame(self.graph.newest, self._last.frame_id)
+        self._is_frame(self.graph.newest, self._last.frame_id, Fragment(now_s, joined=True))
         self._cov_of.clear()
         self._refused.clear()
         self.doubt = Doubt()

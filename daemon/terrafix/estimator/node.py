@@ -179,7 +179,7 @@ class EstimatorNode:
             if verdict is not Verdict.ACCEPTED:
                 t_ns, frame_id = odometry.t_ns, odometry.frame_id
                 yield MeasurementVerdict(t_ns=t_ns, frame_id=frame_id, measurement=name, verdict=verdict)
-        if odometry.verdict not in (Verdict.BAD_IMAGE, Verdict.STALLED):
+        if Verdict.STALLED not in (odometry.verdict, advance.verdict) and odometry.verdict is not Verdict.BAD_IMAGE:
             yield self._prediction(odometry, advance, estimator, seen)
             self._predicted = odometry.frame_id
         yield from self._slow_errors(advance.placed, estimator)

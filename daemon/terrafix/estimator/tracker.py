@@ -15,6 +15,9 @@ from terrafix.estimator.coasted import Coast, Coasts
 from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, LENS, SCALE
 from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sigmas
 from terrafix.estimator.heading import OpenHeading
+from terrafix.estimator.integrity.fragments import Fragment, Fragments, MotionEvidence
+from terrafix.estimator.integrity.motion_gate import MotionInnovation
+from terrafix.estimator.integrity.static_picture import StaticPicture
 from terrafix.estimator.lens import lens_sigma
 from terrafix.estimator.middle import Middle
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
@@ -59,6 +62,8 @@ MAX_LEVEL_SIGMA = 0.5
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 
+HEADING_GATE = 3.0  # sigmas, by which pictures of a new fragment may have turned otherwise than the heading
+MOTION_TIMEOUT_S = 5.0  # as EKF2_NOAID_TOUT of PX4, for one who would be led by inertial sensors alone
 LENS_SURE = 3.0  # sigmas, from which what the lens bends is taken out of the pictures: none is straight to a last digit
 
 Feel = Callable[[int, int], Felt | None]
@@ -79,6 +84,21 @@ class Placed:
     velocity_mps: np.ndarray
     velocity_cov: np.ndarray
     node: int
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What odometry says of a frame. ``motion``: node of the keyframe and the motion since, None without one.
+    ``fused``: the same, if it enters the graph. ``fragment``: to which the frame belongs."""
+
+    verdict: Verdict
+    motion: tuple[int, RelativePose] | None
+    fragment: Fragment
+    local_step_m: np.ndarray | None = None  # (2,) since the frame before, of a fragment that was not joined by then
+
+    @property
+    def fused(self) -> tuple[int, RelativePose] | None:
+        return self.motion if self.verdict is Verdict.ACCEPTED else None
 
 
 @dataclass(frozen=True)
@@ -124,6 +144,10 @@ class Tracker:
         self._open: OpenHeading | None = None  # None: the heading is known
         self._coasts = Coasts()
         self._heights, self._headings = Told(), Told()
+        self._fragments = Fragments()
+        self._fragment = Fragment(0.0, joined=True)  # of the newest frame
+        self._static_picture = StaticPicture()
+        self._motion_refused_s: float | None = None  # time of the first of the motions in a row that were impossible
 
     @property
     def last(self) -> Placed | None:
@@ -188,8 +212,8 @@ class Tracker:
             return self._begin(frame_id, t_s, attitude, felt)
         newest = self.graph.newest
         before, dt_s = self.graph.state(newest), max(t_s - self.graph.time_of(newest), 1e-3)
-        answer = self._by_odometry(odometry, attitude)
-        verdict, known = (answer, None) if isinstance(answer, Verdict) else (Verdict.ACCEPTED, answer)
+        sighting = self._sighting(odometry, t_s, before, attitude, felt)
+        verdict, known = sighting.verdict, sighting.fused
         heading = Verdict.ACCEPTED
         if known is not None and self._cannot_head_so(attitude, known, before):
             if self._headings.begins and self.last_fix_s is None:
@@ -202,6 +226,10 @@ class Tracker:
         led_to, velocity = before.pose.translation(), np.zeros(V_SIZE)
         if way is not None:
             led_to, velocity = way.predicted(led_to, before.velocity, float(before.bias[2]))
+        if self._is_motion_timed_out(sighting, t_s) and way is not None:
+            spread[3:, 3:] = unknown_cov()
+            spread[:3, :3] += unknown_cov()[:3, :3] * dt_s**2
+            return self._begin_again(frame_id, t_s, attitude, led_to, velocity, spread, verdict)
         above_m = None if known is None else float(led_to[2]) - self.terrain.ground_m
         if self._take_off.was_blind(way, above_m):
             # Told of the speed at both ends, a graph would make up the way between them and be too sure of it: it
@@ -236,6 +264,7 @@ class Tracker:
             if way is not None:
                 way, spread, gained = believed(way, p - led_to, spread, seen)
                 velocity = velocity + gained  # or a leg that is right would seem to be in its tail (factors.py)
+        step, step_sigma = self._pictured_step(sighting, p, step, step_sigma)
         height = Verdict.ACCEPTED
         if self._cannot_be_so_high(attitude, p, before, float(spread[2, 2])):
             if self._heights.begins and self.last_fix_s is None:
@@ -258,7 +287,7 @@ class Tracker:
             self._stood_at = None
         elif self._stood_at is None:
             self._stood_at = node
-        self._is_frame(node, frame_id)
+        self._is_frame(node, frame_id, sighting.fragment)
         self._seen_from = None if known is None else parent
         self._cov_of = {n: cov for n, cov in self._cov_of.items() if self.graph.holds(n)}
         self._velocity_cov = spread[3:, 3:]
@@ -274,16 +303,102 @@ class Tracker:
             self._learn_wind(self._last, attitude)
         return Advance(verdict, self._last, step, step_sigma, heading, height)
 
+    def _sighting(self, odometry: Odometry, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Sighting:
+        """``before``: the newest node."""
+        answer = self._by_odometry(odometry, attitude)
+        if isinstance(answer, Verdict):
+            return Sighting(answer, None, Fragment(t_s))
+        parent, motion = answer
+        fragment, keyframe = self._fragments.of(parent), self.graph.state(parent).pose
+        moved_m = keyframe.rotation().matrix() @ motion.p_m
+        in_fragment_m = self._fragments.at_m(parent) + moved_m[:2]
+        local_step_m = None if fragment.joined else in_fragment_m - fragment.moved_m
+        if attitude.stands or self._open is not None:  # nothing predicts the motion
+            fragment.joined = True
+        else:
+            p_m = keyframe.translation() + moved_m
+            innovation = self._motion_innovation(t_s, p_m, parent, motion, before, attitude, felt)
+            frozen = self._static_picture.is_frozen(
+                t_s, attitude, static=odometry.static, moves=not innovation.may_stand
+            )
+            if frozen or not innovation.is_possible:
+                return Sighting(Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE, None, Fragment(t_s))
+            if not fragment.joined:
+                over_s = t_s - self.graph.time_of(parent)
+                yaw_off_rad, yaw_sigma_rad = self._heading_innovation(attitude, answer, before)
+                turns_agree = abs(yaw_off_rad) <= HEADING_GATE * yaw_sigma_rad
+                off_m, cov_m2 = innovation.off_m[:2], innovation.cov_m2[:2, :2]
+                fragment.weigh(t_s, MotionEvidence(off_m, cov_m2, over_s, turns_agree))
+        verdict = Verdict.ACCEPTED if fragment.joined else Verdict.UNCONFIRMED
+        fragment.moved_m = in_fragment_m
+        return Sighting(verdict, answer, fragment, local_step_m)
+
+    def _motion_innovation(
+        self,
+        t_s: float,
+        p_m: np.ndarray,
+        parent: int,
+        motion: RelativePose,
+        before: NodeState,
+        attitude: Attitude,
+        felt: Feel,
+    ) -> MotionInnovation:
+        """Of a camera at ``p_m`` (3,) by its ``motion`` since the node ``parent``; ``before``: the newest node."""
+        way = self._leg(t_s, before, attitude, felt, seen=True)
+        led_to, _ = way.predicted(before.pose.translation(), before.velocity, float(before.bias[2]))
+        dt_s = max(t_s - self.graph.time_of(self.graph.newest), 1e-3)
+        cov_m2 = spread_after(way, self._velocity_cov)[:3, :3]
+        if not self._fragments.of(parent).joined:  # velocity led here all the way from the keyframe
+            since_s = t_s - self.graph.time_of(parent)
+            cov_m2 += self._velocity_cov[:3, :3] * (since_s**2 - dt_s**2)
+        r_w_c = self.graph.state(parent).pose.rotation().matrix() @ motion.r
+        seen_m2 = r_w_c @ motion.cov[3:, 3:] @ r_w_c.T
+        return MotionInnovation(p_m - led_to, cov_m2 + seen_m2, dt_s, way.inertial)
+
+    def _is_motion_timed_out(self, sighting: Sighting, t_s: float) -> bool:
+        """Whether impossible motions have gone on for so long that velocity may be what is wrong."""
+        if sighting.verdict is not Verdict.IMPLAUSIBLE:
+            self._motion_refused_s = None
+            return False
+        self._motion_refused_s = t_s if self._motion_refused_s is None else self._motion_refused_s
+        return t_s - self._motion_refused_s >= MOTION_TIMEOUT_S
+
+    def _pictured_step(
+        self, sighting: Sighting, p_m: np.ndarray, step_m: np.ndarray, sigma_m: float
+    ) -> tuple[np.ndarray, float]:
+        """The step (2,) and its 1-sigma for the anchor's belief, which goes where pictures go, whosever they are.
+        ``step_m`` (2,), ``sigma_m``: of the estimate, to ``p_m``."""
+        last = self._fragment
+        if sighting.fragment is last and sighting.local_step_m is not None:
+            length_m = float(np.hypot(*sighting.local_step_m))
+            return sighting.local_step_m, STEP_FLOOR_M + STEP_SHARE * length_m
+        if sighting.fragment is last or last.joined or self._last is None:
+            return step_m, sigma_m
+        # A fragment ends that nothing has joined: the belief returns to where it began, and goes on from there.
+        cov = tangent_to_world(self._last.cov, self._last.pose.rotation().matrix())[:2, :2]
+        grown_m2 = max(float(np.linalg.eigvalsh(cov - last.began_cov_m2)[-1]), 0.0)
+        return p_m[:2] - last.began_m - last.moved_m, float(np.hypot(sigma_m, np.sqrt(grown_m2)))
+
     def _cannot_head_so(self, attitude: Attitude, seen: tuple[int, RelativePose], before: NodeState) -> bool:
         """What is told of the heading, with the turn that odometry saw; ``before``: the newest node."""
         if attitude.yaw_rad is None or attitude.stands or self._last is None or self._open is not None:
             return False
+        return self._headings.refuses(*self._heading_innovation(attitude, seen, before), self.last_fix_s)
+
+    def _heading_innovation(
+        self, attitude: Attitude, seen: tuple[int, RelativePose], before: NodeState
+    ) -> tuple[float, float]:
+        """The reported heading less the one that odometry has turned to, and the 1-sigma of that [rad]; zero where none
+        is reported. ``seen``: node of the keyframe and the motion since; ``before``: the newest node."""
+        assert self._last is not None
         parent, motion = seen
         yaw_rad = self.camera.yaw_rad(self.graph.state(parent).pose.rotation().matrix() @ motion.r)
-        told_rad = self.camera.yaw_rad(self.camera.expected(attitude, before.bias))
         cov = tangent_to_world(self._last.cov, before.pose.rotation().matrix())
         sigma_rad = float(np.sqrt(np.radians(self.origin.yaw_sigma_deg) ** 2 + COMPASS_SWING_RAD**2 + cov[5, 5]))
-        return self._headings.refuses(math.remainder(told_rad - yaw_rad, math.tau), sigma_rad, self.last_fix_s)
+        if attitude.yaw_rad is None:
+            return 0.0, sigma_rad
+        told_rad = self.camera.yaw_rad(self.camera.expected(attitude, before.bias))
+        return math.remainder(told_rad - yaw_rad, math.tau), sigma_rad
 
     def _cannot_be_so_high(self, attitude: Attitude, p_m: np.ndarray, before: NodeState, moved_m2: float) -> bool:
         """What is told of the height, with the camera predicted at ``p_m`` (3,); ``moved_m2``: variance of the way up
@@ -469,16 +584,23 @@ class Tracker:
             self.camera.factor(self.graph.next_keys(), attitude, r_w_c, ground_m),
             world_to_tangent(cov if self._open is None else self._open.chosen(cov), r_w_c),
         )
-        self._is_frame(node, frame_id)
+        self._is_frame(node, frame_id, Fragment(t_s, joined=True))
         self._last = self._placed(frame_id, t_s, node)
         return self._last
 
-    def _is_frame(self, node: int, frame_id: int) -> None:
+    def _is_frame(self, node: int, frame_id: int, fragment: Fragment) -> None:
         """The newest node."""
+        pose = self.graph.state(node).pose
+        if fragment.frames == 1 and not fragment.joined:
+            fragment.began_m = pose.translation()[:2]
+            fragment.began_cov_m2 = tangent_to_world(self.graph.covariance(node), pose.rotation().matrix())[:2, :2]
+        self._fragment = fragment
+        self._fragments.add(node, fragment)
+        self._fragments.keep({n for n in self._node_of.values() if self.graph.holds(n)} | {node})
         self._node_of = {frame: n for frame, n in self._node_of.items() if self.graph.holds(n)}
         self._node_of[frame_id] = node
         self._frames.append(frame_id)
-        self._levers.extend(self.lever(self.graph.state(node).pose).ravel())
+        self._levers.extend(self.lever(pose).ravel())
 
     def _by_odometry(self, odometry: Odometry, attitude: Attitude) -> tuple[int, RelativePose] | Verdict:
         """The keyframe's node and the motion since; or why odometry does not tell it."""

@@ -2,13 +2,12 @@
 
 from collections.abc import Iterable
 
-import numpy as np
-
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.node import Edge, FrameStore, Image, NodeContext
+from terrafix.core.node import Edge, FrameStore, NodeContext
 from terrafix.messages import Frame, Message, Odometry, Origin, Verdict
 from terrafix.vision.edge import make_edge as make_source_edge
 from terrafix.vision.odometry import FrameTracker
+from terrafix.vision.repeated_picture import PictureHistory, Repeat
 
 
 class VisionNode:
@@ -16,13 +15,14 @@ class VisionNode:
         self._frames = frames
         self._origin: Origin | None = None
         self._tracker: FrameTracker | None = None
-        self._last: Image | None = None
+        self._pictures = PictureHistory()
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
             case Origin() if message != self._origin:  # said again after a restart of the source
                 self._origin = message
                 self._tracker = FrameTracker(CameraCalibration.of(message.camera))
+                self._pictures = PictureHistory()
             case Frame():
                 yield self._odometry(message)
             case _:
@@ -37,15 +37,13 @@ class VisionNode:
             return Odometry(
                 t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.BAD_IMAGE
             )
-        # A sensor's noise makes no two pictures alike. A driver that hangs repeats one, and tracker and map would then
-        # agree that the vehicle stands still.
-        stalled = self._last is not None and np.array_equal(image, self._last)
-        self._last = image
-        if stalled:
+        gray = self._tracker.working_copy(image)
+        repeat = self._pictures.look(gray)
+        if repeat in (Repeat.IDENTICAL, Repeat.OLDER):  # a stale buffer does not show where the vehicle is now
             return Odometry(
                 t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.STALLED
             )
-        motion = self._tracker.track(frame.frame_id, image)
+        motion = self._tracker.register(frame.frame_id, gray)
         return Odometry(
             t_ns=frame.t_ns,
             frame_id=frame.frame_id,
@@ -56,6 +54,7 @@ class VisionNode:
             inliers=motion.inliers,
             tracked=motion.tracked,
             becomes_keyframe=motion.becomes_keyframe,
+            static=repeat is Repeat.PREVIOUS,
             before_id=motion.before_id,
             triples=[
                 (float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in motion.triples

@@ -51,6 +51,7 @@ class _Keyframe:
     before_id: int  # its frame; meaningless where nothing was seen
     sift: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 2) px, descriptors; made when first needed
     age: int = 0
+    registered: bool = False  # it was registered to an earlier keyframe, or a later frame was registered to it
 
 
 @dataclass(frozen=True)
@@ -84,12 +85,21 @@ class FrameTracker:
         self._last_index = np.zeros(0, int)  # which corners these are
         self._misses = 0
         self._missed: _Keyframe | None = None  # the frame that failed last: the first of a new fragment, perhaps
+        self._before_fragment: _Keyframe | None = None  # last keyframe of the fragment before this one
         self._sift = cv2.SIFT.create(nfeatures=SIFT_FEATURES, enable_precise_upscale=True)
 
-    def track(self, frame_id: int, image: Image) -> Motion:
+    def working_copy(self, image: Image) -> np.ndarray:
+        """The picture that is tracked: (H, W) gray, at most WORK_WIDTH_PX wide."""
         gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self._scale < 1.0:
             gray = cv2.resize(gray, (self._camera.width, self._camera.height), interpolation=cv2.INTER_AREA)
+        return gray
+
+    def track(self, frame_id: int, image: Image) -> Motion:
+        return self.register(frame_id, self.working_copy(image))
+
+    def register(self, frame_id: int, gray: np.ndarray) -> Motion:
+        """``gray``: the ``working_copy`` of the next frame."""
         keyframe = self._keyframe
         if keyframe is None:
             return self._new_fragment(frame_id, gray)
@@ -97,16 +107,21 @@ class FrameTracker:
         index, points, tracked = self._follow(keyframe, gray)
         if self._good(keyframe.corners[index], points, tracked, MIN_INLIERS, MIN_INLIER_SHARE):
             return self._accept_tracks(keyframe, frame_id, gray, index, points, tracked)
-        # Against the keyframe by features, and if that fails against the frame that failed before this one: two that
-        # agree with each other are a new fragment, one that agrees with nobody is a foreign frame.
+        # By features: against the keyframe, against the last keyframe of the fragment before (foreign frames end, and
+        # the flight goes on where it was), and against the frame that failed before this one: two that agree with each
+        # other are a new fragment, one that agrees with nobody is a foreign frame.
         here = _Keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1, self._describe(gray))
-        for candidate in (keyframe, self._missed):
+        for candidate in (keyframe, self._before_fragment, self._missed):
             if candidate is None:
                 continue
             points_kf, points = self._match_features(candidate, here)
             inlier, matched = _homography_inliers(points_kf, points), len(points)
             points_kf, points = points_kf[inlier], points[inlier]
             if self._good(points_kf, points, matched, MIN_INLIERS_FEATURES, MIN_INLIER_SHARE_FEATURES):
+                if candidate is self._missed:
+                    self._leave_fragment()
+                elif candidate is self._before_fragment:
+                    self._before_fragment = None
                 # The KLT chain is broken; it starts again from this frame.
                 self._start_keyframe(frame_id, gray)
                 return self._said(candidate, points_kf, points, len(points), matched, due=True)
@@ -209,6 +224,9 @@ class FrameTracker:
     ) -> Motion:
         """The motion that the matches (N, 2), (N, 2) tell, ``inliers`` of ``tracked`` of which agree."""
         self._misses, self._missed = 0, None
+        for registered in (keyframe, self._keyframe):
+            if registered is not None:
+                registered.registered = True
         pick = _spread(a, MAX_PAIRS)
         return Motion(
             keyframe.frame_id,
@@ -231,8 +249,14 @@ class FrameTracker:
         self._missed = here
         return Motion(keyframe.frame_id, Verdict.FEW_INLIERS, np.zeros((0, 4)), 0.0, 0, tracked, False)
 
+    def _leave_fragment(self) -> None:
+        """The next frames are a new fragment. A keyframe that no other frame agreed with is no place to return to."""
+        if self._keyframe is not None and self._keyframe.registered:
+            self._before_fragment = self._keyframe
+
     def _new_fragment(self, frame_id: int, gray: np.ndarray) -> Motion:
         """The frame stands alone: no motion is known, later frames refer to it."""
+        self._leave_fragment()
         self._start_keyframe(frame_id, gray)
         self._misses, self._missed = 0, None
         return Motion(frame_id, Verdict.ACCEPTED, np.zeros((0, 4)), 0.0, 0, 0, True)

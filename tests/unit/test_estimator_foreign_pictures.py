@@ -1,0 +1,171 @@
+"""Pictures of another flight, and a camera that is frozen: what the estimate says while they last and afterwards."""
+
+import math
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from simulated_flight import FRAME_S, Flight, Listener, blind, cov_of, error_m, sigma_m, t_ns
+
+from terrafix.messages import MapMatch, Message, Odometry, Prediction, Verdict
+
+FIRST, END, FRAMES = 30, 42, 70  # frames of the lie, of the flight
+LATER = 9  # frames: the other flight has turned by then
+
+
+def odometry_of(messages: list[Message]) -> Odometry:
+    return next(m for m in messages if isinstance(m, Odometry))
+
+
+def without(messages: list[Message], *kinds: type[Message]) -> list[Message]:
+    return [m for m in messages if not isinstance(m, kinds)]
+
+
+def foreign(other: Flight, i: int) -> Odometry:
+    """Frame i shows ``other`` as it is LATER frames on. Two that match each other are a new fragment."""
+    said = odometry_of(other.messages(i + LATER))
+    if i == FIRST:
+        said = blind(said)
+    keyframe_id = max(said.keyframe_id - LATER, FIRST)
+    return msgspec.structs.replace(said, t_ns=t_ns(i), frame_id=i, keyframe_id=keyframe_id)
+
+
+def flown(lie: dict[int, Odometry], flight: Flight, *, fixes: bool = True) -> Listener:
+    """``lie``: odometry instead of the flight's own, in frames that find nothing on the map."""
+    listener = Listener().fly(flight, 0, FIRST)
+    for i in range(FIRST, FRAMES):
+        messages = flight.messages(i)
+        if i in lie:
+            messages = [*without(messages, Odometry, MapMatch), lie[i]]
+        elif i == END:  # its keyframe showed something else: it begins a fragment, to which later frames refer
+            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
+        listener.hear(messages if fixes else without(messages, MapMatch))
+    return listener
+
+
+def mahalanobis(listener: Listener, flight: Flight, i: int) -> float:
+    said = listener.estimate(i)
+    off = error_m(said, flight)[:2]
+    return math.sqrt(float(off @ np.linalg.solve(cov_of(said)[:2, :2], off)))
+
+
+def is_false(listener: Listener, flight: Flight, i: int) -> bool:
+    """More than 50 m and more than three sigmas off."""
+    off_m = float(np.linalg.norm(error_m(listener.estimate(i), flight)[:2]))
+    return off_m > 50.0 and mahalanobis(listener, flight, i) > 3.0
+
+
+@pytest.mark.parametrize("speed_mps", [3.0, 6.0, 12.0, 25.0, 45.0])
+def test_pictures_of_another_flight_move_nothing(speed_mps: float) -> None:
+    flight = Flight(FRAMES, seed=5)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=speed_mps, turns_rad=2.0)
+    listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    assert not any(is_false(listener, flight, i) for i in range(FIRST, FRAMES))
+    assert listener.verdicts("odometry")[FRAMES - 1].verdict is Verdict.ACCEPTED
+    assert np.linalg.norm(error_m(listener.estimate(FRAMES - 1), flight)[:2]) < 12.0
+
+
+def test_a_foreign_motion_that_cannot_be_ours_is_not_fused() -> None:
+    flight = Flight(FRAMES, seed=5)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, turns_rad=2.0)
+    listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    verdicts = listener.verdicts("odometry")
+    assert {verdicts[i].verdict for i in range(FIRST + 1, END)} <= {Verdict.UNCONFIRMED, Verdict.IMPLAUSIBLE}
+    assert max(mahalanobis(listener, flight, i) for i in range(FIRST, FRAMES)) < 3.5
+
+
+def test_pictures_that_begin_like_this_flight_and_then_turn_are_not_it() -> None:
+    """Same speed, same course, for two frames; the reported heading does not turn with them."""
+    flight = Flight(FRAMES, seed=5)
+    other = Flight(FRAMES, seed=11, turns_rad=-2.5)
+    said = {i: odometry_of(other.messages(i)) for i in range(FIRST, END)}
+    lie = {i: msgspec.structs.replace(m, keyframe_id=max(m.keyframe_id, FIRST)) for i, m in said.items()}
+    listener = flown(lie | {FIRST: blind(said[FIRST])}, flight)
+    assert max(mahalanobis(listener, flight, i) for i in range(FIRST, FRAMES)) < 3.5
+
+
+def test_foreign_motion_teaches_neither_height_nor_calibration() -> None:
+    flight = Flight(FRAMES, seed=5)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, climbs_m=60.0)
+    lied = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    dark = flown({i: blind(odometry_of(flight.messages(i))) for i in range(FIRST, END)}, flight)
+    for i in range(FIRST, END):
+        heights = [
+            np.array([m.agl_m for m in run.said if isinstance(m, Prediction) and m.frame_id == i])
+            for run in (lied, dark)
+        ]
+        assert heights[0] == pytest.approx(heights[1], abs=1.0)
+
+
+def test_a_new_fragment_that_moves_as_predicted_is_the_flight_without_any_map() -> None:
+    """Tracking was lost for three frames; what follows agrees with the velocity that was known."""
+    flight = Flight(FRAMES, seed=6)
+    begins = FIRST + 3
+    lie = {i: blind(odometry_of(flight.messages(i))) for i in range(FIRST, begins + 1)}
+    for i in range(begins + 1, FRAMES):
+        said = odometry_of(flight.messages(i))
+        lie[i] = msgspec.structs.replace(said, keyframe_id=max(said.keyframe_id, begins))
+    # Pairs refer to the keyframe that they were seen from: those of an older one are not the new fragment's.
+    lie = {i: m for i, m in lie.items() if m.verdict is not Verdict.ACCEPTED or m.keyframe_id >= begins}
+    listener = flown({i: m for i, m in lie.items() if i < begins + 4}, flight, fixes=False)
+    verdicts = listener.verdicts("odometry")
+    assert verdicts[FRAMES - 1].verdict is Verdict.ACCEPTED
+    assert mahalanobis(listener, flight, FRAMES - 1) < 3.5
+
+
+def test_the_anchor_follows_what_pictures_show_and_returns_to_the_flight_afterwards() -> None:
+    flight = Flight(FRAMES, seed=5)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=25.0, turns_rad=2.0)
+    listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    steps = {m.frame_id: np.array(m.step_m) for m in listener.said if isinstance(m, Prediction)}
+    theirs_m = np.linalg.norm(np.diff(other.p_m[FIRST + LATER : END + LATER, :2], axis=0), axis=1).sum()
+    assert sum(np.linalg.norm(steps[i]) for i in range(FIRST + 1, END)) == pytest.approx(theirs_m, rel=0.1)
+    ours = (flight.p_m[END + 3] - flight.p_m[FIRST - 1])[:2]
+    assert np.linalg.norm(sum(steps[i] for i in range(FIRST, END + 4)) - ours) < 40.0  # dead reckoning of six seconds
+
+
+def frozen(flight: Flight, i: int) -> Odometry:
+    """The picture of frame FIRST - 1 again: every ray is where it was."""
+    said = odometry_of(flight.messages(FIRST - 1))
+    pairs = [(x, y, x, y) for x, y, _, _ in said.pairs]
+    return msgspec.structs.replace(
+        said, t_ns=t_ns(i), frame_id=i, keyframe_id=FIRST - 1, pairs=pairs, becomes_keyframe=False, static=True
+    )
+
+
+def test_a_frozen_camera_is_not_a_vehicle_that_stands() -> None:
+    flight = Flight(FRAMES, seed=7)
+    # The picture before the lie is a keyframe of its own.
+    listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
+    verdicts = listener.verdicts("odometry")
+    assert all(verdicts[i].verdict is Verdict.STALLED for i in range(FIRST, END))
+    assert max(mahalanobis(listener, flight, i) for i in range(FIRST, FRAMES)) < 3.5
+    way_m = np.linalg.norm((flight.p_m[END - 1] - flight.p_m[FIRST - 1])[:2])
+    assert np.linalg.norm(error_m(listener.estimate(END - 1), flight)[:2]) < 0.5 * way_m
+
+
+def test_a_frozen_picture_is_not_shown_to_the_anchor() -> None:
+    flight = Flight(FRAMES, seed=7)
+    listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
+    predicted = {m.frame_id for m in listener.said if isinstance(m, Prediction)}
+    assert not predicted & set(range(FIRST, END))
+    assert predicted >= {FIRST - 1, *range(END, FRAMES)}
+
+
+def test_velocity_that_odometry_contradicts_for_seconds_is_given_up() -> None:
+    """Nothing tells which of the two is wrong, so the claim must hold for both."""
+    flight = Flight(FRAMES, seed=8)
+    listener = Listener().fly(flight, 0, FIRST)
+    jumped = replace(flight, seed=8, speed_mps=75.0)
+    first_refused = None
+    for i in range(FIRST, FRAMES):
+        said = odometry_of(jumped.messages(i))
+        listener.hear([*without(flight.messages(i), Odometry, MapMatch), said])
+        verdict = listener.verdicts("odometry")[i].verdict
+        if verdict is Verdict.IMPLAUSIBLE and first_refused is None:
+            first_refused = i
+        if first_refused is not None and (i - first_refused) * FRAME_S > 6.0:
+            assert sigma_m(listener.estimate(i)) > 15.0
+            return
+    pytest.fail("odometry of 75 m/s was taken for this flight's at once")

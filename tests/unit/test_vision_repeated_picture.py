@@ -1,0 +1,81 @@
+"""Pictures that repeat an earlier one are recognised through sensor noise, and pictures that move are not."""
+
+import cv2
+import numpy as np
+import pytest
+
+from terrafix.vision.repeated_picture import HISTORY, SAME_PX, WIDTH_PX, PictureHistory, Repeat, same_view
+
+SIDE = 720
+
+
+def ground(seed: int) -> np.ndarray:
+    """(SIDE, 2 SIDE) uint8 with detail of all sizes."""
+    rng = np.random.default_rng(seed)
+    image = sum(
+        cv2.resize(rng.normal(0.0, 12.0, (SIDE // cell, 2 * SIDE // cell)), (2 * SIDE, SIDE)) for cell in (4, 12, 40)
+    )
+    return np.clip(128.0 + image, 0, 255).astype(np.uint8)
+
+
+def noisy(image: np.ndarray, seed: int, sigma: float = 3.0) -> np.ndarray:
+    return np.clip(image + np.random.default_rng(seed).normal(0.0, sigma, image.shape), 0, 255).astype(np.uint8)
+
+
+def view(image: np.ndarray, x_px: float, y_px: float = 0.0) -> np.ndarray:
+    """(480, 720): a window of the ground."""
+    return cv2.warpAffine(image, np.array([[1.0, 0.0, -x_px], [0.0, 1.0, -y_px]]), (720, 480), flags=cv2.INTER_CUBIC)
+
+
+def looks(pictures: list[np.ndarray]) -> list[Repeat]:
+    history = PictureHistory()
+    return [history.look(picture) for picture in pictures]
+
+
+def test_new_noise_on_the_same_picture_is_the_same_view() -> None:
+    still = view(ground(1), 10.0)
+    assert looks([noisy(still, i) for i in range(6)]) == [Repeat.NONE] + [Repeat.PREVIOUS] * 5
+
+
+def test_the_same_pixels_are_identical() -> None:
+    still = view(ground(1), 10.0)
+    assert looks([still, still.copy()]) == [Repeat.NONE, Repeat.IDENTICAL]
+
+
+def test_stale_buffers_in_turn_are_recognised_from_the_first_one_on() -> None:
+    place = ground(2)
+    flown = [noisy(view(place, 6.0 * i), i) for i in range(8)]
+    cycled = [noisy(view(place, 6.0 * (4 + i % 4)), 100 + i) for i in range(8)]
+    said = looks(flown + cycled)
+    assert said[:8] == [Repeat.NONE] * 8
+    assert said[8:] == [Repeat.OLDER] * 8
+
+
+@pytest.mark.parametrize("away", [(4.0 * SAME_PX, 0.0), (0.0, 4.0 * SAME_PX), (0.5, 0.5), (3.0, 0.0), (40.0, 0.0)])
+def test_a_view_that_moved_is_another_one(away: tuple[float, float]) -> None:
+    """``away`` in pixels of the copies that are compared, of which two of these pictures' make one."""
+    place, factor = ground(3), 720 / WIDTH_PX
+    moved = view(place, 20.0 + factor * away[0], factor * away[1])
+    assert looks([noisy(view(place, 20.0), 1), noisy(moved, 2)]) == [Repeat.NONE, Repeat.NONE]
+
+
+def test_a_turn_about_the_middle_is_motion_though_the_mean_displacement_is_none() -> None:
+    still = view(ground(4), 10.0)
+    turn = cv2.getRotationMatrix2D((359.5, 239.5), 0.1, 1.0)
+    assert not same_view(cv2.resize(still, (360, 240)), cv2.resize(cv2.warpAffine(still, turn, (720, 480)), (360, 240)))
+
+
+def test_unrelated_pictures_are_not_the_same_view() -> None:
+    assert looks([noisy(view(ground(i), 0.0), i) for i in range(12)]) == [Repeat.NONE] * 12
+
+
+def test_black_pictures_show_no_displacement() -> None:
+    black = np.full((480, 720), 8, np.uint8)
+    assert looks([noisy(black, i) for i in range(3)]) == [Repeat.NONE] * 3
+
+
+def test_a_picture_older_than_the_history_is_new_ground_again() -> None:
+    place = ground(5)
+    flown = [noisy(view(place, 4.0 * i), i) for i in range(HISTORY + 2)]
+    assert looks([*flown, noisy(view(place, 0.0), 99)])[-1] is Repeat.NONE
+    assert looks([*flown[:HISTORY], noisy(view(place, 0.0), 99)])[-1] is Repeat.OLDER
