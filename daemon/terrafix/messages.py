@@ -229,6 +229,9 @@ class MapMatch(Message, frozen=True, kw_only=True):
     mode_mass: float = 0.0  # share of the belief that sits in the winning mode, 0..1
     mode_e_m: float = 0.0  # centre of the winning mode
     mode_n_m: float = 0.0
+    # The heaviest modes of the belief: east, north [m], share of the mass, variance within the mode per axis [m^2]
+    modes: list[tuple[float, float, float, float]] = []
+    belief_m: Vec2 = (0.0, 0.0)  # mean of the whole belief, east and north
     belief_cov_m2: Mat2 = (0.0, 0.0, 0.0, 0.0)  # of the whole belief, all modes
     ground: Vec3 | None = (
         None  # plane of the ground below, from the map's DEM: AMSL at p_c_in_w_m, slope east, slope north

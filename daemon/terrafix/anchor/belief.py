@@ -167,6 +167,12 @@ class Belief:
         en = -float((axis - mean_n) @ self._mass @ (axis - mean_e))
         return float(p_e @ (axis - mean_e) ** 2), en, float(p_n @ (axis - mean_n) ** 2)
 
+    @property
+    def mean(self) -> tuple[float, float]:
+        """East and north of the whole belief, all modes."""
+        axis = np.arange(len(self._mass)) * self.cell_m
+        return self._e0 + float(self._mass.sum(0) @ axis), self._n0 - float(self._mass.sum(1) @ axis)
+
     def fit_window(self, at_least_half_m: float) -> None:
         """Window around the mean, as wide as the belief needs."""
         ee, _, nn = self.covariance()

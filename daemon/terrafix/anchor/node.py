@@ -47,6 +47,7 @@ MIN_LOOK = 0.08  # a look at the same ground again still says this much
 MODE_MASS = 0.9  # the belief hands a fix to the graph when one mode holds this much
 # A pose on which many patches agree is evidence of its own: found at most right places, at hardly any wrong one.
 POSE_LIKELIHOOD_RATIO = 20.0
+MODES_SAID = 2  # the best place and its best rival
 MODE_TRIED = 0.5  # modes below this are not tried at all
 COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in this very frame
 MIN_AGL_M = 30.0  # below this a frame shows a few roofs and cars
@@ -218,7 +219,8 @@ class AnchorNode:
             return msgspec.structs.replace(answer, verdict=look.verdict)
         self._since_look_m = 0.0
         gain = belief.update(look.surfaces, weight)
-        mode = belief.mode()
+        modes = belief.modes(MODES_SAID)
+        mode = modes[0]
         hypothesis, score = look.best_at(mode.e_m, mode.n_m)
         self._widen(belief, score, weight)
         ee, en, nn = belief.covariance()
@@ -228,6 +230,8 @@ class AnchorNode:
             mode_mass=mode.mass,
             mode_e_m=mode.e_m,
             mode_n_m=mode.n_m,
+            modes=[(m.e_m, m.n_m, m.mass, m.var_m2) for m in modes],
+            belief_m=belief.mean,
             belief_cov_m2=(ee, en, en, nn),
         )
         # Without a heading the belief spreads as fast as frames narrow it, until a pose tells the heading.
@@ -261,9 +265,10 @@ class AnchorNode:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
         if answer.verdict is Verdict.ACCEPTED:
             belief.confirm(mode, likelihood_ratio)
-            mass = belief.mode().mass
-            enough = Verdict.ACCEPTED if mass >= MODE_MASS else Verdict.AMBIGUOUS
-            return msgspec.structs.replace(answer, verdict=enough, mode_mass=mass)
+            modes = belief.modes(MODES_SAID)
+            said = [(m.e_m, m.n_m, m.mass, m.var_m2) for m in modes]
+            enough = Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS
+            return msgspec.structs.replace(answer, verdict=enough, mode_mass=modes[0].mass, modes=said)
         if mode.mass < MODE_MASS:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
         if score < COARSE_SCORE:

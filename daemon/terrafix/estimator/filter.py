@@ -12,13 +12,13 @@ import numpy as np
 from terrafix.core.gate import GATE
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.agreement import Agreement
-from terrafix.estimator.doubt import Doubt
 from terrafix.estimator.factors import HEIGHT
 from terrafix.estimator.graph import NodeState
 from terrafix.estimator.integrity.fragments import Fragment, MapHits
+from terrafix.estimator.integrity.other_place import AGREEING, OtherPlace
+from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.matched import determined, measured_pose, moved_by_lens, straightened_pose
 from terrafix.estimator.resume import Known
-from terrafix.estimator.rival import AGREEING, Rival
 from terrafix.estimator.seen_ground import SeenGround
 from terrafix.estimator.telemetry import Attitude
 from terrafix.estimator.tracker import STEP_SHARE, Advance, Feel, Tracker, nothing_felt
@@ -47,8 +47,7 @@ class FixResult:
 class Estimator(Tracker):
     def __init__(self, origin: Origin, known: Known | None = None) -> None:
         super().__init__(origin, known)
-        self.doubt = Doubt.of(origin)
-        self.rival = Rival()
+        self.hypotheses = PositionHypotheses(origin)
         self.map_sigma_m = 0.0  # of the map that placed us; nothing until it did
         self._torn: dict[int, np.ndarray] = {}  # frame -> spread (2, 2) of the two places between which it was
         self._seen = SeenGround()
@@ -61,8 +60,8 @@ class Estimator(Tracker):
         self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude, felt: Feel = nothing_felt
     ) -> Advance:
         advance = super().advance(frame_id, t_s, odometry, attitude, felt)
-        if self.rival.probability > 0.0:  # for the refinement, which cannot tell right from wrong either
-            self._torn[frame_id] = self.rival.spread_m2()
+        if self.hypotheses.other.probability > 0.0:  # for the refinement, which cannot tell right from wrong either
+            self._torn[frame_id] = self.hypotheses.other.spread_m2()
         return advance
 
     def fix(self, match: MapMatch) -> FixResult:
@@ -73,7 +72,9 @@ class Estimator(Tracker):
         if match.found or match.t_ns >= self._heard_ns:  # of ground and belief the newest frame says most, or a search
             self._heard_ns = max(match.t_ns, self._heard_ns)
             self.terrain.hear(match, None if node is None else self.graph.state(node).pose.translation())
-            lost = self.doubt.hear(match)
+            lost = self.hypotheses.hear(match)
+            if node is not None and match.modes:
+                self._weigh(match, node)
             if lost:
                 return FixResult(Verdict.LOST, None, lost)
         if node is not None and (match.coarse or match.verdict in NOTHING_FOUND):
@@ -90,7 +91,7 @@ class Estimator(Tracker):
         r_w_c = measured.rotation().matrix()
         height = max(float(measured.translation()[2]) - self.terrain.ground_m, 1.0)
         if match.found:  # by a search, over several frames: it outweighs whatever the graph believes
-            self.rival = Rival()
+            self.hypotheses.other = OtherPlace()
             return self._restart(match, node, measured, cov, "found")
         if self._open is not None:
             if match.coarse:  # its heading is one of those that were tried
@@ -119,7 +120,7 @@ class Estimator(Tracker):
             self.terrain.ruggedness.measured(here, height, float(up_m - measured.translation()[2]), sigma_m)
         fixed_s = self.graph.time_of(node)
         if not match.coarse and self._seen.newest_s is not None:
-            self.rival.fade(self._seen.new_m(fixed_s, here, math.inf) / height)
+            self.hypotheses.other.fade(self._seen.new_m(fixed_s, here, math.inf) / height)
         new = self._seen.share(fixed_s, here, height)
         self.graph.add_pose(node, seen, seen_cov / new, by_lens, match.lens)
         if self.mode is CovarianceMode.JACOBIAN:
@@ -128,6 +129,13 @@ class Estimator(Tracker):
             self._map_hits.looked(self._fragments.of(node), found=True)
         self._accepted(match, fixed_s, here)
         return FixResult(Verdict.ACCEPTED, d2, f"new ground {new:.2f}")
+
+    def _weigh(self, match: MapMatch, node: int) -> None:
+        """The belief's modes against the estimate of the same frame."""
+        placed = self._placed(match.frame_id, self.graph.time_of(node), node)
+        p_m = np.asarray(placed.pose.translation())
+        height_m = max(float(p_m[2]) - self.terrain.ground_m, 1.0)
+        self.hypotheses.weigh(match, p_m, tangent_to_world(placed.cov, placed.pose.rotation().matrix()), height_m)
 
     def through_lens(
         self, match: MapMatch, seen: gtsam.Pose3, cov: np.ndarray
@@ -148,7 +156,7 @@ class Estimator(Tracker):
         self._seen.add(t_s, here)
         self._seen_s = max(self._seen_s, t_s)
         self.last_fix_s = self._seen.newest_s
-        self.doubt.start_m = 0.0
+        self.hypotheses.confirmed()
         self.map_sigma_m = match.map_sigma_m
         assert self._last is not None
         self._last = self._placed(self._last.frame_id, self._last.t_s, self.graph.newest)
@@ -164,15 +172,15 @@ class Estimator(Tracker):
         # A pose stands on patches of its own frame. A coarse one says what the belief remembers: one look that went
         # astray is in all that follow. Where nothing is in doubt they count against the graph when they would find a
         # position without it; where another place has spoken already they are more of what speaks for it.
-        sure = self.rival.probability == 0.0
+        sure = self.hypotheses.other.probability == 0.0
         found = row.holds(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height)
         if found or (row.poses if sure else len(row.offsets_m)) >= AGREEING:
-            self.rival.disagreed(row.offsets_m, apart, fixed=self.last_fix_s is not None)
+            self.hypotheses.other.disagreed(row.offsets_m, apart, fixed=self.last_fix_s is not None)
             # Before the first fix only the start coordinate speaks for the graph: as much as one such pose against it.
             first = self.last_fix_s is None and match.inliers >= OUTWEIGHS_START
             needed = (AGREEING, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
             if (found or row.holds(*needed, poses=sure)) and match.mode_mass >= RECOVER_MASS:
-                self.rival.left(offset, apart)
+                self.hypotheses.other.left(offset, apart)
                 return self._restart(match, node, measured, cov, "restarted")
         return FixResult(Verdict.INNOVATION, d2, f"{float(np.hypot(*offset)):.0f} m from the estimate")
 
@@ -202,7 +210,7 @@ class Estimator(Tracker):
         self._is_frame(self.graph.newest, self._last.frame_id, Fragment(now_s, joined=True))
         self._cov_of.clear()
         self._refused.clear()
-        self.doubt = Doubt()
+        self.hypotheses.moved()
         self._seen = SeenGround()
         self._accepted(match, fixed_s, measured.translation()[:2])
         return FixResult(Verdict.ACCEPTED, None, f"{how} {float(np.hypot(*offset)):.0f} m away")

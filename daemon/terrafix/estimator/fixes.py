@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from terrafix.estimator.agreement import AGREE_M
-from terrafix.estimator.rival import Rival
+from terrafix.estimator.integrity.other_place import OtherPlace
 from terrafix.estimator.seen_ground import SeenGround
 from terrafix.estimator.whole import Fix, Retold
 
@@ -55,8 +55,8 @@ def torn(
         for outside, at in sides:
             offsets = [(fixes[i].pose.translation() - poses[fixes[i].node].translation())[:2] for i in outside]
             middle = np.median(offsets, axis=0) if offsets else np.zeros(2)
-            rival = Rival()
+            other = OtherPlace()
             # What all of them together say of the offset is far less off than they are apart.
-            rival.disagreed([o for o in offsets if np.hypot(*(o - middle)) <= AGREE_M], np.zeros((2, 2)), fixed=True)
-            if rival.probability > 0.0:
-                yield at, rival.spread_m2()
+            other.disagreed([o for o in offsets if np.hypot(*(o - middle)) <= AGREE_M], np.zeros((2, 2)), fixed=True)
+            if other.probability > 0.0:
+                yield at, other.spread_m2()

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
@@ -11,6 +13,7 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.core.start import begun
 from terrafix.estimator.coasted import Coast
 from terrafix.estimator.filter import Estimator
+from terrafix.estimator.integrity.time_offset import TimeOffset
 from terrafix.estimator.resume import Keeper, Known, Last, kept
 from terrafix.estimator.righted import Righted
 from terrafix.estimator.stand_in import StandIn
@@ -66,6 +69,7 @@ class EstimatorNode:
         self._said_slow_ns = 0
         self._waiting: list[Odometry] = []  # for the autopilot's words, to which belongs what was learnt
         self._stand_in: StandIn | None = None  # for a keyframe that was left out
+        self._time_offset = TimeOffset()
         self._predicted: int | None = None  # frame of the newest Prediction ...
         self._from_m = np.zeros(2)  # ... and where it was, with its map match
 
@@ -163,6 +167,11 @@ class EstimatorNode:
         if estimator is None:
             return
         origin = estimator.origin
+        stamp_ns, last = odometry.t_ns, estimator.last
+        self._time_offset.step(0.0 if last is None else odometry.t_ns * 1e-9 - last.t_s)
+        if self._time_offset.applied_s:
+            t_ns = stamp_ns - round(self._time_offset.applied_s * 1e9)
+            odometry = msgspec.structs.replace(odometry, t_ns=t_ns)
         sigmas_rad = math.radians(origin.attitude_sigma_deg), math.radians(origin.yaw_sigma_deg)
         attitude = self._attitude = self._righted.look(odometry.t_ns, *sigmas_rad)
         if self._starts and self._start is not None:
@@ -174,6 +183,10 @@ class EstimatorNode:
             self._from_m = np.array(before.pose.translation()[:2])
         advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, self._righted.felt)
         self._tracked = advance.verdict is Verdict.ACCEPTED
+        if advance.turn is not None:
+            late_ns = stamp_ns - odometry.t_ns
+            stamps = replace(advance.turn, t0_ns=advance.turn.t0_ns + late_ns, t1_ns=stamp_ns)
+            self._time_offset.add(stamps, self._telemetry)
         yield _odometry_verdict(odometry, advance.verdict)
         for name, verdict in (("attitude", advance.heading), ("height", advance.height)):
             if verdict is not Verdict.ACCEPTED:
@@ -224,6 +237,7 @@ class EstimatorNode:
             yield MeasurementVerdict(t_ns=match.t_ns, frame_id=match.frame_id, measurement="map", verdict=Verdict.STALE)
             return
         estimator.mode = self._mode
+        were_several = estimator.hypotheses.are_several
         result = estimator.fix(match)
         yield MeasurementVerdict(
             t_ns=match.t_ns,
@@ -233,8 +247,8 @@ class EstimatorNode:
             detail=result.detail,
             mahalanobis2=result.mahalanobis2,
         )
-        torn = result.verdict is Verdict.INNOVATION and estimator.rival.probability > 0.0
-        if (torn or result.verdict in (Verdict.ACCEPTED, Verdict.LOST)) and estimator.last is not None:
+        several = were_several or estimator.hypotheses.are_several
+        if (several or result.verdict in (Verdict.ACCEPTED, Verdict.LOST)) and estimator.last is not None:
             own = match.frame_id == estimator.last.frame_id  # an older frame's match does not see this one's motion
             self._tracked = self._tracked or (own and result.verdict is Verdict.ACCEPTED)
             yield self._estimate(estimator.last, match.t_ns)
@@ -272,18 +286,19 @@ class EstimatorNode:
         aside_m, aside_cov = estimator.middle.aside(estimator.lever(placed.pose))
         cov[:2, :2] += aside_cov
         cov[3:5, 3:5] += estimator.camera.body_sigma_rad**2 * np.eye(2)
-        cov = estimator.rival.added(estimator.doubt.added(cov))
+        v = placed.velocity_mps
+        cov[:3, :3] += self._time_offset.sigma_s**2 * np.outer(v, v)
+        other_m, cov = estimator.hypotheses.claim(cov)
         alt_amsl_m, more_m = estimator.amsl(placed)
         stretch, _ = estimator.stretch(placed.node)
         cov[2, 2] += more_m**2
-        lat_deg, lon_deg = frame.to_wgs84(float(p[0] + aside_m[0]), float(p[1] + aside_m[1]))
+        lat_deg, lon_deg = frame.to_wgs84(*(p[:2] + aside_m + other_m).tolist())
         age_ms = -1
         if estimator.last_fix_s is not None:
             age_ms = max(0, round((placed.t_s - estimator.last_fix_s) * 1e3))
         label = SourceLabel.VISUAL_PROPAGATED if self._tracked else SourceLabel.DEAD_RECKONED
         if self._tracked and 0 <= age_ms <= ANCHORED_FOR_S * 1e3:
             label = SourceLabel.SATELLITE_ANCHORED
-        v = placed.velocity_mps
         return NavEstimate(
             t_ns=round(placed.t_s * 1e9),
             frame_id=placed.frame_id,

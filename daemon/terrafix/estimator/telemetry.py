@@ -105,6 +105,18 @@ class Telemetry:
         unfelt_s = max(0.0, (t1_ns - int(t_f[-1])) * 1e-9)
         return Felt((t - t0_ns) * 1e-9, accel, yaw, float(np.sqrt(scatter * spacing_s)), unfelt_s)
 
+    @property
+    def newest_turn_ns(self) -> int:
+        """Time of the newest whole attitude; -1: there was none."""
+        return self._turns.newest_ns
+
+    def yaw_at(self, t_ns: np.ndarray) -> np.ndarray | None:
+        """Reported heading (N,) at times (N,), unwrapped; None where attitudes do not cover them."""
+        turns = self._turns.around(int(t_ns.min()), int(t_ns.max()))
+        if turns is None or turns[0][0] > t_ns.min() or turns[0][-1] < t_ns.max():
+            return None
+        return np.interp(t_ns, turns[0], _unwrapped(turns[1])[0])
+
     def turned_otherwise(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
         """The turn (3,) about east, north and up by which the attitude turned from ``t0_ns`` to ``t1_ns`` and
         gyroscopes did not, and by how much these turned at all [rad]; None when readings or attitudes do not cover
@@ -152,6 +164,10 @@ class _Series:
         if len(self._t_ns) > 2 * self._kept:
             for column in (self._t_ns, *self._axes):
                 del column[: -self._kept]
+
+    @property
+    def newest_ns(self) -> int:
+        return self._t_ns[-1] if self._t_ns else -1
 
     def around(self, t0_ns: int, t1_ns: int) -> Timed | None:
         """Times (N,) and values (3, N) from the last one before ``t0_ns`` to the first one after ``t1_ns``."""

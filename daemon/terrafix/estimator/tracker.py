@@ -18,6 +18,7 @@ from terrafix.estimator.heading import OpenHeading
 from terrafix.estimator.integrity.fragments import Fragment, Fragments, MotionEvidence
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture
+from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.lens import lens_sigma
 from terrafix.estimator.middle import Middle
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
@@ -109,6 +110,7 @@ class Advance:
     step_sigma_m: float
     heading: Verdict = Verdict.ACCEPTED  # what became of what was told, if it was
     height: Verdict = Verdict.ACCEPTED
+    turn: Turn | None = None  # since the frame before, by pictures
 
 
 class Tracker:
@@ -147,6 +149,7 @@ class Tracker:
         self._fragments = Fragments()
         self._fragment = Fragment(0.0, joined=True)  # of the newest frame
         self._static_picture = StaticPicture()
+        self._heading_seen: tuple[int, int, float] | None = None  # time, keyframe, heading since it: the newest frame
         self._motion_refused_s: float | None = None  # time of the first of the motions in a row that were impossible
 
     @property
@@ -213,6 +216,7 @@ class Tracker:
         newest = self.graph.newest
         before, dt_s = self.graph.state(newest), max(t_s - self.graph.time_of(newest), 1e-3)
         sighting = self._sighting(odometry, t_s, before, attitude, felt)
+        turn = self._turn(odometry, sighting)
         verdict, known = sighting.verdict, sighting.fused
         heading = Verdict.ACCEPTED
         if known is not None and self._cannot_head_so(attitude, known, before):
@@ -301,7 +305,7 @@ class Tracker:
             self._seen_s = t_s
             self._pace.seen(t_s, self._last.velocity_mps, self._last.velocity_cov)
             self._learn_wind(self._last, attitude)
-        return Advance(verdict, self._last, step, step_sigma, heading, height)
+        return Advance(verdict, self._last, step, step_sigma, heading, height, turn)
 
     def _sighting(self, odometry: Odometry, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Sighting:
         """``before``: the newest node."""
@@ -332,6 +336,21 @@ class Tracker:
         verdict = Verdict.ACCEPTED if fragment.joined else Verdict.UNCONFIRMED
         fragment.moved_m = in_fragment_m
         return Sighting(verdict, answer, fragment, local_step_m)
+
+    def _turn(self, odometry: Odometry, sighting: Sighting) -> Turn | None:
+        """Since the frame before, when both were seen from one keyframe, or that frame is the keyframe."""
+        before, self._heading_seen = self._heading_seen, None
+        if sighting.motion is None:
+            return None
+        parent, motion = sighting.motion
+        r_w_kf = self.graph.state(parent).pose.rotation().matrix()
+        since_rad = self.camera.yaw_rad(r_w_kf @ motion.r) - self.camera.yaw_rad(r_w_kf)
+        self._heading_seen = (odometry.t_ns, odometry.keyframe_id, since_rad)
+        if before is not None and before[1] == odometry.keyframe_id:
+            return Turn(before[0], odometry.t_ns, math.remainder(since_rad - before[2], math.tau))
+        if before is not None and parent == self.graph.newest:
+            return Turn(before[0], odometry.t_ns, math.remainder(since_rad, math.tau))
+        return None
 
     def _motion_innovation(
         self,

@@ -186,7 +186,7 @@ class Storyteller(EstimatorNode):
         flight = self.flights[-1]
         node = flight.node_of.get(match.frame_id)
         if node is not None:
-            flight.doubt_m[node] = estimator.doubt.sigma_m
+            flight.doubt_m[node] = estimator.hypotheses.anywhere_m
         if node is None or match.verdict is not Verdict.ACCEPTED or not determined(match):
             said = match.verdict if match.verdict is not Verdict.ACCEPTED else Verdict.STALE
             flight.refused[str(said)] = flight.refused.get(str(said), 0) + 1

@@ -15,18 +15,22 @@ AGREEING = 2  # refused matches in a row that agree with each other: one alone i
 EVEN = 0.5  # probability of the other place when nothing is known but that the two disagree
 FORGET_OVER = 5.0  # of the height: so far flies a repeating pattern, and so far the other place fades to a third ...
 TOLD_LASTS = 2.0  # ... or so much farther, if the map had told it before: a plane crosses long rows at any height
+# A start coordinate is no pattern that repeats: one in 400 is wrong by far more than it claims (anchor/lost.py), and
+# three poses that agree with each other say more against it, and a quarter of a height is new ground for one.
+START_LASTS = 0.05
 FORGOTTEN = 0.01
 REACHED = 1 / 9  # from this probability on three sigmas reach the other place
 
 
 @dataclass
-class Rival:
+class OtherPlace:
     """``offset_m`` (2,): from the estimate to the other place, known to ``cov_m2`` (2, 2)."""
 
     offset_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     cov_m2: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))
     _repeats: float = 0.0  # probability that a pattern is as long as the way over which the map has spoken for us
     _two: bool = False  # ... and that it takes two of them
+    _is_start: bool = False  # the other place is the start, which no map match has ever borne out
     _before_m: np.ndarray | None = None  # from the estimate to where the map had it before; None: nowhere, or in doubt
 
     @property
@@ -41,6 +45,7 @@ class Rival:
             return
         if self._repeats == 0.0:
             self._before_m = np.zeros(2) if fixed else None
+        self._is_start = not fixed
         self._is_at(np.mean(offsets_m, axis=0), cov_m2)
 
     def left(self, offset_m: np.ndarray, cov_m2: np.ndarray) -> None:
@@ -55,7 +60,8 @@ class Rival:
     def fade(self, new_heights: float) -> None:
         """A match agreed with the estimate over new ground, in heights flown since the last one."""
         self._two = self._was_at(np.zeros(2))
-        over = FORGET_OVER * (TOLD_LASTS if self._was_at(self.offset_m) else 1.0)
+        lasts = TOLD_LASTS if self._was_at(self.offset_m) else START_LASTS if self._is_start else 1.0
+        over = FORGET_OVER * lasts
         self._repeats *= float(np.exp(-new_heights / over))
         if self.probability < FORGOTTEN:
             self._repeats = 0.0
@@ -66,12 +72,6 @@ class Rival:
             return False
         off_m = float(np.hypot(*(self._before_m - offset_m)))
         return off_m <= min(AGREE_M, 0.5 * float(np.hypot(*self.offset_m)))
-
-    def added(self, cov: np.ndarray) -> np.ndarray:
-        """``cov`` (6, 6), east and north first, with the spread of the two places."""
-        cov = cov.copy()
-        cov[:2, :2] += self.spread_m2()
-        return cov
 
     def spread_m2(self) -> np.ndarray:
         """(2, 2) of the two places about the estimate.

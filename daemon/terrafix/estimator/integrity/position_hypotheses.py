@@ -1,0 +1,111 @@
+"""Where the vehicle may be, as one mixture: where the graph has it, other places that the map speaks for, anywhere.
+
+What is published is the heaviest component, with the second moments of the mixture about it: the mean of two places
+would be neither of them (Gaussian sum filter: Alspach and Sorenson 1972)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafix.core.gate import GATE
+from terrafix.core.start import SEARCHED_START_M
+from terrafix.estimator.integrity.other_place import OtherPlace
+from terrafix.messages import MapMatch, Origin, Verdict
+
+# A component of less than this weight is left out: a 95 % ellipse about the others is one without it.
+LEAST_WEIGHT = 0.05
+# Of the height: with a position that is known better, poses have placed the graph. A mode of the belief elsewhere
+# widens the claim then and does not move it: a pose on the other place is what it takes to leave.
+PLACED = 0.15
+# What a mode is believed at most without a pose in it: of eight over wide beliefs, with up to 0.97 of the mass, one was
+# the wrong place.
+MOST_WEIGHT = 0.8
+MODE_SIGMA = 0.03  # of the height: buildings that lean shift a whole picture (anchor/answer.py)
+
+
+@dataclass(frozen=True)
+class Component:
+    """``offset_m`` (2,): from the estimate, east and north; ``cov_m2`` (2, 2) of the place; ``weight`` 0..1."""
+
+    offset_m: np.ndarray
+    cov_m2: np.ndarray
+    weight: float
+
+    def about(self, at_m: np.ndarray) -> np.ndarray:
+        """Second moments (2, 2) about a place."""
+        return np.asarray(self.cov_m2 + np.outer(self.offset_m - at_m, self.offset_m - at_m))
+
+
+class PositionHypotheses:
+    """``anywhere_m``: 1-sigma per horizontal axis of "the place may be wrong", its probability counted in. ``other``:
+    the place that map matches in a row speak for, against the graph."""
+
+    def __init__(self, origin: Origin | None = None) -> None:
+        """``origin``: of a flight that begins. A start that is searched is all doubt: as a prior so wide it would make
+        the graph ill-conditioned."""
+        searched = origin is not None and origin.start_sigma_m > SEARCHED_START_M
+        self._start_m = origin.start_sigma_m if origin is not None and searched else 0.0
+        self.anywhere_m = 0.0
+        self.other = OtherPlace()
+        self._modes: tuple[Component, ...] = ()  # of the belief, heaviest first
+        self._belief: Component | None = None  # all of it, while no pose has placed the graph
+
+    @property
+    def are_several(self) -> bool:
+        return bool(self._modes) or self._belief is not None or self.other.probability > 0.0
+
+    def hear(self, match: MapMatch) -> str:
+        """-> what to say of a match whose verdict is LOST; empty for any other."""
+        self.anywhere_m = match.lost_sigma_m
+        return f"lost; search: {match.step.value}" if match.verdict is Verdict.LOST else ""
+
+    def weigh(self, match: MapMatch, p_m: np.ndarray, cov: np.ndarray, height_m: float) -> None:
+        """The anchor's belief against the estimate of that frame: ``p_m`` (3,) with ``cov`` (6, 6), world axes. Where
+        poses have placed the graph, a mode that is as near as both claim is the estimate's own place; else the belief,
+        whose prior the estimate was, knows the place better than that."""
+        lever_m2 = height_m**2 * np.diag([cov[4, 4], cov[3, 3]])  # of a place that is seen, by tilt
+        placed = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1])) < PLACED * height_m
+        modes = []
+        for e_m, n_m, mass, var_m2 in match.modes:
+            cov_m2 = (var_m2 + (MODE_SIGMA * height_m) ** 2) * np.eye(2) + lever_m2
+            mode = Component(np.array([e_m, n_m]) - p_m[:2], cov_m2, mass)
+            apart_m2 = cov[:2, :2] + lever_m2 + cov_m2
+            own = placed and float(mode.offset_m @ np.linalg.solve(apart_m2, mode.offset_m)) <= GATE[2]
+            if mass >= LEAST_WEIGHT and not own:
+                modes.append(mode)
+        self._modes = tuple(sorted(modes, key=lambda mode: -mode.weight))
+        belief_m2 = np.array(match.belief_cov_m2).reshape(2, 2) + lever_m2
+        self._belief = None if placed else Component(np.array(match.belief_m) - p_m[:2], belief_m2, 1.0)
+
+    def confirmed(self) -> None:
+        """A map match agreed with the estimate."""
+        self._start_m, self._modes, self._belief = 0.0, (), None
+
+    def moved(self) -> None:
+        """The graph has begun anew where the map has it."""
+        self.confirmed()
+        self.anywhere_m = 0.0
+
+    def claim(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """-> by how much (2,) what is published is off the estimate, and its covariance (6, 6), from that of the
+        estimate, east and north first."""
+        cov = cov.copy()
+        at_m, cov[:2, :2] = self._of_belief(cov[:2, :2]) if self._belief else self._of_modes(cov[:2, :2])
+        cov[:2, :2] += self.other.spread_m2() + max(self.anywhere_m, self._start_m) ** 2 * np.eye(2)
+        return at_m, cov
+
+    def _of_modes(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The estimate, known to ``own_m2`` (2, 2), and the places that the belief has elsewhere."""
+        own = Component(np.zeros(2), own_m2, 1.0 - sum(mode.weight for mode in self._modes))
+        return own.offset_m, sum(c.weight * c.about(own.offset_m) for c in (own, *self._modes))
+
+    def _of_belief(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """An estimate that no pose has placed: the belief, and what is left to the prior."""
+        assert self._belief is not None
+        prior = Component(np.zeros(2), own_m2, 1.0)
+        mode = next(iter(self._modes), None)
+        if mode is None or mode.weight <= 0.5:
+            return prior.offset_m, max(own_m2, self._belief.about(prior.offset_m), key=np.trace)
+        weight = min(mode.weight, MOST_WEIGHT)
+        rest_m2 = max(prior.about(mode.offset_m), self._belief.about(mode.offset_m), key=np.trace)
+        return mode.offset_m, weight * mode.cov_m2 + (1.0 - weight) * rest_m2

@@ -1,0 +1,83 @@
+"""The time offset between pictures and telemetry, from turns that both see."""
+
+import math
+
+import numpy as np
+import pytest
+
+from terrafix.estimator.integrity.time_offset import PRIOR_S, SLEW, TimeOffset, Turn
+from terrafix.estimator.telemetry import Telemetry
+from terrafix.messages import VehicleState
+
+FRAME_S, TELEMETRY_S = 0.5, 0.1
+
+
+def heading_rad(t_s: np.ndarray, turns: bool) -> np.ndarray:
+    """A course with turns of 30 degrees/s for two seconds, every nine; or none."""
+    return np.asarray(math.radians(30.0) * (2.0 * (t_s // 9.0) + np.clip(t_s % 9.0, 0.0, 2.0)) * turns)
+
+
+SECONDS = 60.0
+
+
+def attitude(t_s: float, yaw_rad: float) -> VehicleState:
+    yaw_rad = math.remainder(yaw_rad, math.tau)
+    return VehicleState(t_ns=round(t_s * 1e9), source="test", yaw_rad=yaw_rad, pitch_rad=0.0, roll_rad=0.0)
+
+
+def flown(late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: int = 1) -> TimeOffset:
+    """Pictures stamped ``late_s`` after they were taken."""
+    rng = np.random.default_rng(seed)
+    telemetry, offset = Telemetry(), TimeOffset()
+    reported_s, frame_s = np.arange(0.0, SECONDS, TELEMETRY_S), np.arange(3.0, SECONDS, FRAME_S)
+    yaw = heading_rad(reported_s, turns) + np.radians(noise_deg) * rng.normal(size=len(reported_s))
+    seen = np.unwrap(heading_rad(frame_s - late_s, turns)) + np.radians(0.1) * rng.normal(size=len(frame_s))
+    at = 0
+    for i, t_s in enumerate(frame_s):
+        while at < len(reported_s) and reported_s[at] <= t_s:
+            telemetry.add(attitude(float(reported_s[at]), float(yaw[at])))
+            at += 1
+        if i:
+            turn_rad = math.remainder(float(seen[i] - seen[i - 1]), math.tau)
+            offset.add(Turn(round(frame_s[i - 1] * 1e9), round(t_s * 1e9), turn_rad), telemetry)
+        offset.step(FRAME_S)
+    return offset
+
+
+@pytest.mark.parametrize("late_s", [1.0, 0.4, -0.5])
+@pytest.mark.parametrize("noise_deg", [0.3, 2.0])
+def test_pictures_that_are_stamped_late_are_found_and_put_right(late_s: float, noise_deg: float) -> None:
+    offset = flown(late_s, noise_deg=noise_deg)
+    mean_s, sigma_s = offset.estimate
+    assert mean_s == pytest.approx(late_s, abs=max(3.0 * sigma_s, 0.06))
+    assert offset.applied_s == pytest.approx(late_s, abs=0.1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_pictures_that_are_stamped_well_stay_as_they_are(seed: int) -> None:
+    offset = flown(0.02, seed=seed)
+    assert offset.applied_s == 0.0 and abs(offset.estimate[0]) < 3.0 * PRIOR_S
+
+
+def test_a_straight_flight_tells_nothing() -> None:
+    offset = flown(1.0, turns=False)
+    assert offset.applied_s == 0.0 and offset.sigma_s == pytest.approx(PRIOR_S)
+
+
+def test_a_compass_that_wanders_more_than_the_vehicle_turns_tells_nothing() -> None:
+    assert flown(0.0, turns=False, noise_deg=5.0).applied_s == 0.0
+
+
+def test_the_applied_offset_changes_slower_than_time_goes_on() -> None:
+    offset = flown(1.0)
+    before_s = offset.applied_s
+    offset._squares, offset._count = np.zeros_like(offset._squares), 0.0  # what was learnt is gone
+    offset.step(FRAME_S)
+    assert offset.applied_s == pytest.approx(before_s - SLEW * FRAME_S)
+
+
+def test_headings_that_nobody_reports_are_not_waited_for() -> None:
+    telemetry, offset = Telemetry(), TimeOffset()
+    for i in range(1000):
+        offset.add(Turn(i * 10**9, (i + 1) * 10**9, 0.5), telemetry)
+    assert offset.applied_s == 0.0 and len(offset._waiting) < 100
