@@ -16,6 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_rig import ALT, MS, S, estimate, live
+from link_wire import packed
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
@@ -49,7 +50,7 @@ class Station:
 
     def send(self, *messages: Any) -> None:
         for message in messages:
-            self.socket.sendto(message.pack(self.mav), self.link)
+            self.socket.sendto(packed(message, self.mav), self.link)
 
     def heard(self, kind: str = "") -> list[Any]:
         """Everything that has come so far."""

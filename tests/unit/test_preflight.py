@@ -20,6 +20,7 @@ from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.signature import generate
+from terrafix.link.transport import Address, Chunk
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
@@ -241,14 +242,14 @@ class Streaming(GroundAutopilot):
         self.now_s += 0.001
         return self.now_s
 
-    def write(self, packet: bytes) -> bool:
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
         said = self._ear.decode(bytearray(packet))
         if said.get_type() == "COMMAND_LONG" and said.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             self._asked[int(said.param1)] = 1e6 / said.param2
             return True
         return super().write(packet)
 
-    def read(self) -> list[bytes]:
+    def read(self) -> list[Chunk]:
         before_s, self._read_s = getattr(self, "_read_s", 0.0), self.now_s
         for message_id, rate_hz in self._asked.items():
             each = rate_hz * self._share

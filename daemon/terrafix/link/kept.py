@@ -11,6 +11,7 @@ import msgspec
 
 from terrafix.core.rundir import leave, left
 from terrafix.link.coast import LastFix
+from terrafix.link.transport import Address
 from terrafix.messages import MapOffset
 
 
@@ -27,6 +28,7 @@ class Kept(msgspec.Struct, frozen=True):
     last: LastFix | None = None
     home_moved_m: float = 0.0
     map_offset: MapOffset | None = None
+    peer: Address | None = None  # where it speaks from, on a listening port
 
 
 def kept(file: Path | None) -> Kept | None:
@@ -46,12 +48,12 @@ class AutopilotKeeper:
         self.found = kept(file)
         self._kept = self.found
 
-    def heard(self, autopilot: ArmedAutopilot | None) -> None:
+    def heard(self, autopilot: ArmedAutopilot | None, peer: Address | None = None) -> None:
         """None: it is not armed."""
         if autopilot is None:
             self._keep(None)
-        elif self._kept is None or self._kept.autopilot != autopilot:
-            self._keep(Kept(autopilot))
+        elif self._kept is None or (self._kept.autopilot, self._kept.peer) != (autopilot, peer):
+            self._keep(Kept(autopilot, peer=peer))
 
     def flies(self, last: LastFix | None, home_moved_m: float) -> None:
         if self._kept is not None:

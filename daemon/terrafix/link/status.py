@@ -12,6 +12,7 @@ from terrafix.link.diagnosis import Heard, heard_on_ground, why_no_autopilot
 from terrafix.link.ground_links import GroundLinks
 from terrafix.link.outputs import Outputs
 from terrafix.link.partner import Partner
+from terrafix.link.served import Served, note
 from terrafix.link.side_output import SideOutput
 from terrafix.link.source_switch import SourceSwitch
 from terrafix.link.streams import Streams
@@ -31,6 +32,7 @@ class Status:
     config: LinkSection
     wire: Connection
     partner: Partner
+    served: Served
     timesync: TimeSync
     streams: Streams
     budget: LineBudget
@@ -55,10 +57,10 @@ class Status:
             bad=self.wire.skipped_bytes,
             refused=self.wire.refused,
             time_offset_ms=None if offset_ns is None else offset_ns / 1e6,
-            detail="; ".join(note for note in (*self._notes(connected), load) if note),
+            detail="; ".join(note for note in (*self._notes(connected, now_ns), load) if note),
         )
 
-    def _notes(self, connected: bool) -> Iterator[str]:
+    def _notes(self, connected: bool, now_ns: int) -> Iterator[str]:
         wire, outputs = self.wire, self.outputs.names(self.partner.firmware)
         yield wire.down
         if not connected and not wire.down:
@@ -69,12 +71,10 @@ class Status:
             yield f"{self.partner.firmware} is neither ArduPilot nor PX4; name in link.outputs what it takes"
         yield from (self.outputs.waits_for, self.switch.problem, *(o.problem for o in self.side_outputs))
         yield from self.ground.notes()
-        others = [str(sysid) for sysid in self.heard.autopilots() if sysid != self.partner.sysid]
-        if connected and others and not self.config.autopilot_sysid:
-            yield (
-                f"more than one autopilot: {self.partner.sysid} is served, {', '.join(others)} is not; "
-                "name yours in link.autopilot_sysid"
-            )
+        yield note(self.served.others(now_ns), self.served.sysid, named=bool(self.config.autopilot_sysid))
+        if wire.ignored is not None:
+            count, (host, port) = wire.ignored
+            yield f"{count} packets ignored, the last from {host}:{port}; {self.config.device} hears that address alone"
         if connected:
             yield self.streams.problem()
         yield self.budget.too_slow(self.streams.wanted_hz, outputs, self.config.rate_hz)

@@ -13,6 +13,7 @@ from terrafix.core.imu import KINDS, Chooser, boot_ns, readings_of
 from terrafix.core.takeoff_height import TakeOffHeight
 from terrafix.link.diagnosis import NAMES
 from terrafix.link.kept import ArmedAutopilot, Kept
+from terrafix.link.served import AUTOPILOT_COMPONENT, is_autopilot_heartbeat
 from terrafix.link.timesync import TimeSync
 from terrafix.messages import Imu, ImuSample, VehicleState
 
@@ -26,17 +27,14 @@ HEIGHT_MAX_M = 20_000.0
 # Readings are said in batches: at 33 Hz one or two a message. A frame's estimate waits for none of them, so that a
 # batch is not longer than the way of a picture through vision.
 IMU_BATCH_NS = 40_000_000
-# A ground station, a camera or another companion has a heartbeat too; an autopilot names its firmware.
-AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 
 class Telemetry:
-    """``take`` each decoded message; a VehicleState comes out with each ATTITUDE, an Imu with every few readings."""
+    """``take`` each decoded message of the autopilot that is served (served.py); a VehicleState comes out with each
+    ATTITUDE, an Imu with every few readings."""
 
-    def __init__(self, timesync: TimeSync, only_sysid: int = 0) -> None:
-        """``only_sysid``: the autopilot's system id; 0: the first autopilot that is heard."""
+    def __init__(self, timesync: TimeSync) -> None:
         self._timesync = timesync
-        self._only_sysid = only_sysid
         self._heartbeat_ns: int | None = None
         self._height: tuple[int, float] | None = None  # (arrival, metres above take-off)
         self._above = TakeOffHeight()
@@ -83,9 +81,8 @@ class Telemetry:
 
     def served(self, kept: Kept, now_ns: int) -> None:
         """By the link before this one, until a moment ago: as if its heartbeat had come now."""
-        if self._only_sysid in (0, kept.autopilot.sysid):
-            self._is_there(kept.autopilot, now_ns, armed=True)
-            self._above = TakeOffHeight(kept.home_moved_m)
+        self._is_there(kept.autopilot, now_ns, armed=True)
+        self._above = TakeOffHeight(kept.home_moved_m)
 
     @property
     def home_moved_m(self) -> float:
@@ -102,12 +99,8 @@ class Telemetry:
         self.sysid, self.vehicle_type = autopilot.sysid, autopilot.vehicle
 
     def _take_heartbeat(self, message: Any, now_ns: int) -> None:
-        if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.get_srcComponent() != AUTOPILOT_COMPONENT:
+        if not is_autopilot_heartbeat(message):
             return
-        if self._only_sysid and message.get_srcSystem() != self._only_sysid:
-            return
-        if self.connected(now_ns) and message.get_srcSystem() != self.sysid:
-            return  # another vehicle on the same network
         heard = ArmedAutopilot(message.get_srcSystem(), int(message.autopilot), int(message.type))
         self._is_there(heard, now_ns, armed=bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED))
 
