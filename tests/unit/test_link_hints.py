@@ -213,9 +213,9 @@ def test_an_estimator_that_has_fallen_silent_is_another_matter() -> None:
 # --- started again in flight ---
 
 
-def position(lat_deg: float, lon_deg: float, above_m: float = 100.0) -> Any:
+def position(boot_ms: int, lat_deg: float, lon_deg: float, above_m: float = 100.0) -> Any:
     place = (round(lat_deg * 1e7), round(lon_deg * 1e7))
-    return mavlink.MAVLink_global_position_int_message(1, *place, 600_000, round(above_m * 1e3), 0, 0, 0, 0)
+    return mavlink.MAVLink_global_position_int_message(boot_ms, *place, 600_000, round(above_m * 1e3), 0, 0, 0, 0)
 
 
 class Restarted:
@@ -235,7 +235,8 @@ class Restarted:
         for step in range(self.seconds * 50, (self.seconds + seconds) * 50):
             now_ns = step * S // 50
             if step % 25 == 0:
-                said = (self._beat, attitude(now_ns // 10**6), position(LAT, LON, above_m))
+                boot_ms = now_ns // 10**6
+                said = (self._beat, attitude(boot_ms), position(boot_ms, LAT, LON, above_m))
                 self.wire.arrive(*(packed(x, self._autopilot) for x in said))
                 if anchor_age_ms is not None:
                     list(self.node.on(estimate(now_ns, late_ns=0, anchor_age_ms=anchor_age_ms)))

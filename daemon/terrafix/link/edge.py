@@ -20,13 +20,14 @@ from terrafix.link.local_pose import Place
 from terrafix.link.named_values import NamedValues
 from terrafix.link.outputs import Outputs
 from terrafix.link.partner import Partner
-from terrafix.link.refusals import Refusals
+from terrafix.link.refusals import Reason, Refusals
 from terrafix.link.resume import Resume
 from terrafix.link.served import AUTOPILOT_COMPONENT, Role, Served, pilot_text
 from terrafix.link.side_output import open_side_outputs
 from terrafix.link.source_switch import SourceSwitch
 from terrafix.link.status import Status, StatusLog
 from terrafix.link.streams import STREAMS_HZ, Streams, wanted_of
+from terrafix.link.telemetry_check import TelemetryCheck
 from terrafix.link.timesync import TimeSync
 from terrafix.link.transport import Address, Transport, open_at_start
 from terrafix.link.words import WARNING, words
@@ -83,6 +84,8 @@ class MavlinkEdge:
         self._served = Served(config.autopilot_sysid, listens=self._connection.listens, found=found)
         baud = config.baud if config.device.startswith("/") else None
         self._budget = LineBudget(baud, signed=self._connection.signed)
+        self._check = TelemetryCheck()
+        self._checked = (0, self._served.address)  # whose: system id and address
         self._refusals = Refusals()
         self._streams = Streams(self._budget.fitting(STREAMS_HZ))
         self._outputs = Outputs(config.outputs, config.gps_id)
@@ -100,6 +103,7 @@ class MavlinkEdge:
             wire=self._connection,
             partner=self._partner,
             served=self._served,
+            refusals=self._refusals,
             timesync=self._timesync,
             streams=self._streams,
             budget=self._budget,
@@ -124,6 +128,7 @@ class MavlinkEdge:
         for other in self._served.warnings(now_ns):
             said.append(self._warn(pilot_text(other, self._served.sysid), now_ns))
         said += self._refusals.verdicts(now_ns)
+        said += [self._warn(text, now_ns) for text in self._refusals.pilot_texts()]
         said += self._ground.poll(now_ns, self._served.sysid)
         if self._connection.reopened != self._opened:  # a new connection: everything is asked for again
             self._opened = self._connection.reopened
@@ -186,7 +191,9 @@ class MavlinkEdge:
         if role is Role.REFUSED:
             self._connection.forget(sender)
             if message.get_srcSystem() == self._served.sysid and sender is not None:
-                self._refusals.add("second sender", f"system {self._served.sysid} at {sender[0]}:{sender[1]}")
+                self._refusals.add(Reason.SENDER, f"system {self._served.sysid} at {sender[0]}:{sender[1]}", now_ns)
+            return
+        if role is Role.AUTOPILOT and self._contradicts(message, now_ns):
             return
         kind = message.get_type()
         if kind == "TIMESYNC":
@@ -199,6 +206,19 @@ class MavlinkEdge:
                 self._connection.send(said, to=sender)
         if role is Role.AUTOPILOT:
             yield from self._take_telemetry(message, now_ns)
+
+    def _contradicts(self, message: Any, now_ns: int) -> bool:
+        """The autopilot, or who passes for it, contradicts what it has said before."""
+        whose = (self._served.sysid, self._served.address)
+        if whose != self._checked:
+            self._checked, self._check = whose, TelemetryCheck()
+        reboots = self._check.reboots
+        why = self._check.refuses(message, now_ns)
+        if why is not None:
+            self._refusals.add(*why, now_ns)
+        if self._check.reboots != reboots:
+            self._partner.telemetry.rebooted()
+        return why is not None
 
     def _take_telemetry(self, message: Any, now_ns: int) -> Iterator[Message]:
         """Of the autopilot that is served."""

@@ -12,6 +12,7 @@ from terrafix.link.diagnosis import Heard, heard_on_ground, why_no_autopilot
 from terrafix.link.ground_links import GroundLinks
 from terrafix.link.outputs import Outputs
 from terrafix.link.partner import Partner
+from terrafix.link.refusals import Refusals
 from terrafix.link.served import Served, note
 from terrafix.link.side_output import SideOutput
 from terrafix.link.source_switch import SourceSwitch
@@ -33,6 +34,7 @@ class Status:
     wire: Connection
     partner: Partner
     served: Served
+    refusals: Refusals
     timesync: TimeSync
     streams: Streams
     budget: LineBudget
@@ -72,6 +74,7 @@ class Status:
         yield from (self.outputs.waits_for, self.switch.problem, *(o.problem for o in self.side_outputs))
         yield from self.ground.notes()
         yield note(self.served.others(now_ns), self.served.sysid, named=bool(self.config.autopilot_sysid))
+        yield from self.refusals.notes(now_ns)
         if wire.ignored is not None:
             count, (host, port) = wire.ignored
             yield f"{count} packets ignored, the last from {host}:{port}; {self.config.device} hears that address alone"

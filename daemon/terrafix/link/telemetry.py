@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.core.airspeed import AirspeedReader
 from terrafix.core.imu import KINDS, Chooser, boot_ns, readings_of
 from terrafix.core.takeoff_height import TakeOffHeight
+from terrafix.link.boot_clock import NS_PER_MS, WRAP_MS
 from terrafix.link.diagnosis import NAMES
 from terrafix.link.kept import ArmedAutopilot, Kept
 from terrafix.link.served import AUTOPILOT_COMPONENT, is_autopilot_heartbeat
@@ -20,8 +21,7 @@ from terrafix.messages import Imu, ImuSample, VehicleState
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000  # three of its heartbeats
 FRESH_NS = 1_000_000_000  # an older height, or airspeed, is not that of this attitude
 MAX_TRANSPORT_NS = 500_000_000  # a mapped time further from its arrival than this is a wrong mapping
-BOOT_WRAP_NS = 2**32 * 1_000_000  # time_boot_ms has 32 bits: after 49.7 days it begins anew
-REBOOT_BACK_MS = 1_000  # boot time that steps back by more is a new boot
+BOOT_WRAP_NS = WRAP_MS * NS_PER_MS
 ATTITUDE_MAX_RAD = 4 * math.pi  # roll, pitch and yaw beyond any convention are garbage
 HEIGHT_MAX_M = 20_000.0
 # Readings are said in batches: at 33 Hz one or two a message. A frame's estimate waits for none of them, so that a
@@ -40,7 +40,6 @@ class Telemetry:
         self._above = TakeOffHeight()
         self._airspeed: tuple[int, float] | None = None  # (arrival, m/s)
         self._airspeed_of = AirspeedReader()
-        self._boot_ms = 0
         self._armed: bool | None = None
         self._serves: ArmedAutopilot | None = None
         self._unix_minus_monotonic_ns: int | None = None
@@ -84,6 +83,10 @@ class Telemetry:
         self._is_there(kept.autopilot, now_ns, armed=True)
         self._above = TakeOffHeight(kept.home_moved_m)
 
+    def rebooted(self) -> None:
+        """Heights were those of another boot."""
+        self._height, self._above = None, TakeOffHeight()
+
     @property
     def home_moved_m(self) -> float:
         """By how much home has risen since take-off."""
@@ -113,9 +116,6 @@ class Telemetry:
         angles = (message.yaw, message.pitch, message.roll)
         if not all(math.isfinite(a) and abs(a) <= ATTITUDE_MAX_RAD for a in angles):
             return None
-        if message.time_boot_ms < self._boot_ms - REBOOT_BACK_MS:
-            self._height, self._above = None, TakeOffHeight()  # take-off height of another boot
-        self._boot_ms = message.time_boot_ms
         return VehicleState(
             t_ns=self.measured_ns(message.time_boot_ms * 1_000_000, now_ns),
             source="mavlink",
