@@ -156,6 +156,8 @@ class MavlinkEdge:
                 self._resume.said(message)
                 self._coast.sent(message)
                 self._keeper.flies(self._coast.last, self._partner.telemetry.home_moved_m)
+                unix_ms = gps_time.unix_ms(message.time_week, message.time_week_ms)
+                self._keeper.timed(None if unix_ms is None else unix_ms * 1_000_000 - message.t_ns)
             case Origin():
                 if message.ground_amsl_m is not None:
                     self._start = Place(message.lat_deg, message.lon_deg, message.ground_amsl_m)
