@@ -155,7 +155,8 @@ class MavlinkEdge:
                 self._send_position(message)
                 self._resume.said(message)
                 self._coast.sent(message)
-                self._keeper.flies(self._coast.last, self._partner.telemetry.home_moved_m)
+                telemetry = self._partner.telemetry
+                self._keeper.flies(self._coast.last, telemetry.home_moved_m, telemetry.pressure_zero_m)
                 unix_ms = gps_time.unix_ms(message.time_week, message.time_week_ms)
                 self._keeper.timed(None if unix_ms is None else unix_ms * 1_000_000 - message.t_ns)
             case Origin():

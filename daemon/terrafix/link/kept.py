@@ -1,6 +1,6 @@
 """What a link leaves to the one that is started in its place: which autopilot it served, while that was armed, where
-its filter was with our last fix (coast.py), by how much its home was moved (core/takeoff_height.py), how far off the
-map is (map_offset.py), and by which time GPS_INPUT goes (gps_time.py).
+its filter was with our last fix (coast.py), where its heights begin (pressure_height.py, core/takeoff_height.py), how
+far off the map is (map_offset.py), and by which time GPS_INPUT goes (gps_time.py).
 
 An autopilot says who it is once a second, and its attitude long before. Who knows it already can say where it leans
 with the first packet, which is what the estimator waits for after a restart in flight."""
@@ -30,6 +30,7 @@ class Kept(msgspec.Struct, frozen=True):
     last: LastFix | None = None
     home_moved_m: float = 0.0
     map_offset: MapOffset | None = None
+    pressure_zero_m: float | None = None  # where it took off (pressure_height.PressureHeight)
     peer: Address | None = None  # where it speaks from, on a listening port
     unix_minus_monotonic_ns: int | None = None  # by which GPS_INPUT states the time (gps_time.LatchedClock)
 
@@ -59,9 +60,10 @@ class AutopilotKeeper:
         elif self._kept is None or (self._kept.autopilot, self._kept.peer) != (autopilot, peer):
             self._keep(Kept(autopilot, peer=peer))
 
-    def flies(self, last: LastFix | None, home_moved_m: float) -> None:
+    def flies(self, last: LastFix | None, home_moved_m: float, pressure_zero_m: float | None = None) -> None:
         if self._kept is not None:
-            self._keep(msgspec.structs.replace(self._kept, last=last, home_moved_m=home_moved_m))
+            heights = {"home_moved_m": home_moved_m, "pressure_zero_m": pressure_zero_m}
+            self._keep(msgspec.structs.replace(self._kept, last=last, **heights))
 
     def timed(self, unix_minus_monotonic_ns: int | None) -> None:
         """With each GPS_INPUT, to the millisecond that it states: what differs by less is the same."""

@@ -14,6 +14,7 @@ from terrafix.core.takeoff_height import TakeOffHeight
 from terrafix.link.boot_clock import NS_PER_MS, WRAP_MS
 from terrafix.link.diagnosis import NAMES
 from terrafix.link.kept import ArmedAutopilot, Kept
+from terrafix.link.pressure_height import PressureHeight
 from terrafix.link.served import AUTOPILOT_COMPONENT, is_autopilot_heartbeat
 from terrafix.link.timesync import TimeSync
 from terrafix.messages import Imu, ImuSample, VehicleState
@@ -38,6 +39,7 @@ class Telemetry:
         self._heartbeat_ns: int | None = None
         self._height: tuple[int, float] | None = None  # (arrival, metres above take-off)
         self._above = TakeOffHeight()
+        self._pressure = PressureHeight()
         self._airspeed: tuple[int, float] | None = None  # (arrival, m/s)
         self._airspeed_of = AirspeedReader()
         self._armed: bool | None = None
@@ -71,6 +73,8 @@ class Telemetry:
             self._take_height(message.relative_alt / 1000.0, message.alt / 1000.0, now_ns)
         elif kind == "ALTITUDE":
             self._take_height(message.altitude_relative, message.altitude_amsl, now_ns)
+        elif kind == "SCALED_PRESSURE":
+            self._pressure.read(message.press_abs, now_ns)
         elif kind == "AIRSPEED":
             if (airspeed_mps := self._airspeed_of.take(message)) is not None:
                 self._airspeed = (now_ns, airspeed_mps)
@@ -82,15 +86,21 @@ class Telemetry:
         """By the link before this one, until a moment ago: as if its heartbeat had come now."""
         self._is_there(kept.autopilot, now_ns, armed=True)
         self._above = TakeOffHeight(kept.home_moved_m)
+        self._pressure = PressureHeight(kept.pressure_zero_m)
 
     def rebooted(self) -> None:
         """Heights were those of another boot."""
-        self._height, self._above = None, TakeOffHeight()
+        self._height, self._above, self._pressure = None, TakeOffHeight(), PressureHeight()
 
     @property
     def home_moved_m(self) -> float:
         """By how much home has risen since take-off."""
         return self._above.moved_m
+
+    @property
+    def pressure_zero_m(self) -> float | None:
+        """See PressureHeight."""
+        return self._pressure.zero_m
 
     @property
     def armed_autopilot(self) -> ArmedAutopilot | None:
@@ -108,9 +118,17 @@ class Telemetry:
         self._is_there(heard, now_ns, armed=bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED))
 
     def _take_height(self, relative_m: float, amsl_m: float, now_ns: int) -> None:
-        """Above take-off, by the barometer: without a sensor nobody knows the height above the ground beneath."""
+        """Above home, by the autopilot's filter."""
         if math.isfinite(relative_m) and abs(relative_m) < HEIGHT_MAX_M:
-            self._height = (now_ns, self._above.above(relative_m, amsl_m, self._armed))
+            above_m = self._above.above(relative_m, amsl_m, self._armed)
+            self._height = (now_ns, above_m)
+            self._pressure.align(above_m, self._armed, now_ns)
+
+    def _height_m(self, now_ns: int) -> float | None:
+        """Above take-off: without a sensor nobody knows the height above the ground beneath. By pressure; by the filter
+        where that is not told."""
+        by_pressure_m = self._pressure.height_m(now_ns)
+        return _fresh(self._height, now_ns) if by_pressure_m is None else by_pressure_m
 
     def _vehicle_state(self, message: Any, now_ns: int) -> VehicleState | None:
         angles = (message.yaw, message.pitch, message.roll)
@@ -122,7 +140,7 @@ class Telemetry:
             yaw_rad=math.remainder(message.yaw, math.tau),
             pitch_rad=message.pitch,
             roll_rad=message.roll,
-            agl_m=_fresh(self._height, now_ns),
+            agl_m=self._height_m(now_ns),
             armed=self._armed if self.connected(now_ns) else None,
             airspeed_mps=_fresh(self._airspeed, now_ns),
         )
