@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
 from terrafix.link import gps_time
+from terrafix.link.admission import Admission
 from terrafix.link.budget import LineBudget
 from terrafix.link.coast import Coast
 from terrafix.link.connection import Connection
@@ -20,14 +21,12 @@ from terrafix.link.local_pose import Place
 from terrafix.link.named_values import NamedValues
 from terrafix.link.outputs import Outputs
 from terrafix.link.partner import Partner
-from terrafix.link.refusals import Reason, Refusals
 from terrafix.link.resume import Resume
-from terrafix.link.served import AUTOPILOT_COMPONENT, Role, Served, pilot_text
+from terrafix.link.served import AUTOPILOT_COMPONENT, Role
 from terrafix.link.side_output import open_side_outputs
 from terrafix.link.source_switch import SourceSwitch
 from terrafix.link.status import Status, StatusLog
 from terrafix.link.streams import STREAMS_HZ, Streams, wanted_of
-from terrafix.link.telemetry_check import TelemetryCheck
 from terrafix.link.timesync import TimeSync
 from terrafix.link.transport import Address, Transport, open_at_start
 from terrafix.link.words import WARNING, words
@@ -81,12 +80,11 @@ class MavlinkEdge:
         self._timesync = TimeSync()
         self._partner = Partner(self._timesync)
         found = self._keeper.found
-        self._served = Served(config.autopilot_sysid, listens=self._connection.listens, found=found)
+        self._admission = Admission(config, listens=self._connection.listens, found=found)
+        self._served = self._admission.served
+        self._reboots = 0  # that telemetry knows of
         baud = config.baud if config.device.startswith("/") else None
         self._budget = LineBudget(baud, signed=self._connection.signed)
-        self._check = TelemetryCheck()
-        self._checked = (0, self._served.address)  # whose: system id and address
-        self._refusals = Refusals()
         self._streams = Streams(self._budget.fitting(STREAMS_HZ))
         self._outputs = Outputs(config.outputs, config.gps_id)
         self._side_outputs = open_side_outputs(config)
@@ -102,8 +100,7 @@ class MavlinkEdge:
             config=config,
             wire=self._connection,
             partner=self._partner,
-            served=self._served,
-            refusals=self._refusals,
+            admission=self._admission,
             timesync=self._timesync,
             streams=self._streams,
             budget=self._budget,
@@ -125,10 +122,8 @@ class MavlinkEdge:
                 self._partner.telemetry.served(self._keeper.found, now_ns)
         for message, sender in self._connection.messages(now_ns):
             said += self._take(message, sender, now_ns)
-        for other in self._served.warnings(now_ns):
-            said.append(self._warn(pilot_text(other, self._served.sysid), now_ns))
-        said += self._refusals.verdicts(now_ns)
-        said += [self._warn(text, now_ns) for text in self._refusals.pilot_texts()]
+        said += self._admission.verdicts(now_ns)
+        said += [self._warn(text, now_ns) for text in self._admission.pilot_texts(now_ns)]
         said += self._ground.poll(now_ns, self._served.sysid)
         if self._connection.reopened != self._opened:  # a new connection: everything is asked for again
             self._opened = self._connection.reopened
@@ -190,13 +185,10 @@ class MavlinkEdge:
             self.status.heard_view = True
             return  # our own view, by way of some router: not an autopilot
         self._heard.take(message)
-        role = self._served.take(message, sender, now_ns)
+        role = self._admission.take(message, sender, now_ns)
         if role is Role.REFUSED:
             self._connection.forget(sender)
-            if message.get_srcSystem() == self._served.sysid and sender is not None:
-                self._refusals.add(Reason.SENDER, f"system {self._served.sysid} at {sender[0]}:{sender[1]}", now_ns)
-            return
-        if role is Role.AUTOPILOT and self._contradicts(message, now_ns):
+        if role in (Role.REFUSED, Role.CONTRADICTS):
             return
         kind = message.get_type()
         if kind == "TIMESYNC":
@@ -210,22 +202,12 @@ class MavlinkEdge:
         if role is Role.AUTOPILOT:
             yield from self._take_telemetry(message, now_ns)
 
-    def _contradicts(self, message: Any, now_ns: int) -> bool:
-        """The autopilot, or who passes for it, contradicts what it has said before."""
-        whose = (self._served.sysid, self._served.address)
-        if whose != self._checked:
-            self._checked, self._check = whose, TelemetryCheck()
-        reboots = self._check.reboots
-        why = self._check.refuses(message, now_ns)
-        if why is not None:
-            self._refusals.add(*why, now_ns)
-        if self._check.reboots != reboots:
-            self._partner.telemetry.rebooted()
-        return why is not None
-
     def _take_telemetry(self, message: Any, now_ns: int) -> Iterator[Message]:
         """Of the autopilot that is served."""
         kind = message.get_type()
+        if self._admission.reboots != self._reboots:
+            self._reboots = self._admission.reboots
+            self._partner.telemetry.rebooted()
         yield from self._partner.take(message, now_ns, self._our_receiver())
         if kind == "HEARTBEAT":
             self._keeper.heard(self._partner.telemetry.armed_autopilot, self._served.address)

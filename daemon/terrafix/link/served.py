@@ -28,6 +28,7 @@ AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 class Role(Enum):
     AUTOPILOT = "autopilot"  # the one that is served
     OTHER = "other"  # a ground station, a gimbal, a vehicle behind the same router
+    CONTRADICTS = "contradicts"  # the same, and not to be believed (admission.py)
     REFUSED = "refused"  # at an address of another vehicle, or of a second sender with our autopilot's id
 
 

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 
 from terrafix.core import logs
 from terrafix.core.config import LinkSection
+from terrafix.link.admission import Admission
 from terrafix.link.budget import LineBudget
 from terrafix.link.connection import Connection
 from terrafix.link.diagnosis import Heard, heard_on_ground, why_no_autopilot
 from terrafix.link.ground_links import GroundLinks
 from terrafix.link.outputs import Outputs
 from terrafix.link.partner import Partner
-from terrafix.link.refusals import Refusals
-from terrafix.link.served import Served, note
 from terrafix.link.side_output import SideOutput
 from terrafix.link.source_switch import SourceSwitch
 from terrafix.link.streams import Streams
@@ -33,8 +32,7 @@ class Status:
     config: LinkSection
     wire: Connection
     partner: Partner
-    served: Served
-    refusals: Refusals
+    admission: Admission
     timesync: TimeSync
     streams: Streams
     budget: LineBudget
@@ -73,8 +71,7 @@ class Status:
             yield f"{self.partner.firmware} is neither ArduPilot nor PX4; name in link.outputs what it takes"
         yield from (self.outputs.waits_for, self.switch.problem, *(o.problem for o in self.side_outputs))
         yield from self.ground.notes()
-        yield note(self.served.others(now_ns), self.served.sysid, named=bool(self.config.autopilot_sysid))
-        yield from self.refusals.notes(now_ns)
+        yield from self.admission.notes(now_ns)
         if wire.ignored is not None:
             count, (host, port) = wire.ignored
             yield f"{count} packets ignored, the last from {host}:{port}; {self.config.device} hears that address alone"
