@@ -216,14 +216,15 @@ class Wire:
         for i in range(round(seconds * 50)):
             now_ns = S + self._steps * 20 * MS
             boot_ms = now_ns // MS
-            true = [*([heartbeat()] if i % 50 == 0 else []), raw(boot_ms), attitude(boot_ms, 0.0)]
+            beat = [heartbeat()] if i % 50 == 0 else []
+            true = [*beat, raw(boot_ms + self.imu_ahead_ms), attitude(boot_ms, 0.0)]
             self._memory.arrive(*(packed(x, self.true) for x in true))
             if forged is not None:
                 self._memory.arrive(packed(forged(boot_ms), self.forger))
             self.said += self.edge.poll(now_ns)
             self._steps += 1
 
-    _steps = 0
+    _steps, imu_ahead_ms = 0, 0
 
     def verdicts(self) -> list[m.MeasurementVerdict]:
         return [x for x in self.said if isinstance(x, m.MeasurementVerdict)]
@@ -275,6 +276,25 @@ def test_a_forged_height_from_another_boot_is_refused_by_its_time() -> None:
     wire.run(5.0, lambda _: mavlink.MAVLink_global_position_int_message(5, 1, 2, 0, 99_000, 0, 0, 0, 0))
     assert {state.agl_m for state in states(wire.said)} == {None}
     assert {verdict.detail.split(":")[0] for verdict in wire.verdicts()} == {"boot time"}
+
+
+def test_inertial_readings_may_have_another_clock() -> None:
+    wire = Wire()
+    wire.imu_ahead_ms = 60_000
+    wire.run(4.0)
+    assert len(states(wire.said)) == 200
+    wire.forger = wire.true
+    wire.run(2.0, lambda boot_ms: attitude(boot_ms, 0.4))
+    assert {state.roll_rad for state in states(wire.said)} == {0.0}
+
+
+def test_forged_readings_from_another_boot_do_not_turn_the_gyroscopes() -> None:
+    wire = Wire()
+    wire.run(2.0)
+    wire.forger = wire.true
+    wire.run(2.0, lambda boot_ms: mavlink.MAVLink_raw_imu_message(5000, 0, 0, -1000, 9000, 0, 0, 0, 0, 0))
+    rates = [sample[4] for x in wire.said if isinstance(x, m.Imu) for sample in x.samples]
+    assert rates and set(rates) == {0.0} and len(states(wire.said)) == 200
 
 
 def test_a_reboot_ends_the_height_of_the_boot_before() -> None:

@@ -17,7 +17,8 @@ class TelemetryCheck:
 
     def __init__(self) -> None:
         self._sequence = Sequence()
-        self._clock = BootClock()
+        self._clock = BootClock()  # of time_boot_ms
+        self._imu_clock = BootClock()  # of time_usec, which need not begin where that does
         self._turns = TurnCheck()
 
     @property
@@ -34,7 +35,8 @@ class TelemetryCheck:
         if since_boot_ns is None:
             return None
         reboots = self.reboots
-        if why := self._clock.refuses(since_boot_ns // NS_PER_MS, now_ns):
+        clock = self._clock if hasattr(message, "time_boot_ms") else self._imu_clock
+        if why := clock.refuses(since_boot_ns // NS_PER_MS, now_ns):
             return Reason.BOOT_TIME, f"{kind}: {why}"
         if self.reboots != reboots:
             self._turns = TurnCheck()
