@@ -374,10 +374,10 @@ class Refinement(Message, frozen=True, kw_only=True):
 
 
 class MeasurementVerdict(Message, frozen=True, kw_only=True):
-    """What the estimator did with one measurement (law: every measurement gets one)."""
+    """What was done with one measurement (law: every measurement gets one)."""
 
-    frame_id: int
-    measurement: str  # "odometry", "map", "attitude", "height"
+    frame_id: int  # -1: of no frame
+    measurement: str  # "odometry", "map", "attitude", "height"; of the link "estimate", "telemetry", "wall clock"
     verdict: Verdict
     detail: str = ""
     mahalanobis2: float | None = None
@@ -409,6 +409,7 @@ class GpsInput(Message, frozen=True, kw_only=True):
     unanchored_s: float | None = None  # seconds since the last map fix; None: nothing was believed yet
     map_offset_m: tuple[float, float] = (0.0, 0.0)  # east, north: error of the map that was taken out (MapOffset)
     reason: str = ""  # why fix_type is not 3
+    resets: int = 0  # jumps of the estimate that were accepted since the link began: reset_counter of ODOMETRY
 
 
 class LinkStatus(Message, frozen=True, kw_only=True):

@@ -6,6 +6,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
+from terrafix.link.transport import Address, Chunk
 
 
 class MemoryWire:
@@ -18,11 +19,11 @@ class MemoryWire:
     def arrive(self, *chunks: bytes) -> None:
         self._coming += chunks
 
-    def read(self) -> list[bytes]:
+    def read(self) -> list[Chunk]:
         coming, self._coming = self._coming, []
-        return coming
+        return [(chunk, None) for chunk in coming]
 
-    def write(self, packet: bytes) -> bool:
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
         self.sent.append(packet)
         return True
 

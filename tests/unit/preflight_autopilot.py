@@ -4,6 +4,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.link.transport import Address, Chunk
+
 VERSION_4_6 = 4 << 24 | 6 << 16 | 3 << 8 | 255
 
 
@@ -36,14 +38,14 @@ class GroundAutopilot:
         self._coming: list[bytes] = []
         self.was_set: list[str] = []
 
-    def read(self) -> list[bytes]:
+    def read(self) -> list[Chunk]:
         coming, self._coming = self._coming, []
-        return coming
+        return [(chunk, None) for chunk in coming]
 
     def close(self) -> None:
         pass
 
-    def write(self, packet: bytes) -> bool:
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
         said = self._ear.decode(bytearray(packet))
         match said.get_type():
             case "HEARTBEAT":

@@ -159,7 +159,7 @@ def test_the_loopback_keeps_order_and_directions_apart() -> None:
     wire.give(b"")
     wire.give(b"2")
     assert (wire.take(), wire.take()) == (b"ab", b"")
-    assert (wire.read(), wire.read()) == ([b"1", b"2"], [])
+    assert (wire.read(), wire.read()) == ([(b"1", None), (b"2", None)], [])
 
 
 def test_positions_far_from_the_origin_stay_right() -> None:

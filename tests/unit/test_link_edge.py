@@ -16,6 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_rig import ALT, MS, S, estimate, live
+from link_wire import packed
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
@@ -49,7 +50,7 @@ class Station:
 
     def send(self, *messages: Any) -> None:
         for message in messages:
-            self.socket.sendto(message.pack(self.mav), self.link)
+            self.socket.sendto(packed(message, self.mav), self.link)
 
     def heard(self, kind: str = "") -> list[Any]:
         """Everything that has come so far."""
@@ -218,11 +219,11 @@ def test_streams_are_asked_for_and_again_when_they_stop(station: Station, edge: 
 
 def test_vehicle_state_from_attitude_and_relative_height(station: Station, edge: MavlinkEdge) -> None:
     meet(station, edge)
-    station.send(attitude(1000))
+    station.send(attitude(1000, yaw=4.0))
     (first,) = states(polled(edge, 1 * S))
     assert first.agl_m is None  # absence is a state
     assert first.yaw_rad is not None
-    assert (first.yaw_rad, first.pitch_rad, first.roll_rad) == pytest.approx((1.0, 0.2, 0.1))
+    assert (first.yaw_rad, first.pitch_rad, first.roll_rad) == pytest.approx((4.0 - math.tau, 0.2, 0.1))
     height = mavlink.MAVLink_global_position_int_message(1000, 1, 2, 700_000, 84_500, 100, 200, 300, 0)
     station.send(height, attitude(1040, yaw=4.0))
     (second,) = states(polled(edge, 1_040 * MS))

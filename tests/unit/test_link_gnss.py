@@ -18,6 +18,7 @@ from terrafix.link.edge import MavlinkEdge
 from terrafix.link.gnss import reading_of
 from terrafix.link.gnss_watch import BACK_NS
 from terrafix.link.node import LinkNode
+from terrafix.link.transport import Address
 from terrafix.messages import GnssState
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
 from terrafix_tools.sim.judge.flight import Vision, fly
@@ -290,7 +291,7 @@ class RigWire(MemoryWire):
 
         rig.autopilot.transmit = tapped  # type: ignore[method-assign]
 
-    def write(self, packet: bytes) -> bool:
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
         self._rig.autopilot.receive(packet, self._rig.t_s)
         return True
 

@@ -20,6 +20,7 @@ from terrafix_tools.preflight.ground import about
 S = 1_000_000_000
 AUTOPILOT = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 VIEW = 201
+GCS = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3)
 
 
 class Station:
@@ -127,7 +128,7 @@ def test_a_hint_on_the_ground_link_is_taken_and_answered_there(station: Station)
     station.heard()
     command = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
     place = (480_000_000, 110_000_000)
-    station.send(mavlink.MAVLink_command_int_message(1, 197, 0, command, 0, 0, 0, 0, 400, 0, *place, 0))
+    station.send(GCS, mavlink.MAVLink_command_int_message(1, 197, 0, command, 0, 0, 0, 0, 400, 0, *place, 0))
     time.sleep(0.02)
     hints = [x for x in rig.run(0.1) if isinstance(x, m.PositionHint)]
     assert len(hints) == 1
@@ -142,7 +143,7 @@ def test_a_hint_that_comes_over_two_links_is_one_and_is_answered_on_both(station
     command = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
     place = (480_000_000, 110_000_000)
     hint = mavlink.MAVLink_command_int_message(1, 197, 0, command, 0, 0, 0, 0, 400, 0, *place, 0)
-    station.send(hint)
+    station.send(GCS, hint)
     rig.wire.arrive(packed(hint, mavlink.MAVLink(None, srcSystem=255, srcComponent=190)))
     time.sleep(0.02)
     assert len([x for x in rig.run(0.1) if isinstance(x, m.PositionHint)]) == 1
@@ -223,10 +224,9 @@ def test_the_second_vehicle_takes_no_commands_but_an_origin_set_on_it_is_a_hint(
     rig = Rig(station.device, view_sysid=VIEW)
     rig.run(1.2)
     station.heard()
-    gcs = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3)
     arm = mavlink.MAVLink_command_long_message(VIEW, 1, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, *(0.0,) * 6)
     origin = mavlink.MAVLink_set_gps_global_origin_message(VIEW, 480_000_000, 110_000_000, 0)
-    station.send(gcs, arm, origin)
+    station.send(GCS, arm, origin)
     time.sleep(0.02)
     assert len([x for x in rig.run(0.1) if isinstance(x, m.PositionHint)]) == 1
     acks = [x for x in of_view(station.heard()) if x.get_type() == "COMMAND_ACK"]

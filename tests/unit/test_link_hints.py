@@ -27,10 +27,13 @@ ORIGIN_HERE = mavlink.MAVLink_set_gps_global_origin_message(1, *E7, 0)
 class Side:
     """The link's edge on a wire in memory, and what it says of what a ground station sends."""
 
-    def __init__(self, **changes: Any) -> None:
+    def __init__(self, *, station: bool = True) -> None:
+        """``station``: the sender has said in a heartbeat that it is a ground station."""
         self.wire = MemoryWire()
-        self.edge = MavlinkEdge(LinkSection(**changes), self.wire, lambda: 0)
+        self.edge = MavlinkEdge(LinkSection(), self.wire, lambda: 0)
         self.now_ns = S
+        if station:
+            self.hears(GCS)
 
     def hears(self, *messages: Any, sender: mavlink.MAVLink = STATION) -> list[m.PositionHint]:
         self.now_ns += S // 10
@@ -112,11 +115,17 @@ def test_an_origin_set_by_a_ground_station_is_a_hint() -> None:
 
 
 def test_an_origin_set_by_a_companion_or_for_another_vehicle_is_none() -> None:
-    side = Side()
+    side = Side(station=False)
     assert side.hears(ORIGIN_HERE) == []  # nobody said to be a ground station
     companion = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     assert side.hears(GCS) == [] and side.hears(ORIGIN_HERE, sender=companion) == []
     assert side.hears(mavlink.MAVLink_set_gps_global_origin_message(2, *E7, 0)) == []
+
+
+def test_a_command_of_one_that_is_no_ground_station_is_denied() -> None:
+    side = Side(station=False)
+    assert side.hears(external()) == []
+    assert side.answers() == [(mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE, mavlink.MAV_RESULT_DENIED)]
 
 
 def test_an_origin_for_the_autopilot_s_id_is_ours_too() -> None:
@@ -204,9 +213,9 @@ def test_an_estimator_that_has_fallen_silent_is_another_matter() -> None:
 # --- started again in flight ---
 
 
-def position(lat_deg: float, lon_deg: float, above_m: float = 100.0) -> Any:
+def position(boot_ms: int, lat_deg: float, lon_deg: float, above_m: float = 100.0) -> Any:
     place = (round(lat_deg * 1e7), round(lon_deg * 1e7))
-    return mavlink.MAVLink_global_position_int_message(1, *place, 600_000, round(above_m * 1e3), 0, 0, 0, 0)
+    return mavlink.MAVLink_global_position_int_message(boot_ms, *place, 600_000, round(above_m * 1e3), 0, 0, 0, 0)
 
 
 class Restarted:
@@ -226,7 +235,8 @@ class Restarted:
         for step in range(self.seconds * 50, (self.seconds + seconds) * 50):
             now_ns = step * S // 50
             if step % 25 == 0:
-                said = (self._beat, attitude(now_ns // 10**6), position(LAT, LON, above_m))
+                boot_ms = now_ns // 10**6
+                said = (self._beat, attitude(boot_ms), position(boot_ms, LAT, LON, above_m))
                 self.wire.arrive(*(packed(x, self._autopilot) for x in said))
                 if anchor_age_ms is not None:
                     list(self.node.on(estimate(now_ns, late_ns=0, anchor_age_ms=anchor_age_ms)))

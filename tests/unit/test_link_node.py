@@ -1,7 +1,9 @@
 """What the link tells the autopilot: carry-forward, freshness, jumps, the ladder, silence, wall time."""
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,13 +23,19 @@ from link_rig import (
     gps,
     texts,
 )
+from link_wire import MemoryWire
 
 from terrafix import messages as m
+from terrafix.core.config import Config, LinkSection
+from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import NodeContext
 from terrafix.link import fix
 from terrafix.link.carry import Attitudes, carry, distance_m, offset, worst_horizontal_variance
-from terrafix.link.gps_time import week_and_ms
-from terrafix.link.node import LinkNode
+from terrafix.link.edge import MavlinkEdge
+from terrafix.link.gps_time import WEEK_MS, week_and_ms
+from terrafix.link.kept import ArmedAutopilot, AutopilotKeeper
+from terrafix.link.node import LinkNode, make_node
 
 
 def nothing(_: int) -> list[m.Message]:
@@ -312,18 +320,82 @@ def test_without_a_plausible_clock_the_week_is_0() -> None:
     assert {(g.time_week, g.time_week_ms) for g in gps(fly(node, 0, S, nothing))} == {(0, 0)}
 
 
-def test_a_creeping_wall_clock_does_not_bend_time_and_a_step_corrects_it() -> None:
-    node = LinkNode(10.0)
-    unix = 1_795_000_000 * S
+def clock_said(wrong_ns: Callable[[int], int], armed: bool | None) -> tuple[list[int], list[str]]:
+    """A minute with a wall clock that is ``wrong_ns`` (of the time) off, of a vehicle that is ``armed`` or not.
+
+    -> (from one GPS_INPUT to the next, ms of GPS time; what was refused)"""
+    node, unix = LinkNode(10.0), 1_795_000_000 * S
 
     def feed(now: int) -> list[m.Message]:
-        wrong = now // 100 if now < 20 * S else 3600 * S  # 1 % fast, then set an hour on
-        return [m.WallClock(t_ns=now, unix_ns=unix + now + wrong, source="system")]
+        if now % S:
+            return []
+        vehicle = m.VehicleState(t_ns=now, source="mavlink", armed=armed)
+        return [vehicle, m.WallClock(t_ns=now, unix_ns=unix + now + wrong_ns(now), source="autopilot")]
 
-    sent = gps(fly(node, 0, 30 * S, feed))
-    steps = [b.time_week_ms - a.time_week_ms for a, b in pairwise(sent)]
-    assert steps.count(100) == len(steps) - 1
-    assert max(steps) == 3_600_100
+    said = fly(node, 0, 60 * S, feed)
+    stamps = [g.time_week * WEEK_MS + g.time_week_ms for g in gps(said)]
+    refused = [x.detail for x in said if isinstance(x, m.MeasurementVerdict) and x.measurement == "wall clock"]
+    return [b - a for a, b in pairwise(stamps)], refused
+
+
+def test_a_creeping_wall_clock_does_not_bend_time() -> None:
+    steps, refused = clock_said(lambda now: now // 200, armed=False)  # 0.5 % fast
+    assert set(steps) == {100} and refused == []
+
+
+HOUR_MS = 3_600_000
+TWENTY_YEARS_NS = 7305 * 24 * 3600 * S
+
+
+@pytest.mark.parametrize("step_ms", [HOUR_MS, -25 * HOUR_MS, -600])
+def test_on_the_ground_a_step_of_the_clock_is_learnt_when_it_has_lasted(step_ms: int) -> None:
+    steps, refused = clock_said(lambda now: 0 if now < 10 * S else step_ms * MS, armed=False)
+    assert [(i, step) for i, step in enumerate(steps) if step != 100] == [(300 - 1, step_ms + 100)]
+    assert len(refused) == 20 and set(refused) == {f"autopilot clock steps by {step_ms / 1000:.1f} s"}
+
+
+@pytest.mark.parametrize("armed", [True, None])
+@pytest.mark.parametrize("step_ns", [HOUR_MS * MS, -25 * HOUR_MS * MS, -600 * MS, TWENTY_YEARS_NS])
+def test_in_flight_time_goes_on_whatever_the_clock_says(step_ns: int, armed: bool | None) -> None:
+    """Not armed by nobody's word, and a week was sent: it may fly."""
+    steps, refused = clock_said(lambda now: 0 if now < 10 * S else step_ns, armed=armed)
+    assert set(steps) == {100} and len(refused) == 50
+
+
+def test_a_clock_that_goes_back_and_forth_is_not_learnt() -> None:
+    steps, _ = clock_said(lambda now: HOUR_MS * MS if now // (15 * S) % 2 else 0, armed=False)
+    assert set(steps) == {100}
+
+
+def test_a_year_that_cannot_be_is_not_learnt_on_the_ground_either() -> None:
+    steps, refused = clock_said(lambda now: 0 if now < 10 * S else TWENTY_YEARS_NS, armed=False)
+    assert set(steps) == {100} and "cannot be" in refused[0]
+
+
+def test_a_link_that_is_started_again_goes_on_with_the_time_of_before(tmp_path: Path) -> None:
+    unix = 1_795_000_000 * S
+    first = LinkNode(10.0)
+    first.on(m.WallClock(t_ns=50 * S, unix_ns=unix, source="system"))
+    keeper = AutopilotKeeper(tmp_path / "link.kept")
+    keeper.heard(ArmedAutopilot(1, 3, 1))
+    edge = MavlinkEdge(LinkSection(), MemoryWire(), lambda: 0, keeper=keeper)
+    for sent in gps(fly(first, 100 * S, 101 * S, every(500 * MS, estimate))):
+        edge.heard(sent)
+    second = make_node(NodeContext(Config(), MemoryFrameStore(), None, tmp_path, kept=tmp_path / "link.kept"))
+    second.on(m.VehicleState(t_ns=102 * S, source="mavlink", armed=True))
+    second.on(m.WallClock(t_ns=102 * S, unix_ns=unix - 25 * HOUR_MS * MS, source="system"))
+    for sent in gps(fly(second, 102 * S, 103 * S, nothing)):
+        assert sent.time_week_ms == pytest.approx(week_and_ms(unix + sent.t_ns - 50 * S)[1], abs=2)
+
+
+# --- steps of the estimate ---
+
+
+def test_jumps_that_were_accepted_are_counted_in_what_is_sent() -> None:
+    node = LinkNode(10.0)
+    said = fly(node, 0, 20 * S, every(500 * MS, lambda t_ns: estimate(t_ns, east_m=100.0 if t_ns > 10 * S else 0.0)))
+    resets = [g.resets for g in gps(said) if g.fix_type == 3]
+    assert resets[0] == 0 and resets[-1] == 1 and sorted(resets) == resets
 
 
 # --- geometry ---

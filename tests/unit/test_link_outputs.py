@@ -21,6 +21,7 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
 from terrafix.link import global_position, gps_time, local_pose, msp, nmea
+from terrafix.link.carry import apart_m, offset
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.local_pose import Attitude, Place
 from terrafix.link.outputs import Outputs
@@ -383,6 +384,28 @@ def test_external_positions_are_few_and_good() -> None:
     edge.heard(msgspec.structs.replace(GPS, t_ns=20 * S, horiz_accuracy_m=31.0))
     edge.heard(msgspec.structs.replace(NO_FIX, t_ns=30 * S))
     assert wire.take() == []
+
+
+@pytest.mark.parametrize("uptime_days", [0.01, 1.0, 10.0, 49.0, 200.0])
+def test_an_external_position_is_of_the_time_that_its_32_bits_state(uptime_days: float) -> None:
+    began_ns = round(uptime_days * 86_400 * S)
+    for step in range(200):
+        t_ns = began_ns + step * 137 * MS
+        way_s = (t_ns - began_ns) / S
+        lat, lon = offset(48.0, 11.0, 20.0 * way_s, -10.0 * way_s)
+        gps = msgspec.structs.replace(GPS, t_ns=t_ns, lat_deg=lat, lon_deg=lon, ve_mps=20.0, vn_mps=-10.0)
+        said = over_the_wire(global_position.external_position_estimate(gps, 1))
+        stated_s = said.param1 - began_ns / S
+        assert 0.0 <= way_s - stated_s < 2.0 * np.spacing(np.float32(began_ns / S))
+        east_m, north_m = apart_m((48.0, 11.0), (said.x / 1e7, said.y / 1e7))
+        assert (east_m, north_m) == pytest.approx((20.0 * stated_s, -10.0 * stated_s), abs=0.05)
+
+
+def test_a_position_that_jumped_is_a_reset_in_local_poses() -> None:
+    for resets, counter in ((0, 0), (3, 3), (256, 0), (259, 3)):
+        gps = msgspec.structs.replace(GPS, resets=resets)
+        for encode in (local_pose.odometry, local_pose.vision_position):
+            assert over_the_wire(encode(gps, ORIGIN, BANKED, ardupilot=True)).reset_counter == counter
 
 
 def test_nmea_and_msp_go_to_devices_of_their_own_which_may_vanish() -> None:

@@ -50,10 +50,17 @@ def test_last_leap_second_is_18_and_table_grows_by_one_each() -> None:
         assert (date.month, date.day, date.hour, date.minute, date.second) in [(1, 1, 0, 0, 0), (7, 1, 0, 0, 0)]
 
 
-@pytest.mark.parametrize("year", [1970, 2000, 2024, 2200])
+@pytest.mark.parametrize("year", [1970, 2000, 2006, 2024, 2046, 2200])
 def test_a_board_without_a_clock_is_not_believed(year: int) -> None:
     assert not gps_time.plausible(unix_ns(f"{year}-06-01T00:00:00"))
     assert gps_time.plausible(unix_ns("2026-06-01T00:00:00"))
+
+
+def test_a_date_that_is_one_round_of_the_week_counter_off_is_not_plausible() -> None:
+    for utc in ("2025-01-01T00:00:00", "2026-06-01T00:00:00", "2044-06-01T00:00:00"):
+        assert gps_time.plausible(unix_ns(utc))
+        for rounds in (-1, 1):
+            assert not gps_time.plausible(unix_ns(utc) + rounds * 1024 * 7 * 24 * 3600 * S)
 
 
 class Autopilot:

@@ -20,6 +20,7 @@ from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.signature import generate
+from terrafix.link.transport import Address, Chunk
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
@@ -30,7 +31,7 @@ from terrafix_tools.preflight.autopilot import Autopilot
 from terrafix_tools.preflight.judge import changes_of, judge, names_of
 from terrafix_tools.preflight.lines import Line, Status, number
 from terrafix_tools.preflight.rules import Context
-from terrafix_tools.preflight.run import preflight
+from terrafix_tools.preflight.run import _of_vehicle, preflight
 from terrafix_tools.sim.autopilot.parameters import FIRMWARE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -117,6 +118,45 @@ def test_the_page_says_why_of_each_value_of_a_preset(name: str) -> None:
             f"{parameter}: the page has another value"
         )
         assert len(rows[parameter][2]) > 10
+
+
+TWO_PORTS = AS_IT_COMES | {"SERIAL2_PROTOCOL": 2}
+
+
+@pytest.mark.parametrize(
+    ("firmware", "changes", "link", "status", "says"),
+    [
+        ((4, 6), {"SERIAL2_PROTOCOL": -1}, {}, "ok", "no second MAVLink port"),
+        ((4, 6), {}, {}, "warn", r"800 bytes a second.*SERIAL1, SERIAL2.*set bit 10 \(1024\) of SERIALn_OPTIONS"),
+        ((4, 6), {}, {"rate_hz": 5.0}, "warn", "400 bytes a second"),
+        ((4, 7), {}, {}, "warn", r"set bit 1 \(2\) of MAVn_OPTIONS"),
+        ((4, 6), {"SERIAL2_OPTIONS": 1024}, {}, "warn", "SERIAL2 does not forward.*link.ground_devices"),
+        ((4, 7), {"MAV2_OPTIONS": 2}, {}, "warn", "SERIAL2 does not forward"),
+        ((4, 7), {"MAV2_OPTIONS": 1}, {}, "warn", "is forwarded"),
+        ((4, 6), {"SERIAL2_OPTIONS": 1026}, {"ground_devices": ["udpout:10.0.0.2:14550"]}, "ok", "stays off"),
+    ],
+)
+def test_it_says_how_to_keep_gps_input_off_the_telemetry(
+    firmware: tuple[int, int], changes: dict[str, float], link: dict[str, Any], status: str, says: str
+) -> None:
+    line = judged(TWO_PORTS | changes, Context(LinkSection(**link), True, 1, 5, firmware))["forwarding"]
+    assert line.status == status and re.search(says, f"{line.text} -> {line.fix}")
+
+
+def test_of_a_firmware_it_asks_the_parameters_that_it_has() -> None:
+    old, new = (set(names_of(Context(LinkSection(), True, 1, 5, firmware))) for firmware in ((4, 6), (4, 7)))
+    assert "SERIAL2_OPTIONS" in old and not {n for n in old if n.startswith("MAV")}
+    assert "MAV2_OPTIONS" in new and "SERIAL2_OPTIONS" not in new
+
+
+def test_which_firmware_flies_is_read_from_its_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr("terrafix_tools.preflight.run.names_of", lambda at: asked.append(at.firmware) or names_of(at))
+    for version in (4 << 24 | 6 << 16, 4 << 24 | 7 << 16):
+        with Autopilot(LinkSection(), GroundAutopilot(TWO_PORTS, version=version)) as autopilot:
+            autopilot.connect()
+            list(_of_vehicle(autopilot, Config()))
+    assert asked == [(4, 6), (4, 7)]
 
 
 @pytest.mark.parametrize(
@@ -241,14 +281,14 @@ class Streaming(GroundAutopilot):
         self.now_s += 0.001
         return self.now_s
 
-    def write(self, packet: bytes) -> bool:
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
         said = self._ear.decode(bytearray(packet))
         if said.get_type() == "COMMAND_LONG" and said.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             self._asked[int(said.param1)] = 1e6 / said.param2
             return True
         return super().write(packet)
 
-    def read(self) -> list[bytes]:
+    def read(self) -> list[Chunk]:
         before_s, self._read_s = getattr(self, "_read_s", 0.0), self.now_s
         for message_id, rate_hz in self._asked.items():
             each = rate_hz * self._share

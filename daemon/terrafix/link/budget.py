@@ -14,6 +14,7 @@ STEPS = 40  # in which rates are lowered together
 LEAST_HZ = {  # below this a stream is of no use; what is not named may go down to 1 Hz
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 10.0,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 2.0,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 2.0,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 2.0,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: 2.0,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 10.0,

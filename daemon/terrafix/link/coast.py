@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.link.boot_clock import boot_step_ms
 from terrafix.link.carry import metres_per_degree, offset
 from terrafix.link.fix import FIX_3D
 from terrafix.link.gnss import FIX_2D, RECEIVERS
@@ -128,7 +129,7 @@ class Coast:
 
 def _moved(last: LastFix, said: Filter, t_ns: int) -> Iterator[Coasted]:
     before = last.filter
-    coast_ms = said.boot_ms - before.boot_ms
+    coast_ms = boot_step_ms(before.boot_ms, said.boot_ms)
     if not 0 < coast_ms <= MAX_COAST_MS:
         return  # another boot, or another flight
     coast_s = coast_ms / 1e3

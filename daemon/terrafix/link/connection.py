@@ -10,7 +10,7 @@ from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
 from terrafix.link.framing import Framer
 from terrafix.link.signing import Signing, read_key
-from terrafix.link.transport import Transport, open_transport
+from terrafix.link.transport import PEERS_MAX, Address, Transport, UdpIn, UdpOut, open_transport
 
 REOPEN_NS = 1_000_000_000
 
@@ -34,19 +34,23 @@ class Connection:
         self._wall_clock_ns = wall_clock_ns
         self._signing = Signing(read_key(Path(config.signing_key)), link_id) if config.signing_key else None
         self._mav = mavlink.MAVLink(None, srcSystem=config.sysid, srcComponent=config.compid)  # packs what is sent
-        self._framer = Framer()
+        self._framers: dict[Address | None, Framer] = {}  # by sender: half a packet of one is not completed by another
         self._try_ns = 0
+        self.heard_bytes = 0
+        self.skipped_bytes = 0  # that belonged to no packet
         self.sent = self.sent_bytes = self.dropped = self.reopened = 0
         self.down = ""  # why there is no transport
 
     @property
-    def heard_bytes(self) -> int:
-        return self._framer.heard
+    def listens(self) -> bool:
+        """Several may speak, each from an address of its own."""
+        return self._config.device.startswith("udpin:")
 
     @property
-    def skipped_bytes(self) -> int:
-        """That belonged to no packet."""
-        return self._framer.skipped
+    def ignored(self) -> tuple[int, Address] | None:
+        """Datagrams from elsewhere than the one address that is heard, and the sender of the newest."""
+        wire = self._transport
+        return (wire.ignored, wire.ignored_from) if isinstance(wire, UdpOut) and wire.ignored_from else None
 
     @property
     def signed(self) -> bool:
@@ -57,8 +61,9 @@ class Connection:
         """Packets without the signature that is asked for."""
         return 0 if self._signing is None else self._signing.refused
 
-    def messages(self, now_ns: int) -> Iterator[Any]:
-        """What has come; opens again first when there is nothing to read from."""
+    def messages(self, now_ns: int) -> Iterator[tuple[Any, Address | None]]:
+        """What has come, with its sender on a listening port (None elsewhere); opens again first when there is nothing
+        to read from."""
         if self._transport is None:
             self._reopen(now_ns)
         if self._transport is None:
@@ -68,13 +73,29 @@ class Connection:
         except OSError as error:
             self._lost(error)
             return
-        for chunk in chunks:
-            for message in self._framer.packets(chunk):
+        for chunk, sender in chunks:
+            for message in self._packets(chunk, sender):
                 if self._signing is None or self._signing.accepts(message, self._wall_clock_ns()):
-                    yield message
+                    yield message, sender
 
-    def send(self, message: Any, sender: mavlink.MAVLink | None = None) -> None:
-        """Packs, signs and sends now, or not at all. ``sender``: somebody else than we (system and component)."""
+    def _packets(self, chunk: bytes, sender: Address | None) -> Iterator[Any]:
+        framer = self._framers.pop(sender, None) or Framer()
+        self._framers[sender] = framer  # the newest is the last
+        if len(self._framers) > PEERS_MAX:
+            del self._framers[next(iter(self._framers))]
+        self.heard_bytes += len(chunk)
+        skipped = framer.skipped
+        yield from framer.packets(chunk)
+        self.skipped_bytes += framer.skipped - skipped
+
+    def forget(self, peer: Address | None) -> None:
+        """A sender on a listening port that gets nothing of what goes to all."""
+        if isinstance(self._transport, UdpIn) and peer is not None:
+            self._transport.forget(peer)
+
+    def send(self, message: Any, sender: mavlink.MAVLink | None = None, *, to: Address | None = None) -> None:
+        """Packs, signs and sends now, or not at all. ``sender``: somebody else than we (system and component).
+        ``to``: see Transport.write."""
         mav = sender or self._mav
         if self._signing is not None:
             self._signing.prepare(mav, self._wall_clock_ns())
@@ -84,7 +105,7 @@ class Connection:
             self.dropped += 1
             return
         try:
-            if self._transport.write(packet):
+            if self._transport.write(packet, to):
                 self.sent += 1
                 self.sent_bytes += len(packet)
             elif self.heard_bytes:  # before anybody was heard there may be nobody to send to
@@ -111,6 +132,6 @@ class Connection:
         except (OSError, LinkError) as error:  # LinkError: a host name that cannot be resolved just now
             self.down = f"cannot be opened again ({error})"
             return
-        self._framer.reset()  # half a packet of the old connection must not swallow one of the new
+        self._framers.clear()  # half a packet of the old connection must not swallow one of the new
         self.down = ""
         self.reopened += 1

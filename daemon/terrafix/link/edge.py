@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
 from terrafix.link import gps_time
+from terrafix.link.admission import Admission
 from terrafix.link.budget import LineBudget
 from terrafix.link.coast import Coast
 from terrafix.link.connection import Connection
@@ -21,13 +22,14 @@ from terrafix.link.named_values import NamedValues
 from terrafix.link.outputs import Outputs
 from terrafix.link.partner import Partner
 from terrafix.link.resume import Resume
+from terrafix.link.served import AUTOPILOT_COMPONENT, Role
 from terrafix.link.side_output import open_side_outputs
 from terrafix.link.source_switch import SourceSwitch
 from terrafix.link.status import Status, StatusLog
 from terrafix.link.streams import STREAMS_HZ, Streams, wanted_of
-from terrafix.link.telemetry import AUTOPILOT_COMPONENT
 from terrafix.link.timesync import TimeSync
-from terrafix.link.transport import Transport, open_at_start
+from terrafix.link.transport import Address, Transport, open_at_start
+from terrafix.link.words import WARNING, words
 from terrafix.messages import (
     GpsInput,
     LinkStatus,
@@ -76,7 +78,11 @@ class MavlinkEdge:
         self._wall_clock_ns = wall_clock_ns
         self._connection = Connection(config, transport, wall_clock_ns)
         self._timesync = TimeSync()
-        self._partner = Partner(self._timesync, config.autopilot_sysid)
+        self._partner = Partner(self._timesync)
+        found = self._keeper.found
+        self._admission = Admission(config, listens=self._connection.listens, found=found)
+        self._served = self._admission.served
+        self._reboots = 0  # that telemetry knows of
         baud = config.baud if config.device.startswith("/") else None
         self._budget = LineBudget(baud, signed=self._connection.signed)
         self._streams = Streams(self._budget.fitting(STREAMS_HZ))
@@ -86,7 +92,6 @@ class MavlinkEdge:
         self._ground = GroundLinks(config, wall_clock_ns, self._hints)
         self._switch = SourceSwitch(config.gps_id)
         self._resume = Resume()
-        found = self._keeper.found
         self._coast = Coast(None if found is None else found.last, self._partner.telemetry.measured_ns)
         self._named_values = NamedValues()
         self._start: Place | None = None  # of the flight
@@ -95,6 +100,7 @@ class MavlinkEdge:
             config=config,
             wire=self._connection,
             partner=self._partner,
+            admission=self._admission,
             timesync=self._timesync,
             streams=self._streams,
             budget=self._budget,
@@ -112,10 +118,13 @@ class MavlinkEdge:
         said: list[Message] = []
         if self._takes_over and self._keeper.found is not None:
             self._takes_over = False
-            self._partner.telemetry.served(self._keeper.found, now_ns)
-        for message in self._connection.messages(now_ns):
-            said += self._take(message, now_ns)
-        said += self._ground.poll(now_ns, self._partner.sysid)
+            if self._served.sysid == self._keeper.found.autopilot.sysid:
+                self._partner.telemetry.served(self._keeper.found, now_ns)
+        for message, sender in self._connection.messages(now_ns):
+            said += self._take(message, sender, now_ns)
+        said += self._admission.verdicts(now_ns)
+        said += [self._warn(text, now_ns) for text in self._admission.pilot_texts(now_ns)]
+        said += self._ground.poll(now_ns, self._served.sysid)
         if self._connection.reopened != self._opened:  # a new connection: everything is asked for again
             self._opened = self._connection.reopened
             self._streams.restart()
@@ -141,7 +150,10 @@ class MavlinkEdge:
                 self._send_position(message)
                 self._resume.said(message)
                 self._coast.sent(message)
-                self._keeper.flies(self._coast.last, self._partner.telemetry.home_moved_m)
+                telemetry = self._partner.telemetry
+                self._keeper.flies(self._coast.last, telemetry.home_moved_m, telemetry.pressure_zero_m)
+                unix_ms = gps_time.unix_ms(message.time_week, message.time_week_ms)
+                self._keeper.timed(None if unix_ms is None else unix_ms * 1_000_000 - message.t_ns)
             case Origin():
                 if message.ground_amsl_m is not None:
                     self._start = Place(message.lat_deg, message.lon_deg, message.ground_amsl_m)
@@ -167,26 +179,38 @@ class MavlinkEdge:
 
     # --- in ---
 
-    def _take(self, message: Any, now_ns: int) -> Iterator[Message]:
+    def _take(self, message: Any, sender: Address | None, now_ns: int) -> Iterator[Message]:
         self._heard.packets += 1
         if self._config.view_sysid and message.get_srcSystem() == self._config.view_sysid:
             self.status.heard_view = True
             return  # our own view, by way of some router: not an autopilot
         self._heard.take(message)
+        role = self._admission.take(message, sender, now_ns)
+        if role is Role.REFUSED:
+            self._connection.forget(sender)
+        if role in (Role.REFUSED, Role.CONTRADICTS):
+            return
         kind = message.get_type()
         if kind == "TIMESYNC":
-            self._take_timesync(message, now_ns)
+            self._take_timesync(message, sender, role, now_ns)
             return
-        for said in self._hints.take(message, now_ns, {self._partner.sysid} - {0}):
+        for said in self._hints.take(message, now_ns, {self._served.sysid} - {0}):
             if isinstance(said, PositionHint):
                 yield said
             else:
-                self._send(said)
+                self._connection.send(said, to=sender)
+        if role is Role.AUTOPILOT:
+            yield from self._take_telemetry(message, now_ns)
+
+    def _take_telemetry(self, message: Any, now_ns: int) -> Iterator[Message]:
+        """Of the autopilot that is served."""
+        kind = message.get_type()
+        if self._admission.reboots != self._reboots:
+            self._reboots = self._admission.reboots
+            self._partner.telemetry.rebooted()
         yield from self._partner.take(message, now_ns, self._our_receiver())
-        if not self._partner.is_it(message):
-            return
         if kind == "HEARTBEAT":
-            self._keeper.heard(self._partner.telemetry.armed_autopilot)
+            self._keeper.heard(self._partner.telemetry.armed_autopilot, self._served.address)
             firmware = self._partner.firmware
             self._streams.serve(firmware, self._budget.fitting(wanted_of(firmware)))
         self._streams.heard(message.get_msgId())
@@ -202,22 +226,30 @@ class MavlinkEdge:
         """Which of the autopilot's receivers we are."""
         return self._config.gps_id if "gps_input" in self._outputs.names(self._partner.firmware) else None
 
-    def _take_timesync(self, message: Any, now_ns: int) -> None:
+    def _take_timesync(self, message: Any, sender: Address | None, role: Role, now_ns: int) -> None:
         if message.tc1 == 0:
-            self._send(mavlink.MAVLink_timesync_message(now_ns, message.ts1))
-        elif self._partner.is_it(message):
+            self._connection.send(mavlink.MAVLink_timesync_message(now_ns, message.ts1), to=sender)
+        elif role is Role.AUTOPILOT:
             self._answers += 1
             self._timesync.answer(message.tc1, message.ts1, now_ns)
 
     # --- out ---
 
     def _send(self, message: Any) -> None:
-        self._connection.send(message)
+        """To the autopilot that is served, and to nobody else."""
+        if self._served.reachable:
+            self._connection.send(message, to=self._served.address)
 
     def _say_to_people(self, message: Any) -> None:
-        """The autopilot hands it on to its ground stations; ours have their own links."""
-        self._send(message)
+        """The autopilot hands it on to its ground stations; others are on the same port; ours have their own links."""
+        self._connection.send(message)
         self._ground.say(message)
+
+    def _warn(self, text: str, now_ns: int) -> StatusText:
+        """-> what was sent to the pilot, for the record."""
+        said = words(now_ns, WARNING, text)
+        self.heard(said)
+        return said
 
     def _send_position(self, gps: GpsInput) -> None:
         """First of all to the autopilot: nothing may delay it."""
@@ -228,12 +260,12 @@ class MavlinkEdge:
         connected = self._partner.telemetry.connected(gps.t_ns)
         for value in self._named_values.messages(gps) if connected or len(self._ground) else ():
             if connected:
-                self._send(value)
+                self._connection.send(value)
             self._ground.say(value)
         self._ground.position(gps)
 
     def _requests(self, now_ns: int) -> Iterator[Any]:
-        sysid = self._partner.sysid
+        sysid = self._served.sysid
         yield from self._streams.requests(sysid, AUTOPILOT_COMPONENT, now_ns)
         yield from self._outputs.requests(self._start, self._partner.now(now_ns), now_ns)
         yield from self._switch.requests(sysid, now_ns)

@@ -35,11 +35,13 @@ PROOF_OF_BIG_STEP = Proof(5, 3.0)
 
 
 class EstimateGate:
-    """``accepted`` is the newest believed estimate; ``holding`` names the jump that is being proved, or is empty."""
+    """``accepted`` is the newest believed estimate; ``holding`` names the jump that is being proved, or is empty.
+    ``steps``: how many jumps were accepted."""
 
     def __init__(self) -> None:
         self.accepted: NavEstimate | None = None
         self.holding = ""
+        self.steps = 0
         self._candidate: NavEstimate | None = None
         self._candidate_since_ns = 0
         self._candidates = 0
@@ -85,6 +87,7 @@ class EstimateGate:
             self._needed = PROOF_OF_BIG_STEP
         held_s = (estimate.t_ns - self._candidate_since_ns) * 1e-9
         if self._candidates >= self._needed.estimates and held_s >= self._needed.seconds:
+            self.steps += 1
             return self._accept(estimate, f"step of {step_m:.0f} m after {self._candidates} estimates that agree")
         self.holding = f"step of {step_m:.0f} m, {self._candidates} of {self._needed.estimates} estimates agree"
         return Verdict.IMPLAUSIBLE, self.holding

@@ -2,8 +2,10 @@
 
 import math
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.link.carry import offset
 from terrafix.messages import GpsInput
 
 SENSOR_ID = 1  # 0 is no sensor to PX4: a slot of its filter whose EKF2_AGPn_ID is 0 is off
@@ -34,7 +36,16 @@ def global_position_sensor(gps: GpsInput, sysid: int) -> mavlink.MAVLink_global_
 
 def external_position_estimate(gps: GpsInput, sysid: int) -> mavlink.MAVLink_command_int_message:
     """ArduPilot takes it only as a COMMAND_INT, in a global frame, without a height (z NaN), and only while it has had
-    no position for a second. It is a hard reset of its filter, behind no gate."""
+    no position for a second. It is a hard reset of its filter, behind no gate.
+
+    Its time is a float of 32 bits, in seconds on our clock: after a day it knows steps of 8 ms, after 50 days of half a
+    second (11 m at 22 m/s). So the position is that of the newest moment that the message can state, at the velocity of
+    ``gps``. A clock that begins with the link would have finer steps, but begin anew with each restart in flight, which
+    ArduPilot takes for packets that are late (JitterCorrection)."""
+    t_s = gps.t_ns * 1e-9
+    stated_s = float32_not_above(t_s)
+    back_s = t_s - stated_s
+    lat_deg, lon_deg = offset(gps.lat_deg, gps.lon_deg, -back_s * gps.ve_mps, -back_s * gps.vn_mps)
     return mavlink.MAVLink_command_int_message(
         sysid,
         mavlink.MAV_COMP_ID_AUTOPILOT1,
@@ -42,11 +53,17 @@ def external_position_estimate(gps: GpsInput, sysid: int) -> mavlink.MAVLink_com
         mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE,
         0,
         0,
-        gps.t_ns * 1e-9,  # time of sending, seconds on our clock
+        stated_s,
         float(PROCESSING),
         gps.horiz_accuracy_m,
         0.0,
-        round(gps.lat_deg * 1e7),
-        round(gps.lon_deg * 1e7),
+        round(lat_deg * 1e7),
+        round(lon_deg * 1e7),
         math.nan,
     )
+
+
+def float32_not_above(value: float) -> float:
+    """The greatest number of 32 bits that is not above ``value``."""
+    near = np.float32(value)
+    return float(near if float(near) <= value else np.nextafter(near, np.float32(-math.inf)))

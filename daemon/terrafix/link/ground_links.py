@@ -34,13 +34,13 @@ class GroundLink:
         self._as_view = self.view.sender() if self.view is not None else None
 
     def poll(self, now_ns: int, systems: set[int]) -> Iterator[PositionHint]:
-        for message in self.connection.messages(now_ns):
+        for message, sender in self.connection.messages(now_ns):
             self.heard.take(message)
             for said in self._hints.take(message, now_ns, systems):
                 if isinstance(said, PositionHint):
                     yield said
                 else:
-                    self.connection.send(said)
+                    self.connection.send(said, to=sender)
             if self.view is not None:
                 self.send_as_view(self.view.answer(message))
 

@@ -57,6 +57,9 @@ class Hints:
             return
         if message.target_component not in (0, self._compid):
             return  # the autopilot's
+        if sender not in self._stations:  # a person gives a hint; nobody else addresses us
+            yield acknowledged(message, mavlink.MAV_RESULT_DENIED)
+            return
         lat_deg, lon_deg = math.nan, math.nan
         if message.get_type() == "COMMAND_LONG":
             lat_deg, lon_deg = message.param5, message.param6

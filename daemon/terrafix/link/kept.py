@@ -1,6 +1,6 @@
 """What a link leaves to the one that is started in its place: which autopilot it served, while that was armed, where
-its filter was with our last fix (coast.py), by how much its home was moved (core/takeoff_height.py), and how far off
-the map is (map_offset.py).
+its filter was with our last fix (coast.py), where its heights begin (pressure_height.py, core/takeoff_height.py), how
+far off the map is (map_offset.py), and by which time GPS_INPUT goes (gps_time.py).
 
 An autopilot says who it is once a second, and its attitude long before. Who knows it already can say where it leans
 with the first packet, which is what the estimator waits for after a restart in flight."""
@@ -11,7 +11,10 @@ import msgspec
 
 from terrafix.core.rundir import leave, left
 from terrafix.link.coast import LastFix
+from terrafix.link.transport import Address
 from terrafix.messages import MapOffset
+
+SAME_TIME_NS = 2_000_000
 
 
 class ArmedAutopilot(msgspec.Struct, frozen=True):
@@ -27,6 +30,9 @@ class Kept(msgspec.Struct, frozen=True):
     last: LastFix | None = None
     home_moved_m: float = 0.0
     map_offset: MapOffset | None = None
+    pressure_zero_m: float | None = None  # where it took off (pressure_height.PressureHeight)
+    peer: Address | None = None  # where it speaks from, on a listening port
+    unix_minus_monotonic_ns: int | None = None  # by which GPS_INPUT states the time (gps_time.LatchedClock)
 
 
 def kept(file: Path | None) -> Kept | None:
@@ -35,7 +41,8 @@ def kept(file: Path | None) -> Kept | None:
 
 
 class AutopilotKeeper:
-    """``heard`` after every HEARTBEAT of the autopilot, ``flies`` after each fix, ``learnt`` with each MapOffset.
+    """``heard`` after every HEARTBEAT of the autopilot, ``flies`` and ``timed`` after each fix, ``learnt`` with each
+    MapOffset.
 
     One that is not armed is not kept: a vehicle on the ground stands where its flight begins, and nobody may believe
     that of one that has taken off meanwhile."""
@@ -46,16 +53,25 @@ class AutopilotKeeper:
         self.found = kept(file)
         self._kept = self.found
 
-    def heard(self, autopilot: ArmedAutopilot | None) -> None:
+    def heard(self, autopilot: ArmedAutopilot | None, peer: Address | None = None) -> None:
         """None: it is not armed."""
         if autopilot is None:
             self._keep(None)
-        elif self._kept is None or self._kept.autopilot != autopilot:
-            self._keep(Kept(autopilot))
+        elif self._kept is None or (self._kept.autopilot, self._kept.peer) != (autopilot, peer):
+            self._keep(Kept(autopilot, peer=peer))
 
-    def flies(self, last: LastFix | None, home_moved_m: float) -> None:
+    def flies(self, last: LastFix | None, home_moved_m: float, pressure_zero_m: float | None = None) -> None:
         if self._kept is not None:
-            self._keep(msgspec.structs.replace(self._kept, last=last, home_moved_m=home_moved_m))
+            heights = {"home_moved_m": home_moved_m, "pressure_zero_m": pressure_zero_m}
+            self._keep(msgspec.structs.replace(self._kept, last=last, **heights))
+
+    def timed(self, unix_minus_monotonic_ns: int | None) -> None:
+        """With each GPS_INPUT, to the millisecond that it states: what differs by less is the same."""
+        before = None if self._kept is None else self._kept.unix_minus_monotonic_ns
+        if self._kept is None or unix_minus_monotonic_ns is None:
+            return
+        if before is None or abs(unix_minus_monotonic_ns - before) > SAME_TIME_NS:
+            self._keep(msgspec.structs.replace(self._kept, unix_minus_monotonic_ns=unix_minus_monotonic_ns))
 
     def learnt(self, map_offset: MapOffset) -> None:
         if self._kept is not None:

@@ -17,6 +17,7 @@ ARDUPILOT_M_PER_E7 = 0.011131884502145034
 PX4_RADIUS_M = 6_371_000.0  # of PX4's sphere (geo.h), on which it has an azimuthal equidistant projection
 YAW_UNKNOWN_RAD = math.pi  # 1-sigma: the attitude in these messages is the autopilot's own, and no news to it
 QUALITY_GOOD = 100  # of ODOMETRY; what is not good is not sent
+RESETS = 256  # reset_counter has 8 bits: a receiver sees that it has changed, and does not take the step for a motion
 _XX, _YY, _ZZ, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20  # diagonal of the upper triangle, row by row
 
 
@@ -105,6 +106,7 @@ def odometry(gps: GpsInput, origin: Place, attitude: Attitude, *, ardupilot: boo
         math.nan,
         pose_covariance(gps, ardupilot=ardupilot),
         velocity_cov,
+        reset_counter=gps.resets % RESETS,
         estimator_type=mavlink.MAV_ESTIMATOR_TYPE_VISION,
         quality=QUALITY_GOOD,
     )
@@ -120,6 +122,7 @@ def vision_position(
         attitude.pitch_rad,
         attitude.yaw_rad,
         pose_covariance(gps, ardupilot=ardupilot),
+        reset_counter=gps.resets % RESETS,
     )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 
 from terrafix.core.config import GnssMode
 from terrafix.core.node import Edge, NodeContext
-from terrafix.link import fix, gps_time, record
+from terrafix.link import fix, record
 from terrafix.link.announce import Announcer
 from terrafix.link.asking import Asking
 from terrafix.link.carry import Attitudes, carry
@@ -12,6 +12,7 @@ from terrafix.link.filter_watch import FilterWatch
 from terrafix.link.gate import EstimateGate
 from terrafix.link.gnss_start import GnssStarts
 from terrafix.link.gnss_watch import GnssWatch
+from terrafix.link.gps_time import LatchedClock
 from terrafix.link.kept import kept
 from terrafix.link.map_offset import MapOffsets
 from terrafix.link.pacer import Pacer
@@ -38,13 +39,13 @@ from terrafix.messages import (
 )
 
 TICK_HZ = 50.0  # as in the process table
-CLOCK_STEP_NS = 500_000_000  # a wall clock that moves less stays latched: the week keeps the monotonic clock's rhythm
 
 
 def make_node(ctx: NodeContext) -> "LinkNode":
     link, before = ctx.config.link, kept(ctx.kept)
     offsets = MapOffsets(None if before is None else before.map_offset) if link.map_offset else None
-    return LinkNode(link.rate_hz, link.gnss, gnss_start=link.gnss_start, map_offsets=offsets)
+    clock = LatchedClock(None if before is None else before.unix_minus_monotonic_ns)
+    return LinkNode(link.rate_hz, link.gnss, gnss_start=link.gnss_start, map_offsets=offsets, clock=clock)
 
 
 def make_edge(ctx: NodeContext) -> Edge:
@@ -58,7 +59,8 @@ def make_edge(ctx: NodeContext) -> Edge:
 
 
 class LinkNode:
-    """Hears estimates, says GpsInput at ``rate_hz``. ``map_offsets`` None: the map's error is not learnt."""
+    """Hears estimates, says GpsInput at ``rate_hz``. ``map_offsets`` None: the map's error is not learnt. ``clock``: of
+    the link before this one, of the same flight."""
 
     def __init__(
         self,
@@ -67,6 +69,7 @@ class LinkNode:
         *,
         gnss_start: bool = True,
         map_offsets: MapOffsets | None = None,
+        clock: LatchedClock | None = None,
     ) -> None:
         self._pacer = Pacer(rate_hz, TICK_HZ)
         self._gate = EstimateGate()
@@ -80,7 +83,8 @@ class LinkNode:
         self._start_holds = False  # the vehicle was seen on the ground, or the map has confirmed where it is
         self._now_ns = 0
         self._ground_amsl_m: float | None = None
-        self._unix_minus_monotonic_ns: int | None = None
+        self._clock = clock or LatchedClock()
+        self._week_sent = False
         self._heard_ns: int | None = None  # newest time of any plausible estimate: somebody has something to say
         self._anchored_ns: int | None = None  # time of the last map fix
         self._estimator_gone = ""
@@ -114,8 +118,8 @@ class LinkNode:
             case Start():
                 text = self._starts.answer(message)
                 return [] if text is None else [text]
-            case WallClock():
-                self._on_wall_clock(message)
+            case WallClock(unix_ns=int()):
+                return self._on_wall_clock(message)
             case ProcessEvent(process="estimator"):
                 return self._on_estimator_event(message)
             case Health():
@@ -151,13 +155,22 @@ class LinkNode:
             t_ns=estimate.t_ns, frame_id=estimate.frame_id, measurement="estimate", verdict=verdict, detail=detail
         )
 
-    def _on_wall_clock(self, clock: WallClock) -> None:
+    def _on_wall_clock(self, clock: WallClock) -> list[Message]:
         if clock.unix_ns is None:
-            return
-        offset_ns = clock.unix_ns - clock.t_ns
-        latched = self._unix_minus_monotonic_ns
-        if latched is None or abs(offset_ns - latched) > CLOCK_STEP_NS:
-            self._unix_minus_monotonic_ns = offset_ns
+            return []
+        in_flight = bool(self._armed) or (self._armed is None and self._week_sent)
+        why = self._clock.hear(clock.unix_ns, clock.t_ns, in_flight=in_flight)
+        if not why:
+            return []
+        return [
+            MeasurementVerdict(
+                t_ns=clock.t_ns,
+                frame_id=-1,
+                measurement="wall clock",
+                verdict=Verdict.IMPLAUSIBLE,
+                detail=f"{clock.source} clock {why}",
+            )
+        ]
 
     def _on_estimator_event(self, event: ProcessEvent) -> list[Message]:
         if event.event in ("died", "stuck", "gave_up"):
@@ -249,7 +262,8 @@ class LinkNode:
         self._no_fix_because = None
         caution = record.Caution(self._rung, self._unanchored_s(now_ns))
         accuracy = horizontal_m, vertical_m, speed_mps
-        return record.with_fix(carried, accuracy, self._week(carried.t_ns), caution, map_offset_m)
+        week, resets = self._week(carried.t_ns), self._gate.steps
+        return record.with_fix(carried, accuracy, week, caution, map_offset_m, resets=resets)
 
     def _no_fix(self, now_ns: int, why: fix.Why, age_ms: float) -> GpsInput:
         self._no_fix_because = why
@@ -257,7 +271,6 @@ class LinkNode:
         return record.no_fix(now_ns, why.text, age_ms, self._ground_amsl_m, self._week(now_ns), caution)
 
     def _week(self, t_ns: int) -> tuple[int, int]:
-        """(0, 0), "use the time of arrival", while no wall clock is plausible: a wrong week would set its clock."""
-        if self._unix_minus_monotonic_ns is None:
-            return 0, 0
-        return gps_time.week_and_ms(t_ns + self._unix_minus_monotonic_ns)
+        week = self._clock.week(t_ns)
+        self._week_sent = self._week_sent or week[0] > 0
+        return week

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.link.gnss import RECEIVERS, reading_of
 from terrafix.link.local_pose import Attitude, Place
 from terrafix.link.outputs import Autopilot
-from terrafix.link.telemetry import AUTOPILOT_COMPONENT, Telemetry
+from terrafix.link.telemetry import Telemetry
 from terrafix.link.timesync import TimeSync
 from terrafix.messages import FilterStatus, Message, VehicleState
 
@@ -18,11 +18,10 @@ SHARED_FLAGS = 2 * mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS - 1  # those below are t
 
 
 class Partner:
-    """``take`` every message of the wire."""
+    """``take`` every message of the autopilot that is served (served.py)."""
 
-    def __init__(self, timesync: TimeSync, only_sysid: int) -> None:
-        """``only_sysid``: its system id; 0: the first autopilot that is heard."""
-        self.telemetry = Telemetry(timesync, only_sysid)
+    def __init__(self, timesync: TimeSync) -> None:
+        self.telemetry = Telemetry(timesync)
         self._state: VehicleState | None = None  # the newest
         self._origin: Place | None = None  # of its filter
 
@@ -34,10 +33,6 @@ class Partner:
     def firmware(self) -> str:
         return self.telemetry.autopilot
 
-    def is_it(self, message: Any) -> bool:
-        """Not another vehicle, a gimbal or a ground station."""
-        return (message.get_srcSystem(), message.get_srcComponent()) == (self.sysid, AUTOPILOT_COMPONENT)
-
     def take(self, message: Any, now_ns: int, our_receiver: int | None) -> Iterator[Message]:
         """``our_receiver``: the GPS that is we ourselves, and no receiver; None: none is."""
         state = self.telemetry.take(message, now_ns)
@@ -46,8 +41,6 @@ class Partner:
                 self._state = state
             yield state
         kind = message.get_type()
-        if not self.is_it(message):
-            return
         if kind in RECEIVERS and RECEIVERS[kind] != our_receiver:
             yield reading_of(message, now_ns)
         elif kind == "GPS_GLOBAL_ORIGIN":

@@ -25,9 +25,11 @@ def with_fix(
     week: tuple[int, int],
     caution: Caution,
     map_offset_m: tuple[float, float],
+    *,
+    resets: int,
 ) -> GpsInput:
     """``accuracy``: horizontal and vertical [m], speed [m/s]; ``week``: GPS week and its millisecond; ``map_offset_m``:
-    what was taken out of ``carried``."""
+    what was taken out of ``carried``; ``resets``: jumps of the estimate that were accepted so far."""
     ve, vn, vu = carried.velocity_enu_mps
     return GpsInput(
         t_ns=carried.t_ns,
@@ -50,6 +52,7 @@ def with_fix(
         caution=caution.rung,
         unanchored_s=caution.unanchored_s,
         map_offset_m=map_offset_m,
+        resets=resets,
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from terrafix.core import logs
 from terrafix.core.config import LinkSection
+from terrafix.link.admission import Admission
 from terrafix.link.budget import LineBudget
 from terrafix.link.connection import Connection
 from terrafix.link.diagnosis import Heard, heard_on_ground, why_no_autopilot
@@ -31,6 +32,7 @@ class Status:
     config: LinkSection
     wire: Connection
     partner: Partner
+    admission: Admission
     timesync: TimeSync
     streams: Streams
     budget: LineBudget
@@ -55,10 +57,10 @@ class Status:
             bad=self.wire.skipped_bytes,
             refused=self.wire.refused,
             time_offset_ms=None if offset_ns is None else offset_ns / 1e6,
-            detail="; ".join(note for note in (*self._notes(connected), load) if note),
+            detail="; ".join(note for note in (*self._notes(connected, now_ns), load) if note),
         )
 
-    def _notes(self, connected: bool) -> Iterator[str]:
+    def _notes(self, connected: bool, now_ns: int) -> Iterator[str]:
         wire, outputs = self.wire, self.outputs.names(self.partner.firmware)
         yield wire.down
         if not connected and not wire.down:
@@ -69,12 +71,10 @@ class Status:
             yield f"{self.partner.firmware} is neither ArduPilot nor PX4; name in link.outputs what it takes"
         yield from (self.outputs.waits_for, self.switch.problem, *(o.problem for o in self.side_outputs))
         yield from self.ground.notes()
-        others = [str(sysid) for sysid in self.heard.autopilots() if sysid != self.partner.sysid]
-        if connected and others and not self.config.autopilot_sysid:
-            yield (
-                f"more than one autopilot: {self.partner.sysid} is served, {', '.join(others)} is not; "
-                "name yours in link.autopilot_sysid"
-            )
+        yield from self.admission.notes(now_ns)
+        if wire.ignored is not None:
+            count, (host, port) = wire.ignored
+            yield f"{count} packets ignored, the last from {host}:{port}; {self.config.device} hears that address alone"
         if connected:
             yield self.streams.problem()
         yield self.budget.too_slow(self.streams.wanted_hz, outputs, self.config.rate_hz)

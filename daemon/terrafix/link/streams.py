@@ -20,7 +20,8 @@ OLD_AFTER = 2  # windows without any effect or answer, after which the old reque
 STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 25.0,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 33.0,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,  # for relative_alt alone
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,  # for relative_alt alone: the zero of the height, and without
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 5.0,  # this the height itself (pressure_height.py)
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5.0,
@@ -31,12 +32,14 @@ PX4_HAS = {  # what PX4 says instead
     mavlink.MAVLINK_MSG_ID_RAW_IMU: mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
 }
-OPTIONAL = {  # not there without a second receiver; not everywhere; not without a sensor
+OPTIONAL = {  # not there without a second receiver; not everywhere; not without a sensor; there is another height
     mavlink.MAVLINK_MSG_ID_GPS2_RAW,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
     mavlink.MAVLINK_MSG_ID_AIRSPEED,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
 }
+NOT_OF_PX4 = {mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE}  # not tried there
 # Without a receiver, without a position, PX4 says nothing at all; its height above home is then in ALTITUDE.
 OPTIONAL_ON_PX4 = OPTIONAL | {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT}
 ONLY_PX4_HZ = {mavlink.MAVLINK_MSG_ID_ALTITUDE: 5.0}
@@ -56,7 +59,7 @@ GROUPS = {  # the group of REQUEST_DATA_STREAM that carries it (ArduPilot's SRn_
 def wanted_of(firmware: str) -> dict[int, float]:
     if firmware != "px4":
         return STREAMS_HZ
-    return {PX4_HAS.get(i, i): hz for i, hz in STREAMS_HZ.items()} | ONLY_PX4_HZ
+    return {PX4_HAS.get(i, i): hz for i, hz in STREAMS_HZ.items() if i not in NOT_OF_PX4} | ONLY_PX4_HZ
 
 
 class Streams:

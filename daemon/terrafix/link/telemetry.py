@@ -11,38 +11,37 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.core.airspeed import AirspeedReader
 from terrafix.core.imu import KINDS, Chooser, boot_ns, readings_of
 from terrafix.core.takeoff_height import TakeOffHeight
+from terrafix.link.boot_clock import NS_PER_MS, WRAP_MS
 from terrafix.link.diagnosis import NAMES
 from terrafix.link.kept import ArmedAutopilot, Kept
+from terrafix.link.pressure_height import PressureHeight
+from terrafix.link.served import AUTOPILOT_COMPONENT, is_autopilot_heartbeat
 from terrafix.link.timesync import TimeSync
 from terrafix.messages import Imu, ImuSample, VehicleState
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000  # three of its heartbeats
 FRESH_NS = 1_000_000_000  # an older height, or airspeed, is not that of this attitude
 MAX_TRANSPORT_NS = 500_000_000  # a mapped time further from its arrival than this is a wrong mapping
-BOOT_WRAP_NS = 2**32 * 1_000_000  # time_boot_ms has 32 bits: after 49.7 days it begins anew
-REBOOT_BACK_MS = 1_000  # boot time that steps back by more is a new boot
+BOOT_WRAP_NS = WRAP_MS * NS_PER_MS
 ATTITUDE_MAX_RAD = 4 * math.pi  # roll, pitch and yaw beyond any convention are garbage
 HEIGHT_MAX_M = 20_000.0
 # Readings are said in batches: at 33 Hz one or two a message. A frame's estimate waits for none of them, so that a
 # batch is not longer than the way of a picture through vision.
 IMU_BATCH_NS = 40_000_000
-# A ground station, a camera or another companion has a heartbeat too; an autopilot names its firmware.
-AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 
 class Telemetry:
-    """``take`` each decoded message; a VehicleState comes out with each ATTITUDE, an Imu with every few readings."""
+    """``take`` each decoded message of the autopilot that is served (served.py); a VehicleState comes out with each
+    ATTITUDE, an Imu with every few readings."""
 
-    def __init__(self, timesync: TimeSync, only_sysid: int = 0) -> None:
-        """``only_sysid``: the autopilot's system id; 0: the first autopilot that is heard."""
+    def __init__(self, timesync: TimeSync) -> None:
         self._timesync = timesync
-        self._only_sysid = only_sysid
         self._heartbeat_ns: int | None = None
         self._height: tuple[int, float] | None = None  # (arrival, metres above take-off)
         self._above = TakeOffHeight()
+        self._pressure = PressureHeight()
         self._airspeed: tuple[int, float] | None = None  # (arrival, m/s)
         self._airspeed_of = AirspeedReader()
-        self._boot_ms = 0
         self._armed: bool | None = None
         self._serves: ArmedAutopilot | None = None
         self._unix_minus_monotonic_ns: int | None = None
@@ -74,6 +73,8 @@ class Telemetry:
             self._take_height(message.relative_alt / 1000.0, message.alt / 1000.0, now_ns)
         elif kind == "ALTITUDE":
             self._take_height(message.altitude_relative, message.altitude_amsl, now_ns)
+        elif kind == "SCALED_PRESSURE":
+            self._pressure.read(message.press_abs, now_ns)
         elif kind == "AIRSPEED":
             if (airspeed_mps := self._airspeed_of.take(message)) is not None:
                 self._airspeed = (now_ns, airspeed_mps)
@@ -83,14 +84,23 @@ class Telemetry:
 
     def served(self, kept: Kept, now_ns: int) -> None:
         """By the link before this one, until a moment ago: as if its heartbeat had come now."""
-        if self._only_sysid in (0, kept.autopilot.sysid):
-            self._is_there(kept.autopilot, now_ns, armed=True)
-            self._above = TakeOffHeight(kept.home_moved_m)
+        self._is_there(kept.autopilot, now_ns, armed=True)
+        self._above = TakeOffHeight(kept.home_moved_m)
+        self._pressure = PressureHeight(kept.pressure_zero_m)
+
+    def rebooted(self) -> None:
+        """Heights were those of another boot."""
+        self._height, self._above, self._pressure = None, TakeOffHeight(), PressureHeight()
 
     @property
     def home_moved_m(self) -> float:
         """By how much home has risen since take-off."""
         return self._above.moved_m
+
+    @property
+    def pressure_zero_m(self) -> float | None:
+        """See PressureHeight."""
+        return self._pressure.zero_m
 
     @property
     def armed_autopilot(self) -> ArmedAutopilot | None:
@@ -102,34 +112,35 @@ class Telemetry:
         self.sysid, self.vehicle_type = autopilot.sysid, autopilot.vehicle
 
     def _take_heartbeat(self, message: Any, now_ns: int) -> None:
-        if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.get_srcComponent() != AUTOPILOT_COMPONENT:
+        if not is_autopilot_heartbeat(message):
             return
-        if self._only_sysid and message.get_srcSystem() != self._only_sysid:
-            return
-        if self.connected(now_ns) and message.get_srcSystem() != self.sysid:
-            return  # another vehicle on the same network
         heard = ArmedAutopilot(message.get_srcSystem(), int(message.autopilot), int(message.type))
         self._is_there(heard, now_ns, armed=bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED))
 
     def _take_height(self, relative_m: float, amsl_m: float, now_ns: int) -> None:
-        """Above take-off, by the barometer: without a sensor nobody knows the height above the ground beneath."""
+        """Above home, by the autopilot's filter."""
         if math.isfinite(relative_m) and abs(relative_m) < HEIGHT_MAX_M:
-            self._height = (now_ns, self._above.above(relative_m, amsl_m, self._armed))
+            above_m = self._above.above(relative_m, amsl_m, self._armed)
+            self._height = (now_ns, above_m)
+            self._pressure.align(above_m, self._armed, now_ns)
+
+    def _height_m(self, now_ns: int) -> float | None:
+        """Above take-off: without a sensor nobody knows the height above the ground beneath. By pressure; by the filter
+        where that is not told."""
+        by_pressure_m = self._pressure.height_m(now_ns)
+        return _fresh(self._height, now_ns) if by_pressure_m is None else by_pressure_m
 
     def _vehicle_state(self, message: Any, now_ns: int) -> VehicleState | None:
         angles = (message.yaw, message.pitch, message.roll)
         if not all(math.isfinite(a) and abs(a) <= ATTITUDE_MAX_RAD for a in angles):
             return None
-        if message.time_boot_ms < self._boot_ms - REBOOT_BACK_MS:
-            self._height, self._above = None, TakeOffHeight()  # take-off height of another boot
-        self._boot_ms = message.time_boot_ms
         return VehicleState(
             t_ns=self.measured_ns(message.time_boot_ms * 1_000_000, now_ns),
             source="mavlink",
             yaw_rad=math.remainder(message.yaw, math.tau),
             pitch_rad=message.pitch,
             roll_rad=message.roll,
-            agl_m=_fresh(self._height, now_ns),
+            agl_m=self._height_m(now_ns),
             armed=self._armed if self.connected(now_ns) else None,
             airspeed_mps=_fresh(self._airspeed, now_ns),
         )

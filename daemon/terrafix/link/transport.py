@@ -5,6 +5,7 @@ print. ``read`` and ``write`` raise OSError when the other side is gone; the edg
 
 import contextlib
 import errno
+import ipaddress
 import os
 import select
 import socket
@@ -19,16 +20,23 @@ CONNECT_S = 3.0  # a TCP peer that does not answer at start
 READ_MAX = 65_536  # bytes taken per look: a flood costs its share of a tick, not the tick
 DATAGRAMS_MAX = 200
 PEERS_MAX = 8  # who is answered on a listening port
+ANY_PORT = 0
 IN_PROGRESS = (errno.EINPROGRESS, errno.EWOULDBLOCK, errno.EALREADY)
 
 
+Address = tuple[str, int]
+Chunk = tuple[bytes, Address | None]  # the sender on a listening port; None where there is one other end only
+
+
 class Transport(Protocol):
-    def read(self) -> list[bytes]:
+    def read(self) -> list[Chunk]:
         """What has come, in order; empty when there is nothing."""
         ...
 
-    def write(self, packet: bytes) -> bool:
-        """False: there was no room (or nobody to send to) and the packet is lost; it is never sent late."""
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
+        """``to``: one peer of a listening port; None: all that it answers, or the other end.
+
+        False: there was no room (or nobody to send to) and the packet is lost; it is never sent late."""
         ...
 
     def close(self) -> None: ...
@@ -67,7 +75,7 @@ def open_transport(device: str, baud: int, *, wait: bool) -> Transport:
 
 
 @cache  # once per run, so that nothing in flight waits for a name server
-def _address(device: str, rest: str) -> tuple[str, int]:
+def _address(device: str, rest: str) -> Address:
     host, _, port = rest.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65_536:
         raise LinkError(f"link '{device}': needs HOST:PORT; write for example {device.split(':')[0]}:127.0.0.1:14550")
@@ -78,25 +86,33 @@ def _address(device: str, rest: str) -> tuple[str, int]:
 
 
 class _Udp:
-    def __init__(self) -> None:
+    def __init__(self, bind_to: Address | None) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        if bind_to is None:
+            return
+        try:
+            self._socket.bind(bind_to)
+        except OSError:
+            self._socket.close()
+            raise
 
-    def read(self) -> list[bytes]:
-        packets: list[bytes] = []
-        while len(packets) < DATAGRAMS_MAX:
+    def read(self) -> list[Chunk]:
+        chunks: list[Chunk] = []
+        for _ in range(DATAGRAMS_MAX):
             try:
                 data, sender = self._socket.recvfrom(READ_MAX)
             except (BlockingIOError, ConnectionRefusedError):
                 break
-            packets.append(data)
-            self._from(sender)
-        return packets
+            if (chunk := self._from(data, sender)) is not None:
+                chunks.append(chunk)
+        return chunks
 
-    def _from(self, sender: tuple[str, int]) -> None:
-        """Somebody spoke."""
+    def _from(self, data: bytes, sender: Address) -> Chunk | None:
+        """What becomes of a datagram; None: it is not for us."""
+        raise NotImplementedError
 
-    def _send(self, packet: bytes, to: tuple[str, int]) -> bool:
+    def _send(self, packet: bytes, to: Address) -> bool:
         try:
             return self._socket.sendto(packet, to) == len(packet)
         except OSError:  # no buffer, no route, nobody listening: UDP has no connection to lose
@@ -107,34 +123,47 @@ class _Udp:
 
 
 class UdpOut(_Udp):
-    def __init__(self, address: tuple[str, int]) -> None:
-        super().__init__()
-        self._to = address
+    """To one address, and heard from that one only; a loopback address is spoken to from loopback.
 
-    def write(self, packet: bytes) -> bool:
+    The socket is not connected: it would be tied to the address that this computer has now, and a network that is
+    not there yet would be an error. ``ignored``: datagrams of other senders, ``ignored_from`` the newest of them."""
+
+    def __init__(self, address: Address) -> None:
+        super().__init__(("127.0.0.1", ANY_PORT) if ipaddress.ip_address(address[0]).is_loopback else None)
+        self._to = address
+        self.ignored = 0
+        self.ignored_from: Address | None = None
+
+    def _from(self, data: bytes, sender: Address) -> Chunk | None:
+        if sender == self._to:
+            return data, None
+        self.ignored, self.ignored_from = self.ignored + 1, sender
+        return None
+
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
         return self._send(packet, self._to)
 
 
 class UdpIn(_Udp):
-    """Listens, and answers to everybody who has spoken (the last few of them)."""
+    """Listens, and answers who has spoken (the last few of them), less those that are to be forgotten."""
 
-    def __init__(self, address: tuple[str, int]) -> None:
-        super().__init__()
-        self._peers: dict[tuple[str, int], None] = {}
-        try:
-            self._socket.bind(address)
-        except OSError:
-            self._socket.close()
-            raise
+    def __init__(self, address: Address) -> None:
+        super().__init__(address)
+        self._peers: dict[Address, None] = {}
 
-    def _from(self, sender: tuple[str, int]) -> None:
+    def _from(self, data: bytes, sender: Address) -> Chunk | None:
         self._peers.pop(sender, None)
         self._peers[sender] = None
         while len(self._peers) > PEERS_MAX:
             del self._peers[next(iter(self._peers))]
+        return data, sender
 
-    def write(self, packet: bytes) -> bool:
-        return any([self._send(packet, peer) for peer in self._peers])
+    def forget(self, peer: Address) -> None:
+        """It gets nothing until it speaks again."""
+        self._peers.pop(peer, None)
+
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
+        return any([self._send(packet, peer) for peer in (self._peers if to is None else (to,))])
 
 
 class _Stream:
@@ -143,7 +172,7 @@ class _Stream:
     def __init__(self) -> None:
         self._rest = b""
 
-    def write(self, packet: bytes) -> bool:
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
         if self._rest:
             self._rest = self._rest[self._put(self._rest) :]
             if self._rest:
@@ -157,7 +186,7 @@ class _Stream:
 
 
 class Tcp(_Stream):
-    def __init__(self, address: tuple[str, int], *, wait: bool) -> None:
+    def __init__(self, address: Address, *, wait: bool) -> None:
         super().__init__()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # 10 Hz of small packets, each at once
@@ -174,7 +203,7 @@ class Tcp(_Stream):
             self._socket.close()
             raise
 
-    def read(self) -> list[bytes]:
+    def read(self) -> list[Chunk]:
         if not self._connected:
             if not select.select([], [self._socket], [], 0)[1]:
                 return []
@@ -185,7 +214,7 @@ class Tcp(_Stream):
             return []
         if not data:
             raise ConnectionResetError(errno.ECONNRESET, "the other side has closed")
-        return [data]
+        return [(data, None)]
 
     def _put(self, data: bytes) -> int:
         try:
@@ -212,14 +241,14 @@ class Serial(_Stream):
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
 
-    def read(self) -> list[bytes]:
+    def read(self) -> list[Chunk]:
         for _, events in self._poll.poll(0):
             if events & (select.POLLHUP | select.POLLERR | select.POLLNVAL):
                 raise OSError(errno.EIO, "the device is gone")
             data = os.read(self._fd, READ_MAX)
             if not data:  # ready, yet empty: a USB converter that was pulled
                 raise OSError(errno.EIO, "the device is gone")
-            return [data]
+            return [(data, None)]
         return []
 
     def _put(self, data: bytes) -> int:

@@ -195,7 +195,7 @@ class Autopilot:
             chunks = self._transport.read()
         except OSError as error:
             raise LinkError(f"{self._config.device}: connection lost ({error.strerror or error}); try again") from None
-        for chunk in chunks:
+        for chunk, _ in chunks:
             for message in self._framer.packets(chunk):
                 if self._signing is not None and not self._signing.accepts(message, time.time_ns()):
                     continue

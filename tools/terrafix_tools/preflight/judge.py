@@ -3,11 +3,11 @@
 from collections.abc import Iterable, Iterator, Sequence
 
 from terrafix.link.outputs import LOCAL
+from terrafix_tools.preflight import forwarding
+from terrafix_tools.preflight.forwarding import SERIALS, mavlink_ports
 from terrafix_tools.preflight.lines import Change, Line, Status, number, ok
 from terrafix_tools.preflight.rules import ALWAYS, EXTERNAL_NAV, GPS_INPUT_RULES, LOCAL_RULES, Context, Rule, Values
 
-SERIALS = range(10)
-MAVLINK_PROTOCOLS = (1.0, 2.0)
 SETS = (1, 2, 3)
 
 
@@ -16,7 +16,8 @@ def names_of(context: Context) -> list[str]:
     rules = [_name(rule, context) for rule in (*ALWAYS, *GPS_INPUT_RULES, *LOCAL_RULES)]
     sources = [f"EK3_SRC{k}_{what}" for k in SETS for what in ("POSXY", "VELXY", "YAW")]
     serial = [f"SERIAL{i}_{what}" for i in SERIALS for what in ("PROTOCOL", "BAUD")]
-    return list(dict.fromkeys([*rules, f"GPS{context.other}_TYPE", *sources, *serial]))
+    names = [*rules, f"GPS{context.other}_TYPE", *sources, *serial, *forwarding.names_of(context)]
+    return list(dict.fromkeys(names))
 
 
 def judge(values: Values, context: Context) -> Iterator[Line]:
@@ -34,6 +35,8 @@ def judge(values: Values, context: Context) -> Iterator[Line]:
         yield _source_set(values, local)
     if context.link.device.startswith("/"):
         yield _serial(values, context.link.baud)
+    if "gps_input" in outputs:
+        yield forwarding.forwarding(values, context)
     yield _identity(context)
 
 
@@ -88,9 +91,7 @@ def _source_set(values: Values, outputs: Sequence[str]) -> Line:
 
 def _serial(values: Values, baud: int) -> Line:
     """SERIALn_BAUD is in thousands for the usual speeds: 57 is 57600, 921 is 921600 (ArduPilot, AP_SerialManager)."""
-    ports = {
-        i: values.get(f"SERIAL{i}_BAUD") for i in SERIALS if values.get(f"SERIAL{i}_PROTOCOL") in MAVLINK_PROTOCOLS
-    }
+    ports = {i: values.get(f"SERIAL{i}_BAUD") for i in mavlink_ports(values)}
     same = [i for i, code in ports.items() if code is not None and code in (baud, baud // 1000)]
     if same:
         return ok("serial port", f"SERIAL{same[0]} speaks MAVLink at {baud} baud")

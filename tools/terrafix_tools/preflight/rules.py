@@ -22,6 +22,7 @@ class Context:
     plane: bool
     sysid: int
     delay_ms: int  # advice for GPSn_DELAY_MS
+    firmware: tuple[int, int] = (4, 6)  # major, minor
 
     @property
     def gps(self) -> int:

@@ -108,10 +108,10 @@ def _configured(config: Config, link: str, map_path: Path | None) -> Config:
 
 def _of_vehicle(autopilot: Autopilot, config: Config) -> list[Line]:
     round_trip_ms = autopilot.round_trip_ms()
-    context = Context(
-        config.link, autopilot.plane, autopilot.sysid, vehicle.delay_advice_ms(config.link, round_trip_ms)
-    )
     lines = list(vehicle.about(autopilot, config.link, round_trip_ms))
+    delay_ms = vehicle.delay_advice_ms(config.link, round_trip_ms)
+    firmware = vehicle.firmware_of(autopilot.newest.get(("AUTOPILOT_VERSION", autopilot.sysid)))
+    context = Context(config.link, autopilot.plane, autopilot.sysid, delay_ms, firmware)
     return lines + list(judge(autopilot.read(names_of(context)), context))
 
 

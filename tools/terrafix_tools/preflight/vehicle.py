@@ -10,12 +10,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.core.config import LinkSection
 from terrafix.link.streams import Streams
 from terrafix_tools.preflight.autopilot import Autopilot
+from terrafix_tools.preflight.forwarding import WIRE_BYTES
 from terrafix_tools.preflight.lines import Line, fail, ok, warn
 
 OLDEST = (4, 6)  # the firmware whose behaviour is known
 CLOCK_S = 2.0
 SLOW_MS = 100.0
-WIRE_BYTES = 80  # GPS_INPUT, signed 93
 BITS_PER_BYTE = 10  # 8N1
 DELAY_LEAST_MS, DELAY_MOST_MS = 5, 50
 LOOPBACK = ("127.", "localhost")
@@ -59,13 +59,18 @@ def save_mission(autopilot: Autopilot, path: Path) -> Line | None:
     return None
 
 
+def firmware_of(version: Any) -> tuple[int, int]:
+    """Major and minor of AUTOPILOT_VERSION; None: it did not come, and the oldest is assumed that is known."""
+    return OLDEST if version is None else (version.flight_sw_version >> 24, version.flight_sw_version >> 16 & 0xFF)
+
+
 def _firmware(kind: str, sysid: int, version: Any) -> Line:
     if version is None:
         return warn("firmware", f"{kind}, system {sysid}, does not say its version", "is it ArduPilot 4.6 or later?")
     number = version.flight_sw_version
     numbers = (number >> 24, number >> 16 & 0xFF, number >> 8 & 0xFF)
     text = f"{kind} {'.'.join(map(str, numbers))}, system {sysid}"
-    if numbers[:2] < OLDEST:
+    if firmware_of(version) < OLDEST:
         return fail("firmware", f"{text}: names and behaviour differ before 4.6", "update the autopilot")
     return ok("firmware", text)
 

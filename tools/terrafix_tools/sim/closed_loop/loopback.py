@@ -1,5 +1,7 @@
 """A wire in memory between the companion's MAVLink edge and an autopilot in the same process."""
 
+from terrafix.link.transport import Address, Chunk
+
 
 class Loopback:
     """The companion's ``Transport`` (link/transport.py) on one side, bytes for the autopilot on the other."""
@@ -8,11 +10,11 @@ class Loopback:
         self._to_companion: list[bytes] = []
         self._to_autopilot: list[bytes] = []
 
-    def read(self) -> list[bytes]:
+    def read(self) -> list[Chunk]:
         packets, self._to_companion = self._to_companion, []
-        return packets
+        return [(packet, None) for packet in packets]
 
-    def write(self, packet: bytes) -> bool:
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
         self._to_autopilot.append(packet)
         return True
 
