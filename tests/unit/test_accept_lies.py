@@ -99,6 +99,12 @@ def test_foreign_frames_are_consecutive_pictures_of_half_a_flight_away_mirrored(
 
 
 @pytest.mark.usefixtures("numbered")
+def test_a_fast_foreign_camera_passes_three_pictures_a_frame() -> None:
+    shown = [s.image[0, -1, 0] for s in flown(planned("fast foreign frames").edit)[40:50] if s.image is not None]
+    assert [int(b) - int(a) for a, b in pairwise(shown)] == [3] * 3 + [3 - FRAMES] + [3] * 5
+
+
+@pytest.mark.usefixtures("numbered")
 def test_foreign_frames_at_random_are_some_fifteen_per_cent_and_the_same_again() -> None:
     plan = planned("15 % foreign frames", flight(180))
     changed, again = ([i for i, grey in enumerate(greys(flown(plan.edit, 180))) if grey == 200] for _ in range(2))
@@ -134,6 +140,13 @@ def test_late_pictures_are_a_second_old_and_telemetry_is_not() -> None:
     found = flown(lying.late_pictures(1.0))
     assert greys(found)[:6] == [1, 1, 1, 2, 3, 4]
     assert all(s.frame.t_ns == s.states[0].t_ns == round(i * STEP_S * NS) for i, s in enumerate(found))
+
+
+def test_a_camera_that_falls_behind_plays_at_half_speed_and_is_live_again() -> None:
+    plan = planned("camera falls behind")
+    found, lie = greys(flown(plan.edit)), lie_of(plan)
+    assert (lie.from_s, lie.to_s) == (20.0, 35.0)
+    assert found[40:47] == [41, 41, 42, 42, 43, 43, 44] and found[69:72] == [55, 56, 72]
 
 
 def test_dropped_and_doubled_frames_lose_no_telemetry() -> None:

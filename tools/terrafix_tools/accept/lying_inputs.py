@@ -93,6 +93,26 @@ def late_pictures(lag_s: float) -> Edit:
     return edit
 
 
+def slow_pictures(span: Span, speed: float) -> Edit:
+    """From the beginning of ``span`` the pictures play at ``speed`` (below 1) of the true one: they fall behind, until
+    the camera is live again at its end. Times and telemetry are true."""
+
+    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
+        held: deque[tuple[float, Image]] = deque()
+        for shot in shots:
+            t_s = shot.frame.t_ns / 1e9
+            if shot.image is None or not span.has(t_s):
+                yield shot
+                continue
+            held.append((t_s, shot.image))
+            shown_s = span.from_s + speed * (t_s - span.from_s)
+            while len(held) > 1 and held[1][0] <= shown_s:
+                held.popleft()
+            yield replace(shot, image=held[0][1])
+
+    return edit
+
+
 def dropped_and_doubled(dropped: float, doubled: float, seed: int) -> Edit:
     """A share of the frames is missing, and a share comes twice, the second time half way to the next frame.
 
