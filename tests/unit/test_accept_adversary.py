@@ -84,7 +84,7 @@ def measured(names: tuple[str, ...], **values: float) -> list[JudgedRow]:
 
 def test_the_table_pools_flights_and_names_who_never_recovered() -> None:
     def line(place: str, **values: float) -> list[Line]:
-        rows = measured(PASSING, within_20_m=0.5, **values)
+        rows = measured(PASSING, near_at_all=0.5, **values)
         results = [Result(scenario="s", promise="", rows=rows, frames=100)]
         case = Case(place, Wanted(out=Path("out")))
         return lines_of(case, conclude(results, flight="", map_path="", quick=True, seed=1, whole=False))

@@ -56,7 +56,7 @@ def _line(place: str, result: Result) -> Line:
         scenario=result.scenario,
         place=place,
         frames=result.frames,
-        within_20m=value("within 20 m"),
+        within_20m=value("within 20 m", "near at all"),
         false_fixes=value("false fixes in all", "false fixes"),
         late_false_fixes=value("late false fixes", "false fixes"),
         notice_s=value("time to notice"),
