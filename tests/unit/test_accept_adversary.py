@@ -15,6 +15,8 @@ from terrafix_tools.accept.fly import Result
 from terrafix_tools.accept.judged import JudgedRow, Verdict
 from terrafix_tools.accept.run import Wanted
 from terrafix_tools.accept.table import conclude
+from terrafix_tools.sim.autopilot.parameters import Kind
+from terrafix_tools.sim.flights import make as making
 
 
 def image(path: Path, *, bands: int = 3, pixel_m: float = 0.5) -> None:
@@ -53,6 +55,35 @@ def test_another_town_is_another_folder_and_every_seed_has_its_flight(
     others = [c.wanted.other_map for c in cases[:3]]
     assert [o.parent.name for o in others if o] == ["b", "a", "b"]
     assert cases[2].wanted.map_path == tmp_path / "a" / "1.tif" and cases[2].wanted.lies
+
+
+def test_who_flies_over_an_image_is_the_first_with_room_and_a_flight_is_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair, tried = adversary.Pair("a", Path("a/1.tif"), Path("a/2.tif")), []
+
+    def make(out: Path, wanted: making.Wanted, *, progress: bool) -> None:
+        tried.append((wanted.vehicle, wanted.agl_m, wanted.seed, wanted.map_path))
+        if wanted.vehicle is Kind.PLANE:
+            raise UsageError("no room")
+        out.mkdir()
+
+    monkeypatch.setattr(making, "make", make)
+    adversary._make(tmp_path / "a", pair, 7)
+    assert (tmp_path / "a").is_dir() and [t[0] for t in tried] == [Kind.PLANE, Kind.COPTER]
+    assert tried[1][1:] == (110.0, 7, Path("a/2.tif"))
+    adversary._make(tmp_path / "a", pair, 7)
+    assert len(tried) == 2
+    monkeypatch.setattr(adversary, "FLOWN_BY", ((Kind.PLANE, 130.0),))
+    with pytest.raises(UsageError, match=r"1\.tif: no flight has room over it; no room"):
+        adversary._make(tmp_path / "b", pair, 7)
+
+
+def test_a_mistake_on_the_command_line_is_a_line(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="nowhere to fly"):
+        adversary.main(tmp_path)
+    with pytest.raises(UsageError, match="write numbers"):
+        adversary.main(tmp_path, generated=True, seeds="one")
 
 
 def test_a_flight_is_named_with_its_map(tmp_path: Path) -> None:

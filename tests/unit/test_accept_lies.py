@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import rasterio
@@ -147,6 +148,27 @@ def test_a_camera_that_falls_behind_plays_at_half_speed_and_is_live_again() -> N
     found, lie = greys(flown(plan.edit)), lie_of(plan)
     assert (lie.from_s, lie.to_s) == (20.0, 35.0)
     assert found[40:47] == [41, 41, 42, 42, 43, 43, 44] and found[69:72] == [55, 56, 72]
+
+
+def test_half_of_the_picture_is_that_of_the_first_frame() -> None:
+    found = flown(planned("half the picture stands still").edit)
+    for i, shot in enumerate(found[1:], start=1):
+        assert shot.image is not None
+        assert (shot.image[:2, :4] == i + 1).all() and (shot.image[2:, :4] < 12).all()
+    assert not np.array_equal(found[1].image[2:], found[2].image[2:])  # type: ignore[index]
+
+
+def test_late_telemetry_comes_later_with_a_time_of_its_own_and_none_is_lost() -> None:
+    found = flown(planned("telemetry 2 s late").edit)
+    assert [len(s.states) for s in found[:6]] == [0, 0, 0, 0, 1, 1]
+    for name in ("states", "imu"):
+        said = [m for s in found for m in getattr(s, name)]
+        assert [m.t_ns for m in said] == [round(i * STEP_S * NS) for i in range(4, FRAMES)]
+    true = list(shots())
+    edited = lying.late_telemetry(2.0)(
+        replace(s, states=(msgspec.structs.replace(s.states[0], agl_m=float(i)),)) for i, s in enumerate(true)
+    )
+    assert [s.states[0].agl_m for s in list(edited)[4:7]] == [0.0, 1.0, 2.0]
 
 
 def test_dropped_and_doubled_frames_lose_no_telemetry() -> None:

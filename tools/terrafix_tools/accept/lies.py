@@ -15,6 +15,7 @@ FRAMES = 90  # of a generated flight: 45 s
 FROZEN_S, FORGED_S, LATE_S = 15.0, 10.0, 1.0
 BUFFERS = 4
 HALF_SPEED = 0.5
+STILL_SHARE, LATE_TELEMETRY_S = 0.5, 2.0
 MAP_SHIFT_M, SMALL_SHIFT_M = (212.0, -212.0), (100.0, 80.0)  # east, north: 300 m; 128 m, as between two datums
 DROPPED, DOUBLED = 0.15, 0.15
 _scenario = partial(Scenario, frames=FRAMES)
@@ -150,6 +151,18 @@ LIES: tuple[Scenario, ...] = (
         "For 15 s the pictures play at half their speed, then the camera is live.",
         PASSING,
         plans.for_seconds(FROZEN_S, "slow", lambda span: lying.slow_pictures(span, HALF_SPEED)),
+    ),
+    _scenario(
+        "half the picture stands still",
+        "The lower half of every picture shows a part of the vehicle, from the first frame on.",
+        LASTING,
+        plans.throughout("half of it stands still", edit=lying.partly_frozen(STILL_SHARE, SEED)),
+    ),
+    _scenario(
+        "telemetry 2 s late",
+        "All that the autopilot reports is two seconds old when it gets its time.",
+        (*LASTING, "late sure over 20 m"),
+        plans.throughout("late telemetry", edit=lying.late_telemetry(LATE_TELEMETRY_S)),
     ),
     _scenario(
         "pictures 1 s late",

@@ -14,8 +14,9 @@ import msgspec
 import numpy as np
 
 from terrafix.core.node import Image
-from terrafix.messages import Origin, VehicleState
+from terrafix.messages import Imu, Origin, VehicleState
 from terrafix.vision.sources import Shot
+from terrafix.vision.sources.contract import Said
 from terrafix_tools.accept.faults import Edit, StateEdit, telemetry
 from terrafix_tools.accept.judged import Span
 
@@ -111,6 +112,49 @@ def slow_pictures(span: Span, speed: float) -> Edit:
             yield replace(shot, image=held[0][1])
 
     return edit
+
+
+def partly_frozen(share: float, seed: int) -> Edit:
+    """The lower ``share`` of each picture is that of the first one, with new noise: a part of the vehicle in view."""
+
+    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
+        rng = np.random.default_rng([seed, 73])
+        first: Image | None = None
+        for shot in shots:
+            if shot.image is None:
+                yield shot
+                continue
+            first = shot.image if first is None else first
+            rows = round(share * len(first))
+            image = shot.image.copy()
+            image[-rows:] = _noisy(first[-rows:], NOISE_GREY, rng)
+            yield replace(shot, image=image)
+
+    return edit
+
+
+def late_telemetry(lag_s: float) -> Edit:
+    """What the vehicle reports comes ``lag_s`` later, with the time at which it comes; pictures are not late."""
+
+    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
+        lag_ns = round(lag_s * 1e9)
+        states: deque[VehicleState] = deque()
+        imu: deque[Imu] = deque()
+        for shot in shots:
+            states += [msgspec.structs.replace(s, t_ns=s.t_ns + lag_ns) for s in shot.states]
+            imu += [msgspec.structs.replace(i, t_ns=i.t_ns + lag_ns) for i in shot.imu]
+            due_ns = shot.frame.t_ns
+            yield replace(shot, states=_due(states, due_ns), imu=_due(imu, due_ns))
+
+    return edit
+
+
+def _due(waiting: deque[Said], t_ns: int) -> tuple[Said, ...]:
+    """Takes what was said up to ``t_ns`` out of ``waiting``."""
+    due = []
+    while waiting and waiting[0].t_ns <= t_ns:
+        due.append(waiting.popleft())
+    return tuple(due)
 
 
 def dropped_and_doubled(dropped: float, doubled: float, seed: int) -> Edit:
