@@ -48,7 +48,7 @@ def test_five_frames_count_where_they_last_longer_than_three_seconds(tmp_path: P
 
 
 def test_false_fixes_before_and_after_the_lie_are_always_late(tmp_path: Path) -> None:
-    found = flight(tmp_path, f3=FALSE, f12=FALSE, f22_23=FALSE)
+    found = flight(tmp_path, f3=FALSE, f10=FALSE, f22_23=FALSE)  # frame 10 is the first of the lie
     assert of.late_false_fixes(found).value == 3.0
     assert of.false_fixes_in_all(found) == of.Measured(4.0, "1 before the lie, 1 in it, 2 after it")
 
@@ -69,6 +69,9 @@ def test_recovery_counts_frames_after_the_end_until_three_in_a_row_are_right(tmp
     assert of.recovery_frames(flight(tmp_path / "a")).value == 1.0
     assert of.recovery_frames(flight(tmp_path / "b", f21_23=COVERED)).value == 4.0
     assert of.recovery_frames(flight(tmp_path / "c", f21_23=COVERED, f25=SLIGHTLY)).value == 6.0
+    assert (
+        of.recovery_frames(flight(tmp_path / "last", f21_56=COVERED)).value == 37.0
+    )  # the last three frames are right
     never = of.recovery_frames(flight(tmp_path / "d", f21_59=SLIGHTLY))
     assert never.value is None and never.verdict is Verdict.BELOW
     assert judge("a", ("recovery",), flight(tmp_path / "e", f21_31=COVERED))[0].verdict is Verdict.BELOW
