@@ -8,7 +8,7 @@ import numpy as np
 
 from terrafix_tools.accept.evidence import Evidence, Seen
 from terrafix_tools.accept.judged import Measured, Span, Verdict
-from terrafix_tools.evaluate import FALSE_FIX_ERROR_M, FALSE_FIX_MAHALANOBIS2
+from terrafix_tools.evaluate import FALSE_FIX_ERROR_M, is_false_fix
 
 ALLOWED_S, ALLOWED_FRAMES = 3.0, 5  # from the beginning of a lie: what a fix takes to be withdrawn
 RECOVERED_M, RECOVERED_FRAMES = 20.0, 3  # back: so near, not false, and for so many frames in a row
@@ -80,7 +80,7 @@ def claim_width(e: Evidence) -> Measured:
     """Median claimed 1-sigma over the 1-sigma that the median error of the same frames shows; 1 when true.
 
     Only frames before the lie and after its end, with a position."""
-    frames = [f for f in e.frames if f.compared and f.error_m is not None and not in_lie(e, f)]
+    frames = [f for f in e.frames if f.error_m is not None and not in_lie(e, f)]
     claims = [
         math.sqrt(0.5 * (f.row.sigma_e_m**2 + f.row.sigma_n_m**2))
         for f in frames
@@ -96,11 +96,8 @@ def claim_width(e: Evidence) -> Measured:
 
 
 def is_false(frame: Seen, beyond_m: float = FALSE_FIX_ERROR_M) -> bool:
-    """Wrong by more than ``beyond_m`` and by more than 3 sigma of its own claim."""
-    if frame.compared is None or frame.error_m is None or frame.error_m <= beyond_m:
-        return False
-    distance2 = frame.compared.mahalanobis2
-    return distance2 is None or distance2 > FALSE_FIX_MAHALANOBIS2
+    """A frame without truth is not."""
+    return frame.compared is not None and is_false_fix(frame.compared, beyond_m)
 
 
 def in_lie(e: Evidence, frame: Seen) -> bool:
