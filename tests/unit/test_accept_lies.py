@@ -117,8 +117,18 @@ def test_foreign_frames_at_random_are_some_fifteen_per_cent_and_the_same_again()
 def test_frames_of_elsewhere_come_in_reverse_and_are_far_away() -> None:
     found = greys(flown(planned("elsewhere in reverse").edit))[40:50]
     assert [b - a for a, b in pairwise(found)] == [-1] * 9
-    assert all(abs(grey - 1 - i) * STEP_M >= 350.0 for i, grey in enumerate(found, start=40))
-    assert "350 m apart" in str(BY_NAME["elsewhere in reverse"].plan(flight(30)))
+    assert found[0] == FRAMES  # the last picture is the farthest
+    slow = {f"{i}.jpg": Truth(48.0 + i * 1e-5, 11.0) for i in range(FRAMES)}  # 111 m in all
+    assert "150 m apart" in str(BY_NAME["elsewhere in reverse"].plan(replace(flight(), truth=slow)))
+
+
+@pytest.mark.usefixtures("numbered")
+def test_the_part_that_comes_in_reverse_has_ten_frames_before_it() -> None:
+    """A flight that stands from frame 40 on: its first frame is the farthest, and nothing comes before that."""
+    place = LocalFrame(48.0, 11.0)
+    truth = {f"{i}.jpg": Truth(*place.to_wgs84(0.0, min(i, 40) * STEP_M)) for i in range(FRAMES)}
+    plan = planned("elsewhere in reverse", replace(flight(), truth=truth))
+    assert greys(flown(plan.edit))[40:50] == [10, 9, 8, 7, 6, 5, 4, 3, 2, 1]
 
 
 def test_a_frozen_picture_has_new_noise_each_time() -> None:
@@ -242,7 +252,10 @@ def test_the_camera_is_not_as_described() -> None:
 
 def test_a_start_that_is_wrong_or_not_known() -> None:
     off = planned("start 300 m off").origin(ORIGIN)
-    assert np.hypot(*LocalFrame(48.0, 11.0).to_local(off.lat_deg, off.lon_deg)) == pytest.approx(300.0, abs=1.0)
+    # Towards the middle of the flight, which goes north.
+    assert LocalFrame(48.0, 11.0).to_local(off.lat_deg, off.lon_deg) == pytest.approx((212.0, 212.0), abs=0.5)
+    lie = lie_of(planned("start 300 m off"))
+    assert lie.from_s == lie.to_s == 0.0
     assert off.start_sigma_m == 50.0
     assert start_is_unknown(planned("start unknown").origin(ORIGIN))
     other = planned("another town's map, no start")
@@ -287,6 +300,40 @@ def test_maps_that_lie(tmp_path: Path) -> None:
     with rasterio.open(out) as source:
         assert source.transform.a == pytest.approx(2.2)
         assert source.transform @ (30, 20) == pytest.approx(true @ (30, 20), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "east_m", "north_m", "pixel_m"),
+    [
+        ("map shifted by 300 m", 212.0, -212.0, 2.0),
+        ("map in another datum", 100.0, 80.0, 2.0),
+        ("map 10 % too large", 0.0, 0.0, 2.2),
+    ],
+)
+def test_a_scenario_flies_with_the_map_that_it_names(
+    tmp_path: Path, name: str, east_m: float, north_m: float, pixel_m: float
+) -> None:
+    given, out = tmp_path / "given.tif", tmp_path / "out.tif"
+    write_map(given)
+    plan = planned(name, flight(map_path=given))
+    assert plan.other_map is not None and plan.other_map(given, out) == ""
+    with rasterio.open(given) as source:
+        middle = source.transform @ (30, 20)
+    with rasterio.open(out) as source:
+        moved = np.array(source.transform @ (30, 20)) - middle
+        assert moved == pytest.approx([east_m, north_m], abs=2.0) and source.transform.a == pytest.approx(pixel_m)
+    lie = lie_of(plan)
+    assert (lie.from_s, lie.to_s) == (0.0, (FRAMES - 1) * STEP_S) and plan.origin(ORIGIN) == ORIGIN
+
+
+def test_without_the_map_of_another_town_the_own_one_is_mirrored(tmp_path: Path) -> None:
+    given, out = tmp_path / "given.tif", tmp_path / "out.tif"
+    image = write_map(given)
+    plan = planned("another town's map", flight(map_path=given))
+    assert plan.other_map is not None and plan.other_map(given, out) == ""
+    with rasterio.open(out) as source:
+        assert (source.read() == image[:, :, ::-1]).all()
+    assert plan.origin(ORIGIN).start_sigma_m == 50.0
 
 
 def test_another_town_is_put_where_the_map_was_and_keeps_the_size_of_its_pixels(tmp_path: Path) -> None:
