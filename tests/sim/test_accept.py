@@ -46,3 +46,17 @@ def test_a_scenario_that_does_not_exist_is_one_clear_line(tmp_path: Path) -> Non
         [*COMMAND, "--scenario", "moon", "--out", str(tmp_path)], capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 2 and done.stderr.strip().count("\n") == 0 and "'moon': not a scenario" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_map_that_lies_is_made_flown_and_judged_by_the_rows_of_lies(tmp_path: Path) -> None:
+    out = tmp_path / "accept"
+    command = [*COMMAND, "--quick", "--workers", "1", "--out", str(out), "--scenario", "map shifted by 300 m"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    table = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
+    (result,) = table["results"]
+    assert result["frames"] == 90 and result["nees"] == []  # no frame has true inputs
+    rows = {row["what"]: row for row in table["rows"]}
+    assert rows["frames within 20 m, shown only"]["measured"] < 0.1  # the map is really off
+    assert rows["false fixes later than 3 s and 5 frames into the lie"]["measured"] == 0.0
+    assert done.returncode == (1 if table["broken"] else 0), done.stderr

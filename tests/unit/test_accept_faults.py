@@ -18,7 +18,8 @@ from terrafix_tools.accept import faults
 from terrafix_tools.accept.fault_nodes import FrameNames, HotComputer, WrongFixes
 from terrafix_tools.accept.flight import Flight, Stop, read_any_truth
 from terrafix_tools.accept.judged import Span
-from terrafix_tools.accept.scenarios import BY_NAME, Plan
+from terrafix_tools.accept.plan import Plan
+from terrafix_tools.accept.scenarios import BY_NAME
 from terrafix_tools.accept.stale_map import stale_along
 from terrafix_tools.evaluate import Truth
 
@@ -60,7 +61,7 @@ class Counting:
 
 
 def altered(edit: faults.Edit, **more: object) -> list[Shot]:
-    source = faults.AlteredSource(Counting(), edit, start=faults.same_origin, **more)  # type: ignore[arg-type]
+    source = faults.AlteredSource(Counting(), edit, origin=faults.same_origin, **more)  # type: ignore[arg-type]
     return list(source.shots())
 
 

@@ -2,18 +2,22 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
+from accept_case import Said, evidence
+from rich.console import Console
 
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix_tools.accept import run
+from terrafix_tools.accept import fly, run
 from terrafix_tools.accept.criteria import EVERYWHERE, unmeasured
 from terrafix_tools.accept.fly import Job, Point, Result
-from terrafix_tools.accept.judged import JudgedRow, Span, Verdict
+from terrafix_tools.accept.judged import JudgedRow, Marks, Span, Verdict
+from terrafix_tools.accept.lies import LIES
 from terrafix_tools.accept.run import Wanted, accept, truth_of
 from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
 from terrafix_tools.accept.table import conclude, headline, markdown, write
@@ -89,6 +93,33 @@ def test_the_three_files_agree(tmp_path: Path) -> None:
     assert page.count("<figure") == 1 and "a &lt;flight&gt;" in page and "dark &amp; cold" in page
     assert not re.search(r'(src|href)="', page)  # one file, works offline
     assert headline(acceptance).startswith("1 scenarios flown: 1 pass, 1 below floor")
+
+
+def test_lies_are_flown_instead_of_the_ordinary_scenarios_and_any_by_its_name() -> None:
+    out = Path("out")
+    assert run._chosen(Wanted(out=out)) == list(SCENARIOS)
+    assert run._chosen(Wanted(out=out, lies=True)) == list(LIES)
+    named = Wanted(out=out, scenarios=("ten foreign frames", "baseline"))
+    assert [s.name for s in run._chosen(named)] == ["baseline", "ten foreign frames"]
+
+
+def test_a_job_names_the_other_map_and_a_quick_one_is_short(tmp_path: Path) -> None:
+    wanted = Wanted(out=tmp_path, flight="f", truth=Path("t"), other_map=Path("town.tif"), quick=True)
+    jobs = run._jobs(wanted, [BY_NAME["start 300 m off"], BY_NAME["photos every 155 m"]], Console())
+    assert {job.other_map for job in jobs.values()} == {"town.tif"}
+    assert [jobs[name].frames for name in ("start 300 m off", "photos every 155 m")] == [90, run.QUICK_FRAMES]
+    whole = run._jobs(replace(wanted, quick=False), [BY_NAME["start 300 m off"]], Console())
+    assert whole["start 300 m off"].frames is None
+
+
+def test_frames_in_a_lie_say_nothing_of_the_claims(tmp_path: Path) -> None:
+    lie = Span(5.0, 10.0, "lie")
+    frames = [Said(error_m=3.0)] * 10 + [Said(error_m=90.0)] * 11 + [Said(error_m=3.0)] * 9
+    found = evidence(tmp_path, frames, Marks(spans=(lie,), lie=lie))
+    found.summary["wall_s"] = 1.0
+    judged = fly._result(BY_NAME["ten foreign frames"], found)
+    assert len(judged.nees) == 19 and max(judged.nees) < 1.0
+    assert judged.claim_width == pytest.approx(5.0 * 1.1774 / 3.0, rel=0.01)
 
 
 def test_a_kept_result_is_of_the_very_same_job(tmp_path: Path) -> None:

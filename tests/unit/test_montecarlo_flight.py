@@ -13,7 +13,7 @@ from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
 from terrafix.estimator.tracker import Tracker
 from terrafix.messages import MapMatch, Prediction, Verdict
-from terrafix_tools.montecarlo.fault import Fault
+from terrafix_tools.montecarlo.fault import LIES, Fault
 from terrafix_tools.montecarlo.faults import JUMP_M, JUMPS, Faults
 from terrafix_tools.montecarlo.flight import run
 from terrafix_tools.montecarlo.flown import Flown, Shot, fly
@@ -39,7 +39,7 @@ def test_a_number_is_a_flight_and_the_rounds_have_every_fault() -> None:
     assert plan(3, 7) != plan(4, 7)
     faults = [plan(1, n).fault for n in range(12)]
     assert faults.count(Fault.NONE) == 4
-    assert set(faults) == set(Fault) - {Fault.HILLS, Fault.PHOTOS}
+    assert set(faults) == set(Fault) - {Fault.HILLS, Fault.PHOTOS, *LIES}
     assert all(abs(plan(1, n, fault=Fault.HEIGHT).height_scale - 1.0) == pytest.approx(0.1) for n in range(4))
 
 
@@ -208,7 +208,15 @@ def test_the_command_writes_its_table_and_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"flights": 0}, {"first": -1}, {"duration_s": 5.0}, {"duration_s": float("nan")}, {"workers": 0}]
+    "wrong",
+    [
+        {"flights": 0},
+        {"first": -1},
+        {"duration_s": 5.0},
+        {"duration_s": float("nan")},
+        {"workers": 0},
+        {"lie_share": 5.0},
+    ],
 )
 def test_what_cannot_be_flown_is_said_in_a_line(tmp_path: Path, wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):

@@ -94,6 +94,13 @@ def compare(rows: list[Row], truth: dict[str, Truth]) -> list[Compared]:
     return compared
 
 
+def is_false_fix(compared: Compared, beyond_m: float = FALSE_FIX_ERROR_M) -> bool:
+    """Wrong by more than ``beyond_m`` and by more than 3 sigma of its own claim; no position is not false."""
+    if compared.error_m is None or compared.error_m <= beyond_m:
+        return False
+    return compared.mahalanobis2 is None or compared.mahalanobis2 > FALSE_FIX_MAHALANOBIS2
+
+
 def _errors(errors_m: list[float], frames: int, prefix: str) -> dict[str, float | None]:
     out: dict[str, float | None] = {
         f"{prefix}within_{limit}m": sum(e <= limit for e in errors_m) / frames for limit in LIMITS_M
@@ -133,11 +140,7 @@ def metrics(
     result |= {
         "ellipse95_coverage": sum(v <= ELLIPSE95 for v in nees) / len(located) if located else None,
         "mean_nees": float(np.mean(nees)) if nees else None,
-        "false_fixes": sum(
-            c.error_m > FALSE_FIX_ERROR_M and (c.mahalanobis2 is None or c.mahalanobis2 > FALSE_FIX_MAHALANOBIS2)
-            for c in located
-            if c.error_m is not None
-        ),
+        "false_fixes": sum(is_false_fix(c) for c in located),
         "anchor_rate": sum(c.row.anchor_age_ms == 0 for c in compared) / frames,
         "odometry_rate": _odometry_rate(summary),
         "frame_ms_median": float(np.median(times_ms)) if times_ms else None,

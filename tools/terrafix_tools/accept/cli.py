@@ -21,6 +21,13 @@ def accept(
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the table and every scenario's replay.")] = Path("out/accept"),
     scenario: Annotated[list[str] | None, typer.Option(help="Only this scenario; may be given several times.")] = None,
+    lies: Annotated[
+        bool, typer.Option("--lies", help="The scenarios in which an input lies, instead of the ordinary ones.")
+    ] = False,
+    other_map: Annotated[
+        Path | None, typer.Option(help="GeoTIFF of another town, for the scenarios that fly with one.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Scenarios at a time; each keeps a core busy.")] = 2,
     quick: Annotated[
         bool, typer.Option("--quick", help="120 frames of each flight; leaves the three long scenarios out.")
     ] = False,
@@ -47,6 +54,9 @@ def accept(
         seed=seed,
         models=tuple(model or ()),
         configs=tuple(config or ()),
+        lies=lies,
+        other_map=other_map,
+        workers=workers,
     )
     acceptance = run_accept(wanted)
     typer.echo(f"{headline(acceptance)} Written to {out / 'acceptance.html'}")

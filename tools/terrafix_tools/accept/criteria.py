@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from terrafix_tools.accept import integrity
 from terrafix_tools.accept import measures as of
 from terrafix_tools.accept.evidence import Evidence
-from terrafix_tools.accept.judged import Bounds, JudgedRow, Verdict
-from terrafix_tools.accept.measures import Measured
+from terrafix_tools.accept.judged import Bounds, JudgedRow, Measured, Verdict
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "within 50 m outside": (
         "AC-1", "frames within 50 m, outside the marked time", "%", _least(0.80), _least(0.99), of.within_50m_outside),
     "within 20 m": ("AC-2", "frames within 20 m", "%", _least(0.60), _least(0.95), of.within_20m),
+    "near at all": ("AC-2", "frames within 20 m, shown only", "%", None, None, of.within_20m),
     "wrong ones rejected": ("AC-3", "wrong frames or fixes rejected", "%", ALL, None, of.wrong_rejected),
     "next frame": ("AC-3", "error after a wrong frame or fix, worst", "m", _most(50.0), None, of.error_after_wrong),
     "fragments": ("AC-4", "disconnected fragments that survive", "%", ALL, None, of.fragments_alive),
@@ -64,10 +65,26 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "vehicle error": (
         "ON-6", "error of the autopilot's own position, worst", "m", _most(200.0), _most(50.0), of.vehicle_error_m),
     "failsafes": ("ON-6", "fail-safes of the autopilot", "", _most(0.0), None, of.failsafes),
+    "late false fixes": (
+        "AC-13", "false fixes later than 3 s and 5 frames into the lie", "", _most(0.0), None,
+        integrity.late_false_fixes),
+    "late sure over 20 m": (
+        "AC-13", "the same beyond 20 m", "", _most(0.0), None, integrity.late_sure_over_20m),
+    "false fixes in all": ("AC-13", "false fixes in all", "", None, None, integrity.false_fixes_in_all),
+    "time to notice": (
+        "AC-13", "from the lie's beginning to the last false fix", "s", None, None, integrity.time_to_notice_s),
+    "longest false run": ("AC-13", "false fixes in a row, most", "", None, None, integrity.longest_false_run),
+    "recovery": ("AC-15", "frames until right again", "", _most(10.0), None, integrity.recovery_frames),
+    "right at the end": (
+        "AC-15", "frames within 50 m in the last tenth", "%", _least(0.80), None, integrity.right_at_the_end),
+    "claim width": ("AC-13", "claimed 1-sigma over that of the error", "", None, None, integrity.claim_width),
     "mode": ("ON-2", "frames with the covariance mode that heat asks for", "%", ALL, None, of.right_mode),
 }  # fmt: skip
 CRITERIA = {name: Criterion(*row, elsewhere=AT_ONCE if name == "latency" else "") for name, row in _ROWS.items()}
 
+# A lie that lasts to the end of the flight, and one that ends before.
+LASTING = ("late false fixes", "false fixes in all", "time to notice", "longest false run", "near at all", "claims")
+PASSING = (*LASTING, "recovery", "right at the end", "claim width")
 EVERYWHERE = ("within 50 m", "within 20 m", "not localised", "both estimates", "claims", "coverage", "false fixes")
 
 

@@ -20,6 +20,7 @@ from terrafix_tools.accept.flight import Stop
 from terrafix_tools.accept.judged import Span
 
 Edit = Callable[[Iterator[Shot]], Iterator[Shot]]
+StateEdit = Callable[[VehicleState], VehicleState]
 LAP_MARK = "@"  # "0001.jpg@2": the same picture flown over again
 
 
@@ -38,13 +39,13 @@ class AlteredSource:
     live = False
 
     def __init__(
-        self, source: Source, edit: Edit = same, *, frames: int | None = None, start: Callable[[Origin], Origin]
+        self, source: Source, edit: Edit = same, *, frames: int | None = None, origin: Callable[[Origin], Origin]
     ) -> None:
-        """``frames``: only so many of ``source``. ``start`` changes what is said of the start."""
-        self._source, self._edit, self._frames, self._start = source, edit, frames, start
+        """``frames``: only so many of ``source``. ``origin`` changes what is said of start and camera."""
+        self._source, self._edit, self._frames, self._origin = source, edit, frames, origin
 
     def origin(self) -> Origin:
-        return self._start(self._source.origin())
+        return self._origin(self._source.origin())
 
     def length(self) -> int | None:
         """An edit may add or remove a few."""
@@ -173,7 +174,7 @@ def frozen(span: Span) -> Edit:
     return edit
 
 
-def telemetry(change: Callable[[VehicleState], VehicleState]) -> Edit:
+def telemetry(change: StateEdit) -> Edit:
     """What the autopilot reports is not so."""
 
     def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
@@ -191,25 +192,32 @@ def height_times(factor: float) -> Edit:
 
 
 def yaw_plus(degrees: float) -> Edit:
+    return telemetry(turned(degrees))
+
+
+def turned(degrees: float) -> StateEdit:
+    """The heading is off by this, clockwise."""
+
     def change(state: VehicleState) -> VehicleState:
         if state.yaw_rad is None:
             return state
         yaw_rad = math.remainder(state.yaw_rad + math.radians(degrees), 2 * math.pi)
         return msgspec.structs.replace(state, yaw_rad=yaw_rad)
 
-    return telemetry(change)
+    return change
 
 
 def yaw_unknown() -> Edit:
     return telemetry(lambda state: msgspec.structs.replace(state, yaw_rad=None))
 
 
-def start_moved(east_m: float, north_m: float) -> Callable[[Origin], Origin]:
-    """The start coordinate is wrong by this, and claims what it always claims."""
+def start_moved(east_m: float, north_m: float, sigma_m: float | None = None) -> Callable[[Origin], Origin]:
+    """The start coordinate is wrong by this, and claims ``sigma_m`` (None: what it always claims)."""
 
     def move(origin: Origin) -> Origin:
         lat_deg, lon_deg = LocalFrame(origin.lat_deg, origin.lon_deg).to_wgs84(east_m, north_m)
-        return msgspec.structs.replace(origin, lat_deg=lat_deg, lon_deg=lon_deg)
+        claimed_m = origin.start_sigma_m if sigma_m is None else sigma_m
+        return msgspec.structs.replace(origin, lat_deg=lat_deg, lon_deg=lon_deg, start_sigma_m=claimed_m)
 
     return move
 

@@ -36,6 +36,12 @@ class Flight:
     truth: dict[str, Truth]
     stops: list[Stop]
     footprint_m: float  # diagonal of what one frame sees, at the middle height
+    other_map: Path | None = None  # GeoTIFF of another place, for scenarios that fly with it; None: none was given
+
+    @property
+    def has_raster_map(self) -> bool:
+        """The map is a GeoTIFF, which a scenario can change; a package it cannot."""
+        return self.map_path is not None and self.map_path.suffix.lower() != ".gpkg"
 
     @property
     def duration_s(self) -> float:

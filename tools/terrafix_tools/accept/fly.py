@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -23,8 +24,10 @@ from terrafix_tools.accept.criteria import judge, unmeasured
 from terrafix_tools.accept.evidence import Evidence, gather
 from terrafix_tools.accept.faults import AlteredSource, ThereAndBack, same_origin
 from terrafix_tools.accept.flight import Flight, open_flight
+from terrafix_tools.accept.integrity import claim_width, in_lie
 from terrafix_tools.accept.judged import JudgedRow, Span
-from terrafix_tools.accept.scenarios import BY_NAME, CLOSED_LOOP, LONG_FRAMES, Plan, Scenario
+from terrafix_tools.accept.plan import Plan, Scenario
+from terrafix_tools.accept.scenarios import BY_NAME, CLOSED_LOOP, LONG_FRAMES
 from terrafix_tools.bench.flights import program_age_s
 from terrafix_tools.mapping.build import build, ensure_package
 from terrafix_tools.replay import map_cache_dir, replay
@@ -47,6 +50,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     configs: list[str] = []
     threads: int = 1
     seed: int = 0
+    other_map: str = ""  # GeoTIFF of another place, for the scenarios that fly with one
     generated: bool = False  # a perfect map: its error is drawn from what the configuration claims
 
 
@@ -67,7 +71,8 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     rows: list[JudgedRow]
     points: list[Point] = []
     spans: list[Span] = []
-    nees: list[float] = []  # squared Mahalanobis distance of every frame with truth
+    nees: list[float] = []  # squared Mahalanobis distance of every frame with truth and true inputs
+    claim_width: float | None = None  # claimed 1-sigma over that of the error, of the same frames
     frames: int = 0
     wall_s: float = 0.0
 
@@ -107,6 +112,7 @@ def fly(job: Job, imports_s: float = 0.0) -> Result:
     flight = open_flight(
         job.flight, Path(job.map) if job.map else None, Path(job.dem) if job.dem else None, Path(job.truth), job.frames
     )
+    flight = replace(flight, other_map=Path(job.other_map) if job.other_map else None)
     plan = scenario.plan(flight)
     if isinstance(plan, str):
         return _not_flown(scenario, plan)
@@ -134,7 +140,7 @@ def fly(job: Job, imports_s: float = 0.0) -> Result:
             altered=lambda source: _altered(source, flight, plan, job.frames),
         )
     except MapError as error:
-        if plan.start is same_origin:
+        if plan.origin is same_origin:
             raise
         return _not_flown(scenario, f"the map does not reach the wrong start: {error}")
     evidence = gather(
@@ -154,7 +160,12 @@ def _result(scenario: Scenario, evidence: Evidence) -> Result:
         rows=judge(scenario.name, scenario.criteria, evidence),
         points=[_point(evidence, i) for i in range(len(evidence.frames))],
         spans=list(evidence.marks.spans),
-        nees=[f.compared.mahalanobis2 for f in evidence.frames if f.compared and f.compared.mahalanobis2 is not None],
+        nees=[
+            f.compared.mahalanobis2
+            for f in evidence.frames
+            if f.compared and f.compared.mahalanobis2 is not None and not in_lie(evidence, f)
+        ],
+        claim_width=claim_width(evidence).value,
         frames=len(evidence.frames),
         wall_s=evidence.summary["wall_s"],
     )
@@ -168,7 +179,7 @@ def _not_flown(scenario: Scenario, why: str) -> Result:
 def _altered(source: Source, flight: Flight, plan: Plan, frames: int | None) -> Source:
     if plan.long_route and len(flight.stops) < LONG_FRAMES:
         source, frames = ThereAndBack(source, flight.stops, LONG_FRAMES), None
-    return AlteredSource(source, plan.edit, frames=frames, start=plan.start)
+    return AlteredSource(source, plan.edit, frames=frames, origin=plan.origin)
 
 
 def _package(flight: Flight, plan: Plan, out: Path) -> tuple[Path | None, str]:

@@ -54,6 +54,16 @@ class Marks(msgspec.Struct, frozen=True, kw_only=True):
     spans: tuple[Span, ...] = ()
     wrong_files: frozenset[str] = frozenset()  # frames that are foreign, or whose map fix was made wrong
     breaks_s: tuple[float, ...] = ()  # the first frame after each gap in the overlap
+    lie: Span | None = None  # when an input is false; None: all inputs are true, whatever is missing
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One number of a flight. ``value`` None: nothing to measure, unless ``verdict`` says what that means."""
+
+    value: float | None
+    why: str = ""
+    verdict: Verdict | None = None
 
 
 class JudgedRow(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,6 +1,5 @@
 """One function for each number of the acceptance table. Each says what it measured, or why it could not."""
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -12,21 +11,12 @@ from terrafix.messages import CovarianceMode, NavEstimate, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.epipolar import reprojection_error
 from terrafix_tools.accept.evidence import Evidence, Seen
-from terrafix_tools.accept.judged import Span, Verdict
+from terrafix_tools.accept.judged import Measured, Span, Verdict
 
 NEAR_M = 50.0  # AC-1; also what counts as right after something went wrong (AC-3)
 MIN_WAY_M = 100.0  # a share of a shorter way than this says nothing
 ASK_FRAMES, ASK_S = 3, 2.0  # AC-6
 SETTLE_S = 10.0  # after a stretch without sight, before frames count again as outside of it
-
-
-@dataclass(frozen=True)
-class Measured:
-    """``value`` None: nothing to measure, unless ``verdict`` says what that means."""
-
-    value: float | None
-    why: str = ""
-    verdict: Verdict | None = None
 
 
 def within_50m(e: Evidence) -> Measured:

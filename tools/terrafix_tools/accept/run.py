@@ -18,13 +18,15 @@ from terrafix_tools.accept import fly
 from terrafix_tools.accept.criteria import failed, unmeasured
 from terrafix_tools.accept.fly import RESULT, Job, Result
 from terrafix_tools.accept.judged import BROKEN, shown
-from terrafix_tools.accept.scenarios import BY_NAME, CLOSED_LOOP, SCENARIOS, Scenario
+from terrafix_tools.accept.lies import LIES
+from terrafix_tools.accept.plan import Scenario
+from terrafix_tools.accept.scenarios import BY_NAME, CLOSED_LOOP, SCENARIOS
 from terrafix_tools.accept.table import Acceptance, conclude, write
 
 JOB, GROUND_JOB, CRASH = "job.json", "ground.json", "crash.txt"
 QUICK_FRAMES = 120
 QUICK_LEAVES_OUT = ("long route", "60 s blackout", "slow spoof")  # they are long, or they are nothing
-AT_ONCE = 2  # scenarios: each keeps about one core busy
+AT_ONCE = 2  # scenarios, when nobody says how many: each keeps about one core busy
 LOOK_S = 2.0  # how often the line that names the running ones is looked after
 _MISTAKES = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}
 
@@ -51,6 +53,9 @@ class Wanted:
     seed: int = 1
     models: tuple[str, ...] = ()
     configs: tuple[Path, ...] = ()
+    lies: bool = False  # the scenarios of lies.py, instead of the ordinary ones
+    other_map: Path | None = None  # GeoTIFF of another place
+    workers: int = AT_ONCE  # scenarios at a time
 
 
 def accept(wanted: Wanted) -> Acceptance:
@@ -69,7 +74,7 @@ def accept(wanted: Wanted) -> Acceptance:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("scenarios", total=len(chosen), completed=len(results))
-        for result in _flown(jobs, progress, task):
+        for result in _flown(jobs, wanted.workers, progress, task):
             results[result.scenario] = result
             write(_concluded(wanted, chosen, results), wanted.out)
             progress.console.print(_line(result), highlight=False)
@@ -86,7 +91,7 @@ def _concluded(wanted: Wanted, chosen: list[Scenario], results: dict[str, Result
         map_path=str(wanted.map_path or ""),
         quick=wanted.quick,
         seed=None if wanted.flight else wanted.seed,
-        whole=not wanted.scenarios,
+        whole=not wanted.scenarios and not wanted.lies,
     )
 
 
@@ -109,7 +114,9 @@ def _chosen(wanted: Wanted) -> list[Scenario]:
     unknown = [name for name in wanted.scenarios if name not in BY_NAME]
     if unknown:
         raise UsageError(f"--scenario '{unknown[0]}': not a scenario; known: {', '.join(BY_NAME)}")
-    return [s for s in SCENARIOS if not wanted.scenarios or s.name in wanted.scenarios]
+    if wanted.scenarios:
+        return [scenario for name, scenario in BY_NAME.items() if name in wanted.scenarios]
+    return list(LIES if wanted.lies else SCENARIOS)
 
 
 def _not_flown(wanted: Wanted, chosen: list[Scenario]) -> Iterator[tuple[Scenario, str]]:
@@ -133,11 +140,11 @@ def _jobs(wanted: Wanted, chosen: list[Scenario], console: Console) -> dict[str,
     """By scenario; the ground that they need is there afterwards. Longest first, or the end is one long wait."""
     skipped = {scenario.name for scenario, _ in _not_flown(wanted, chosen)}
     flown = sorted((s for s in chosen if s.name not in skipped), key=lambda s: -s.frames)
-    threads = max(1, (os.cpu_count() or 1) // AT_ONCE)
+    threads = max(1, (os.cpu_count() or 1) // wanted.workers)
     jobs: dict[str, Job] = {}
     for scenario in flown:
         out = str(wanted.out / scenario.name.replace(" ", "-").replace("%", "percent"))
-        frames = QUICK_FRAMES if wanted.quick else None
+        frames = _frames(wanted, scenario) if wanted.quick else None
         place = Job(
             scenario=scenario.name,
             flight=wanted.flight,
@@ -149,13 +156,14 @@ def _jobs(wanted: Wanted, chosen: list[Scenario], console: Console) -> dict[str,
             configs=[str(path.resolve()) for path in wanted.configs],
             threads=threads,
             seed=wanted.seed,
+            other_map=str(wanted.other_map or ""),
         )
         jobs[scenario.name] = place if wanted.flight else _over_generated(place, scenario, flown, wanted, console)
     return jobs
 
 
 def _over_generated(job: Job, scenario: Scenario, flown: list[Scenario], wanted: Wanted, console: Console) -> Job:
-    frames = {s.name: QUICK_FRAMES if wanted.quick else s.frames for s in flown}
+    frames = {s.name: _frames(wanted, s) for s in flown}
     kind = _kind(scenario)
     longest = max(frames[s.name] for s in flown if _kind(s) == kind)
     ground = _ground(wanted, kind, longest, console)
@@ -169,6 +177,11 @@ def _over_generated(job: Job, scenario: Scenario, flown: list[Scenario], wanted:
         frames=frames[scenario.name],
         generated=True,
     )
+
+
+def _frames(wanted: Wanted, scenario: Scenario) -> int:
+    """Of a generated flight."""
+    return min(QUICK_FRAMES, scenario.frames) if wanted.quick else scenario.frames
 
 
 def _kind(scenario: Scenario) -> str:
@@ -228,8 +241,8 @@ def _encoded(job: Job) -> bytes:
     return msgspec.json.format(msgspec.json.encode(job))
 
 
-def _flown(jobs: dict[str, Job], progress: Progress, task: TaskID) -> Iterator[Result]:
-    with ThreadPoolExecutor(AT_ONCE) as pool:
+def _flown(jobs: dict[str, Job], workers: int, progress: Progress, task: TaskID) -> Iterator[Result]:
+    with ThreadPoolExecutor(workers) as pool:
         running: dict[Future[Result], str] = {pool.submit(_fly, job): name for name, job in jobs.items()}
         while running:
             active = [name for future, name in running.items() if future.running()]

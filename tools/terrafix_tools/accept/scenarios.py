@@ -1,20 +1,20 @@
 """The named scenarios: which ground, what goes wrong, what is promised. In words: docs/acceptance.md."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from terrafix.core.node import Image, Node, NodeContext
-from terrafix.messages import Origin
 from terrafix_tools.accept import faults
 from terrafix_tools.accept.criteria import EVERYWHERE
 from terrafix_tools.accept.fault_nodes import FrameNames, HotComputer, WrongFixes
 from terrafix_tools.accept.flight import Flight
 from terrafix_tools.accept.judged import Marks, Span
+from terrafix_tools.accept.lies import LIES
+from terrafix_tools.accept.plan import Plan, Scenario
 from terrafix_tools.accept.stale_map import REACH, stale_along
-from terrafix_tools.replay import MakeNodes, make_nodes
+from terrafix_tools.replay import make_nodes
 
 FOREIGN_AT = (0.3, 0.55, 0.8)  # of the frames
 FAR_M = 350.0
@@ -28,28 +28,6 @@ OUTLIER_EVERY = 10  # up to 10 % wrong map matches do no harm (AC-5)
 KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the other way: 990 m, while the start claims some tens
 
 WITH_SPAN = ("claims", "coverage", "false fixes", "both estimates", "within 50 m outside", "says so", "found again")
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How one flight becomes the scenario."""
-
-    edit: faults.Edit = faults.same
-    start: Callable[[Origin], Origin] = faults.same_origin
-    nodes: MakeNodes = make_nodes
-    other_map: Callable[[Path, Path], str] | None = None  # (map of the flight, map to write) -> why not, or ""
-    long_route: bool = False
-    marks: Marks = field(default_factory=Marks)
-
-
-@dataclass(frozen=True)
-class Scenario:
-    name: str
-    promise: str
-    criteria: tuple[str, ...]
-    plan: Callable[[Flight], Plan | str]  # a text: why it cannot be flown with this flight
-    ground: str = "base"  # of the generated world; a flight that is given has only "base"
-    frames: int = 160  # of a generated flight
 
 
 def _as_it_is(_: Flight) -> Plan:
@@ -135,7 +113,7 @@ def _share_of(flight: Flight, shares: tuple[float, float], text: str) -> Span:
 
 
 def _unmatchable(flight: Flight) -> Plan | str:
-    if flight.map_path is None or flight.map_path.suffix.lower() == ".gpkg":
+    if not flight.has_raster_map:
         return "needs the map as a GeoTIFF, to make it stale along a fifth of the route"
     shares = _fifth(flight)
     first, last = (flight.at(share) for share in shares)
@@ -204,7 +182,7 @@ def _heading_unknown(_: Flight) -> Plan:
 def _kidnapped(flight: Flight) -> Plan:
     # Towards the middle of the flight: the map is there.
     ahead = np.where(np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0)
-    return Plan(start=faults.start_moved(*(ahead * KIDNAPPED_M).tolist()))
+    return Plan(origin=faults.start_moved(*(ahead * KIDNAPPED_M).tolist()))
 
 
 def _hot_day(flight: Flight) -> Plan:
@@ -274,4 +252,4 @@ SCENARIOS: tuple[Scenario, ...] = (
         (*EVERYWHERE, "mode"), _hot_day),
     Scenario("camera stall", "The camera repeats one picture for 10 s.", WITH_SPAN, _stall),
 )  # fmt: skip
-BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
+BY_NAME = {scenario.name: scenario for scenario in (*SCENARIOS, *LIES)}

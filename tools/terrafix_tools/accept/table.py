@@ -2,6 +2,7 @@
 
 import json
 import math
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from terrafix_tools.evaluate import ELLIPSE95
 NAME = "acceptance"
 OVERALL = "all scenarios"
 COVERAGE = Bounds(0.93, 0.98)
+WIDEST = Bounds(high=2.0)  # a claim may be twice as wide as the error, and no wider
 NEES_QUANTILES = (-1.959964, 1.959964)  # of the normal distribution: 2.5 and 97.5 %
 LEAST_FLIGHTS = 5  # fewer draws of the map's error cannot tell an honest claim from a modest one
 
@@ -38,7 +40,7 @@ def conclude(
     results: list[Result], *, flight: str, map_path: str, quick: bool, seed: int | None, whole: bool
 ) -> Acceptance:
     """``whole``: all scenarios were wanted; then the rows that belong to no scenario are there, too."""
-    overall = [_honest(results)] + (_elsewhere() if whole else [])
+    overall = [_honest(results), _width(results)] + (_elsewhere() if whole else [])
     rows = [row for result in results for row in result.rows] + overall
     return Acceptance(
         flight=flight,
@@ -88,6 +90,27 @@ def _honest(results: list[Result]) -> JudgedRow:
         why += "; too modest" if mean < low or (mean <= high and inside > 0.98) else "; too sure"
     verdict = Verdict.PASS if holds else Verdict.BELOW
     return JudgedRow(**row, measured=round(inside, 6), verdict=verdict, why=why)  # type: ignore[arg-type]
+
+
+def _width(results: list[Result]) -> JudgedRow:
+    """Over all flights, each counted once: the median of claimed over real 1-sigma where inputs are true."""
+    widths = [r.claim_width for r in results if r.claim_width is not None]
+    row = {
+        "scenario": OVERALL,
+        "ac": "AC-13",
+        "what": "claimed 1-sigma over that of the error, median of the flights",
+        "unit": "",
+        "floor": WIDEST.text(""),
+        "goal": "",
+        "goal_met": None,
+    }
+    if len(widths) < LEAST_FLIGHTS:
+        why = f"{len(widths)} flights; {LEAST_FLIGHTS} are the least that can tell"
+        return JudgedRow(**row, measured=None, verdict=Verdict.NOT_MEASURABLE, why=why)  # type: ignore[arg-type]
+    width = statistics.median(widths)
+    verdict = Verdict.PASS if WIDEST.holds(width) else Verdict.BELOW
+    why = f"{len(widths)} flights, {min(widths):.1f} to {max(widths):.1f}"
+    return JudgedRow(**row, measured=round(width, 6), verdict=verdict, why=why)  # type: ignore[arg-type]
 
 
 def _elsewhere() -> list[JudgedRow]:

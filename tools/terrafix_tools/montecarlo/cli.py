@@ -17,6 +17,9 @@ def montecarlo(
     seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 1,
     duration: Annotated[float, typer.Option(help="Seconds of every flight.")] = 600.0,
     fault: Annotated[Fault | None, typer.Option(help="Only this one, in every flight.")] = None,
+    lies: Annotated[
+        float, typer.Option(help="Probability of each lie of an input in a flight, on top of its fault; 0.05 is usual.")
+    ] = 0.0,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one for each processor.")] = None,
     long: Annotated[
         bool, typer.Option("--endurance", help="Instead one flight of two hours: are time and memory flat?")
@@ -31,7 +34,7 @@ def montecarlo(
 
     if long:
         raise typer.Exit(0 if endurance(seed)["flat"] else BROKEN_FLOOR)
-    wanted = Wanted(out, flights, first, seed, duration, fault, workers)
+    wanted = Wanted(out, flights, first, seed, duration, fault, lies, workers)
     result = run(wanted)
     typer.echo(f"Written to {out}")
     raise typer.Exit(0 if all(result["floors"].values()) else BROKEN_FLOOR)

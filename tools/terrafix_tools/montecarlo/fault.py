@@ -4,7 +4,7 @@ from enum import StrEnum
 
 
 class Fault(StrEnum):
-    """One kind of trouble; a flight has one, or none."""
+    """One kind of trouble; a flight has one, or none, and with --lies some of LIES beside it."""
 
     NONE = "none"
     WRONG = "10 % wrong matches"  # each somewhere else
@@ -17,3 +17,23 @@ class Fault(StrEnum):
     DRIFT = "no map after 90 s"  # odometry alone
     HILLS = "hills without elevation"  # against the rules; this and the next only when asked for
     PHOTOS = "photos 5 s apart"  # that hardly overlap, with what the autopilot said at each and nothing between
+    FOREIGN = "foreign motion"  # from here on: an input lies
+    FROZEN = "frozen camera"
+    STALE = "late pictures"
+    SCALE = "height scale wrong"
+    FOCAL = "focal length wrong"
+    HEADING = "heading 90 or 180 deg off"
+    START = "start 300 m off"
+    TOWN = "wrong-map matches"
+
+
+LIES = (
+    Fault.FOREIGN,
+    Fault.FROZEN,
+    Fault.STALE,
+    Fault.SCALE,
+    Fault.FOCAL,
+    Fault.HEADING,
+    Fault.START,
+    Fault.TOWN,
+)

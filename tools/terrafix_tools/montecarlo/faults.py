@@ -47,11 +47,9 @@ class Faults:
     def alter(self, match: MapMatch, shot: Shot) -> MapMatch:
         """What the estimator hears instead of ``match``."""
         if self.blind(shot.t_s) or self.unmapped(shot.t_s):
-            return msgspec.structs.replace(
-                match, verdict=Verdict.FEW_INLIERS, coarse=False, p_c_in_w_m=None, q_w_c=None, cov=None, inliers=0
-            )
+            return nothing_found(match)
         moved_m = self._moved(shot.t_s)
-        return match if moved_m is None else self._wrong(match, shot, moved_m)
+        return match if moved_m is None else sure_of(match, shot, moved_m, self._rng)
 
     def _moved(self, t_s: float) -> np.ndarray | None:
         """(2,) how far the match of this frame is off; None: it is as it is."""
@@ -67,20 +65,28 @@ class Faults:
             return self._row_m
         return None
 
-    def _wrong(self, match: MapMatch, shot: Shot, moved_m: np.ndarray) -> MapMatch:
-        """A match that is sure of a place ``moved_m`` (2,) from the true one."""
-        p = shot.p_m + np.array([*(moved_m + SURE_M * self._rng.normal(size=2)), SURE_M * self._rng.normal()])
-        cov = np.diag([SURE_M**2] * 3 + [SURE_RAD**2] * 3)
-        return msgspec.structs.replace(
-            match,
-            verdict=Verdict.ACCEPTED,
-            coarse=False,
-            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-            q_w_c=quat_from_rot(shot.r_w_c),
-            cov=tuple(float(v) for v in cov.ravel()),
-            inliers=30,
-            margin=7.0,
-            mode_mass=0.99,
-            mode_e_m=float(p[0]),
-            mode_n_m=float(p[1]),
-        )
+
+def nothing_found(match: MapMatch) -> MapMatch:
+    """Of a frame that the map does not know."""
+    return msgspec.structs.replace(
+        match, verdict=Verdict.FEW_INLIERS, coarse=False, p_c_in_w_m=None, q_w_c=None, cov=None, inliers=0
+    )
+
+
+def sure_of(match: MapMatch, shot: Shot, moved_m: np.ndarray, rng: np.random.Generator) -> MapMatch:
+    """A match that is sure of a place ``moved_m`` (2,) from the true one."""
+    p = shot.p_m + np.array([*(moved_m + SURE_M * rng.normal(size=2)), SURE_M * rng.normal()])
+    cov = np.diag([SURE_M**2] * 3 + [SURE_RAD**2] * 3)
+    return msgspec.structs.replace(
+        match,
+        verdict=Verdict.ACCEPTED,
+        coarse=False,
+        p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+        q_w_c=quat_from_rot(shot.r_w_c),
+        cov=tuple(float(v) for v in cov.ravel()),
+        inliers=30,
+        margin=7.0,
+        mode_mass=0.99,
+        mode_e_m=float(p[0]),
+        mode_n_m=float(p[1]),
+    )

@@ -27,6 +27,7 @@ from terrafix_tools.montecarlo.faults import Faults
 from terrafix_tools.montecarlo.flown import fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens
+from terrafix_tools.montecarlo.lies import Lies
 from terrafix_tools.montecarlo.matches import MapMatches
 from terrafix_tools.montecarlo.plan import FlightPlan
 from terrafix_tools.montecarlo.sightings import Sightings
@@ -52,6 +53,7 @@ class Record:
     refine_cpu_s: float = 0.0
     rebuilds: int = 0
     restarts: int = 0
+    lie_from_s: float | None = None  # when the first lie begins; None: there is none
     fixes: dict[str, int] = field(default_factory=dict)  # verdicts on map matches
 
 
@@ -96,17 +98,18 @@ class Run:
             map_sigma_m=plan.map_sigma_m,
             seed=plan.seed,
         )
-        faults = Faults(plan.fault, plan.duration_s, plan.seed)
+        faults, lies = Faults(plan.fault, plan.duration_s, plan.seed), Lies(plan, flown)
+        record.lie_from_s = lies.begins_s()
         self._tell(flown.origin)
         late: list[tuple[int, MapMatch]] = []  # frame at which it is heard
         for i, shot in enumerate(flown.frames):
-            odometry = sightings.see(i, shot, blind=faults.blind(shot.t_s))
+            odometry = sightings.see(i, lies.picture(i), blind=faults.blind(shot.t_s))
             with self._stopwatch(record.cpu_ms, i):
                 for state in flown.telemetry[i]:
                     self._tell(state)
                 said = self._tell(odometry)
             late += [
-                (i + faults.late_frames(), faults.alter(matches.match(prediction, shot), shot))
+                (i + faults.late_frames(), faults.alter(lies.match(i, prediction, matches.match), shot))
                 for prediction in said
                 if isinstance(prediction, Prediction)
             ]

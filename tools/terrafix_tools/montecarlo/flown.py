@@ -19,7 +19,7 @@ from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.plan import FlightPlan
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.camera.mount import Fixed, Gimbal
-from terrafix_tools.sim.interfaces import Readings
+from terrafix_tools.sim.interfaces import Readings, State
 from terrafix_tools.sim.sensors.errors import SensorErrors
 from terrafix_tools.sim.sensors.suite import VehicleSensors
 from terrafix_tools.sim.vehicle.copter import Copter, CopterLimits
@@ -51,6 +51,9 @@ class Shot:
 class Flown:
     origin: Origin
     frames: list[Shot]
+    pictures: list[
+        Shot
+    ]  # what each frame shows: the truth of the moment when it was really taken, with its stated time
     telemetry: list[list[Message]]  # before each frame
     way_m: np.ndarray  # (N,) flown over ground up to each frame
     terrain: Terrain  # in the estimator's world
@@ -70,12 +73,21 @@ def fly(plan: FlightPlan, terrain: Terrain) -> Flown:
     home_m = terrain.bare_at_m(float(claimed[0]), float(claimed[1]))
     every = TELEMETRY_EVERY if plan.has_imu else SLOW_EVERY
     frame_every = round(1.0 / (plan.frame_hz * STEP_S))
+    lag = round(plan.picture_lag_s / STEP_S)
     frames: list[Shot] = []
+    pictures: list[Shot] = []
+    taken: Shot | None = None  # the picture that is under way, when pictures are late
     telemetry: list[list[Message]] = []
     waiting: list[Message] = []
     batch: list[Readings] = []
     way_m, way = 0.0, []
     state = first
+
+    def shot(at: State) -> Shot:
+        held = hanging.r_w_c(at)
+        p_m = at.p_b_in_w_m - np.array([*claimed, 0.0])
+        return Shot(at.t_s, p_m, held @ tilt, held @ r_b_c.T, at.velocity_enu_mps)
+
     for i in range(math.floor(plan.duration_s / STEP_S)):
         if i:
             state = vehicle.step(STEP_S, None)
@@ -90,13 +102,14 @@ def fly(plan: FlightPlan, terrain: Terrain) -> Flown:
             waiting.append(_inertial(batch))
             batch = []
         if i % frame_every == 0:
-            held = hanging.r_w_c(state)
-            p_m = state.p_b_in_w_m - np.array([*claimed, 0.0])
-            frames.append(Shot(state.t_s, p_m, held @ tilt, held @ r_b_c.T, state.velocity_enu_mps))
+            frames.append(shot(state))
+            pictures.append(replace(taken or frames[-1], t_s=state.t_s))
             telemetry.append(waiting[-1:] if plan.fault is Fault.PHOTOS else waiting)
             waiting = []
             way.append(way_m)
-    return Flown(_origin(plan, home_m), frames, telemetry, np.array(way), terrain.seen_from(claimed))
+        if lag and (i + lag) % frame_every == 0:
+            taken = shot(state)
+    return Flown(_origin(plan, home_m), frames, pictures, telemetry, np.array(way), terrain.seen_from(claimed))
 
 
 def _vehicle(plan: FlightPlan, terrain: Terrain, frame: LocalFrame) -> Plane | Copter:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.messages import Camera
-from terrafix_tools.montecarlo.fault import Fault
+from terrafix_tools.montecarlo.fault import LIES, Fault
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.vehicle.wind import Wind
 
@@ -17,6 +17,10 @@ HALTON = (5, 7)  # bases of the map errors' sequence (Halton 1960); they share n
 CAMERAS = ((1280, 720, 684.0), (1600, 900, 1164.4), (960, 540, 560.0))
 FLAT_M = 2.0  # 1-sigma of the relief over which a map without elevation may be flown: the ground must be flat then
 PHOTOS_HZ = 0.2
+HEIGHT_SCALES = (0.7, 1.3, 3.28084, 1.0 / 3.28084)  # of a lie: 30 % off, and feet for metres both ways
+FOCAL_FACTORS = (0.5, 2.0)  # described over true, by a lie; the logarithm is uniform between them
+LAG_S = (0.2, 1.0)  # how old the pictures of a lie are
+START_OFF_M, START_CLAIM_M = 300.0, 50.0
 FOCAL_SIGMA, K1_SIGMA = 0.01, 0.005  # of a lens that was calibrated once, or whose maker's numbers were taken
 
 
@@ -65,10 +69,20 @@ class FlightPlan:
     start_error_m: tuple[float, float]
     height_scale: float
     compass_rad: float | None  # None: of ordinary size
+    lies: frozenset[Fault] = frozenset()  # of LIES
+    picture_lag_s: float = 0.0  # so much older than its time says is each picture
 
 
-def plan(run_seed: int, number: int, *, fault: Fault | None = None, duration_s: float = DURATION_S) -> FlightPlan:
-    """Flight ``number`` of a run. ``fault``: this one, instead of the round's."""
+def plan(
+    run_seed: int,
+    number: int,
+    *,
+    fault: Fault | None = None,
+    duration_s: float = DURATION_S,
+    lie_share: float = 0.0,
+) -> FlightPlan:
+    """Flight ``number`` of a run. ``fault``: this one, instead of the round's. ``lie_share``: probability of each of
+    LIES in a flight, on top of its fault."""
     rng = np.random.default_rng([run_seed, number, 50])
     chosen = ROUND[number % len(ROUND)] if fault is None else fault
     kind = Kind.PLANE if rng.uniform() < 0.5 else Kind.COPTER
@@ -117,6 +131,7 @@ def plan(run_seed: int, number: int, *, fault: Fault | None = None, duration_s: 
         height_scale=1.0 + float(rng.normal(0.0, 0.01)),
         compass_rad=None,
     )
+    drawn = _lying(drawn, _lies(run_seed, number, chosen, lie_share))
     if chosen is Fault.HILLS:
         return replace(drawn, hills_m=20.0, has_dem=False)
     if chosen is Fault.PHOTOS:
@@ -126,6 +141,33 @@ def plan(run_seed: int, number: int, *, fault: Fault | None = None, duration_s: 
     if chosen is Fault.COMPASS:
         return replace(drawn, compass_rad=sign * math.radians(float(rng.uniform(10.0, 15.0))))
     return drawn
+
+
+def _lies(run_seed: int, number: int, chosen: Fault, share: float) -> frozenset[Fault]:
+    draws = np.random.default_rng([run_seed, number, 59]).uniform(size=len(LIES))
+    return frozenset(lie for lie, draw in zip(LIES, draws.tolist(), strict=True) if draw < share or lie is chosen)
+
+
+def _lying(drawn: FlightPlan, lies: frozenset[Fault]) -> FlightPlan:
+    """With the lies that are there from the first frame to the last; montecarlo/lies.py has the others."""
+    rng = np.random.default_rng([drawn.seed, 60])
+    scale = float(rng.choice(HEIGHT_SCALES))
+    factor = math.exp(float(rng.uniform(*np.log(FOCAL_FACTORS))))
+    turn_rad = math.radians(float(rng.choice([-90.0, 90.0, 180.0])))
+    lag_s, towards = float(rng.uniform(*LAG_S)), float(rng.uniform(0.0, 2.0 * math.pi))
+    changes: dict[str, object] = {"lies": lies}
+    if Fault.SCALE in lies:
+        changes |= {"height_scale": scale}
+    if Fault.FOCAL in lies:
+        changes |= {"focal_error": 1.0 / factor - 1.0}
+    if Fault.HEADING in lies:
+        changes |= {"compass_rad": turn_rad}
+    if Fault.STALE in lies:
+        changes |= {"picture_lag_s": lag_s}
+    if Fault.START in lies:
+        off_m = (START_OFF_M * math.sin(towards), START_OFF_M * math.cos(towards))
+        changes |= {"start_sigma_m": START_CLAIM_M, "start_error_m": off_m}
+    return replace(drawn, **changes)  # type: ignore[arg-type]
 
 
 def _map_offset(run_seed: int, number: int, sigma_m: float) -> tuple[float, float]:

@@ -39,6 +39,7 @@ class Wanted:
     seed: int = 1
     duration_s: float = DURATION_S
     fault: Fault | None = None
+    lie_share: float = 0.0  # probability of each of LIES in a flight
     workers: int | None = None  # None: one for each processor that this program may use
 
 
@@ -69,6 +70,8 @@ def _check(wanted: Wanted) -> None:
         raise UsageError(f"--flights {wanted.flights} --first {wanted.first}: at least one flight, from number 0 on")
     if not SHORTEST_S <= wanted.duration_s <= LONGEST_S:
         raise UsageError(f"--duration {wanted.duration_s:g}: choose {SHORTEST_S:g} to {LONGEST_S:g} seconds")
+    if not 0.0 <= wanted.lie_share <= 1.0:
+        raise UsageError(f"--lies {wanted.lie_share:g}: a probability is from 0 to 1")
     if wanted.workers is not None and wanted.workers < 1:
         raise UsageError(f"--workers {wanted.workers}: choose at least 1")
 
@@ -102,11 +105,13 @@ def _results(wanted: Wanted, numbers: range) -> Iterator[tuple[int, Record]]:
 
 
 def _one(wanted: Wanted, number: int) -> tuple[int, Record]:
-    return number, run(plan(wanted.seed, number, fault=wanted.fault, duration_s=wanted.duration_s))
+    return number, run(
+        plan(wanted.seed, number, fault=wanted.fault, duration_s=wanted.duration_s, lie_share=wanted.lie_share)
+    )
 
 
 def _result(wanted: Wanted, seen: list[Seen]) -> dict[str, Any]:
-    groups = {fault: [s for s in seen if s.record.plan.fault is fault] for fault in Fault}
+    groups = {fault: [s for s in seen if fault in {s.record.plan.fault, *s.record.plan.lies}] for fault in Fault}
     total = summary(seen)
     return {
         "seed": wanted.seed,
@@ -125,6 +130,7 @@ def _flight(seen: Seen) -> dict[str, Any]:
     return {
         "number": p.number,
         "fault": str(p.fault),
+        "lies": sorted(map(str, p.lies)),
         "vehicle": str(p.kind),
         "agl_m": p.agl_m,
         "hills_m": p.hills_m,
@@ -154,6 +160,7 @@ def show(result: dict[str, Any], console: Console) -> None:
         "median",
         "max",
         "false",
+        "to notice",
         "inside 95 %",
         "refined",
         "NEES [band]",
@@ -169,6 +176,7 @@ def show(result: dict[str, Any], console: Console) -> None:
             f"{row['median_m']:.1f} m",
             f"{row['max_m']:.0f} m",
             str(row["false_fixes"]),
+            "-" if row["notice_s"] is None else f"{row['notice_s']:.0f} s",
             f"{100 * row['coverage']:.1f} %",
             "-" if row["coverage_refined"] is None else f"{100 * row['coverage_refined']:.1f} %",
             f"{nees['mean']:.2f} [{nees['low']:.2f}, {nees['high']:.2f}]",

@@ -112,7 +112,18 @@ class Seen:
 
     @property
     def false_fixes(self) -> int:
-        return int(((self.distance_m > FALSE_FIX_ERROR_M) & (self.nees > FALSE_FIX_MAHALANOBIS2)).sum())
+        return int(self._false().sum())
+
+    @property
+    def notice_s(self) -> float | None:
+        """From the beginning of the first lie to the last false fix after it; None: no lie, or no false fix."""
+        begins_s, wrong = self.record.lie_from_s, self._false()
+        last_s = max(self.record.t_s[wrong].tolist(), default=-math.inf)
+        return last_s - begins_s if begins_s is not None and last_s >= begins_s else None
+
+    def _false(self) -> np.ndarray:
+        """(N,) bool"""
+        return np.asarray((self.distance_m > FALSE_FIX_ERROR_M) & (self.nees > FALSE_FIX_MAHALANOBIS2))
 
     def refined_nees(self) -> np.ndarray:
         """Of the frames that were refined."""
@@ -166,6 +177,7 @@ def summary(flights: list[Seen]) -> dict[str, Any]:
         "max_m": float(distance.max()),
         "refined_median_m": float(np.median(refined_m)) if len(refined_m) else None,
         "false_fixes": sum(f.false_fixes for f in flights),
+        "notice_s": max((f.notice_s for f in flights if f.notice_s is not None), default=None),
         "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
         "coverage": float((nees <= ELLIPSE95).mean()),
         "coverage_refined": float((refined <= ELLIPSE95).mean()) if len(refined) else None,
