@@ -11,10 +11,12 @@ from terrafix.anchor.alone import alone
 from terrafix.anchor.belief import Belief, Mode
 from terrafix.anchor.matcher import AS_PREDICTED, FrameMatcher, Look, View
 from terrafix.anchor.node import AnchorNode
+from terrafix.anchor.null_model import USUAL, FlightBudget
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
+SHARE = FlightBudget().log_probability  # of the first frame
 NEAR_M = (7.0, -5.0)  # of the mode from the truth
 
 
@@ -34,11 +36,13 @@ def mode(e_m: float, n_m: float) -> Mode:
     return Mode(e_m, n_m, 0.1, 0.1, 9.0)
 
 
-def decided(ground: np.ndarray, frame: np.ndarray, modes: list[Mode]) -> tuple[Mode, np.ndarray] | None:
+def decided(
+    ground: np.ndarray, frame: np.ndarray, modes: list[Mode], log_probability: float = SHARE
+) -> tuple[Mode, np.ndarray] | None:
     source: Any = FlatMap(ground)
     matcher = FrameMatcher(PINHOLE, source, GradientDescriber())
     predicted = View(0.0, 0.0, R, AGL_M, 0.0, 0.03, 0.02, 0.03)
-    found = alone(frame, predicted, SameLook(Verdict.ACCEPTED), modes, source, matcher)
+    found = alone(frame, predicted, SameLook(Verdict.ACCEPTED), modes, source, matcher, USUAL, log_probability)
     if found is None:
         return None
     assert found[1].pnp.fit is not None

@@ -239,7 +239,10 @@ class TwoDates:
     """The newest layer shows other ground, as after building works; the older one is right, and states its accuracy."""
 
     manifest = SimpleNamespace(
-        layers=(SimpleNamespace(table="new", ce90_m=None), SimpleNamespace(table="old", ce90_m=5.0))
+        layers=tuple(
+            SimpleNamespace(table=table, ce90_m=ce90_m, null_model=None)
+            for table, ce90_m in (("new", None), ("old", 5.0))
+        )
     )
 
     def __init__(self, ground: np.ndarray) -> None:

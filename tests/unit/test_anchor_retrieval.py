@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +12,11 @@ from terrafix.anchor.agreement import Agreement
 from terrafix.anchor.chance import COARSE, PATCHES, PRIOR_PLACES, Chance
 from terrafix.anchor.lost import MOST_ODDS, LostWatch, pose_gain
 from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
+from terrafix.anchor.null_model import USUAL, FlightBudget
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.anchor.tracks import (
     AHEAD,
     CLEAR_LEAD,
-    ENOUGH,
     LEADS,
     LLR_MAX,
     LLR_MIN,
@@ -33,6 +34,7 @@ from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import POOL
 
 AGL_M = 100.0
+ENOUGH = 10.0  # evidence that a wrong place hardly comes to
 SIDE_M = 500.0
 STEP_M = np.array([9.0, 12.0])  # 15 m a frame
 START_M = np.array([-90.0, -70.0])
@@ -60,7 +62,8 @@ def frames(ground: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndar
 
 
 def searched(source: BoundedMap, around_m: tuple[float, float] | None) -> MapSearch:
-    return MapSearch(source, FrameMatcher(PINHOLE, source, GradientDescriber()), AGL_M, around_m)  # type: ignore[arg-type]
+    local: Any = source
+    return MapSearch(local, FrameMatcher(PINHOLE, local, GradientDescriber()), AGL_M, around_m, USUAL, FlightBudget())
 
 
 def predicted() -> View:
@@ -229,7 +232,7 @@ def test_what_is_found_has_enough_and_is_ahead(
 ) -> None:
     tracks = searched(BoundedMap(ground), None).tracks
     tracks.all = [best, *rivals]
-    assert tracks._is_found(best) is found
+    assert tracks._is_found(best, ENOUGH) is found
 
 
 def test_one_piece_of_ground_counts_once() -> None:
@@ -320,9 +323,9 @@ def test_a_place_without_rivals_is_weighed_against_places_that_are_none(ground: 
     for k, e_m in enumerate((0.0, -0.5, 0.5, -1.0)):
         tracks.propose(float(p_m[0]) + e_m * AGL_M, float(p_m[1]), Hypothesis(0.0, 1.0), AGL_M)
         tracks.all[-1].looked_at(-9.0 if k else 2.0, wide=False)
-    tracks.look(picture, predicted(), 0.0)
-    assert len(tracks.all) == 1 and tracks._chance._sums[0] == PRIOR_PLACES + 3.0
-    assert not tracks._chance.is_known
+    tracks.look(picture, predicted(), 0.0, ENOUGH)
+    assert len(tracks.all) == 1 and tracks.chance._sums[0] == PRIOR_PLACES + 3.0
+    assert not tracks.chance.is_known
 
 
 def test_more_patches_say_more() -> None:

@@ -194,7 +194,7 @@ class Estimator(Tracker):
         self._is_frame(self.graph.newest, self._last.frame_id)
         self._cov_of.clear()
         self._refused.clear()
-        self.doubt = Doubt()
+        self.doubt = Doubt(match.lost_sigma_m)  # of a place that is still being tested
         self._seen = SeenGround()
         self._accepted(match, fixed_s, measured.translation()[:2])
         return FixResult(Verdict.ACCEPTED, None, f"{how} {float(np.hypot(*offset)):.0f} m away")
