@@ -58,7 +58,7 @@ def learn_into(package: Path, heights_m: Sequence[float]) -> None:
     try:
         west, south, east, north = opened.manifest.bounds_wgs84
         local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
-        rows = tuple(learn(local, agl_m) for agl_m in heights_m)
+        rows = tuple(learn(local, agl_m, FLIGHTS, STRETCHES) for agl_m in heights_m)
         model = NullModel(version=VERSION, matcher=GradientDescriber.name, rows=rows)
         newest, *others = opened.manifest.layers
         layers: tuple[Layer, ...] = (msgspec.structs.replace(newest, null_model=model), *others)
@@ -78,7 +78,7 @@ def learn_into(package: Path, heights_m: Sequence[float]) -> None:
     write_seal(package)
 
 
-def learn(source: LocalMap, agl_m: float, flights: int = FLIGHTS, stretches: int = STRETCHES) -> NullRow:
+def learn(source: LocalMap, agl_m: float, flights: int, stretches: int) -> NullRow:
     """What ``flights`` over mirrored ground find, each over ``stretches`` of new ground. Raises UsageError."""
     draw = np.random.default_rng(SEED)
     best, sigmas, patches, places = list[float](), list[float](), list[tuple[float, float]](), 1.0
@@ -122,7 +122,7 @@ def _strip(source: LocalMap, agl_m: float, stretches: int, draw: np.random.Gener
     for _ in range(DRAWS):
         e_m, n_m = draw.uniform(e_min, e_max), draw.uniform(n_min, n_max)
         turn = cv2.getRotationMatrix2D((side / 2, side / 2), draw.uniform(0.0, 360.0), 1.0)
-        turn[:, 2] += (width - side) / 2, (CAMERA.height - side) / 2
+        turn[:, 2] += np.array([width - side, CAMERA.height - side]) / 2
         half_m = side / 2 * gsd_m
         picture, valid = source.window(e_m - half_m, n_m + half_m, side, side, gsd_m)
         seen = cv2.warpAffine(valid.astype(np.uint8), turn, (width, CAMERA.height))
