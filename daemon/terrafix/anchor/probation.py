@@ -19,13 +19,15 @@ FIRST_ODDS = 0.0
 PASSED_ODDS = START_ODDS  # as sure as a start: a wrong place comes to this once in 400 times
 # One in eight: six stretches of new ground that say nothing, each LOOK_MIN, for what changed or leans does so in all.
 FAILED_ODDS = -math.log(8.0)
+# The exponent of the e-value: the one that tells most of a clear frame while the mean over chance stays at most one
+# with LOOK_MIN as the least, where a tenth of chance counts as a tail: 0.9 exp(-0.4) + 0.1^0.4 = 1.
+CALIBRATOR = 0.4
 
 
 def log_e_value(log_probability: float) -> float:
-    """Evidence against chance of something that chance gives with this probability: 1 / (2 sqrt(p)), at most one in
-    the mean over chance (Vovk and Wang, "E-values: calibration, combination and applications", 2021, eq. 1). It stays
-    so with LOOK_MIN as the least, where no more than a fifth of chance counts as a tail."""
-    return -math.log(2.0) - 0.5 * log_probability
+    """Evidence against chance of something that chance gives with this probability: k p^(k - 1), at most one in the
+    mean over chance (Vovk and Wang, "E-values: calibration, combination and applications", 2021, eq. 1)."""
+    return math.log(CALIBRATOR) + (CALIBRATOR - 1.0) * log_probability
 
 
 class Probation:

@@ -122,7 +122,8 @@ def _strip(source: LocalMap, agl_m: float, stretches: int, draw: np.random.Gener
     for _ in range(DRAWS):
         e_m, n_m = draw.uniform(e_min, e_max), draw.uniform(n_min, n_max)
         turn = cv2.getRotationMatrix2D((side / 2, side / 2), draw.uniform(0.0, 360.0), 1.0)
-        turn[:, 2] += np.array([width - side, CAMERA.height - side]) / 2
+        turn[0, 2] += (width - side) / 2
+        turn[1, 2] += (CAMERA.height - side) / 2
         half_m = side / 2 * gsd_m
         picture, valid = source.window(e_m - half_m, n_m + half_m, side, side, gsd_m)
         seen = cv2.warpAffine(valid.astype(np.uint8), turn, (width, CAMERA.height))
