@@ -11,7 +11,7 @@ from terrafix.anchor.alone import alone
 from terrafix.anchor.belief import Belief, Mode
 from terrafix.anchor.matcher import AS_PREDICTED, FrameMatcher, Look, View
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.null_model import USUAL, FlightBudget
+from terrafix.anchor.null_model import USUAL, FlightBudget, Tail
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
@@ -56,6 +56,26 @@ def test_the_patches_find_the_mode_that_is_right(ground: np.ndarray) -> None:
     assert np.linalg.norm(found[1] - TRUE_M) < 3.0
 
 
+def test_a_frame_needs_more_the_less_likely_a_wrong_find_may_be(ground: np.ndarray) -> None:
+    """The best of three wrong places comes to what is needed with three times the probability of one."""
+    frame, modes = view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), mode(*TRUE_M[:2])]
+    assert decided(ground, frame, modes) is not None
+    assert decided(ground, frame, modes, log_probability=-60.0) is None
+
+
+def test_what_single_frames_need_is_that_of_the_map(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[float]()
+
+    def enough(_tail: Tail, log_probability: float) -> float:
+        asked.append(log_probability)
+        return np.inf
+
+    monkeypatch.setattr(Tail, "exceeded_with", enough)
+    frame, modes = view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), mode(*TRUE_M[:2])]
+    assert decided(ground, frame, modes) is None
+    assert asked[0] == pytest.approx(SHARE - np.log(3.0))
+
+
 def test_ground_that_is_nowhere_on_the_map_is_found_nowhere(ground: np.ndarray) -> None:
     other = view(texture(9, SIDE_M), PINHOLE, R, TRUE_M)
     assert decided(ground, other, [mode(20.0 * e, 20.0 * n) for e in (-3, 0, 3) for n in (-3, 0, 3)]) is None
@@ -76,6 +96,8 @@ def test_one_look_that_does_not_decide_is_decided_by_patches_where_little_is_cla
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch, sigma_m: float, verdict: Verdict
 ) -> None:
     monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # a look that says nothing
+    spent = list[float]()
+    monkeypatch.setattr("terrafix.anchor.node.alone", lambda *of: spent.append(of[-1]) or alone(*of))
     package: Any = OnlyMap(ground)
     frames = MemoryFrameStore(2)
     node = AnchorNode(frames, package, GradientDescriber(), 1.0)
@@ -84,5 +106,6 @@ def test_one_look_that_does_not_decide_is_decided_by_patches_where_little_is_cla
     near = predicted(1, sigma_m, at_m=TRUE_M + np.array([*NEAR_M, 0.0]))
     said, *_ = node.on(near)
     assert isinstance(said, MapMatch) and said.verdict is verdict
+    assert spent == ([SHARE] if verdict is Verdict.ACCEPTED else [])
     if verdict is Verdict.ACCEPTED:
         assert said.p_c_in_w_m is not None and np.linalg.norm(np.array(said.p_c_in_w_m) - TRUE_M) < 3.0

@@ -13,7 +13,7 @@ from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 from terrafix.anchor.lost import LOOK_MIN
 from terrafix.anchor.matcher import AS_PREDICTED, FrameMatcher, View
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.null_model import USUAL, FlightBudget, Tail
+from terrafix.anchor.null_model import USUAL, Tail
 from terrafix.anchor.place_check import FINE_PER_AGL
 from terrafix.anchor.place_search import anywhere_m, mixed_sigma_m
 from terrafix.anchor.probation import CALIBRATOR, FAILED_ODDS, PASSED_ODDS, Probation, log_e_value
@@ -174,14 +174,3 @@ def test_a_wrong_find_is_withdrawn_and_the_search_goes_on_over_the_whole_map(
     assert lost > 0
     assert all(m.lost_sigma_m >= 0.2 * anywhere_m(source) for m in said)  # never sure of it
     assert said[lost].step is SearchStep.WHOLE_MAP and said[lost].lost_sigma_m == anywhere_m(source)
-
-
-def test_a_search_that_goes_on_spends_from_the_budget_of_the_flight(ground: np.ndarray) -> None:
-    source: Any = OnlyMap(ground)
-    budget = FlightBudget()
-    search = MapSearch(source, FrameMatcher(PINHOLE, source, GradientDescriber()), AGL_M, None, USUAL, budget)
-    before = search.enough
-    for _ in range(3):
-        search.look(view(ground, PINHOLE, R, TRUE_M), HERE)
-        search.move(STRETCH_M, 0.0, 1.0)
-    assert search.enough > before

@@ -9,6 +9,7 @@ from typing import Any
 import map_rasters
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from terrafix.anchor.map_format import MANIFEST_TABLE
 from terrafix.anchor.map_package import LocalMap, MapPackage
@@ -17,6 +18,7 @@ from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.mapping import null_model
 from terrafix_tools.mapping.build import build_package, layer_of
+from terrafix_tools.mapping.cli import app
 from terrafix_tools.mapping.null_model import CAMERA, Strip, _strip
 
 SIDE_PX, AGL_M = 500, 50.0  # 250 m
@@ -114,3 +116,16 @@ def test_the_camera_goes_along_the_strip_by_its_steps() -> None:
     strip = Strip(picture, 20.4)
     assert (strip.frame(0)[:, 41:] == strip.frame(2)[:, :-41]).all()
     assert strip.frame(3).shape == (CAMERA.height, CAMERA.width, 3)
+
+
+def test_the_heights_of_the_command_line_are_those_that_are_learnt(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard = list[list[float]]()
+    monkeypatch.setattr("terrafix_tools.mapping.build.learn_into", lambda _part, heights_m: heard.append([*heights_m]))
+    out = str(tmp_path / "m.gpkg")
+    run = CliRunner().invoke(app, ["build", str(image), "--out", out, "--null-agl", "50", "--null-agl", "120"])
+    assert run.exit_code == 0 and heard == [[50.0, 120.0]]
+    again = CliRunner().invoke(app, ["build", str(image), "--out", str(tmp_path / "n.gpkg")])
+    assert again.exit_code == 0 and len(heard) == 1
+    assert CliRunner().invoke(app, ["build", str(image), "--out", out, "--null-agl", "10"]).exit_code == 2
