@@ -14,7 +14,7 @@ from terrafix.anchor.place_check import FINE_PER_AGL, PlaceCheck
 from terrafix.anchor.tracks import LLR_MAX, NEW_EVIDENCE, Tracks
 from terrafix.core.node import Image
 
-# Even odds: the claim is 0.7 of "anywhere" then, and two places of a map are hardly ever three times that apart.
+# The prior: even odds. The claim is 0.7 of "anywhere" then; 1.2 % of pairs of places are three times that apart.
 FIRST_ODDS = 0.0
 PASSED_ODDS = START_ODDS  # as sure as a start: a wrong place comes to this once in 400 times
 # One in eight: six stretches of new ground that say nothing, each LOOK_MIN, for what changed or leans does so in all.
