@@ -11,10 +11,12 @@ from terrafix.anchor.alone import alone
 from terrafix.anchor.belief import Belief, Mode
 from terrafix.anchor.matcher import AS_PREDICTED, FrameMatcher, Look, View
 from terrafix.anchor.node import AnchorNode
+from terrafix.anchor.null_model import USUAL, FlightBudget, Tail
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
+SHARE = FlightBudget().log_probability  # of the first frame
 NEAR_M = (7.0, -5.0)  # of the mode from the truth
 
 
@@ -34,11 +36,13 @@ def mode(e_m: float, n_m: float) -> Mode:
     return Mode(e_m, n_m, 0.1, 0.1, 9.0)
 
 
-def decided(ground: np.ndarray, frame: np.ndarray, modes: list[Mode]) -> tuple[Mode, np.ndarray] | None:
+def decided(
+    ground: np.ndarray, frame: np.ndarray, modes: list[Mode], log_probability: float = SHARE
+) -> tuple[Mode, np.ndarray] | None:
     source: Any = FlatMap(ground)
     matcher = FrameMatcher(PINHOLE, source, GradientDescriber())
     predicted = View(0.0, 0.0, R, AGL_M, 0.0, 0.03, 0.02, 0.03)
-    found = alone(frame, predicted, SameLook(Verdict.ACCEPTED), modes, source, matcher)
+    found = alone(frame, predicted, SameLook(Verdict.ACCEPTED), modes, source, matcher, USUAL, log_probability)
     if found is None:
         return None
     assert found[1].pnp.fit is not None
@@ -50,6 +54,26 @@ def test_the_patches_find_the_mode_that_is_right(ground: np.ndarray) -> None:
     found = decided(ground, view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), right])
     assert found is not None and found[0] is right
     assert np.linalg.norm(found[1] - TRUE_M) < 3.0
+
+
+def test_a_frame_needs_more_the_less_likely_a_wrong_find_may_be(ground: np.ndarray) -> None:
+    """The best of three wrong places comes to what is needed with three times the probability of one."""
+    frame, modes = view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), mode(*TRUE_M[:2])]
+    assert decided(ground, frame, modes) is not None
+    assert decided(ground, frame, modes, log_probability=-60.0) is None
+
+
+def test_what_single_frames_need_is_that_of_the_map(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[float]()
+
+    def enough(_tail: Tail, log_probability: float) -> float:
+        asked.append(log_probability)
+        return np.inf
+
+    monkeypatch.setattr(Tail, "exceeded_with", enough)
+    frame, modes = view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), mode(*TRUE_M[:2])]
+    assert decided(ground, frame, modes) is None
+    assert asked[0] == pytest.approx(SHARE - np.log(3.0))
 
 
 def test_ground_that_is_nowhere_on_the_map_is_found_nowhere(ground: np.ndarray) -> None:
@@ -72,6 +96,8 @@ def test_one_look_that_does_not_decide_is_decided_by_patches_where_little_is_cla
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch, sigma_m: float, verdict: Verdict
 ) -> None:
     monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # a look that says nothing
+    spent = list[float]()
+    monkeypatch.setattr("terrafix.anchor.node.alone", lambda *of: spent.append(of[-1]) or alone(*of))
     package: Any = OnlyMap(ground)
     frames = MemoryFrameStore(2)
     node = AnchorNode(frames, package, GradientDescriber(), 1.0)
@@ -80,5 +106,6 @@ def test_one_look_that_does_not_decide_is_decided_by_patches_where_little_is_cla
     near = predicted(1, sigma_m, at_m=TRUE_M + np.array([*NEAR_M, 0.0]))
     said, *_ = node.on(near)
     assert isinstance(said, MapMatch) and said.verdict is verdict
+    assert spent == ([SHARE] if verdict is Verdict.ACCEPTED else [])
     if verdict is Verdict.ACCEPTED:
         assert said.p_c_in_w_m is not None and np.linalg.norm(np.array(said.p_c_in_w_m) - TRUE_M) < 3.0

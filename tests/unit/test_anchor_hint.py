@@ -98,7 +98,7 @@ def test_a_hint_against_a_start_that_nothing_confirmed_begins_a_search_there(
     began = MapSearch.__init__
 
     def begin(self: MapSearch, *arguments: Any) -> None:
-        around.append(arguments[-1])
+        around.append(arguments[3])
         began(self, *arguments)
 
     monkeypatch.setattr(MapSearch, "__init__", begin)

@@ -15,6 +15,7 @@ from terrafix.anchor.belief import Belief
 from terrafix.anchor.lost import LostWatch
 from terrafix.anchor.matcher import FrameMatcher
 from terrafix.anchor.node import AnchorNode
+from terrafix.anchor.null_model import USUAL, VERSION, NullModel
 from terrafix.anchor.place_search import LOST_SIGMA_M, start_around
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.core.frames import MemoryFrameStore
@@ -112,6 +113,27 @@ def test_a_start_that_is_not_known_is_searched_on_the_whole_map(
     said = match(node, 1, 100.0)
     assert (said.verdict, said.step, said.lost_sigma_m) == (Verdict.LOST, SearchStep.WHOLE_MAP, LOST_SIGMA_M)
     assert said.p_c_in_w_m is None and said.cov is None and not said.found
+
+
+def test_a_search_needs_what_the_map_says_of_its_wrong_places(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needed = list[float]()
+    monkeypatch.setattr(MapSearch, "look", lambda search, *_: needed.append(search.enough))
+    rows = tuple(
+        msgspec.structs.replace(USUAL, agl_m=agl_m, search=msgspec.structs.replace(USUAL.search, above=above))
+        for agl_m, above in ((0.5 * AGL_M, 1e3), (1.1 * AGL_M, 50.0))
+    )
+    layer = SimpleNamespace(
+        table="imagery", ce90_m=None, null_model=NullModel(version=VERSION, matcher="gradient", rows=rows)
+    )
+    for manifest in (OnlyMap.manifest, SimpleNamespace(layers=(layer,))):
+        monkeypatch.setattr(OnlyMap, "manifest", manifest)
+        node, frames = started(ground, 5000.0)
+        frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+        match(node, 1, 100.0)
+    assert needed[0] < 20.0
+    assert needed[1] == pytest.approx(needed[0] + 50.0 - USUAL.search.above)
 
 
 def test_a_search_joins_frames_by_their_steps_however_the_unknown_place_grows_worse(
@@ -239,7 +261,10 @@ class TwoDates:
     """The newest layer shows other ground, as after building works; the older one is right, and states its accuracy."""
 
     manifest = SimpleNamespace(
-        layers=(SimpleNamespace(table="new", ce90_m=None), SimpleNamespace(table="old", ce90_m=5.0))
+        layers=tuple(
+            SimpleNamespace(table=table, ce90_m=ce90_m, null_model=None)
+            for table, ce90_m in (("new", None), ("old", 5.0))
+        )
     )
 
     def __init__(self, ground: np.ndarray) -> None:

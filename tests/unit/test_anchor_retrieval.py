@@ -2,7 +2,9 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
@@ -11,15 +13,16 @@ from terrafix.anchor.agreement import Agreement
 from terrafix.anchor.chance import COARSE, PATCHES, PRIOR_PLACES, Chance
 from terrafix.anchor.lost import MOST_ODDS, LostWatch, pose_gain
 from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
+from terrafix.anchor.null_model import USUAL, FlightBudget, NullRow
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.anchor.tracks import (
     AHEAD,
     CLEAR_LEAD,
-    ENOUGH,
     LEADS,
     LLR_MAX,
     LLR_MIN,
     MIN_FRAMES,
+    NEAR,
     NEW_EVIDENCE,
     SPEAKS,
     Found,
@@ -33,6 +36,7 @@ from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import POOL
 
 AGL_M = 100.0
+ENOUGH = 10.0  # evidence that a wrong place hardly comes to
 SIDE_M = 500.0
 STEP_M = np.array([9.0, 12.0])  # 15 m a frame
 START_M = np.array([-90.0, -70.0])
@@ -59,8 +63,9 @@ def frames(ground: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndar
         yield view(ground, PINHOLE, rotation(HEADING_DEG), p_m), p_m
 
 
-def searched(source: BoundedMap, around_m: tuple[float, float] | None) -> MapSearch:
-    return MapSearch(source, FrameMatcher(PINHOLE, source, GradientDescriber()), AGL_M, around_m)  # type: ignore[arg-type]
+def searched(source: BoundedMap, around_m: tuple[float, float] | None, null: NullRow = USUAL) -> MapSearch:
+    local: Any = source
+    return MapSearch(local, FrameMatcher(PINHOLE, local, GradientDescriber()), AGL_M, around_m, null, FlightBudget())
 
 
 def predicted() -> View:
@@ -99,6 +104,45 @@ def test_one_frame_is_never_enough_however_often_it_is_seen(ground: np.ndarray) 
         assert search.look(picture, predicted()) is None
         search.move(0.0, 0.0, 4.0)  # it hovers, and odometry knows no better
     assert search.tracks.all[0].frames == 1
+
+
+def test_where_the_best_wrong_places_score_high_more_is_needed_of_the_right_one(ground: np.ndarray) -> None:
+    null = msgspec.structs.replace(USUAL, search=msgspec.structs.replace(USUAL.search, above=60.0))
+    search = searched(BoundedMap(ground), None, null)
+    found, _, after = fly(search, ground, 5)
+    assert found is None and after == 5
+    assert search.tracks.all[0].odds > searched(BoundedMap(ground), None).enough  # enough on a usual map
+
+
+def test_every_stretch_of_new_ground_makes_a_find_need_more_and_no_frame_within_it(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Tracks, "look", lambda *_: None)
+    search, needed = searched(BoundedMap(ground), None), list[float]()
+    picture, _ = next(frames(ground, 1))
+    for _ in range(11):
+        search.look(picture, predicted())
+        needed.append(search.enough)
+        search.move(0.2 * NEW_EVIDENCE * AGL_M, 0.0, 1.0)
+    assert needed[0] == needed[4] < needed[5] == needed[9] < needed[10]
+
+
+def test_what_could_be_the_best_by_chance_grows_with_map_and_headings_and_falls_with_height(
+    ground: np.ndarray,
+) -> None:
+    source, few, many = BoundedMap(ground), (Hypothesis(0.0, 1.0),), 3 * (Hypothesis(0.0, 1.0),)
+    search = searched(source, None)
+    search._hypotheses = few
+    assert search.places == pytest.approx((SIDE_M / (NEAR * AGL_M)) ** 2)
+    search._hypotheses = many
+    assert search.places == pytest.approx(3.0 * (SIDE_M / (NEAR * AGL_M)) ** 2)
+    search.agl_m = 10.0 * SIDE_M
+    assert search.places == 3.0  # of a map that is all one place
+
+
+def test_a_search_begins_with_what_patches_come_to_on_this_map(ground: np.ndarray) -> None:
+    search = searched(BoundedMap(ground), None, msgspec.structs.replace(USUAL, patches=(1.5, 2.0)))
+    assert search.tracks.chance.patches == pytest.approx((1.5, 2.0))
 
 
 def test_a_look_is_a_wide_one_once_it_joins_new_ground(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,7 +273,7 @@ def test_what_is_found_has_enough_and_is_ahead(
 ) -> None:
     tracks = searched(BoundedMap(ground), None).tracks
     tracks.all = [best, *rivals]
-    assert tracks._is_found(best) is found
+    assert tracks._is_found(best, ENOUGH) is found
 
 
 def test_one_piece_of_ground_counts_once() -> None:
@@ -320,9 +364,9 @@ def test_a_place_without_rivals_is_weighed_against_places_that_are_none(ground: 
     for k, e_m in enumerate((0.0, -0.5, 0.5, -1.0)):
         tracks.propose(float(p_m[0]) + e_m * AGL_M, float(p_m[1]), Hypothesis(0.0, 1.0), AGL_M)
         tracks.all[-1].looked_at(-9.0 if k else 2.0, wide=False)
-    tracks.look(picture, predicted(), 0.0)
-    assert len(tracks.all) == 1 and tracks._chance._sums[0] == PRIOR_PLACES + 3.0
-    assert not tracks._chance.is_known
+    tracks.look(picture, predicted(), 0.0, ENOUGH)
+    assert len(tracks.all) == 1 and tracks.chance._sums[0] == PRIOR_PLACES + 3.0
+    assert not tracks.chance.is_known
 
 
 def test_more_patches_say_more() -> None:

@@ -65,6 +65,19 @@ def test_what_a_search_found_replaces_it_at_once() -> None:
     assert sigma_m(run.estimate(59)) < 8.0
 
 
+def test_a_place_that_is_found_and_still_tested_claims_the_doubt_of_it_until_the_map_takes_it_back() -> None:
+    flight = Flight(60, seed=3, dem=True)
+    run = flown_wrong(flight)
+    found = msgspec.structs.replace(flight.fix(40, WRONG_M), found=True, lost_sigma_m=700.0)
+    run.hear(with_map(flight, 40, found))
+    assert run.verdicts("map")[40].verdict is Verdict.ACCEPTED
+    assert 700.0 <= sigma_m(run.estimate(40)) < 720.0
+    run.hear(with_map(flight, 41, msgspec.structs.replace(flight.fix(41, WRONG_M), lost_sigma_m=200.0)))
+    assert 200.0 <= sigma_m(run.estimate(41)) < 220.0
+    run.hear(with_map(flight, 42, flight.fix(42, WRONG_M)))
+    assert sigma_m(run.estimate(42)) < 15.0
+
+
 def test_the_same_fix_without_a_search_behind_it_is_refused() -> None:
     flight = Flight(60, seed=3)
     run = flown_wrong(flight)

@@ -12,19 +12,28 @@ from terrafix.anchor.belief import Mode
 from terrafix.anchor.chance import Chance
 from terrafix.anchor.map_package import LocalMap
 from terrafix.anchor.matcher import Fix, FrameMatcher, Look, View, view_at
+from terrafix.anchor.null_model import NullRow
 from terrafix.anchor.place_check import CELL_PER_AGL, PlaceCheck
 from terrafix.anchor.tracks import AHEAD, CHANCE_MOST, LLR_MAX, LLR_SLOPE, NEAR
 from terrafix.core.node import Image
 
 PLACES = 12  # modes that are checked, some 50 ms each
-LIKELIHOOD_RATIO = float(np.exp(LLR_MAX))  # less log(PLACES), 6 nats are left: one in four hundred may be wrong
+LIKELIHOOD_RATIO = float(np.exp(LLR_MAX))  # of a place that is found so, for the belief
 
 
 def alone(
-    image: Image, view: View, look: Look, modes: Sequence[Mode], source: LocalMap, matcher: FrameMatcher
+    image: Image,
+    view: View,
+    look: Look,
+    modes: Sequence[Mode],
+    source: LocalMap,
+    matcher: FrameMatcher,
+    null: NullRow,
+    log_probability: float,
 ) -> tuple[Mode, Fix] | None:
-    """``modes`` of the belief after the look. None: no place, or more than one, for which the patches speak."""
-    check, chance = PlaceCheck(source, matcher), Chance()
+    """``modes`` of the belief after the look. None: no place, or more than one, for which the patches speak. ``null``:
+    of the map at this height; ``log_probability`` that this frame may find a place when all of them are wrong."""
+    check, chance = PlaceCheck(source, matcher), Chance(null.patches)
     views = [view_at(view, look.best_at(m.e_m, m.n_m)[0], m.e_m, m.n_m) for m in modes]
     checked = [(check.at(image, there, CELL_PER_AGL), mode) for there, mode in zip(views, modes, strict=True)]
     places = sorted(((c, m) for c, m in checked if c is not None), key=lambda place: -place[0].agreement.llr)
@@ -35,8 +44,9 @@ def alone(
     others = [c for c, m in places[1:] if np.hypot(m.e_m - mode.e_m, m.n_m - mode.n_m) > near_m]
     for other in others:
         chance.learn(other.agreement, fine=False)
-    evidence, *rivals = (LLR_SLOPE * (chance.sigmas(c.agreement, fine=False) - CHANCE_MOST) for c in (best, *others))
-    if evidence < LLR_MAX or evidence < max(rivals, default=0.0) + AHEAD:
+    sigmas, *rivals = (chance.sigmas(c.agreement, fine=False) for c in (best, *others))
+    enough = null.frame.exceeded_with(log_probability - np.log(len(places)))
+    if sigmas < enough or LLR_SLOPE * (sigmas - max((CHANCE_MOST, *rivals))) < AHEAD:
         return None
     fix = check.settled(image, view, best.fix)
     return None if fix is None else (mode, fix)

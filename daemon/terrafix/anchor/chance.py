@@ -18,8 +18,10 @@ LEARNT_PLACES = 24  # enough to know what chance comes to here
 
 
 class Chance:
-    def __init__(self) -> None:
-        self._sums = PRIOR_PLACES * np.array([1.0, 0.0, 1.0])  # places, values, squares
+    def __init__(self, patches: tuple[float, float] = (0.0, 1.0)) -> None:
+        """``patches``: mean and standard deviation of the map's null model, in units of ``COARSE`` and ``FINE``."""
+        mean, sigma = patches
+        self._sums = PRIOR_PLACES * np.array([1.0, mean, mean**2 + sigma**2])  # places, values, squares
 
     @property
     def is_known(self) -> bool:
@@ -33,10 +35,15 @@ class Chance:
 
     def sigmas(self, found: Agreement, *, fine: bool) -> float:
         """How far a place is above chance, in standard deviations."""
+        mean, sigma = self.patches
+        return (_usual_sigmas(found, fine=fine) - mean) / sigma
+
+    @property
+    def patches(self) -> tuple[float, float]:
+        """Mean and standard deviation of what wrong places come to, as far as they are known by now."""
         count, total, squares = self._sums
         mean = total / count
-        sigma = np.sqrt(max(squares / count - mean**2, LEAST_VARIANCE))
-        return float((_usual_sigmas(found, fine=fine) - mean) / sigma)
+        return float(mean), float(np.sqrt(max(squares / count - mean**2, LEAST_VARIANCE)))
 
 
 def _usual_sigmas(found: Agreement, *, fine: bool) -> float:

@@ -9,6 +9,7 @@ from terrafix.anchor.map_features import CACHE_BYTES, Describer
 from terrafix.anchor.map_layers import LayerChoice
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import FrameMatcher, Look, View
+from terrafix.anchor.null_model import NullModel, NullRow, null_at
 from terrafix.anchor.tile_shelf import MOST, TileShelf
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
@@ -20,12 +21,17 @@ CE90_SIGMAS = 2.1460  # of a circular normal error: sqrt(-2 ln 0.1)
 
 @dataclass(frozen=True)
 class Dated:
-    """One layer. ``sigma_m``: error of its position, 1-sigma per horizontal axis."""
+    """One layer. ``sigma_m``: error of its position, 1-sigma per horizontal axis. ``null``: what the best wrong places
+    of it score, if somebody has measured that."""
 
     map: LocalMap
     matcher: FrameMatcher
     agreed: AgreedPose
     sigma_m: float
+    null: NullModel | None
+
+    def null_at(self, agl_m: float) -> NullRow:
+        return null_at(self.null, self.matcher.gradients.name, agl_m)
 
 
 class Layers:
@@ -49,7 +55,9 @@ class Layers:
                 kept = TileShelf(shelf, f"{_file(package)} {frame} {layer.table}", MOST // len(layers))
             matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers), kept)
             stated = ce90_m if layer.ce90_m is None else layer.ce90_m
-            self._all[layer.table] = Dated(bound, matcher, AgreedPose(bound, matcher), stated / CE90_SIGMAS)
+            self._all[layer.table] = Dated(
+                bound, matcher, AgreedPose(bound, matcher), stated / CE90_SIGMAS, layer.null_model
+            )
         self._choice = LayerChoice([layer.table for layer in layers])
 
     def see_through(self, bend: float) -> None:

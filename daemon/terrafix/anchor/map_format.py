@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import msgspec
 
+from terrafix.anchor.null_model import NullModel
+
 FORMAT_VERSION = 2  # 1: one imagery layer, elevation in a table of its own, placement outside the checksum
 APPLICATION_ID = 0x47504B47  # "GPKG", OGC 12-128r18 requirement 2
 IMAGERY_TABLE = "imagery"  # the first layer; further ones are imagery_2, imagery_3, ...
@@ -77,6 +79,7 @@ class Layer(msgspec.Struct, frozen=True, kw_only=True):
     levels: tuple[Level, ...]  # coarse to fine
     tiles: int
     descriptors: DescriptorTable | None = None
+    null_model: NullModel | None = None  # what wrong places score; None: not measured
 
 
 class VectorTable(msgspec.Struct, frozen=True, kw_only=True):

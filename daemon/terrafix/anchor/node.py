@@ -15,8 +15,9 @@ from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.matcher import view_at
 from terrafix.anchor.model_watch import ModelWatch
+from terrafix.anchor.null_model import FlightBudget
 from terrafix.anchor.place_check import SIGMA_FLOOR
-from terrafix.anchor.place_search import PlaceSearch, anywhere_m, start_around
+from terrafix.anchor.place_search import PlaceSearch, mixed_sigma_m, start_around
 from terrafix.anchor.start import answered
 from terrafix.anchor.tracks import NEAR
 from terrafix.anchor.views import ground_plane, view_of
@@ -95,6 +96,7 @@ class AnchorNode:
         self._belief: Belief | None = None
         self._watch = LostWatch()
         self._search = PlaceSearch()
+        self._alone = FlightBudget()  # of single frames
         self._since_look_m = np.inf  # motion since the last look at new ground
         self._poor_looks = 0.0
         self._variance_m2 = 0.0  # of the last prediction
@@ -248,7 +250,9 @@ class AnchorNode:
                 answer = together if together.verdict is Verdict.ACCEPTED else answer
         claimed_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
         if not tried and new >= 1.0 and claims_little(claimed_m, view.agl_m):
-            place = alone(image, view, look, belief.modes(PLACES), used.map, used.matcher)
+            self._alone.spend()
+            null, share = used.null_at(view.agl_m), self._alone.log_probability
+            place = alone(image, view, look, belief.modes(PLACES), used.map, used.matcher, null, share)
             if place is not None:
                 mode, fix = place
                 answer = judged(msgspec.structs.replace(answer, mode_e_m=mode.e_m, mode_n_m=mode.n_m), fix, view)
@@ -256,10 +260,12 @@ class AnchorNode:
                 likelihood_ratio = LIKELIHOOD_RATIO
         self._watch.looked(gain, weight, new, inliers, claimed_m, view.agl_m)
         # Of the mixture "where it is believed to be, or anywhere": the variance that the second part adds.
-        self._search.sigma_m = float(np.sqrt(self._watch.doubt)) * anywhere_m(best.map)
+        tested = self._search.tested(image, view_at(view, hypothesis, mode.e_m, mode.n_m) if tried else None)
+        doubt = max(self._watch.doubt, tested)
+        self._search.sigma_m = mixed_sigma_m(doubt, best.map)
         answer = msgspec.structs.replace(answer, lost_sigma_m=self._search.sigma_m)
-        if self._watch.lost:  # nothing speaks for the place that was believed any more
-            self._search.begin(best, prediction.agl_m, prediction.p_c_in_w_m[:2])
+        if self._watch.lost or doubt == 1.0:  # nothing speaks for the place that was believed any more
+            self._search.begin(best, prediction.agl_m, prediction.p_c_in_w_m[:2] if tested < 1.0 else None)
             return self._search.answer(answer)
         if not tried:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
@@ -302,6 +308,7 @@ class AnchorNode:
             if turned:
                 sigma_m = float(np.sqrt(max(step_var + step_m**2, grown)))
             sway = min(SWAY, float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))))
+            self._search.move(prediction.step_m, float(np.sqrt(step_var)))  # a place that was found is tested further
             self._belief.move(*prediction.step_m, float(np.hypot(sigma_m, sway * prediction.agl_m)))
             self._belief.fit_window(0.0)
             if not 0.4 < cell_m / self._belief.cell_m < 2.5:  # an octave is left alone: no flicker at its edge

@@ -7,6 +7,9 @@ from terrafix.anchor.answer import found
 from terrafix.anchor.hint import SIGMAS_95, Believed, radius_now_m, weigh
 from terrafix.anchor.layers import Dated
 from terrafix.anchor.map_package import LocalMap
+from terrafix.anchor.matcher import View
+from terrafix.anchor.null_model import FlightBudget
+from terrafix.anchor.probation import Probation
 from terrafix.anchor.retrieval import MapSearch
 from terrafix.anchor.views import ground_plane, view_of
 from terrafix.core.geodesy import LocalFrame
@@ -23,6 +26,11 @@ def anywhere_m(source: LocalMap) -> float:
     return max(LOST_SIGMA_M, 0.5 * (e_max - e_min), 0.5 * (n_max - n_min))
 
 
+def mixed_sigma_m(doubt: float, source: LocalMap) -> float:
+    """1-sigma per axis that "anywhere", with this probability, adds to a place that is known."""
+    return float(np.sqrt(doubt)) * anywhere_m(source)
+
+
 def start_around(e_m: float, n_m: float, sigma_m: float, source: LocalMap) -> tuple[float, float] | None:
     """Where a search begins: around a place that says something, None when it says no more than the map."""
     e_min, n_min, e_max, n_max = source.bounds_m
@@ -30,11 +38,13 @@ def start_around(e_m: float, n_m: float, sigma_m: float, source: LocalMap) -> tu
 
 
 class PlaceSearch:
-    """``sigma_m``: what the position is known worse by than the estimator thinks, 1-sigma per axis; also of a place
-    that is only doubted, and then without a search."""
+    """One flight's. ``sigma_m``: what the position is known worse by than the estimator thinks, 1-sigma per axis; also
+    of a place that is only doubted, and then without a search."""
 
     def __init__(self) -> None:
         self._search: MapSearch | None = None
+        self._probation: Probation | None = None
+        self._budget = FlightBudget()
         self.sigma_m = 0.0
 
     @property
@@ -43,12 +53,28 @@ class PlaceSearch:
 
     def begin(self, best: Dated, agl_m: float, around_m: tuple[float, float] | None) -> None:
         """``around_m``: where; None: the whole map."""
-        self._search = MapSearch(best.map, best.matcher, agl_m, around_m)
+        self._search = MapSearch(best.map, best.matcher, agl_m, around_m, best.null_at(agl_m), self._budget)
+        self._probation = None
         self.sigma_m = anywhere_m(best.map)
 
     def move(self, step_m: tuple[float, float], sigma_m: float) -> None:
         if self._search is not None:
             self._search.move(*step_m, sigma_m)
+        if self._probation is not None:
+            self._probation.move(float(np.hypot(*step_m)))
+
+    def tested(self, image: Image, view: View | None) -> float:
+        """A frame at the place that was found last, seen from ``view`` (None: several places are possible).
+
+        -> probability that it is wrong; 0 when it is not in question any more, 1 when it is given up."""
+        test = self._probation
+        if test is None:
+            return 0.0
+        test.look(image, view)
+        if test.passed or test.failed:
+            self._probation = None
+            return 0.0 if test.passed else 1.0
+        return test.doubt
 
     def answer(self, answer: MapMatch) -> MapMatch:
         """What is said while it is on."""
@@ -86,8 +112,9 @@ class PlaceSearch:
         said = found(said, place.fix, view, place.track.jump_m)
         if said.verdict is not Verdict.ACCEPTED:
             return self.answer(answer)
-        self._search, self.sigma_m = None, 0.0
-        return msgspec.structs.replace(said, lost_sigma_m=0.0)
+        self._probation = Probation(self._search.tracks, best.null_at(prediction.agl_m).frame, prediction.agl_m)
+        self._search, self.sigma_m = None, mixed_sigma_m(self._probation.doubt, best.map)
+        return msgspec.structs.replace(said, lost_sigma_m=self.sigma_m)
 
     def heed(self, hint: PositionHint, origin: Origin, prediction: Prediction, best: Dated, odds: float) -> HintVerdict:
         """The operator's hint: where the search goes on, or a comparison with what is believed at these log odds."""

@@ -12,7 +12,8 @@ from terrafix.anchor.correlate import standardise
 from terrafix.anchor.map_package import LocalMap
 from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.mosaic import Mosaic
-from terrafix.anchor.tracks import NEAR, SAME, Found, Tracks
+from terrafix.anchor.null_model import FlightBudget, NullRow
+from terrafix.anchor.tracks import NEAR, NEW_EVIDENCE, SAME, Found, Tracks
 from terrafix.anchor.wide_search import BLOCK_CELLS, Block, WideSearch, blocks_of
 from terrafix.core.node import Image
 from terrafix.messages import SearchStep
@@ -51,9 +52,16 @@ class Peak:
 
 class MapSearch:
     def __init__(
-        self, source: LocalMap, matcher: FrameMatcher, agl_m: float, around_m: tuple[float, float] | None
+        self,
+        source: LocalMap,
+        matcher: FrameMatcher,
+        agl_m: float,
+        around_m: tuple[float, float] | None,
+        null: NullRow,
+        budget: FlightBudget,
     ) -> None:
-        """``around_m``: the last place that was believed, where the search begins; None: nowhere."""
+        """``around_m``: the last place that was believed, where the search begins; None: nowhere. ``null``: of the map
+        at this height; ``budget``: of the flight, from which every stretch of new ground takes a share."""
         self._map = source
         self._matcher = matcher
         self.agl_m = agl_m
@@ -64,11 +72,13 @@ class MapSearch:
         self._cell_m = 0.0
         self._hypotheses: tuple[Hypothesis, ...] = ()
         self._mosaic = Mosaic((), 1.0)
-        self.tracks = Tracks(source, matcher)
+        self._null = null
+        self._budget = budget
+        self.tracks = Tracks(source, matcher, null.patches)
         self._p_m = np.zeros(2)  # by odometry, since the search began
         self._var_m2 = 0.0
         self._way_m = 0.0  # flown since the search began
-        self._looked_way_m = self._verified_way_m = -np.inf
+        self._looked_way_m = self._verified_way_m = self._decided_way_m = -np.inf
 
     @property
     def step(self) -> SearchStep:
@@ -98,7 +108,22 @@ class MapSearch:
         if self._way_m - self._verified_way_m < VERIFY_EVERY * view.agl_m:
             return None
         self._verified_way_m = self._way_m
-        return self.tracks.look(image, view, self._way_m)
+        if self._way_m - self._decided_way_m >= NEW_EVIDENCE * view.agl_m:
+            self._decided_way_m = self._way_m
+            self._budget.spend()
+        return self.tracks.look(image, view, self._way_m, self.enough)
+
+    @property
+    def enough(self) -> float:
+        """Evidence that a place needs by now."""
+        return self._null.enough(self.places, self._budget.log_probability)
+
+    @property
+    def places(self) -> float:
+        """That could be the best one by chance: neighbours of the whole map, times headings and scales."""
+        e_min, n_min, e_max, n_max = self._map.bounds_m
+        area = (e_max - e_min) * (n_max - n_min) / (NEAR * self.agl_m) ** 2
+        return max(area, 1.0) * max(len(self._hypotheses), 1)
 
     def _look_wide(self, image: Image, view: View) -> None:
         if not self._blocks:

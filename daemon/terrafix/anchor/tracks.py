@@ -1,7 +1,8 @@
 """Places that a search follows: what frames along the way say for each decides which of them is right, if any.
 
 Evidence is a log likelihood ratio, "here against the best wrong places of a map". It counts once for the same ground.
-A track is found when it has enough of it, and more than every other track."""
+A track is found when it has more of it than the best wrong place of the map may come to (``null_model.py``), and more
+than every other track."""
 
 from dataclasses import dataclass, replace
 
@@ -29,7 +30,6 @@ LLR_MIN, LLR_MAX = -1.4, 9.0
 NEW_EVIDENCE = 0.4  # of the height: a frame over this much new ground is new evidence
 SAME_EVIDENCE = 0.05  # the same ground again
 WORST = -1.0  # a track that falls below is given up for this ground
-ENOUGH = 10.0  # some 60 places are looked at in a search, 4 nats, and one in four hundred searches may be wrong, 6
 AHEAD = 5.0  # of the best other track
 SPEAKS = 2.0  # nats of a frame that speaks for its place
 MIN_FRAMES = 2  # that must speak for it: what chance gave in one frame is gone in the next
@@ -113,12 +113,14 @@ class Found:
 
 
 class Tracks:
-    def __init__(self, source: LocalMap, matcher: FrameMatcher) -> None:
+    def __init__(self, source: LocalMap, matcher: FrameMatcher, patches: tuple[float, float] = (0.0, 1.0)) -> None:
+        """``patches``: what chance comes to by the map's null model."""
         self._map = source
         self._matcher = matcher
-        self._check = PlaceCheck(source, matcher)
-        self._chance = Chance()
+        self.check = PlaceCheck(source, matcher)
+        self.chance = Chance(patches)
         self.all: list[Track] = []  # best first
+        self.sigmas: list[float] = []  # above chance, of the places that the last frame was compared with
 
     def move(self, step_m: np.ndarray) -> None:
         """``step_m`` (2,): east, north, by odometry."""
@@ -133,20 +135,22 @@ class Tracks:
         elif near.score <= 0.0:
             near.e_m, near.n_m, near.hypothesis = e_m, n_m, hypothesis
 
-    def look(self, image: Image, view: View, way_m: float) -> Found | None:
-        """The frame at the tracks; the one that is found by now, with its pose in this frame."""
+    def look(self, image: Image, view: View, way_m: float, enough: float) -> Found | None:
+        """The frame at the tracks; the one that is found by now, with its pose in this frame. ``enough``: evidence that
+        the best wrong place of the map hardly comes to."""
         hopeless = [t for t in self.all if not t.is_open and t.scored_way_m == -np.inf]
         kept_m = NEW_EVIDENCE * view.agl_m  # a place that was given up is not proposed again over the same ground
         self.all = [t for t in self.all if t.is_open or way_m - t.scored_way_m < kept_m]
         tried = sorted((t for t in self.all if t.is_open), key=lambda t: (t.score <= 0.0, -t.odds))[:AT_A_TIME]
-        if not self._chance.is_known:  # a place far ahead has hardly a rival to learn from, and may yet be wrong
+        if not self.chance.is_known:  # a place far ahead has hardly a rival to learn from, and may yet be wrong
             for track in hopeless[: AT_A_TIME - len(tried)]:
-                if (found := self._check.at(image, self._at(track, view), CELL_PER_AGL)) is not None:
-                    self._chance.learn(found.agreement, fine=False)
+                if (found := self.check.at(image, self._at(track, view), CELL_PER_AGL)) is not None:
+                    self.chance.learn(found.agreement, fine=False)
+        self.sigmas = []
         fixes = [(track, self._checked(track, image, view, way_m)) for track in tried]
         self.all.sort(key=lambda t: -t.odds)
         self.all = [t for i, t in enumerate(self.all) if not self._is_second(t, self.all[:i], view)]
-        if not self.all or not self._is_found(self.all[0]):
+        if not self.all or not self._is_found(self.all[0], enough):
             return None
         fix = next((fix for track, fix in fixes if track is self.all[0]), None)
         return None if fix is None else Found(self.all[0], self._matcher.refined(image, view, fix))
@@ -166,13 +170,14 @@ class Tracks:
         """What the frame says for the track, which moves to where it fits best; None: nothing, or no pose."""
         here = self._at(track, view)
         speaks = track.score > 0.0 or track.lead >= LEADING
-        found = self._check.at(image, here, FINE_PER_AGL if speaks else CELL_PER_AGL)
+        found = self.check.at(image, here, FINE_PER_AGL if speaks else CELL_PER_AGL)
         if found is None:  # hardly any of it lies on the map
             track.checked(LLR_MIN, way_m, view.agl_m)
             return None
-        z = self._chance.sigmas(found.agreement, fine=speaks)
+        z = self.chance.sigmas(found.agreement, fine=speaks)
+        self.sigmas.append(z)
         if self.all and track is not self.all[0]:
-            self._chance.learn(found.agreement, fine=speaks)
+            self.chance.learn(found.agreement, fine=speaks)
         gain, placed = evidence(z), track.frames > 0
         track.checked(gain, way_m, view.agl_m)
         track.off_sigmas2 = _off_sigmas2(track.hypothesis, view)
@@ -189,10 +194,10 @@ class Tracks:
     def _is_second(self, track: Track, better: list[Track], view: View) -> bool:
         return any(b.is_near(track.e_m, track.n_m, view.agl_m) for b in better)
 
-    def _is_found(self, best: Track) -> bool:
+    def _is_found(self, best: Track, enough: float) -> bool:
         rivals = self.all[1:]
         return best.witnesses >= MIN_FRAMES and best.odds >= max(
-            ENOUGH, max((t.odds for t in rivals), default=0.0) + AHEAD
+            enough, max((t.odds for t in rivals), default=0.0) + AHEAD
         )
 
 

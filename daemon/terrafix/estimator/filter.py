@@ -210,7 +210,7 @@ class Estimator(Tracker):
         self._is_frame(self.graph.newest, self._last.frame_id, Fragment(now_s, joined=True))
         self._cov_of.clear()
         self._refused.clear()
-        self.hypotheses.moved()
+        self.hypotheses.moved(match.lost_sigma_m)
         self._seen = SeenGround()
         self._accepted(match, fixed_s, measured.translation()[:2])
         return FixResult(Verdict.ACCEPTED, None, f"{how} {float(np.hypot(*offset)):.0f} m away")

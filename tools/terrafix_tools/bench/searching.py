@@ -20,6 +20,7 @@ import typer
 
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
+from terrafix.anchor.null_model import USUAL, FlightBudget
 from terrafix.anchor.retrieval import FINE_CELL_PER_AGL, MapSearch
 from terrafix.anchor.wide_search import BLOCK_CELLS, WideSearch, blocks_of
 from terrafix.core.camera import CameraCalibration
@@ -82,7 +83,7 @@ def _decisions(
     source: LocalMap, matcher: FrameMatcher, frames: list[Image], agl_m: float, yaw_sigma_rad: float
 ) -> list[Callable[[], object]]:
     """Joint look and tracks of each frame."""
-    search, view = MapSearch(source, matcher, agl_m, None), _view(agl_m, yaw_sigma_rad)
+    search, view = MapSearch(source, matcher, agl_m, None, USUAL, FlightBudget()), _view(agl_m, yaw_sigma_rad)
 
     def decide(frame: Image) -> None:
         search.look(frame, view)

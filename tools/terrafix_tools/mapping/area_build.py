@@ -57,6 +57,7 @@ class Order:
     licence: str = ""
     ce90_m: float | None = None
     descriptors: Descriptors = Descriptors.WEIGHTS_FREE
+    null_agl_m: tuple[float, ...] = ()
     rate: float | None = None
     workers: int | None = None  # None: as many as are sensible
     scheduler: str = ""
@@ -100,6 +101,7 @@ def build_order(order: Order) -> Path | None:
             elevation=elevation,
             vectors=vectors,
             descriptors=order.descriptors,
+            null_agl_m=order.null_agl_m,
             workers=order.workers or usual_workers(),
             cluster=cluster,
             progress=True,

@@ -26,6 +26,7 @@ from terrafix_tools.mapping.descriptors import write_descriptors
 from terrafix_tools.mapping.descriptors_kind import Descriptors
 from terrafix_tools.mapping.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
+from terrafix_tools.mapping.null_model import learn_into
 from terrafix_tools.mapping.parallel import CHUNKS_PER_WORKER, GDAL_CACHE_MB, Crew, Piece, Processes, render_pieces
 from terrafix_tools.mapping.progress import Bar, progress_bar
 from terrafix_tools.mapping.pyramid import BUILT_WITH, Pyramid, levels_of, open_renderer
@@ -77,12 +78,14 @@ def build_package(
     elevation: ElevationInput | None = None,
     vectors: VectorInput | None = None,
     descriptors: Descriptors = Descriptors.WEIGHTS_FREE,
+    null_agl_m: Sequence[float] = (),
     workers: int = 1,
     cluster: Crew | None = None,
     progress: bool = False,
 ) -> Path:
     """Writes the package `out`. ``workers``: processes that read and encode imagery and elevation and describe the
-    imagery; ``cluster``: other computers that do so in their place. Neither changes a byte.
+    imagery; ``cluster``: other computers that do so in their place. Neither changes a byte. ``null_agl_m``: heights
+    above ground at which the null model is learnt.
 
     The same input gives the same bytes. Nothing is left at `out` or beside it when this fails or is interrupted.
     With several workers this must be called from a program that may be imported again (``multiprocessing`` forkserver).
@@ -102,6 +105,8 @@ def build_package(
             with new_package(part) as (writer, db):
                 one = _Build(writer, db, scratch, out.stem, descriptors, crew, bar)
                 one.write(ordered, elevation, vectors)
+            if null_agl_m:
+                learn_into(part, null_agl_m)
             with part.open("rb") as file:
                 os.fsync(file.fileno())
             part.replace(out)

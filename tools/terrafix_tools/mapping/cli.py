@@ -46,6 +46,10 @@ def map_build(
     descriptors: Annotated[
         Descriptors, typer.Option(help="Of the ground, for the search of a vehicle that is lost.")
     ] = Descriptors.WEIGHTS_FREE,
+    null_agl: Annotated[
+        list[float] | None,
+        typer.Option(min=30.0, help="Height of flights, m: learns what wrong places score there; may be repeated."),
+    ] = None,
     rate: Annotated[
         float | None, typer.Option(help="Requests a second that the servers of --source allow; 5 when nothing is said.")
     ] = None,
@@ -78,6 +82,7 @@ def map_build(
             licence=licence,
             ce90_m=ce90,
             descriptors=descriptors,
+            null_agl_m=tuple(null_agl or ()),
             rate=rate,
             workers=workers,
             scheduler=scheduler,

@@ -81,10 +81,10 @@ class PositionHypotheses:
         """A map match agreed with the estimate."""
         self._start_m, self._modes, self._belief = 0.0, (), None
 
-    def moved(self) -> None:
-        """The graph has begun anew where the map has it."""
+    def moved(self, anywhere_m: float) -> None:
+        """The graph has begun anew where the map has it, a place that is still tested when ``anywhere_m`` is not 0."""
         self.confirmed()
-        self.anywhere_m = 0.0
+        self.anywhere_m = anywhere_m
 
     def claim(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """-> by how much (2,) what is published is off the estimate, and its covariance (6, 6), from that of the

@@ -1,0 +1,157 @@
+"""Flights on maps of other places: what does the best wrong place come to, and is one found?
+
+python -m terrafix_tools.bench.wrong_maps FLIGHT --map MAP [--map MAP ...] [--mirrored] [--step 0.25] [--frames 40]
+    [--json FILE]
+
+The flight goes through vision and estimator without a map and without a start; each map is searched with what they
+predict, a frame every ``--step`` heights. No map may be of the place of the flight, unless it is ``--mirrored``. For
+each map a row: stretches of new ground, the best sum of a stretch (90 % quantile and most), what a find needed at the
+end, and how many places were found. The last line is the tail of all of them, as a null model has it."""
+
+import argparse
+import itertools
+import json
+import math
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import typer
+
+from terrafix.anchor.map_package import MapPackage
+from terrafix.anchor.matcher import FrameMatcher
+from terrafix.anchor.null_model import TAIL_FROM, USUAL, FlightBudget, Tail, null_at
+from terrafix.anchor.retrieval import MapSearch
+from terrafix.anchor.tracks import NEW_EVIDENCE
+from terrafix.anchor.views import view_of
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.config import load
+from terrafix.core.errors import TerrafixError
+from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import Image, NodeContext
+from terrafix.core.shell import InProcessShell
+from terrafix.core.start import start_is_unknown
+from terrafix.messages import Message, Origin, Prediction
+from terrafix.vision.sources import Source, open_source
+from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.mapping.build import ensure_package
+from terrafix_tools.replay import FRAMES_KEPT, make_nodes, map_cache_dir
+
+UNKNOWN_START_M = 1000.0
+
+
+@dataclass(frozen=True)
+class WrongMap:
+    """One flight on one map. ``best``: sum of the best place, for each stretch of 0.4 heights; ``sigmas``: of every
+    frame at every place that was checked; ``needed`` by a find in the last one; ``found``: frames that found one."""
+
+    places: float
+    best: list[float]
+    sigmas: list[float]
+    needed: float
+    found: int
+
+
+def predicted(source: Source, *, mirrored: bool) -> Iterator[tuple[Prediction, Image]]:
+    """Every frame with what vision and estimator predict of it, on no map."""
+    store, heard = MemoryFrameStore(FRAMES_KEPT), list[Message]()
+    with tempfile.TemporaryDirectory(prefix="terrafix-wrong-") as out:
+        ctx = NodeContext(config=load([]), frames=store, map_path=None, out_dir=Path(out))
+        shell = InProcessShell(make_nodes(ctx), lambda _who, message: heard.append(message))
+    shell.feed(_somewhere(source.origin()))
+    for shot in source.shots():
+        for told in itertools.chain(shot.states, shot.imu):
+            shell.feed(told)
+        if shot.image is None:
+            continue
+        image = np.ascontiguousarray(shot.image[:, ::-1]) if mirrored else shot.image
+        store.put(shot.frame.frame_id, image)
+        heard.clear()
+        shell.feed(shot.frame)
+        yield from ((m, image) for m in heard if isinstance(m, Prediction))
+
+
+def _somewhere(origin: Origin) -> Origin:
+    """An unknown start has no coordinate: any will do, for the search does not look at it."""
+    lat_deg, lon_deg = (0.0, 0.0) if start_is_unknown(origin) else (origin.lat_deg, origin.lon_deg)
+    return msgspec.structs.replace(origin, lat_deg=lat_deg, lon_deg=lon_deg, start_sigma_m=UNKNOWN_START_M)
+
+
+def searched(
+    flight: Iterator[tuple[Prediction, Image]], camera: CameraCalibration, package: Path, step: float, frames: int
+) -> WrongMap:
+    """``step``: heights between frames, of which there are ``frames``. Raises MapError."""
+    opened = MapPackage.open(package)
+    west, south, east, north = opened.manifest.bounds_wgs84
+    local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
+    matcher = FrameMatcher(camera, local, GradientDescriber())
+    search: MapSearch | None = None
+    best, sigmas = dict[int, float](), list[float]()
+    found, looks, way_m, since_m, variance_m2 = 0, 0, 0.0, np.zeros(2), 0.0
+    for prediction, image in flight:
+        agl_m = prediction.agl_m
+        if search is None:
+            null = null_at(opened.layer().null_model, GradientDescriber.name, agl_m)
+            search = MapSearch(local, matcher, agl_m, None, null, FlightBudget())
+        else:
+            since_m += prediction.step_m
+            variance_m2 += max(prediction.step_cov_m2[0], prediction.step_cov_m2[3])
+            if np.hypot(*since_m) < step * agl_m:
+                continue
+            search.move(float(since_m[0]), float(since_m[1]), math.sqrt(variance_m2))
+            way_m += float(np.hypot(*since_m))
+            since_m, variance_m2 = np.zeros(2), 0.0
+        found += search.look(image, view_of(prediction, None, 0.0)) is not None
+        sigmas += search.tracks.sigmas
+        stretch = int(way_m / (NEW_EVIDENCE * agl_m))
+        best[stretch] = max([best.get(stretch, -math.inf), *(track.odds for track in search.tracks.all)])
+        looks += 1
+        if looks == frames:
+            break
+    assert search is not None
+    return WrongMap(search.places, [v for v in best.values() if math.isfinite(v)], sigmas, search.enough, found)
+
+
+def row(name: str, result: WrongMap) -> str:
+    high = float(np.quantile(result.best, TAIL_FROM))
+    return (
+        f"{name:40} {len(result.best):9} {high:9.1f} {max(result.best):6.1f} {result.needed:7.1f} {result.found:6}"
+        f" {result.places:8.0f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("flight", metavar="FLIGHT")
+    parser.add_argument("--map", type=Path, action="append", required=True, help="of another place; may be repeated")
+    parser.add_argument("--mirrored", action="store_true", help="left and right exchanged")
+    parser.add_argument("--step", type=float, default=0.25, help="heights between frames")
+    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--json", type=Path, help="writes every value")
+    given = parser.parse_args()
+    typer.echo(f"{'flight on map':40} stretches  90 % of   most  needed  found   places")
+    results: dict[str, WrongMap] = {}
+    try:
+        source = open_source(given.flight)
+        camera = CameraCalibration.of(source.origin().camera)
+        for wanted in given.map:
+            name = f"{Path(given.flight).name} on {wanted.stem}"
+            flight = predicted(open_source(given.flight), mirrored=given.mirrored)
+            package = ensure_package(wanted, map_cache_dir())
+            results[name] = searched(flight, camera, package, given.step, given.frames)
+            typer.echo(row(name, results[name]))
+    except TerrafixError as error:
+        sys.exit(f"{error}")
+    typer.echo(f"sums: {Tail.of([v for r in results.values() for v in r.best], USUAL.search)}")
+    typer.echo(f"single frames: {Tail.of([v for r in results.values() for v in r.sigmas], USUAL.frame)}")
+    if given.json is not None:
+        given.json.write_text(json.dumps({k: asdict(v) for k, v in results.items()}, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

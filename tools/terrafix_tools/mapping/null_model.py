@@ -1,0 +1,135 @@
+"""Learns the null model of a map: what the best wrong places score, from flights that cannot be on it.
+
+The flights are over the map itself, mirrored and turned: ground of the same kind, at the same scale, that is nowhere on
+the map. They go through the search of the flight."""
+
+import math
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from terrafix.anchor.map_format import HASH_TABLE, MANIFEST_TABLE, SEAL_TABLE, Layer, checksum_of, manifest_rows
+from terrafix.anchor.map_package import LocalMap, MapPackage
+from terrafix.anchor.map_seal import BLANK, write_seal
+from terrafix.anchor.matcher import FrameMatcher, View
+from terrafix.anchor.null_model import USUAL, VERSION, FlightBudget, NullModel, NullRow, Tail
+from terrafix.anchor.retrieval import MapSearch
+from terrafix.anchor.tracks import NEW_EVIDENCE
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.errors import UsageError
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import Image
+from terrafix_engines.features.gradient import GradientDescriber
+
+CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
+NORTH_UP = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+# What the predictions of a flight with a compass leave open, 1-sigma.
+YAW_SIGMA_RAD, SCALE_SIGMA, TILT_SIGMA_RAD = math.radians(11.0), 0.06, math.radians(1.2)
+STEP_SIGMA = 0.01  # of the height: what odometry leaves open of a step
+STEPS_PER_STRETCH = 2
+FLIGHTS, STRETCHES = 10, 6  # some two minutes of one core for each height
+DRAWS = 40  # places that are tried for one flight
+VALID = 0.98  # share of the ground of a flight that the map must have
+SEED = 1  # the same package has the same model
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Ground along a way, (h, w, 3) as it lies below: the camera goes from its left end to its right one."""
+
+    picture: Image
+    step_px: float
+
+    def frame(self, i: int) -> Image:
+        left = round(i * self.step_px)
+        return np.ascontiguousarray(self.picture[:, left : left + CAMERA.width])
+
+
+def learn_into(package: Path, heights_m: Sequence[float]) -> None:
+    """Adds the null model of its newest layer to a package that nobody has signed.
+
+    Raises UsageError: the map is too small for flights at one of these heights."""
+    opened = MapPackage.open(package)
+    try:
+        west, south, east, north = opened.manifest.bounds_wgs84
+        local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
+        rows = tuple(learn(local, agl_m, FLIGHTS, STRETCHES) for agl_m in heights_m)
+        model = NullModel(version=VERSION, matcher=GradientDescriber.name, rows=rows)
+        newest, *others = opened.manifest.layers
+        layers: tuple[Layer, ...] = (msgspec.structs.replace(newest, null_model=model), *others)
+        manifest = msgspec.structs.replace(opened.manifest, layers=layers)
+    finally:
+        opened.close()
+    db = sqlite3.connect(package)
+    try:
+        hashes = db.execute(f"SELECT table_name, zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}")
+        said = dict(manifest_rows(manifest))
+        said["checksum"] = checksum_of(said.items(), hashes.fetchall())
+        with db:
+            db.executemany(f"UPDATE {MANIFEST_TABLE} SET value = ? WHERE key = ?", [(v, k) for k, v in said.items()])
+            db.execute(f"UPDATE {SEAL_TABLE} SET seal = ?", (BLANK,))
+    finally:
+        db.close()
+    write_seal(package)
+
+
+def learn(source: LocalMap, agl_m: float, flights: int, stretches: int) -> NullRow:
+    """What ``flights`` over mirrored ground find, each over ``stretches`` of new ground. Raises UsageError."""
+    draw = np.random.default_rng(SEED)
+    best, sigmas, patches, places = list[float](), list[float](), list[tuple[float, float]](), 1.0
+    for _ in range(flights):
+        strip = _strip(source, agl_m, stretches, draw)
+        search = MapSearch(
+            source, FrameMatcher(CAMERA, source, GradientDescriber()), agl_m, None, USUAL, FlightBudget()
+        )
+        for stretch in range(stretches):
+            reached = -math.inf
+            for step in range(STEPS_PER_STRETCH):
+                search.look(strip.frame(stretch * STEPS_PER_STRETCH + step), _predicted(agl_m))
+                reached = max([reached, *(track.odds for track in search.tracks.all)])
+                sigmas += search.tracks.sigmas
+                search.move(NEW_EVIDENCE / STEPS_PER_STRETCH * agl_m, 0.0, STEP_SIGMA * agl_m)
+            if stretch and math.isfinite(reached):  # the first one has not had the frames yet that speak for a place
+                best.append(reached)
+        patches.append(search.tracks.chance.patches)
+        places = search.places
+    mean, sigma = np.mean(patches, axis=0)
+    return NullRow(
+        agl_m=agl_m,
+        places=round(places, 1),
+        search=Tail.of(best, USUAL.search),
+        frame=Tail.of(sigmas, USUAL.frame),
+        patches=(round(float(mean), 4), round(float(sigma), 4)),
+    )
+
+
+def _predicted(agl_m: float) -> View:
+    return View(0.0, 0.0, NORTH_UP, agl_m, 0.0, YAW_SIGMA_RAD, SCALE_SIGMA, TILT_SIGMA_RAD)
+
+
+def _strip(source: LocalMap, agl_m: float, stretches: int, draw: np.random.Generator) -> Strip:
+    """A strip of the map in any direction, mirrored."""
+    gsd_m = agl_m / CAMERA.fx
+    step_px = NEW_EVIDENCE / STEPS_PER_STRETCH * agl_m / gsd_m
+    width = CAMERA.width + math.ceil(stretches * STEPS_PER_STRETCH * step_px)
+    side = math.ceil(math.hypot(width, CAMERA.height))
+    e_min, n_min, e_max, n_max = source.bounds_m
+    for _ in range(DRAWS):
+        e_m, n_m = draw.uniform(e_min, e_max), draw.uniform(n_min, n_max)
+        turn = cv2.getRotationMatrix2D((side / 2, side / 2), draw.uniform(0.0, 360.0), 1.0)
+        turn[0, 2] += (width - side) / 2
+        turn[1, 2] += (CAMERA.height - side) / 2
+        half_m = side / 2 * gsd_m
+        picture, valid = source.window(e_m - half_m, n_m + half_m, side, side, gsd_m)
+        seen = cv2.warpAffine(valid.astype(np.uint8), turn, (width, CAMERA.height))
+        if seen.mean() >= VALID:
+            return Strip(cv2.warpAffine(picture, turn, (width, CAMERA.height))[:, ::-1], step_px)
+    raise UsageError(
+        f"no way of {stretches * NEW_EVIDENCE * agl_m:.0f} m at {agl_m:.0f} m above ground lies on the map; "
+        "give --null-agl a lower height, or leave it out"
+    )
