@@ -90,6 +90,7 @@ def replay(
         Console(stderr=True).print(_last_line(summary, out))
         if summary["lens"] is not None:
             Console(stderr=True).print(summary["lens"], markup=False)
+        Console(stderr=True).print(summary["verdict"]["text"], markup=False, highlight=False)
     return summary
 
 
