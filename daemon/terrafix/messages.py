@@ -339,6 +339,18 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     emitted_at_ns: int  # when it was said; in a replay, the time of the frame that it answers
 
 
+class CalibrationFault(Message, frozen=True, kw_only=True):
+    """A monitor has found, or finds no more, that what describes the flight is wrong: said on every change.
+
+    ``quantity``: "scale" (height or focal length), "mount yaw", "heading", "mirrored picture", "registration" (the map
+    is found nowhere, and why is not known)."""
+
+    quantity: str
+    factor: float | None  # scale: told height over the true one; angles: told less true, degrees; None: not known
+    detail: str  # what it was found from
+    active: bool
+
+
 class LearntLens(msgspec.Struct, frozen=True, kw_only=True):
     """k1, k2, p1, p2, the focal length (relative, less one) and the middle of the picture (right and down of where its
     description has it), in normalised coordinates; the inverse of their covariance."""
@@ -566,6 +578,7 @@ AnyMessage = (
     | HintVerdict
     | Start
     | NavEstimate
+    | CalibrationFault
     | SlowErrors
     | Refinement
     | MeasurementVerdict

@@ -40,6 +40,7 @@ EVERYTHING: tuple[type[m.Message], ...] = (
     m.HintVerdict,
     m.Start,
     m.NavEstimate,
+    m.CalibrationFault,
     m.SlowErrors,
     m.Refinement,
     m.MeasurementVerdict,
@@ -66,7 +67,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "link",
         "terrafix.link.node",
-        (m.Origin, m.NavEstimate, m.SearchState, m.HintVerdict, m.Start, m.Health, m.ProcessEvent),
+        (m.Origin, m.NavEstimate, m.CalibrationFault, m.SearchState, m.HintVerdict, m.Start, m.Health, m.ProcessEvent),
         (
             m.VehicleState,
             m.Imu,
@@ -91,7 +92,7 @@ PROCESSES: tuple[Process, ...] = (
         "estimator",
         "terrafix.estimator.node",
         (m.Origin, m.Start, m.Frame, m.VehicleState, m.Imu, m.Coasted, m.Odometry, m.MapMatch, m.Health, m.SourceEnded),
-        (m.Prediction, m.NavEstimate, m.SlowErrors, m.Refinement, m.MeasurementVerdict),
+        (m.Prediction, m.NavEstimate, m.CalibrationFault, m.SlowErrors, m.Refinement, m.MeasurementVerdict),
         0.0,
         20.0,
     ),

@@ -35,6 +35,11 @@ SENTENCES = [  # everything that Terrafix can say to a pilot; a new text belongs
     r"whole map searched, send a hint",
     r"hint (taken, searching within|agrees,|is|not used,) [\d.]+ k?m( from us| off, searching| outside the map)?",
     r"hint is no position, not used",
+    r"the map is found (nowhere: no fix|again)",
+    r"height/focal seems x[\d.]+ off: no fix",
+    r"(heading|mount yaw) off by -?\d+ deg: no fix",
+    r"mirrored picture: no fix",
+    r"(scale|heading|mount yaw|mirrored picture) is plausible again",
     r"autopilot (does not use the position|uses a position again)",
 ]
 
@@ -158,3 +163,18 @@ def test_named_values_once_a_second_and_only_to_an_autopilot() -> None:
     lost = {x.name: x.value for x in wire.take("NAMED_VALUE_FLOAT")}
     assert lost["TFX_FIX"] == 1.0
     assert math.isnan(lost["TFX_ACC_M"]) and math.isnan(lost["TFX_MAP_S"])
+
+
+@pytest.mark.parametrize(
+    ("quantity", "factor"),
+    [("scale", 3.28), ("heading", -179.6), ("mount yaw", 180.0), ("mirrored picture", None), ("registration", None)],
+)
+def test_the_pilot_reads_what_seems_miscalibrated_and_when_it_is_plausible_again(
+    quantity: str, factor: float | None
+) -> None:
+    node = LinkNode(10.0)
+    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True)
+    said = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
+    began, ended = (message for message in said if isinstance(message, m.StatusText))
+    assert whole(began.text) and began.text.endswith("no fix") and began.severity == 2
+    assert whole(ended.text) and "no fix" not in ended.text and ended.severity == 6

@@ -171,6 +171,11 @@ def test_a_map_elsewhere_says_how_far(folder: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_a_start_with_latitude_and_longitude_swapped_is_said_as_such(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match=r"latitude and longitude are swapped: 48.000000, 11.000000 lies on the map"):
+        replay(folder, None, tmp_path / "out", start=(11.0, 48.0), nodes=nodes)
+
+
 def test_no_map_anywhere(folder: Path, tmp_path: Path) -> None:
     toml = (folder / "flight.toml").read_text()
     (folder / "flight.toml").write_text(toml.replace('map = "../maps/here.tif"', ""))

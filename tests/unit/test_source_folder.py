@@ -231,3 +231,53 @@ def test_real_flights_load_as_they_are(data_set: Callable[[str], Path], name: st
     assert hint is not None and hint.is_file()
     shot = next(iter(source.shots()))
     assert shot.image is not None and shot.states[0].agl_m
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("fx = 300\n", "fx = 2.8\n", "are a field of view of 178.0 degrees, more than 160; is that in millimetres?"),
+        ("fy = 300.0\n", "fy = 2.8\n", "fy is in pixels: millimetres / sensor size in millimetres * 240"),
+        (
+            "fx = 300\n",
+            "fx = 6200\n",
+            "are a field of view of 3.0 degrees, less than 3; give the focal length in pixels",
+        ),
+        ("fx = 300\n", "fx = 610\n", "fx is 2.03 times fy"),
+        ("fx = 300\n", "fx = 145\n", "fx is 0.48 times fy"),
+        ("[start]", "[mount]\npitch_deg = 0.0\n[start]", "pitch_deg = 0 and roll_deg = 0 do not look down"),
+        ("[start]", "[mount]\npitch_deg = 90.0\n[start]", "do not look down at the ground; -90 is straight down"),
+        ("[start]", "[mount]\nroll_deg = 100.0\npitch_deg = 0\n[start]", "do not look down"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_with_what_was_meant(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in TOML
+    with pytest.raises(SourceError) as error:
+        open_source(str(flight(tmp_path / "f", toml=TOML.replace(old, new, 1))))
+    assert said in one_line(error) and "flight.toml" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("fx = 300\n", "fx = 305\n"),
+        ("fx = 300\nfy = 300.0", "fx = 6000\nfy = 4500.0"),  # 3.05 degrees
+        ("fx = 300\nfy = 300.0", "fx = 30\nfy = 30.0"),  # 159 degrees
+        ("[start]", "[mount]\npitch_deg = -30.0\n[start]"),
+    ],
+)
+def test_an_unusual_camera_is_taken(tmp_path: Path, old: str, new: str) -> None:
+    assert old in TOML
+    open_source(str(flight(tmp_path / "f", toml=TOML.replace(old, new, 1))))
+
+
+@pytest.mark.parametrize(("agl", "refused"), [(12_000.0, True), (4_900.0, False)])
+def test_heights_that_cannot_be_metres_are_refused(tmp_path: Path, agl: float, refused: bool) -> None:
+    rows = "\n".join(f"{i:04}.jpg,{i}.0,,,,{agl if i else 0.0}" for i in range(5))
+    folder = flight(tmp_path / "f", csv=f"file,t_s,yaw_deg,pitch_deg,roll_deg,agl_m\n{rows}\n")
+    if not refused:
+        open_source(str(folder))
+        return
+    with pytest.raises(SourceError) as error:
+        open_source(str(folder))
+    assert "agl_m is 12000 in half of the rows" in one_line(error) and "centimetres" in one_line(error)

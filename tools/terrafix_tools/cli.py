@@ -69,6 +69,10 @@ def run(
         stop_after_source=until_end,
         nursery=context.obj,
     )
+    if until_end and code == 0:  # not when the vehicle is switched off: a long record takes its time
+        from terrafix_tools.flight_verdict import verdict_of
+
+        typer.echo(verdict_of(out).text(), err=True)
     raise typer.Exit(code)
 
 
@@ -91,7 +95,9 @@ def replay(
     from terrafix_tools.replay import replay as run_replay
 
     at = parse_start(start)
-    run_replay(flight, map_path, out, models=model or [], configs=config or [], progress=not quiet, start=at)
+    said = run_replay(flight, map_path, out, models=model or [], configs=config or [], progress=not quiet, start=at)
+    if said["verdict"]["active_faults"]:
+        raise typer.Exit(1)
 
 
 @app.command()

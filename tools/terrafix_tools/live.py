@@ -42,9 +42,8 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     ground_amsl_m = None
     try:
         if place is not None and not with_map.covers_start(*place, sigma_m):
-            raise MapError(
-                f"{package}: has no imagery at the start {place[0]:.6f}, {place[1]:.6f}; use another --map or check it"
-            )
+            todo = swapped(with_map, *place, sigma_m) or "use another --map or check it"
+            raise MapError(f"{package}: has no imagery at the start {place[0]:.6f}, {place[1]:.6f}; {todo}")
         if place is not None:
             ground_amsl_m = with_map.ground_amsl_m(*place)
         elif unknown:
@@ -52,6 +51,13 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     finally:
         with_map.close()
     return package, ground_amsl_m
+
+
+def swapped(opened: MapPackage, lat_deg: float, lon_deg: float, sigma_m: float) -> str:
+    """What to say of a start outside the map that lies on it with latitude and longitude exchanged; else empty."""
+    if abs(lon_deg) > 90.0 or not opened.covers_start(lon_deg, lat_deg, sigma_m):
+        return ""
+    return f"latitude and longitude are swapped: {lon_deg:.6f}, {lat_deg:.6f} lies on the map"
 
 
 def _built(geotiff: Path) -> Path:

@@ -28,6 +28,7 @@ from terrafix.recorder.writer import versions
 from terrafix.vision.sources import Source, open_source
 from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import Stored, find, models_folder
+from terrafix_tools.live import swapped
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay_output import ReplayOutput
 
@@ -90,6 +91,7 @@ def replay(
         Console(stderr=True).print(_last_line(summary, out))
         if summary["lens"] is not None:
             Console(stderr=True).print(summary["lens"], markup=False)
+        Console(stderr=True).print(summary["verdict"]["text"], markup=False, highlight=False)
     return summary
 
 
@@ -193,7 +195,9 @@ def _check_map(package: Path, origin: Origin) -> tuple[Origin, dict[str, Any]]:
         frame = LocalFrame(origin.lat_deg, origin.lon_deg)
         local = opened.bind(frame)
         if not unknown and not opened.covers_start(origin.lat_deg, origin.lon_deg, origin.start_sigma_m):
-            raise MapError(f"{package}: {_not_covered(origin, local.bounds_m)}; use another --map or check the start")
+            todo = swapped(opened, origin.lat_deg, origin.lon_deg, origin.start_sigma_m)
+            todo = todo or "use another --map or check the start"
+            raise MapError(f"{package}: {_not_covered(origin, local.bounds_m)}; {todo}")
         if origin.ground_amsl_m is None:
             ground_m = opened.ground_amsl_m(origin.lat_deg, origin.lon_deg)
             origin = msgspec.structs.replace(origin, ground_amsl_m=ground_m)

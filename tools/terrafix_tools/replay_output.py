@@ -13,11 +13,22 @@ import numpy as np
 from terrafix.core.config import Config
 from terrafix.core.errors import OutputError
 from terrafix.core.node import Image
-from terrafix.messages import Frame, MapMatch, MeasurementVerdict, Message, Odometry, Origin, SlowErrors, Verdict
+from terrafix.messages import (
+    CalibrationFault,
+    Frame,
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    Odometry,
+    Origin,
+    SlowErrors,
+    Verdict,
+)
 from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
-from terrafix_tools.estimates import ESTIMATES, PARTIAL, RowTable, write_rows
+from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, RowTable, write_rows
 from terrafix_tools.finalise.output import SUMMARY as FINALISED_SUMMARY
 from terrafix_tools.finalise.output import TABLE as FINALISED_TABLE
+from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.lens_words import lens_words
 
 RECORD, SUMMARY = "flight.mcap", "summary.json"
@@ -37,6 +48,7 @@ class ReplayOutput:
         self._registered: dict[int, bool] = {}
         self._origin: Origin | None = None
         self._learnt: SlowErrors | None = None
+        self._faults: list[tuple[float, CalibrationFault]] = []
 
     def __enter__(self) -> Self:
         """Raises OutputError when the folder cannot be written."""
@@ -84,6 +96,7 @@ class ReplayOutput:
             "odometry_frames": sum(self._registered.values()),
             "verdicts": {what: dict(sorted(c.items())) for what, c in sorted(self._verdicts.items())},
             "lens": lens_words(self._origin.camera, self._learnt) if self._origin and self._learnt else None,
+            "verdict": flight_verdict(rows, self._faults, self._verdicts.get("map")).as_json(),
             "matcher_verdicts": dict(sorted(self._matcher.items())),
             "frame_ms_median": round(float(np.median(times_ms)), 1) if times_ms else None,
             "frame_ms_p95": round(float(np.percentile(times_ms, 95)), 1) if times_ms else None,
@@ -123,6 +136,8 @@ class ReplayOutput:
                 self._registered[message.frame_id] = False
         elif isinstance(message, Origin):
             self._origin = message
+        elif isinstance(message, CalibrationFault):
+            self._faults.append((message.t_ns / NS, message))
         elif isinstance(message, SlowErrors):
             self._learnt = message
         elif isinstance(message, MapMatch):

@@ -13,6 +13,7 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.core.start import begun
 from terrafix.estimator.coasted import Coast
 from terrafix.estimator.filter import Estimator
+from terrafix.estimator.integrity.monitors import Monitors
 from terrafix.estimator.integrity.time_offset import TimeOffset
 from terrafix.estimator.resume import Keeper, Known, Last, kept
 from terrafix.estimator.righted import Righted
@@ -72,6 +73,7 @@ class EstimatorNode:
         self._time_offset = TimeOffset()
         self._predicted: int | None = None  # frame of the newest Prediction ...
         self._from_m = np.zeros(2)  # ... and where it was, with its map match
+        self._monitors: Monitors | None = None
 
     @property
     def origin(self) -> Origin | None:
@@ -85,7 +87,7 @@ class EstimatorNode:
     def on(self, message: Message) -> Iterable[Message]:
         match message:
             case Origin() if message != self._origin:  # said again after a restart
-                self._origin = message
+                self._origin, self._monitors = message, Monitors(message)
                 self._frame = LocalFrame(message.lat_deg, message.lon_deg)
                 self._begin(begun(message, self._start), self._known(message, self._frame))
                 waiting, self._coasted = self._coasted, []
@@ -196,6 +198,12 @@ class EstimatorNode:
             yield self._prediction(odometry, advance, estimator, seen)
             self._predicted = odometry.frame_id
         yield from self._slow_errors(advance.placed, estimator)
+        if self._monitors is not None:
+            agl_m = float(advance.placed.pose.translation()[2]) - estimator.terrain.below(
+                advance.placed.pose.translation()
+            )
+            self._monitors.odometry(odometry, self._telemetry, float(np.hypot(*advance.step_m)), agl_m)
+            yield from self._monitors.changes(odometry.t_ns)
         estimate = self._estimate(advance.placed, odometry.t_ns)
         if estimator.last_fix_s is not None:  # before that the autopilot has, or had, another position
             self._righted.told(estimate.t_ns, estimate.velocity_sigma_mps)
@@ -247,6 +255,9 @@ class EstimatorNode:
             detail=result.detail,
             mahalanobis2=result.mahalanobis2,
         )
+        if self._monitors is not None:
+            self._monitors.matched(match, self._telemetry, accepted=result.verdict is Verdict.ACCEPTED)
+            yield from self._monitors.changes(match.t_ns)
         several = were_several or estimator.hypotheses.are_several
         if (several or result.verdict in (Verdict.ACCEPTED, Verdict.LOST)) and estimator.last is not None:
             own = match.frame_id == estimator.last.frame_id  # an older frame's match does not see this one's motion
@@ -289,6 +300,8 @@ class EstimatorNode:
         v = placed.velocity_mps
         cov[:3, :3] += self._time_offset.sigma_s**2 * np.outer(v, v)
         other_m, cov = estimator.hypotheses.claim(cov)
+        if self._monitors is not None:
+            cov[:2, :2] += self._monitors.sigma_m**2 * np.eye(2)
         alt_amsl_m, more_m = estimator.amsl(placed)
         stretch, _ = estimator.stretch(placed.node)
         cov[2, 2] += more_m**2

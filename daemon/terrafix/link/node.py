@@ -16,8 +16,9 @@ from terrafix.link.gps_time import LatchedClock
 from terrafix.link.kept import kept
 from terrafix.link.map_offset import MapOffsets
 from terrafix.link.pacer import Pacer
-from terrafix.link.words import CRITICAL, INFO, NOTICE, WARNING, words
+from terrafix.link.words import CRITICAL, INFO, NOTICE, WARNING, fault_words, words
 from terrafix.messages import (
+    CalibrationFault,
     FilterStatus,
     GnssReading,
     GpsInput,
@@ -130,6 +131,8 @@ class LinkNode:
                 self._asking.step = message.step
             case HintVerdict():
                 return [self._on_hint(message)]
+            case CalibrationFault():
+                return [words(message.t_ns, CRITICAL if message.active else INFO, fault_words(message))]
         return []
 
     def tick(self, now_ns: int) -> Iterable[Message]:

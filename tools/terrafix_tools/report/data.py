@@ -9,6 +9,7 @@ from typing import Any
 
 from terrafix.core.errors import EvaluationError, SourceError
 from terrafix.messages import (
+    CalibrationFault,
     Dropped,
     GpsInput,
     Health,
@@ -54,6 +55,7 @@ class FlightView:
     map_verdict: dict[int, str] = field(default_factory=dict)  # by frame id
     health: list[tuple[float, str, float | None]] = field(default_factory=list)  # t_s, band, temperature
     gps: list[tuple[float, GpsInput]] = field(default_factory=list)
+    faults: list[tuple[float, CalibrationFault]] = field(default_factory=list)
     events: list[tuple[float, ProcessEvent]] = field(default_factory=list)
     pilot_texts: list[tuple[float, StatusText]] = field(default_factory=list)
     dropped: Counter[str] = field(default_factory=Counter)  # "process: message"
@@ -170,7 +172,7 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
             view.learnt = message
         elif isinstance(message, Dropped):
             view.dropped[f"{message.process}: {message.message}"] += message.count
-        elif isinstance(message, Health | GpsInput | ProcessEvent | StatusText):
+        elif isinstance(message, Health | GpsInput | ProcessEvent | StatusText | CalibrationFault):
             timed.append((t_ns, message))
     for frame_id, row in table.rows.items():
         if frame_id in sent_ns:
@@ -182,6 +184,8 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
             view.health.append((t_s, str(message.band), message.temperature_c))
         elif isinstance(message, GpsInput):
             view.gps.append((t_s, message))
+        elif isinstance(message, CalibrationFault):
+            view.faults.append((t_s, message))
         elif isinstance(message, ProcessEvent):
             view.events.append((t_s, message))
         elif isinstance(message, StatusText):

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.link.words import fault_words
+from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.lens_words import lens_words
 from terrafix_tools.report.charts import clock
 from terrafix_tools.report.data import FlightView, radius95_m
@@ -94,6 +96,8 @@ def moments(view: FlightView) -> list[tuple[float | None, str]]:
     """(time or None, sentence), in order of time; what has no time comes last."""
     said: list[tuple[float | None, str]] = []
     said += _positions(view) + _anchors(view) + _errors(view) + _gps(view)
+    said += [(t_s, f"{fault_words(fault).capitalize()}: {fault.detail}.") for t_s, fault in view.faults]
+    said.append((None, f"Verdict: {flight_verdict(view.rows, view.faults, view.verdicts.get('map')).text()}"))
     lens = lens_words(view.origin.camera, view.learnt) if view.origin and view.learnt else None
     if lens is not None:
         said.append((None, lens))

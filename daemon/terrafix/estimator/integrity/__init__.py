@@ -1,0 +1,1 @@
+"""Monitors of what a flight is described by: height, focal length, mount, mirrored pictures. Pure; no graph."""

@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import Camera, Origin
+from terrafix.vision.sources.plausible import check_camera
 
 START_SIGMA_M = 10.0  # a coordinate read off a map or a phone before take-off
 YAW_SIGMA_DEG = 5.0  # compass of a small multirotor near its motors
@@ -131,11 +132,11 @@ def read_description(path: Path) -> Description:
 
 
 def camera_of(path: Path, read: Description) -> Camera:
-    """Camera and mount of the description in ``path``. SourceError when there is no [camera]."""
+    """Camera and mount of the description in ``path``. SourceError: there is no [camera], or it cannot be."""
     if read.camera is None:
         raise SourceError(f"{path}: there is no [camera]; add one with width, height, fx, fy, cx, cy in pixels")
     c, m = read.camera, read.mount
-    return Camera(
+    camera = Camera(
         width=c.width,
         height=c.height,
         fx=c.fx,
@@ -149,6 +150,8 @@ def camera_of(path: Path, read: Description) -> Camera:
         mount_roll_deg=m.roll_deg,
         mount_tolerance_deg=m.tolerance_deg,
     )
+    check_camera(path, camera)
+    return camera
 
 
 def origin_of(read: Description, camera: Camera, start: tuple[float, float] | None) -> Origin:

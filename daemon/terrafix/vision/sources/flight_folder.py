@@ -12,6 +12,7 @@ from terrafix.messages import Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, UpTo
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
 from terrafix.vision.sources.images import WRONG_SIZE, read_image, reduced
+from terrafix.vision.sources.plausible import check_heights
 from terrafix.vision.sources.table import Row, read_table
 
 
@@ -27,6 +28,8 @@ class FlightFolder:
         self._stored = camera_of(toml, self._description)
         self._origin = origin_of(self._description, reduced(self._stored), start)
         self._rows = read_table(folder / "frames.csv", "frames.csv", with_file=True)
+        told = [row.state.agl_m for row in self._rows if row.state is not None and row.state.agl_m is not None]
+        check_heights(folder / "frames.csv", told)
         self._check_files()
         self._check_size()
         self._states = self._telemetry()
