@@ -167,5 +167,28 @@ def test_velocity_that_odometry_contradicts_for_seconds_is_given_up() -> None:
             first_refused = i
         if first_refused is not None and (i - first_refused) * FRAME_S > 6.0:
             assert sigma_m(listener.estimate(i)) > 15.0
+            assert any("contradicts velocity" in v.detail for v in listener.verdicts("reset").values())
             return
     pytest.fail("odometry of 75 m/s was taken for this flight's at once")
+
+
+def test_a_height_that_keeps_the_anchor_from_looking_is_given_up_for_the_reported_one() -> None:
+    flight = Flight(30, seed=3, dem=True)
+    listener = Listener().fly(flight, 0, 20)
+    fix = flight.fix(19)
+    assert fix.p_c_in_w_m is not None
+    low = msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))
+    listener.hear([low])
+    assert listener.estimate(19).agl_m < 20.0
+    listener.hear(without(flight.messages(20), MapMatch))
+    resets = listener.verdicts("reset")
+    assert list(resets) == [20] and "are reported" in resets[20].detail
+    assert listener.estimate(20).agl_m == pytest.approx(flight.p_m[20, 2], abs=15.0)
+    for i in range(21, 30):
+        listener.hear(flight.messages(i))
+    assert list(listener.verdicts("reset")) == [20]
+
+
+def test_a_flight_at_its_reported_height_is_never_reset() -> None:
+    flight = Flight(30, seed=3, dem=True, climbs_m=0.0)
+    assert Listener().fly(flight, 0, 30).verdicts("reset") == {}

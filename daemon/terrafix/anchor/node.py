@@ -24,6 +24,7 @@ from terrafix.anchor.views import ground_plane, view_of
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import ModelError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.limits import LEAST_LOOK_AGL_M
 from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.core.start import SEARCHED_START_M
@@ -51,7 +52,7 @@ POSE_LIKELIHOOD_RATIO = 20.0
 MODES_SAID = 2  # the best place and its best rival
 MODE_TRIED = 0.5  # modes below this are not tried at all
 COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in this very frame
-MIN_AGL_M = 30.0  # below this a frame shows a few roofs and cars
+
 START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is not known yet
 # Of the height: what the belief follows is the place from which a picture seems to be taken, and a tilt that is a
 # degree more than in the frame before moves it. At most: whose tilt is known better sways less. Every frame adds it,
@@ -197,7 +198,7 @@ class AnchorNode:
             self._hint = None
         if self._search.is_on:
             answer = self._search.look(
-                answer, prediction, image if prediction.agl_m >= MIN_AGL_M else None, best, self._ground_m
+                answer, prediction, image if prediction.agl_m >= LEAST_LOOK_AGL_M else None, best, self._ground_m
             )
             if answer.found:
                 self._watch = LostWatch()
@@ -210,7 +211,7 @@ class AnchorNode:
         ground, relief_m = ground_plane(best.map, e_m, n_m, prediction.agl_m)
         view = view_of(prediction, ground, self._ground_m)
         answer = msgspec.structs.replace(answer, ground=ground, relief_m=relief_m)
-        if view.agl_m < MIN_AGL_M:
+        if view.agl_m < LEAST_LOOK_AGL_M:
             return msgspec.structs.replace(answer, verdict=Verdict.TOO_LOW)
         looks = self._layers.looks(image, view, belief)
         new = min(self._since_look_m / (NEW_GROUND_SHARE * max(look.footprint_m for look in looks.values())), 1.0)

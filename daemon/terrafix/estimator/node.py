@@ -190,6 +190,14 @@ class EstimatorNode:
             stamps = replace(advance.turn, t0_ns=advance.turn.t0_ns + late_ns, t1_ns=stamp_ns)
             self._time_offset.add(stamps, self._telemetry)
         yield _odometry_verdict(odometry, advance.verdict)
+        if advance.reset:
+            yield MeasurementVerdict(
+                t_ns=odometry.t_ns,
+                frame_id=odometry.frame_id,
+                measurement="reset",
+                verdict=Verdict.ACCEPTED,
+                detail=advance.reset,
+            )
         for name, verdict in (("attitude", advance.heading), ("height", advance.height)):
             if verdict is not Verdict.ACCEPTED:
                 t_ns, frame_id = odometry.t_ns, odometry.frame_id

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from terrafix.core.limits import LEAST_LOOK_AGL_M
 from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.estimator.air import Air, Wind
 from terrafix.estimator.beginning import Beginning, Slow, TakeOff
@@ -63,6 +64,7 @@ MAX_LEVEL_SIGMA = 0.5
 STEP_SHARE = 0.04  # of a step: what odometry over real ground gets wrong, for the anchor's belief
 STEP_FLOOR_M = 0.5
 
+LOW_RATIO = 1.5  # of LEAST_LOOK_AGL_M: a reported height above this would be looked from
 HEADING_GATE = 3.0  # sigmas, by which pictures of a new fragment may have turned otherwise than the heading
 MOTION_TIMEOUT_S = 5.0  # as EKF2_NOAID_TOUT of PX4, for one who would be led by inertial sensors alone
 LENS_SURE = 3.0  # sigmas, from which what the lens bends is taken out of the pictures: none is straight to a last digit
@@ -111,6 +113,7 @@ class Advance:
     heading: Verdict = Verdict.ACCEPTED  # what became of what was told, if it was
     height: Verdict = Verdict.ACCEPTED
     turn: Turn | None = None  # since the frame before, by pictures
+    reset: str = ""  # why the graph began anew with this frame; empty: it did not
 
 
 class Tracker:
@@ -233,7 +236,8 @@ class Tracker:
         if self._is_motion_timed_out(sighting, t_s) and way is not None:
             spread[3:, 3:] = unknown_cov()
             spread[:3, :3] += unknown_cov()[:3, :3] * dt_s**2
-            return self._begin_again(frame_id, t_s, attitude, led_to, velocity, spread, verdict)
+            advance = self._begin_again(frame_id, t_s, attitude, led_to, velocity, spread, verdict)
+            return replace(advance, reset=f"odometry contradicts velocity for {MOTION_TIMEOUT_S:.0f} s")
         above_m = None if known is None else float(led_to[2]) - self.terrain.ground_m
         if self._take_off.was_blind(way, above_m):
             # Told of the speed at both ends, a graph would make up the way between them and be too sure of it: it
@@ -274,6 +278,13 @@ class Tracker:
             if self._heights.begins and self.last_fix_s is None:
                 return self._begin(frame_id, t_s, attitude, felt)
             attitude, height = replace(attitude, agl_m=None), Verdict.IMPLAUSIBLE
+        if self._is_too_low_to_be_looked_at(attitude, p):
+            cov = tangent_to_world(self._last.cov, before.pose.rotation().matrix()) + _padded(spread[:3, :3])
+            sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+            placed = self._start_graph(frame_id, t_s, attitude, p[:2], sigma_m)
+            seen_m, reported_m = float(p[2]) - self.terrain.below(p), self._reported_agl_m(attitude, p)
+            why = f"height {seen_m:.0f} m, where {reported_m:.0f} m are reported"
+            return Advance(verdict, placed, step, step_sigma, heading, height, turn, reset=why)
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[self.graph.next_node] = _compose_cov(self._cov_of[parent], motion)
         state = NodeState(pose, before.bias, velocity)
@@ -430,6 +441,19 @@ class Tracker:
         cov = tangent_to_world(self._last.cov, before.pose.rotation().matrix())
         sigma_m = float(np.sqrt(self.origin.agl_sigma_m**2 + cov[2, 2] + moved_m2))
         return self._heights.refuses(told_m - float(expected_m), sigma_m, self.last_fix_s)
+
+    def _is_too_low_to_be_looked_at(self, attitude: Attitude, p_m: np.ndarray) -> bool:
+        """Whether a height that has walked off keeps the anchor from looks that would correct it, while the reported
+        one, above the ground that a map tells, would allow them. ``p_m`` (3,) of the camera."""
+        if attitude.agl_m is None or attitude.stands or not self.terrain.is_told or self._open is not None:
+            return False
+        agl_m = float(p_m[2]) - self.terrain.below(p_m)
+        return agl_m < LEAST_LOOK_AGL_M and self._reported_agl_m(attitude, p_m) > LOW_RATIO * LEAST_LOOK_AGL_M
+
+    def _reported_agl_m(self, attitude: Attitude, p_m: np.ndarray) -> float:
+        """Reported height above the ground below ``p_m`` (3,)."""
+        assert attitude.agl_m is not None
+        return (self.origin.ground_amsl_m or 0.0) + attitude.agl_m - self.terrain.below(p_m)
 
     def _leg(self, t_s: float, before: NodeState, attitude: Attitude, felt: Feel, *, seen: bool) -> Leg:
         """From the newest node to now."""
@@ -732,6 +756,13 @@ class Tracker:
 def scale_sigma(camera: Camera) -> float:
     """1-sigma of SCALE before anything was seen."""
     return float(np.hypot(camera.focal_sigma, BAROMETER_SCALE))
+
+
+def _padded(position_m2: np.ndarray) -> np.ndarray:
+    """(6, 6), position first, of a covariance (3, 3) of position."""
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = position_m2
+    return cov
 
 
 def _compose_cov(cov_parent: np.ndarray, motion: RelativePose) -> np.ndarray:

@@ -6,12 +6,13 @@ its airspeed; it may also have been led astray by a receiver. So its position is
 
 from typing import Any
 
+from terrafix.core.limits import LEAST_LOOK_AGL_M
 from terrafix.link.fix import STARTED_IN_FLIGHT
 from terrafix.link.hints import is_place
 from terrafix.messages import GpsInput, PositionHint
 
 RADIUS_M = 300.0  # what a plane without airspeed loses in two minutes without any position is 170 m
-LEAST_HEIGHT_M = 30.0  # above take-off: below it no map fix is tried
+
 AGAIN_NS = 20_000_000_000
 TIMES = 3
 
@@ -34,7 +35,7 @@ class Resume:
         if self._given and now_ns - self._given_ns < AGAIN_NS:
             return None
         lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
-        if not is_place(lat_deg, lon_deg) or message.relative_alt < LEAST_HEIGHT_M * 1e3:
+        if not is_place(lat_deg, lon_deg) or message.relative_alt < LEAST_LOOK_AGL_M * 1e3:
             return None
         self._given, self._given_ns = self._given + 1, now_ns
         return PositionHint(t_ns=now_ns, lat_deg=lat_deg, lon_deg=lon_deg, radius_m=RADIUS_M, source="autopilot")

@@ -12,13 +12,13 @@ from terrafix.anchor.layers import CE90_SIGMAS
 from terrafix.anchor.map_format import Layer
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import MIN_SIDE_CELLS, FrameMatcher
-from terrafix.anchor.node import MIN_AGL_M
 from terrafix.anchor.retrieval import CELL_PER_AGL
 from terrafix.anchor.tile_index import is_kept
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Map
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.limits import LEAST_LOOK_AGL_M
 from terrafix.vision.sources.description import camera_of, read_description
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
@@ -98,8 +98,10 @@ def check(
     plan = read_mission(mission) if mission else None
     if agl_m is None:
         agl_m = (plan and height_of(plan)) or DEFAULT_AGL_M
-    if agl_m < MIN_AGL_M:
-        raise UsageError(f"{agl_m:.0f} m above ground: no fix is tried below {MIN_AGL_M:.0f} m; give another --agl")
+    if agl_m < LEAST_LOOK_AGL_M:
+        raise UsageError(
+            f"{agl_m:.0f} m above ground: no fix is tried below {LEAST_LOOK_AGL_M:.0f} m; give another --agl"
+        )
     west, south, east, north = package.manifest.bounds_wgs84
     frame = LocalFrame((south + north) / 2, (west + east) / 2)
     local = package.bind(frame, layer)

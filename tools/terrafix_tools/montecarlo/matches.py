@@ -11,10 +11,11 @@ import numpy as np
 from terrafix.anchor.answer import coarse, judged
 from terrafix.anchor.belief import Mode, cell_for
 from terrafix.anchor.matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, REACH, Fix, View
-from terrafix.anchor.node import COARSE_SCORE, MIN_AGL_M
+from terrafix.anchor.node import COARSE_SCORE
 from terrafix.anchor.patches import MAX_PATCHES
 from terrafix.anchor.pnp import THRESHOLD, solve
 from terrafix.core.geodesy import rot_from_quat
+from terrafix.core.limits import LEAST_LOOK_AGL_M
 from terrafix.core.pose import log_so3
 from terrafix.messages import MapMatch, Prediction, Vec3, Verdict
 from terrafix_tools.montecarlo.flown import Shot
@@ -63,7 +64,7 @@ class MapMatches:
         good = self._good(shot.t_s)
         r_w_c, p_m = rot_from_quat(prediction.q_w_c), np.array(prediction.p_c_in_w_m)
         agl_m = prediction.agl_m if ground is None else float(p_m[2]) - ground[0]
-        if agl_m < MIN_AGL_M:
+        if agl_m < LEAST_LOOK_AGL_M:
             return msgspec.structs.replace(answer, verdict=Verdict.TOO_LOW)
         place = self._apparent(shot, r_w_c, agl_m)
         if not self._in_reach(prediction, shot, place, agl_m):

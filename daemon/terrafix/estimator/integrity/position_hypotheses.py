@@ -97,7 +97,8 @@ class PositionHypotheses:
     def _of_modes(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The estimate, known to ``own_m2`` (2, 2), and the places that the belief has elsewhere."""
         own = Component(np.zeros(2), own_m2, 1.0 - sum(mode.weight for mode in self._modes))
-        return own.offset_m, sum(c.weight * c.about(own.offset_m) for c in (own, *self._modes))
+        moments_m2 = np.sum([c.weight * c.about(own.offset_m) for c in (own, *self._modes)], axis=0)
+        return own.offset_m, moments_m2
 
     def _of_belief(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """An estimate that no pose has placed: the belief, and what is left to the prior."""
