@@ -115,7 +115,7 @@ def weighed(sigma_m: float, *modes: tuple[float, float, float]) -> PositionHypot
     return hypotheses
 
 
-def test_a_mode_that_holds_most_of_a_wide_belief_is_published_with_the_moments_about_it() -> None:
+def test_a_mode_that_leads_a_wide_belief_is_published_with_the_moments_about_it() -> None:
     hypotheses = weighed(60.0, (300.0, 0.0, 0.7))
     at_m, cov = hypotheses.claim(np.diag([3600.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == [300.0, 0.0] and hypotheses.are_several
@@ -129,14 +129,20 @@ def test_a_mode_without_a_pose_is_never_sure() -> None:
     assert cov[0, 0] == pytest.approx((1.0 - MOST_WEIGHT) * (3600.0 + 300.0**2) + MOST_WEIGHT * MODE_M2)
 
 
-def test_a_belief_without_a_mode_of_most_of_the_mass_claims_its_whole_spread_where_the_estimate_is() -> None:
-    at_m, cov = weighed(60.0, (300.0, 0.0, 0.4)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
+@pytest.mark.parametrize(("mass", "rival", "leads"), [(0.26, 0.1, True), (0.24, 0.06, False), (0.4, 0.17, False)])
+def test_a_mode_leads_by_its_mass_and_by_how_much_its_rival_has(mass: float, rival: float, leads: bool) -> None:
+    at_m, _ = weighed(60.0, (300.0, 0.0, mass), (-200.0, 0.0, rival)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
+    assert at_m.tolist() == ([300.0, 0.0] if leads else [0.0, 0.0])
+
+
+def test_a_belief_without_a_leading_mode_claims_its_whole_spread_where_the_estimate_is() -> None:
+    at_m, cov = weighed(60.0, (300.0, 0.0, 0.2)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == [0.0, 0.0]
     assert cov[0, 0] == pytest.approx(9000.0 + 40.0**2) and cov[1, 1] == pytest.approx(400.0)
 
 
 def test_a_belief_that_is_narrower_than_the_estimate_without_such_a_mode_claims_no_less() -> None:
-    at_m, cov = weighed(200.0, (30.0, 0.0, 0.4)).claim(np.diag([40000.0] * 3 + [0.01] * 3))
+    at_m, cov = weighed(200.0, (30.0, 0.0, 0.2)).claim(np.diag([40000.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == [0.0, 0.0] and cov[0, 0] == cov[1, 1] == 40000.0
 
 

@@ -20,6 +20,9 @@ PLACED = 0.15
 # What a mode is believed at most without a pose in it: of eight over wide beliefs, with up to 0.97 of the mass, one was
 # the wrong place.
 MOST_WEIGHT = 0.8
+# What a mode must hold, and how many times the weight of its best rival, to be the best single place. The rest of the
+# mixture is in the moments about it, so that this decides where the ellipse is, not how far it reaches.
+LEADING_WEIGHT, LEADS = 0.25, 2.5
 MODE_SIGMA = 0.03  # of the height: buildings that lean shift a whole picture (anchor/answer.py)
 
 
@@ -104,8 +107,8 @@ class PositionHypotheses:
         """An estimate that no pose has placed: the belief, and what is left to the prior."""
         assert self._belief is not None
         prior = Component(np.zeros(2), own_m2, 1.0)
-        mode = next(iter(self._modes), None)
-        if mode is None or mode.weight <= 0.5:
+        mode, rival = (*self._modes, None, None)[:2]
+        if mode is None or mode.weight < max(LEADING_WEIGHT, LEADS * (rival.weight if rival else 0.0)):
             return prior.offset_m, max(own_m2, self._belief.about(prior.offset_m), key=np.trace)
         weight = min(mode.weight, MOST_WEIGHT)
         rest_m2 = max(prior.about(mode.offset_m), self._belief.about(mode.offset_m), key=np.trace)
