@@ -54,7 +54,6 @@ class PlaceSearch:
     def begin(self, best: Dated, agl_m: float, around_m: tuple[float, float] | None) -> None:
         """``around_m``: where; None: the whole map."""
         self._search = MapSearch(best.map, best.matcher, agl_m, around_m, best.null_at(agl_m), self._budget)
-        self._probation = None
         self.sigma_m = anywhere_m(best.map)
 
     def move(self, step_m: tuple[float, float], sigma_m: float) -> None:
