@@ -172,7 +172,7 @@ def test_looks_that_find_nothing_widen_the_claim_before_they_raise_the_alarm() -
     monitor.flew(40.0, HEIGHT_M)
     assert monitor.sigma_m == pytest.approx(0.0, abs=1e-3)  # nothing has been looked at
     _looks(monitor, 1, found=False)
-    assert monitor.sigma_m == pytest.approx(REACH * 65.0 * math.sqrt(0.2 - PRIOR), rel=0.02)
+    assert monitor.sigma_m == pytest.approx(REACH * 65.0 * math.sqrt(0.2067 - PRIOR), rel=0.02)
     _looks(monitor, 3, found=False)
     assert not monitor.active and monitor.probability > 0.9
     _looks(monitor, 10, found=False)
@@ -190,7 +190,9 @@ def test_looks_at_the_same_ground_count_once() -> None:
 
 def test_what_the_map_has_confirmed_is_no_more_in_question() -> None:
     monitor = Registration()
-    _looks(monitor, 2, found=True)
+    _looks(monitor, 1, found=True)
+    assert not monitor.confirmed
+    _looks(monitor, 1, found=True)
     assert monitor.confirmed and monitor.sigma_m == 0.0
     _looks(monitor, 50, found=False)
     assert monitor.probability == 0.0 and not monitor.active
