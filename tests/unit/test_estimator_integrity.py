@@ -11,7 +11,7 @@ from simulated_flight import ORIGIN, Flight, Listener, sigma_m, t_ns
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
 from terrafix.estimator.integrity.cusum import LARGEST_STEP, MARGIN, Cusum, threshold
-from terrafix.estimator.integrity.inertial import LEAST_CHANGE_MPS, WINDOW_S, InertialMonitor
+from terrafix.estimator.integrity.inertial import LEAST_CHANGE_MPS, MOUNT_YAWS_DEG, WINDOW_S, InertialMonitor
 from terrafix.estimator.integrity.matched import OffsetMonitor, told_over_seen
 from terrafix.estimator.integrity.monitors import UNKNOWN_M, Monitors
 from terrafix.estimator.integrity.registration import NEW_GROUND, PRIOR, REACH, Registration
@@ -75,14 +75,20 @@ def test_a_sighting_is_the_way_in_heights_and_a_turn_that_is_as_told() -> None:
     seen = sighting(pairs, before, now, Mount().r_b_c())
     assert seen is not None
     assert seen.moved == pytest.approx([0.1, -0.2], abs=1e-9)
-    assert seen.said_rad == pytest.approx(0.5) and seen.turned_rad == pytest.approx(0.0, abs=1e-9)
+    assert seen.said_rad == pytest.approx(0.5) and seen.turned_rad == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_mirrored_picture_turns_the_other_way() -> None:
     pairs, before, now = _flown((0.0, 0.0), 0.2)
     seen = sighting(pairs * (-1.0, 1.0, -1.0, 1.0), before, now, Mount().r_b_c())
     assert seen is not None
-    assert seen.turned_rad == pytest.approx(-0.4, abs=0.05)
+    assert seen.turned_rad == pytest.approx(-0.2, abs=0.02)
+
+
+def test_a_camera_that_is_mounted_backwards_turns_as_the_attitude_does() -> None:
+    pairs, before, now = _flown((0.0, 0.0), 0.2, mount_yaw_deg=180.0)
+    seen = sighting(pairs, before, now, Mount().r_b_c())
+    assert seen is not None and seen.turned_rad == pytest.approx(0.2, abs=0.02)
 
 
 def test_without_a_heading_or_with_few_rays_there_is_no_sighting() -> None:
@@ -92,43 +98,44 @@ def test_without_a_heading_or_with_few_rays_there_is_no_sighting() -> None:
     assert sighting(pairs, replace(before, roll_rad=2.5), now, Mount().r_b_c()) is None  # the horizon and above
 
 
-def _manoeuvres(gain: complex, *, windows: int = 60, noise_mps: float = 1.0) -> InertialMonitor:
-    """Changes of 8 m/s in all directions, as pictures of a wrong description show them."""
+def _manoeuvres(gain: float, *, mount: int = 0, windows: int = 60) -> InertialMonitor:
+    """Changes of 8 m/s in all directions, as pictures of a wrong description show them, to 1 m/s."""
     rng, monitor = np.random.default_rng(8), InertialMonitor()
+    turned = np.exp(1j * np.radians(MOUNT_YAWS_DEG[mount] - np.array(MOUNT_YAWS_DEG)))
     for i in range(windows):
         began_s = i * (WINDOW_S + 1.0)
-        monitor.add(began_s, 0j)
+        monitor.add(began_s, 5.0 * turned)
         assert monitor.window(began_s + WINDOW_S - 0.1) is None
-        assert monitor.window(began_s + WINDOW_S) == (began_s, 0j)
+        assert monitor.window(began_s + WINDOW_S) == began_s
         felt = 8.0 * np.exp(2j * math.pi * rng.uniform())
-        noise = complex(*rng.normal(0.0, noise_mps, 2))
-        monitor.compare(began_s + WINDOW_S, gain * felt + noise, felt)
+        noise = complex(*rng.normal(0.0, 1.0, 2))
+        monitor.compare(began_s + WINDOW_S, (5.0 + gain * felt + noise) * turned, felt)
     return monitor
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0, 3.28, 1 / 3.28])
 def test_velocity_changes_name_the_scale(factor: float) -> None:
-    fault = _manoeuvres(complex(factor)).fault
+    fault = _manoeuvres(factor).fault
     assert fault is not None and fault.quantity == "scale" and fault.factor == pytest.approx(factor)
 
 
-@pytest.mark.parametrize("deg", [90.0, -90.0, 180.0])
-def test_velocity_changes_name_a_mount_that_is_turned(deg: float) -> None:
-    fault = _manoeuvres(complex(np.exp(1j * math.radians(deg)))).fault
-    assert fault is not None and fault.quantity == "mount yaw" and fault.factor == deg
+@pytest.mark.parametrize("mount", [1, 2, 3])
+def test_velocity_changes_name_a_mount_that_is_turned(mount: int) -> None:
+    fault = _manoeuvres(1.0, mount=mount).fault
+    assert fault is not None and fault.quantity == "mount yaw" and fault.factor == MOUNT_YAWS_DEG[mount]
 
 
 def test_velocity_changes_of_a_right_description_raise_no_alarm() -> None:
-    assert _manoeuvres(1.0 + 0j, windows=5000).fault is None
-    assert _manoeuvres(1.1 + 0j, windows=500).fault is None  # a focal length within its usual sigma
+    assert _manoeuvres(1.0, windows=5000).fault is None
+    assert _manoeuvres(1.1, windows=500).fault is None  # a focal length within its usual sigma
 
 
 def test_flight_without_manoeuvres_tells_nothing() -> None:
-    monitor = InertialMonitor()
+    monitor, little = InertialMonitor(), np.full(4, 0.9j * LEAST_CHANGE_MPS)
     for i in range(500):
-        monitor.add(i * 5.0, 0j)
+        monitor.add(i * 5.0, 0.0 * little)
         monitor.window(i * 5.0 + 4.0)
-        monitor.compare(i * 5.0 + 4.0, 0.9j * LEAST_CHANGE_MPS, -0.9j * LEAST_CHANGE_MPS)
+        monitor.compare(i * 5.0 + 4.0, little, -0.9j * LEAST_CHANGE_MPS)
     assert monitor.fault is None
 
 
@@ -137,7 +144,7 @@ def test_turns_tell_a_mirrored_picture(mirrored: bool) -> None:
     rng, sigma = np.random.default_rng(3), math.radians(2.0)
     monitor = TurnMonitor(sigma)
     for said in rng.normal(0.0, math.radians(6.0), 200):
-        monitor.add(said, (-2.0 * said if mirrored else 0.0) + rng.normal(0.0, sigma))
+        monitor.add(said, (-said if mirrored else said) + rng.normal(0.0, sigma))
     assert monitor.mirrored is mirrored
 
 
@@ -165,7 +172,7 @@ def test_looks_that_find_nothing_widen_the_claim_before_they_raise_the_alarm() -
     monitor.flew(40.0, HEIGHT_M)
     assert monitor.sigma_m == pytest.approx(0.0, abs=1e-3)  # nothing has been looked at
     _looks(monitor, 1, found=False)
-    assert monitor.sigma_m == pytest.approx(REACH * 65.0 * math.sqrt(0.2 - PRIOR), rel=0.02)
+    assert monitor.sigma_m == pytest.approx(REACH * 65.0 * math.sqrt(0.2067 - PRIOR), rel=0.02)
     _looks(monitor, 3, found=False)
     assert not monitor.active and monitor.probability > 0.9
     _looks(monitor, 10, found=False)
@@ -183,7 +190,9 @@ def test_looks_at_the_same_ground_count_once() -> None:
 
 def test_what_the_map_has_confirmed_is_no_more_in_question() -> None:
     monitor = Registration()
-    _looks(monitor, 2, found=True)
+    _looks(monitor, 1, found=True)
+    assert not monitor.confirmed
+    _looks(monitor, 1, found=True)
     assert monitor.confirmed and monitor.sigma_m == 0.0
     _looks(monitor, 50, found=False)
     assert monitor.probability == 0.0 and not monitor.active
@@ -259,3 +268,19 @@ def test_a_compass_that_is_90_degrees_off_is_named_by_poses_on_the_map() -> None
     assert [(fault.quantity, fault.active) for fault in faults] == [("heading", True)]
     assert faults[0].factor == pytest.approx(90.0, abs=15.0)
     assert monitors.changes(t_ns(61)) == []
+
+
+def test_a_finding_is_said_again_when_it_becomes_another_one() -> None:
+    from terrafix.estimator.telemetry import Telemetry
+
+    monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(200, dem=True)
+    said = []
+    for i in range(200):
+        state, _, *_ = flight.messages(i)
+        assert isinstance(state, VehicleState) and state.yaw_rad is not None
+        telemetry.add(msgspec.structs.replace(state, yaw_rad=state.yaw_rad + (1.5 if i < 100 else 3.0)))
+        monitors.matched(flight.fix(i), telemetry, accepted=True)
+        said += monitors.changes(t_ns(i))
+    assert all(fault.quantity == "heading" and fault.active for fault in said)
+    assert 2 <= len(said) <= 5
+    assert said[0].factor == pytest.approx(86.0, abs=10.0) and said[-1].factor == pytest.approx(172.0, abs=35.0)

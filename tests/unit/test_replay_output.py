@@ -120,6 +120,22 @@ def test_three_files_and_one_row_a_frame(folder: Path, tmp_path: Path) -> None:
     assert isinstance(recorded[0], m.Origin)
 
 
+def test_the_summary_has_a_verdict_from_rows_faults_and_answers(folder: Path, tmp_path: Path) -> None:
+    class Faulty(StandInEstimator):
+        def on(self, message: m.Message) -> Iterable[m.Message]:
+            yield from super().on(message)
+            if isinstance(message, m.Odometry) and message.frame_id == FRAMES - 2:
+                fault = {"t_ns": message.t_ns, "quantity": "scale", "factor": 2.0, "detail": ""}
+                yield m.CalibrationFault(**fault, active=True)
+
+    said = replay(folder, None, tmp_path / "right", nodes=nodes)["verdict"]
+    assert said["verdict"] == "trust it in part" and said["reasons"] == ["no position"] and said["active_faults"] == []
+    wrong = replay(folder, None, tmp_path / "wrong", nodes=lambda ctx: nodes(ctx) | {"estimator": Faulty()})["verdict"]
+    assert wrong["verdict"] == "do not trust it"
+    assert wrong["active_faults"] == ["height/focal seems x2.00 off"]
+    assert json.loads((tmp_path / "wrong" / "summary.json").read_text())["verdict"] == wrong
+
+
 def test_twice_the_same_but_for_the_time(folder: Path, tmp_path: Path) -> None:
     tables = []
     for name in ("a", "b"):

@@ -8,6 +8,7 @@ import pytest
 from flight_records import frame, live_messages, origin, write_record, write_truth
 
 from terrafix.core.errors import SourceError
+from terrafix.messages import CalibrationFault
 from terrafix_tools.estimates import Row, write_rows
 from terrafix_tools.report.charts import clock, spans_of, ticks
 from terrafix_tools.report.page import report
@@ -58,6 +59,15 @@ def test_a_live_record_with_truth(tmp_path: Path) -> None:
     assert "Longest GPS_INPUT silence: 0.50 s." in page.text
     assert "3 messages were dropped" in page.text
     assert any(link.startswith("data:image/jpeg") for link in page.links)
+
+
+def test_the_report_says_what_is_miscalibrated_and_whether_to_trust_the_flight(tmp_path: Path) -> None:
+    wrong = CalibrationFault(t_ns=7_000_000_000, quantity="scale", factor=2.0, detail="told against seen", active=True)
+    right = CalibrationFault(t_ns=8_000_000_000, quantity="scale", factor=2.0, detail="told against seen", active=False)
+    write_record(tmp_path / "flight-000.mcap", [*live_messages(), wrong, right])
+    text = page_of(tmp_path).text
+    assert "Height/focal seems x2.00 off: no fix: told against seen." in text
+    assert "Verdict: Trust it from 8.0 s to 9.5 s, and no more than that (height/focal seems x2.00 off)." in text
 
 
 def test_without_truth_it_shows_what_was_claimed(tmp_path: Path) -> None:

@@ -89,7 +89,9 @@ def flight_verdict(
 
 def verdict_of(folder: Path) -> FlightVerdict:
     """Of the record in a folder. Raises SourceError when there is none."""
-    table, faults, answers = RowTable(), [], {}
+    table = RowTable()
+    faults: list[tuple[float, CalibrationFault]] = []
+    answers: dict[str, int] = {}
     for _, _, message in read_flight(folder):
         table.take(message)
         if isinstance(message, CalibrationFault):

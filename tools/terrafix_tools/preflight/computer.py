@@ -20,6 +20,7 @@ from terrafix_engines.features import open_describer
 from terrafix_engines.features.xfeat import XFeatDescriber
 from terrafix_engines.providers import short
 from terrafix_engines.runtime import ModelFileError
+from terrafix_tools.live import swapped
 from terrafix_tools.mapping.check_mission import uncovered, way_of
 from terrafix_tools.mapping.check_text import where
 from terrafix_tools.mission.file import read_mission
@@ -91,7 +92,8 @@ def _start(package: MapPackage, config: Config) -> Iterator[Line]:
     if package.covers(*place):
         yield ok("start", f"{at} lies on the map")
     else:
-        yield fail("start", f"{at} does not lie on the map", "correct the start, or take another map")
+        todo = swapped(package, *place, 0.0) or "correct the start, or take another map"
+        yield fail("start", f"{at} does not lie on the map", todo)
 
 
 def _cover(package: MapPackage, mission: Path) -> Iterator[Line]:

@@ -7,12 +7,13 @@ import numpy as np
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_from_quat, yaw_of
-from terrafix.estimator.integrity.inertial import InertialMonitor
+from terrafix.core.pose import exp_so3
+from terrafix.estimator.integrity.inertial import MOUNT_YAWS_DEG, InertialMonitor
 from terrafix.estimator.integrity.matched import SCATTER, OffsetMonitor, told_over_seen
 from terrafix.estimator.integrity.registration import Registration
-from terrafix.estimator.integrity.sighting import Sighting, sighting
+from terrafix.estimator.integrity.sighting import sighting
 from terrafix.estimator.integrity.turns import TurnMonitor
-from terrafix.estimator.telemetry import Attitude, Telemetry
+from terrafix.estimator.telemetry import Telemetry
 from terrafix.messages import CalibrationFault, MapMatch, Odometry, Origin, Verdict
 
 UNKNOWN_M = 1000.0  # 1-sigma per horizontal axis while a description is known to be wrong
@@ -20,7 +21,7 @@ SPACING_S = 1.0  # between turns that count: pictures of one keyframe share thei
 # Constant errors, 1-sigma, beyond the described ones: a compass beside motors, a barometer over uneven ground.
 HEADING_RAD, HEIGHT_SHARE = math.radians(10.0), 0.05
 YAW_SCATTER_RAD = math.radians(3.0)
-LEVEL_RAD = math.radians(10.0)  # a camera that is mounted otherwise levels pictures of a vehicle that leans wrongly
+ANOTHER = 0.2  # of a factor, by which it changes to be said again
 NOT_LOOKED = (Verdict.BAD_IMAGE, Verdict.NO_FEATURES, Verdict.NO_PREDICTION, Verdict.OUTSIDE_MAP, Verdict.TOO_LOW)
 
 
@@ -36,6 +37,7 @@ class Monitors:
     def __init__(self, origin: Origin) -> None:
         self._origin = origin
         self._r_b_c = Mount.of(origin.camera).r_b_c()
+        self._mounts = [exp_so3(np.array([0.0, 0.0, math.radians(deg)])) @ self._r_b_c for deg in MOUNT_YAWS_DEG]
         self._inertial = InertialMonitor()
         self._turns = TurnMonitor(math.radians(origin.yaw_sigma_deg))
         self._registration = Registration()
@@ -68,20 +70,22 @@ class Monitors:
         if odometry.t_ns * 1e-9 - self._turned_s >= SPACING_S:
             self._turned_s = odometry.t_ns * 1e-9
             self._turns.add(seen.said_rad, seen.turned_rad)
-        if now.agl_m is not None and _level(before) and _level(now):
-            self._velocity(seen, now.agl_m, (began_ns, odometry.t_ns), telemetry)
+        if now.agl_m is None:
+            return
+        mounted = [sighting(np.array(odometry.pairs), before, now, r_b_c) for r_b_c in self._mounts]
+        moved = [complex(*one.moved) for one in mounted if one is not None]
+        if len(moved) == len(self._mounts):
+            velocities = np.array(moved) * now.agl_m / ((odometry.t_ns - began_ns) * 1e-9)
+            self._velocity(velocities, (began_ns + odometry.t_ns) // 2, telemetry)
 
-    def _velocity(self, seen: Sighting, agl_m: float, span_ns: tuple[int, int], telemetry: Telemetry) -> None:
-        east, north = seen.moved * agl_m / ((span_ns[1] - span_ns[0]) * 1e-9)
-        velocity, middle_ns = complex(east, north), sum(span_ns) // 2
-        window = self._inertial.window(middle_ns * 1e-9)
-        if window is not None:
-            began_s, began_mps = window
-            felt = telemetry.felt(round(began_s * 1e9), middle_ns)
-            if felt is not None:
-                change = np.trapezoid(felt.accel_w_mps2[:, :2], felt.s_s, axis=0)
-                self._inertial.compare(middle_ns * 1e-9, velocity - began_mps, complex(*change))
-        self._inertial.add(middle_ns * 1e-9, velocity)
+    def _velocity(self, seen_mps: np.ndarray, t_ns: int, telemetry: Telemetry) -> None:
+        t_s = t_ns * 1e-9
+        began_s = self._inertial.window(t_s)
+        felt = None if began_s is None else telemetry.felt(round(began_s * 1e9), t_ns)
+        if felt is not None:
+            change_mps = np.trapezoid(felt.accel_w_mps2[:, :2], felt.s_s, axis=0)
+            self._inertial.compare(t_s, seen_mps, complex(*change_mps))
+        self._inertial.add(t_s, seen_mps)
 
     def matched(self, match: MapMatch, telemetry: Telemetry, *, accepted: bool) -> None:
         """What the map said of a frame. ``accepted``: it has entered the graph; one whose height is off seldom does."""
@@ -107,7 +111,14 @@ class Monitors:
         """What has begun or ended since the last call."""
         now = self._found()
         said = [self._fault(t_ns, name, self._said[name], active=False) for name in self._said if name not in now]
-        said += [self._fault(t_ns, name, now[name], active=True) for name in now if name not in self._said]
+        said += [
+            self._fault(t_ns, name, finding, active=True)
+            for name, finding in now.items()
+            if name not in self._said or _differs(finding.factor, self._said[name].factor)
+        ]
+        for name, finding in now.items():  # what was said stays the measure of what is another finding
+            if name in self._said and not _differs(finding.factor, self._said[name].factor):
+                now[name] = self._said[name]
         self._said = now
         return said
 
@@ -134,5 +145,6 @@ class Monitors:
         )
 
 
-def _level(attitude: Attitude) -> bool:
-    return max(abs(attitude.roll_rad or 0.0), abs(attitude.pitch_rad or 0.0)) < LEVEL_RAD
+def _differs(now: float | None, before: float | None) -> bool:
+    """Factors or degrees that are two findings, not one that is known better by now."""
+    return now is not None and before is not None and abs(now - before) > ANOTHER * max(abs(now), abs(before))

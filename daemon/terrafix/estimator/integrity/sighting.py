@@ -13,8 +13,8 @@ LEAST_PAIRS = 8
 
 @dataclass(frozen=True)
 class Sighting:
-    """``moved`` (2,) east, north, in heights above the ground; ``turned_rad``: how far the pictures turned more than
-    the attitude says, clockwise; ``said_rad``: by how much the attitude turned, clockwise."""
+    """``moved`` (2,) east, north, in heights above the ground; ``turned_rad``: by how much the pictures show that the
+    camera turned about its optical axis, clockwise, whatever its mount is; ``said_rad``: the same by the attitude."""
 
     moved: np.ndarray
     turned_rad: float
@@ -31,12 +31,16 @@ def sighting(pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarr
     if int(down.sum()) < LEAST_PAIRS:
         return None
     kf, k = (rays[down, 0] / -rays[down, 2] + 1j * rays[down, 1] / -rays[down, 2] for rays in (rays_kf, rays_k))
-    spread = k - k.mean()
-    # kf = ratio * k + moved, by least squares (Umeyama 1991) over complex numbers east + i north
-    ratio = complex(np.vdot(spread, kf - kf.mean()) / max(float(np.vdot(spread, spread).real), 1e-12))
-    moved = complex(kf.mean() - ratio * k.mean())
+    moved = complex(kf.mean() - _ratio(k, kf) * k.mean())
+    turned = _ratio(pairs[:, 2] + 1j * pairs[:, 3], pairs[:, 0] + 1j * pairs[:, 1])
     said_rad = float(np.remainder(now.yaw_rad - before.yaw_rad + np.pi, 2 * np.pi) - np.pi)
-    return Sighting(np.array([moved.real, moved.imag]), float(-np.angle(ratio)), said_rad)
+    return Sighting(np.array([moved.real, moved.imag]), float(np.angle(turned)), said_rad)
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> complex:
+    """b = ratio * a + shift, by least squares (Umeyama 1991) over complex numbers (N,)."""
+    spread = a - a.mean()
+    return complex(np.vdot(spread, b - b.mean()) / max(float(np.vdot(spread, spread).real), 1e-12))
 
 
 def _rays(xy: np.ndarray, attitude: Attitude, r_b_c: np.ndarray) -> np.ndarray:

@@ -19,6 +19,6 @@ class TurnMonitor:
     def mirrored(self) -> bool:
         return self._test.active
 
-    def add(self, said_rad: float, more_rad: float) -> None:
-        """A turn by the attitude, and how much more the pictures turned: nothing, or minus two turns if mirrored."""
-        self._test.add((more_rad**2 - (more_rad + 2.0 * said_rad) ** 2) / (2.0 * self._variance))
+    def add(self, said_rad: float, turned_rad: float) -> None:
+        """A turn by the attitude, and as pictures show it: the same, or the opposite if they are mirrored."""
+        self._test.add(-2.0 * said_rad * turned_rad / self._variance)
