@@ -276,6 +276,14 @@ def test_a_forged_tilt_whose_numbers_fit_is_refused_by_the_gyroscopes() -> None:
     assert wire.texts() == ["Terrafix: attitude jumps without gyros, ignored"]
 
 
+def test_an_attitude_that_is_no_number_opens_no_gate() -> None:
+    wire = Wire()
+    wire.forger = wire.true
+    wire.run(2.0)
+    wire.run(2.0, lambda boot_ms: attitude(boot_ms, math.nan if boot_ms % 40 else 0.4))
+    assert {state.roll_rad for state in states(wire.said)} == {0.0}
+
+
 def test_a_forged_height_from_another_boot_is_refused_by_its_time() -> None:
     wire = Wire()
     wire.forger = wire.true
