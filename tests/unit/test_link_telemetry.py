@@ -183,6 +183,13 @@ def test_below_the_stated_threshold_a_tilt_is_taken() -> None:
     assert all(checked([(t, 0.8 * JUMP_RAD * (i % 2)) for i, t in enumerate(at_25_hz(2.0))]))
 
 
+def test_a_tenth_of_what_was_turned_is_allowed_for() -> None:
+    assert checked([(0.0, 0.0), (0.9, 3.0 * 0.9 * 1.08)], rate=3.0) == [True, True]
+    assert checked([(0.0, 0.0), (0.9, 3.0 * 0.9 * 1.20)], rate=3.0) == [True, False]
+    assert checked([(0.0, 0.0), (0.1, 3.0 * 0.1 * 1.7)], own=3.0, readings=False) == [True, True]
+    assert checked([(0.0, 0.0), (0.1, 3.0 * 0.1 * 2.2)], own=3.0, readings=False) == [True, False]
+
+
 def test_rates_that_a_forger_writes_into_its_attitude_count_for_nothing_beside_gyroscopes() -> None:
     rolls = [pair for t in at_25_hz(2.0) for pair in ((t, 0.0), (t + 0.02, 0.5))]
     assert checked(rolls, own=25.0) == [True, False] * 50
