@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
 from terrafix.core.geodesy import LocalFrame
+from terrafix.link.coast import Filter, LastFix, _moved
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.kept import AutopilotKeeper
 from terrafix.messages import Coasted, GpsInput, Message
@@ -173,3 +174,11 @@ def test_not_while_it_has_our_own_fix(autopilot: Autopilot) -> None:
     assert not coasted(autopilot.says(KILLED_S + 0.1, belief(KILLED_S + 0.1)))
     autopilot.edge.heard(fix(KILLED_S + 0.2, fix_type=1))
     assert coasted(autopilot.says(KILLED_S + 0.3, status(), receiver(1), belief(KILLED_S + 0.3)))
+
+
+def test_the_wrap_of_the_autopilots_time_is_no_other_boot() -> None:
+    at_fix = Filter(2**32 - 1000, 48.0, 11.0, (0.0, 0.0, 0.0))
+    last = LastFix(at_fix, 48.0, 11.0, (0.0, 0.0, 0.0), 3.0, 0.5, frozenset())
+    (coasted,) = _moved(last, msgspec.structs.replace(at_fix, boot_ms=1000), S)
+    assert coasted.coast_s == 2.0
+    assert list(_moved(last, msgspec.structs.replace(at_fix, boot_ms=70_000), S)) == []

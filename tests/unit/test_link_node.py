@@ -367,6 +367,14 @@ def test_a_clock_that_goes_back_and_forth_is_not_learnt() -> None:
     assert set(steps) == {100}
 
 
+def test_a_clock_that_steps_on_is_learnt_where_it_stays() -> None:
+    def wrong_ns(now: int) -> int:
+        return HOUR_MS * MS * (0 if now < 10 * S else 1 if now < 25 * S else 2)
+
+    steps, _ = clock_said(wrong_ns, armed=False)
+    assert [(i, step) for i, step in enumerate(steps) if step != 100] == [(450 - 1, 2 * HOUR_MS + 100)]
+
+
 def test_a_year_that_cannot_be_is_not_learnt_on_the_ground_either() -> None:
     steps, refused = clock_said(lambda now: 0 if now < 10 * S else TWENTY_YEARS_NS, armed=False)
     assert set(steps) == {100} and "cannot be" in refused[0]

@@ -36,7 +36,7 @@ class Vehicle:
 
     def __init__(self, kept: Path | None = None) -> None:
         self.wire, self.mav = MemoryWire(), mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
-        self.kept, self.seconds = kept, 0.0
+        self.kept, self.seconds, self.booted_s = kept, 100.0, 0.0
         self.restart()
 
     def restart(self) -> None:
@@ -48,7 +48,7 @@ class Vehicle:
         said: list[Any] = []
         for _ in range(round(seconds * 5)):
             self.seconds += 0.2
-            boot_ms, ardupilot = round(self.seconds * 1e3), mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+            boot_ms, ardupilot = round((self.seconds - self.booted_s) * 1e3), mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
             said = [mavlink.MAVLink_heartbeat_message(2, ardupilot, 128 if armed else 0, 0, 4, 3)]
             if above_m is not None:
                 said.append(mavlink.MAVLink_scaled_pressure_message(boot_ms, pressure_at(above_m), 0.0, 3500))
@@ -56,8 +56,8 @@ class Vehicle:
                 heights = (round(500e3 + filter_m * 1e3), round(filter_m * 1e3))
                 said.append(mavlink.MAVLink_global_position_int_message(boot_ms, 1, 2, *heights, 0, 0, 0, 0))
             self.wire.arrive(*(packed(x, self.mav) for x in (*said, attitude(boot_ms))))
-            last = states(self.edge.poll(round(self.seconds * S)))[-1]
-        return last.agl_m
+            heights = [state.agl_m for state in states(self.edge.poll(round(self.seconds * S)))]
+        return heights[-1]
 
 
 def test_a_filter_that_is_led_astray_by_our_velocity_does_not_move_the_height() -> None:
@@ -103,6 +103,14 @@ def test_a_link_that_is_started_in_the_air_takes_its_zero_from_the_filter_once()
     vehicle = Vehicle()
     assert vehicle.says(53.0, 50.0, armed=True) == pytest.approx(53.0, abs=0.1)
     assert vehicle.says(80.0, 60.0, armed=True) == pytest.approx(63.0, abs=0.1)
+
+
+def test_an_autopilot_that_has_rebooted_has_heights_of_its_own() -> None:
+    vehicle = Vehicle()
+    vehicle.says(0.0, 0.0, armed=False)
+    assert vehicle.says(50.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    vehicle.booted_s = vehicle.seconds
+    assert vehicle.says(3.0, 50.0, armed=True, seconds=3.0) == pytest.approx(3.0, abs=0.1)
 
 
 def test_a_link_that_is_started_again_keeps_the_zero_of_the_ground(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Who is served on a link, and who is not heard there: two vehicles, forgers and ground stations on real sockets."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
@@ -14,9 +15,9 @@ from test_link_edge import GPS
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge, open_edge
-from terrafix.link.kept import kept
+from terrafix.link.kept import ArmedAutopilot, AutopilotKeeper, kept
 from terrafix.link.served import FRESH_NS, MOVED_AFTER_NS, OTHER_AFTER_NS, Other, pilot_text
-from terrafix.link.transport import UdpOut
+from terrafix.link.transport import PEERS_MAX, UdpOut
 
 pytestmark = pytest.mark.real_time  # the packets go through the kernel
 
@@ -78,7 +79,10 @@ def test_a_second_vehicle_is_warned_of_once_and_again_when_it_comes_back(
     warning = "Terrafix: vehicle 9 on our port gets nothing"
     assert port.texts() == [warning]
     assert warning in [x.text for x in ours.heard("STATUSTEXT")]
-    assert f"7 is served, 9 at 127.0.0.1:{theirs.address[1]} gets nothing" in port.detail()
+    assert (
+        f"7 is served, 9 at 127.0.0.1:{theirs.address[1]} gets nothing" in port.detail()
+        and "second sender" not in port.detail()
+    )
     for second in range(6, 20):
         port.hears(second * S, ours, heartbeat())
     assert "9 at" not in port.detail()
@@ -139,7 +143,7 @@ def test_a_wire_with_one_other_end_gets_the_position_before_anybody_is_heard() -
 
 
 def test_the_same_vehicle_is_served_at_its_new_address_after_three_seconds(port: Port, ours: Speaker) -> None:
-    port.hears(1 * S, ours, armed())
+    port.hears(1 * S, ours, armed(), attitude(100_000))
     with Speaker(7) as moved:
         port.hears(1 * S + MOVED_AFTER_NS - MS, moved, armed())
         port.edge.heard(GPS)
@@ -148,6 +152,8 @@ def test_the_same_vehicle_is_served_at_its_new_address_after_three_seconds(port:
         ours.heard()
         port.edge.heard(GPS)
         assert len(moved.heard("GPS_INPUT")) == 1
+        # What the old address said of time and attitude does not count.
+        assert len(states(port.hears(2 * S + MOVED_AFTER_NS, moved, attitude(5, yaw=-2.0)))) == 1
     assert ours.heard("GPS_INPUT") == []
 
 
@@ -184,23 +190,80 @@ def test_a_link_that_is_started_again_serves_the_address_of_before(
     assert len(ours.heard("GPS_INPUT")) == 1 and theirs.heard("GPS_INPUT") == []
 
 
+def test_one_that_the_configuration_does_not_name_is_not_taken_over(tmp_path: Path) -> None:
+    keeper = AutopilotKeeper(tmp_path / "link.kept")
+    keeper.heard(ArmedAutopilot(7, 3, 1))
+    config = LinkSection(autopilot_sysid=9)
+    edge = MavlinkEdge(config, MemoryWire(), lambda: 0, keeper=AutopilotKeeper(tmp_path / "link.kept"))
+    assert not [x for x in edge.poll(S) if isinstance(x, m.LinkStatus)][-1].connected
+
+
 # --- forgers ---
 
 
+def test_the_clock_of_another_component_is_not_the_autopilots() -> None:
+    wire, offsets = MemoryWire(), []
+    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
+    for begin_ns, sender in ((10 * S, 191), (20 * S, 1)):
+        mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=sender)
+        beat = packed(heartbeat(), mavlink.MAVLink(None, srcSystem=7, srcComponent=1))
+        said: list[m.Message] = []
+        for i in range(20):
+            wire.arrive(*(packed(mavlink.MAVLink_timesync_message(99 * S, t.ts1), mav) for t in wire.take("TIMESYNC")))
+            wire.arrive(*([beat] if i == 0 else []))
+            said += edge.poll(begin_ns + i * 100 * MS)
+        offsets.append([x for x in said if isinstance(x, m.LinkStatus)][-1].time_offset_ms)
+    assert offsets[0] is None and offsets[1] is not None
+
+
+def test_half_a_packet_of_one_sender_swallows_none_of_another(port: Port, ours: Speaker, theirs: Speaker) -> None:
+    theirs.socket.sendto(b"\xfd\xff" + bytes(40), port.address)
+    said = port.hears(1 * S, ours, heartbeat(), attitude(1000))
+    assert len(states(said)) == 1
+
+
+def test_bytes_that_are_no_packet_are_counted(port: Port, ours: Speaker) -> None:
+    ours.socket.sendto(b"garbage", port.address)
+    port.hears(1 * S, ours, heartbeat())
+    assert [x for x in port.said if isinstance(x, m.LinkStatus)][-1].bad == len(b"garbage")
+
+
+def test_of_many_senders_the_last_eight_are_answered(port: Port) -> None:
+    with ExitStack() as stack:
+        speakers = [stack.enter_context(Speaker(255, 190)) for _ in range(PEERS_MAX + 2)]
+        for i, speaker in enumerate(speakers):
+            port.hears(S + i * MS, speaker, station_heartbeat())
+        for speaker in speakers:
+            speaker.heard()
+        port.edge.heard(m.StatusText(t_ns=0, severity=4, text="Terrafix: a word"))
+        heard = [len(speaker.heard("STATUSTEXT")) for speaker in speakers]
+    assert heard == [0, 0] + [1] * PEERS_MAX
+    assert len(port.edge._connection._framers) == PEERS_MAX
+
+
+def test_who_asks_for_our_time_alone_is_told(port: Port, ours: Speaker) -> None:
+    port.hears(1 * S, ours, heartbeat())
+    with Speaker(255, 190) as station:
+        ours.heard()
+        port.hears(1100 * MS, station, mavlink.MAVLink_timesync_message(0, 777))
+        assert [t.ts1 for t in station.heard("TIMESYNC")] == [777]
+    assert 777 not in [t.ts1 for t in ours.heard("TIMESYNC")]
+
+
 def test_a_second_sender_with_our_autopilots_id_is_not_heard_and_gets_nothing(port: Port, ours: Speaker) -> None:
-    port.hears(1 * S, ours, heartbeat(), attitude(1000, yaw=1.0))
+    port.hears(101 * S, ours, heartbeat(), attitude(1000, yaw=1.0))
     ours.heard()
     with Speaker(7) as forger:
-        said = port.hears(1100 * MS, forger, attitude(1100, yaw=2.0), heartbeat(), station_heartbeat(), ORIGIN_HERE)
+        said = port.hears(101_100 * MS, forger, attitude(1100, yaw=2.0), heartbeat(), station_heartbeat(), ORIGIN_HERE)
         port.edge.heard(GPS)
         assert states(said) == [] and hints(said) == []
         assert forger.kinds() == set()
-    assert states(port.hears(1200 * MS, ours, attitude(1200, yaw=1.0)))
+    assert states(port.hears(101_200 * MS, ours, attitude(1200, yaw=1.0)))
     assert port.texts() == ["Terrafix: a second sender is system 7, ignored"]
     (verdict, *_) = [x for x in port.said if isinstance(x, m.MeasurementVerdict)]
     assert (verdict.measurement, verdict.verdict) == ("telemetry", m.Verdict.IMPLAUSIBLE)
     assert f"127.0.0.1:{forger.address[1]}" in verdict.detail
-    port.hears(2 * S, ours, heartbeat())
+    port.hears(103 * S, ours, heartbeat())
     assert f"a second sender of system 7 at 127.0.0.1:{forger.address[1]} is ignored" in port.detail()
 
 

@@ -183,6 +183,13 @@ def test_below_the_stated_threshold_a_tilt_is_taken() -> None:
     assert all(checked([(t, 0.8 * JUMP_RAD * (i % 2)) for i, t in enumerate(at_25_hz(2.0))]))
 
 
+def test_a_tenth_of_what_was_turned_is_allowed_for() -> None:
+    assert checked([(0.0, 0.0), (0.9, 3.0 * 0.9 * 1.08)], rate=3.0) == [True, True]
+    assert checked([(0.0, 0.0), (0.9, 3.0 * 0.9 * 1.20)], rate=3.0) == [True, False]
+    assert checked([(0.0, 0.0), (0.1, 3.0 * 0.1 * 1.7)], own=3.0, readings=False) == [True, True]
+    assert checked([(0.0, 0.0), (0.1, 3.0 * 0.1 * 2.2)], own=3.0, readings=False) == [True, False]
+
+
 def test_rates_that_a_forger_writes_into_its_attitude_count_for_nothing_beside_gyroscopes() -> None:
     rolls = [pair for t in at_25_hz(2.0) for pair in ((t, 0.0), (t + 0.02, 0.5))]
     assert checked(rolls, own=25.0) == [True, False] * 50
@@ -274,6 +281,14 @@ def test_a_forged_tilt_whose_numbers_fit_is_refused_by_the_gyroscopes() -> None:
     assert {state.roll_rad for state in states(wire.said)} == {0.0}
     assert {verdict.detail.split(":")[0] for verdict in wire.verdicts()} == {"attitude"}
     assert wire.texts() == ["Terrafix: attitude jumps without gyros, ignored"]
+
+
+def test_an_attitude_that_is_no_number_opens_no_gate() -> None:
+    wire = Wire()
+    wire.forger = wire.true
+    wire.run(2.0)
+    wire.run(2.0, lambda boot_ms: attitude(boot_ms, math.nan if boot_ms % 40 else 0.4))
+    assert {state.roll_rad for state in states(wire.said)} == {0.0}
 
 
 def test_a_forged_height_from_another_boot_is_refused_by_its_time() -> None:
