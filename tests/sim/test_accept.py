@@ -57,6 +57,7 @@ def test_a_map_that_lies_is_made_flown_and_judged_by_the_rows_of_lies(tmp_path: 
     (result,) = table["results"]
     assert result["frames"] == 90 and result["nees"] == []  # no frame has true inputs
     rows = {row["what"]: row for row in table["rows"]}
-    assert rows["frames within 20 m, shown only"]["measured"] < 0.1  # the map is really off
+    # The map is really off: only what the start carries is near.
+    assert rows["frames within 20 m, shown only"]["measured"] < 0.3
     assert rows["false fixes later than 3 s and 5 frames into the lie"]["measured"] == 0.0
     assert done.returncode == (1 if table["broken"] else 0), done.stderr
