@@ -78,6 +78,28 @@ def test_a_place_that_is_found_and_still_tested_claims_the_doubt_of_it_until_the
     assert sigma_m(run.estimate(42)) < 15.0
 
 
+@pytest.mark.parametrize(
+    ("offset_m", "start_sigma_m", "said"), [(700.0, 15.0, True), (20.0, 15.0, False), (700.0, 5000.0, False)]
+)
+def test_a_map_that_contradicts_the_start_is_on_record(offset_m: float, start_sigma_m: float, said: bool) -> None:
+    flight, run = Flight(6, seed=3), Listener()
+    run.hear([msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m)])
+    for i in range(5):
+        run.hear(with_map(flight, i, lost(flight.fix(i))))
+    run.hear(with_map(flight, 5, msgspec.structs.replace(flight.fix(5, (offset_m, 0.0)), found=True)))
+    verdicts = run.verdicts("start")
+    assert list(verdicts) == ([5] if said else [])
+    if said:
+        assert verdicts[5].verdict is Verdict.INNOVATION and "start and map are 7" in verdicts[5].detail
+
+
+def test_a_place_that_is_found_again_later_says_nothing_of_the_start() -> None:
+    flight = Flight(60, seed=3, dem=True)
+    run = flown_wrong(flight)
+    run.hear(with_map(flight, 40, msgspec.structs.replace(flight.fix(40, WRONG_M), found=True)))
+    assert run.verdicts("start") == {}
+
+
 def test_the_same_fix_without_a_search_behind_it_is_refused() -> None:
     flight = Flight(60, seed=3)
     run = flown_wrong(flight)

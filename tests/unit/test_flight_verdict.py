@@ -37,10 +37,15 @@ def fault(quantity: str, *, active: bool = True, factor: float | None = None) ->
 
 
 def test_a_flight_on_the_map_is_trusted() -> None:
-    said = flight_verdict(rows(), (), {"accepted": 60})
+    said = flight_verdict(rows(), (), {"map": {"accepted": 60}})
     assert (said.word, said.spans, said.reasons) == ("trust it", [(0.0, 59.0)], [])
     assert said.text() == "Trust it."
     assert said.as_json()["verdict"] == "trust it" and said.as_json()["trusted_s"] == [[0.0, 59.0]]
+
+
+def test_a_start_that_the_map_contradicts_leaves_the_choice_to_a_person() -> None:
+    said = flight_verdict(rows(), (), {"map": {"accepted": 60}, "start": {"innovation": 1}})
+    assert said.word == "do not trust it" and "start and map contradict each other" in said.text()
 
 
 def test_spans_without_a_sure_position_are_left_out_and_named() -> None:
@@ -92,9 +97,9 @@ def test_a_map_that_is_found_nowhere_counts_from_the_last_match_on() -> None:
 
 
 def test_an_estimate_that_refuses_most_positions_on_the_map_is_not_trusted() -> None:
-    assert flight_verdict(rows(), (), {"accepted": 4, "innovation": 5}).word == "do not trust it"
-    assert flight_verdict(rows(), (), {"accepted": 5, "innovation": 5}).word == "trust it"
-    assert flight_verdict(rows(), (), {"accepted": 0, "innovation": 7}).word == "trust it"  # too few to tell
+    assert flight_verdict(rows(), (), {"map": {"accepted": 4, "innovation": 5}}).word == "do not trust it"
+    assert flight_verdict(rows(), (), {"map": {"accepted": 5, "innovation": 5}}).word == "trust it"
+    assert flight_verdict(rows(), (), {"map": {"accepted": 0, "innovation": 7}}).word == "trust it"  # too few to tell
 
 
 def test_no_frames_are_nothing_to_trust() -> None:

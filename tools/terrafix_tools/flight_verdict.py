@@ -1,7 +1,8 @@
 """The verdict on a whole flight, judged without truth: trust it, from t1 to t2, or do not, and why."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -16,6 +17,8 @@ from terrafix_tools.estimates import NS, Row, RowTable
 UNCONFIRMED_S = LADDER[1][0]  # a flight may last so long on its start coordinate before a map match confirms it
 UNANCHORED_S = LADDER[-1][0]  # ... and so long without one later on
 REFUSED_SHARE, LEAST_POSES = 0.5, 8  # of the poses on the map, refused by the estimate: one of the two is wrong
+# Nothing on board tells which of the two.
+START_OFF = "start and map contradict each other: one of them is in the wrong place"
 SHOWN_SPANS = 3
 
 
@@ -58,10 +61,10 @@ class FlightVerdict:
 def flight_verdict(
     rows: Sequence[Row],
     faults: Iterable[tuple[float, CalibrationFault]] = (),
-    map_verdicts: dict[str, int] | None = None,
+    verdicts: Mapping[str, Mapping[str, int]] | None = None,
 ) -> FlightVerdict:
-    """``faults`` with their times in seconds, as the rows have theirs; ``map_verdicts``: how often the estimator
-    answered each of the map matches."""
+    """``faults`` with their times in seconds, as the rows have theirs; ``verdicts``: how often each measurement ("map",
+    "start") got each verdict."""
     ordered = sorted(faults, key=lambda fault: fault[0])
     active: dict[str, tuple[float, CalibrationFault]] = {}
     wrong: list[tuple[float, float, str]] = []
@@ -72,7 +75,8 @@ def flight_verdict(
             began_s, first = active.pop(fault.quantity)
             wrong.append((_since(began_s, first, rows), t_s, _named(first)))
     wrong += [(_since(t_s, fault, rows), math.inf, _named(fault)) for t_s, fault in active.values()]
-    refused = _refused(map_verdicts or {})
+    answers = verdicts or {}
+    refused = START_OFF if answers.get("start") else _refused(answers.get("map", {}))
     begins_s = rows[0].t_s if rows else 0.0
     why = [refused or _why_not(row, begins_s, wrong) for row in rows]
     spans = []
@@ -91,14 +95,14 @@ def verdict_of(folder: Path) -> FlightVerdict:
     """Of the record in a folder. Raises SourceError when there is none."""
     table = RowTable()
     faults: list[tuple[float, CalibrationFault]] = []
-    answers: dict[str, int] = {}
+    verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for _, _, message in read_flight(folder):
         table.take(message)
         if isinstance(message, CalibrationFault):
             faults.append((message.t_ns / NS, message))
-        elif isinstance(message, MeasurementVerdict) and message.measurement == "map":
-            answers[str(message.verdict)] = answers.get(str(message.verdict), 0) + 1
-    return flight_verdict(list(table.rows.values()), faults, answers)
+        elif isinstance(message, MeasurementVerdict):
+            verdicts[message.measurement][str(message.verdict)] += 1
+    return flight_verdict(list(table.rows.values()), faults, verdicts)
 
 
 def _why_not(row: Row, begins_s: float, wrong: list[tuple[float, float, str]]) -> str:
@@ -125,7 +129,7 @@ def _since(alarm_s: float, fault: CalibrationFault, rows: Sequence[Row]) -> floa
     return max(anchored, default=-math.inf) + 1e-9
 
 
-def _refused(answers: dict[str, int]) -> str:
+def _refused(answers: Mapping[str, int]) -> str:
     refused, taken = answers.get(Verdict.INNOVATION, 0), answers.get(Verdict.ACCEPTED, 0)
     if refused + taken < LEAST_POSES or refused <= REFUSED_SHARE * (refused + taken):
         return ""

@@ -96,7 +96,7 @@ class ReplayOutput:
             "odometry_frames": sum(self._registered.values()),
             "verdicts": {what: dict(sorted(c.items())) for what, c in sorted(self._verdicts.items())},
             "lens": lens_words(self._origin.camera, self._learnt) if self._origin and self._learnt else None,
-            "verdict": flight_verdict(rows, self._faults, self._verdicts.get("map")).as_json(),
+            "verdict": flight_verdict(rows, self._faults, self._verdicts).as_json(),
             "matcher_verdicts": dict(sorted(self._matcher.items())),
             "frame_ms_median": round(float(np.median(times_ms)), 1) if times_ms else None,
             "frame_ms_p95": round(float(np.percentile(times_ms, 95)), 1) if times_ms else None,

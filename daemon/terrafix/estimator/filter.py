@@ -11,6 +11,7 @@ import numpy as np
 
 from terrafix.core.gate import GATE
 from terrafix.core.pose import tangent_to_world
+from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.factors import HEIGHT
 from terrafix.estimator.graph import NodeState
@@ -42,6 +43,7 @@ class FixResult:
     verdict: Verdict
     mahalanobis2: float | None
     detail: str = ""
+    start_off: str = ""  # the map contradicts the start coordinate, which no match had borne out; empty: it does not
 
 
 class Estimator(Tracker):
@@ -189,7 +191,8 @@ class Estimator(Tracker):
         what the graph has of the way to the newest frame."""
         was, now = self.graph.state(node), self.graph.state(self.graph.newest)
         fixed_s, now_s = self.graph.time_of(node), self.graph.time_of(self.graph.newest)
-        offset = (measured.translation() - was.pose.translation())[:2]
+        offset, apart = _offset(was.pose, self._covariance(node), measured, cov)
+        start_off = self._start_off(offset, apart)
         onward = was.pose.between(now.pose)
         moved = onward.inverse().AdjointMap()
         cov = RESTART_INFLATION * moved @ cov @ moved.T
@@ -213,7 +216,15 @@ class Estimator(Tracker):
         self.hypotheses.moved(match.lost_sigma_m)
         self._seen = SeenGround()
         self._accepted(match, fixed_s, measured.translation()[:2])
-        return FixResult(Verdict.ACCEPTED, None, f"{how} {float(np.hypot(*offset)):.0f} m away")
+        return FixResult(Verdict.ACCEPTED, None, f"{how} {float(np.hypot(*offset)):.0f} m away", start_off)
+
+    def _start_off(self, offset: np.ndarray, apart_m2: np.ndarray) -> str:
+        """``offset`` (2,): from where a flight that no match has placed was to where the first ones place it;
+        ``apart_m2`` (2, 2): what both claim of it. Nothing on board tells which of the two is in the wrong place."""
+        searched = self.origin.start_sigma_m > SEARCHED_START_M
+        if self.last_fix_s is not None or searched or float(offset @ np.linalg.solve(apart_m2, offset)) <= GATE[2]:
+            return ""
+        return f"start and map are {float(np.hypot(*offset)):.0f} m apart: one of them is wrong"
 
     def refine(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """frame -> position (3,) and its covariance (3x3), by all that was measured in the flight, after landing."""

@@ -263,6 +263,14 @@ class EstimatorNode:
             detail=result.detail,
             mahalanobis2=result.mahalanobis2,
         )
+        if result.start_off:
+            yield MeasurementVerdict(
+                t_ns=match.t_ns,
+                frame_id=match.frame_id,
+                measurement="start",
+                verdict=Verdict.INNOVATION,
+                detail=result.start_off,
+            )
         if self._monitors is not None:
             self._monitors.matched(match, self._telemetry, accepted=result.verdict is Verdict.ACCEPTED)
             yield from self._monitors.changes(match.t_ns)

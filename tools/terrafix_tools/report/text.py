@@ -97,7 +97,7 @@ def moments(view: FlightView) -> list[tuple[float | None, str]]:
     said: list[tuple[float | None, str]] = []
     said += _positions(view) + _anchors(view) + _errors(view) + _gps(view)
     said += [(t_s, f"{fault_words(fault).capitalize()}: {fault.detail}.") for t_s, fault in view.faults]
-    said.append((None, f"Verdict: {flight_verdict(view.rows, view.faults, view.verdicts.get('map')).text()}"))
+    said.append((None, f"Verdict: {flight_verdict(view.rows, view.faults, view.verdicts).text()}"))
     lens = lens_words(view.origin.camera, view.learnt) if view.origin and view.learnt else None
     if lens is not None:
         said.append((None, lens))
