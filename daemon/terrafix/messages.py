@@ -389,7 +389,8 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
     """What was done with one measurement (law: every measurement gets one)."""
 
     frame_id: int  # -1: of no frame
-    # "odometry", "map", "attitude", "height", "start", "reset" (of the graph); of the link "estimate", "telemetry", "wall clock"
+    # "odometry", "map", "attitude", "height", "start", "reset" (of the graph); of the link "estimate", "telemetry",
+    # "wall clock"
     measurement: str
     verdict: Verdict
     detail: str = ""
