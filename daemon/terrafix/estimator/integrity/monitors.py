@@ -9,6 +9,7 @@ from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_from_quat, yaw_of
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.integrity.inertial import MOUNT_YAWS_DEG, InertialMonitor
+from terrafix.estimator.integrity.levelling import LevellingMonitor
 from terrafix.estimator.integrity.matched import SCATTER, OffsetMonitor, told_over_seen
 from terrafix.estimator.integrity.registration import Registration
 from terrafix.estimator.integrity.sighting import sighting
@@ -40,6 +41,7 @@ class Monitors:
         self._mounts = [exp_so3(np.array([0.0, 0.0, math.radians(deg)])) @ self._r_b_c for deg in MOUNT_YAWS_DEG]
         self._inertial = InertialMonitor()
         self._turns = TurnMonitor(math.radians(origin.yaw_sigma_deg))
+        self._levelling = LevellingMonitor()
         self._registration = Registration()
         heading = math.hypot(HEADING_RAD, math.radians(origin.yaw_sigma_deg))
         self._heading = OffsetMonitor(heading, YAW_SCATTER_RAD)
@@ -70,6 +72,8 @@ class Monitors:
         if odometry.t_ns * 1e-9 - self._turned_s >= SPACING_S:
             self._turned_s = odometry.t_ns * 1e-9
             self._turns.add(seen.said_rad, seen.turned_rad)
+            span_s = began_ns * 1e-9, odometry.t_ns * 1e-9
+            self._levelling.add(np.array(odometry.pairs), before, now, self._r_b_c, span_s)
         if now.agl_m is None:
             return
         mounted = [sighting(np.array(odometry.pairs), before, now, r_b_c) for r_b_c in self._mounts]
@@ -130,6 +134,8 @@ class Monitors:
             )
         if self._turns.mirrored:
             found["mirrored picture"] = Finding(None, "pictures turn the other way than the attitude")
+        if self._levelling.fault:
+            found["attitude"] = Finding(None, f"{self._levelling.fault}: pictures that it levels jump")
         if self._height is not None and self._height.active:
             found["scale"] = Finding(math.exp(self._height.mean), "told heights against poses on the map")
         if self._heading.active:
