@@ -120,7 +120,7 @@ def write_track(folder: Path, place: Callable[[float], tuple[float, float]]) -> 
     with (folder / "track.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(TRACK_COLUMNS)
-        for t_s in np.arange(0.0, 40.0, 0.2).tolist():
+        for t_s in np.arange(0.0, 70.0, 0.2).tolist():
             e_m, n_m = place(t_s)
             writer.writerow([t_s, e_m, n_m, 100.0, 100.0, "", "", ""])
 
@@ -135,7 +135,7 @@ def gps_input(t_s: float, e_m: float, n_m: float, fix_type: int = 3) -> GpsInput
 
 
 def test_gps_input_is_compared_with_the_true_place_and_the_vehicle_with_the_way_without_the_lie(tmp_path: Path) -> None:
-    """North at 20 m/s, a second behind the flight without the lie, and 30 m east of it; that turns back at 35 s."""
+    """North at 20 m/s, a second behind the flight without the lie, and 30 m east of it; that stops at 20 s."""
     write_track(tmp_path / "way", lambda t_s: (0.0, 20.0 * t_s if t_s < 20.0 else 400.0))
     write_track(tmp_path, lambda t_s: (30.0, 20.0 * (t_s - 1.0)))
     writer = FlightWriter(tmp_path / "flight.mcap", header(Config()))
@@ -149,11 +149,12 @@ def test_gps_input_is_compared_with_the_true_place_and_the_vehicle_with_the_way_
     assert (second.error_m, second.reason) == (None, "dark")
 
 
-def test_another_leg_over_the_same_ground_is_not_the_way(tmp_path: Path) -> None:
+@pytest.mark.parametrize("now_s", [10.0, 50.0])
+def test_another_leg_over_the_same_ground_is_not_the_way(now_s: float, tmp_path: Path) -> None:
     write_track(tmp_path / "way", lambda t_s: (0.0, 20.0 * t_s))
-    write_track(tmp_path, lambda _: (0.0, 600.0))  # where the way leads 20 s later
+    write_track(tmp_path, lambda _: (0.0, 600.0))  # where the way leads 20 s later, or has led 20 s before
     writer = FlightWriter(tmp_path / "flight.mcap", header(Config()))
-    writer.write(gps_input(10.0, 0.0, 600.0), 0)
+    writer.write(gps_input(now_s, 0.0, 600.0), 0)
     writer.close()
     assert sent_fixes(tmp_path, tmp_path / "way", PLACE)[0].aside_m == pytest.approx(200.0, abs=0.5)
 
