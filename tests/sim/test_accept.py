@@ -11,6 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from terrafix_tools.accept.fly import Job, fly
+from terrafix_tools.accept.generated import make
+from terrafix_tools.accept.judged import JudgedRow, Verdict
+
 COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "accept"]
 SCENARIOS = ("baseline", "foreign frame", "350 m outlier fix")
 
@@ -61,3 +65,21 @@ def test_a_map_that_lies_is_made_flown_and_judged_by_the_rows_of_lies(tmp_path: 
     assert rows["frames within 20 m, shown only"]["measured"] < 0.3
     assert rows["false fixes later than 3 s and 5 frames into the lie"]["measured"] == 0.0
     assert done.returncode == (1 if table["broken"] else 0), done.stderr
+
+
+@pytest.mark.slow
+def test_a_camera_that_freezes_while_gnss_is_jammed_takes_the_aircraft_not_aside(tmp_path: Path) -> None:
+    ground, out = tmp_path / "ground", tmp_path / "out"
+    make("base", ground, seed=1, frames=4)  # of its flight nothing is used
+    job = Job(
+        scenario="GNSS jam, frozen picture", flight="", truth="", map=str(ground / "map.tif"), out=str(out), seed=1,
+        generated=True)  # fmt: skip
+    rows: dict[str, JudgedRow] = {row.what: row for row in fly(job).rows}
+    aside = rows["aside of the way without the lie while a 3D fix is sent, worst"]
+    assert aside.verdict is Verdict.PASS and aside.measured is not None and aside.measured > 0.1
+    assert rows["false GPS_INPUT later than 3 s and 5 frames into the lie"].measured == 0.0
+    assert rows["fail-safes of the autopilot"].measured == 0.0
+    # It flew on GPS_INPUT: GNSS was gone, and its dead reckoning alone would not have been served.
+    peer = json.loads((out / "peer.json").read_text(encoding="utf-8"))
+    assert peer["accepted"] > 100
+    assert (out / "without-lie" / "track.csv").is_file()

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from terrafix_tools.accept import integrity
+from terrafix_tools.accept import integrity, loop_integrity
 from terrafix_tools.accept import measures as of
 from terrafix_tools.accept.evidence import Evidence
 from terrafix_tools.accept.judged import Bounds, JudgedRow, Measured, Verdict
@@ -78,6 +78,16 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "right at the end": (
         "AC-15", "frames within 50 m in the last tenth", "%", _least(0.80), None, integrity.right_at_the_end),
     "claim width": ("AC-13", "claimed 1-sigma over that of the error", "", None, None, integrity.claim_width),
+    "aside on a fix": (
+        "ON-6", "aside of the way without the lie while a 3D fix is sent, worst", "m", _most(50.0), None,
+        loop_integrity.aside_on_a_fix_m),
+    "aside at withdrawal": (
+        "ON-6", "aside when the 3D fix is withdrawn", "m", None, None, loop_integrity.aside_at_withdrawal_m),
+    "late lies sent": (
+        "AC-13", "false GPS_INPUT later than 3 s and 5 frames into the lie", "", _most(0.0), None,
+        loop_integrity.late_lies_sent),
+    "lies sent": ("AC-13", "false GPS_INPUT in all", "", None, None, loop_integrity.lies_sent),
+    "fix again": ("AC-15", "3D fix and right again after the lie", "s", _most(5.0), None, loop_integrity.fix_again_s),
     "mode": ("ON-2", "frames with the covariance mode that heat asks for", "%", ALL, None, of.right_mode),
 }  # fmt: skip
 CRITERIA = {name: Criterion(*row, elsewhere=AT_ONCE if name == "latency" else "") for name, row in _ROWS.items()}
@@ -85,6 +95,10 @@ CRITERIA = {name: Criterion(*row, elsewhere=AT_ONCE if name == "latency" else ""
 # A lie that lasts to the end of the flight, and one that ends before.
 LASTING = ("late false fixes", "false fixes in all", "time to notice", "longest false run", "near at all", "claims")
 PASSING = (*LASTING, "recovery", "right at the end", "claim width")
+LYING_IN_THE_LOOP = (
+    "aside on a fix", "aside at withdrawal", "late lies sent", "lies sent", "fix again", "recovery",
+    "late false fixes", "false fixes in all", "right at the end", "claims", "vehicle error", "failsafes",
+)  # fmt: skip
 EVERYWHERE = ("within 50 m", "within 20 m", "not localised", "both estimates", "claims", "coverage", "false fixes")
 
 

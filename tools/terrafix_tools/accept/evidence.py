@@ -53,6 +53,17 @@ class Seen:
         return self.map_verdict is Verdict.ACCEPTED
 
 
+@dataclass(frozen=True)
+class SentFix:
+    """One GPS_INPUT of a closed loop, beside what was true at its time."""
+
+    t_s: float  # of the flight
+    error_m: float | None  # horizontal; None: it has no 3D fix
+    accuracy_m: float  # 1-sigma that it claims
+    aside_m: float  # of the vehicle: its distance from the way that it flies without the lie
+    reason: str = ""  # why it has no fix
+
+
 @dataclass
 class Evidence:
     origin: Origin
@@ -64,6 +75,7 @@ class Evidence:
     start_up_s: float  # from the start of the program to its first frame
     peer: dict[str, Any]  # peer.json of a closed loop; empty for a replay
     searches: list[SearchState] = field(default_factory=list)  # changes of the search, in order
+    sent: list[SentFix] = field(default_factory=list)  # of a closed loop with a lie in it; empty otherwise
 
     @property
     def span_s(self) -> float:

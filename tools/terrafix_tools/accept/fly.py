@@ -26,8 +26,8 @@ from terrafix_tools.accept.faults import AlteredSource, ThereAndBack, same_origi
 from terrafix_tools.accept.flight import Flight, open_flight
 from terrafix_tools.accept.integrity import claim_width, in_lie
 from terrafix_tools.accept.judged import JudgedRow, Span
-from terrafix_tools.accept.plan import Plan, Scenario
-from terrafix_tools.accept.scenarios import BY_NAME, CLOSED_LOOP, LONG_FRAMES
+from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
+from terrafix_tools.accept.scenarios import BY_NAME, LONG_FRAMES
 from terrafix_tools.bench.flights import program_age_s
 from terrafix_tools.mapping.build import build, ensure_package
 from terrafix_tools.replay import map_cache_dir, replay

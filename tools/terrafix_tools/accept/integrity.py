@@ -28,7 +28,7 @@ def late_sure_over_20m(e: Evidence) -> Measured:
 
 
 def false_fixes_in_all(e: Evidence) -> Measured:
-    lie = _lie(e)
+    lie = lie_of(e)
     wrong = [f for f in e.frames if is_false(f)]
     during = sum(lie.has(f.t_s) for f in wrong)
     before = sum(f.t_s < lie.from_s for f in wrong)
@@ -38,11 +38,11 @@ def false_fixes_in_all(e: Evidence) -> Measured:
 
 def time_to_notice_s(e: Evidence) -> Measured:
     """From the beginning of the lie to the last false fix; zero when there is none."""
-    since = [f for f in e.frames if f.t_s >= _lie(e).from_s]
+    since = [f for f in e.frames if f.t_s >= lie_of(e).from_s]
     wrong = [number for number, f in enumerate(since, start=1) if is_false(f)]
     if not wrong:
         return Measured(0.0, "no false fix")
-    return Measured(since[wrong[-1] - 1].t_s - _lie(e).from_s, f"{wrong[-1]} frames")
+    return Measured(since[wrong[-1] - 1].t_s - lie_of(e).from_s, f"{wrong[-1]} frames")
 
 
 def longest_false_run(e: Evidence) -> Measured:
@@ -56,13 +56,13 @@ def longest_false_run(e: Evidence) -> Measured:
 
 def recovery_frames(e: Evidence) -> Measured:
     """Frames after the end of the lie until within 20 m and not false, for three in a row; that frame counts."""
-    after = [f for f in e.frames if f.compared and f.t_s > _lie(e).to_s]
+    after = [f for f in e.frames if f.compared and f.t_s > lie_of(e).to_s]
     if len(after) < RECOVERED_FRAMES:
         return Measured(None, "the flight ends with the lie")
     right = [_right(f) for f in after]
     for number in range(len(after) - RECOVERED_FRAMES + 1):
         if all(right[number : number + RECOVERED_FRAMES]):
-            return Measured(float(number + 1), f"{after[number].t_s - _lie(e).to_s:.1f} s")
+            return Measured(float(number + 1), f"{after[number].t_s - lie_of(e).to_s:.1f} s")
     return Measured(None, f"not in the {len(after)} frames that follow", Verdict.BELOW)
 
 
@@ -70,7 +70,7 @@ def right_at_the_end(e: Evidence) -> Measured:
     """Share within 50 m of the last tenth of the frames, when inputs are true there."""
     known = [f for f in e.frames if f.compared]
     last = known[-max(1, round(LAST_SHARE * len(known))) :]
-    if any(_lie(e).has(f.t_s) for f in last):
+    if any(lie_of(e).has(f.t_s) for f in last):
         return Measured(None, "the lie lasts to the end")
     near = [f.error_m is not None and f.error_m <= FALSE_FIX_ERROR_M for f in last]
     return Measured(sum(near) / len(near), f"{len(last)} frames")
@@ -105,7 +105,7 @@ def in_lie(e: Evidence, frame: Seen) -> bool:
 
 
 def _late(e: Evidence, beyond_m: float) -> Measured:
-    lie = _lie(e)
+    lie = lie_of(e)
     since = [f for f in e.frames if f.t_s >= lie.from_s]
     allowed = {
         id(f) for n, f in enumerate(since) if lie.has(f.t_s) and (n < ALLOWED_FRAMES or f.t_s <= lie.from_s + ALLOWED_S)
@@ -120,7 +120,7 @@ def _right(frame: Seen) -> bool:
     return frame.error_m is not None and frame.error_m <= RECOVERED_M and not is_false(frame)
 
 
-def _lie(e: Evidence) -> Span:
+def lie_of(e: Evidence) -> Span:
     """Without a lie: the marked time, or the very beginning."""
     if e.marks.lie is not None:
         return e.marks.lie

@@ -7,11 +7,12 @@ from functools import partial
 from terrafix_tools.accept import faults
 from terrafix_tools.accept import lying_inputs as lying
 from terrafix_tools.accept import lying_plans as plans
-from terrafix_tools.accept.criteria import EVERYWHERE, LASTING, PASSING
+from terrafix_tools.accept.criteria import EVERYWHERE, LASTING, LYING_IN_THE_LOOP, PASSING
 from terrafix_tools.accept.lying_plans import SEED, START_CLAIM_M
-from terrafix_tools.accept.plan import Scenario
+from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
 
 FRAMES = 90  # of a generated flight: 45 s
+LOOP_FRAMES = 200  # 100 s: GNSS for 40 s, jammed for 20 s, the lie for 15 s, and 25 s to recover
 FROZEN_S, FORGED_S, LATE_S = 15.0, 10.0, 1.0
 BUFFERS = 4
 HALF_SPEED = 0.5
@@ -25,6 +26,12 @@ HEIGHTS = (
     ("height 30 % high", "The reported height is 30 % too large, and stated as good.", 1.3),
     ("height in feet", "The reported height is in feet where metres are expected.", lying.FEET_IN_A_METRE),
     ("height taken for feet", "The reported height was divided by 3.28 once too often.", 1.0 / lying.FEET_IN_A_METRE),
+)
+IN_THE_LOOP: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    ("GNSS jam, frozen picture", "one picture again and again, with new noise", ()),
+    ("GNSS jam, four stale buffers", "four pictures in turn", ()),
+    ("GNSS jam, foreign frames", "pictures of another place that agree with each other", ()),
+    ("GNSS jam, late pictures", "pictures that are a second old", ("late sure over 20 m",)),
 )
 LIES: tuple[Scenario, ...] = (
     _scenario("ten foreign frames", "Ten frames in a row show another place.", PASSING, plans.foreign_row),
@@ -206,5 +213,16 @@ LIES: tuple[Scenario, ...] = (
         "No start is known.",
         (*SCARCE, "first position"),
         plans.true_inputs(origin=lying.start_unknown),
+    ),
+    *(
+        Scenario(
+            name,
+            f"In flight, with nothing but Terrafix, for 15 s: {text}. Closed loop.",
+            (*LYING_IN_THE_LOOP, *more),
+            lambda _: Plan(),
+            ground=CLOSED_LOOP,
+            frames=LOOP_FRAMES,
+        )
+        for name, text, more in IN_THE_LOOP
     ),
 )

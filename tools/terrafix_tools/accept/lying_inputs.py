@@ -7,7 +7,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, tee
 
 import cv2
 import msgspec
@@ -92,6 +92,17 @@ def late_pictures(lag_s: float) -> Edit:
             yield replace(shot, image=held[0][1])
 
     return edit
+
+
+def during(span: Span, edit: Edit) -> Edit:
+    """``edit``, which has one shot out for each shot in, sees the whole flight and counts in ``span`` only."""
+
+    def edited(shots: Iterator[Shot]) -> Iterator[Shot]:
+        true, seen = tee(shots)
+        for shot, changed in zip(true, edit(seen), strict=True):
+            yield changed if span.has(shot.frame.t_ns / 1e9) else shot
+
+    return edited
 
 
 def slow_pictures(span: Span, speed: float) -> Edit:

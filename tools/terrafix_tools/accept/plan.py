@@ -10,6 +10,8 @@ from terrafix_tools.accept.flight import Flight
 from terrafix_tools.accept.judged import Marks
 from terrafix_tools.replay import MakeNodes, make_nodes
 
+CLOSED_LOOP = "closed loop"  # ground of a scenario in which an aircraft steers by the estimate; over the base ground
+
 
 @dataclass(frozen=True)
 class Plan:

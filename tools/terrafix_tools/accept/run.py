@@ -15,17 +15,23 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from terrafix.core.errors import MapError, OutputError, TerrafixError, UsageError
 from terrafix.vision.sources import open_source
 from terrafix_tools.accept import fly
+from terrafix_tools.accept.closed_lies import LIES_IN_THE_LOOP
 from terrafix_tools.accept.criteria import failed, unmeasured
 from terrafix_tools.accept.fly import RESULT, Job, Result
 from terrafix_tools.accept.judged import BROKEN, shown
 from terrafix_tools.accept.lies import LIES
-from terrafix_tools.accept.plan import Scenario
-from terrafix_tools.accept.scenarios import BY_NAME, CLOSED_LOOP, SCENARIOS
+from terrafix_tools.accept.plan import CLOSED_LOOP, Scenario
+from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
 from terrafix_tools.accept.table import Acceptance, conclude, write
 
 JOB, GROUND_JOB, CRASH = "job.json", "ground.json", "crash.txt"
 QUICK_FRAMES = 120
-QUICK_LEAVES_OUT = ("long route", "60 s blackout", "slow spoof")  # they are long, or they are nothing
+QUICK_LEAVES_OUT = (
+    "long route",
+    "60 s blackout",
+    "slow spoof",
+    *LIES_IN_THE_LOOP,
+)  # they are long, or they are nothing
 AT_ONCE = 2  # scenarios, when nobody says how many: each keeps about one core busy
 LOOK_S = 2.0  # how often the line that names the running ones is looked after
 _MISTAKES = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}

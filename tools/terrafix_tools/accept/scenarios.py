@@ -12,7 +12,7 @@ from terrafix_tools.accept.fault_nodes import FrameNames, HotComputer, WrongFixe
 from terrafix_tools.accept.flight import Flight
 from terrafix_tools.accept.judged import Marks, Span
 from terrafix_tools.accept.lies import LIES
-from terrafix_tools.accept.plan import Plan, Scenario
+from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
 from terrafix_tools.accept.stale_map import REACH, stale_along
 from terrafix_tools.replay import make_nodes
 
@@ -195,7 +195,6 @@ def _hot_day(flight: Flight) -> Plan:
     return Plan(nodes=nodes, marks=Marks(spans=(span,)))
 
 
-CLOSED_LOOP = "closed loop"  # over the base ground
 IN_THE_LOOP = (
     "within 50 m", "within 20 m", "not localised", "claims", "coverage", "false fixes",
     "interval", "gap", "vehicle error", "failsafes",
