@@ -172,6 +172,19 @@ def test_velocity_that_odometry_contradicts_for_seconds_is_given_up() -> None:
     pytest.fail("odometry of 75 m/s was taken for this flight's at once")
 
 
+def test_a_coarse_match_does_not_join_a_fragment_to_the_flight() -> None:
+    """It says what the belief remembers; pictures of another flight have no part in it."""
+    flight = Flight(FRAMES, seed=5)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, turns_rad=2.0)
+    listener = Listener().fly(flight, 0, FIRST)
+    for i in range(FIRST, FIRST + 3):
+        coarse = msgspec.structs.replace(flight.fix(i), coarse=True)
+        listener.hear([*without(flight.messages(i), Odometry, MapMatch), foreign(other, i), coarse])
+    verdicts = listener.verdicts("map")
+    assert [verdicts[i].verdict for i in range(FIRST, FIRST + 3)] == [Verdict.UNCONFIRMED] * 3
+    assert listener.estimate(FIRST + 2).last_anchor_age_ms > 0
+
+
 def test_a_height_that_keeps_the_anchor_from_looking_is_given_up_for_the_reported_one() -> None:
     flight = Flight(30, seed=3, dem=True)
     listener = Listener().fly(flight, 0, 20)

@@ -102,6 +102,8 @@ class Estimator(Tracker):
             if away2 > GATE[2]:
                 return self._refuse(match, node, measured, cov, away2)
             return self._restart(match, node, measured, cov, "heading found")
+        if match.coarse and not self._fragments.of(node).joined:  # it says what the belief remembers, not what is seen
+            return FixResult(Verdict.UNCONFIRMED, None, "a coarse fix does not join a fragment to the flight")
         predicted = self.graph.state(node).pose
         spread = float(np.sqrt(np.max(np.diag(tangent_to_world(self._covariance(node), r_w_c))[:2])))
         if match.coarse and spread > COARSE_CONTINUES * height:
