@@ -88,6 +88,7 @@ def test_the_terms_of_a_claim(tmp_path: Path) -> None:
     said: list[Message] = [origin(0.1), estimate(1, 0.0, 9.0), estimate(1, 20.0, 3.0), estimate(2, 20.0, 3.0)]
     found = claims_of(replay(tmp_path, [1.0, 1.0], 6.0, said))
     assert found.map_m2 == pytest.approx(9.0)
+    assert found.nees_if_map_off == pytest.approx((1.0 / 36.0 + 9.0 * 2.0 / 36.0) / 2.0, rel=1e-4)
     assert found.principal_m2 == pytest.approx((100.0 * 0.02 * 800 / 400) ** 2)
     assert found.time_m2 == pytest.approx(0.6**2 / 2)
     assert found.rest_m2 == pytest.approx(36.0 - 9.0 - 16.0)
@@ -105,13 +106,13 @@ def test_each_flight_counts_alike_however_many_frames_it_has(tmp_path: Path) -> 
     assert whole.median_ratio == pytest.approx(math.sqrt(2.0) / (4.0 / 1.1774), rel=1e-3)
     assert whole.shares["rest"] == pytest.approx(1.0) and whole.shares["map"] == 0.0
     assert pool(flights[:1]).nees_sigma is None
-    assert "2 flights: inside 50.0%, NEES / dof 4.00 +- 4.00" in table(flights)[-1]
+    assert "2 flights: inside 50.0%, NEES / dof 4.00 +- 4.00, 4.00 if maps are off" in table(flights)[-1]
 
 
 def test_the_command_prints_the_table_and_writes_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = replay(tmp_path, [3.0, 5.0], 2.0)
     main([str(out), "--json", str(tmp_path / "claims.json")])
-    assert "| out | 2 | 50% | 2.12 |" in capsys.readouterr().out
+    assert "| out | 2 | 50% | 2.12 | 2.12 |" in capsys.readouterr().out
     assert json.loads((tmp_path / "claims.json").read_text())["pool"]["flights"] == 1
 
 
