@@ -9,7 +9,7 @@ alike however many frames they have, and the spread of NEES is that between flig
 its terms: map, principal point, at most so much of the time offset, and the rest (graph and hypotheses).
 
 Simulated flights are often over a map that is exact, while its package states an error. For those there is the NEES
-that would be expected if the map were off as it is claimed to be: what it lacks to 1 is what the rest claims too much."""
+that would be expected if the map were off as it is claimed to be: what it lacks to 1 the rest claims too much."""
 
 import argparse
 import json
@@ -141,8 +141,8 @@ def pool(flights: list[Claims]) -> Pool:
 def table(flights: list[Claims]) -> list[str]:
     """Rows of a Markdown table, metres per axis, and one line for the pool."""
     lines = [
-        "| flight | frames | inside 95 % | NEES / dof | ... if the map is off | error, rms "
-        "| shared by the flight | claimed | map | principal point | time offset, at most | rest | claimed / error | ... of medians |",
+        "| flight | frames | inside 95 % | NEES / dof | ... if the map is off | error, rms | shared by the flight "
+        "| claimed | map | principal point | time offset, at most | rest | claimed / error | ... of medians |",
         "|---" * 14 + "|",
     ]
     for f in flights:
@@ -159,7 +159,8 @@ def table(flights: list[Claims]) -> list[str]:
     lines += [
         "",
         f"{p.flights} flights: inside {p.inside_95:.1%}, NEES / dof {p.nees:.2f}{sigma}, "
-        f"{p.nees_if_map_off:.2f} if maps are off, claimed / error {p.ratio:.1f}, of medians {p.median_ratio:.1f}; of the claimed variance {shares}",
+        f"{p.nees_if_map_off:.2f} if maps are off, claimed / error {p.ratio:.1f}, of medians {p.median_ratio:.1f}; "
+        f"of the claimed variance {shares}",
     ]
     return lines
 
