@@ -1,6 +1,7 @@
 """The position error of a map layer: stated, estimated from another layer, or the default; and that it is claimed."""
 
 from pathlib import Path
+from typing import cast
 
 import map_rasters
 import msgspec
@@ -10,13 +11,14 @@ from rasterio.transform import Affine
 
 from terrafix.anchor.layers import Layers
 from terrafix.anchor.map_format import CE90_SIGMAS, Accuracy, Ce90Origin, Layer, accuracy_of
-from terrafix.anchor.map_package import MapPackage
+from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.mapping import accuracy
 from terrafix_tools.mapping.accuracy import given_offset, with_estimates
 from terrafix_tools.mapping.build import build_package, layer_of
-from terrafix_tools.mapping.overlap import Offset, agreed_offset
+from terrafix_tools.mapping.overlap import GRID, Offset, agreed_offset, binomial_tail, register
 
 DEFAULT = Accuracy(10.0, Ce90Origin.DEFAULT)
 SHIFT_M = (6.0, -4.0)
@@ -56,8 +58,40 @@ def test_two_layers_that_state_nothing_are_both_estimated_and_the_newest_stands_
     assert opened.manifest.ce90_m == new[0]
 
 
-def test_what_both_producers_state_stays(tmp_path: Path) -> None:
+def test_what_both_producers_state_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(accuracy, "register", lambda *_: pytest.fail("registered, and nobody asked"))
     assert said(package(tmp_path, (2.0, 3.0))) == [(2.0, Ce90Origin.STATED), (3.0, Ce90Origin.STATED)]
+
+
+def test_an_offset_is_where_the_second_layer_shows_a_point_less_where_the_first_does(tmp_path: Path) -> None:
+    opened = package(tmp_path, (2.0, 3.0))
+    west, south, east, north = opened.manifest.bounds_wgs84
+    frame = LocalFrame((south + north) / 2, (west + east) / 2)
+    found = register(opened.bind(frame, "imagery"), opened.bind(frame, "imagery_2"))
+    opened.close()
+    assert found is not None
+    assert (found.east_m, found.north_m) == (pytest.approx(SHIFT_M[0], abs=0.2), pytest.approx(SHIFT_M[1], abs=0.2))
+
+
+class Void:
+    """A layer without a pixel in a box; counts the windows that are read of it."""
+
+    bounds_m = (-5000.0, -2000.0, 5000.0, 2000.0)
+
+    def __init__(self, gsd_m: float) -> None:
+        self.gsd_m = gsd_m
+        self.asked_m: list[float] = []
+
+    def window(self, _e: float, _n: float, width: int, height: int, gsd_m: float) -> tuple[np.ndarray, np.ndarray]:
+        self.asked_m.append(gsd_m)
+        return np.zeros((height, width, 3), np.uint8), np.zeros((height, width), bool)
+
+
+def test_a_large_overlap_is_sampled_at_the_coarser_pixel_and_void_ground_is_not_searched() -> None:
+    first, second = Void(0.5), Void(3.0)
+    assert register(cast(LocalMap, first), cast(LocalMap, second)) is None
+    assert 0 < len(first.asked_m) <= GRID**2 and set(first.asked_m) == {3.0}
+    assert second.asked_m == []
 
 
 def test_layers_that_show_other_ground_say_nothing_of_each_other(tmp_path: Path) -> None:
@@ -118,6 +152,24 @@ def test_a_stated_layer_counts_before_one_that_states_nothing_and_then_the_farth
 
 def test_two_layers_that_lie_alike_may_share_their_error_and_claim_no_less_than_0_7_of_the_default() -> None:
     assert given_offset(Offset(0.0, 0.0, 0.0, 50), DEFAULT, DEFAULT) == pytest.approx(10.0 / np.sqrt(2.0))
+
+
+def test_an_offset_far_beyond_what_maps_are_off_by_is_believed_and_not_the_default() -> None:
+    far = given_offset(Offset(60.0, 0.0, 0.0, 50), DEFAULT, Accuracy(2.0, Ce90Origin.STATED))
+    assert far == pytest.approx(CE90_SIGMAS * 60.0 / np.sqrt(2.0), rel=0.005)
+
+
+@pytest.mark.parametrize(("other", "other_m2"), [(Accuracy(0.0, Ce90Origin.STATED), 0.0), (DEFAULT, 21.7)])
+def test_what_the_registration_does_not_know_is_left_to_the_default(other: Accuracy, other_m2: float) -> None:
+    vague = Offset(0.0, 0.0, 10.0, 1)
+    known_m2 = other_m2 + vague.sigma_m**2
+    left_m2 = 21.7 * known_m2 / (21.7 + known_m2)
+    assert given_offset(vague, DEFAULT, other) == pytest.approx(CE90_SIGMAS * np.sqrt(left_m2 + 50.0), rel=1e-3)
+
+
+def test_the_upper_tail_of_a_binomial_distribution() -> None:
+    assert binomial_tail(0, 5, 0.3) == pytest.approx(1.0)
+    assert binomial_tail(4, 5, 0.5) == pytest.approx(6.0 / 32.0)
 
 
 def test_what_varies_from_patch_to_patch_is_half_each_layers() -> None:

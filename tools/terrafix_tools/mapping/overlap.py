@@ -58,7 +58,7 @@ def agreed_offset(offsets_m: np.ndarray, agree_m: float, reach_m: float) -> Offs
     near = np.linalg.norm(offsets_m[:, None] - offsets_m[None], axis=2) <= agree_m
     most = int(near.sum(1).max())
     share = math.pi * agree_m**2 / (2.0 * reach_m) ** 2
-    if most < LEAST_AGREEING or len(offsets_m) * _at_least(most - 1, len(offsets_m) - 1, share) > CHANCE:
+    if most < LEAST_AGREEING or len(offsets_m) * binomial_tail(most - 1, len(offsets_m) - 1, share) > CHANCE:
         return None
     agreeing = offsets_m[near[int(near.sum(1).argmax())]]
     middle = np.median(agreeing, axis=0)
@@ -66,7 +66,7 @@ def agreed_offset(offsets_m: np.ndarray, agree_m: float, reach_m: float) -> Offs
     return Offset(float(middle[0]), float(middle[1]), scatter_m, most)
 
 
-def _at_least(least: int, of: int, probability: float) -> float:
+def binomial_tail(least: int, of: int, probability: float) -> float:
     """Upper tail of a binomial distribution."""
     return sum(math.comb(of, n) * probability**n * (1.0 - probability) ** (of - n) for n in range(least, of + 1))
 
