@@ -172,6 +172,12 @@ def test_the_upper_tail_of_a_binomial_distribution() -> None:
     assert binomial_tail(4, 5, 0.5) == pytest.approx(6.0 / 32.0)
 
 
+def test_no_layer_is_estimated_better_than_one_that_states_its_error_and_may_share_it() -> None:
+    alike = Offset(0.0, 0.0, 0.0, 50)
+    assert given_offset(alike, DEFAULT, Accuracy(6.0, Ce90Origin.STATED)) == pytest.approx(6.0)
+    assert given_offset(alike, DEFAULT, Accuracy(40.0, Ce90Origin.STATED)) == pytest.approx(10.0)
+
+
 def test_what_varies_from_patch_to_patch_is_half_each_layers() -> None:
     smooth, rough = (given_offset(Offset(0.0, 0.0, s, 10**9), DEFAULT, DEFAULT) for s in (0.0, 2.0))
     assert (rough**2 - smooth**2) / CE90_SIGMAS**2 == pytest.approx(2.0, rel=1e-3)

@@ -10,7 +10,8 @@ most likely s, of two layers that state nothing s^2 = |d|^2 / 4 per axis. What i
 normal error with the same second moment about the layer as it lies, and half of what varies from patch to patch.
 
 Two layers that were placed by the same reference share an error that d does not show. That is bounded: of two layers
-that state nothing the estimate is never below 1/sqrt(2) of the default, that is 7.1 m."""
+that state nothing the estimate is never below 1/sqrt(2) of the default, that is 7.1 m; beside one that states its error
+it is never below that."""
 
 import itertools
 import math
@@ -65,13 +66,15 @@ def given_offset(offset: Offset, own: Accuracy, other: Accuracy) -> float:
     apart_m2 = (offset.east_m**2 + offset.north_m**2) / 2.0  # per axis
     if other.origin is Ce90Origin.STATED:
         known_m2 = other.sigma_m**2 + offset.sigma_m**2
+        least_m2 = min(own.sigma_m**2, other.sigma_m**2)
         own_m2 = max(own.sigma_m**2, apart_m2 - known_m2)
     else:
+        least_m2 = 0.0
         own_m2 = max(own.sigma_m**2, apart_m2 / 2.0)
         known_m2 = own_m2 + offset.sigma_m**2
     weight = own_m2 / (own_m2 + known_m2)
     moment_m2 = weight**2 * apart_m2 + own_m2 * (1.0 - weight) + offset.scatter_m**2 / 2.0
-    return CE90_SIGMAS * math.sqrt(moment_m2)
+    return CE90_SIGMAS * math.sqrt(max(moment_m2, least_m2))
 
 
 def _registered(package: MapPackage) -> dict[tuple[int, int], Offset]:
