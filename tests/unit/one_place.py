@@ -31,7 +31,9 @@ class OnlyMap(FlatMap):
     """A package and what it is bound to in one."""
 
     bounds_m = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
-    manifest = SimpleNamespace(layers=(SimpleNamespace(table="imagery", ce90_m=None, null_model=None),))
+    manifest = SimpleNamespace(
+        layers=(SimpleNamespace(table="imagery", ce90_m=None, ce90_origin=None, null_model=None),)
+    )
 
     def bind(self, _frame: object, _layer: str) -> "OnlyMap":
         return self

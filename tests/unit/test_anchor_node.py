@@ -125,7 +125,10 @@ def test_a_search_needs_what_the_map_says_of_its_wrong_places(
         for agl_m, above in ((0.5 * AGL_M, 1e3), (1.1 * AGL_M, 50.0))
     )
     layer = SimpleNamespace(
-        table="imagery", ce90_m=None, null_model=NullModel(version=VERSION, matcher="gradient", rows=rows)
+        table="imagery",
+        ce90_m=None,
+        ce90_origin=None,
+        null_model=NullModel(version=VERSION, matcher="gradient", rows=rows),
     )
     for manifest in (OnlyMap.manifest, SimpleNamespace(layers=(layer,))):
         monkeypatch.setattr(OnlyMap, "manifest", manifest)
@@ -262,7 +265,7 @@ class TwoDates:
 
     manifest = SimpleNamespace(
         layers=tuple(
-            SimpleNamespace(table=table, ce90_m=ce90_m, null_model=None)
+            SimpleNamespace(table=table, ce90_m=ce90_m, ce90_origin=None, null_model=None)
             for table, ce90_m in (("new", None), ("old", 5.0))
         )
     )

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from simulated_flight import (
     FRAME_S,
+    KEYFRAME_EVERY,
     ORIGIN,
     SPEED_MPS,
     Flight,
@@ -138,6 +139,28 @@ def test_a_step_is_claimed_no_wider_for_lying_far_from_its_keyframe() -> None:
     sigmas_m = [m.step_cov_m2[0] ** 0.5 for m in run.said if isinstance(m, Prediction) and m.frame_id]
     assert max(sigmas_m) < 1.3 * min(sigmas_m)
     assert min(sigmas_m) > 0.15 * SPEED_MPS * FRAME_S  # that fifth is claimed
+
+
+def test_an_error_of_a_keyframe_is_in_one_step_and_not_in_each_one_from_it() -> None:
+    """The rays of one keyframe are all aside, as when its tilt is wrong: the ways of its frames share that."""
+    first = 7 * KEYFRAME_EVERY + 1
+    end = first + KEYFRAME_EVERY
+    flight = Flight(end, seed=6)
+    run = Listener().fly(flight, 0, first)
+    for i in range(first, end):
+        for message in flight.messages(i):
+            if isinstance(message, Odometry):
+                pairs = [(a + 0.06, b, c, d) for a, b, c, d in message.pairs]
+                run.hear([msgspec.structs.replace(message, pairs=pairs)])
+            elif not isinstance(message, MapMatch):
+                run.hear([message])
+    said = {m.frame_id: m for m in run.said if isinstance(m, Prediction)}
+    off_m = [
+        np.hypot(*(np.array(said[i].step_m) - np.diff(flight.p_m[i - 1 : i + 1], axis=0)[0, :2])) for i in said if i
+    ]
+    assert run.verdicts("odometry")[end - 1].verdict is Verdict.ACCEPTED
+    assert off_m[first - 1] > 4.0
+    assert max(off_m[first:]) < 1.5
 
 
 def test_refined_positions_are_no_worse(long_flight: Flight, long_run: Listener) -> None:

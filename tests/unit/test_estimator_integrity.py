@@ -244,6 +244,34 @@ def test_looks_that_find_nothing_withdraw_the_position() -> None:
     assert sigma_m(listener.estimate(12)) > 50.0  # of 72 m
 
 
+def _coarsely(message: Message) -> Message:
+    """A match without a pose: the belief's mode."""
+    if not isinstance(message, MapMatch):
+        return message
+    return msgspec.structs.replace(message, coarse=True, inliers=0)
+
+
+def test_coarse_matches_that_enter_the_graph_are_no_looks_that_find_nothing() -> None:
+    listener, faults = _fly(_coarsely, fix_every=1)
+    verdicts = listener.verdicts("map").values()
+    assert sum(v.verdict is Verdict.ACCEPTED for v in verdicts) > 100
+    assert faults == []
+    assert max(sigma_m(listener.estimate(i)) for i in range(120)) < 20.0
+
+
+def test_coarse_matches_that_the_graph_refuses_find_nothing() -> None:
+    def aside(message: Message) -> Message:
+        said = _coarsely(message)
+        if not isinstance(said, MapMatch) or said.p_c_in_w_m is None:
+            return said
+        e_m, n_m, up_m = said.p_c_in_w_m
+        return msgspec.structs.replace(said, p_c_in_w_m=(e_m + 400.0 * (said.frame_id % 3), n_m - 500.0, up_m))
+
+    listener, faults = _fly(aside, fix_every=1)
+    assert not any(v.verdict is Verdict.ACCEPTED for v in listener.verdicts("map").values())
+    assert [(fault.quantity, fault.active) for fault in faults] == [("registration", True)]
+
+
 def test_looks_at_ground_without_texture_say_nothing() -> None:
     def nothing(message: Message) -> Message:
         if isinstance(message, Odometry):

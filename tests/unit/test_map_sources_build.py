@@ -116,7 +116,7 @@ def test_several_sources_and_several_dates_from_a_file(tmp_path: Path) -> None:
     package = MapPackage.open(tmp_path / "m.gpkg", verify=True)
     new, old = package.manifest.layers
     assert (new.date, new.ce90_m, new.licence) == ("2022-05-01", 6.0, "own flight; CC0")
-    assert (old.date, old.source, old.ce90_m) == ("2011-05-01", "old", None)
+    assert (old.date, old.source, old.ce90_m) == ("2011-05-01", "old", 6.0)  # estimated: it lies as the new one does
     package.close()
     with rasterio.open(f"GPKG:{tmp_path / 'm.gpkg'}:imagery") as file:
         image = file.read([3, 2, 1]).transpose(1, 2, 0)

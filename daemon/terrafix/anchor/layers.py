@@ -6,6 +6,7 @@ from pathlib import Path
 from terrafix.anchor.agreed import AgreedPose
 from terrafix.anchor.belief import Belief, Mode
 from terrafix.anchor.map_features import CACHE_BYTES, Describer
+from terrafix.anchor.map_format import accuracy_of
 from terrafix.anchor.map_layers import LayerChoice
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import FrameMatcher, Look, View
@@ -15,8 +16,6 @@ from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
 from terrafix.messages import Verdict
-
-CE90_SIGMAS = 2.1460  # of a circular normal error: sqrt(-2 ln 0.1)
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Dated:
 
 
 class Layers:
-    """``ce90_m`` counts for the layers that state none. ``shelf``: folder in memory for what was computed of them."""
+    """``ce90_m`` counts for the layers that have none. ``shelf``: folder in memory for what was computed of them."""
 
     def __init__(
         self,
@@ -54,10 +53,8 @@ class Layers:
             if shelf is not None:
                 kept = TileShelf(shelf, f"{_file(package)} {frame} {layer.table}", MOST // len(layers))
             matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers), kept)
-            stated = ce90_m if layer.ce90_m is None else layer.ce90_m
-            self._all[layer.table] = Dated(
-                bound, matcher, AgreedPose(bound, matcher), stated / CE90_SIGMAS, layer.null_model
-            )
+            sigma_m = accuracy_of(layer, ce90_m).sigma_m
+            self._all[layer.table] = Dated(bound, matcher, AgreedPose(bound, matcher), sigma_m, layer.null_model)
         self._choice = LayerChoice([layer.table for layer in layers])
 
     def see_through(self, bend: float) -> None:

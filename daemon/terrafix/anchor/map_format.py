@@ -4,6 +4,7 @@ import hashlib
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import StrEnum
 
 import msgspec
 
@@ -19,6 +20,7 @@ SIGNATURE_TABLE = "terrafix_signature"
 SEAL_TABLE = "terrafix_seal"
 TILE_PX = 256
 DEM_TILE_PX = 256
+CE90_SIGMAS = 2.1460  # radius that holds 90 % of a circular normal error, in its sigmas: sqrt(-2 ln 0.1)
 DEM_NULL = 65535  # void in a 16-bit elevation tile
 SIGNED_AS = b"terrafix map package\n"  # before the checksum in what is signed: the key may sign other things too
 
@@ -62,6 +64,14 @@ class DescriptorTable(msgspec.Struct, frozen=True, kw_only=True):
     tiles: int
 
 
+class Ce90Origin(StrEnum):
+    """Where the position error of a layer comes from."""
+
+    STATED = "stated"  # by the producer
+    ESTIMATED = "estimated"  # when the package was built, from another layer of it
+    DEFAULT = "default"  # neither: `[map] ce90_m` counts
+
+
 class Layer(msgspec.Struct, frozen=True, kw_only=True):
     """One imagery layer: one date, one pixel grid. Layers of a package may differ in CRS."""
 
@@ -70,7 +80,7 @@ class Layer(msgspec.Struct, frozen=True, kw_only=True):
     licence: str
     source: str  # file name
     source_sha256: str
-    ce90_m: float | None  # radius that holds 90 % of the errors of position; None: not stated
+    ce90_m: float | None  # radius that holds 90 % of the errors of position; None: not known
     gsd_m: float  # ground metres per pixel of the finest level at the centre of the layer
     crs: str  # "EPSG:32651", or WKT
     x_min: float  # corner of the tile matrices, CRS units
@@ -80,6 +90,27 @@ class Layer(msgspec.Struct, frozen=True, kw_only=True):
     tiles: int
     descriptors: DescriptorTable | None = None
     null_model: NullModel | None = None  # what wrong places score; None: not measured
+    ce90_origin: Ce90Origin | None = None  # None: a package from before this was recorded; what it has is stated
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Error of position of a layer: radius that holds 90 % of it, and where that number comes from."""
+
+    ce90_m: float
+    origin: Ce90Origin
+
+    @property
+    def sigma_m(self) -> float:
+        """1-sigma per horizontal axis, of a circular normal error."""
+        return self.ce90_m / CE90_SIGMAS
+
+
+def accuracy_of(layer: Layer, default_ce90_m: float) -> Accuracy:
+    """``default_ce90_m``: `[map] ce90_m`, of a layer that says nothing."""
+    if layer.ce90_m is None:
+        return Accuracy(default_ce90_m, Ce90Origin.DEFAULT)
+    return Accuracy(layer.ce90_m, layer.ce90_origin or Ce90Origin.STATED)
 
 
 class VectorTable(msgspec.Struct, frozen=True, kw_only=True):

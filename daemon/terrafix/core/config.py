@@ -26,7 +26,7 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 class Map(Section, frozen=True, kw_only=True):
     path: str = ""  # map package or GeoTIFF; the command line wins
-    ce90_m: Annotated[float, Meta(ge=0, le=200)] = 10.0  # of a package that states none
+    ce90_m: Annotated[float, Meta(ge=0, le=200)] = 10.0  # of a layer of which none is stated or estimated
     require_signature: bool = False  # refuse a package that none of trusted_keys has signed
     trusted_keys: list[str] = []  # public keys (.pub of `terrafix map keygen`), or folders of them
 

@@ -140,7 +140,8 @@ class Tracker:
         self._pace = Pace()
         self._wind = Wind()
         self._seen_s = 0.0  # time of the newest frame whose motion, or place, was seen
-        self._seen_from: int | None = None  # node of the keyframe that odometry saw the newest frame from
+        # Node of the keyframe that odometry saw the newest frame from, and where that was in its camera (3,).
+        self._seen_from: tuple[int, np.ndarray] | None = None
         self._felt: bool | None = None  # whether the last leg was measured; None: there was none
         self._stood_at: int | None = None  # node at which a vehicle stands, motors off
         self._take_off = TakeOff()
@@ -263,7 +264,12 @@ class Tracker:
             seen = r_w_c @ motion.cov[3:, 3:] @ r_w_c.T
             # Of the step over the ground: where no map tells how that rises, the height is known far less well.
             aside_m2 = float(np.linalg.eigvalsh(seen[:2, :2])[-1])
-            if parent == self._seen_from and motion.seen is not None:
+            same_keyframe = self._seen_from is not None and self._seen_from[0] == parent
+            if self._seen_from is not None and same_keyframe:
+                # Both by odometry: against the estimate of the frame before, an error of the leg from the keyframe
+                # would be in the step of every frame of it, and add up in the belief that follows these steps.
+                step = (p - self.graph.state(parent).pose.transformFrom(self._seen_from[1]))[:2]
+            if same_keyframe and motion.seen is not None:
                 # A wrong height stretches all of the way since the keyframe alike; the frame before had its part of it.
                 way_m2 = float(np.sum((p - self.graph.state(parent).pose.translation())[:2] ** 2))
                 stretch2 = motion.seen.ground.stretch_sigma**2
@@ -303,7 +309,7 @@ class Tracker:
         elif self._stood_at is None:
             self._stood_at = node
         self._is_frame(node, frame_id, sighting.fragment)
-        self._seen_from = None if known is None else parent
+        self._seen_from = None if known is None else (parent, motion.p_m)
         self._cov_of = {n: cov for n, cov in self._cov_of.items() if self.graph.holds(n)}
         self._velocity_cov = spread[3:, 3:]
         self._be_led(node, t_s, attitude, felt)

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import typer
 
-from terrafix.anchor.layers import CE90_SIGMAS
+from terrafix.anchor.map_format import CE90_SIGMAS
 from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, TerrafixError
 from terrafix.core.node import Node, NodeContext

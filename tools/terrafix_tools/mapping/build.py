@@ -15,10 +15,11 @@ import rasterio
 from pyproj import Transformer
 from rasterio.errors import RasterioError
 
-from terrafix.anchor.map_format import FORMAT_VERSION, IMAGERY_TABLE, DemGrid, Layer, Manifest, VectorTable
+from terrafix.anchor.map_format import FORMAT_VERSION, IMAGERY_TABLE, Ce90Origin, DemGrid, Layer, Manifest, VectorTable
 from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
+from terrafix_tools.mapping.accuracy import estimate_into
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
 from terrafix_tools.mapping.collar import find_collar
 from terrafix_tools.mapping.dem import TILES_PER_WORKER, DemSource, height_places, open_heights, write_elevation
@@ -105,6 +106,8 @@ def build_package(
             with new_package(part) as (writer, db):
                 one = _Build(writer, db, scratch, out.stem, descriptors, crew, bar)
                 one.write(ordered, elevation, vectors)
+            if len(layers) > 1:
+                estimate_into(part)
             if null_agl_m:
                 learn_into(part, null_agl_m)
             with part.open("rb") as file:
@@ -187,6 +190,7 @@ class _Build:
             source=given.source,
             source_sha256=given.source_sha256,
             ce90_m=given.ce90_m,
+            ce90_origin=Ce90Origin.DEFAULT if given.ce90_m is None else Ce90Origin.STATED,
             gsd_m=source.gsd_m,
             crs=":".join(authority) if authority else source.crs.to_wkt(),
             x_min=source.x_min,

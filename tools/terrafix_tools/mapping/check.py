@@ -8,8 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from terrafix.anchor.layers import CE90_SIGMAS
-from terrafix.anchor.map_format import Layer
+from terrafix.anchor.map_format import Ce90Origin, Layer, accuracy_of
 from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.anchor.matcher import MIN_SIDE_CELLS, FrameMatcher
 from terrafix.anchor.retrieval import CELL_PER_AGL
@@ -67,7 +66,7 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     cell_step_m: float
     expected_error_m: float  # median, horizontal, where it sees
     ce90_m: float
-    ce90_is_stated: bool
+    ce90_origin: Ce90Origin
     warnings: list[str]
     mission: MissionCheck | None
 
@@ -124,7 +123,7 @@ def check(
             blind=way.stretches(blind(way_sight)),
             seen_share=float(np.mean(~blind(way_sight))),
         )
-    ce90_m = found.ce90_m if found.ce90_m is not None else Map().ce90_m
+    accuracy = accuracy_of(found, Map().ce90_m)
     said = MapCheck(
         package=str(package.path),
         layer=found.table,
@@ -143,9 +142,9 @@ def check(
         weak=grid.share(Sight.WEAK),
         blind=grid.share(Sight.BLIND),
         cell_step_m=step_m,
-        expected_error_m=MEDIAN_SIGMAS * math.hypot(ce90_m / CE90_SIGMAS, MATCH_CELLS * cell_m / MEDIAN_SIGMAS),
-        ce90_m=ce90_m,
-        ce90_is_stated=found.ce90_m is not None,
+        expected_error_m=MEDIAN_SIGMAS * math.hypot(accuracy.sigma_m, MATCH_CELLS * cell_m / MEDIAN_SIGMAS),
+        ce90_m=accuracy.ce90_m,
+        ce90_origin=accuracy.origin,
         warnings=[
             *_warnings(found, int(min(frame_m) / cell_m), package.manifest.has_dem, cell_m, agl_m),
             *_search_warnings(local, matcher, agl_m),

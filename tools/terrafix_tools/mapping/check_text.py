@@ -30,12 +30,12 @@ def lines_of(said: MapCheck) -> list[tuple[str, str]]:
     ]
     if said.mission is not None:
         rows += _mission_rows(said)
-    stated = "stated" if said.ce90_is_stated else "assumed"
     rows.append(
         (
             "expect",
             f"a median error of about {said.expected_error_m:.0f} m where it sees "
-            f"(map {said.ce90_m:.0f} m CE90 {stated}, matching one cell); elsewhere it grows with the distance flown",
+            f"(map {said.ce90_m:.0f} m CE90, {said.ce90_origin}; matching one cell); "
+            "elsewhere it grows with the distance flown",
         )
     )
     return rows + [("note", text) for text in said.warnings]

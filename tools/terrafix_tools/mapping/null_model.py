@@ -4,7 +4,6 @@ The flights are over the map itself, mirrored and turned: ground of the same kin
 the map. They go through the search of the flight."""
 
 import math
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,8 @@ import cv2
 import msgspec
 import numpy as np
 
-from terrafix.anchor.map_format import HASH_TABLE, MANIFEST_TABLE, SEAL_TABLE, Layer, checksum_of, manifest_rows
+from terrafix.anchor.map_format import Layer
 from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.map_seal import BLANK, write_seal
 from terrafix.anchor.matcher import FrameMatcher, View
 from terrafix.anchor.null_model import USUAL, VERSION, FlightBudget, NullModel, NullRow, Tail
 from terrafix.anchor.retrieval import MapSearch
@@ -25,6 +23,7 @@ from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.mapping.rewrite import rewrite_manifest
 
 CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
 NORTH_UP = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -65,17 +64,7 @@ def learn_into(package: Path, heights_m: Sequence[float]) -> None:
         manifest = msgspec.structs.replace(opened.manifest, layers=layers)
     finally:
         opened.close()
-    db = sqlite3.connect(package)
-    try:
-        hashes = db.execute(f"SELECT table_name, zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}")
-        said = dict(manifest_rows(manifest))
-        said["checksum"] = checksum_of(said.items(), hashes.fetchall())
-        with db:
-            db.executemany(f"UPDATE {MANIFEST_TABLE} SET value = ? WHERE key = ?", [(v, k) for k, v in said.items()])
-            db.execute(f"UPDATE {SEAL_TABLE} SET seal = ?", (BLANK,))
-    finally:
-        db.close()
-    write_seal(package)
+    rewrite_manifest(package, manifest)
 
 
 def learn(source: LocalMap, agl_m: float, flights: int, stretches: int) -> NullRow:

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from terrafix.anchor.map_format import CE90_SIGMAS
 from terrafix.messages import Camera
 from terrafix_tools.montecarlo.fault import LIES, Fault
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.vehicle.wind import Wind
 
 DURATION_S = 600.0
-CE90_SIGMAS = 2.1460  # CE90 of a circular normal error in its sigmas: sqrt(-2 ln 0.1)
 HALTON = (5, 7)  # bases of the map errors' sequence (Halton 1960); they share no factor with the round of faults
 # Cameras of the real flights and of the simulated ones: width, height, focal length in pixels.
 CAMERAS = ((1280, 720, 684.0), (1600, 900, 1164.4), (960, 540, 560.0))
