@@ -166,6 +166,35 @@ def test_two_other_places_share_what_a_placed_estimate_leaves() -> None:
     assert cov[1, 1] == pytest.approx(0.5 * 25.0 + 0.3 * MODE_M2 + 0.2 * (400.0**2 + MODE_M2))
 
 
+@pytest.mark.parametrize(
+    ("sigma_m", "modes"),
+    [
+        (60.0, [(300.0, 0.0, 0.7)]),  # a leading mode
+        (60.0, [(300.0, 0.0, 0.2)]),  # a wide belief without one
+        (200.0, [(30.0, 0.0, 0.7)]),  # a prior that is wider than the belief
+        (14.0, [(300.0, 0.0, 0.4), (0.0, 300.0, 0.5)]),  # other places than that of a placed graph
+    ],
+)
+def test_what_is_published_is_positive_definite_however_place_and_attitude_are_correlated(
+    sigma_m: float, modes: list[tuple[float, float, float]]
+) -> None:
+    cov = np.diag([sigma_m**2] * 2 + [4.0] + [0.01] * 3)
+    for place, angle in ((0, 4), (1, 3)):
+        cov[place, angle] = cov[angle, place] = 0.99 * sigma_m * 0.1
+    _, claimed = weighed(sigma_m, *modes).claim(cov)
+    assert np.linalg.eigvalsh(claimed).min() > 0.0
+
+
+@pytest.mark.parametrize("mass", [0.7, 0.2])
+def test_a_belief_that_no_look_renews_widens_as_the_estimate_does(mass: float) -> None:
+    hypotheses = weighed(60.0, (300.0, 0.0, mass))
+    wide, wider = np.diag([3600.0] * 3 + [0.01] * 3), np.diag([3600.0, 5000.0] + [3600.0] + [0.01] * 3)
+    at_m, before = hypotheses.claim(wide)
+    now_m, now = hypotheses.claim(wider)
+    assert now_m.tolist() == at_m.tolist()
+    assert now[:2, :2] - before[:2, :2] == pytest.approx(np.diag([0.0, 1400.0]))
+
+
 def test_a_match_that_agrees_ends_it() -> None:
     hypotheses = weighed(60.0, (300.0, 0.0, 0.7))
     hypotheses.confirmed()

@@ -2,12 +2,14 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
+from simulated_flight import ORIGIN, Flight, Listener, t_ns
 
 from terrafix.estimator.integrity.time_offset import PRIOR_S, SLEW, TimeOffset, Turn
 from terrafix.estimator.telemetry import Telemetry
-from terrafix.messages import VehicleState
+from terrafix.messages import Prediction, VehicleState
 
 FRAME_S, TELEMETRY_S = 0.5, 0.1
 
@@ -81,3 +83,41 @@ def test_headings_that_nobody_reports_are_not_waited_for() -> None:
     for i in range(1000):
         offset.add(Turn(i * 10**9, (i + 1) * 10**9, 0.5), telemetry)
     assert offset.applied_s == 0.0 and len(offset._waiting) < 100
+
+
+class LateCamera(TimeOffset):
+    """Is sure of an offset of a second, and keeps the turns that it is given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.turns: list[Turn] = []
+
+    @property
+    def estimate(self) -> tuple[float, float]:
+        return 1.0, 0.01
+
+    def add(self, turn: Turn, telemetry: Telemetry) -> None:
+        self.turns.append(turn)
+
+
+def test_the_node_shifts_frames_by_a_fifth_of_the_time_between_their_stamps_and_learns_at_the_stamps() -> None:
+    flight, late = Flight(30, seed=3), LateCamera()
+    listener = Listener().fly(flight, 0, 10)
+    listener.node._time_offset = late
+    listener.fly(flight, 10, 30)
+    shifted_s = [(t_ns(i) - listener.estimate(i).t_ns) * 1e-9 for i in range(10, 30)]
+    assert shifted_s == pytest.approx([min(SLEW * 0.5 * (i + 1), 1.0) for i in range(20)])
+    assert [(turn.t0_ns, turn.t1_ns) for turn in late.turns] == [(t_ns(i - 1), t_ns(i)) for i in range(10, 30)]
+
+
+def test_another_camera_has_a_time_offset_of_its_own() -> None:
+    flight, late = Flight(12, seed=3), LateCamera()
+    listener = Listener().fly(flight, 0, 2)
+    listener.node._time_offset = late
+    listener.fly(flight, 2, 12)
+    assert late.applied_s > 0.5
+    listener.hear([msgspec.structs.replace(ORIGIN, start_sigma_m=20.0)])
+    listener.fly(flight, 10, 12)
+    assert listener.estimate(11).t_ns == t_ns(11)
+    first = [m for m in listener.said if isinstance(m, Prediction) and m.frame_id == 10][-1]
+    assert np.hypot(*first.step_m) < 1e-9
