@@ -28,6 +28,17 @@ def test_a_motion_is_possible_up_to_the_gate_beyond_the_hardest_manoeuvre(
     assert not innovation(1.01 * limit_m, inertial=inertial).is_possible
 
 
+def test_the_gate_refuses_one_true_motion_in_a_million() -> None:
+    """Chi-square with 3 degrees of freedom, in closed form."""
+    beyond = math.erfc(math.sqrt(GATE_D2 / 2.0)) + math.sqrt(2.0 * GATE_D2 / math.pi) * math.exp(-GATE_D2 / 2.0)
+    assert beyond == pytest.approx(1e-6, rel=0.01)
+
+
+def test_a_motion_within_the_hardest_manoeuvre_is_possible_however_well_it_is_predicted() -> None:
+    sure = replace(innovation(0.5, inertial=False), cov_m2=0.01 * np.eye(3))
+    assert sure.is_possible and sure.d2(40.0) == 0.0
+
+
 @pytest.mark.parametrize("inertial", [False, True])
 def test_no_manoeuvre_ends_in_a_stand_from_one_frame_to_the_next(inertial: bool) -> None:
     limit_m = math.sqrt(GATE[3]) * SIGMA_M
