@@ -116,6 +116,28 @@ def test_a_new_fragment_that_moves_as_predicted_is_the_flight_without_any_map() 
     assert mahalanobis(listener, flight, FRAMES - 1) < 3.5
 
 
+@pytest.mark.parametrize("said", [Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE, "coarse"])
+def test_looks_that_find_nothing_where_every_look_found_a_pose_speak_against_a_new_fragment(
+    said: Verdict | str,
+) -> None:
+    """It moves as predicted, which would join it; one pose joins it."""
+    flight = Flight(FRAMES, seed=6, fix_every=1)
+    listener = Listener().fly(flight, 0, FIRST)
+    for i in range(FIRST, END):
+        odometry, match = odometry_of(flight.messages(i)), flight.fix(i)
+        if i == FIRST:
+            odometry = blind(odometry)
+        if said == "coarse":
+            match = msgspec.structs.replace(match, coarse=True)
+        elif isinstance(said, Verdict):
+            match = msgspec.structs.replace(match, verdict=said)
+        listener.hear([*without(flight.messages(i), Odometry, MapMatch), odometry, match])
+    verdicts = listener.verdicts("odometry")
+    assert all(verdicts[i].verdict is Verdict.UNCONFIRMED for i in range(FIRST + 1, END))
+    listener.hear([flight.fix(END - 1), *flight.messages(END)])
+    assert listener.verdicts("odometry")[END].verdict is Verdict.ACCEPTED
+
+
 def test_the_anchor_follows_what_pictures_show_and_returns_to_the_flight_afterwards() -> None:
     flight = Flight(FRAMES, seed=5)
     other = Flight(FRAMES + LATER, seed=11, speed_mps=25.0, turns_rad=2.0)
@@ -254,6 +276,28 @@ def test_a_height_that_keeps_the_anchor_from_looking_is_given_up_for_the_reporte
     for i in range(21, 30):
         listener.hear(flight.messages(i))
     assert list(listener.verdicts("reset")) == [20]
+
+
+@pytest.mark.parametrize("reported_m", [20.0, 40.0])
+def test_a_reported_height_that_would_hardly_be_looked_from_resets_nothing(reported_m: float) -> None:
+    flight = Flight(25, seed=3, dem=True)
+    listener = Listener().fly(flight, 0, 20)
+    fix = flight.fix(19)
+    assert fix.p_c_in_w_m is not None
+    listener.hear([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    state = next(m for m in flight.messages(20) if isinstance(m, VehicleState))
+    listener.hear([msgspec.structs.replace(state, agl_m=reported_m), odometry_of(flight.messages(20))])
+    assert listener.estimate(20).agl_m < 25.0 and listener.verdicts("reset") == {}
+
+
+def test_without_a_map_of_the_ground_a_low_height_resets_nothing() -> None:
+    flight = Flight(25, seed=3)
+    listener = Listener().fly(flight, 0, 20)
+    fix = flight.fix(19)
+    assert fix.p_c_in_w_m is not None
+    listener.hear([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    listener.hear(without(flight.messages(20), MapMatch))
+    assert listener.estimate(20).agl_m < 25.0 and listener.verdicts("reset") == {}
 
 
 def test_the_height_after_a_reset_is_the_reported_one_above_the_take_off() -> None:

@@ -5,11 +5,12 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from simulated_flight import ORIGIN, Flight, Listener, t_ns
+from simulated_flight import ORIGIN, Flight, Listener, blind, cov_of, t_ns
 
+from terrafix.core.geodesy import yaw_of
 from terrafix.estimator.integrity.time_offset import PRIOR_S, SLEW, TimeOffset, Turn
 from terrafix.estimator.telemetry import Telemetry
-from terrafix.messages import Prediction, VehicleState
+from terrafix.messages import Odometry, Prediction, VehicleState
 
 FRAME_S, TELEMETRY_S = 0.5, 0.1
 
@@ -108,6 +109,49 @@ def test_the_node_shifts_frames_by_a_fifth_of_the_time_between_their_stamps_and_
     shifted_s = [(t_ns(i) - listener.estimate(i).t_ns) * 1e-9 for i in range(10, 30)]
     assert shifted_s == pytest.approx([min(SLEW * 0.5 * (i + 1), 1.0) for i in range(20)])
     assert [(turn.t0_ns, turn.t1_ns) for turn in late.turns] == [(t_ns(i - 1), t_ns(i)) for i in range(10, 30)]
+
+
+def test_the_turns_that_the_node_learns_from_are_those_of_the_camera() -> None:
+    """From keyframe to keyframe and within, over north; none beside a frame in which nothing was tracked."""
+    flight, late, dark = Flight(50, seed=3, turns_rad=-4.0), LateCamera(), 25
+    listener = Listener().fly(flight, 0, 10)
+    listener.node._time_offset = late
+    for i in range(10, 50):
+        listener.hear([blind(m) if isinstance(m, Odometry) and i == dark else m for m in flight.messages(i)])
+    heading_rad = {t_ns(i): yaw_of(r) for i, r in enumerate(flight.r_w_b)}
+    off_rad = [
+        math.remainder(turn.yaw_rad - heading_rad[turn.t1_ns] + heading_rad[turn.t0_ns], math.tau)
+        for turn in late.turns
+    ]
+    assert np.abs(off_rad).max() < 0.05
+    assert max(abs(turn.yaw_rad) for turn in late.turns) > 0.9
+    assert {turn.t1_ns for turn in late.turns} == {t_ns(i) for i in range(10, 50) if i not in (dark, dark + 1)}
+
+
+class KnownTo(TimeOffset):
+    """An offset that is probably none, known to ``one_sigma_s``."""
+
+    def __init__(self, one_sigma_s: float) -> None:
+        super().__init__()
+        self._one_sigma_s = one_sigma_s
+
+    @property
+    def estimate(self) -> tuple[float, float]:
+        return 0.0, self._one_sigma_s
+
+
+def test_what_is_not_known_of_the_offset_is_claimed_along_the_way() -> None:
+    flight, covs_m2 = Flight(12, seed=3), []
+    for sigma_s in (1.0, 0.01):
+        listener = Listener().fly(flight, 0, 11)
+        listener.node._time_offset = KnownTo(sigma_s)
+        covs_m2.append(cov_of(listener.fly(flight, 11, 12).estimate(11))[:2, :2])
+    way_m = (flight.p_m[11] - flight.p_m[10])[:2]
+    along = way_m / np.linalg.norm(way_m)
+    across = np.array([along[1], -along[0]])
+    grown_m2 = covs_m2[0] - covs_m2[1]
+    assert along @ grown_m2 @ along == pytest.approx((PRIOR_S**2 - 0.01**2) * 12.0**2, rel=0.1)
+    assert across @ grown_m2 @ across == pytest.approx(0.0, abs=0.01)
 
 
 def test_another_camera_has_a_time_offset_of_its_own() -> None:
