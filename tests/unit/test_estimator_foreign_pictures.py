@@ -1,14 +1,16 @@
 """Pictures of another flight, and a camera that is frozen: what the estimate says while they last and afterwards."""
 
 import math
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 from simulated_flight import FRAME_S, ORIGIN, Flight, Listener, blind, cov_of, error_m, sigma_m, t_ns
 
+from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import AT_REST_S
-from terrafix.estimator.tracker import MOTION_TIMEOUT_S
+from terrafix.estimator.tracker import MOTION_TIMEOUT_S, Tracker
 from terrafix.estimator.velocity import MAX_SPEED_SIGMA_MPS
 from terrafix.messages import MapMatch, Message, Odometry, Prediction, VehicleState, Verdict
 
@@ -138,6 +140,26 @@ def test_looks_that_find_nothing_where_every_look_found_a_pose_speak_against_a_n
     assert listener.verdicts("odometry")[END].verdict is Verdict.ACCEPTED
 
 
+def test_the_motion_of_an_unjoined_fragment_is_predicted_from_its_keyframe_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Velocity led the keyframe there, too, so that its error counts over all of the time since."""
+    predicted = Tracker._motion_innovation
+    beyond: list[float] = []
+
+    def spy(tracker: Tracker, t_s: float, p_m: np.ndarray, parent: int, *rest: Any) -> MotionInnovation:
+        innovation = predicted(tracker, t_s, p_m, parent, *rest)
+        if not tracker._fragments.of(parent).joined:
+            since_s = t_s - tracker.graph.time_of(parent)
+            velocity_m2 = tracker._velocity_cov[:2, :2] * since_s**2
+            beyond.append(float(np.linalg.eigvalsh(innovation.cov_m2[:2, :2] - velocity_m2)[0]))
+        return innovation
+
+    monkeypatch.setattr(Tracker, "_motion_innovation", spy)
+    flight = Flight(FRAMES, seed=5)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=3.0, turns_rad=2.0)
+    flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    assert len(beyond) > 5 and min(beyond) > 0.0
+
+
 def test_the_anchor_follows_what_pictures_show_and_returns_to_the_flight_afterwards() -> None:
     flight = Flight(FRAMES, seed=5)
     other = Flight(FRAMES + LATER, seed=11, speed_mps=25.0, turns_rad=2.0)
@@ -177,10 +199,18 @@ def test_a_frozen_picture_is_not_shown_to_the_anchor() -> None:
     assert predicted >= {FIRST - 1, *range(END, FRAMES)}
 
 
-def test_a_frozen_camera_is_recognised_where_no_heading_is_reported() -> None:
-    """Nothing predicts the motion then; that it lasts tells all the same."""
-    flight = Flight(FRAMES, seed=7, knows=frozenset({"attitude", "height"}))
-    listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight, fixes=False)
+@pytest.mark.parametrize("found", [True, False])
+def test_a_frozen_camera_is_recognised_where_no_heading_is_reported(found: bool) -> None:
+    """``found``: the map has told the heading by then. Else nothing predicts the motion, but the time tells."""
+    flight, listener = Flight(FRAMES, seed=7, knows=frozenset({"attitude", "height"})), Listener()
+    listener.hear([ORIGIN])
+    for i in range(FRAMES):
+        messages = flight.messages(i) if found and i < FIRST else without(flight.messages(i), MapMatch)
+        if FIRST <= i < END:
+            messages = [*without(messages, Odometry), frozen(flight, i)]
+        elif i == END:  # its keyframe showed something else
+            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
+        listener.hear(messages)
     verdicts = listener.verdicts("odometry")
     lasts = FIRST + round(AT_REST_S / FRAME_S)
     assert all(verdicts[i].verdict is Verdict.STALLED for i in range(lasts, END))

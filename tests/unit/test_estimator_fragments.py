@@ -42,6 +42,12 @@ def test_motion_as_predicted_joins_a_fragment_after_two_frames_in_a_row() -> Non
     assert fragment.joined and JOIN_FRAMES == 2
 
 
+def test_a_fragment_that_is_joined_stays_so() -> None:
+    fragment = Fragment(0.0, joined=True)
+    fragment.weigh(0.5, evidence(6.0))
+    assert fragment.joined
+
+
 def test_the_motion_of_another_flight_joins_nothing() -> None:
     fragment = Fragment(0.0)
     for i in range(20):

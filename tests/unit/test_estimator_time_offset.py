@@ -28,11 +28,13 @@ def attitude(t_s: float, yaw_rad: float) -> VehicleState:
     return VehicleState(t_ns=round(t_s * 1e9), source="test", yaw_rad=yaw_rad, pitch_rad=0.0, roll_rad=0.0)
 
 
-def flown(late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: int = 1) -> TimeOffset:
+def flown(
+    late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: int = 1, every_s: float = FRAME_S
+) -> TimeOffset:
     """Pictures stamped ``late_s`` after they were taken."""
     rng = np.random.default_rng(seed)
     telemetry, offset = Telemetry(), TimeOffset()
-    reported_s, frame_s = np.arange(0.0, SECONDS, TELEMETRY_S), np.arange(3.0, SECONDS, FRAME_S)
+    reported_s, frame_s = np.arange(0.0, SECONDS, TELEMETRY_S), np.arange(3.0, SECONDS, every_s)
     yaw = heading_rad(reported_s, turns) + np.radians(noise_deg) * rng.normal(size=len(reported_s))
     seen = np.unwrap(heading_rad(frame_s - late_s, turns)) + np.radians(0.1) * rng.normal(size=len(frame_s))
     at = 0
@@ -43,7 +45,7 @@ def flown(late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: in
         if i:
             turn_rad = math.remainder(float(seen[i] - seen[i - 1]), math.tau)
             offset.add(Turn(round(frame_s[i - 1] * 1e9), round(t_s * 1e9), turn_rad), telemetry)
-        offset.step(FRAME_S)
+        offset.step(every_s)
     return offset
 
 
@@ -83,7 +85,11 @@ def test_headings_that_nobody_reports_are_not_waited_for() -> None:
     telemetry, offset = Telemetry(), TimeOffset()
     for i in range(1000):
         offset.add(Turn(i * 10**9, (i + 1) * 10**9, 0.5), telemetry)
-    assert offset.applied_s == 0.0 and len(offset._waiting) < 100
+    assert offset.applied_s == 0.0 and len(offset._waiting) < 6
+
+
+def test_sixty_frames_a_second_wait_for_their_headings_as_long_as_one() -> None:
+    assert flown(1.0, every_s=1.0 / 60.0).applied_s == pytest.approx(1.0, abs=0.1)
 
 
 class LateCamera(TimeOffset):
