@@ -212,7 +212,15 @@ def test_what_is_published_is_positive_definite_however_place_and_attitude_are_c
     for place, angle in ((0, 4), (1, 3)):
         cov[place, angle] = cov[angle, place] = 0.99 * sigma_m * 0.1
     _, claimed = weighed(sigma_m, *modes).claim(cov)
-    assert np.linalg.eigvalsh(claimed).min() > 0.0
+    assert np.linalg.eigvalsh(claimed).min() > 0.0 and (claimed == claimed.T).all()
+
+
+def test_a_mode_elsewhere_widens_as_a_placed_estimate_does_and_narrows_with_it_no_more() -> None:
+    hypotheses = weighed(5.0, (300.0, 0.0, 0.4))
+    claimed = [hypotheses.claim(np.diag([var_m2] * 3 + [0.01] * 3))[1][1, 1] for var_m2 in (25.0, 125.0, 5.0)]
+    assert claimed == pytest.approx(
+        [0.6 * 25.0 + 0.4 * MODE_M2, 0.6 * 125.0 + 0.4 * (MODE_M2 + 100.0), 3.0 + 0.4 * MODE_M2]
+    )
 
 
 @pytest.mark.parametrize("mass", [0.7, 0.2])
