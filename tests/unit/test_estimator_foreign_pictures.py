@@ -1,14 +1,18 @@
 """Pictures of another flight, and a camera that is frozen: what the estimate says while they last and afterwards."""
 
 import math
-from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from simulated_flight import FRAME_S, Flight, Listener, blind, cov_of, error_m, sigma_m, t_ns
+from simulated_flight import FRAME_S, ORIGIN, Flight, Listener, blind, cov_of, error_m, sigma_m, t_ns
 
-from terrafix.messages import MapMatch, Message, Odometry, Prediction, Verdict
+from terrafix.estimator.integrity.motion_gate import MotionInnovation
+from terrafix.estimator.integrity.static_picture import AT_REST_S
+from terrafix.estimator.tracker import MOTION_TIMEOUT_S, Tracker
+from terrafix.estimator.velocity import MAX_SPEED_SIGMA_MPS
+from terrafix.messages import MapMatch, Message, Odometry, Prediction, VehicleState, Verdict
 
 FIRST, END, FRAMES = 30, 42, 70  # frames of the lie, of the flight
 LATER = 9  # frames: the other flight has turned by then
@@ -114,6 +118,48 @@ def test_a_new_fragment_that_moves_as_predicted_is_the_flight_without_any_map() 
     assert mahalanobis(listener, flight, FRAMES - 1) < 3.5
 
 
+@pytest.mark.parametrize("said", [Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE, "coarse"])
+def test_looks_that_find_nothing_where_every_look_found_a_pose_speak_against_a_new_fragment(
+    said: Verdict | str,
+) -> None:
+    """It moves as predicted, which would join it; one pose joins it."""
+    flight = Flight(FRAMES, seed=6, fix_every=1)
+    listener = Listener().fly(flight, 0, FIRST)
+    for i in range(FIRST, END):
+        odometry, match = odometry_of(flight.messages(i)), flight.fix(i)
+        if i == FIRST:
+            odometry = blind(odometry)
+        if said == "coarse":
+            match = msgspec.structs.replace(match, coarse=True)
+        elif isinstance(said, Verdict):
+            match = msgspec.structs.replace(match, verdict=said)
+        listener.hear([*without(flight.messages(i), Odometry, MapMatch), odometry, match])
+    verdicts = listener.verdicts("odometry")
+    assert all(verdicts[i].verdict is Verdict.UNCONFIRMED for i in range(FIRST + 1, END))
+    listener.hear([flight.fix(END - 1), *flight.messages(END)])
+    assert listener.verdicts("odometry")[END].verdict is Verdict.ACCEPTED
+
+
+def test_the_motion_of_an_unjoined_fragment_is_predicted_from_its_keyframe_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Velocity led the keyframe there, too, so that its error counts over all of the time since."""
+    predicted = Tracker._motion_innovation
+    beyond: list[float] = []
+
+    def spy(tracker: Tracker, t_s: float, p_m: np.ndarray, parent: int, *rest: Any) -> MotionInnovation:
+        innovation = predicted(tracker, t_s, p_m, parent, *rest)
+        if not tracker._fragments.of(parent).joined:
+            since_s = t_s - tracker.graph.time_of(parent)
+            velocity_m2 = tracker._velocity_cov[:2, :2] * since_s**2
+            beyond.append(float(np.linalg.eigvalsh(innovation.cov_m2[:2, :2] - velocity_m2)[0]))
+        return innovation
+
+    monkeypatch.setattr(Tracker, "_motion_innovation", spy)
+    flight = Flight(FRAMES, seed=5)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=3.0, turns_rad=2.0)
+    flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    assert len(beyond) > 5 and min(beyond) > 0.0
+
+
 def test_the_anchor_follows_what_pictures_show_and_returns_to_the_flight_afterwards() -> None:
     flight = Flight(FRAMES, seed=5)
     other = Flight(FRAMES + LATER, seed=11, speed_mps=25.0, turns_rad=2.0)
@@ -153,23 +199,96 @@ def test_a_frozen_picture_is_not_shown_to_the_anchor() -> None:
     assert predicted >= {FIRST - 1, *range(END, FRAMES)}
 
 
-def test_velocity_that_odometry_contradicts_for_seconds_is_given_up() -> None:
-    """Nothing tells which of the two is wrong, so the claim must hold for both."""
-    flight = Flight(FRAMES, seed=8)
+@pytest.mark.parametrize("found", [True, False])
+def test_a_frozen_camera_is_recognised_where_no_heading_is_reported(found: bool) -> None:
+    """``found``: the map has told the heading by then. Else nothing predicts the motion, but the time tells."""
+    flight, listener = Flight(FRAMES, seed=7, knows=frozenset({"attitude", "height"})), Listener()
+    listener.hear([ORIGIN])
+    for i in range(FRAMES):
+        messages = flight.messages(i) if found and i < FIRST else without(flight.messages(i), MapMatch)
+        if FIRST <= i < END:
+            messages = [*without(messages, Odometry), frozen(flight, i)]
+        elif i == END:  # its keyframe showed something else
+            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
+        listener.hear(messages)
+    verdicts = listener.verdicts("odometry")
+    lasts = FIRST + round(AT_REST_S / FRAME_S)
+    assert all(verdicts[i].verdict is Verdict.STALLED for i in range(lasts, END))
+    assert verdicts[FRAMES - 1].verdict is Verdict.ACCEPTED
+
+
+def test_a_frozen_picture_stays_one_when_the_graph_begins_anew() -> None:
+    """Its keyframe is older than the new graph; that does not make it a picture for the anchor."""
+    flight = Flight(FRAMES, seed=7)
     listener = Listener().fly(flight, 0, FIRST)
-    jumped = replace(flight, seed=8, speed_mps=75.0)
-    first_refused = None
-    for i in range(FIRST, FRAMES):
-        said = odometry_of(jumped.messages(i))
+    for i in range(FIRST, END):
+        listener.hear([*without(flight.messages(i), Odometry, MapMatch), frozen(flight, i)])
+        if i == FIRST + 2:
+            listener.hear([msgspec.structs.replace(flight.fix(FIRST - 1), found=True)])
+    verdicts = listener.verdicts("odometry")
+    assert all(verdicts[i].verdict is Verdict.STALLED for i in range(FIRST, END))
+
+
+def test_a_view_that_changed_while_nothing_was_tracked_ends_a_frozen_picture() -> None:
+    flight = Flight(FRAMES, seed=7)
+    hover = msgspec.structs.replace(frozen(flight, FIRST), pairs=[])  # static, and nothing is tracked in it
+    lie = {FIRST: frozen(flight, FIRST), FIRST + 1: blind(frozen(flight, FIRST + 1))}
+    lie[FIRST + 2] = msgspec.structs.replace(hover, t_ns=t_ns(FIRST + 2), frame_id=FIRST + 2)
+    verdicts = flown(lie, flight).verdicts("odometry")
+    assert verdicts[FIRST].verdict is Verdict.STALLED
+    assert verdicts[FIRST + 2].verdict is Verdict.FEW_INLIERS
+
+
+def test_pictures_that_vision_skips_do_not_end_a_frozen_one() -> None:
+    flight = Flight(FRAMES, seed=7)
+    lie = {i: frozen(flight, i) for i in range(FIRST, END)}
+    for i, verdict in ((FIRST + 1, Verdict.STALLED), (FIRST + 3, Verdict.BAD_IMAGE)):
+        lie[i] = blind(lie[i], verdict)
+        lie[i + 1] = msgspec.structs.replace(lie[i + 1], pairs=[])
+    verdicts = flown(lie, flight).verdicts("odometry")
+    assert [verdicts[i].verdict for i in (FIRST + 1, FIRST + 2)] == [Verdict.STALLED] * 2
+    assert [verdicts[i].verdict for i in (FIRST + 3, FIRST + 4)] == [Verdict.BAD_IMAGE, Verdict.STALLED]
+
+
+def test_the_step_after_frames_that_the_anchor_did_not_see_is_known_as_the_way_over_all_of_them() -> None:
+    flight = Flight(FRAMES, seed=7)
+    listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
+    said = {m.frame_id: m for m in listener.said if isinstance(m, Prediction)}
+    truth_m = (flight.p_m[END] - flight.p_m[FIRST - 1])[:2]
+    sigma = math.sqrt(said[END].step_cov_m2[0])
+    assert np.linalg.norm(said[END].step_m - truth_m) < 3.5 * sigma
+    grown_m2 = cov_of(listener.estimate(END))[:2, :2] - cov_of(listener.estimate(FIRST - 1))[:2, :2]
+    assert sigma > 0.7 * math.sqrt(np.linalg.eigvalsh(grown_m2)[-1])
+    assert math.sqrt(said[END + 1].step_cov_m2[0]) < 0.5 * sigma
+
+
+def test_two_frames_with_one_time_stamp_are_no_evidence_of_motion() -> None:
+    flight = Flight(FRAMES, seed=5)
+    still = msgspec.structs.replace(frozen(flight, FIRST + 1), t_ns=t_ns(FIRST), keyframe_id=FIRST, static=False)
+    listener = Listener().fly(flight, 0, FIRST)
+    listener.hear([*without(flight.messages(FIRST), Odometry, MapMatch), blind(odometry_of(flight.messages(FIRST)))])
+    listener.hear([still])
+    assert listener.verdicts("odometry")[FIRST + 1].verdict is Verdict.UNCONFIRMED
+
+
+@pytest.mark.parametrize(("speed_mps", "then"), [(110.0, Verdict.ACCEPTED), (150.0, Verdict.IMPLAUSIBLE)])
+def test_velocity_that_odometry_contradicts_for_seconds_is_given_up_once(speed_mps: float, then: Verdict) -> None:
+    """Nothing tells which of the two is wrong, so the claim must hold for both."""
+    flight, impossible = Flight(FRAMES, seed=8), Flight(FRAMES, seed=8, speed_mps=speed_mps)
+    listener = Listener().fly(flight, 0, FIRST)
+    timeout = FIRST + 2 + round(MOTION_TIMEOUT_S / FRAME_S)  # the first frame that is surely later than it
+    for i in range(FIRST, timeout + 4):
+        said = odometry_of(impossible.messages(i))
+        if i == FIRST:  # one motion that is possible: the five seconds begin after it
+            said = odometry_of(flight.messages(i))
         listener.hear([*without(flight.messages(i), Odometry, MapMatch), said])
-        verdict = listener.verdicts("odometry")[i].verdict
-        if verdict is Verdict.IMPLAUSIBLE and first_refused is None:
-            first_refused = i
-        if first_refused is not None and (i - first_refused) * FRAME_S > 6.0:
-            assert sigma_m(listener.estimate(i)) > 15.0
-            assert any("contradicts velocity" in v.detail for v in listener.verdicts("reset").values())
-            return
-    pytest.fail("odometry of 75 m/s was taken for this flight's at once")
+    verdicts = listener.verdicts("odometry")
+    assert all(verdicts[i].verdict is Verdict.IMPLAUSIBLE for i in range(FIRST + 1, timeout + 1))
+    assert list(listener.verdicts("reset")) == [timeout]
+    assert "contradicts velocity for 5 s" in listener.verdicts("reset")[timeout].detail
+    assert sigma_m(listener.estimate(timeout)) > 15.0
+    assert listener.estimate(timeout).velocity_sigma_mps >= MAX_SPEED_SIGMA_MPS[0]
+    assert verdicts[timeout + 1].verdict is then
 
 
 def test_a_coarse_match_does_not_join_a_fragment_to_the_flight() -> None:
@@ -200,6 +319,47 @@ def test_a_height_that_keeps_the_anchor_from_looking_is_given_up_for_the_reporte
     for i in range(21, 30):
         listener.hear(flight.messages(i))
     assert list(listener.verdicts("reset")) == [20]
+
+
+@pytest.mark.parametrize("reported_m", [20.0, 40.0])
+def test_a_reported_height_that_would_hardly_be_looked_from_resets_nothing(reported_m: float) -> None:
+    flight = Flight(25, seed=3, dem=True)
+    listener = Listener().fly(flight, 0, 20)
+    fix = flight.fix(19)
+    assert fix.p_c_in_w_m is not None
+    listener.hear([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    state = next(m for m in flight.messages(20) if isinstance(m, VehicleState))
+    listener.hear([msgspec.structs.replace(state, agl_m=reported_m), odometry_of(flight.messages(20))])
+    assert listener.estimate(20).agl_m < 25.0 and listener.verdicts("reset") == {}
+
+
+def test_without_a_map_of_the_ground_a_low_height_resets_nothing() -> None:
+    flight = Flight(25, seed=3)
+    listener = Listener().fly(flight, 0, 20)
+    fix = flight.fix(19)
+    assert fix.p_c_in_w_m is not None
+    listener.hear([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    listener.hear(without(flight.messages(20), MapMatch))
+    assert listener.estimate(20).agl_m < 25.0 and listener.verdicts("reset") == {}
+
+
+def test_the_height_after_a_reset_is_the_reported_one_above_the_take_off() -> None:
+    """The take-off was 60 m higher than the ground here."""
+    flight, above_m = Flight(25, seed=3, dem=True), 60.0
+    listener = Listener()
+    listener.hear([msgspec.structs.replace(ORIGIN, ground_amsl_m=above_m)])
+    for i in range(21):
+        for m in flight.messages(i):
+            if isinstance(m, VehicleState) and m.agl_m is not None:
+                m = msgspec.structs.replace(m, agl_m=m.agl_m - above_m)
+            if i < 20 or not isinstance(m, MapMatch):
+                listener.hear([m])
+        if i == 19:
+            fix = flight.fix(19)
+            assert fix.p_c_in_w_m is not None
+            listener.hear([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    assert list(listener.verdicts("reset")) == [20]
+    assert listener.estimate(20).agl_m == pytest.approx(flight.p_m[20, 2], abs=15.0)
 
 
 def test_a_flight_at_its_reported_height_is_never_reset() -> None:

@@ -10,8 +10,6 @@ from terrafix.estimator.integrity.fragments import (
     FOREIGN_SPEED_MPS,
     JOIN_FRAMES,
     JOIN_LLR,
-    LASTING_FRAMES,
-    LASTING_S,
     Fragment,
     Fragments,
     MapHits,
@@ -29,12 +27,25 @@ def test_the_evidence_of_a_motion_is_the_ratio_of_the_two_densities() -> None:
     assert evidence(0.7).llr == pytest.approx(math.log(own / foreign))
 
 
+def test_motion_speaks_for_the_flight_when_it_is_twenty_times_as_likely_as_that_of_any_up_to_30_mps() -> None:
+    sigma_m, foreign = 0.5, 1.0 / (math.pi * (30.0 * 0.5) ** 2)
+    for factor, speaks in ((18.0, False), (22.0, True)):
+        off_m = sigma_m * math.sqrt(-2.0 * math.log(factor * foreign * 2.0 * math.pi * sigma_m**2))
+        assert evidence(off_m, sigma_m).speaks_for_own(0.0) is speaks
+
+
 def test_motion_as_predicted_joins_a_fragment_after_two_frames_in_a_row() -> None:
     fragment = Fragment(0.0)
     for i, off_m in enumerate([0.3, 6.0, 0.3, 0.3]):
         assert not fragment.joined
         fragment.weigh(0.5 * i, evidence(off_m))
     assert fragment.joined and JOIN_FRAMES == 2
+
+
+def test_a_fragment_that_is_joined_stays_so() -> None:
+    fragment = Fragment(0.0, joined=True)
+    fragment.weigh(0.5, evidence(6.0))
+    assert fragment.joined
 
 
 def test_the_motion_of_another_flight_joins_nothing() -> None:
@@ -76,6 +87,19 @@ def test_no_pose_on_a_map_that_usually_gives_one_speaks_against_a_fragment() -> 
     assert new.joined
 
 
+def test_the_share_of_looks_that_find_a_pose_is_learnt_over_ten_of_them() -> None:
+    hits, own, new = MapHits(), Fragment(0.0, joined=True), Fragment(0.0)
+    for _ in range(10):
+        hits.looked(own, found=True)
+    hits.looked(new, found=False)
+    assert new.map_llr == pytest.approx(10.0 * math.log(0.9))
+    hits.looked(own, found=False)
+    assert own.map_llr == 0.0
+    later = Fragment(0.0)
+    hits.looked(later, found=False)
+    assert later.map_llr == pytest.approx(math.log(1.0 - 0.9 * (1.0 - 0.9**10)))
+
+
 def test_where_the_map_never_gives_a_pose_its_silence_says_nothing() -> None:
     hits, new = MapHits(), Fragment(0.0)
     for _ in range(20):
@@ -91,12 +115,15 @@ def test_pictures_that_turn_otherwise_than_the_heading_are_not_of_this_flight() 
 
 def test_a_fragment_that_lasts_is_the_flight_in_the_end() -> None:
     often, long = Fragment(0.0), Fragment(0.0)
-    for i in range(LASTING_FRAMES + 5):
+    for i in range(25):
         often.weigh(0.1 * i, evidence(6.0, over_s=0.1))
-    long.weigh(LASTING_S + 1.0, evidence(6.0))
+    often.weigh(29.9, evidence(6.0))
+    for i in range(18):
+        long.weigh(31.0 + i, evidence(6.0))
     assert not often.joined and not long.joined
-    often.weigh(LASTING_S, evidence(6.0))
-    assert often.joined
+    often.weigh(30.0, evidence(6.0))
+    long.weigh(50.0, evidence(6.0))
+    assert often.joined and long.joined
 
 
 def test_nodes_know_their_fragment_and_where_in_it_they_are() -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, Flight, Listener, cov_of, error_m, sigma_m
 
-from terrafix.estimator.integrity.position_hypotheses import LEAST_WEIGHT, MODE_SIGMA, MOST_WEIGHT, PositionHypotheses
+from terrafix.estimator.integrity.position_hypotheses import LEAST_WEIGHT, PositionHypotheses
 from terrafix.messages import MapMatch, Message, Refinement, SearchStep, SourceEnded, Verdict
 
 WRONG_M = (700.0, -500.0)
@@ -122,15 +122,15 @@ def test_anywhere_is_what_the_anchor_says_and_lies_in_the_plane() -> None:
 
 
 HEIGHT_M, MODE_VAR_M2 = 100.0, 4.0
-MODE_M2 = MODE_VAR_M2 + (MODE_SIGMA * HEIGHT_M) ** 2  # of a mode's place, where no tilt is uncertain
+MODE_M2 = MODE_VAR_M2 + 3.0**2  # 3 % of the height: of a mode's place, where no tilt is uncertain
 BELIEF = (50.0, 20.0), (9000.0, 0.0, 0.0, 400.0)  # mean and covariance of all of it; the estimate is at (10, 20)
 
 
-def weighed(sigma_m: float, *modes: tuple[float, float, float]) -> PositionHypotheses:
-    """An estimate at (10, 20), known to ``sigma_m``, and modes: offset east and north, mass."""
+def weighed(sigma_m: float, *modes: tuple[float, float, float], cov: np.ndarray | None = None) -> PositionHypotheses:
+    """An estimate at (10, 20), known to ``sigma_m`` or ``cov`` (6, 6), and modes: offset east and north, mass."""
     hypotheses = PositionHypotheses()
     said = [(10.0 + e, 20.0 + n, mass, MODE_VAR_M2) for e, n, mass in modes]
-    cov = np.diag([sigma_m**2] * 3 + [0.0] * 3)
+    cov = np.diag([sigma_m**2] * 3 + [0.0] * 3) if cov is None else cov
     match = msgspec.structs.replace(Flight(2).fix(1), verdict=Verdict.AMBIGUOUS, modes=said)
     match = msgspec.structs.replace(match, belief_m=BELIEF[0], belief_cov_m2=BELIEF[1])
     hypotheses.weigh(match, np.array([10.0, 20.0, HEIGHT_M]), cov, HEIGHT_M)
@@ -148,7 +148,7 @@ def test_a_mode_that_leads_a_wide_belief_is_published_with_the_moments_about_it(
 
 def test_a_mode_without_a_pose_is_never_sure() -> None:
     _, cov = weighed(60.0, (300.0, 0.0, 0.99)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
-    assert cov[0, 0] == pytest.approx((1.0 - MOST_WEIGHT) * (3600.0 + 300.0**2) + MOST_WEIGHT * MODE_M2)
+    assert cov[0, 0] == pytest.approx(0.2 * (3600.0 + 300.0**2) + 0.8 * MODE_M2)
 
 
 @pytest.mark.parametrize(("mass", "rival", "leads"), [(0.26, 0.1, True), (0.24, 0.06, False), (0.4, 0.17, False)])
@@ -181,11 +181,78 @@ def test_the_mode_where_a_placed_graph_is_and_one_of_hardly_any_weight_change_no
     assert weighed(5.0, (30.0, 0.0, 0.9)).are_several
 
 
+@pytest.mark.parametrize(("mass", "counts"), [(0.04, False), (0.06, True)])
+def test_a_mode_counts_from_a_twentieth_of_the_mass_on(mass: float, counts: bool) -> None:
+    assert weighed(5.0, (300.0, 0.0, mass)).are_several is counts
+
+
+@pytest.mark.parametrize(
+    ("east_m", "north_m", "placed"), [(14.0, 14.0, True), (16.0, 16.0, False), (5.0, 16.0, False), (16.0, 5.0, False)]
+)
+def test_a_graph_is_placed_when_its_worst_axis_is_below_15_percent_of_the_height(
+    east_m: float, north_m: float, placed: bool
+) -> None:
+    cov = np.diag([east_m**2, north_m**2, 1.0, 0.0, 0.0, 0.0])
+    at_m, _ = weighed(0.0, (300.0, 0.0, 0.7), cov=cov).claim(cov)
+    assert at_m.tolist() == ([0.0, 0.0] if placed else [300.0, 0.0])
+
+
+def test_a_place_that_is_seen_is_known_as_badly_as_the_tilt() -> None:
+    """From 100 m 0.2 rad about north are 20 m to the east, 0.1 rad about east are 10 m to the north."""
+    tilted = np.diag([3600.0, 3600.0, 1.0, 0.1**2, 0.2**2, 0.0])
+    cov = np.diag([3600.0] * 3 + [0.01] * 3)
+    lever_m2 = (
+        weighed(60.0, (300.0, 0.0, 0.7), cov=tilted).claim(cov)[1] - weighed(60.0, (300.0, 0.0, 0.7)).claim(cov)[1]
+    )
+    assert np.diag(lever_m2)[:2] == pytest.approx([0.7 * 20.0**2, 0.7 * 10.0**2])
+    belief_m2 = weighed(60.0, (300.0, 0.0, 0.2), cov=tilted).claim(cov)[1]
+    assert np.diag(belief_m2)[:2] == pytest.approx([9000.0 + 40.0**2 + 20.0**2, 400.0 + 10.0**2])
+    near = np.diag([25.0, 25.0, 1.0, 0.1**2, 0.2**2, 0.0])
+    assert not weighed(5.0, (60.0, 0.0, 0.9), cov=near).are_several and weighed(5.0, (60.0, 0.0, 0.9)).are_several
+
+
 def test_two_other_places_share_what_a_placed_estimate_leaves() -> None:
     at_m, cov = weighed(5.0, (300.0, 0.0, 0.3), (0.0, -400.0, 0.2)).claim(np.diag([25.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == [0.0, 0.0]
     assert cov[0, 0] == pytest.approx(0.5 * 25.0 + 0.3 * (300.0**2 + MODE_M2) + 0.2 * MODE_M2)
     assert cov[1, 1] == pytest.approx(0.5 * 25.0 + 0.3 * MODE_M2 + 0.2 * (400.0**2 + MODE_M2))
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "modes"),
+    [
+        (60.0, [(300.0, 0.0, 0.7)]),  # a leading mode
+        (60.0, [(300.0, 0.0, 0.2)]),  # a wide belief without one
+        (200.0, [(30.0, 0.0, 0.7)]),  # a prior that is wider than the belief
+        (14.0, [(300.0, 0.0, 0.4), (0.0, 300.0, 0.5)]),  # other places than that of a placed graph
+    ],
+)
+def test_what_is_published_is_positive_definite_however_place_and_attitude_are_correlated(
+    sigma_m: float, modes: list[tuple[float, float, float]]
+) -> None:
+    cov = np.diag([sigma_m**2] * 2 + [4.0] + [0.01] * 3)
+    for place, angle in ((0, 4), (1, 3)):
+        cov[place, angle] = cov[angle, place] = 0.99 * sigma_m * 0.1
+    _, claimed = weighed(sigma_m, *modes).claim(cov)
+    assert np.linalg.eigvalsh(claimed).min() > 0.0 and (claimed == claimed.T).all()
+
+
+def test_a_mode_elsewhere_widens_as_a_placed_estimate_does_and_narrows_with_it_no_more() -> None:
+    hypotheses = weighed(5.0, (300.0, 0.0, 0.4))
+    claimed = [hypotheses.claim(np.diag([var_m2] * 3 + [0.01] * 3))[1][1, 1] for var_m2 in (25.0, 125.0, 5.0)]
+    assert claimed == pytest.approx(
+        [0.6 * 25.0 + 0.4 * MODE_M2, 0.6 * 125.0 + 0.4 * (MODE_M2 + 100.0), 3.0 + 0.4 * MODE_M2]
+    )
+
+
+@pytest.mark.parametrize("mass", [0.7, 0.2])
+def test_a_belief_that_no_look_renews_widens_as_the_estimate_does(mass: float) -> None:
+    hypotheses = weighed(60.0, (300.0, 0.0, mass))
+    wide, wider = np.diag([3600.0] * 3 + [0.01] * 3), np.diag([3600.0, 5000.0] + [3600.0] + [0.01] * 3)
+    at_m, before = hypotheses.claim(wide)
+    now_m, now = hypotheses.claim(wider)
+    assert now_m.tolist() == at_m.tolist()
+    assert now[:2, :2] - before[:2, :2] == pytest.approx(np.diag([0.0, 1400.0]))
 
 
 def test_a_match_that_agrees_ends_it() -> None:

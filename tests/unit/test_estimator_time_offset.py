@@ -2,12 +2,15 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
+from simulated_flight import ORIGIN, Flight, Listener, blind, cov_of, t_ns
 
+from terrafix.core.geodesy import yaw_of
 from terrafix.estimator.integrity.time_offset import PRIOR_S, SLEW, TimeOffset, Turn
 from terrafix.estimator.telemetry import Telemetry
-from terrafix.messages import VehicleState
+from terrafix.messages import Odometry, Prediction, VehicleState
 
 FRAME_S, TELEMETRY_S = 0.5, 0.1
 
@@ -25,11 +28,13 @@ def attitude(t_s: float, yaw_rad: float) -> VehicleState:
     return VehicleState(t_ns=round(t_s * 1e9), source="test", yaw_rad=yaw_rad, pitch_rad=0.0, roll_rad=0.0)
 
 
-def flown(late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: int = 1) -> TimeOffset:
+def flown(
+    late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: int = 1, every_s: float = FRAME_S
+) -> TimeOffset:
     """Pictures stamped ``late_s`` after they were taken."""
     rng = np.random.default_rng(seed)
     telemetry, offset = Telemetry(), TimeOffset()
-    reported_s, frame_s = np.arange(0.0, SECONDS, TELEMETRY_S), np.arange(3.0, SECONDS, FRAME_S)
+    reported_s, frame_s = np.arange(0.0, SECONDS, TELEMETRY_S), np.arange(3.0, SECONDS, every_s)
     yaw = heading_rad(reported_s, turns) + np.radians(noise_deg) * rng.normal(size=len(reported_s))
     seen = np.unwrap(heading_rad(frame_s - late_s, turns)) + np.radians(0.1) * rng.normal(size=len(frame_s))
     at = 0
@@ -40,7 +45,7 @@ def flown(late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: in
         if i:
             turn_rad = math.remainder(float(seen[i] - seen[i - 1]), math.tau)
             offset.add(Turn(round(frame_s[i - 1] * 1e9), round(t_s * 1e9), turn_rad), telemetry)
-        offset.step(FRAME_S)
+        offset.step(every_s)
     return offset
 
 
@@ -80,4 +85,89 @@ def test_headings_that_nobody_reports_are_not_waited_for() -> None:
     telemetry, offset = Telemetry(), TimeOffset()
     for i in range(1000):
         offset.add(Turn(i * 10**9, (i + 1) * 10**9, 0.5), telemetry)
-    assert offset.applied_s == 0.0 and len(offset._waiting) < 100
+    assert offset.applied_s == 0.0 and len(offset._waiting) < 6
+
+
+def test_sixty_frames_a_second_wait_for_their_headings_as_long_as_one() -> None:
+    assert flown(1.0, every_s=1.0 / 60.0).applied_s == pytest.approx(1.0, abs=0.1)
+
+
+class LateCamera(TimeOffset):
+    """Is sure of an offset of a second, and keeps the turns that it is given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.turns: list[Turn] = []
+
+    @property
+    def estimate(self) -> tuple[float, float]:
+        return 1.0, 0.01
+
+    def add(self, turn: Turn, telemetry: Telemetry) -> None:
+        self.turns.append(turn)
+
+
+def test_the_node_shifts_frames_by_a_fifth_of_the_time_between_their_stamps_and_learns_at_the_stamps() -> None:
+    flight, late = Flight(30, seed=3), LateCamera()
+    listener = Listener().fly(flight, 0, 10)
+    listener.node._time_offset = late
+    listener.fly(flight, 10, 30)
+    shifted_s = [(t_ns(i) - listener.estimate(i).t_ns) * 1e-9 for i in range(10, 30)]
+    assert shifted_s == pytest.approx([min(SLEW * 0.5 * (i + 1), 1.0) for i in range(20)])
+    assert [(turn.t0_ns, turn.t1_ns) for turn in late.turns] == [(t_ns(i - 1), t_ns(i)) for i in range(10, 30)]
+
+
+def test_the_turns_that_the_node_learns_from_are_those_of_the_camera() -> None:
+    """From keyframe to keyframe and within, over north; none beside a frame in which nothing was tracked."""
+    flight, late, dark = Flight(50, seed=3, turns_rad=-4.0), LateCamera(), 25
+    listener = Listener().fly(flight, 0, 10)
+    listener.node._time_offset = late
+    for i in range(10, 50):
+        listener.hear([blind(m) if isinstance(m, Odometry) and i == dark else m for m in flight.messages(i)])
+    heading_rad = {t_ns(i): yaw_of(r) for i, r in enumerate(flight.r_w_b)}
+    off_rad = [
+        math.remainder(turn.yaw_rad - heading_rad[turn.t1_ns] + heading_rad[turn.t0_ns], math.tau)
+        for turn in late.turns
+    ]
+    assert np.abs(off_rad).max() < 0.05
+    assert max(abs(turn.yaw_rad) for turn in late.turns) > 0.9
+    assert {turn.t1_ns for turn in late.turns} == {t_ns(i) for i in range(10, 50) if i not in (dark, dark + 1)}
+
+
+class KnownTo(TimeOffset):
+    """An offset that is probably none, known to ``one_sigma_s``."""
+
+    def __init__(self, one_sigma_s: float) -> None:
+        super().__init__()
+        self._one_sigma_s = one_sigma_s
+
+    @property
+    def estimate(self) -> tuple[float, float]:
+        return 0.0, self._one_sigma_s
+
+
+def test_what_is_not_known_of_the_offset_is_claimed_along_the_way() -> None:
+    flight, covs_m2 = Flight(12, seed=3), []
+    for sigma_s in (1.0, 0.01):
+        listener = Listener().fly(flight, 0, 11)
+        listener.node._time_offset = KnownTo(sigma_s)
+        covs_m2.append(cov_of(listener.fly(flight, 11, 12).estimate(11))[:2, :2])
+    way_m = (flight.p_m[11] - flight.p_m[10])[:2]
+    along = way_m / np.linalg.norm(way_m)
+    across = np.array([along[1], -along[0]])
+    grown_m2 = covs_m2[0] - covs_m2[1]
+    assert along @ grown_m2 @ along == pytest.approx((PRIOR_S**2 - 0.01**2) * 12.0**2, rel=0.1)
+    assert across @ grown_m2 @ across == pytest.approx(0.0, abs=0.01)
+
+
+def test_another_camera_has_a_time_offset_of_its_own() -> None:
+    flight, late = Flight(12, seed=3), LateCamera()
+    listener = Listener().fly(flight, 0, 2)
+    listener.node._time_offset = late
+    listener.fly(flight, 2, 12)
+    assert late.applied_s > 0.5
+    listener.hear([msgspec.structs.replace(ORIGIN, start_sigma_m=20.0)])
+    listener.fly(flight, 10, 12)
+    assert listener.estimate(11).t_ns == t_ns(11)
+    first = [m for m in listener.said if isinstance(m, Prediction) and m.frame_id == 10][-1]
+    assert np.hypot(*first.step_m) < 1e-9

@@ -154,6 +154,27 @@ def test_a_run_of_foreign_frames_ends_where_the_flight_was(ground: np.ndarray) -
     assert tracker.track(11, picture(ground, track[11])).keyframe_id >= 10
 
 
+def test_a_frame_that_was_registered_to_a_keyframe_is_a_place_to_return_to(ground: np.ndarray) -> None:
+    """A large step makes the frame a keyframe; foreign frames come before any other was registered to it."""
+    tracker, other = FrameTracker(PINHOLE), texture(33, 190.0)
+    tracker.track(0, picture(ground, pose(0.0, 0.0)))
+    far = tracker.track(1, picture(ground, STEPS["far"]))
+    assert far.verdict is Verdict.ACCEPTED and far.becomes_keyframe
+    for i in (2, 3):
+        tracker.track(i, picture(other, pose(0.0, 5.0 * i)))
+    assert tracker.track(4, picture(ground, STEPS["far"])).keyframe_id == 1
+
+
+def test_foreign_frames_that_agree_with_nobody_end_where_the_flight_was_too(ground: np.ndarray) -> None:
+    tracker = FrameTracker(PINHOLE)
+    for i in range(4):
+        tracker.track(i, picture(ground, pose(0.0, 4.0 * i)))
+    alone = [tracker.track(4 + i, foreign(40 + i)) for i in range(MAX_MISSES)]
+    assert alone[-1].verdict is Verdict.ACCEPTED and alone[-1].keyframe_id == 3 + MAX_MISSES
+    back = tracker.track(4 + MAX_MISSES, picture(ground, pose(0.0, 16.0)))
+    assert back.verdict is Verdict.ACCEPTED and back.keyframe_id < 4
+
+
 def test_a_frame_that_agreed_with_nobody_is_no_place_to_return_to(ground: np.ndarray) -> None:
     tracker = FrameTracker(PINHOLE)
     tracker.track(0, foreign(20))  # alone

@@ -1,10 +1,12 @@
 """The vision node: what it says of pictures that are no measurement."""
 
+import msgspec
 import numpy as np
 
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import Camera, Frame, Odometry, Origin, Verdict
 from terrafix.vision.node import VisionNode
+from terrafix.vision.odometry import Motion
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 ORIGIN = Origin(
@@ -31,15 +33,22 @@ def noisy(image: np.ndarray, seed: int) -> np.ndarray:
     return np.clip(image + noise, 0, 255).astype(np.uint8)
 
 
-def verdicts(images: list[np.ndarray]) -> list[Verdict]:
+def odometry(images: list[np.ndarray], origins: dict[int, Origin] | None = None) -> list[Odometry]:
+    """``origins``: said before the frame of that number, besides the first."""
     store = MemoryFrameStore()
     node = VisionNode(store)
     list(node.on(ORIGIN))
     said = []
     for i, image in enumerate(images):
+        if origins and i in origins:
+            list(node.on(origins[i]))
         store.put(i, image)
         said += list(node.on(Frame(t_ns=i * 500_000_000, frame_id=i, file=f"{i}.jpg", width=640, height=480)))
-    return [m.verdict for m in said if isinstance(m, Odometry)]
+    return [m for m in said if isinstance(m, Odometry)]
+
+
+def verdicts(images: list[np.ndarray]) -> list[Verdict]:
+    return [m.verdict for m in odometry(images)]
 
 
 def test_a_camera_that_repeats_its_picture_is_stalled_until_a_new_one_comes() -> None:
@@ -53,3 +62,35 @@ def test_a_camera_that_repeats_its_picture_is_stalled_until_a_new_one_comes() ->
 def test_standing_still_over_the_same_ground_is_not_a_stall() -> None:
     still = picture(2)
     assert Verdict.STALLED not in verdicts([noisy(still, i) for i in range(5)])
+
+
+def test_a_picture_that_repeats_the_one_before_but_for_noise_is_called_static() -> None:
+    said = odometry([noisy(picture(1), 1), noisy(picture(1), 2), noisy(picture(2), 3)])
+    assert [m.static for m in said] == [False, True, False]
+
+
+def test_a_stale_buffer_is_stalled() -> None:
+    said = verdicts([noisy(picture(1), 1), noisy(picture(2), 2), noisy(picture(1), 3)])
+    assert said[2] is Verdict.STALLED
+
+
+def test_an_origin_that_is_said_again_changes_nothing_and_another_one_begins_anew() -> None:
+    still = noisy(picture(1), 1)
+    assert odometry([still, still], {1: ORIGIN})[1].verdict is Verdict.STALLED
+    other = odometry([still, still], {1: msgspec.structs.replace(ORIGIN, start_sigma_m=20.0)})[1]
+    assert other.verdict is Verdict.ACCEPTED and other.becomes_keyframe
+
+
+def test_points_that_three_keyframes_saw_name_the_first_of_them() -> None:
+    store = MemoryFrameStore()
+    node = VisionNode(store)
+    list(node.on(ORIGIN))
+    seen = np.arange(6.0).reshape(1, 6)
+    motion = Motion(4, Verdict.ACCEPTED, seen[:, :4], 0.001, 30, 40, True, 2, seen, 0.002)
+    assert node._tracker is not None
+    node._tracker.register = lambda frame_id, gray: motion  # type: ignore[method-assign]
+    store.put(5, picture(1))
+    (said,) = node.on(Frame(t_ns=0, frame_id=5, file="5.jpg", width=640, height=480))
+    assert isinstance(said, Odometry)
+    assert (said.before_id, said.keyframe_id, said.triples_sigma_norm) == (2, 4, 0.002)
+    assert said.pairs == [(0.0, 1.0, 2.0, 3.0)] and said.triples == [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]

@@ -79,3 +79,46 @@ def test_a_picture_older_than_the_history_is_new_ground_again() -> None:
     flown = [noisy(view(place, 4.0 * i), i) for i in range(HISTORY + 2)]
     assert looks([*flown, noisy(view(place, 0.0), 99)])[-1] is Repeat.NONE
     assert looks([*flown[:HISTORY], noisy(view(place, 0.0), 99)])[-1] is Repeat.OLDER
+
+
+@pytest.mark.parametrize("towards", [(1.0, 0.0), (0.0, 1.0)])
+def test_a_camera_that_sways_by_0_008_degrees_moves_and_one_that_sways_by_half_of_it_does_not(
+    towards: tuple[float, float],
+) -> None:
+    """With a field of view of 90 degrees over 720 px. OpenCV warps in steps of 1/32 px."""
+    place = ground(6)
+    for sway_px, said in ((2.0 / 32.0, Repeat.NONE), (1.0 / 32.0, Repeat.PREVIOUS)):
+        moved = view(place, 20.0 + sway_px * towards[0], sway_px * towards[1])
+        assert looks([noisy(view(place, 20.0), 1), noisy(moved, 2)])[1] is said
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_motion_in_one_quarter_of_the_picture_is_motion(row: int, column: int) -> None:
+    still, moved = cv2.resize(view(ground(7), 10.0), (360, 240)), cv2.resize(view(ground(7), 12.0), (360, 240))
+    now = still.copy()
+    quarter = slice(120 * row, 120 * (row + 1)), slice(180 * column, 180 * (column + 1))
+    now[quarter] = moved[quarter]
+    assert same_view(still, still) and not same_view(still, now)
+
+
+def test_fog_with_dark_edges_shows_no_displacement() -> None:
+    """Alike as such pictures are, nothing in them could show that the camera moves."""
+    y, x = np.mgrid[-1.0:1.0:480j, -1.0:1.0:720j]
+    fog = 150.0 - 40.0 * (x**2 + y**2)
+    assert looks([noisy(fog, i, 1.0) for i in range(3)]) == [Repeat.NONE] * 3
+
+
+def test_a_frozen_picture_of_little_contrast_is_recognised() -> None:
+    faint = 128.0 + 0.15 * (view(ground(8), 10.0) - 128.0)
+    assert looks([noisy(faint, i, 0.5) for i in range(3)]) == [Repeat.NONE, Repeat.PREVIOUS, Repeat.PREVIOUS]
+
+
+def test_two_buffers_in_turn_are_recognised_with_the_third_picture() -> None:
+    first, second = view(ground(9), 0.0), view(ground(9), 30.0)
+    said = looks([noisy(first, 1), noisy(second, 2), noisy(first, 3), noisy(second, 4)])
+    assert said == [Repeat.NONE, Repeat.NONE, Repeat.OLDER, Repeat.OLDER]
+
+
+def test_pictures_of_another_size_are_never_the_same_view() -> None:
+    still = view(ground(1), 10.0)
+    assert looks([noisy(still, 1), noisy(still[:400], 2)]) == [Repeat.NONE, Repeat.NONE]

@@ -71,8 +71,10 @@ class EstimatorNode:
         self._waiting: list[Odometry] = []  # for the autopilot's words, to which belongs what was learnt
         self._stand_in: StandIn | None = None  # for a keyframe that was left out
         self._time_offset = TimeOffset()
+        self._stamp_ns: int | None = None  # of the newest frame, as the camera has it
         self._predicted: int | None = None  # frame of the newest Prediction ...
-        self._from_m = np.zeros(2)  # ... and where it was, with its map match
+        self._from_m = np.zeros(2)  # ... and where it was, with its map match,
+        self._from_m2 = np.zeros((2, 2))  # known to this covariance
         self._monitors: Monitors | None = None
 
     @property
@@ -89,6 +91,7 @@ class EstimatorNode:
             case Origin() if message != self._origin:  # said again after a restart
                 self._origin, self._monitors = message, Monitors(message)
                 self._frame = LocalFrame(message.lat_deg, message.lon_deg)
+                self._time_offset, self._predicted = TimeOffset(), None  # of another camera, in other axes
                 self._begin(begun(message, self._start), self._known(message, self._frame))
                 waiting, self._coasted = self._coasted, []
                 for said in waiting:
@@ -169,8 +172,9 @@ class EstimatorNode:
         if estimator is None:
             return
         origin = estimator.origin
-        stamp_ns, last = odometry.t_ns, estimator.last
-        self._time_offset.step(0.0 if last is None else odometry.t_ns * 1e-9 - last.t_s)
+        stamp_ns = odometry.t_ns
+        before_ns, self._stamp_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns, stamp_ns
+        self._time_offset.step((stamp_ns - before_ns) * 1e-9)
         if self._time_offset.applied_s:
             t_ns = stamp_ns - round(self._time_offset.applied_s * 1e9)
             odometry = msgspec.structs.replace(odometry, t_ns=t_ns)
@@ -183,12 +187,11 @@ class EstimatorNode:
         seen = before is not None and before.frame_id == self._predicted
         if before is not None and seen:
             self._from_m = np.array(before.pose.translation()[:2])
+            self._from_m2 = tangent_to_world(before.cov, before.pose.rotation().matrix())[:2, :2]
         advance = estimator.advance(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, self._righted.felt)
         self._tracked = advance.verdict is Verdict.ACCEPTED
         if advance.turn is not None:
-            late_ns = stamp_ns - odometry.t_ns
-            stamps = replace(advance.turn, t0_ns=advance.turn.t0_ns + late_ns, t1_ns=stamp_ns)
-            self._time_offset.add(stamps, self._telemetry)
+            self._time_offset.add(replace(advance.turn, t0_ns=before_ns, t1_ns=stamp_ns), self._telemetry)
         yield _odometry_verdict(odometry, advance.verdict)
         if advance.reset:
             yield MeasurementVerdict(
@@ -282,13 +285,16 @@ class EstimatorNode:
 
     def _prediction(self, odometry: Odometry, advance: Advance, estimator: Estimator, seen: bool) -> Prediction:
         """``seen``: the frame before had a Prediction, too. After some that had none, what is known by now of the way
-        since the last one counts: odometry that begins again tells of the velocity in between."""
+        since the last one counts: odometry that begins again tells of the velocity in between. So does what the
+        covariance has grown by."""
         placed = advance.placed
         r_w_c = placed.pose.rotation().matrix()
         p = placed.pose.translation()
         cov = tangent_to_world(placed.cov, r_w_c)
-        step_var = advance.step_sigma_m**2
-        step = advance.step_m if seen or self._predicted is None else np.asarray(p[:2]) - self._from_m
+        step, step_var = advance.step_m, advance.step_sigma_m**2
+        if not seen and self._predicted is not None:
+            step = np.asarray(p[:2]) - self._from_m
+            step_var += max(float(np.linalg.eigvalsh(cov[:2, :2] - self._from_m2)[-1]), 0.0)
         return Prediction(
             t_ns=odometry.t_ns,
             frame_id=odometry.frame_id,

@@ -326,15 +326,20 @@ class Tracker:
 
     def _sighting(self, odometry: Odometry, t_s: float, before: NodeState, attitude: Attitude, felt: Feel) -> Sighting:
         """``before``: the newest node."""
+        if odometry.verdict in (Verdict.BAD_IMAGE, Verdict.STALLED):  # no new view, so nothing that could have changed
+            return Sighting(odometry.verdict, None, Fragment(t_s))
         answer = self._by_odometry(odometry, attitude)
         if isinstance(answer, Verdict):
-            return Sighting(answer, None, Fragment(t_s))
+            frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, moves=False)
+            return Sighting(Verdict.STALLED if frozen else answer, None, Fragment(t_s))
         parent, motion = answer
         fragment, keyframe = self._fragments.of(parent), self.graph.state(parent).pose
         moved_m = keyframe.rotation().matrix() @ motion.p_m
         in_fragment_m = self._fragments.at_m(parent) + moved_m[:2]
         local_step_m = None if fragment.joined else in_fragment_m - fragment.moved_m
         if attitude.stands or self._open is not None:  # nothing predicts the motion
+            if self._static_picture.is_frozen(t_s, attitude, static=odometry.static, moves=False):
+                return Sighting(Verdict.STALLED, None, Fragment(t_s))
             fragment.joined = True
         else:
             p_m = keyframe.translation() + moved_m
@@ -345,7 +350,7 @@ class Tracker:
             if frozen or not innovation.is_possible:
                 return Sighting(Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE, None, Fragment(t_s))
             if not fragment.joined:
-                over_s = t_s - self.graph.time_of(parent)
+                over_s = max(t_s - self.graph.time_of(parent), 1e-3)
                 yaw_off_rad, yaw_sigma_rad = self._heading_innovation(attitude, answer, before)
                 turns_agree = abs(yaw_off_rad) <= HEADING_GATE * yaw_sigma_rad
                 off_m, cov_m2 = innovation.off_m[:2], innovation.cov_m2[:2, :2]
@@ -386,7 +391,7 @@ class Tracker:
         cov_m2 = spread_after(way, self._velocity_cov)[:3, :3]
         if not self._fragments.of(parent).joined:  # velocity led here all the way from the keyframe
             since_s = t_s - self.graph.time_of(parent)
-            cov_m2 += self._velocity_cov[:3, :3] * (since_s**2 - dt_s**2)
+            cov_m2 += self._velocity_cov[:3, :3] * max(since_s**2 - dt_s**2, 0.0)
         r_w_c = self.graph.state(parent).pose.rotation().matrix() @ motion.r
         seen_m2 = r_w_c @ motion.cov[3:, 3:] @ r_w_c.T
         return MotionInnovation(p_m - led_to, cov_m2 + seen_m2, dt_s, way.inertial)
@@ -397,7 +402,10 @@ class Tracker:
             self._motion_refused_s = None
             return False
         self._motion_refused_s = t_s if self._motion_refused_s is None else self._motion_refused_s
-        return t_s - self._motion_refused_s >= MOTION_TIMEOUT_S
+        if t_s - self._motion_refused_s < MOTION_TIMEOUT_S:
+            return False
+        self._motion_refused_s = None  # velocity is unknown from here on: the next one has its own time
+        return True
 
     def _pictured_step(
         self, sighting: Sighting, p_m: np.ndarray, step_m: np.ndarray, sigma_m: float
@@ -599,6 +607,8 @@ class Tracker:
         bias, bias_cov = (np.zeros(BIAS_SIZE), assumed) if slow is None else slow
         r_w_c = self.camera.expected(attitude, bias)
         up_m = self.terrain.ground_m + agl
+        if origin.ground_amsl_m is not None and attitude.agl_m is not None:  # above the ground of the take-off
+            up_m = origin.ground_amsl_m + attitude.agl_m
         if slow is not None:  # seen heights, from the one that is told above the barometer's zero
             told_m = (origin.ground_amsl_m or 0.0) + agl - self.terrain.ground_m
             up_m = self.terrain.ground_m + told_m * float(np.exp(-bias[SCALE])) - float(bias[HEIGHT])
@@ -642,7 +652,7 @@ class Tracker:
         pose = self.graph.state(node).pose
         if fragment.frames == 1 and not fragment.joined:
             fragment.began_m = pose.translation()[:2]
-            fragment.began_cov_m2 = tangent_to_world(self.graph.covariance(node), pose.rotation().matrix())[:2, :2]
+            fragment.began_cov_m2 = tangent_to_world(self._covariance(node), pose.rotation().matrix())[:2, :2]
         self._fragment = fragment
         self._fragments.add(node, fragment)
         self._fragments.keep({n for n in self._node_of.values() if self.graph.holds(n)} | {node})

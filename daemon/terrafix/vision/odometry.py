@@ -224,9 +224,8 @@ class FrameTracker:
     ) -> Motion:
         """The motion that the matches (N, 2), (N, 2) tell, ``inliers`` of ``tracked`` of which agree."""
         self._misses, self._missed = 0, None
-        for registered in (keyframe, self._keyframe):
-            if registered is not None:
-                registered.registered = True
+        if self._keyframe is not None:
+            self._keyframe.registered = True
         pick = _spread(a, MAX_PAIRS)
         return Motion(
             keyframe.frame_id,

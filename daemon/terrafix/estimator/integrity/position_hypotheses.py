@@ -3,7 +3,7 @@
 What is published is the heaviest component, with the second moments of the mixture about it: the mean of two places
 would be neither of them (Gaussian sum filter: Alspach and Sorenson 1972)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,6 +52,7 @@ class PositionHypotheses:
         self.other = OtherPlace()
         self._modes: tuple[Component, ...] = ()  # of the belief, heaviest first
         self._belief: Component | None = None  # all of it, while no pose has placed the graph
+        self._own_m2 = np.zeros((2, 2))  # of the estimate that these were weighed against
 
     @property
     def are_several(self) -> bool:
@@ -68,7 +69,7 @@ class PositionHypotheses:
         whose prior the estimate was, knows the place better than that."""
         lever_m2 = height_m**2 * np.diag([cov[4, 4], cov[3, 3]])  # of a place that is seen, by tilt
         placed = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1])) < PLACED * height_m
-        modes = []
+        modes, self._own_m2 = [], cov[:2, :2].copy()
         for e_m, n_m, mass, var_m2 in match.modes:
             cov_m2 = (var_m2 + (MODE_SIGMA * height_m) ** 2) * np.eye(2) + lever_m2
             mode = Component(np.array([e_m, n_m]) - p_m[:2], cov_m2, mass)
@@ -93,23 +94,39 @@ class PositionHypotheses:
         """-> by how much (2,) what is published is off the estimate, and its covariance (6, 6), from that of the
         estimate, east and north first."""
         cov = cov.copy()
-        at_m, cov[:2, :2] = self._of_belief(cov[:2, :2]) if self._belief else self._of_modes(cov[:2, :2])
-        cov[:2, :2] += self.other.spread_m2() + max(self.anywhere_m, self._start_m) ** 2 * np.eye(2)
+        at_m, moments_m2, own = self._of_belief(cov[:2, :2]) if self._belief else self._of_modes(cov[:2, :2])
+        # Only in the estimate's own share are place, height and attitude correlated.
+        cov[:2, 2:] *= own
+        cov[2:, :2] *= own
+        cov[:2, :2] = moments_m2 + self.other.spread_m2() + max(self.anywhere_m, self._start_m) ** 2 * np.eye(2)
         return at_m, cov
 
-    def _of_modes(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The estimate, known to ``own_m2`` (2, 2), and the places that the belief has elsewhere."""
-        own = Component(np.zeros(2), own_m2, 1.0 - sum(mode.weight for mode in self._modes))
-        moments_m2 = np.sum([c.weight * c.about(own.offset_m) for c in (own, *self._modes)], axis=0)
-        return own.offset_m, moments_m2
+    def _of_modes(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """The estimate, known to ``own_m2`` (2, 2), and the places that the belief has elsewhere. -> offset (2,),
+        moments (2, 2) about it, and the weight of the estimate in these."""
+        modes = [self._by_now(mode, own_m2) for mode in self._modes]
+        own = Component(np.zeros(2), own_m2, 1.0 - sum(mode.weight for mode in modes))
+        moments_m2 = np.sum([c.weight * c.about(own.offset_m) for c in (own, *modes)], axis=0)
+        return own.offset_m, moments_m2, own.weight
 
-    def _of_belief(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """An estimate that no pose has placed: the belief, and what is left to the prior."""
+    def _of_belief(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """An estimate that no pose has placed: the belief, and what is left to the prior. Returns as ``_of_modes``."""
         assert self._belief is not None
-        prior = Component(np.zeros(2), own_m2, 1.0)
+        prior, belief = Component(np.zeros(2), own_m2, 1.0), self._by_now(self._belief, own_m2)
+        mode = self._leading_mode or Component(np.zeros(2), np.zeros((2, 2)), 0.0)
+        weight = min(mode.weight, MOST_WEIGHT)
+        rest = max(prior, belief, key=lambda component: float(np.trace(component.about(mode.offset_m))))
+        moments_m2 = weight * self._by_now(mode, own_m2).cov_m2 + (1.0 - weight) * rest.about(mode.offset_m)
+        return mode.offset_m, moments_m2, 1.0 - weight if rest is prior else 0.0
+
+    @property
+    def _leading_mode(self) -> Component | None:
         mode, rival = (*self._modes, None, None)[:2]
         if mode is None or mode.weight < max(LEADING_WEIGHT, LEADS * (rival.weight if rival else 0.0)):
-            return prior.offset_m, max(own_m2, self._belief.about(prior.offset_m), key=np.trace)
-        weight = min(mode.weight, MOST_WEIGHT)
-        rest_m2 = max(prior.about(mode.offset_m), self._belief.about(mode.offset_m), key=np.trace)
-        return mode.offset_m, weight * mode.cov_m2 + (1.0 - weight) * rest_m2
+            return None
+        return mode
+
+    def _by_now(self, place: Component, own_m2: np.ndarray) -> Component:
+        """A place that was weighed against an older estimate, by now as much wider as the estimate has become."""
+        values, axes = np.linalg.eigh(own_m2 - self._own_m2)
+        return replace(place, cov_m2=place.cov_m2 + (axes * np.maximum(values, 0.0)) @ axes.T)

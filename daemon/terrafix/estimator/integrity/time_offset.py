@@ -46,7 +46,8 @@ class TimeOffset:
         reach_ns = round(GRID_S[-1] * 1e9)
         while self._waiting and self._waiting[0].t1_ns + reach_ns <= newest_ns:
             self._weigh(self._waiting.pop(0), telemetry)
-        del self._waiting[: -len(GRID_S)]  # nobody reports a heading
+        while self._waiting and self._waiting[0].t1_ns + 2 * reach_ns < turn.t1_ns:  # nobody reports a heading
+            del self._waiting[0]
 
     @property
     def estimate(self) -> tuple[float, float]:
