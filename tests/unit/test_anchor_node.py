@@ -291,3 +291,22 @@ def test_the_layer_that_fits_is_learnt(ground: np.ndarray) -> None:
     assert [m.verdict for m in said[-2:]] == [Verdict.ACCEPTED] * 2
     assert said[-1].map_sigma_m == pytest.approx(5.0 / 2.146)
     assert said[-1].p_c_in_w_m is not None and np.hypot(*(np.array(said[-1].p_c_in_w_m) - at_m)[:2]) < 3.0
+
+
+@pytest.mark.parametrize(
+    ("off_m", "sigma_m", "searches"), [(4000.0, 1400.0, True), (4000.0, 1300.0, False), (50.0, 30.0, False)]
+)
+def test_a_flight_that_dead_reckoning_has_led_off_the_map_is_searched_where_it_may_be_on_it(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch, off_m: float, sigma_m: float, searches: bool
+) -> None:
+    monkeypatch.setattr(MapSearch, "look", lambda *_: None)
+    node, frames = started(ground)
+    assert node._layers is not None
+    e_max = node._layers.best.map.bounds_m[2]
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    match(node, 1, 10.0)
+    away = np.array([e_max + off_m, TRUE_M[1], TRUE_M[2]])
+    frames.put(2, view(ground, PINHOLE, R, TRUE_M))
+    said = match(node, 2, sigma_m, at_m=away, step_m=float(away[0] - TRUE_M[0]))
+    assert (said.verdict is Verdict.LOST) == searches
+    assert node._search.is_on == searches

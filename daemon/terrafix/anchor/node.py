@@ -60,6 +60,7 @@ UNKNOWN_HEADING_RAD = 1.5  # 1-sigma from which a heading says nothing
 POOR_SCORE = 2.0  # standardised correlation in the mode; a frame at the right place scores 3 to 10
 POOR_LOOKS = 4.0  # full looks below it before the search widens
 WIDEN = 1.6
+OFF_MAP_SIGMAS = 3.0  # by which a position that lies off the map may be on it
 FOUND_SIGMA_M = 10.0  # of the place that a search has found, for the belief that follows it
 
 
@@ -216,6 +217,10 @@ class AnchorNode:
         weight = max(new, MIN_LOOK)
         used, look = self._layers.chosen(looks, belief.mode(), weight)
         answer = msgspec.structs.replace(answer, map_sigma_m=used.sigma_m)
+        if look.verdict is Verdict.OUTSIDE_MAP and self._may_be_on(best, prediction):
+            # Dead reckoning over minutes leads off the map, and no look would ever be made again.
+            self._search.begin(best, prediction.agl_m, None)
+            return self._search.answer(answer)
         if look.verdict is not Verdict.ACCEPTED:
             return msgspec.structs.replace(answer, verdict=look.verdict)
         self._since_look_m = 0.0
@@ -280,6 +285,15 @@ class AnchorNode:
         if score < COARSE_SCORE:
             return answer
         return coarse(answer, mode, belief.cell_m, view, look.scale_at(mode.e_m, mode.n_m))
+
+    @staticmethod
+    def _may_be_on(best: Dated, prediction: Prediction) -> bool:
+        """Whether a position that claims little, and lies off the map, may be on it all the same."""
+        e_m, n_m, _ = prediction.p_c_in_w_m
+        e_min, n_min, e_max, n_max = best.map.bounds_m
+        off_m = float(np.hypot(max(e_min - e_m, 0.0, e_m - e_max), max(n_min - n_m, 0.0, n_m - n_max)))
+        sigma_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
+        return claims_little(sigma_m, prediction.agl_m) and off_m <= OFF_MAP_SIGMAS * sigma_m
 
     def _moved(self, prediction: Prediction, best: Dated, origin: Origin) -> Belief:
         cell_m = cell_for(prediction.agl_m, best.matcher.look_cell_m(prediction.agl_m))
