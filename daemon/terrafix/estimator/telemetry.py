@@ -117,16 +117,6 @@ class Telemetry:
             return None
         return np.interp(t_ns, turns[0], _unwrapped(turns[1])[0])
 
-    def turned_at(self, t_ns: np.ndarray) -> np.ndarray | None:
-        """Turn (N,) about the body's down axis until times (N,), by gyroscopes, from an arbitrary zero [rad]; None
-        where readings do not cover them without gaps."""
-        read = self._rates.around(int(t_ns.min()), int(t_ns.max()))
-        if read is None or not _covers(read[0], int(t_ns.min()), int(t_ns.max()), MAX_READING_GAP_NS):
-            return None
-        t, rate = read[0], read[1][2]
-        turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t) * 1e-9)])
-        return np.interp(t_ns, t, turned)
-
     def turned_otherwise(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
         """The turn (3,) about east, north and up by which the attitude turned from ``t0_ns`` to ``t1_ns`` and
         gyroscopes did not, and by how much these turned at all [rad]; None when readings or attitudes do not cover

@@ -18,7 +18,6 @@ from terrafix.estimator.graph import WALK_SIGMAS, NodeState, PoseGraph, walk_sig
 from terrafix.estimator.heading import OpenHeading
 from terrafix.estimator.integrity.fragments import Fragment, Fragments, MotionEvidence
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
-from terrafix.estimator.integrity.sighting import turned_rad
 from terrafix.estimator.integrity.static_picture import StaticPicture
 from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.lens import lens_sigma
@@ -154,7 +153,7 @@ class Tracker:
         self._fragments = Fragments()
         self._fragment = Fragment(0.0, joined=True)  # of the newest frame
         self._static_picture = StaticPicture()
-        self._heading_seen: tuple[int, int, float] | None = None  # time, keyframe, turn since it: the newest frame
+        self._heading_seen: tuple[int, int, float] | None = None  # time, keyframe, heading since it: the newest frame
         self._motion_refused_s: float | None = None  # time of the first of the motions in a row that were impossible
 
     @property
@@ -365,8 +364,9 @@ class Tracker:
         before, self._heading_seen = self._heading_seen, None
         if sighting.motion is None:
             return None
-        parent, _ = sighting.motion
-        since_rad = turned_rad(np.array(odometry.pairs))
+        parent, motion = sighting.motion
+        r_w_kf = self.graph.state(parent).pose.rotation().matrix()
+        since_rad = self.camera.yaw_rad(r_w_kf @ motion.r) - self.camera.yaw_rad(r_w_kf)
         self._heading_seen = (odometry.t_ns, odometry.keyframe_id, since_rad)
         if before is not None and before[1] == odometry.keyframe_id:
             return Turn(before[0], odometry.t_ns, math.remainder(since_rad - before[2], math.tau))

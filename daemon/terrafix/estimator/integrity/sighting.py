@@ -32,13 +32,9 @@ def sighting(pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarr
         return None
     kf, k = (rays[down, 0] / -rays[down, 2] + 1j * rays[down, 1] / -rays[down, 2] for rays in (rays_kf, rays_k))
     moved = complex(kf.mean() - _ratio(k, kf) * k.mean())
+    turned = _ratio(pairs[:, 2] + 1j * pairs[:, 3], pairs[:, 0] + 1j * pairs[:, 1])
     said_rad = float(np.remainder(now.yaw_rad - before.yaw_rad + np.pi, 2 * np.pi) - np.pi)
-    return Sighting(np.array([moved.real, moved.imag]), turned_rad(pairs), said_rad)
-
-
-def turned_rad(pairs: np.ndarray) -> float:
-    """By how much ``pairs`` (N, 4) show that the camera turned about its optical axis, clockwise."""
-    return float(np.angle(_ratio(pairs[:, 2] + 1j * pairs[:, 3], pairs[:, 0] + 1j * pairs[:, 1])))
+    return Sighting(np.array([moved.real, moved.imag]), float(np.angle(turned)), said_rad)
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> complex:

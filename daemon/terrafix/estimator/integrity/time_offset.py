@@ -3,9 +3,7 @@ Shen 2018, "Online temporal calibration for monocular visual-inertial systems").
 
 A picture that is stamped ``offset_s`` late shows a turn so much after the autopilot reports it. The offset is held as a
 density over a grid: the prior is that of a camera which stamps its frames, with a small share of one that does not.
-The noise of the turns is not assumed but marginalised, so that a compass that wanders widens the density. Two
-references are kept, and the one that fits is used: the gyroscope about the body's down axis, as a camera that is fixed
-to it turns, and the heading, as one on a gimbal does."""
+The noise of the turns is not assumed but marginalised, so that a compass that wanders widens the density."""
 
 from dataclasses import dataclass
 
@@ -16,22 +14,20 @@ from terrafix.estimator.telemetry import Telemetry
 GRID_S = np.arange(-2.0, 2.0001, 0.05)
 PRIOR_S = 0.03  # 1-sigma of a frame that is stamped when it arrives: exposure, readout and transfer of USB cameras
 STRAY = 0.01  # share of cameras whose buffers or pipeline may delay by anything on the grid
-# 1-sigma of a turn between two frames, at least: of headings that only wander some offset fits best by chance, too.
-TURN_FLOOR_RAD = np.radians(0.6)
+TURN_FLOOR_RAD = np.radians(0.3)  # 1-sigma of a turn between two frames, at least
 REMEMBERED = 300.0  # turns, after which the share of one is a third
 SURE_SIGMAS = 4.0
-STRAY_SIGMAS = 3.0  # of the prior: a mean beyond is that of a stray camera
-SURE_S = 0.25  # 1-sigma of an offset that is applied, at most
+SURE_S = 0.1  # 1-sigma of an offset that is applied, at most
 SLEW = 0.2  # of the time between two frames: by so much the applied offset changes
 
 
 @dataclass(frozen=True)
 class Turn:
-    """Turn about the optical axis from ``t0_ns`` to ``t1_ns`` as pictures show it, clockwise."""
+    """Change of heading from ``t0_ns`` to ``t1_ns`` as pictures show it, clockwise."""
 
     t0_ns: int
     t1_ns: int
-    turned_rad: float
+    yaw_rad: float
 
 
 class TimeOffset:
@@ -40,9 +36,8 @@ class TimeOffset:
     def __init__(self) -> None:
         self.applied_s = 0.0
         self._waiting: list[Turn] = []  # for attitudes as late as the grid reaches
-        # Of turns seen less turns reported, by gyroscope and by heading (rows), for each offset; how many.
-        self._squares = np.zeros((2, len(GRID_S)))
-        self._count = np.zeros(2)
+        self._squares = np.zeros(len(GRID_S))  # of turns seen less turns reported, for each offset
+        self._count = 0.0
 
     def add(self, turn: Turn, telemetry: Telemetry) -> None:
         """A turn between frames, at their own stamps."""
@@ -58,11 +53,8 @@ class TimeOffset:
     def estimate(self) -> tuple[float, float]:
         """Mean and 1-sigma of the density [s]."""
         log = np.log((1.0 - STRAY) * _normal(GRID_S, PRIOR_S) + STRAY / (GRID_S[-1] - GRID_S[0]))
-        if self._count.any():
-            means = self._squares / np.maximum(self._count, 1e-9)[:, None] + TURN_FLOOR_RAD**2
-            least = np.where(self._count > 0.5 * self._count.max(), means.min(axis=1), np.inf)
-            best = int(np.argmin(least))
-            log = log - 0.5 * self._count[best] * np.log(means[best])
+        if self._count > 0.0:
+            log = log - 0.5 * self._count * np.log(self._squares / self._count + TURN_FLOOR_RAD**2)
         density = np.exp(log - log.max())
         density /= density.sum()
         mean = float(density @ GRID_S)
@@ -71,12 +63,8 @@ class TimeOffset:
 
     @property
     def sigma_s(self) -> float:
-        """1-sigma of what is left: where turns show a stray offset, its own and what is not applied of it; else at most
-        the prior's, since a stray camera shows itself in turns."""
-        mean_s, sigma_s = self.estimate
-        if abs(mean_s) <= STRAY_SIGMAS * PRIOR_S:
-            return min(sigma_s, PRIOR_S)
-        return float(np.hypot(sigma_s, mean_s - self.applied_s))
+        """1-sigma of what is left: at most the prior's, since a stray camera shows itself in turns."""
+        return min(self.estimate[1], PRIOR_S)
 
     def step(self, dt_s: float) -> None:
         """``applied_s`` of the next frame, ``dt_s`` after the last: it follows the estimate where that is sure."""
@@ -87,15 +75,13 @@ class TimeOffset:
 
     def _weigh(self, turn: Turn, telemetry: Telemetry) -> None:
         shift_ns = np.round(GRID_S * 1e9).astype(np.int64)
-        times_ns = np.concatenate([turn.t0_ns - shift_ns, turn.t1_ns - shift_ns])
+        ends = [telemetry.yaw_at(t_ns - shift_ns) for t_ns in (turn.t0_ns, turn.t1_ns)]
+        if ends[0] is None or ends[1] is None:
+            return
+        off_rad = (turn.yaw_rad - (ends[1] - ends[0]) + np.pi) % (2.0 * np.pi) - np.pi
         keep = 1.0 - 1.0 / REMEMBERED
-        for i, reported in enumerate((telemetry.turned_at(times_ns), telemetry.yaw_at(times_ns))):
-            if reported is None:
-                continue
-            began, ended = np.split(reported, 2)
-            off_rad = (turn.turned_rad - (ended - began) + np.pi) % (2.0 * np.pi) - np.pi
-            self._squares[i] = keep * self._squares[i] + off_rad**2
-            self._count[i] = keep * self._count[i] + 1.0
+        self._squares = keep * self._squares + off_rad**2
+        self._count = keep * self._count + 1.0
 
 
 def _normal(x: np.ndarray, sigma: float) -> np.ndarray:
