@@ -60,7 +60,6 @@ def pose_gain(inliers: int) -> float:
     return max((gain for least, gain in POSE_LLR if inliers >= least), default=0.0)
 
 
-def pose_likelihood_ratio(inliers: int, weight: float) -> float:
-    """Of a pose in a mode of the belief, "here against elsewhere"; ``inliers`` 0: it stands on no single patches.
-    ``weight`` 0..1 of the look: over ground that was just seen many patches agree as they did before."""
-    return float(np.exp(max(weight * pose_gain(inliers), LEAST_POSE_GAIN)))
+def pose_likelihood_ratio(inliers: int) -> float:
+    """Of a pose in a mode of the belief, "here against elsewhere"; ``inliers`` 0: it stands on no single patches."""
+    return float(np.exp(max(pose_gain(inliers), LEAST_POSE_GAIN)))

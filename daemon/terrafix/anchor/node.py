@@ -242,12 +242,12 @@ class AnchorNode:
         )
         # Without a heading the belief spreads as fast as frames narrow it, until a pose tells the heading.
         tried = mode.mass >= MODE_TRIED or heading_is_open(prediction)
-        inliers, likelihood_ratio = 0, pose_likelihood_ratio(0, weight)
+        inliers, likelihood_ratio = 0, pose_likelihood_ratio(0)
         if tried:
             answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
             if answer.verdict is Verdict.ACCEPTED:
                 inliers = answer.inliers
-                likelihood_ratio = pose_likelihood_ratio(inliers, weight)
+                likelihood_ratio = pose_likelihood_ratio(inliers)
             # Single patches that say less than all of them may be aside together: these know it better.
             if answer.verdict is not Verdict.ACCEPTED or ground_sigma_m(answer, view.agl_m) > SIGMA_FLOOR * view.agl_m:
                 agreed = used.agreed.at(image, view_at(view, hypothesis, mode.e_m, mode.n_m))
