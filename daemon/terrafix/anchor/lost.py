@@ -17,7 +17,6 @@ DOUBT_ODDS = 2.94  # 5 %: from here on a 95 % ellipse around the place would not
 # What a pose says, by the patches that agree. Measured on nine flights and maps: at 70 right places a pose was found on
 # 25 to 90 % of the frames, with 20 inliers in the median; at 930 wrong ones on 0.5 %, with 9 to 11 (one had 20).
 POSE_LLR = ((8, 3.0), (12, 5.0), (20, 6.0))  # inliers, gain
-LEAST_POSE_GAIN = 3.0  # of a pose that all patches together gave, without a consensus of single ones
 WIDE, WIDE_M = 0.5, 40.0  # share of the height, and metres: a 1-sigma above both claims little
 
 
@@ -58,8 +57,3 @@ def claims_little(sigma_m: float, agl_m: float) -> bool:
 def pose_gain(inliers: int) -> float:
     """Log likelihood ratio, "here against elsewhere", of a pose on which so many patches agree."""
     return max((gain for least, gain in POSE_LLR if inliers >= least), default=0.0)
-
-
-def pose_likelihood_ratio(inliers: int) -> float:
-    """Of a pose in a mode of the belief, "here against elsewhere"; ``inliers`` 0: it stands on no single patches."""
-    return float(np.exp(max(pose_gain(inliers), LEAST_POSE_GAIN)))

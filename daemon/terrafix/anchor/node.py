@@ -10,7 +10,7 @@ from terrafix.anchor.alone import LIKELIHOOD_RATIO, PLACES, alone
 from terrafix.anchor.answer import coarse, ground_sigma_m, judged
 from terrafix.anchor.belief import Belief, cell_for
 from terrafix.anchor.layers import Dated, Layers
-from terrafix.anchor.lost import LostWatch, claims_little, pose_likelihood_ratio
+from terrafix.anchor.lost import LostWatch, claims_little
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.matcher import view_at
@@ -47,6 +47,8 @@ from terrafix_engines.runtime import ModelFileError, ModelRunError
 NEW_GROUND_SHARE = 0.35  # of the footprint: after this much motion a look counts as a new one
 MIN_LOOK = 0.08  # a look at the same ground again still says this much
 MODE_MASS = 0.9  # the belief hands a fix to the graph when one mode holds this much
+# A pose on which many patches agree is evidence of its own: found at most right places, at hardly any wrong one.
+POSE_LIKELIHOOD_RATIO = 20.0
 MODES_SAID = 2  # the best place and its best rival
 MODE_TRIED = 0.5  # modes below this are not tried at all
 COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in this very frame
@@ -242,12 +244,11 @@ class AnchorNode:
         )
         # Without a heading the belief spreads as fast as frames narrow it, until a pose tells the heading.
         tried = mode.mass >= MODE_TRIED or heading_is_open(prediction)
-        inliers, likelihood_ratio = 0, pose_likelihood_ratio(0)
+        inliers, likelihood_ratio = 0, POSE_LIKELIHOOD_RATIO
         if tried:
             answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
             if answer.verdict is Verdict.ACCEPTED:
                 inliers = answer.inliers
-                likelihood_ratio = pose_likelihood_ratio(inliers)
             # Single patches that say less than all of them may be aside together: these know it better.
             if answer.verdict is not Verdict.ACCEPTED or ground_sigma_m(answer, view.agl_m) > SIGMA_FLOOR * view.agl_m:
                 agreed = used.agreed.at(image, view_at(view, hypothesis, mode.e_m, mode.n_m))
