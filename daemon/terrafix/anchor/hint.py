@@ -36,6 +36,13 @@ def radius_now_m(radius_m: float, age_s: float) -> float:
     return radius_m + SPEED_MPS * max(age_s, 0.0)
 
 
+def outside_m(at_m: tuple[float, float], bounds_m: Bounds) -> float:
+    """How far a place (east, north) lies outside of ``bounds_m``; 0 within."""
+    return math.hypot(
+        max(bounds_m[0] - at_m[0], 0.0, at_m[0] - bounds_m[2]), max(bounds_m[1] - at_m[1], 0.0, at_m[1] - bounds_m[3])
+    )
+
+
 def weigh(
     at_m: tuple[float, float], radius_m: float, believed: Believed, bounds_m: Bounds, *, searching: bool
 ) -> Weighed:
@@ -44,11 +51,9 @@ def weigh(
     A place that poses have confirmed is not given up for a hint: an operator who is wrong must do no harm. One that
     the map has not confirmed more than the start (odds), or that claims less than the hint, is."""
     distance_m = math.hypot(at_m[0] - believed.e_m, at_m[1] - believed.n_m)
-    outside_m = math.hypot(
-        max(bounds_m[0] - at_m[0], 0.0, at_m[0] - bounds_m[2]), max(bounds_m[1] - at_m[1], 0.0, at_m[1] - bounds_m[3])
-    )
-    if outside_m > radius_m:
-        return Weighed(Verdict.OUTSIDE_MAP, False, distance_m, f"hint is {length(outside_m)} outside the map")
+    off_m = outside_m(at_m, bounds_m)
+    if off_m > radius_m:
+        return Weighed(Verdict.OUTSIDE_MAP, False, distance_m, f"hint is {length(off_m)} outside the map")
     if searching or radius_m < SIGMAS_95 * believed.sigma_m:
         return Weighed(Verdict.ACCEPTED, True, distance_m, f"hint taken, searching within {length(radius_m)}")
     if distance_m <= radius_m + SURE * believed.sigma_m:

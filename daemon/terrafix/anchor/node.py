@@ -9,6 +9,7 @@ import numpy as np
 from terrafix.anchor.alone import LIKELIHOOD_RATIO, PLACES, alone
 from terrafix.anchor.answer import coarse, ground_sigma_m, judged
 from terrafix.anchor.belief import Belief, cell_for
+from terrafix.anchor.hint import outside_m
 from terrafix.anchor.layers import Dated, Layers
 from terrafix.anchor.lost import LostWatch, claims_little
 from terrafix.anchor.map_features import Describer
@@ -291,8 +292,7 @@ class AnchorNode:
     def _may_be_on(best: Dated, prediction: Prediction) -> bool:
         """Whether a position that claims little, and lies off the map, may be on it all the same."""
         e_m, n_m, _ = prediction.p_c_in_w_m
-        e_min, n_min, e_max, n_max = best.map.bounds_m
-        off_m = float(np.hypot(max(e_min - e_m, 0.0, e_m - e_max), max(n_min - n_m, 0.0, n_m - n_max)))
+        off_m = outside_m((e_m, n_m), best.map.bounds_m)
         sigma_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
         return claims_little(sigma_m, prediction.agl_m) and off_m <= OFF_MAP_SIGMAS * sigma_m
 

@@ -125,11 +125,16 @@ def relative_pose(
     return RelativePose(r_w_kf.T @ fit.r_w_c, r_w_kf.T @ fit.p_c_in_w_m, cov, seen)
 
 
+def similarity_ratio(a: np.ndarray, b: np.ndarray) -> complex:
+    """b = ratio * a by least squares over complex numbers (N,) of zero mean: scale and turn (Umeyama 1991)."""
+    return complex(np.vdot(a, b) / max(float(np.vdot(a, a).real), 1e-12))
+
+
 def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
     """b = scale * turn * a + shift by least squares (Umeyama 1991) in the plane; turn as (3x3) about up."""
     mean_a, mean_b = a.mean(0), b.mean(0)
     za, zb = (a - mean_a) @ (1, 1j), (b - mean_b) @ (1, 1j)
-    ratio = complex(np.vdot(za, zb) / max(float(np.vdot(za, za).real), 1e-12))
+    ratio = similarity_ratio(za, zb)
     turn = local_rotation_up(float(np.angle(ratio)))
     scale = abs(ratio)
     return turn, scale, mean_b - scale * turn[:2, :2] @ mean_a

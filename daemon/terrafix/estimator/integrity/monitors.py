@@ -38,7 +38,8 @@ class Monitors:
     def __init__(self, origin: Origin) -> None:
         self._origin = origin
         self._r_b_c = Mount.of(origin.camera).r_b_c()
-        self._mounts = [exp_so3(np.array([0.0, 0.0, math.radians(deg)])) @ self._r_b_c for deg in MOUNT_YAWS_DEG]
+        turns = [exp_so3(np.array([0.0, 0.0, math.radians(deg)])) for deg in MOUNT_YAWS_DEG[1:]]  # the first is none
+        self._other_mounts = [turn @ self._r_b_c for turn in turns]
         self._inertial = InertialMonitor()
         self._turns = TurnMonitor(math.radians(origin.yaw_sigma_deg))
         self._levelling = LevellingMonitor()
@@ -66,19 +67,20 @@ class Monitors:
             return
         self._textured = odometry.frame_id
         before, now = telemetry.at(began_ns), telemetry.at(odometry.t_ns)
-        seen = sighting(np.array(odometry.pairs), before, now, self._r_b_c)
+        pairs = np.array(odometry.pairs)
+        seen = sighting(pairs, before, now, self._r_b_c)
         if seen is None:
             return
         if odometry.t_ns * 1e-9 - self._turned_s >= SPACING_S:
             self._turned_s = odometry.t_ns * 1e-9
             self._turns.add(seen.said_rad, seen.turned_rad)
             span_s = began_ns * 1e-9, odometry.t_ns * 1e-9
-            self._levelling.add(np.array(odometry.pairs), before, now, self._r_b_c, span_s)
+            self._levelling.add(pairs, before, now, self._r_b_c, span_s)
         if now.agl_m is None:
             return
-        mounted = [sighting(np.array(odometry.pairs), before, now, r_b_c) for r_b_c in self._mounts]
+        mounted = (seen, *(sighting(pairs, before, now, r_b_c) for r_b_c in self._other_mounts))
         moved = [complex(*one.moved) for one in mounted if one is not None]
-        if len(moved) == len(self._mounts):
+        if len(moved) == len(mounted):
             velocities = np.array(moved) * now.agl_m / ((odometry.t_ns - began_ns) * 1e-9)
             self._velocity(velocities, (began_ns + odometry.t_ns) // 2, telemetry)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.geodesy import rot_w_b
+from terrafix.estimator.motion import similarity_ratio
 from terrafix.estimator.telemetry import Attitude
 
 LEAST_DOWN = 0.2  # down component of a unit-depth ray that meets the ground no farther than five heights away
@@ -38,9 +39,8 @@ def sighting(pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarr
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> complex:
-    """b = ratio * a + shift, by least squares (Umeyama 1991) over complex numbers (N,)."""
-    spread = a - a.mean()
-    return complex(np.vdot(spread, b - b.mean()) / max(float(np.vdot(spread, spread).real), 1e-12))
+    """b = ratio * a + shift, by least squares over complex numbers (N,)."""
+    return similarity_ratio(a - a.mean(), b - b.mean())
 
 
 def _rays(xy: np.ndarray, attitude: Attitude, r_b_c: np.ndarray) -> np.ndarray:
