@@ -209,6 +209,30 @@ class Listener:
         return {m.frame_id: m for m in self.said if isinstance(m, MeasurementVerdict) and m.measurement == measurement}
 
 
+def same_features(flight: Flight, keyframe: int, i: int, features: np.ndarray) -> Odometry:
+    """Of frame i against ``keyframe``, whose ``features`` (N, 2) it tracks: other frames track the same ones."""
+    below = np.array([0.0, 0.0, flight.ground_m[keyframe]])
+    views = [(flight.r_w_c[k], flight.p_m[k] - below) for k in (keyframe, i)]
+    noise = np.random.default_rng([i, 3]).normal(0.0, SIGMA_NORM, features.shape)
+    pairs = np.hstack([features, apply(homography(views[0], views[1]), features) + noise]).tolist()
+    return Odometry(
+        t_ns=t_ns(i),
+        frame_id=i,
+        keyframe_id=keyframe,
+        verdict=Verdict.ACCEPTED,
+        pairs=[(a, b, c, d) for a, b, c, d in pairs],
+        sigma_norm=SIGMA_NORM,
+        inliers=len(pairs),
+        tracked=len(pairs),
+    )
+
+
+def some_features() -> np.ndarray:
+    """(40, 2), normalised, of one picture."""
+    rng = np.random.default_rng(3)
+    return np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
+
+
 def t_ns(i: int) -> int:
     return round(i * FRAME_S * 1e9)
 

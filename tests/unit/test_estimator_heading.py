@@ -37,12 +37,12 @@ def headings_rad(listener: Listener) -> dict[int, float]:
 def test_the_heading_stays_open_until_a_match_says_it(knows: set[str], seed: int) -> None:
     flight, listener = flown(knows, seed=seed)
     yaw_rad = headings_rad(listener)
-    truth_rad = [yaw_of(r) for r in flight.r_w_b]
-    for said in (m for m in listener.said if isinstance(m, Prediction) and 0 < m.frame_id <= FIRST_MATCH):
+    truth_rad, first = [yaw_of(r) for r in flight.r_w_b], min(yaw_rad)
+    for said in (m for m in listener.said if isinstance(m, Prediction) and first < m.frame_id <= FIRST_MATCH):
         i = said.frame_id
         assert said.cov[35] > 2.5**2
         # It is a choice of axes: what is seen turns the vehicle in them, and nothing turns the axes.
-        turned = math.remainder(yaw_rad[i] - yaw_rad[0] - truth_rad[i] + truth_rad[0], math.tau)
+        turned = math.remainder(yaw_rad[i] - yaw_rad[first] - truth_rad[i] + truth_rad[first], math.tau)
         assert abs(turned) < math.radians(5.0)
         off_m = np.array(said.p_c_in_w_m[:2]) - flight.p_m[i, :2]
         assert float(off_m @ np.linalg.solve(np.array(said.cov).reshape(6, 6)[:2, :2], off_m)) < 9.0

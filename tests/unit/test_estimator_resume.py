@@ -4,8 +4,18 @@ import math
 
 import numpy as np
 import pytest
-from ground import apply, homography
-from simulated_flight import FRAME_S, ORIGIN, SIGMA_NORM, SPEED_MPS, Flight, Listener, blind, error_m, sigma_m
+from simulated_flight import (
+    FRAME_S,
+    ORIGIN,
+    SPEED_MPS,
+    Flight,
+    Listener,
+    blind,
+    error_m,
+    same_features,
+    sigma_m,
+    some_features,
+)
 
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.pose import log_so3
@@ -122,34 +132,14 @@ def test_a_picture_that_is_older_than_the_first_words_is_not_begun_with(flight: 
 
 def test_odometry_against_a_picture_that_was_left_out_is_not_lost(flight: Flight, killed: Last) -> None:
     """It is the keyframe of the pictures after it, for up to five seconds where a vehicle is slow."""
-    rng = np.random.default_rng(3)
-    seen = np.column_stack([rng.uniform(-0.7, 0.7, 40), rng.uniform(-0.3, 0.3, 40)])
-    old, new = BACK, BACK + 4
-
-    def against_the_old(i: int, first: int) -> Odometry:
-        """With the keyframe's features from ``first`` on: no two pictures show the same of them."""
-        below = np.array([0.0, 0.0, flight.ground_m[old]])
-        views = [(flight.r_w_c[k], flight.p_m[k] - below) for k in (old, i)]
-        there = apply(homography(views[0], views[1]), seen) + rng.normal(0.0, SIGMA_NORM, seen.shape)
-        pairs = [(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([seen, there])[first:]]
-        return Odometry(
-            t_ns=round(i * FRAME_S * 1e9),
-            frame_id=i,
-            keyframe_id=old,
-            verdict=Verdict.ACCEPTED,
-            pairs=pairs,
-            sigma_norm=SIGMA_NORM,
-            inliers=len(pairs),
-            tracked=len(pairs),
-        )
-
+    old, new, features = BACK, BACK + 4, some_features()
     node = EstimatorNode(0, killed)
     said = list(node.on(ORIGIN))
     said += node.on(blind(next(m for m in flight.messages(old) if isinstance(m, Odometry))))
     for i in (new, new + 1, new + 2):
         for message in [m for m in flight.messages(i) if isinstance(m, VehicleState)]:
             said += node.on(message)
-        said += node.on(against_the_old(i, first=5 * (i - new)))
+        said += node.on(same_features(flight, old, i, features[5 * (i - new) :]))  # no two show the same of them
     judged = [m for m in said if isinstance(m, MeasurementVerdict) and m.measurement == "odometry"]
     verdicts = {m.frame_id: m.verdict for m in judged}
     assert verdicts == {old: Verdict.STALE} | dict.fromkeys((new, new + 1, new + 2), Verdict.ACCEPTED)

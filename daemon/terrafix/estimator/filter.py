@@ -15,7 +15,7 @@ from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.factors import HEIGHT
 from terrafix.estimator.graph import NodeState
-from terrafix.estimator.integrity.fragments import Fragment, MapHits
+from terrafix.estimator.integrity.fragments import MapHits
 from terrafix.estimator.integrity.other_place import AGREEING, OtherPlace
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.matched import determined, measured_pose, moved_by_lens, straightened_pose
@@ -211,9 +211,8 @@ class Estimator(Tracker):
             velocity, self._velocity_cov, self._open = np.zeros(V_SIZE), unknown_cov(), None
         self.graph.start(now_s, NodeState(measured.compose(onward), bias, velocity), cov, bias_cov, self._velocity_cov)
         assert self._last is not None
-        self._felt = self._stood_at = None
-        self._is_frame(self.graph.newest, self._last.frame_id, Fragment(now_s, joined=True))
         self._cov_of.clear()
+        self._graph_began(self.graph.newest, self._last.frame_id, now_s)
         self._refused.clear()
         self.hypotheses.moved(match.lost_sigma_m)
         self._seen = SeenGround()

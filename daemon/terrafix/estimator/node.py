@@ -17,7 +17,6 @@ from terrafix.estimator.integrity.monitors import Monitors
 from terrafix.estimator.integrity.time_offset import TimeOffset
 from terrafix.estimator.resume import Keeper, Known, Last, kept
 from terrafix.estimator.righted import Righted
-from terrafix.estimator.stand_in import StandIn
 from terrafix.estimator.telemetry import Attitude, Telemetry
 from terrafix.estimator.tracker import Advance, Placed
 from terrafix.messages import (
@@ -68,8 +67,8 @@ class EstimatorNode:
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True
         self._said_slow_ns = 0
+        self._first_ns: int | None = None  # time of the first frame or telemetry
         self._waiting: list[Odometry] = []  # for the autopilot's words, to which belongs what was learnt
-        self._stand_in: StandIn | None = None  # for a keyframe that was left out
         self._time_offset = TimeOffset()
         self._stamp_ns: int | None = None  # of the newest frame, as the camera has it
         self._predicted: int | None = None  # frame of the newest Prediction ...
@@ -99,6 +98,7 @@ class EstimatorNode:
             case Start() if not self._on_map and (self._start is None or message.t_ns != self._start.t_ns):
                 self._start, self._starts = message, True
             case VehicleState():
+                self._first_ns = message.t_ns if self._first_ns is None else self._first_ns
                 self._telemetry.add(message)
                 yield from self._begun()
             case Imu():
@@ -159,13 +159,12 @@ class EstimatorNode:
             known = [one.yaw_rad is not None and one.agl_m is not None for one in said]
             if any(known):
                 older, self._waiting = self._waiting[: known.index(True)], self._waiting[known.index(True) :]
-                self._stand_in = StandIn.of(self._waiting[0], older)
                 yield from (_odometry_verdict(odometry, Verdict.STALE, BEFORE_WORDS) for odometry in older)
             elif self._waiting[-1].t_ns - self._waiting[0].t_ns < WORDS_WAIT_NS:
                 return
         waiting, self._waiting = self._waiting, []
         for odometry in waiting:
-            yield from self._on_odometry(self._stand_in.instead(odometry) if self._stand_in else odometry)
+            yield from self._on_odometry(odometry)
 
     def _on_odometry(self, odometry: Odometry) -> Iterable[Message]:
         estimator = self._estimator
@@ -205,7 +204,8 @@ class EstimatorNode:
             if verdict is not Verdict.ACCEPTED:
                 t_ns, frame_id = odometry.t_ns, odometry.frame_id
                 yield MeasurementVerdict(t_ns=t_ns, frame_id=frame_id, measurement=name, verdict=verdict)
-        if Verdict.STALLED not in (odometry.verdict, advance.verdict) and odometry.verdict is not Verdict.BAD_IMAGE:
+        no_new_view = Verdict.STALLED in (odometry.verdict, advance.verdict) or odometry.verdict is Verdict.BAD_IMAGE
+        if not no_new_view and not self._awaits_telemetry(odometry.t_ns, attitude, estimator):
             yield self._prediction(odometry, advance, estimator, seen)
             self._predicted = odometry.frame_id
         yield from self._slow_errors(advance.placed, estimator)
@@ -219,6 +219,15 @@ class EstimatorNode:
         if estimator.last_fix_s is not None:  # before that the autopilot has, or had, another position
             self._righted.told(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
+
+    def _awaits_telemetry(self, t_ns: int, attitude: Attitude, estimator: Estimator) -> bool:
+        """Whether a frame at ``t_ns`` comes so early that heading and height may yet be reported: the anchor would look
+        at all of both for seconds, while vision and the link have only begun."""
+        self._first_ns = t_ns if self._first_ns is None else self._first_ns
+        if self._resumed_from is not None or estimator.last_fix_s is not None:
+            return False
+        unknown = attitude.yaw_rad is None or attitude.agl_m is None
+        return unknown and 0 <= t_ns - self._first_ns < WORDS_WAIT_NS
 
     def _slow_errors(self, placed: Placed, estimator: Estimator) -> Iterable[SlowErrors]:
         """Not before a map fix: until then they are what was assumed. Not for a computer that is hot."""

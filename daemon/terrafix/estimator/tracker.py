@@ -20,6 +20,7 @@ from terrafix.estimator.integrity.fragments import Fragment, Fragments, MotionEv
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture
 from terrafix.estimator.integrity.time_offset import Turn
+from terrafix.estimator.keyframe_substitution import KeyframeSubstitution
 from terrafix.estimator.lens import lens_sigma
 from terrafix.estimator.middle import Middle
 from terrafix.estimator.motion import Ground, RelativePose, relative_pose
@@ -149,6 +150,8 @@ class Tracker:
         self._beginning = Beginning(origin, known)
         self._open: OpenHeading | None = None  # None: the heading is known
         self._coasts = Coasts()
+        self._newest_odometry: Odometry | None = None  # as vision has it
+        self._substitution: KeyframeSubstitution | None = None  # for the keyframe that the graph began without
         self._heights, self._headings = Told(), Told()
         self._fragments = Fragments()
         self._fragment = Fragment(0.0, joined=True)  # of the newest frame
@@ -214,6 +217,9 @@ class Tracker:
         self, frame_id: int, t_s: float, odometry: Odometry, attitude: Attitude, felt: Feel = nothing_felt
     ) -> Advance:
         """``felt(t0_ns, t1_ns)``: acceleration between two times, where the inertial readings cover them."""
+        self._newest_odometry = odometry
+        if self._substitution is not None:
+            odometry = self._substitution.applied(odometry)
         if self._last is None or (self.last_fix_s is None and self._beginning.is_told_more(attitude)):
             # No linear graph recovers from a heading that turns out to be 70 degrees off what was assumed.
             return self._begin(frame_id, t_s, attitude, felt)
@@ -632,7 +638,6 @@ class Tracker:
         ground_m: float,
     ) -> Placed:
         """Of one node, whose pose is known to ``cov`` (6x6, world axes), above ground at ``ground_m``."""
-        self._felt = self._stood_at = self._seen_from = None
         r_w_c = state.pose.rotation().matrix()
         node = self.graph.start(
             t_s,
@@ -643,9 +648,16 @@ class Tracker:
             self.camera.factor(self.graph.next_keys(), attitude, r_w_c, ground_m),
             world_to_tangent(cov if self._open is None else self._open.chosen(cov), r_w_c),
         )
-        self._is_frame(node, frame_id, Fragment(t_s, joined=True))
+        self._graph_began(node, frame_id, t_s)
         self._last = self._placed(frame_id, t_s, node)
         return self._last
+
+    def _graph_began(self, node: int, frame_id: int, t_s: float) -> None:
+        """With the newest frame as its only ``node``."""
+        assert self._newest_odometry is not None
+        self._substitution = KeyframeSubstitution.of(self._newest_odometry)
+        self._felt = self._stood_at = self._seen_from = None
+        self._is_frame(node, frame_id, Fragment(t_s, joined=True))
 
     def _is_frame(self, node: int, frame_id: int, fragment: Fragment) -> None:
         """The newest node."""
