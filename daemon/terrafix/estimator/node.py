@@ -172,6 +172,7 @@ class EstimatorNode:
             return
         origin = estimator.origin
         stamp_ns = odometry.t_ns
+        self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         before_ns, self._stamp_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns, stamp_ns
         self._time_offset.step((stamp_ns - before_ns) * 1e-9)
         if self._time_offset.applied_s:
@@ -223,8 +224,7 @@ class EstimatorNode:
     def _awaits_telemetry(self, t_ns: int, attitude: Attitude, estimator: Estimator) -> bool:
         """Whether a frame at ``t_ns`` comes so early that heading and height may yet be reported: the anchor would look
         at all of both for seconds, while vision and the link have only begun."""
-        self._first_ns = t_ns if self._first_ns is None else self._first_ns
-        if self._resumed_from is not None or estimator.last_fix_s is not None:
+        if self._first_ns is None or self._resumed_from is not None or estimator.last_fix_s is not None:
             return False
         unknown = attitude.yaw_rad is None or attitude.agl_m is None
         return unknown and 0 <= t_ns - self._first_ns < WORDS_WAIT_NS
