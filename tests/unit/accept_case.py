@@ -43,6 +43,7 @@ class Said:
     """What was said of one frame."""
 
     error_m: float = 1.0  # east
+    late_s: float = 0.0  # the estimate is of so much before the stamp of the frame
     sigma_m: float = 5.0
     label: SourceLabel = SourceLabel.SATELLITE_ANCHORED
     fixed: bool = True
@@ -94,7 +95,7 @@ def evidence(out: Path, frames: Sequence[Said], marks: Marks = UNMARKED, **gathe
 def _frame(i: int, said: Said) -> list[Message]:
     t_ns = round(i * STEP_S * 1e9)
     e_m, n_m = true_m(i)
-    lat_deg, lon_deg = PLACE.to_wgs84(e_m + said.error_m, n_m)
+    lat_deg, lon_deg = PLACE.to_wgs84(e_m + said.error_m, n_m - said.late_s * STEP_M / STEP_S)
     answer = Verdict.ACCEPTED if said.fixed else Verdict.WEAK_PEAK
     cov = tuple(float(v) for v in (np.eye(6) * said.sigma_m**2).ravel())
     return [
@@ -107,7 +108,8 @@ def _frame(i: int, said: Said) -> list[Message]:
         MapMatch(t_ns=t_ns, frame_id=i, verdict=answer, matcher="gradient"),
         MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="map", verdict=answer),
         NavEstimate(
-            t_ns=t_ns, frame_id=i, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=100.0, agl_m=100.0,
+            t_ns=t_ns - round(said.late_s * 1e9), frame_id=i, lat_deg=lat_deg, lon_deg=lon_deg,
+            alt_amsl_m=100.0, agl_m=100.0,
             velocity_enu_mps=(0.0, 20.0, 0.0), velocity_sigma_mps=1.0, q_w_b=(1.0, 0.0, 0.0, 0.0), cov=cov,
             source_label=said.label, covariance_mode=said.mode, last_anchor_age_ms=0, emitted_at_ns=t_ns),
     ]  # fmt: skip

@@ -53,6 +53,20 @@ def test_false_fixes_before_and_after_the_lie_are_always_late(tmp_path: Path) ->
     assert of.false_fixes_in_all(found) == of.Measured(4.0, "1 before the lie, 1 in it, 2 after it")
 
 
+def test_a_lie_of_one_frame_may_be_believed_as_long_as_any_other(tmp_path: Path) -> None:
+    found = flight(tmp_path, f10_13=FALSE, f30=FALSE)
+    short = Span(10 * STEP_S, 10 * STEP_S, "told once")
+    found.marks = Marks(spans=(short,), lie=short)
+    assert of.late_false_fixes(found).value == 1.0
+
+
+def test_an_estimate_is_compared_with_the_truth_of_its_own_time(tmp_path: Path) -> None:
+    """Pictures that are known to be late have their estimates before their stamps, where the vehicle was then."""
+    late = flight(tmp_path, f2_57=Said(late_s=0.7 * STEP_S))
+    assert max(f.error_m for f in late.frames if f.error_m is not None) == pytest.approx(1.0, abs=0.1)
+    assert late.metrics["within_5m"] == 1.0
+
+
 def test_late_pictures_are_judged_beyond_20_m(tmp_path: Path) -> None:
     found = flight(tmp_path, f30=SLIGHTLY)
     assert of.late_false_fixes(found).value == 0.0 and of.late_sure_over_20m(found).value == 1.0

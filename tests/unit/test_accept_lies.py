@@ -200,6 +200,20 @@ def test_photos_share_little_ground_and_carry_one_state_each() -> None:
     assert "only 3 photos" in str(BY_NAME["photos every 155 m"].plan(flight(30)))
 
 
+def test_a_photo_carries_height_and_heading_though_they_are_reported_apart() -> None:
+    def apart() -> Iterator[Shot]:
+        for shot in shots():
+            (state,) = shot.states
+            attitude = msgspec.structs.replace(state, agl_m=None)
+            height = msgspec.structs.replace(
+                state, yaw_rad=None, pitch_rad=None, roll_rad=None, agl_m=state.t_ns * 1e-9
+            )
+            yield replace(shot, states=(attitude, height))
+
+    found = list(planned("photos every 155 m").edit(apart()))
+    assert all(s.states[0].yaw_rad == 3.0 and s.states[0].agl_m == s.frame.t_ns * 1e-9 for s in found)
+
+
 def test_a_gap_takes_frames_and_telemetry_out_and_everything_after_it_is_later() -> None:
     plan = planned("gap of minutes")
     found = flown(plan.edit)

@@ -229,3 +229,20 @@ def test_a_wide_window_gets_no_finer_cells_than_it_can_have() -> None:
     half_m = belief.half_m
     belief.set_cell(0.05)
     assert belief.half_m == pytest.approx(half_m, rel=0.02) and belief.half_m / belief.cell_m <= MAX_HALF_CELLS + 1
+
+
+def test_a_share_of_a_start_lies_evenly_over_all_that_is_searched() -> None:
+    narrow, wide = Belief(0.0, 0.0, 20.0, 1.0), Belief(0.0, 0.0, 20.0, 1.0, stray=0.01, reach_m=300.0)
+    assert narrow.half_m < 150.0 and wide.half_m == pytest.approx(300.0, abs=1.0)
+    assert mass_of(wide) == pytest.approx(1.0)
+    far = wide._mass[:100, :100]  # 200 m and more from the start, 10 sigmas
+    assert far.sum() == pytest.approx(0.01 * far.size / wide._mass.size, rel=0.01)
+
+
+def test_a_place_beyond_what_a_start_claims_is_found_by_two_looks() -> None:
+    belief = Belief(0.0, 0.0, 20.0, 1.0, stray=1.0 / 400.0, reach_m=160.0)
+    there = surface([(140.0, 30.0, 6.0)])
+    belief.update((there,), 1.0)
+    belief.update((there,), 1.0)
+    mode = belief.mode()
+    assert np.hypot(mode.e_m - 140.0, mode.n_m - 30.0) < 2.0 and mode.mass > 0.5

@@ -6,6 +6,7 @@ import pytest
 from terrafix.estimator.integrity.other_place import EVEN, FORGET_OVER, REACHED, START_LASTS, OtherPlace
 
 FROM_MAP = np.diag([4.0, 4.0, 9.0, 1e-4, 1e-4, 1e-4])
+MASS = 0.0  # of the belief where the pose is: it has nothing to say
 APART = np.diag([16.0, 25.0])  # what estimate and match together do not know of the offset
 
 
@@ -40,12 +41,12 @@ def test_who_went_over_keeps_the_place_that_was_left_until_new_ground_has_spoken
     other, offset = OtherPlace(), np.array([0.0, 80.0])
     other.left(offset, APART)
     assert mahalanobis2(added(other, FROM_MAP), -offset) < 5.991
-    other.fade(0.0)  # hovering proves nothing
+    other.fade(0.0, MASS)  # hovering proves nothing
     assert mahalanobis2(added(other, FROM_MAP), -offset) < 5.991
     for _ in range(10):
-        other.fade(0.4 * FORGET_OVER / 10)
+        other.fade(0.4 * FORGET_OVER / 10, MASS)
     assert mahalanobis2(added(other, FROM_MAP), -offset) < 5.991
-    other.fade(5.0 * FORGET_OVER)
+    other.fade(5.0 * FORGET_OVER, MASS)
     assert np.array_equal(added(other, FROM_MAP), FROM_MAP)
 
 
@@ -53,12 +54,12 @@ def test_the_other_place_is_known_as_well_as_estimate_and_match_were() -> None:
     """A plane without IMU had drifted by 8 m when it went over, and the place that was left lay aside of the offset."""
     other, offset = OtherPlace(), np.array([-75.0, -3.0])
     other.left(offset, APART)
-    other.fade(0.5 * FORGET_OVER)
+    other.fade(0.5 * FORGET_OVER, MASS)
     aside = -offset + np.array([3.0, 7.0])
     assert mahalanobis2(added(other, FROM_MAP), aside) < 9.0
     sure = OtherPlace()
     sure.left(offset, 0.0 * APART)
-    sure.fade(0.5 * FORGET_OVER)
+    sure.fade(0.5 * FORGET_OVER, MASS)
     assert mahalanobis2(added(sure, FROM_MAP), aside) > 9.0
 
 
@@ -70,9 +71,9 @@ def test_a_place_that_the_map_told_before_and_after_is_wrong_only_if_two_pattern
         other.disagreed([away, away], APART, fixed=map_told)
         assert other.probability == pytest.approx(EVEN)
         other.left(away, APART)
-    other.fade(0.0)
+    other.fade(0.0, MASS)
     assert other.probability == pytest.approx(EVEN**2 if fixed else EVEN)
-    other.fade(2.0 * FORGET_OVER)
+    other.fade(2.0 * FORGET_OVER, MASS)
     assert (other.probability == 0.0) == fixed
 
 
@@ -80,7 +81,7 @@ def test_a_place_to_which_the_flight_was_led_has_the_map_on_one_side_only() -> N
     other, offset = OtherPlace(), np.array([60.0, 0.0])
     other.disagreed([offset, offset], APART, fixed=True)
     other.left(offset, APART)
-    other.fade(0.0)
+    other.fade(0.0, MASS)
     assert other.probability == pytest.approx(EVEN)
 
 
@@ -89,16 +90,16 @@ def test_rows_that_a_plane_crosses_for_half_a_minute_hide_no_place_that_the_map_
     other.disagreed([offset, offset], APART, fixed=True)
     other.left(offset, APART)
     for _ in range(30):
-        other.fade(20.0 / 78.0)
+        other.fade(20.0 / 78.0, MASS)
     assert mahalanobis2(added(other, FROM_MAP), -offset) < 5.991
 
 
 def test_an_ellipse_that_does_not_reach_the_other_place_is_not_as_wide_as_that_is_unknown() -> None:
     other, offset = OtherPlace(), np.array([60.0, 0.0])
     other.left(offset, APART)
-    other.fade(FORGET_OVER * np.log(EVEN / REACHED))
+    other.fade(FORGET_OVER * np.log(EVEN / REACHED), MASS)
     assert other.spread_m2()[1, 1] == pytest.approx(APART[1, 1])
-    other.fade(FORGET_OVER * np.log(2.0))
+    other.fade(FORGET_OVER * np.log(2.0), MASS)
     assert other.spread_m2()[1, 1] == pytest.approx(APART[1, 1] / 2.0)
 
 
@@ -107,8 +108,21 @@ def test_a_start_that_no_map_match_bore_out_is_forgotten_soon() -> None:
     for other, fixed in ((start, False), (told, True)):
         other.disagreed([np.array([200.0, 200.0])] * 2, APART, fixed=fixed)
         other.left(np.array([200.0, 200.0]), APART)
-        other.fade(FORGET_OVER * START_LASTS)
+        other.fade(FORGET_OVER * START_LASTS, MASS)
     assert start.probability == pytest.approx(EVEN * np.exp(-1.0))
-    start.fade(3.0 * FORGET_OVER * START_LASTS)
-    told.fade(3.0 * FORGET_OVER * START_LASTS)
+    start.fade(3.0 * FORGET_OVER * START_LASTS, MASS)
+    told.fade(3.0 * FORGET_OVER * START_LASTS, MASS)
     assert start.probability == 0.0 and told.probability > 0.3
+
+
+def test_a_start_that_the_belief_gives_no_mass_is_forgotten_without_any_way() -> None:
+    """The belief began at the start: what it has left of that is not in the mode of the pose."""
+    start, told = OtherPlace(), OtherPlace()
+    for other, fixed in ((start, False), (told, True)):
+        other.disagreed([np.array([200.0, 200.0])] * 2, APART, fixed=fixed)
+        other.left(np.array([200.0, 200.0]), APART)
+        other.fade(0.0, 0.7)
+        assert other.probability == pytest.approx(EVEN if fixed else 0.3)
+        other.fade(0.0, 0.995)
+    assert start.probability == 0.0
+    assert told.probability == pytest.approx(EVEN)

@@ -70,16 +70,20 @@ class Surface:
 class Belief:
     """Mass over camera positions (east, north). The grid travels with the camera, so motion costs no resampling."""
 
-    def __init__(self, e_m: float, n_m: float, sigma_m: float, cell_m: float) -> None:
+    def __init__(
+        self, e_m: float, n_m: float, sigma_m: float, cell_m: float, stray: float = 0.0, reach_m: float = 0.0
+    ) -> None:
+        """A normal density of ``sigma_m`` per axis; the share ``stray`` of the mass is uniform over the window, which
+        reaches ``reach_m`` at least."""
         self.cell_m = cell_m
-        half = min(max(4.0 * sigma_m / cell_m + MARGIN_CELLS, MIN_HALF_CELLS), MAX_HALF_CELLS)
+        half = min(max(4.0 * sigma_m / cell_m + MARGIN_CELLS, MIN_HALF_CELLS, reach_m / cell_m), MAX_HALF_CELLS)
         cells = 2 * int(np.ceil(half)) + 1
         self._e0 = e_m - (cells // 2) * self.cell_m  # position of column 0
         self._n0 = n_m + (cells // 2) * self.cell_m  # position of row 0
         axis = (np.arange(cells) - cells // 2) * self.cell_m
         log = -0.5 * (axis**2) / sigma_m**2
-        self._mass = np.exp(log[:, None] + log[None, :])
-        self._mass = self._mass / self._mass.sum()
+        normal = np.exp(log[:, None] + log[None, :])
+        self._mass = (1.0 - stray) * normal / normal.sum() + stray / normal.size
 
     def move(self, east_m: float, north_m: float, sigma_m: float) -> None:
         """Odometry: shift by the step, spread by its error."""

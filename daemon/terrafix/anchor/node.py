@@ -11,7 +11,7 @@ from terrafix.anchor.answer import coarse, ground_sigma_m, judged
 from terrafix.anchor.belief import Belief, cell_for
 from terrafix.anchor.hint import outside_m
 from terrafix.anchor.layers import Dated, Layers
-from terrafix.anchor.lost import LostWatch, claims_little
+from terrafix.anchor.lost import START_ODDS, LostWatch, claims_little
 from terrafix.anchor.map_features import Describer
 from terrafix.anchor.map_package import MapPackage
 from terrafix.anchor.matcher import view_at
@@ -54,6 +54,9 @@ MODES_SAID = 2  # the best place and its best rival
 MODE_TRIED = 0.5  # modes below this are not tried at all
 COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in this very frame
 
+# A start coordinate that is wrong by far more than it claims: how often (lost.py), and how far it is looked for until
+# a pose has placed the flight.
+START_STRAY, STRAY_SIGMAS, STRAY_MOST_M = float(np.exp(-START_ODDS)), 8.0, 500.0
 START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is not known yet
 # Of the height: what the belief follows is the place from which a picture seems to be taken, and a tilt that is a
 # degree more than in the frame before moves it. At most: whose tilt is known better sways less. Every frame adds it,
@@ -97,6 +100,7 @@ class AnchorNode:
     def _begin(self) -> None:
         """Nothing is known of the flight yet."""
         self._belief: Belief | None = None
+        self._reach_m = 0.0  # of its window, at least
         self._watch = LostWatch()
         self._search = PlaceSearch()
         self._alone = FlightBudget()  # of single frames
@@ -206,6 +210,7 @@ class AnchorNode:
                 self._watch = LostWatch()
                 cell_m = cell_for(prediction.agl_m, best.matcher.look_cell_m(prediction.agl_m))
                 self._belief = Belief(answer.mode_e_m, answer.mode_n_m, FOUND_SIGMA_M, cell_m)
+                self._reach_m = 0.0
             return answer
         if image is None:
             return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE, step=SearchStep.SKIP)
@@ -278,6 +283,7 @@ class AnchorNode:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
         if answer.verdict is Verdict.ACCEPTED:
             belief.confirm(mode, likelihood_ratio)
+            self._reach_m = 0.0
             modes = belief.modes(MODES_SAID)
             said = [(m.e_m, m.n_m, m.mass, m.var_m2) for m in modes]
             enough = Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS
@@ -311,7 +317,9 @@ class AnchorNode:
             e_m, n_m, _ = prediction.p_c_in_w_m
             start = float(np.sqrt(variance))
             tilt = prediction.agl_m * float(np.sqrt(max(prediction.cov[21], prediction.cov[28])))
-            self._belief = Belief(e_m, n_m, float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt)), cell_m)
+            sigma_m = float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt))
+            self._reach_m = min(STRAY_SIGMAS * sigma_m, STRAY_MOST_M)
+            self._belief = Belief(e_m, n_m, sigma_m, cell_m, START_STRAY, self._reach_m)
             # A prediction that is better than that start was found before: this process was started again in flight.
             if origin.start_sigma_m > SEARCHED_START_M and start > 0.5 * SEARCHED_START_M:
                 around_m = start_around(e_m, n_m, origin.start_sigma_m, best.map)
@@ -325,7 +333,7 @@ class AnchorNode:
             sway = min(SWAY, float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))))
             self._search.move(prediction.step_m, float(np.sqrt(step_var)))  # a place that was found is tested further
             self._belief.move(*prediction.step_m, float(np.hypot(sigma_m, sway * prediction.agl_m)))
-            self._belief.fit_window(0.0)
+            self._belief.fit_window(self._reach_m)
             if not 0.4 < cell_m / self._belief.cell_m < 2.5:  # an octave is left alone: no flicker at its edge
                 self._belief.set_cell(cell_m)
         self._since_look_m += float(np.hypot(step_m, sigma_m))

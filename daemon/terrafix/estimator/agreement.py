@@ -16,15 +16,17 @@ class Agreement:
     _began_at_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     _reached_m: float = 0.0
 
-    def add(self, offset_m: np.ndarray, here_m: np.ndarray, *, coarse: bool) -> None:
-        """One more, with the estimate at ``here_m``. One that does not agree begins a new row."""
+    def add(self, offset_m: np.ndarray, here_m: np.ndarray, *, coarse: bool) -> bool:
+        """One more, with the estimate at ``here_m``. -> whether it agrees with the row; else it begins a new one."""
         if self.offsets_m and float(np.hypot(*(offset_m - np.mean(self.offsets_m, axis=0)))) > AGREE_M:
             self.clear()
-        if not self.offsets_m:
+        agrees = bool(self.offsets_m)
+        if not agrees:
             self._began_at_m = here_m
         self.offsets_m.append(offset_m)
         self.poses += not coarse
         self._reached_m = float(np.hypot(*(here_m - self._began_at_m)))
+        return agrees
 
     def holds(self, count: int, over_m: float, *, poses: bool = False) -> bool:
         """So many agree (so many ``poses``), over so much way that they are not one mistake seen again and again."""

@@ -16,6 +16,7 @@ from terrafix.estimator.agreement import Agreement
 from terrafix.estimator.factors import HEIGHT
 from terrafix.estimator.graph import NodeState
 from terrafix.estimator.integrity.fragments import MapHits
+from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.other_place import AGREEING, OtherPlace
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.matched import determined, measured_pose, moved_by_lens, straightened_pose
@@ -93,7 +94,7 @@ class Estimator(Tracker):
         r_w_c = measured.rotation().matrix()
         height = max(float(measured.translation()[2]) - self.terrain.ground_m, 1.0)
         if match.found:  # by a search, over several frames: it outweighs whatever the graph believes
-            self.hypotheses.other = OtherPlace()
+            self.hypotheses.other, self.hypotheses.map_consistency = OtherPlace(), MapConsistency()
             return self._restart(match, node, measured, cov, "found")
         if self._open is not None:
             if match.coarse:  # its heading is one of those that were tried
@@ -124,13 +125,15 @@ class Estimator(Tracker):
             self.terrain.ruggedness.measured(here, height, float(up_m - measured.translation()[2]), sigma_m)
         fixed_s = self.graph.time_of(node)
         if not match.coarse and self._seen.newest_s is not None:
-            self.hypotheses.other.fade(self._seen.new_m(fixed_s, here, math.inf) / height)
+            new_heights = self._seen.new_m(fixed_s, here, math.inf) / height
+            self.hypotheses.other.fade(new_heights, match.mode_mass)
         new = self._seen.share(fixed_s, here, height)
         self.graph.add_pose(node, seen, seen_cov / new, by_lens, match.lens)
         if self.mode is CovarianceMode.JACOBIAN:
             self._cov_of[node] = np.linalg.inv(np.linalg.inv(self._cov_of[node]) + np.linalg.inv(cov / new))
         if not match.coarse:
             self._map_hits.looked(self._fragments.of(node), found=True)
+            self.hypotheses.map_consistency.agreed(new)
         self._accepted(match, fixed_s, here)
         return FixResult(Verdict.ACCEPTED, d2, f"new ground {new:.2f}")
 
@@ -171,7 +174,9 @@ class Estimator(Tracker):
         predicted = self.graph.state(node).pose
         offset, apart = _offset(predicted, self._covariance(node), measured, cov)
         row = self._refused
-        row.add(offset, predicted.translation()[:2], coarse=match.coarse)
+        agrees = row.add(offset, predicted.translation()[:2], coarse=match.coarse)
+        if not match.coarse and not agrees:  # those that agree with each other speak for another place
+            self.hypotheses.map_consistency.refused(offset)
         height = float(measured.translation()[2]) - self.terrain.ground_m
         # A pose stands on patches of its own frame. A coarse one says what the belief remembers: one look that went
         # astray is in all that follow. Where nothing is in doubt they count against the graph when they would find a

@@ -14,6 +14,7 @@ KEPT = 400  # states; 8 s at 50 Hz
 KEPT_TURNS, KEPT_READINGS = 3000, 6000
 STANDS_BELOW_M = 10.0  # what a barometer may have drifted before take-off
 MAX_GAP_NS = 1_000_000_000  # older than this against the frame says nothing about it
+BOX = np.linspace(-1.0, 1.0, 9)
 MOMENT_NS = 200_000_000  # by which states may come out of order
 # Between readings, and from the last one to the frame: the acceleration is taken to go straight from one to the next.
 MAX_READING_GAP_NS = 120_000_000
@@ -110,12 +111,17 @@ class Telemetry:
         """Time of the newest whole attitude; -1: there was none."""
         return self._turns.newest_ns
 
-    def yaw_at(self, t_ns: np.ndarray) -> np.ndarray | None:
-        """Reported heading (N,) at times (N,), unwrapped; None where attitudes do not cover them."""
-        turns = self._turns.around(int(t_ns.min()), int(t_ns.max()))
-        if turns is None or turns[0][0] > t_ns.min() or turns[0][-1] < t_ns.max():
+    def turned_about(self, t_ns: np.ndarray) -> np.ndarray | None:
+        """Reported yaw, pitch and roll (3, N) about times (N,) [ns], unwrapped: means over two report intervals, whose
+        noise is the same at a report and between two. None where attitudes do not cover that."""
+        turns = self._turns.around(int(t_ns.min()) - MAX_GAP_NS, int(t_ns.max()) + MAX_GAP_NS)
+        if turns is None:
             return None
-        return np.interp(t_ns, turns[0], _unwrapped(turns[1])[0])
+        about_ns = np.median(np.diff(turns[0])) * BOX
+        if turns[0][0] > t_ns.min() + about_ns[0] or turns[0][-1] < t_ns.max() + about_ns[-1]:
+            return None
+        at_ns = t_ns[:, None] + about_ns
+        return np.stack([np.interp(at_ns, turns[0], angle).mean(axis=1) for angle in _unwrapped(turns[1])])
 
     def turned_otherwise(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
         """The turn (3,) about east, north and up by which the attitude turned from ``t0_ns`` to ``t1_ns`` and

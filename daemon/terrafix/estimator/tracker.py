@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from terrafix.core.geodesy import yaw_of
 from terrafix.core.limits import LEAST_LOOK_AGL_M
 from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.estimator.air import Air, Wind
@@ -371,8 +372,10 @@ class Tracker:
         if sighting.motion is None:
             return None
         parent, motion = sighting.motion
-        r_w_kf = self.graph.state(parent).pose.rotation().matrix()
-        since_rad = self.camera.yaw_rad(r_w_kf @ motion.r) - self.camera.yaw_rad(r_w_kf)
+        state = self.graph.state(parent)
+        r_w_kf = state.pose.rotation().matrix()
+        yaw_kf_rad, yaw_rad = (yaw_of(self.camera.body(r_w_c, state.bias)) for r_w_c in (r_w_kf, r_w_kf @ motion.r))
+        since_rad = yaw_rad - yaw_kf_rad
         self._heading_seen = (odometry.t_ns, odometry.keyframe_id, since_rad)
         if before is not None and before[1] == odometry.keyframe_id:
             return Turn(before[0], odometry.t_ns, math.remainder(since_rad - before[2], math.tau))

@@ -25,6 +25,8 @@ from terrafix_tools.accept.judged import Marks
 from terrafix_tools.estimates import ESTIMATES, Row, read_rows
 from terrafix_tools.evaluate import Compared, Truth, compare, metrics, read_summary
 
+STAMP_S = 1e-3  # times of one row are rounded to this
+
 
 @dataclass
 class Seen:
@@ -103,6 +105,24 @@ def moved_truth(truth: dict[str, Truth], east_m: float, north_m: float) -> dict[
     return moved
 
 
+def truth_of_estimates(frames: list[Seen], truth: dict[str, Truth]) -> dict[str, Truth]:
+    """Truth by file, of the time that each frame's newest estimate is of. ``truth``: of the times of the frames.
+
+    An estimator that knows how late its pictures are has them at an earlier time than they were stamped with; between
+    two frames the truth is a straight line."""
+    known = [frame for frame in frames if frame.row.file in truth]
+    times_s = [frame.t_s for frame in known]
+    lat_deg = [truth[frame.row.file].lat_deg for frame in known]
+    lon_deg = [truth[frame.row.file].lon_deg for frame in known]
+    at = {}
+    for frame in known:
+        t_s = frame.estimates[-1].t_ns * 1e-9 if frame.estimates else frame.t_s
+        same = abs(t_s - frame.t_s) < STAMP_S
+        there = Truth(float(np.interp(t_s, times_s, lat_deg)), float(np.interp(t_s, times_s, lon_deg)))
+        at[frame.row.file] = truth[frame.row.file] if same else there
+    return at
+
+
 def gather(
     out: Path,
     truth: dict[str, Truth],
@@ -120,10 +140,8 @@ def gather(
     rows = read_rows(out / ESTIMATES)
     names = original(row.file for row in rows)
     moved = moved_truth(truth, *truth_offset_m)
-    truth = {row.file: moved[name] for row, name in zip(rows, names, strict=True) if name in moved}
     summary = read_summary(out)
-    compared = {c.row.file: c for c in compare(rows, truth)}
-    frames = [Seen(row, compared.get(row.file)) for row in rows]
+    frames = [Seen(row) for row in rows]
     by_id: dict[int, Seen] = {}  # rows are in the order in which frames were said
     origin, hot, searches = None, set(), []
     for _, _, message in read_flight(out):
@@ -151,5 +169,10 @@ def gather(
             case _:
                 pass
     assert origin is not None
+    at_stamps = {row.file: moved[name] for row, name in zip(rows, names, strict=True) if name in moved}
+    truth = truth_of_estimates(frames, at_stamps)
+    compared = {c.row.file: c for c in compare(rows, truth)}
+    for frame in frames:
+        frame.compared = compared.get(frame.row.file)
     of_all = metrics(rows, truth, summary, None)
     return Evidence(origin, frames, marks, of_all, summary, hot, start_up_s, peer or {}, searches)

@@ -18,7 +18,7 @@ MEDIAN_ERROR = math.sqrt(2.0 * math.log(2.0))  # of a circular normal error, in 
 
 
 def late_false_fixes(e: Evidence) -> Measured:
-    """All but those within the first 3 s or 5 frames of the lie; before the lie and after its end all count."""
+    """All but those of the first 3 s or 5 frames since the lie began, however short it was."""
     return _late(e, FALSE_FIX_ERROR_M)
 
 
@@ -107,9 +107,7 @@ def in_lie(e: Evidence, frame: Seen) -> bool:
 def _late(e: Evidence, beyond_m: float) -> Measured:
     lie = lie_of(e)
     since = [f for f in e.frames if f.t_s >= lie.from_s]
-    allowed = {
-        id(f) for n, f in enumerate(since) if lie.has(f.t_s) and (n < ALLOWED_FRAMES or f.t_s <= lie.from_s + ALLOWED_S)
-    }
+    allowed = {id(f) for n, f in enumerate(since) if n < ALLOWED_FRAMES or f.t_s <= lie.from_s + ALLOWED_S}
     wrong = [f for f in e.frames if is_false(f, beyond_m)]
     late = [f for f in wrong if id(f) not in allowed]
     worst_m = max((f.error_m for f in late if f.error_m is not None), default=0.0)

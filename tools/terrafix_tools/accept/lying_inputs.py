@@ -196,14 +196,17 @@ def dropped_and_doubled(dropped: float, doubled: float, seed: int) -> Edit:
 
 
 def photos(files: frozenset[str]) -> Edit:
-    """Only these frames, each with the newest state that was reported by then: nothing is heard between them."""
+    """Only these frames, each with the newest of all that was reported by then, in one state: an autopilot reports
+    attitude and height in messages of their own."""
 
     def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
-        newest: tuple[VehicleState, ...] = ()
+        newest: VehicleState | None = None
         for shot in shots:
-            newest = shot.states[-1:] or newest
+            for state in shot.states:
+                said = {name: value for name in state.__struct_fields__ if (value := getattr(state, name)) is not None}
+                newest = state if newest is None else msgspec.structs.replace(newest, **said)
             if shot.frame.file in files:
-                yield Shot(shot.frame, newest, shot.image)
+                yield Shot(shot.frame, () if newest is None else (newest,), shot.image)
 
     return edit
 

@@ -24,7 +24,7 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix_tools.montecarlo.faults import Faults
-from terrafix_tools.montecarlo.flown import fly
+from terrafix_tools.montecarlo.flown import Shot, fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens
 from terrafix_tools.montecarlo.lies import Lies
@@ -68,6 +68,7 @@ class Run:
         self._plan, self._flown = plan, flown
         self._node = EstimatorNode()
         self._frame = LocalFrame(flown.origin.lat_deg, flown.origin.lon_deg)
+        self._times_ns: dict[int, int] = {}  # frame -> time of its newest estimate
         self._page_mb = os.sysconf("SC_PAGE_SIZE") / 2**20
         n = len(flown.frames)
         self._record = Record(
@@ -152,14 +153,21 @@ class Run:
                 case Refinement():
                     for pose in answer.poses:
                         at = self._frame.to_local(pose.lat_deg, pose.lon_deg)
-                        truth_m = self._flown.frames[pose.frame_id].p_m[:2]
+                        truth_m = self._truth(pose.frame_id).p_m[:2]
                         self._record.refined_error_m[pose.frame_id] = np.array(at) - truth_m
                         self._record.refined_sigma_m[pose.frame_id] = pose.sigma_e_m, pose.sigma_n_m
         return said
 
+    def _truth(self, frame_id: int) -> Shot:
+        """At the time that the newest estimate of the frame is of: an estimator that knows how late its pictures are
+        has that before the frame's stamp."""
+        shot, t_ns = self._flown.frames[frame_id], self._times_ns[frame_id]
+        return shot if round(shot.t_s * 1e9) == t_ns else self._flown.at(t_ns * 1e-9)
+
     def _estimate(self, said: NavEstimate) -> None:
         i, record = said.frame_id, self._record
-        shot = self._flown.frames[i]
+        self._times_ns[i] = said.t_ns
+        shot = self._truth(i)
         e_m, n_m = self._frame.to_local(said.lat_deg, said.lon_deg)
         record.error_m[i, :3] = np.array([e_m, n_m, said.alt_amsl_m]) - shot.p_m
         record.error_m[i, 3:] = log_so3(rot_from_quat(said.q_w_b) @ shot.r_w_b.T)

@@ -10,7 +10,7 @@ import numpy as np
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.pose import exp_so3
+from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Imu, Message, Origin, VehicleState
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.mission import Box, Mission
@@ -57,6 +57,22 @@ class Flown:
     telemetry: list[list[Message]]  # before each frame
     way_m: np.ndarray  # (N,) flown over ground up to each frame
     terrain: Terrain  # in the estimator's world
+
+    def at(self, t_s: float) -> Shot:
+        """The truth at any time of the flight: cubic in position, one rotation at constant rate, between two frames."""
+        times_s = [shot.t_s for shot in self.frames]
+        i = int(np.clip(np.searchsorted(times_s, t_s, side="right") - 1, 0, len(times_s) - 2))
+        a, b = self.frames[i], self.frames[i + 1]
+        dt_s = b.t_s - a.t_s
+        u = (t_s - a.t_s) / dt_s
+        p_m = (
+            (2 * u**3 - 3 * u**2 + 1) * a.p_m
+            + (u**3 - 2 * u**2 + u) * dt_s * a.velocity_mps
+            + (3 * u**2 - 2 * u**3) * b.p_m
+            + (u**3 - u**2) * dt_s * b.velocity_mps
+        )
+        turned = [ra @ exp_so3(u * log_so3(ra.T @ rb)) for ra, rb in ((a.r_w_c, b.r_w_c), (a.r_w_b, b.r_w_b))]
+        return Shot(t_s, p_m, turned[0], turned[1], (1 - u) * a.velocity_mps + u * b.velocity_mps)
 
 
 def fly(plan: FlightPlan, terrain: Terrain) -> Flown:

@@ -57,13 +57,18 @@ class OtherPlace:
     def _is_at(self, offset_m: np.ndarray, cov_m2: np.ndarray) -> None:
         self.offset_m, self.cov_m2, self._repeats, self._two = offset_m, cov_m2, EVEN, False
 
-    def fade(self, new_heights: float) -> None:
-        """A match agreed with the estimate over new ground, in heights flown since the last one."""
+    def fade(self, new_heights: float, mode_mass: float) -> None:
+        """A camera pose agreed with the estimate over new ground, in heights flown since the last one.
+
+        ``mode_mass``: of the belief, where the pose is. The belief began at the start, and what it has left of that is
+        in the rest."""
         self._two = self._was_at(np.zeros(2))
         lasts = TOLD_LASTS if self._was_at(self.offset_m) else START_LASTS if self._is_start else 1.0
         over = FORGET_OVER * lasts
         self._repeats *= float(np.exp(-new_heights / over))
-        if self.probability < FORGOTTEN:
+        if self._is_start:
+            self._repeats = min(self._repeats, 1.0 - mode_mass)
+        if self.probability <= FORGOTTEN:
             self._repeats = 0.0
 
     def _was_at(self, offset_m: np.ndarray) -> bool:

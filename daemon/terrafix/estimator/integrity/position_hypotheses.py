@@ -9,6 +9,7 @@ import numpy as np
 
 from terrafix.core.gate import GATE
 from terrafix.core.start import SEARCHED_START_M
+from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.other_place import OtherPlace
 from terrafix.messages import MapMatch, Origin, Verdict
 
@@ -50,13 +51,15 @@ class PositionHypotheses:
         self._start_m = origin.start_sigma_m if origin is not None and searched else 0.0
         self.anywhere_m = 0.0
         self.other = OtherPlace()
+        self.map_consistency = MapConsistency()
         self._modes: tuple[Component, ...] = ()  # of the belief, heaviest first
         self._belief: Component | None = None  # all of it, while no pose has placed the graph
         self._own_m2 = np.zeros((2, 2))  # of the estimate that these were weighed against
 
     @property
     def are_several(self) -> bool:
-        return bool(self._modes) or self._belief is not None or self.other.probability > 0.0
+        several = bool(self._modes) or self._belief is not None or self.other.probability > 0.0
+        return several or self.map_consistency.variance_m2 > 0.0
 
     def hear(self, match: MapMatch) -> str:
         """-> what to say of a match whose verdict is LOST; empty for any other."""
@@ -98,7 +101,8 @@ class PositionHypotheses:
         # Only in the estimate's own share are place, height and attitude correlated.
         cov[:2, 2:] *= own
         cov[2:, :2] *= own
-        cov[:2, :2] = moments_m2 + self.other.spread_m2() + max(self.anywhere_m, self._start_m) ** 2 * np.eye(2)
+        anywhere_m2 = max(self.anywhere_m, self._start_m) ** 2 + self.map_consistency.variance_m2
+        cov[:2, :2] = moments_m2 + self.other.spread_m2() + anywhere_m2 * np.eye(2)
         return at_m, cov
 
     def _of_modes(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
