@@ -1,0 +1,188 @@
+"""The runs whose messages are compared: recorded flights, simulated ones, a restart in flight, the link, finalise.
+
+A case takes a folder to work in and gives its digests. All are deterministic on one computer with one thread for linear
+algebra (``run.py`` sees to that); another processor may round otherwise."""
+
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from terrafix.core.node import Edge, Node, NodeContext
+from terrafix.estimator.resume import Keeper
+from terrafix.link.gps_input import encode
+from terrafix.link.node import TICK_HZ, LinkNode
+from terrafix.messages import (
+    CalibrationFault,
+    GpsInput,
+    Message,
+    NavEstimate,
+    Odometry,
+    Origin,
+    SearchState,
+    VehicleState,
+    WallClock,
+)
+from terrafix.recorder.reader import read_flight
+from terrafix_tools.finalise.output import TABLE
+from terrafix_tools.finalise.run import finalise
+from terrafix_tools.golden.digest import Digest, Digests
+from terrafix_tools.montecarlo.flight import Run
+from terrafix_tools.montecarlo.plan import plan
+from terrafix_tools.replay import make_nodes, replay
+from terrafix_tools.sim.autopilot.parameters import Kind
+from terrafix_tools.sim.flights import make as making
+
+VILLAGE, TOWN = "flights/village-1", "flights/town-a"
+SIMULATED_S = 60.0
+MONTECARLO_SEED, MONTECARLO_FLIGHTS, MONTECARLO_S = 3, 12, 120.0
+RESTARTED_AT = 40  # frame of the simulated flight after which the estimator's process is another one
+UNIX_NS = 1_750_000_000_000_000_000  # of the link's wall clock: any time at which GPS week and leap seconds are known
+
+
+@dataclass(frozen=True)
+class Case:
+    """``needs``: files of the data folder."""
+
+    name: str
+    digests: Callable[[Path, Path], dict[str, Digest]]  # data folder, folder to work in
+    needs: tuple[str, ...] = ()
+
+
+def of_record(folder: Path) -> Digests:
+    digests = Digests()
+    for _, _, message in read_flight(folder):
+        digests.take(message)
+    return digests
+
+
+def _replayed(flight: str, map_name: str, models: tuple[str, ...] = ()) -> Callable[[Path, Path], dict[str, Digest]]:
+    def digests(data: Path, work: Path) -> dict[str, Digest]:
+        wanted = [f"{name}={data / path}" for name, path in (model.split("=") for model in models)]
+        replay(data / flight, data / map_name, work / "out", models=wanted)
+        return of_record(work / "out").result()
+
+    return digests
+
+
+def _simulated(kind: Kind, seed: int, nodes: Callable[[NodeContext], Mapping[str, Node]] = make_nodes):  # type: ignore[no-untyped-def]
+    def digests(_: Path, work: Path) -> dict[str, Digest]:
+        making.make(work / "flight", making.Wanted(seed=seed, vehicle=kind, duration_s=SIMULATED_S), progress=False)
+        replay(work / "flight", None, work / "out", nodes=nodes)
+        return of_record(work / "out").result()
+
+    return digests
+
+
+def montecarlo(_: Path, __: Path) -> dict[str, Digest]:
+    """Every message that the estimator says in a round of simulated flights."""
+    digests = Digests()
+    for number in range(MONTECARLO_FLIGHTS):
+        flight = _Heard(plan(MONTECARLO_SEED, number, fault=None, duration_s=MONTECARLO_S, lie_share=0.05))
+        flight.digests = digests
+        flight.record(refine=True)
+    return digests.result()
+
+
+class _Heard(Run):
+    digests: Digests
+
+    def hear(self, message: Message) -> list[Message]:
+        said = super().hear(message)
+        for one in said:
+            self.digests.take(one)
+        return said
+
+
+class RestartedEstimator:
+    """The estimator, in a process that is another one from frame ``at`` on: that has what the first one kept."""
+
+    def __init__(self, ctx: NodeContext, node: Node, at: int) -> None:
+        self._ctx, self._node, self._at = ctx, node, at
+        self._file = Path(tempfile.mkdtemp()) / "kept"
+        self._edge: Edge = Keeper(self._file)
+        self._origin: Origin | None = None
+
+    def on(self, message: Message) -> Iterable[Message]:
+        if isinstance(message, Origin):
+            self._origin = message
+        if isinstance(message, Odometry) and message.frame_id == self._at and self._origin is not None:
+            again = replace(self._ctx, kept=self._file, epoch_ns=self._origin.t_ns)
+            self._node = make_nodes(again)["estimator"]
+            yield from self._node.on(self._origin)
+        self._edge.heard(message)
+        for said in self._node.on(message):
+            self._edge.heard(said)
+            yield said
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        return self._node.tick(now_ns)
+
+
+def restarted(ctx: NodeContext) -> dict[str, Node]:
+    nodes = make_nodes(ctx)
+    return {**nodes, "estimator": RestartedEstimator(ctx, nodes["estimator"], RESTARTED_AT)}
+
+
+def finalised(data: Path, work: Path) -> dict[str, Digest]:
+    """The whole-flight solution of a recorded flight; its record is not compared again."""
+    replay(data / VILLAGE, data / "maps/village-2014-01.tif", work / "out")
+    finalise(work / "out")
+    digests = Digests()
+    digests.take_bytes(TABLE, (work / "out" / TABLE).read_bytes())
+    return digests.result()
+
+
+def link(_: Path, work: Path) -> dict[str, Digest]:
+    """A simulated flight as the link hears it, with its ticks: GpsInput and the bytes of GPS_INPUT, texts, verdicts."""
+    wanted = making.Wanted(seed=33, vehicle=Kind.COPTER, duration_s=SIMULATED_S)
+    making.make(work / "flight", wanted, progress=False)
+    replay(work / "flight", None, work / "out")
+    digests, node, wire = Digests(), LinkNode(10.0), mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+    tick_ns = round(1e9 / TICK_HZ)
+    now_ns = 0
+    heard = (Origin, NavEstimate, CalibrationFault, SearchState, VehicleState)
+    node_says = [*node.on(WallClock(t_ns=0, source="golden", unix_ns=UNIX_NS))]
+    for _topic, _log_ns, message in read_flight(work / "out"):
+        if not isinstance(message, heard):
+            continue
+        while now_ns + tick_ns <= message.t_ns:
+            now_ns += tick_ns
+            node_says += node.tick(now_ns)
+        if isinstance(message, NavEstimate):
+            message = msgspec.structs.replace(message, emitted_at_ns=message.t_ns)
+        node_says += node.on(message)
+    for said in node_says:
+        digests.take(said)
+        if isinstance(said, GpsInput):
+            digests.take_bytes("GPS_INPUT", bytes(encode(said, 0).pack(wire)))
+    return digests.result()
+
+
+CASES = (
+    Case("montecarlo", montecarlo),
+    Case("copter", _simulated(Kind.COPTER, 31)),
+    Case("plane", _simulated(Kind.PLANE, 32)),
+    Case("restart in flight", _simulated(Kind.COPTER, 31, restarted)),
+    Case("link", link),
+    Case(
+        "village-1 on 2014-01",
+        _replayed(VILLAGE, "maps/village-2014-01.tif"),
+        (VILLAGE, "maps/village-2014-01.tif"),
+    ),
+    Case(
+        "village-1 on 2014-03",
+        _replayed(VILLAGE, "maps/village-2014-03.tif"),
+        (VILLAGE, "maps/village-2014-03.tif"),
+    ),
+    Case(
+        "village-1 by XFeat",
+        _replayed(VILLAGE, "maps/village-2014-01.tif", ("xfeat=models/xfeat.onnx",)),
+        (VILLAGE, "maps/village-2014-01.tif", "models/xfeat.onnx"),
+    ),
+    Case("town-a", _replayed(TOWN, "maps/town.tif"), (TOWN, "maps/town.tif")),
+    Case("finalise village-1", finalised, (VILLAGE, "maps/village-2014-01.tif")),
+)
