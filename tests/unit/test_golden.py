@@ -90,5 +90,5 @@ def test_cases_are_compared_with_their_references(monkeypatch: pytest.MonkeyPatc
 
 def test_a_case_that_fails_says_why_in_one_line(tmp_path: Path) -> None:
     town = next(case for case in CASES if case.name == "town-a")
-    with pytest.raises(UsageError, match="town-a: failed; .*town-a"):
+    with pytest.raises(UsageError, match=r"town-a: failed; .*town-a"):
         golden.found(town, tmp_path)

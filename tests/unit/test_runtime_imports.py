@@ -24,6 +24,7 @@ OWNERS = {
         "terrafix_tools.sim.flights.log",
         "terrafix_tools.sim.sitl",
         "terrafix_tools.preflight",
+        "terrafix_tools.golden",
     ),  # tlog: reads recorded telemetry
     "mavsdk": ("terrafix_tools.sim.sitl",),
     "serial": ("terrafix.link",),
