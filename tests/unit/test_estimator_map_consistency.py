@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from terrafix.estimator.integrity.map_consistency import LEAST_WEIGHT, MapConsistency
+from terrafix.core.gate import LEAST_WEIGHT
+from terrafix.estimator.integrity.map_consistency import MapConsistency
 
 AWAY_M = np.array([90.0, -120.0])  # 150 m
 

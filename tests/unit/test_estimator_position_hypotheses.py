@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, Flight, Listener, cov_of, error_m, sigma_m
 
-from terrafix.estimator.integrity.position_hypotheses import LEAST_WEIGHT, PositionHypotheses
+from terrafix.core.gate import LEAST_WEIGHT
+from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.messages import MapMatch, Message, Refinement, SearchStep, SourceEnded, Verdict
 
 WRONG_M = (700.0, -500.0)

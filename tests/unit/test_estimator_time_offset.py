@@ -186,8 +186,8 @@ def test_turns_of_a_camera_that_is_pitched_in_its_mount_are_not_late() -> None:
     rate = np.interp(t_s % 12.0, [0.0, 1.0, 5.0, 6.0], [0.0, math.radians(12.0), math.radians(12.0), 0.0])
     yaw, roll = np.cumsum(rate) * TELEMETRY_S, np.arctan(22.0 * rate / 9.81)
     noise = np.radians(0.3) * rng.normal(size=len(t_s))
-    for at, told, rolled in zip(t_s, yaw + noise, roll, strict=True):
-        state = attitude(float(at), float(told))
+    for at, reported, rolled in zip(t_s, yaw + noise, roll, strict=True):
+        state = attitude(float(at), float(reported))
         telemetry.add(msgspec.structs.replace(state, roll_rad=float(rolled)))
         if round(at * 10) % 10 == 5 and at > 1.0:
             i, j = round((at - 1.0) * 10), round(at * 10)

@@ -74,7 +74,8 @@ class Belief:
         self, e_m: float, n_m: float, sigma_m: float, cell_m: float, stray: float = 0.0, reach_m: float = 0.0
     ) -> None:
         """A normal density of ``sigma_m`` per axis; the share ``stray`` of the mass is uniform over the window, which
-        reaches ``reach_m`` at least."""
+        reaches ``reach_m`` at least until ``confirm``."""
+        self._reach_m = reach_m
         self.cell_m = cell_m
         half = min(max(4.0 * sigma_m / cell_m + MARGIN_CELLS, MIN_HALF_CELLS, reach_m / cell_m), MAX_HALF_CELLS)
         cells = 2 * int(np.ceil(half)) + 1
@@ -156,6 +157,7 @@ class Belief:
 
     def confirm(self, mode: Mode, likelihood_ratio: float) -> None:
         """Evidence from another source that the camera is in this mode."""
+        self._reach_m = 0.0
         axis = np.arange(len(self._mass)) * self.cell_m
         distance2 = (self._n0 - axis - mode.n_m)[:, None] ** 2 + (self._e0 + axis - mode.e_m)[None, :] ** 2
         self._mass = np.where(
@@ -181,7 +183,7 @@ class Belief:
         """Window around the mean, as wide as the belief needs."""
         ee, _, nn = self.covariance()
         spread = 3.0 * float(np.sqrt(max(ee, nn))) / self.cell_m + MARGIN_CELLS
-        self._resize(max(MIN_HALF_CELLS, at_least_half_m / self.cell_m, spread))
+        self._resize(max(MIN_HALF_CELLS, max(at_least_half_m, self._reach_m) / self.cell_m, spread))
 
     def set_cell(self, cell_m: float) -> None:
         """Another resolution, when the height has changed much; as fine as so wide a window can have."""

@@ -100,7 +100,6 @@ class AnchorNode:
     def _begin(self) -> None:
         """Nothing is known of the flight yet."""
         self._belief: Belief | None = None
-        self._reach_m = 0.0  # of its window, at least
         self._watch = LostWatch()
         self._search = PlaceSearch()
         self._alone = FlightBudget()  # of single frames
@@ -210,7 +209,6 @@ class AnchorNode:
                 self._watch = LostWatch()
                 cell_m = cell_for(prediction.agl_m, best.matcher.look_cell_m(prediction.agl_m))
                 self._belief = Belief(answer.mode_e_m, answer.mode_n_m, FOUND_SIGMA_M, cell_m)
-                self._reach_m = 0.0
             return answer
         if image is None:
             return msgspec.structs.replace(answer, verdict=Verdict.BAD_IMAGE, step=SearchStep.SKIP)
@@ -283,7 +281,6 @@ class AnchorNode:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
         if answer.verdict is Verdict.ACCEPTED:
             belief.confirm(mode, likelihood_ratio)
-            self._reach_m = 0.0
             modes = belief.modes(MODES_SAID)
             said = [(m.e_m, m.n_m, m.mass, m.var_m2) for m in modes]
             enough = Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS
@@ -318,8 +315,8 @@ class AnchorNode:
             start = float(np.sqrt(variance))
             tilt = prediction.agl_m * float(np.sqrt(max(prediction.cov[21], prediction.cov[28])))
             sigma_m = float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt))
-            self._reach_m = min(STRAY_SIGMAS * sigma_m, STRAY_MOST_M)
-            self._belief = Belief(e_m, n_m, sigma_m, cell_m, START_STRAY, self._reach_m)
+            reach_m = min(STRAY_SIGMAS * sigma_m, STRAY_MOST_M)
+            self._belief = Belief(e_m, n_m, sigma_m, cell_m, START_STRAY, reach_m)
             # A prediction that is better than that start was found before: this process was started again in flight.
             if origin.start_sigma_m > SEARCHED_START_M and start > 0.5 * SEARCHED_START_M:
                 around_m = start_around(e_m, n_m, origin.start_sigma_m, best.map)
@@ -333,7 +330,7 @@ class AnchorNode:
             sway = min(SWAY, float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))))
             self._search.move(prediction.step_m, float(np.sqrt(step_var)))  # a place that was found is tested further
             self._belief.move(*prediction.step_m, float(np.hypot(sigma_m, sway * prediction.agl_m)))
-            self._belief.fit_window(self._reach_m)
+            self._belief.fit_window(0.0)
             if not 0.4 < cell_m / self._belief.cell_m < 2.5:  # an octave is left alone: no flicker at its edge
                 self._belief.set_cell(cell_m)
         self._since_look_m += float(np.hypot(step_m, sigma_m))

@@ -14,7 +14,7 @@ KEPT = 400  # states; 8 s at 50 Hz
 KEPT_TURNS, KEPT_READINGS = 3000, 6000
 STANDS_BELOW_M = 10.0  # what a barometer may have drifted before take-off
 MAX_GAP_NS = 1_000_000_000  # older than this against the frame says nothing about it
-BOX = np.linspace(-1.0, 1.0, 9)
+BOX = np.linspace(-1.0, 1.0, 9)  # where reported angles are averaged about a time, in intervals between reports
 MOMENT_NS = 200_000_000  # by which states may come out of order
 # Between readings, and from the last one to the frame: the acceleration is taken to go straight from one to the next.
 MAX_READING_GAP_NS = 120_000_000

@@ -5,7 +5,6 @@ flights. Everything lies in --out; what is there already is not flown again."""
 
 import json
 import shutil
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -17,11 +16,12 @@ import rasterio
 import typer
 from rasterio.errors import RasterioIOError
 
-from terrafix.core.errors import OutputError, TerrafixError, UsageError
+from terrafix.core.errors import OutputError, UsageError
 from terrafix_tools.accept.cases_table import Case, Line, lines_of, markdown
 from terrafix_tools.accept.run import Wanted, accept, truth_of
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.flights import make as making
+from terrafix_tools.standalone import run_standalone
 
 DURATION_S = 50.0  # of a simulated flight: 100 frames
 # Who flies over an image, and how high: the first for whose turns there is room.
@@ -181,14 +181,5 @@ def main(
     raise typer.Exit(BROKEN_FLOOR if any(line.broken for line in lines) else 0)
 
 
-def program() -> None:
-    """A user's mistake is one line and its exit code."""
-    try:
-        typer.run(main)
-    except TerrafixError as error:
-        typer.echo(f"adversary: {error}", err=True)
-        sys.exit(error.exit_code)
-
-
 if __name__ == "__main__":
-    program()
+    run_standalone("adversary", main)

@@ -14,9 +14,10 @@ from typing import Annotated
 import msgspec
 import typer
 
-from terrafix.core.errors import OutputError, TerrafixError, UsageError
+from terrafix.core.errors import OutputError, UsageError
 from terrafix_tools.golden.cases import CASES, Case
 from terrafix_tools.golden.digest import Digest, References, differences
+from terrafix_tools.standalone import run_standalone
 
 REFERENCES = Path("tests/golden/references.json")
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -132,14 +133,5 @@ def main(
     raise typer.Exit(DIFFERENT if different else 0)
 
 
-def program() -> None:
-    """A user's mistake is one line and its exit code."""
-    try:
-        typer.run(main)
-    except TerrafixError as error:
-        typer.echo(f"golden: {error}", err=True)
-        sys.exit(error.exit_code)
-
-
 if __name__ == "__main__":
-    program()
+    run_standalone("golden", main)

@@ -3,8 +3,7 @@
 A case takes a folder to work in and gives its digests. All are deterministic on one computer with one thread for linear
 algebra (``run.py`` sees to that); another processor may round otherwise."""
 
-import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,7 +31,7 @@ from terrafix_tools.finalise.run import finalise
 from terrafix_tools.golden.digest import Digest, Digests
 from terrafix_tools.montecarlo.flight import Run
 from terrafix_tools.montecarlo.plan import plan
-from terrafix_tools.replay import make_nodes, replay
+from terrafix_tools.replay import MakeNodes, make_nodes, replay
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.flights import make as making
 
@@ -42,13 +41,15 @@ MONTECARLO_SEED, MONTECARLO_FLIGHTS, MONTECARLO_S = 3, 12, 120.0
 RESTARTED_AT = 40  # frame of the simulated flight after which the estimator's process is another one
 UNIX_NS = 1_750_000_000_000_000_000  # of the link's wall clock: any time at which GPS week and leap seconds are known
 
+DigestsOf = Callable[[Path, Path], dict[str, Digest]]  # of the data folder and a folder to work in
+
 
 @dataclass(frozen=True)
 class Case:
     """``needs``: files of the data folder."""
 
     name: str
-    digests: Callable[[Path, Path], dict[str, Digest]]  # data folder, folder to work in
+    digests: DigestsOf
     needs: tuple[str, ...] = ()
 
 
@@ -59,7 +60,7 @@ def of_record(folder: Path) -> Digests:
     return digests
 
 
-def _replayed(flight: str, map_name: str, models: tuple[str, ...] = ()) -> Callable[[Path, Path], dict[str, Digest]]:
+def _replayed(flight: str, map_name: str, models: tuple[str, ...] = ()) -> DigestsOf:
     def digests(data: Path, work: Path) -> dict[str, Digest]:
         wanted = [f"{name}={data / path}" for name, path in (model.split("=") for model in models)]
         replay(data / flight, data / map_name, work / "out", models=wanted)
@@ -68,11 +69,16 @@ def _replayed(flight: str, map_name: str, models: tuple[str, ...] = ()) -> Calla
     return digests
 
 
-def _simulated(kind: Kind, seed: int, nodes: Callable[[NodeContext], Mapping[str, Node]] = make_nodes):  # type: ignore[no-untyped-def]
+def _fly(work: Path, kind: Kind, seed: int, nodes: MakeNodes = make_nodes) -> Path:
+    """-> the folder with the replay of a simulated flight."""
+    making.make(work / "flight", making.Wanted(seed=seed, vehicle=kind, duration_s=SIMULATED_S), progress=False)
+    replay(work / "flight", None, work / "out", nodes=nodes)
+    return work / "out"
+
+
+def _simulated(kind: Kind, seed: int, nodes: MakeNodes = make_nodes) -> DigestsOf:
     def digests(_: Path, work: Path) -> dict[str, Digest]:
-        making.make(work / "flight", making.Wanted(seed=seed, vehicle=kind, duration_s=SIMULATED_S), progress=False)
-        replay(work / "flight", None, work / "out", nodes=nodes)
-        return of_record(work / "out").result()
+        return of_record(_fly(work, kind, seed, nodes)).result()
 
     return digests
 
@@ -102,7 +108,7 @@ class RestartedEstimator:
 
     def __init__(self, ctx: NodeContext, node: Node, at: int) -> None:
         self._ctx, self._node, self._at = ctx, node, at
-        self._file = Path(tempfile.mkdtemp()) / "kept"
+        self._file = ctx.out_dir / "kept"
         self._edge: Edge = Keeper(self._file)
         self._origin: Origin | None = None
 
@@ -138,15 +144,13 @@ def finalised(data: Path, work: Path) -> dict[str, Digest]:
 
 def link(_: Path, work: Path) -> dict[str, Digest]:
     """A simulated flight as the link hears it, with its ticks: GpsInput and the bytes of GPS_INPUT, texts, verdicts."""
-    wanted = making.Wanted(seed=33, vehicle=Kind.COPTER, duration_s=SIMULATED_S)
-    making.make(work / "flight", wanted, progress=False)
-    replay(work / "flight", None, work / "out")
+    record = _fly(work, Kind.COPTER, 33)
     digests, node, wire = Digests(), LinkNode(10.0), mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     tick_ns = round(1e9 / TICK_HZ)
     now_ns = 0
     heard = (Origin, NavEstimate, CalibrationFault, SearchState, VehicleState)
     node_says = [*node.on(WallClock(t_ns=0, source="golden", unix_ns=UNIX_NS))]
-    for _topic, _log_ns, message in read_flight(work / "out"):
+    for _topic, _log_ns, message in read_flight(record):
         if not isinstance(message, heard):
             continue
         while now_ns + tick_ns <= message.t_ns:

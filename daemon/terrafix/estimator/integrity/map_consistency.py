@@ -8,10 +8,11 @@ import math
 
 import numpy as np
 
+from terrafix.core.gate import LEAST_WEIGHT
+
 # Probabilities that a pose is refused by the innovation gate and agrees with no other one.
 REFUSED, REFUSED_ELSEWHERE = 0.1, 0.9  # up to a tenth of the poses is wrong on a map of another year
 LEAST, MOST = -6.0, 4.0  # log odds: a map that was right for a kilometre may end all the same
-LEAST_WEIGHT = 0.05  # probability from which it reaches into a 95 % ellipse
 REMEMBERED = 0.7  # of the squared distances of refused poses, from one to the next
 
 

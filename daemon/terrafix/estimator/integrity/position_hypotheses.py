@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.core.gate import GATE
+from terrafix.core.gate import GATE, LEAST_WEIGHT
 from terrafix.core.start import SEARCHED_START_M
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.other_place import OtherPlace
 from terrafix.messages import MapMatch, Origin, Verdict
 
-# A component of less than this weight is left out: a 95 % ellipse about the others is one without it.
-LEAST_WEIGHT = 0.05
 # Of the height: with a position that is known better, poses have placed the graph. A mode of the belief elsewhere
 # widens the claim then and does not move it: a pose on the other place is what it takes to leave.
 PLACED = 0.15

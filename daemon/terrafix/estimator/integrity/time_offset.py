@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.core.gate import LEAST_WEIGHT
 from terrafix.estimator.telemetry import Telemetry
 
 GRID_S = np.arange(-2.0, 2.0001, 0.05)
@@ -22,7 +23,6 @@ MOUNT_RAD = np.radians(1.5)  # 1-sigma of what is not learnt of the camera's pit
 # Of the turns: two in a row share a reported heading and a keyframe.
 INDEPENDENT = 0.5
 REMEMBERED = 300.0  # turns, after which the share of one is a third
-LEAST_WEIGHT = 0.05
 REPORTS_NS = 250_000_000  # of attitudes that are waited for beyond the grid: two at 8 Hz
 SURE_SIGMAS = 4.0
 SURE_S = 0.1  # 1-sigma of an offset that is applied, at most

@@ -1,7 +1,6 @@
 """The autopilot peer in a process of its own: ``python -m terrafix_tools.sim.autopilot.process COURSE.csv``."""
 
 import signal
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -9,9 +8,9 @@ from typing import Annotated
 import typer
 
 from terrafix.core.asked import Asked
-from terrafix.core.errors import TerrafixError
 from terrafix_tools.sim.autopilot.course import read_course
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+from terrafix_tools.standalone import run_standalone
 
 LOOK_S = 0.05  # between two looks whether to stop; a signal ends the sleep at once
 
@@ -35,13 +34,5 @@ def fly_course(
     peer.stop().write(out)
 
 
-def main() -> None:
-    try:
-        typer.run(fly_course)
-    except TerrafixError as error:
-        typer.echo(f"terrafix peer: {error}", err=True)
-        sys.exit(error.exit_code)
-
-
 if __name__ == "__main__":
-    main()
+    run_standalone("terrafix peer", fly_course)

@@ -17,13 +17,14 @@ import msgspec
 import typer
 from rich.console import Console
 
-from terrafix.core.errors import TerrafixError, UsageError
+from terrafix.core.errors import UsageError
 from terrafix_tools.sim.demo.flight import fly
 from terrafix_tools.sim.flights.folder import plan_flight, write_flight
 from terrafix_tools.sim.interval.pace import Pace, pace_of
 from terrafix_tools.sim.out_folder import make_room, write_json
 from terrafix_tools.sim.world import place as world
 from terrafix_tools.sim.world.mapped import CAMERA_SEASON, write_map
+from terrafix_tools.standalone import run_standalone
 
 MARK, RESULT = "interval.json", "pace.json"
 LONGEST_MIN = 60.0
@@ -100,13 +101,5 @@ def _ms(value: float | None) -> str:
     return "nothing" if value is None else f"{value:.1f} ms"
 
 
-def main() -> None:
-    try:
-        typer.run(interval)
-    except TerrafixError as error:
-        typer.echo(f"terrafix interval: {error}", err=True)
-        sys.exit(error.exit_code)
-
-
 if __name__ == "__main__":
-    main()
+    run_standalone("terrafix interval", interval)
