@@ -367,7 +367,7 @@ class SlowErrors(Message, frozen=True, kw_only=True):
     # logarithm of heights told over heights seen [-]
     error: tuple[float, float, float, float, float, float]
     cov: tuple[float, ...]  # 6x6, row-major
-    lens: LearntLens | None = None  # of a camera that nobody has calibrated; estimator/middle.py
+    lens: LearntLens | None = None  # of a camera that nobody has calibrated; estimator/measurements/principal_point.py
 
 
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):

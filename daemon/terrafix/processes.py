@@ -12,11 +12,11 @@ from terrafix import messages as m
 class Process:
     name: str
     module: str  # has make_node(ctx: NodeContext) -> Node; may have make_edge(ctx) -> Edge (its sockets and files)
-    hears: tuple[type[m.Message], ...]
-    says: tuple[type[m.Message], ...]
+    subscribes: tuple[type[m.Message], ...]
+    publishes: tuple[type[m.Message], ...]
     tick_hz: float  # how often tick() is called; 0 = only messages
     stuck_after_s: float  # no progress for this long counts as dead
-    newest: tuple[type[m.Message], ...] = ()  # a backlog of these becomes the newest one (see core/inbox.py)
+    newest: tuple[type[m.Message], ...] = ()  # a backlog of these becomes the newest one (see runtime/inbox.py)
 
 
 # Who else speaks.

@@ -28,8 +28,8 @@ from standing_copter import standing
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
-from terrafix.link.carry import offset
 from terrafix.link.edge import open_edge
+from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.node import LinkNode
 
 BINARY_VARIABLE = "TERRAFIX_PX4_SITL"

@@ -8,7 +8,7 @@ from pilot import HOVER_M, Pilot, end, fly_up, terrafix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from standing_copter import HOME, copter, free_port
 
-from terrafix.core.takeoff_height import TakeOffHeight
+from terrafix.core.mavlink.home_altitude import TakeOffHeight
 
 pytestmark = pytest.mark.slow
 LOWER_M = 30.0

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from standing_copter import HOME, WAIT_S, Heard, copter, free_port, stand
 
 from terrafix.core.config import LinkSection
-from terrafix.link.signing import timestamp
+from terrafix.link.mavlink.signing import timestamp
 
 pytestmark = pytest.mark.slow
 EXTERNAL_NAV = {"GPS1_TYPE": 0, "VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_POSZ": 1, "EK3_SRC1_YAW": 1}

@@ -11,7 +11,7 @@ from px4 import AUTO, HOME, HOVER_M, LAND, LOITER, NO_GPS, OURS, WAYPOINT_M, Fli
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
-from terrafix.link.carry import offset
+from terrafix.link.integrity.output_predictor import offset
 
 pytestmark = pytest.mark.slow
 ODOMETRY = {"EKF2_EV_CTRL": 5}  # horizontal position and velocity

@@ -13,10 +13,10 @@ from terrafix.anchor.node import AnchorNode
 from terrafix.core.config import LinkSection
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.shell import InProcessShell
 from terrafix.estimator.node import EstimatorNode
 from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
+from terrafix.runtime.executor import InProcessShell
 from terrafix_engines.features.gradient import GradientDescriber
 
 pytestmark = pytest.mark.slow

@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable
 
 from terrafix import messages as m
-from terrafix.link.carry import offset
 from terrafix.link.edge import MavlinkEdge
+from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.node import LinkNode
 
 LAT, LON, ALT = 48.0, 11.0, 620.0

@@ -6,7 +6,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
-from terrafix.link.transport import Address, Chunk
+from terrafix.link.mavlink.transport import Address, Chunk
 
 
 class MemoryWire:

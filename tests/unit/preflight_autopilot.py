@@ -4,7 +4,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.link.transport import Address, Chunk
+from terrafix.link.mavlink.transport import Address, Chunk
 
 VERSION_4_6 = 4 << 24 | 6 << 16 | 3 << 8 | 255
 

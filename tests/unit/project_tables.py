@@ -14,12 +14,12 @@ ALSO_SAID_BY = {"ProcessEvent": f"the {SUPERVISOR}", "Dropped": "the shell of ev
 
 
 def processes() -> str:
-    rows = ["| process | hears | says | ticks | counts as stuck after |", "|---|---|---|---|---|"]
+    rows = ["| process | subscribes | publishes | ticks | counts as stuck after |", "|---|---|---|---|---|"]
     for process in PROCESSES:
-        hears = "everything" if process.hears == EVERYTHING else _names(process.hears)
+        hears = "everything" if process.subscribes == EVERYTHING else _names(process.subscribes)
         newest = f" (a backlog of {_names(process.newest)} becomes the newest)" if process.newest else ""
         ticks = f"{process.tick_hz:g} Hz" if process.tick_hz else "-"
-        says = _names(process.says)
+        says = _names(process.publishes)
         rows.append(f"| `{process.name}` | {hears}{newest} | {says} | {ticks} | {process.stuck_after_s:g} s |")
     return "\n".join(rows)
 
@@ -27,9 +27,9 @@ def processes() -> str:
 def said() -> str:
     rows = ["| message | said by | heard by | what it is |", "|---|---|---|---|"]
     for message in EVERYTHING:
-        by = [p.name for p in PROCESSES if message in p.says]
+        by = [p.name for p in PROCESSES if message in p.publishes]
         by += [ALSO_SAID_BY[message.__name__]] if message.__name__ in ALSO_SAID_BY else []
-        hearers = [p.name for p in PROCESSES if message in p.hears and p.hears != EVERYTHING]
+        hearers = [p.name for p in PROCESSES if message in p.subscribes and p.subscribes != EVERYTHING]
         rows.append(f"| {message.__name__} | {', '.join(by)} | {', '.join(hearers) or '-'} | {_purpose(message)} |")
     return "\n".join(rows)
 

@@ -152,8 +152,10 @@ def process_name() -> str:
 
 _BASE = Process("", "runtime_nodes", (), (), 0.0, 5.0)
 TABLE: tuple[Process, ...] = (
-    replace(_BASE, name="recorder", hears=EVERYTHING, tick_hz=1.0),
-    replace(_BASE, name="link", hears=(m.Origin,), says=(m.LinkStatus,), tick_hz=50.0, stuck_after_s=1.0),
-    replace(_BASE, name="estimator", hears=(m.Origin, m.Frame), says=(m.MeasurementVerdict,), stuck_after_s=0.7),
-    replace(_BASE, name="vision", says=(m.Origin, m.Frame, m.SourceEnded)),
+    replace(_BASE, name="recorder", subscribes=EVERYTHING, tick_hz=1.0),
+    replace(_BASE, name="link", subscribes=(m.Origin,), publishes=(m.LinkStatus,), tick_hz=50.0, stuck_after_s=1.0),
+    replace(
+        _BASE, name="estimator", subscribes=(m.Origin, m.Frame), publishes=(m.MeasurementVerdict,), stuck_after_s=0.7
+    ),
+    replace(_BASE, name="vision", publishes=(m.Origin, m.Frame, m.SourceEnded)),
 )

@@ -13,7 +13,7 @@ from ground import apply, homography
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
 from terrafix.core.pose import exp_so3
-from terrafix.estimator.matched import ROOFS
+from terrafix.estimator.measurements.map_pose import ROOFS
 from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import (
     Camera,

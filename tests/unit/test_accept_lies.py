@@ -14,7 +14,7 @@ from rasterio.transform import Affine
 from rasterio.warp import transform as warped
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.start import start_is_unknown
+from terrafix.core.initial_position import start_is_unknown
 from terrafix.messages import Camera, Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources import Shot
 from terrafix_tools.accept import faults, lying_maps

@@ -8,7 +8,7 @@ import pytest
 from accept_case import Said, evidence, file_of
 
 from terrafix.core.pose import exp_so3
-from terrafix.link.asking import Asking
+from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept import measures as of
@@ -163,7 +163,7 @@ def test_who_is_lost_must_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     for short in ([Said()] * 10, [*[Said()] * 4, *lost[:4], *[Said()] * 4]):
         found = of.asks(evidence(tmp_path / f"b{len(short)}", short))
         assert (found.value, found.verdict) == (None, None) and "never lost" in found.why
-    monkeypatch.setattr(Asking, "due", lambda *_: "")
+    monkeypatch.setattr(PriorRequest, "due", lambda *_: "")
     assert of.asks(evidence(tmp_path / "c", lost)).verdict is Verdict.BELOW
 
 

@@ -8,10 +8,10 @@ import pytest
 from link_rig import MS, S
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.core.airspeed import UNHEALTHY, USED, AirspeedReader
-from terrafix.core.tlog import read_tlog, record
-from terrafix.link.telemetry import Telemetry
-from terrafix.link.timesync import TimeSync
+from terrafix.core.mavlink.airspeed import UNHEALTHY, USED, AirspeedReader
+from terrafix.core.mavlink.tlog import read_tlog, record
+from terrafix.link.autopilot.telemetry import Telemetry
+from terrafix.link.mavlink.timesync import TimeSync
 from terrafix.messages import VehicleState
 
 T0_US = 1_700_000_000_000_000

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.agreed import AgreedPose
-from terrafix.anchor.matcher import FrameMatcher, View
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
+from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.messages import Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
@@ -19,9 +19,9 @@ TILT_SIGMA_RAD = float(np.radians(1.0))
 
 
 @pytest.fixture(scope="module")
-def agreed() -> AgreedPose:
+def agreed() -> ConsensusPose:
     source = FlatMap(texture(8, SIDE_M))
-    return AgreedPose(source, FrameMatcher(PINHOLE, source, GradientDescriber()))  # type: ignore[arg-type]
+    return ConsensusPose(source, FrameMatcher(PINHOLE, source, GradientDescriber()))  # type: ignore[arg-type]
 
 
 def changed(seed: int) -> np.ndarray:
@@ -47,7 +47,7 @@ def seen(ground: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, View]:
     return view(ground, PINHOLE, R, here_m), here_m, believed
 
 
-def test_over_changed_and_leaning_ground_there_is_a_pose_that_claims_what_it_is_worth(agreed: AgreedPose) -> None:
+def test_over_changed_and_leaning_ground_there_is_a_pose_that_claims_what_it_is_worth(agreed: ConsensusPose) -> None:
     """Mean NEES of three numbers over eight places is below 5.0 in 99 of 100 cases when claims are exact."""
     nees = []
     for seed in range(8):
@@ -62,14 +62,14 @@ def test_over_changed_and_leaning_ground_there_is_a_pose_that_claims_what_it_is_
     assert np.mean(nees) < 5.0
 
 
-def test_at_wrong_places_there_is_none(agreed: AgreedPose) -> None:
+def test_at_wrong_places_there_is_none(agreed: ConsensusPose) -> None:
     for seed, away_m in enumerate([(60.0, -70.0), (50.0, 70.0), (-70.0, -60.0), (45.0, 0.0)]):
         picture, _, believed = seen(texture(8, SIDE_M), seed)
         wrong = replace(believed, e_m=believed.e_m + away_m[0], n_m=believed.n_m + away_m[1])
         assert agreed.at(picture, wrong) is None
 
 
-def test_the_tilt_is_not_held_to_what_was_predicted(agreed: AgreedPose) -> None:
+def test_the_tilt_is_not_held_to_what_was_predicted(agreed: ConsensusPose) -> None:
     """Whoever takes the pose knows the prediction already: told twice it would count twice."""
     picture, _, believed = seen(texture(8, SIDE_M), 0)
     fix = agreed.at(picture, replace(believed, tilt_sigma_rad=1e-4))

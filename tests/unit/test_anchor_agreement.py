@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.anchor.agreement import agreement
+from terrafix.anchor.verification.patch_consensus import agreement
 
 CELL = 0.01  # of the height
 REACH = 16

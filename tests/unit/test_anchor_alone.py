@@ -7,12 +7,12 @@ import pytest
 from ground import GSD_M, PINHOLE, FlatMap, texture, view
 from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
-from terrafix.anchor.alone import alone
-from terrafix.anchor.belief import Belief, Mode
-from terrafix.anchor.matcher import AS_PREDICTED, FrameMatcher, Look, View
+from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, CorrelationResult, FrameMatcher, View
+from terrafix.anchor.matching.point_mass_filter import Belief, Mode
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.null_model import USUAL, FlightBudget, Tail
+from terrafix.anchor.verification.single_frame import localize_single_frame
 from terrafix.core.frames import MemoryFrameStore
+from terrafix.map.null_model import USUAL, FlightBudget, Tail
 from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
@@ -25,7 +25,7 @@ def ground() -> np.ndarray:
     return texture(8, SIDE_M)
 
 
-class SameLook(Look):
+class SameLook(CorrelationResult):
     """Every place fits best as it was predicted."""
 
     def best_at(self, e_m: float, n_m: float) -> tuple[Any, float]:
@@ -42,7 +42,9 @@ def decided(
     source: Any = FlatMap(ground)
     matcher = FrameMatcher(PINHOLE, source, GradientDescriber())
     predicted = View(0.0, 0.0, R, AGL_M, 0.0, 0.03, 0.02, 0.03)
-    found = alone(frame, predicted, SameLook(Verdict.ACCEPTED), modes, source, matcher, USUAL, log_probability)
+    found = localize_single_frame(
+        frame, predicted, SameLook(Verdict.ACCEPTED), modes, source, matcher, USUAL, log_probability
+    )
     if found is None:
         return None
     assert found[1].pnp.fit is not None
@@ -97,7 +99,9 @@ def test_one_look_that_does_not_decide_is_decided_by_patches_where_little_is_cla
 ) -> None:
     monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # a look that says nothing
     spent = list[float]()
-    monkeypatch.setattr("terrafix.anchor.node.alone", lambda *of: spent.append(of[-1]) or alone(*of))
+    monkeypatch.setattr(
+        "terrafix.anchor.node.localize_single_frame", lambda *of: spent.append(of[-1]) or localize_single_frame(*of)
+    )
     package: Any = OnlyMap(ground)
     frames = MemoryFrameStore(2)
     node = AnchorNode(frames, package, GradientDescriber(), 1.0)

@@ -5,7 +5,14 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from terrafix.anchor.belief import MAX_HALF_CELLS, MODE_RADIUS_CELLS, Belief, Surface, _blurred, cell_for
+from terrafix.anchor.matching.point_mass_filter import (
+    MAX_HALF_CELLS,
+    MODE_RADIUS_CELLS,
+    Belief,
+    Surface,
+    _blurred,
+    cell_for,
+)
 
 HALF_M = 200.0
 CELL_M = 2.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.anchor.correlate import Searchable, standardise
+from terrafix.anchor.matching.ncc import Searchable, standardise
 
 
 def descriptors(seed: int, channels: int = 4, height: int = 120, width: int = 150) -> np.ndarray:

@@ -8,11 +8,11 @@ from ground import PINHOLE, view
 from one_place import predicted
 from test_anchor_node import ORIGIN, TRUE_M, OnlyMap, R, ground, started
 
-from terrafix.anchor.hint import SPEED_MPS, Believed, length, radius_now_m, weigh
-from terrafix.anchor.lost import MOST_ODDS, START_ODDS
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.place_search import PlaceSearch
-from terrafix.anchor.retrieval import MapSearch
+from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.relocalization.position_prior import SPEED_MPS, CurrentBelief, length, radius_now_m, weigh
+from terrafix.anchor.relocalization.relocalizer import PlaceSearch
+from terrafix.anchor.verification.lock_monitor import MOST_ODDS, START_ODDS
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import (
@@ -29,8 +29,8 @@ from terrafix_engines.features.gradient import GradientDescriber
 __all__ = ["ground"]  # the fixture
 FRAME = LocalFrame(ORIGIN.lat_deg, ORIGIN.lon_deg)
 BOUNDS = (-10_000.0, -10_000.0, 10_000.0, 10_000.0)
-KNOWN = Believed(0.0, 0.0, 10.0, MOST_ODDS)
-START = Believed(0.0, 0.0, 10.0, START_ODDS - 0.1)
+KNOWN = CurrentBelief(0.0, 0.0, 10.0, MOST_ODDS)
+START = CurrentBelief(0.0, 0.0, 10.0, START_ODDS - 0.1)
 
 
 @pytest.mark.parametrize(
@@ -41,13 +41,13 @@ START = Believed(0.0, 0.0, 10.0, START_ODDS - 0.1)
         (START, 3000.0, 5000.0, False, Verdict.ACCEPTED, False, "hint agrees, 3.0 km from us"),
         (START, 8000.0, 5000.0, False, Verdict.ACCEPTED, True, "hint is 8.0 km off, searching"),
         (KNOWN, 200.0, 5000.0, True, Verdict.ACCEPTED, True, "hint taken, searching within 5.0 km"),
-        (Believed(0.0, 0.0, 400.0, MOST_ODDS), 10.0, 500.0, False, Verdict.ACCEPTED, True, "within 500 m"),
+        (CurrentBelief(0.0, 0.0, 400.0, MOST_ODDS), 10.0, 500.0, False, Verdict.ACCEPTED, True, "within 500 m"),
         (KNOWN, 16_000.0, 5000.0, True, Verdict.OUTSIDE_MAP, False, "hint is 6.0 km outside the map"),
         (KNOWN, 14_000.0, 5000.0, True, Verdict.ACCEPTED, True, "searching within"),
     ],
 )
 def test_what_a_hint_is_worth(
-    believed: Believed, east_m: float, radius_m: float, searching: bool, verdict: Verdict, begins: bool, text: str
+    believed: CurrentBelief, east_m: float, radius_m: float, searching: bool, verdict: Verdict, begins: bool, text: str
 ) -> None:
     weighed = weigh((east_m, 0.0), radius_m, believed, BOUNDS, searching=searching)
     assert (weighed.verdict, weighed.begins_search) == (verdict, begins)

@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.belief import Belief, Surface
-from terrafix.anchor.matcher import (
+from terrafix.anchor.matching.frame_matcher import (
     LEARNED_INLIERS,
     MAX_HYPOTHESES,
+    CorrelationResult,
     FrameMatcher,
     Hypothesis,
-    Look,
     View,
     _hypotheses,
 )
+from terrafix.anchor.matching.point_mass_filter import Belief, Surface
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Verdict
@@ -220,12 +220,12 @@ def test_a_learned_model_is_asked_for_a_pose_where_gradients_have_none(
     assert fix.pnp.fit is not None and np.linalg.norm(fix.pnp.fit.p_c_in_w_m - TRUE_M) < 3.0
 
 
-def scales_scored(**z: float) -> Look:
+def scales_scored(**z: float) -> CorrelationResult:
     """A look at scales of 0.92, 1 and 1.08 that fit as well as this at every position."""
     scored = {"small": 0.92, "same": 1.0, "large": 1.08}
     surfaces = tuple(Surface(np.full((5, 5), z[name], np.float32), -4.0, 4.0, 2.0) for name in scored)
     hypotheses = tuple(Hypothesis(0.0, scale) for scale in scored.values())
-    return Look(Verdict.ACCEPTED, surfaces, hypotheses, 100.0, 2.0)
+    return CorrelationResult(Verdict.ACCEPTED, surfaces, hypotheses, 100.0, 2.0)
 
 
 def test_the_scale_that_fits_is_told_as_well_as_the_others_fit_worse() -> None:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.correlate import standardise
-from terrafix.anchor.matcher import Hypothesis
-from terrafix.anchor.mosaic import MOST_FRAMES, Mosaic, _shifted
-from terrafix.anchor.rectify import rectify
-from terrafix.anchor.wide_search import BLOCK_CELLS, Block, Template, WideSearch
+from terrafix.anchor.matching.frame_matcher import Hypothesis
+from terrafix.anchor.matching.ncc import standardise
+from terrafix.anchor.matching.orthorectify import rectify
+from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, Template, WideSearch
+from terrafix.anchor.relocalization.mosaic import MOST_FRAMES, Mosaic, _shifted
 from terrafix.core.geodesy import local_rotation_up
 from terrafix_engines.features.gradient import GradientDescriber
 

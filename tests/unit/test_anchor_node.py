@@ -9,16 +9,16 @@ import pytest
 from ground import PINHOLE, texture, view
 from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
-from terrafix.anchor.agreed import AgreedPose
-from terrafix.anchor.answer import ground_sigma_m
-from terrafix.anchor.belief import Belief
-from terrafix.anchor.lost import LostWatch
-from terrafix.anchor.matcher import FrameMatcher
+from terrafix.anchor.matching.frame_matcher import FrameMatcher
+from terrafix.anchor.matching.match_message import ground_sigma_m
+from terrafix.anchor.matching.point_mass_filter import Belief
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.null_model import USUAL, VERSION, NullModel
-from terrafix.anchor.place_search import LOST_SIGMA_M, start_around
-from terrafix.anchor.retrieval import MapSearch
+from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.relocalization.relocalizer import LOST_SIGMA_M, start_around
+from terrafix.anchor.verification.consensus_pose import ConsensusPose
+from terrafix.anchor.verification.lock_monitor import LockMonitor
 from terrafix.core.frames import MemoryFrameStore
+from terrafix.map.null_model import USUAL, VERSION, NullModel
 from terrafix.messages import MapMatch, SearchState, SearchStep, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
@@ -59,14 +59,14 @@ def test_where_no_patch_finds_its_spot_alone_all_of_them_together_give_the_pose(
     """And do not count as a confirmation, which would keep a wrong place for long."""
     heard = list[int]()
     monkeypatch.setattr(FrameMatcher, "fix", lambda *_: None)
-    monkeypatch.setattr(LostWatch, "looked", lambda _self, _gain, _weight, _new, inliers, *_: heard.append(inliers))
+    monkeypatch.setattr(LockMonitor, "looked", lambda _self, _gain, _weight, _new, inliers, *_: heard.append(inliers))
     node, frames = started(ground)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     said = match(node, 1, 10.0)
     assert said.verdict is Verdict.ACCEPTED and not said.coarse and said.p_c_in_w_m is not None
     assert np.linalg.norm(np.array(said.p_c_in_w_m) - TRUE_M) < 3.0
     assert heard == [0]
-    monkeypatch.setattr(AgreedPose, "at", lambda *_: None)  # and without these the place of the belief remains
+    monkeypatch.setattr(ConsensusPose, "at", lambda *_: None)  # and without these the place of the belief remains
     frames.put(2, view(ground, PINHOLE, R, TRUE_M))
     assert match(node, 2, 10.0).coarse
 
@@ -75,16 +75,16 @@ def test_where_no_patch_finds_its_spot_alone_all_of_them_together_give_the_pose(
 def test_a_pose_of_single_patches_that_claims_little_is_one_of_all_patches(
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch, sigma_m: float, asked: bool
 ) -> None:
-    heard, together = list[bool](), AgreedPose.at
+    heard, together = list[bool](), ConsensusPose.at
     monkeypatch.setattr("terrafix.anchor.node.ground_sigma_m", lambda *_: sigma_m)
-    monkeypatch.setattr(AgreedPose, "at", lambda *of: heard.append(True) or together(*of))
+    monkeypatch.setattr(ConsensusPose, "at", lambda *of: heard.append(True) or together(*of))
     node, frames = started(ground)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     said = match(node, 1, 10.0)
     assert said.verdict is Verdict.ACCEPTED and not said.coarse
     assert np.linalg.norm(np.array(said.p_c_in_w_m) - TRUE_M) < 3.0
     assert bool(heard) is asked
-    monkeypatch.setattr(AgreedPose, "at", lambda *_: None)  # where these say nothing the first one stays
+    monkeypatch.setattr(ConsensusPose, "at", lambda *_: None)  # where these say nothing the first one stays
     frames.put(2, view(ground, PINHOLE, R, TRUE_M))
     assert not match(node, 2, 10.0).coarse
 
@@ -171,7 +171,7 @@ def test_a_place_that_nothing_speaks_for_is_withdrawn_and_said(
 ) -> None:
     node, frames = started(ground)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
-    monkeypatch.setattr(LostWatch, "lost", True)
+    monkeypatch.setattr(LockMonitor, "lost", True)
     said = match(node, 1, 10.0)
     assert (said.verdict, said.step, said.lost_sigma_m) == (Verdict.LOST, SearchStep.WIDEN, LOST_SIGMA_M)
     assert said.matches == [] and said.p_c_in_w_m is None
@@ -205,7 +205,7 @@ def test_every_step_of_the_escalation_is_said(ground: np.ndarray, monkeypatch: p
     ]
     said.clear()
     with monkeypatch.context() as patched:
-        patched.setattr(LostWatch, "lost", True)
+        patched.setattr(LockMonitor, "lost", True)
         patched.setattr(MapSearch, "look", lambda *_: None)
         fly(7, picture)
         patched.setattr(MapSearch, "step", SearchStep.ASK)

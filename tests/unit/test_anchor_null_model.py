@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from terrafix.anchor.null_model import (
+from terrafix.map.null_model import (
     PRIOR_EXCESSES,
     TAIL_FROM,
     USUAL,

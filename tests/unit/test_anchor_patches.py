@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.map_features import MapFeatures
-from terrafix.anchor.patches import PatchMatches, match_patches
-from terrafix.anchor.rectify import rectify
+from terrafix.anchor.matching.descriptor_cache import MapFeatures
+from terrafix.anchor.matching.orthorectify import rectify
+from terrafix.anchor.matching.patch_matcher import PatchMatches, match_patches
 from terrafix_engines.features.gradient import GradientDescriber
 
 AGL_M = 100.0

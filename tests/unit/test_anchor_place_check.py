@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.answer import found as said_found
-from terrafix.anchor.chance import Chance
-from terrafix.anchor.matcher import FrameMatcher, View
-from terrafix.anchor.place_check import CELL_PER_AGL, FINE_PER_AGL, Checked, PlaceCheck
-from terrafix.anchor.tracks import LLR_MAX, evidence
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
+from terrafix.anchor.matching.match_message import found as said_found
+from terrafix.anchor.relocalization.hypothesis_tracker import LLR_MAX, evidence
+from terrafix.anchor.verification.patch_null import PatchNull
+from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_PER_AGL, Checked, PlaceCheck
 from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
@@ -51,7 +51,7 @@ def at(check: PlaceCheck, picture: np.ndarray, proposed: View, cell_per_agl: flo
 @pytest.mark.parametrize("cell_per_agl", [CELL_PER_AGL, FINE_PER_AGL])
 def test_the_right_place_is_told_with_its_pose(check: PlaceCheck, picture: np.ndarray, cell_per_agl: float) -> None:
     found = at(check, picture, PROPOSED, cell_per_agl)
-    assert evidence(Chance().sigmas(found.agreement, fine=cell_per_agl == FINE_PER_AGL)) == LLR_MAX
+    assert evidence(PatchNull().sigmas(found.agreement, fine=cell_per_agl == FINE_PER_AGL)) == LLR_MAX
     pose = found.fix.pnp.fit
     assert pose is not None and found.fix.pnp.verdict is Verdict.ACCEPTED
     off_m = pose.p_c_in_w_m - HERE_M
@@ -71,7 +71,7 @@ def test_wrong_places_come_to_what_chance_does(
     check: PlaceCheck, picture: np.ndarray, away_m: tuple[float, float]
 ) -> None:
     wrong = replace(PROPOSED, e_m=PROPOSED.e_m + away_m[0], n_m=PROPOSED.n_m + away_m[1])
-    assert evidence(Chance().sigmas(at(check, picture, wrong).agreement, fine=False)) < 2.0
+    assert evidence(PatchNull().sigmas(at(check, picture, wrong).agreement, fine=False)) < 2.0
 
 
 def test_off_the_map_there_is_nothing_to_check(check: PlaceCheck, picture: np.ndarray) -> None:

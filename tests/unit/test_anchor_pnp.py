@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from ground import rotation
 
-from terrafix.anchor.pnp import MIN_INLIERS, THRESHOLD, PnpResult, solve
+from terrafix.anchor.matching.pnp import MIN_INLIERS, THRESHOLD, PnpResult, solve
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Verdict
 

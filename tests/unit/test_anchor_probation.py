@@ -10,16 +10,22 @@ import pytest
 from ground import PINHOLE, texture, view
 from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
-from terrafix.anchor.lost import LOOK_MIN
-from terrafix.anchor.matcher import AS_PREDICTED, FrameMatcher, View
+from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, FrameMatcher, View
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.null_model import USUAL, Tail
-from terrafix.anchor.place_check import FINE_PER_AGL
-from terrafix.anchor.place_search import anywhere_m, mixed_sigma_m
-from terrafix.anchor.probation import CALIBRATOR, FAILED_ODDS, PASSED_ODDS, Probation, log_e_value
-from terrafix.anchor.retrieval import MapSearch
-from terrafix.anchor.tracks import LLR_MAX, NEW_EVIDENCE, Found, Track, Tracks
+from terrafix.anchor.relocalization.hypothesis_tracker import (
+    LLR_MAX,
+    NEW_EVIDENCE,
+    Found,
+    HypothesisTracker,
+    PlaceHypothesis,
+)
+from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.relocalization.relocalizer import anywhere_m, mixed_sigma_m
+from terrafix.anchor.verification.lock_monitor import LOOK_MIN
+from terrafix.anchor.verification.place_verifier import FINE_PER_AGL
+from terrafix.anchor.verification.probation import CALIBRATOR, FAILED_ODDS, PASSED_ODDS, Probation, log_e_value
 from terrafix.core.frames import MemoryFrameStore
+from terrafix.map.null_model import USUAL, Tail
 from terrafix.messages import MapMatch, SearchStep, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
@@ -35,7 +41,7 @@ def ground() -> np.ndarray:
 
 def probation(ground: np.ndarray) -> Probation:
     source: Any = OnlyMap(ground)
-    return Probation(Tracks(source, FrameMatcher(PINHOLE, source, GradientDescriber())), USUAL.frame, AGL_M)
+    return Probation(HypothesisTracker(source, FrameMatcher(PINHOLE, source, GradientDescriber())), USUAL.frame, AGL_M)
 
 
 def test_chance_multiplies_the_odds_by_less_than_one_in_the_mean() -> None:
@@ -86,7 +92,7 @@ def test_the_same_ground_again_says_nothing_of_the_place(ground: np.ndarray) -> 
 
 def test_a_place_that_nothing_speaks_for_is_given_up_after_some_stretches_of_ground(ground: np.ndarray) -> None:
     source: Any = OnlyMap(ground)
-    tracks = Tracks(source, FrameMatcher(PINHOLE, source, GradientDescriber()))
+    tracks = HypothesisTracker(source, FrameMatcher(PINHOLE, source, GradientDescriber()))
     other = texture(21, SIDE_M)
     pictures = [
         view(other, PINHOLE, R, np.array([e_m, n_m, AGL_M]))
@@ -127,7 +133,7 @@ def found_at(e_m: float, n_m: float, ground: np.ndarray) -> Any:
         true = view(ground, PINHOLE, R, np.array([e_m, n_m, AGL_M]))
         checked = search.tracks.check.at(true, there, 1 / 100)
         assert checked is not None
-        return Found(Track(e_m, n_m, AS_PREDICTED), checked.fix)
+        return Found(PlaceHypothesis(e_m, n_m, AS_PREDICTED), checked.fix)
 
     return look
 

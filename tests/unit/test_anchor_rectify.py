@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from ground import LENS, PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.rectify import footprint, rectify
+from terrafix.anchor.matching.orthorectify import footprint, rectify
 from terrafix.core.camera import CameraCalibration
 
 GSD_M = 0.5

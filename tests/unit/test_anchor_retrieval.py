@@ -9,13 +9,8 @@ import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.agreement import Agreement
-from terrafix.anchor.chance import COARSE, PATCHES, PRIOR_PLACES, Chance
-from terrafix.anchor.lost import MOST_ODDS, LostWatch, pose_gain
-from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
-from terrafix.anchor.null_model import USUAL, FlightBudget, NullRow
-from terrafix.anchor.retrieval import MapSearch
-from terrafix.anchor.tracks import (
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
+from terrafix.anchor.relocalization.hypothesis_tracker import (
     AHEAD,
     CLEAR_LEAD,
     LEADS,
@@ -26,11 +21,16 @@ from terrafix.anchor.tracks import (
     NEW_EVIDENCE,
     SPEAKS,
     Found,
-    Track,
-    Tracks,
+    HypothesisTracker,
+    PlaceHypothesis,
     _off_sigmas2,
     evidence,
 )
+from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.verification.lock_monitor import MOST_ODDS, LockMonitor, pose_gain
+from terrafix.anchor.verification.patch_consensus import PatchConsensus
+from terrafix.anchor.verification.patch_null import COARSE, PATCHES, PRIOR_PLACES, PatchNull
+from terrafix.map.null_model import USUAL, FlightBudget, NullRow
 from terrafix.messages import SearchStep
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import POOL
@@ -117,7 +117,7 @@ def test_where_the_best_wrong_places_score_high_more_is_needed_of_the_right_one(
 def test_every_stretch_of_new_ground_makes_a_find_need_more_and_no_frame_within_it(
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Tracks, "look", lambda *_: None)
+    monkeypatch.setattr(HypothesisTracker, "look", lambda *_: None)
     search, needed = searched(BoundedMap(ground), None), list[float]()
     picture, _ = next(frames(ground, 1))
     for _ in range(11):
@@ -146,7 +146,7 @@ def test_a_search_begins_with_what_patches_come_to_on_this_map(ground: np.ndarra
 
 
 def test_a_look_is_a_wide_one_once_it_joins_new_ground(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Tracks, "look", lambda *_: None)
+    monkeypatch.setattr(HypothesisTracker, "look", lambda *_: None)
     search, wide = searched(BoundedMap(ground), None), list[bool]()
     for i, (picture, _) in enumerate(frames(ground, 5)):
         if i:
@@ -164,10 +164,10 @@ def test_what_is_not_on_the_map_is_not_found_there() -> None:
 def test_the_search_grows_by_tiles_to_the_whole_map_and_then_asks(
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Tracks, "look", lambda *_: None)  # nobody is found
-    monkeypatch.setattr("terrafix.anchor.retrieval.FINE_HYPOTHESES", 0)  # pooled cells are faster
-    monkeypatch.setattr("terrafix.anchor.wide_search.BLOCK_CELLS", 12)
-    monkeypatch.setattr("terrafix.anchor.retrieval.BLOCK_CELLS", 12)
+    monkeypatch.setattr(HypothesisTracker, "look", lambda *_: None)  # nobody is found
+    monkeypatch.setattr("terrafix.anchor.relocalization.map_search.FINE_HYPOTHESES", 0)  # pooled cells are faster
+    monkeypatch.setattr("terrafix.anchor.relocalization.block_search.BLOCK_CELLS", 12)
+    monkeypatch.setattr("terrafix.anchor.relocalization.map_search.BLOCK_CELLS", 12)
     search = searched(BoundedMap(ground), START_M.tolist())
     picture, _ = next(frames(ground, 1))
     said: list[tuple[SearchStep, int]] = []
@@ -205,14 +205,14 @@ def test_a_way_that_nobody_saw_ends_the_tracks(ground: np.ndarray) -> None:
 
 
 def test_odometry_moves_a_track() -> None:
-    track = Track(10.0, 20.0, Hypothesis(0.0, 1.0))
+    track = PlaceHypothesis(10.0, 20.0, Hypothesis(0.0, 1.0))
     track.moved(np.array([3.0, -4.0]))
     assert (track.e_m, track.n_m) == (13.0, 16.0)
 
 
 def test_a_track_moves_by_its_own_heading_and_height() -> None:
     """Odometry tells steps as the predicted heading and height have them; a search has others."""
-    track = Track(10.0, 20.0, Hypothesis(np.pi / 2, 1.5))
+    track = PlaceHypothesis(10.0, 20.0, Hypothesis(np.pi / 2, 1.5))
     track.moved(np.array([4.0, 0.0]))  # east, and a quarter turn counter-clockwise of that is north
     assert (track.e_m, track.n_m) == pytest.approx((10.0, 26.0))
 
@@ -248,8 +248,8 @@ def test_the_next_row_of_houses_is_followed_too(ground: np.ndarray) -> None:
 
 def track_of(
     score: float, leads: tuple[float, ...] = (), frames: int = MIN_FRAMES, e_m: float = 0.0, *, wide: bool = False
-) -> Track:
-    return Track(e_m, 0.0, Hypothesis(0.0, 1.0), score, frames, leads=leads, wide=wide)
+) -> PlaceHypothesis:
+    return PlaceHypothesis(e_m, 0.0, Hypothesis(0.0, 1.0), score, frames, leads=leads, wide=wide)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def track_of(
     ],
 )
 def test_what_is_found_has_enough_and_is_ahead(
-    ground: np.ndarray, best: Track, rivals: list[Track], found: bool
+    ground: np.ndarray, best: PlaceHypothesis, rivals: list[PlaceHypothesis], found: bool
 ) -> None:
     tracks = searched(BoundedMap(ground), None).tracks
     tracks.all = [best, *rivals]
@@ -278,7 +278,7 @@ def test_what_is_found_has_enough_and_is_ahead(
 
 def test_one_piece_of_ground_counts_once() -> None:
     """However many frames show it; and what speaks against a place does so once."""
-    track = Track(0.0, 0.0, Hypothesis(0.0, 1.0))
+    track = PlaceHypothesis(0.0, 0.0, Hypothesis(0.0, 1.0))
     for i in range(11):
         track.checked(LLR_MAX, i * 0.1 * NEW_EVIDENCE * AGL_M, AGL_M)
     assert track.score == pytest.approx(2.0 * LLR_MAX) and track.frames == 11
@@ -288,7 +288,7 @@ def test_one_piece_of_ground_counts_once() -> None:
 
 
 def test_a_frame_that_says_next_to_nothing_does_not_speak_for_a_place() -> None:
-    track = Track(0.0, 0.0, Hypothesis(0.0, 1.0))
+    track = PlaceHypothesis(0.0, 0.0, Hypothesis(0.0, 1.0))
     track.checked(SPEAKS - 0.1, 0.0, AGL_M)
     assert track.score > 0.0 and track.frames == 0
     track.checked(SPEAKS + 0.1, AGL_M, AGL_M)
@@ -332,12 +332,12 @@ def test_a_heading_and_a_height_that_are_as_predicted_speak_for_a_place_and_othe
     assert 1.0 < _off_sigmas2(Hypothesis(0.1, 1.0), known) < 2.0  # patches leave some degrees open
 
 
-def of(llr: float, patches: int = PATCHES) -> Agreement:
-    return Agreement(llr, np.zeros(6), np.zeros((patches, 2)), np.zeros(patches, bool))
+def of(llr: float, patches: int = PATCHES) -> PatchConsensus:
+    return PatchConsensus(llr, np.zeros(6), np.zeros((patches, 2)), np.zeros(patches, bool))
 
 
 def test_what_chance_comes_to_is_no_evidence() -> None:
-    chance, by_chance = Chance(), COARSE[0]
+    chance, by_chance = PatchNull(), COARSE[0]
 
     def gain(llr: float, patches: int) -> float:
         return evidence(chance.sigmas(of(llr, patches), fine=False))
@@ -350,13 +350,13 @@ def test_what_chance_comes_to_is_no_evidence() -> None:
 
 def test_ground_that_repeats_has_to_say_more() -> None:
     """What its wrong places come to is chance there, on cells of either kind."""
-    chance = Chance()
+    chance = PatchNull()
     before = chance.sigmas(of(16.0), fine=True)
     for llr in np.random.default_rng(1).normal(12.0, 2.7, 200):
         chance.learn(of(float(llr)), fine=True)
         chance.learn(of(60.0, PATCHES // 2), fine=True)  # half of them beyond the map
     assert before > 2.5 and chance.sigmas(of(16.0), fine=True) == pytest.approx(1.55, abs=0.3)
-    assert chance.sigmas(of(16.0), fine=False) < Chance().sigmas(of(16.0), fine=False) - 1.0
+    assert chance.sigmas(of(16.0), fine=False) < PatchNull().sigmas(of(16.0), fine=False) - 1.0
 
 
 def test_a_place_without_rivals_is_weighed_against_places_that_are_none(ground: np.ndarray) -> None:
@@ -377,7 +377,7 @@ def test_more_patches_say_more() -> None:
 
 
 def test_a_start_that_nothing_speaks_for_is_given_up_after_some_looks() -> None:
-    watch = LostWatch()
+    watch = LockMonitor()
     looks = 0
     while not watch.lost:
         watch.looked(0.6, 1.0, 1.0, 0, 10.0, AGL_M)
@@ -388,14 +388,14 @@ def test_a_start_that_nothing_speaks_for_is_given_up_after_some_looks() -> None:
 @pytest.mark.parametrize("weight", [0.1, 1.0])
 def test_looks_at_the_right_place_keep_it(weight: float) -> None:
     """Without a single pose: what the frames say for the belief is enough."""
-    watch = LostWatch()
+    watch = LockMonitor()
     for _ in range(200):
         watch.looked(4.0 * weight, weight, weight, 0, 10.0, AGL_M)
         assert not watch.lost
 
 
 def test_poses_carry_over_ground_without_texture_but_not_for_ever() -> None:
-    watch = LostWatch()
+    watch = LockMonitor()
     for _ in range(60):
         watch.looked(7.0, 1.0, 1.0, 20, 10.0, AGL_M)
     assert watch.odds == MOST_ODDS
@@ -407,14 +407,14 @@ def test_poses_carry_over_ground_without_texture_but_not_for_ever() -> None:
 
 
 def test_looks_at_one_field_say_nothing_against_it() -> None:
-    watch = LostWatch()
+    watch = LockMonitor()
     for _ in range(300):
         watch.looked(-0.2, 0.08, 0.0, 0, 10.0, AGL_M)
     assert not watch.lost and watch.doubt == 0.0
 
 
 def test_doubt_is_a_probability_and_begins_when_the_ellipse_would_not_hold() -> None:
-    watch = LostWatch()
+    watch = LockMonitor()
     assert watch.doubt == 0.0
     said = []
     while not watch.lost:
@@ -425,15 +425,15 @@ def test_doubt_is_a_probability_and_begins_when_the_ellipse_would_not_hold() -> 
 
 
 def test_a_position_that_claims_little_is_not_given_up() -> None:
-    watch = LostWatch()
+    watch = LockMonitor()
     for _ in range(60):
         watch.looked(-3.0, 1.0, 1.0, 0, 80.0, AGL_M)
     assert not watch.lost
 
 
 def test_a_way_that_nobody_saw_leaves_no_more_than_a_start() -> None:
-    watch = LostWatch()
+    watch = LockMonitor()
     for _ in range(60):
         watch.looked(7.0, 1.0, 1.0, 20, 10.0, AGL_M)
     watch.looked(0.0, 1.0, 1.0, 0, 80.0, AGL_M)
-    assert watch.odds == LostWatch().odds
+    assert watch.odds == LockMonitor().odds

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.anchor.spectrum import spectra, transform_shape
+from terrafix.anchor.matching.fft import spectra, transform_shape
 
 
 @pytest.mark.parametrize(("height", "width"), [(90, 90), (33, 64), (1, 7), (250, 121)])

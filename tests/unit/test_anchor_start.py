@@ -12,10 +12,10 @@ from terrafix import messages as m
 from terrafix.anchor.node import AnchorNode
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.inbox import fold_prediction
-from terrafix.core.shell import InProcessShell
 from terrafix.estimator.node import EstimatorNode
 from terrafix.link.node import LinkNode
+from terrafix.runtime.executor import InProcessShell
+from terrafix.runtime.inbox import fold_prediction
 from terrafix_engines.features.gradient import GradientDescriber
 
 FRAME = LocalFrame(ORIGIN.lat_deg, ORIGIN.lon_deg)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from ground import PINHOLE, FlatMap, rotation, texture, view
 
-from terrafix.anchor.correlate import Searchable, standardise
-from terrafix.anchor.map_features import MapFeatures
-from terrafix.anchor.rectify import Rectified, rectify
-from terrafix.anchor.wide_search import BLOCK_CELLS, Block, WideSearch, blocks_of
+from terrafix.anchor.matching.descriptor_cache import MapFeatures
+from terrafix.anchor.matching.ncc import Searchable, standardise
+from terrafix.anchor.matching.orthorectify import Rectified, rectify
+from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, WideSearch, blocks_of
 from terrafix.core.geodesy import local_rotation_up
 from terrafix_engines.features.gradient import GradientDescriber
 
@@ -73,7 +73,7 @@ def test_more_templates_than_are_held_at_a_time(
 ) -> None:
     templates = [search.describe(seen(ground, t)) for t in (-20.0, 0.0, 20.0)]
     (whole,) = search.look(templates, [HERE], CELL_M)
-    monkeypatch.setattr("terrafix.anchor.wide_search.AT_ONCE", 2)
+    monkeypatch.setattr("terrafix.anchor.relocalization.block_search.AT_ONCE", 2)
     (parted,) = search.look(templates, [HERE], CELL_M)
     assert np.array_equal(whole.correlation, parted.correlation, equal_nan=True) and np.array_equal(
         whole.index, parted.index

@@ -10,7 +10,7 @@ import pytest
 from autopilot_rig import GOOD, HEIGHT_M, LAT, LON, Gps, Rig, at_5_hz, changed, real_fix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.link.carry import offset
+from terrafix.link.integrity.output_predictor import offset
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, Kind
 
 ABSOLUTE, RELATIVE, VELOCITY, GLITCH, CONSTANT = 16, 8, 2, 32768, 128  # EKF_STATUS_REPORT.flags

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafix.estimator.filter import Estimator
-from terrafix.estimator.telemetry import Telemetry
+from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Imu
 from terrafix_tools.bench import growth, map_size
 from terrafix_tools.bench.stream import FIX_EVERY, FRAME_S, LEG_S, ORIGIN, spoken

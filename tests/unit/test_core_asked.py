@@ -3,12 +3,12 @@
 import signal
 import threading
 
-from terrafix.core.asked import Asked
+from terrafix.runtime.stop_signal import StopSignal
 
 
 def test_a_signal_is_noted_and_then_the_signals_are_again_whose_they_were() -> None:
     before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
-    with Asked(signal.SIGTERM, signal.SIGINT) as asked:
+    with StopSignal(signal.SIGTERM, signal.SIGINT) as asked:
         assert not asked()
         signal.raise_signal(signal.SIGINT)
         assert asked()
@@ -19,7 +19,7 @@ def test_outside_the_main_thread_no_signal_is_taken() -> None:
     heard: list[bool] = []
 
     def look() -> None:
-        with Asked(signal.SIGTERM) as asked:
+        with StopSignal(signal.SIGTERM) as asked:
             heard.append(asked())
 
     before = signal.getsignal(signal.SIGTERM)

@@ -8,10 +8,10 @@ from link_wire import MemoryWire, attitude, packed, states
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
-from terrafix.core.takeoff_height import TakeOffHeight
-from terrafix.core.tlog import read_tlog, record
+from terrafix.core.mavlink.home_altitude import TakeOffHeight
+from terrafix.core.mavlink.tlog import read_tlog, record
+from terrafix.link.autopilot.checkpoint import CheckpointWriter
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.kept import AutopilotKeeper
 from terrafix.messages import GpsInput
 
 S = 1_000_000_000
@@ -84,7 +84,7 @@ def test_the_link_goes_on_from_take_off_also_when_it_is_started_again(tmp_path: 
 
     def link() -> tuple[MavlinkEdge, MemoryWire]:
         wire = MemoryWire()
-        return MavlinkEdge(LinkSection(), wire, lambda: 0, keeper=AutopilotKeeper(tmp_path / "link.kept")), wire
+        return MavlinkEdge(LinkSection(), wire, lambda: 0, keeper=CheckpointWriter(tmp_path / "link.checkpoint")), wire
 
     edge, wire = link()
     wire.arrive(packed(armed(), mav))

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from terrafix.estimator.agreement import AGREE_M, Agreement
+from terrafix.estimator.integrity.innovation_run import AGREE_M, InnovationRun
 
 
-def row(offsets_m: list[tuple[float, float]], spacing_m: float = 20.0, *, coarse: int = 0) -> Agreement:
+def row(offsets_m: list[tuple[float, float]], spacing_m: float = 20.0, *, coarse: int = 0) -> InnovationRun:
     """``coarse``: so many of them, the first ones."""
-    said = Agreement()
+    said = InnovationRun()
     for i, offset_m in enumerate(offsets_m):
         said.add(np.array(offset_m), np.array([spacing_m * i, 0.0]), coarse=i < coarse)
     return said

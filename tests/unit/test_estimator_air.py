@@ -6,8 +6,16 @@ import pytest
 from gtsam.symbol_shorthand import B, V
 from inertial_flight import InertialFlight, flown
 
-from terrafix.estimator.air import DISTRUST_S, GUST_S, LEARNS_FROM_MPS, WIND_WALK, Air, Wind, air_factor
-from terrafix.estimator.velocity import V_SIZE
+from terrafix.estimator.measurements.airspeed import (
+    DISTRUST_S,
+    GUST_S,
+    LEARNS_FROM_MPS,
+    WIND_WALK,
+    AirspeedObservation,
+    WindEstimator,
+    air_factor,
+)
+from terrafix.estimator.models.motion_model import V_SIZE
 
 WIND_MPS, SCALE = np.array([4.0, -5.0]), 1.08
 SEEN_MPS, STEP_S = 0.4, 0.5
@@ -18,7 +26,7 @@ class Plane:
 
     def __init__(self, seed: int, gust_mps: float = 1.0, turn_radps: float = 2 * np.pi / 60.0) -> None:
         self.rng = np.random.default_rng(seed)
-        self.wind, self.gust_mps, self.turn_radps = Wind(), gust_mps, turn_radps
+        self.wind, self.gust_mps, self.turn_radps = WindEstimator(), gust_mps, turn_radps
         self.t_s, self.yaw_rad, self.gust, self.blows = 0.0, 0.0, np.zeros(2), WIND_MPS
 
     def fly(self) -> np.ndarray:
@@ -37,7 +45,7 @@ class Plane:
             self.wind.seen(self.t_s, velocity, SEEN_MPS**2 * np.eye(3), read_mps, self.yaw_rad)
             seconds -= STEP_S
 
-    def tells(self, read_mps: float = 20.0 / SCALE) -> Air | None:
+    def tells(self, read_mps: float = 20.0 / SCALE) -> AirspeedObservation | None:
         return self.wind.tells(self.t_s, read_mps, self.yaw_rad, 0.0)
 
 
@@ -95,7 +103,7 @@ def test_a_tube_that_fills_is_not_believed_and_what_it_reads_then_is_learnt_anew
 
 
 def test_the_factor_says_what_it_differs_by() -> None:
-    air = Air(20.0, 0.7, WIND_MPS, np.eye(2), np.eye(2), 1.0)
+    air = AirspeedObservation(20.0, 0.7, WIND_MPS, np.eye(2), np.eye(2), 1.0)
     factor = air_factor(V(0), B(0), air, np.diag([4.0, 4.0]))
     values = gtsam.Values()
     values.insert(V(0), np.concatenate([air.velocity(0.1), np.zeros(V_SIZE - 2)]))

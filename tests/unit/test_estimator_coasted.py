@@ -8,10 +8,10 @@ import pytest
 from simulated_flight import ORIGIN, PLACE, Flight, Listener, blind, error_m, sigma_m, t_ns
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix.estimator.coasted import BEFORE_S, Coast
+from terrafix.estimator.measurements.ekf_dead_reckoning import BEFORE_S, DeadReckoning
+from terrafix.estimator.models.motion_model import GRAVITY_MPS2, TILT_S, WANDERING_SHARE
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.resume import Keeper, Last, kept
-from terrafix.estimator.velocity import GRAVITY_MPS2, TILT_S, WANDERING_SHARE
+from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, load_checkpoint
 from terrafix.messages import Coasted, NavEstimate, Odometry, Prediction
 
 KILLED, BACK = 61, 73  # frames: six seconds
@@ -24,11 +24,11 @@ def flight() -> Flight:
 
 
 @pytest.fixture(scope="module")
-def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Last:
-    keeper = Keeper(file := tmp_path_factory.mktemp("run") / "estimator.kept")
+def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> EstimatorCheckpoint:
+    keeper = CheckpointWriter(file := tmp_path_factory.mktemp("run") / "estimator.checkpoint")
     for message in [flight.fix(KILLED - 2), *Listener().fly(flight, 0, KILLED).said]:
         keeper.heard(message)
-    last = kept(file)
+    last = load_checkpoint(file)
     assert last is not None
     return last
 
@@ -56,7 +56,9 @@ def coasted(flight: Flight, off_m: tuple[float, float] = (0.0, 0.0)) -> Coasted:
     )
 
 
-def resumed(flight: Flight, last: Last | None, said: Coasted | None, *, heard_first: bool = True) -> Listener:
+def resumed(
+    flight: Flight, last: EstimatorCheckpoint | None, said: Coasted | None, *, heard_first: bool = True
+) -> Listener:
     run = Listener()
     run.node = EstimatorNode(0, last)
     run.hear([ORIGIN])
@@ -70,7 +72,7 @@ def resumed(flight: Flight, last: Last | None, said: Coasted | None, *, heard_fi
     return run
 
 
-def test_it_knows_place_and_velocity_with_the_first_picture(flight: Flight, killed: Last) -> None:
+def test_it_knows_place_and_velocity_with_the_first_picture(flight: Flight, killed: EstimatorCheckpoint) -> None:
     first = resumed(flight, killed, coasted(flight)).estimate(BACK)
     assert sigma_m(first) < 7.0 and first.velocity_sigma_mps < LINK_LETS_MPS
     assert np.linalg.norm(error_m(first, flight)[:2]) < 3.0 * sigma_m(first)
@@ -80,7 +82,7 @@ def test_it_knows_place_and_velocity_with_the_first_picture(flight: Flight, kill
     assert sigma_m(without) > 2.0 * sigma_m(first) and without.velocity_sigma_mps > 10.0
 
 
-def test_it_is_said_in_time_for_the_second_picture(flight: Flight, killed: Last) -> None:
+def test_it_is_said_in_time_for_the_second_picture(flight: Flight, killed: EstimatorCheckpoint) -> None:
     """The anchor, whose belief was as wide as the first one's place, is told to begin where this one is."""
     late = msgspec.structs.replace(coasted(flight), t_ns=t_ns(BACK) + round(BEFORE_S * 1e9) + 1)
     run = resumed(flight, killed, late)
@@ -93,7 +95,7 @@ def test_it_is_said_in_time_for_the_second_picture(flight: Flight, killed: Last)
 
 @pytest.mark.parametrize("heard_first", [True, False])
 def test_a_picture_that_was_taken_a_moment_before_waits_for_no_other(
-    flight: Flight, killed: Last, heard_first: bool
+    flight: Flight, killed: EstimatorCheckpoint, heard_first: bool
 ) -> None:
     moment_s = 0.2
     said = coasted(flight)
@@ -113,7 +115,9 @@ def test_a_picture_that_was_taken_a_moment_before_waits_for_no_other(
     assert np.linalg.norm(off_mps) < 3.0 * first.velocity_sigma_mps
 
 
-def test_it_may_be_said_before_anybody_has_said_where_the_flight_began(flight: Flight, killed: Last) -> None:
+def test_it_may_be_said_before_anybody_has_said_where_the_flight_began(
+    flight: Flight, killed: EstimatorCheckpoint
+) -> None:
     """The link is there before vision, and with it the Origin, is."""
     run = Listener()
     run.node = EstimatorNode(0, killed)
@@ -138,7 +142,7 @@ def test_backwards_and_forwards_a_coast_ends_where_it_began() -> None:
         way_m=(0.0, 0.0),
         gain_mps=(0.0, 0.0, 0.0),
     )
-    coast = Coast.of(said, frame)
+    coast = DeadReckoning.of(said, frame)
     tilts_rad = (math.radians(0.7), math.radians(0.7))
     back, end, on = (coast.until(2.0 + s, None, 0.3, 0.0, tilts_rad) for s in (-0.25, 0.0, 0.25))
     assert np.allclose([back.at_m[0], end.at_m[0], on.at_m[0]], [35.0, 40.0, 45.0], atol=0.3)
@@ -147,7 +151,7 @@ def test_backwards_and_forwards_a_coast_ends_where_it_began() -> None:
     assert sigmas[0] < sigmas[1] < sigmas[2] and sigmas[0] == pytest.approx(np.hypot(4.0, 2.0 * 1.75), rel=0.1)
 
 
-def test_a_filter_that_jumped_is_not_believed(flight: Flight, killed: Last) -> None:
+def test_a_filter_that_jumped_is_not_believed(flight: Flight, killed: EstimatorCheckpoint) -> None:
     led_astray = resumed(flight, killed, coasted(flight, off_m=(400.0, 0.0)))
     without = resumed(flight, killed, None)
     assert led_astray.estimate(BACK).cov == without.estimate(BACK).cov
@@ -188,7 +192,7 @@ def test_claims_hold_for_a_tilt_that_is_off_as_it_is_said_to_be(coast_s: float) 
             way_m=(float(way[0]), float(way[1])),
             gain_mps=(float(gain[-1, 0]), float(gain[-1, 1]), 0.0),
         )
-        got = Coast.of(said, frame).until(coast_s, None, 0.3, 0.0, (tilt_rad, tilt_rad))
+        got = DeadReckoning.of(said, frame).until(coast_s, None, 0.3, 0.0, (tilt_rad, tilt_rad))
         off_m, off_mps = got.at_m - (20.0 * coast_s, 0.0), got.velocity_mps[:2] - (20.0, 0.0)
         of_position = off_m @ np.linalg.solve(got.cov_m2, off_m)
         nees.append([of_position, off_mps @ np.linalg.solve(got.velocity_cov[:2, :2], off_mps)])

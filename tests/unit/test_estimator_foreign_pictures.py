@@ -10,8 +10,8 @@ from simulated_flight import FRAME_S, ORIGIN, Flight, Listener, blind, cov_of, e
 
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import AT_REST_S
-from terrafix.estimator.tracker import MOTION_TIMEOUT_S, Tracker
-from terrafix.estimator.velocity import MAX_SPEED_SIGMA_MPS
+from terrafix.estimator.models.motion_model import MAX_SPEED_SIGMA_MPS
+from terrafix.estimator.propagation import MOTION_TIMEOUT_S, Propagation
 from terrafix.messages import MapMatch, Message, Odometry, Prediction, VehicleState, Verdict
 
 FIRST, END, FRAMES = 30, 42, 70  # frames of the lie, of the flight
@@ -142,10 +142,10 @@ def test_looks_that_find_nothing_where_every_look_found_a_pose_speak_against_a_n
 
 def test_the_motion_of_an_unjoined_fragment_is_predicted_from_its_keyframe_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Velocity led the keyframe there, too, so that its error counts over all of the time since."""
-    predicted = Tracker._motion_innovation
+    predicted = Propagation._motion_innovation
     beyond: list[float] = []
 
-    def spy(tracker: Tracker, t_s: float, p_m: np.ndarray, parent: int, *rest: Any) -> MotionInnovation:
+    def spy(tracker: Propagation, t_s: float, p_m: np.ndarray, parent: int, *rest: Any) -> MotionInnovation:
         innovation = predicted(tracker, t_s, p_m, parent, *rest)
         if not tracker._fragments.of(parent).joined:
             since_s = t_s - tracker.graph.time_of(parent)
@@ -153,7 +153,7 @@ def test_the_motion_of_an_unjoined_fragment_is_predicted_from_its_keyframe_on(mo
             beyond.append(float(np.linalg.eigvalsh(innovation.cov_m2[:2, :2] - velocity_m2)[0]))
         return innovation
 
-    monkeypatch.setattr(Tracker, "_motion_innovation", spy)
+    monkeypatch.setattr(Propagation, "_motion_innovation", spy)
     flight = Flight(FRAMES, seed=5)
     other = Flight(FRAMES + LATER, seed=11, speed_mps=3.0, turns_rad=2.0)
     flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)

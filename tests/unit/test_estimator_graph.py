@@ -6,10 +6,10 @@ import pytest
 from gtsam.symbol_shorthand import B, C, V
 from simulated_flight import Flight, Listener, cov_of, error_m, sigma_m, t_ns
 
-from terrafix.estimator.factors import BIAS_SIZE
-from terrafix.estimator.graph import PoseGraph
-from terrafix.estimator.lag import BATCH_NODES, LAG_NODES, FixedLag
-from terrafix.estimator.velocity import V_SIZE
+from terrafix.estimator.factors.custom_factors import BIAS_SIZE
+from terrafix.estimator.graph.fixed_lag import BATCH_NODES, LAG_NODES, FixedLagSmoother
+from terrafix.estimator.graph.pose_graph import PoseGraph
+from terrafix.estimator.models.motion_model import V_SIZE
 from terrafix.messages import MapMatch, Refinement, SourceEnded, Verdict
 
 
@@ -46,7 +46,7 @@ def test_marginalising_changes_no_estimate(seed: int) -> None:
     """Numbers that hang on the ones before and on those of a keyframe, on one that is held for long, and some of which
     are told late, against a solution of everything at once."""
     rng = np.random.default_rng([seed, 4])
-    lag, everything = FixedLag(), gtsam.NonlinearFactorGraph()
+    lag, everything = FixedLagSmoother(), gtsam.NonlinearFactorGraph()
     start = gtsam.Values()
     unit = gtsam.noiseModel.Unit.Create
     for i in range(90):

@@ -8,14 +8,14 @@ from gtsam.symbol_shorthand import B, C
 from simulated_flight import FRAME_S, Flight, Listener, blind
 
 from terrafix.core.pose import tangent_to_world
-from terrafix.estimator.factors import BIAS_SIZE, same_ground_factor
-from terrafix.estimator.filter import Estimator
-from terrafix.estimator.matched import measured_pose
-from terrafix.estimator.motion import Ground
+from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.factors.custom_factors import BIAS_SIZE, plane_two_view_factor
+from terrafix.estimator.measurements.map_pose import measured_pose
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.models.plane_motion import Ground
+from terrafix.estimator.models.terrain import Terrain
+from terrafix.estimator.models.terrain_roughness import CANDIDATES, PRIOR
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.ruggedness import CANDIDATES, PRIOR
-from terrafix.estimator.telemetry import Attitude
-from terrafix.estimator.terrain import Terrain
 from terrafix.messages import (
     Camera,
     MapMatch,
@@ -153,7 +153,7 @@ def test_ground_that_bends_may_not_turn_the_camera(along: tuple[float, float]) -
         known = gtsam.noiseModel.Isotropic.Sigma
         graph.add(gtsam.PriorFactorPose3(C(0), keyframe, known(6, 1e-6)))
         graph.add(gtsam.PriorFactorVector(B(1), np.zeros(BIAS_SIZE), known(BIAS_SIZE, 1e-6)))
-        graph.add(same_ground_factor(C(0), C(1), B(1), keyframe, pose, pairs, 1e-4, ground))
+        graph.add(plane_two_view_factor(C(0), C(1), B(1), keyframe, pose, pairs, 1e-4, ground))
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
         turned = gtsam.Rot3.Logmap(looks_down.between(solved.atPose3(C(1)).rotation()))
         cov = gtsam.Marginals(graph, solved).marginalCovariance(C(1))[:3, :3]
@@ -183,7 +183,7 @@ def test_a_slope_does_not_say_where_a_lost_camera_is() -> None:
     points = np.column_stack([seen[:, 0] * depth, -seen[:, 1] * depth, 100.0 - depth])
     in_pose = (points - pose.translation()) @ looks_down
     pairs = np.column_stack([seen, in_pose[:, :2] / in_pose[:, 2:]])
-    factor = same_ground_factor(0, 1, 2, keyframe, pose, pairs, 1e-3, sloping)
+    factor = plane_two_view_factor(0, 1, 2, keyframe, pose, pairs, 1e-3, sloping)
 
     def error(moved_m: tuple[float, float, float]) -> float:
         values = gtsam.Values()

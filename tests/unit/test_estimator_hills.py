@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from simulated_flight import ORIGIN, Flight, Listener, cov_of, error_m
 
-from terrafix.estimator.ruggedness import CANDIDATES, Ruggedness
+from terrafix.estimator.models.terrain_roughness import CANDIDATES, TerrainRoughness
 from terrafix.messages import MapMatch
 
 FRAMES = 240
@@ -72,7 +72,7 @@ def test_one_that_brakes_hard_does_not_change_its_height(seed: int) -> None:
         assert off_m @ np.linalg.solve(cov_of(said)[:2, :2], off_m) < 2.5
 
 
-def walked(rise: float, metres: float, told: Ruggedness, seed: int) -> list[float]:
+def walked(rise: float, metres: float, told: TerrainRoughness, seed: int) -> list[float]:
     """What it takes the ground for that is measured to 4 m, every 60 m."""
     rng = np.random.default_rng(seed)
     at_m = np.arange(0.0, metres, 60.0)
@@ -86,14 +86,14 @@ def walked(rise: float, metres: float, told: Ruggedness, seed: int) -> list[floa
 
 @pytest.mark.parametrize("rise", CANDIDATES)
 def test_it_learns_how_rugged_the_ground_is(rise: float) -> None:
-    ends = [np.mean(walked(rise, 6000.0, Ruggedness(), seed)[-20:]) for seed in range(8)]
+    ends = [np.mean(walked(rise, 6000.0, TerrainRoughness(), seed)[-20:]) for seed in range(8)]
     assert 0.7 * rise < np.median(ends) < 2.5 * rise
 
 
 def test_where_hills_begin_it_forgets_the_plain() -> None:
     plains, hills = [], []
     for seed in range(8):
-        told = Ruggedness()
+        told = TerrainRoughness()
         plains.append(walked(0.0, 5000.0, told, seed)[-1])
         hills.append(max(walked(3.0, 1000.0, told, seed)))
     assert 0.3 < np.median(plains) < 0.8 and np.median(hills) > 1.5
@@ -104,7 +104,7 @@ def test_smooth_hills_are_hills() -> None:
     were taken for half of a plain. A walk that rises as much on 300 m rises 0.7 m for each root of a metre."""
     taken_for = []
     for seed in range(8):
-        told, rng = Ruggedness(), np.random.default_rng(seed)
+        told, rng = TerrainRoughness(), np.random.default_rng(seed)
         for at in np.arange(0.0, 4000.0, 22.0):
             level_m = 15.0 * np.sin(2.0 * np.pi * (at / 1500.0 + seed / 8.0)) + rng.normal(0.0, 2.0)
             told.measured(np.array([0.0, at]), 100.0, float(level_m), 4.0)
@@ -115,11 +115,11 @@ def test_smooth_hills_are_hills() -> None:
 
 def test_what_the_candidates_leave_open_is_in_the_claim() -> None:
     """Of a rise of which nothing is known the mean square counts: mountains are rare, and high."""
-    assert Ruggedness().rise == pytest.approx(np.sqrt(0.35 * 0.3**2 + 0.5 * 1.0**2 + 0.15 * 3.0**2))
+    assert TerrainRoughness().rise == pytest.approx(np.sqrt(0.35 * 0.3**2 + 0.5 * 1.0**2 + 0.15 * 3.0**2))
 
 
 def test_levels_of_the_same_ground_are_one() -> None:
-    told = Ruggedness()
+    told = TerrainRoughness()
     for i in range(50):
         told.measured(np.array([0.0, 0.5 * i]), 100.0, 20.0 * (i % 2), 4.0)
-    assert told.rise == Ruggedness().rise
+    assert told.rise == TerrainRoughness().rise

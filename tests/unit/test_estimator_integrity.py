@@ -10,14 +10,14 @@ from simulated_flight import ORIGIN, Flight, Listener, sigma_m, t_ns
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
-from terrafix.estimator.integrity.cusum import LARGEST_STEP, MARGIN, Cusum, threshold
-from terrafix.estimator.integrity.inertial import LEAST_CHANGE_MPS, MOUNT_YAWS_DEG, WINDOW_S, InertialMonitor
-from terrafix.estimator.integrity.matched import OffsetMonitor, told_over_seen
-from terrafix.estimator.integrity.monitors import UNKNOWN_M, Monitors
-from terrafix.estimator.integrity.registration import NEW_GROUND, PRIOR, REACH, Registration
-from terrafix.estimator.integrity.sighting import sighting
-from terrafix.estimator.integrity.turns import TurnMonitor
-from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.monitors.calibration_monitors import UNKNOWN_M, Monitors
+from terrafix.estimator.monitors.cusum import LARGEST_STEP, MARGIN, Cusum, threshold
+from terrafix.estimator.monitors.inertial import LEAST_CHANGE_MPS, MOUNT_YAWS_DEG, WINDOW_S, InertialMonitor
+from terrafix.estimator.monitors.map_offsets import OffsetMonitor, told_over_seen
+from terrafix.estimator.monitors.registration import NEW_GROUND, PRIOR, REACH, Registration
+from terrafix.estimator.monitors.sighting import sighting
+from terrafix.estimator.monitors.turns import TurnMonitor
 from terrafix.messages import CalibrationFault, MapMatch, Message, Odometry, VehicleState, Verdict
 
 HEIGHT_M = 100.0
@@ -284,7 +284,7 @@ def test_looks_at_ground_without_texture_say_nothing() -> None:
 
 
 def test_a_compass_that_is_90_degrees_off_is_named_by_poses_on_the_map() -> None:
-    from terrafix.estimator.telemetry import Telemetry
+    from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 
     monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(60, dem=True)
     for i in range(60):
@@ -299,7 +299,7 @@ def test_a_compass_that_is_90_degrees_off_is_named_by_poses_on_the_map() -> None
 
 
 def test_a_finding_is_said_again_when_it_becomes_another_one() -> None:
-    from terrafix.estimator.telemetry import Telemetry
+    from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 
     monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(200, dem=True)
     said = []

@@ -4,10 +4,10 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
-from terrafix.estimator.factors import BIAS_SIZE
-from terrafix.estimator.graph import NodeState, PoseGraph, _tie
-from terrafix.estimator.lag import BATCH_NODES, FixedLag
-from terrafix.estimator.velocity import V_SIZE
+from terrafix.estimator.factors.custom_factors import BIAS_SIZE
+from terrafix.estimator.graph.fixed_lag import BATCH_NODES, FixedLagSmoother
+from terrafix.estimator.graph.pose_graph import NodeState, PoseGraph, _tie
+from terrafix.estimator.models.motion_model import V_SIZE
 
 SIZES = {"c": 6, "b": BIAS_SIZE, "v": V_SIZE}
 ALONE = BATCH_NODES - 1  # a graph that begins with the last node of a batch: that leaves by itself
@@ -29,7 +29,7 @@ def of(keys: list[int], rng: np.random.Generator) -> gtsam.CustomFactor:
 
 def is_lost(seed: int, *, tied: bool) -> bool:
     """Whether the tree loses a variable, in thirty nodes as they follow from each other."""
-    rng, lag, keyframe = np.random.default_rng(seed), FixedLag(), ALONE
+    rng, lag, keyframe = np.random.default_rng(seed), FixedLagSmoother(), ALONE
     for n in range(ALONE, ALONE + 30):
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(C(n), gtsam.Pose3())

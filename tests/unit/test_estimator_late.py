@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated_flight import ORIGIN, Flight, Listener, blind, cov_of, error_m, sigma_m, t_ns
 
-from terrafix.estimator.seen_ground import KEPT, SeenGround
+from terrafix.estimator.integrity.correlated_fixes import KEPT, CorrelatedFixes
 from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, SourceEnded, SourceLabel, Verdict
 
 LATEST = 4  # frames: two seconds
@@ -143,7 +143,7 @@ def test_one_that_comes_after_the_flight_says_so() -> None:
 def test_ground_counts_the_same_in_any_order() -> None:
     places = [np.array([20.0 * i, 0.0]) for i in range(4)]
     for order in ((0, 1, 2, 3), (0, 2, 1, 3), (3, 1, 0, 2), (3, 2, 1, 0)):
-        seen, total_m = SeenGround(), 0.0
+        seen, total_m = CorrelatedFixes(), 0.0
         for i in order:
             total_m += seen.new_m(float(i), places[i], 50.0)
             seen.add(float(i), places[i])
@@ -153,7 +153,7 @@ def test_ground_counts_the_same_in_any_order() -> None:
 
 
 def test_ground_far_away_is_all_new() -> None:
-    seen = SeenGround()
+    seen = CorrelatedFixes()
     assert seen.new_m(0.0, np.zeros(2), 50.0) == 50.0 and seen.newest_s is None
     for i in range(3 * KEPT):
         seen.add(float(i), np.array([100.0 * i, 0.0]))
@@ -165,7 +165,7 @@ def test_ground_far_away_is_all_new() -> None:
 @pytest.mark.parametrize("hz", [0.5, 2.0, 5.0, 30.0])
 def test_more_frames_a_second_over_the_same_ground_do_not_tell_more(hz: float) -> None:
     """A vehicle that hovers for half a minute, 100 m up, after its first fix."""
-    seen, counted = SeenGround(), 0.0
+    seen, counted = CorrelatedFixes(), 0.0
     seen.add(0.0, np.zeros(2))
     for t_s in np.arange(1, 30 * hz) / hz:
         counted += seen.share(float(t_s), np.zeros(2), 100.0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from simulated_flight import ORIGIN
 
-from terrafix.estimator.mounted import LEAN_S, UNKNOWN_ATTITUDE_RAD, MountedCamera
-from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.measurements.attitude_height import LEAN_S, UNKNOWN_ATTITUDE_RAD, MountedCamera
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
 
 
 def test_that_it_is_level_is_said_once_in_a_lean() -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from simulated_flight import ORIGIN, Flight, Listener
 
-from terrafix.estimator.factors import BIAS_SIZE, LENS, same_ground_factor
-from terrafix.estimator.lens import LENS_SIGMA
-from terrafix.estimator.motion import Ground
+from terrafix.estimator.factors.custom_factors import BIAS_SIZE, LENS, plane_two_view_factor
+from terrafix.estimator.models.lens_prior import LENS_SIGMA
+from terrafix.estimator.models.plane_motion import Ground
 from terrafix.messages import MapMatch, Message, Odometry
 
 MAPPED = 30  # frames, before the map ends
@@ -29,7 +29,7 @@ def test_a_lens_that_bends_explains_what_no_motion_does(turned_rad: float) -> No
     in_pose = (points - pose.translation()) @ pose.rotation().matrix()
     k1 = 0.01
     pairs = np.hstack([bent(seen, k1), bent(in_pose[:, :2] / in_pose[:, 2:], k1)])
-    factor = same_ground_factor(0, 1, 2, keyframe, pose, pairs, 1e-4, Ground(100.0, 2.0, slope_sigma=0.01))
+    factor = plane_two_view_factor(0, 1, 2, keyframe, pose, pairs, 1e-4, Ground(100.0, 2.0, slope_sigma=0.01))
 
     def error(believed: float) -> float:
         values, bias = gtsam.Values(), np.zeros(BIAS_SIZE)

@@ -7,13 +7,13 @@ import pytest
 from gtsam.symbol_shorthand import B, C
 from simulated_flight import CAMERA, ORIGIN, Flight, Listener
 
-from terrafix.anchor.rectify import rectify
+from terrafix.anchor.matching.orthorectify import rectify
 from terrafix.core.camera import CameraCalibration, bent, straightened
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.pose import fit_pose
-from terrafix.estimator.factors import BIAS_SIZE, LENS, map_fix_factor
-from terrafix.estimator.lens import centre_sigma, lens_sigma
-from terrafix.estimator.matched import moved_by_lens
+from terrafix.estimator.factors.custom_factors import BIAS_SIZE, LENS, map_fix_factor
+from terrafix.estimator.measurements.map_pose import moved_by_lens
+from terrafix.estimator.models.lens_prior import centre_sigma, lens_sigma
 from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, Prediction, SlowErrors, Verdict
 from terrafix_tools.lens_words import lens_words
 

@@ -8,8 +8,8 @@ import pytest
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
-from terrafix.estimator.integrity.levelling import WAYS, LevellingMonitor
-from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.monitors.levelling import WAYS, LevellingMonitor
 
 R_B_C = Mount().r_b_c()
 AGL_M = 100.0

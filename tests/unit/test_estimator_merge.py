@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from terrafix.core.pose import exp_so3
-from terrafix.estimator.fragments import Anchor, Fragment, Join, Merged
-from terrafix.estimator.similarity import merge
 from terrafix_tools.bench.merging import STEP_SIGMAS, Torn, measure, pose_errors, torn_flight
+from terrafix_tools.finalise.sim3_pose_graph import merge
+from terrafix_tools.finalise.submap_types import AbsoluteConstraint, MergedSubmaps, RelativeConstraint, Submap
 
 CHI2_95_2 = 5.991
 
@@ -18,20 +18,20 @@ def nees(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     return np.einsum("ni,ni->n", errors, np.linalg.solve(covs, errors[..., None])[..., 0])
 
 
-def without(torn: Torn, *gone: int) -> list[Anchor]:
+def without(torn: Torn, *gone: int) -> list[AbsoluteConstraint]:
     """The anchors of all other fragments."""
     return [a for a in torn.anchors if a.fragment not in gone]
 
 
-def seen_again(torn: Torn, first: tuple[int, int], second: tuple[int, int]) -> Join:
+def seen_again(torn: Torn, first: tuple[int, int], second: tuple[int, int]) -> RelativeConstraint:
     """A relocalisation without error between keyframes of two fragments whose unit is the metre."""
     (a, i), (b, j) = first, second
     r_a, r_b = torn.r_w_c[a][i], torn.r_w_c[b][j]
     way = r_a.T @ (torn.p_w_m[b][j] - torn.p_w_m[a][i])
-    return Join(first, second, r_a.T @ r_b, way, np.diag(STEP_SIGMAS**2), 1.0, 0.01)
+    return RelativeConstraint(first, second, r_a.T @ r_b, way, np.diag(STEP_SIGMAS**2), 1.0, 0.01)
 
 
-def median_m(torn: Torn, merged: Merged) -> float:
+def median_m(torn: Torn, merged: MergedSubmaps) -> float:
     return float(np.median(np.linalg.norm(pose_errors(torn, merged)[0][:, 3:], axis=1)))
 
 
@@ -132,7 +132,7 @@ def test_a_wrong_relocalisation_is_refused() -> None:
     assert median_m(torn, merged) < 4.0
 
 
-def _in_other_units(fragment: Fragment, m_per_unit: float) -> Fragment:
+def _in_other_units(fragment: Submap, m_per_unit: float) -> Submap:
     cov = fragment.step_cov.copy()
     cov[:, 3:, 3:] /= m_per_unit**2
     return replace(fragment, p_c_in_f=fragment.p_c_in_f / m_per_unit, step_cov=cov, scale_sigma=None)

@@ -7,8 +7,8 @@ import pytest
 from simulated_flight import CAMERA
 
 from terrafix.core.pose import exp_so3
-from terrafix.estimator.middle import Middle, graph_aside
-from terrafix.estimator.structure import Trio
+from terrafix.estimator.factors.three_view import ThreeViewPose
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter, graph_aside
 from terrafix.messages import Camera, CovarianceMode, NavEstimate, SlowErrors, SourceLabel
 from terrafix_tools.lens_words import lens_words
 
@@ -26,7 +26,7 @@ def shown(ray: np.ndarray, bends: tuple[float, float], middle: np.ndarray) -> np
 
 def triple(
     rng: np.random.Generator, bends: tuple[float, float], middle: np.ndarray, lean: float = 0.05
-) -> tuple[np.ndarray, Trio]:
+) -> tuple[np.ndarray, ThreeViewPose]:
     """60 points of ground with houses, and the cameras as a graph has them that knows nothing of the lens."""
     poses = []
     for way_m in (-25.0, 25.0):
@@ -39,11 +39,13 @@ def triple(
         in_c = (points - pose.translation()) @ pose.rotation().matrix()
         seen.append(shown(in_c[:, :2] / in_c[:, 2:], bends, middle) + rng.normal(0.0, NOISE, (60, 2)))
     first, last = (pose.retract(rng.normal(0.0, [0.01] * 3 + [0.5] * 3)) for pose in poses)
-    return np.hstack(seen), Trio(first, last, HEIGHT_M, 0.0, 0.0)
+    return np.hstack(seen), ThreeViewPose(first, last, HEIGHT_M, 0.0, 0.0)
 
 
-def learnt(seed: int, camera: Camera = UNCALIBRATED, bends: tuple[float, float] = BENDS, lean: float = 0.05) -> Middle:
-    rng, found = np.random.default_rng(seed), Middle(camera)
+def learnt(
+    seed: int, camera: Camera = UNCALIBRATED, bends: tuple[float, float] = BENDS, lean: float = 0.05
+) -> PrincipalPointFilter:
+    rng, found = np.random.default_rng(seed), PrincipalPointFilter(camera)
     for _ in range(40):
         triples, at = triple(rng, bends, MIDDLE, lean)
         found.see(triples, NOISE, at)
@@ -53,7 +55,7 @@ def learnt(seed: int, camera: Camera = UNCALIBRATED, bends: tuple[float, float] 
 def test_a_lens_that_bends_shows_where_its_middle_is() -> None:
     found = [learnt(seed) for seed in range(8)]
     for one in found:
-        assert np.sqrt(np.diag(one.cov)).max() < 0.5 * np.sqrt(np.diag(Middle(UNCALIBRATED).cov)).min()
+        assert np.sqrt(np.diag(one.cov)).max() < 0.5 * np.sqrt(np.diag(PrincipalPointFilter(UNCALIBRATED).cov)).min()
     errors = [one.offset - MIDDLE for one in found]
     assert np.linalg.norm(np.mean(errors, axis=0)) < 0.3 * np.linalg.norm(MIDDLE)
     nees = np.mean([e @ np.linalg.solve(one.cov, e) for e, one in zip(errors, found, strict=True)])
@@ -61,7 +63,7 @@ def test_a_lens_that_bends_shows_where_its_middle_is() -> None:
 
 
 def test_without_a_bend_a_camera_that_leans_shows_it_and_one_that_does_not_shows_nothing() -> None:
-    before = np.sqrt(Middle(UNCALIBRATED).cov[0, 0])
+    before = np.sqrt(PrincipalPointFilter(UNCALIBRATED).cov[0, 0])
     leans = learnt(1, bends=(0.0, 0.0))
     assert np.linalg.norm(leans.offset - MIDDLE) < 0.2 * np.linalg.norm(MIDDLE)
     level = learnt(1, bends=(0.0, 0.0), lean=0.0)
@@ -77,18 +79,18 @@ def test_without_a_bend_a_camera_that_leans_shows_it_and_one_that_does_not_shows
 def test_what_somebody_has_measured_is_not_learnt(camera: Camera) -> None:
     found = learnt(1, camera)
     assert found.learnt is None and np.array_equal(found.offset, np.zeros(2))
-    assert np.array_equal(found.cov, Middle(camera).cov)
+    assert np.array_equal(found.cov, PrincipalPointFilter(camera).cov)
 
 
 def test_points_that_fit_no_lens_are_left_out() -> None:
-    found, before = Middle(UNCALIBRATED), Middle(UNCALIBRATED)
+    found, before = PrincipalPointFilter(UNCALIBRATED), PrincipalPointFilter(UNCALIBRATED)
     triples, at = triple(np.random.default_rng(2), BENDS, MIDDLE)
     found.see(np.random.default_rng(3).permuted(triples, axis=0), NOISE, at)
     assert np.array_equal(found.cov, before.cov) and np.array_equal(found.offset, before.offset)
 
 
 def test_what_is_no_number_changes_nothing() -> None:
-    found, before = Middle(UNCALIBRATED), Middle(UNCALIBRATED)
+    found, before = PrincipalPointFilter(UNCALIBRATED), PrincipalPointFilter(UNCALIBRATED)
     triples, at = triple(np.random.default_rng(2), BENDS, MIDDLE)
     for wrong in (np.full_like(triples, np.nan), 1e200 * triples):
         with np.errstate(all="ignore"):
@@ -98,7 +100,7 @@ def test_what_is_no_number_changes_nothing() -> None:
 
 def test_what_was_learnt_outlives_the_process() -> None:
     found = learnt(1)
-    again = Middle(UNCALIBRATED, found.learnt)
+    again = PrincipalPointFilter(UNCALIBRATED, found.learnt)
     assert np.allclose(again.offset, found.offset) and np.allclose(again.cov, found.cov)
 
 

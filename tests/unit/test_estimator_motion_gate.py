@@ -9,7 +9,7 @@ import pytest
 from terrafix.core.gate import GATE
 from terrafix.estimator.integrity.motion_gate import GATE_D2, MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture
-from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
 
 FLYING = Attitude(0.0, 0.0, 0.0, 100.0, armed=True)
 SIGMA_M = 0.5

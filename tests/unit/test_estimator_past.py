@@ -5,25 +5,25 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C, V
 
-from terrafix.estimator import past as past_module
-from terrafix.estimator.factors import BIAS_SIZE
-from terrafix.estimator.lag import FixedLag
-from terrafix.estimator.linear import NODE, IndeterminateError, Linear, eliminate, solve
-from terrafix.estimator.past import MOST_OPEN, Past
-from terrafix.estimator.velocity import V_SIZE
+from terrafix.estimator.factors.custom_factors import BIAS_SIZE
+from terrafix.estimator.graph import marginalized
+from terrafix.estimator.graph.elimination import NODE, GaussianFactor, IndeterminateError, eliminate, solve
+from terrafix.estimator.graph.fixed_lag import FixedLagSmoother
+from terrafix.estimator.graph.marginalized import MOST_OPEN, MarginalizedHistory
+from terrafix.estimator.models.motion_model import V_SIZE
 
 STEP_M, TURN_RAD = np.array([6.0, 0.0, 0.0]), 0.02
 ODOMETRY = np.array([0.003, 0.003, 0.006, 0.3, 0.3, 0.3])  # 1-sigma
 FIX = np.array([0.02, 0.02, 0.02, 2.0, 2.0, 2.0])
 
 
-def random_chain(nodes: int, rng: np.random.Generator) -> list[Linear]:
+def random_chain(nodes: int, rng: np.random.Generator) -> list[GaussianFactor]:
     """A prior, neighbours, and a node on which every third one hangs."""
     sides = [(0,), *((i, i + 1) for i in range(nodes - 1)), *((2, i) for i in range(5, nodes, 3))]
-    return [Linear(s, rng.normal(size=(NODE, NODE * len(s))), rng.normal(size=NODE)) for s in sides]
+    return [GaussianFactor(s, rng.normal(size=(NODE, NODE * len(s))), rng.normal(size=NODE)) for s in sides]
 
 
-def dense(factors: list[Linear], nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def dense(factors: list[GaussianFactor], nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """By normal equations: changes (nodes, NODE), covariance (NODE * nodes, NODE * nodes)."""
     information, vector = np.zeros((NODE * nodes, NODE * nodes)), np.zeros(NODE * nodes)
     for f in factors:
@@ -66,7 +66,7 @@ def test_what_nothing_holds_is_indeterminate() -> None:
     with pytest.raises(IndeterminateError):
         solve(random_chain(4, np.random.default_rng(3))[1:])  # without the prior
     with pytest.raises(IndeterminateError):
-        solve([Linear((0,), np.full((NODE, NODE), np.nan), np.zeros(NODE))])
+        solve([GaussianFactor((0,), np.full((NODE, NODE), np.nan), np.zeros(NODE))])
 
 
 class Chain:
@@ -106,10 +106,10 @@ class Chain:
                 graph.add(gtsam.PriorFactorPose3(C(i), fix, gtsam.noiseModel.Diagonal.Sigmas(FIX)))
             self.factors.append(graph)
 
-    def flown(self, past: Past) -> Past:
+    def flown(self, past: MarginalizedHistory) -> MarginalizedHistory:
         """Where the vehicle stands, the first node of that stays in the window until it moves again."""
         past.begin(0)
-        lag, window = FixedLag(), list[int]()
+        lag, window = FixedLagSmoother(), list[int]()
         for i, (factors, (parent, motion)) in enumerate(zip(self.factors, self.steps, strict=True)):
             if i in self.stands[1:]:
                 lag.keep(self.stands.start)
@@ -127,7 +127,7 @@ class Chain:
         past.leave(window, self._noted(lag, window))
         return past
 
-    def _noted(self, lag: FixedLag, window: list[int]) -> gtsam.Values:
+    def _noted(self, lag: FixedLagSmoother, window: list[int]) -> gtsam.Values:
         values = lag.estimate()
         for n in window:
             for key in (C(n), B(n), V(n)):
@@ -157,9 +157,9 @@ def sigmas(cov: np.ndarray) -> np.ndarray:
 def test_it_is_the_batch_optimisation_of_the_whole_flight(most_kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A gap of 100 nodes without a fix, and 25 m to correct where it ends. What is left is what is not linear. How many
     nodes are kept makes no difference."""
-    monkeypatch.setattr(past_module, "MOST_KEPT", most_kept)
+    monkeypatch.setattr(marginalized, "MOST_KEPT", most_kept)
     chain = Chain(260, fixes={*range(10, 100, 10), *range(200, 260, 10)})
-    past = chain.flown(Past())
+    past = chain.flown(MarginalizedHistory())
     p_m, cov = past.refine()
     assert len(past._kept) <= most_kept + 1 and len(past._linear) <= most_kept + 1
     exact_m, exact_cov = chain.batch()
@@ -171,9 +171,9 @@ def test_it_is_the_batch_optimisation_of_the_whole_flight(most_kept: int, monkey
 
 
 def test_what_is_kept_stays_small_however_long_the_flight() -> None:
-    past = Chain(1700, fixes=set(range(0, 1700, 20))).flown(Past())
-    assert past_module.MOST_KEPT - 2 <= len(past._kept) <= past_module.MOST_KEPT
-    assert max(len(past._linear), len(past._left)) < past_module.MOST_KEPT + 3 * MOST_OPEN
+    past = Chain(1700, fixes=set(range(0, 1700, 20))).flown(MarginalizedHistory())
+    assert marginalized.MOST_KEPT - 2 <= len(past._kept) <= marginalized.MOST_KEPT
+    assert max(len(past._linear), len(past._left)) < marginalized.MOST_KEPT + 3 * MOST_OPEN
     p_m, cov = past.refine()
     assert p_m.shape == (1700, 3) and np.isfinite(p_m).all()
     assert np.linalg.eigvalsh(cov).min() > 0.0
@@ -183,7 +183,7 @@ def test_a_vehicle_that_stands_hangs_on_one_node_for_long() -> None:
     """That node stays in the window meanwhile."""
     stands = range(40, 240)
     chain = Chain(300, fixes={10, 20, 30, 260, 270, 280}, stands=stands)
-    past = chain.flown(Past())
+    past = chain.flown(MarginalizedHistory())
     assert len(past._left) < 120
     p_m, cov = past.refine()
     exact_m, exact_cov = chain.batch()
@@ -193,9 +193,9 @@ def test_a_vehicle_that_stands_hangs_on_one_node_for_long() -> None:
 
 def test_a_graph_that_began_anew_leaves_two_parts() -> None:
     first, second = Chain(48, fixes={0, 20}), Chain(30, fixes={0, 20}, seed=1)
-    past = first.flown(Past())
+    past = first.flown(MarginalizedHistory())
     past.begin(48)
-    second.flown(Past())
+    second.flown(MarginalizedHistory())
     for factors in second.factors:
         past.add(_renumbered(factors, 48))
     past.leave(list(range(48, 78)), _later(second.said, 48, 30))
@@ -225,11 +225,11 @@ def _later(values: gtsam.Values, by: int, nodes: int) -> gtsam.Values:
 
 def test_a_stretch_of_which_nothing_is_known_takes_only_itself() -> None:
     """A factor that is no number: the rest of the flight is refined."""
-    past, bad = Past(), gtsam.NonlinearFactorGraph()
+    past, bad = MarginalizedHistory(), gtsam.NonlinearFactorGraph()
     bad.add(gtsam.PriorFactorVector(V(52), np.full(V_SIZE, np.nan), gtsam.noiseModel.Unit.Create(V_SIZE)))
     past.add(bad)
     past.begin = lambda node: None  # type: ignore[method-assign] # it forgets what was before, and node 0 begins anyway
     p_m, cov = Chain(120, fixes=set(range(0, 120, 10))).flown(past).refine()
     lost = np.flatnonzero(~np.isfinite(p_m).all(axis=1))
-    assert 52 in lost and len(lost) <= 2 * past_module.SPACING
+    assert 52 in lost and len(lost) <= 2 * marginalized.SPACING
     assert np.isfinite(cov[np.isfinite(p_m).all(axis=1)]).all()

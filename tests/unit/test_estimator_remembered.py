@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C
 
-from terrafix.estimator import remembered
-from terrafix.estimator.remembered import MOST, custom_factor
+from terrafix.estimator.factors import linearization_cache
+from terrafix.estimator.factors.linearization_cache import MOST, custom_factor
 
 
 class Counted:
@@ -57,6 +57,6 @@ def test_factors_do_not_answer_for_each_other_and_few_remember() -> None:
     for _ in range(2):
         for i, factor in enumerate(factors):
             assert answer(factor, around(60.0, 0.0))[0, -1] == i - 60.0
-    assert len(remembered._answers) == MOST
+    assert len(linearization_cache._answers) == MOST
     assert answer(factors[-1], around(60.0, 0.0))[0, -1] == len(factors) - 61.0
     assert [counted.times for counted in all_counted] == [2] * len(factors)

@@ -20,7 +20,7 @@ from simulated_flight import (
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.pose import log_so3
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.resume import Keeper, Known, Last, Learnt, kept
+from terrafix.estimator.prior import CalibrationPrior, CheckpointWriter, EstimatorCheckpoint, NavPrior, load_checkpoint
 from terrafix.messages import MeasurementVerdict, Odometry, Prediction, VehicleState, Verdict
 
 KILLED, BACK = 60, 66  # frames: three seconds
@@ -33,19 +33,19 @@ def flight() -> Flight:
 
 
 @pytest.fixture(scope="module")
-def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Last:
+def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> EstimatorCheckpoint:
     """What it said last, through the file."""
-    file = tmp_path_factory.mktemp("run") / "estimator.kept"
-    assert kept(file) is None
-    keeper = Keeper(file)
+    file = tmp_path_factory.mktemp("run") / "estimator.checkpoint"
+    assert load_checkpoint(file) is None
+    keeper = CheckpointWriter(file)
     for message in [flight.fix(KILLED - 2), *Listener().fly(flight, 0, KILLED).said]:
         keeper.heard(message)
-    last = kept(file)
+    last = load_checkpoint(file)
     assert last is not None and last.estimate.frame_id == KILLED - 1
     return last
 
 
-def resumed(flight: Flight, last: Last | None) -> Listener:
+def resumed(flight: Flight, last: EstimatorCheckpoint | None) -> Listener:
     run = Listener()
     run.node = EstimatorNode(0, last)
     run.hear([ORIGIN])
@@ -57,7 +57,7 @@ def resumed(flight: Flight, last: Last | None) -> Listener:
     return run
 
 
-def test_it_goes_on_from_there(flight: Flight, killed: Last) -> None:
+def test_it_goes_on_from_there(flight: Flight, killed: EstimatorCheckpoint) -> None:
     run = resumed(flight, killed)
     first = run.estimate(BACK)
     assert np.linalg.norm(error_m(first, flight)[:2]) < 25.0
@@ -68,7 +68,7 @@ def test_it_goes_on_from_there(flight: Flight, killed: Last) -> None:
     assert sigma_m(run.estimate(flight.frames - 1)) < 10.0
 
 
-def test_the_anchor_is_told_of_the_way_in_between(flight: Flight, killed: Last) -> None:
+def test_the_anchor_is_told_of_the_way_in_between(flight: Flight, killed: EstimatorCheckpoint) -> None:
     told = next(m for m in resumed(flight, killed).said if isinstance(m, Prediction))
     flown_m = flight.p_m[BACK, :2] - flight.p_m[KILLED - 1, :2]
     assert np.linalg.norm(told.step_m - flown_m) < 20.0 < np.linalg.norm(flown_m)
@@ -86,10 +86,10 @@ def heading_and_scale_sigma(run: Listener) -> tuple[float, float]:
     return float(np.sqrt(first.cov[35])), first.agl_sigma_m / first.agl_m
 
 
-def test_what_was_learnt_of_compass_and_barometer_holds_on(flight: Flight, killed: Last) -> None:
+def test_what_was_learnt_of_compass_and_barometer_holds_on(flight: Flight, killed: EstimatorCheckpoint) -> None:
     assert killed.slow is not None and killed.estimate.t_ns - killed.slow.t_ns < 1_500_000_000
     with_it = heading_and_scale_sigma(resumed(flight, killed))
-    without = heading_and_scale_sigma(resumed(flight, Last(killed.estimate, match=killed.match)))
+    without = heading_and_scale_sigma(resumed(flight, EstimatorCheckpoint(killed.estimate, match=killed.match)))
     assert with_it[0] < 0.6 * without[0] and with_it[1] <= without[1]
     # And it was learnt right: the heading that is begun with is no farther off than it claims.
     first = resumed(flight, killed).estimate(BACK)
@@ -97,7 +97,9 @@ def test_what_was_learnt_of_compass_and_barometer_holds_on(flight: Flight, kille
     assert abs(log_so3(turned)[2]) < 3.0 * with_it[0]
 
 
-def test_frames_wait_for_the_words_to_which_belongs_what_was_learnt(flight: Flight, killed: Last) -> None:
+def test_frames_wait_for_the_words_to_which_belongs_what_was_learnt(
+    flight: Flight, killed: EstimatorCheckpoint
+) -> None:
     """Vision is there before the link: a graph that began blind would begin anew, and lose its keyframe."""
     node = EstimatorNode(0, killed)
     said = list(node.on(ORIGIN))
@@ -114,7 +116,9 @@ def test_frames_wait_for_the_words_to_which_belongs_what_was_learnt(flight: Flig
     assert sum(isinstance(m, Prediction) for m in said) == 2
 
 
-def test_a_picture_that_is_older_than_the_first_words_is_not_begun_with(flight: Flight, killed: Last) -> None:
+def test_a_picture_that_is_older_than_the_first_words_is_not_begun_with(
+    flight: Flight, killed: EstimatorCheckpoint
+) -> None:
     """A camera has buffers. Begun with it, the graph was blind, and the anchor looked at all headings for 8 s."""
     node = EstimatorNode(0, killed)
     said = list(node.on(ORIGIN))
@@ -130,7 +134,7 @@ def test_a_picture_that_is_older_than_the_first_words_is_not_begun_with(flight: 
     assert np.sqrt(told[0].cov[35]) < 0.1
 
 
-def test_odometry_against_a_picture_that_was_left_out_is_not_lost(flight: Flight, killed: Last) -> None:
+def test_odometry_against_a_picture_that_was_left_out_is_not_lost(flight: Flight, killed: EstimatorCheckpoint) -> None:
     """It is the keyframe of the pictures after it, for up to five seconds where a vehicle is slow."""
     old, new, features = BACK, BACK + 4, some_features()
     node = EstimatorNode(0, killed)
@@ -149,7 +153,7 @@ def test_odometry_against_a_picture_that_was_left_out_is_not_lost(flight: Flight
         assert np.linalg.norm(step.step_m - flown_m) < 1.5 < 0.5 * np.linalg.norm(flown_m)
 
 
-def test_an_autopilot_that_says_nothing_is_not_waited_for(flight: Flight, killed: Last) -> None:
+def test_an_autopilot_that_says_nothing_is_not_waited_for(flight: Flight, killed: EstimatorCheckpoint) -> None:
     node = EstimatorNode(0, killed)
     said = list(node.on(ORIGIN))
     for i in range(BACK, BACK + 5):
@@ -165,9 +169,9 @@ def flown_on(turned_deg: float, from_s: float) -> np.ndarray:
     return PLANE_MPS * np.trapezoid([np.cos(course), np.sin(course)], t)
 
 
-def plane(heads_rad: float = math.radians(90.0), learnt: Learnt | None = None) -> Known:
+def plane(heads_rad: float = math.radians(90.0), learnt: CalibrationPrior | None = None) -> NavPrior:
     """Flies east."""
-    return Known(0.0, np.zeros(2), 5.0, np.array([PLANE_MPS, 0.0]), 0.4, heads_rad, learnt)
+    return NavPrior(0.0, np.zeros(2), 5.0, np.array([PLANE_MPS, 0.0]), 0.4, heads_rad, learnt)
 
 
 @pytest.mark.parametrize("turned_deg", [-110.0, -40.0, 90.0, 110.0])
@@ -194,7 +198,7 @@ def test_who_heads_as_before_flew_straight_on() -> None:
 
 def test_a_compass_that_is_off_as_it_was_learnt_has_not_turned() -> None:
     off_rad = math.radians(8.0)
-    learnt = Learnt(0.0, np.array([0.0, 0.0, off_rad, 0.0, 0.0, 0.0]), np.eye(6))
+    learnt = CalibrationPrior(0.0, np.array([0.0, 0.0, off_rad, 0.0, 0.0, 0.0]), np.eye(6))
     way_m, _ = plane(learnt=learnt).later(DOWN_S, math.radians(90.0) + off_rad)
     assert way_m == pytest.approx([PLANE_MPS * DOWN_S, 0.0], abs=0.1)
 
@@ -202,5 +206,5 @@ def test_a_compass_that_is_off_as_it_was_learnt_has_not_turned() -> None:
 def test_the_heading_of_a_copter_that_flies_sideways_tells_nothing() -> None:
     sideways = plane(heads_rad=0.0)
     assert np.array_equal(sideways.later(DOWN_S, 1.0)[0], sideways.later(DOWN_S, None)[0])
-    hovers = Known(0.0, np.zeros(2), 5.0, np.array([1.0, 0.0]), 0.4, math.radians(90.0))
+    hovers = NavPrior(0.0, np.zeros(2), 5.0, np.array([1.0, 0.0]), 0.4, math.radians(90.0))
     assert np.array_equal(hovers.later(DOWN_S, 0.0)[0], hovers.later(DOWN_S, None)[0])

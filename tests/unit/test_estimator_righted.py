@@ -10,10 +10,17 @@ from inertial_flight import InertialFlight, flown
 
 from terrafix.core.geodesy import rot_w_b
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.estimator.righted import AIDS_MPS, COASTS_S, ORDINARY_RADPS, UNAIDED_RAD, UNAIDED_S, Righted
-from terrafix.estimator.telemetry import Attitude, Telemetry
-from terrafix.estimator.velocity import TILT_S
-from terrafix.link.fix import MAX_SPEED_SIGMA_MPS
+from terrafix.estimator.measurements.ahrs_correction import (
+    AIDS_MPS,
+    COASTS_S,
+    ORDINARY_RADPS,
+    UNAIDED_RAD,
+    UNAIDED_S,
+    AhrsCorrectionMonitor,
+)
+from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
+from terrafix.estimator.models.motion_model import TILT_S
+from terrafix.link.integrity.fix_type import MAX_SPEED_SIGMA_MPS
 from terrafix.messages import Imu, VehicleState
 
 S = 1_000_000_000
@@ -82,9 +89,9 @@ def test_who_did_not_hear_all_of_it_does_not_know() -> None:
     assert telemetry.turned_otherwise(4 * S, 5 * S) is not None
 
 
-def looked(telemetry: Telemetry, until_s: float = 7.9) -> tuple[Righted, list[tuple[float, Attitude]]]:
+def looked(telemetry: Telemetry, until_s: float = 7.9) -> tuple[AhrsCorrectionMonitor, list[tuple[float, Attitude]]]:
     """Twice a second: seconds, attitude."""
-    righted = Righted(telemetry)
+    righted = AhrsCorrectionMonitor(telemetry)
     times = np.arange(0.0, until_s, 0.5)
     return righted, [(float(t), righted.look(round(t * S), SIGMA_RAD, YAW_SIGMA_RAD)) for t in times]
 
@@ -142,7 +149,7 @@ def test_what_claims_explain_is_believed_as_it_is_said() -> None:
 def test_a_jump_that_nobody_felt_is_let_in_slowly() -> None:
     """It may have been wrong before: after a few TILT_S it is believed."""
     telemetry = Telemetry()
-    righted = Righted(telemetry)
+    righted = AhrsCorrectionMonitor(telemetry)
     tilts, sigmas_deg = [], []
     for i in range(60 * HZ):
         t = i / HZ
@@ -163,7 +170,7 @@ def test_gyroscopes_that_are_not_level_with_the_vehicle_put_nothing_right() -> N
     """A board that is screwed on at 1.5 degrees, and an attitude that has it taken out; the plane circles."""
     board = exp_so3(np.radians([1.2, 0.9, 0.0]))
     telemetry = Telemetry()
-    righted = Righted(telemetry)
+    righted = AhrsCorrectionMonitor(telemetry)
     for i in range(40 * HZ):
         t = i / HZ
         telemetry.add(
@@ -210,7 +217,7 @@ def test_who_did_not_hear_the_gyroscopes_believes_what_is_said() -> None:
 
 
 def test_an_autopilot_that_was_told_nothing_may_be_off_for_long() -> None:
-    righted = Righted(flew(1.0, lambda t: 0.0))
+    righted = AhrsCorrectionMonitor(flew(1.0, lambda t: 0.0))
 
     def off_rad(t_s: float, sigma_mps: float) -> float:
         attitude = righted.look(round(t_s * S), SIGMA_RAD, YAW_SIGMA_RAD)
@@ -229,7 +236,7 @@ def test_an_autopilot_that_was_told_nothing_may_be_off_for_long() -> None:
 def test_who_was_killed_told_it_nothing() -> None:
     back_s = 7.0
     for told_s, off_rad in ((back_s - 5.0, UNAIDED_RAD), (back_s - 1.0, 0.0)):
-        righted = Righted(flew(1.0, lambda t: 0.0), round(told_s * S))
+        righted = AhrsCorrectionMonitor(flew(1.0, lambda t: 0.0), round(told_s * S))
         assert righted.look(round(back_s * S), SIGMA_RAD, YAW_SIGMA_RAD).righted_rad == pytest.approx(off_rad)
 
 

@@ -8,7 +8,13 @@ from simulated_flight import CAMERA, ORIGIN, Flight, Listener, cov_of, error_m
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
-from terrafix.estimator.factors import BAROMETER_SCALE, BIAS_SIZE, HEIGHT, SCALE, attitude_and_height_residual
+from terrafix.estimator.factors.custom_factors import (
+    BAROMETER_SCALE,
+    BIAS_SIZE,
+    HEIGHT,
+    SCALE,
+    attitude_and_height_residual,
+)
 from terrafix.messages import MapMatch, Message, NavEstimate, Odometry
 
 MAPPED, FRAMES = 90, 170  # it climbs, sinks, and climbs again in the dark

@@ -9,8 +9,7 @@ from simulated_flight import FRAME_S, ORIGIN, PLACE, Flight, Listener, error_m, 
 
 from terrafix.core.codec import decode, decode_json, encode, encode_json
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.resume import Keeper, kept
-from terrafix.estimator.whole import Storyteller
+from terrafix.estimator.prior import CheckpointWriter, load_checkpoint
 from terrafix.messages import (
     MapMatch,
     MeasurementVerdict,
@@ -22,6 +21,7 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
+from terrafix_tools.finalise.flight_graph import FlightReplayer
 
 NOBODY_SAID_M = 4000.0
 UNKNOWN = msgspec.structs.replace(ORIGIN, start_sigma_m=NOBODY_SAID_M)
@@ -155,8 +155,8 @@ def test_a_flight_from_there_is_a_flight() -> None:
 
 
 def killed(folder: Path) -> Path:
-    file = folder / "estimator.kept"
-    keeper = Keeper(file)
+    file = folder / "estimator.checkpoint"
+    keeper = CheckpointWriter(file)
     for message in (said_at(TOLD_AT), *stood(start=said_at(TOLD_AT)).said):
         keeper.heard(message)
     return file
@@ -166,7 +166,7 @@ def test_an_estimator_that_is_started_in_its_place_knows_it(tmp_path: Path) -> N
     """Where it was and how high the ground is there; also after a second time, though it is said once."""
     file = killed(tmp_path)
     for _ in range(2):
-        last = kept(file)
+        last = load_checkpoint(file)
         assert last is not None
         run = Listener()
         run.node = EstimatorNode(0, last)
@@ -175,7 +175,7 @@ def test_an_estimator_that_is_started_in_its_place_knows_it(tmp_path: Path) -> N
         said = run.estimate(11)
         assert at_m(said) == pytest.approx(AT_M, abs=1.0) and sigma_m(said) < 60.0
         assert said.alt_amsl_m == pytest.approx(GROUND_M + 0.4, abs=1.0)
-        keeper = Keeper(file)
+        keeper = CheckpointWriter(file)
         for message in run.said:
             keeper.heard(message)
     run.hear([said_at(12, 0.0, 0.0), *standing(12)])
@@ -185,18 +185,18 @@ def test_an_estimator_that_is_started_in_its_place_knows_it(tmp_path: Path) -> N
 
 
 def test_one_that_was_on_the_map_goes_on_from_there(tmp_path: Path) -> None:
-    flight, file = Flight(20, seed=2), tmp_path / "estimator.kept"
-    keeper = Keeper(file)
+    flight, file = Flight(20, seed=2), tmp_path / "estimator.checkpoint"
+    keeper = CheckpointWriter(file)
     for message in Listener().fly(flight, 0, 20).said:
         keeper.heard(message)
     run = Listener()
-    run.node = EstimatorNode(0, kept(file))
+    run.node = EstimatorNode(0, load_checkpoint(file))
     run.hear([UNKNOWN, said_at(20), *standing(20)])
     assert np.linalg.norm(at_m(run.estimate(20)) - flight.p_m[19, :2]) < 30.0
 
 
 def test_after_landing_the_flight_begins_there_too() -> None:
-    storyteller = Storyteller()
+    storyteller = FlightReplayer()
     for message in (UNKNOWN, *standing(0), *standing(1), said_at(2), *standing(2), *standing(3)):
         storyteller.on(message)
     before, after = storyteller.flights

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C
 
-from terrafix.estimator.factors import BIAS_SIZE, HEIGHT, LENS
-from terrafix.estimator.structure import MIN_TRIPLES, Structure, Trio, structure_factor, structure_of
+from terrafix.estimator.factors.custom_factors import BIAS_SIZE, HEIGHT, LENS
+from terrafix.estimator.factors.three_view import (
+    MIN_TRIPLES,
+    ThreeViewConstraint,
+    ThreeViewPose,
+    three_view_constraint,
+    three_view_factor,
+)
 
 DOWN = gtsam.Rot3(np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]))
 HEIGHT_M, SIGMA, FOCAL_SIGMA = 100.0, 5e-4, 0.01
@@ -39,12 +45,12 @@ class Flown:
         seen = seen * (1.0 + lens * np.sum(seen**2, axis=2, keepdims=True))
         self.triples = seen.reshape(-1, 6) + SIGMA * rng.normal(size=(len(seen), 6))
 
-    def guess(self, off: float = 1.0) -> Trio:
+    def guess(self, off: float = 1.0) -> ThreeViewPose:
         believed = [
             pose.retract(off * np.concatenate([self.rng.normal(0, 0.005, 3), self.rng.normal(0, 0.5, 3)]))
             for pose in self.poses
         ]
-        return Trio(believed[1].between(believed[0]), believed[1].between(believed[2]), HEIGHT_M, 0.0, 0.0)
+        return ThreeViewPose(believed[1].between(believed[0]), believed[1].between(believed[2]), HEIGHT_M, 0.0, 0.0)
 
     def values(self, scale: float = 1.0, lens: float = 0.0) -> gtsam.Values:
         values = gtsam.Values()
@@ -60,8 +66,8 @@ def length(pose: gtsam.Pose3) -> float:
     return float(np.linalg.norm(pose.translation()))
 
 
-def seen_of(flown: Flown, guess: Trio | None = None) -> Structure:
-    seen = structure_of(flown.triples, SIGMA, guess or flown.guess(), FOCAL_SIGMA)
+def seen_of(flown: Flown, guess: ThreeViewPose | None = None) -> ThreeViewConstraint:
+    seen = three_view_constraint(flown.triples, SIGMA, guess or flown.guess(), FOCAL_SIGMA)
     assert seen is not None
     return seen
 
@@ -81,7 +87,7 @@ def test_what_it_claims_is_no_less_than_it_errs_by() -> None:
     for seed in range(40):
         flown = Flown(seed)
         seen = seen_of(flown)
-        error = structure_factor(NODES, seen, rises=False).unwhitenedError(flown.values())
+        error = three_view_factor(NODES, seen, rises=False).unwhitenedError(flown.values())
         squares, rows = squares + float(error @ error), rows + len(error)
     assert 0.02 < squares / rows < 0.5  # its points count once in three, and as no more than sixteen
 
@@ -89,7 +95,7 @@ def test_what_it_claims_is_no_less_than_it_errs_by() -> None:
 def test_it_says_nothing_of_how_long_all_of_it_is() -> None:
     flown = Flown(3)
     seen = seen_of(flown)
-    factor = structure_factor(NODES, seen, rises=False)
+    factor = three_view_factor(NODES, seen, rises=False)
     same, longer = (factor.unwhitenedError(flown.values(scale)) for scale in (1.0, 1.3))
     assert longer == pytest.approx(same, abs=0.02 * float(np.linalg.norm(same)) + 1e-6)
     assert seen.rows.shape[0] <= 12
@@ -97,7 +103,7 @@ def test_it_says_nothing_of_how_long_all_of_it_is() -> None:
 
 def test_a_lens_is_learnt_from_it() -> None:
     flown = Flown(4, lens=-0.03)
-    factor = structure_factor(NODES, seen_of(flown, flown.guess(0.2)), rises=False)
+    factor = three_view_factor(NODES, seen_of(flown, flown.guess(0.2)), rises=False)
     square = {lens: float(np.sum(factor.unwhitenedError(flown.values(lens=lens)) ** 2)) for lens in (0.0, -0.03, -0.06)}
     assert square[-0.03] < 0.5 * min(square[0.0], square[-0.06])
 
@@ -105,30 +111,30 @@ def test_a_lens_is_learnt_from_it() -> None:
 def test_ways_that_are_too_short_or_points_that_are_too_few_tell_nothing() -> None:
     flown = Flown(5)
     guess = flown.guess()
-    assert structure_of(flown.triples[: MIN_TRIPLES - 1], SIGMA, guess, FOCAL_SIGMA) is None
+    assert three_view_constraint(flown.triples[: MIN_TRIPLES - 1], SIGMA, guess, FOCAL_SIGMA) is None
     short = replace(guess, last=gtsam.Pose3(guess.last.rotation(), 0.05 * guess.last.translation()))
-    assert structure_of(flown.triples, SIGMA, short, FOCAL_SIGMA) is None
+    assert three_view_constraint(flown.triples, SIGMA, short, FOCAL_SIGMA) is None
 
 
 def test_points_that_are_not_the_same_tell_nothing() -> None:
     flown = Flown(6)
     mixed = flown.triples.copy()
     mixed[:, 4:] = mixed[::-1, 4:]
-    assert structure_of(mixed, SIGMA, flown.guess(), FOCAL_SIGMA) is None
+    assert three_view_constraint(mixed, SIGMA, flown.guess(), FOCAL_SIGMA) is None
 
 
 def test_what_ends_far_from_all_that_the_pairs_say_is_not_believed() -> None:
     flown = Flown(7)
     guess = flown.guess(0.0)
     far = replace(guess, last=guess.last.compose(gtsam.Pose3(gtsam.Rot3.Rz(0.2), np.zeros(3))))
-    assert structure_of(flown.triples, SIGMA, guess, FOCAL_SIGMA) is not None
-    assert structure_of(flown.triples, SIGMA, far, FOCAL_SIGMA) is None
+    assert three_view_constraint(flown.triples, SIGMA, guess, FOCAL_SIGMA) is not None
+    assert three_view_constraint(flown.triples, SIGMA, far, FOCAL_SIGMA) is None
 
 
 @pytest.mark.parametrize("rises", [False, True])
 def test_the_jacobians_are_the_differences(rises: bool) -> None:
     flown = Flown(8)
-    factor = structure_factor(NODES, seen_of(flown, flown.guess(0.0)), rises=rises)
+    factor = three_view_factor(NODES, seen_of(flown, flown.guess(0.0)), rises=rises)
     values = flown.values()
     if rises:
         for i in range(3):

@@ -9,7 +9,7 @@ from simulated_flight import ORIGIN, Flight, Listener, blind, cov_of, t_ns
 
 from terrafix.core.geodesy import yaw_of
 from terrafix.estimator.integrity.time_offset import GRID_S, PRIOR_S, SLEW, TimeOffset, Turn
-from terrafix.estimator.telemetry import Telemetry
+from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Odometry, Prediction, VehicleState
 
 FRAME_S, TELEMETRY_S = 0.5, 0.1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated_flight import ORIGIN, Flight, Listener, cov_of, error_m
 
-from terrafix.estimator.told import REPEATED, SIGMAS, Told
+from terrafix.estimator.integrity.innovation_gate import REPEATED, SIGMAS, InnovationGate
 from terrafix.messages import MapMatch, MeasurementVerdict, VehicleState, Verdict
 
 Alter = Callable[[VehicleState], VehicleState]
@@ -84,7 +84,7 @@ def test_first_heights_that_later_ones_contradict_are_forgotten(
 
 
 def test_what_is_repeated_without_a_map_fix_is_believed_in_the_end() -> None:
-    words = Told()
+    words = InnovationGate()
     far_m = 1.01 * SIGMAS * 5.0
     assert [words.refuses(far_m, 5.0, 1.0) for _ in range(REPEATED + 1)] == [True] * REPEATED + [False]
     assert not words.refuses(0.99 * SIGMAS * 5.0, 5.0, 1.0)

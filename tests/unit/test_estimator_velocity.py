@@ -11,21 +11,21 @@ from gtsam.symbol_shorthand import B, C, V
 from inertial_flight import ORIGIN, InertialFlight, flown
 
 from terrafix.core.geodesy import rot_w_b
-from terrafix.estimator.factors import BIAS_SIZE, ROBUST_K, leg_factor
-from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.telemetry import Telemetry
-from terrafix.estimator.velocity import (
+from terrafix.estimator.factors.custom_factors import BIAS_SIZE, ROBUST_K, motion_factor
+from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.estimator.models.motion_model import (
     MANOEUVRE_S,
     STEADY_MPS2,
     V_SIZE,
     WANDERING_SHARE,
-    Felt,
+    WorldAcceleration,
     believed,
     course_memory_s,
-    leg,
+    integrate_motion,
     spread_after,
     unknown_cov,
 )
+from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import (
     CovarianceMode,
     Imu,
@@ -112,7 +112,7 @@ def test_a_batch_is_its_readings_one_by_one() -> None:
 
 def test_a_measured_leg_is_the_integral() -> None:
     felt = told(6.0).felt(S, 3 * S)
-    way = leg(2.0, felt, (0.0, 0.0), 0.0, 20.0, 0.01, same_kind=True)
+    way = integrate_motion(2.0, felt, (0.0, 0.0), 0.0, 20.0, 0.01, same_kind=True)
     start, end = (20.0 * np.array([math.sin(y), math.cos(y), 0.0]) for y in (1.2, 1.6))
     p, v = way.predicted(np.zeros(3), np.concatenate([start, np.zeros(5)]), 0.0)
     assert v[:3] == pytest.approx(end, abs=0.05)
@@ -125,10 +125,10 @@ def test_a_measured_leg_is_the_integral() -> None:
 def test_a_heading_that_reads_too_far_clockwise_is_turned_back() -> None:
     true, read = (told(6.0).felt(S, 3 * S), told(6.0).felt(S, 3 * S))
     assert true is not None and read is not None
-    turned = Felt(read.s_s, read.accel_w_mps2 @ rot_up(0.1), read.yaw_rad + 0.1, read.noise_mps2)
+    turned = WorldAcceleration(read.s_s, read.accel_w_mps2 @ rot_up(0.1), read.yaw_rad + 0.1, read.noise_mps2)
     v = np.array([10.0, 5.0, 0.0, 0.3, -0.2, 0.1, 0.05, -0.03])
-    a = leg(2.0, true, (0.0, 0.0), 0.0, 20.0, 0.01, same_kind=True).predicted(np.zeros(3), v, 0.0)
-    b = leg(2.0, turned, (0.0, 0.0), 0.1, 20.0, 0.01, same_kind=True).predicted(np.zeros(3), v, 0.1)
+    a = integrate_motion(2.0, true, (0.0, 0.0), 0.0, 20.0, 0.01, same_kind=True).predicted(np.zeros(3), v, 0.0)
+    b = integrate_motion(2.0, turned, (0.0, 0.0), 0.1, 20.0, 0.01, same_kind=True).predicted(np.zeros(3), v, 0.1)
     assert a[0] == pytest.approx(b[0]) and a[1] == pytest.approx(b[1])
 
 
@@ -147,8 +147,8 @@ def test_the_covariance_of_a_leg_is_that_of_sampled_motion(measured: bool) -> No
     rng = np.random.default_rng(2)
     t = np.linspace(0.0, dt, steps + 1)
     turn = 0.1 if measured else 0.04
-    felt = Felt(t, np.zeros((steps + 1, 3)), 0.4 + turn * t, 0.1) if measured else None
-    way = leg(dt, felt, (0.4, 0.4 + turn * dt), 0.0, 20.0, 0.02, same_kind=True)
+    felt = WorldAcceleration(t, np.zeros((steps + 1, 3)), 0.4 + turn * t, 0.1) if measured else None
+    way = integrate_motion(dt, felt, (0.4, 0.4 + turn * dt), 0.0, 20.0, 0.02, same_kind=True)
     memory, course = (15.0, 1e6) if measured else (MANOEUVRE_S, course_memory_s(20.0))
     sigma = G * 0.02 * math.sqrt(WANDERING_SHARE) if measured else 1.6  # the rest of the tilt is steady
     h = dt / steps
@@ -172,13 +172,15 @@ def test_a_turn_of_the_heading_may_be_one_of_the_course() -> None:
     radius = speed * dt / turn
     off = np.array([radius, radius - speed * dt])  # east, north, from where it would be straight on; it flew north
     spread = [
-        spread_after(leg(dt, None, yaws, 0.0, speed, 0.02, same_kind=True), 0.1 * np.eye(V_SIZE))[:2, :2]
+        spread_after(integrate_motion(dt, None, yaws, 0.0, speed, 0.02, same_kind=True), 0.1 * np.eye(V_SIZE))[:2, :2]
         for yaws in ((0.5 * math.pi, 0.5 * math.pi), (0.5 * math.pi, 0.5 * math.pi - turn))
     ]
     straight, turned = (float(off @ np.linalg.solve(cov, off)) for cov in spread)
     assert turned < 5.99 < 10.0 < straight
     wander = math.radians(4.0)  # of a compass: no reason to doubt a course
-    as_before = spread_after(leg(dt, None, (0.0, wander), 0.0, speed, 0.02, same_kind=True), 0.1 * np.eye(V_SIZE))
+    as_before = spread_after(
+        integrate_motion(dt, None, (0.0, wander), 0.0, speed, 0.02, same_kind=True), 0.1 * np.eye(V_SIZE)
+    )
     assert np.allclose(np.diag(as_before[:2, :2]), np.diag(spread[0]), rtol=0.01)
 
 
@@ -188,7 +190,9 @@ def test_a_board_that_is_not_level_leads_astray_by_the_square_of_the_time_until_
     cov = np.zeros((V_SIZE, V_SIZE))
     cov[6:, 6:] = unknown_cov()[6:, 6:]
     t = np.linspace(0.0, 1.0, 50)
-    way = leg(1.0, Felt(t, np.zeros((50, 3)), np.zeros(50), 0.0), (0.0, 0.0), 0.0, 20.0, 0.0, same_kind=True)
+    way = integrate_motion(
+        1.0, WorldAcceleration(t, np.zeros((50, 3)), np.zeros(50), 0.0), (0.0, 0.0), 0.0, 20.0, 0.0, same_kind=True
+    )
     place, total = np.zeros((3, 3)), np.zeros((11, 11))
     total[3:, 3:] = cov
     for _ in range(60):
@@ -206,7 +210,7 @@ def test_a_board_that_is_not_level_leads_astray_by_the_square_of_the_time_until_
 
 
 def test_a_steady_error_does_not_move_who_is_not_led_by_the_imu() -> None:
-    way = leg(2.0, None, (0.3, 0.3), 0.0, 20.0, 0.01, same_kind=True)
+    way = integrate_motion(2.0, None, (0.3, 0.3), 0.0, 20.0, 0.01, same_kind=True)
     assert not way.way_by_accel[:, 3:].any() and not way.gain_by_accel[:, 3:].any()
     assert way.lasting[3:] == pytest.approx(math.exp(-2.0 / 600.0))  # it is still there when readings come again
 
@@ -214,7 +218,7 @@ def test_a_steady_error_does_not_move_who_is_not_led_by_the_imu() -> None:
 @pytest.mark.parametrize("speed_mps", [5.0, 12.0, 25.0])
 def test_a_drone_out_of_sight_keeps_its_speed_and_loses_its_course(speed_mps: float) -> None:
     """The covariance of velocity, stationary, is that of the speed in an unknown direction."""
-    way = leg(1000.0, None, (0.0, 0.0), 0.0, speed_mps, 0.0, same_kind=True)
+    way = integrate_motion(1000.0, None, (0.0, 0.0), 0.0, speed_mps, 0.0, same_kind=True)
     assert way.keep < 1e-6
     assert np.sqrt(way.cov[3, 3] + way.cov[4, 4]) == pytest.approx(speed_mps, rel=0.02)
     assert course_memory_s(5.0) < course_memory_s(12.0) < course_memory_s(25.0) < 40.0
@@ -224,14 +228,14 @@ def test_a_drone_out_of_sight_keeps_its_speed_and_loses_its_course(speed_mps: fl
 @pytest.mark.parametrize("above", [False, True])
 def test_the_factor_knows_its_own_derivatives(measured: bool, above: bool) -> None:
     felt = told(6.0).felt(S, 2 * S) if measured else None
-    way = leg(1.0, felt, (1.2, 1.4), 0.05, 20.0, 0.01, same_kind=True)
+    way = integrate_motion(1.0, felt, (1.2, 1.4), 0.05, 20.0, 0.01, same_kind=True)
     way = replace(way.above(90.0, 6.0), lifted=True) if above else way
     values = gtsam.Values()
     for node, (yaw, at) in enumerate(((1.2, (0.0, 0.0, 100.0)), (1.4, (18.0, 6.0, 101.0)))):
         values.insert(C(node), gtsam.Pose3(gtsam.Rot3(rot_w_b(yaw, 0.1, 0.2)), np.array(at)))
         values.insert(V(node), np.array([18.0, 7.0, 0.5, 0.1, -0.2, 0.05, 0.03, -0.04]))
         values.insert(B(node), np.array([0.01, 0.02, 0.05, 1.0, 0.005]))
-    factor = leg_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), way)
+    factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), way)
     whitened = np.linalg.inv(np.linalg.cholesky(way.cov))
     analytic, _ = factor.linearize(values).jacobian()
     numeric = []
@@ -253,14 +257,14 @@ def test_a_leg_that_nobody_felt_says_nothing_of_the_height() -> None:
     ground_m, errors = 40.0, {}
     for measured in (False, True):
         felt = told(6.0).felt(S, 2 * S) if measured else None
-        way = leg(1.0, felt, (1.2, 1.4), 0.0, 20.0, 0.01, same_kind=True).above(100.0, ground_m)
+        way = integrate_motion(1.0, felt, (1.2, 1.4), 0.0, 20.0, 0.01, same_kind=True).above(100.0, ground_m)
         for scale in (1.0, 0.5):
             values = gtsam.Values()
             for node, at in enumerate(((0.0, 0.0, 98.0), (15.0, 6.0, 100.0))):
                 values.insert(C(node), gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, ground_m]) + scale * np.array(at)))
                 values.insert(V(node), np.concatenate([scale * np.array([18.0, 7.0, 0.5]), np.zeros(V_SIZE - 3)]))
             values.insert(B(1), np.zeros(BIAS_SIZE))
-            errors[measured, scale] = leg_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), way).error(values)
+            errors[measured, scale] = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), way).error(values)
     assert errors[False, 0.5] == pytest.approx(errors[False, 1.0], rel=1e-9)
     assert errors[True, 0.5] != pytest.approx(errors[True, 1.0], rel=0.01)
 
@@ -273,7 +277,7 @@ def test_a_leg_that_nobody_felt_gives_way_to_what_is_seen(measured: bool, above:
     """Ten sigmas off: half of a hundred if it was felt, or is all that is told; what Huber's tail says if a camera saw
     the way."""
     felt = told(6.0).felt(S, 2 * S) if measured else None
-    way = leg(1.0, felt, (1.2, 1.4), 0.0, 20.0, 0.01, same_kind=True)
+    way = integrate_motion(1.0, felt, (1.2, 1.4), 0.0, 20.0, 0.01, same_kind=True)
     v0 = np.array([18.0, 7.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     p1, v1 = way.predicted(np.zeros(3), v0, 0.0)
     sigmas = np.linalg.cholesky(way.cov)
@@ -286,13 +290,13 @@ def test_a_leg_that_nobody_felt_gives_way_to_what_is_seen(measured: bool, above:
     values.insert(B(1), np.zeros(BIAS_SIZE))
     if above:
         way = way.above(100.0, -100.0)
-    factor = leg_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), way)
+    factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), way)
     assert factor.error(values) == pytest.approx(cost)
 
 
 def test_odometry_tells_the_velocity_at_the_end_of_a_leg() -> None:
     """Half of what the way seen says of it, where leg and odometry are known alike."""
-    way = leg(1.0, None, (1.2, 1.2), 0.0, 20.0, 0.0, same_kind=True)
+    way = integrate_motion(1.0, None, (1.2, 1.2), 0.0, 20.0, 0.0, same_kind=True)
     spread = spread_after(way, unknown_cov())
     off_m = np.array([3.0, -2.0, 0.5])
     _, left, gained = believed(way, off_m, spread, spread[:3, :3])

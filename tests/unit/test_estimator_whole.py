@@ -7,9 +7,9 @@ from simulated_flight import ORIGIN, Flight, Listener, error_m
 from told_flight import blind_between, errors, nees, shifted, told, unmatched
 
 from terrafix.core.geodesy import local_rotation_up
-from terrafix.estimator.smoothing import smooth
-from terrafix.estimator.whole import Storyteller
 from terrafix.messages import MapMatch, Message, Verdict
+from terrafix_tools.finalise.batch_smoother import smooth
+from terrafix_tools.finalise.flight_graph import FlightReplayer
 
 FAR_M = (350.0, -200.0)
 
@@ -160,7 +160,7 @@ def test_matches_at_the_end_that_contradict_the_rest_leave_both_places_open() ->
 
 
 def test_a_record_of_two_flights_is_two_flights() -> None:
-    storyteller, flight = Storyteller(), Flight(12, seed=8)
+    storyteller, flight = FlightReplayer(), Flight(12, seed=8)
     for said in (ORIGIN, *flight.messages(0), *flight.messages(1)):
         storyteller.on(said)
     storyteller.on(ORIGIN)  # a new file of the record repeats it

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import zmq
 
-from terrafix.core import rundir
-from terrafix.core.bus import Publisher, Subscriber
 from terrafix.core.errors import LinkError, UsageError
-from terrafix.core.rundir import OwnedRunDir, RunDir, living
 from terrafix.messages import HintVerdict, PositionHint, Verdict
 from terrafix.processes import OPERATOR
+from terrafix.runtime import run_dir
+from terrafix.runtime.bus import Publisher, Subscriber
+from terrafix.runtime.run_dir import OwnedRunDir, RunDir, living
 from terrafix_tools.hint import send
 from terrafix_tools.hint.send import HEARERS, hint
 
@@ -61,7 +61,7 @@ class Flying:
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunDir]:
-    monkeypatch.setattr(rundir, "SHM", tmp_path)
+    monkeypatch.setattr(run_dir, "SHM", tmp_path)
     owned = OwnedRunDir()
     yield owned.run_dir
     owned.remove()
@@ -94,7 +94,7 @@ def test_processes_that_do_not_listen_yet_are_said(run: RunDir, monkeypatch: pyt
 
 
 def test_nobody_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rundir, "SHM", tmp_path)
+    monkeypatch.setattr(run_dir, "SHM", tmp_path)
     (tmp_path / "terrafix-dead").mkdir()
     (tmp_path / "terrafix-dead" / "lock").touch()
     with pytest.raises(LinkError, match="no Terrafix flies on this computer"):

@@ -8,10 +8,10 @@ import pytest
 from link_rig import MS, S
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.core.imu import boot_ns, readings_of
-from terrafix.core.tlog import read_imu, record
-from terrafix.link.telemetry import Telemetry
-from terrafix.link.timesync import TimeSync
+from terrafix.core.mavlink.imu import boot_ns, readings_of
+from terrafix.core.mavlink.tlog import read_imu, record
+from terrafix.link.autopilot.telemetry import Telemetry
+from terrafix.link.mavlink.timesync import TimeSync
 from terrafix.messages import Imu
 
 G = 9.80665

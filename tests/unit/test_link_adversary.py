@@ -11,8 +11,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.link.carry import offset
 from terrafix.link.edge import open_edge
+from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.node import LinkNode
 from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer

@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.link.announce import CALM_NS, LONGEST_NS, Announcer
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.node import LinkNode
+from terrafix.link.pilot_text.debounce import CALM_NS, LONGEST_NS, Debounce
 
 SCREEN = 50  # characters of STATUSTEXT
 SENTENCES = [  # everything that Terrafix can say to a pilot; a new text belongs here
@@ -117,7 +117,7 @@ def test_warnings_of_the_ladder_do_not_wait() -> None:
 def test_the_last_word_is_always_true() -> None:
     draw = random.Random(1)
     for _ in range(50):
-        announcer, told, now_ns, state = Announcer[bool](), None, 0, False
+        announcer, told, now_ns, state = Debounce[bool](), None, 0, False
         for _ in range(200):
             now_ns += draw.randint(1, 20) * S
             state = draw.random() < 0.5
@@ -126,14 +126,14 @@ def test_the_last_word_is_always_true() -> None:
 
 
 def test_calm_makes_the_first_word_quick_again() -> None:
-    announcer = Announcer[int]()
+    announcer = Debounce[int]()
     assert [announcer.due(i, i * 6 * S) for i in range(4)] == [True, True, False, True]
     assert announcer.due(9, 18 * S + CALM_NS)
     assert announcer.due(8, 18 * S + CALM_NS + 5 * S)
 
 
 def test_that_it_is_well_again_is_told_after_five_seconds_whatever_was_said_before() -> None:
-    announcer, now_ns = Announcer[int](), 0
+    announcer, now_ns = Debounce[int](), 0
     announcer.told = 0
     for rung in (1, 2, 3, 1, 2, 3):
         now_ns += 15 * S

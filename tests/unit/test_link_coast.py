@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
 from terrafix.core.geodesy import LocalFrame
-from terrafix.link.coast import Filter, LastFix, _moved
+from terrafix.link.autopilot.checkpoint import CheckpointWriter
+from terrafix.link.autopilot.ekf_dead_reckoning import Filter, LastFix, _moved
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.kept import AutopilotKeeper
 from terrafix.messages import Coasted, GpsInput, Message
 
 S, MS = 1_000_000_000, 1_000_000
@@ -85,9 +85,9 @@ class Autopilot:
     def restart(self) -> None:
         self.wire = MemoryWire()
         config = msgspec.structs.replace(LinkSection(), gps_id=GPS_ID)
-        self.edge = MavlinkEdge(config, self.wire, lambda: 0, keeper=AutopilotKeeper(self._kept))
+        self.edge = MavlinkEdge(config, self.wire, lambda: 0, keeper=CheckpointWriter(self._kept))
 
-    def says(self, t_s: float, *messages: Any) -> list[Message]:
+    def sends(self, t_s: float, *messages: Any) -> list[Message]:
         self.wire.arrive(*(packed(message, self._mav) for message in messages))
         return list(self.edge.poll(round(t_s * S)))
 
@@ -96,10 +96,10 @@ class Autopilot:
         armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
         plane, ardupilot = mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
         beat = mavlink.MAVLink_heartbeat_message(plane, ardupilot, armed, 0, mavlink.MAV_STATE_ACTIVE, 3)
-        self.says(0.0, beat, receiver(receiver_fix), status())
+        self.sends(0.0, beat, receiver(receiver_fix), status())
         for tenth in range(round(KILLED_S * 10) + 1):
             if tenth % 2:
-                self.says(0.1 * tenth - 0.04, belief(0.1 * tenth - 0.04))
+                self.sends(0.1 * tenth - 0.04, belief(0.1 * tenth - 0.04))
             self.edge.heard(fix(0.1 * tenth))
 
 
@@ -109,14 +109,14 @@ def coasted(said: Iterable[Message]) -> list[Coasted]:
 
 @pytest.fixture
 def autopilot(tmp_path: Path) -> Autopilot:
-    return Autopilot(tmp_path / "link.kept")
+    return Autopilot(tmp_path / "link.checkpoint")
 
 
 def test_who_is_started_again_says_how_the_filter_moved(autopilot: Autopilot) -> None:
     autopilot.is_served()
     autopilot.restart()
-    assert not coasted(autopilot.says(BACK_S - 0.2, belief(BACK_S - 0.2)))  # what led it is not known yet
-    (said,) = coasted(autopilot.says(BACK_S, status(), receiver(1), belief(BACK_S)))
+    assert not coasted(autopilot.sends(BACK_S - 0.2, belief(BACK_S - 0.2)))  # what led it is not known yet
+    (said,) = coasted(autopilot.sends(BACK_S, status(), receiver(1), belief(BACK_S)))
     since_s = BACK_S - said.coast_s
     assert KILLED_S - 0.3 < since_s <= KILLED_S and said.t_ns == round(BACK_S * S)
     # Our own position and velocity, at the time of the filter's words ...
@@ -133,10 +133,10 @@ def test_who_is_started_again_says_how_the_filter_moved(autopilot: Autopilot) ->
 def test_it_asks_for_what_it_would_have_to_wait_for(autopilot: Autopilot) -> None:
     autopilot.is_served()
     autopilot.restart()
-    autopilot.says(BACK_S, belief(BACK_S))
+    autopilot.sends(BACK_S, belief(BACK_S))
     asked = {int(x.param1) for x in autopilot.wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_REQUEST_MESSAGE}
     assert asked == {193, 24, 124}  # EKF_STATUS_REPORT, GPS_RAW_INT, GPS2_RAW
-    autopilot.says(BACK_S + 0.5, status(), receiver(1))
+    autopilot.sends(BACK_S + 0.5, status(), receiver(1))
     assert not any(x.command == mavlink.MAV_CMD_REQUEST_MESSAGE for x in autopilot.wire.take("COMMAND_LONG"))
 
 
@@ -144,36 +144,36 @@ def test_it_asks_for_what_it_would_have_to_wait_for(autopilot: Autopilot) -> Non
 def test_not_while_a_receiver_may_lead_it_astray(autopilot: Autopilot, before: int, after: int) -> None:
     autopilot.is_served(receiver_fix=before)
     autopilot.restart()
-    assert not coasted(autopilot.says(BACK_S, status(), receiver(after), belief(BACK_S)))
-    assert not coasted(autopilot.says(BACK_S + 0.2, status(), receiver(1), belief(BACK_S + 0.2)))
+    assert not coasted(autopilot.sends(BACK_S, status(), receiver(after), belief(BACK_S)))
+    assert not coasted(autopilot.sends(BACK_S + 0.2, status(), receiver(1), belief(BACK_S + 0.2)))
 
 
 def test_not_before_the_receiver_that_it_had_was_heard(autopilot: Autopilot) -> None:
     autopilot.is_served()
     autopilot.restart()
-    assert not coasted(autopilot.says(BACK_S, status(), belief(BACK_S)))
-    assert coasted(autopilot.says(BACK_S + 0.2, receiver(1), belief(BACK_S + 0.2)))
+    assert not coasted(autopilot.sends(BACK_S, status(), belief(BACK_S)))
+    assert coasted(autopilot.sends(BACK_S + 0.2, receiver(1), belief(BACK_S + 0.2)))
 
 
 @pytest.mark.parametrize("flags", [mavlink.EKF_ATTITUDE, MOVES | mavlink.EKF_CONST_POS_MODE])
 def test_not_of_a_filter_that_has_lost_its_velocity(autopilot: Autopilot, flags: int) -> None:
     autopilot.is_served()
     autopilot.restart()
-    assert not coasted(autopilot.says(BACK_S, status(flags), receiver(1), belief(BACK_S)))
+    assert not coasted(autopilot.sends(BACK_S, status(flags), receiver(1), belief(BACK_S)))
 
 
 def test_not_of_another_boot_nor_after_more_than_a_minute(autopilot: Autopilot) -> None:
     autopilot.is_served()
     autopilot.restart()
-    assert not coasted(autopilot.says(BACK_S, status(), receiver(1), belief(BACK_S, boot_s=1.0)))
-    assert not coasted(autopilot.says(80.0, status(), receiver(1), belief(80.0)))
+    assert not coasted(autopilot.sends(BACK_S, status(), receiver(1), belief(BACK_S, boot_s=1.0)))
+    assert not coasted(autopilot.sends(80.0, status(), receiver(1), belief(80.0)))
 
 
 def test_not_while_it_has_our_own_fix(autopilot: Autopilot) -> None:
     autopilot.is_served()
-    assert not coasted(autopilot.says(KILLED_S + 0.1, belief(KILLED_S + 0.1)))
+    assert not coasted(autopilot.sends(KILLED_S + 0.1, belief(KILLED_S + 0.1)))
     autopilot.edge.heard(fix(KILLED_S + 0.2, fix_type=1))
-    assert coasted(autopilot.says(KILLED_S + 0.3, status(), receiver(1), belief(KILLED_S + 0.3)))
+    assert coasted(autopilot.sends(KILLED_S + 0.3, status(), receiver(1), belief(KILLED_S + 0.3)))
 
 
 def test_the_wrap_of_the_autopilots_time_is_no_other_boot() -> None:

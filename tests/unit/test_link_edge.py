@@ -22,11 +22,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
-from terrafix.link import gps_input
 from terrafix.link.edge import MavlinkEdge, open_edge
-from terrafix.link.gps_time import week_and_ms
+from terrafix.link.mavlink.transport import UdpOut, open_transport
 from terrafix.link.node import LinkNode
-from terrafix.link.transport import UdpOut, open_transport
+from terrafix.link.output import gps_input
+from terrafix.link.output.gps_time import week_and_ms
 
 pytestmark = pytest.mark.real_time
 

@@ -8,7 +8,7 @@ from link_rig import covariance
 
 from terrafix import messages as m
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
-from terrafix.link.carry import Attitudes, Carried, carry, distance_m, offset
+from terrafix.link.integrity.output_predictor import Attitudes, PredictedState, distance_m, offset, predict_to
 
 MS, S = 1_000_000, 1_000_000_000
 LAT, LON, AMSL = 48.1, 14.3, 400.0
@@ -59,7 +59,7 @@ def heard(until_s: float, *, compass_rad: float = 0.0, lost_s: tuple[float, floa
     return history
 
 
-def carried(age_s: float, history: Attitudes) -> Carried:
+def carried(age_s: float, history: Attitudes) -> PredictedState:
     estimate = m.NavEstimate(
         t_ns=S,
         frame_id=1,
@@ -76,10 +76,10 @@ def carried(age_s: float, history: Attitudes) -> Carried:
         last_anchor_age_ms=0,
         emitted_at_ns=S,
     )
-    return carry(estimate, S + round(age_s * S), history)
+    return predict_to(estimate, S + round(age_s * S), history)
 
 
-def speed_error_mps(found: Carried, age_s: float) -> float:
+def speed_error_mps(found: PredictedState, age_s: float) -> float:
     return float(np.linalg.norm(np.array(found.velocity_enu_mps) - flown(age_s)[0]))
 
 

@@ -133,7 +133,7 @@ def test_the_link_goes_before_others_where_that_is_allowed_and_says_so_where_it_
     """In a process of its own: this one stays as it is. Without the right (a limit of 0) nothing changes."""
     program = (
         "import os, resource, sys, threading\n"
-        "from terrafix.link.priority import first_in_line\n"
+        "from terrafix.link.output.realtime_priority import first_in_line\n"
         "threading.Thread(target=threading.Event().wait, daemon=True).start()\n"  # as the one that writes the log
         "if sys.argv[1] == 'no':\n"
         "    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))\n"

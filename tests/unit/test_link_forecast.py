@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from link_rig import LAT, LON, MS, SPEED_EAST, S, estimate
 
-from terrafix.link.carry import Attitudes, carry, offset
-from terrafix.link.gnss_forecast import LAG_S, OffsetForecast
-from terrafix.link.gnss_judge import DRAG_CHANCE, JUMP_SIGMAS, ReceiverJudge
-from terrafix.link.gnss_scatter import LEAST_SCALE, PRIOR_SAMPLES, Errors, Scatter
+from terrafix.link.gnss.offset_predictor import LAG_S, OffsetForecast
+from terrafix.link.gnss.predictor_noise import LEAST_SCALE, PRIOR_SAMPLES, Errors, Scatter
+from terrafix.link.gnss.spoofing_detector import DRAG_CHANCE, JUMP_SIGMAS, SpoofingDetector
+from terrafix.link.integrity.output_predictor import Attitudes, offset, predict_to
 from terrafix.messages import GnssReading, GnssState
 
 DT_S = 0.2
@@ -131,14 +131,14 @@ def test_after_a_vague_stretch_nobody_is_accused_of_what_was_vague() -> None:
 
 
 def judged(
-    judge: ReceiverJudge, begin_s: float, end_s: float, east_m: float, ours_m: float, step_m: float = 0.0
+    judge: SpoofingDetector, begin_s: float, end_s: float, east_m: float, ours_m: float, step_m: float = 0.0
 ) -> set[GnssState]:
     """What is said of readings at 5 Hz that are ``east_m`` off. Estimates are new with each, ``ours_m`` off, with a
     sigma of 6 m, and have made a step of ``step_m`` lately."""
     said = set()
     for k in range(seconds(begin_s), seconds(end_s)):
         t_ns = round(k * DT_S * S)
-        vision = carry(estimate(t_ns - 50 * MS, sigma_m=6.0, east_m=ours_m), t_ns, Attitudes())
+        vision = predict_to(estimate(t_ns - 50 * MS, sigma_m=6.0, east_m=ours_m), t_ns, Attitudes())
         lat, lon = offset(LAT, LON, SPEED_EAST * t_ns / S + east_m, 0.0)
         place = {"lat_deg": lat, "lon_deg": lon, "horizontal_m": 1.3}
         there = GnssReading(t_ns=t_ns, receiver=0, fix_type=3, speed_mps=SPEED_EAST, satellites=14, **place)
@@ -148,10 +148,10 @@ def judged(
 
 def test_when_it_was_we_who_moved_it_is_learnt_anew() -> None:
     """A map is left for another one: all is 26 m elsewhere from one estimate to the next, within the claims."""
-    judge = ReceiverJudge()
+    judge = SpoofingDetector()
     judged(judge, 0.0, 900.0, 1.0, 0.0)
     moved = judged(judge, 900.0, 910.0, 1.0, 27.0, step_m=27.0) | judged(judge, 910.0, 1000.0, 1.0, 27.0)
     assert moved == {GnssState.TRUSTED}
-    without = ReceiverJudge()
+    without = SpoofingDetector()
     judged(without, 0.0, 900.0, 1.0, 0.0)
     assert GnssState.SPOOFED in judged(without, 900.0, 910.0, 27.0, 0.0)  # the same, and it was not we

@@ -4,7 +4,7 @@ import pytest
 from link_wire import attitude, packed
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.link.framing import Framer
+from terrafix.link.mavlink.framing import Framer
 from terrafix_tools.sim.autopilot.fuzz import fuzz
 from terrafix_tools.sim.autopilot.fuzz_wire import BadWire
 

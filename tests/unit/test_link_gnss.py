@@ -13,12 +13,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.link.carry import offset
+from terrafix.link.autopilot.gnss_receiver import reading_of
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.gnss import reading_of
-from terrafix.link.gnss_watch import BACK_NS
+from terrafix.link.gnss.monitor import BACK_NS
+from terrafix.link.integrity.output_predictor import offset
+from terrafix.link.mavlink.transport import Address
 from terrafix.link.node import LinkNode
-from terrafix.link.transport import Address
 from terrafix.messages import GnssState
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
 from terrafix_tools.sim.judge.flight import Vision, fly

@@ -10,10 +10,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.core.start import SEARCHED_START_M
-from terrafix.link.asking import AGAIN_NS, HINTED_NS, NOT_KNOWN_M, Asking
+from terrafix.core.initial_position import SEARCHED_START_M
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.hints import LEAST_RADIUS_M, RADIUS_M
+from terrafix.link.ground_station.position_prior import LEAST_RADIUS_M, RADIUS_M
+from terrafix.link.ground_station.prior_request import AGAIN_NS, HINTED_NS, NOT_KNOWN_M, PriorRequest
 from terrafix.link.node import LinkNode
 
 LAT, LON = 48.1234567, 11.7654321
@@ -33,9 +33,9 @@ class Side:
         self.edge = MavlinkEdge(LinkSection(), self.wire, lambda: 0)
         self.now_ns = S
         if station:
-            self.hears(GCS)
+            self.receives(GCS)
 
-    def hears(self, *messages: Any, sender: mavlink.MAVLink = STATION) -> list[m.PositionHint]:
+    def receives(self, *messages: Any, sender: mavlink.MAVLink = STATION) -> list[m.PositionHint]:
         self.now_ns += S // 10
         self.wire.arrive(*(packed(x, sender) for x in messages))
         return [x for x in self.edge.poll(self.now_ns) if isinstance(x, m.PositionHint)]
@@ -54,7 +54,7 @@ def external(to: tuple[int, int] = OURS, place: tuple[int, int] = E7, sigma: flo
 
 def test_a_command_to_our_component_is_a_hint_and_is_acknowledged() -> None:
     side = Side()
-    (hint,) = side.hears(external())
+    (hint,) = side.receives(external())
     assert (hint.lat_deg, hint.lon_deg) == pytest.approx((LAT, LON), abs=1e-7)
     # 95 % of a round Gaussian: sqrt(-2 ln 0.05) of its sigma per axis
     assert hint.radius_m == pytest.approx(400.0 * math.sqrt(-2 * math.log(0.05)), rel=1e-4)
@@ -64,7 +64,7 @@ def test_a_command_to_our_component_is_a_hint_and_is_acknowledged() -> None:
 
 def test_the_long_form_of_custom_actions_is_taken_too() -> None:
     command = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
-    (hint,) = Side().hears(mavlink.MAVLink_command_long_message(*OURS, command, 0, 0, 0, 0, 0, LAT, LON, 0))
+    (hint,) = Side().receives(mavlink.MAVLink_command_long_message(*OURS, command, 0, 0, 0, 0, 0, LAT, LON, 0))
     assert (hint.lat_deg, hint.lon_deg) == pytest.approx((LAT, LON), abs=1e-5)  # 32 bits: a metre
     assert hint.radius_m == RADIUS_M
 
@@ -72,7 +72,7 @@ def test_the_long_form_of_custom_actions_is_taken_too() -> None:
 @pytest.mark.parametrize("to", [(1, 1), (2, 197), (1, 191)])
 def test_a_command_to_another_is_not_ours(to: tuple[int, int]) -> None:
     side = Side()
-    assert side.hears(external(to)) == [] and side.answers() == []
+    assert side.receives(external(to)) == [] and side.answers() == []
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_a_command_to_another_is_not_ours(to: tuple[int, int]) -> None:
 )
 def test_what_is_no_position_is_denied_and_said(bad: Any) -> None:
     side = Side()
-    assert side.hears(bad) == []
+    assert side.receives(bad) == []
     said = side.wire.take()
     assert [x.result for x in said if x.get_type() == "COMMAND_ACK"] == [mavlink.MAV_RESULT_DENIED]
     assert ["hint is no position" in x.text for x in said if x.get_type() == "STATUSTEXT"] == [True]
@@ -94,52 +94,52 @@ def test_what_is_no_position_is_denied_and_said(bad: Any) -> None:
 
 @pytest.mark.parametrize("sigma", [0.0, -3.0, math.nan, math.inf])
 def test_an_accuracy_that_says_nothing_is_five_kilometres(sigma: float) -> None:
-    assert Side().hears(external(sigma=sigma))[0].radius_m == RADIUS_M
+    assert Side().receives(external(sigma=sigma))[0].radius_m == RADIUS_M
 
 
 def test_a_hint_is_never_better_than_a_finger_on_a_map() -> None:
-    assert Side().hears(external(sigma=1.0))[0].radius_m == LEAST_RADIUS_M
+    assert Side().receives(external(sigma=1.0))[0].radius_m == LEAST_RADIUS_M
 
 
 def test_other_commands_to_our_component_are_refused_and_those_to_all_are_left_alone() -> None:
     side = Side()
     for component in (197, 0):
-        side.hears(mavlink.MAVLink_command_long_message(1, component, 512, 0, *(0.0,) * 7))
+        side.receives(mavlink.MAVLink_command_long_message(1, component, 512, 0, *(0.0,) * 7))
     assert side.answers() == [(512, mavlink.MAV_RESULT_UNSUPPORTED)]
 
 
 def test_an_origin_set_by_a_ground_station_is_a_hint() -> None:
-    (hint,) = Side().hears(GCS, ORIGIN_HERE)
+    (hint,) = Side().receives(GCS, ORIGIN_HERE)
     assert (hint.lat_deg, hint.lon_deg) == pytest.approx((LAT, LON), abs=1e-7)
     assert hint.radius_m == RADIUS_M
 
 
 def test_an_origin_set_by_a_companion_or_for_another_vehicle_is_none() -> None:
     side = Side(station=False)
-    assert side.hears(ORIGIN_HERE) == []  # nobody said to be a ground station
+    assert side.receives(ORIGIN_HERE) == []  # nobody said to be a ground station
     companion = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
-    assert side.hears(GCS) == [] and side.hears(ORIGIN_HERE, sender=companion) == []
-    assert side.hears(mavlink.MAVLink_set_gps_global_origin_message(2, *E7, 0)) == []
+    assert side.receives(GCS) == [] and side.receives(ORIGIN_HERE, sender=companion) == []
+    assert side.receives(mavlink.MAVLink_set_gps_global_origin_message(2, *E7, 0)) == []
 
 
 def test_a_command_of_one_that_is_no_ground_station_is_denied() -> None:
     side = Side(station=False)
-    assert side.hears(external()) == []
+    assert side.receives(external()) == []
     assert side.answers() == [(mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE, mavlink.MAV_RESULT_DENIED)]
 
 
 def test_an_origin_for_the_autopilot_s_id_is_ours_too() -> None:
     side = Side()
-    side.hears(heartbeat(), sender=mavlink.MAVLink(None, srcSystem=7, srcComponent=1))
-    assert len(side.hears(GCS, mavlink.MAVLink_set_gps_global_origin_message(7, *E7, 0))) == 1
+    side.receives(heartbeat(), sender=mavlink.MAVLink(None, srcSystem=7, srcComponent=1))
+    assert len(side.receives(GCS, mavlink.MAVLink_set_gps_global_origin_message(7, *E7, 0))) == 1
 
 
 def test_the_same_hint_sent_again_is_one_hint_and_two_acknowledgements() -> None:
     side = Side()
-    assert len(side.hears(external(), external())) == 1
+    assert len(side.receives(external(), external())) == 1
     assert len(side.answers()) == 2
     side.now_ns += 4 * S
-    assert len(side.hears(external())) == 1
+    assert len(side.receives(external())) == 1
 
 
 # --- asking ---
@@ -203,7 +203,7 @@ def test_a_vehicle_that_is_not_armed_is_not_lost() -> None:
 
 
 def test_an_estimator_that_has_fallen_silent_is_another_matter() -> None:
-    asking = Asking()
+    asking = PriorRequest()
     for frame in range(4):
         asking.estimate(estimate(frame * S, cov=covariance(1000.0)))
     assert asking.due(4 * S) and not asking.due(4 * S)

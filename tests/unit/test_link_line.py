@@ -12,11 +12,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.link.budget import LEAST_HZ, SHARE_IN, LineBudget
 from terrafix.link.edge import MavlinkEdge, open_edge
+from terrafix.link.mavlink.bandwidth import LEAST_HZ, SHARE_IN, LinkBandwidth
+from terrafix.link.mavlink.message_rates import STREAMS_HZ
+from terrafix.link.mavlink.timesync import TimeSync
 from terrafix.link.node import LinkNode
-from terrafix.link.streams import STREAMS_HZ
-from terrafix.link.timesync import TimeSync
 
 ATTITUDE = mavlink.MAVLINK_MSG_ID_ATTITUDE
 
@@ -43,13 +43,13 @@ def _ones(kind: str, count: int) -> object:
 @pytest.mark.parametrize("signed", [False, True])
 def test_sizes_are_those_on_the_wire(signed: bool) -> None:
     for message_id in STREAMS_HZ:
-        assert LineBudget(57_600, signed=signed).bytes_a_second({message_id: 1.0}) == longest(message_id, signed)
+        assert LinkBandwidth(57_600, signed=signed).bytes_a_second({message_id: 1.0}) == longest(message_id, signed)
 
 
 @pytest.mark.parametrize("signed", [False, True])
 @pytest.mark.parametrize("baud", [38_400, 57_600, 115_200, 921_600])
 def test_rates_fit_the_line_and_stay_useful(baud: int, signed: bool) -> None:
-    budget = LineBudget(baud, signed=signed)
+    budget = LinkBandwidth(baud, signed=signed)
     rates = budget.fitting(STREAMS_HZ)
     assert sum(rate * longest(i, signed) for i, rate in rates.items()) <= SHARE_IN * baud / 10
     assert all(LEAST_HZ.get(i, 1.0) <= rate <= STREAMS_HZ[i] for i, rate in rates.items())
@@ -59,11 +59,11 @@ def test_rates_fit_the_line_and_stay_useful(baud: int, signed: bool) -> None:
 
 
 def test_a_line_that_is_too_slow_is_told_with_what_it_needs() -> None:
-    budget = LineBudget(9600, signed=False)
+    budget = LinkBandwidth(9600, signed=False)
     said = budget.too_slow(budget.fitting(STREAMS_HZ), ("gps_input",), 10.0)
     assert said.startswith("9600 baud is too slow (in needs ")
     assert "out needs" in said
-    assert LineBudget(None, signed=False).too_slow(STREAMS_HZ, ("gps_input",), 10.0) == ""
+    assert LinkBandwidth(None, signed=False).too_slow(STREAMS_HZ, ("gps_input",), 10.0) == ""
 
 
 @pytest.mark.parametrize(("baud", "slower"), [(38_400, True), (57_600, False), (921_600, False)])

@@ -11,10 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_link_gnss import READING_AGE_NS, reading, right, watched
 
 from terrafix import messages as m
-from terrafix.link.carry import Attitudes, apart_m, carry, offset
-from terrafix.link.coast import Coast
-from terrafix.link.kept import ArmedAutopilot, AutopilotKeeper, kept
-from terrafix.link.map_offset import REACH, SLEW_MPS, Batch, MapOffsets, Registration
+from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter, load_checkpoint
+from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder
+from terrafix.link.gnss.map_registration import REACH, SLEW_MPS, Batch, MapOffsets, Registration
+from terrafix.link.integrity.output_predictor import Attitudes, apart_m, offset, predict_to
 from terrafix.link.node import LinkNode
 
 MAP_M = 3.5
@@ -194,7 +194,7 @@ def test_each_layer_of_a_map_has_its_own() -> None:
     for i in range(1200):
         t_ns = i * S // 5
         said = estimate(t_ns - READING_AGE_NS, east_m=OFF_M, **CLAIMS)
-        vision = carry(said, t_ns - READING_AGE_NS, Attitudes())
+        vision = predict_to(said, t_ns - READING_AGE_NS, Attitudes())
         offsets.take(reading(t_ns, (0.0, 0.0)), vision, said, trusted=True)
         offsets.corrected(said, t_ns)
     assert offsets.corrected(said, t_ns)[1][0] > 2.0
@@ -210,17 +210,17 @@ def test_readings_over_two_layers_are_no_batch_of_either() -> None:
         t_ns = i * S // 5
         layer_m = MAP_M if i // 50 % 2 else 2.0  # ten seconds each, a batch takes twenty
         said = estimate(t_ns - READING_AGE_NS, east_m=OFF_M, **(CLAIMS | {"map_sigma_m": layer_m}))
-        vision = carry(said, t_ns - READING_AGE_NS, Attitudes())
+        vision = predict_to(said, t_ns - READING_AGE_NS, Attitudes())
         assert offsets.take(reading(t_ns, (0.0, 0.0)), vision, said, trusted=True) is None
 
 
 def test_the_next_link_goes_on_with_it(tmp_path: Path) -> None:
     heard = flown(learning(), 240.0)
-    keeper = AutopilotKeeper(tmp_path / "link")
+    keeper = CheckpointWriter(tmp_path / "link")
     keeper.heard(ArmedAutopilot(1, 3, 1))
     keeper.learnt(learnt(heard)[-1])
     keeper.flies(None, 0.0)
-    found = kept(tmp_path / "link")
+    found = load_checkpoint(tmp_path / "link")
     assert found is not None
     restarted = learning(found.map_offset)
     assert sent(flown(restarted, 5.0, begin_s=240.0))[0].map_offset_m == pytest.approx(
@@ -230,7 +230,7 @@ def test_the_next_link_goes_on_with_it(tmp_path: Path) -> None:
 
 def test_where_the_estimator_begins_again_is_on_the_map() -> None:
     """Coasted tells it our last fix, and it knows nothing of what was taken out."""
-    coast = Coast(None, lambda boot_ns, _: boot_ns)
+    coast = DeadReckoningRecorder(None, lambda boot_ns, _: boot_ns)
     heard = sent(flown(learning(), 240.0))
     t_ns = heard[-1].t_ns - 50_000_000
     lat, lon = (round(v * 1e7) for v in offset(LAT, LON, SPEED_EAST * t_ns / S, 0.0))

@@ -30,12 +30,18 @@ from terrafix.core.config import Config, LinkSection
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import NodeContext
-from terrafix.link import fix
-from terrafix.link.carry import Attitudes, carry, distance_m, offset, worst_horizontal_variance
+from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.gps_time import WEEK_MS, week_and_ms
-from terrafix.link.kept import ArmedAutopilot, AutopilotKeeper
+from terrafix.link.integrity import fix_type
+from terrafix.link.integrity.output_predictor import (
+    Attitudes,
+    distance_m,
+    offset,
+    predict_to,
+    worst_horizontal_variance,
+)
 from terrafix.link.node import LinkNode, make_node
+from terrafix.link.output.gps_time import WEEK_MS, week_and_ms
 
 
 def nothing(_: int) -> list[m.Message]:
@@ -114,11 +120,11 @@ def test_stale_means_fix_1_then_silence_and_back_at_once() -> None:
     said = fly(LinkNode(10.0), 0, 62 * S, feed)
     last_estimate = 9_500 * MS
     for g in reported(said, S):
-        assert g.fix_type == (3 if g.t_ns <= last_estimate + fix.MAX_AGE_NS or g.t_ns > 60 * S else 1)
+        assert g.fix_type == (3 if g.t_ns <= last_estimate + fix_type.MAX_AGE_NS or g.t_ns > 60 * S else 1)
         assert g.fix_type == 3 or (g.lat_deg == g.lon_deg == 0.0 and "old" in g.reason)
     quiet = [(a.t_ns, b.t_ns) for a, b in pairwise(gps(said)) if b.t_ns - a.t_ns > 200 * MS]
     assert len(quiet) == 1
-    assert quiet[0][0] == pytest.approx(last_estimate + fix.SILENT_AFTER_NS, abs=100 * MS)
+    assert quiet[0][0] == pytest.approx(last_estimate + fix_type.SILENT_AFTER_NS, abs=100 * MS)
     assert quiet[0][1] == pytest.approx(60 * S, abs=400 * MS)
     assert any("silent" in t for t in texts(said))
 
@@ -384,12 +390,14 @@ def test_a_link_that_is_started_again_goes_on_with_the_time_of_before(tmp_path: 
     unix = 1_795_000_000 * S
     first = LinkNode(10.0)
     first.on(m.WallClock(t_ns=50 * S, unix_ns=unix, source="system"))
-    keeper = AutopilotKeeper(tmp_path / "link.kept")
+    keeper = CheckpointWriter(tmp_path / "link.checkpoint")
     keeper.heard(ArmedAutopilot(1, 3, 1))
     edge = MavlinkEdge(LinkSection(), MemoryWire(), lambda: 0, keeper=keeper)
     for sent in gps(fly(first, 100 * S, 101 * S, every(500 * MS, estimate))):
         edge.heard(sent)
-    second = make_node(NodeContext(Config(), MemoryFrameStore(), None, tmp_path, kept=tmp_path / "link.kept"))
+    second = make_node(
+        NodeContext(Config(), MemoryFrameStore(), None, tmp_path, checkpoint=tmp_path / "link.checkpoint")
+    )
     second.on(m.VehicleState(t_ns=102 * S, source="mavlink", armed=True))
     second.on(m.WallClock(t_ns=102 * S, unix_ns=unix - 25 * HOUR_MS * MS, source="system"))
     for sent in gps(fly(second, 102 * S, 103 * S, nothing)):
@@ -436,7 +444,7 @@ def attitudes(yaw_rate: float, roll: float, end_ns: int) -> Attitudes:
 def test_a_banked_turn_is_carried_along_the_arc() -> None:
     bank = math.radians(25.0)
     rate = 9.81 * math.tan(bank) / SPEED_EAST
-    carried = carry(estimate(0), 1 * S, attitudes(rate, bank, 1 * S))
+    carried = predict_to(estimate(0), 1 * S, attitudes(rate, bank, 1 * S))
     radius = SPEED_EAST / rate
     true_lat, true_lon = offset(LAT, LON, radius * math.sin(rate), -radius * (1 - math.cos(rate)))
     straight_lat, straight_lon = offset(LAT, LON, SPEED_EAST, 0.0)
@@ -448,13 +456,13 @@ def test_a_banked_turn_is_carried_along_the_arc() -> None:
 
 @pytest.mark.parametrize(("yaw_rate", "roll"), [(1.0, 0.0), (0.0, 0.4), (0.5, -0.4)])
 def test_yawing_or_leaning_alone_is_not_a_turn(yaw_rate: float, roll: float) -> None:
-    carried = carry(estimate(0), 1 * S, attitudes(yaw_rate, roll, 1 * S))
+    carried = predict_to(estimate(0), 1 * S, attitudes(yaw_rate, roll, 1 * S))
     assert carried.velocity_enu_mps == pytest.approx((SPEED_EAST, 0.0, 0.0))
 
 
 def test_old_attitude_is_no_attitude() -> None:
-    blind = carry(estimate(2 * S), 3 * S, attitudes(0.0, 0.0, 1 * S))
-    seeing = carry(estimate(2 * S), 3 * S, attitudes(0.0, 0.0, 3 * S))
+    blind = predict_to(estimate(2 * S), 3 * S, attitudes(0.0, 0.0, 1 * S))
+    seeing = predict_to(estimate(2 * S), 3 * S, attitudes(0.0, 0.0, 3 * S))
     assert blind.horizontal_sigma_m > seeing.horizontal_sigma_m
 
 

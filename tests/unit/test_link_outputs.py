@@ -20,12 +20,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
-from terrafix.link import global_position, gps_time, local_pose, msp, nmea
-from terrafix.link.carry import apart_m, offset
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.local_pose import Attitude, Place
-from terrafix.link.outputs import Outputs
-from terrafix.link.side_output import open_side_outputs
+from terrafix.link.integrity.output_predictor import apart_m, offset
+from terrafix.link.output import global_position, gps_time, msp, nmea, odometry
+from terrafix.link.output.odometry import Attitude, Place
+from terrafix.link.output.selection import Outputs
+from terrafix.link.output.serial_outputs import open_side_outputs
 from terrafix_tools.sim.autopilot.parameters import Kind
 
 S, MS = 1_000_000_000, 1_000_000
@@ -70,9 +70,9 @@ def ardupilots_error(covariance: list[float], first: int = 0) -> float:
 
 @pytest.mark.parametrize(("sigma", "variance"), [(1.0, 0.577), (5.0, 6.46), (10.0, 18.3)])
 def test_fact_the_cube_root_rule_gives_the_true_sigma(sigma: float, variance: float) -> None:
-    assert local_pose.variance_for_ardupilot(sigma) == pytest.approx(variance, rel=3e-3)
+    assert odometry.variance_for_ardupilot(sigma) == pytest.approx(variance, rel=3e-3)
     gps = msgspec.structs.replace(GPS, horiz_accuracy_m=sigma)
-    for encode in (local_pose.odometry, local_pose.vision_position):
+    for encode in (odometry.odometry, odometry.vision_position):
         said = over_the_wire(encode(gps, ORIGIN, BANKED, ardupilot=True))
         covariance = said.pose_covariance if said.get_type() == "ODOMETRY" else said.covariance
         assert ardupilots_error(covariance) == pytest.approx(sigma, rel=1e-5)
@@ -80,13 +80,13 @@ def test_fact_the_cube_root_rule_gives_the_true_sigma(sigma: float, variance: fl
 
 
 def test_other_firmware_gets_plain_variances() -> None:
-    said = over_the_wire(local_pose.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
+    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
     assert said.pose_covariance[0] == said.pose_covariance[6] == pytest.approx(6.5**2)
     assert said.pose_covariance[11] == pytest.approx(4.5**2)
 
 
 def test_px4_gets_metres_of_its_own_sphere_in_a_frame_that_has_a_north() -> None:
-    said = over_the_wire(local_pose.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
+    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
     assert said.frame_id == mavlink.MAV_FRAME_LOCAL_NED
     # MapProjection::reproject, the way back
     x, y = said.x / 6_371_000.0, said.y / 6_371_000.0
@@ -96,7 +96,7 @@ def test_px4_gets_metres_of_its_own_sphere_in_a_frame_that_has_a_north() -> None
     back = math.degrees(lat), ORIGIN.lon_deg + math.degrees(east)
     assert back == pytest.approx((GPS.lat_deg, GPS.lon_deg), abs=2e-7)
     at_origin = msgspec.structs.replace(GPS, lat_deg=ORIGIN.lat_deg, lon_deg=ORIGIN.lon_deg)
-    assert local_pose.north_east_down(at_origin, ORIGIN, ardupilot=False)[:2] == (0.0, 0.0)
+    assert odometry.north_east_down(at_origin, ORIGIN, ardupilot=False)[:2] == (0.0, 0.0)
 
 
 def body_to_ned(a: Attitude) -> np.ndarray:
@@ -108,7 +108,7 @@ def body_to_ned(a: Attitude) -> np.ndarray:
 
 
 def test_odometry_says_frames_velocity_and_place_as_ardupilot_reads_them() -> None:
-    said = over_the_wire(local_pose.odometry(GPS, ORIGIN, BANKED, ardupilot=True))
+    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=True))
     assert (said.frame_id, said.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
     w, x, y, z = said.q
     turned = np.array(
@@ -133,8 +133,8 @@ def test_odometry_says_frames_velocity_and_place_as_ardupilot_reads_them() -> No
 def test_the_date_line_is_no_wall() -> None:
     gps = msgspec.structs.replace(GPS, lat_deg=0.0, lon_deg=-179.999)
     place = Place(0.0, 179.999, 0.0)
-    assert local_pose.north_east_down(gps, place, ardupilot=True)[:2] == pytest.approx((0.0, 222.6), abs=0.1)
-    assert local_pose.north_east_down(gps, place, ardupilot=False)[:2] == pytest.approx((0.0, 222.4), abs=0.1)
+    assert odometry.north_east_down(gps, place, ardupilot=True)[:2] == pytest.approx((0.0, 222.6), abs=0.1)
+    assert odometry.north_east_down(gps, place, ardupilot=False)[:2] == pytest.approx((0.0, 222.4), abs=0.1)
 
 
 # --- GLOBAL_POSITION_SENSOR and EXTERNAL_POSITION_ESTIMATE ---
@@ -404,7 +404,7 @@ def test_an_external_position_is_of_the_time_that_its_32_bits_state(uptime_days:
 def test_a_position_that_jumped_is_a_reset_in_local_poses() -> None:
     for resets, counter in ((0, 0), (3, 3), (256, 0), (259, 3)):
         gps = msgspec.structs.replace(GPS, resets=resets)
-        for encode in (local_pose.odometry, local_pose.vision_position):
+        for encode in (odometry.odometry, odometry.vision_position):
             assert over_the_wire(encode(gps, ORIGIN, BANKED, ardupilot=True)).reset_counter == counter
 
 

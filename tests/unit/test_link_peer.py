@@ -21,11 +21,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError, SourceError
-from terrafix.link import gps_input
-from terrafix.link.carry import offset
 from terrafix.link.edge import open_edge
+from terrafix.link.integrity.output_predictor import offset
+from terrafix.link.mavlink.message_rates import STREAMS_HZ
 from terrafix.link.node import LinkNode
-from terrafix.link.streams import STREAMS_HZ
+from terrafix.link.output import gps_input
 from terrafix_tools.sim.autopilot.course import PeerState, read_course, write_course
 from terrafix_tools.sim.autopilot.gps import GpsInputDriver, JitterCorrection
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, GPS_INPUT_ALONE, NO_DCM

@@ -9,10 +9,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_core_takeoff_height import NO_FIX
 
 from terrafix.core.config import LinkSection
+from terrafix.link.autopilot.checkpoint import CheckpointWriter
+from terrafix.link.autopilot.pressure_height import FRESH_NS, PressureHeight, isa_height_m
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.kept import AutopilotKeeper
-from terrafix.link.pressure_height import FRESH_NS, PressureHeight, isa_height_m
-from terrafix.link.streams import wanted_of
+from terrafix.link.mavlink.message_rates import wanted_of
 
 S, MS = 1_000_000_000, 1_000_000
 FIELD_HPA = 955.0  # some 500 m above the sea
@@ -41,9 +41,11 @@ class Vehicle:
 
     def restart(self) -> None:
         """Of the link."""
-        self.edge = MavlinkEdge(LinkSection(), self.wire, lambda: 0, keeper=AutopilotKeeper(self.kept))
+        self.edge = MavlinkEdge(LinkSection(), self.wire, lambda: 0, keeper=CheckpointWriter(self.kept))
 
-    def says(self, filter_m: float | None, above_m: float | None, *, armed: bool, seconds: float = 1.0) -> float | None:
+    def sends(
+        self, filter_m: float | None, above_m: float | None, *, armed: bool, seconds: float = 1.0
+    ) -> float | None:
         """-> the height that comes of it, at the end."""
         said: list[Any] = []
         for _ in range(round(seconds * 5)):
@@ -62,32 +64,32 @@ class Vehicle:
 
 def test_a_filter_that_is_led_astray_by_our_velocity_does_not_move_the_height() -> None:
     vehicle = Vehicle()
-    vehicle.says(0.0, 0.0, armed=False, seconds=10.0)
-    assert vehicle.says(50.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    vehicle.sends(0.0, 0.0, armed=False, seconds=10.0)
+    assert vehicle.sends(50.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
     for astray_m in range(1, 20):
-        assert vehicle.says(50.0 + astray_m, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+        assert vehicle.sends(50.0 + astray_m, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
 
 
 def test_without_pressure_it_is_the_height_of_the_filter() -> None:
     vehicle = Vehicle()
-    vehicle.says(0.0, 0.0, armed=False)
-    assert vehicle.says(60.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
-    assert vehicle.says(60.0, None, armed=True, seconds=2.0) == 60.0
-    assert vehicle.says(60.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    vehicle.sends(0.0, 0.0, armed=False)
+    assert vehicle.sends(60.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    assert vehicle.sends(60.0, None, armed=True, seconds=2.0) == 60.0
+    assert vehicle.sends(60.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
 
 
 def test_without_the_filter_it_goes_on_by_pressure() -> None:
     vehicle = Vehicle()
-    vehicle.says(0.0, 0.0, armed=False)
-    vehicle.says(50.0, 50.0, armed=True)
-    assert vehicle.says(None, 60.0, armed=True, seconds=3.0) == pytest.approx(60.0, abs=0.1)
+    vehicle.sends(0.0, 0.0, armed=False)
+    vehicle.sends(50.0, 50.0, armed=True)
+    assert vehicle.sends(None, 60.0, armed=True, seconds=3.0) == pytest.approx(60.0, abs=0.1)
 
 
 def test_on_the_ground_the_zero_follows_the_weather() -> None:
     vehicle = Vehicle()
-    vehicle.says(0.0, 0.0, armed=False)
-    vehicle.says(0.0, 8.0, armed=False, seconds=60.0)  # the pressure has fallen by 1 hPa
-    assert vehicle.says(50.0, 58.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    vehicle.sends(0.0, 0.0, armed=False)
+    vehicle.sends(0.0, 8.0, armed=False, seconds=60.0)  # the pressure has fallen by 1 hPa
+    assert vehicle.sends(50.0, 58.0, armed=True) == pytest.approx(50.0, abs=0.1)
 
 
 def test_one_bad_reading_on_the_ground_does_not_become_the_zero() -> None:
@@ -101,25 +103,25 @@ def test_one_bad_reading_on_the_ground_does_not_become_the_zero() -> None:
 
 def test_a_link_that_is_started_in_the_air_takes_its_zero_from_the_filter_once() -> None:
     vehicle = Vehicle()
-    assert vehicle.says(53.0, 50.0, armed=True) == pytest.approx(53.0, abs=0.1)
-    assert vehicle.says(80.0, 60.0, armed=True) == pytest.approx(63.0, abs=0.1)
+    assert vehicle.sends(53.0, 50.0, armed=True) == pytest.approx(53.0, abs=0.1)
+    assert vehicle.sends(80.0, 60.0, armed=True) == pytest.approx(63.0, abs=0.1)
 
 
 def test_an_autopilot_that_has_rebooted_has_heights_of_its_own() -> None:
     vehicle = Vehicle()
-    vehicle.says(0.0, 0.0, armed=False)
-    assert vehicle.says(50.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    vehicle.sends(0.0, 0.0, armed=False)
+    assert vehicle.sends(50.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
     vehicle.booted_s = vehicle.seconds
-    assert vehicle.says(3.0, 50.0, armed=True, seconds=3.0) == pytest.approx(3.0, abs=0.1)
+    assert vehicle.sends(3.0, 50.0, armed=True, seconds=3.0) == pytest.approx(3.0, abs=0.1)
 
 
 def test_a_link_that_is_started_again_keeps_the_zero_of_the_ground(tmp_path: Path) -> None:
-    vehicle = Vehicle(tmp_path / "link.kept")
-    vehicle.says(0.0, 0.0, armed=False)
-    vehicle.says(55.0, 50.0, armed=True)
+    vehicle = Vehicle(tmp_path / "link.checkpoint")
+    vehicle.sends(0.0, 0.0, armed=False)
+    vehicle.sends(55.0, 50.0, armed=True)
     vehicle.edge.heard(NO_FIX)
     vehicle.restart()
-    assert vehicle.says(55.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    assert vehicle.sends(55.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
 
 
 @pytest.mark.parametrize("armed", [True, None])

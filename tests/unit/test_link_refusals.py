@@ -4,7 +4,7 @@ import pytest
 from link_rig import MS, S
 
 from terrafix import messages as m
-from terrafix.link.refusals import EPISODE_NS, MANY, PILOT_TEXTS, Reason, Refusals
+from terrafix.link.admission.refusals import EPISODE_NS, MANY, PILOT_TEXTS, Reason, Refusals
 
 
 def test_each_reason_is_recorded_at_once_and_then_once_a_second_with_its_count() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from terrafix.link.priority import PRIORITY
+from terrafix.link.output.realtime_priority import PRIORITY
 
 UNIT = Path(__file__).resolve().parents[2] / "systemd" / "terrafix.service"
 

@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import ConfigError
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.framing import Framer
-from terrafix.link.signing import EPOCH_UNIX_NS, Signing, read_key, timestamp
+from terrafix.link.mavlink.framing import Framer
+from terrafix.link.mavlink.signing import EPOCH_UNIX_NS, Signing, read_key, timestamp
 from terrafix.messages import LinkStatus
 
 KEY = bytes(range(32))

@@ -8,9 +8,9 @@ import pytest
 from link_rig import LAT, LON, MS, S, estimate, fly, texts
 
 from terrafix import messages as m
-from terrafix.link.carry import distance_m, offset
-from terrafix.link.gnss_judge import LEAST_M, UNKNOWN_M
-from terrafix.link.gnss_start import AWAY_SIGMAS, CARRIED_MPS, GOOD_M, STEADY_NS
+from terrafix.link.gnss.initial_position import AWAY_SIGMAS, CARRIED_MPS, GOOD_M, STEADY_NS
+from terrafix.link.gnss.spoofing_detector import LEAST_M, UNKNOWN_M
+from terrafix.link.integrity.output_predictor import distance_m, offset
 from terrafix.link.node import LinkNode
 
 CAMERA = m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0)

@@ -6,9 +6,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.link.diagnosis import Heard, why_no_autopilot
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.streams import OPTIONAL_ON_PX4, PATIENCE, Streams, wanted_of
+from terrafix.link.mavlink.diagnosis import Heard, why_no_autopilot
+from terrafix.link.mavlink.message_rates import OPTIONAL_ON_PX4, PATIENCE, Streams, wanted_of
 
 S = 1_000_000_000
 ATTITUDE, HEIGHT = mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT

@@ -12,10 +12,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.link.boot_clock import BACK_MS, CONFIRM_NS, WRAP_MS, BootClock, boot_step_ms
+from terrafix.link.admission.boot_clock import BACK_MS, CONFIRM_NS, WRAP_MS, BootClock, boot_step_ms
+from terrafix.link.admission.sequence_numbers import LATE, LOST, PROOF, TWO_NS, Sequence
+from terrafix.link.admission.turn_check import JUMP_RAD, TurnCheck, said
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.sequence import LATE, LOST, PROOF, TWO_NS, Sequence
-from terrafix.link.turn_check import JUMP_RAD, TurnCheck, said
 
 # --- packet numbers ---
 

@@ -7,9 +7,9 @@ from itertools import pairwise
 import pytest
 from link_rig import MS, TICK_NS, S
 
-from terrafix.link import gps_time
-from terrafix.link.pacer import Pacer
-from terrafix.link.timesync import TimeSync
+from terrafix.link.mavlink.timesync import TimeSync
+from terrafix.link.output import gps_time
+from terrafix.link.output.send_schedule import SendSchedule
 
 
 def unix_ns(text: str) -> int:
@@ -120,7 +120,7 @@ def test_timesync_ignores_answers_to_others() -> None:
 
 
 def sent_times(rate_hz: float, ticks: list[int]) -> list[int]:
-    pacer = Pacer(rate_hz, 50.0)
+    pacer = SendSchedule(rate_hz, 50.0)
     return [t for t in ticks if pacer.due(t)]
 
 

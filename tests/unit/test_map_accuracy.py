@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from rasterio.transform import Affine
 
-from terrafix.anchor.layers import Layers
-from terrafix.anchor.map_format import CE90_SIGMAS, Accuracy, Ce90Origin, Layer, accuracy_of
-from terrafix.anchor.map_package import LocalMap, MapPackage
+from terrafix.anchor.matching.map_layers import Layers
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.format import CE90_SIGMAS, Accuracy, Ce90Origin, Layer, accuracy_of
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.mapping import accuracy
 from terrafix_tools.mapping.accuracy import given_offset, with_estimates

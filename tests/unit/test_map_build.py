@@ -19,9 +19,9 @@ import rasterio.warp
 from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError, TerrafixError, UsageError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build, ensure_package
 
 

@@ -13,9 +13,9 @@ import map_rasters
 import numpy as np
 import pytest
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.check import check
 from terrafix_tools.mapping.check_mission import way_of

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from map_cluster import local_cluster
 
-from terrafix.anchor.map_package import MapPackage
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.dem import TILES_PER_WORKER, height_places
 

@@ -11,9 +11,9 @@ import rasterio
 import rasterio.warp
 from rasterio.transform import Affine
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping import build as build_module
 from terrafix_tools.mapping import parallel
 from terrafix_tools.mapping.build import build

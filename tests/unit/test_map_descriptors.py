@@ -11,12 +11,12 @@ from map_standard import violations
 from pyproj import Transformer
 from rasterio.transform import Affine
 
-from terrafix.anchor.map_features import MapFeatures
-from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.matcher import FrameMatcher
-from terrafix.anchor.tile_index import TileIndex
+from terrafix.anchor.matching.descriptor_cache import MapFeatures
+from terrafix.anchor.matching.frame_matcher import FrameMatcher
+from terrafix.anchor.relocalization.coarse_descriptors import TileIndex
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import POOL, PooledGradientDescriber
 from terrafix_tools.mapping import check

@@ -11,9 +11,9 @@ import rasterio
 from pyproj import Transformer
 from rasterio.transform import Affine
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.dem import DemSource
 from terrafix_tools.mapping.layers import ElevationInput

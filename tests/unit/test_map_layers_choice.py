@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.anchor.map_layers import MEMORY, PAIRS, PROBE_EVERY, LayerChoice
+from terrafix.anchor.matching.layer_selector import MEMORY, PAIRS, PROBE_EVERY, LayerChoice
 
 NOISE = 1.5  # of the scores from frame to frame, the same for all layers of one place
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from terrafix.anchor.map_format import MANIFEST_TABLE
-from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.null_model import VERSION, null_at
 from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.format import MANIFEST_TABLE
+from terrafix.map.null_model import VERSION, null_at
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix_tools.mapping import null_model
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.cli import app

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from rasterio.transform import Affine
 
-from terrafix.anchor.map_package import MapPackage
-from terrafix.anchor.map_seal import BLANK, MARKER, VOLATILE
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.checksum import BLANK, MARKER, VOLATILE
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build, build_package, layer_of
 from terrafix_tools.mapping.dem import DemSource
 from terrafix_tools.mapping.layers import ElevationInput, VectorInput

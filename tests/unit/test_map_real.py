@@ -7,8 +7,8 @@ import pytest
 import rasterio
 from map_standard import violations
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build
 
 FAST = ["imagery/joplin/before.tif", "imagery/prairie/20120731.tif", "imagery/swellendam/ortho.tif"]

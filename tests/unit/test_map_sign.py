@@ -10,10 +10,10 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from terrafix.anchor.map_package import MapPackage
-from terrafix.anchor.map_seal import write_seal
 from terrafix.core.errors import ConfigError, MapError, OutputError, UsageError
 from terrafix.core.signature import TrustedKey, generate, is_signed, read_public, trusted_keys
+from terrafix.map.checksum import write_seal
+from terrafix.map.package import MapPackage
 from terrafix_tools.live import package_for
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.sign import sign_package

@@ -14,8 +14,8 @@ import rasterio
 from map_servers import Asked, Reply, serving
 from rich.console import Console
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, TerrafixError, UsageError
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.area_build import Order, build_order
 
 WORLD = map_servers.pyramid(5, 6, zoom=17)

@@ -11,9 +11,9 @@ import numpy as np
 import pyogrio
 import pytest
 
-from terrafix.anchor.map_package import MapPackage
-from terrafix.anchor.map_vectors import wkb_parts
 from terrafix.core.errors import MapError
+from terrafix.map.package import MapPackage
+from terrafix.map.vectors import wkb_parts
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.layers import Feature, VectorInput
 

@@ -13,8 +13,8 @@ from rasterio.enums import Resampling
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 
-from terrafix.anchor.map_package import LocalMap, MapPackage
 from terrafix.core.geodesy import LocalFrame, local_crs
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix_tools.mapping.build import build
 
 SIDE_PX = 900

@@ -10,10 +10,10 @@ import tiny_onnx
 from ground import PINHOLE, texture, view
 from one_place import ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
 
-from terrafix.anchor.model_watch import FAILURES
+from terrafix.anchor.model_monitor import FAILURES
 from terrafix.anchor.node import AnchorNode, make_node
-from terrafix.anchor.place_search import LOST_SIGMA_M
-from terrafix.anchor.retrieval import MapSearch
+from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.relocalization.relocalizer import LOST_SIGMA_M
 from terrafix.core.config import Config, Models
 from terrafix.core.errors import ModelError
 from terrafix.core.frames import MemoryFrameStore

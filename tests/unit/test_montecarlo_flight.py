@@ -11,7 +11,7 @@ import pytest
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
-from terrafix.estimator.tracker import Tracker
+from terrafix.estimator.propagation import Propagation
 from terrafix.messages import MapMatch, Prediction, Verdict
 from terrafix_tools.montecarlo.fault import LIES, Fault
 from terrafix_tools.montecarlo.faults import JUMP_M, JUMPS, Faults
@@ -184,7 +184,7 @@ def test_three_keyframes_carry_the_way_on_over_hills_in_the_dark(monkeypatch: py
         return sum(errors), sum(claims)
 
     error_m, claim_m = flown_m()
-    monkeypatch.setattr(Tracker, "_three", lambda *_: None)
+    monkeypatch.setattr(Propagation, "_three", lambda *_: None)
     without_m, claim_without_m = flown_m()
     assert error_m < 0.85 * without_m
     assert error_m < claim_m < 0.8 * claim_without_m

@@ -6,9 +6,9 @@ from ground import PINHOLE, apply, homography, rotation, texture, view
 
 from terrafix.core.geodesy import yaw_of
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.estimator.motion import Ground, RelativePose, relative_pose
-from terrafix.estimator.mounted import UNKNOWN_ATTITUDE_RAD
-from terrafix.vision.odometry import FrameTracker
+from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
+from terrafix.estimator.models.plane_motion import Ground, RelativePose, relative_pose
+from terrafix.vision.feature_tracker import FrameTracker
 
 AGL_M = 100.0
 SIGMA = 1.0 / 380.0  # one pixel

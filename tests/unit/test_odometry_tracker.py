@@ -7,7 +7,7 @@ from ground import PINHOLE, apply, homography, rotation, texture, view
 
 from terrafix.core.camera import CameraCalibration
 from terrafix.messages import Verdict
-from terrafix.vision.odometry import MAX_MISSES, MAX_PAIRS, FrameTracker, Motion
+from terrafix.vision.feature_tracker import MAX_MISSES, MAX_PAIRS, FrameTracker, Motion
 
 AGL_M = 100.0
 Pose = tuple[np.ndarray, np.ndarray]

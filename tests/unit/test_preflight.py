@@ -13,14 +13,14 @@ from preflight_autopilot import GroundAutopilot
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import Config, HealthSection, LinkSection, RecorderSection
 from terrafix.core.config import Map as MapSection
 from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.signature import generate
-from terrafix.link.transport import Address, Chunk
+from terrafix.link.mavlink.transport import Address, Chunk
+from terrafix.map.package import MapPackage
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission

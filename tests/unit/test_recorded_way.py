@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import EvaluationError, OutputError, SourceError
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.tlog import read_tlog
+from terrafix.core.mavlink.tlog import read_tlog
 from terrafix.vision.sources import open_source
 from terrafix_tools.sim.flights.recorded import read_recorded, write_recorded
 from terrafix_tools.sim.flights.smooth import smooth

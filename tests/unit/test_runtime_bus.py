@@ -11,13 +11,13 @@ import zmq
 from runtime_nodes import ORIGIN
 
 from terrafix import messages as m
-from terrafix.core import bus
-from terrafix.core.bus import Publisher, Subscriber
 from terrafix.core.node import Edge
-from terrafix.core.progress import Progress
-from terrafix.core.rundir import RunDir
-from terrafix.core.shell import LiveShell
 from terrafix.processes import EVERYTHING, Process
+from terrafix.runtime import bus
+from terrafix.runtime.bus import Publisher, Subscriber
+from terrafix.runtime.executor import LiveShell
+from terrafix.runtime.progress_stamp import Progress
+from terrafix.runtime.run_dir import RunDir
 
 pytestmark = pytest.mark.real_time
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from terrafix.core import rundir
 from terrafix.core.config import Config, LinkSection, Map, Source
-from terrafix.core.progress import Progress
-from terrafix.core.rundir import PREFIX, OwnedRunDir, RunDir
 from terrafix.processes import PROCESSES
-from terrafix.spec import spec_of
-from terrafix.supervisor import _is_camera, killed_just_now
+from terrafix.runtime import run_dir
+from terrafix.runtime.progress_stamp import Progress
+from terrafix.runtime.run_dir import PREFIX, OwnedRunDir, RunDir
+from terrafix.runtime.run_spec import spec_of
+from terrafix.runtime.supervisor import _is_camera, killed_just_now
 
 
 def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
@@ -23,7 +23,7 @@ def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
     (dead.path / "lock").touch()
     dead.spec.write_bytes(spec)
     dead.set_epoch(7)
-    dead.kept("estimator").write_bytes(b"the newest estimate")
+    dead.checkpoint("estimator").write_bytes(b"the newest estimate")
     dead.shelf("anchor").mkdir()
     (dead.shelf("anchor") / "0 0.tile").touch()
     progress = Progress.create(dead.progress("link"))
@@ -49,7 +49,7 @@ def test_it_goes_on_from_a_run_of_the_same_that_was_killed_just_now(
     owned = OwnedRunDir(tmp_path, b"this map", goes_on=camera)
     try:
         assert owned.run_dir.epoch_ns == (7 if goes_on else None)
-        assert owned.run_dir.kept("estimator").exists() == goes_on
+        assert owned.run_dir.checkpoint("estimator").exists() == goes_on
         assert (owned.run_dir.shelf("anchor") / "0 0.tile").exists() == goes_on
         assert dead.path.exists() == stays, "what goes on another way has an heir that is still to come"
     finally:
@@ -76,7 +76,7 @@ CAMERA = "http://127.0.0.1:80/stream"
 def test_a_map_that_was_looked_at_is_not_looked_at_again_while_a_vehicle_waits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rundir, "SHM", tmp_path)
+    monkeypatch.setattr(run_dir, "SHM", tmp_path)
     package, out = tmp_path / "a.gpkg", tmp_path / "out"
     config = Config(map=Map(path=str(package)), source=Source(path=CAMERA), link=LinkSection(device="udpin:h:1"))
     spec = msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5))

@@ -16,11 +16,16 @@ PACKAGES = {
 }
 # library -> the modules (and what is below them) that may import it
 OWNERS = {
-    "gtsam": ("terrafix.estimator", "terrafix_tools.bench.growth", "terrafix_tools.bench.merging_baseline"),
+    "gtsam": (
+        "terrafix.estimator",
+        "terrafix_tools.finalise",
+        "terrafix_tools.bench.growth",
+        "terrafix_tools.bench.merging_baseline",
+    ),
     "pymavlink": (
         "terrafix.link",
         "terrafix_tools.sim.autopilot",
-        "terrafix.core.tlog",
+        "terrafix.core.mavlink.tlog",
         "terrafix_tools.sim.flights.log",
         "terrafix_tools.sim.sitl",
         "terrafix_tools.preflight",
@@ -31,8 +36,8 @@ OWNERS = {
     "onnxruntime": ("terrafix_engines",),
     "torch": ("terrafix_engines.train",),
     "faiss": ("terrafix.anchor",),
-    "systemd": ("terrafix.supervisor",),
-    "zmq": ("terrafix.core", "terrafix.supervisor"),
+    "systemd": ("terrafix.runtime.supervisor",),
+    "zmq": ("terrafix.runtime",),
     "pickle": (),
 }
 DIRECTION = {  # package -> our packages that it may import besides itself
@@ -41,7 +46,7 @@ DIRECTION = {  # package -> our packages that it may import besides itself
     "terrafix_engines": set(),
 }
 # What of terrafix is not a process: imported by all.
-COMMON = {"core", "messages", "processes"}
+COMMON = {"core", "map", "messages", "processes", "runtime"}
 
 
 def modules() -> Iterator[tuple[str, Path]]:
@@ -95,18 +100,26 @@ def test_process_folders_do_not_import_each_other(folder: str) -> None:
                     assert parts[1] in COMMON | {folder}, f"{module} imports {name}"
 
 
-def test_core_imports_only_what_is_common() -> None:
+@pytest.mark.parametrize(
+    ("folder", "allowed"),
+    [
+        ("core", {"core", "messages"}),
+        ("map", {"core", "map", "messages"}),
+        ("runtime", {"core", "messages", "processes", "runtime"}),
+    ],
+)
+def test_what_is_common_imports_nothing_above_it(folder: str, allowed: set[str]) -> None:
     for module, path in MODULES.items():
-        if module.startswith("terrafix.core"):
+        if within(module, f"terrafix.{folder}"):
             ours = [name.split(".") for name in imports(path) if name.startswith("terrafix")]
-            assert all(parts[0] == "terrafix" and parts[1] in COMMON for parts in ours), module
+            assert all(parts[0] == "terrafix" and parts[1] in allowed for parts in ours), module
 
 
 def test_the_link_process_is_free_of_gtsam_opencv_and_onnxruntime() -> None:
     """Also of what pulls them in by a detour: the whole process entry is loaded, in an interpreter of its own."""
     code = """
 import sys
-import terrafix.child, terrafix.core.shell, terrafix.link.node
+import terrafix.runtime.process_main, terrafix.runtime.executor, terrafix.link.node
 print(*sorted({"cv2", "gtsam", "onnxruntime", "faiss", "scipy", "matplotlib"} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -118,7 +131,7 @@ def test_the_command_line_loads_nothing_that_computes() -> None:
     """`--help` is fast, and so is a restart in flight."""
     code = """
 import sys
-import terrafix_tools.cli, terrafix.nursery
+import terrafix_tools.cli, terrafix.runtime.fork_server
 print(*sorted({"numpy", "cv2", "pyproj", "zmq", "structlog"} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -136,5 +149,5 @@ def loaded(modules: str, named: set[str]) -> set[str]:
 
 def test_a_restart_in_flight_waits_for_nothing_that_it_does_not_need() -> None:
     """The supervisor has no arrays; the anchor opens a model, or checks a signature, where one is configured."""
-    assert loaded("terrafix.supervisor", {"numpy", "cv2", "pyproj"}) == set()
-    assert loaded("terrafix.child, terrafix.anchor.node", {"onnxruntime", "cryptography"}) == set()
+    assert loaded("terrafix.runtime.supervisor", {"numpy", "cv2", "pyproj"}) == set()
+    assert loaded("terrafix.runtime.process_main, terrafix.anchor.node", {"onnxruntime", "cryptography"}) == set()

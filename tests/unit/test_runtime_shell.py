@@ -10,9 +10,9 @@ from runtime_nodes import ORIGIN
 from terrafix import messages as m
 from terrafix.core import codec
 from terrafix.core.clock import Ticker
-from terrafix.core.inbox import Inbox
-from terrafix.core.shell import InProcessShell
 from terrafix.processes import EVERYTHING, PROCESSES, SOURCE, Process
+from terrafix.runtime.executor import InProcessShell
+from terrafix.runtime.inbox import Inbox
 
 
 def frame(frame_id: int) -> m.Frame:
@@ -105,10 +105,10 @@ def test_a_node_that_the_table_does_not_know_is_an_error() -> None:
 
 
 def test_every_message_that_is_said_is_heard_and_recorded() -> None:
-    recorded = set(next(p for p in PROCESSES if p.name == "recorder").hears)
+    recorded = set(next(p for p in PROCESSES if p.name == "recorder").subscribes)
     assert recorded == set(m.AnyMessage.__args__)
     for process in PROCESSES:
-        assert set(process.newest) <= set(process.hears)
+        assert set(process.newest) <= set(process.subscribes)
 
 
 def test_ticker_keeps_an_absolute_grid() -> None:

@@ -16,13 +16,13 @@ import pytest
 from runtime_nodes import TABLE
 
 from terrafix import messages as m
-from terrafix.children import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, describe
-from terrafix.core import rundir
 from terrafix.core.codec import decode_json
 from terrafix.core.errors import ConfigError, MapError, OutputError
-from terrafix.core.progress import Progress
-from terrafix.nursery import Forked
-from terrafix.supervisor import run, sd_notify
+from terrafix.runtime import run_dir
+from terrafix.runtime.fork_server import Forked
+from terrafix.runtime.managed_process import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, describe
+from terrafix.runtime.progress_stamp import Progress
+from terrafix.runtime.supervisor import run, sd_notify
 
 pytestmark = pytest.mark.real_time
 
@@ -198,7 +198,7 @@ RUNNER = """
 import sys
 from pathlib import Path
 from runtime_nodes import TABLE
-from terrafix.supervisor import run
+from terrafix.runtime.supervisor import run
 sys.exit(run(source="", map_path=None, link="", out_dir=Path(sys.argv[1]), configs=[], table=TABLE))
 """
 
@@ -215,7 +215,7 @@ def supervisor_process(out_dir: Path, **environment: str) -> Iterator[subprocess
 
 
 def children_of(pid: int) -> dict[str, int]:
-    """Name, as `ps` shows it -> pid; the nursery has that of the interpreter."""
+    """Name, as `ps` shows it -> pid; the fork_server has that of the interpreter."""
     found = {}
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         with contextlib.suppress(FileNotFoundError):  # ended meanwhile
@@ -232,7 +232,7 @@ def is_gone(pid: int) -> bool:
 
 
 def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tmp_path: Path) -> None:
-    others = {run.path for run in rundir.living()}
+    others = {run.path for run in run_dir.living()}
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(15)
@@ -241,7 +241,7 @@ def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tm
             assert systemd.recv(1000).startswith(b"WATCHDOG=1\nSTATUS=flying")
             for pid in children_of(process.pid).values():
                 assert b"NOTIFY_SOCKET" not in Path(f"/proc/{pid}/environ").read_bytes()
-            (folder,) = (run for run in rundir.living() if run.path not in others)
+            (folder,) = (run for run in run_dir.living() if run.path not in others)
             progress = Progress(folder.progress("link"))
             systemd.settimeout(0.05)
             heard_s = began_s = time.monotonic()
@@ -272,20 +272,20 @@ def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tm
 def test_children_die_with_a_killed_supervisor_and_its_leftovers_are_swept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    others = {run.path for run in rundir.living()}
+    others = {run.path for run in run_dir.living()}
     with supervisor_process(tmp_path / "out") as process:
         eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
         children = children_of(process.pid)
-        (folder,) = {run.path for run in rundir.living()} - others
-        eventually(rundir.RunDir(folder).flew_just_now, 15)
+        (folder,) = {run.path for run in run_dir.living()} - others
+        eventually(run_dir.RunDir(folder).flew_just_now, 15)
         process.kill()
         eventually(lambda: all(is_gone(pid) for pid in children.values()), 2)
-    rundir.OwnedRunDir().remove()
+    run_dir.OwnedRunDir().remove()
     assert folder.exists(), "the one that goes on from there is still to come"
-    monkeypatch.setattr(rundir, "SAME_FLIGHT_NS", 0)
-    living = rundir.OwnedRunDir()
+    monkeypatch.setattr(run_dir, "SAME_FLIGHT_NS", 0)
+    living = run_dir.OwnedRunDir()
     assert not folder.exists(), "the next start removes what the killed one left"
-    rundir.OwnedRunDir().remove()
+    run_dir.OwnedRunDir().remove()
     assert living.run_dir.path.exists(), "the folder of a living supervisor stays"
     living.remove()
     assert not living.run_dir.path.exists()
@@ -306,8 +306,8 @@ def test_a_nursery_that_dies_takes_nobody_with_it_and_another_is_there_when_it_i
     with supervisor_process(tmp_path / "out") as process:
         eventually(lambda: names <= set(children_of(process.pid)), 15)
         before = children_of(process.pid)
-        (nursery,) = (pid for name, pid in before.items() if name not in names)
-        os.kill(nursery, signal.SIGKILL)
+        (fork_server,) = (pid for name, pid in before.items() if name not in names)
+        os.kill(fork_server, signal.SIGKILL)
         os.kill(before["estimator"], signal.SIGKILL)
         eventually(lambda: children_of(process.pid).get("estimator", before["estimator"]) != before["estimator"], 5)
         after = children_of(process.pid)

@@ -10,7 +10,7 @@ import pytest
 from source_folders import HEADER, TOML, flight, jpeg, picture
 
 from terrafix.core.errors import SourceError, UsageError
-from terrafix.core.start import start_is_unknown
+from terrafix.core.initial_position import start_is_unknown
 from terrafix.vision.sources import open_source, parse_start
 
 

@@ -11,7 +11,7 @@ from source_folders import jpeg, picture
 from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import rot_w_b
-from terrafix.core.start import start_is_unknown
+from terrafix.core.initial_position import start_is_unknown
 from terrafix.vision.sources import open_source
 from terrafix.vision.sources.photos import body_of_gimbal
 

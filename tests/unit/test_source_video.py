@@ -14,7 +14,7 @@ from source_folders import HEIGHT, TOML, WIDTH, flight, picture
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
-from terrafix.core.tlog import read_tlog
+from terrafix.core.mavlink.tlog import read_tlog
 from terrafix.messages import Camera
 from terrafix.vision.sources import open_source
 from terrafix.vision.sources.camera import LiveCamera

@@ -11,8 +11,8 @@ from terrafix.core.clock import now_ns
 from terrafix.core.config import Config, Source
 from terrafix.core.errors import MapError, SourceError
 from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.initial_position import map_bounds, placed, start_is_unknown
 from terrafix.core.node import NodeContext
-from terrafix.core.start import map_bounds, placed, start_is_unknown
 from terrafix.messages import Origin
 from terrafix.vision.edge import make_edge
 from terrafix.vision.sources import open_source

@@ -5,8 +5,8 @@ from typing import cast
 import msgspec
 import pytest
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import Config
+from terrafix.map.package import MapPackage
 from terrafix_tools.live import swapped
 from terrafix_tools.preflight import computer
 from terrafix_tools.preflight.lines import Status

@@ -5,8 +5,8 @@ import numpy as np
 
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import Camera, Frame, Odometry, Origin, Verdict
+from terrafix.vision.feature_tracker import Motion
 from terrafix.vision.node import VisionNode
-from terrafix.vision.odometry import Motion
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 ORIGIN = Origin(

@@ -13,7 +13,7 @@ from rasterio.transform import Affine
 from typer.testing import CliRunner
 
 from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
-from terrafix.core.tlog import read_tlog
+from terrafix.core.mavlink.tlog import read_tlog
 from terrafix.vision.sources import open_source
 from terrafix_tools.cli import app
 from terrafix_tools.mission.mission import Box

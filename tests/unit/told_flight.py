@@ -9,9 +9,9 @@ from flight_records import write_record
 from simulated_flight import PLACE, Flight, blind, t_ns
 
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
-from terrafix.estimator.smoothing import Smoothed
-from terrafix.estimator.whole import Retold, Storyteller
 from terrafix.messages import Frame, MapMatch, Message, Odometry, Verdict
+from terrafix_tools.finalise.batch_smoother import Smoothed
+from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 
 Alter = Callable[[Message], Message | None]
 
@@ -32,9 +32,9 @@ def messages(flight: Flight, alter: Alter = as_it_is) -> Iterable[Message]:
             yield altered
 
 
-def told(flight: Flight, alter: Alter = as_it_is, afterwards: Iterable[Message] = ()) -> Retold:
+def told(flight: Flight, alter: Alter = as_it_is, afterwards: Iterable[Message] = ()) -> FlightGraph:
     """``afterwards``: heard when the flight is over."""
-    storyteller = Storyteller()
+    storyteller = FlightReplayer()
     for message in (*messages(flight, alter), *afterwards):
         storyteller.on(message)
     retold = storyteller.flights[0]
@@ -82,7 +82,7 @@ def blind_between(first: int, end: int) -> Alter:
     return alter
 
 
-def errors(flight: Flight, retold: Retold, found: Smoothed) -> tuple[np.ndarray, np.ndarray]:
+def errors(flight: Flight, retold: FlightGraph, found: Smoothed) -> tuple[np.ndarray, np.ndarray]:
     """Of every frame: east and north from truth (N, 2), and the covariance that is claimed (N, 2, 2)."""
     off, covs = [], []
     for i in range(flight.frames):

@@ -17,7 +17,7 @@ from terrafix_tools.preflight.cli import preflight
 from terrafix_tools.sim.cli import app as sim_app
 
 if TYPE_CHECKING:
-    from terrafix.nursery import Nursery
+    from terrafix.runtime.fork_server import ForkServer
 
 ON_THE_GROUND = ("rasterio", "urllib3", "pmtiles", "osmium")  # the extra `ground`: a vehicle need not have it
 
@@ -47,8 +47,8 @@ def run(
     config: ConfigOption = None,
 ) -> None:
     """Fly: start the processes under the supervisor until stopped."""
-    from terrafix.supervisor import killed_just_now
-    from terrafix.supervisor import run as run_supervised
+    from terrafix.runtime.supervisor import killed_just_now
+    from terrafix.runtime.supervisor import run as run_supervised
 
     configs = config or []
     before = killed_just_now(source=source, start=start, map_path=map_path, link=link, out_dir=out, configs=configs)
@@ -67,7 +67,7 @@ def run(
         out_dir=out,
         configs=configs,
         stop_after_source=until_end,
-        nursery=context.obj,
+        fork_server=context.obj,
     )
     if until_end and code == 0:  # not when the vehicle is switched off: a long record takes its time
         from terrafix_tools.flight_verdict import verdict_of
@@ -155,12 +155,12 @@ def bench(
     run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat, growing=growing)
 
 
-def main(nursery: "Nursery | None" = None) -> None:
+def main(fork_server: "ForkServer | None" = None) -> None:
     """The one funnel for errors: a user's mistake is one line and an exit code, a bug is a traceback.
 
-    ``nursery``: for `run`, one that was begun already (program.py)."""
+    ``fork_server``: for `run`, one that was begun already (program.py)."""
     try:
-        app(obj=nursery)
+        app(obj=fork_server)
     except TerrafixError as error:
         typer.echo(f"terrafix: {error}", err=True)
         sys.exit(error.exit_code)

@@ -8,14 +8,16 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from terrafix.link.fix import LADDER, MAX_HORIZONTAL_SIGMA_M
-from terrafix.link.words import fault_words
+from terrafix.link.integrity.fix_type import DEGRADATION_LEVELS, MAX_HORIZONTAL_SIGMA_M
+from terrafix.link.pilot_text.statustext import fault_words
 from terrafix.messages import CalibrationFault, MeasurementVerdict, Verdict
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import NS, Row, RowTable
 
-UNCONFIRMED_S = LADDER[1][0]  # a flight may last so long on its start coordinate before a map match confirms it
-UNANCHORED_S = LADDER[-1][0]  # ... and so long without one later on
+UNCONFIRMED_S = DEGRADATION_LEVELS[1][
+    0
+]  # a flight may last so long on its start coordinate before a map match confirms it
+UNANCHORED_S = DEGRADATION_LEVELS[-1][0]  # ... and so long without one later on
 REFUSED_SHARE, LEAST_POSES = 0.5, 8  # of the poses on the map, refused by the estimate: one of the two is wrong
 # Nothing on board tells which of the two.
 START_OFF = "start and map contradict each other: one of them is in the wrong place"

@@ -4,7 +4,7 @@ import numpy as np
 
 from terrafix.core.camera import bent, straightened
 from terrafix.core.gate import GATE
-from terrafix.estimator.middle import Middle
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.messages import Camera, SlowErrors
 
 LENS = 4  # of SlowErrors.error
@@ -20,7 +20,7 @@ def lens_words(camera: Camera, learnt: SlowErrors) -> str | None:
 
 
 def _middle(camera: Camera, learnt: SlowErrors) -> str:
-    found = Middle(camera, learnt.lens)
+    found = PrincipalPointFilter(camera, learnt.lens)
     px = found.offset * (camera.fx, camera.fy)
     sigma_px = np.sqrt(np.diag(found.cov)) * (camera.fx, camera.fy)
     if not found.offset.any() or found.offset @ np.linalg.solve(found.cov, found.offset) < GATE[2]:

@@ -3,11 +3,11 @@
 import os
 from pathlib import Path
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import load
 from terrafix.core.errors import MapError
+from terrafix.core.initial_position import middle_of, start_is_unknown
 from terrafix.core.signature import trusted_keys
-from terrafix.core.start import middle_of, start_is_unknown
+from terrafix.map.package import MapPackage
 from terrafix.vision.sources import open_configured, parse_start
 from terrafix.vision.sources.description import START_SIGMA_M
 

@@ -1,7 +1,7 @@
 """The program `terrafix`: its command line, and for `run` first what takes longest.
 
-A vehicle waits when it is started again in flight. The nursery imports what the processes need; it is begun before the
-command line is loaded, and imports beside that."""
+A vehicle waits when it is started again in flight. The fork_server imports what the processes need; it is begun before
+the command line is loaded, and imports beside that."""
 
 import sys
 
@@ -12,12 +12,12 @@ def main() -> None:
 
         cli.main()
         return
-    from terrafix.nursery import Nursery
+    from terrafix.runtime.fork_server import ForkServer
 
-    with Nursery() as nursery:
+    with ForkServer() as fork_server:
         from terrafix_tools import cli
 
-        cli.main(nursery)
+        cli.main(fork_server)
 
 
 if __name__ == "__main__":

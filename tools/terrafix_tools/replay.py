@@ -14,17 +14,17 @@ import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, ModelError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.initial_position import placed, start_is_unknown
 from terrafix.core.node import Node, NodeContext
-from terrafix.core.shell import InProcessShell
-from terrafix.core.start import placed, start_is_unknown
+from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.writer import versions
+from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
 from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import Stored, find, models_folder

@@ -6,29 +6,29 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from terrafix.anchor.alone import LIKELIHOOD_RATIO, PLACES, alone
-from terrafix.anchor.answer import coarse, ground_sigma_m, judged
-from terrafix.anchor.belief import Belief, cell_for
-from terrafix.anchor.hint import outside_m
-from terrafix.anchor.layers import Dated, Layers
-from terrafix.anchor.lost import START_ODDS, LostWatch, claims_little
-from terrafix.anchor.map_features import Describer
-from terrafix.anchor.map_package import MapPackage
-from terrafix.anchor.matcher import view_at
-from terrafix.anchor.model_watch import ModelWatch
-from terrafix.anchor.null_model import FlightBudget
-from terrafix.anchor.place_check import SIGMA_FLOOR
-from terrafix.anchor.place_search import PlaceSearch, mixed_sigma_m, start_around
-from terrafix.anchor.start import answered
-from terrafix.anchor.tracks import NEAR
-from terrafix.anchor.views import ground_plane, view_of
+from terrafix.anchor.initial_position import answered
+from terrafix.anchor.matching.descriptor_cache import Describer
+from terrafix.anchor.matching.frame_matcher import view_at
+from terrafix.anchor.matching.map_layers import Layers, MapLayer
+from terrafix.anchor.matching.match_message import ground_sigma_m, mode_match, pose_match
+from terrafix.anchor.matching.point_mass_filter import Belief, cell_for
+from terrafix.anchor.matching.predicted_view import ground_plane, view_of
+from terrafix.anchor.model_monitor import ModelWatch
+from terrafix.anchor.relocalization.hypothesis_tracker import NEAR
+from terrafix.anchor.relocalization.position_prior import outside_m
+from terrafix.anchor.relocalization.relocalizer import PlaceSearch, mixed_sigma_m, start_around
+from terrafix.anchor.verification.lock_monitor import START_ODDS, LockMonitor, claims_little
+from terrafix.anchor.verification.place_verifier import SIGMA_FLOOR
+from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, PLACES, localize_single_frame
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import ModelError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.initial_position import SEARCHED_START_M
 from terrafix.core.limits import LEAST_LOOK_AGL_M
 from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.signature import trusted_keys
-from terrafix.core.start import SEARCHED_START_M
+from terrafix.map.null_model import FlightBudget
+from terrafix.map.package import MapPackage
 from terrafix.messages import (
     GnssStart,
     MapMatch,
@@ -54,8 +54,8 @@ MODES_SAID = 2  # the best place and its best rival
 MODE_TRIED = 0.5  # modes below this are not tried at all
 COARSE_SCORE = 3.0  # standardised correlation that a coarse fix must have in this very frame
 
-# A start coordinate that is wrong by far more than it claims: how often (lost.py), and how far it is looked for until
-# a pose has placed the flight.
+# A start coordinate that is wrong by far more than it claims: how often (lock_monitor.py), and how far it is looked for
+# until a pose has placed the flight.
 START_STRAY, STRAY_SIGMAS, STRAY_MOST_M = float(np.exp(-START_ODDS)), 8.0, 500.0
 START_SIGMA_FLOOR_M = 8.0  # an apparent position also carries the tilt that is not known yet
 # Of the height: what the belief follows is the place from which a picture seems to be taken, and a tilt that is a
@@ -100,7 +100,7 @@ class AnchorNode:
     def _begin(self) -> None:
         """Nothing is known of the flight yet."""
         self._belief: Belief | None = None
-        self._watch = LostWatch()
+        self._watch = LockMonitor()
         self._search = PlaceSearch()
         self._alone = FlightBudget()  # of single frames
         self._since_look_m = np.inf  # motion since the last look at new ground
@@ -206,7 +206,7 @@ class AnchorNode:
                 answer, prediction, image if prediction.agl_m >= LEAST_LOOK_AGL_M else None, best, self._ground_m
             )
             if answer.found:
-                self._watch = LostWatch()
+                self._watch = LockMonitor()
                 cell_m = cell_for(prediction.agl_m, best.matcher.look_cell_m(prediction.agl_m))
                 self._belief = Belief(answer.mode_e_m, answer.mode_n_m, FOUND_SIGMA_M, cell_m)
             return answer
@@ -250,22 +250,22 @@ class AnchorNode:
         tried = mode.mass >= MODE_TRIED or heading_is_open(prediction)
         inliers, likelihood_ratio = 0, POSE_LIKELIHOOD_RATIO
         if tried:
-            answer = judged(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
+            answer = pose_match(answer, used.matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m), view)
             if answer.verdict is Verdict.ACCEPTED:
                 inliers = answer.inliers
             # Single patches that say less than all of them may be aside together: these know it better.
             if answer.verdict is not Verdict.ACCEPTED or ground_sigma_m(answer, view.agl_m) > SIGMA_FLOOR * view.agl_m:
                 agreed = used.agreed.at(image, view_at(view, hypothesis, mode.e_m, mode.n_m))
-                together = answer if agreed is None else judged(answer, agreed, view)
+                together = answer if agreed is None else pose_match(answer, agreed, view)
                 answer = together if together.verdict is Verdict.ACCEPTED else answer
         claimed_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
         if not tried and new >= 1.0 and claims_little(claimed_m, view.agl_m):
             self._alone.spend()
             null, share = used.null_at(view.agl_m), self._alone.log_probability
-            place = alone(image, view, look, belief.modes(PLACES), used.map, used.matcher, null, share)
+            place = localize_single_frame(image, view, look, belief.modes(PLACES), used.map, used.matcher, null, share)
             if place is not None:
                 mode, fix = place
-                answer = judged(msgspec.structs.replace(answer, mode_e_m=mode.e_m, mode_n_m=mode.n_m), fix, view)
+                answer = pose_match(msgspec.structs.replace(answer, mode_e_m=mode.e_m, mode_n_m=mode.n_m), fix, view)
                 tried = answer.verdict is Verdict.ACCEPTED
                 likelihood_ratio = LIKELIHOOD_RATIO
         self._watch.looked(gain, weight, new, inliers, claimed_m, view.agl_m)
@@ -289,17 +289,17 @@ class AnchorNode:
             return msgspec.structs.replace(answer, verdict=Verdict.AMBIGUOUS)
         if score < COARSE_SCORE:
             return answer
-        return coarse(answer, mode, belief.cell_m, view, look.scale_at(mode.e_m, mode.n_m))
+        return mode_match(answer, mode, belief.cell_m, view, look.scale_at(mode.e_m, mode.n_m))
 
     @staticmethod
-    def _may_be_on(best: Dated, prediction: Prediction) -> bool:
+    def _may_be_on(best: MapLayer, prediction: Prediction) -> bool:
         """Whether a position that claims little, and lies off the map, may be on it all the same."""
         e_m, n_m, _ = prediction.p_c_in_w_m
         off_m = outside_m((e_m, n_m), best.map.bounds_m)
         sigma_m = float(np.sqrt(max(prediction.cov[0], prediction.cov[7])))
         return claims_little(sigma_m, prediction.agl_m) and off_m <= OFF_MAP_SIGMAS * sigma_m
 
-    def _moved(self, prediction: Prediction, best: Dated, origin: Origin) -> Belief:
+    def _moved(self, prediction: Prediction, best: MapLayer, origin: Origin) -> Belief:
         cell_m = cell_for(prediction.agl_m, best.matcher.look_cell_m(prediction.agl_m))
         step_m = float(np.hypot(*prediction.step_m))
         # Blind, the error of the position grows faster than the steps' own errors add up: with that of the velocity.

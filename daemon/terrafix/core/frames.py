@@ -2,7 +2,7 @@
 
 The shared ring has one writer and any number of readers, and nobody waits. A file that is mapped by hand, not
 multiprocessing.shared_memory: that one registers every reader with a resource tracker, which unlinks the memory
-of the living when a reader dies (Python < 3.13). Who owns the folder removes the file (core/rundir.py).
+of the living when a reader dies (Python < 3.13). Who owns the folder removes the file (runtime/run_dir.py).
 
 Slot = 64 bytes of header (generation, frame id + 1, height, width) and the pixels. The writer makes the generation
 odd, writes, and makes it even again; a reader copies and takes the copy only if the generation was even and is

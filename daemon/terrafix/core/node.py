@@ -31,7 +31,9 @@ class NodeContext:
     map_path: Path | None  # map package (GeoPackage)
     out_dir: Path  # where the recorder writes
     ground_amsl_m: float | None = None  # of the map at the start, for sources that do not know it
-    kept: Path | None = None  # file in memory for what this process leaves to the one that is started in its place
+    checkpoint: Path | None = (
+        None  # file in memory for what this process leaves to the one that is started in its place
+    )
     shelf: Path | None = None  # folder in memory for what would have to be computed anew; it need not exist
     epoch_ns: int | None = None  # t_ns of this run's first Origin: set when the source's process starts again
 

@@ -8,17 +8,17 @@ import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
+from terrafix.core.initial_position import begun
 from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
-from terrafix.core.start import begun
-from terrafix.estimator.coasted import Coast
-from terrafix.estimator.filter import Estimator
-from terrafix.estimator.integrity.monitors import Monitors
+from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.integrity.time_offset import TimeOffset
-from terrafix.estimator.resume import Keeper, Known, Last, kept
-from terrafix.estimator.righted import Righted
-from terrafix.estimator.telemetry import Attitude, Telemetry
-from terrafix.estimator.tracker import Advance, Placed
+from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
+from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
+from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
+from terrafix.estimator.monitors.calibration_monitors import Monitors
+from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, NavPrior, load_checkpoint
+from terrafix.estimator.propagation import FrameState, PropagationResult
 from terrafix.messages import (
     Coasted,
     CovarianceMode,
@@ -52,7 +52,7 @@ class EstimatorNode:
     """``began_ns``: of the flight, when this process was started again in it: since then the vehicle has flown on.
     ``last``: what the process before it said last."""
 
-    def __init__(self, began_ns: int | None = None, last: Last | None = None) -> None:
+    def __init__(self, began_ns: int | None = None, last: EstimatorCheckpoint | None = None) -> None:
         self._began_ns, self._resumed_from = began_ns, last
         self._origin: Origin | None = None  # as it was said
         self._start = None if last is None else last.start  # ... and what was said of the start since
@@ -61,7 +61,7 @@ class EstimatorNode:
         self._estimator: Estimator | None = None
         self._frame: LocalFrame | None = None
         self._telemetry = Telemetry()
-        self._righted = Righted(self._telemetry, None if last is None else last.estimate.t_ns)
+        self._righted = AhrsCorrectionMonitor(self._telemetry, None if last is None else last.estimate.t_ns)
         self._attitude: Attitude | None = None  # at the newest frame
         self._coasted: list[Coasted] = []  # before there was an Origin: the link may be there before vision is
         self._mode = CovarianceMode.MARGINALS
@@ -121,7 +121,7 @@ class EstimatorNode:
     def tick(self, now_ns: int) -> Iterable[Message]:
         return ()
 
-    def _begin(self, origin: Origin, known: Known | None) -> Estimator:
+    def _begin(self, origin: Origin, known: NavPrior | None) -> Estimator:
         """Anew."""
         self._estimator = Estimator(origin, known)
         return self._estimator
@@ -137,15 +137,15 @@ class EstimatorNode:
         """With the first frame after a Start. A vehicle that still stands is where that says; another one was there."""
         assert self._origin is not None and self._frame is not None
         self._starts, self._predicted, self._started_with = False, None, frame_id
-        known = Known.told(start, self._frame, (t_ns if stands else start.t_ns) * 1e-9)
+        known = NavPrior.told(start, self._frame, (t_ns if stands else start.t_ns) * 1e-9)
         return self._begin(begun(self._origin, start), known)
 
-    def _known(self, origin: Origin, frame: LocalFrame) -> Known | None:
+    def _known(self, origin: Origin, frame: LocalFrame) -> NavPrior | None:
         if self._began_ns is None:
             return None
         if self._resumed_from is not None:
-            return Known.of(self._resumed_from, frame, origin.camera)
-        return Known.start(origin, self._began_ns * 1e-9)
+            return NavPrior.of(self._resumed_from, frame, origin.camera)
+        return NavPrior.start(origin, self._began_ns * 1e-9)
 
     def _begun(self) -> Iterable[Message]:
         """All frames that wait, when the first of them can be begun with. Vision may be there before the link is, after
@@ -229,7 +229,7 @@ class EstimatorNode:
         unknown = attitude.yaw_rad is None or attitude.agl_m is None
         return unknown and 0 <= t_ns - self._first_ns < WORDS_WAIT_NS
 
-    def _slow_errors(self, placed: Placed, estimator: Estimator) -> Iterable[SlowErrors]:
+    def _slow_errors(self, placed: FrameState, estimator: Estimator) -> Iterable[SlowErrors]:
         """Not before a map fix: until then they are what was assumed. Not for a computer that is hot."""
         t_ns = round(placed.t_s * 1e9)
         hot = self._mode is CovarianceMode.JACOBIAN
@@ -254,7 +254,10 @@ class EstimatorNode:
             return
         if estimator.last_fix_s is not None:
             return
-        if estimator.coasted(Coast.of(said, frame), self._attitude, self._righted.felt) and estimator.last is not None:
+        if (
+            estimator.coasted(DeadReckoning.of(said, frame), self._attitude, self._righted.felt)
+            and estimator.last is not None
+        ):
             yield self._estimate(estimator.last, said.t_ns)
 
     def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
@@ -292,7 +295,9 @@ class EstimatorNode:
             self._tracked = self._tracked or (own and result.verdict is Verdict.ACCEPTED)
             yield self._estimate(estimator.last, match.t_ns)
 
-    def _prediction(self, odometry: Odometry, advance: Advance, estimator: Estimator, seen: bool) -> Prediction:
+    def _prediction(
+        self, odometry: Odometry, advance: PropagationResult, estimator: Estimator, seen: bool
+    ) -> Prediction:
         """``seen``: the frame before had a Prediction, too. After some that had none, what is known by now of the way
         since the last one counts: odometry that begins again tells of the velocity in between. So does what the
         covariance has grown by."""
@@ -318,7 +323,7 @@ class EstimatorNode:
             start_ns=max(0 if self._start is None else self._start.t_ns, round(estimator.led_s * 1e9)),
         )
 
-    def _estimate(self, placed: Placed, t_ns: int) -> NavEstimate:
+    def _estimate(self, placed: FrameState, t_ns: int) -> NavEstimate:
         estimator, frame = self._estimator, self._frame
         assert estimator is not None and frame is not None
         p = placed.pose.translation()
@@ -387,8 +392,8 @@ def _odometry_verdict(odometry: Odometry, verdict: Verdict, detail: str = "") ->
 
 
 def make_node(ctx: NodeContext) -> EstimatorNode:
-    return EstimatorNode(ctx.epoch_ns, kept(ctx.kept))
+    return EstimatorNode(ctx.epoch_ns, load_checkpoint(ctx.checkpoint))
 
 
 def make_edge(ctx: NodeContext) -> Edge | None:
-    return None if ctx.kept is None else Keeper(ctx.kept)
+    return None if ctx.checkpoint is None else CheckpointWriter(ctx.checkpoint)

@@ -8,28 +8,28 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
-from terrafix.link import gps_time
-from terrafix.link.admission import Admission
-from terrafix.link.budget import LineBudget
-from terrafix.link.coast import Coast
-from terrafix.link.connection import Connection
-from terrafix.link.diagnosis import Heard
-from terrafix.link.ground_links import GroundLinks
-from terrafix.link.hints import Hints
-from terrafix.link.kept import AutopilotKeeper
-from terrafix.link.local_pose import Place
-from terrafix.link.named_values import NamedValues
-from terrafix.link.outputs import Outputs
-from terrafix.link.partner import Partner
-from terrafix.link.resume import Resume
-from terrafix.link.served import AUTOPILOT_COMPONENT, Role
-from terrafix.link.side_output import open_side_outputs
-from terrafix.link.source_switch import SourceSwitch
+from terrafix.link.admission.admission import Admission
+from terrafix.link.admission.served_autopilot import AUTOPILOT_COMPONENT, Role
+from terrafix.link.autopilot.autopilot import AutopilotPeer
+from terrafix.link.autopilot.autopilot_prior import AutopilotPrior
+from terrafix.link.autopilot.checkpoint import CheckpointWriter
+from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder
+from terrafix.link.gnss.source_switch import SourceSwitch
+from terrafix.link.ground_station.links import GroundLinks
+from terrafix.link.ground_station.named_values import NamedValues
+from terrafix.link.ground_station.position_prior import Hints
+from terrafix.link.mavlink.bandwidth import LinkBandwidth
+from terrafix.link.mavlink.connection import Connection
+from terrafix.link.mavlink.diagnosis import Heard
+from terrafix.link.mavlink.message_rates import STREAMS_HZ, Streams, wanted_of
+from terrafix.link.mavlink.timesync import TimeSync
+from terrafix.link.mavlink.transport import Address, Transport, open_at_start
+from terrafix.link.output import gps_time
+from terrafix.link.output.odometry import Place
+from terrafix.link.output.selection import Outputs
+from terrafix.link.output.serial_outputs import open_side_outputs
+from terrafix.link.pilot_text.statustext import WARNING, statustext
 from terrafix.link.status import Status, StatusLog
-from terrafix.link.streams import STREAMS_HZ, Streams, wanted_of
-from terrafix.link.timesync import TimeSync
-from terrafix.link.transport import Address, Transport, open_at_start
-from terrafix.link.words import WARNING, words
 from terrafix.messages import (
     GpsInput,
     LinkStatus,
@@ -55,7 +55,7 @@ def open_edge(config: LinkSection, kept: Path | None = None) -> "MavlinkEdge":
     """Opens the device of the configuration. ``kept``: see AutopilotKeeper. Raises LinkError with what to check,
     ConfigError for a signing key."""
     transport = open_at_start(config.device, config.baud)
-    return MavlinkEdge(config, transport, time.time_ns, tell=StatusLog().tell, keeper=AutopilotKeeper(kept))
+    return MavlinkEdge(config, transport, time.time_ns, tell=StatusLog().tell, keeper=CheckpointWriter(kept))
 
 
 class MavlinkEdge:
@@ -68,31 +68,31 @@ class MavlinkEdge:
         wall_clock_ns: Callable[[], int],
         *,
         tell: Callable[[LinkStatus], None] = lambda _: None,
-        keeper: AutopilotKeeper | None = None,
+        keeper: CheckpointWriter | None = None,
     ) -> None:
         """``tell`` gets every LinkStatus, for the log."""
-        self._keeper = keeper or AutopilotKeeper(None)
+        self._keeper = keeper or CheckpointWriter(None)
         self._takes_over = self._keeper.found is not None
         self._config = config
         self._tell = tell
         self._wall_clock_ns = wall_clock_ns
         self._connection = Connection(config, transport, wall_clock_ns)
         self._timesync = TimeSync()
-        self._partner = Partner(self._timesync)
+        self._partner = AutopilotPeer(self._timesync)
         found = self._keeper.found
         self._admission = Admission(config, listens=self._connection.listens, found=found)
         self._served = self._admission.served
         self._reboots = 0  # that telemetry knows of
         baud = config.baud if config.device.startswith("/") else None
-        self._budget = LineBudget(baud, signed=self._connection.signed)
+        self._budget = LinkBandwidth(baud, signed=self._connection.signed)
         self._streams = Streams(self._budget.fitting(STREAMS_HZ))
         self._outputs = Outputs(config.outputs, config.gps_id)
         self._side_outputs = open_side_outputs(config)
         self._hints = Hints(config.sysid, config.compid)
         self._ground = GroundLinks(config, wall_clock_ns, self._hints)
         self._switch = SourceSwitch(config.gps_id)
-        self._resume = Resume()
-        self._coast = Coast(None if found is None else found.last, self._partner.telemetry.measured_ns)
+        self._resume = AutopilotPrior()
+        self._coast = DeadReckoningRecorder(None if found is None else found.last, self._partner.telemetry.measured_ns)
         self._named_values = NamedValues()
         self._start: Place | None = None  # of the flight
         self._heard = Heard()
@@ -247,7 +247,7 @@ class MavlinkEdge:
 
     def _warn(self, text: str, now_ns: int) -> StatusText:
         """-> what was sent to the pilot, for the record."""
-        said = words(now_ns, WARNING, text)
+        said = statustext(now_ns, WARNING, text)
         self.heard(said)
         return said
 

@@ -4,19 +4,20 @@ from collections.abc import Iterable, Iterator
 
 from terrafix.core.config import GnssMode
 from terrafix.core.node import Edge, NodeContext
-from terrafix.link import fix, record
-from terrafix.link.announce import Announcer
-from terrafix.link.asking import Asking
-from terrafix.link.carry import Attitudes, carry
-from terrafix.link.filter_watch import FilterWatch
-from terrafix.link.gate import EstimateGate
-from terrafix.link.gnss_start import GnssStarts
-from terrafix.link.gnss_watch import GnssWatch
-from terrafix.link.gps_time import LatchedClock
-from terrafix.link.kept import kept
-from terrafix.link.map_offset import MapOffsets
-from terrafix.link.pacer import Pacer
-from terrafix.link.words import CRITICAL, INFO, NOTICE, WARNING, fault_words, words
+from terrafix.link.autopilot.checkpoint import load_checkpoint
+from terrafix.link.autopilot.ekf_status_monitor import FilterWatch
+from terrafix.link.gnss.initial_position import GnssStarts
+from terrafix.link.gnss.map_registration import MapOffsets
+from terrafix.link.gnss.monitor import GnssMonitor
+from terrafix.link.ground_station.prior_request import PriorRequest
+from terrafix.link.integrity import fix_type
+from terrafix.link.integrity.estimate_gate import EstimateGate
+from terrafix.link.integrity.output_predictor import Attitudes, predict_to
+from terrafix.link.output import gps_report
+from terrafix.link.output.gps_time import LatchedClock
+from terrafix.link.output.send_schedule import SendSchedule
+from terrafix.link.pilot_text.debounce import Debounce
+from terrafix.link.pilot_text.statustext import CRITICAL, INFO, NOTICE, WARNING, fault_words, statustext
 from terrafix.messages import (
     CalibrationFault,
     FilterStatus,
@@ -43,7 +44,7 @@ TICK_HZ = 50.0  # as in the process table
 
 
 def make_node(ctx: NodeContext) -> "LinkNode":
-    link, before = ctx.config.link, kept(ctx.kept)
+    link, before = ctx.config.link, load_checkpoint(ctx.checkpoint)
     offsets = MapOffsets(None if before is None else before.map_offset) if link.map_offset else None
     clock = LatchedClock(None if before is None else before.unix_minus_monotonic_ns)
     return LinkNode(link.rate_hz, link.gnss, gnss_start=link.gnss_start, map_offsets=offsets, clock=clock)
@@ -52,9 +53,9 @@ def make_node(ctx: NodeContext) -> "LinkNode":
 def make_edge(ctx: NodeContext) -> Edge:
     """For a process of its own. Raises LinkError when the device cannot be opened, ConfigError."""
     from terrafix.link.edge import open_edge  # replay has no edge and need not load MAVLink
-    from terrafix.link.priority import first_in_line
+    from terrafix.link.output.realtime_priority import first_in_line
 
-    edge = open_edge(ctx.config.link, ctx.kept)
+    edge = open_edge(ctx.config.link, ctx.checkpoint)
     first_in_line()
     return edge
 
@@ -72,13 +73,13 @@ class LinkNode:
         map_offsets: MapOffsets | None = None,
         clock: LatchedClock | None = None,
     ) -> None:
-        self._pacer = Pacer(rate_hz, TICK_HZ)
+        self._pacer = SendSchedule(rate_hz, TICK_HZ)
         self._gate = EstimateGate()
-        self._fix = fix.FixGate()
+        self._fix = fix_type.FixGate()
         self._attitudes = Attitudes()
-        self._gnss = GnssWatch(gnss, map_offsets)
+        self._gnss = GnssMonitor(gnss, map_offsets)
         self._starts = GnssStarts(wanted=gnss_start)
-        self._asking = Asking()
+        self._asking = PriorRequest()
         self._filter = FilterWatch()
         self._armed: bool | None = None
         self._start_holds = False  # the vehicle was seen on the ground, or the map has confirmed where it is
@@ -92,10 +93,10 @@ class LinkNode:
         self._band = ThermalBand.NORMAL
         self._rung = 0
         self._silent = False
-        self._no_fix_because: fix.Why | None = None
+        self._no_fix_because: fix_type.NoFixReason | None = None
         self._said_started = False
-        self._said_fix = Announcer[bool]()
-        self._said_rung = Announcer[int]()
+        self._said_fix = Debounce[bool]()
+        self._said_rung = Debounce[int]()
         self._said_rung.told = 0
         self._climbed = 0  # the highest rung since the last map fix
 
@@ -132,7 +133,7 @@ class LinkNode:
             case HintVerdict():
                 return [self._on_hint(message)]
             case CalibrationFault():
-                return [words(message.t_ns, CRITICAL if message.active else INFO, fault_words(message))]
+                return [statustext(message.t_ns, CRITICAL if message.active else INFO, fault_words(message))]
         return []
 
     def tick(self, now_ns: int) -> Iterable[Message]:
@@ -178,7 +179,7 @@ class LinkNode:
     def _on_estimator_event(self, event: ProcessEvent) -> list[Message]:
         if event.event in ("died", "stuck", "gave_up"):
             self._estimator_gone = f"estimator {event.event.replace('_', ' ')}"
-            return [words(event.t_ns, CRITICAL, self._estimator_gone)]
+            return [statustext(event.t_ns, CRITICAL, self._estimator_gone)]
         if event.event in ("started", "restarted"):
             self._estimator_gone = ""
         return []
@@ -189,22 +190,22 @@ class LinkNode:
         self._band = health.band
         severity = {ThermalBand.NORMAL: INFO, ThermalBand.HOT: NOTICE, ThermalBand.CRITICAL: WARNING}[health.band]
         degrees = "" if health.temperature_c is None else f", {health.temperature_c:.0f} C"
-        return [words(health.t_ns, severity, f"computer is {health.band}{degrees}")]
+        return [statustext(health.t_ns, severity, f"computer is {health.band}{degrees}")]
 
     def _on_hint(self, hint: HintVerdict) -> StatusText:
         if hint.verdict is Verdict.ACCEPTED:
             self._asking.hinted(hint.t_ns)
-        return words(hint.t_ns, INFO if hint.verdict is Verdict.ACCEPTED else WARNING, hint.text)
+        return statustext(hint.t_ns, INFO if hint.verdict is Verdict.ACCEPTED else WARNING, hint.text)
 
     def _send(self, now_ns: int) -> Iterator[Message]:
         yield from self._climb_ladder(now_ns)
         if self._armed is not False and (question := self._asking.due(now_ns)):  # on the ground nobody is lost
-            yield words(now_ns, WARNING, question)
-        silent = self._heard_ns is not None and now_ns - self._heard_ns > fix.SILENT_AFTER_NS
+            yield statustext(now_ns, WARNING, question)
+        silent = self._heard_ns is not None and now_ns - self._heard_ns > fix_type.SILENT_AFTER_NS
         if silent != self._silent:
             self._silent = silent
             if silent:
-                yield words(now_ns, CRITICAL, f"silent: no estimate for {fix.SILENT_AFTER_NS / 1e9:.0f} s")
+                yield statustext(now_ns, CRITICAL, f"silent: no estimate for {fix_type.SILENT_AFTER_NS / 1e9:.0f} s")
         if silent:
             self._fix.lower()
             yield from self._gnss.tick(now_ns, good=False)
@@ -213,30 +214,32 @@ class LinkNode:
         yield gps
         good = self._no_fix_because is None
         yield from self._gnss.tick(now_ns, good=good)
-        if self._no_fix_because is fix.STARTED_IN_FLIGHT and not self._said_started:
+        if self._no_fix_because is fix_type.STARTED_IN_FLIGHT and not self._said_started:
             self._said_started = True
-            yield words(now_ns, WARNING, "started in flight, searching the map")
+            yield statustext(now_ns, WARNING, "started in flight, searching the map")
         for uses, text in self._filter.look(now_ns, good=good):
-            yield words(now_ns, INFO if uses else WARNING, text)
+            yield statustext(now_ns, INFO if uses else WARNING, text)
         if self._said_fix.due(good, now_ns, clears=good):
             because = self._no_fix_because
             yield (
-                words(now_ns, INFO, "3D fix") if because is None else words(now_ns, WARNING, f"no fix: {because.short}")
+                statustext(now_ns, INFO, "3D fix")
+                if because is None
+                else statustext(now_ns, WARNING, f"no fix: {because.short}")
             )
 
     def _climb_ladder(self, now_ns: int) -> Iterator[StatusText]:
         age_s = self._unanchored_s(now_ns)
-        self._rung = 0 if age_s is None else fix.rung(age_s)
-        after_s, _, severity = fix.LADDER[self._rung]
+        self._rung = 0 if age_s is None else fix_type.degradation_level(age_s)
+        after_s, _, severity = fix_type.DEGRADATION_LEVELS[self._rung]
         if self._rung > self._climbed:
             urgent = severity <= WARNING
             if self._said_rung.due(self._rung, now_ns, urgent=urgent):
-                yield words(now_ns, severity, f"no map fix for {after_s:.0f} s")
+                yield statustext(now_ns, severity, f"no map fix for {after_s:.0f} s")
             self._climbed = self._rung
         elif self._rung == 0:
             self._climbed = 0
             if self._said_rung.due(0, now_ns, clears=True):
-                yield words(now_ns, INFO, "map fix again")
+                yield statustext(now_ns, INFO, "map fix again")
 
     def _unanchored_s(self, now_ns: int) -> float | None:
         """Seconds without a map fix; None: nothing was ever believed."""
@@ -246,32 +249,32 @@ class LinkNode:
         estimate = self._gate.accepted
         if estimate is None:
             nobody = self._estimator_gone or "no estimate yet"
-            return self._no_fix(now_ns, fix.Why(nobody, nobody), -1.0)
+            return self._no_fix(now_ns, fix_type.NoFixReason(nobody, nobody), -1.0)
         sent, map_offset_m = self._gnss.less_map_offset(estimate, now_ns)
-        carried = carry(sent, now_ns, self._attitudes)
-        horizontal_m, vertical_m, speed_mps = fix.reported_accuracy(carried, self._rung)
+        carried = predict_to(sent, now_ns, self._attitudes)
+        horizontal_m, vertical_m, speed_mps = fix_type.reported_accuracy(carried, self._rung)
         if self._gate.holding:
-            why: fix.Why | None = fix.Why(self._gate.holding, "the position has jumped")
+            why: fix_type.NoFixReason | None = fix_type.NoFixReason(self._gate.holding, "the position has jumped")
             self._fix.lower()
         elif self._armed and not self._start_holds:
-            why = fix.STARTED_IN_FLIGHT
+            why = fix_type.STARTED_IN_FLIGHT
             self._fix.lower()
         else:
             why = self._fix.judge(carried, horizontal_m, self._rung, estimate.source_label)
             if why is not None and self._estimator_gone:
-                why = fix.Why(self._estimator_gone, self._estimator_gone)
+                why = fix_type.NoFixReason(self._estimator_gone, self._estimator_gone)
         if why is not None:
             return self._no_fix(now_ns, why, carried.age_s * 1e3)
         self._no_fix_because = None
-        caution = record.Caution(self._rung, self._unanchored_s(now_ns))
+        caution = gps_report.Degradation(self._rung, self._unanchored_s(now_ns))
         accuracy = horizontal_m, vertical_m, speed_mps
         week, resets = self._week(carried.t_ns), self._gate.steps
-        return record.with_fix(carried, accuracy, week, caution, map_offset_m, resets=resets)
+        return gps_report.with_fix(carried, accuracy, week, caution, map_offset_m, resets=resets)
 
-    def _no_fix(self, now_ns: int, why: fix.Why, age_ms: float) -> GpsInput:
+    def _no_fix(self, now_ns: int, why: fix_type.NoFixReason, age_ms: float) -> GpsInput:
         self._no_fix_because = why
-        caution = record.Caution(self._rung, self._unanchored_s(now_ns))
-        return record.no_fix(now_ns, why.text, age_ms, self._ground_amsl_m, self._week(now_ns), caution)
+        caution = gps_report.Degradation(self._rung, self._unanchored_s(now_ns))
+        return gps_report.no_fix(now_ns, why.text, age_ms, self._ground_amsl_m, self._week(now_ns), caution)
 
     def _week(self, t_ns: int) -> tuple[int, int]:
         week = self._clock.week(t_ns)

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 from terrafix.core import logs
 from terrafix.core.config import LinkSection
-from terrafix.link.admission import Admission
-from terrafix.link.budget import LineBudget
-from terrafix.link.connection import Connection
-from terrafix.link.diagnosis import Heard, heard_on_ground, why_no_autopilot
-from terrafix.link.ground_links import GroundLinks
-from terrafix.link.outputs import Outputs
-from terrafix.link.partner import Partner
-from terrafix.link.side_output import SideOutput
-from terrafix.link.source_switch import SourceSwitch
-from terrafix.link.streams import Streams
-from terrafix.link.timesync import TimeSync
+from terrafix.link.admission.admission import Admission
+from terrafix.link.autopilot.autopilot import AutopilotPeer
+from terrafix.link.gnss.source_switch import SourceSwitch
+from terrafix.link.ground_station.links import GroundLinks
+from terrafix.link.mavlink.bandwidth import LinkBandwidth
+from terrafix.link.mavlink.connection import Connection
+from terrafix.link.mavlink.diagnosis import Heard, heard_on_ground, why_no_autopilot
+from terrafix.link.mavlink.message_rates import Streams
+from terrafix.link.mavlink.timesync import TimeSync
+from terrafix.link.output.selection import Outputs
+from terrafix.link.output.serial_outputs import SideOutput
 from terrafix.messages import LinkStatus
 
 NS_PER_S = 1_000_000_000
@@ -31,11 +31,11 @@ class Status:
 
     config: LinkSection
     wire: Connection
-    partner: Partner
+    partner: AutopilotPeer
     admission: Admission
     timesync: TimeSync
     streams: Streams
-    budget: LineBudget
+    budget: LinkBandwidth
     outputs: Outputs
     side_outputs: list[SideOutput]
     switch: SourceSwitch

@@ -15,8 +15,8 @@ import msgspec
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
 from terrafix.core.frames import FrameWriter
+from terrafix.core.initial_position import Bounds, map_bounds, placed, start_is_unknown
 from terrafix.core.node import Edge, NodeContext
-from terrafix.core.start import Bounds, map_bounds, placed, start_is_unknown
 from terrafix.messages import Message, SourceEnded
 from terrafix.vision.sources import Shot, Source, open_configured
 

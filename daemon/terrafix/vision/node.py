@@ -6,7 +6,7 @@ from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Edge, FrameStore, NodeContext
 from terrafix.messages import Frame, Message, Odometry, Origin, Verdict
 from terrafix.vision.edge import make_edge as make_source_edge
-from terrafix.vision.odometry import FrameTracker
+from terrafix.vision.feature_tracker import FrameTracker
 from terrafix.vision.repeated_picture import PictureHistory, Repeat
 
 

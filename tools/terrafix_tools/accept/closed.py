@@ -12,7 +12,7 @@ import numpy as np
 from terrafix.core.config import Config, LinkSection
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
-from terrafix.link.fix import FIX_3D
+from terrafix.link.integrity.fix_type import FIX_3D
 from terrafix.messages import Frame, GpsInput
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import Shot

@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 import typer
 
-from terrafix.anchor.map_format import CE90_SIGMAS
 from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, TerrafixError
 from terrafix.core.node import Node, NodeContext
+from terrafix.map.format import CE90_SIGMAS
 from terrafix.messages import Frame, Message
 from terrafix.vision.sources import Source
 from terrafix_tools.accept.criteria import judge, unmeasured

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
-from terrafix.core.start import SEARCHED_START_M
-from terrafix.link.asking import Asking
+from terrafix.core.initial_position import SEARCHED_START_M
+from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, NavEstimate, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.epipolar import reprojection_error
@@ -86,7 +86,7 @@ def asks(e: Evidence) -> Measured:
     if wanted_ns is None:
         worst_m = max((_worst_sigma_m(estimate) for estimate in said), default=0.0)
         return Measured(None, f"its place was never lost: it claims {worst_m:.0f} m at worst")
-    asking, searches = Asking(), list(e.searches)
+    asking, searches = PriorRequest(), list(e.searches)
     for estimate in said:
         while searches and searches[0].t_ns <= estimate.t_ns:
             asking.step = searches.pop(0).step

@@ -11,11 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.rectify import rectify
+from terrafix.anchor.matching.orthorectify import rectify
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.node import Image
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix.messages import Origin, Prediction
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import open_source

@@ -25,7 +25,7 @@ from terrafix.core.camera import Mount
 from terrafix.core.errors import EvaluationError, OutputError, TerrafixError, UsageError
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.estimator.integrity.time_offset import PRIOR_S
-from terrafix.estimator.middle import Middle
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.messages import Camera, LearntLens, NavEstimate, Origin, SlowErrors
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import ESTIMATES, Row, read_rows
@@ -205,7 +205,7 @@ def _terms(replay: Path) -> np.ndarray:
 
 def _principal_m2(said: NavEstimate, camera: Camera, lens: LearntLens | None) -> float:
     lever = said.agl_m * (rot_from_quat(said.q_w_b) @ Mount.of(camera).r_b_c())[:2, :2]
-    return float(np.trace(Middle(camera, lens).aside(lever)[1])) / 2.0
+    return float(np.trace(PrincipalPointFilter(camera, lens).aside(lever)[1])) / 2.0
 
 
 def main(arguments: list[str] | None = None) -> None:

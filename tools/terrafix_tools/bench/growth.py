@@ -16,10 +16,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from terrafix.estimator.filter import Estimator
-from terrafix.estimator.graph import PoseGraph
-from terrafix.estimator.past import Past
-from terrafix.estimator.telemetry import Telemetry
+from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.graph.marginalized import MarginalizedHistory
+from terrafix.estimator.graph.pose_graph import PoseGraph
+from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Imu
 from terrafix_tools.bench.flights import spread
 from terrafix_tools.bench.stream import ORIGIN, spoken
@@ -58,7 +58,7 @@ class _TimedGraph(PoseGraph):
         self.spent_ms += (time.process_time() - began_s) * 1e3
 
 
-class _WholeFlight(Past):
+class _WholeFlight(MarginalizedHistory):
     """Every factor of the flight, linear, beside the few that the estimator keeps: for the queries from scratch."""
 
     def __init__(self) -> None:

@@ -24,15 +24,15 @@ import msgspec
 import numpy as np
 import typer
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import load
 from terrafix.core.errors import SourceError, TerrafixError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.initial_position import placed
 from terrafix.core.node import NodeContext
-from terrafix.core.shell import InProcessShell
-from terrafix.core.start import placed
+from terrafix.map.package import MapPackage
 from terrafix.messages import MapMatch, Message, NavEstimate, Origin
+from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay import FRAMES_KEPT, make_nodes, map_cache_dir

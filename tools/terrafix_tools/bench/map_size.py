@@ -19,11 +19,11 @@ import rasterio
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from terrafix.anchor.belief import Belief, cell_for
-from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.matcher import FrameMatcher, View
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
+from terrafix.anchor.matching.point_mass_filter import Belief, cell_for
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features import open_describer
 from terrafix_tools.bench.flights import spread
 from terrafix_tools.mapping.build import build

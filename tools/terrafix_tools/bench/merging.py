@@ -19,9 +19,9 @@ from rich.table import Table
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.estimator.fragments import Anchor, Fragment, Merged
-from terrafix.estimator.similarity import merge
 from terrafix_tools.bench import merging_baseline
+from terrafix_tools.finalise.sim3_pose_graph import merge
+from terrafix_tools.finalise.submap_types import AbsoluteConstraint, MergedSubmaps, Submap
 
 RESULT = "merging.json"
 FRAGMENTS, ANCHOR_EVERY, WRONG_SHARE, WRONG_M = 10, 10, 0.05, 350.0
@@ -36,13 +36,13 @@ SCALE_WALK = 0.002
 class Torn:
     """A flight in pieces; truth is ``r_w_c`` and ``p_w_m`` of every fragment, ``wrong`` (A,) says of every anchor."""
 
-    fragments: list[Fragment]
-    anchors: list[Anchor]
+    fragments: list[Submap]
+    anchors: list[AbsoluteConstraint]
     wrong: np.ndarray
     r_w_c: list[np.ndarray]
     p_w_m: list[np.ndarray]
 
-    def right_anchors(self) -> list[Anchor]:
+    def right_anchors(self) -> list[AbsoluteConstraint]:
         return [a for a, wrong in zip(self.anchors, self.wrong, strict=True) if not wrong]
 
 
@@ -67,13 +67,15 @@ def torn_flight(
         for k in range(f % anchor_every, keyframes, anchor_every):
             error = ANCHOR_SIGMAS * rng.normal(size=6)
             r, p = r_w[at][k], p_w[at][k]
-            anchors.append(Anchor(f, k, r @ exp_so3(error[:3]), p + r @ error[3:], np.diag(ANCHOR_SIGMAS**2)))
+            anchors.append(
+                AbsoluteConstraint(f, k, r @ exp_so3(error[:3]), p + r @ error[3:], np.diag(ANCHOR_SIGMAS**2))
+            )
     wrong = np.zeros(len(anchors), bool)
     wrong[rng.permutation(len(anchors))[: round(wrong_share * len(anchors))]] = True
     for i in np.flatnonzero(wrong):
         a, towards = anchors[i], float(rng.uniform(0.0, 2.0 * np.pi))
         away_m = WRONG_M * np.array([np.cos(towards), np.sin(towards), 0.0])
-        anchors[i] = Anchor(a.fragment, a.keyframe, a.r_w_c, a.p_c_in_w_m + away_m, a.cov)
+        anchors[i] = AbsoluteConstraint(a.fragment, a.keyframe, a.r_w_c, a.p_c_in_w_m + away_m, a.cov)
     return Torn(pieces, anchors, wrong, truth_r, truth_p)
 
 
@@ -90,7 +92,7 @@ def _course(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
     return r, p
 
 
-def _fragment(rng: np.random.Generator, r_w: np.ndarray, p_w: np.ndarray, scale_known: bool) -> Fragment:
+def _fragment(rng: np.random.Generator, r_w: np.ndarray, p_w: np.ndarray, scale_known: bool) -> Submap:
     n = len(r_w)
     scale = np.exp(np.cumsum(SCALE_WALK * rng.normal(size=n)))
     scale *= 1.0 if scale_known else float(np.exp(rng.normal(0.0, 0.5)))
@@ -105,16 +107,16 @@ def _fragment(rng: np.random.Generator, r_w: np.ndarray, p_w: np.ndarray, scale_
         r_f[i] = r_f[i - 1] @ r_step @ exp_so3(error[:3])
         p_f[i] = p_f[i - 1] + r_f[i - 1] @ p_step
     parent = np.arange(-1, n - 1)
-    return Fragment(r_f, p_f, parent, np.broadcast_to(cov, (n, 6, 6)), 0.01 if scale_known else None, SCALE_WALK)
+    return Submap(r_f, p_f, parent, np.broadcast_to(cov, (n, 6, 6)), 0.01 if scale_known else None, SCALE_WALK)
 
 
-def positions(fragments: list[Fragment], anchors: list[Anchor]) -> list[np.ndarray]:
+def positions(fragments: list[Submap], anchors: list[AbsoluteConstraint]) -> list[np.ndarray]:
     """(N, 3) of the keyframes of every fragment, as merged; not a number where it was not placed."""
     placed = merge(fragments, anchors).placements
     return [np.full((len(f), 3), np.nan) if p is None else p.p_c_in_w_m for f, p in zip(fragments, placed, strict=True)]
 
 
-def pose_errors(torn: Torn, merged: Merged) -> tuple[np.ndarray, np.ndarray]:
+def pose_errors(torn: Torn, merged: MergedSubmaps) -> tuple[np.ndarray, np.ndarray]:
     """(M, 6) tangent of the error, of placed keyframes, and the covariances (M, 6, 6) that were claimed."""
     errors, covs = [], []
     for placed, r_true, p_true in zip(merged.placements, torn.r_w_c, torn.p_w_m, strict=True):
@@ -130,7 +132,9 @@ def measure(keyframes: int) -> dict[str, Any]:
     """``keyframes`` of the whole flight, in FRAGMENTS pieces."""
     torn = torn_flight(1, keyframes=keyframes // FRAGMENTS)
     right = torn.right_anchors()
-    ways: list[tuple[str, Callable[[list[Fragment], list[Anchor]], list[np.ndarray]], list[Anchor]]] = [
+    ways: list[
+        tuple[str, Callable[[list[Submap], list[AbsoluteConstraint]], list[np.ndarray]], list[AbsoluteConstraint]]
+    ] = [
         ("merge", positions, torn.anchors),
         ("merge, no wrong anchors", positions, right),
         (merging_baseline.METHOD, merging_baseline.positions, torn.anchors),

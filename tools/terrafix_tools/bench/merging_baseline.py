@@ -3,14 +3,14 @@
 import gtsam
 import numpy as np
 
-from terrafix.estimator.consensus import place
-from terrafix.estimator.fragments import Anchor, Fragment
+from terrafix_tools.finalise.sim3_consensus import place
+from terrafix_tools.finalise.submap_types import AbsoluteConstraint, Submap
 
 METHOD = "gtsam.LevenbergMarquardtOptimizer, no robust loss"
 LOOSE = np.array([1e-2, 1e-2, 1e-2, 1e-6, 1e-6, 1e-6, 0.1])  # precisions of a prior that says nothing
 
 
-def positions(fragments: list[Fragment], anchors: list[Anchor]) -> list[np.ndarray]:
+def positions(fragments: list[Submap], anchors: list[AbsoluteConstraint]) -> list[np.ndarray]:
     """(N, 3) of the keyframes of every fragment, metres. It begins where the robust merge begins, too."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     first_key = np.cumsum([0, *(len(f) for f in fragments)]).tolist()

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from terrafix.anchor.belief import Belief, cell_for
-from terrafix.anchor.map_package import MapPackage
-from terrafix.anchor.matcher import FrameMatcher, View
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
+from terrafix.anchor.matching.point_mass_filter import Belief, cell_for
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Config
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.node import Image
 from terrafix.estimator.node import EstimatorNode
 from terrafix.link.node import TICK_HZ, LinkNode
+from terrafix.map.package import MapPackage
 from terrafix.messages import (
     Health,
     MapMatch,
@@ -32,7 +32,7 @@ from terrafix.messages import (
     WallClock,
 )
 from terrafix.recorder.reader import read_flight
-from terrafix.vision.odometry import FrameTracker
+from terrafix.vision.feature_tracker import FrameTracker
 from terrafix.vision.sources import open_source
 from terrafix_engines.features import open_describer
 from terrafix_tools.bench.flights import run_part, spread

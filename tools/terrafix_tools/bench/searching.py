@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 import typer
 
-from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.matcher import FrameMatcher, Hypothesis, View
-from terrafix.anchor.null_model import USUAL, FlightBudget
-from terrafix.anchor.retrieval import FINE_CELL_PER_AGL, MapSearch
-from terrafix.anchor.wide_search import BLOCK_CELLS, WideSearch, blocks_of
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
+from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, WideSearch, blocks_of
+from terrafix.anchor.relocalization.map_search import FINE_CELL_PER_AGL, MapSearch
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import TerrafixError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
+from terrafix.map.null_model import USUAL, FlightBudget
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 
 CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)

@@ -11,7 +11,7 @@ import numpy as np
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
-from terrafix.core.imu import GRAVITY_MPS2
+from terrafix.core.mavlink.imu import GRAVITY_MPS2
 from terrafix.messages import Camera, Imu, ImuSample, MapMatch, Odometry, Origin, VehicleState, Verdict
 
 FRAME_S, SPEED_MPS, HEIGHT_M = 0.5, 12.0, 100.0

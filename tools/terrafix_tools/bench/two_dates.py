@@ -22,13 +22,13 @@ import numpy as np
 import typer
 from pyproj import Transformer
 
-from terrafix.anchor.answer import ground_cov_m2
-from terrafix.anchor.map_package import MapPackage
+from terrafix.anchor.matching.match_message import ground_cov_m2
 from terrafix.anchor.node import AnchorNode
 from terrafix.core.config import load
 from terrafix.core.errors import MapError, TerrafixError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import local_crs, quat_from_rot, rot_from_quat
+from terrafix.map.package import MapPackage
 from terrafix.messages import Camera, MapMatch, Origin, Prediction, Verdict
 from terrafix_engines.features import open_describer
 from terrafix_engines.runtime import ModelFileError

@@ -22,21 +22,21 @@ import msgspec
 import numpy as np
 import typer
 
-from terrafix.anchor.map_package import MapPackage
-from terrafix.anchor.matcher import FrameMatcher
-from terrafix.anchor.null_model import TAIL_FROM, USUAL, FlightBudget, Tail, null_at
-from terrafix.anchor.retrieval import MapSearch
-from terrafix.anchor.tracks import NEW_EVIDENCE
-from terrafix.anchor.views import view_of
+from terrafix.anchor.matching.frame_matcher import FrameMatcher
+from terrafix.anchor.matching.predicted_view import view_of
+from terrafix.anchor.relocalization.hypothesis_tracker import NEW_EVIDENCE
+from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import load
 from terrafix.core.errors import TerrafixError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.initial_position import start_is_unknown
 from terrafix.core.node import Image, NodeContext
-from terrafix.core.shell import InProcessShell
-from terrafix.core.start import start_is_unknown
+from terrafix.map.null_model import TAIL_FROM, USUAL, FlightBudget, Tail, null_at
+from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, Prediction
+from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.mapping.build import ensure_package

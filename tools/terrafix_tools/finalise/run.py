@@ -16,17 +16,17 @@ from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame, yaw_of
 from terrafix.core.pose import exp_so3, tangent_to_world
-from terrafix.estimator.smoothing import Smoothed, smooth
-from terrafix.estimator.whole import Retold, Storyteller
 from terrafix.messages import Frame, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.reader import ReadResult, read_flight
 from terrafix.recorder.writer import RECORD_FORMAT, versions
 from terrafix_tools.estimates import NS
+from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
+from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.output import TABLE, FinalRow, write
 
 # What the estimator decided by; its own refinement at the end is what this is to be better than.
-HEARD = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.hears if t is not SourceEnded)
+HEARD = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.subscribes if t is not SourceEnded)
 
 Step = Callable[[str, int, int | None], None]
 
@@ -72,9 +72,9 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
     )
 
 
-def _told(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, FinalRow], list[Retold]]:
+def _told(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, FinalRow], list[FlightGraph]]:
     """-> a row for every frame, in order of arrival; the flights of the record."""
-    storyteller = Storyteller()
+    storyteller = FlightReplayer()
     rows: dict[int, FinalRow] = {}
     for _, _, message in read_flight(folder, result):
         if isinstance(message, Frame):
@@ -99,7 +99,7 @@ def _told(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, Final
     return rows, [flight for flight in storyteller.flights if flight.node_of]
 
 
-def _smoothed(flight: Retold, rows: dict[int, FinalRow], step: Step) -> dict[str, Any]:
+def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> dict[str, Any]:
     """Fills the rows of one flight. -> what the summary says of it."""
     try:
         found = smooth(flight, lambda done, of: step("smooth", done, of))
@@ -130,7 +130,7 @@ def _fill(row: FinalRow, found: Smoothed, node: int, frame: LocalFrame, r_b_c: n
     row.yaw_deg = math.degrees(yaw_of(r_w_c @ (r_b_c @ tilt).T)) % 360.0
 
 
-def _said(flight: Retold, found: Smoothed | None, not_placed: list[dict[str, Any]]) -> dict[str, Any]:
+def _said(flight: FlightGraph, found: Smoothed | None, not_placed: list[dict[str, Any]]) -> dict[str, Any]:
     believed = int(found.believed.sum()) if found else 0
     offsets = found.map_offset_m if found else {}
     tilt_deg = np.degrees(np.median(found.bias[:, :2], axis=0)) if found else None

@@ -11,9 +11,9 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.node import Edge, Node, NodeContext
-from terrafix.estimator.resume import Keeper
-from terrafix.link.gps_input import encode
+from terrafix.estimator.prior import CheckpointWriter
 from terrafix.link.node import TICK_HZ, LinkNode
+from terrafix.link.output.gps_input import encode
 from terrafix.messages import (
     CalibrationFault,
     GpsInput,
@@ -108,15 +108,15 @@ class RestartedEstimator:
 
     def __init__(self, ctx: NodeContext, node: Node, at: int) -> None:
         self._ctx, self._node, self._at = ctx, node, at
-        self._file = ctx.out_dir / "kept"
-        self._edge: Edge = Keeper(self._file)
+        self._file = ctx.out_dir / "checkpoint"
+        self._edge: Edge = CheckpointWriter(self._file)
         self._origin: Origin | None = None
 
     def on(self, message: Message) -> Iterable[Message]:
         if isinstance(message, Origin):
             self._origin = message
         if isinstance(message, Odometry) and message.frame_id == self._at and self._origin is not None:
-            again = replace(self._ctx, kept=self._file, epoch_ns=self._origin.t_ns)
+            again = replace(self._ctx, checkpoint=self._file, epoch_ns=self._origin.t_ns)
             self._node = make_nodes(again)["estimator"]
             yield from self._node.on(self._origin)
         self._edge.heard(message)

@@ -5,12 +5,12 @@ from pathlib import Path
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import LinkError, UsageError
-from terrafix.core.operator import Operator
-from terrafix.core.rundir import RunDir, living
 from terrafix.messages import HintVerdict, PositionHint
 from terrafix.processes import PROCESSES
+from terrafix.runtime.cli_client import Operator
+from terrafix.runtime.run_dir import RunDir, living
 
-HEARERS = [process.name for process in PROCESSES if PositionHint in process.hears]
+HEARERS = [process.name for process in PROCESSES if PositionHint in process.subscribes]
 HEARD_S = 20.0  # they look for an operator several times a second, an anchor that searches between two looks
 ANSWER_S = 10.0  # comes with the next frame
 RADIUS_M = (100.0, 100_000.0)

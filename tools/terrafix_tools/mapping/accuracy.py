@@ -20,10 +20,10 @@ from pathlib import Path
 
 import msgspec
 
-from terrafix.anchor.map_format import CE90_SIGMAS, Accuracy, Ce90Origin, Layer, accuracy_of
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import Map
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.format import CE90_SIGMAS, Accuracy, Ce90Origin, Layer, accuracy_of
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.overlap import Offset, register
 from terrafix_tools.mapping.rewrite import rewrite_manifest
 

@@ -15,9 +15,9 @@ import rasterio
 from pyproj import Transformer
 from rasterio.errors import RasterioError
 
-from terrafix.anchor.map_format import FORMAT_VERSION, IMAGERY_TABLE, Ce90Origin, DemGrid, Layer, Manifest, VectorTable
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError
+from terrafix.map.format import FORMAT_VERSION, IMAGERY_TABLE, Ce90Origin, DemGrid, Layer, Manifest, VectorTable
+from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.accuracy import estimate_into
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach

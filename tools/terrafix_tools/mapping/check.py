@@ -8,16 +8,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from terrafix.anchor.map_format import Ce90Origin, Layer, accuracy_of
-from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.matcher import MIN_SIDE_CELLS, FrameMatcher
-from terrafix.anchor.retrieval import CELL_PER_AGL
-from terrafix.anchor.tile_index import is_kept
+from terrafix.anchor.matching.frame_matcher import MIN_SIDE_CELLS, FrameMatcher
+from terrafix.anchor.relocalization.coarse_descriptors import is_kept
+from terrafix.anchor.relocalization.map_search import CELL_PER_AGL
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Map
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.limits import LEAST_LOOK_AGL_M
+from terrafix.map.format import Ce90Origin, Layer, accuracy_of
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix.vision.sources.description import camera_of, read_description
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber

@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.check_sight import Looker, Sight
 from terrafix_tools.mission.mission import PLACED, Above, Do, Mission
 

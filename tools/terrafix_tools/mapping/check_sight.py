@@ -15,10 +15,10 @@ from enum import IntEnum
 import cv2
 import numpy as np
 
-from terrafix.anchor.correlate import Searchable, standardise
-from terrafix.anchor.map_features import MapFeatures
-from terrafix.anchor.map_package import LocalMap
-from terrafix.anchor.matcher import MIN_SIDE_CELLS
+from terrafix.anchor.matching.descriptor_cache import MapFeatures
+from terrafix.anchor.matching.frame_matcher import MIN_SIDE_CELLS
+from terrafix.anchor.matching.ncc import Searchable, standardise
+from terrafix.map.package import LocalMap
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.mapping.progress import Bar
 

@@ -16,8 +16,8 @@ from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
-from terrafix.anchor.map_format import DEM_NULL, DEM_TILE_PX, DemGrid, Level
 from terrafix.core.errors import MapError
+from terrafix.map.format import DEM_NULL, DEM_TILE_PX, DemGrid, Level
 from terrafix_tools.mapping.gpkg import GpkgWriter
 from terrafix_tools.mapping.layers import Bounds, Elevation, ElevationInput
 from terrafix_tools.mapping.pyramid import Place

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from terrafix.anchor.map_format import TILE_PX, DescriptorTable, Layer, Level
-from terrafix.anchor.map_tiles import Part, picture_of, put_picture
+from terrafix.map.format import TILE_PX, DescriptorTable, Layer, Level
+from terrafix.map.tile_cache import Part, picture_of, put_picture
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.gpkg import GpkgWriter
 from terrafix_tools.mapping.parallel import Crew, render_pieces

@@ -10,7 +10,8 @@ from pathlib import Path
 from pyproj import CRS
 from pyproj.enums import WktVersion
 
-from terrafix.anchor.map_format import (
+from terrafix.map.checksum import BLANK, write_seal
+from terrafix.map.format import (
     APPLICATION_ID,
     DEM_NULL,
     DEM_TILE_PX,
@@ -28,7 +29,6 @@ from terrafix.anchor.map_format import (
     manifest_rows,
     tile_sha256,
 )
-from terrafix.anchor.map_seal import BLANK, write_seal
 from terrafix_tools.mapping import gpkg_schema
 from terrafix_tools.mapping.layers import Bounds
 

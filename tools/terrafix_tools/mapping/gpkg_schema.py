@@ -1,6 +1,6 @@
 """SQL of the tables of a package: OGC 12-128r18 (version 1.3), its extensions, and ours."""
 
-from terrafix.anchor.map_format import HASH_TABLE, MANIFEST_TABLE, SEAL_TABLE, SIGNATURE_TABLE
+from terrafix.map.format import HASH_TABLE, MANIFEST_TABLE, SEAL_TABLE, SIGNATURE_TABLE
 
 # Geometry columns also where there are no features: without that table GDAL opens no table of attributes.
 CORE = f"""

@@ -8,7 +8,7 @@ from typing import Protocol, Self
 import numpy as np
 from pyproj import CRS
 
-from terrafix.anchor.map_format import DemGrid
+from terrafix.map.format import DemGrid
 
 Bounds = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max in the CRS
 Feature = tuple[

@@ -12,16 +12,16 @@ import cv2
 import msgspec
 import numpy as np
 
-from terrafix.anchor.map_format import Layer
-from terrafix.anchor.map_package import LocalMap, MapPackage
-from terrafix.anchor.matcher import FrameMatcher, View
-from terrafix.anchor.null_model import USUAL, VERSION, FlightBudget, NullModel, NullRow, Tail
-from terrafix.anchor.retrieval import MapSearch
-from terrafix.anchor.tracks import NEW_EVIDENCE
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
+from terrafix.anchor.relocalization.hypothesis_tracker import NEW_EVIDENCE
+from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
+from terrafix.map.format import Layer
+from terrafix.map.null_model import USUAL, VERSION, FlightBudget, NullModel, NullRow, Tail
+from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.mapping.rewrite import rewrite_manifest
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.anchor.map_package import LocalMap
-from terrafix.anchor.patches import match_patches
-from terrafix.anchor.rectify import Rectified
+from terrafix.anchor.matching.orthorectify import Rectified
+from terrafix.anchor.matching.patch_matcher import match_patches
+from terrafix.map.package import LocalMap
 from terrafix_engines.features.gradient import GradientDescriber
 
 PATCH_CELLS = 48

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import typer
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.check import check
 from terrafix_tools.mapping.check_text import lines_of, where
 from terrafix_tools.mapping.preview_page import write_page

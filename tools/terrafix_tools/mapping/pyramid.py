@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import rasterio
 
-from terrafix.anchor.map_format import TILE_PX, Level
+from terrafix.map.format import TILE_PX, Level
 from terrafix_tools.mapping.collar import BLEED_PX, TRIM_PX, Collar
 from terrafix_tools.mapping.gpkg import GpkgWriter
 from terrafix_tools.mapping.layers import Imagery

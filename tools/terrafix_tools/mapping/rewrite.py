@@ -3,8 +3,8 @@
 import sqlite3
 from pathlib import Path
 
-from terrafix.anchor.map_format import HASH_TABLE, MANIFEST_TABLE, SEAL_TABLE, Manifest, checksum_of, manifest_rows
-from terrafix.anchor.map_seal import BLANK, write_seal
+from terrafix.map.checksum import BLANK, write_seal
+from terrafix.map.format import HASH_TABLE, MANIFEST_TABLE, SEAL_TABLE, Manifest, checksum_of, manifest_rows
 
 
 def rewrite_manifest(package: Path, manifest: Manifest) -> None:

@@ -3,11 +3,11 @@
 import sqlite3
 from pathlib import Path
 
-from terrafix.anchor.map_format import FORMAT_VERSION, SEAL_TABLE, SIGNATURE_TABLE, signed_bytes
-from terrafix.anchor.map_package import UNREADABLE, MapPackage
-from terrafix.anchor.map_seal import BLANK, write_seal
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.signature import TrustedKey, sign
+from terrafix.map.checksum import BLANK, write_seal
+from terrafix.map.format import FORMAT_VERSION, SEAL_TABLE, SIGNATURE_TABLE, signed_bytes
+from terrafix.map.package import UNREADABLE, MapPackage
 
 
 def sign_package(package: Path, private_key: Path) -> TrustedKey:

@@ -8,9 +8,9 @@ import struct
 
 import numpy as np
 
-from terrafix.anchor.map_format import VectorTable
-from terrafix.anchor.map_vectors import features_sha256_of, wkb_parts
 from terrafix.core.errors import MapError
+from terrafix.map.format import VectorTable
+from terrafix.map.vectors import features_sha256_of, wkb_parts
 from terrafix_tools.mapping import gpkg_schema
 from terrafix_tools.mapping.gpkg import WGS84, GpkgWriter
 from terrafix_tools.mapping.layers import Bounds, VectorInput

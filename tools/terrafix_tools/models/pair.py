@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from terrafix.anchor.correlate import Searchable
-from terrafix.anchor.map_features import Describer
+from terrafix.anchor.matching.descriptor_cache import Describer
+from terrafix.anchor.matching.ncc import Searchable
 from terrafix.core.errors import MapError
 from terrafix_engines.features import open_describer, open_detector, open_matcher, open_picture_matcher
 from terrafix_engines.features.gradient import GradientDescriber

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.resume import Last
+from terrafix.estimator.prior import EstimatorCheckpoint
 from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, Origin, SlowErrors
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Run
@@ -70,7 +70,7 @@ class OldAndYoung(Run):
                 case MapMatch() if message.ground is not None:
                     self._ground = msgspec.structs.replace(message, matches=[])
                 case NavEstimate() if message.t_ns >= self._from_ns and self._origin is not None:
-                    self._young = EstimatorNode(0, Last(message, self._slow, self._ground))
+                    self._young = EstimatorNode(0, EstimatorCheckpoint(message, self._slow, self._ground))
                     list(self._young.on(self._origin))
                     return
                 case _:

@@ -8,12 +8,12 @@ import math
 import msgspec
 import numpy as np
 
-from terrafix.anchor.answer import coarse, judged
-from terrafix.anchor.belief import Mode, cell_for
-from terrafix.anchor.matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, REACH, Fix, View
+from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, REACH, Fix, View
+from terrafix.anchor.matching.match_message import mode_match, pose_match
+from terrafix.anchor.matching.patch_matcher import MAX_PATCHES
+from terrafix.anchor.matching.pnp import THRESHOLD, solve
+from terrafix.anchor.matching.point_mass_filter import Mode, cell_for
 from terrafix.anchor.node import COARSE_SCORE
-from terrafix.anchor.patches import MAX_PATCHES
-from terrafix.anchor.pnp import THRESHOLD, solve
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.limits import LEAST_LOOK_AGL_M
 from terrafix.core.pose import log_so3
@@ -73,10 +73,10 @@ class MapMatches:
         mode = Mode(float(place[0]), float(place[1]), MASS, 0.0, cell_for(agl_m, 0.0) ** 2)
         view = View(mode.e_m, mode.n_m, r_w_c, agl_m, float(p_m[2]) - agl_m, 0.0, 0.0, 0.0)
         answer = msgspec.structs.replace(answer, margin=score, mode_mass=MASS, mode_e_m=mode.e_m, mode_n_m=mode.n_m)
-        answer = judged(answer, self._fix(shot, good, view), view)
+        answer = pose_match(answer, self._fix(shot, good, view), view)
         if answer.verdict is Verdict.ACCEPTED or score < COARSE_SCORE:
             return answer
-        return coarse(answer, mode, cell_for(agl_m, 0.0), view, None)
+        return mode_match(answer, mode, cell_for(agl_m, 0.0), view, None)
 
     def _fix(self, shot: Shot, good: float, view: View) -> Fix:
         xy, points = self._patches(shot, good)

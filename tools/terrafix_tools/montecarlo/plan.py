@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.anchor.map_format import CE90_SIGMAS
+from terrafix.map.format import CE90_SIGMAS
 from terrafix.messages import Camera
 from terrafix_tools.montecarlo.fault import LIES, Fault
 from terrafix_tools.sim.autopilot.parameters import Kind

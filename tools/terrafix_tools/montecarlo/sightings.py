@@ -1,8 +1,8 @@
 """Odometry as vision would say it: tracks of points on relief, houses and trees, through the real camera model.
 
-What `vision/odometry.py` does to pictures is done to points: keyframes, spread, and the same RANSAC homography with the
-same thresholds, so that what stands above the ground is let in and left out as it is in flight. The pixel noise makes
-the tracks scatter about their homography as those of the real flights do (docs/monte-carlo.md)."""
+What `vision/feature_tracker.py` does to pictures is done to points: keyframes, spread, and the same RANSAC homography
+with the same thresholds, so that what stands above the ground is let in and left out as it is in flight. The pixel
+noise makes the tracks scatter about their homography as those of the real flights do (docs/monte-carlo.md)."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from terrafix.messages import Odometry, Verdict
-from terrafix.vision import odometry as real
+from terrafix.vision import feature_tracker as real
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.lens import Lens

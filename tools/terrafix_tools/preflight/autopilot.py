@@ -10,12 +10,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
-from terrafix.link.budget import LineBudget
-from terrafix.link.diagnosis import Heard, why_no_autopilot
-from terrafix.link.framing import Framer
-from terrafix.link.signing import Signing, read_key
-from terrafix.link.streams import STREAMS_HZ, Streams
-from terrafix.link.transport import Transport, open_at_start
+from terrafix.link.mavlink.bandwidth import LinkBandwidth
+from terrafix.link.mavlink.diagnosis import Heard, why_no_autopilot
+from terrafix.link.mavlink.framing import Framer
+from terrafix.link.mavlink.message_rates import STREAMS_HZ, Streams
+from terrafix.link.mavlink.signing import Signing, read_key
+from terrafix.link.mavlink.transport import Transport, open_at_start
 from terrafix_tools.preflight.lines import number
 
 HEARTBEAT_S = 1.0
@@ -142,7 +142,7 @@ class Autopilot:
     def rates(self) -> Streams:
         """The messages that the link will ask for are asked for, and counted for RATES_S."""
         baud = self._config.baud if self._config.device.startswith("/") else None
-        budget = LineBudget(baud, signed=self._signing is not None)
+        budget = LinkBandwidth(baud, signed=self._signing is not None)
         streams = Streams(budget.fitting(STREAMS_HZ))
         for message in self._listen(RATES_S):
             if message is not None:

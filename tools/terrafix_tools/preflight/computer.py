@@ -7,13 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.config import Config
 from terrafix.core.errors import TerrafixError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.signature import trusted_keys
 from terrafix.health.sysfs import read_disk_free_mb, read_throttling, read_zones
-from terrafix.link import gps_time
+from terrafix.link.output import gps_time
+from terrafix.map.package import MapPackage
 from terrafix.vision.sources import open_configured, parse_start
 from terrafix.vision.sources.description import read_description
 from terrafix_engines.features import open_describer

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import TerrafixError
-from terrafix.link.ground_links import GroundLinks
-from terrafix.link.hints import Hints
+from terrafix.link.ground_station.links import GroundLinks
+from terrafix.link.ground_station.position_prior import Hints
 from terrafix_tools.preflight.lines import Line, fail, ok, warn
 
 

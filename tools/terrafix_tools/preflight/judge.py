@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from terrafix.link.outputs import LOCAL
+from terrafix.link.output.selection import LOCAL
 from terrafix_tools.preflight import forwarding
 from terrafix_tools.preflight.forwarding import SERIALS, mavlink_ports
 from terrafix_tools.preflight.lines import Change, Line, Status, number, ok

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from terrafix.core.config import LinkSection
-from terrafix.link.outputs import Outputs
+from terrafix.link.output.selection import Outputs
 from terrafix_tools.preflight.lines import Status
 
 MAV_GPS = 14

@@ -8,7 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
-from terrafix.link.streams import Streams
+from terrafix.link.mavlink.message_rates import Streams
 from terrafix_tools.preflight.autopilot import Autopilot
 from terrafix_tools.preflight.forwarding import WIRE_BYTES
 from terrafix_tools.preflight.lines import Line, fail, ok, warn

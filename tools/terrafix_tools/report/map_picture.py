@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from terrafix.anchor.map_package import MapPackage
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
+from terrafix.map.package import MapPackage
 from terrafix_tools.estimates import Row
 from terrafix_tools.report.data import FlightView, ellipse95
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.link.words import fault_words
+from terrafix.link.pilot_text.statustext import fault_words
 from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.lens_words import lens_words
 from terrafix_tools.report.charts import clock

@@ -2,7 +2,7 @@
 
 Two hypotheses in log odds: the map shows the ground below, and now and then a pose is wrong; or it does not, and poses
 are wherever patterns look alike, so that hardly one agrees with the estimate. Looks that find no pose say nothing here:
-over bare ground they are many (registration.py, anchor/lost.py)."""
+over bare ground they are many (registration.py, anchor/verification/lock_monitor.py)."""
 
 import math
 

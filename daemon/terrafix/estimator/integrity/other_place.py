@@ -9,14 +9,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from terrafix.estimator.agreement import AGREE_M
+from terrafix.estimator.integrity.innovation_run import AGREE_M
 
 AGREEING = 2  # refused matches in a row that agree with each other: one alone is a mistake
 EVEN = 0.5  # probability of the other place when nothing is known but that the two disagree
 FORGET_OVER = 5.0  # of the height: so far flies a repeating pattern, and so far the other place fades to a third ...
 TOLD_LASTS = 2.0  # ... or so much farther, if the map had told it before: a plane crosses long rows at any height
-# A start coordinate is no pattern that repeats: one in 400 is wrong by far more than it claims (anchor/lost.py), and
-# three poses that agree with each other say more against it, and a quarter of a height is new ground for one.
+# A start coordinate is no pattern that repeats: one in 400 is wrong by far more than it claims
+# (anchor/verification/lock_monitor.py), and three poses that agree with each other say more against it, and a quarter
+# of a height is new ground for one.
 START_LASTS = 0.05
 FORGOTTEN = 0.01
 REACHED = 1 / 9  # from this probability on three sigmas reach the other place

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.core.gate import GATE, LEAST_WEIGHT
-from terrafix.core.start import SEARCHED_START_M
+from terrafix.core.initial_position import SEARCHED_START_M
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.other_place import OtherPlace
 from terrafix.messages import MapMatch, Origin, Verdict
@@ -22,7 +22,7 @@ MOST_WEIGHT = 0.8
 # What a mode must hold, and how many times the weight of its best rival, to be the best single place. The rest of the
 # mixture is in the moments about it, so that this decides where the ellipse is, not how far it reaches.
 LEADING_WEIGHT, LEADS = 0.25, 2.5
-MODE_SIGMA = 0.03  # of the height: buildings that lean shift a whole picture (anchor/answer.py)
+MODE_SIGMA = 0.03  # of the height: buildings that lean shift a whole picture (anchor/matching/match_message.py)
 
 
 @dataclass(frozen=True)

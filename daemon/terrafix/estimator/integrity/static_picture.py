@@ -2,7 +2,7 @@
 
 import math
 
-from terrafix.estimator.telemetry import Attitude
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
 
 ATTITUDE_MOVED_RAD = math.radians(1.0)  # beyond what an attitude filter of a vehicle at rest wanders in a minute
 # No multirotor in the air keeps its attitude to 0.006 degrees, what a static picture claims, for so long.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.gate import LEAST_WEIGHT
-from terrafix.estimator.telemetry import Telemetry
+from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 
 GRID_S = np.arange(-2.0, 2.0001, 0.05)
 RESOLUTION_S2 = (GRID_S[1] - GRID_S[0]) ** 2 / 12.0

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from terrafix.core.errors import SourceError
-from terrafix.core.tlog import read_imu, read_tlog
+from terrafix.core.mavlink.tlog import read_imu, read_tlog
 from terrafix.messages import Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, UpTo
 from terrafix.vision.sources.description import camera_of, origin_of, read_description

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from terrafix.link.carry import distance_m
+from terrafix.link.integrity.output_predictor import distance_m
 from terrafix_tools.sim.autopilot.gps import NO_GPS, Fix, GpsInputDriver, GpsInstance
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.autopilot.switch import BLEND

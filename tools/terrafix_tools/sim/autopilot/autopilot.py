@@ -18,7 +18,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix.link.gps_time import GPS_EPOCH_UNIX_S, gps_minus_utc_s
+from terrafix.link.output.gps_time import GPS_EPOCH_UNIX_S, gps_minus_utc_s
 from terrafix_tools.sim.autopilot.align import Alignment, complaints
 from terrafix_tools.sim.autopilot.ekf import Ekf, Fusion
 from terrafix_tools.sim.autopilot.gps import WEEK_S, Fix, GpsInputDriver, GpsInstance

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from terrafix.core.config import LinkSection
-from terrafix.link.carry import distance_m, offset
 from terrafix.link.edge import MavlinkEdge
+from terrafix.link.integrity.output_predictor import distance_m, offset
 from terrafix.link.node import TICK_HZ, LinkNode
 from terrafix.messages import CovarianceMode, GpsInput, NavEstimate, SourceLabel, VehicleState
 from terrafix_tools.sim.autopilot.fuzz_wire import (

@@ -7,7 +7,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.link.signing import timestamp
+from terrafix.link.mavlink.signing import timestamp
 
 MS = 1_000_000
 UNIX_NS = 1_795_262_400 * 1000 * MS  # 2026-11-21

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from terrafix.core.asked import Asked
+from terrafix.runtime.stop_signal import StopSignal
 from terrafix_tools.sim.autopilot.course import read_course
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 from terrafix_tools.standalone import run_standalone
@@ -24,7 +24,7 @@ def fly_course(
     aligned: Annotated[bool, typer.Option(help="Starts in the air, position known.")] = True,
 ) -> None:
     """Flies until SIGTERM or SIGINT, then writes the report."""
-    stopping = Asked(signal.SIGTERM, signal.SIGINT)
+    stopping = StopSignal(signal.SIGTERM, signal.SIGINT)
     zero_ns = start_ns or time.monotonic_ns()
     peer = AutopilotPeer(seed=seed, aligned=aligned)
     used = peer.start(port, read_course(course), lambda: (time.monotonic_ns() - zero_ns) * 1e-9)

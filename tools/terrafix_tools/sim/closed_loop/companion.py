@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import Image, Node, NodeContext
-from terrafix.core.shell import InProcessShell
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.transport import Transport
+from terrafix.link.mavlink.transport import Transport
 from terrafix.messages import (
     Frame,
     GpsInput,
@@ -27,6 +26,7 @@ from terrafix.messages import (
     ThermalReading,
 )
 from terrafix.processes import PROCESSES
+from terrafix.runtime.executor import InProcessShell
 
 ALL = ("vision", "anchor", "estimator", "link", "health")
 HEALTH_NS = 1_000_000_000
@@ -44,7 +44,8 @@ class Delays:
 
 
 class Slow:
-    """A node whose answers come later. What arrives while it works waits, and only the newest of it (core/inbox.py)."""
+    """A node whose answers come later. What arrives while it works waits, and only the newest of it
+    (runtime/inbox.py)."""
 
     def __init__(self, node: Node, delay_ns: int) -> None:
         self._node, self._delay_ns = node, delay_ns

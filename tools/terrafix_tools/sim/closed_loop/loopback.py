@@ -1,10 +1,10 @@
 """A wire in memory between the companion's MAVLink edge and an autopilot in the same process."""
 
-from terrafix.link.transport import Address, Chunk
+from terrafix.link.mavlink.transport import Address, Chunk
 
 
 class Loopback:
-    """The companion's ``Transport`` (link/transport.py) on one side, bytes for the autopilot on the other."""
+    """The companion's ``Transport`` (link/mavlink/transport.py) on one side, bytes for the autopilot on the other."""
 
     def __init__(self) -> None:
         self._to_companion: list[bytes] = []

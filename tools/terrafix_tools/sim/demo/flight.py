@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from terrafix import supervisor
 from terrafix.messages import ProcessEvent
+from terrafix.runtime import supervisor
 from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 from terrafix_tools.sim.autopilot.report import PeerReport

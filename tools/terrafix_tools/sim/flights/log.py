@@ -5,7 +5,7 @@ from pathlib import Path
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import OutputError
-from terrafix.core.tlog import record
+from terrafix.core.mavlink.tlog import record
 from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
 from terrafix_tools.sim.interfaces import Readings
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix.link.map_offset import MapOffsets
+from terrafix.link.gnss.map_registration import MapOffsets
 from terrafix.link.node import LinkNode
 from terrafix.messages import (
     CovarianceMode,

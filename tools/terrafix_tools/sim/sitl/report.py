@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.errors import OutputError
-from terrafix.link.carry import distance_m
+from terrafix.link.integrity.output_predictor import distance_m
 from terrafix_tools.sim.out_folder import write_json
 from terrafix_tools.sim.sitl.firmware import Home
 from terrafix_tools.sim.sitl.observer import Belief, Notes, Truth

@@ -6,7 +6,7 @@ and a Terrafix whose autopilot and camera are gone waits for them to come back."
 import signal
 import sys
 
-from terrafix.nursery import end_with
+from terrafix.runtime.fork_server import end_with
 from terrafix_tools import program
 
 

@@ -1,0 +1,1 @@
+"""One frame against the map."""

@@ -1,0 +1,113 @@
+"""Dense descriptors of the map, computed tile by tile when first needed and kept while there is room."""
+
+from collections import OrderedDict
+from typing import Protocol
+
+import numpy as np
+
+from terrafix.anchor.matching.descriptor_store import DescriptorStore
+
+TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride
+PAD_PX = 32  # context around a tile, so that its rim is described as if there were no rim; a multiple of every stride
+CACHE_BYTES = 192 * 1024 * 1024
+
+
+class MapWindows(Protocol):
+    """What is needed of the map: ``LocalMap`` of the package reader."""
+
+    gsd_m: float
+
+    def window(
+        self, e_min_m: float, n_max_m: float, width_px: int, height_px: int, gsd_m: float
+    ) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+class Describer(Protocol):
+    """Image in, dense descriptors out; one for each kind of feature."""
+
+    name: str
+    stride: int
+    channels: int
+
+    def describe(self, image: np.ndarray) -> np.ndarray:
+        """(H, W, 3) uint8 BGR -> (C, H // stride, W // stride) float32"""
+        ...
+
+
+class MapFeatures:
+    def __init__(
+        self,
+        source: MapWindows,
+        describer: Describer,
+        cache_bytes: int = CACHE_BYTES,
+        pad_px: int = PAD_PX,
+        shelf: DescriptorStore | None = None,
+    ) -> None:
+        """``shelf``: where they are kept for the next process, too."""
+        self._source = source
+        self._describer = describer
+        self._pad_px = pad_px
+        self._shelf = shelf
+        self._tiles: OrderedDict[tuple[float, int, int], tuple[np.ndarray, np.ndarray]] = OrderedDict()
+        self._bytes, self._most_bytes = 0, cache_bytes
+
+    def window(
+        self, e_min_m: float, n_max_m: float, width: int, height: int, gsd_m: float
+    ) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """``width`` x ``height`` cells (a cell is ``stride`` pixels of ``gsd_m``) from about (e_min_m, n_max_m).
+
+        -> descriptors (C, height, width) float32, valid (height, width) bool, and the corner that was really used:
+        the nearest one on the grid of cells."""
+        cell = gsd_m * self._describer.stride
+        per_tile = TILE_CELLS_PX // self._describer.stride
+        column, row = round(e_min_m / cell), round(-n_max_m / cell)
+        valid = np.zeros((height, width), bool)
+        out: np.ndarray | None = None
+        for ty in range(row // per_tile, (row + height - 1) // per_tile + 1):
+            for tx in range(column // per_tile, (column + width - 1) // per_tile + 1):
+                tile, tile_valid = self._tile(gsd_m, tx, ty, cell, per_tile)
+                y0, x0 = ty * per_tile - row, tx * per_tile - column
+                ys = slice(max(y0, 0), min(y0 + per_tile, height))
+                xs = slice(max(x0, 0), min(x0 + per_tile, width))
+                if out is None:
+                    out = np.zeros((len(tile), height, width), np.float32)
+                from_y = slice(ys.start - y0, ys.stop - y0)
+                from_x = slice(xs.start - x0, xs.stop - x0)
+                out[:, ys, xs] = tile[:, from_y, from_x]
+                valid[ys, xs] = tile_valid[from_y, from_x]
+        assert out is not None
+        return out, valid, column * cell, -row * cell
+
+    def _tile(self, gsd_m: float, tx: int, ty: int, cell: float, per_tile: int) -> tuple[np.ndarray, np.ndarray]:
+        key = (gsd_m, tx, ty)
+        name = f"{self._describer.name} {gsd_m!r} {tx} {ty}"
+        if key in self._tiles:
+            self._tiles.move_to_end(key)
+            if self._shelf is not None:
+                self._shelf.used(name)
+            return self._tiles[key]
+        tile = None if self._shelf is None else self._shelf.take(name)
+        if tile is None:
+            tile = self._computed(gsd_m, tx, ty, cell, per_tile)
+            if self._shelf is not None:
+                self._shelf.put(name, *tile)
+        self._tiles[key] = tile
+        self._bytes += tile[0].nbytes + tile[1].nbytes
+        while self._bytes > self._most_bytes and len(self._tiles) > 1:
+            _, (old, old_valid) = self._tiles.popitem(last=False)
+            self._bytes -= old.nbytes + old_valid.nbytes
+        return tile
+
+    def _computed(self, gsd_m: float, tx: int, ty: int, cell: float, per_tile: int) -> tuple[np.ndarray, np.ndarray]:
+        stride, pad_px = self._describer.stride, self._pad_px
+        side = TILE_CELLS_PX + 2 * pad_px
+        image, ok = self._source.window(
+            tx * per_tile * cell - pad_px * gsd_m, -ty * per_tile * cell + pad_px * gsd_m, side, side, gsd_m
+        )
+        inner = slice(pad_px // stride, pad_px // stride + per_tile)
+        rim = slice(pad_px, pad_px + TILE_CELLS_PX)
+        valid = np.asarray(ok[rim, rim].reshape(per_tile, stride, per_tile, stride).all(axis=(1, 3)))
+        if valid.any():
+            descriptors = self._describer.describe(image)[:, inner, inner]
+            return np.where(valid, descriptors, 0.0).astype(np.float16), valid
+        return np.zeros((self._describer.channels, *valid.shape), np.float16), valid  # beside the map

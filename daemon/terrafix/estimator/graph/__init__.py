@@ -1,0 +1,1 @@
+"""The iSAM2 window, and what has left it."""

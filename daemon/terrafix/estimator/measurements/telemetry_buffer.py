@@ -1,0 +1,204 @@
+"""What the autopilot said around a frame's time: attitude, height, inertial readings, each with its absence."""
+
+from bisect import bisect_left, bisect_right
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafix.estimator.models.motion_model import GRAVITY_MPS2, WorldAcceleration
+from terrafix.messages import Imu, VehicleState
+
+KEPT = 400  # states; 8 s at 50 Hz
+# Attitudes and readings: two minutes at 25 and 50 Hz, which a camera may be away; 30 s at 200 Hz.
+KEPT_TURNS, KEPT_READINGS = 3000, 6000
+STANDS_BELOW_M = 10.0  # what a barometer may have drifted before take-off
+MAX_GAP_NS = 1_000_000_000  # older than this against the frame says nothing about it
+BOX = np.linspace(-1.0, 1.0, 9)  # where reported angles are averaged about a time, in intervals between reports
+MOMENT_NS = 200_000_000  # by which states may come out of order
+# Between readings, and from the last one to the frame: the acceleration is taken to go straight from one to the next.
+MAX_READING_GAP_NS = 120_000_000
+MAX_ATTITUDE_GAP_NS = 260_000_000  # ATTITUDE at 4 Hz, ArduPilot's own rate, turns a vehicle too far between two
+
+
+Timed = tuple[np.ndarray, np.ndarray]  # times (N,) [ns], values (3, N)
+
+
+@dataclass(frozen=True)
+class Attitude:
+    yaw_rad: float | None
+    pitch_rad: float | None
+    roll_rad: float | None
+    agl_m: float | None
+    armed: bool | None = None
+    airspeed_mps: float | None = None
+    righted_rad: float = 0.0  # by how much tilt may be off beyond what is always said of it (ahrs_correction.py)
+
+    @property
+    def stands(self) -> bool:
+        """On the ground, motors off. An autopilot that reports a height is not believed to be off in the air."""
+        return self.armed is False and (self.agl_m is None or self.agl_m < STANDS_BELOW_M)
+
+
+_FIELDS = ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed", "airspeed_mps")
+
+
+class Telemetry:
+    def __init__(self) -> None:
+        self._states: deque[VehicleState] = deque(maxlen=KEPT)
+        self._turns = _Series(KEPT_TURNS)  # yaw, pitch, roll
+        self._forces = _Series(KEPT_READINGS)  # forward, right, down
+        self._rates = _Series(KEPT_READINGS)  # about the same axes
+
+    def add(self, state: VehicleState) -> None:
+        self._states.append(state)
+        if state.yaw_rad is None or state.pitch_rad is None or state.roll_rad is None:
+            return
+        self._turns.add(state.t_ns, state.yaw_rad, state.pitch_rad, state.roll_rad)
+
+    def add_imu(self, imu: Imu) -> None:
+        for before_ns, forward, right, down, *rates in imu.samples:
+            self._forces.add(imu.t_ns - before_ns, forward, right, down)
+            self._rates.add(imu.t_ns - before_ns, *rates)
+
+    def at(self, t_ns: int) -> Attitude:
+        """Field by field the value measured nearest to ``t_ns``; ``None`` where nobody said it within a second."""
+        best: dict[str, tuple[int, float | bool]] = {}
+        unsettled = list(_FIELDS)
+        for state in reversed(self._states):
+            away_ns = abs(state.t_ns - t_ns)
+            if away_ns > MAX_GAP_NS:
+                if state.t_ns < t_ns - 2 * MAX_GAP_NS:
+                    break  # they come in order of time, to a moment
+                continue
+            for name in unsettled.copy():
+                value = getattr(state, name)
+                if value is not None and (name not in best or away_ns <= best[name][0]):
+                    best[name] = (away_ns, value)
+                elif name in best and state.t_ns + MOMENT_NS < t_ns - best[name][0]:
+                    unsettled.remove(name)  # whatever is left is farther away
+            if not unsettled:
+                break
+        said = {name: value for name, (_, value) in best.items()}
+        return Attitude(*(said.get(name) for name in _FIELDS))  # type: ignore[arg-type]
+
+    def felt(self, t0_ns: int, t1_ns: int, turned: np.ndarray | None = None) -> WorldAcceleration | None:
+        """Acceleration from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that. ``turned``
+        (3, 2): by how much attitudes are turned about east, north and up at both ends [rad], which is taken out."""
+        known = self._with_attitudes(self._forces, t0_ns, t1_ns)
+        if known is None:
+            return None
+        (t_f, f), (t_a, angles) = known
+        inside = t_f[(t_f > t0_ns) & (t_f < t1_ns)]
+        t = np.concatenate([[t0_ns], inside, [t1_ns]])
+        f_b = [np.interp(t, t_f, axis) for axis in f]
+        yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
+        accel = _in_world(f_b, yaw, pitch, roll)
+        if turned is not None:
+            away = np.column_stack([np.interp(t, [t0_ns, t1_ns], axis) for axis in turned])
+            first = np.cross(away, accel)
+            accel = accel - first + 0.5 * np.cross(away, first)  # turned back, to the second order
+            yaw = yaw + away[:, 2]  # clockwise
+        accel[:, 2] -= GRAVITY_MPS2
+        # What the readings scatter from one to the next is vibration, whatever its frequency was.
+        spacing_s = (t_f[-1] - t_f[0]) * 1e-9 / (len(t_f) - 1)
+        scatter = float(np.mean(np.square(np.diff(f, 2)))) / 6.0 if f.shape[1] > 3 else 0.0
+        unfelt_s = max(0.0, (t1_ns - int(t_f[-1])) * 1e-9)
+        return WorldAcceleration((t - t0_ns) * 1e-9, accel, yaw, float(np.sqrt(scatter * spacing_s)), unfelt_s)
+
+    @property
+    def newest_turn_ns(self) -> int:
+        """Time of the newest whole attitude; -1: there was none."""
+        return self._turns.newest_ns
+
+    def turned_about(self, t_ns: np.ndarray) -> np.ndarray | None:
+        """Reported yaw, pitch and roll (3, N) about times (N,) [ns], unwrapped: means over two report intervals, whose
+        noise is the same at a report and between two. None where attitudes do not cover that."""
+        turns = self._turns.around(int(t_ns.min()) - MAX_GAP_NS, int(t_ns.max()) + MAX_GAP_NS)
+        if turns is None:
+            return None
+        about_ns = np.median(np.diff(turns[0])) * BOX
+        if turns[0][0] > t_ns.min() + about_ns[0] or turns[0][-1] < t_ns.max() + about_ns[-1]:
+            return None
+        at_ns = t_ns[:, None] + about_ns
+        return np.stack([np.interp(at_ns, turns[0], angle).mean(axis=1) for angle in _unwrapped(turns[1])])
+
+    def turned_otherwise(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
+        """The turn (3,) about east, north and up by which the attitude turned from ``t0_ns`` to ``t1_ns`` and
+        gyroscopes did not, and by how much these turned at all [rad]; None when readings or attitudes do not cover
+        that."""
+        known = self._with_attitudes(self._rates, t0_ns, t1_ns)
+        if known is None:
+            return None
+        (t_g, w), (t_a, angles) = known
+        inside = t_a[(t_a > t0_ns) & (t_a < t1_ns)]
+        t = np.concatenate([[t0_ns], inside, [t1_ns]])
+        yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
+        r_w_b = np.stack([_in_world([*axis], yaw, pitch, roll) for axis in np.eye(3)], axis=2)
+        step = np.einsum("nij,nkj->nik", r_w_b[1:], r_w_b[:-1])
+        turned = 0.5 * np.column_stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
+        # The integral of the rates, from one attitude to the next, in the world by the attitude between them.
+        summed = [np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t_g) * 1e-9)]) for a in w]
+        felt = [np.diff(np.interp(t, t_g, axis)) for axis in summed]
+        between = (0.5 * (angle[1:] + angle[:-1]) for angle in (yaw, pitch, roll))
+        apart = turned.sum(axis=0) - _in_world(felt, *between).sum(axis=0)
+        return apart, float(np.linalg.norm(felt, axis=0).sum())
+
+    def _with_attitudes(self, readings: "_Series", t0_ns: int, t1_ns: int) -> tuple[Timed, Timed] | None:
+        """Readings and attitudes around a span; None when they do not cover it."""
+        read, turns = readings.around(t0_ns, t1_ns), self._turns.around(t0_ns, t1_ns)
+        if t1_ns <= t0_ns or read is None or turns is None:
+            return None
+        covered = _covers(read[0], t0_ns, t1_ns, MAX_READING_GAP_NS)
+        return (read, turns) if covered and _covers(turns[0], t0_ns, t1_ns, MAX_ATTITUDE_GAP_NS) else None
+
+
+class _Series:
+    """The newest ``kept`` readings of three axes, in order of time; older than the newest is not taken."""
+
+    def __init__(self, kept: int) -> None:
+        self._kept = kept
+        self._t_ns: list[int] = []
+        self._axes: tuple[list[float], list[float], list[float]] = ([], [], [])
+
+    def add(self, t_ns: int, x: float, y: float, z: float) -> None:
+        if self._t_ns and t_ns <= self._t_ns[-1]:
+            return
+        self._t_ns.append(t_ns)
+        for axis, value in zip(self._axes, (x, y, z), strict=True):
+            axis.append(value)
+        if len(self._t_ns) > 2 * self._kept:
+            for column in (self._t_ns, *self._axes):
+                del column[: -self._kept]
+
+    @property
+    def newest_ns(self) -> int:
+        return self._t_ns[-1] if self._t_ns else -1
+
+    def around(self, t0_ns: int, t1_ns: int) -> Timed | None:
+        """Times (N,) and values (3, N) from the last one before ``t0_ns`` to the first one after ``t1_ns``."""
+        first = max(0, bisect_right(self._t_ns, t0_ns) - 1)
+        last = min(len(self._t_ns), bisect_left(self._t_ns, t1_ns) + 1)
+        if last - first < 2:
+            return None
+        return np.array(self._t_ns[first:last]), np.array([axis[first:last] for axis in self._axes])
+
+
+def _unwrapped(angles: np.ndarray) -> np.ndarray:
+    """(3, N); numpy's own takes long to find that nothing turns over."""
+    return np.unwrap(angles, axis=1) if np.abs(np.diff(angles, axis=1)).max() >= np.pi else angles
+
+
+def _covers(t_ns: np.ndarray, t0_ns: int, t1_ns: int, gap_ns: int) -> bool:
+    edges = t_ns[0] <= t0_ns + gap_ns and t_ns[-1] >= t1_ns - gap_ns
+    return bool(edges and np.diff(t_ns).max() <= gap_ns)
+
+
+def _in_world(f_b: list[np.ndarray], yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Three axes (N,) of body FRD -> (N, 3) in world ENU; ``rot_w_b`` for many at once."""
+    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
+    x, y, z = f_b
+    ahead = cp * x + sp * (sr * y + cr * z)  # level axes of the heading: forward, right
+    right = cr * y - sr * z
+    down = -sp * x + cp * (sr * y + cr * z)
+    return np.column_stack([sy * ahead + cy * right, cy * ahead - sy * right, -down])

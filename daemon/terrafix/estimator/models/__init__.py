@@ -1,0 +1,1 @@
+"""Motion, terrain and lens: no measurement and no graph."""

@@ -1,0 +1,1 @@
+"""Monitors of what the flight was described as: scale, mount, heading, attitude, registration."""

@@ -1,0 +1,1 @@
+"""Whose packets are heard, and which are believed."""

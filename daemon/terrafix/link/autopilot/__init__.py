@@ -1,0 +1,1 @@
+"""The autopilot that is served, and its state."""

@@ -1,0 +1,1 @@
+"""GNSS receivers: whether to trust them, and the map error that a trusted one shows."""

@@ -1,0 +1,1 @@
+"""Which estimate is sent, as which fix, and carried to when."""

@@ -1,0 +1,61 @@
+"""The position as MSP2_SENSOR_GPS, for iNav (GPS provider MSP) and ArduPilot (GPS1_TYPE 19), over a serial port.
+
+Frame: MSP version 2 (github.com/iNavFlight/inav/wiki/MSP-V2). Payload: 52 bytes, little endian, packed, as
+``mspSensorGpsDataMessage_t`` in iNav's msp_protocol_v2_sensor_msg.h."""
+
+import math
+import struct
+from datetime import UTC, datetime
+
+from terrafix.link.output.gps_time import unix_ms
+from terrafix.messages import GpsInput
+
+MSP2_SENSOR_GPS = 0x1F03
+WEEK_UNKNOWN, YAW_UNKNOWN = 0xFFFF, 0xFFFF
+UINT16_MAX = 0xFFFF
+# instance, week, ms of week, fix, satellites, accuracies h, v [cm], speed [cm/s], hdop * 100, longitude, latitude
+# [1e-7 deg], height [cm], velocity north, east, down [cm/s], course, yaw [0.01 deg], year, month, day, h, min, s
+PAYLOAD = struct.Struct("<BHIBBHHHHiiiiiiHHHBBBBB")
+
+
+def frame(gps: GpsInput) -> bytes:
+    """One message to the flight controller; it is a command, not an answer ('<')."""
+    good = gps.fix_type >= 3
+    ms = unix_ms(gps.time_week, gps.time_week_ms)
+    when = datetime.fromtimestamp(ms / 1000, UTC) if ms is not None else None
+    payload = PAYLOAD.pack(
+        0,
+        gps.time_week or WEEK_UNKNOWN,
+        gps.time_week_ms,
+        gps.fix_type,
+        gps.satellites_visible,
+        _centi(gps.horiz_accuracy_m),
+        _centi(gps.vert_accuracy_m),
+        _centi(gps.speed_accuracy_mps),
+        _centi(gps.hdop),
+        round(gps.lon_deg * 1e7),
+        round(gps.lat_deg * 1e7),
+        round(gps.alt_amsl_m * 100),
+        round(gps.vn_mps * 100),
+        round(gps.ve_mps * 100),
+        round(gps.vd_mps * 100),
+        round(math.degrees(math.atan2(gps.ve_mps, gps.vn_mps)) * 100) % 36_000 if good else 0,
+        YAW_UNKNOWN,
+        *((when.year, when.month, when.day, when.hour, when.minute, when.second) if when else (0,) * 6),
+    )
+    head = struct.pack("<BHH", 0, MSP2_SENSOR_GPS, len(payload))
+    return b"$X<" + head + payload + bytes([crc8_dvb_s2(head + payload)])
+
+
+def crc8_dvb_s2(data: bytes) -> int:
+    """Polynomial 0xD5, start 0 (ETSI EN 302 307)."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0xD5 if crc & 0x80 else crc << 1) & 0xFF
+    return crc
+
+
+def _centi(value: float) -> int:
+    return min(UINT16_MAX, max(0, round(value * 100)))

@@ -1,0 +1,146 @@
+"""One imagery layer seen in the metres of a local frame: windows at any scale."""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from pyproj import CRS, Transformer
+
+from terrafix.map.format import TILE_PX, Layer, Level
+from terrafix.map.tile_cache import TileStore
+
+COARSER_ALLOWED = 1.1  # a level up to 10 % coarser than asked is used rather than one almost twice as fine
+BLOCK_PX = 512  # a window is rendered in blocks that stay in the cache, each with an affine map of its own
+MIN_BLOCK_PX = 64
+AFFINE_TOLERANCE_PX = 0.02  # split a block until its affine map is this close to the projection, in pixels of the level
+# A reduction by s wants a low-pass of variance (s^2 - 1) / 4 px^2. [1 2 1] / 4 has 0.5 and costs a quarter of any other
+# kernel: up to a reduction by two the nearer of it and none is used.
+BLUR_MIN_SCALE, BLUR_FAST_SCALE = math.sqrt(2.0), 2.0
+
+# The corners of a block, the middles of its sides and its centre, as (s, t, 1) with s and t from 0 to 1; and what takes
+# nine values there to the affine map that is nearest to them.
+KNOTS = np.array([(s, t, 1.0) for t in (0.0, 0.5, 1.0) for s in (0.0, 0.5, 1.0)])
+FIT = np.linalg.pinv(KNOTS)
+
+
+class Block(NamedTuple):
+    """A part of a window, pixels."""
+
+    row: int
+    column: int
+    height: int
+    width: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
+
+    def quarters(self) -> list["Block"]:
+        """Two when one side is too short to be halved."""
+        rows = _halves(self.row, self.height)
+        return [Block(r, c, h, w) for r, h in rows for c, w in _halves(self.column, self.width)]
+
+
+class LayerView:
+    def __init__(self, layer: Layer, tiles: TileStore, local: CRS) -> None:
+        self._layer = layer
+        self._tiles = tiles
+        self.to_crs = Transformer.from_crs(local, layer.crs, always_xy=True)
+        self.bounds_m: tuple[float, float, float, float] = self.to_crs.transform_bounds(
+            *layer.bounds, densify_pts=51, direction="INVERSE"
+        )
+        # Ground size of one CRS unit at the centre of the layer, to choose a level in metres.
+        self.unit_m = layer.gsd_m / math.sqrt(layer.levels[-1].pixel_x * layer.levels[-1].pixel_y)
+
+    def window(
+        self, e_min_m: float, n_max_m: float, width_px: int, height_px: int, gsd_m: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As ``LocalMap.window``."""
+        image = np.zeros((height_px, width_px, 3), np.uint8)
+        mask = np.zeros((height_px, width_px), np.uint8)
+        level = self._level_for(gsd_m)
+        blocks = [
+            Block(row, column, min(BLOCK_PX, height_px - row), min(BLOCK_PX, width_px - column))
+            for row in range(0, height_px, BLOCK_PX)
+            for column in range(0, width_px, BLOCK_PX)
+        ]
+        while blocks:
+            uv = self._project(blocks, e_min_m, n_max_m, gsd_m, level)
+            affine = FIT @ uv
+            error_px = np.abs(KNOTS @ affine - uv).max(axis=(1, 2))  # NaN beyond the projection: nothing there
+            crooked: list[Block] = []
+            for i, block in enumerate(blocks):
+                if error_px[i] > AFFINE_TOLERANCE_PX and max(block.height, block.width) > MIN_BLOCK_PX:
+                    crooked += block.quarters()
+                elif np.isfinite(uv[i]).all():
+                    place = block.slices
+                    self._draw(image[place], mask[place], affine[i], uv[i], level)
+            blocks = crooked
+        return image, mask.view(bool)
+
+    def _level_for(self, gsd_m: float) -> Level:
+        """The coarsest level that still has the detail asked for."""
+        for level in self._layer.levels:
+            if math.sqrt(level.pixel_x * level.pixel_y) * self.unit_m <= gsd_m * COARSER_ALLOWED:
+                return level
+        return self._layer.levels[-1]
+
+    def _project(self, blocks: list[Block], e_min_m: float, n_max_m: float, gsd_m: float, level: Level) -> np.ndarray:
+        """(blocks, 9, 2): column and row of the level under the knots of each block, whole numbers at pixel centres."""
+        places = np.array([(b.column, b.row) for b in blocks])[:, None]
+        sizes = np.array([(b.width, b.height) for b in blocks])[:, None]
+        pixels = places + KNOTS[:, :2] * sizes
+        x, y = self.to_crs.transform(e_min_m + pixels[..., 0] * gsd_m, n_max_m - pixels[..., 1] * gsd_m)
+        u = (x - self._layer.x_min) / level.pixel_x - 0.5
+        v = (self._layer.y_max - y) / level.pixel_y - 0.5
+        return np.stack([u, v], axis=2)
+
+    def _draw(self, image: np.ndarray, mask: np.ndarray, affine: np.ndarray, uv: np.ndarray, level: Level) -> None:
+        """Fills one block (views into the window) through ``affine``, which takes (s, t, 1), both 0 to 1 over the
+        block, to column and row of the level."""
+        height_px, width_px = mask.shape
+        across, down = affine[0] / width_px, affine[1] / height_px
+        scale = math.sqrt(abs(float(across[0] * down[1] - across[1] * down[0])))
+        side, sigma_px = _low_pass(scale)
+        margin = 2 + side // 2
+        low = np.floor(uv.min(axis=0)).astype(int) - margin
+        high = np.ceil(uv.max(axis=0)).astype(int) + margin + 1
+        start, end = np.maximum(low, 0), np.minimum(high, [level.columns * TILE_PX, level.rows * TILE_PX])
+        if (start >= end).any():
+            return
+        (u_0, v_0), (width, height) = (int(v) for v in start), (int(v) for v in end - start)
+        source, whole = self._tiles.mosaic(self._layer.table, level, u_0, v_0, width, height)
+        whole &= bool((start == low).all() and (end == high).all())  # else the window reaches beyond the tiles
+        if not whole and not source[:, :, 3].any():
+            return
+        if side > 1:
+            valid = None if whole else cv2.erode(cv2.extractChannel(source, 3), np.ones((side, side), np.uint8))
+            source = cv2.GaussianBlur(source, (side, side), sigma_px)
+            if valid is not None:
+                cv2.insertChannel(valid, source, 3)
+        # From pixel centres of the block, as OpenCV has them.
+        corner = affine[2] + (across + down) / 2 - (u_0, v_0)
+        # Four channels: OpenCV warps them in half the time of three, and the fourth carries the mask.
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        warped = cv2.warpAffine(source, np.stack([across, down, corner], axis=1), (width_px, height_px), flags=flags)
+        cv2.cvtColor(warped, cv2.COLOR_BGRA2BGR, dst=image)
+        if whole:
+            mask[:] = 1
+            return
+        np.equal(cv2.extractChannel(warped, 3), 255, out=mask.view(bool))  # every pixel that was blended is valid
+        image[mask == 0] = 0
+
+
+def _low_pass(scale: float) -> tuple[int, float]:
+    """Side of the Gaussian kernel and its sigma, pixels; side 1: none, sigma 0: OpenCV's own for the side."""
+    if scale <= BLUR_FAST_SCALE:
+        return (3, 0.0) if scale > BLUR_MIN_SCALE else (1, 0.0)
+    sigma_px = 0.5 * math.sqrt(scale * scale - 1.0)
+    return 2 * round(2.5 * sigma_px) + 1, sigma_px
+
+
+def _halves(start: int, size: int) -> list[tuple[int, int]]:
+    """(start, size), or two when it is long enough to be halved."""
+    half = size // 2
+    return [(start, size)] if size <= MIN_BLOCK_PX else [(start, half), (start + half, size - half)]

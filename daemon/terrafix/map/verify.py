@@ -1,0 +1,123 @@
+"""Opening a map package: the checks that come before its first tile is used."""
+
+import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import msgspec
+
+from terrafix.core.errors import MapError
+from terrafix.core.signature import TrustedKey, is_signed
+from terrafix.map import format_v1
+from terrafix.map.format import (
+    APPLICATION_ID,
+    FORMAT_VERSION,
+    HASH_TABLE,
+    IMAGERY_TABLE,
+    MANIFEST_TABLE,
+    SIGNATURE_TABLE,
+    HashRow,
+    Manifest,
+    checksum_of,
+    signed_bytes,
+)
+
+
+def connect(path: Path) -> sqlite3.Connection:
+    """Read-only connection after the checks that need no SQL. Raises MapError."""
+    if not path.is_file():
+        raise MapError(f"{path}: no such map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'")
+    try:
+        with path.open("rb") as file:
+            head = file.read(100)
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read ({error.strerror})") from None
+    if head[:16] != b"SQLite format 3\x00" or len(head) < 100:
+        raise MapError(f"{path}: not a map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'")
+    page = int.from_bytes(head[16:18], "big")
+    expected = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")  # sqlite.org/fileformat2.html
+    actual = path.stat().st_size
+    if actual < expected:
+        raise MapError(f"{path}: truncated map package ({actual} of {expected} bytes); copy or build it again")
+    if path.with_name(f"{path.name}-journal").exists():
+        raise MapError(f"{path}: signing it was interrupted; run 'terrafix map sign' again")
+    # immutable: no locks and no journal beside the file, so that a read-only medium will do.
+    return sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)
+
+
+def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
+    """The manifest after its checksum over itself and the list of tiles was found right. Raises MapError."""
+    tables = {row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if db.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID or MANIFEST_TABLE not in tables:
+        raise MapError(
+            f"{path}: not a Terrafix map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'"
+        )
+    rows: dict[str, str] = dict(db.execute(f"SELECT key, value FROM {MANIFEST_TABLE}"))
+    version = rows.get("format_version", "")
+    if version.isdigit() and int(version) > FORMAT_VERSION:
+        raise MapError(
+            f"{path}: map package of format {version}, this Terrafix reads up to {FORMAT_VERSION}; update Terrafix"
+        )
+    first = version == "1"
+    missing = (format_v1.TABLES if first else {IMAGERY_TABLE, HASH_TABLE}) - tables
+    if missing:
+        raise MapError(f"{path}: damaged map package (no table {min(missing)}); build or copy it again")
+    hashes: list[HashRow]
+    if first:
+        hashes = format_v1.hashes(db)
+        checksum = format_v1.checksum_of(rows, hashes)
+    else:
+        hashes = db.execute(
+            f"SELECT table_name, zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}"
+        ).fetchall()
+        checksum = checksum_of(rows.items(), hashes)
+    if checksum != rows.get("checksum"):
+        raise MapError(f"{path}: checksum mismatch, the package was altered; build or copy it again")
+    fields: dict[str, Any] = {}
+    try:
+        for field in msgspec.structs.fields(Manifest):
+            if field.name not in rows and not field.required:
+                continue
+            text = rows[field.name]
+            fields[field.name] = text if field.type is str else msgspec.json.decode(text, type=field.type)
+        if first:
+            fields["layers"] = (format_v1.layer(db, fields, len(hashes)),)
+        manifest = Manifest(**fields)
+    except (KeyError, TypeError, msgspec.DecodeError) as error:
+        raise MapError(f"{path}: damaged manifest ({error}); build or copy the package again") from None
+    if len(hashes) != manifest.tiles or not manifest.layers:
+        raise MapError(f"{path}: damaged manifest (tiles or layers missing); build or copy the package again")
+    return manifest
+
+
+def check_signature(
+    path: Path, db: sqlite3.Connection, manifest: Manifest, trusted: Sequence[TrustedKey] | None
+) -> tuple[str, ...]:
+    """Ids of the keys that signed the package; every signature in it must be right.
+
+    ``trusted``: keys of which one must have signed; None: an unsigned package will do.
+    Raises MapError: altered after signing, signed by nobody who is trusted, or not signed."""
+    tables = {row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    signed: list[str] = []
+    if SIGNATURE_TABLE in tables and manifest.format_version > 1:
+        for key_id, public_key, signature in db.execute(f"SELECT key_id, public_key, signature FROM {SIGNATURE_TABLE}"):
+            key = TrustedKey(public_key)
+            if key.key_id != key_id or not is_signed(key, signed_bytes(manifest.checksum), signature):
+                raise MapError(
+                    f"{path}: wrong signature (key {key_id}), the package was altered after it was signed; "
+                    "copy it again, or sign it again if you know why"
+                )
+            signed.append(key.key_id)
+    if trusted is not None and not signed:
+        raise MapError(
+            f"{path}: not signed, and [map] require_signature asks for it; "
+            f"sign it: terrafix map sign {path.name} --key KEY"
+        )
+    if trusted is not None and not {key.key_id for key in trusted} & set(signed):
+        raise MapError(
+            f"{path}: signed by {', '.join(signed)}, which is not in [map] trusted_keys "
+            f"({', '.join(key.key_id for key in trusted)}); add its public key, or use a package that you trust"
+        )
+    return tuple(signed)

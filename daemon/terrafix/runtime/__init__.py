@@ -1,0 +1,1 @@
+"""What forks, waits or writes: the supervisor, the processes, the bus, the shells."""
