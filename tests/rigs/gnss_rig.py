@@ -1,0 +1,51 @@
+"""Readings of a GNSS receiver with known errors, and a watch that is fed with them."""
+
+from collections.abc import Callable
+from typing import Any
+
+from link_rig import LAT, LON, MS, SPEED_EAST, S, estimate
+from terrafix import messages as m
+from terrafix.link.integrity.output_predictor import offset
+from terrafix.link.node import LinkNode
+
+READING_AGE_NS = 150 * MS
+
+
+Where = Callable[[float], tuple[float, float] | None]  # s -> error east, north of the receiver, m; None: no fix
+
+
+def reading(t_ns: int, error: tuple[float, float] | None, **changes: Any) -> m.GnssReading:
+    """A receiver on the vehicle of link_rig: flies east at 20 m/s; its reading is 150 ms old."""
+    fields: dict[str, Any] = {"t_ns": t_ns, "receiver": 0, "fix_type": 3, "satellites": 14, "horizontal_m": 1.3}
+    fields |= {"speed_mps": SPEED_EAST, "lat_deg": None, "lon_deg": None}
+    if error is None:
+        fields |= {"fix_type": 1, "horizontal_m": None, "satellites": 0}
+    else:
+        east_m = SPEED_EAST * (t_ns - READING_AGE_NS) / S
+        fields["lat_deg"], fields["lon_deg"] = offset(LAT, LON, east_m + error[0], error[1])
+    return m.GnssReading(**fields | changes)
+
+
+def watched(
+    node: LinkNode,
+    seconds: float,
+    where: Where,
+    *,
+    begin_s: float = 0.0,
+    ours: Callable[[float], float] = lambda _: 0.0,
+    **claims: Any,
+) -> list[m.Message]:
+    """Readings at 5 Hz, estimates at 2 Hz with error ``ours`` (m east), the link's ticks."""
+    heard: list[m.Message] = []
+    for step in range(round(begin_s * 50), round((begin_s + seconds) * 50)):
+        now_ns, t_s = step * 20 * MS, step * 0.02
+        if step % 25 == 5:
+            heard += node.on(estimate(now_ns - 100 * MS, east_m=ours(t_s), **claims))
+        if step % 10 == 0:
+            heard += node.on(reading(now_ns, where(t_s)))
+        heard += node.tick(now_ns)
+    return heard
+
+
+def right(_: float) -> tuple[float, float]:
+    return 1.0, -1.0

@@ -1,0 +1,112 @@
+"""The benchmark on a tiny generated flight: every field that its JSON promises, and what bad arguments say."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground import PINHOLE, FlatMap, rotation, texture, view
+from terrafix.core.errors import OutputError, SourceError, UsageError
+from terrafix.core.geodesy import quat_from_rot
+from terrafix.messages import Prediction
+from terrafix_tools.bench.baseline import SiftBaseline
+from terrafix_tools.bench.run import bench
+
+FRAMES = 3
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """No data here: the generated flight stands in."""
+    out = tmp_path_factory.mktemp("bench") / "deep" / "bench.json"
+    returned = bench(out.parent / "no-data", out, frames=FRAMES)
+    written: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
+    assert written == json.loads(json.dumps(returned))
+    return written
+
+
+@pytest.mark.slow
+def test_what_could_not_be_measured_is_named(measured: dict[str, Any]) -> None:
+    assert [text.split(":")[0] for text in measured["missing"]] == ["XFeat", "flight village-1", "flight town-a"]
+    assert list(measured["flights"]) == ["generated"]
+
+
+@pytest.mark.slow
+def test_the_machine_is_described(measured: dict[str, Any]) -> None:
+    machine = measured["machine"]
+    assert machine["cores"] >= 1 and machine["memory_mb"] > 100 and machine["cpu"]
+    assert len(machine["load_average_before"]) == len(machine["load_average_after"]) == 3
+    assert machine["versions"]["numpy"] and machine["versions"]["python"]
+
+
+@pytest.mark.slow
+def test_times_memory_and_accuracy_of_the_replay(measured: dict[str, Any]) -> None:
+    flight = measured["flights"]["generated"]
+    assert flight["frames"] == FRAMES and list(flight["runs"]) == ["weights-free"]
+    run = flight["runs"]["weights-free"]
+    assert list(run["stage_ms"]) == ["decode", "vision", "anchor", "estimator"]
+    for times in (run["frame_ms"], run["cpu_ms"], *run["stage_ms"].values()):
+        assert 0.0 < times["median"] <= times["p95"]
+    parts = sum(times["median"] for times in run["stage_ms"].values())
+    assert parts == pytest.approx(run["frame_ms"]["median"], rel=0.3)
+    assert run["first_frame_ms"] > 0.0 and run["start_up_s"] > 0.0
+    assert run["frames_per_s"] == pytest.approx(1e3 / run["frame_ms"]["median"], rel=0.9)  # the first frame counts here
+    assert 50.0 < run["peak_memory_mb"] < 4000.0
+    assert run["accuracy"]["localised"] == FRAMES
+    assert 0.0 <= run["accuracy"]["within_20m"] <= run["accuracy"]["within_50m"] <= 1.0
+
+
+@pytest.mark.slow
+def test_the_baseline_and_the_ratios_to_it(measured: dict[str, Any]) -> None:
+    flight = measured["flights"]["generated"]
+    baseline, ratios = flight["baseline"], flight["ratios"]["weights-free"]
+    assert "SIFT" in baseline["method"] and 0 <= baseline["answered"] <= baseline["frames"] == FRAMES
+    assert set(baseline["accuracy"]) == {"within_20m", "within_50m", "median_m"}
+    ours = flight["runs"]["weights-free"]["frame_ms"]["median"]
+    assert ratios["frame_ms"] == pytest.approx(ours / baseline["frame_ms"]["median"], abs=0.001)
+    assert set(ratios) == {"frame_ms", "cpu_ms", "within_20m", "within_50m"}
+
+
+@pytest.mark.slow
+def test_the_parts(measured: dict[str, Any]) -> None:
+    micro = measured["micro"]
+    assert micro["flight"] == "generated"
+    for part in ("odometry", "look (search)", "belief update", "fix (patches + PnP)", "link, one second"):
+        assert micro[part]["median"] > 0.0
+    for mode in ("marginals", "jacobian"):
+        assert f"estimator frame, 20 nodes, {mode}" in micro  # empty: three frames do not fill the window
+
+
+def test_a_flight_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"none of moon-1 is there; check --data and --flight"):
+        bench(tmp_path, tmp_path / "b.json", flights=["moon-1"])
+
+
+def test_bad_arguments(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--frames 1"):
+        bench(tmp_path, tmp_path / "b.json", frames=1)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        bench(tmp_path, tmp_path / "file" / "b.json")
+
+
+def test_the_baseline_is_right_where_it_can_be() -> None:
+    """The same picture on both sides, where SIFT cannot fail: an unfair baseline would be worth nothing."""
+    ground, r, p = texture(3, 420.0), rotation(35.0, 3.0, -2.0), np.array([12.0, -20.0, 100.0])
+    baseline = SiftBaseline(PINHOLE, FlatMap(ground))  # type: ignore[arg-type]
+    predicted = Prediction(
+        t_ns=0,
+        frame_id=0,
+        p_c_in_w_m=(-10.0, 5.0, 100.0),
+        q_w_c=quat_from_rot(rotation(38.0, 3.0, -2.0)),
+        cov=(0.0,) * 36,
+        agl_m=98.0,
+        agl_sigma_m=3.0,
+        step_m=(0.0, 0.0),
+        step_cov_m2=(0.0,) * 4,
+    )
+    found = baseline.locate(view(ground, PINHOLE, r, p), predicted)
+    assert found == pytest.approx((12.0, -20.0), abs=1.5)
+    assert baseline.locate(view(texture(50, 420.0), PINHOLE, r, p), predicted) is None

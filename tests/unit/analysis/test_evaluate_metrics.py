@@ -1,0 +1,155 @@
+"""Evaluation: every number of evaluation.json on flights small enough to count by hand."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from flight_records import ORIGIN
+from terrafix.core.errors import EvaluationError
+from terrafix_tools.estimates import COLUMNS, Row, write_rows
+from terrafix_tools.evaluate import evaluate, offset_m, read_truth
+
+CONTRACT = [
+    "frames",
+    "localised",
+    *[f"{p}{k}" for p in ("", "refined_") for k in ("within_5m", "within_10m", "within_20m", "within_50m")],
+    *[f"{p}{k}" for p in ("", "refined_") for k in ("median_m", "p95_m", "max_m")],
+    "ellipse95_coverage",
+    "mean_nees",
+    "false_fixes",
+    "anchor_rate",
+    "odometry_rate",
+    "frame_ms_median",
+    "frame_ms_p95",
+]
+
+
+def row(i: int, east_m: float | None, *, sigma_m: float = 4.0, refined_m: float | None = None, age_ms: int = 0) -> Row:
+    """A frame whose estimate is ``east_m`` east of the truth at the origin; None: no position."""
+    made = Row(file=f"{i}.jpg", t_s=i / 2, process_ms=100.0 + i)
+    if east_m is not None:
+        made.lat_deg, made.lon_deg = ORIGIN.to_wgs84(east_m, 0.0)
+        made.sigma_e_m = made.sigma_n_m = sigma_m
+        made.cov_en_m2 = 0.0
+        made.anchor_age_ms = age_ms
+        made.source_label = "satellite_anchored"
+    if refined_m is not None:
+        made.refined_lat_deg, made.refined_lon_deg = ORIGIN.to_wgs84(refined_m, 0.0)
+    return made
+
+
+def folder(path: Path, rows: list[Row], truth: str | None = None, summary: dict[str, object] | None = None) -> Path:
+    with (path / "estimates.csv").open("w") as stream:
+        write_rows(stream, rows)
+    lines = [f"{r.file},48.0,11.0" for r in rows]
+    (path / "truth.csv").write_text(truth if truth is not None else "\n".join(["file,lat_deg,lon_deg", *lines]))
+    (path / "summary.json").write_text(json.dumps(summary or {"frames": len(rows), "odometry_frames": 2}))
+    return path
+
+
+def test_the_numbers(tmp_path: Path) -> None:
+    rows = [
+        row(0, None),
+        row(1, 3.0, refined_m=1.0),
+        row(2, 8.0, refined_m=4.0, age_ms=500),
+        row(3, 60.0, refined_m=30.0),
+        row(4, 60.0, sigma_m=40.0),
+    ]
+    found = evaluate(folder(tmp_path, rows), tmp_path / "truth.csv", json_only=True)
+    assert set(CONTRACT) <= set(found)
+    assert (found["frames"], found["localised"]) == (5, 4)
+    assert [found[f"within_{m}m"] for m in (5, 10, 20, 50)] == [0.2, 0.4, 0.4, 0.4]
+    assert [found[f"refined_within_{m}m"] for m in (5, 10, 20, 50)] == [0.4, 0.4, 0.4, 0.6]
+    assert found["median_m"] == pytest.approx(34.0, abs=0.01)
+    assert found["max_m"] == pytest.approx(60.0, abs=0.01)
+    assert found["refined_median_m"] == pytest.approx(4.0, abs=0.01)
+    assert found["ellipse95_coverage"] == 0.75  # 3, 8 of 4 m and 60 of 40 m are inside; 60 of 4 m is not
+    nees = [(3 / 4) ** 2, (8 / 4) ** 2, (60 / 4) ** 2, (60 / 40) ** 2]
+    assert found["mean_nees"] == pytest.approx(sum(nees) / 4, rel=1e-3)
+    assert found["false_fixes"] == 1  # 60 m claimed as 4 m; 60 m claimed as 40 m is honest
+    assert found["anchor_rate"] == 0.6
+    assert found["odometry_rate"] == 0.5
+    assert found["frame_ms_median"] == 102.0
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == found
+
+
+def test_nothing_localised_is_a_result(tmp_path: Path) -> None:
+    found = evaluate(folder(tmp_path, [row(0, None), row(1, None)]), tmp_path / "truth.csv")
+    assert (found["localised"], found["within_50m"], found["median_m"]) == (0, 0.0, None)
+    assert (found["ellipse95_coverage"], found["false_fixes"]) == (None, 0)
+
+
+def test_correlated_covariance_counts(tmp_path: Path) -> None:
+    made = row(0, None)
+    made.lat_deg, made.lon_deg = ORIGIN.to_wgs84(10.0, 10.0)
+    made.sigma_e_m = made.sigma_n_m = 6.0
+    made.cov_en_m2 = 0.9 * 36.0  # long axis towards north-east, where the error is
+    along = evaluate(folder(tmp_path, [made]), tmp_path / "truth.csv", json_only=True)
+    made.cov_en_m2 = -0.9 * 36.0
+    across = evaluate(folder(tmp_path, [made]), tmp_path / "truth.csv", json_only=True)
+    assert along["mean_nees"] == pytest.approx(200 / (36 * 1.9), rel=1e-3)
+    assert across["mean_nees"] == pytest.approx(200 / (36 * 0.1), rel=1e-3)
+    assert (along["ellipse95_coverage"], across["ellipse95_coverage"]) == (1.0, 0.0)
+
+
+def test_a_covariance_that_is_none_is_not_coverage(tmp_path: Path) -> None:
+    found = evaluate(folder(tmp_path, [row(0, 60.0, sigma_m=0.0)]), tmp_path / "truth.csv", json_only=True)
+    assert (found["ellipse95_coverage"], found["mean_nees"], found["covariance_invalid"]) == (0.0, None, 1)
+    assert found["false_fixes"] == 1
+
+
+def test_frames_without_truth_do_not_count(tmp_path: Path) -> None:
+    truth = "file,lat_deg,lon_deg,agl_m\n0.jpg,48.0,11.0,5\n1.jpg,,,\nother.jpg,48.0,11.0,5\n"
+    found = evaluate(folder(tmp_path, [row(0, 1.0), row(1, 1.0)], truth), tmp_path / "truth.csv", json_only=True)
+    assert (found["frames"], found["frames_without_truth"]) == (1, 1)
+
+
+def test_sigma_of_the_truth_is_an_extra_key(tmp_path: Path) -> None:
+    folder(tmp_path, [row(0, 12.0, sigma_m=4.0)])
+    (tmp_path / "flight.toml").write_text("[truth]\nsigma_m = 7.0\n")
+    found = evaluate(tmp_path, tmp_path / "truth.csv", json_only=True)
+    assert (found["ellipse95_coverage"], found["ellipse95_coverage_with_truth_sigma"]) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("truth", "says"),
+    [
+        ("file,lat_deg\n0.jpg,48\n", "column lon_deg missing"),
+        ("", "column file, lat_deg, lon_deg missing"),
+        ("file,lat_deg,lon_deg\na.jpg,48,11\n", "no frame stands in both"),
+        ("file,lat_deg,lon_deg\n0.jpg,48,11\n0.jpg,48,11\n", "line 3: '0.jpg' stands there a second time"),
+        ("file,lat_deg,lon_deg\n0.jpg,north,11\n", "line 2: lat_deg is 'north', not a number"),
+        ("file,lat_deg,lon_deg\n0.jpg,nan,11\n", "not a finite number"),
+        ("file,lat_deg,lon_deg\n0.jpg,148,11\n", "no place on earth"),
+        ("file,lat_deg,lon_deg\n0.jpg,48\n", "line 2: 2 cells where the head has 3"),
+        ("file,lat_deg,lon_deg\n0.jpg,,\n", "no row with a position"),
+    ],
+)
+def test_bad_truth_is_one_line_with_its_place(tmp_path: Path, truth: str, says: str) -> None:
+    with pytest.raises(EvaluationError, match=says) as caught:
+        evaluate(folder(tmp_path, [row(0, 1.0)], truth), tmp_path / "truth.csv")
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match=r"estimates.csv: no such file; write it with 'terrafix replay'"):
+        evaluate(tmp_path, tmp_path / "truth.csv")
+    with pytest.raises(EvaluationError, match=r"truth.csv: no such file"):
+        read_truth(tmp_path / "truth.csv")
+
+
+def test_offsets_are_metres_east_and_north(tmp_path: Path) -> None:
+    (tmp_path / "truth.csv").write_text("\ufefffile, lat_deg, lon_deg\n0.jpg, 48.0, 11.0\n")
+    truth = read_truth(tmp_path / "truth.csv")["0.jpg"]
+    east_m, north_m = offset_m(truth, *ORIGIN.to_wgs84(30.0, -40.0))
+    assert (east_m, north_m) == (pytest.approx(30.0, abs=1e-3), pytest.approx(-40.0, abs=1e-3))
+    assert math.hypot(east_m, north_m) == pytest.approx(50.0, abs=1e-3)
+
+
+def test_the_columns_are_the_contract() -> None:
+    assert ",".join(COLUMNS) == (
+        "file,t_s,lat_deg,lon_deg,alt_amsl_m,agl_m,sigma_e_m,sigma_n_m,cov_en_m2,yaw_deg,source_label,anchor_age_ms,"
+        "covariance_mode,process_ms,refined_lat_deg,refined_lon_deg"
+    )

@@ -1,0 +1,242 @@
+"""Replay with small stand-in nodes: files, columns, determinism, and what bad input says."""
+
+import csv
+import errno
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine
+
+from flight_records import ORIGIN, estimate
+from source_folders import TOML, flight
+from terrafix import messages as m
+from terrafix.core.errors import ConfigError, MapError, ModelError, OutputError, UsageError
+from terrafix.core.node import Node, NodeContext
+from terrafix.recorder.reader import read_flight
+from terrafix.recorder.writer import FlightWriter
+from terrafix_tools.estimates import COLUMNS, read_rows
+from terrafix_tools.replay import replay
+
+FRAMES = 6
+LOST = 2  # the frame for which the stand-in estimator says nothing
+
+
+class StandInVision:
+    def on(self, message: m.Message) -> Iterable[m.Message]:
+        if isinstance(message, m.Frame):
+            keyframe = max(0, message.frame_id - 1)
+            verdict = m.Verdict.BAD_IMAGE if message.error else m.Verdict.ACCEPTED
+            yield m.Odometry(t_ns=message.t_ns, frame_id=message.frame_id, keyframe_id=keyframe, verdict=verdict)
+
+    def tick(self, now_ns: int) -> Iterable[m.Message]:
+        return ()
+
+
+class StandInEstimator:
+    """Two estimates a frame: the last one counts."""
+
+    def __init__(self, die_at: int = -1) -> None:
+        self._die_at = die_at
+
+    def on(self, message: m.Message) -> Iterable[m.Message]:
+        match message:
+            case m.Odometry(frame_id=i):
+                if i == self._die_at:
+                    raise RuntimeError("a bug")
+                said = m.MeasurementVerdict(
+                    t_ns=message.t_ns, frame_id=i, measurement="odometry", verdict=message.verdict
+                )
+                yield said
+                if i != LOST:
+                    yield estimate(i, 999.0, 999.0)
+                    yield estimate(i, 10.0 * i, -10.0)
+            case m.SourceEnded():
+                for offset_m in (5.0, 0.0):
+                    lat_deg, lon_deg = ORIGIN.to_wgs84(0.0, offset_m)
+                    pose = m.RefinedPose(
+                        frame_id=1, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=0.0, sigma_e_m=1.0, sigma_n_m=1.0
+                    )
+                    yield m.Refinement(t_ns=message.t_ns, poses=[pose])
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> Iterable[m.Message]:
+        return ()
+
+
+def nodes(ctx: NodeContext) -> dict[str, Node]:
+    return {"vision": StandInVision(), "estimator": StandInEstimator()}
+
+
+def map_at(path: Path, lon_deg: float = 11.0) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(0).integers(1, 255, (3, 128, 128), dtype=np.uint8)
+    size = 0.00001
+    place = Affine(size, 0.0, lon_deg - 64 * size, 0.0, -size, 48.0 + 64 * size)
+    profile = {"driver": "GTiff", "width": 128, "height": 128, "count": 3, "dtype": "uint8"}
+    with rasterio.open(path, "w", crs="EPSG:4326", transform=place, **profile) as file:
+        file.write(pixels)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    map_at(tmp_path / "maps" / "here.tif")
+    return flight(tmp_path / "flight", FRAMES, toml=TOML.replace("lon_deg = 2.0", "lon_deg = 11.0"))
+
+
+def test_three_files_and_one_row_a_frame(folder: Path, tmp_path: Path) -> None:
+    (folder / "frames" / "0004.jpg").write_bytes(b"not an image")
+    summary = replay(folder, None, tmp_path / "out", nodes=nodes)
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["estimates.csv", "flight.mcap", "summary.json"]
+    rows = list(csv.DictReader((tmp_path / "out" / "estimates.csv").read_text().splitlines()))
+    assert list(rows[0]) == list(COLUMNS)
+    assert [r["file"] for r in rows] == [f"{i:04}.jpg" for i in range(FRAMES)]
+    assert [bool(r["lat_deg"]) for r in rows] == [i != LOST for i in range(FRAMES)]
+    last = rows[3]
+    assert ORIGIN.to_local(float(last["lat_deg"]), float(last["lon_deg"])) == pytest.approx((30.0, -10.0), abs=0.01)
+    assert (last["t_s"], last["yaw_deg"], last["sigma_e_m"], last["cov_en_m2"]) == (
+        "1.500",
+        "90.000",
+        "4.0000",
+        "0.00000",
+    )
+    assert (last["source_label"], last["anchor_age_ms"]) == ("satellite_anchored", "0")
+    assert all(float(r["process_ms"]) > 0 for r in rows)
+    assert [bool(r["refined_lat_deg"]) for r in rows] == [i == 1 for i in range(FRAMES)]
+    assert float(rows[1]["refined_lat_deg"]) == pytest.approx(48.0, abs=1e-8)  # the last refinement
+    assert summary == json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["frames"], summary["localised"], summary["odometry_frames"]) == (FRAMES, FRAMES - 1, FRAMES - 2)
+    assert summary["verdicts"]["odometry"] == {"accepted": FRAMES - 1, "bad_image": 1}
+    recorded = [message for _, _, message in read_flight(tmp_path / "out")]
+    assert sum(isinstance(message, m.Frame) for message in recorded) == FRAMES
+    assert isinstance(recorded[0], m.Origin)
+
+
+def test_the_summary_has_a_verdict_from_rows_faults_and_answers(folder: Path, tmp_path: Path) -> None:
+    class Faulty(StandInEstimator):
+        def on(self, message: m.Message) -> Iterable[m.Message]:
+            yield from super().on(message)
+            if isinstance(message, m.Odometry) and message.frame_id == FRAMES - 2:
+                fault = {"t_ns": message.t_ns, "quantity": "scale", "factor": 2.0, "detail": ""}
+                yield m.CalibrationFault(**fault, active=True)
+
+    said = replay(folder, None, tmp_path / "right", nodes=nodes)["verdict"]
+    assert said["verdict"] == "trust it in part" and said["reasons"] == ["no position"] and said["active_faults"] == []
+    wrong = replay(folder, None, tmp_path / "wrong", nodes=lambda ctx: nodes(ctx) | {"estimator": Faulty()})["verdict"]
+    assert wrong["verdict"] == "do not trust it"
+    assert wrong["active_faults"] == ["height/focal seems x2.00 off"]
+    assert json.loads((tmp_path / "wrong" / "summary.json").read_text())["verdict"] == wrong
+
+
+def test_twice_the_same_but_for_the_time(folder: Path, tmp_path: Path) -> None:
+    tables = []
+    for name in ("a", "b"):
+        replay(folder, None, tmp_path / name, nodes=nodes)
+        rows = list(csv.reader((tmp_path / name / "estimates.csv").read_text().splitlines()))
+        at = rows[0].index("process_ms")
+        tables.append([row[:at] + row[at + 1 :] for row in rows])
+    assert tables[0] == tables[1]
+
+
+def test_a_replay_that_dies_leaves_what_it_had(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    replay(folder, None, out, nodes=nodes)
+    (out / "report.html").write_text("old")
+    with pytest.raises(RuntimeError, match="a bug"):
+        replay(folder, None, out, nodes=lambda ctx: {"vision": StandInVision(), "estimator": StandInEstimator(4)})
+    assert sorted(p.name for p in out.iterdir()) == ["estimates.csv.partial", "flight.mcap.partial"]
+    assert len(read_rows(out / "estimates.csv.partial")) == 4
+    assert sum(isinstance(x, m.Frame) for _, _, x in read_flight(out / "flight.mcap.partial")) >= 4
+
+
+def test_height_of_the_ground_comes_from_the_map(folder: Path, tmp_path: Path) -> None:
+    from terrafix_tools.mapping.build import build
+
+    dem = tmp_path / "dem.tif"
+    place = Affine(0.001, 0.0, 10.99, 0.0, -0.001, 48.01)
+    profile = {"driver": "GTiff", "width": 20, "height": 20, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(dem, "w", transform=place, **profile) as file:
+        file.write(np.full((1, 20, 20), 512.5, np.float32))
+    package = build(tmp_path / "maps" / "here.tif", tmp_path / "with-dem.gpkg", dem=dem)
+    replay(folder, package, tmp_path / "out", nodes=nodes)
+    said = next(x for _, _, x in read_flight(tmp_path / "out") if isinstance(x, m.Origin))
+    assert said.ground_amsl_m is not None
+    assert math.isclose(said.ground_amsl_m, 512.5, abs_tol=0.1)
+
+
+def test_the_start_may_be_given(folder: Path, tmp_path: Path) -> None:
+    replay(folder, None, tmp_path / "out", start=(48.0001, 11.0), nodes=nodes)
+    said = next(x for _, _, x in read_flight(tmp_path / "out") if isinstance(x, m.Origin))
+    assert (said.lat_deg, said.lon_deg) == (48.0001, 11.0)
+
+
+def test_a_map_elsewhere_says_how_far(folder: Path, tmp_path: Path) -> None:
+    elsewhere = map_at(tmp_path / "far.tif", lon_deg=11.1)
+    with pytest.raises(
+        MapError, match=r"does not cover the start 48.000000, 11.000000; its nearest edge is 7\.\d km away"
+    ):
+        replay(folder, elsewhere, tmp_path / "out", nodes=nodes)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_start_with_latitude_and_longitude_swapped_is_said_as_such(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match=r"latitude and longitude are swapped: 48.000000, 11.000000 lies on the map"):
+        replay(folder, None, tmp_path / "out", start=(11.0, 48.0), nodes=nodes)
+
+
+def test_no_map_anywhere(folder: Path, tmp_path: Path) -> None:
+    toml = (folder / "flight.toml").read_text()
+    (folder / "flight.toml").write_text(toml.replace('map = "../maps/here.tif"', ""))
+    with pytest.raises(MapError, match="names no map; give one with --map"):
+        replay(folder, None, tmp_path / "out", nodes=nodes)
+    with pytest.raises(MapError, match="no such map"):
+        replay(folder, tmp_path / "none.tif", tmp_path / "out", nodes=nodes)
+
+
+def test_models_are_checked_before_the_flight(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERRAFIX_MODELS", str(tmp_path / "models"))
+    for text, error, says in (
+        ("xfeat=none.onnx", ModelError, "none.onnx: no such model file"),
+        ("xfeat", ModelError, r"models/xfeat\.onnx: no such model file \(xfeat\); terrafix models fetch xfeat"),
+        ("xfeat=", UsageError, "write NAME=PATH, or NAME alone"),
+        ("xfeat=lighterglue-l3", ModelError, "'lighterglue-l3' cannot be used as xfeat"),
+        ("superglue=a.onnx", UsageError, "no model is called 'superglue'; known: xfeat"),
+    ):
+        with pytest.raises(error, match=says):
+            replay(folder, None, tmp_path / "out", models=[text], nodes=nodes)
+
+
+def test_bad_configuration_and_output(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "bad.toml").write_text("[recorder]\nthumbnail = true\n")
+    with pytest.raises(ConfigError, match="did you mean 'thumbnails'"):
+        replay(folder, None, tmp_path / "out", configs=[tmp_path / "bad.toml"], nodes=nodes)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        replay(folder, None, tmp_path / "file" / "out", nodes=nodes)
+
+
+def test_a_disk_that_is_full_is_one_line(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_self: FlightWriter) -> None:
+        if (tmp_path / "out" / "estimates.csv.partial").read_text(encoding="utf-8").count("\n") > 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(FlightWriter, "flush", full)
+    with pytest.raises(OutputError, match=r"cannot be written \(No space left on device\); is the disk full"):
+        replay(folder, None, tmp_path / "out", nodes=nodes)
+    assert not (tmp_path / "out" / "estimates.csv").exists()
+
+
+def test_thumbnails_follow_the_configuration(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text("[recorder]\nthumbnails = false\n")
+    with_pictures = replay(folder, None, tmp_path / "a", nodes=nodes)
+    without = replay(folder, None, tmp_path / "b", configs=[tmp_path / "c.toml"], nodes=nodes)
+    assert (tmp_path / "a" / "flight.mcap").stat().st_size > (tmp_path / "b" / "flight.mcap").stat().st_size
+    assert msgspec.json.encode(without["config"]) != msgspec.json.encode(with_pictures["config"])

@@ -1,0 +1,83 @@
+"""The frame as the map would show it: aligned to a fraction of a pixel, whatever attitude and lens."""
+
+import cv2
+import numpy as np
+import pytest
+
+from ground import LENS, PINHOLE, FlatMap, rotation, texture, view
+from terrafix.anchor.matching.orthorectify import footprint, rectify
+from terrafix.core.camera import CameraCalibration
+
+GSD_M = 0.5
+ATTITUDES = [(0.0, 0.0, 0.0), (137.0, 0.0, 0.0), (20.0, 12.0, -9.0), (-75.0, -6.0, 15.0)]
+
+
+@pytest.fixture(scope="module")
+def ground() -> np.ndarray:
+    return texture(6, 460.0)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, LENS])
+@pytest.mark.parametrize("attitude", ATTITUDES)
+def test_it_lies_on_the_map(ground: np.ndarray, camera: CameraCalibration, attitude: tuple[float, ...]) -> None:
+    r, p = rotation(*attitude), np.array([14.3, -22.7, 90.0])
+    flat = rectify(view(ground, camera, r, p), camera, r, 90.0, GSD_M)
+    assert flat is not None
+    h, w = flat.mask.shape
+    shown, valid = FlatMap(ground).window(p[0] + flat.e_min_m, p[1] + flat.n_max_m, w, h, GSD_M)
+    assert valid.all()
+    inner = cv2.erode(flat.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    shifts = []
+    for y in range(0, h - 64, 48):
+        for x in range(0, w - 64, 48):
+            tile = np.s_[y : y + 64, x : x + 64]
+            if inner[tile].all():
+                mine, theirs = (
+                    cv2.cvtColor(i[tile], cv2.COLOR_BGR2GRAY).astype(np.float64) for i in (flat.image, shown)
+                )
+                shift, response = cv2.phaseCorrelate(mine - mine.mean(), theirs - theirs.mean())
+                if response > 0.2:
+                    shifts.append(shift)
+    assert len(shifts) >= 4
+    assert np.linalg.norm(np.median(shifts, axis=0)) < 0.15
+    assert np.median(np.linalg.norm(shifts, axis=1)) < 0.5
+    difference = np.abs(flat.image.astype(float) - shown)[inner].mean()
+    assert difference < 6.0  # grey levels, of a picture whose contrast is 50
+
+
+def test_the_mask_is_what_the_camera_saw(ground: np.ndarray) -> None:
+    r, p = rotation(45.0), np.array([0.0, 0.0, 90.0])
+    flat = rectify(view(ground, PINHOLE, r, p), PINHOLE, r, 90.0, GSD_M)
+    assert flat is not None
+    seen_m2 = flat.mask.sum() * GSD_M**2
+    true_m2 = (PINHOLE.width - 1) * (PINHOLE.height - 1) * (90.0 / PINHOLE.fx) ** 2
+    assert seen_m2 == pytest.approx(true_m2, rel=0.02)
+    assert not flat.mask[0, 0] and not flat.mask[-1, -1]  # the corners of the box are beyond a turned frame
+
+
+@pytest.mark.parametrize("stride", [1, 8])
+def test_sides_are_multiples_of_the_stride(ground: np.ndarray, stride: int) -> None:
+    r = rotation(10.0)
+    flat = rectify(view(ground, PINHOLE, r, np.array([0.0, 0.0, 90.0])), PINHOLE, r, 90.0, GSD_M, stride)
+    assert flat is not None
+    assert flat.image.shape[:2] == flat.mask.shape and not any(s % stride for s in flat.mask.shape)
+
+
+def test_the_footprint_is_that_of_a_pinhole() -> None:
+    e_min, n_min, e_max, n_max = footprint(PINHOLE, rotation(0.0), 100.0) or (0.0,) * 4
+    assert (e_min, e_max) == pytest.approx((-319.5 / 3.8, 319.5 / 3.8))
+    assert (n_min, n_max) == pytest.approx((-179.5 / 3.8, 179.5 / 3.8))
+
+
+@pytest.mark.parametrize("pitch_deg", [80.0, 120.0, 180.0])
+def test_no_ground_in_sight_is_none(pitch_deg: float) -> None:
+    image = np.zeros((PINHOLE.height, PINHOLE.width, 3), np.uint8)
+    assert footprint(PINHOLE, rotation(0.0, pitch_deg), 100.0) is None
+    assert rectify(image, PINHOLE, rotation(0.0, pitch_deg), 100.0, GSD_M) is None
+
+
+def test_a_steep_view_stays_bounded() -> None:
+    image = np.full((PINHOLE.height, PINHOLE.width, 3), 128, np.uint8)
+    flat = rectify(image, PINHOLE, rotation(0.0, 60.0), 100.0, GSD_M)
+    assert flat is not None
+    assert max(flat.mask.shape) <= 2 * 1.6 * 100.0 / GSD_M + 1

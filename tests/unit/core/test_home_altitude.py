@@ -1,0 +1,85 @@
+"""A home that is moved in flight does not move the vehicle."""
+
+import math
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from gps_messages import NO_FIX, S
+from link_wire import MemoryWire, attitude, packed, states
+from terrafix.core.config import LinkSection
+from terrafix.core.mavlink.home_altitude import TakeOffHeight
+from terrafix.core.mavlink.tlog import read_tlog, record
+from terrafix.link.autopilot.checkpoint import CheckpointWriter
+from terrafix.link.edge import MavlinkEdge
+
+GROUND_M, BOAT_M = 400.0, 365.0
+
+
+def test_home_is_moved_while_it_climbs() -> None:
+    height = TakeOffHeight()
+    heights = [50.0, 52.0, 54.0, 56.0, 58.0]
+    homes = [GROUND_M, GROUND_M, BOAT_M, BOAT_M, GROUND_M + 20.0]
+    said = [height.above(GROUND_M + h - home, GROUND_M + h, True) for h, home in zip(heights, homes, strict=True)]
+    assert said == pytest.approx(heights)
+    assert height.moved_m == pytest.approx(20.0)
+
+
+def test_a_filter_that_gets_its_height_above_the_sea_has_not_moved() -> None:
+    """An autopilot that took off without any position, and was told one in flight."""
+    height = TakeOffHeight()
+    assert [height.above(50.0 + i, amsl, True) for i, amsl in enumerate((50.0, 51.0, 452.0))] == [50.0, 51.0, 52.0]
+
+
+def test_before_it_is_armed_home_is_where_it_stands() -> None:
+    height = TakeOffHeight()
+    assert height.above(3.0, GROUND_M + 3.0, False) == 3.0  # the barometer has drifted
+    assert height.above(0.0, GROUND_M + 3.0, False) == 0.0  # and it is armed
+    assert height.above(0.1, GROUND_M + 3.1, True) == pytest.approx(0.1)
+
+
+def test_one_that_does_not_tell_its_height_above_the_sea_is_taken_at_its_word() -> None:
+    height = TakeOffHeight()
+    assert [height.above(h, math.nan, True) for h in (50.0, 85.0)] == [50.0, 85.0]
+
+
+def position(boot_ms: int, above_ground_m: float, home_m: float) -> mavlink.MAVLink_global_position_int_message:
+    amsl_m = GROUND_M + above_ground_m
+    place = (480_000_000, 110_000_000, round(1e3 * amsl_m), round(1e3 * (amsl_m - home_m)))
+    return mavlink.MAVLink_global_position_int_message(boot_ms, *place, 0, 0, 0, 0)
+
+
+def armed() -> mavlink.MAVLink_heartbeat_message:
+    kinds = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    return mavlink.MAVLink_heartbeat_message(*kinds, mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 0, 0, 3)
+
+
+def test_the_link_goes_on_from_take_off_also_when_it_is_started_again(tmp_path: Path) -> None:
+    mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+
+    def heights(edge: MavlinkEdge, wire: MemoryWire, at_s: int, home_m: float) -> list[float | None]:
+        wire.arrive(packed(position(1000 * at_s, 50.0 + at_s, home_m), mav), packed(attitude(1000 * at_s), mav))
+        return [state.agl_m for state in states(edge.poll(at_s * S))]
+
+    def link() -> tuple[MavlinkEdge, MemoryWire]:
+        wire = MemoryWire()
+        return MavlinkEdge(LinkSection(), wire, lambda: 0, keeper=CheckpointWriter(tmp_path / "link.checkpoint")), wire
+
+    edge, wire = link()
+    wire.arrive(packed(armed(), mav))
+    assert heights(edge, wire, 1, GROUND_M) == pytest.approx([51.0])
+    assert heights(edge, wire, 2, BOAT_M) == pytest.approx([52.0])
+    edge.heard(NO_FIX)
+    edge, wire = link()
+    assert heights(edge, wire, 8, BOAT_M) == pytest.approx([58.0])
+
+
+def test_a_telemetry_log_does_the_same(tmp_path: Path) -> None:
+    mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+    homes = [GROUND_M, GROUND_M, BOAT_M]
+    log = [record(1_700_000_000_000_000, packed(armed(), mav))]
+    for second, home_m in enumerate(homes):
+        log.append(record(1_700_000_000_000_000 + second * 1_000_000, packed(position(0, 50.0, home_m), mav)))
+    (tmp_path / "flight.tlog").write_bytes(b"".join(log))
+    assert [state.agl_m for state in read_tlog(tmp_path / "flight.tlog")] == pytest.approx([50.0] * 3)

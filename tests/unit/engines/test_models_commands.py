@@ -1,0 +1,161 @@
+"""`terrafix models list|verify|build|bench`, and models by name for a replay."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine
+from typer.testing import CliRunner
+
+import tiny_onnx
+from terrafix.core.errors import MapError, ModelError, OutputError
+from terrafix_engines.providers import CPU, CUDA, TENSORRT
+from terrafix_tools.models import bench, build, listing
+from terrafix_tools.models.bench import bench_all
+from terrafix_tools.models.build import build_all
+from terrafix_tools.models.cli import app
+from terrafix_tools.models.listing import verify_all
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "models"
+    folder.mkdir()
+    tiny_onnx.write(folder, tiny_onnx.XFEAT_LIKE, tiny_onnx.xfeat_like())
+    return folder
+
+
+def test_list_tells_what_is_there_and_which_providers_there_are(folder: Path) -> None:
+    found = CliRunner().invoke(app, ["list", "--folder", str(folder), "--json"])
+    told = json.loads(found.output)
+    assert {m["name"]: m["state"] for m in told["models"]} == {
+        "xfeat": "not fetched",
+        "lighterglue-l3": "not fetched",
+        "tiny": "ready",
+    }
+    assert told["folder"] == str(folder) and told["providers"]["CPU"] == ""
+    (folder / "tiny.onnx").write_bytes(b"x")
+    shown = CliRunner().invoke(app, ["list", "--folder", str(folder)]).output
+    assert "altered" in shown and "Apache-2.0" in shown and str(folder) in shown
+
+
+def test_verify_says_how_it_runs_and_fails_for_what_does_not(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    verify_all([], str(folder))
+    assert "tiny: as published, run by CPU" in capsys.readouterr().out
+    (folder / "tiny.onnx").write_bytes(b"x")
+    with pytest.raises(ModelError, match="2 of 2 models cannot be used"):
+        verify_all(["tiny", "xfeat"], str(folder))
+    told = capsys.readouterr().out.splitlines()
+    assert len(told) == 2 and "not the published file" in told[0] and "terrafix models fetch xfeat" in told[1]
+
+
+def test_an_empty_folder_and_a_broken_manifest(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no model is there yet; terrafix models fetch NAME"):
+        verify_all([], str(tmp_path / "nothing"))
+    (tmp_path / "mine.toml").write_text("name = ")
+    with pytest.raises(ModelError, match=r"mine\.toml: not valid TOML"):
+        listing.show(str(tmp_path), as_json=True)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ModelError, match="file: cannot be read"):
+        listing.show(str(tmp_path / "file"), as_json=True)
+
+
+def test_a_file_that_may_not_be_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_: Path, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "stat", refused)
+    with pytest.raises(ModelError, match=r"cannot be read \(Permission denied\)"):
+        verify_all([], str(folder))
+
+
+def test_without_tensorrt_nothing_is_built(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: [CPU])
+    with pytest.raises(ModelError, match=r"TensorRT cannot be used here: this ONNX Runtime .* nothing was built"):
+        build_all([], str(folder))
+
+
+def test_build_says_what_became_of_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The runtime's own tests build with a machine that has TensorRT, as far as it can be told here."""
+    monkeypatch.setattr(build.providers, "check", lambda _: None)
+    asked: list[dict[str, Any]] = []
+
+    def opened(_model: object, **more: Any) -> Any:
+        asked.append(more)
+        return type(
+            "Opened", (), {"provider": provider, "sha256": "f" * 64, "passed_over": ["TensorRT: out of memory"]}
+        )
+
+    monkeypatch.setattr(build, "opened_whole", opened)
+    provider = TENSORRT
+    build_all(["tiny"], str(folder))
+    assert asked == [{"build": True}] and f"ready in {folder}/engines/{'f' * 16}" in capsys.readouterr().out
+    provider = CUDA
+    with pytest.raises(ModelError, match=r"tiny: no engine \(TensorRT: out of memory\)"):
+        build_all(["tiny"], str(folder))
+
+
+def test_bench_measures_beside_what_needs_no_weights(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "models.json"
+    bench_all([], str(folder), out, runs=3, pair=None, trials=1)
+    measured = json.loads(out.read_text())
+    rows = measured["models"]["tiny"]["rows"]
+    assert [row["sizes"]["height"] for row in rows] == [32, 64] and measured["machine"]["cores"] > 0
+    for row in rows:
+        assert row["provider"] == "CPU" and row["runs"] == 3 and row["baseline"]["what"] == "gradients"
+        assert 0.0 < row["ms"]["median"] <= row["ms"]["p95"] and row["baseline"]["ms"]["median"] > 0.0
+    with pytest.raises(OutputError, match="cannot be written"):
+        bench_all([], str(folder), out / "file.json", runs=1, pair=None, trials=1)
+
+
+def raster(path: Path, image: np.ndarray, x_m: float = 500_000.0, crs: int = 32633) -> Path:
+    profile = {"driver": "GTiff", "count": 3, "dtype": "uint8", "width": image.shape[1], "height": image.shape[0]}
+    with rasterio.open(path, "w", crs=crs, transform=Affine(0.5, 0, x_m, 0, -0.5, 5e6), **profile) as file:
+        file.write(image[:, :, ::-1].transpose(2, 0, 1))
+    return path
+
+
+def test_a_pair_of_images_tells_which_features_find_the_place(folder: Path, tmp_path: Path) -> None:
+    """The second image begins 30 px further east and is darker: places are compared on the ground, not in pixels."""
+    from ground import texture
+
+    ground = np.ascontiguousarray(texture(6, 230.0)[:860, :900])
+    one = raster(tmp_path / "one.tif", ground)
+    two = raster(tmp_path / "two.tif", cv2.convertScaleAbs(ground[:, 30:], alpha=0.8), 500_000.0 + 30 * 0.5)
+    out = tmp_path / "models.json"
+    bench_all([], str(folder), out, runs=1, pair=(one, two), trials=1)
+    methods = json.loads(out.read_text())["pair"]["methods"]
+    assert set(methods) == {"SIFT", "gradients, dense", "tiny, dense", "tiny, nearest"}
+    assert methods["gradients, dense"]["near"] == 1.0 and methods["SIFT"]["near"] == 1.0
+    elsewhere = raster(tmp_path / "three.tif", ground, crs=32634)
+    with pytest.raises(MapError, match="another coordinate system than"):
+        bench_all([], str(folder), out, runs=1, pair=(one, elsewhere), trials=1)
+    small = raster(tmp_path / "small.tif", ground[:500])
+    with pytest.raises(MapError, match="less than the 700 px of a window"):
+        bench_all([], str(folder), out, runs=1, pair=(one, small), trials=1)
+
+
+def test_an_export_of_one_size_is_timed_too(tmp_path: Path) -> None:
+    text = tiny_onnx.XFEAT_LIKE.split("[[presets]]")[0].replace('3, "height", "width"', "3, 24, 40")
+    text = text.replace('"height/8", "width/8"', "3, 5")
+    tiny_onnx.write(tmp_path, text, tiny_onnx.xfeat_like())
+    bench_all([], str(tmp_path), tmp_path / "m.json", runs=2, pair=None, trials=1)
+    (row,) = json.loads((tmp_path / "m.json").read_text())["models"]["tiny"]["rows"]
+    assert row["input"] == [1, 3, 24, 40]
+
+
+def test_a_slow_model_is_timed_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "MOST_S", 0.0)
+    assert bench._timed(lambda: None, 50)["runs"] == bench.FEWEST - 1
+
+
+def test_the_help_of_every_command_is_there() -> None:
+    for command in ("list", "fetch", "verify", "build", "bench"):
+        found = CliRunner().invoke(app, [command, "--help"])
+        assert found.exit_code == 0 and "--folder" in found.output

@@ -1,0 +1,127 @@
+"""Manifests: those that come with the program are right, and a user's mistakes are told in one line."""
+
+from pathlib import Path
+
+import pytest
+
+import tiny_onnx
+from terrafix_engines import manifest
+from terrafix_engines.manifest import ManifestError
+from terrafix_engines.runtime import ModelFileError
+from terrafix_engines.store import State, Stored, find, models_folder, stored
+
+HEAD = f'file = "tiny.onnx"\nsha256 = "{"0" * 64}"\nsize_bytes = 7\n'
+WHOLE = HEAD + tiny_onnx.XFEAT_LIKE
+
+
+def written(folder: Path, text: str, name: str = "tiny.toml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_the_shipped_ones_are_whole_and_say_where_from_and_under_which_licence() -> None:
+    shipped = [manifest.read(path) for path in manifest.SHIPPED.glob("*.toml")]
+    assert {m.name for m in shipped} == {"xfeat", "lighterglue-l3"}
+    for m in shipped:
+        assert m.source.startswith("https://") and m.licence == "Apache-2.0" and m.credit
+        assert m.source.endswith(m.file)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (('name = "tiny"\n', 'name = "Tiny Model"\n'), "name"),
+        (('role = "dense"', 'role = "dens"'), "Invalid enum value 'dens'"),
+        (('role = "dense"', 'role = "matcher"'), r"needs a section \[matcher\]"),
+        (('licence = "CC0"\n', ""), "missing required field `licence`"),
+        (('licence = "CC0"\n', 'licence = "CC0"\nlicense = "CC0"\n'), "unknown field `license`"),
+        (('file = "tiny.onnx"', 'file = "../tiny.onnx"'), "file"),
+        (('input = "input"', 'input = "image"'), "'image' is used, but neither"),
+        (('name = "reliability"', 'name = "certainty"'), "'reliability' is used, but neither"),
+        (("width = 64 }\n[[presets]]", "wide = 64 }\n[[presets]]"), "a preset has no size for 'width'"),
+        (("height = 32", "height = 0"), "presets"),
+        (('licence = "CC0"\n', 'licence = "CC0"\nsource = "ftp://host/file"\n'), "must be an http or https address"),
+        (("size_bytes = 7", "size_bytes = "), "not valid TOML"),
+        (('"height/8"', '"height/0"'), "outputs"),
+        (('"height/8"', '"rows/8"'), "'rows' is divided in a shape, but is no size of an input"),
+        (('3, "height", "width"]', '3, "h", "w"]'), "is divided in a shape"),
+        (('["batch", 3, "height", "width"]', '[3, "height", "width"]'), 'must end with "height", "width", or'),
+    ],
+)
+def test_a_mistake_is_told_with_file_and_reason(tmp_path: Path, change: tuple[str, str], says: str) -> None:
+    assert change[0] in WHOLE
+    path = written(tmp_path, WHOLE.replace(*change, 1))
+    with pytest.raises(ManifestError, match=says) as error:
+        manifest.read(path)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_broken_file_does_no_harm_to_a_shipped_model(tmp_path: Path) -> None:
+    written(tmp_path, "name = ")
+    assert manifest.named("xfeat", tmp_path).name == "xfeat"
+    with pytest.raises(ManifestError, match=r"tiny\.toml: not valid TOML"):
+        manifest.named("tiny", tmp_path)
+
+
+def test_a_name_is_given_once(tmp_path: Path) -> None:
+    written(tmp_path, WHOLE.replace('"tiny"', '"xfeat"'))
+    with pytest.raises(ManifestError, match=r"tiny\.toml: the name 'xfeat' is taken"):
+        manifest.known(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("shape", "sizes", "wrong"),
+    [
+        ((1, 64, 4, 8), {"batch": 1, "height": 32, "width": 64}, ""),
+        ((1, 64, 5, 8), {"batch": 1, "height": 32, "width": 64}, "'descriptors' is [1, 64, 5, 8], not"),
+        ((1, 64, 4), {"batch": 1, "height": 32, "width": 64}, "has 3 dimensions, not 4"),
+        ((2, 64, 4, 8), {"height": 32, "width": 64}, ""),
+    ],
+)
+def test_shapes_are_compared(shape: tuple[int, ...], sizes: dict[str, int], wrong: str) -> None:
+    tensor = manifest.Tensor(name="descriptors", shape=["batch", 64, "height/8", "width/8"])
+    found = manifest.sizes_of(tensor, shape, sizes)
+    assert wrong in found and bool(found) == bool(wrong)
+    assert sizes["batch"] == shape[0] or wrong
+
+
+def test_the_folder_is_chosen_named_or_the_users_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("TERRAFIX_MODELS", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert models_folder() == tmp_path / ".local/share/terrafix/models"
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert models_folder() == tmp_path / "data/terrafix/models"
+    monkeypatch.setenv("TERRAFIX_MODELS", str(tmp_path / "m"))
+    assert models_folder() == tmp_path / "m"
+    assert models_folder("~/chosen") == tmp_path / "chosen"
+
+
+def test_what_a_text_means_for_a_model(tmp_path: Path) -> None:
+    tiny_onnx.write(tmp_path, tiny_onnx.XFEAT_LIKE, tiny_onnx.xfeat_like())
+    assert find("models/xfeat.onnx", "xfeat", tmp_path) == Path("models/xfeat.onnx")
+    assert find("own.onnx", "xfeat", tmp_path) == Path("own.onnx")
+    found = find("tiny", "xfeat", tmp_path)
+    assert isinstance(found, Stored) and found.path == tmp_path / "tiny.onnx" and found.state() is State.READY
+    with pytest.raises(ModelFileError, match="no model is called 'superglue'; known: lighterglue-l3, xfeat, tiny"):
+        find("superglue", "xfeat", tmp_path)
+    with pytest.raises(
+        ModelFileError, match="'lighterglue-l3' cannot be used as xfeat: its role is matcher, not dense"
+    ):
+        find("lighterglue-l3", "xfeat", tmp_path)
+
+
+def test_a_file_is_ready_absent_or_altered(tmp_path: Path) -> None:
+    path = tiny_onnx.write(tmp_path, tiny_onnx.XFEAT_LIKE, tiny_onnx.xfeat_like())
+    model = stored(manifest.read(path.with_suffix(".toml")), tmp_path)
+    assert model.state() is State.READY
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + b"?")
+    assert model.state() is State.ALTERED
+    path.write_bytes(content + b"?")
+    assert model.state() is State.ALTERED
+    path.unlink()
+    assert model.state() is State.ABSENT
+    with pytest.raises(ModelFileError, match=r"tiny\.onnx: not there; terrafix models fetch tiny"):
+        model.open(("input",), ("descriptors",))

@@ -1,0 +1,142 @@
+"""Wind and airspeed: learnt while pictures tell the velocity, and worth what they claim when they do not."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, V
+
+from inertial_flight import InertialFlight, flown
+from terrafix.estimator.measurements.airspeed import (
+    DISTRUST_S,
+    GUST_S,
+    LEARNS_FROM_MPS,
+    WIND_WALK,
+    AirspeedObservation,
+    WindEstimator,
+    air_factor,
+)
+from terrafix.estimator.models.motion_model import V_SIZE
+
+WIND_MPS, SCALE = np.array([4.0, -5.0]), 1.08
+SEEN_MPS, STEP_S = 0.4, 0.5
+
+
+class Plane:
+    """Flies circles of a minute at 20 m/s in a wind that gusts and changes."""
+
+    def __init__(self, seed: int, gust_mps: float = 1.0, turn_radps: float = 2 * np.pi / 60.0) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.wind, self.gust_mps, self.turn_radps = WindEstimator(), gust_mps, turn_radps
+        self.t_s, self.yaw_rad, self.gust, self.blows = 0.0, 0.0, np.zeros(2), WIND_MPS
+
+    def fly(self) -> np.ndarray:
+        """-> true velocity (3,) after a step."""
+        self.t_s += STEP_S
+        self.yaw_rad += self.turn_radps * STEP_S
+        keep = np.exp(-STEP_S / GUST_S)
+        self.gust = keep * self.gust + self.gust_mps * np.sqrt(1.0 - keep**2) * self.rng.normal(0.0, 1.0, 2)
+        self.blows = self.blows + WIND_WALK * np.sqrt(STEP_S) * self.rng.normal(0.0, 1.0, 2)
+        ahead = np.array([np.sin(self.yaw_rad), np.cos(self.yaw_rad)])
+        return np.array([*(20.0 * ahead + self.blows + self.gust), 0.0])
+
+    def seen(self, seconds: float, read_mps: float = 20.0 / SCALE) -> None:
+        while seconds > 0.0:
+            velocity = self.fly() + SEEN_MPS * self.rng.normal(0.0, 1.0, 3)
+            self.wind.seen(self.t_s, velocity, SEEN_MPS**2 * np.eye(3), read_mps, self.yaw_rad)
+            seconds -= STEP_S
+
+    def tells(self, read_mps: float = 20.0 / SCALE) -> AirspeedObservation | None:
+        return self.wind.tells(self.t_s, read_mps, self.yaw_rad, 0.0)
+
+
+def test_wind_and_scale_are_learnt_in_turns_as_well_as_is_claimed() -> None:
+    off2 = []
+    for seed in range(40):
+        plane = Plane(seed)
+        plane.seen(120.0)
+        air = plane.tells()
+        assert air is not None
+        off = air.wind_mps - plane.blows
+        off2.append(float(off @ np.linalg.solve(air.common + air.changed, off)))
+        assert air.still_mps == pytest.approx(20.0, abs=2.0)
+    assert 0.5 < np.mean(off2) < 2.6  # 2 where the claim is true to the letter
+
+
+@pytest.mark.parametrize("gap_s", [10.0, 60.0])
+@pytest.mark.parametrize("gust_mps", [0.5, 1.5, 3.0])
+def test_a_way_that_nobody_saw_is_as_wrong_as_is_claimed(gap_s: float, gust_mps: float) -> None:
+    """However gusty it is: that is learnt, too."""
+    off2 = []
+    for seed in range(40):
+        plane = Plane(seed, gust_mps)
+        plane.seen(200.0)
+        since_s, off, cov = plane.t_s, np.zeros(2), np.zeros((2, 2))
+        while plane.t_s < since_s + gap_s:
+            velocity, air = plane.fly(), plane.tells()
+            assert air is not None
+            off += STEP_S * (velocity[:2] - air.velocity(0.0))
+            cov += STEP_S**2 * air.cov(STEP_S, plane.t_s - since_s)
+        off2.append(float(off @ np.linalg.solve(cov, off)))
+    assert 0.3 < np.mean(off2) < 2.4
+
+
+def test_it_tells_nothing_before_it_has_learnt_nor_of_a_vehicle_that_does_not_fly() -> None:
+    plane = Plane(seed=1)
+    assert plane.tells() is None
+    plane.seen(60.0)
+    assert plane.tells() is not None
+    assert plane.tells(read_mps=3.0) is None
+    assert plane.wind.tells(plane.t_s, None, 0.0, 0.0) is None
+    assert plane.wind.tells(plane.t_s, 20.0, None, 0.0) is None
+    assert plane.wind.tells(plane.t_s + 3600.0, 20.0, 0.0, 0.0) is None  # the wind has changed
+
+
+def test_a_tube_that_fills_is_not_believed_and_what_it_reads_then_is_learnt_anew() -> None:
+    plane = Plane(seed=2)
+    plane.seen(120.0)
+    plane.seen(DISTRUST_S, read_mps=9.0)
+    assert plane.tells() is None
+    plane.seen(200.0, read_mps=18.0)
+    air = plane.tells(read_mps=18.0)
+    assert air is not None and float(np.sqrt(np.linalg.eigvalsh(air.common + air.changed)[-1])) < LEARNS_FROM_MPS
+    assert np.linalg.norm(air.wind_mps - plane.blows) < 3.0
+
+
+def test_the_factor_says_what_it_differs_by() -> None:
+    air = AirspeedObservation(20.0, 0.7, WIND_MPS, np.eye(2), np.eye(2), 1.0)
+    factor = air_factor(V(0), B(0), air, np.diag([4.0, 4.0]))
+    values = gtsam.Values()
+    values.insert(V(0), np.concatenate([air.velocity(0.1), np.zeros(V_SIZE - 2)]))
+    values.insert(B(0), np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    assert factor.error(values) == pytest.approx(0.0, abs=1e-12)
+    values.update(B(0), np.array([0.0, 0.0, 0.15, 0.0, 0.0, 0.0]))  # 1 m/s across, at 2 m/s: half a sigma
+    assert factor.error(values) == pytest.approx(0.125, rel=0.02)
+    step = gtsam.VectorValues()
+    step.insert(V(0), np.array([0.1, -0.2, *[0.0] * (V_SIZE - 2)]))
+    step.insert(B(0), np.array([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0]))
+    assert factor.linearize(values).error(step) == pytest.approx(factor.error(values.retract(step)), rel=1e-3)
+
+
+@pytest.mark.parametrize("imu", [True, False])
+def test_a_plane_that_sees_nothing_for_40_s_is_where_wind_and_airspeed_say(imu: bool) -> None:
+    blind = (70, 110)
+    with_air, without = [], []
+    for seed in (4, 5, 6):
+        flight = InertialFlight(seed=seed, seconds=112)
+        with_air.append(flown(flight, imu=imu, blind=blind, airspeed=True))
+        without.append(flown(flight, imu=imu, blind=blind))
+    off_m = [np.linalg.norm(run.position_error_m[109]) for run in with_air]
+    sigma_m = [np.linalg.norm(run.position_sigma_m[109]) for run in with_air]
+    assert max(off_m) < 100.0 and np.mean(np.square(np.divide(off_m, sigma_m))) < 1.5
+    assert np.mean(sigma_m) < (0.75 if imu else 0.3) * np.mean(
+        [np.linalg.norm(run.position_sigma_m[109]) for run in without]
+    )
+
+
+@pytest.mark.parametrize("imu", [True, False])
+@pytest.mark.parametrize("iced", [0.4, 0.7])
+def test_a_tube_that_ices_up_in_the_cloud_leads_nobody_astray(imu: bool, iced: float) -> None:
+    flight = InertialFlight(seed=4, seconds=112)
+    run = flown(flight, imu=imu, blind=(70, 110), airspeed=True, iced=iced)
+    far = np.linalg.norm(run.position_error_m, axis=1) / np.linalg.norm(run.position_sigma_m, axis=1)
+    assert np.max(far) < 2.5

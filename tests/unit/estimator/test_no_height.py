@@ -1,0 +1,27 @@
+"""A flight whose height nobody says: the estimator does not make one up, and the first map match tells it."""
+
+import numpy as np
+import pytest
+
+from simulated_flight import ORIGIN, Flight, Listener, cov_of, error_m
+from terrafix.messages import MapMatch, Prediction
+
+FIRST_MATCH = 36
+
+
+@pytest.mark.parametrize("knows", [{"yaw", "attitude"}, set()], ids=["attitude", "nothing"])
+def test_the_height_stays_open_until_a_match_says_it(knows: set[str]) -> None:
+    flight, listener = Flight(72, seed=3, knows=frozenset(knows)), Listener()
+    listener.hear([ORIGIN])
+    for i in range(flight.frames):
+        listener.hear(m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i < FIRST_MATCH))
+    predicted = {m.frame_id: m for m in listener.said if isinstance(m, Prediction)}
+    for i in range(min(predicted), FIRST_MATCH + 1):
+        off_m = predicted[i].agl_m - float(flight.p_m[i, 2])
+        assert abs(off_m) < predicted[i].agl_sigma_m and 60.0 < predicted[i].agl_m < 200.0
+    after = predicted[FIRST_MATCH + 12]
+    assert after.agl_sigma_m < 8.0 and abs(after.agl_m - float(flight.p_m[FIRST_MATCH + 12, 2])) < 16.0
+    last = listener.estimate(flight.frames - 1)
+    off = error_m(last, flight)[:2]
+    assert float(off @ np.linalg.solve(cov_of(last)[:2, :2], off)) < 13.8
+    assert last.velocity_sigma_mps < 3.0

@@ -1,0 +1,146 @@
+"""The middle of the picture, of points that three cameras see through a lens that bends around it."""
+
+import gtsam
+import msgspec
+import numpy as np
+import pytest
+
+from simulated_flight import CAMERA
+from terrafix.core.pose import exp_so3
+from terrafix.estimator.factors.three_view import ThreeViewPose
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter, graph_aside
+from terrafix.messages import Camera, CovarianceMode, NavEstimate, SlowErrors, SourceLabel
+from terrafix_tools.lens_words import lens_words
+
+UNCALIBRATED = msgspec.structs.replace(CAMERA, focal_sigma=0.1)
+HEIGHT_M = 80.0
+NOISE = 0.25 / 560.0
+# What a wide lens bends (k1, k2), and where its middle is: 20 and 13 px of `CAMERA`.
+BENDS, MIDDLE = (-0.06, 0.04), np.array([0.036, 0.023])
+
+
+def shown(ray: np.ndarray, bends: tuple[float, float], middle: np.ndarray) -> np.ndarray:
+    r2 = np.sum(ray**2, axis=1, keepdims=True)
+    return np.asarray(ray * (1.0 + bends[0] * r2 + bends[1] * r2**2) + middle)
+
+
+def triple(
+    rng: np.random.Generator, bends: tuple[float, float], middle: np.ndarray, lean: float = 0.05
+) -> tuple[np.ndarray, ThreeViewPose]:
+    """60 points of ground with houses, and the cameras as a graph has them that knows nothing of the lens."""
+    poses = []
+    for way_m in (-25.0, 25.0):
+        turn = gtsam.Rot3(exp_so3(rng.normal(0.0, lean, 3)))
+        poses.append(gtsam.Pose3(turn, np.array([0.0, way_m, 0.0]) + rng.normal(0.0, 3.0, 3)))
+    ray = rng.uniform((-0.85, -0.5), (0.85, 0.5), (60, 2))
+    points = np.column_stack([ray, np.ones(60)]) * HEIGHT_M * (1.0 - 0.05 * rng.uniform(0.0, 1.0, (60, 1)))
+    seen = []
+    for pose in (poses[0], gtsam.Pose3(), poses[1]):
+        in_c = (points - pose.translation()) @ pose.rotation().matrix()
+        seen.append(shown(in_c[:, :2] / in_c[:, 2:], bends, middle) + rng.normal(0.0, NOISE, (60, 2)))
+    first, last = (pose.retract(rng.normal(0.0, [0.01] * 3 + [0.5] * 3)) for pose in poses)
+    return np.hstack(seen), ThreeViewPose(first, last, HEIGHT_M, 0.0, 0.0)
+
+
+def learnt(
+    seed: int, camera: Camera = UNCALIBRATED, bends: tuple[float, float] = BENDS, lean: float = 0.05
+) -> PrincipalPointFilter:
+    rng, found = np.random.default_rng(seed), PrincipalPointFilter(camera)
+    for _ in range(40):
+        triples, at = triple(rng, bends, MIDDLE, lean)
+        found.see(triples, NOISE, at)
+    return found
+
+
+def test_a_lens_that_bends_shows_where_its_middle_is() -> None:
+    found = [learnt(seed) for seed in range(8)]
+    for one in found:
+        assert np.sqrt(np.diag(one.cov)).max() < 0.5 * np.sqrt(np.diag(PrincipalPointFilter(UNCALIBRATED).cov)).min()
+    errors = [one.offset - MIDDLE for one in found]
+    assert np.linalg.norm(np.mean(errors, axis=0)) < 0.3 * np.linalg.norm(MIDDLE)
+    nees = np.mean([e @ np.linalg.solve(one.cov, e) for e, one in zip(errors, found, strict=True)])
+    assert nees < 2.0  # 40 triples of fresh points know more than those of a flight, which share them
+
+
+def test_without_a_bend_a_camera_that_leans_shows_it_and_one_that_does_not_shows_nothing() -> None:
+    before = np.sqrt(PrincipalPointFilter(UNCALIBRATED).cov[0, 0])
+    leans = learnt(1, bends=(0.0, 0.0))
+    assert np.linalg.norm(leans.offset - MIDDLE) < 0.2 * np.linalg.norm(MIDDLE)
+    level = learnt(1, bends=(0.0, 0.0), lean=0.0)
+    assert np.linalg.norm(level.offset) < 0.3 * before
+    assert np.sqrt(np.diag(level.cov)).min() > 0.9 * before
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [CAMERA, msgspec.structs.replace(UNCALIBRATED, distortion=(-0.1, 0.02, 0.0, 0.0))],
+    ids=["calibrated", "stated"],
+)
+def test_what_somebody_has_measured_is_not_learnt(camera: Camera) -> None:
+    found = learnt(1, camera)
+    assert found.learnt is None and np.array_equal(found.offset, np.zeros(2))
+    assert np.array_equal(found.cov, PrincipalPointFilter(camera).cov)
+
+
+def test_points_that_fit_no_lens_are_left_out() -> None:
+    found, before = PrincipalPointFilter(UNCALIBRATED), PrincipalPointFilter(UNCALIBRATED)
+    triples, at = triple(np.random.default_rng(2), BENDS, MIDDLE)
+    found.see(np.random.default_rng(3).permuted(triples, axis=0), NOISE, at)
+    assert np.array_equal(found.cov, before.cov) and np.array_equal(found.offset, before.offset)
+
+
+def test_what_is_no_number_changes_nothing() -> None:
+    found, before = PrincipalPointFilter(UNCALIBRATED), PrincipalPointFilter(UNCALIBRATED)
+    triples, at = triple(np.random.default_rng(2), BENDS, MIDDLE)
+    for wrong in (np.full_like(triples, np.nan), 1e200 * triples):
+        with np.errstate(all="ignore"):
+            found.see(wrong, NOISE, at)
+    assert np.array_equal(found.cov, before.cov) and np.array_equal(found.offset, before.offset)
+
+
+def test_what_was_learnt_outlives_the_process() -> None:
+    found = learnt(1)
+    again = PrincipalPointFilter(UNCALIBRATED, found.learnt)
+    assert np.allclose(again.offset, found.offset) and np.allclose(again.cov, found.cov)
+
+
+def test_who_can_calibrate_the_camera_is_told() -> None:
+    slow = SlowErrors(
+        t_ns=0, frame_id=0, error=(0.0,) * 6, cov=tuple((np.eye(6) * 1e-4).ravel()), lens=learnt(1).learnt
+    )
+    words = lens_words(UNCALIBRATED, slow)
+    assert words is not None and "cx = 500 and cy = 28" in words
+    assert lens_words(UNCALIBRATED, msgspec.structs.replace(slow, lens=None)) is None
+
+
+def test_ground_that_is_seen_aside_puts_the_camera_aside_and_not_farther_up() -> None:
+    """A middle that is right of where the description has it: what lies below is seen on the right, and the graph has
+    the camera on the left. A camera whose right is west is farther west."""
+    found = learnt(1)
+    r_w_c = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])  # right is west, down is north
+    aside_m, cov = found.aside(HEIGHT_M * r_w_c[:2, :2])
+    assert np.allclose(aside_m, HEIGHT_M * found.offset * (-1.0, 1.0))
+    assert np.allclose(np.diag(cov), HEIGHT_M**2 * np.diag(found.cov))
+
+
+def test_an_estimator_that_is_started_again_begins_where_its_graph_was() -> None:
+    found = learnt(1)
+    assert found.learnt is not None
+    said = NavEstimate(
+        t_ns=0,
+        frame_id=0,
+        lat_deg=48.0,
+        lon_deg=11.0,
+        alt_amsl_m=HEIGHT_M,
+        agl_m=HEIGHT_M,
+        velocity_enu_mps=(0.0, 0.0, 0.0),
+        velocity_sigma_mps=1.0,
+        q_w_b=(0.0, 0.7071067811865476, 0.7071067811865476, 0.0),  # level, heading north
+        cov=tuple(np.eye(6).ravel()),
+        source_label=SourceLabel.SATELLITE_ANCHORED,
+        covariance_mode=CovarianceMode.MARGINALS,
+        last_anchor_age_ms=0,
+        emitted_at_ns=0,
+    )
+    # Right in the picture is east, down in it is south.
+    assert np.allclose(graph_aside(said, UNCALIBRATED, found.learnt), HEIGHT_M * found.offset * (1.0, -1.0), atol=1e-6)

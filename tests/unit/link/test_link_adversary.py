@@ -1,0 +1,121 @@
+"""Liars beside the real link, node and edge, and the simulated autopilot, in real time and on real sockets."""
+
+import math
+from collections.abc import Callable
+
+import msgspec
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from link_port import Speaker, free_port, station_heartbeat
+from link_rig import ALT, LAT, LON, MS, SPEED_EAST, covariance, estimate, live, texts
+from terrafix import messages as m
+from terrafix.core.config import LinkSection
+from terrafix.link.edge import open_edge
+from terrafix.link.integrity.output_predictor import offset
+from terrafix.link.node import LinkNode
+from terrafix_tools.sim.autopilot.course import PeerState
+from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+
+pytestmark = pytest.mark.real_time
+
+SECONDS = 4.0
+FORGED_ROLL = 0.4  # 23 degrees: half the height aside
+
+
+def eastward(north_m: float) -> Callable[[float], PeerState]:
+    """A course at SPEED_EAST, so far north of the one that the estimates are of."""
+
+    def course(t_s: float) -> PeerState:
+        lat, lon = offset(LAT, LON, SPEED_EAST * t_s, north_m)
+        return PeerState(lat, lon, ALT, 120.0, math.pi / 2, 0.02, 0.0, 0.0, SPEED_EAST, 0.0)
+
+    return course
+
+
+class Estimates:
+    """Four a second, of a vehicle on ``eastward(0)``."""
+
+    def __init__(self) -> None:
+        self._zero_ns: int | None = None
+        self._next_ns = 0
+
+    def __call__(self, now_ns: int) -> list[m.Message]:
+        self._zero_ns = now_ns if self._zero_ns is None else self._zero_ns
+        if now_ns < self._next_ns:
+            return []
+        self._next_ns = now_ns + 250 * MS
+        said = estimate(now_ns - self._zero_ns, cov=covariance(3.0))
+        return [msgspec.structs.replace(said, t_ns=now_ns, emitted_at_ns=now_ns)]
+
+
+class Forger:
+    """Says every 40 ms that the autopilot ``sysid`` leans, and gives hints as a ground station."""
+
+    def __init__(self, speaker: Speaker, to: tuple[str, int], sysid: int) -> None:
+        self._speaker, self._to, self._sysid = speaker, to, sysid
+        self._next_ns = 0
+
+    def speak(self, now_ns: int) -> None:
+        if now_ns < self._next_ns:
+            return
+        self._next_ns = now_ns + 40 * MS
+        leaning = mavlink.MAVLink_attitude_message(now_ns // MS % 2**32, FORGED_ROLL, 0.0, 0.0, 0, 0, 0)
+        hint = mavlink.MAVLink_set_gps_global_origin_message(self._sysid, 490_000_000, 120_000_000, 0)
+        self._speaker.send(self._to, leaning, station_heartbeat(), hint)
+
+
+def test_of_two_copters_on_one_port_one_flies_on_us_and_the_other_hears_nothing() -> None:
+    port = free_port()
+    edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
+    ours, theirs = AutopilotPeer(seed=1, sysid=1), AutopilotPeer(seed=2, sysid=2)
+    estimates = Estimates()
+    ours.start(0, eastward(0.0), to=port)
+    said = live(LinkNode(10.0), edge, 1.5, estimates)
+    theirs.start(0, eastward(66_000.0), to=port)
+    said += live(LinkNode(10.0), edge, SECONDS, estimates)
+    first, second = ours.stop(), theirs.stop()
+    edge.close()
+    assert first.gps_input_received > 10 * (SECONDS - 1.0)
+    assert second.gps_input_received == 0
+    assert second.position_error_max_m is None or second.position_error_max_m < 100.0
+    assert [x.text for x in said if isinstance(x, m.StatusText) if "vehicle 2" in x.text] == [
+        "Terrafix: vehicle 2 on our port gets nothing"
+    ]
+    assert "Terrafix: vehicle 2 on our port gets nothing" in first.status_texts
+
+
+@pytest.mark.parametrize("kind", ["udpin", "udpout"])
+def test_a_forger_of_telemetry_and_hints_moves_nothing(kind: str) -> None:
+    peer, estimates = AutopilotPeer(seed=3), Estimates()
+    if kind == "udpin":
+        port = free_port()
+        peer.start(0, eastward(0.0), to=port)
+    else:
+        port = peer.start(0, eastward(0.0))
+    edge = open_edge(LinkSection(device=f"{kind}:127.0.0.1:{port}"))
+    node, said = LinkNode(10.0), list[m.Message]()
+    said += live(node, edge, 1.5, estimates)
+    own = edge._connection._transport._socket.getsockname()  # type: ignore[union-attr]
+    with Speaker(1) as speaker:
+        forger = Forger(speaker, ("127.0.0.1", own[1]), 1)
+
+        def feed(now_ns: int) -> list[m.Message]:
+            forger.speak(now_ns)
+            return estimates(now_ns)
+
+        said += live(node, edge, SECONDS, feed)
+        assert speaker.heard() == []
+    report = peer.stop()
+    edge.close()
+    rolls = [x.roll_rad for x in said if isinstance(x, m.VehicleState) and x.roll_rad is not None]
+    assert len(rolls) > 20 * SECONDS and max(map(abs, rolls)) < 0.1
+    assert not [x for x in said if isinstance(x, m.PositionHint)]
+    assert report.position_error_max_m is not None and report.position_error_max_m < 10.0
+    status = [x for x in said if isinstance(x, m.LinkStatus)][-1]
+    if kind == "udpin":
+        assert "Terrafix: a second sender is system 1, ignored" in texts(said)
+        assert "a second sender of system 1" in status.detail
+        assert any(x.measurement == "telemetry" for x in said if isinstance(x, m.MeasurementVerdict))
+    else:
+        assert "packets ignored, the last from 127.0.0.1" in status.detail

@@ -1,0 +1,511 @@
+"""The wire: real UDP, TCP and pseudo-terminals; every field of GPS_INPUT; garbage, absence and return of the device."""
+
+import errno
+import math
+import os
+import pty
+import socket
+import time
+from collections.abc import Iterator
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from gps_input_message import GPS
+from link_rig import ALT, MS, S, estimate, live
+from link_wire import packed
+from terrafix import messages as m
+from terrafix.core.config import LinkSection
+from terrafix.core.errors import LinkError
+from terrafix.link.edge import MavlinkEdge, open_edge
+from terrafix.link.mavlink.transport import UdpOut, open_transport
+from terrafix.link.node import LinkNode
+from terrafix.link.output import gps_input
+from terrafix.link.output.gps_time import week_and_ms
+
+pytestmark = pytest.mark.real_time
+
+UNIX_NS = 1_795_262_400 * S  # 2026-11-21
+
+
+class Station:
+    """The autopilot's end of a UDP wire, by hand."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(2.0)
+        self.port = self.socket.getsockname()[1]
+        self.mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+        self.mav.robust_parsing = True
+        self.link: Any = None
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def send(self, *messages: Any) -> None:
+        for message in messages:
+            self.socket.sendto(packed(message, self.mav), self.link)
+
+    def heard(self, kind: str = "") -> list[Any]:
+        """Everything that has come so far."""
+        found: list[Any] = []
+        self.socket.setblocking(False)
+        while True:
+            try:
+                data, self.link = self.socket.recvfrom(4096)
+            except BlockingIOError:
+                return [x for x in found if not kind or x.get_type() == kind]
+            found += self.mav.parse_buffer(data) or []
+
+
+def heartbeat(kind: int = mavlink.MAV_TYPE_QUADROTOR, autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA) -> Any:
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
+
+
+def attitude(boot_ms: int, yaw: float = 1.0) -> Any:
+    return mavlink.MAVLink_attitude_message(boot_ms, 0.1, 0.2, yaw, 0, 0, 0)
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    station = Station()
+    yield station
+    station.close()
+
+
+def edge_to(station: Station, **changes: Any) -> MavlinkEdge:
+    config = LinkSection(device=f"udpout:127.0.0.1:{station.port}", **changes)
+    return MavlinkEdge(config, open_transport(config.device, config.baud, wait=True), lambda: UNIX_NS)
+
+
+@pytest.fixture
+def edge(station: Station) -> Iterator[MavlinkEdge]:
+    edge = edge_to(station)
+    yield edge
+    edge.close()
+
+
+def polled(edge: MavlinkEdge, now_ns: int) -> list[m.Message]:
+    """One look after the wire had time to deliver."""
+    time.sleep(0.005)
+    return list(edge.poll(now_ns))
+
+
+def states(said: list[m.Message]) -> list[m.VehicleState]:
+    return [x for x in said if isinstance(x, m.VehicleState)]
+
+
+def status(said: list[m.Message]) -> m.LinkStatus:
+    return [x for x in said if isinstance(x, m.LinkStatus)][-1]
+
+
+def test_every_field_of_gps_input_arrives(station: Station, edge: MavlinkEdge) -> None:
+    edge.heard(GPS)
+    time.sleep(0.01)
+    (sent,) = station.heard("GPS_INPUT")
+    assert sent.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V2
+    assert (sent.get_srcSystem(), sent.get_srcComponent()) == (1, 197)
+    assert sent.to_dict() == {
+        "mavpackettype": "GPS_INPUT",
+        "time_usec": 123_456_789,
+        "gps_id": 0,
+        "ignore_flags": 0,
+        "time_week_ms": 561_618_250,
+        "time_week": 2445,
+        "fix_type": 3,
+        "lat": 481_234_567,
+        "lon": -1_227_654_321,
+        "alt": 512.25,
+        "hdop": 1.0,
+        "vdop": 1.0,
+        "vn": -3.5,
+        "ve": 12.25,
+        "vd": -0.5,
+        "speed_accuracy": 0.75,
+        "horiz_accuracy": 6.5,
+        "vert_accuracy": 4.5,
+        "satellites_visible": 6,
+        "yaw": 0,
+    }
+
+
+def test_gps_id_comes_from_the_configuration(station: Station) -> None:
+    edge = edge_to(station, gps_id=1)
+    edge.heard(GPS)
+    time.sleep(0.01)
+    assert station.heard("GPS_INPUT")[0].gps_id == 1
+    edge.close()
+
+
+@given(
+    lat=st.floats(-90, 90), lon=st.floats(-180, 180), week=st.integers(0, 65535), alt=st.floats(-500, 10_000, width=32)
+)
+def test_any_position_can_be_packed(lat: float, lon: float, week: int, alt: float) -> None:
+    gps = msgspec.structs.replace(GPS, lat_deg=lat, lon_deg=lon, time_week=week, alt_amsl_m=alt)
+    parser = mavlink.MAVLink(None)
+    (back,) = parser.parse_buffer(gps_input.encode(gps, 0).pack(mavlink.MAVLink(None, 1, 197)))
+    assert abs(back.lat / 1e7 - lat) < 6e-8
+    assert abs(back.lon / 1e7 - lon) < 6e-8
+    assert back.alt == alt
+
+
+def test_it_presents_itself_as_an_onboard_computer_once_a_second(station: Station, edge: MavlinkEdge) -> None:
+    for tenth in range(40):
+        edge.poll(tenth * 100 * MS)
+    time.sleep(0.01)
+    beats = station.heard("HEARTBEAT")
+    assert len(beats) == 4
+    assert {b.type for b in beats} == {mavlink.MAV_TYPE_ONBOARD_CONTROLLER}
+    assert {b.autopilot for b in beats} == {mavlink.MAV_AUTOPILOT_INVALID}
+
+
+def test_status_text_reaches_the_pilot(station: Station, edge: MavlinkEdge) -> None:
+    edge.heard(m.StatusText(t_ns=0, severity=4, text="Terrafix: no map fix for 15 s"))
+    time.sleep(0.01)
+    (text,) = station.heard("STATUSTEXT")
+    assert (text.severity, text.text) == (4, "Terrafix: no map fix for 15 s")
+
+
+def meet(station: Station, edge: MavlinkEdge, now_ns: int = 0, beat: Any = None) -> None:
+    polled(edge, now_ns)
+    time.sleep(0.01)
+    station.heard()
+    station.send(beat or heartbeat())
+    polled(edge, now_ns + MS)
+
+
+def test_streams_are_asked_for_and_again_when_they_stop(station: Station, edge: MavlinkEdge) -> None:
+    meet(station, edge)
+    time.sleep(0.01)
+    asked = station.heard("COMMAND_LONG")
+    fives = {(33, 200_000.0), (24, 200_000.0), (124, 200_000.0), (295, 200_000.0)}
+    assert {(int(a.param1), a.param2) for a in asked} >= {(30, 40_000.0), (2, 1_000_000.0)} | fives
+    assert {(a.command, a.target_system, a.target_component) for a in asked} == {(511, 7, 1)}
+    for second in range(1, 5):  # attitude comes as wanted, the others do not
+        station.send(heartbeat(), *(attitude(second * 1000 + i * 40) for i in range(25)))
+        said = polled(edge, second * S)
+    again = {int(a.param1) for a in station.heard("COMMAND_LONG")}
+    assert again == {int(a.param1) for a in asked} - {30, 295}  # of airspeed nobody knows whether there is any
+    assert "GLOBAL_POSITION_INT 0.0 of 5 Hz, SYSTEM_TIME 0.0 of 1 Hz" in status(said).detail
+    assert "ATTITUDE" not in status(said).detail
+
+
+def test_vehicle_state_from_attitude_and_relative_height(station: Station, edge: MavlinkEdge) -> None:
+    meet(station, edge)
+    station.send(attitude(1000, yaw=4.0))
+    (first,) = states(polled(edge, 1 * S))
+    assert first.agl_m is None  # absence is a state
+    assert first.yaw_rad is not None
+    assert (first.yaw_rad, first.pitch_rad, first.roll_rad) == pytest.approx((4.0 - math.tau, 0.2, 0.1))
+    height = mavlink.MAVLink_global_position_int_message(1000, 1, 2, 700_000, 84_500, 100, 200, 300, 0)
+    station.send(height, attitude(1040, yaw=4.0))
+    (second,) = states(polled(edge, 1_040 * MS))
+    assert second.agl_m == 84.5
+    assert second.yaw_rad == pytest.approx(4.0 - math.tau)
+    assert second.velocity_enu_mps is None  # that of the filter which hears us is no measurement
+    station.send(heartbeat(), attitude(3000))
+    (third,) = states(polled(edge, 3 * S))
+    assert third.agl_m is None  # the height is 2 s old
+
+
+def test_other_vehicles_ground_stations_and_nonsense_are_not_the_autopilot(station: Station, edge: MavlinkEdge) -> None:
+    meet(station, edge)
+    station.mav.srcSystem = 9
+    station.send(heartbeat(), attitude(5000, yaw=2.0))
+    station.mav.srcSystem, station.mav.srcComponent = 7, 190
+    station.send(heartbeat(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID), attitude(5000, yaw=2.0))
+    station.mav.srcComponent = 1
+    station.send(attitude(5000, yaw=math.nan), attitude(5000, yaw=1e9))
+    said = polled(edge, 1 * S)
+    assert states(said) == []
+    assert (status(said).sysid, status(said).autopilot) == (7, "ardupilot")
+
+
+def test_attitude_is_stamped_with_the_time_of_its_measurement(station: Station, edge: MavlinkEdge) -> None:
+    boot_ahead_ns = 1000 * S  # the autopilot has been running for longer
+    meet(station, edge)
+    for tenth in range(1, 30):
+        now_ns = tenth * 100 * MS
+        if tenth % 5 == 0:
+            station.send(heartbeat())
+        polled(edge, now_ns)
+        for request in station.heard("TIMESYNC"):
+            assert request.tc1 == 0
+            station.send(mavlink.MAVLink_timesync_message(request.ts1 + MS + boot_ahead_ns, request.ts1))
+        polled(edge, now_ns + 2 * MS)
+    station.send(attitude(1_003_000))  # measured at 3.000 s of ours, arrives 60 ms later
+    said = polled(edge, 3_060 * MS)
+    assert states(said)[0].t_ns == pytest.approx(3 * S, abs=MS)
+    station.send(heartbeat())
+    offset_ms = status(polled(edge, 4_100 * MS)).time_offset_ms
+    assert offset_ms == pytest.approx(1e6, abs=1.0)
+
+
+def test_it_answers_the_autopilots_timesync(station: Station, edge: MavlinkEdge) -> None:
+    meet(station, edge)
+    station.send(mavlink.MAVLink_timesync_message(0, 777))
+    polled(edge, 5 * S)
+    time.sleep(0.01)
+    assert (5 * S, 777) in [(t.tc1, t.ts1) for t in station.heard("TIMESYNC")]
+
+
+def test_status_says_when_the_autopilot_is_gone_and_counts(station: Station, edge: MavlinkEdge) -> None:
+    before = status(polled(edge, 0))
+    assert (before.connected, before.autopilot, before.time_offset_ms) == (False, "none", None)
+    assert "nothing heard" in before.detail
+    meet(station, edge, 100 * MS)
+    there = status(polled(edge, 1100 * MS))
+    assert (there.connected, there.autopilot, there.sysid) == (True, "ardupilot", 7)
+    assert there.received == 1
+    assert there.sent > 3
+    assert not status(polled(edge, 6 * S)).connected
+
+
+def test_px4_is_told_apart(station: Station) -> None:
+    edge = edge_to(station, outputs=["gps_input"])
+    meet(station, edge, beat=heartbeat(autopilot=mavlink.MAV_AUTOPILOT_PX4))
+    said = status(polled(edge, 1100 * MS))
+    edge.close()
+    assert said.autopilot == "px4"
+    assert "does not take GPS_INPUT" in said.detail
+
+
+def test_wall_clock_is_ours_the_autopilots_or_nobodys(station: Station) -> None:
+    config = LinkSection(device=f"udpout:127.0.0.1:{station.port}")
+    for ours, source in ((UNIX_NS, "system"), (5 * S, "none")):
+        edge = MavlinkEdge(config, open_transport(config.device, 0, wait=True), partial(int, ours))
+        (clock,) = [x for x in edge.poll(3 * S) if isinstance(x, m.WallClock)]
+        assert (clock.t_ns, clock.source, clock.unix_ns) == (3 * S, source, UNIX_NS if source == "system" else None)
+        edge.close()
+    edge = MavlinkEdge(config, open_transport(config.device, 0, wait=True), lambda: 5 * S)
+    meet(station, edge)
+    station.send(mavlink.MAVLink_system_time_message(UNIX_NS // 1000, 1000))
+    (clock,) = [x for x in polled(edge, 1 * S) if isinstance(x, m.WallClock)]
+    assert (clock.t_ns, clock.source, clock.unix_ns) == (1 * S, "autopilot", UNIX_NS)
+    edge.close()
+
+
+# --- garbage ---
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    chunks=st.lists(st.binary(max_size=400), max_size=6),
+    magic=st.sampled_from([b"", b"\xfd", b"\xfe", b"\xfd\x09\x00"]),
+)
+def test_garbage_never_raises(station: Station, chunks: list[bytes], magic: bytes) -> None:
+    edge = edge_to(station)
+    polled_at = 0
+    edge.poll(polled_at)
+    station.socket.settimeout(2.0)
+    link = station.socket.recvfrom(4096)[1]
+    station.heard()
+    for chunk in chunks:
+        station.socket.sendto(magic + chunk, link)
+        edge.poll(polled_at := polled_at + S)
+    edge.heard(GPS)
+    edge.close()
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_packets_are_counted_and_the_next_good_one_is_read(station: Station, data: st.DataObject) -> None:
+    edge = edge_to(station)
+    meet(station, edge)
+    packet = bytearray(attitude(1000).pack(station.mav))
+    cut = data.draw(st.integers(1, len(packet)), label="cut")
+    flip = data.draw(st.integers(0, len(packet) - 1), label="flip")
+    packet[flip] ^= data.draw(st.integers(1, 255), label="bits")
+    station.socket.sendto(bytes(packet[:cut]), station.link)
+    for i in range(12):  # at most the 280 bytes that a broken length claims are lost
+        station.send(attitude(2000 + i))
+    said = states(polled(edge, 2 * S))
+    assert said
+    assert all(s.yaw_rad == 1.0 and s.roll_rad == pytest.approx(0.1) for s in said[-3:])
+    edge.close()
+
+
+# --- devices that come and go ---
+
+
+@pytest.mark.parametrize(
+    ("device", "says"),
+    [
+        ("udpin:nonsense", "needs HOST:PORT"),
+        ("udpout:127.0.0.1:99999", "needs HOST:PORT"),
+        ("tcp:127.0.0.1:1", "is the other side listening?"),
+        ("udpout:no.such.host.invalid:14550", "is not known"),
+        ("serial:ttyUSB0:57600", "not understood"),
+        ("ttyUSB0", "not understood"),
+        ("/dev/no-such-device", "is it plugged in"),
+        ("/dev/null", "is it plugged in"),
+    ],
+)
+def test_what_cannot_be_opened_at_start_is_one_clear_line(device: str, says: str) -> None:
+    with pytest.raises(LinkError, match=says) as caught:
+        open_edge(LinkSection(device=device))
+    assert device in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_port_in_use_is_named(station: Station) -> None:
+    with pytest.raises(LinkError, match="taken by another program"):
+        open_edge(LinkSection(device=f"udpin:127.0.0.1:{station.port}"))
+
+
+def test_udpin_answers_whoever_speaks(station: Station) -> None:
+    free = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    free.bind(("127.0.0.1", 0))
+    port = free.getsockname()[1]
+    free.close()
+    edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
+    edge.heard(GPS)  # nobody there yet: dropped, and no news
+    station.link = ("127.0.0.1", port)
+    station.send(heartbeat())
+    said = polled(edge, 2 * S)
+    assert "not sent" not in status(said).detail
+    edge.heard(GPS)
+    time.sleep(0.01)
+    assert len(station.heard("GPS_INPUT")) == 1
+    edge.close()
+
+
+def test_serial_both_ways_and_back_after_it_was_pulled(tmp_path: Any) -> None:
+    master, slave = pty.openpty()
+    device = tmp_path / "ttyFC"
+    device.symlink_to(os.ttyname(slave))
+    edge = open_edge(LinkSection(device=str(device), baud=115_200))
+    autopilot = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+    os.write(master, heartbeat().pack(autopilot) + attitude(1000).pack(autopilot))
+    assert len(states(polled(edge, 1 * S))) == 1
+    edge.heard(GPS)
+    time.sleep(0.01)
+    ours = mavlink.MAVLink(None)
+    ours.robust_parsing = True
+    assert "GPS_INPUT" in [x.get_type() for x in ours.parse_buffer(os.read(master, 4096))]
+
+    os.close(slave)
+    os.close(master)  # pulled
+    gone = polled(edge, 3 * S)
+    edge.heard(GPS)
+    assert "connection lost" in status(gone).detail
+    device.unlink()
+    assert "cannot be opened again" in status(polled(edge, 5 * S)).detail
+
+    master, slave = pty.openpty()
+    device.symlink_to(os.ttyname(slave))
+    polled(edge, 7 * S)
+    os.write(master, heartbeat().pack(autopilot) + attitude(9000).pack(autopilot))
+    back = polled(edge, 8 * S)
+    assert len(states(back)) == 1
+    assert "opened again 1 times" in status(back).detail
+    edge.close()
+    os.close(slave)
+    os.close(master)
+
+
+def test_a_full_serial_line_never_blocks_and_never_breaks_a_packet() -> None:
+    master, slave = pty.openpty()
+    edge = open_edge(LinkSection(device=os.ttyname(slave)))
+    began = time.monotonic()
+    for _ in range(2000):  # nobody reads
+        edge.heard(GPS)
+    assert time.monotonic() - began < 2.0
+    os.set_blocking(master, False)
+    parser = mavlink.MAVLink(None)
+    parser.robust_parsing = True
+    kinds: list[str] = []
+    for _ in range(50):
+        try:
+            kinds += [x.get_type() for x in parser.parse_buffer(os.read(master, 65536)) or []]
+        except OSError as error:
+            assert error.errno == errno.EAGAIN
+        edge.heard(GPS)
+    assert len(kinds) > 50
+    assert set(kinds) == {"GPS_INPUT"}
+    edge.close()
+    os.close(slave)
+    os.close(master)
+
+
+def test_tcp_comes_back_without_waiting() -> None:
+    server = socket.create_server(("127.0.0.1", 0))
+    address = server.getsockname()
+    edge = open_edge(LinkSection(device=f"tcp:127.0.0.1:{address[1]}"))
+    peer, _ = server.accept()
+    autopilot = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+    peer.sendall(heartbeat().pack(autopilot) + attitude(1000).pack(autopilot))
+    assert len(states(polled(edge, 1 * S))) == 1
+    peer.close()
+    server.close()
+    for second in range(2, 6):  # refused again and again
+        began = time.monotonic()
+        said = polled(edge, second * S)
+        edge.heard(GPS)
+        assert time.monotonic() - began < 0.2
+    assert not status(said).connected
+    server = socket.create_server(address)
+    polled(edge, 7 * S)
+    peer, _ = server.accept()
+    peer.sendall(heartbeat().pack(autopilot) + attitude(9000).pack(autopilot))
+    assert len(states(polled(edge, 8 * S))) == 1
+    edge.heard(GPS)
+    peer.settimeout(2.0)
+    parser = mavlink.MAVLink(None)
+    parser.robust_parsing = True
+    assert "GPS_INPUT" in [x.get_type() for x in parser.parse_buffer(peer.recv(4096))]
+    edge.close()
+    peer.close()
+    server.close()
+
+
+def test_node_and_edge_together_send_10_hz_with_week_and_position(station: Station) -> None:
+    edge, node = edge_to(station), LinkNode(10.0)
+    zero_ns = time.monotonic_ns()
+    fed = [0]
+
+    def feed(now_ns: int) -> list[m.Message]:
+        if now_ns - fed[0] < 250 * MS:
+            return []
+        fed[0] = now_ns
+        late = estimate(now_ns - zero_ns)
+        return [msgspec.structs.replace(late, t_ns=now_ns, emitted_at_ns=now_ns)]
+
+    live(node, edge, 1.5, feed)
+    sent = station.heard("GPS_INPUT")
+    edge.close()
+    assert 5 <= len(sent) <= 17
+    good = [g for g in sent if g.fix_type == 3]
+    assert len(good) >= len(sent) - 3
+    assert all(g.alt == pytest.approx(ALT) and g.ve == 20.0 and g.satellites_visible == 6 for g in good)
+    assert {g.time_week for g in sent} == {week_and_ms(UNIX_NS)[0]}
+    for a, b in pairwise(sent):  # the week runs with the clock that positions are carried on
+        assert b.time_week_ms - a.time_week_ms == pytest.approx((b.time_usec - a.time_usec) / 1e3, abs=1.0)
+
+
+def test_sending_to_nobody_is_no_error() -> None:
+    transport = UdpOut(("127.0.0.1", 9))
+    assert transport.write(b"x")
+    time.sleep(0.01)
+    assert transport.write(b"x")  # the port answered that nobody listens
+    assert transport.read() == []
+    transport.close()
+
+
+def test_the_link_imports_neither_gtsam_nor_onnxruntime_nor_opencv() -> None:
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, terrafix.link.node, terrafix.link.edge;"
+        "print([n for n in ('gtsam', 'onnxruntime', 'cv2', 'faiss') if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,435 @@
+"""Every output against a decoder that is not ours: pymavlink, the autopilot's arithmetic, published check values."""
+
+import ctypes
+import math
+import os
+import pty
+import time
+from datetime import UTC, datetime
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from autopilot_rig import GOOD, Rig
+from link_wire import MemoryWire, attitude, heartbeat, packed
+from terrafix import messages as m
+from terrafix.core.config import LinkSection
+from terrafix.core.errors import LinkError
+from terrafix.link.edge import MavlinkEdge
+from terrafix.link.integrity.output_predictor import apart_m, offset
+from terrafix.link.output import global_position, gps_time, msp, nmea, odometry
+from terrafix.link.output.odometry import Attitude, Place
+from terrafix.link.output.selection import Outputs
+from terrafix.link.output.serial_outputs import open_side_outputs
+from terrafix_tools.sim.autopilot.parameters import Kind
+
+S, MS = 1_000_000_000, 1_000_000
+WHEN = datetime(2026, 11, 21, 12, 35, 19, 250_000, tzinfo=UTC)
+WEEK, WEEK_MS = gps_time.week_and_ms(int(WHEN.timestamp() * 1000) * MS)
+GPS = m.GpsInput(
+    t_ns=123_456_789_000,
+    fix_type=3,
+    time_week=WEEK,
+    time_week_ms=WEEK_MS,
+    lat_deg=48.117_300_5,
+    lon_deg=-11.516_666_7,
+    alt_amsl_m=545.4,
+    hdop=1.0,
+    vdop=1.0,
+    vn_mps=-3.0,
+    ve_mps=4.0,
+    vd_mps=-0.5,
+    speed_accuracy_mps=0.75,
+    horiz_accuracy_m=6.5,
+    vert_accuracy_m=4.5,
+    satellites_visible=6,
+    estimate_age_ms=180.0,
+)
+NO_FIX = msgspec.structs.replace(GPS, fix_type=1, lat_deg=0.0, lon_deg=0.0, satellites_visible=0, time_week=0)
+ORIGIN = Place(48.0, -11.5, 500.0)
+BANKED = Attitude(0.4, -0.2, 2.5)
+
+
+def over_the_wire(message: Any) -> Any:
+    return mavlink.MAVLink(None).decode(bytearray(packed(message, mavlink.MAVLink(None, 1, 197))))
+
+
+# --- ODOMETRY and VISION_POSITION_ESTIMATE ---
+
+
+def ardupilots_error(covariance: list[float], first: int = 0) -> float:
+    """GCS_Common.cpp, handle_odometry and handle_common_vision_position_estimate_data."""
+    a, b, c = (0, 6, 11) if first == 0 else (15, 18, 20)
+    return (covariance[a] ** 2 + covariance[b] ** 2 + covariance[c] ** 2) ** (1 / 3)
+
+
+@pytest.mark.parametrize(("sigma", "variance"), [(1.0, 0.577), (5.0, 6.46), (10.0, 18.3)])
+def test_fact_the_cube_root_rule_gives_the_true_sigma(sigma: float, variance: float) -> None:
+    assert odometry.variance_for_ardupilot(sigma) == pytest.approx(variance, rel=3e-3)
+    gps = msgspec.structs.replace(GPS, horiz_accuracy_m=sigma)
+    for encode in (odometry.odometry, odometry.vision_position):
+        said = over_the_wire(encode(gps, ORIGIN, BANKED, ardupilot=True))
+        covariance = said.pose_covariance if said.get_type() == "ODOMETRY" else said.covariance
+        assert ardupilots_error(covariance) == pytest.approx(sigma, rel=1e-5)
+        assert ardupilots_error(covariance, 15) == pytest.approx(math.pi, rel=1e-5)
+
+
+def test_other_firmware_gets_plain_variances() -> None:
+    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
+    assert said.pose_covariance[0] == said.pose_covariance[6] == pytest.approx(6.5**2)
+    assert said.pose_covariance[11] == pytest.approx(4.5**2)
+
+
+def test_px4_gets_metres_of_its_own_sphere_in_a_frame_that_has_a_north() -> None:
+    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
+    assert said.frame_id == mavlink.MAV_FRAME_LOCAL_NED
+    # MapProjection::reproject, the way back
+    x, y = said.x / 6_371_000.0, said.y / 6_371_000.0
+    c, lat0 = math.hypot(x, y), math.radians(ORIGIN.lat_deg)
+    lat = math.asin(math.cos(c) * math.sin(lat0) + x * math.sin(c) * math.cos(lat0) / c)
+    east = math.atan2(y * math.sin(c), c * math.cos(lat0) * math.cos(c) - x * math.sin(lat0) * math.sin(c))
+    back = math.degrees(lat), ORIGIN.lon_deg + math.degrees(east)
+    assert back == pytest.approx((GPS.lat_deg, GPS.lon_deg), abs=2e-7)
+    at_origin = msgspec.structs.replace(GPS, lat_deg=ORIGIN.lat_deg, lon_deg=ORIGIN.lon_deg)
+    assert odometry.north_east_down(at_origin, ORIGIN, ardupilot=False)[:2] == (0.0, 0.0)
+
+
+def body_to_ned(a: Attitude) -> np.ndarray:
+    cr, sr, cp, sp, cy, sy = (f(x) for x in (a.roll_rad, a.pitch_rad, a.yaw_rad) for f in (math.cos, math.sin))
+    x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return z @ y @ x
+
+
+def test_odometry_says_frames_velocity_and_place_as_ardupilot_reads_them() -> None:
+    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=True))
+    assert (said.frame_id, said.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
+    w, x, y, z = said.q
+    turned = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    assert turned == pytest.approx(body_to_ned(BANKED), abs=1e-6)
+    assert turned @ [said.vx, said.vy, said.vz] == pytest.approx([-3.0, 4.0, -0.5], abs=1e-5)
+    assert said.time_usec == 123_456_789
+    assert (said.quality, said.reset_counter) == (100, 0)
+    # Location::offset_latlng, the way back: degrees per metre on ArduPilot's plane
+    inverse = 89.83204953368922e-7
+    lat = ORIGIN.lat_deg + said.x * inverse
+    lon = ORIGIN.lon_deg + said.y * inverse / math.cos(math.radians((lat + ORIGIN.lat_deg) / 2))
+    assert (lat, lon) == pytest.approx((GPS.lat_deg, GPS.lon_deg), abs=2e-8)
+    assert said.z == pytest.approx(-45.4)
+
+
+def test_the_date_line_is_no_wall() -> None:
+    gps = msgspec.structs.replace(GPS, lat_deg=0.0, lon_deg=-179.999)
+    place = Place(0.0, 179.999, 0.0)
+    assert odometry.north_east_down(gps, place, ardupilot=True)[:2] == pytest.approx((0.0, 222.6), abs=0.1)
+    assert odometry.north_east_down(gps, place, ardupilot=False)[:2] == pytest.approx((0.0, 222.4), abs=0.1)
+
+
+# --- GLOBAL_POSITION_SENSOR and EXTERNAL_POSITION_ESTIMATE ---
+
+
+def test_every_field_of_global_position_sensor() -> None:
+    said = over_the_wire(global_position.global_position_sensor(GPS, 7)).to_dict()
+    assert math.isnan(said.pop("alt_ellipsoid"))
+    assert said.pop("alt") == pytest.approx(545.4)
+    assert said == {
+        "mavpackettype": "GLOBAL_POSITION_SENSOR",
+        "target_system": 7,
+        "target_component": 1,
+        "id": 1,
+        "time_usec": 123_456_789,
+        "processing_time": 0,
+        "source": 2,
+        "flags": 0,
+        "lat": 481_173_005,
+        "lon": -115_166_667,
+        "eph": 6.5,
+        "epv": 4.5,
+    }
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+def test_fact_external_position_moves_a_filter_that_has_no_gps_and_no_other(kind: Kind) -> None:
+    rig = Rig(kind)
+    rig.fly(5.0, GOOD)
+    lat, lon = rig.autopilot._frame.to_wgs84(*map(float, rig.truth(7.0)[:2]))
+    gps = msgspec.structs.replace(GPS, lat_deg=lat + 0.001, lon_deg=lon, t_ns=7 * S)  # 111 m north
+    message = global_position.external_position_estimate(gps, 1)
+    assert (message.param2, message.param3) == (0.0, 6.5)
+    (refused,) = rig.ask(message, "COMMAND_ACK")
+    assert refused.result == mavlink.MAV_RESULT_FAILED
+    rig.fly(2.0)
+    (taken,) = rig.ask(message, "COMMAND_ACK")
+    assert taken.result == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.north_m() == pytest.approx(111.2, abs=1.0)
+
+
+# --- NMEA ---
+
+
+def fields(line: bytes) -> list[str]:
+    """By hand: the checksum is the exclusive or of what stands between $ and *."""
+    body, _, checksum = line.decode("ascii").strip().lstrip("$").partition("*")
+    total = 0
+    for character in body:
+        total ^= ord(character)
+    assert total == int(checksum, 16)
+    return body.split(",")
+
+
+def test_the_hand_decoder_reads_the_published_example() -> None:
+    read = fields(b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
+    assert len(read) == 15
+
+
+def test_nmea_sentences_field_by_field() -> None:
+    gga, rmc, gst = nmea.sentences(GPS).splitlines(keepends=True)
+    assert all(line.endswith(b"\r\n") and len(line) <= 82 for line in (gga, rmc, gst))
+    place = ["4807.038030", "N", "01131.000002", "W"]
+    assert fields(gga) == ["GPGGA", "123519.25", *place, "1", "06", "1.0", "545.40", "M", "", "M", "", ""]
+    speed = f"{5.0 * 3600 / 1852:.3f}"
+    assert fields(rmc) == ["GPRMC", "123519.25", "A", *place, speed, "126.87", "211126", "", "", "A"]
+    assert fields(gst) == ["GPGST", "123519.25", "", "6.50", "6.50", "", "6.50", "6.50", "4.50"]
+
+
+def test_nmea_without_fix_and_clock_says_nothing_of_place_and_time() -> None:
+    gga, rmc, gst = (fields(line) for line in nmea.sentences(NO_FIX).splitlines())
+    assert gga == ["GPGGA", "", "", "", "", "", "0", "00", "", "", "M", "", "M", "", ""]
+    assert rmc == ["GPRMC", "", "V", *[""] * 9, "N"]
+    assert set(gst[1:]) == {""}
+
+
+@settings(deadline=None)
+@given(lat=st.floats(-90, 90), lon=st.floats(-180, 180))
+def test_nmea_angles_come_back_from_anywhere(lat: float, lon: float) -> None:
+    read = fields(nmea.sentences(msgspec.structs.replace(GPS, lat_deg=lat, lon_deg=lon)).splitlines()[0])
+    for value, hemisphere, digits, expected in ((read[2], read[3], 2, lat), (read[4], read[5], 3, lon)):
+        minutes = float(value[digits:])
+        assert minutes < 60.0
+        degrees = (int(value[:digits]) + minutes / 60) * (-1 if hemisphere in "SW" else 1)
+        assert degrees == pytest.approx(expected, abs=1e-8)
+
+
+# --- MSP ---
+
+
+class SensorGps(ctypes.LittleEndianStructure):
+    """mspSensorGpsDataMessage_t of iNav's msp_protocol_v2_sensor_msg.h, as a C compiler lays it out."""
+
+    _pack_ = 1
+    _layout_ = "ms"
+    _fields_ = (
+        ("instance", ctypes.c_uint8),
+        ("gpsWeek", ctypes.c_uint16),
+        ("msTOW", ctypes.c_uint32),
+        ("fixType", ctypes.c_uint8),
+        ("satellitesInView", ctypes.c_uint8),
+        ("horizontalPosAccuracy", ctypes.c_uint16),
+        ("verticalPosAccuracy", ctypes.c_uint16),
+        ("horizontalVelAccuracy", ctypes.c_uint16),
+        ("hdop", ctypes.c_uint16),
+        ("longitude", ctypes.c_int32),
+        ("latitude", ctypes.c_int32),
+        ("mslAltitude", ctypes.c_int32),
+        ("nedVelNorth", ctypes.c_int32),
+        ("nedVelEast", ctypes.c_int32),
+        ("nedVelDown", ctypes.c_int32),
+        ("groundCourse", ctypes.c_uint16),
+        ("trueYaw", ctypes.c_uint16),
+        ("year", ctypes.c_uint16),
+        ("month", ctypes.c_uint8),
+        ("day", ctypes.c_uint8),
+        ("hour", ctypes.c_uint8),
+        ("min", ctypes.c_uint8),
+        ("sec", ctypes.c_uint8),
+    )
+
+
+def test_msp_checksum_has_the_published_check_value() -> None:
+    assert msp.crc8_dvb_s2(b"123456789") == 0xBC  # catalogue of parametrised CRC algorithms, CRC-8/DVB-S2
+
+
+def test_msp_frame_field_by_field() -> None:
+    frame = msp.frame(GPS)
+    assert frame[:8] == b"$X<\x00\x03\x1f" + (52).to_bytes(2, "little")
+    assert ctypes.sizeof(SensorGps) == 52
+    read = SensorGps.from_buffer_copy(frame[8:-1])
+    assert {name: getattr(read, name) for name, _ in SensorGps._fields_} == {
+        "instance": 0,
+        "gpsWeek": WEEK,
+        "msTOW": WEEK_MS,
+        "fixType": 3,
+        "satellitesInView": 6,
+        "horizontalPosAccuracy": 650,
+        "verticalPosAccuracy": 450,
+        "horizontalVelAccuracy": 75,
+        "hdop": 100,
+        "longitude": -115_166_667,
+        "latitude": 481_173_005,
+        "mslAltitude": 54_540,
+        "nedVelNorth": -300,
+        "nedVelEast": 400,
+        "nedVelDown": -50,
+        "groundCourse": 12_687,
+        "trueYaw": 65_535,
+        "year": 2026,
+        "month": 11,
+        "day": 21,
+        "hour": 12,
+        "min": 35,
+        "sec": 19,
+    }
+
+
+def test_msp_without_fix_and_clock() -> None:
+    read = SensorGps.from_buffer_copy(msp.frame(NO_FIX)[8:-1])
+    assert (read.gpsWeek, read.fixType, read.satellitesInView, read.year) == (0xFFFF, 1, 0, 0)
+
+
+@settings(deadline=None)
+@given(unix_ms=st.integers(1_000_000_000_000, 4_000_000_000_000))
+def test_the_week_goes_there_and_back(unix_ms: int) -> None:
+    assert gps_time.unix_ms(*gps_time.week_and_ms(unix_ms * MS)) == unix_ms
+
+
+# --- which, and when ---
+
+
+def edge_on(wire: MemoryWire, **changes: Any) -> MavlinkEdge:
+    return MavlinkEdge(LinkSection(**changes), wire, lambda: 0)
+
+
+@pytest.mark.parametrize(
+    ("firmware", "configured", "sent"),
+    [
+        ("ardupilot", [], ("gps_input",)),
+        ("none", [], ("gps_input",)),
+        ("px4", [], ("global_position",)),
+        ("px4", ["odometry"], ("odometry",)),
+        ("ardupilot", ["gps_input", "external_position"], ("gps_input", "external_position")),
+    ],
+)
+def test_the_configuration_or_else_the_firmware_decides(firmware: str, configured: Any, sent: tuple[str, ...]) -> None:
+    assert Outputs(configured, 0).names(firmware) == sent
+
+
+def test_px4_gets_its_message_and_no_gps_input() -> None:
+    wire = MemoryWire()
+    edge = edge_on(wire)
+    wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_PX4), mavlink.MAVLink(None, 7, 1)))
+    list(edge.poll(0))
+    wire.take()
+    edge.heard(GPS)
+    (said,) = wire.take()
+    assert (said.get_type(), said.target_system) == ("GLOBAL_POSITION_SENSOR", 7)
+    edge.heard(NO_FIX)
+    assert wire.take() == []  # whatever it says without a fix, PX4 takes for a position
+
+
+def test_local_outputs_wait_for_the_origin_and_are_silent_without_a_fix() -> None:
+    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
+    edge = edge_on(wire, outputs=["odometry", "vision_position"])
+    edge.heard(
+        m.Origin(
+            t_ns=0,
+            camera=m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0),
+            lat_deg=48.0,
+            lon_deg=-11.5,
+            ground_amsl_m=500.0,
+            start_sigma_m=5.0,
+            yaw_sigma_deg=5.0,
+            agl_sigma_m=5.0,
+            attitude_sigma_deg=2.0,
+        )
+    )
+    wire.arrive(packed(heartbeat(), autopilot), packed(attitude(1), autopilot))
+    list(edge.poll(GPS.t_ns - 4 * S))
+    asked = [a for a in wire.take("COMMAND_LONG") if a.command == mavlink.MAV_CMD_REQUEST_MESSAGE]
+    assert [a.param1 for a in asked] == [49.0]  # GPS_GLOBAL_ORIGIN
+    edge.heard(GPS)
+    assert wire.take() == []
+    wire.arrive(packed(heartbeat(), autopilot))
+    status = [x for x in edge.poll(GPS.t_ns - S) if isinstance(x, m.LinkStatus)][-1]
+    assert "waits for the autopilot's origin" in status.detail
+    (given,) = wire.take("SET_GPS_GLOBAL_ORIGIN")  # it has none: that of the flight becomes it
+    assert (given.latitude, given.longitude, given.altitude) == (480_000_000, -115_000_000, 500_000)
+    origin = mavlink.MAVLink_gps_global_origin_message(480_000_000, -115_000_000, 500_000)
+    wire.arrive(packed(origin, autopilot), packed(attitude(2), autopilot))
+    list(edge.poll(GPS.t_ns))
+    wire.take()
+    edge.heard(GPS)
+    assert [x.get_type() for x in wire.take()] == ["ODOMETRY", "VISION_POSITION_ESTIMATE"]
+    edge.heard(NO_FIX)
+    assert wire.take() == []
+
+
+def test_external_positions_are_few_and_good() -> None:
+    wire = MemoryWire()
+    edge = edge_on(wire, outputs=["external_position"])
+    for tenth in range(100):
+        edge.heard(msgspec.structs.replace(GPS, t_ns=tenth * 100 * MS))
+    assert len(wire.take("COMMAND_INT")) == 2
+    edge.heard(msgspec.structs.replace(GPS, t_ns=20 * S, horiz_accuracy_m=31.0))
+    edge.heard(msgspec.structs.replace(NO_FIX, t_ns=30 * S))
+    assert wire.take() == []
+
+
+@pytest.mark.parametrize("uptime_days", [0.01, 1.0, 10.0, 49.0, 200.0])
+def test_an_external_position_is_of_the_time_that_its_32_bits_state(uptime_days: float) -> None:
+    began_ns = round(uptime_days * 86_400 * S)
+    for step in range(200):
+        t_ns = began_ns + step * 137 * MS
+        way_s = (t_ns - began_ns) / S
+        lat, lon = offset(48.0, 11.0, 20.0 * way_s, -10.0 * way_s)
+        gps = msgspec.structs.replace(GPS, t_ns=t_ns, lat_deg=lat, lon_deg=lon, ve_mps=20.0, vn_mps=-10.0)
+        said = over_the_wire(global_position.external_position_estimate(gps, 1))
+        stated_s = said.param1 - began_ns / S
+        assert 0.0 <= way_s - stated_s < 2.0 * np.spacing(np.float32(began_ns / S))
+        east_m, north_m = apart_m((48.0, 11.0), (said.x / 1e7, said.y / 1e7))
+        assert (east_m, north_m) == pytest.approx((20.0 * stated_s, -10.0 * stated_s), abs=0.05)
+
+
+def test_a_position_that_jumped_is_a_reset_in_local_poses() -> None:
+    for resets, counter in ((0, 0), (3, 3), (256, 0), (259, 3)):
+        gps = msgspec.structs.replace(GPS, resets=resets)
+        for encode in (odometry.odometry, odometry.vision_position):
+            assert over_the_wire(encode(gps, ORIGIN, BANKED, ardupilot=True)).reset_counter == counter
+
+
+def test_nmea_and_msp_go_to_devices_of_their_own_which_may_vanish() -> None:
+    masters, names = [], []
+    for _ in range(2):
+        master, slave = pty.openpty()
+        masters.append(master)
+        names.append(os.ttyname(slave))
+        os.close(slave)
+    edge = edge_on(MemoryWire(), nmea_device=names[0], nmea_baud=9600, msp_device=names[1])
+    edge.heard(GPS)
+    time.sleep(0.01)
+    assert os.read(masters[0], 4096) == nmea.sentences(GPS)
+    assert os.read(masters[1], 4096) == msp.frame(GPS)
+    os.close(masters[0])
+    edge.heard(GPS)
+    (status,) = [x for x in edge.poll(0) if isinstance(x, m.LinkStatus)]
+    assert f"{names[0]}: connection lost" in status.detail
+    time.sleep(0.01)
+    assert os.read(masters[1], 4096) == msp.frame(GPS)
+    edge.close()
+    os.close(masters[1])
+
+
+def test_a_side_output_that_cannot_be_opened_is_one_line() -> None:
+    with pytest.raises(LinkError, match=r"/dev/none.*plugged in"):
+        open_side_outputs(LinkSection(nmea_device="/dev/none"))

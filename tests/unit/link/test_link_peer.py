@@ -1,0 +1,375 @@
+"""The autopilot peer keeps the rules that were measured on the firmware, and the link lives up to them, end to end."""
+
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from link_rig import ALT, LAT, LON, MS, SPEED_EAST, S, covariance, estimate, every, fly, gps, live
+from terrafix import messages as m
+from terrafix.core.config import LinkSection
+from terrafix.core.errors import LinkError, SourceError
+from terrafix.link.edge import open_edge
+from terrafix.link.integrity.output_predictor import offset
+from terrafix.link.mavlink.message_rates import STREAMS_HZ
+from terrafix.link.node import LinkNode
+from terrafix.link.output import gps_input
+from terrafix_tools.sim.autopilot.course import PeerState, read_course, write_course
+from terrafix_tools.sim.autopilot.gps import GpsInputDriver, JitterCorrection
+from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, GPS_INPUT_ALONE, NO_DCM
+from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+
+pytestmark = pytest.mark.real_time
+
+CONFIG = Path(__file__).resolve().parents[3] / "config"
+
+
+def message(**changes: Any) -> Any:
+    """A GPS_INPUT as a good sender makes it."""
+    fields = dict(
+        time_usec=0,
+        gps_id=0,
+        ignore_flags=0,
+        time_week_ms=1000,
+        time_week=0,
+        fix_type=3,
+        lat=round(LAT * 1e7),
+        lon=round(LON * 1e7),
+        alt=500.0,
+        hdop=1.0,
+        vdop=1.0,
+        vn=1.0,
+        ve=2.0,
+        vd=0.0,
+        speed_accuracy=0.3,
+        horiz_accuracy=2.0,
+        vert_accuracy=3.0,
+        satellites_visible=6,
+    )
+    return mavlink.MAVLink_gps_input_message(**(fields | changes))
+
+
+def fed(driver: GpsInputDriver, period_s: float, count: int, start_s: float = 0.0, **changes: Any) -> float:
+    for i in range(count):
+        driver.take(message(**changes), start_s + i * period_s)
+    return start_s + (count - 1) * period_s
+
+
+# --- facts: rate health ---
+
+
+@pytest.mark.parametrize(("rate_hz", "healthy"), [(10, True), (5, True), (4, False), (3, False), (1, False)])
+def test_fact_needs_a_mean_interval_below_215_ms(rate_hz: float, healthy: bool) -> None:
+    driver = GpsInputDriver(0, 5.0)
+    assert driver.healthy(fed(driver, 1 / rate_hz, 300)) is healthy
+
+
+def test_fact_one_gap_over_245_ms_is_forgiven_two_in_a_row_are_not() -> None:
+    driver = GpsInputDriver(0, 5.0)
+    now = fed(driver, 0.1, 100)
+    driver.take(message(), now + 0.3)
+    assert driver.healthy(now + 0.3)
+    driver.take(message(), now + 0.6)
+    assert not driver.healthy(now + 0.6)
+
+
+def test_fact_silence_of_a_minute_spoils_the_mean_for_half_a_minute_at_5_hz_a_quarter_of_it_at_10() -> None:
+    def recovery_s(rate_hz: float) -> float:
+        driver = GpsInputDriver(0, 5.0)
+        start = fed(driver, 1 / rate_hz, 100) + 60.0
+        driver.look(start - 1.0)
+        for i in range(1000):
+            driver.take(message(), start + i / rate_hz)
+            if driver.healthy(start + i / rate_hz):
+                return i / rate_hz
+        return math.inf
+
+    assert 30.0 < recovery_s(5.0) < 50.0
+    assert recovery_s(10.0) < recovery_s(5.0) / 2.5
+
+
+def test_fact_after_4_s_of_silence_the_receiver_is_gone() -> None:
+    driver = GpsInputDriver(0, 5.0)
+    now = fed(driver, 0.1, 50)
+    driver.look(now + 3.9)
+    assert (driver.fix_type, driver.satellites) == (3, 6)
+    driver.look(now + 4.1)
+    assert (driver.fix_type, driver.satellites, driver.healthy(now + 4.1)) == (1, 0, False)
+
+
+# --- facts: fields ---
+
+
+@pytest.mark.parametrize("fix_type", [0, 1, 2])
+def test_fact_below_3d_nothing_reaches_the_filter(fix_type: int) -> None:
+    assert GpsInputDriver(0, 5.0).take(message(fix_type=fix_type), 0.0) is None
+
+
+def test_fact_an_ignored_velocity_stays_at_its_last_value() -> None:
+    driver = GpsInputDriver(0, 5.0)
+    never = driver.take(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.0)
+    driver.take(message(vn=5.0), 0.1)
+    stuck = driver.take(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.2)
+    assert never is not None
+    assert stuck is not None
+    assert (never.velocity_ned_mps[0], stuck.velocity_ned_mps[0]) == (0.0, 5.0)
+
+
+def test_fact_the_driver_takes_a_fix_for_200_ms_old_unless_told_otherwise() -> None:
+    for delay_ms, lag_s in ((0.0, 0.2), (5.0, 0.005), (100.0, 0.1), (900.0, 0.25)):
+        fix = GpsInputDriver(0, delay_ms).take(message(), 10.0)
+        assert fix is not None
+        assert 10.0 - fix.t_s == pytest.approx(lag_s)
+
+
+def test_fact_the_week_takes_out_variations_of_latency_and_not_its_mean() -> None:
+    jitter = JitterCorrection()
+    late = [0.02, 0.05, 0.13, 0.02, 0.08] * 40
+    corrected = [jitter.correct(1e9 + i * 0.1, 5.0 + i * 0.1 + late[i]) - i * 0.1 - 5.0 for i in range(200)]
+    assert all(c == pytest.approx(0.02, abs=1e-6) for c in corrected[1:])
+
+
+def test_the_course_survives_its_file(tmp_path: Path) -> None:
+    rows = [
+        (t / 2, PeerState(48 + t * 1e-5, 11.0, 600, 100, 3.1 if t % 2 else -3.1, 0, 0.1, 1.0, 2, 0, 9.0))
+        for t in range(9)
+    ]
+    write_course(tmp_path / "course.csv", rows)
+    course = read_course(tmp_path / "course.csv")
+    assert course(1.5) == rows[3][1]
+    assert abs(math.remainder(course(1.75).yaw_rad - math.pi, math.tau)) < 1e-9  # the short way round
+    assert course(99.0).lat_deg == rows[-1][1].lat_deg
+    assert course(99.0).vn_mps == 0.0
+    (tmp_path / "bad.csv").write_text("t_s,lat\n1,2\n")
+    for name in ("bad.csv", "none.csv"):
+        with pytest.raises(SourceError, match=name):
+            read_course(tmp_path / name)
+
+
+def in_file(name: str) -> dict[str, float]:
+    lines = (CONFIG / "vehicles" / f"{name}.param").read_text().splitlines()
+    rows = (line.split(",") for line in lines if line and not line.startswith("#"))
+    return {key: float(value) for key, value in rows}
+
+
+def test_parameters_of_the_simulated_autopilot_are_those_of_the_vehicle_files() -> None:
+    """What a file sets beyond them does not decide about GPS and is not simulated."""
+
+    def simulated(name: str) -> dict[str, float]:
+        return {key: value for key, value in in_file(name).items() if key in FIRMWARE}
+
+    assert simulated("copter") == GPS_INPUT_ALONE
+    assert simulated("plane") == GPS_INPUT_ALONE | NO_DCM
+    assert simulated("second-gps") == BESIDE_A_RECEIVER | NO_DCM
+
+
+# --- facts: what the link sends, against the contract ---
+
+
+def everything_sent() -> list[m.GpsInput]:
+    """A flight with good, bad, stale, jumping and absent estimates."""
+
+    def make(t: int) -> m.NavEstimate:
+        second = t // S
+        return estimate(
+            t,
+            sigma_m=90.0 if 20 <= second < 25 else 3.0 + second % 9,
+            east_m=400.0 if second == 30 else 0.0,
+            velocity_sigma=2.0 if 40 <= second < 45 else 0.6,
+        )
+
+    def feed(now: int) -> list[m.Message]:
+        return [] if 50 * S < now < 100 * S or now < 3 * S else every(300 * MS, make)(now)
+
+    node = LinkNode(10.0)
+    node.on(m.WallClock(t_ns=0, unix_ns=1_795_262_400 * S, source="system"))
+    return gps(fly(node, 0, 110 * S, feed))
+
+
+def test_fact_fix_type_is_3_or_1_and_never_0() -> None:
+    assert {g.fix_type for g in everything_sent()} == {1, 3}
+
+
+def test_fact_what_is_sent_as_3d_passes_every_check_of_the_autopilot_but_honest_accuracy() -> None:
+    good = [g for g in everything_sent() if g.fix_type == 3]
+    assert all(6 <= g.satellites_visible <= 10 for g in good)
+    assert all(g.hdop <= 1.4 and g.vdop <= 1.4 for g in good)
+    assert all(g.speed_accuracy_mps < 1.5 for g in good)
+    assert all(0.5 <= g.horiz_accuracy_m <= 100.0 for g in good)
+    assert all(g.time_week > 0 and g.alt_amsl_m == ALT and g.ve_mps == SPEED_EAST for g in good)
+
+
+def test_fact_all_fields_always_and_no_yaw() -> None:
+    for g in everything_sent():
+        sent = gps_input.encode(g, 0)
+        assert (sent.ignore_flags, sent.yaw) == (0, 0)
+
+
+def test_fact_5_to_10_hz_no_gap_over_245_ms_while_there_is_something_to_say() -> None:
+    times = [g.t_ns for g in everything_sent()]
+    gaps = [b - a for a, b in pairwise(times)]
+    assert sorted(gaps)[-2] <= 245 * MS  # all but the stated silence
+    assert max(gaps) > 4 * S
+
+
+def test_fact_no_single_report_of_bad_accuracy() -> None:
+    sent = [g for g in everything_sent() if g.fix_type == 3]
+    assert all(b.horiz_accuracy_m < max(15.1, 3.1 * a.horiz_accuracy_m) for a, b in pairwise(sent))
+
+
+# --- end to end ---
+
+
+def course(t_s: float) -> PeerState:
+    lat, lon = offset(LAT, LON, SPEED_EAST * t_s, 0.0)
+    return PeerState(lat, lon, ALT, 120.0, math.pi / 2, 0.02, 0.0, 0.0, SPEED_EAST, 0.0)
+
+
+class Flight:
+    """Link and peer on the same clock; estimates 150 ms late, 4 a second, with an error to choose."""
+
+    def __init__(self) -> None:
+        self.zero_ns = time.monotonic_ns()
+        self._next_ns = 0
+        self.east_m = 0.0
+
+    def clock(self) -> float:
+        return (time.monotonic_ns() - self.zero_ns) * 1e-9
+
+    def feed(self, now_ns: int) -> list[m.Message]:
+        if now_ns < self._next_ns:
+            return []
+        self._next_ns = now_ns + 250 * MS
+        at_ns = now_ns - 150 * MS
+        late = estimate(at_ns - self.zero_ns, east_m=self.east_m, cov=covariance(3.0))
+        return [msgspec.structs.replace(late, t_ns=at_ns, emitted_at_ns=now_ns)]
+
+
+def test_the_peer_flies_on_what_the_link_sends(tmp_path: Path) -> None:
+    flight, peer = Flight(), AutopilotPeer(seed=3)
+    port = peer.start(0, course, flight.clock)
+    edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{port}"))
+    said = live(LinkNode(10.0), edge, 3.0, flight.feed)
+    report = peer.stop()
+    edge.close()
+    assert 20 <= report.gps_input_received <= 32
+    assert report.accepted == report.gps_input_received - report.no_fix
+    assert (report.rejected, report.resets, report.other_instance, report.bad_packets) == (0, 0, 0, 0)
+    assert report.fix3_share > 0.7
+    assert report.interval_median_ms == pytest.approx(100.0, abs=20.0)
+    assert report.gps_error_median_m is not None
+    assert report.gps_error_median_m < 1.0
+    assert report.position_error_median_m is not None
+    assert report.position_error_median_m < 1.0
+    assert report.message_intervals_set == len(STREAMS_HZ)
+    assert report.timesync_requests >= 5
+    assert report.companion_heartbeats in (3, 4)
+    assert "Terrafix: 3D fix" in report.status_texts
+    report.write(tmp_path / "peer.json")
+    assert json.loads((tmp_path / "peer.json").read_text())["accepted"] == report.accepted
+    states = [x for x in said if isinstance(x, m.VehicleState)]
+    assert len(states) > 20  # 25 Hz, as asked for
+    assert states[-1].agl_m == pytest.approx(120.0, abs=2.0)
+    assert states[-1].yaw_rad == pytest.approx(math.pi / 2, abs=0.1)
+    status = [x for x in said if isinstance(x, m.LinkStatus)][-1]
+    assert (status.connected, status.autopilot) == (True, "ardupilot")
+    assert status.time_offset_ms is not None
+
+
+@pytest.mark.slow
+def test_twenty_seconds_in_time_and_one_wrong_estimate(stall_ms: Callable[[], float]) -> None:
+    """AC-14 and AC-3, to the delay of the machine itself."""
+    flight, peer = Flight(), AutopilotPeer(seed=4)
+    edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{peer.start(0, course, flight.clock)}"))
+    node = LinkNode(10.0)
+
+    def feed(now_ns: int) -> list[m.Message]:
+        flight.east_m = 350.0 if 10.0 <= flight.clock() < 10.25 else 0.0
+        return flight.feed(now_ns)
+
+    live(node, edge, 20.0, feed)
+    report = peer.stop()
+    edge.close()
+    delay_ms = stall_ms()
+    assert report.healthy_share > 0.99
+    assert report.longest_gap_ms is not None
+    assert report.longest_gap_ms < 245.0 + delay_ms
+    assert report.interval_p99_ms is not None
+    assert report.interval_p99_ms <= 120.0 + delay_ms
+    assert 1 <= report.no_fix <= 6
+    assert report.gps_error_p95_m is not None
+    assert report.gps_error_p95_m < 1.0
+    assert report.position_error_max_m is not None
+    assert report.position_error_max_m < 1.0
+
+
+def test_the_peer_answers_parameters_and_refuses_what_it_cannot() -> None:
+    peer = AutopilotPeer()
+    port = peer.start(0, course)
+    wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    wire.settimeout(2.0)
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
+
+    def ask(packet: Any, kind: str) -> list[Any]:
+        wire.sendto(packet.pack(mav), ("127.0.0.1", port))
+        found: list[Any] = []
+        until = time.monotonic() + 0.15
+        while time.monotonic() < until:
+            found += mav.parse_buffer(wire.recv(4096)) or []
+        return [x for x in found if x.get_type() == kind]
+
+    assert len(ask(mavlink.MAVLink_param_request_list_message(1, 1), "PARAM_VALUE")) == len(FIRMWARE)
+    (value,) = ask(mavlink.MAVLink_param_request_read_message(1, 1, b"GPS1_TYPE", -1), "PARAM_VALUE")
+    assert (value.param_id, value.param_value) == ("GPS1_TYPE", 14.0)
+    (ack,) = ask(mavlink.MAVLink_command_long_message(1, 1, 400, 0, *(0.0,) * 7), "COMMAND_ACK")
+    assert ack.result == mavlink.MAV_RESULT_UNSUPPORTED
+    wire.close()
+    peer.stop()
+
+
+def test_a_used_port_is_one_clear_line() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        with pytest.raises(LinkError, match="cannot be used"):
+            AutopilotPeer().start(taken.getsockname()[1], course)
+
+
+def test_the_peer_in_a_process_of_its_own(tmp_path: Path) -> None:
+    write_course(tmp_path / "course.csv", [(t / 2, course(t / 2)) for t in range(60)])
+    out = tmp_path / "peer.json"
+    command = [
+        sys.executable,
+        "-m",
+        "terrafix_tools.sim.autopilot.process",
+        str(tmp_path / "course.csv"),
+        "--port",
+        "0",
+        "--out",
+        str(out),
+    ]
+    zero_ns = time.monotonic_ns()
+    with subprocess.Popen([*command, "--start-ns", str(zero_ns)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        port = int(process.stdout.readline().rsplit(":", 1)[1])
+        flight = Flight()
+        flight.zero_ns = zero_ns
+        edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{port}"))
+        live(LinkNode(10.0), edge, 1.5, flight.feed)
+        os.kill(process.pid, signal.SIGTERM)
+        assert process.wait(10) == 0
+        edge.close()
+    report = json.loads(out.read_text())
+    assert report["gps_input_received"] >= 5
+    assert report["gps_error_median_m"] < 2.0

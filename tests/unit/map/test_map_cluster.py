@@ -1,0 +1,82 @@
+"""A build over a Dask cluster: the same bytes, also when a worker dies; what is said when the cluster is none."""
+
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import map_rasters
+from map_cluster import local_cluster
+from terrafix.map.package import MapPackage
+from terrafix_tools.mapping.build import build
+from terrafix_tools.mapping.dem import TILES_PER_WORKER, height_places
+
+ENOUGH = 600_000  # bytes of the package that is being written: some chunks are in it, more are to come
+
+
+def command(tif: Path, out: Path, address: str, *more: str) -> list[str]:
+    terrafix = "import sys; from terrafix_tools.cli import main; main()"
+    return [sys.executable, "-c", terrafix, "map", "build", str(tif), "--out", str(out), "--scheduler", address, *more]
+
+
+def written(out: Path) -> int:
+    """Bytes of a package that is not finished yet."""
+    return sum(part.stat().st_size for part in out.parent.glob(f".{out.name}.*/part.gpkg"))
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_bytes_also_when_a_worker_is_killed(tmp_path: Path) -> None:
+    """As a stranger would: the real scheduler, three real workers, the command line; then the scheduler dies."""
+    bands = np.tile(map_rasters.texture(500, 500), (1, 17, 13))
+    bands[:, :300] = 0  # a collar, which the workers read from a file
+    tif = map_rasters.utm(tmp_path / "i.tif", bands, tiled=True)
+    heights = np.tile(map_rasters.texture(500, 500, seed=1)[:1], (1, 6, 5)).astype(np.float32)
+    dem = map_rasters.utm(tmp_path / "d.tif", heights, pixel_m=2.0)
+    (tmp_path / "cluster").mkdir()
+    here, there = tmp_path / "here" / "m.gpkg", tmp_path / "there" / "m.gpkg"
+    build(tif, here, dem=dem)
+    grid = MapPackage.open(here).manifest.dem
+    assert grid and len(height_places(grid)) >= TILES_PER_WORKER  # else the cluster has no part in them
+    with local_cluster(tmp_path / "cluster", workers=3) as cluster:
+        line = command(
+            tif, there, cluster.address, "--dem", dem.name
+        )  # seen from the folder of the command, not theirs
+        building = subprocess.Popen(line, stderr=subprocess.PIPE, cwd=tmp_path)
+        while written(there) < ENOUGH and building.poll() is None:
+            time.sleep(0.02)
+        assert building.poll() is None, building.communicate()[1]
+        cluster.workers[0].kill()
+        _, said = building.communicate(timeout=120)
+        assert building.returncode == 0, said
+        assert there.read_bytes() == here.read_bytes()
+        assert all(worker.poll() is None for worker in cluster.workers[1:])
+
+        tif.write_bytes(tif.read_bytes()[:120_000_000])
+        done = subprocess.run(command(tif, there, cluster.address), capture_output=True, text=True, timeout=120)
+        assert done.returncode == 5 and "i.tif: cannot be read near" in done.stderr.splitlines()[-1]
+        assert there.read_bytes() == here.read_bytes()
+    assert [path.name for path in there.parent.iterdir()] == ["m.gpkg"]
+
+
+def test_nobody_at_the_address(tmp_path: Path) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    done = subprocess.run(command(tif, tmp_path / "m.gpkg", address), capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(f"terrafix: --scheduler {address}: no Dask scheduler answers there")
+    assert not (tmp_path / "m.gpkg").exists()
+
+
+def test_without_dask_one_line_says_what_to_install(tmp_path: Path) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
+    hidden = command(tif, tmp_path / "m.gpkg", "tcp://127.0.0.1:1")
+    hidden[2] = "import sys; sys.modules['distributed'] = None; " + hidden[2]
+    done = subprocess.run(hidden, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr == "terrafix: --scheduler needs distributed; install it: pip install 'terrafix[cluster]'\n"

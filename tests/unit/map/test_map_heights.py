@@ -1,0 +1,78 @@
+"""Heights of elevation rasters become what an autopilot calls above mean sea level."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import Transformer
+
+import map_rasters
+from terrafix.core.errors import MapError, UsageError
+from terrafix_tools.mapping import heights
+from terrafix_tools.mapping.heights import to_amsl
+from terrafix_tools.mapping.heights_datum import Datum
+
+HEIGHT_M = np.linspace(300.0, 900.0, 200 * 300, dtype=np.float32).reshape(1, 200, 300)
+
+
+def write_geoid(path: Path, west: float = 118.0, constant_m: float = 0.0) -> Path:
+    """N = constant + 10 m + 2 m for each degree east of 120, 3 m for each degree north of 20; NOAA's .gtx format."""
+    lon_deg, lat_deg = np.meshgrid(west + 0.25 * np.arange(33), 18.0 + 0.25 * np.arange(33))
+    values = (constant_m + 10.0 + 2.0 * (lon_deg - 120.0) + 3.0 * (lat_deg - 20.0)).astype(">f4")
+    head = np.array([18.0, west, 0.25, 0.25], ">f8").tobytes() + np.array([33, 33], ">i4").tobytes()
+    path.write_bytes(head + values.tobytes())
+    return path
+
+
+def write_dem(path: Path) -> Path:
+    """UTM zone 51, near 121 east, 23.5 north; a void in one corner."""
+    height_m = HEIGHT_M.copy()
+    height_m[0, :20, :30] = -9999.0
+    return map_rasters.utm(path, height_m, pixel_m=30.0, nodata=-9999.0)
+
+
+def undulation_m(column: float, row: float, constant_m: float = 0.0) -> float:
+    x, y = 300_000.0 + 30.0 * (column + 0.5), 2_600_000.0 - 30.0 * (row + 0.5)
+    lon_deg, lat_deg = Transformer.from_crs(32651, 4326, always_xy=True).transform(x, y)
+    return constant_m + 10.0 + 2.0 * (lon_deg - 120.0) + 3.0 * (lat_deg - 20.0)
+
+
+def test_heights_above_the_ellipsoid_lose_the_undulation(tmp_path: Path) -> None:
+    dem, geoid = write_dem(tmp_path / "dem.tif"), write_geoid(tmp_path / "geoid.gtx")
+    used, note = to_amsl(dem, Datum.ELLIPSOID, tmp_path / "out.tif", geoid)
+    assert used == tmp_path / "out.tif" and "ellipsoid to EGM96" in note
+    with rasterio.open(used) as file:
+        made = file.read(1)
+        assert file.transform == rasterio.open(dem).transform and file.crs.to_epsg() == 32651
+    for column, row in ((40, 5), (299, 199), (150, 100), (0, 199)):
+        expected = HEIGHT_M[0, row, column] - undulation_m(column, row)
+        assert made[row, column] == pytest.approx(expected, abs=0.002)
+    assert np.isnan(made[:20, :30]).all() and np.isfinite(made[20:]).all()
+
+
+def test_heights_above_egm2008_are_converted_where_both_grids_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = write_geoid(tmp_path / "egm08.gtx", constant_m=0.7)
+    monkeypatch.setitem(heights.GRIDS, Datum.EGM2008, str(other))
+    used, _ = to_amsl(write_dem(tmp_path / "d.tif"), Datum.EGM2008, tmp_path / "o.tif", write_geoid(tmp_path / "g.gtx"))
+    with rasterio.open(used) as file:
+        assert np.nanmax(np.abs(file.read(1)[50:] - HEIGHT_M[0, 50:] - 0.7)) < 0.002
+
+
+def test_what_happens_without_grids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(heights.GRIDS, Datum.EGM96, "no_such_grid.tif")
+    monkeypatch.setitem(heights.GRIDS, Datum.EGM2008, "no_such_grid.tif")
+    dem = write_dem(tmp_path / "dem.tif")
+    assert to_amsl(dem, Datum.EGM96, tmp_path / "o.tif") == (dem, "heights above EGM96, as given")
+    used, note = to_amsl(dem, Datum.EGM2008, tmp_path / "o.tif")
+    assert used == dem and "not installed" in note
+    with pytest.raises(UsageError, match=r"count from the ellipsoid .*pyproj sync"):
+        to_amsl(dem, Datum.ELLIPSOID, tmp_path / "o.tif")
+    (tmp_path / "bad.gtx").write_bytes(b"nothing")
+    with pytest.raises(UsageError, match="not a grid of a geoid"):
+        to_amsl(dem, Datum.ELLIPSOID, tmp_path / "o.tif", tmp_path / "bad.gtx")
+    far = write_geoid(tmp_path / "far.gtx", west=-60.0)
+    with pytest.raises(MapError, match="grid of the geoid ends"):
+        to_amsl(dem, Datum.ELLIPSOID, tmp_path / "o.tif", far)

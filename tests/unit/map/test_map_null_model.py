@@ -1,0 +1,131 @@
+"""The null model of a package: learnt from mirrored flights over the map itself, part of what is signed."""
+
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import map_rasters
+from terrafix.core.errors import MapError, UsageError
+from terrafix.core.geodesy import LocalFrame
+from terrafix.map.format import MANIFEST_TABLE
+from terrafix.map.null_model import VERSION, null_at
+from terrafix.map.package import LocalMap, MapPackage
+from terrafix_tools.mapping import null_model
+from terrafix_tools.mapping.build import build_package, layer_of
+from terrafix_tools.mapping.cli import app
+from terrafix_tools.mapping.null_model import CAMERA, Strip, _strip
+
+SIDE_PX, AGL_M = 500, 50.0  # 250 m
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("null")
+    return map_rasters.utm(folder / "i.tif", map_rasters.texture(SIDE_PX, SIDE_PX, seed=4))
+
+
+def bound(package: Path) -> LocalMap:
+    opened = MapPackage.open(package)
+    west, south, east, north = opened.manifest.bounds_wgs84
+    return opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
+
+
+@pytest.fixture(scope="module")
+def measured(image: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A package with the null model of two short flights."""
+    with pytest.MonkeyPatch.context() as short:
+        short.setattr(null_model, "FLIGHTS", 2)
+        short.setattr(null_model, "STRETCHES", 2)
+        out = tmp_path_factory.mktemp("measured") / "m.gpkg"
+        return build_package([layer_of(image)], out, null_agl_m=(AGL_M,))
+
+
+def test_a_package_keeps_what_its_wrong_places_score(measured: Path) -> None:
+    opened = MapPackage.open(measured, verify=True)  # checksum and seal are those of the package with it
+    model = opened.layer().null_model
+    assert model is not None and (model.version, model.matcher) == (VERSION, "gradient")
+    row = null_at(model, "gradient", 2.0 * AGL_M)
+    assert row is model.rows[0] and row.agl_m == AGL_M
+    assert row.places > 100.0  # 12 by 12 neighbours, at several headings and heights
+    assert 0.0 < row.search.share < 1.0 and row.search.count > 10.0
+    assert row.frame.count > 10.0 and row.frame.above > row.patches[0]
+    assert row.enough(row.places, -8.0) > row.search.above
+
+
+def test_the_same_map_has_the_same_null_model(measured: Path) -> None:
+    model = MapPackage.open(measured).layer().null_model
+    assert model is not None and null_model.learn(bound(measured), AGL_M, 2, 2) == model.rows[0]
+
+
+def test_without_a_height_nothing_is_learnt(image: Path, tmp_path: Path) -> None:
+    path = build_package([layer_of(image)], tmp_path / "m.gpkg")
+    assert MapPackage.open(path).layer().null_model is None
+
+
+def test_a_null_model_that_was_altered_is_an_altered_package(measured: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(measured, tmp_path / "m.gpkg"))
+    db = sqlite3.connect(path)
+    (said,) = db.execute(f"SELECT value FROM {MANIFEST_TABLE} WHERE key = 'layers'").fetchone()
+    layers = json.loads(said)
+    layers[0]["null_model"]["rows"][0]["search"]["above"] = -50.0
+    db.execute(f"UPDATE {MANIFEST_TABLE} SET value = ? WHERE key = 'layers'", (json.dumps(layers),))
+    db.commit()
+    db.close()
+    with pytest.raises(MapError, match="checksum mismatch"):
+        MapPackage.open(path)
+
+
+def test_a_map_that_is_too_small_for_a_flight_is_said_and_nothing_is_left(image: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no way of 720 m at 300 m above ground lies on the map; give --null-agl"):
+        build_package([layer_of(image)], tmp_path / "m.gpkg", null_agl_m=(300.0,))
+    assert not list(tmp_path.iterdir())
+
+
+class InTheMiddle:
+    """Draws the middle of everything, and no turn."""
+
+    def uniform(self, low: float, high: float) -> float:
+        return 0.0 if high == 360.0 else 0.5 * (low + high)
+
+
+def test_the_ground_of_a_flight_is_that_of_the_map_mirrored(image: Path, tmp_path: Path) -> None:
+    local = bound(build_package([layer_of(image)], tmp_path / "m.gpkg"))
+    draw: Any = InTheMiddle()
+    strip = _strip(local, AGL_M, 1, draw)
+    gsd_m = AGL_M / CAMERA.fx
+    h, w = strip.picture.shape[:2]
+    e_min, n_min, e_max, n_max = local.bounds_m
+    middle = 0.5 * (e_min + e_max), 0.5 * (n_min + n_max)
+    as_it_lies, _ = local.window(middle[0] - w / 2 * gsd_m, middle[1] + h / 2 * gsd_m, w, h, gsd_m)
+
+    def alike(a: np.ndarray, b: np.ndarray) -> float:
+        inner = (slice(8, -8), slice(8, -8))
+        return float(np.corrcoef(a[inner].ravel(), b[inner].ravel())[0, 1])
+
+    assert alike(strip.picture[:, ::-1], as_it_lies) > 0.97 > 0.5 > alike(strip.picture, as_it_lies)
+
+
+def test_the_camera_goes_along_the_strip_by_its_steps() -> None:
+    picture = np.random.default_rng(1).integers(0, 255, (CAMERA.height, 2 * CAMERA.width, 3), np.uint8)
+    strip = Strip(picture, 20.4)
+    assert (strip.frame(0)[:, 41:] == strip.frame(2)[:, :-41]).all()
+    assert strip.frame(3).shape == (CAMERA.height, CAMERA.width, 3)
+
+
+def test_the_heights_of_the_command_line_are_those_that_are_learnt(
+    image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard = list[list[float]]()
+    monkeypatch.setattr("terrafix_tools.mapping.build.learn_into", lambda _part, heights_m: heard.append([*heights_m]))
+    out = str(tmp_path / "m.gpkg")
+    run = CliRunner().invoke(app, ["build", str(image), "--out", out, "--null-agl", "50", "--null-agl", "120"])
+    assert run.exit_code == 0 and heard == [[50.0, 120.0]]
+    again = CliRunner().invoke(app, ["build", str(image), "--out", str(tmp_path / "n.gpkg")])
+    assert again.exit_code == 0 and len(heard) == 1
+    assert CliRunner().invoke(app, ["build", str(image), "--out", out, "--null-agl", "10"]).exit_code == 2

@@ -1,0 +1,153 @@
+"""Who may import whom: direction of dependencies, one owner for each heavy library, what the link is free of."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+PACKAGES = {
+    "terrafix": ROOT / "daemon" / "terrafix",
+    "terrafix_engines": ROOT / "engines" / "terrafix_engines",
+    "terrafix_tools": ROOT / "tools" / "terrafix_tools",
+}
+# library -> the modules (and what is below them) that may import it
+OWNERS = {
+    "gtsam": (
+        "terrafix.estimator",
+        "terrafix_tools.finalise",
+        "terrafix_tools.bench.growth",
+        "terrafix_tools.bench.merging_baseline",
+    ),
+    "pymavlink": (
+        "terrafix.link",
+        "terrafix_tools.sim.autopilot",
+        "terrafix.core.mavlink.tlog",
+        "terrafix_tools.sim.flights.log",
+        "terrafix_tools.sim.sitl",
+        "terrafix_tools.preflight",
+        "terrafix_tools.golden",
+    ),  # tlog: reads recorded telemetry
+    "mavsdk": ("terrafix_tools.sim.sitl",),
+    "serial": ("terrafix.link",),
+    "onnxruntime": ("terrafix_engines",),
+    "torch": ("terrafix_engines.train",),
+    "faiss": ("terrafix.anchor",),
+    "systemd": ("terrafix.runtime.supervisor",),
+    "zmq": ("terrafix.runtime",),
+    "pickle": (),
+}
+DIRECTION = {  # package -> our packages that it may import besides itself
+    "terrafix_tools": {"terrafix", "terrafix_engines"},
+    "terrafix": {"terrafix_engines"},
+    "terrafix_engines": set(),
+}
+# What of terrafix is not a process: imported by all.
+COMMON = {"core", "map", "messages", "processes", "runtime"}
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    for package, folder in PACKAGES.items():
+        for path in sorted(folder.rglob("*.py")):
+            parts = [package, *path.relative_to(folder).with_suffix("").parts]
+            yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
+
+
+MODULES = dict(modules())
+
+
+def imports(path: Path) -> Iterator[str]:
+    """All imported modules, also those inside functions; ``from a import b`` counts as a.b."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def within(name: str, module: str) -> bool:
+    return name == module or name.startswith((module + ".", module + "_"))
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_dependencies_point_one_way(module: str) -> None:
+    package = module.split(".")[0]
+    ours = {name.split(".")[0] for name in imports(MODULES[module])} & set(PACKAGES)
+    assert ours <= DIRECTION[package] | {package}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_heavy_libraries_have_one_owner(module: str) -> None:
+    for name in imports(MODULES[module]):
+        owners = OWNERS.get(name.split(".")[0])
+        assert owners is None or any(within(module, owner) for owner in owners), f"{module} imports {name}"
+
+
+PROCESS_FOLDERS = sorted({p.parent.name for p in PACKAGES["terrafix"].glob("*/__init__.py")} - COMMON)
+
+
+@pytest.mark.parametrize("folder", PROCESS_FOLDERS)
+def test_process_folders_do_not_import_each_other(folder: str) -> None:
+    for module, path in MODULES.items():
+        if module.startswith(f"terrafix.{folder}"):
+            for name in imports(path):
+                parts = name.split(".")
+                if parts[0] == "terrafix" and len(parts) > 1:
+                    assert parts[1] in COMMON | {folder}, f"{module} imports {name}"
+
+
+@pytest.mark.parametrize(
+    ("folder", "allowed"),
+    [
+        ("core", {"core", "messages"}),
+        ("map", {"core", "map", "messages"}),
+        ("runtime", {"core", "messages", "processes", "runtime"}),
+    ],
+)
+def test_what_is_common_imports_nothing_above_it(folder: str, allowed: set[str]) -> None:
+    for module, path in MODULES.items():
+        if within(module, f"terrafix.{folder}"):
+            ours = [name.split(".") for name in imports(path) if name.startswith("terrafix")]
+            assert all(parts[0] == "terrafix" and parts[1] in allowed for parts in ours), module
+
+
+def test_the_link_process_is_free_of_gtsam_opencv_and_onnxruntime() -> None:
+    """Also of what pulls them in by a detour: the whole process entry is loaded, in an interpreter of its own."""
+    code = """
+import sys
+import terrafix.runtime.process_main, terrafix.runtime.executor, terrafix.link.node
+print(*sorted({"cv2", "gtsam", "onnxruntime", "faiss", "scipy", "matplotlib"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []
+
+
+def test_the_command_line_loads_nothing_that_computes() -> None:
+    """`--help` is fast, and so is a restart in flight."""
+    code = """
+import sys
+import terrafix_tools.cli, terrafix.runtime.fork_server
+print(*sorted({"numpy", "cv2", "pyproj", "zmq", "structlog"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []
+
+
+def loaded(modules: str, named: set[str]) -> set[str]:
+    """Which of ``named`` an interpreter of its own has after importing ``modules``."""
+    code = f"import sys, {modules}; print(*sorted({named!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+def test_a_restart_in_flight_waits_for_nothing_that_it_does_not_need() -> None:
+    """The supervisor has no arrays; the anchor opens a model, or checks a signature, where one is configured."""
+    assert loaded("terrafix.runtime.supervisor", {"numpy", "cv2", "pyproj"}) == set()
+    assert loaded("terrafix.runtime.process_main, terrafix.anchor.node", {"onnxruntime", "cryptography"}) == set()

@@ -1,0 +1,114 @@
+"""What is declared is what is used: dependencies, lock, version."""
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import terrafix
+
+ROOT = Path(__file__).resolve().parents[3]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+CORE = {canonicalize_name(Requirement(r).name): Requirement(r) for r in PROJECT["dependencies"]}
+EXTRAS = {
+    extra: {canonicalize_name(Requirement(r).name): Requirement(r) for r in requirements}
+    for extra, requirements in PROJECT["optional-dependencies"].items()
+}
+IMPORTED_AS = {"opencv-python-headless": "cv2", "pyserial": "serial", "pyzmq": "zmq", "pillow": "PIL"}
+COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist"}  # used by scripts/check, imported by nobody
+TRAINING = ROOT / "engines" / "terrafix_engines" / "train"  # beside the engines, and stays on the ground
+EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
+OURS = {"terrafix", "terrafix_engines", "terrafix_tools"}
+LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+
+
+def imported(*folders: str, training: bool = True) -> set[str]:
+    """First names of all third-party modules that are imported below the folders; with or without the training."""
+    found: set[str] = set()
+    for folder in folders:
+        own = {path.stem for path in (ROOT / folder).rglob("*.py")}
+        for path in (ROOT / folder).rglob("*.py"):
+            if not training and TRAINING in path.parents:
+                continue
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Import):
+                    found |= {alias.name.split(".")[0] for alias in node.names}
+                elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                    found.add((node.module or "").split(".")[0])
+        found -= own if folder == "tests" else set()
+    return found - OURS - set(sys.stdlib_module_names)
+
+
+def modules(requirements: dict[str, Requirement]) -> set[str]:
+    return {IMPORTED_AS.get(name, name) for name in requirements if name not in COMMANDS}
+
+
+def test_what_flies_imports_only_the_core_dependencies() -> None:
+    assert imported("daemon", "engines", training=False) <= modules(CORE)
+
+
+def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
+    declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
+    declared |= modules(EXTRAS["train"]) - EXPORTER
+    assert imported("daemon", "engines", "tools") == declared
+    assert imported("tests") - declared <= modules(EXTRAS["dev"])
+    assert modules(EXTRAS["dev"]) <= imported("tests")
+
+
+def test_every_dependency_has_a_range() -> None:
+    for requirement in [
+        *CORE.values(),
+        *(one for extra in ("ground", "sim", "cluster", "train") for one in EXTRAS[extra].values()),
+    ]:
+        operators = {specifier.operator for specifier in requirement.specifier}
+        assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"
+
+
+def test_the_lock_holds_every_dependency_within_its_range() -> None:
+    """But for the training: its PyTorch is that of the GPU's driver."""
+    locked: dict[str, list[str]] = {}
+    for name, version in re.findall(r"^([\w.-]+)==([^\s;]+)", LOCK, flags=re.M):
+        locked.setdefault(canonicalize_name(name), []).append(version)
+    for requirements in (CORE, *(EXTRAS[extra] for extra in EXTRAS if extra != "train")):
+        for name, requirement in requirements.items():
+            assert name in locked, f"{name} is not in requirements.lock: run scripts/lock"
+            for version in locked[name]:
+                assert requirement.specifier.contains(version), f"requirements.lock has {name} {version}"
+
+
+def test_the_lock_names_no_host() -> None:
+    assert not re.search(r"://|--index-url|--extra-index-url|--find-links|file:", LOCK)
+
+
+def test_one_version_everywhere() -> None:
+    version = PROJECT["version"]
+    assert terrafix.__version__ == version
+    assert metadata.version("terrafix") == version
+    newest = re.search(r"^## \[([^\]]+)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.M)
+    assert newest is not None and newest[1] == version
+
+
+def test_the_licence_is_the_one_declared() -> None:
+    assert PROJECT["license"] == "Apache-2.0"
+    assert "Version 2.0, January 2004" in (ROOT / "LICENSE").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("package", sorted(OURS))
+def test_the_packages_say_that_they_are_typed(package: str) -> None:
+    assert list(ROOT.glob(f"*/{package}/py.typed"))
+
+
+@pytest.mark.parametrize("command", ["replay /nowhere", "map build /nowhere.tif --out /nowhere.gpkg"])
+def test_without_the_ground_tools_one_line_says_what_to_install(command: str) -> None:
+    """As on a vehicle: the core dependencies only."""
+    code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr == "terrafix: this command needs rasterio; install it: pip install 'terrafix[ground]'\n"

@@ -1,0 +1,102 @@
+"""The README's two commands: they are what CI runs, and on a machine where they cannot work they say why."""
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+DEMO, CHECK = "sh scripts/demo", "sh scripts/check"
+TOOLS = ("cat", "cksum", "dirname", "pwd", "sh")  # of the system, all that the scripts need before there is a Python
+
+
+def lines(path: Path) -> list[str]:
+    return [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
+
+
+def clone(folder: Path) -> Path:
+    """What the set-up commands need of a clone."""
+    shutil.copytree(ROOT / "scripts", folder / "scripts")
+    for name in ("pyproject.toml", "requirements.lock"):
+        shutil.copy(ROOT / name, folder)
+    return folder
+
+
+def path_with(folder: Path, **programs: str) -> str:
+    """A PATH with nothing but TOOLS and the shell scripts named."""
+    folder.mkdir()
+    for tool in TOOLS:
+        found = shutil.which(tool)
+        if found is not None:
+            (folder / tool).symlink_to(found)
+    for name, body in programs.items():
+        script = folder / name.replace("_", ".")
+        script.write_text(f"#!/bin/sh\n{body}\n", encoding="utf-8")
+        script.chmod(0o755)
+    return str(folder)
+
+
+def attempt(tmp_path: Path, command: str, **programs: str) -> subprocess.CompletedProcess[str]:
+    repository = clone(tmp_path / "clone")
+    path = path_with(tmp_path / "bin", **programs)
+    return subprocess.run(
+        command.split(), cwd=repository, env={"PATH": path}, capture_output=True, text=True, timeout=60
+    )
+
+
+def test_there_are_exactly_two_set_up_commands() -> None:
+    section = README.split("## Two commands")[1].split("\n## ")[0]
+    assert re.findall(r"```sh\n(.*?)```", section, flags=re.S) == [f"{DEMO}\n", f"{CHECK}\n"]
+    assert README.count("```sh\n") == 2
+
+
+def test_ci_runs_the_second_command_and_nothing_else() -> None:
+    ci = ROOT / ".ci" / "run"
+    assert os.access(ci, os.X_OK)
+    assert lines(ci) == ["set -eu", 'cd "$(dirname "$0")/.."', CHECK]
+
+
+@pytest.mark.parametrize("script", ["demo", "check", "install", "lock"])
+def test_scripts_are_shell_without_errors(script: str) -> None:
+    done = subprocess.run(["sh", "-n", f"scripts/{script}"], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", [DEMO, CHECK])
+def test_without_python_one_line_says_what_to_install(command: str, tmp_path: Path) -> None:
+    done = attempt(tmp_path, command)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1 and "needs Python 3.11 or newer; found none" in done.stderr
+
+
+def test_an_old_python_is_named(tmp_path: Path) -> None:
+    old = 'if [ "$1" = --version ]; then echo "Python 3.10.12"; else exit 1; fi'
+    done = attempt(tmp_path, DEMO, python3=old)
+    assert done.returncode == 1
+    assert "needs Python 3.11 or newer; found Python 3.10.12" in done.stderr
+
+
+def test_a_python_without_venv_is_told_from_a_good_one(tmp_path: Path) -> None:
+    bare = 'case "$2" in *ensurepip*) exit 1 ;; *print*) echo python3.11-venv ;; esac'
+    done = attempt(tmp_path, CHECK, python3_11=bare)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "venv module is missing" in done.stderr and "apt install python3.11-venv" in done.stderr
+
+
+def test_commands_of_the_readme_exist() -> None:
+    from typer.testing import CliRunner
+
+    from terrafix_tools.cli import app
+
+    used = re.findall(r"^\.venv/bin/terrafix ((?:map |sim )?\w+)(.*)$", README, flags=re.M)
+    assert {command for command, _ in used} == {"map build", "replay", "evaluate", "report", "run", "accept", "sim fly"}
+    for command, rest in used:
+        shown = CliRunner().invoke(app, [*command.split(), "--help"], env={"COLUMNS": "300"})
+        assert shown.exit_code == 0
+        for option in re.findall(r"--[a-z-]+", rest):
+            assert option in shown.output, f"terrafix {command} has no {option}"

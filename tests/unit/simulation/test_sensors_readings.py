@@ -1,0 +1,135 @@
+"""Sensors err as much as they say, in the way they say, and the same way twice."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from flown import PLACE
+from terrafix_tools.sim.interfaces import Readings
+from terrafix_tools.sim.sensors.clock import Clock
+from terrafix_tools.sim.sensors.errors import TYPICAL, SensorErrors
+from terrafix_tools.sim.sensors.suite import VehicleSensors
+from vehicle_state import STEP_S, changes, state
+
+KEPT = {"yaw_constant_rad", "yaw_slow_s", "attitude_slow_s", "range_limits_m"}
+PERFECT = replace(TYPICAL, **{f.name: 0.0 for f in fields(SensorErrors) if f.name not in KEPT})
+
+
+def read(sensors: VehicleSensors, seconds: float, **changes: object) -> list[Readings]:
+    return [sensors.read(state(i * STEP_S, **changes)) for i in range(round(seconds / STEP_S))]
+
+
+def test_without_errors_the_readings_are_the_truth() -> None:
+    sensors = VehicleSensors(PLACE, errors=PERFECT, rangefinder=True)
+    turned = state(0.0, roll_rad=0.3, pitch_rad=-0.1, rates_b_radps=np.array([0.1, -0.2, 0.3]), agl_m=40.0)
+    reading = sensors.read(turned)
+    assert reading.gyro_b_radps == pytest.approx([0.1, -0.2, 0.3])
+    assert reading.accel_b_mps2 == pytest.approx([0.0, 0.0, -9.80665])
+    assert (reading.yaw_rad, reading.pitch_rad, reading.roll_rad) == pytest.approx((math.pi / 2, -0.1, 0.3))
+    assert (reading.baro_amsl_m, reading.airspeed_mps) == pytest.approx((500.0, 20.0))
+    assert reading.range_m == pytest.approx(40.0 / (math.cos(0.3) * math.cos(0.1)))
+
+
+def test_inertial_noise_is_that_of_the_data_sheet_on_the_ground_and_vibration_in_the_air() -> None:
+    """White noise of density d, sampled at 50 Hz: d * sqrt(50)."""
+    still = read(VehicleSensors(PLACE, seed=1), 60.0, agl_m=0.0)
+    gyro = np.array([r.gyro_b_radps for r in still])
+    accel = np.array([r.accel_b_mps2 for r in still])
+    assert np.diff(gyro, axis=0).std() / math.sqrt(2) == pytest.approx(math.radians(0.0028) * math.sqrt(50), rel=0.05)
+    assert np.diff(accel, axis=0).std() / math.sqrt(2) == pytest.approx(70e-6 * 9.81 * math.sqrt(50), rel=0.05)
+    flying = np.array([r.accel_b_mps2 for r in read(VehicleSensors(PLACE, seed=1), 60.0)])
+    assert np.diff(flying, axis=0).std() / math.sqrt(2) == pytest.approx(TYPICAL.vibration_mps2, rel=0.05)
+
+
+def test_biases_of_many_vehicles_have_the_spread_that_is_said() -> None:
+    first = [VehicleSensors(PLACE, seed=seed).read(state(0.0, agl_m=0.0)) for seed in range(300)]
+    gyro = np.array([r.gyro_b_radps for r in first])
+    assert gyro.std() == pytest.approx(TYPICAL.gyro_bias_radps, rel=0.12)
+    assert abs(gyro.mean()) < 0.15 * TYPICAL.gyro_bias_radps
+    yaw = [math.remainder(r.yaw_rad - math.pi / 2, math.tau) for r in first]
+    assert 0.8 < np.std(yaw) / math.hypot(TYPICAL.yaw_sigma_rad, TYPICAL.yaw_by_heading_rad * math.sqrt(0.625)) < 1.25
+
+
+def test_bias_walks_with_the_root_of_time() -> None:
+    ends = []
+    for seed in range(40):
+        errors = replace(PERFECT, gyro_walk=1e-3)
+        ends.append(read(VehicleSensors(PLACE, seed=seed, errors=errors), 16.0)[-1].gyro_b_radps)
+    assert np.std(ends) == pytest.approx(1e-3 * 4.0, rel=0.2)
+
+
+def test_the_compass_errs_by_heading_and_by_what_it_is_told() -> None:
+    errors = replace(PERFECT, yaw_constant_rad=math.radians(15.0), yaw_by_heading_rad=math.radians(2.0))
+    sensors = VehicleSensors(PLACE, seed=3, errors=errors)
+    found = []
+    for i, yaw in enumerate(np.linspace(0.0, math.tau, 200, endpoint=False)):
+        reading = sensors.read(state(i * STEP_S, yaw_rad=float(yaw)))
+        found.append(math.degrees(math.remainder(reading.yaw_rad - yaw, math.tau)))
+    assert np.mean(found) == pytest.approx(15.0, abs=0.05)
+    assert 1.5 < np.ptp(found) / 2 < 3.2
+
+
+def test_the_attitude_filter_errs_slowly() -> None:
+    """A process of the first order, of standard deviation s and memory T, changes by s * sqrt(2 - 2 exp(-t / T))."""
+    flights = [VehicleSensors(PLACE, seed=seed) for seed in range(24)]
+    said = [[sensors.read(state(0.2 * i)) for i in range(1000)] for sensors in flights]
+    roll = np.array([[r.roll_rad for r in readings] for readings in said])
+    yaw = np.array([[r.yaw_rad for r in readings] for readings in said])
+    for t_s in (1.0, 10.0, 30.0):
+        of_roll, of_yaw = (math.sqrt(2.0 - 2.0 * math.exp(-t_s / memory_s)) for memory_s in (10.0, 15.0))
+        assert changes(roll, round(t_s / 0.2)) == pytest.approx(0.65 * of_roll, rel=0.15)
+        assert changes(yaw, round(t_s / 0.2)) == pytest.approx(1.5 * of_yaw, rel=0.15)
+
+
+def test_a_barometer_takes_a_part_of_the_dynamic_pressure_for_height() -> None:
+    """Which part is the vehicle's own; it grows with the square of the speed through the air."""
+    errors = replace(PERFECT, baro_static=0.15)
+    flights = [VehicleSensors(PLACE, seed=seed, errors=errors) for seed in range(60)]
+    speeds = (0.0, 10.0, 20.0)
+    said = np.array([[f.read(state(0.02 * v, airspeed_mps=v)).baro_amsl_m for v in speeds] for f in flights])
+    above = said[:, 1:] - said[:, :1]
+    assert np.std(above[:, 1]) == pytest.approx(0.15 * 20.0**2 / 19.6, rel=0.25)
+    assert above[:, 0] == pytest.approx(0.25 * above[:, 1])
+
+
+def test_a_wrong_scale_of_the_barometer_counts_from_the_start() -> None:
+    sensors = VehicleSensors(PLACE, seed=1, errors=replace(PERFECT, baro_scale=0.1))
+    sensors.read(state(0.0))
+    low = sensors.read(state(0.02)).baro_amsl_m
+    high = sensors.read(state(0.04, p_b_in_w_m=np.array([0.0, 0.0, 700.0]))).baro_amsl_m
+    assert low == pytest.approx(500.0)
+    assert abs(high - 700.0) > 1.0
+
+
+def test_the_rangefinder_has_limits_and_drops_out() -> None:
+    def share(agl_m: float, **changes: object) -> float:
+        found = read(VehicleSensors(PLACE, seed=1, rangefinder=True), 40.0, agl_m=agl_m, **changes)
+        return sum(r.range_m is not None for r in found) / len(found)
+
+    assert 0.96 < share(30.0) < 0.995
+    assert share(70.0) == 0.0
+    assert share(30.0, roll_rad=1.2) == 0.0
+    assert share(0.05) < 0.1
+    assert all(r.range_m is None for r in read(VehicleSensors(PLACE, seed=1), 1.0))
+
+
+def test_the_same_seed_reads_the_same() -> None:
+    def told(seed: int) -> list[float]:
+        return [float(v) for r in read(VehicleSensors(PLACE, seed=seed), 5.0) for v in (*r.gyro_b_radps, r.baro_amsl_m)]
+
+    assert told(4) == told(4)
+    assert told(4) != told(5)
+
+
+def test_the_clock_of_the_autopilot_starts_and_runs_by_itself() -> None:
+    clock = Clock(offset_s=100.0, drift=50e-6)
+    assert clock.boot_ns(0.0) == 100_000_000_000
+    assert clock.boot_ns(1000.0) - clock.boot_ns(0.0) == 1_000_050_000_000
+    assert Clock.of(3) == Clock.of(3) != Clock.of(4)
+
+
+def test_a_course_that_does_not_tell_its_airspeed_has_a_barometer() -> None:
+    reading = VehicleSensors(PLACE, seed=1).read(state(0.0, airspeed_mps=float("nan")))
+    assert abs(reading.baro_amsl_m - 500.0) < 50.0

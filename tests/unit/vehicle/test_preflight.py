@@ -1,0 +1,501 @@
+"""Preflight: every rule, every mistake of a user, writing with the old values kept, and the presets that pass it."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from typer.testing import CliRunner
+
+import map_rasters
+from preflight_autopilot import GroundAutopilot
+from terrafix.core.config import Config, HealthSection, LinkSection, RecorderSection
+from terrafix.core.config import Map as MapSection
+from terrafix.core.config import Source as SourceSection
+from terrafix.core.errors import LinkError, UsageError
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.signature import generate
+from terrafix.link.mavlink.transport import Address, Chunk
+from terrafix.map.package import MapPackage
+from terrafix_tools.cli import app
+from terrafix_tools.mapping.build import build
+from terrafix_tools.mission.file import read_mission, write_mission
+from terrafix_tools.mission.mission import Do, Item, Mission
+from terrafix_tools.preflight import autopilot as conversation
+from terrafix_tools.preflight import computer, vehicle
+from terrafix_tools.preflight.autopilot import Autopilot
+from terrafix_tools.preflight.judge import changes_of, judge, names_of
+from terrafix_tools.preflight.lines import Line, Status, number
+from terrafix_tools.preflight.rules import Context
+from terrafix_tools.preflight.run import _of_vehicle, preflight
+from terrafix_tools.sim.autopilot.parameters import FIRMWARE
+
+ROOT = Path(__file__).resolve().parents[3]
+VEHICLES = ROOT / "config" / "vehicles"
+PAGE = ROOT / "docs" / "autopilot.md"
+# ArduPilot 4.6 as it comes (read from its firmware in software in the loop)
+AS_IT_COMES = FIRMWARE | {
+    "AHRS_EKF_TYPE": 3,
+    "EK3_ENABLE": 1,
+    "EK3_POS_I_GATE": 500,
+    "EK3_SRC1_YAW": 1,
+    "EK3_VELNE_M_NSE": 0.5,
+    "EK3_VEL_I_GATE": 500,
+    "FS_EKF_THRESH": 0.8,
+    "GPS_HDOP_GOOD": 140,
+    "SERIAL1_PROTOCOL": 2,
+    "SERIAL1_BAUD": 57,
+    "VISO_DELAY_MS": 10,
+    "VISO_TYPE": 0,
+}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The simulated autopilot answers at once; silence need not be waited for as long as on a radio."""
+    for name, value in {
+        "LOOK_S": 0.0,
+        "QUIET_S": 0.02,
+        "ANSWER_S": 0.1,
+        "OTHERS_S": 0.05,
+        "CONNECT_S": 0.1,
+        "RATES_S": 0.01,
+    }.items():
+        monkeypatch.setattr(conversation, name, value)
+
+
+def preset(name: str) -> dict[str, float]:
+    lines = (VEHICLES / f"{name}.param").read_text().splitlines()
+    return {n: float(v) for n, v in (line.split(",") for line in lines if line and not line.startswith("#"))}
+
+
+def context(*, plane: bool = True, delay_ms: int = 5, **link: Any) -> Context:
+    return Context(LinkSection(**link), plane, 1, delay_ms)
+
+
+def judged(values: dict[str, float], at: Context) -> dict[str, Line]:
+    return {line.check: line for line in judge(values, at)}
+
+
+# --- rules and presets ---
+
+
+@pytest.mark.parametrize("name", ["plane", "copter"])
+def test_the_presets_leave_nothing_to_say(name: str) -> None:
+    lines = judged(AS_IT_COMES | preset(name), context(plane=name == "plane"))
+    assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
+
+
+def test_the_preset_beside_a_receiver_leaves_nothing_to_say() -> None:
+    values = AS_IT_COMES | preset("second-gps") | {"EK3_GPS_CHECK": 23}
+    lines = judged(values, context(gps_id=1))
+    assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
+
+
+@pytest.mark.parametrize(("plane", "name"), [(True, "plane"), (False, "copter")])
+def test_what_it_would_set_on_a_new_autopilot_is_the_preset(plane: bool, name: str) -> None:
+    changes = {c.name: c.new for c in changes_of(judge(AS_IT_COMES, context(plane=plane)))}
+    assert changes.items() <= preset(name).items()
+    after = AS_IT_COMES | changes
+    assert all(line.status is Status.OK for line in judge(after, context(plane=plane)))
+
+
+@pytest.mark.parametrize("name", ["plane", "copter", "second-gps"])
+def test_the_page_says_why_of_each_value_of_a_preset(name: str) -> None:
+    rows = {
+        parameter: [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in PAGE.read_text().splitlines()
+        if line.startswith("| `")
+        for parameter in re.findall(r"`([A-Z0-9_]+)`", line.split("|")[1])
+    }
+    for parameter, value in preset(name).items():
+        assert parameter in rows, f"docs/autopilot.md does not say why {parameter}"
+        assert re.search(rf"(?<![\d.]){number(value)}(?![\d.]*\d)", rows[parameter][1]), (
+            f"{parameter}: the page has another value"
+        )
+        assert len(rows[parameter][2]) > 10
+
+
+TWO_PORTS = AS_IT_COMES | {"SERIAL2_PROTOCOL": 2}
+
+
+@pytest.mark.parametrize(
+    ("firmware", "changes", "link", "status", "says"),
+    [
+        ((4, 6), {"SERIAL2_PROTOCOL": -1}, {}, "ok", "no second MAVLink port"),
+        ((4, 6), {}, {}, "warn", r"800 bytes a second.*SERIAL1, SERIAL2.*set bit 10 \(1024\) of SERIALn_OPTIONS"),
+        ((4, 6), {}, {"rate_hz": 5.0}, "warn", "400 bytes a second"),
+        ((4, 7), {}, {}, "warn", r"set bit 1 \(2\) of MAVn_OPTIONS"),
+        ((4, 6), {"SERIAL2_OPTIONS": 1024}, {}, "warn", "SERIAL2 does not forward.*link.ground_devices"),
+        ((4, 7), {"MAV2_OPTIONS": 2}, {}, "warn", "SERIAL2 does not forward"),
+        ((4, 7), {"MAV2_OPTIONS": 1}, {}, "warn", "is forwarded"),
+        ((4, 6), {"SERIAL2_OPTIONS": 1026}, {"ground_devices": ["udpout:10.0.0.2:14550"]}, "ok", "stays off"),
+    ],
+)
+def test_it_says_how_to_keep_gps_input_off_the_telemetry(
+    firmware: tuple[int, int], changes: dict[str, float], link: dict[str, Any], status: str, says: str
+) -> None:
+    line = judged(TWO_PORTS | changes, Context(LinkSection(**link), True, 1, 5, firmware))["forwarding"]
+    assert line.status == status and re.search(says, f"{line.text} -> {line.fix}")
+
+
+def test_of_a_firmware_it_asks_the_parameters_that_it_has() -> None:
+    old, new = (set(names_of(Context(LinkSection(), True, 1, 5, firmware))) for firmware in ((4, 6), (4, 7)))
+    assert "SERIAL2_OPTIONS" in old and not {n for n in old if n.startswith("MAV")}
+    assert "MAV2_OPTIONS" in new and "SERIAL2_OPTIONS" not in new
+
+
+def test_which_firmware_flies_is_read_from_its_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr("terrafix_tools.preflight.run.names_of", lambda at: asked.append(at.firmware) or names_of(at))
+    for version in (4 << 24 | 6 << 16, 4 << 24 | 7 << 16):
+        with Autopilot(LinkSection(), GroundAutopilot(TWO_PORTS, version=version)) as autopilot:
+            autopilot.connect()
+            list(_of_vehicle(autopilot, Config()))
+    assert asked == [(4, 6), (4, 7)]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "status", "says"),
+    [
+        ("GPS1_TYPE", 1, "fail", "set 14"),
+        ("GPS1_DELAY_MS", 0, "fail", "200 ms"),
+        ("GPS1_DELAY_MS", 220, "fail", "moment of sending"),
+        ("EK3_GPS_CHECK", 31, "fail", "set 23"),
+        ("EK3_VELNE_M_NSE", 0.3, "fail", "failsafe"),
+        ("EK3_VELNE_M_NSE", 1.5, "fail", "does not align"),
+        ("EK3_SRC1_VELXY", 0, "fail", "velocity is sent"),
+        ("EK3_SRC1_POSZ", 3, "warn", "barometer"),
+        ("EK3_SRC1_YAW", 2, "fail", "no yaw"),
+        ("AHRS_OPTIONS", 2, "warn", "set 3"),
+        ("ARSPD_USE", 0, "warn", "170 m"),
+        ("EK3_CHECK_SCALE", 50, "warn", "set 100"),
+    ],
+)
+def test_each_wrong_value_has_a_reason_and_a_fix(name: str, value: float, status: str, says: str) -> None:
+    line = judged(AS_IT_COMES | preset("plane") | {name: value}, context())[name]
+    assert line.status == status
+    assert says in f"{line.text} {line.fix}"
+    assert (line.change is not None) or not line.fix
+
+
+@pytest.mark.parametrize(("value", "text"), [(1048566.0, "1048566"), (0.8999999761581421, "0.9"), (-1.0, "-1")])
+def test_values_are_written_without_loss(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_a_blending_switch_beside_a_receiver_is_told() -> None:
+    values = AS_IT_COMES | preset("second-gps") | {"GPS_AUTO_SWITCH": 2, "ARMING_CHECK": 1}
+    lines = judged(values, context(gps_id=1))
+    assert (lines["GPS_AUTO_SWITCH"].status, lines["ARMING_CHECK"].status) == ("warn", "warn")
+    assert "GPS_PRIMARY" in lines
+    assert "GPS_AUTO_SWITCH" not in judged(AS_IT_COMES, context())  # alone it does not matter
+
+
+def test_other_outputs_have_other_rules() -> None:
+    at = context(outputs=["odometry"])
+    lines = judged(AS_IT_COMES, at)
+    assert "GPS1_TYPE" not in lines
+    assert (lines["VISO_TYPE"].status, lines["source set"].status) == ("fail", "fail")
+    good = AS_IT_COMES | {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6, "AHRS_OPTIONS": 1}
+    assert all(line.status is Status.OK for line in judge(good, at))
+    loop = judged(good | {"EK3_SRC2_YAW": 6}, at)["source set"]
+    assert "the autopilot's own" in loop.text
+    blind = judged(good, context(outputs=["vision_position"]))["source set"]
+    assert "no velocity" in blind.text
+
+
+def test_serial_speed_and_system_id_are_compared() -> None:
+    at = Context(LinkSection(device="/dev/ttyTHS1", baud=921_600, sysid=1), True, 3, 5)
+    lines = judged(AS_IT_COMES | preset("plane"), at)
+    assert "no port speaks MAVLink at 921600 baud (MAVLink: SERIAL1 57)" in lines["serial port"].text
+    assert "set link.sysid = 3" in lines["system id"].fix
+    same = judged(AS_IT_COMES | {"SERIAL1_BAUD": 921}, at)
+    assert same["serial port"].status == "ok"
+
+
+def test_a_firmware_without_the_parameter_is_told() -> None:
+    values = {name: value for name, value in AS_IT_COMES.items() if name != "GPS1_TYPE"}
+    assert "no such parameter" in judged(values, context())["GPS1_TYPE"].text
+    assert "GPS1_TYPE" in names_of(context())
+
+
+@pytest.mark.parametrize(
+    ("device", "baud", "trip_ms", "advice"),
+    [
+        ("udpout:a:1", 9600, None, 5),
+        ("udpout:a:1", 9600, 40.0, 20),
+        ("/dev/x", 57_600, None, 14),
+        ("/dev/x", 9600, 9.0, 50),
+    ],
+)
+def test_the_advice_on_the_delay_comes_from_the_line(
+    device: str, baud: int, trip_ms: float | None, advice: int
+) -> None:
+    assert vehicle.delay_advice_ms(LinkSection(device=device, baud=baud), trip_ms) == advice
+
+
+# --- the conversation ---
+
+
+def talk(there: GroundAutopilot, **link: Any) -> Autopilot:
+    return Autopilot(LinkSection(**link), there)
+
+
+def test_parameters_are_read_through_losses() -> None:
+    there = GroundAutopilot(AS_IT_COMES, loses=20)
+    with talk(there) as asked:
+        asked.connect(1.0)
+        read = asked.read([*AS_IT_COMES, "NO_SUCH_PARAMETER"])
+    assert read == pytest.approx(AS_IT_COMES)
+    assert (asked.plane, asked.sysid, asked.armed) == (True, 1, False)
+
+
+@pytest.mark.parametrize(
+    ("there", "link", "says"),
+    [
+        (GroundAutopilot({}, also=(9,)), {}, "2 autopilots on .*, system ids 1, 9; name yours in link.autopilot_sysid"),
+        (GroundAutopilot({}), {"autopilot_sysid": 3}, "has system id 1, not 3; correct link.autopilot_sysid"),
+        (GroundAutopilot({}, firmware=mavlink.MAV_AUTOPILOT_PX4), {}, "is px4, not ArduPilot"),
+        (GroundAutopilot({}, firmware=mavlink.MAV_AUTOPILOT_INVALID), {}, "no autopilot on .*, only system 1"),
+    ],
+)
+def test_who_is_there_may_be_wrong(there: GroundAutopilot, link: dict[str, Any], says: str) -> None:
+    with talk(there, **link) as asked, pytest.raises(LinkError, match=says) as caught:
+        asked.connect(0.3)
+    assert "\n" not in str(caught.value)
+
+
+class Streaming(GroundAutopilot):
+    """On a clock of its own (s), and sends what is asked for at ``share`` of its rate."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__({})
+        self._share, self._asked, self.now_s = share, dict[int, float](), 0.0
+
+    def clock(self) -> float:
+        self.now_s += 0.001
+        return self.now_s
+
+    def write(self, packet: bytes, to: Address | None = None) -> bool:
+        said = self._ear.decode(bytearray(packet))
+        if said.get_type() == "COMMAND_LONG" and said.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            self._asked[int(said.param1)] = 1e6 / said.param2
+            return True
+        return super().write(packet)
+
+    def read(self) -> list[Chunk]:
+        before_s, self._read_s = getattr(self, "_read_s", 0.0), self.now_s
+        for message_id, rate_hz in self._asked.items():
+            each = rate_hz * self._share
+            for _ in range(int(each * self.now_s) - int(each * before_s)):
+                kind = mavlink.mavlink_map[message_id]
+                self._say(kind(*([0] * n if n else 0 for n in kind.array_lengths)))
+        return super().read()
+
+
+@pytest.mark.parametrize(
+    ("share", "status", "says"),
+    [(1.0, "ok", "attitude 25 Hz, IMU 33 Hz"), (0.5, "warn", "too slow: ATTITUDE 12.")],
+)
+def test_what_the_link_will_ask_for_is_asked_for_and_counted(
+    share: float, status: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conversation, "RATES_S", 6.5)
+    there = Streaming(share)
+    with Autopilot(LinkSection(), there, there.clock) as asked:
+        asked.connect(0.3)
+        line = vehicle.rates(asked.rates())
+    assert (line.status, says in line.text) == (status, True), line.text
+
+
+def test_parameters_that_cannot_be_read_are_one_line() -> None:
+    with talk(GroundAutopilot({})) as asked:
+        asked.connect(0.3)
+        with pytest.raises(LinkError, match="does not answer requests for parameters"):
+            asked.read(["GPS1_TYPE"])
+
+
+def test_a_parameter_that_stays_as_it_was_is_an_error() -> None:
+    with talk(GroundAutopilot(AS_IT_COMES, read_only=("GPS1_TYPE",))) as asked:
+        asked.connect(0.3)
+        with pytest.raises(LinkError, match="GPS1_TYPE could not be set to 14"):
+            asked.write("GPS1_TYPE", 14)
+
+
+# --- the command ---
+
+
+@pytest.fixture
+def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[GroundAutopilot], None]:
+    def put(there: GroundAutopilot) -> None:
+        monkeypatch.setattr(conversation, "open_at_start", lambda _device, _baud: there)
+
+    return put
+
+
+def test_write_sets_what_is_wrong_and_keeps_the_old_values(wired: Any, tmp_path: Path, capsys: Any) -> None:
+    there = GroundAutopilot(AS_IT_COMES)
+    wired(there)
+    ready = preflight([], out=tmp_path, write=True, yes=True, as_json=True, with_computer=False)
+    said = json.loads(capsys.readouterr().out)
+    assert ready and said["ready"]
+    assert {name: there.values[name] for name in preset("plane")} == pytest.approx(preset("plane"))
+    kept = dict(line.split(",") for line in Path(said["saved_to"]).read_text().splitlines())
+    assert {name: float(value) for name, value in kept.items()} == {name: AS_IT_COMES[name] for name in kept}
+    assert set(kept) == {change["name"] for change in said["written"]} == set(there.was_set)
+
+
+def test_without_consent_nothing_is_set(wired: Any, tmp_path: Path) -> None:
+    there = GroundAutopilot(AS_IT_COMES)
+    wired(there)
+    arguments = ["preflight", "--write", "--autopilot-only", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, arguments, input="n\n")
+    assert done.exit_code == 1
+    assert "GPS1_TYPE        1 -> 14" in done.output
+    assert there.was_set == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_cannot_ask(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="add --yes"):
+        preflight([], out=tmp_path, write=True, as_json=True)
+
+
+def test_nothing_is_set_on_an_armed_vehicle(wired: Any, tmp_path: Path) -> None:
+    there = GroundAutopilot(AS_IT_COMES, armed=True)
+    wired(there)
+    with pytest.raises(UsageError, match="disarm it"):
+        preflight([], out=tmp_path, write=True, yes=True, with_computer=False)
+    assert there.was_set == []
+
+
+def test_nobody_there_is_a_line_and_the_rest_is_checked(tmp_path: Path) -> None:
+    arguments = ["preflight", "--json", "--link", "udpout:127.0.0.1:9", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, arguments)
+    lines = {line["check"]: line for line in json.loads(done.output)["lines"]}
+    assert done.exit_code == 1
+    assert lines["autopilot"]["status"] == "fail"
+    assert "nothing heard on udpout:127.0.0.1:9" in lines["autopilot"]["text"]
+    assert {"map", "camera", "models", "clock", "disk", "temperature"} <= lines.keys()
+
+
+@pytest.mark.parametrize("device", ["udpin:127.0.0.1", "udpin:127.0.0.1:70000", "127.0.0.1:14550", "tcp:127.0.0.1:9"])
+def test_a_device_that_cannot_be_is_said_once_with_what_to_do(device: str, tmp_path: Path) -> None:
+    arguments = ["preflight", "--json", "--autopilot-only", "--link", device, "--out", str(tmp_path)]
+    (line,) = json.loads(CliRunner().invoke(app, arguments).output)["lines"]
+    assert device in line["text"]
+    assert line["fix"] and line["fix"] not in line["text"]
+
+
+def test_an_old_firmware_fails(wired: Any, tmp_path: Path) -> None:
+    there = GroundAutopilot(AS_IT_COMES | preset("plane"), version=4 << 24 | 5 << 16)
+    with talk(there) as asked:
+        asked.connect(0.3)
+        lines = {line.check: line for line in vehicle.about(asked, LinkSection(), 5.0)}
+    assert lines["firmware"].status == "fail"
+    assert "4.5.0" in lines["firmware"].text
+
+
+def test_a_mission_on_board_becomes_a_file(tmp_path: Path) -> None:
+    there = GroundAutopilot(AS_IT_COMES, mission=((22, 48.0, 11.0, 50.0), (16, 48.01, 11.02, 120.0)))
+    with talk(there) as asked:
+        asked.connect(0.3)
+        assert vehicle.save_mission(asked, tmp_path / "m") is None
+    plan = read_mission(tmp_path / "m")
+    assert plan.items[-1].lat_deg == pytest.approx(48.01)
+    assert plan.items[-1].height_m == 120.0
+
+
+def test_a_mission_on_board_is_checked_against_the_map_whatever_is_in_it(tmp_path: Path, wired: Any) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=1.0)
+    package = build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
+    opened = MapPackage.open(package)
+    west, south, east, north = opened.manifest.bounds_wgs84
+    opened.close()
+    lat, lon = (south + north) / 2, (west + east) / 2
+    on_it = ((189, lat, lon, 60.0), (177, 0.0, 0.0, 0.0), (82, lat + 1e-4, lon, 60.0))  # landing from, jump, spline
+    for items, status in ((on_it, "ok"), ((*on_it, (82, north + 0.01, lon, 60.0)), "fail")):
+        wired(GroundAutopilot(AS_IT_COMES, mission=items, home=(lat, lon)))
+        arguments = ["preflight", "--link", "udpout:127.0.0.1:9", "--map", str(package), "--json"]
+        done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
+        lines = {line["check"]: line for line in json.loads(done.output)["lines"]}
+        assert lines["mission"]["status"] == status, lines["mission"]
+
+
+# --- this computer ---
+
+
+def noise(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (90, 120, 3), np.uint8)
+
+
+def test_what_the_camera_shows() -> None:
+    smooth = np.dstack([np.tile(np.linspace(60, 200, 120, dtype=np.uint8), (90, 1))] * 3)
+    assert computer.picture([noise(i) for i in range(3)]).status == "ok"
+    assert "same picture" in computer.picture([noise(1)] * 3).text
+    assert "blurred" in computer.picture([smooth, smooth + 1, smooth]).text
+    black = [np.full((90, 120, 3), i, np.uint8) for i in range(3)]
+    assert "lens cap" in computer.picture(black).fix
+    assert "only 1" in computer.picture([noise(1)]).text
+
+
+def test_heat_disk_and_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    zone = tmp_path / "class" / "thermal" / "thermal_zone0"
+    zone.mkdir(parents=True)
+    (zone / "temp").write_text("83000")
+    (zone / "type").write_text("cpu-thermal")
+    config = Config(health=HealthSection(sysfs_root=str(tmp_path)), recorder=RecorderSection(budget_mb=10**9))
+    monkeypatch.setattr(computer.time, "time_ns", lambda: 0)
+    lines = {line.check: line for line in computer.about(config, None, tmp_path / "out")}
+    assert (lines["temperature"].status, lines["disk"].status, lines["clock"].status) == ("warn", "warn", "warn")
+    assert "83 C (cpu-thermal), on the ground already" in lines["temperature"].text
+    assert "GPS week" in lines["clock"].text
+
+
+def test_map_start_and_mission_belong_together(tmp_path: Path) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=1.0)
+    package = build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
+    opened = MapPackage.open(package)
+    west, south, east, north = opened.manifest.bounds_wgs84
+    opened.close()
+    frame = LocalFrame((south + north) / 2, (west + east) / 2)
+
+    def lines(start_m: tuple[float, float], *way_m: tuple[float, float], signed: bool = False) -> dict[str, Line]:
+        places = [frame.to_wgs84(*place) for place in way_m]
+        items = tuple(Item(Do.WAYPOINT, i, lat, lon, 100.0) for i, (lat, lon) in enumerate(places, start=1))
+        mission = tmp_path / "m.waypoints"
+        write_mission(mission, Mission("test", *places[0], items))
+        lat, lon = frame.to_wgs84(*start_m)
+        chosen = MapSection(path=str(package), require_signature=signed, trusted_keys=[str(tmp_path / "a.pub")])
+        config = Config(map=chosen, source=SourceSection(start=f"{lat:.7f},{lon:.7f}"))
+        return {line.check: line for line in computer.about(config, mission, tmp_path)}
+
+    good = lines((0.0, 0.0), (-50.0, 0.0), (50.0, 50.0))
+    assert [good[check].status for check in ("map", "start", "mission")] == ["ok"] * 3
+    config = Config(map=MapSection(path=str(package)))
+    unknown = {line.check: line for line in computer.about(config, tmp_path / "none.plan", tmp_path)}
+    assert [unknown[check].status for check in ("map", "start", "mission")] == ["ok", "warn", "fail"]
+    assert "no such mission file" in unknown["mission"].text
+    assert "autopilot's GNSS" in unknown["start"].text and "whole map" in unknown["start"].text
+    config = Config(map=MapSection(path=str(package)), link=LinkSection(gnss_start=False))
+    searched = {line.check: line for line in computer.about(config, tmp_path / "none.plan", tmp_path)}
+    assert "GNSS" not in searched["start"].text and "whole map" in searched["start"].text
+    bad = lines((900.0, 0.0), (0.0, 0.0), (400.0, 0.0))
+    assert (bad["start"].status, bad["mission"].status) == ("fail", "fail")
+    assert "leaves the map" in bad["mission"].text
+    generate(tmp_path / "a.key", tmp_path / "a.pub", "somebody")
+    unsigned = lines((0.0, 0.0), (-50.0, 0.0), (50.0, 50.0), signed=True)
+    assert unsigned["map"].status == "fail"
+    assert "sign" in f"{unsigned['map'].text} {unsigned['map'].fix}"
+
+
+def test_a_map_that_is_not_there_is_a_line(tmp_path: Path) -> None:
+    config = Config(map=MapSection(path=str(tmp_path / "none.gpkg")))
+    lines = {line.check: line for line in computer.about(config, None, tmp_path)}
+    assert lines["map"].status == "fail"
+    assert "terrafix map build" in lines["map"].fix

@@ -1,0 +1,67 @@
+"""Terrafix beside a firmware: it ends with the flight, however the flight ends."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from map_format1 import unpack
+
+pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
+
+from terrafix_tools.sim.sitl import stages
+from terrafix_tools.sim.sitl.firmware import Home
+from terrafix_tools.sim.sitl.stages import Daemon
+
+pytestmark = pytest.mark.real_time
+
+ENDS_S = 30.0  # some seconds on a quiet machine
+
+FLIGHT = """
+import sys, time
+from pathlib import Path
+from types import SimpleNamespace
+from terrafix_tools.sim.sitl.firmware import Home
+from terrafix_tools.sim.sitl.stages import Daemon
+scene = SimpleNamespace(home=Home(48.0002, 11.0002, 500.0, 90.0), map_path=Path(sys.argv[2]))
+with Daemon(Path(sys.argv[1]), scene, "http://127.0.0.1:9/", "udpin:127.0.0.1:0") as daemon:
+    daemon.start()
+    time.sleep(600)
+"""
+
+DEAF = """
+import signal, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("deaf", flush=True)
+time.sleep(60)
+"""
+
+
+def eventually(holds: Any, within_s: float) -> None:
+    until_s = time.monotonic() + within_s
+    while not holds():
+        assert time.monotonic() < until_s
+        time.sleep(0.05)
+
+
+def test_a_flight_that_is_killed_takes_terrafix_with_it_in_order(tmp_path: Path) -> None:
+    log = tmp_path / "terrafix.log"
+    with subprocess.Popen([sys.executable, "-c", FLIGHT, str(tmp_path), str(unpack(tmp_path))]) as flight:
+        eventually(lambda: log.exists() and log.read_text().count("process started") == 6, 60.0)
+        flight.kill()
+    eventually(lambda: log.read_text().count("process stopped") == 6, ENDS_S)
+
+
+def test_one_that_does_not_end_when_it_is_asked_to_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages, "STOP_S", 0.2)
+    scene: Any = SimpleNamespace(home=Home(48.0, 11.0, 500.0, 90.0), map_path=tmp_path / "map.gpkg")
+    with Daemon(tmp_path, scene, "http://127.0.0.1:9/", "udpin:127.0.0.1:0") as daemon:
+        daemon._command = [sys.executable, "-c", DEAF]
+        daemon.start()
+        eventually(lambda: "deaf" in (tmp_path / "terrafix.log").read_text(), 20.0)
+        process: Any = daemon._process
+    assert process.returncode == -9

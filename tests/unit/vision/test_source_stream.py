@@ -1,0 +1,155 @@
+"""Frames over HTTP: exact times, lost connections, foreign cameras, and a stream to the real source."""
+
+import http.server
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from source_folders import HEIGHT, TOML, WIDTH, jpeg, picture
+from terrafix.core.clock import now_ns
+from terrafix.core.errors import SourceError, UsageError
+from terrafix.vision.sources import Shot, Source, open_source
+from terrafix_tools.sim.camera.stream import FrameStream
+
+pytestmark = pytest.mark.real_time
+
+
+@pytest.fixture
+def description(tmp_path: Path) -> Path:
+    path = tmp_path / "camera.toml"
+    path.write_text(TOML)
+    return path
+
+
+@pytest.fixture
+def watch() -> Iterator[Callable[[Source], list[Shot]]]:
+    """``watch(source)``: the list that its shots go into, from a thread as in flight."""
+    running: list[tuple[Source, threading.Thread]] = []
+
+    def start(source: Source) -> list[Shot]:
+        seen: list[Shot] = []
+        thread = threading.Thread(target=lambda: seen.extend(source.shots()))
+        thread.start()
+        running.append((source, thread))
+        return seen
+
+    yield start
+    for source, thread in running:
+        source.close()
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def until(true: Callable[[], bool], limit_s: float = 20.0) -> None:
+    end_s = time.monotonic() + limit_s
+    while not true():
+        assert time.monotonic() < end_s, "never happened"
+        time.sleep(0.005)
+
+
+def test_frames_arrive_with_their_own_times(description: Path, watch: Callable[[Source], list[Shot]]) -> None:
+    with FrameStream(jpeg_quality=95) as stream:
+        source = open_source(stream.url, camera=description, rate_hz=100.0)
+        assert source.live
+        seen = watch(source)
+        assert stream.wait_for_viewer(10.0)
+        base_ns = now_ns() - 5_000_000_000  # exposed long before they are sent, as late frames are
+        for i in range(5):
+            stream.push(picture(i), base_ns + i * 50_000_001)
+        until(lambda: len(seen) == 5)
+    assert [s.frame.t_ns - base_ns for s in seen] == [i * 50_000_001 for i in range(5)]
+    assert [s.frame.frame_id for s in seen] == list(range(5))
+    for i, shot in enumerate(seen):
+        assert shot.image is not None and shot.image.shape == (HEIGHT, WIDTH, 3)
+        assert float(np.abs(shot.image.astype(float) - picture(i)).mean()) < 6.0
+
+
+def test_a_lost_stream_is_waited_for(description: Path, watch: Callable[[Source], list[Shot]]) -> None:
+    first = FrameStream()
+    port = int(first.url.rstrip("/").rsplit(":", 1)[1])
+    seen = watch(open_source(first.url, camera=description, rate_hz=1e6))
+    assert first.wait_for_viewer(10.0)
+    first.push(picture(0), now_ns())
+    until(lambda: len(seen) == 1)
+    first.close()
+    with FrameStream(port) as second:
+        assert second.wait_for_viewer(20.0)
+        second.push_jpeg(b"no picture", now_ns())
+        second.push(picture(1, 160, 120), now_ns())
+        second.push(picture(2), now_ns())
+        until(lambda: len(seen) >= 4)
+    errors = [s.frame.error for s in seen]
+    assert errors[0] == "" and "decoded" in errors[1] and "wrong size: 160x120" in errors[2] and errors[3] == ""
+
+
+def test_nobody_waits_for_a_slow_viewer(description: Path) -> None:
+    with FrameStream() as stream:
+        source = open_source(stream.url, camera=description, rate_hz=1000.0)
+        assert stream.wait_for_viewer(10.0)
+        blank = jpeg(0)
+        for i in range(3000):
+            stream.push_jpeg(blank + bytes(20_000), i)  # 60 MB: more than any socket holds
+        shots = source.shots()
+        assert next(shots).image is not None
+        source.close()
+        shots.close()  # type: ignore[attr-defined]
+
+
+class ForeignCamera(http.server.BaseHTTPRequestHandler):
+    """Neither lengths nor times, and a boundary with the dashes in the header, as some cameras do it."""
+
+    def do_GET(self) -> None:
+        if self.path != "/video":
+            self.send_error(404)
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace;boundary=--cam")
+        self.end_headers()
+        for i in range(3):
+            self.wfile.write(b"--cam\r\nContent-Type: image/jpeg\r\n\r\n" + jpeg(i) + b"\r\n")
+        self.wfile.write(b"--cam--\r\n")
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+def test_a_camera_of_another_make(description: Path) -> None:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), ForeignCamera)
+    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_address[1]}"
+    try:
+        began_ns = now_ns()
+        source = open_source(f"{address}/video", camera=description, rate_hz=1e6)
+        shots = source.shots()
+        taken = [next(shots) for _ in range(3)]
+        assert began_ns <= taken[0].frame.t_ns <= taken[2].frame.t_ns <= now_ns()
+        for i, shot in enumerate(taken):
+            assert shot.image is not None
+            assert np.array_equal(shot.image, cv2.imdecode(np.frombuffer(jpeg(i), np.uint8), cv2.IMREAD_COLOR))
+        source.close()
+        shots.close()  # type: ignore[attr-defined]
+        with pytest.raises(SourceError, match=r"answers 404 .*, not an MJPEG stream"):
+            open_source(f"{address}/", camera=description)
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def test_mistakes_are_one_clear_line(description: Path) -> None:
+    with FrameStream() as stream:
+        url = stream.url
+        with pytest.raises(UsageError, match="cannot be streamed there"):
+            FrameStream(int(url.rstrip("/").rsplit(":", 1)[1]))
+        with pytest.raises(SourceError, match=r"set \[source\] camera"):
+            open_source(url)
+    with pytest.raises(SourceError, match="nobody sends pictures there"):
+        open_source(url, camera=description)
+    with pytest.raises(SourceError, match="nobody sends pictures there"):
+        open_source("http://127.0.0.1:99999/", camera=description)
+    source = open_source(url, camera=description, wait_for_camera=True)  # a restart in flight
+    source.close()

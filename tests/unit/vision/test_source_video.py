@@ -1,0 +1,209 @@
+"""Videos, cameras and telemetry logs: the sources with a clock of their own."""
+
+import math
+import struct
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from source_folders import HEIGHT, TOML, WIDTH, flight, picture
+from terrafix.core.clock import now_ns
+from terrafix.core.errors import SourceError
+from terrafix.core.mavlink.tlog import read_tlog
+from terrafix.messages import Camera
+from terrafix.vision.sources import open_source
+from terrafix.vision.sources.camera import LiveCamera
+
+T0_US = 1_700_000_000_000_000
+DESCRIPTION = TOML.replace("[start]\nlat_deg = 48.0\nlon_deg = 2.0\n", "")
+
+
+def video(path: Path, seconds: float = 3.0, fps: float = 10.0) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (WIDTH, HEIGHT))
+    assert writer.isOpened()
+    for i in range(round(seconds * fps)):
+        writer.write(np.full((HEIGHT, WIDTH, 3), i * 8, np.uint8))
+    writer.release()
+    path.with_suffix(".toml").write_text(TOML)
+    return path
+
+
+def test_a_video_is_sampled_at_its_own_times(tmp_path: Path) -> None:
+    path = video(tmp_path / "flight.mp4")
+    path.with_suffix(".csv").write_text("t_s,agl_m\n0,50\n0.2,51\n0.4,52\n")
+    source = open_source(str(path))
+    shots = list(source.shots())
+    assert [round(s.frame.t_ns / 1e9, 3) for s in shots] == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
+    assert [s.frame.frame_id for s in shots] == list(range(6))
+    assert source.length() == 6
+    for i, shot in enumerate(shots):  # the picture is the one of that time
+        assert shot.image is not None and abs(float(shot.image.mean()) - i * 40) < 6
+    assert [[s.agl_m for s in shot.states] for shot in shots[:2]] == [[50.0], [51.0, 52.0]]
+    again = list(source.shots(from_s=1.2))
+    assert [(s.frame.frame_id, s.frame.file) for s in again] == [(s.frame.frame_id, s.frame.file) for s in shots[3:]]
+    every = list(open_source(str(path), rate_hz=30).shots())
+    assert len(every) == 30
+
+
+def test_bad_videos(tmp_path: Path) -> None:
+    path = video(tmp_path / "flight.mp4", 1.0)
+    path.with_suffix(".toml").write_text(TOML.replace("width = 320", "width = 640"))
+    with pytest.raises(SourceError, match="the video is 320x240"):
+        open_source(str(path))
+    path.with_suffix(".toml").unlink()
+    with pytest.raises(SourceError, match=r"write flight\.toml beside it"):
+        open_source(str(path))
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(path.read_bytes()[:500])
+    broken.with_suffix(".toml").write_text(TOML)
+    with pytest.raises(SourceError, match="cannot be opened as a video"):
+        open_source(str(broken))
+
+
+class FakeCamera:
+    """A device that delivers ``frames`` pictures and is then unplugged."""
+
+    def __init__(self, frames: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+        self.left = frames
+        self.size = size
+        self.released = False
+
+    def grab(self) -> bool:
+        self.left -= 1
+        return self.left >= 0
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, picture(self.left, *self.size)
+
+    def get(self, prop: int) -> float:
+        return float({cv2.CAP_PROP_FRAME_WIDTH: self.size[0], cv2.CAP_PROP_FRAME_HEIGHT: self.size[1]}.get(prop, 0))
+
+    def release(self) -> None:
+        self.released = True
+
+
+def live(tmp_path: Path, devices: Iterable[FakeCamera | None], **more: bool) -> LiveCamera:
+    description = tmp_path / "camera.toml"
+    description.write_text(DESCRIPTION)
+    supply = iter(devices)
+
+    def plug(spec: str, camera: Camera) -> FakeCamera | None:
+        return next(supply, None)
+
+    return LiveCamera(
+        "0", (1.0, 2.0), description, 1e6, open_capture=plug, reconnect_s=0.001, wait=more.get("wait", False)
+    )
+
+
+def test_an_unplugged_camera_is_waited_for(tmp_path: Path) -> None:
+    first, second = FakeCamera(2), FakeCamera(3)
+    camera = live(tmp_path, [first, None, None, second])
+    began_ns = now_ns()
+    shots = camera.shots()
+    taken = [next(shots) for _ in range(5)]
+    assert [s.frame.frame_id for s in taken] == [0, 1, 2, 3, 4]
+    times = [s.frame.t_ns for s in taken]
+    assert times == sorted(times) and began_ns <= times[0] <= now_ns()
+    assert first.released and camera.spec == "/dev/video0" and camera.live
+    threading.Timer(0.05, camera.close).start()
+    assert list(shots) == []  # ends when it is closed, though no camera is there
+    assert second.released
+
+
+def test_a_camera_of_another_size_or_none_at_all(tmp_path: Path) -> None:
+    small = FakeCamera(1, (160, 120))
+    with pytest.raises(SourceError, match="the camera gives 160x120, its description says 320x240"):
+        live(tmp_path, [small])
+    assert small.released
+    with pytest.raises(SourceError, match="cannot be opened"):
+        live(tmp_path, [])
+    late = live(tmp_path, [None, FakeCamera(1)], wait=True)
+    assert next(late.shots()).image is not None
+    probed = FakeCamera(1)
+    live(tmp_path, [probed]).close()
+    assert probed.released
+
+
+def test_cameras_say_what_they_miss(tmp_path: Path) -> None:
+    description = tmp_path / "camera.toml"
+    description.write_text(DESCRIPTION)
+    with pytest.raises(SourceError, match=r"set \[source\] camera"):
+        open_source("/dev/video77")
+    with pytest.raises(SourceError, match="/dev/video77: the camera cannot be opened"):
+        open_source("77", camera=description, start=(1.0, 2.0))
+    if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
+        with pytest.raises(SourceError, match="built without GStreamer"):
+            open_source("videotestsrc ! appsink", camera=description, start=(1.0, 2.0))
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in (Path(__file__).parents[3] / "config/cameras").glob("*.toml")))
+def test_the_camera_examples_are_valid(name: str) -> None:
+    description = Path(__file__).parents[3] / "config" / "cameras" / name
+    with pytest.raises(SourceError, match="cannot be opened"):
+        open_source("77", camera=description, start=(1.0, 2.0))
+
+
+def record(offset_s: float, message: mavlink.MAVLink_message, component: int = 1, mavlink1: bool = False) -> bytes:
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=component)
+    packet = message.pack(sender, force_mavlink1=mavlink1)
+    return struct.pack(">Q", T0_US + round(offset_s * 1e6)) + bytes(packet)
+
+
+def attitude(offset_s: float, yaw: float, component: int = 1) -> bytes:
+    return record(offset_s, mavlink.MAVLink_attitude_message(0, 0.1, -0.2, yaw, 0, 0, 0), component)
+
+
+def height(offset_s: float, relative_m: float) -> bytes:
+    position = mavlink.MAVLink_global_position_int_message(
+        0, 480000000, 20000000, 250000, int(relative_m * 1e3), 0, 0, 0, 0
+    )
+    return record(offset_s, position, mavlink1=True)
+
+
+def hud(offset_s: float, alt_m: float) -> bytes:
+    return record(offset_s, mavlink.MAVLink_vfr_hud_message(0, 0, 350, 0, alt_m, 0))
+
+
+def test_a_telemetry_log_gives_attitude_and_height(tmp_path: Path) -> None:
+    log = tmp_path / "t.tlog"
+    log.write_bytes(attitude(0, 1.0) + hud(0.1, 300) + height(0.5, 80.5) + attitude(1, 1.1) + attitude(1.2, 2, 154))
+    states = read_tlog(log)
+    assert [(s.t_ns, s.agl_m) for s in states] == [(0, None), (500_000_000, 80.5), (10**9, None)]
+    assert (states[0].roll_rad, states[0].pitch_rad, states[2].yaw_rad) == pytest.approx((0.1, -0.2, 1.1))
+    assert all(s.source == "mavlink" and s.velocity_enu_mps is None for s in states)
+    assert read_tlog(log, T0_US + 250_000)[0].t_ns == -250_000_000
+
+
+def test_a_log_with_little_in_it(tmp_path: Path) -> None:
+    log = tmp_path / "t.tlog"
+    log.write_bytes(hud(0, 300) + hud(1, 340))
+    states = read_tlog(log)
+    assert [s.agl_m for s in states if s.agl_m is not None] == [0, 40]
+    assert [s.yaw_rad for s in states if s.yaw_rad is not None] == pytest.approx([math.radians(-10)] * 2)
+
+
+def test_damage_in_a_log_costs_the_damaged_records(tmp_path: Path) -> None:
+    log = tmp_path / "t.tlog"
+    good = [attitude(i, 0.1 * i) for i in range(5)]
+    crc = bytearray(good[1])
+    crc[-1] ^= 0xFF
+    log.write_bytes(good[0] + bytes(crc) + good[2] + b"\xfd\xfe garbage \xfd" * 3 + good[3] + good[4][:-5])
+    assert [s.t_ns // 10**9 for s in read_tlog(log)] == [0, 2, 3]
+    log.write_bytes(b"not a log, " * 50)
+    with pytest.raises(SourceError, match="holds no MAVLink record"):
+        read_tlog(log)
+
+
+def test_a_flight_folder_with_a_log_needs_only_file_and_time(tmp_path: Path) -> None:
+    rows = "\n".join(f"{i:04}.jpg,{i * 0.5}" for i in range(3))
+    toml = TOML.replace("yaw_sigma_deg = 3.0", f"yaw_sigma_deg = 3.0\ntlog_t0_us = {T0_US}")
+    folder = flight(tmp_path / "f", 3, toml=toml, csv=f"file,t_s\n{rows}\n")
+    said = [attitude(t, t) for t in (-1.0, 0.0, 0.2, 0.4, 0.9, 7.0)]
+    (folder / "telemetry.tlog").write_bytes(b"".join(said))
+    shots = list(open_source(str(folder)).shots())
+    assert [[round(s.t_ns / 1e9, 1) for s in shot.states] for shot in shots] == [[0.0], [0.2, 0.4], [0.9]]
