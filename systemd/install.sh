@@ -3,8 +3,8 @@
 #
 #   sudo systemd/install.sh [--python /path/to/python3.11] [--prefix DIR] [--no-pip]
 #
-# Run it again to upgrade: an existing /etc/terrafix/terrafix.toml stays as it is. --prefix installs the files below
-# DIR without starting anything (for images and tests); --no-pip leaves the virtual environment alone.
+# Run it again to upgrade: an existing /etc/terrafix/terrafix.toml is not changed. --prefix installs the files below
+# DIR and starts nothing (for images and tests); --no-pip does not change the virtual environment.
 set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
@@ -24,7 +24,8 @@ if [ -z "$prefix" ] && [ "$(id -u)" -ne 0 ]; then
     exit 2
 fi
 
-# gtsam 4.3 has wheels from Python 3.11 on; JetPack 6 brings 3.10 (docs/jetson.md says how to get a newer one).
+# gtsam 4.3 has wheels for Python 3.11 and later; JetPack 6 includes 3.10 (docs/jetson.md describes how to install a
+# newer one).
 if [ "$pip" = yes ]; then
     for candidate in $python python3.12 python3.11 python3; do
         if command -v "$candidate" >/dev/null 2>&1 &&

@@ -33,7 +33,7 @@ def data_set(data_dir: Path) -> Callable[[str], Path]:
     return find
 
 
-# Sleeps and looks how much later than asked for it woke up; says the worst when its input ends.
+# Sleeps 5 ms again and again, and prints the longest delay of a wake-up [ms] when its input ends.
 SLEEPER = """
 import select, sys, time
 worst_s, step_s = 0.0, 0.005
@@ -49,10 +49,10 @@ print(1e3 * worst_s)
 
 @pytest.fixture
 def stall_ms() -> Iterator[Callable[[], float]]:
-    """``stall_ms()``: how late, at worst, this machine woke a process that only sleeps, since the test began.
+    """``stall_ms()``: the longest delay with which this machine woke a sleeping process since the test began.
 
-    A promise about time can be kept to the machine's own delay, not better. That process is one of its own: what is
-    tested cannot excuse itself with a delay that it made."""
+    A limit on time can be met only up to this delay. It is measured in a separate process, so that delays inside the
+    tested process do not count."""
     with subprocess.Popen(
         [sys.executable, "-c", SLEEPER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as sleeper:

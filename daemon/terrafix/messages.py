@@ -1,14 +1,14 @@
-"""What is said between the processes: every message, with units, frames and who says it.
+"""All messages between the processes, with units, frames and publishers.
 
-Conventions that hold everywhere
---------------------------------
-* ``t_ns`` is the time of the *measurement* on the one monotonic clock, in nanoseconds.
-* World frame ``w``: local east, north, up (ENU) in metres around the flight's origin (``Origin``);
+Conventions
+-----------
+* ``t_ns`` is the time of the *measurement* on the shared monotonic clock, in nanoseconds.
+* World frame ``w``: local east, north, up (ENU) in metres about the origin of the flight (``Origin``);
   up is height above mean sea level (AMSL).
 * Body frame ``b``: forward, right, down (FRD). Camera frame ``c``: OpenCV (x right, y down, z into the scene).
-* ``q_a_b`` is a unit quaternion (w, x, y, z) that takes b coordinates into a.
+* ``q_a_b`` is a unit quaternion (w, x, y, z) that rotates b coordinates into a.
 * Covariances 6x6 are row-major, order (east, north, up, rotation about east, north, up), m^2 and rad^2.
-* A field that is ``None`` is not known; absence is a state, not an error.
+* The value ``None`` means unknown, which is a valid state of a field.
 """
 
 from enum import StrEnum
@@ -24,15 +24,15 @@ ImuSample = tuple[int, float, float, float, float, float, float]
 
 
 class SourceLabel(StrEnum):
-    """Where a position comes from (AC-12)."""
+    """Source of a position (AC-12)."""
 
-    SATELLITE_ANCHORED = "satellite_anchored"  # a map match entered within the last keyframes
-    VISUAL_PROPAGATED = "visual_propagated"  # odometry since the last map match
-    DEAD_RECKONED = "dead_reckoned"  # neither map nor odometry: growing covariance only
+    SATELLITE_ANCHORED = "satellite_anchored"  # a map match was fused within the last keyframes
+    VISUAL_PROPAGATED = "visual_propagated"  # visual odometry since the last map match
+    DEAD_RECKONED = "dead_reckoned"  # neither map match nor odometry: prediction with growing covariance
 
 
 class CovarianceMode(StrEnum):
-    """How the 6x6 covariance was computed (ON-2)."""
+    """Method by which the 6x6 covariance was computed (ON-2)."""
 
     MARGINALS = "marginals"
     JACOBIAN = "jacobian"
@@ -40,48 +40,45 @@ class CovarianceMode(StrEnum):
 
 class ThermalBand(StrEnum):
     NORMAL = "normal"
-    HOT = "hot"  # throttling or close to it: the cheap covariance is used
+    HOT = "hot"  # throttled or close to it: the estimator computes the cheaper covariance
     CRITICAL = "critical"
 
 
 class Verdict(StrEnum):
-    """The answer to every measurement; anything but ACCEPTED names the reason of the rejection."""
+    """Result of a measurement: ACCEPTED, or the reason of the rejection."""
 
     ACCEPTED = "accepted"
     BAD_IMAGE = "bad_image"  # unreadable, truncated, wrong size
-    STALLED = "stalled"  # the camera repeats an earlier picture while the vehicle moves
-    NO_FEATURES = "no_features"  # nothing to track
+    STALLED = "stalled"  # the camera repeats an earlier image while the vehicle moves
+    NO_FEATURES = "no_features"  # no features to track
     FEW_INLIERS = "few_inliers"
-    NO_PREDICTION = "no_prediction"  # nobody knows where to look
+    NO_PREDICTION = "no_prediction"  # no prior position
     OUTSIDE_MAP = "outside_map"
-    TOO_LOW = "too_low"  # the footprint is too small to be matched
-    AMBIGUOUS = "ambiguous"  # more than one place fits
-    WEAK_PEAK = "weak_peak"
-    PNP_FAILED = "pnp_failed"
-    HIGH_REPROJECTION = "high_reprojection"
+    TOO_LOW = "too_low"  # the footprint is too small for matching
+    AMBIGUOUS = "ambiguous"  # more than one position fits
     DEGENERATE = "degenerate"
-    INNOVATION = "innovation"  # disagrees with the estimate by more than both claim
+    INNOVATION = "innovation"  # the innovation exceeds its gate
     STALE = "stale"
-    UNCONFIRMED = "unconfirmed"  # of a fragment that nothing has joined to the flight yet
-    IMPLAUSIBLE = "implausible"  # jump, speed or height that cannot be
-    MODEL_FAILED = "model_failed"  # the learned model gave no usable answer; ModelEvent has the reason
-    LOST = "lost"  # what is seen is not where the vehicle was believed to be; its place is searched
+    UNCONFIRMED = "unconfirmed"  # match of a trajectory fragment that is not yet joined to the flight
+    IMPLAUSIBLE = "implausible"  # impossible jump, speed or height
+    MODEL_FAILED = "model_failed"  # the learned model gave no usable output; ModelEvent has the reason
+    LOST = "lost"  # the images contradict the estimated position; relocalisation is active
 
 
 class SearchStep(StrEnum):
-    """How far the search for the vehicle's place has gone (PB-8)."""
+    """Stage of the relocalisation search (PB-8)."""
 
     NORMAL = "normal"
-    SKIP = "skip"  # this frame says nothing; the next one is tried
-    NEW_FRAGMENT = "new_fragment"  # nothing joins this frame to the one before
-    MERGE = "merge"  # the map joins what was flown since then to what came before, or a search has found the place
-    WIDEN = "widen"  # lost: around the last place, 1 to 25 tiles
+    SKIP = "skip"  # this frame gives no information; the next one is tried
+    NEW_FRAGMENT = "new_fragment"  # odometry does not connect this frame to the previous one
+    MERGE = "merge"  # a map match joins the fragment to the earlier trajectory, or a search has found the position
+    WIDEN = "widen"  # lost: search around the last position, 1 to 25 tiles
     WHOLE_MAP = "whole_map"
-    ASK = "ask"  # the whole map was searched: a coarse position from the operator would help
+    ASK = "ask"  # the whole map was searched without result: a coarse position from the operator would help
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
-    """Base of all messages."""
+    """Base class of all messages."""
 
     t_ns: int
 
@@ -90,7 +87,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
 
 
 class Camera(msgspec.Struct, frozen=True, kw_only=True):
-    """Pinhole camera of the stored frames (pixels) and its mount in the body (degrees)."""
+    """Pinhole intrinsics for the stored frames (pixels) and orientation of the camera in the body (degrees)."""
 
     width: int
     height: int
@@ -99,40 +96,40 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True):
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()  # OpenCV order: k1 k2 p1 p2 k3 ...
-    focal_sigma: float = 0.1  # 1-sigma of the focal length, a share of it
+    focal_sigma: float = 0.1  # 1-sigma of the focal length, relative
     mount_yaw_deg: float = 0.0
     mount_pitch_deg: float = -90.0  # straight down, image top forward
     mount_roll_deg: float = 0.0
-    mount_tolerance_deg: float = 5.0  # 1-sigma of the real tilt around the nominal one
+    mount_tolerance_deg: float = 5.0  # 1-sigma of the true tilt about the nominal tilt
 
 
 class Origin(Message, frozen=True, kw_only=True):
-    """Said once by whoever opens the source: camera, frame of reference and start of the flight."""
+    """Camera, reference point of the local frame and initial position; published once when the source is opened."""
 
     camera: Camera
     lat_deg: float
     lon_deg: float
     ground_amsl_m: float | None  # AMSL height of the ground at the origin
-    start_sigma_m: float  # 1-sigma of the start coordinate, per horizontal axis; of the size of the map: not known
+    start_sigma_m: float  # 1-sigma of the initial position per horizontal axis; as large as the map if unknown
     yaw_sigma_deg: float
     agl_sigma_m: float
-    attitude_sigma_deg: float  # roll and pitch, when they are reported
+    attitude_sigma_deg: float  # of reported roll and pitch
 
 
 class Frame(Message, frozen=True, kw_only=True):
-    """A camera frame exists; its pixels are in the frame store under ``frame_id``."""
+    """A new camera frame, whose pixels are in the frame store under ``frame_id``."""
 
     frame_id: int
     file: str  # name in the source ("" for a live camera)
     width: int
     height: int
-    error: str = ""  # not empty: there are no pixels, and this says why
+    error: str = ""  # not empty: the frame has no pixels; this is the reason
 
 
 class VehicleState(Message, frozen=True, kw_only=True):
     """Attitude, height and velocity as an autopilot reports them, at ``t_ns``.
 
-    ``yaw_rad`` clockwise from true north; ``agl_m`` above ground (or take-off); never GNSS position."""
+    ``yaw_rad``: clockwise from true north. ``agl_m``: above ground (or take-off). Contains no GNSS position."""
 
     source: str  # "frames.csv", "mavlink", "exif"
     yaw_rad: float | None = None
@@ -140,15 +137,15 @@ class VehicleState(Message, frozen=True, kw_only=True):
     roll_rad: float | None = None
     agl_m: float | None = None
     velocity_enu_mps: Vec3 | None = None
-    armed: bool | None = None  # motors may turn; a vehicle that is not armed stands
-    airspeed_mps: float | None = None  # as a sensor reads it, never computed from wind or GNSS
+    armed: bool | None = None  # motors are enabled; a vehicle that is not armed is stationary
+    airspeed_mps: float | None = None  # reading of an airspeed sensor; not a value computed from wind or GNSS
 
 
 class Imu(Message, frozen=True, kw_only=True):
-    """Inertial readings of the autopilot, a few at a time, oldest first; ``t_ns`` is that of the newest.
+    """A batch of IMU samples of the autopilot, oldest first; ``t_ns`` is the time of the newest.
 
     ``samples``: (ns before ``t_ns``; specific force forward, right, down [m/s^2]; angular velocity about the same
-    axes [rad/s]). Level and at rest the specific force is (0, 0, -9.81)."""
+    axes [rad/s]). The specific force at rest and level is (0, 0, -9.81)."""
 
     source: str  # "mavlink"
     samples: list[ImuSample]
@@ -164,95 +161,94 @@ class SourceEnded(Message, frozen=True, kw_only=True):
 
 
 class Odometry(Message, frozen=True, kw_only=True):
-    """Motion of frame ``frame_id`` against keyframe ``keyframe_id``, as matched rays.
+    """Feature matches of frame ``frame_id`` with keyframe ``keyframe_id``, the input of visual odometry.
 
-    ``pairs``: (x_kf, y_kf, x, y) in undistorted normalised image coordinates (tan of the angle) of
-    features on the ground seen in both, RANSAC inliers, spread over the image. Metric scale comes
-    later, from the height that the estimator knows.
+    ``pairs``: (x_kf, y_kf, x, y) in undistorted normalised image coordinates (tangents of the ray angles) of ground
+    features in both frames: RANSAC inliers, spread over the image. The estimator adds the metric scale from its
+    height.
 
-    ``triples``: (x_before, y_before, x_kf, y_kf, x, y), of features that the keyframe before, ``before_id``, saw as
-    well; of frames that become a keyframe. They say how long the way to this frame is in units of the way before,
-    whatever the ground is like."""
+    ``triples``: (x_before, y_before, x_kf, y_kf, x, y) of features that are also in the previous keyframe
+    ``before_id``; only of frames that become a keyframe. They determine the ratio of two successive baselines
+    independently of the shape of the ground."""
 
     frame_id: int
     keyframe_id: int
     verdict: Verdict
     pairs: list[tuple[float, float, float, float]] = []
-    sigma_norm: float = 0.0  # 1-sigma of one coordinate, normalised units
+    sigma_norm: float = 0.0  # 1-sigma of one coordinate of ``pairs``, normalised units
     inliers: int = 0
     tracked: int = 0
-    becomes_keyframe: bool = False  # following frames refer to this frame
-    before_id: int = -1  # -1: there are no triples
+    becomes_keyframe: bool = False  # the following frames are matched with this frame
+    before_id: int = -1  # previous keyframe; -1: no triples
     triples: list[tuple[float, float, float, float, float, float]] = []
-    triples_sigma_norm: float = 0.0  # 1-sigma of one coordinate of these, normalised units
-    static: bool = (
-        False  # the same view as in the frame before, to 0.006 degrees: the vehicle stands, or the camera is frozen
-    )
+    triples_sigma_norm: float = 0.0  # 1-sigma of one coordinate of ``triples``, normalised units
+    # The view equals that of the previous frame to 0.006 degrees: the vehicle is stationary, or the camera is frozen.
+    static: bool = False
 
 
 # --- estimator to anchor --------------------------------------------------------------------------
 
 
 class Prediction(Message, frozen=True, kw_only=True):
-    """Where the estimator believes that the camera was at frame ``frame_id``, before any map match of it."""
+    """Predicted camera pose at frame ``frame_id`` (the prior for map matching), without a map match of that frame."""
 
     frame_id: int
     p_c_in_w_m: Vec3
     q_w_c: Quat
     cov: Mat6  # of the camera pose
-    agl_m: float  # height of the camera above the ground beneath it
+    agl_m: float  # height of the camera above the ground below it
     agl_sigma_m: float
-    step_m: Vec2  # camera motion (east, north) since the previous Prediction, by odometry alone
-    step_cov_m2: Mat2  # its covariance (ee, en, ne, nn)
-    lens: float = 0.0  # what the lens bends beyond its description, as far as that is sure (core.camera.straightened)
-    start_ns: int = 0  # t_ns of what told the place anew (a Start, a Coasted); 0: nothing did
+    step_m: Vec2  # camera motion (east, north) since the previous Prediction, from odometry alone
+    step_cov_m2: Mat2  # covariance of step_m (ee, en, ne, nn)
+    lens: float = 0.0  # estimated residual radial distortion, if significant (core.camera.undistort_division)
+    start_ns: int = 0  # t_ns of the Start or Coasted that reset the position; 0: no reset
 
 
 # --- anchor ---------------------------------------------------------------------------------------
 
 
 class MapMatch(Message, frozen=True, kw_only=True):
-    """A frame against the map: 2D-3D matches, the camera pose that they give, and how sure the belief is."""
+    """Result of matching a frame to the map: 2D-3D matches, their camera pose, and the posterior over position."""
 
     frame_id: int
     verdict: Verdict
     matcher: str  # "gradient", "xfeat"
-    coarse: bool = False  # position of the belief's mode alone: no 2D-3D matches agreed
+    coarse: bool = False  # position of the posterior mode only: no consistent 2D-3D matches
     matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight
     p_c_in_w_m: Vec3 | None = None
     q_w_c: Quat | None = None
     cov: Mat6 | None = None
-    lens: float = 0.0  # the frame was seen through this (as in Prediction)
+    lens: float = 0.0  # residual radial distortion used for this frame (as in Prediction)
     inliers: int = 0
     reprojection_px: float = 0.0
-    margin: float = 0.0  # best peak over the best rival, in standard deviations of the surface
-    mode_mass: float = 0.0  # share of the belief that sits in the winning mode, 0..1
-    mode_e_m: float = 0.0  # centre of the winning mode
+    margin: float = 0.0  # best peak less second-best peak of the correlation surface, in its standard deviations
+    mode_mass: float = 0.0  # probability mass of the strongest mode of the posterior, 0..1
+    mode_e_m: float = 0.0  # centre of the strongest mode
     mode_n_m: float = 0.0
-    # The heaviest modes of the belief: east, north [m], share of the mass, variance within the mode per axis [m^2]
+    # The strongest modes of the posterior: east, north [m], probability mass, variance within the mode per axis [m^2]
     modes: list[tuple[float, float, float, float]] = []
-    belief_m: Vec2 = (0.0, 0.0)  # mean of the whole belief, east and north
-    belief_cov_m2: Mat2 = (0.0, 0.0, 0.0, 0.0)  # of the whole belief, all modes
-    ground: Vec3 | None = (
-        None  # plane of the ground below, from the map's DEM: AMSL at p_c_in_w_m, slope east, slope north
-    )
-    relief_m: float = 0.0  # what the ground that is seen departs from that plane, root mean square
-    map_sigma_m: float = 0.0  # error of the map itself, 1-sigma per horizontal axis: common to all matches
+    belief_m: Vec2 = (0.0, 0.0)  # mean of the whole posterior, east and north
+    belief_cov_m2: Mat2 = (0.0, 0.0, 0.0, 0.0)  # covariance of the whole posterior, all modes
+    # Plane fitted to the ground below in the DEM of the map: AMSL height at p_c_in_w_m, slope east, slope north.
+    ground: Vec3 | None = None
+    relief_m: float = 0.0  # RMS deviation of the visible ground from that plane
+    map_sigma_m: float = 0.0  # error of the map itself, 1-sigma per horizontal axis, common to all matches
     step: SearchStep = SearchStep.NORMAL
-    lost_sigma_m: float = 0.0  # that the place may be wrong: 1-sigma per horizontal axis, on top of what is predicted
-    found: bool = False  # by a search: what was believed of the position before counts for nothing
+    # 1-sigma per horizontal axis, for the case that the position is wrong; in addition to the predicted covariance.
+    lost_sigma_m: float = 0.0
+    found: bool = False  # found by relocalisation: the prior position is to be discarded
 
 
 class SearchState(Message, frozen=True, kw_only=True):
-    """Said on every change: how far the search for the vehicle's place has gone; ``normal`` when there is none."""
+    """Stage of the relocalisation search, published on every change; ``normal`` when no search is active."""
 
     step: SearchStep
 
 
 class PositionHint(Message, frozen=True, kw_only=True):
-    """A coarse position from a person, or after a restart in flight from the autopilot: where a search begins.
+    """A coarse position prior for the search, from the operator, or from the autopilot after a restart in flight.
 
-    ``radius_m``: it is so near, in 95 of 100 cases; at ``t_ns``, when the hint was given."""
+    ``radius_m``: 95 % radius about the given position, at ``t_ns``, the time at which the hint was given."""
 
     lat_deg: float
     lon_deg: float
@@ -261,10 +257,11 @@ class PositionHint(Message, frozen=True, kw_only=True):
 
 
 class Coasted(Message, frozen=True, kw_only=True):
-    """How the autopilot's filter has moved by its own sensors alone, in ``coast_s`` from our last 3D fix to ``t_ns``.
+    """Dead reckoning of the autopilot's EKF, without aiding, over ``coast_s`` from our last 3D fix to ``t_ns``.
 
-    Position and velocity with their 1-sigma per axis are those of the fix. ``gain_mps``: by how much the filter's
-    velocity changed since; ``way_m``: how much farther (east, north) it has come by that than by its velocity then."""
+    Position and velocity with their 1-sigma per axis are those of that fix. ``gain_mps``: change of the EKF velocity
+    since (delta v). ``way_m``: displacement (east, north) since, less the EKF velocity at the fix times ``coast_s``
+    (delta p)."""
 
     coast_s: float
     lat_deg: float
@@ -277,51 +274,52 @@ class Coasted(Message, frozen=True, kw_only=True):
 
 
 class HintVerdict(Message, frozen=True, kw_only=True):
-    """What became of a PositionHint, said with the first frame after it.
+    """Result of a PositionHint, published with the first frame after it.
 
-    ACCEPTED: a search begins there, or it agrees with the position that the map holds; INNOVATION: it does not agree,
-    and changes nothing; OUTSIDE_MAP."""
+    ACCEPTED: a search starts there, or it agrees with the position of the map lock; INNOVATION: it disagrees with the
+    map lock and is ignored; OUTSIDE_MAP."""
 
     hint_t_ns: int  # t_ns of the hint
     verdict: Verdict
-    distance_m: float | None  # from the position that was believed; None: none was
-    sigma_m: float | None  # what that one claimed, 1-sigma per horizontal axis
+    distance_m: float | None  # from the estimated position; None: there was none
+    sigma_m: float | None  # of that estimate, 1-sigma per horizontal axis
     text: str  # for the operator, at most 40 characters
 
 
 class Start(Message, frozen=True, kw_only=True):
-    """Where the flight begins, if its Origin does not say so: the answer to a GnssStart, with the ground of the map.
+    """Initial position if Origin has none: the reply to a GnssStart, with the ground height of the map.
 
-    ``t_ns`` is that of the GnssStart. OUTSIDE_MAP: not taken. Without a place (None) the start is not known."""
+    ``t_ns`` is that of the GnssStart. OUTSIDE_MAP: rejected. Without coordinates (None) the initial position is
+    unknown."""
 
     verdict: Verdict
     lat_deg: float | None
     lon_deg: float | None
     sigma_m: float | None  # 1-sigma per horizontal axis
-    ground_amsl_m: float | None  # AMSL height of the ground there; None: the map does not tell
+    ground_amsl_m: float | None  # AMSL height of the ground there; None: not in the map
 
 
 class ModelChange(StrEnum):
     OPENED = "opened"
-    PROVIDER = "provider"  # the one that ran it failed; the next one does from now on
-    FAILED = "failed"  # no usable answer to this frame
-    GIVEN_UP = "given_up"  # matching goes on without weights
+    PROVIDER = "provider"  # the execution provider failed; the next one is used from now on
+    FAILED = "failed"  # no usable output for this frame
+    GIVEN_UP = "given_up"  # matching continues without the learned model
 
 
 class ModelEvent(Message, frozen=True, kw_only=True):
-    """What became of the learned model that map matching uses: said at the start, and on every change."""
+    """State of the learned model for map matching, published at the start and on every change."""
 
     model: str  # "xfeat"
     change: ModelChange
     provider: str  # "TensorRT", "CUDA", "CPU"; empty: none
-    detail: str  # checksum and why better providers were passed over; or the reason of the change
+    detail: str  # checksum and why preferred providers were not used, or the reason of the change
 
 
 # --- estimator ------------------------------------------------------------------------------------
 
 
 class NavEstimate(Message, frozen=True, kw_only=True):
-    """The product: where the vehicle was at ``t_ns`` and how well that is known (AC-12, ON-1)."""
+    """Estimated position, velocity and attitude of the vehicle at ``t_ns`` with covariance (AC-12, ON-1)."""
 
     frame_id: int
     lat_deg: float
@@ -332,42 +330,44 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     velocity_sigma_mps: float
     q_w_b: Quat
     cov: Mat6  # of the body pose
-    map_sigma_m: float = 0.0  # of it, per horizontal axis: the error of the map itself, as that states it
+    map_sigma_m: float = 0.0  # part of cov: stated error of the map itself, 1-sigma per horizontal axis
     source_label: SourceLabel
     covariance_mode: CovarianceMode
-    last_anchor_age_ms: int  # -1: never anchored
-    emitted_at_ns: int  # when it was said; in a replay, the time of the frame that it answers
+    last_anchor_age_ms: int  # age of the last map fix; -1: none yet
+    emitted_at_ns: int  # time of publication; in a replay, the time of the frame
 
 
 class CalibrationFault(Message, frozen=True, kw_only=True):
-    """A monitor has found, or finds no more, that what describes the flight is wrong: said on every change.
+    """A monitor has detected a calibration fault, or its end; published on every change.
 
-    ``quantity``: "scale" (height or focal length), "mount yaw", "heading", "mirrored picture", "registration" (the map
-    is found nowhere, and why is not known)."""
+    ``quantity``: "scale" (height or focal length), "mount yaw", "heading", "mirrored picture", "registration" (frames
+    match the map nowhere, for an unknown reason)."""
 
     quantity: str
-    factor: float | None  # scale: told height over the true one; angles: told less true, degrees; None: not known
-    detail: str  # what it was found from
+    factor: float | None  # scale: reported over true height; angles: reported less true, degrees; None: unknown
+    detail: str  # evidence of the fault
     active: bool
 
 
 class LearntLens(msgspec.Struct, frozen=True, kw_only=True):
-    """k1, k2, p1, p2, the focal length (relative, less one) and the middle of the picture (right and down of where its
-    description has it), in normalised coordinates; the inverse of their covariance."""
+    """Estimated intrinsics in normalised coordinates with information matrix.
+
+    ``value``: k1, k2, p1, p2, relative error of the focal length, offset of the principal point from its calibration
+    (right, down). ``information``: inverse of their covariance."""
 
     value: tuple[float, ...]  # 7
     information: tuple[float, ...]  # 7x7, row-major
 
 
 class SlowErrors(Message, frozen=True, kw_only=True):
-    """Once a second: what was learnt by now of what is off for a whole flight: mount, compass, barometer, lens."""
+    """Estimated calibration errors that are constant in a flight (mount, compass, barometer, lens), once a second."""
 
     frame_id: int
     # Tilt of the mount about the camera's x and y [rad], heading [rad], height [m], first radial coefficient [-],
-    # logarithm of heights told over heights seen [-]
+    # logarithm of the ratio of reported to observed heights [-]
     error: tuple[float, float, float, float, float, float]
     cov: tuple[float, ...]  # 6x6, row-major
-    lens: LearntLens | None = None  # of a camera that nobody has calibrated; estimator/measurements/principal_point.py
+    lens: LearntLens | None = None  # only of an uncalibrated camera; estimator/measurements/principal_point.py
 
 
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
@@ -379,29 +379,41 @@ class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
     sigma_n_m: float
 
 
+class ClaimBudget(Message, frozen=True, kw_only=True):
+    """1 Hz: which terms the horizontal covariance of a NavEstimate is made of."""
+
+    frame_id: int
+    # Mean horizontal variance [m^2] of each term: "graph", "map", "principal_point", "time_offset", "hypotheses",
+    # "calibration". Their sum is that of NavEstimate.cov.
+    terms_m2: dict[str, float]
+
+
 class Refinement(Message, frozen=True, kw_only=True):
-    """Better positions of past frames, after later anchors (AC-8)."""
+    """Smoothed positions of past frames, after later map fixes (AC-8)."""
 
     poses: list[RefinedPose]
 
 
 class MeasurementVerdict(Message, frozen=True, kw_only=True):
-    """What was done with one measurement (law: every measurement gets one)."""
+    """Result of the checks of one measurement; every measurement gets one (law 3)."""
 
-    frame_id: int  # -1: of no frame
-    # "odometry", "map", "attitude", "height", "start", "reset" (of the graph); of the link "estimate", "telemetry",
-    # "wall clock"
+    frame_id: int  # -1: not related to a frame
+    # From the estimator "odometry", "map", "attitude", "height", "airspeed", "dead_reckoning", "start", "reset" (of the
+    # graph); from the link "estimate", "telemetry", "wall clock"
     measurement: str
     verdict: Verdict
     detail: str = ""
-    mahalanobis2: float | None = None
+    mahalanobis2: float | None = None  # squared Mahalanobis distance of the innovation
+    innovation: tuple[float, ...] = ()  # measured less predicted, in units of the measurement
+    innovation_variance: tuple[float, ...] = ()  # of each component, measurement and prediction together
+    test_ratio: float | None = None  # mahalanobis2 over the limit of its gate: above 1 it is rejected
 
 
 # --- link -----------------------------------------------------------------------------------------
 
 
 class GpsInput(Message, frozen=True, kw_only=True):
-    """What was sent to the autopilot as MAVLink GPS_INPUT (232); units of this record are SI."""
+    """The GPS_INPUT message (MAVLink 232) as sent to the autopilot, in SI units."""
 
     fix_type: int
     time_week: int
@@ -418,44 +430,45 @@ class GpsInput(Message, frozen=True, kw_only=True):
     horiz_accuracy_m: float
     vert_accuracy_m: float
     satellites_visible: int
-    estimate_age_ms: float  # age of the estimate that this was carried forward from; -1: none
-    caution: int = 0  # rung of the caution ladder: 1, 2, 3 from 5, 15, 35 s without a map fix
-    unanchored_s: float | None = None  # seconds since the last map fix; None: nothing was believed yet
-    map_offset_m: tuple[float, float] = (0.0, 0.0)  # east, north: error of the map that was taken out (MapOffset)
-    reason: str = ""  # why fix_type is not 3
-    resets: int = 0  # jumps of the estimate that were accepted since the link began: reset_counter of ODOMETRY
+    estimate_age_ms: float  # age of the estimate that was propagated to this time; -1: none
+    caution: int = 0  # degradation level: 1, 2, 3 from 5, 15, 35 s without a map fix
+    unanchored_s: float | None = None  # seconds since the last map fix; None: no estimate accepted yet
+    map_offset_m: tuple[float, float] = (0.0, 0.0)  # east, north: subtracted error of the map (MapOffset)
+    reason: str = ""  # reason for a fix_type other than 3
+    resets: int = 0  # accepted jumps of the estimate since the start of the link: reset_counter of ODOMETRY
 
 
 class LinkStatus(Message, frozen=True, kw_only=True):
-    """1 Hz: the state of the MAVLink connection."""
+    """State of the MAVLink connection, at 1 Hz."""
 
     connected: bool
     autopilot: str  # "ardupilot", "px4", "none", ...
     sysid: int
     sent: int
     received: int
-    bad: int  # bytes that belonged to no packet
-    refused: int = 0  # packets without the signature that is asked for
+    bad: int  # bytes that are not part of a valid packet
+    refused: int = 0  # packets without the required signature
     time_offset_ms: float | None
     detail: str = ""
 
 
 class GnssReading(Message, frozen=True, kw_only=True):
-    """What a GNSS receiver of the autopilot says, at its arrival; to be judged, and never to navigate by in flight."""
+    """Position report of a GNSS receiver of the autopilot, at its arrival; monitored only, not fused in flight."""
 
     receiver: int  # 0 is the autopilot's GPS1
     fix_type: int  # GPS_FIX_TYPE: 3 is 3D
     lat_deg: float | None  # None: no position
     lon_deg: float | None
-    horizontal_m: float | None  # 1-sigma that it claims
+    horizontal_m: float | None  # 1-sigma that the receiver reports
     speed_mps: float | None
     satellites: int | None
 
 
 class GnssStart(Message, frozen=True, kw_only=True):
-    """Where a receiver says that the vehicle stands before take-off, until it is armed; repeated once a second.
+    """Position of the vehicle before take-off from a GNSS receiver, until arming; repeated once a second.
 
-    ``t_ns`` is that of the reading, and of its repetitions. Without a place (None) the one before is withdrawn."""
+    ``t_ns`` is that of the reading, also in its repetitions. Without coordinates (None) the previous one is
+    withdrawn."""
 
     lat_deg: float | None
     lon_deg: float | None
@@ -464,59 +477,61 @@ class GnssStart(Message, frozen=True, kw_only=True):
 
 
 class GnssState(StrEnum):
-    UNKNOWN = "unknown"  # nothing to compare with yet
+    UNKNOWN = "unknown"  # no position to compare with yet
     TRUSTED = "trusted"  # has agreed with the map for long enough
-    LOST = "lost"  # no fix, silent, or useless by its own word
-    SPOOFED = "spoofed"  # says a position that cannot be
-    DISPUTED = "disputed"  # disagrees, but just when our own estimate moved
+    LOST = "lost"  # no fix, no messages, or a reported accuracy too low for use
+    SPOOFED = "spoofed"  # reports an impossible position
+    DISPUTED = "disputed"  # disagrees, but since a jump of our own estimate
 
 
 class GnssVerdict(Message, frozen=True, kw_only=True):
-    """What is thought of a GNSS receiver: on every change, and once a second."""
+    """Assessment of a GNSS receiver, on every change and once a second."""
 
     receiver: int
     state: GnssState
     distance_m: float | None  # from our estimate
-    sigmas: float | None  # the same in standard deviations, when both claims are honest
+    sigmas: float | None  # the distance in standard deviations of both reported covariances
     reason: str = ""
 
 
 class MapOffset(Message, frozen=True, kw_only=True):
-    """How far off the map is, as a receiver that is trusted shows it; on every change. ``t_ns``: of what was learnt."""
+    """Registration error of the map, estimated from a trusted GNSS receiver, on every change.
 
-    map_sigma_m: float  # which map: what it states of itself, 1-sigma per horizontal axis
-    lat_deg: float  # where it was learnt last
+    ``t_ns``: time of the estimate."""
+
+    map_sigma_m: float  # identifies the map: its stated error, 1-sigma per horizontal axis
+    lat_deg: float  # position of the last update
     lon_deg: float
-    # Error of the map east and north [m], of the receiver [m], age of its readings less what is assumed [s]
+    # Error of the map east and north [m], of the receiver [m], latency of its readings less the assumed latency [s]
     state: tuple[float, ...]
     cov: tuple[float, ...]  # 5x5, row-major
 
 
 class PositionSource(Message, frozen=True, kw_only=True):
-    """The autopilot is to fly on us (``vision``), or on its GNSS ``receiver`` again."""
+    """Command to the autopilot to navigate by Terrafix (``vision``), or by its GNSS ``receiver`` again."""
 
     vision: bool
     receiver: int
 
 
 class FilterStatus(Message, frozen=True, kw_only=True):
-    """What the autopilot's filter says of itself (EKF_STATUS_REPORT, PX4: ESTIMATOR_STATUS): whether our position
-    arrives in it."""
+    """Status of the autopilot's EKF (EKF_STATUS_REPORT, PX4: ESTIMATOR_STATUS), which shows whether it fuses our
+    position."""
 
     flags: int  # EKF_STATUS_FLAGS
-    position_ratio: float  # horizontal innovation by its gate: 1 is the limit
+    position_ratio: float  # horizontal innovation over its gate (test ratio): 1 is the limit
     velocity_ratio: float
 
 
 class WallClock(Message, frozen=True, kw_only=True):
-    """Said by the link's edge: Unix time at ``t_ns``, for the GPS week. ``unix_ns`` None: no clock is plausible."""
+    """Unix time at ``t_ns`` from the edge of the link, for the GPS week. ``unix_ns`` None: no clock is plausible."""
 
     unix_ns: int | None
     source: str  # "system", "autopilot", "none"
 
 
 class StatusText(Message, frozen=True, kw_only=True):
-    """A line for the pilot's screen, sent as MAVLink STATUSTEXT (253)."""
+    """A text for the pilot's display, sent as MAVLink STATUSTEXT (253)."""
 
     severity: int  # MAV_SEVERITY: 2 critical, 4 warning, 5 notice, 6 info
     text: str  # at most 50 characters
@@ -531,25 +546,25 @@ class TemperatureZone(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ThermalReading(Message, frozen=True, kw_only=True):
-    """1 Hz: what the sensors of the computer say, unjudged; Health is made of it."""
+    """Raw readings of the computer's temperature sensors, at 1 Hz; Health is derived from them."""
 
     zones: list[TemperatureZone]
-    throttling: list[str]  # cooling devices that slow a processor down right now
+    throttling: list[str]  # cooling devices that currently throttle a processor
     disk_free_mb: int | None
 
 
 class Health(Message, frozen=True, kw_only=True):
-    """1 Hz: temperature, throttle and disk."""
+    """Temperature, throttling and free disk space of the computer, at 1 Hz."""
 
     band: ThermalBand
-    temperature_c: float | None  # hottest zone; None: no zone readable
+    temperature_c: float | None  # hottest zone; None: no readable zone
     throttled: bool
     disk_free_mb: int | None
-    cause: str  # why the band is what it is
+    cause: str  # reason of the band
 
 
 class ProcessEvent(Message, frozen=True, kw_only=True):
-    """Said by the supervisor: a process started, died, was restarted or gave up."""
+    """A process started, died, was restarted or given up; published by the supervisor."""
 
     process: str
     event: str  # "started", "died", "stuck", "restarted", "gave_up", "stopped"
@@ -557,7 +572,7 @@ class ProcessEvent(Message, frozen=True, kw_only=True):
 
 
 class Dropped(Message, frozen=True, kw_only=True):
-    """Said by the shell: a queue overflowed and messages were lost."""
+    """Messages lost to a queue overflow; published by the shell of a process."""
 
     process: str
     message: str
@@ -582,6 +597,7 @@ AnyMessage = (
     | NavEstimate
     | CalibrationFault
     | SlowErrors
+    | ClaimBudget
     | Refinement
     | MeasurementVerdict
     | GpsInput

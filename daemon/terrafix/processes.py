@@ -1,7 +1,7 @@
-"""Who runs and who hears what: the process table.
+"""The process table: which processes run, and which messages each one subscribes to and publishes.
 
-A process is a node (a function of messages) in a shell that owns clock, sockets and files. ``module`` is
-named by string and imported in the child, so that one broken import cannot take the supervisor down."""
+A process is a node (a function of messages) in a shell that owns clock, sockets and files. ``module`` is the name of a
+module that is imported in the child process, so that a failing import does not end the supervisor."""
 
 from dataclasses import dataclass
 
@@ -11,20 +11,20 @@ from terrafix import messages as m
 @dataclass(frozen=True)
 class Process:
     name: str
-    module: str  # has make_node(ctx: NodeContext) -> Node; may have make_edge(ctx) -> Edge (its sockets and files)
+    module: str  # defines make_node(ctx: NodeContext) -> Node and optionally make_edge(ctx) -> Edge (sockets, files)
     subscribes: tuple[type[m.Message], ...]
     publishes: tuple[type[m.Message], ...]
-    tick_hz: float  # how often tick() is called; 0 = only messages
-    stuck_after_s: float  # no progress for this long counts as dead
-    newest: tuple[type[m.Message], ...] = ()  # a backlog of these becomes the newest one (see runtime/inbox.py)
+    tick_hz: float  # rate of tick(); 0 = tick() is not called
+    stuck_after_s: float  # a process without progress for this long is killed and restarted
+    newest: tuple[type[m.Message], ...] = ()  # types of which only the newest is kept in the queue (runtime/inbox.py)
 
 
-# Who else speaks.
-SOURCE = "source"  # who "says" what is fed into the in-process shell
-SUPERVISOR = "supervisor"  # says ProcessEvent
-OPERATOR = "operator"  # a command on this computer that says PositionHint; seldom there
+# Publishers besides the processes of the table.
+SOURCE = "source"  # publisher of the messages that are fed into the in-process shell
+SUPERVISOR = "supervisor"  # publishes ProcessEvent
+OPERATOR = "operator"  # a command on this computer that publishes PositionHint; usually not running
 
-EVERYTHING: tuple[type[m.Message], ...] = (
+ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.Origin,
     m.Frame,
     m.VehicleState,
@@ -42,6 +42,7 @@ EVERYTHING: tuple[type[m.Message], ...] = (
     m.NavEstimate,
     m.CalibrationFault,
     m.SlowErrors,
+    m.ClaimBudget,
     m.Refinement,
     m.MeasurementVerdict,
     m.GpsInput,
@@ -60,9 +61,9 @@ EVERYTHING: tuple[type[m.Message], ...] = (
     m.Dropped,
 )
 
-# Start order is this order; stop order is the reverse, so the recorder hears the last word of everybody.
+# Processes start in this order and stop in the reverse order, so that the recorder receives the last messages of all.
 PROCESSES: tuple[Process, ...] = (
-    Process("recorder", "terrafix.recorder.node", EVERYTHING, (), 1.0, 15.0),
+    Process("recorder", "terrafix.recorder.node", ALL_MESSAGES, (), 1.0, 15.0),
     Process("health", "terrafix.health.node", (), (m.ThermalReading, m.Health), 1.0, 15.0),
     Process(
         "link",
@@ -85,14 +86,22 @@ PROCESSES: tuple[Process, ...] = (
             m.WallClock,
             m.StatusText,
         ),
-        50.0,  # GPS_INPUT leaves at 10 Hz; the finer tick keeps its interval steady
+        50.0,  # GPS_INPUT is sent at 10 Hz; the finer tick reduces the jitter of its interval
         2.0,
     ),
     Process(
         "estimator",
         "terrafix.estimator.node",
         (m.Origin, m.Start, m.Frame, m.VehicleState, m.Imu, m.Coasted, m.Odometry, m.MapMatch, m.Health, m.SourceEnded),
-        (m.Prediction, m.NavEstimate, m.CalibrationFault, m.SlowErrors, m.Refinement, m.MeasurementVerdict),
+        (
+            m.Prediction,
+            m.NavEstimate,
+            m.CalibrationFault,
+            m.SlowErrors,
+            m.ClaimBudget,
+            m.Refinement,
+            m.MeasurementVerdict,
+        ),
         0.0,
         20.0,
     ),
@@ -102,7 +111,7 @@ PROCESSES: tuple[Process, ...] = (
         (m.Origin, m.Prediction, m.PositionHint, m.GnssStart),
         (m.MapMatch, m.ModelEvent, m.SearchState, m.HintVerdict, m.Start),
         0.0,
-        90.0,  # one look over a large map takes seconds, and half a minute on a computer that is ten times as busy
+        90.0,  # one correlation over a large map takes seconds, half a minute on a computer with ten times the load
         (m.Prediction,),
     ),
     Process(

@@ -1,4 +1,4 @@
-"""What the GPU and TensorRT of this computer are called, asked of their own libraries: an engine fits only these."""
+"""Names of the GPU and the TensorRT version, from their libraries; a TensorRT engine is valid only for these."""
 
 import ctypes
 
@@ -8,9 +8,9 @@ _NAME_BYTES = 128
 
 
 def gpu_name() -> str | None:
-    """Name of the first CUDA device, for example "Orin"; None: there is no driver or no device.
+    """Name of the first CUDA device, for example "Orin"; None without a driver or device.
 
-    CUDA driver API: cuInit, cuDeviceGet, cuDeviceGetName return 0 when all is well."""
+    CUDA driver API: cuInit, cuDeviceGet, cuDeviceGetName return 0 on success."""
     cuda = _library(CUDA)
     if cuda is None:
         return None
@@ -21,7 +21,7 @@ def gpu_name() -> str | None:
 
 
 def tensorrt_version() -> str | None:
-    """As libnvinfer counts (10.3.0 is 100300, 8.6.1 is 8601); None: the library is not there."""
+    """Version number of libnvinfer (10.3.0 is 100300, 8.6.1 is 8601); None without the library."""
     nvinfer = _library(TENSORRT)
     return None if nvinfer is None else str(nvinfer.getInferLibVersion())
 

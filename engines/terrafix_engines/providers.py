@@ -1,7 +1,7 @@
-"""How a model is run: TensorRT, then CUDA, then the CPU, and why one of them cannot.
+"""ONNX Runtime execution providers: TensorRT, then CUDA, then the CPU, and why one is not available.
 
-TensorRT compiles an engine for one model, one TensorRT, one GPU, one precision and one set of sizes, which takes
-minutes: engines are made on the ground (`terrafix models build`) and only loaded in flight."""
+TensorRT compiles an engine per model, TensorRT version, GPU, precision and set of sizes, which takes minutes: engines
+are built on the ground (`terrafix models build`) and only loaded in flight."""
 
 import json
 import re
@@ -9,45 +9,45 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from terrafix_engines import gpu
-from terrafix_engines.manifest import Preset, Tensor, shape_of
+from terrafix_engines.manifest import Preset, Tensor, concrete_shape
 
 TENSORRT, CUDA, CPU = "TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"
 PREFERENCE = (TENSORRT, CUDA, CPU)
-READY = "ready.json"  # written when an engine has answered once: what was cut off while it was built has none
-# One arena grows by what is asked and not by powers of two: on a Jetson the GPU's memory is everybody's.
+READY = "ready.json"  # written after the first successful run of an engine; missing after an interrupted build
+# The arena grows by the requested size, not by powers of two: on a Jetson the GPU shares the system's memory.
 CUDA_OPTIONS = {"arena_extend_strategy": "kSameAsRequested", "cudnn_conv_algo_search": "HEURISTIC"}
 
 Shapes = tuple[tuple[int, ...], ...]  # of all inputs
-Chain = list[str | tuple[str, dict[str, str]]]  # as InferenceSession wants its providers
+Chain = list[str | tuple[str, dict[str, str]]]  # the ``providers`` argument of InferenceSession
 
 
 class UnavailableError(Exception):
-    """This provider cannot run this model here, and why."""
+    """The provider cannot run the model on this computer; the message says why."""
 
 
 @dataclass(frozen=True)
-class PassedOver:
-    """A provider that does not run the model, or does no longer."""
+class RejectedProvider:
+    """A provider that cannot run the model, or failed while running it."""
 
     provider: str
     reason: str
 
     def __str__(self) -> str:
-        return f"{short(self.provider)}: {self.reason}"
+        return f"{short_name(self.provider)}: {self.reason}"
 
 
-def short(provider: str) -> str:
-    """The name that people use."""
+def short_name(provider: str) -> str:
+    """Common name of a provider."""
     return {TENSORRT: "TensorRT", CUDA: "CUDA", CPU: "CPU"}.get(provider, provider)
 
 
 def check(provider: str) -> None:
-    """Raises UnavailableError when this computer cannot use the provider for any model."""
-    import onnxruntime as ort  # only where a model is opened (runtime.py)
+    """Raises UnavailableError when the computer cannot use the provider for any model."""
+    import onnxruntime as ort  # deferred until a model is opened (runtime.py)
 
     available = ort.get_available_providers()
     if provider not in available:
-        has = ", ".join(short(p) for p in PREFERENCE if p in available)
+        has = ", ".join(short_name(p) for p in PREFERENCE if p in available)
         raise UnavailableError(f"this ONNX Runtime ({ort.__version__}) is built without it, it has {has}")
     if provider == CPU:
         return
@@ -57,8 +57,8 @@ def check(provider: str) -> None:
         raise UnavailableError("the library libnvinfer cannot be loaded")
 
 
-def chain(provider: str, options: dict[str, str] | None = None) -> Chain:
-    """The provider and those that take what it cannot compute."""
+def provider_chain(provider: str, options: dict[str, str] | None = None) -> Chain:
+    """The provider, followed by the fallbacks for operators that it does not support."""
     if provider == CPU:
         return [CPU]
     cuda: Chain = [(CUDA, CUDA_OPTIONS), CPU]
@@ -66,7 +66,7 @@ def chain(provider: str, options: dict[str, str] | None = None) -> Chain:
 
 
 def engine_folder(root: Path, sha256: str, preset: Preset) -> Path:
-    """Where the engine of a model with this checksum lies: below ``root``, one folder for each thing that it fits."""
+    """Engine folder below ``root``: one per model, TensorRT and ONNX Runtime version, GPU, precision and sizes."""
     import onnxruntime as ort
 
     gpu_name = re.sub(r"[^A-Za-z0-9]+", "-", gpu.gpu_name() or "none")
@@ -76,7 +76,7 @@ def engine_folder(root: Path, sha256: str, preset: Preset) -> Path:
 
 
 def is_ready(folder: Path) -> bool:
-    """There is an engine, and it was built to the end: ONNX Runtime would build a missing one without a word."""
+    """True when an engine exists and its build was completed; ONNX Runtime would silently build a missing one."""
     return (folder / READY).is_file() and any(folder.glob("*.engine"))
 
 
@@ -85,8 +85,8 @@ def mark_ready(folder: Path, preset: Preset) -> None:
 
 
 def tensorrt_options(folder: Path, preset: Preset, inputs: tuple[Tensor, ...]) -> dict[str, str]:
-    """One engine with these sizes and no others (onnxruntime.ai: TensorRT Execution Provider, Configurations)."""
-    profile = ",".join(f"{t.name}:{'x'.join(str(n) for n in shape_of(t, preset.sizes))}" for t in inputs)
+    """Options for one engine of exactly these sizes (onnxruntime.ai: TensorRT Execution Provider, Configurations)."""
+    profile = ",".join(f"{t.name}:{'x'.join(str(n) for n in concrete_shape(t, preset.sizes))}" for t in inputs)
     return {
         "trt_engine_cache_enable": "True",
         "trt_engine_cache_path": str(folder),

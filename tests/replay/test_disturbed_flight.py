@@ -1,4 +1,4 @@
-"""A real flight with a frame from 350 m away in it, and five frames missing in a turn: AC-3 and AC-4 on real ground."""
+"""A recorded flight with a foreign frame from 350 m away, and with five frames missing in a turn (AC-3, AC-4)."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,46 +7,47 @@ import numpy as np
 import pytest
 
 from terrafix.messages import SearchStep
-from terrafix_tools.accept import faults, measures
-from terrafix_tools.accept.evidence import gather
+from terrafix_tools.accept.faults import faults
 from terrafix_tools.accept.flight import open_flight
-from terrafix_tools.accept.judged import Marks
+from terrafix_tools.accept.measuring import measures
+from terrafix_tools.accept.measuring.evidence import gather
+from terrafix_tools.accept.measuring.judged import Marks
 from terrafix_tools.replay import replay
 
 FRAMES = 85
-WRONG_BEFORE, TURN = 40, range(56, 61)  # frames of village-1: on a straight leg; within a turn of 65 degrees
+INSERTED_BEFORE, TURN = 40, range(56, 61)  # frames of village-1: on a straight leg; in a turn of 65 degrees
 FAR_M = 350.0
 
 
 @pytest.mark.slow
-def test_a_far_frame_is_refused_and_a_gap_in_a_turn_is_survived(
+def test_a_foreign_frame_is_rejected_and_a_gap_in_a_turn_is_bridged(
     data_set: Callable[[str], Path], tmp_path: Path
 ) -> None:
     folder = data_set("flights/village-1")
     data_set("maps/village-2014-01.tif")
     flight = open_flight(str(folder), None, None, folder / "truth.csv", None)
     track_m = flight.track_m()
-    away_m = np.hypot(*(track_m - track_m[WRONG_BEFORE]).T)
+    away_m = np.hypot(*(track_m - track_m[INSERTED_BEFORE]).T)
     far = int(np.argmax(away_m >= FAR_M))
     assert away_m[far] >= FAR_M
-    before = flight.stops[WRONG_BEFORE].file
-    wrong = faults.foreign_frames({before: flight.picture(far)})
-    gap = faults.without(frozenset(flight.stops[i].file for i in TURN))
+    next_file = flight.frame_refs[INSERTED_BEFORE].file
+    inserted = faults.foreign_frames({next_file: flight.picture(far)})
+    gap = faults.without_frames(frozenset(flight.frame_refs[i].file for i in TURN))
     replay(
         folder,
         None,
         tmp_path,
-        altered=lambda source: faults.AlteredSource(
-            source, lambda shots: gap(wrong(shots)), frames=FRAMES, origin=faults.same_origin
+        wrap_source=lambda source: faults.AlteredSource(
+            source, lambda shots: gap(inserted(shots)), frames=FRAMES, origin=faults.unchanged_origin
         ),
     )
-    marks = Marks(wrong_files=frozenset({faults.foreign_name(before)}))
-    seen = gather(tmp_path, flight.truth, marks)
-    assert len(seen.frames) == FRAMES + 1 - len(TURN)
-    assert measures.wrong_rejected(seen).value == 1.0
-    after_m = measures.error_after_wrong(seen).value
+    marks = Marks(wrong_files=frozenset({faults.foreign_name(next_file)}))
+    evidence = gather(tmp_path, flight.truth, marks)
+    assert len(evidence.frames) == FRAMES + 1 - len(TURN)
+    assert measures.wrong_rejected(evidence).value == 1.0
+    after_m = measures.error_after_wrong(evidence).value
     assert after_m is not None and after_m < 50.0
-    assert seen.metrics["within_50m"] == 1.0 and seen.metrics["within_20m"] >= 0.8
-    assert seen.metrics["false_fixes"] == 0 and seen.metrics["ellipse95_coverage"] >= 0.9
-    assert seen.metrics["odometry_rate"] > 0.95  # the gap costs no fragment: what is left still overlaps
-    assert {frame.match.step for frame in seen.frames if frame.match} <= {SearchStep.NORMAL, SearchStep.SKIP}
+    assert evidence.metrics["within_50m"] == 1.0 and evidence.metrics["within_20m"] >= 0.8
+    assert evidence.metrics["false_fixes"] == 0 and evidence.metrics["ellipse95_coverage"] >= 0.9
+    assert evidence.metrics["odometry_rate"] > 0.95  # the gap starts no new fragment: the remaining frames overlap
+    assert {frame.match.step for frame in evidence.frames if frame.match} <= {SearchStep.NORMAL, SearchStep.SKIP}

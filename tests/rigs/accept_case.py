@@ -1,4 +1,4 @@
-"""A made-up flight for the tests of acceptance: straight north, estimates with known errors, a record that says so."""
+"""A synthetic flight for the acceptance tests: straight north, estimates with known errors, and its record."""
 
 import json
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix.recorder.writer import FlightWriter, header
-from terrafix_tools.accept.evidence import Evidence, gather
-from terrafix_tools.accept.judged import Marks
+from terrafix_tools.accept.measuring.evidence import Evidence, gather
+from terrafix_tools.accept.measuring.judged import Marks
 from terrafix_tools.estimates import ESTIMATES, RowTable, write_rows
 from terrafix_tools.evaluate import Truth
 
@@ -35,19 +35,19 @@ PLACE = LocalFrame(48.0, 11.0)
 CAMERA = Camera(width=960, height=540, fx=500.0, fy=500.0, cx=479.5, cy=269.5)
 STEP_M, STEP_S = 10.0, 0.5
 UNMARKED = Marks()
-LEVEL = (0.0, 1.0, 0.0, 0.0)  # some rotation: straight down
+LOOKING_DOWN = (0.0, 1.0, 0.0, 0.0)  # q_w_c, w first
 
 
 @dataclass(frozen=True)
-class Said:
-    """What was said of one frame."""
+class FrameCase:
+    """Messages about one frame, by their errors."""
 
     error_m: float = 1.0  # east
-    late_s: float = 0.0  # the estimate is of so much before the stamp of the frame
+    late_s: float = 0.0  # time of the estimate before the stamp of the frame
     sigma_m: float = 5.0
     label: SourceLabel = SourceLabel.SATELLITE_ANCHORED
     fixed: bool = True
-    predicted_error_m: float = 0.0  # east, before the fix
+    predicted_error_m: float = 0.0  # of the prediction before the map fix
     mode: CovarianceMode = CovarianceMode.MARGINALS
     odometry: Verdict = Verdict.ACCEPTED
 
@@ -57,19 +57,20 @@ def file_of(i: int) -> str:
 
 
 def true_m(i: int) -> tuple[float, float]:
+    """-> true east, north of frame i."""
     return 0.0, i * STEP_M
 
 
-def evidence(out: Path, frames: Sequence[Said], marks: Marks = UNMARKED, **gathered: object) -> Evidence:
-    """As a replay would have left it."""
+def evidence(out: Path, frames: Sequence[FrameCase], marks: Marks = UNMARKED, **gathered: object) -> Evidence:
+    """Evidence as of a replay."""
     out.mkdir(exist_ok=True)
     messages: list[Message] = [
         Origin(
             t_ns=0, camera=CAMERA, lat_deg=48.0, lon_deg=11.0, ground_amsl_m=0.0, start_sigma_m=10.0,
             yaw_sigma_deg=3.0, agl_sigma_m=3.0, attitude_sigma_deg=1.0)
     ]  # fmt: skip
-    for i, said in enumerate(frames):
-        messages += _frame(i, said)
+    for i, case in enumerate(frames):
+        messages += _frame(i, case)
     poses = [
         RefinedPose(frame_id=i, lat_deg=48.0, lon_deg=11.0, alt_amsl_m=0.0, sigma_e_m=1.0, sigma_n_m=1.0)
         for i in range(len(frames))
@@ -92,24 +93,24 @@ def evidence(out: Path, frames: Sequence[Said], marks: Marks = UNMARKED, **gathe
     return gather(out, truth, marks, **gathered)  # type: ignore[arg-type]
 
 
-def _frame(i: int, said: Said) -> list[Message]:
+def _frame(i: int, case: FrameCase) -> list[Message]:
     t_ns = round(i * STEP_S * 1e9)
     e_m, n_m = true_m(i)
-    lat_deg, lon_deg = PLACE.to_wgs84(e_m + said.error_m, n_m - said.late_s * STEP_M / STEP_S)
-    answer = Verdict.ACCEPTED if said.fixed else Verdict.WEAK_PEAK
-    cov = tuple(float(v) for v in (np.eye(6) * said.sigma_m**2).ravel())
+    lat_deg, lon_deg = PLACE.to_wgs84(e_m + case.error_m, n_m - case.late_s * STEP_M / STEP_S)
+    match_verdict = Verdict.ACCEPTED if case.fixed else Verdict.FEW_INLIERS
+    cov = tuple(float(v) for v in (np.eye(6) * case.sigma_m**2).ravel())
     return [
         Frame(t_ns=t_ns, frame_id=i, file=file_of(i), width=960, height=540),
-        Odometry(t_ns=t_ns, frame_id=i, keyframe_id=0, verdict=said.odometry),
-        MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="odometry", verdict=said.odometry),
+        Odometry(t_ns=t_ns, frame_id=i, keyframe_id=0, verdict=case.odometry),
+        MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="odometry", verdict=case.odometry),
         Prediction(
-            t_ns=t_ns, frame_id=i, p_c_in_w_m=(e_m + said.predicted_error_m, n_m, 100.0), q_w_c=LEVEL, cov=cov,
+            t_ns=t_ns, frame_id=i, p_c_in_w_m=(e_m + case.predicted_error_m, n_m, 100.0), q_w_c=LOOKING_DOWN, cov=cov,
             agl_m=100.0, agl_sigma_m=2.0, step_m=(0.0, STEP_M), step_cov_m2=(1.0, 0.0, 0.0, 1.0)),
-        MapMatch(t_ns=t_ns, frame_id=i, verdict=answer, matcher="gradient"),
-        MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="map", verdict=answer),
+        MapMatch(t_ns=t_ns, frame_id=i, verdict=match_verdict, matcher="gradient"),
+        MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="map", verdict=match_verdict),
         NavEstimate(
-            t_ns=t_ns - round(said.late_s * 1e9), frame_id=i, lat_deg=lat_deg, lon_deg=lon_deg,
+            t_ns=t_ns - round(case.late_s * 1e9), frame_id=i, lat_deg=lat_deg, lon_deg=lon_deg,
             alt_amsl_m=100.0, agl_m=100.0,
             velocity_enu_mps=(0.0, 20.0, 0.0), velocity_sigma_mps=1.0, q_w_b=(1.0, 0.0, 0.0, 0.0), cov=cov,
-            source_label=said.label, covariance_mode=said.mode, last_anchor_age_ms=0, emitted_at_ns=t_ns),
+            source_label=case.label, covariance_mode=case.mode, last_anchor_age_ms=0, emitted_at_ns=t_ns),
     ]  # fmt: skip

@@ -1,4 +1,5 @@
-"""What the autopilot's tests share: a vehicle in steady flight with nearly perfect sensors, and GPS_INPUT to choose."""
+"""Rig of the tests of the simulated autopilot: a vehicle in steady flight with almost perfect sensors, and GPS_INPUT
+with adjustable errors."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +22,7 @@ FRAME = LocalFrame(LAT, LON)
 
 @dataclass(frozen=True)
 class Gps:
-    """A GPS_INPUT as a good sender makes it; the position is the truth plus ``north_m``."""
+    """Fields of GPS_INPUT; the defaults are those of a healthy sender. Position: the truth plus ``north_m``."""
 
     north_m: float = 0.0
     hacc: float = 1.0
@@ -34,14 +35,15 @@ class Gps:
     velocity: tuple[float, float, float] | None = None  # None: the true one
     ignore: int = 0
     gps_id: int = 0
-    late_s: float = 0.0
+    late_s: float = 0.0  # age of the position
 
 
 Given = Callable[[float], "Gps | None"]
 
 
 class Rig:
-    """``fly`` for some seconds with a GPS; then look at ``autopilot``, ``error_m`` and ``texts``."""
+    """``fly`` runs the autopilot for some seconds with a GPS. Results: ``autopilot``, ``error_m``, ``texts``, and
+    ``received``, all MAVLink messages of the autopilot."""
 
     def __init__(
         self,
@@ -69,23 +71,25 @@ class Rig:
         self.t_s = 0.0
         self._next_gps_s = 0.0
         self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
-        self._ears = mavlink.MAVLink(None)
-        self.heard: list[Any] = []
+        self._parser = mavlink.MAVLink(None)
+        self.received: list[Any] = []
 
     def truth(self, t_s: float) -> np.ndarray:
+        """-> (3,) true position, ENU."""
         return np.array([*(self.velocity[:2] * t_s), HEIGHT_M])
 
     def fly(self, seconds: float, gps: Gps | Given | None = None, *, until: Callable[[], bool] | None = None) -> float:
-        """``until``: stop earlier when this holds. -> seconds flown."""
+        """``gps``: GPS_INPUT, or a function of the seconds since this call; None: not sent. ``until``: ends the run
+        early when it is true. -> seconds flown."""
         began_s = self.t_s
         for _ in range(round(seconds / STEP_S)):
             self.t_s = round(self.t_s + STEP_S, 6)
             self.autopilot.step(self.t_s, self._readings())
-            wanted = gps(self.t_s - began_s) if callable(gps) else gps
-            if wanted is not None and self.t_s >= self._next_gps_s - 1e-9:
-                self._next_gps_s = max(self._next_gps_s + 1.0 / wanted.rate_hz, self.t_s)
-                self.send(self._message(wanted))
-            self.heard += self._ears.parse_buffer(self.autopilot.transmit()) or []
+            sent = gps(self.t_s - began_s) if callable(gps) else gps
+            if sent is not None and self.t_s >= self._next_gps_s - 1e-9:
+                self._next_gps_s = max(self._next_gps_s + 1.0 / sent.rate_hz, self.t_s)
+                self.send(self._message(sent))
+            self.received += self._parser.parse_buffer(self.autopilot.transmit()) or []
             if until is not None and until():
                 break
         return self.t_s - began_s
@@ -94,32 +98,33 @@ class Rig:
         self.autopilot.receive(bytes(message.pack(self._mav)), self.t_s)
         self._mav.seq = (self._mav.seq + 1) % 256
 
-    def ask(self, message: Any, kind: str) -> list[Any]:
-        """What the autopilot answers at once."""
+    def request(self, message: Any, kind: str) -> list[Any]:
+        """Sends a message -> the immediate replies of a type."""
         self.autopilot.transmit()
         self.send(message)
-        return [m for m in self._ears.parse_buffer(self.autopilot.transmit()) or [] if m.get_type() == kind]
+        return [m for m in self._parser.parse_buffer(self.autopilot.transmit()) or [] if m.get_type() == kind]
 
     def error_m(self) -> float:
         return float(np.hypot(*self.error_en_m()))
 
     def error_en_m(self) -> np.ndarray:
-        believed = self.autopilot.navigation()
-        assert believed is not None
-        return believed.p_b_in_w_m[:2] - self.truth(self.t_s)[:2]
+        """-> (2,) error of the autopilot's position, east and north."""
+        navigation = self.autopilot.navigation()
+        assert navigation is not None
+        return navigation.p_b_in_w_m[:2] - self.truth(self.t_s)[:2]
 
     def north_m(self) -> float:
-        """How much of a false position to the north it believes."""
+        """-> error of the autopilot's position to the north."""
         return float(self.error_en_m()[1])
 
     def texts(self) -> list[str]:
-        return [text for _, text in self.autopilot.wire.said]
+        return [text for _, text in self.autopilot.wire.sent_texts]
 
     def flags(self) -> int:
         return self.autopilot.status.flags(running=self.autopilot.ekf is not None)
 
     def last(self, kind: str) -> Any:
-        return [m for m in self.heard if m.get_type() == kind][-1]
+        return [m for m in self.received if m.get_type() == kind][-1]
 
     def _readings(self) -> Readings:
         force = rot_w_b(self.yaw, 0.0, 0.0).T @ np.array([0.0, 0.0, GRAVITY])
@@ -166,14 +171,15 @@ GOOD = Gps()
 
 
 def real_fix(lat_deg: float = LAT, lon_deg: float = LON, *, fix_type: int = 3, satellites: int = 14) -> GnssFix:
-    """A healthy receiver."""
+    """A fix of a healthy GNSS receiver."""
     return GnssFix(fix_type, lat_deg, lon_deg, HEIGHT_M, (0.0, 0.0, 0.0), 0.5, 0.8, 0.2, satellites, 0.8)
 
 
 def at_5_hz(fix: Callable[[float], GnssFix | None]) -> Callable[[float], GnssFix | None]:
-    """A receiver's rhythm."""
+    """``fix`` at the rate of a receiver: None between the fixes."""
     return lambda t_s: fix(t_s) if round(t_s / STEP_S) % 10 == 0 else None
 
 
 def changed(**changes: Any) -> Gps:
+    """GOOD with other fields."""
     return replace(GOOD, **changes)

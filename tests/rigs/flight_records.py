@@ -1,4 +1,4 @@
-"""Records and folders of a short made-up flight, for the tests of recorder, evaluation and report."""
+"""Record and truth of a short synthetic flight, for the tests of recorder, evaluation and report."""
 
 import math
 from pathlib import Path
@@ -79,21 +79,23 @@ def gps_input(t_ns: int, fix_type: int = 3) -> m.GpsInput:
 
 
 def live_messages(frames: int = 20) -> list[m.Message]:
-    """A flight to the east at 10 m/s: no position for the first frame, every fifth map match rejected, a kill."""
-    said: list[m.Message] = [origin()]
+    """A flight to the east at 10 m/s: the first frame has no position, every fifth map match is rejected, and the link
+    is killed once."""
+    messages: list[m.Message] = [origin()]
     for i in range(frames):
         t_ns = i * PERIOD_NS
-        said.append(frame(i))
+        messages.append(frame(i))
         matched = m.Verdict.ACCEPTED if i % 5 else m.Verdict.AMBIGUOUS
-        said.append(m.MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="map", verdict=matched))
+        messages.append(m.MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="map", verdict=matched))
         if i:
-            said.append(estimate(i, 5.0 * i + 1.0, 2.0, age_ms=0 if i % 5 else 500))
-        said += [gps_input(t_ns + k * 100_000_000, 1 if i == 0 else 3) for k in range(5) if not (i == 10 and k)]
+            messages.append(estimate(i, 5.0 * i + 1.0, 2.0, age_ms=0 if i % 5 else 500))
+        messages += [gps_input(t_ns + k * 100_000_000, 1 if i == 0 else 3) for k in range(5) if not (i == 10 and k)]
         band = m.ThermalBand.HOT if i > 15 else m.ThermalBand.NORMAL
-        said.append(m.Health(t_ns=t_ns, band=band, temperature_c=60.0 + i, throttled=False, disk_free_mb=1, cause=""))
-    said.append(m.ProcessEvent(t_ns=10 * PERIOD_NS, process="link", event="died", detail="signal 9 <kill>"))
-    said.append(m.Dropped(t_ns=11 * PERIOD_NS, process="vision", message="Frame", count=3))
-    return said
+        health = m.Health(t_ns=t_ns, band=band, temperature_c=60.0 + i, throttled=False, disk_free_mb=1, cause="")
+        messages.append(health)
+    messages.append(m.ProcessEvent(t_ns=10 * PERIOD_NS, process="link", event="died", detail="signal 9 <kill>"))
+    messages.append(m.Dropped(t_ns=11 * PERIOD_NS, process="vision", message="Frame", count=3))
+    return messages
 
 
 def write_record(path: Path, messages: list[m.Message]) -> None:
@@ -101,12 +103,13 @@ def write_record(path: Path, messages: list[m.Message]) -> None:
     for message in messages:
         writer.write(message, message.t_ns)
         if isinstance(message, m.Frame):
-            picture = np.full((48, 64, 3), message.frame_id * 5 % 255, np.uint8)
-            writer.write_thumbnail(message.t_ns, message.frame_id, thumbnail_jpeg(picture, 32))
+            thumbnail = np.full((48, 64, 3), message.frame_id * 5 % 255, np.uint8)
+            writer.write_thumbnail(message.t_ns, message.frame_id, thumbnail_jpeg(thumbnail, 32))
     writer.close()
 
 
 def write_truth(path: Path, frames: int = 20) -> None:
+    """Writes truth.csv of ``live_messages``."""
     lines = ["file,lat_deg,lon_deg,agl_m,yaw_deg"]
     for i in range(frames):
         lat_deg, lon_deg = ORIGIN.to_wgs84(5.0 * i, 0.0)

@@ -1,4 +1,4 @@
-"""Readings of a GNSS receiver with known errors, and a watch that is fed with them."""
+"""Readings of a GNSS receiver with known errors, and a link that is fed with them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,11 +11,11 @@ from terrafix.link.node import LinkNode
 READING_AGE_NS = 150 * MS
 
 
-Where = Callable[[float], tuple[float, float] | None]  # s -> error east, north of the receiver, m; None: no fix
+Where = Callable[[float], tuple[float, float] | None]  # s -> receiver's error east, north [m]; None: no fix
 
 
 def reading(t_ns: int, error: tuple[float, float] | None, **changes: Any) -> m.GnssReading:
-    """A receiver on the vehicle of link_rig: flies east at 20 m/s; its reading is 150 ms old."""
+    """Reading of a receiver on the vehicle of link_rig, which flies east at 20 m/s. It is 150 ms old."""
     fields: dict[str, Any] = {"t_ns": t_ns, "receiver": 0, "fix_type": 3, "satellites": 14, "horizontal_m": 1.3}
     fields |= {"speed_mps": SPEED_EAST, "lat_deg": None, "lon_deg": None}
     if error is None:
@@ -26,7 +26,7 @@ def reading(t_ns: int, error: tuple[float, float] | None, **changes: Any) -> m.G
     return m.GnssReading(**fields | changes)
 
 
-def watched(
+def feed_receiver(
     node: LinkNode,
     seconds: float,
     where: Where,
@@ -35,17 +35,19 @@ def watched(
     ours: Callable[[float], float] = lambda _: 0.0,
     **claims: Any,
 ) -> list[m.Message]:
-    """Readings at 5 Hz, estimates at 2 Hz with error ``ours`` (m east), the link's ticks."""
-    heard: list[m.Message] = []
+    """-> messages of a link that gets readings at 5 Hz with the error ``where``, and estimates at 2 Hz with the error
+    ``ours`` [m east]."""
+    published: list[m.Message] = []
     for step in range(round(begin_s * 50), round((begin_s + seconds) * 50)):
         now_ns, t_s = step * 20 * MS, step * 0.02
         if step % 25 == 5:
-            heard += node.on(estimate(now_ns - 100 * MS, east_m=ours(t_s), **claims))
+            published += node.on(estimate(now_ns - 100 * MS, east_m=ours(t_s), **claims))
         if step % 10 == 0:
-            heard += node.on(reading(now_ns, where(t_s)))
-        heard += node.tick(now_ns)
-    return heard
+            published += node.on(reading(now_ns, where(t_s)))
+        published += node.tick(now_ns)
+    return published
 
 
-def right(_: float) -> tuple[float, float]:
+def accurate(_: float) -> tuple[float, float]:
+    """Errors of a receiver that is not spoofed."""
     return 1.0, -1.0

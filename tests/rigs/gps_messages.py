@@ -1,4 +1,4 @@
-"""GPS_INPUT messages that several tests of the link share."""
+"""A GpsInput without a fix."""
 
 from terrafix.messages import GpsInput
 

@@ -1,4 +1,5 @@
-"""A simulated plane with the sensors of a real autopilot, and what odometry and anchor would say of its pictures."""
+"""A simulated plane with the sensors of an autopilot, and the odometry and map matches of its
+frames."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,7 +7,6 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from ground import apply, homography
 from simulated_flight import CAMERA, FIX_SIGMAS, PAIRS, PLACE, ROOFS, SIGMA_NORM
 from simulated_flight import ORIGIN as STEADY_ORIGIN
 from terrafix.core.camera import Mount
@@ -18,6 +18,7 @@ from terrafix.messages import (
     Imu,
     ImuSample,
     MapMatch,
+    MeasurementVerdict,
     Message,
     NavEstimate,
     Odometry,
@@ -30,6 +31,7 @@ from terrafix_tools.mission.mission import Box
 from terrafix_tools.sim.sensors.suite import VehicleSensors
 from terrafix_tools.sim.vehicle.plane import Plane
 from terrafix_tools.sim.vehicle.wind import Wind
+from textured_ground import apply, homography
 
 STEP_S, FRAME_EVERY, STATE_EVERY, BATCH = 0.02, 50, 2, 3
 FIX_EVERY = 4
@@ -38,7 +40,10 @@ ORIGIN = msgspec.structs.replace(STEADY_ORIGIN, yaw_sigma_deg=3.0, agl_sigma_m=3
 
 
 class InertialFlight:
-    """One frame a second. ``said[i]``: what came since the frame before, the pictures' messages last."""
+    """One frame per second. ``messages_by_frame[i]``: telemetry since the previous frame, then odometry and map match.
+
+    Truth per frame: ``poses`` (R_w_c, position of the camera in ENU relative to the start coordinate),
+    ``velocity_mps`` (ENU)."""
 
     def __init__(self, seed: int, seconds: int = 70) -> None:
         rng = np.random.default_rng([seed, 78])
@@ -48,54 +53,56 @@ class InertialFlight:
         tilt = np.radians(rng.normal(0.0, CAMERA.mount_tolerance_deg / 2, 2))
         mount = Mount.of(CAMERA).r_b_c() @ exp_so3(np.array([*tilt, 0.0]))
         start = plane.state.p_b_in_w_m[:2] + rng.normal(0.0, ORIGIN.start_sigma_m, 2)
-        self.poses: list[tuple[np.ndarray, np.ndarray]] = []  # R_w_c and position of the camera at each frame
+        self.poses: list[tuple[np.ndarray, np.ndarray]] = []
         self.velocity_mps: list[np.ndarray] = []
-        self.said: list[list[Message]] = []
-        waiting: list[Message] = []
+        self.messages_by_frame: list[list[Message]] = []
+        telemetry: list[Message] = []
         batch: list[tuple[int, np.ndarray]] = []
         for i in range(round(seconds / STEP_S)):
             state = plane.step(STEP_S, None) if i else plane.state
-            shown, t_ns = sensors.read(state), round(state.t_s * 1e9)
+            readings, t_ns = sensors.read(state), round(state.t_s * 1e9)
             if i % STATE_EVERY == 0:
-                waiting.append(
+                telemetry.append(
                     VehicleState(
                         t_ns=t_ns,
                         source="simulated",
-                        yaw_rad=shown.yaw_rad,
-                        pitch_rad=shown.pitch_rad,
-                        roll_rad=shown.roll_rad,
-                        agl_m=shown.baro_amsl_m,
+                        yaw_rad=readings.yaw_rad,
+                        pitch_rad=readings.pitch_rad,
+                        roll_rad=readings.roll_rad,
+                        agl_m=readings.baro_amsl_m,
                         armed=True,
-                        airspeed_mps=shown.airspeed_mps,
+                        airspeed_mps=readings.airspeed_mps,
                     )
                 )
-            batch.append((t_ns, np.concatenate([shown.accel_b_mps2, shown.gyro_b_radps])))
+            batch.append((t_ns, np.concatenate([readings.accel_b_mps2, readings.gyro_b_radps])))
             if len(batch) == BATCH:
                 samples: list[ImuSample] = [(t_ns - at_ns, *values.tolist()) for at_ns, values in batch]
-                waiting.append(Imu(t_ns=t_ns, source="simulated", samples=samples))
+                telemetry.append(Imu(t_ns=t_ns, source="simulated", samples=samples))
                 batch = []
             if i % FRAME_EVERY == 0:
                 self.poses.append((state.r_w_b() @ mount, state.p_b_in_w_m - np.array([*start, 0.0])))
                 self.velocity_mps.append(state.velocity_enu_mps)
-                frame_id = len(self.said)
-                said = [*waiting, self._odometry(frame_id, t_ns, rng)]
+                frame_id = len(self.messages_by_frame)
+                messages = [*telemetry, self._odometry(frame_id, t_ns, rng)]
                 if frame_id and frame_id % FIX_EVERY == 0:
-                    said.append(self._fix(frame_id, t_ns, rng))
-                self.said.append(said)
-                waiting = []
+                    messages.append(self._fix(frame_id, t_ns, rng))
+                self.messages_by_frame.append(messages)
+                telemetry = []
 
     def _odometry(self, i: int, t_ns: int, rng: np.random.Generator) -> Odometry:
         if i == 0:
             return Odometry(t_ns=t_ns, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
         keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
-        seen = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
-        there = apply(homography(self.poses[keyframe], self.poses[i]), seen) + rng.normal(0.0, SIGMA_NORM, seen.shape)
+        keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
+        frame_xy = apply(homography(self.poses[keyframe], self.poses[i]), keyframe_xy) + rng.normal(
+            0.0, SIGMA_NORM, keyframe_xy.shape
+        )
         return Odometry(
             t_ns=t_ns,
             frame_id=i,
             keyframe_id=keyframe,
             verdict=Verdict.ACCEPTED,
-            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([seen, there])],
+            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
             sigma_norm=SIGMA_NORM,
             inliers=PAIRS,
             tracked=PAIRS,
@@ -124,13 +131,14 @@ class InertialFlight:
 
 @dataclass(frozen=True)
 class Flown:
-    """One row for each frame: the last estimate that was said of it; errors are east, north (, up)."""
+    """One row per frame: the last published estimate. Errors are estimate minus truth, ENU."""
 
-    said: list[NavEstimate]
+    estimates: list[NavEstimate]
     position_error_m: np.ndarray  # (N, 2)
     position_sigma_m: np.ndarray  # (N, 2)
     velocity_error_mps: np.ndarray  # (N, 3)
     velocity_sigma_mps: np.ndarray  # (N,)
+    verdicts: list[MeasurementVerdict]  # all of the flight
 
 
 def flown(
@@ -145,37 +153,46 @@ def flown(
     no_camera: tuple[int, int] = (0, 0),
     frames: int = 1000,
 ) -> Flown:
-    """``blind``: frames in which nothing is seen. ``no_imu``: seconds of which no inertial reading came.
-    ``iced``: share of the airspeed that the sensor reads in the blind frames.
-    ``no_camera``: frames that nobody took."""
+    """Runs an EstimatorNode on the first ``frames`` frames of a flight.
+
+    ``imu``, ``airspeed``: the telemetry has them. ``blind``: frames (first, end) without tracked features and map
+    match. ``no_imu``: interval (begin, end) [s] without inertial readings. ``iced``: scale factor of the airspeed
+    sensor in the blind frames. ``no_camera``: frames (first, end) that are missing."""
     node = EstimatorNode()
     cause = Health(t_ns=0, band=band, temperature_c=60.0, throttled=False, disk_free_mb=1000, cause="test")
     for message in (ORIGIN, cause):
         assert list(node.on(message)) == []
     last: dict[int, NavEstimate] = {}
-    for i, said in enumerate(flight.said[:frames]):
-        for message in _heard(said, imu, range(*blind), i, no_imu):
+    verdicts: list[MeasurementVerdict] = []
+    for i, messages in enumerate(flight.messages_by_frame[:frames]):
+        for message in _with_outages(messages, imu, range(*blind), i, no_imu):
             if isinstance(message, VehicleState):
                 read_mps = (message.airspeed_mps or 0.0) * (iced if i in range(*blind) else 1.0)
                 message = msgspec.structs.replace(message, airspeed_mps=read_mps if airspeed else None)
             if i in range(*no_camera) and isinstance(message, (Odometry, MapMatch)):
                 continue
-            for answer in node.on(message):
-                if isinstance(answer, NavEstimate):
-                    last[answer.frame_id] = answer
+            for reply in node.on(message):
+                if isinstance(reply, NavEstimate):
+                    last[reply.frame_id] = reply
+                elif isinstance(reply, MeasurementVerdict):
+                    verdicts.append(reply)
     rows = [last[i] for i in sorted(last)]
-    place = [np.array([*PLACE.to_local(e.lat_deg, e.lon_deg)]) - flight.poses[e.frame_id][1][:2] for e in rows]
+    errors_m = [np.array([*PLACE.to_local(e.lat_deg, e.lon_deg)]) - flight.poses[e.frame_id][1][:2] for e in rows]
     return Flown(
         rows,
-        np.array(place),
+        np.array(errors_m),
         np.sqrt(np.array([[e.cov[0], e.cov[7]] for e in rows])),
         np.array([e.velocity_enu_mps for e in rows]) - np.array([flight.velocity_mps[e.frame_id] for e in rows]),
         np.array([e.velocity_sigma_mps for e in rows]),
+        verdicts,
     )
 
 
-def _heard(said: list[Message], imu: bool, blind: range, i: int, no_imu: tuple[float, float]) -> Iterable[Message]:
-    for message in said:
+def _with_outages(
+    messages: list[Message], imu: bool, blind: range, i: int, no_imu: tuple[float, float]
+) -> Iterable[Message]:
+    """The messages of frame i as they arrive with these outages (see ``flown``)."""
+    for message in messages:
         if isinstance(message, Imu) and (not imu or no_imu[0] <= message.t_ns * 1e-9 < no_imu[1]):
             continue
         if i in blind and isinstance(message, MapMatch):

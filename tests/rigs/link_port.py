@@ -1,4 +1,4 @@
-"""Real sockets on loopback for the link's tests: a port that it listens at, and those who speak to it."""
+"""Real sockets on loopback for the link's tests: the listening port of an edge, and senders of MAVLink packets."""
 
 import socket
 import time
@@ -12,11 +12,11 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge, open_edge
 
-ARRIVES_S = 0.005  # loopback
+ARRIVES_S = 0.005  # time for delivery over loopback
 
 
 class Speaker:
-    """One sender: a system and component at an address of its own."""
+    """One sender of MAVLink packets: a system and component with its own socket."""
 
     def __init__(self, sysid: int, compid: int = 1, *, port: int = 0) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -24,7 +24,7 @@ class Speaker:
         self.socket.setblocking(False)
         self.address: tuple[str, int] = self.socket.getsockname()
         self.mav = mavlink.MAVLink(None, srcSystem=sysid, srcComponent=compid)
-        self._ear = mavlink.MAVLink(None)
+        self._parser = mavlink.MAVLink(None)
 
     def __enter__(self) -> Self:
         return self
@@ -36,18 +36,18 @@ class Speaker:
         for message in messages:
             self.socket.sendto(packed(message, self.mav), to)
 
-    def heard(self, kind: str = "") -> list[Any]:
-        """Everything that has come since the last call."""
+    def received(self, kind: str = "") -> list[Any]:
+        """-> messages received since the last call; only those of type ``kind``, if given."""
         time.sleep(ARRIVES_S)
         found = []
         while True:
             try:
-                found.append(self._ear.decode(bytearray(self.socket.recv(4096))))
+                found.append(self._parser.decode(bytearray(self.socket.recv(4096))))
             except BlockingIOError:
                 return [x for x in found if not kind or x.get_type() == kind]
 
     def kinds(self) -> set[str]:
-        return {x.get_type() for x in self.heard()}
+        return {x.get_type() for x in self.received()}
 
 
 def free_port() -> int:
@@ -56,28 +56,29 @@ def free_port() -> int:
 
 
 class Port:
-    """The edge, listening; ``hears`` sends to it and polls."""
+    """A listening edge. ``published``: all messages of its polls."""
 
     def __init__(self, edge: MavlinkEdge, address: tuple[str, int]) -> None:
         self.edge, self.address = edge, address
-        self.said: list[m.Message] = []
+        self.published: list[m.Message] = []
 
     def receives(self, now_ns: int, speaker: Speaker, *messages: Any) -> list[m.Message]:
+        """Sends the messages to the edge, and polls it."""
         speaker.send(self.address, *messages)
         return self.poll(now_ns)
 
     def poll(self, now_ns: int) -> list[m.Message]:
         time.sleep(ARRIVES_S)
-        said = list(self.edge.poll(now_ns))
-        self.said += said
-        return said
+        published = list(self.edge.poll(now_ns))
+        self.published += published
+        return published
 
     def detail(self) -> str:
-        """Of the newest LinkStatus."""
-        return [x for x in self.said if isinstance(x, m.LinkStatus)][-1].detail
+        """-> detail of the newest LinkStatus."""
+        return [x for x in self.published if isinstance(x, m.LinkStatus)][-1].detail
 
     def texts(self) -> list[str]:
-        return [x.text for x in self.said if isinstance(x, m.StatusText)]
+        return [x.text for x in self.published if isinstance(x, m.StatusText)]
 
 
 def listening(**changes: Any) -> Port:

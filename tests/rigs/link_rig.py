@@ -1,4 +1,4 @@
-"""What the link's tests share: estimates of a vehicle on a straight line, and the shell's loop in a few lines."""
+"""Rig of the link's tests: estimates of a vehicle on a straight line, and simplified loops of the shell."""
 
 import gc
 import math
@@ -35,7 +35,7 @@ def estimate(
     velocity_sigma: float = 0.5,
     **changes: object,
 ) -> m.NavEstimate:
-    """A vehicle that flies east at 20 m/s through LAT, LON at t = 0; ``east_m`` is the estimate's error."""
+    """Estimate of a vehicle that flies east at 20 m/s through LAT, LON at t = 0. ``east_m``: error to the east."""
     lat, lon = offset(LAT, LON, SPEED_EAST * t_ns / S + east_m, 0.0)
     fields: dict[str, object] = dict(
         t_ns=t_ns,
@@ -60,17 +60,18 @@ Feed = Callable[[int], list[m.Message]]
 
 
 def fly(node: LinkNode, start_ns: int, end_ns: int, feed: Feed, step_ns: int = TICK_NS) -> list[m.Message]:
-    """Ticks at 50 Hz; ``feed(now_ns)`` gives the messages that arrive before each tick. -> all that was said."""
-    said: list[m.Message] = []
+    """Ticks the node at 50 Hz in simulated time. ``feed(now_ns)``: messages that arrive before a tick. -> all published
+    messages."""
+    published: list[m.Message] = []
     for now_ns in range(start_ns, end_ns, step_ns):
         for message in feed(now_ns):
-            said += node.on(message)
-        said += node.tick(now_ns)
-    return said
+            published += node.on(message)
+        published += node.tick(now_ns)
+    return published
 
 
 def every(period_ns: int, make: Callable[[int], m.Message], late_ns: int = 100 * MS) -> Feed:
-    """``make(t_ns)`` once a period, arriving ``late_ns`` after ``t_ns``."""
+    """-> a feed of ``make(t_ns)`` once per period, which arrives ``late_ns`` after ``t_ns``."""
 
     def feed(now_ns: int) -> list[m.Message]:
         t_ns = now_ns - late_ns
@@ -79,41 +80,41 @@ def every(period_ns: int, make: Callable[[int], m.Message], late_ns: int = 100 *
     return feed
 
 
-def gps(said: list[m.Message]) -> list[m.GpsInput]:
-    return [x for x in said if isinstance(x, m.GpsInput)]
+def gps(published: list[m.Message]) -> list[m.GpsInput]:
+    return [x for x in published if isinstance(x, m.GpsInput)]
 
 
-def texts(said: list[m.Message]) -> list[str]:
-    return [x.text for x in said if isinstance(x, m.StatusText)]
+def texts(published: list[m.Message]) -> list[str]:
+    return [x.text for x in published if isinstance(x, m.StatusText)]
 
 
 def east_error_m(sent: m.GpsInput) -> float:
-    """Error of a sent position against the straight line, at the time it is for."""
+    """-> error of a sent position to the east, at its time."""
     true_lat, true_lon = offset(LAT, LON, SPEED_EAST * sent.t_ns / S, 0.0)
     return (sent.lon_deg - true_lon) * 111_320.0 * math.cos(math.radians(true_lat))
 
 
 def live(node: LinkNode, edge: MavlinkEdge, seconds: float, feed: Feed = lambda _: []) -> list[m.Message]:
-    """The live shell's loop in small: real time, the real edge. -> all that was said and read."""
-    gc.freeze()  # as the shell does: to collect all that a run of tests has made would stop the loop for 150 ms
-    said: list[m.Message] = []
+    """Runs the loop of the live shell in real time with the real edge. -> all published and received messages."""
+    gc.freeze()  # as the shell does: a collection of the objects of all earlier tests takes 150 ms
+    published: list[m.Message] = []
     until_ns = time.monotonic_ns() + round(seconds * S)
     next_tick_ns = 0
     while (now_ns := time.monotonic_ns()) < until_ns:
         for message in feed(now_ns):
-            said += _offer(edge, list(node.on(message)))
+            published += _pass_to_edge(edge, list(node.on(message)))
         for message in edge.poll(now_ns):
-            said.append(message)
-            said += _offer(edge, list(node.on(message)))
+            published.append(message)
+            published += _pass_to_edge(edge, list(node.on(message)))
         if now_ns >= next_tick_ns:
             next_tick_ns = now_ns - now_ns % TICK_NS + TICK_NS
-            said += _offer(edge, list(node.tick(now_ns)))
+            published += _pass_to_edge(edge, list(node.tick(now_ns)))
         time.sleep(0.001)
     gc.unfreeze()
-    return said
+    return published
 
 
-def _offer(edge: MavlinkEdge, messages: list[m.Message]) -> list[m.Message]:
+def _pass_to_edge(edge: MavlinkEdge, messages: list[m.Message]) -> list[m.Message]:
     for message in messages:
-        edge.heard(message)
+        edge.on_message(message)
     return messages

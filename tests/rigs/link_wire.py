@@ -1,4 +1,4 @@
-"""A wire in memory for the link's edge, and the packets of an autopilot."""
+"""A transport in memory for the link's edge, and MAVLink packets of an autopilot."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,18 +10,18 @@ from terrafix.link.mavlink.transport import Address, Chunk
 
 
 class MemoryWire:
-    """A Transport: ``arrive`` is what the other side sends, ``sent`` what we sent."""
+    """A Transport. ``arrive``: adds received bytes; ``sent``: the packets that the edge has sent."""
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
-        self._coming: list[bytes] = []
+        self._received: list[bytes] = []
 
     def arrive(self, *chunks: bytes) -> None:
-        self._coming += chunks
+        self._received += chunks
 
     def read(self) -> list[Chunk]:
-        coming, self._coming = self._coming, []
-        return [(chunk, None) for chunk in coming]
+        received, self._received = self._received, []
+        return [(chunk, None) for chunk in received]
 
     def write(self, packet: bytes, to: Address | None = None) -> bool:
         self.sent.append(packet)
@@ -31,11 +31,11 @@ class MemoryWire:
         pass
 
     def take(self, kind: str = "") -> list[Any]:
-        """What we sent since the last call, decoded."""
+        """-> messages sent since the last call, decoded; only those of type ``kind``, if given."""
         sent, self.sent = self.sent, []
-        ear = mavlink.MAVLink(None)
-        heard = [ear.decode(bytearray(packet)) for packet in sent]
-        return [x for x in heard if not kind or x.get_type() == kind]
+        parser = mavlink.MAVLink(None)
+        messages = [parser.decode(bytearray(packet)) for packet in sent]
+        return [x for x in messages if not kind or x.get_type() == kind]
 
 
 def packed(message: Any, mav: mavlink.MAVLink) -> bytes:
@@ -52,5 +52,5 @@ def attitude(boot_ms: int, yaw: float = 1.0) -> Any:
     return mavlink.MAVLink_attitude_message(boot_ms, 0.1, 0.2, yaw, 0, 0, 0)
 
 
-def states(said: Iterable[m.Message]) -> list[m.VehicleState]:
-    return [x for x in said if isinstance(x, m.VehicleState)]
+def states(messages: Iterable[m.Message]) -> list[m.VehicleState]:
+    return [x for x in messages if isinstance(x, m.VehicleState)]

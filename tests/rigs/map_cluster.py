@@ -1,4 +1,4 @@
-"""A Dask cluster of real processes on this machine, for tests: scheduler, workers, and the way to kill one."""
+"""A Dask cluster of real processes on this machine: scheduler and workers, which tests can kill."""
 
 import json
 import subprocess
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-DEADLINE_S = 120.0  # machines are slow and shared
+DEADLINE_S = 120.0  # for the start of the scheduler; long, because the machine may be busy
 
 
 class LocalCluster:
@@ -27,7 +27,7 @@ class LocalCluster:
         for number in range(workers):
             folder_of_worker = folder / f"worker-{number}"
             folder_of_worker.mkdir()
-            # Without a nanny, so that one that is killed stays away.
+            # Without a nanny, which would restart a killed worker.
             options = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(folder_of_worker))
             self._start("worker", self.address, *options)
 

@@ -1,4 +1,4 @@
-"""Vector features of a small map."""
+"""Vector features of a small map, as WKB geometries."""
 
 import struct
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ def line(points: list[tuple[float, float]]) -> bytes:
 
 
 def polygon(*rings: list[tuple[float, float]]) -> bytes:
-    """Big endian, to see that both orders are read."""
+    """-> WKB in big endian; the other geometries are little endian, so that both byte orders are read."""
     body = b"".join(struct.pack(">I", len(r)) + b"".join(struct.pack(">2d", *p) for p in r) for r in rings)
     return struct.pack(">BII", 0, 3, len(rings)) + body
 

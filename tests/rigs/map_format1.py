@@ -1,4 +1,4 @@
-"""A package as the first release wrote it: imagery of 120 by 100 pixels at 0.5 m, elevation on a plane."""
+"""A map package of format 1 (first release): imagery of 120 by 100 pixels at 0.5 m, planar elevation."""
 
 import gzip
 from pathlib import Path

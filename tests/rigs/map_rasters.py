@@ -1,4 +1,4 @@
-"""Small generated GeoTIFFs for the tests of the map builder and reader."""
+"""Small generated GeoTIFFs for the tests of map builder and map reader."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from rasterio.transform import Affine
 
 
 def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
-    """(3, height, width) uint8 RGB, smooth and rich, never 0 or 255."""
+    """-> (3, height, width) uint8 RGB: smooth noise of several scales, without the values 0 and 255."""
     rng = np.random.default_rng(seed)
     image = np.zeros((height, width, 3), np.float32)
     for sigma_px, weight in ((2.5, 1.0), (12.0, 1.2), (40.0, 1.0)):
@@ -21,7 +21,7 @@ def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 
 def write_tif(path: Path, bands: np.ndarray, crs: str | None, transform: Affine | None, **profile: Any) -> Path:
-    """Writes (count, height, width); what `colorinterp`, `colormap` and `nodata` say goes into the file."""
+    """Writes bands (count, height, width). ``profile``: of rasterio, and also ``colorinterp`` and ``colormap``."""
     interpretation = profile.pop("colorinterp", None)
     palette = profile.pop("colormap", None)
     if transform is not None:
@@ -46,5 +46,5 @@ def write_tif(path: Path, bands: np.ndarray, crs: str | None, transform: Affine 
 
 
 def utm(path: Path, bands: np.ndarray, crs: str = "EPSG:32651", pixel_m: float = 0.5, **profile: Any) -> Path:
-    """A GeoTIFF whose top left corner is at 300 km, 2 600 km of its zone."""
+    """Writes a GeoTIFF whose top left corner is at easting 300 km, northing 2 600 km."""
     return write_tif(path, bands, crs, Affine(pixel_m, 0, 300_000.0, 0, -pixel_m, 2_600_000.0), **profile)

@@ -1,4 +1,4 @@
-"""Small HTTP servers on this machine that speak the protocols of map servers, and misbehave on demand."""
+"""Small HTTP servers on this machine with the protocols of map servers, and with errors that tests choose."""
 
 import threading
 import time
@@ -18,18 +18,19 @@ TILE_PX = 256
 
 @dataclass
 class Reply:
-    """``promised``: what Content-Length says, when that is not the truth. ``delay_s``: before anything is said."""
+    """``content_length``: value of the header if it differs from the length of the body. ``delay_s``: delay of the
+    whole reply."""
 
     status: int = 200
     body: bytes = b""
     headers: dict[str, str] = field(default_factory=dict)
-    promised: int | None = None
+    content_length: int | None = None
     delay_s: float = 0.0
 
 
 @dataclass
-class Asked:
-    """One request, as a server saw it."""
+class Request:
+    """One request as the server received it. ``at_s``: monotonic time."""
 
     method: str
     path: str
@@ -39,13 +40,14 @@ class Asked:
 
 
 class Server:
-    """``answer(asked) -> Reply`` for every request. ``asked`` has them all."""
+    """Replies to every request with ``answer(request)``. ``requests``: all received ones; ``completed``: number of
+    complete replies of status 200, by path; ``max_concurrent``: largest number of requests in progress."""
 
-    def __init__(self, answer: Callable[[Asked], Reply]) -> None:
-        self.asked: list[Asked] = []
-        self.answered: Counter[str] = Counter()  # whole answers of status 200, by path
-        self.most_at_once = 0
-        self._at_once = 0
+    def __init__(self, answer: Callable[[Request], Reply]) -> None:
+        self.requests: list[Request] = []
+        self.completed: Counter[str] = Counter()
+        self.max_concurrent = 0
+        self._concurrent = 0
         self._lock = threading.Lock()
         self._stop = threading.Event()
         owner = self
@@ -72,38 +74,38 @@ class Server:
         self._http.shutdown()
         self._http.server_close()
 
-    def serve(self, handler: BaseHTTPRequestHandler, answer: Callable[[Asked], Reply]) -> None:
+    def serve(self, handler: BaseHTTPRequestHandler, answer: Callable[[Request], Reply]) -> None:
         body = handler.rfile.read(int(handler.headers.get("Content-Length", 0)))
-        asked = Asked(handler.command, handler.path, dict(handler.headers), body, time.monotonic())
+        request = Request(handler.command, handler.path, dict(handler.headers), body, time.monotonic())
         with self._lock:
-            self.asked.append(asked)
-            self._at_once += 1
-            self.most_at_once = max(self.most_at_once, self._at_once)
+            self.requests.append(request)
+            self._concurrent += 1
+            self.max_concurrent = max(self.max_concurrent, self._concurrent)
         try:
-            reply = answer(asked)
+            reply = answer(request)
             self._stop.wait(reply.delay_s)
             handler.send_response(reply.status)
             for name, value in reply.headers.items():
                 handler.send_header(name, value)
             if reply.status != 204:
-                length = len(reply.body) if reply.promised is None else reply.promised
+                length = len(reply.body) if reply.content_length is None else reply.content_length
                 handler.send_header("Content-Length", str(length))
             handler.end_headers()
             handler.wfile.write(reply.body)
-            if reply.promised is not None:
+            if reply.content_length is not None:
                 handler.close_connection = True
             elif reply.status == 200:
                 with self._lock:
-                    self.answered[asked.path] += 1
+                    self.completed[request.path] += 1
         except (BrokenPipeError, ConnectionResetError):
             handler.close_connection = True
         finally:
             with self._lock:
-                self._at_once -= 1
+                self._concurrent -= 1
 
 
 @contextmanager
-def serving(answer: Callable[[Asked], Reply]) -> Iterator[Server]:
+def serving(answer: Callable[[Request], Reply]) -> Iterator[Server]:
     server = Server(answer)
     try:
         yield server
@@ -117,27 +119,28 @@ def mercator(lon_deg: float, lat_deg: float) -> tuple[float, float]:
 
 
 class Pyramid:
-    """An image in EPSG:3857 whose corner is that of a tile, cut into tiles of one zoom."""
+    """An image in EPSG:3857, aligned with the tile grid, as tiles of one zoom level. ``column``, ``row``: first
+    tile."""
 
     def __init__(self, image: np.ndarray, zoom: int, column: int, row: int, side: int = TILE_PX) -> None:
         self.image, self.zoom, self.column, self.row, self.side = image, zoom, column, row, side
 
     def tile(self, zoom: int, column: int, row: int, suffix: str = ".png") -> bytes | None:
-        """None outside the image."""
+        """-> encoded tile; None outside the image and at other zoom levels."""
         r, c = (row - self.row) * self.side, (column - self.column) * self.side
         inside = 0 <= r < self.image.shape[0] and 0 <= c < self.image.shape[1]
         if zoom != self.zoom or not inside:
             return None
         return cv2.imencode(suffix, self.image[r : r + self.side, c : c + self.side])[1].tobytes()
 
-    def answer(self, asked: Asked) -> Reply:
-        """/z/x/y.png"""
-        z, x, y = asked.path.split("?")[0].rsplit(".", 1)[0].strip("/").split("/")[-3:]
+    def answer(self, request: Request) -> Reply:
+        """Replies to paths ``/z/x/y.png``."""
+        z, x, y = request.path.split("?")[0].rsplit(".", 1)[0].strip("/").split("/")[-3:]
         data = self.tile(int(z), int(x), int(y))
         return Reply(404) if data is None else Reply(body=data, headers={"Content-Type": "image/png"})
 
     def box_deg(self, inset_tiles: float = 0.0) -> str:
-        """The image's box for --area, ``inset_tiles`` inside its border."""
+        """-> bounding box of the image for ``--area``, reduced by ``inset_tiles`` on each side."""
         span_m = 2 * HALF_M / (1 << self.zoom)
         rows, columns = self.image.shape[0] / self.side, self.image.shape[1] / self.side
         x = [(self.column + c) * span_m - HALF_M for c in (inset_tiles, columns - inset_tiles)]
@@ -147,7 +150,7 @@ class Pyramid:
 
 
 def pyramid(rows: int, columns: int, *, zoom: int = 18, lon_deg: float = 13.4, lat_deg: float = 47.1) -> Pyramid:
-    """A smooth random texture of so many tiles around a place; never black or white."""
+    """-> a smooth random texture of ``rows`` by ``columns`` tiles from the tile of a place on, never black or white."""
     rng = np.random.default_rng(7)
     coarse = np.zeros((rows * TILE_PX // 4, columns * TILE_PX // 4, 3), np.float32)
     for sigma_px, weight in ((1.0, 1.0), (4.0, 1.5)):
@@ -156,5 +159,5 @@ def pyramid(rows: int, columns: int, *, zoom: int = 18, lon_deg: float = 13.4, l
     image = cv2.resize(coarse, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
     x, y = mercator(lon_deg, lat_deg)
     span_m = 2 * HALF_M / (1 << zoom)
-    made = np.clip(128 + 35 * image, 5, 250).astype(np.uint8)
-    return Pyramid(made, zoom, int((x + HALF_M) // span_m), int((HALF_M - y) // span_m))
+    pixels = np.clip(128 + 35 * image, 5, 250).astype(np.uint8)
+    return Pyramid(pixels, zoom, int((x + HALF_M) // span_m), int((HALF_M - y) // span_m))

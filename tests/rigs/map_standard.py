@@ -1,8 +1,8 @@
-"""Is a file a GeoPackage by the standard? Says every requirement that it breaks, by its number.
+"""Checks a file against the GeoPackage standard and lists the violated requirements by number.
 
-OGC 12-128r18 (version 1.3.1) with its extensions for WKT of CRS, metadata and R-trees, and OGC 17-066r1 (tiled gridded
-coverages); numbers are those of their requirements.
-Knows nothing of the writer: only SQLite, and OpenCV to look into tiles."""
+Standards: OGC 12-128r18 (version 1.3.1) with its extensions for WKT of CRS, metadata and R-trees, and OGC 17-066r1
+(tiled gridded coverages). The checks are independent of the writer: they use only SQLite, and OpenCV to decode
+tiles."""
 
 import math
 import re
@@ -126,7 +126,7 @@ Find = Callable[..., list[tuple]]
 
 
 def violations(path: Path) -> list[str]:
-    """Empty: by these checks it is a GeoPackage."""
+    """-> one text for each violation; empty: the file passes all checks."""
     db = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
     try:
 
@@ -146,7 +146,7 @@ def _names(find: Find) -> set[str]:
 def _file(path: Path, find: Find) -> Iterator[str]:
     head = path.read_bytes()[:100]
     if head[:16] != b"SQLite format 3\0":
-        yield "1: no SQLite 3 file"
+        yield "1: not an SQLite 3 file"
     if head[68:72] != b"GPKG" or find("PRAGMA user_version")[0][0] not in range(10200, 10500):
         yield "2: application_id or user_version"
     if path.suffix != ".gpkg":
@@ -169,7 +169,7 @@ def _tables(_: Path, find: Find) -> Iterator[str]:
 def _same_columns(table: str, find: Find, wanted: dict[str, tuple[str, int, int]]) -> Iterator[str]:
     found = {row[1]: (row[2], row[3], int(row[5] > 0)) for row in find(f'PRAGMA table_info("{table}")')}
     for column, (kind, required, key) in wanted.items():
-        # The primary key of one INTEGER column is never NULL, whether the table says so or not.
+        # A primary key of one INTEGER column cannot be NULL, with or without NOT NULL in the table definition.
         if column not in found or found[column][::2] != (kind, key) or (not key and found[column][1] != required):
             yield f"annex C: {table}.{column} is {found.get(column)}, not {(kind, required, key)}"
 
@@ -185,7 +185,7 @@ def _contents(_: Path, find: Find) -> Iterator[str]:
     names = _names(find)
     for name, changed in find("SELECT table_name, last_change FROM gpkg_contents"):
         if name not in names:
-            yield f"14: contents names {name}, which is not there"
+            yield f"14: contents lists {name}, which does not exist"
         if not TIME.fullmatch(changed):
             yield f"15: last_change {changed}"
     used = {
@@ -220,14 +220,14 @@ def _extensions(_: Path, find: Find) -> Iterator[str]:
     rows = find("SELECT table_name, column_name, extension_name, definition, scope FROM gpkg_extensions")
     for table, column, name, definition, scope in rows:
         if table is not None and table not in names:
-            yield f"60: extension {name} names {table}, which is not there"
+            yield f"60: extension {name} refers to {table}, which does not exist"
         elif column is not None and column not in {row[1] for row in find(f'PRAGMA table_info("{table}")')}:
-            yield f"61: extension {name} names {table}.{column}, which is not there"
+            yield f"61: extension {name} refers to {table}.{column}, which does not exist"
         if not re.fullmatch(r"[a-zA-Z0-9]+_\w+", name) or not definition:
             yield f"62, 63: extension {name}: {definition}"
         if scope not in ("read-write", "write-only"):
             yield f"64: scope {scope}"
-    said = {row[2]: {(r[0], r[1]) for r in rows if r[2] == row[2]} for row in rows}
+    declared = {row[2]: {(r[0], r[1]) for r in rows if r[2] == row[2]} for row in rows}
     coverages = {row[0] for row in find("SELECT table_name FROM gpkg_contents WHERE data_type = ?", COVERAGE)}
     wanted = {"gpkg_crs_wkt": {("gpkg_spatial_ref_sys", "definition_12_063")}}
     if "gpkg_metadata" in names:
@@ -241,8 +241,8 @@ def _extensions(_: Path, find: Find) -> Iterator[str]:
     if trees:
         wanted["gpkg_rtree_index"] = {(name[len("rtree_") : -len("_geom")], "geom") for name in trees}
     for name, places in wanted.items():
-        if said.get(name) != places:
-            yield f"extension {name} is declared for {said.get(name)}, not {places}"
+        if declared.get(name) != places:
+            yield f"extension {name} is declared for {declared.get(name)}, not {places}"
 
 
 def _tiles(_: Path, find: Find) -> Iterator[str]:
@@ -285,8 +285,8 @@ def _tiles(_: Path, find: Find) -> Iterator[str]:
             if not png and (not jpeg or kind != "tiles"):
                 yield f"36: tile {zoom}/{column}/{row} of {table} is neither PNG nor JPEG"
                 continue
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-            if picture is None or picture.shape[:2] != zooms[zoom][4:2:-1]:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            if image is None or image.shape[:2] != zooms[zoom][4:2:-1]:
                 yield f"49, 50: tile {zoom}/{column}/{row} of {table} does not decode, or has another size"
 
 
@@ -296,7 +296,6 @@ def _features(_: Path, find: Find) -> Iterator[str]:
     if listed and "gpkg_geometry_columns" not in names:
         yield "22: features without gpkg_geometry_columns"
         return
-    triggers = {name for (name,) in find("SELECT name FROM sqlite_master WHERE type = 'trigger'")}
     for table, srs_id in listed:
         columns = find(
             "SELECT column_name, geometry_type_name, srs_id, z, m FROM gpkg_geometry_columns WHERE table_name = ?",
@@ -309,22 +308,42 @@ def _features(_: Path, find: Find) -> Iterator[str]:
             yield f"27: z or m of {table}"
         if [row[5] for row in find(f'PRAGMA table_info("{table}")') if row[2] == "INTEGER"] != [1]:
             yield f"29: {table} has no integer primary key"
-        full = 0
-        for (blob,) in find(f'SELECT "{columns[0][0]}" FROM "{table}"'):
-            if blob[:3] != b"GP\0" or struct.unpack("<i" if blob[3] & 1 else ">i", blob[4:8])[0] != srs_id:
-                yield f"19: a geometry of {table} has no header of GeoPackage"
-            elif not blob[3] & 0x10:  # not empty
-                full += 1
-                if len(blob) <= 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]:
-                    yield f"19: a geometry of {table} has no WKB"
+        geometries = [blob for (blob,) in find(f'SELECT "{columns[0][0]}" FROM "{table}"')]
+        yield from _geometries(table, srs_id, geometries)
         if f"rtree_{table}_geom" in names:
-            if {name.format(table) for name in RTREE} - triggers:
-                yield f"75: triggers of the R-tree of {table}"
-            if find(f'SELECT count(*) FROM "rtree_{table}_geom"') != [(full,)]:
-                yield f"77: the R-tree of {table} has not the {full} features that are not empty"
+            yield from _rtree(
+                table, sum(_has_header(blob, srs_id) and not _is_empty(blob) for blob in geometries), find
+            )
     for (table,) in find("SELECT table_name FROM gpkg_contents WHERE data_type = 'attributes'"):
         if [row[5] for row in find(f'PRAGMA table_info("{table}")') if row[2] == "INTEGER"] != [1]:
             yield f"119: {table} has no integer primary key"
+
+
+def _has_header(blob: bytes, srs_id: int) -> bool:
+    """True for the binary header of GeoPackage with this CRS."""
+    return blob[:3] == b"GP\0" and struct.unpack("<i" if blob[3] & 1 else ">i", blob[4:8])[0] == srs_id
+
+
+def _is_empty(blob: bytes) -> bool:
+    """True for the flag of an empty geometry in the header."""
+    return bool(blob[3] & 0x10)
+
+
+def _geometries(table: str, srs_id: int, geometries: list[bytes]) -> Iterator[str]:
+    for blob in geometries:
+        if not _has_header(blob, srs_id):
+            yield f"19: a geometry of {table} has no header of GeoPackage"
+        elif not _is_empty(blob) and len(blob) <= 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]:
+            yield f"19: a geometry of {table} has no WKB"
+
+
+def _rtree(table: str, features: int, find: Find) -> Iterator[str]:
+    """``features``: number of non-empty features of the table."""
+    triggers = {name for (name,) in find("SELECT name FROM sqlite_master WHERE type = 'trigger'")}
+    if {name.format(table) for name in RTREE} - triggers:
+        yield f"75: triggers of the R-tree of {table}"
+    if find(f'SELECT count(*) FROM "rtree_{table}_geom"') != [(features,)]:
+        yield f"77: the R-tree of {table} does not have the {features} non-empty features"
 
 
 def _coverage(_: Path, find: Find) -> Iterator[str]:
@@ -342,8 +361,8 @@ def _coverage(_: Path, find: Find) -> Iterator[str]:
         if described != {row[0] for row in find(f'SELECT id FROM "{table}"')}:
             yield f"gridded coverage 10 to 12: not every tile of {table} has its ancillary row"
         for (data,) in find(f'SELECT tile_data FROM "{table}"'):
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-            if data[:4] != b"\x89PNG" or picture is None or picture.dtype != np.uint16 or picture.ndim != 2:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            if data[:4] != b"\x89PNG" or image is None or image.dtype != np.uint16 or image.ndim != 2:
                 yield f"gridded coverage 13: a tile of {table} is no grey PNG of 16 bits"
 
 

@@ -1,4 +1,4 @@
-"""The two tables of docs/architecture.md, made from the code. Run this file to write them into the page."""
+"""Generates the two tables of docs/architecture.md from the code. Run this file to write them into the page."""
 
 import re
 from pathlib import Path
@@ -6,41 +6,44 @@ from pathlib import Path
 import msgspec
 
 from terrafix import messages
-from terrafix.processes import EVERYTHING, PROCESSES, SUPERVISOR
+from terrafix.processes import ALL_MESSAGES, PROCESSES, SUPERVISOR
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "architecture.md"
-# Said by the shell and the supervisor, which are not processes of the table.
-ALSO_SAID_BY = {"ProcessEvent": f"the {SUPERVISOR}", "Dropped": "the shell of every process"}
+# Published by the shell and the supervisor, which are not processes of the table.
+OTHER_PUBLISHERS = {"ProcessEvent": f"the {SUPERVISOR}", "Dropped": "the shell of every process"}
 
 
-def processes() -> str:
-    rows = ["| process | subscribes | publishes | ticks | counts as stuck after |", "|---|---|---|---|---|"]
+def process_table() -> str:
+    rows = ["| process | subscribes to | publishes | tick rate | time-out without progress |", "|---|---|---|---|---|"]
     for process in PROCESSES:
-        hears = "everything" if process.subscribes == EVERYTHING else _names(process.subscribes)
-        newest = f" (a backlog of {_names(process.newest)} becomes the newest)" if process.newest else ""
+        subscribes = "all messages" if process.subscribes == ALL_MESSAGES else _names(process.subscribes)
+        newest = f" (of queued {_names(process.newest)} only the newest)" if process.newest else ""
         ticks = f"{process.tick_hz:g} Hz" if process.tick_hz else "-"
-        says = _names(process.publishes)
-        rows.append(f"| `{process.name}` | {hears}{newest} | {says} | {ticks} | {process.stuck_after_s:g} s |")
+        publishes = _names(process.publishes)
+        rows.append(
+            f"| `{process.name}` | {subscribes}{newest} | {publishes} | {ticks} | {process.stuck_after_s:g} s |"
+        )
     return "\n".join(rows)
 
 
-def said() -> str:
-    rows = ["| message | said by | heard by | what it is |", "|---|---|---|---|"]
-    for message in EVERYTHING:
-        by = [p.name for p in PROCESSES if message in p.publishes]
-        by += [ALSO_SAID_BY[message.__name__]] if message.__name__ in ALSO_SAID_BY else []
-        hearers = [p.name for p in PROCESSES if message in p.subscribes and p.subscribes != EVERYTHING]
-        rows.append(f"| {message.__name__} | {', '.join(by)} | {', '.join(hearers) or '-'} | {_purpose(message)} |")
+def message_table() -> str:
+    rows = ["| message | published by | subscribed by | contents |", "|---|---|---|---|"]
+    for message in ALL_MESSAGES:
+        publishers = [p.name for p in PROCESSES if message in p.publishes]
+        publishers += [OTHER_PUBLISHERS[message.__name__]] if message.__name__ in OTHER_PUBLISHERS else []
+        subscribers = [p.name for p in PROCESSES if message in p.subscribes and p.subscribes != ALL_MESSAGES]
+        columns = message.__name__, ", ".join(publishers), ", ".join(subscribers) or "-", _purpose(message)
+        rows.append(f"| {' | '.join(columns)} |")
     return "\n".join(rows)
 
 
 def page(text: str) -> str:
-    """The text of the page with both tables as the code has them now."""
-    for name, table in (("processes", processes()), ("messages", said())):
+    """The text of the page with both tables generated from the code."""
+    for name, table in (("processes", process_table()), ("messages", message_table())):
         text, count = re.subn(
             rf"(<!-- table: {name} -->).*?(<!-- end -->)", lambda m, t=table: f"{m[1]}\n{t}\n{m[2]}", text, flags=re.S
         )
-        assert count == 1, f"{PAGE}: the marks of the table '{name}' are gone"
+        assert count == 1, f"{PAGE}: the marks of the table '{name}' are missing"
     return text
 
 
@@ -49,7 +52,7 @@ def _names(of: tuple[type[messages.Message], ...]) -> str:
 
 
 def _purpose(message: type[msgspec.Struct]) -> str:
-    """First paragraph of the docstring, without the ids of requirements."""
+    """-> first paragraph of the docstring, without requirement ids."""
     first = " ".join((message.__doc__ or "").strip().split("\n\n")[0].split())
     return re.sub(r" \([A-Z]{2}-\d+[^)]*\)", "", first).replace("``", "`")
 

@@ -1,4 +1,4 @@
-"""Small nodes for the tests of shell and supervisor; children import this module by name (see `table`)."""
+"""Small nodes for the tests of shell and supervisor. Child processes import this module by name (see ``TABLE``)."""
 
 import os
 import threading
@@ -14,7 +14,7 @@ from terrafix.core.codec import encode_json
 from terrafix.core.errors import LinkError
 from terrafix.core.frames import FrameWriter
 from terrafix.core.node import Edge, Node, NodeContext
-from terrafix.processes import EVERYTHING, Process
+from terrafix.processes import ALL_MESSAGES, Process
 
 CAMERA = m.Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
 ORIGIN = m.Origin(
@@ -35,7 +35,7 @@ def image_of(frame_id: int) -> np.ndarray:
     return np.full((48, 64, 3), frame_id % 251, np.uint8)
 
 
-class Silent:
+class SilentNode:
     def on(self, message: m.Message) -> Iterable[m.Message]:
         return ()
 
@@ -44,7 +44,8 @@ class Silent:
 
 
 class SourceEdge:
-    """Origin, then frames at 50 Hz: as many as ``config.link.baud`` less 9600 (a number that tests may choose)."""
+    """Publishes the Origin, then frames at 50 Hz. Their number is ``config.link.baud`` minus 9600, because tests can
+    set this value."""
 
     def __init__(self, ctx: NodeContext) -> None:
         assert isinstance(ctx.frames, FrameWriter)
@@ -67,15 +68,16 @@ class SourceEdge:
         self._next_id += 1
         self._next_ns = now_ns + FRAME_PERIOD_NS
 
-    def heard(self, message: m.Message) -> None:
+    def on_message(self, message: m.Message) -> None:
         pass
 
     def close(self) -> None:
         pass
 
 
-class Worker(Silent):
-    """Says for every frame whether it knows the origin and sees the right pixels. ``TROUBLE`` makes it ill once."""
+class Worker(SilentNode):
+    """Publishes for every frame whether it has the origin and the correct pixels. The environment variable ``TROUBLE``
+    makes it fail once."""
 
     def __init__(self, ctx: NodeContext) -> None:
         self._ctx = ctx
@@ -87,14 +89,14 @@ class Worker(Silent):
         if isinstance(message, m.Frame):
             self._maybe_trouble(message.frame_id)
             image = self._ctx.frames.get(message.frame_id)
-            seen = image is not None and np.array_equal(image, image_of(message.frame_id))
-            verdict = m.Verdict.ACCEPTED if seen and self._origin is not None else m.Verdict.BAD_IMAGE
+            pixels_correct = image is not None and np.array_equal(image, image_of(message.frame_id))
+            verdict = m.Verdict.ACCEPTED if pixels_correct and self._origin is not None else m.Verdict.BAD_IMAGE
             yield m.MeasurementVerdict(
                 t_ns=message.t_ns,
                 frame_id=message.frame_id,
                 measurement="test",
                 verdict=verdict,
-                detail=f"pid {os.getpid()} origin {self._origin is not None} pixels {seen}",
+                detail=f"pid {os.getpid()} origin {self._origin is not None} pixels {pixels_correct}",
             )
 
     def _maybe_trouble(self, frame_id: int) -> None:
@@ -108,7 +110,7 @@ class Worker(Silent):
         raise ZeroDivisionError("a bug for the test")
 
 
-class Link(Silent):
+class Link(SilentNode):
     def tick(self, now_ns: int) -> Iterable[m.Message]:
         yield m.LinkStatus(
             t_ns=now_ns, connected=True, autopilot="none", sysid=1, sent=0, received=0, bad=0, time_offset_ms=None
@@ -116,7 +118,7 @@ class Link(Silent):
 
 
 class FileEdge:
-    """Writes every message that it hears as a line, at once."""
+    """Writes every message of the process as a line, unbuffered."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("ab", buffering=0)
@@ -124,7 +126,7 @@ class FileEdge:
     def poll(self, now_ns: int) -> Iterable[m.Message]:
         return ()
 
-    def heard(self, message: m.Message) -> None:
+    def on_message(self, message: m.Message) -> None:
         self._file.write(encode_json(message) + b"\n")
 
     def close(self) -> None:
@@ -137,22 +139,22 @@ def make_node(ctx: NodeContext) -> Node:
         raise ZeroDivisionError("a bug at every start")
     if role == "link" and ctx.config.link.device == "broken":
         raise LinkError("broken: no such device; check --link")
-    return {"estimator": lambda: Worker(ctx), "link": Link}.get(role, Silent)()
+    return {"estimator": lambda: Worker(ctx), "link": Link}.get(role, SilentNode)()
 
 
 def make_edge(ctx: NodeContext) -> Edge | None:
-    edges = {"vision": lambda: SourceEdge(ctx), "recorder": lambda: FileEdge(ctx.out_dir / "heard.jsonl")}
+    edges = {"vision": lambda: SourceEdge(ctx), "recorder": lambda: FileEdge(ctx.out_dir / "received.jsonl")}
     return edges[process_name()]() if process_name() in edges else None
 
 
 def process_name() -> str:
-    """One module stands for all processes: their name is what `ps` shows."""
+    """The process name as in `ps`, because one module implements all processes."""
     return Path("/proc/self/comm").read_text().strip()
 
 
 _BASE = Process("", "runtime_nodes", (), (), 0.0, 5.0)
 TABLE: tuple[Process, ...] = (
-    replace(_BASE, name="recorder", subscribes=EVERYTHING, tick_hz=1.0),
+    replace(_BASE, name="recorder", subscribes=ALL_MESSAGES, tick_hz=1.0),
     replace(_BASE, name="link", subscribes=(m.Origin,), publishes=(m.LinkStatus,), tick_hz=50.0, stuck_after_s=1.0),
     replace(
         _BASE, name="estimator", subscribes=(m.Origin, m.Frame), publishes=(m.MeasurementVerdict,), stuck_after_s=0.7

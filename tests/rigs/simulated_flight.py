@@ -1,7 +1,7 @@
-"""What vision, autopilot and anchor would say of a flight whose truth is known: messages for the estimator.
+"""A simulated flight with known truth: the messages of vision, autopilot and anchor as input of the estimator.
 
-Flat ground at height zero, or hills that no map tells; every error is drawn from the distribution that its message
-claims."""
+The ground is flat at height zero, or has hills that the map does not contain. Every error is drawn from the
+distribution that its message states."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ground import apply, homography
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
 from terrafix.core.pose import exp_so3
@@ -27,13 +26,14 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
+from textured_ground import apply, homography
 
 FRAME_S = 0.5
 SPEED_MPS = 12.0
 PAIRS, SIGMA_NORM = 40, 1.0 / 560.0
 KEYFRAME_EVERY = 3
 PLACE = LocalFrame(48.0, 11.0)
-CAMERA = Camera(  # somebody has calibrated it
+CAMERA = Camera(  # calibrated: focal length to 1 %
     width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, focal_sigma=0.01, mount_tolerance_deg=4.0
 )
 ORIGIN = Origin(
@@ -53,37 +53,38 @@ FIX_SIGMAS = np.array([2.0, 2.0, 3.0, math.radians(1.0), math.radians(1.0), math
 
 @dataclass(frozen=True)
 class Flight:
-    """``messages(i)`` are those of frame i; truth is in ``p_m`` (N, 3), ``yaw_rad`` (N,)."""
+    """``messages(i)`` are those of frame i. Truth: ``p_m`` (N, 3) position of the camera in ENU, ``r_w_b`` and
+    ``r_w_c`` attitudes of body and camera (N of (3, 3)), ``ground_m`` (N,) height of the ground below."""
 
     frames: int
     seed: int = 0
-    fix_every: int = 9  # 54 m: new ground each time
-    knows: frozenset[str] = frozenset({"yaw", "attitude", "height"})
+    fix_every: int = 9  # frames from one map match to the next: 54 m, so that each sees new ground
+    telemetry: frozenset[str] = frozenset({"yaw", "attitude", "height"})  # fields that VehicleState has
     speed_mps: float = SPEED_MPS
-    dem: bool = False  # the map tells that the ground is flat
-    climbs_m: float = 8.0  # half of what it rises and sinks
-    turns_rad: float = 0.0  # by which it turns after a quarter of a minute, within two seconds
-    hovers: bool = False  # every other ten seconds, at once: it brakes and flies off as hard as it can
-    hills_m: float = 0.0  # 1-sigma of ground that rises and falls over a kilometre
+    dem: bool = False  # the map has an elevation model (flat)
+    climb_amplitude_m: float = 8.0  # of the sinusoidal height
+    turn_rad: float = 0.0  # turn from 15 s to 17 s
+    stop_and_go: bool = False  # stops and accelerates within a frame, every 10 s
+    hills_m: float = 0.0  # 1-sigma of the ground height; wavelength 1 km
     ground_m: np.ndarray = field(init=False, repr=False)
     rng_of: np.random.Generator = field(init=False, repr=False)
     p_m: np.ndarray = field(init=False, repr=False)
     r_w_b: list[np.ndarray] = field(init=False, repr=False)
     r_w_c: list[np.ndarray] = field(init=False, repr=False)
-    _said: list[list[Message]] = field(init=False, repr=False)
+    _messages: list[list[Message]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng([self.seed, 77])
         t_s = np.arange(self.frames) * FRAME_S
         heading = 0.5 + np.cumsum(0.10 * np.sin(t_s / 11.0)) * FRAME_S
-        heading += self.turns_rad * np.clip((t_s - 15.0) / 2.0, 0.0, 1.0)
-        speed_mps = self.speed_mps * np.where(self.hovers & (t_s % 20.0 >= 10.0), 0.05, 1.0)
+        heading += self.turn_rad * np.clip((t_s - 15.0) / 2.0, 0.0, 1.0)
+        speed_mps = self.speed_mps * np.where(self.stop_and_go & (t_s % 20.0 >= 10.0), 0.05, 1.0)
         steps = speed_mps[:, None] * FRAME_S * np.column_stack([np.sin(heading), np.cos(heading)])
         start = rng.normal(0.0, ORIGIN.start_sigma_m, 2)
         xy = start + np.vstack([np.zeros(2), np.cumsum(steps[:-1], axis=0)])
-        way = np.arange(self.frames) * self.speed_mps * FRAME_S
-        ground = math.sqrt(2.0) * self.hills_m * (np.cos(way / 160.0 + self.seed) - math.cos(self.seed))
-        up = 100.0 + self.climbs_m * np.sin(t_s / 17.0) + ground  # it follows the ground that it sees
+        path_m = np.arange(self.frames) * self.speed_mps * FRAME_S
+        ground = math.sqrt(2.0) * self.hills_m * (np.cos(path_m / 160.0 + self.seed) - math.cos(self.seed))
+        up = 100.0 + self.climb_amplitude_m * np.sin(t_s / 17.0) + ground  # terrain following
         angles = np.radians(np.column_stack([2.0 * np.sin(t_s / 1.7), 2.5 * np.sin(t_s / 2.3)]))
         tilt = np.radians(rng.normal(0.0, CAMERA.mount_tolerance_deg / 2, 2))
         mount = Mount.of(CAMERA).r_b_c() @ exp_so3(np.array([*tilt, 0.0]))
@@ -97,7 +98,7 @@ class Flight:
         ):
             object.__setattr__(self, name, value)
         yaw_bias, height_bias = np.radians(rng.normal(0.0, 3.0)), rng.normal(0.0, 2.0)
-        said = [
+        messages = [
             [
                 self._state(i, float(heading[i]) + yaw_bias, angles[i], float(up[i]) + height_bias),
                 self._odometry(i),
@@ -105,20 +106,21 @@ class Flight:
             ]
             for i in range(self.frames)
         ]
-        object.__setattr__(self, "_said", said)
+        object.__setattr__(self, "_messages", messages)
 
     def messages(self, i: int) -> list[Message]:
-        return list(self._said[i])
+        return list(self._messages[i])
 
     def all_messages(self) -> Iterator[Message]:
+        """Origin, the messages of all frames, SourceEnded."""
         yield ORIGIN
-        for said in self._said:
-            yield from said
+        for messages in self._messages:
+            yield from messages
         yield SourceEnded(t_ns=t_ns(self.frames - 1), frames=self.frames)
 
     def fix(self, i: int, offset_m: tuple[float, float] = (0.0, 0.0)) -> MapMatch:
-        """A map match of frame i, off by what it claims and by ``offset_m``."""
-        height_m = self.p_m[i, 2] - self.ground_m[i]  # what a picture tells; the map believes the ground to be flat
+        """Map match of frame i, with errors of its covariance and an additional ``offset_m`` (east, north)."""
+        height_m = self.p_m[i, 2] - self.ground_m[i]  # the image shows the height above ground; the map is flat
         warp = np.array([0.0, 0.0, ROOFS * height_m, 0.0, 0.0, 0.0])
         error = self.rng_of.normal(0.0, np.hypot(FIX_SIGMAS, warp))
         p = np.array([*self.p_m[i, :2], height_m]) + error[:3] + (*offset_m, 0.0)
@@ -151,66 +153,69 @@ class Flight:
         return VehicleState(
             t_ns=state.t_ns,
             source=state.source,
-            yaw_rad=state.yaw_rad if "yaw" in self.knows else None,
-            pitch_rad=state.pitch_rad if "attitude" in self.knows else None,
-            roll_rad=state.roll_rad if "attitude" in self.knows else None,
-            agl_m=state.agl_m if "height" in self.knows else None,
+            yaw_rad=state.yaw_rad if "yaw" in self.telemetry else None,
+            pitch_rad=state.pitch_rad if "attitude" in self.telemetry else None,
+            roll_rad=state.roll_rad if "attitude" in self.telemetry else None,
+            agl_m=state.agl_m if "height" in self.telemetry else None,
         )
 
     def _odometry(self, i: int) -> Odometry:
         keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
-        due = i % KEYFRAME_EVERY == 0
+        is_keyframe = i % KEYFRAME_EVERY == 0
         if i == 0:
             return Odometry(t_ns=0, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
         rng = self.rng_of
-        seen = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
+        keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
         below = np.array([0.0, 0.0, self.ground_m[keyframe]])
         matrix = homography((self.r_w_c[keyframe], self.p_m[keyframe] - below), (self.r_w_c[i], self.p_m[i] - below))
-        there = apply(matrix, seen) + rng.normal(0.0, SIGMA_NORM, seen.shape)
+        frame_xy = apply(matrix, keyframe_xy) + rng.normal(0.0, SIGMA_NORM, keyframe_xy.shape)
         return Odometry(
             t_ns=t_ns(i),
             frame_id=i,
             keyframe_id=keyframe,
             verdict=Verdict.ACCEPTED,
-            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([seen, there])],
+            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
             sigma_norm=SIGMA_NORM,
             inliers=PAIRS,
             tracked=PAIRS,
-            becomes_keyframe=due,
+            becomes_keyframe=is_keyframe,
         )
 
 
-class Listener:
-    """Feeds a node and keeps what it says."""
+class EstimatorRun:
+    """Feeds an EstimatorNode and records its messages in ``published``."""
 
     def __init__(self) -> None:
         self.node = EstimatorNode()
-        self.said: list[Message] = []
+        self.published: list[Message] = []
 
-    def hear(self, messages: Iterable[Message]) -> list[Message]:
-        """-> what the node says to these."""
-        answers = [answer for message in messages for answer in self.node.on(message)]
-        self.said += answers
-        return answers
+    def feed(self, messages: Iterable[Message]) -> list[Message]:
+        """-> the messages that the node publishes for these."""
+        published = [reply for message in messages for reply in self.node.on(message)]
+        self.published += published
+        return published
 
-    def fly(self, flight: Flight, first: int, end: int) -> "Listener":
-        """Frames first .. end - 1."""
+    def fly(self, flight: Flight, first: int, end: int) -> "EstimatorRun":
+        """Feeds the frames first .. end - 1, after the Origin if ``first`` is 0."""
         if first == 0:
-            self.hear([ORIGIN])
+            self.feed([ORIGIN])
         for i in range(first, end):
-            self.hear(flight.messages(i))
+            self.feed(flight.messages(i))
         return self
 
     def estimate(self, frame_id: int) -> NavEstimate:
-        """The last one that was said of a frame."""
-        return [m for m in self.said if isinstance(m, NavEstimate) and m.frame_id == frame_id][-1]
+        """-> the last published estimate of a frame."""
+        return [m for m in self.published if isinstance(m, NavEstimate) and m.frame_id == frame_id][-1]
 
     def verdicts(self, measurement: str) -> dict[int, MeasurementVerdict]:
-        return {m.frame_id: m for m in self.said if isinstance(m, MeasurementVerdict) and m.measurement == measurement}
+        """-> the last verdict of a measurement for each frame."""
+        verdicts = (m for m in self.published if isinstance(m, MeasurementVerdict))
+        return {m.frame_id: m for m in verdicts if m.measurement == measurement}
 
 
 def same_features(flight: Flight, keyframe: int, i: int, features: np.ndarray) -> Odometry:
-    """Of frame i against ``keyframe``, whose ``features`` (N, 2) it tracks: other frames track the same ones."""
+    """Odometry of frame i against ``keyframe`` with the same ``features`` (N, 2; normalised coordinates in the
+    keyframe) for every frame."""
     below = np.array([0.0, 0.0, flight.ground_m[keyframe]])
     views = [(flight.r_w_c[k], flight.p_m[k] - below) for k in (keyframe, i)]
     noise = np.random.default_rng([i, 3]).normal(0.0, SIGMA_NORM, features.shape)
@@ -228,7 +233,7 @@ def same_features(flight: Flight, keyframe: int, i: int, features: np.ndarray) -
 
 
 def some_features() -> np.ndarray:
-    """(40, 2), normalised, of one picture."""
+    """(PAIRS, 2) features of one image, normalised coordinates."""
     rng = np.random.default_rng(3)
     return np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
 
@@ -237,22 +242,22 @@ def t_ns(i: int) -> int:
     return round(i * FRAME_S * 1e9)
 
 
-def error_m(said: NavEstimate, flight: Flight, offset_m: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-    """(3,): east, north, up from truth (moved by ``offset_m``) to the estimate."""
-    e_m, n_m = PLACE.to_local(said.lat_deg, said.lon_deg)
-    return np.array([e_m, n_m, said.alt_amsl_m]) - flight.p_m[said.frame_id] - (*offset_m, 0.0)
+def error_m(estimate: NavEstimate, flight: Flight, offset_m: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """-> (3,) error of the estimate: east, north, up; the truth is shifted by ``offset_m`` (east, north)."""
+    e_m, n_m = PLACE.to_local(estimate.lat_deg, estimate.lon_deg)
+    return np.array([e_m, n_m, estimate.alt_amsl_m]) - flight.p_m[estimate.frame_id] - (*offset_m, 0.0)
 
 
-def cov_of(said: NavEstimate) -> np.ndarray:
-    return np.array(said.cov).reshape(6, 6)
+def cov_of(estimate: NavEstimate) -> np.ndarray:
+    return np.array(estimate.cov).reshape(6, 6)
 
 
-def sigma_m(said: NavEstimate) -> float:
-    """Horizontal, one axis."""
-    return float(np.sqrt((said.cov[0] + said.cov[7]) / 2))
+def sigma_m(estimate: NavEstimate) -> float:
+    """Horizontal 1-sigma, per axis."""
+    return float(np.sqrt((estimate.cov[0] + estimate.cov[7]) / 2))
 
 
 def blind(odometry: Message, verdict: Verdict = Verdict.FEW_INLIERS) -> Odometry:
-    """The same frame when nothing could be tracked in it."""
+    """The odometry message of the same frame without tracked features."""
     assert isinstance(odometry, Odometry)
     return Odometry(t_ns=odometry.t_ns, frame_id=odometry.frame_id, keyframe_id=odometry.keyframe_id, verdict=verdict)

@@ -1,4 +1,4 @@
-"""Generated flights for the tests of the sources."""
+"""Generated flight folders for the tests of the image sources."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ HEADER = "file,t_s,yaw_deg,pitch_deg,roll_deg,agl_m"
 
 
 def picture(seed: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """(H, W, 3) uint8 with structure everywhere."""
+    """-> (H, W, 3) uint8 with texture everywhere."""
     rng = np.random.default_rng(seed)
     coarse = rng.integers(0, 255, (height // 8, width // 8, 3), dtype=np.uint8)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -40,6 +40,7 @@ def jpeg(seed: int, width: int = WIDTH, height: int = HEIGHT) -> bytes:
 
 
 def flight(folder: Path, frames: int = 5, *, toml: str = TOML, csv: str | None = None, step_s: float = 0.5) -> Path:
+    """Writes a flight folder -> the folder. ``csv``: content of frames.csv, instead of one that fits the frames."""
     (folder / "frames").mkdir(parents=True)
     for i in range(frames):
         (folder / "frames" / f"{i:04}.jpg").write_bytes(jpeg(i))

@@ -1,4 +1,4 @@
-"""ONNX files of a few nodes, written byte by byte (onnx.proto3, protocol buffers): no test needs real weights."""
+"""ONNX files of a few nodes, encoded by hand (onnx.proto3, protocol buffers), so that tests need no real weights."""
 
 import hashlib
 from pathlib import Path
@@ -28,13 +28,13 @@ def _block(field: int, content: bytes | str) -> bytes:
 
 
 def tensor(name: str, array: np.ndarray) -> bytes:
-    """An initializer."""
+    """-> TensorProto of an initializer."""
     dims = b"".join(_number(1, size) for size in array.shape)
     return dims + _number(2, TYPES[array.dtype.name]) + _block(8, name) + _block(9, array.tobytes())
 
 
 def node(kind: str, inputs: list[str], outputs: list[str], **ints: int | list[int]) -> bytes:
-    """Attributes are whole numbers or lists of them."""
+    """-> NodeProto. Attributes are integers or lists of integers."""
     body = b"".join(_block(1, name) for name in inputs) + b"".join(_block(2, name) for name in outputs)
     body += _block(4, kind)
     for name, value in ints.items():
@@ -47,13 +47,13 @@ def node(kind: str, inputs: list[str], outputs: list[str], **ints: int | list[in
 
 
 def value(name: str, shape: Shape, dtype: str = "float32") -> bytes:
-    """An input or an output."""
+    """-> ValueInfoProto of an input or output."""
     dims = b"".join(_block(1, _number(1, s) if isinstance(s, int) else _block(2, s)) for s in shape)
     return _block(1, name) + _block(2, _block(1, _number(1, TYPES[dtype]) + _block(2, dims)))
 
 
 def model(nodes: list[bytes], initializers: list[bytes], inputs: list[bytes], outputs: list[bytes]) -> bytes:
-    """A file of opset 17."""
+    """-> ModelProto with opset 17: the content of a file."""
     graph = b"".join(_block(1, one) for one in nodes) + _block(2, "tiny")
     graph += b"".join(_block(5, one) for one in initializers)
     graph += b"".join(_block(11, one) for one in inputs) + b"".join(_block(12, one) for one in outputs)
@@ -61,11 +61,12 @@ def model(nodes: list[bytes], initializers: list[bytes], inputs: list[bytes], ou
 
 
 def xfeat_like(nan: str = "never") -> bytes:
-    """Tensors of XFeat, one convolution each. ``nan``: "never", "always", or "blue": where a cell is pure blue."""
+    """-> a model with the outputs of XFeat, one convolution each. ``nan``: cells whose descriptors are NaN: "never",
+    "always", or "blue" (cells of pure blue)."""
     rng = np.random.default_rng(1)
     weights = {name: rng.normal(size=(c, 3, 8, 8)).astype(np.float32) for name, c in (("d", 64), ("k", 65), ("r", 1))}
     red = np.zeros((1, 3, 8, 8), np.float32)
-    red[0, 0], red[0, 2] = 1 / 64, -1 / 64  # of the mean of a cell, more than blue
+    red[0, 0], red[0, 2] = 1 / 64, -1 / 64  # mean red minus mean blue of a cell
     least = np.array({"never": 9.0, "blue": 0.5, "always": -9.0}[nan], np.float32)
     convolution = {"kernel_shape": [8, 8], "strides": [8, 8]}
     nodes = [
@@ -87,7 +88,8 @@ def xfeat_like(nan: str = "never") -> bytes:
 
 
 def brightest_of_rows() -> bytes:
-    """Two pictures in, a pair for each row out: its brightest pixel in each, and how bright that is in the first."""
+    """-> a matcher of two images: for each row the brightest pixels of both, with the brightness in the first as
+    confidence."""
     nodes, outputs = [], [value("mkpts0", ["n", 2]), value("mkpts1", ["n", 2]), value("mconf", ["n"])]
     for k in "01":
         nodes += [
@@ -104,14 +106,14 @@ def brightest_of_rows() -> bytes:
         node("ReduceMax", ["image0"], ["bright"], axes=[3], keepdims=0),
         node("Reshape", ["bright", "flat"], ["mconf"]),
     ]
-    known = {"column": np.array([-1, 1]), "flat": np.array([-1]), "axis": np.array(0)}
-    known |= {"zero": np.array(0.0, np.float32), "one": np.array(1.0, np.float32)}
-    pictures = [value(f"image{k}", [1, 1, "height", "width"]) for k in "01"]
-    return model(nodes, [tensor(n, a) for n, a in known.items()], pictures, outputs)
+    initializers = {"column": np.array([-1, 1]), "flat": np.array([-1]), "axis": np.array(0)}
+    initializers |= {"zero": np.array(0.0, np.float32), "one": np.array(1.0, np.float32)}
+    images = [value(f"image{k}", [1, 1, "height", "width"]) for k in "01"]
+    return model(nodes, [tensor(n, a) for n, a in initializers.items()], images, outputs)
 
 
 def constants(inputs: dict[str, tuple[Shape, str]], outputs: dict[str, np.ndarray]) -> bytes:
-    """Gives the same whatever goes in."""
+    """-> a model whose outputs do not depend on its inputs."""
     nodes = [node("Identity", [f"{name}_is"], [name]) for name in outputs]
     return model(
         nodes,
@@ -122,7 +124,7 @@ def constants(inputs: dict[str, tuple[Shape, str]], outputs: dict[str, np.ndarra
 
 
 def write(folder: Path, manifest: str, content: bytes) -> Path:
-    """The model NAME.onnx and its manifest, which gets file, sha256 and size. -> the model."""
+    """Writes the model NAME.onnx and its manifest with file, sha256 and size. -> path of the model."""
     name = next(line.split('"')[1] for line in manifest.splitlines() if line.startswith("name = "))
     path = folder / f"{name}.onnx"
     path.write_bytes(content)

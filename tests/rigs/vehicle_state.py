@@ -1,4 +1,4 @@
-"""A simulated vehicle in a known state."""
+"""State of a simulated vehicle in level flight."""
 
 import math
 from dataclasses import replace
@@ -28,5 +28,5 @@ def state(t_s: float, **changes: object) -> State:
 
 
 def changes(values: np.ndarray, steps: int) -> float:
-    """Rms of what the rows of ``values`` (N, M) change by over so many steps, degrees."""
+    """-> RMS change [deg] of ``values`` (N, M) [rad] over a number of rows."""
     return math.degrees(math.sqrt(np.mean(np.square(values[:, steps:] - values[:, :-steps]))))

@@ -1,4 +1,4 @@
-"""`terrafix accept` as a person runs it: killed in the middle, resumed, and judged to the end."""
+"""`terrafix accept` as a command: killed and resumed, wrong maps, camera faults, usage errors."""
 
 import json
 import os
@@ -13,25 +13,25 @@ import pytest
 
 from terrafix_tools.accept.fly import Job, fly
 from terrafix_tools.accept.generated import make
-from terrafix_tools.accept.judged import JudgedRow, Verdict
+from terrafix_tools.accept.measuring.judged import JudgedRow, Verdict
 
 COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "accept"]
 SCENARIOS = ("baseline", "foreign frame", "350 m outlier fix")
 
 
 @pytest.mark.slow
-def test_killed_and_resumed(tmp_path: Path) -> None:
+def test_a_killed_acceptance_run_is_resumed_without_repeating_finished_scenarios(tmp_path: Path) -> None:
     out = tmp_path / "accept"
-    command = [*COMMAND, "--quick", "--out", str(out), *(word for name in SCENARIOS for word in ("--scenario", name))]
+    command = [*COMMAND, "--quick", "--out", str(out), *(part for name in SCENARIOS for part in ("--scenario", name))]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True) as running:
         deadline_s = time.monotonic() + 1200.0
         while not list(out.glob("*/result.json")):
-            assert time.monotonic() < deadline_s and running.poll() is None, "no scenario came to its end"
+            assert time.monotonic() < deadline_s and running.poll() is None, "no scenario has finished"
             time.sleep(0.5)
         os.killpg(running.pid, signal.SIGKILL)
-    kept = {path: path.stat().st_mtime_ns for path in out.glob("*/result.json")}
+    finished = {path: path.stat().st_mtime_ns for path in out.glob("*/result.json")}
     done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=1200)
-    assert {path: path.stat().st_mtime_ns for path in kept} == kept  # not flown again
+    assert {path: path.stat().st_mtime_ns for path in finished} == finished  # finished scenarios are not run again
     table = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
     assert [result["scenario"] for result in table["results"]] == list(SCENARIOS)
     assert done.returncode == (1 if table["broken"] else 0), done.stderr
@@ -45,7 +45,7 @@ def test_killed_and_resumed(tmp_path: Path) -> None:
     assert page.count("<figure") == len(SCENARIOS) and not re.search(r'(src|href)="', page)
 
 
-def test_a_scenario_that_does_not_exist_is_one_clear_line(tmp_path: Path) -> None:
+def test_an_unknown_scenario_is_a_usage_error_of_one_line(tmp_path: Path) -> None:
     done = subprocess.run(
         [*COMMAND, "--scenario", "moon", "--out", str(tmp_path)], capture_output=True, text=True, timeout=120
     )
@@ -53,7 +53,7 @@ def test_a_scenario_that_does_not_exist_is_one_clear_line(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_map_that_lies_is_made_flown_and_judged_by_the_rows_of_lies(tmp_path: Path) -> None:
+def test_a_shifted_map_is_generated_flown_and_evaluated_with_the_rows_of_false_inputs(tmp_path: Path) -> None:
     out = tmp_path / "accept"
     command = [*COMMAND, "--quick", "--workers", "1", "--out", str(out), "--scenario", "map shifted by 300 m"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
@@ -61,9 +61,10 @@ def test_a_map_that_lies_is_made_flown_and_judged_by_the_rows_of_lies(tmp_path: 
     (result,) = table["results"]
     assert result["frames"] == 90 and result["nees"] == []  # no frame has true inputs
     rows = {row["what"]: row for row in table["rows"]}
-    # The map is really off: only what the start carries is near.
+    # The map really is shifted: only the frames that the start position determines are near the truth.
     assert rows["frames within 20 m, shown only"]["measured"] < 0.3
-    # Nothing on board tells a map in the wrong place from a wrong start: the flight follows one, and must say so.
+    # A shifted map and a wrong start are not distinguishable on board: the estimate follows one of them, and the
+    # summary must report the contradiction.
     summary = json.loads((out / "map-shifted-by-300-m" / "summary.json").read_text(encoding="utf-8"))
     late = rows["false fixes later than 3 s and 5 frames into the lie"]["measured"]
     assert late == 0.0 or "start and map contradict each other" in summary["verdict"]["text"]
@@ -71,18 +72,18 @@ def test_a_map_that_lies_is_made_flown_and_judged_by_the_rows_of_lies(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_camera_that_freezes_while_gnss_is_jammed_takes_the_aircraft_not_aside(tmp_path: Path) -> None:
+def test_a_frozen_camera_during_a_gnss_jam_does_not_move_the_aircraft_off_its_path(tmp_path: Path) -> None:
     ground, out = tmp_path / "ground", tmp_path / "out"
-    make("base", ground, seed=1, frames=4)  # of its flight nothing is used
+    make("base", ground, seed=1, frames=4)  # only its map is used
     job = Job(
         scenario="GNSS jam, frozen picture", flight="", truth="", map=str(ground / "map.tif"), out=str(out), seed=1,
         generated=True)  # fmt: skip
     rows: dict[str, JudgedRow] = {row.what: row for row in fly(job).rows}
-    aside = rows["aside of the way without the lie while a 3D fix is sent, worst"]
-    assert aside.verdict is Verdict.PASS and aside.measured is not None and aside.measured > 0.1
+    deviation = rows["aside of the way without the lie while a 3D fix is sent, worst"]
+    assert deviation.verdict is Verdict.PASS and deviation.measured is not None and deviation.measured > 0.1
     assert rows["false GPS_INPUT later than 3 s and 5 frames into the lie"].measured == 0.0
     assert rows["fail-safes of the autopilot"].measured == 0.0
-    # It flew on GPS_INPUT: GNSS was gone, and its dead reckoning alone would not have been served.
+    # The autopilot used GPS_INPUT: GNSS was jammed.
     peer = json.loads((out / "peer.json").read_text(encoding="utf-8"))
     assert peer["accepted"] > 100
     assert (out / "without-lie" / "track.csv").is_file()

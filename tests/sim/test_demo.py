@@ -1,4 +1,4 @@
-"""The demo as a stranger runs it: one command, the real processes, an autopilot that must be served."""
+"""`terrafix demo` as a command, with the real processes and a simulated autopilot."""
 
 import json
 import os
@@ -20,7 +20,7 @@ RESUMES_WITHIN_S = 2.0
 
 
 def children_of(pid: int) -> dict[str, int]:
-    """Names of the daemon's processes (as `ps` shows them) -> pid; among them what else the program has started."""
+    """-> pid of each child process by its name (as in `ps`): the daemon's processes and other children."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
@@ -29,14 +29,16 @@ def children_of(pid: int) -> dict[str, int]:
             parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
             name = (entry / "comm").read_text().strip()
         except OSError:
-            continue  # ended meanwhile
+            continue  # the process has ended
         if parent == pid:
             found[name] = int(entry.name)
     return found
 
 
 @pytest.mark.slow
-def test_the_autopilot_is_served(tmp_path: Path, stall_ms: Callable[[], float]) -> None:
+def test_the_demo_sends_gps_input_without_gaps_and_writes_its_report(
+    tmp_path: Path, stall_ms: Callable[[], float]
+) -> None:
     out = tmp_path / "demo"
     began_s = time.monotonic()
     done = subprocess.run(
@@ -57,39 +59,41 @@ def test_the_autopilot_is_served(tmp_path: Path, stall_ms: Callable[[], float]) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victims", [("link",), ("estimator", "anchor", "vision")], ids=["the link", "the others"])
-def test_killed_processes_come_back(victims: tuple[str, ...], tmp_path: Path, stall_ms: Callable[[], float]) -> None:
+def test_killed_processes_are_restarted_and_gps_input_continues(
+    victims: tuple[str, ...], tmp_path: Path, stall_ms: Callable[[], float]
+) -> None:
     out = tmp_path / "demo"
     with subprocess.Popen(
         [*COMMAND, "--out", str(out), "--duration", str(DURATION_S)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     ) as running:
         deadline_s = time.monotonic() + 120.0
         while not {*victims, "vision"} <= set(children_of(running.pid)):
-            assert time.monotonic() < deadline_s and running.poll() is None, "the flight did not begin"
+            assert time.monotonic() < deadline_s and running.poll() is None, "the flight has not started"
             time.sleep(0.2)
         time.sleep(15.0)
         for victim in victims:
             os.kill(children_of(running.pid)[victim], signal.SIGKILL)
             time.sleep(8.0)
-        said = running.communicate(timeout=240)[0].decode()
+        output = running.communicate(timeout=240)[0].decode()
     for victim in victims:
-        assert f"{victim} died: killed by SIGKILL" in said and f"{victim} restarted" in said, said
+        assert f"{victim} died: killed by SIGKILL" in output and f"{victim} restarted" in output, output
         assert victim in (out / "report.html").read_text()
     peer = json.loads((out / "peer.json").read_text())
     if "link" in victims:
         assert peer["longest_gap_ms"] < 1e3 * RESUMES_WITHIN_S
     else:
-        assert peer["longest_gap_ms"] < 245.0 + stall_ms()  # the link goes on whatever happens to the others
+        assert peer["longest_gap_ms"] < 245.0 + stall_ms()  # the link does not depend on the others
 
 
-def test_a_folder_that_no_demo_made_is_left_alone(tmp_path: Path) -> None:
+def test_demo_does_not_write_into_a_foreign_folder(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
     done = subprocess.run([*COMMAND, "--out", str(tmp_path)], capture_output=True, text=True, timeout=60)
     assert done.returncode == 6
-    assert done.stderr.strip().count("\n") == 0 and "no demo made" in done.stderr
+    assert done.stderr.strip().count("\n") == 0 and "not made by demo" in done.stderr
     assert (tmp_path / "thesis.txt").read_text() == "precious"
 
 
-def test_an_impossible_duration_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_too_short_duration_is_a_usage_error_of_one_line(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     done = subprocess.run([*COMMAND, "--out", str(out), "--duration", "1"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and "--duration 1" in done.stderr

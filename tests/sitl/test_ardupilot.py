@@ -1,4 +1,5 @@
-"""ArduPilot's own firmware flies on our GPS_INPUT. Needs a SITL binary (docs/sitl.md); up to 20 minutes a vehicle."""
+"""ArduPilot's firmware in the loop flies on GPS_INPUT alone. Needs a SITL binary (docs/sitl.md); up to 20 minutes per
+vehicle."""
 
 import json
 import os
@@ -15,7 +16,8 @@ COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "sim", "ardupilot"]
 
 
 def binary(vehicle: str) -> Path:
-    """The binary that TERRAFIX_ARDUPILOT_SITL names, or its neighbour for the other vehicle; else a skip."""
+    """-> the binary that TERRAFIX_ARDUPILOT_SITL names, or the one for ``vehicle`` in the same folder; skips the test
+    without one."""
     pytest.importorskip("mavsdk", reason="SITL MISSING: mavsdk is not installed (pip install 'terrafix[sim]')")
     named = os.environ.get("TERRAFIX_ARDUPILOT_SITL", "")
     if not named:
@@ -46,7 +48,7 @@ def test_five_kilometres_on_gps_input_alone(vehicle: str, tmp_path: Path) -> Non
     assert flown["not_healthy"] == 0
     assert flown["ekf_failsafes"] == 0
     assert flown["gps_input_fix_share"] > 0.9 and flown["belief_p95_m"] < 30.0
-    # AIRSPEED comes with a sensor only: the plane has one, at 22 m/s.
-    states = [said for _, _, said in read_flight(tmp_path / "record") if isinstance(said, VehicleState)]
+    # Only the plane has an airspeed sensor; it flies at 22 m/s.
+    states = [message for _, _, message in read_flight(tmp_path / "record") if isinstance(message, VehicleState)]
     airspeeds = [state.airspeed_mps for state in states if state.airspeed_mps is not None]
     assert (len(airspeeds) > 0.9 * len(states) and max(airspeeds) > 15.0) if vehicle == "plane" else not airspeeds

@@ -1,4 +1,5 @@
-"""Killed and started again in flight: what ArduPilot's own firmware shows, and an external position in between."""
+"""Restart of Terrafix in flight with ArduPilot's firmware in the loop: loss and return of the fix, and the external
+position that is accepted meanwhile."""
 
 import socket
 import subprocess
@@ -8,83 +9,87 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from pilot import GUIDED, Pilot, end, fly_up, terrafix
+from pilot import GUIDED, Pilot, kill_terrafix, start_terrafix, take_off
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from standing_copter import HOME, SENT, Heard, copter, free_port, stand
+from standing_copter import HOME, SENT, ReceivedMessages, copter, free_port, run_link
 
 from terrafix.core.config import LinkSection
 
 pytestmark = pytest.mark.slow
 HOVER_S = 20.0
-SILENT_S = 5.5  # the firmware notices after 4.0 s, and its failsafe comes after 7.8 s
+SILENT_S = 5.5  # the firmware reports the loss after 4.0 s; its failsafe follows after 7.8 s
 RESUMES_WITHIN_S = 2.0
 NEAR_M = 10.0
 
 
-def began(running: subprocess.Popen[str]) -> tuple[float, float]:
-    """(s on the monotonic clock, s of a processor) at its first 3D fix."""
+def first_fix_times(running: subprocess.Popen[str]) -> tuple[float, float]:
+    """-> time of the first 3D fix on the monotonic clock [s], and the processor time of the program until then [s]."""
     assert running.stdout is not None
-    line = next(line for line in running.stdout if line.startswith("fix "))  # logs come there, too
+    line = next(line for line in running.stdout if line.startswith("fix "))  # the logs are in the same stream
     running.stdout.close()
     _, at_s, cpu_s = line.split()
     return float(at_s), float(cpu_s)
 
 
-def test_fact_killed_in_flight_the_fix_goes_and_is_back_two_seconds_after_the_restart(
+def test_fact_a_kill_in_flight_loses_the_fix_until_two_seconds_after_the_restart(
     tmp_path: Path, stall_ms: Callable[[], float]
 ) -> None:
-    """GPS_INPUT is the only GPS, and every threshold of the filter is as it comes."""
+    """GPS_INPUT is the only GPS; all thresholds of the EKF have their defaults."""
     port, ground_port = free_port(), free_port()
-    pilot, running = Pilot(ground_port), terrafix(port)
+    pilot, running = Pilot(ground_port), start_terrafix(port)
     try:
         with copter(tmp_path, {"GPS1_TYPE": 14, "GPS1_DELAY_MS": 5}, port, free_port(socket.SOCK_STREAM), ground_port):
-            fly_up(pilot)
-            pilot.healthy.clear()
-            pilot.listen(HOVER_S)
-            assert all(pilot.healthy) and len(pilot.healthy) > HOVER_S
-            assert pilot.off_home_m() < NEAR_M
+            take_off(pilot)
+            pilot.gps_healthy.clear()
+            pilot.receive_for(HOVER_S)
+            assert all(pilot.gps_healthy) and len(pilot.gps_healthy) > HOVER_S
+            assert pilot.true_distance_from_home_m() < NEAR_M
             killed_s = time.monotonic()
-            end(running)
-            pilot.listen(SILENT_S)
+            kill_terrafix(running)
+            pilot.receive_for(SILENT_S)
             lost = [t_s - killed_s for t_s, fix in pilot.fixes if t_s > killed_s and fix < 3]
             assert lost and lost[0] > 3.0, "the firmware did not show the loss"
-            running, restarted_s = terrafix(port), time.monotonic()
-            pilot.until("the fix after the restart", lambda: pilot.fix() == 3)
+            running, restarted_s = start_terrafix(port), time.monotonic()
+            pilot.wait_for("3D fix after the restart", lambda: pilot.fix_type() == 3)
             back_s = pilot.fixes[-1][0]
-            sent_s, cpu_s = began(running)
-            pilot.listen(5.0)
+            sent_s, cpu_s = first_fix_times(running)
+            pilot.receive_for(5.0)
             sys.stdout.write(
                 f"fix lost {lost[0]:.2f} s after the kill; back {back_s - restarted_s:.2f} s after the restart: "
                 f"{cpu_s:.2f} s of a processor to the first GPS_INPUT, shown {back_s - sent_s:.2f} s after it\n"
             )
-            # On a busy machine a program starts as slowly as the machine lets it: its share of a processor counts.
+            # The start-up is counted in processor time, which a busy machine does not lengthen.
             assert cpu_s + back_s - sent_s < RESUMES_WITHIN_S + stall_ms() / 1e3
-            assert pilot.off_home_m() < NEAR_M
+            assert pilot.true_distance_from_home_m() < NEAR_M
             assert pilot.newest["HEARTBEAT"].custom_mode == GUIDED  # no failsafe
             assert not [text for text in pilot.texts if "EKF variance" in text or "Failsafe" in text], pilot.texts
     finally:
-        end(running)
+        kill_terrafix(running)
         pilot.close()
 
 
-def test_fact_an_external_position_is_accepted_when_gps_input_has_ended(tmp_path: Path) -> None:
-    """A hard reset without a gate: it stands where we say, at once."""
+def test_fact_an_external_position_is_accepted_after_gps_input_has_stopped(tmp_path: Path) -> None:
+    """The EKF resets its position to the sent one at once, without an innovation gate."""
     port = free_port()
     device = f"udpin:127.0.0.1:{port}"
 
-    def answered(heard: Heard) -> bool:
-        ack = heard.newest.get("COMMAND_ACK")
-        return ack is not None and ack.command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE and moved(heard)
+    def is_acknowledged(received: ReceivedMessages) -> bool:
+        ack = received.newest.get("COMMAND_ACK")
+        return (
+            ack is not None
+            and ack.command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+            and is_at_sent_position(received)
+        )
 
-    def moved(heard: Heard) -> bool:
-        at = heard.at("GLOBAL_POSITION_INT")
-        return at is not None and abs(at[0] - round(SENT[0] * 1e7)) < 200
+    def is_at_sent_position(received: ReceivedMessages) -> bool:
+        position = received.position_e7("GLOBAL_POSITION_INT")
+        return position is not None and abs(position[0] - round(SENT[0] * 1e7)) < 200
 
     with copter(tmp_path, {"GPS1_TYPE": 14, "GPS1_DELAY_MS": 5}, port, free_port(socket.SOCK_STREAM)):
         flag = mavlink.EKF_POS_HORIZ_ABS
-        placed = lambda h: bool(getattr(h.newest.get("EKF_STATUS_REPORT"), "flags", 0) & flag)  # noqa: E731
-        stand(LinkSection(device=device), placed, HOME)
-        time.sleep(1.5)  # it takes none while it fuses GPS
-        heard = stand(LinkSection(device=device, outputs=["external_position"]), answered)
-    assert heard.newest["COMMAND_ACK"].result == mavlink.MAV_RESULT_ACCEPTED, heard.texts
-    assert moved(heard)
+        has_position = lambda r: bool(getattr(r.newest.get("EKF_STATUS_REPORT"), "flags", 0) & flag)  # noqa: E731
+        run_link(LinkSection(device=device), has_position, HOME)
+        time.sleep(1.5)  # an external position is rejected while the EKF fuses GPS
+        received = run_link(LinkSection(device=device, outputs=["external_position"]), is_acknowledged)
+    assert received.newest["COMMAND_ACK"].result == mavlink.MAV_RESULT_ACCEPTED, received.texts
+    assert is_at_sent_position(received)

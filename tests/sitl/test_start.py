@@ -1,4 +1,4 @@
-"""Nobody says the start: ArduPilot's own firmware stands, and its receiver says where."""
+"""Initial position from the GNSS receiver of ArduPilot's firmware (SITL), on the ground, without a configured start."""
 
 import socket
 import time
@@ -20,44 +20,44 @@ from terrafix.runtime.executor import InProcessShell
 from terrafix_engines.features.gradient import GradientDescriber
 
 pytestmark = pytest.mark.slow
-AWAY_M = (700.0, -400.0)  # home, in the frame of reference
+AWAY_M = (700.0, -400.0)  # home, east and north of the Origin
 
 
-def test_fact_the_start_is_where_the_firmware_s_receiver_says(tmp_path: Path) -> None:
+def test_fact_the_initial_position_is_that_of_the_firmwares_receiver(tmp_path: Path) -> None:
     port = free_port()
     with copter(tmp_path, {}, port, free_port(socket.SOCK_STREAM)):
-        said = listened(port)
-    starts = [x for x in said if isinstance(x, m.Start)]
-    estimates = [x for x in said if isinstance(x, m.NavEstimate)]
-    texts = [x.text for x in said if isinstance(x, m.StatusText)]
+        published = run_processes(port)
+    starts = [x for x in published if isinstance(x, m.Start)]
+    estimates = [x for x in published if isinstance(x, m.NavEstimate)]
+    texts = [x.text for x in published if isinstance(x, m.StatusText)]
     assert starts, texts
     assert [text for text in texts if "start" in text] == ["Terrafix: start from GNSS, 2 m"]
     frame = LocalFrame(HOME[0], HOME[1])
     assert min(x.cov[0] for x in estimates if x.t_ns < starts[0].t_ns) > 1900.0**2
     east_m, north_m = frame.to_local(estimates[-1].lat_deg, estimates[-1].lon_deg)
     assert max(abs(east_m), abs(north_m)) < 3.0 and estimates[-1].cov[0] < 3.0**2
-    assert any(x.fix_type == 3 for x in said if isinstance(x, m.GpsInput))
+    assert any(x.fix_type == 3 for x in published if isinstance(x, m.GpsInput))
 
 
-def listened(port: int) -> list[m.Message]:
-    """What link, anchor and estimator said, until there was a 3D fix for three seconds."""
+def run_processes(port: int) -> list[m.Message]:
+    """Runs link, anchor and estimator until 30 GpsInput have a 3D fix, at most WAIT_S -> what they published."""
     edge, link = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}", gps_id=1)), LinkNode(10.0)
     anchor = AnchorNode(MemoryFrameStore(1), None, GradientDescriber(), 10.0)
-    said: list[m.Message] = []
+    published: list[m.Message] = []
 
-    def sink(_who: str, message: m.Message) -> None:
-        said.append(message)
-        edge.heard(message)
+    def sink(_process: str, message: m.Message) -> None:
+        published.append(message)
+        edge.on_message(message)
 
     shell = InProcessShell({"link": link, "anchor": anchor, "estimator": EstimatorNode()}, sink)
     shell.feed(origin())
-    began, next_ns, frame_id = time.monotonic(), 0, 0
+    began_s, next_ns, frame_id = time.monotonic(), 0, 0
     try:
-        while time.monotonic() - began < WAIT_S and fixes(said) < 30:
+        while time.monotonic() - began_s < WAIT_S and fixes(published) < 30:
             now_ns = time.monotonic_ns()
             for message in edge.poll(now_ns):
-                for own in link.on(message):  # the edge's words reach the node of its own process too
-                    shell.feed(own)
+                for reply in link.on(message):  # messages of the edge also reach the node of its own process
+                    shell.feed(reply)
                 shell.feed(message)
             if now_ns >= next_ns:
                 next_ns, frame_id = now_ns + 500_000_000, frame_id + 1
@@ -68,15 +68,16 @@ def listened(port: int) -> list[m.Message]:
             time.sleep(0.002)
     finally:
         edge.close()
-    return said
+    return published
 
 
-def fixes(said: Iterable[m.Message]) -> int:
-    return sum(isinstance(x, m.GpsInput) and x.fix_type == 3 for x in said)
+def fixes(messages: Iterable[m.Message]) -> int:
+    """-> number of GpsInput with a 3D fix."""
+    return sum(isinstance(x, m.GpsInput) and x.fix_type == 3 for x in messages)
 
 
 def origin() -> m.Origin:
-    """Of a map of 4 km, around a place that is not home."""
+    """Origin of a map of 4 km whose centre is AWAY_M from home."""
     lat_deg, lon_deg = LocalFrame(HOME[0], HOME[1]).to_wgs84(-AWAY_M[0], -AWAY_M[1])
     camera = m.Camera(width=640, height=480, fx=500, fy=500, cx=320, cy=240)
     sigmas = {"start_sigma_m": 2000.0, "yaw_sigma_deg": 5.0, "agl_sigma_m": 5.0, "attitude_sigma_deg": 2.0}

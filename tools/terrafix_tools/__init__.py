@@ -1,3 +1,3 @@
-"""What stays on the ground."""
+"""Programs of the ground station: map building, simulation, evaluation and pre-flight checks."""
 
-import terrafix  # noqa: F401 (before numpy, which a tool may import first: see there)
+import terrafix  # noqa: F401 - imported before numpy, which a tool may import first: see terrafix/__init__.py

@@ -1,4 +1,4 @@
-"""The command line `terrafix`. Every command imports what it needs when it is called, so that --help is fast."""
+"""The command line `terrafix`. Each command imports its modules when it is called, so that --help is fast."""
 
 import sys
 from pathlib import Path
@@ -19,7 +19,8 @@ from terrafix_tools.sim.cli import app as sim_app
 if TYPE_CHECKING:
     from terrafix.runtime.fork_server import ForkServer
 
-ON_THE_GROUND = ("rasterio", "urllib3", "pmtiles", "osmium")  # the extra `ground`: a vehicle need not have it
+# optional packages of the extra `ground`; not installed on a vehicle
+GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium")
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
 app.add_typer(map_app, name="map")
@@ -47,13 +48,15 @@ def run(
     config: ConfigOption = None,
 ) -> None:
     """Fly: start the processes under the supervisor until stopped."""
-    from terrafix.runtime.supervisor import killed_just_now
+    from terrafix.runtime.supervisor import recently_killed_spec
     from terrafix.runtime.supervisor import run as run_supervised
 
     configs = config or []
-    before = killed_just_now(source=source, start=start, map_path=map_path, link=link, out_dir=out, configs=configs)
-    if before is not None:
-        package, ground_amsl_m = map_path, before.ground_amsl_m
+    previous_run = recently_killed_spec(
+        source=source, start=start, map_path=map_path, link=link, out_dir=out, configs=configs
+    )
+    if previous_run is not None:
+        package, ground_amsl_m = map_path, previous_run.ground_amsl_m
     else:
         from terrafix_tools.live import package_for
 
@@ -69,7 +72,7 @@ def run(
         stop_after_source=until_end,
         fork_server=context.obj,
     )
-    if until_end and code == 0:  # not when the vehicle is switched off: a long record takes its time
+    if until_end and code == 0:  # not at a shutdown of the vehicle: reading a long record takes too long
         from terrafix_tools.flight_verdict import verdict_of
 
         typer.echo(verdict_of(out).text(), err=True)
@@ -90,13 +93,15 @@ def replay(
     config: ConfigOption = None,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
-    """Fly a recorded flight as fast as this machine can; the same input gives the same output."""
+    """Replay a recorded flight as fast as this machine can; the same input gives the same output."""
     from terrafix.vision.sources import parse_start
     from terrafix_tools.replay import replay as run_replay
 
-    at = parse_start(start)
-    said = run_replay(flight, map_path, out, models=model or [], configs=config or [], progress=not quiet, start=at)
-    if said["verdict"]["active_faults"]:
+    start_lat_lon = parse_start(start)
+    summary = run_replay(
+        flight, map_path, out, models=model or [], configs=config or [], progress=not quiet, start=start_lat_lon
+    )
+    if summary["verdict"]["active_faults"]:
         raise typer.Exit(1)
 
 
@@ -115,12 +120,12 @@ def evaluate(
 @app.command()
 def report(
     folder: Annotated[Path, typer.Argument(help="Output of replay, run or demo.")],
-    truth: Annotated[Path | None, typer.Option(help="truth.csv, when there is one.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="truth.csv, if available.")] = None,
     map_path: Annotated[
         Path | None, typer.Option("--map", help="Map package; default: the one in summary.json.")
     ] = None,
 ) -> None:
-    """One self-contained HTML page about a flight: FOLDER/report.html."""
+    """Write one self-contained HTML page about a flight: FOLDER/report.html."""
     from terrafix_tools.report.page import report as run_report
 
     typer.echo(run_report(folder, truth, map_path))
@@ -128,11 +133,11 @@ def report(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for everything that the demo makes.")] = Path("out/demo"),
+    out: Annotated[Path, typer.Option(help="Folder for all output of the demo.")] = Path("out/demo"),
     seed: Annotated[int, typer.Option(help="Seed of the world and of the noise.")] = 1,
     duration: Annotated[float, typer.Option(help="Seconds of flight.")] = 90.0,
 ) -> None:
-    """A flight over a generated world with the real processes and an autopilot peer, ending in a report."""
+    """Fly over a generated world with the real processes and a simulated autopilot, and write a report."""
     from terrafix_tools.sim.demo.demo import demo as run_demo
 
     raise typer.Exit(run_demo(out, seed=seed, duration_s=duration))
@@ -145,20 +150,21 @@ def bench(
     flight: Annotated[
         list[str] | None, typer.Option(help="Name in flights/, or 'generated'; may be given several times.")
     ] = None,
-    frames: Annotated[int | None, typer.Option(help="Only so many frames of each flight.")] = None,
-    xfeat: Annotated[bool, typer.Option(help="Also with XFeat, when models/xfeat.onnx is there.")] = True,
-    growing: Annotated[bool, typer.Option(help="Also larger maps (to 100 km2) and longer flights.")] = True,
+    frames: Annotated[int | None, typer.Option(help="Use at most this many frames of each flight.")] = None,
+    xfeat: Annotated[bool, typer.Option(help="Also run with XFeat, when models/xfeat.onnx exists.")] = True,
+    growing: Annotated[bool, typer.Option(help="Also run larger maps (to 100 km2) and longer flights.")] = True,
 ) -> None:
-    """Time, memory and accuracy beside baselines measured in the same run, and how they grow."""
+    """Measure time, memory and accuracy next to baselines of the same run, and how they scale."""
     from terrafix_tools.bench.run import bench as run_bench
 
     run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat, growing=growing)
 
 
 def main(fork_server: "ForkServer | None" = None) -> None:
-    """The one funnel for errors: a user's mistake is one line and an exit code, a bug is a traceback.
+    """Runs the command line. A TerrafixError ends with one line and its exit code, any other exception is a traceback.
 
-    ``fork_server``: for `run`, one that was begun already (program.py)."""
+    ``fork_server``: for `run`, a fork server that is already started (program.py).
+    """
     try:
         app(obj=fork_server)
     except TerrafixError as error:
@@ -166,7 +172,7 @@ def main(fork_server: "ForkServer | None" = None) -> None:
         sys.exit(error.exit_code)
     except ModuleNotFoundError as error:
         missing = (error.name or "").split(".")[0]
-        if missing not in ON_THE_GROUND:
+        if missing not in GROUND_PACKAGES:
             raise
         typer.echo(f"terrafix: this command needs {missing}; install it: pip install 'terrafix[ground]'", err=True)
         sys.exit(UsageError.exit_code)

@@ -1,4 +1,4 @@
-"""estimates.csv: one row per input frame; how it is made from messages, written and read."""
+"""estimates.csv: one row per input frame. Conversion from messages, writing and reading."""
 
 import csv
 import math
@@ -14,7 +14,9 @@ from terrafix.messages import Frame, Message, NavEstimate, Refinement
 
 @dataclass
 class Row:
-    """One frame. ``None`` is an empty cell: not known. Field order is column order; docs/outputs.md explains each."""
+    """One input frame. ``None`` is an empty cell (unknown). Field order is column order; docs/outputs.md describes
+    each.
+    """
 
     file: str
     t_s: float
@@ -40,7 +42,7 @@ class Row:
 
 COLUMNS: tuple[str, ...] = tuple(f.name for f in fields(Row))
 
-# Digits after the point: fixed, so that two replays write the same bytes. 1e-8 degree is 1 mm.
+# Digits after the decimal point, fixed so that two replays write the same bytes. 1e-8 degree is 1 mm.
 DIGITS: dict[str, int] = {
     "t_s": 3,
     "lat_deg": 8,
@@ -59,7 +61,7 @@ _TEXT = ("file", "source_label", "covariance_mode")
 _REQUIRED = ("file", "lat_deg", "lon_deg", "sigma_e_m", "sigma_n_m", "cov_en_m2")
 NS = 1_000_000_000
 ESTIMATES = "estimates.csv"
-PARTIAL = ".partial"  # appended to the name of an output until the flight is over
+PARTIAL = ".partial"  # suffix of the name of an output file until the flight is over
 
 
 def yaw_deg_of(estimate: NavEstimate) -> float:
@@ -69,7 +71,7 @@ def yaw_deg_of(estimate: NavEstimate) -> float:
 
 
 class RowTable:
-    """Builds the rows from the messages of a flight, in the order in which they were said."""
+    """Builds the rows from the messages of a flight, in the order of publication."""
 
     def __init__(self) -> None:
         self.rows: dict[int, Row] = {}  # by frame id, in order of arrival
@@ -86,14 +88,14 @@ class RowTable:
                     row.refined_lat_deg, row.refined_lon_deg = pose.lat_deg, pose.lon_deg
 
     @staticmethod
-    def _estimate(row: Row, said: NavEstimate) -> None:
-        row.lat_deg, row.lon_deg = said.lat_deg, said.lon_deg
-        row.alt_amsl_m, row.agl_m = said.alt_amsl_m, said.agl_m
-        row.sigma_e_m, row.sigma_n_m = math.sqrt(said.cov[0]), math.sqrt(said.cov[7])
-        row.cov_en_m2 = said.cov[1]
-        row.yaw_deg = yaw_deg_of(said)
-        row.source_label, row.covariance_mode = str(said.source_label), str(said.covariance_mode)
-        row.anchor_age_ms = said.last_anchor_age_ms
+    def _estimate(row: Row, estimate: NavEstimate) -> None:
+        row.lat_deg, row.lon_deg = estimate.lat_deg, estimate.lon_deg
+        row.alt_amsl_m, row.agl_m = estimate.alt_amsl_m, estimate.agl_m
+        row.sigma_e_m, row.sigma_n_m = math.sqrt(estimate.cov[0]), math.sqrt(estimate.cov[7])
+        row.cov_en_m2 = estimate.cov[1]
+        row.yaw_deg = yaw_deg_of(estimate)
+        row.source_label, row.covariance_mode = str(estimate.source_label), str(estimate.covariance_mode)
+        row.anchor_age_ms = estimate.last_anchor_age_ms
 
 
 def cells(row: Row) -> list[str]:
@@ -104,21 +106,21 @@ def cells(row: Row) -> list[str]:
             out.append("")
         elif name in DIGITS:
             text = f"{value:.{DIGITS[name]}f}"
-            out.append(text[1:] if text.startswith("-") and not text.strip("-0.") else text)  # no minus zero
+            out.append(text[1:] if text.startswith("-") and not text.strip("-0.") else text)  # no "-0.000"
         else:
             out.append(str(value))
     return out
 
 
-def write_rows(stream: TextIO, rows: Iterable[Row], *, head: bool = True) -> None:
+def write_rows(stream: TextIO, rows: Iterable[Row], *, header: bool = True) -> None:
     writer = csv.writer(stream, lineterminator="\n")
-    if head:
+    if header:
         writer.writerow(COLUMNS)
     writer.writerows(cells(row) for row in rows)
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows of an estimates.csv. Raises EvaluationError with file, line and reason."""
+    """Returns the rows of an estimates.csv. Raises EvaluationError with file, line and reason."""
     rows: list[Row] = []
     for line, raw in read_table(path, _REQUIRED, "write it with 'terrafix replay'"):
         row = Row(file=raw["file"], t_s=number(path, line, "t_s", raw.get("t_s", "")) or 0.0)
@@ -137,7 +139,8 @@ def read_table(
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """Yields (line number, cells by column); no two rows have the same ``key``.
 
-    Raises EvaluationError: file or columns missing, torn line, key twice."""
+    Raises EvaluationError: file or columns missing, wrong number of cells, duplicate key.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -145,31 +148,29 @@ def read_table(
     except (OSError, UnicodeDecodeError) as error:
         raise EvaluationError(f"{path}: cannot be read ({error})") from None
     reader = csv.reader(text.splitlines())
-    head = [name.strip() for name in next(reader, [])]
-    missing = [name for name in required if name not in head]
+    header = [name.strip() for name in next(reader, [])]
+    missing = [name for name in required if name not in header]
     if missing:
         raise EvaluationError(
-            f"{path}: column {', '.join(missing)} missing; the columns are {', '.join(head) or 'none'}"
+            f"{path}: column {', '.join(missing)} missing; the columns are {', '.join(header) or 'none'}"
         )
     seen: dict[str, int] = {}
     for raw in reader:
         if not any(cell.strip() for cell in raw):
             continue
         line = reader.line_num
-        if len(raw) != len(head):
-            raise EvaluationError(f"{path}, line {line}: {len(raw)} cells where the head has {len(head)}")
-        row = {name: cell.strip() for name, cell in zip(head, raw, strict=True)}
+        if len(raw) != len(header):
+            raise EvaluationError(f"{path}, line {line}: {len(raw)} cells, but the header has {len(header)}")
+        row = {name: cell.strip() for name, cell in zip(header, raw, strict=True)}
         file = row[key]
         if file in seen:
-            raise EvaluationError(
-                f"{path}, line {line}: '{file}' stands there a second time (first in line {seen[file]})"
-            )
+            raise EvaluationError(f"{path}, line {line}: duplicate row of '{file}' (first in line {seen[file]})")
         seen[file] = line
         yield line, row
 
 
 def number(path: Path, line: int, column: str, text: str) -> float | None:
-    """A finite number, or None for an empty cell; EvaluationError otherwise."""
+    """Returns a finite number, or None for an empty cell; raises EvaluationError otherwise."""
     if not text:
         return None
     try:

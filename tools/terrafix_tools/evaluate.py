@@ -1,4 +1,4 @@
-"""Estimates against ground truth: evaluation.json. Every definition is in docs/outputs.md."""
+"""Compares estimates with ground truth: evaluation.json. docs/outputs.md defines every metric."""
 
 import json
 import math
@@ -18,9 +18,10 @@ from terrafix_tools.estimates import Row, number, read_rows, read_table
 from terrafix_tools.finalise.output import TABLE as FINALISED
 
 LIMITS_M = (5, 10, 20, 50)
-ELLIPSE95 = 5.991  # chi-square with 2 degrees of freedom, 95 %
+ELLIPSE95 = 5.991  # chi-square quantile, 2 degrees of freedom, 95 %
 FALSE_FIX_ERROR_M = 50.0
-FALSE_FIX_MAHALANOBIS2 = 9.0  # "> 3 sigma": the squared Mahalanobis distance in the claimed 2x2 is above 3^2
+# "> 3 sigma": the squared Mahalanobis distance under the reported 2x2 covariance exceeds 3^2
+FALSE_FIX_MAHALANOBIS2 = 9.0
 _GEOD = Geod(ellps="WGS84")
 
 
@@ -32,7 +33,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Compared:
-    """One input frame that has truth; errors are estimate minus truth, None where there is no position."""
+    """One input frame that has ground truth. Errors are estimate minus truth, None where there is no estimate."""
 
     row: Row
     truth: Truth
@@ -40,11 +41,11 @@ class Compared:
     error_n_m: float | None
     error_m: float | None
     refined_error_m: float | None  # horizontal distance of the refined position
-    mahalanobis2: float | None  # squared, in the claimed covariance; None also where that is not positive definite
+    mahalanobis2: float | None  # squared, under the reported covariance; None also where that is not positive definite
 
 
 def read_truth(path: Path) -> dict[str, Truth]:
-    """Truth by file name. Raises EvaluationError."""
+    """Returns the truth by file name. Raises EvaluationError."""
     truth: dict[str, Truth] = {}
     for line, row in read_table(path, ("file", "lat_deg", "lon_deg"), "give the truth.csv of this flight"):
         lat_deg = number(path, line, "lat_deg", row["lat_deg"])
@@ -52,7 +53,9 @@ def read_truth(path: Path) -> dict[str, Truth]:
         if lat_deg is None or lon_deg is None:
             continue  # a frame without truth
         if not (-90.0 <= lat_deg <= 90.0 and -180.0 <= lon_deg <= 180.0):
-            raise EvaluationError(f"{path}, line {line}: {lat_deg}, {lon_deg} is no place on earth; columns swapped?")
+            raise EvaluationError(
+                f"{path}, line {line}: {lat_deg}, {lon_deg} is not a valid position; columns swapped?"
+            )
         truth[row["file"]] = Truth(lat_deg, lon_deg)
     if not truth:
         raise EvaluationError(f"{path}: no row with a position")
@@ -60,14 +63,16 @@ def read_truth(path: Path) -> dict[str, Truth]:
 
 
 def offset_m(truth: Truth, lat_deg: float, lon_deg: float) -> tuple[float, float]:
-    """East and north from truth to the position, metres along the WGS84 geodesic."""
+    """Returns the east and north offset from truth to the position, metres along the WGS84 geodesic."""
     azimuth_deg, _, distance_m = _GEOD.inv(truth.lon_deg, truth.lat_deg, lon_deg, lat_deg)
     azimuth = math.radians(azimuth_deg)
     return distance_m * math.sin(azimuth), distance_m * math.cos(azimuth)
 
 
 def mahalanobis2(row: Row, e_m: float, n_m: float, extra_sigma_m: float = 0.0) -> float | None:
-    """Squared Mahalanobis distance of (e_m, n_m) in the row's claimed 2x2, or None when that is not a covariance."""
+    """Squared Mahalanobis distance of (e_m, n_m) under the row's reported 2x2 covariance (plus ``extra_sigma_m``^2 on
+    the diagonal); None when that is not positive definite.
+    """
     if row.sigma_e_m is None or row.sigma_n_m is None or row.cov_en_m2 is None:
         return None
     ee, nn, en = row.sigma_e_m**2 + extra_sigma_m**2, row.sigma_n_m**2 + extra_sigma_m**2, row.cov_en_m2
@@ -78,7 +83,7 @@ def mahalanobis2(row: Row, e_m: float, n_m: float, extra_sigma_m: float = 0.0) -
 
 
 def compare(rows: list[Row], truth: dict[str, Truth]) -> list[Compared]:
-    """The input frames that have truth, in input order."""
+    """Returns the input frames that have truth, in input order."""
     compared = []
     for row in rows:
         if (true := truth.get(row.file)) is None:
@@ -95,7 +100,9 @@ def compare(rows: list[Row], truth: dict[str, Truth]) -> list[Compared]:
 
 
 def is_false_fix(compared: Compared, beyond_m: float = FALSE_FIX_ERROR_M) -> bool:
-    """Wrong by more than ``beyond_m`` and by more than 3 sigma of its own claim; no position is not false."""
+    """True when the error exceeds ``beyond_m`` and 3 sigma of the reported covariance. A frame without position is not
+    false.
+    """
     if compared.error_m is None or compared.error_m <= beyond_m:
         return False
     return compared.mahalanobis2 is None or compared.mahalanobis2 > FALSE_FIX_MAHALANOBIS2
@@ -112,7 +119,7 @@ def _errors(errors_m: list[float], frames: int, prefix: str) -> dict[str, float 
 
 
 def _odometry_rate(summary: dict[str, Any]) -> float | None:
-    """Frames that odometry registered, of those that could be (all but the first)."""
+    """Share of the frames that odometry registered; the first frame cannot be registered and does not count."""
     registered, frames = summary.get("odometry_frames"), summary.get("frames")
     if not isinstance(registered, int) or not isinstance(frames, int) or frames < 2:
         return None
@@ -122,13 +129,11 @@ def _odometry_rate(summary: dict[str, Any]) -> float | None:
 def metrics(
     rows: list[Row], truth: dict[str, Truth], summary: dict[str, Any], truth_sigma_m: float | None
 ) -> dict[str, Any]:
-    """The numbers of evaluation.json. ``rows`` and ``truth`` must share a file name (EvaluationError)."""
+    """Computes the metrics of evaluation.json. Raises EvaluationError if ``rows`` and ``truth`` share no file name."""
     compared = compare(rows, truth)
     if not compared:
         here, there = (rows[0].file if rows else "nothing"), next(iter(truth))
-        raise EvaluationError(
-            f"no frame stands in both: estimates have '{here}' ..., truth has '{there}' ...; same flight?"
-        )
+        raise EvaluationError(f"no frame in common: estimates have '{here}' ..., truth has '{there}' ...; same flight?")
     frames = len(compared)
     located = [c for c in compared if c.error_m is not None]
     errors_m = [c.error_m for c in compared if c.error_m is not None]
@@ -145,29 +150,29 @@ def metrics(
         "odometry_rate": _odometry_rate(summary),
         "frame_ms_median": float(np.median(times_ms)) if times_ms else None,
         "frame_ms_p95": float(np.percentile(times_ms, 95)) if times_ms else None,
-        # Beyond the contract:
+        # Additional to the specified metrics:
         "refined": len(refined_m),
         "frames_without_truth": len(rows) - frames,
         "covariance_invalid": len(located) - len(nees),
     }
     if truth_sigma_m is not None:
-        wide = [mahalanobis2(c.row, c.error_e_m or 0.0, c.error_n_m or 0.0, truth_sigma_m) for c in located]
-        inside = sum(v is not None and v <= ELLIPSE95 for v in wide)
+        inflated = [mahalanobis2(c.row, c.error_e_m or 0.0, c.error_n_m or 0.0, truth_sigma_m) for c in located]
+        inside = sum(v is not None and v <= ELLIPSE95 for v in inflated)
         result["truth_sigma_m"] = truth_sigma_m
         result["ellipse95_coverage_with_truth_sigma"] = inside / len(located) if located else None
     return {key: round(value, 6) if isinstance(value, float) else value for key, value in result.items()}
 
 
 def finalised_metrics(rows: list[Row], truth: dict[str, Truth]) -> dict[str, Any]:
-    """The same of finalised.csv, where that is defined; every key begins with ``finalised``."""
+    """The same metrics of finalised.csv, where they are defined; every key begins with ``finalised``."""
     whole = metrics(rows, truth, {}, None)
-    kept = ("median_m", "p95_m", "max_m", "ellipse95_coverage", "mean_nees", "false_fixes")
-    names = [name for name in whole if name.startswith("within_") or name in kept]
+    metric_names = ("median_m", "p95_m", "max_m", "ellipse95_coverage", "mean_nees", "false_fixes")
+    names = [name for name in whole if name.startswith("within_") or name in metric_names]
     return {"finalised": whole["localised"], **{f"finalised_{name}": whole[name] for name in names}}
 
 
 def truth_sigma_of(truth_path: Path) -> float | None:
-    """[truth] sigma_m of the flight.toml beside truth.csv, when there is one."""
+    """Reads [truth] sigma_m of the flight.toml next to truth.csv; None when there is none."""
     try:
         table = tomllib.loads((truth_path.parent / "flight.toml").read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
@@ -178,7 +183,7 @@ def truth_sigma_of(truth_path: Path) -> float | None:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """summary.json, or nothing when it is not there."""
+    """Reads summary.json; an empty dict when it does not exist."""
     path = folder / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
@@ -210,7 +215,7 @@ def evaluate(folder: Path, truth_path: Path, *, json_only: bool = False) -> dict
     return result
 
 
-def _shown(key: str, value: float | int | None) -> str:
+def _format(key: str, value: float | int | None) -> str:
     if value is None:
         return "-"
     if "within" in key or key.endswith("_rate") or "coverage" in key:
@@ -233,5 +238,5 @@ def _table(result: dict[str, Any], folder: Path) -> Table:
         if key.startswith(("refined_", "finalised")) or key in ("frames", "localised"):
             continue
         others = [f"{stage}_{key}" for stage in ("refined", "finalised")]
-        table.add_row(key, _shown(key, value), *(_shown(o, result[o]) if o in result else "" for o in others))
+        table.add_row(key, _format(key, value), *(_format(o, result[o]) if o in result else "" for o in others))
     return table

@@ -1,7 +1,8 @@
-"""The program `terrafix`: its command line, and for `run` first what takes longest.
+"""Entry point `terrafix`.
 
-A vehicle waits when it is started again in flight. The fork_server imports what the processes need; it is begun before
-the command line is loaded, and imports beside that."""
+`run` may be a restart in flight, so its start-up time matters: the fork server, which imports what the processes need,
+starts before the command line is loaded and imports in parallel with it.
+"""
 
 import sys
 

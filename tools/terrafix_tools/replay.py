@@ -1,4 +1,4 @@
-"""`terrafix replay`: a recorded flight through the same nodes that fly, as fast as this machine can."""
+"""`terrafix replay`: a recorded flight through the nodes that run in flight, as fast as this machine can."""
 
 import importlib
 import json
@@ -18,7 +18,7 @@ from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, ModelError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.initial_position import placed, start_is_unknown
+from terrafix.core.initial_position import start_is_unknown, with_map_center
 from terrafix.core.node import Node, NodeContext
 from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, SourceEnded
@@ -27,22 +27,23 @@ from terrafix.recorder.writer import versions
 from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
 from terrafix_engines.runtime import ModelFileError
-from terrafix_engines.store import Stored, find, models_folder
-from terrafix_tools.live import swapped
+from terrafix_engines.store import StoredModel, models_folder, resolve_model
+from terrafix_tools.live import swapped_hint
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay_output import ReplayOutput
 
-FLOWN = ("vision", "anchor", "estimator")  # processes that decide; link, health and recorder need a live world
-FOLDER = "folder"  # the key of [models] that is no model
-FRAMES_KEPT = 32  # what a node may still ask for; as many as the live ring has
+# processes that compute the estimate; link, health and recorder need a live system
+REPLAYED_PROCESSES = ("vision", "anchor", "estimator")
+FOLDER = "folder"  # key of [models] that is not a model
+FRAMES_KEPT = 32  # frames that a node may still request; the size of the live frame ring
 
 MakeNodes = Callable[[NodeContext], Mapping[str, Node]]
 MakeSource = Callable[[Source], Source]
 
 
 def make_nodes(ctx: NodeContext) -> dict[str, Node]:
-    """The deciding nodes of the process table."""
-    return {p.name: importlib.import_module(p.module).make_node(ctx) for p in PROCESSES if p.name in FLOWN}
+    """Creates the nodes of the process table that compute the estimate."""
+    return {p.name: importlib.import_module(p.module).make_node(ctx) for p in PROCESSES if p.name in REPLAYED_PROCESSES}
 
 
 def replay(
@@ -55,15 +56,16 @@ def replay(
     progress: bool = False,
     start: tuple[float, float] | None = None,
     nodes: MakeNodes = make_nodes,
-    altered: MakeSource = lambda source: source,
+    wrap_source: MakeSource = lambda source: source,
 ) -> dict[str, Any]:
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
-    ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg) instead of the source's. ``nodes`` and ``altered`` put
-    something between flight and nodes (a stopwatch, a fault). Raises the TerrafixError family."""
+    ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg), overrides the source's. ``nodes`` and ``wrap_source`` wrap the
+    nodes and the source (to measure time, to inject faults). Raises subclasses of TerrafixError.
+    """
     began_s = time.perf_counter()
     config = _with_models(load(configs or []), models or [])
-    source = altered(open_source(str(flight), start=start))
+    source = wrap_source(open_source(str(flight), start=start))
     if source.live:
         raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
     package = ensure_package(_map_of(map_path, config, source), map_cache_dir(), progress=progress)
@@ -71,9 +73,9 @@ def replay(
     with ReplayOutput(out, config) as output:
         frames = MemoryFrameStore(FRAMES_KEPT)
         ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
-        heard: list[Message] = []
-        shell = InProcessShell(nodes(ctx), lambda _who, message: heard.append(message))
-        _fly(source, origin, shell, frames, heard, output, progress)
+        published: list[Message] = []
+        shell = InProcessShell(nodes(ctx), lambda _who, message: published.append(message))
+        _feed_flight(source, origin, shell, frames, published, output, progress)
         source.close()
         summary = {
             "flight": source.name(),
@@ -88,7 +90,7 @@ def replay(
         }
         output.finish(summary)
     if progress:
-        Console(stderr=True).print(_last_line(summary, out))
+        Console(stderr=True).print(_result_line(summary, out))
         if summary["lens"] is not None:
             Console(stderr=True).print(summary["lens"], markup=False)
         Console(stderr=True).print(summary["verdict"]["text"], markup=False, highlight=False)
@@ -96,7 +98,7 @@ def replay(
 
 
 def peak_memory_mb() -> float:
-    """Largest resident memory of this program. Not getrusage: that counts what forked it, too (execve(2))."""
+    """Peak resident memory of this program, MB. Not getrusage, whose value includes the parent before execve(2)."""
     for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
         if line.startswith("VmHWM:"):
             return round(int(line.split()[1]) / 1024, 1)
@@ -104,24 +106,24 @@ def peak_memory_mb() -> float:
 
 
 def map_cache_dir() -> Path:
-    """Where packages made from GeoTIFFs are kept between runs."""
+    """Folder that caches packages made from GeoTIFFs."""
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(base) / "terrafix" / "maps"
 
 
-def _fly(
+def _feed_flight(
     source: Source,
     origin: Origin,
     shell: InProcessShell,
     frames: MemoryFrameStore,
-    heard: list[Message],
+    published: list[Message],
     output: ReplayOutput,
     progress: bool,
 ) -> None:
-    """One frame after the other. Recording stands outside the measured time: in flight it is another process."""
+    """Feeds the frames one after the other. Recording is outside the measured time: in flight it is another process."""
     shell.feed(origin)
-    output.take(heard)
-    heard.clear()
+    output.take(published)
+    published.clear()
     count, last_ns = 0, origin.t_ns
     shots = source.shots()
     with _bar(progress, source.length()) as step:
@@ -132,32 +134,33 @@ def _fly(
                 break
             if shot.image is not None:
                 frames.put(shot.frame.frame_id, shot.image)
-            for said in (*shot.imu, *shot.states):
-                shell.feed(said)
+            for message in (*shot.imu, *shot.states):
+                shell.feed(message)
             shell.feed(shot.frame)
             process_ms = (time.perf_counter() - began_s) * 1e3
-            output.take(heard)
+            output.take(published)
             output.frame_done(shot.frame, shot.image, process_ms)
-            heard.clear()
+            published.clear()
             count, last_ns = count + 1, shot.frame.t_ns
             step()
     shell.feed(SourceEnded(t_ns=last_ns, frames=count))
-    output.take(heard)
+    output.take(published)
 
 
 def _with_models(config: Config, models: list[str]) -> Config:
-    """The configuration with NAME=PATH, or NAME alone for one that was fetched, of the command line in its [models];
-    every file must exist."""
+    """Returns the configuration with the command line's models in its [models]: NAME=PATH, or NAME alone for a fetched
+    model. Every file must exist.
+    """
     known = [f.name for f in msgspec.structs.fields(type(config.models)) if f.name != FOLDER]
-    given: dict[str, str] = {}
+    models_by_name: dict[str, str] = {}
     for text in models:
         name, equals, path = text.partition("=")
         if equals and not path:
             raise UsageError(f"--model '{text}': write NAME=PATH, or NAME alone for a model that was fetched")
         if name not in known:
-            raise UsageError(f"--model '{text}': no model is called '{name}'; known: {', '.join(known)}")
-        given[name] = path or name
-    chosen = msgspec.structs.replace(config.models, **given)
+            raise UsageError(f"--model '{text}': unknown model '{name}'; known: {', '.join(known)}")
+        models_by_name[name] = path or name
+    chosen = msgspec.structs.replace(config.models, **models_by_name)
     for name in known:
         if wanted := getattr(chosen, name):
             _check_model(wanted, name, models_folder(chosen.folder))
@@ -166,36 +169,36 @@ def _with_models(config: Config, models: list[str]) -> Config:
 
 def _check_model(wanted: str, name: str, folder: Path) -> None:
     try:
-        found = find(wanted, name, folder)
-        there = found.is_there() if isinstance(found, Stored) else os.path.isfile(found)
+        found = resolve_model(wanted, name, folder)
+        exists = found.exists() if isinstance(found, StoredModel) else os.path.isfile(found)
     except ModelFileError as error:
         raise ModelError(str(error)) from None
-    if not there:
+    if not exists:
         path, todo = (
             (found.path, f"terrafix models fetch {found.manifest.name}")
-            if isinstance(found, Stored)
+            if isinstance(found, StoredModel)
             else (found, "check the path")
         )
-        raise ModelError(f"{path}: no such model file ({name}); {todo}, or leave it out to fly without weights")
+        raise ModelError(f"{path}: no such model file ({name}); {todo}, or omit it to fly without weights")
 
 
-def _map_of(given: Path | None, config: Config, source: Source) -> Path:
-    chosen = given or (Path(config.map.path) if config.map.path else None) or source.map_hint()
+def _map_of(map_path: Path | None, config: Config, source: Source) -> Path:
+    chosen = map_path or (Path(config.map.path) if config.map.path else None) or source.map_hint()
     if chosen is None:
         raise MapError(f"{source.name()}: the flight names no map; give one with --map (GeoTIFF or map package)")
     return chosen
 
 
 def _check_map(package: Path, origin: Origin) -> tuple[Origin, dict[str, Any]]:
-    """-> the origin with the height of its ground, where the map knows it; what the summary says of the map."""
+    """Returns the origin, with its ground height where the map has it, and the map section of the summary."""
     opened = MapPackage.open(package)
     try:
         unknown = start_is_unknown(origin)
-        origin = placed(origin, opened.manifest.bounds_wgs84)
+        origin = with_map_center(origin, opened.manifest.bounds_wgs84)
         frame = LocalFrame(origin.lat_deg, origin.lon_deg)
         local = opened.bind(frame)
         if not unknown and not opened.covers_start(origin.lat_deg, origin.lon_deg, origin.start_sigma_m):
-            todo = swapped(opened, origin.lat_deg, origin.lon_deg, origin.start_sigma_m)
+            todo = swapped_hint(opened, origin.lat_deg, origin.lon_deg, origin.start_sigma_m)
             todo = todo or "use another --map or check the start"
             raise MapError(f"{package}: {_not_covered(origin, local.bounds_m)}; {todo}")
         if origin.ground_amsl_m is None:
@@ -232,7 +235,7 @@ def _bar(shown: bool, total: int | None) -> Iterator[Callable[[], None]]:
         yield lambda: progress.advance(task)
 
 
-def _last_line(summary: dict[str, Any], out: Path) -> str:
+def _result_line(summary: dict[str, Any], out: Path) -> str:
     timing = json.dumps(summary["frame_ms_median"])
     return (
         f"{summary['localised']} of {summary['frames']} frames localised, median {timing} ms a frame; written to {out}"

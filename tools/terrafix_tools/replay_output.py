@@ -1,4 +1,4 @@
-"""What a replay leaves behind: rows, record and summary, under temporary names until the flight is over."""
+"""Output of a replay: rows, record and summary, under temporary names until the flight is over."""
 
 import json
 from collections import Counter, defaultdict
@@ -32,12 +32,12 @@ from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.lens_words import lens_words
 
 RECORD, SUMMARY = "flight.mcap", "summary.json"
-# Made of the three above: those of an earlier replay would lie.
+# Derived from the three files above: those of an earlier replay would be stale.
 DERIVED = ("evaluation.json", "report.html", FINALISED_TABLE, FINALISED_SUMMARY)
 
 
 class ReplayOutput:
-    """Use as a context: leaving it with an error keeps the partial files, which are readable."""
+    """A context manager. On an exception the partial files stay and are readable."""
 
     def __init__(self, out: Path, config: Config) -> None:
         self._out = out
@@ -47,7 +47,7 @@ class ReplayOutput:
         self._matcher: Counter[str] = Counter()
         self._registered: dict[int, bool] = {}
         self._origin: Origin | None = None
-        self._learnt: SlowErrors | None = None
+        self._calibration: SlowErrors | None = None
         self._faults: list[tuple[float, CalibrationFault]] = []
 
     def __enter__(self) -> Self:
@@ -73,7 +73,7 @@ class ReplayOutput:
                 self._count(message)
 
     def frame_done(self, frame: Frame, image: Image | None, process_ms: float) -> None:
-        """The row of the frame goes to the disk now, its refinement comes with the last word."""
+        """Writes the row of the frame to disk; its refined position follows in finish()."""
         settings = self._config.recorder
         row = self._table.rows[frame.frame_id]
         row.process_ms = process_ms
@@ -82,11 +82,11 @@ class ReplayOutput:
                 jpeg = thumbnail_jpeg(image, settings.thumbnail_width_px)
                 self._record.write_thumbnail(frame.t_ns, frame.frame_id, jpeg)
             self._record.flush()
-            write_rows(self._csv, [row], head=False)
+            write_rows(self._csv, [row], header=False)
             self._csv.flush()
 
     def counts(self) -> dict[str, Any]:
-        """Frames, verdicts and times, as summary.json has them."""
+        """Returns frames, verdicts and times for summary.json."""
         rows = list(self._table.rows.values())
         times_ms = [r.process_ms for r in rows if r.process_ms is not None]
         return {
@@ -95,7 +95,7 @@ class ReplayOutput:
             "refined": sum(r.refined_lat_deg is not None for r in rows),
             "odometry_frames": sum(self._registered.values()),
             "verdicts": {what: dict(sorted(c.items())) for what, c in sorted(self._verdicts.items())},
-            "lens": lens_words(self._origin.camera, self._learnt) if self._origin and self._learnt else None,
+            "lens": lens_words(self._origin.camera, self._calibration) if self._origin and self._calibration else None,
             "verdict": flight_verdict(rows, self._faults, self._verdicts).as_json(),
             "matcher_verdicts": dict(sorted(self._matcher.items())),
             "frame_ms_median": round(float(np.median(times_ms)), 1) if times_ms else None,
@@ -103,7 +103,7 @@ class ReplayOutput:
         }
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Writes the refined rows and the summary, and gives everything its name."""
+        """Writes the refined rows and the summary, and renames all files to their final names."""
         with self._writing():
             self._csv.close()
             self._record.close()
@@ -119,7 +119,7 @@ class ReplayOutput:
     ) -> None:
         if not self._csv.closed:
             for file in (self._csv, self._record):
-                with suppress(OSError):  # of a disk that is full; the reason for leaving has been said
+                with suppress(OSError):  # disk full; the original exception is already propagating
                     file.close()
 
     @contextmanager
@@ -139,7 +139,7 @@ class ReplayOutput:
         elif isinstance(message, CalibrationFault):
             self._faults.append((message.t_ns / NS, message))
         elif isinstance(message, SlowErrors):
-            self._learnt = message
+            self._calibration = message
         elif isinstance(message, MapMatch):
             self._matcher[str(message.verdict)] += 1
         elif isinstance(message, Odometry):

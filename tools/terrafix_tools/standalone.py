@@ -1,4 +1,4 @@
-"""Programs beside the command line `terrafix`: ``python -m terrafix_tools.NAME``."""
+"""Entry of the programs outside the command line `terrafix`: ``python -m terrafix_tools.NAME``."""
 
 import sys
 from collections.abc import Callable
@@ -10,7 +10,9 @@ from terrafix.core.errors import TerrafixError
 
 
 def run_standalone(name: str, command: Callable[..., Any]) -> None:
-    """``command`` with the arguments of this process. A user's mistake: one line after ``name``, and its exit code."""
+    """Runs ``command`` with the arguments of this process. A TerrafixError ends with one line after ``name`` and its
+    exit code.
+    """
     try:
         typer.run(command)
     except TerrafixError as error:

@@ -1,59 +1,65 @@
-"""The learned model in flight: what runs it, what it could not answer, and when matching goes on without it."""
+"""Monitor of the learned model in flight: its execution provider, its failures, and the decision to continue without
+it."""
 
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.messages import ModelChange, ModelEvent
 from terrafix_engines.features.xfeat import XFeatDescriber
-from terrafix_engines.providers import short
+from terrafix_engines.providers import short_name
 
-FAILURES = 5  # frames in a row without an answer: the model is given up for this flight
+MAX_FAILURES = 5  # consecutive frames without a result after which the model is disabled for this flight [tuned]
 
 
-class ModelWatch:
-    """Nothing to say of a describer without weights, unless another was wanted: ``not_opened`` says why it is not."""
+class ModelMonitor:
+    """Emits nothing for a describer without weights, unless a model was configured and could not be opened;
+    ``not_opened`` is then the reason."""
 
     def __init__(self, describer: Describer, not_opened: str = "") -> None:
         self._name = describer.name
         self._not_opened = not_opened
         self._model = describer.model if isinstance(describer, XFeatDescriber) else None
-        self._said = 0  # of the providers that were passed over
+        self._reported = 0  # number of rejected execution providers that were already reported
         self._failures = 0
-        self._answers = 0  # of the model, when it was last looked at
+        self._results = 0  # number of model results at the last check
 
     def opened(self, t_ns: int) -> list[ModelEvent]:
-        """At the start of a flight."""
+        """Events at the start of a flight."""
         if self._not_opened:
             return [self._event(t_ns, ModelChange.GIVEN_UP, self._not_opened)]
         if self._model is None:
             return []
-        self._said = len(self._model.passed_over)
-        why = "".join(f"; {over}" for over in self._model.passed_over)
+        self._reported = len(self._model.rejected_providers)
+        why = "".join(f"; {rejected}" for rejected in self._model.rejected_providers)
         return [self._event(t_ns, ModelChange.OPENED, f"sha256 {self._model.sha256[:12]}{why}")]
 
-    def answered(self, t_ns: int) -> list[ModelEvent]:
-        """After a frame that did not need it, or that it described: only these end a row of failures."""
-        if self._model is not None and self._model.answers != self._answers:
-            self._failures, self._answers = 0, self._model.answers
-        return self._moved(t_ns)
+    def succeeded(self, t_ns: int) -> list[ModelEvent]:
+        """After a frame without a failure. Only a frame for which the model produced a result resets the failure
+        count."""
+        if self._model is not None and self._model.run_count != self._results:
+            self._failures, self._results = 0, self._model.run_count
+        return self._provider_events(t_ns)
 
     def failed(self, t_ns: int, reason: str) -> list[ModelEvent]:
-        """After a frame that it did not; ``given_up`` is true from the last one on."""
+        """After a frame on which the model failed; ``given_up`` is true from the ``MAX_FAILURES``-th consecutive one
+        on."""
         self._failures += 1
-        self._answers = self._model.answers if self._model is not None else 0
-        said = [*self._moved(t_ns), self._event(t_ns, ModelChange.FAILED, reason)]
+        self._results = self._model.run_count if self._model is not None else 0
+        events = [*self._provider_events(t_ns), self._event(t_ns, ModelChange.FAILED, reason)]
         if self.given_up:
-            said.append(self._event(t_ns, ModelChange.GIVEN_UP, f"{self._failures} frames in a row without an answer"))
-        return said
+            events.append(
+                self._event(t_ns, ModelChange.GIVEN_UP, f"{self._failures} frames in a row without an answer")
+            )
+        return events
 
     @property
     def given_up(self) -> bool:
-        return self._failures >= FAILURES
+        return self._failures >= MAX_FAILURES
 
-    def _moved(self, t_ns: int) -> list[ModelEvent]:
-        if self._model is None or len(self._model.passed_over) == self._said:
+    def _provider_events(self, t_ns: int) -> list[ModelEvent]:
+        if self._model is None or len(self._model.rejected_providers) == self._reported:
             return []
-        new, self._said = self._model.passed_over[self._said :], len(self._model.passed_over)
-        return [self._event(t_ns, ModelChange.PROVIDER, "; ".join(str(over) for over in new))]
+        new, self._reported = self._model.rejected_providers[self._reported :], len(self._model.rejected_providers)
+        return [self._event(t_ns, ModelChange.PROVIDER, "; ".join(str(rejected) for rejected in new))]
 
     def _event(self, t_ns: int, change: ModelChange, detail: str) -> ModelEvent:
-        provider = short(self._model.provider) if self._model is not None else ""
+        provider = short_name(self._model.provider) if self._model is not None else ""
         return ModelEvent(t_ns=t_ns, model=self._name, change=change, provider=provider, detail=detail)

@@ -1,4 +1,6 @@
-"""Messages as bytes: msgpack between processes, JSON for people. No pickle: bytes from outside never run code."""
+"""Serialisation of messages: msgpack between processes, JSON for records and logs.
+
+No pickle, because unpickling bytes from outside can execute code."""
 
 from typing import Any
 
@@ -7,18 +9,18 @@ import msgspec
 from terrafix.messages import AnyMessage, Message
 
 
-def _plain(value: Any) -> Any:
-    """numpy scalars that slipped into a message become plain numbers; anything else is a bug of the sayer."""
-    import numpy as np  # only here: the supervisor speaks, too, and has no arrays
+def _numpy_to_python(value: Any) -> Any:
+    """Encoder hook: numpy scalar -> Python number. Raises TypeError for any other type, a bug in the publisher."""
+    import numpy as np  # imported here because the supervisor publishes messages but must not load numpy
 
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} cannot be part of a message")
 
 
-_msgpack_encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
+_msgpack_encoder = msgspec.msgpack.Encoder(enc_hook=_numpy_to_python)
 _msgpack_decoder = msgspec.msgpack.Decoder(AnyMessage)
-_json_encoder = msgspec.json.Encoder(enc_hook=_plain)
+_json_encoder = msgspec.json.Encoder(enc_hook=_numpy_to_python)
 _json_decoder = msgspec.json.Decoder(AnyMessage)
 
 
@@ -27,7 +29,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes | memoryview) -> Message:
-    """Raises msgspec.ValidationError or DecodeError when ``data`` is no message of messages.py."""
+    """Raises msgspec.ValidationError or DecodeError when ``data`` is not a message of messages.py."""
     return _msgpack_decoder.decode(data)
 
 

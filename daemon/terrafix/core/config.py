@@ -1,7 +1,7 @@
-"""Configuration: strict, bounded, read once. The defaults here and in config/default.toml are the same (tested).
+"""Configuration: strict keys, bounded values, read once at start.
 
-A key that is not here is an error that proposes the nearest name. What a user cannot sensibly choose is a
-constant in the code, not a key."""
+The defaults here and in config/default.toml are equal (tested). An unknown key is an error that proposes the nearest
+known key. Values that a user cannot sensibly choose are constants in the code."""
 
 import difflib
 import re
@@ -21,40 +21,40 @@ Baud = Annotated[int, Meta(ge=9600, le=3_000_000)]
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of every section."""
+    """Base class of all sections."""
 
 
 class Map(Section, frozen=True, kw_only=True):
-    path: str = ""  # map package or GeoTIFF; the command line wins
-    ce90_m: Annotated[float, Meta(ge=0, le=200)] = 10.0  # of a layer of which none is stated or estimated
-    require_signature: bool = False  # refuse a package that none of trusted_keys has signed
-    trusted_keys: list[str] = []  # public keys (.pub of `terrafix map keygen`), or folders of them
+    path: str = ""  # map package or GeoTIFF; the command line overrides it
+    ce90_m: Annotated[float, Meta(ge=0, le=200)] = 10.0  # default for layers without a stated or estimated CE90
+    require_signature: bool = False  # reject a package that no key of trusted_keys has signed
+    trusted_keys: list[str] = []  # public key files (.pub of `terrafix map keygen`), or folders of them
 
 
 class Models(Section, frozen=True, kw_only=True):
-    xfeat: str = ""  # name of a fetched model, or path of an ONNX file; empty: weights-free
-    folder: str = ""  # of fetched models; empty: TERRAFIX_MODELS, or the user's data folder
+    xfeat: str = ""  # name of a fetched model, or path of an ONNX file; empty: matching without a learned model
+    folder: str = ""  # folder of fetched models; empty: TERRAFIX_MODELS, or the user's data folder
 
 
 class LinkSection(Section, frozen=True, kw_only=True):
     device: str = "udpout:127.0.0.1:14550"
     baud: Baud = 921_600
-    ground_devices: list[str] = []  # ground stations besides what the autopilot forwards; nothing is forwarded here
+    ground_devices: list[str] = []  # direct links to ground stations; no packet is forwarded between them
     ground_baud: Baud = 57_600
-    view_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # shows our position there as a vehicle of its own; 0: no
+    view_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # ghost vehicle at our position on ground_devices; 0: none
     sysid: Annotated[int, Meta(ge=1, le=255)] = 1
     compid: Annotated[int, Meta(ge=1, le=255)] = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
-    autopilot_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: the first autopilot that is heard
-    signing_key: str = ""  # file with the MAVLink 2 signing key; empty: neither signed nor checked
+    autopilot_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: the first autopilot that is received
+    signing_key: str = ""  # file with the MAVLink 2 signing key; empty: packets are neither signed nor checked
     gps_id: Annotated[int, Meta(ge=0, le=3)] = 0
-    rate_hz: Annotated[float, Meta(ge=5, le=15)] = 10.0  # faster leaves gaps that the autopilot drops
-    outputs: list[OutputName] = []  # empty: by the autopilot, gps_input for ArduPilot, global_position for PX4
-    gnss: GnssMode = "advise"  # what follows when a receiver disagrees with the map
-    gnss_start: bool = True  # a receiver says where the flight begins, if nobody else does
-    map_offset: bool = True  # what a trusted receiver shows of the map's own error is taken out of what is sent
-    nmea_device: str = ""  # also NMEA 0183 to this device
+    rate_hz: Annotated[float, Meta(ge=5, le=15)] = 10.0  # the autopilot drops messages at shorter intervals
+    outputs: list[OutputName] = []  # empty: chosen by autopilot, gps_input for ArduPilot, global_position for PX4
+    gnss: GnssMode = "advise"  # reaction when a GNSS receiver disagrees with the map
+    gnss_start: bool = True  # initial position from a GNSS receiver, if no other source gives one
+    map_offset: bool = True  # subtract the map error that a trusted GNSS receiver shows from the output
+    nmea_device: str = ""  # additional output: NMEA 0183 to this device
     nmea_baud: Baud = 115_200
-    msp_device: str = ""  # also MSP2_SENSOR_GPS to this device
+    msp_device: str = ""  # additional output: MSP2_SENSOR_GPS to this device
     msp_baud: Baud = 115_200
 
 
@@ -73,10 +73,10 @@ class HealthSection(Section, frozen=True, kw_only=True):
 
 class Source(Section, frozen=True, kw_only=True):
     path: str = ""  # flight folder, photo folder, video file, /dev/video* or a GStreamer pipeline
-    realtime: bool = True  # play a recorded source at its own pace (live shell only)
-    start: str = ""  # "LAT,LON" in degrees, over what the source says; the command line wins
-    camera: str = ""  # camera description (config/cameras); cameras need one, photos and videos may have one
-    rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0  # frames a second taken from a video or a camera
+    realtime: bool = True  # play a recorded source in real time (live shell only)
+    start: str = ""  # "LAT,LON" in degrees, overrides the source; the command line overrides it
+    camera: str = ""  # camera description (config/cameras); required for cameras, optional for photos and videos
+    rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0  # frames per second taken from a video or a camera
 
 
 class LogSection(Section, frozen=True, kw_only=True):
@@ -94,7 +94,7 @@ class Config(Section, frozen=True, kw_only=True):
 
 
 def load(paths: list[Path]) -> Config:
-    """Defaults, then each file over the last, key by key. Raises ConfigError with file, key and what to do."""
+    """Defaults, overridden key by key by each file in turn. Raises ConfigError with file, key and what to do."""
     merged: dict[str, dict[str, object]] = {}
     for path in paths:
         for name, table in _read(path).items():
@@ -120,7 +120,7 @@ def _read(path: Path) -> dict[str, object]:
 
 
 def _explain(text: str) -> str:
-    """Adds the nearest known name to msgspec's message about an unknown key."""
+    """Replaces msgspec's message about an unknown key by one with the nearest known key."""
     unknown = re.search(r"unknown field `(.+?)`(?: - at `\$\.?(.*?)`)?", text)
     if not unknown:
         return text.replace("`$.", "`")

@@ -1,4 +1,4 @@
-"""The exception tree. One funnel (the command line) prints the message and exits with ``exit_code``.
+"""The exception tree. The command line catches TerrafixError in one place, prints it and exits with ``exit_code``.
 
 TerrafixError
 +-- UsageError            2   wrong arguments
@@ -10,11 +10,11 @@ TerrafixError
 +-- ModelError            8   a model file that is missing, altered or of the wrong shape
 +-- EvaluationError       9   truth and estimates that do not belong together
 
-Each message says what is wrong, where, and what to do next. A bug is not caught: it ends in a traceback."""
+Each message states what is wrong, where, and what to do next. Other exceptions are bugs and end in a traceback."""
 
 
 class TerrafixError(Exception):
-    """A user's mistake or a missing thing; never a bug."""
+    """A user error or a missing resource, as opposed to a bug."""
 
     exit_code = 1
 

@@ -1,12 +1,14 @@
 """Frame stores: pixels by frame id, in one process (replay) or in shared memory (live).
 
-The shared ring has one writer and any number of readers, and nobody waits. A file that is mapped by hand, not
-multiprocessing.shared_memory: that one registers every reader with a resource tracker, which unlinks the memory
-of the living when a reader dies (Python < 3.13). Who owns the folder removes the file (runtime/run_dir.py).
+The shared ring buffer has one writer and any number of readers and is wait-free. It is a memory-mapped file instead of
+multiprocessing.shared_memory, because the latter registers every reader with a resource tracker that unlinks the
+memory for all processes when one reader dies (Python < 3.13). The owner of the run folder removes the file
+(runtime/run_dir.py).
 
-Slot = 64 bytes of header (generation, frame id + 1, height, width) and the pixels. The writer makes the generation
-odd, writes, and makes it even again; a reader copies and takes the copy only if the generation was even and is
-still the same (a sequence lock). So an overwritten or half-written frame is ``None``, never a torn image."""
+A slot is a header of 64 bytes (generation, frame id + 1, height, width) followed by the pixels. Access is by sequence
+lock: the writer makes the generation odd, writes, and makes it even again; a reader copies the slot and accepts the
+copy if the generation was even before and is unchanged after. An overwritten or partially written frame therefore
+reads as ``None``."""
 
 import mmap
 import os
@@ -21,9 +23,9 @@ from terrafix.core.errors import OutputError
 from terrafix.core.node import FrameStore, Image
 
 MAGIC = 0x31465852_52455431  # layout version 1
-BUDGET_BYTES = 192 * 2**20  # a tenth of the memory goal; 31 full-HD frames, 3 s at 10 Hz
-MAX_SLOTS = 32  # nobody is later than this many frames and still useful
-MIN_SLOTS = 4  # frames of 26 megapixels (78 MB each) exceed the budget, but come slowly
+BUDGET_BYTES = 192 * 2**20  # a tenth of the memory target; 31 full-HD frames, 3 s at 10 Hz
+MAX_SLOTS = 32  # a consumer that lags by more frames than this gives no useful result
+MIN_SLOTS = 4  # frames of 26 megapixels (78 MB each) exceed the budget, but arrive at a low rate
 CHANNELS = 3  # BGR
 _PAGE = 4096
 _SLOT_HEADER_WORDS = 8
@@ -33,14 +35,14 @@ _GENERATION, _FRAME, _HEIGHT, _WIDTH = range(4)  # words of a slot header
 
 @runtime_checkable
 class FrameWriter(FrameStore, Protocol):
-    """The store as the one process has it that says Frame."""
+    """Frame store of the one process that publishes Frame."""
 
     def put(self, frame_id: int, image: Image) -> None: ...
 
 
 class MemoryFrameStore:
-    """The newest frames of this process: ``capacity`` of them, fewer of large ones, as in the live ring. What it
-    returns is read-only: all readers share it."""
+    """The newest frames in the memory of this process: at most ``capacity``, fewer if they are large, as in the shared
+    ring. ``get`` returns a read-only array that all readers share."""
 
     def __init__(self, capacity: int = MAX_SLOTS) -> None:
         self._capacity = capacity
@@ -59,13 +61,13 @@ class MemoryFrameStore:
 
 
 class SharedFrameStore:
-    """Ring of frames in the file ``path``. The file is made by the first ``put`` and sized by its image.
+    """Ring buffer of frames in the file ``path``. The first ``put`` creates the file and sizes it by its image.
 
-    A writer that starts again goes on in the same file, so its readers notice nothing. An image that is larger
-    than the slots gets a new file in the same place; readers see that theirs is no longer the one there."""
+    A restarted writer continues in the same file, which is transparent to readers. An image larger than the slots
+    replaces the file; readers detect the replacement and reopen it."""
 
     def __init__(self, path: Path, *, writer: bool = False, slots: int = 0, slot_bytes: int = 0) -> None:
-        """``slots`` and ``slot_bytes``: at least so large, whatever the first image; 0: by the first image."""
+        """``slots`` and ``slot_bytes``: number of slots and least size of a slot; 0: derived from the first image."""
         self._path = path
         self._writer = writer
         self._slots = slots
@@ -73,7 +75,7 @@ class SharedFrameStore:
         self._ring: _Ring | None = None
 
     def put(self, frame_id: int, image: Image) -> None:
-        """``image``: (H, W, 3) uint8. Raises OutputError when shared memory has no room for the ring."""
+        """``image``: (H, W, 3) uint8 BGR. Raises OutputError when shared memory is too small for the ring."""
         if not self._writer:
             raise ValueError("this store was opened for reading")
         if image.dtype != np.uint8 or image.ndim != CHANNELS or image.shape[2] != CHANNELS:
@@ -81,7 +83,7 @@ class SharedFrameStore:
         self._writable(image.nbytes).put(frame_id, image)
 
     def get(self, frame_id: int) -> Image | None:
-        """A copy that belongs to the caller, or None: never written, overwritten, or just being overwritten."""
+        """A copy (H, W, 3) owned by the caller. None: the frame was never written, or is or was overwritten."""
         if self._ring is not None and self._ring.replaced(self._path):
             self.close()
         if self._ring is None:
@@ -110,7 +112,7 @@ def _slots_for(slot_bytes: int) -> int:
 
 
 class _Ring:
-    """One mapped file."""
+    """One memory-mapped ring file."""
 
     def __init__(self, fd: int) -> None:
         status = os.fstat(fd)
@@ -127,7 +129,7 @@ class _Ring:
 
     @classmethod
     def open(cls, path: Path) -> "_Ring | None":
-        """None: there is no ring yet."""
+        """None: the file does not exist yet. Raises ValueError when it has another layout version."""
         try:
             fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except FileNotFoundError:
@@ -143,25 +145,25 @@ class _Ring:
     @classmethod
     def create(cls, path: Path, slots: int, slot_bytes: int) -> "_Ring":
         slot_bytes = -(-slot_bytes // _PAGE) * _PAGE
-        fresh = path.with_name(path.name + ".new")
-        fd = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        temporary = path.with_name(path.name + ".new")
+        fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
         try:
             _allocate(fd, path, _data_offset(slots) + slots * slot_bytes)
             header = np.array([MAGIC, slots, slot_bytes], np.uint64)
             os.pwrite(fd, header.tobytes(), 0)
-            os.replace(fresh, path)  # readers see the old ring or the whole new one
+            os.replace(temporary, path)  # atomic: readers see the old ring or the complete new one
             return cls(fd)
         finally:
             os.close(fd)
 
     def replaced(self, path: Path) -> bool:
-        """Another file lies at ``path`` now. (The number of a file that is still mapped is not given out again.)"""
+        """Whether ``path`` is now another file. The inode number of a file that is still mapped is not reused."""
         return os.stat(path).st_ino != self._inode
 
     def put(self, frame_id: int, image: Image) -> None:
         slot = frame_id % len(self._headers)
         header = self._headers[slot]
-        # Odd, and never what it was: also when the last writer died in the middle and left it odd.
+        # Odd and different from before, also when the previous writer died during a write and left it odd.
         generation = (int(header[_GENERATION]) + 1) | 1
         header[_GENERATION] = generation
         self._fence()
@@ -182,7 +184,7 @@ class _Ring:
         shape = (int(header[_HEIGHT]), int(header[_WIDTH]), CHANNELS)
         size = shape[0] * shape[1] * CHANNELS
         if size > self.slot_bytes:
-            return None  # header of another generation, caught in the middle
+            return None  # the header is being overwritten
         image = self._pixels[slot, :size].reshape(shape).copy()
         self._fence()
         return image if int(header[_GENERATION]) == generation else None
@@ -192,10 +194,10 @@ class _Ring:
         self._memory.close()
 
     def _fence(self) -> None:
-        """A full memory barrier. x86 needs none here, ARM does: memory accesses may otherwise pass each other.
+        """Full memory barrier. Not needed on x86; on ARM memory accesses may otherwise be reordered.
 
-        Acquire and release each stop one direction; a release followed by an acquire lets nothing through
-        (ARM Architecture Reference Manual, B2.3: RCsc), which two pairs in a row guarantee. 0.3 microseconds."""
+        Acquire and release are one-way barriers; a release followed by an acquire is a full barrier (ARM Architecture
+        Reference Manual, B2.3: RCsc), which two lock and unlock pairs in a row guarantee. Takes 0.3 microseconds."""
         for _ in range(2):
             self._fence_lock.acquire()
             self._fence_lock.release()
@@ -206,7 +208,9 @@ def _data_offset(slots: int) -> int:
 
 
 def _allocate(fd: int, path: Path, size: int) -> None:
-    """Memory is taken now: a write beyond what a small /dev/shm has would kill the process with SIGBUS later."""
+    """Reserves the memory now, because a later write beyond the capacity of /dev/shm would raise SIGBUS.
+
+    Raises OutputError when ``size`` bytes are not available."""
     try:
         os.posix_fallocate(fd, 0, size)
     except OSError as error:

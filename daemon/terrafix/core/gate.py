@@ -1,6 +1,8 @@
-"""How far off is too far: chi-square at 99.9 %, by degrees of freedom, for squared Mahalanobis distances."""
+"""Innovation gates: limits of the squared Mahalanobis distance, and the least weight of a mixture component."""
 
+# Chi-square quantiles at 99.9 % by degrees of freedom. [spec: chi-square distribution]
 GATE = {2: 13.82, 3: 16.27, 6: 22.46, 7: 24.32}
 
-# Of a mixture: a component of less than this weight is left out. A 95 % ellipse about the others is one without it.
-LEAST_WEIGHT = 0.05
+# Components of a Gaussian mixture below this weight are neglected: a 95 % confidence ellipse may leave out 5 % of the
+# probability. [spec: 95 % confidence level]
+MIN_COMPONENT_WEIGHT = 0.05

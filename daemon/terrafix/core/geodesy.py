@@ -1,4 +1,4 @@
-"""WGS84 to local metres and back."""
+"""WGS84 <-> local metres, and attitude conversions between Euler angles, rotation matrices and quaternions."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,24 +6,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+GRAVITY_MPS2 = 9.81  # of specific force and of banked turns
+
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
 
-# Transverse Mercator with its centre and unit scale at the origin: metres, true north at the origin.
-# Scale error is below 1e-6 within 9 km of the central meridian (Snyder, USGS PP 1395, eq. 8-11).
+# Transverse Mercator with centre and unit scale at the origin: metres, grid north = true north at the origin.
+# The scale error is below 1e-6 within 9 km of the central meridian (Snyder, USGS PP 1395, eq. 8-11).
 LOCAL = "+proj=tmerc +lat_0={lat_deg:.9f} +lon_0={lon_deg:.9f} +k=1 +x_0=0 +y_0=0"
 
 
 def local_crs(lat_deg: float, lon_deg: float) -> "CRS":
-    """The metres of ``LocalFrame`` for pyproj."""
-    from pyproj import CRS  # only here: link and vision turn vectors, and shall be there soon after a restart
+    """The projected CRS of ``LocalFrame``, for pyproj."""
+    from pyproj import CRS  # imported here: link and vision use only the rotations, and must restart quickly
 
     return CRS.from_proj4(LOCAL.format(lat_deg=lat_deg, lon_deg=lon_deg) + " +datum=WGS84 +units=m")
 
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """East and north in metres around (lat_deg, lon_deg). Up stays AMSL and does not pass through here."""
+    """Local frame: east and north in metres about (lat_deg, lon_deg). Heights stay AMSL and are not converted."""
 
     lat_deg: float
     lon_deg: float
@@ -32,7 +34,7 @@ class LocalFrame:
     def __post_init__(self) -> None:
         from pyproj import Transformer
 
-        # What Transformer.from_crs comes to after a look at its data base, which takes 10 to 25 ms each time.
+        # The pipeline that Transformer.from_crs selects, without its database look-up of 10 to 25 ms.
         local = LOCAL.format(lat_deg=self.lat_deg, lon_deg=self.lon_deg)
         steps = f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step {local} +ellps=WGS84"
         object.__setattr__(self, "_from_wgs84", Transformer.from_pipeline(steps))
@@ -49,7 +51,7 @@ class LocalFrame:
 
 
 def rot_w_b(yaw_rad: float, pitch_rad: float, roll_rad: float) -> np.ndarray:
-    """R_w_b (3x3): body FRD into world ENU, from the aerospace angles (yaw clockwise from north, Z-Y-X)."""
+    """R_w_b (3x3): rotates body FRD into world ENU. Aerospace Euler angles Z-Y-X [rad], yaw clockwise from north."""
     cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
     cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
@@ -64,14 +66,14 @@ def rot_w_b(yaw_rad: float, pitch_rad: float, roll_rad: float) -> np.ndarray:
     return r_enu_ned @ r_ned_b
 
 
-def angles_of(r_w_b: np.ndarray) -> tuple[float, float, float]:
-    """Yaw, pitch and roll [rad] of R_w_b (3x3): what ``rot_w_b`` makes it of."""
+def euler_from_rot(r_w_b: np.ndarray) -> tuple[float, float, float]:
+    """Inverse of ``rot_w_b``: R_w_b (3x3) -> yaw, pitch, roll [rad]."""
     pitch_rad = math.asin(max(-1.0, min(1.0, float(r_w_b[2, 0]))))
     return yaw_of(r_w_b), pitch_rad, math.atan2(-float(r_w_b[2, 1]), -float(r_w_b[2, 2]))
 
 
 def yaw_of(r_w_b: np.ndarray) -> float:
-    """Heading of the body's forward axis, radians clockwise from north, in (-pi, pi]."""
+    """Heading [rad] of the body's forward axis in R_w_b (3x3), clockwise from north, in (-pi, pi]."""
     return math.atan2(float(r_w_b[0, 0]), float(r_w_b[1, 0]))
 
 
@@ -106,6 +108,6 @@ def rot_from_quat(q: tuple[float, float, float, float]) -> np.ndarray:
 
 
 def local_rotation_up(angle_rad: float) -> np.ndarray:
-    """Rotation (3x3) about the world's up axis, counter-clockwise seen from above."""
+    """Rotation (3x3) about the world's up axis by ``angle_rad``, counter-clockwise seen from above."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,6 +1,6 @@
-"""Structured logs: one JSON object a line on stdout, which systemd carries to the journal. Logging never waits.
+"""Structured logs: one JSON object per line on stdout, which systemd forwards to the journal. Logging does not block.
 
-ERROR: something is lost or broken; WARN: it goes on, with less; INFO: a change of state; DEBUG: for the developer."""
+ERROR: data or a function is lost; WARN: degraded operation; INFO: change of state; DEBUG: for developers."""
 
 import atexit
 import json
@@ -12,24 +12,24 @@ from typing import Any, TextIO
 
 from terrafix.core.clock import now_ns
 
-# structlog loads rich where it is installed, for tracebacks in colour, which are never shown here: a tenth of a second
-# of a processor for each of seven processes, when a flight waits for them to be there again.
+# structlog imports rich, where installed, for coloured tracebacks, which are not used here. The import costs 0.1 s of
+# CPU time in each of seven processes, which delays a restart in flight.
 _HIDDEN = "rich"
 if _HIDDEN not in sys.modules:
-    sys.modules[_HIDDEN] = None  # type: ignore[assignment]  # as `import` has it for what is not there
+    sys.modules[_HIDDEN] = None  # type: ignore[assignment]  # makes `import` raise ModuleNotFoundError
     import structlog
 
     del sys.modules[_HIDDEN]
 else:
     import structlog
 
-QUEUE_LENGTH = 2000  # lines; a reader of stdout that hangs costs lines, not flight time
-FLUSH_S = 1.0  # last words at the end of the process, at most this long
+QUEUE_LENGTH = 2000  # lines; when the reader of stdout hangs, lines are lost instead of the process blocking
+FLUSH_S = 1.0  # time limit for writing the queued lines at exit
 LEVELS = {"DEBUG": logging.DEBUG, "INFO": logging.INFO, "WARN": logging.WARNING, "ERROR": logging.ERROR}
 
 
 class LineWriter:
-    """Lines in, a thread writes them. A full queue loses lines and says how many."""
+    """Queue of lines that a thread writes to ``stream``. When the queue is full, lines are dropped and counted."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -62,7 +62,7 @@ class LineWriter:
 
 
 class _Logger:
-    """The end of structlog's chain."""
+    """Last element of structlog's processor chain."""
 
     def __init__(self, writer: LineWriter) -> None:
         self._writer = writer
@@ -79,12 +79,12 @@ def _monotonic(_logger: Any, _method: str, event: structlog.typing.EventDict) ->
 
 
 def configure(level: str, process: str, stream: TextIO | None = None) -> LineWriter:
-    """Sets up structlog for this process and returns the writer (closed by itself at exit)."""
+    """Configures structlog for this process and returns the writer, which is closed at exit."""
     writer = LineWriter(stream or sys.stdout)
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True, key="time"),  # for people; t_ns is the clock
+            structlog.processors.TimeStamper(fmt="iso", utc=True, key="time"),  # for readers; t_ns is the reference
             _monotonic,
             structlog.processors.EventRenamer("event"),
             structlog.processors.dict_tracebacks,

@@ -1,7 +1,7 @@
-"""The node contract: a function of messages (law 1).
+"""The node contract: a node is a function of messages (law 1).
 
-``on`` and ``tick`` take messages and time and return messages. No clock, socket, file or thread inside; live,
-replay and simulation run the same objects. What a node needs from outside (pixels, a map) it is given."""
+``on`` and ``tick`` take messages and time and return messages. A node has no clock, socket, file or thread of its own;
+live operation, replay and simulation run the same objects. Pixels, the map and settings come with ``NodeContext``."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,47 +17,45 @@ Image = np.ndarray  # (H, W, 3) uint8 BGR
 
 
 class FrameStore(Protocol):
-    """Pixels by frame id. A frame that was overwritten or never arrived is ``None``."""
+    """Pixels by frame id. ``None``: the frame was overwritten or never arrived."""
 
     def get(self, frame_id: int) -> Image | None: ...
 
 
 @dataclass(frozen=True)
 class NodeContext:
-    """What a node may use; every path is absolute."""
+    """Resources of a node; every path is absolute."""
 
     config: Config
     frames: FrameStore
     map_path: Path | None  # map package (GeoPackage)
-    out_dir: Path  # where the recorder writes
-    ground_amsl_m: float | None = None  # of the map at the start, for sources that do not know it
-    checkpoint: Path | None = (
-        None  # file in memory for what this process leaves to the one that is started in its place
-    )
-    shelf: Path | None = None  # folder in memory for what would have to be computed anew; it need not exist
-    epoch_ns: int | None = None  # t_ns of this run's first Origin: set when the source's process starts again
+    out_dir: Path  # output folder of the recorder
+    ground_amsl_m: float | None = None  # ground height of the map at the initial position, for sources without one
+    checkpoint: Path | None = None  # checkpoint file in shared memory, read by the next instance of this process
+    cache_dir: Path | None = None  # folder in shared memory for recomputable results; it need not exist
+    epoch_ns: int | None = None  # t_ns of the first Origin of this run; set when the source process is restarted
 
 
 class Node(Protocol):
     def on(self, message: Message) -> Iterable[Message]:
-        """Take one message, return what follows from it."""
+        """Processes one message; returns the resulting messages."""
         ...
 
     def tick(self, now_ns: int) -> Iterable[Message]:
-        """Called at the rate of the process table; ``now_ns`` is the shell's monotonic time."""
+        """Called at the tick rate of the process table; ``now_ns`` is the monotonic time of the shell."""
         ...
 
 
 class Edge(Protocol):
-    """The part of a process that touches the world (camera, serial port, MCAP file).
+    """The input and output of a process (camera, serial port, MCAP file).
 
-    The live shell polls it: what it read becomes messages for the bus *and* for the node of the same process;
-    what the node says is offered to it."""
+    The live shell polls it. The messages that it returns are published on the bus and passed to the node of the same
+    process; the messages of the node are passed to ``on_message``."""
 
     def poll(self, now_ns: int) -> Iterable[Message]: ...
 
-    def heard(self, message: Message) -> None:
-        """Every message that the process hears or says itself."""
+    def on_message(self, message: Message) -> None:
+        """Called with every message that the process receives and every message that its node publishes."""
         ...
 
     def close(self) -> None: ...

@@ -1,31 +1,32 @@
-"""Pose from 2D-3D matches by robust Gauss-Newton, with the covariance of the result. Pure numpy.
+"""Camera pose from 2D-3D matches by robust Gauss-Newton (iteratively reweighted least squares), with covariance.
 
-The tangent of a pose is (rotation, translation), both on the right (camera frame), the order of GTSAM's Pose3."""
+The tangent vector of a pose is (rotation, translation), applied on the right (camera frame), as GTSAM's Pose3."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-HUBER_K = 1.345  # in sigmas; 95 % efficiency on Gaussian noise (Huber 1981)
+HUBER_K = 1.345  # threshold in sigmas: 95 % efficiency on Gaussian noise (Huber 1981)
 MAX_ITERATIONS = 15
-MAX_CONDITION = 1e9  # of the normal equations, in units in which a perfect geometry has a few
-STEP_TOLERANCE = 1e-5  # rad and relative metres: a hundredth of a pixel, below any noise here
+MAX_CONDITION = 1e9  # condition number of the scaled normal equations; a well-conditioned geometry has less than ten
+STEP_TOLERANCE = 1e-5  # last step [rad, and metres relative to depth]: a hundredth of a pixel, below the noise
 
 
 @dataclass(frozen=True)
 class PoseFit:
-    """``r_w_c`` (3x3), ``p_c_in_w_m`` (3,), ``cov`` (6x6, tangent order), ``residuals`` (N,) normalised units."""
+    """``r_w_c`` (3x3), ``p_c_in_w_m`` (3,), ``cov`` (6x6, tangent order), ``residuals`` (N,): norm of each
+    reprojection error in normalised image units."""
 
     r_w_c: np.ndarray
     p_c_in_w_m: np.ndarray
     cov: np.ndarray
     residuals: np.ndarray
-    sigma: float  # of one coordinate, estimated from the residuals (not below the floor that was given)
+    sigma: float  # 1-sigma of one image coordinate from the residuals, normalised units; at least ``sigma_floor``
 
 
 def exp_so3(w: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula, (3,) -> (3x3)."""
+    """Exponential map of SO(3) (Rodrigues' formula): rotation vector (3,) [rad] -> matrix (3x3)."""
     x, y, z = w.tolist()
     angle2 = x * x + y * y + z * z
     angle = math.sqrt(angle2)
@@ -40,7 +41,7 @@ def exp_so3(w: np.ndarray) -> np.ndarray:
 
 
 def log_so3(r: np.ndarray) -> np.ndarray:
-    """(3x3) -> (3,); good below pi."""
+    """Logarithm of SO(3): matrix (3x3) -> rotation vector (3,) [rad]. Valid for angles below pi."""
     (a, b, c), (d, e, f), (g, h, i) = r.tolist()
     angle = math.acos(min(1.0, max(-1.0, (a + e + i - 1.0) / 2.0)))
     half = 0.5 if angle < 1e-7 else angle / (2.0 * math.sin(angle))
@@ -50,11 +51,12 @@ def log_so3(r: np.ndarray) -> np.ndarray:
 def project_with_jacobian(
     r_w_c: np.ndarray, p_c_in_w_m: np.ndarray, points_w_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """-> normalised coordinates (N, 2), Jacobian (N, 2, 6) by the tangent, depth (N,)."""
+    """Projects points (N, 3) -> normalised coordinates (N, 2), their Jacobian (N, 2, 6) with respect to the tangent
+    vector of the pose, depth (N,) [m]."""
     q = (points_w_m - p_c_in_w_m) @ r_w_c
     z = np.maximum(q[:, 2], 1e-6)
     xy = q[:, :2] / z[:, None]
-    # q = R^T (P - p); right perturbation: dq = [q]x w - v. Row by row, of x = q_x / z and y = q_y / z:
+    # q = R^T (P - p); right perturbation: dq = [q]x w - v. Rows: derivatives of x = q_x / z and y = q_y / z.
     x, y = xy.T
     jacobian = np.zeros((len(q), 2, 6))
     jacobian[:, 0, 0], jacobian[:, 1, 1] = x * y, -x * y
@@ -72,16 +74,18 @@ def fit_pose(
     p_c_in_w_m: np.ndarray,
     sigma_floor: float,
     weights: np.ndarray | None = None,
-    effective: float = 1.0,
+    independent_share: float = 1.0,
     tilt_sigma_rad: float | None = None,
     tolerance: float = STEP_TOLERANCE,
 ) -> PoseFit | None:
-    """Robust least squares on the reprojection error of points (N, 3) seen at normalised ``xy`` (N, 2).
+    """Robust least squares on the reprojection error of points (N, 3) observed at normalised ``xy`` (N, 2).
 
-    ``effective``: share of the matches that count as independent (neighbouring patches share pixels; relief moves
-    whole blocks of them). ``tilt_sigma_rad``: how well the tilt of the given ``r_w_c`` is known, when it is to be a
-    prior: matches in a narrow band trade tilt for translation. ``tolerance``: of the last step, rad and relative
-    metres. ``None`` when the geometry does not determine a pose."""
+    ``r_w_c``, ``p_c_in_w_m``: initial pose. ``sigma_floor``: least 1-sigma of an image coordinate, normalised units.
+    ``weights`` (N,): extra weight of each match. ``independent_share``: share of the matches that counts as independent
+    (neighbouring patches share pixels; relief displaces whole blocks of patches). ``tilt_sigma_rad``: 1-sigma of a
+    prior on the tilt of the given ``r_w_c``, needed because matches in a narrow band cannot separate tilt from
+    translation; None: no prior. ``tolerance``: size of the last step, rad and metres relative to depth. Returns
+    ``None`` when the geometry does not determine a pose."""
     sigma = sigma_floor
     r, p = r_w_c, p_c_in_w_m
     hessian = np.eye(6)
@@ -93,7 +97,7 @@ def fit_pose(
             return None
         error = xy - predicted
         norm = np.sqrt(np.einsum("ni,ni->n", error, error))
-        sigma = max(sigma_floor, _median(norm) / 1.177)  # the median of a Rayleigh variable is 1.177 sigma
+        sigma = max(sigma_floor, _median(norm) / 1.177)  # the median of a Rayleigh distribution is 1.177 sigma
         w = np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
         if weights is not None:
             w *= weights
@@ -102,31 +106,31 @@ def fit_pose(
         hessian = weighted @ flat
         gradient = weighted @ error.ravel()
         if tilt_sigma_rad is not None:
-            stiffness = sigma**2 / effective / tilt_sigma_rad**2
+            stiffness = sigma**2 / independent_share / tilt_sigma_rad**2
             hessian[[0, 1], [0, 1]] += stiffness
             gradient[:2] -= stiffness * log_so3(r_w_c.T @ r)[:2]
         scale[3:] = len(depth) / float(depth.sum())
         scaled = hessian / scale / scale[:, None]
         eigenvalues = np.linalg.eigvalsh(scaled)
-        if not eigenvalues[0] * MAX_CONDITION > eigenvalues[-1]:  # written so that a NaN fails, too
+        if not eigenvalues[0] * MAX_CONDITION > eigenvalues[-1]:  # in this form the test also rejects NaN
             return None
         step = np.linalg.solve(scaled, gradient / scale) / scale
         r = r @ exp_so3(step[:3])
         p = p + r @ step[3:]
         if float(np.abs(step * scale).max()) < tolerance:
             break
-    cov = sigma**2 / max(effective, 1e-6) * np.linalg.inv(hessian)
+    cov = sigma**2 / max(independent_share, 1e-6) * np.linalg.inv(hessian)
     return PoseFit(r, p, (cov + cov.T) / 2, norm, sigma)
 
 
 def _median(values: np.ndarray) -> float:
-    """numpy's own takes ten times as long for so few."""
+    """Median. np.median takes ten times as long for arrays of this size."""
     ordered = np.sort(values)
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def tangent_to_world(cov: np.ndarray, r_w_c: np.ndarray) -> np.ndarray:
-    """Covariance (6x6) in the tangent order -> (position ENU, rotation about ENU axes), the order of the messages."""
+    """Covariance (6x6) in tangent order, camera frame -> (position ENU, rotation about ENU axes), as in messages."""
     a = np.zeros((6, 6))
     a[:3, 3:] = r_w_c
     a[3:, :3] = r_w_c

@@ -1,6 +1,7 @@
-"""Ed25519 keys and signatures (RFC 8032) of what is prepared on the ground and trusted in flight.
+"""Ed25519 keys and signatures (RFC 8032) of map packages, which are prepared on the ground and trusted in flight.
 
-The library is imported where it computes: the map is opened after a restart in flight, too, and most need no key."""
+The cryptography library is imported only in the functions that use it: the map is also opened at a restart in flight,
+and most configurations need no key."""
 
 import base64
 import binascii
@@ -13,9 +14,9 @@ from pathlib import Path
 
 from terrafix.core.errors import ConfigError, OutputError, UsageError
 
-PUBLIC_PREFIX = "terrafix-ed25519 "  # one line of text: what it is, the key in base64, whose it is
+PUBLIC_PREFIX = "terrafix-ed25519 "  # a public key file is one line: this prefix, the key in base64, the owner
 KEY_BYTES = 32
-ID_DIGITS = 16
+ID_DIGITS = 16  # hexadecimal
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,12 @@ class TrustedKey:
 
     @cached_property
     def key_id(self) -> str:
-        """First half of the sha256 of the key in hexadecimal: short enough to read out, long enough to be unique."""
+        """First ID_DIGITS hexadecimal digits of the sha256 of the key: short enough to read aloud, and unique."""
         return hashlib.sha256(self.raw).hexdigest()[:ID_DIGITS]
 
 
 def is_signed(key: TrustedKey, message: bytes, signature: bytes) -> bool:
-    """Whether ``signature`` is that of the key's owner over ``message``. A malformed key or signature is not."""
+    """Whether ``signature`` is a valid signature of ``message`` by ``key``. False for a malformed key or signature."""
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
@@ -43,7 +44,7 @@ def is_signed(key: TrustedKey, message: bytes, signature: bytes) -> bool:
 
 
 def sign(private_key: Path, message: bytes) -> tuple[TrustedKey, bytes]:
-    """-> the public key and the signature. Raises UsageError: no private key in the file."""
+    """Signs ``message`` -> public key, signature. Raises UsageError when the file holds no private key."""
     from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -64,7 +65,7 @@ def sign(private_key: Path, message: bytes) -> tuple[TrustedKey, bytes]:
 
 
 def generate(private_key: Path, public_key: Path, owner: str) -> TrustedKey:
-    """Writes a new pair of keys, the private one readable by its owner only. Raises OutputError; overwrites nothing."""
+    """Writes a new key pair; the private key file has mode 0600. Raises OutputError, also when a file exists."""
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
@@ -85,7 +86,7 @@ def generate(private_key: Path, public_key: Path, owner: str) -> TrustedKey:
 
 
 def read_public(path: Path) -> TrustedKey:
-    """Raises ConfigError: not a public key as ``generate`` writes it."""
+    """Reads a public key file as ``generate`` writes it. Raises ConfigError when it is not one."""
     try:
         text = path.read_text(encoding="ascii")
     except OSError as error:
@@ -103,9 +104,9 @@ def read_public(path: Path) -> TrustedKey:
 
 
 def trusted_keys(paths: Sequence[str], *, required: bool) -> tuple[TrustedKey, ...] | None:
-    """The keys in these files, and in the .pub files of these folders; None when no signature is required.
+    """The public keys in these files and in the .pub files of these folders; None when no signature is required.
 
-    Raises ConfigError: a file without a key, or a signature required and nobody trusted."""
+    Raises ConfigError for a file without a key, or when a signature is required and there is no key."""
     if not required:
         return None
     files = [f for p in map(Path, paths) for f in (sorted(p.glob("*.pub")) if p.is_dir() else [p])]

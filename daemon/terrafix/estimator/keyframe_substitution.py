@@ -1,8 +1,8 @@
-"""Odometry against a keyframe that the graph no longer has.
+"""Odometry against a keyframe that the graph does not have.
 
-A graph that begins anew at a frame drops the keyframe of vision, which stays vision's keyframe for as long as the
-pictures share enough: seconds of a slow vehicle, of which all odometry would be lost. Where two later pictures saw the
-same features of it, the first of the two is keyframe as well."""
+A graph that begins anew at a frame drops the keyframe of vision, which remains vision's keyframe while the pictures
+overlap: for a slow vehicle that is seconds, of which all odometry would be lost. The first frame of the new graph
+replaces it, for features that both it and a later frame have matched to the keyframe."""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from terrafix.messages import Odometry, Verdict
 
 @dataclass(frozen=True)
 class KeyframeSubstitution:
-    """Frame ``frame_id`` in the place of ``keyframe_id``. ``seen``: features of that keyframe (x, y) -> the same in
-    the frame; ``sigma_norm``: 1-sigma of one coordinate of these. All normalised image coordinates."""
+    """Frame ``frame_id`` replaces ``keyframe_id``. ``seen``: features of that keyframe (x, y) -> the same in the frame;
+    ``sigma_norm``: 1-sigma of one coordinate. All normalised image coordinates."""
 
     keyframe_id: int
     frame_id: int
@@ -24,15 +24,15 @@ class KeyframeSubstitution:
 
     @classmethod
     def of(cls, first: Odometry) -> "KeyframeSubstitution | None":
-        """``first``: odometry, as vision has it, of the frame at which the graph begins. None: it tracks no keyframe
-        before itself."""
+        """``first``: odometry, as vision published it, of the first frame of the graph. None: it has no earlier
+        keyframe."""
         if first.verdict is not Verdict.ACCEPTED or not first.pairs or first.keyframe_id == first.frame_id:
             return None
         seen = {(x_kf, y_kf): (x, y) for x_kf, y_kf, x, y in first.pairs}
         return cls(first.keyframe_id, first.frame_id, seen, first.sigma_norm)
 
     def applied(self, odometry: Odometry) -> Odometry:
-        """The same motion against ``frame_id``, without triples, whose third picture is the lost keyframe; unchanged
+        """The same motion against ``frame_id``, without triples, which need the lost keyframe; unchanged
         where it refers to another keyframe."""
         if odometry.keyframe_id != self.keyframe_id or odometry.frame_id == self.frame_id:
             return odometry
@@ -41,6 +41,6 @@ class KeyframeSubstitution:
             odometry,
             keyframe_id=self.frame_id,
             pairs=pairs,
-            sigma_norm=math.hypot(self.sigma_norm, odometry.sigma_norm),  # the keyframe's own points were exact
+            sigma_norm=math.hypot(self.sigma_norm, odometry.sigma_norm),  # the keyframe's own points have no error
             triples=[],
         )

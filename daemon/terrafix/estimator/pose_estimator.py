@@ -1,6 +1,7 @@
-"""The estimator as a function call: a match goes in, a pose comes out. Beside the messages, for who has none.
+"""The estimator as a function call: a match goes in, a pose comes out. For callers without messages (ON-1).
 
-It drives the node that flies: the same graph, gates and verdicts. Where a node says a verdict, a call raises."""
+It drives the node that flies, with the same graph, gates and verdicts. Where the node publishes a rejection, a call
+raises."""
 
 import warnings
 from dataclasses import dataclass
@@ -24,9 +25,8 @@ ThermalState = Health
 
 
 class PnpFailureError(Exception):
-    """This match gave no pose: PnP failed, its geometry is degenerate, or the graph refused it. ``verdict`` says which.
-
-    The estimator goes on with odometry."""
+    """This match gave no pose: PnP failed, its geometry is degenerate, or the gate rejected it (``verdict``). The
+    estimator continues with odometry."""
 
     def __init__(self, verdict: Verdict, detail: str) -> None:
         super().__init__(f"{verdict.value}: {detail}" if detail else verdict.value)
@@ -34,7 +34,7 @@ class PnpFailureError(Exception):
 
 
 class CovarianceDegradedWarning(UserWarning):
-    """The computer is hot: the covariance is the one from inliers, not from the marginals of the graph."""
+    """Thermal throttle: the covariance is from odometry and inliers, not from the marginals of the graph."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PoseEstimate:
 
 
 class PoseEstimator:
-    """``node`` has heard Origin and hears the odometry of each frame; this adds the matches to its graph."""
+    """``node`` has received the Origin and receives the odometry of each frame; this adds matches to its graph."""
 
     def __init__(self, node: EstimatorNode) -> None:
         self._node = node
@@ -59,9 +59,9 @@ class PoseEstimator:
         return self._node.mode
 
     def estimate(self, match: MatchResult, camera: CameraCalibration, thermal: ThermalState) -> PoseEstimate:
-        """The newest pose, after the factor of ``match`` entered the graph. The mode is that of ``thermal``.
+        """The newest pose, with ``match`` in the graph. ``thermal`` decides the covariance mode.
 
-        ``camera`` must be the one that Origin named (ValueError). Raises PnpFailureError; warns with
+        ``camera`` must be that of the Origin (ValueError). Raises PnpFailureError; warns with
         CovarianceDegradedWarning."""
         origin = self._node.origin
         if origin is None or camera != CameraCalibration.of(origin.camera):

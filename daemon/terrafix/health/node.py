@@ -1,4 +1,4 @@
-"""Health: readings become a thermal band, with hysteresis. The estimator takes the cheap covariance when it is hot."""
+"""Health: thermal band of the computer, with hysteresis. When hot, the estimator computes the cheaper covariance."""
 
 from collections.abc import Iterable
 
@@ -12,13 +12,14 @@ _RANK = {ThermalBand.NORMAL: 0, ThermalBand.HOT: 1, ThermalBand.CRITICAL: 2}
 
 
 class HealthNode:
-    """A band is entered at its limit and left ``hysteresis_c`` below it, so that it does not flutter.
+    """ThermalReading in, Health out. A band is entered at its limit and left ``hysteresis_c`` below it, so that it does
+    not oscillate.
 
-    Throttling has no hysteresis of ours: the kernel's governor has its own, and the cheap covariance must not
-    outlive the heat (ON-2)."""
+    Throttling has no hysteresis here: the kernel's governor has one, and the cheaper covariance must end with the
+    throttling (ON-2)."""
 
     def __init__(self, settings: HealthSection) -> None:
-        """Raises ConfigError when the limits contradict each other."""
+        """Raises ConfigError when ``critical_c`` is not above ``hot_c``."""
         if settings.critical_c <= settings.hot_c:
             raise ConfigError(
                 f"[health] critical_c = {settings.critical_c:g} is not above hot_c = {settings.hot_c:g};"
@@ -29,12 +30,13 @@ class HealthNode:
 
     def on(self, message: Message) -> Iterable[Message]:
         if isinstance(message, ThermalReading):
-            yield self._judge(message)
+            yield self._health(message)
 
     def tick(self, now_ns: int) -> Iterable[Message]:
         return ()
 
-    def _judge(self, reading: ThermalReading) -> Health:
+    def _health(self, reading: ThermalReading) -> Health:
+        """Band by temperature; at least HOT while a processor is throttled."""
         hottest = max(reading.zones, key=lambda zone: zone.temperature_c, default=None)
         self._by_temperature, cause = self._band(hottest)
         band = self._by_temperature
@@ -52,6 +54,7 @@ class HealthNode:
         )
 
     def _band(self, hottest: TemperatureZone | None) -> tuple[ThermalBand, str]:
+        """-> (band by temperature, its cause in words)."""
         if hottest is None:
             return ThermalBand.NORMAL, "no temperature zone is readable: taken for normal"
         limits = ((ThermalBand.CRITICAL, self._settings.critical_c), (ThermalBand.HOT, self._settings.hot_c))

@@ -1,7 +1,7 @@
-"""The edge of health: thermal zones, cooling devices and the disk, read once a second.
+"""Edge of the health process: reads thermal zones, cooling devices and the free disk space once a second.
 
 Files: https://docs.kernel.org/driver-api/thermal/sysfs-api.html (temperatures in thousandths of a degree Celsius).
-A sensor that cannot be read (Jetson zones of powered-down units say EAGAIN) is left out, not guessed."""
+A sensor that cannot be read is left out (on a Jetson the zones of powered-down units return EAGAIN)."""
 
 import shutil
 from collections.abc import Iterable
@@ -12,14 +12,16 @@ from terrafix.core.clock import Ticker
 from terrafix.core.node import NodeContext
 from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, ThermalReading
 
-RATE_HZ = 1.0
-PLAUSIBLE_C = (-55.0, 150.0)  # broken sensors report -256 or 255; silicon works in -40..125
+RATE_HZ = 1.0  # readings per second
+PLAUSIBLE_C = (-55.0, 150.0)  # degrees Celsius; broken sensors report -256 or 255; silicon works in -40..125
 # Cooling devices that slow a processor down when their state is above 0: Jetson (cpu-throttle-alert, devfreq-...gpu),
 # generic (cpufreq-cpu0, thermal-cpufreq-0), ACPI (Processor). Fans and warnings (hot-surface-alert) do not.
 THROTTLING = ("throttle-alert", "cpufreq", "devfreq", "processor")
 
 
 class HealthEdge:
+    """Publishes ThermalReading; logs Health."""
+
     def __init__(self, ctx: NodeContext) -> None:
         self._thermal = Path(ctx.config.health.sysfs_root) / "class" / "thermal"
         self._out_dir = ctx.out_dir
@@ -36,7 +38,7 @@ class HealthEdge:
                 disk_free_mb=read_disk_free_mb(self._out_dir),
             )
 
-    def heard(self, message: Message) -> None:
+    def on_message(self, message: Message) -> None:
         """Logs every change of the band with its cause."""
         if isinstance(message, Health) and message.band is not self._band:
             before, self._band = self._band, message.band
@@ -48,6 +50,7 @@ class HealthEdge:
 
 
 def read_zones(thermal: Path) -> list[TemperatureZone]:
+    """All zones with a plausible temperature. ``thermal``: sysfs folder class/thermal."""
     zones = []
     for folder in sorted(thermal.glob("thermal_zone*")):
         millidegrees = _number(folder / "temp")
@@ -60,7 +63,7 @@ def read_zones(thermal: Path) -> list[TemperatureZone]:
 
 
 def read_throttling(thermal: Path) -> list[str]:
-    """Names of the cooling devices that slow a processor down right now."""
+    """Names of the cooling devices that slow a processor down at present."""
     active = []
     for folder in sorted(thermal.glob("cooling_device*")):
         kind = _text(folder / "type") or ""
@@ -70,6 +73,7 @@ def read_throttling(thermal: Path) -> list[str]:
 
 
 def read_disk_free_mb(folder: Path) -> int | None:
+    """Free space of the disk that holds ``folder`` [MB]; None when it cannot be read."""
     try:
         return shutil.disk_usage(folder).free // 10**6
     except OSError:

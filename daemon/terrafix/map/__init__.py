@@ -1,1 +1,1 @@
-"""The map package: a library of its own, read by the anchor and by the tools."""
+"""Map package reader: a library without dependencies on the nodes, used by the anchor and by the tools."""

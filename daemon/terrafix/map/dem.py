@@ -1,4 +1,4 @@
-"""The elevation of a package in the metres of a local frame."""
+"""Elevation of a map package, sampled in the coordinates of a local frame."""
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -6,18 +6,20 @@ from pyproj import CRS, Transformer
 from terrafix.map.format import DEM_TILE_PX, ELEVATION_TABLE, DemGrid
 from terrafix.map.tile_cache import TileStore
 
-EXACT_POINTS = 4096  # more points than this are projected through a quadratic fit (good to centimetres over 20 km)
+MAX_EXACT_POINTS = 4096  # above this count, points are projected by a quadratic fit (error: centimetres over 20 km)
 CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))  # row, column
 
 
 class ElevationView:
+    """Bilinear sampler of the elevation grid. ``local``: CRS of the local frame; ``crs``: CRS of the grid."""
+
     def __init__(self, grid: DemGrid, tiles: TileStore, local: CRS, crs: CRS) -> None:
         self._grid = grid
         self._tiles = tiles
         self._to_crs = Transformer.from_crs(local, crs, always_xy=True)
 
     def at(self, e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray:
-        """Metres AMSL (float64, the shape of e_m), bilinear; NaN where unknown."""
+        """Local coordinates (any shape, metres) -> height AMSL in metres, float64, same shape. NaN where unknown."""
         e_m, n_m = np.broadcast_arrays(np.asarray(e_m, np.float64), np.asarray(n_m, np.float64))
         grid = self._grid
         x, y = self._project(e_m.ravel(), n_m.ravel())
@@ -35,21 +37,21 @@ class ElevationView:
         return height_m.reshape(e_m.shape)
 
     def _posts(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Stored heights at whole (row, column) of the grid."""
+        """Stored heights (metres AMSL) at integer grid indices (row, column); NaN for void or missing tiles."""
         tile_row, tile_column = row // DEM_TILE_PX, column // DEM_TILE_PX
         tile_id = tile_row * self._grid.width_px + tile_column
         heights_m = np.full(row.shape, np.nan)
-        for one in np.unique(tile_id):
-            tr, tc = divmod(int(one), self._grid.width_px)
+        for unique_id in np.unique(tile_id):
+            tr, tc = divmod(int(unique_id), self._grid.width_px)
             tile = self._tiles.tile((ELEVATION_TABLE, 0, tc, tr))
             if tile is not None:
-                here = tile_id == one
-                heights_m[here] = tile[0][row[here] - tr * DEM_TILE_PX, column[here] - tc * DEM_TILE_PX]
+                in_tile = tile_id == unique_id
+                heights_m[in_tile] = tile[0][row[in_tile] - tr * DEM_TILE_PX, column[in_tile] - tc * DEM_TILE_PX]
         return heights_m
 
     def _project(self, e_m: np.ndarray, n_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Local metres (N,) to map coordinates (N,) each."""
-        if e_m.size <= EXACT_POINTS:
+        """Local coordinates (N,) in metres -> map coordinates x (N,), y (N,) in CRS units."""
+        if e_m.size <= MAX_EXACT_POINTS:
             return self._to_crs.transform(e_m, n_m)
         e_0, n_0 = float(e_m.mean()), float(n_m.mean())
         span = max(float(np.ptp(e_m)), float(np.ptp(n_m)), 1.0)
@@ -62,5 +64,5 @@ class ElevationView:
 
 
 def _quadratic(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(N, 6) terms of a polynomial of degree two."""
+    """(N,), (N,) -> (N, 6): the monomials of a bivariate polynomial of degree two."""
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)

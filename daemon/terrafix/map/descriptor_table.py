@@ -1,4 +1,4 @@
-"""Descriptors that a package keeps for its tiles, in the metres of a local frame."""
+"""Precomputed tile descriptors of a map package, resampled to the coordinates of a local frame."""
 
 import math
 
@@ -9,17 +9,19 @@ from pyproj import Transformer
 from terrafix.map.format import TILE_PX, DescriptorTable, Layer, Level
 from terrafix.map.tile_cache import TileStore
 
-# (s, t, 1) over a window, and what takes values there to the affine map that is nearest to them: within a tenth of a
-# cell over the 300 cells that a block of the search has, in every projection that maps come in.
+# Knots (s, t, 1) over a window, and the pseudo-inverse that maps values at the knots to their least-squares affine map.
+# The affine error is below a tenth of a cell over a search block of 300 cells, in all usual map projections.
 KNOTS = np.array([(s, t, 1.0) for t in (0.0, 0.5, 1.0) for s in (0.0, 0.5, 1.0)])
-FIT = np.linalg.pinv(KNOTS)
+FIT_AFFINE = np.linalg.pinv(KNOTS)
 
 
 class StoredDescriptors:
+    """Reads windows of the descriptors of one layer."""
+
     def __init__(
         self, layer: Layer, table: DescriptorTable, tiles: TileStore, to_crs: Transformer, unit_m: float
     ) -> None:
-        """``to_crs``: from the local frame; ``unit_m``: ground metres of one unit of the layer's CRS."""
+        """``to_crs``: local frame -> CRS of the layer; ``unit_m``: ground metres per unit of that CRS."""
         self._layer, self._table, self._tiles, self._to_crs = layer, table, tiles, to_crs
         self._levels = {
             math.sqrt(level.pixel_x * level.pixel_y) * unit_m: level
@@ -29,27 +31,30 @@ class StoredDescriptors:
 
     @property
     def gsds_m(self) -> tuple[float, ...]:
-        """Ground metres of the pixels that were described, for each level that is there."""
+        """Ground sampling distance in metres of each level that has descriptors (pixels, not cells)."""
         return tuple(self._levels)
 
     def window(
         self, e_min_m: float, n_max_m: float, width: int, height: int, gsd_m: float
     ) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """As ``MapFeatures.window``, for one of ``gsds_m``: cells of ``pool`` of its pixels, north up."""
+        """Same contract as ``MapFeatures.window``. ``gsd_m`` is one of ``gsds_m``; a cell has ``pool`` pixels a side.
+
+        -> descriptors (channels, height, width) float32, valid (height, width) bool, east and north in metres of the
+        north-west corner. North up; ``width`` and ``height`` count cells."""
         level, pool = self._levels[gsd_m], self._table.pool
         cell_m = gsd_m * pool
         column, row = round(e_min_m / cell_m), round(-n_max_m / cell_m)
         corner = np.array([column * cell_m, -row * cell_m])
-        places = corner + KNOTS[:, :2] * (width * cell_m, -height * cell_m)
-        x, y = self._to_crs.transform(places[:, 0], places[:, 1])
+        knots = corner + KNOTS[:, :2] * (width * cell_m, -height * cell_m)
+        x, y = self._to_crs.transform(knots[:, 0], knots[:, 1])
         u = (np.asarray(x) - self._layer.x_min) / (level.pixel_x * pool) - 0.5
         v = (self._layer.y_max - np.asarray(y)) / (level.pixel_y * pool) - 0.5
         out = np.zeros((self._table.channels, height, width), np.float32)
         valid = np.zeros((height, width), bool)
-        if not np.isfinite(u + v).all():  # beyond the projection
+        if not np.isfinite(u + v).all():  # outside the domain of the projection
             return out, valid, float(corner[0]), float(corner[1])
         uv = np.stack([u, v], axis=1)
-        affine = FIT @ uv
+        affine = FIT_AFFINE @ uv
         across, down = affine[0] / width, affine[1] / height
         low = np.floor(uv.min(axis=0)).astype(int) - 1
         high = np.ceil(uv.max(axis=0)).astype(int) + 2
@@ -61,10 +66,12 @@ class StoredDescriptors:
             cv2.warpAffine(planes[k], matrix, (width, height), out[k], flags=flags)
         np.equal(cv2.warpAffine(planes[-1], matrix, (width, height), flags=flags), 255.0, out=valid)
         out *= valid / 255.0
-        return _turned(out, math.atan2(across[1], across[0])), valid, float(corner[0]), float(corner[1])
+        return _rotate_orientations(out, math.atan2(across[1], across[0])), valid, float(corner[0]), float(corner[1])
 
     def _mosaic(self, level: Level, corner: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
-        """Cells [corner, corner + size), columns first: (channels + 1, height, width) float32, 0 to 255."""
+        """Cells [corner, corner + size), column first -> (channels + 1, height, width) float32, 0 to 255.
+
+        The last plane is the validity mask. Missing tiles are zero."""
         (column, row), (width, height), side = corner, size, TILE_PX // self._table.pool
         out = np.zeros((self._table.channels + 1, height, width), np.float32)
         for tr in range(max(row // side, 0), min((row + height - 1) // side, level.rows - 1) + 1):
@@ -79,10 +86,14 @@ class StoredDescriptors:
         return out
 
 
-def _turned(descriptors: np.ndarray, angle_rad: float) -> np.ndarray:
-    """Directions of gradients counted from the axes of the local frame instead of the layer's; ``angle_rad`` from the
-    layer's columns to the east, clockwise (rows go down). Channels are directions modulo pi, clockwise."""
+def _rotate_orientations(descriptors: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Rotates gradient orientations from the axes of the layer to those of the local frame.
+
+    ``angle_rad``: from the layer's columns to east, clockwise (rows go down). Channels are orientations modulo pi,
+    clockwise; a rotation by a fraction of a channel is interpolated linearly."""
     steps = -angle_rad / (math.pi / len(descriptors))
-    whole = math.floor(steps)
-    share = np.float32(steps - whole)
-    return (1 - share) * np.roll(descriptors, whole, axis=0) + share * np.roll(descriptors, whole + 1, axis=0)
+    whole_steps = math.floor(steps)
+    fraction = np.float32(steps - whole_steps)
+    return (1 - fraction) * np.roll(descriptors, whole_steps, axis=0) + fraction * np.roll(
+        descriptors, whole_steps + 1, axis=0
+    )

@@ -1,4 +1,4 @@
-"""The format of a map package: tables, manifest, checksum. What is written here is what is signed."""
+"""The format of a map package: tables, manifest, checksum. The checksum covers all of it and is what is signed."""
 
 import hashlib
 import struct
@@ -10,7 +10,7 @@ import msgspec
 
 from terrafix.map.null_model import NullModel
 
-FORMAT_VERSION = 2  # 1: one imagery layer, elevation in a table of its own, placement outside the checksum
+FORMAT_VERSION = 2  # version 1: one imagery layer, private elevation table, georeference not covered by the checksum
 APPLICATION_ID = 0x47504B47  # "GPKG", OGC 12-128r18 requirement 2
 IMAGERY_TABLE = "imagery"  # the first layer; further ones are imagery_2, imagery_3, ...
 ELEVATION_TABLE = "elevation"
@@ -20,15 +20,17 @@ SIGNATURE_TABLE = "terrafix_signature"
 SEAL_TABLE = "terrafix_seal"
 TILE_PX = 256
 DEM_TILE_PX = 256
-CE90_SIGMAS = 2.1460  # radius that holds 90 % of a circular normal error, in its sigmas: sqrt(-2 ln 0.1)
+CE90_SIGMAS = 2.1460  # CE90 of a circular normal error in units of its sigma: sqrt(-2 ln 0.1)
 DEM_NULL = 65535  # void in a 16-bit elevation tile
-SIGNED_AS = b"terrafix map package\n"  # before the checksum in what is signed: the key may sign other things too
+SIGNATURE_PREFIX = (
+    b"terrafix map package\n"  # domain separation: prefix of the signed bytes, as the key may sign other data
+)
 
 HashRow = tuple[str, int, int, int, bytes]  # table, zoom, column, row, sha256
 
 
 class DemGrid(msgspec.Struct, frozen=True, kw_only=True):
-    """Placement of the elevation grid in the map's CRS; x_min, y_max is the outer corner of the first pixel."""
+    """Georeference of the elevation grid in the map's CRS; (x_min, y_max) is the outer corner of the first pixel."""
 
     x_min: float
     y_max: float
@@ -41,7 +43,7 @@ class DemGrid(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Level:
-    """One zoom level: tile matrix of 256 px tiles. Units of the CRS."""
+    """One zoom level: a tile matrix of 256 px tiles. Pixel sizes in CRS units."""
 
     zoom: int
     pixel_x: float
@@ -51,25 +53,25 @@ class Level:
 
 
 class DescriptorTable(msgspec.Struct, frozen=True, kw_only=True):
-    """Descriptors for the search of a place that nobody knows: of the tiles of some levels of a layer, the same tiles.
+    """Precomputed descriptors for relocalization: one descriptor tile per imagery tile, for some levels of a layer.
 
-    A tile is a PNG of 8 bits: ``channels`` pictures of cells below each other, 255 for 1, and one that is 255 where all
-    of a cell is valid."""
+    A tile is an 8-bit PNG: ``channels`` planes of cells stacked vertically, 255 encodes 1.0, and a last plane that is
+    255 where all pixels of a cell are valid."""
 
     table: str
-    name: str  # of the describer, with its version
-    pool: int  # pixels of a cell's side
+    name: str  # name and version of the describer
+    pool: int  # side of a cell, pixels
     channels: int
     zooms: tuple[int, ...]
     tiles: int
 
 
 class Ce90Origin(StrEnum):
-    """Where the position error of a layer comes from."""
+    """Origin of a layer's horizontal accuracy."""
 
-    STATED = "stated"  # by the producer
-    ESTIMATED = "estimated"  # when the package was built, from another layer of it
-    DEFAULT = "default"  # neither: `[map] ce90_m` counts
+    STATED = "stated"  # by the producer of the imagery
+    ESTIMATED = "estimated"  # at build time, against another layer of the package
+    DEFAULT = "default"  # neither is known: `[map] ce90_m` is used
 
 
 class Layer(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,41 +82,41 @@ class Layer(msgspec.Struct, frozen=True, kw_only=True):
     licence: str
     source: str  # file name
     source_sha256: str
-    ce90_m: float | None  # radius that holds 90 % of the errors of position; None: not known
+    ce90_m: float | None  # circular error: radius that contains 90 % of the position errors; None: unknown
     gsd_m: float  # ground metres per pixel of the finest level at the centre of the layer
     crs: str  # "EPSG:32651", or WKT
-    x_min: float  # corner of the tile matrices, CRS units
+    x_min: float  # upper left corner of the tile matrices, CRS units
     y_max: float
-    bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max of the imagery; the matrices reach beyond
+    bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max of the imagery; tile matrices may exceed it
     levels: tuple[Level, ...]  # coarse to fine
     tiles: int
     descriptors: DescriptorTable | None = None
-    null_model: NullModel | None = None  # what wrong places score; None: not measured
-    ce90_origin: Ce90Origin | None = None  # None: a package from before this was recorded; what it has is stated
+    null_model: NullModel | None = None  # score distribution of wrong places; None: not measured
+    ce90_origin: Ce90Origin | None = None  # None: the package predates this field; then ce90_m is STATED
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Error of position of a layer: radius that holds 90 % of it, and where that number comes from."""
+    """Horizontal accuracy of a layer: CE90 in metres, and its origin."""
 
     ce90_m: float
     origin: Ce90Origin
 
     @property
     def sigma_m(self) -> float:
-        """1-sigma per horizontal axis, of a circular normal error."""
+        """1-sigma per horizontal axis of a circular normal error with this CE90."""
         return self.ce90_m / CE90_SIGMAS
 
 
 def accuracy_of(layer: Layer, default_ce90_m: float) -> Accuracy:
-    """``default_ce90_m``: `[map] ce90_m`, of a layer that says nothing."""
+    """Accuracy of a layer. ``default_ce90_m``: `[map] ce90_m`, for a layer without one."""
     if layer.ce90_m is None:
         return Accuracy(default_ce90_m, Ce90Origin.DEFAULT)
     return Accuracy(layer.ce90_m, layer.ce90_origin or Ce90Origin.STATED)
 
 
 class VectorTable(msgspec.Struct, frozen=True, kw_only=True):
-    """A table of features; sha256 is over all its rows."""
+    """A table of vector features; ``sha256`` covers all its rows."""
 
     table: str
     features: int
@@ -125,9 +127,9 @@ class VectorTable(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
-    """What the package says about itself; one row each in the table terrafix_manifest.
+    """Metadata of the package; stored as one row per field in the table terrafix_manifest.
 
-    What is said of imagery at the top is said of the newest layer, the one that is used when none is named."""
+    The imagery fields at this level describe the newest layer, which is the default layer."""
 
     format_version: int
     name: str
@@ -146,11 +148,11 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     ce90_m: float | None = None
     layers: tuple[Layer, ...] = ()  # newest first
     vectors: tuple[VectorTable, ...] = ()
-    sealed: bool = False  # whether the file has a seal (``checksum.py``)
+    sealed: bool = False  # whether the file contains a file digest (``checksum.py``)
 
 
 def manifest_rows(manifest: Manifest) -> list[tuple[str, str]]:
-    """(key, value) rows of the table: text as it is, everything else as JSON."""
+    """(key, value) rows of the manifest table: strings unchanged, everything else as JSON."""
     rows = []
     for name in manifest.__struct_fields__:
         value = getattr(manifest, name)
@@ -159,7 +161,7 @@ def manifest_rows(manifest: Manifest) -> list[tuple[str, str]]:
 
 
 def checksum_of(rows: Iterable[tuple[str, str]], hashes: Iterable[HashRow]) -> str:
-    """sha256 over the manifest rows but `checksum`, and over table, place and sha256 of every tile; both sorted."""
+    """sha256 over all manifest rows except `checksum`, and over table, tile index and sha256 of every tile; sorted."""
     digest = hashlib.sha256()
     for key, value in sorted(rows):
         if key != "checksum":
@@ -170,7 +172,7 @@ def checksum_of(rows: Iterable[tuple[str, str]], hashes: Iterable[HashRow]) -> s
 
 
 def tile_sha256(data: bytes, scale: float | None = None, offset: float | None = None) -> bytes:
-    """What is recorded of a tile; of an elevation tile with the scale and the offset that make metres of it."""
+    """Hash that is recorded for a tile; for an elevation tile it includes the scale and offset to metres."""
     digest = hashlib.sha256(data)
     if scale is not None and offset is not None:
         digest.update(struct.pack("<dd", scale, offset))
@@ -178,16 +180,16 @@ def tile_sha256(data: bytes, scale: float | None = None, offset: float | None = 
 
 
 def features_sha256(rows: Iterable[tuple[int, bytes, str, str, str]]) -> str:
-    """sha256 over the rows (fid, geom, kind, name, attributes) of a table of features, in the order of their fid."""
+    """sha256 over the rows (fid, geom, kind, name, attributes) of a feature table, ordered by fid."""
     digest = hashlib.sha256()
     for fid, geometry, *texts in rows:
         digest.update(struct.pack("<qI", fid, len(geometry)) + geometry)
         for text in texts:
-            coded = (text or "").encode()
-            digest.update(struct.pack("<I", len(coded)) + coded)
+            encoded = (text or "").encode()
+            digest.update(struct.pack("<I", len(encoded)) + encoded)
     return digest.hexdigest()
 
 
 def signed_bytes(checksum: str) -> bytes:
-    """What the signature of a package is over."""
-    return SIGNED_AS + checksum.encode()
+    """The bytes that the signature of a package covers."""
+    return SIGNATURE_PREFIX + checksum.encode()

@@ -1,4 +1,4 @@
-"""Packages of format 1, which are still read: one layer, elevation in a private table of deflated float32."""
+"""Reader for packages of format 1: one layer, elevation in a private table of zlib-compressed float32 tiles."""
 
 import hashlib
 import sqlite3
@@ -15,7 +15,7 @@ TABLES = {"gpkg_tile_matrix", "gpkg_tile_matrix_set", IMAGERY_TABLE, HASH_TABLE}
 
 
 def hashes(db: sqlite3.Connection) -> list[HashRow]:
-    """Zoom -1 was elevation; it becomes zoom 0 of its table."""
+    """Tile hashes. Format 1 marks elevation with zoom -1; it is mapped to zoom 0 of the elevation table."""
     return [
         (ELEVATION_TABLE if zoom < 0 else IMAGERY_TABLE, max(zoom, 0), column, row, sha256)
         for zoom, column, row, sha256 in db.execute(
@@ -25,18 +25,19 @@ def hashes(db: sqlite3.Connection) -> list[HashRow]:
 
 
 def checksum_of(rows: dict[str, str], listed: list[HashRow]) -> str:
+    """Checksum as format 1 defines it: without table names, elevation as zoom -1."""
     digest = hashlib.sha256()
     for key, value in sorted(rows.items()):
         if key != "checksum":
             digest.update(f"{key}={value}\n".encode())
-    as_written = [(-1 if table == ELEVATION_TABLE else zoom, c, r, sha) for table, zoom, c, r, sha in listed]
-    for zoom, column, row, tile_hash in sorted(as_written):
+    entries = [(-1 if table == ELEVATION_TABLE else zoom, c, r, sha) for table, zoom, c, r, sha in listed]
+    for zoom, column, row, tile_hash in sorted(entries):
         digest.update(f"{zoom}/{column}/{row}:".encode() + tile_hash)
     return digest.hexdigest()
 
 
 def layer(db: sqlite3.Connection, fields: dict[str, Any], tiles: int) -> Layer:
-    """The one layer, from the manifest's fields and the tables of the GeoPackage."""
+    """The single layer, from the manifest fields and the GeoPackage tables."""
     x_min, y_max = db.execute(
         "SELECT min_x, max_y FROM gpkg_tile_matrix_set WHERE table_name = ?", (IMAGERY_TABLE,)
     ).fetchone()
@@ -48,10 +49,10 @@ def layer(db: sqlite3.Connection, fields: dict[str, Any], tiles: int) -> Layer:
         " WHERE table_name = ? ORDER BY zoom_level",
         (IMAGERY_TABLE,),
     )
-    named = {name: fields[name] for name in ("date", "licence", "source", "source_sha256", "gsd_m", "crs")}
+    copied = {name: fields[name] for name in ("date", "licence", "source", "source_sha256", "gsd_m", "crs")}
     return Layer(
         table=IMAGERY_TABLE,
-        **named,
+        **copied,
         ce90_m=fields.get("ce90_m"),
         x_min=x_min,
         y_max=y_max,
@@ -62,6 +63,6 @@ def layer(db: sqlite3.Connection, fields: dict[str, Any], tiles: int) -> Layer:
 
 
 def heights(data: bytes) -> np.ndarray:
-    """(256, 256) float32 of an elevation tile, which was stored with the first column and row of its neighbours."""
+    """Decodes an elevation tile to (256, 256) float32. It is stored with the first column and row of its neighbours."""
     side = DEM_TILE_PX + 1
     return np.frombuffer(zlib.decompress(data), dtype="<f4").reshape(side, side)[:DEM_TILE_PX, :DEM_TILE_PX]

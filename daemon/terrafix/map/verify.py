@@ -1,4 +1,4 @@
-"""Opening a map package: the checks that come before its first tile is used."""
+"""Checks when a map package is opened, before its first tile is used."""
 
 import sqlite3
 from collections.abc import Sequence
@@ -26,29 +26,29 @@ from terrafix.map.format import (
 
 
 def connect(path: Path) -> sqlite3.Connection:
-    """Read-only connection after the checks that need no SQL. Raises MapError."""
+    """Opens a read-only connection, after the checks that need no SQL. Raises MapError."""
     if not path.is_file():
         raise MapError(f"{path}: no such map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'")
     try:
         with path.open("rb") as file:
-            head = file.read(100)
+            header = file.read(100)
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from None
-    if head[:16] != b"SQLite format 3\x00" or len(head) < 100:
+    if header[:16] != b"SQLite format 3\x00" or len(header) < 100:
         raise MapError(f"{path}: not a map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'")
-    page = int.from_bytes(head[16:18], "big")
-    expected = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")  # sqlite.org/fileformat2.html
+    page = int.from_bytes(header[16:18], "big")
+    expected = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")  # sqlite.org/fileformat2.html
     actual = path.stat().st_size
     if actual < expected:
         raise MapError(f"{path}: truncated map package ({actual} of {expected} bytes); copy or build it again")
     if path.with_name(f"{path.name}-journal").exists():
         raise MapError(f"{path}: signing it was interrupted; run 'terrafix map sign' again")
-    # immutable: no locks and no journal beside the file, so that a read-only medium will do.
+    # immutable: SQLite takes no locks and writes no journal beside the file, so the file may be on a read-only medium.
     return sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)
 
 
 def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
-    """The manifest after its checksum over itself and the list of tiles was found right. Raises MapError."""
+    """Reads the manifest and verifies its checksum (over the manifest rows and the tile hashes). Raises MapError."""
     tables = {row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if db.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID or MANIFEST_TABLE not in tables:
         raise MapError(
@@ -60,12 +60,12 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
         raise MapError(
             f"{path}: map package of format {version}, this Terrafix reads up to {FORMAT_VERSION}; update Terrafix"
         )
-    first = version == "1"
-    missing = (format_v1.TABLES if first else {IMAGERY_TABLE, HASH_TABLE}) - tables
+    is_format_1 = version == "1"
+    missing = (format_v1.TABLES if is_format_1 else {IMAGERY_TABLE, HASH_TABLE}) - tables
     if missing:
         raise MapError(f"{path}: damaged map package (no table {min(missing)}); build or copy it again")
     hashes: list[HashRow]
-    if first:
+    if is_format_1:
         hashes = format_v1.hashes(db)
         checksum = format_v1.checksum_of(rows, hashes)
     else:
@@ -82,7 +82,7 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
                 continue
             text = rows[field.name]
             fields[field.name] = text if field.type is str else msgspec.json.decode(text, type=field.type)
-        if first:
+        if is_format_1:
             fields["layers"] = (format_v1.layer(db, fields, len(hashes)),)
         manifest = Manifest(**fields)
     except (KeyError, TypeError, msgspec.DecodeError) as error:
@@ -95,10 +95,10 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
 def check_signature(
     path: Path, db: sqlite3.Connection, manifest: Manifest, trusted: Sequence[TrustedKey] | None
 ) -> tuple[str, ...]:
-    """Ids of the keys that signed the package; every signature in it must be right.
+    """Verifies all signatures; returns the ids of the keys that signed the package.
 
-    ``trusted``: keys of which one must have signed; None: an unsigned package will do.
-    Raises MapError: altered after signing, signed by nobody who is trusted, or not signed."""
+    ``trusted``: at least one of these keys must have signed; None: an unsigned package is accepted.
+    Raises MapError: a signature is wrong (altered after signing), no trusted key signed, or it is not signed."""
     tables = {row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     signed: list[str] = []
     if SIGNATURE_TABLE in tables and manifest.format_version > 1:

@@ -1,4 +1,4 @@
-"""The recorder process: hears everything, writes it down in a thread of its own, and never makes anybody wait."""
+"""The recorder process: receives all messages and writes them in a separate thread, without blocking the process."""
 
 import queue
 import threading
@@ -10,13 +10,13 @@ from terrafix.messages import Dropped, Frame, Message
 from terrafix.recorder.segments import SegmentRing
 from terrafix.recorder.writer import header, thumbnail_jpeg
 
-QUEUE_LENGTH = 8192  # about 30 s of all messages; more would only hide a disk that cannot follow
-FLUSH_S = 0.25  # at most this much of the flight is lost when the process is killed
+QUEUE_LENGTH = 8192  # about 30 s of all messages; a longer queue would only hide a disk that is too slow
+FLUSH_S = 0.25  # interval of flushes: at most this much of the record is lost when the process is killed
 CLOSE_TIMEOUT_S = 10.0
 
 
 class RecorderNode:
-    """Decides nothing: what the process hears goes to the edge."""
+    """Does nothing: the edge writes the messages of the process."""
 
     def on(self, message: Message) -> Iterable[Message]:
         return ()
@@ -26,7 +26,7 @@ class RecorderNode:
 
 
 class RecorderEdge:
-    """Queue in front, one writing thread behind; a full queue drops and counts, and the count is recorded too."""
+    """A queue and a writer thread. A full queue drops messages; their count is recorded as Dropped."""
 
     def __init__(self, ring: SegmentRing, frames: FrameStore, thumbnail_width_px: int | None) -> None:
         self._ring = ring
@@ -43,13 +43,13 @@ class RecorderEdge:
     def poll(self, now_ns: int) -> Iterable[Message]:
         self._now_ns = now_ns
         if not self._thread.is_alive():
-            # Its traceback is on stderr; the process must die with it to be restarted.
+            # Its traceback is on stderr. The process must end as well, so that it is restarted.
             raise RuntimeError("the recorder's writing thread has died")
         return ()
 
-    def heard(self, message: Message) -> None:
+    def on_message(self, message: Message) -> None:
         try:
-            # Before the first poll the message's own time is the best guess.
+            # Before the first poll the time of the message is the best approximation of its reception time.
             self._queue.put_nowait((self._now_ns or message.t_ns, message))
         except queue.Full:
             with self._dropped_lock:
@@ -61,7 +61,7 @@ class RecorderEdge:
 
     def _write_all(self) -> None:
         while True:
-            closing = self._closing.is_set()  # read before the queue is emptied, so that nothing is left behind
+            closing = self._closing.is_set()  # read before the queue is emptied, so that no message is missed
             self._drain()
             self._ring.flush()
             if closing:
@@ -72,10 +72,10 @@ class RecorderEdge:
     def _drain(self) -> None:
         while True:
             try:
-                heard_ns, message = self._queue.get_nowait()
+                received_ns, message = self._queue.get_nowait()
             except queue.Empty:
                 break
-            self._ring.write(message, heard_ns)
+            self._ring.write(message, received_ns)
             if isinstance(message, Frame):
                 self._thumbnail(message)
         with self._dropped_lock:

@@ -1,4 +1,4 @@
-"""Reads a flight record, whole or cut off: one file, or a folder with the segments of a flight."""
+"""Reads a flight record, complete or truncated: one file, or a folder with the segments of a flight."""
 
 import re
 import struct
@@ -20,32 +20,32 @@ from terrafix.recorder.schema import THUMBNAIL_TOPIC, TYPE_BY_TOPIC
 from terrafix.recorder.writer import HEADER_NAME, decode_thumbnail
 
 _SEGMENT = re.compile(r"flight-(\d+)\.mcap$")
-_RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # above any record of ours; a torn length field must not ask for gigabytes
+_RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # more than any valid record; a corrupt length must not allocate gigabytes
 
-# What a torn record may raise, besides its own end: lengths, compression and text of bytes that were never written.
-_TORN = (McapError, struct.error, zstandard.ZstdError, UnicodeDecodeError, msgspec.DecodeError)
+# Exceptions of a truncated or corrupt record: invalid length, compression or text in bytes that were never written.
+_CORRUPT = (McapError, struct.error, zstandard.ZstdError, UnicodeDecodeError, msgspec.DecodeError)
 
 _decoders = {topic: msgspec.json.Decoder(t) for topic, t in TYPE_BY_TOPIC.items()}
 
 
 @dataclass
 class ReadResult:
-    """What reading met; filled while the iterator runs."""
+    """Properties of the record, filled while the iterator of a read function runs."""
 
     header: dict[str, Any] = field(default_factory=dict)  # format, config, versions of the first file
     files: list[Path] = field(default_factory=list)
-    cut_off: list[Path] = field(default_factory=list)  # files without their end (killed, power cut, disk full)
+    truncated_files: list[Path] = field(default_factory=list)  # without their end (kill, power failure, full disk)
     undecodable: int = 0  # messages of another version of this program
     segment_starts_ns: list[int] = field(default_factory=list)  # publish time of the first message of each file
 
 
 def flight_files(path: Path) -> list[Path]:
-    """The record files of a folder, oldest first; a file is itself. Raises SourceError when there is none."""
+    """The record files of a folder, oldest first; for a file, the file. Raises SourceError when there is none."""
     if path.is_file():
         return [path]
     segments = sorted((int(hit.group(1)), p) for p in path.glob("flight-*.mcap") if (hit := _SEGMENT.search(p.name)))
     files = [p for _, p in segments]
-    # A replay: its record, or what a killed one left.
+    # A replay writes one file: the complete record, or the partial one of a killed replay.
     files += [p for name in ("flight.mcap", "flight.mcap.partial") if (p := path / name).is_file()][:1]
     if not files:
         raise SourceError(
@@ -55,35 +55,35 @@ def flight_files(path: Path) -> list[Path]:
 
 
 def read_flight(path: Path, result: ReadResult | None = None) -> Iterator[tuple[str, int, Message]]:
-    """Yields (topic, log_time_ns, message) in the order heard, over all files; thumbnails are left out."""
-    for topic, log_ns, _, message in read_heard(path, result):
+    """Yields (topic, log_time_ns, message) in the order of reception, over all files, without thumbnails."""
+    for topic, log_ns, _, message in read_received(path, result):
         yield topic, log_ns, message
 
 
-def read_heard(path: Path, result: ReadResult | None = None) -> Iterator[tuple[str, int, int, Message]]:
-    """Like read_flight, with the time at which the recorder heard it: (topic, log_time_ns, heard_ns, message)."""
-    found = ReadResult() if result is None else result
-    for channel, record in _records(path, found):
+def read_received(path: Path, result: ReadResult | None = None) -> Iterator[tuple[str, int, int, Message]]:
+    """Like read_flight, with the reception time at the recorder: (topic, log_time_ns, received_ns, message)."""
+    result = ReadResult() if result is None else result
+    for channel, record in _records(path, result):
         decoder = _decoders.get(channel.topic)
         if decoder is None:
             continue
         try:
             message = decoder.decode(record.data)
         except msgspec.MsgspecError:
-            found.undecodable += 1
+            result.undecodable += 1
             continue
         yield channel.topic, record.log_time, record.publish_time, message
 
 
 def read_thumbnails(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Yields (frame id, JPEG)."""
+    """Yields (frame id, JPEG) in the order of the record."""
     for channel, record in _records(path, ReadResult()):
         if channel.topic == THUMBNAIL_TOPIC:
             yield decode_thumbnail(record.data)
 
 
-class _Exact:
-    """A stream whose read() gives what was asked for or says that the file is over; mcap takes short reads as whole."""
+class _ExactReadStream:
+    """A stream whose read() returns exactly ``length`` bytes or raises EndOfFile; mcap accepts short reads."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
@@ -95,32 +95,34 @@ class _Exact:
         return data
 
 
-def _records(path: Path, found: ReadResult) -> Iterator[tuple[Channel, McapMessage]]:
+def _records(path: Path, result: ReadResult) -> Iterator[tuple[Channel, McapMessage]]:
     for file in flight_files(path):
-        found.files.append(file)
+        result.files.append(file)
         with file.open("rb") as stream:
-            yield from _records_of(file, stream, found)
+            yield from _records_of(file, stream, result)
 
 
-def _records_of(file: Path, stream: IO[bytes], found: ReadResult) -> Iterator[tuple[Channel, McapMessage]]:
-    """Sequential, because the index at the end is what a cut-off file lacks."""
+def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[tuple[Channel, McapMessage]]:
+    """Reads sequentially, because the index is at the end of the file, which a truncated file lacks."""
     channels: dict[int, Channel] = {}
     first = True
     try:
-        for record in StreamReader(cast(IO[bytes], _Exact(stream)), record_size_limit=_RECORD_LIMIT_BYTES).records:
+        for record in StreamReader(
+            cast(IO[bytes], _ExactReadStream(stream)), record_size_limit=_RECORD_LIMIT_BYTES
+        ).records:
             if isinstance(record, Channel):
                 channels[record.id] = record
-            elif isinstance(record, Metadata) and record.name == HEADER_NAME and not found.header:
-                found.header = {
+            elif isinstance(record, Metadata) and record.name == HEADER_NAME and not result.header:
+                result.header = {
                     "format": record.metadata.get("format", ""),
                     "config": msgspec.json.decode(record.metadata.get("config", "{}")),
                     "versions": msgspec.json.decode(record.metadata.get("versions", "{}")),
                 }
             elif isinstance(record, McapMessage) and record.channel_id in channels:
                 if first:
-                    found.segment_starts_ns.append(record.publish_time)
+                    result.segment_starts_ns.append(record.publish_time)
                     first = False
                 yield channels[record.channel_id], record
-    except _TORN:
-        # The file ends, or is torn, in the middle of a record; what came before it is good.
-        found.cut_off.append(file)
+    except _CORRUPT:
+        # The file ends or is corrupt within a record; the records before it are valid.
+        result.truncated_files.append(file)

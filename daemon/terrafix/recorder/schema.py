@@ -1,4 +1,4 @@
-"""Channels of the flight record: one per message type, JSON with a JSON schema, so that Foxglove opens it."""
+"""Channels of the flight record: one per message type, JSON with a JSON schema, readable by Foxglove."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from terrafix.messages import Message
 
 MESSAGE_TYPES: dict[str, type[Message]] = {t.__name__: t for t in m.AnyMessage.__args__}
 THUMBNAIL_TOPIC = "/thumbnail"
-THUMBNAIL_SCHEMA_NAME = "foxglove.CompressedImage"  # a schema name that Foxglove's image panel knows
+THUMBNAIL_SCHEMA_NAME = "foxglove.CompressedImage"  # a schema that Foxglove's image panel supports
 
 THUMBNAIL_SCHEMA: dict[str, Any] = {
     "title": THUMBNAIL_SCHEMA_NAME,
@@ -33,7 +33,7 @@ class Stamp(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Thumbnail(msgspec.Struct, frozen=True, kw_only=True):
-    """A small JPEG of a frame, in the shape of foxglove.CompressedImage; ``frame_id`` is our frame id as text."""
+    """A small JPEG of a frame as foxglove.CompressedImage; ``frame_id`` is the frame id as text."""
 
     timestamp: Stamp
     frame_id: str
@@ -42,7 +42,7 @@ class Thumbnail(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def topic_of(message_type: type[Message]) -> str:
-    """NavEstimate -> /nav_estimate"""
+    """Topic of a message type: NavEstimate -> /nav_estimate"""
     name = message_type.__name__
     return "/" + "".join(("_" if i and c.isupper() else "") + c.lower() for i, c in enumerate(name))
 
@@ -51,9 +51,9 @@ TYPE_BY_TOPIC: dict[str, type[Message]] = {topic_of(t): t for t in MESSAGE_TYPES
 
 
 def schema_of(message_type: type[Message]) -> bytes:
-    """JSON schema in the plain subset that viewers read: no references, unions or arrays of arrays.
+    """JSON schema in the subset that viewers support: no references, unions or arrays of arrays.
 
-    Arrays of arrays (matched points) are in the data but not in the schema, which does not forbid them."""
+    Arrays of arrays (matched points) are in the data but not in the schema, which allows additional properties."""
     full = msgspec.json.schema(message_type)
     plain = _plain(full, full["$defs"])
     if plain is None:
@@ -62,7 +62,7 @@ def schema_of(message_type: type[Message]) -> bytes:
 
 
 def _plain(node: dict[str, Any], defs: dict[str, Any]) -> dict[str, Any] | None:
-    """One schema node without references and unions; None when a viewer could not show it."""
+    """A schema node without references and unions; None when a viewer could not display it."""
     if "$ref" in node:
         return _plain(defs[node["$ref"].rsplit("/", 1)[-1]], defs)
     if "anyOf" in node:

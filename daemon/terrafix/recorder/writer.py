@@ -1,4 +1,5 @@
-"""One MCAP file of the flight record: full header first, then messages, flushed so that a kill costs little."""
+"""One MCAP file of the flight record: complete header, then messages with regular flushes that limit the loss at a
+kill."""
 
 import base64
 import platform
@@ -26,19 +27,19 @@ from terrafix.recorder.schema import (
     topic_of,
 )
 
-CHUNK_BYTES = 128 * 1024  # what a kill may cost at most between two calls of flush(); also the unit of compression
-JPEG_QUALITY = 70  # a thumbnail is for a person's glance
+CHUNK_BYTES = 128 * 1024  # largest loss at a kill between two calls of flush(); also the unit of compression
+JPEG_QUALITY = 70  # sufficient for visual inspection of a thumbnail
 GIT_TIMEOUT_S = 2.0
 RECORD_FORMAT = "terrafix-flight/1"
 HEADER_NAME = "terrafix"
-_END_CHUNK = "_Writer__finalize_chunk"  # mcap ends a chunk by size only; by time needs this name (tested)
+_END_CHUNK = "_Writer__finalize_chunk"  # mcap ends chunks by size only; flush() calls this private method (tested)
 _VERSIONED = ("terrafix", "numpy", "gtsam", "opencv-python-headless", "onnxruntime", "pymavlink", "mcap", "msgspec")
 
 _encoder = msgspec.json.Encoder()
 
 
 def versions() -> dict[str, str]:
-    """Versions of this program and of what it computes with; empty text where one is not installed."""
+    """Versions of this program and of its libraries; empty text where one is not installed."""
     found = {"python": sys.version.split()[0], "platform": platform.platform(), "git": git_describe()}
     for name in _VERSIONED:
         try:
@@ -49,7 +50,7 @@ def versions() -> dict[str, str]:
 
 
 def git_describe() -> str:
-    """Commit of the source tree that runs, or empty text when it does not run from one."""
+    """Commit of the running source tree; empty text for an installed package."""
     root = Path(__file__).resolve().parents[3]
     if not (root / ".git").exists():
         return ""
@@ -62,7 +63,7 @@ def git_describe() -> str:
 
 
 def header(config: Config) -> dict[str, str]:
-    """What stands at the start of every file of the record: format, configuration echo, versions."""
+    """Header of every file of the record: format, configuration, versions."""
     return {
         "format": RECORD_FORMAT,
         "config": _encoder.encode(config).decode(),
@@ -71,7 +72,7 @@ def header(config: Config) -> dict[str, str]:
 
 
 def thumbnail_jpeg(image: np.ndarray, width_px: int) -> bytes:
-    """(H, W, 3) uint8 BGR -> JPEG of that width (never enlarged)."""
+    """(H, W, 3) uint8 BGR -> JPEG of ``width_px``, or of the original width if that is smaller."""
     factor = min(1.0, width_px / image.shape[1])
     size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -80,12 +81,12 @@ def thumbnail_jpeg(image: np.ndarray, width_px: int) -> bytes:
 
 
 class FlightWriter:
-    """Writes one file. Not thread-safe; raises OutputError when the file cannot be made."""
+    """Writes one file. Not thread-safe. Raises OutputError when the file cannot be created."""
 
-    def __init__(self, path: Path, head: dict[str, str]) -> None:
+    def __init__(self, path: Path, header_metadata: dict[str, str]) -> None:
         self.path = path
         try:
-            # A raw (unbuffered) file would be wrapped in a buffer by mcap that nobody can flush.
+            # A raw (unbuffered) file would be wrapped by mcap in a buffer that cannot be flushed from outside.
             self._file = path.open("wb")
         except OSError as error:
             raise OutputError(
@@ -93,7 +94,7 @@ class FlightWriter:
             ) from None
         self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._mcap.start(profile="", library=f"terrafix {version('terrafix')}")
-        self._mcap.add_metadata(HEADER_NAME, head)
+        self._mcap.add_metadata(HEADER_NAME, header_metadata)
         self._channels: dict[str, int] = {}
         self._sequence = 0
         for message_type in MESSAGE_TYPES.values():
@@ -101,9 +102,9 @@ class FlightWriter:
         self._register(THUMBNAIL_TOPIC, THUMBNAIL_SCHEMA_NAME, _encoder.encode(THUMBNAIL_SCHEMA))
         self.flush()
 
-    def write(self, message: Message, heard_ns: int) -> None:
-        """log_time is the time of the measurement, publish_time the time at which the recorder heard of it."""
-        self._add(topic_of(type(message)), _encoder.encode(message), message.t_ns, heard_ns)
+    def write(self, message: Message, received_ns: int) -> None:
+        """In MCAP, log_time is the time of the measurement and publish_time the time of reception at the recorder."""
+        self._add(topic_of(type(message)), _encoder.encode(message), message.t_ns, received_ns)
 
     def write_thumbnail(self, t_ns: int, frame_id: int, jpeg: bytes) -> None:
         stamp = Stamp(sec=t_ns // 1_000_000_000, nsec=t_ns % 1_000_000_000)
@@ -114,7 +115,7 @@ class FlightWriter:
         return self._file.tell()
 
     def flush(self) -> None:
-        """Everything written so far is with the operating system: kill -9 of this process does not lose it."""
+        """Passes all data to the operating system, so that kill -9 of this process does not lose it."""
         getattr(self._mcap, _END_CHUNK)()
         self._file.flush()
 
@@ -128,11 +129,11 @@ class FlightWriter:
 
     def _add(self, topic: str, data: bytes, log_ns: int, publish_ns: int) -> None:
         self._sequence += 1
-        # MCAP times are unsigned; a clock that starts below zero would not be writable.
+        # MCAP times are unsigned, so negative times are clamped.
         self._mcap.add_message(self._channels[topic], max(0, log_ns), data, max(0, publish_ns), self._sequence)
 
 
 def decode_thumbnail(data: bytes) -> tuple[int, bytes]:
-    """-> (frame id, JPEG)"""
+    """Payload of the thumbnail topic -> (frame id, JPEG)"""
     raw = msgspec.json.decode(data)
     return int(raw["frame_id"]), base64.b64decode(raw["data"])

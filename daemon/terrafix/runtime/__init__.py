@@ -1,1 +1,1 @@
-"""What forks, waits or writes: the supervisor, the processes, the bus, the shells."""
+"""The layer above the operating system: supervisor, processes, message bus, shells, files of a run."""

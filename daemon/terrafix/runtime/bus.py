@@ -1,13 +1,15 @@
-"""Messages between processes: pyzmq publish and subscribe over ipc, drops counted, nobody waits.
+"""Publish/subscribe messaging between processes: pyzmq over ipc, non-blocking, with counted losses.
 
-Every process publishes on an endpoint of its own and connects to those who say what it hears: no broker whose death
-would silence all. Sockets reconnect by themselves, so either side may be killed and started again.
+Every process publishes on its own endpoint and connects to the publishers of the messages it subscribes to. There is
+no broker, which would be a single point of failure. Sockets reconnect automatically, so that either side may be killed
+and restarted.
 
-A message travels as (topic, header, body): topic = type name and "|" (zmq matches prefixes), header = a number of
-this life of the publisher and one that counts the messages of this topic. Gaps in the count are losses.
+A message is sent as (topic, header, body). Topic: type name and "|", because zmq matches prefixes. Header: a session id
+of the publisher, random for each start of the process, and a sequence number per topic. Gaps in the sequence numbers
+are losses.
 
-*Retained* messages: a subscriber that comes late (a restarted process) gets them again from their publisher, which
-sees every subscription (XPUB). The others see them twice and know it by the count."""
+*Retained* messages are sent again to a late subscriber (a restarted process) by their publisher, which receives every
+subscription (XPUB). Other subscribers receive them twice and discard them by their sequence number."""
 
 import os
 import struct
@@ -21,25 +23,25 @@ from terrafix.core import codec
 from terrafix.core.clock import now_ns
 from terrafix.messages import Message, Origin, ProcessEvent, SourceEnded
 
-QUEUE_LENGTH = 1000  # messages per connection and side; then the newest are lost, and counted by the reader
-RECONNECT_MS = 20  # how soon a restarted publisher is found again
-LINGER_MS = 200  # last words, at most this long
-BURST = 500  # messages taken from the socket at once, so that a flood cannot keep a process from its ticks
-HEADER = struct.Struct(">QQ")  # life of the publisher, count in the topic
+QUEUE_LENGTH = 1000  # messages per connection and side; beyond it the newest are lost, and counted by the subscriber
+RECONNECT_MS = 20  # interval of reconnection attempts to a restarted publisher
+LINGER_MS = 200  # time limit for sending queued messages at exit
+BURST = 500  # most messages received in one call, so that a burst cannot delay the ticks of a process
+HEADER = struct.Struct(">QQ")  # session id of the publisher, sequence number in the topic
 
-ALWAYS_NS = 2**63
+NO_EXPIRY_NS = 2**63
 
 
 class Retention(NamedTuple):
-    last: int  # how many
+    last: int  # number of messages
     max_age_ns: int
 
 
-# What late comers get again. Events of processes: what happened while the recorder was started (again), but not the
-# old deaths, which would be news to a link that has just been restarted.
+# Messages that are sent again to late subscribers. ProcessEvent: the age limit covers the events during a (re)start of
+# the recorder, but excludes old deaths, which a restarted link would report as new.
 RETAINED: dict[type[Message], Retention] = {
-    Origin: Retention(1, ALWAYS_NS),
-    SourceEnded: Retention(1, ALWAYS_NS),
+    Origin: Retention(1, NO_EXPIRY_NS),
+    SourceEnded: Retention(1, NO_EXPIRY_NS),
     ProcessEvent: Retention(100, 10_000_000_000),
 }
 
@@ -54,44 +56,45 @@ class Publisher:
     ) -> None:
         self._clock = clock
         self.socket = context.socket(zmq.XPUB)
-        # A subscription counts from when ``serve`` has seen it, and not from some moment inside of a send: who needs
-        # what is retained would hear the message that is just being sent before it.
+        # A subscription becomes active in ``serve``. Otherwise it could become active during a send, and the subscriber
+        # would receive the message being sent before the retained ones.
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.SNDHWM, QUEUE_LENGTH)
         self.socket.setsockopt(zmq.LINGER, LINGER_MS)
-        self.socket.bind(address)  # replaces the socket file of a killed predecessor
-        self._life = int.from_bytes(os.urandom(8), "big")
-        self._count: Counter[bytes] = Counter()
+        self.socket.bind(address)  # replaces the socket file of a killed process
+        self._session_id = int.from_bytes(os.urandom(8), "big")
+        self._sequence: Counter[bytes] = Counter()
         self._subscriptions: Counter[bytes] = Counter()
         self._retained: dict[bytes, deque[tuple[int, list[bytes]]]] = {
             topic(kind): deque(maxlen=retention.last) for kind, retention in RETAINED.items()
         }
         self._max_age_ns = {topic(kind): retention.max_age_ns for kind, retention in RETAINED.items()}
 
-    def say(self, message: Message) -> None:
+    def publish(self, message: Message) -> None:
+        """Sends ``message`` to all subscribers of its type."""
         self.serve()
         name = topic(type(message))
-        self._count[name] += 1
-        parts = [name, HEADER.pack(self._life, self._count[name]), codec.encode(message)]
+        self._sequence[name] += 1
+        parts = [name, HEADER.pack(self._session_id, self._sequence[name]), codec.encode(message)]
         if name in self._retained:
             self._retained[name].append((self._clock(), parts))
         self.socket.send_multipart(parts)
 
     def serve(self) -> None:
-        """Gives new subscribers what is retained; call it regularly."""
+        """Activates new subscriptions and sends them the retained messages. Must be called regularly."""
         while self.socket.poll(0):
             request = self.socket.recv()
             name = request[1:]
-            wanted = request[:1] == b"\x01"
-            self.socket.setsockopt(zmq.SUBSCRIBE if wanted else zmq.UNSUBSCRIBE, name)
-            if wanted:
+            is_subscription = request[:1] == b"\x01"
+            self.socket.setsockopt(zmq.SUBSCRIBE if is_subscription else zmq.UNSUBSCRIBE, name)
+            if is_subscription:
                 self._subscriptions[name] += 1
-                for said_ns, parts in self._retained.get(name, ()):
-                    if self._clock() - said_ns <= self._max_age_ns[name]:
+                for published_ns, parts in self._retained.get(name, ()):
+                    if self._clock() - published_ns <= self._max_age_ns[name]:
                         self.socket.send_multipart(parts)
 
     def subscriptions(self, kind: type[Message]) -> int:
-        """How many subscriptions to this type have come so far."""
+        """Number of subscriptions to this type received so far."""
         return self._subscriptions[topic(kind)]
 
     def close(self) -> None:
@@ -99,7 +102,7 @@ class Publisher:
 
 
 class Subscriber:
-    """``lost`` counts messages that were said and did not arrive, by type name."""
+    """``lost`` counts messages that were published and did not arrive, by type name."""
 
     def __init__(
         self, context: zmq.Context[zmq.Socket[bytes]], addresses: Iterable[str], kinds: Iterable[type[Message]]
@@ -111,11 +114,11 @@ class Subscriber:
             self.socket.setsockopt(zmq.SUBSCRIBE, topic(kind))
         for address in addresses:
             self.socket.connect(address)
-        self._last: defaultdict[bytes, dict[int, int]] = defaultdict(dict)  # topic -> life -> count
+        self._last: defaultdict[bytes, dict[int, int]] = defaultdict(dict)  # topic -> session id -> sequence number
         self.lost: Counter[str] = Counter()
 
     def receive(self) -> Iterator[Message]:
-        """What has arrived, at most BURST, without waiting."""
+        """The messages that have arrived, at most BURST, without blocking."""
         for _ in range(BURST):
             try:
                 name, header, body = self.socket.recv_multipart(zmq.DONTWAIT)
@@ -125,13 +128,13 @@ class Subscriber:
                 yield codec.decode(body)
 
     def _is_new(self, name: bytes, header: bytes) -> bool:
-        life, count = HEADER.unpack(header)
-        last = self._last[name].get(life)
-        if last is not None and count <= last:
-            return False  # retained, said again for somebody else
-        if last is not None and count > last + 1:
-            self.lost[name[:-1].decode()] += count - last - 1
-        self._last[name][life] = count
+        session_id, sequence = HEADER.unpack(header)
+        last = self._last[name].get(session_id)
+        if last is not None and sequence <= last:
+            return False  # a retained message, sent again for another subscriber
+        if last is not None and sequence > last + 1:
+            self.lost[name[:-1].decode()] += sequence - last - 1
+        self._last[name][session_id] = sequence
         return True
 
     def close(self) -> None:

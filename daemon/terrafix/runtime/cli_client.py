@@ -1,4 +1,4 @@
-"""A command on this computer, on the bus of a run: it says something to the processes, and hears their answers."""
+"""A command on this computer as a client on the bus of a run: it publishes messages and receives the replies."""
 
 import time
 from collections.abc import Iterator
@@ -10,17 +10,17 @@ from terrafix.processes import OPERATOR
 from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.run_dir import RunDir
 
-LOOK_MS = 20
+POLL_MS = 20
 
 
 class Operator:
-    """A context manager; one at a time on a run."""
+    """Publisher and subscriber of an operator's command. A context manager; at most one at a time per run."""
 
-    def __init__(self, run_dir: RunDir, *, answers: type[Message], answered_by: str) -> None:
-        """``answers``: what is heard, of the process ``answered_by``."""
+    def __init__(self, run_dir: RunDir, *, replies: type[Message], replier: str) -> None:
+        """``replies``: message type to receive, published by the process ``replier``."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._publisher = Publisher(self._context, run_dir.address(OPERATOR))
-        self._subscriber = Subscriber(self._context, [run_dir.address(answered_by)], (answers,))
+        self._subscriber = Subscriber(self._context, [run_dir.address(replier)], (replies,))
 
     def __enter__(self) -> "Operator":
         return self
@@ -30,20 +30,20 @@ class Operator:
         self._publisher.close()
         self._context.term()
 
-    def is_heard(self, kind: type[Message], by: int, wait_s: float) -> bool:
-        """Waits until so many processes listen to this kind of message."""
+    def wait_for_subscribers(self, kind: type[Message], count: int, wait_s: float) -> bool:
+        """Waits until ``count`` processes subscribe to messages of type ``kind``. False: not within ``wait_s``."""
         until = time.monotonic() + wait_s
-        while self._publisher.subscriptions(kind) < by and time.monotonic() < until:
-            self._publisher.socket.poll(LOOK_MS)
+        while self._publisher.subscriptions(kind) < count and time.monotonic() < until:
+            self._publisher.socket.poll(POLL_MS)
             self._publisher.serve()
-        return self._publisher.subscriptions(kind) >= by
+        return self._publisher.subscriptions(kind) >= count
 
-    def say(self, message: Message) -> None:
-        self._publisher.say(message)
+    def publish(self, message: Message) -> None:
+        self._publisher.publish(message)
 
-    def answers(self, wait_s: float) -> Iterator[Message]:
-        """What is answered within so long, as it comes."""
+    def replies(self, wait_s: float) -> Iterator[Message]:
+        """Yields the replies as they arrive, for ``wait_s``."""
         until = time.monotonic() + wait_s
         while time.monotonic() < until:
-            self._subscriber.socket.poll(LOOK_MS)
+            self._subscriber.socket.poll(POLL_MS)
             yield from self._subscriber.receive()

@@ -1,7 +1,7 @@
 """The two shells that run nodes: in one process (replay, simulation, tests) and live (one process each, on the bus).
 
-A node does not know which one it is in. The live shell owns what the node may not have: the clock, the sockets, the
-edge. One thread: what is slow delays only its own process."""
+Nodes run unchanged in both. The live shell owns the clock, the sockets and the edge, which a node may not have. It has
+a single thread, so that a slow node delays only its own process."""
 
 import gc
 import importlib
@@ -20,16 +20,16 @@ from terrafix.runtime.inbox import Inbox
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
 
-EDGE_PERIOD_NS = 10_000_000  # an edge is looked at this often at least; 100 idle turns a second cost 1 % of a core
-IDLE_NS = 50_000_000  # a process that waits for messages shows this often that it is not stuck
-DROPPED_PERIOD_NS = 1_000_000_000  # losses are said at most this often
-HEARERS_WAIT_NS = 20_000_000_000  # the source waits this long for those who must not miss Origin and first frames
-STOP_DRAIN_NS = 2_000_000_000  # at a stop, what is queued is still worked on, for at most this long
-STOP_QUIET_MS = 100  # nothing more comes when this long nothing came
+EDGE_PERIOD_NS = 10_000_000  # longest interval between polls of an edge; 100 idle polls a second take 1 % of a core
+IDLE_NS = 50_000_000  # longest interval between progress stamps of a process that waits for messages
+DROPPED_PERIOD_NS = 1_000_000_000  # shortest interval between reports of lost messages
+SUBSCRIBERS_WAIT_NS = 20_000_000_000  # longest wait of the source for the subscribers of Origin and the first frames
+STOP_DRAIN_NS = 2_000_000_000  # at a stop, queued messages are still processed for at most this long
+STOP_QUIET_MS = 100  # the queues count as empty after this long without a message
 
 
 class InProcessShell:
-    """All nodes in one place, one message after the other: the same input gives the same output."""
+    """All nodes in one process, one message at a time: deterministic, the same input gives the same output."""
 
     def __init__(
         self,
@@ -38,7 +38,9 @@ class InProcessShell:
         *,
         table: tuple[Process, ...] = PROCESSES,
     ) -> None:
-        """``nodes`` by process name; ``sink(who, message)`` gets every message once, in the order of delivery."""
+        """``nodes`` by process name. ``sink(publisher, message)`` gets every message once, in the order of delivery.
+
+        Raises ValueError for a node that is not in the process table."""
         self._nodes = [(process, nodes[process.name]) for process in table if process.name in nodes]
         unknown = set(nodes) - {process.name for process, _ in self._nodes}
         if unknown:
@@ -47,26 +49,27 @@ class InProcessShell:
         self._tickers: dict[str, Ticker] = {}
 
     def feed(self, message: Message) -> None:
-        """Delivers ``message`` and all that follows from it, breadth first, hearers in table order, until quiet."""
-        self._settle(deque([(SOURCE, message)]))
+        """Delivers ``message`` and all resulting messages, breadth first, to subscribers in table order."""
+        self._deliver(deque([(SOURCE, message)]))
 
     def tick(self, now_ns: int) -> None:
-        """Ticks, once, every node whose period has passed; the first call sets the phase."""
-        said: deque[tuple[str, Message]] = deque()
+        """Ticks once every node whose period has passed; the first call sets the phase."""
+        pending: deque[tuple[str, Message]] = deque()
         for process, node in self._nodes:
             if process.tick_hz > 0:
                 ticker = self._tickers.setdefault(process.name, Ticker(process.tick_hz, now_ns))
                 if ticker.due(now_ns):
-                    said.extend((process.name, m) for m in node.tick(now_ns))
-        self._settle(said)
+                    pending.extend((process.name, m) for m in node.tick(now_ns))
+        self._deliver(pending)
 
-    def _settle(self, said: deque[tuple[str, Message]]) -> None:
-        while said:
-            who, message = said.popleft()
-            self._sink(who, message)
+    def _deliver(self, pending: deque[tuple[str, Message]]) -> None:
+        """Delivers (publisher, message) pairs and all resulting messages until the queue is empty."""
+        while pending:
+            publisher, message = pending.popleft()
+            self._sink(publisher, message)
             for process, node in self._nodes:
-                if process.name != who and isinstance(message, process.subscribes):
-                    said.extend((process.name, m) for m in node.on(message))
+                if process.name != publisher and isinstance(message, process.subscribes):
+                    pending.extend((process.name, m) for m in node.on(message))
 
 
 def run_process(
@@ -77,13 +80,13 @@ def run_process(
     stopping: Callable[[], bool],
     table: tuple[Process, ...] = PROCESSES,
 ) -> None:
-    """Runs the process ``name`` until ``stopping()``. Raises what its node and edge raise: a bug ends the process."""
+    """Runs the process ``name`` until ``stopping()``. Exceptions of node and edge propagate and end the process."""
     process = next(p for p in table if p.name == name)
     module = importlib.import_module(process.module)
     node: Node = module.make_node(ctx)
     make_edge: Callable[[NodeContext], Edge] | None = getattr(module, "make_edge", None)
     edge = make_edge(ctx) if make_edge else None
-    gc.freeze()  # what is imported and opened by now lives for ever: collections need not look at it
+    gc.freeze()  # objects created until now live until the end, so that garbage collection need not scan them
     with zmq.Context() as context:
         shell = LiveShell(process, table, node, edge, endpoints, context)
         try:
@@ -108,16 +111,17 @@ class LiveShell:
         self._endpoints = endpoints
         self._node = node
         self._edge = edge
-        # Its own words do not come back to a process: it connects to the others only.
-        speakers = [p.name for p in table if p is not process and says_any(p, process.subscribes)]
+        # A process does not receive its own messages: it connects to the other publishers only.
+        publishers = [p.name for p in table if p is not process and publishes_any(p, process.subscribes)]
         if ProcessEvent in process.subscribes:
-            speakers.append(SUPERVISOR)
+            publishers.append(SUPERVISOR)
         if PositionHint in process.subscribes:
-            speakers.append(OPERATOR)
+            publishers.append(OPERATOR)
         opens_source = Origin in process.publishes
-        self._hearers = [p.name for p in table if opens_source and Origin in p.subscribes and p is not process]
+        # The subscribers that the process which opens the source waits for before it starts.
+        self._required = [p.name for p in table if opens_source and Origin in p.subscribes and p is not process]
         self._publisher = Publisher(context, endpoints.address(process.name))
-        self._subscriber = Subscriber(context, [endpoints.address(s) for s in speakers], process.subscribes)
+        self._subscriber = Subscriber(context, [endpoints.address(s) for s in publishers], process.subscribes)
         self._inbox = Inbox(process.newest)
         self._progress = Progress(endpoints.progress(process.name))
         self._ticker = Ticker(process.tick_hz, now_ns()) if process.tick_hz > 0 else None
@@ -127,11 +131,12 @@ class LiveShell:
         self._poller.register(self._publisher.socket, zmq.POLLIN)
 
     def run(self, stopping: Callable[[], bool]) -> None:
+        """Runs until ``stopping()``, then processes the queued messages for at most STOP_DRAIN_NS."""
         self._progress.stamp(now_ns())
-        self._wait_for_hearers(stopping)
+        self._wait_for_subscribers(stopping)
         while not stopping():
             self._progress.begin()
-            worked = self._turn()
+            worked = self._step()
             self._progress.stamp(now_ns(), len(self._inbox))
             if not worked:
                 self._wait()
@@ -144,43 +149,46 @@ class LiveShell:
         self._subscriber.close()
         self._progress.close()
 
-    def _turn(self) -> bool:
-        """One tick if due, one look at the edge, one message. True when there was something to do."""
+    def _step(self) -> bool:
+        """One tick if due, one poll of the edge, one queued message. False: there was nothing to do."""
         worked = False
         now = now_ns()
         if self._ticker is not None and self._ticker.due(now):
-            self._say(self._node.tick(now))
+            self._publish(self._node.tick(now))
         if self._edge is not None:
             for message in self._edge.poll(now):
                 worked = True
                 if isinstance(message, Origin):
                     self._endpoints.set_epoch(message.t_ns)
-                self._publisher.say(message)
-                self._say(self._node.on(message))
-        return self._hear() or worked
+                self._publisher.publish(message)
+                self._publish(self._node.on(message))
+        return self._process_next() or worked
 
-    def _hear(self) -> bool:
+    def _process_next(self) -> bool:
+        """Receives messages and passes the oldest queued one to edge and node. False: none is queued."""
         self._publisher.serve()
         for message in self._subscriber.receive():
             self._inbox.put(message)
-        self._say_dropped()
+        self._publish_losses()
         next_message = self._inbox.take()
         if next_message is None:
             return False
         if self._edge is not None:
-            self._edge.heard(next_message)
-        self._say(self._node.on(next_message))
+            self._edge.on_message(next_message)
+        self._publish(self._node.on(next_message))
         return True
 
-    def _say(self, messages: Iterable[Message]) -> None:
+    def _publish(self, messages: Iterable[Message]) -> None:
+        """Passes the messages of the node to the edge and to the bus."""
         for message in messages:
-            if isinstance(message, NavEstimate):  # a node has no clock to say when it spoke
+            if isinstance(message, NavEstimate):  # set here because a node has no clock
                 message = msgspec.structs.replace(message, emitted_at_ns=now_ns())
             if self._edge is not None:
-                self._edge.heard(message)  # first: what is sent to the autopilot does not wait for the bus
-            self._publisher.say(message)
+                self._edge.on_message(message)  # before the bus, so that output to the autopilot is not delayed
+            self._publisher.publish(message)
 
-    def _say_dropped(self) -> None:
+    def _publish_losses(self) -> None:
+        """Publishes Dropped for lost and skipped messages, at most once per DROPPED_PERIOD_NS."""
         lost, skipped = self._subscriber.lost, self._inbox.skipped
         if not (lost or skipped) or not self._dropped_ticker.due(now_ns()):
             return
@@ -188,36 +196,37 @@ class LiveShell:
         lost.clear()
         skipped.clear()
         now = now_ns()
-        self._say(Dropped(t_ns=now, process=self._process.name, message=k, count=n) for k, n in counts.items())
+        self._publish(Dropped(t_ns=now, process=self._process.name, message=k, count=n) for k, n in counts.items())
 
     def _wait(self) -> None:
-        """Until the next message, or until there is something else to do."""
+        """Waits for a message, at most until the next tick or poll of the edge is due."""
         now = now_ns()
         until = now + (IDLE_NS if self._edge is None else EDGE_PERIOD_NS)
         if self._ticker is not None:
             until = min(until, self._ticker.next_ns)
         if until > now:
-            self._poller.poll(-((now - until) // 1_000_000))  # rounded up: too early would be a turn for nothing
+            self._poller.poll(-((now - until) // 1_000_000))  # ms, rounded up: to wake up early would be useless
 
-    def _wait_for_hearers(self, stopping: Callable[[], bool]) -> None:
-        """Whoever opens the source says Origin once and then frames: those who need them connect first. All are
-        started together; who opens a large map, or builds the engine of a model, takes longer."""
-        until = now_ns() + HEARERS_WAIT_NS
-        while self._missing_hearers() > 0 and now_ns() < until and not stopping():
+    def _wait_for_subscribers(self, stopping: Callable[[], bool]) -> None:
+        """The process that opens the source publishes Origin once and then frames, so their subscribers must connect
+        first. All processes start together; to open a large map or to build the engine of a model takes longer."""
+        until = now_ns() + SUBSCRIBERS_WAIT_NS
+        while self._missing_subscribers() > 0 and now_ns() < until and not stopping():
             self._publisher.serve()
             self._poller.poll(10)
             self._progress.stamp(now_ns())
 
-    def _missing_hearers(self) -> int:
-        living = sum(not self._endpoints.gave_up(name).exists() for name in self._hearers)
-        return living - self._publisher.subscriptions(Origin)
+    def _missing_subscribers(self) -> int:
+        expected = sum(not self._endpoints.gave_up(name).exists() for name in self._required)
+        return expected - self._publisher.subscriptions(Origin)
 
     def _drain(self) -> None:
+        """Processes queued messages until no more arrive, for at most STOP_DRAIN_NS."""
         until = now_ns() + STOP_DRAIN_NS
-        while now_ns() < until and (self._hear() or self._subscriber.socket.poll(STOP_QUIET_MS)):
+        while now_ns() < until and (self._process_next() or self._subscriber.socket.poll(STOP_QUIET_MS)):
             self._progress.stamp(now_ns(), len(self._inbox))
 
 
-def says_any(process: Process, kinds: tuple[type[Message], ...]) -> bool:
-    """Dropped is said by the shell, so by every process."""
+def publishes_any(process: Process, kinds: tuple[type[Message], ...]) -> bool:
+    """Whether ``process`` publishes one of ``kinds``. Its shell, and so every process, publishes Dropped."""
     return Dropped in kinds or any(kind in kinds for kind in process.publishes)

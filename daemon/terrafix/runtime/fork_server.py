@@ -1,9 +1,9 @@
-"""Where the processes come from: one interpreter that has imported what all of them need, and forks.
+"""Fork server: one interpreter that has imported the common modules and forks the processes of the daemon.
 
-Six interpreters that import the same cost a second of a processor, when a flight waits for all of them to be there
-again. The fork server (``serve`` in process_main.py) has neither threads nor sockets but the one on which it is asked:
-what it forks is as good as a program that was just started. It is the parent of nobody: the supervisor adopts the
-processes, sees their end itself, and starts another fork server should this one die."""
+Six interpreters that each import the same modules cost a second of CPU time, which delays a restart in flight. The fork
+server (``serve`` in process_main.py) has no threads and no sockets except the request socket, so that a forked process
+starts in a clean state. It is not the parent of the processes: the supervisor is their subreaper, observes their exit
+itself, and starts another fork server if this one dies."""
 
 import contextlib
 import ctypes
@@ -17,30 +17,30 @@ from typing import IO
 
 from terrafix.runtime.run_dir import RunDir
 
-PR_SET_PDEATHSIG = 1  # prctl(2): a signal for us when our parent ends
-PR_SET_CHILD_SUBREAPER = 36  # a process whose parent ended becomes ours
-READY_LIMIT_S = 10.0  # imports, on a computer that is very busy
-TRIES = 2  # a fork server that was killed is found dead when the next process is wanted
-WHERE_SIGNAL = signal.SIGUSR2  # "where are you?": the supervisor asks a stuck process for its tracebacks
-WORDS = "\0"  # between the words of a request: a path has none
+PR_SET_PDEATHSIG = 1  # prctl(2): send a signal to this process when its parent ends
+PR_SET_CHILD_SUBREAPER = 36  # prctl(2): orphaned descendants become children of this process
+READY_LIMIT_S = 10.0  # time for the imports on a heavily loaded computer
+FORK_ATTEMPTS = 2  # the death of a killed fork server is noticed at the next request, which is then repeated
+TRACEBACK_SIGNAL = signal.SIGUSR2  # the supervisor sends it to a stuck process, which then prints its tracebacks
+FIELD_SEPARATOR = "\0"  # between the fields of a request; a path cannot contain it
 
 
-class Forked:
-    """A process of the fork server's, with what is used of subprocess.Popen."""
+class ForkedProcess:
+    """A process created by the fork server, with the part of the interface of subprocess.Popen that is used."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
         self._code: int | None = None
 
     def poll(self) -> int | None:
-        """Its exit code, -N for signal N; None while it lives."""
+        """Exit code, -N for signal N; None while the process runs."""
         if self._code is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             self._code = os.waitstatus_to_exitcode(status) if pid else None
         return self._code
 
     def send_signal(self, number: int) -> None:
-        if self.poll() is None:  # its number is not another's before we have seen its end
+        if self.poll() is None:  # the pid is not reused before waitpid has returned its exit status
             os.kill(self.pid, number)
 
     def terminate(self) -> None:
@@ -50,7 +50,7 @@ class Forked:
         self.send_signal(signal.SIGKILL)
 
     def wait(self, limit_s: float) -> int:
-        """Raises TimeoutError."""
+        """Waits for the end of the process -> exit code as in ``poll``. Raises TimeoutError after ``limit_s``."""
         descriptor = os.pidfd_open(self.pid) if self.poll() is None else None
         if descriptor is not None:
             try:
@@ -64,29 +64,29 @@ class Forked:
 
 
 class ForkServer:
-    """The supervisor's view. It is started at once and is ready when somebody is wanted; a context manager."""
+    """Client of the fork server in the supervisor. The constructor starts the server; a context manager."""
 
     def __init__(self, output: IO[str] | None = None) -> None:
-        """``output``: where stdout and stderr of the processes go; None: where ours go."""
+        """``output``: file for stdout and stderr of the processes; None: inherited."""
         self._output = output
-        _adopt(True)
+        _set_child_subreaper(True)
         self._start()
 
-    def fork(self, name: str, run_dir: RunDir) -> Forked:
-        """The process ``name`` begins to run, as a child of this process. Raises ChildProcessError: twice in vain."""
-        for _ in range(TRIES):
-            with contextlib.suppress(OSError):  # it is dead, or was too long in coming
-                self._socket.send(WORDS.join((name, str(run_dir.path))).encode())
+    def fork(self, name: str, run_dir: RunDir) -> ForkedProcess:
+        """Starts the process ``name`` as a child of this process. Raises ChildProcessError after two failures."""
+        for _ in range(FORK_ATTEMPTS):
+            with contextlib.suppress(OSError):  # the fork server is dead, or did not answer in time
+                self._socket.send(FIELD_SEPARATOR.join((name, str(run_dir.path))).encode())
                 answer = self._socket.recv(64)
                 if answer:
-                    return Forked(int(answer))
+                    return ForkedProcess(int(answer))
             self._stop()
             self._start()
         raise ChildProcessError(f"{name} could not be started")
 
     def close(self) -> None:
         self._stop()
-        _adopt(False)
+        _set_child_subreaper(False)
 
     def __enter__(self) -> "ForkServer":
         return self
@@ -95,17 +95,17 @@ class ForkServer:
         self.close()
 
     def _start(self) -> None:
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket, server_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(READY_LIMIT_S)
-        with theirs:
+        with server_socket:
             environment = {k: v for k, v in os.environ.items() if k not in ("NOTIFY_SOCKET", "WATCHDOG_USEC")}
             self._popen = subprocess.Popen(
-                [sys.executable, "-m", "terrafix.runtime.process_main", str(theirs.fileno()), str(os.getpid())],
+                [sys.executable, "-m", "terrafix.runtime.process_main", str(server_socket.fileno()), str(os.getpid())],
                 stdin=subprocess.DEVNULL,
                 stdout=self._output,
                 stderr=self._output,
                 env=environment,
-                pass_fds=[theirs.fileno()],
+                pass_fds=[server_socket.fileno()],
             )
 
     def _stop(self) -> None:
@@ -114,8 +114,9 @@ class ForkServer:
         self._popen.wait()
 
 
-def end_with(parent_pid: int, number: signal.Signals) -> bool:
-    """Asks the kernel to send this process that signal when its parent has ended. False: it has already."""
+def set_parent_death_signal(parent_pid: int, number: signal.Signals) -> bool:
+    """The kernel sends ``number`` to this process when its parent ends. False: ``parent_pid`` is not its parent, which
+    means that the parent has already ended."""
     _prctl(PR_SET_PDEATHSIG, number)
     return os.getppid() == parent_pid
 
@@ -127,5 +128,5 @@ def _prctl(option: int, value: int) -> None:
         raise OSError(ctypes.get_errno(), f"prctl({option})")
 
 
-def _adopt(wanted: bool) -> None:
-    _prctl(PR_SET_CHILD_SUBREAPER, int(wanted))
+def _set_child_subreaper(enabled: bool) -> None:
+    _prctl(PR_SET_CHILD_SUBREAPER, int(enabled))

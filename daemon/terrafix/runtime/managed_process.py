@@ -1,4 +1,4 @@
-"""One supervised process: started, watched by its progress, restarted within limits, stopped."""
+"""One supervised process: start, monitoring of its progress, restart within limits, stop."""
 
 import signal
 import threading
@@ -9,52 +9,53 @@ from enum import Enum
 
 from terrafix.core.errors import TerrafixError
 from terrafix.processes import Process
-from terrafix.runtime.fork_server import WHERE_SIGNAL, Forked, ForkServer
+from terrafix.runtime.fork_server import TRACEBACK_SIGNAL, ForkedProcess, ForkServer
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
 
-RESTART_LIMIT = 5  # deaths in the window; more is not bad luck but a fault that a restart does not cure
+RESTART_LIMIT = 5  # deaths within the window; more indicate a fault that a restart does not clear
 RESTART_WINDOW_NS = 60_000_000_000
 BACKOFF_NS = (0, 100_000_000, 300_000_000, 1_000_000_000)  # before the 1st, 2nd, ... restart in the window
 FIRST_START_LIMIT_NS = 300_000_000_000  # imports, and engines that are built when the models are new
-START_LIMIT_NS = 60_000_000_000  # a process that was ready before has nothing left to build
-STOP_LIMIT_S = 5.0  # SIGTERM to SIGKILL
-KILL_LIMIT_S = 1.0  # SIGKILL to the end, unless a driver holds the process in the kernel
-TRACEBACK_S = 0.2  # for a stuck process to say where it is
-USER_MISTAKES = frozenset(kind.exit_code for kind in TerrafixError.__subclasses__())
+START_LIMIT_NS = 60_000_000_000  # a process that was ready before has already built its engines
+STOP_LIMIT_S = 5.0  # from SIGTERM to SIGKILL
+KILL_LIMIT_S = 1.0  # from SIGKILL to the exit; it takes longer if a driver blocks the process in the kernel
+TRACEBACK_S = 0.2  # for a stuck process to print its tracebacks
+USER_ERROR_CODES = frozenset(kind.exit_code for kind in TerrafixError.__subclasses__())
 
 
 @dataclass(frozen=True)
 class Event:
-    """``name`` as in messages.ProcessEvent."""
+    """``name``: as ``event`` in messages.ProcessEvent."""
 
     name: str
     detail: str = ""
 
 
 @dataclass(frozen=True)
-class Mistake:
-    """Why a process could not even start, when that is something the user can mend."""
+class UserError:
+    """Why a process could not start, if it is an error that the user can correct."""
 
     exit_code: int
     text: str
 
 
 class State(Enum):
-    WAITING = "waiting"  # to be started, now or after a pause
+    WAITING = "waiting"  # to be started, at once or after a pause
     STARTING = "starting"  # no progress stamp yet
     RUNNING = "running"
-    FINISHED = "finished"  # ended by itself with 0
+    FINISHED = "finished"  # ended by itself with exit code 0
     GAVE_UP = "gave up"
 
 
 class RestartWindow:
-    """How long to wait before the next restart, or None: it has died too often."""
+    """Limits restarts by the number of deaths within RESTART_WINDOW_NS."""
 
     def __init__(self) -> None:
         self._deaths_ns: deque[int] = deque()
 
-    def died(self, now_ns: int) -> int | None:
+    def record_death(self, now_ns: int) -> int | None:
+        """-> pause [ns] before the next restart; None: the process has died too often."""
         while self._deaths_ns and now_ns - self._deaths_ns[0] > RESTART_WINDOW_NS:
             self._deaths_ns.popleft()
         self._deaths_ns.append(now_ns)
@@ -66,16 +67,16 @@ class ManagedProcess:
     def __init__(self, process: Process, run_dir: RunDir, fork_server: ForkServer) -> None:
         self.process = process
         self.state = State.WAITING
-        self.mistake: Mistake | None = None
+        self.user_error: UserError | None = None
         self.progress = Progress.create(run_dir.progress(process.name))
         self._run_dir = run_dir
-        self._nursery = fork_server
-        self._forked: Forked | None = None
+        self._fork_server = fork_server
+        self._forked: ForkedProcess | None = None
         self._start_at_ns = 0
         self._started_ns = 0
-        self._lives = 0
+        self._starts = 0
         self._was_ready = False
-        self._killed = False  # by us, for being stuck; its end is still to come
+        self._killed = False  # killed by the supervisor because it was stuck; its exit is still pending
         self._window = RestartWindow()
 
     @property
@@ -84,11 +85,11 @@ class ManagedProcess:
 
     @property
     def settled(self) -> bool:
-        """Nobody needs to wait for it: it is ready, or it never will be."""
+        """Whether it is ready or never will be, so that readiness of the daemon need not wait for it."""
         return self.state in (State.RUNNING, State.FINISHED, State.GAVE_UP)
 
     def check(self, now_ns: int) -> Iterator[Event]:
-        """Looks after the process once; yields what happened."""
+        """One check of the process: starts, restarts or kills it if necessary. Yields the resulting events."""
         if self.state is State.WAITING:
             if now_ns >= self._start_at_ns:
                 yield self._start(now_ns)
@@ -104,7 +105,7 @@ class ManagedProcess:
                 self.state, self._was_ready = State.RUNNING, True
 
     def stop(self) -> Event | None:
-        """SIGTERM, and SIGKILL if that does not help. None: it did not run."""
+        """SIGTERM, then SIGKILL after STOP_LIMIT_S. None: the process was not running."""
         if self._forked is None:
             return None
         self._forked.terminate()
@@ -112,22 +113,22 @@ class ManagedProcess:
             detail = describe(self._forked.wait(STOP_LIMIT_S))
         except TimeoutError:
             self._show_traceback_and_kill()
-            detail = f"killed: still there {STOP_LIMIT_S:.0f} s after SIGTERM"
+            detail = f"killed: still running {STOP_LIMIT_S:.0f} s after SIGTERM"
             try:
                 self._forked.wait(KILL_LIMIT_S)
             except TimeoutError:
-                detail += "; it hangs in the kernel"
+                detail += "; it is blocked in the kernel"
         self._forked = None
         return Event("stopped", detail)
 
     def _start(self, now_ns: int) -> Event:
         self.progress.reset()
-        self._forked = self._nursery.fork(self.process.name, self._run_dir)
+        self._forked = self._fork_server.fork(self.process.name, self._run_dir)
         self.state = State.STARTING
         self._killed = False
         self._started_ns = now_ns
-        self._lives += 1
-        return Event("started" if self._lives == 1 else "restarted", f"pid {self._forked.pid}")
+        self._starts += 1
+        return Event("started" if self._starts == 1 else "restarted", f"pid {self._forked.pid}")
 
     def _ended(self, code: int, now_ns: int) -> Iterator[Event]:
         self._forked = None
@@ -137,14 +138,14 @@ class ManagedProcess:
             return
         if not self._killed:
             yield Event("died", describe(code))
-        if code in USER_MISTAKES and not self._was_ready:
-            file = self._run_dir.mistake(self.process.name)
-            self.mistake = Mistake(code, file.read_text(encoding="utf-8") if file.exists() else "no reason given")
+        if code in USER_ERROR_CODES and not self._was_ready:
+            file = self._run_dir.user_error(self.process.name)
+            self.user_error = UserError(code, file.read_text(encoding="utf-8") if file.exists() else "no reason given")
             self.state = State.GAVE_UP
             self._run_dir.gave_up(self.process.name).touch()
-            yield Event("gave_up", f"cannot start: {self.mistake.text}")
+            yield Event("gave_up", f"cannot start: {self.user_error.text}")
             return
-        pause_ns = self._window.died(now_ns)
+        pause_ns = self._window.record_death(now_ns)
         if pause_ns is None:
             self.state = State.GAVE_UP
             self._run_dir.gave_up(self.process.name).touch()
@@ -165,14 +166,14 @@ class ManagedProcess:
 
     def _show_traceback_and_kill(self) -> None:
         assert self._forked is not None
-        self._forked.send_signal(WHERE_SIGNAL)
+        self._forked.send_signal(TRACEBACK_SIGNAL)
         threading.Event().wait(TRACEBACK_S)
         self._forked.kill()
         self._killed = True
 
 
 def describe(code: int) -> str:
-    """-9 -> 'killed by SIGKILL', 1 -> 'exit code 1'."""
+    """Exit code as text: -9 -> 'killed by SIGKILL', 1 -> 'exit code 1'."""
     if code >= 0:
         return f"exit code {code}"
     try:

@@ -1,4 +1,4 @@
-"""What is to be run, as the supervisor writes it for its processes, and for a supervisor that goes on after it."""
+"""Specification of a run, written by the supervisor for its processes and for a supervisor that resumes the run."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ class ProcessSpec(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Spec(msgspec.Struct, frozen=True, kw_only=True):
-    """What the supervisor tells its processes: one file, so that all of them see the same."""
+    """The content of one file (spec.json in the run folder), so that all processes read the same settings."""
 
     table: list[ProcessSpec]
     config: Config

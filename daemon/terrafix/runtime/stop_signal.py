@@ -1,8 +1,8 @@
-"""Whether a signal has asked this process to end.
+"""Whether a signal has requested this process to end.
 
-An Event would be set under a lock. Signals come in twos: Ctrl-C and what ends a process group reach a program and its
-parent, which passes it on at once. The handler of the second runs in the middle of that of the first, in the same
-thread, and waits for that lock for ever."""
+A threading.Event is not used because ``set`` takes a lock. Signals often arrive twice: Ctrl-C, or a signal to the
+process group, reaches both a program and its parent, which forwards it at once. The handler of the second signal then
+interrupts that of the first in the same thread and deadlocks on the lock."""
 
 import signal
 import threading
@@ -10,16 +10,17 @@ from types import TracebackType
 
 
 class StopSignal:
-    """``asked()``: one of the signals has come. As a context manager it gives the signals back to whose they were."""
+    """Calling the object returns whether one of the signals has arrived. A context manager: restores the previous
+    handlers at exit."""
 
     def __init__(self, *numbers: signal.Signals) -> None:
-        """Nothing is heard outside the main thread: only that may have signal handlers."""
-        self._came = False
-        heard = numbers if threading.current_thread() is threading.main_thread() else ()
-        self._before = {number: signal.signal(number, self._note) for number in heard}
+        """No handler is installed outside the main thread, because Python allows handlers only there."""
+        self._received = False
+        handled = numbers if threading.current_thread() is threading.main_thread() else ()
+        self._previous = {number: signal.signal(number, self._on_signal) for number in handled}
 
     def __call__(self) -> bool:
-        return self._came
+        return self._received
 
     def __enter__(self) -> "StopSignal":
         return self
@@ -27,8 +28,8 @@ class StopSignal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for number, handler in self._before.items():
+        for number, handler in self._previous.items():
             signal.signal(number, handler)
 
-    def _note(self, *_: object) -> None:
-        self._came = True
+    def _on_signal(self, *_: object) -> None:
+        self._received = True

@@ -1,7 +1,7 @@
-"""Frame-to-keyframe motion: KLT while the overlap is large, SIFT when it is not, one RANSAC homography either way.
+"""Frame-to-keyframe motion: KLT tracks at large overlap, else SIFT matches; one RANSAC homography in both cases.
 
-The ground is close to a plane seen from flying height, so a homography holds the matches together; what stands
-above it is left out by the RANSAC threshold or enters as noise, which the covariance states."""
+From flying height the ground is close to a plane, so its matches agree with one homography. Points above the ground
+fail the RANSAC threshold or add noise, which the covariance includes."""
 
 from dataclasses import dataclass, field
 
@@ -9,35 +9,32 @@ import cv2
 import numpy as np
 
 from terrafix.core.camera import CameraCalibration
+from terrafix.core.limits import MAX_KEYFRAME_AGE
 from terrafix.core.node import Image
 from terrafix.messages import Verdict
-from terrafix.vision.patch_alignment import realigned
+from terrafix.vision.patch_alignment import align_patches
 
-WORK_WIDTH_PX = 720  # wide enough for 0.2 m detail at 100 m, small enough for 10 frames a second on two cores
+WORK_WIDTH_PX = 720  # resolves 0.2 m from 100 m; small enough for 10 frames per second on two cores
 MAX_CORNERS = 400
 MIN_CORNER_DISTANCE_PX = 12
-MIN_CORNERS = 40
 KLT_WINDOW_PX = 21
 KLT_LEVELS = 4
-FORWARD_BACKWARD_PX = 1.0  # a track that does not come back to where it began is wrong (Kalal 2010)
-RANSAC_PX = 2.5  # 0.4 m at 100 m: what stands above the ground is left out
+FORWARD_BACKWARD_PX = 1.0  # forward-backward check: larger return error rejects a track (Kalal 2010)
+RANSAC_PX = 2.5  # 0.4 m from 100 m; excludes points above the ground
 MIN_INLIERS = 20
-MIN_INLIER_SHARE = 0.35
-MIN_SPREAD = 0.12  # inliers must span this share of the image's width and height, else the pose is not determined
-MIN_INLIERS_FEATURES = 15  # chance gives 4 to 8 of 100 wrong matches
-MIN_INLIER_SHARE_FEATURES = 0.15
-KEYFRAME_SHIFT = 0.22  # of the image width: the next keyframe is due while three quarters are still shared
-KEYFRAME_TRACKED = 0.45  # share of the keyframe's corners still tracked
-KEYFRAME_MAX_AGE = 10  # frames; half the estimator's window, so that the keyframe is still in it
-MAX_MISSES = 5  # frames that may fail against one keyframe before a new fragment starts (PB-5)
+MIN_INLIER_RATIO = 0.35
+MIN_SPREAD = 0.12  # inliers must span this fraction of image width and height, else the pose is not determined
+MIN_INLIERS_FEATURES = 15  # by chance, 4 to 8 of 100 wrong matches agree
+MIN_INLIER_RATIO_FEATURES = 0.15
+KEYFRAME_SHIFT = 0.22  # median shift for a new keyframe, fraction of the image width: three quarters still overlap
+KEYFRAME_TRACKED = 0.45  # minimum fraction of the keyframe's corners that are still tracked
+MAX_FAILURES = 5  # consecutive registration failures before a new fragment starts (PB-5)
 MAX_PAIRS = 48
-SIGMA_PX = (
-    0.75  # of a matched coordinate: tracks slip when the picture turns or the exposure steps (measured 0.4 to 0.9)
-)
+SIGMA_PX = 0.75  # 1-sigma of a matched coordinate; tracks drift with rotation and exposure steps (measured 0.4 to 0.9)
 MAX_TRIPLES, MIN_TRIPLES = 96, 12
-REALIGNED_SIGMA_PX = 0.25  # of a coordinate of a corner that a new keyframe found anew (measured 0.13 to 0.6)
+ALIGNED_SIGMA_PX = 0.25  # 1-sigma of a corner coordinate after patch alignment (measured 0.13 to 0.6)
 SIFT_FEATURES = 1500
-SIFT_RATIO = 0.8  # Lowe 2004
+SIFT_RATIO = 0.8  # ratio test, Lowe 2004
 
 _NO_POINTS, _NO_TRIPLES, _NONE = np.zeros((0, 2), np.float32), np.zeros((0, 6)), np.zeros(0, int)
 
@@ -47,19 +44,20 @@ class _Keyframe:
     frame_id: int
     gray: np.ndarray
     corners: np.ndarray  # (N, 2) px
-    before: np.ndarray  # (N, 2) px: where these are in the keyframe before; nan: not seen there
-    before_id: int  # its frame; meaningless where nothing was seen
-    sift: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 2) px, descriptors; made when first needed
+    previous_corners: np.ndarray  # (N, 2) px: the same corners in the previous keyframe; NaN: not observed there
+    previous_keyframe_id: int  # frame id of the previous keyframe; meaningless where all of ``previous_corners`` is NaN
+    sift: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 2) px, descriptors (N, 128); computed on demand
     age: int = 0
-    registered: bool = False  # it was registered to an earlier keyframe, or a later frame was registered to it
+    registered: bool = False  # registered to an earlier keyframe, or a later frame was registered to it
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Matches of a frame with its keyframe; ``pairs`` (N, 4) normalised (x_kf, y_kf, x, y).
+    """Matches of a frame with its keyframe. ``pairs`` (N, 4): normalised coordinates (x_kf, y_kf, x, y).
 
-    ``triples`` (N, 6) normalised (x_before, y_before, x_kf, y_kf, x, y): corners that the keyframe before, frame
-    ``before_id``, saw as well. Only of a frame that becomes a keyframe."""
+    ``triples`` (N, 6): normalised coordinates (x_prev, y_prev, x_kf, y_kf, x, y) of corners that the previous keyframe,
+    frame ``previous_keyframe_id``, observed as well; only for a frame that becomes a keyframe. ``sigma_norm``,
+    ``triples_sigma_norm``: 1-sigma of a coordinate, normalised."""
 
     keyframe_id: int
     verdict: Verdict
@@ -68,68 +66,69 @@ class Motion:
     inliers: int
     tracked: int
     becomes_keyframe: bool
-    before_id: int = -1
+    previous_keyframe_id: int = -1
     triples: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     triples_sigma_norm: float = 0.0
 
 
 class FrameTracker:
-    """Feed frames in order; keeps one keyframe and the last tracked frame."""
+    """Registers frames in order; stores one keyframe and the last tracked frame."""
 
     def __init__(self, camera: CameraCalibration) -> None:
         self._scale = min(1.0, WORK_WIDTH_PX / camera.width)
         self._camera = camera.scaled(self._scale)
         self._keyframe: _Keyframe | None = None
-        self._last_gray: np.ndarray | None = None  # newest frame that was tracked
-        self._last_points = np.zeros((0, 2), np.float32)  # where the keyframe's corners are in it
-        self._last_index = np.zeros(0, int)  # which corners these are
-        self._misses = 0
-        self._missed: _Keyframe | None = None  # the frame that failed last: the first of a new fragment, perhaps
-        self._before_fragment: _Keyframe | None = None  # last keyframe of the fragment before this one
+        self._last_gray: np.ndarray | None = None  # last tracked frame
+        self._last_points = np.zeros((0, 2), np.float32)  # (N, 2) px: the keyframe's corners in that frame
+        self._last_index = np.zeros(0, int)  # (N,) their indices in the keyframe
+        self._failures = 0
+        self._failed_frame: _Keyframe | None = None  # last frame that failed: candidate for the start of a new fragment
+        self._previous_fragment: _Keyframe | None = None  # last keyframe of the previous fragment
         self._sift = cv2.SIFT.create(nfeatures=SIFT_FEATURES, enable_precise_upscale=True)
 
     def working_copy(self, image: Image) -> np.ndarray:
-        """The picture that is tracked: (H, W) gray, at most WORK_WIDTH_PX wide."""
+        """(H, W) gray image for tracking, at most WORK_WIDTH_PX wide."""
         gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self._scale < 1.0:
             gray = cv2.resize(gray, (self._camera.width, self._camera.height), interpolation=cv2.INTER_AREA)
         return gray
 
     def track(self, frame_id: int, image: Image) -> Motion:
+        """Registers a full-size image; see ``register``."""
         return self.register(frame_id, self.working_copy(image))
 
     def register(self, frame_id: int, gray: np.ndarray) -> Motion:
-        """``gray``: the ``working_copy`` of the next frame."""
+        """Registers the next frame to a keyframe. ``gray``: its ``working_copy``."""
         keyframe = self._keyframe
         if keyframe is None:
             return self._new_fragment(frame_id, gray)
         keyframe.age += 1
-        index, points, tracked = self._follow(keyframe, gray)
-        if self._good(keyframe.corners[index], points, tracked, MIN_INLIERS, MIN_INLIER_SHARE):
+        index, points, tracked = self._track_klt(keyframe, gray)
+        if self._determines_motion(keyframe.corners[index], points, tracked, MIN_INLIERS, MIN_INLIER_RATIO):
             return self._accept_tracks(keyframe, frame_id, gray, index, points, tracked)
-        # By features: against the keyframe, against the last keyframe of the fragment before (foreign frames end, and
-        # the flight goes on where it was), and against the frame that failed before this one: two that agree with each
-        # other are a new fragment, one that agrees with nobody is a foreign frame.
-        here = _Keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1, self._describe(gray))
-        for candidate in (keyframe, self._before_fragment, self._missed):
+        # Feature matching against three candidates: the keyframe; the last keyframe of the previous fragment (after
+        # foreign frames, the flight continues where it was); the last failed frame. Two failed frames that match each
+        # other start a new fragment; one that matches no candidate is a foreign frame.
+        current = _Keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1, self._describe(gray))
+        for candidate in (keyframe, self._previous_fragment, self._failed_frame):
             if candidate is None:
                 continue
-            points_kf, points = self._match_features(candidate, here)
+            points_kf, points = self._match_features(candidate, current)
             inlier, matched = _homography_inliers(points_kf, points), len(points)
             points_kf, points = points_kf[inlier], points[inlier]
-            if self._good(points_kf, points, matched, MIN_INLIERS_FEATURES, MIN_INLIER_SHARE_FEATURES):
-                if candidate is self._missed:
-                    self._leave_fragment()
-                elif candidate is self._before_fragment:
-                    self._before_fragment = None
-                # The KLT chain is broken; it starts again from this frame.
+            if self._determines_motion(points_kf, points, matched, MIN_INLIERS_FEATURES, MIN_INLIER_RATIO_FEATURES):
+                if candidate is self._failed_frame:
+                    self._end_fragment()
+                elif candidate is self._previous_fragment:
+                    self._previous_fragment = None
+                # The KLT chain is broken; it restarts from this frame.
                 self._start_keyframe(frame_id, gray)
-                return self._said(candidate, points_kf, points, len(points), matched, due=True)
-        return self._miss(keyframe, here, tracked)
+                return self._build_motion(candidate, points_kf, points, len(points), matched, due=True)
+        return self._reject(keyframe, current, tracked)
 
-    def _follow(self, keyframe: _Keyframe, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """KLT from the last tracked frame. -> which of the keyframe's corners (N,) one homography holds together, where
-        they are here (N, 2), and how many were tracked."""
+    def _track_klt(self, keyframe: _Keyframe, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+        """KLT from the last tracked frame. -> indices (N,) of the keyframe's corners that agree with one homography,
+        their positions (N, 2) px in this frame, and the number of tracked corners."""
         if self._last_gray is None or len(self._last_points) < MIN_INLIERS:
             return _NONE, _NO_POINTS, 0
         window = (KLT_WINDOW_PX, KLT_WINDOW_PX)
@@ -142,17 +141,17 @@ class FrameTracker:
         )
         closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < FORWARD_BACKWARD_PX
         keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed
-        here, index = ahead.reshape(-1, 2)[keep], self._last_index[keep]
-        inlier = _homography_inliers(keyframe.corners[index], here)
+        positions, index = ahead.reshape(-1, 2)[keep], self._last_index[keep]
+        inlier = _homography_inliers(keyframe.corners[index], positions)
         if inlier.sum() >= MIN_INLIERS:
-            self._last_points, self._last_index, self._last_gray = here[inlier], index[inlier], gray
-        return index[inlier], here[inlier], int(keep.sum())
+            self._last_points, self._last_index, self._last_gray = positions[inlier], index[inlier], gray
+        return index[inlier], positions[inlier], int(keep.sum())
 
-    def _match_features(self, keyframe: _Keyframe, here: _Keyframe) -> tuple[np.ndarray, np.ndarray]:
-        """SIFT: large steps and turns between frames. -> points in the keyframe, points here."""
+    def _match_features(self, keyframe: _Keyframe, current: _Keyframe) -> tuple[np.ndarray, np.ndarray]:
+        """SIFT matches, for large displacements and rotations. -> points in both frames (N, 2), (N, 2), px."""
         if keyframe.sift is None:
             keyframe.sift = self._describe(keyframe.gray)
-        (points_kf, descriptors_kf), (points, descriptors) = keyframe.sift, here.sift or self._describe(here.gray)
+        (points_kf, descriptors_kf), (points, descriptors) = keyframe.sift, current.sift or self._describe(current.gray)
         if len(points_kf) < 2 or len(points) < 2:
             return _NO_POINTS, _NO_POINTS
         pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors_kf, descriptors, k=2)
@@ -162,16 +161,22 @@ class FrameTracker:
         return points_kf[[m.queryIdx for m in good]], points[[m.trainIdx for m in good]]
 
     def _describe(self, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """SIFT points (N, 2) px and descriptors (N, 128)."""
         keypoints, descriptors = self._sift.detectAndCompute(gray, None)
         if descriptors is None:
             return _NO_POINTS, np.zeros((0, 128), np.float32)
         return np.array([k.pt for k in keypoints], np.float32), descriptors
 
-    def _good(self, a: np.ndarray, b: np.ndarray, of: int, at_least: int, share: float) -> bool:
-        """The matches (N, 2), (N, 2) that agree, of so many, determine a motion."""
-        return len(a) >= at_least and len(a) >= share * of and self._spans(a) and self._spans(b)
+    def _determines_motion(
+        self, a: np.ndarray, b: np.ndarray, matches: int, min_inliers: int, min_ratio: float
+    ) -> bool:
+        """True when the inliers (N, 2), (N, 2), out of ``matches``, are enough and cover enough of the image."""
+        return (
+            len(a) >= min_inliers and len(a) >= min_ratio * matches and self._covers_image(a) and self._covers_image(b)
+        )
 
-    def _spans(self, points: np.ndarray) -> bool:
+    def _covers_image(self, points: np.ndarray) -> bool:
+        """True when the points (N, 2) px cover enough of the image in both directions."""
         size = (self._camera.width, self._camera.height)
         return bool(np.all(np.ptp(points, axis=0) > np.multiply(size, MIN_SPREAD)))
 
@@ -184,34 +189,35 @@ class FrameTracker:
         points: np.ndarray,
         tracked: int,
     ) -> Motion:
-        """``points`` (N, 2): where the corners ``index`` (N,) of the keyframe were tracked to."""
+        """``points`` (N, 2) px: tracked positions of the keyframe's corners ``index`` (N,)."""
         corners = keyframe.corners[index]
         shift = float(np.median(np.linalg.norm(corners - points, axis=1))) / self._camera.width
         due = (
             shift > KEYFRAME_SHIFT
             or len(index) < KEYFRAME_TRACKED * max(len(keyframe.corners), 1)
-            or keyframe.age >= KEYFRAME_MAX_AGE
+            or keyframe.age >= MAX_KEYFRAME_AGE
         )
-        here, kept = realigned(keyframe.gray, corners, gray, points, RANSAC_PX)
+        aligned, valid = align_patches(keyframe.gray, corners, gray, points, RANSAC_PX)
         triples = _NO_TRIPLES
         if due:
-            triples = self._triples(keyframe, here, index[kept])
-            self._start_keyframe(frame_id, gray, here, corners[kept], keyframe.frame_id)
-        # A blurred picture lies on no patch; its tracks are there all the same.
-        if len(kept) < MIN_INLIERS or not self._spans(here):
-            here, kept = points, np.arange(len(points))
-        return self._said(keyframe, corners[kept], here, len(index), tracked, due=due, triples=triples)
+            triples = self._triples(keyframe, aligned, index[valid])
+            self._start_keyframe(frame_id, gray, aligned, corners[valid], keyframe.frame_id)
+        # Patch alignment fails on a blurred image, but the tracks are still valid.
+        if len(valid) < MIN_INLIERS or not self._covers_image(aligned):
+            aligned, valid = points, np.arange(len(points))
+        return self._build_motion(keyframe, corners[valid], aligned, len(index), tracked, due=due, triples=triples)
 
-    def _triples(self, keyframe: _Keyframe, here: np.ndarray, index: np.ndarray) -> np.ndarray:
-        three = np.isfinite(keyframe.before[index, 0])
+    def _triples(self, keyframe: _Keyframe, positions: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Three-view matches (N, 6), normalised, of the corners ``index`` at ``positions`` (N, 2) px."""
+        three = np.isfinite(keyframe.previous_corners[index, 0])
         if three.sum() < MIN_TRIPLES:
             return _NO_TRIPLES
-        here, index = here[three], index[three]
-        pick = _spread(keyframe.corners[index], MAX_TRIPLES)
-        views = keyframe.before[index[pick]], keyframe.corners[index[pick]], here[pick]
+        positions, index = positions[three], index[three]
+        pick = _select_spread(keyframe.corners[index], MAX_TRIPLES)
+        views = keyframe.previous_corners[index[pick]], keyframe.corners[index[pick]], positions[pick]
         return np.hstack([self._camera.normalise(px) for px in views])
 
-    def _said(
+    def _build_motion(
         self,
         keyframe: _Keyframe,
         a: np.ndarray,
@@ -222,75 +228,81 @@ class FrameTracker:
         due: bool,
         triples: np.ndarray = _NO_TRIPLES,
     ) -> Motion:
-        """The motion that the matches (N, 2), (N, 2) tell, ``inliers`` of ``tracked`` of which agree."""
-        self._misses, self._missed = 0, None
+        """Motion from inlier matches (N, 2), (N, 2) px; ``inliers`` of ``tracked`` matches agree with it."""
+        self._failures, self._failed_frame = 0, None
         if self._keyframe is not None:
             self._keyframe.registered = True
-        pick = _spread(a, MAX_PAIRS)
+        pick = _select_spread(a, MAX_PAIRS)
         return Motion(
             keyframe.frame_id,
             Verdict.ACCEPTED,
             np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])]),
-            # A consensus that few of the matches share may be a roof instead of the ground: less is claimed for it.
+            # A consensus with a low inlier ratio may be a roof instead of the ground: its sigma is larger.
             SIGMA_PX / self._camera.fx / float(np.sqrt(inliers / tracked)),
             inliers,
             tracked,
             due,
-            keyframe.before_id if len(triples) else -1,
+            keyframe.previous_keyframe_id if len(triples) else -1,
             triples,
-            REALIGNED_SIGMA_PX / self._camera.fx,
+            ALIGNED_SIGMA_PX / self._camera.fx,
         )
 
-    def _miss(self, keyframe: _Keyframe, here: _Keyframe, tracked: int) -> Motion:
-        self._misses += 1
-        if self._misses >= MAX_MISSES or keyframe.age >= KEYFRAME_MAX_AGE:
-            return self._new_fragment(here.frame_id, here.gray)
-        self._missed = here
+    def _reject(self, keyframe: _Keyframe, current: _Keyframe, tracked: int) -> Motion:
+        """Registration failed. Starts a new fragment after MAX_MISSES failures, or when the keyframe is too old."""
+        self._failures += 1
+        if self._failures >= MAX_FAILURES or keyframe.age >= MAX_KEYFRAME_AGE:
+            return self._new_fragment(current.frame_id, current.gray)
+        self._failed_frame = current
         return Motion(keyframe.frame_id, Verdict.FEW_INLIERS, np.zeros((0, 4)), 0.0, 0, tracked, False)
 
-    def _leave_fragment(self) -> None:
-        """The next frames are a new fragment. A keyframe that no other frame agreed with is no place to return to."""
+    def _end_fragment(self) -> None:
+        """Ends the fragment. A keyframe to which no other frame was registered is not a candidate for a return."""
         if self._keyframe is not None and self._keyframe.registered:
-            self._before_fragment = self._keyframe
+            self._previous_fragment = self._keyframe
 
     def _new_fragment(self, frame_id: int, gray: np.ndarray) -> Motion:
-        """The frame stands alone: no motion is known, later frames refer to it."""
-        self._leave_fragment()
+        """The frame starts a fragment: it has no motion, later frames are registered to it."""
+        self._end_fragment()
         self._start_keyframe(frame_id, gray)
-        self._misses, self._missed = 0, None
+        self._failures, self._failed_frame = 0, None
         return Motion(frame_id, Verdict.ACCEPTED, np.zeros((0, 4)), 0.0, 0, 0, True)
 
     def _start_keyframe(
         self,
         frame_id: int,
         gray: np.ndarray,
-        kept: np.ndarray = _NO_POINTS,
-        before: np.ndarray = _NO_POINTS,
-        before_id: int = -1,
+        carried: np.ndarray = _NO_POINTS,
+        previous_corners: np.ndarray = _NO_POINTS,
+        previous_keyframe_id: int = -1,
     ) -> None:
-        """Corners that are ``kept`` (N, 2) live on, and were seen at ``before`` (N, 2); new ones fill what is empty."""
+        """The frame becomes the keyframe. Corners ``carried`` (N, 2) px were at ``previous_corners`` (N, 2) in the last
+        keyframe; new ones are detected in the areas without corners."""
         empty = np.full(gray.shape, 255, np.uint8)
-        for x, y in np.round(kept).astype(int):
+        for x, y in np.round(carried).astype(int):
             cv2.circle(empty, (int(x), int(y)), MIN_CORNER_DISTANCE_PX, 0, -1)
-        wanted = MAX_CORNERS - len(kept)
-        corners = cv2.goodFeaturesToTrack(gray, wanted, 0.005, MIN_CORNER_DISTANCE_PX, mask=empty) if wanted else None
+        missing_count = MAX_CORNERS - len(carried)
+        corners = (
+            cv2.goodFeaturesToTrack(gray, missing_count, 0.005, MIN_CORNER_DISTANCE_PX, mask=empty)
+            if missing_count
+            else None
+        )
         new = corners.reshape(-1, 2).astype(np.float32) if corners is not None else _NO_POINTS
-        found = np.vstack([kept, new])
+        found = np.vstack([carried, new])
         unseen = np.full((len(new), 2), np.nan, np.float32)
-        self._keyframe = _Keyframe(frame_id, gray, found, np.vstack([before, unseen]), before_id)
+        self._keyframe = _Keyframe(frame_id, gray, found, np.vstack([previous_corners, unseen]), previous_keyframe_id)
         self._last_gray, self._last_points, self._last_index = gray, found, np.arange(len(found))
 
 
 def _homography_inliers(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which of the matches (N, 2), (N, 2) one homography explains: (N,) bool."""
+    """(N,) bool: matches (N, 2), (N, 2) px that agree with one RANSAC homography."""
     if len(a) < 8:
         return np.zeros(len(a), bool)
     _, mask = cv2.findHomography(a, b, cv2.RANSAC, RANSAC_PX, maxIters=1500, confidence=0.999)
     return np.zeros(len(a), bool) if mask is None else mask.ravel().astype(bool)
 
 
-def _spread(points: np.ndarray, limit: int) -> np.ndarray:
-    """Indices of at most ``limit`` points, round-robin over an 8 x 6 grid, so that no corner of the image wins."""
+def _select_spread(points: np.ndarray, limit: int) -> np.ndarray:
+    """Indices of at most ``limit`` points, round-robin over an 8 x 6 grid, for an even distribution over the image."""
     if len(points) <= limit:
         return np.arange(len(points))
     low, span = points.min(0), np.maximum(np.ptp(points, axis=0), 1.0)

@@ -1,4 +1,4 @@
-"""Vision: every frame becomes an Odometry, or the reason why there is none."""
+"""Vision node: publishes one Odometry per Frame, with its verdict."""
 
 from collections.abc import Iterable
 
@@ -11,18 +11,20 @@ from terrafix.vision.repeated_picture import PictureHistory, Repeat
 
 
 class VisionNode:
+    """In: Origin, Frame. Out: Odometry."""
+
     def __init__(self, frames: FrameStore) -> None:
         self._frames = frames
         self._origin: Origin | None = None
         self._tracker: FrameTracker | None = None
-        self._pictures = PictureHistory()
+        self._history = PictureHistory()
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
-            case Origin() if message != self._origin:  # said again after a restart of the source
+            case Origin() if message != self._origin:  # published again after a restart of the source
                 self._origin = message
                 self._tracker = FrameTracker(CameraCalibration.of(message.camera))
-                self._pictures = PictureHistory()
+                self._history = PictureHistory()
             case Frame():
                 yield self._odometry(message)
             case _:
@@ -38,8 +40,8 @@ class VisionNode:
                 t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.BAD_IMAGE
             )
         gray = self._tracker.working_copy(image)
-        repeat = self._pictures.look(gray)
-        if repeat in (Repeat.IDENTICAL, Repeat.OLDER):  # a stale buffer does not show where the vehicle is now
+        repeat = self._history.classify(gray)
+        if repeat in (Repeat.IDENTICAL, Repeat.OLDER):  # a stale buffer does not show the current position
             return Odometry(
                 t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.STALLED
             )
@@ -55,7 +57,7 @@ class VisionNode:
             tracked=motion.tracked,
             becomes_keyframe=motion.becomes_keyframe,
             static=repeat is Repeat.PREVIOUS,
-            before_id=motion.before_id,
+            before_id=motion.previous_keyframe_id,
             triples=[
                 (float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in motion.triples
             ],

@@ -1,8 +1,8 @@
-"""Pictures that repeat an earlier one: a frozen sensor, a driver that returns old buffers in turn.
+"""Detects images that repeat an earlier one: a frozen sensor, or a driver that cycles through old buffers.
 
-A camera in the air never shows exactly the same view twice: attitude and position sway by more than a hundredth of a
-degree. Sensor noise is new in every buffer that a frozen sensor delivers, so equality of the pixels does not tell; the
-displacement between two pictures does, and noise averages out of it."""
+A camera in flight does not show exactly the same view twice: attitude and position vary by more than a hundredth of a
+degree. A frozen sensor adds new noise to every buffer, so pixel equality is not a test. The displacement between two
+images is one, because noise averages out of it."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -11,23 +11,23 @@ from enum import Enum
 import cv2
 import numpy as np
 
-HISTORY = 40  # pictures: buffer rings of drivers and encoders have 3 to 32
-WIDTH_PX = 360  # of the copies that are compared: four pixels and more of the sensor in each, which damps its noise
-THUMBNAIL_PX = 24  # side of the thumbnails that choose which earlier picture is compared
-# Displacement up to which two pictures are the same, in every quarter of the picture. Of 90 degrees over 360 px this is
+HISTORY = 40  # images; buffer rings of drivers and encoders have 3 to 32
+WIDTH_PX = 360  # of the compared copies: each pixel averages four or more sensor pixels, which reduces noise
+THUMBNAIL_PX = 24  # side of the thumbnails that select the earlier image to compare with
+# Two images with a displacement below this in every quadrant are the same view. For a 90 degree lens over 360 px it is
 # 0.006 degrees; attitude control of multirotors, gimbals included, holds 0.01 to 0.02 (manufacturers' data sheets).
-SAME_PX = 0.025
-SAME_CORRELATION = 0.5  # of unrelated pictures the estimated displacement is near zero, too, and this is below 0.3
-MIN_GRADIENT = 0.5  # grey values per pixel, root mean square: a black or grey picture shows no displacement
+MAX_SHIFT_PX = 0.025
+MIN_CORRELATION = 0.5  # unrelated images also have a displacement estimate near zero, but a correlation below 0.3
+MIN_GRADIENT = 0.5  # RMS, grey levels per pixel: a uniform image has no measurable displacement
 
 
 class Repeat(Enum):
-    """Which earlier picture a picture repeats."""
+    """The earlier image that an image repeats."""
 
     NONE = "none"
-    IDENTICAL = "identical"  # the one before, pixel by pixel: no sensor delivers that
-    PREVIOUS = "previous"  # the one before, but for noise: a camera that stands still, or a frozen one
-    OLDER = "older"  # not the one before: a stale buffer
+    IDENTICAL = "identical"  # the previous image, equal in every pixel; no sensor delivers that
+    PREVIOUS = "previous"  # the previous image except for noise: a stationary camera, or a frozen sensor
+    OLDER = "older"  # an image before the previous one: a stale buffer
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,14 @@ class _Copy:
 
 
 class PictureHistory:
-    """The newest ``HISTORY`` pictures, compared by what they show."""
+    """The newest ``HISTORY`` images, compared by their content."""
 
     def __init__(self) -> None:
         self._copies: deque[_Copy] = deque(maxlen=HISTORY)
         self._last: np.ndarray | None = None
 
-    def look(self, gray: np.ndarray) -> Repeat:
-        """``gray`` (H, W) uint8: the newest picture, which joins the history. -> what it repeats."""
+    def classify(self, gray: np.ndarray) -> Repeat:
+        """Adds the newest image, ``gray`` (H, W) uint8. -> which earlier image it repeats."""
         height = max(round(gray.shape[0] * WIDTH_PX / gray.shape[1]), 8)
         image = cv2.resize(gray, (WIDTH_PX, height), interpolation=cv2.INTER_AREA)
         small = cv2.resize(image, (THUMBNAIL_PX, THUMBNAIL_PX), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -66,13 +66,13 @@ class PictureHistory:
 
 
 def same_view(before: np.ndarray, now: np.ndarray) -> bool:
-    """Whether two pictures (H, W), uint8, of one size show the same view but for noise.
+    """True when two images (H, W) uint8 of equal size show the same view except for noise.
 
-    One step of Lucas and Kanade (1981) in each quarter: the displacement that explains the difference best."""
+    One Lucas-Kanade step (1981) per quadrant: the least-squares displacement."""
     if before.shape != now.shape:
         return False
     first, second = before.astype(np.float32), now.astype(np.float32)
-    if _correlation(first, second) < SAME_CORRELATION:
+    if _correlation(first, second) < MIN_CORRELATION:
         return False
     along_x, along_y = (
         cv2.Scharr(first, cv2.CV_32F, 1, 0, scale=1 / 32),
@@ -87,7 +87,7 @@ def same_view(before: np.ndarray, now: np.ndarray) -> bool:
             if np.linalg.eigvalsh(normal)[0] < MIN_GRADIENT**2 * gradient.shape[1]:
                 return False
             moved_px = np.linalg.solve(normal, gradient @ difference[rows, columns].ravel())
-            if float(np.hypot(*moved_px)) > SAME_PX:
+            if float(np.hypot(*moved_px)) > MAX_SHIFT_PX:
                 return False
     return True
 

@@ -1,4 +1,4 @@
-"""Features of images: dense describers for the map matcher, detectors and matchers of points. One file a model."""
+"""Image features: dense describers for the map matcher, keypoint detectors and matchers. One file per model."""
 
 from pathlib import Path
 
@@ -9,44 +9,45 @@ from terrafix_engines.features.keypoints import Detector
 from terrafix_engines.features.lightglue import LightGlueMatcher
 from terrafix_engines.features.semidense import SemiDenseMatcher
 from terrafix_engines.features.xfeat import XFeatDescriber, XFeatDetector
-from terrafix_engines.manifest import DENSE_OUTPUTS, ManifestError, named
+from terrafix_engines.manifest import DENSE_OUTPUTS, ManifestError, find_manifest
 from terrafix_engines.runtime import Model, ModelFileError
-from terrafix_engines.store import ENGINES, Stored, find, models_folder
+from terrafix_engines.store import ENGINES, StoredModel, models_folder, resolve_model
 
 
 def open_describer(xfeat: str, folder: str = "") -> GradientDescriber | XFeatDescriber:
-    """XFeat when its ONNX file or the name of a fetched model is given, else oriented gradients. ``folder``: of models,
-    see ``models_folder``. Raises ModelFileError."""
+    """XFeat when ``xfeat`` is an ONNX file or the name of a fetched model; oriented gradients when it is empty.
+
+    ``folder``: models folder, see ``models_folder``. Raises ModelFileError."""
     if not xfeat:
         return GradientDescriber()
     where = models_folder(folder)
-    found = find(xfeat, XFeatDescriber.name, where)
-    if isinstance(found, Stored):
+    found = resolve_model(xfeat, XFeatDescriber.name, where)
+    if isinstance(found, StoredModel):
         return XFeatDescriber(found.open(xfeat_model.INPUTS, xfeat_model.DESCRIPTORS_ONLY), found.manifest)
-    return _own_xfeat(found, where)
+    return _open_user_xfeat(found, where)
 
 
-def open_detector(model: Stored) -> Detector:
-    """Of a model whose role is "dense" or "keypoints". Raises ModelFileError."""
+def open_detector(model: StoredModel) -> Detector:
+    """Detector for a model with role "dense" or "keypoints". Raises ModelFileError."""
     if model.manifest.role == "dense":
         return XFeatDetector(model.open(xfeat_model.INPUTS, DENSE_OUTPUTS), model.manifest)
     return ExportedDetector(model.open(*ExportedDetector.names(model.manifest)), model.manifest)
 
 
-def open_matcher(model: Stored) -> LightGlueMatcher:
-    """Of a model whose role is "matcher". Raises ModelFileError."""
+def open_matcher(model: StoredModel) -> LightGlueMatcher:
+    """Keypoint matcher for a model with role "matcher". Raises ModelFileError."""
     return LightGlueMatcher(model.open(*LightGlueMatcher.names(model.manifest)), model.manifest)
 
 
-def open_picture_matcher(model: Stored) -> SemiDenseMatcher:
-    """Of a model whose role is "pair". Raises ModelFileError."""
+def open_pair_matcher(model: StoredModel) -> SemiDenseMatcher:
+    """Image pair matcher for a model with role "pair". Raises ModelFileError."""
     return SemiDenseMatcher(model.open(*SemiDenseMatcher.names(model.manifest)), model.manifest)
 
 
-def _own_xfeat(path: Path, folder: Path) -> XFeatDescriber:
-    """A file of the user's own with the tensors of XFeat, whatever its checksum."""
+def _open_user_xfeat(path: Path, folder: Path) -> XFeatDescriber:
+    """A user's own file with XFeat's tensors; the checksum is not verified."""
     try:
-        manifest = named(XFeatDescriber.name, folder)
+        manifest = find_manifest(XFeatDescriber.name, folder)
     except ManifestError as error:
         raise ModelFileError(str(error)) from None
     model = Model(path, xfeat_model.INPUTS, xfeat_model.DESCRIPTORS_ONLY, manifest=manifest, engines=folder / ENGINES)

@@ -1,4 +1,4 @@
-"""A picture becomes the input of a model, as its manifest says."""
+"""Converts an image to the input tensor of a model, as its manifest specifies."""
 
 import cv2
 import numpy as np
@@ -7,14 +7,14 @@ from terrafix_engines.manifest import ImageInput
 
 
 def image_tensor(image: np.ndarray, spec: ImageInput, height: int, width: int) -> np.ndarray:
-    """(H, W, 3) uint8 BGR -> (1, C, height, width) float32, filled up by reflection at the right and at the bottom."""
+    """(H, W, 3) uint8 BGR -> (1, C, height, width) float32, padded by reflection at the right and at the bottom."""
     bottom, right = height - image.shape[0], width - image.shape[1]
-    filled = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REFLECT_101)
+    padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REFLECT_101)
     match spec.colour:
         case "gray":
-            planes = cv2.cvtColor(filled, cv2.COLOR_BGR2GRAY)[None]
+            planes = cv2.cvtColor(padded, cv2.COLOR_BGR2GRAY)[None]
         case "rgb":
-            planes = filled[:, :, ::-1].transpose(2, 0, 1)
+            planes = padded[:, :, ::-1].transpose(2, 0, 1)
         case "bgr":
-            planes = filled.transpose(2, 0, 1)
+            planes = padded.transpose(2, 0, 1)
     return np.ascontiguousarray(planes[None], dtype=np.float32) * np.float32(spec.scale)

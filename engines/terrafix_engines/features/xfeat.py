@@ -1,17 +1,17 @@
-"""XFeat (Potje et al., CVPR 2024) from an ONNX file with the maps of its backbone: dense descriptors, and keypoints."""
+"""XFeat (Potje et al., CVPR 2024) from an ONNX file with the maps of its backbone: dense descriptors and keypoints."""
 
 import cv2
 import numpy as np
 
 from terrafix_engines.features.image_input import image_tensor
-from terrafix_engines.features.keypoints import Keypoints, best_of, unit
+from terrafix_engines.features.keypoints import Keypoints, select_strongest, unit_rows
 from terrafix_engines.manifest import DENSE_INPUT, DENSE_OUTPUTS, Manifest
 from terrafix_engines.runtime import Model
 
 STRIDE = 8
 INPUTS = (DENSE_INPUT,)
 DESCRIPTORS_ONLY = DENSE_OUTPUTS[:1]
-# Of the authors' detectAndCompute: least probability of a keypoint, and the square in which it must be the greatest.
+# From the authors' detectAndCompute: minimum keypoint probability, and the side of the non-maximum suppression window.
 MIN_PROBABILITY = 0.05
 NMS_SIDE_PX = 5
 
@@ -44,21 +44,26 @@ class XFeatDetector:
         assert manifest.image is not None
         self.model, self._image = model, manifest.image
 
-    def detect(self, image: np.ndarray, most: int) -> Keypoints:
+    def detect(self, image: np.ndarray, max_points: int) -> Keypoints:
         height, width = image.shape[:2]
         tensor = image_tensor(image, self._image, *self.model.side_lengths(height, width))
         descriptors, logits, reliability = (one[0] for one in self.model.run(tensor))
         heat = probabilities(logits)
-        greatest = cv2.dilate(heat, np.ones((NMS_SIDE_PX, NMS_SIDE_PX), np.uint8))
-        y, x = np.nonzero((heat == greatest) & (heat > MIN_PROBABILITY))
+        local_maximum = cv2.dilate(heat, np.ones((NMS_SIDE_PX, NMS_SIDE_PX), np.uint8))
+        y, x = np.nonzero((heat == local_maximum) & (heat > MIN_PROBABILITY))
         xy_px = np.column_stack([x, y]).astype(np.float32)
         scores = heat[y, x] * sample(reliability, xy_px)[:, 0]
-        kept = best_of(xy_px, scores, (width, height), most)
-        return Keypoints(xy_px[kept], scores[kept], unit(sample(descriptors, xy_px[kept])), size_px=(width, height))
+        strongest = select_strongest(xy_px, scores, (width, height), max_points)
+        return Keypoints(
+            xy_px[strongest],
+            scores[strongest],
+            unit_rows(sample(descriptors, xy_px[strongest])),
+            size_px=(width, height),
+        )
 
 
 def probabilities(logits: np.ndarray) -> np.ndarray:
-    """(65, h, w): 64 pixels of each cell, row by row, and "no keypoint here" -> (8 h, 8 w) float32."""
+    """Keypoint logits (65, h, w): 64 pixels per cell, row by row, and "no keypoint" -> (8 h, 8 w) float32."""
     shifted = np.exp(logits - logits.max(0))
     pixels = (shifted / shifted.sum(0))[:-1]
     h, w = pixels.shape[1:]
@@ -67,7 +72,7 @@ def probabilities(logits: np.ndarray) -> np.ndarray:
 
 
 def sample(cells: np.ndarray, xy_px: np.ndarray) -> np.ndarray:
-    """(C, h, w) of STRIDE pixels each, at pixels (N, 2) -> (N, C), bilinear, at the rim the outermost cell."""
+    """Bilinear sampling of (C, h, w) cells of STRIDE pixels at pixels (N, 2) -> (N, C); edge cells are repeated."""
     h, w = cells.shape[1:]
     x = np.clip((xy_px[:, 0] + 0.5) / STRIDE - 0.5, 0.0, w - 1.0)
     y = np.clip((xy_px[:, 1] + 0.5) / STRIDE - 0.5, 0.0, h - 1.0)

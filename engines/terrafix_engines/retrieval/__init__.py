@@ -1,1 +1,1 @@
-"""Descriptors of ground for place recognition."""
+"""Descriptors for place recognition."""

@@ -1,20 +1,20 @@
-"""Pooled oriented gradients: what a piece of ground a tenth of the height wide looks like, in eight numbers.
+"""Pooled oriented gradients: eight numbers per cell, for cells of about a tenth of the height above ground.
 
-The dense descriptor of `features/gradient.py`, computed on fine pixels, averaged over square cells: a histogram of
-oriented gradients (Dalal and Triggs, CVPR 2005) with cells that do not overlap. A cell keeps how much there is of each
-direction and forgets where in the cell: that survives a heading that is off by degrees, other shadows and a map that is
-off by metres. Gradients of the same ground made coarse first keep neither."""
+The dense descriptor of `features/gradient.py`, computed on fine pixels and averaged over square cells: a histogram of
+oriented gradients (Dalal and Triggs, CVPR 2005) with non-overlapping cells. A cell contains the strength of each
+orientation but not its position in the cell, which makes it robust to heading errors of degrees, changed shadows and
+map errors of metres. Gradients of a downscaled image are not robust to these."""
 
 import cv2
 import numpy as np
 
 from terrafix_engines.features.gradient import CHANNELS, GradientDescriber
 
-POOL = 4  # pixels of a cell's side
+POOL = 4  # side of a cell, pixels
 
 
 class PooledGradientDescriber:
-    name = "pooled-gradient-1"  # kept in map packages: another number when the same ground gives other descriptors
+    name = "pooled-gradient-1"  # stored in map packages: increment it when the descriptors of the same ground change
     channels = CHANNELS
     stride = POOL
 

@@ -1,3 +1,3 @@
-"""How weights of our own are made: from pictures of places at several dates to an ONNX file with its manifest.
+"""Training of the feature network: from images of places at several dates to an ONNX file with its manifest.
 
-Stays on the ground, and needs PyTorch (extra `train`); nothing else imports it. docs/training.md"""
+Runs on the ground and needs PyTorch (extra `train`); no other package imports it. docs/training.md"""

@@ -1,4 +1,4 @@
-"""What a user of the training can get wrong: one line, what, where, and what to do next."""
+"""User errors of the training: one line with the problem, its location and the remedy."""
 
 
 class TrainingError(Exception):

@@ -1,7 +1,7 @@
-"""The loop: draws views, changes their weather, teaches; keeps what it has, so that it can go on where it was stopped.
+"""Training loop: samples views, augments them, takes optimiser steps, saves checkpoints.
 
-Views and weather of a step follow from the seed and the step alone: what was stopped and goes on sees what it would
-have seen. On a CPU the result is the same bit for bit; a GPU adds gradients in any order."""
+The views and augmentations of a step depend on the seed and the step number only, so a resumed run continues with the
+same data. On a CPU the result is bit-identical; a GPU sums gradients in varying order."""
 
 import math
 import time
@@ -14,21 +14,21 @@ import numpy as np
 import torch
 
 from terrafix_engines.train.errors import TrainingError
-from terrafix_engines.train.losses import WEIGHTS, Teacher
-from terrafix_engines.train.measure import Measured, measure
-from terrafix_engines.train.network import Describing
-from terrafix_engines.train.views import Sheet, Views, draw
-from terrafix_engines.train.weather import changed
+from terrafix_engines.train.losses import WEIGHTS, TrainingLoss
+from terrafix_engines.train.measure import Evaluation, evaluate
+from terrafix_engines.train.network import FeatureNetwork
+from terrafix_engines.train.views import ImageStack, Views, sample_views
+from terrafix_engines.train.weather import augment
 
-RATE, WARM_UP_SHARE, DECAY, MOST_GRADIENT = 1e-3, 0.05, 1e-2, 1.0
-KEPT_EVERY_S, SAID_EVERY_S = 60.0, 10.0
-MEASURED_EVERY = 20  # times that something is said
-SMOOTH = 0.95  # of the losses that are said
+LEARNING_RATE, WARM_UP_SHARE, WEIGHT_DECAY, MAX_GRADIENT_NORM = 1e-3, 0.05, 1e-2, 1.0
+CHECKPOINT_EVERY_S, REPORT_EVERY_S = 60.0, 10.0
+EVALUATION_EVERY = 20  # progress reports per evaluation
+LOSS_SMOOTHING = 0.95  # exponential smoothing of the reported losses
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that decides what comes out, besides the pictures. ``steps``: after them the learning rate is zero."""
+    """Everything except the images that determines the result. ``steps``: the learning rate is zero after these."""
 
     steps: int
     batch: int
@@ -39,59 +39,61 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Said:
+class Progress:
     step: int
     losses: dict[str, float]
     steps_per_s: float
-    measured: Measured | None
+    evaluation: Evaluation | None
 
 
 class Training:
     def __init__(
-        self, recipe: Recipe, trained: list[Sheet], held_out: list[Sheet], checkpoint: Path, device: str
+        self, recipe: Recipe, trained: list[ImageStack], held_out: list[ImageStack], checkpoint: Path, device: str
     ) -> None:
-        """Goes on from ``checkpoint`` where there is one. Raises TrainingError."""
+        """Resumes from ``checkpoint`` if it exists. Raises TrainingError."""
         torch.manual_seed(recipe.seed)
         self.recipe, self.device, self.step = recipe, device, 0
         self._trained, self._held_out, self._checkpoint = trained, held_out, checkpoint
-        self.network, self._teacher = Describing(recipe.width).to(device), Teacher().to(device)
-        self._all = [*self.network.parameters(), *self._teacher.parameters()]
-        self._optimiser = torch.optim.AdamW(self._all, lr=RATE, weight_decay=DECAY)
+        self.network, self._criterion = FeatureNetwork(recipe.width).to(device), TrainingLoss().to(device)
+        self._all = [*self.network.parameters(), *self._criterion.parameters()]
+        self._optimiser = torch.optim.AdamW(self._all, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         if checkpoint.exists():
             self._load()
 
-    def run(self, seconds: float) -> Iterator[Said]:
-        """Until ``seconds`` are over, or all steps done. What is yielded is for people."""
-        began_s = said_s = kept_s = time.monotonic()
-        smooth: dict[str, float] = {}
-        said, said_step, begun_step = 0, self.step, self.step
+    def run(self, seconds: float) -> Iterator[Progress]:
+        """Trains for ``seconds`` or until all steps are done; yields progress reports."""
+        start_s = report_s = checkpoint_s = time.monotonic()
+        smoothed: dict[str, float] = {}
+        reports, report_step, start_step = 0, self.step, self.step
         self.network.train()
-        while self.step < self.recipe.steps and time.monotonic() - began_s < seconds:
-            for name, value in self._teach().items():
-                smooth[name] = SMOOTH * smooth.get(name, value) + (1 - SMOOTH) * value
+        while self.step < self.recipe.steps and time.monotonic() - start_s < seconds:
+            for name, value in self._train_step().items():
+                smoothed[name] = LOSS_SMOOTHING * smoothed.get(name, value) + (1 - LOSS_SMOOTHING) * value
             now_s = time.monotonic()
-            if now_s - said_s >= SAID_EVERY_S or self.step == begun_step + 1:
-                pace = (self.step - said_step) / max(now_s - said_s, 1e-6)
-                yield Said(self.step, dict(smooth), pace, self.measure() if said % MEASURED_EVERY == 0 else None)
-                said, said_step, said_s = said + 1, self.step, time.monotonic()
-            if now_s - kept_s >= KEPT_EVERY_S:
-                self.keep()
-                kept_s = now_s
-        self.keep()
-        yield Said(self.step, smooth, 0.0, self.measure(batches=8))
+            if now_s - report_s >= REPORT_EVERY_S or self.step == start_step + 1:
+                pace = (self.step - report_step) / max(now_s - report_s, 1e-6)
+                yield Progress(
+                    self.step, dict(smoothed), pace, self.evaluate() if reports % EVALUATION_EVERY == 0 else None
+                )
+                reports, report_step, report_s = reports + 1, self.step, time.monotonic()
+            if now_s - checkpoint_s >= CHECKPOINT_EVERY_S:
+                self.save_checkpoint()
+                checkpoint_s = now_s
+        self.save_checkpoint()
+        yield Progress(self.step, smoothed, 0.0, self.evaluate(batches=8))
 
-    def measure(self, batches: int = 2) -> Measured:
-        return measure(self.network, self._held_out, batches, self.recipe.batch)
+    def evaluate(self, batches: int = 2) -> Evaluation:
+        return evaluate(self.network, self._held_out, batches, self.recipe.batch)
 
-    def keep(self) -> None:
-        """Whole or not at all: a checkpoint that was cut off would be the end of the run."""
+    def save_checkpoint(self) -> None:
+        """Writes the checkpoint atomically, because a truncated one could not be resumed."""
         part = self._checkpoint.with_suffix(".part")
         torch.save(
             {
                 "recipe": asdict(self.recipe),
                 "step": self.step,
                 "network": self.network.state_dict(),
-                "teacher": self._teacher.state_dict(),
+                "teacher": self._criterion.state_dict(),
                 "optimiser": self._optimiser.state_dict(),
             },
             part,
@@ -99,26 +101,28 @@ class Training:
         part.replace(self._checkpoint)
 
     def _load(self) -> None:
-        kept: dict[str, Any] = torch.load(self._checkpoint, map_location=self.device, weights_only=True)
-        if kept.get("recipe") != asdict(self.recipe):
-            raise TrainingError(f"{self._checkpoint}: of another recipe; choose another --out, or the options it had")
-        self.network.load_state_dict(kept["network"])
-        self._teacher.load_state_dict(kept["teacher"])
-        self._optimiser.load_state_dict(kept["optimiser"])
-        self.step = kept["step"]
+        saved: dict[str, Any] = torch.load(self._checkpoint, map_location=self.device, weights_only=True)
+        if saved.get("recipe") != asdict(self.recipe):
+            raise TrainingError(
+                f"{self._checkpoint}: was made with other options; choose another --out, or use the same options"
+            )
+        self.network.load_state_dict(saved["network"])
+        self._criterion.load_state_dict(saved["teacher"])
+        self._optimiser.load_state_dict(saved["optimiser"])
+        self.step = saved["step"]
 
-    def _teach(self) -> dict[str, float]:
+    def _train_step(self) -> dict[str, float]:
         rng = np.random.default_rng((self.recipe.seed, self.step))
         g = torch.Generator(self.device).manual_seed(self.recipe.seed * 1_000_003 + self.step)
         for group in self._optimiser.param_groups:
-            group["lr"] = RATE * rate_at(self.step, self.recipe.steps)
+            group["lr"] = LEARNING_RATE * learning_rate_factor(self.step, self.recipe.steps)
         with torch.no_grad():
-            views = in_other_weather(draw(self._trained, self.recipe.batch, rng), g)
-        losses = self._teacher.losses(self.network, views, g)
+            views = augment_views(sample_views(self._trained, self.recipe.batch, rng), g)
+        losses = self._criterion.losses(self.network, views, g)
         total = torch.stack([WEIGHTS[name] * loss for name, loss in losses.items()]).sum()
         self._optimiser.zero_grad()
         total.backward()
-        torch.nn.utils.clip_grad_norm_(self._all, MOST_GRADIENT)
+        torch.nn.utils.clip_grad_norm_(self._all, MAX_GRADIENT_NORM)
         self._optimiser.step()
         self.step += 1
         values = torch.stack([loss.detach() for loss in losses.values()]).tolist()
@@ -127,12 +131,12 @@ class Training:
         return dict(zip(losses, values, strict=True))
 
 
-def in_other_weather(views: Views, g: torch.Generator) -> Views:
-    """Each view for itself."""
-    return replace(views, camera=changed(views.camera, g), ground=changed(views.ground, g))
+def augment_views(views: Views, g: torch.Generator) -> Views:
+    """Augments both views independently."""
+    return replace(views, camera=augment(views.camera, g), ground=augment(views.ground, g))
 
 
-def rate_at(step: int, steps: int) -> float:
-    """Rises over WARM_UP_SHARE of the steps, then falls to zero as a cosine."""
+def learning_rate_factor(step: int, steps: int) -> float:
+    """Learning rate schedule: linear warm-up over WARM_UP_SHARE of the steps, then a cosine to zero; factor 0 to 1."""
     rise = min((step + 1) / (WARM_UP_SHARE * steps), 1.0)
     return rise * 0.5 * (1.0 + math.cos(math.pi * min(step / steps, 1.0)))

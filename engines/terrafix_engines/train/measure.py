@@ -1,6 +1,5 @@
-"""How well the network finds places that it was never trained on: the camera at one date, the map at another, and only
-what a flight leaves open of heading, height and tilt made up. The yardstick of training; the anchor itself is asked by
-`terrafix_tools.bench.two_dates --model`."""
+"""Evaluation on held-out places: camera image and map of different dates, with the pose errors of a flight (heading,
+height, tilt) only. It tracks the training; `terrafix_tools.bench.two_dates --model` evaluates the whole matcher."""
 
 from dataclasses import dataclass
 
@@ -8,16 +7,16 @@ import numpy as np
 import torch
 
 from terrafix_engines.train.losses import PLACES, places
-from terrafix_engines.train.network import Describing
-from terrafix_engines.train.views import MEASURED, REACH_CELLS, Sheet, draw
+from terrafix_engines.train.network import FeatureNetwork
+from terrafix_engines.train.views import EVALUATION_RANGES, REACH_CELLS, ImageStack, sample_views
 
-SEED = 5  # the same views every time
+SEED = 5  # the same views in every evaluation
 
 
 @dataclass(frozen=True)
-class Measured:
-    """Shares, of ``views``: the best of PLACES^2 places is the right one or beside it; the nearest tile of the batch is
-    the right one."""
+class Evaluation:
+    """Fractions of ``views``. ``found``: the best of PLACES^2 offsets is the true one or adjacent to it; ``tiles``: the
+    nearest tile descriptor of the batch is the true one."""
 
     views: int
     found: float
@@ -28,12 +27,12 @@ class Measured:
 
 
 @torch.no_grad()
-def measure(network: Describing, held_out: list[Sheet], batches: int, batch: int) -> Measured:
+def evaluate(network: FeatureNetwork, held_out: list[ImageStack], batches: int, batch: int) -> Evaluation:
     network.eval()
     rng = np.random.default_rng(SEED)
     found, tiles = 0, 0
     for _ in range(batches):
-        views = draw(held_out, batch, rng, MEASURED)
+        views = sample_views(held_out, batch, rng, EVALUATION_RANGES)
         camera, _, _, camera_tile = network(views.camera)
         ground, _, _, ground_tile = network(views.ground)
         best = places(camera, ground, views).flatten(1).argmax(1)
@@ -42,4 +41,4 @@ def measure(network: Describing, held_out: list[Sheet], batches: int, batch: int
         right = torch.arange(batch, device=best.device)
         tiles += int(((camera_tile @ ground_tile.T).argmax(1) == right).sum())
     network.train()
-    return Measured(batches * batch, found / (batches * batch), tiles / (batches * batch))
+    return Evaluation(batches * batch, found / (batches * batch), tiles / (batches * batch))

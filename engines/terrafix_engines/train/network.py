@@ -1,7 +1,7 @@
-"""The network: a picture becomes descriptors of its cells, keypoints, how far to trust each cell, and one descriptor of
-all of it. Its first three outputs are those of XFeat (Potje et al., CVPR 2024), so that it goes where XFeat goes.
+"""The network: image -> cell descriptors, keypoints, reliability per cell, and one descriptor of the whole image.
 
-Small on purpose: 0.3 million numbers, 1.5 GMAC for 640 x 640. It shares two cores with all that flies."""
+The first three outputs are those of XFeat (Potje et al., CVPR 2024), so that it can replace XFeat. The network is small
+(0.3 million parameters, 1.5 GMAC for 640 x 640) because it shares two cores with the whole system."""
 
 import torch
 import torch.nn.functional as F
@@ -9,12 +9,14 @@ from torch import Tensor, nn
 
 CHANNELS, TILE_CHANNELS = 64, 128
 STRIDE = 8
-LEVEL_CELLS = 5  # brightness and contrast are those of so many cells around: a tile of the map alone must tell the same
-LEAST_CONTRAST = 0.02  # noise of a sensor is not amplified
+NORMALISATION_CELLS = (
+    5  # window of the local normalisation in cells; small, so that a single map tile gives the same result
+)
+MIN_CONTRAST = 0.02  # floor, so that sensor noise is not amplified
 
 
-class Describing(nn.Module):
-    """``width``: channels at an eighth of the picture."""
+class FeatureNetwork(nn.Module):
+    """``width``: channels at an eighth of the image resolution."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -33,10 +35,10 @@ class Describing(nn.Module):
         self.tile_power = nn.Parameter(torch.tensor(3.0))
         self.tile_white = nn.Linear(TILE_CHANNELS, TILE_CHANNELS)
 
-    def forward(self, picture: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(B, 3, H, W), RGB, 0 to 1, sides multiples of 16 -> descriptors (B, 64, H/8, W/8) of norm 1, keypoint logits
         (B, 65, H/8, W/8), reliability (B, 1, H/8, W/8) in 0 to 1, tile descriptor (B, 128) of norm 1."""
-        level = levelled(picture)
+        level = normalise_contrast(image)
         fine = self.fine(level)
         wide = F.interpolate(self.wide(fine), scale_factor=2.0, mode="bilinear", align_corners=False)
         features = self.near(fine) + wide
@@ -45,26 +47,31 @@ class Describing(nn.Module):
         return descriptors, logits, torch.sigmoid(self.reliability(features)), self._tile(features)
 
     def _tile(self, features: Tensor) -> Tensor:
-        """Generalised mean over all cells, then whitened, since means of positive numbers are all much alike (Radenovic
-        et al., Fine-tuning CNN image retrieval, TPAMI 2018)."""
+        """Generalised mean (GeM) over all cells, then whitening, because means of positive values are highly correlated
+        (Radenovic et al., Fine-tuning CNN image retrieval, TPAMI 2018)."""
         power = self.tile_power.clamp(1.0, 8.0)
         positive = F.softplus(self.tile(features)) + 1e-3
         return F.normalize(self.tile_white((positive**power).mean((2, 3)) ** (1.0 / power)), dim=1, eps=1e-4)
 
 
-def levelled(picture: Tensor) -> Tensor:
-    """Local brightness taken away, local contrast made one. By neighbourhoods and not by the whole picture: descriptors
-    of a frame and of a tile of the map, of another size, must be the same where they show the same."""
-    coarse = F.avg_pool2d(picture, STRIDE)
-    squares = F.avg_pool2d(picture**2, STRIDE)
-    around = {"kernel_size": LEVEL_CELLS, "stride": 1, "padding": LEVEL_CELLS // 2, "count_include_pad": False}
+def normalise_contrast(image: Tensor) -> Tensor:
+    """Local brightness and contrast normalisation. It is local, not over the whole image, so that a frame and a map
+    tile of another size have the same descriptors where they show the same ground."""
+    coarse = F.avg_pool2d(image, STRIDE)
+    squares = F.avg_pool2d(image**2, STRIDE)
+    around = {
+        "kernel_size": NORMALISATION_CELLS,
+        "stride": 1,
+        "padding": NORMALISATION_CELLS // 2,
+        "count_include_pad": False,
+    }
     mean = F.avg_pool2d(coarse, **around)
     variance = (F.avg_pool2d(squares, **around) - mean**2).mean(1, keepdim=True)
-    contrast = torch.sqrt(variance.clamp(min=0.0) + LEAST_CONTRAST**2)
+    contrast = torch.sqrt(variance.clamp(min=0.0) + MIN_CONTRAST**2)
     mean, contrast = (
         F.interpolate(one, scale_factor=float(STRIDE), mode="bilinear", align_corners=False) for one in (mean, contrast)
     )
-    return (picture - mean) / contrast
+    return (image - mean) / contrast
 
 
 def _step(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Sequential:

@@ -1,4 +1,4 @@
-"""What scenarios do to a flight: exactly what they say, and nothing else."""
+"""Edits of a flight by scenarios: their effect, and the absence of side effects."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -14,13 +14,13 @@ from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, Frame, Health, MapMatch, Message, Origin, Prediction, VehicleState, Verdict
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept import faults
-from terrafix_tools.accept.fault_nodes import FrameNames, HotComputer, WrongFixes
-from terrafix_tools.accept.flight import Flight, Stop, read_any_truth
-from terrafix_tools.accept.judged import Span
+from terrafix_tools.accept.faults import faults
+from terrafix_tools.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_tools.accept.faults.stale_map import stale_along
+from terrafix_tools.accept.flight import Flight, FrameRef, read_any_truth
+from terrafix_tools.accept.measuring.judged import Span
 from terrafix_tools.accept.plan import Plan
 from terrafix_tools.accept.scenarios import BY_NAME
-from terrafix_tools.accept.stale_map import stale_along
 from terrafix_tools.evaluate import Truth
 
 CAMERA = Camera(width=8, height=4, fx=8.0, fy=8.0, cx=3.5, cy=1.5)
@@ -61,7 +61,7 @@ class Counting:
 
 
 def altered(edit: faults.Edit, **more: object) -> list[Shot]:
-    source = faults.AlteredSource(Counting(), edit, origin=faults.same_origin, **more)  # type: ignore[arg-type]
+    source = faults.AlteredSource(Counting(), edit, origin=faults.unchanged_origin, **more)  # type: ignore[arg-type]
     return list(source.shots())
 
 
@@ -74,14 +74,14 @@ def grey(shot: Shot) -> int:
     return int(shot.image[0, 0, 0])
 
 
-def test_only_so_many_frames_and_numbers_from_zero() -> None:
-    shots = altered(faults.without(frozenset({"1.jpg", "2.jpg"})), frames=6)
+def test_an_altered_source_limits_and_renumbers_frames() -> None:
+    shots = altered(faults.without_frames(frozenset({"1.jpg", "2.jpg"})), frames=6)
     assert files(shots) == ["0.jpg", "3.jpg", "4.jpg", "5.jpg"]
     assert [s.frame.frame_id for s in shots] == [0, 1, 2, 3]
-    assert [len(s.states) for s in shots] == [1, 3, 1, 1]  # the autopilot went on reporting
+    assert [len(s.states) for s in shots] == [1, 3, 1, 1]  # telemetry continues
 
 
-def test_a_foreign_frame_comes_between_two_others() -> None:
+def test_a_foreign_frame_is_inserted_between_two_others() -> None:
     stranger = np.full((4, 8, 3), 99, np.uint8)
     shots = altered(faults.foreign_frames({"5.jpg": stranger}))
     assert len(shots) == FRAMES + 1
@@ -91,13 +91,13 @@ def test_a_foreign_frame_comes_between_two_others() -> None:
     assert foreign.image is stranger and foreign.states == ()
 
 
-def test_dark_and_frozen_pictures() -> None:
+def test_black_and_frozen_pictures() -> None:
     span = Span(3.0, 5.0, "")
-    assert [grey(s) for s in altered(faults.dark(span))] == [1, 2, 3, 0, 0, 0, *range(7, 13)]
+    assert [grey(s) for s in altered(faults.black(span))] == [1, 2, 3, 0, 0, 0, *range(7, 13)]
     assert [grey(s) for s in altered(faults.frozen(span))] == [1, 2, 3, 3, 3, 3, *range(7, 13)]
 
 
-def test_telemetry_that_is_not_so() -> None:
+def test_edits_of_telemetry() -> None:
     assert altered(faults.height_times(1.1))[5].states[0].agl_m == pytest.approx(115.5)
     turned = altered(faults.yaw_plus(15.0))[0].states[0].yaw_rad
     assert turned is not None and np.degrees(turned) == pytest.approx(np.degrees(3.0) + 15.0 - 360.0)
@@ -105,18 +105,18 @@ def test_telemetry_that_is_not_so() -> None:
     assert unknown.yaw_rad is None and unknown.agl_m == 100.0
 
 
-def test_the_start_moves_and_claims_what_it_did() -> None:
+def test_a_moved_start_keeps_its_stated_sigma() -> None:
     moved = faults.start_moved(700.0, -300.0)(ORIGIN)
     east_m, north_m = LocalFrame(48.0, 11.0).to_local(moved.lat_deg, moved.lon_deg)
     assert (east_m, north_m) == pytest.approx((700.0, -300.0), abs=0.01)
     assert moved.start_sigma_m == ORIGIN.start_sigma_m
 
 
-def test_there_and_back() -> None:
+def test_a_long_route_is_the_flight_forwards_and_backwards() -> None:
     states = [shot.states[0] for shot in Counting().shots()]
-    source = faults.ThereAndBack(Counting(), [Stop(f"{i}.jpg", float(i), s) for i, s in enumerate(states)], 30)
+    source = faults.ThereAndBack(Counting(), [FrameRef(f"{i}.jpg", float(i), s) for i, s in enumerate(states)], 30)
     shots = list(source.shots())
-    assert [grey(s) for s in shots[9:14]] == [10, 11, 12, 11, 10]  # turns at the last frame
+    assert [grey(s) for s in shots[9:14]] == [10, 11, 12, 11, 10]  # reverses at the last frame
     times = [s.frame.t_ns for s in shots]
     assert len(shots) == 30 and times == [i * 10**9 for i in range(30)]
     assert len(set(files(shots))) == 30 and faults.original(files(shots)[11:13]) == ["11.jpg", "10.jpg"]
@@ -125,7 +125,7 @@ def test_there_and_back() -> None:
 
 
 class Saying:
-    """A node that answers every message with the same words, and remembers what it heard."""
+    """A node that publishes the same messages for every input, and stores its inputs."""
 
     def __init__(self, *answers: Message) -> None:
         self.answers, self.heard = answers, list[Message]()
@@ -138,22 +138,22 @@ class Saying:
         return iter(())
 
 
-def test_a_wrong_fix_is_350_m_off_and_sure() -> None:
-    said = MapMatch(t_ns=0, frame_id=1, verdict=Verdict.AMBIGUOUS, matcher="gradient")
-    anchor = WrongFixes(Saying(said), frozenset({"1.jpg"}), seed=0)
+def test_a_wrong_fix_is_350_m_away_with_a_small_covariance() -> None:
+    published = MapMatch(t_ns=0, frame_id=1, verdict=Verdict.AMBIGUOUS, matcher="gradient")
+    anchor = WrongFixes(Saying(published), frozenset({"1.jpg"}), seed=0)
     names = FrameNames(Saying(), anchor)
     prediction = Prediction(
         t_ns=0, frame_id=1, p_c_in_w_m=(10.0, 20.0, 100.0), q_w_c=(1.0, 0.0, 0.0, 0.0), cov=(0.0,) * 36, agl_m=100.0,
         agl_sigma_m=1.0, step_m=(0.0, 0.0), step_cov_m2=(0.0,) * 4)  # fmt: skip
     names.on(Frame(t_ns=0, frame_id=0, file="0.jpg", width=8, height=4))
-    assert list(anchor.on(prediction)) == [said]
+    assert list(anchor.on(prediction)) == [published]
     names.on(Frame(t_ns=0, frame_id=1, file="1.jpg", width=8, height=4))
     (wrong,) = anchor.on(prediction)
     assert isinstance(wrong, MapMatch) and wrong.verdict is Verdict.ACCEPTED and wrong.p_c_in_w_m is not None
     assert np.hypot(wrong.p_c_in_w_m[0] - 10.0, wrong.p_c_in_w_m[1] - 20.0) == pytest.approx(350.0)
 
 
-def test_the_computer_is_hot_for_a_while() -> None:
+def test_throttling_is_reported_within_its_span() -> None:
     inner = Saying()
     node = HotComputer(inner, Span(1.0, 2.0, ""))
     for i in range(4):
@@ -167,11 +167,11 @@ def straight(frames: int = 40, step_m: float = 20.0, map_path: Path | None = Non
     half = frames // 2
     at = [(0.0, i * step_m) if i <= half else ((i - half) * step_m, half * step_m) for i in range(frames)]
     truth = {f"{i}.jpg": Truth(*place.to_wgs84(*p)) for i, p in enumerate(at)}
-    stops = [Stop(f"{i}.jpg", i * 0.5, None) for i in range(frames)]
-    return Flight("flight", map_path, None, truth, stops, footprint_m=100.0)
+    frame_refs = [FrameRef(f"{i}.jpg", i * 0.5, None) for i in range(frames)]
+    return Flight("flight", map_path, None, truth, frame_refs, footprint_m=100.0)
 
 
-def test_the_gap_is_where_the_track_turns_and_shares_no_ground() -> None:
+def test_the_gap_is_at_the_turn_of_the_track_and_leaves_no_overlap() -> None:
     flight = straight()
     plan = BY_NAME["sharp turn"].plan(flight)
     assert isinstance(plan, Plan)
@@ -183,15 +183,15 @@ def test_the_gap_is_where_the_track_turns_and_shares_no_ground() -> None:
     assert np.hypot(*(track[after] - track[before])) >= 100.0
 
 
-def test_a_far_frame_is_350_m_from_where_it_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_far_frame_is_inserted_350_m_from_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = straight()
     monkeypatch.setattr(Flight, "picture", lambda _, number: np.full((4, 8, 3), number, np.uint8))
     plan = BY_NAME["350 m frame"].plan(flight)
     assert isinstance(plan, Plan) and len(plan.marks.wrong_files) == 3
     track = flight.track_m()
-    own = (Frame(t_ns=i, frame_id=i, file=stop.file, width=8, height=4) for i, stop in enumerate(flight.stops))
+    own = (Frame(t_ns=i, frame_id=i, file=stop.file, width=8, height=4) for i, stop in enumerate(flight.frame_refs))
     shots = list(plan.edit(Shot(frame, (), None) for frame in own))
-    assert len(shots) == len(flight.stops) + 3
+    assert len(shots) == len(flight.frame_refs) + 3
     for before, shot in pairwise(shots):
         if before.frame.file in plan.marks.wrong_files:
             away = np.hypot(*(track - track[shot.frame.frame_id]).T)
@@ -199,7 +199,7 @@ def test_a_far_frame_is_350_m_from_where_it_comes_again(monkeypatch: pytest.Monk
     assert "350 m apart" in str(BY_NAME["350 m frame"].plan(straight(frames=10)))
 
 
-def test_a_flight_that_is_too_short_is_said_to_be() -> None:
+def test_a_flight_that_is_too_short_gives_a_reason() -> None:
     short = straight(frames=10, step_m=2.0)
     assert BY_NAME["three fragments"].plan(short) == "no part of the flight is long enough to leave ground out"
     blackout = BY_NAME["60 s blackout"].plan(short)
@@ -207,19 +207,21 @@ def test_a_flight_that_is_too_short_is_said_to_be() -> None:
     assert "GeoTIFF" in str(BY_NAME["20 % unmatchable"].plan(straight(map_path=Path("map.gpkg"))))
 
 
-def test_the_unmatchable_fifth_is_where_the_flight_does_not_come_again() -> None:
-    """Two thirds of it go round and round over one place; a map that is stale there would be so for all of them."""
+def test_the_unmatchable_fifth_is_not_visible_in_other_frames() -> None:
+    """Two thirds of it circle over one place; a map that is stale there would be stale for all of them."""
     place, frames = LocalFrame(48.0, 11.0), 60
     turns = [(50.0 * np.sin(i), 50.0 * np.cos(i)) for i in range(40)]
     at = [*turns, *((100.0 * (i + 1), 0.0) for i in range(20))]
     truth = {f"{i}.jpg": Truth(*place.to_wgs84(*p)) for i, p in enumerate(at)}
-    stops = [Stop(f"{i}.jpg", i * 0.5, None) for i in range(frames)]
-    plan = BY_NAME["20 % unmatchable"].plan(Flight("flight", Path("map.tif"), None, truth, stops, footprint_m=100.0))
+    frame_refs = [FrameRef(f"{i}.jpg", i * 0.5, None) for i in range(frames)]
+    plan = BY_NAME["20 % unmatchable"].plan(
+        Flight("flight", Path("map.tif"), None, truth, frame_refs, footprint_m=100.0)
+    )
     assert isinstance(plan, Plan)
     assert plan.marks.spans[0].from_s >= 0.5 * 40 and plan.marks.spans[0].to_s < 0.5 * 58
 
 
-def test_a_stale_map_differs_along_the_stretch_only(tmp_path: Path) -> None:
+def test_a_stale_map_differs_only_along_its_part_of_the_route(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (3, 400, 600), dtype=np.uint8)
     profile = {"driver": "GTiff", "width": 600, "height": 400, "count": 3, "dtype": "uint8", "crs": "EPSG:32632"}
@@ -238,7 +240,7 @@ def test_a_stale_map_differs_along_the_stretch_only(tmp_path: Path) -> None:
     assert (stale[:, 100, 120] == image[:, 299, 479]).all()  # the point opposite
 
 
-def test_coordinates_csv_is_a_truth(tmp_path: Path) -> None:
+def test_coordinates_csv_is_read_as_truth(tmp_path: Path) -> None:
     path = tmp_path / "coordinates.csv"
     path.write_text("image, lat, lon\nAD000001.jpg, 48.275292, 37.385220\nAD000002, 48.275001, 37.382922\n")
     found = read_any_truth(path, ["AD000001.jpg", "AD000002.jpg", "AD000003.jpg"])

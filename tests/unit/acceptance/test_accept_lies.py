@@ -1,4 +1,4 @@
-"""Scenarios in which an input lies: each edit does what it says, and nothing before or after its time."""
+"""Scenarios with false inputs: the effect of each edit within its span, and none outside."""
 
 import math
 from collections.abc import Iterator
@@ -17,11 +17,12 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import start_is_unknown
 from terrafix.messages import Camera, Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept import faults, lying_maps
-from terrafix_tools.accept import lying_inputs as lying
-from terrafix_tools.accept.flight import Flight, Stop
-from terrafix_tools.accept.judged import Span
-from terrafix_tools.accept.lies import LIES
+from terrafix_tools.accept.faults import faults
+from terrafix_tools.accept.flight import Flight, FrameRef
+from terrafix_tools.accept.lies import inputs as lying
+from terrafix_tools.accept.lies import maps as lying_maps
+from terrafix_tools.accept.lies.lies import LIES
+from terrafix_tools.accept.measuring.judged import Span
 from terrafix_tools.accept.plan import CLOSED_LOOP, Plan
 from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
 from terrafix_tools.evaluate import Truth
@@ -38,8 +39,8 @@ def flight(frames: int = FRAMES, map_path: Path | None = Path("map.tif")) -> Fli
     """Straight north at 24 m/s."""
     place = LocalFrame(48.0, 11.0)
     truth = {f"{i}.jpg": Truth(*place.to_wgs84(0.0, i * STEP_M)) for i in range(frames)}
-    stops = [Stop(f"{i}.jpg", i * STEP_S, None) for i in range(frames)]
-    return Flight("flight", map_path, None, truth, stops, footprint_m=100.0)
+    frame_refs = [FrameRef(f"{i}.jpg", i * STEP_S, None) for i in range(frames)]
+    return Flight("flight", map_path, None, truth, frame_refs, footprint_m=100.0)
 
 
 def shots(frames: int = FRAMES) -> Iterator[Shot]:
@@ -58,7 +59,7 @@ def flown(edit: faults.Edit, frames: int = FRAMES) -> list[Shot]:
 
 
 def greys(found: list[Shot]) -> list[int]:
-    """What each picture shows on its left."""
+    """Grey value on the left of each picture."""
     return [round(float(np.mean(s.image[:, :4]))) for s in found if s.image is not None]
 
 
@@ -87,7 +88,7 @@ def numbered(monkeypatch: pytest.MonkeyPatch) -> None:
         ("every second frame foreign", list(range(40, 70, 2))),
     ],
 )
-def test_foreign_frames_are_consecutive_pictures_of_half_a_flight_away_mirrored(name: str, numbers: list[int]) -> None:
+def test_foreign_frames_are_consecutive_mirrored_pictures_of_half_a_flight_later(name: str, numbers: list[int]) -> None:
     plan = planned(name)
     changed = [i for i, grey in enumerate(greys(flown(plan.edit))) if grey != i + 1]
     assert changed == numbers
@@ -100,13 +101,13 @@ def test_foreign_frames_are_consecutive_pictures_of_half_a_flight_away_mirrored(
 
 
 @pytest.mark.usefixtures("numbered")
-def test_a_fast_foreign_camera_passes_three_pictures_a_frame() -> None:
+def test_a_fast_foreign_camera_advances_three_pictures_per_frame() -> None:
     shown = [s.image[0, -1, 0] for s in flown(planned("fast foreign frames").edit)[40:50] if s.image is not None]
     assert [int(b) - int(a) for a, b in pairwise(shown)] == [3] * 3 + [3 - FRAMES] + [3] * 5
 
 
 @pytest.mark.usefixtures("numbered")
-def test_foreign_frames_at_random_are_some_fifteen_per_cent_and_the_same_again() -> None:
+def test_random_foreign_frames_are_about_15_percent_and_reproducible() -> None:
     plan = planned("15 % foreign frames", flight(180))
     changed, again = ([i for i, grey in enumerate(greys(flown(plan.edit, 180))) if grey == 200] for _ in range(2))
     assert changed == again and min(changed) >= 18 and max(changed) <= 144
@@ -114,24 +115,24 @@ def test_foreign_frames_at_random_are_some_fifteen_per_cent_and_the_same_again()
 
 
 @pytest.mark.usefixtures("numbered")
-def test_frames_of_elsewhere_come_in_reverse_and_are_far_away() -> None:
+def test_frames_of_another_place_are_reversed_and_far_away() -> None:
     found = greys(flown(planned("elsewhere in reverse").edit))[40:50]
     assert [b - a for a, b in pairwise(found)] == [-1] * 9
     assert found[0] == FRAMES  # the last picture is the farthest
-    slow = {f"{i}.jpg": Truth(48.0 + i * 1e-5, 11.0) for i in range(FRAMES)}  # 111 m in all
+    slow = {f"{i}.jpg": Truth(48.0 + i * 1e-5, 11.0) for i in range(FRAMES)}  # 111 m in total
     assert "150 m apart" in str(BY_NAME["elsewhere in reverse"].plan(replace(flight(), truth=slow)))
 
 
 @pytest.mark.usefixtures("numbered")
-def test_the_part_that_comes_in_reverse_has_ten_frames_before_it() -> None:
-    """A flight that stands from frame 40 on: its first frame is the farthest, and nothing comes before that."""
+def test_the_reversed_part_has_ten_frames_before_it() -> None:
+    """A flight that stands still from frame 40 on: its first frame is the farthest, and has none before it."""
     place = LocalFrame(48.0, 11.0)
     truth = {f"{i}.jpg": Truth(*place.to_wgs84(0.0, min(i, 40) * STEP_M)) for i in range(FRAMES)}
     plan = planned("elsewhere in reverse", replace(flight(), truth=truth))
     assert greys(flown(plan.edit))[40:50] == [10, 9, 8, 7, 6, 5, 4, 3, 2, 1]
 
 
-def test_a_frozen_picture_has_new_noise_each_time() -> None:
+def test_a_frozen_picture_has_new_noise_in_each_frame() -> None:
     plan = planned("frozen picture with noise")
     found, lie = flown(plan.edit), lie_of(plan)
     assert (lie.from_s, lie.to_s) == (20.0, 35.0)
@@ -142,25 +143,25 @@ def test_a_frozen_picture_has_new_noise_each_time() -> None:
     assert noise == pytest.approx(lying.NOISE_GREY, rel=0.15)
 
 
-def test_stale_buffers_come_in_turn() -> None:
+def test_stale_buffers_are_repeated_in_turn() -> None:
     span = Span(4.0, 8.0, "")
     assert greys(flown(lying.stale_buffers(span, 4, noise_grey=0.0, seed=0)))[8:18] == [5, 6, 7, 8, 5, 6, 7, 8, 5, 18]
 
 
-def test_late_pictures_are_a_second_old_and_telemetry_is_not() -> None:
+def test_late_pictures_are_a_second_old_with_telemetry_in_time() -> None:
     found = flown(lying.late_pictures(1.0))
     assert greys(found)[:6] == [1, 1, 1, 2, 3, 4]
     assert all(s.frame.t_ns == s.states[0].t_ns == round(i * STEP_S * NS) for i, s in enumerate(found))
 
 
-def test_a_camera_that_falls_behind_plays_at_half_speed_and_is_live_again() -> None:
+def test_slow_pictures_play_at_half_speed_until_the_end_of_the_span() -> None:
     plan = planned("camera falls behind")
     found, lie = greys(flown(plan.edit)), lie_of(plan)
     assert (lie.from_s, lie.to_s) == (20.0, 35.0)
     assert found[40:47] == [41, 41, 42, 42, 43, 43, 44] and found[69:72] == [55, 56, 72]
 
 
-def test_half_of_the_picture_is_that_of_the_first_frame() -> None:
+def test_the_frozen_half_of_a_picture_is_that_of_the_first_frame() -> None:
     found = flown(planned("half the picture stands still").edit)
     for i, shot in enumerate(found[1:], start=1):
         assert shot.image is not None
@@ -168,12 +169,12 @@ def test_half_of_the_picture_is_that_of_the_first_frame() -> None:
     assert not np.array_equal(found[1].image[2:], found[2].image[2:])  # type: ignore[index]
 
 
-def test_late_telemetry_comes_later_with_a_time_of_its_own_and_none_is_lost() -> None:
+def test_late_telemetry_has_the_time_stamps_of_its_arrival_and_none_is_lost() -> None:
     found = flown(planned("telemetry 2 s late").edit)
     assert [len(s.states) for s in found[:6]] == [0, 0, 0, 0, 1, 1]
     for name in ("states", "imu"):
-        said = [m for s in found for m in getattr(s, name)]
-        assert [m.t_ns for m in said] == [round(i * STEP_S * NS) for i in range(4, FRAMES)]
+        messages = [m for s in found for m in getattr(s, name)]
+        assert [m.t_ns for m in messages] == [round(i * STEP_S * NS) for i in range(4, FRAMES)]
     true = list(shots())
     edited = lying.late_telemetry(2.0)(
         replace(s, states=(msgspec.structs.replace(s.states[0], agl_m=float(i)),)) for i, s in enumerate(true)
@@ -181,26 +182,26 @@ def test_late_telemetry_comes_later_with_a_time_of_its_own_and_none_is_lost() ->
     assert [s.states[0].agl_m for s in list(edited)[4:7]] == [0.0, 1.0, 2.0]
 
 
-def test_dropped_and_doubled_frames_lose_no_telemetry() -> None:
+def test_dropped_and_doubled_frames_keep_all_telemetry() -> None:
     found = flown(lying.dropped_and_doubled(0.15, 0.15, seed=3))
     assert [s.states[0].t_ns for s in found if s.states] == sorted(s.states[0].t_ns for s in found if s.states)
-    again = [s for s in found if lying.REPEATED in s.frame.file]
+    again = [s for s in found if lying.DOUBLED_SUFFIX in s.frame.file]
     gone = FRAMES - (len(found) - len(again))
     assert 6 <= len(again) <= 25 and 6 <= gone <= 25
     assert sum(len(s.states) for s in found) >= FRAMES - 2 and sum(len(s.imu) for s in found) >= FRAMES - 2
     times = [s.frame.t_ns for s in found]
     assert times == sorted(set(times))
-    assert all(a.image is b.image for a, b in pairwise(found) if lying.REPEATED in b.frame.file)
+    assert all(a.image is b.image for a, b in pairwise(found) if lying.DOUBLED_SUFFIX in b.frame.file)
 
 
-def test_photos_share_little_ground_and_carry_one_state_each() -> None:
+def test_photos_have_little_overlap_and_one_state_each() -> None:
     found = flown(planned("photos every 155 m").edit)
     assert [s.frame.frame_id for s in found] == list(range(0, FRAMES, 13))  # 156 m
     assert all(len(s.states) == 1 and not s.imu and s.states[0].t_ns == s.frame.t_ns for s in found)
     assert "only 3 photos" in str(BY_NAME["photos every 155 m"].plan(flight(30)))
 
 
-def test_a_photo_carries_height_and_heading_though_they_are_reported_apart() -> None:
+def test_the_state_of_a_photo_merges_separate_messages() -> None:
     def apart() -> Iterator[Shot]:
         for shot in shots():
             (state,) = shot.states
@@ -214,7 +215,7 @@ def test_a_photo_carries_height_and_heading_though_they_are_reported_apart() -> 
     assert all(s.states[0].yaw_rad == 3.0 and s.states[0].agl_m == s.frame.t_ns * 1e-9 for s in found)
 
 
-def test_a_gap_takes_frames_and_telemetry_out_and_everything_after_it_is_later() -> None:
+def test_a_gap_removes_frames_and_telemetry_and_delays_the_rest() -> None:
     plan = planned("gap of minutes")
     found = flown(plan.edit)
     times_s = [s.frame.t_ns / NS for s in found]
@@ -226,7 +227,7 @@ def test_a_gap_takes_frames_and_telemetry_out_and_everything_after_it_is_later()
     assert not span.has(times_s[40]) and span.has(times_s[40] - 1.0) and plan.marks.lie is None
 
 
-def test_telemetry_is_forged_for_its_time_only() -> None:
+def test_telemetry_is_forged_within_its_span_only() -> None:
     for name, field, change_rad in (("forged tilt", "roll_rad", 0.2618), ("forged heading", "yaw_rad", 1.5708)):
         plan = planned(name)
         lie = lie_of(plan)
@@ -237,7 +238,7 @@ def test_telemetry_is_forged_for_its_time_only() -> None:
             assert after.imu == before.imu
 
 
-def test_roll_and_pitch_swapped_and_of_wrong_sign() -> None:
+def test_edits_of_roll_and_pitch() -> None:
     swapped = flown(planned("roll and pitch swapped").edit)[5].states[0]
     assert (swapped.roll_rad, swapped.pitch_rad) == (0.1, -0.2)
     negated = flown(planned("roll and pitch negated").edit)[5].states[0]
@@ -248,13 +249,13 @@ def test_roll_and_pitch_swapped_and_of_wrong_sign() -> None:
     ("name", "factor"),
     [("height 30 % low", 0.7), ("height 30 % high", 1.3), ("height in feet", 3.28), ("height taken for feet", 0.305)],
 )
-def test_the_height_is_wrong_and_stated_as_good(name: str, factor: float) -> None:
+def test_a_wrong_height_keeps_its_stated_sigma(name: str, factor: float) -> None:
     plan = planned(name)
     assert flown(plan.edit)[3].states[0].agl_m == pytest.approx(100.0 * factor, rel=0.01)
     assert plan.origin(ORIGIN) == ORIGIN
 
 
-def test_the_camera_is_not_as_described() -> None:
+def test_edits_of_the_camera_calibration() -> None:
     half, twice = (planned(f"focal length {word}").origin(ORIGIN).camera for word in ("halved", "doubled"))
     assert (half.fx, half.fy, twice.fx, twice.fy) == (4.0, 4.0, 16.0, 16.0)
     assert half.focal_sigma == twice.focal_sigma == 0.01
@@ -264,9 +265,9 @@ def test_the_camera_is_not_as_described() -> None:
     assert mirrored is not None and mirrored[0, 0, 0] == 200 and mirrored[0, -1, 0] == 8
 
 
-def test_a_start_that_is_wrong_or_not_known() -> None:
+def test_a_wrong_or_unknown_start() -> None:
     off = planned("start 300 m off").origin(ORIGIN)
-    # Towards the middle of the flight, which goes north.
+    # Towards the centre of the flight, which goes north.
     assert LocalFrame(48.0, 11.0).to_local(off.lat_deg, off.lon_deg) == pytest.approx((212.0, 212.0), abs=0.5)
     lie = lie_of(planned("start 300 m off"))
     assert lie.from_s == lie.to_s == 0.0
@@ -277,7 +278,7 @@ def test_a_start_that_is_wrong_or_not_known() -> None:
     assert flown(planned("height unknown").edit)[0].states[0].agl_m is None
 
 
-def test_a_lie_that_does_not_fit_into_the_flight_is_said_to_be_too_long() -> None:
+def test_a_lie_longer_than_the_flight_gives_a_reason() -> None:
     assert str(BY_NAME["frozen picture with noise"].plan(flight(60))) == "the flight lasts only 30 s"
     assert str(BY_NAME["ten foreign frames"].plan(flight(20))) == "the flight has only 20 frames"
     assert "GeoTIFF" in str(BY_NAME["map shifted by 300 m"].plan(flight(map_path=Path("map.gpkg"))))
@@ -297,7 +298,7 @@ def write_map(
     return image
 
 
-def test_maps_that_lie(tmp_path: Path) -> None:
+def test_mirrored_shifted_and_scaled_maps(tmp_path: Path) -> None:
     given, out = tmp_path / "given.tif", tmp_path / "out.tif"
     image = write_map(given)
     with rasterio.open(given) as source:
@@ -324,7 +325,7 @@ def test_maps_that_lie(tmp_path: Path) -> None:
         ("map 10 % too large", 0.0, 0.0, 2.2),
     ],
 )
-def test_a_scenario_flies_with_the_map_that_it_names(
+def test_a_scenario_writes_the_map_of_its_plan(
     tmp_path: Path, name: str, east_m: float, north_m: float, pixel_m: float
 ) -> None:
     given, out = tmp_path / "given.tif", tmp_path / "out.tif"
@@ -340,7 +341,7 @@ def test_a_scenario_flies_with_the_map_that_it_names(
     assert (lie.from_s, lie.to_s) == (0.0, (FRAMES - 1) * STEP_S) and plan.origin(ORIGIN) == ORIGIN
 
 
-def test_without_the_map_of_another_town_the_own_one_is_mirrored(tmp_path: Path) -> None:
+def test_without_another_map_the_own_one_is_mirrored(tmp_path: Path) -> None:
     given, out = tmp_path / "given.tif", tmp_path / "out.tif"
     image = write_map(given)
     plan = planned("another town's map", flight(map_path=given))
@@ -350,7 +351,7 @@ def test_without_the_map_of_another_town_the_own_one_is_mirrored(tmp_path: Path)
     assert plan.origin(ORIGIN).start_sigma_m == 50.0
 
 
-def test_another_town_is_put_where_the_map_was_and_keeps_the_size_of_its_pixels(tmp_path: Path) -> None:
+def test_another_map_is_centred_on_the_own_one_and_keeps_its_pixel_size(tmp_path: Path) -> None:
     given, other, out = (tmp_path / name for name in ("given.tif", "other.tif", "out.tif"))
     write_map(given)
     image = write_map(other, (30, 50), crs="EPSG:3857", pixel_m=1.5)  # web Mercator: 1 m on the ground at 48 degrees
@@ -365,7 +366,7 @@ def test_another_town_is_put_where_the_map_was_and_keeps_the_size_of_its_pixels(
         assert placed.width == 30
 
 
-def test_every_lie_is_explained_and_judged() -> None:
+def test_every_lie_is_documented_and_has_criteria() -> None:
     page = (Path(__file__).resolve().parents[3] / "docs" / "acceptance.md").read_text(encoding="utf-8")
     names = [scenario.name for scenario in LIES]
     assert len(set(names)) == len(names) and not {s.name for s in SCENARIOS} & set(names)

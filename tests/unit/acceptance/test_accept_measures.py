@@ -1,24 +1,27 @@
-"""The numbers of the acceptance table, on a flight whose errors are known."""
+"""The numbers of the acceptance table, on a flight with known errors."""
 
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
-from accept_case import Said, evidence, file_of
+from accept_case import FrameCase, evidence, file_of
 from terrafix.core.pose import exp_so3
 from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
-from terrafix_tools.accept import measures as of
-from terrafix_tools.accept.criteria import CRITERIA, judge
-from terrafix_tools.accept.judged import Bounds, Marks, Span, Verdict, shown
+from terrafix_tools.accept.measuring import measures as of
+from terrafix_tools.accept.measuring.criteria import CRITERIA, judge
+from terrafix_tools.accept.measuring.judged import Bounds, Marks, Span, Verdict, with_unit
 from terrafix_tools.accept.table import nees_band
 
-GOOD = Said()
-LOST = Said(error_m=300.0, sigma_m=200.0, label=SourceLabel.DEAD_RECKONED, fixed=False, odometry=Answer.FEW_INLIERS)
-ODOMETRY = Said(error_m=8.0, label=SourceLabel.VISUAL_PROPAGATED, fixed=False)
+GOOD = FrameCase()
+LOST = FrameCase(
+    error_m=300.0, sigma_m=200.0, label=SourceLabel.DEAD_RECKONED, fixed=False, odometry=Answer.FEW_INLIERS
+)
+ODOMETRY = FrameCase(error_m=8.0, label=SourceLabel.VISUAL_PROPAGATED, fixed=False)
 
 
 def test_a_good_flight_holds_every_floor(tmp_path: Path) -> None:
@@ -41,19 +44,19 @@ def test_shares_are_of_all_frames(tmp_path: Path) -> None:
     found = evidence(tmp_path, [GOOD] * 6 + [replace(GOOD, error_m=30.0)] * 2 + [LOST] * 2)
     assert of.within_50m(found).value == pytest.approx(0.8)
     assert of.within_20m(found).value == pytest.approx(0.6)
-    assert of.not_localised(found).value == pytest.approx(0.2)  # dead reckoning alone is no localisation
+    assert of.not_localised(found).value == pytest.approx(0.2)  # dead reckoning only counts as not localised
     rows = judge("a", ("within 50 m", "not localised"), found)
     assert [row.verdict for row in rows] == [Verdict.PASS, Verdict.BELOW]
     assert rows[0].goal_met is False
 
 
-def test_wrong_and_sure_of_it_breaks_a_floor(tmp_path: Path) -> None:
+def test_a_false_fix_breaks_a_floor(tmp_path: Path) -> None:
     found = evidence(tmp_path, [GOOD] * 9 + [replace(GOOD, error_m=120.0)])
     row = judge("a", ("false fixes",), found)[0]
     assert row.measured == 1.0 and row.verdict is Verdict.BELOW
 
 
-def test_a_fix_that_should_have_been_refused(tmp_path: Path) -> None:
+def test_an_accepted_wrong_fix_breaks_the_floor(tmp_path: Path) -> None:
     marks = Marks(wrong_files=frozenset({file_of(3), file_of(7)}))
     frames = [GOOD] * 10
     frames[3] = replace(GOOD, fixed=False)
@@ -63,74 +66,74 @@ def test_a_fix_that_should_have_been_refused(tmp_path: Path) -> None:
     assert of.error_after_wrong(found).value == pytest.approx(77.0, abs=0.1)
 
 
-def test_every_fragment_counts(tmp_path: Path) -> None:
+def test_fragments_are_judged_separately(tmp_path: Path) -> None:
     marks = Marks(breaks_s=(2.0, 4.0))  # frames 0-3, 4-7, 8-11
     frames = [GOOD] * 4 + [replace(GOOD, fixed=False, error_m=90.0)] * 4 + [GOOD] * 3 + [LOST]
     found = evidence(tmp_path, frames, marks)
-    assert of.fragments_alive(found).value == pytest.approx(2 / 3)
+    assert of.fragments_localised(found).value == pytest.approx(2 / 3)
     assert of.worst_fragment(found).value == 0.0
 
 
-def test_how_long_it_pretends(tmp_path: Path) -> None:
+def test_the_delay_of_the_label_change_over_unmatchable_ground(tmp_path: Path) -> None:
     marks = Marks(spans=(Span(5.0, 9.0, "blind"),))
-    frames = [GOOD] * 13 + [ODOMETRY] * 6 + [GOOD] * 11  # says so from 6.5 s on
-    assert of.says_so_after(evidence(tmp_path / "a", frames, marks)).value == pytest.approx(1.5)
-    never = of.says_so_after(evidence(tmp_path / "b", [GOOD] * 30, marks))
-    assert never.value == pytest.approx(4.0) and never.why == "it never says so"
+    frames = [GOOD] * 13 + [ODOMETRY] * 6 + [GOOD] * 11  # the label changes at 6.5 s
+    assert of.label_change_s(evidence(tmp_path / "a", frames, marks)).value == pytest.approx(1.5)
+    never = of.label_change_s(evidence(tmp_path / "b", [GOOD] * 30, marks))
+    assert never.value == pytest.approx(4.0) and never.why == "the label never changes"
     at_once = evidence(tmp_path / "c", [GOOD] * 10 + [ODOMETRY] * 20, marks)
-    assert of.says_so_after(at_once).value == 0.0
+    assert of.label_change_s(at_once).value == 0.0
 
 
-def test_found_again_means_that_it_stays(tmp_path: Path) -> None:
+def test_relocalization_requires_five_consecutive_frames(tmp_path: Path) -> None:
     marks = Marks(spans=(Span(1.0, 3.0, "blind"),))
-    frames = [GOOD] * 2 + [LOST] * 6 + [GOOD] + [LOST] * 3 + [GOOD] * 8  # one lucky frame at 4 s, good from 6 s on
-    assert of.found_again_s(evidence(tmp_path, frames, marks)).value == pytest.approx(3.0)
-    never = of.found_again_s(evidence(tmp_path / "never", [GOOD] * 2 + [LOST] * 10, marks))
+    frames = [GOOD] * 2 + [LOST] * 6 + [GOOD] + [LOST] * 3 + [GOOD] * 8  # one good frame at 4 s, all from 6 s on
+    assert of.relocalized_after_s(evidence(tmp_path, frames, marks)).value == pytest.approx(3.0)
+    never = of.relocalized_after_s(evidence(tmp_path / "never", [GOOD] * 2 + [LOST] * 10, marks))
     assert never.value is None and never.verdict is Verdict.BELOW
 
 
-def test_frames_in_the_marked_time_do_not_count_outside(tmp_path: Path) -> None:
+def test_frames_in_a_marked_span_do_not_count_as_outside(tmp_path: Path) -> None:
     marks = Marks(spans=(Span(5.0, 9.0, "blind"),))
     frames = [GOOD] * 10 + [LOST] * 28 + [GOOD] * 12  # lost until 19 s: 10 s after the end
     assert of.within_50m_outside(evidence(tmp_path, frames, marks)).value == pytest.approx(1.0)
 
 
-def test_drift_is_against_the_true_motion(tmp_path: Path) -> None:
-    """Between the fixes at frames 2 and 7 the prediction gains 12 m to the east; the fix before was off by 2 m."""
+def test_drift_is_the_error_of_the_motion_between_fixes(tmp_path: Path) -> None:
+    """Between the fixes at frames 2 and 7 the prediction gains 12 m to the east; the first fix has an error of 2 m."""
     frames = [GOOD] * 2 + [replace(GOOD, error_m=2.0)] + [ODOMETRY] * 4 + [replace(GOOD, predicted_error_m=14.0)]
     found = evidence(tmp_path, frames)
     assert of.drift(found).value == pytest.approx(12.0, abs=0.05)
-    assert of.drift_share(found).value is None  # 50 m are too short a way
+    assert of.drift_share(found).value is None  # a path of 50 m is too short
     long = evidence(tmp_path / "long", [*frames[:3], *[ODOMETRY] * 19, frames[-1]])
     assert of.drift_share(long).value == pytest.approx(12.0 / 200.0, rel=0.01)
 
 
-def test_drift_without_odometry_is_no_drift(tmp_path: Path) -> None:
+def test_drift_needs_odometry_in_all_frames(tmp_path: Path) -> None:
     frames = [GOOD, replace(ODOMETRY, odometry=Answer.FEW_INLIERS), replace(GOOD, predicted_error_m=500.0)]
     assert (of.drift(evidence(tmp_path, frames)).value or 0.0) < 5.0
 
 
-def test_the_mode_must_follow_the_heat(tmp_path: Path) -> None:
+def test_the_covariance_mode_follows_throttling(tmp_path: Path) -> None:
     found = evidence(tmp_path, [GOOD] * 4 + [replace(GOOD, mode=CovarianceMode.JACOBIAN)] * 2)
-    assert of.right_mode(found).value == pytest.approx(4 / 6)  # nobody said that it was hot
+    assert of.right_mode(found).value == pytest.approx(4 / 6)  # no throttling was reported
 
 
-def test_a_claim_that_is_no_covariance(tmp_path: Path) -> None:
+def test_an_invalid_covariance_breaks_the_floor(tmp_path: Path) -> None:
     found = evidence(tmp_path, [GOOD] * 3)
     broken = [-1.0] + [0.0] * 35
-    said = found.frames[1].estimates
-    said[0] = type(said[0])(**{f: getattr(said[0], f) for f in said[0].__struct_fields__} | {"cov": tuple(broken)})
-    assert of.complete_claims(found).value == pytest.approx(2 / 3)
+    estimates = found.frames[1].estimates
+    estimates[0] = msgspec.structs.replace(estimates[0], cov=tuple(broken))
+    assert of.complete_estimates(found).value == pytest.approx(2 / 3)
 
 
-def test_the_map_is_off_by_what_was_drawn(tmp_path: Path) -> None:
+def test_the_truth_is_shifted_by_the_drawn_map_error(tmp_path: Path) -> None:
     found = evidence(tmp_path, [replace(GOOD, error_m=0.0)] * 5, truth_offset_m=(3.0, 4.0))
     errors = [f.error_m for f in found.frames]
     assert errors == pytest.approx([5.0] * 5, abs=0.02)
 
 
 @pytest.mark.parametrize("relief", [0.0, 0.02])
-def test_reprojection_of_odometry_is_what_noise_leaves(tmp_path: Path, relief: float) -> None:
+def test_the_reprojection_error_of_odometry_is_that_of_the_noise(tmp_path: Path, relief: float) -> None:
     """Noise of 0.8 px in both pictures: the mean length of a plane normal error is 0.8 sqrt(pi/2), whether the points
     lie on a plane or are up to 2 % of the height above it, as much as odometry
     lets in; a little less after a fit of 8 unknowns to 2 x 48 numbers."""
@@ -147,7 +150,7 @@ def test_reprojection_of_odometry_is_what_noise_leaves(tmp_path: Path, relief: f
     assert of.odometry_px(found).value == pytest.approx(expected, rel=0.08)
 
 
-def test_reprojection_of_a_camera_that_hovers_is_no_number_of_its_own(tmp_path: Path) -> None:
+def test_the_reprojection_error_of_a_hovering_camera_is_finite(tmp_path: Path) -> None:
     found = evidence(tmp_path, [GOOD] * 3)
     still = [(x, y, x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.3, 0.0, 0.3)]
     for frame in found.frames:
@@ -155,31 +158,31 @@ def test_reprojection_of_a_camera_that_hovers_is_no_number_of_its_own(tmp_path: 
     assert of.odometry_px(found).value == pytest.approx(0.0, abs=1e-6)
 
 
-def test_who_is_lost_must_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lost = [Said(fixed=False, sigma_m=800.0)] * 20
-    asked = of.asks(evidence(tmp_path / "a", [*[Said()] * 4, *lost]))
-    assert asked.value == pytest.approx(0.0, abs=0.5)  # it may take a frame
+def test_a_lost_flight_must_request_a_position(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lost = [FrameCase(fixed=False, sigma_m=800.0)] * 20
+    asked = of.prior_request_delay_s(evidence(tmp_path / "a", [*[FrameCase()] * 4, *lost]))
+    assert asked.value == pytest.approx(0.0, abs=0.5)  # up to one frame
     assert asked.why == "asked 4 s into the flight"  # lost from frame 4, at 2 s; 3 frames and 2 s later
-    for short in ([Said()] * 10, [*[Said()] * 4, *lost[:4], *[Said()] * 4]):
-        found = of.asks(evidence(tmp_path / f"b{len(short)}", short))
+    for short in ([FrameCase()] * 10, [*[FrameCase()] * 4, *lost[:4], *[FrameCase()] * 4]):
+        found = of.prior_request_delay_s(evidence(tmp_path / f"b{len(short)}", short))
         assert (found.value, found.verdict) == (None, None) and "never lost" in found.why
     monkeypatch.setattr(PriorRequest, "due", lambda *_: "")
-    assert of.asks(evidence(tmp_path / "c", lost)).verdict is Verdict.BELOW
+    assert of.prior_request_delay_s(evidence(tmp_path / "c", lost)).verdict is Verdict.BELOW
 
 
-def test_bounds_and_words() -> None:
+def test_bounds_and_their_texts() -> None:
     assert Bounds(0.93, 0.98).holds(0.93) and not Bounds(0.93, 0.98).holds(0.985)
     assert Bounds(low=0.8).text("%") == ">= 80 %" and Bounds(high=50.0).text("m") == "<= 50 m"
     assert Bounds(0.93, 0.98).text("%") == "93 to 98 %"
-    assert shown(0.9549, "%") == "95.5 %" and shown(None, "m") == "-" and shown(0.0, "") == "0"
+    assert with_unit(0.9549, "%") == "95.5 %" and with_unit(None, "m") == "-" and with_unit(0.0, "") == "0"
 
 
-def test_the_chi_square_band_against_draws() -> None:
+def test_the_nees_band_agrees_with_simulated_draws() -> None:
     """Means of n squared Mahalanobis distances in two dimensions, by simulation."""
     draws = (np.random.default_rng(3).normal(size=(40_000, 12, 2)) ** 2).sum(axis=2).mean(axis=1)
     assert nees_band(12) == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.02)
 
 
-def test_every_row_has_a_number_of_the_requirements() -> None:
+def test_every_row_has_a_requirement_number() -> None:
     known = {f"AC-{i}" for i in range(1, 18)} | {"ON-2", "ON-6"}
     assert {criterion.ac for criterion in CRITERIA.values()} <= known

@@ -1,4 +1,4 @@
-"""Claims against errors over several flights: a table that is the same for any number of frames, and its terms."""
+"""Consistency of claims over several flights: NEES and coverage with equal weights of the flights, and the terms."""
 
 import json
 import math
@@ -44,11 +44,11 @@ def replay(
     folder: Path,
     errors_m: list[float],
     sigma_m: float,
-    said: list[Message] | None = None,
+    messages: list[Message] | None = None,
     *,
     truth_sigma_m: float = 0.0,
 ) -> Path:
-    """A replay folder with the flight beside it."""
+    """Writes a replay folder and its flight folder -> the replay folder."""
     flight, out = folder / "flight", folder / "out"
     flight.mkdir(parents=True)
     out.mkdir()
@@ -60,18 +60,18 @@ def replay(
     with (out / "estimates.csv").open("w", newline="") as stream:
         write_rows(stream, [row(name, e, sigma_m) for name, e in zip(names, errors_m, strict=True)])
     writer = FlightWriter(out / "flight.mcap", header(Config()))
-    for message in said or [origin(0.01), estimate(1, 0.0, 0.0)]:
+    for message in messages or [origin(0.01), estimate(1, 0.0, 0.0)]:
         writer.write(message, 0)
     writer.close()
     return out
 
 
-def test_a_flight_is_judged_per_axis_and_what_all_frames_share_is_its_bias(tmp_path: Path) -> None:
+def test_errors_and_claims_are_per_axis_and_the_mean_error_is_the_bias(tmp_path: Path) -> None:
     found = claims_of(replay(tmp_path, [3.0, 5.0], 2.0))
     assert found.nees == pytest.approx((9.0 + 25.0) / 2 / 4.0 / 2, rel=1e-4)
     assert found.error_m2 == pytest.approx((9.0 + 25.0) / 4, rel=1e-4)
     assert found.bias_m2 == pytest.approx(16.0 / 2, rel=1e-4)
-    assert (found.claimed_m2, found.inside_95) == (pytest.approx(4.0), 0.5)  # 5 m are 2.5 sigmas, beyond 95 %
+    assert (found.claimed_m2, found.inside_95) == (pytest.approx(4.0), 0.5)  # 5 m are 2.5 sigmas, outside 95 %
     assert found.ratio == pytest.approx(math.sqrt(4.0 / 8.5), rel=1e-4)
     assert (found.median_error_m, found.median_claim_m) == (pytest.approx(4.0, rel=1e-4), pytest.approx(2.0))
     assert found.median_ratio == pytest.approx(2.0 / (4.0 / 1.1774), rel=1e-3)
@@ -83,10 +83,10 @@ def test_the_error_of_the_truth_is_added_to_the_claim(tmp_path: Path) -> None:
     assert found.nees == pytest.approx(0.5, rel=1e-4)
 
 
-def test_the_terms_of_a_claim(tmp_path: Path) -> None:
-    """The map's sigma; 2 % of the width of an uncalibrated lens at this height; 30 ms of the way; and the rest."""
-    said: list[Message] = [origin(0.1), estimate(1, 0.0, 9.0), estimate(1, 20.0, 3.0), estimate(2, 20.0, 3.0)]
-    found = claims_of(replay(tmp_path, [1.0, 1.0], 6.0, said))
+def test_the_claimed_variance_is_split_into_its_terms(tmp_path: Path) -> None:
+    """Map sigma; principal point: 2 % of the image width of an uncalibrated lens; time offset: 30 ms; the rest."""
+    messages: list[Message] = [origin(0.1), estimate(1, 0.0, 9.0), estimate(1, 20.0, 3.0), estimate(2, 20.0, 3.0)]
+    found = claims_of(replay(tmp_path, [1.0, 1.0], 6.0, messages))
     assert found.map_m2 == pytest.approx(9.0)
     assert found.nees_if_map_off == pytest.approx((1.0 / 36.0 + 9.0 * 2.0 / 36.0) / 2.0, rel=1e-4)
     assert found.principal_m2 == pytest.approx((100.0 * 0.02 * 800 / 400) ** 2)
@@ -94,29 +94,31 @@ def test_the_terms_of_a_claim(tmp_path: Path) -> None:
     assert found.rest_m2 == pytest.approx(36.0 - 9.0 - 16.0)
 
 
-def test_each_flight_counts_alike_however_many_frames_it_has(tmp_path: Path) -> None:
+def test_flights_have_equal_weights_whatever_their_number_of_frames(tmp_path: Path) -> None:
     flights = [
         claims_of(replay(tmp_path / "long", [0.0] * 9, 1.0)),
         claims_of(replay(tmp_path / "short", [4.0], 1.0)),
     ]
-    whole = pool(flights)
-    assert whole.nees == pytest.approx(4.0, rel=1e-4) and whole.inside_95 == 0.5
-    assert whole.nees_sigma == pytest.approx(4.0, rel=1e-4)
-    assert whole.ratio == pytest.approx(math.sqrt(2.0 / 8.0), rel=1e-4)
-    assert whole.median_ratio == pytest.approx(math.sqrt(2.0) / (4.0 / 1.1774), rel=1e-3)
-    assert whole.shares["rest"] == pytest.approx(1.0) and whole.shares["map"] == 0.0
+    pooled = pool(flights)
+    assert pooled.nees == pytest.approx(4.0, rel=1e-4) and pooled.inside_95 == 0.5
+    assert pooled.nees_sigma == pytest.approx(4.0, rel=1e-4)
+    assert pooled.ratio == pytest.approx(math.sqrt(2.0 / 8.0), rel=1e-4)
+    assert pooled.median_ratio == pytest.approx(math.sqrt(2.0) / (4.0 / 1.1774), rel=1e-3)
+    assert pooled.shares["rest"] == pytest.approx(1.0) and pooled.shares["map"] == 0.0
     assert pool(flights[:1]).nees_sigma is None
     assert "2 flights: inside 50.0%, NEES / dof 4.00 +- 4.00, 4.00 if maps are off" in table(flights)[-1]
 
 
-def test_the_command_prints_the_table_and_writes_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_claims_command_prints_the_table_and_writes_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = replay(tmp_path, [3.0, 5.0], 2.0)
     main([str(out), "--json", str(tmp_path / "claims.json")])
     assert "| out | 2 | 50% | 2.12 | 2.12 |" in capsys.readouterr().out
     assert json.loads((tmp_path / "claims.json").read_text())["pool"]["flights"] == 1
 
 
-def test_a_flight_without_truth_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_flight_without_truth_is_an_error_of_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = replay(tmp_path, [3.0], 2.0)
     truth = tmp_path / "flight" / "truth.csv"
     elsewhere = truth.rename(tmp_path / "elsewhere.csv")

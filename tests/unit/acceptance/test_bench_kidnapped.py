@@ -1,4 +1,4 @@
-"""The table of kidnapped starts: what counts as found, what a user's mistake says."""
+"""Benchmark of kidnapped starts: counts of the table, truth file and its errors."""
 
 from pathlib import Path
 
@@ -9,18 +9,18 @@ from terrafix_tools.bench import kidnapped
 from terrafix_tools.bench.kidnapped import Try, row
 
 
-def tried(found_after: int | None, wrong: int = 0) -> Try:
+def attempt(found_after: int | None, wrong: int = 0) -> Try:
     return Try(3, found_after, None if found_after is None else 4.0, wrong, 10, 1.2, 0.5)
 
 
-def test_a_row_counts_what_was_found_and_every_try_that_announced_a_wrong_place() -> None:
-    assert row("somewhere", [tried(2), tried(None, wrong=3), tried(9), tried(4)]).split() == [
+def test_a_row_counts_found_tries_and_tries_with_a_wrong_position() -> None:
+    assert row("somewhere", [attempt(2), attempt(None, wrong=3), attempt(9), attempt(4)]).split() == [
         "somewhere", "4", "3", "after", "4", "(worst", "9)", "1", "1.2", "0.50",
     ]  # fmt: skip
-    assert "never" in row("nowhere", [tried(None)])
+    assert "never" in row("nowhere", [attempt(None)])
 
 
-def test_a_flight_without_truth_is_told(tmp_path: Path) -> None:
+def test_a_flight_without_usable_truth_raises_a_source_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no usable truth"):
         kidnapped._truth(tmp_path)
     (tmp_path / "truth.csv").write_text("file,lat_deg\n1.jpg,3\n", encoding="utf-8")
@@ -30,5 +30,5 @@ def test_a_flight_without_truth_is_told(tmp_path: Path) -> None:
     assert kidnapped._truth(tmp_path) == {"1.jpg": (3.0, 4.5)}
 
 
-def test_distances_are_those_over_the_ground() -> None:
+def test_distances_are_horizontal_ground_distances() -> None:
     assert kidnapped._apart_m((50.0, 8.0), (50.001, 8.0)) == pytest.approx(111.2, abs=0.2)

@@ -1,4 +1,4 @@
-"""The benchmark on a tiny generated flight: every field that its JSON promises, and what bad arguments say."""
+"""`terrafix bench` on a tiny generated flight: fields of its JSON, and errors of bad arguments."""
 
 import json
 from pathlib import Path
@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground import PINHOLE, FlatMap, rotation, texture, view
 from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import Prediction
 from terrafix_tools.bench.baseline import SiftBaseline
 from terrafix_tools.bench.run import bench
+from textured_ground import PINHOLE, FlatMap, rotation, texture, view
 
 FRAMES = 3
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """No data here: the generated flight stands in."""
+    """Result of a run without data, which uses the generated flight."""
     out = tmp_path_factory.mktemp("bench") / "deep" / "bench.json"
     returned = bench(out.parent / "no-data", out, frames=FRAMES)
     written: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
@@ -28,13 +28,13 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_what_could_not_be_measured_is_named(measured: dict[str, Any]) -> None:
+def test_missing_data_is_listed_in_the_result(measured: dict[str, Any]) -> None:
     assert [text.split(":")[0] for text in measured["missing"]] == ["XFeat", "flight village-1", "flight town-a"]
     assert list(measured["flights"]) == ["generated"]
 
 
 @pytest.mark.slow
-def test_the_machine_is_described(measured: dict[str, Any]) -> None:
+def test_the_result_describes_the_machine(measured: dict[str, Any]) -> None:
     machine = measured["machine"]
     assert machine["cores"] >= 1 and machine["memory_mb"] > 100 and machine["cpu"]
     assert len(machine["load_average_before"]) == len(machine["load_average_after"]) == 3
@@ -42,7 +42,7 @@ def test_the_machine_is_described(measured: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_times_memory_and_accuracy_of_the_replay(measured: dict[str, Any]) -> None:
+def test_the_result_has_times_memory_and_accuracy_of_the_replay(measured: dict[str, Any]) -> None:
     flight = measured["flights"]["generated"]
     assert flight["frames"] == FRAMES and list(flight["runs"]) == ["weights-free"]
     run = flight["runs"]["weights-free"]
@@ -52,14 +52,15 @@ def test_times_memory_and_accuracy_of_the_replay(measured: dict[str, Any]) -> No
     parts = sum(times["median"] for times in run["stage_ms"].values())
     assert parts == pytest.approx(run["frame_ms"]["median"], rel=0.3)
     assert run["first_frame_ms"] > 0.0 and run["start_up_s"] > 0.0
-    assert run["frames_per_s"] == pytest.approx(1e3 / run["frame_ms"]["median"], rel=0.9)  # the first frame counts here
+    # frames_per_s includes the first frame, the median does not.
+    assert run["frames_per_s"] == pytest.approx(1e3 / run["frame_ms"]["median"], rel=0.9)
     assert 50.0 < run["peak_memory_mb"] < 4000.0
     assert run["accuracy"]["localised"] == FRAMES
     assert 0.0 <= run["accuracy"]["within_20m"] <= run["accuracy"]["within_50m"] <= 1.0
 
 
 @pytest.mark.slow
-def test_the_baseline_and_the_ratios_to_it(measured: dict[str, Any]) -> None:
+def test_the_result_has_the_baseline_and_the_ratios_to_it(measured: dict[str, Any]) -> None:
     flight = measured["flights"]["generated"]
     baseline, ratios = flight["baseline"], flight["ratios"]["weights-free"]
     assert "SIFT" in baseline["method"] and 0 <= baseline["answered"] <= baseline["frames"] == FRAMES
@@ -70,21 +71,21 @@ def test_the_baseline_and_the_ratios_to_it(measured: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_the_parts(measured: dict[str, Any]) -> None:
+def test_the_result_has_times_of_single_parts(measured: dict[str, Any]) -> None:
     micro = measured["micro"]
     assert micro["flight"] == "generated"
     for part in ("odometry", "look (search)", "belief update", "fix (patches + PnP)", "link, one second"):
         assert micro[part]["median"] > 0.0
     for mode in ("marginals", "jacobian"):
-        assert f"estimator frame, 20 nodes, {mode}" in micro  # empty: three frames do not fill the window
+        assert f"estimator frame, 20 nodes, {mode}" in micro  # without times: three frames do not fill the window
 
 
-def test_a_flight_that_is_not_there(tmp_path: Path) -> None:
+def test_an_unknown_flight_raises_a_source_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"none of moon-1 is there; check --data and --flight"):
         bench(tmp_path, tmp_path / "b.json", flights=["moon-1"])
 
 
-def test_bad_arguments(tmp_path: Path) -> None:
+def test_bad_bench_arguments_raise_usage_and_output_errors(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--frames 1"):
         bench(tmp_path, tmp_path / "b.json", frames=1)
     (tmp_path / "file").write_text("")
@@ -92,8 +93,8 @@ def test_bad_arguments(tmp_path: Path) -> None:
         bench(tmp_path, tmp_path / "file" / "b.json")
 
 
-def test_the_baseline_is_right_where_it_can_be() -> None:
-    """The same picture on both sides, where SIFT cannot fail: an unfair baseline would be worth nothing."""
+def test_the_baseline_locates_an_identical_image() -> None:
+    """With the same image on both sides SIFT must succeed; a baseline that fails here would be an unfair comparison."""
     ground, r, p = texture(3, 420.0), rotation(35.0, 3.0, -2.0), np.array([12.0, -20.0, 100.0])
     baseline = SiftBaseline(PINHOLE, FlatMap(ground))  # type: ignore[arg-type]
     predicted = Prediction(

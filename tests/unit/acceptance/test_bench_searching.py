@@ -1,4 +1,4 @@
-"""What a search costs, on a small map: every line is measured, and a file that is no map is told."""
+"""Benchmark of the search on a small map: all lines are measured, and a file that is not a map is reported."""
 
 import json
 import sys
@@ -11,7 +11,7 @@ from terrafix_tools.mapping.build import build
 
 
 @pytest.mark.slow
-def test_every_line_is_measured(
+def test_the_search_benchmark_measures_every_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     map_size._draw(tmp_path / "map.tif", 800)

@@ -1,4 +1,4 @@
-"""One frame over imagery of another date: the anchor is sure at the right place, and says how well it knows it."""
+"""Benchmark of single frames on imagery of another date: acceptance, prediction, and covariance of the centre point."""
 
 from pathlib import Path
 
@@ -8,17 +8,17 @@ import pytest
 from rasterio.transform import Affine
 
 import map_rasters
-from ground import texture
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.pose import exp_so3
 from terrafix.messages import MapMatch, Verdict
-from terrafix_tools.bench.two_dates import FOCAL_PX, Places, measure, middle_of, row
+from terrafix_tools.bench.two_dates import FOCAL_PX, Places, centre_point_of, measure, row
+from textured_ground import texture
 
 
 @pytest.fixture(scope="module")
 def dates(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """One ground twice; the second picture is darker and begins 30 px further east."""
+    """Two images of the same ground; the second one is darker and begins 30 px further east."""
     folder = tmp_path_factory.mktemp("dates")
     ground = np.ascontiguousarray(texture(6, 300.0)[:880])
     first = map_rasters.utm(folder / "first.tif", ground[:, :, ::-1].transpose(2, 0, 1))
@@ -27,7 +27,7 @@ def dates(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return first, map_rasters.write_tif(folder / "second.tif", later, "EPSG:32651", moved)
 
 
-def test_it_is_sure_where_it_is_right_and_nowhere_else(
+def test_only_frames_near_the_prediction_are_accepted(
     dates: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -41,20 +41,22 @@ def test_it_is_sure_where_it_is_right_and_nowhere_else(
         measure(dates[0], other, 1, 0)
 
 
-def test_what_is_told_of_a_place_is_where_it_is(dates: tuple[Path, Path]) -> None:
-    """A camera above a pixel sees the others of the map where they lie."""
+def test_the_prediction_of_a_place_projects_map_pixels_correctly(dates: tuple[Path, Path]) -> None:
+    """A map pixel projects into the camera above another pixel at the correct image position."""
     places = Places(*dates)
     px, other_px = np.array([500.0, 400.0]), np.array([600.0, 430.0])
-    origin, prediction = places.told(px)
-    way_m = [*(places.local_m(other_px) - places.local_m(px)), -prediction.agl_m]
-    ray = rot_from_quat(prediction.q_w_c).T @ np.array(way_m)
+    origin, prediction = places.prior(px)
+    relative_m = [*(places.local_m(other_px) - places.local_m(px)), -prediction.agl_m]
+    ray = rot_from_quat(prediction.q_w_c).T @ np.array(relative_m)
     assert ray[:2] / ray[2] * FOCAL_PX == pytest.approx([100.0, 30.0], abs=0.1)
     assert (origin.camera.fx, origin.camera.cx) == (FOCAL_PX, 199.5)
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_where_the_map_is_empty_nothing_is_asked(dates: tuple[Path, Path], tmp_path: Path, *, elsewhere: bool) -> None:
-    """The right half of the second image holds no imagery: no place of the first one there, and none told there."""
+def test_no_positions_are_drawn_where_the_map_is_empty(
+    dates: tuple[Path, Path], tmp_path: Path, *, elsewhere: bool
+) -> None:
+    """The right half of the second image is empty: neither true nor predicted positions are drawn there."""
     ground = np.ascontiguousarray(texture(6, 300.0)[:880])
     half = ground.shape[1] // 2
     ground[:, half:] = 0
@@ -64,22 +66,23 @@ def test_where_the_map_is_empty_nothing_is_asked(dates: tuple[Path, Path], tmp_p
     assert max(px[0] for px in drawn) < half - 180
 
 
-def test_the_covariance_of_the_middle_is_that_of_many_cameras() -> None:
+def test_the_covariance_of_the_centre_point_equals_that_of_sampled_poses() -> None:
     rng = np.random.default_rng(1)
     half = rng.normal(size=(6, 6)) * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])[:, None]
     cov, p = half @ half.T, np.array([10.0, -20.0, 100.0])
     down = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
-    def seen(error: np.ndarray) -> np.ndarray:
-        """By the definition of the covariance: an error of position, and a small rotation about the world's axes."""
-        axis, at = (exp_so3(error[3:]) @ down)[:, 2], p + error[:3]
-        return (at - axis * at[2] / axis[2])[:2]
+    def centre_point(error: np.ndarray) -> np.ndarray:
+        """The centre point for a pose error by the definition of the covariance: position, small rotation about the
+        world axes."""
+        axis, position_m = (exp_so3(error[3:]) @ down)[:, 2], p + error[:3]
+        return (position_m - axis * position_m[2] / axis[2])[:2]
 
-    cloud = np.array([seen(e) for e in rng.multivariate_normal(np.zeros(6), cov, 20_000)])
+    cloud = np.array([centre_point(e) for e in rng.multivariate_normal(np.zeros(6), cov, 20_000)])
     match = MapMatch(
         t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", map_sigma_m=3.0,
         p_c_in_w_m=(10.0, -20.0, 100.0), q_w_c=quat_from_rot(down), cov=tuple(cov.ravel().tolist()),
     )  # fmt: skip
-    place_m, found = middle_of(match)
+    place_m, found = centre_point_of(match)
     assert place_m == pytest.approx([10.0, -20.0])
     assert found - 9.0 * np.eye(2) == pytest.approx(np.cov(cloud.T), rel=0.1, abs=0.1)

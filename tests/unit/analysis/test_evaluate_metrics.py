@@ -1,4 +1,4 @@
-"""Evaluation: every number of evaluation.json on flights small enough to count by hand."""
+"""Evaluation: every metric of evaluation.json on flights small enough to compute by hand."""
 
 import json
 import math
@@ -49,7 +49,7 @@ def folder(path: Path, rows: list[Row], truth: str | None = None, summary: dict[
     return path
 
 
-def test_the_numbers(tmp_path: Path) -> None:
+def test_the_metrics_of_a_small_flight_are_correct(tmp_path: Path) -> None:
     rows = [
         row(0, None),
         row(1, 3.0, refined_m=1.0),
@@ -68,20 +68,20 @@ def test_the_numbers(tmp_path: Path) -> None:
     assert found["ellipse95_coverage"] == 0.75  # 3, 8 of 4 m and 60 of 40 m are inside; 60 of 4 m is not
     nees = [(3 / 4) ** 2, (8 / 4) ** 2, (60 / 4) ** 2, (60 / 40) ** 2]
     assert found["mean_nees"] == pytest.approx(sum(nees) / 4, rel=1e-3)
-    assert found["false_fixes"] == 1  # 60 m claimed as 4 m; 60 m claimed as 40 m is honest
+    assert found["false_fixes"] == 1  # 60 m with a sigma of 4 m; 60 m with 40 m is consistent
     assert found["anchor_rate"] == 0.6
     assert found["odometry_rate"] == 0.5
     assert found["frame_ms_median"] == 102.0
     assert json.loads((tmp_path / "evaluation.json").read_text()) == found
 
 
-def test_nothing_localised_is_a_result(tmp_path: Path) -> None:
+def test_a_flight_without_localised_frames_has_metrics(tmp_path: Path) -> None:
     found = evaluate(folder(tmp_path, [row(0, None), row(1, None)]), tmp_path / "truth.csv")
     assert (found["localised"], found["within_50m"], found["median_m"]) == (0, 0.0, None)
     assert (found["ellipse95_coverage"], found["false_fixes"]) == (None, 0)
 
 
-def test_correlated_covariance_counts(tmp_path: Path) -> None:
+def test_the_coverage_uses_the_correlation_of_the_covariance(tmp_path: Path) -> None:
     made = row(0, None)
     made.lat_deg, made.lon_deg = ORIGIN.to_wgs84(10.0, 10.0)
     made.sigma_e_m = made.sigma_n_m = 6.0
@@ -94,19 +94,19 @@ def test_correlated_covariance_counts(tmp_path: Path) -> None:
     assert (along["ellipse95_coverage"], across["ellipse95_coverage"]) == (1.0, 0.0)
 
 
-def test_a_covariance_that_is_none_is_not_coverage(tmp_path: Path) -> None:
+def test_an_invalid_covariance_does_not_count_as_covered(tmp_path: Path) -> None:
     found = evaluate(folder(tmp_path, [row(0, 60.0, sigma_m=0.0)]), tmp_path / "truth.csv", json_only=True)
     assert (found["ellipse95_coverage"], found["mean_nees"], found["covariance_invalid"]) == (0.0, None, 1)
     assert found["false_fixes"] == 1
 
 
-def test_frames_without_truth_do_not_count(tmp_path: Path) -> None:
+def test_frames_without_truth_are_excluded_from_the_metrics(tmp_path: Path) -> None:
     truth = "file,lat_deg,lon_deg,agl_m\n0.jpg,48.0,11.0,5\n1.jpg,,,\nother.jpg,48.0,11.0,5\n"
     found = evaluate(folder(tmp_path, [row(0, 1.0), row(1, 1.0)], truth), tmp_path / "truth.csv", json_only=True)
     assert (found["frames"], found["frames_without_truth"]) == (1, 1)
 
 
-def test_sigma_of_the_truth_is_an_extra_key(tmp_path: Path) -> None:
+def test_the_sigma_of_the_truth_adds_a_second_coverage(tmp_path: Path) -> None:
     folder(tmp_path, [row(0, 12.0, sigma_m=4.0)])
     (tmp_path / "flight.toml").write_text("[truth]\nsigma_m = 7.0\n")
     found = evaluate(tmp_path, tmp_path / "truth.csv", json_only=True)
@@ -118,22 +118,22 @@ def test_sigma_of_the_truth_is_an_extra_key(tmp_path: Path) -> None:
     [
         ("file,lat_deg\n0.jpg,48\n", "column lon_deg missing"),
         ("", "column file, lat_deg, lon_deg missing"),
-        ("file,lat_deg,lon_deg\na.jpg,48,11\n", "no frame stands in both"),
-        ("file,lat_deg,lon_deg\n0.jpg,48,11\n0.jpg,48,11\n", "line 3: '0.jpg' stands there a second time"),
+        ("file,lat_deg,lon_deg\na.jpg,48,11\n", "no frame in common"),
+        ("file,lat_deg,lon_deg\n0.jpg,48,11\n0.jpg,48,11\n", "line 3: duplicate row of '0.jpg'"),
         ("file,lat_deg,lon_deg\n0.jpg,north,11\n", "line 2: lat_deg is 'north', not a number"),
         ("file,lat_deg,lon_deg\n0.jpg,nan,11\n", "not a finite number"),
-        ("file,lat_deg,lon_deg\n0.jpg,148,11\n", "no place on earth"),
-        ("file,lat_deg,lon_deg\n0.jpg,48\n", "line 2: 2 cells where the head has 3"),
+        ("file,lat_deg,lon_deg\n0.jpg,148,11\n", "not a valid position"),
+        ("file,lat_deg,lon_deg\n0.jpg,48\n", "line 2: 2 cells, but the header has 3"),
         ("file,lat_deg,lon_deg\n0.jpg,,\n", "no row with a position"),
     ],
 )
-def test_bad_truth_is_one_line_with_its_place(tmp_path: Path, truth: str, says: str) -> None:
+def test_a_bad_truth_file_is_one_line_with_its_location(tmp_path: Path, truth: str, says: str) -> None:
     with pytest.raises(EvaluationError, match=says) as caught:
         evaluate(folder(tmp_path, [row(0, 1.0)], truth), tmp_path / "truth.csv")
     assert "\n" not in str(caught.value)
 
 
-def test_missing_files_are_named(tmp_path: Path) -> None:
+def test_the_error_names_the_missing_file(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match=r"estimates.csv: no such file; write it with 'terrafix replay'"):
         evaluate(tmp_path, tmp_path / "truth.csv")
     with pytest.raises(EvaluationError, match=r"truth.csv: no such file"):
@@ -148,7 +148,7 @@ def test_offsets_are_metres_east_and_north(tmp_path: Path) -> None:
     assert math.hypot(east_m, north_m) == pytest.approx(50.0, abs=1e-3)
 
 
-def test_the_columns_are_the_contract() -> None:
+def test_the_columns_of_estimates_csv_are_as_specified() -> None:
     assert ",".join(COLUMNS) == (
         "file,t_s,lat_deg,lon_deg,alt_amsl_m,agl_m,sigma_e_m,sigma_n_m,cov_en_m2,yaw_deg,source_label,anchor_age_ms,"
         "covariance_mode,process_ms,refined_lat_deg,refined_lon_deg"

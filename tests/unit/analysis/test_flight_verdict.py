@@ -1,4 +1,4 @@
-"""The verdict on a whole flight: from rows, faults and answers to map matches, without truth."""
+"""The verdict on a whole flight from rows, faults and map match verdicts, without ground truth."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from terrafix_tools.flight_verdict import flight_verdict, verdict_of
 
 
 def rows(count: int = 60) -> list[Row]:
-    """One a second, anchored each."""
+    """One row per second, each with a map match."""
     return [
         Row(
             file=f"{i}.jpg",
@@ -36,85 +36,85 @@ def fault(quantity: str, *, active: bool = True, factor: float | None = None) ->
     return m.CalibrationFault(t_ns=0, quantity=quantity, factor=factor, detail="", active=active)
 
 
-def test_a_flight_on_the_map_is_trusted() -> None:
-    said = flight_verdict(rows(), (), {"map": {"accepted": 60}})
-    assert (said.word, said.spans, said.reasons) == ("trust it", [(0.0, 59.0)], [])
-    assert said.text() == "Trust it."
-    assert said.as_json()["verdict"] == "trust it" and said.as_json()["trusted_s"] == [[0.0, 59.0]]
+def test_a_flight_with_map_matches_is_trusted() -> None:
+    verdict = flight_verdict(rows(), (), {"map": {"accepted": 60}})
+    assert (verdict.label, verdict.spans, verdict.reasons) == ("trust it", [(0.0, 59.0)], [])
+    assert verdict.text() == "Trust it."
+    assert verdict.as_json()["verdict"] == "trust it" and verdict.as_json()["trusted_s"] == [[0.0, 59.0]]
 
 
-def test_a_start_that_the_map_contradicts_leaves_the_choice_to_a_person() -> None:
-    said = flight_verdict(rows(), (), {"map": {"accepted": 60}, "start": {"innovation": 1}})
-    assert said.word == "do not trust it" and "start and map contradict each other" in said.text()
+def test_a_start_that_contradicts_the_map_is_not_trusted() -> None:
+    verdict = flight_verdict(rows(), (), {"map": {"accepted": 60}, "start": {"innovation": 1}})
+    assert verdict.label == "do not trust it" and "start and map contradict each other" in verdict.text()
 
 
-def test_spans_without_a_sure_position_are_left_out_and_named() -> None:
+def test_spans_without_a_certain_position_are_excluded_with_a_reason() -> None:
     flown = rows()
     for row in flown[10:20]:
         row.sigma_e_m = row.sigma_n_m = 51.0
     flown[30].lat_deg = None
-    said = flight_verdict(flown)
-    assert said.word == "trust it in part"
-    assert said.spans == [(0.0, 9.0), (20.0, 29.0), (31.0, 59.0)]
-    assert said.reasons == ["claims worse than 50 m", "no position"]
-    assert "from 0.0 s to 9.0 s" in said.text() and "no position" in said.text()
+    verdict = flight_verdict(flown)
+    assert verdict.label == "trust it in part"
+    assert verdict.spans == [(0.0, 9.0), (20.0, 29.0), (31.0, 59.0)]
+    assert verdict.reasons == ["claims worse than 50 m", "no position"]
+    assert "from 0.0 s to 9.0 s" in verdict.text() and "no position" in verdict.text()
 
 
 @pytest.mark.parametrize(("age_ms", "trusted"), [(35_000, True), (35_001, False)])
-def test_a_position_may_be_carried_forward_for_as_long_as_the_link_sends_it(age_ms: int, trusted: bool) -> None:
+def test_a_propagated_position_is_trusted_as_long_as_the_link_sends_it(age_ms: int, trusted: bool) -> None:
     flown = rows()
     flown[-1].anchor_age_ms = age_ms
     assert (flight_verdict(flown).share == 1.0) is trusted
 
 
-def test_a_start_that_no_map_match_confirms_is_not_trusted_for_longer_than_a_moment() -> None:
+def test_a_start_without_confirming_map_match_is_trusted_only_briefly() -> None:
     flown = rows()
     for row in flown:
         row.anchor_age_ms = -1
-    said = flight_verdict(flown)
-    assert said.spans == [(0.0, 5.0)]
-    assert said.reasons == ["no map match has confirmed the start"]
+    verdict = flight_verdict(flown)
+    assert verdict.spans == [(0.0, 5.0)]
+    assert verdict.reasons == ["no map match has confirmed the start"]
 
 
-def test_a_wrong_description_is_wrong_from_the_beginning_of_the_flight() -> None:
-    said = flight_verdict(rows(), [(40.0, fault("scale", factor=0.5))])
-    assert said.word == "do not trust it" and said.active_faults == ["height/focal seems x0.50 off"]
-    assert said.text() == "Do not trust it (height/focal seems x0.50 off)."
+def test_a_calibration_fault_applies_from_the_start_of_the_flight() -> None:
+    verdict = flight_verdict(rows(), [(40.0, fault("scale", factor=0.5))])
+    assert verdict.label == "do not trust it" and verdict.active_faults == ["height/focal seems x0.50 off"]
+    assert verdict.text() == "Do not trust it (height/focal seems x0.50 off)."
 
 
-def test_what_follows_the_end_of_a_fault_is_trusted() -> None:
-    said = flight_verdict(rows(), [(40.0, fault("heading", active=False)), (20.0, fault("heading", factor=90.0))])
-    assert said.spans == [(40.0, 59.0)] and said.active_faults == []
+def test_the_time_after_the_end_of_a_fault_is_trusted() -> None:
+    verdict = flight_verdict(rows(), [(40.0, fault("heading", active=False)), (20.0, fault("heading", factor=90.0))])
+    assert verdict.spans == [(40.0, 59.0)] and verdict.active_faults == []
 
 
-def test_a_map_that_is_found_nowhere_counts_from_the_last_match_on() -> None:
+def test_a_registration_fault_applies_from_the_last_match_on() -> None:
     flown = rows()
     for row in flown[31:]:
         row.anchor_age_ms = 1000
-    said = flight_verdict(flown, [(50.0, fault("registration"))])
-    assert said.spans == [(0.0, 30.0)]
-    assert said.active_faults == ["the map is found nowhere"]
+    verdict = flight_verdict(flown, [(50.0, fault("registration"))])
+    assert verdict.spans == [(0.0, 30.0)]
+    assert verdict.active_faults == ["the map is found nowhere"]
 
 
-def test_an_estimate_that_refuses_most_positions_on_the_map_is_not_trusted() -> None:
-    assert flight_verdict(rows(), (), {"map": {"accepted": 4, "innovation": 5}}).word == "do not trust it"
-    assert flight_verdict(rows(), (), {"map": {"accepted": 5, "innovation": 5}}).word == "trust it"
-    assert flight_verdict(rows(), (), {"map": {"accepted": 0, "innovation": 7}}).word == "trust it"  # too few to tell
+def test_a_flight_that_rejects_most_map_matches_is_not_trusted() -> None:
+    assert flight_verdict(rows(), (), {"map": {"accepted": 4, "innovation": 5}}).label == "do not trust it"
+    assert flight_verdict(rows(), (), {"map": {"accepted": 5, "innovation": 5}}).label == "trust it"
+    assert flight_verdict(rows(), (), {"map": {"accepted": 0, "innovation": 7}}).label == "trust it"  # too few to tell
 
 
-def test_no_frames_are_nothing_to_trust() -> None:
+def test_a_flight_without_frames_is_not_trusted() -> None:
     assert flight_verdict([]).text() == "Do not trust it (no frame)."
 
 
-def test_the_verdict_of_a_record(tmp_path: Path) -> None:
+def test_the_verdict_is_computed_from_a_record(tmp_path: Path) -> None:
     record = FlightWriter(tmp_path / "flight.mcap", header(Config()))
     for i in range(20):
         record.write(frame(i), i)
         record.write(estimate(i, 0.0, 0.0), i)
-        said = m.MeasurementVerdict(t_ns=i, frame_id=i, measurement="map", verdict=m.Verdict.INNOVATION)
-        record.write(said, i)
+        verdict = m.MeasurementVerdict(t_ns=i, frame_id=i, measurement="map", verdict=m.Verdict.INNOVATION)
+        record.write(verdict, i)
     record.close()
-    assert verdict_of(tmp_path).reasons == ["20 of 20 positions on the map were refused"]
+    assert verdict_of(tmp_path).reasons == ["20 of 20 map matches were rejected"]
     record = FlightWriter(tmp_path / "flight.mcap", header(Config()))
     for i in range(20):
         record.write(frame(i), i)

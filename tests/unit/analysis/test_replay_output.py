@@ -1,4 +1,4 @@
-"""Replay with small stand-in nodes: files, columns, determinism, and what bad input says."""
+"""Replay with small stub nodes: files, columns, determinism, and errors on bad input."""
 
 import csv
 import errno
@@ -24,10 +24,10 @@ from terrafix_tools.estimates import COLUMNS, read_rows
 from terrafix_tools.replay import replay
 
 FRAMES = 6
-LOST = 2  # the frame for which the stand-in estimator says nothing
+LOST = 2  # the frame for which the stub estimator publishes no estimate
 
 
-class StandInVision:
+class StubVision:
     def on(self, message: m.Message) -> Iterable[m.Message]:
         if isinstance(message, m.Frame):
             keyframe = max(0, message.frame_id - 1)
@@ -38,8 +38,8 @@ class StandInVision:
         return ()
 
 
-class StandInEstimator:
-    """Two estimates a frame: the last one counts."""
+class StubEstimator:
+    """Publishes two estimates per frame; the last one counts."""
 
     def __init__(self, die_at: int = -1) -> None:
         self._die_at = die_at
@@ -71,7 +71,7 @@ class StandInEstimator:
 
 
 def nodes(ctx: NodeContext) -> dict[str, Node]:
-    return {"vision": StandInVision(), "estimator": StandInEstimator()}
+    return {"vision": StubVision(), "estimator": StubEstimator()}
 
 
 def map_at(path: Path, lon_deg: float = 11.0) -> Path:
@@ -92,7 +92,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return flight(tmp_path / "flight", FRAMES, toml=TOML.replace("lon_deg = 2.0", "lon_deg = 11.0"))
 
 
-def test_three_files_and_one_row_a_frame(folder: Path, tmp_path: Path) -> None:
+def test_a_replay_writes_three_files_and_one_row_per_frame(folder: Path, tmp_path: Path) -> None:
     (folder / "frames" / "0004.jpg").write_bytes(b"not an image")
     summary = replay(folder, None, tmp_path / "out", nodes=nodes)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["estimates.csv", "flight.mcap", "summary.json"]
@@ -120,8 +120,8 @@ def test_three_files_and_one_row_a_frame(folder: Path, tmp_path: Path) -> None:
     assert isinstance(recorded[0], m.Origin)
 
 
-def test_the_summary_has_a_verdict_from_rows_faults_and_answers(folder: Path, tmp_path: Path) -> None:
-    class Faulty(StandInEstimator):
+def test_the_summary_has_a_verdict_from_rows_faults_and_map_matches(folder: Path, tmp_path: Path) -> None:
+    class Faulty(StubEstimator):
         def on(self, message: m.Message) -> Iterable[m.Message]:
             yield from super().on(message)
             if isinstance(message, m.Odometry) and message.frame_id == FRAMES - 2:
@@ -136,7 +136,7 @@ def test_the_summary_has_a_verdict_from_rows_faults_and_answers(folder: Path, tm
     assert json.loads((tmp_path / "wrong" / "summary.json").read_text())["verdict"] == wrong
 
 
-def test_twice_the_same_but_for_the_time(folder: Path, tmp_path: Path) -> None:
+def test_two_replays_differ_only_in_run_time(folder: Path, tmp_path: Path) -> None:
     tables = []
     for name in ("a", "b"):
         replay(folder, None, tmp_path / name, nodes=nodes)
@@ -146,18 +146,18 @@ def test_twice_the_same_but_for_the_time(folder: Path, tmp_path: Path) -> None:
     assert tables[0] == tables[1]
 
 
-def test_a_replay_that_dies_leaves_what_it_had(folder: Path, tmp_path: Path) -> None:
+def test_an_interrupted_replay_leaves_readable_partial_files(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     replay(folder, None, out, nodes=nodes)
     (out / "report.html").write_text("old")
     with pytest.raises(RuntimeError, match="a bug"):
-        replay(folder, None, out, nodes=lambda ctx: {"vision": StandInVision(), "estimator": StandInEstimator(4)})
+        replay(folder, None, out, nodes=lambda ctx: {"vision": StubVision(), "estimator": StubEstimator(4)})
     assert sorted(p.name for p in out.iterdir()) == ["estimates.csv.partial", "flight.mcap.partial"]
     assert len(read_rows(out / "estimates.csv.partial")) == 4
     assert sum(isinstance(x, m.Frame) for _, _, x in read_flight(out / "flight.mcap.partial")) >= 4
 
 
-def test_height_of_the_ground_comes_from_the_map(folder: Path, tmp_path: Path) -> None:
+def test_the_ground_height_at_the_start_comes_from_the_map(folder: Path, tmp_path: Path) -> None:
     from terrafix_tools.mapping.build import build
 
     dem = tmp_path / "dem.tif"
@@ -172,13 +172,13 @@ def test_height_of_the_ground_comes_from_the_map(folder: Path, tmp_path: Path) -
     assert math.isclose(said.ground_amsl_m, 512.5, abs_tol=0.1)
 
 
-def test_the_start_may_be_given(folder: Path, tmp_path: Path) -> None:
+def test_a_given_start_overrides_that_of_the_source(folder: Path, tmp_path: Path) -> None:
     replay(folder, None, tmp_path / "out", start=(48.0001, 11.0), nodes=nodes)
     said = next(x for _, _, x in read_flight(tmp_path / "out") if isinstance(x, m.Origin))
     assert (said.lat_deg, said.lon_deg) == (48.0001, 11.0)
 
 
-def test_a_map_elsewhere_says_how_far(folder: Path, tmp_path: Path) -> None:
+def test_the_error_of_a_map_elsewhere_states_the_distance(folder: Path, tmp_path: Path) -> None:
     elsewhere = map_at(tmp_path / "far.tif", lon_deg=11.1)
     with pytest.raises(
         MapError, match=r"does not cover the start 48.000000, 11.000000; its nearest edge is 7\.\d km away"
@@ -187,12 +187,12 @@ def test_a_map_elsewhere_says_how_far(folder: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_start_with_latitude_and_longitude_swapped_is_said_as_such(folder: Path, tmp_path: Path) -> None:
+def test_the_error_of_a_start_with_swapped_coordinates_says_so(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"latitude and longitude are swapped: 48.000000, 11.000000 lies on the map"):
         replay(folder, None, tmp_path / "out", start=(11.0, 48.0), nodes=nodes)
 
 
-def test_no_map_anywhere(folder: Path, tmp_path: Path) -> None:
+def test_a_replay_without_a_map_is_an_error(folder: Path, tmp_path: Path) -> None:
     toml = (folder / "flight.toml").read_text()
     (folder / "flight.toml").write_text(toml.replace('map = "../maps/here.tif"', ""))
     with pytest.raises(MapError, match="names no map; give one with --map"):
@@ -208,13 +208,13 @@ def test_models_are_checked_before_the_flight(folder: Path, tmp_path: Path, monk
         ("xfeat", ModelError, r"models/xfeat\.onnx: no such model file \(xfeat\); terrafix models fetch xfeat"),
         ("xfeat=", UsageError, "write NAME=PATH, or NAME alone"),
         ("xfeat=lighterglue-l3", ModelError, "'lighterglue-l3' cannot be used as xfeat"),
-        ("superglue=a.onnx", UsageError, "no model is called 'superglue'; known: xfeat"),
+        ("superglue=a.onnx", UsageError, "unknown model 'superglue'; known: xfeat"),
     ):
         with pytest.raises(error, match=says):
             replay(folder, None, tmp_path / "out", models=[text], nodes=nodes)
 
 
-def test_bad_configuration_and_output(folder: Path, tmp_path: Path) -> None:
+def test_a_bad_configuration_or_output_folder_is_an_error(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("[recorder]\nthumbnail = true\n")
     with pytest.raises(ConfigError, match="did you mean 'thumbnails'"):
         replay(folder, None, tmp_path / "out", configs=[tmp_path / "bad.toml"], nodes=nodes)
@@ -223,7 +223,7 @@ def test_bad_configuration_and_output(folder: Path, tmp_path: Path) -> None:
         replay(folder, None, tmp_path / "file" / "out", nodes=nodes)
 
 
-def test_a_disk_that_is_full_is_one_line(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_one_line(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_self: FlightWriter) -> None:
         if (tmp_path / "out" / "estimates.csv.partial").read_text(encoding="utf-8").count("\n") > 3:
             raise OSError(errno.ENOSPC, "No space left on device")

@@ -1,4 +1,4 @@
-"""The report: one page that needs nothing else, from a live record or a replay, with or without truth."""
+"""The report: one self-contained page, from a live record or a replay, with or without truth."""
 
 import re
 from html.parser import HTMLParser
@@ -15,7 +15,7 @@ from terrafix_tools.report.page import report
 
 
 class Page(HTMLParser):
-    """Tags that are open, links, and the text."""
+    """Open tags, links and text of an HTML page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ def page_of(folder: Path, **options: Path) -> Page:
     return page
 
 
-def test_a_live_record_with_truth(tmp_path: Path) -> None:
+def test_the_report_of_a_live_record_with_truth_has_all_sections(tmp_path: Path) -> None:
     write_record(tmp_path / "flight-000.mcap", live_messages())
     write_truth(tmp_path / "truth.csv")
     (tmp_path / "peer.json").write_text('{"longest_gap_ms": 512.5, "resets": 0}')
@@ -56,59 +56,63 @@ def test_a_live_record_with_truth(tmp_path: Path) -> None:
     for words in ("within 20 m", "95 % ellipse", "Verdicts", "ambiguous", "GPS_INPUT", "longest gap ms", "thermal"):
         assert words in page.text, words
     assert "Process link: died (signal 9 <kill>)." in page.text
-    assert "Longest GPS_INPUT silence: 0.50 s." in page.text
+    assert "Longest GPS_INPUT gap: 0.50 s." in page.text
     assert "3 messages were dropped" in page.text
     assert any(link.startswith("data:image/jpeg") for link in page.links)
 
 
-def test_the_report_says_what_is_miscalibrated_and_whether_to_trust_the_flight(tmp_path: Path) -> None:
-    wrong = CalibrationFault(t_ns=7_000_000_000, quantity="scale", factor=2.0, detail="told against seen", active=True)
-    right = CalibrationFault(t_ns=8_000_000_000, quantity="scale", factor=2.0, detail="told against seen", active=False)
+def test_the_report_has_calibration_faults_and_the_verdict(tmp_path: Path) -> None:
+    wrong = CalibrationFault(
+        t_ns=7_000_000_000, quantity="scale", factor=2.0, detail="stated against measured", active=True
+    )
+    right = CalibrationFault(
+        t_ns=8_000_000_000, quantity="scale", factor=2.0, detail="stated against measured", active=False
+    )
     write_record(tmp_path / "flight-000.mcap", [*live_messages(), wrong, right])
     text = page_of(tmp_path).text
-    assert "Height/focal seems x2.00 off: no fix: told against seen." in text
+    assert "Height/focal seems x2.00 off: no fix: stated against measured." in text
     assert "Verdict: Trust it from 8.0 s to 9.5 s, and no more than that (height/focal seems x2.00 off)." in text
 
 
-def test_without_truth_it_shows_what_was_claimed(tmp_path: Path) -> None:
+def test_without_truth_the_report_shows_the_reported_accuracy(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", live_messages())
     page = page_of(tmp_path)
-    assert "claimed 95 % radius, median" in page.text
+    assert "reported 95 % radius, median" in page.text
     assert "no ground truth" in page.text
     assert "median error" not in page.text
 
 
-def test_a_record_that_was_cut_off_is_reported_and_said_so(tmp_path: Path) -> None:
+def test_the_report_of_a_truncated_record_states_the_truncation(tmp_path: Path) -> None:
     write_record(tmp_path / "flight-000.mcap", live_messages(60))
     data = (tmp_path / "flight-000.mcap").read_bytes()
     (tmp_path / "flight-000.mcap").write_bytes(data[: len(data) * 3 // 4])
-    assert "1 file(s) of the record end abruptly" in page_of(tmp_path).text
+    assert "1 file(s) of the record are truncated" in page_of(tmp_path).text
 
 
-def test_a_replay_that_was_killed(tmp_path: Path) -> None:
+def test_the_report_of_an_interrupted_replay_says_unfinished(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap.partial", live_messages())
     with (tmp_path / "estimates.csv.partial").open("w") as stream:
         write_rows(stream, [Row(file="0000.jpg", t_s=0.0), Row(file="0001.jpg", t_s=0.5)])
     assert "replay, unfinished" in page_of(tmp_path).text
 
 
-def test_a_flight_without_any_position(tmp_path: Path) -> None:
+def test_the_report_of_a_flight_without_position_says_so(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", [origin(), frame(0), frame(1)])
     assert "No frame was localised" in page_of(tmp_path).text
 
 
-def test_a_single_frame(tmp_path: Path) -> None:
+def test_a_flight_of_a_single_frame_has_a_report(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", live_messages(2)[:6])
     page_of(tmp_path)
 
 
-def test_names_of_files_are_text_not_markup(tmp_path: Path) -> None:
+def test_file_names_are_escaped_in_the_report(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", [origin(), frame(0, "</script><script>alert(1)</script>.jpg")])
     text = report(tmp_path).read_text(encoding="utf-8")
     assert "<script>alert" not in text
 
 
-def test_a_folder_without_a_flight(tmp_path: Path) -> None:
+def test_a_folder_without_a_flight_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no flight record"):
         report(tmp_path)
     with pytest.raises(SourceError, match="no such folder"):
@@ -118,12 +122,12 @@ def test_a_folder_without_a_flight(tmp_path: Path) -> None:
         report(tmp_path)
 
 
-def test_ticks_are_round_and_inside() -> None:
+def test_chart_ticks_are_round_and_inside_the_range() -> None:
     assert ticks(0.0, 100.0, 5) == [0, 20, 40, 60, 80, 100]
     assert ticks(0.0, 178.5, 9, sixties=True) == [0, 30, 60, 90, 120, 150]
     assert ticks(0.5, 60.0, 5, log=True) == [0.5, 1, 2, 5, 10, 20, 50]
 
 
-def test_clock_and_spans() -> None:
+def test_clock_texts_and_state_spans() -> None:
     assert [clock(t) for t in (0, 75, 3725)] == ["0:00", "1:15", "1:02:05"]
     assert spans_of([(0, "a"), (1, "a"), (2, "b")], 5) == [(0, 2, "a"), (2, 5, "b")]

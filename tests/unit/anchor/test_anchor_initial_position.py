@@ -1,4 +1,4 @@
-"""A start from GNSS at the anchor, which has the map; and all the way, from the receiver to the estimate."""
+"""Initial position from GNSS: check in the anchor, which has the map, and the whole chain from receiver to estimate."""
 
 from typing import Any
 
@@ -6,8 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from ground import PINHOLE, texture, view
-from one_place import ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
+from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
 from terrafix import messages as m
 from terrafix.anchor.node import AnchorNode
 from terrafix.core.frames import MemoryFrameStore
@@ -15,8 +14,9 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.estimator.node import EstimatorNode
 from terrafix.link.node import LinkNode
 from terrafix.runtime.executor import InProcessShell
-from terrafix.runtime.inbox import fold_prediction
+from terrafix.runtime.inbox import merge_predictions
 from terrafix_engines.features.gradient import GradientDescriber
+from textured_ground import PINHOLE, texture, view
 
 FRAME = LocalFrame(ORIGIN.lat_deg, ORIGIN.lon_deg)
 UNKNOWN = msgspec.structs.replace(ORIGIN, start_sigma_m=5000.0)
@@ -25,8 +25,8 @@ PLACE_M = (40.0, -30.0)
 S = 1_000_000_000
 
 
-class Place(OnlyMap):
-    """Whose ground is high, and of which this is all."""
+class Place(SingleMapPackage):
+    """A map of elevated ground that covers only this place."""
 
     def covers_start(self, lat_deg: float, lon_deg: float, sigma_m: float) -> bool:
         assert sigma_m == SIGMA_M
@@ -53,16 +53,16 @@ def gnss_start(t_ns: int, at_m: tuple[float, float] | None = PLACE_M) -> m.GnssS
     return m.GnssStart(t_ns=t_ns, lat_deg=lat_deg, lon_deg=lon_deg, sigma_m=sigma_m, receiver=0)
 
 
-def test_it_is_answered_with_the_ground_of_the_map_and_every_time(ground: np.ndarray) -> None:
+def test_every_gnss_start_is_answered_with_the_ground_height_of_the_map(ground: np.ndarray) -> None:
     node, _ = anchor(ground)
-    said = gnss_start(S)
-    (answer,) = node.on(said)
-    place = {"lat_deg": said.lat_deg, "lon_deg": said.lon_deg, "sigma_m": SIGMA_M, "ground_amsl_m": GROUND_M}
+    start = gnss_start(S)
+    (answer,) = node.on(start)
+    place = {"lat_deg": start.lat_deg, "lon_deg": start.lon_deg, "sigma_m": SIGMA_M, "ground_amsl_m": GROUND_M}
     assert answer == m.Start(t_ns=S, verdict=m.Verdict.ACCEPTED, **place)  # type: ignore[arg-type]
-    assert list(node.on(said)) == [answer]  # whoever missed it hears it now
+    assert list(node.on(start)) == [answer]  # repeated for subscribers that missed it
 
 
-def test_a_place_beside_the_map_is_no_start_and_takes_the_one_before_with_it(ground: np.ndarray) -> None:
+def test_a_gnss_start_outside_the_map_is_rejected_and_invalidates_the_previous_one(ground: np.ndarray) -> None:
     node, _ = anchor(ground)
     list(node.on(gnss_start(S)))
     (answer,) = node.on(gnss_start(2 * S, (SIDE_M, 0.0)))
@@ -73,7 +73,7 @@ def test_a_place_beside_the_map_is_no_start_and_takes_the_one_before_with_it(gro
     assert (withdrawn.verdict, withdrawn.lat_deg, withdrawn.sigma_m) == (m.Verdict.ACCEPTED, None, None)
 
 
-def test_the_first_prediction_from_a_start_ends_the_search(ground: np.ndarray) -> None:
+def test_the_first_prediction_based_on_a_start_ends_the_search(ground: np.ndarray) -> None:
     node, frames = anchor(ground)
     list(node.on(UNKNOWN))
     steps = []
@@ -85,7 +85,9 @@ def test_the_first_prediction_from_a_start_ends_the_search(ground: np.ndarray) -
     assert steps == [(False, m.SearchStep.WHOLE_MAP), (True, m.SearchStep.NORMAL), (True, m.SearchStep.NORMAL)]
 
 
-def test_an_estimator_that_forgot_the_start_does_not_take_the_place_from_the_anchor(ground: np.ndarray) -> None:
+def test_a_prediction_without_prior_time_after_an_estimator_restart_does_not_reset_the_anchor(
+    ground: np.ndarray,
+) -> None:
     node, frames = anchor(ground)
     list(node.on(UNKNOWN))
     for frame_id, sigma_m, start_ns in ((1, 10.0, S), (2, 100.0, 0)):
@@ -94,42 +96,47 @@ def test_an_estimator_that_forgot_the_start_does_not_take_the_place_from_the_anc
         assert isinstance(match, m.MapMatch) and match.verdict is m.Verdict.ACCEPTED
 
 
-def test_a_start_is_not_lost_where_only_the_newest_prediction_counts() -> None:
-    folded = fold_prediction(predicted(1, 100.0), predicted(2, 10.0, start_ns=S))
-    assert isinstance(folded, m.Prediction) and folded.start_ns == S
+def test_merged_predictions_are_the_newer_one_with_the_steps_of_both() -> None:
+    older, newer = predicted(1, 100.0, step_m=3.0), predicted(2, 10.0, step_m=4.0, start_ns=S)
+    newer = msgspec.structs.replace(newer, lens=0.01)
+    merged = merge_predictions(older, newer)
+    assert isinstance(merged, m.Prediction)
+    assert merged.step_m == tuple(a + b for a, b in zip(older.step_m, newer.step_m, strict=True))
+    assert merged.step_cov_m2 == tuple(a + b for a, b in zip(older.step_cov_m2, newer.step_cov_m2, strict=True))
+    assert msgspec.structs.replace(merged, step_m=newer.step_m, step_cov_m2=newer.step_cov_m2) == newer
 
 
-def test_from_the_receiver_to_the_estimate(ground: np.ndarray) -> None:
-    """The nodes that fly, of a copter that stands, is armed, and whose receiver is led astray afterwards."""
-    said: list[m.Message] = []
+def test_a_gnss_start_reaches_the_estimate_through_link_anchor_and_estimator(ground: np.ndarray) -> None:
+    """Nodes of the flight stack with a copter that stands, is armed, and whose receiver is spoofed afterwards."""
+    messages: list[m.Message] = []
     nodes = {"link": LinkNode(10.0), "anchor": anchor(ground)[0], "estimator": EstimatorNode()}
-    shell = InProcessShell(nodes, lambda _, message: said.append(message))
+    shell = InProcessShell(nodes, lambda _, message: messages.append(message))
     shell.feed(UNKNOWN)
     for step in range(200):
         t_ns, armed = step * S // 10, step >= 100
         state = {"yaw_rad": 0.0, "pitch_rad": 0.0, "roll_rad": 0.0, "agl_m": 0.3, "armed": armed}
         attitude = m.VehicleState(t_ns=t_ns, source="mavlink", **state)  # type: ignore[arg-type]
-        nodes["link"].on(attitude)  # its edge's words reach the node of its own process too
+        nodes["link"].on(attitude)  # messages of the link's edge also reach the node of the same process
         shell.feed(attitude)
         if step % 2 == 0:
             lat_deg, lon_deg = FRAME.to_wgs84(PLACE_M[0] + 500.0 * armed, PLACE_M[1])
             receiver = {"receiver": 0, "fix_type": 3, "horizontal_m": SIGMA_M, "speed_mps": 0.1, "satellites": 12}
             reading = m.GnssReading(t_ns=t_ns, lat_deg=lat_deg, lon_deg=lon_deg, **receiver)  # type: ignore[arg-type]
             for answer in nodes["link"].on(reading):
-                said.append(answer)
+                messages.append(answer)
                 shell.feed(answer)
         if step % 5 == 0:
             shell.feed(m.Odometry(t_ns=t_ns, frame_id=step, keyframe_id=step, verdict=m.Verdict.NO_FEATURES))
         shell.tick(t_ns)
-    found = [x for x in said if isinstance(x, m.NavEstimate)]
-    assert min(estimate.cov[0] for estimate in found if estimate.t_ns < 5 * S) > 4900.0**2  # nobody had said it
+    found = [x for x in messages if isinstance(x, m.NavEstimate)]
+    assert min(estimate.cov[0] for estimate in found if estimate.t_ns < 5 * S) > 4900.0**2  # before the GNSS start
     for estimate in (x for x in found if 5 * S <= x.t_ns < 10 * S):
         at_m = FRAME.to_local(estimate.lat_deg, estimate.lon_deg)
         assert at_m == pytest.approx(PLACE_M, abs=0.1) and estimate.cov[0] < (1.2 * SIGMA_M) ** 2
         assert estimate.alt_amsl_m == pytest.approx(GROUND_M + 0.3, abs=1.0)
-    last = found[-1]  # ten seconds after arming, without a picture
+    last = found[-1]  # ten seconds after arming, without a frame
     off_m = np.hypot(*np.subtract(FRAME.to_local(last.lat_deg, last.lon_deg), PLACE_M))
     assert off_m < 1.0
-    texts = [x.text for x in said if isinstance(x, m.StatusText) and "GNSS" in x.text]
+    texts = [x.text for x in messages if isinstance(x, m.StatusText) and "GNSS" in x.text]
     assert texts == ["Terrafix: start from GNSS, 2 m"]
-    assert any(x.fix_type == 3 for x in said if isinstance(x, m.GpsInput))
+    assert any(x.fix_type == 3 for x in messages if isinstance(x, m.GpsInput))

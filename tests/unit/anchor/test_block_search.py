@@ -1,15 +1,15 @@
-"""One frame against a region of the map: the same measurement as the exact correlation, in blocks."""
+"""Block correlation of a frame with a region of the map, compared with the exact correlation."""
 
 import numpy as np
 import pytest
 
-from ground import PINHOLE, FlatMap, rotation, texture, view
 from terrafix.anchor.matching.descriptor_cache import MapFeatures
-from terrafix.anchor.matching.ncc import Searchable, standardise
+from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, rectify
-from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, WideSearch, blocks_of
+from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, BlockCorrelator, blocks_of
 from terrafix.core.geodesy import local_rotation_up
 from terrafix_engines.features.gradient import GradientDescriber
+from textured_ground import PINHOLE, FlatMap, rotation, texture, view
 
 AGL_M, CELL_M = 100.0, 2.0
 TRUE_M = np.array([62.0, -81.0, AGL_M])
@@ -23,14 +23,14 @@ def ground() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def search(ground: np.ndarray) -> WideSearch:
-    return WideSearch(FlatMap(ground), GradientDescriber())
+def correlator(ground: np.ndarray) -> BlockCorrelator:
+    return BlockCorrelator(FlatMap(ground), GradientDescriber())
 
 
-def seen(ground: np.ndarray, turn_deg: float = 0.0, scale: float = 1.0) -> Rectified:
-    """The frame, rectified as if heading and height were off by this."""
-    picture = view(ground, PINHOLE, TRUE_R, TRUE_M)
-    frame = rectify(picture, PINHOLE, local_rotation_up(np.radians(turn_deg)) @ TRUE_R, AGL_M * scale, CELL_M)
+def rectified_frame(ground: np.ndarray, turn_deg: float = 0.0, scale: float = 1.0) -> Rectified:
+    """The frame, rectified with an error of yaw and scale."""
+    camera_image = view(ground, PINHOLE, TRUE_R, TRUE_M)
+    frame = rectify(camera_image, PINHOLE, local_rotation_up(np.radians(turn_deg)) @ TRUE_R, AGL_M * scale, CELL_M)
     assert frame is not None
     return frame
 
@@ -40,52 +40,52 @@ def place_of(block: Block, z: np.ndarray) -> tuple[float, float]:
     return (block.column + c) * CELL_M, -(block.row + r) * CELL_M
 
 
-def test_the_place_stands_out(ground: np.ndarray, search: WideSearch) -> None:
-    (look,) = search.look([search.describe(seen(ground))], [HERE], CELL_M)
-    assert place_of(HERE, look.correlation) == pytest.approx(tuple(TRUE_M[:2]), abs=2 * CELL_M)
-    assert np.nanmax(standardise(look.correlation)) > 5.0
+def test_the_place_stands_out(ground: np.ndarray, correlator: BlockCorrelator) -> None:
+    (result,) = correlator.correlate([correlator.describe(rectified_frame(ground))], [HERE], CELL_M)
+    assert place_of(HERE, result.correlation) == pytest.approx(tuple(TRUE_M[:2]), abs=2 * CELL_M)
+    assert np.nanmax(standardise(result.correlation)) > 5.0
 
 
-def test_it_measures_what_the_exact_correlation_measures(ground: np.ndarray, search: WideSearch) -> None:
-    frame = seen(ground)
-    (look,) = search.look([search.describe(frame)], [HERE], CELL_M)
+def test_block_correlation_approximates_the_exact_correlation(ground: np.ndarray, correlator: BlockCorrelator) -> None:
+    frame = rectified_frame(ground)
+    (result,) = correlator.correlate([correlator.describe(frame)], [HERE], CELL_M)
     height, width = (BLOCK_CELLS + side for side in frame.mask.shape)
     e_m, n_m = HERE.column * CELL_M + frame.e_min_m, -HERE.row * CELL_M + frame.n_max_m
     window, valid, e_m, n_m = MapFeatures(FlatMap(ground), GradientDescriber()).window(e_m, n_m, width, height, CELL_M)
-    exact = standardise(Searchable(window, valid).search(search.describe(frame).descriptors, frame.mask))
+    exact = standardise(CorrelationWindow(window, valid).correlate(correlator.describe(frame).descriptors, frame.mask))
     exact = exact[:BLOCK_CELLS, :BLOCK_CELLS]
-    z = standardise(look.correlation)
+    z = standardise(result.correlation)
     both = np.isfinite(exact) & np.isfinite(z)
     assert both.mean() > 0.1
     assert np.corrcoef(exact[both], z[both])[0, 1] > 0.95
     assert np.nanmax(z) == pytest.approx(float(np.nanmax(exact)), rel=0.25)
 
 
-def test_it_says_which_heading_and_scale_fit(ground: np.ndarray, search: WideSearch) -> None:
+def test_the_index_gives_the_best_yaw_and_scale(ground: np.ndarray, correlator: BlockCorrelator) -> None:
     tried = [(-20.0, 1.0), (0.0, 0.8), (0.0, 1.0), (20.0, 1.0)]
-    (look,) = search.look([search.describe(seen(ground, *t)) for t in tried], [HERE], CELL_M)
-    best = np.unravel_index(int(np.nanargmax(look.correlation)), look.correlation.shape)
-    assert tried[int(look.index[best])] == (0.0, 1.0)
+    (result,) = correlator.correlate([correlator.describe(rectified_frame(ground, *t)) for t in tried], [HERE], CELL_M)
+    best = np.unravel_index(int(np.nanargmax(result.correlation)), result.correlation.shape)
+    assert tried[int(result.index[best])] == (0.0, 1.0)
 
 
-def test_more_templates_than_are_held_at_a_time(
-    ground: np.ndarray, search: WideSearch, monkeypatch: pytest.MonkeyPatch
+def test_templates_in_several_chunks_give_the_same_result(
+    ground: np.ndarray, correlator: BlockCorrelator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    templates = [search.describe(seen(ground, t)) for t in (-20.0, 0.0, 20.0)]
-    (whole,) = search.look(templates, [HERE], CELL_M)
-    monkeypatch.setattr("terrafix.anchor.relocalization.block_search.AT_ONCE", 2)
-    (parted,) = search.look(templates, [HERE], CELL_M)
+    templates = [correlator.describe(rectified_frame(ground, t)) for t in (-20.0, 0.0, 20.0)]
+    (whole,) = correlator.correlate(templates, [HERE], CELL_M)
+    monkeypatch.setattr("terrafix.anchor.relocalization.block_search.CHUNK_TEMPLATES", 2)
+    (parted,) = correlator.correlate(templates, [HERE], CELL_M)
     assert np.array_equal(whole.correlation, parted.correlation, equal_nan=True) and np.array_equal(
         whole.index, parted.index
     )
 
 
-def test_off_the_map_nothing_is_known(ground: np.ndarray, search: WideSearch) -> None:
-    (look,) = search.look([search.describe(seen(ground))], [Block(5000, 5000)], CELL_M)
-    assert np.isnan(look.correlation).all()
+def test_blocks_off_the_map_are_nan(ground: np.ndarray, correlator: BlockCorrelator) -> None:
+    (result,) = correlator.correlate([correlator.describe(rectified_frame(ground))], [Block(5000, 5000)], CELL_M)
+    assert np.isnan(result.correlation).all()
 
 
-def test_what_lies_beside_the_map_is_not_described(ground: np.ndarray) -> None:
+def test_no_descriptors_are_computed_off_the_map(ground: np.ndarray) -> None:
     class Counting(GradientDescriber):
         described = 0
 

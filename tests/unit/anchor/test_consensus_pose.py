@@ -1,4 +1,4 @@
-"""A pose from all patches together: over ground that has changed and leans, and at wrong places none."""
+"""Consensus pose: found over ground that has changed and leans, rejected at wrong places."""
 
 from dataclasses import replace
 
@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
 from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.messages import Verdict
 from terrafix_engines.features.gradient import GradientDescriber
+from textured_ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
 
 AGL_M = 100.0
 SIDE_M = 400.0
@@ -19,14 +19,14 @@ TILT_SIGMA_RAD = float(np.radians(1.0))
 
 
 @pytest.fixture(scope="module")
-def agreed() -> ConsensusPose:
+def estimator() -> ConsensusPose:
     source = FlatMap(texture(8, SIDE_M))
     return ConsensusPose(source, FrameMatcher(PINHOLE, source, GradientDescriber()))  # type: ignore[arg-type]
 
 
-def changed(seed: int) -> np.ndarray:
-    """The ground of another year: half of it another ground, and what stands on it leans, blocks of 15 m together, by
-    3 m on each axis."""
+def changed_ground(seed: int) -> np.ndarray:
+    """Ground of another year: half of it is other ground, and its objects lean, blocks of 15 m together, by 3 m on each
+    axis."""
     ground, rng = (
         cv2.addWeighted(texture(8, SIDE_M), 0.5, texture(20 + seed, SIDE_M), 0.5, 0.0),
         np.random.default_rng(seed),
@@ -38,21 +38,24 @@ def changed(seed: int) -> np.ndarray:
     return cv2.remap(ground, x + dx, y + dy, cv2.INTER_LINEAR)
 
 
-def seen(ground: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, View]:
-    """A picture, where it was taken (3,), and what is believed of that."""
+def observation(ground: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, View]:
+    """An image, the camera position (3,), and the believed view."""
     rng = np.random.default_rng(100 + seed)
     here_m = np.array([*rng.uniform(-40.0, 40.0, 2), AGL_M])
     e_m, n_m = (float(v) for v in here_m[:2] + rng.normal(0.0, 3.0, 2))
-    believed = View(e_m, n_m, R, 1.02 * AGL_M, 0.0, float(np.radians(3.0)), 0.03, TILT_SIGMA_RAD)
-    return view(ground, PINHOLE, R, here_m), here_m, believed
+    believed_view = View(e_m, n_m, R, 1.02 * AGL_M, 0.0, float(np.radians(3.0)), 0.03, TILT_SIGMA_RAD)
+    return view(ground, PINHOLE, R, here_m), here_m, believed_view
 
 
-def test_over_changed_and_leaning_ground_there_is_a_pose_that_claims_what_it_is_worth(agreed: ConsensusPose) -> None:
-    """Mean NEES of three numbers over eight places is below 5.0 in 99 of 100 cases when claims are exact."""
+def test_over_changed_and_leaning_ground_the_pose_is_found_with_a_consistent_covariance(
+    estimator: ConsensusPose,
+) -> None:
+    """The mean NEES of three numbers over eight places is below 5.0 with a probability of 99 % if the covariance is
+    exact."""
     nees = []
     for seed in range(8):
-        picture, here_m, believed = seen(changed(seed), seed)
-        fix = agreed.at(picture, believed)
+        image, here_m, believed_view = observation(changed_ground(seed), seed)
+        fix = estimator.estimate(image, believed_view)
         assert fix is not None and fix.pnp.verdict is Verdict.ACCEPTED and fix.pnp.fit is not None
         fit = fix.pnp.fit
         off_m = fit.r_w_c.T @ (fit.p_c_in_w_m - here_m)
@@ -62,16 +65,16 @@ def test_over_changed_and_leaning_ground_there_is_a_pose_that_claims_what_it_is_
     assert np.mean(nees) < 5.0
 
 
-def test_at_wrong_places_there_is_none(agreed: ConsensusPose) -> None:
+def test_wrong_places_give_no_consensus_pose(estimator: ConsensusPose) -> None:
     for seed, away_m in enumerate([(60.0, -70.0), (50.0, 70.0), (-70.0, -60.0), (45.0, 0.0)]):
-        picture, _, believed = seen(texture(8, SIDE_M), seed)
-        wrong = replace(believed, e_m=believed.e_m + away_m[0], n_m=believed.n_m + away_m[1])
-        assert agreed.at(picture, wrong) is None
+        image, _, believed_view = observation(texture(8, SIDE_M), seed)
+        wrong = replace(believed_view, e_m=believed_view.e_m + away_m[0], n_m=believed_view.n_m + away_m[1])
+        assert estimator.estimate(image, wrong) is None
 
 
-def test_the_tilt_is_not_held_to_what_was_predicted(agreed: ConsensusPose) -> None:
-    """Whoever takes the pose knows the prediction already: told twice it would count twice."""
-    picture, _, believed = seen(texture(8, SIDE_M), 0)
-    fix = agreed.at(picture, replace(believed, tilt_sigma_rad=1e-4))
+def test_the_pose_has_no_tilt_prior(estimator: ConsensusPose) -> None:
+    """The consumer of the pose already uses the predicted tilt; with a tilt prior it would count twice."""
+    image, _, believed_view = observation(texture(8, SIDE_M), 0)
+    fix = estimator.estimate(image, replace(believed_view, tilt_sigma_rad=1e-4))
     assert fix is not None and fix.pnp.fit is not None
     assert float(np.sqrt(fix.pnp.fit.cov[:2, :2].diagonal().min())) > 1e-3

@@ -1,4 +1,4 @@
-"""Transforms against NumPy's."""
+"""Spectra compared with NumPy's."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from terrafix.anchor.matching.fft import spectra, transform_shape
 
 
 @pytest.mark.parametrize(("height", "width"), [(90, 90), (33, 64), (1, 7), (250, 121)])
-def test_a_transform_is_numpys_of_what_is_padded(height: int, width: int) -> None:
+def test_spectra_equal_numpys_rfft2_with_zero_padding(height: int, width: int) -> None:
     x = np.random.default_rng(height).normal(size=(3, 2, height, width)).astype(np.float32)
     shape = transform_shape(height, width)
     assert shape[0] >= height and shape[1] >= width and shape[0] % 2 == shape[1] % 2 == 0

@@ -1,9 +1,9 @@
-"""Correlation of dense descriptors: the right place to a cell, silence off the map, no faith in flat ground."""
+"""Normalised correlation of dense descriptors: exact position, NaN off the map, no amplification of flat ground."""
 
 import numpy as np
 import pytest
 
-from terrafix.anchor.matching.ncc import Searchable, standardise
+from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 
 
 def descriptors(seed: int, channels: int = 4, height: int = 120, width: int = 150) -> np.ndarray:
@@ -18,27 +18,27 @@ def test_a_known_shift_is_found_to_the_cell(row: int, column: int) -> None:
     window = descriptors(1)
     noise = np.random.default_rng(2).normal(0.0, 0.7, (4, 30, 40))
     template = (window[:, row : row + 30, column : column + 40] + noise).astype(np.float32)
-    surface = Searchable(window, np.ones(window.shape[1:], bool)).search(template, WHOLE)
+    surface = CorrelationWindow(window, np.ones(window.shape[1:], bool)).correlate(template, WHOLE)
     assert surface.shape == (91, 111)
     assert np.unravel_index(int(np.argmax(surface)), surface.shape) == (row, column)
     assert 0.6 < surface.max() <= 1.0 and surface.min() >= -1.0
     assert standardise(surface).max() > 8.0
 
 
-def test_perfect_agreement_is_one_whatever_the_brightness() -> None:
+def test_perfect_agreement_is_one_independent_of_brightness() -> None:
     window = descriptors(3)
     template = 3.0 * window[:, 20:50, 30:70] + 2.0
-    surface = Searchable(window, np.ones(window.shape[1:], bool)).search(template, WHOLE)
+    surface = CorrelationWindow(window, np.ones(window.shape[1:], bool)).correlate(template, WHOLE)
     assert float(surface[20, 30]) == pytest.approx(1.0, abs=1e-3)
-    opposite = Searchable(window, np.ones(window.shape[1:], bool)).search(-template, WHOLE)
+    opposite = CorrelationWindow(window, np.ones(window.shape[1:], bool)).correlate(-template, WHOLE)
     assert float(opposite[20, 30]) == pytest.approx(-1.0, abs=1e-3)
 
 
-def test_it_is_what_a_plain_sum_says() -> None:
+def test_the_fft_result_equals_direct_summation() -> None:
     window, rng = descriptors(4, 3, 40, 50), np.random.default_rng(5)
     mask = rng.random((12, 15)) > 0.3
     template = rng.normal(size=(3, 12, 15)).astype(np.float32)
-    surface = Searchable(window, np.ones((40, 50), bool)).search(template, mask)
+    surface = CorrelationWindow(window, np.ones((40, 50), bool)).correlate(template, mask)
     for row, column in ((0, 0), (11, 20), (28, 35)):
         here = window[:, row : row + 12, column : column + 15][:, mask]
         mine = template[:, mask]
@@ -48,59 +48,59 @@ def test_it_is_what_a_plain_sum_says() -> None:
         )
 
 
-def test_what_is_masked_does_not_count() -> None:
+def test_masked_cells_do_not_count() -> None:
     window = descriptors(6)
     template = window[:, 40:70, 60:100].copy()
     mask = WHOLE.copy()
     mask[:10] = False
-    template[:, :10] = 50.0  # a black bar, a wing, the edge of the frame
-    surface = Searchable(window, np.ones(window.shape[1:], bool)).search(template, mask)
+    template[:, :10] = 50.0  # an unmasked bar of large values, such as a wing or the edge of the frame
+    surface = CorrelationWindow(window, np.ones(window.shape[1:], bool)).correlate(template, mask)
     assert np.unravel_index(int(np.argmax(surface)), surface.shape) == (40, 60)
 
 
-def test_off_the_map_is_not_a_number() -> None:
+def test_cells_off_the_map_are_nan() -> None:
     window, valid = descriptors(7), np.ones((120, 150), bool)
     valid[:, :60] = False
     window[:, ~valid] = 0.0
-    surface = Searchable(window, valid).search(window[:, 50:80, 100:140], WHOLE)
+    surface = CorrelationWindow(window, valid).correlate(window[:, 50:80, 100:140], WHOLE)
     assert np.isnan(surface[:, :40]).all()  # less than 60 % on the map
     assert np.isfinite(surface[:, 61:]).all()
     assert np.unravel_index(int(np.nanargmax(surface)), surface.shape) == (50, 100)
-    nowhere = Searchable(np.zeros_like(window), np.zeros_like(valid)).search(window[:, 50:80, 100:140], WHOLE)
+    nowhere = CorrelationWindow(np.zeros_like(window), np.zeros_like(valid)).correlate(window[:, 50:80, 100:140], WHOLE)
     assert np.isnan(nowhere).all()
 
 
 def test_flat_ground_is_not_amplified() -> None:
-    """Water beside land: noise a hundred times weaker than the template must not become a match."""
+    """Water beside land: noise a hundred times weaker than the template must not correlate."""
     window = descriptors(8)
     template = window[:, 20:50, 20:60].copy()
     window[:, :, 75:] = 0.01 * np.random.default_rng(9).normal(size=(4, 120, 75))
-    surface = Searchable(window, np.ones((120, 150), bool)).search(template, WHOLE)
+    surface = CorrelationWindow(window, np.ones((120, 150), bool)).correlate(template, WHOLE)
     assert np.abs(surface[:, 80:]).max() < 0.05
 
 
-def test_a_blank_frame_over_a_blank_map_agrees_with_nothing() -> None:
+def test_a_blank_frame_over_a_blank_map_has_no_correlation() -> None:
     window = np.zeros((4, 120, 150), np.float32)
-    blank = Searchable(window, np.ones((120, 150), bool)).search(np.zeros((4, 30, 40), np.float32), WHOLE)
+    blank = CorrelationWindow(window, np.ones((120, 150), bool)).correlate(np.zeros((4, 30, 40), np.float32), WHOLE)
     assert np.abs(np.nan_to_num(blank)).max() < 1e-3
 
 
-def test_standardised_chance_is_zero_and_one() -> None:
-    chance = np.random.default_rng(10).normal(0.02, 0.05, (200, 200)).astype(np.float32)
-    chance[:20] = np.nan
-    z = standardise(chance)
+def test_random_alignment_is_standardised_to_zero_mean_and_unit_sigma() -> None:
+    noise = np.random.default_rng(10).normal(0.02, 0.05, (200, 200)).astype(np.float32)
+    noise[:20] = np.nan
+    z = standardise(noise)
     assert np.isnan(z[:20]).all()
     assert (float(np.nanmedian(z)), float(np.nanstd(z))) == pytest.approx((0.0, 1.0), abs=0.05)
 
 
-def test_a_surface_with_many_lookalikes_has_no_high_peak() -> None:
+def test_a_surface_with_many_similar_places_has_no_high_peak() -> None:
     rng = np.random.default_rng(11)
     surface = rng.normal(0.0, 0.03, (200, 200)).astype(np.float32)
-    surface.ravel()[rng.choice(40_000, 800, replace=False)] = 0.5  # streets agree with many wrong places
+    surface.ravel()[rng.choice(40_000, 800, replace=False)] = 0.5  # streets that correlate with many wrong places
     assert standardise(surface).max() < 4.0
 
 
-def test_too_little_to_judge_by_is_not_a_number() -> None:
+def test_a_surface_with_few_finite_cells_is_nan() -> None:
     assert np.isnan(standardise(np.full((50, 50), np.nan, np.float32))).all()
     assert np.isnan(standardise(np.ones((5, 5), np.float32))).all()
-    assert np.isfinite(standardise(np.ones((50, 50), np.float32))).all()  # flat: nothing stands out
+    assert np.isfinite(standardise(np.ones((50, 50), np.float32))).all()  # a flat surface has no peak

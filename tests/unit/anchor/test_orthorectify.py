@@ -1,12 +1,12 @@
-"""The frame as the map would show it: aligned to a fraction of a pixel, whatever attitude and lens."""
+"""Orthorectification: alignment with the map to a fraction of a pixel for several attitudes and lenses."""
 
 import cv2
 import numpy as np
 import pytest
 
-from ground import LENS, PINHOLE, FlatMap, rotation, texture, view
 from terrafix.anchor.matching.orthorectify import footprint, rectify
 from terrafix.core.camera import CameraCalibration
+from textured_ground import LENS, PINHOLE, FlatMap, rotation, texture, view
 
 GSD_M = 0.5
 ATTITUDES = [(0.0, 0.0, 0.0), (137.0, 0.0, 0.0), (20.0, 12.0, -9.0), (-75.0, -6.0, 15.0)]
@@ -19,7 +19,9 @@ def ground() -> np.ndarray:
 
 @pytest.mark.parametrize("camera", [PINHOLE, LENS])
 @pytest.mark.parametrize("attitude", ATTITUDES)
-def test_it_lies_on_the_map(ground: np.ndarray, camera: CameraCalibration, attitude: tuple[float, ...]) -> None:
+def test_the_orthorectified_frame_is_aligned_with_the_map(
+    ground: np.ndarray, camera: CameraCalibration, attitude: tuple[float, ...]
+) -> None:
     r, p = rotation(*attitude), np.array([14.3, -22.7, 90.0])
     flat = rectify(view(ground, camera, r, p), camera, r, 90.0, GSD_M)
     assert flat is not None
@@ -42,17 +44,18 @@ def test_it_lies_on_the_map(ground: np.ndarray, camera: CameraCalibration, attit
     assert np.linalg.norm(np.median(shifts, axis=0)) < 0.15
     assert np.median(np.linalg.norm(shifts, axis=1)) < 0.5
     difference = np.abs(flat.image.astype(float) - shown)[inner].mean()
-    assert difference < 6.0  # grey levels, of a picture whose contrast is 50
+    assert difference < 6.0  # grey levels, for an image with a contrast of 50
 
 
-def test_the_mask_is_what_the_camera_saw(ground: np.ndarray) -> None:
+def test_the_mask_covers_the_visible_ground(ground: np.ndarray) -> None:
     r, p = rotation(45.0), np.array([0.0, 0.0, 90.0])
     flat = rectify(view(ground, PINHOLE, r, p), PINHOLE, r, 90.0, GSD_M)
     assert flat is not None
     seen_m2 = flat.mask.sum() * GSD_M**2
     true_m2 = (PINHOLE.width - 1) * (PINHOLE.height - 1) * (90.0 / PINHOLE.fx) ** 2
     assert seen_m2 == pytest.approx(true_m2, rel=0.02)
-    assert not flat.mask[0, 0] and not flat.mask[-1, -1]  # the corners of the box are beyond a turned frame
+    # the corners of the bounding box lie outside of a rotated frame
+    assert not flat.mask[0, 0] and not flat.mask[-1, -1]
 
 
 @pytest.mark.parametrize("stride", [1, 8])
@@ -70,13 +73,13 @@ def test_the_footprint_is_that_of_a_pinhole() -> None:
 
 
 @pytest.mark.parametrize("pitch_deg", [80.0, 120.0, 180.0])
-def test_no_ground_in_sight_is_none(pitch_deg: float) -> None:
+def test_without_visible_ground_the_result_is_none(pitch_deg: float) -> None:
     image = np.zeros((PINHOLE.height, PINHOLE.width, 3), np.uint8)
     assert footprint(PINHOLE, rotation(0.0, pitch_deg), 100.0) is None
     assert rectify(image, PINHOLE, rotation(0.0, pitch_deg), 100.0, GSD_M) is None
 
 
-def test_a_steep_view_stays_bounded() -> None:
+def test_an_oblique_view_has_a_bounded_footprint() -> None:
     image = np.full((PINHOLE.height, PINHOLE.width, 3), 128, np.uint8)
     flat = rectify(image, PINHOLE, rotation(0.0, 60.0), 100.0, GSD_M)
     assert flat is not None

@@ -1,9 +1,9 @@
-"""What the patches of a frame say for a place: under one motion of the camera, and against chance."""
+"""Patch consensus: evidence under one motion of the camera, for right, random and changed ground."""
 
 import numpy as np
 import pytest
 
-from terrafix.anchor.verification.patch_consensus import agreement
+from terrafix.anchor.verification.patch_consensus import estimate_consensus
 
 CELL = 0.01  # of the height
 REACH = 16
@@ -13,8 +13,8 @@ GROUND = np.array([(x, y) for x in ACROSS for y in 0.7 * ACROSS])
 
 
 def moved(motion: tuple[float, ...]) -> np.ndarray:
-    """Where the ground at GROUND comes to lie, (N, 2), for a motion (east, north, heading, scale, tilt, tilt): by
-    projecting it, not by a Jacobian."""
+    """(N, 2): offsets of the ground at GROUND for a motion (east, north, yaw, scale, tilt, tilt), by projection instead
+    of a Jacobian."""
     east, north, yaw, scale, tilt_e, tilt_n = motion
     turned = (1.0 + scale) * GROUND @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     rays = np.column_stack([turned, -np.ones(len(turned))])
@@ -26,8 +26,8 @@ def moved(motion: tuple[float, ...]) -> np.ndarray:
 
 
 def surfaces(offsets: np.ndarray, right: np.ndarray, seed: int = 1, height: float = 4.0) -> np.ndarray:
-    """Smooth noise as wrong places give it, with a peak at ``offsets`` (N, 2), of so many standard deviations, for the
-    patches that are ``right``."""
+    """Smooth noise as at wrong places; the patches in ``right`` have a peak of ``height`` standard deviations at
+    ``offsets`` (N, 2)."""
     rng, side = np.random.default_rng(seed), 2 * REACH + 1
     rows, columns = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1] * CELL
     out = np.zeros((len(offsets), side, side))
@@ -56,26 +56,26 @@ ALL, NONE = np.ones(len(GROUND), bool), np.zeros(len(GROUND), bool)
 )
 def test_the_motion_is_found(motion: tuple[float, ...]) -> None:
     offsets = moved(motion)
-    found = agreement(surfaces(offsets, ALL), GROUND, CELL, TILT_SIGMA)
-    assert found.agrees.mean() > 0.8
+    found = estimate_consensus(surfaces(offsets, ALL), GROUND, CELL, TILT_SIGMA)
+    assert found.inliers.mean() > 0.8
     assert np.median(np.linalg.norm(found.offsets - offsets, axis=1)) < 1.5 * CELL
     assert found.motion[2:4] == pytest.approx(motion[2:4], abs=0.015)
     assert found.motion[:2] + found.motion[4:] == pytest.approx(np.add(motion[:2], motion[4:]), abs=0.015)
 
 
-def test_clear_peaks_are_found_where_they_are() -> None:
-    """Around them several cells are worth the most that a patch can be."""
+def test_clear_peaks_are_located_without_bias() -> None:
+    """Around a clear peak several cells reach the bound of one patch's evidence."""
     offsets = moved((0.03, 0.02, 0.0, 0.0, 0.0, 0.0))
-    found = agreement(surfaces(offsets, ALL, height=12.0), GROUND, CELL, TILT_SIGMA)
+    found = estimate_consensus(surfaces(offsets, ALL, height=12.0), GROUND, CELL, TILT_SIGMA)
     assert np.abs((found.offsets - offsets).mean(0)).max() < 0.15 * CELL
     assert found.motion[:2] == pytest.approx((0.03, 0.02), abs=0.15 * CELL)
 
 
-def test_chance_says_little_and_ground_that_has_changed_takes_away_only_its_own_share() -> None:
+def test_random_surfaces_give_little_evidence_and_changed_ground_removes_only_its_share() -> None:
     offsets = moved((0.03, 0.02, 0.04, 0.02, 0.0, 0.0))
     half = GROUND[:, 0] + GROUND[:, 1] > 0.0
     right, changed, wrong = (
-        [agreement(surfaces(offsets, which, seed), GROUND, CELL, TILT_SIGMA).llr for seed in range(5)]
+        [estimate_consensus(surfaces(offsets, which, seed), GROUND, CELL, TILT_SIGMA).llr for seed in range(5)]
         for which in (ALL, half, NONE)
     )
     assert min(right) > 2.0 * max(wrong)

@@ -1,13 +1,13 @@
-"""Patches of a frame found on the map: to a fraction of a cell, and only where the answer is unique."""
+"""Patch matcher: sub-cell accuracy, and no match where the maximum is not unique."""
 
 import numpy as np
 import pytest
 
-from ground import PINHOLE, FlatMap, rotation, texture, view
 from terrafix.anchor.matching.descriptor_cache import MapFeatures
 from terrafix.anchor.matching.orthorectify import rectify
 from terrafix.anchor.matching.patch_matcher import PatchMatches, match_patches
 from terrafix_engines.features.gradient import GradientDescriber
+from textured_ground import PINHOLE, FlatMap, rotation, texture, view
 
 AGL_M = 100.0
 GSD_M = 0.5
@@ -48,7 +48,7 @@ def test_a_shift_is_found_to_a_fraction_of_a_cell(ground: np.ndarray, shift_m: t
     assert (found.weight > 0).all() and (found.weight <= 1).all()
 
 
-def test_where_the_camera_is_expected_does_not_matter_within_reach(ground: np.ndarray) -> None:
+def test_the_result_does_not_depend_on_the_predicted_position_within_the_search_radius(ground: np.ndarray) -> None:
     found = matched(ground, FlatMap(ground), (float(HERE_M[0]) + 2.7, float(HERE_M[1]) - 3.3))
     offsets = found.map_m - (found.frame_m + HERE_M[:2])
     assert len(offsets) >= 12
@@ -60,22 +60,22 @@ def test_patches_come_from_all_over_the_frame(ground: np.ndarray) -> None:
     assert (np.ptp(found.frame_m, axis=0) > (60.0, 30.0)).all()
 
 
-def test_another_place_matches_hardly_anywhere(ground: np.ndarray) -> None:
+def test_another_place_gives_few_and_inconsistent_matches(ground: np.ndarray) -> None:
     right = matched(ground, FlatMap(ground), (float(HERE_M[0]), float(HERE_M[1])))
     wrong = matched(ground, FlatMap(texture(77, 360.0)), (float(HERE_M[0]), float(HERE_M[1])))
     assert len(wrong.weight) < 0.7 * len(right.weight)
     if len(wrong.weight):
         assert wrong.weight.mean() < 0.5 * right.weight.mean()
         scatter = wrong.map_m - (wrong.frame_m + HERE_M[:2])
-        assert np.ptp(scatter, axis=0).max() > 2.0  # what is found does not agree
+        assert np.ptp(scatter, axis=0).max() > 2.0  # the matches are inconsistent
 
 
-def test_off_the_map_there_is_nothing(ground: np.ndarray) -> None:
+def test_patches_off_the_map_give_no_match(ground: np.ndarray) -> None:
     found = matched(ground, FlatMap(ground, (900.0, 0.0)), (float(HERE_M[0]), float(HERE_M[1])))
     assert found.frame_m.shape == (0, 2) and found.map_m.shape == (0, 2) and len(found.weight) == 0
 
 
-def test_ground_without_texture_gives_nothing() -> None:
+def test_ground_without_texture_gives_no_match() -> None:
     water = np.full((1440, 1440, 3), 90, np.uint8)
     found = matched(water, FlatMap(water), (float(HERE_M[0]), float(HERE_M[1])))
     assert len(found.weight) == 0

@@ -1,4 +1,4 @@
-"""A place that a search proposes, checked with one frame: evidence and pose, right and wrong."""
+"""Place verifier: evidence and pose at right and wrong places."""
 
 from dataclasses import replace
 
@@ -7,19 +7,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
-from terrafix.anchor.matching.match_message import found as said_found
+from terrafix.anchor.matching.match_message import relocalized_match
 from terrafix.anchor.relocalization.hypothesis_tracker import LLR_MAX, evidence
 from terrafix.anchor.verification.patch_null import PatchNull
-from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_PER_AGL, Checked, PlaceCheck
+from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_CELL_PER_AGL, PlaceVerifier, VerifiedPlace
 from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
+from textured_ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
 
 AGL_M = 100.0
 HEADING_DEG = 40.0
 HERE_M = np.array([-20.0, 30.0, AGL_M])
-PROPOSED = View(
+PROPOSED_VIEW = View(
     float(HERE_M[0]) + 5.0,
     float(HERE_M[1]) - 4.0,
     rotation(HEADING_DEG + 5.0),
@@ -32,54 +32,58 @@ PROPOSED = View(
 
 
 @pytest.fixture(scope="module")
-def check() -> PlaceCheck:
+def verifier() -> PlaceVerifier:
     source = FlatMap(texture(8, 400.0))
-    return PlaceCheck(source, FrameMatcher(PINHOLE, source, GradientDescriber()))  # type: ignore[arg-type]
+    return PlaceVerifier(source, FrameMatcher(PINHOLE, source, GradientDescriber()))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def picture() -> np.ndarray:
+def image() -> np.ndarray:
     return view(texture(8, 400.0), PINHOLE, rotation(HEADING_DEG), HERE_M)
 
 
-def at(check: PlaceCheck, picture: np.ndarray, proposed: View, cell_per_agl: float = CELL_PER_AGL) -> Checked:
-    found = check.at(picture, proposed, cell_per_agl)
+def verified_place(
+    verifier: PlaceVerifier, image: np.ndarray, proposed: View, cell_per_agl: float = CELL_PER_AGL
+) -> VerifiedPlace:
+    found = verifier.verify(image, proposed, cell_per_agl)
     assert found is not None
     return found
 
 
-@pytest.mark.parametrize("cell_per_agl", [CELL_PER_AGL, FINE_PER_AGL])
-def test_the_right_place_is_told_with_its_pose(check: PlaceCheck, picture: np.ndarray, cell_per_agl: float) -> None:
-    found = at(check, picture, PROPOSED, cell_per_agl)
-    assert evidence(PatchNull().sigmas(found.agreement, fine=cell_per_agl == FINE_PER_AGL)) == LLR_MAX
+@pytest.mark.parametrize("cell_per_agl", [CELL_PER_AGL, FINE_CELL_PER_AGL])
+def test_the_right_place_has_full_evidence_and_the_right_pose(
+    verifier: PlaceVerifier, image: np.ndarray, cell_per_agl: float
+) -> None:
+    found = verified_place(verifier, image, PROPOSED_VIEW, cell_per_agl)
+    assert evidence(PatchNull().sigmas(found.consensus, fine=cell_per_agl == FINE_CELL_PER_AGL)) == LLR_MAX
     pose = found.fix.pnp.fit
     assert pose is not None and found.fix.pnp.verdict is Verdict.ACCEPTED
     off_m = pose.p_c_in_w_m - HERE_M
-    # Place and tilt change places: five metres are three degrees.
+    # Position and tilt are correlated: five metres correspond to three degrees.
     assert np.linalg.norm(off_m) < 5.0
-    assert off_m[:2] @ np.linalg.solve(_position_cov(found), off_m[:2]) < 9.2  # 99 % of two numbers
+    assert off_m[:2] @ np.linalg.solve(_position_cov(found), off_m[:2]) < 9.2  # chi-square, 2 degrees of freedom, 99 %
 
 
-def _position_cov(found: Checked) -> np.ndarray:
+def _position_cov(found: VerifiedPlace) -> np.ndarray:
     fit = found.fix.pnp.fit
     assert fit is not None
     return np.asarray((fit.r_w_c @ fit.cov[3:, 3:] @ fit.r_w_c.T)[:2, :2])
 
 
 @pytest.mark.parametrize("away_m", [(60.0, -70.0), (50.0, 70.0), (-70.0, -60.0)])
-def test_wrong_places_come_to_what_chance_does(
-    check: PlaceCheck, picture: np.ndarray, away_m: tuple[float, float]
+def test_wrong_places_score_like_the_null_model(
+    verifier: PlaceVerifier, image: np.ndarray, away_m: tuple[float, float]
 ) -> None:
-    wrong = replace(PROPOSED, e_m=PROPOSED.e_m + away_m[0], n_m=PROPOSED.n_m + away_m[1])
-    assert evidence(PatchNull().sigmas(at(check, picture, wrong).agreement, fine=False)) < 2.0
+    wrong = replace(PROPOSED_VIEW, e_m=PROPOSED_VIEW.e_m + away_m[0], n_m=PROPOSED_VIEW.n_m + away_m[1])
+    assert evidence(PatchNull().sigmas(verified_place(verifier, image, wrong).consensus, fine=False)) < 2.0
 
 
-def test_off_the_map_there_is_nothing_to_check(check: PlaceCheck, picture: np.ndarray) -> None:
-    assert check.at(picture, replace(PROPOSED, e_m=900.0), CELL_PER_AGL) is None
+def test_a_place_off_the_map_is_not_verified(verifier: PlaceVerifier, image: np.ndarray) -> None:
+    assert verifier.verify(image, replace(PROPOSED_VIEW, e_m=900.0), CELL_PER_AGL) is None
 
 
 def leaning(ground: np.ndarray, seed: int) -> np.ndarray:
-    """The ground of another picture: what stands on it leans, whole blocks of 80 m together, by 2 m on each axis."""
+    """The ground in another image: its objects lean, blocks of 80 m together, by 2 m on each axis."""
     rng, side, blocks = np.random.default_rng(seed), len(ground), len(ground) * GSD_M / 80.0
     aside = [rng.normal(0.0, 2.0 / GSD_M, (round(blocks), round(blocks))).astype(np.float32) for _ in range(2)]
     dx, dy = (cv2.resize(a, (side, side), interpolation=cv2.INTER_LINEAR) for a in aside)
@@ -87,30 +91,42 @@ def leaning(ground: np.ndarray, seed: int) -> np.ndarray:
     return cv2.remap(ground, x + dx, y + dy, cv2.INTER_LINEAR)
 
 
-def test_what_is_found_claims_what_leaning_ground_takes_it_aside(check: PlaceCheck) -> None:
-    """Mean NEES of two numbers over twelve places is below 3.3 in 97.5 of 100 cases when claims are exact."""
+def test_the_covariance_of_a_relocalized_pose_covers_the_displacement_by_leaning_ground(
+    verifier: PlaceVerifier,
+) -> None:
+    """The mean NEES of two numbers over twelve places is below 3.3 with a probability of 97.5 % if the covariance is
+    exact."""
     ground, nees = texture(8, 400.0), []
     empty = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient")
     for seed in range(12):
         here_m = HERE_M.copy()
         here_m[:2] += np.random.default_rng(seed).uniform(-40.0, 40.0, 2)
-        picture = view(leaning(ground, seed), PINHOLE, rotation(HEADING_DEG), here_m)
-        proposed = replace(PROPOSED, e_m=float(here_m[0]) + 5.0, n_m=float(here_m[1]) - 4.0, tilt_sigma_rad=0.005)
-        fix = at(check, picture, proposed, FINE_PER_AGL).fix
+        image = view(leaning(ground, seed), PINHOLE, rotation(HEADING_DEG), here_m)
+        proposed = replace(PROPOSED_VIEW, e_m=float(here_m[0]) + 5.0, n_m=float(here_m[1]) - 4.0, tilt_sigma_rad=0.005)
+        fix = verified_place(verifier, image, proposed, FINE_CELL_PER_AGL).fix
         before = msgspec.structs.replace(empty, mode_e_m=proposed.e_m, mode_n_m=proposed.n_m)
-        said = said_found(before, fix, proposed, (0.0, 0.0))
-        assert said.verdict is Verdict.ACCEPTED and said.found and said.p_c_in_w_m is not None and said.cov is not None
-        off_m = np.array(said.p_c_in_w_m[:2]) - here_m[:2]
-        nees.append(off_m @ np.linalg.solve(np.array(said.cov).reshape(6, 6)[:2, :2], off_m))
-    assert np.mean(nees) < 3.3 and max(nees) < 13.8  # 99.9 % of one
+        match = relocalized_match(before, fix, proposed, (0.0, 0.0))
+        assert (
+            match.verdict is Verdict.ACCEPTED and match.found and match.p_c_in_w_m is not None and match.cov is not None
+        )
+        off_m = np.array(match.p_c_in_w_m[:2]) - here_m[:2]
+        nees.append(off_m @ np.linalg.solve(np.array(match.cov).reshape(6, 6)[:2, :2], off_m))
+    assert np.mean(nees) < 3.3 and max(nees) < 13.8  # 99.9 % of a single one
 
 
-def test_a_place_that_jumps_from_frame_to_frame_claims_as_little(check: PlaceCheck, picture: np.ndarray) -> None:
-    fix = at(check, picture, PROPOSED).fix
+def test_the_innovation_between_frames_is_added_to_the_covariance(verifier: PlaceVerifier, image: np.ndarray) -> None:
+    fix = verified_place(verifier, image, PROPOSED_VIEW).fix
     before = MapMatch(
-        t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", mode_e_m=PROPOSED.e_m, mode_n_m=PROPOSED.n_m
+        t_ns=0,
+        frame_id=0,
+        verdict=Verdict.LOST,
+        matcher="gradient",
+        mode_e_m=PROPOSED_VIEW.e_m,
+        mode_n_m=PROPOSED_VIEW.n_m,
     )
-    still, jumped = (said_found(before, fix, PROPOSED, jump_m).cov for jump_m in ((0.0, 0.0), (6.0, -8.0)))
+    still, jumped = (
+        relocalized_match(before, fix, PROPOSED_VIEW, innovation_m).cov for innovation_m in ((0.0, 0.0), (6.0, -8.0))
+    )
     assert still is not None and jumped is not None
     more = (np.array(jumped) - np.array(still)).reshape(6, 6)
     assert more[:2, :2] == pytest.approx(np.array([[36.0, -48.0], [-48.0, 64.0]]))

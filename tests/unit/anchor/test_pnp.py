@@ -1,12 +1,12 @@
-"""Pose from patches: right with many wrong ones among them, and no pose where there is none."""
+"""Pose from patch matches: right despite many wrong matches, none from random ones."""
 
 import numpy as np
 import pytest
 
-from ground import rotation
-from terrafix.anchor.matching.pnp import MIN_INLIERS, THRESHOLD, PnpResult, solve
+from terrafix.anchor.matching.pnp import INLIER_THRESHOLD, MIN_INLIERS, PnpResult, solve
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Verdict
+from textured_ground import rotation
 
 AGL_M = 100.0
 REACH = 0.08
@@ -15,25 +15,25 @@ R, P = rotation(35.0, 3.0, -5.0), np.array([40.0, -15.0, 250.0 + AGL_M])
 
 
 def scene(rng: np.random.Generator, count: int, relief_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) on the ground below and where the camera sees them (N, 2)."""
+    """Points (N, 3) on the ground and their normalised image coordinates (N, 2)."""
     points = np.column_stack([P[:2] + rng.uniform(-55.0, 55.0, (count, 2)), 250.0 + rng.uniform(0, relief_m, count)])
     in_c = (points - P) @ R
     return points, in_c[:, :2] / in_c[:, 2:] + rng.normal(0.0, SIGMA, (count, 2))
 
 
-def solved(points: np.ndarray, xy: np.ndarray, r: np.ndarray = R, reach: float = REACH) -> PnpResult:
-    return solve(points, xy, np.ones(len(xy)), r, AGL_M, SIGMA, THRESHOLD, reach)
+def solve_equal_weights(points: np.ndarray, xy: np.ndarray, r: np.ndarray = R, reach: float = REACH) -> PnpResult:
+    return solve(points, xy, np.ones(len(xy)), r, AGL_M, SIGMA, INLIER_THRESHOLD, reach)
 
 
 @pytest.mark.parametrize("relief_m", [0.0, 8.0])
 @pytest.mark.parametrize("seed", range(5))
-def test_the_pose_with_forty_per_cent_wrong(seed: int, relief_m: float) -> None:
+def test_the_pose_is_right_with_forty_per_cent_wrong_matches(seed: int, relief_m: float) -> None:
     rng = np.random.default_rng([seed, 3])
     points, xy = scene(rng, 45, relief_m)
     wrong = np.arange(45) < 18
     points[wrong, :2] += rng.uniform(-REACH, REACH, (18, 2)) * AGL_M + rng.choice([-5.0, 5.0], (18, 2))
     predicted = R @ exp_so3(rng.normal(0.0, 0.03, 3))
-    found = solved(points, xy, predicted)
+    found = solve_equal_weights(points, xy, predicted)
     assert found.verdict is Verdict.ACCEPTED and found.fit is not None
     assert np.linalg.norm(found.fit.p_c_in_w_m - P) < 2.0
     assert np.degrees(np.linalg.norm(log_so3(R.T @ found.fit.r_w_c))) < 1.2
@@ -43,51 +43,51 @@ def test_the_pose_with_forty_per_cent_wrong(seed: int, relief_m: float) -> None:
     assert error @ np.linalg.solve(found.fit.cov, error) < 22.5  # chi-square, 6 degrees of freedom, 99.9 %
 
 
-def test_large_coordinates_cost_nothing() -> None:
+def test_large_coordinates_do_not_reduce_precision() -> None:
     rng = np.random.default_rng(2)
     points, xy = scene(rng, 40, 0.0)
     away = np.array([20_000.0, -15_000.0, 0.0])
-    near, far = solved(points, xy), solved(points + away, xy)
+    near, far = solve_equal_weights(points, xy), solve_equal_weights(points + away, xy)
     assert near.fit is not None and far.fit is not None
     assert far.fit.p_c_in_w_m - away == pytest.approx(near.fit.p_c_in_w_m, abs=0.01)
 
 
 @pytest.mark.parametrize("count", [0, 3, MIN_INLIERS - 1])
-def test_few_matches_are_no_pose(count: int) -> None:
+def test_few_matches_give_no_pose(count: int) -> None:
     points, xy = scene(np.random.default_rng(1), count, 5.0)
-    found = solved(points, xy)
+    found = solve_equal_weights(points, xy)
     assert (found.verdict, found.fit) == (Verdict.FEW_INLIERS, None)
 
 
-def test_whoever_errs_more_often_is_asked_for_more_inliers() -> None:
+def test_the_required_number_of_inliers_is_an_argument() -> None:
     points, xy = scene(np.random.default_rng(1), 18, 5.0)
-    asked = (points, xy, np.ones(len(xy)), R, AGL_M, SIGMA, THRESHOLD, REACH)
-    assert solve(*asked).verdict is Verdict.ACCEPTED
-    assert solve(*asked, least=20).verdict is Verdict.FEW_INLIERS
+    arguments = (points, xy, np.ones(len(xy)), R, AGL_M, SIGMA, INLIER_THRESHOLD, REACH)
+    assert solve(*arguments).verdict is Verdict.ACCEPTED
+    assert solve(*arguments, min_inliers=20).verdict is Verdict.FEW_INLIERS
 
 
-def test_of_a_quarter_of_right_matches_comes_no_wrong_pose() -> None:
+def test_a_quarter_of_right_matches_gives_no_wrong_pose() -> None:
     rng = np.random.default_rng(1)
     points, xy = scene(rng, 48, 0.0)
     points[12:, :2] += rng.uniform(-2 * REACH, 2 * REACH, (36, 2)) * AGL_M
-    found = solved(points, xy)
+    found = solve_equal_weights(points, xy)
     assert found.fit is None or found.inliers[:12].all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("relief_m", [0.0, 6.0])
-def test_random_matches_are_refused(relief_m: float) -> None:
-    """What patches at a wrong place say: anything within their reach. At most one of a hundred may pass."""
+def test_random_matches_are_rejected(relief_m: float) -> None:
+    """Matches at a wrong place are random within the search radius. At most one of a hundred sets may be accepted."""
     passed = 0
     for seed in range(100):
         rng = np.random.default_rng([seed, 9])
         points, xy = scene(rng, int(rng.integers(10, 49)), relief_m)
         points[:, :2] += rng.uniform(-REACH, REACH, (len(points), 2)) * AGL_M
-        passed += solved(points, xy).verdict is Verdict.ACCEPTED
+        passed += solve_equal_weights(points, xy).verdict is Verdict.ACCEPTED
     assert passed <= 1
 
 
-def test_random_matches_of_the_wide_search_are_refused() -> None:
+def test_random_matches_of_the_wide_search_are_rejected() -> None:
     passed = 0
     for seed in range(100):
         rng = np.random.default_rng([seed, 10])
@@ -98,26 +98,29 @@ def test_random_matches_of_the_wide_search_are_refused() -> None:
     assert passed <= 1
 
 
-def test_a_pose_far_from_the_predicted_tilt_is_refused() -> None:
+def test_a_pose_far_from_the_predicted_tilt_is_rejected() -> None:
     points, xy = scene(np.random.default_rng(4), 40, 0.0)
-    found = solved(points, xy, R @ exp_so3(np.array([0.5, 0.0, 0.0])))
+    found = solve_equal_weights(points, xy, R @ exp_so3(np.array([0.5, 0.0, 0.0])))
     assert (found.verdict, found.fit) == (Verdict.DEGENERATE, None)
-    turned = solved(points, xy, R @ exp_so3(np.array([0.0, 0.0, 1.0])))  # heading is what matching may find out
+    turned = solve_equal_weights(
+        points, xy, R @ exp_so3(np.array([0.0, 0.0, 1.0]))
+    )  # the heading may differ from the prediction
     assert turned.verdict is Verdict.ACCEPTED
 
 
-def test_the_same_matches_give_the_same_pose() -> None:
+def test_the_pose_is_deterministic() -> None:
     rng = np.random.default_rng(5)
     points, xy = scene(rng, 40, 0.0)
     points[:15, :2] += rng.uniform(-6.0, 6.0, (15, 2))
-    once, again = solved(points, xy), solved(points, xy)
+    once, again = solve_equal_weights(points, xy), solve_equal_weights(points, xy)
     assert once.fit is not None and again.fit is not None
     assert np.array_equal(once.fit.p_c_in_w_m, again.fit.p_c_in_w_m)
     assert np.array_equal(once.inliers, again.inliers)
 
 
 def mean_nees(wrong: int) -> float:
-    """Of the poses from 48 patches that err by 0.8 % of the height, of which so many are at a random place."""
+    """Mean NEES of poses from 48 patches with an error of 0.8 % of the height, of which ``wrong`` are at random
+    places."""
     errors = []
     for seed in range(120):
         rng = np.random.default_rng([seed, 7])
@@ -125,13 +128,13 @@ def mean_nees(wrong: int) -> float:
         in_c = (points - P) @ R
         xy = in_c[:, :2] / in_c[:, 2:] + rng.normal(0.0, 0.008, (48, 2))
         points[:wrong, :2] += rng.uniform(-REACH, REACH, (wrong, 2)) * AGL_M
-        fit = solved(points, xy).fit
+        fit = solve_equal_weights(points, xy).fit
         assert fit is not None
         error = np.concatenate([log_so3(R.T @ fit.r_w_c), R.T @ (fit.p_c_in_w_m - P)])
         errors.append(float(error @ np.linalg.solve(fit.cov, error)))
     return float(np.mean(errors))
 
 
-def test_what_agrees_by_chance_is_in_the_covariance() -> None:
-    """Taken for inliers like the others the wrong ones raise it by half."""
+def test_false_inliers_inflate_the_covariance() -> None:
+    """Counted as inliers, the wrong matches raise the mean NEES by half."""
     assert mean_nees(wrong=26) < 1.3 * mean_nees(wrong=0)

@@ -1,4 +1,4 @@
-"""The belief over the map: what every look, motion and blur does to the mass, hypothesis by hypothesis."""
+"""Point-mass filter: effect of observations, motion and blur on the mass."""
 
 import tracemalloc
 
@@ -11,7 +11,7 @@ from terrafix.anchor.matching.point_mass_filter import (
     Belief,
     Surface,
     _blurred,
-    cell_for,
+    belief_cell_m,
 )
 
 HALF_M = 200.0
@@ -19,7 +19,7 @@ CELL_M = 2.0
 
 
 def surface(peaks: list[tuple[float, float, float]], seed: int = 0, cell_m: float = 1.0) -> Surface:
-    """Chance everywhere, and peaks (e_m, n_m, z) as wide as a real one."""
+    """Random alignment with peaks (e_m, n_m, z) of realistic width."""
     rng = np.random.default_rng(seed)
     side = round(2 * HALF_M / cell_m) + 1
     axis = np.arange(side) * cell_m - HALF_M
@@ -38,7 +38,7 @@ def mass_of(belief: Belief) -> float:
     return float(belief._mass.sum())
 
 
-def test_starts_at_the_place_with_the_sigma_that_it_is_given() -> None:
+def test_a_belief_starts_with_the_given_mean_and_sigma() -> None:
     belief = Belief(30.0, -20.0, 15.0, CELL_M)
     mode = belief.mode()
     assert (mode.e_m, mode.n_m) == pytest.approx((30.0, -20.0), abs=CELL_M)
@@ -47,10 +47,10 @@ def test_starts_at_the_place_with_the_sigma_that_it_is_given() -> None:
     assert abs(en) < 1.0
 
 
-def test_mass_is_conserved_whatever_happens() -> None:
+def test_mass_is_conserved_by_every_operation() -> None:
     belief = Belief(0.0, 0.0, 20.0, CELL_M)
     for i in range(16):
-        belief.move(3.0, -2.0, (0.0, 1.0, 30.0, 200.0)[i % 4])
+        belief.predict(3.0, -2.0, (0.0, 1.0, 30.0, 200.0)[i % 4])
         belief.update((surface([(0.0, 0.0, 4.0)], i),), 0.5)
         belief.fit_window(0.0)
         assert mass_of(belief) == pytest.approx(1.0, abs=1e-9)
@@ -58,7 +58,7 @@ def test_mass_is_conserved_whatever_happens() -> None:
         assert 0.0 < belief.mode().mass <= 1.0
 
 
-def test_many_headings_need_no_more_memory_than_a_few() -> None:
+def test_memory_does_not_grow_with_the_number_of_hypotheses() -> None:
     belief = Belief(0.0, 0.0, 500.0, CELL_M)
     one = surface([(0.0, 0.0, 4.0)])
     tracemalloc.start()
@@ -70,7 +70,7 @@ def test_many_headings_need_no_more_memory_than_a_few() -> None:
     assert peak < 10 * belief._mass.nbytes
 
 
-def test_a_look_finds_the_place() -> None:
+def test_one_observation_finds_the_position() -> None:
     belief = Belief(0.0, 0.0, 25.0, CELL_M)
     for i in range(3):
         belief.update((surface([(34.0, -22.0, 6.0)], i),), 1.0)
@@ -79,21 +79,21 @@ def test_a_look_finds_the_place() -> None:
     assert mode.mass > 0.95
 
 
-def test_two_places_that_look_alike_stay_two_modes() -> None:
+def test_two_similar_places_remain_two_modes() -> None:
     belief = Belief(0.0, 0.0, 40.0, CELL_M)
     for i in range(5):
         belief.update((surface([(40.0, 0.0, 6.0), (-40.0, 0.0, 6.0)], i),), 1.0)
     mode = belief.mode()
     assert 0.3 < mode.mass < 0.7
-    assert mode.rival > 0.25
+    assert mode.second_mass > 0.25
     ee, _, nn = belief.covariance()
-    assert ee**0.5 > 25.0 > nn**0.5  # the whole belief knows of both
+    assert ee**0.5 > 25.0 > nn**0.5  # the covariance of the whole belief includes both modes
 
 
-def test_the_next_frame_decides_between_them() -> None:
+def test_the_next_frame_discriminates_between_two_modes() -> None:
     belief = Belief(0.0, 0.0, 40.0, CELL_M)
     belief.update((surface([(40.0, 0.0, 6.0), (-40.0, 0.0, 6.0)]),), 1.0)
-    belief.move(20.0, 10.0, 1.0)
+    belief.predict(20.0, 10.0, 1.0)
     belief.update((surface([(-20.0, 10.0, 6.0)], 1),), 1.0)
     mode = belief.mode()
     assert (mode.e_m, mode.n_m) == pytest.approx((-20.0, 10.0), abs=4.0)
@@ -101,25 +101,25 @@ def test_the_next_frame_decides_between_them() -> None:
 
 
 @pytest.mark.parametrize(("east_m", "north_m"), [(7.0, 0.0), (0.0, -13.0), (131.3, 77.7)])
-def test_motion_moves_it(east_m: float, north_m: float) -> None:
+def test_prediction_shifts_the_belief(east_m: float, north_m: float) -> None:
     belief = Belief(5.0, 5.0, 10.0, CELL_M)
     before = belief.covariance()
-    belief.move(east_m, north_m, 0.0)
+    belief.predict(east_m, north_m, 0.0)
     mode = belief.mode()
     assert (mode.e_m, mode.n_m) == pytest.approx((5.0 + east_m, 5.0 + north_m), abs=0.2)
     assert belief.covariance() == pytest.approx(before)
 
 
 @pytest.mark.parametrize("sigma_m", [3.0, 12.0, 40.0, 90.0])
-def test_uncertain_motion_spreads_it(sigma_m: float) -> None:
+def test_uncertain_motion_spreads_the_belief(sigma_m: float) -> None:
     belief = Belief(0.0, 0.0, 10.0, CELL_M)
     belief.fit_window(400.0)
-    belief.move(0.0, 0.0, sigma_m)
+    belief.predict(0.0, 0.0, sigma_m)
     ee, _, nn = belief.covariance()
     assert (ee**0.5, nn**0.5) == pytest.approx([np.hypot(10.0, sigma_m)] * 2, rel=0.08)
 
 
-def test_a_wide_blur_is_a_narrow_one_many_times() -> None:
+def test_a_wide_blur_equals_repeated_narrow_ones() -> None:
     rows, columns = np.mgrid[:241, :241]
     mass = sum(
         share * np.exp(-((rows - r) ** 2 + (columns - c) ** 2) / (2 * 5.0**2))
@@ -129,7 +129,7 @@ def test_a_wide_blur_is_a_narrow_one_many_times() -> None:
     wide = _blurred(mass, 24.0)
     narrow = mass
     for _ in range(16):
-        narrow = _blurred(narrow, 6.0)  # sigma^2 adds up: 16 x 36 = 24^2
+        narrow = _blurred(narrow, 6.0)  # sigma^2 adds: 16 x 36 = 24^2
     wide, narrow = wide / wide.sum(), narrow / narrow.sum()
     assert np.abs(wide - narrow).sum() / 2 < 0.03  # total variation
 
@@ -139,21 +139,21 @@ def test_a_wide_blur_is_a_narrow_one_many_times() -> None:
     assert centre(wide) == pytest.approx(centre(mass), abs=1.0)
 
 
-def test_nothing_is_ever_excluded() -> None:
-    """Sure of the wrong place, then shown the right one: the belief comes back."""
+def test_no_position_is_excluded() -> None:
+    """After a wrong start with full confidence, observations of the right position recover the belief."""
     belief = Belief(0.0, 0.0, 10.0, CELL_M)
     for i in range(20):
         belief.update((surface([(0.0, 0.0, 6.0)], i),), 1.0)
     assert belief.mode().mass > 0.99
-    looks = 0
+    count = 0
     while np.hypot(belief.mode().e_m - 80.0, belief.mode().n_m - 50.0) > 5.0:
-        belief.update((surface([(80.0, 50.0, 5.0)], 100 + looks),), 1.0)
-        looks += 1
-        assert looks < 10
-    assert looks >= 2  # but not at once
+        belief.update((surface([(80.0, 50.0, 5.0)], 100 + count),), 1.0)
+        count += 1
+        assert count < 10
+    assert count >= 2  # not with a single one
 
 
-def test_the_same_ground_again_proves_little() -> None:
+def test_a_low_weight_observation_changes_the_belief_little() -> None:
     full, repeated = Belief(0.0, 0.0, 40.0, CELL_M), Belief(0.0, 0.0, 40.0, CELL_M)
     peaks = [(40.0, 0.0, 5.0), (-40.0, 0.0, 4.0)]
     full.update((surface(peaks),), 1.0)
@@ -161,7 +161,7 @@ def test_the_same_ground_again_proves_little() -> None:
     assert repeated.covariance()[0] > 2 * full.covariance()[0] or repeated.mode().mass < 0.5 * full.mode().mass
 
 
-def test_outside_the_map_is_a_little_worse_than_chance_not_impossible() -> None:
+def test_positions_outside_the_map_count_slightly_worse_than_random_alignment() -> None:
     belief = Belief(0.0, 0.0, 30.0, CELL_M)
     z = flat().z.copy()
     z[:, :200] = np.nan  # the west is off the map
@@ -170,46 +170,46 @@ def test_outside_the_map_is_a_little_worse_than_chance_not_impossible() -> None:
     assert 0.05 < west < 0.95
 
 
-def test_surfaces_of_several_hypotheses_count_by_their_best() -> None:
+def test_of_several_hypotheses_the_best_counts_in_each_cell() -> None:
     belief = Belief(0.0, 0.0, 25.0, CELL_M)
     belief.update((flat(), surface([(20.0, 20.0, 6.0)]), flat(-2.0)), 1.0)
     assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((20.0, 20.0), abs=4.0)
 
 
 @pytest.mark.parametrize("cell_m", [0.5, 1.0, 2.0, 5.0])
-def test_cells_of_any_size_put_the_peak_in_the_same_place(cell_m: float) -> None:
+def test_the_peak_position_does_not_depend_on_the_cell_size(cell_m: float) -> None:
     belief = Belief(0.0, 0.0, 25.0, CELL_M)
     for i in range(3):
         belief.update((surface([(30.0, -10.0, 7.0)], i, cell_m),), 1.0)
     assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((30.0, -10.0), abs=max(3.0, cell_m))
 
 
-def test_confirmation_lifts_the_mode_and_no_other() -> None:
+def test_confirm_raises_only_the_given_mode() -> None:
     belief = Belief(0.0, 0.0, 40.0, CELL_M)
     belief.update((surface([(40.0, 0.0, 5.0), (-40.0, 0.0, 5.0)]),), 1.0)
     before = belief.mode()
     belief.confirm(before, 20.0)
     after = belief.mode()
-    assert after.mass > before.mass and after.rival < before.rival
+    assert after.mass > before.mass and after.second_mass < before.second_mass
     assert (after.e_m, after.n_m) == pytest.approx((before.e_m, before.n_m), abs=MODE_RADIUS_CELLS * CELL_M / 2)
     assert mass_of(belief) == pytest.approx(1.0)
 
 
-def test_the_window_follows_and_is_bounded() -> None:
+def test_the_window_follows_the_belief_and_is_bounded() -> None:
     belief = Belief(0.0, 0.0, 20.0, CELL_M)
     for _ in range(30):
-        belief.move(50.0, 0.0, 60.0)
+        belief.predict(50.0, 0.0, 60.0)
         belief.fit_window(0.0)
     assert belief.half_m <= 1502.0
     assert len(belief._mass) <= 1503
     mode_e, _ = belief.centre
     assert mode_e == pytest.approx(1500.0, abs=10.0)
-    belief.update((Surface(np.full((5, 5), np.nan, np.float32), 0.0, 0.0, 1.0),), 1.0)  # knows nothing at all
+    belief.update((Surface(np.full((5, 5), np.nan, np.float32), 0.0, 0.0, 1.0),), 1.0)  # no information
     assert mass_of(belief) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("cell_m", [1.0, 4.0])
-def test_another_resolution_keeps_every_mode_where_it_is(cell_m: float) -> None:
+def test_set_cell_keeps_the_positions_of_all_modes(cell_m: float) -> None:
     belief = Belief(0.0, 0.0, 40.0, CELL_M)
     belief.update((surface([(52.0, 30.0, 6.0), (-40.0, -10.0, 5.5)]),), 1.0)
     before, cov = belief.mode(), belief.covariance()
@@ -219,35 +219,35 @@ def test_another_resolution_keeps_every_mode_where_it_is(cell_m: float) -> None:
     assert belief.cell_m == cell_m
     assert (after.e_m, after.n_m) == pytest.approx((before.e_m, before.n_m), abs=max(2.0, cell_m))
     assert np.sqrt(belief.covariance()[0]) == pytest.approx(np.sqrt(cov[0]), rel=0.1)
-    belief.update((surface([(52.0, 30.0, 6.0)], 1),), 1.0)  # and it goes on from there
+    belief.update((surface([(52.0, 30.0, 6.0)], 1),), 1.0)  # updates continue to work
     assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((52.0, 30.0), abs=max(4.0, cell_m))
 
 
-def test_the_cell_goes_with_the_height() -> None:
-    sizes = [cell_for(agl_m, 0.5) for agl_m in (30.0, 60.0, 100.0, 150.0, 300.0, 1000.0)]
+def test_the_cell_size_follows_the_height() -> None:
+    sizes = [belief_cell_m(agl_m, 0.5) for agl_m in (30.0, 60.0, 100.0, 150.0, 300.0, 1000.0)]
     assert sizes == sorted(sizes)
-    assert sizes[0] == 1.0 and cell_for(100.0, 0.5) == 2.0 and sizes[-1] >= 16.0
-    assert cell_for(30.0, 8.0) >= 8.0  # never finer than what is looked at
+    assert sizes[0] == 1.0 and belief_cell_m(100.0, 0.5) == 2.0 and sizes[-1] >= 16.0
+    assert belief_cell_m(30.0, 8.0) >= 8.0  # not finer than the correlation's cells
 
 
-def test_a_wide_window_gets_no_finer_cells_than_it_can_have() -> None:
-    """A height that fell to nearly nothing under a belief as wide as the map asked for 133 GB."""
+def test_the_cell_size_of_a_wide_window_is_bounded() -> None:
+    """A height near zero under a belief as wide as the map would need 133 GB."""
     belief = Belief(0.0, 0.0, 300.0, 8.0)
     half_m = belief.half_m
     belief.set_cell(0.05)
     assert belief.half_m == pytest.approx(half_m, rel=0.02) and belief.half_m / belief.cell_m <= MAX_HALF_CELLS + 1
 
 
-def test_a_share_of_a_start_lies_evenly_over_all_that_is_searched() -> None:
-    narrow, wide = Belief(0.0, 0.0, 20.0, 1.0), Belief(0.0, 0.0, 20.0, 1.0, stray=0.01, reach_m=300.0)
+def test_the_uniform_share_of_a_start_covers_the_whole_window() -> None:
+    narrow, wide = Belief(0.0, 0.0, 20.0, 1.0), Belief(0.0, 0.0, 20.0, 1.0, uniform_share=0.01, min_half_m=300.0)
     assert narrow.half_m < 150.0 and wide.half_m == pytest.approx(300.0, abs=1.0)
     assert mass_of(wide) == pytest.approx(1.0)
     far = wide._mass[:100, :100]  # 200 m and more from the start, 10 sigmas
     assert far.sum() == pytest.approx(0.01 * far.size / wide._mass.size, rel=0.01)
 
 
-def test_a_place_beyond_what_a_start_claims_is_found_by_two_looks() -> None:
-    belief = Belief(0.0, 0.0, 20.0, 1.0, stray=1.0 / 400.0, reach_m=160.0)
+def test_a_position_beyond_the_sigma_of_a_start_is_found_by_two_observations() -> None:
+    belief = Belief(0.0, 0.0, 20.0, 1.0, uniform_share=1.0 / 400.0, min_half_m=160.0)
     there = surface([(140.0, 30.0, 6.0)])
     belief.update((there,), 1.0)
     belief.update((there,), 1.0)

@@ -1,23 +1,23 @@
-"""A frame that nothing joins to the one before, over a wide belief: its patches decide, or nobody does."""
+"""Localization by a single frame with a wide belief: patches select a mode or none."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ground import GSD_M, PINHOLE, FlatMap, texture, view
-from one_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
+from single_map_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, CorrelationResult, FrameMatcher, View
 from terrafix.anchor.matching.point_mass_filter import Belief, Mode
 from terrafix.anchor.node import AnchorNode
 from terrafix.anchor.verification.single_frame import localize_single_frame
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.map.null_model import USUAL, FlightBudget, Tail
+from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget, Tail
 from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
+from textured_ground import GSD_M, PINHOLE, FlatMap, texture, view
 
-SHARE = FlightBudget().log_probability  # of the first frame
-NEAR_M = (7.0, -5.0)  # of the mode from the truth
+SHARE = FalseAlarmBudget().log_probability  # of the first frame
+NEAR_M = (7.0, -5.0)  # offset of the mode from the true position
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +25,8 @@ def ground() -> np.ndarray:
     return texture(8, SIDE_M)
 
 
-class SameLook(CorrelationResult):
-    """Every place fits best as it was predicted."""
+class SameResult(CorrelationResult):
+    """Every place fits best with the predicted yaw and scale."""
 
     def best_at(self, e_m: float, n_m: float) -> tuple[Any, float]:
         return AS_PREDICTED, 4.0
@@ -36,14 +36,14 @@ def mode(e_m: float, n_m: float) -> Mode:
     return Mode(e_m, n_m, 0.1, 0.1, 9.0)
 
 
-def decided(
+def selected_mode(
     ground: np.ndarray, frame: np.ndarray, modes: list[Mode], log_probability: float = SHARE
 ) -> tuple[Mode, np.ndarray] | None:
     source: Any = FlatMap(ground)
     matcher = FrameMatcher(PINHOLE, source, GradientDescriber())
     predicted = View(0.0, 0.0, R, AGL_M, 0.0, 0.03, 0.02, 0.03)
     found = localize_single_frame(
-        frame, predicted, SameLook(Verdict.ACCEPTED), modes, source, matcher, USUAL, log_probability
+        frame, predicted, SameResult(Verdict.ACCEPTED), modes, source, matcher, DEFAULT_NULL, log_probability
     )
     if found is None:
         return None
@@ -51,65 +51,68 @@ def decided(
     return found[0], found[1].pnp.fit.p_c_in_w_m
 
 
-def test_the_patches_find_the_mode_that_is_right(ground: np.ndarray) -> None:
+def test_the_patches_select_the_right_mode(ground: np.ndarray) -> None:
     right = mode(TRUE_M[0] + NEAR_M[0], TRUE_M[1] + NEAR_M[1])
-    found = decided(ground, view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), right])
+    found = selected_mode(ground, view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), right])
     assert found is not None and found[0] is right
     assert np.linalg.norm(found[1] - TRUE_M) < 3.0
 
 
-def test_a_frame_needs_more_the_less_likely_a_wrong_find_may_be(ground: np.ndarray) -> None:
-    """The best of three wrong places comes to what is needed with three times the probability of one."""
+def test_a_lower_false_alarm_probability_requires_more_evidence(ground: np.ndarray) -> None:
+    """The best of three wrong places exceeds the threshold with three times the probability of one."""
     frame, modes = view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), mode(*TRUE_M[:2])]
-    assert decided(ground, frame, modes) is not None
-    assert decided(ground, frame, modes, log_probability=-60.0) is None
+    assert selected_mode(ground, frame, modes) is not None
+    assert selected_mode(ground, frame, modes, log_probability=-60.0) is None
 
 
-def test_what_single_frames_need_is_that_of_the_map(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = list[float]()
+def test_the_threshold_of_a_single_frame_comes_from_the_null_model_of_the_map(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log_probabilities = list[float]()
 
     def enough(_tail: Tail, log_probability: float) -> float:
-        asked.append(log_probability)
+        log_probabilities.append(log_probability)
         return np.inf
 
-    monkeypatch.setattr(Tail, "exceeded_with", enough)
+    monkeypatch.setattr(Tail, "exceedance_value", enough)
     frame, modes = view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), mode(*TRUE_M[:2])]
-    assert decided(ground, frame, modes) is None
-    assert asked[0] == pytest.approx(SHARE - np.log(3.0))
+    assert selected_mode(ground, frame, modes) is None
+    assert log_probabilities[0] == pytest.approx(SHARE - np.log(3.0))
 
 
-def test_ground_that_is_nowhere_on_the_map_is_found_nowhere(ground: np.ndarray) -> None:
+def test_ground_that_is_not_on_the_map_selects_no_mode(ground: np.ndarray) -> None:
     other = view(texture(9, SIDE_M), PINHOLE, R, TRUE_M)
-    assert decided(ground, other, [mode(20.0 * e, 20.0 * n) for e in (-3, 0, 3) for n in (-3, 0, 3)]) is None
-    assert decided(ground, other, []) is None
+    assert selected_mode(ground, other, [mode(20.0 * e, 20.0 * n) for e in (-3, 0, 3) for n in (-3, 0, 3)]) is None
+    assert selected_mode(ground, other, []) is None
 
 
-def test_ground_that_is_there_twice_is_found_nowhere(ground: np.ndarray) -> None:
+def test_repeated_ground_selects_no_mode(ground: np.ndarray) -> None:
     half = ground[:, : round(220.0 / GSD_M)]
     twice = np.hstack([half, half])
     places = [np.array([e_m, 0.0, AGL_M]) for e_m in (-110.0, 110.0)]
     frame = view(twice, PINHOLE, R, places[0])
-    assert decided(twice, frame, [mode(*place[:2]) for place in places]) is None
-    assert decided(twice, frame, [mode(*places[0][:2])]) is not None
+    assert selected_mode(twice, frame, [mode(*place[:2]) for place in places]) is None
+    assert selected_mode(twice, frame, [mode(*places[0][:2])]) is not None
 
 
 @pytest.mark.parametrize(("sigma_m", "verdict"), [(90.0, Verdict.ACCEPTED), (30.0, Verdict.AMBIGUOUS)])
-def test_one_look_that_does_not_decide_is_decided_by_patches_where_little_is_claimed(
+def test_an_undecided_correlation_is_decided_by_patches_if_the_position_sigma_is_large(
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch, sigma_m: float, verdict: Verdict
 ) -> None:
-    monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # a look that says nothing
-    spent = list[float]()
+    monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # no evidence
+    log_probabilities = list[float]()
     monkeypatch.setattr(
-        "terrafix.anchor.node.localize_single_frame", lambda *of: spent.append(of[-1]) or localize_single_frame(*of)
+        "terrafix.anchor.localizer.localize_single_frame",
+        lambda *of: log_probabilities.append(of[-1]) or localize_single_frame(*of),
     )
-    package: Any = OnlyMap(ground)
+    package: Any = SingleMapPackage(ground)
     frames = MemoryFrameStore(2)
     node = AnchorNode(frames, package, GradientDescriber(), 1.0)
     list(node.on(ORIGIN))
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     near = predicted(1, sigma_m, at_m=TRUE_M + np.array([*NEAR_M, 0.0]))
-    said, *_ = node.on(near)
-    assert isinstance(said, MapMatch) and said.verdict is verdict
-    assert spent == ([SHARE] if verdict is Verdict.ACCEPTED else [])
+    match, *_ = node.on(near)
+    assert isinstance(match, MapMatch) and match.verdict is verdict
+    assert log_probabilities == ([SHARE] if verdict is Verdict.ACCEPTED else [])
     if verdict is Verdict.ACCEPTED:
-        assert said.p_c_in_w_m is not None and np.linalg.norm(np.array(said.p_c_in_w_m) - TRUE_M) < 3.0
+        assert match.p_c_in_w_m is not None and np.linalg.norm(np.array(match.p_c_in_w_m) - TRUE_M) < 3.0

@@ -1,4 +1,4 @@
-"""Airspeed out of MAVLink, live and from a log: of one healthy sensor, and of nothing else."""
+"""Airspeed from MAVLink, live and from a log: from one healthy sensor only."""
 
 import math
 from pathlib import Path
@@ -32,48 +32,50 @@ def packed(message: Any) -> bytes:
 
 
 def states(messages: list[tuple[int, Any]]) -> list[VehicleState]:
-    """(arrival, message) -> what telemetry says of them."""
+    """(arrival time, message) -> published vehicle states."""
     telemetry = Telemetry(TimeSync())
     wire = [(0, HEARTBEAT), *messages]
-    said = [telemetry.take(mavlink.MAVLink(None).decode(bytearray(packed(m))), now_ns) for now_ns, m in wire]
-    return [state for state in said if isinstance(state, VehicleState)]
+    messages_out = [
+        telemetry.on_message(mavlink.MAVLink(None).decode(bytearray(packed(m))), now_ns) for now_ns, m in wire
+    ]
+    return [state for state in messages_out if isinstance(state, VehicleState)]
 
 
-def test_flags_are_those_of_the_dialect() -> None:
+def test_airspeed_flags_equal_those_of_the_mavlink_dialect() -> None:
     assert (UNHEALTHY, USED) == (mavlink.AIRSPEED_SENSOR_UNHEALTHY, mavlink.AIRSPEED_SENSOR_USING)
 
 
-def test_one_sensor_is_read_until_it_fails() -> None:
+def test_one_airspeed_sensor_is_used_until_it_fails() -> None:
     reader = AirspeedReader()
     assert reader.take(airspeed(20.0)) == 20.0
-    assert reader.take(airspeed(25.0, sensor=1)) is None  # it has another scale
-    assert reader.take(airspeed(20.0, flags=UNHEALTHY)) is None  # the last value that it had
+    assert reader.take(airspeed(25.0, sensor=1)) is None  # not the selected sensor: its scale differs
+    assert reader.take(airspeed(20.0, flags=UNHEALTHY)) is None  # repeats the last valid value
     assert reader.take(airspeed(25.0, sensor=1)) == 25.0
     assert reader.take(airspeed(20.0)) is None
 
 
-def test_a_sensor_that_the_autopilot_has_given_up_is_no_sensor() -> None:
+def test_a_sensor_that_the_autopilot_has_deselected_is_not_used() -> None:
     reader = AirspeedReader()
-    assert reader.take(airspeed(20.0, flags=0)) == 20.0  # ARSPD_USE 0: good all the same
+    assert reader.take(airspeed(20.0, flags=0)) == 20.0  # ARSPD_USE 0: never used by the autopilot, but valid
     assert reader.take(airspeed(20.0)) == 20.0
-    assert reader.take(airspeed(1.0, flags=0)) is None  # blocked, and healthy by its own word
+    assert reader.take(airspeed(1.0, flags=0)) is None  # a blocked tube, still reported as healthy
     assert reader.take(airspeed(20.0)) == 20.0
 
 
 @pytest.mark.parametrize("mps", [math.nan, math.inf, -1.0, 900.0])
-def test_garbage_is_no_airspeed(mps: float) -> None:
+def test_an_implausible_airspeed_is_rejected(mps: float) -> None:
     assert AirspeedReader().take(airspeed(mps)) is None
 
 
-def test_the_link_says_it_while_it_is_fresh_and_never_that_of_the_hud() -> None:
+def test_the_link_publishes_fresh_sensor_airspeed_and_ignores_vfr_hud() -> None:
     moments = [(0, attitude(0)), (100 * MS, airspeed(21.0)), (200 * MS, VFR_HUD), (200 * MS, attitude(200))]
-    said = states([*moments, (2 * S, attitude(2000))])
-    assert [state.airspeed_mps for state in said] == [None, pytest.approx(21.0), None]
+    published = states([*moments, (2 * S, attitude(2000))])
+    assert [state.airspeed_mps for state in published] == [None, pytest.approx(21.0), None]
 
 
-def test_a_log_has_it_too(tmp_path: Path) -> None:
+def test_airspeed_is_read_from_a_telemetry_log(tmp_path: Path) -> None:
     log = tmp_path / "telemetry.tlog"
     messages = [HEARTBEAT, attitude(0), airspeed(21.0), VFR_HUD, airspeed(21.5), attitude(100)]
     log.write_bytes(b"".join(record(T0_US + 50_000 * i, packed(m)) for i, m in enumerate(messages)))
-    said = [(state.t_ns // MS, state.airspeed_mps) for state in read_tlog(log) if state.airspeed_mps is not None]
-    assert said == [(100, pytest.approx(21.0)), (200, pytest.approx(21.5))]
+    published = [(state.t_ns // MS, state.airspeed_mps) for state in read_tlog(log) if state.airspeed_mps is not None]
+    assert published == [(100, pytest.approx(21.0)), (200, pytest.approx(21.5))]

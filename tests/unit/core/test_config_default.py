@@ -1,4 +1,4 @@
-"""config/default.toml is the documentation of core/config.py: the same keys, values and bounds, each explained."""
+"""config/default.toml documents core/config.py: the same keys, values and bounds, each with an explanation."""
 
 import tomllib
 from pathlib import Path
@@ -13,12 +13,12 @@ from terrafix.core.errors import ConfigError
 DEFAULT = Path(__file__).resolve().parents[3] / "config" / "default.toml"
 
 
-def test_every_key_is_there_with_the_value_that_the_code_has() -> None:
+def test_default_toml_has_every_key_with_the_default_of_the_code() -> None:
     assert tomllib.loads(DEFAULT.read_text()) == msgspec.to_builtins(Config())
     assert load([DEFAULT]) == Config()
 
 
-def test_every_key_is_explained_and_every_bound_is_named() -> None:
+def test_default_toml_explains_every_key_and_states_its_bounds() -> None:
     lines = DEFAULT.read_text().splitlines()
     section = ""
     for number, line in enumerate(lines):
@@ -61,14 +61,14 @@ def written(folder: Path, text: str) -> Path:
         ("[link\n", r"my\.toml: not valid TOML"),
     ],
 )
-def test_a_mistake_is_one_line_with_file_key_and_remedy(tmp_path: Path, text: str, complaint: str) -> None:
+def test_a_configuration_error_is_one_line_with_file_key_and_remedy(tmp_path: Path, text: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint) as caught:
         load([written(tmp_path, text)])
     assert "\n" not in str(caught.value)
     assert caught.value.exit_code == 3
 
 
-def test_later_files_win_key_by_key(tmp_path: Path) -> None:
+def test_later_configuration_files_override_earlier_ones_key_by_key(tmp_path: Path) -> None:
     config = load([DEFAULT, written(tmp_path, "[health]\nhot_c = 70\n")])
     assert (config.health.hot_c, config.health.critical_c) == (70.0, 95.0)
     with pytest.raises(ConfigError, match="no such configuration file"):

@@ -1,4 +1,4 @@
-"""Frame stores: what was overwritten is None, and an image is never torn."""
+"""Frame stores: overwritten frames read as None, and no image is torn."""
 
 import multiprocessing
 import subprocess
@@ -18,7 +18,7 @@ def image(value: int, height: int = 20, width: int = 30) -> np.ndarray:
     return np.full((height, width, 3), value, np.uint8)
 
 
-def test_memory_store_keeps_the_newest_and_protects_them() -> None:
+def test_the_memory_store_keeps_the_newest_frames_read_only() -> None:
     store = MemoryFrameStore(2)
     for i in range(3):
         store.put(i, image(i))
@@ -30,7 +30,7 @@ def test_memory_store_keeps_the_newest_and_protects_them() -> None:
     assert isinstance(store, FrameWriter)
 
 
-def test_shared_store_gives_copies_and_none_for_what_is_not_there(tmp_path: Path) -> None:
+def test_the_shared_store_returns_copies_and_none_for_missing_frames(tmp_path: Path) -> None:
     path = tmp_path / "frames"
     reader = SharedFrameStore(path)
     assert reader.get(0) is None, "no writer yet"
@@ -49,7 +49,7 @@ def test_shared_store_gives_copies_and_none_for_what_is_not_there(tmp_path: Path
         writer.put(1, image(1).astype(np.float32))
 
 
-def test_larger_images_get_a_new_ring_and_readers_follow(tmp_path: Path) -> None:
+def test_a_larger_image_replaces_the_ring_and_readers_reopen_it(tmp_path: Path) -> None:
     writer = SharedFrameStore(tmp_path / "frames", writer=True, slots=4)
     reader = SharedFrameStore(tmp_path / "frames")
     writer.put(0, image(1))
@@ -58,13 +58,13 @@ def test_larger_images_get_a_new_ring_and_readers_follow(tmp_path: Path) -> None
     large = reader.get(1)
     assert large is not None and np.array_equal(large, image(2, 400, 300))
     assert reader.get(0) is None
-    writer.put(2, image(3))  # smaller again: same ring
+    writer.put(2, image(3))  # a smaller image uses the same ring
     assert reader.get(1) is not None
     small = reader.get(2)
     assert small is not None and small.shape == (20, 30, 3)
 
 
-def test_either_side_may_start_again(tmp_path: Path) -> None:
+def test_reader_and_writer_of_the_frame_ring_may_restart(tmp_path: Path) -> None:
     path = tmp_path / "frames"
     first = SharedFrameStore(path, writer=True, slots=4)
     first.put(0, image(1))
@@ -72,12 +72,12 @@ def test_either_side_may_start_again(tmp_path: Path) -> None:
     assert reader.get(0) is not None
     second = SharedFrameStore(path, writer=True, slots=4)
     second.put(1, image(2))
-    assert reader.get(0) is not None, "the new writer goes on in the same ring"
+    assert reader.get(0) is not None, "the new writer continues in the same ring"
     assert reader.get(1) is not None
     assert SharedFrameStore(path).get(1) is not None
 
 
-def test_a_writer_that_dies_in_the_middle_leaves_none_and_the_next_one_repairs_it(tmp_path: Path) -> None:
+def test_a_partially_written_frame_reads_as_none_and_the_next_writer_overwrites_it(tmp_path: Path) -> None:
     path = tmp_path / "frames"
     code = f"""
 import os
@@ -97,7 +97,7 @@ store.put(2, np.zeros((20, 30, 3), np.uint8))
     assert repaired is not None and np.array_equal(repaired, image(4))
 
 
-def write_for_ever(path: str, ready: "multiprocessing.synchronize.Event") -> None:
+def write_continuously(path: str, ready: "multiprocessing.synchronize.Event") -> None:
     store = SharedFrameStore(Path(path), writer=True, slots=2)
     frame_id = 0
     while True:
@@ -106,10 +106,10 @@ def write_for_ever(path: str, ready: "multiprocessing.synchronize.Event") -> Non
         frame_id += 1
 
 
-def test_no_image_is_torn_while_another_process_writes_as_fast_as_it_can(tmp_path: Path) -> None:
+def test_no_image_is_torn_while_another_process_writes_continuously(tmp_path: Path) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready = spawn.Event()
-    writer = spawn.Process(target=write_for_ever, args=(str(tmp_path / "frames"), ready), daemon=True)
+    writer = spawn.Process(target=write_continuously, args=(str(tmp_path / "frames"), ready), daemon=True)
     writer.start()
     try:
         assert ready.wait(20)
@@ -133,7 +133,9 @@ def test_no_image_is_torn_while_another_process_writes_as_fast_as_it_can(tmp_pat
     assert whole > 10, (whole, overwritten)
 
 
-def test_large_photos_fit_and_a_full_memory_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_photos_get_few_slots_and_full_memory_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert frames_module._slots_for(6252 * 4168 * 3) == frames_module.MIN_SLOTS
     assert frames_module._slots_for(1280 * 720 * 3) == frames_module.MAX_SLOTS
     store = SharedFrameStore(tmp_path / "frames", writer=True, slots=4, slot_bytes=2**50)
@@ -141,7 +143,7 @@ def test_large_photos_fit_and_a_full_memory_is_one_clear_line(tmp_path: Path, mo
         store.put(0, image(0))
 
 
-def test_a_photo_of_26_megapixels_passes(tmp_path: Path) -> None:
+def test_a_photo_of_26_megapixels_passes_through_shared_memory(tmp_path: Path) -> None:
     store = SharedFrameStore(Path("/dev/shm") / f"terrafix-test-{tmp_path.name}", writer=True, slots=2)
     try:
         photo = np.zeros((4168, 6252, 3), np.uint8)
@@ -154,7 +156,7 @@ def test_a_photo_of_26_megapixels_passes(tmp_path: Path) -> None:
         Path("/dev/shm", f"terrafix-test-{tmp_path.name}").unlink()
 
 
-def test_no_warning_and_no_leftover_of_a_resource_tracker(tmp_path: Path) -> None:
+def test_the_frame_ring_survives_its_readers_without_resource_tracker_warnings(tmp_path: Path) -> None:
     code = f"""
 from pathlib import Path
 import numpy as np

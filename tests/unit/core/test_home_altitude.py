@@ -1,4 +1,4 @@
-"""A home that is moved in flight does not move the vehicle."""
+"""Height above take-off when a ground station moves home in flight."""
 
 import math
 from pathlib import Path
@@ -17,31 +17,33 @@ from terrafix.link.edge import MavlinkEdge
 GROUND_M, BOAT_M = 400.0, 365.0
 
 
-def test_home_is_moved_while_it_climbs() -> None:
+def test_height_above_take_off_is_continuous_when_home_is_moved_in_flight() -> None:
     height = TakeOffHeight()
     heights = [50.0, 52.0, 54.0, 56.0, 58.0]
     homes = [GROUND_M, GROUND_M, BOAT_M, BOAT_M, GROUND_M + 20.0]
-    said = [height.above(GROUND_M + h - home, GROUND_M + h, True) for h, home in zip(heights, homes, strict=True)]
-    assert said == pytest.approx(heights)
-    assert height.moved_m == pytest.approx(20.0)
+    takeoff_heights = [
+        height.update(GROUND_M + h - home, GROUND_M + h, True) for h, home in zip(heights, homes, strict=True)
+    ]
+    assert takeoff_heights == pytest.approx(heights)
+    assert height.home_rise_m == pytest.approx(20.0)
 
 
-def test_a_filter_that_gets_its_height_above_the_sea_has_not_moved() -> None:
-    """An autopilot that took off without any position, and was told one in flight."""
+def test_a_jump_of_the_height_above_sea_level_is_not_a_move_of_home() -> None:
+    """An autopilot that takes off without a position and receives one in flight."""
     height = TakeOffHeight()
-    assert [height.above(50.0 + i, amsl, True) for i, amsl in enumerate((50.0, 51.0, 452.0))] == [50.0, 51.0, 52.0]
+    assert [height.update(50.0 + i, amsl, True) for i, amsl in enumerate((50.0, 51.0, 452.0))] == [50.0, 51.0, 52.0]
 
 
-def test_before_it_is_armed_home_is_where_it_stands() -> None:
+def test_before_arming_home_is_the_position_of_the_vehicle() -> None:
     height = TakeOffHeight()
-    assert height.above(3.0, GROUND_M + 3.0, False) == 3.0  # the barometer has drifted
-    assert height.above(0.0, GROUND_M + 3.0, False) == 0.0  # and it is armed
-    assert height.above(0.1, GROUND_M + 3.1, True) == pytest.approx(0.1)
+    assert height.update(3.0, GROUND_M + 3.0, False) == 3.0  # the barometer has drifted
+    assert height.update(0.0, GROUND_M + 3.0, False) == 0.0  # and it is armed
+    assert height.update(0.1, GROUND_M + 3.1, True) == pytest.approx(0.1)
 
 
-def test_one_that_does_not_tell_its_height_above_the_sea_is_taken_at_its_word() -> None:
+def test_without_height_above_sea_level_the_height_above_home_is_used() -> None:
     height = TakeOffHeight()
-    assert [height.above(h, math.nan, True) for h in (50.0, 85.0)] == [50.0, 85.0]
+    assert [height.update(h, math.nan, True) for h in (50.0, 85.0)] == [50.0, 85.0]
 
 
 def position(boot_ms: int, above_ground_m: float, home_m: float) -> mavlink.MAVLink_global_position_int_message:
@@ -55,7 +57,7 @@ def armed() -> mavlink.MAVLink_heartbeat_message:
     return mavlink.MAVLink_heartbeat_message(*kinds, mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 0, 0, 3)
 
 
-def test_the_link_goes_on_from_take_off_also_when_it_is_started_again(tmp_path: Path) -> None:
+def test_a_restarted_link_keeps_the_height_above_take_off(tmp_path: Path) -> None:
     mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
 
     def heights(edge: MavlinkEdge, wire: MemoryWire, at_s: int, home_m: float) -> list[float | None]:
@@ -64,18 +66,20 @@ def test_the_link_goes_on_from_take_off_also_when_it_is_started_again(tmp_path: 
 
     def link() -> tuple[MavlinkEdge, MemoryWire]:
         wire = MemoryWire()
-        return MavlinkEdge(LinkSection(), wire, lambda: 0, keeper=CheckpointWriter(tmp_path / "link.checkpoint")), wire
+        return MavlinkEdge(
+            LinkSection(), wire, lambda: 0, checkpoint_writer=CheckpointWriter(tmp_path / "link.checkpoint")
+        ), wire
 
     edge, wire = link()
     wire.arrive(packed(armed(), mav))
     assert heights(edge, wire, 1, GROUND_M) == pytest.approx([51.0])
     assert heights(edge, wire, 2, BOAT_M) == pytest.approx([52.0])
-    edge.heard(NO_FIX)
+    edge.on_message(NO_FIX)
     edge, wire = link()
     assert heights(edge, wire, 8, BOAT_M) == pytest.approx([58.0])
 
 
-def test_a_telemetry_log_does_the_same(tmp_path: Path) -> None:
+def test_a_telemetry_log_gives_height_above_take_off_when_home_is_moved(tmp_path: Path) -> None:
     mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
     homes = [GROUND_M, GROUND_M, BOAT_M]
     log = [record(1_700_000_000_000_000, packed(armed(), mav))]

@@ -1,4 +1,4 @@
-"""Logs: one JSON object a line, levels, and a reader that hangs."""
+"""Logs: one JSON object per line, levels, and a blocked reader."""
 
 import io
 import json
@@ -7,7 +7,7 @@ import threading
 from terrafix.core import logs
 
 
-def test_lines_are_json_with_level_process_and_both_times() -> None:
+def test_log_lines_are_json_with_level_process_and_both_times() -> None:
     stream = io.StringIO()
     writer = logs.configure("INFO", "anchor", stream)
     logs.get().debug("not shown")
@@ -18,22 +18,22 @@ def test_lines_are_json_with_level_process_and_both_times() -> None:
     assert line == {"process": "anchor", "event": "belief spread", "level": "warning", "sigma_m": 12.5}
 
 
-class Hanging(io.StringIO):
+class BlockedStream(io.StringIO):
     def __init__(self) -> None:
         super().__init__()
-        self.go_on = threading.Event()
+        self.unblock = threading.Event()
 
     def write(self, text: str) -> int:
-        self.go_on.wait()
+        self.unblock.wait()
         return super().write(text)
 
 
-def test_a_reader_that_hangs_costs_lines_and_not_time() -> None:
-    stream = Hanging()
+def test_a_blocked_log_reader_loses_lines_without_blocking_the_process() -> None:
+    stream = BlockedStream()
     writer = logs.configure("INFO", "link", stream)
     for i in range(logs.QUEUE_LENGTH + 500):
         logs.get().info("line", number=i)
-    stream.go_on.set()
+    stream.unblock.set()
     writer.close()
     lines = [json.loads(text) for text in stream.getvalue().splitlines()]
     lost = [line["count"] for line in lines if line["event"] == "log lines lost"]

@@ -29,31 +29,33 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def test_list_tells_what_is_there_and_which_providers_there_are(folder: Path) -> None:
+def test_list_shows_fetched_models_and_available_providers(folder: Path) -> None:
     found = CliRunner().invoke(app, ["list", "--folder", str(folder), "--json"])
-    told = json.loads(found.output)
-    assert {m["name"]: m["state"] for m in told["models"]} == {
+    output = json.loads(found.output)
+    assert {m["name"]: m["state"] for m in output["models"]} == {
         "xfeat": "not fetched",
         "lighterglue-l3": "not fetched",
         "tiny": "ready",
     }
-    assert told["folder"] == str(folder) and told["providers"]["CPU"] == ""
+    assert output["folder"] == str(folder) and output["providers"]["CPU"] == ""
     (folder / "tiny.onnx").write_bytes(b"x")
     shown = CliRunner().invoke(app, ["list", "--folder", str(folder)]).output
     assert "altered" in shown and "Apache-2.0" in shown and str(folder) in shown
 
 
-def test_verify_says_how_it_runs_and_fails_for_what_does_not(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_shows_the_provider_and_fails_for_a_model_that_does_not_run(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     verify_all([], str(folder))
     assert "tiny: as published, run by CPU" in capsys.readouterr().out
     (folder / "tiny.onnx").write_bytes(b"x")
     with pytest.raises(ModelError, match="2 of 2 models cannot be used"):
         verify_all(["tiny", "xfeat"], str(folder))
-    told = capsys.readouterr().out.splitlines()
-    assert len(told) == 2 and "not the published file" in told[0] and "terrafix models fetch xfeat" in told[1]
+    output = capsys.readouterr().out.splitlines()
+    assert len(output) == 2 and "not the published file" in output[0] and "terrafix models fetch xfeat" in output[1]
 
 
-def test_an_empty_folder_and_a_broken_manifest(tmp_path: Path) -> None:
+def test_list_handles_an_empty_folder_and_a_broken_manifest(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no model is there yet; terrafix models fetch NAME"):
         verify_all([], str(tmp_path / "nothing"))
     (tmp_path / "mine.toml").write_text("name = ")
@@ -64,7 +66,7 @@ def test_an_empty_folder_and_a_broken_manifest(tmp_path: Path) -> None:
         listing.show(str(tmp_path / "file"), as_json=True)
 
 
-def test_a_file_that_may_not_be_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verify_reports_a_file_without_read_permission(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(_: Path, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
@@ -73,26 +75,26 @@ def test_a_file_that_may_not_be_read(folder: Path, monkeypatch: pytest.MonkeyPat
         verify_all([], str(folder))
 
 
-def test_without_tensorrt_nothing_is_built(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_build_without_tensorrt_builds_no_engine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("onnxruntime.get_available_providers", lambda: [CPU])
     with pytest.raises(ModelError, match=r"TensorRT cannot be used here: this ONNX Runtime .* nothing was built"):
         build_all([], str(folder))
 
 
-def test_build_says_what_became_of_it(
+def test_build_reports_its_result(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The runtime's own tests build with a machine that has TensorRT, as far as it can be told here."""
+    """Only the report; tests/unit/runtime builds on a simulated machine with TensorRT."""
     monkeypatch.setattr(build.providers, "check", lambda _: None)
     asked: list[dict[str, Any]] = []
 
     def opened(_model: object, **more: Any) -> Any:
         asked.append(more)
         return type(
-            "Opened", (), {"provider": provider, "sha256": "f" * 64, "passed_over": ["TensorRT: out of memory"]}
+            "Opened", (), {"provider": provider, "sha256": "f" * 64, "rejected_providers": ["TensorRT: out of memory"]}
         )
 
-    monkeypatch.setattr(build, "opened_whole", opened)
+    monkeypatch.setattr(build, "open_complete", opened)
     provider = TENSORRT
     build_all(["tiny"], str(folder))
     assert asked == [{"build": True}] and f"ready in {folder}/engines/{'f' * 16}" in capsys.readouterr().out
@@ -101,7 +103,7 @@ def test_build_says_what_became_of_it(
         build_all(["tiny"], str(folder))
 
 
-def test_bench_measures_beside_what_needs_no_weights(folder: Path, tmp_path: Path) -> None:
+def test_bench_compares_with_the_describer_without_weights(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "models.json"
     bench_all([], str(folder), out, runs=3, pair=None, trials=1)
     measured = json.loads(out.read_text())
@@ -121,9 +123,9 @@ def raster(path: Path, image: np.ndarray, x_m: float = 500_000.0, crs: int = 326
     return path
 
 
-def test_a_pair_of_images_tells_which_features_find_the_place(folder: Path, tmp_path: Path) -> None:
-    """The second image begins 30 px further east and is darker: places are compared on the ground, not in pixels."""
-    from ground import texture
+def test_bench_of_an_image_pair_shows_which_features_find_the_place(folder: Path, tmp_path: Path) -> None:
+    """The second image begins 30 px further east and is darker; positions are compared in ground coordinates."""
+    from textured_ground import texture
 
     ground = np.ascontiguousarray(texture(6, 230.0)[:860, :900])
     one = raster(tmp_path / "one.tif", ground)
@@ -141,7 +143,7 @@ def test_a_pair_of_images_tells_which_features_find_the_place(folder: Path, tmp_
         bench_all([], str(folder), out, runs=1, pair=(one, small), trials=1)
 
 
-def test_an_export_of_one_size_is_timed_too(tmp_path: Path) -> None:
+def test_bench_times_a_model_of_fixed_input_size(tmp_path: Path) -> None:
     text = tiny_onnx.XFEAT_LIKE.split("[[presets]]")[0].replace('3, "height", "width"', "3, 24, 40")
     text = text.replace('"height/8", "width/8"', "3, 5")
     tiny_onnx.write(tmp_path, text, tiny_onnx.xfeat_like())
@@ -150,12 +152,12 @@ def test_an_export_of_one_size_is_timed_too(tmp_path: Path) -> None:
     assert row["input"] == [1, 3, 24, 40]
 
 
-def test_a_slow_model_is_timed_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "MOST_S", 0.0)
-    assert bench._timed(lambda: None, 50)["runs"] == bench.FEWEST - 1
+def test_bench_times_a_slow_model_with_fewer_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "MAX_TIME_S", 0.0)
+    assert bench._time_runs(lambda: None, 50)["runs"] == bench.MIN_RUNS - 1
 
 
-def test_the_help_of_every_command_is_there() -> None:
+def test_every_models_command_has_help() -> None:
     for command in ("list", "fetch", "verify", "build", "bench"):
         found = CliRunner().invoke(app, [command, "--help"])
         assert found.exit_code == 0 and "--folder" in found.output

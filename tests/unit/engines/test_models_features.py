@@ -1,4 +1,4 @@
-"""Keypoints of XFeat and of exports that a manifest describes, and how those of two pictures are joined."""
+"""Keypoints of XFeat and of models with a manifest, and their matching between two images."""
 
 import shutil
 from collections.abc import Callable
@@ -8,17 +8,23 @@ import numpy as np
 import pytest
 
 import tiny_onnx
-from ground import texture
 from terrafix_engines import manifest
-from terrafix_engines.features import open_describer, open_detector, open_matcher, open_picture_matcher
-from terrafix_engines.features.exported import in_pixels
+from terrafix_engines.features import open_describer, open_detector, open_matcher, open_pair_matcher
+from terrafix_engines.features.exported import to_pixels
 from terrafix_engines.features.image_input import image_tensor
-from terrafix_engines.features.keypoints import Keypoints, MutualNearest, PairMatcher, best_of, unit
-from terrafix_engines.features.lightglue import as_pairs, placed
+from terrafix_engines.features.keypoints import (
+    Keypoints,
+    MutualNearestMatcher,
+    PairMatcher,
+    select_strongest,
+    unit_rows,
+)
+from terrafix_engines.features.lightglue import decode_matches, model_coordinates
 from terrafix_engines.features.xfeat import XFeatDescriber, probabilities, sample
 from terrafix_engines.manifest import Coordinates, ImageInput, MatcherTensors
 from terrafix_engines.runtime import ModelRunError
-from terrafix_engines.store import Stored, stored
+from terrafix_engines.store import StoredModel, stored_model
+from textured_ground import texture
 
 DETECTOR = """name = "points"
 title = "an export of points"
@@ -109,12 +115,12 @@ shape = ["pairs"]
 DataSet = Callable[[str], Path]
 
 
-def kept(folder: Path, text: str, content: bytes) -> Stored:
+def kept(folder: Path, text: str, content: bytes) -> StoredModel:
     path = tiny_onnx.write(folder, text, content)
-    return stored(manifest.read(path.with_suffix(".toml")), folder)
+    return stored_model(manifest.read(path.with_suffix(".toml")), folder)
 
 
-def exported(folder: Path, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray) -> Stored:
+def exported(folder: Path, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray) -> StoredModel:
     outputs = {"kpts": keypoints[None], "scores": scores[None], "desc": descriptors[None]}
     content = tiny_onnx.constants(
         {"image": ([1, 1, "h", "w"], "float32")}, {k: v.astype(np.float32) for k, v in outputs.items()}
@@ -122,7 +128,7 @@ def exported(folder: Path, keypoints: np.ndarray, scores: np.ndarray, descriptor
     return kept(folder, DETECTOR, content)
 
 
-def test_a_picture_becomes_the_input_that_the_manifest_asks_for() -> None:
+def test_an_image_is_converted_as_the_manifest_specifies() -> None:
     image = np.zeros((2, 3, 3), np.uint8)
     image[0, 2] = (10, 20, 30)
     for colour, planes in (("rgb", (30, 20, 10)), ("bgr", (10, 20, 30))):
@@ -134,7 +140,7 @@ def test_a_picture_becomes_the_input_that_the_manifest_asks_for() -> None:
     assert gray.shape == (1, 1, 2, 3) and gray[0, 0, 0, 2] == round(0.114 * 10 + 0.587 * 20 + 0.299 * 30)
 
 
-def test_the_65_logits_of_a_cell_are_its_pixels_row_by_row_and_none() -> None:
+def test_the_65_logits_of_a_cell_are_its_pixels_by_row_and_no_keypoint() -> None:
     logits = np.zeros((65, 3, 4), np.float32)
     logits[64] = 20.0
     logits[8 * 5 + 2, 1, 3] = 30.0
@@ -144,38 +150,38 @@ def test_the_65_logits_of_a_cell_are_its_pixels_row_by_row_and_none() -> None:
     assert heat.max() > 0.99 and np.sort(heat.ravel())[-2] < 1e-6
 
 
-def test_maps_are_read_where_their_cells_lie() -> None:
+def test_cell_maps_are_sampled_at_cell_centres() -> None:
     y, x = np.mgrid[0:4, 0:6].astype(np.float32)
     cells = np.stack([x, y])
     at = np.array([[3.5, 3.5], [11.5, 3.5], [7.5, 19.5], [0.0, 0.0], [47.0, 31.0]], np.float32)
-    expected = [[0, 0], [1, 0], [0.5, 2], [0, 0], [5, 3]]  # the middle of cell k is pixel 8 k + 3.5; the rim is kept
+    expected = [[0, 0], [1, 0], [0.5, 2], [0, 0], [5, 3]]  # the centre of cell k is pixel 8 k + 3.5; edge cells repeat
     assert np.allclose(sample(cells, at), expected)
 
 
-def test_coordinates_of_other_exports_become_pixels() -> None:
+def test_keypoint_coordinates_of_all_conventions_are_converted_to_pixels() -> None:
     corners = np.array([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0]], np.float32)
     expected = [[0, 0], [639, 479], [319.5, 239.5]]
     given: tuple[tuple[Coordinates, np.ndarray], ...]
     given = (("signed", corners), ("unit", (corners + 1) / 2), ("pixels", np.array(expected)))
     for coordinates, xy in given:
-        assert np.allclose(in_pixels(xy, coordinates, (480, 640)), expected)
+        assert np.allclose(to_pixels(xy, coordinates, (480, 640)), expected)
 
 
-def test_the_best_points_within_the_picture_are_kept() -> None:
+def test_the_strongest_keypoints_inside_the_image_are_selected() -> None:
     xy = np.array([[0, 0], [9, 4], [9.2, 4], [5, -0.1], [3, 3]], np.float32)
-    assert best_of(xy, np.array([0.1, 0.5, 0.9, 0.9, 0.5]), (10, 5), 3).tolist() == [1, 4, 0]
+    assert select_strongest(xy, np.array([0.1, 0.5, 0.9, 0.9, 0.5]), (10, 5), 3).tolist() == [1, 4, 0]
 
 
-def test_mutual_nearest_neighbours_find_the_permutation_and_leave_strangers_out() -> None:
+def test_mutual_nearest_neighbours_find_the_permutation_and_no_false_matches() -> None:
     rng = np.random.default_rng(2)
-    first = unit(rng.normal(size=(40, 32)))
+    first = unit_rows(rng.normal(size=(40, 32)))
     order = rng.permutation(40)[:30]
-    second = unit(np.vstack([first[order] + rng.normal(0, 0.02, (30, 32)), rng.normal(size=(20, 32))]))
-    pairs, scores = MutualNearest().match(points(first), points(second))
+    second = unit_rows(np.vstack([first[order] + rng.normal(0, 0.02, (30, 32)), rng.normal(size=(20, 32))]))
+    pairs, scores = MutualNearestMatcher().match(points(first), points(second))
     assert sorted(map(tuple, pairs.tolist())) == sorted((int(k), i) for i, k in enumerate(order))
     assert scores.min() > 0.9
     nobody = points(np.zeros((0, 32), np.float32))
-    assert len(MutualNearest().match(nobody, points(first))[0]) == 0
+    assert len(MutualNearestMatcher().match(nobody, points(first))[0]) == 0
 
 
 def points(descriptors: np.ndarray, xy_px: np.ndarray | None = None) -> Keypoints:
@@ -184,24 +190,24 @@ def points(descriptors: np.ndarray, xy_px: np.ndarray | None = None) -> Keypoint
     return Keypoints(xy_px, np.ones(count, np.float32), descriptors, (640, 480))
 
 
-def test_a_matcher_gets_its_coordinates_and_says_its_pairs_in_the_stated_way() -> None:
+def test_a_matcher_uses_the_coordinates_and_pair_format_of_its_manifest() -> None:
     def spec(**more: str) -> MatcherTensors:
         common = {"features": "f", "keypoints": ["a", "b"], "descriptors": ["c", "d"], "matches": "m", "scores": "s"}
         return manifest.msgspec.convert(common | more, MatcherTensors)
 
     given = points(np.zeros((2, 4), np.float32), np.array([[320.0, 240.0], [640.0, 0.0]], np.float32))
-    assert np.allclose(placed(given, spec()), [[0, 0], [1, -0.75]])
-    assert np.allclose(placed(given, spec(coordinates="pixels")), given.xy_px)
+    assert np.allclose(model_coordinates(given, spec()), [[0, 0], [1, -0.75]])
+    assert np.allclose(model_coordinates(given, spec(coordinates="pixels")), given.xy_px)
     scores = np.array([0.5, 0.25], np.float32)
     for matches in ([[3, 1], [4, 2]], [[0, 3, 1], [0, 4, 2]]):
-        pairs, confidence = as_pairs(np.array(matches), scores, spec())
+        pairs, confidence = decode_matches(np.array(matches), scores, spec())
         assert pairs.tolist() == [[3, 1], [4, 2]] and confidence.tolist() == [0.5, 0.25]
-    pairs, confidence = as_pairs(np.array([[-1, 7, -1, 0]]), np.array([[0.0, 0.5, 0.0, 1.0]]), spec(form="index"))
+    pairs, confidence = decode_matches(np.array([[-1, 7, -1, 0]]), np.array([[0.0, 0.5, 0.0, 1.0]]), spec(form="index"))
     assert pairs.tolist() == [[1, 7], [3, 0]] and confidence.tolist() == [0.5, 1.0]
 
 
-def test_an_export_of_points_runs_by_its_manifest(tmp_path: Path) -> None:
-    # 90 x 60 is filled up to 96 x 64: signed coordinates count in that, and points in the filling are dropped.
+def test_a_keypoint_model_runs_by_its_manifest(tmp_path: Path) -> None:
+    # 90 x 60 is padded to 96 x 64: signed coordinates refer to that, and points in the padding are dropped.
     xy_px = np.array([[10.0, 20.0], [89.0, 59.0], [93.0, 10.0]])
     signed = xy_px / [95.0, 63.0] * 2 - 1
     descriptors = np.random.default_rng(1).normal(size=(4, 3))
@@ -209,11 +215,11 @@ def test_an_export_of_points_runs_by_its_manifest(tmp_path: Path) -> None:
     found = detector.detect(np.zeros((60, 90, 3), np.uint8), 10)
     assert detector.name == "points" and found.size_px == (90, 60)
     assert np.allclose(found.xy_px, [[89, 59], [10, 20]], atol=1e-3)
-    assert np.allclose(found.descriptors, unit(descriptors.T[[1, 0]]), atol=1e-6)
+    assert np.allclose(found.descriptors, unit_rows(descriptors.T[[1, 0]]), atol=1e-6)
     assert len(detector.detect(np.zeros((60, 90, 3), np.uint8), 1).xy_px) == 1
 
 
-def test_a_matcher_runs_by_its_manifest_and_may_not_join_what_is_not_there(tmp_path: Path) -> None:
+def test_a_matcher_runs_by_its_manifest_and_must_not_match_missing_keypoints(tmp_path: Path) -> None:
     inputs: dict[str, tuple[tiny_onnx.Shape, str]] = {
         name: ([1, count, size], "float32")
         for name, count, size in (("k0", "a", 2), ("k1", "b", 2), ("d0", "a", 4), ("d1", "b", 4))
@@ -225,23 +231,23 @@ def test_a_matcher_runs_by_its_manifest_and_may_not_join_what_is_not_there(tmp_p
     first, second = points(np.ones((9, 4), np.float32)), points(np.ones((12, 4), np.float32))
     pairs, scores = matcher.match(first, second)
     assert pairs.tolist() == [[3, 8]] and np.allclose(scores, 0.7)
-    with pytest.raises(ModelRunError, match="glue: joins points that are not there"):
+    with pytest.raises(ModelRunError, match="glue: matches points that do not exist"):
         matcher.match(first, points(np.ones((8, 4), np.float32)))
     assert len(matcher.match(first, points(np.ones((7, 4), np.float32)))[0]) == 0
 
 
-def test_an_export_of_one_size_is_filled_up_to_it_and_takes_nothing_larger(tmp_path: Path) -> None:
+def test_a_model_of_fixed_size_pads_small_images_and_rejects_larger_ones(tmp_path: Path) -> None:
     outputs = {"kpts": np.zeros((1, 3, 2)), "scores": np.ones((1, 3)), "desc": np.ones((1, 4, 3))}
     content = tiny_onnx.constants(
         {"image": ([1, 1, 64, 96], "float32")}, {k: v.astype(np.float32) for k, v in outputs.items()}
     )
     detector = open_detector(kept(tmp_path, DETECTOR.replace('"height", "width"', "64, 96"), content))
     assert len(detector.detect(np.zeros((60, 90, 3), np.uint8), 10).xy_px) == 3
-    with pytest.raises(ModelRunError, match="takes pictures of 96x64 px, not 97x60"):
+    with pytest.raises(ModelRunError, match="takes images of 96x64 px, not 97x60"):
         detector.detect(np.zeros((60, 97, 3), np.uint8), 10)
 
 
-def test_a_manifest_that_mixes_its_outputs_up_is_told(tmp_path: Path) -> None:
+def test_swapped_outputs_in_a_keypoint_manifest_are_reported(tmp_path: Path) -> None:
     text = DETECTOR.replace("channels_first = true\n", "").replace(
         'shape = [1, 4, "points"]', 'shape = [1, "rows", "columns"]'
     )
@@ -254,34 +260,34 @@ def test_a_manifest_that_mixes_its_outputs_up_is_told(tmp_path: Path) -> None:
         detector.detect(np.zeros((64, 64, 3), np.uint8), 10)
 
 
-def test_a_model_that_is_given_both_pictures_says_what_is_the_same_in_them(tmp_path: Path) -> None:
-    """The graph answers with the brightest pixel of each row of either picture: known without it."""
+def test_an_image_pair_model_returns_corresponding_points(tmp_path: Path) -> None:
+    """The graph outputs the brightest pixel of each row of both images, so the expected result is known."""
     first, second = np.zeros((8, 20, 3), np.uint8), np.zeros((6, 24, 3), np.uint8)
     for row, (x0, x1) in enumerate(((3, 5), (19, 23), (0, 11), (7, 9), (2, 1), (4, 6))):
         first[row, x0], second[row, x1] = 51 * row, 255
-    matcher = open_picture_matcher(kept(tmp_path, SEMI_DENSE, tiny_onnx.brightest_of_rows()))
+    matcher = open_pair_matcher(kept(tmp_path, SEMI_DENSE, tiny_onnx.brightest_of_rows()))
     found = matcher.match(first, second)
-    # Both are filled up to 24 x 8. Rows 6 and 7 of the second one are filling, and bright: they are left out.
+    # Both are padded to 24 x 8. Rows 6 and 7 of the second one are padding, and bright: they must be dropped.
     assert matcher.name == "both"
     assert found.first_px.tolist() == [[0, 0], [19, 1], [0, 2], [7, 3], [2, 4], [4, 5]]
     assert found.second_px.tolist() == [[5, 0], [23, 1], [11, 2], [9, 3], [1, 4], [6, 5]]
     assert np.allclose(found.confidence, [0, 0.2, 0.4, 0.6, 0.8, 1.0])
 
 
-def test_a_manifest_that_mixes_the_two_pictures_up_is_told(tmp_path: Path) -> None:
+def test_swapped_outputs_in_a_pair_manifest_are_reported(tmp_path: Path) -> None:
     other = SEMI_DENSE.replace('name = "image1"\nshape = [1, 1,', 'name = "image1"\nshape = [1, 3,')
-    for text, says in (
+    for text, reason in (
         (other, "'image1' must have the shape of 'image0'"),
         (SEMI_DENSE.replace('second = "image1"', 'second = "right"'), "'right' is used, but neither"),
         (SEMI_DENSE.split("[pair]")[0] + "[[inputs]]" + SEMI_DENSE.split("[[inputs]]", 1)[1], r"a section \[pair\]"),
     ):
-        with pytest.raises(manifest.ManifestError, match=says):
+        with pytest.raises(manifest.ManifestError, match=reason):
             kept(tmp_path, text, b"no model")
     outputs = {"mkpts0": np.zeros((3, 2)), "mkpts1": np.zeros((3, 2)), "mconf": np.zeros(2)}
     pictures: dict[str, tuple[tiny_onnx.Shape, str]] = {f"image{k}": ([1, 1, "h", "w"], "float32") for k in (0, 1)}
     content = tiny_onnx.constants(pictures, {k: v.astype(np.float32) for k, v in outputs.items()})
     stated = SEMI_DENSE.replace('name = "mconf"\nshape = ["pairs"]', 'name = "mconf"\nshape = ["scores"]')
-    matcher = open_picture_matcher(kept(tmp_path, stated, content))
+    matcher = open_pair_matcher(kept(tmp_path, stated, content))
     with pytest.raises(ModelRunError, match=r"both: 3 and 3 points, 2 scores; check \[pair\]"):
         matcher.match(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8, 3), np.uint8))
 
@@ -293,7 +299,7 @@ def real(data_set: DataSet, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_xfeat_is_the_same_by_name_and_by_path(real: Path) -> None:
+def test_xfeat_by_name_equals_xfeat_by_path(real: Path) -> None:
     image = texture(3, 40.0)[:90, :130]
     by_name = open_describer("xfeat", str(real))
     by_path = open_describer(str(real / "xfeat.onnx"), str(real / "nothing"))
@@ -304,16 +310,16 @@ def test_xfeat_is_the_same_by_name_and_by_path(real: Path) -> None:
 
 
 @pytest.mark.parametrize("glue", ["", "lighterglue-l3"])
-def test_real_features_find_how_far_a_picture_was_moved(real: Path, glue: str) -> None:
+def test_real_features_find_the_shift_between_two_images(real: Path, glue: str) -> None:
     ground = texture(4, 120.0)
-    known = manifest.known(real)
-    detector = open_detector(stored(known["xfeat"], real))
-    matcher: PairMatcher = open_matcher(stored(known[glue], real)) if glue else MutualNearest()
+    known = manifest.read_all(real)
+    detector = open_detector(stored_model(known["xfeat"], real))
+    matcher: PairMatcher = open_matcher(stored_model(known[glue], real)) if glue else MutualNearestMatcher()
     first, second = ground[40:296, 60:316], ground[53:309, 37:293]
     one, two = detector.detect(first, 300), detector.detect(second, 300)
     pairs, _ = matcher.match(one, two)
     moved = two.xy_px[pairs[:, 1]] - one.xy_px[pairs[:, 0]]
-    # A descriptor is one of a cell of 8 px: within that a neighbour may be taken for the point itself.
+    # A descriptor covers a cell of 8 px: a match may be a neighbour within the cell.
     right = np.hypot(*(moved - [23, -13]).T) < 8.0
     assert right.sum() >= 50 and right.mean() > 0.8
     assert np.hypot(*(np.median(moved, axis=0) - [23, -13])) < 1.0

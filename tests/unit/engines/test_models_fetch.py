@@ -1,4 +1,4 @@
-"""`terrafix models fetch`: whole and right under its own name, or not at all."""
+"""`terrafix models fetch`: a complete and verified file, or none."""
 
 import errno
 import os
@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import tiny_onnx
-from map_servers import Asked, Reply, serving
+from map_servers import Reply, Request, serving
 from terrafix.core.errors import ModelError, OutputError, TerrafixError
 from terrafix_tools.models import download
 from terrafix_tools.models.cli import app
@@ -27,7 +27,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A models folder that knows a model `tiny`, whose file is not there."""
+    """A models folder with the manifest of a model `tiny`, without its file."""
     folder = tmp_path / "models"
     folder.mkdir()
     tiny_onnx.write(folder, tiny_onnx.XFEAT_LIKE, CONTENT).unlink()
@@ -38,90 +38,90 @@ def fetch(folder: Path, source: object) -> None:
     fetch_all(["tiny"], str(source), str(folder))
 
 
-def ranged(asked: Asked, content: bytes = CONTENT) -> Reply:
-    """A server that knows ranges."""
-    wanted = asked.headers.get("Range", "")
+def ranged(request: Request, content: bytes = CONTENT) -> Reply:
+    """A server that supports range requests."""
+    wanted = request.headers.get("Range", "")
     if not wanted:
         return Reply(body=content)
     start = int(wanted.removeprefix("bytes=").rstrip("-"))
-    told = {"Content-Range": f"bytes {start}-{len(content) - 1}/{len(content)}"}
-    return Reply(status=206, body=content[start:], headers=told)
+    headers = {"Content-Range": f"bytes {start}-{len(content) - 1}/{len(content)}"}
+    return Reply(status=206, body=content[start:], headers=headers)
 
 
-def test_a_file_comes_whole(folder: Path) -> None:
+def test_fetch_downloads_a_complete_file(folder: Path) -> None:
     with serving(ranged) as server:
         fetch(folder, f"{server.url}/tiny.onnx")
     assert (folder / "tiny.onnx").read_bytes() == CONTENT
     assert sorted(path.name for path in folder.iterdir()) == ["tiny.onnx", "tiny.toml"]
 
 
-def test_it_goes_on_where_it_was_cut_off(folder: Path) -> None:
-    def cut(asked: Asked) -> Reply:
-        reply = ranged(asked)
-        reply.promised = len(reply.body)
+def test_fetch_resumes_after_a_lost_connection(folder: Path) -> None:
+    def cut(request: Request) -> Reply:
+        reply = ranged(request)
+        reply.content_length = len(reply.body)
         reply.body = reply.body[:9000]
         return reply
 
     with serving(cut) as server:
         fetch(folder, f"{server.url}/tiny.onnx")
-        ranges = [asked.headers.get("Range", "") for asked in server.asked]
+        ranges = [request.headers.get("Range", "") for request in server.requests]
     assert (folder / "tiny.onnx").read_bytes() == CONTENT
     assert ranges[:3] == ["", "bytes=9000-", "bytes=18000-"]
 
 
-def test_a_later_run_goes_on_too_and_a_stranger_is_started_anew(folder: Path) -> None:
+def test_a_later_fetch_resumes_and_restarts_when_the_partial_file_does_not_match(folder: Path) -> None:
     part = folder / "tiny.onnx.part"
     for begun, requests in ((CONTENT[:500], 1), (b"another file", 2)):
         (folder / "tiny.onnx").unlink(missing_ok=True)
         part.write_bytes(begun)
         with serving(ranged) as server:
             fetch(folder, f"{server.url}/tiny.onnx")
-            assert server.asked[0].headers["Range"] == f"bytes={len(begun)}-" and len(server.asked) == requests
+            assert server.requests[0].headers["Range"] == f"bytes={len(begun)}-" and len(server.requests) == requests
         assert (folder / "tiny.onnx").read_bytes() == CONTENT and not part.exists()
 
 
-def test_a_server_without_ranges_sends_it_all_again(folder: Path) -> None:
+def test_fetch_restarts_on_a_server_without_range_requests(folder: Path) -> None:
     (folder / "tiny.onnx.part").write_bytes(b"x" * 500)
     with serving(lambda _: Reply(body=CONTENT)) as server:
         fetch(folder, f"{server.url}/tiny.onnx")
     assert (folder / "tiny.onnx").read_bytes() == CONTENT
 
 
-def test_a_server_that_recovers_is_asked_again(folder: Path) -> None:
+def test_fetch_retries_a_server_that_recovers(folder: Path) -> None:
     replies = iter([Reply(status=503), Reply(status=429)])
-    with serving(lambda asked: next(replies, None) or ranged(asked)) as server:
+    with serving(lambda request: next(replies, None) or ranged(request)) as server:
         fetch(folder, f"{server.url}/tiny.onnx")
     assert (folder / "tiny.onnx").read_bytes() == CONTENT
 
 
-def always_cut(_: Asked) -> Reply:
-    return Reply(body=CONTENT[:100], promised=len(CONTENT))
+def always_cut(_: Request) -> Reply:
+    return Reply(body=CONTENT[:100], content_length=len(CONTENT))
 
 
 ALTERED = CONTENT[:-1] + b"?"
 
 
 @pytest.mark.parametrize(
-    ("answer", "says"),
+    ("answer", "reason"),
     [
         (lambda _: Reply(status=404), "the server refuses (status 404); check the address"),
-        (lambda _: Reply(status=500), "the server says 500, 0.0 of 0.1 MB are here; run it again"),
+        (lambda _: Reply(status=500), "the server returned status 500, 0.0 of 0.1 MB are here; run it again"),
         (always_cut, "the answer was cut off, 0.0 of 0.1 MB are here; run it again to go on"),
         (lambda _: Reply(body=b"<html>no</html>"), "has 15 bytes, the published file"),
         (lambda _: Reply(body=CONTENT + b"more"), "the published file"),
         (lambda _: Reply(body=ALTERED), "not the published file (sha256"),
     ],
 )
-def test_what_goes_wrong_is_told_and_leaves_nothing_under_the_name(
-    folder: Path, answer: Callable[[Asked], Reply], says: str
+def test_a_failed_fetch_is_reported_and_leaves_no_model_file(
+    folder: Path, answer: Callable[[Request], Reply], reason: str
 ) -> None:
     with serving(answer) as server, pytest.raises(ModelError) as error:
         fetch(folder, f"{server.url}/tiny.onnx")
-    assert says in str(error.value) and "\n" not in str(error.value)
+    assert reason in str(error.value) and "\n" not in str(error.value)
     assert not (folder / "tiny.onnx").exists()
 
 
-def test_no_network(folder: Path) -> None:
+def test_fetch_without_network_is_reported(folder: Path) -> None:
     with serving(ranged) as server:
         url = server.url
     with pytest.raises(ModelError, match=r"no connection, 0\.0 of .* or give a file with --from"):
@@ -129,7 +129,7 @@ def test_no_network(folder: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["tiny.toml"]
 
 
-def test_from_a_folder_or_a_file(folder: Path, tmp_path: Path) -> None:
+def test_fetch_copies_from_a_folder_or_a_file(folder: Path, tmp_path: Path) -> None:
     stick = tmp_path / "stick"
     stick.mkdir()
     (stick / "tiny.onnx").write_bytes(CONTENT)
@@ -147,7 +147,7 @@ def test_from_a_folder_or_a_file(folder: Path, tmp_path: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["tiny.toml"]
 
 
-def test_an_altered_file_is_replaced_and_a_right_one_is_left(folder: Path, tmp_path: Path) -> None:
+def test_fetch_replaces_an_altered_file_and_keeps_a_correct_one(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "tiny.onnx").write_bytes(CONTENT)
     (folder / "tiny.onnx").write_bytes(ALTERED)
     fetch(folder, tmp_path)
@@ -156,13 +156,13 @@ def test_an_altered_file_is_replaced_and_a_right_one_is_left(folder: Path, tmp_p
     assert found.exit_code == 0 and "is there already, as published" in found.output
 
 
-def test_the_licence_is_shown(folder: Path, tmp_path: Path) -> None:
+def test_fetch_shows_the_licence(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "tiny.onnx").write_bytes(CONTENT)
     found = CliRunner().invoke(app, ["fetch", "tiny", "--from", str(tmp_path), "--folder", str(folder)])
     assert found.exit_code == 0 and "licence CC0" in found.output and "sha256 is right" in found.output
 
 
-def test_a_folder_that_cannot_be_used(folder: Path, tmp_path: Path) -> None:
+def test_fetch_reports_an_unusable_models_folder(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "tiny.onnx").write_bytes(CONTENT)
     (tmp_path / "file").write_text("")
     with pytest.raises(TerrafixError) as error:
@@ -170,14 +170,14 @@ def test_a_folder_that_cannot_be_used(folder: Path, tmp_path: Path) -> None:
     assert isinstance(error.value, OutputError) and "the model was not fetched" in str(error.value)
     with pytest.raises(ModelError, match="no model is called 'superglue'; known: "):
         fetch_all(["superglue"], "", str(folder))
-    if os.geteuid() != 0:  # root may read everything
+    if os.geteuid() != 0:  # root ignores permissions
         folder.chmod(0o000)
         with pytest.raises(ModelError, match="cannot be read"):
             fetch(folder, tmp_path)
         folder.chmod(0o755)
 
 
-def test_a_full_disk_is_told_and_what_came_is_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_and_the_partial_file_remains(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -187,15 +187,15 @@ def test_a_full_disk_is_told_and_what_came_is_kept(folder: Path, monkeypatch: py
     assert not (folder / "tiny.onnx").exists() and (folder / "tiny.onnx.part").stat().st_size == len(CONTENT)
 
 
-def test_two_at_once_do_not_write_into_each_other(folder: Path) -> None:
+def test_two_concurrent_fetches_use_separate_files(folder: Path) -> None:
     other: list[str] = []
 
-    def answer(asked: Asked) -> Reply:
+    def answer(request: Request) -> Reply:
         if not other:
             with pytest.raises(ModelError, match="another terrafix is fetching this model") as error:
                 fetch(folder, "http://127.0.0.1:1/tiny.onnx")
             other.append(str(error.value))
-        return ranged(asked)
+        return ranged(request)
 
     with serving(answer) as server:
         fetch(folder, f"{server.url}/tiny.onnx")

@@ -1,4 +1,4 @@
-"""A learned model that fails in flight: contained, said, recorded, and in the end done without."""
+"""A learned model that fails in flight: the failure is contained, published and recorded; then it is abandoned."""
 
 from pathlib import Path
 from typing import Any
@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import tiny_onnx
-from ground import PINHOLE, texture, view
-from one_place import ORIGIN, SIDE_M, TRUE_M, OnlyMap, R, predicted
-from terrafix.anchor.model_monitor import FAILURES
+from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
+from terrafix.anchor.model_monitor import MAX_FAILURES
 from terrafix.anchor.node import AnchorNode, make_node
 from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.relocalization.relocalizer import LOST_SIGMA_M
@@ -28,15 +27,16 @@ from terrafix.messages import (
 )
 from terrafix_engines.features import open_describer
 from terrafix_engines.features.xfeat import XFeatDescriber
-from terrafix_engines.providers import CUDA, PassedOver
+from terrafix_engines.providers import CUDA, RejectedProvider
 from terrafix_engines.runtime import ModelRunError
+from textured_ground import PINHOLE, texture, view
 
 BLUE = np.full((360, 640, 3), (255, 0, 0), np.uint8)
 STARTED = msgspec.structs.replace(ORIGIN, t_ns=7)
 
 
 class Flight:
-    """An anchor with a model that has no answer to a blue picture."""
+    """An anchor node with a model that fails on a blue image."""
 
     def __init__(self, folder: Path, ground: np.ndarray, start_sigma_m: float = 10.0) -> None:
         tiny_onnx.write(folder, tiny_onnx.XFEAT_LIKE, tiny_onnx.xfeat_like("blue"))
@@ -44,16 +44,16 @@ class Flight:
         assert isinstance(describer, XFeatDescriber)
         self.describer, self.frames, self.frame_id = describer, MemoryFrameStore(4), 0
         self.seen = view(ground, PINHOLE, R, TRUE_M)
-        package: Any = OnlyMap(ground)
+        package: Any = SingleMapPackage(ground)
         self.node = AnchorNode(self.frames, package, describer, 1.0)
         self.begun = list(self.node.on(msgspec.structs.replace(STARTED, start_sigma_m=start_sigma_m)))
 
     def frame(self, image: np.ndarray, sigma_m: float = 10.0) -> tuple[MapMatch, list[ModelEvent]]:
         self.frame_id += 1
         self.frames.put(self.frame_id, image)
-        said: list[Message] = list(self.node.on(predicted(self.frame_id, sigma_m)))
-        (match,) = (m for m in said if isinstance(m, MapMatch))
-        return match, [m for m in said if isinstance(m, ModelEvent)]
+        published: list[Message] = list(self.node.on(predicted(self.frame_id, sigma_m)))
+        (match,) = (m for m in published if isinstance(m, MapMatch))
+        return match, [m for m in published if isinstance(m, ModelEvent)]
 
 
 @pytest.fixture(scope="module")
@@ -61,29 +61,29 @@ def ground() -> np.ndarray:
     return texture(8, SIDE_M)
 
 
-def test_it_is_said_what_runs_the_model_and_why_nothing_better_does(tmp_path: Path, ground: np.ndarray) -> None:
+def test_the_provider_and_the_reasons_against_better_ones_are_published(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
     (event,) = flight.begun
     assert isinstance(event, ModelEvent)
     assert (event.t_ns, event.model, event.change) == (7, "xfeat", ModelChange.OPENED)
     assert event.provider and flight.describer.model.sha256[:12] in event.detail
-    for over in flight.describer.model.passed_over:
+    for over in flight.describer.model.rejected_providers:
         assert str(over) in event.detail
 
 
-def test_a_frame_without_an_answer_costs_that_frame_only(tmp_path: Path, ground: np.ndarray) -> None:
+def test_a_failed_inference_loses_one_frame_only(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
     match, events = flight.frame(BLUE)
     assert (match.verdict, match.step, match.matcher) == (Verdict.MODEL_FAILED, SearchStep.SKIP, "xfeat")
     assert match.cov is None and match.p_c_in_w_m is None
-    assert [e.change for e in events] == [ModelChange.FAILED] and "not a number" in events[0].detail
+    assert [e.change for e in events] == [ModelChange.FAILED] and "has NaN" in events[0].detail
     match, events = flight.frame(flight.seen)
     assert match.verdict is not Verdict.MODEL_FAILED and match.matcher == "xfeat" and events == []
 
 
-def test_a_model_that_never_answers_is_given_up_and_the_flight_goes_on(tmp_path: Path, ground: np.ndarray) -> None:
+def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
-    for _ in range(FAILURES):
+    for _ in range(MAX_FAILURES):
         match, events = flight.frame(BLUE)
     assert match.verdict is Verdict.MODEL_FAILED
     assert [e.change for e in events] == [ModelChange.FAILED, ModelChange.GIVEN_UP]
@@ -92,40 +92,42 @@ def test_a_model_that_never_answers_is_given_up_and_the_flight_goes_on(tmp_path:
     assert match.p_c_in_w_m is not None and np.hypot(*(np.array(match.p_c_in_w_m) - TRUE_M)[:2]) < 3.0
 
 
-def test_only_failures_in_a_row_count(tmp_path: Path, ground: np.ndarray) -> None:
+def test_only_consecutive_failures_count(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
-    for image in [*[BLUE] * (FAILURES - 1), flight.seen, *[BLUE] * (FAILURES - 1)]:
+    for image in [*[BLUE] * (MAX_FAILURES - 1), flight.seen, *[BLUE] * (MAX_FAILURES - 1)]:
         match, _ = flight.frame(image)
     assert match.matcher == "xfeat"
     match, events = flight.frame(BLUE)
     assert events[-1].change is ModelChange.GIVEN_UP
 
 
-def test_a_provider_that_failed_is_said(tmp_path: Path, ground: np.ndarray) -> None:
+def test_a_failed_provider_is_published(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
-    flight.describer.model.passed_over.append(PassedOver(CUDA, "failed while it ran: out of memory"))
+    flight.describer.model.rejected_providers.append(RejectedProvider(CUDA, "failed while it ran: out of memory"))
     _, events = flight.frame(flight.seen)
     (event,) = events
     assert event.change is ModelChange.PROVIDER and event.detail == "CUDA: failed while it ran: out of memory"
     assert flight.frame(flight.seen)[1] == []
 
 
-def test_while_it_is_lost_it_stays_lost(tmp_path: Path, ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_model_during_a_search_leaves_the_search_state_unchanged(
+    tmp_path: Path, ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def broken(*_: object) -> None:
         raise ModelRunError("no answer")
 
-    monkeypatch.setattr(MapSearch, "look", broken)
+    monkeypatch.setattr(MapSearch, "process_frame", broken)
     flight = Flight(tmp_path, ground, start_sigma_m=5000.0)
-    for _ in range(FAILURES):
+    for _ in range(MAX_FAILURES):
         match, events = flight.frame(flight.seen, sigma_m=100.0)
         assert (match.verdict, match.lost_sigma_m) == (Verdict.LOST, LOST_SIGMA_M)
     assert events[-1].change is ModelChange.GIVEN_UP
-    monkeypatch.setattr(MapSearch, "look", lambda *_: None)
+    monkeypatch.setattr(MapSearch, "process_frame", lambda *_: None)
     match, _ = flight.frame(flight.seen, sigma_m=100.0)
     assert (match.verdict, match.lost_sigma_m, match.matcher) == (Verdict.LOST, LOST_SIGMA_M, "gradient")
 
 
-def test_a_model_that_cannot_be_opened_is_refused_on_the_ground_and_done_without_in_flight(tmp_path: Path) -> None:
+def test_a_model_that_cannot_be_opened_is_an_error_on_the_ground_and_skipped_in_flight(tmp_path: Path) -> None:
     (tmp_path / "xfeat.onnx").write_bytes(b"half a file")
     config = Config(models=Models(xfeat=str(tmp_path / "xfeat.onnx")))
 

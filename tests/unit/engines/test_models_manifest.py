@@ -1,4 +1,4 @@
-"""Manifests: those that come with the program are right, and a user's mistakes are told in one line."""
+"""Manifests: the shipped ones are valid, and errors in a user's own are reported in one line."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import tiny_onnx
 from terrafix_engines import manifest
 from terrafix_engines.manifest import ManifestError
 from terrafix_engines.runtime import ModelFileError
-from terrafix_engines.store import State, Stored, find, models_folder, stored
+from terrafix_engines.store import State, StoredModel, models_folder, resolve_model, stored_model
 
 HEAD = f'file = "tiny.onnx"\nsha256 = "{"0" * 64}"\nsize_bytes = 7\n'
 WHOLE = HEAD + tiny_onnx.XFEAT_LIKE
@@ -20,7 +20,7 @@ def written(folder: Path, text: str, name: str = "tiny.toml") -> Path:
     return path
 
 
-def test_the_shipped_ones_are_whole_and_say_where_from_and_under_which_licence() -> None:
+def test_the_shipped_manifests_have_a_source_and_a_licence() -> None:
     shipped = [manifest.read(path) for path in manifest.SHIPPED.glob("*.toml")]
     assert {m.name for m in shipped} == {"xfeat", "lighterglue-l3"}
     for m in shipped:
@@ -29,7 +29,7 @@ def test_the_shipped_ones_are_whole_and_say_where_from_and_under_which_licence()
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "reason"),
     [
         (('name = "tiny"\n', 'name = "Tiny Model"\n'), "name"),
         (('role = "dense"', 'role = "dens"'), "Invalid enum value 'dens'"),
@@ -49,25 +49,25 @@ def test_the_shipped_ones_are_whole_and_say_where_from_and_under_which_licence()
         (('["batch", 3, "height", "width"]', '[3, "height", "width"]'), 'must end with "height", "width", or'),
     ],
 )
-def test_a_mistake_is_told_with_file_and_reason(tmp_path: Path, change: tuple[str, str], says: str) -> None:
+def test_a_manifest_error_names_file_and_reason(tmp_path: Path, change: tuple[str, str], reason: str) -> None:
     assert change[0] in WHOLE
     path = written(tmp_path, WHOLE.replace(*change, 1))
-    with pytest.raises(ManifestError, match=says) as error:
+    with pytest.raises(ManifestError, match=reason) as error:
         manifest.read(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_broken_file_does_no_harm_to_a_shipped_model(tmp_path: Path) -> None:
+def test_a_broken_manifest_does_not_affect_a_shipped_model(tmp_path: Path) -> None:
     written(tmp_path, "name = ")
-    assert manifest.named("xfeat", tmp_path).name == "xfeat"
+    assert manifest.find_manifest("xfeat", tmp_path).name == "xfeat"
     with pytest.raises(ManifestError, match=r"tiny\.toml: not valid TOML"):
-        manifest.named("tiny", tmp_path)
+        manifest.find_manifest("tiny", tmp_path)
 
 
-def test_a_name_is_given_once(tmp_path: Path) -> None:
+def test_a_duplicate_model_name_is_rejected(tmp_path: Path) -> None:
     written(tmp_path, WHOLE.replace('"tiny"', '"xfeat"'))
     with pytest.raises(ManifestError, match=r"tiny\.toml: the name 'xfeat' is taken"):
-        manifest.known(tmp_path)
+        manifest.read_all(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -79,14 +79,18 @@ def test_a_name_is_given_once(tmp_path: Path) -> None:
         ((2, 64, 4, 8), {"height": 32, "width": 64}, ""),
     ],
 )
-def test_shapes_are_compared(shape: tuple[int, ...], sizes: dict[str, int], wrong: str) -> None:
+def test_tensor_shapes_are_compared_with_the_manifest(
+    shape: tuple[int, ...], sizes: dict[str, int], wrong: str
+) -> None:
     tensor = manifest.Tensor(name="descriptors", shape=["batch", 64, "height/8", "width/8"])
-    found = manifest.sizes_of(tensor, shape, sizes)
+    found = manifest.bind_sizes(tensor, shape, sizes)
     assert wrong in found and bool(found) == bool(wrong)
     assert sizes["batch"] == shape[0] or wrong
 
 
-def test_the_folder_is_chosen_named_or_the_users_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_models_folder_is_the_argument_the_environment_or_the_users_data_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     for name in ("TERRAFIX_MODELS", "XDG_DATA_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -98,23 +102,23 @@ def test_the_folder_is_chosen_named_or_the_users_own(monkeypatch: pytest.MonkeyP
     assert models_folder("~/chosen") == tmp_path / "chosen"
 
 
-def test_what_a_text_means_for_a_model(tmp_path: Path) -> None:
+def test_a_configured_model_is_resolved_as_name_or_path(tmp_path: Path) -> None:
     tiny_onnx.write(tmp_path, tiny_onnx.XFEAT_LIKE, tiny_onnx.xfeat_like())
-    assert find("models/xfeat.onnx", "xfeat", tmp_path) == Path("models/xfeat.onnx")
-    assert find("own.onnx", "xfeat", tmp_path) == Path("own.onnx")
-    found = find("tiny", "xfeat", tmp_path)
-    assert isinstance(found, Stored) and found.path == tmp_path / "tiny.onnx" and found.state() is State.READY
+    assert resolve_model("models/xfeat.onnx", "xfeat", tmp_path) == Path("models/xfeat.onnx")
+    assert resolve_model("own.onnx", "xfeat", tmp_path) == Path("own.onnx")
+    found = resolve_model("tiny", "xfeat", tmp_path)
+    assert isinstance(found, StoredModel) and found.path == tmp_path / "tiny.onnx" and found.state() is State.READY
     with pytest.raises(ModelFileError, match="no model is called 'superglue'; known: lighterglue-l3, xfeat, tiny"):
-        find("superglue", "xfeat", tmp_path)
+        resolve_model("superglue", "xfeat", tmp_path)
     with pytest.raises(
         ModelFileError, match="'lighterglue-l3' cannot be used as xfeat: its role is matcher, not dense"
     ):
-        find("lighterglue-l3", "xfeat", tmp_path)
+        resolve_model("lighterglue-l3", "xfeat", tmp_path)
 
 
-def test_a_file_is_ready_absent_or_altered(tmp_path: Path) -> None:
+def test_a_stored_model_is_ready_absent_or_altered(tmp_path: Path) -> None:
     path = tiny_onnx.write(tmp_path, tiny_onnx.XFEAT_LIKE, tiny_onnx.xfeat_like())
-    model = stored(manifest.read(path.with_suffix(".toml")), tmp_path)
+    model = stored_model(manifest.read(path.with_suffix(".toml")), tmp_path)
     assert model.state() is State.READY
     content = path.read_bytes()
     path.write_bytes(content[:-1] + b"?")

@@ -1,4 +1,4 @@
-"""The list of places that is trained on: aligned by their georeference, and held out as wholes. Needs no PyTorch."""
+"""The list of training places: co-registration by georeference, held-out places. Needs no PyTorch."""
 
 import subprocess
 import sys
@@ -28,7 +28,7 @@ def ground(seed: int, height: int, width: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
 
 
-def test_dates_of_a_place_are_cut_to_what_all_of_them_show(tmp_path: Path) -> None:
+def test_dates_of_a_place_are_cropped_to_their_common_area(tmp_path: Path) -> None:
     whole = ground(1, 800, 900)
     geotiff(tmp_path / "a.tif", whole[:700, :850], 1000.0, 5000.0)
     geotiff(tmp_path / "b.tif", whole[20:, 31:], 1000.0 + 31 * GSD_M, 5000.0 - 20 * GSD_M)
@@ -39,28 +39,28 @@ def test_dates_of_a_place_are_cut_to_what_all_of_them_show(tmp_path: Path) -> No
     np.testing.assert_array_equal(levels[0].pictures[1], expected)
 
 
-def test_a_large_place_has_several_scales(tmp_path: Path) -> None:
+def test_a_large_place_has_several_scale_levels(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), ground(1, 1400, 1300))
     levels = read_places([Place(name="here", pictures=["a.png"])], tmp_path)
     assert [level.pictures.shape for level in levels] == [(1, 3, 1400, 1300), (1, 3, 700, 650)]
 
 
 @pytest.mark.parametrize(
-    "second, said",
+    "second, reason",
     [
         ({"west_m": 1000.0, "gsd_m": 0.6}, "another size"),
         ({"west_m": 1000.0 + 500 * GSD_M}, "less than 640 px"),
         ({"west_m": 90_000.0}, "less than 640 px"),
     ],
 )
-def test_dates_that_do_not_fit_are_refused(tmp_path: Path, second: dict[str, float], said: str) -> None:
+def test_dates_with_mismatching_grids_are_rejected(tmp_path: Path, second: dict[str, float], reason: str) -> None:
     geotiff(tmp_path / "a.tif", ground(1, 800, 800), 1000.0, 5000.0)
     geotiff(tmp_path / "b.tif", ground(2, 800, 800), north_m=5000.0, **second)
-    with pytest.raises(TrainingError, match=said):
+    with pytest.raises(TrainingError, match=reason):
         read_places([Place(name="here", pictures=["a.tif", "b.tif"])], tmp_path)
 
 
-def test_pictures_without_a_place_must_be_of_one_size(tmp_path: Path) -> None:
+def test_images_without_georeference_must_have_one_size(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), ground(1, 800, 800))
     cv2.imwrite(str(tmp_path / "b.png"), ground(1, 800, 801))
     with pytest.raises(TrainingError, match="not georeferenced"):
@@ -75,7 +75,7 @@ def listed(*places: tuple[str, str, bool]) -> str:
 
 
 @pytest.mark.parametrize(
-    "text, said",
+    "text, reason",
     [
         (listed(("a", "a.tif", False), ("b", "b.tif", False)), "held_out = true"),
         (listed(("a", "a.tif", True)), "to train on"),
@@ -85,14 +85,14 @@ def listed(*places: tuple[str, str, bool]) -> str:
         ("[place", "no list of places"),
     ],
 )
-def test_a_list_that_would_measure_what_it_trained_on_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_an_invalid_place_list_is_rejected(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "places.toml"
     path.write_text(text)
-    with pytest.raises(TrainingError, match=said):
+    with pytest.raises(TrainingError, match=reason):
         read_list(path)
 
 
-def test_without_pytorch_one_line_says_what_to_install() -> None:
+def test_without_pytorch_the_error_names_the_package_to_install() -> None:
     code = (
         "import runpy, sys; sys.modules['torch'] = None; sys.argv = ['train', 'x.toml', '--out', 'y'];"
         "runpy.run_module('terrafix_engines.train', run_name='__main__')"

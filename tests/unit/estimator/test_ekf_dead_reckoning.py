@@ -1,4 +1,4 @@
-"""An estimator that is started in flight begins where the autopilot's filter coasted to, as sure as that is."""
+"""An estimator restarted in flight begins at the autopilot's dead-reckoned position, with its covariance."""
 
 import math
 
@@ -6,16 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, PLACE, Flight, Listener, blind, error_m, sigma_m, t_ns
-from terrafix.core.geodesy import LocalFrame
-from terrafix.estimator.measurements.ekf_dead_reckoning import BEFORE_S, DeadReckoning
-from terrafix.estimator.models.motion_model import GRAVITY_MPS2, TILT_S, WANDERING_SHARE
+from simulated_flight import ORIGIN, PLACE, EstimatorRun, Flight, blind, error_m, sigma_m, t_ns
+from terrafix.core.geodesy import GRAVITY_MPS2, LocalFrame
+from terrafix.estimator.measurements.ekf_dead_reckoning import MAX_AHEAD_S, DeadReckoning
+from terrafix.estimator.models.motion_model import TILT_CORRELATION_S, TILT_VARYING_SHARE
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, load_checkpoint
-from terrafix.messages import Coasted, NavEstimate, Odometry, Prediction
+from terrafix.messages import Coasted, NavEstimate, Odometry, Prediction, Verdict
 
 KILLED, BACK = 61, 73  # frames: six seconds
-LINK_LETS_MPS = 1.45  # velocity sigma at which the link begins to send a fix
+LINK_LETS_MPS = 1.45  # velocity sigma below which the link sends a fix
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,8 @@ def flight() -> Flight:
 @pytest.fixture(scope="module")
 def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> EstimatorCheckpoint:
     keeper = CheckpointWriter(file := tmp_path_factory.mktemp("run") / "estimator.checkpoint")
-    for message in [flight.fix(KILLED - 2), *Listener().fly(flight, 0, KILLED).said]:
-        keeper.heard(message)
+    for message in [flight.fix(KILLED - 2), *EstimatorRun().fly(flight, 0, KILLED).published]:
+        keeper.on_message(message)
     last = load_checkpoint(file)
     assert last is not None
     return last
@@ -37,8 +37,8 @@ def velocity(flight: Flight, i: int) -> np.ndarray:
     return (flight.p_m[i + 1] - flight.p_m[i - 1]) / ((t_ns(i + 1) - t_ns(i - 1)) * 1e-9)
 
 
-def coasted(flight: Flight, off_m: tuple[float, float] = (0.0, 0.0)) -> Coasted:
-    """From the last frame but one before the kill to the first after the restart; off by so much at its end."""
+def autopilot_dead_reckoning(flight: Flight, off_m: tuple[float, float] = (0.0, 0.0)) -> Coasted:
+    """From the second last frame before the kill to the first after the restart, with an error of ``off_m``."""
     since, until = KILLED - 2, BACK
     v0, v1, dt_s = velocity(flight, since), velocity(flight, until), (t_ns(until) - t_ns(since)) * 1e-9
     way = flight.p_m[until] - flight.p_m[since] - v0 * dt_s + (*off_m, 0.0)
@@ -57,23 +57,25 @@ def coasted(flight: Flight, off_m: tuple[float, float] = (0.0, 0.0)) -> Coasted:
 
 
 def resumed(
-    flight: Flight, last: EstimatorCheckpoint | None, said: Coasted | None, *, heard_first: bool = True
-) -> Listener:
-    run = Listener()
+    flight: Flight, last: EstimatorCheckpoint | None, dead_reckoning: Coasted | None, *, received_first: bool = True
+) -> EstimatorRun:
+    run = EstimatorRun()
     run.node = EstimatorNode(0, last)
-    run.hear([ORIGIN])
+    run.feed([ORIGIN])
     for i in range(BACK, flight.frames):
         messages = flight.messages(i)
         if i == BACK:
             messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
-            if said is not None:
-                messages = [said, *messages] if heard_first else [*messages, said]
-        run.hear(messages)
+            if dead_reckoning is not None:
+                messages = [dead_reckoning, *messages] if received_first else [*messages, dead_reckoning]
+        run.feed(messages)
     return run
 
 
-def test_it_knows_place_and_velocity_with_the_first_picture(flight: Flight, killed: EstimatorCheckpoint) -> None:
-    first = resumed(flight, killed, coasted(flight)).estimate(BACK)
+def test_after_a_restart_position_and_velocity_are_known_at_the_first_frame(
+    flight: Flight, killed: EstimatorCheckpoint
+) -> None:
+    first = resumed(flight, killed, autopilot_dead_reckoning(flight)).estimate(BACK)
     assert sigma_m(first) < 7.0 and first.velocity_sigma_mps < LINK_LETS_MPS
     assert np.linalg.norm(error_m(first, flight)[:2]) < 3.0 * sigma_m(first)
     off_mps = np.array(first.velocity_enu_mps) - velocity(flight, BACK)
@@ -82,32 +84,32 @@ def test_it_knows_place_and_velocity_with_the_first_picture(flight: Flight, kill
     assert sigma_m(without) > 2.0 * sigma_m(first) and without.velocity_sigma_mps > 10.0
 
 
-def test_it_is_said_in_time_for_the_second_picture(flight: Flight, killed: EstimatorCheckpoint) -> None:
-    """The anchor, whose belief was as wide as the first one's place, is told to begin where this one is."""
-    late = msgspec.structs.replace(coasted(flight), t_ns=t_ns(BACK) + round(BEFORE_S * 1e9) + 1)
+def test_late_dead_reckoning_is_fused_at_the_second_frame(flight: Flight, killed: EstimatorCheckpoint) -> None:
+    """The prediction tells the anchor, whose belief is as wide as the first position, to begin at the new one."""
+    late = msgspec.structs.replace(autopilot_dead_reckoning(flight), t_ns=t_ns(BACK) + round(MAX_AHEAD_S * 1e9) + 1)
     run = resumed(flight, killed, late)
     assert sigma_m(run.estimate(BACK)) > 15.0
     assert sigma_m(run.estimate(BACK + 1)) < 7.0
-    first, second, third = [m for m in run.said if isinstance(m, Prediction)][:3]
+    first, second, third = [m for m in run.published if isinstance(m, Prediction)][:3]
     assert first.start_ns == 0 and second.start_ns == third.start_ns == second.t_ns
     assert second.cov[0] < 0.2 * first.cov[0]
 
 
-@pytest.mark.parametrize("heard_first", [True, False])
-def test_a_picture_that_was_taken_a_moment_before_waits_for_no_other(
-    flight: Flight, killed: EstimatorCheckpoint, heard_first: bool
+@pytest.mark.parametrize("received_first", [True, False])
+def test_dead_reckoning_slightly_after_a_frame_is_fused_at_that_frame(
+    flight: Flight, killed: EstimatorCheckpoint, received_first: bool
 ) -> None:
     moment_s = 0.2
-    said = coasted(flight)
-    way_m = (np.array(said.velocity_enu_mps) + said.gain_mps)[:2] * moment_s
+    dead_reckoning = autopilot_dead_reckoning(flight)
+    way_m = (np.array(dead_reckoning.velocity_enu_mps) + dead_reckoning.gain_mps)[:2] * moment_s
     late = msgspec.structs.replace(
-        said,
-        t_ns=said.t_ns + round(moment_s * 1e9),
-        coast_s=said.coast_s + moment_s,
-        way_m=tuple(np.add(said.way_m, way_m - np.array(said.velocity_enu_mps[:2]) * moment_s)),
+        dead_reckoning,
+        t_ns=dead_reckoning.t_ns + round(moment_s * 1e9),
+        coast_s=dead_reckoning.coast_s + moment_s,
+        way_m=tuple(np.add(dead_reckoning.way_m, way_m - np.array(dead_reckoning.velocity_enu_mps[:2]) * moment_s)),
     )
-    run = resumed(flight, killed, late, heard_first=heard_first)
-    first = [m for m in run.said if isinstance(m, NavEstimate) and m.frame_id == BACK][-1]
+    run = resumed(flight, killed, late, received_first=received_first)
+    first = [m for m in run.published if isinstance(m, NavEstimate) and m.frame_id == BACK][-1]
     assert first.t_ns == t_ns(BACK)
     assert sigma_m(first) < 7.0 and first.velocity_sigma_mps < LINK_LETS_MPS
     assert np.linalg.norm(error_m(first, flight)[:2]) < 3.0 * sigma_m(first)
@@ -115,23 +117,21 @@ def test_a_picture_that_was_taken_a_moment_before_waits_for_no_other(
     assert np.linalg.norm(off_mps) < 3.0 * first.velocity_sigma_mps
 
 
-def test_it_may_be_said_before_anybody_has_said_where_the_flight_began(
-    flight: Flight, killed: EstimatorCheckpoint
-) -> None:
-    """The link is there before vision, and with it the Origin, is."""
-    run = Listener()
+def test_dead_reckoning_before_the_origin_is_used(flight: Flight, killed: EstimatorCheckpoint) -> None:
+    """The link may start before vision, which publishes the Origin."""
+    run = EstimatorRun()
     run.node = EstimatorNode(0, killed)
-    run.hear([coasted(flight), ORIGIN])
-    run.hear([blind(m) if isinstance(m, Odometry) else m for m in flight.messages(BACK)])
+    run.feed([autopilot_dead_reckoning(flight), ORIGIN])
+    run.feed([blind(m) if isinstance(m, Odometry) else m for m in flight.messages(BACK)])
     first = run.estimate(BACK)
     assert sigma_m(first) < 7.0 and first.velocity_sigma_mps < LINK_LETS_MPS
 
 
-def test_backwards_and_forwards_a_coast_ends_where_it_began() -> None:
-    """As sure of it as the velocity is known: what was wrong of it is wrong of the way back, too."""
+def test_dead_reckoning_propagates_backwards_and_forwards() -> None:
+    """Its covariance follows from that of the velocity, whose error has the same sign backwards."""
     frame = LocalFrame(48.0, 11.0)
     lat_deg, lon_deg = frame.to_wgs84(0.0, 0.0)
-    said = Coasted(
+    dead_reckoning = Coasted(
         t_ns=2_000_000_000,
         coast_s=2.0,
         lat_deg=lat_deg,
@@ -142,7 +142,7 @@ def test_backwards_and_forwards_a_coast_ends_where_it_began() -> None:
         way_m=(0.0, 0.0),
         gain_mps=(0.0, 0.0, 0.0),
     )
-    coast = DeadReckoning.of(said, frame)
+    coast = DeadReckoning.of(dead_reckoning, frame)
     tilts_rad = (math.radians(0.7), math.radians(0.7))
     back, end, on = (coast.until(2.0 + s, None, 0.3, 0.0, tilts_rad) for s in (-0.25, 0.0, 0.25))
     assert np.allclose([back.at_m[0], end.at_m[0], on.at_m[0]], [35.0, 40.0, 45.0], atol=0.3)
@@ -151,37 +151,41 @@ def test_backwards_and_forwards_a_coast_ends_where_it_began() -> None:
     assert sigmas[0] < sigmas[1] < sigmas[2] and sigmas[0] == pytest.approx(np.hypot(4.0, 2.0 * 1.75), rel=0.1)
 
 
-def test_a_filter_that_jumped_is_not_believed(flight: Flight, killed: EstimatorCheckpoint) -> None:
-    led_astray = resumed(flight, killed, coasted(flight, off_m=(400.0, 0.0)))
+def test_dead_reckoning_with_a_jump_is_rejected(flight: Flight, killed: EstimatorCheckpoint) -> None:
+    with_jump = resumed(flight, killed, autopilot_dead_reckoning(flight, off_m=(400.0, 0.0)))
     without = resumed(flight, killed, None)
-    assert led_astray.estimate(BACK).cov == without.estimate(BACK).cov
-    assert all(m.start_ns == 0 for m in led_astray.said if isinstance(m, Prediction))
+    assert with_jump.estimate(BACK).cov == without.estimate(BACK).cov
+    (verdict,) = with_jump.verdicts("dead_reckoning").values()
+    assert verdict.verdict is Verdict.INNOVATION and verdict.test_ratio is not None and verdict.test_ratio > 1.0
+    assert np.linalg.norm(verdict.innovation) > 300.0
+    assert without.verdicts("dead_reckoning") == {}
+    assert all(m.start_ns == 0 for m in with_jump.published if isinstance(m, Prediction))
 
 
-def test_who_was_not_killed_is_not_led(flight: Flight) -> None:
-    """Without an estimate before it, nobody knows that this is the same flight."""
-    run, without = resumed(flight, None, coasted(flight)), resumed(flight, None, None)
+def test_without_a_checkpoint_dead_reckoning_is_not_used(flight: Flight) -> None:
+    """Without an earlier estimate it is unknown whether this is the same flight."""
+    run, without = resumed(flight, None, autopilot_dead_reckoning(flight)), resumed(flight, None, None)
     assert run.estimate(BACK).cov == without.estimate(BACK).cov
 
 
 @pytest.mark.parametrize("coast_s", [3.0, 6.0, 20.0])
-def test_claims_hold_for_a_tilt_that_is_off_as_it_is_said_to_be(coast_s: float) -> None:
-    """A plane that circles; the filter's tilt, and with it gravity, wanders as an attitude's does."""
+def test_dead_reckoning_is_consistent_with_the_stated_tilt_sigma(coast_s: float) -> None:
+    """The tilt error of the filter, and with it the gravity error, is a first-order process."""
     rng, frame, tilt_rad = np.random.default_rng(5), LocalFrame(48.0, 11.0), math.radians(0.7)
     nees, step_s = [], 0.02
     for _ in range(300):
         n = round(coast_s / step_s)
         drift = np.zeros((n, 2))
         drift[0] = rng.normal(0.0, 1.0, 2)
-        keep = math.exp(-step_s / TILT_S)
+        keep = math.exp(-step_s / TILT_CORRELATION_S)
         for i in range(1, n):
             drift[i] = keep * drift[i - 1] + math.sqrt(1.0 - keep**2) * rng.normal(0.0, 1.0, 2)
-        wrong = GRAVITY_MPS2 * tilt_rad * math.sqrt(WANDERING_SHARE) * drift
+        wrong = GRAVITY_MPS2 * tilt_rad * math.sqrt(TILT_VARYING_SHARE) * drift
         gain = np.cumsum(wrong, axis=0) * step_s
         way = gain.sum(axis=0) * step_s
         v0_off, p0_off = rng.normal(0.0, 0.4, 2), rng.normal(0.0, 4.0, 2)
         lat_deg, lon_deg = frame.to_wgs84(*(float(m) for m in p0_off))
-        said = Coasted(
+        dead_reckoning = Coasted(
             t_ns=round(coast_s * 1e9),
             coast_s=coast_s,
             lat_deg=lat_deg,
@@ -192,7 +196,7 @@ def test_claims_hold_for_a_tilt_that_is_off_as_it_is_said_to_be(coast_s: float) 
             way_m=(float(way[0]), float(way[1])),
             gain_mps=(float(gain[-1, 0]), float(gain[-1, 1]), 0.0),
         )
-        got = DeadReckoning.of(said, frame).until(coast_s, None, 0.3, 0.0, (tilt_rad, tilt_rad))
+        got = DeadReckoning.of(dead_reckoning, frame).until(coast_s, None, 0.3, 0.0, (tilt_rad, tilt_rad))
         off_m, off_mps = got.at_m - (20.0 * coast_s, 0.0), got.velocity_mps[:2] - (20.0, 0.0)
         of_position = off_m @ np.linalg.solve(got.cov_m2, off_m)
         nees.append([of_position, off_mps @ np.linalg.solve(got.velocity_cov[:2, :2], off_mps)])

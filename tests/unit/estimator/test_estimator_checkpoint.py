@@ -9,8 +9,8 @@ from simulated_flight import (
     FRAME_S,
     ORIGIN,
     SPEED_MPS,
+    EstimatorRun,
     Flight,
-    Listener,
     blind,
     error_m,
     same_features,
@@ -38,22 +38,22 @@ def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Estimato
     file = tmp_path_factory.mktemp("run") / "estimator.checkpoint"
     assert load_checkpoint(file) is None
     keeper = CheckpointWriter(file)
-    for message in [flight.fix(KILLED - 2), *Listener().fly(flight, 0, KILLED).said]:
-        keeper.heard(message)
+    for message in [flight.fix(KILLED - 2), *EstimatorRun().fly(flight, 0, KILLED).published]:
+        keeper.on_message(message)
     last = load_checkpoint(file)
     assert last is not None and last.estimate.frame_id == KILLED - 1
     return last
 
 
-def resumed(flight: Flight, last: EstimatorCheckpoint | None) -> Listener:
-    run = Listener()
+def resumed(flight: Flight, last: EstimatorCheckpoint | None) -> EstimatorRun:
+    run = EstimatorRun()
     run.node = EstimatorNode(0, last)
-    run.hear([ORIGIN])
+    run.feed([ORIGIN])
     for i in range(BACK, flight.frames):
         said = flight.messages(i)
         if i == BACK:  # its keyframe is not known to this one
             said = [blind(m) if isinstance(m, Odometry) else m for m in said]
-        run.hear(said)
+        run.feed(said)
     return run
 
 
@@ -69,7 +69,7 @@ def test_it_goes_on_from_there(flight: Flight, killed: EstimatorCheckpoint) -> N
 
 
 def test_the_anchor_is_told_of_the_way_in_between(flight: Flight, killed: EstimatorCheckpoint) -> None:
-    told = next(m for m in resumed(flight, killed).said if isinstance(m, Prediction))
+    told = next(m for m in resumed(flight, killed).published if isinstance(m, Prediction))
     flown_m = flight.p_m[BACK, :2] - flight.p_m[KILLED - 1, :2]
     assert np.linalg.norm(told.step_m - flown_m) < 20.0 < np.linalg.norm(flown_m)
 
@@ -80,9 +80,9 @@ def test_without_what_it_left_it_knows_the_start_only(flight: Flight) -> None:
     assert sigma_m(first) > 0.5 * SPEED_MPS * FRAME_S * BACK
 
 
-def heading_and_scale_sigma(run: Listener) -> tuple[float, float]:
+def heading_and_scale_sigma(run: EstimatorRun) -> tuple[float, float]:
     """Of the first Prediction: what the anchor has to look through."""
-    first = next(m for m in run.said if isinstance(m, Prediction))
+    first = next(m for m in run.published if isinstance(m, Prediction))
     return float(np.sqrt(first.cov[35])), first.agl_sigma_m / first.agl_m
 
 
@@ -178,7 +178,7 @@ def plane(heads_rad: float = math.radians(90.0), learnt: CalibrationPrior | None
 @pytest.mark.parametrize("from_s", [0.0, 2.0])
 def test_a_turn_that_nobody_saw_is_in_the_heading_after_it(turned_deg: float, from_s: float) -> None:
     """A plane that was killed in a bank of 42 degrees was 140 m from where it would have been straight on."""
-    way_m, sigma_m = plane().later(DOWN_S, math.radians(90.0 - turned_deg))
+    way_m, sigma_m = plane().path_until(DOWN_S, math.radians(90.0 - turned_deg))
     true_m = flown_on(turned_deg, from_s)
     off_m, straight_m = np.linalg.norm(way_m - true_m), np.linalg.norm([PLANE_MPS * DOWN_S, 0.0] - true_m)
     assert off_m < 2.0 * sigma_m and sigma_m < 60.0
@@ -186,25 +186,25 @@ def test_a_turn_that_nobody_saw_is_in_the_heading_after_it(turned_deg: float, fr
 
 
 def test_who_heads_as_before_flew_straight_on() -> None:
-    way_m, sigma_m = plane().later(DOWN_S, math.radians(90.0))
+    way_m, sigma_m = plane().path_until(DOWN_S, math.radians(90.0))
     assert way_m == pytest.approx([PLANE_MPS * DOWN_S, 0.0], abs=0.1)
-    forgotten_m, wider_m = plane().later(DOWN_S, None)
+    forgotten_m, wider_m = plane().path_until(DOWN_S, None)
     assert forgotten_m[0] < 0.9 * way_m[0] and forgotten_m[1] == 0.0
     assert wider_m == pytest.approx(sigma_m, rel=0.1)
-    long_m, long_sigma_m = plane().later(60.0, math.radians(90.0))
-    back_m, _ = plane().later(60.0, None)
+    long_m, long_sigma_m = plane().path_until(60.0, math.radians(90.0))
+    back_m, _ = plane().path_until(60.0, None)
     assert long_m[0] - back_m[0] < 2.0 * long_sigma_m  # it may have turned away and back
 
 
 def test_a_compass_that_is_off_as_it_was_learnt_has_not_turned() -> None:
     off_rad = math.radians(8.0)
     learnt = CalibrationPrior(0.0, np.array([0.0, 0.0, off_rad, 0.0, 0.0, 0.0]), np.eye(6))
-    way_m, _ = plane(learnt=learnt).later(DOWN_S, math.radians(90.0) + off_rad)
+    way_m, _ = plane(learnt=learnt).path_until(DOWN_S, math.radians(90.0) + off_rad)
     assert way_m == pytest.approx([PLANE_MPS * DOWN_S, 0.0], abs=0.1)
 
 
 def test_the_heading_of_a_copter_that_flies_sideways_tells_nothing() -> None:
     sideways = plane(heads_rad=0.0)
-    assert np.array_equal(sideways.later(DOWN_S, 1.0)[0], sideways.later(DOWN_S, None)[0])
+    assert np.array_equal(sideways.path_until(DOWN_S, 1.0)[0], sideways.path_until(DOWN_S, None)[0])
     hovers = NavPrior(0.0, np.zeros(2), 5.0, np.array([1.0, 0.0]), 0.4, math.radians(90.0))
-    assert np.array_equal(hovers.later(DOWN_S, 0.0)[0], hovers.later(DOWN_S, None)[0])
+    assert np.array_equal(hovers.path_until(DOWN_S, 0.0)[0], hovers.path_until(DOWN_S, None)[0])

@@ -1,4 +1,4 @@
-"""Pictures of another flight, and a camera that is frozen: what the estimate says while they last and afterwards."""
+"""Pictures of another flight, and a frozen camera: the estimate during and after them."""
 
 import math
 from typing import Any
@@ -7,15 +7,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import FRAME_S, ORIGIN, Flight, Listener, blind, cov_of, error_m, sigma_m, t_ns
+from simulated_flight import FRAME_S, ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m, sigma_m, t_ns
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
-from terrafix.estimator.integrity.static_picture import AT_REST_S
+from terrafix.estimator.integrity.static_picture import MAX_STATIC_S
+from terrafix.estimator.measurements.odometry import KeyframeMotion, OdometryMeasurement
 from terrafix.estimator.models.motion_model import MAX_SPEED_SIGMA_MPS
-from terrafix.estimator.propagation import MOTION_TIMEOUT_S, Propagation
+from terrafix.estimator.propagation import MOTION_TIMEOUT_S
 from terrafix.messages import MapMatch, Message, Odometry, Prediction, VehicleState, Verdict
 
-FIRST, END, FRAMES = 30, 42, 70  # frames of the lie, of the flight
-LATER = 9  # frames: the other flight has turned by then
+FIRST, END, FRAMES = 30, 42, 70  # frames of the false pictures, of the flight
+LATER = 9  # frames, after which the other flight has turned
 
 
 def odometry_of(messages: list[Message]) -> Odometry:
@@ -27,90 +28,98 @@ def without(messages: list[Message], *kinds: type[Message]) -> list[Message]:
 
 
 def foreign(other: Flight, i: int) -> Odometry:
-    """Frame i shows ``other`` as it is LATER frames on. Two that match each other are a new fragment."""
-    said = odometry_of(other.messages(i + LATER))
+    """Frame i shows ``other`` LATER frames on. Its frames match each other and form a new fragment."""
+    odometry = odometry_of(other.messages(i + LATER))
     if i == FIRST:
-        said = blind(said)
-    keyframe_id = max(said.keyframe_id - LATER, FIRST)
-    return msgspec.structs.replace(said, t_ns=t_ns(i), frame_id=i, keyframe_id=keyframe_id)
+        odometry = blind(odometry)
+    keyframe_id = max(odometry.keyframe_id - LATER, FIRST)
+    return msgspec.structs.replace(odometry, t_ns=t_ns(i), frame_id=i, keyframe_id=keyframe_id)
 
 
-def flown(lie: dict[int, Odometry], flight: Flight, *, fixes: bool = True) -> Listener:
-    """``lie``: odometry instead of the flight's own, in frames that find nothing on the map."""
-    listener = Listener().fly(flight, 0, FIRST)
+def flown(lie: dict[int, Odometry], flight: Flight, *, fixes: bool = True) -> EstimatorRun:
+    """``lie``: odometry instead of the flight's own, in frames without a map match."""
+    listener = EstimatorRun().fly(flight, 0, FIRST)
     for i in range(FIRST, FRAMES):
         messages = flight.messages(i)
         if i in lie:
             messages = [*without(messages, Odometry, MapMatch), lie[i]]
-        elif i == END:  # its keyframe showed something else: it begins a fragment, to which later frames refer
+        elif i == END:  # its keyframe showed another flight: it begins a fragment
             messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
-        listener.hear(messages if fixes else without(messages, MapMatch))
+        listener.feed(messages if fixes else without(messages, MapMatch))
     return listener
 
 
-def mahalanobis(listener: Listener, flight: Flight, i: int) -> float:
-    said = listener.estimate(i)
-    off = error_m(said, flight)[:2]
-    return math.sqrt(float(off @ np.linalg.solve(cov_of(said)[:2, :2], off)))
+def mahalanobis(listener: EstimatorRun, flight: Flight, i: int) -> float:
+    estimate = listener.estimate(i)
+    off = error_m(estimate, flight)[:2]
+    return math.sqrt(float(off @ np.linalg.solve(cov_of(estimate)[:2, :2], off)))
 
 
-def is_false(listener: Listener, flight: Flight, i: int) -> bool:
-    """More than 50 m and more than three sigmas off."""
+def is_false(listener: EstimatorRun, flight: Flight, i: int) -> bool:
+    """An error of more than 50 m and more than three sigmas."""
     off_m = float(np.linalg.norm(error_m(listener.estimate(i), flight)[:2]))
     return off_m > 50.0 and mahalanobis(listener, flight, i) > 3.0
 
 
+STARTED, FOUND = "first frame", "map match: found"  # reasons of a reset
+
+
+def resets(run: EstimatorRun) -> dict[int, str]:
+    """Frame and reason of each reset of the graph."""
+    return {frame: verdict.detail for frame, verdict in run.verdicts("reset").items()}
+
+
 @pytest.mark.parametrize("speed_mps", [3.0, 6.0, 12.0, 25.0, 45.0])
-def test_pictures_of_another_flight_move_nothing(speed_mps: float) -> None:
+def test_pictures_of_another_flight_cause_no_false_fix(speed_mps: float) -> None:
     flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=speed_mps, turns_rad=2.0)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=speed_mps, turn_rad=2.0)
     listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
     assert not any(is_false(listener, flight, i) for i in range(FIRST, FRAMES))
     assert listener.verdicts("odometry")[FRAMES - 1].verdict is Verdict.ACCEPTED
     assert np.linalg.norm(error_m(listener.estimate(FRAMES - 1), flight)[:2]) < 12.0
 
 
-def test_a_foreign_motion_that_cannot_be_ours_is_not_fused() -> None:
+def test_an_implausible_foreign_motion_is_not_fused() -> None:
     flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, turns_rad=2.0)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, turn_rad=2.0)
     listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
     verdicts = listener.verdicts("odometry")
     assert {verdicts[i].verdict for i in range(FIRST + 1, END)} <= {Verdict.UNCONFIRMED, Verdict.IMPLAUSIBLE}
     assert max(mahalanobis(listener, flight, i) for i in range(FIRST, FRAMES)) < 3.5
 
 
-def test_pictures_that_begin_like_this_flight_and_then_turn_are_not_it() -> None:
-    """Same speed, same course, for two frames; the reported heading does not turn with them."""
+def test_a_fragment_that_turns_against_the_reported_heading_does_not_join() -> None:
+    """Same speed and course for two frames; then they turn, and the reported heading does not."""
     flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES, seed=11, turns_rad=-2.5)
-    said = {i: odometry_of(other.messages(i)) for i in range(FIRST, END)}
-    lie = {i: msgspec.structs.replace(m, keyframe_id=max(m.keyframe_id, FIRST)) for i, m in said.items()}
-    listener = flown(lie | {FIRST: blind(said[FIRST])}, flight)
+    other = Flight(FRAMES, seed=11, turn_rad=-2.5)
+    odometry = {i: odometry_of(other.messages(i)) for i in range(FIRST, END)}
+    lie = {i: msgspec.structs.replace(m, keyframe_id=max(m.keyframe_id, FIRST)) for i, m in odometry.items()}
+    listener = flown(lie | {FIRST: blind(odometry[FIRST])}, flight)
     assert max(mahalanobis(listener, flight, i) for i in range(FIRST, FRAMES)) < 3.5
 
 
-def test_foreign_motion_teaches_neither_height_nor_calibration() -> None:
+def test_unconfirmed_motion_does_not_update_height_and_calibration() -> None:
     flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, climbs_m=60.0)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, climb_amplitude_m=60.0)
     lied = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
     dark = flown({i: blind(odometry_of(flight.messages(i))) for i in range(FIRST, END)}, flight)
     for i in range(FIRST, END):
         heights = [
-            np.array([m.agl_m for m in run.said if isinstance(m, Prediction) and m.frame_id == i])
+            np.array([m.agl_m for m in run.published if isinstance(m, Prediction) and m.frame_id == i])
             for run in (lied, dark)
         ]
         assert heights[0] == pytest.approx(heights[1], abs=1.0)
 
 
-def test_a_new_fragment_that_moves_as_predicted_is_the_flight_without_any_map() -> None:
-    """Tracking was lost for three frames; what follows agrees with the velocity that was known."""
+def test_a_fragment_that_moves_as_predicted_joins_without_a_map() -> None:
+    """Tracking is lost for three frames; the next ones agree with the known velocity."""
     flight = Flight(FRAMES, seed=6)
     begins = FIRST + 3
     lie = {i: blind(odometry_of(flight.messages(i))) for i in range(FIRST, begins + 1)}
     for i in range(begins + 1, FRAMES):
-        said = odometry_of(flight.messages(i))
-        lie[i] = msgspec.structs.replace(said, keyframe_id=max(said.keyframe_id, begins))
-    # Pairs refer to the keyframe that they were seen from: those of an older one are not the new fragment's.
+        odometry = odometry_of(flight.messages(i))
+        lie[i] = msgspec.structs.replace(odometry, keyframe_id=max(odometry.keyframe_id, begins))
+    # Pairs belong to the keyframe from which they were tracked: those of an older one do not belong to the fragment.
     lie = {i: m for i, m in lie.items() if m.verdict is not Verdict.ACCEPTED or m.keyframe_id >= begins}
     listener = flown({i: m for i, m in lie.items() if i < begins + 4}, flight, fixes=False)
     verdicts = listener.verdicts("odometry")
@@ -118,53 +127,58 @@ def test_a_new_fragment_that_moves_as_predicted_is_the_flight_without_any_map() 
     assert mahalanobis(listener, flight, FRAMES - 1) < 3.5
 
 
-@pytest.mark.parametrize("said", [Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE, "coarse"])
-def test_looks_that_find_nothing_where_every_look_found_a_pose_speak_against_a_new_fragment(
-    said: Verdict | str,
+@pytest.mark.parametrize("outcome", [Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE, "coarse"])
+def test_correlations_without_a_pose_delay_joining_where_the_hit_rate_is_high(
+    outcome: Verdict | str,
 ) -> None:
-    """It moves as predicted, which would join it; one pose joins it."""
+    """It moves as predicted, which would join it elsewhere; one pose joins it."""
     flight = Flight(FRAMES, seed=6, fix_every=1)
-    listener = Listener().fly(flight, 0, FIRST)
+    listener = EstimatorRun().fly(flight, 0, FIRST)
     for i in range(FIRST, END):
         odometry, match = odometry_of(flight.messages(i)), flight.fix(i)
         if i == FIRST:
             odometry = blind(odometry)
-        if said == "coarse":
+        if outcome == "coarse":
             match = msgspec.structs.replace(match, coarse=True)
-        elif isinstance(said, Verdict):
-            match = msgspec.structs.replace(match, verdict=said)
-        listener.hear([*without(flight.messages(i), Odometry, MapMatch), odometry, match])
+        elif isinstance(outcome, Verdict):
+            match = msgspec.structs.replace(match, verdict=outcome)
+        listener.feed([*without(flight.messages(i), Odometry, MapMatch), odometry, match])
     verdicts = listener.verdicts("odometry")
     assert all(verdicts[i].verdict is Verdict.UNCONFIRMED for i in range(FIRST + 1, END))
-    listener.hear([flight.fix(END - 1), *flight.messages(END)])
+    listener.feed([flight.fix(END - 1), *flight.messages(END)])
     assert listener.verdicts("odometry")[END].verdict is Verdict.ACCEPTED
 
 
-def test_the_motion_of_an_unjoined_fragment_is_predicted_from_its_keyframe_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Velocity led the keyframe there, too, so that its error counts over all of the time since."""
-    predicted = Propagation._motion_innovation
+def test_the_prediction_of_an_unjoined_fragment_covers_the_time_since_its_keyframe(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The keyframe itself was placed by velocity, so that the velocity error counts over all of the time since."""
+    predicted = OdometryMeasurement._innovation
     beyond: list[float] = []
 
-    def spy(tracker: Propagation, t_s: float, p_m: np.ndarray, parent: int, *rest: Any) -> MotionInnovation:
-        innovation = predicted(tracker, t_s, p_m, parent, *rest)
-        if not tracker._fragments.of(parent).joined:
-            since_s = t_s - tracker.graph.time_of(parent)
-            velocity_m2 = tracker._velocity_cov[:2, :2] * since_s**2
+    def spy(
+        odometry: OdometryMeasurement, t_s: float, p_m: np.ndarray, seen: KeyframeMotion, *rest: Any
+    ) -> MotionInnovation:
+        innovation = predicted(odometry, t_s, p_m, seen, *rest)
+        state = odometry._state
+        if not state.fragments.of(seen.parent).joined:
+            since_s = t_s - state.graph.time_of(seen.parent)
+            velocity_m2 = state.velocity_cov[:2, :2] * since_s**2
             beyond.append(float(np.linalg.eigvalsh(innovation.cov_m2[:2, :2] - velocity_m2)[0]))
         return innovation
 
-    monkeypatch.setattr(Propagation, "_motion_innovation", spy)
+    monkeypatch.setattr(OdometryMeasurement, "_innovation", spy)
     flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=3.0, turns_rad=2.0)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=3.0, turn_rad=2.0)
     flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
     assert len(beyond) > 5 and min(beyond) > 0.0
 
 
-def test_the_anchor_follows_what_pictures_show_and_returns_to_the_flight_afterwards() -> None:
+def test_prediction_steps_follow_a_foreign_fragment_and_return_after_it() -> None:
     flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=25.0, turns_rad=2.0)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=25.0, turn_rad=2.0)
     listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
-    steps = {m.frame_id: np.array(m.step_m) for m in listener.said if isinstance(m, Prediction)}
+    steps = {m.frame_id: np.array(m.step_m) for m in listener.published if isinstance(m, Prediction)}
     theirs_m = np.linalg.norm(np.diff(other.p_m[FIRST + LATER : END + LATER, :2], axis=0), axis=1).sum()
     assert sum(np.linalg.norm(steps[i]) for i in range(FIRST + 1, END)) == pytest.approx(theirs_m, rel=0.1)
     ours = (flight.p_m[END + 3] - flight.p_m[FIRST - 1])[:2]
@@ -172,17 +186,17 @@ def test_the_anchor_follows_what_pictures_show_and_returns_to_the_flight_afterwa
 
 
 def frozen(flight: Flight, i: int) -> Odometry:
-    """The picture of frame FIRST - 1 again: every ray is where it was."""
-    said = odometry_of(flight.messages(FIRST - 1))
-    pairs = [(x, y, x, y) for x, y, _, _ in said.pairs]
+    """The picture of frame FIRST - 1 again: all image points are unchanged."""
+    odometry = odometry_of(flight.messages(FIRST - 1))
+    pairs = [(x, y, x, y) for x, y, _, _ in odometry.pairs]
     return msgspec.structs.replace(
-        said, t_ns=t_ns(i), frame_id=i, keyframe_id=FIRST - 1, pairs=pairs, becomes_keyframe=False, static=True
+        odometry, t_ns=t_ns(i), frame_id=i, keyframe_id=FIRST - 1, pairs=pairs, becomes_keyframe=False, static=True
     )
 
 
-def test_a_frozen_camera_is_not_a_vehicle_that_stands() -> None:
+def test_a_frozen_camera_is_not_taken_for_a_standing_vehicle() -> None:
     flight = Flight(FRAMES, seed=7)
-    # The picture before the lie is a keyframe of its own.
+    # The last true picture is a keyframe.
     listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
     verdicts = listener.verdicts("odometry")
     assert all(verdicts[i].verdict is Verdict.STALLED for i in range(FIRST, END))
@@ -191,40 +205,40 @@ def test_a_frozen_camera_is_not_a_vehicle_that_stands() -> None:
     assert np.linalg.norm(error_m(listener.estimate(END - 1), flight)[:2]) < 0.5 * way_m
 
 
-def test_a_frozen_picture_is_not_shown_to_the_anchor() -> None:
+def test_no_prediction_is_published_for_a_frozen_picture() -> None:
     flight = Flight(FRAMES, seed=7)
     listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
-    predicted = {m.frame_id for m in listener.said if isinstance(m, Prediction)}
+    predicted = {m.frame_id for m in listener.published if isinstance(m, Prediction)}
     assert not predicted & set(range(FIRST, END))
     assert predicted >= {FIRST - 1, *range(END, FRAMES)}
 
 
 @pytest.mark.parametrize("found", [True, False])
-def test_a_frozen_camera_is_recognised_where_no_heading_is_reported(found: bool) -> None:
-    """``found``: the map has told the heading by then. Else nothing predicts the motion, but the time tells."""
-    flight, listener = Flight(FRAMES, seed=7, knows=frozenset({"attitude", "height"})), Listener()
-    listener.hear([ORIGIN])
+def test_a_frozen_camera_is_detected_without_a_heading(found: bool) -> None:
+    """``found``: a map match has given the heading. Else no motion is predicted, and the duration decides."""
+    flight, listener = Flight(FRAMES, seed=7, telemetry=frozenset({"attitude", "height"})), EstimatorRun()
+    listener.feed([ORIGIN])
     for i in range(FRAMES):
         messages = flight.messages(i) if found and i < FIRST else without(flight.messages(i), MapMatch)
         if FIRST <= i < END:
             messages = [*without(messages, Odometry), frozen(flight, i)]
-        elif i == END:  # its keyframe showed something else
+        elif i == END:  # its keyframe showed another picture
             messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
-        listener.hear(messages)
+        listener.feed(messages)
     verdicts = listener.verdicts("odometry")
-    lasts = FIRST + round(AT_REST_S / FRAME_S)
+    lasts = FIRST + round(MAX_STATIC_S / FRAME_S)
     assert all(verdicts[i].verdict is Verdict.STALLED for i in range(lasts, END))
     assert verdicts[FRAMES - 1].verdict is Verdict.ACCEPTED
 
 
-def test_a_frozen_picture_stays_one_when_the_graph_begins_anew() -> None:
-    """Its keyframe is older than the new graph; that does not make it a picture for the anchor."""
+def test_a_frozen_picture_stays_stalled_after_a_reset_of_the_graph() -> None:
+    """Its keyframe is older than the new graph; no prediction is published nevertheless."""
     flight = Flight(FRAMES, seed=7)
-    listener = Listener().fly(flight, 0, FIRST)
+    listener = EstimatorRun().fly(flight, 0, FIRST)
     for i in range(FIRST, END):
-        listener.hear([*without(flight.messages(i), Odometry, MapMatch), frozen(flight, i)])
+        listener.feed([*without(flight.messages(i), Odometry, MapMatch), frozen(flight, i)])
         if i == FIRST + 2:
-            listener.hear([msgspec.structs.replace(flight.fix(FIRST - 1), found=True)])
+            listener.feed([msgspec.structs.replace(flight.fix(FIRST - 1), found=True)])
     verdicts = listener.verdicts("odometry")
     assert all(verdicts[i].verdict is Verdict.STALLED for i in range(FIRST, END))
 
@@ -239,7 +253,7 @@ def test_a_view_that_changed_while_nothing_was_tracked_ends_a_frozen_picture() -
     assert verdicts[FIRST + 2].verdict is Verdict.FEW_INLIERS
 
 
-def test_pictures_that_vision_skips_do_not_end_a_frozen_one() -> None:
+def test_skipped_pictures_do_not_end_a_frozen_picture() -> None:
     flight = Flight(FRAMES, seed=7)
     lie = {i: frozen(flight, i) for i in range(FIRST, END)}
     for i, verdict in ((FIRST + 1, Verdict.STALLED), (FIRST + 3, Verdict.BAD_IMAGE)):
@@ -250,42 +264,41 @@ def test_pictures_that_vision_skips_do_not_end_a_frozen_one() -> None:
     assert [verdicts[i].verdict for i in (FIRST + 3, FIRST + 4)] == [Verdict.BAD_IMAGE, Verdict.STALLED]
 
 
-def test_the_step_after_frames_that_the_anchor_did_not_see_is_known_as_the_way_over_all_of_them() -> None:
+def test_the_step_covariance_after_stalled_frames_spans_all_of_them() -> None:
     flight = Flight(FRAMES, seed=7)
     listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
-    said = {m.frame_id: m for m in listener.said if isinstance(m, Prediction)}
+    odometry = {m.frame_id: m for m in listener.published if isinstance(m, Prediction)}
     truth_m = (flight.p_m[END] - flight.p_m[FIRST - 1])[:2]
-    sigma = math.sqrt(said[END].step_cov_m2[0])
-    assert np.linalg.norm(said[END].step_m - truth_m) < 3.5 * sigma
+    sigma = math.sqrt(odometry[END].step_cov_m2[0])
+    assert np.linalg.norm(odometry[END].step_m - truth_m) < 3.5 * sigma
     grown_m2 = cov_of(listener.estimate(END))[:2, :2] - cov_of(listener.estimate(FIRST - 1))[:2, :2]
     assert sigma > 0.7 * math.sqrt(np.linalg.eigvalsh(grown_m2)[-1])
-    assert math.sqrt(said[END + 1].step_cov_m2[0]) < 0.5 * sigma
+    assert math.sqrt(odometry[END + 1].step_cov_m2[0]) < 0.5 * sigma
 
 
 def test_two_frames_with_one_time_stamp_are_no_evidence_of_motion() -> None:
     flight = Flight(FRAMES, seed=5)
     still = msgspec.structs.replace(frozen(flight, FIRST + 1), t_ns=t_ns(FIRST), keyframe_id=FIRST, static=False)
-    listener = Listener().fly(flight, 0, FIRST)
-    listener.hear([*without(flight.messages(FIRST), Odometry, MapMatch), blind(odometry_of(flight.messages(FIRST)))])
-    listener.hear([still])
+    listener = EstimatorRun().fly(flight, 0, FIRST)
+    listener.feed([*without(flight.messages(FIRST), Odometry, MapMatch), blind(odometry_of(flight.messages(FIRST)))])
+    listener.feed([still])
     assert listener.verdicts("odometry")[FIRST + 1].verdict is Verdict.UNCONFIRMED
 
 
 @pytest.mark.parametrize(("speed_mps", "then"), [(110.0, Verdict.ACCEPTED), (150.0, Verdict.IMPLAUSIBLE)])
-def test_velocity_that_odometry_contradicts_for_seconds_is_given_up_once(speed_mps: float, then: Verdict) -> None:
+def test_contradicted_velocity_is_reset_once_after_the_timeout(speed_mps: float, then: Verdict) -> None:
     """Nothing tells which of the two is wrong, so the claim must hold for both."""
     flight, impossible = Flight(FRAMES, seed=8), Flight(FRAMES, seed=8, speed_mps=speed_mps)
-    listener = Listener().fly(flight, 0, FIRST)
+    listener = EstimatorRun().fly(flight, 0, FIRST)
     timeout = FIRST + 2 + round(MOTION_TIMEOUT_S / FRAME_S)  # the first frame that is surely later than it
     for i in range(FIRST, timeout + 4):
-        said = odometry_of(impossible.messages(i))
+        odometry = odometry_of(impossible.messages(i))
         if i == FIRST:  # one motion that is possible: the five seconds begin after it
-            said = odometry_of(flight.messages(i))
-        listener.hear([*without(flight.messages(i), Odometry, MapMatch), said])
+            odometry = odometry_of(flight.messages(i))
+        listener.feed([*without(flight.messages(i), Odometry, MapMatch), odometry])
     verdicts = listener.verdicts("odometry")
     assert all(verdicts[i].verdict is Verdict.IMPLAUSIBLE for i in range(FIRST + 1, timeout + 1))
-    assert list(listener.verdicts("reset")) == [timeout]
-    assert "contradicts velocity for 5 s" in listener.verdicts("reset")[timeout].detail
+    assert resets(listener) == {0: STARTED, timeout: "odometry contradicts velocity for 5 s"}
     assert sigma_m(listener.estimate(timeout)) > 15.0
     assert listener.estimate(timeout).velocity_sigma_mps >= MAX_SPEED_SIGMA_MPS[0]
     assert verdicts[timeout + 1].verdict is then
@@ -294,74 +307,74 @@ def test_velocity_that_odometry_contradicts_for_seconds_is_given_up_once(speed_m
 def test_a_coarse_match_does_not_join_a_fragment_to_the_flight() -> None:
     """It says what the belief remembers; pictures of another flight have no part in it."""
     flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, turns_rad=2.0)
-    listener = Listener().fly(flight, 0, FIRST)
+    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, turn_rad=2.0)
+    listener = EstimatorRun().fly(flight, 0, FIRST)
     for i in range(FIRST, FIRST + 3):
         coarse = msgspec.structs.replace(flight.fix(i), coarse=True)
-        listener.hear([*without(flight.messages(i), Odometry, MapMatch), foreign(other, i), coarse])
+        listener.feed([*without(flight.messages(i), Odometry, MapMatch), foreign(other, i), coarse])
     verdicts = listener.verdicts("map")
     assert [verdicts[i].verdict for i in range(FIRST, FIRST + 3)] == [Verdict.UNCONFIRMED] * 3
     assert listener.estimate(FIRST + 2).last_anchor_age_ms > 0
 
 
-def test_a_height_that_keeps_the_anchor_from_looking_is_given_up_for_the_reported_one() -> None:
+def test_a_height_too_low_for_matching_is_reset_to_the_reported_one() -> None:
     flight = Flight(30, seed=3, dem=True)
-    listener = Listener().fly(flight, 0, 20)
+    listener = EstimatorRun().fly(flight, 0, 20)
     fix = flight.fix(19)
     assert fix.p_c_in_w_m is not None
     low = msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))
-    listener.hear([low])
+    listener.feed([low])
     assert listener.estimate(19).agl_m < 20.0
-    listener.hear(without(flight.messages(20), MapMatch))
-    resets = listener.verdicts("reset")
-    assert list(resets) == [20] and "are reported" in resets[20].detail
+    listener.feed(without(flight.messages(20), MapMatch))
+    assert list(resets(listener).items())[:2] == [(0, STARTED), (19, FOUND)]
+    assert list(resets(listener)) == [0, 19, 20] and "are reported" in resets(listener)[20]
     assert listener.estimate(20).agl_m == pytest.approx(flight.p_m[20, 2], abs=15.0)
     for i in range(21, 30):
-        listener.hear(flight.messages(i))
-    assert list(listener.verdicts("reset")) == [20]
+        listener.feed(flight.messages(i))
+    assert list(resets(listener)) == [0, 19, 20]
 
 
 @pytest.mark.parametrize("reported_m", [20.0, 40.0])
-def test_a_reported_height_that_would_hardly_be_looked_from_resets_nothing(reported_m: float) -> None:
+def test_a_reported_height_near_the_matching_limit_causes_no_reset(reported_m: float) -> None:
     flight = Flight(25, seed=3, dem=True)
-    listener = Listener().fly(flight, 0, 20)
+    listener = EstimatorRun().fly(flight, 0, 20)
     fix = flight.fix(19)
     assert fix.p_c_in_w_m is not None
-    listener.hear([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    listener.feed([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
     state = next(m for m in flight.messages(20) if isinstance(m, VehicleState))
-    listener.hear([msgspec.structs.replace(state, agl_m=reported_m), odometry_of(flight.messages(20))])
-    assert listener.estimate(20).agl_m < 25.0 and listener.verdicts("reset") == {}
+    listener.feed([msgspec.structs.replace(state, agl_m=reported_m), odometry_of(flight.messages(20))])
+    assert listener.estimate(20).agl_m < 25.0 and resets(listener) == {0: STARTED, 19: FOUND}
 
 
-def test_without_a_map_of_the_ground_a_low_height_resets_nothing() -> None:
+def test_without_an_elevation_map_a_low_height_causes_no_reset() -> None:
     flight = Flight(25, seed=3)
-    listener = Listener().fly(flight, 0, 20)
+    listener = EstimatorRun().fly(flight, 0, 20)
     fix = flight.fix(19)
     assert fix.p_c_in_w_m is not None
-    listener.hear([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
-    listener.hear(without(flight.messages(20), MapMatch))
-    assert listener.estimate(20).agl_m < 25.0 and listener.verdicts("reset") == {}
+    listener.feed([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    listener.feed(without(flight.messages(20), MapMatch))
+    assert listener.estimate(20).agl_m < 25.0 and resets(listener) == {0: STARTED, 19: FOUND}
 
 
 def test_the_height_after_a_reset_is_the_reported_one_above_the_take_off() -> None:
     """The take-off was 60 m higher than the ground here."""
     flight, above_m = Flight(25, seed=3, dem=True), 60.0
-    listener = Listener()
-    listener.hear([msgspec.structs.replace(ORIGIN, ground_amsl_m=above_m)])
+    listener = EstimatorRun()
+    listener.feed([msgspec.structs.replace(ORIGIN, ground_amsl_m=above_m)])
     for i in range(21):
         for m in flight.messages(i):
             if isinstance(m, VehicleState) and m.agl_m is not None:
                 m = msgspec.structs.replace(m, agl_m=m.agl_m - above_m)
             if i < 20 or not isinstance(m, MapMatch):
-                listener.hear([m])
+                listener.feed([m])
         if i == 19:
             fix = flight.fix(19)
             assert fix.p_c_in_w_m is not None
-            listener.hear([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
-    assert list(listener.verdicts("reset")) == [20]
+            listener.feed([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    assert list(resets(listener)) == [0, 19, 20]
     assert listener.estimate(20).agl_m == pytest.approx(flight.p_m[20, 2], abs=15.0)
 
 
 def test_a_flight_at_its_reported_height_is_never_reset() -> None:
-    flight = Flight(30, seed=3, dem=True, climbs_m=0.0)
-    assert Listener().fly(flight, 0, 30).verdicts("reset") == {}
+    flight = Flight(30, seed=3, dem=True, climb_amplitude_m=0.0)
+    assert resets(EstimatorRun().fly(flight, 0, 30)) == {0: STARTED}

@@ -1,29 +1,25 @@
-"""A focal length that is not what its description says: learnt from climbs, and without a map true to its claim."""
+"""Height scale of a camera with a wrong focal length: estimated from climbs, and consistent without a map."""
 
 import gtsam
 import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import CAMERA, ORIGIN, Flight, Listener, cov_of, error_m
+from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight, cov_of, error_m
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
-from terrafix.estimator.factors.custom_factors import (
-    BAROMETER_SCALE,
-    BIAS_SIZE,
-    HEIGHT,
-    SCALE,
-    attitude_and_height_residual,
-)
+from terrafix.estimator.factors.attitude_height import attitude_height_residual
+from terrafix.estimator.models.bias_walk import BAROMETER_SCALE_SIGMA
+from terrafix.estimator.state import CALIBRATION_SIZE, HEIGHT, LOG_HEIGHT_SCALE
 from terrafix.messages import MapMatch, Message, NavEstimate, Odometry
 
-MAPPED, FRAMES = 90, 170  # it climbs, sinks, and climbs again in the dark
+MAPPED, FRAMES = 90, 170  # climb, descent, and a second climb without map matches
 UNCALIBRATED = msgspec.structs.replace(ORIGIN, camera=msgspec.structs.replace(CAMERA, focal_sigma=0.1))
 
 
 def seen_through(message: Message, focal: float) -> Message:
-    """As a camera shows it whose focal length is ``focal`` of the described one: nearer to its middle, and so from
-    higher up."""
+    """The message of a camera with ``focal`` times the described focal length: rays nearer to the optical axis, and map
+    poses higher up."""
     if isinstance(message, Odometry) and message.pairs:
         pairs = focal * np.array(message.pairs)
         return msgspec.structs.replace(message, pairs=[tuple(map(float, row)) for row in pairs])
@@ -34,28 +30,30 @@ def seen_through(message: Message, focal: float) -> Message:
     return message
 
 
-def flown(focal: float, *, dem: bool, seed: int) -> tuple[Flight, Listener]:
-    flight, run = Flight(FRAMES, seed=seed, dem=dem, climbs_m=40.0), Listener()
-    run.hear([UNCALIBRATED])
+def flown(focal: float, *, dem: bool, seed: int) -> tuple[Flight, EstimatorRun]:
+    flight, run = Flight(FRAMES, seed=seed, dem=dem, climb_amplitude_m=40.0), EstimatorRun()
+    run.feed([UNCALIBRATED])
     for i in range(FRAMES):
-        said = [m for m in flight.messages(i) if i < MAPPED or not isinstance(m, MapMatch)]
-        run.hear(seen_through(m, focal) for m in said)
+        messages = [m for m in flight.messages(i) if i < MAPPED or not isinstance(m, MapMatch)]
+        run.feed(seen_through(m, focal) for m in messages)
     return flight, run
 
 
-def learnt(run: Listener) -> tuple[float, float]:
-    assert run.node._estimator is not None
-    graph = run.node._estimator.graph
+def estimated(run: EstimatorRun) -> tuple[float, float]:
+    assert run.node.estimator is not None
+    graph = run.node.estimator.graph
     cov = graph.bias_covariance(graph.newest)
-    return float(graph.state(graph.newest).bias[SCALE]), float(np.sqrt(cov[SCALE, SCALE]))
+    return float(graph.state(graph.newest).bias[LOG_HEIGHT_SCALE]), float(
+        np.sqrt(cov[LOG_HEIGHT_SCALE, LOG_HEIGHT_SCALE])
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dem", [False, True])
 @pytest.mark.parametrize("focal", [0.8, 1.0])
-def test_it_is_learnt_from_climbs(focal: float, dem: bool) -> None:
+def test_the_height_scale_is_estimated_from_climbs(focal: float, dem: bool) -> None:
     _, run = flown(focal, dem=dem, seed=3)
-    scale, sigma = learnt(run)
+    scale, sigma = estimated(run)
     assert sigma < 0.05
     assert abs(scale - np.log(focal)) < 3.0 * sigma
 
@@ -63,7 +61,7 @@ def test_it_is_learnt_from_climbs(focal: float, dem: bool) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("dem", [False, True])
 @pytest.mark.parametrize("focal", [0.8, 1.25])
-def test_a_climb_in_the_dark_ends_where_the_claim_says(focal: float, dem: bool) -> None:
+def test_a_climb_without_map_matches_ends_within_the_covariance(focal: float, dem: bool) -> None:
     nees, heights = [], []
     for seed in range(4):
         flight, run = flown(focal, dem=dem, seed=seed)
@@ -75,32 +73,32 @@ def test_a_climb_in_the_dark_ends_where_the_claim_says(focal: float, dem: bool) 
     assert np.max(np.abs(heights)) < 3.0
 
 
-def test_an_altitude_is_the_barometers_where_the_lens_is_to_blame_and_the_pictures_where_the_air_is() -> None:
+def test_the_height_scale_is_divided_between_focal_length_and_barometer_by_variance() -> None:
     for focal_sigma, share in ((0.1, 0.8), (0.01, 0.0385)):
-        run = Listener()
+        run = EstimatorRun()
         camera = msgspec.structs.replace(CAMERA, focal_sigma=focal_sigma)
-        run.hear([msgspec.structs.replace(ORIGIN, camera=camera), *Flight(1).messages(0)[:2]])
-        estimator = run.node._estimator
+        run.feed([msgspec.structs.replace(ORIGIN, camera=camera), *Flight(1).messages(0)[:2]])
+        estimator = run.node.estimator
         assert estimator is not None
         state = estimator.graph.state(0)
-        state.bias[SCALE] = np.log(0.8)
-        stretch, sigma = estimator.stretch(0)
+        state.bias[LOG_HEIGHT_SCALE] = np.log(0.8)
+        stretch, sigma = estimator.state.height_scale(0)
         assert stretch == pytest.approx(0.8**share, rel=1e-3)
-        assert sigma == pytest.approx((focal_sigma**-2 + BAROMETER_SCALE**-2) ** -0.5)
+        assert sigma == pytest.approx((focal_sigma**-2 + BAROMETER_SCALE_SIGMA**-2) ** -0.5)
 
 
-def test_the_jacobians_are_the_differences() -> None:
+def test_the_jacobians_match_numerical_differences() -> None:
     r_w_b, r_b_c = rot_w_b(0.3, 0.02, -0.03), Mount.of(CAMERA).r_b_c()
     pose = gtsam.Pose3(gtsam.Rot3(r_w_b @ r_b_c), np.array([3.0, 4.0, 150.0]))
-    bias = np.zeros(BIAS_SIZE)
-    bias[[HEIGHT, SCALE]] = 7.0, -0.2
+    bias = np.zeros(CALIBRATION_SIZE)
+    bias[[HEIGHT, LOG_HEIGHT_SCALE]] = 7.0, -0.2
 
     def residual(pose: gtsam.Pose3, bias: np.ndarray) -> np.ndarray:
-        return attitude_and_height_residual(pose, bias, r_w_b, r_b_c, 140.0, 20.0)[0]
+        return attitude_height_residual(pose, bias, r_w_b, r_b_c, 140.0, 20.0)[0]
 
-    _, by_pose, by_bias = attitude_and_height_residual(pose, bias, r_w_b, r_b_c, 140.0, 20.0)
+    _, by_pose, by_bias = attitude_height_residual(pose, bias, r_w_b, r_b_c, 140.0, 20.0)
     step = 1e-5
     moved = [(residual(pose.retract(step * d), bias) - residual(pose, bias)) / step for d in np.eye(6)]
-    biased = [(residual(pose, bias + step * d) - residual(pose, bias)) / step for d in np.eye(BIAS_SIZE)]
+    biased = [(residual(pose, bias + step * d) - residual(pose, bias)) / step for d in np.eye(CALIBRATION_SIZE)]
     assert np.allclose(np.column_stack(moved), by_pose, atol=1e-3)
     assert np.allclose(np.column_stack(biased), by_bias, atol=1e-3)

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import FRAME_S, ORIGIN, PLACE, Flight, Listener, error_m, sigma_m
+from simulated_flight import FRAME_S, ORIGIN, PLACE, EstimatorRun, Flight, error_m, sigma_m
 from terrafix.core.codec import decode, decode_json, encode, encode_json
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import CheckpointWriter, load_checkpoint
@@ -48,13 +48,13 @@ def standing(i: int, armed: bool = False) -> list[Message]:
 
 def stood(
     frames: int = 10, start: Start | None = None, told_at: int = TOLD_AT, node: EstimatorNode | None = None
-) -> Listener:
-    run = Listener()
+) -> EstimatorRun:
+    run = EstimatorRun()
     run.node = node or run.node
-    run.hear([UNKNOWN])
+    run.feed([UNKNOWN])
     for i in range(frames):
-        run.hear([start] if start is not None and i == told_at else [])
-        run.hear(standing(i))
+        run.feed([start] if start is not None and i == told_at else [])
+        run.feed(standing(i))
     return run
 
 
@@ -74,40 +74,40 @@ def test_it_begins_there_with_the_next_frame_as_sure_as_that_is() -> None:
 
 def test_the_anchor_is_told_from_which_start_a_prediction_comes() -> None:
     run = stood(start=said_at(TOLD_AT))
-    told = {m.frame_id: m for m in run.said if isinstance(m, Prediction)}
+    told = {m.frame_id: m for m in run.published if isinstance(m, Prediction)}
     assert [told[i].start_ns for i in (TOLD_AT - 1, TOLD_AT, 9)] == [0, *[said_at(TOLD_AT).t_ns] * 2]
     assert told[TOLD_AT].step_m == (0.0, 0.0)
 
 
 def test_a_ground_that_the_map_does_not_tell_stays_as_it_was() -> None:
-    run = Listener()
-    run.hear([msgspec.structs.replace(UNKNOWN, ground_amsl_m=25.0), said_at(0, ground_m=None), *standing(0)])
+    run = EstimatorRun()
+    run.feed([msgspec.structs.replace(UNKNOWN, ground_amsl_m=25.0), said_at(0, ground_m=None), *standing(0)])
     assert run.estimate(0).alt_amsl_m == pytest.approx(25.4, abs=1.0)
 
 
 def test_said_again_it_changes_nothing_and_elsewhere_it_begins_there() -> None:
     run = stood(start=said_at(TOLD_AT))
-    estimator = run.node._estimator
-    run.hear([said_at(TOLD_AT), *standing(10)])
-    assert run.node._estimator is estimator
-    run.hear([said_at(11, 0.0, 0.0), *standing(11)])
+    estimator = run.node.estimator
+    run.feed([said_at(TOLD_AT), *standing(10)])
+    assert run.node.estimator is estimator
+    run.feed([said_at(11, 0.0, 0.0), *standing(11)])
     assert at_m(run.estimate(11)) == pytest.approx([0.0, 0.0], abs=0.1)
 
 
 def test_what_is_withdrawn_is_not_known() -> None:
     run = stood(start=said_at(TOLD_AT))
-    run.hear([withdrawn(10), *standing(10)])
+    run.feed([withdrawn(10), *standing(10)])
     assert sigma_m(run.estimate(10)) > NOBODY_SAID_M
     assert run.node.origin == UNKNOWN
 
 
 def test_a_start_before_the_first_picture_holds_while_the_vehicle_stands() -> None:
     """However long: the camera may be late."""
-    run = Listener()
-    run.hear([UNKNOWN, said_at(0), *standing(240)])
+    run = EstimatorRun()
+    run.feed([UNKNOWN, said_at(0), *standing(240)])
     assert sigma_m(run.estimate(240)) < 1.2 * SIGMA_M
-    flown = Listener()
-    flown.hear([UNKNOWN, said_at(0), *standing(20, armed=True)])
+    flown = EstimatorRun()
+    flown.feed([UNKNOWN, said_at(0), *standing(20, armed=True)])
     assert sigma_m(flown.estimate(20)) > 50.0  # it has flown for ten seconds, nobody knows where
 
 
@@ -123,19 +123,19 @@ def test_a_match_of_a_frame_before_it_says_nothing() -> None:
         ground=(300.0, 0.0, 0.0),
         lost_sigma_m=1000.0,
     )
-    (verdict,) = run.hear([match])
+    (verdict,) = run.feed([match])
     assert isinstance(verdict, MeasurementVerdict) and verdict.verdict is Verdict.STALE
-    run.hear(standing(10))
+    run.feed(standing(10))
     after = run.estimate(10)
     assert after.alt_amsl_m == pytest.approx(before.alt_amsl_m, abs=0.5) and sigma_m(after) < 1.2 * SIGMA_M
 
 
 def test_a_place_that_the_map_has_told_stays() -> None:
     flight = Flight(20, seed=2)
-    run = Listener().fly(flight, 0, 20)
-    run.hear([said_at(20)])
-    assert run.node._estimator is not None and run.node._estimator.last_fix_s is not None
-    run.hear([blind_frame(20)])
+    run = EstimatorRun().fly(flight, 0, 20)
+    run.feed([said_at(20)])
+    assert run.node.estimator is not None and run.node.estimator.last_fix_s is not None
+    run.feed([blind_frame(20)])
     assert np.linalg.norm(at_m(run.estimate(20)) - flight.p_m[19, :2]) < 30.0
 
 
@@ -146,10 +146,10 @@ def blind_frame(i: int) -> Odometry:
 def test_a_flight_from_there_is_a_flight() -> None:
     """With matches that are gated: at the place in the middle of the map, where nobody was, all would be refused."""
     flight = Flight(30, seed=5)
-    run = Listener()
-    run.hear([UNKNOWN, said_at(0, *flight.p_m[0, :2], ground_m=0.0)])
+    run = EstimatorRun()
+    run.feed([UNKNOWN, said_at(0, *flight.p_m[0, :2], ground_m=0.0)])
     for i in range(30):
-        run.hear(flight.messages(i))
+        run.feed(flight.messages(i))
     assert {v.verdict for v in run.verdicts("map").values()} == {Verdict.ACCEPTED}
     assert np.linalg.norm(error_m(run.estimate(29), flight)[:2]) < 10.0
 
@@ -157,8 +157,8 @@ def test_a_flight_from_there_is_a_flight() -> None:
 def killed(folder: Path) -> Path:
     file = folder / "estimator.checkpoint"
     keeper = CheckpointWriter(file)
-    for message in (said_at(TOLD_AT), *stood(start=said_at(TOLD_AT)).said):
-        keeper.heard(message)
+    for message in (said_at(TOLD_AT), *stood(start=said_at(TOLD_AT)).published):
+        keeper.on_message(message)
     return file
 
 
@@ -168,17 +168,17 @@ def test_an_estimator_that_is_started_in_its_place_knows_it(tmp_path: Path) -> N
     for _ in range(2):
         last = load_checkpoint(file)
         assert last is not None
-        run = Listener()
+        run = EstimatorRun()
         run.node = EstimatorNode(0, last)
-        run.hear([UNKNOWN])
-        run.hear(standing(11))
+        run.feed([UNKNOWN])
+        run.feed(standing(11))
         said = run.estimate(11)
         assert at_m(said) == pytest.approx(AT_M, abs=1.0) and sigma_m(said) < 60.0
         assert said.alt_amsl_m == pytest.approx(GROUND_M + 0.4, abs=1.0)
         keeper = CheckpointWriter(file)
-        for message in run.said:
-            keeper.heard(message)
-    run.hear([said_at(12, 0.0, 0.0), *standing(12)])
+        for message in run.published:
+            keeper.on_message(message)
+    run.feed([said_at(12, 0.0, 0.0), *standing(12)])
     assert at_m(run.estimate(12)) == pytest.approx(
         [0.0, 0.0], abs=0.1
     )  # nobody was on the map: the newest start counts
@@ -187,11 +187,11 @@ def test_an_estimator_that_is_started_in_its_place_knows_it(tmp_path: Path) -> N
 def test_one_that_was_on_the_map_goes_on_from_there(tmp_path: Path) -> None:
     flight, file = Flight(20, seed=2), tmp_path / "estimator.checkpoint"
     keeper = CheckpointWriter(file)
-    for message in Listener().fly(flight, 0, 20).said:
-        keeper.heard(message)
-    run = Listener()
+    for message in EstimatorRun().fly(flight, 0, 20).published:
+        keeper.on_message(message)
+    run = EstimatorRun()
     run.node = EstimatorNode(0, load_checkpoint(file))
-    run.hear([UNKNOWN, said_at(20), *standing(20)])
+    run.feed([UNKNOWN, said_at(20), *standing(20)])
     assert np.linalg.norm(at_m(run.estimate(20)) - flight.p_m[19, :2]) < 30.0
 
 
@@ -202,7 +202,7 @@ def test_after_landing_the_flight_begins_there_too() -> None:
     before, after = storyteller.flights
     assert (before.origin.start_sigma_m, after.origin.start_sigma_m) == (NOBODY_SAID_M, SIGMA_M)
     assert sorted(before.node_of) == [0, 1] and sorted(after.node_of) == [2, 3]
-    assert after.graph is storyteller._estimator.graph  # type: ignore[union-attr]
+    assert after.recorder.graph is storyteller.node.estimator.graph  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("start", [said_at(3), withdrawn(3)])

@@ -1,41 +1,41 @@
-"""Fixes that are not believed one by one."""
+"""Runs of consecutive rejected fixes with consistent offsets."""
 
 import numpy as np
 
-from terrafix.estimator.integrity.innovation_run import AGREE_M, InnovationRun
+from terrafix.estimator.integrity.innovation_run import CONSISTENT_M, InnovationRun
 
 
-def row(offsets_m: list[tuple[float, float]], spacing_m: float = 20.0, *, coarse: int = 0) -> InnovationRun:
-    """``coarse``: so many of them, the first ones."""
-    said = InnovationRun()
+def make_run(offsets_m: list[tuple[float, float]], spacing_m: float = 20.0, *, coarse: int = 0) -> InnovationRun:
+    """``coarse``: the first ones of the fixes are coarse."""
+    run = InnovationRun()
     for i, offset_m in enumerate(offsets_m):
-        said.add(np.array(offset_m), np.array([spacing_m * i, 0.0]), coarse=i < coarse)
-    return said
+        run.add(np.array(offset_m), np.array([spacing_m * i, 0.0]), coarse=i < coarse)
+    return run
 
 
-def test_several_that_agree_over_new_ground_hold() -> None:
-    said = row([(100.0, 0.0), (103.0, -4.0), (98.0, 2.0), (101.0, 1.0)])
-    assert said.holds(4, 50.0)
-    assert not said.holds(5, 50.0)  # too few
-    assert not said.holds(4, 60.0)  # over too little way: 60 m, and more is asked
+def test_enough_consistent_offsets_over_a_long_span_confirm_the_run() -> None:
+    run = make_run([(100.0, 0.0), (103.0, -4.0), (98.0, 2.0), (101.0, 1.0)])
+    assert run.is_confirmed(4, 50.0)
+    assert not run.is_confirmed(5, 50.0)  # too few
+    assert not run.is_confirmed(4, 60.0)  # the span is 60 m, and it must be more
 
 
-def test_one_mistake_seen_again_and_again_does_not() -> None:
-    assert not row([(100.0, 0.0)] * 10, spacing_m=0.5).holds(4, 50.0)
+def test_repeated_offsets_over_the_same_ground_do_not_confirm_the_run() -> None:
+    assert not make_run([(100.0, 0.0)] * 10, spacing_m=0.5).is_confirmed(4, 50.0)
 
 
-def test_coarse_ones_are_none_of_the_poses() -> None:
-    said = row([(100.0, 0.0)] * 5, coarse=3)
-    assert said.holds(5, 50.0) and said.holds(2, 50.0, poses=True)
-    assert not said.holds(3, 50.0, poses=True) and not said.holds(2, 80.0, poses=True)
+def test_coarse_fixes_do_not_count_as_poses() -> None:
+    run = make_run([(100.0, 0.0)] * 5, coarse=3)
+    assert run.is_confirmed(5, 50.0) and run.is_confirmed(2, 50.0, poses_only=True)
+    assert not run.is_confirmed(3, 50.0, poses_only=True) and not run.is_confirmed(2, 80.0, poses_only=True)
 
 
-def test_one_that_does_not_agree_begins_a_new_row() -> None:
-    said = row([(100.0, 0.0)] * 5 + [(100.0, AGREE_M + 1.0)])
-    assert len(said.offsets_m) == said.poses == 1 and not said.holds(1, 1.0)
+def test_an_inconsistent_offset_begins_a_new_run() -> None:
+    run = make_run([(100.0, 0.0)] * 5 + [(100.0, CONSISTENT_M + 1.0)])
+    assert len(run.offsets_m) == run.poses == 1 and not run.is_confirmed(1, 1.0)
 
 
-def test_what_was_said_can_be_forgotten() -> None:
-    said = row([(100.0, 0.0)] * 5)
-    said.clear()
-    assert not said.holds(1, 0.0) and said.poses == 0
+def test_clear_empties_the_run() -> None:
+    run = make_run([(100.0, 0.0)] * 5)
+    run.clear()
+    assert not run.is_confirmed(1, 0.0) and run.poses == 0

@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, Flight, Listener, blind, cov_of, error_m, sigma_m, t_ns
-from terrafix.estimator.integrity.correlated_fixes import KEPT, CorrelatedFixes
+from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m, sigma_m, t_ns
+from terrafix.estimator.integrity.correlated_fixes import MAX_FIXES, CorrelatedFixes
 from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, SourceEnded, SourceLabel, Verdict
 
 LATEST = 4  # frames: two seconds
@@ -39,10 +39,10 @@ def test_the_order_is_an_odd_one() -> None:
 
 def test_the_same_odd_order_gives_the_same_bytes() -> None:
     said = late(Flight(60, seed=5, fix_every=2), 60, seed=1)
-    runs = [Listener(), Listener()]
+    runs = [EstimatorRun(), EstimatorRun()]
     for run in runs:
-        run.hear(said)
-    assert msgspec.json.encode(runs[0].said) == msgspec.json.encode(runs[1].said)
+        run.feed(said)
+    assert msgspec.json.encode(runs[0].published) == msgspec.json.encode(runs[1].published)
 
 
 @pytest.mark.slow
@@ -50,8 +50,8 @@ def test_the_same_odd_order_gives_the_same_bytes() -> None:
 def test_late_matches_are_worth_as_much_as_those_in_time(seed: int) -> None:
     """Once they are heard: within a fifth of what both claim, and the claims within a tenth."""
     flight, frames = Flight(90, seed=seed, fix_every=3), 90
-    timely, tardy = Listener().fly(flight, 0, frames), Listener()
-    tardy.hear(late(flight, frames, seed))
+    timely, tardy = EstimatorRun().fly(flight, 0, frames), EstimatorRun()
+    tardy.feed(late(flight, frames, seed))
     assert {v.verdict for v in tardy.verdicts("map").values()} == {Verdict.ACCEPTED}
     assert sorted(tardy.verdicts("map")) == list(range(0, frames, 3))
     a, b = timely.estimate(frames - 1), tardy.estimate(frames - 1)
@@ -64,8 +64,8 @@ def test_estimates_are_honest_while_matches_are_late() -> None:
     nees = []
     for seed in range(3):
         flight = Flight(80, seed=seed, fix_every=3)
-        run = Listener()
-        run.hear(late(flight, 80, seed))
+        run = EstimatorRun()
+        run.feed(late(flight, 80, seed))
         for i in range(20, 80):
             e = error_m(run.estimate(i), flight)[:2]
             nees.append(float(e @ np.linalg.solve(cov_of(run.estimate(i))[:2, :2], e)))
@@ -74,57 +74,57 @@ def test_estimates_are_honest_while_matches_are_late() -> None:
 
 def test_an_answer_to_an_old_frame_says_the_newest_place() -> None:
     flight = Flight(40, seed=2)
-    run = Listener().fly(flight, 0, 35)
+    run = EstimatorRun().fly(flight, 0, 35)
     for i in range(35, 40):
-        run.hear([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
-    said = [m for m in run.hear([flight.fix(37)]) if isinstance(m, NavEstimate)]
+        run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
+    said = [m for m in run.feed([flight.fix(37)]) if isinstance(m, NavEstimate)]
     assert [(m.frame_id, m.t_ns, m.emitted_at_ns) for m in said] == [(39, t_ns(39), t_ns(39))]
     assert said[0].last_anchor_age_ms == 1000
-    older = [m for m in run.hear([flight.fix(35)]) if isinstance(m, NavEstimate)]
+    older = [m for m in run.feed([flight.fix(35)]) if isinstance(m, NavEstimate)]
     assert [m.last_anchor_age_ms for m in older] == [1000]  # the newest fix is still that of frame 37
 
 
 def test_a_late_match_does_not_make_a_blind_frame_a_seen_one() -> None:
     flight = Flight(40, seed=2)
-    run = Listener().fly(flight, 0, 37)
+    run = EstimatorRun().fly(flight, 0, 37)
     for i in range(37, 40):
         said = [m for m in flight.messages(i) if not isinstance(m, MapMatch)]
-        run.hear([blind(m) if isinstance(m, Odometry) else m for m in said])
-    run.hear([flight.fix(36)])
+        run.feed([blind(m) if isinstance(m, Odometry) else m for m in said])
+    run.feed([flight.fix(36)])
     assert run.verdicts("map")[36].verdict is Verdict.ACCEPTED
     assert run.estimate(39).source_label is SourceLabel.DEAD_RECKONED
-    run.hear([flight.fix(39)])
+    run.feed([flight.fix(39)])
     assert run.estimate(39).source_label is SourceLabel.SATELLITE_ANCHORED
 
 
 def test_of_two_matches_the_newer_one_knows_the_ground_below() -> None:
     flight = Flight(40, seed=2)
-    run = Listener().fly(flight, 0, 40)
+    run = EstimatorRun().fly(flight, 0, 40)
     high, low = (msgspec.structs.replace(flight.fix(i), ground=(up, 0.0, 0.0)) for i, up in ((39, 12.0), (36, 4.0)))
-    run.hear([high])
+    run.feed([high])
     above_m = run.estimate(39).agl_m
-    run.hear([low])
+    run.feed([low])
     assert run.estimate(39).agl_m == pytest.approx(above_m, abs=2.0)  # a fix moves it, too; the ground would by 8 m
     assert {run.verdicts("map")[i].verdict for i in (36, 39)} == {Verdict.ACCEPTED}
 
 
 def test_what_a_search_found_knows_its_ground_however_late_it_is() -> None:
     flight = Flight(42, seed=9)
-    run = Listener().fly(flight, 0, 30)
+    run = EstimatorRun().fly(flight, 0, 30)
     for i in range(30, 42):
-        run.hear([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
+        run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
     newer = msgspec.structs.replace(flight.fix(41), verdict=Verdict.AMBIGUOUS, ground=(0.0, 0.0, 0.0))
     found = msgspec.structs.replace(flight.fix(36, (300.0, 200.0)), found=True, ground=(20.0, 0.0, 0.0))
-    run.hear([newer, found])
+    run.feed([newer, found])
     said = run.estimate(41)
     assert said.alt_amsl_m - said.agl_m == pytest.approx(20.0, abs=0.5)
 
 
 def test_one_that_is_too_old_says_so_and_changes_nothing() -> None:
     flight = Flight(60, seed=3)
-    run = Listener().fly(flight, 0, 60)
+    run = EstimatorRun().fly(flight, 0, 60)
     before = run.estimate(59)
-    answers = run.hear([flight.fix(20)])
+    answers = run.feed([flight.fix(20)])
     assert run.verdicts("map")[20].verdict is Verdict.STALE
     assert not any(isinstance(m, NavEstimate) for m in answers) and run.estimate(59) == before
 
@@ -132,10 +132,10 @@ def test_one_that_is_too_old_says_so_and_changes_nothing() -> None:
 def test_one_that_comes_after_the_flight_says_so() -> None:
     """The anchor is still at its last picture when the source has ended."""
     flight = Flight(60, seed=3)
-    run = Listener().fly(flight, 0, 59)
-    run.hear([m for m in flight.messages(59) if not isinstance(m, MapMatch)])
-    run.hear([SourceEnded(t_ns=t_ns(59), frames=60)])
-    answers = run.hear([flight.fix(59)])
+    run = EstimatorRun().fly(flight, 0, 59)
+    run.feed([m for m in flight.messages(59) if not isinstance(m, MapMatch)])
+    run.feed([SourceEnded(t_ns=t_ns(59), frames=60)])
+    answers = run.feed([flight.fix(59)])
     assert run.verdicts("map")[59].verdict is Verdict.STALE
     assert not any(isinstance(m, NavEstimate) for m in answers)
 
@@ -145,21 +145,21 @@ def test_ground_counts_the_same_in_any_order() -> None:
     for order in ((0, 1, 2, 3), (0, 2, 1, 3), (3, 1, 0, 2), (3, 2, 1, 0)):
         seen, total_m = CorrelatedFixes(), 0.0
         for i in order:
-            total_m += seen.new_m(float(i), places[i], 50.0)
+            total_m += seen.new_ground_m(float(i), places[i], 50.0)
             seen.add(float(i), places[i])
         assert total_m == pytest.approx(50.0 + 60.0)  # the first, and all the way; no step is longer than what counts
     assert seen.newest_s == 3.0
-    assert seen.new_m(1.0, places[1], 50.0) == 0.0
+    assert seen.new_ground_m(1.0, places[1], 50.0) == 0.0
 
 
 def test_ground_far_away_is_all_new() -> None:
     seen = CorrelatedFixes()
-    assert seen.new_m(0.0, np.zeros(2), 50.0) == 50.0 and seen.newest_s is None
-    for i in range(3 * KEPT):
+    assert seen.new_ground_m(0.0, np.zeros(2), 50.0) == 50.0 and seen.newest_s is None
+    for i in range(3 * MAX_FIXES):
         seen.add(float(i), np.array([100.0 * i, 0.0]))
-    assert seen.new_m(500.0, np.array([1e5, 0.0]), 50.0) == 50.0
-    assert seen.new_m(500.0, np.array([1e5, 0.0]), math.inf) > 8e4
-    assert len(seen._fixes) == KEPT
+    assert seen.new_ground_m(500.0, np.array([1e5, 0.0]), 50.0) == 50.0
+    assert seen.new_ground_m(500.0, np.array([1e5, 0.0]), math.inf) > 8e4
+    assert len(seen._fixes) == MAX_FIXES
 
 
 @pytest.mark.parametrize("hz", [0.5, 2.0, 5.0, 30.0])
@@ -168,8 +168,8 @@ def test_more_frames_a_second_over_the_same_ground_do_not_tell_more(hz: float) -
     seen, counted = CorrelatedFixes(), 0.0
     seen.add(0.0, np.zeros(2))
     for t_s in np.arange(1, 30 * hz) / hz:
-        counted += seen.share(float(t_s), np.zeros(2), 100.0)
+        counted += seen.information_share(float(t_s), np.zeros(2), 100.0)
         seen.add(float(t_s), np.zeros(2))
     assert counted == pytest.approx(30 * min(0.2, 0.1 * hz), rel=0.1)
-    assert seen.share(30.0, np.array([25.0, 0.0]), 100.0) == pytest.approx(0.5)  # half of its ground is new
-    assert seen.share(30.0, np.array([80.0, 0.0]), 100.0) == 1.0
+    assert seen.information_share(30.0, np.array([25.0, 0.0]), 100.0) == pytest.approx(0.5)  # half of its ground is new
+    assert seen.information_share(30.0, np.array([80.0, 0.0]), 100.0) == 1.0

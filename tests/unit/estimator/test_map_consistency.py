@@ -1,58 +1,58 @@
-"""Camera poses that agree neither with the flight nor with each other widen the claim; those of a true map do not."""
+"""Camera poses inconsistent with the flight and with each other inflate the covariance; those of a true map do not."""
 
 import numpy as np
 import pytest
 
-from terrafix.core.gate import LEAST_WEIGHT
+from terrafix.core.gate import MIN_COMPONENT_WEIGHT
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 
-AWAY_M = np.array([90.0, -120.0])  # 150 m
+OFFSET_M = np.array([90.0, -120.0])  # 150 m
 
 
-def refused(consistency: MapConsistency, times: int) -> MapConsistency:
+def after_rejected(consistency: MapConsistency, times: int) -> MapConsistency:
     for _ in range(times):
-        consistency.refused(AWAY_M)
+        consistency.add_rejected(OFFSET_M)
     return consistency
 
 
 @pytest.mark.parametrize("times", [0, 1])
-def test_one_refused_pose_is_a_mistake_and_widens_nothing(times: int) -> None:
-    assert refused(MapConsistency(), times).variance_m2 == 0.0
+def test_a_single_rejected_pose_does_not_inflate_the_covariance(times: int) -> None:
+    assert after_rejected(MapConsistency(), times).variance_m2 == 0.0
 
 
-def test_refused_poses_without_one_that_agrees_widen_the_claim_as_far_as_they_are() -> None:
-    few, many = (refused(MapConsistency(), times) for times in (2, 6))
-    assert LEAST_WEIGHT < few.probability < 0.5
+def test_rejected_poses_without_accepted_ones_inflate_the_covariance_to_their_distance() -> None:
+    few, many = (after_rejected(MapConsistency(), times) for times in (2, 6))
+    assert MIN_COMPONENT_WEIGHT < few.probability < 0.5
     assert few.variance_m2 == pytest.approx(few.probability * 150.0**2)
     assert many.probability > 0.9 and many.variance_m2 == pytest.approx(150.0**2, rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_map_on_which_a_tenth_of_the_poses_is_wrong_is_still_one_of_this_ground(seed: int) -> None:
+def test_a_map_with_a_tenth_of_wrong_poses_is_not_taken_for_another_place(seed: int) -> None:
     rng, consistency = np.random.default_rng(seed), MapConsistency()
-    doubted = 0
+    inflated = 0
     for _ in range(500):
         if rng.uniform() < 0.1:
-            consistency.refused(AWAY_M)
+            consistency.add_rejected(OFFSET_M)
         else:
-            consistency.agreed(0.5)
-        doubted += consistency.variance_m2 > 0.0
-    assert doubted < 0.1 * 500
+            consistency.add_accepted(0.5)
+        inflated += consistency.variance_m2 > 0.0
+    assert inflated < 0.1 * 500
 
 
-def test_poses_that_agree_over_new_ground_end_the_doubt_and_the_same_ground_again_does_not() -> None:
-    hovering, flying = (refused(MapConsistency(), 4) for _ in range(2))
+def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
+    hovering, flying = (after_rejected(MapConsistency(), 4) for _ in range(2))
     for _ in range(10):
-        hovering.agreed(0.0)
-        flying.agreed(0.5)
-    assert hovering.probability == refused(MapConsistency(), 4).probability
+        hovering.add_accepted(0.0)
+        flying.add_accepted(0.5)
+    assert hovering.probability == after_rejected(MapConsistency(), 4).probability
     assert flying.variance_m2 == 0.0
 
 
-def test_what_was_refused_long_ago_says_nothing_of_where_poses_are_refused_now() -> None:
-    consistency = refused(MapConsistency(), 1)
+def test_the_distance_of_earlier_rejected_poses_is_forgotten_after_accepted_ones() -> None:
+    consistency = after_rejected(MapConsistency(), 1)
     for _ in range(20):
-        consistency.agreed(1.0)
+        consistency.add_accepted(1.0)
     for _ in range(4):
-        consistency.refused(0.1 * AWAY_M)
+        consistency.add_rejected(0.1 * OFFSET_M)
     assert consistency.variance_m2 == pytest.approx(consistency.probability * 15.0**2)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, Flight, Listener, cov_of, error_m
+from simulated_flight import ORIGIN, EstimatorRun, Flight, cov_of, error_m
 from terrafix.messages import MapMatch, Prediction
 
 FIRST_MATCH = 36
@@ -11,11 +11,11 @@ FIRST_MATCH = 36
 
 @pytest.mark.parametrize("knows", [{"yaw", "attitude"}, set()], ids=["attitude", "nothing"])
 def test_the_height_stays_open_until_a_match_says_it(knows: set[str]) -> None:
-    flight, listener = Flight(72, seed=3, knows=frozenset(knows)), Listener()
-    listener.hear([ORIGIN])
+    flight, listener = Flight(72, seed=3, telemetry=frozenset(knows)), EstimatorRun()
+    listener.feed([ORIGIN])
     for i in range(flight.frames):
-        listener.hear(m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i < FIRST_MATCH))
-    predicted = {m.frame_id: m for m in listener.said if isinstance(m, Prediction)}
+        listener.feed(m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i < FIRST_MATCH))
+    predicted = {m.frame_id: m for m in listener.published if isinstance(m, Prediction)}
     for i in range(min(predicted), FIRST_MATCH + 1):
         off_m = predicted[i].agl_m - float(flight.p_m[i, 2])
         assert abs(off_m) < predicted[i].agl_sigma_m and 60.0 < predicted[i].agl_m < 200.0

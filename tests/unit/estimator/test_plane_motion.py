@@ -1,18 +1,18 @@
-"""Metric motion between two cameras above flat ground, from matched rays and the height."""
+"""Metric motion between two cameras over a ground plane, from matched rays and the height."""
 
 import numpy as np
 import pytest
 
-from ground import PINHOLE, apply, homography, rotation, texture, view
 from terrafix.core.geodesy import yaw_of
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.models.plane_motion import Ground, RelativePose, relative_pose
 from terrafix.vision.feature_tracker import FrameTracker
+from textured_ground import PINHOLE, apply, homography, rotation, texture, view
 
 AGL_M = 100.0
 SIGMA = 1.0 / 380.0  # one pixel
-TILT_SIGMA_RAD = np.radians(30.0)  # nothing is known of the new tilt
+TILT_SIGMA_RAD = np.radians(30.0)  # unknown tilt of the second camera
 FLAT = Ground(AGL_M, 2.0)
 Pose = tuple[np.ndarray, np.ndarray]
 
@@ -24,7 +24,7 @@ def pairs_between(a: Pose, b: Pose, count: int, rng: np.random.Generator, sigma:
 
 
 def between(a: Pose, b: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Truth: camera b in camera a."""
+    """True pose of camera b in camera a."""
     return a[0].T @ b[0], a[0].T @ (b[1] - a[1])
 
 
@@ -40,21 +40,21 @@ SECOND = {
 
 
 @pytest.mark.parametrize("name", SECOND)
-def test_rotation_and_metric_translation(name: str) -> None:
+def test_rotation_and_metric_translation_match_the_truth(name: str) -> None:
     rng = np.random.default_rng(5)
     second = SECOND[name]
     r_true, p_true = between(FIRST, second)
     pairs = pairs_between(FIRST, second, 80, rng, 1e-5)
     motion = relative_pose(
         pairs, SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, FLAT
-    )  # nothing is known of the new attitude
+    )  # unknown attitude of the second camera
     assert motion is not None
     assert np.degrees(np.linalg.norm(log_so3(r_true.T @ motion.r))) < 0.02
     assert np.linalg.norm(motion.p_m - p_true) < 0.05
 
 
 @pytest.mark.parametrize("name", ["forward", "turn", "climb", "tilt"])
-def test_from_pictures(name: str) -> None:
+def test_motion_from_rendered_pictures_is_within_its_covariance(name: str) -> None:
     ground, second = texture(2, 340.0), SECOND[name]
     tracker = FrameTracker(PINHOLE)
     tracker.track(0, view(ground, PINHOLE, *FIRST))
@@ -69,8 +69,8 @@ def test_from_pictures(name: str) -> None:
 
 
 @pytest.mark.parametrize("guess_error_deg", [0.0, 2.0, 4.0])
-def test_the_mirror_solution_is_not_taken(guess_error_deg: float) -> None:
-    """A plane seen twice has a second solution whose tilt and translation trade places."""
+def test_the_mirror_solution_of_the_plane_is_rejected(guess_error_deg: float) -> None:
+    """Two views of a plane have a second solution in which tilt and translation are exchanged."""
     rng = np.random.default_rng(8)
     for _ in range(30):
         yaw, tilt = float(rng.uniform(-180, 180)), rng.uniform(-8.0, 8.0, 2)
@@ -86,7 +86,7 @@ def test_the_mirror_solution_is_not_taken(guess_error_deg: float) -> None:
         assert np.linalg.norm(motion.p_m - p_true) < 2.0
 
 
-def test_a_wrong_height_scales_the_step_and_the_sigma_says_so() -> None:
+def test_a_height_error_scales_the_translation_and_is_in_its_covariance() -> None:
     rng = np.random.default_rng(2)
     second = SECOND["forward"]
     _, p_true = between(FIRST, second)
@@ -99,23 +99,23 @@ def test_a_wrong_height_scales_the_step_and_the_sigma_says_so() -> None:
     assert float(np.sqrt(along @ low.cov[3:, 3:] @ along)) == pytest.approx(np.linalg.norm(error), rel=0.3)
 
 
-def test_the_covariance_holds_the_errors() -> None:
+def test_the_covariance_is_consistent_with_the_errors() -> None:
     rng = np.random.default_rng(4)
     second = SECOND["tilt"]
     r_true, p_true = between(FIRST, second)
     nees = []
     for _ in range(200):
-        pairs = pairs_between(FIRST, second, 10, rng, SIGMA)  # so few that each counts as independent
+        pairs = pairs_between(FIRST, second, 10, rng, SIGMA)  # few enough to count as independent
         motion = relative_pose(pairs, SIGMA, FIRST[0], second[0], TILT_SIGMA_RAD, Ground(AGL_M, 0.0))
         assert motion is not None
         error = np.concatenate([log_so3(r_true.T @ motion.r), motion.r.T @ (motion.p_m - p_true)])
         nees.append(error @ np.linalg.solve(motion.cov, error))
-    assert 2.0 < np.mean(nees) < 8.0  # 6 would be exact; more than claimed is the worse fault
+    assert 2.0 < np.mean(nees) < 8.0  # expected 6; an overconfident covariance is the worse error
 
 
 @pytest.mark.parametrize("slope", [(0.1, 0.0), (0.0, -0.15), (-0.08, 0.12)])
-def test_sloping_ground(slope: tuple[float, float]) -> None:
-    """The same motion over a hillside that the DEM knows: metric and unturned; unknown, the sigma must hold it."""
+def test_a_slope_is_exact_with_a_dem_and_within_the_covariance_without(slope: tuple[float, float]) -> None:
+    """The same motion over a hillside: exact with the slope of a DEM; without it the error is within the covariance."""
     rng = np.random.default_rng(9)
     r, p = SECOND["tilt"]
     seen = np.column_stack([rng.uniform(-0.7, 0.7, 80), rng.uniform(-0.4, 0.4, 80), np.ones(80)])
@@ -135,31 +135,31 @@ def test_sloping_ground(slope: tuple[float, float]) -> None:
     assert error @ np.linalg.solve(unknown.cov, error) < 22.5
 
 
-def test_a_lean_into_a_turn_is_a_motion_unless_the_tilt_is_told_otherwise() -> None:
+def test_a_large_tilt_change_is_accepted_only_with_unknown_tilt_and_a_good_fit() -> None:
     rng = np.random.default_rng(6)
     leaning = (rotation(-10.0, 5.0, 22.0), np.array([3.0, 5.0, AGL_M]))
     r_true, p_true = between(FIRST, leaning)
     pairs = pairs_between(FIRST, leaning, 80, rng, 1e-4)
-    untold = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], UNKNOWN_ATTITUDE_RAD, FLAT)
-    assert untold is not None
-    assert np.degrees(np.linalg.norm(log_so3(r_true.T @ untold.r))) < 0.5
-    assert np.linalg.norm(untold.p_m - p_true) < 1.0
+    unreported = relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], UNKNOWN_ATTITUDE_RAD, FLAT)
+    assert unreported is not None
+    assert np.degrees(np.linalg.norm(log_so3(r_true.T @ unreported.r))) < 0.5
+    assert np.linalg.norm(unreported.p_m - p_true) < 1.0
     assert relative_pose(pairs, SIGMA, FIRST[0], FIRST[0], np.radians(2.0), FLAT) is None
-    wavy = pairs + rng.normal(0.0, 3.0 * SIGMA, pairs.shape)  # a plane that they do not fit
+    wavy = pairs + rng.normal(0.0, 3.0 * SIGMA, pairs.shape)  # matches that do not fit a plane
     assert relative_pose(wavy, SIGMA, FIRST[0], FIRST[0], UNKNOWN_ATTITUDE_RAD, FLAT) is None
 
 
-def test_what_cannot_be_known_is_none() -> None:
+def test_degenerate_matches_give_no_motion() -> None:
     rng = np.random.default_rng(6)
     pairs = pairs_between(FIRST, SECOND["forward"], 80, rng, 1e-4)
     assert relative_pose(pairs[:5], SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, FLAT) is None
     assert relative_pose(np.zeros((0, 4)), SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, FLAT) is None
     assert relative_pose(np.repeat(pairs[:1], 30, axis=0), SIGMA, FIRST[0], FIRST[0], TILT_SIGMA_RAD, FLAT) is None
-    sky = rotation(30.0, 130.0)  # the camera looks up: no ground ahead
+    sky = rotation(30.0, 130.0)  # the camera looks up: no ground in view
     assert relative_pose(pairs, SIGMA, sky, sky, TILT_SIGMA_RAD, FLAT) is None
 
 
-def test_two_thousand_steps_keep_the_rotation_a_rotation() -> None:
+def test_a_chain_of_two_thousand_rotations_stays_orthonormal() -> None:
     rng = np.random.default_rng(7)
     now: Pose = (rotation(10.0), np.array([0.0, 0.0, AGL_M]))
     r_chain = now[0]
@@ -176,5 +176,5 @@ def test_two_thousand_steps_keep_the_rotation_a_rotation() -> None:
     assert np.linalg.det(r_chain) == pytest.approx(1.0, abs=1e-9)
 
 
-def test_a_wrong_height_stretches_a_way_by_its_share() -> None:
-    assert Ground(100.0, 3.0, level_share=0.04).stretch_sigma == pytest.approx(0.05)
+def test_the_scale_sigma_of_a_translation_combines_height_and_level() -> None:
+    assert Ground(100.0, 3.0, level_share=0.04).translation_scale_sigma == pytest.approx(0.05)

@@ -92,7 +92,7 @@ def test_sigma_is_that_of_one_coordinate() -> None:
 def test_fewer_independent_matches_claim_less() -> None:
     r, p, points = looking(), np.array([0.0, 0.0, AGL_M]), scene(40, 5)
     xy = seen(points, r, p)
-    all_of_them, a_quarter = (fit_pose(points, xy, r, p, 1e-3, effective=e) for e in (1.0, 0.25))
+    all_of_them, a_quarter = (fit_pose(points, xy, r, p, 1e-3, independent_share=e) for e in (1.0, 0.25))
     assert all_of_them is not None and a_quarter is not None
     assert a_quarter.cov == pytest.approx(4.0 * all_of_them.cov)
 

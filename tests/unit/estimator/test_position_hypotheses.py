@@ -1,11 +1,11 @@
-"""A position that proved wrong: withdrawn, and replaced by the one that a search has found."""
+"""Position mixture: withdrawal of a wrong position, relocalization, and modes of the belief."""
 
 import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, Flight, Listener, cov_of, error_m, sigma_m
-from terrafix.core.gate import LEAST_WEIGHT
+from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, EstimatorRun, Flight, cov_of, error_m, sigma_m
+from terrafix.core.gate import MIN_COMPONENT_WEIGHT
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.messages import MapMatch, Message, Refinement, SearchStep, SourceEnded, Verdict
 
@@ -27,17 +27,17 @@ def with_map(flight: Flight, i: int, match: MapMatch) -> list[Message]:
     return [m for m in flight.messages(i) if not isinstance(m, MapMatch)] + [match]
 
 
-def flown_wrong(flight: Flight) -> Listener:
-    """30 frames at a place that is 860 m off and sure of it, then ten on which the anchor says LOST."""
-    run = Listener().fly(flight, 0, 1)
+def flown_wrong(flight: Flight) -> EstimatorRun:
+    """30 frames at a position with an error of 860 m and a small covariance, then ten matches with LOST."""
+    run = EstimatorRun().fly(flight, 0, 1)
     for i in range(1, 30):
-        run.hear(with_map(flight, i, flight.fix(i)))
+        run.feed(with_map(flight, i, flight.fix(i)))
     for i in range(30, 40):
-        run.hear(with_map(flight, i, lost(flight.fix(i))))
+        run.feed(with_map(flight, i, lost(flight.fix(i))))
     return run
 
 
-def test_lost_means_that_the_position_claims_nothing() -> None:
+def test_a_lost_match_inflates_the_position_covariance_to_the_lost_sigma() -> None:
     flight = Flight(60, seed=3)
     run = flown_wrong(flight)
     assert sigma_m(run.estimate(29)) < 10.0
@@ -45,175 +45,183 @@ def test_lost_means_that_the_position_claims_nothing() -> None:
         assert sigma_m(run.estimate(i)) > 0.99 * LOST_SIGMA_M
         assert run.verdicts("map")[i].verdict is Verdict.LOST
         assert run.verdicts("map")[i].detail == "lost; search: widen"
-        assert run.verdicts("odometry")[i].verdict is Verdict.ACCEPTED  # which goes on meanwhile
+        assert run.verdicts("odometry")[i].verdict is Verdict.ACCEPTED  # odometry continues
         assert np.linalg.eigvalsh(cov_of(run.estimate(i))).min() > 0.0
     step = error_m(run.estimate(39), flight)[:2] - error_m(run.estimate(30), flight)[:2]
     assert np.linalg.norm(step) < 0.1 * 9 * FRAME_S * SPEED_MPS
 
 
-def test_what_a_search_found_replaces_it_at_once() -> None:
+def test_a_relocalized_match_resets_the_position_at_once() -> None:
     flight = Flight(60, seed=3, dem=True)
     run = flown_wrong(flight)
     found = msgspec.structs.replace(flight.fix(40, WRONG_M), found=True)
-    run.hear(with_map(flight, 40, found))
+    run.feed(with_map(flight, 40, found))
     verdict = run.verdicts("map")[40]
     assert verdict.verdict is Verdict.ACCEPTED and "found 8" in verdict.detail
     assert np.linalg.norm(error_m(run.estimate(40), flight, WRONG_M)[:2]) < 20.0
     assert sigma_m(run.estimate(40)) < 15.0
     for i in range(41, 60):
-        run.hear(with_map(flight, i, flight.fix(i, WRONG_M)))
+        run.feed(with_map(flight, i, flight.fix(i, WRONG_M)))
         assert np.linalg.norm(error_m(run.estimate(i), flight, WRONG_M)[:2]) < 4 * sigma_m(run.estimate(i)) + 5.0
     assert sigma_m(run.estimate(59)) < 8.0
 
 
-def test_a_place_that_is_found_and_still_tested_claims_the_doubt_of_it_until_the_map_takes_it_back() -> None:
+def test_a_relocalized_place_under_verification_keeps_its_lost_sigma_until_that_is_withdrawn() -> None:
     flight = Flight(60, seed=3, dem=True)
     run = flown_wrong(flight)
     found = msgspec.structs.replace(flight.fix(40, WRONG_M), found=True, lost_sigma_m=700.0)
-    run.hear(with_map(flight, 40, found))
+    run.feed(with_map(flight, 40, found))
     assert run.verdicts("map")[40].verdict is Verdict.ACCEPTED
     assert 700.0 <= sigma_m(run.estimate(40)) < 720.0
-    run.hear(with_map(flight, 41, msgspec.structs.replace(flight.fix(41, WRONG_M), lost_sigma_m=200.0)))
+    run.feed(with_map(flight, 41, msgspec.structs.replace(flight.fix(41, WRONG_M), lost_sigma_m=200.0)))
     assert 200.0 <= sigma_m(run.estimate(41)) < 220.0
-    run.hear(with_map(flight, 42, flight.fix(42, WRONG_M)))
+    run.feed(with_map(flight, 42, flight.fix(42, WRONG_M)))
     assert sigma_m(run.estimate(42)) < 15.0
 
 
 @pytest.mark.parametrize(
-    ("offset_m", "start_sigma_m", "said"), [(700.0, 15.0, True), (20.0, 15.0, False), (700.0, 5000.0, False)]
+    ("offset_m", "start_sigma_m", "recorded"), [(700.0, 15.0, True), (20.0, 15.0, False), (700.0, 5000.0, False)]
 )
-def test_a_map_that_contradicts_the_start_is_on_record(offset_m: float, start_sigma_m: float, said: bool) -> None:
-    flight, run = Flight(6, seed=3), Listener()
-    run.hear([msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m)])
+def test_a_contradiction_of_start_and_map_is_recorded(offset_m: float, start_sigma_m: float, recorded: bool) -> None:
+    flight, run = Flight(6, seed=3), EstimatorRun()
+    run.feed([msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m)])
     for i in range(5):
-        run.hear(with_map(flight, i, lost(flight.fix(i))))
-    run.hear(with_map(flight, 5, msgspec.structs.replace(flight.fix(5, (offset_m, 0.0)), found=True)))
+        run.feed(with_map(flight, i, lost(flight.fix(i))))
+    run.feed(with_map(flight, 5, msgspec.structs.replace(flight.fix(5, (offset_m, 0.0)), found=True)))
     verdicts = run.verdicts("start")
-    assert list(verdicts) == ([5] if said else [])
-    if said:
+    assert list(verdicts) == ([5] if recorded else [])
+    if recorded:
         assert verdicts[5].verdict is Verdict.INNOVATION and "start and map are 7" in verdicts[5].detail
 
 
-def test_a_place_that_is_found_again_later_says_nothing_of_the_start() -> None:
+def test_a_later_relocalization_is_not_compared_with_the_start() -> None:
     flight = Flight(60, seed=3, dem=True)
     run = flown_wrong(flight)
-    run.hear(with_map(flight, 40, msgspec.structs.replace(flight.fix(40, WRONG_M), found=True)))
+    run.feed(with_map(flight, 40, msgspec.structs.replace(flight.fix(40, WRONG_M), found=True)))
     assert run.verdicts("start") == {}
 
 
-def test_the_same_fix_without_a_search_behind_it_is_refused() -> None:
+def test_the_same_fix_without_relocalization_is_rejected() -> None:
     flight = Flight(60, seed=3)
     run = flown_wrong(flight)
-    doubted = msgspec.structs.replace(flight.fix(40, WRONG_M), lost_sigma_m=LOST_SIGMA_M)
-    run.hear(with_map(flight, 40, doubted))
+    with_lost_sigma = msgspec.structs.replace(flight.fix(40, WRONG_M), lost_sigma_m=LOST_SIGMA_M)
+    run.feed(with_map(flight, 40, with_lost_sigma))
     assert run.verdicts("map")[40].verdict is Verdict.INNOVATION
     assert sigma_m(run.estimate(40)) > 0.99 * LOST_SIGMA_M
 
 
-def test_anywhere_is_what_the_anchor_says_and_lies_in_the_plane() -> None:
+def test_the_lost_sigma_of_the_anchor_inflates_the_horizontal_axes_only() -> None:
     hypotheses, flight = PositionHypotheses(), Flight(2)
-    assert hypotheses.hear(lost(flight.fix(0), SearchStep.ASK)) == "lost; search: ask"
+    assert hypotheses.on_match(lost(flight.fix(0), SearchStep.ASK)) == "lost; search: ask"
     _, cov = hypotheses.claim(np.eye(6))
     assert cov[0, 0] == 1.0 + LOST_SIGMA_M**2 and cov[2, 2] == 1.0
-    assert hypotheses.hear(msgspec.structs.replace(flight.fix(1), lost_sigma_m=5.0)) == ""
+    assert hypotheses.on_match(msgspec.structs.replace(flight.fix(1), lost_sigma_m=5.0)) == ""
     assert hypotheses.claim(np.eye(6))[1][1, 1] == 26.0
-    hypotheses.hear(flight.fix(1))
+    hypotheses.on_match(flight.fix(1))
     at_m, cov = hypotheses.claim(np.eye(6))
     assert (cov == np.eye(6)).all() and (at_m == 0.0).all()
 
 
 HEIGHT_M, MODE_VAR_M2 = 100.0, 4.0
-MODE_M2 = MODE_VAR_M2 + 3.0**2  # 3 % of the height: of a mode's place, where no tilt is uncertain
-BELIEF = (50.0, 20.0), (9000.0, 0.0, 0.0, 400.0)  # mean and covariance of all of it; the estimate is at (10, 20)
+MODE_M2 = MODE_VAR_M2 + 3.0**2  # 3 % of the height: 1-sigma of a mode without tilt uncertainty
+BELIEF = (50.0, 20.0), (9000.0, 0.0, 0.0, 400.0)  # mean and covariance of the belief; the estimate is at (10, 20)
 
 
-def weighed(sigma_m: float, *modes: tuple[float, float, float], cov: np.ndarray | None = None) -> PositionHypotheses:
-    """An estimate at (10, 20), known to ``sigma_m`` or ``cov`` (6, 6), and modes: offset east and north, mass."""
+def with_modes(sigma_m: float, *modes: tuple[float, float, float], cov: np.ndarray | None = None) -> PositionHypotheses:
+    """An estimate at (10, 20) with ``sigma_m`` or ``cov`` (6, 6), and modes: offset east and north, mass."""
     hypotheses = PositionHypotheses()
-    said = [(10.0 + e, 20.0 + n, mass, MODE_VAR_M2) for e, n, mass in modes]
+    modes_of_match = [(10.0 + e, 20.0 + n, mass, MODE_VAR_M2) for e, n, mass in modes]
     cov = np.diag([sigma_m**2] * 3 + [0.0] * 3) if cov is None else cov
-    match = msgspec.structs.replace(Flight(2).fix(1), verdict=Verdict.AMBIGUOUS, modes=said)
+    match = msgspec.structs.replace(Flight(2).fix(1), verdict=Verdict.AMBIGUOUS, modes=modes_of_match)
     match = msgspec.structs.replace(match, belief_m=BELIEF[0], belief_cov_m2=BELIEF[1])
-    hypotheses.weigh(match, np.array([10.0, 20.0, HEIGHT_M]), cov, HEIGHT_M)
+    hypotheses.update_modes(match, np.array([10.0, 20.0, HEIGHT_M]), cov, HEIGHT_M)
     return hypotheses
 
 
-def test_a_mode_that_leads_a_wide_belief_is_published_with_the_moments_about_it() -> None:
-    hypotheses = weighed(60.0, (300.0, 0.0, 0.7))
+def test_the_leading_mode_of_a_wide_belief_is_published_with_the_second_moments_about_it() -> None:
+    hypotheses = with_modes(60.0, (300.0, 0.0, 0.7))
     at_m, cov = hypotheses.claim(np.diag([3600.0] * 3 + [0.01] * 3))
-    assert at_m.tolist() == [300.0, 0.0] and hypotheses.are_several
-    assert cov[0, 0] == pytest.approx(0.3 * (3600.0 + 300.0**2) + 0.7 * MODE_M2)  # the prior is farther than the belief
+    assert at_m.tolist() == [300.0, 0.0] and hypotheses.is_multimodal
+    assert cov[0, 0] == pytest.approx(
+        0.3 * (3600.0 + 300.0**2) + 0.7 * MODE_M2
+    )  # the prior has larger moments than the belief
     assert cov[1, 1] == pytest.approx(0.3 * 3600.0 + 0.7 * MODE_M2)
     assert cov[3, 3] == 0.01
 
 
-def test_a_mode_without_a_pose_is_never_sure() -> None:
-    _, cov = weighed(60.0, (300.0, 0.0, 0.99)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
+def test_the_weight_of_a_mode_without_a_pose_is_limited() -> None:
+    _, cov = with_modes(60.0, (300.0, 0.0, 0.99)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
     assert cov[0, 0] == pytest.approx(0.2 * (3600.0 + 300.0**2) + 0.8 * MODE_M2)
 
 
-@pytest.mark.parametrize(("mass", "rival", "leads"), [(0.26, 0.1, True), (0.24, 0.06, False), (0.4, 0.17, False)])
-def test_a_mode_leads_by_its_mass_and_by_how_much_its_rival_has(mass: float, rival: float, leads: bool) -> None:
-    at_m, _ = weighed(60.0, (300.0, 0.0, mass), (-200.0, 0.0, rival)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
+@pytest.mark.parametrize(("mass", "second", "leads"), [(0.26, 0.1, True), (0.24, 0.06, False), (0.4, 0.17, False)])
+def test_a_leading_mode_needs_a_minimum_mass_and_a_ratio_to_the_second_mode(
+    mass: float, second: float, leads: bool
+) -> None:
+    at_m, _ = with_modes(60.0, (300.0, 0.0, mass), (-200.0, 0.0, second)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == ([300.0, 0.0] if leads else [0.0, 0.0])
 
 
-def test_a_belief_without_a_leading_mode_claims_its_whole_spread_where_the_estimate_is() -> None:
-    at_m, cov = weighed(60.0, (300.0, 0.0, 0.2)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
+def test_without_a_leading_mode_the_moments_of_the_belief_about_the_estimate_are_published() -> None:
+    at_m, cov = with_modes(60.0, (300.0, 0.0, 0.2)).claim(np.diag([3600.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == [0.0, 0.0]
     assert cov[0, 0] == pytest.approx(9000.0 + 40.0**2) and cov[1, 1] == pytest.approx(400.0)
 
 
-def test_a_belief_that_is_narrower_than_the_estimate_without_such_a_mode_claims_no_less() -> None:
-    at_m, cov = weighed(200.0, (30.0, 0.0, 0.2)).claim(np.diag([40000.0] * 3 + [0.01] * 3))
+def test_a_belief_narrower_than_the_estimate_does_not_reduce_the_covariance() -> None:
+    at_m, cov = with_modes(200.0, (30.0, 0.0, 0.2)).claim(np.diag([40000.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == [0.0, 0.0] and cov[0, 0] == cov[1, 1] == 40000.0
 
 
-def test_a_graph_that_poses_have_placed_is_not_moved_by_a_mode() -> None:
-    at_m, cov = weighed(5.0, (300.0, 0.0, 0.8)).claim(np.diag([25.0] * 3 + [0.01] * 3))
+def test_a_mode_elsewhere_does_not_move_the_position_of_a_placed_graph() -> None:
+    at_m, cov = with_modes(5.0, (300.0, 0.0, 0.8)).claim(np.diag([25.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == [0.0, 0.0]
     assert cov[0, 0] == pytest.approx(0.2 * 25.0 + 0.8 * (300.0**2 + MODE_M2))
 
 
-def test_the_mode_where_a_placed_graph_is_and_one_of_hardly_any_weight_change_nothing() -> None:
-    hypotheses = weighed(5.0, (10.0, -10.0, 0.9), (300.0, 0.0, 0.9 * LEAST_WEIGHT))
+def test_a_mode_at_a_placed_graph_and_one_of_negligible_weight_have_no_effect() -> None:
+    hypotheses = with_modes(5.0, (10.0, -10.0, 0.9), (300.0, 0.0, 0.9 * MIN_COMPONENT_WEIGHT))
     at_m, cov = hypotheses.claim(np.eye(6))
-    assert at_m.tolist() == [0.0, 0.0] and (cov == np.eye(6)).all() and not hypotheses.are_several
-    assert weighed(5.0, (30.0, 0.0, 0.9)).are_several
+    assert at_m.tolist() == [0.0, 0.0] and (cov == np.eye(6)).all() and not hypotheses.is_multimodal
+    assert with_modes(5.0, (30.0, 0.0, 0.9)).is_multimodal
 
 
 @pytest.mark.parametrize(("mass", "counts"), [(0.04, False), (0.06, True)])
-def test_a_mode_counts_from_a_twentieth_of_the_mass_on(mass: float, counts: bool) -> None:
-    assert weighed(5.0, (300.0, 0.0, mass)).are_several is counts
+def test_modes_below_5_percent_of_the_mass_are_ignored(mass: float, counts: bool) -> None:
+    assert with_modes(5.0, (300.0, 0.0, mass)).is_multimodal is counts
 
 
 @pytest.mark.parametrize(
     ("east_m", "north_m", "placed"), [(14.0, 14.0, True), (16.0, 16.0, False), (5.0, 16.0, False), (16.0, 5.0, False)]
 )
-def test_a_graph_is_placed_when_its_worst_axis_is_below_15_percent_of_the_height(
+def test_a_graph_is_placed_if_its_largest_sigma_is_below_15_percent_of_the_height(
     east_m: float, north_m: float, placed: bool
 ) -> None:
     cov = np.diag([east_m**2, north_m**2, 1.0, 0.0, 0.0, 0.0])
-    at_m, _ = weighed(0.0, (300.0, 0.0, 0.7), cov=cov).claim(cov)
+    at_m, _ = with_modes(0.0, (300.0, 0.0, 0.7), cov=cov).claim(cov)
     assert at_m.tolist() == ([0.0, 0.0] if placed else [300.0, 0.0])
 
 
-def test_a_place_that_is_seen_is_known_as_badly_as_the_tilt() -> None:
-    """From 100 m 0.2 rad about north are 20 m to the east, 0.1 rad about east are 10 m to the north."""
+def test_the_tilt_uncertainty_widens_modes_and_belief() -> None:
+    """At 100 m, 0.2 rad about north are 20 m to the east; 0.1 rad about east are 10 m to the north."""
     tilted = np.diag([3600.0, 3600.0, 1.0, 0.1**2, 0.2**2, 0.0])
     cov = np.diag([3600.0] * 3 + [0.01] * 3)
     lever_m2 = (
-        weighed(60.0, (300.0, 0.0, 0.7), cov=tilted).claim(cov)[1] - weighed(60.0, (300.0, 0.0, 0.7)).claim(cov)[1]
+        with_modes(60.0, (300.0, 0.0, 0.7), cov=tilted).claim(cov)[1]
+        - with_modes(60.0, (300.0, 0.0, 0.7)).claim(cov)[1]
     )
     assert np.diag(lever_m2)[:2] == pytest.approx([0.7 * 20.0**2, 0.7 * 10.0**2])
-    belief_m2 = weighed(60.0, (300.0, 0.0, 0.2), cov=tilted).claim(cov)[1]
+    belief_m2 = with_modes(60.0, (300.0, 0.0, 0.2), cov=tilted).claim(cov)[1]
     assert np.diag(belief_m2)[:2] == pytest.approx([9000.0 + 40.0**2 + 20.0**2, 400.0 + 10.0**2])
     near = np.diag([25.0, 25.0, 1.0, 0.1**2, 0.2**2, 0.0])
-    assert not weighed(5.0, (60.0, 0.0, 0.9), cov=near).are_several and weighed(5.0, (60.0, 0.0, 0.9)).are_several
+    assert (
+        not with_modes(5.0, (60.0, 0.0, 0.9), cov=near).is_multimodal
+        and with_modes(5.0, (60.0, 0.0, 0.9)).is_multimodal
+    )
 
 
-def test_two_other_places_share_what_a_placed_estimate_leaves() -> None:
-    at_m, cov = weighed(5.0, (300.0, 0.0, 0.3), (0.0, -400.0, 0.2)).claim(np.diag([25.0] * 3 + [0.01] * 3))
+def test_two_modes_elsewhere_and_a_placed_estimate_are_weighted_by_mass() -> None:
+    at_m, cov = with_modes(5.0, (300.0, 0.0, 0.3), (0.0, -400.0, 0.2)).claim(np.diag([25.0] * 3 + [0.01] * 3))
     assert at_m.tolist() == [0.0, 0.0]
     assert cov[0, 0] == pytest.approx(0.5 * 25.0 + 0.3 * (300.0**2 + MODE_M2) + 0.2 * MODE_M2)
     assert cov[1, 1] == pytest.approx(0.5 * 25.0 + 0.3 * MODE_M2 + 0.2 * (400.0**2 + MODE_M2))
@@ -224,31 +232,31 @@ def test_two_other_places_share_what_a_placed_estimate_leaves() -> None:
     [
         (60.0, [(300.0, 0.0, 0.7)]),  # a leading mode
         (60.0, [(300.0, 0.0, 0.2)]),  # a wide belief without one
-        (200.0, [(30.0, 0.0, 0.7)]),  # a prior that is wider than the belief
-        (14.0, [(300.0, 0.0, 0.4), (0.0, 300.0, 0.5)]),  # other places than that of a placed graph
+        (200.0, [(30.0, 0.0, 0.7)]),  # a prior wider than the belief
+        (14.0, [(300.0, 0.0, 0.4), (0.0, 300.0, 0.5)]),  # modes elsewhere and a placed graph
     ],
 )
-def test_what_is_published_is_positive_definite_however_place_and_attitude_are_correlated(
+def test_the_published_covariance_is_positive_definite_for_correlated_position_and_attitude(
     sigma_m: float, modes: list[tuple[float, float, float]]
 ) -> None:
     cov = np.diag([sigma_m**2] * 2 + [4.0] + [0.01] * 3)
     for place, angle in ((0, 4), (1, 3)):
         cov[place, angle] = cov[angle, place] = 0.99 * sigma_m * 0.1
-    _, claimed = weighed(sigma_m, *modes).claim(cov)
-    assert np.linalg.eigvalsh(claimed).min() > 0.0 and (claimed == claimed.T).all()
+    _, published = with_modes(sigma_m, *modes).claim(cov)
+    assert np.linalg.eigvalsh(published).min() > 0.0 and (published == published.T).all()
 
 
-def test_a_mode_elsewhere_widens_as_a_placed_estimate_does_and_narrows_with_it_no_more() -> None:
-    hypotheses = weighed(5.0, (300.0, 0.0, 0.4))
-    claimed = [hypotheses.claim(np.diag([var_m2] * 3 + [0.01] * 3))[1][1, 1] for var_m2 in (25.0, 125.0, 5.0)]
-    assert claimed == pytest.approx(
+def test_a_mode_elsewhere_widens_with_the_estimate_and_does_not_narrow_with_it() -> None:
+    hypotheses = with_modes(5.0, (300.0, 0.0, 0.4))
+    published = [hypotheses.claim(np.diag([var_m2] * 3 + [0.01] * 3))[1][1, 1] for var_m2 in (25.0, 125.0, 5.0)]
+    assert published == pytest.approx(
         [0.6 * 25.0 + 0.4 * MODE_M2, 0.6 * 125.0 + 0.4 * (MODE_M2 + 100.0), 3.0 + 0.4 * MODE_M2]
     )
 
 
 @pytest.mark.parametrize("mass", [0.7, 0.2])
-def test_a_belief_that_no_look_renews_widens_as_the_estimate_does(mass: float) -> None:
-    hypotheses = weighed(60.0, (300.0, 0.0, mass))
+def test_between_matches_the_belief_widens_with_the_estimate(mass: float) -> None:
+    hypotheses = with_modes(60.0, (300.0, 0.0, mass))
     wide, wider = np.diag([3600.0] * 3 + [0.01] * 3), np.diag([3600.0, 5000.0] + [3600.0] + [0.01] * 3)
     at_m, before = hypotheses.claim(wide)
     now_m, now = hypotheses.claim(wider)
@@ -256,50 +264,50 @@ def test_a_belief_that_no_look_renews_widens_as_the_estimate_does(mass: float) -
     assert now[:2, :2] - before[:2, :2] == pytest.approx(np.diag([0.0, 1400.0]))
 
 
-def test_a_match_that_agrees_ends_it() -> None:
-    hypotheses = weighed(60.0, (300.0, 0.0, 0.7))
-    hypotheses.confirmed()
+def test_an_accepted_match_clears_all_modes() -> None:
+    hypotheses = with_modes(60.0, (300.0, 0.0, 0.7))
+    hypotheses.on_match_accepted()
     assert (hypotheses.claim(np.eye(6))[1] == np.eye(6)).all()
 
 
-def test_the_estimate_is_published_at_the_mode_that_the_belief_has_while_the_graph_waits_for_a_pose() -> None:
-    """A start that is 300 m off and claims 100 m; ambiguous matches whose heaviest mode is the right place."""
+def test_the_leading_mode_is_published_while_the_graph_has_no_pose() -> None:
+    """A start with an error of 300 m and a sigma of 100 m; ambiguous matches with the heaviest mode at the truth."""
     flight = Flight(12, seed=3)
-    run = Listener()
-    run.hear([msgspec.structs.replace(ORIGIN, start_sigma_m=100.0, lat_deg=ORIGIN.lat_deg, lon_deg=ORIGIN.lon_deg)])
+    run = EstimatorRun()
+    run.feed([msgspec.structs.replace(ORIGIN, start_sigma_m=100.0, lat_deg=ORIGIN.lat_deg, lon_deg=ORIGIN.lon_deg)])
     for i in range(12):
-        at = flight.p_m[i] + np.array([300.0, 0.0, 0.0])  # where the map has it
+        at = flight.p_m[i] + np.array([300.0, 0.0, 0.0])  # the position on the map
         modes = [(float(at[0]), float(at[1]), 0.7, MODE_VAR_M2)]
-        said = msgspec.structs.replace(
+        match = msgspec.structs.replace(
             flight.fix(i), verdict=Verdict.AMBIGUOUS, modes=modes, belief_m=(float(at[0]), float(at[1]))
         )
-        run.hear(with_map(flight, i, said))
+        run.feed(with_map(flight, i, match))
     error = error_m(run.estimate(11), flight, (300.0, 0.0))[:2]
     assert np.linalg.norm(error) < 25.0
     assert 80.0 < sigma_m(run.estimate(11)) < 250.0
 
 
-def test_a_place_that_the_frames_speak_against_claims_less_before_it_is_given_up() -> None:
+def test_a_lost_sigma_of_an_ambiguous_match_inflates_the_covariance_before_the_place_is_lost() -> None:
     flight = Flight(30, seed=3)
-    run = Listener().fly(flight, 0, 20)
-    said = msgspec.structs.replace(flight.fix(20), verdict=Verdict.AMBIGUOUS, lost_sigma_m=134.0)
-    run.hear(with_map(flight, 20, said))
-    run.hear(with_map(flight, 21, said))
+    run = EstimatorRun().fly(flight, 0, 20)
+    match = msgspec.structs.replace(flight.fix(20), verdict=Verdict.AMBIGUOUS, lost_sigma_m=134.0)
+    run.feed(with_map(flight, 20, match))
+    run.feed(with_map(flight, 21, match))
     assert sigma_m(run.estimate(21)) > 134.0
 
 
-def test_a_start_that_is_not_known_claims_nothing_from_the_first_frame_and_is_refined_all_the_same() -> None:
+def test_an_unknown_start_has_its_full_sigma_from_the_first_frame_and_the_flight_is_refined() -> None:
     flight = Flight(30, seed=3)
-    run = Listener()
-    run.hear([msgspec.structs.replace(ORIGIN, start_sigma_m=5000.0)])
-    run.hear(flight.messages(0)[:2])
+    run = EstimatorRun()
+    run.feed([msgspec.structs.replace(ORIGIN, start_sigma_m=5000.0)])
+    run.feed(flight.messages(0)[:2])
     for i in range(1, 10):
-        run.hear(with_map(flight, i, lost(flight.fix(i)) if i % 2 else silent(flight.fix(i))))
+        run.feed(with_map(flight, i, lost(flight.fix(i)) if i % 2 else silent(flight.fix(i))))
     assert min(sigma_m(run.estimate(i)) for i in range(10)) > 5000.0
-    run.hear(with_map(flight, 10, msgspec.structs.replace(flight.fix(10, WRONG_M), found=True)))
+    run.feed(with_map(flight, 10, msgspec.structs.replace(flight.fix(10, WRONG_M), found=True)))
     for i in range(11, 30):
-        run.hear(with_map(flight, i, flight.fix(i, WRONG_M)))
+        run.feed(with_map(flight, i, flight.fix(i, WRONG_M)))
     assert np.linalg.norm(error_m(run.estimate(29), flight, WRONG_M)[:2]) < 10.0
-    run.hear([SourceEnded(t_ns=0, frames=30)])
-    (refined,) = [m for m in run.said if isinstance(m, Refinement)]
+    run.feed([SourceEnded(t_ns=0, frames=30)])
+    (refined,) = [m for m in run.published if isinstance(m, Refinement)]
     assert len(refined.poses) == 30

@@ -1,4 +1,4 @@
-"""The middle of the picture, of points that three cameras see through a lens that bends around it."""
+"""Self-calibration of the principal point from points in three views, with radial distortion."""
 
 import gtsam
 import msgspec
@@ -8,14 +8,14 @@ import pytest
 from simulated_flight import CAMERA
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.factors.three_view import ThreeViewPose
-from terrafix.estimator.measurements.principal_point import PrincipalPointFilter, graph_aside
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter, graph_shift
 from terrafix.messages import Camera, CovarianceMode, NavEstimate, SlowErrors, SourceLabel
 from terrafix_tools.lens_words import lens_words
 
 UNCALIBRATED = msgspec.structs.replace(CAMERA, focal_sigma=0.1)
 HEIGHT_M = 80.0
 NOISE = 0.25 / 560.0
-# What a wide lens bends (k1, k2), and where its middle is: 20 and 13 px of `CAMERA`.
+# Distortion of a wide lens (k1, k2), and its principal point: 20 and 13 px of `CAMERA`.
 BENDS, MIDDLE = (-0.06, 0.04), np.array([0.036, 0.023])
 
 
@@ -27,7 +27,7 @@ def shown(ray: np.ndarray, bends: tuple[float, float], middle: np.ndarray) -> np
 def triple(
     rng: np.random.Generator, bends: tuple[float, float], middle: np.ndarray, lean: float = 0.05
 ) -> tuple[np.ndarray, ThreeViewPose]:
-    """60 points of ground with houses, and the cameras as a graph has them that knows nothing of the lens."""
+    """60 points of ground with houses, and camera poses of a graph without a model of the lens."""
     poses = []
     for way_m in (-25.0, 25.0):
         turn = gtsam.Rot3(exp_so3(rng.normal(0.0, lean, 3)))
@@ -48,21 +48,21 @@ def learnt(
     rng, found = np.random.default_rng(seed), PrincipalPointFilter(camera)
     for _ in range(40):
         triples, at = triple(rng, bends, MIDDLE, lean)
-        found.see(triples, NOISE, at)
+        found.update(triples, NOISE, at)
     return found
 
 
-def test_a_lens_that_bends_shows_where_its_middle_is() -> None:
+def test_radial_distortion_makes_the_principal_point_observable() -> None:
     found = [learnt(seed) for seed in range(8)]
     for one in found:
         assert np.sqrt(np.diag(one.cov)).max() < 0.5 * np.sqrt(np.diag(PrincipalPointFilter(UNCALIBRATED).cov)).min()
     errors = [one.offset - MIDDLE for one in found]
     assert np.linalg.norm(np.mean(errors, axis=0)) < 0.3 * np.linalg.norm(MIDDLE)
     nees = np.mean([e @ np.linalg.solve(one.cov, e) for e, one in zip(errors, found, strict=True)])
-    assert nees < 2.0  # 40 triples of fresh points know more than those of a flight, which share them
+    assert nees < 2.0  # 40 independent sets carry more information than those of a flight, which share points
 
 
-def test_without_a_bend_a_camera_that_leans_shows_it_and_one_that_does_not_shows_nothing() -> None:
+def test_without_distortion_the_principal_point_is_observable_only_with_tilt() -> None:
     before = np.sqrt(PrincipalPointFilter(UNCALIBRATED).cov[0, 0])
     leans = learnt(1, bends=(0.0, 0.0))
     assert np.linalg.norm(leans.offset - MIDDLE) < 0.2 * np.linalg.norm(MIDDLE)
@@ -76,35 +76,35 @@ def test_without_a_bend_a_camera_that_leans_shows_it_and_one_that_does_not_shows
     [CAMERA, msgspec.structs.replace(UNCALIBRATED, distortion=(-0.1, 0.02, 0.0, 0.0))],
     ids=["calibrated", "stated"],
 )
-def test_what_somebody_has_measured_is_not_learnt(camera: Camera) -> None:
+def test_a_calibrated_principal_point_is_not_estimated(camera: Camera) -> None:
     found = learnt(1, camera)
     assert found.learnt is None and np.array_equal(found.offset, np.zeros(2))
     assert np.array_equal(found.cov, PrincipalPointFilter(camera).cov)
 
 
-def test_points_that_fit_no_lens_are_left_out() -> None:
+def test_inconsistent_points_are_rejected() -> None:
     found, before = PrincipalPointFilter(UNCALIBRATED), PrincipalPointFilter(UNCALIBRATED)
     triples, at = triple(np.random.default_rng(2), BENDS, MIDDLE)
-    found.see(np.random.default_rng(3).permuted(triples, axis=0), NOISE, at)
+    found.update(np.random.default_rng(3).permuted(triples, axis=0), NOISE, at)
     assert np.array_equal(found.cov, before.cov) and np.array_equal(found.offset, before.offset)
 
 
-def test_what_is_no_number_changes_nothing() -> None:
+def test_non_finite_points_have_no_effect() -> None:
     found, before = PrincipalPointFilter(UNCALIBRATED), PrincipalPointFilter(UNCALIBRATED)
     triples, at = triple(np.random.default_rng(2), BENDS, MIDDLE)
     for wrong in (np.full_like(triples, np.nan), 1e200 * triples):
         with np.errstate(all="ignore"):
-            found.see(wrong, NOISE, at)
+            found.update(wrong, NOISE, at)
     assert np.array_equal(found.cov, before.cov) and np.array_equal(found.offset, before.offset)
 
 
-def test_what_was_learnt_outlives_the_process() -> None:
+def test_the_estimate_is_restored_from_its_message() -> None:
     found = learnt(1)
     again = PrincipalPointFilter(UNCALIBRATED, found.learnt)
     assert np.allclose(again.offset, found.offset) and np.allclose(again.cov, found.cov)
 
 
-def test_who_can_calibrate_the_camera_is_told() -> None:
+def test_the_estimated_principal_point_is_reported() -> None:
     slow = SlowErrors(
         t_ns=0, frame_id=0, error=(0.0,) * 6, cov=tuple((np.eye(6) * 1e-4).ravel()), lens=learnt(1).learnt
     )
@@ -113,20 +113,20 @@ def test_who_can_calibrate_the_camera_is_told() -> None:
     assert lens_words(UNCALIBRATED, msgspec.structs.replace(slow, lens=None)) is None
 
 
-def test_ground_that_is_seen_aside_puts_the_camera_aside_and_not_farther_up() -> None:
-    """A middle that is right of where the description has it: what lies below is seen on the right, and the graph has
-    the camera on the left. A camera whose right is west is farther west."""
+def test_a_principal_point_offset_moves_the_camera_horizontally() -> None:
+    """For a principal point right of the stated one, the nadir appears on the right, so that the graph has the camera
+    too far to the left. With right being west, the true camera is farther west."""
     found = learnt(1)
-    r_w_c = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])  # right is west, down is north
-    aside_m, cov = found.aside(HEIGHT_M * r_w_c[:2, :2])
+    r_w_c = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])  # image right is west, image down is north
+    aside_m, cov = found.shift(HEIGHT_M * r_w_c[:2, :2])
     assert np.allclose(aside_m, HEIGHT_M * found.offset * (-1.0, 1.0))
     assert np.allclose(np.diag(cov), HEIGHT_M**2 * np.diag(found.cov))
 
 
-def test_an_estimator_that_is_started_again_begins_where_its_graph_was() -> None:
+def test_a_restart_uses_the_position_of_the_graph_without_the_principal_point_offset() -> None:
     found = learnt(1)
     assert found.learnt is not None
-    said = NavEstimate(
+    estimate = NavEstimate(
         t_ns=0,
         frame_id=0,
         lat_deg=48.0,
@@ -142,5 +142,6 @@ def test_an_estimator_that_is_started_again_begins_where_its_graph_was() -> None
         last_anchor_age_ms=0,
         emitted_at_ns=0,
     )
-    # Right in the picture is east, down in it is south.
-    assert np.allclose(graph_aside(said, UNCALIBRATED, found.learnt), HEIGHT_M * found.offset * (1.0, -1.0), atol=1e-6)
+    # Image right is east, image down is south.
+    shift_m = graph_shift(estimate, UNCALIBRATED, found.learnt)
+    assert np.allclose(shift_m, HEIGHT_M * found.offset * (1.0, -1.0), atol=1e-6)

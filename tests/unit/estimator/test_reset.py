@@ -8,13 +8,14 @@ from simulated_flight import (
     FRAME_S,
     ORIGIN,
     SPEED_MPS,
+    EstimatorRun,
     Flight,
-    Listener,
     blind,
     error_m,
     same_features,
     some_features,
 )
+from terrafix.estimator.initialization import ResetReason
 from terrafix.messages import Message, Odometry, Prediction, VehicleState, Verdict
 
 FRAMES = 8
@@ -39,29 +40,31 @@ def without_telemetry(messages: list[Message]) -> list[Message]:
     return [m for m in messages if not isinstance(m, VehicleState)]
 
 
-def steps_off_m(run: Listener, flight: Flight, first: int) -> list[float]:
+def steps_off_m(run: EstimatorRun, flight: Flight, first: int) -> list[float]:
     """Of each Prediction after frame ``first``: its step less the true one."""
-    steps = {m.frame_id: np.array(m.step_m) for m in run.said if isinstance(m, Prediction) and m.frame_id > first}
+    steps = {m.frame_id: np.array(m.step_m) for m in run.published if isinstance(m, Prediction) and m.frame_id > first}
     return [float(np.linalg.norm(s - (flight.p_m[i] - flight.p_m[i - 1])[:2])) for i, s in steps.items()]
 
 
 def test_odometry_of_the_keyframe_before_a_late_heading_is_fused(flight: Flight) -> None:
-    run = Listener()
-    run.hear([ORIGIN])
+    run = EstimatorRun()
+    run.feed([ORIGIN])
     for i in range(FRAMES):
         said = of_one_keyframe(flight, i)
-        run.hear(said if i >= FIRST_TELEMETRY else without_telemetry(said))
+        run.feed(said if i >= FIRST_TELEMETRY else without_telemetry(said))
     assert {i: v.verdict for i, v in run.verdicts("odometry").items()} == dict.fromkeys(range(FRAMES), Verdict.ACCEPTED)
+    reasons = {frame: verdict.detail for frame, verdict in run.verdicts("reset").items()}
+    assert reasons == {0: ResetReason.FIRST_FRAME, FIRST_TELEMETRY: ResetReason.FIRST_TELEMETRY}
     assert max(steps_off_m(run, flight, FIRST_TELEMETRY)) < 2.5 < 0.5 * SPEED_MPS * FRAME_S
 
 
 def test_odometry_of_the_keyframe_before_a_find_is_fused(flight: Flight) -> None:
-    run = Listener()
-    run.hear([ORIGIN])
+    run = EstimatorRun()
+    run.feed([ORIGIN])
     for i in range(FRAMES):
-        run.hear(of_one_keyframe(flight, i))
+        run.feed(of_one_keyframe(flight, i))
         if i == FOUND:
-            run.hear([msgspec.structs.replace(flight.fix(i, offset_m=(300.0, 0.0)), found=True)])
+            run.feed([msgspec.structs.replace(flight.fix(i, offset_m=(300.0, 0.0)), found=True)])
     assert "found" in run.verdicts("map")[FOUND].detail
     assert {i: v.verdict for i, v in run.verdicts("odometry").items()} == dict.fromkeys(range(FRAMES), Verdict.ACCEPTED)
     assert max(steps_off_m(run, flight, FOUND)) < 1.5
@@ -69,13 +72,13 @@ def test_odometry_of_the_keyframe_before_a_find_is_fused(flight: Flight) -> None
 
 
 def test_where_the_first_frame_tracks_nothing_its_keyframe_stays_lost(flight: Flight) -> None:
-    run = Listener()
-    run.hear([ORIGIN])
+    run = EstimatorRun()
+    run.feed([ORIGIN])
     for i in range(FRAMES):
         said = of_one_keyframe(flight, i)
         if i == FIRST_TELEMETRY:
             said = [blind(m) if isinstance(m, Odometry) else m for m in said]
-        run.hear(said if i >= FIRST_TELEMETRY else without_telemetry(said))
+        run.feed(said if i >= FIRST_TELEMETRY else without_telemetry(said))
     assert run.verdicts("odometry")[FIRST_TELEMETRY + 1].verdict is Verdict.STALE
 
 
@@ -83,25 +86,25 @@ def test_where_the_first_frame_tracks_nothing_its_keyframe_stays_lost(flight: Fl
 def test_no_frame_of_the_first_second_is_looked_at_without_telemetry(
     telemetry_from_s: float | None, flight: Flight
 ) -> None:
-    run = Listener()
-    run.hear([ORIGIN])
+    run = EstimatorRun()
+    run.feed([ORIGIN])
     for i in range(FRAMES):
         heard = telemetry_from_s is not None and i * FRAME_S >= telemetry_from_s
-        run.hear(of_one_keyframe(flight, i) if heard else without_telemetry(of_one_keyframe(flight, i)))
+        run.feed(of_one_keyframe(flight, i) if heard else without_telemetry(of_one_keyframe(flight, i)))
     first_s = 1.0 if telemetry_from_s is None else min(telemetry_from_s, 1.0)
-    looked_at = [m.frame_id for m in run.said if isinstance(m, Prediction)]
+    looked_at = [m.frame_id for m in run.published if isinstance(m, Prediction)]
     assert looked_at == list(range(round(first_s / FRAME_S), FRAMES))
     assert run.estimate(0).frame_id == 0  # there is an estimate from the first frame on
 
 
 def test_telemetry_that_lasts_for_a_second_is_all_there_will_be(flight: Flight) -> None:
     """An autopilot that tells no height, and that was heard before the camera was."""
-    run = Listener()
-    run.hear([ORIGIN])
+    run = EstimatorRun()
+    run.feed([ORIGIN])
     for i in range(4):
         said = [
             msgspec.structs.replace(m, agl_m=None) if isinstance(m, VehicleState) else m
             for m in of_one_keyframe(flight, i)
         ]
-        run.hear(said if i >= 2 else [m for m in said if isinstance(m, VehicleState)])
-    assert [m.frame_id for m in run.said if isinstance(m, Prediction)] == [2, 3]
+        run.feed(said if i >= 2 else [m for m in said if isinstance(m, VehicleState)])
+    assert [m.frame_id for m in run.published if isinstance(m, Prediction)] == [2, 3]

@@ -1,4 +1,4 @@
-"""Three keyframes that see the same points: one way in units of the other, and nothing of how long all of it is."""
+"""Three-view factor: ratio of both translations, without absolute scale."""
 
 from dataclasses import replace
 
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C
 
-from terrafix.estimator.factors.custom_factors import BIAS_SIZE, HEIGHT, LENS
 from terrafix.estimator.factors.three_view import (
     MIN_TRIPLES,
     ThreeViewConstraint,
@@ -15,6 +14,7 @@ from terrafix.estimator.factors.three_view import (
     three_view_constraint,
     three_view_factor,
 )
+from terrafix.estimator.state import CALIBRATION_SIZE, HEIGHT, RADIAL_K1
 
 DOWN = gtsam.Rot3(np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]))
 HEIGHT_M, SIGMA, FOCAL_SIGMA = 100.0, 5e-4, 0.01
@@ -22,7 +22,7 @@ NODES = ((C(0), B(0)), (C(1), B(1)), (C(2), B(2)))
 
 
 class Flown:
-    """Three cameras over hills of ``relief_m`` (1-sigma), what they see, and a guess of where they are."""
+    """Three cameras over hills of ``relief_m`` (1-sigma), their matches, and a guess of their poses."""
 
     def __init__(self, seed: int, relief_m: float = 8.0, lens: float = 0.0, *, points: int = 60) -> None:
         self.rng = rng = np.random.default_rng(seed)
@@ -46,16 +46,16 @@ class Flown:
         self.triples = seen.reshape(-1, 6) + SIGMA * rng.normal(size=(len(seen), 6))
 
     def guess(self, off: float = 1.0) -> ThreeViewPose:
-        believed = [
+        guessed = [
             pose.retract(off * np.concatenate([self.rng.normal(0, 0.005, 3), self.rng.normal(0, 0.5, 3)]))
             for pose in self.poses
         ]
-        return ThreeViewPose(believed[1].between(believed[0]), believed[1].between(believed[2]), HEIGHT_M, 0.0, 0.0)
+        return ThreeViewPose(guessed[1].between(guessed[0]), guessed[1].between(guessed[2]), HEIGHT_M, 0.0, 0.0)
 
     def values(self, scale: float = 1.0, lens: float = 0.0) -> gtsam.Values:
         values = gtsam.Values()
-        bias = np.zeros(BIAS_SIZE)
-        bias[LENS] = lens
+        bias = np.zeros(CALIBRATION_SIZE)
+        bias[RADIAL_K1] = lens
         for i, pose in enumerate(self.poses):
             values.insert(C(i), gtsam.Pose3(pose.rotation(), scale * pose.translation()))
             values.insert(B(i), bias)
@@ -66,49 +66,49 @@ def length(pose: gtsam.Pose3) -> float:
     return float(np.linalg.norm(pose.translation()))
 
 
-def seen_of(flown: Flown, guess: ThreeViewPose | None = None) -> ThreeViewConstraint:
-    seen = three_view_constraint(flown.triples, SIGMA, guess or flown.guess(), FOCAL_SIGMA)
-    assert seen is not None
-    return seen
+def constraint_of(flown: Flown, guess: ThreeViewPose | None = None) -> ThreeViewConstraint:
+    constraint = three_view_constraint(flown.triples, SIGMA, guess or flown.guess(), FOCAL_SIGMA)
+    assert constraint is not None
+    return constraint
 
 
-def test_hills_do_not_change_how_long_one_way_is_in_units_of_the_other() -> None:
+def test_the_ratio_of_the_translations_does_not_depend_on_relief() -> None:
     off = []
     for seed in range(30):
         flown = Flown(seed)
-        at = seen_of(flown).at
+        at = constraint_of(flown).at
         true = length(flown.poses[1].between(flown.poses[2])) / length(flown.poses[1].between(flown.poses[0]))
         off.append(length(at.last) / length(at.first) / true - 1.0)
-    assert np.sqrt(np.mean(np.square(off))) < 0.01  # one plane through such ground is some 5 % wrong
+    assert np.sqrt(np.mean(np.square(off))) < 0.01  # one plane through such ground has an error of some 5 %
 
 
-def test_what_it_claims_is_no_less_than_it_errs_by() -> None:
+def test_the_residual_at_the_truth_is_within_the_stated_noise() -> None:
     squares, rows = 0.0, 0
     for seed in range(40):
         flown = Flown(seed)
-        seen = seen_of(flown)
-        error = three_view_factor(NODES, seen, rises=False).unwhitenedError(flown.values())
+        constraint = constraint_of(flown)
+        error = three_view_factor(NODES, constraint, rises=False).unwhitenedError(flown.values())
         squares, rows = squares + float(error @ error), rows + len(error)
-    assert 0.02 < squares / rows < 0.5  # its points count once in three, and as no more than sixteen
+    assert 0.02 < squares / rows < 0.5  # its points have a third of their weight, and count as sixteen at most
 
 
-def test_it_says_nothing_of_how_long_all_of_it_is() -> None:
+def test_the_factor_carries_no_information_about_absolute_scale() -> None:
     flown = Flown(3)
-    seen = seen_of(flown)
-    factor = three_view_factor(NODES, seen, rises=False)
+    constraint = constraint_of(flown)
+    factor = three_view_factor(NODES, constraint, rises=False)
     same, longer = (factor.unwhitenedError(flown.values(scale)) for scale in (1.0, 1.3))
     assert longer == pytest.approx(same, abs=0.02 * float(np.linalg.norm(same)) + 1e-6)
-    assert seen.rows.shape[0] <= 12
+    assert constraint.jacobian.shape[0] <= 12
 
 
-def test_a_lens_is_learnt_from_it() -> None:
+def test_the_radial_coefficient_is_observable() -> None:
     flown = Flown(4, lens=-0.03)
-    factor = three_view_factor(NODES, seen_of(flown, flown.guess(0.2)), rises=False)
+    factor = three_view_factor(NODES, constraint_of(flown, flown.guess(0.2)), rises=False)
     square = {lens: float(np.sum(factor.unwhitenedError(flown.values(lens=lens)) ** 2)) for lens in (0.0, -0.03, -0.06)}
     assert square[-0.03] < 0.5 * min(square[0.0], square[-0.06])
 
 
-def test_ways_that_are_too_short_or_points_that_are_too_few_tell_nothing() -> None:
+def test_short_translations_and_few_points_give_no_constraint() -> None:
     flown = Flown(5)
     guess = flown.guess()
     assert three_view_constraint(flown.triples[: MIN_TRIPLES - 1], SIGMA, guess, FOCAL_SIGMA) is None
@@ -116,14 +116,14 @@ def test_ways_that_are_too_short_or_points_that_are_too_few_tell_nothing() -> No
     assert three_view_constraint(flown.triples, SIGMA, short, FOCAL_SIGMA) is None
 
 
-def test_points_that_are_not_the_same_tell_nothing() -> None:
+def test_mismatched_points_give_no_constraint() -> None:
     flown = Flown(6)
     mixed = flown.triples.copy()
     mixed[:, 4:] = mixed[::-1, 4:]
     assert three_view_constraint(mixed, SIGMA, flown.guess(), FOCAL_SIGMA) is None
 
 
-def test_what_ends_far_from_all_that_the_pairs_say_is_not_believed() -> None:
+def test_a_solution_far_from_the_guess_is_rejected() -> None:
     flown = Flown(7)
     guess = flown.guess(0.0)
     far = replace(guess, last=guess.last.compose(gtsam.Pose3(gtsam.Rot3.Rz(0.2), np.zeros(3))))
@@ -132,9 +132,9 @@ def test_what_ends_far_from_all_that_the_pairs_say_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize("rises", [False, True])
-def test_the_jacobians_are_the_differences(rises: bool) -> None:
+def test_the_jacobians_match_numerical_differences(rises: bool) -> None:
     flown = Flown(8)
-    factor = three_view_factor(NODES, seen_of(flown, flown.guess(0.0)), rises=rises)
+    factor = three_view_factor(NODES, constraint_of(flown, flown.guess(0.0)), rises=rises)
     values = flown.values()
     if rises:
         for i in range(3):

@@ -1,4 +1,4 @@
-"""The time offset between pictures and telemetry, from turns that both see."""
+"""Time offset between frames and telemetry, from turns that both observe."""
 
 import math
 
@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, Flight, Listener, blind, cov_of, t_ns
+from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, t_ns
 from terrafix.core.geodesy import yaw_of
-from terrafix.estimator.integrity.time_offset import GRID_S, PRIOR_S, SLEW, TimeOffset, Turn
+from terrafix.estimator.integrity.time_offset import GRID_S, MAX_SLEW, PRIOR_SIGMA_S, TimeOffset, Turn
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Odometry, Prediction, VehicleState
 
@@ -31,7 +31,7 @@ def attitude(t_s: float, yaw_rad: float) -> VehicleState:
 def flown(
     late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: int = 1, every_s: float = FRAME_S
 ) -> TimeOffset:
-    """Pictures stamped ``late_s`` after they were taken."""
+    """Frames with time stamps ``late_s`` after the exposure."""
     rng = np.random.default_rng(seed)
     telemetry, offset = Telemetry(), TimeOffset()
     reported_s, frame_s = np.arange(0.0, SECONDS, TELEMETRY_S), np.arange(3.0, SECONDS, every_s)
@@ -51,7 +51,7 @@ def flown(
 
 @pytest.mark.parametrize("late_s", [1.0, 0.4, -0.5])
 @pytest.mark.parametrize("noise_deg", [0.3, 2.0])
-def test_pictures_that_are_stamped_late_are_found_and_put_right(late_s: float, noise_deg: float) -> None:
+def test_a_time_offset_is_estimated_and_applied(late_s: float, noise_deg: float) -> None:
     offset = flown(late_s, noise_deg=noise_deg)
     mean_s, sigma_s = offset.estimate
     assert mean_s == pytest.approx(late_s, abs=max(3.0 * sigma_s, 0.06))
@@ -59,41 +59,41 @@ def test_pictures_that_are_stamped_late_are_found_and_put_right(late_s: float, n
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_pictures_that_are_stamped_well_stay_as_they_are(seed: int) -> None:
+def test_an_insignificant_time_offset_is_not_applied(seed: int) -> None:
     offset = flown(0.02, seed=seed)
-    assert offset.applied_s == 0.0 and abs(offset.estimate[0]) < 3.0 * PRIOR_S
+    assert offset.applied_s == 0.0 and abs(offset.estimate[0]) < 3.0 * PRIOR_SIGMA_S
 
 
-def test_a_straight_flight_tells_nothing() -> None:
+def test_a_straight_flight_gives_no_time_offset() -> None:
     offset = flown(1.0, turns=False)
-    assert offset.applied_s == 0.0 and offset.sigma_s == pytest.approx(PRIOR_S)
+    assert offset.applied_s == 0.0 and offset.sigma_s == pytest.approx(PRIOR_SIGMA_S)
 
 
-def test_a_compass_that_wanders_more_than_the_vehicle_turns_tells_nothing() -> None:
+def test_compass_noise_without_turns_gives_no_time_offset() -> None:
     assert flown(0.0, turns=False, noise_deg=5.0).applied_s == 0.0
 
 
-def test_the_applied_offset_changes_slower_than_time_goes_on() -> None:
+def test_the_slew_rate_of_the_applied_offset_is_limited() -> None:
     offset = flown(1.0)
     before_s = offset.applied_s
-    offset._squares, offset._count = np.zeros_like(offset._squares), 0.0  # what was learnt is gone
+    offset._residual2, offset._count = np.zeros_like(offset._residual2), 0.0  # clears the evidence
     offset.step(FRAME_S)
-    assert offset.applied_s == pytest.approx(before_s - SLEW * FRAME_S)
+    assert offset.applied_s == pytest.approx(before_s - MAX_SLEW * FRAME_S)
 
 
-def test_headings_that_nobody_reports_are_not_waited_for() -> None:
+def test_pending_turns_are_dropped_if_no_heading_is_reported() -> None:
     telemetry, offset = Telemetry(), TimeOffset()
     for i in range(1000):
         offset.add(Turn(i * 10**9, (i + 1) * 10**9, 0.5), telemetry)
-    assert offset.applied_s == 0.0 and len(offset._waiting) < 6
+    assert offset.applied_s == 0.0 and len(offset._pending) < 6
 
 
-def test_sixty_frames_a_second_wait_for_their_headings_as_long_as_one() -> None:
+def test_a_time_offset_is_estimated_at_60_frames_per_second() -> None:
     assert flown(1.0, every_s=1.0 / 60.0).applied_s == pytest.approx(1.0, abs=0.1)
 
 
 class LateCamera(TimeOffset):
-    """Is sure of an offset of a second, and keeps the turns that it is given."""
+    """Estimates an offset of a second with certainty, and stores the added turns."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -107,23 +107,23 @@ class LateCamera(TimeOffset):
         self.turns.append(turn)
 
 
-def test_the_node_shifts_frames_by_a_fifth_of_the_time_between_their_stamps_and_learns_at_the_stamps() -> None:
+def test_the_node_shifts_frame_times_by_the_slew_limited_offset_and_adds_turns_at_the_stamps() -> None:
     flight, late = Flight(30, seed=3), LateCamera()
-    listener = Listener().fly(flight, 0, 10)
+    listener = EstimatorRun().fly(flight, 0, 10)
     listener.node._time_offset = late
     listener.fly(flight, 10, 30)
     shifted_s = [(t_ns(i) - listener.estimate(i).t_ns) * 1e-9 for i in range(10, 30)]
-    assert shifted_s == pytest.approx([min(SLEW * 0.5 * (i + 1), 1.0) for i in range(20)])
+    assert shifted_s == pytest.approx([min(MAX_SLEW * 0.5 * (i + 1), 1.0) for i in range(20)])
     assert [(turn.t0_ns, turn.t1_ns) for turn in late.turns] == [(t_ns(i - 1), t_ns(i)) for i in range(10, 30)]
 
 
-def test_the_turns_that_the_node_learns_from_are_those_of_the_camera() -> None:
-    """From keyframe to keyframe and within, over north; none beside a frame in which nothing was tracked."""
-    flight, late, dark = Flight(50, seed=3, turns_rad=-4.0), LateCamera(), 25
-    listener = Listener().fly(flight, 0, 10)
+def test_the_node_adds_the_turns_of_the_camera_except_beside_untracked_frames() -> None:
+    """Between and within keyframes, across north; none beside a frame without tracking."""
+    flight, late, dark = Flight(50, seed=3, turn_rad=-4.0), LateCamera(), 25
+    listener = EstimatorRun().fly(flight, 0, 10)
     listener.node._time_offset = late
     for i in range(10, 50):
-        listener.hear([blind(m) if isinstance(m, Odometry) and i == dark else m for m in flight.messages(i)])
+        listener.feed([blind(m) if isinstance(m, Odometry) and i == dark else m for m in flight.messages(i)])
     heading_rad = {t_ns(i): yaw_of(r) for i, r in enumerate(flight.r_w_b)}
     off_rad = [
         math.remainder(turn.yaw_rad - heading_rad[turn.t1_ns] + heading_rad[turn.t0_ns], math.tau)
@@ -135,24 +135,26 @@ def test_the_turns_that_the_node_learns_from_are_those_of_the_camera() -> None:
 
 
 class KnownTo(TimeOffset):
-    """An offset about zero, known to ``one_sigma_s``; the share ``stray`` is of a camera that does not stamp."""
+    """An offset of zero with ``one_sigma_s``; ``unstamped``: probability of a camera that does not stamp its frames."""
 
-    def __init__(self, one_sigma_s: float, stray: float) -> None:
+    def __init__(self, one_sigma_s: float, unstamped: float) -> None:
         super().__init__()
-        self._known = one_sigma_s, stray
+        self._known = one_sigma_s, unstamped
 
     @property
     def density(self) -> tuple[np.ndarray, float]:
-        one_sigma_s, stray = self._known
+        one_sigma_s, unstamped = self._known
         density = np.exp(-0.5 * (GRID_S / one_sigma_s) ** 2)
-        return density / density.sum(), stray
+        return density / density.sum(), unstamped
 
 
-@pytest.mark.parametrize(("stray", "claimed_s"), [(0.01, PRIOR_S), (0.2, 0.3)])
-def test_what_is_not_known_of_the_offset_is_claimed_along_the_way(stray: float, claimed_s: float) -> None:
+@pytest.mark.parametrize(("unstamped", "sigma_s"), [(0.01, PRIOR_SIGMA_S), (0.2, 0.3)])
+def test_the_uncertainty_of_the_time_offset_inflates_the_covariance_along_the_velocity(
+    unstamped: float, sigma_s: float
+) -> None:
     flight, covs_m2 = Flight(12, seed=3), []
-    for offset in (KnownTo(0.3, stray), KnownTo(0.03, 0.0)):
-        listener = Listener().fly(flight, 0, 11)
+    for offset in (KnownTo(0.3, unstamped), KnownTo(0.03, 0.0)):
+        listener = EstimatorRun().fly(flight, 0, 11)
         listener.node._time_offset = offset
         covs_m2.append(cov_of(listener.fly(flight, 11, 12).estimate(11))[:2, :2])
         left_s2 = offset.sigma_s**2
@@ -160,26 +162,26 @@ def test_what_is_not_known_of_the_offset_is_claimed_along_the_way(stray: float, 
     along = way_m / np.linalg.norm(way_m)
     across = np.array([along[1], -along[0]])
     grown_m2 = covs_m2[0] - covs_m2[1]
-    assert along @ grown_m2 @ along == pytest.approx((claimed_s**2 - left_s2) * 12.0**2, rel=0.1, abs=0.01)
+    assert along @ grown_m2 @ along == pytest.approx((sigma_s**2 - left_s2) * 12.0**2, rel=0.1, abs=0.01)
     assert across @ grown_m2 @ across == pytest.approx(0.0, abs=0.05)
 
 
-def test_another_camera_has_a_time_offset_of_its_own() -> None:
+def test_a_new_origin_resets_the_time_offset() -> None:
     flight, late = Flight(12, seed=3), LateCamera()
-    listener = Listener().fly(flight, 0, 2)
+    listener = EstimatorRun().fly(flight, 0, 2)
     listener.node._time_offset = late
     listener.fly(flight, 2, 12)
     assert late.applied_s > 0.5
-    listener.hear([msgspec.structs.replace(ORIGIN, start_sigma_m=20.0)])
+    listener.feed([msgspec.structs.replace(ORIGIN, start_sigma_m=20.0)])
     listener.fly(flight, 10, 12)
     assert listener.estimate(11).t_ns == t_ns(11)
-    first = [m for m in listener.said if isinstance(m, Prediction) and m.frame_id == 10][-1]
+    first = [m for m in listener.published if isinstance(m, Prediction) and m.frame_id == 10][-1]
     assert np.hypot(*first.step_m) < 1e-9
 
 
-def test_turns_of_a_camera_that_is_pitched_in_its_mount_are_not_late() -> None:
-    """Such a camera, pitched by 4 degrees otherwise than described, shows a plane that rolls in as one that turns 2.3
-    degrees less, and one that rolls out as one that turns by as much more."""
+def test_a_mount_pitch_error_is_not_taken_for_a_time_offset() -> None:
+    """A mount pitch error of 4 degrees changes the visual turn of a plane by -2.3 degrees when it rolls into a turn,
+    and by +2.3 degrees when it rolls out."""
 
     rng, telemetry, offset = np.random.default_rng(5), Telemetry(), TimeOffset()
     t_s = np.arange(0.0, 120.0, TELEMETRY_S)

@@ -1,4 +1,4 @@
-"""Health on a tree of files: zones, throttling, hysteresis, and what cannot be read."""
+"""Health from a sysfs tree: zones, throttling, hysteresis, and files that cannot be read."""
 
 import io
 import json
@@ -21,7 +21,7 @@ def settings(**values: object) -> HealthSection:
     return HealthSection(**({"hot_c": 80.0, "critical_c": 95.0, "hysteresis_c": 5.0} | values))  # type: ignore[arg-type]
 
 
-def judge(node: HealthNode, temperature_c: float | None, *throttling: str) -> Health:
+def evaluate(node: HealthNode, temperature_c: float | None, *throttling: str) -> Health:
     zones = [] if temperature_c is None else [TemperatureZone(name="cpu-thermal", temperature_c=temperature_c)]
     (health,) = node.on(ThermalReading(t_ns=5, zones=zones, throttling=list(throttling), disk_free_mb=7))
     assert isinstance(health, Health)
@@ -39,30 +39,30 @@ def judge(node: HealthNode, temperature_c: float | None, *throttling: str) -> He
 )
 def test_bands_are_entered_at_the_limit_and_left_below_it(temperatures_c: list[float], bands: str) -> None:
     node = HealthNode(settings())
-    assert "".join(judge(node, t).band[0] for t in temperatures_c) == bands
+    assert "".join(evaluate(node, t).band[0] for t in temperatures_c) == bands
 
 
-def test_without_hysteresis_the_limit_itself_decides() -> None:
+def test_without_hysteresis_a_band_is_left_at_its_limit() -> None:
     node = HealthNode(settings(hysteresis_c=0.0))
-    assert "".join(judge(node, t).band[0] for t in (80.0, 79.99, 80.0, 95.0, 94.99)) == "hnhch"
+    assert "".join(evaluate(node, t).band[0] for t in (80.0, 79.99, 80.0, 95.0, 94.99)) == "hnhch"
 
 
-def test_throttling_is_hot_while_it_lasts_and_never_less_than_the_temperature_says() -> None:
+def test_throttling_gives_at_least_the_band_hot_while_it_lasts() -> None:
     node = HealthNode(settings())
-    hot = judge(node, 60.0, "cpu-throttle-alert")
+    hot = evaluate(node, 60.0, "cpu-throttle-alert")
     assert (hot.band, hot.throttled) == (ThermalBand.HOT, True)
     assert hot.cause == "cpu-thermal 60.0 C is the hottest zone; throttled by cpu-throttle-alert"
-    assert judge(node, 60.0).band is ThermalBand.NORMAL, "back at once when the governor lets go"
-    assert judge(node, 96.0, "cpu-throttle-alert").band is ThermalBand.CRITICAL
+    assert evaluate(node, 60.0).band is ThermalBand.NORMAL, "no hysteresis after the end of throttling"
+    assert evaluate(node, 96.0, "cpu-throttle-alert").band is ThermalBand.CRITICAL
 
 
-def test_nothing_readable_is_normal_and_says_so() -> None:
-    health = judge(HealthNode(settings()), None)
+def test_without_a_readable_zone_the_band_is_normal_and_the_cause_states_it() -> None:
+    health = evaluate(HealthNode(settings()), None)
     assert (health.band, health.temperature_c, health.disk_free_mb, health.t_ns) == (ThermalBand.NORMAL, None, 7, 5)
     assert health.cause == "no temperature zone is readable: taken for normal"
 
 
-def test_limits_that_contradict_each_other_are_a_mistake() -> None:
+def test_a_critical_limit_below_the_hot_limit_is_rejected() -> None:
     with pytest.raises(ConfigError, match=r"\[health\] critical_c = 70 is not above hot_c = 80; raise critical_c"):
         HealthNode(settings(critical_c=70.0))
 
@@ -79,10 +79,10 @@ def context(tmp_path: Path) -> NodeContext:
     return NodeContext(config=config, frames=MemoryFrameStore(1), map_path=None, out_dir=tmp_path)
 
 
-def test_a_jetson_like_tree_of_files(tmp_path: Path) -> None:
+def test_a_sysfs_tree_as_on_a_jetson_is_read_and_changes_of_the_band_are_logged(tmp_path: Path) -> None:
     write(tmp_path, "thermal_zone0", type="cpu-thermal", temp="61500")
     write(tmp_path, "thermal_zone1", type="gpu-thermal", temp="63250")
-    write(tmp_path, "thermal_zone2", type="cv0-thermal", temp="-256000")  # a unit without power
+    write(tmp_path, "thermal_zone2", type="cv0-thermal", temp="-256000")  # powered down
     write(tmp_path, "thermal_zone3", type="cv1-thermal")  # temp cannot be read
     write(tmp_path, "thermal_zone4", type="odd", temp="warm")
     write(tmp_path, "cooling_device0", type="pwm-fan", cur_state="3")
@@ -107,7 +107,7 @@ def test_a_jetson_like_tree_of_files(tmp_path: Path) -> None:
         write(tmp_path, "cooling_device1", cur_state=state)
         for message in edge.poll(second * SECOND_NS):
             for health in node.on(message):
-                edge.heard(health)
+                edge.on_message(health)
     edge.close()
     writer.close()
     changes = [json.loads(line) for line in stream.getvalue().splitlines()]
@@ -115,7 +115,7 @@ def test_a_jetson_like_tree_of_files(tmp_path: Path) -> None:
     assert changes[0]["cause"] == "gpu-thermal 81.0 C; hot from 80 C down to 75 C"
 
 
-def test_an_empty_root_is_a_state(tmp_path: Path) -> None:
+def test_a_missing_sysfs_tree_gives_an_empty_reading(tmp_path: Path) -> None:
     (reading,) = make_edge(context(tmp_path / "nothing")).poll(0)
     assert isinstance(reading, ThermalReading)
     assert (reading.zones, reading.throttling, reading.disk_free_mb) == ([], [], None)

@@ -1,4 +1,4 @@
-"""Growing caution, visible everywhere: record, screen, named values; whole sentences, and no flood of them."""
+"""Degradation levels in GPS_INPUT, STATUSTEXT and NAMED_VALUE_FLOAT; texts of the pilot and their debounce."""
 
 import math
 import random
@@ -14,10 +14,10 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.node import LinkNode
-from terrafix.link.pilot_text.debounce import CALM_NS, LONGEST_NS, Debounce
+from terrafix.link.pilot_text.debounce import MAX_INTERVAL_NS, RESET_AFTER_NS, Debounce
 
-SCREEN = 50  # characters of STATUSTEXT
-SENTENCES = [  # everything that Terrafix can say to a pilot; a new text belongs here
+MAX_CHARACTERS = 50  # characters of STATUSTEXT
+KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"3D fix",
     r"no fix: (the estimate is too old|neither map nor odometry|worse than \d+ m|the speed is too uncertain)",
     r"no fix: (suddenly less accurate|the position has jumped|no estimate yet|estimator (died|stuck|gave up))",
@@ -44,14 +44,14 @@ SENTENCES = [  # everything that Terrafix can say to a pilot; a new text belongs
 ]
 
 
-def whole(text: str) -> bool:
-    return len(text) <= SCREEN and any(re.fullmatch(f"Terrafix: {sentence}", text) for sentence in SENTENCES)
+def is_known(text: str) -> bool:
+    return len(text) <= MAX_CHARACTERS and any(re.fullmatch(f"Terrafix: {known}", text) for known in KNOWN_TEXTS)
 
 
-def test_whatever_happens_the_pilot_reads_whole_sentences() -> None:
+def test_every_pilot_text_is_one_of_the_known_sentences() -> None:
     draw = random.Random(4)
     labels = list(m.SourceLabel)
-    said: list[m.Message] = []
+    published: list[m.Message] = []
     for _ in range(12):
         node = LinkNode(10.0, "act")
         sigma, velocity, east, label = 4.0, 0.5, 0.0, labels[0]
@@ -63,13 +63,13 @@ def test_whatever_happens_the_pilot_reads_whole_sentences() -> None:
             age_ms = draw.choice((0, 6_000, 16_000, 40_000))
             if draw.random() < 0.2:
                 claims = {"velocity_sigma": velocity, "anchor_age_ms": age_ms, "source_label": label}
-                said += node.on(estimate(now_ns - 100 * MS, sigma_m=sigma, east_m=east, **claims))  # type: ignore[arg-type]
+                published += node.on(estimate(now_ns - 100 * MS, sigma_m=sigma, east_m=east, **claims))  # type: ignore[arg-type]
             if draw.random() < 0.01:
                 event = draw.choice(("died", "stuck", "gave_up", "restarted"))
-                said += node.on(m.ProcessEvent(t_ns=now_ns, process="estimator", event=event))
+                published += node.on(m.ProcessEvent(t_ns=now_ns, process="estimator", event=event))
             if draw.random() < 0.01:
                 band = draw.choice(list(m.ThermalBand))
-                said += node.on(
+                published += node.on(
                     m.Health(
                         t_ns=now_ns,
                         band=band,
@@ -79,87 +79,88 @@ def test_whatever_happens_the_pilot_reads_whole_sentences() -> None:
                         cause="a long cause",
                     )
                 )
-            said += node.tick(now_ns)
-    heard = set(texts(said))
-    assert len(heard) >= 12
-    assert [text for text in heard if not whole(text)] == []
+            published += node.tick(now_ns)
+    published_texts = set(texts(published))
+    assert len(published_texts) >= 12
+    assert [text for text in published_texts if not is_known(text)] == []
 
 
-def test_the_record_has_the_rung_and_the_seconds() -> None:
+def test_gps_input_records_the_degradation_level_and_the_time_without_a_map_fix() -> None:
     feed = every(200 * MS, lambda t: estimate(t, anchor_age_ms=t // MS), late_ns=20 * MS)
     sent = gps(fly(LinkNode(10.0), 0, 40 * S, feed))
-    for seconds, rung in ((3, 0), (10, 1), (20, 2), (38, 3)):
+    for seconds, level in ((3, 0), (10, 1), (20, 2), (38, 3)):
         at = next(g for g in sent if g.t_ns >= seconds * S)
-        assert at.caution == rung
+        assert at.caution == level
         assert at.unanchored_s == pytest.approx(seconds, abs=0.3)
 
 
-def test_before_anything_is_known_nothing_is_claimed_about_the_map() -> None:
+def test_before_the_first_estimate_the_time_without_a_map_fix_is_unknown() -> None:
     (first,) = gps(list(LinkNode(10.0).tick(0)))
     assert (first.caution, first.unanchored_s) == (0, None)
 
 
-def test_a_ladder_that_is_climbed_again_and_again_becomes_quiet() -> None:
-    feed = every(200 * MS, lambda t: estimate(t, anchor_age_ms=t // MS % 6500), late_ns=20 * MS)  # 5 s, again and again
-    said = fly(LinkNode(10.0), 0, 300 * S, feed)
-    about_the_map = [t for t in texts(said) if "map fix" in t]
-    assert 2 <= len(about_the_map) <= 14  # it went up and down 46 times
+def test_an_oscillating_degradation_level_is_reported_at_growing_intervals() -> None:
+    # The age of the map fix exceeds 5 s repeatedly.
+    feed = every(200 * MS, lambda t: estimate(t, anchor_age_ms=t // MS % 6500), late_ns=20 * MS)
+    published = fly(LinkNode(10.0), 0, 300 * S, feed)
+    map_fix_texts = [t for t in texts(published) if "map fix" in t]
+    assert 2 <= len(map_fix_texts) <= 14  # the level changed 46 times in each direction
 
 
-def test_warnings_of_the_ladder_do_not_wait() -> None:
+def test_degradation_warnings_are_not_delayed_by_the_debounce() -> None:
     feed = every(200 * MS, lambda t: estimate(t, anchor_age_ms=t // MS % 40_000), late_ns=20 * MS)
-    said = fly(LinkNode(10.0), 0, 130 * S, feed)
+    published = fly(LinkNode(10.0), 0, 130 * S, feed)
     for seconds in (15, 35):
-        at = [x.t_ns / S for x in said if isinstance(x, m.StatusText) and f"for {seconds} s" in x.text]
+        at = [x.t_ns / S for x in published if isinstance(x, m.StatusText) and f"for {seconds} s" in x.text]
         assert at == pytest.approx([seconds, seconds + 40, seconds + 80], abs=0.5)
 
 
-def test_the_last_word_is_always_true() -> None:
+def test_the_last_reported_state_is_the_true_one() -> None:
     draw = random.Random(1)
     for _ in range(50):
-        announcer, told, now_ns, state = Debounce[bool](), None, 0, False
+        debounce, reported, now_ns, state = Debounce[bool](), None, 0, False
         for _ in range(200):
             now_ns += draw.randint(1, 20) * S
             state = draw.random() < 0.5
-            told = state if announcer.due(state, now_ns) else told
-        assert announcer.due(state, now_ns + LONGEST_NS) or told == state
+            reported = state if debounce.due(state, now_ns) else reported
+        assert debounce.due(state, now_ns + MAX_INTERVAL_NS) or reported == state
 
 
-def test_calm_makes_the_first_word_quick_again() -> None:
-    announcer = Debounce[int]()
-    assert [announcer.due(i, i * 6 * S) for i in range(4)] == [True, True, False, True]
-    assert announcer.due(9, 18 * S + CALM_NS)
-    assert announcer.due(8, 18 * S + CALM_NS + 5 * S)
+def test_after_a_stable_period_the_debounce_interval_is_short_again() -> None:
+    debounce = Debounce[int]()
+    assert [debounce.due(i, i * 6 * S) for i in range(4)] == [True, True, False, True]
+    assert debounce.due(9, 18 * S + RESET_AFTER_NS)
+    assert debounce.due(8, 18 * S + RESET_AFTER_NS + 5 * S)
 
 
-def test_that_it_is_well_again_is_told_after_five_seconds_whatever_was_said_before() -> None:
-    announcer, now_ns = Debounce[int](), 0
-    announcer.told = 0
-    for rung in (1, 2, 3, 1, 2, 3):
+def test_the_end_of_a_warning_is_reported_after_five_seconds() -> None:
+    debounce, now_ns = Debounce[int](), 0
+    debounce.reported = 0
+    for level in (1, 2, 3, 1, 2, 3):
         now_ns += 15 * S
-        assert announcer.due(rung, now_ns, urgent=True)
-    assert not announcer.due(0, now_ns + 4 * S, clears=True)
-    assert announcer.due(0, now_ns + 5 * S, clears=True)
-    assert not announcer.due(1, now_ns + 10 * S)  # ... and the next bad word that is not urgent waits
+        assert debounce.due(level, now_ns, urgent=True)
+    assert not debounce.due(0, now_ns + 4 * S, clears=True)
+    assert debounce.due(0, now_ns + 5 * S, clears=True)
+    assert not debounce.due(1, now_ns + 10 * S)  # the next warning that is not urgent waits
 
 
-def test_named_values_once_a_second_and_only_to_an_autopilot() -> None:
+def test_named_values_are_sent_once_a_second_after_an_autopilot_is_connected() -> None:
     wire = MemoryWire()
     edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
     (sent,) = gps(list(LinkNode(10.0).tick(0)))
     known = msgspec.structs.replace(sent, fix_type=3, horiz_accuracy_m=6.5, caution=1, unanchored_s=7.25)
     for tenth in range(20):
-        edge.heard(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
+        edge.on_message(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
     assert wire.take("NAMED_VALUE_FLOAT") == []
     wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)))
     list(edge.poll(0))
     for tenth in range(25):
-        edge.heard(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
+        edge.on_message(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
     values = [(x.name, x.value) for x in wire.take("NAMED_VALUE_FLOAT")]
     assert values == [("TFX_FIX", 3.0), ("TFX_ACC_M", 6.5), ("TFX_MAP_S", 7.25), ("TFX_CAUT", 1.0)] * 2
     wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)))
     list(edge.poll(4 * S))
-    edge.heard(msgspec.structs.replace(sent, t_ns=5 * S))
+    edge.on_message(msgspec.structs.replace(sent, t_ns=5 * S))
     lost = {x.name: x.value for x in wire.take("NAMED_VALUE_FLOAT")}
     assert lost["TFX_FIX"] == 1.0
     assert math.isnan(lost["TFX_ACC_M"]) and math.isnan(lost["TFX_MAP_S"])
@@ -169,12 +170,10 @@ def test_named_values_once_a_second_and_only_to_an_autopilot() -> None:
     ("quantity", "factor"),
     [("scale", 3.28), ("heading", -179.6), ("mount yaw", 180.0), ("mirrored picture", None), ("registration", None)],
 )
-def test_the_pilot_reads_what_seems_miscalibrated_and_when_it_is_plausible_again(
-    quantity: str, factor: float | None
-) -> None:
+def test_a_calibration_fault_and_its_end_are_reported_to_the_pilot(quantity: str, factor: float | None) -> None:
     node = LinkNode(10.0)
     fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True)
-    said = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
-    began, ended = (message for message in said if isinstance(message, m.StatusText))
-    assert whole(began.text) and began.text.endswith("no fix") and began.severity == 2
-    assert whole(ended.text) and "no fix" not in ended.text and ended.severity == 6
+    published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
+    began, ended = (message for message in published if isinstance(message, m.StatusText))
+    assert is_known(began.text) and began.text.endswith("no fix") and began.severity == 2
+    assert is_known(ended.text) and "no fix" not in ended.text and ended.severity == 6

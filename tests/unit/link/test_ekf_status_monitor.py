@@ -1,4 +1,4 @@
-"""Whether the autopilot uses what it is sent, and the connection's state in the log."""
+"""Monitor of the autopilot's EKF status, the log of the connection state, and real-time priority."""
 
 import math
 import subprocess
@@ -17,12 +17,12 @@ from terrafix.link.edge import MavlinkEdge
 from terrafix.link.node import LinkNode
 from terrafix.link.status import StatusLog
 
-USING = 831  # what ArduPilot says with a position: attitude, velocities, positions relative and absolute, predicted
-HOLDING = 167  # attitude, vertical, constant position mode
+USING_FLAGS = 831  # ArduPilot with a position: attitude, velocities, positions relative, absolute and predicted
+NOT_USING_FLAGS = 167  # attitude, vertical, constant position mode
 
 
-def said_with(flags: Any, seconds: int = 60, sigma_m: float = 4.0) -> list[tuple[int, str]]:
-    """(second, text about the filter) of a flight in which the autopilot says ``flags(second)`` once a second."""
+def autopilot_texts(flags: Any, seconds: int = 60, sigma_m: float = 4.0) -> list[tuple[int, str]]:
+    """-> (second, text about the EKF) of a flight in which the EKF status is ``flags(second)``; None: not sent."""
     node, found = LinkNode(10.0), []
     feed = every(S // 2, lambda t_ns: estimate(t_ns, sigma_m=sigma_m))
     for second in range(seconds):
@@ -34,52 +34,54 @@ def said_with(flags: Any, seconds: int = 60, sigma_m: float = 4.0) -> list[tuple
     return found
 
 
-def test_an_autopilot_that_uses_the_position_is_no_news() -> None:
-    assert said_with(lambda _: USING) == []
+def test_no_text_while_the_autopilot_uses_the_position() -> None:
+    assert autopilot_texts(lambda _: USING_FLAGS) == []
 
 
-@pytest.mark.parametrize("flags", [HOLDING, mavlink.EKF_UNINITIALIZED, USING & ~mavlink.EKF_POS_HORIZ_ABS])
-def test_one_that_does_not_is_given_half_a_minute(flags: int) -> None:
-    ((second, text),) = said_with(lambda _: flags)
+@pytest.mark.parametrize(
+    "flags", [NOT_USING_FLAGS, mavlink.EKF_UNINITIALIZED, USING_FLAGS & ~mavlink.EKF_POS_HORIZ_ABS]
+)
+def test_an_autopilot_that_does_not_use_the_position_is_reported_after_30_s(flags: int) -> None:
+    ((second, text),) = autopilot_texts(lambda _: flags)
     assert text == "Terrafix: autopilot does not use the position"
     assert second == pytest.approx(30, abs=2)  # the first 3D fix comes within a second
 
 
-def test_it_is_said_when_it_comes_back() -> None:
-    found = said_with(lambda second: HOLDING if second < 40 else USING)
+def test_a_text_reports_that_the_position_is_used_again() -> None:
+    found = autopilot_texts(lambda second: NOT_USING_FLAGS if second < 40 else USING_FLAGS)
     assert [text for _, text in found][1:] == ["Terrafix: autopilot uses a position again"]
 
 
-def test_without_a_fix_or_without_word_of_the_filter_there_is_nothing_to_say() -> None:
-    assert said_with(lambda _: HOLDING, sigma_m=80.0) == []
-    assert said_with(lambda second: HOLDING if second < 3 else None) == []
+def test_no_text_without_a_fix_or_without_a_recent_ekf_status() -> None:
+    assert autopilot_texts(lambda _: NOT_USING_FLAGS, sigma_m=80.0) == []
+    assert autopilot_texts(lambda second: NOT_USING_FLAGS if second < 3 else None) == []
 
 
-def test_the_report_of_the_filter_is_asked_for_and_recorded() -> None:
+def test_ekf_status_report_is_requested_and_recorded() -> None:
     wire, autopilot = MemoryWire(), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
-    report = mavlink.MAVLink_ekf_status_report_message(USING, 0.2, 0.3, 0.1, 0.1, 0.0)
-    broken = mavlink.MAVLink_ekf_status_report_message(USING, float("nan"), 0.3, 0.1, 0.1, 0.0)
+    report = mavlink.MAVLink_ekf_status_report_message(USING_FLAGS, 0.2, 0.3, 0.1, 0.1, 0.0)
+    broken = mavlink.MAVLink_ekf_status_report_message(USING_FLAGS, float("nan"), 0.3, 0.1, 0.1, 0.0)
     wire.arrive(packed(heartbeat(), autopilot), packed(report, autopilot), packed(broken, autopilot))
     (status,) = [x for x in edge.poll(S) if isinstance(x, m.FilterStatus)]
-    assert (status.flags, status.t_ns) == (USING, S)
+    assert (status.flags, status.t_ns) == (USING_FLAGS, S)
     assert (status.velocity_ratio, status.position_ratio) == pytest.approx((0.2, 0.3))
-    asked = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
-    assert mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT in asked
+    requested = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    assert mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT in requested
 
 
-def test_px4_says_it_in_its_own_words() -> None:
+def test_px4_estimator_status_is_converted_to_filter_status() -> None:
     wire, autopilot = MemoryWire(), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
-    flags = USING | mavlink.ESTIMATOR_GPS_GLITCH  # the bit that says EKF_UNINITIALIZED with ArduPilot
+    flags = USING_FLAGS | mavlink.ESTIMATOR_GPS_GLITCH  # the same bit as ArduPilot's EKF_UNINITIALIZED
     report = mavlink.MAVLink_estimator_status_message(0, flags, math.nan, 0.3, 0.1, 0.1, 0.0, 0.0, 1.0, 1.0)
     wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_PX4), autopilot), packed(report, autopilot))
     (status,) = [x for x in edge.poll(S) if isinstance(x, m.FilterStatus)]
-    assert (status.flags, status.velocity_ratio) == (USING, 0.0)
+    assert (status.flags, status.velocity_ratio) == (USING_FLAGS, 0.0)
     assert status.position_ratio == pytest.approx(0.3)
-    asked = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
-    assert {mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU} <= asked
-    assert not {mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, mavlink.MAVLINK_MSG_ID_RAW_IMU} & asked
+    requested = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    assert {mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU} <= requested
+    assert not {mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, mavlink.MAVLINK_MSG_ID_RAW_IMU} & requested
 
 
 # --- the log ---
@@ -92,15 +94,15 @@ def status(second: float, detail: str = "", *, connected: bool = True) -> m.Link
         time_offset_ms=None, detail=detail)  # fmt: skip
 
 
-def test_the_log_has_changes_of_kind_and_not_every_second() -> None:
+def test_the_log_contains_changes_of_kind_only() -> None:
     log = StatusLog()
     with capture_logs() as lines:
         for second in range(40):
-            log.tell(status(second, "nothing heard on /dev/ttyTHS1", connected=False))
+            log.log(status(second, "nothing heard on /dev/ttyTHS1", connected=False))
         for second in range(40, 60):
-            log.tell(status(second, f"{second} not sent"))
+            log.log(status(second, f"{second} not sent"))
         for second in range(60, 80):
-            log.tell(status(second))
+            log.log(status(second))
     assert [(line["log_level"], line["event"]) for line in lines] == [
         ("warning", "no autopilot"),
         ("warning", "autopilot"),
@@ -110,15 +112,15 @@ def test_the_log_has_changes_of_kind_and_not_every_second() -> None:
     assert lines[1]["detail"] == "40 not sent"
 
 
-def test_an_autopilot_that_is_there_at_once_is_one_line() -> None:
+def test_an_autopilot_that_connects_immediately_is_one_log_line() -> None:
     log = StatusLog()
     with capture_logs() as lines:
-        log.tell(status(0, "nothing heard", connected=False))
-        log.tell(status(1))
+        log.log(status(0, "nothing heard", connected=False))
+        log.log(status(1))
     assert [line["event"] for line in lines] == ["autopilot"]
 
 
-def test_a_firmware_that_nobody_knows_is_said() -> None:
+def test_an_unknown_firmware_is_reported() -> None:
     wire = MemoryWire()
     edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
     wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_GENERIC), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)))
@@ -129,18 +131,18 @@ def test_a_firmware_that_nobody_knows_is_said() -> None:
 # --- the priority of the process ---
 
 
-def test_the_link_goes_before_others_where_that_is_allowed_and_says_so_where_it_is_not() -> None:
-    """In a process of its own: this one stays as it is. Without the right (a limit of 0) nothing changes."""
+def test_the_link_gets_real_time_priority_or_logs_that_it_is_not_permitted() -> None:
+    """Runs in another process, which leaves the priority of this one unchanged. A limit of 0 forbids the change."""
     program = (
         "import os, resource, sys, threading\n"
-        "from terrafix.link.output.realtime_priority import first_in_line\n"
-        "threading.Thread(target=threading.Event().wait, daemon=True).start()\n"  # as the one that writes the log
+        "from terrafix.link.output.realtime_priority import set_realtime_priority\n"
+        "threading.Thread(target=threading.Event().wait, daemon=True).start()\n"  # like the log writer
         "if sys.argv[1] == 'no':\n"
         "    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))\n"
         "    os.getuid() == 0 and os.setuid(65534)\n"
         "threads = os.listdir('/proc/self/task')\n"
         "assert len(threads) == 2\n"
-        "print(first_in_line(), all(os.sched_getscheduler(int(t)) == os.SCHED_RR for t in threads))\n"
+        "print(set_realtime_priority(), all(os.sched_getscheduler(int(t)) == os.SCHED_RR for t in threads))\n"
     )
     for may in ("yes", "no"):
         done = subprocess.run([sys.executable, "-c", program, may], capture_output=True, text=True, check=True)

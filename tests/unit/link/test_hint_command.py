@@ -12,9 +12,9 @@ from terrafix.messages import HintVerdict, PositionHint, Verdict
 from terrafix.processes import OPERATOR
 from terrafix.runtime import run_dir
 from terrafix.runtime.bus import Publisher, Subscriber
-from terrafix.runtime.run_dir import OwnedRunDir, RunDir, living
+from terrafix.runtime.run_dir import OwnedRunDir, RunDir, live_runs
 from terrafix_tools.hint import send
-from terrafix_tools.hint.send import HEARERS, hint
+from terrafix_tools.hint.send import SUBSCRIBERS, hint
 
 pytestmark = pytest.mark.real_time
 
@@ -33,7 +33,7 @@ class Flying:
     def _live(self) -> None:
         with zmq.Context() as context:
             says = Publisher(context, self._run.address("anchor"))
-            hears = [Subscriber(context, [self._run.address(OPERATOR)], (PositionHint,)) for _ in HEARERS]
+            hears = [Subscriber(context, [self._run.address(OPERATOR)], (PositionHint,)) for _ in SUBSCRIBERS]
             self._ready.set()
             while not self._stop.is_set():
                 says.serve()
@@ -50,7 +50,7 @@ class Flying:
         for of in (said.t_ns - 1, said.t_ns):  # the first one answers somebody else
             if self._verdict is not None:
                 text = "hint not used, 12 km from us" if of == said.t_ns else "of another"
-                says.say(
+                says.publish(
                     HintVerdict(t_ns=of, hint_t_ns=of, verdict=self._verdict, distance_m=1.0, sigma_m=1.0, text=text)
                 )
 
@@ -88,7 +88,7 @@ def test_without_a_frame_it_says_that_the_hint_waits(run: RunDir, monkeypatch: p
 
 
 def test_processes_that_do_not_listen_yet_are_said(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(send, "HEARD_S", 0.1)
+    monkeypatch.setattr(send, "SUBSCRIBE_TIMEOUT_S", 0.1)
     with pytest.raises(LinkError, match="is Terrafix still starting"):
         hint(48.1, 11.5, 3000.0)
 
@@ -106,12 +106,12 @@ def test_nobody_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_of_several_one_must_be_named(run: RunDir) -> None:
     other = OwnedRunDir()
     try:
-        assert {r.path for r in living()} == {run.path, other.run_dir.path}
+        assert {r.path for r in live_runs()} == {run.path, other.run_dir.path}
         with pytest.raises(UsageError, match="several fly here; name one: --run "):
             hint(48.1, 11.5, 3000.0)
     finally:
         other.remove()
-    assert [r.path for r in living()] == [run.path]
+    assert [r.path for r in live_runs()] == [run.path]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What was felt since an estimate: a copter that leans to a corner is where its readings say, not straight ahead."""
+"""Prediction with inertial readings: a copter that rolls into a corner is followed, constant velocity is not used."""
 
 import math
 
@@ -8,7 +8,7 @@ import pytest
 from link_rig import covariance
 from terrafix import messages as m
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
-from terrafix.link.integrity.output_predictor import Attitudes, PredictedState, distance_m, offset, predict_to
+from terrafix.link.integrity.output_predictor import InertialBuffer, PredictedState, distance_m, offset, predict_to
 
 MS, S = 1_000_000, 1_000_000_000
 LAT, LON, AMSL = 48.1, 14.3, 400.0
@@ -17,28 +17,28 @@ UP = np.array([0.0, 0.0, 9.81])
 
 
 def accel(t_s: float) -> np.ndarray:
-    """East, north, up: it brakes and turns within half a second, as ArduPilot's copter does at a waypoint."""
+    """Acceleration east, north, up: brakes and turns within half a second, as ArduPilot's copter at a waypoint."""
     rise = min(t_s / 0.3, 1.0)
     return np.array([-3.0 * rise, 4.0 * rise, 0.5 * rise])
 
 
 def attitude(t_s: float) -> tuple[float, float]:
-    """Pitch, roll."""
+    """Pitch and roll [rad]."""
     rise = min(t_s / 0.3, 1.0)
     return math.radians(-20.0 + 15.0 * rise), math.radians(-25.0 * rise)
 
 
-def flown(t_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity, way: integrated in steps of a tenth of a millisecond."""
+def true_motion(t_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """True velocity and displacement, integrated in steps of a tenth of a millisecond."""
     v, p, dt = np.array([SPEED_MPS, 0.0, 0.0]), np.zeros(3), 1e-4
     for k in range(round(t_s / dt)):
         v, p = v + accel((k + 0.5) * dt) * dt, p + v * dt
     return v, p
 
 
-def heard(until_s: float, *, compass_rad: float = 0.0, lost_s: tuple[float, float] = (9.0, 9.0)) -> Attitudes:
+def recorded(until_s: float, *, compass_rad: float = 0.0, lost_s: tuple[float, float] = (9.0, 9.0)) -> InertialBuffer:
     """ATTITUDE at 25 Hz, readings at 33 Hz, from 0.2 s before the corner; none in the span ``lost_s``."""
-    history = Attitudes()
+    inertial = InertialBuffer()
     moments = [(t, "attitude") for t in np.arange(-0.2, until_s, 0.04)] + [
         (t, "imu") for t in np.arange(-0.19, until_s, 0.03) if not lost_s[0] < t < lost_s[1]
     ]
@@ -46,20 +46,20 @@ def heard(until_s: float, *, compass_rad: float = 0.0, lost_s: tuple[float, floa
         pitch, roll = attitude(max(t_s, 0.0))
         t_ns = round(t_s * S) + S
         if kind == "attitude":
-            said = m.VehicleState(
+            state = m.VehicleState(
                 t_ns=t_ns, source="mavlink", yaw_rad=YAW_RAD + compass_rad, pitch_rad=pitch, roll_rad=roll
             )
-            history.add(said)
+            inertial.add_attitude(state)
         else:
             a_w = accel(t_s) if t_s > 0.0 else np.zeros(3)
             f = rot_w_b(YAW_RAD, pitch, roll).T @ (a_w + UP)
-            history.add_imu(
+            inertial.add_imu(
                 m.Imu(t_ns=t_ns, source="mavlink", samples=[(0, float(f[0]), float(f[1]), float(f[2]), 0.0, 0.0, 0.0)])
             )
-    return history
+    return inertial
 
 
-def carried(age_s: float, history: Attitudes) -> PredictedState:
+def predicted(age_s: float, inertial: InertialBuffer) -> PredictedState:
     estimate = m.NavEstimate(
         t_ns=S,
         frame_id=1,
@@ -76,37 +76,39 @@ def carried(age_s: float, history: Attitudes) -> PredictedState:
         last_anchor_age_ms=0,
         emitted_at_ns=S,
     )
-    return predict_to(estimate, S + round(age_s * S), history)
+    return predict_to(estimate, S + round(age_s * S), inertial)
 
 
-def speed_error_mps(found: PredictedState, age_s: float) -> float:
-    return float(np.linalg.norm(np.array(found.velocity_enu_mps) - flown(age_s)[0]))
+def speed_error_mps(state: PredictedState, age_s: float) -> float:
+    return float(np.linalg.norm(np.array(state.velocity_enu_mps) - true_motion(age_s)[0]))
 
 
 @pytest.mark.parametrize("age_s", [0.25, 0.65, 1.5])
 @pytest.mark.parametrize("compass_deg", [0.0, -12.0])
-def test_a_corner_is_carried_as_it_was_felt(age_s: float, compass_deg: float) -> None:
-    """The heading is the estimate's: the autopilot's compass may be off."""
-    found = carried(age_s, heard(age_s, compass_rad=math.radians(compass_deg)))
-    assert speed_error_mps(found, age_s) < min(0.5, 2.0 * found.speed_sigma_mps)
-    _, way = flown(age_s)
-    lat, lon = offset(LAT, LON, float(way[0]), float(way[1]))
-    assert distance_m(found.lat_deg, found.lon_deg, lat, lon) < 0.5
-    assert found.alt_amsl_m == pytest.approx(AMSL + way[2], abs=0.3)
+def test_inertial_prediction_follows_a_corner_with_the_heading_of_the_estimate(
+    age_s: float, compass_deg: float
+) -> None:
+    """The prediction uses the heading of the estimate, because the autopilot's compass may be wrong."""
+    state = predicted(age_s, recorded(age_s, compass_rad=math.radians(compass_deg)))
+    assert speed_error_mps(state, age_s) < min(0.5, 2.0 * state.speed_sigma_mps)
+    _, displacement = true_motion(age_s)
+    lat, lon = offset(LAT, LON, float(displacement[0]), float(displacement[1]))
+    assert distance_m(state.lat_deg, state.lon_deg, lat, lon) < 0.5
+    assert state.alt_amsl_m == pytest.approx(AMSL + displacement[2], abs=0.3)
 
 
-def test_carried_on_straight_it_would_be_wrong() -> None:
-    """What the test above can see."""
-    still = Attitudes()
-    assert speed_error_mps(carried(0.65, still), 0.65) > 2.0
+def test_prediction_with_constant_velocity_is_wrong_in_a_corner() -> None:
+    """Shows that the test above can fail."""
+    still = InertialBuffer()
+    assert speed_error_mps(predicted(0.65, still), 0.65) > 2.0
 
 
 @pytest.mark.parametrize("lost_s", [(-1.0, 9.0), (0.1, 0.5), (0.3, 9.0)])
-def test_readings_that_do_not_cover_the_span_are_not_used(lost_s: tuple[float, float]) -> None:
-    found = carried(0.65, heard(0.65, lost_s=lost_s))
-    assert found.velocity_enu_mps == pytest.approx((SPEED_MPS, 0.0, 0.0))
+def test_readings_that_do_not_cover_the_interval_are_not_used(lost_s: tuple[float, float]) -> None:
+    state = predicted(0.65, recorded(0.65, lost_s=lost_s))
+    assert state.velocity_enu_mps == pytest.approx((SPEED_MPS, 0.0, 0.0))
 
 
-def test_what_is_felt_is_less_sure_with_time_and_with_what_was_turned() -> None:
-    sigmas = [carried(age_s, heard(age_s)).speed_sigma_mps for age_s in (0.0, 0.3, 0.8, 1.6)]
+def test_the_sigma_of_inertial_prediction_grows_with_age_and_acceleration() -> None:
+    sigmas = [predicted(age_s, recorded(age_s)).speed_sigma_mps for age_s in (0.0, 0.3, 0.8, 1.6)]
     assert sigmas == sorted(sigmas) and sigmas[0] == pytest.approx(0.2)

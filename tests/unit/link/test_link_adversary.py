@@ -1,4 +1,4 @@
-"""Liars beside the real link, node and edge, and the simulated autopilot, in real time and on real sockets."""
+"""Forgers beside the real link (node and edge) and the simulated autopilot, in real time and on real sockets."""
 
 import math
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 pytestmark = pytest.mark.real_time
 
 SECONDS = 4.0
-FORGED_ROLL = 0.4  # 23 degrees: half the height aside
+FORGED_ROLL = 0.4  # rad: 23 degrees, which displaces the optical axis on the ground by half the height
 
 
 def eastward(north_m: float) -> Callable[[float], PeerState]:
-    """A course at SPEED_EAST, so far north of the one that the estimates are of."""
+    """A course at SPEED_EAST, ``north_m`` north of that of the estimates."""
 
     def course(t_s: float) -> PeerState:
         lat, lon = offset(LAT, LON, SPEED_EAST * t_s, north_m)
@@ -45,18 +45,18 @@ class Estimates:
         if now_ns < self._next_ns:
             return []
         self._next_ns = now_ns + 250 * MS
-        said = estimate(now_ns - self._zero_ns, cov=covariance(3.0))
-        return [msgspec.structs.replace(said, t_ns=now_ns, emitted_at_ns=now_ns)]
+        published = estimate(now_ns - self._zero_ns, cov=covariance(3.0))
+        return [msgspec.structs.replace(published, t_ns=now_ns, emitted_at_ns=now_ns)]
 
 
 class Forger:
-    """Says every 40 ms that the autopilot ``sysid`` leans, and gives hints as a ground station."""
+    """Sends every 40 ms a forged roll of the autopilot ``sysid``, and hints as a ground station."""
 
     def __init__(self, speaker: Speaker, to: tuple[str, int], sysid: int) -> None:
         self._speaker, self._to, self._sysid = speaker, to, sysid
         self._next_ns = 0
 
-    def speak(self, now_ns: int) -> None:
+    def send_due(self, now_ns: int) -> None:
         if now_ns < self._next_ns:
             return
         self._next_ns = now_ns + 40 * MS
@@ -65,28 +65,28 @@ class Forger:
         self._speaker.send(self._to, leaning, station_heartbeat(), hint)
 
 
-def test_of_two_copters_on_one_port_one_flies_on_us_and_the_other_hears_nothing() -> None:
+def test_of_two_copters_on_one_port_only_the_first_receives_gps_input() -> None:
     port = free_port()
     edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
     ours, theirs = AutopilotPeer(seed=1, sysid=1), AutopilotPeer(seed=2, sysid=2)
     estimates = Estimates()
     ours.start(0, eastward(0.0), to=port)
-    said = live(LinkNode(10.0), edge, 1.5, estimates)
+    published = live(LinkNode(10.0), edge, 1.5, estimates)
     theirs.start(0, eastward(66_000.0), to=port)
-    said += live(LinkNode(10.0), edge, SECONDS, estimates)
+    published += live(LinkNode(10.0), edge, SECONDS, estimates)
     first, second = ours.stop(), theirs.stop()
     edge.close()
     assert first.gps_input_received > 10 * (SECONDS - 1.0)
     assert second.gps_input_received == 0
     assert second.position_error_max_m is None or second.position_error_max_m < 100.0
-    assert [x.text for x in said if isinstance(x, m.StatusText) if "vehicle 2" in x.text] == [
+    assert [x.text for x in published if isinstance(x, m.StatusText) if "vehicle 2" in x.text] == [
         "Terrafix: vehicle 2 on our port gets nothing"
     ]
     assert "Terrafix: vehicle 2 on our port gets nothing" in first.status_texts
 
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
-def test_a_forger_of_telemetry_and_hints_moves_nothing(kind: str) -> None:
+def test_forged_telemetry_and_hints_have_no_effect(kind: str) -> None:
     peer, estimates = AutopilotPeer(seed=3), Estimates()
     if kind == "udpin":
         port = free_port()
@@ -94,28 +94,28 @@ def test_a_forger_of_telemetry_and_hints_moves_nothing(kind: str) -> None:
     else:
         port = peer.start(0, eastward(0.0))
     edge = open_edge(LinkSection(device=f"{kind}:127.0.0.1:{port}"))
-    node, said = LinkNode(10.0), list[m.Message]()
-    said += live(node, edge, 1.5, estimates)
+    node, published = LinkNode(10.0), list[m.Message]()
+    published += live(node, edge, 1.5, estimates)
     own = edge._connection._transport._socket.getsockname()  # type: ignore[union-attr]
     with Speaker(1) as speaker:
         forger = Forger(speaker, ("127.0.0.1", own[1]), 1)
 
         def feed(now_ns: int) -> list[m.Message]:
-            forger.speak(now_ns)
+            forger.send_due(now_ns)
             return estimates(now_ns)
 
-        said += live(node, edge, SECONDS, feed)
-        assert speaker.heard() == []
+        published += live(node, edge, SECONDS, feed)
+        assert speaker.received() == []
     report = peer.stop()
     edge.close()
-    rolls = [x.roll_rad for x in said if isinstance(x, m.VehicleState) and x.roll_rad is not None]
+    rolls = [x.roll_rad for x in published if isinstance(x, m.VehicleState) and x.roll_rad is not None]
     assert len(rolls) > 20 * SECONDS and max(map(abs, rolls)) < 0.1
-    assert not [x for x in said if isinstance(x, m.PositionHint)]
+    assert not [x for x in published if isinstance(x, m.PositionHint)]
     assert report.position_error_max_m is not None and report.position_error_max_m < 10.0
-    status = [x for x in said if isinstance(x, m.LinkStatus)][-1]
+    status = [x for x in published if isinstance(x, m.LinkStatus)][-1]
     if kind == "udpin":
-        assert "Terrafix: a second sender is system 1, ignored" in texts(said)
+        assert "Terrafix: a second sender is system 1, ignored" in texts(published)
         assert "a second sender of system 1" in status.detail
-        assert any(x.measurement == "telemetry" for x in said if isinstance(x, m.MeasurementVerdict))
+        assert any(x.measurement == "telemetry" for x in published if isinstance(x, m.MeasurementVerdict))
     else:
         assert "packets ignored, the last from 127.0.0.1" in status.detail

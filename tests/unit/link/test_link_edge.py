@@ -1,4 +1,4 @@
-"""The wire: real UDP, TCP and pseudo-terminals; every field of GPS_INPUT; garbage, absence and return of the device."""
+"""The edge on real UDP, TCP and pseudo-terminals: all fields of GPS_INPUT, garbage, loss and return of the device."""
 
 import errno
 import math
@@ -35,7 +35,7 @@ UNIX_NS = 1_795_262_400 * S  # 2026-11-21
 
 
 class Station:
-    """The autopilot's end of a UDP wire, by hand."""
+    """The autopilot's end of a UDP connection."""
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -53,8 +53,8 @@ class Station:
         for message in messages:
             self.socket.sendto(packed(message, self.mav), self.link)
 
-    def heard(self, kind: str = "") -> list[Any]:
-        """Everything that has come so far."""
+    def received(self, kind: str = "") -> list[Any]:
+        """-> messages received since the last call."""
         found: list[Any] = []
         self.socket.setblocking(False)
         while True:
@@ -93,23 +93,23 @@ def edge(station: Station) -> Iterator[MavlinkEdge]:
 
 
 def polled(edge: MavlinkEdge, now_ns: int) -> list[m.Message]:
-    """One look after the wire had time to deliver."""
+    """Polls once, after the packets have had time to arrive."""
     time.sleep(0.005)
     return list(edge.poll(now_ns))
 
 
-def states(said: list[m.Message]) -> list[m.VehicleState]:
-    return [x for x in said if isinstance(x, m.VehicleState)]
+def states(published: list[m.Message]) -> list[m.VehicleState]:
+    return [x for x in published if isinstance(x, m.VehicleState)]
 
 
-def status(said: list[m.Message]) -> m.LinkStatus:
-    return [x for x in said if isinstance(x, m.LinkStatus)][-1]
+def status(published: list[m.Message]) -> m.LinkStatus:
+    return [x for x in published if isinstance(x, m.LinkStatus)][-1]
 
 
 def test_every_field_of_gps_input_arrives(station: Station, edge: MavlinkEdge) -> None:
-    edge.heard(GPS)
+    edge.on_message(GPS)
     time.sleep(0.01)
-    (sent,) = station.heard("GPS_INPUT")
+    (sent,) = station.received("GPS_INPUT")
     assert sent.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V2
     assert (sent.get_srcSystem(), sent.get_srcComponent()) == (1, 197)
     assert sent.to_dict() == {
@@ -138,16 +138,16 @@ def test_every_field_of_gps_input_arrives(station: Station, edge: MavlinkEdge) -
 
 def test_gps_id_comes_from_the_configuration(station: Station) -> None:
     edge = edge_to(station, gps_id=1)
-    edge.heard(GPS)
+    edge.on_message(GPS)
     time.sleep(0.01)
-    assert station.heard("GPS_INPUT")[0].gps_id == 1
+    assert station.received("GPS_INPUT")[0].gps_id == 1
     edge.close()
 
 
 @given(
     lat=st.floats(-90, 90), lon=st.floats(-180, 180), week=st.integers(0, 65535), alt=st.floats(-500, 10_000, width=32)
 )
-def test_any_position_can_be_packed(lat: float, lon: float, week: int, alt: float) -> None:
+def test_any_position_can_be_packed_as_gps_input(lat: float, lon: float, week: int, alt: float) -> None:
     gps = msgspec.structs.replace(GPS, lat_deg=lat, lon_deg=lon, time_week=week, alt_amsl_m=alt)
     parser = mavlink.MAVLink(None)
     (back,) = parser.parse_buffer(gps_input.encode(gps, 0).pack(mavlink.MAVLink(None, 1, 197)))
@@ -156,52 +156,52 @@ def test_any_position_can_be_packed(lat: float, lon: float, week: int, alt: floa
     assert back.alt == alt
 
 
-def test_it_presents_itself_as_an_onboard_computer_once_a_second(station: Station, edge: MavlinkEdge) -> None:
+def test_the_edge_sends_a_heartbeat_as_onboard_controller_once_a_second(station: Station, edge: MavlinkEdge) -> None:
     for tenth in range(40):
         edge.poll(tenth * 100 * MS)
     time.sleep(0.01)
-    beats = station.heard("HEARTBEAT")
-    assert len(beats) == 4
-    assert {b.type for b in beats} == {mavlink.MAV_TYPE_ONBOARD_CONTROLLER}
-    assert {b.autopilot for b in beats} == {mavlink.MAV_AUTOPILOT_INVALID}
+    heartbeats = station.received("HEARTBEAT")
+    assert len(heartbeats) == 4
+    assert {b.type for b in heartbeats} == {mavlink.MAV_TYPE_ONBOARD_CONTROLLER}
+    assert {b.autopilot for b in heartbeats} == {mavlink.MAV_AUTOPILOT_INVALID}
 
 
-def test_status_text_reaches_the_pilot(station: Station, edge: MavlinkEdge) -> None:
-    edge.heard(m.StatusText(t_ns=0, severity=4, text="Terrafix: no map fix for 15 s"))
+def test_a_status_text_is_sent_as_statustext(station: Station, edge: MavlinkEdge) -> None:
+    edge.on_message(m.StatusText(t_ns=0, severity=4, text="Terrafix: no map fix for 15 s"))
     time.sleep(0.01)
-    (text,) = station.heard("STATUSTEXT")
+    (text,) = station.received("STATUSTEXT")
     assert (text.severity, text.text) == (4, "Terrafix: no map fix for 15 s")
 
 
-def meet(station: Station, edge: MavlinkEdge, now_ns: int = 0, beat: Any = None) -> None:
+def connect(station: Station, edge: MavlinkEdge, now_ns: int = 0, beat: Any = None) -> None:
     polled(edge, now_ns)
     time.sleep(0.01)
-    station.heard()
+    station.received()
     station.send(beat or heartbeat())
     polled(edge, now_ns + MS)
 
 
-def test_streams_are_asked_for_and_again_when_they_stop(station: Station, edge: MavlinkEdge) -> None:
-    meet(station, edge)
+def test_streams_are_requested_and_requested_again_when_they_stop(station: Station, edge: MavlinkEdge) -> None:
+    connect(station, edge)
     time.sleep(0.01)
-    asked = station.heard("COMMAND_LONG")
+    requested = station.received("COMMAND_LONG")
     fives = {(33, 200_000.0), (24, 200_000.0), (124, 200_000.0), (295, 200_000.0)}
-    assert {(int(a.param1), a.param2) for a in asked} >= {(30, 40_000.0), (2, 1_000_000.0)} | fives
-    assert {(a.command, a.target_system, a.target_component) for a in asked} == {(511, 7, 1)}
-    for second in range(1, 5):  # attitude comes as wanted, the others do not
+    assert {(int(a.param1), a.param2) for a in requested} >= {(30, 40_000.0), (2, 1_000_000.0)} | fives
+    assert {(a.command, a.target_system, a.target_component) for a in requested} == {(511, 7, 1)}
+    for second in range(1, 5):  # ATTITUDE arrives at its rate, the others do not
         station.send(heartbeat(), *(attitude(second * 1000 + i * 40) for i in range(25)))
-        said = polled(edge, second * S)
-    again = {int(a.param1) for a in station.heard("COMMAND_LONG")}
-    assert again == {int(a.param1) for a in asked} - {30, 295}  # of airspeed nobody knows whether there is any
-    assert "GLOBAL_POSITION_INT 0.0 of 5 Hz, SYSTEM_TIME 0.0 of 1 Hz" in status(said).detail
-    assert "ATTITUDE" not in status(said).detail
+        published = polled(edge, second * S)
+    requested_again = {int(a.param1) for a in station.received("COMMAND_LONG")}
+    assert requested_again == {int(a.param1) for a in requested} - {30, 295}  # AIRSPEED is optional
+    assert "GLOBAL_POSITION_INT 0.0 of 5 Hz, SYSTEM_TIME 0.0 of 1 Hz" in status(published).detail
+    assert "ATTITUDE" not in status(published).detail
 
 
-def test_vehicle_state_from_attitude_and_relative_height(station: Station, edge: MavlinkEdge) -> None:
-    meet(station, edge)
+def test_vehicle_state_contains_attitude_and_recent_relative_height(station: Station, edge: MavlinkEdge) -> None:
+    connect(station, edge)
     station.send(attitude(1000, yaw=4.0))
     (first,) = states(polled(edge, 1 * S))
-    assert first.agl_m is None  # absence is a state
+    assert first.agl_m is None  # no height received yet
     assert first.yaw_rad is not None
     assert (first.yaw_rad, first.pitch_rad, first.roll_rad) == pytest.approx((4.0 - math.tau, 0.2, 0.1))
     height = mavlink.MAVLink_global_position_int_message(1000, 1, 2, 700_000, 84_500, 100, 200, 300, 0)
@@ -209,58 +209,58 @@ def test_vehicle_state_from_attitude_and_relative_height(station: Station, edge:
     (second,) = states(polled(edge, 1_040 * MS))
     assert second.agl_m == 84.5
     assert second.yaw_rad == pytest.approx(4.0 - math.tau)
-    assert second.velocity_enu_mps is None  # that of the filter which hears us is no measurement
+    assert second.velocity_enu_mps is None  # the EKF's velocity contains ours: not a measurement
     station.send(heartbeat(), attitude(3000))
     (third,) = states(polled(edge, 3 * S))
     assert third.agl_m is None  # the height is 2 s old
 
 
-def test_other_vehicles_ground_stations_and_nonsense_are_not_the_autopilot(station: Station, edge: MavlinkEdge) -> None:
-    meet(station, edge)
+def test_telemetry_of_other_vehicles_and_ground_stations_is_ignored(station: Station, edge: MavlinkEdge) -> None:
+    connect(station, edge)
     station.mav.srcSystem = 9
     station.send(heartbeat(), attitude(5000, yaw=2.0))
     station.mav.srcSystem, station.mav.srcComponent = 7, 190
     station.send(heartbeat(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID), attitude(5000, yaw=2.0))
     station.mav.srcComponent = 1
     station.send(attitude(5000, yaw=math.nan), attitude(5000, yaw=1e9))
-    said = polled(edge, 1 * S)
-    assert states(said) == []
-    assert (status(said).sysid, status(said).autopilot) == (7, "ardupilot")
+    published = polled(edge, 1 * S)
+    assert states(published) == []
+    assert (status(published).sysid, status(published).autopilot) == (7, "ardupilot")
 
 
-def test_attitude_is_stamped_with_the_time_of_its_measurement(station: Station, edge: MavlinkEdge) -> None:
-    boot_ahead_ns = 1000 * S  # the autopilot has been running for longer
-    meet(station, edge)
+def test_attitude_is_stamped_with_its_measurement_time_by_timesync(station: Station, edge: MavlinkEdge) -> None:
+    boot_ahead_ns = 1000 * S  # the autopilot booted earlier
+    connect(station, edge)
     for tenth in range(1, 30):
         now_ns = tenth * 100 * MS
         if tenth % 5 == 0:
             station.send(heartbeat())
         polled(edge, now_ns)
-        for request in station.heard("TIMESYNC"):
+        for request in station.received("TIMESYNC"):
             assert request.tc1 == 0
             station.send(mavlink.MAVLink_timesync_message(request.ts1 + MS + boot_ahead_ns, request.ts1))
         polled(edge, now_ns + 2 * MS)
-    station.send(attitude(1_003_000))  # measured at 3.000 s of ours, arrives 60 ms later
-    said = polled(edge, 3_060 * MS)
-    assert states(said)[0].t_ns == pytest.approx(3 * S, abs=MS)
+    station.send(attitude(1_003_000))  # measured at local time 3.000 s, arrives 60 ms later
+    published = polled(edge, 3_060 * MS)
+    assert states(published)[0].t_ns == pytest.approx(3 * S, abs=MS)
     station.send(heartbeat())
     offset_ms = status(polled(edge, 4_100 * MS)).time_offset_ms
     assert offset_ms == pytest.approx(1e6, abs=1.0)
 
 
-def test_it_answers_the_autopilots_timesync(station: Station, edge: MavlinkEdge) -> None:
-    meet(station, edge)
+def test_the_edge_responds_to_timesync_requests_of_the_autopilot(station: Station, edge: MavlinkEdge) -> None:
+    connect(station, edge)
     station.send(mavlink.MAVLink_timesync_message(0, 777))
     polled(edge, 5 * S)
     time.sleep(0.01)
-    assert (5 * S, 777) in [(t.tc1, t.ts1) for t in station.heard("TIMESYNC")]
+    assert (5 * S, 777) in [(t.tc1, t.ts1) for t in station.received("TIMESYNC")]
 
 
-def test_status_says_when_the_autopilot_is_gone_and_counts(station: Station, edge: MavlinkEdge) -> None:
+def test_link_status_has_the_connection_and_packet_counts(station: Station, edge: MavlinkEdge) -> None:
     before = status(polled(edge, 0))
     assert (before.connected, before.autopilot, before.time_offset_ms) == (False, "none", None)
     assert "nothing heard" in before.detail
-    meet(station, edge, 100 * MS)
+    connect(station, edge, 100 * MS)
     there = status(polled(edge, 1100 * MS))
     assert (there.connected, there.autopilot, there.sysid) == (True, "ardupilot", 7)
     assert there.received == 1
@@ -268,16 +268,16 @@ def test_status_says_when_the_autopilot_is_gone_and_counts(station: Station, edg
     assert not status(polled(edge, 6 * S)).connected
 
 
-def test_px4_is_told_apart(station: Station) -> None:
+def test_px4_is_identified_and_gps_input_to_it_is_reported(station: Station) -> None:
     edge = edge_to(station, outputs=["gps_input"])
-    meet(station, edge, beat=heartbeat(autopilot=mavlink.MAV_AUTOPILOT_PX4))
-    said = status(polled(edge, 1100 * MS))
+    connect(station, edge, beat=heartbeat(autopilot=mavlink.MAV_AUTOPILOT_PX4))
+    published = status(polled(edge, 1100 * MS))
     edge.close()
-    assert said.autopilot == "px4"
-    assert "does not take GPS_INPUT" in said.detail
+    assert published.autopilot == "px4"
+    assert "does not take GPS_INPUT" in published.detail
 
 
-def test_wall_clock_is_ours_the_autopilots_or_nobodys(station: Station) -> None:
+def test_wall_clock_is_from_the_system_the_autopilot_or_none(station: Station) -> None:
     config = LinkSection(device=f"udpout:127.0.0.1:{station.port}")
     for ours, source in ((UNIX_NS, "system"), (5 * S, "none")):
         edge = MavlinkEdge(config, open_transport(config.device, 0, wait=True), partial(int, ours))
@@ -285,7 +285,7 @@ def test_wall_clock_is_ours_the_autopilots_or_nobodys(station: Station) -> None:
         assert (clock.t_ns, clock.source, clock.unix_ns) == (3 * S, source, UNIX_NS if source == "system" else None)
         edge.close()
     edge = MavlinkEdge(config, open_transport(config.device, 0, wait=True), lambda: 5 * S)
-    meet(station, edge)
+    connect(station, edge)
     station.send(mavlink.MAVLink_system_time_message(UNIX_NS // 1000, 1000))
     (clock,) = [x for x in polled(edge, 1 * S) if isinstance(x, m.WallClock)]
     assert (clock.t_ns, clock.source, clock.unix_ns) == (1 * S, "autopilot", UNIX_NS)
@@ -300,43 +300,43 @@ def test_wall_clock_is_ours_the_autopilots_or_nobodys(station: Station) -> None:
     chunks=st.lists(st.binary(max_size=400), max_size=6),
     magic=st.sampled_from([b"", b"\xfd", b"\xfe", b"\xfd\x09\x00"]),
 )
-def test_garbage_never_raises(station: Station, chunks: list[bytes], magic: bytes) -> None:
+def test_garbage_bytes_do_not_raise(station: Station, chunks: list[bytes], magic: bytes) -> None:
     edge = edge_to(station)
     polled_at = 0
     edge.poll(polled_at)
     station.socket.settimeout(2.0)
     link = station.socket.recvfrom(4096)[1]
-    station.heard()
+    station.received()
     for chunk in chunks:
         station.socket.sendto(magic + chunk, link)
         edge.poll(polled_at := polled_at + S)
-    edge.heard(GPS)
+    edge.on_message(GPS)
     edge.close()
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damaged_packets_are_counted_and_the_next_good_one_is_read(station: Station, data: st.DataObject) -> None:
+def test_a_damaged_packet_does_not_hide_the_following_packets(station: Station, data: st.DataObject) -> None:
     edge = edge_to(station)
-    meet(station, edge)
+    connect(station, edge)
     packet = bytearray(attitude(1000).pack(station.mav))
     cut = data.draw(st.integers(1, len(packet)), label="cut")
     flip = data.draw(st.integers(0, len(packet) - 1), label="flip")
     packet[flip] ^= data.draw(st.integers(1, 255), label="bits")
     station.socket.sendto(bytes(packet[:cut]), station.link)
-    for i in range(12):  # at most the 280 bytes that a broken length claims are lost
+    for i in range(12):  # at most the 280 bytes of a wrong length are lost
         station.send(attitude(2000 + i))
-    said = states(polled(edge, 2 * S))
-    assert said
-    assert all(s.yaw_rad == 1.0 and s.roll_rad == pytest.approx(0.1) for s in said[-3:])
+    published = states(polled(edge, 2 * S))
+    assert published
+    assert all(s.yaw_rad == 1.0 and s.roll_rad == pytest.approx(0.1) for s in published[-3:])
     edge.close()
 
 
-# --- devices that come and go ---
+# --- devices that are lost and return ---
 
 
 @pytest.mark.parametrize(
-    ("device", "says"),
+    ("device", "expected"),
     [
         ("udpin:nonsense", "needs HOST:PORT"),
         ("udpout:127.0.0.1:99999", "needs HOST:PORT"),
@@ -348,36 +348,36 @@ def test_damaged_packets_are_counted_and_the_next_good_one_is_read(station: Stat
         ("/dev/null", "is it plugged in"),
     ],
 )
-def test_what_cannot_be_opened_at_start_is_one_clear_line(device: str, says: str) -> None:
-    with pytest.raises(LinkError, match=says) as caught:
+def test_a_device_that_cannot_be_opened_at_start_raises_one_line_with_advice(device: str, expected: str) -> None:
+    with pytest.raises(LinkError, match=expected) as caught:
         open_edge(LinkSection(device=device))
     assert device in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_port_in_use_is_named(station: Station) -> None:
+def test_a_udp_port_in_use_raises_with_advice(station: Station) -> None:
     with pytest.raises(LinkError, match="taken by another program"):
         open_edge(LinkSection(device=f"udpin:127.0.0.1:{station.port}"))
 
 
-def test_udpin_answers_whoever_speaks(station: Station) -> None:
+def test_udpin_sends_to_the_sender_of_the_first_packet(station: Station) -> None:
     free = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     free.bind(("127.0.0.1", 0))
     port = free.getsockname()[1]
     free.close()
     edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
-    edge.heard(GPS)  # nobody there yet: dropped, and no news
+    edge.on_message(GPS)  # no peer yet: dropped without being counted
     station.link = ("127.0.0.1", port)
     station.send(heartbeat())
-    said = polled(edge, 2 * S)
-    assert "not sent" not in status(said).detail
-    edge.heard(GPS)
+    published = polled(edge, 2 * S)
+    assert "not sent" not in status(published).detail
+    edge.on_message(GPS)
     time.sleep(0.01)
-    assert len(station.heard("GPS_INPUT")) == 1
+    assert len(station.received("GPS_INPUT")) == 1
     edge.close()
 
 
-def test_serial_both_ways_and_back_after_it_was_pulled(tmp_path: Any) -> None:
+def test_a_serial_port_works_both_ways_and_reopens_after_unplugging(tmp_path: Any) -> None:
     master, slave = pty.openpty()
     device = tmp_path / "ttyFC"
     device.symlink_to(os.ttyname(slave))
@@ -385,16 +385,16 @@ def test_serial_both_ways_and_back_after_it_was_pulled(tmp_path: Any) -> None:
     autopilot = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
     os.write(master, heartbeat().pack(autopilot) + attitude(1000).pack(autopilot))
     assert len(states(polled(edge, 1 * S))) == 1
-    edge.heard(GPS)
+    edge.on_message(GPS)
     time.sleep(0.01)
     ours = mavlink.MAVLink(None)
     ours.robust_parsing = True
     assert "GPS_INPUT" in [x.get_type() for x in ours.parse_buffer(os.read(master, 4096))]
 
     os.close(slave)
-    os.close(master)  # pulled
+    os.close(master)  # unplugged
     gone = polled(edge, 3 * S)
-    edge.heard(GPS)
+    edge.on_message(GPS)
     assert "connection lost" in status(gone).detail
     device.unlink()
     assert "cannot be opened again" in status(polled(edge, 5 * S)).detail
@@ -411,12 +411,12 @@ def test_serial_both_ways_and_back_after_it_was_pulled(tmp_path: Any) -> None:
     os.close(master)
 
 
-def test_a_full_serial_line_never_blocks_and_never_breaks_a_packet() -> None:
+def test_a_full_serial_buffer_neither_blocks_nor_corrupts_packets() -> None:
     master, slave = pty.openpty()
     edge = open_edge(LinkSection(device=os.ttyname(slave)))
     began = time.monotonic()
-    for _ in range(2000):  # nobody reads
-        edge.heard(GPS)
+    for _ in range(2000):  # the other end does not read
+        edge.on_message(GPS)
     assert time.monotonic() - began < 2.0
     os.set_blocking(master, False)
     parser = mavlink.MAVLink(None)
@@ -427,7 +427,7 @@ def test_a_full_serial_line_never_blocks_and_never_breaks_a_packet() -> None:
             kinds += [x.get_type() for x in parser.parse_buffer(os.read(master, 65536)) or []]
         except OSError as error:
             assert error.errno == errno.EAGAIN
-        edge.heard(GPS)
+        edge.on_message(GPS)
     assert len(kinds) > 50
     assert set(kinds) == {"GPS_INPUT"}
     edge.close()
@@ -435,7 +435,7 @@ def test_a_full_serial_line_never_blocks_and_never_breaks_a_packet() -> None:
     os.close(master)
 
 
-def test_tcp_comes_back_without_waiting() -> None:
+def test_tcp_reconnects_without_blocking() -> None:
     server = socket.create_server(("127.0.0.1", 0))
     address = server.getsockname()
     edge = open_edge(LinkSection(device=f"tcp:127.0.0.1:{address[1]}"))
@@ -445,18 +445,18 @@ def test_tcp_comes_back_without_waiting() -> None:
     assert len(states(polled(edge, 1 * S))) == 1
     peer.close()
     server.close()
-    for second in range(2, 6):  # refused again and again
+    for second in range(2, 6):  # every attempt to connect is refused
         began = time.monotonic()
-        said = polled(edge, second * S)
-        edge.heard(GPS)
+        published = polled(edge, second * S)
+        edge.on_message(GPS)
         assert time.monotonic() - began < 0.2
-    assert not status(said).connected
+    assert not status(published).connected
     server = socket.create_server(address)
     polled(edge, 7 * S)
     peer, _ = server.accept()
     peer.sendall(heartbeat().pack(autopilot) + attitude(9000).pack(autopilot))
     assert len(states(polled(edge, 8 * S))) == 1
-    edge.heard(GPS)
+    edge.on_message(GPS)
     peer.settimeout(2.0)
     parser = mavlink.MAVLink(None)
     parser.robust_parsing = True
@@ -479,22 +479,22 @@ def test_node_and_edge_together_send_10_hz_with_week_and_position(station: Stati
         return [msgspec.structs.replace(late, t_ns=now_ns, emitted_at_ns=now_ns)]
 
     live(node, edge, 1.5, feed)
-    sent = station.heard("GPS_INPUT")
+    sent = station.received("GPS_INPUT")
     edge.close()
     assert 5 <= len(sent) <= 17
     good = [g for g in sent if g.fix_type == 3]
     assert len(good) >= len(sent) - 3
     assert all(g.alt == pytest.approx(ALT) and g.ve == 20.0 and g.satellites_visible == 6 for g in good)
     assert {g.time_week for g in sent} == {week_and_ms(UNIX_NS)[0]}
-    for a, b in pairwise(sent):  # the week runs with the clock that positions are carried on
+    for a, b in pairwise(sent):  # GPS time advances with the clock of the prediction
         assert b.time_week_ms - a.time_week_ms == pytest.approx((b.time_usec - a.time_usec) / 1e3, abs=1.0)
 
 
-def test_sending_to_nobody_is_no_error() -> None:
+def test_udp_send_without_a_listener_does_not_raise() -> None:
     transport = UdpOut(("127.0.0.1", 9))
     assert transport.write(b"x")
     time.sleep(0.01)
-    assert transport.write(b"x")  # the port answered that nobody listens
+    assert transport.write(b"x")  # ICMP has reported that no socket listens
     assert transport.read() == []
     transport.close()
 

@@ -1,4 +1,4 @@
-"""Every output against a decoder that is not ours: pymavlink, the autopilot's arithmetic, published check values."""
+"""Every output against an independent decoder: pymavlink, the autopilot's arithmetic, published check values."""
 
 import ctypes
 import math
@@ -21,11 +21,11 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
 from terrafix.link.edge import MavlinkEdge
-from terrafix.link.integrity.output_predictor import apart_m, offset
+from terrafix.link.integrity.output_predictor import east_north_m, offset
 from terrafix.link.output import global_position, gps_time, msp, nmea, odometry
-from terrafix.link.output.odometry import Attitude, Place
-from terrafix.link.output.selection import Outputs
-from terrafix.link.output.serial_outputs import open_side_outputs
+from terrafix.link.output.odometry import Attitude, GeodeticPoint
+from terrafix.link.output.selection import PositionOutputs
+from terrafix.link.output.serial_outputs import open_serial_outputs
 from terrafix_tools.sim.autopilot.parameters import Kind
 
 S, MS = 1_000_000_000, 1_000_000
@@ -51,52 +51,53 @@ GPS = m.GpsInput(
     estimate_age_ms=180.0,
 )
 NO_FIX = msgspec.structs.replace(GPS, fix_type=1, lat_deg=0.0, lon_deg=0.0, satellites_visible=0, time_week=0)
-ORIGIN = Place(48.0, -11.5, 500.0)
+ORIGIN = GeodeticPoint(48.0, -11.5, 500.0)
 BANKED = Attitude(0.4, -0.2, 2.5)
 
 
-def over_the_wire(message: Any) -> Any:
+def decoded(message: Any) -> Any:
     return mavlink.MAVLink(None).decode(bytearray(packed(message, mavlink.MAVLink(None, 1, 197))))
 
 
 # --- ODOMETRY and VISION_POSITION_ESTIMATE ---
 
 
-def ardupilots_error(covariance: list[float], first: int = 0) -> float:
-    """GCS_Common.cpp, handle_odometry and handle_common_vision_position_estimate_data."""
+def ardupilot_sigma(covariance: list[float], first: int = 0) -> float:
+    """Standard deviation as GCS_Common.cpp computes it (handle_odometry and
+    handle_common_vision_position_estimate_data). ``first``: 0 for the position, otherwise the attitude."""
     a, b, c = (0, 6, 11) if first == 0 else (15, 18, 20)
     return (covariance[a] ** 2 + covariance[b] ** 2 + covariance[c] ** 2) ** (1 / 3)
 
 
 @pytest.mark.parametrize(("sigma", "variance"), [(1.0, 0.577), (5.0, 6.46), (10.0, 18.3)])
 def test_fact_the_cube_root_rule_gives_the_true_sigma(sigma: float, variance: float) -> None:
-    assert odometry.variance_for_ardupilot(sigma) == pytest.approx(variance, rel=3e-3)
+    assert odometry.ardupilot_variance(sigma) == pytest.approx(variance, rel=3e-3)
     gps = msgspec.structs.replace(GPS, horiz_accuracy_m=sigma)
     for encode in (odometry.odometry, odometry.vision_position):
-        said = over_the_wire(encode(gps, ORIGIN, BANKED, ardupilot=True))
-        covariance = said.pose_covariance if said.get_type() == "ODOMETRY" else said.covariance
-        assert ardupilots_error(covariance) == pytest.approx(sigma, rel=1e-5)
-        assert ardupilots_error(covariance, 15) == pytest.approx(math.pi, rel=1e-5)
+        sent = decoded(encode(gps, ORIGIN, BANKED, ardupilot=True))
+        covariance = sent.pose_covariance if sent.get_type() == "ODOMETRY" else sent.covariance
+        assert ardupilot_sigma(covariance) == pytest.approx(sigma, rel=1e-5)
+        assert ardupilot_sigma(covariance, 15) == pytest.approx(math.pi, rel=1e-5)
 
 
 def test_other_firmware_gets_plain_variances() -> None:
-    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
-    assert said.pose_covariance[0] == said.pose_covariance[6] == pytest.approx(6.5**2)
-    assert said.pose_covariance[11] == pytest.approx(4.5**2)
+    sent = decoded(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
+    assert sent.pose_covariance[0] == sent.pose_covariance[6] == pytest.approx(6.5**2)
+    assert sent.pose_covariance[11] == pytest.approx(4.5**2)
 
 
-def test_px4_gets_metres_of_its_own_sphere_in_a_frame_that_has_a_north() -> None:
-    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
-    assert said.frame_id == mavlink.MAV_FRAME_LOCAL_NED
-    # MapProjection::reproject, the way back
-    x, y = said.x / 6_371_000.0, said.y / 6_371_000.0
+def test_px4_gets_metres_on_its_sphere_in_the_frame_local_ned() -> None:
+    sent = decoded(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=False))
+    assert sent.frame_id == mavlink.MAV_FRAME_LOCAL_NED
+    # The inverse: MapProjection::reproject
+    x, y = sent.x / 6_371_000.0, sent.y / 6_371_000.0
     c, lat0 = math.hypot(x, y), math.radians(ORIGIN.lat_deg)
     lat = math.asin(math.cos(c) * math.sin(lat0) + x * math.sin(c) * math.cos(lat0) / c)
     east = math.atan2(y * math.sin(c), c * math.cos(lat0) * math.cos(c) - x * math.sin(lat0) * math.sin(c))
-    back = math.degrees(lat), ORIGIN.lon_deg + math.degrees(east)
-    assert back == pytest.approx((GPS.lat_deg, GPS.lon_deg), abs=2e-7)
+    reprojected = math.degrees(lat), ORIGIN.lon_deg + math.degrees(east)
+    assert reprojected == pytest.approx((GPS.lat_deg, GPS.lon_deg), abs=2e-7)
     at_origin = msgspec.structs.replace(GPS, lat_deg=ORIGIN.lat_deg, lon_deg=ORIGIN.lon_deg)
-    assert odometry.north_east_down(at_origin, ORIGIN, ardupilot=False)[:2] == (0.0, 0.0)
+    assert odometry.position_ned_m(at_origin, ORIGIN, ardupilot=False)[:2] == (0.0, 0.0)
 
 
 def body_to_ned(a: Attitude) -> np.ndarray:
@@ -107,44 +108,44 @@ def body_to_ned(a: Attitude) -> np.ndarray:
     return z @ y @ x
 
 
-def test_odometry_says_frames_velocity_and_place_as_ardupilot_reads_them() -> None:
-    said = over_the_wire(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=True))
-    assert (said.frame_id, said.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
-    w, x, y, z = said.q
-    turned = np.array(
+def test_odometry_has_frames_velocity_and_position_as_ardupilot_reads_them() -> None:
+    sent = decoded(odometry.odometry(GPS, ORIGIN, BANKED, ardupilot=True))
+    assert (sent.frame_id, sent.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
+    w, x, y, z = sent.q
+    r_ned_b = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    assert turned == pytest.approx(body_to_ned(BANKED), abs=1e-6)
-    assert turned @ [said.vx, said.vy, said.vz] == pytest.approx([-3.0, 4.0, -0.5], abs=1e-5)
-    assert said.time_usec == 123_456_789
-    assert (said.quality, said.reset_counter) == (100, 0)
-    # Location::offset_latlng, the way back: degrees per metre on ArduPilot's plane
+    assert r_ned_b == pytest.approx(body_to_ned(BANKED), abs=1e-6)
+    assert r_ned_b @ [sent.vx, sent.vy, sent.vz] == pytest.approx([-3.0, 4.0, -0.5], abs=1e-5)
+    assert sent.time_usec == 123_456_789
+    assert (sent.quality, sent.reset_counter) == (100, 0)
+    # The inverse: Location::offset_latlng, degrees per metre on ArduPilot's plane
     inverse = 89.83204953368922e-7
-    lat = ORIGIN.lat_deg + said.x * inverse
-    lon = ORIGIN.lon_deg + said.y * inverse / math.cos(math.radians((lat + ORIGIN.lat_deg) / 2))
+    lat = ORIGIN.lat_deg + sent.x * inverse
+    lon = ORIGIN.lon_deg + sent.y * inverse / math.cos(math.radians((lat + ORIGIN.lat_deg) / 2))
     assert (lat, lon) == pytest.approx((GPS.lat_deg, GPS.lon_deg), abs=2e-8)
-    assert said.z == pytest.approx(-45.4)
+    assert sent.z == pytest.approx(-45.4)
 
 
-def test_the_date_line_is_no_wall() -> None:
+def test_local_positions_are_continuous_across_the_date_line() -> None:
     gps = msgspec.structs.replace(GPS, lat_deg=0.0, lon_deg=-179.999)
-    place = Place(0.0, 179.999, 0.0)
-    assert odometry.north_east_down(gps, place, ardupilot=True)[:2] == pytest.approx((0.0, 222.6), abs=0.1)
-    assert odometry.north_east_down(gps, place, ardupilot=False)[:2] == pytest.approx((0.0, 222.4), abs=0.1)
+    origin = GeodeticPoint(0.0, 179.999, 0.0)
+    assert odometry.position_ned_m(gps, origin, ardupilot=True)[:2] == pytest.approx((0.0, 222.6), abs=0.1)
+    assert odometry.position_ned_m(gps, origin, ardupilot=False)[:2] == pytest.approx((0.0, 222.4), abs=0.1)
 
 
 # --- GLOBAL_POSITION_SENSOR and EXTERNAL_POSITION_ESTIMATE ---
 
 
 def test_every_field_of_global_position_sensor() -> None:
-    said = over_the_wire(global_position.global_position_sensor(GPS, 7)).to_dict()
-    assert math.isnan(said.pop("alt_ellipsoid"))
-    assert said.pop("alt") == pytest.approx(545.4)
-    assert said == {
+    sent = decoded(global_position.global_position_sensor(GPS, 7)).to_dict()
+    assert math.isnan(sent.pop("alt_ellipsoid"))
+    assert sent.pop("alt") == pytest.approx(545.4)
+    assert sent == {
         "mavpackettype": "GLOBAL_POSITION_SENSOR",
         "target_system": 7,
         "target_component": 1,
@@ -168,11 +169,11 @@ def test_fact_external_position_moves_a_filter_that_has_no_gps_and_no_other(kind
     gps = msgspec.structs.replace(GPS, lat_deg=lat + 0.001, lon_deg=lon, t_ns=7 * S)  # 111 m north
     message = global_position.external_position_estimate(gps, 1)
     assert (message.param2, message.param3) == (0.0, 6.5)
-    (refused,) = rig.ask(message, "COMMAND_ACK")
-    assert refused.result == mavlink.MAV_RESULT_FAILED
+    (rejected,) = rig.request(message, "COMMAND_ACK")
+    assert rejected.result == mavlink.MAV_RESULT_FAILED
     rig.fly(2.0)
-    (taken,) = rig.ask(message, "COMMAND_ACK")
-    assert taken.result == mavlink.MAV_RESULT_ACCEPTED
+    (accepted,) = rig.request(message, "COMMAND_ACK")
+    assert accepted.result == mavlink.MAV_RESULT_ACCEPTED
     assert rig.north_m() == pytest.approx(111.2, abs=1.0)
 
 
@@ -180,7 +181,7 @@ def test_fact_external_position_moves_a_filter_that_has_no_gps_and_no_other(kind
 
 
 def fields(line: bytes) -> list[str]:
-    """By hand: the checksum is the exclusive or of what stands between $ and *."""
+    """Fields of a sentence, with an independent checksum: exclusive or of all characters between $ and *."""
     body, _, checksum = line.decode("ascii").strip().lstrip("$").partition("*")
     total = 0
     for character in body:
@@ -189,7 +190,7 @@ def fields(line: bytes) -> list[str]:
     return body.split(",")
 
 
-def test_the_hand_decoder_reads_the_published_example() -> None:
+def test_the_nmea_decoder_of_this_test_reads_the_published_example() -> None:
     read = fields(b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
     assert len(read) == 15
 
@@ -204,7 +205,7 @@ def test_nmea_sentences_field_by_field() -> None:
     assert fields(gst) == ["GPGST", "123519.25", "", "6.50", "6.50", "", "6.50", "6.50", "4.50"]
 
 
-def test_nmea_without_fix_and_clock_says_nothing_of_place_and_time() -> None:
+def test_nmea_without_fix_and_clock_has_empty_position_and_time() -> None:
     gga, rmc, gst = (fields(line) for line in nmea.sentences(NO_FIX).splitlines())
     assert gga == ["GPGGA", "", "", "", "", "", "0", "00", "", "", "M", "", "M", "", ""]
     assert rmc == ["GPRMC", "", "V", *[""] * 9, "N"]
@@ -213,7 +214,7 @@ def test_nmea_without_fix_and_clock_says_nothing_of_place_and_time() -> None:
 
 @settings(deadline=None)
 @given(lat=st.floats(-90, 90), lon=st.floats(-180, 180))
-def test_nmea_angles_come_back_from_anywhere(lat: float, lon: float) -> None:
+def test_nmea_angles_are_decoded_to_the_same_position(lat: float, lon: float) -> None:
     read = fields(nmea.sentences(msgspec.structs.replace(GPS, lat_deg=lat, lon_deg=lon)).splitlines()[0])
     for value, hemisphere, digits, expected in ((read[2], read[3], 2, lat), (read[4], read[5], 3, lon)):
         minutes = float(value[digits:])
@@ -300,11 +301,11 @@ def test_msp_without_fix_and_clock() -> None:
 
 @settings(deadline=None)
 @given(unix_ms=st.integers(1_000_000_000_000, 4_000_000_000_000))
-def test_the_week_goes_there_and_back(unix_ms: int) -> None:
+def test_gps_week_and_unix_time_are_inverse(unix_ms: int) -> None:
     assert gps_time.unix_ms(*gps_time.week_and_ms(unix_ms * MS)) == unix_ms
 
 
-# --- which, and when ---
+# --- selection and timing ---
 
 
 def edge_on(wire: MemoryWire, **changes: Any) -> MavlinkEdge:
@@ -321,27 +322,29 @@ def edge_on(wire: MemoryWire, **changes: Any) -> MavlinkEdge:
         ("ardupilot", ["gps_input", "external_position"], ("gps_input", "external_position")),
     ],
 )
-def test_the_configuration_or_else_the_firmware_decides(firmware: str, configured: Any, sent: tuple[str, ...]) -> None:
-    assert Outputs(configured, 0).names(firmware) == sent
+def test_outputs_are_those_of_the_configuration_otherwise_of_the_firmware(
+    firmware: str, configured: Any, sent: tuple[str, ...]
+) -> None:
+    assert PositionOutputs(configured, 0).names(firmware) == sent
 
 
-def test_px4_gets_its_message_and_no_gps_input() -> None:
+def test_px4_gets_global_position_sensor_with_a_fix_and_no_gps_input() -> None:
     wire = MemoryWire()
     edge = edge_on(wire)
     wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_PX4), mavlink.MAVLink(None, 7, 1)))
     list(edge.poll(0))
     wire.take()
-    edge.heard(GPS)
-    (said,) = wire.take()
-    assert (said.get_type(), said.target_system) == ("GLOBAL_POSITION_SENSOR", 7)
-    edge.heard(NO_FIX)
-    assert wire.take() == []  # whatever it says without a fix, PX4 takes for a position
+    edge.on_message(GPS)
+    (sent,) = wire.take()
+    assert (sent.get_type(), sent.target_system) == ("GLOBAL_POSITION_SENSOR", 7)
+    edge.on_message(NO_FIX)
+    assert wire.take() == []  # PX4 takes any message for a position
 
 
-def test_local_outputs_wait_for_the_origin_and_are_silent_without_a_fix() -> None:
+def test_local_frame_outputs_wait_for_the_origin_and_stop_without_a_fix() -> None:
     wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
     edge = edge_on(wire, outputs=["odometry", "vision_position"])
-    edge.heard(
+    edge.on_message(
         m.Origin(
             t_ns=0,
             camera=m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0),
@@ -356,59 +359,59 @@ def test_local_outputs_wait_for_the_origin_and_are_silent_without_a_fix() -> Non
     )
     wire.arrive(packed(heartbeat(), autopilot), packed(attitude(1), autopilot))
     list(edge.poll(GPS.t_ns - 4 * S))
-    asked = [a for a in wire.take("COMMAND_LONG") if a.command == mavlink.MAV_CMD_REQUEST_MESSAGE]
-    assert [a.param1 for a in asked] == [49.0]  # GPS_GLOBAL_ORIGIN
-    edge.heard(GPS)
+    requested = [a for a in wire.take("COMMAND_LONG") if a.command == mavlink.MAV_CMD_REQUEST_MESSAGE]
+    assert [a.param1 for a in requested] == [49.0]  # GPS_GLOBAL_ORIGIN
+    edge.on_message(GPS)
     assert wire.take() == []
     wire.arrive(packed(heartbeat(), autopilot))
     status = [x for x in edge.poll(GPS.t_ns - S) if isinstance(x, m.LinkStatus)][-1]
     assert "waits for the autopilot's origin" in status.detail
-    (given,) = wire.take("SET_GPS_GLOBAL_ORIGIN")  # it has none: that of the flight becomes it
-    assert (given.latitude, given.longitude, given.altitude) == (480_000_000, -115_000_000, 500_000)
+    (set_origin,) = wire.take("SET_GPS_GLOBAL_ORIGIN")  # the autopilot has none: it gets the start of the flight
+    assert (set_origin.latitude, set_origin.longitude, set_origin.altitude) == (480_000_000, -115_000_000, 500_000)
     origin = mavlink.MAVLink_gps_global_origin_message(480_000_000, -115_000_000, 500_000)
     wire.arrive(packed(origin, autopilot), packed(attitude(2), autopilot))
     list(edge.poll(GPS.t_ns))
     wire.take()
-    edge.heard(GPS)
+    edge.on_message(GPS)
     assert [x.get_type() for x in wire.take()] == ["ODOMETRY", "VISION_POSITION_ESTIMATE"]
-    edge.heard(NO_FIX)
+    edge.on_message(NO_FIX)
     assert wire.take() == []
 
 
-def test_external_positions_are_few_and_good() -> None:
+def test_external_positions_are_sent_every_five_seconds_with_a_good_accuracy_only() -> None:
     wire = MemoryWire()
     edge = edge_on(wire, outputs=["external_position"])
     for tenth in range(100):
-        edge.heard(msgspec.structs.replace(GPS, t_ns=tenth * 100 * MS))
+        edge.on_message(msgspec.structs.replace(GPS, t_ns=tenth * 100 * MS))
     assert len(wire.take("COMMAND_INT")) == 2
-    edge.heard(msgspec.structs.replace(GPS, t_ns=20 * S, horiz_accuracy_m=31.0))
-    edge.heard(msgspec.structs.replace(NO_FIX, t_ns=30 * S))
+    edge.on_message(msgspec.structs.replace(GPS, t_ns=20 * S, horiz_accuracy_m=31.0))
+    edge.on_message(msgspec.structs.replace(NO_FIX, t_ns=30 * S))
     assert wire.take() == []
 
 
 @pytest.mark.parametrize("uptime_days", [0.01, 1.0, 10.0, 49.0, 200.0])
-def test_an_external_position_is_of_the_time_that_its_32_bits_state(uptime_days: float) -> None:
+def test_an_external_position_is_at_the_time_that_its_float32_field_represents(uptime_days: float) -> None:
     began_ns = round(uptime_days * 86_400 * S)
     for step in range(200):
         t_ns = began_ns + step * 137 * MS
-        way_s = (t_ns - began_ns) / S
-        lat, lon = offset(48.0, 11.0, 20.0 * way_s, -10.0 * way_s)
+        elapsed_s = (t_ns - began_ns) / S
+        lat, lon = offset(48.0, 11.0, 20.0 * elapsed_s, -10.0 * elapsed_s)
         gps = msgspec.structs.replace(GPS, t_ns=t_ns, lat_deg=lat, lon_deg=lon, ve_mps=20.0, vn_mps=-10.0)
-        said = over_the_wire(global_position.external_position_estimate(gps, 1))
-        stated_s = said.param1 - began_ns / S
-        assert 0.0 <= way_s - stated_s < 2.0 * np.spacing(np.float32(began_ns / S))
-        east_m, north_m = apart_m((48.0, 11.0), (said.x / 1e7, said.y / 1e7))
-        assert (east_m, north_m) == pytest.approx((20.0 * stated_s, -10.0 * stated_s), abs=0.05)
+        sent = decoded(global_position.external_position_estimate(gps, 1))
+        field_s = sent.param1 - began_ns / S
+        assert 0.0 <= elapsed_s - field_s < 2.0 * np.spacing(np.float32(began_ns / S))
+        east_m, north_m = east_north_m((48.0, 11.0), (sent.x / 1e7, sent.y / 1e7))
+        assert (east_m, north_m) == pytest.approx((20.0 * field_s, -10.0 * field_s), abs=0.05)
 
 
-def test_a_position_that_jumped_is_a_reset_in_local_poses() -> None:
+def test_an_accepted_jump_changes_the_reset_counter_of_local_poses() -> None:
     for resets, counter in ((0, 0), (3, 3), (256, 0), (259, 3)):
         gps = msgspec.structs.replace(GPS, resets=resets)
         for encode in (odometry.odometry, odometry.vision_position):
-            assert over_the_wire(encode(gps, ORIGIN, BANKED, ardupilot=True)).reset_counter == counter
+            assert decoded(encode(gps, ORIGIN, BANKED, ardupilot=True)).reset_counter == counter
 
 
-def test_nmea_and_msp_go_to_devices_of_their_own_which_may_vanish() -> None:
+def test_nmea_and_msp_are_sent_on_their_own_devices_and_one_may_be_lost() -> None:
     masters, names = [], []
     for _ in range(2):
         master, slave = pty.openpty()
@@ -416,12 +419,12 @@ def test_nmea_and_msp_go_to_devices_of_their_own_which_may_vanish() -> None:
         names.append(os.ttyname(slave))
         os.close(slave)
     edge = edge_on(MemoryWire(), nmea_device=names[0], nmea_baud=9600, msp_device=names[1])
-    edge.heard(GPS)
+    edge.on_message(GPS)
     time.sleep(0.01)
     assert os.read(masters[0], 4096) == nmea.sentences(GPS)
     assert os.read(masters[1], 4096) == msp.frame(GPS)
     os.close(masters[0])
-    edge.heard(GPS)
+    edge.on_message(GPS)
     (status,) = [x for x in edge.poll(0) if isinstance(x, m.LinkStatus)]
     assert f"{names[0]}: connection lost" in status.detail
     time.sleep(0.01)
@@ -430,6 +433,6 @@ def test_nmea_and_msp_go_to_devices_of_their_own_which_may_vanish() -> None:
     os.close(masters[1])
 
 
-def test_a_side_output_that_cannot_be_opened_is_one_line() -> None:
+def test_a_serial_output_that_cannot_be_opened_raises_with_a_remedy() -> None:
     with pytest.raises(LinkError, match=r"/dev/none.*plugged in"):
-        open_side_outputs(LinkSection(nmea_device="/dev/none"))
+        open_serial_outputs(LinkSection(nmea_device="/dev/none"))

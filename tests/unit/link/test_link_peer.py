@@ -1,4 +1,4 @@
-"""The autopilot peer keeps the rules that were measured on the firmware, and the link lives up to them, end to end."""
+"""The simulated autopilot follows the rules measured on the firmware, and the link complies with them end to end."""
 
 import json
 import math
@@ -37,7 +37,7 @@ CONFIG = Path(__file__).resolve().parents[3] / "config"
 
 
 def message(**changes: Any) -> Any:
-    """A GPS_INPUT as a good sender makes it."""
+    """A valid GPS_INPUT with changes."""
     fields = dict(
         time_usec=0,
         gps_id=0,
@@ -63,7 +63,7 @@ def message(**changes: Any) -> Any:
 
 def fed(driver: GpsInputDriver, period_s: float, count: int, start_s: float = 0.0, **changes: Any) -> float:
     for i in range(count):
-        driver.take(message(**changes), start_s + i * period_s)
+        driver.on_report(message(**changes), start_s + i * period_s)
     return start_s + (count - 1) * period_s
 
 
@@ -79,9 +79,9 @@ def test_fact_needs_a_mean_interval_below_215_ms(rate_hz: float, healthy: bool) 
 def test_fact_one_gap_over_245_ms_is_forgiven_two_in_a_row_are_not() -> None:
     driver = GpsInputDriver(0, 5.0)
     now = fed(driver, 0.1, 100)
-    driver.take(message(), now + 0.3)
+    driver.on_report(message(), now + 0.3)
     assert driver.healthy(now + 0.3)
-    driver.take(message(), now + 0.6)
+    driver.on_report(message(), now + 0.6)
     assert not driver.healthy(now + 0.6)
 
 
@@ -89,9 +89,9 @@ def test_fact_silence_of_a_minute_spoils_the_mean_for_half_a_minute_at_5_hz_a_qu
     def recovery_s(rate_hz: float) -> float:
         driver = GpsInputDriver(0, 5.0)
         start = fed(driver, 1 / rate_hz, 100) + 60.0
-        driver.look(start - 1.0)
+        driver.check_timeout(start - 1.0)
         for i in range(1000):
-            driver.take(message(), start + i / rate_hz)
+            driver.on_report(message(), start + i / rate_hz)
             if driver.healthy(start + i / rate_hz):
                 return i / rate_hz
         return math.inf
@@ -103,9 +103,9 @@ def test_fact_silence_of_a_minute_spoils_the_mean_for_half_a_minute_at_5_hz_a_qu
 def test_fact_after_4_s_of_silence_the_receiver_is_gone() -> None:
     driver = GpsInputDriver(0, 5.0)
     now = fed(driver, 0.1, 50)
-    driver.look(now + 3.9)
+    driver.check_timeout(now + 3.9)
     assert (driver.fix_type, driver.satellites) == (3, 6)
-    driver.look(now + 4.1)
+    driver.check_timeout(now + 4.1)
     assert (driver.fix_type, driver.satellites, driver.healthy(now + 4.1)) == (1, 0, False)
 
 
@@ -113,35 +113,35 @@ def test_fact_after_4_s_of_silence_the_receiver_is_gone() -> None:
 
 
 @pytest.mark.parametrize("fix_type", [0, 1, 2])
-def test_fact_below_3d_nothing_reaches_the_filter(fix_type: int) -> None:
-    assert GpsInputDriver(0, 5.0).take(message(fix_type=fix_type), 0.0) is None
+def test_fact_below_3d_nothing_reaches_the_ekf(fix_type: int) -> None:
+    assert GpsInputDriver(0, 5.0).on_report(message(fix_type=fix_type), 0.0) is None
 
 
 def test_fact_an_ignored_velocity_stays_at_its_last_value() -> None:
     driver = GpsInputDriver(0, 5.0)
-    never = driver.take(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.0)
-    driver.take(message(vn=5.0), 0.1)
-    stuck = driver.take(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.2)
+    never = driver.on_report(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.0)
+    driver.on_report(message(vn=5.0), 0.1)
+    stuck = driver.on_report(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.2)
     assert never is not None
     assert stuck is not None
     assert (never.velocity_ned_mps[0], stuck.velocity_ned_mps[0]) == (0.0, 5.0)
 
 
-def test_fact_the_driver_takes_a_fix_for_200_ms_old_unless_told_otherwise() -> None:
+def test_fact_the_driver_assumes_a_delay_of_200_ms_unless_configured() -> None:
     for delay_ms, lag_s in ((0.0, 0.2), (5.0, 0.005), (100.0, 0.1), (900.0, 0.25)):
-        fix = GpsInputDriver(0, delay_ms).take(message(), 10.0)
+        fix = GpsInputDriver(0, delay_ms).on_report(message(), 10.0)
         assert fix is not None
         assert 10.0 - fix.t_s == pytest.approx(lag_s)
 
 
-def test_fact_the_week_takes_out_variations_of_latency_and_not_its_mean() -> None:
+def test_fact_the_gps_week_removes_latency_variations_and_not_the_mean() -> None:
     jitter = JitterCorrection()
     late = [0.02, 0.05, 0.13, 0.02, 0.08] * 40
     corrected = [jitter.correct(1e9 + i * 0.1, 5.0 + i * 0.1 + late[i]) - i * 0.1 - 5.0 for i in range(200)]
     assert all(c == pytest.approx(0.02, abs=1e-6) for c in corrected[1:])
 
 
-def test_the_course_survives_its_file(tmp_path: Path) -> None:
+def test_a_course_is_unchanged_after_write_and_read(tmp_path: Path) -> None:
     rows = [
         (t / 2, PeerState(48 + t * 1e-5, 11.0, 600, 100, 3.1 if t % 2 else -3.1, 0, 0.1, 1.0, 2, 0, 9.0))
         for t in range(9)
@@ -149,7 +149,7 @@ def test_the_course_survives_its_file(tmp_path: Path) -> None:
     write_course(tmp_path / "course.csv", rows)
     course = read_course(tmp_path / "course.csv")
     assert course(1.5) == rows[3][1]
-    assert abs(math.remainder(course(1.75).yaw_rad - math.pi, math.tau)) < 1e-9  # the short way round
+    assert abs(math.remainder(course(1.75).yaw_rad - math.pi, math.tau)) < 1e-9  # interpolates across +-pi
     assert course(99.0).lat_deg == rows[-1][1].lat_deg
     assert course(99.0).vn_mps == 0.0
     (tmp_path / "bad.csv").write_text("t_s,lat\n1,2\n")
@@ -165,7 +165,7 @@ def in_file(name: str) -> dict[str, float]:
 
 
 def test_parameters_of_the_simulated_autopilot_are_those_of_the_vehicle_files() -> None:
-    """What a file sets beyond them does not decide about GPS and is not simulated."""
+    """Other parameters of the files do not affect GPS and are not simulated."""
 
     def simulated(name: str) -> dict[str, float]:
         return {key: value for key, value in in_file(name).items() if key in FIRMWARE}
@@ -175,11 +175,11 @@ def test_parameters_of_the_simulated_autopilot_are_those_of_the_vehicle_files() 
     assert simulated("second-gps") == BESIDE_A_RECEIVER | NO_DCM
 
 
-# --- facts: what the link sends, against the contract ---
+# --- facts: GPS_INPUT of the link ---
 
 
 def everything_sent() -> list[m.GpsInput]:
-    """A flight with good, bad, stale, jumping and absent estimates."""
+    """-> GPS_INPUT of a flight with good, bad, stale, jumping and missing estimates."""
 
     def make(t: int) -> m.NavEstimate:
         second = t // S
@@ -211,20 +211,20 @@ def test_fact_what_is_sent_as_3d_passes_every_check_of_the_autopilot_but_honest_
     assert all(g.time_week > 0 and g.alt_amsl_m == ALT and g.ve_mps == SPEED_EAST for g in good)
 
 
-def test_fact_all_fields_always_and_no_yaw() -> None:
+def test_fact_all_fields_are_sent_and_yaw_is_none() -> None:
     for g in everything_sent():
         sent = gps_input.encode(g, 0)
         assert (sent.ignore_flags, sent.yaw) == (0, 0)
 
 
-def test_fact_5_to_10_hz_no_gap_over_245_ms_while_there_is_something_to_say() -> None:
+def test_fact_gps_input_has_no_gap_over_245_ms_except_silence() -> None:
     times = [g.t_ns for g in everything_sent()]
     gaps = [b - a for a, b in pairwise(times)]
-    assert sorted(gaps)[-2] <= 245 * MS  # all but the stated silence
+    assert sorted(gaps)[-2] <= 245 * MS  # except the one silence
     assert max(gaps) > 4 * S
 
 
-def test_fact_no_single_report_of_bad_accuracy() -> None:
+def test_fact_no_single_report_has_a_bad_accuracy() -> None:
     sent = [g for g in everything_sent() if g.fix_type == 3]
     assert all(b.horiz_accuracy_m < max(15.1, 3.1 * a.horiz_accuracy_m) for a, b in pairwise(sent))
 
@@ -238,7 +238,7 @@ def course(t_s: float) -> PeerState:
 
 
 class Flight:
-    """Link and peer on the same clock; estimates 150 ms late, 4 a second, with an error to choose."""
+    """Clock and estimates for link and simulated autopilot: 4 Hz, 150 ms late, with an error ``east_m``."""
 
     def __init__(self) -> None:
         self.zero_ns = time.monotonic_ns()
@@ -257,11 +257,11 @@ class Flight:
         return [msgspec.structs.replace(late, t_ns=at_ns, emitted_at_ns=now_ns)]
 
 
-def test_the_peer_flies_on_what_the_link_sends(tmp_path: Path) -> None:
+def test_the_simulated_autopilot_navigates_on_the_gps_input_of_the_link(tmp_path: Path) -> None:
     flight, peer = Flight(), AutopilotPeer(seed=3)
     port = peer.start(0, course, flight.clock)
     edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{port}"))
-    said = live(LinkNode(10.0), edge, 3.0, flight.feed)
+    published = live(LinkNode(10.0), edge, 3.0, flight.feed)
     report = peer.stop()
     edge.close()
     assert 20 <= report.gps_input_received <= 32
@@ -279,18 +279,18 @@ def test_the_peer_flies_on_what_the_link_sends(tmp_path: Path) -> None:
     assert "Terrafix: 3D fix" in report.status_texts
     report.write(tmp_path / "peer.json")
     assert json.loads((tmp_path / "peer.json").read_text())["accepted"] == report.accepted
-    states = [x for x in said if isinstance(x, m.VehicleState)]
-    assert len(states) > 20  # 25 Hz, as asked for
+    states = [x for x in published if isinstance(x, m.VehicleState)]
+    assert len(states) > 20  # 25 Hz requested
     assert states[-1].agl_m == pytest.approx(120.0, abs=2.0)
     assert states[-1].yaw_rad == pytest.approx(math.pi / 2, abs=0.1)
-    status = [x for x in said if isinstance(x, m.LinkStatus)][-1]
+    status = [x for x in published if isinstance(x, m.LinkStatus)][-1]
     assert (status.connected, status.autopilot) == (True, "ardupilot")
     assert status.time_offset_ms is not None
 
 
 @pytest.mark.slow
-def test_twenty_seconds_in_time_and_one_wrong_estimate(stall_ms: Callable[[], float]) -> None:
-    """AC-14 and AC-3, to the delay of the machine itself."""
+def test_gps_input_keeps_its_interval_for_20_s_with_one_wrong_estimate(stall_ms: Callable[[], float]) -> None:
+    """AC-14 and AC-3, with the scheduling delay of this machine added."""
     flight, peer = Flight(), AutopilotPeer(seed=4)
     edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{peer.start(0, course, flight.clock)}"))
     node = LinkNode(10.0)
@@ -315,7 +315,7 @@ def test_twenty_seconds_in_time_and_one_wrong_estimate(stall_ms: Callable[[], fl
     assert report.position_error_max_m < 1.0
 
 
-def test_the_peer_answers_parameters_and_refuses_what_it_cannot() -> None:
+def test_the_simulated_autopilot_answers_parameters_and_rejects_other_commands() -> None:
     peer = AutopilotPeer()
     port = peer.start(0, course)
     wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -339,14 +339,14 @@ def test_the_peer_answers_parameters_and_refuses_what_it_cannot() -> None:
     peer.stop()
 
 
-def test_a_used_port_is_one_clear_line() -> None:
+def test_a_used_port_of_the_simulated_autopilot_raises_one_line() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         with pytest.raises(LinkError, match="cannot be used"):
             AutopilotPeer().start(taken.getsockname()[1], course)
 
 
-def test_the_peer_in_a_process_of_its_own(tmp_path: Path) -> None:
+def test_the_simulated_autopilot_runs_in_its_own_process(tmp_path: Path) -> None:
     write_course(tmp_path / "course.csv", [(t / 2, course(t / 2)) for t in range(60)])
     out = tmp_path / "peer.json"
     command = [

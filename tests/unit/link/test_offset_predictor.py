@@ -1,4 +1,4 @@
-"""Where a receiver should be by how it was: what is usual is learnt, a drag-off is not, nobody pays for our errors."""
+"""Prediction of a receiver's offset: p-values, learning of a constant offset, drag-off, steps of our own estimate."""
 
 import math
 
@@ -6,30 +6,30 @@ import numpy as np
 import pytest
 
 from link_rig import LAT, LON, MS, SPEED_EAST, S, estimate
-from terrafix.link.gnss.offset_predictor import LAG_S, OffsetForecast
-from terrafix.link.gnss.predictor_noise import LEAST_SCALE, PRIOR_SAMPLES, Errors, Scatter
-from terrafix.link.gnss.spoofing_detector import DRAG_CHANCE, JUMP_SIGMAS, SpoofingDetector
-from terrafix.link.integrity.output_predictor import Attitudes, offset, predict_to
+from terrafix.link.gnss.offset_predictor import HORIZON_S, OffsetPredictor
+from terrafix.link.gnss.predictor_noise import MIN_POSITION_SCALE, PRIOR_SAMPLES, PredictionErrors, PredictorNoise
+from terrafix.link.gnss.spoofing_detector import DRAG_P_VALUE, JUMP_GATE_SIGMAS, SpoofingDetector
+from terrafix.link.integrity.output_predictor import InertialBuffer, offset, predict_to
 from terrafix.messages import GnssReading, GnssState
 
 DT_S = 0.2
-MAP_M = (-9.0, 4.0)  # what the map is off, for the whole flight
+MAP_M = (-9.0, 4.0)  # error of the map, constant over the flight
 
 
-NOTHING_M = 1e6  # 1-sigma of a slip: our velocity says nothing
+NO_DRIFT_SIGMA_M = 1e6  # 1-sigma of a drift without information
 
 
-def chances(
-    forecast: OffsetForecast,
+def p_values(
+    predictor: OffsetPredictor,
     offsets: list[complex],
     sigma_m: float = 6.0,
-    slips: list[complex] | None = None,
-    slip_sigma_m: float = NOTHING_M,
+    drifts: list[complex] | None = None,
+    drift_sigma_m: float = NO_DRIFT_SIGMA_M,
 ) -> list[float]:
-    moved = slips or [0j] * len(offsets)
+    moved = drifts or [0j] * len(offsets)
     return [
-        forecast.take(offset, sigma_m, slip, slip_sigma_m, DT_S, learn=True)[0]
-        for offset, slip in zip(offsets, moved, strict=True)
+        predictor.update(offset, sigma_m, drift, drift_sigma_m, DT_S, learn=True)[0]
+        for offset, drift in zip(offsets, moved, strict=True)
     ]
 
 
@@ -37,121 +37,124 @@ def seconds(value_s: float) -> int:
     return round(value_s / DT_S)
 
 
-def test_the_chance_is_that_of_a_student_t_in_two_dimensions() -> None:
-    """Against drawn numbers: with nothing but the prior there are two degrees of freedom for each of its samples."""
-    forecast = OffsetForecast()
-    chances(forecast, [0j] * seconds(LAG_S + 2.0), sigma_m=1.0)  # a mean, and no error of a forecast yet
+def test_the_p_value_is_that_of_a_bivariate_student_t() -> None:
+    """Compared with drawn numbers. With the prior alone there are two degrees of freedom for each of its samples."""
+    predictor = OffsetPredictor()
+    p_values(predictor, [0j] * seconds(HORIZON_S + 2.0), sigma_m=1.0)  # a mean, and no prediction error yet
     rng, freedom = np.random.default_rng(1), 2.0 * PRIOR_SAMPLES
     drawn = rng.normal(size=(400_000, 2)) / np.sqrt(rng.chisquare(freedom, 400_000) / freedom)[:, None]
-    away = np.hypot(*drawn.T)
+    distances_m = np.hypot(*drawn.T)
     for limit in (1.0, 2.0, 4.0):
-        fresh = OffsetForecast()
-        chances(fresh, [0j] * seconds(LAG_S + 2.0), sigma_m=1.0)
-        fresh.pause()
-        said, error_m = fresh.take(complex(limit, 0.0), 1.0, 0j, NOTHING_M, DT_S, learn=False)
+        fresh = OffsetPredictor()
+        p_values(fresh, [0j] * seconds(HORIZON_S + 2.0), sigma_m=1.0)
+        fresh.clear_pending()
+        p_value, error_m = fresh.update(complex(limit, 0.0), 1.0, 0j, NO_DRIFT_SIGMA_M, DT_S, learn=False)
         assert error_m == pytest.approx(limit)
-        assert said == pytest.approx(float((away > limit).mean()), rel=0.05)
+        assert p_value == pytest.approx(float((distances_m > limit).mean()), rel=0.05)
 
 
-def test_what_stays_for_the_flight_is_usual_and_a_change_of_it_is_not() -> None:
-    forecast, steady = OffsetForecast(), complex(*MAP_M)
-    assert min(chances(forecast, [steady] * seconds(600.0))) > 0.05  # never a word against it
-    walked = chances(forecast, [steady + 1.0 * DT_S * k for k in range(seconds(40.0))])
-    seen_s = next(k for k, chance in enumerate(walked) if chance < DRAG_CHANCE) * DT_S
-    assert seen_s < 29.0
-    away_m = abs(steady + seen_s)
-    assert away_m < JUMP_SIGMAS * 6.0  # the distance alone says nothing yet
+def test_a_constant_offset_is_learnt_and_a_change_of_it_is_detected() -> None:
+    predictor, steady = OffsetPredictor(), complex(*MAP_M)
+    assert min(p_values(predictor, [steady] * seconds(600.0))) > 0.05  # no alarm
+    walking = p_values(predictor, [steady + 1.0 * DT_S * k for k in range(seconds(40.0))])
+    detected_s = next(k for k, p_value in enumerate(walking) if p_value < DRAG_P_VALUE) * DT_S
+    assert detected_s < 29.0
+    distance_m = abs(steady + detected_s)
+    assert distance_m < JUMP_GATE_SIGMAS * 6.0  # the distance test gives no alarm yet
 
 
-def test_the_slip_against_our_velocity_makes_it_seen_earlier() -> None:
+def test_the_drift_against_our_velocity_detects_a_drag_off_earlier() -> None:
     drag, quiet = 1.0 * DT_S, [0j] * seconds(600.0)
-    walked, slips = [drag * k + 0j for k in range(seconds(40.0))], [drag + 0j] * seconds(40.0)
-    seen_s = []
-    for slip_sigma_m in (NOTHING_M, 18.0):
-        forecast = OffsetForecast()
-        chances(forecast, quiet, slip_sigma_m=slip_sigma_m)
-        said = chances(forecast, walked, slips=slips, slip_sigma_m=slip_sigma_m)
-        seen_s.append(next(k for k, chance in enumerate(said) if chance < DRAG_CHANCE) * DT_S)
-    assert seen_s[1] < seen_s[0] - 2.0
+    walking, drifts = [drag * k + 0j for k in range(seconds(40.0))], [drag + 0j] * seconds(40.0)
+    detected_s = []
+    for drift_sigma_m in (NO_DRIFT_SIGMA_M, 18.0):
+        predictor = OffsetPredictor()
+        p_values(predictor, quiet, drift_sigma_m=drift_sigma_m)
+        values = p_values(predictor, walking, drifts=drifts, drift_sigma_m=drift_sigma_m)
+        detected_s.append(next(k for k, p_value in enumerate(values) if p_value < DRAG_P_VALUE) * DT_S)
+    assert detected_s[1] < detected_s[0] - 2.0
 
 
-def test_when_the_receiver_has_not_moved_against_our_velocity_it_is_we_who_are_elsewhere() -> None:
-    """A map that is off elsewhere: the offset walks, the slip does not."""
-    walked = [0.6 * DT_S * k + 0j for k in range(seconds(40.0))]
-    least = []
-    for slip_sigma_m in (NOTHING_M, 18.0):
-        forecast = OffsetForecast()
-        chances(forecast, [0j] * seconds(600.0), slip_sigma_m=slip_sigma_m)
-        least.append(min(chances(forecast, walked, slip_sigma_m=slip_sigma_m)))
-    assert least[1] > 5.0 * least[0]
+def test_an_offset_without_drift_of_the_receiver_has_a_larger_p_value() -> None:
+    """As with a map that is wrong in another place: the offset changes, the receiver has no drift."""
+    walking = [0.6 * DT_S * k + 0j for k in range(seconds(40.0))]
+    smallest = []
+    for drift_sigma_m in (NO_DRIFT_SIGMA_M, 18.0):
+        predictor = OffsetPredictor()
+        p_values(predictor, [0j] * seconds(600.0), drift_sigma_m=drift_sigma_m)
+        smallest.append(min(p_values(predictor, walking, drift_sigma_m=drift_sigma_m)))
+    assert smallest[1] > 5.0 * smallest[0]
 
 
-def test_both_forecasts_together_have_the_variance_that_drawn_errors_have() -> None:
-    """Errors that are alike in part, of which much was seen: a chance of 5 % is one in twenty."""
+def test_the_combined_prediction_has_the_variance_of_drawn_errors() -> None:
+    """Correlated errors, after many samples: 5 % of the p-values are below 0.05."""
     rng = np.random.default_rng(3)
     mixed = rng.normal(size=(4000, 2)) @ np.array([1.0, 1j])
     position_m = 6.0 * mixed
-    slip_m = 12.0 * (0.4 * mixed + math.sqrt(1.0 - 0.4**2) * rng.normal(size=(4000, 2)) @ np.array([1.0, 1j]))
-    scatter, said = Scatter(), []
-    for k, (position, slip) in enumerate(zip(position_m, slip_m, strict=True)):
-        errors = Errors(complex(position), 6.0, complex(slip), 12.0)
+    drift_m = 12.0 * (0.4 * mixed + math.sqrt(1.0 - 0.4**2) * rng.normal(size=(4000, 2)) @ np.array([1.0, 1j]))
+    noise, values = PredictorNoise(), []
+    for k, (position, drift) in enumerate(zip(position_m, drift_m, strict=True)):
+        errors = PredictionErrors(complex(position), 6.0, complex(drift), 12.0)
         if k >= 2000:
-            said.append(scatter.chance(errors)[0])
-        scatter.learn(errors, gain=1.0, keep=1.0)
-    for chance in (0.05, 0.3):
-        assert float(np.mean(np.array(said) < chance)) == pytest.approx(chance, rel=0.25)
+            values.append(noise.p_value(errors)[0])
+        noise.update(errors, gain=1.0, keep=1.0)
+    for share in (0.05, 0.3):
+        assert float(np.mean(np.array(values) < share)) == pytest.approx(share, rel=0.25)
 
 
-def test_a_drag_off_is_not_learnt_while_it_begins() -> None:
-    forecast = OffsetForecast()
-    chances(forecast, [0j] * seconds(600.0))
-    _, before_m = forecast.take(10.0 + 0j, 6.0, 0j, NOTHING_M, DT_S, learn=True)
-    chances(forecast, [10.0 + 0j] * seconds(LAG_S - 5.0))
-    _, after_m = forecast.take(10.0 + 0j, 6.0, 0j, NOTHING_M, DT_S, learn=True)
+def test_a_drag_off_is_not_learnt_within_the_horizon() -> None:
+    predictor = OffsetPredictor()
+    p_values(predictor, [0j] * seconds(600.0))
+    _, before_m = predictor.update(10.0 + 0j, 6.0, 0j, NO_DRIFT_SIGMA_M, DT_S, learn=True)
+    p_values(predictor, [10.0 + 0j] * seconds(HORIZON_S - 5.0))
+    _, after_m = predictor.update(10.0 + 0j, 6.0, 0j, NO_DRIFT_SIGMA_M, DT_S, learn=True)
     assert before_m is not None and after_m is not None
-    assert after_m == pytest.approx(10.0, abs=0.1) and before_m < after_m  # smoothed, and then in full
+    assert after_m == pytest.approx(10.0, abs=0.1) and before_m < after_m  # first after the low-pass, then in full
 
 
-def test_a_flight_that_was_better_than_claimed_may_become_as_bad() -> None:
-    """However quiet it was: three times what is claimed is no drag-off."""
-    forecast = OffsetForecast()
-    chances(forecast, [0j] * seconds(3000.0))
-    said = chances(forecast, [complex(3.0 * 6.0, 0.0)] * seconds(10.0))
-    assert min(said) > DRAG_CHANCE
-    assert LEAST_SCALE * math.sqrt(-2.0 * math.log(DRAG_CHANCE)) > 3.0  # why, for as much as there is to learn
+def test_after_a_flight_with_small_errors_the_claimed_error_is_still_no_alarm() -> None:
+    """Three times the claimed sigma is no drag-off, however small the errors were before."""
+    predictor = OffsetPredictor()
+    p_values(predictor, [0j] * seconds(3000.0))
+    values = p_values(predictor, [complex(3.0 * 6.0, 0.0)] * seconds(10.0))
+    assert min(values) > DRAG_P_VALUE
+    # The lower limit of the scale ensures this for any number of samples.
+    assert MIN_POSITION_SCALE * math.sqrt(-2.0 * math.log(DRAG_P_VALUE)) > 3.0
 
 
-def test_after_a_vague_stretch_nobody_is_accused_of_what_was_vague() -> None:
-    forecast = OffsetForecast()
-    chances(forecast, [0j] * seconds(600.0))
+def test_after_an_interval_with_a_large_sigma_there_is_no_false_alarm() -> None:
+    predictor = OffsetPredictor()
+    p_values(predictor, [0j] * seconds(600.0))
     drift = [complex(0.5 * DT_S * k, 0.0) for k in range(seconds(60.0))]
-    blind = [forecast.take(x, math.hypot(6.0, abs(x)), 0j, NOTHING_M, DT_S, learn=True)[0] for x in drift]
-    back = chances(forecast, [0j] * seconds(120.0))
+    blind = [predictor.update(x, math.hypot(6.0, abs(x)), 0j, NO_DRIFT_SIGMA_M, DT_S, learn=True)[0] for x in drift]
+    back = p_values(predictor, [0j] * seconds(120.0))
     assert min(blind + back) > 0.01
 
 
-def judged(
-    judge: SpoofingDetector, begin_s: float, end_s: float, east_m: float, ours_m: float, step_m: float = 0.0
+def detector_states(
+    detector: SpoofingDetector, begin_s: float, end_s: float, east_m: float, ours_m: float, step_m: float = 0.0
 ) -> set[GnssState]:
-    """What is said of readings at 5 Hz that are ``east_m`` off. Estimates are new with each, ``ours_m`` off, with a
-    sigma of 6 m, and have made a step of ``step_m`` lately."""
-    said = set()
+    """-> states of the detector over readings at 5 Hz with an error of ``east_m``. Each reading has a new estimate with
+    an error of ``ours_m``, a sigma of 6 m and a recent step of ``step_m``."""
+    states = set()
     for k in range(seconds(begin_s), seconds(end_s)):
         t_ns = round(k * DT_S * S)
-        vision = predict_to(estimate(t_ns - 50 * MS, sigma_m=6.0, east_m=ours_m), t_ns, Attitudes())
+        vision = predict_to(estimate(t_ns - 50 * MS, sigma_m=6.0, east_m=ours_m), t_ns, InertialBuffer())
         lat, lon = offset(LAT, LON, SPEED_EAST * t_ns / S + east_m, 0.0)
         place = {"lat_deg": lat, "lon_deg": lon, "horizontal_m": 1.3}
-        there = GnssReading(t_ns=t_ns, receiver=0, fix_type=3, speed_mps=SPEED_EAST, satellites=14, **place)
-        said.add(judge.take(there, vision, step_m).state)
-    return said
+        reading = GnssReading(t_ns=t_ns, receiver=0, fix_type=3, speed_mps=SPEED_EAST, satellites=14, **place)
+        states.add(detector.update(reading, vision, step_m).state)
+    return states
 
 
-def test_when_it_was_we_who_moved_it_is_learnt_anew() -> None:
-    """A map is left for another one: all is 26 m elsewhere from one estimate to the next, within the claims."""
-    judge = SpoofingDetector()
-    judged(judge, 0.0, 900.0, 1.0, 0.0)
-    moved = judged(judge, 900.0, 910.0, 1.0, 27.0, step_m=27.0) | judged(judge, 910.0, 1000.0, 1.0, 27.0)
+def test_after_a_step_of_the_estimate_the_offset_is_learnt_again() -> None:
+    """As at the border of two maps: the estimate steps by 26 m, within its claim."""
+    detector = SpoofingDetector()
+    detector_states(detector, 0.0, 900.0, 1.0, 0.0)
+    moved = detector_states(detector, 900.0, 910.0, 1.0, 27.0, step_m=27.0) | detector_states(
+        detector, 910.0, 1000.0, 1.0, 27.0
+    )
     assert moved == {GnssState.TRUSTED}
-    without = SpoofingDetector()
-    judged(without, 0.0, 900.0, 1.0, 0.0)
-    assert GnssState.SPOOFED in judged(without, 900.0, 910.0, 27.0, 0.0)  # the same, and it was not we
+    without_step = SpoofingDetector()  # the same distance, without a step of the estimate
+    detector_states(without_step, 0.0, 900.0, 1.0, 0.0)
+    assert GnssState.SPOOFED in detector_states(without_step, 900.0, 910.0, 27.0, 0.0)

@@ -1,4 +1,4 @@
-"""A serial line and the autopilot's clock: rates that fit, overload that is told, and time through reboot and wrap."""
+"""Bandwidth of a serial line (limited rates, reports of overload), and TIMESYNC through outliers, reboot and wrap."""
 
 import os
 import pty
@@ -13,7 +13,7 @@ from link_wire import MemoryWire, attitude, heartbeat, packed, states
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge, open_edge
-from terrafix.link.mavlink.bandwidth import LEAST_HZ, SHARE_IN, LinkBandwidth
+from terrafix.link.mavlink.bandwidth import MIN_RATE_HZ, USABLE_SHARE_IN, LinkBandwidth
 from terrafix.link.mavlink.message_rates import STREAMS_HZ
 from terrafix.link.mavlink.timesync import TimeSync
 from terrafix.link.node import LinkNode
@@ -21,8 +21,8 @@ from terrafix.link.node import LinkNode
 ATTITUDE = mavlink.MAVLINK_MSG_ID_ATTITUDE
 
 
-def longest(message_id: int, signed: bool = False) -> int:
-    """Bytes on the wire, by packing one with nothing but ones, which leaves no zeros to cut off."""
+def packed_length(message_id: int, signed: bool = False) -> int:
+    """-> packed bytes of a message whose fields have no trailing zero bytes, which MAVLink 2 would truncate."""
     kind = mavlink.mavlink_map[message_id]
     message = kind(*(_ones(t, n) for t, n in zip(kind.fieldtypes, kind.array_lengths, strict=True)))
     mav = mavlink.MAVLink(None)
@@ -41,38 +41,40 @@ def _ones(kind: str, count: int) -> object:
 
 
 @pytest.mark.parametrize("signed", [False, True])
-def test_sizes_are_those_on_the_wire(signed: bool) -> None:
+def test_message_sizes_equal_the_packed_lengths(signed: bool) -> None:
     for message_id in STREAMS_HZ:
-        assert LinkBandwidth(57_600, signed=signed).bytes_a_second({message_id: 1.0}) == longest(message_id, signed)
+        assert LinkBandwidth(57_600, signed=signed).bytes_per_second({message_id: 1.0}) == packed_length(
+            message_id, signed
+        )
 
 
 @pytest.mark.parametrize("signed", [False, True])
 @pytest.mark.parametrize("baud", [38_400, 57_600, 115_200, 921_600])
-def test_rates_fit_the_line_and_stay_useful(baud: int, signed: bool) -> None:
-    budget = LinkBandwidth(baud, signed=signed)
-    rates = budget.fitting(STREAMS_HZ)
-    assert sum(rate * longest(i, signed) for i, rate in rates.items()) <= SHARE_IN * baud / 10
-    assert all(LEAST_HZ.get(i, 1.0) <= rate <= STREAMS_HZ[i] for i, rate in rates.items())
-    assert budget.too_slow(rates, ("gps_input",), 10.0) == ""
+def test_limited_rates_fit_the_bandwidth_and_stay_above_their_minimum(baud: int, signed: bool) -> None:
+    bandwidth = LinkBandwidth(baud, signed=signed)
+    rates = bandwidth.limit_rates(STREAMS_HZ)
+    assert sum(rate * packed_length(i, signed) for i, rate in rates.items()) <= USABLE_SHARE_IN * baud / 10
+    assert all(MIN_RATE_HZ.get(i, 1.0) <= rate <= STREAMS_HZ[i] for i, rate in rates.items())
+    assert bandwidth.capacity_problem(rates, ("gps_input",), 10.0) == ""
     if baud >= 115_200 or (baud == 57_600 and not signed):
         assert rates == STREAMS_HZ
 
 
-def test_a_line_that_is_too_slow_is_told_with_what_it_needs() -> None:
-    budget = LinkBandwidth(9600, signed=False)
-    said = budget.too_slow(budget.fitting(STREAMS_HZ), ("gps_input",), 10.0)
-    assert said.startswith("9600 baud is too slow (in needs ")
-    assert "out needs" in said
-    assert LinkBandwidth(None, signed=False).too_slow(STREAMS_HZ, ("gps_input",), 10.0) == ""
+def test_a_baud_rate_that_is_too_low_is_reported_with_the_need() -> None:
+    bandwidth = LinkBandwidth(9600, signed=False)
+    published = bandwidth.capacity_problem(bandwidth.limit_rates(STREAMS_HZ), ("gps_input",), 10.0)
+    assert published.startswith("9600 baud is too slow (in needs ")
+    assert "out needs" in published
+    assert LinkBandwidth(None, signed=False).capacity_problem(STREAMS_HZ, ("gps_input",), 10.0) == ""
 
 
 @pytest.mark.parametrize(("baud", "slower"), [(38_400, True), (57_600, False), (921_600, False)])
-def test_over_a_pty_what_is_asked_for_and_what_is_sent_fits(baud: int, slower: bool) -> None:
+def test_requested_and_sent_messages_fit_the_baud_rate_over_a_pty(baud: int, slower: bool) -> None:
     master, slave = pty.openpty()
     edge, node = open_edge(LinkSection(device=os.ttyname(slave), baud=baud)), LinkNode(10.0)
-    autopilot, ear = mavlink.MAVLink(None, 7, 1), mavlink.MAVLink(None)
-    ear.robust_parsing = True
-    sent, asked = 0, {}
+    autopilot, parser = mavlink.MAVLink(None, 7, 1), mavlink.MAVLink(None)
+    parser.robust_parsing = True
+    sent, requested = 0, {}
     os.set_blocking(master, False)
     for tick in range(10 * 50):
         now_ns = tick * TICK_NS
@@ -82,26 +84,26 @@ def test_over_a_pty_what_is_asked_for_and_what_is_sent_fits(baud: int, slower: b
         list(edge.poll(now_ns))
         if tick % 20 == 0:
             node.on(estimate(now_ns))
-        for said in node.tick(now_ns):
-            edge.heard(said)
+        for published in node.tick(now_ns):
+            edge.on_message(published)
         try:
             data = os.read(master, 65_536)
         except BlockingIOError:
             continue
         sent += len(data)
-        for message in ear.parse_buffer(data) or []:
+        for message in parser.parse_buffer(data) or []:
             if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-                asked[int(message.param1)] = 1e6 / message.param2
+                requested[int(message.param1)] = 1e6 / message.param2
     edge.close()
     os.close(slave)
     os.close(master)
-    assert set(asked) == set(STREAMS_HZ)
-    assert sum(rate * longest(i) for i, rate in asked.items()) <= SHARE_IN * baud / 10 * 1.001
+    assert set(requested) == set(STREAMS_HZ)
+    assert sum(rate * packed_length(i) for i, rate in requested.items()) <= USABLE_SHARE_IN * baud / 10 * 1.001
     assert sent / 10 <= 0.9 * baud / 10
-    assert (asked[ATTITUDE] < 25.0) == slower
+    assert (requested[ATTITUDE] < 25.0) == slower
 
 
-def test_a_full_line_is_reported_once_a_second() -> None:
+def test_a_saturated_line_is_reported_once_a_second() -> None:
     wire = MemoryWire()
     edge = MavlinkEdge(LinkSection(device="/dev/ttyTHS1", baud=57_600), wire, lambda: 0)
     autopilot = mavlink.MAVLink(None, 7, 1)
@@ -120,44 +122,44 @@ def test_a_full_line_is_reported_once_a_second() -> None:
 # --- the autopilot's clock ---
 
 
-def answered(sync: TimeSync, seconds: range, offset_ns: int, draw: random.Random, jitter_ms: float = 1.0) -> None:
+def exchange(sync: TimeSync, seconds: range, offset_ns: int, draw: random.Random, jitter_ms: float = 1.0) -> None:
     for second in seconds:
         sent = sync.request(second * S)
         there, back = (round(draw.uniform(0.5, 0.5 + jitter_ms) * MS) for _ in range(2))
-        sync.answer(sent + there + offset_ns, sent, sent + there + back)
+        sync.on_response(sent + there + offset_ns, sent, sent + there + back)
 
 
-def test_outliers_by_the_dozen_do_not_move_it_while_they_do_not_agree() -> None:
+def test_many_inconsistent_timesync_outliers_do_not_change_the_offset() -> None:
     draw, sync = random.Random(2), TimeSync()
-    answered(sync, range(30), 5 * S, draw)
+    exchange(sync, range(30), 5 * S, draw)
     for second in range(30, 90):
         wrong = draw.choice((-1, 1)) * draw.randint(50, 4000) * MS if second % 3 else 0
-        answered(sync, range(second, second + 1), 5 * S + wrong, draw)
-        assert sync.offset_at(second * S) == pytest.approx(5 * S, abs=3 * MS)
+        exchange(sync, range(second, second + 1), 5 * S + wrong, draw)
+        assert sync.offset_at_ns(second * S) == pytest.approx(5 * S, abs=3 * MS)
     assert sync.resets == 0
 
 
 @pytest.mark.parametrize("tc1", [2**63 - 1, 1, -(2**63)])
-def test_impossible_times_are_outliers(tc1: int) -> None:
+def test_impossible_timesync_times_are_outliers(tc1: int) -> None:
     draw, sync = random.Random(3), TimeSync()
-    answered(sync, range(20), 5 * S, draw)
+    exchange(sync, range(20), 5 * S, draw)
     for second in (20, 21):
-        sync.answer(tc1, sync.request(second * S), second * S + MS)
-    assert sync.offset_at(21 * S) == pytest.approx(5 * S, abs=2 * MS)
+        sync.on_response(tc1, sync.request(second * S), second * S + MS)
+    assert sync.offset_at_ns(21 * S) == pytest.approx(5 * S, abs=2 * MS)
 
 
-def test_answers_that_come_twice_or_late_count_once() -> None:
+def test_duplicate_and_late_timesync_responses_are_ignored() -> None:
     sync = TimeSync()
     sent = sync.request(S)
-    sync.answer(sent + 9 * S, sent, S + 2 * MS)
-    sync.answer(sent + 99 * S, sent, S + 3 * MS)  # the same request again, another time
+    sync.on_response(sent + 9 * S, sent, S + 2 * MS)
+    sync.on_response(sent + 99 * S, sent, S + 3 * MS)  # a second response to the same request, with another time
     late = sync.request(2 * S)
-    sync.answer(late + 99 * S, late, 3 * S)  # a second under way
-    assert sync.offset_at(S) == pytest.approx(9 * S, abs=2 * MS)
+    sync.on_response(late + 99 * S, late, 3 * S)  # round trip of one second
+    assert sync.offset_at_ns(S) == pytest.approx(9 * S, abs=2 * MS)
 
 
 def synced_edge(offset_ns: int) -> tuple[MavlinkEdge, MemoryWire, mavlink.MAVLink]:
-    """After 20 s of round trips with an autopilot whose clock is ``offset_ns`` ahead."""
+    """-> an edge after 20 s of round trips with an autopilot whose clock is ``offset_ns`` ahead."""
     wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
     edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
     for tenth in range(200):
@@ -172,24 +174,24 @@ def synced_edge(offset_ns: int) -> tuple[MavlinkEdge, MemoryWire, mavlink.MAVLin
 
 
 @pytest.mark.parametrize("days", [1, 49.7, 50, 120])
-def test_measurements_keep_their_time_when_the_boot_time_wraps(days: float) -> None:
+def test_measurement_times_are_correct_when_the_boot_time_wraps(days: float) -> None:
     """time_boot_ms has 32 bits, 49.7 days; TIMESYNC has 64."""
     offset_ns = round(days * 86_400) * S
     edge, wire, autopilot = synced_edge(offset_ns)
-    boot_ms = (20_000 + offset_ns // MS) % 2**32  # measured at 20.000 s of ours, arrives 30 ms later
+    boot_ms = (20_000 + offset_ns // MS) % 2**32  # measured at local time 20.000 s, arrives 30 ms later
     wire.arrive(packed(heartbeat(), autopilot), packed(attitude(boot_ms), autopilot))
     (state,) = states(edge.poll(20_030 * MS))
     assert state.t_ns == pytest.approx(20 * S, abs=2 * MS)
 
 
-def test_after_a_reboot_of_the_autopilot_times_are_those_of_arrival_until_the_clocks_agree_again() -> None:
+def test_after_an_autopilot_reboot_measurements_have_their_arrival_time() -> None:
     edge, wire, autopilot = synced_edge(1000 * S)
     wire.arrive(packed(heartbeat(), autopilot), packed(attitude(500), autopilot))
     (state,) = states(edge.poll(21 * S))
     assert state.t_ns == 21 * S
 
 
-def test_the_whole_thing_flies_on_through_a_reboot() -> None:
-    """Positions do not depend on the autopilot's clock at all."""
-    said = fly(LinkNode(10.0), 0, 10 * S, lambda now: [estimate(now - 100 * MS)] if now % (400 * MS) == 0 else [])
-    assert sum(isinstance(x, m.GpsInput) for x in said) == 100
+def test_gps_input_does_not_depend_on_the_autopilots_clock() -> None:
+    """So a reboot of the autopilot does not affect it."""
+    published = fly(LinkNode(10.0), 0, 10 * S, lambda now: [estimate(now - 100 * MS)] if now % (400 * MS) == 0 else [])
+    assert sum(isinstance(x, m.GpsInput) for x in published) == 100

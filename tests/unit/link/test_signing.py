@@ -1,4 +1,4 @@
-"""MAVLink 2 signing, against pymavlink's own implementation and the published layout; nothing unsigned gets through."""
+"""MAVLink 2 signing, compared with pymavlink's implementation and the published layout; rejection of other packets."""
 
 import hashlib
 from pathlib import Path
@@ -23,7 +23,7 @@ UNIX_NS = 1_795_262_400 * S  # 2026-11-21
 
 
 def sender(key: bytes | None = KEY, *, unix_ns: int = UNIX_NS, sysid: int = 7) -> mavlink.MAVLink:
-    """pymavlink's signing, the other side."""
+    """A sender that signs with pymavlink's implementation; ``key`` None: it does not sign."""
     mav = mavlink.MAVLink(None, srcSystem=sysid, srcComponent=1)
     if key is not None:
         mav.signing.secret_key, mav.signing.sign_outgoing, mav.signing.link_id = key, True, 3
@@ -47,21 +47,21 @@ def edge_on(wire: MemoryWire, key: Path) -> MavlinkEdge:
     return MavlinkEdge(LinkSection(signing_key=str(key)), wire, lambda: UNIX_NS)
 
 
-def test_what_we_sign_pymavlink_accepts_and_layout_is_the_published_one(tmp_path: Path) -> None:
+def test_signed_packets_have_the_published_layout_and_pymavlink_accepts_them(tmp_path: Path) -> None:
     wire = MemoryWire()
     list(edge_on(wire, key_file(tmp_path)).poll(0))
-    ear = mavlink.MAVLink(None)
-    ear.signing.secret_key = KEY
-    ear.signing.timestamp = timestamp(UNIX_NS)
-    times = []
+    receiver = mavlink.MAVLink(None)
+    receiver.signing.secret_key = KEY
+    receiver.signing.timestamp = timestamp(UNIX_NS)
+    timestamps = []
     for packet in wire.sent:
-        assert ear.decode(bytearray(packet)).get_signed()
+        assert receiver.decode(bytearray(packet)).get_signed()
         assert packet[2] == 1
         assert packet[-6:] == hashlib.sha256(KEY + packet[:-6]).digest()[:6]
-        times.append(int.from_bytes(packet[-12:-6], "little"))
-    assert len(times) >= 2
-    assert times == sorted(set(times))  # strictly growing
-    assert times[0] == (UNIX_NS - EPOCH_UNIX_NS) // 10_000
+        timestamps.append(int.from_bytes(packet[-12:-6], "little"))
+    assert len(timestamps) >= 2
+    assert timestamps == sorted(set(timestamps))  # strictly increasing
+    assert timestamps[0] == (UNIX_NS - EPOCH_UNIX_NS) // 10_000
 
 
 @pytest.mark.parametrize(
@@ -71,16 +71,16 @@ def test_what_we_sign_pymavlink_accepts_and_layout_is_the_published_one(tmp_path
         (sender(None), False),
         (sender(bytes(32)), False),
         (sender(unix_ns=UNIX_NS - 59 * S), True),
-        (sender(unix_ns=UNIX_NS - 61 * S), False),  # recorded earlier and played again
+        (sender(unix_ns=UNIX_NS - 61 * S), False),  # replay of an earlier recording
     ],
 )
-def test_only_the_key_opens(mav: mavlink.MAVLink, accepted: bool) -> None:
+def test_only_packets_signed_with_our_key_and_a_recent_time_are_accepted(mav: mavlink.MAVLink, accepted: bool) -> None:
     signing = Signing(KEY)
     assert signing.accepts(decoded(packed(attitude(1000), mav)), UNIX_NS) is accepted
     assert signing.refused == (not accepted)
 
 
-def test_a_packet_is_heard_once() -> None:
+def test_a_replayed_packet_is_rejected() -> None:
     signing, mav = Signing(KEY), sender()
     first, second = (decoded(packed(attitude(t), mav)) for t in (1, 2))
     assert signing.accepts(second, UNIX_NS)
@@ -88,7 +88,7 @@ def test_a_packet_is_heard_once() -> None:
     assert not signing.accepts(first, UNIX_NS)
 
 
-def test_a_forged_time_does_not_shut_the_true_sender_out() -> None:
+def test_a_forged_timestamp_does_not_block_the_true_sender() -> None:
     signing, mav = Signing(KEY), sender()
     assert signing.accepts(decoded(packed(attitude(1), mav)), UNIX_NS)
     forged = decoded(packed(attitude(2), sender(bytes(32), unix_ns=UNIX_NS + 10**9 * S)))
@@ -96,48 +96,48 @@ def test_a_forged_time_does_not_shut_the_true_sender_out() -> None:
     assert signing.accepts(decoded(packed(attitude(3), mav)), UNIX_NS)
 
 
-def test_mavlink_1_cannot_be_signed_and_is_not_heard() -> None:
+def test_mavlink_1_packets_are_rejected_because_they_are_unsigned() -> None:
     packet = bytes(attitude(1).pack(mavlink.MAVLink(None, 7, 1), force_mavlink1=True))
     assert not Signing(KEY).accepts(decoded(packet), UNIX_NS)
 
 
-def test_a_computer_without_a_clock_takes_the_time_of_the_autopilot(tmp_path: Path) -> None:
+def test_without_a_plausible_clock_the_timestamp_of_the_autopilot_is_used(tmp_path: Path) -> None:
     signing = Signing(KEY)
     assert signing.accepts(decoded(packed(attitude(1), sender())), 5 * S)
     mav = mavlink.MAVLink(None, 1, 197)
-    signing.prepare(mav, 5 * S)
+    signing.sign_next(mav, 5 * S)
     assert mav.signing.timestamp > timestamp(UNIX_NS)
 
 
 @settings(deadline=None)
 @given(place=st.integers(0, 52), bits=st.integers(1, 255))
-def test_no_byte_of_a_signed_packet_can_be_changed(place: int, bits: int) -> None:
+def test_a_signed_packet_with_any_changed_byte_is_rejected(place: int, bits: int) -> None:
     packet = bytearray(packed(attitude(1000), sender()))
     packet[place % len(packet)] ^= bits
     signing = Signing(KEY)
     assert not any(signing.accepts(m, UNIX_NS) for m in Framer().packets(bytes(packet)))
 
 
-def test_the_edge_ignores_what_is_not_signed_and_says_so(tmp_path: Path) -> None:
+def test_the_edge_ignores_unsigned_packets_and_reports_them(tmp_path: Path) -> None:
     wire = MemoryWire()
     edge = edge_on(wire, key_file(tmp_path))
     unsigned = mavlink.MAVLink(None, 7, 1)
     wire.arrive(packed(heartbeat(), unsigned) + packed(attitude(1000), unsigned))
-    said = list(edge.poll(0))
-    assert states(said) == []
-    (status,) = [m for m in said if isinstance(m, LinkStatus)]
+    published = list(edge.poll(0))
+    assert states(published) == []
+    (status,) = [m for m in published if isinstance(m, LinkStatus)]
     assert (status.connected, status.refused) == (False, 2)
     assert "not signed with link.signing_key" in status.detail
     true = sender()
     wire.arrive(packed(heartbeat(), true) + packed(attitude(1000), true) + packed(attitude(1040), unsigned))
-    said = list(edge.poll(S))
-    assert len(states(said)) == 1
-    (status,) = [m for m in said if isinstance(m, LinkStatus)]
+    published = list(edge.poll(S))
+    assert len(states(published)) == 1
+    (status,) = [m for m in published if isinstance(m, LinkStatus)]
     assert status.connected
     assert "3 unsigned or wrongly signed packets ignored" in status.detail
 
 
-def test_keys_in_both_forms_and_what_is_no_key(tmp_path: Path) -> None:
+def test_signing_keys_are_read_in_both_formats_and_invalid_ones_raise(tmp_path: Path) -> None:
     assert read_key(key_file(tmp_path)) == KEY
     assert read_key(key_file(tmp_path, KEY)) == KEY
     with pytest.raises(ConfigError, match="64 hexadecimal digits"):

@@ -1,4 +1,4 @@
-"""The systemd unit: systemd understands it, and it lets the link take its priority."""
+"""The systemd unit: systemd-analyze verifies it, and it allows the real-time priority of the link."""
 
 import re
 import shutil
@@ -12,22 +12,22 @@ from terrafix.link.output.realtime_priority import PRIORITY
 UNIT = Path(__file__).resolve().parents[3] / "systemd" / "terrafix.service"
 
 
-def granted(key: str) -> list[str]:
+def values_of(key: str) -> list[str]:
     return re.findall(rf"^{key}=(.*)$", UNIT.read_text(), re.MULTILINE)
 
 
-def test_systemd_has_nothing_to_say_about_the_unit() -> None:
+def test_systemd_analyze_verifies_the_unit() -> None:
     analyze = shutil.which("systemd-analyze")
     if analyze is None:
         pytest.skip("no systemd-analyze on this machine")
-    done = subprocess.run([analyze, "verify", str(UNIT)], capture_output=True, text=True, timeout=60, check=False)
-    said = [line for line in done.stderr.splitlines() if UNIT.name in line]
-    assert [line for line in said if "is not executable" not in line] == []  # it is not installed here
+    result = subprocess.run([analyze, "verify", str(UNIT)], capture_output=True, text=True, timeout=60, check=False)
+    messages = [line for line in result.stderr.splitlines() if UNIT.name in line]
+    assert [line for line in messages if "is not executable" not in line] == []  # it is not installed here
 
 
-def test_the_limit_is_what_the_link_asks_for_and_nothing_takes_it_away() -> None:
+def test_the_unit_allows_the_real_time_priority_of_the_link() -> None:
     """sched(7): up to RLIMIT_RTPRIO no capability is needed. RestrictRealtime= would filter the system call."""
-    assert granted("LimitRTPRIO") == [str(PRIORITY)]
-    assert granted("AmbientCapabilities") == [""]
-    assert granted("RestrictRealtime") in ([], ["no"])
-    assert granted("SystemCallFilter") == []
+    assert values_of("LimitRTPRIO") == [str(PRIORITY)]
+    assert values_of("AmbientCapabilities") == [""]
+    assert values_of("RestrictRealtime") in ([], ["no"])
+    assert values_of("SystemCallFilter") == []

@@ -1,4 +1,4 @@
-"""GPS week and leap seconds, the autopilot's clock on ours, and the pace of sending."""
+"""GPS week and leap seconds, TIMESYNC with the autopilot's clock, and the send schedule."""
 
 import random
 from datetime import UTC, datetime, timedelta
@@ -27,11 +27,11 @@ def unix_ns(text: str) -> int:
         ("2026-11-21T12:00:00", 2445, 6 * 86_400 + 43_218),
     ],
 )
-def test_known_dates(utc: str, week: int, seconds: int) -> None:
+def test_gps_week_of_known_dates(utc: str, week: int, seconds: int) -> None:
     assert gps_time.week_and_ms(unix_ns(utc)) == (week, seconds * 1000)
 
 
-def test_agrees_with_calendar_arithmetic_and_never_leaves_the_week() -> None:
+def test_gps_week_agrees_with_calendar_arithmetic() -> None:
     rng = random.Random(1)
     for _ in range(200):
         t_ns = rng.randrange(unix_ns("2017-01-02T00:00:00"), unix_ns("2035-01-01T00:00:00"))
@@ -41,7 +41,7 @@ def test_agrees_with_calendar_arithmetic_and_never_leaves_the_week() -> None:
         assert abs((since - datetime(1970, 1, 1)).total_seconds() * 1e3 - t_ns / 1e6) < 1.1
 
 
-def test_last_leap_second_is_18_and_table_grows_by_one_each() -> None:
+def test_the_leap_second_table_ends_at_18_and_has_valid_dates() -> None:
     assert gps_time.gps_minus_utc_s(gps_time.GPS_EPOCH_UNIX_S) == 0
     assert gps_time.gps_minus_utc_s(unix_ns("2030-01-01T00:00:00") // S) == 18
     assert all(a < b for a, b in pairwise(gps_time.LEAP_SECONDS_UNIX_S))
@@ -51,20 +51,20 @@ def test_last_leap_second_is_18_and_table_grows_by_one_each() -> None:
 
 
 @pytest.mark.parametrize("year", [1970, 2000, 2006, 2024, 2046, 2200])
-def test_a_board_without_a_clock_is_not_believed(year: int) -> None:
-    assert not gps_time.plausible(unix_ns(f"{year}-06-01T00:00:00"))
-    assert gps_time.plausible(unix_ns("2026-06-01T00:00:00"))
+def test_an_implausible_year_is_rejected(year: int) -> None:
+    assert not gps_time.is_plausible(unix_ns(f"{year}-06-01T00:00:00"))
+    assert gps_time.is_plausible(unix_ns("2026-06-01T00:00:00"))
 
 
-def test_a_date_that_is_one_round_of_the_week_counter_off_is_not_plausible() -> None:
+def test_a_date_off_by_one_week_counter_rollover_is_implausible() -> None:
     for utc in ("2025-01-01T00:00:00", "2026-06-01T00:00:00", "2044-06-01T00:00:00"):
-        assert gps_time.plausible(unix_ns(utc))
+        assert gps_time.is_plausible(unix_ns(utc))
         for rounds in (-1, 1):
-            assert not gps_time.plausible(unix_ns(utc) + rounds * 1024 * 7 * 24 * 3600 * S)
+            assert not gps_time.is_plausible(unix_ns(utc) + rounds * 1024 * 7 * 24 * 3600 * S)
 
 
 class Autopilot:
-    """Another clock at the end of a wire with delay: answers TIMESYNC."""
+    """Another clock behind a connection with delay; responds to TIMESYNC."""
 
     def __init__(self, offset_s: float, drift: float, seed: int = 0) -> None:
         self.offset_s, self.drift, self.rng = offset_s, drift, random.Random(seed)
@@ -73,50 +73,50 @@ class Autopilot:
         return ours_ns + round(self.offset_s * S + self.drift * ours_ns)
 
     def exchange(self, sync: TimeSync, now_ns: int, slow: float = 0.2) -> None:
-        """A fast wire, on which every fifth answer is held up on one side."""
+        """A fast connection on which a share ``slow`` of the responses is delayed in one direction."""
         there, back = (self.rng.uniform(0.3, 1.0) * MS for _ in range(2))
         if self.rng.random() < slow:
             back += self.rng.uniform(5, 40) * MS
         request = sync.request(now_ns)
-        sync.answer(self.time_ns(now_ns + round(there)), request, now_ns + round(there + back))
+        sync.on_response(self.time_ns(now_ns + round(there)), request, now_ns + round(there + back))
 
 
 @pytest.mark.parametrize("drift", [0.0, 40e-6, -40e-6])
 def test_timesync_follows_offset_and_drift_within_a_millisecond(drift: float) -> None:
     sync, autopilot = TimeSync(), Autopilot(-1234.5, drift)
-    assert sync.to_ours(1) is None
+    assert sync.to_local_ns(1) is None
     for second in range(5000, 5100):
         autopilot.exchange(sync, second * S)
         if second > 5015:
             at_ns = second * S + 700 * MS
-            ours = sync.to_ours(autopilot.time_ns(at_ns))
+            ours = sync.to_local_ns(autopilot.time_ns(at_ns))
             assert ours is not None
             assert abs(ours - at_ns) < 1 * MS
 
 
-def test_timesync_leaves_out_an_outlier_and_follows_a_reboot() -> None:
+def test_timesync_ignores_one_outlier_and_follows_a_reboot() -> None:
     sync, autopilot = TimeSync(), Autopilot(500.0, 0.0)
     for second in range(20):
         autopilot.exchange(sync, second * S, slow=0.0)
-    before = sync.offset_at(20 * S)
+    before = sync.offset_at_ns(20 * S)
     assert before is not None
-    sync.answer(autopilot.time_ns(20 * S) + 3 * S, sync.request(20 * S), 20 * S + MS)
-    assert sync.offset_at(20 * S) == before
+    sync.on_response(autopilot.time_ns(20 * S) + 3 * S, sync.request(20 * S), 20 * S + MS)
+    assert sync.offset_at_ns(20 * S) == before
     rebooted = Autopilot(-5.0, 0.0)
     for second in range(21, 30):
         rebooted.exchange(sync, second * S, slow=0.0)
-    after = sync.offset_at(30 * S)
+    after = sync.offset_at_ns(30 * S)
     assert after is not None
     assert abs(after - rebooted.offset_s * S) < 1 * MS
     assert sync.resets == 1
 
 
-def test_timesync_ignores_answers_to_others() -> None:
+def test_timesync_ignores_responses_to_other_requests() -> None:
     sync = TimeSync()
     sync.request(1 * S)
-    sync.answer(5 * S, 1 * S + 1, 2 * S)
-    sync.answer(0, 1 * S, 1 * S + MS)
-    assert sync.offset_at(2 * S) is None
+    sync.on_response(5 * S, 1 * S + 1, 2 * S)
+    sync.on_response(0, 1 * S, 1 * S + MS)
+    assert sync.offset_at_ns(2 * S) is None
 
 
 def sent_times(rate_hz: float, ticks: list[int]) -> list[int]:
@@ -134,7 +134,7 @@ def gaps_ms(times: list[int]) -> list[float]:
 
 
 @pytest.mark.parametrize("jitter_ms", [0, 5, 15])
-def test_ten_hertz_through_tick_jitter(jitter_ms: int) -> None:
+def test_sends_at_10_hz_hold_their_interval_with_tick_jitter(jitter_ms: int) -> None:
     gaps = gaps_ms(sent_times(10.0, jittered(100.0, jitter_ms * MS)))
     assert len(gaps) in range(995, 1001)
     assert gaps[int(0.99 * len(gaps))] <= 120.0 + jitter_ms
@@ -143,19 +143,19 @@ def test_ten_hertz_through_tick_jitter(jitter_ms: int) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 7.0, 10.0, 12.5, 15.0])
-def test_the_mean_rate_is_the_configured_one(rate_hz: float) -> None:
+def test_the_mean_send_rate_is_the_configured_rate(rate_hz: float) -> None:
     times = sent_times(rate_hz, jittered(60.0, 3 * MS))
     assert len(times) / 60.0 == pytest.approx(rate_hz, rel=0.01)
 
 
-def test_a_stall_is_not_made_up_for_and_the_grid_stays() -> None:
+def test_sends_missed_in_a_stall_are_dropped_and_the_time_grid_stays() -> None:
     ticks = [t for t in jittered(20.0, 0) if not 5 * S < t < 5 * S + 650 * MS]
     times = sent_times(10.0, ticks)
     assert gaps_ms(times)[0] >= 50.0
     assert times[-1] % (100 * MS) == times[0] % (100 * MS)
 
 
-def test_late_sends_keep_apart_what_the_filter_would_drop() -> None:
+def test_late_sends_keep_the_minimum_interval_of_the_ekf() -> None:
     rng = random.Random(3)
     ticks = [t for t in jittered(60.0, 18 * MS) if rng.random() > 0.3]
     gaps = gaps_ms(sent_times(10.0, ticks))

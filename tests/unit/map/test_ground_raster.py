@@ -1,4 +1,4 @@
-"""Any georeferenced image as the ground: where its pixels end up, voids, bands, projections, and clear errors."""
+"""Georeferenced images as simulated ground: position of pixels, voids, bands, projections, and errors."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +22,7 @@ PLAIN = Film(noise=0.0, vignette=0.0, blur_px=0.0, exposure_jitter=0.0, detail=0
 
 
 def down(yaw_deg: float, tilt_deg: float = 0.0) -> np.ndarray:
-    """R_w_c: straight down, image top to ``yaw_deg``, then tipped about the image's x axis."""
+    """R_w_c: straight down, image top towards ``yaw_deg``, then rotated about the image's x axis."""
     s, c = np.sin(np.radians(yaw_deg)), np.cos(np.radians(yaw_deg))
     level = np.array([[c, -s, 0.0], [-s, -c, 0.0], [0.0, 0.0, -1.0]])
     ts, tc = np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg))
@@ -30,9 +30,9 @@ def down(yaw_deg: float, tilt_deg: float = 0.0) -> np.ndarray:
 
 
 def seen_from(path: Path, frame: LocalFrame, p_c: np.ndarray, r_w_c: np.ndarray) -> np.ndarray:
-    """The map as the camera must see it over flat ground at 0 m: each pixel's ray, through WGS84, bicubic look-up.
+    """Reference rendering over flat ground at 0 m: the ray of each pixel, through WGS84, bicubic interpolation.
 
-    Of the project it takes the definition of the local frame; lens, rays, projection and look-up are its own."""
+    It shares only the definition of the local frame with the project; lens, rays, projection are independent."""
     x, y = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     rays = np.stack([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, np.ones(x.shape)], axis=-1) @ r_w_c.T
     at = p_c + rays * (-p_c[2] / rays[..., 2])[..., None]
@@ -52,7 +52,7 @@ def pixel_of(transform: Affine, x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def shift_px(a: np.ndarray, b: np.ndarray) -> float:
-    """Offset between two pictures of one scene, by phase correlation under a window."""
+    """Offset between two images of one scene, by windowed phase correlation."""
     a, b = (cv2.cvtColor(v, cv2.COLOR_BGR2GRAY).astype(np.float64) for v in (a, b))
     (dx, dy), response = cv2.phaseCorrelate(a, b, cv2.createHanningWindow(a.shape[::-1], cv2.CV_64F))
     assert response > 0.3
@@ -64,7 +64,7 @@ def shift_px(a: np.ndarray, b: np.ndarray) -> float:
     ("e_m", "n_m", "agl_m", "yaw_deg", "tilt_deg"),
     [(0, 0, 120, 0, 0), (90, -60, 120, 37, 5), (-110, 80, 90, -121, -9), (20, 30, 330, 200, 3), (0, -60, 150, 0, 35)],
 )
-def test_a_frame_over_a_real_map_matches_it(
+def test_a_rendered_frame_matches_a_real_map(
     data_set: Callable[[str], Path], e_m: float, n_m: float, agl_m: float, yaw_deg: float, tilt_deg: float
 ) -> None:
     path = data_set("maps/town.tif")
@@ -82,7 +82,7 @@ def test_a_frame_over_a_real_map_matches_it(
     assert max(shifts) < 0.5
     assert shifts[0] < 0.1
     off_px = shift_px(frame_bgr[20:520, 20:900], expected[20:520, 23:903])
-    assert off_px == pytest.approx(3.0, abs=0.2)  # the measure sees what it must see
+    assert off_px == pytest.approx(3.0, abs=0.2)  # the metric detects a known offset
 
 
 def write(path: Path, bands: np.ndarray, transform: Affine, crs: str, nodata: float | None = None) -> Path:
@@ -93,7 +93,7 @@ def write(path: Path, bands: np.ndarray, transform: Affine, crs: str, nodata: fl
 
 
 def blob_image(lat_deg: float, lon_deg: float, crs: str, transform: Affine, size: int) -> np.ndarray:
-    """(1, size, size) uint8: a white blob of 2 m at a place on earth, on grey."""
+    """(1, size, size) uint8: a white blob of 2 m at a WGS84 position, on grey."""
     x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(lon_deg, lat_deg)
     column, row = pixel_of(transform, x, y)
     rows, columns = np.mgrid[:size, :size] + 0.5
@@ -104,7 +104,9 @@ def blob_image(lat_deg: float, lon_deg: float, crs: str, transform: Affine, size
 
 @pytest.mark.parametrize("crs", ["EPSG:32633", "EPSG:3035", "EPSG:4326"])
 @pytest.mark.parametrize("count", [1, 3, 4])
-def test_every_projection_and_number_of_bands(tmp_path: Path, crs: str, count: int) -> None:
+def test_ground_rasters_of_all_projections_and_band_counts_are_georeferenced_correctly(
+    tmp_path: Path, crs: str, count: int
+) -> None:
     frame, place = LocalFrame(48.1, 14.4), (48.10030, 14.40060)
     x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(frame.lon_deg, frame.lat_deg)
     step = (0.5 / 74_400.0, 0.5 / 111_200.0) if crs == "EPSG:4326" else (0.5, 0.5)
@@ -122,7 +124,7 @@ def test_every_projection_and_number_of_bands(tmp_path: Path, crs: str, count: i
     assert np.hypot(seen[0] - expected[0], seen[1] - expected[1]) < (0.7 if crs == "EPSG:4326" else 0.2)
 
 
-def test_voids_and_the_world_beyond_have_the_mean_colour(tmp_path: Path) -> None:
+def test_voids_and_the_area_outside_have_the_mean_colour(tmp_path: Path) -> None:
     frame = LocalFrame(48.1, 14.4)
     x, y = Transformer.from_crs(4326, 32633, always_xy=True).transform(frame.lon_deg, frame.lat_deg)
     image = np.full((3, 400, 400), 90, np.uint8)
@@ -133,7 +135,7 @@ def test_voids_and_the_world_beyond_have_the_mean_colour(tmp_path: Path) -> None
     assert picture.min() == picture.max() == 90
 
 
-def test_voids_in_the_elevation_are_filled_from_beside_them(tmp_path: Path) -> None:
+def test_elevation_voids_are_filled_from_their_neighbours(tmp_path: Path) -> None:
     frame = LocalFrame(48.1, 14.4)
     x, y = Transformer.from_crs(4326, 32633, always_xy=True).transform(frame.lon_deg, frame.lat_deg)
     image = write(
@@ -149,7 +151,7 @@ def test_voids_in_the_elevation_are_filled_from_beside_them(tmp_path: Path) -> N
     ground = open_ground(image, dem, frame)
     assert float(ground.height_amsl_m(np.array(-60.0), np.array(0.0))) == pytest.approx(250.0)
     assert float(ground.height_amsl_m(np.array(60.0), np.array(0.0))) == pytest.approx(300.0)
-    assert float(ground.height_amsl_m(np.array(5000.0), np.array(0.0))) == pytest.approx(300.0)  # its edge goes on
+    assert float(ground.height_amsl_m(np.array(5000.0), np.array(0.0))) == pytest.approx(300.0)  # the edge is extended
 
 
 def test_mistakes_are_one_clear_line(tmp_path: Path) -> None:
@@ -163,5 +165,5 @@ def test_mistakes_are_one_clear_line(tmp_path: Path) -> None:
         open_ground(tmp_path / "none.tif", None, frame)
     with pytest.raises(MapError, match="no elevation under"):
         open_ground(image, far, frame)
-    with pytest.raises(MapError, match="is nowhere near the flight"):
+    with pytest.raises(MapError, match="is not near the flight"):
         open_ground(image, None, LocalFrame(-20.0, -120.0))

@@ -1,4 +1,4 @@
-"""The area of a map: boxes, KML, GeoJSON, missions; buffers and corridors; what is refused and how."""
+"""The area of a map: boxes, KML, GeoJSON, missions; buffers and corridors; rejected inputs."""
 
 import json
 import math
@@ -10,16 +10,16 @@ from pyproj import CRS, Geod
 from rasterio.transform import Affine
 
 from terrafix.core.errors import SourceError, TerrafixError, UsageError
-from terrafix_tools.mapping.area import Area, Placed
-from terrafix_tools.mapping.area_checks import check_area
-from terrafix_tools.mapping.area_files import read_area
+from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.checks import check_area
+from terrafix_tools.mapping.area.files import read_area
 
 EARTH = Geod(ellps="WGS84")
 SQUARE = [[13.0, 47.0], [13.1, 47.0], [13.1, 47.1], [13.0, 47.1], [13.0, 47.0]]
 
 
 def inside(area: Area, lon_deg: float, lat_deg: float) -> bool:
-    """Whether a point lies in one of the polygons, by GDAL's rule for a cell of a ten-thousandth of a degree."""
+    """Point in polygon test, by GDAL's rasterisation with cells of a ten-thousandth of a degree."""
     grid = Affine(1e-4, 0, lon_deg - 5e-5, 0, -1e-4, lat_deg + 5e-5)
     return bool(Placed(area, CRS.from_epsg(4326)).burn(grid, 1, 1)[0, 0])
 
@@ -52,7 +52,7 @@ def test_a_buffer_adds_a_band_and_round_corners() -> None:
     assert size_km2 == pytest.approx(inner_m2 / 1e6 + around_m / 1e3 * 2.0 + math.pi * 4.0, rel=0.01)
 
 
-def test_without_a_word_about_it_the_buffer_is_20_km() -> None:
+def test_the_default_buffer_is_20_km() -> None:
     west, south, _, _ = read_area("13.0,47.0,13.1,47.1").bounds_deg
     _, _, west_m = EARTH.inv(13.0, 47.05, west, 47.05)
     _, _, south_m = EARTH.inv(13.05, 47.0, 13.05, south)
@@ -60,7 +60,7 @@ def test_without_a_word_about_it_the_buffer_is_20_km() -> None:
 
 
 @pytest.mark.parametrize("azimuth_deg", range(0, 360, 15))
-def test_a_buffer_is_nowhere_thinner_than_asked(azimuth_deg: float) -> None:
+def test_a_buffer_is_nowhere_thinner_than_requested(azimuth_deg: float) -> None:
     area = read_area("13.0,47.0,13.1,47.1", buffer_km=5.0)
     corner = (13.1, 47.1) if azimuth_deg <= 90 else (13.0, 47.0)
     assert inside(area, *away(*corner, azimuth_deg, 4_990.0))
@@ -68,7 +68,7 @@ def test_a_buffer_is_nowhere_thinner_than_asked(azimuth_deg: float) -> None:
         assert not inside(area, *away(*corner, azimuth_deg, 5_080.0))
 
 
-def test_kml_polygons_are_joined_and_holes_are_filled(tmp_path: Path) -> None:
+def test_kml_polygons_are_merged_and_holes_are_filled(tmp_path: Path) -> None:
     ring = "<LinearRing><coordinates>13.02,47.02 13.08,47.02 13.05,47.08</coordinates></LinearRing>"
     hole = f"<innerBoundaryIs>{ring}</innerBoundaryIs>"
     other = [[13.2, 47.0], [13.3, 47.0], [13.25, 47.1]]
@@ -79,7 +79,7 @@ def test_kml_polygons_are_joined_and_holes_are_filled(tmp_path: Path) -> None:
     assert inside(area, 13.05, 47.05) and inside(area, 13.25, 47.05) and not inside(area, 13.15, 47.05)
 
 
-def test_geojson_of_every_kind_of_polygon(tmp_path: Path) -> None:
+def test_all_geojson_polygon_types_are_read(tmp_path: Path) -> None:
     shifted = [[x + 1.0, y] for x, y in SQUARE]
     document = {
         "type": "FeatureCollection",
@@ -103,17 +103,17 @@ def write_waypoints(path: Path, places: list[tuple[float, float]]) -> Path:
     return path
 
 
-def test_a_corridor_follows_the_mission_and_does_not_close_it(tmp_path: Path) -> None:
+def test_a_corridor_follows_the_mission_without_closing_it(tmp_path: Path) -> None:
     path = write_waypoints(tmp_path / "m.waypoints", [(13.3, 47.0), (13.3, 47.2)])
     area = read_area(str(path), corridor_km=1.0)
     length_m = EARTH.line_length([13.0, 13.3, 13.3], [47.0, 47.0, 47.2])
-    # Two straight pieces with round ends; the bend is covered once on its inside and rounded on its outside.
+    # Two straight parts with round ends; at the bend the inside overlaps and the outside is rounded.
     bend_km2 = math.pi / 4 - 1.0
     assert check_area(area) == pytest.approx(length_m / 1e3 * 2.0 + math.pi + bend_km2, rel=0.015)
     assert inside(area, 13.15, 47.0) and inside(area, 13.3, 47.1) and not inside(area, 13.15, 47.1)
 
 
-def test_a_plan_of_qgroundcontrol_is_a_mission(tmp_path: Path) -> None:
+def test_a_qgroundcontrol_plan_is_read_as_a_mission(tmp_path: Path) -> None:
     item = {"type": "SimpleItem", "command": 16, "frame": 3, "params": [0, 0, 0, None, 47.05, 13.2, 80], "doJumpId": 1}
     mission = {"plannedHomePosition": [47.0, 13.1, 400], "items": [item], "version": 2}
     path = tmp_path / "m.plan"
@@ -136,7 +136,7 @@ def simple(lat: float, lon: float, command: int = 16) -> dict[str, object]:
 PLOT = [[47.1, 13.2], [47.1, 13.21], [47.11, 13.21], [47.11, 13.2]]
 TRIGGER = {"type": "SimpleItem", "command": 206, "frame": 2, "params": [25, 0, 1, 0, 0, 0, 0]}
 LINES = {"Items": [simple(47.1, 13.2), TRIGGER, simple(47.11, 13.25)], "VisualTransectPoints": []}
-COMPLEX = {  # as QGroundControl 4 writes them, without what says nothing about places -> the place that it goes to
+COMPLEX = {  # as QGroundControl 4 writes them, reduced to their positions -> the flown position
     "survey": ({"TransectStyleComplexItem": LINES, "polygon": PLOT, "angle": 0}, (13.25, 47.11)),
     "CorridorScan": ({"TransectStyleComplexItem": LINES, "polyline": PLOT[:2], "CorridorWidth": 50}, (13.25, 47.11)),
     "StructureScan": ({"polygon": PLOT, "CameraCalc": {"DistanceToSurface": 1000}, "EntranceAltitude": 50},
@@ -147,7 +147,7 @@ COMPLEX = {  # as QGroundControl 4 writes them, without what says nothing about 
 
 
 @pytest.mark.parametrize("kind", COMPLEX)
-def test_complex_items_of_a_plan_are_where_they_fly(tmp_path: Path, kind: str) -> None:
+def test_complex_plan_items_have_their_flown_positions(tmp_path: Path, kind: str) -> None:
     fields, (lon, lat) = COMPLEX[kind]
     path = write_plan(
         tmp_path / "m.plan", simple(47.0, 13.1), {"type": "ComplexItem", "complexItemType": kind} | fields
@@ -158,13 +158,13 @@ def test_complex_items_of_a_plan_are_where_they_fly(tmp_path: Path, kind: str) -
 
 
 @pytest.mark.parametrize("kind", COMPLEX)
-def test_complex_items_without_places_are_named(tmp_path: Path, kind: str) -> None:
+def test_complex_plan_items_without_positions_are_named(tmp_path: Path, kind: str) -> None:
     path = write_plan(tmp_path / "m.plan", simple(47.0, 13.1), {"type": "ComplexItem", "complexItemType": kind})
     with pytest.raises(SourceError, match=f"item 2: a '{kind}' without"):
         read_area(str(path), corridor_km=0.3)
 
 
-def test_a_mission_of_one_place_gets_a_circle(tmp_path: Path) -> None:
+def test_a_mission_with_one_position_becomes_a_circle(tmp_path: Path) -> None:
     path = write_waypoints(tmp_path / "m.waypoints", [(13.0, 47.0)])
     assert check_area(read_area(str(path), buffer_km=3.0)) == pytest.approx(math.pi * 9.0, rel=0.015)
 
@@ -173,18 +173,18 @@ REFUSED = {
     "bowtie.kml": (kml(kml_polygon([[13, 47], [13.1, 47.1], [13.1, 47], [13, 47.1]])), "crosses itself near 47.05"),
     "spike.kml": (kml(kml_polygon([[13, 47], [13.1, 47], [13.2, 47]])), "without area|crosses itself"),
     "two.kml": (kml(kml_polygon([[13, 47], [13.1, 47]])), "without area"),
-    "empty.kml": (kml(kml_polygon([])), "holds no point"),
-    "nothing.kml": (kml("<Point><coordinates>13,47</coordinates></Point>"), "holds no polygon and no line"),
+    "empty.kml": (kml(kml_polygon([])), "contains no point"),
+    "nothing.kml": (kml("<Point><coordinates>13,47</coordinates></Point>"), "contains no polygon and no line"),
     "words.kml": (kml("<LineString><coordinates>here,there</coordinates></LineString>"), "no numbers"),
     "broken.kml": ("<kml><Document>", "not valid XML"),
-    "swapped.kml": (kml(kml_polygon([[47, 113], [47.1, 113], [47.1, 113.1]])), "is no place"),
+    "swapped.kml": (kml(kml_polygon([[47, 113], [47.1, 113], [47.1, 113.1]])), "is not a position"),
     "date.kml": (kml(kml_polygon([[179.9, 10], [-179.9, 10], [-179.9, 10.1], [179.9, 10.1]])), "antimeridian"),
     "not.geojson": ("{", "not valid JSON"),
     "list.geojson": ("[1, 2]", "not GeoJSON"),
     "deep.geojson": ("[" * 100_000, "not valid JSON"),
-    "bare.geojson": ('{"type": "Feature"}', "holds no polygon"),
+    "bare.geojson": ('{"type": "Feature"}', "contains no polygon"),
     "flat.geojson": ('{"type": "Polygon", "coordinates": [[1, 2, 3]]}', "no list of"),
-    "topo.geojson": ('{"type": "Topology", "coordinates": []}', "is no area"),
+    "topo.geojson": ('{"type": "Topology", "coordinates": []}', "is not an area"),
     "plan.json": ('{"fileType": "Plan"}', "name it .plan"),
     "zip.kmz": ("", "unzip it"),
     "area.shp": ("", "give a box W,S,E,N"),
@@ -192,7 +192,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_files_that_are_no_area_are_refused_with_the_reason(tmp_path: Path, name: str) -> None:
+def test_an_invalid_area_file_is_rejected_with_the_reason(tmp_path: Path, name: str) -> None:
     text, reason = REFUSED[name]
     (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(UsageError, match=reason) as caught:
@@ -206,7 +206,7 @@ def test_files_that_are_no_area_are_refused_with_the_reason(tmp_path: Path, name
         ("13.1,47.0,13.0,47.1", 0.0, "west is east of east"),
         ("13.0,47.1,13.1,47.0", 0.0, "an empty box"),
         ("13.0,47.0,13.0,47.1", 0.0, "an empty box"),
-        ("13.0,47.0,13.1,97.1", 0.0, "is no place"),
+        ("13.0,47.0,13.1,97.1", 0.0, "is not a position"),
         ("10.0,83.9,10.1,83.95", 20.0, "degrees of latitude"),
         ("10.0,-85,10.1,-84.9", 0.0, "degrees of latitude"),
         ("179.9,10,179.95,10.1", 20.0, "antimeridian"),
@@ -216,13 +216,13 @@ def test_files_that_are_no_area_are_refused_with_the_reason(tmp_path: Path, name
         ("nowhere.kml", 1.0, "no such file"),
     ],
 )
-def test_boxes_and_buffers_that_cannot_be(text: str, buffer_km: float, reason: str) -> None:
+def test_invalid_boxes_and_buffers_are_rejected(text: str, buffer_km: float, reason: str) -> None:
     with pytest.raises(UsageError, match=reason):
         check_area(read_area(text, buffer_km=buffer_km))
 
 
-def test_a_corridor_needs_a_line_and_a_line_needs_a_width(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no mission and no line"):
+def test_a_corridor_needs_a_line_and_a_width(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="neither a mission nor a line"):
         read_area("13.0,47.0,13.1,47.1", corridor_km=2.0)
     with pytest.raises(UsageError, match="exclude each other"):
         read_area("13.0,47.0,13.1,47.1", corridor_km=2.0, buffer_km=2.0)
@@ -232,7 +232,7 @@ def test_a_corridor_needs_a_line_and_a_line_needs_a_width(tmp_path: Path) -> Non
         read_area(str(tmp_path / "none.waypoints"), corridor_km=1.0)
 
 
-def test_a_star_of_many_points_is_no_crossing_and_one_swap_is_one(tmp_path: Path) -> None:
+def test_a_star_polygon_is_valid_and_swapped_vertices_are_a_self_intersection(tmp_path: Path) -> None:
     angle = np.linspace(0, 2 * np.pi, 600, endpoint=False)
     radius = np.where(np.arange(600) % 2, 0.05, 0.03)
     points = np.stack([13.0 + radius * np.cos(angle), 47.0 + radius * np.sin(angle)], axis=1)

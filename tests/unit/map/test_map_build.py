@@ -1,4 +1,4 @@
-"""What the builder makes of the images that people have, and what it says about those it cannot use."""
+"""Map builds from common image formats, and the errors for unusable images."""
 
 import math
 import os
@@ -26,7 +26,7 @@ from terrafix_tools.mapping.build import build, ensure_package
 
 
 def finest(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The whole map at its own pixels, as GDAL reads the package: (h, w, 3) RGB and (h, w) bool."""
+    """The map at full resolution, as GDAL reads the package: (h, w, 3) RGB and (h, w) bool."""
     with rasterio.open(path) as file:
         return file.read([1, 2, 3]).transpose(1, 2, 0), file.dataset_mask() > 0
 
@@ -40,7 +40,7 @@ def test_the_package_is_a_geopackage_that_gdal_reads(tmp_path: Path) -> None:
         assert file.transform.almost_equals(Affine(0.5, 0, 300_000, 0, -0.5, 2_600_000))
         assert len(file.overviews(1)) == 2
     tables = {"terrafix_manifest", "terrafix_signature", "imagery_descriptors"}
-    assert {name for name, _ in pyogrio.list_layers(out)} == tables  # a warning would be an error
+    assert {name for name, _ in pyogrio.list_layers(out)} == tables  # pytest turns a warning into an error
     assert pyogrio.read_info(out, layer="terrafix_manifest")["features"] > 15
     image, valid = finest(out)
     assert valid.all()
@@ -71,7 +71,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b", "i.tif", "m.gpkg"]
 
 
-def test_the_stated_accuracy_is_kept_and_none_is_none(tmp_path: Path) -> None:
+def test_a_stated_accuracy_is_stored_and_a_missing_one_is_none(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 500))
     for ce90_m in (5.0, None):
         package = MapPackage.open(build(tif, tmp_path / "m.gpkg", ce90_m=ce90_m))
@@ -92,7 +92,7 @@ def floating(rgb: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("change", [gray, deep, floating])
-def test_gray_16_bit_and_float_keep_their_picture(tmp_path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+def test_gray_16_bit_and_float_images_are_converted(tmp_path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     rgb = map_rasters.texture(300, 300)
     image, valid = finest(build(map_rasters.utm(tmp_path / "i.tif", change(rgb)), tmp_path / "m.gpkg"))
     assert valid.all()
@@ -102,7 +102,7 @@ def test_gray_16_bit_and_float_keep_their_picture(tmp_path: Path, change: Callab
     assert image.std() > 25
 
 
-def test_near_infrared_is_left_out_and_alpha_is_the_mask(tmp_path: Path) -> None:
+def test_near_infrared_is_dropped_and_alpha_is_the_mask(tmp_path: Path) -> None:
     rgb = map_rasters.texture(300, 300)
     fourth = np.full((1, 300, 300), 255, np.uint8)
     fourth[0, 100:200, 100:200] = 0
@@ -116,7 +116,7 @@ def test_near_infrared_is_left_out_and_alpha_is_the_mask(tmp_path: Path) -> None
     assert np.array_equal(valid, fourth[0] > 0)
 
 
-def test_palette_and_nodata(tmp_path: Path) -> None:
+def test_palette_images_and_nodata_are_converted(tmp_path: Path) -> None:
     index = (map_rasters.texture(300, 300)[:1] // 32).astype(np.uint8)
     colours = {i: (30 * i, 255 - 30 * i, 20 + 10 * i, 255) for i in range(8)}
     tif = map_rasters.utm(tmp_path / "p.tif", index, colormap=colours)
@@ -148,7 +148,7 @@ def test_a_collar_without_a_mask_is_invalid_and_shadows_are_not(tmp_path: Path, 
     assert valid[250:400, 1150:1300].all()
 
 
-def test_geographic_and_rotated_images_are_brought_north_up(tmp_path: Path) -> None:
+def test_geographic_and_rotated_images_are_warped_north_up(tmp_path: Path) -> None:
     rgb = map_rasters.texture(400, 400)
     geographic = Affine(5e-6, 0, 20.5, 0, -5e-6, -34.0)
     package = MapPackage.open(
@@ -165,12 +165,12 @@ def test_geographic_and_rotated_images_are_brought_north_up(tmp_path: Path) -> N
     assert valid.sum() * 0.25 == pytest.approx(400 * 400 * 0.25, rel=0.02)
 
 
-def test_elevation_is_bilinear_with_voids(tmp_path: Path) -> None:
+def test_elevation_is_interpolated_bilinearly_with_voids(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(600, 600))
     x = 299_000 + 10 * (np.arange(300) + 0.5)
     y = 2_601_000 - 10 * (np.arange(300) + 0.5)
     height_m = (100 + 0.05 * (x[None, :] - 300_000) - 0.02 * (y[:, None] - 2_600_000)).astype(np.float32)
-    height_m[110:113, 110:113] = -9999  # said by nobody
+    height_m[110:113, 110:113] = -9999  # not declared as nodata
     dem = map_rasters.write_tif(
         tmp_path / "d.tif", height_m[None], "EPSG:32651", Affine(10, 0, 299_000, 0, -10, 2_601_000)
     )
@@ -205,7 +205,7 @@ def _wgs84(x: float, y: float) -> tuple[float, float]:
     return lat_deg[0], lon_deg[0]
 
 
-def test_ensure_package_builds_once_and_passes_packages_through(tmp_path: Path) -> None:
+def test_ensure_package_builds_once_and_returns_existing_packages(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
     first = ensure_package(tif, tmp_path / "cache")
     stamp = first.stat().st_mtime_ns
@@ -239,7 +239,7 @@ def broken(tmp_path: Path, what: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("what", "says"),
+    ("what", "expected_text"),
     [
         ("missing", "no such file"),
         ("text", "not an image"),
@@ -248,15 +248,15 @@ def broken(tmp_path: Path, what: str) -> Path:
         ("truncated", "cannot be read"),
     ],
 )
-def test_unusable_imagery_is_one_clear_line_and_leaves_nothing(tmp_path: Path, what: str, says: str) -> None:
+def test_unusable_imagery_is_a_one_line_error_and_leaves_no_file(tmp_path: Path, what: str, expected_text: str) -> None:
     path = broken(tmp_path, what)
-    with pytest.raises(MapError, match=says) as caught:
+    with pytest.raises(MapError, match=expected_text) as caught:
         build(path, tmp_path / "out" / "m.gpkg")
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
 
-def test_unusable_outputs_and_options(tmp_path: Path) -> None:
+def test_unusable_outputs_and_options_are_reported(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
     (tmp_path / "file").write_text("in the way")
     wrong: list[tuple[type[TerrafixError], Path, str]] = [
@@ -271,7 +271,7 @@ def test_unusable_outputs_and_options(tmp_path: Path) -> None:
     assert tif.stat().st_size > 0 and sorted(p.name for p in tmp_path.iterdir()) == ["file", "i.tif"]
 
 
-def test_no_elevation_under_the_imagery(tmp_path: Path) -> None:
+def test_elevation_that_does_not_cover_the_imagery_is_reported(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
     elsewhere = map_rasters.write_tif(
         tmp_path / "d.tif", np.full((1, 50, 50), 9, np.float32), "EPSG:4326", Affine(0.001, 0, 10, 0, -0.001, 50)
@@ -280,7 +280,7 @@ def test_no_elevation_under_the_imagery(tmp_path: Path) -> None:
         build(tif, tmp_path / "m.gpkg", dem=elsewhere)
 
 
-def test_an_interrupted_build_leaves_nothing(tmp_path: Path) -> None:
+def test_an_interrupted_build_leaves_no_file(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 12, 12)))
     out = tmp_path / "out" / "m.gpkg"
     program = f"""import signal
@@ -298,8 +298,8 @@ build(Path({str(tif)!r}), Path({str(out)!r}))"""
 
 
 @pytest.mark.slow
-def test_the_number_of_workers_changes_no_byte(tmp_path: Path) -> None:
-    """Enough chunks that two processes are used, and a border without picture, so that there is a collar to share."""
+def test_the_package_is_byte_identical_for_any_number_of_workers(tmp_path: Path) -> None:
+    """Enough chunks for two processes, and an empty border, so that the workers share a collar mask."""
     bands = np.tile(map_rasters.texture(500, 500), (1, 13, 9))
     bands[:, :300] = 0
     tif = map_rasters.utm(tmp_path / "i.tif", bands, tiled=True)
@@ -308,7 +308,7 @@ def test_the_number_of_workers_changes_no_byte(tmp_path: Path) -> None:
     assert one.read_bytes() == two.read_bytes()
 
 
-def test_a_worker_says_what_is_wrong_with_the_imagery(tmp_path: Path) -> None:
+def test_an_imagery_error_in_a_worker_is_reported(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 13, 13)), tiled=True)
     tif.write_bytes(tif.read_bytes()[:60_000_000])
     with pytest.raises(MapError, match=r"i\.tif: cannot be read near column"):
@@ -316,8 +316,8 @@ def test_a_worker_says_what_is_wrong_with_the_imagery(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["i.tif"]
 
 
-def test_no_space_on_the_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
-    """A limit on the size of files stands for a full disk: the same error comes from the system."""
+def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path: Path) -> None:
+    """A file size limit simulates a full disk: the system returns an error in the same place."""
     tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 4, 4)))
     program = f"""import resource
 from pathlib import Path
@@ -334,12 +334,12 @@ except OutputError as error:
 
 
 def alive_in_group(group: int) -> list[str]:
-    """Processes of a group that still run; proc_pid_stat(5): pid (comm) state ppid pgrp."""
+    """Running processes of a process group; proc_pid_stat(5): pid (comm) state ppid pgrp."""
     found = []
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             name, fields = path.read_text().rsplit(")", 1)
-        except OSError:  # it has just ended
+        except OSError:  # it has just exited
             continue
         state, _, pgrp = fields.split()[:3]
         if int(pgrp) == group and state != "Z":
@@ -348,8 +348,8 @@ def alive_in_group(group: int) -> list[str]:
 
 
 @pytest.mark.slow
-def test_ctrl_c_with_workers_leaves_nothing_and_nobody(tmp_path: Path) -> None:
-    """As a terminal does it: the interrupt reaches the whole group of processes."""
+def test_ctrl_c_with_workers_leaves_no_file_and_no_process(tmp_path: Path) -> None:
+    """As in a terminal: the interrupt goes to the whole process group."""
     tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 20, 20)), tiled=True)
     script = tmp_path / "program.py"
     script.write_text(f"""from pathlib import Path
@@ -364,8 +364,8 @@ if __name__ == "__main__":
             break
         time.sleep(0.02)
     os.killpg(child.pid, signal.SIGINT)
-    _, said = child.communicate(timeout=60)
-    assert child.returncode != 0 and said.count(b"Traceback") <= 1  # the parent's own, no worker's
+    _, stderr = child.communicate(timeout=60)
+    assert child.returncode != 0 and stderr.count(b"Traceback") <= 1  # of the parent only, not of a worker
     assert list((tmp_path / "out").iterdir()) == []
     deadline_s = time.monotonic() + 30
     while time.monotonic() < deadline_s and alive_in_group(child.pid):
@@ -374,27 +374,27 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("date", ["2024-13-01", "2024-1-1", "20240101", "2024-02-30"])
-def test_dates_that_are_none(tmp_path: Path, date: str) -> None:
+def test_invalid_dates_are_rejected(tmp_path: Path, date: str) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
     with pytest.raises(UsageError, match="YYYY-MM-DD"):
         build(tif, tmp_path / "m.gpkg", date=date)
 
 
-def test_a_coordinate_system_that_leads_nowhere(tmp_path: Path) -> None:
+def test_an_unusable_coordinate_system_is_rejected(tmp_path: Path) -> None:
     local = 'ENGCRS["Site",EDATUM["Pole"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
     corner = Affine(1, 0, 5, 0, -1, 5)
     tif = map_rasters.write_tif(tmp_path / "i.tif", map_rasters.texture(64, 64), local, corner)
     with pytest.raises(MapError, match=r"i\.tif: .*(not on the earth|no coordinate system)"):
         build(tif, tmp_path / "m.gpkg")
-    far = Affine(1, 0, 3e9, 0, -1, 5e9)  # UTM coordinates that are nowhere
+    far = Affine(1, 0, 3e9, 0, -1, 5e9)  # invalid UTM coordinates
     tif = map_rasters.write_tif(tmp_path / "j.tif", map_rasters.texture(64, 64), "EPSG:32651", far)
     with pytest.raises(MapError, match=r"j\.tif"):
         build(tif, tmp_path / "m.gpkg")
     assert not (tmp_path / "m.gpkg").exists()
 
 
-def test_images_over_the_antimeridian_and_at_the_pole_are_refused(tmp_path: Path) -> None:
-    """There west is east of east, and what asks for the middle of the map would look on the other side of the earth."""
+def test_images_across_the_antimeridian_or_at_a_pole_are_rejected(tmp_path: Path) -> None:
+    """There west is greater than east, and the centre of the map would be on the other side of the earth."""
     bands = map_rasters.texture(64, 64)
     places = {
         "antimeridian": ("EPSG:4326", Affine(0.01, 0, 179.7, 0, -0.01, 10.0)),
@@ -406,11 +406,11 @@ def test_images_over_the_antimeridian_and_at_the_pole_are_refused(tmp_path: Path
     assert [path.name for path in tmp_path.iterdir()] == ["i.tif"]
 
 
-def test_an_output_that_is_no_file_is_left_alone(tmp_path: Path) -> None:
-    """A rename would replace it: a device, a pipe."""
+def test_an_output_that_is_not_a_regular_file_is_not_replaced(tmp_path: Path) -> None:
+    """A rename would replace a device or a pipe."""
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
     os.mkfifo(tmp_path / "pipe.gpkg")
-    with pytest.raises(OutputError, match="is no file"):
+    with pytest.raises(OutputError, match="is not a regular file"):
         build(tif, tmp_path / "pipe.gpkg")
     assert (tmp_path / "pipe.gpkg").is_fifo()
     with pytest.raises(OutputError, match=r"end in \.gpkg"):

@@ -1,4 +1,4 @@
-"""`terrafix map check`: what is seen and what is not, missions that leave the map, and what a person is told."""
+"""`terrafix map check`: matchable ground, missions that leave the map, and the report."""
 
 import json
 import math
@@ -17,11 +17,11 @@ from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build
-from terrafix_tools.mapping.check import check
-from terrafix_tools.mapping.check_mission import way_of
-from terrafix_tools.mapping.check_sight import Looker, Sight
-from terrafix_tools.mapping.check_text import lines_of
-from terrafix_tools.mapping.preview_page import page
+from terrafix_tools.mapping.check.check import check
+from terrafix_tools.mapping.check.mission import mission_route
+from terrafix_tools.mapping.check.preview_page import page
+from terrafix_tools.mapping.check.sight import MatchabilityProbe, Sight
+from terrafix_tools.mapping.check.text import lines_of
 from terrafix_tools.mission.file import write_mission
 from terrafix_tools.mission.mission import Do, Item, Mission
 
@@ -30,7 +30,7 @@ TEXTURE_E_M, FLAT_E_M, ROWS_E_M = -350.0, 0.0, 350.0  # their middles
 
 
 def ground() -> np.ndarray:
-    """(3, 350, 1050): rich texture; a lake with the noise of its camera; rows of an orchard that all look alike."""
+    """(3, 350, 1050): rich texture; a lake with camera noise; periodic orchard rows."""
     bands = map_rasters.texture(HEIGHT_PX, WIDTH_PX)
     rng = np.random.default_rng(5)
     lake = cv2.GaussianBlur(rng.normal(size=(HEIGHT_PX, 350)).astype(np.float32), (0, 0), 1.0)
@@ -55,7 +55,7 @@ def opened_with_frame(path: Path) -> tuple[MapPackage, LocalFrame]:
 
 
 def mission_over(folder: Path, frame: LocalFrame, *places_m: tuple[float, float]) -> Path:
-    """A waypoint file through places of the local frame, 100 m above home."""
+    """A waypoint file through positions (e, n) of the local frame, 100 m above home."""
     places = [frame.to_wgs84(*place) for place in places_m]
     items = tuple(Item(Do.WAYPOINT, i, lat, lon, 100.0) for i, (lat, lon) in enumerate(places, start=1))
     path = folder / "mission.waypoints"
@@ -63,39 +63,41 @@ def mission_over(folder: Path, frame: LocalFrame, *places_m: tuple[float, float]
     return path
 
 
-def test_texture_is_seen_and_water_and_rows_are_not(package: Path) -> None:
+def test_texture_is_matchable_and_water_and_orchard_rows_are_not(package: Path) -> None:
     opened, frame = opened_with_frame(package)
-    looker = Looker(opened.bind(frame), 1.0, 80.0)
+    probe = MatchabilityProbe(opened.bind(frame), 1.0, 80.0)
     for n_m in (-60.0, -20.0, 20.0, 60.0):
-        assert looker.at(TEXTURE_E_M, n_m)[0] == Sight.SEES
-        assert looker.at(FLAT_E_M, n_m)[0] == Sight.BLIND
-        assert looker.at(ROWS_E_M, n_m)[0] == Sight.BLIND
-    assert looker.at(-600.0, 0.0)[0] == Sight.NO_MAP
-    assert looker.at(-500.0, 0.0)[0] == Sight.NO_MAP  # half the frame is beyond the edge
+        assert probe.at(TEXTURE_E_M, n_m)[0] == Sight.SEES
+        assert probe.at(FLAT_E_M, n_m)[0] == Sight.BLIND
+        assert probe.at(ROWS_E_M, n_m)[0] == Sight.BLIND
+    assert probe.at(-600.0, 0.0)[0] == Sight.NO_MAP
+    assert probe.at(-500.0, 0.0)[0] == Sight.NO_MAP  # half the frame is beyond the edge
     opened.close()
 
 
-def test_the_grid_and_the_shares(package: Path) -> None:
+def test_the_check_grid_and_its_fractions(package: Path) -> None:
     opened, _ = opened_with_frame(package)
     checked = check(opened)
-    said = checked.said
-    assert said.sees + said.weak + said.blind == pytest.approx(1.0)
-    assert said.sees == pytest.approx(0.33, abs=0.12) and said.blind == pytest.approx(0.62, abs=0.15)
+    report = checked.report
+    assert report.sees + report.weak + report.blind == pytest.approx(1.0)
+    assert report.sees == pytest.approx(0.33, abs=0.12) and report.blind == pytest.approx(0.62, abs=0.15)
     columns = (TEXTURE_E_M, FLAT_E_M, ROWS_E_M)
     row = int((checked.grid.n_max_m - 0.0) / checked.grid.step_m)
     seen = [checked.grid.sight[row, int((e_m - checked.grid.e_min_m) / checked.grid.step_m)] for e_m in columns]
     assert seen == [Sight.SEES, Sight.BLIND, Sight.BLIND]
-    assert said.cell_m == pytest.approx(1.0) and said.frame_gsd_m == pytest.approx(100 / 914)
+    assert report.cell_m == pytest.approx(1.0) and report.frame_gsd_m == pytest.approx(100 / 914)
     # CE90 4 m: sigma 4/2.1460; matching: median of one cell. Median of the two together.
-    assert said.expected_error_m == pytest.approx(math.hypot(1.1774 * 4 / 2.146, 1.0), rel=1e-3)
-    assert any("elevation" in text for text in said.warnings) and not any("accuracy" in text for text in said.warnings)
+    assert report.expected_error_m == pytest.approx(math.hypot(1.1774 * 4 / 2.146, 1.0), rel=1e-3)
+    assert any("elevation" in text for text in report.warnings) and not any(
+        "accuracy" in text for text in report.warnings
+    )
     opened.close()
 
 
-def test_a_mission_on_the_map_says_where_it_will_be_blind(tmp_path: Path, package: Path) -> None:
+def test_a_mission_check_lists_the_stretches_without_fixes(tmp_path: Path, package: Path) -> None:
     opened, frame = opened_with_frame(package)
     path = mission_over(tmp_path, frame, (-420.0, 0.0), (0.0, 0.0), (0.0, 60.0))
-    mission = check(opened, mission=path).said.mission
+    mission = check(opened, mission=path).report.mission
     assert mission is not None and mission.outside == []
     assert mission.length_m == pytest.approx(480, abs=2)
     longest = mission.blind[0]
@@ -105,21 +107,21 @@ def test_a_mission_on_the_map_says_where_it_will_be_blind(tmp_path: Path, packag
     opened.close()
 
 
-def test_a_mission_that_leaves_the_map_is_told_where(tmp_path: Path, package: Path) -> None:
+def test_a_mission_check_lists_where_it_leaves_the_map(tmp_path: Path, package: Path) -> None:
     opened, frame = opened_with_frame(package)
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-400.0, 300.0), (-300.0, 300.0), (-300.0, 0.0))
-    said = check(opened, mission=path).said
-    assert said.mission is not None
-    (outside,) = said.mission.outside
+    report = check(opened, mission=path).report
+    assert report.mission is not None
+    (outside,) = report.mission.outside
     assert outside.length_m == pytest.approx(2 * 125 + 100, abs=40)  # the edge is at 175 m
     assert outside.after_item == 1
     assert frame.to_local(*outside.start)[1] == pytest.approx(175 + 10, abs=12)
-    assert "after item 1" in dict(lines_of(said))["outside"]
+    assert "after item 1" in dict(lines_of(report))["outside"]
     opened.close()
 
 
 @pytest.mark.slow
-def test_the_command_fails_with_its_reason(tmp_path: Path, package: Path) -> None:
+def test_map_check_fails_with_a_reason(tmp_path: Path, package: Path) -> None:
     _, frame = opened_with_frame(package)
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-400.0, 300.0))
     command = [sys.executable, "-m", "terrafix_tools.cli", "map", "check", str(package), "--mission", str(path)]
@@ -133,7 +135,7 @@ def test_the_command_fails_with_its_reason(tmp_path: Path, package: Path) -> Non
     assert "sees" in done.stdout and "outside" not in done.stdout
 
 
-def test_loiters_and_returns_are_part_of_the_way(package: Path) -> None:
+def test_loiter_and_return_items_are_part_of_the_path(package: Path) -> None:
     _, frame = opened_with_frame(package)
     home = frame.to_wgs84(-400.0, 0.0)
     there = frame.to_wgs84(-400.0, 100.0)
@@ -142,21 +144,21 @@ def test_loiters_and_returns_are_part_of_the_way(package: Path) -> None:
         Item(Do.LOITER_TURNS, 2, *there, 50.0, amount=2, radius_m=-80.0),
         Item(Do.RETURN, 3),
     )
-    way = way_of(Mission("m", *home, items), frame)
-    assert way.points_m[0] == pytest.approx((-400.0, 0.0), abs=0.1)
-    assert way.points_m[-1] == pytest.approx((-400.0, 0.0), abs=0.1)
-    assert way.points_m[:, 1].max() == pytest.approx(180.0, abs=2)
-    assert np.hypot(*np.diff(way.points_m, axis=0).T).max() <= 22
+    route = mission_route(Mission("m", *home, items), frame)
+    assert route.points_m[0] == pytest.approx((-400.0, 0.0), abs=0.1)
+    assert route.points_m[-1] == pytest.approx((-400.0, 0.0), abs=0.1)
+    assert route.points_m[:, 1].max() == pytest.approx(180.0, abs=2)
+    assert np.hypot(*np.diff(route.points_m, axis=0).T).max() <= 22
 
 
 @pytest.mark.slow
-def test_a_map_that_is_too_coarse_and_a_height_that_is_too_low(tmp_path: Path, package: Path) -> None:
+def test_a_map_that_is_too_coarse_or_a_height_that_is_too_low_is_reported(tmp_path: Path, package: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=10.0)
     coarse = MapPackage.open(build(tif, tmp_path / "m.gpkg"))
-    said = check(coarse, agl_m=120.0).said
-    assert any("no fix will come" in text for text in said.warnings)
-    assert any("does not say when" in text for text in said.warnings)
-    assert any("accuracy is not stated; 10 m" in text for text in said.warnings)
+    report = check(coarse, agl_m=120.0).report
+    assert any("no fix will come" in text for text in report.warnings)
+    assert any("does not say when" in text for text in report.warnings)
+    assert any("accuracy is not stated; 10 m" in text for text in report.warnings)
     coarse.close()
     opened = MapPackage.open(package)
     with pytest.raises(UsageError, match="below 30 m"):
@@ -166,7 +168,7 @@ def test_a_map_that_is_too_coarse_and_a_height_that_is_too_low(tmp_path: Path, p
     opened.close()
 
 
-def test_the_page_stands_alone(tmp_path: Path, package: Path) -> None:
+def test_the_preview_page_needs_no_other_file(tmp_path: Path, package: Path) -> None:
     opened, frame = opened_with_frame(package)
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-300.0, 0.0))
     text = page(check(opened, mission=path))
@@ -178,21 +180,21 @@ def test_the_page_stands_alone(tmp_path: Path, package: Path) -> None:
 
 
 @pytest.mark.slow
-def test_real_water_is_blind_and_a_real_town_is_seen(tmp_path: Path, data_set: Callable[[str], Path]) -> None:
+def test_real_water_is_not_matchable_and_a_real_town_is(tmp_path: Path, data_set: Callable[[str], Path]) -> None:
     reef = MapPackage.open(build(data_set("imagery/single/reef.tif"), tmp_path / "reef.gpkg"))
     west, south, east, north = reef.manifest.bounds_wgs84
-    looker = Looker(reef.bind(LocalFrame(south, west)), 1.0, 100.0)
+    probe = MatchabilityProbe(reef.bind(LocalFrame(south, west)), 1.0, 100.0)
     frame = LocalFrame(south, west)
 
     def at(column_share: float, row_share: float) -> Sight:
-        """Shares of the whole image, from its north-western corner."""
+        """Fractions of the image size, from its north-western corner."""
         e_m, n_m = frame.to_local(north + (south - north) * row_share, west + (east - west) * column_share)
-        return looker.at(e_m, n_m)[0]
+        return probe.at(e_m, n_m)[0]
 
     assert {at(0.36, y) for y in (0.30, 0.35, 0.40, 0.46)} == {Sight.BLIND}  # open water
     assert {at(x, 0.50) for x in (0.74, 0.78)} == {Sight.SEES}  # bushes and houses ashore
     reef.close()
     town = MapPackage.open(build(data_set("maps/town.tif"), tmp_path / "town.gpkg"))
-    said = check(town, agl_m=120.0).said
-    assert said.sees > 0.95
+    report = check(town, agl_m=120.0).report
+    assert report.sees > 0.95
     town.close()

@@ -1,4 +1,4 @@
-"""A build over a Dask cluster: the same bytes, also when a worker dies; what is said when the cluster is none."""
+"""A build on a Dask cluster: identical bytes, also when a worker dies; the error without a cluster."""
 
 import socket
 import subprocess
@@ -13,7 +13,7 @@ import map_rasters
 from map_cluster import local_cluster
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build
-from terrafix_tools.mapping.dem import TILES_PER_WORKER, height_places
+from terrafix_tools.mapping.package.dem import TILES_PER_WORKER, height_places
 
 ENOUGH = 600_000  # bytes of the package that is being written: some chunks are in it, more are to come
 
@@ -24,15 +24,15 @@ def command(tif: Path, out: Path, address: str, *more: str) -> list[str]:
 
 
 def written(out: Path) -> int:
-    """Bytes of a package that is not finished yet."""
+    """Size in bytes of an unfinished package."""
     return sum(part.stat().st_size for part in out.parent.glob(f".{out.name}.*/part.gpkg"))
 
 
 @pytest.mark.slow
-def test_a_cluster_gives_the_same_bytes_also_when_a_worker_is_killed(tmp_path: Path) -> None:
-    """As a stranger would: the real scheduler, three real workers, the command line; then the scheduler dies."""
+def test_a_cluster_build_is_byte_identical_also_when_a_worker_is_killed(tmp_path: Path) -> None:
+    """End to end: the real scheduler, three real workers, the command line; then the scheduler dies."""
     bands = np.tile(map_rasters.texture(500, 500), (1, 17, 13))
-    bands[:, :300] = 0  # a collar, which the workers read from a file
+    bands[:, :300] = 0  # a collar mask, which the workers read from a file
     tif = map_rasters.utm(tmp_path / "i.tif", bands, tiled=True)
     heights = np.tile(map_rasters.texture(500, 500, seed=1)[:1], (1, 6, 5)).astype(np.float32)
     dem = map_rasters.utm(tmp_path / "d.tif", heights, pixel_m=2.0)
@@ -40,7 +40,7 @@ def test_a_cluster_gives_the_same_bytes_also_when_a_worker_is_killed(tmp_path: P
     here, there = tmp_path / "here" / "m.gpkg", tmp_path / "there" / "m.gpkg"
     build(tif, here, dem=dem)
     grid = MapPackage.open(here).manifest.dem
-    assert grid and len(height_places(grid)) >= TILES_PER_WORKER  # else the cluster has no part in them
+    assert grid and len(height_places(grid)) >= TILES_PER_WORKER  # otherwise the cluster computes no elevation tiles
     with local_cluster(tmp_path / "cluster", workers=3) as cluster:
         line = command(
             tif, there, cluster.address, "--dem", dem.name
@@ -50,8 +50,8 @@ def test_a_cluster_gives_the_same_bytes_also_when_a_worker_is_killed(tmp_path: P
             time.sleep(0.02)
         assert building.poll() is None, building.communicate()[1]
         cluster.workers[0].kill()
-        _, said = building.communicate(timeout=120)
-        assert building.returncode == 0, said
+        _, stderr = building.communicate(timeout=120)
+        assert building.returncode == 0, stderr
         assert there.read_bytes() == here.read_bytes()
         assert all(worker.poll() is None for worker in cluster.workers[1:])
 
@@ -62,7 +62,7 @@ def test_a_cluster_gives_the_same_bytes_also_when_a_worker_is_killed(tmp_path: P
     assert [path.name for path in there.parent.iterdir()] == ["m.gpkg"]
 
 
-def test_nobody_at_the_address(tmp_path: Path) -> None:
+def test_an_unreachable_cluster_is_reported(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -73,7 +73,7 @@ def test_nobody_at_the_address(tmp_path: Path) -> None:
     assert not (tmp_path / "m.gpkg").exists()
 
 
-def test_without_dask_one_line_says_what_to_install(tmp_path: Path) -> None:
+def test_without_dask_the_error_names_the_package_to_install(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
     hidden = command(tif, tmp_path / "m.gpkg", "tcp://127.0.0.1:1")
     hidden[2] = "import sys; sys.modules['distributed'] = None; " + hidden[2]

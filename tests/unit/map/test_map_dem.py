@@ -1,4 +1,4 @@
-"""Elevation as a tiled gridded coverage (OGC 17-066r1), against GDAL's own reading of it."""
+"""Elevation as a tiled gridded coverage (OGC 17-066r1), compared with GDAL's reader."""
 
 import sqlite3
 from pathlib import Path
@@ -17,7 +17,7 @@ from terrafix.map.package import MapPackage
 from terrafix_tools.mapping import build as build_module
 from terrafix_tools.mapping import parallel
 from terrafix_tools.mapping.build import build
-from terrafix_tools.mapping.dem import encode_heights
+from terrafix_tools.mapping.package.dem import encode_heights
 
 
 def mountains() -> np.ndarray:
@@ -38,7 +38,7 @@ def package(tmp_path: Path) -> Path:
     return build(tif, tmp_path / "m.gpkg", dem=dem)
 
 
-def test_gdal_reads_metres_where_we_do(package: Path) -> None:
+def test_gdal_reads_the_same_heights(package: Path) -> None:
     opened = MapPackage.open(package, verify=True)
     frame = LocalFrame(23.497, 121.043)
     local = opened.bind(frame)
@@ -60,14 +60,14 @@ def test_gdal_reads_metres_where_we_do(package: Path) -> None:
     known = np.isfinite(ours)
     assert 0.5 < known.mean() < 1.0 and known.sum() > 200
     here, seen = height_m[rows, columns], mask[rows, columns]
-    steep = np.abs(here - ours) > 1.0  # a place that is a millimetre off on the cliff
+    steep = np.abs(here - ours) > 1.0  # a position error of a millimetre on the cliff
     assert seen[known].all() and steep[known].mean() < 0.02
     assert np.abs(here - ours)[known & ~steep].max() < 0.2
     assert np.isnan(ours[~seen]).all()
     opened.close()
 
 
-def test_the_tables_are_those_of_the_standard(package: Path) -> None:
+def test_the_elevation_tables_follow_the_standard(package: Path) -> None:
     db = sqlite3.connect(package)
     assert db.execute("SELECT data_type FROM gpkg_contents WHERE table_name = 'elevation'").fetchone() == (
         "2d-gridded-coverage",
@@ -94,7 +94,7 @@ def test_the_tables_are_those_of_the_standard(package: Path) -> None:
 
 
 @pytest.mark.parametrize(("low", "span"), [(-430.0, 3.0), (0.0, 655.0), (100.0, 8700.0), (12.345, 0.0)])
-def test_heights_survive_their_encoding(low: float, span: float) -> None:
+def test_heights_are_preserved_by_their_encoding(low: float, span: float) -> None:
     height_m = (low + span * np.random.default_rng(1).random((256, 256))).astype(np.float32)
     known = np.ones((256, 256), bool)
     known[:3] = False
@@ -119,7 +119,7 @@ def test_several_processes_write_the_same_heights(tmp_path: Path, monkeypatch: p
     assert started == [2] and one.read_bytes() == two.read_bytes()
 
 
-def test_an_altered_scale_of_a_tile_is_noticed(package: Path) -> None:
+def test_an_altered_tile_scale_is_detected(package: Path) -> None:
     db = sqlite3.connect(package)
     db.execute("UPDATE gpkg_2d_gridded_tile_ancillary SET offset = offset + 100 WHERE tpudt_id = 1")
     db.commit()
@@ -128,7 +128,7 @@ def test_an_altered_scale_of_a_tile_is_noticed(package: Path) -> None:
         MapPackage.open(package, verify=True)
 
 
-def test_a_dem_that_breaks_off_is_one_line(tmp_path: Path) -> None:
+def test_a_truncated_dem_is_a_one_line_error(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
     corner = Affine(5, 0, 299_500, 0, -5, 2_600_500)
     dem = map_rasters.write_tif(tmp_path / "d.tif", mountains(), "EPSG:32651", corner)
@@ -141,7 +141,7 @@ def test_a_dem_that_breaks_off_is_one_line(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d.tif", "i.tif"]
 
 
-def test_pictures_and_heights_are_not_taken_for_each_other(tmp_path: Path) -> None:
+def test_imagery_and_elevation_files_are_not_confused(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
     dem = map_rasters.utm(tmp_path / "d.tif", mountains())
     with pytest.raises(MapError, match=r"i\.tif: has 3 bands, elevation has one"):

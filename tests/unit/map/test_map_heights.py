@@ -1,4 +1,4 @@
-"""Heights of elevation rasters become what an autopilot calls above mean sea level."""
+"""Conversion of elevation raster heights to AMSL as autopilots define it."""
 
 from pathlib import Path
 
@@ -9,15 +9,15 @@ from pyproj import Transformer
 
 import map_rasters
 from terrafix.core.errors import MapError, UsageError
-from terrafix_tools.mapping import heights
-from terrafix_tools.mapping.heights import to_amsl
-from terrafix_tools.mapping.heights_datum import Datum
+from terrafix_tools.mapping.package import heights
+from terrafix_tools.mapping.package.height_datums import Datum
+from terrafix_tools.mapping.package.heights import to_amsl
 
 HEIGHT_M = np.linspace(300.0, 900.0, 200 * 300, dtype=np.float32).reshape(1, 200, 300)
 
 
 def write_geoid(path: Path, west: float = 118.0, constant_m: float = 0.0) -> Path:
-    """N = constant + 10 m + 2 m for each degree east of 120, 3 m for each degree north of 20; NOAA's .gtx format."""
+    """N = constant + 10 m + 2 m per degree east of 120 + 3 m per degree north of 20; NOAA's .gtx format."""
     lon_deg, lat_deg = np.meshgrid(west + 0.25 * np.arange(33), 18.0 + 0.25 * np.arange(33))
     values = (constant_m + 10.0 + 2.0 * (lon_deg - 120.0) + 3.0 * (lat_deg - 20.0)).astype(">f4")
     head = np.array([18.0, west, 0.25, 0.25], ">f8").tobytes() + np.array([33, 33], ">i4").tobytes()
@@ -38,7 +38,7 @@ def undulation_m(column: float, row: float, constant_m: float = 0.0) -> float:
     return constant_m + 10.0 + 2.0 * (lon_deg - 120.0) + 3.0 * (lat_deg - 20.0)
 
 
-def test_heights_above_the_ellipsoid_lose_the_undulation(tmp_path: Path) -> None:
+def test_ellipsoidal_heights_are_reduced_by_the_undulation(tmp_path: Path) -> None:
     dem, geoid = write_dem(tmp_path / "dem.tif"), write_geoid(tmp_path / "geoid.gtx")
     used, note = to_amsl(dem, Datum.ELLIPSOID, tmp_path / "out.tif", geoid)
     assert used == tmp_path / "out.tif" and "ellipsoid to EGM96" in note
@@ -51,9 +51,7 @@ def test_heights_above_the_ellipsoid_lose_the_undulation(tmp_path: Path) -> None
     assert np.isnan(made[:20, :30]).all() and np.isfinite(made[20:]).all()
 
 
-def test_heights_above_egm2008_are_converted_where_both_grids_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_egm2008_heights_are_converted_when_both_grids_exist(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     other = write_geoid(tmp_path / "egm08.gtx", constant_m=0.7)
     monkeypatch.setitem(heights.GRIDS, Datum.EGM2008, str(other))
     used, _ = to_amsl(write_dem(tmp_path / "d.tif"), Datum.EGM2008, tmp_path / "o.tif", write_geoid(tmp_path / "g.gtx"))
@@ -61,7 +59,7 @@ def test_heights_above_egm2008_are_converted_where_both_grids_are(
         assert np.nanmax(np.abs(file.read(1)[50:] - HEIGHT_M[0, 50:] - 0.7)) < 0.002
 
 
-def test_what_happens_without_grids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_geoid_grids_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(heights.GRIDS, Datum.EGM96, "no_such_grid.tif")
     monkeypatch.setitem(heights.GRIDS, Datum.EGM2008, "no_such_grid.tif")
     dem = write_dem(tmp_path / "dem.tif")

@@ -1,4 +1,4 @@
-"""Several layers of different dates in one package, and packages of the first format."""
+"""Several layers of different dates in one package, and packages of format 1."""
 
 from functools import partial
 from pathlib import Path
@@ -15,14 +15,14 @@ from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build_package, layer_of
-from terrafix_tools.mapping.dem import DemSource
 from terrafix_tools.mapping.layers import ElevationInput
+from terrafix_tools.mapping.package.dem import DemSource
 
 LAT_DEG, LON_DEG = 23.4986, 121.0426
 
 
 def placed(path: Path, seed: int, crs: str, pixel: float, side_px: int) -> Path:
-    """A texture around the same place of the earth."""
+    """A texture around the same WGS84 position."""
     x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(LON_DEG, LAT_DEG)
     corner = Affine(pixel, 0, x - side_px * pixel / 2, 0, -pixel, y + side_px * pixel / 2)
     return map_rasters.write_tif(path, map_rasters.texture(side_px, side_px, seed), crs, corner)
@@ -42,7 +42,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_package(layers, folder / "m.gpkg")
 
 
-def test_the_newest_is_first_and_each_layer_says_what_it_is(package: Path) -> None:
+def test_layers_are_ordered_by_date_with_their_metadata(package: Path) -> None:
     opened = MapPackage.open(package, verify=True)
     manifest = opened.manifest
     assert [(x.table, x.date, x.source, x.ce90_m) for x in manifest.layers] == [
@@ -58,7 +58,7 @@ def test_the_newest_is_first_and_each_layer_says_what_it_is(package: Path) -> No
     opened.close()
 
 
-def test_a_window_shows_the_layer_that_is_asked_for_at_the_same_place(package: Path) -> None:
+def test_a_window_shows_the_requested_layer_at_the_same_position(package: Path) -> None:
     opened = MapPackage.open(package)
     frame = LocalFrame(LAT_DEG, LON_DEG)
     local = opened.bind(frame)
@@ -69,16 +69,16 @@ def test_a_window_shows_the_layer_that_is_asked_for_at_the_same_place(package: P
     bound = opened.bind(frame, "imagery_2")
     assert np.array_equal(bound.window(-50, 50, 100, 100, 1.0)[0], old)
     assert bound.gsd_m == pytest.approx(0.5, rel=1e-3) and bound.bounds_m != local.bounds_m
-    # The texture of seed 1, by its own pixels: 100 m in the middle of an image of 350 m.
+    # The texture of seed 1 at full resolution: the central 100 m of an image of 350 m.
     texture = map_rasters.texture(700, 700, 1)[::-1, 250:450, 250:450].transpose(1, 2, 0).astype(np.float64)
     expected = texture.reshape(100, 2, 100, 2, 3).mean(axis=(1, 3))
-    turned = old.astype(np.float64)  # UTM's north is within half a degree of true north here
+    turned = old.astype(np.float64)  # grid north is within half a degree of true north here
     inner = np.s_[10:90, 10:90]
     assert np.corrcoef(expected[inner].ravel(), turned[inner].ravel())[0, 1] > 0.9
     opened.close()
 
 
-def test_cover_is_that_of_the_layer(package: Path) -> None:
+def test_coverage_is_that_of_the_layer(package: Path) -> None:
     opened = MapPackage.open(package)
     lat_deg, lon_deg = LocalFrame(LAT_DEG, LON_DEG).to_wgs84(280.0, 0.0)
     assert not opened.covers(lat_deg, lon_deg) and not opened.covers(lat_deg, lon_deg, "imagery_2")
@@ -88,14 +88,14 @@ def test_cover_is_that_of_the_layer(package: Path) -> None:
     opened.close()
 
 
-def test_gdal_sees_every_layer_with_its_own_grid(package: Path) -> None:
+def test_gdal_reads_every_layer_with_its_grid(package: Path) -> None:
     for table, crs, pixel in (("imagery", 3857, 1.0), ("imagery_2", 32651, 0.5), ("imagery_3", 32651, 2.0)):
         with rasterio.open(f"GPKG:{package}:{table}") as file:
             assert file.crs.to_epsg() == crs and file.transform.a == pytest.approx(pixel)
             assert file.dataset_mask().mean() > 250
 
 
-def test_elevation_lies_under_the_newest_layer(tmp_path: Path) -> None:
+def test_elevation_is_built_for_the_newest_layer(tmp_path: Path) -> None:
     new = placed(tmp_path / "new.tif", 2, "EPSG:3857", 1.0, 300)
     old = placed(tmp_path / "old.tif", 1, "EPSG:32651", 0.5, 300)
     height = np.full((1, 60, 60), 321.5, np.float32)
@@ -111,7 +111,7 @@ def test_elevation_lies_under_the_newest_layer(tmp_path: Path) -> None:
     opened.close()
 
 
-def test_a_package_of_the_first_format_still_flies(tmp_path: Path) -> None:
+def test_a_format_1_package_is_readable(tmp_path: Path) -> None:
     opened = MapPackage.open(map_format1.unpack(tmp_path), verify=True)
     manifest = opened.manifest
     assert (manifest.format_version, manifest.date, manifest.licence, manifest.ce90_m) == (1, "2020-07-10", "CC0", 4.0)
@@ -126,7 +126,7 @@ def test_a_package_of_the_first_format_still_flies(tmp_path: Path) -> None:
     opened.close()
 
 
-def test_damage_in_a_package_of_the_first_format_is_still_noticed(tmp_path: Path) -> None:
+def test_damage_in_a_format_1_package_is_detected(tmp_path: Path) -> None:
     path = map_format1.unpack(tmp_path)
     content = path.read_bytes()
     at = content.index(b"\x89PNG") + 3000  # in the middle of a tile

@@ -1,4 +1,4 @@
-"""Several sources as one picture: which pixel comes from where, and to its place."""
+"""Mosaics of several sources: the source and the position of each pixel."""
 
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from rasterio.transform import Affine
 import map_rasters
 import map_servers
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area import Area, Placed
-from terrafix_tools.mapping.area_files import read_area
-from terrafix_tools.mapping.mosaic import Mosaic, MosaicPlan
-from terrafix_tools.mapping.mosaic_cover import uncovered
-from terrafix_tools.mapping.mosaic_grid import grid_for
+from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.mosaic.cover import uncovered
+from terrafix_tools.mapping.mosaic.grid import grid_for
+from terrafix_tools.mapping.mosaic.mosaic import Mosaic, MosaicPlan
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.sources.collared import raster_opener
 from terrafix_tools.mapping.sources.tile_grid import tiles_of
@@ -38,8 +38,8 @@ def mosaic(area: Area, *parts: object, gsd_m: float | None = None) -> Mosaic:
     return Mosaic(plan)
 
 
-def test_the_first_source_with_a_pixel_wins_and_its_pixels_are_copied(tmp_path: Path) -> None:
-    """Two images of one raster; the first has a hole, and ends in the middle."""
+def test_the_first_source_with_a_valid_pixel_is_copied(tmp_path: Path) -> None:
+    """Two images of one raster; the first has a hole and covers only half of the area."""
     bands = map_rasters.texture(400, 600, seed=1)
     mask = np.full((1, 400, 300), 255, np.uint8)
     mask[:, 100:200, 50:150] = 0
@@ -55,11 +55,11 @@ def test_the_first_source_with_a_pixel_wins_and_its_pixels_are_copied(tmp_path: 
     expected[:, :, :300] = np.where(mask > 0, bands[:, :, :300], expected[:, :, :300])
     expected = expected[::-1, row : row + made.height_px, column : column + made.width_px].transpose(1, 2, 0)
     assert (image[valid > 0] == expected[valid > 0]).all()
-    assert valid.mean() > 0.98 * 255  # all of the box; its sides are not quite those of the zone's grid
+    assert valid.mean() > 0.98 * 255  # the whole box, whose sides are slightly rotated against the zone's grid
 
 
-def test_a_source_in_another_crs_lands_where_it_belongs(tmp_path: Path) -> None:
-    """A smooth function of place, seen through Web Mercator tiles of half the detail, on a UTM grid."""
+def test_a_source_in_another_crs_is_reprojected_to_its_position(tmp_path: Path) -> None:
+    """A smooth function of position, from Web Mercator tiles of half the resolution, on a UTM grid."""
 
     def value(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return 128 + 60 * np.sin(x / 3.0) + 50 * np.cos(y / 4.0)
@@ -84,11 +84,13 @@ def test_a_source_in_another_crs_lands_where_it_belongs(tmp_path: Path) -> None:
         gy = made.y_max - (np.arange(made.height_px) + 0.5) * 0.5
     error = image[:, :, 0].astype(float) - value(*np.meshgrid(gx, gy))
     assert valid.mean() > 0.97 * 255
-    assert np.abs(error[valid > 0]).max() < 2.0  # rounding twice and bilinear; half a pixel to a side would be 4.5
+    assert (
+        np.abs(error[valid > 0]).max() < 2.0
+    )  # two roundings and bilinear interpolation; a shift by half a pixel would be 4.5
 
 
-def test_a_coarser_detail_is_averaged_and_not_picked(tmp_path: Path) -> None:
-    """A checkerboard of single pixels becomes grey."""
+def test_downsampling_averages_pixels(tmp_path: Path) -> None:
+    """A checkerboard of one-pixel squares becomes grey."""
     board = np.indices((1024, 1024)).sum(axis=0) % 2 * 200 + 20
     path = map_rasters.utm(tmp_path / "1.tif", np.repeat(board[None].astype(np.uint8), 3, axis=0))
     area = box_of("EPSG:32651", 300_100.0, 2_599_600.0, 300_400.0, 2_599_900.0)
@@ -98,18 +100,18 @@ def test_a_coarser_detail_is_averaged_and_not_picked(tmp_path: Path) -> None:
     assert np.abs(image[valid > 0].astype(int) - 120).max() <= 2
 
 
-def test_no_source_in_the_area(tmp_path: Path) -> None:
+def test_an_area_without_any_source_is_reported(tmp_path: Path) -> None:
     path = map_rasters.utm(tmp_path / "1.tif", map_rasters.texture(64, 64))
     far = box_of("EPSG:32651", 400_000.0, 2_599_600.0, 400_400.0, 2_599_900.0)
-    with ImagerySource(path) as source, pytest.raises(MapError, match="no source reaches"):
+    with ImagerySource(path) as source, pytest.raises(MapError, match="no source covers"):
         grid_for(far, [source], None)
     other_side = read_area("-60.0,23.0,-59.9,23.1", buffer_km=0.0)
     with ImagerySource(path) as source, pytest.raises(MapError, match=r"outside the coordinate system|no source"):
         grid_for(other_side, [source], None)
 
 
-def test_a_black_collar_is_no_pixel_of_a_mosaic(tmp_path: Path) -> None:
-    """As scanned maps and reprojected photographs have it: the second source shows through."""
+def test_a_black_collar_is_invalid_in_a_mosaic(tmp_path: Path) -> None:
+    """As in scanned maps and reprojected photographs: the second source is used there."""
     bands = map_rasters.texture(800, 800)
     bands[:, :, :300] = 0
     framed = map_rasters.utm(tmp_path / "1.tif", bands)
@@ -128,8 +130,8 @@ def test_a_black_collar_is_no_pixel_of_a_mosaic(tmp_path: Path) -> None:
     assert image[100:600, collar + 10 :].std() > 10
 
 
-def test_only_tiles_are_fetched_that_better_sources_leave_open(tmp_path: Path) -> None:
-    """An image over tiles 0 to 2 of four columns, with a hole of a few pixels in column 1."""
+def test_only_tiles_in_gaps_of_better_sources_are_fetched(tmp_path: Path) -> None:
+    """An image that covers tiles 0 to 2 of four columns, with a hole of a few pixels in column 1."""
     span_m = 2 * map_servers.HALF_M / (1 << WORLD.zoom)
     corner = WORLD.column * span_m - map_servers.HALF_M, map_servers.HALF_M - WORLD.row * span_m
     bands = np.concatenate([WORLD.image[:, :800].transpose(2, 0, 1), np.full((1, 768, 800), 255, np.uint8)])

@@ -1,4 +1,4 @@
-"""Opening map packages that are whole, damaged, altered, foreign or from the future."""
+"""Opening of map packages: intact, damaged, altered, of other programs, or of a future format."""
 
 import sqlite3
 import struct
@@ -12,11 +12,11 @@ from rasterio.transform import Affine
 import map_rasters
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
-from terrafix.map.checksum import BLANK, MARKER, VOLATILE
+from terrafix.map.checksum import DIGEST_MARKER, EMPTY_DIGEST, VOLATILE_HEADER_BYTES
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build, build_package, layer_of
-from terrafix_tools.mapping.dem import DemSource
 from terrafix_tools.mapping.layers import ElevationInput, VectorInput
+from terrafix_tools.mapping.package.dem import DemSource
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def change(path: Path, statement: str) -> None:
     db.close()
 
 
-def test_missing_foreign_and_truncated_files(tmp_path: Path, package: Path) -> None:
+def test_missing_foreign_and_truncated_files_are_rejected(tmp_path: Path, package: Path) -> None:
     with pytest.raises(MapError, match="no such map package"):
         MapPackage.open(tmp_path / "none.gpkg")
     with pytest.raises(MapError, match="not a map package"):
@@ -51,7 +51,7 @@ def test_missing_foreign_and_truncated_files(tmp_path: Path, package: Path) -> N
         MapPackage.open(package)
 
 
-def test_a_future_format_says_update(package: Path) -> None:
+def test_a_future_format_asks_for_an_update(package: Path) -> None:
     change(package, "UPDATE terrafix_manifest SET value = '99' WHERE key = 'format_version'")
     with pytest.raises(MapError, match=r"format 99.*update Terrafix"):
         MapPackage.open(package)
@@ -66,13 +66,13 @@ def test_a_future_format_says_update(package: Path) -> None:
         "UPDATE terrafix_hash SET sha256 = zeroblob(32) WHERE zoom_level = 0",
     ],
 )
-def test_an_altered_manifest_or_list_of_tiles_is_noticed_at_opening(package: Path, statement: str) -> None:
+def test_an_altered_manifest_or_tile_list_is_detected_at_opening(package: Path, statement: str) -> None:
     change(package, statement)
     with pytest.raises(MapError, match="checksum mismatch"):
         MapPackage.open(package)
 
 
-def test_an_altered_tile_is_void_in_flight_and_an_error_when_verified(package: Path) -> None:
+def test_an_altered_tile_is_missing_in_flight_and_an_error_when_verified(package: Path) -> None:
     swap = (
         "UPDATE imagery SET tile_data = (SELECT tile_data FROM imagery WHERE zoom_level = 0)"
         " WHERE zoom_level = 2 AND tile_column = 1 AND tile_row = 1"
@@ -91,13 +91,13 @@ def test_an_altered_tile_is_void_in_flight_and_an_error_when_verified(package: P
         MapPackage.open(package, verify=True)
 
 
-def test_a_lost_tile_is_noticed(package: Path) -> None:
+def test_a_lost_tile_is_detected(package: Path) -> None:
     change(package, "DELETE FROM imagery WHERE zoom_level = 2 AND tile_column = 0 AND tile_row = 0")
     with pytest.raises(MapError, match="zoom 2 column 0 row 0"):
         MapPackage.open(package, verify=True)
 
 
-def test_a_path_with_odd_characters_opens(tmp_path: Path) -> None:
+def test_a_path_with_special_characters_opens(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
     folder = tmp_path / "a b?c#d%41é"
     MapPackage.open(build(tif, folder / "m.gpkg"), verify=True).close()
@@ -105,7 +105,7 @@ def test_a_path_with_odd_characters_opens(tmp_path: Path) -> None:
 
 
 def everything(path: Path, *, verify: bool = True) -> tuple[object, ...]:
-    """All that a flight can learn from a package."""
+    """All data that a flight can read from a package."""
     opened = MapPackage.open(path, verify=verify)
     try:
         west, south, east, north = opened.manifest.bounds_wgs84
@@ -114,18 +114,18 @@ def everything(path: Path, *, verify: bool = True) -> tuple[object, ...]:
         far, _ = local.window(-160.0, 160.0, 80, 80, 4.0)
         up = local.elevation(np.linspace(-100, 100, 50), np.zeros(50))
         roads = opened.features("roads", west - 1, south - 1, east + 1, north + 1)
-        said = [(f.kind, f.name, f.attributes, [p.tobytes() for p in f.parts]) for f in roads]
+        features = [(f.kind, f.name, f.attributes, [p.tobytes() for p in f.parts]) for f in roads]
         heights = None if up is None else up.tobytes()
         assert not opened.damaged_tiles
-        return opened.manifest, image.tobytes(), valid.tobytes(), far.tobytes(), heights, said
+        return opened.manifest, image.tobytes(), valid.tobytes(), far.tobytes(), heights, features
     finally:
         opened.close()
 
 
 @pytest.mark.slow
-def test_one_flipped_bit_anywhere_is_refused(tmp_path: Path) -> None:
-    """All over the file: tiles, manifest, hashes, tables of the standard, indices, schema, free space. What SQLite may
-    change by looking is refused or changes nothing."""
+def test_a_flipped_bit_anywhere_is_detected(tmp_path: Path) -> None:
+    """In tiles, manifest, hashes, tables of the standard, indices, schema and free space. The header bytes that SQLite
+    rewrites may be altered without an effect."""
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(400, 400))
     plane = np.linspace(100, 160, 40 * 40, dtype=np.float32).reshape(1, 40, 40)
     corner = Affine(50, 0, 299_000, 0, -50, 2_601_000)
@@ -140,8 +140,13 @@ def test_one_flipped_bit_anywhere_is_refused(tmp_path: Path) -> None:
     whole = path.read_bytes()
     expected = everything(path)
     rng = np.random.default_rng(7)
-    header = [at for start, end in VOLATILE for at in range(start, end)]
-    for at in (*rng.integers(0, len(whole), 200), whole.index(MARKER) + 3, whole.index(MARKER) + 20, *header):
+    header = [at for start, end in VOLATILE_HEADER_BYTES for at in range(start, end)]
+    for at in (
+        *rng.integers(0, len(whole), 200),
+        whole.index(DIGEST_MARKER) + 3,
+        whole.index(DIGEST_MARKER) + 20,
+        *header,
+    ):
         bit = 1 << int(rng.integers(8))
         path.write_bytes(whole[:at] + bytes([whole[at] ^ bit]) + whole[at + 1 :])
         try:
@@ -151,8 +156,8 @@ def test_one_flipped_bit_anywhere_is_refused(tmp_path: Path) -> None:
             assert str(path) in str(error) and "\n" not in str(error)
 
 
-def test_swapped_tiles_are_refused(package: Path) -> None:
-    """Two good tiles in each other's places."""
+def test_swapped_tiles_are_detected(package: Path) -> None:
+    """Two valid tiles at swapped positions."""
     change(package, "UPDATE imagery SET tile_column = 9 WHERE zoom_level = 2 AND tile_column = 0 AND tile_row = 0")
     change(package, "UPDATE imagery SET tile_column = 0 WHERE zoom_level = 2 AND tile_column = 1 AND tile_row = 0")
     change(package, "UPDATE imagery SET tile_column = 1 WHERE zoom_level = 2 AND tile_column = 9 AND tile_row = 0")
@@ -160,10 +165,10 @@ def test_swapped_tiles_are_refused(package: Path) -> None:
         MapPackage.open(package, verify=True)
 
 
-def test_the_placement_that_other_programs_read_does_not_move_ours(package: Path) -> None:
-    """The tables of the standard are outside the checksum: what flies takes its placement from the manifest.
+def test_the_georeference_is_read_from_the_manifest_and_not_the_geopackage_tables(package: Path) -> None:
+    """The GeoPackage tables are not covered by the checksum; the reader takes the georeference from the manifest.
 
-    But they are under the seal."""
+    The file digest covers them."""
     before = everything(package)
     change(package, "UPDATE gpkg_tile_matrix_set SET min_x = min_x + 1000, max_y = max_y + 1000")
     change(package, "UPDATE gpkg_tile_matrix SET pixel_x_size = 2 * pixel_x_size")
@@ -172,8 +177,8 @@ def test_the_placement_that_other_programs_read_does_not_move_ours(package: Path
         everything(package)
 
 
-def test_a_look_with_a_program_that_opens_for_writing_leaves_the_seal_whole(package: Path) -> None:
-    """QGIS switches to a write-ahead log and back; that changes the header and nothing else."""
+def test_opening_the_file_for_writing_does_not_invalidate_the_file_digest(package: Path) -> None:
+    """QGIS switches to a write-ahead log and back, which changes only the header."""
     before = package.read_bytes()
     db = sqlite3.connect(package)
     for mode in ("WAL", "DELETE"):
@@ -184,11 +189,11 @@ def test_a_look_with_a_program_that_opens_for_writing_leaves_the_seal_whole(pack
     MapPackage.open(package, verify=True).close()
 
 
-def test_a_seal_that_signing_left_blank_says_nothing_and_one_that_is_gone_is_missed(package: Path) -> None:
+def test_a_blank_file_digest_is_accepted_and_a_missing_one_is_not(package: Path) -> None:
     whole = package.read_bytes()
-    at = whole.index(MARKER)
-    package.write_bytes(whole[:at] + BLANK + whole[at + len(BLANK) :])
+    at = whole.index(DIGEST_MARKER)
+    package.write_bytes(whole[:at] + EMPTY_DIGEST + whole[at + len(EMPTY_DIGEST) :])
     MapPackage.open(package, verify=True).close()
-    package.write_bytes(whole[:at] + bytes(len(BLANK)) + whole[at + len(BLANK) :])
+    package.write_bytes(whole[:at] + bytes(len(EMPTY_DIGEST)) + whole[at + len(EMPTY_DIGEST) :])
     with pytest.raises(MapError, match="altered since it was built"):
         MapPackage.open(package, verify=True)

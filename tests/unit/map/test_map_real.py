@@ -1,4 +1,4 @@
-"""Every map and image of the shared data set becomes a package that keeps the standard and shows the image."""
+"""Every image of the shared data set becomes a package that follows the standard and reproduces the image."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +30,7 @@ SLOW = [
 
 
 @pytest.mark.parametrize("name", [*FAST, *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
-def test_real_imagery(tmp_path: Path, data_set: Callable[[str], Path], name: str) -> None:
+def test_real_imagery_becomes_a_valid_package(tmp_path: Path, data_set: Callable[[str], Path], name: str) -> None:
     tif = data_set(name)
     dem = data_set("imagery/swellendam/srtm.tif") if "swellendam" in name else None
     out = build(tif, tmp_path / "m.gpkg", dem=dem)

@@ -1,4 +1,4 @@
-"""Signed packages: who may be trusted, what is refused and why."""
+"""Signed packages: trusted keys, and the reasons for a rejection."""
 
 import sqlite3
 import stat
@@ -12,11 +12,11 @@ import map_format1
 import map_rasters
 from terrafix.core.errors import ConfigError, MapError, OutputError, UsageError
 from terrafix.core.signature import TrustedKey, generate, is_signed, read_public, trusted_keys
-from terrafix.map.checksum import write_seal
+from terrafix.map.checksum import write_file_digest
 from terrafix.map.package import MapPackage
 from terrafix_tools.live import package_for
 from terrafix_tools.mapping.build import build
-from terrafix_tools.mapping.sign import sign_package
+from terrafix_tools.mapping.package.sign import sign_package
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def change(path: Path, statement: str, *values: object) -> None:
     db.close()
 
 
-def test_signature_is_that_of_rfc_8032() -> None:
+def test_signatures_follow_rfc_8032() -> None:
     """Test 2 of RFC 8032, section 7.1."""
     public = bytes.fromhex("3d4017c3e843895a92b70aa74d1b7ebc9c982ccf2ec4968cc0cd55f12af4660c")
     signature = bytes.fromhex(
@@ -49,14 +49,14 @@ def test_signature_is_that_of_rfc_8032() -> None:
     assert not is_signed(TrustedKey(public[:-1]), b"\x72", signature)
 
 
-def test_a_signed_package_opens_where_its_signer_is_trusted(tmp_path: Path, package: Path) -> None:
+def test_a_signed_package_opens_with_a_trusted_key(tmp_path: Path, package: Path) -> None:
     private, public, key = keys(tmp_path)
     before = package.read_bytes()
     assert sign_package(package, private) == key
     opened = MapPackage.open(package, verify=True, trusted=[key])
     assert opened.signed_by == (key.key_id,)
     assert opened.manifest.checksum.encode() in before
-    # The signature by the library itself, over what the document says.
+    # The signature computed with the library, over the documented bytes.
     loaded = load_pem_private_key(private.read_bytes(), password=None)
     assert isinstance(loaded, Ed25519PrivateKey)
     db = sqlite3.connect(package)
@@ -72,7 +72,7 @@ def test_a_signed_package_opens_where_its_signer_is_trusted(tmp_path: Path, pack
     assert trusted_keys([str(public)], required=False) is None
 
 
-def test_unsigned_foreign_and_altered_packages_are_refused_with_the_reason(tmp_path: Path, package: Path) -> None:
+def test_unsigned_foreign_and_altered_packages_are_rejected_with_the_reason(tmp_path: Path, package: Path) -> None:
     private, _, key = keys(tmp_path)
     _, _, other = keys(tmp_path, "other")
     MapPackage.open(package).close()
@@ -88,13 +88,11 @@ def test_unsigned_foreign_and_altered_packages_are_refused_with_the_reason(tmp_p
         MapPackage.open(package)
     package.write_bytes(whole)
     change(package, "UPDATE terrafix_signature SET signature = zeroblob(64)")
-    with pytest.raises(MapError, match="wrong signature"):  # also where no signature is asked for
+    with pytest.raises(MapError, match="wrong signature"):  # also when no signature is required
         MapPackage.open(package)
 
 
-def test_somebody_who_makes_the_checksum_right_again_cannot_make_the_signature_right(
-    tmp_path: Path, package: Path
-) -> None:
+def test_a_forged_checksum_does_not_pass_the_signature(tmp_path: Path, package: Path) -> None:
     private, _, key = keys(tmp_path)
     sign_package(package, private)
     other = build(map_rasters.utm(tmp_path / "j.tif", map_rasters.texture(300, 300, seed=9)), tmp_path / "n.gpkg")
@@ -104,10 +102,10 @@ def test_somebody_who_makes_the_checksum_right_again_cannot_make_the_signature_r
     change(other, "INSERT INTO terrafix_signature (key_id, public_key, signature) VALUES (?, ?, ?)", *row)
     with pytest.raises(MapError, match="wrong signature"):
         MapPackage.open(other, trusted=[key])
-    # A key of the attacker's under the name of the trusted one.
+    # The attacker's key under the id of the trusted one.
     mine, _, attacker = keys(tmp_path, "attacker")
     change(other, "DELETE FROM terrafix_signature")
-    write_seal(other)  # needs no key: the seal is against accidents
+    write_file_digest(other)  # needs no key: the file digest protects against accidents only
     sign_package(other, mine)
     change(other, "UPDATE terrafix_signature SET key_id = ?", key.key_id)
     with pytest.raises(MapError, match="wrong signature"):
@@ -115,7 +113,7 @@ def test_somebody_who_makes_the_checksum_right_again_cannot_make_the_signature_r
     assert attacker != key
 
 
-def test_two_may_sign_and_signing_twice_changes_nothing(tmp_path: Path, package: Path) -> None:
+def test_two_keys_can_sign_and_signing_twice_changes_nothing(tmp_path: Path, package: Path) -> None:
     first, _, one = keys(tmp_path)
     second, _, two = keys(tmp_path, "second")
     sign_package(package, first)
@@ -136,7 +134,7 @@ def test_a_damaged_package_is_not_signed(tmp_path: Path, package: Path) -> None:
         sign_package(package, private)
 
 
-def test_an_interrupted_signing_is_noticed_and_taken_back(tmp_path: Path, package: Path) -> None:
+def test_an_interrupted_signing_is_detected_and_rolled_back(tmp_path: Path, package: Path) -> None:
     private, _, key = keys(tmp_path)
     db = sqlite3.connect(package)
     db.execute("PRAGMA cache_size = 1")
@@ -150,14 +148,14 @@ def test_an_interrupted_signing_is_noticed_and_taken_back(tmp_path: Path, packag
     db.rollback()
     db.close()
     package.write_bytes(half)
-    package.with_name("m.gpkg-journal").write_bytes(journal)  # as a power cut leaves it
+    package.with_name("m.gpkg-journal").write_bytes(journal)  # as after a power failure
     with pytest.raises(MapError, match=r"interrupted.*terrafix map sign"):
         MapPackage.open(package)
     sign_package(package, private)
     MapPackage.open(package, verify=True, trusted=[key]).close()
 
 
-def test_keys_that_are_none(tmp_path: Path, package: Path) -> None:
+def test_invalid_keys_are_reported(tmp_path: Path, package: Path) -> None:
     private, public, _ = keys(tmp_path)
     with pytest.raises(OutputError, match="never overwritten"):
         generate(private, public, "")
@@ -175,7 +173,7 @@ def test_keys_that_are_none(tmp_path: Path, package: Path) -> None:
             trusted_keys(paths, required=True)
 
 
-def test_a_package_of_the_first_format_is_not_signed(tmp_path: Path) -> None:
+def test_a_format_1_package_cannot_be_signed(tmp_path: Path) -> None:
     first_format = map_format1.unpack(tmp_path)
     private, _, key = keys(tmp_path)
     with pytest.raises(MapError, match=r"format 1.*build it again"):
@@ -184,7 +182,7 @@ def test_a_package_of_the_first_format_is_not_signed(tmp_path: Path) -> None:
         MapPackage.open(first_format, trusted=[key])
 
 
-def test_a_run_that_requires_signatures_refuses_before_it_starts(tmp_path: Path, package: Path) -> None:
+def test_a_run_that_requires_signatures_rejects_an_unsigned_map_before_it_starts(tmp_path: Path, package: Path) -> None:
     private, public, _ = keys(tmp_path)
     config = tmp_path / "my.toml"
     config.write_text(f'[map]\nrequire_signature = true\ntrusted_keys = ["{public}"]\n')
@@ -200,5 +198,5 @@ def test_a_run_that_requires_signatures_refuses_before_it_starts(tmp_path: Path,
     change(
         package, "UPDATE imagery SET tile_data = zeroblob(9) WHERE zoom_level = 1 AND tile_column = 0 AND tile_row = 0"
     )
-    with pytest.raises(MapError, match="altered or lost"):  # every tile, not only the list of them
+    with pytest.raises(MapError, match="altered or lost"):  # verifies every tile, not only the tile list
         package_for("/dev/video0", start, package, [config])

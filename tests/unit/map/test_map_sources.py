@@ -1,4 +1,4 @@
-"""Sources of imagery: what a person may write, and files of tiles."""
+"""Imagery sources: source specifications and tile files."""
 
 import contextlib
 import gzip
@@ -14,28 +14,28 @@ from pyproj import CRS
 
 import map_servers
 from terrafix.core.errors import ConfigError, MapError, UsageError
-from terrafix_tools.mapping.area import Area, Placed
-from terrafix_tools.mapping.area_files import read_area
+from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.files import read_area
 from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
 from terrafix_tools.mapping.sources.tile_files import open_tiles
 from terrafix_tools.mapping.sources.tile_grid import Tile, ground_pixel_m, tiles_of, zoom_for
 from terrafix_tools.mapping.sources.tile_imagery import TileImagery
 from terrafix_tools.mapping.sources.tile_job import tile_file_opener
-from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode, picture_side
+from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode, image_side
 from terrafix_tools.mapping.sources.tile_store import TileStore
 from terrafix_tools.mapping.sources.url_template import UrlTemplate
 
 BERLIN = Tile(17, 70406, 42987)  # the tile of the Brandenburg Gate, by the formula of the OpenStreetMap wiki
 
 
-def test_the_tile_of_a_known_place() -> None:
+def test_the_tile_index_of_a_known_position() -> None:
     lon_deg, lat_deg = 13.3777, 52.5163
     area = Area("gate", (np.array([[lon_deg, lat_deg], [lon_deg + 1e-6, lat_deg], [lon_deg, lat_deg + 1e-6]]),))
     assert list(tiles_of(Placed(area, CRS.from_epsg(3857)), 17)) == [BERLIN]
 
 
-def test_the_zoom_follows_the_wanted_detail() -> None:
-    # 156543.03 m a pixel at zoom 0 on the equator, halved with every zoom.
+def test_the_zoom_follows_the_requested_resolution() -> None:
+    # 156543.03 m per pixel at zoom 0 on the equator, halved with every zoom level.
     assert zoom_for(0.6, 0.0, 256) == 18 and zoom_for(0.59, 0.0, 256) == 19 and zoom_for(0.6, 0.0, 512) == 17
     assert zoom_for(0.3, 60.0, 256) == 18
     assert ground_pixel_m(18, 60.0, 256) == pytest.approx(0.29858, abs=1e-4)
@@ -52,7 +52,7 @@ def test_the_zoom_follows_the_wanted_detail() -> None:
         ("http://h/{z}/{x}/{y}?key=${MAP_KEY}", "http://h/17/70406/42987?key=a{b}"),
     ],
 )  # fmt: skip
-def test_addresses_of_a_tile(template: str, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_url_templates_are_expanded(template: str, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAP_KEY", "a{b}")
     UrlTemplate(template).check()
     assert UrlTemplate(template).url(BERLIN) == url
@@ -68,18 +68,18 @@ def test_addresses_of_a_tile(template: str, url: str, monkeypatch: pytest.Monkey
         ("http://h/{z}/{x}/{y}?k=${NO_SUCH_KEY}", "export NO_SUCH_KEY"),
     ],
 )
-def test_addresses_that_cannot_work(text: str, reason: str) -> None:
+def test_invalid_url_templates_are_rejected(text: str, reason: str) -> None:
     with pytest.raises(UsageError, match=reason.replace("{", r"\{").replace("}", r"\}")):
         parse_sources([text], licence="CC0")
 
 
-def test_a_source_of_the_network_needs_a_licence() -> None:
-    with pytest.raises(UsageError, match="under which licence"):
+def test_a_network_source_needs_a_licence() -> None:
+    with pytest.raises(UsageError, match="needs the licence"):
         parse_sources(["http://h/{z}/{x}/{y}.png"])
     assert parse_sources(["a.tif", "sentinel-2"])[1].service == "sentinel-2"
 
 
-def test_a_file_of_sources(tmp_path: Path) -> None:
+def test_a_source_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "maps.toml"
     path.write_text(
         '[[source]]\npath = "town.tif"\ndate = "2023-06-01"\nce90_m = 3.0\n'
@@ -98,7 +98,7 @@ def test_a_file_of_sources(tmp_path: Path) -> None:
     [
         ("", "source"),
         ("source = []", r"has no \[\[source\]\]"),
-        ('[[source]]\nurl = "http://h/{z}/{x}/{y}"\n', "under which licence"),
+        ('[[source]]\nurl = "http://h/{z}/{x}/{y}"\n', "needs the licence"),
         ('[[source]]\npath = "a.tif"\nurl = "http://h/{z}/{x}/{y}"\n', "exactly one of"),
         ("[[source]]\n", "exactly one of"),
         ('[[source]]\npath = "a.tif"\nzooom = 3\n', "zooom"),
@@ -108,7 +108,7 @@ def test_a_file_of_sources(tmp_path: Path) -> None:
         ("[[source]\n", "cannot be read as TOML"),
     ],
 )
-def test_files_of_sources_that_are_wrong(tmp_path: Path, text: str, reason: str) -> None:
+def test_invalid_source_files_are_rejected(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "maps.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=reason) as caught:
@@ -142,7 +142,7 @@ def write_pmtiles(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["mbtiles", "pmtiles"])
-def test_files_of_tiles_are_read_pixel_for_pixel(tmp_path: Path, kind: str) -> None:
+def test_tile_files_are_read_pixel_by_pixel(tmp_path: Path, kind: str) -> None:
     path = (write_mbtiles if kind == "mbtiles" else write_pmtiles)(tmp_path / f"a.{kind}")
     area = read_area(WORLD.box_deg(), buffer_km=1.0)
     with tile_file_opener(SourceSpec(path=str(path)), area, None)() as imagery:
@@ -153,7 +153,7 @@ def test_files_of_tiles_are_read_pixel_for_pixel(tmp_path: Path, kind: str) -> N
     assert not mask[:20].any() and not mask[:, :10].any() and not mask[-20:].any() and not mask[:, -10:].any()
 
 
-def test_a_missing_tile_is_a_hole_and_a_wanted_zoom_must_be_there(tmp_path: Path) -> None:
+def test_a_missing_tile_is_a_hole_and_the_requested_zoom_must_exist(tmp_path: Path) -> None:
     path = write_mbtiles(tmp_path / "a.mbtiles", skip=(1, 1))
     area = read_area(WORLD.box_deg(0.2), buffer_km=0.0)
     with tile_file_opener(SourceSpec(path=str(path)), area, None)() as imagery:
@@ -163,7 +163,7 @@ def test_a_missing_tile_is_a_hole_and_a_wanted_zoom_must_be_there(tmp_path: Path
         tile_file_opener(SourceSpec(path=str(path), zoom=12), area, None)
 
 
-def test_files_that_are_no_tiles(tmp_path: Path) -> None:
+def test_invalid_tile_files_are_reported(tmp_path: Path) -> None:
     for name in ("a.mbtiles", "a.pmtiles"):
         with pytest.raises(MapError, match="no such file"):
             open_tiles(tmp_path / name)
@@ -182,7 +182,7 @@ def test_files_that_are_no_tiles(tmp_path: Path) -> None:
         open_tiles(tmp_path / "c.pmtiles").get(Tile(16, WORLD.column, WORLD.row))
 
 
-def test_a_file_of_empty_tiles_is_named(tmp_path: Path) -> None:
+def test_a_tile_file_of_empty_tiles_is_reported(tmp_path: Path) -> None:
     with contextlib.closing(sqlite3.connect(tmp_path / "a.mbtiles")) as db:
         db.execute("CREATE TABLE tiles (zoom_level INTEGER, tile_column INTEGER, tile_row INTEGER, tile_data BLOB)")
         db.execute("INSERT INTO tiles VALUES (16, 1, 1, NULL)")
@@ -190,12 +190,12 @@ def test_a_file_of_empty_tiles_is_named(tmp_path: Path) -> None:
             db.execute(f"UPDATE tiles SET tile_data = {tile}")
             db.commit()
             reader = open_tiles(tmp_path / "a.mbtiles")
-            with pytest.raises(MapError, match=r"a\.mbtiles: its tiles are no square pictures"):
-                picture_side(reader.first(16), tmp_path / "a.mbtiles")
+            with pytest.raises(MapError, match=r"a\.mbtiles: its tiles are not square images"):
+                image_side(reader.first(16), tmp_path / "a.mbtiles")
             reader.close()
 
 
-def test_a_damaged_tile_in_a_file_is_named(tmp_path: Path) -> None:
+def test_a_damaged_tile_in_a_tile_file_is_reported(tmp_path: Path) -> None:
     path = write_mbtiles(tmp_path / "a.mbtiles")
     with TileStore(path, "test") as store:
         store.add(Tile(16, WORLD.column, WORLD.row), b"")
@@ -204,7 +204,7 @@ def test_a_damaged_tile_in_a_file_is_named(tmp_path: Path) -> None:
         imagery.read(0, 0, 10, 10)
 
 
-def test_pictures_of_tiles() -> None:
+def test_tile_images_are_decoded() -> None:
     grey = np.arange(256, dtype=np.uint8)[None].repeat(256, axis=0)
     assert (decode(cv2.imencode(".png", grey)[1].tobytes(), 256)[:, :, :3] == grey[:, :, None]).all()
     clear = np.full((256, 256, 4), 100, np.uint8)

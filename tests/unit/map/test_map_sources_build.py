@@ -1,4 +1,4 @@
-"""`terrafix map build --area` from end to end: servers, files, estimate, package."""
+"""`terrafix map build --area` end to end: servers, files, estimate, package."""
 
 import io
 import json
@@ -13,10 +13,10 @@ from rich.console import Console
 
 import map_rasters
 import map_servers
-from map_servers import Asked, Reply, serving
+from map_servers import Reply, Request, serving
 from terrafix.core.errors import MapError, TerrafixError, UsageError
 from terrafix.map.package import MapPackage
-from terrafix_tools.mapping.area_build import Order, build_order
+from terrafix_tools.mapping.area.build import Order, build_order
 
 WORLD = map_servers.pyramid(5, 6, zoom=17)
 
@@ -37,7 +37,7 @@ def console(text: io.StringIO) -> Console:
 
 
 def assert_shows_the_world(package: Path, most: float = 2.7) -> None:
-    """The package against the image that the tiles were cut from, placed by hand."""
+    """Compares the package with the image that the tiles were cut from, at its known position."""
     span_m = 2 * map_servers.HALF_M / (1 << WORLD.zoom)
     with rasterio.open(package) as file:
         assert file.crs.to_epsg() == 3857 and file.transform.a == pytest.approx(span_m / 256)
@@ -47,21 +47,21 @@ def assert_shows_the_world(package: Path, most: float = 2.7) -> None:
         image, valid = file.read([3, 2, 1]).transpose(1, 2, 0), file.dataset_mask() > 0
     truth = WORLD.image[round(row) :, round(column) :][: image.shape[0], : image.shape[1]]
     assert valid.mean() > 0.98 and np.abs(image[valid].astype(float) - truth[valid]).mean() < most
-    # A pixel further would be seen.
+    # The comparison is sensitive to a shift by one pixel.
     assert np.abs(image[:, 1:].astype(float) - truth[:, :-1])[valid[:, 1:]].mean() > 1.5 * most
 
 
 @pytest.mark.slow
-def test_a_tile_server_becomes_a_package_and_the_second_time_nothing_is_fetched(tmp_path: Path) -> None:
+def test_a_tile_server_becomes_a_package_and_a_second_build_fetches_nothing(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server:
-        said = io.StringIO()
-        out = build_order(order(tmp_path, server.url, say=console(said)))
+        output = io.StringIO()
+        out = build_order(order(tmp_path, server.url, say=console(output)))
         assert out is not None
-        asked = len(server.asked)
-        assert asked == 30 and "12 of 30 there, 18 to fetch" in said.getvalue()
+        request = len(server.requests)
+        assert request == 30 and "12 of 30 there, 18 to fetch" in output.getvalue()
         first = out.read_bytes()
         build_order(order(tmp_path, server.url))
-        assert len(server.asked) == asked and out.read_bytes() == first
+        assert len(server.requests) == request and out.read_bytes() == first
     assert_shows_the_world(out)
     package = MapPackage.open(out, verify=True)
     assert package.manifest.licence == "CC0" and package.manifest.source == server.url + "/{z}/{x}/{y}.png"
@@ -71,17 +71,17 @@ def test_a_tile_server_becomes_a_package_and_the_second_time_nothing_is_fetched(
 
 def test_an_estimate_fetches_a_sample_and_writes_nothing(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server:
-        said = io.StringIO()
-        assert build_order(order(tmp_path, server.url, estimate_only=True, say=console(said))) is None
-        assert len(server.asked) == 12
-    assert not (tmp_path / "m.gpkg").exists() and "MB in" in said.getvalue()
+        output = io.StringIO()
+        assert build_order(order(tmp_path, server.url, estimate_only=True, say=console(output))) is None
+        assert len(server.requests) == 12
+    assert not (tmp_path / "m.gpkg").exists() and "MB in" in output.getvalue()
 
 
-def test_a_download_that_fails_half_way_leaves_no_package_and_goes_on_later(tmp_path: Path) -> None:
+def test_a_failed_download_leaves_no_package_and_resumes_later(tmp_path: Path) -> None:
     broken = True
 
-    def answer(asked: Asked) -> Reply:
-        return Reply(403, b"enough for today") if broken and len(server.asked) > 20 else WORLD.answer(asked)
+    def answer(request: Request) -> Reply:
+        return Reply(403, b"enough for today") if broken and len(server.requests) > 20 else WORLD.answer(request)
 
     with serving(answer) as server:
         with pytest.raises(MapError, match="enough for today"):
@@ -89,15 +89,15 @@ def test_a_download_that_fails_half_way_leaves_no_package_and_goes_on_later(tmp_
         assert not list(tmp_path.glob("*.gpkg")) and not list(tmp_path.glob(".m.gpkg*"))
         broken = False
         build_order(order(tmp_path, server.url))
-        assert max(server.answered.values()) == 1
+        assert max(server.completed.values()) == 1
     assert_shows_the_world(tmp_path / "m.gpkg")
 
 
 @pytest.mark.slow
-def test_several_sources_and_several_dates_from_a_file(tmp_path: Path) -> None:
-    """A local image first, a server for the rest of the place; and an old layer beside them."""
+def test_several_sources_and_dates_are_built_from_a_source_file(tmp_path: Path) -> None:
+    """A local image first, a server for the rest of the area, and a second, older layer."""
     with serving(WORLD.answer) as server:
-        # Tiles 2.. of the world from a server, 0 and 1 from a GeoTIFF of the same raster, inverted to be told apart.
+        # Tiles 2.. of the world from a server, 0 and 1 from an inverted GeoTIFF of the same raster.
         span_m = 2 * map_servers.HALF_M / (1 << WORLD.zoom)
         corner = WORLD.column * span_m - map_servers.HALF_M, map_servers.HALF_M - WORLD.row * span_m
         place = rasterio.Affine(span_m / 256, 0, corner[0], 0, -span_m / 256, corner[1])
@@ -111,12 +111,12 @@ def test_several_sources_and_several_dates_from_a_file(tmp_path: Path) -> None:
             f'[[source]]\npath = "left.tif"\nlayer = "old"\ndate = "2011-05-01"\nlicence = "archive"\n'
         )
         build_order(order(tmp_path, server.url, source=[], sources=tmp_path / "maps.toml", licence=""))
-        # Nothing is fetched from a server that a better source covers.
-        assert {int(a.path.split("/")[2]) - WORLD.column for a in server.asked} == {1, 2, 3, 4, 5}
+        # Tiles that a better source covers are not fetched.
+        assert {int(a.path.split("/")[2]) - WORLD.column for a in server.requests} == {1, 2, 3, 4, 5}
     package = MapPackage.open(tmp_path / "m.gpkg", verify=True)
     new, old = package.manifest.layers
     assert (new.date, new.ce90_m, new.licence) == ("2022-05-01", 6.0, "own flight; CC0")
-    assert (old.date, old.source, old.ce90_m) == ("2011-05-01", "old", 6.0)  # estimated: it lies as the new one does
+    assert (old.date, old.source, old.ce90_m) == ("2011-05-01", "old", 6.0)  # estimated: it coincides with the new one
     package.close()
     with rasterio.open(f"GPKG:{tmp_path / 'm.gpkg'}:imagery") as file:
         image = file.read([3, 2, 1]).transpose(1, 2, 0)
@@ -128,13 +128,13 @@ def test_several_sources_and_several_dates_from_a_file(tmp_path: Path) -> None:
     assert np.abs(image.astype(float) - truth)[10:-10, 10:-10].mean() < 4.0
 
 
-def test_what_a_person_forgets_is_said_before_anything_is_fetched(tmp_path: Path) -> None:
+def test_missing_options_are_reported_before_the_download(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server:
         for change, reason in (
-            ({"licence": ""}, "under which licence"),
-            ({"source": []}, "--source says from what"),
+            ({"licence": ""}, "needs the licence"),
+            ({"source": []}, "--area needs a --source"),
             ({"gsd_m": 0.0}, "between 0.01 and 100"),
-            ({"area": "13,47,13.1,47.1", "buffer_km": None, "corridor_km": 1.0}, "no mission and no line"),
+            ({"area": "13,47,13.1,47.1", "buffer_km": None, "corridor_km": 1.0}, "neither a mission nor a line"),
             ({"area": "10,40,12,42"}, "at most 10,000"),
             ({"area": ""}, "give one image"),
             ({"area": "", "source": ["one.tif"], "buffer_km": None, "gsd_m": 0.0}, "need --area"),
@@ -144,18 +144,18 @@ def test_what_a_person_forgets_is_said_before_anything_is_fetched(tmp_path: Path
         ):
             with pytest.raises(TerrafixError, match=reason):
                 build_order(order(tmp_path, server.url, **change))
-        assert not server.asked
+        assert not server.requests
     assert not list(tmp_path.glob("*.gpkg"))
 
 
 @pytest.mark.slow
-def test_a_large_download_waits_for_a_yes(tmp_path: Path) -> None:
+def test_a_large_download_waits_for_confirmation(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server, pytest.raises(UsageError, match="add --yes"):
         build_order(order(tmp_path, server.url, buffer_km=20.0, rate=5.0))
 
 
 @pytest.mark.slow
-def test_the_command_line(tmp_path: Path) -> None:
+def test_map_build_area_runs_from_the_command_line(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server:
         command = [sys.executable, "-m", "terrafix_tools.cli", "map", "build", "--area", WORLD.box_deg(1.6)]
         command += ["--buffer", "0", "--source", server.url + "/{z}/{x}/{y}.png", "--gsd", "0.82", "--licence", "CC0"]
@@ -169,17 +169,17 @@ def test_the_command_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_change_no_byte_and_a_mission_is_offered_a_corridor(tmp_path: Path) -> None:
+def test_workers_change_no_byte_and_a_mission_gets_a_corridor_hint(tmp_path: Path) -> None:
     west, south, east, north = (float(v) for v in WORLD.box_deg(1.0).split(","))
     item = {"type": "SimpleItem", "command": 16, "frame": 3, "params": [0, 0, 0, None, north, east, 80]}
     mission = {"plannedHomePosition": [south, west, 400], "items": [item]}
     (tmp_path / "m.plan").write_text(json.dumps({"fileType": "Plan", "mission": mission}))
-    said = io.StringIO()
+    output = io.StringIO()
     with serving(WORLD.answer) as server:
-        common = {"area": str(tmp_path / "m.plan"), "say": console(said)}
+        common = {"area": str(tmp_path / "m.plan"), "say": console(output)}
         with pytest.raises(UsageError, match="add --yes"):
             build_order(order(tmp_path, server.url, **{**common, "buffer_km": None, "rate": 5.0}))
-        assert "--corridor 2 along the mission would be" in said.getvalue()
+        assert "--corridor 2 along the mission would be" in output.getvalue()
         narrow = {**common, "buffer_km": None, "corridor_km": 0.1}
         build_order(order(tmp_path, server.url, **narrow))
         one = (tmp_path / "m.gpkg").read_bytes()
@@ -190,7 +190,7 @@ def test_workers_change_no_byte_and_a_mission_is_offered_a_corridor(tmp_path: Pa
     assert 0.2 < valid.mean() < 0.9 and valid[-5:].any() and not valid[0, 0] and not valid[-1, -1]
 
 
-def test_elevation_and_vectors_come_with_it(tmp_path: Path) -> None:
+def test_an_area_build_includes_elevation_and_vectors(tmp_path: Path) -> None:
     west, south, east, north = (float(v) for v in WORLD.box_deg(1.0).split(","))
     (tmp_path / "a.osm").write_text(
         f'<osm version="0.6"><node id="1" version="1" lon="{west}" lat="{south}"/>'

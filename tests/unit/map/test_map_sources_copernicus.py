@@ -1,4 +1,4 @@
-"""Copernicus Data Space, against a server on this machine that speaks its protocols: token, catalogue, pictures."""
+"""Copernicus Data Space, with a local server that implements its protocols: token, catalogue, images."""
 
 import json
 from dataclasses import dataclass, field
@@ -12,12 +12,12 @@ from pyproj import CRS, Transformer
 from rasterio.io import MemoryFile
 from rasterio.transform import Affine
 
-from map_servers import Asked, Reply, serving
+from map_servers import Reply, Request, serving
 from terrafix.core.errors import MapError, UsageError
-from terrafix_tools.mapping.area_files import read_area
-from terrafix_tools.mapping.dem import DemSource
-from terrafix_tools.mapping.fetch import FetchError, RefusedError
-from terrafix_tools.mapping.fetch_pace import Limits
+from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.fetching.fetch import FetchError, RefusedError
+from terrafix_tools.mapping.fetching.pace import Limits
+from terrafix_tools.mapping.package.dem import DemSource
 from terrafix_tools.mapping.sources import copernicus, glo30, sentinel
 from terrafix_tools.mapping.sources.copernicus import Copernicus, Credentials, Service, read_credentials
 from terrafix_tools.mapping.sources.spec import SourceSpec
@@ -29,7 +29,7 @@ EPSG = "http://www.opengis.net/def/crs/EPSG/0/"
 
 @dataclass
 class FakeService:
-    """Remembers what it was asked. ``trouble``: replies that come before the true ones, by path."""
+    """Records requests. ``trouble``: replies by path that precede the regular ones."""
 
     scenes: list[str] = field(default_factory=lambda: ["2024-07-02T10:00:00Z", "2024-07-20T10:00:00Z"])
     trouble: dict[str, list[Reply]] = field(default_factory=dict)
@@ -38,26 +38,26 @@ class FakeService:
     pictures: list[dict] = field(default_factory=list)
     expires_s: float = 600.0
 
-    def answer(self, asked: Asked) -> Reply:
-        if self.trouble.get(asked.path):
-            return self.trouble[asked.path].pop(0)
-        if asked.path == "/token":
-            return self.token(asked)
-        if asked.headers["Authorization"] not in {f"Bearer token-{n}" for n in range(1, self.tokens + 1)}:
+    def answer(self, request: Request) -> Reply:
+        if self.trouble.get(request.path):
+            return self.trouble[request.path].pop(0)
+        if request.path == "/token":
+            return self.token(request)
+        if request.headers["Authorization"] not in {f"Bearer token-{n}" for n in range(1, self.tokens + 1)}:
             return Reply(401, b"no such token")
-        body = json.loads(asked.body)
-        if asked.path == "/api/catalog/1.0.0/search":
+        body = json.loads(request.body)
+        if request.path == "/api/catalog/1.0.0/search":
             self.searches.append(body)
             start = body.get("next", 0)
             page = [{"properties": {"datetime": t}} for t in self.scenes[start : start + 1]]
             following = {"next": start + 1} if start + 1 < len(self.scenes) else {}
             return Reply(body=json.dumps({"features": page, "context": following}).encode())
-        assert asked.path == "/api/process" and asked.headers["Accept"] == "image/tiff"
+        assert request.path == "/api/process" and request.headers["Accept"] == "image/tiff"
         self.pictures.append(body)
         return Reply(body=picture(body), headers={"Content-Type": "image/tiff"})
 
-    def token(self, asked: Asked) -> Reply:
-        form = parse_qs(asked.body.decode())
+    def token(self, request: Request) -> Reply:
+        form = parse_qs(request.body.decode())
         if form != {"grant_type": ["client_credentials"], "client_id": ["me"], "client_secret": [SECRET]}:
             return Reply(401, b'{"error":"invalid_client"}')
         self.tokens += 1
@@ -66,12 +66,12 @@ class FakeService:
 
 
 def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """What the fake satellite sees: a function of place."""
+    """Ground of the fake satellite images: a function of position."""
     return (120 + 50 * np.sin(x / 700.0) + 40 * np.cos(y / 900.0)).astype(np.float32)
 
 
 def picture(request: dict) -> bytes:
-    """As the Process API makes it: without saying that the fourth band is a mask."""
+    """As from the Process API, which does not mark the fourth band as a mask."""
     assert request["input"]["bounds"]["properties"]["crs"] == EPSG + "32632"
     x_min, y_min, x_max, y_max = request["input"]["bounds"]["bbox"]
     width, height = request["output"]["width"], request["output"]["height"]
@@ -83,7 +83,7 @@ def picture(request: dict) -> bytes:
         assert request["input"]["data"][0]["dataFilter"] == {"demInstance": "COPERNICUS_30"}
         bands = seen[None] + 500.0
     else:
-        valid = np.broadcast_to(np.where(x < 728_000.0, 255, 0), seen.shape)  # clouds all summer in the east
+        valid = np.broadcast_to(np.where(x < 728_000.0, 255, 0), seen.shape)  # permanent clouds in the east
         bands = np.stack([seen, seen, seen, valid]).astype(np.uint8)
     with MemoryFile() as memory:
         profile = {"width": width, "height": height, "count": len(bands), "dtype": bands.dtype, "compress": "deflate"}
@@ -99,9 +99,9 @@ def picture(request: dict) -> bytes:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COPERNICUS_CLIENT_ID", "me")
     monkeypatch.setenv("COPERNICUS_CLIENT_SECRET", SECRET)
-    monkeypatch.setattr(copernicus, "MOST_PX", 250)
-    monkeypatch.setattr("terrafix_tools.mapping.sources.chunks.MOST_PX", 250)
-    monkeypatch.setattr(glo30, "MOST_PX", 250)
+    monkeypatch.setattr(copernicus, "MAX_REQUEST_PX", 250)
+    monkeypatch.setattr("terrafix_tools.mapping.sources.chunks.MAX_REQUEST_PX", 250)
+    monkeypatch.setattr(glo30, "MAX_REQUEST_PX", 250)
     monkeypatch.setattr(Copernicus.__init__, "__defaults__", (Limits(500.0, 2, first_wait_s=0.01),))
 
 
@@ -113,7 +113,7 @@ def spec(**more: object) -> SourceSpec:
     return SourceSpec(service="sentinel-2", date="2024-08-01", days=60, **more)  # type: ignore[arg-type]
 
 
-def test_a_mosaic_comes_in_pieces_that_fit_and_is_kept(tmp_path: Path) -> None:
+def test_a_sentinel_mosaic_is_fetched_in_adjacent_pieces_and_cached(tmp_path: Path) -> None:
     fake = FakeService()
     with serving(fake.answer) as server:
         job = sentinel.SentinelJob(spec(), AREA, tmp_path, service(server.url))
@@ -129,10 +129,10 @@ def test_a_mosaic_comes_in_pieces_that_fit_and_is_kept(tmp_path: Path) -> None:
     assert search["collections"] == ["sentinel-2-l2a"] and search["bbox"] == list(AREA.bounds_deg)
     assert search["datetime"] == "2024-06-02T00:00:00Z/2024-08-01T23:59:59Z"
     assert fake.searches[1]["next"] == 1
-    asked = fake.pictures[0]["input"]["data"][0]
-    assert asked["dataFilter"]["timeRange"] == {"from": "2024-06-02T00:00:00Z", "to": "2024-08-01T23:59:59Z"}
+    request = fake.pictures[0]["input"]["data"][0]
+    assert request["dataFilter"]["timeRange"] == {"from": "2024-06-02T00:00:00Z", "to": "2024-08-01T23:59:59Z"}
     assert job.date == "2024-08-01" and job.licence == "Contains modified Copernicus Sentinel data 2024"
-    # Every place of the area is in exactly one piece, at 10 m, and shows what the satellite saw there.
+    # Every point of the area is in exactly one piece, at 10 m, with the right content.
     to_utm = Transformer.from_crs(4326, 32632, always_xy=True)
     for lon_deg, lat_deg in ((11.971, 47.001), (11.99, 47.01), (12.005, 47.019)):
         x, y = to_utm.transform(lon_deg, lat_deg)
@@ -150,8 +150,8 @@ def test_a_mosaic_comes_in_pieces_that_fit_and_is_kept(tmp_path: Path) -> None:
         assert found == 1
 
 
-def test_troubles_pass_and_a_token_that_ends_is_renewed(tmp_path: Path) -> None:
-    fake = FakeService(expires_s=60.0)  # ends at once, counted with the minute in hand
+def test_transient_errors_are_retried_and_an_expired_token_is_renewed(tmp_path: Path) -> None:
+    fake = FakeService(expires_s=60.0)  # expires at once, because of the safety margin of a minute
     bounds = {"bbox": [0, 0, 2500, 2500], "properties": {"crs": EPSG + "32632"}}
     kind = {"bounds": bounds, "data": [{"type": "sentinel-2-l2a"}]}
     whole = picture({"input": kind, "output": {"width": 250, "height": 250}})
@@ -168,12 +168,12 @@ def test_troubles_pass_and_a_token_that_ends_is_renewed(tmp_path: Path) -> None:
     assert fake.tokens > 1
 
 
-def test_a_failure_half_way_keeps_what_came(tmp_path: Path) -> None:
+def test_a_failed_sentinel_download_keeps_completed_pieces(tmp_path: Path) -> None:
     fake = FakeService()
 
-    def answer(asked: Asked) -> Reply:
-        full = asked.path == "/api/process" and len(fake.pictures) >= 2
-        return Reply(403, b"out of processing units") if full else fake.answer(asked)
+    def answer(request: Request) -> Reply:
+        full = request.path == "/api/process" and len(fake.pictures) >= 2
+        return Reply(403, b"out of processing units") if full else fake.answer(request)
 
     with serving(answer) as server, pytest.raises(RefusedError, match="out of processing units"):
         sentinel.SentinelJob(spec(), AREA, tmp_path, service(server.url)).fetch(lambda _: None)
@@ -187,20 +187,22 @@ def test_a_failure_half_way_keeps_what_came(tmp_path: Path) -> None:
         assert len(fake.pictures) - before == missing
 
 
-def test_wrong_credentials_and_no_scene_are_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_credentials_and_missing_scenes_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeService(scenes=[])
     with serving(fake.answer) as server:
-        with pytest.raises(MapError, match="saw it never with under 50 % clouds between 2024-06-02 and 2024-08-01"):
+        with pytest.raises(
+            MapError, match="no Sentinel-2 scene with under 50 % clouds between 2024-06-02 and 2024-08-01"
+        ):
             sentinel.SentinelJob(spec(), AREA, tmp_path, service(server.url)).estimate()
         monkeypatch.setenv("COPERNICUS_CLIENT_SECRET", "wrong")
         with pytest.raises(RefusedError, match=r"invalid_client.*check key, credentials"):
             sentinel.SentinelJob(spec(), AREA, tmp_path, service(server.url)).estimate()
         fake.trouble["/token"] = [Reply(200, b"<html>maintenance</html>")]
-        with pytest.raises(FetchError, match="gave no token"):
+        with pytest.raises(FetchError, match="no access token received"):
             sentinel.SentinelJob(spec(), AREA, tmp_path, service(server.url)).estimate()
 
 
-def test_credentials_come_from_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_credentials_are_read_from_a_private_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("COPERNICUS_CLIENT_SECRET")
     file = tmp_path / "copernicus.toml"
     with pytest.raises(UsageError, match="export COPERNICUS_CLIENT_ID"):
@@ -216,7 +218,7 @@ def test_credentials_come_from_a_file_of_ones_own(tmp_path: Path, monkeypatch: p
         read_credentials(file)
 
 
-def test_elevation_of_glo_30_is_one_raster(tmp_path: Path) -> None:
+def test_glo_30_elevation_is_merged_into_one_raster(tmp_path: Path) -> None:
     fake = FakeService()
     with serving(fake.answer) as server:
         path = glo30.fetch_glo30(AREA, tmp_path, lambda _: None, service(server.url))

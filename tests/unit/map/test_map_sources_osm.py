@@ -1,4 +1,4 @@
-"""Roads, water and buildings of OpenStreetMap: an extract and a server must give the same features."""
+"""Roads, water and buildings of OpenStreetMap: an extract and a server give the same features."""
 
 import json
 import struct
@@ -9,15 +9,15 @@ import numpy as np
 import osmium
 import pytest
 
-from map_servers import Asked, Reply, serving
+from map_servers import Reply, Request, serving
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area_files import read_area
-from terrafix_tools.mapping.fetch import FetchError
-from terrafix_tools.mapping.fetch_pace import Limits
+from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.fetching.fetch import FetchError
+from terrafix_tools.mapping.fetching.pace import Limits
 from terrafix_tools.mapping.layers import Feature
-from terrafix_tools.mapping.vectors_source_overpass import fetch_overpass, overpass_features
-from terrafix_tools.mapping.vectors_source_pbf import pbf_features
-from terrafix_tools.mapping.vectors_source_rings import polygons_of
+from terrafix_tools.mapping.vectors.overpass import fetch_overpass, overpass_features
+from terrafix_tools.mapping.vectors.pbf import pbf_features
+from terrafix_tools.mapping.vectors.rings import polygons_of
 
 AREA = read_area("13.00,47.00,13.05,47.05", buffer_km=0.0)
 FAST = Limits(500.0, 1, first_wait_s=0.01)
@@ -66,7 +66,7 @@ def tagged(tags: dict[str, str]) -> str:
 
 
 def elements() -> list[dict]:
-    """As Overpass answers `out geom`."""
+    """Elements as in an Overpass response to `out geom`."""
 
     def geometry(refs: list[int]) -> list[dict]:
         return [{"lat": NODES[r][1], "lon": NODES[r][0]} for r in refs]
@@ -79,7 +79,7 @@ def elements() -> list[dict]:
 
 
 def parsed(wkb: bytes) -> tuple[str, list[list[tuple[float, float]]]]:
-    """A reader of WKB of its own: "line" or "polygon", and its parts, rings from their least point on."""
+    """Independent WKB reader: "line" or "polygon", and its parts; rings start at their smallest point."""
     order, kind, count = struct.unpack_from("<BII", wkb)
     assert order == 1
     if kind == 2:
@@ -127,11 +127,11 @@ def assert_right(features: list[Feature]) -> None:
     }
 
 
-def test_an_extract(tmp_path: Path) -> None:
+def test_an_osm_extract_is_read(tmp_path: Path) -> None:
     assert_right(list(pbf_features(write_osm(tmp_path / "a.osm"), AREA)))
 
 
-def test_an_extract_in_the_usual_format(tmp_path: Path) -> None:
+def test_a_pbf_extract_is_read(tmp_path: Path) -> None:
     source = write_osm(tmp_path / "a.osm")
     with osmium.SimpleWriter(str(tmp_path / "a.osm.pbf")) as writer:
         for thing in osmium.FileProcessor(source):
@@ -139,7 +139,7 @@ def test_an_extract_in_the_usual_format(tmp_path: Path) -> None:
     assert summary(list(pbf_features(tmp_path / "a.osm.pbf", AREA))) == summary(list(pbf_features(source, AREA)))
 
 
-def test_extracts_that_are_none(tmp_path: Path) -> None:
+def test_invalid_extracts_are_reported(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="no such file"):
         list(pbf_features(tmp_path / "none.osm.pbf", AREA))
     for name, data in (("a.osm.pbf", b"no protobuf at all" * 20), ("b.txt", b"x"), ("c.osm", b"<osm><node")):
@@ -148,26 +148,26 @@ def test_extracts_that_are_none(tmp_path: Path) -> None:
             list(pbf_features(tmp_path / name, AREA))
 
 
-def test_a_server_is_asked_box_by_box_and_once(tmp_path: Path) -> None:
-    """An object that lies in several boxes is one feature."""
+def test_overpass_is_queried_once_per_box(tmp_path: Path) -> None:
+    """An object in several boxes becomes one feature."""
     area = read_area("13.00,47.00,13.15,47.05", buffer_km=0.0)
     body = json.dumps({"version": 0.6, "elements": elements()}).encode()
     with serving(lambda _: Reply(body=body)) as server:
         paths = fetch_overpass(server.url + "/api/interpreter", area, tmp_path, lambda _: None, FAST)
-        assert len(server.asked) == len(paths) == 2
-        query = parse_qs(server.asked[0].body.decode())["data"][0]
+        assert len(server.requests) == len(paths) == 2
+        query = parse_qs(server.requests[0].body.decode())["data"][0]
         assert "[bbox:47.000000,13.000000,47.100000,13.100000]" in query and query.endswith("out geom;")
         fetch_overpass(server.url + "/api/interpreter", area, tmp_path, lambda _: None, FAST)
-        assert len(server.asked) == 2
+        assert len(server.requests) == 2
     assert_right(list(overpass_features(paths, AREA)))
 
 
-def test_a_server_that_ran_out_of_time_is_asked_again(tmp_path: Path) -> None:
-    """It says so with status 200 and half of the elements."""
+def test_an_overpass_time_out_is_retried(tmp_path: Path) -> None:
+    """Overpass reports it with status 200 and a part of the elements."""
     late = {"elements": elements()[:2], "remark": 'runtime error: Query timed out in "query" at line 2'}
     waiting = [Reply(429), Reply(504), Reply(body=json.dumps(late).encode()), Reply(body=b"<html>busy</html>")]
 
-    def answer(_: Asked) -> Reply:
+    def answer(_: Request) -> Reply:
         return waiting.pop(0) if waiting else Reply(body=json.dumps({"elements": elements()}).encode())
 
     with serving(answer) as server:
@@ -178,7 +178,7 @@ def test_a_server_that_ran_out_of_time_is_asked_again(tmp_path: Path) -> None:
         fetch_overpass(server.url + "/api", AREA, tmp_path, lambda _: None, FAST)
 
 
-def test_rings_are_joined_in_any_order_and_direction() -> None:
+def test_rings_are_assembled_in_any_order_and_direction() -> None:
     a, b, c, d = (0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)
     hole = [(1.0, 1.0), (2.0, 1.0), (2.0, 2.0), (1.0, 1.0)]
     away = [(9.0, 9.0), (9.5, 9.0), (9.5, 9.5), (9.0, 9.0)]

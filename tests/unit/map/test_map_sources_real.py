@@ -1,4 +1,4 @@
-"""A real photograph map, through a server of tiles and back: what was moved by it, measured against the original."""
+"""A real aerial image through a tile server: displacement of the result against the original."""
 
 import threading
 from collections.abc import Callable
@@ -14,15 +14,17 @@ from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
-from map_servers import HALF_M, Asked, Reply, serving
-from terrafix_tools.mapping.area_build import Order, build_order
+from map_servers import HALF_M, Reply, Request, serving
+from terrafix_tools.mapping.area.build import Order, build_order
 
 ZOOM = 19
 PATCH_PX = 512
 
 
 @pytest.mark.slow
-def test_a_town_comes_back_within_a_pixel(tmp_path: Path, data_set: Callable[[str], Path]) -> None:
+def test_a_town_through_a_tile_server_is_displaced_by_less_than_a_pixel(
+    tmp_path: Path, data_set: Callable[[str], Path]
+) -> None:
     path = data_set("maps/town.tif")
     span_m = 2 * HALF_M / (1 << ZOOM)
     world = {"transform": Affine(span_m / 256, 0, -HALF_M, 0, -span_m / 256, HALF_M), "width": 256 << ZOOM}
@@ -35,8 +37,8 @@ def test_a_town_comes_back_within_a_pixel(tmp_path: Path, data_set: Callable[[st
             original, crs="EPSG:3857", height=256 << ZOOM, resampling=Resampling.cubic, add_alpha=True, **world
         )
 
-        def answer(asked: Asked) -> Reply:
-            zoom, column, row = (int(part) for part in asked.path.removesuffix(".png").strip("/").split("/"))
+        def answer(request: Request) -> Reply:
+            zoom, column, row = (int(part) for part in request.path.removesuffix(".png").strip("/").split("/"))
             assert zoom == ZOOM
             with lock:
                 bands = tiles.read([3, 2, 1, 4], window=Window(256 * column, 256 * row, 256, 256))

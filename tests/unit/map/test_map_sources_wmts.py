@@ -1,13 +1,13 @@
-"""Servers of the WMTS kind, asked in the way that their capabilities say."""
+"""WMTS servers, with requests according to their capabilities."""
 
 from pathlib import Path
 
 import pytest
 
 import map_servers
-from map_servers import Asked, Reply, serving
+from map_servers import Reply, Request, serving
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area_files import read_area
+from terrafix_tools.mapping.area.files import read_area
 from terrafix_tools.mapping.sources.spec import SourceSpec
 from terrafix_tools.mapping.sources.tile_job import TileJob
 from terrafix_tools.mapping.sources.wmts import read_capabilities
@@ -43,17 +43,17 @@ REST = '<ResourceURL format="image/png" resourceType="tile" template="{url}/r/{S
 
 
 @pytest.mark.parametrize("restful", [True, False])
-def test_a_wmts_server_is_asked_in_its_own_way(tmp_path: Path, restful: bool) -> None:
-    def answer(asked: Asked) -> Reply:
-        if asked.path.startswith("/caps"):
+def test_wmts_requests_follow_the_capabilities(tmp_path: Path, restful: bool) -> None:
+    def answer(request: Request) -> Reply:
+        if request.path.startswith("/caps"):
             resource = REST.replace("{url}", server.url) if restful else ""
             text = CAPABILITIES.replace("{url}", server.url).replace("{resource}", resource)
             return Reply(body=text.encode())
         if restful:
-            _, r, style, google, matrix, row, column = asked.path.removesuffix(".png").split("/")
+            _, r, style, google, matrix, row, column = request.path.removesuffix(".png").split("/")
             assert (r, style, google, matrix) == ("r", "day", "google", "g%3A16")
         else:
-            values = dict(pair.split("=") for pair in asked.path.removeprefix("/kvp?").split("&"))
+            values = dict(pair.split("=") for pair in request.path.removeprefix("/kvp?").split("&"))
             assert values["REQUEST"] == "GetTile" and values["LAYER"] == "ortho" and values["TILEMATRIX"] == "g%3A16"
             assert values["STYLE"] == "day" and values["TILEMATRIXSET"] == "google" and values["FORMAT"] == "image/png"
             row, column = values["TILEROW"], values["TILECOL"]
@@ -63,7 +63,7 @@ def test_a_wmts_server_is_asked_in_its_own_way(tmp_path: Path, restful: bool) ->
     area = read_area(WORLD.box_deg(0.2), buffer_km=0.0)
     with serving(answer) as server:
         spec = SourceSpec(wmts=server.url + "/caps", layer_name="ortho", licence="CC0", requests_per_s=500)
-        job = TileJob(spec, area, 0.1, tmp_path)  # finer than the server has: its finest
+        job = TileJob(spec, area, 0.1, tmp_path)  # finer than the server provides: its finest level is used
         assert job.estimate().items == 12
         job.fetch(lambda _: None)
     with job.openers()[0]() as imagery:
@@ -80,6 +80,6 @@ def test_a_wmts_server_is_asked_in_its_own_way(tmp_path: Path, restful: bool) ->
         ("ortho", "<html>", "no WMTS capabilities"),
     ],
 )
-def test_capabilities_that_are_of_no_use(layer: str, data: str, reason: str) -> None:
+def test_unusable_wmts_capabilities_are_reported(layer: str, data: str, reason: str) -> None:
     with pytest.raises(MapError, match=reason):
         read_capabilities(data.replace("{resource}", "").encode(), layer, "http://h")

@@ -1,4 +1,4 @@
-"""A package is a GeoPackage by the standard, whatever is in it; and the check of the standard finds what is wrong."""
+"""Packages follow the GeoPackage standard with any contents; and the standard check detects every violation."""
 
 import logging
 import shutil
@@ -18,9 +18,9 @@ from map_features import features
 from map_standard import violations
 from terrafix.core.signature import generate
 from terrafix_tools.mapping.build import build_package, layer_of
-from terrafix_tools.mapping.dem import DemSource
 from terrafix_tools.mapping.layers import ElevationInput, VectorInput
-from terrafix_tools.mapping.sign import sign_package
+from terrafix_tools.mapping.package.dem import DemSource
+from terrafix_tools.mapping.package.sign import sign_package
 
 LOCAL = (
     'PROJCS["here",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
@@ -32,7 +32,7 @@ LOCAL += 'PARAMETER["false_northing",2600000],UNIT["metre",1]]'
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With everything: layers in three CRS (one without a code), holes, elevation, features, a signature."""
+    """All contents: layers in three CRS (one without a code), holes, elevation, features, a signature."""
     folder = tmp_path_factory.mktemp("standard")
     holes = map_rasters.texture(700, 900)
     holes[:, 200:400, 100:700] = 0
@@ -58,12 +58,12 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_everything_together_keeps_the_standard(package: Path) -> None:
+def test_a_package_with_all_contents_follows_the_geopackage_standard(package: Path) -> None:
     assert violations(package) == []
 
 
-def test_gdal_opens_all_of_it_without_a_word(package: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Its driver complains of what it does not like: versions, extensions, matrices, CRS."""
+def test_gdal_opens_a_package_without_warnings(package: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """GDAL's driver warns about versions, extensions, matrices and CRS."""
     caplog.set_level(logging.DEBUG)
     for table, bands in (("imagery", 4), ("imagery_2", 4), ("imagery_3", 4), ("elevation", 1)):
         with rasterio.open(f"GPKG:{package}:{table}") as file:
@@ -105,7 +105,7 @@ DAMAGE = {
 
 @pytest.fixture
 def copy(package: Path, tmp_path: Path) -> Iterator[tuple[Path, sqlite3.Connection]]:
-    """Without the triggers of the features, which call functions that only GDAL has."""
+    """A copy without the feature triggers, which call functions that only GDAL provides."""
     path = Path(shutil.copy(package, tmp_path / "copy.gpkg"))
     db = sqlite3.connect(path)
     for name, count in (("ST_IsEmpty", 1), ("ST_MinX", 1), ("ST_MaxX", 1), ("ST_MinY", 1), ("ST_MaxY", 1)):

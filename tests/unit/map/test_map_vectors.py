@@ -1,4 +1,4 @@
-"""Roads, water and buildings in a package, against GDAL's own reading of them."""
+"""Roads, water and buildings in a package, compared with GDAL's reader."""
 
 import json
 import sqlite3
@@ -39,7 +39,7 @@ def test_gdal_reads_what_was_written(package: Path) -> None:
     assert info["features"] == 2 and info["total_bounds"] == pytest.approx((LON, LAT, LON + 1.1, LAT + 1))
 
 
-def test_the_reader_gives_parts_and_attributes_of_a_box(package: Path) -> None:
+def test_reading_features_of_a_box_returns_parts_and_attributes(package: Path) -> None:
     opened = MapPackage.open(package, verify=True)
     assert [(v.table, v.features, v.licence) for v in opened.manifest.vectors] == [
         ("roads", 2, "ODbL 1.0"),
@@ -66,10 +66,10 @@ def test_the_reader_gives_parts_and_attributes_of_a_box(package: Path) -> None:
         "DELETE FROM roads WHERE fid = 2",
     ],
 )
-def test_altered_features_are_noticed(package: Path, statement: str) -> None:
+def test_altered_features_are_detected(package: Path, statement: str) -> None:
     db = sqlite3.connect(package)
     for (trigger,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
-        db.execute(f'DROP TRIGGER "{trigger}"')  # they call functions that only a GeoPackage editor has
+        db.execute(f'DROP TRIGGER "{trigger}"')  # they call functions that only GeoPackage editors provide
     db.execute(statement)
     db.commit()
     db.close()
@@ -82,7 +82,7 @@ def test_altered_features_are_noticed(package: Path, statement: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "wkb", "says"),
+    ("table", "wkb", "expected"),
     [
         ("roads", b"", "not two-dimensional WKB"),
         ("roads", line(ROAD)[:-3], "not two-dimensional WKB"),
@@ -94,15 +94,15 @@ def test_altered_features_are_noticed(package: Path, statement: str) -> None:
         ('x"; DROP TABLE imagery; --', line(ROAD), "cannot be the name"),
     ],
 )
-def test_features_that_cannot_be_stored(tmp_path: Path, table: str, wkb: bytes, says: str) -> None:
+def test_features_that_cannot_be_stored_are_reported(tmp_path: Path, table: str, wkb: bytes, expected: str) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
     vectors = VectorInput([(table, wkb, {})], source="my.osm")
-    with pytest.raises(MapError, match=f"my.osm: .*{says}"):
+    with pytest.raises(MapError, match=f"my.osm: .*{expected}"):
         build_package([layer_of(tif)], tmp_path / "m.gpkg", vectors=vectors)
     assert not (tmp_path / "m.gpkg").exists()
 
 
-def test_deep_nesting_is_refused_and_not_a_crash() -> None:
+def test_deep_geometry_nesting_is_rejected() -> None:
     bomb = struct.pack("<BII", 1, 7, 1) * 100_000
     with pytest.raises(MapError, match="not two-dimensional WKB"):
         wkb_parts(bomb)

@@ -1,4 +1,4 @@
-"""A window of a map package against an independent rendering by GDAL into the same local CRS."""
+"""Windows of a map package, compared with an independent rendering by GDAL in the same local CRS."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ SIDE_PX = 900
 
 
 def placed(tmp_path: Path, crs: str, lat_deg: float, lon_deg: float, pixel: float) -> Path:
-    """A generated GeoTIFF around a place."""
+    """A generated GeoTIFF around a position."""
     x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(lon_deg, lat_deg)
     corner = Affine(pixel, 0, x - SIDE_PX * pixel / 2, 0, -pixel, y + SIDE_PX * pixel / 2)
     return map_rasters.write_tif(tmp_path / "image.tif", map_rasters.texture(SIDE_PX, SIDE_PX), crs, corner)
@@ -45,7 +45,7 @@ def reference(tif: Path, frame: LocalFrame, e_min_m: float, n_max_m: float, side
 
 
 def shift_px(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(dx, dy) by which a is displaced from b, by least squares on the gradient."""
+    """Displacement (dx, dy) of a relative to b, by least squares on the gradient."""
     a, b = (cv2.GaussianBlur(image, (0, 0), 2.0).astype(np.float64).mean(axis=2)[8:-8, 8:-8] for image in (a, b))
     gradient = np.stack(
         [cv2.Sobel(b, cv2.CV_64F, 1, 0).ravel() / 8, cv2.Sobel(b, cv2.CV_64F, 0, 1).ravel() / 8], axis=1
@@ -72,7 +72,7 @@ def render(local: LocalMap, gsd_m: float, side_px: int) -> tuple[np.ndarray, flo
         ("EPSG:2263", 40.7, -74.0),  # feet
     ],
 )
-def test_window_is_where_gdal_puts_it(tmp_path: Path, crs: str, lat_deg: float, lon_deg: float) -> None:
+def test_a_window_has_the_position_that_gdal_computes(tmp_path: Path, crs: str, lat_deg: float, lon_deg: float) -> None:
     pixel = 0.5 / 0.3048 if crs == "EPSG:2263" else 0.5
     tif = placed(tmp_path, crs, lat_deg, lon_deg, pixel)
     package = MapPackage.open(build(tif, tmp_path / "map.gpkg"), verify=True)
@@ -90,8 +90,8 @@ def test_window_is_where_gdal_puts_it(tmp_path: Path, crs: str, lat_deg: float, 
     package.close()
 
 
-def test_place_of_a_dot_is_exact_by_pyproj(tmp_path: Path) -> None:
-    """Gaussian dots far from the frame's origin, in EPSG:3857 at 60 degrees north where the map bends most."""
+def test_the_position_of_a_dot_is_exact_by_pyproj(tmp_path: Path) -> None:
+    """Gaussian dots far from the frame's origin, in EPSG:3857 at 60 degrees north, where its curvature is large."""
     x_0, y_0 = Transformer.from_crs(4326, 3857, always_xy=True).transform(25.0, 60.2)
     bands = np.full((3, 2000, 2000), 60, np.uint8)
     rows, columns = np.mgrid[0:2000, 0:2000]
@@ -124,8 +124,8 @@ def test_place_of_a_dot_is_exact_by_pyproj(tmp_path: Path) -> None:
     package.close()
 
 
-def test_reduced_windows_do_not_alias(tmp_path: Path) -> None:
-    """A pattern finer than the window's pixels becomes grey, at every reduction."""
+def test_downsampled_windows_do_not_alias(tmp_path: Path) -> None:
+    """A pattern finer than the window's pixels becomes grey, at every scale."""
     rows, columns = np.mgrid[0:1024, 0:1024]
     bands = np.repeat(np.where((rows + columns) % 2, 200, 56).astype(np.uint8)[None], 3, axis=0)
     package = MapPackage.open(build(map_rasters.utm(tmp_path / "fine.tif", bands), tmp_path / "fine.gpkg"))
@@ -140,7 +140,7 @@ def test_reduced_windows_do_not_alias(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(300, 400), (512, 512), (256, 256)])
-def test_outside_is_zero_and_invalid_and_edges_are_sharp(tmp_path: Path, height: int, width: int) -> None:
+def test_the_area_outside_is_zero_and_invalid_with_sharp_edges(tmp_path: Path, height: int, width: int) -> None:
     package = MapPackage.open(
         build(map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(height, width)), tmp_path / "i.gpkg")
     )
@@ -164,7 +164,7 @@ def test_outside_is_zero_and_invalid_and_edges_are_sharp(tmp_path: Path, height:
     package.close()
 
 
-def test_the_cache_does_not_change_what_is_seen(tmp_path: Path) -> None:
+def test_the_tile_cache_does_not_change_a_window(tmp_path: Path) -> None:
     path = build(map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(600, 600)), tmp_path / "i.gpkg")
     package = MapPackage.open(path)
     west, south, east, north = package.manifest.bounds_wgs84

@@ -1,4 +1,4 @@
-"""Digests of messages: what changes one, what does not, and what is said of a difference."""
+"""Digests of messages: which changes they detect, which they ignore, and how differences are reported."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def digests(messages: list[Message]) -> dict[str, Digest]:
     return found.result()
 
 
-def test_every_type_has_its_own_digest_and_count() -> None:
+def test_every_message_type_has_its_own_digest_and_count() -> None:
     found = digests([*FRAMES, estimate(0)])
     assert {name: digest.count for name, digest in found.items()} == {"Frame": 3, "NavEstimate": 1}
     assert found["Frame"] == digests(FRAMES)["Frame"]
@@ -36,16 +36,16 @@ def test_every_type_has_its_own_digest_and_count() -> None:
         [*FRAMES[:2], msgspec.structs.replace(FRAMES[2], t_ns=FRAMES[2].t_ns + 1)],
     ],
 )
-def test_one_message_less_another_order_and_one_nanosecond_change_the_digest(changed: list[Message]) -> None:
+def test_a_missing_message_another_order_or_time_changes_the_digest(changed: list[Message]) -> None:
     assert digests(changed)["Frame"] != digests(FRAMES)["Frame"]
 
 
-def test_the_time_at_which_the_shell_sent_a_message_is_not_compared() -> None:
+def test_the_publication_time_of_a_message_is_not_part_of_the_digest() -> None:
     assert digests([estimate(0, late_ns=0)]) == digests([estimate(0, late_ns=5 * S)])
     assert digests([estimate(0)]) != digests([estimate(0, east_m=0.001)])
 
 
-def test_two_streams_of_bytes_differ_where_only_their_borders_do() -> None:
+def test_byte_streams_with_different_chunk_borders_have_different_digests() -> None:
     one, two = Digests(), Digests()
     for found, parts in ((one, (b"ab", b"c")), (two, (b"a", b"bc"))):
         for part in parts:
@@ -53,7 +53,7 @@ def test_two_streams_of_bytes_differ_where_only_their_borders_do() -> None:
     assert one.result() != two.result()
 
 
-def test_a_difference_says_which_stream_and_how() -> None:
+def test_a_digest_difference_names_the_stream_and_the_change() -> None:
     before = digests([*FRAMES, estimate(0)])
     now = digests([*FRAMES[:2], msgspec.structs.replace(FRAMES[2], width=9)])
     assert differences(before, before) == []
@@ -62,16 +62,18 @@ def test_a_difference_says_which_stream_and_how() -> None:
     assert differences({}, digests(FRAMES)) == ["Frame: new (3)"]
 
 
-def test_case_names_are_unique_and_an_unknown_one_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_case_names_are_unique_and_an_unknown_name_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert len({case.name for case in CASES}) == len(CASES)
-    with pytest.raises(UsageError, match="'towm-a': there is none; choose from: montecarlo"):
+    with pytest.raises(UsageError, match="'towm-a': unknown; choose from: montecarlo"):
         golden.wanted_cases(["towm-a"], tmp_path)
     left = [case.name for case in golden.wanted_cases([], tmp_path)]
     assert left == [case.name for case in CASES if not case.needs]
-    assert "town-a: left out" in capsys.readouterr().err
+    assert "town-a: skipped" in capsys.readouterr().err
 
 
-def test_references_that_are_absent_or_no_references(tmp_path: Path) -> None:
+def test_missing_and_corrupt_reference_files_are_errors(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="write it with --update-refs"):
         golden.references(tmp_path / "none.json")
     (tmp_path / "torn.json").write_text('{"montecarlo": {"Frame"')
@@ -81,14 +83,14 @@ def test_references_that_are_absent_or_no_references(tmp_path: Path) -> None:
 
 def test_cases_are_compared_with_their_references(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     case = Case("flight", lambda _, __: {})
-    monkeypatch.setattr(golden, "found", lambda *_: digests(FRAMES))
+    monkeypatch.setattr(golden, "run_case", lambda *_: digests(FRAMES))
     golden.write(tmp_path / "refs.json", {"flight": digests(FRAMES)})
     assert golden.compare([case], tmp_path, golden.references(tmp_path / "refs.json")) == 0
     assert golden.compare([case], tmp_path, {"flight": digests(FRAMES[:2])}) == 1
     assert golden.compare([case], tmp_path, {}) == 1
 
 
-def test_a_case_that_fails_says_why_in_one_line(tmp_path: Path) -> None:
+def test_a_failed_case_gives_its_reason_in_one_line(tmp_path: Path) -> None:
     town = next(case for case in CASES if case.name == "town-a")
     with pytest.raises(UsageError, match=r"town-a: failed; .*town-a"):
-        golden.found(town, tmp_path)
+        golden.run_case(town, tmp_path)

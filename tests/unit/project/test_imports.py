@@ -1,4 +1,4 @@
-"""Who may import whom: direction of dependencies, one owner for each heavy library, what the link is free of."""
+"""Import rules: direction of dependencies, one owner of each heavy library, libraries that the link must not load."""
 
 import ast
 import subprocess
@@ -14,7 +14,7 @@ PACKAGES = {
     "terrafix_engines": ROOT / "engines" / "terrafix_engines",
     "terrafix_tools": ROOT / "tools" / "terrafix_tools",
 }
-# library -> the modules (and what is below them) that may import it
+# library -> the modules (and their submodules) that may import it
 OWNERS = {
     "gtsam": (
         "terrafix.estimator",
@@ -40,12 +40,12 @@ OWNERS = {
     "zmq": ("terrafix.runtime",),
     "pickle": (),
 }
-DIRECTION = {  # package -> our packages that it may import besides itself
+DIRECTION = {  # package -> other packages of the project that it may import
     "terrafix_tools": {"terrafix", "terrafix_engines"},
     "terrafix": {"terrafix_engines"},
     "terrafix_engines": set(),
 }
-# What of terrafix is not a process: imported by all.
+# Packages and modules of terrafix that are not a process and may be imported by all.
 COMMON = {"core", "map", "messages", "processes", "runtime"}
 
 
@@ -60,7 +60,7 @@ MODULES = dict(modules())
 
 
 def imports(path: Path) -> Iterator[str]:
-    """All imported modules, also those inside functions; ``from a import b`` counts as a.b."""
+    """All imported modules, also inside functions; ``from a import b`` counts as a.b."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -74,14 +74,14 @@ def within(name: str, module: str) -> bool:
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_dependencies_point_one_way(module: str) -> None:
+def test_packages_are_imported_in_one_direction_only(module: str) -> None:
     package = module.split(".")[0]
     ours = {name.split(".")[0] for name in imports(MODULES[module])} & set(PACKAGES)
     assert ours <= DIRECTION[package] | {package}
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_heavy_libraries_have_one_owner(module: str) -> None:
+def test_heavy_libraries_are_imported_by_their_owners_only(module: str) -> None:
     for name in imports(MODULES[module]):
         owners = OWNERS.get(name.split(".")[0])
         assert owners is None or any(within(module, owner) for owner in owners), f"{module} imports {name}"
@@ -100,6 +100,15 @@ def test_process_folders_do_not_import_each_other(folder: str) -> None:
                     assert parts[1] in COMMON | {folder}, f"{module} imports {name}"
 
 
+@pytest.mark.parametrize("folder", PROCESS_FOLDERS)
+def test_of_the_runtime_process_folders_import_only_the_checkpoint_mechanism(folder: str) -> None:
+    """Processes do not know the run folder: all of their files in it are checkpoints (runtime/checkpoint.py)."""
+    for module, path in MODULES.items():
+        if module.startswith(f"terrafix.{folder}"):
+            used = {name for name in imports(path) if name.startswith("terrafix.runtime")}
+            assert used <= {"terrafix.runtime.checkpoint.CheckpointFile"}, f"{module} imports {used}"
+
+
 @pytest.mark.parametrize(
     ("folder", "allowed"),
     [
@@ -108,7 +117,7 @@ def test_process_folders_do_not_import_each_other(folder: str) -> None:
         ("runtime", {"core", "messages", "processes", "runtime"}),
     ],
 )
-def test_what_is_common_imports_nothing_above_it(folder: str, allowed: set[str]) -> None:
+def test_common_packages_import_nothing_above_them(folder: str, allowed: set[str]) -> None:
     for module, path in MODULES.items():
         if within(module, f"terrafix.{folder}"):
             ours = [name.split(".") for name in imports(path) if name.startswith("terrafix")]
@@ -116,7 +125,7 @@ def test_what_is_common_imports_nothing_above_it(folder: str, allowed: set[str])
 
 
 def test_the_link_process_is_free_of_gtsam_opencv_and_onnxruntime() -> None:
-    """Also of what pulls them in by a detour: the whole process entry is loaded, in an interpreter of its own."""
+    """Includes indirect imports: the complete process entry point is imported in a separate interpreter."""
     code = """
 import sys
 import terrafix.runtime.process_main, terrafix.runtime.executor, terrafix.link.node
@@ -127,8 +136,8 @@ print(*sorted({"cv2", "gtsam", "onnxruntime", "faiss", "scipy", "matplotlib"} & 
     assert done.stdout.split() == []
 
 
-def test_the_command_line_loads_nothing_that_computes() -> None:
-    """`--help` is fast, and so is a restart in flight."""
+def test_the_command_line_imports_no_numerical_libraries() -> None:
+    """So that `--help` and a restart in flight are fast."""
     code = """
 import sys
 import terrafix_tools.cli, terrafix.runtime.fork_server
@@ -140,14 +149,14 @@ print(*sorted({"numpy", "cv2", "pyproj", "zmq", "structlog"} & set(sys.modules))
 
 
 def loaded(modules: str, named: set[str]) -> set[str]:
-    """Which of ``named`` an interpreter of its own has after importing ``modules``."""
+    """Which of the modules ``named`` are loaded after importing ``modules`` in a separate interpreter."""
     code = f"import sys, {modules}; print(*sorted({named!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.split())
 
 
-def test_a_restart_in_flight_waits_for_nothing_that_it_does_not_need() -> None:
-    """The supervisor has no arrays; the anchor opens a model, or checks a signature, where one is configured."""
+def test_supervisor_and_processes_do_not_import_optional_libraries_at_start() -> None:
+    """The supervisor needs no arrays; the anchor opens a model or checks a signature only if one is configured."""
     assert loaded("terrafix.runtime.supervisor", {"numpy", "cv2", "pyproj"}) == set()
     assert loaded("terrafix.runtime.process_main, terrafix.anchor.node", {"onnxruntime", "cryptography"}) == set()

@@ -1,10 +1,10 @@
-"""The estimator as a function call (ON-1): the names, the shared graph, the mode of each frame, and failures."""
+"""PoseEstimator, the estimator as a function call (ON-1): names, shared graph, covariance mode, and failures."""
 
 import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import CAMERA, ORIGIN, Flight, Listener, cov_of, t_ns
+from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight, cov_of, t_ns
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.pose import exp_so3
@@ -30,7 +30,7 @@ COOL, HOT = thermal(ThermalBand.NORMAL), thermal(ThermalBand.HOT)
 
 
 def seen(flight: Flight, i: int, points: np.ndarray) -> list[tuple[float, float, float, float, float, float]]:
-    """2D-3D matches of points (N, 3) in frame i."""
+    """2D-3D matches of ground points (N, 3) [m] in frame i."""
     q = (points - flight.p_m[i]) @ flight.r_w_c[i]
     xy = q[:, :2] / q[:, 2:]
     return [(*map(float, a), *map(float, b), 1.0) for a, b in zip(xy, points, strict=True)]  # type: ignore[misc]
@@ -42,8 +42,8 @@ def flight() -> Flight:
 
 
 @pytest.fixture
-def run(flight: Flight) -> Listener:
-    return Listener().fly(flight, 0, AT + 1)
+def run(flight: Flight) -> EstimatorRun:
+    return EstimatorRun().fly(flight, 0, AT + 1)
 
 
 def match_of(flight: Flight, i: int = AT) -> MatchResult:
@@ -52,16 +52,16 @@ def match_of(flight: Flight, i: int = AT) -> MatchResult:
     return msgspec.structs.replace(flight.fix(i), matches=seen(flight, i, under + grid))
 
 
-def test_the_factor_enters_the_graph_that_the_node_flies_on(flight: Flight, run: Listener) -> None:
+def test_estimate_adds_the_map_factor_to_the_graph_of_the_node(flight: Flight, run: EstimatorRun) -> None:
     pose = PoseEstimator(run.node).estimate(match_of(flight), LENS, COOL)
     assert (pose.frame_id, pose.source_label) == (AT, SourceLabel.SATELLITE_ANCHORED)
     assert pose.last_satellite_anchor_age_ms == 0
-    said = run.hear(m for m in flight.messages(AT + 1) if not isinstance(m, MapMatch))[-1]
-    assert said.last_anchor_age_ms == 500  # type: ignore[attr-defined]
-    assert np.sqrt(cov_of(said)[0, 0]) < 5.0  # type: ignore[arg-type]  # without the fix: 15 m, of the start
+    estimate_after = run.feed(m for m in flight.messages(AT + 1) if not isinstance(m, MapMatch))[-1]
+    assert estimate_after.last_anchor_age_ms == 500  # type: ignore[attr-defined]
+    assert np.sqrt(cov_of(estimate_after)[0, 0]) < 5.0  # type: ignore[arg-type]  # without the fix 15 m, the sigma of the start
 
 
-def test_position_orientation_and_their_order(flight: Flight, run: Listener) -> None:
+def test_pose_and_covariance_have_the_stated_order_and_units(flight: Flight, run: EstimatorRun) -> None:
     before = run.estimate(AT)
     pose = PoseEstimator(run.node).estimate(match_of(flight), LENS, COOL)
     assert pose.covariance_6x6.shape == (6, 6)
@@ -76,13 +76,13 @@ def test_position_orientation_and_their_order(flight: Flight, run: Listener) -> 
     assert pose.emitted_at == t_ns(AT)
 
 
-def test_the_mode_follows_the_thermal_state_frame_by_frame(flight: Flight, run: Listener) -> None:
+def test_the_covariance_mode_follows_the_thermal_state_per_frame(flight: Flight, run: EstimatorRun) -> None:
     estimator = PoseEstimator(run.node)
     assert estimator.current_covariance_mode() is CovarianceMode.MARGINALS
     with pytest.warns(CovarianceDegradedWarning, match="test"):
         hot = estimator.estimate(match_of(flight), LENS, HOT)
     assert hot.covariance_mode is estimator.current_covariance_mode() is CovarianceMode.JACOBIAN
-    run.hear(flight.messages(AT + 1))
+    run.feed(flight.messages(AT + 1))
     cool = estimator.estimate(match_of(flight, AT + 1), LENS, COOL)  # a warning would be an error here
     assert cool.covariance_mode is estimator.current_covariance_mode() is CovarianceMode.MARGINALS
 
@@ -109,33 +109,33 @@ def _upside_down(match: MatchResult) -> tuple[float, float, float, float]:
 @pytest.mark.parametrize(
     "why", ["on a line", "three matches of one point", "behind the camera", "no number", "no covariance", "no pose"]
 )
-def test_degenerate_matches_give_no_pose(why: str, flight: Flight, run: Listener) -> None:
+def test_degenerate_matches_raise_and_leave_the_estimate_unchanged(why: str, flight: Flight, run: EstimatorRun) -> None:
     before = run.estimate(AT)
     with pytest.raises(PnpFailureError, match="degenerate") as failure:
         PoseEstimator(run.node).estimate(broken(match_of(flight), flight)[why], LENS, COOL)
     assert failure.value.verdict is Verdict.DEGENERATE
     assert run.estimate(AT) == before
-    run.hear(flight.messages(AT + 1))
-    assert run.estimate(AT + 1).source_label is SourceLabel.VISUAL_PROPAGATED  # the flight goes on by odometry
+    run.feed(flight.messages(AT + 1))
+    assert run.estimate(AT + 1).source_label is SourceLabel.VISUAL_PROPAGATED  # the flight continues with odometry
 
 
-def test_what_pnp_or_the_gate_refused_says_so(flight: Flight, run: Listener) -> None:
+def test_failures_of_pnp_and_gate_are_stated_in_the_exception(flight: Flight, run: EstimatorRun) -> None:
     estimator = PoseEstimator(run.node)
     with pytest.raises(PnpFailureError, match="pnp_failed"):
-        estimator.estimate(msgspec.structs.replace(match_of(flight), verdict=Verdict.PNP_FAILED), LENS, COOL)
+        estimator.estimate(msgspec.structs.replace(match_of(flight), verdict=Verdict.DEGENERATE), LENS, COOL)
     with pytest.raises(PnpFailureError, match=r"innovation: \d+ m from the estimate"):
         estimator.estimate(flight.fix(AT, (354.0, 0.0)), LENS, COOL)
     with pytest.raises(PnpFailureError, match="stale"):
         estimator.estimate(msgspec.structs.replace(match_of(flight), frame_id=4711), LENS, COOL)
 
 
-def test_another_camera_is_a_mistake(flight: Flight, run: Listener) -> None:
+def test_a_camera_other_than_that_of_the_flight_is_an_error(flight: Flight, run: EstimatorRun) -> None:
     with pytest.raises(ValueError, match="camera"):
         PoseEstimator(run.node).estimate(match_of(flight), LENS.scaled(0.5), COOL)
     with pytest.raises(ValueError, match="camera"):
-        PoseEstimator(Listener().node).estimate(match_of(flight), LENS, COOL)
+        PoseEstimator(EstimatorRun().node).estimate(match_of(flight), LENS, COOL)
 
 
-def test_the_camera_of_these_tests_is_that_of_the_flight() -> None:
+def test_the_camera_and_message_types_match_those_of_the_flight() -> None:
     assert CameraCalibration.of(ORIGIN.camera) == LENS
     assert issubclass(MatchResult, MapMatch)

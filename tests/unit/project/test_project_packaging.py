@@ -1,4 +1,4 @@
-"""What is declared is what is used: dependencies, lock, version."""
+"""Declared dependencies, lock file and version agree with the code."""
 
 import ast
 import re
@@ -22,15 +22,15 @@ EXTRAS = {
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
 IMPORTED_AS = {"opencv-python-headless": "cv2", "pyserial": "serial", "pyzmq": "zmq", "pillow": "PIL"}
-COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist"}  # used by scripts/check, imported by nobody
-TRAINING = ROOT / "engines" / "terrafix_engines" / "train"  # beside the engines, and stays on the ground
+COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist"}  # used by scripts/check, not imported
+TRAINING = ROOT / "engines" / "terrafix_engines" / "train"  # part of the engines package, used on the ground only
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools"}
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 
 def imported(*folders: str, training: bool = True) -> set[str]:
-    """First names of all third-party modules that are imported below the folders; with or without the training."""
+    """Top-level names of all third-party modules imported below the folders; with or without the training code."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
@@ -50,7 +50,7 @@ def modules(requirements: dict[str, Requirement]) -> set[str]:
     return {IMPORTED_AS.get(name, name) for name in requirements if name not in COMMANDS}
 
 
-def test_what_flies_imports_only_the_core_dependencies() -> None:
+def test_daemon_and_engines_import_only_the_core_dependencies() -> None:
     assert imported("daemon", "engines", training=False) <= modules(CORE)
 
 
@@ -62,7 +62,7 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     assert modules(EXTRAS["dev"]) <= imported("tests")
 
 
-def test_every_dependency_has_a_range() -> None:
+def test_every_dependency_has_a_version_range() -> None:
     for requirement in [
         *CORE.values(),
         *(one for extra in ("ground", "sim", "cluster", "train") for one in EXTRAS[extra].values()),
@@ -71,8 +71,8 @@ def test_every_dependency_has_a_range() -> None:
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"
 
 
-def test_the_lock_holds_every_dependency_within_its_range() -> None:
-    """But for the training: its PyTorch is that of the GPU's driver."""
+def test_the_lock_file_has_every_dependency_within_its_range() -> None:
+    """Except those of the training, whose version of PyTorch depends on the GPU driver."""
     locked: dict[str, list[str]] = {}
     for name, version in re.findall(r"^([\w.-]+)==([^\s;]+)", LOCK, flags=re.M):
         locked.setdefault(canonicalize_name(name), []).append(version)
@@ -83,11 +83,11 @@ def test_the_lock_holds_every_dependency_within_its_range() -> None:
                 assert requirement.specifier.contains(version), f"requirements.lock has {name} {version}"
 
 
-def test_the_lock_names_no_host() -> None:
+def test_the_lock_file_names_no_host() -> None:
     assert not re.search(r"://|--index-url|--extra-index-url|--find-links|file:", LOCK)
 
 
-def test_one_version_everywhere() -> None:
+def test_the_version_is_the_same_in_code_metadata_and_changelog() -> None:
     version = PROJECT["version"]
     assert terrafix.__version__ == version
     assert metadata.version("terrafix") == version
@@ -95,19 +95,19 @@ def test_one_version_everywhere() -> None:
     assert newest is not None and newest[1] == version
 
 
-def test_the_licence_is_the_one_declared() -> None:
+def test_the_licence_file_matches_the_declared_licence() -> None:
     assert PROJECT["license"] == "Apache-2.0"
     assert "Version 2.0, January 2004" in (ROOT / "LICENSE").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("package", sorted(OURS))
-def test_the_packages_say_that_they_are_typed(package: str) -> None:
+def test_the_packages_are_marked_as_typed(package: str) -> None:
     assert list(ROOT.glob(f"*/{package}/py.typed"))
 
 
 @pytest.mark.parametrize("command", ["replay /nowhere", "map build /nowhere.tif --out /nowhere.gpkg"])
-def test_without_the_ground_tools_one_line_says_what_to_install(command: str) -> None:
-    """As on a vehicle: the core dependencies only."""
+def test_without_the_ground_extra_one_line_states_what_to_install(command: str) -> None:
+    """The installation on a vehicle has the core dependencies only."""
     code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2

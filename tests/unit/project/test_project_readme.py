@@ -1,4 +1,4 @@
-"""The README's two commands: they are what CI runs, and on a machine where they cannot work they say why."""
+"""The two commands of the README: CI runs them; without their requirements they state what is missing."""
 
 import os
 import re
@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[3]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DEMO, CHECK = "sh scripts/demo", "sh scripts/check"
-TOOLS = ("cat", "cksum", "dirname", "pwd", "sh")  # of the system, all that the scripts need before there is a Python
+TOOLS = ("cat", "cksum", "dirname", "pwd", "sh")  # system tools that the scripts need before Python is found
 
 
 def lines(path: Path) -> list[str]:
@@ -19,7 +19,7 @@ def lines(path: Path) -> list[str]:
 
 
 def clone(folder: Path) -> Path:
-    """What the set-up commands need of a clone."""
+    """The files of a clone that the set-up commands need."""
     shutil.copytree(ROOT / "scripts", folder / "scripts")
     for name in ("pyproject.toml", "requirements.lock"):
         shutil.copy(ROOT / name, folder)
@@ -27,7 +27,7 @@ def clone(folder: Path) -> Path:
 
 
 def path_with(folder: Path, **programs: str) -> str:
-    """A PATH with nothing but TOOLS and the shell scripts named."""
+    """A PATH that contains only TOOLS and the given shell scripts."""
     folder.mkdir()
     for tool in TOOLS:
         found = shutil.which(tool)
@@ -48,39 +48,39 @@ def attempt(tmp_path: Path, command: str, **programs: str) -> subprocess.Complet
     )
 
 
-def test_there_are_exactly_two_set_up_commands() -> None:
+def test_the_readme_has_exactly_two_set_up_commands() -> None:
     section = README.split("## Two commands")[1].split("\n## ")[0]
     assert re.findall(r"```sh\n(.*?)```", section, flags=re.S) == [f"{DEMO}\n", f"{CHECK}\n"]
     assert README.count("```sh\n") == 2
 
 
-def test_ci_runs_the_second_command_and_nothing_else() -> None:
+def test_ci_runs_only_the_check_command() -> None:
     ci = ROOT / ".ci" / "run"
     assert os.access(ci, os.X_OK)
     assert lines(ci) == ["set -eu", 'cd "$(dirname "$0")/.."', CHECK]
 
 
 @pytest.mark.parametrize("script", ["demo", "check", "install", "lock"])
-def test_scripts_are_shell_without_errors(script: str) -> None:
+def test_scripts_have_no_shell_syntax_errors(script: str) -> None:
     done = subprocess.run(["sh", "-n", f"scripts/{script}"], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("command", [DEMO, CHECK])
-def test_without_python_one_line_says_what_to_install(command: str, tmp_path: Path) -> None:
+def test_without_python_one_line_states_what_to_install(command: str, tmp_path: Path) -> None:
     done = attempt(tmp_path, command)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1 and "needs Python 3.11 or newer; found none" in done.stderr
 
 
-def test_an_old_python_is_named(tmp_path: Path) -> None:
+def test_an_old_python_version_is_stated_in_the_error(tmp_path: Path) -> None:
     old = 'if [ "$1" = --version ]; then echo "Python 3.10.12"; else exit 1; fi'
     done = attempt(tmp_path, DEMO, python3=old)
     assert done.returncode == 1
     assert "needs Python 3.11 or newer; found Python 3.10.12" in done.stderr
 
 
-def test_a_python_without_venv_is_told_from_a_good_one(tmp_path: Path) -> None:
+def test_a_python_without_the_venv_module_is_detected(tmp_path: Path) -> None:
     bare = 'case "$2" in *ensurepip*) exit 1 ;; *print*) echo python3.11-venv ;; esac'
     done = attempt(tmp_path, CHECK, python3_11=bare)
     assert done.returncode == 1
@@ -88,7 +88,7 @@ def test_a_python_without_venv_is_told_from_a_good_one(tmp_path: Path) -> None:
     assert "venv module is missing" in done.stderr and "apt install python3.11-venv" in done.stderr
 
 
-def test_commands_of_the_readme_exist() -> None:
+def test_commands_and_options_in_the_readme_exist() -> None:
     from typer.testing import CliRunner
 
     from terrafix_tools.cli import app

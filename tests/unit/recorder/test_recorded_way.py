@@ -1,4 +1,4 @@
-"""A smooth way through a recorded truth, and the telemetry of an autopilot that flew it."""
+"""A smooth trajectory through recorded ground truth, and the simulated telemetry of an autopilot on it."""
 
 import csv
 import math
@@ -22,44 +22,44 @@ PLACE = LocalFrame(47.0, 8.0)
 G = 9.80665
 
 
-def true_way(t_s: np.ndarray) -> np.ndarray:
-    """(N, 2): a circle of 60 m at 8 m/s."""
+def true_positions(t_s: np.ndarray) -> np.ndarray:
+    """Positions (N, 2) [m] at times ``t_s`` (N,): a circle with a radius of 60 m at 8 m/s."""
     return 60.0 * np.column_stack([np.sin(t_s * 8.0 / 60.0), np.cos(t_s * 8.0 / 60.0)])
 
 
-def test_a_polynomial_of_fifth_degree_between_two_states_is_met_exactly() -> None:
-    """Samples of a parabola: the smoothest way through them is the parabola, and its derivatives are known."""
+def test_smoothing_samples_of_a_parabola_reproduces_the_parabola() -> None:
+    """The smoothest curve through samples of a parabola is the parabola, whose derivatives are known."""
     t_s = np.array([0.0, 1.0, 2.5, 3.0, 7.0, 8.0])
-    found = smooth(t_s, (3.0 - 2.0 * t_s + 0.5 * t_s**2)[:, None], 10.0).at(np.array([0.3, 2.0, 5.5, 8.0]))[:, :, 0]
+    curve = smooth(t_s, (3.0 - 2.0 * t_s + 0.5 * t_s**2)[:, None], 10.0).at(np.array([0.3, 2.0, 5.5, 8.0]))[:, :, 0]
     at = np.array([0.3, 2.0, 5.5, 8.0])
-    assert found[:, 0] == pytest.approx(3.0 - 2.0 * at + 0.5 * at**2, abs=1e-3)
-    assert found[:, 1] == pytest.approx(-2.0 + at, abs=1e-2)
-    assert found[:, 2] == pytest.approx(1.0, abs=0.05)
+    assert curve[:, 0] == pytest.approx(3.0 - 2.0 * at + 0.5 * at**2, abs=1e-3)
+    assert curve[:, 1] == pytest.approx(-2.0 + at, abs=1e-2)
+    assert curve[:, 2] == pytest.approx(1.0, abs=0.05)
 
 
-def test_rate_and_acceleration_are_the_derivatives_of_the_way() -> None:
+def test_rate_and_acceleration_are_the_derivatives_of_the_trajectory() -> None:
     rng = np.random.default_rng(1)
     t_s = np.cumsum(rng.uniform(0.3, 2.0, 60))
     curve = smooth(t_s, rng.normal(0.0, 5.0, (60, 2)).cumsum(axis=0), 4.0)
     fine = np.arange(t_s[0], t_s[-1], 0.005)
-    value, rate, bend = curve.at(fine).transpose(1, 0, 2)
+    value, rate, acceleration = curve.at(fine).transpose(1, 0, 2)
     assert np.abs(np.gradient(value, 0.005, axis=0) - rate)[1:-1].max() < 1e-2
-    inside = np.abs(np.gradient(rate, 0.005, axis=0) - bend)[1:-1]
+    inside = np.abs(np.gradient(rate, 0.005, axis=0) - acceleration)[1:-1]
     assert np.quantile(inside, 0.99) < 0.05  # the third derivative may jump at a sample
 
 
-def test_noise_of_a_truth_does_not_become_g_forces() -> None:
-    """Samples at 2 Hz with 2 m of noise: differences would shake with 16 m/s^2 and more."""
+def test_noise_of_the_ground_truth_does_not_become_acceleration() -> None:
+    """Samples at 2 Hz with 2 m of noise: their second differences exceed 16 m/s^2."""
     t_s = np.arange(0.0, 60.0, 0.5)
-    noisy = true_way(t_s) + np.random.default_rng(2).normal(0.0, 2.0, (120, 2))
+    noisy = true_positions(t_s) + np.random.default_rng(2).normal(0.0, 2.0, (120, 2))
     assert np.abs(np.diff(noisy, 2, axis=0) / 0.25).max() > 16.0
-    found = smooth(t_s, noisy, 3.0).at(np.arange(0.0, 59.5, 0.02))
-    assert np.linalg.norm(found[:, 2], axis=1).max() < 3.05
-    off = np.linalg.norm(found[:, 0] - true_way(np.arange(0.0, 59.5, 0.02)), axis=1)
-    assert np.median(off) < 1.6  # nearer to the truth than its samples
+    curve = smooth(t_s, noisy, 3.0).at(np.arange(0.0, 59.5, 0.02))
+    assert np.linalg.norm(curve[:, 2], axis=1).max() < 3.05
+    off = np.linalg.norm(curve[:, 0] - true_positions(np.arange(0.0, 59.5, 0.02)), axis=1)
+    assert np.median(off) < 1.6  # nearer to the ground truth than the samples
 
 
-def test_outside_its_samples_the_rate_stays() -> None:
+def test_outside_the_samples_the_rate_is_constant() -> None:
     t_s = np.arange(0.0, 5.0)
     after = smooth(t_s, (2.0 * t_s)[:, None], 5.0).at(np.array([-1.0, 6.0]))[:, :, 0]
     assert after[:, 0] == pytest.approx([-2.0, 12.0], abs=1e-3)
@@ -68,12 +68,12 @@ def test_outside_its_samples_the_rate_stays() -> None:
 
 @pytest.fixture
 def recorded(tmp_path: Path) -> Path:
-    """A circle, 12 s long, without a ground height, heading along the way."""
+    """A flight folder: a circle of 12 s without ground height, heading along the course."""
     folder = tmp_path / "flight"
     (folder / "frames").mkdir(parents=True)
     t_s = np.arange(0.0, 12.1, 0.5)
     times, truth = [["file", "t_s", "yaw_deg"]], [["file", "lat_deg", "lon_deg", "agl_m", "yaw_deg"]]
-    for i, (t, (e_m, n_m)) in enumerate(zip(t_s, true_way(t_s), strict=True)):
+    for i, (t, (e_m, n_m)) in enumerate(zip(t_s, true_positions(t_s), strict=True)):
         cv2.imwrite(str(folder / "frames" / f"{i}.png"), np.full((48, 64, 3), 90, np.uint8))
         lat_deg, lon_deg = PLACE.to_wgs84(float(e_m), float(n_m))
         yaw_deg = math.degrees(math.pi / 2 + t * 8.0 / 60.0) % 360.0
@@ -90,7 +90,7 @@ def recorded(tmp_path: Path) -> Path:
 
 
 def packets(path: Path) -> list[tuple[float, object]]:
-    """(seconds, message) of a tlog, read with pymavlink's own parser."""
+    """(time [s], message) of a tlog, read with the parser of pymavlink."""
     data, out = path.read_bytes(), []
     parser = mavlink.MAVLink(None)
     at, first = 0, None
@@ -103,10 +103,10 @@ def packets(path: Path) -> list[tuple[float, object]]:
     return out
 
 
-def test_the_folder_flies_with_imu(recorded: Path, tmp_path: Path) -> None:
+def test_the_written_flight_folder_opens_and_has_all_telemetry_messages(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    way = write_recorded(recorded, out, seed=3)
-    assert way.level.off < 0.05
+    trajectory = write_recorded(recorded, out, seed=3)
+    assert trajectory.level.rms < 0.05
     assert (out / "truth.csv").read_bytes() == (recorded / "truth.csv").read_bytes()
     source = open_source(str(out))
     shots = list(source.shots())
@@ -121,8 +121,8 @@ def test_the_folder_flies_with_imu(recorded: Path, tmp_path: Path) -> None:
     assert {"SCALED_PRESSURE", "GPS_RAW_INT", "SYSTEM_TIME"} <= set(kinds)
 
 
-def test_its_imu_is_that_of_the_circle(recorded: Path, tmp_path: Path) -> None:
-    """8 m/s around 60 m to the right: 1.07 m/s^2 to the right, 0.133 rad/s of yaw, and gravity."""
+def test_the_simulated_imu_is_that_of_a_circle(recorded: Path, tmp_path: Path) -> None:
+    """A right turn with 8 m/s and 60 m radius: 1.07 m/s^2 to the right, 0.133 rad/s of yaw, and gravity."""
     write_recorded(recorded, tmp_path / "out", seed=3)
     imu = [m for t, m in packets(tmp_path / "out" / "telemetry.tlog") if m.get_type() == "RAW_IMU" and 2 < t < 10]  # type: ignore[attr-defined]
     mean = np.array([[m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro] for m in imu]).mean(axis=0)  # type: ignore[attr-defined]
@@ -130,7 +130,7 @@ def test_its_imu_is_that_of_the_circle(recorded: Path, tmp_path: Path) -> None:
     assert mean[3:] / 1e3 == pytest.approx([0.0, 0.0, 8.0 / 60.0], abs=0.012)
 
 
-def test_its_attitude_and_height_are_those_of_the_truth(recorded: Path, tmp_path: Path) -> None:
+def test_the_simulated_attitude_and_height_follow_the_ground_truth(recorded: Path, tmp_path: Path) -> None:
     write_recorded(recorded, tmp_path / "out", seed=3)
     states = read_tlog(tmp_path / "out" / "telemetry.tlog")
     heights = [(s.t_ns / 1e9, s.agl_m) for s in states if s.agl_m is not None]
@@ -140,7 +140,7 @@ def test_its_attitude_and_height_are_those_of_the_truth(recorded: Path, tmp_path
     assert np.degrees(np.std(turns)) < 3.0
 
 
-def test_the_same_seed_writes_the_same_log(recorded: Path, tmp_path: Path) -> None:
+def test_the_same_seed_writes_the_same_telemetry_log(recorded: Path, tmp_path: Path) -> None:
     logs = []
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         write_recorded(recorded, tmp_path / name, seed=seed)
@@ -148,7 +148,7 @@ def test_the_same_seed_writes_the_same_log(recorded: Path, tmp_path: Path) -> No
     assert logs[0] == logs[1] != logs[2]
 
 
-def test_what_cannot_be_is_one_clear_line(recorded: Path, tmp_path: Path) -> None:
+def test_unusable_flights_and_outputs_are_rejected_with_one_line(recorded: Path, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="choose another --out"):
         write_recorded(recorded, recorded, seed=1)
     lines = (recorded / "truth.csv").read_text().splitlines()
@@ -165,9 +165,9 @@ def test_what_cannot_be_is_one_clear_line(recorded: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("name", "off_m"), [("village-1", 3.0), ("town-a", 1.0)])
-def test_real_flights_get_a_way_near_their_truth(name: str, off_m: float, data_set: DataSet) -> None:
-    way, _ = read_recorded(data_set(f"flights/{name}"))
-    assert way.level.off < off_m
-    path = way.path(float(way.level.t_s[-1]))
-    bend = np.gradient(path[:, 3:5], 0.02, axis=0)
-    assert np.linalg.norm(bend, axis=1).max() < 6.5
+def test_trajectories_of_real_flights_are_near_their_ground_truth(name: str, off_m: float, data_set: DataSet) -> None:
+    trajectory, _ = read_recorded(data_set(f"flights/{name}"))
+    assert trajectory.level.rms < off_m
+    path = trajectory.path(float(trajectory.level.t_s[-1]))
+    acceleration = np.gradient(path[:, 3:5], 0.02, axis=0)
+    assert np.linalg.norm(acceleration, axis=1).max() < 6.5

@@ -1,4 +1,4 @@
-"""The flight record: what is written is read, also after a kill, a cut or a torn tail."""
+"""The flight record: written messages are read back, also after a kill, a truncation or corruption of the end."""
 
 import json
 import os
@@ -38,7 +38,7 @@ from terrafix.recorder.node import make_edge
 edge = make_edge(NodeContext(Config(), MemoryFrameStore(1), None, Path(sys.argv[1])))
 for i in range(100000):
     edge.poll(i)
-    edge.heard(m.SourceEnded(t_ns=i, frames=i))
+    edge.on_message(m.SourceEnded(t_ns=i, frames=i))
     sys.stdout.write(f"{i}\\n")
     sys.stdout.flush()
     time.sleep(0.002)
@@ -49,20 +49,20 @@ def read(path: Path, result: ReadResult | None = None) -> list[m.Message]:
     return [message for _, _, message in read_flight(path, result)]
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    said = live_messages()
-    write_record(tmp_path / "flight.mcap", said)
+def test_recorded_messages_are_read_back(tmp_path: Path) -> None:
+    messages = live_messages()
+    write_record(tmp_path / "flight.mcap", messages)
     result = ReadResult()
-    assert read(tmp_path, result) == said
+    assert read(tmp_path, result) == messages
     assert result.header["config"]["recorder"]["thumbnails"] is True
     assert result.header["versions"]["python"] == sys.version.split()[0]
-    assert result.cut_off == []
+    assert result.truncated_files == []
     pictures = dict(read_thumbnails(tmp_path))
     assert len(pictures) == 20
     assert pictures[3].startswith(b"\xff\xd8")
 
 
-def test_a_standard_reader_opens_it_with_schemas_that_viewers_understand(tmp_path: Path) -> None:
+def test_a_standard_mcap_reader_opens_the_record_with_json_schemas(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", live_messages())
     with (tmp_path / "flight.mcap").open("rb") as stream:
         found = {}
@@ -93,46 +93,46 @@ def test_every_message_has_a_plain_schema(message_type: type[m.Message]) -> None
 
 
 @pytest.mark.parametrize("share", [0.1, 0.31, 0.5, 0.77, 0.9, 0.995])
-def test_a_cut_off_record_reads_up_to_the_cut(tmp_path: Path, share: float) -> None:
-    said = live_messages(200)
+def test_a_truncated_record_is_read_up_to_its_end(tmp_path: Path, share: float) -> None:
+    messages = live_messages(200)
     whole = tmp_path / "whole.mcap"
-    write_record(whole, said)
+    write_record(whole, messages)
     data = whole.read_bytes()
     (tmp_path / "flight.mcap").write_bytes(data[: int(len(data) * share)])
     result = ReadResult()
-    got = read(tmp_path, result)
-    assert got == said[: len(got)]
-    assert result.cut_off == [tmp_path / "flight.mcap"]
+    read_back = read(tmp_path, result)
+    assert read_back == messages[: len(read_back)]
+    assert result.truncated_files == [tmp_path / "flight.mcap"]
 
 
 @pytest.mark.parametrize("tail", [b"\x00" * 4096, b"\xff" * 4096, bytes(range(256)) * 16])
-def test_a_torn_tail_costs_only_the_tail(tmp_path: Path, tail: bytes) -> None:
-    said = live_messages(200)
-    write_record(tmp_path / "whole.mcap", said)
+def test_a_corrupt_tail_loses_only_the_tail(tmp_path: Path, tail: bytes) -> None:
+    messages = live_messages(200)
+    write_record(tmp_path / "whole.mcap", messages)
     data = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "flight.mcap").write_bytes(data[: len(data) * 2 // 3] + tail)
-    got = read(tmp_path)
-    assert got == said[: len(got)]
-    assert len(got) > len(said) // 4
+    read_back = read(tmp_path)
+    assert read_back == messages[: len(read_back)]
+    assert len(read_back) > len(messages) // 4
 
 
-def test_kill_9_costs_less_than_a_second(tmp_path: Path) -> None:
-    heard: list[tuple[float, int]] = []
+def test_kill_9_loses_less_than_a_second_of_the_record(tmp_path: Path) -> None:
+    written: list[tuple[float, int]] = []
     with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            heard.append((time.monotonic(), int(line)))
-            if heard[-1][1] >= 600:
+            written.append((time.monotonic(), int(line)))
+            if written[-1][1] >= 600:
                 break
         killed = time.monotonic()
         os.kill(process.pid, signal.SIGKILL)
-    got = [x.frames for x in read(tmp_path) if isinstance(x, m.SourceEnded)]
-    assert got == list(range(len(got)))
-    must_be_there = [i for at, i in heard if at < killed - 0.9]
-    assert len(got) >= len(must_be_there)
+    read_back = [x.frames for x in read(tmp_path) if isinstance(x, m.SourceEnded)]
+    assert read_back == list(range(len(read_back)))
+    must_be_there = [i for at, i in written if at < killed - 0.9]
+    assert len(read_back) >= len(must_be_there)
 
 
-def test_a_restarted_recorder_goes_on_in_the_next_file(tmp_path: Path) -> None:
+def test_a_restarted_recorder_continues_in_the_next_file(tmp_path: Path) -> None:
     for part in range(2):
         ring = SegmentRing(tmp_path, header(Config()), 64)
         ring.write(frame(part), part)
@@ -141,7 +141,7 @@ def test_a_restarted_recorder_goes_on_in_the_next_file(tmp_path: Path) -> None:
     assert [x.frame_id for x in read(tmp_path) if isinstance(x, m.Frame)] == [0, 1]
 
 
-def test_the_ring_keeps_its_budget_and_the_newest(tmp_path: Path) -> None:
+def test_the_ring_of_record_files_keeps_its_budget_and_the_newest_messages(tmp_path: Path) -> None:
     ring = SegmentRing(tmp_path, header(Config()), 1)
     ring.write(origin(), 0)
     noise = np.random.default_rng(1)
@@ -161,51 +161,51 @@ def test_the_ring_keeps_its_budget_and_the_newest(tmp_path: Path) -> None:
         assert result.header["format"].startswith("terrafix-flight/")
 
 
-class StuckRing(SegmentRing):
-    """A disk that does not answer until it is let go."""
+class BlockedRing(SegmentRing):
+    """A disk whose writes block until ``unblock`` is set."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, header(Config()), 64)
-        self.go = threading.Event()
+        self.unblock = threading.Event()
 
-    def write(self, message: m.Message, heard_ns: int) -> None:
-        self.go.wait()
-        super().write(message, heard_ns)
+    def write(self, message: m.Message, received_ns: int) -> None:
+        self.unblock.wait()
+        super().write(message, received_ns)
 
 
-def test_a_stuck_disk_stops_nobody_and_losses_are_recorded(tmp_path: Path) -> None:
-    ring = StuckRing(tmp_path)
+def test_a_blocked_disk_does_not_block_the_recorder_and_losses_are_recorded(tmp_path: Path) -> None:
+    ring = BlockedRing(tmp_path)
     edge = RecorderEdge(ring, MemoryFrameStore(1), None)
     began = time.monotonic()
     for i in range(QUEUE_LENGTH + 500):
-        edge.heard(estimate(i, 0.0, 0.0))
+        edge.on_message(estimate(i, 0.0, 0.0))
     assert time.monotonic() - began < 2.0
-    ring.go.set()
+    ring.unblock.set()
     edge.close()
-    said = read(tmp_path)
-    lost = sum(x.count for x in said if isinstance(x, m.Dropped))
-    kept = sum(isinstance(x, m.NavEstimate) for x in said)
+    messages = read(tmp_path)
+    lost = sum(x.count for x in messages if isinstance(x, m.Dropped))
+    kept = sum(isinstance(x, m.NavEstimate) for x in messages)
     assert 490 <= lost <= 500
     assert kept + lost == QUEUE_LENGTH + 500
 
 
-def test_frames_get_thumbnails_of_the_configured_width(tmp_path: Path) -> None:
+def test_frames_get_thumbnails_unless_their_pixels_are_gone(tmp_path: Path) -> None:
     store = MemoryFrameStore(2)
     store.put(0, np.zeros((480, 640, 3), np.uint8))
     edge = make_edge(NodeContext(Config(), store, None, tmp_path))
-    edge.heard(frame(0))
-    edge.heard(frame(1))  # its pixels are gone: no thumbnail, no failure
+    edge.on_message(frame(0))
+    edge.on_message(frame(1))  # its pixels are not in the store: no thumbnail and no error
     edge.close()
     pictures = dict(read_thumbnails(tmp_path))
     assert list(pictures) == [0]
 
 
-def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
+def test_an_output_folder_that_cannot_be_created_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be made"):
         make_edge(NodeContext(Config(), MemoryFrameStore(1), None, tmp_path / "file" / "out"))
 
 
-def test_a_folder_without_record_says_so(tmp_path: Path) -> None:
+def test_a_folder_without_flight_record_is_a_source_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no flight record"):
         read(tmp_path)

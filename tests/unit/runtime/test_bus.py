@@ -1,4 +1,4 @@
-"""Publish and subscribe over ipc, and the live shell on it: late comers, restarts, losses."""
+"""Publish/subscribe over ipc, and the live shell on it: late subscribers, restarts, losses."""
 
 import os
 import threading
@@ -12,7 +12,7 @@ import zmq
 from runtime_nodes import ORIGIN
 from terrafix import messages as m
 from terrafix.core.node import Edge
-from terrafix.processes import EVERYTHING, Process
+from terrafix.processes import ALL_MESSAGES, Process
 from terrafix.runtime import bus
 from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.executor import LiveShell
@@ -24,8 +24,8 @@ pytestmark = pytest.mark.real_time
 
 @pytest.fixture
 def context() -> Iterator["zmq.Context[zmq.Socket[bytes]]"]:
-    with zmq.Context() as made:
-        yield made
+    with zmq.Context() as zmq_context:
+        yield zmq_context
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def frame(frame_id: int) -> m.Frame:
 
 
 def collect(subscriber: Subscriber, publisher: Publisher, until: Callable[[list[m.Message]], bool]) -> list[m.Message]:
-    """What arrives, while the publisher serves its new subscribers."""
+    """Messages that arrive while the publisher serves its new subscribers."""
     got: list[m.Message] = []
     deadline = time.monotonic() + 5
     while not until(got):
@@ -49,7 +49,7 @@ def collect(subscriber: Subscriber, publisher: Publisher, until: Callable[[list[
     return got
 
 
-def test_late_comers_get_the_origin_and_others_do_not_get_it_twice(
+def test_late_subscribers_get_the_retained_origin_and_others_do_not_get_it_twice(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:
     address = run_dir.address("vision")
@@ -57,26 +57,26 @@ def test_late_comers_get_the_origin_and_others_do_not_get_it_twice(
     publisher = Publisher(context, address)
     collect(early, publisher, lambda _: publisher.subscriptions(m.Origin) == 1)
     for message in (ORIGIN, frame(1)):
-        publisher.say(message)
+        publisher.publish(message)
     assert collect(early, publisher, lambda got: len(got) == 2) == [ORIGIN, frame(1)]
     late = Subscriber(context, [address], (m.Origin, m.Frame))
     assert collect(late, publisher, bool) == [ORIGIN]
-    publisher.say(frame(2))
-    assert collect(late, publisher, bool) == [frame(2)], "what is not retained is not said again"
-    assert collect(early, publisher, bool) == [frame(2)], "Origin came a second time over the wire and was known"
-    assert not early.lost and not late.lost, "a late comer has lost nothing"
+    publisher.publish(frame(2))
+    assert collect(late, publisher, bool) == [frame(2)], "messages that are not retained are not sent again"
+    assert collect(early, publisher, bool) == [frame(2)], "the second Origin is discarded by its sequence number"
+    assert not early.lost and not late.lost, "messages before the subscription are not losses"
     for side in (early, late, publisher):
         side.close()
 
 
-def test_events_of_processes_are_said_again_while_they_are_news(
+def test_process_events_are_retained_for_ten_seconds(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:
     clock_ns = [0]
     publisher = Publisher(context, run_dir.address("supervisor"), clock=lambda: clock_ns[0])
     for second in (0, 15, 16):
         clock_ns[0] = second * 1_000_000_000
-        publisher.say(m.ProcessEvent(t_ns=clock_ns[0], process="anchor", event="died"))
+        publisher.publish(m.ProcessEvent(t_ns=clock_ns[0], process="anchor", event="died"))
     clock_ns[0] = 20_000_000_000
     late = Subscriber(context, [run_dir.address("supervisor")], (m.ProcessEvent,))
     got = collect(late, publisher, lambda got: len(got) == 2)
@@ -85,25 +85,25 @@ def test_events_of_processes_are_said_again_while_they_are_news(
     publisher.close()
 
 
-def test_a_restarted_publisher_is_found_again_and_its_origin_counts(
+def test_subscribers_reconnect_to_a_restarted_publisher_and_receive_its_origin(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:
     address = run_dir.address("vision")
     subscriber = Subscriber(context, [address], (m.Origin,))
     first = Publisher(context, address)
-    first.say(ORIGIN)
+    first.publish(ORIGIN)
     assert collect(subscriber, first, bool) == [ORIGIN]
     first.close()
     started = time.monotonic()
     second = Publisher(context, address)
-    second.say(ORIGIN)
+    second.publish(ORIGIN)
     assert collect(subscriber, second, bool) == [ORIGIN]
     assert time.monotonic() - started < 1.0
     subscriber.close()
     second.close()
 
 
-def test_a_subscriber_that_does_not_read_loses_messages_nobody_waits_and_the_loss_is_counted(
+def test_messages_lost_by_a_slow_subscriber_are_counted_and_publishing_does_not_block(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:
     publisher = Publisher(context, run_dir.address("vision"))
@@ -112,16 +112,16 @@ def test_a_subscriber_that_does_not_read_loses_messages_nobody_waits_and_the_los
     total = 6 * bus.QUEUE_LENGTH
     started = time.monotonic()
     for i in range(total):
-        publisher.say(frame(i))
-    assert time.monotonic() - started < 3, "saying never blocks"
+        publisher.publish(frame(i))
+    assert time.monotonic() - started < 3, "publishing does not block"
     time.sleep(0.2)
     got = len(list(slow.receive()))
     while more := len(list(slow.receive())):
         got += more
     deadline = time.monotonic() + 10.0
-    # A gap shows with the next message that comes through, and there may be more than one.
+    # A gap is detected with the next message that arrives, and there may be several gaps.
     while got + slow.lost["Frame"] < total and time.monotonic() < deadline:
-        publisher.say(frame(total))
+        publisher.publish(frame(total))
         total += 1
         time.sleep(0.01)
         got += len(list(slow.receive()))
@@ -132,7 +132,7 @@ def test_a_subscriber_that_does_not_read_loses_messages_nobody_waits_and_the_los
 
 
 class SlowNode:
-    """Takes 0.1 s for a Prediction, which it reports."""
+    """Takes 0.1 s for a Prediction and publishes a MapMatch for it."""
 
     def on(self, message: m.Message) -> Iterable[m.Message]:
         time.sleep(0.1)
@@ -150,8 +150,8 @@ class SlowNode:
 
 
 SLOW = Process("slow", "", (m.Prediction,), (m.MapMatch,), 0.0, 1.0, (m.Prediction,))
-TALKER = Process("talker", "", (), (m.Prediction,), 0.0, 1.0)
-LISTENER = Process("listener", "", EVERYTHING, (), 0.0, 1.0)
+PUBLISHER = Process("publisher", "", (), (m.Prediction,), 0.0, 1.0)
+LISTENER = Process("listener", "", ALL_MESSAGES, (), 0.0, 1.0)
 
 
 def prediction(frame_id: int) -> m.Prediction:
@@ -168,44 +168,44 @@ def prediction(frame_id: int) -> m.Prediction:
     )
 
 
-def test_a_slow_consumer_takes_the_newest_skips_the_rest_and_says_so(
+def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_ones(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:
-    table = (SLOW, TALKER, LISTENER)
+    table = (SLOW, PUBLISHER, LISTENER)
     progress = Progress.create(run_dir.progress("slow"))
     stop = threading.Event()
     shell = LiveShell(SLOW, table, SlowNode(), None, run_dir, context)
-    talker = Publisher(context, run_dir.address("talker"))
-    listener = Subscriber(context, [run_dir.address("slow")], EVERYTHING)
+    publisher = Publisher(context, run_dir.address("publisher"))
+    listener = Subscriber(context, [run_dir.address("slow")], ALL_MESSAGES)
     thread = threading.Thread(target=shell.run, args=(stop.is_set,))
     thread.start()
-    heard: list[m.Message] = []
+    received: list[m.Message] = []
     try:
-        while not talker.subscriptions(m.Prediction):
-            talker.serve()
+        while not publisher.subscriptions(m.Prediction):
+            publisher.serve()
             time.sleep(0.01)
         time.sleep(0.1)
         for i in range(100):
-            talker.say(prediction(i))
+            publisher.publish(prediction(i))
             time.sleep(0.015)
         deadline = time.monotonic() + 5
-        while not any(isinstance(h, m.MapMatch) and h.frame_id == 99 for h in heard) and time.monotonic() < deadline:
-            heard += listener.receive()
+        while not any(isinstance(h, m.MapMatch) and h.frame_id == 99 for h in received) and time.monotonic() < deadline:
+            received += listener.receive()
             time.sleep(0.01)
-        time.sleep(1.2)  # losses are said once a second
+        time.sleep(1.2)  # losses are published once a second
     finally:
         stop.set()
         thread.join()
-    heard += listener.receive()
-    matches = [h for h in heard if isinstance(h, m.MapMatch)]
+    received += listener.receive()
+    matches = [h for h in received if isinstance(h, m.MapMatch)]
     assert matches[-1].frame_id == 99
     assert 10 <= len(matches) < 30
-    assert sum(h.mode_e_m for h in matches) == 100.0, "the motion of the skipped ones is kept"
-    dropped = [h for h in heard if isinstance(h, m.Dropped)]
+    assert sum(h.mode_e_m for h in matches) == 100.0, "the merged predictions contain the motion of the skipped ones"
+    dropped = [h for h in received if isinstance(h, m.Dropped)]
     assert {(d.process, d.message) for d in dropped} == {("slow", "Prediction")}
     assert sum(d.count for d in dropped) == 100 - len(matches)
     assert progress.stamp_ns > 0 and progress.idle
-    for side in (shell, talker, listener, progress):
+    for side in (shell, publisher, listener, progress):
         side.close()
 
 
@@ -221,32 +221,32 @@ class TickingNode:
         return ()
 
 
-class OneWord:
-    """An edge that reads one Frame from the world."""
+class OneFrameEdge:
+    """An edge that reads one Frame."""
 
     def __init__(self) -> None:
-        self.said = False
-        self.heard_from_bus: list[m.Message] = []
+        self.done = False
+        self.received: list[m.Message] = []
         self.closed = False
 
     def poll(self, now_ns: int) -> Iterable[m.Message]:
-        if not self.said:
-            self.said = True
+        if not self.done:
+            self.done = True
             yield frame(1)
 
-    def heard(self, message: m.Message) -> None:
-        self.heard_from_bus.append(message)
+    def on_message(self, message: m.Message) -> None:
+        self.received.append(message)
 
     def close(self) -> None:
         self.closed = True
 
 
-def test_ticks_are_steady_and_the_edge_is_polled_and_closed(
+def test_ticks_keep_the_time_grid_and_the_edge_is_polled_and_closed(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:
     process = Process("ticking", "", (), (m.Frame,), 50.0, 1.0)
     Progress.create(run_dir.progress("ticking")).close()
-    node, edge = TickingNode(), OneWord()
+    node, edge = TickingNode(), OneFrameEdge()
     as_edge: Edge = edge
     shell = LiveShell(process, (process,), node, as_edge, run_dir, context)
     until = time.monotonic() + 1.0
@@ -255,10 +255,10 @@ def test_ticks_are_steady_and_the_edge_is_polled_and_closed(
     assert edge.closed
     assert 45 <= len(node.ticks_ns) <= 51
     phases_ms = [((t - node.ticks_ns[0]) / 1e6 + 10) % 20 - 10 for t in node.ticks_ns]
-    assert sorted(phases_ms)[len(phases_ms) // 2] < 3, "lateness does not add up"
+    assert sorted(phases_ms)[len(phases_ms) // 2] < 3, "delays do not accumulate"
 
 
-def test_progress_of_a_process_is_seen_from_outside(tmp_path: Path) -> None:
+def test_progress_stamps_are_visible_in_another_mapping(tmp_path: Path) -> None:
     outside = Progress.create(tmp_path / "p")
     inside = Progress(tmp_path / "p")
     assert outside.stamp_ns == 0
@@ -279,29 +279,30 @@ def test_addresses_are_short_enough_for_unix_sockets() -> None:
     assert len(os.fsencode(longest)) < 107
 
 
-def test_who_comes_while_much_is_said_hears_what_is_retained_first(
+def test_a_subscriber_that_joins_a_busy_stream_receives_retained_messages_first(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:
-    """A subscription may come inside of a send: of a thousand such late comers thirty heard a frame before Origin."""
+    """A subscription may arrive during a send: without XPUB_MANUAL thirty of a thousand late subscribers received a
+    frame before Origin."""
     over = threading.Event()
 
-    def speak() -> None:
+    def publish_frames() -> None:
         publisher = Publisher(context, run_dir.address("vision"))
-        publisher.say(ORIGIN)
+        publisher.publish(ORIGIN)
         count = 0
         while not over.is_set():
-            publisher.say(frame(count := count + 1))
+            publisher.publish(frame(count := count + 1))
             time.sleep(0)
         publisher.close()
 
-    speaker = threading.Thread(target=speak)
-    speaker.start()
+    thread = threading.Thread(target=publish_frames)
+    thread.start()
     try:
         for _ in range(500):
             late = Subscriber(context, [run_dir.address("vision")], (m.Origin, m.Frame))
-            assert late.socket.poll(5000), "nothing was heard"
+            assert late.socket.poll(5000), "no message was received"
             assert next(late.receive()) == ORIGIN
             late.socket.close()
     finally:
         over.set()
-        speaker.join(10)
+        thread.join(10)

@@ -1,4 +1,4 @@
-"""The in-process shell, the inbox, the clock and the codec: pure, so exact."""
+"""The in-process shell, the inbox, the ticker and the codec. They are deterministic, so results are exact."""
 
 from collections.abc import Iterable
 
@@ -10,7 +10,7 @@ from runtime_nodes import ORIGIN
 from terrafix import messages as m
 from terrafix.core import codec
 from terrafix.core.clock import Ticker
-from terrafix.processes import EVERYTHING, PROCESSES, SOURCE, Process
+from terrafix.processes import ALL_MESSAGES, PROCESSES, SOURCE, Process
 from terrafix.runtime.executor import InProcessShell
 from terrafix.runtime.inbox import Inbox
 
@@ -43,15 +43,15 @@ def status(now_ns: int) -> m.LinkStatus:
     )
 
 
-class Teller:
-    """Answers every message that it hears with its own name, and every tick with a status."""
+class ReplyingNode:
+    """Publishes a verdict with its name for every Frame, and a status at every tick."""
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.heard: list[str] = []
+        self.received: list[str] = []
 
     def on(self, message: m.Message) -> Iterable[m.Message]:
-        self.heard.append(type(message).__name__)
+        self.received.append(type(message).__name__)
         if isinstance(message, m.Frame):
             yield verdict(message.frame_id, self.name)
 
@@ -62,34 +62,34 @@ class Teller:
 TABLE = (
     Process("first", "", (m.Frame, m.MeasurementVerdict), (m.MeasurementVerdict,), 10.0, 1.0),
     Process("second", "", (m.Frame, m.MeasurementVerdict), (m.MeasurementVerdict,), 0.0, 1.0),
-    Process("listener", "", EVERYTHING, (), 0.0, 1.0),
+    Process("listener", "", ALL_MESSAGES, (), 0.0, 1.0),
 )
 
 
-def test_messages_go_breadth_first_in_table_order_and_through_the_sink_once() -> None:
-    said: list[tuple[str, str]] = []
-    nodes = {name: Teller(name) for name in ("listener", "second", "first")}  # order of the dict does not matter
-    shell = InProcessShell(nodes, lambda who, message: said.append((who, type(message).__name__)), table=TABLE)
+def test_messages_are_delivered_breadth_first_in_table_order_and_reach_the_sink_once() -> None:
+    sunk: list[tuple[str, str]] = []
+    nodes = {name: ReplyingNode(name) for name in ("listener", "second", "first")}  # the order has no effect
+    shell = InProcessShell(nodes, lambda who, message: sunk.append((who, type(message).__name__)), table=TABLE)
     shell.feed(frame(7))
     both = [("first", "MeasurementVerdict"), ("second", "MeasurementVerdict"), ("listener", "MeasurementVerdict")]
-    assert said == [(SOURCE, "Frame"), *both]
-    assert nodes["first"].heard == ["Frame", "MeasurementVerdict", "MeasurementVerdict"], "not its own word"
-    assert nodes["listener"].heard == ["Frame", "MeasurementVerdict", "MeasurementVerdict"]
+    assert sunk == [(SOURCE, "Frame"), *both]
+    assert nodes["first"].received == ["Frame", "MeasurementVerdict", "MeasurementVerdict"], "not its own message"
+    assert nodes["listener"].received == ["Frame", "MeasurementVerdict", "MeasurementVerdict"]
 
 
-def test_ticks_come_at_the_rate_of_the_table_and_only_where_there_is_one() -> None:
-    said: list[tuple[str, int]] = []
-    nodes = {"first": Teller("first"), "second": Teller("second")}
-    shell = InProcessShell(nodes, lambda who, message: said.append((who, message.t_ns)), table=TABLE)
+def test_ticks_have_the_rate_of_the_process_table() -> None:
+    sunk: list[tuple[str, int]] = []
+    nodes = {"first": ReplyingNode("first"), "second": ReplyingNode("second")}
+    shell = InProcessShell(nodes, lambda who, message: sunk.append((who, message.t_ns)), table=TABLE)
     for now_ms in (0, 50, 99, 100, 450, 460, 500):
         shell.tick(now_ms * 1_000_000)
-    assert said == [("first", ms * 1_000_000) for ms in (0, 100, 450, 500)], "late ticks are not made up for"
+    assert sunk == [("first", ms * 1_000_000) for ms in (0, 100, 450, 500)], "missed ticks are skipped"
 
 
 def test_the_same_input_gives_the_same_bytes() -> None:
     def fly() -> list[bytes]:
         record: list[bytes] = []
-        nodes = {name: Teller(name) for name in ("first", "second", "listener")}
+        nodes = {name: ReplyingNode(name) for name in ("first", "second", "listener")}
         shell = InProcessShell(nodes, lambda who, msg: record.append(who.encode() + codec.encode(msg)), table=TABLE)
         for i in range(20):
             shell.feed(frame(i))
@@ -99,28 +99,28 @@ def test_the_same_input_gives_the_same_bytes() -> None:
     assert fly() == fly()
 
 
-def test_a_node_that_the_table_does_not_know_is_an_error() -> None:
+def test_a_node_outside_the_process_table_is_an_error() -> None:
     with pytest.raises(ValueError, match="not in the process table: foo"):
-        InProcessShell({"foo": Teller("foo")}, lambda *_: None, table=TABLE)
+        InProcessShell({"foo": ReplyingNode("foo")}, lambda *_: None, table=TABLE)
 
 
-def test_every_message_that_is_said_is_heard_and_recorded() -> None:
+def test_the_recorder_subscribes_to_every_message_type() -> None:
     recorded = set(next(p for p in PROCESSES if p.name == "recorder").subscribes)
     assert recorded == set(m.AnyMessage.__args__)
     for process in PROCESSES:
         assert set(process.newest) <= set(process.subscribes)
 
 
-def test_ticker_keeps_an_absolute_grid() -> None:
+def test_the_ticker_keeps_an_absolute_time_grid() -> None:
     ticker = Ticker(50.0, 1000)
     assert ticker.due(1000) and not ticker.due(1000)
     assert ticker.due(1000 + 27_000_000), "late by 7 ms"
-    assert ticker.next_ns == 1000 + 40_000_000, "the next one is not late"
+    assert ticker.next_ns == 1000 + 40_000_000, "the next deadline stays on the grid"
     assert ticker.due(1000 + 130_000_000)
     assert ticker.next_ns == 1000 + 140_000_000, "missed ticks are skipped"
 
 
-def test_only_the_newest_prediction_is_worked_on_and_no_motion_is_lost() -> None:
+def test_queued_predictions_are_merged_into_the_newest_without_loss_of_motion() -> None:
     inbox = Inbox(newest=(m.Prediction,))
     inbox.put(ORIGIN)
     for i, (east_m, north_m) in enumerate([(1.0, 2.0), (10.0, 20.0), (100.0, 200.0)]):
@@ -135,7 +135,7 @@ def test_only_the_newest_prediction_is_worked_on_and_no_motion_is_lost() -> None
     assert inbox.skipped == {"Prediction": 2}
 
 
-def test_a_full_inbox_loses_the_oldest_and_counts_but_keeps_the_origin() -> None:
+def test_a_full_inbox_drops_and_counts_the_oldest_messages_except_the_origin() -> None:
     inbox = Inbox(capacity=3)
     inbox.put(ORIGIN)
     for i in range(5):
@@ -144,14 +144,14 @@ def test_a_full_inbox_loses_the_oldest_and_counts_but_keeps_the_origin() -> None
     assert [inbox.take() for _ in range(4)] == [ORIGIN, frame(3), frame(4), None]
 
 
-def test_codec_round_trip_of_numbers_enums_and_absence() -> None:
+def test_codec_round_trip_of_numbers_enums_and_none() -> None:
     estimate = prediction(3, 0.1 + 0.2, -0.0)
     for message in (estimate, verdict(1, "höhe"), ORIGIN, status(2**62)):
         assert codec.decode(codec.encode(message)) == message
         assert codec.decode_json(codec.encode_json(message)) == message
 
 
-def test_codec_takes_numpy_scalars_and_refuses_other_things() -> None:
+def test_codec_accepts_numpy_scalars_and_rejects_arrays_and_unknown_types() -> None:
     odd = msgspec.structs.replace(prediction(np.int64(3), np.float64(0.1), np.float32(0.5)))  # type: ignore[arg-type]
     assert codec.decode(codec.encode(odd)) == prediction(3, 0.1, 0.5)
     with pytest.raises(TypeError, match="ndarray cannot be part of a message"):

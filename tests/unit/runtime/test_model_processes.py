@@ -1,4 +1,4 @@
-"""Which provider runs a model, what is refused when it is opened, and what a failure costs while it runs."""
+"""Selection of the execution provider of a model, rejection of unusable models, and failures while a model runs."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def opened(path: Path, **more: Any) -> Model:
     return Model(path, IN, OUT, manifest=described, engines=path.parent / "engines", exact=True, **more)
 
 
-def test_it_computes_what_the_file_says(tiny: Path) -> None:
+def test_the_model_computes_the_function_of_its_file(tiny: Path) -> None:
     image = np.random.default_rng(3).random((1, 3, 64, 64), dtype=np.float32)
     (found,) = opened(tiny).run(image)
     weights = np.random.default_rng(1).normal(size=(64, 3, 8, 8)).astype(np.float32)
@@ -38,25 +38,25 @@ def test_it_computes_what_the_file_says(tiny: Path) -> None:
     assert found.shape == (1, 64, 8, 8) and np.allclose(found[0], expected, atol=1e-3)
 
 
-def test_a_plain_onnx_runtime_says_why_it_is_the_processor(tiny: Path) -> None:
+def test_an_onnx_runtime_without_gpu_states_why_it_uses_the_cpu(tiny: Path) -> None:
     if set(ort.get_available_providers()) & {TENSORRT, CUDA}:
         pytest.skip("this ONNX Runtime has a GPU provider")
     model = opened(tiny)
     assert model.provider == CPU
-    assert [one.provider for one in model.passed_over] == [TENSORRT, CUDA]
-    assert "built without it, it has" in str(model.passed_over[0]) and "CPU" in str(model.passed_over[0])
+    assert [one.provider for one in model.rejected_providers] == [TENSORRT, CUDA]
+    assert "built without it, it has" in str(model.rejected_providers[0]) and "CPU" in str(model.rejected_providers[0])
 
 
-def test_an_answer_that_is_not_a_number_costs_that_answer_only(tiny: Path) -> None:
+def test_an_output_with_nan_is_rejected_and_the_next_run_succeeds(tiny: Path) -> None:
     model = opened(tiny)
-    with pytest.raises(ModelRunError, match="'descriptors' is not a number in places"):
+    with pytest.raises(ModelRunError, match="'descriptors' has NaN or infinite values"):
         model.run(BLUE)
     assert np.isfinite(model.run(GRAY)[0]).all()
-    assert model.answers == 1
+    assert model.run_count == 1
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 64, 64), (1, 3, 64), (2, 3, 0, 64)])
-def test_an_input_of_the_wrong_shape_is_refused_and_does_no_harm(tiny: Path, shape: tuple[int, ...]) -> None:
+def test_an_input_of_the_wrong_shape_is_rejected_and_the_provider_is_kept(tiny: Path, shape: tuple[int, ...]) -> None:
     model = opened(tiny)
     with pytest.raises(ModelRunError, match=r"tiny\.onnx: "):
         model.run(np.zeros(shape, np.float32))
@@ -100,13 +100,13 @@ def spoilt(path: Path, kind: str) -> None:
         ("cut off", "not the published file"),
         ("one bit", "not the published file"),
         ("not onnx", "cannot be run"),
-        ("never a number", "output 'descriptors' is not a number"),
+        ("never a number", "output 'descriptors' has NaN"),
         ("other channels", "output 'descriptors' is"),
         ("other type", "is float32, not int64"),
         ("other tensors", "has inputs ['picture'] and outputs ['features'], expected ('input',)"),
     ],
 )
-def test_what_cannot_be_used_is_refused_in_one_line(tiny: Path, kind: str, says: str) -> None:
+def test_an_unusable_model_file_is_rejected_with_one_line(tiny: Path, kind: str, says: str) -> None:
     spoilt(tiny, kind)
     with pytest.raises(ModelFileError) as error:
         opened(tiny)
@@ -114,13 +114,13 @@ def test_what_cannot_be_used_is_refused_in_one_line(tiny: Path, kind: str, says:
 
 
 class Machine:
-    """A computer with a GPU, as far as ONNX Runtime tells: sessions compute on the CPU and fail on demand."""
+    """Simulates a computer with a GPU in ONNX Runtime: sessions compute on the CPU and fail on request."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.fails: dict[str, str] = {}  # provider -> "start", "session", "memory", "nonsense"
-        self.options: list[dict[str, str]] = []  # of TensorRT
-        self.builds = True  # TensorRT writes an engine
-        self.ran: list[tuple[int, ...]] = []  # shapes that CUDA was given
+        self.options: list[dict[str, str]] = []  # options of each TensorRT session
+        self.builds = True  # whether TensorRT writes an engine
+        self.ran: list[tuple[int, ...]] = []  # input shapes of all runs on CUDA
         real, owner = ort.InferenceSession, self
 
         class Session:
@@ -166,31 +166,31 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
     return Machine(monkeypatch)
 
 
-def test_no_engine_is_built_in_flight(tiny: Path, machine: Machine) -> None:
+def test_no_tensorrt_engine_is_built_in_flight(tiny: Path, machine: Machine) -> None:
     model = opened(tiny)
     assert model.provider == CUDA and machine.options == []
-    (over,) = model.passed_over
+    (over,) = model.rejected_providers
     assert over.provider == TENSORRT and "no engine" in over.reason and "terrafix models build" in over.reason
 
 
-def test_every_size_that_is_known_is_met_before_take_off(tiny: Path, machine: Machine) -> None:
+def test_all_preset_sizes_are_run_once_before_take_off(tiny: Path, machine: Machine) -> None:
     model = opened(tiny)
     assert model.provider == CUDA and machine.ran == [(1, 3, 32, 64), (1, 3, 64, 64)]
 
 
-def test_a_model_without_presets_is_not_for_tensorrt(tiny: Path, machine: Machine) -> None:
+def test_a_model_without_presets_does_not_use_tensorrt(tiny: Path, machine: Machine) -> None:
     described = tiny.with_suffix(".toml")
     described.write_text(described.read_text().split("[[presets]]")[0])
     model = opened(tiny, build=True)
-    assert model.provider == CUDA and "has no preset" in model.passed_over[0].reason
+    assert model.provider == CUDA and "has no preset" in model.rejected_providers[0].reason
     assert machine.ran == [(1, 3, runtime.WARM_UP_SIZE, runtime.WARM_UP_SIZE)]
 
 
-def test_an_engine_that_was_built_is_taken(tiny: Path, machine: Machine) -> None:
+def test_a_built_tensorrt_engine_is_used(tiny: Path, machine: Machine) -> None:
     assert opened(tiny, build=True).provider == TENSORRT
     machine.options.clear()
     model = opened(tiny)
-    assert model.provider == TENSORRT and model.passed_over == []
+    assert model.provider == TENSORRT and model.rejected_providers == []
     assert [o["trt_profile_opt_shapes"] for o in machine.options] == ["input:1x3x32x64", "input:1x3x64x64"]
     for options in machine.options:
         assert options["trt_profile_min_shapes"] == options["trt_profile_max_shapes"]
@@ -200,7 +200,7 @@ def test_an_engine_that_was_built_is_taken(tiny: Path, machine: Machine) -> None
     assert len(model.run(GRAY)) == 1
 
 
-def test_an_engine_fits_one_model_gpu_tensorrt_precision_and_size(
+def test_an_engine_is_specific_to_model_gpu_tensorrt_precision_and_size(
     tiny: Path, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     presets = manifest.read(tiny.with_suffix(".toml")).presets
@@ -219,13 +219,13 @@ def test_an_engine_fits_one_model_gpu_tensorrt_precision_and_size(
     assert len({folder, *others}) == 6
 
 
-def test_an_engine_that_was_not_built_to_its_end_is_not_taken(tiny: Path, machine: Machine) -> None:
+def test_an_incomplete_engine_is_not_used(tiny: Path, machine: Machine) -> None:
     machine.fails[TENSORRT] = "memory"
     built = opened(tiny, build=True)
-    assert built.provider == CUDA and "Failed to allocate memory" in built.passed_over[0].reason
+    assert built.provider == CUDA and "Failed to allocate memory" in built.rejected_providers[0].reason
     del machine.fails[TENSORRT]
     assert opened(tiny).provider == CUDA
-    machine.builds = False  # and one that says it is ready, but whose engine is gone
+    machine.builds = False  # an engine folder that is marked as ready but has no engine file
     opened(tiny, build=True)
     for engine in tiny.parent.rglob("*.engine"):
         engine.unlink()
@@ -233,36 +233,42 @@ def test_an_engine_that_was_not_built_to_its_end_is_not_taken(tiny: Path, machin
 
 
 @pytest.mark.parametrize(("kind", "says"), [("start", "could not start it"), ("session", "out of memory")])
-def test_a_provider_that_does_not_start_is_passed_over(tiny: Path, machine: Machine, kind: str, says: str) -> None:
+def test_a_provider_that_does_not_start_is_skipped(tiny: Path, machine: Machine, kind: str, says: str) -> None:
     machine.fails[CUDA] = kind
     model = opened(tiny)
-    assert model.provider == CPU and says in model.passed_over[1].reason and "\n" not in model.passed_over[1].reason
+    assert (
+        model.provider == CPU
+        and says in model.rejected_providers[1].reason
+        and "\n" not in model.rejected_providers[1].reason
+    )
 
 
-def test_a_computer_without_a_device_uses_the_processor(
+def test_a_computer_without_cuda_device_uses_the_cpu(
     tiny: Path, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(gpu, "gpu_name", lambda: None)
     model = opened(tiny)
-    assert model.provider == CPU and {one.reason for one in model.passed_over} == {"the driver finds no CUDA device"}
+    assert model.provider == CPU and {one.reason for one in model.rejected_providers} == {
+        "the driver finds no CUDA device"
+    }
 
 
-@pytest.mark.parametrize(("kind", "says"), [("memory", "Failed to allocate memory"), ("nonsense", "not a number")])
-def test_a_provider_that_fails_in_flight_is_left_for_the_next_one(
+@pytest.mark.parametrize(("kind", "says"), [("memory", "Failed to allocate memory"), ("nonsense", "has NaN")])
+def test_a_provider_that_fails_in_flight_is_replaced_by_the_next_one(
     tiny: Path, machine: Machine, kind: str, says: str
 ) -> None:
     model = opened(tiny)
     before = model.run(GRAY)
     machine.fails[CUDA] = kind
-    assert np.array_equal(model.run(GRAY), before)  # the same frame, without a loss
+    assert np.array_equal(model.run(GRAY), before)  # the same frame is run again on the next provider
     assert model.provider == CPU
-    assert model.passed_over[-1].provider == CUDA and says in model.passed_over[-1].reason
+    assert model.rejected_providers[-1].provider == CUDA and says in model.rejected_providers[-1].reason
     del machine.fails[CUDA]
     model.run(GRAY)
-    assert model.provider == CPU  # for good: a flight does not go to and fro
+    assert model.provider == CPU  # no return to a provider that has failed
 
 
-def test_when_nobody_can_any_more_every_answer_is_refused(tiny: Path, machine: Machine) -> None:
+def test_every_run_raises_when_all_providers_have_failed(tiny: Path, machine: Machine) -> None:
     model = opened(tiny)
     machine.fails |= {CUDA: "memory", CPU: "session"}
     for _ in range(2):
@@ -270,15 +276,15 @@ def test_when_nobody_can_any_more_every_answer_is_refused(tiny: Path, machine: M
             model.run(GRAY)
 
 
-def test_a_frame_that_no_engine_is_made_for_goes_to_the_next_provider(tiny: Path, machine: Machine) -> None:
+def test_a_frame_size_without_engine_runs_on_the_next_provider(tiny: Path, machine: Machine) -> None:
     opened(tiny, build=True)
     model = opened(tiny)
     assert model.side_lengths(20, 60) == (32, 64) and model.side_lengths(33, 10) == (64, 64)
     model.run(np.full((1, 3, *model.side_lengths(100, 60)), 0.5, np.float32))
-    assert model.provider == CUDA and "nothing is ready for" in model.passed_over[-1].reason
+    assert model.provider == CUDA and "no session for inputs" in model.rejected_providers[-1].reason
 
 
-def test_on_the_processor_a_frame_is_filled_up_to_multiples_only(tiny: Path) -> None:
+def test_on_the_cpu_a_frame_is_padded_only_to_the_stride(tiny: Path) -> None:
     assert opened(tiny).side_lengths(100, 57) == (104, 64)
 
 

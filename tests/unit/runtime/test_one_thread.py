@@ -1,4 +1,4 @@
-"""Matrices are small and processes share the cores: no process of ours computes with more than one thread of BLAS."""
+"""Our processes use one BLAS thread each, because their matrices are small and they share the cores."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""The program `terrafix`: what is begun before the command line is there, and who gets it."""
+"""The program `terrafix`: the fork server that starts before the command line is imported, and its use."""
 
 import subprocess
 import sys
@@ -13,67 +13,68 @@ RUN = ["terrafix", "run", "--map", "area.gpkg", "--source", "/dev/video0"]
 
 
 class ForkServer:
-    """Says when it was begun and closed."""
+    """Records when it is started and closed."""
 
-    made: "list[ForkServer]"
-    said: list[str]
+    created: "list[ForkServer]"
+    events: list[str]
 
     def __init__(self) -> None:
-        self.made.append(self)
-        self.said.append("typer" if "terrafix_tools.cli" in sys.modules else "begun first")
+        self.created.append(self)
+        self.events.append("after typer" if "terrafix_tools.cli" in sys.modules else "started first")
 
     def __enter__(self) -> "ForkServer":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.said.append("closed")
+        self.events.append("closed")
 
 
 @pytest.fixture
 def fork_server(monkeypatch: pytest.MonkeyPatch) -> type[ForkServer]:
-    ForkServer.made, ForkServer.said = [], []
+    ForkServer.created, ForkServer.events = [], []
     monkeypatch.setattr("terrafix.runtime.fork_server.ForkServer", ForkServer)
     return ForkServer
 
 
-def test_a_run_gets_the_nursery_that_was_begun_before_the_command_line(
+def test_a_run_uses_the_fork_server_started_before_the_command_line(
     fork_server: type[ForkServer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     got: dict[str, Any] = {}
 
-    def run(**wanted: Any) -> int:
-        got.update(wanted, closed="closed" in fork_server.said)
+    def run(**arguments: Any) -> int:
+        got.update(arguments, closed="closed" in fork_server.events)
         return 3
 
+    spec = SimpleNamespace(ground_amsl_m=320.0)
     monkeypatch.setattr("terrafix.runtime.supervisor.run", run)
-    monkeypatch.setattr("terrafix.runtime.supervisor.killed_just_now", lambda **_: SimpleNamespace(ground_amsl_m=320.0))
+    monkeypatch.setattr("terrafix.runtime.supervisor.recently_killed_spec", lambda **_: spec)
     monkeypatch.delitem(sys.modules, "terrafix_tools.cli", raising=False)
     monkeypatch.setattr(sys, "argv", RUN)
     with pytest.raises(SystemExit) as ended:
         program.main()
     assert ended.value.code == 3
-    assert got["fork_server"] is fork_server.made[0] and not got["closed"] and got["ground_amsl_m"] == 320.0
-    assert fork_server.said == ["begun first", "closed"]
+    assert got["fork_server"] is fork_server.created[0] and not got["closed"] and got["ground_amsl_m"] == 320.0
+    assert fork_server.events == ["started first", "closed"]
 
 
-def test_a_run_that_cannot_begin_leaves_no_nursery(
+def test_a_run_with_wrong_arguments_closes_the_fork_server(
     fork_server: type[ForkServer], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["terrafix", "run", "--mapp", "area.gpkg"])
     with pytest.raises(SystemExit) as ended:
         program.main()
     assert ended.value.code == 2 and "--mapp" in capsys.readouterr().err
-    assert fork_server.said[-1] == "closed"
+    assert fork_server.events[-1] == "closed"
 
 
-def test_other_commands_have_no_nursery(fork_server: type[ForkServer], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_commands_start_no_fork_server(fork_server: type[ForkServer], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["terrafix", "--help"])
     with pytest.raises(SystemExit):
         program.main()
-    assert fork_server.made == []
+    assert fork_server.created == []
 
 
-def test_the_program_itself_loads_no_command_line() -> None:
+def test_the_program_module_does_not_import_the_command_line() -> None:
     code = """
 import sys
 import terrafix_tools.program, terrafix.runtime.fork_server

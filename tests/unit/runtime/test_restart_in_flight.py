@@ -1,4 +1,4 @@
-"""All of Terrafix was killed in flight and is started again: what it takes from the run before."""
+"""Restart of all of Terrafix in flight: the state that it takes over from the killed run."""
 
 import fcntl
 import shutil
@@ -14,26 +14,27 @@ from terrafix.runtime import run_dir
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import PREFIX, OwnedRunDir, RunDir
 from terrafix.runtime.run_spec import spec_of
-from terrafix.runtime.supervisor import _is_camera, killed_just_now
+from terrafix.runtime.supervisor import _is_camera, recently_killed_spec
 
 
 def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
-    dead = RunDir(parent / f"{PREFIX}dead")
-    dead.path.mkdir()
-    (dead.path / "lock").touch()
-    dead.spec.write_bytes(spec)
-    dead.set_epoch(7)
-    dead.checkpoint("estimator").write_bytes(b"the newest estimate")
-    dead.shelf("anchor").mkdir()
-    (dead.shelf("anchor") / "0 0.tile").touch()
-    progress = Progress.create(dead.progress("link"))
+    """The folder of a run that was killed ``age_s`` ago."""
+    stale = RunDir(parent / f"{PREFIX}dead")
+    stale.path.mkdir()
+    (stale.path / "lock").touch()
+    stale.spec.write_bytes(spec)
+    stale.set_epoch(7)
+    stale.checkpoint("estimator").write_bytes(b"the newest estimate")
+    stale.cache_dir("anchor").mkdir()
+    (stale.cache_dir("anchor") / "0 0.tile").touch()
+    progress = Progress.create(stale.progress("link"))
     progress.stamp(time.monotonic_ns() - round(age_s * 1e9))
     progress.close()
-    return dead
+    return stale
 
 
 @pytest.mark.parametrize(
-    ("spec", "camera", "age_s", "goes_on", "stays"),
+    ("spec", "camera", "age_s", "resumes", "stays"),
     [
         (b"this map", True, 5.0, True, False),
         (b"this map", False, 5.0, False, True),
@@ -42,29 +43,29 @@ def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
         (b"another map", True, 61.0, False, False),
     ],
 )
-def test_it_goes_on_from_a_run_of_the_same_that_was_killed_just_now(
-    tmp_path: Path, spec: bytes, camera: bool, age_s: float, goes_on: bool, stays: bool
+def test_a_run_resumes_from_a_recently_killed_run_with_the_same_spec(
+    tmp_path: Path, spec: bytes, camera: bool, age_s: float, resumes: bool, stays: bool
 ) -> None:
-    dead = killed(tmp_path, spec, age_s)
-    owned = OwnedRunDir(tmp_path, b"this map", goes_on=camera)
+    stale = killed(tmp_path, spec, age_s)
+    owned = OwnedRunDir(tmp_path, b"this map", resume=camera)
     try:
-        assert owned.run_dir.epoch_ns == (7 if goes_on else None)
-        assert owned.run_dir.checkpoint("estimator").exists() == goes_on
-        assert (owned.run_dir.shelf("anchor") / "0 0.tile").exists() == goes_on
-        assert dead.path.exists() == stays, "what goes on another way has an heir that is still to come"
+        assert owned.run_dir.epoch_ns == (7 if resumes else None)
+        assert owned.run_dir.checkpoint("estimator").exists() == resumes
+        assert (owned.run_dir.cache_dir("anchor") / "0 0.tile").exists() == resumes
+        assert stale.path.exists() == stays, "a run with another spec is kept for its own successor"
     finally:
         owned.remove()
 
 
-def test_a_supervisor_that_ended_without_being_asked_leaves_it_too(tmp_path: Path) -> None:
+def test_the_folder_kept_by_a_failed_supervisor_is_resumed_and_then_removed(tmp_path: Path) -> None:
     first = OwnedRunDir(tmp_path, b"this map")
     first.run_dir.set_epoch(7)
     progress = Progress.create(first.run_dir.progress("link"))
     progress.stamp(time.monotonic_ns())
     progress.close()
-    first.left = True
+    first.keep_for_successor = True
     first.remove()
-    second = OwnedRunDir(tmp_path, b"this map", goes_on=True)
+    second = OwnedRunDir(tmp_path, b"this map", resume=True)
     assert second.run_dir.epoch_ns == 7
     second.remove()
     assert not list(tmp_path.iterdir())
@@ -73,7 +74,7 @@ def test_a_supervisor_that_ended_without_being_asked_leaves_it_too(tmp_path: Pat
 CAMERA = "http://127.0.0.1:80/stream"
 
 
-def test_a_map_that_was_looked_at_is_not_looked_at_again_while_a_vehicle_waits(
+def test_the_spec_of_a_recently_killed_run_is_found_so_that_the_map_is_not_inspected_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_dir, "SHM", tmp_path)
@@ -81,30 +82,30 @@ def test_a_map_that_was_looked_at_is_not_looked_at_again_while_a_vehicle_waits(
     config = Config(map=Map(path=str(package)), source=Source(path=CAMERA), link=LinkSection(device="udpin:h:1"))
     spec = msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5))
 
-    def found(source: str = CAMERA, map_path: Path = package, link: str = "udpin:h:1") -> float | None:
-        before = killed_just_now(source=source, map_path=map_path, link=link, out_dir=out, configs=[])
+    def ground_amsl_m(source: str = CAMERA, map_path: Path = package, link: str = "udpin:h:1") -> float | None:
+        before = recently_killed_spec(source=source, map_path=map_path, link=link, out_dir=out, configs=[])
         return None if before is None else before.ground_amsl_m
 
-    assert found() is None
-    dead = killed(tmp_path, spec, 5.0)
-    assert found() == 412.5
-    assert found(map_path=tmp_path / "b.gpkg") is None
-    assert found(link="udpin:h:2") is None
+    assert ground_amsl_m() is None
+    stale = killed(tmp_path, spec, 5.0)
+    assert ground_amsl_m() == 412.5
+    assert ground_amsl_m(map_path=tmp_path / "b.gpkg") is None
+    assert ground_amsl_m(link="udpin:h:2") is None
     config = msgspec.structs.replace(config, source=Source(path=str(tmp_path)))
-    dead.spec.write_bytes(msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5)))
-    assert found(source=str(tmp_path)) is None, "a recording begins anew"
-    dead.spec.write_bytes(b'{"of another version": 1}')
-    assert found() is None
-    dead.spec.write_bytes(spec)
-    with (dead.path / "lock").open() as lock:
+    stale.spec.write_bytes(msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5)))
+    assert ground_amsl_m(source=str(tmp_path)) is None, "a recorded source is not resumed"
+    stale.spec.write_bytes(b'{"of another version": 1}')
+    assert ground_amsl_m() is None
+    stale.spec.write_bytes(spec)
+    with (stale.path / "lock").open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert found() is None, "it lives"
-    shutil.rmtree(dead.path)
+        assert ground_amsl_m() is None, "its supervisor is running"
+    shutil.rmtree(stale.path)
     killed(tmp_path, spec, 61.0)
-    assert found() is None
+    assert ground_amsl_m() is None
 
 
-def test_a_recording_is_no_camera(tmp_path: Path) -> None:
+def test_a_recorded_source_is_not_a_live_camera(tmp_path: Path) -> None:
     assert _is_camera("/dev/video0")
     assert _is_camera("http://127.0.0.1:80/stream")
     assert _is_camera("v4l2src device=/dev/video0 ! videoconvert ! appsink " + "x" * 300)

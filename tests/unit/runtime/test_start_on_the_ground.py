@@ -9,7 +9,7 @@ from terrafix.core.errors import MapError, SourceError, UsageError
 from terrafix_tools.live import package_for
 
 
-def test_mistakes_in_source_start_and_map_are_found_on_the_ground(tmp_path: Path) -> None:
+def test_errors_in_source_start_and_map_are_reported_before_take_off(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no source given"):
         package_for("", "", None, [])
     with pytest.raises(UsageError, match="write LAT,LON in degrees"):
@@ -20,7 +20,7 @@ def test_mistakes_in_source_start_and_map_are_found_on_the_ground(tmp_path: Path
         package_for("/dev/video0", "", tmp_path / "none.gpkg", [])
 
 
-def test_a_map_that_does_not_cover_the_start_is_refused(data_set: Callable[[str], Path], tmp_path: Path) -> None:
+def test_a_missing_map_is_rejected(data_set: Callable[[str], Path], tmp_path: Path) -> None:
     flight = data_set("flights/town-a")
     with pytest.raises(MapError, match=r"none\.tif: no such map"):
         package_for(str(flight), "", tmp_path / "none.tif", [])

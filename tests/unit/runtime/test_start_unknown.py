@@ -1,4 +1,4 @@
-"""A flight whose start nobody knows: the source says so, whoever opens it puts it in the middle of the map."""
+"""A flight with unknown start: vision replaces it by the centre of the map."""
 
 import math
 import sqlite3
@@ -11,7 +11,7 @@ from terrafix.core.clock import now_ns
 from terrafix.core.config import Config, Source
 from terrafix.core.errors import MapError, SourceError
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.core.initial_position import map_bounds, placed, start_is_unknown
+from terrafix.core.initial_position import map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import NodeContext
 from terrafix.messages import Origin
 from terrafix.vision.edge import make_edge
@@ -22,7 +22,7 @@ NO_START = TOML.replace("[start]\nlat_deg = 48.0\nlon_deg = 2.0\n", "")
 
 
 def package(path: Path, value: str = f"[{WEST}, {SOUTH}, {EAST}, {NORTH}]") -> Path:
-    """What is looked at of a map package: one row of its manifest."""
+    """The part of a map package that is read: one row of its manifest."""
     db = sqlite3.connect(path)
     db.execute("CREATE TABLE terrafix_manifest (key TEXT, value TEXT)")
     db.execute("INSERT INTO terrafix_manifest VALUES ('bounds_wgs84', ?)", (value,))
@@ -36,7 +36,7 @@ def context(folder: Path, map_path: Path | None) -> NodeContext:
     return NodeContext(config=config, frames=MemoryFrameStore(), map_path=map_path, out_dir=folder)
 
 
-def test_it_starts_in_the_middle_of_the_map_as_uncertain_as_the_map_is_large(tmp_path: Path) -> None:
+def test_an_unknown_start_is_the_map_centre_with_the_size_of_the_map_as_sigma(tmp_path: Path) -> None:
     edge = make_edge(context(flight(tmp_path / "f", toml=NO_START), package(tmp_path / "map.gpkg")))
     try:
         (origin,) = edge.poll(now_ns())
@@ -48,13 +48,13 @@ def test_it_starts_in_the_middle_of_the_map_as_uncertain_as_the_map_is_large(tmp
         edge.close()
 
 
-def test_a_known_start_is_left_alone(tmp_path: Path) -> None:
+def test_a_known_start_is_not_changed(tmp_path: Path) -> None:
     origin = open_source(str(flight(tmp_path / "f"))).origin()
     assert not start_is_unknown(origin)
-    assert placed(origin, (WEST, SOUTH, EAST, NORTH)) == origin
+    assert with_map_center(origin, (WEST, SOUTH, EAST, NORTH)) == origin
 
 
-def test_neither_start_nor_map_is_a_mistake(tmp_path: Path) -> None:
+def test_a_source_without_start_and_without_map_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="neither a start coordinate nor a map to search; give --map, or --start"):
         make_edge(context(flight(tmp_path / "f", toml=NO_START), None))
 

@@ -1,4 +1,4 @@
-"""Signals that ask for the end: noted, and given back."""
+"""Signals that request the end of the process, and the restoration of the previous handlers."""
 
 import signal
 import threading
@@ -6,24 +6,24 @@ import threading
 from terrafix.runtime.stop_signal import StopSignal
 
 
-def test_a_signal_is_noted_and_then_the_signals_are_again_whose_they_were() -> None:
+def test_a_signal_is_recorded_and_the_previous_handlers_are_restored() -> None:
     before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
-    with StopSignal(signal.SIGTERM, signal.SIGINT) as asked:
-        assert not asked()
+    with StopSignal(signal.SIGTERM, signal.SIGINT) as stop_requested:
+        assert not stop_requested()
         signal.raise_signal(signal.SIGINT)
-        assert asked()
+        assert stop_requested()
     assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)] == before
 
 
-def test_outside_the_main_thread_no_signal_is_taken() -> None:
-    heard: list[bool] = []
+def test_no_handler_is_installed_outside_the_main_thread() -> None:
+    results: list[bool] = []
 
-    def look() -> None:
-        with StopSignal(signal.SIGTERM) as asked:
-            heard.append(asked())
+    def enter_in_thread() -> None:
+        with StopSignal(signal.SIGTERM) as stop_requested:
+            results.append(stop_requested())
 
     before = signal.getsignal(signal.SIGTERM)
-    thread = threading.Thread(target=look)
+    thread = threading.Thread(target=enter_in_thread)
     thread.start()
     thread.join()
-    assert heard == [False] and signal.getsignal(signal.SIGTERM) is before
+    assert results == [False] and signal.getsignal(signal.SIGTERM) is before

@@ -1,4 +1,4 @@
-"""The supervisor with real processes: kills, hangs, bugs, mistakes, and the ordered stop."""
+"""The supervisor with real processes: kills, hangs, bugs, user errors, and the ordered stop."""
 
 import contextlib
 import os
@@ -19,7 +19,7 @@ from terrafix import messages as m
 from terrafix.core.codec import decode_json
 from terrafix.core.errors import ConfigError, MapError, OutputError
 from terrafix.runtime import run_dir
-from terrafix.runtime.fork_server import Forked
+from terrafix.runtime.fork_server import ForkedProcess
 from terrafix.runtime.managed_process import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, describe
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.supervisor import run, sd_notify
@@ -32,8 +32,8 @@ FOREVER = 100_000  # frames
 
 @pytest.fixture(autouse=True)
 def children_find_the_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    also = os.environ.get("PYTHONPATH")  # of a tree that is not installed
-    monkeypatch.setenv("PYTHONPATH", f"{RIGS}{os.pathsep}{also}" if also else str(RIGS))
+    existing = os.environ.get("PYTHONPATH")  # set when the source tree is not installed
+    monkeypatch.setenv("PYTHONPATH", f"{RIGS}{os.pathsep}{existing}" if existing else str(RIGS))
 
 
 class Flight:
@@ -64,9 +64,9 @@ class Flight:
             table=TABLE,
         )
 
-    def heard(self) -> list[m.Message]:
-        """What the recorder has written so far, less a line that is just being written."""
-        path = self.out_dir / "heard.jsonl"
+    def recorded(self) -> list[m.Message]:
+        """The messages that the recorder has written so far, without a partial last line."""
+        path = self.out_dir / "received.jsonl"
         return [decode_json(line) for line in path.read_bytes().split(b"\n")[:-1]] if path.exists() else []
 
     def pid(self, process: str) -> int:
@@ -74,8 +74,8 @@ class Flight:
         return int(started[-1].detail.removeprefix("pid "))
 
     def verdicts_of(self, pid: int) -> list[m.MeasurementVerdict]:
-        said = (e for e in self.heard() if isinstance(e, m.MeasurementVerdict))
-        return [v for v in said if v.detail.startswith(f"pid {pid} ")]
+        verdicts = (e for e in self.recorded() if isinstance(e, m.MeasurementVerdict))
+        return [v for v in verdicts if v.detail.startswith(f"pid {pid} ")]
 
     def names(self, process: str) -> list[str]:
         return [e.event for e in self.events if e.process == process]
@@ -105,27 +105,27 @@ def eventually(look: Callable[[], object], within_s: float) -> None:
         time.sleep(0.01)
 
 
-def test_a_recorded_source_runs_to_its_end_and_nothing_is_lost(tmp_path: Path) -> None:
+def test_a_recorded_source_runs_to_its_end_without_loss_of_messages(tmp_path: Path) -> None:
     with flight(tmp_path, frames=30, stop_after_source=True) as f:
         f.wait(within_s=20)
     assert f.code == 0
-    heard = f.heard()
-    assert [e.frame_id for e in heard if isinstance(e, m.Frame)] == list(range(30))
-    verdicts = [e for e in heard if isinstance(e, m.MeasurementVerdict)]
+    recorded = f.recorded()
+    assert [e.frame_id for e in recorded if isinstance(e, m.Frame)] == list(range(30))
+    verdicts = [e for e in recorded if isinstance(e, m.MeasurementVerdict)]
     assert [v.frame_id for v in verdicts] == list(range(30))
-    assert {v.verdict for v in verdicts} == {m.Verdict.ACCEPTED}, "all knew the origin and saw the right pixels"
-    assert not [e for e in heard if isinstance(e, m.Dropped)]
+    assert {v.verdict for v in verdicts} == {m.Verdict.ACCEPTED}, "all have the origin and the correct pixels"
+    assert not [e for e in recorded if isinstance(e, m.Dropped)]
 
     assert [e.process for e in f.events if e.event == "started"] == [p.name for p in TABLE]
     stopped = [e for e in f.events if e.event == "stopped"]
     assert [e.process for e in stopped] == [p.name for p in reversed(TABLE)]
     assert {e.detail for e in stopped} == {"exit code 0"}
-    recorded = [(e.process, e.event) for e in heard if isinstance(e, m.ProcessEvent)]
-    assert ("recorder", "started") in recorded, "what happened before the recorder listened is said to it again"
-    assert ("link", "stopped") in recorded, "the recorder hears the last word of everybody"
+    events = [(e.process, e.event) for e in recorded if isinstance(e, m.ProcessEvent)]
+    assert ("recorder", "started") in events, "events before the subscription of the recorder are retained"
+    assert ("link", "stopped") in events, "the recorder receives the last messages of all processes"
 
 
-def test_killed_and_broken_children_are_back_within_two_seconds_and_know_the_origin(
+def test_killed_and_crashed_processes_restart_within_two_seconds_and_receive_the_origin(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TROUBLE", "bug")  # in the estimator, once
@@ -140,24 +140,24 @@ def test_killed_and_broken_children_are_back_within_two_seconds_and_know_the_ori
             if name == "estimator":
                 eventually(lambda: f.verdicts_of(f.pid("estimator")), 2.0 - (time.monotonic() - killed))
                 first = f.verdicts_of(f.pid("estimator"))[0]
-                assert first.verdict is m.Verdict.ACCEPTED, f"Origin came again before the first frame: {first.detail}"
-        before, pid, lines = f.pid("estimator"), f.pid("vision"), len(f.heard())
-        eventually(lambda: len(f.heard()) > lines, 5)  # the recorder is back: it is our witness
+                assert first.verdict is m.Verdict.ACCEPTED, f"retained Origin before the first frame: {first.detail}"
+        before, pid, lines = f.pid("estimator"), f.pid("vision"), len(f.recorded())
+        eventually(lambda: len(f.recorded()) > lines, 5)  # the recorder is running again, and its file is checked
         os.kill(pid, signal.SIGKILL)
         eventually(lambda: f.pid("vision") != pid, 2.0)
         count = len(f.verdicts_of(before))
         eventually(lambda: len(f.verdicts_of(before)) > count + 5, 5)
         assert f.verdicts_of(before)[-1].verdict is m.Verdict.ACCEPTED, "the frame ring outlives its writer"
     assert f.code == 0
-    origins = [e for e in f.heard() if isinstance(e, m.Origin)]
-    assert len(origins) >= 2 and len({o.t_ns for o in origins}) == 1, "a restarted source goes on on the same time"
+    origins = [e for e in f.recorded() if isinstance(e, m.Origin)]
+    assert len(origins) >= 2 and len({o.t_ns for o in origins}) == 1, "a restarted source keeps its time axis"
     for name in ("link", "recorder", "vision"):
         assert f.names(name) == ["started", "died", "restarted", "stopped"]
     assert f.names("estimator") == ["started", "died", "restarted", "died", "restarted", "stopped"]
     assert {e.detail for e in f.events if e.event == "died"} == {"exit code 1", "killed by SIGKILL"}
 
 
-def test_a_stuck_child_is_noticed_says_where_and_is_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stuck_process_prints_a_traceback_and_is_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TROUBLE", "stuck")
     with flight(tmp_path) as f:
         eventually(lambda: "restarted" in f.names("estimator"), 15)
@@ -167,9 +167,7 @@ def test_a_stuck_child_is_noticed_says_where_and_is_restarted(tmp_path: Path, mo
     assert f.names("link") == ["started", "stopped"]
 
 
-def test_a_mistake_of_the_user_is_one_line_and_its_exit_code(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_user_error_gives_one_line_and_its_exit_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with flight(tmp_path, link="broken") as f:
         f.wait(within_s=10)
     assert f.code == 7
@@ -179,7 +177,7 @@ def test_a_mistake_of_the_user_is_one_line_and_its_exit_code(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ill", "code"), [("estimator", 0), ("link", 1)])
-def test_only_a_link_that_gives_up_ends_the_flight(
+def test_only_the_failure_of_the_link_ends_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ill: str, code: int
 ) -> None:
     monkeypatch.setenv("TROUBLE", f"{ill} always")
@@ -188,8 +186,8 @@ def test_only_a_link_that_gives_up_ends_the_flight(
         if ill == "link":
             f.wait(within_s=20)
         else:
-            count = len(f.heard())
-            eventually(lambda: sum(isinstance(e, m.Frame) for e in f.heard()[count:]) > 5, 10)
+            count = len(f.recorded())
+            eventually(lambda: sum(isinstance(e, m.Frame) for e in f.recorded()[count:]) > 5, 10)
     assert f.code == code
     assert f.names(ill) == ["started", *["died", "restarted"] * RESTART_LIMIT, "died", "gave_up"]
 
@@ -215,24 +213,24 @@ def supervisor_process(out_dir: Path, **environment: str) -> Iterator[subprocess
 
 
 def children_of(pid: int) -> dict[str, int]:
-    """Name, as `ps` shows it -> pid; the fork_server has that of the interpreter."""
-    found = {}
+    """Process name as in `ps` -> pid; the fork server has the name of the interpreter."""
+    pids = {}
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         with contextlib.suppress(FileNotFoundError):  # ended meanwhile
-            found[Path(f"/proc/{child}/comm").read_text().strip()] = int(child)
-    return found
+            pids[Path(f"/proc/{child}/comm").read_text().strip()] = int(child)
+    return pids
 
 
 def is_gone(pid: int) -> bool:
-    """Gone, or a zombie that only waits to be reaped."""
+    """Whether the process has ended; it may still be a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
     except FileNotFoundError:
         return True
 
 
-def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tmp_path: Path) -> None:
-    others = {run.path for run in run_dir.living()}
+def test_systemd_receives_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tmp_path: Path) -> None:
+    others = {run.path for run in run_dir.live_runs()}
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(15)
@@ -241,24 +239,24 @@ def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tm
             assert systemd.recv(1000).startswith(b"WATCHDOG=1\nSTATUS=flying")
             for pid in children_of(process.pid).values():
                 assert b"NOTIFY_SOCKET" not in Path(f"/proc/{pid}/environ").read_bytes()
-            (folder,) = (run for run in run_dir.living() if run.path not in others)
+            (folder,) = (run for run in run_dir.live_runs() if run.path not in others)
             progress = Progress(folder.progress("link"))
             systemd.settimeout(0.05)
-            heard_s = began_s = time.monotonic()
+            watchdog_s = began_s = time.monotonic()
             stopped: set[int] = set()
-            while time.monotonic() - heard_s < 1.2:  # WATCHDOG comes every 0.5 s, a traceback holds it up by 0.2 s
-                assert time.monotonic() - began_s < 10.0, "fed while no link makes progress"
+            while time.monotonic() - watchdog_s < 1.2:  # WATCHDOG has a period of 0.5 s; a traceback delays it by 0.2 s
+                assert time.monotonic() - began_s < 10.0, "the watchdog is triggered while the link makes no progress"
                 link = children_of(process.pid).get("link")
-                # Alive and not making progress, and the next one, too; one that is not ready yet is given longer.
+                # Stop each ready link process; the time-out of one that is not ready yet is longer.
                 if link is not None and link not in stopped and progress.stamp_ns:
                     os.kill(link, signal.SIGSTOP)
                     stopped.add(link)
                 with contextlib.suppress(TimeoutError):
                     systemd.recv(1000)
-                    heard_s = time.monotonic()
+                    watchdog_s = time.monotonic()
             progress.close()
             systemd.settimeout(15)
-            assert systemd.recv(1000).startswith(b"WATCHDOG=1"), "fed again after the stuck links were restarted"
+            assert systemd.recv(1000).startswith(b"WATCHDOG=1"), "triggered again after the stuck links were restarted"
             process.send_signal(signal.SIGTERM)
             assert process.wait(15) == 0
             rest = []
@@ -269,29 +267,29 @@ def test_systemd_hears_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tm
             assert rest[-1] == b"STOPPING=1"
 
 
-def test_children_die_with_a_killed_supervisor_and_its_leftovers_are_swept(
+def test_processes_end_with_a_killed_supervisor_and_its_stale_folder_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    others = {run.path for run in run_dir.living()}
+    others = {run.path for run in run_dir.live_runs()}
     with supervisor_process(tmp_path / "out") as process:
         eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
         children = children_of(process.pid)
-        (folder,) = {run.path for run in run_dir.living()} - others
-        eventually(run_dir.RunDir(folder).flew_just_now, 15)
+        (folder,) = {run.path for run in run_dir.live_runs()} - others
+        eventually(run_dir.RunDir(folder).was_alive_recently, 15)
         process.kill()
         eventually(lambda: all(is_gone(pid) for pid in children.values()), 2)
     run_dir.OwnedRunDir().remove()
-    assert folder.exists(), "the one that goes on from there is still to come"
+    assert folder.exists(), "the folder is kept for a supervisor that resumes the run"
     monkeypatch.setattr(run_dir, "SAME_FLIGHT_NS", 0)
-    living = run_dir.OwnedRunDir()
-    assert not folder.exists(), "the next start removes what the killed one left"
+    running = run_dir.OwnedRunDir()
+    assert not folder.exists(), "the next supervisor removes a stale folder"
     run_dir.OwnedRunDir().remove()
-    assert living.run_dir.path.exists(), "the folder of a living supervisor stays"
-    living.remove()
-    assert not living.run_dir.path.exists()
+    assert running.run_dir.path.exists(), "the folder of a running supervisor is kept"
+    running.remove()
+    assert not running.run_dir.path.exists()
 
 
-def test_signals_that_come_together_do_not_wait_for_each_other(tmp_path: Path) -> None:
+def test_simultaneous_signals_do_not_deadlock(tmp_path: Path) -> None:
     with supervisor_process(tmp_path / "out") as process:
         eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
         until_s = time.monotonic() + 0.5
@@ -301,7 +299,7 @@ def test_signals_that_come_together_do_not_wait_for_each_other(tmp_path: Path) -
         process.wait(15)
 
 
-def test_a_nursery_that_dies_takes_nobody_with_it_and_another_is_there_when_it_is_wanted(tmp_path: Path) -> None:
+def test_a_killed_fork_server_ends_no_process_and_is_restarted_at_the_next_request(tmp_path: Path) -> None:
     names = {p.name for p in TABLE}
     with supervisor_process(tmp_path / "out") as process:
         eventually(lambda: names <= set(children_of(process.pid)), 15)
@@ -317,27 +315,27 @@ def test_a_nursery_that_dies_takes_nobody_with_it_and_another_is_there_when_it_i
     assert all(is_gone(pid) for pid in {*before.values(), *after.values()})
 
 
-def test_who_was_forked_is_waited_for_no_longer_than_wanted_and_ended() -> None:
-    asleep = Forked(os.posix_spawn("/bin/sleep", ["sleep", "30"], os.environ))
+def test_waiting_for_a_forked_process_times_out_and_termination_gives_its_exit_code() -> None:
+    asleep = ForkedProcess(os.posix_spawn("/bin/sleep", ["sleep", "30"], os.environ))
     assert asleep.poll() is None
     with pytest.raises(TimeoutError):
         asleep.wait(0.05)
     asleep.terminate()
     assert asleep.wait(5.0) == -signal.SIGTERM
-    asleep.kill()  # its number may be another's by now
+    asleep.kill()  # the pid may be reused by now
     assert asleep.poll() == -signal.SIGTERM
 
 
-def test_restart_window_pauses_longer_and_gives_up() -> None:
+def test_restart_pauses_increase_until_the_process_is_given_up() -> None:
     window = RestartWindow()
-    pauses = [window.died(i * 10**9) for i in range(RESTART_LIMIT + 1)]
+    pauses = [window.record_death(i * 10**9) for i in range(RESTART_LIMIT + 1)]
     assert pauses[0] == 0, "the first restart is immediate"
     assert pauses[-1] is None
     assert sorted(p for p in pauses if p is not None) == [p for p in pauses if p is not None]
-    assert window.died(2 * RESTART_WINDOW_NS) == 0, "old deaths are forgotten"
+    assert window.record_death(2 * RESTART_WINDOW_NS) == 0, "deaths before the window do not count"
 
 
-def test_what_can_be_checked_is_checked_before_anything_starts(tmp_path: Path) -> None:
+def test_configuration_map_and_output_folder_are_checked_before_any_start(tmp_path: Path) -> None:
     def attempt(**changes: object) -> None:
         arguments = {"source": "", "map_path": None, "link": "", "out_dir": tmp_path / "out", "configs": []}
         run(**(arguments | changes), table=TABLE)  # type: ignore[arg-type]
@@ -353,13 +351,13 @@ def test_what_can_be_checked_is_checked_before_anything_starts(tmp_path: Path) -
         attempt(configs=[tmp_path / "none.toml"])
 
 
-def test_exit_codes_in_words() -> None:
+def test_exit_codes_are_described_as_text() -> None:
     assert describe(-9) == "killed by SIGKILL"
     assert describe(-64) == "killed by SIGRTMAX"
     assert describe(3) == "exit code 3"
 
 
-def test_sd_notify_without_systemd_does_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_sd_notify_without_systemd_has_no_effect(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     sd_notify("READY=1")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))

@@ -1,4 +1,4 @@
-"""A start whose latitude and longitude are exchanged is said as such, before `run` and in `preflight`."""
+"""A start with exchanged latitude and longitude is reported as such, before `run` and in `preflight`."""
 
 from typing import cast
 
@@ -7,13 +7,13 @@ import pytest
 
 from terrafix.core.config import Config
 from terrafix.map.package import MapPackage
-from terrafix_tools.live import swapped
+from terrafix_tools.live import swapped_hint
 from terrafix_tools.preflight import computer
 from terrafix_tools.preflight.lines import Status
 
 
 class OnePlace:
-    """A map of 48, 11 and nothing else."""
+    """A map that covers only the point 48, 11."""
 
     def covers(self, lat_deg: float, lon_deg: float) -> bool:
         return (lat_deg, lon_deg) == (48.0, 11.0)
@@ -26,15 +26,15 @@ class OnePlace:
 PLACE = cast(MapPackage, OnePlace())
 
 
-def test_only_a_start_that_lies_on_the_map_the_other_way_round_is_called_swapped() -> None:
-    said = swapped(PLACE, 11.0, 48.0, 10.0)
+def test_a_start_is_swapped_only_if_the_exchanged_coordinates_are_on_the_map() -> None:
+    said = swapped_hint(PLACE, 11.0, 48.0, 10.0)
     assert said == "latitude and longitude are swapped: 48.000000, 11.000000 lies on the map"
-    assert swapped(PLACE, 12.0, 48.0, 10.0) == ""
-    assert swapped(PLACE, 11.0, 148.0, 10.0) == ""
+    assert swapped_hint(PLACE, 12.0, 48.0, 10.0) == ""
+    assert swapped_hint(PLACE, 11.0, 148.0, 10.0) == ""
 
 
 @pytest.mark.parametrize(("start", "todo"), [("11, 48", "are swapped"), ("12, 48", "correct the start")])
-def test_preflight_says_that_a_start_is_swapped(start: str, todo: str) -> None:
+def test_preflight_reports_a_swapped_start(start: str, todo: str) -> None:
     config = Config()
     config = msgspec.structs.replace(config, source=msgspec.structs.replace(config.source, start=start))
     (line,) = computer._start(PLACE, config)

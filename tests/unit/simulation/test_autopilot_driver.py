@@ -1,4 +1,4 @@
-"""What ArduPilot's GPS library and its filter make of single fields of GPS_INPUT: facts read in its source code."""
+"""Effect of single fields of GPS_INPUT in ArduPilot's GPS library and filter: facts from its source code."""
 
 from itertools import pairwise
 
@@ -40,58 +40,58 @@ def gps_input(*, ignore: int = 0, hacc: float = 7.0, speed_mps: float = 3.0) -> 
     )
 
 
-def taken_over(hacc: float, satellites: int = 10, sacc: float = 0.5, seconds: float = 5.0) -> float:
-    """Metres of a false position 30 m to the north that a hovering copter has taken over."""
+def displacement_m(hacc: float, satellites: int = 10, sacc: float = 0.5, seconds: float = 5.0) -> float:
+    """Displacement of a hovering copter, m, towards a false position 30 m to the north."""
     rig = Rig(Kind.COPTER)
     rig.fly(20.0, changed(hacc=hacc, sacc=sacc, satellites=satellites))
     rig.fly(seconds, changed(north_m=30.0, hacc=hacc, sacc=sacc, satellites=satellites))
     return rig.north_m()
 
 
-def test_fact_what_is_ignored_keeps_its_last_value() -> None:
-    """Never set a flag only sometimes: an accuracy or a velocity of before is fused for ever."""
+def test_fact_an_ignored_field_keeps_its_last_value() -> None:
+    """A flag must be set always or never: otherwise an earlier accuracy or velocity is fused forever."""
     driver = GpsInputDriver(0, 5.0)
-    first = driver.take(gps_input(), 0.0)
-    later = driver.take(gps_input(ignore=ACCURACIES | VELOCITY, hacc=50.0, speed_mps=20.0), 0.1)
+    first = driver.on_report(gps_input(), 0.0)
+    later = driver.on_report(gps_input(ignore=ACCURACIES | VELOCITY, hacc=50.0, speed_mps=20.0), 0.1)
     assert first is not None and later is not None
     assert (later.horizontal_m, later.speed_mps, later.vertical_m) == pytest.approx((7.0, 0.4, 2.0))
     assert later.velocity_ned_mps == first.velocity_ned_mps
 
 
-def test_fact_a_velocity_that_was_never_sent_is_zero() -> None:
-    fix = GpsInputDriver(0, 5.0).take(gps_input(ignore=VELOCITY), 0.0)
+def test_fact_a_velocity_never_sent_is_zero() -> None:
+    fix = GpsInputDriver(0, 5.0).on_report(gps_input(ignore=VELOCITY), 0.0)
     assert fix is not None and fix.velocity_ned_mps == (0.0, 0.0, 0.0)
 
 
-def test_fact_a_height_that_is_ignored_is_sea_level() -> None:
-    fix = GpsInputDriver(0, 5.0).take(gps_input(ignore=mavlink.GPS_INPUT_IGNORE_FLAG_ALT), 0.0)
+def test_fact_an_ignored_height_is_sea_level() -> None:
+    fix = GpsInputDriver(0, 5.0).on_report(gps_input(ignore=mavlink.GPS_INPUT_IGNORE_FLAG_ALT), 0.0)
     assert fix is not None and fix.alt_amsl_m == 0.0
 
 
-def test_fact_accuracies_that_were_never_sent_are_taken_for_the_best() -> None:
+def test_fact_accuracies_never_sent_count_as_the_best() -> None:
     trusted = Rig(Kind.COPTER)
     trusted.fly(20.0, changed(ignore=ACCURACIES))
     trusted.fly(5.0, changed(north_m=3.0, ignore=ACCURACIES))
-    told = Rig(Kind.COPTER)
-    told.fly(20.0, changed(hacc=5.0))
-    told.fly(5.0, changed(north_m=3.0, hacc=5.0))
-    assert trusted.north_m() > 2.0 and told.north_m() < 1.0
+    reported = Rig(Kind.COPTER)
+    reported.fly(20.0, changed(hacc=5.0))
+    reported.fly(5.0, changed(north_m=3.0, hacc=5.0))
+    assert trusted.north_m() > 2.0 and reported.north_m() < 1.0
 
 
-def test_fact_without_a_week_and_whatever_time_usec_says_it_is_the_time_of_arrival() -> None:
+def test_fact_without_a_gps_week_the_time_of_arrival_is_used_whatever_time_usec_is() -> None:
     driver = GpsInputDriver(0, 5.0)
     for now_s in (10.0, 10.16, 10.2):
-        fix = driver.take(gps_input(), now_s)
+        fix = driver.on_report(gps_input(), now_s)
         assert fix is not None and fix.t_s == pytest.approx(now_s - 0.005)
 
 
 @pytest.mark.parametrize(("satellites", "factor"), [(6, 1.0), (5, 1.4), (4, 2.0)])
-def test_fact_few_satellites_make_both_accuracies_worse(satellites: int, factor: float) -> None:
-    assert taken_over(20.0, satellites) == pytest.approx(taken_over(20.0 * factor, 6, 0.5 * factor), rel=0.02)
+def test_fact_few_satellites_increase_both_noises(satellites: int, factor: float) -> None:
+    assert displacement_m(20.0, satellites) == pytest.approx(displacement_m(20.0 * factor, 6, 0.5 * factor), rel=0.02)
 
 
-def test_fact_an_accuracy_beyond_100_m_is_taken_for_100_m() -> None:
-    assert taken_over(300.0, seconds=30.0) == pytest.approx(taken_over(100.0, seconds=30.0), rel=0.01)
+def test_fact_an_accuracy_beyond_100_m_counts_as_100_m() -> None:
+    assert displacement_m(300.0, seconds=30.0) == pytest.approx(displacement_m(100.0, seconds=30.0), rel=0.01)
 
 
 def test_fact_a_report_of_80_m_takes_14_s_to_fade_to_5() -> None:
@@ -106,11 +106,11 @@ def test_fact_a_report_of_80_m_takes_14_s_to_fade_to_5() -> None:
         rig.fly(1.0, changed(north_m=15.0, hacc=5.0))
         after.append(rig.north_m())
     slow = [b - a for a, b in pairwise([0.0, *after])]
-    assert before < 1.0 and max(slow[:4]) < 0.3 * max(slow[10:])  # at first it hardly listens
+    assert before < 1.0 and max(slow[:4]) < 0.3 * max(slow[10:])  # a low gain at first
 
 
-def test_fact_an_honest_speed_accuracy_does_not_widen_the_gate_of_the_velocity() -> None:
-    """So velocity that is too uncertain is no fix, and not a fix with a large number."""
+def test_fact_the_reported_speed_accuracy_does_not_widen_the_velocity_gate() -> None:
+    """Therefore a too uncertain velocity must be sent as no fix, not as a fix with a large accuracy."""
     ratios = []
     for sacc in (0.3, 3.0):
         rig = Rig(Kind.COPTER)

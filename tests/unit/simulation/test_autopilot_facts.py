@@ -34,7 +34,9 @@ def on_ground(kind: Kind, **parameters: float) -> Rig:
 
 @pytest.mark.parametrize(("kind", "uses_s", "arms_s"), [(Kind.COPTER, 20.6, 21.7), (Kind.PLANE, 11.4, 12.4)])
 @pytest.mark.parametrize("rate_hz", [5.0, 10.0])
-def test_fact_a_good_gps_is_used_and_armed_on_in_time(kind: Kind, uses_s: float, arms_s: float, rate_hz: float) -> None:
+def test_fact_a_good_gps_is_used_and_allows_arming_in_time(
+    kind: Kind, uses_s: float, arms_s: float, rate_hz: float
+) -> None:
     rig = on_ground(kind)
     gps = changed(rate_hz=rate_hz, satellites=6, hdop=2.5, hacc=5.0, vacc=7.5, sacc=1.0)
     assert rig.fly(40.0, gps, until=lambda: "EKF3 IMU0 origin set" in rig.texts()) == pytest.approx(10.0, abs=0.5)
@@ -45,7 +47,7 @@ def test_fact_a_good_gps_is_used_and_armed_on_in_time(kind: Kind, uses_s: float,
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 2.0, 3.0, 4.0])
-def test_fact_below_5_hz_it_is_used_and_never_healthy(rate_hz: float) -> None:
+def test_fact_below_5_hz_gps_is_used_and_never_healthy(rate_hz: float) -> None:
     rig = on_ground(Kind.COPTER)
     rig.fly(60.0, changed(rate_hz=rate_hz))
     assert rig.flags() & ABSOLUTE
@@ -53,7 +55,7 @@ def test_fact_below_5_hz_it_is_used_and_never_healthy(rate_hz: float) -> None:
 
 
 @pytest.mark.parametrize("fix_type", [1, 2])
-def test_fact_without_a_3d_fix_it_is_a_bad_fix(fix_type: int) -> None:
+def test_fact_without_a_3d_fix_arming_reports_a_bad_fix(fix_type: int) -> None:
     rig = on_ground(Kind.COPTER)
     rig.fly(30.0, changed(fix_type=fix_type))
     assert "GPS 1: Bad fix" in rig.autopilot.prearm(rig.t_s)
@@ -68,7 +70,7 @@ def test_fact_fix_type_0_keeps_a_copters_filter_from_starting() -> None:
 
 
 @BOTH
-def test_fact_nothing_sent_is_a_bad_fix(kind: Kind) -> None:
+def test_fact_no_gps_input_is_a_bad_fix(kind: Kind) -> None:
     rig = on_ground(kind)
     rig.fly(5.0)
     assert "GPS 1: Bad fix" in rig.autopilot.prearm(rig.t_s)
@@ -88,7 +90,7 @@ def test_fact_nothing_sent_is_a_bad_fix(kind: Kind) -> None:
         changed(sacc=1.5),
     ],
 )
-def test_fact_what_fails_the_checks_never_sets_the_origin(bad: Gps) -> None:
+def test_fact_a_fix_that_fails_the_checks_never_sets_the_origin(bad: Gps) -> None:
     rig = on_ground(Kind.COPTER)
     rig.fly(60.0, bad)
     assert rig.autopilot.prearm(rig.t_s) == ["AHRS: waiting for home"]
@@ -106,7 +108,7 @@ def test_fact_what_fails_the_checks_never_sets_the_origin(bad: Gps) -> None:
         (11.0, {"EK3_CHECK_SCALE": 200.0}, False),
     ],
 )
-def test_fact_check_and_scale_decide_which_accuracy_will_do(
+def test_fact_check_and_scale_determine_the_required_accuracy(
     hacc: float, parameters: dict[str, float], ready: bool
 ) -> None:
     rig = on_ground(Kind.COPTER, **parameters)
@@ -124,13 +126,13 @@ def test_fact_check_and_scale_decide_which_accuracy_will_do(
         | mavlink.GPS_INPUT_IGNORE_FLAG_VERTICAL_ACCURACY,
     ],
 )
-def test_fact_ignored_fields_do_not_hinder_arming(ignored: int) -> None:
+def test_fact_ignored_fields_do_not_prevent_arming(ignored: int) -> None:
     rig = on_ground(Kind.COPTER)
     rig.fly(30.0, changed(ignore=ignored))
     assert rig.autopilot.prearm(rig.t_s) == []
 
 
-def test_fact_the_firmware_as_it_comes_wants_a_better_accuracy_of_a_copter_than_of_a_plane() -> None:
+def test_fact_the_default_parameters_require_a_better_accuracy_in_a_copter_than_in_a_plane() -> None:
     ready = {}
     for kind in Kind:
         rig = Rig(kind, flying=False, parameters={"EK3_GPS_CHECK": FIRMWARE["EK3_GPS_CHECK"], "EK3_CHECK_SCALE": 150.0})
@@ -144,16 +146,16 @@ def test_fact_the_firmware_as_it_comes_wants_a_better_accuracy_of_a_copter_than_
 
 
 @pytest.mark.parametrize(("kind", "error_m"), [(Kind.COPTER, 0.2), (Kind.PLANE, 0.5)])
-def test_fact_3_s_of_silence_show_nowhere(kind: Kind, error_m: float) -> None:
+def test_fact_a_gap_of_3_s_has_no_visible_effect(kind: Kind, error_m: float) -> None:
     rig = flying(kind)
-    flags, said = rig.flags(), len(rig.texts())
+    flags, text_count = rig.flags(), len(rig.texts())
     rig.fly(3.0)
-    assert (rig.flags(), len(rig.texts())) == (flags, said)
+    assert (rig.flags(), len(rig.texts())) == (flags, text_count)
     assert rig.last("GPS_RAW_INT").fix_type == 3
     assert rig.error_m() <= 2 * error_m
 
 
-def test_fact_6_s_of_silence_show_in_gps_raw_int_after_4() -> None:
+def test_fact_a_gap_of_6_s_shows_in_gps_raw_int_after_4_s() -> None:
     rig = flying(Kind.COPTER)
     flags = rig.flags()
     rig.fly(3.8)
@@ -166,7 +168,7 @@ def test_fact_6_s_of_silence_show_in_gps_raw_int_after_4() -> None:
     assert rig.texts()[-1] == "GPS 1: detected MAV"
 
 
-def test_fact_12_s_of_silence_land_a_copter() -> None:
+def test_fact_a_gap_of_12_s_lands_a_copter() -> None:
     rig = flying(Kind.COPTER)
     assert rig.fly(12.0, until=lambda: not rig.flags() & ABSOLUTE) == pytest.approx(7.0, abs=0.3)
     assert not rig.flags() & (RELATIVE | VELOCITY)
@@ -179,7 +181,7 @@ def test_fact_12_s_of_silence_land_a_copter() -> None:
     assert rig.autopilot.status.failsafes == 1
 
 
-def test_fact_12_s_of_silence_leave_a_plane_dead_reckoning_and_end_in_a_reset() -> None:
+def test_fact_in_a_gap_of_12_s_a_plane_dead_reckons_and_then_resets() -> None:
     rig = flying(Kind.PLANE)
     assert rig.fly(12.0, until=lambda: not rig.flags() & ABSOLUTE) == pytest.approx(10.0, abs=0.3)
     rig.fly(2.0)
@@ -190,7 +192,7 @@ def test_fact_12_s_of_silence_leave_a_plane_dead_reckoning_and_end_in_a_reset() 
     assert LAND not in rig.texts()
 
 
-def test_fact_a_plane_dead_reckons_for_two_minutes_by_its_airspeed() -> None:
+def test_fact_a_plane_dead_reckons_for_two_minutes_with_airspeed() -> None:
     rig = flying(Kind.PLANE, 60.0)
     for seconds, error_m in ((20.0, 3.2), (40.0, 4.1), (60.0, 11.0)):
         rig.fly(seconds)
@@ -205,17 +207,17 @@ def test_fact_a_plane_dead_reckons_for_two_minutes_by_its_airspeed() -> None:
 
 @BOTH
 @pytest.mark.parametrize("fix_type", [0, 1, 2])
-def test_fact_3_s_below_3d_are_a_silence_that_shows_at_once(kind: Kind, fix_type: int) -> None:
+def test_fact_3_s_below_3d_act_like_a_gap_that_is_reported_at_once(kind: Kind, fix_type: int) -> None:
     rig = flying(kind)
-    flags, said = rig.flags(), len(rig.texts())
+    flags, text_count = rig.flags(), len(rig.texts())
     rig.fly(3.0, changed(fix_type=fix_type))
     assert rig.last("GPS_RAW_INT").fix_type == fix_type
-    assert (rig.flags(), len(rig.texts())) == (flags, said)
+    assert (rig.flags(), len(rig.texts())) == (flags, text_count)
     assert rig.error_m() < 1.0
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 0.5])
-def test_fact_1_hz_and_less_fly_fine(rate_hz: float) -> None:
+def test_fact_1_hz_and_less_are_sufficient_in_flight(rate_hz: float) -> None:
     rig = flying(Kind.COPTER, 60.0, changed(rate_hz=rate_hz))
     assert rig.flags() & ABSOLUTE
     assert rig.error_m() < 1.0
@@ -226,11 +228,11 @@ def test_fact_1_hz_and_less_fly_fine(rate_hz: float) -> None:
 
 @BOTH
 @pytest.mark.parametrize("hacc", [10.0, 30.0, 50.0, 100.0, 200.0])
-def test_fact_bad_accuracy_alone_is_silent(kind: Kind, hacc: float) -> None:
+def test_fact_bad_accuracy_alone_gives_no_text_or_flag(kind: Kind, hacc: float) -> None:
     rig = flying(kind)
-    flags, said = rig.flags(), len(rig.texts())
+    flags, text_count = rig.flags(), len(rig.texts())
     rig.fly(15.0, changed(hacc=hacc))
-    assert (rig.flags(), len(rig.texts())) == (flags, said)
+    assert (rig.flags(), len(rig.texts())) == (flags, text_count)
     assert rig.error_m() < 3.0
 
 
@@ -277,7 +279,7 @@ def test_fact_a_step_beyond_the_gate_is_a_glitch_and_after_10_s_a_reset(kind: Ki
     assert rig.autopilot.counts.resets == 1
 
 
-def test_fact_20_m_with_good_accuracy_are_rejected_unless_bad_accuracy_came_before() -> None:
+def test_fact_a_step_of_20_m_with_good_accuracy_is_rejected_unless_bad_accuracy_preceded() -> None:
     rig = flying(Kind.COPTER)
     rig.fly(9.5, changed(north_m=20.0))
     assert rig.north_m() < 1.0
@@ -292,15 +294,15 @@ def test_fact_20_m_with_good_accuracy_are_rejected_unless_bad_accuracy_came_befo
 
 
 @pytest.mark.parametrize(("hacc", "followed_m"), [(1.0, 73.0), (10.0, 26.0)])
-def test_fact_a_drift_of_2_mps_is_followed_without_a_word(hacc: float, followed_m: float) -> None:
+def test_fact_a_drift_of_2_mps_is_followed_without_a_text(hacc: float, followed_m: float) -> None:
     rig = flying(Kind.COPTER)
-    said = len(rig.texts())
+    text_count = len(rig.texts())
     rig.fly(40.0, lambda t_s: changed(north_m=2.0 * t_s, hacc=hacc))
     assert rig.north_m() == pytest.approx(followed_m, rel=0.25)
-    assert len(rig.texts()) == said
+    assert len(rig.texts()) == text_count
 
 
-def test_fact_a_plane_falls_back_to_dcm_and_flies_the_jump_unless_told_not_to() -> None:
+def test_fact_a_plane_falls_back_to_dcm_and_follows_the_jump_unless_configured_otherwise() -> None:
     rig = flying(Kind.PLANE, parameters={"AHRS_OPTIONS": 0.0})
     assert rig.fly(9.0, changed(north_m=200.0), until=lambda: rig.north_m() > 100.0) == pytest.approx(4.0, abs=0.5)
     assert "AHRS: DCM active" in rig.texts()
@@ -313,7 +315,7 @@ def test_fact_a_plane_falls_back_to_dcm_and_flies_the_jump_unless_told_not_to() 
 # --- velocity and delay ---
 
 
-def test_fact_a_fix_is_taken_for_200_ms_old_unless_told_otherwise() -> None:
+def test_fact_a_fix_counts_as_200_ms_old_unless_configured_otherwise() -> None:
     for delay_ms, late_s, error_m in ((0.0, 0.2, 0.4), (200.0, 0.2, 0.4), (5.0, 0.0, 0.4)):
         rig = flying(Kind.PLANE, 30.0, changed(late_s=late_s), parameters={"GPS1_DELAY_MS": delay_ms})
         assert rig.error_m() <= 2 * error_m
@@ -321,12 +323,12 @@ def test_fact_a_fix_is_taken_for_200_ms_old_unless_told_otherwise() -> None:
     assert wrong.error_m() == pytest.approx(0.2 * 22.0, rel=0.2)  # a present position, shifted by 200 ms
 
 
-def test_fact_700_ms_are_more_than_the_buffer_holds() -> None:
+def test_fact_a_delay_of_700_ms_exceeds_the_buffer() -> None:
     rig = flying(Kind.PLANE, 30.0, changed(late_s=0.7), parameters={"GPS1_DELAY_MS": 700.0})
     assert 8.0 < rig.error_m() < 14.0
 
 
-def test_fact_an_ignored_velocity_is_fused_as_zero_and_position_alone_needs_the_sources_changed() -> None:
+def test_fact_an_ignored_velocity_is_fused_as_zero_and_position_alone_needs_other_sources() -> None:
     silent = changed(ignore=VEL_HORIZ | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT)
     rig = flying(Kind.PLANE, 30.0, silent)
     assert rig.autopilot.ekf is not None
@@ -364,19 +366,19 @@ def test_fact_gps_2_takes_over_when_gps_1_is_lost(switch: float, switches: bool)
     rig = two_gps(switch)
     mine = changed(gps_id=1, satellites=6)
     rig.fly(29.9, mine)
-    said, flags = len(rig.texts()), rig.flags()
+    text_count, flags = len(rig.texts()), rig.flags()
     assert rig.autopilot.used_gps == 0
     rig.fly(2.5, mine)
     assert rig.autopilot.used_gps == int(switches)
     rig.fly(10.0, mine)
     assert (LAND in rig.texts()) is not switches
     if switches:
-        assert (rig.flags(), len(rig.texts())) == (flags, said)
+        assert (rig.flags(), len(rig.texts())) == (flags, text_count)
         rig.fly(30.0, mine)
         assert rig.autopilot.used_gps == 0  # and back
 
 
-def test_fact_more_satellites_win_in_mode_1_and_not_in_mode_4() -> None:
+def test_fact_more_satellites_are_preferred_in_mode_1_and_not_in_mode_4() -> None:
     for switch, chosen in ((1.0, 1), (4.0, 0)):
         rig = two_gps(switch, lost_s=1e9)
         rig.fly(30.0, changed(gps_id=1, satellites=20))
@@ -394,7 +396,7 @@ def test_fact_every_enabled_gps_must_have_a_fix_before_arming() -> None:
     assert rig.autopilot.prearm(rig.t_s) == []
 
 
-def test_fact_a_spoofed_gps_1_is_left_when_told_so() -> None:
+def test_fact_a_spoofed_gps_1_is_left_on_a_parameter_change() -> None:
     lat, lon = offset(LAT, LON, 0.0, 300.0)
     rig = Rig(
         Kind.COPTER,
@@ -412,7 +414,7 @@ def test_fact_a_spoofed_gps_1_is_left_when_told_so() -> None:
     assert "Glitch cleared" in rig.texts()
 
 
-def test_fact_gps_2_can_be_made_gps_input_in_flight() -> None:
+def test_fact_gps_2_can_be_set_to_gps_input_in_flight() -> None:
     rig = two_gps(4.0)
     rig.autopilot.parameters["GPS2_TYPE"] = 0.0
     rig.autopilot.gps[1] = None
@@ -440,7 +442,7 @@ def source_set(number: float) -> Any:
 
 def test_fact_source_sets_1_to_3_are_accepted_and_4_is_denied() -> None:
     rig = flying(Kind.PLANE, 5.0)
-    results = [rig.ask(source_set(n), "COMMAND_ACK")[0].result for n in (1, 2, 3, 4)]
+    results = [rig.request(source_set(n), "COMMAND_ACK")[0].result for n in (1, 2, 3, 4)]
     assert results == [0, 0, 0, 2]  # MAV_RESULT_ACCEPTED, DENIED
 
 
@@ -454,7 +456,7 @@ def test_fact_a_plane_without_sources_ignores_a_spoof() -> None:
     assert not rig.flags() & ABSOLUTE
 
 
-def test_fact_without_sources_on_the_ground_the_aiding_stops_at_once_and_comes_back() -> None:
+def test_fact_without_sources_on_the_ground_aiding_stops_at_once_and_returns() -> None:
     rig = on_ground(Kind.COPTER)
     rig.fly(30.0, GOOD)
     rig.send(source_set(3))
@@ -472,11 +474,11 @@ def external(north_m: float, *, z: float = math.nan, frame: int = 0) -> Any:
     return mavlink.MAVLink_command_int_message(1, 1, frame, 43003, 0, 0, 0.0, 0.0, 10.0, 0.0, *place)
 
 
-def test_fact_an_external_position_is_a_hard_reset_while_gps_is_away() -> None:
+def test_fact_an_external_position_is_a_reset_while_gps_is_not_fused() -> None:
     rig = flying(Kind.COPTER)
 
     def answer(message: Any) -> int:
-        return int(rig.ask(message, "COMMAND_ACK")[0].result)
+        return int(rig.request(message, "COMMAND_ACK")[0].result)
 
     assert answer(external(0.0)) == mavlink.MAV_RESULT_FAILED  # GPS was fused in the last second
     rig.fly(1.5)
@@ -490,7 +492,7 @@ def test_fact_an_external_position_is_a_hard_reset_while_gps_is_away() -> None:
     assert LAND in rig.texts()  # it is not an aid
 
 
-def test_fact_gps_that_comes_back_takes_an_external_position_away() -> None:
+def test_fact_returning_gps_overrides_an_external_position() -> None:
     rig = flying(Kind.PLANE)
     rig.fly(11.0)
     lat, lon = offset(LAT, LON, 22.0 * rig.t_s, 0.0)

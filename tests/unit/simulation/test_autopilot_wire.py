@@ -1,4 +1,4 @@
-"""What the simulated autopilot says over MAVLink, byte for byte as a ground station would decode it."""
+"""MAVLink output of the simulated autopilot, decoded as by a ground station."""
 
 import math
 from dataclasses import replace
@@ -35,17 +35,17 @@ def interval(name: str, microseconds: float) -> Any:
 
 
 def count(rig: Rig, name: str, seconds: float) -> int:
-    rig.heard.clear()
+    rig.received.clear()
     rig.fly(seconds, GOOD)
-    return sum(m.get_type() == name for m in rig.heard)
+    return sum(m.get_type() == name for m in rig.received)
 
 
-def test_every_stream_comes_and_says_what_the_vehicle_does() -> None:
+def test_every_stream_is_sent_and_matches_the_vehicle() -> None:
     rig = Rig(
         Kind.PLANE, parameters={**BESIDE_A_RECEIVER, "GPS1_TYPE": 1.0}, real_gps=at_5_hz(lambda _: real_fix(fix_type=1))
     )
     rig.fly(11.0, changed(gps_id=1))
-    assert {m.get_type() for m in rig.heard} >= set(STREAMS)
+    assert {m.get_type() for m in rig.received} >= set(STREAMS)
     assert rig.last("HEARTBEAT").type == mavlink.MAV_TYPE_FIXED_WING
     assert rig.last("ATTITUDE").yaw == pytest.approx(rig.yaw, abs=1e-3)
     hud = rig.last("VFR_HUD")
@@ -57,61 +57,61 @@ def test_every_stream_comes_and_says_what_the_vehicle_does() -> None:
     assert rig.last("AIRSPEED").airspeed == pytest.approx(rig.airspeed, abs=1.0)
     raw = rig.last("GPS2_RAW")
     assert (raw.fix_type, raw.satellites_visible, raw.h_acc) == (3, 10, 1000)
-    assert rig.last("SYSTEM_TIME").time_unix_usec == 0  # no GPS week was ever sent
+    assert rig.last("SYSTEM_TIME").time_unix_usec == 0  # no GPS week was sent
 
 
-def test_its_position_is_its_belief_and_never_the_truth() -> None:
+def test_the_sent_position_is_the_navigation_solution_and_not_the_truth() -> None:
     rig = Rig(Kind.COPTER)
     rig.fly(10.0, GOOD)
     rig.fly(30.0, changed(north_m=30.0, hacc=5.0))
-    said = rig.last("GLOBAL_POSITION_INT")
-    believed = FRAME.to_wgs84(*(float(v) for v in rig.autopilot.navigation().p_b_in_w_m[:2]))  # type: ignore[union-attr]
-    assert (said.lat * 1e-7 - LAT) * 111_200.0 == pytest.approx(rig.north_m(), abs=0.7)
+    message = rig.last("GLOBAL_POSITION_INT")
+    navigation_lat_lon = FRAME.to_wgs84(*(float(v) for v in rig.autopilot.navigation().p_b_in_w_m[:2]))  # type: ignore[union-attr]
+    assert (message.lat * 1e-7 - LAT) * 111_200.0 == pytest.approx(rig.north_m(), abs=0.7)
     assert rig.north_m() > 10.0
-    assert (believed[0] - LAT) * 111_200.0 == pytest.approx(rig.north_m(), abs=0.1)
-    assert said.relative_alt / 1e3 == pytest.approx(HEIGHT_M - HOME_M, abs=1.0)
+    assert (navigation_lat_lon[0] - LAT) * 111_200.0 == pytest.approx(rig.north_m(), abs=0.1)
+    assert message.relative_alt / 1e3 == pytest.approx(HEIGHT_M - HOME_M, abs=1.0)
 
 
-def test_rates_are_those_that_were_asked_for() -> None:
+def test_streams_have_the_requested_rates() -> None:
     rig = Rig(Kind.COPTER)
     assert count(rig, "ATTITUDE", 4.0) == pytest.approx(16, abs=1)
     for microseconds, rate_hz in ((40_000.0, 25), (20_000.0, 50), (0.0, 4), (-1.0, 0)):
-        (ack,) = rig.ask(interval("ATTITUDE", microseconds), "COMMAND_ACK")
+        (ack,) = rig.request(interval("ATTITUDE", microseconds), "COMMAND_ACK")
         assert ack.result == mavlink.MAV_RESULT_ACCEPTED
         assert count(rig, "ATTITUDE", 4.0) == pytest.approx(4 * rate_hz, abs=1)
-    (ack,) = rig.ask(interval("ODOMETRY", 1e5), "COMMAND_ACK")
+    (ack,) = rig.request(interval("ODOMETRY", 1e5), "COMMAND_ACK")
     assert ack.result == mavlink.MAV_RESULT_DENIED
     unknown = mavlink.MAVLink_command_long_message(1, 1, 400, 0, *(0.0,) * 7)
-    assert rig.ask(unknown, "COMMAND_ACK")[0].result == mavlink.MAV_RESULT_UNSUPPORTED
+    assert rig.request(unknown, "COMMAND_ACK")[0].result == mavlink.MAV_RESULT_UNSUPPORTED
 
 
-def test_parameters_are_told_set_and_listed() -> None:
+def test_parameters_can_be_read_set_and_listed() -> None:
     rig = Rig(Kind.COPTER)
-    everything = rig.ask(mavlink.MAVLink_param_request_list_message(1, 1), "PARAM_VALUE")
+    everything = rig.request(mavlink.MAVLink_param_request_list_message(1, 1), "PARAM_VALUE")
     assert {m.param_id for m in everything} == set(FIRMWARE)
-    (one,) = rig.ask(mavlink.MAVLink_param_request_read_message(1, 1, b"GPS_PRIMARY", -1), "PARAM_VALUE")
+    (one,) = rig.request(mavlink.MAVLink_param_request_read_message(1, 1, b"GPS_PRIMARY", -1), "PARAM_VALUE")
     assert (one.param_id, one.param_value) == ("GPS_PRIMARY", 0.0)
-    (by_index,) = rig.ask(mavlink.MAVLink_param_request_read_message(1, 1, b"", 0), "PARAM_VALUE")
+    (by_index,) = rig.request(mavlink.MAVLink_param_request_read_message(1, 1, b"", 0), "PARAM_VALUE")
     assert by_index.param_id == everything[0].param_id
     put = mavlink.MAVLink_param_set_message(1, 1, b"GPS_PRIMARY", 1.0, mavlink.MAV_PARAM_TYPE_REAL32)
-    assert rig.ask(put, "PARAM_VALUE")[0].param_value == 1.0
-    assert rig.ask(mavlink.MAVLink_param_request_read_message(1, 1, b"NONSENSE", -1), "PARAM_VALUE") == []
+    assert rig.request(put, "PARAM_VALUE")[0].param_value == 1.0
+    assert rig.request(mavlink.MAVLink_param_request_read_message(1, 1, b"NONSENSE", -1), "PARAM_VALUE") == []
     with pytest.raises(UsageError, match="NONSENSE"):
         parameters_of(Kind.COPTER, {"NONSENSE": 1.0})
 
 
-def test_timesync_has_its_own_clock() -> None:
+def test_timesync_uses_the_autopilots_own_clock() -> None:
     rig = Rig(Kind.COPTER)
     rig.fly(10.0, GOOD)
-    (answer,) = rig.ask(mavlink.MAVLink_timesync_message(0, 123), "TIMESYNC")
+    (answer,) = rig.request(mavlink.MAVLink_timesync_message(0, 123), "TIMESYNC")
     assert answer.ts1 == 123
     assert abs(answer.tc1 * 1e-9 - rig.t_s) > 5.0
     rig.fly(10.0, GOOD)
-    (later,) = rig.ask(mavlink.MAVLink_timesync_message(0, 124), "TIMESYNC")
+    (later,) = rig.request(mavlink.MAVLink_timesync_message(0, 124), "TIMESYNC")
     assert (later.tc1 - answer.tc1) * 1e-9 == pytest.approx(10.0, rel=1e-4)
 
 
-def test_a_gps_week_sets_its_wall_clock() -> None:
+def test_a_gps_week_sets_the_autopilots_wall_clock() -> None:
     rig = Rig(Kind.COPTER)
     week, ms = 2400, 123_000
     packet = rig._message(GOOD)
@@ -123,27 +123,27 @@ def test_a_gps_week_sets_its_wall_clock() -> None:
     assert rig.last("SYSTEM_TIME").time_unix_usec * 1e-6 == pytest.approx(expected_s, abs=1.1)
 
 
-def test_damaged_bytes_are_counted_and_do_not_hurt() -> None:
+def test_damaged_bytes_are_counted_and_ignored() -> None:
     rig = Rig(Kind.COPTER)
     rng = np.random.default_rng(1)
     for _ in range(50):
         rig.autopilot.receive(rng.integers(0, 256, 60, dtype=np.uint8).tobytes(), rig.t_s)
-    assert rig.autopilot.wire.heard.bad_packets > 0
+    assert rig.autopilot.wire.received.bad_packets > 0
     rig.fly(20.0, GOOD)
     assert rig.autopilot.counts.accepted > 80
 
 
-def test_the_same_flight_is_the_same_bytes() -> None:
-    def said() -> list[str]:
+def test_the_same_flight_gives_the_same_bytes() -> None:
+    def message() -> list[str]:
         rig = Rig(Kind.PLANE, seed=5)
         rig.fly(20.0, GOOD)
-        return [str(m) for m in rig.heard]
+        return [str(m) for m in rig.received]
 
-    assert said() == said()
+    assert message() == message()
 
 
-def test_it_takes_off_without_an_order() -> None:
-    """What is in the air was armed."""
+def test_a_take_off_arms_the_autopilot_without_a_command() -> None:
+    """A vehicle in the air counts as armed."""
     rig = Rig(Kind.COPTER, flying=False)
     rig.fly(30.0, GOOD)
     assert not rig.autopilot.armed
@@ -152,17 +152,17 @@ def test_it_takes_off_without_an_order() -> None:
     assert rig.autopilot.armed and rig.autopilot.flying
 
 
-def test_the_loopback_keeps_order_and_directions_apart() -> None:
+def test_the_loopback_keeps_order_and_separates_directions() -> None:
     wire = Loopback()
     assert wire.write(b"a") and wire.write(b"b")
-    wire.give(b"1")
-    wire.give(b"")
-    wire.give(b"2")
+    wire.to_companion(b"1")
+    wire.to_companion(b"")
+    wire.to_companion(b"2")
     assert (wire.take(), wire.take()) == (b"ab", b"")
     assert (wire.read(), wire.read()) == ([(b"1", None), (b"2", None)], [])
 
 
-def test_positions_far_from_the_origin_stay_right() -> None:
+def test_positions_far_from_the_origin_are_correct() -> None:
     rig = Rig(Kind.PLANE)
     rig.fly(10.0, GOOD)
     assert math.dist(rig.truth(rig.t_s)[:2], (0.0, 0.0)) > 200.0
@@ -170,8 +170,8 @@ def test_positions_far_from_the_origin_stay_right() -> None:
     assert rig.last("GLOBAL_POSITION_INT").lon * 1e-7 > LON
 
 
-def test_a_push_beyond_any_sensor_fills_the_message_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A flight that is let go in mid-air gains its speed within a step."""
+def test_an_acceleration_beyond_the_sensor_range_is_clipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight that starts in mid-air gains its speed within one step."""
     rig = Rig(Kind.PLANE)
     shown = rig._readings
     monkeypatch.setattr(rig, "_readings", lambda: replace(shown(), accel_b_mps2=np.array([2400.0, 0.0, -2400.0])))

@@ -1,4 +1,4 @@
-"""The simulated flight of the Monte Carlo run: what it says belongs to its truth, and errs as real flights do."""
+"""The simulated flight of the Monte Carlo run: consistent with its truth, with errors as of real flights."""
 
 import json
 from dataclasses import replace
@@ -11,30 +11,30 @@ import pytest
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
-from terrafix.estimator.propagation import Propagation
+from terrafix.estimator.measurements.odometry import OdometryMeasurement
 from terrafix.messages import MapMatch, Prediction, Verdict
 from terrafix_tools.montecarlo.fault import LIES, Fault
 from terrafix_tools.montecarlo.faults import JUMP_M, JUMPS, Faults
 from terrafix_tools.montecarlo.flight import run
-from terrafix_tools.montecarlo.flown import Flown, Shot, fly
+from terrafix_tools.montecarlo.flown import Shot, SimulatedFlight, fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens
 from terrafix_tools.montecarlo.matches import MapMatches
 from terrafix_tools.montecarlo.plan import FlightPlan, plan
-from terrafix_tools.montecarlo.run import PICTURE, RESULT, Wanted, montecarlo
-from terrafix_tools.montecarlo.sightings import Sightings
-from terrafix_tools.montecarlo.statistics import Seen
+from terrafix_tools.montecarlo.run import PICTURE, RESULT, RunOptions, montecarlo
+from terrafix_tools.montecarlo.sightings import SimulatedOdometry
+from terrafix_tools.montecarlo.statistics import FlightResult
 
 SHORT_S = 60.0
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[FlightPlan, Flown]:
+def flown() -> tuple[FlightPlan, SimulatedFlight]:
     drawn = replace(plan(5, 0, fault=Fault.NONE, duration_s=SHORT_S), has_dem=True)
     return drawn, fly(drawn, Terrain(drawn.seed, drawn.hills_m, drawn.settled))
 
 
-def test_a_number_is_a_flight_and_the_rounds_have_every_fault() -> None:
+def test_a_plan_is_reproducible_and_a_round_has_every_fault() -> None:
     assert plan(3, 7) == plan(3, 7)
     assert plan(3, 7) != plan(4, 7)
     faults = [plan(1, n).fault for n in range(12)]
@@ -43,7 +43,7 @@ def test_a_number_is_a_flight_and_the_rounds_have_every_fault() -> None:
     assert all(abs(plan(1, n, fault=Fault.HEIGHT).height_scale - 1.0) == pytest.approx(0.1) for n in range(4))
 
 
-def test_registration_errors_of_a_hundred_maps_are_those_that_the_maps_state() -> None:
+def test_registration_errors_of_100_maps_have_the_stated_distribution() -> None:
     drawn = [plan(1, n) for n in range(100)]
     share = np.array([np.hypot(*p.map_offset_m) / p.map_sigma_m for p in drawn])
     assert np.mean(share**2) == pytest.approx(2.0, rel=0.1)
@@ -51,8 +51,8 @@ def test_registration_errors_of_a_hundred_maps_are_those_that_the_maps_state() -
     assert np.abs(np.mean([np.array(p.map_offset_m) / p.map_sigma_m for p in drawn], axis=0)).max() < 0.1
 
 
-def test_a_map_is_stretched_as_measured_and_more_when_it_states_more() -> None:
-    """0.8 m on village-1, whatever a better map states; a third of what a worse one states. 0.35 m are detail."""
+def test_the_warp_of_a_map_is_as_measured_and_grows_with_its_stated_error() -> None:
+    """0.8 m as on village-1 for better maps, a third of the stated sigma for worse ones; 0.35 m are detail."""
     places = np.random.default_rng(2).uniform(-3000.0, 3000.0, (4000, 2))
     for sigma_m, warp_m in ((1.0, 0.8), (2.0, 0.8), (6.0, 2.0)):
         errors = [MapError(seed, np.array([3.0, 1.0]), sigma_m).at(places) - (3.0, 1.0) for seed in range(6)]
@@ -68,7 +68,7 @@ def test_the_ground_is_the_same_from_another_origin() -> None:
     assert float(terrain.bare_m(places).std()) == pytest.approx(20.0, rel=0.5)
 
 
-def test_a_lens_looks_where_it_projects() -> None:
+def test_rays_and_projection_of_a_lens_are_inverse() -> None:
     lens = Lens(CameraCalibration(1280, 720, 684.0, 684.0, 639.5, 359.5), focal=0.02, k1=-0.01)
     px = np.array([[0.0, 0.0], [639.5, 359.5], [1279.0, 719.0], [200.0, 600.0]])
     assert lens.project(40.0 * lens.rays(px)) == pytest.approx(px, abs=0.02)
@@ -76,14 +76,16 @@ def test_a_lens_looks_where_it_projects() -> None:
     assert true.project(true.rays(px)) == pytest.approx(true.described.project(true.rays(px)))
 
 
-def test_tracks_scatter_about_their_homography_as_those_of_real_flights(flown: tuple[FlightPlan, Flown]) -> None:
+def test_tracks_scatter_about_their_homography_as_those_of_real_flights(
+    flown: tuple[FlightPlan, SimulatedFlight],
+) -> None:
     """village-1: 0.48 px after one frame, 0.77 after two, 0.84 after three, 0.9 later (medians, 720 px wide)."""
     drawn, flight = flown
     lens = Lens(CameraCalibration.of(drawn.camera), drawn.focal_error, drawn.k1_error)
-    sightings, scatter = Sightings(lens, flight.terrain, 1), {1: [], 2: [], 3: []}  # type: ignore[var-annotated]
+    sightings, scatter = SimulatedOdometry(lens, flight.terrain, 1), {1: [], 2: [], 3: []}  # type: ignore[var-annotated]
     focal_px = lens.described.fx * 720 / lens.described.width
     for i, shot in enumerate(flight.frames):
-        odometry = sightings.see(i, shot)
+        odometry = sightings.odometry(i, shot)
         age = i - odometry.keyframe_id
         if age in scatter and len(odometry.pairs) > 8:
             pairs = focal_px * np.array(odometry.pairs)
@@ -95,7 +97,7 @@ def test_tracks_scatter_about_their_homography_as_those_of_real_flights(flown: t
     assert 0.5 < np.median(scatter[2]) < 0.95
 
 
-def test_a_match_finds_the_camera_on_the_map_and_says_how_well(flown: tuple[FlightPlan, Flown]) -> None:
+def test_simulated_matches_have_small_and_consistent_errors(flown: tuple[FlightPlan, SimulatedFlight]) -> None:
     drawn, flight = flown
     offset = np.array([4.0, -3.0])
     matches = _matches(drawn, flight, offset)
@@ -112,7 +114,7 @@ def test_a_match_finds_the_camera_on_the_map_and_says_how_well(flown: tuple[Flig
     assert 0.1 < np.mean(share) < 4.0
 
 
-def test_what_the_anchor_does_not_search_is_not_found(flown: tuple[FlightPlan, Flown]) -> None:
+def test_positions_outside_of_the_search_range_are_not_matched(flown: tuple[FlightPlan, SimulatedFlight]) -> None:
     drawn, flight = flown
     matches, shot = _matches(drawn, flight, np.zeros(2)), flight.frames[10]
     for wrong in (
@@ -123,7 +125,7 @@ def test_what_the_anchor_does_not_search_is_not_found(flown: tuple[FlightPlan, F
         assert matches.match(wrong, shot).verdict is Verdict.AMBIGUOUS
 
 
-def test_faults_are_where_and_as_large_as_they_say(flown: tuple[FlightPlan, Flown]) -> None:
+def test_faults_have_their_stated_times_and_sizes(flown: tuple[FlightPlan, SimulatedFlight]) -> None:
     flight = flown[1]
     right = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient")
 
@@ -131,8 +133,8 @@ def test_faults_are_where_and_as_large_as_they_say(flown: tuple[FlightPlan, Flow
         faults, out = Faults(fault, 600.0, 1), []
         for i in range(600):
             shot = replace(flight.frames[0], t_s=float(i))
-            said = faults.alter(right, shot).p_c_in_w_m
-            out.append(np.nan if said is None else np.hypot(*(np.array(said) - shot.p_m)[:2]))
+            p_m = faults.alter(right, shot).p_c_in_w_m
+            out.append(np.nan if p_m is None else np.hypot(*(np.array(p_m) - shot.p_m)[:2]))
         return np.array(out)
 
     jumps = moved(Fault.JUMPS)
@@ -141,11 +143,11 @@ def test_faults_are_where_and_as_large_as_they_say(flown: tuple[FlightPlan, Flow
     assert 0.06 < np.isfinite(moved(Fault.WRONG)).mean() < 0.14
     assert np.isfinite(moved(Fault.ROWS)).sum() == 30
     assert not np.isfinite(moved(Fault.NONE)).any()
-    blind = [Faults(Fault.BLACKOUT, 600.0, 1).blind(float(t)) for t in range(600)]
+    blind = [Faults(Fault.BLACKOUT, 600.0, 1).is_blacked_out(float(t)) for t in range(600)]
     assert sum(blind) == 120
 
 
-def test_a_flight_is_the_same_again_and_close_to_its_truth() -> None:
+def test_a_flight_is_reproducible_and_close_to_the_truth() -> None:
     drawn = replace(plan(5, 2, fault=Fault.NONE, duration_s=SHORT_S), start_sigma_m=5.0)
     one, two = run(drawn), run(drawn)
     for name in ("error_m", "cov", "velocity_error_mps", "refined_error_m"):
@@ -154,9 +156,9 @@ def test_a_flight_is_the_same_again_and_close_to_its_truth() -> None:
     assert np.median(np.hypot(*(one.error_m[:, :2] - np.array(drawn.map_offset_m)).T)) < 8.0
 
 
-def test_matches_that_agree_on_a_wrong_place_make_no_false_fix() -> None:
-    """Flight 22 was 80 m off for half a minute and claimed 3 m."""
-    seen = Seen.of(run(plan(1, 22, fault=Fault.ROWS, duration_s=100.0)))
+def test_consistent_wrong_matches_cause_no_false_fix() -> None:
+    """Regression: flight 22 had an error of 80 m for half a minute with a sigma of 3 m."""
+    seen = FlightResult.of(run(plan(1, 22, fault=Fault.ROWS, duration_s=100.0)))
     assert seen.distance_m.max() > 50.0
     assert seen.false_fixes == 0
     assert float((seen.nees < 5.991).mean()) > 0.9
@@ -164,42 +166,42 @@ def test_matches_that_agree_on_a_wrong_place_make_no_false_fix() -> None:
 
 
 @pytest.mark.slow
-def test_a_hillside_that_no_map_tells_is_not_taken_for_a_tilt_of_the_camera() -> None:
-    """For half a minute each keyframe sees the same slope. Taken for news each time, it moved flight 3 by 4.2 m on each
-    axis, and the claim was 2.4 m."""
-    seen = Seen.of(run(plan(1, 3, fault=Fault.HILLS, duration_s=180.0)))
+def test_an_unmapped_slope_is_not_taken_for_a_tilt_of_the_camera() -> None:
+    """For half a minute all keyframes observe the same slope. Treated as independent, they moved flight 3 by 4.2 m per
+    axis at a sigma of 2.4 m."""
+    seen = FlightResult.of(run(plan(1, 3, fault=Fault.HILLS, duration_s=180.0)))
     assert float(seen.map_nees[60:].mean()) < 4.0
     assert float((seen.nees < 5.991).mean()) > 0.93
 
 
-def test_three_keyframes_carry_the_way_on_over_hills_in_the_dark(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_three_view_constraints_reduce_the_drift_over_hills_without_a_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two flights over relief of 20 m, 150 s without a map."""
     hills = [plan(1, number, fault=Fault.DRIFT, duration_s=240.0) for number in (2, 8)]
 
     def flown_m() -> tuple[float, float]:
-        """Mean error in the dark, and the claim at its end."""
+        """Mean error without a map, and the sigma at its end."""
         records = [run(one, refine=False) for one in hills]
         errors = [float(np.hypot(*record.error_m[90:, :2].T).mean()) for record in records]
         claims = [float(np.sqrt(np.trace(record.cov[-1, :2, :2]))) for record in records]
         return sum(errors), sum(claims)
 
     error_m, claim_m = flown_m()
-    monkeypatch.setattr(Propagation, "_three", lambda *_: None)
+    monkeypatch.setattr(OdometryMeasurement, "three_view", lambda *_: None)
     without_m, claim_without_m = flown_m()
     assert error_m < 0.85 * without_m
     assert error_m < claim_m < 0.8 * claim_without_m
 
 
-def test_photos_that_do_not_overlap_are_claimed_for_the_speed_of_what_flies_and_for_its_turns() -> None:
-    """Flight 16 flies 22 m/s, seen by the map alone. With the pace that nothing but odometry told, 10 m/s, a turn led
-    it out of the search, and 23 of its 120 positions were false."""
-    seen = Seen.of(run(plan(1, 16, fault=Fault.PHOTOS)))
+def test_sparse_photos_have_a_covariance_for_speed_and_turns() -> None:
+    """Regression: flight 16 flies 22 m/s with map matches only. With a speed prior of odometry only, 10 m/s, a turn led
+    it out of the search window, and 23 of its 120 positions were false."""
+    seen = FlightResult.of(run(plan(1, 16, fault=Fault.PHOTOS)))
     assert seen.false_fixes == 0
     assert float((seen.nees < 5.991).mean()) > 0.93
 
 
 def test_the_command_writes_its_table_and_picture(tmp_path: Path) -> None:
-    result = montecarlo(Wanted(tmp_path, flights=1, seed=5, duration_s=SHORT_S, workers=1))
+    result = montecarlo(RunOptions(tmp_path, flights=1, seed=5, duration_s=SHORT_S, workers=1))
     written = json.loads((tmp_path / RESULT).read_text())
     assert written["all"]["frames"] == SHORT_S
     assert written["flights"][0]["number"] == 0
@@ -218,19 +220,19 @@ def test_the_command_writes_its_table_and_picture(tmp_path: Path) -> None:
         {"lie_share": 5.0},
     ],
 )
-def test_what_cannot_be_flown_is_said_in_a_line(tmp_path: Path, wrong: dict[str, float]) -> None:
+def test_invalid_options_are_usage_errors(tmp_path: Path, wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):
-        montecarlo(Wanted(tmp_path, **wrong))  # type: ignore[arg-type]
+        montecarlo(RunOptions(tmp_path, **wrong))  # type: ignore[arg-type]
 
 
-def _matches(drawn: FlightPlan, flight: Flown, offset_m: np.ndarray) -> MapMatches:
+def _matches(drawn: FlightPlan, flight: SimulatedFlight, offset_m: np.ndarray) -> MapMatches:
     lens = Lens(CameraCalibration.of(drawn.camera))
     error = MapError(drawn.seed, offset_m, 2.0)
     return MapMatches(lens, flight.terrain, error, has_dem=True, map_sigma_m=2.0, seed=drawn.seed)
 
 
 def _prediction(i: int, shot: Shot, east_m: float = 0.0, up_m: float = 0.0, turn_rad: float = 0.0) -> Prediction:
-    """Close to the truth, and sure of it."""
+    """A prediction close to the truth, with a small covariance."""
     cov = np.diag([25.0, 25.0, 9.0, 1e-4, 1e-4, 4e-4])
     p = shot.p_m + np.array([east_m, 0.0, up_m])
     turned = rot_w_b(turn_rad, 0.0, 0.0) @ rot_w_b(0.0, 0.0, 0.0).T @ shot.r_w_c

@@ -1,4 +1,4 @@
-"""Monte Carlo flights in which an input lies: each lie is where, and as large as, it says."""
+"""Monte Carlo flights with false inputs: times and sizes of each."""
 
 from dataclasses import replace
 
@@ -9,11 +9,11 @@ from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
 from terrafix_tools.montecarlo import lies as of
 from terrafix_tools.montecarlo.fault import LIES, Fault
 from terrafix_tools.montecarlo.flight import Record
-from terrafix_tools.montecarlo.flown import Flown, Shot, fly
+from terrafix_tools.montecarlo.flown import Shot, SimulatedFlight, fly
 from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.lies import Lies, Search
 from terrafix_tools.montecarlo.plan import FlightPlan, plan
-from terrafix_tools.montecarlo.statistics import Seen
+from terrafix_tools.montecarlo.statistics import FlightResult
 
 SHORT_S = 60.0
 FOUND = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", inliers=20)
@@ -23,12 +23,12 @@ PREDICTION = Prediction(
     agl_sigma_m=3.0, step_m=(0.0, 0.0), step_cov_m2=(1.0, 0.0, 0.0, 1.0))  # fmt: skip
 
 
-def flown(fault: Fault, number: int = 0) -> tuple[FlightPlan, Flown]:
+def flown(fault: Fault, number: int = 0) -> tuple[FlightPlan, SimulatedFlight]:
     drawn = plan(5, number, fault=fault, duration_s=SHORT_S)
     return drawn, fly(drawn, Terrain(drawn.seed, drawn.hills_m, drawn.settled))
 
 
-def test_each_lie_is_in_five_per_cent_of_the_flights_and_changes_nothing_else() -> None:
+def test_each_lie_has_its_probability_and_changes_nothing_else() -> None:
     plans = [plan(1, n, lie_share=0.05) for n in range(600)]
     for lie in LIES:
         assert 0.025 < np.mean([lie in p.lies for p in plans]) < 0.08, lie
@@ -39,7 +39,7 @@ def test_each_lie_is_in_five_per_cent_of_the_flights_and_changes_nothing_else() 
     assert plans[lying].fault is plan(1, lying).fault
 
 
-def test_numbers_that_lie_are_as_wrong_as_they_say() -> None:
+def test_false_numbers_have_their_stated_sizes() -> None:
     def numbers(fault: Fault, name: str) -> np.ndarray:
         drawn = [plan(1, n, fault=fault) for n in range(40)]
         assert all(p.lies == {fault} for p in drawn)
@@ -55,7 +55,7 @@ def test_numbers_that_lie_are_as_wrong_as_they_say() -> None:
     assert set(numbers(Fault.START, "start_sigma_m")) == {50.0}
 
 
-def test_late_pictures_show_where_the_vehicle_was() -> None:
+def test_late_pictures_show_the_earlier_position() -> None:
     drawn, flight = flown(Fault.STALE)
     for seen, true in list(zip(flight.pictures, flight.frames, strict=True))[2:]:
         assert seen.t_s == true.t_s
@@ -65,7 +65,7 @@ def test_late_pictures_show_where_the_vehicle_was() -> None:
     assert all(np.array_equal(a.p_m, b.p_m) for a, b in zip(honest.pictures, honest.frames, strict=True))
 
 
-def test_a_frozen_camera_shows_one_place_with_new_times() -> None:
+def test_a_frozen_camera_repeats_one_pose_with_new_times() -> None:
     drawn, flight = flown(Fault.FROZEN)
     lies = Lies(drawn, flight)
     shown = [lies.picture(i) for i in range(len(flight.frames))]
@@ -73,10 +73,10 @@ def test_a_frozen_camera_shows_one_place_with_new_times() -> None:
     assert held == list(range(held[0], held[-1] + 1)) and 14 <= len(held) <= 40
     assert all(np.array_equal(shown[i].p_m, flight.frames[held[0] - 1].p_m) for i in held)
     assert [shot.t_s for shot in shown] == [shot.t_s for shot in flight.frames]
-    assert lies.begins_s() == flight.frames[held[0] - 1].t_s
+    assert lies.start_s() == flight.frames[held[0] - 1].t_s
 
 
-def test_foreign_motion_is_far_away_and_of_one_piece_and_the_map_does_not_know_it() -> None:
+def test_foreign_motion_is_far_away_and_consistent_and_has_no_map_match() -> None:
     drawn, flight = flown(Fault.FOREIGN)
     lies = Lies(drawn, flight)
     steps, foreign = [], []
@@ -96,13 +96,13 @@ def test_foreign_motion_is_far_away_and_of_one_piece_and_the_map_does_not_know_i
     assert not np.allclose(turned, flight.frames[foreign[0]].r_w_c)
 
 
-def test_over_the_map_of_another_town_few_looks_find_and_they_find_wrong_places() -> None:
+def test_over_the_map_of_another_town_a_fifth_of_the_frames_have_wrong_matches() -> None:
     drawn, flight = flown(Fault.TOWN)
     lies, off = Lies(drawn, flight), []
-    begins_s = lies.begins_s()
-    assert begins_s is not None
-    after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= begins_s]
-    for i in after * 20:  # as many looks as tell a share
+    start_s = lies.start_s()
+    assert start_s is not None
+    after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= start_s]
+    for i in after * 20:  # enough matches to estimate a share
         match = lies.match(i, PREDICTION, lambda *_: FOUND)
         if match.p_c_in_w_m is not None:
             off.append(float(np.hypot(*(np.array(match.p_c_in_w_m) - flight.frames[i].p_m)[:2])))
@@ -112,40 +112,40 @@ def test_over_the_map_of_another_town_few_looks_find_and_they_find_wrong_places(
     assert lies.match(0, PREDICTION, lambda *_: FOUND) == FOUND
 
 
-def test_the_stand_in_for_the_search_is_lost_after_looks_in_vain_and_finds_what_can_be_seen() -> None:
+def test_the_search_model_is_lost_without_matches_and_finds_a_visible_place() -> None:
     shot = Shot(0.0, np.array([300.0, 0.0, 100.0]), np.eye(3), np.eye(3), np.zeros(3))
 
     def visible(prediction: Prediction, _: Shot) -> MapMatch:
         return FOUND if prediction.p_c_in_w_m[0] == 300.0 else NOTHING
 
     search = Search()
-    said = [search.heard(NOTHING, PREDICTION, shot, visible) for _ in range(of.LOST_LOOKS + of.FOUND_LOOKS)]
-    lost = [m.verdict is Verdict.LOST for m in said]
-    assert lost.index(True) == of.LOST_LOOKS - 1 and sum(lost) == of.FOUND_LOOKS - 1
-    assert said[of.LOST_LOOKS].lost_sigma_m == 300.0 and said[of.LOST_LOOKS].step is SearchStep.WIDEN
-    found = said[of.LOST_LOOKS + of.FOUND_LOOKS - 2]
+    matches = [search.update(NOTHING, PREDICTION, shot, visible) for _ in range(of.LOST_FRAMES + of.FOUND_FRAMES)]
+    lost = [m.verdict is Verdict.LOST for m in matches]
+    assert lost.index(True) == of.LOST_FRAMES - 1 and sum(lost) == of.FOUND_FRAMES - 1
+    assert matches[of.LOST_FRAMES].lost_sigma_m == 300.0 and matches[of.LOST_FRAMES].step is SearchStep.WIDEN
+    found = matches[of.LOST_FRAMES + of.FOUND_FRAMES - 2]
     assert found.found and found.step is SearchStep.MERGE and found.lost_sigma_m == 0.0
-    assert said[-1] == NOTHING  # it counts anew
+    assert matches[-1] == NOTHING  # the counters restart
     blind = Search()
-    never = [blind.heard(NOTHING, PREDICTION, shot, lambda *_: NOTHING) for _ in range(60)]
+    never = [blind.update(NOTHING, PREDICTION, shot, lambda *_: NOTHING) for _ in range(60)]
     assert not any(m.found for m in never) and never[-1].verdict is Verdict.LOST
     reset = Search()
-    looks = [reset.heard(FOUND if i % 10 == 9 else NOTHING, PREDICTION, shot, visible) for i in range(60)]
+    looks = [reset.update(FOUND if i % 10 == 9 else NOTHING, PREDICTION, shot, visible) for i in range(60)]
     assert not any(m.verdict is Verdict.LOST for m in looks)
 
 
-def test_time_to_notice_is_to_the_last_false_fix_after_the_lie_began() -> None:
+def test_time_to_notice_ends_at_the_last_false_fix_after_the_start_of_the_lie() -> None:
     def noticed(lie_from_s: float | None, false_at: list[int]) -> float | None:
         n = 40
         error = np.zeros((n, 6))
         error[false_at, 0] = 80.0
         cov = np.tile(np.eye(6), (n, 1, 1))
         record = Record(
-            plan=plan(1, 0), t_s=np.arange(n, dtype=float), way_m=np.zeros(n), truth_m=np.zeros((n, 2)), error_m=error,
+            plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n), truth_m=np.zeros((n, 2)), error_m=error,
             cov=cov, velocity_error_mps=np.zeros((n, 3)), velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1),
             refined_error_m=np.zeros((n, 2)), refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n),
             memory_mb=np.zeros(n), lie_from_s=lie_from_s)  # fmt: skip
-        return Seen.of(record).notice_s
+        return FlightResult.of(record).notice_s
 
     assert noticed(10.0, [12, 13]) == 3.0
     assert noticed(10.0, [4]) is None and noticed(10.0, []) is None and noticed(None, [12]) is None

@@ -1,9 +1,9 @@
-"""Monte Carlo statistics against independent computation: tables, simulation, closed forms."""
+"""Monte Carlo statistics against tables, simulations and closed forms."""
 
 import numpy as np
 import pytest
 
-from terrafix_tools.montecarlo.endurance import OldAndYoung, slopes
+from terrafix_tools.montecarlo.endurance import RestartComparison, slopes
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import run
 from terrafix_tools.montecarlo.plan import plan
@@ -35,14 +35,14 @@ def test_whitened_errors_have_the_length_of_the_nees() -> None:
     assert (whitened(error, cov) ** 2).sum(axis=1) == pytest.approx(nees_of(error, cov))
 
 
-def test_white_errors_are_as_many_draws_as_frames_and_a_constant_is_one() -> None:
+def test_white_errors_give_one_draw_per_frame_and_a_constant_gives_one() -> None:
     white = np.random.default_rng(2).normal(size=(2000, 2))
     assert 1500 < draws_in([white]) <= 2000
     assert draws_in([np.ones((2000, 2))]) == pytest.approx(1.0, rel=0.2)
 
 
-def test_correlated_errors_are_as_many_draws_as_their_squares_are_worth() -> None:
-    """First-order process: the squares are correlated by rho^(2 lag), n (1 - rho^2) / (1 + rho^2) are left."""
+def test_the_effective_draws_of_a_first_order_process() -> None:
+    """First-order process: the squares have the correlation rho^(2 lag), so that n (1 - rho^2) / (1 + rho^2) remain."""
     rho, rng = 0.9, np.random.default_rng(3)
     x = np.zeros((20000, 2))
     for i in range(1, len(x)):
@@ -50,8 +50,8 @@ def test_correlated_errors_are_as_many_draws_as_their_squares_are_worth() -> Non
     assert draws_in([x]) == pytest.approx(20000 * (1 - rho**2) / (1 + rho**2), rel=0.2)
 
 
-def test_the_band_holds_95_of_100_honest_runs_and_no_run_that_claims_too_little() -> None:
-    """Runs of 20 flights whose error has a constant part, as a map's registration makes it."""
+def test_the_band_contains_95_of_100_consistent_runs_and_no_overconfident_one() -> None:
+    """Runs of 20 flights with a constant part of the error, as by the registration of a map."""
     rng = np.random.default_rng(4)
     held = overconfident = 0
     for _ in range(100):
@@ -63,7 +63,7 @@ def test_the_band_holds_95_of_100_honest_runs_and_no_run_that_claims_too_little(
     assert overconfident == 0
 
 
-def test_floors_name_what_is_broken() -> None:
+def test_each_broken_floor_is_reported() -> None:
     good = {"coverage": 0.95, "coverage_refined": 0.96, "false_fixes": 0, "nees": {"holds": True}}
     assert all(floors(good).values())
     for key, bad in (("coverage", 0.99), ("coverage", 0.9), ("coverage_refined", None), ("false_fixes", 1)):
@@ -74,7 +74,7 @@ def test_floors_name_what_is_broken() -> None:
 @pytest.mark.parametrize(
     ("growth_per_h", "growth_mb_per_h", "flat"), [(0.0, 0.5, True), (0.03, 0.0, False), (0.0, 60.0, False)]
 )
-def test_slopes_are_those_of_the_estimator_whatever_the_machine_did_meanwhile(
+def test_slopes_are_independent_of_the_load_of_the_machine(
     growth_per_h: float, growth_mb_per_h: float, flat: bool
 ) -> None:
     rng, t_s = np.random.default_rng(5), np.arange(7200.0)
@@ -87,13 +87,13 @@ def test_slopes_are_those_of_the_estimator_whatever_the_machine_did_meanwhile(
     assert found["flat"] is flat
 
 
-def test_a_young_estimator_hears_what_an_old_one_does_and_is_where_it_is() -> None:
-    flight = OldAndYoung(plan(1, 0, fault=Fault.NONE, duration_s=60.0), 30.0)
+def test_a_restarted_estimator_processes_the_same_messages_and_agrees() -> None:
+    flight = RestartComparison(plan(1, 0, fault=Fault.NONE, duration_s=60.0), 30.0)
     alone = run(plan(1, 0, fault=Fault.NONE, duration_s=60.0), refine=False)
     record = flight.record(refine=False)
-    np.testing.assert_array_equal(record.error_m, alone.error_m)  # nobody changed what the old one says
+    np.testing.assert_array_equal(record.error_m, alone.error_m)  # the output of the old one is unchanged
     spent_ms = np.array(flight.frames_ms)
     assert len(spent_ms) == (record.t_s > 30.0).sum() and (spent_ms > 0.0).all()
-    old, young = flight._node._estimator, flight._young._estimator  # type: ignore[union-attr]
+    old, young = flight._node.estimator, flight._young.estimator
     apart_m = old.last.pose.translation() - young.last.pose.translation()  # type: ignore[union-attr]
     assert np.hypot(*apart_m[:2]) < 3.0

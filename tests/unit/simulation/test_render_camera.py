@@ -1,4 +1,4 @@
-"""Fisheye, rolling shutter, ridges and weather, each against a computation of its own."""
+"""Fisheye, rolling shutter, ridges and weather, each against an independent computation."""
 
 import math
 
@@ -31,7 +31,7 @@ def local_crs() -> CRS:
 
 
 def dotted(places_m: np.ndarray) -> np.ndarray:
-    """White dots of 0.8 m at local places (N, 2) on black; the image's middle is the origin."""
+    """White dots of 0.8 m at local positions (N, 2) on black; the image centre is the origin."""
     image = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     for e_m, n_m in places_m:
         x, y = SIZE_PX / 2 + e_m / GSD_M - 0.5, SIZE_PX / 2 - n_m / GSD_M - 0.5
@@ -42,7 +42,7 @@ def dotted(places_m: np.ndarray) -> np.ndarray:
 
 
 def ground_of(image: np.ndarray, height: object, post_m: float) -> Ground:
-    """``height(e, n)`` on posts every ``post_m``."""
+    """Ground with ``height(e, n)`` on posts every ``post_m``."""
     assert callable(height)
     posts = np.arange(-480.0, 480.0 + post_m / 2, post_m)
     dem = height(posts[None, :], -posts[:, None]) + np.zeros((len(posts), len(posts)))
@@ -62,7 +62,7 @@ def hills(e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray:
 
 
 def dot_at(frame: np.ndarray, place: np.ndarray, reach: int = 7) -> np.ndarray | None:
-    """Centroid (x, y) of the dot near a pixel; None: nothing there."""
+    """Centroid (x, y) of the dot near a pixel; None if there is none."""
     cx, cy = round(float(place[0])), round(float(place[1]))
     patch = np.maximum(frame[cy - reach : cy + reach + 1, cx - reach : cx + reach + 1].astype(float) - 15.0, 0.0)
     if patch.sum() < 300.0:
@@ -87,7 +87,7 @@ def test_fisheye_rays_and_pixels_are_those_of_opencv() -> None:
     assert np.abs(LENS.project(rays * 7.0) - px).max() < 1e-6
 
 
-def test_dots_on_hills_appear_where_a_fisheye_sees_them() -> None:
+def test_dots_on_hills_appear_at_their_fisheye_projection() -> None:
     places = lattice()
     ground = ground_of(dotted(places), hills, 8.0)
     p_c, r_w_c = np.array([10.0, -15.0, 290.0]), DOWN @ cv2.Rodrigues(np.array([0.12, -0.08, 0.5]))[0]
@@ -101,7 +101,7 @@ def test_dots_on_hills_appear_where_a_fisheye_sees_them() -> None:
     assert float(np.median(errors)) < 0.25 and float(np.quantile(errors, 0.95)) < 0.6
 
 
-def test_a_rolling_shutter_sees_each_row_at_its_time() -> None:
+def test_a_rolling_shutter_renders_each_row_at_its_time() -> None:
     places = lattice()
     ground = ground_of(dotted(places), hills, 8.0)
     readout_s = 0.05
@@ -112,7 +112,7 @@ def test_a_rolling_shutter_sees_each_row_at_its_time() -> None:
     errors, still = [], []
     for point in np.column_stack([places, hills(places[:, 0], places[:, 1])]):
         row = 269.5
-        for _ in range(20):  # the row decides the time, and the time decides the row
+        for _ in range(20):  # row and time depend on each other
             t_s = (row / 539.0 - 0.5) * readout_s
             turned = r_w_c @ cv2.Rodrigues(rates * t_s)[0]
             in_c = turned.T @ (point - p_c - velocity * t_s)
@@ -130,7 +130,7 @@ def test_a_rolling_shutter_sees_each_row_at_its_time() -> None:
         )
     assert len(errors) > 30
     assert float(np.median(errors)) < 0.2 and max(errors) < 0.6
-    assert max(still) > 4.0  # without the shutter it would be elsewhere
+    assert max(still) > 4.0  # with a global shutter it would be elsewhere
 
 
 def ridge(e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray:
@@ -138,13 +138,13 @@ def ridge(e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray:
     return 100.0 + np.maximum(0.0, 90.0 - 2.0 * np.abs(n_m - 60.0)) + 0.0 * e_m
 
 
-def test_a_ridge_hides_what_is_behind_it() -> None:
+def test_a_ridge_occludes_the_ground_behind_it() -> None:
     places = lattice(16.0)
     ground = ground_of(dotted(places), ridge, 5.0)
     p_c = np.array([0.0, -120.0, 260.0])
     tilt = math.radians(-55.0)
     r_w_c = DOWN @ np.array([[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]])
-    assert (r_w_c @ (0.0, 0.0, 1.0))[1] > 0.5  # it looks to the north
+    assert (r_w_c @ (0.0, 0.0, 1.0))[1] > 0.5  # the camera looks north
     frame = Renderer(ground, CAMERA, film=PLAIN).frame(p_c, r_w_c, 0)[..., 0]
     points = np.column_stack([places, ridge(places[:, 0], places[:, 1])])
     in_c = (points - p_c) @ r_w_c
@@ -166,10 +166,10 @@ def test_a_ridge_hides_what_is_behind_it() -> None:
             wrong += at is not None
     assert len(errors) > 40 and hidden > 15
     assert float(np.median(errors)) < 0.35 and float(np.quantile(errors, 0.9)) < 1.0
-    assert wrong == 0  # behind the ridge nothing shines through
+    assert wrong == 0  # no dot behind the ridge is visible
 
 
-def test_haze_light_and_clouds_do_what_physics_says() -> None:
+def test_haze_light_and_clouds_follow_their_formulas() -> None:
     image = np.full((SIZE_PX, SIZE_PX, 3), 100, np.uint8)
 
     def slope(e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray:
@@ -204,7 +204,7 @@ def state(roll_rad: float, rates: np.ndarray) -> State:
     return State(3.0, np.zeros(3), np.array([15.0, 0.0, 0.0]), 1.2, 0.1, roll_rad, 100.0, rates, np.zeros(3), 15.0)
 
 
-def test_a_gimbal_holds_the_horizon_and_a_fixed_camera_does_not() -> None:
+def test_a_gimbal_is_stabilised_and_a_fixed_camera_is_not() -> None:
     banked = state(0.5, np.zeros(3))
     axis = Fixed().r_w_c(banked) @ (0.0, 0.0, 1.0)
     assert math.degrees(math.acos(-axis[2])) == pytest.approx(math.degrees(math.acos(math.cos(0.1) * math.cos(0.5))))
@@ -220,8 +220,8 @@ def test_a_gimbal_holds_the_horizon_and_a_fixed_camera_does_not() -> None:
     assert math.sqrt(float(np.mean(np.square(tilts))) / 2) == pytest.approx(0.5, rel=0.3)
 
 
-@pytest.mark.parametrize("hanging", [Fixed(Mount(pitch_deg=-70.0)), Gimbal(Mount(pitch_deg=-60.0), error_deg=0.0)])
-def test_the_motion_of_the_camera_is_the_derivative_of_its_pose(hanging: Fixed | Gimbal) -> None:
+@pytest.mark.parametrize("mount", [Fixed(Mount(pitch_deg=-70.0)), Gimbal(Mount(pitch_deg=-60.0), error_deg=0.0)])
+def test_the_motion_of_the_camera_is_the_derivative_of_its_pose(mount: Fixed | Gimbal) -> None:
     rates = np.array([0.2, -0.1, 0.3])
     now = state(0.3, rates)
     dt_s = 1e-5
@@ -230,6 +230,6 @@ def test_the_motion_of_the_camera_is_the_derivative_of_its_pose(hanging: Fixed |
     pitch = math.asin(turned[2, 0])
     roll = math.atan2(-turned[2, 1], -turned[2, 2])
     then = State(3.0, np.zeros(3), now.velocity_enu_mps, yaw, pitch, roll, 100.0, rates, np.zeros(3), 15.0)
-    step = hanging.r_w_c(now).T @ hanging.r_w_c(then)
+    step = mount.r_w_c(now).T @ mount.r_w_c(then)
     measured = np.array([step[2, 1] - step[1, 2], step[0, 2] - step[2, 0], step[1, 0] - step[0, 1]]) / 2 / dt_s
-    assert hanging.motion(now).rates_c_radps == pytest.approx(measured, abs=1e-4)
+    assert mount.motion(now).rates_c_radps == pytest.approx(measured, abs=1e-4)

@@ -48,7 +48,7 @@ def painted(px: np.ndarray) -> np.ndarray:
 
 
 def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
-    """R_w_c of a camera that looks down with its top forward, body angles Z-Y-X, written out once more."""
+    """R_w_c of a nadir camera with its top forward, body angles Z-Y-X, implemented independently."""
     y, p, r = (math.radians(v) for v in (yaw_deg, pitch_deg, roll_deg))
     rz = np.array([[math.cos(y), -math.sin(y), 0], [math.sin(y), math.cos(y), 0], [0, 0, 1]])
     ry = np.array([[math.cos(p), 0, math.sin(p)], [0, 1, 0], [-math.sin(p), 0, math.cos(p)]])
@@ -75,7 +75,7 @@ def projected(camera: m.Camera, p_c: np.ndarray, r_w_c: np.ndarray, points: np.n
 @pytest.mark.parametrize("camera", [PINHOLE, WIDE], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("terrain", [flat, hills])
 @pytest.mark.parametrize(("yaw", "pitch", "roll"), [(0.0, 0.0, 0.0), (37.0, 3.0, 0.0), (-120.0, -4.0, 26.0)])
-def test_points_on_the_ground_appear_where_they_project(
+def test_points_on_the_ground_appear_at_their_projection(
     camera: m.Camera, terrain: object, yaw: float, pitch: float, roll: float
 ) -> None:
     assert callable(terrain)

@@ -1,16 +1,16 @@
-"""Vehicles that a pilot would accept, that keep their limits, and that fly where they believe to be."""
+"""Vehicle models: plausible flight, within limits, steering by the navigation solution."""
 
 import math
 
 import numpy as np
 import pytest
 
-from flown import HOME, PLACE, STEP_S, at, flat, fly, hills, mission, positions
 from terrafix_tools.mission.course import course
-from terrafix_tools.mission.mission import Above, Box, Do, Item
+from terrafix_tools.mission.mission import AltitudeFrame, Box, Do, Item
 from terrafix_tools.sim.vehicle.copter import Copter, CopterLimits
 from terrafix_tools.sim.vehicle.plane import Plane, PlaneLimits
 from terrafix_tools.sim.vehicle.wind import Gusts, Wind
+from vehicle_missions import HOME, PLACE, STEP_S, at, flat, fly, hills, mission, positions
 
 CALM = Wind(0.0, 0.0)
 G = 9.80665
@@ -36,7 +36,7 @@ def test_turns_are_coordinated_and_within_the_bank_limit() -> None:
     assert turning.sum() > 100
     assert yaw_rate[turning] == pytest.approx((G * np.tan(roll) / speed)[turning], abs=0.02)
     aside = np.array([s.force_b_mps2[1] for s in states])
-    assert np.abs(aside).max() < 0.8  # the ball stays in the middle
+    assert np.abs(aside).max() < 0.8  # no sideslip acceleration
 
 
 def test_climb_speed_and_height_are_held() -> None:
@@ -49,14 +49,14 @@ def test_climb_speed_and_height_are_held() -> None:
     assert np.abs(np.array([s.airspeed_mps for s in states]) - 22.0).max() < 1.0
 
 
-def test_heights_count_from_sea_home_or_the_ground_below() -> None:
-    """All three mean the same height over hills, once: at the waypoint; only one follows the ground."""
-    for above, wanted in ((Above.SEA, 520.0), (Above.HOME, 520.0 - hills(*HOME))):
-        flown = mission(*(at(Do.WAYPOINT, 100.0, n, wanted, above=above) for n in (-50.0, 4000.0)))
+def test_heights_refer_to_sea_level_home_or_the_ground_below() -> None:
+    """All three are the same height at the waypoint; over hills only one follows the ground."""
+    for altitude_frame, wanted in ((AltitudeFrame.SEA, 520.0), (AltitudeFrame.HOME, 520.0 - hills(*HOME))):
+        flown = mission(*(at(Do.WAYPOINT, 100.0, n, wanted, altitude_frame=altitude_frame) for n in (-50.0, 4000.0)))
         plane = Plane(flown, PLACE, hills, wind=CALM)
         up = positions(fly(plane, plane.state, 60.0))[:, 2]
-        assert np.abs(up - 520.0).max() < 1.0, above
-    flown = mission(*(at(Do.WAYPOINT, 100.0, n, 120.0, above=Above.GROUND) for n in (-50.0, 4000.0)))
+        assert np.abs(up - 520.0).max() < 1.0, altitude_frame
+    flown = mission(*(at(Do.WAYPOINT, 100.0, n, 120.0, altitude_frame=AltitudeFrame.GROUND) for n in (-50.0, 4000.0)))
     plane = Plane(flown, PLACE, hills, wind=CALM)
     states = fly(plane, plane.state, 60.0)
     assert np.abs([s.agl_m - 120.0 for s in states]).max() < 8.0
@@ -66,8 +66,8 @@ def test_heights_count_from_sea_home_or_the_ground_below() -> None:
 
 
 @pytest.mark.parametrize("vehicle", [Plane, Copter])
-def test_it_flies_on_what_it_is_told(vehicle: type[Plane] | type[Copter]) -> None:
-    """A position that is 40 m too far east puts it 40 m west of its leg; the physics knows nothing of that."""
+def test_the_vehicle_steers_by_the_given_navigation(vehicle: type[Plane] | type[Copter]) -> None:
+    """A navigation error of 40 m to the east moves it 40 m west of its leg; the physics uses the truth."""
     made = vehicle(LEG, PLACE, flat, wind=CALM)
     states = fly(made, made.state, 60.0, np.array([40.0, 0.0, -5.0]))
     last = states[-1].p_b_in_w_m
@@ -82,13 +82,13 @@ def test_wind_drifts_the_nose_and_not_the_track() -> None:
     assert math.sin(states[-1].yaw_rad) == pytest.approx(-6.0 / 22.0, abs=0.03)
 
 
-def test_a_plane_takes_off_and_lands_where_it_should() -> None:
+def test_a_plane_takes_off_and_lands_at_its_points() -> None:
     flown = course(4, 4000.0, Box(-900.0, -600.0, 900.0, 600.0), PLACE, agl_m=100.0, from_ground=True)
     plane = Plane(flown, PLACE, flat, seed=4)
     states = fly(plane, plane.state, 320.0)
     assert plane.finished
     assert max(s.agl_m for s in states) == pytest.approx(100.0, abs=12.0)
-    assert states[300].airspeed_mps < 6.0 and states[300].agl_m == 0.0  # sensors run while it stands
+    assert states[300].airspeed_mps < 6.0 and states[300].agl_m == 0.0  # stands for the sensor calibration
     flying = [i for i, s in enumerate(states) if s.agl_m > 1.0]
     touch = states[flying[-1]].p_b_in_w_m[:2]
     assert math.dist(touch, PLACE.to_local(flown.items[-1].lat_deg, flown.items[-1].lon_deg)) < 30.0
@@ -121,7 +121,7 @@ def test_a_copter_takes_off_waits_circles_and_lands_on_the_point() -> None:
 
 
 @pytest.mark.parametrize("vehicle", [Plane, Copter])
-def test_every_gust_lets_it_take_off(vehicle: type[Plane] | type[Copter]) -> None:
+def test_a_vehicle_takes_off_in_any_gust(vehicle: type[Plane] | type[Copter]) -> None:
     flown = mission(Item(Do.TAKE_OFF, height_m=40.0), at(Do.WAYPOINT, 900.0, -50.0, 40.0))
     for seed in range(8):
         made = vehicle(flown, PLACE, hills, wind=Wind(5.0, 6.0), seed=seed)
@@ -129,10 +129,11 @@ def test_every_gust_lets_it_take_off(vehicle: type[Plane] | type[Copter]) -> Non
 
 
 @pytest.mark.parametrize("vehicle", [Plane, Copter])
-def test_who_meets_the_ground_has_crashed(vehicle: type[Plane] | type[Copter]) -> None:
-    """A hill, and a height that counts from the sea."""
+def test_a_vehicle_that_hits_the_ground_has_crashed(vehicle: type[Plane] | type[Copter]) -> None:
+    """A hill, and a height above sea level."""
     flown = mission(
-        at(Do.WAYPOINT, *HOME, 430.0, above=Above.SEA), at(Do.WAYPOINT, 100.0, 900.0, 430.0, above=Above.SEA)
+        at(Do.WAYPOINT, *HOME, 430.0, altitude_frame=AltitudeFrame.SEA),
+        at(Do.WAYPOINT, 100.0, 900.0, 430.0, altitude_frame=AltitudeFrame.SEA),
     )
     made = vehicle(flown, PLACE, lambda e_m, n_m: 400.0 + max(0.0, 60.0 - abs(n_m - 300.0) / 2), wind=CALM)
     states = fly(made, made.state, 60.0)
@@ -140,7 +141,7 @@ def test_who_meets_the_ground_has_crashed(vehicle: type[Plane] | type[Copter]) -
     assert 150.0 < states[-1].p_b_in_w_m[1] < 450.0
 
 
-def test_a_copter_looks_where_it_goes() -> None:
+def test_a_copter_turns_its_yaw_to_the_course() -> None:
     copter = Copter(CORNERS, PLACE, flat, wind=CALM)
     states = fly(copter, copter.state, 100.0)
     v = states[-1].velocity_enu_mps
@@ -149,14 +150,14 @@ def test_a_copter_looks_where_it_goes() -> None:
 
 
 @pytest.mark.parametrize(("vehicle", "speed"), [(Plane, 18.0), (Copter, 6.0)])
-def test_a_change_of_speed_is_obeyed(vehicle: type[Plane] | type[Copter], speed: float) -> None:
+def test_a_speed_change_item_is_executed(vehicle: type[Plane] | type[Copter], speed: float) -> None:
     flown = mission(Item(Do.SPEED, amount=speed), *LEG.items)
     made = vehicle(flown, PLACE, flat, wind=CALM)
     assert fly(made, made.state, 30.0)[-1].airspeed_mps == pytest.approx(speed, abs=0.5)
 
 
 @pytest.mark.parametrize("vehicle", [Plane, Copter])
-def test_loiter_time_ends_and_a_loiter_for_ever_counts_as_finished(vehicle: type[Plane] | type[Copter]) -> None:
+def test_a_timed_loiter_ends_and_an_unlimited_one_counts_as_finished(vehicle: type[Plane] | type[Copter]) -> None:
     flown = mission(at(Do.WAYPOINT, *HOME), at(Do.LOITER_TIME, 100.0, 250.0, amount=20.0), at(Do.LOITER, 100.0, 600.0))
     made = vehicle(flown, PLACE, flat, wind=CALM)
     states = fly(made, made.state, 36.0)

@@ -1,15 +1,15 @@
-"""What gyroscope and accelerometer show belongs to the motion: a strapdown of its own comes back to the trajectory."""
+"""Rates and forces are consistent with the motion: an independent strapdown integration gives the trajectory."""
 
 import cv2
 import numpy as np
 import pytest
 
-from flown import HOME, PLACE, STEP_S, at, fly, hills, mission, positions
 from terrafix.core.geodesy import rot_w_b
 from terrafix_tools.mission.mission import Do, Item, Mission
 from terrafix_tools.sim.interfaces import State
 from terrafix_tools.sim.vehicle.copter import Copter
 from terrafix_tools.sim.vehicle.plane import Plane
+from vehicle_missions import HOME, PLACE, STEP_S, at, fly, hills, mission, positions
 
 GRAVITY_ENU_MPS2 = np.array([0.0, 0.0, -9.80665])
 SECONDS = 60.0
@@ -42,10 +42,10 @@ def strapdown(states: list[State]) -> np.ndarray:
 
 @pytest.mark.parametrize("vehicle", [Plane, Copter])
 @pytest.mark.parametrize("flown", [IN_THE_AIR, FROM_THE_GROUND])
-def test_a_strapdown_comes_back_to_the_trajectory(vehicle: type[Plane] | type[Copter], flown: Mission) -> None:
+def test_a_strapdown_integration_reproduces_the_trajectory(vehicle: type[Plane] | type[Copter], flown: Mission) -> None:
     made = vehicle(flown, PLACE, hills, seed=3)
     states = fly(made, made.state, SECONDS)
-    assert np.ptp(positions(states)[:, 0]) > 100.0  # it did fly
+    assert np.ptp(positions(states)[:, 0]) > 100.0  # the vehicle has moved
     error_m = np.linalg.norm(strapdown(states) - positions(states), axis=1)
     assert error_m.max() < 0.05
 
@@ -65,14 +65,14 @@ def test_forces_and_rates_are_those_of_a_small_aircraft(vehicle: type[Plane] | t
     states = fly(made, made.state, SECONDS)
     force = np.array([s.force_b_mps2 for s in states])
     rates = np.array([s.rates_b_radps for s in states])
-    assert np.allclose(force[1:100], [0.0, 0.0, 9.80665 * -1.0], atol=1e-9)  # it stands
+    assert np.allclose(force[1:100], [0.0, 0.0, 9.80665 * -1.0], atol=1e-9)  # standing
     assert np.allclose(rates[:100], 0.0)
     assert np.linalg.norm(force, axis=1).max() < 2.5 * 9.81
     assert np.abs(rates).max() < 4.0
 
 
 @pytest.mark.parametrize("vehicle", [Plane, Copter])
-def test_the_same_seed_flies_the_same_and_another_does_not(vehicle: type[Plane] | type[Copter]) -> None:
+def test_the_flight_is_a_function_of_the_seed(vehicle: type[Plane] | type[Copter]) -> None:
     tracks = []
     for seed in (1, 1, 2):
         made = vehicle(IN_THE_AIR, PLACE, hills, seed=seed)

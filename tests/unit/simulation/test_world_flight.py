@@ -1,4 +1,4 @@
-"""The made flight: where it flies, the folder that it leaves, and what the command refuses."""
+"""Generated flights: course, output folder, and rejected options."""
 
 import contextlib
 import csv
@@ -28,7 +28,7 @@ from terrafix_tools.sim.flights.folder import (
     plan_flight,
     write_flight,
 )
-from terrafix_tools.sim.flights.make import Wanted, make
+from terrafix_tools.sim.flights.make import FlightOptions, make
 from terrafix_tools.sim.flights.scene import Scene, scene_of_image, scene_of_place, scene_of_world
 from terrafix_tools.sim.world import place as world
 
@@ -63,11 +63,11 @@ def image(tmp_path: Path) -> Path:
     return path
 
 
-def test_it_flies_kilometres_inside_the_world(place: world.World, flight: Flight) -> None:
+def test_a_generated_flight_covers_kilometres_inside_the_world(place: world.World, flight: Flight) -> None:
     assert 1700.0 < flight.path.length_m(DURATION_S) < 2500.0
     box = scene_of_world(place, GREY).box.shrunk(150.0)
     for t_s in np.arange(0.0, DURATION_S, 1.0):
-        assert box.holds(*flight.path.state(float(t_s)).p_b_in_w_m[:2])
+        assert box.contains(*flight.path.state(float(t_s)).p_b_in_w_m[:2])
 
 
 def test_the_scene_is_as_large_as_its_image(place: world.World, image: Path) -> None:
@@ -80,7 +80,7 @@ def test_the_scene_is_as_large_as_its_image(place: world.World, image: Path) -> 
     assert scene.height()(10.0, 20.0) == 0.0
 
 
-def test_between_two_steps_the_state_goes_straight(flight: Flight) -> None:
+def test_the_state_is_interpolated_linearly_between_steps(flight: Flight) -> None:
     a, b = flight.path.states[700], flight.path.states[701]
     middle = flight.path.state((a.t_s + b.t_s) / 2)
     assert middle.p_b_in_w_m == pytest.approx((a.p_b_in_w_m + b.p_b_in_w_m) / 2)
@@ -88,67 +88,67 @@ def test_between_two_steps_the_state_goes_straight(flight: Flight) -> None:
     assert flight.path.state(1e6).t_s == flight.path.states[-1].t_s
 
 
-def test_the_start_is_off_by_what_it_claims_at_most(flight: Flight) -> None:
+def test_the_error_of_the_start_is_within_its_stated_sigma(flight: Flight) -> None:
     start = flight.frame.to_local(*flight.start_wgs84)
     assert 0.1 < math.dist(start, flight.path.states[0].p_b_in_w_m[:2]) < 75.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("telemetry", [True, False])
-def test_the_folder_is_complete_and_agrees_with_the_truth(small: Scene, telemetry: bool, tmp_path: Path) -> None:
+def test_the_flight_folder_is_complete_and_matches_the_truth(small: Scene, telemetry: bool, tmp_path: Path) -> None:
     short = flight_over(small, seed=2, duration_s=2.0)
     seen: list[tuple[int, int]] = []
     write_flight(tmp_path, short, "../map.gpkg", seed=2, telemetry=telemetry, progress=lambda *step: seen.append(step))
     count = round(2.0 * FRAME_HZ)
     assert seen[-1] == (count, count)
     with (tmp_path / "frames.csv").open() as file:
-        said = list(csv.DictReader(file))
+        frame_rows = list(csv.DictReader(file))
     with (tmp_path / "truth.csv").open() as file:
         truth = list(csv.DictReader(file))
-    assert [row["file"] for row in said] == [row["file"] for row in truth]
-    assert all((tmp_path / "frames" / row["file"]).is_file() for row in said)
+    assert [row["file"] for row in frame_rows] == [row["file"] for row in truth]
+    assert all((tmp_path / "frames" / row["file"]).is_file() for row in frame_rows)
     with contextlib.closing(open_source(str(tmp_path))) as source:
         shots = list(source.shots())
     assert len(shots) == count and not any(shot.frame.error for shot in shots)
     assert bool(shots[-1].states) == telemetry
     assert tomllib.loads((tmp_path / "flight.toml").read_text())["map"] == "../map.gpkg"
-    state = short.path.state(float(said[2]["t_s"]))
+    state = short.path.state(float(frame_rows[2]["t_s"]))
     e_m, n_m = short.frame.to_local(float(truth[2]["lat_deg"]), float(truth[2]["lon_deg"]))
     assert (e_m, n_m) == pytest.approx(tuple(state.p_b_in_w_m[:2]), abs=0.02)
 
 
-def test_the_log_errs_as_much_as_flight_toml_says(flight: Flight, tmp_path: Path) -> None:
+def test_the_errors_of_the_log_match_flight_toml(flight: Flight, tmp_path: Path) -> None:
     flight.telemetry.write(tmp_path / "telemetry.tlog")
     yaw, roll, height = [], [], []
-    for said in read_tlog(tmp_path / "telemetry.tlog"):
-        truth = flight.path.state(said.t_ns / 1e9)
-        if said.yaw_rad is not None and said.roll_rad is not None:
-            yaw.append(math.degrees(math.remainder(said.yaw_rad - truth.yaw_rad, math.tau)))
-            roll.append(math.degrees(said.roll_rad - truth.roll_rad))
-        elif said.agl_m is not None:
-            height.append(said.agl_m - (float(truth.p_b_in_w_m[2]) - flight.ground_amsl_m))
+    for reading in read_tlog(tmp_path / "telemetry.tlog"):
+        truth = flight.path.state(reading.t_ns / 1e9)
+        if reading.yaw_rad is not None and reading.roll_rad is not None:
+            yaw.append(math.degrees(math.remainder(reading.yaw_rad - truth.yaw_rad, math.tau)))
+            roll.append(math.degrees(reading.roll_rad - truth.roll_rad))
+        elif reading.agl_m is not None:
+            height.append(reading.agl_m - (float(truth.p_b_in_w_m[2]) - flight.ground_amsl_m))
     assert len(yaw) >= 50 * DURATION_S and len(height) >= 10 * DURATION_S
     assert 0.2 < np.abs(yaw).max() < 12.0
     assert 0.05 < np.std(roll) < 1.0 and np.abs(roll).max() < 3.0
     assert np.abs(height).max() < 9.0
 
 
-def test_the_same_seed_is_the_same_flight(place: world.World) -> None:
+def test_the_same_seed_gives_the_same_flight(place: world.World) -> None:
     scene = scene_of_world(place, GREY)
     ends = [flight_over(scene, Kind.COPTER, seed=seed, duration_s=5.0).path.states[-1].p_b_in_w_m for seed in (5, 5, 6)]
     assert np.array_equal(ends[0], ends[1]) and not np.allclose(ends[0], ends[2])
 
 
-def test_without_a_duration_it_flies_until_the_mission_is_done(small: Scene) -> None:
+def test_without_a_duration_the_flight_ends_with_the_mission(small: Scene) -> None:
     mission = mission_over(small, Kind.PLANE, seed=1, length_m=2500.0, agl_m=120.0)
     done = flight_over(small, seed=1, mission=mission)
     assert done.path.length_m() == pytest.approx(2500.0, rel=0.12)
     assert done.duration_s == pytest.approx(2500.0 / 22.0, rel=0.2)
 
 
-def test_the_command_makes_a_folder_that_opens(image: Path, tmp_path: Path) -> None:
+def test_the_command_makes_a_readable_flight_folder(image: Path, tmp_path: Path) -> None:
     """Over an image, from a mission file, with a jammed receiver."""
-    make(tmp_path / "a", Wanted(image=image, vehicle=Kind.COPTER, agl_m=60.0, length_km=0.5, duration_s=1.0))
+    make(tmp_path / "a", FlightOptions(image=image, vehicle=Kind.COPTER, agl_m=60.0, length_km=0.5, duration_s=1.0))
     out = tmp_path / "b"
     arguments = ["sim", "make", "--out", str(out), "--image", str(image), "--vehicle", "copter", "--quiet"]
     arguments += ["--mission", str(tmp_path / "a" / "mission.waypoints"), "--duration", "3", "--jam-after", "1"]
@@ -174,9 +174,9 @@ def test_the_command_generates_a_place_and_its_map(tmp_path: Path) -> None:
     assert (tmp_path / "a" / "map.gpkg").stat().st_size > 50_000
 
 
-def test_a_place_made_where_it_is_looked_at_is_the_same_place() -> None:
+def test_a_place_rendered_on_demand_equals_the_whole_place() -> None:
     place = world.generate(3, width_m=600.0, height_m=600.0)
-    whole, made = scene_of_world(place, place.look("autumn")), scene_of_place(place, "autumn")
+    whole, made = scene_of_world(place, place.render("autumn")), scene_of_place(place, "autumn")
     assert made.box == whole.box
     assert made.height()(50.0, -80.0) == whole.height()(50.0, -80.0)
     down = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -186,7 +186,7 @@ def test_a_place_made_where_it_is_looked_at_is_the_same_place() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "kind", "said"),
+    ("changes", "kind", "reason"),
     [
         ({"size_km": 50.0}, UsageError, "100 km2"),
         ({"size_km": 2.0, "image": Path("a.tif")}, UsageError, "--size-km"),
@@ -196,38 +196,38 @@ def test_a_place_made_where_it_is_looked_at_is_the_same_place() -> None:
         ({"agl_m": 5.0}, UsageError, "--agl 5"),
         ({"jam_after_s": -1.0}, UsageError, "--jam-after -1"),
         ({"dem": Path("dem.tif")}, UsageError, "belong to --image"),
-        ({"mission": Path("m.plan"), "length_km": 2.0}, UsageError, "leave --length-km and"),
+        ({"mission": Path("m.plan"), "length_km": 2.0}, UsageError, "omit --length-km and"),
         ({"mission": Path("m.plan")}, SourceError, "no such mission file"),
         ({"events": Path("e.toml")}, SourceError, "--events"),
     ],
 )
-def test_what_cannot_be_made_is_said_before_anything_is_written(
-    changes: dict[str, object], kind: type[TerrafixError], said: str, tmp_path: Path
+def test_invalid_options_are_rejected_before_anything_is_written(
+    changes: dict[str, object], kind: type[TerrafixError], reason: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(kind, match=said):
-        make(tmp_path / "out", Wanted(**changes))  # type: ignore[arg-type]
+    with pytest.raises(kind, match=reason):
+        make(tmp_path / "out", FlightOptions(**changes))  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
 
 
-def test_a_mission_outside_the_image_or_no_room_in_it(image: Path, tmp_path: Path) -> None:
+def test_a_mission_outside_the_image_or_without_room_is_an_error(image: Path, tmp_path: Path) -> None:
     (tmp_path / "m.waypoints").write_text(
         "QGC WPL 110\n0 1 0 16 0 0 0 0 47.85 15.0 0 1\n1 0 3 16 0 0 0 0 47.95 15.0 100 1\n"
     )
     with pytest.raises(SourceError, match="outside the world"):
-        make(tmp_path / "out", Wanted(image=image, mission=tmp_path / "m.waypoints"))
+        make(tmp_path / "out", FlightOptions(image=image, mission=tmp_path / "m.waypoints"))
     (tmp_path / "m.waypoints").write_text(
         "QGC WPL 110\n0 1 0 16 0 0 0 0 47.850 15.007 0 1\n1 0 0 16 0 0 0 0 47.850 15.007 -50 1\n"
     )
     with pytest.raises(SourceError, match="50 m in the ground"):
-        make(tmp_path / "out", Wanted(image=image, mission=tmp_path / "m.waypoints"))
+        make(tmp_path / "out", FlightOptions(image=image, mission=tmp_path / "m.waypoints"))
     with pytest.raises(UsageError, match="larger image"):
-        make(tmp_path / "out", Wanted(image=image, agl_m=300.0))
+        make(tmp_path / "out", FlightOptions(image=image, agl_m=300.0))
     assert not (tmp_path / "out").exists()
 
 
 def test_an_unwritable_folder_is_one_clear_line(small: Scene, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="choose another --out"):
-        make(tmp_path / "file", Wanted())
+        make(tmp_path / "file", FlightOptions())
     with pytest.raises(OutputError, match="cannot be written"):
         write_flight(tmp_path / "file", flight_over(small, seed=1, duration_s=1.0), "map.gpkg", seed=2)

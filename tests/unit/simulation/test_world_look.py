@@ -1,4 +1,4 @@
-"""The generated place: the seed decides everything, its pieces fit, and dates share structure but not brightness."""
+"""The generated place: a function of the seed, seamless, and dates that share structure but not brightness."""
 
 import subprocess
 import sys
@@ -27,47 +27,47 @@ def place() -> world.World:
 
 @pytest.fixture(scope="module")
 def looks(place: world.World) -> tuple[np.ndarray, np.ndarray]:
-    return place.look("summer"), place.look("autumn")
+    return place.render("summer"), place.render("autumn")
 
 
 def test_the_same_seed_gives_the_same_place(place: world.World, looks: tuple[np.ndarray, np.ndarray]) -> None:
     again = world.generate(5, **SMALL)
-    assert np.array_equal(again.look("summer"), looks[0])
+    assert np.array_equal(again.render("summer"), looks[0])
     assert np.array_equal(again.dem_amsl_m, place.dem_amsl_m)
 
 
 def test_another_seed_gives_another_place(looks: tuple[np.ndarray, np.ndarray]) -> None:
-    other = world.generate(6, **SMALL).look("summer")
+    other = world.generate(6, **SMALL).render("summer")
     assert float(np.mean(other != looks[0])) > 0.8
 
 
-def test_there_is_a_relief_of_tens_of_metres() -> None:
+def test_the_relief_has_tens_of_metres() -> None:
     relief = np.ptp(world.generate(5).dem_amsl_m)
     assert 25.0 < relief < 120.0
 
 
 def nearly_equal(a: np.ndarray, b: np.ndarray) -> bool:
-    """But for the rounding of sub-pixel edges, which depends on where a canvas begins."""
+    """Equal except for the rounding of sub-pixel edges, which depends on the origin of the canvas."""
     off = np.abs(a.astype(int) - b)
     return bool(off.max() <= 4 and np.mean(off > 0) < 1e-3)
 
 
-def test_pieces_fit_without_a_seam_whatever_their_size(
-    place: world.World, looks: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_pieces_of_any_size_fit_without_a_seam(place: world.World, looks: tuple[np.ndarray, np.ndarray]) -> None:
     painter = Painter(place.layout, SEASONS["summer"], place.gsd_m)
     for column, row, width, height in ((0, 0, 300, 200), (777, 431, 512, 333), (1300, 900, 500, 500)):
         part = painter.paint(column, row, width, height)
         assert nearly_equal(part, looks[0][row : row + height, column : column + width])
 
 
-def test_a_larger_place_begins_with_the_smaller_one(looks: tuple[np.ndarray, np.ndarray]) -> None:
+def test_a_larger_place_contains_the_smaller_one(looks: tuple[np.ndarray, np.ndarray]) -> None:
     larger = world.generate(5, width_m=1500.0, height_m=800.0)
     part = Painter(larger.layout, SEASONS["summer"], larger.gsd_m).paint(0, 0, 1800, 1400)
-    assert float(np.mean(part == looks[0])) > 0.999  # the light at the very edge of the elevation model differs
+    assert float(np.mean(part == looks[0])) > 0.999  # the illumination at the edge of the elevation model differs
 
 
-def test_the_ground_of_a_flight_is_the_look(place: world.World, looks: tuple[np.ndarray, np.ndarray]) -> None:
+def test_the_ground_of_a_flight_equals_the_rendered_image(
+    place: world.World, looks: tuple[np.ndarray, np.ndarray]
+) -> None:
     ground = place.ground("summer", LocalFrame(*place.wgs84(450.0, 350.0)))
     assert nearly_equal(ground.picture.window(0, 900, 950, 700, 400), looks[0][950:1350, 900:1600])
     halved = cv2.resize(looks[0][:1400, :1800], (900, 700), interpolation=cv2.INTER_AREA)
@@ -77,15 +77,15 @@ def test_the_ground_of_a_flight_is_the_look(place: world.World, looks: tuple[np.
 
 
 @pytest.mark.slow
-def test_every_season_is_another_picture_of_one_place(place: world.World) -> None:
-    pictures = {name: place.look(name).astype(float).mean(axis=2).ravel() for name in SEASONS}
+def test_every_season_is_a_different_image_of_one_place(place: world.World) -> None:
+    pictures = {name: place.render(name).astype(float).mean(axis=2).ravel() for name in SEASONS}
     assert len(pictures) >= 3
     for first in pictures:
         for second in pictures:
             assert first == second or np.corrcoef(pictures[first], pictures[second])[0, 1] < 0.75
 
 
-def test_noise_never_repeats_and_has_no_grid() -> None:
+def test_noise_is_not_periodic_and_has_no_grid() -> None:
     far = white(9, 4096, -2048, 256, 256)
     for dx, dy in ((1024, 0), (0, 1024), (65536, 0), (1024, 1024)):
         assert abs(float(np.corrcoef(far.ravel(), white(9, 4096 + dx, -2048 + dy, 256, 256).ravel())[0, 1])) < 0.02
@@ -119,26 +119,26 @@ camera = m.Camera(width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5)
 renderer = Renderer(ground, camera)
 for index, at_m in enumerate(np.arange(-4800.0, 4800.0, 200.0)):
     renderer.frame(np.array([at_m, 0.7 * at_m, 520.0]), np.diag([1.0, -1.0, -1.0]), index)
-# Not ru_maxrss: it remembers the process that started this one.
+# Not ru_maxrss, which includes the parent process.
 print(int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) // 1024)
 """
 
 
 @pytest.mark.slow
-def test_a_hundred_square_kilometres_do_not_lie_in_memory() -> None:
-    """The picture alone would be 1200 MB; the flight crosses all of it."""
+def test_a_hundred_square_kilometres_are_not_held_in_memory() -> None:
+    """The image alone would be 1200 MB; the flight crosses all of it."""
     done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True, check=True, timeout=900)
     assert int(done.stdout) < 600
 
 
-def test_a_place_of_no_size_is_one_clear_line() -> None:
+def test_a_place_of_invalid_size_is_one_clear_line() -> None:
     for width_m, height_m in ((0.0, 700.0), (float("nan"), 700.0), (20_000.0, 20_000.0)):
         with pytest.raises(UsageError, match="choose at least 100 m"):
             world.generate(1, width_m=width_m, height_m=height_m)
 
 
 def oriented(grey: np.ndarray) -> list[np.ndarray]:
-    """Edge strength in four directions, blind to the sign of the contrast."""
+    """Edge strength in four directions, independent of the sign of the contrast."""
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.5)
     gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
     strength, angle = np.hypot(gx, gy), np.arctan2(gy, gx)
@@ -147,7 +147,7 @@ def oriented(grey: np.ndarray) -> list[np.ndarray]:
 
 
 def found(surface: np.ndarray, margin: int) -> bool:
-    """The best place is within 5 m of the true one."""
+    """True if the maximum is within 5 m of the true position."""
     x, y = cv2.minMaxLoc(surface)[3]
     return bool(np.hypot(x - margin, y - margin) <= 10)
 
@@ -171,7 +171,7 @@ def test_two_dates_agree_in_structure_but_not_in_brightness(looks: tuple[np.ndar
     assert by_pixels < 0.7 * tried
 
 
-def test_the_rasters_say_where_they_are(
+def test_the_rasters_are_georeferenced(
     place: world.World, looks: tuple[np.ndarray, np.ndarray], tmp_path: Path
 ) -> None:
     world.write_image(tmp_path / "map.tif", place, looks[0])
@@ -195,7 +195,7 @@ def test_an_unwritable_place_is_one_clear_line(place: world.World, tmp_path: Pat
 def test_a_place_is_written_piece_by_piece(
     place: world.World, looks: tuple[np.ndarray, np.ndarray], tmp_path: Path
 ) -> None:
-    place.write_look(tmp_path / "map.tif", "summer")
+    place.write_rendering(tmp_path / "map.tif", "summer")
     world.write_image(tmp_path / "whole.tif", place, looks[0])
     with rasterio.open(tmp_path / "map.tif") as pieces, rasterio.open(tmp_path / "whole.tif") as whole:
         assert pieces.transform == whole.transform

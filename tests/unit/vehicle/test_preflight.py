@@ -1,4 +1,4 @@
-"""Preflight: every rule, every mistake of a user, writing with the old values kept, and the presets that pass it."""
+"""Preflight: every rule, usage errors, writing with saved previous values, and the presets that pass it."""
 
 import json
 import re
@@ -28,17 +28,17 @@ from terrafix_tools.mission.mission import Do, Item, Mission
 from terrafix_tools.preflight import autopilot as conversation
 from terrafix_tools.preflight import computer, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
-from terrafix_tools.preflight.judge import changes_of, judge, names_of
+from terrafix_tools.preflight.judge import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.lines import Line, Status, number
 from terrafix_tools.preflight.rules import Context
-from terrafix_tools.preflight.run import _of_vehicle, preflight
+from terrafix_tools.preflight.run import _vehicle_lines, preflight
 from terrafix_tools.sim.autopilot.parameters import FIRMWARE
 
 ROOT = Path(__file__).resolve().parents[3]
 VEHICLES = ROOT / "config" / "vehicles"
 PAGE = ROOT / "docs" / "autopilot.md"
-# ArduPilot 4.6 as it comes (read from its firmware in software in the loop)
-AS_IT_COMES = FIRMWARE | {
+# Defaults of ArduPilot 4.6 (read from its firmware in software in the loop)
+DEFAULTS = FIRMWARE | {
     "AHRS_EKF_TYPE": 3,
     "EK3_ENABLE": 1,
     "EK3_POS_I_GATE": 500,
@@ -56,9 +56,9 @@ AS_IT_COMES = FIRMWARE | {
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The simulated autopilot answers at once; silence need not be waited for as long as on a radio."""
+    """Short time-outs: the simulated autopilot replies at once."""
     for name, value in {
-        "LOOK_S": 0.0,
+        "POLL_S": 0.0,
         "QUIET_S": 0.02,
         "ANSWER_S": 0.1,
         "OTHERS_S": 0.05,
@@ -77,35 +77,35 @@ def context(*, plane: bool = True, delay_ms: int = 5, **link: Any) -> Context:
     return Context(LinkSection(**link), plane, 1, delay_ms)
 
 
-def judged(values: dict[str, float], at: Context) -> dict[str, Line]:
-    return {line.check: line for line in judge(values, at)}
+def lines_by_check(values: dict[str, float], at: Context) -> dict[str, Line]:
+    return {line.check: line for line in check_parameters(values, at)}
 
 
 # --- rules and presets ---
 
 
 @pytest.mark.parametrize("name", ["plane", "copter"])
-def test_the_presets_leave_nothing_to_say(name: str) -> None:
-    lines = judged(AS_IT_COMES | preset(name), context(plane=name == "plane"))
+def test_the_presets_pass_all_rules(name: str) -> None:
+    lines = lines_by_check(DEFAULTS | preset(name), context(plane=name == "plane"))
     assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
 
 
-def test_the_preset_beside_a_receiver_leaves_nothing_to_say() -> None:
-    values = AS_IT_COMES | preset("second-gps") | {"EK3_GPS_CHECK": 23}
-    lines = judged(values, context(gps_id=1))
+def test_the_preset_with_a_real_receiver_passes_all_rules() -> None:
+    values = DEFAULTS | preset("second-gps") | {"EK3_GPS_CHECK": 23}
+    lines = lines_by_check(values, context(gps_id=1))
     assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
 
 
 @pytest.mark.parametrize(("plane", "name"), [(True, "plane"), (False, "copter")])
-def test_what_it_would_set_on_a_new_autopilot_is_the_preset(plane: bool, name: str) -> None:
-    changes = {c.name: c.new for c in changes_of(judge(AS_IT_COMES, context(plane=plane)))}
+def test_the_proposed_changes_on_a_new_autopilot_are_the_preset(plane: bool, name: str) -> None:
+    changes = {c.name: c.new for c in proposed_changes(check_parameters(DEFAULTS, context(plane=plane)))}
     assert changes.items() <= preset(name).items()
-    after = AS_IT_COMES | changes
-    assert all(line.status is Status.OK for line in judge(after, context(plane=plane)))
+    after = DEFAULTS | changes
+    assert all(line.status is Status.OK for line in check_parameters(after, context(plane=plane)))
 
 
 @pytest.mark.parametrize("name", ["plane", "copter", "second-gps"])
-def test_the_page_says_why_of_each_value_of_a_preset(name: str) -> None:
+def test_the_page_gives_the_reason_of_each_value_of_a_preset(name: str) -> None:
     rows = {
         parameter: [cell.strip() for cell in line.split("|")[1:-1]]
         for line in PAGE.read_text().splitlines()
@@ -120,7 +120,7 @@ def test_the_page_says_why_of_each_value_of_a_preset(name: str) -> None:
         assert len(rows[parameter][2]) > 10
 
 
-TWO_PORTS = AS_IT_COMES | {"SERIAL2_PROTOCOL": 2}
+TWO_PORTS = DEFAULTS | {"SERIAL2_PROTOCOL": 2}
 
 
 @pytest.mark.parametrize(
@@ -136,26 +136,28 @@ TWO_PORTS = AS_IT_COMES | {"SERIAL2_PROTOCOL": 2}
         ((4, 6), {"SERIAL2_OPTIONS": 1026}, {"ground_devices": ["udpout:10.0.0.2:14550"]}, "ok", "stays off"),
     ],
 )
-def test_it_says_how_to_keep_gps_input_off_the_telemetry(
+def test_the_forwarding_check_explains_how_to_stop_forwarding_of_gps_input(
     firmware: tuple[int, int], changes: dict[str, float], link: dict[str, Any], status: str, says: str
 ) -> None:
-    line = judged(TWO_PORTS | changes, Context(LinkSection(**link), True, 1, 5, firmware))["forwarding"]
+    line = lines_by_check(TWO_PORTS | changes, Context(LinkSection(**link), True, 1, 5, firmware))["forwarding"]
     assert line.status == status and re.search(says, f"{line.text} -> {line.fix}")
 
 
-def test_of_a_firmware_it_asks_the_parameters_that_it_has() -> None:
-    old, new = (set(names_of(Context(LinkSection(), True, 1, 5, firmware))) for firmware in ((4, 6), (4, 7)))
+def test_only_parameters_of_the_firmware_version_are_requested() -> None:
+    old, new = (set(parameter_names(Context(LinkSection(), True, 1, 5, firmware))) for firmware in ((4, 6), (4, 7)))
     assert "SERIAL2_OPTIONS" in old and not {n for n in old if n.startswith("MAV")}
     assert "MAV2_OPTIONS" in new and "SERIAL2_OPTIONS" not in new
 
 
-def test_which_firmware_flies_is_read_from_its_version(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_firmware_version_comes_from_autopilot_version(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, int]] = []
-    monkeypatch.setattr("terrafix_tools.preflight.run.names_of", lambda at: asked.append(at.firmware) or names_of(at))
+    monkeypatch.setattr(
+        "terrafix_tools.preflight.run.parameter_names", lambda at: asked.append(at.firmware) or parameter_names(at)
+    )
     for version in (4 << 24 | 6 << 16, 4 << 24 | 7 << 16):
         with Autopilot(LinkSection(), GroundAutopilot(TWO_PORTS, version=version)) as autopilot:
             autopilot.connect()
-            list(_of_vehicle(autopilot, Config()))
+            list(_vehicle_lines(autopilot, Config()))
     assert asked == [(4, 6), (4, 7)]
 
 
@@ -177,51 +179,51 @@ def test_which_firmware_flies_is_read_from_its_version(monkeypatch: pytest.Monke
     ],
 )
 def test_each_wrong_value_has_a_reason_and_a_fix(name: str, value: float, status: str, says: str) -> None:
-    line = judged(AS_IT_COMES | preset("plane") | {name: value}, context())[name]
+    line = lines_by_check(DEFAULTS | preset("plane") | {name: value}, context())[name]
     assert line.status == status
     assert says in f"{line.text} {line.fix}"
     assert (line.change is not None) or not line.fix
 
 
 @pytest.mark.parametrize(("value", "text"), [(1048566.0, "1048566"), (0.8999999761581421, "0.9"), (-1.0, "-1")])
-def test_values_are_written_without_loss(value: float, text: str) -> None:
+def test_parameter_values_are_formatted_without_loss(value: float, text: str) -> None:
     assert number(value) == text
 
 
-def test_a_blending_switch_beside_a_receiver_is_told() -> None:
-    values = AS_IT_COMES | preset("second-gps") | {"GPS_AUTO_SWITCH": 2, "ARMING_CHECK": 1}
-    lines = judged(values, context(gps_id=1))
+def test_a_blending_switch_with_a_real_receiver_is_a_warning() -> None:
+    values = DEFAULTS | preset("second-gps") | {"GPS_AUTO_SWITCH": 2, "ARMING_CHECK": 1}
+    lines = lines_by_check(values, context(gps_id=1))
     assert (lines["GPS_AUTO_SWITCH"].status, lines["ARMING_CHECK"].status) == ("warn", "warn")
     assert "GPS_PRIMARY" in lines
-    assert "GPS_AUTO_SWITCH" not in judged(AS_IT_COMES, context())  # alone it does not matter
+    assert "GPS_AUTO_SWITCH" not in lines_by_check(DEFAULTS, context())  # not relevant without another receiver
 
 
-def test_other_outputs_have_other_rules() -> None:
+def test_local_frame_outputs_have_their_own_rules() -> None:
     at = context(outputs=["odometry"])
-    lines = judged(AS_IT_COMES, at)
+    lines = lines_by_check(DEFAULTS, at)
     assert "GPS1_TYPE" not in lines
     assert (lines["VISO_TYPE"].status, lines["source set"].status) == ("fail", "fail")
-    good = AS_IT_COMES | {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6, "AHRS_OPTIONS": 1}
-    assert all(line.status is Status.OK for line in judge(good, at))
-    loop = judged(good | {"EK3_SRC2_YAW": 6}, at)["source set"]
+    good = DEFAULTS | {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6, "AHRS_OPTIONS": 1}
+    assert all(line.status is Status.OK for line in check_parameters(good, at))
+    loop = lines_by_check(good | {"EK3_SRC2_YAW": 6}, at)["source set"]
     assert "the autopilot's own" in loop.text
-    blind = judged(good, context(outputs=["vision_position"]))["source set"]
+    blind = lines_by_check(good, context(outputs=["vision_position"]))["source set"]
     assert "no velocity" in blind.text
 
 
-def test_serial_speed_and_system_id_are_compared() -> None:
+def test_serial_speed_and_system_id_are_checked() -> None:
     at = Context(LinkSection(device="/dev/ttyTHS1", baud=921_600, sysid=1), True, 3, 5)
-    lines = judged(AS_IT_COMES | preset("plane"), at)
+    lines = lines_by_check(DEFAULTS | preset("plane"), at)
     assert "no port speaks MAVLink at 921600 baud (MAVLink: SERIAL1 57)" in lines["serial port"].text
     assert "set link.sysid = 3" in lines["system id"].fix
-    same = judged(AS_IT_COMES | {"SERIAL1_BAUD": 921}, at)
+    same = lines_by_check(DEFAULTS | {"SERIAL1_BAUD": 921}, at)
     assert same["serial port"].status == "ok"
 
 
-def test_a_firmware_without_the_parameter_is_told() -> None:
-    values = {name: value for name, value in AS_IT_COMES.items() if name != "GPS1_TYPE"}
-    assert "no such parameter" in judged(values, context())["GPS1_TYPE"].text
-    assert "GPS1_TYPE" in names_of(context())
+def test_a_missing_parameter_is_reported() -> None:
+    values = {name: value for name, value in DEFAULTS.items() if name != "GPS1_TYPE"}
+    assert "no such parameter" in lines_by_check(values, context())["GPS1_TYPE"].text
+    assert "GPS1_TYPE" in parameter_names(context())
 
 
 @pytest.mark.parametrize(
@@ -233,25 +235,25 @@ def test_a_firmware_without_the_parameter_is_told() -> None:
         ("/dev/x", 9600, 9.0, 50),
     ],
 )
-def test_the_advice_on_the_delay_comes_from_the_line(
+def test_the_recommended_delay_follows_from_the_line(
     device: str, baud: int, trip_ms: float | None, advice: int
 ) -> None:
     assert vehicle.delay_advice_ms(LinkSection(device=device, baud=baud), trip_ms) == advice
 
 
-# --- the conversation ---
+# --- the MAVLink client ---
 
 
-def talk(there: GroundAutopilot, **link: Any) -> Autopilot:
+def connected(there: GroundAutopilot, **link: Any) -> Autopilot:
     return Autopilot(LinkSection(**link), there)
 
 
-def test_parameters_are_read_through_losses() -> None:
-    there = GroundAutopilot(AS_IT_COMES, loses=20)
-    with talk(there) as asked:
+def test_parameters_are_read_despite_packet_loss() -> None:
+    there = GroundAutopilot(DEFAULTS, loses=20)
+    with connected(there) as asked:
         asked.connect(1.0)
-        read = asked.read([*AS_IT_COMES, "NO_SUCH_PARAMETER"])
-    assert read == pytest.approx(AS_IT_COMES)
+        read = asked.read([*DEFAULTS, "NO_SUCH_PARAMETER"])
+    assert read == pytest.approx(DEFAULTS)
     assert (asked.plane, asked.sysid, asked.armed) == (True, 1, False)
 
 
@@ -264,14 +266,14 @@ def test_parameters_are_read_through_losses() -> None:
         (GroundAutopilot({}, firmware=mavlink.MAV_AUTOPILOT_INVALID), {}, "no autopilot on .*, only system 1"),
     ],
 )
-def test_who_is_there_may_be_wrong(there: GroundAutopilot, link: dict[str, Any], says: str) -> None:
-    with talk(there, **link) as asked, pytest.raises(LinkError, match=says) as caught:
+def test_a_wrong_or_ambiguous_autopilot_is_an_error(there: GroundAutopilot, link: dict[str, Any], says: str) -> None:
+    with connected(there, **link) as asked, pytest.raises(LinkError, match=says) as caught:
         asked.connect(0.3)
     assert "\n" not in str(caught.value)
 
 
 class Streaming(GroundAutopilot):
-    """On a clock of its own (s), and sends what is asked for at ``share`` of its rate."""
+    """Has its own clock (s), and sends requested streams at ``share`` of their rate."""
 
     def __init__(self, share: float) -> None:
         super().__init__({})
@@ -282,9 +284,9 @@ class Streaming(GroundAutopilot):
         return self.now_s
 
     def write(self, packet: bytes, to: Address | None = None) -> bool:
-        said = self._ear.decode(bytearray(packet))
-        if said.get_type() == "COMMAND_LONG" and said.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            self._asked[int(said.param1)] = 1e6 / said.param2
+        message = self._parser.decode(bytearray(packet))
+        if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            self._asked[int(message.param1)] = 1e6 / message.param2
             return True
         return super().write(packet)
 
@@ -294,7 +296,7 @@ class Streaming(GroundAutopilot):
             each = rate_hz * self._share
             for _ in range(int(each * self.now_s) - int(each * before_s)):
                 kind = mavlink.mavlink_map[message_id]
-                self._say(kind(*([0] * n if n else 0 for n in kind.array_lengths)))
+                self._send(kind(*([0] * n if n else 0 for n in kind.array_lengths)))
         return super().read()
 
 
@@ -302,7 +304,7 @@ class Streaming(GroundAutopilot):
     ("share", "status", "says"),
     [(1.0, "ok", "attitude 25 Hz, IMU 33 Hz"), (0.5, "warn", "too slow: ATTITUDE 12.")],
 )
-def test_what_the_link_will_ask_for_is_asked_for_and_counted(
+def test_the_streams_of_the_link_are_requested_and_counted(
     share: float, status: str, says: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(conversation, "RATES_S", 6.5)
@@ -313,15 +315,15 @@ def test_what_the_link_will_ask_for_is_asked_for_and_counted(
     assert (line.status, says in line.text) == (status, True), line.text
 
 
-def test_parameters_that_cannot_be_read_are_one_line() -> None:
-    with talk(GroundAutopilot({})) as asked:
+def test_unreadable_parameters_are_one_line() -> None:
+    with connected(GroundAutopilot({})) as asked:
         asked.connect(0.3)
         with pytest.raises(LinkError, match="does not answer requests for parameters"):
             asked.read(["GPS1_TYPE"])
 
 
-def test_a_parameter_that_stays_as_it_was_is_an_error() -> None:
-    with talk(GroundAutopilot(AS_IT_COMES, read_only=("GPS1_TYPE",))) as asked:
+def test_a_parameter_that_keeps_its_value_is_an_error() -> None:
+    with connected(GroundAutopilot(DEFAULTS, read_only=("GPS1_TYPE",))) as asked:
         asked.connect(0.3)
         with pytest.raises(LinkError, match="GPS1_TYPE could not be set to 14"):
             asked.write("GPS1_TYPE", 14)
@@ -338,43 +340,43 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[GroundAutopilot], None]:
     return put
 
 
-def test_write_sets_what_is_wrong_and_keeps_the_old_values(wired: Any, tmp_path: Path, capsys: Any) -> None:
-    there = GroundAutopilot(AS_IT_COMES)
+def test_write_sets_wrong_parameters_and_saves_the_previous_values(wired: Any, tmp_path: Path, capsys: Any) -> None:
+    there = GroundAutopilot(DEFAULTS)
     wired(there)
     ready = preflight([], out=tmp_path, write=True, yes=True, as_json=True, with_computer=False)
-    said = json.loads(capsys.readouterr().out)
-    assert ready and said["ready"]
+    output = json.loads(capsys.readouterr().out)
+    assert ready and output["ready"]
     assert {name: there.values[name] for name in preset("plane")} == pytest.approx(preset("plane"))
-    kept = dict(line.split(",") for line in Path(said["saved_to"]).read_text().splitlines())
-    assert {name: float(value) for name, value in kept.items()} == {name: AS_IT_COMES[name] for name in kept}
-    assert set(kept) == {change["name"] for change in said["written"]} == set(there.was_set)
+    saved = dict(line.split(",") for line in Path(output["saved_to"]).read_text().splitlines())
+    assert {name: float(value) for name, value in saved.items()} == {name: DEFAULTS[name] for name in saved}
+    assert set(saved) == {change["name"] for change in output["written"]} == set(there.parameters_set)
 
 
-def test_without_consent_nothing_is_set(wired: Any, tmp_path: Path) -> None:
-    there = GroundAutopilot(AS_IT_COMES)
+def test_without_confirmation_nothing_is_set(wired: Any, tmp_path: Path) -> None:
+    there = GroundAutopilot(DEFAULTS)
     wired(there)
     arguments = ["preflight", "--write", "--autopilot-only", "--out", str(tmp_path)]
     done = CliRunner().invoke(app, arguments, input="n\n")
     assert done.exit_code == 1
     assert "GPS1_TYPE        1 -> 14" in done.output
-    assert there.was_set == []
+    assert there.parameters_set == []
     assert list(tmp_path.iterdir()) == []
 
 
-def test_json_cannot_ask(tmp_path: Path) -> None:
+def test_json_with_write_requires_yes(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="add --yes"):
         preflight([], out=tmp_path, write=True, as_json=True)
 
 
 def test_nothing_is_set_on_an_armed_vehicle(wired: Any, tmp_path: Path) -> None:
-    there = GroundAutopilot(AS_IT_COMES, armed=True)
+    there = GroundAutopilot(DEFAULTS, armed=True)
     wired(there)
     with pytest.raises(UsageError, match="disarm it"):
         preflight([], out=tmp_path, write=True, yes=True, with_computer=False)
-    assert there.was_set == []
+    assert there.parameters_set == []
 
 
-def test_nobody_there_is_a_line_and_the_rest_is_checked(tmp_path: Path) -> None:
+def test_a_missing_autopilot_is_a_failure_and_the_other_checks_run(tmp_path: Path) -> None:
     arguments = ["preflight", "--json", "--link", "udpout:127.0.0.1:9", "--out", str(tmp_path)]
     done = CliRunner().invoke(app, arguments)
     lines = {line["check"]: line for line in json.loads(done.output)["lines"]}
@@ -385,25 +387,25 @@ def test_nobody_there_is_a_line_and_the_rest_is_checked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("device", ["udpin:127.0.0.1", "udpin:127.0.0.1:70000", "127.0.0.1:14550", "tcp:127.0.0.1:9"])
-def test_a_device_that_cannot_be_is_said_once_with_what_to_do(device: str, tmp_path: Path) -> None:
+def test_an_invalid_device_is_one_failure_with_a_fix(device: str, tmp_path: Path) -> None:
     arguments = ["preflight", "--json", "--autopilot-only", "--link", device, "--out", str(tmp_path)]
     (line,) = json.loads(CliRunner().invoke(app, arguments).output)["lines"]
     assert device in line["text"]
     assert line["fix"] and line["fix"] not in line["text"]
 
 
-def test_an_old_firmware_fails(wired: Any, tmp_path: Path) -> None:
-    there = GroundAutopilot(AS_IT_COMES | preset("plane"), version=4 << 24 | 5 << 16)
-    with talk(there) as asked:
+def test_an_old_firmware_is_a_failure(wired: Any, tmp_path: Path) -> None:
+    there = GroundAutopilot(DEFAULTS | preset("plane"), version=4 << 24 | 5 << 16)
+    with connected(there) as asked:
         asked.connect(0.3)
-        lines = {line.check: line for line in vehicle.about(asked, LinkSection(), 5.0)}
+        lines = {line.check: line for line in vehicle.check_lines(asked, LinkSection(), 5.0)}
     assert lines["firmware"].status == "fail"
     assert "4.5.0" in lines["firmware"].text
 
 
-def test_a_mission_on_board_becomes_a_file(tmp_path: Path) -> None:
-    there = GroundAutopilot(AS_IT_COMES, mission=((22, 48.0, 11.0, 50.0), (16, 48.01, 11.02, 120.0)))
-    with talk(there) as asked:
+def test_the_mission_on_board_is_saved_as_a_file(tmp_path: Path) -> None:
+    there = GroundAutopilot(DEFAULTS, mission=((22, 48.0, 11.0, 50.0), (16, 48.01, 11.02, 120.0)))
+    with connected(there) as asked:
         asked.connect(0.3)
         assert vehicle.save_mission(asked, tmp_path / "m") is None
     plan = read_mission(tmp_path / "m")
@@ -411,16 +413,16 @@ def test_a_mission_on_board_becomes_a_file(tmp_path: Path) -> None:
     assert plan.items[-1].height_m == 120.0
 
 
-def test_a_mission_on_board_is_checked_against_the_map_whatever_is_in_it(tmp_path: Path, wired: Any) -> None:
+def test_a_mission_on_board_with_any_items_is_checked_against_the_map(tmp_path: Path, wired: Any) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=1.0)
     package = build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
     opened = MapPackage.open(package)
     west, south, east, north = opened.manifest.bounds_wgs84
     opened.close()
     lat, lon = (south + north) / 2, (west + east) / 2
-    on_it = ((189, lat, lon, 60.0), (177, 0.0, 0.0, 0.0), (82, lat + 1e-4, lon, 60.0))  # landing from, jump, spline
+    on_it = ((189, lat, lon, 60.0), (177, 0.0, 0.0, 0.0), (82, lat + 1e-4, lon, 60.0))  # DO_LAND_START, jump, spline
     for items, status in ((on_it, "ok"), ((*on_it, (82, north + 0.01, lon, 60.0)), "fail")):
-        wired(GroundAutopilot(AS_IT_COMES, mission=items, home=(lat, lon)))
+        wired(GroundAutopilot(DEFAULTS, mission=items, home=(lat, lon)))
         arguments = ["preflight", "--link", "udpout:127.0.0.1:9", "--map", str(package), "--json"]
         done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
         lines = {line["check"]: line for line in json.loads(done.output)["lines"]}
@@ -434,30 +436,30 @@ def noise(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 255, (90, 120, 3), np.uint8)
 
 
-def test_what_the_camera_shows() -> None:
+def test_the_camera_check_detects_frozen_blurred_and_dark_images() -> None:
     smooth = np.dstack([np.tile(np.linspace(60, 200, 120, dtype=np.uint8), (90, 1))] * 3)
-    assert computer.picture([noise(i) for i in range(3)]).status == "ok"
-    assert "same picture" in computer.picture([noise(1)] * 3).text
-    assert "blurred" in computer.picture([smooth, smooth + 1, smooth]).text
+    assert computer.check_images([noise(i) for i in range(3)]).status == "ok"
+    assert "same picture" in computer.check_images([noise(1)] * 3).text
+    assert "blurred" in computer.check_images([smooth, smooth + 1, smooth]).text
     black = [np.full((90, 120, 3), i, np.uint8) for i in range(3)]
-    assert "lens cap" in computer.picture(black).fix
-    assert "only 1" in computer.picture([noise(1)]).text
+    assert "lens cap" in computer.check_images(black).fix
+    assert "only 1" in computer.check_images([noise(1)]).text
 
 
-def test_heat_disk_and_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_heat_low_disk_space_and_a_wrong_clock_are_warnings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     zone = tmp_path / "class" / "thermal" / "thermal_zone0"
     zone.mkdir(parents=True)
     (zone / "temp").write_text("83000")
     (zone / "type").write_text("cpu-thermal")
     config = Config(health=HealthSection(sysfs_root=str(tmp_path)), recorder=RecorderSection(budget_mb=10**9))
     monkeypatch.setattr(computer.time, "time_ns", lambda: 0)
-    lines = {line.check: line for line in computer.about(config, None, tmp_path / "out")}
+    lines = {line.check: line for line in computer.check_lines(config, None, tmp_path / "out")}
     assert (lines["temperature"].status, lines["disk"].status, lines["clock"].status) == ("warn", "warn", "warn")
     assert "83 C (cpu-thermal), on the ground already" in lines["temperature"].text
     assert "GPS week" in lines["clock"].text
 
 
-def test_map_start_and_mission_belong_together(tmp_path: Path) -> None:
+def test_start_and_mission_must_lie_on_the_map(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=1.0)
     package = build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
     opened = MapPackage.open(package)
@@ -473,17 +475,17 @@ def test_map_start_and_mission_belong_together(tmp_path: Path) -> None:
         lat, lon = frame.to_wgs84(*start_m)
         chosen = MapSection(path=str(package), require_signature=signed, trusted_keys=[str(tmp_path / "a.pub")])
         config = Config(map=chosen, source=SourceSection(start=f"{lat:.7f},{lon:.7f}"))
-        return {line.check: line for line in computer.about(config, mission, tmp_path)}
+        return {line.check: line for line in computer.check_lines(config, mission, tmp_path)}
 
     good = lines((0.0, 0.0), (-50.0, 0.0), (50.0, 50.0))
     assert [good[check].status for check in ("map", "start", "mission")] == ["ok"] * 3
     config = Config(map=MapSection(path=str(package)))
-    unknown = {line.check: line for line in computer.about(config, tmp_path / "none.plan", tmp_path)}
+    unknown = {line.check: line for line in computer.check_lines(config, tmp_path / "none.plan", tmp_path)}
     assert [unknown[check].status for check in ("map", "start", "mission")] == ["ok", "warn", "fail"]
     assert "no such mission file" in unknown["mission"].text
     assert "autopilot's GNSS" in unknown["start"].text and "whole map" in unknown["start"].text
     config = Config(map=MapSection(path=str(package)), link=LinkSection(gnss_start=False))
-    searched = {line.check: line for line in computer.about(config, tmp_path / "none.plan", tmp_path)}
+    searched = {line.check: line for line in computer.check_lines(config, tmp_path / "none.plan", tmp_path)}
     assert "GNSS" not in searched["start"].text and "whole map" in searched["start"].text
     bad = lines((900.0, 0.0), (0.0, 0.0), (400.0, 0.0))
     assert (bad["start"].status, bad["mission"].status) == ("fail", "fail")
@@ -494,8 +496,8 @@ def test_map_start_and_mission_belong_together(tmp_path: Path) -> None:
     assert "sign" in f"{unsigned['map'].text} {unsigned['map'].fix}"
 
 
-def test_a_map_that_is_not_there_is_a_line(tmp_path: Path) -> None:
+def test_a_missing_map_is_a_failure_with_a_fix(tmp_path: Path) -> None:
     config = Config(map=MapSection(path=str(tmp_path / "none.gpkg")))
-    lines = {line.check: line for line in computer.about(config, None, tmp_path)}
+    lines = {line.check: line for line in computer.check_lines(config, None, tmp_path)}
     assert lines["map"].status == "fail"
     assert "terrafix map build" in lines["map"].fix

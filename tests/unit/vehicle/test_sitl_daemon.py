@@ -1,4 +1,4 @@
-"""Terrafix beside a firmware: it ends with the flight, however the flight ends."""
+"""Terrafix as a child of a SITL flight: it ends with the flight, however the flight ends."""
 
 import subprocess
 import sys
@@ -48,7 +48,7 @@ def eventually(holds: Any, within_s: float) -> None:
         time.sleep(0.05)
 
 
-def test_a_flight_that_is_killed_takes_terrafix_with_it_in_order(tmp_path: Path) -> None:
+def test_terrafix_stops_in_order_when_its_flight_is_killed(tmp_path: Path) -> None:
     log = tmp_path / "terrafix.log"
     with subprocess.Popen([sys.executable, "-c", FLIGHT, str(tmp_path), str(unpack(tmp_path))]) as flight:
         eventually(lambda: log.exists() and log.read_text().count("process started") == 6, 60.0)
@@ -56,7 +56,7 @@ def test_a_flight_that_is_killed_takes_terrafix_with_it_in_order(tmp_path: Path)
     eventually(lambda: log.read_text().count("process stopped") == 6, ENDS_S)
 
 
-def test_one_that_does_not_end_when_it_is_asked_to_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terrafix_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stages, "STOP_S", 0.2)
     scene: Any = SimpleNamespace(home=Home(48.0, 11.0, 500.0, 90.0), map_path=tmp_path / "map.gpkg")
     with Daemon(tmp_path, scene, "http://127.0.0.1:9/", "udpin:127.0.0.1:0") as daemon:

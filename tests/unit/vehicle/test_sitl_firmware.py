@@ -1,4 +1,4 @@
-"""A binary that is missing, may not be run or is none, and ports that are taken: one line that says what to do."""
+"""A missing, non-executable or invalid binary, and ports in use: one line with a remedy."""
 
 import socket
 import subprocess
@@ -25,32 +25,32 @@ def started(program: Path, folder: Path) -> Firmware:
     return Firmware(program, Kind.PLANE, folder, HOME, Ports(1, 2, 3, 4), [folder / "a.param", folder / "b.param"])
 
 
-def test_no_binary_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_binary_setting_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TERRAFIX_ARDUPILOT_SITL", raising=False)
     with pytest.raises(UsageError, match=r"TERRAFIX_ARDUPILOT_SITL; docs/sitl.md"):
         find_binary(None)
 
 
-def test_the_variable_names_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_environment_variable_selects_the_binary(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     program = script(tmp_path / "arduplane", "")
     monkeypatch.setenv("TERRAFIX_ARDUPILOT_SITL", str(program))
     assert find_binary(None) == program
 
 
-def test_a_binary_that_is_not_there(tmp_path: Path) -> None:
+def test_a_binary_that_does_not_exist_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such ArduPilot binary"):
         find_binary(tmp_path / "arduplane")
     with pytest.raises(UsageError, match="no such ArduPilot binary"):
         find_binary(tmp_path)  # a folder
 
 
-def test_a_binary_that_may_not_be_executed(tmp_path: Path) -> None:
+def test_a_binary_without_execute_permission_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "arduplane").write_text("")
     with pytest.raises(UsageError, match=r"may not be executed; chmod \+x"):
         find_binary(tmp_path / "arduplane")
 
 
-def test_a_file_that_is_no_program(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_program_is_an_error(tmp_path: Path) -> None:
     program = tmp_path / "arduplane"
     program.write_bytes(b"\x7fELF of another machine")
     program.chmod(0o755)
@@ -61,18 +61,18 @@ def test_a_file_that_is_no_program(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "kind"), [("arduplane", "plane"), ("arducopter-4.6.3", "copter"), ("ArduPlane", "plane")]
 )
-def test_the_name_says_the_vehicle(name: str, kind: str) -> None:
+def test_the_vehicle_follows_from_the_binary_name(name: str, kind: str) -> None:
     assert kind_of(Path("/somewhere") / name, None) == kind
 
 
 @pytest.mark.parametrize("name", ["firmware", "plane-or-copter"])
-def test_a_name_that_does_not_say_it(name: str) -> None:
+def test_an_inconclusive_binary_name_is_an_error(name: str) -> None:
     with pytest.raises(UsageError, match="give --vehicle"):
         kind_of(Path(name), None)
     assert kind_of(Path(name), Kind.COPTER) is Kind.COPTER
 
 
-def test_a_port_in_use() -> None:
+def test_a_port_in_use_is_an_error() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         taken = other.getsockname()[1]
@@ -87,7 +87,7 @@ def test_free_ports_differ() -> None:
     assert len({ports.ground, ports.companion, ports.observer, ports.rc_in}) == 4
 
 
-def test_it_is_told_where_it_stands_and_whom_to_speak_to(tmp_path: Path) -> None:
+def test_the_firmware_gets_home_ports_and_parameters(tmp_path: Path) -> None:
     program = script(tmp_path / "arduplane", "import sys, time; print(sys.argv[1:], flush=True); time.sleep(60)")
     with started(program, tmp_path / "run") as firmware:
         console = tmp_path / "run" / "firmware.log"
@@ -96,23 +96,23 @@ def test_it_is_told_where_it_stands_and_whom_to_speak_to(tmp_path: Path) -> None
                 break
             time.sleep(0.05)
         firmware.check()  # it runs
-    said = console.read_text()
+    text = console.read_text()
     for words in ("--home', '48.00000000,14.00000000,320.00,90.0", "--model', 'plane", "udpclient:127.0.0.1:2"):
-        assert words in said
-    assert f"{tmp_path}/run/a.param,{tmp_path}/run/b.param" in said
+        assert words in text
+    assert f"{tmp_path}/run/a.param,{tmp_path}/run/b.param" in text
 
 
-def test_one_that_ends_by_itself_is_quoted(tmp_path: Path) -> None:
+def test_the_error_of_a_firmware_that_ended_quotes_its_last_output(tmp_path: Path) -> None:
     program = script(tmp_path / "arduplane", "print('no such model'); raise SystemExit(3)")
     with started(program, tmp_path / "run") as firmware:
         firmware._process.wait(20)
-        with pytest.raises(UsageError, match="ended with code 3 and said: no such model"):
+        with pytest.raises(UsageError, match="ended with code 3, last output: no such model"):
             firmware.check()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "text"),
     [
         (["--binary", "/nowhere/arduplane"], "/nowhere/arduplane: no such ArduPilot binary; docs/sitl.md says how"),
         (["--binary", sys.executable, "--vehicle", "plane", "--length", "-1"], "--length -1: choose more than 0"),
@@ -120,7 +120,7 @@ def test_one_that_ends_by_itself_is_quoted(tmp_path: Path) -> None:
         (["--binary", sys.executable], "the name does not say plane or copter; give --vehicle"),
     ],
 )
-def test_a_mistake_is_one_line(arguments: list[str], said: str, tmp_path: Path) -> None:
+def test_a_usage_error_is_one_line(arguments: list[str], text: str, tmp_path: Path) -> None:
     pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
     command = [
         sys.executable,
@@ -133,5 +133,5 @@ def test_a_mistake_is_one_line(arguments: list[str], said: str, tmp_path: Path) 
         *arguments,
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    assert done.returncode == 2 and text in done.stderr and done.stderr.count("\n") == 1, done.stderr
     assert not (tmp_path / "out").exists()

@@ -1,8 +1,8 @@
-"""A mission as MAVSDK uploads it: commands, frames and amounts by the numbers of MAVLink's common.xml."""
+"""A mission as MAVSDK uploads it: commands, frames and parameters with the numbers of MAVLink's common.xml."""
 
 import pytest
 
-from terrafix_tools.mission.mission import Above, Do, Item, Mission
+from terrafix_tools.mission.mission import AltitudeFrame, Do, Item, Mission
 
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
 
@@ -16,13 +16,13 @@ MISSION = Mission(
         Item(Do.TAKE_OFF, height_m=60.0),
         Item(Do.WAYPOINT, 1, 48.1234567, -14.7654321, 120.0),
         Item(Do.SPEED, 2, amount=15.0),
-        Item(Do.LOITER_TURNS, 3, 48.2, 14.3, 100.0, Above.GROUND, 2.0, -80.0),
+        Item(Do.LOITER_TURNS, 3, 48.2, 14.3, 100.0, AltitudeFrame.GROUND, 2.0, -80.0),
         Item(Do.LAND, 4, 48.1, 14.2, 0.0),
     ),
 )
 
 
-def test_numbers() -> None:
+def test_mission_items_have_the_numbers_of_mavlink() -> None:
     made = items(MISSION)
     assert [item.seq for item in made] == [0, 1, 2, 3, 4, 5]
     assert [item.command for item in made[1:]] == [22, 16, 178, 18, 21]

@@ -1,4 +1,4 @@
-"""What the observer notes and what the report makes of it, from packets and courses made by hand."""
+"""The observer's log and the report from it, with constructed packets and trajectories."""
 
 import json
 import math
@@ -15,14 +15,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix_tools.sim.sitl.firmware import Home
 from terrafix_tools.sim.sitl.observer import (
     SO_TIMESTAMPNS,
-    Belief,
-    Notes,
+    FlightLog,
     Observer,
-    Said,
+    PositionRecord,
+    StatusTextRecord,
     Truth,
     arrival_ns,
-    between,
-    take,
+    interpolate,
+    record,
 )
 from terrafix_tools.sim.sitl.report import (
     Figures,
@@ -46,22 +46,24 @@ def state(t_s: float, east_m: float) -> Truth:
     return Truth(round(t_s * S), LAT_DEG, LON_DEG + east_m * EAST_DEG_PER_M, up_m, (0.0, 20.0, 0.0), 0.0, 0.0, 1.57)
 
 
-def good_flight() -> Notes:
-    """20 m/s to the east from the loss at 60 s on, for 300 s; its own position is 3 m off; it lands 10 m too far."""
-    notes = Notes()
-    notes.truth = [state(t, 20.0 * min(300.0, max(0.0, t - 60.0))) for t in range(381)]
-    notes.beliefs = [Belief(t * S, LAT_DEG, LON_DEG + (20.0 * (t - 60) + 3.0) * EAST_DEG_PER_M) for t in range(61, 360)]
-    notes.fix_types[0].extend((t * S, 6 if t < 60 else 1) for t in range(5, 360))
-    notes.fix_types[1].extend((t * S, 3) for t in range(30, 360))
-    notes.gps_healthy = [(t * S, True) for t in range(5, 360)]
-    return notes
+def good_flight() -> FlightLog:
+    """20 m/s to the east from the loss at 60 s, for 300 s; position error 3 m; landing 10 m too far."""
+    log = FlightLog()
+    log.truth = [state(t, 20.0 * min(300.0, max(0.0, t - 60.0))) for t in range(381)]
+    log.positions = [
+        PositionRecord(t * S, LAT_DEG, LON_DEG + (20.0 * (t - 60) + 3.0) * EAST_DEG_PER_M) for t in range(61, 360)
+    ]
+    log.fix_types[0].extend((t * S, 6 if t < 60 else 1) for t in range(5, 360))
+    log.fix_types[1].extend((t * S, 3) for t in range(30, 360))
+    log.gps_healthy = [(t * S, True) for t in range(5, 360)]
+    return log
 
 
 def landing(error_m: float = 10.0) -> Home:
     return Home(LAT_DEG, LON_DEG + (6000.0 - error_m) * EAST_DEG_PER_M, HOME_AMSL_M, 90.0)
 
 
-def test_a_good_flight_passes_everything() -> None:
+def test_a_good_flight_passes_all_verdicts() -> None:
     flown = figures(good_flight(), TIMES, landing())
     assert flown.flown_m == pytest.approx(6000.0, rel=0.006)
     assert flown.landing_error_m == pytest.approx(10.0, rel=0.01) and flown.touchdown_m == flown.landing_error_m
@@ -71,19 +73,19 @@ def test_a_good_flight_passes_everything() -> None:
     assert all(verdicts(flown, 5000.0).values())
 
 
-def failing(notes: Notes, times: Times = TIMES, error_m: float = 10.0) -> set[str]:
-    return {what for what, good in verdicts(figures(notes, times, landing(error_m)), 5000.0).items() if not good}
+def failing(log: FlightLog, times: Times = TIMES, error_m: float = 10.0) -> set[str]:
+    return {what for what, good in verdicts(figures(log, times, landing(error_m)), 5000.0).items() if not good}
 
 
-def test_each_failure_is_seen() -> None:
-    said = good_flight()
-    said.said.append(Said(100 * S, 2, "PreArm: GPS 2: not healthy"))
-    assert failing(said) == {"no 'GPS not healthy'"}
+def test_each_failure_fails_its_verdict() -> None:
+    flight_log = good_flight()
+    flight_log.texts.append(StatusTextRecord(100 * S, 2, "PreArm: GPS 2: not healthy"))
+    assert failing(flight_log) == {"no 'GPS not healthy'"}
     sick = good_flight()
     sick.gps_healthy[150] = (155 * S, False)
     assert failing(sick) == {"no 'GPS not healthy'"}
     led = good_flight()
-    led.said.append(Said(100 * S, 1, "EKF Failsafe: changed to LAND Mode"))
+    led.texts.append(StatusTextRecord(100 * S, 1, "EKF Failsafe: changed to LAND Mode"))
     assert failing(led) == {"no EKF failsafe"}
     cheated = good_flight()
     cheated.fix_types[0].append((200 * S, 3))
@@ -101,17 +103,17 @@ def test_each_failure_is_seen() -> None:
     assert failing(aloft, replace(TIMES, landed_ns=None)) == {"landed", "landing within 30 m"}
 
 
-def test_every_restart_is_timed_and_the_slowest_one_counts() -> None:
+def test_every_restart_is_timed_and_the_slowest_decides() -> None:
     def flown_with(*back_s: float | None) -> tuple[Figures, bool]:
-        notes, kills = good_flight(), []
+        log, kills = good_flight(), []
         for at_s, after_s in zip((100, 140, 180), back_s, strict=False):
             until_s = 20.0 if after_s is None else 5.0 + after_s
-            gone = [(t_ns, fix) for t_ns, fix in notes.fix_types[1] if at_s * S + 4 * S <= t_ns < (at_s + until_s) * S]
+            gone = [(t_ns, fix) for t_ns, fix in log.fix_types[1] if at_s * S + 4 * S <= t_ns < (at_s + until_s) * S]
             for t_ns, fix in gone:
-                notes.fix_types[1][notes.fix_types[1].index((t_ns, fix))] = (t_ns, 1)
-            back_ns = None if after_s is None else round((at_s + 5.0 + after_s) * S)
-            kills.append(Kill(at_s * S, (at_s + 5) * S, back_ns))
-        flown = figures(notes, replace(TIMES, kills=tuple(kills)), landing())
+                log.fix_types[1][log.fix_types[1].index((t_ns, fix))] = (t_ns, 1)
+            recovered_ns = None if after_s is None else round((at_s + 5.0 + after_s) * S)
+            kills.append(Kill(at_s * S, (at_s + 5) * S, recovered_ns))
+        flown = figures(log, replace(TIMES, kills=tuple(kills)), landing())
         return flown, verdicts(flown, 5000.0)["3D fix again within 2 s of each restart"]
 
     flown, quick = flown_with(1.0, 1.5)
@@ -121,60 +123,66 @@ def test_every_restart_is_timed_and_the_slowest_one_counts() -> None:
     assert never.back_s == [1.0, None] and not quick
 
 
-def test_what_was_before_arming_or_before_the_loss_does_not_count() -> None:
-    notes = good_flight()
-    notes.said += [Said(5 * S, 2, "PreArm: GPS 2: not healthy"), Said(6 * S, 6, "AHRS: DCM active")]
-    notes.gps_healthy[0] = (5 * S, False)
-    assert failing(notes) == set()
+def test_events_before_arming_or_before_the_loss_do_not_count() -> None:
+    log = good_flight()
+    log.texts += [
+        StatusTextRecord(5 * S, 2, "PreArm: GPS 2: not healthy"),
+        StatusTextRecord(6 * S, 6, "AHRS: DCM active"),
+    ]
+    log.gps_healthy[0] = (5 * S, False)
+    assert failing(log) == set()
 
 
-def test_a_gps_without_a_fix_or_on_the_ground_is_not_sick() -> None:
-    notes = good_flight()
-    notes.gps_healthy[150] = (155 * S, False)
-    fixes = notes.fix_types[1]
+def test_a_gps_without_a_fix_or_on_the_ground_is_not_unhealthy() -> None:
+    log = good_flight()
+    log.gps_healthy[150] = (155 * S, False)
+    fixes = log.fix_types[1]
     fixes[fixes.index((155 * S, 3))] = (155 * S, 1)
-    notes.gps_healthy.append((370 * S, False))
-    assert failing(notes) == set()
+    log.gps_healthy.append((370 * S, False))
+    assert failing(log) == set()
 
 
-def test_a_failsafe_on_the_ground_is_told_apart() -> None:
-    notes = good_flight()
-    notes.said += [Said(361 * S, 2, "EKF variance"), Said(390 * S, 2, "EKF variance")]
-    flown = figures(notes, TIMES, landing())
+def test_a_failsafe_on_the_ground_is_counted_separately() -> None:
+    log = good_flight()
+    log.texts += [StatusTextRecord(361 * S, 2, "EKF variance"), StatusTextRecord(390 * S, 2, "EKF variance")]
+    flown = figures(log, TIMES, landing())
     assert (flown.ekf_failsafes, flown.ekf_failsafes_on_ground) == (0, 1)
 
 
 def test_a_failsafe_that_is_cleared_counts_once() -> None:
-    notes = good_flight()
-    notes.said += [Said(90 * S, 1, "EKF Failsafe: changed to LAND Mode"), Said(95 * S, 1, "EKF Failsafe Cleared")]
-    assert figures(notes, TIMES, landing()).ekf_failsafes == 1
+    log = good_flight()
+    log.texts += [
+        StatusTextRecord(90 * S, 1, "EKF Failsafe: changed to LAND Mode"),
+        StatusTextRecord(95 * S, 1, "EKF Failsafe Cleared"),
+    ]
+    assert figures(log, TIMES, landing()).ekf_failsafes == 1
 
 
-def test_gaps_of_gps_input() -> None:
-    notes = good_flight()
-    fixes = notes.fix_types[1]
+def test_gaps_of_gps_input_are_measured() -> None:
+    log = good_flight()
+    fixes = log.fix_types[1]
     for i, (t_ns, _) in enumerate(fixes):
         if 100 * S <= t_ns <= 104 * S:
             fixes[i] = (t_ns, 1)
-    flown = figures(notes, TIMES, landing())
+    flown = figures(log, TIMES, landing())
     assert flown.gps_input_longest_gap_s == 4.0
     assert flown.gps_input_fix_share == pytest.approx(1.0 - 5 / 300, abs=1e-3)
 
 
-def test_a_flight_that_never_began() -> None:
-    flown = figures(Notes(), Times(), landing())
+def test_a_flight_that_was_not_started_fails() -> None:
+    flown = figures(FlightLog(), Times(), landing())
     assert flown.flown_m == 0.0 and flown.landing_error_m is None
     held = verdicts(flown, 5000.0)
     assert not held["take-off on GNSS"] and not held["5 km on GPS_INPUT alone"] and not held["landed"]
 
 
-def test_files(tmp_path: Path) -> None:
-    notes = good_flight()
-    notes.said.append(Said(100 * S, 6, "EKF3 IMU0 is using GPS"))
-    flown = figures(notes, TIMES, landing())
+def test_report_texts_and_truth_are_written(tmp_path: Path) -> None:
+    log = good_flight()
+    log.texts.append(StatusTextRecord(100 * S, 6, "EKF3 IMU0 is using GPS"))
+    flown = figures(log, TIMES, landing())
     write_report(tmp_path / "a.json", {"vehicle": "plane"}, flown, 5000.0)
-    write_texts(tmp_path / "texts.log", notes)
-    write_truth(tmp_path / "truth.csv", notes)
+    write_texts(tmp_path / "texts.log", log)
+    write_truth(tmp_path / "truth.csv", log)
     report = json.loads((tmp_path / "a.json").read_text())
     assert report["passed"] is True and report["vehicle"] == "plane"
     assert report["figures"]["landing_error_m"] == flown.landing_error_m
@@ -183,8 +191,8 @@ def test_files(tmp_path: Path) -> None:
     assert len(rows) == 382 and rows[-1].startswith("380000000000,48.0000000,14.08")
 
 
-def test_packets_become_notes() -> None:
-    """Through the wire format: what is noted is what was packed."""
+def test_packets_are_recorded_in_the_log() -> None:
+    """Through the wire format: the log has the values that were packed."""
     sender, receiver = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
     zeros = [0.0] * 6
     sent = [
@@ -198,63 +206,63 @@ def test_packets_become_notes() -> None:
         mavlink.MAVLink_autopilot_version_message(0, 0x040603FF, 0, 0, 0, list(b"3fc7011a"), [0] * 8, [0] * 8, 0, 0, 0),
         mavlink.MAVLink_heartbeat_message(1, 3, mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 0, 0, 3),
     ]
-    notes = Notes()
+    log = FlightLog()
     for message in receiver.parse_buffer(b"".join(one.pack(sender) for one in sent)) or []:
-        take(notes, message, 7)
-    truth = notes.truth[0]
+        record(log, message, 7)
+    truth = log.truth[0]
     assert (truth.lat_deg, truth.lon_deg) == pytest.approx((48.1234567, 14.1234567), abs=1e-9)
     assert truth.amsl_m == 412.5 and truth.velocity_ned_mps == (3.0, -4.0, 0.5)
     assert (truth.roll_rad, truth.pitch_rad, truth.yaw_rad) == pytest.approx((0.1, -0.2, 1.5), abs=1e-6)
-    assert notes.fix_types[0] == [(7, 1)] and notes.gps_healthy == [(7, True)] and notes.armed == [(7, True)]
-    assert notes.said == [Said(7, 4, "GPS Glitch")] and notes.version == "4.6.3 (3fc7011a)"
+    assert log.fix_types[0] == [(7, 1)] and log.gps_healthy == [(7, True)] and log.armed == [(7, True)]
+    assert log.texts == [StatusTextRecord(7, 4, "GPS Glitch")] and log.version == "4.6.3 (3fc7011a)"
 
 
-def test_the_truth_has_the_time_of_the_firmware_however_it_comes() -> None:
-    """Bursts, a machine that was busy, a state of another turn than the time before it, a clock that lost 50 ms."""
+def test_the_truth_has_the_firmware_time_regardless_of_its_arrival() -> None:
+    """Bursts, a busy machine, a state of another cycle than the time before it, a clock that lost 50 ms."""
     rng = np.random.default_rng(3)
-    notes, apart_ns = Notes(), 1000 * S
+    log, apart_ns = FlightLog(), 1000 * S
 
-    def say(boot_ms: int, late_ms: float, turn_ms: float = 0.05) -> None:
+    def send(boot_ms: int, late_ms: float, turn_ms: float = 0.05) -> None:
         arrival_ns = boot_ms * 1_000_000 + apart_ns + round(late_ms * 1e6)
-        take(notes, mavlink.MAVLink_system_time_message(0, boot_ms), arrival_ns)
-        take(notes, mavlink.MAVLink_global_position_int_message(boot_ms, 0, boot_ms, 0, 0, 0, 0, 0, 0), arrival_ns)
+        record(log, mavlink.MAVLink_system_time_message(0, boot_ms), arrival_ns)
+        record(log, mavlink.MAVLink_global_position_int_message(boot_ms, 0, boot_ms, 0, 0, 0, 0, 0, 0), arrival_ns)
         state = mavlink.MAVLink_sim_state_message(*[0.0] * 15, boot_ms * 0.02, *[0.0] * 5, 0, 0)
-        take(notes, state, arrival_ns + round(turn_ms * 1e6))
+        record(log, state, arrival_ns + round(turn_ms * 1e6))
 
     late_ms = rng.uniform(-3.0, 3.0, 200) + np.where(rng.random(200) < 0.2, 20.0, 0.0)
     for i, late in enumerate(late_ms):
-        say(25 * i, late, turn_ms=5.0 if i % 10 == 9 else 0.05)
-    assert len(notes.truth) == 180, "of a state from another turn nobody knows when it was"
-    settled = [one for one in notes.truth if one.t_ns > apart_ns + 2 * S]
+        send(25 * i, late, turn_ms=5.0 if i % 10 == 9 else 0.05)
+    assert len(log.truth) == 180, "of a state from another turn nobody knows when it was"
+    settled = [one for one in log.truth if one.t_ns > apart_ns + 2 * S]
     true_ns = [one.amsl_m / 0.02 * 1e6 + apart_ns for one in settled]
     off_ms = (np.array([one.t_ns for one in settled]) - true_ns) / 1e6
     assert abs(off_ms.mean()) < 2.0 and np.ptp(off_ms) < 2.0
-    assert notes.beliefs[-1].t_ns - notes.beliefs[-2].t_ns == pytest.approx(25e6, abs=1e6)
+    assert log.positions[-1].t_ns - log.positions[-2].t_ns == pytest.approx(25e6, abs=1e6)
     apart_ns += 50_000_000
     for i in range(200, 300):
-        say(25 * i, 0.0)
-    assert all(b.t_ns > a.t_ns for a, b in pairwise(notes.truth))
-    assert notes.truth[-1].t_ns == 25 * 299 * 1_000_000 + apart_ns
+        send(25 * i, 0.0)
+    assert all(b.t_ns > a.t_ns for a, b in pairwise(log.truth))
+    assert log.truth[-1].t_ns == 25 * 299 * 1_000_000 + apart_ns
 
 
-def test_truth_between_two_states() -> None:
+def test_truth_is_interpolated_between_two_states() -> None:
     before, after = replace(state(1.0, 0.0), yaw_rad=3.1), replace(state(2.0, 20.0), yaw_rad=-3.1, roll_rad=0.4)
-    middle = between(before, after, 1_500_000_000)
+    middle = interpolate(before, after, 1_500_000_000)
     assert middle.lon_deg == pytest.approx(LON_DEG + 10.0 * EAST_DEG_PER_M, abs=1e-12)
     assert math.cos(middle.yaw_rad) == pytest.approx(-1.0) and middle.roll_rad == pytest.approx(0.2)
 
 
-def test_truth_is_not_guessed() -> None:
+def test_truth_is_not_extrapolated() -> None:
     observer = Observer(0)
-    observer.notes.truth = [state(1.0, 0.0), state(2.0, 20.0)]
+    observer.log.truth = [state(1.0, 0.0), state(2.0, 20.0)]
     assert observer.truth_at(S - 1) is None and observer.truth_at(2 * S + 1) is None
     assert observer.truth_at(S) == state(1.0, 0.0)
     with observer:
         pass  # closes the port
 
 
-def test_a_late_reader_does_not_make_the_truth_late() -> None:
-    """The kernel stamped the datagram when it came, not when somebody looked."""
+def test_a_late_reader_does_not_delay_the_truth() -> None:
+    """The kernel's time stamp is that of the arrival, not of the read."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as to,

@@ -1,4 +1,4 @@
-"""The mission of the harness and the vehicle's parameters, as the firmware gets them."""
+"""Mission and vehicle parameters of the SITL harness, as the firmware gets them."""
 
 import itertools
 import math
@@ -30,17 +30,17 @@ def length_m(mission: Mission) -> float:
 
 @pytest.mark.parametrize("kind", list(Kind))
 @pytest.mark.parametrize("wanted_m", [500.0, 5000.0, 10_000.0])
-def test_long_enough_and_inside(place: world.World, kind: Kind, wanted_m: float) -> None:
+def test_the_mission_is_long_enough_and_inside_the_world(place: world.World, kind: Kind, wanted_m: float) -> None:
     mission = mission_for(place, kind, wanted_m)
-    assert length_m(mission) >= wanted_m + 1500.0  # what is flown before the loss is on top
+    assert length_m(mission) >= wanted_m + 1500.0  # plus the distance flown before the loss
     laps, lap_m = laps_for(wanted_m)
-    assert laps * lap_m == pytest.approx(length_m(mission), rel=0.05)  # the time that a flight is given
+    assert laps * lap_m == pytest.approx(length_m(mission), rel=0.05)  # determines the time limit of the flight
     assert mission.items[0].do is Do.TAKE_OFF and mission.items[-1].do is Do.LAND
     last = mission.items[-1]
     assert (last.lat_deg, last.lon_deg) == place_of(place) == (mission.home_lat_deg, mission.home_lon_deg)
 
 
-def test_a_plane_comes_in_on_a_slope_that_it_can_fly(place: world.World) -> None:
+def test_a_plane_approaches_on_a_feasible_glide_path(place: world.World) -> None:
     approach, land = mission_for(place, Kind.PLANE, 5000.0).items[-2:]
     assert approach.lat_deg and approach.lon_deg and approach.height_m and land.lat_deg and land.lon_deg
     azimuth_deg, _, away_m = GEOD.inv(approach.lon_deg, approach.lat_deg, land.lon_deg, land.lat_deg)
@@ -49,13 +49,13 @@ def test_a_plane_comes_in_on_a_slope_that_it_can_fly(place: world.World) -> None
 
 
 @pytest.mark.parametrize("wanted_m", [0.0, -5000.0, 1e6])
-def test_a_length_that_cannot_be(place: world.World, wanted_m: float) -> None:
+def test_an_invalid_length_is_an_error(place: world.World, wanted_m: float) -> None:
     with pytest.raises(UsageError, match=r"--length .* choose"):
         mission_for(place, Kind.PLANE, wanted_m)
 
 
 @pytest.mark.parametrize("kind", list(Kind))
-def test_parameters_are_a_file_that_ardupilot_reads(kind: Kind, tmp_path: Path) -> None:
+def test_the_parameter_file_has_ardupilots_format(kind: Kind, tmp_path: Path) -> None:
     path = tmp_path / "vehicle.param"
     write_parameters(path, kind)
     rows = [line.split(",") for line in path.read_text().splitlines()]
@@ -64,4 +64,4 @@ def test_parameters_are_a_file_that_ardupilot_reads(kind: Kind, tmp_path: Path) 
     assert len(values) == len(rows)
     ours = Path(__file__).resolve().parents[3] / "config" / "vehicles" / "second-gps.param"
     about_us = {line.split(",")[0] for line in ours.read_text().splitlines() if not line.startswith("#")}
-    assert not about_us & values.keys()  # what is tested is the file that people load
+    assert not about_us & values.keys()  # they are in the file that users load

@@ -1,13 +1,13 @@
-"""Frame to keyframe: the motion between pictures, foreign pictures, lost overlap and new fragments."""
+"""Frame-to-keyframe tracking: motion, foreign frames, lost overlap and new fragments."""
 
 import cv2
 import numpy as np
 import pytest
 
-from ground import PINHOLE, apply, homography, rotation, texture, view
 from terrafix.core.camera import CameraCalibration
 from terrafix.messages import Verdict
-from terrafix.vision.feature_tracker import MAX_MISSES, MAX_PAIRS, FrameTracker, Motion
+from terrafix.vision.feature_tracker import MAX_FAILURES, MAX_PAIRS, FrameTracker, Motion
+from textured_ground import PINHOLE, apply, homography, rotation, texture, view
 
 AGL_M = 100.0
 Pose = tuple[np.ndarray, np.ndarray]
@@ -27,18 +27,18 @@ def picture(ground: np.ndarray, at: Pose, camera: CameraCalibration = PINHOLE) -
 
 
 def foreign(seed: int = 9) -> np.ndarray:
-    """Another place altogether."""
+    """A frame of another place."""
     return picture(texture(seed, 190.0), pose(0.0, 0.0))
 
 
 def errors(motion: Motion, keyframe: Pose, now: Pose) -> np.ndarray:
-    """How far each match lies from where the ground really went, in pixels: (N, 2)."""
+    """Error of each match against the true motion of the ground, in pixels: (N, 2)."""
     expected = apply(homography(keyframe, now), motion.pairs[:, :2])
     return (motion.pairs[:, 2:] - expected) * PINHOLE.fx
 
 
 def is_right(motion: Motion, keyframe: Pose, now: Pose) -> bool:
-    """To the nearest pixel, as these pictures show the ground, and the errors average out."""
+    """Every match is right within a pixel, the resolution of these images, and the mean error is small."""
     error = errors(motion, keyframe, now)
     return bool(np.median(np.linalg.norm(error, axis=1)) < 1.2 and np.linalg.norm(error.mean(0)) < 0.5)
 
@@ -48,13 +48,13 @@ STEPS = {
     "turn": pose(2.0, 6.0, yaw_deg=9.0),
     "climb": pose(0.0, 8.0, agl_m=106.0),
     "tilt": (rotation(0.0, 4.0, -5.0), np.array([2.0, 5.0, AGL_M])),
-    "far": pose(10.0, 55.0, yaw_deg=20.0),  # about half of the picture is shared
+    "far": pose(10.0, 55.0, yaw_deg=20.0),  # about half of the image overlaps
     "turned round": pose(5.0, 5.0, yaw_deg=170.0),
 }
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_the_motion_is_recovered(ground: np.ndarray, name: str) -> None:
+def test_tracking_recovers_the_motion(ground: np.ndarray, name: str) -> None:
     tracker, first, second = FrameTracker(PINHOLE), pose(0.0, 0.0), STEPS[name]
     start = tracker.track(4, picture(ground, first))
     assert (start.keyframe_id, start.becomes_keyframe, len(start.pairs)) == (4, True, 0)
@@ -63,11 +63,11 @@ def test_the_motion_is_recovered(ground: np.ndarray, name: str) -> None:
     assert 15 <= len(motion.pairs) <= MAX_PAIRS and motion.inliers >= len(motion.pairs)
     assert is_right(motion, first, second)
     spread = np.ptp(motion.pairs[:, :2], axis=0) * PINHOLE.fx
-    assert spread[0] > 0.3 * PINHOLE.width  # matches from all over what is shared, not from one roof
+    assert spread[0] > 0.3 * PINHOLE.width  # matches cover the overlap, not one roof
     assert 0.2 / PINHOLE.fx < motion.sigma_norm < 5.0 / PINHOLE.fx
 
 
-def test_large_frames_are_worked_on_small_and_answered_in_the_same_units(ground: np.ndarray) -> None:
+def test_large_frames_are_downscaled_and_give_the_same_normalised_matches(ground: np.ndarray) -> None:
     camera = CameraCalibration(1440, 810, 855.0, 855.0, 719.5, 404.5)
     tracker, first, second = FrameTracker(camera), pose(0.0, 0.0), pose(4.0, 10.0, yaw_deg=5.0)
     tracker.track(0, picture(ground, first, camera))
@@ -76,7 +76,7 @@ def test_large_frames_are_worked_on_small_and_answered_in_the_same_units(ground:
     assert is_right(motion, first, second)
 
 
-def test_a_lens_is_taken_out(ground: np.ndarray) -> None:
+def test_lens_distortion_is_removed_from_the_matches(ground: np.ndarray) -> None:
     camera = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5, (-0.15, 0.03, 0.0, 0.0))
     tracker, first, second = FrameTracker(camera), pose(0.0, 0.0), pose(3.0, 12.0, yaw_deg=4.0)
     tracker.track(0, picture(ground, first, camera))
@@ -84,8 +84,8 @@ def test_a_lens_is_taken_out(ground: np.ndarray) -> None:
     assert is_right(motion, first, second)
 
 
-def test_a_long_flight_is_one_chain(ground: np.ndarray) -> None:
-    """Each frame refers to a keyframe that was said to be one, and every match is right."""
+def test_a_long_flight_is_one_chain_of_keyframes(ground: np.ndarray) -> None:
+    """Each frame refers to a frame that became a keyframe, and every match is right."""
     tracker = FrameTracker(PINHOLE)
     track = [pose(-80.0 + 9.0 * i, 0.05 * (9.0 * i) ** 1.2, yaw_deg=3.0 * i) for i in range(18)]
     keyframes = set()
@@ -100,17 +100,17 @@ def test_a_long_flight_is_one_chain(ground: np.ndarray) -> None:
     assert 3 <= len(keyframes) <= 12  # not every frame, and not too few for the overlap
 
 
-def test_corners_outlive_their_keyframe_and_are_seen_by_three(ground: np.ndarray) -> None:
+def test_corners_are_carried_over_keyframes_and_give_three_view_matches(ground: np.ndarray) -> None:
     tracker, at, keyframes, seen = FrameTracker(PINHOLE), dict[int, Pose](), list[int](), 0
     for i in range(18):
         at[i] = pose(-80.0 + 9.0 * i, 0.4 * i, yaw_deg=2.0 * i)
         motion = tracker.track(i, picture(ground, at[i]))
         if len(motion.triples):
-            assert motion.becomes_keyframe and [motion.before_id, motion.keyframe_id] == keyframes[-2:]
+            assert motion.becomes_keyframe and [motion.previous_keyframe_id, motion.keyframe_id] == keyframes[-2:]
             views = motion.triples.reshape(-1, 3, 2)
             for which, before in enumerate(keyframes[-2:]):
                 error = (views[:, 2] - apply(homography(at[before], at[i]), views[:, which])) * PINHOLE.fx
-                # A track from frame to frame slips by 0.3 to 0.9 px.
+                # A frame-to-frame track drifts by 0.3 to 0.9 px.
                 assert np.median(np.linalg.norm(error, axis=1)) < 0.4
             seen += 1
         if motion.becomes_keyframe:
@@ -118,16 +118,16 @@ def test_corners_outlive_their_keyframe_and_are_seen_by_three(ground: np.ndarray
     assert seen == len(keyframes) - 2 > 1
 
 
-def test_a_new_fragment_knows_nothing_of_the_keyframes_before(ground: np.ndarray) -> None:
+def test_a_new_fragment_has_no_matches_with_earlier_keyframes(ground: np.ndarray) -> None:
     tracker = FrameTracker(PINHOLE)
     for i in range(6):
         tracker.track(i, picture(ground, pose(9.0 * i, 0.0)))
-    for i in range(MAX_MISSES + 1):
+    for i in range(MAX_FAILURES + 1):
         tracker.track(6 + i, foreign())
     assert len(tracker.track(20, foreign()).triples) == 0
 
 
-def test_a_foreign_frame_costs_that_frame_only(ground: np.ndarray) -> None:
+def test_a_foreign_frame_loses_one_frame_only(ground: np.ndarray) -> None:
     tracker = FrameTracker(PINHOLE)
     track = [pose(0.0, 8.0 * i) for i in range(5)]
     for i in range(2):
@@ -140,8 +140,8 @@ def test_a_foreign_frame_costs_that_frame_only(ground: np.ndarray) -> None:
     assert tracker.track(4, picture(ground, track[4])).verdict is Verdict.ACCEPTED
 
 
-def test_a_run_of_foreign_frames_ends_where_the_flight_was(ground: np.ndarray) -> None:
-    """Foreign frames that agree with each other become the keyframe; the next own frame returns to the one before."""
+def test_after_a_run_of_foreign_frames_tracking_returns_to_the_previous_keyframe(ground: np.ndarray) -> None:
+    """Foreign frames that match each other give a keyframe; the next own frame returns to the previous keyframe."""
     tracker, other = FrameTracker(PINHOLE), texture(33, 190.0)
     track = [pose(0.0, 4.0 * i) for i in range(16)]
     for i in range(4):
@@ -154,8 +154,8 @@ def test_a_run_of_foreign_frames_ends_where_the_flight_was(ground: np.ndarray) -
     assert tracker.track(11, picture(ground, track[11])).keyframe_id >= 10
 
 
-def test_a_frame_that_was_registered_to_a_keyframe_is_a_place_to_return_to(ground: np.ndarray) -> None:
-    """A large step makes the frame a keyframe; foreign frames come before any other was registered to it."""
+def test_tracking_can_return_to_a_frame_that_was_registered_to_a_keyframe(ground: np.ndarray) -> None:
+    """A large step makes the frame a keyframe; foreign frames follow before any frame was registered to it."""
     tracker, other = FrameTracker(PINHOLE), texture(33, 190.0)
     tracker.track(0, picture(ground, pose(0.0, 0.0)))
     far = tracker.track(1, picture(ground, STEPS["far"]))
@@ -165,17 +165,17 @@ def test_a_frame_that_was_registered_to_a_keyframe_is_a_place_to_return_to(groun
     assert tracker.track(4, picture(ground, STEPS["far"])).keyframe_id == 1
 
 
-def test_foreign_frames_that_agree_with_nobody_end_where_the_flight_was_too(ground: np.ndarray) -> None:
+def test_after_foreign_frames_without_matches_tracking_returns_to_the_previous_keyframe(ground: np.ndarray) -> None:
     tracker = FrameTracker(PINHOLE)
     for i in range(4):
         tracker.track(i, picture(ground, pose(0.0, 4.0 * i)))
-    alone = [tracker.track(4 + i, foreign(40 + i)) for i in range(MAX_MISSES)]
-    assert alone[-1].verdict is Verdict.ACCEPTED and alone[-1].keyframe_id == 3 + MAX_MISSES
-    back = tracker.track(4 + MAX_MISSES, picture(ground, pose(0.0, 16.0)))
+    alone = [tracker.track(4 + i, foreign(40 + i)) for i in range(MAX_FAILURES)]
+    assert alone[-1].verdict is Verdict.ACCEPTED and alone[-1].keyframe_id == 3 + MAX_FAILURES
+    back = tracker.track(4 + MAX_FAILURES, picture(ground, pose(0.0, 16.0)))
     assert back.verdict is Verdict.ACCEPTED and back.keyframe_id < 4
 
 
-def test_a_frame_that_agreed_with_nobody_is_no_place_to_return_to(ground: np.ndarray) -> None:
+def test_tracking_does_not_return_to_a_frame_without_matches(ground: np.ndarray) -> None:
     tracker = FrameTracker(PINHOLE)
     tracker.track(0, foreign(20))  # alone
     for i in range(1, 4):
@@ -186,7 +186,7 @@ def test_a_frame_that_agreed_with_nobody_is_no_place_to_return_to(ground: np.nda
 
 
 @pytest.mark.parametrize("gray_value", [0, 128, 255])
-def test_a_frame_without_anything_in_it(ground: np.ndarray, gray_value: int) -> None:
+def test_a_uniform_frame_is_not_registered(ground: np.ndarray, gray_value: int) -> None:
     blank = np.full((PINHOLE.height, PINHOLE.width, 3), gray_value, np.uint8)
     tracker = FrameTracker(PINHOLE)
     tracker.track(0, picture(ground, pose(0.0, 0.0)))
@@ -194,34 +194,34 @@ def test_a_frame_without_anything_in_it(ground: np.ndarray, gray_value: int) -> 
     assert tracker.track(2, picture(ground, pose(0.0, 10.0))).verdict is Verdict.ACCEPTED
 
 
-def test_blank_from_the_first_frame_on(ground: np.ndarray) -> None:
+def test_uniform_frames_from_the_start_are_not_registered(ground: np.ndarray) -> None:
     blank = np.zeros((PINHOLE.height, PINHOLE.width, 3), np.uint8)
     tracker = FrameTracker(PINHOLE)
     for i in range(3):
         assert len(tracker.track(i, blank).pairs) == 0
-    found = [tracker.track(3 + i, picture(ground, pose(0.0, 9.0 * i))) for i in range(MAX_MISSES + 3)]
+    found = [tracker.track(3 + i, picture(ground, pose(0.0, 9.0 * i))) for i in range(MAX_FAILURES + 3)]
     assert found[-1].verdict is Verdict.ACCEPTED and len(found[-1].pairs) > 0
 
 
-def test_after_some_misses_a_new_fragment_begins() -> None:
-    """Frames that agree with nobody: the last one stands alone, and later frames refer to it."""
+def test_repeated_registration_failures_start_a_new_fragment() -> None:
+    """Frames without matches: the last one starts a fragment, and later frames refer to it."""
     tracker = FrameTracker(PINHOLE)
     tracker.track(0, foreign(20))
-    motions = [tracker.track(1 + i, foreign(21 + i)) for i in range(MAX_MISSES)]
-    assert [m.verdict for m in motions[:-1]] == [Verdict.FEW_INLIERS] * (MAX_MISSES - 1)
+    motions = [tracker.track(1 + i, foreign(21 + i)) for i in range(MAX_FAILURES)]
+    assert [m.verdict for m in motions[:-1]] == [Verdict.FEW_INLIERS] * (MAX_FAILURES - 1)
     last = motions[-1]
     assert (last.verdict, last.keyframe_id, last.becomes_keyframe, len(last.pairs)) == (
         Verdict.ACCEPTED,
-        MAX_MISSES,
+        MAX_FAILURES,
         True,
         0,
     )
-    place = texture(21 + MAX_MISSES - 1, 190.0)
-    again = tracker.track(MAX_MISSES + 1, picture(place, pose(0.0, 6.0)))
-    assert (again.verdict, again.keyframe_id) == (Verdict.ACCEPTED, MAX_MISSES)
+    place = texture(21 + MAX_FAILURES - 1, 190.0)
+    again = tracker.track(MAX_FAILURES + 1, picture(place, pose(0.0, 6.0)))
+    assert (again.verdict, again.keyframe_id) == (Verdict.ACCEPTED, MAX_FAILURES)
 
 
-def test_two_frames_that_agree_with_each_other_are_a_new_fragment(ground: np.ndarray) -> None:
+def test_two_failed_frames_that_match_each_other_start_a_new_fragment(ground: np.ndarray) -> None:
     tracker = FrameTracker(PINHOLE)
     first, second = pose(-150.0, -150.0, 40.0), pose(-146.0, -141.0, 45.0)
     tracker.track(0, picture(ground, pose(100.0, 120.0)))
@@ -232,7 +232,7 @@ def test_two_frames_that_agree_with_each_other_are_a_new_fragment(ground: np.nda
     assert is_right(motion, first, second)
 
 
-def test_the_same_frames_give_the_same_matches(ground: np.ndarray) -> None:
+def test_tracking_is_deterministic(ground: np.ndarray) -> None:
     frames = [picture(ground, pose(0.0, 14.0 * i, 6.0 * i)) for i in range(4)] + [foreign()]
     runs = []
     for _ in range(2):
@@ -248,7 +248,7 @@ def test_the_same_frames_give_the_same_matches(ground: np.ndarray) -> None:
         )
 
 
-def test_noise_and_light_do_not_matter(ground: np.ndarray) -> None:
+def test_tracking_is_robust_to_noise_and_illumination(ground: np.ndarray) -> None:
     rng = np.random.default_rng(3)
     tracker, first, second = FrameTracker(PINHOLE), pose(0.0, 0.0), pose(3.0, 12.0)
     tracker.track(0, picture(ground, first))

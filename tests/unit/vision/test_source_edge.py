@@ -1,4 +1,4 @@
-"""The live edge: pace, newest first, going on after a restart, the end."""
+"""The source edge: real-time playback, newest frame first, restart, end of the source."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -14,36 +14,36 @@ from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import Frame, Message, Origin, SourceEnded, VehicleState
-from terrafix.vision.edge import OVERTAKEN, SourceEdge, make_edge
+from terrafix.vision.edge import DROPPED_ERROR, SourceEdge, make_edge
 from terrafix.vision.sources import Shot, open_source
 
 pytestmark = pytest.mark.real_time
 
 
 class Listener:
-    """Polls an edge until something is true, as the live shell would."""
+    """Polls an edge until a condition holds, as the process loop does."""
 
     def __init__(self, edge: SourceEdge) -> None:
         self.edge = edge
-        self.said: list[Message] = []
+        self.messages: list[Message] = []
         self.heard_ns: dict[int, int] = {}
 
     def until(self, true: Callable[[], bool], limit_s: float = 10.0) -> None:
         end_ns = now_ns() + round(limit_s * 1e9)
         while not true():
-            assert now_ns() < end_ns, f"never happened; said: {[type(m).__name__ for m in self.said]}"
+            assert now_ns() < end_ns, f"never happened; messages: {[type(m).__name__ for m in self.messages]}"
             for message in self.edge.poll(now_ns()):
-                self.said.append(message)
+                self.messages.append(message)
                 if isinstance(message, Frame):
                     self.heard_ns[message.frame_id] = now_ns()
             time.sleep(0.002)
 
     @property
     def frames(self) -> list[Frame]:
-        return [m for m in self.said if isinstance(m, Frame)]
+        return [m for m in self.messages if isinstance(m, Frame)]
 
     def ended(self) -> bool:
-        return any(isinstance(m, SourceEnded) for m in self.said)
+        return any(isinstance(m, SourceEnded) for m in self.messages)
 
 
 @pytest.fixture
@@ -60,44 +60,46 @@ def edge_of(closing: list[SourceEdge], folder: Path, epoch_ns: int | None = None
     return Listener(edge)
 
 
-def test_a_flight_is_played_at_its_pace(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_a_recording_plays_in_real_time(tmp_path: Path, closing: list[SourceEdge]) -> None:
     listener = edge_of(closing, flight(tmp_path / "f", 4, step_s=0.1))
     listener.until(listener.ended)
-    assert isinstance(listener.said[0], Origin)
-    zero_ns = listener.said[0].t_ns
+    assert isinstance(listener.messages[0], Origin)
+    zero_ns = listener.messages[0].t_ns
     assert [f.t_ns - zero_ns for f in listener.frames] == [i * 100_000_000 for i in range(4)]
     for frame in listener.frames:
         assert listener.heard_ns[frame.frame_id] >= frame.t_ns  # not before its time
-    states = [m for m in listener.said if isinstance(m, VehicleState)]
+    states = [m for m in listener.messages if isinstance(m, VehicleState)]
     assert [s.t_ns for s in states] == [f.t_ns for f in listener.frames]
-    assert listener.said[-1].frames == 4  # type: ignore[attr-defined]
-    assert list(listener.edge.poll(now_ns())) == []  # the end is said once
+    assert listener.messages[-1].frames == 4  # type: ignore[attr-defined]
+    assert list(listener.edge.poll(now_ns())) == []  # the end is published once
 
 
-def test_a_restart_goes_on_where_the_flight_is(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_a_restart_resumes_at_the_current_flight_time(tmp_path: Path, closing: list[SourceEdge]) -> None:
     epoch_ns = now_ns() - 550_000_000
     listener = edge_of(closing, flight(tmp_path / "f", 12, step_s=0.1), epoch_ns)
     listener.until(listener.ended)
-    assert listener.said[0].t_ns == epoch_ns
+    assert listener.messages[0].t_ns == epoch_ns
     ids = [f.frame_id for f in listener.frames]
     assert ids[0] >= 6 and ids == list(range(ids[0], 12))
     assert [f.t_ns - epoch_ns for f in listener.frames] == [i * 100_000_000 for i in ids]
 
 
-def test_a_restart_after_the_end_says_the_end(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_a_restart_after_the_end_publishes_the_end(tmp_path: Path, closing: list[SourceEdge]) -> None:
     listener = edge_of(closing, flight(tmp_path / "f", 3, step_s=0.1), now_ns() - 10**10)
     listener.until(listener.ended)
-    assert listener.frames == [] and listener.said[-1].frames == 3  # type: ignore[attr-defined]
+    assert listener.frames == [] and listener.messages[-1].frames == 3  # type: ignore[attr-defined]
 
 
-def test_as_fast_as_it_can_loses_nothing(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_playback_without_real_time_drops_no_frame(tmp_path: Path, closing: list[SourceEdge]) -> None:
     listener = edge_of(closing, flight(tmp_path / "f", 12, step_s=60.0), realtime=False)
     listener.until(listener.ended)
     assert [f.frame_id for f in listener.frames] == list(range(12))
     assert not any(f.error for f in listener.frames)
 
 
-def test_the_newest_wins_and_the_others_are_told(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_the_newest_frame_is_delivered_and_dropped_frames_are_published_with_an_error(
+    tmp_path: Path, closing: list[SourceEdge]
+) -> None:
     listener = edge_of(closing, flight(tmp_path / "f", 10, step_s=0.02))
     listener.until(lambda: len(listener.frames) >= 1)
     time.sleep(0.7)  # vision is busy with the first frame
@@ -105,13 +107,13 @@ def test_the_newest_wins_and_the_others_are_told(tmp_path: Path, closing: list[S
     assert [f.frame_id for f in listener.frames] == list(range(10))
     whole = [f.frame_id for f in listener.frames if not f.error]
     assert len(whole) <= 5 and whole[-3:] == [7, 8, 9]
-    assert {f.error for f in listener.frames} == {"", OVERTAKEN}
-    times = [m.t_ns for m in listener.said[1:-1]]
+    assert {f.error for f in listener.frames} == {"", DROPPED_ERROR}
+    times = [m.t_ns for m in listener.messages[1:-1]]
     assert times == sorted(times)
 
 
 class BrokenSource:
-    """A source with a bug, and as a live camera: ids start anew at 0 each time."""
+    """A source that can raise, and can act as a live camera, whose frame ids restart at 0."""
 
     def __init__(self, real: str, live: bool, bug: bool) -> None:
         self._real = open_source(real)
@@ -133,14 +135,14 @@ class BrokenSource:
             yield Shot(frame, (), picture(i))
 
 
-def test_a_bug_in_the_thread_ends_the_process(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_an_exception_in_the_reader_thread_ends_the_process(tmp_path: Path, closing: list[SourceEdge]) -> None:
     edge = SourceEdge(BrokenSource(str(flight(tmp_path / "f")), live=False, bug=True), MemoryFrameStore(), None, True)
     closing.append(edge)
     with pytest.raises(ZeroDivisionError):
         Listener(edge).until(lambda: False)
 
 
-def test_ids_of_a_camera_grow_over_a_restart(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_frame_ids_of_a_camera_increase_over_a_restart(tmp_path: Path, closing: list[SourceEdge]) -> None:
     camera = BrokenSource(str(flight(tmp_path / "f")), live=True, bug=False)
     store = MemoryFrameStore()
     edge = SourceEdge(camera, store, now_ns() - 5 * 10**9, True)
@@ -150,7 +152,7 @@ def test_ids_of_a_camera_grow_over_a_restart(tmp_path: Path, closing: list[Sourc
     first, second = (f.frame_id for f in listener.frames)
     assert first >= 5000 and second == first + 1
     assert store.get(second) is not None
-    assert abs(now_ns() - listener.frames[0].t_ns) < 5 * 10**9  # a camera's times are on our clock already
+    assert abs(now_ns() - listener.frames[0].t_ns) < 5 * 10**9  # camera times are already on the monotonic clock
 
 
 def test_make_edge_reads_the_configuration(tmp_path: Path, closing: list[SourceEdge]) -> None:
@@ -169,9 +171,9 @@ def test_make_edge_reads_the_configuration(tmp_path: Path, closing: list[SourceE
         make_edge(context())
 
 
-@pytest.mark.parametrize(("own", "said"), [(None, 612.0), (40.0, 40.0)])
-def test_the_ground_of_the_map_stands_in_for_one_that_the_source_does_not_know(
-    tmp_path: Path, closing: list[SourceEdge], own: float | None, said: float
+@pytest.mark.parametrize(("own", "expected_m"), [(None, 612.0), (40.0, 40.0)])
+def test_the_ground_height_of_the_map_is_the_default_for_a_source_without_one(
+    tmp_path: Path, closing: list[SourceEdge], own: float | None, expected_m: float
 ) -> None:
     source = open_source(str(flight(tmp_path / "f")))
     known = msgspec.structs.replace(source.origin(), ground_amsl_m=own)
@@ -180,4 +182,4 @@ def test_the_ground_of_the_map_stands_in_for_one_that_the_source_does_not_know(
     closing.append(edge)
     listener = Listener(edge)
     listener.until(listener.ended)
-    assert isinstance(listener.said[0], Origin) and listener.said[0].ground_amsl_m == said
+    assert isinstance(listener.messages[0], Origin) and listener.messages[0].ground_amsl_m == expected_m

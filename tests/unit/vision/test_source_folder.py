@@ -1,4 +1,4 @@
-"""Flight folders: what is read, and what every kind of bad input says."""
+"""Flight folders: what is read, and the error for every kind of invalid input."""
 
 import math
 import shutil
@@ -20,7 +20,7 @@ def one_line(error: pytest.ExceptionInfo[Exception]) -> str:
     return text
 
 
-def test_a_flight_gives_its_frames_in_order_with_telemetry(tmp_path: Path) -> None:
+def test_a_flight_folder_yields_its_frames_in_order_with_telemetry(tmp_path: Path) -> None:
     source = open_source(str(flight(tmp_path / "f")))
     shots = list(source.shots())
     assert [s.frame.frame_id for s in shots] == [0, 1, 2, 3, 4]
@@ -36,14 +36,14 @@ def test_a_flight_gives_its_frames_in_order_with_telemetry(tmp_path: Path) -> No
     assert (origin.yaw_sigma_deg, origin.camera.mount_pitch_deg) == (3.0, -90.0)
 
 
-def test_going_on_in_the_middle_keeps_ids_and_times(tmp_path: Path) -> None:
+def test_starting_in_the_middle_keeps_frame_ids_and_times(tmp_path: Path) -> None:
     source = open_source(str(flight(tmp_path / "f")))
     shots = list(source.shots(from_s=0.9))
     assert [(s.frame.frame_id, s.frame.t_ns) for s in shots] == [(2, 10**9), (3, 1_500_000_000), (4, 2 * 10**9)]
     assert len(shots[0].states) == 1
 
 
-def test_start_on_the_command_line_wins_and_may_be_missing(tmp_path: Path) -> None:
+def test_a_start_argument_overrides_the_file_and_both_may_be_missing(tmp_path: Path) -> None:
     without = TOML.replace("[start]\nlat_deg = 48.0\nlon_deg = 2.0\n", "")
     folder = str(flight(tmp_path / "f", toml=without))
     assert open_source(folder, start=(1.0, 2.0)).origin().lat_deg == 1.0
@@ -52,13 +52,13 @@ def test_start_on_the_command_line_wins_and_may_be_missing(tmp_path: Path) -> No
     assert open_source(str(flight(tmp_path / "g")), start=(1.0, 2.0)).origin().lon_deg == 2.0
 
 
-def test_only_file_and_time_are_enough(tmp_path: Path) -> None:
+def test_frames_csv_needs_only_file_and_time(tmp_path: Path) -> None:
     folder = flight(tmp_path / "f", frames=2, csv="\ufefffile,t_s\r\n0000.jpg,0\r\n0001.jpg,1.5\r\n")
     assert [(s.frame.t_ns, s.states) for s in open_source(str(folder)).shots()] == [(0, ()), (1_500_000_000, ())]
 
 
 @pytest.mark.parametrize(
-    ("rows", "said"),
+    ("rows", "expected_text"),
     [
         ("0000.jpg,0,,,,\n0009.jpg,1,,,,", "row 3: frames/0009.jpg does not exist"),
         ("0000.jpg,0,,,,\n0001.jpg,0,,,,", "row 3: t_s 0 is not later"),
@@ -75,15 +75,15 @@ def test_only_file_and_time_are_enough(tmp_path: Path) -> None:
         ("", "there are no rows"),
     ],
 )
-def test_a_wrong_row_is_named(tmp_path: Path, rows: str, said: str) -> None:
+def test_an_invalid_row_is_named(tmp_path: Path, rows: str, expected_text: str) -> None:
     folder = flight(tmp_path / "f", csv=f"{HEADER}\n{rows}\n")
     with pytest.raises(SourceError) as error:
         open_source(str(folder))
-    assert said in one_line(error) and "frames.csv" in str(error.value)
+    assert expected_text in one_line(error) and "frames.csv" in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("header", "said"),
+    ("header", "expected_text"),
     [
         ("file,t_s,heading", "unknown column 'heading'"),
         ("file,yaw_deg", "there is no column 't_s'"),
@@ -91,14 +91,14 @@ def test_a_wrong_row_is_named(tmp_path: Path, rows: str, said: str) -> None:
         ("file,t_s,t_s", "a column stands twice"),
     ],
 )
-def test_a_wrong_header_is_named(tmp_path: Path, header: str, said: str) -> None:
+def test_an_invalid_header_is_named(tmp_path: Path, header: str, expected_text: str) -> None:
     with pytest.raises(SourceError) as error:
         open_source(str(flight(tmp_path / "f", csv=f"{header}\n0000.jpg,0,0\n")))
-    assert said in one_line(error)
+    assert expected_text in one_line(error)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "expected_text"),
     [
         ("fx = 300\n", "", "[camera] has no 'fx'; add it"),
         ("fx = 300\n", "focal_x = 300\n", "unknown key 'focal_x' in [camera]"),
@@ -113,21 +113,21 @@ def test_a_wrong_header_is_named(tmp_path: Path, header: str, said: str) -> None
         ("[camera]", "[camera", "not valid TOML"),
     ],
 )
-def test_a_wrong_key_is_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_an_invalid_key_is_named(tmp_path: Path, old: str, new: str, expected_text: str) -> None:
     assert old in TOML
     with pytest.raises(SourceError) as error:
         open_source(str(flight(tmp_path / "f", toml=TOML.replace(old, new, 1))))
-    assert said in one_line(error) and "flight.toml" in str(error.value)
+    assert expected_text in one_line(error) and "flight.toml" in str(error.value)
 
 
-def test_no_camera_says_what_to_add(tmp_path: Path) -> None:
+def test_a_missing_camera_section_is_reported_with_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(SourceError) as error:
         open_source(str(flight(tmp_path / "f", toml="[start]\nlat_deg=1\nlon_deg=2\n")))
     assert "add one with width, height, fx, fy, cx, cy" in one_line(error)
 
 
 @pytest.mark.parametrize("gone", ["flight.toml", "frames.csv", "frames"])
-def test_a_missing_part_is_named(tmp_path: Path, gone: str) -> None:
+def test_a_missing_file_or_folder_is_named(tmp_path: Path, gone: str) -> None:
     folder = flight(tmp_path / "f")
     shutil.rmtree(folder / gone) if gone == "frames" else (folder / gone).unlink()
     with pytest.raises(SourceError) as error:
@@ -135,7 +135,7 @@ def test_a_missing_part_is_named(tmp_path: Path, gone: str) -> None:
     assert gone in one_line(error)
 
 
-def test_what_is_no_source_is_said(tmp_path: Path) -> None:
+def test_a_path_that_is_not_a_source_is_reported(tmp_path: Path) -> None:
     (tmp_path / "text.txt").write_text("hello")
     (tmp_path / "one.jpg").write_bytes(jpeg(0))
     (tmp_path / "empty").mkdir()
@@ -152,13 +152,13 @@ def _cut(data: bytes) -> bytes:
 
 
 def _with_thumbnail(data: bytes) -> bytes:
-    """A thumbnail in APP1 ends with an end marker of its own."""
+    """A thumbnail in APP1 has its own end marker."""
     thumbnail = b"Exif\0\0" + jpeg(9, 64, 48)
     return data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "expected_text"),
     [
         (lambda d: b"", "empty"),
         (lambda d: b"no picture", "cannot be decoded"),
@@ -169,17 +169,17 @@ def _with_thumbnail(data: bytes) -> bytes:
         (lambda d: jpeg(0, 640, 480), "wrong size: 640x480, the camera says 320x240"),
     ],
 )
-def test_a_bad_frame_costs_that_frame_only(tmp_path: Path, damage, said: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_damaged_frame_loses_one_frame_only(tmp_path: Path, damage, expected_text: str) -> None:  # type: ignore[no-untyped-def]
     folder = flight(tmp_path / "f")
     victim = folder / "frames" / "0002.jpg"
     victim.write_bytes(damage(victim.read_bytes()))
     shots = list(open_source(str(folder)).shots())
-    assert said in shots[2].frame.error and shots[2].image is None
+    assert expected_text in shots[2].frame.error and shots[2].image is None
     assert [bool(s.frame.error) for s in shots] == [False, False, True, False, False]
     assert shots[2].states
 
 
-def test_a_camera_of_another_size_is_said_before_the_flight(tmp_path: Path) -> None:
+def test_a_camera_size_mismatch_is_reported_before_the_flight(tmp_path: Path) -> None:
     toml = TOML.replace("width = 320", "width = 640").replace("height = 240", "height = 480")
     with pytest.raises(SourceError) as error:
         open_source(str(flight(tmp_path / "f", toml=toml)))
@@ -193,15 +193,15 @@ def test_a_folder_named_like_a_camera_is_a_folder(tmp_path: Path, monkeypatch: p
     assert open_source("2014").length() == open_source("now!").length() == 5
 
 
-def test_a_frame_that_vanishes_in_flight_costs_that_frame_only(tmp_path: Path) -> None:
+def test_a_frame_deleted_in_flight_loses_one_frame_only(tmp_path: Path) -> None:
     folder = flight(tmp_path / "f")
     source = open_source(str(folder))
     (folder / "frames" / "0003.jpg").unlink()
     assert [bool(s.frame.error) for s in source.shots()] == [False, False, False, True, False]
 
 
-def test_whole_pictures_pass(tmp_path: Path) -> None:
-    """Trailing bytes, a thumbnail, and a picture that is grey by nature."""
+def test_complete_images_are_accepted(tmp_path: Path) -> None:
+    """Trailing bytes, a thumbnail, and an image that is grey all over."""
     import cv2
 
     folder = flight(tmp_path / "f", frames=4)
@@ -214,7 +214,7 @@ def test_whole_pictures_pass(tmp_path: Path) -> None:
     assert [s.frame.error for s in open_source(str(folder)).shots()] == [""] * 4
 
 
-def test_start_text() -> None:
+def test_a_start_argument_is_parsed_and_validated() -> None:
     assert parse_start(" -29.4167, -51.94 ") == (-29.4167, -51.94)
     assert parse_start("") is None
     for wrong in ("48", "48,2,3", "north,east", "120,30", "nan,0"):
@@ -224,7 +224,7 @@ def test_start_text() -> None:
 
 
 @pytest.mark.parametrize(("name", "frames"), [("village-1", 358), ("town-a", 31)])
-def test_real_flights_load_as_they_are(data_set: Callable[[str], Path], name: str, frames: int) -> None:
+def test_real_flights_load(data_set: Callable[[str], Path], name: str, frames: int) -> None:
     source = open_source(str(data_set(f"flights/{name}")))
     assert source.length() == frames
     hint = source.map_hint()
@@ -234,7 +234,7 @@ def test_real_flights_load_as_they_are(data_set: Callable[[str], Path], name: st
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "expected_text"),
     [
         ("fx = 300\n", "fx = 2.8\n", "are a field of view of 178.0 degrees, more than 160; is that in millimetres?"),
         ("fy = 300.0\n", "fy = 2.8\n", "fy is in pixels: millimetres / sensor size in millimetres * 240"),
@@ -250,11 +250,11 @@ def test_real_flights_load_as_they_are(data_set: Callable[[str], Path], name: st
         ("[start]", "[mount]\nroll_deg = 100.0\npitch_deg = 0\n[start]", "do not look down"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused_with_what_was_meant(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_an_implausible_camera_is_rejected_with_a_hint(tmp_path: Path, old: str, new: str, expected_text: str) -> None:
     assert old in TOML
     with pytest.raises(SourceError) as error:
         open_source(str(flight(tmp_path / "f", toml=TOML.replace(old, new, 1))))
-    assert said in one_line(error) and "flight.toml" in str(error.value)
+    assert expected_text in one_line(error) and "flight.toml" in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -266,13 +266,13 @@ def test_a_camera_that_cannot_be_is_refused_with_what_was_meant(tmp_path: Path, 
         ("[start]", "[mount]\npitch_deg = -30.0\n[start]"),
     ],
 )
-def test_an_unusual_camera_is_taken(tmp_path: Path, old: str, new: str) -> None:
+def test_an_unusual_but_plausible_camera_is_accepted(tmp_path: Path, old: str, new: str) -> None:
     assert old in TOML
     open_source(str(flight(tmp_path / "f", toml=TOML.replace(old, new, 1))))
 
 
 @pytest.mark.parametrize(("agl", "refused"), [(12_000.0, True), (4_900.0, False)])
-def test_heights_that_cannot_be_metres_are_refused(tmp_path: Path, agl: float, refused: bool) -> None:
+def test_heights_that_cannot_be_metres_are_rejected(tmp_path: Path, agl: float, refused: bool) -> None:
     rows = "\n".join(f"{i:04}.jpg,{i}.0,,,,{agl if i else 0.0}" for i in range(5))
     folder = flight(tmp_path / "f", csv=f"file,t_s,yaw_deg,pitch_deg,roll_deg,agl_m\n{rows}\n")
     if not refused:

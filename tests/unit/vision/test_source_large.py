@@ -1,4 +1,4 @@
-"""Large pictures are read smaller: the same rays, the same refusals, a fraction of the memory."""
+"""Large images are downscaled when they are read: the same rays, the same errors, a fraction of the memory."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import pytest
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.frames import MIN_SLOTS, MemoryFrameStore
 from terrafix.messages import Camera
-from terrafix.vision.sources.images import decode_image, read_image, reduced, reduction
+from terrafix.vision.sources.images import decode_image, downscale_factor, downscaled_camera, read_image
 
 WIDTH, HEIGHT = 3105, 2071  # neither is a multiple of a block, nor of two
 CAMERA = Camera(
@@ -29,7 +29,7 @@ def dotted() -> np.ndarray:
 
 
 def middles(image: np.ndarray, near: np.ndarray, reach: int) -> np.ndarray:
-    """(N, 2) centre of what is bright around each place."""
+    """(N, 2) centroids of the brightness around each point."""
     found = []
     for x, y in near:
         x0, y0 = round(x) - reach, round(y) - reach
@@ -41,11 +41,11 @@ def middles(image: np.ndarray, near: np.ndarray, reach: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_what_is_seen_through_the_smaller_camera_is_where_it_was(tmp_path: Path, suffix: str) -> None:
+def test_rays_through_the_downscaled_camera_are_unchanged(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     cv2.imwrite(str(path), dotted())
     image, error = read_image(path, WIDTH, HEIGHT)
-    small = CameraCalibration.of(reduced(CAMERA))
+    small = CameraCalibration.of(downscaled_camera(CAMERA))
     assert error == "" and image is not None
     assert image.shape == (small.height, small.width, 3) == (1036, 1553, 3)
     stored = CameraCalibration.of(CAMERA)
@@ -55,32 +55,32 @@ def test_what_is_seen_through_the_smaller_camera_is_where_it_was(tmp_path: Path,
 
 
 @pytest.mark.parametrize("width, by", [(640, 1), (2999, 1), (3000, 2), (4000, 2), (6252, 4), (12_000, 8), (40_000, 8)])
-def test_pictures_stay_as_wide_as_anything_looks(width: int, by: int) -> None:
-    assert reduction(width) == by
-    camera = reduced(Camera(width=width, height=width, fx=1.0, fy=1.0, cx=0.0, cy=0.0))
+def test_the_downscale_factor_keeps_the_minimum_width(width: int, by: int) -> None:
+    assert downscale_factor(width) == by
+    camera = downscaled_camera(Camera(width=width, height=width, fx=1.0, fy=1.0, cx=0.0, cy=0.0))
     assert camera.width >= min(width, 1500)
 
 
-def test_a_small_picture_is_read_as_it_is_stored() -> None:
+def test_a_small_image_is_not_downscaled() -> None:
     camera = Camera(width=1600, height=900, fx=1100.0, fy=1100.0, cx=799.5, cy=449.5)
-    assert reduced(camera) == camera
+    assert downscaled_camera(camera) == camera
 
 
-def test_a_picture_of_another_size_is_refused(tmp_path: Path) -> None:
+def test_an_image_of_another_size_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), np.zeros((HEIGHT, 3600, 3), np.uint8))
     image, error = read_image(path, WIDTH, HEIGHT)
     assert image is None and error.startswith("wrong size") and f"says {WIDTH}x{HEIGHT}" in error
 
 
-def test_data_that_ran_out_are_noticed_in_the_smaller_picture_too() -> None:
+def test_grey_fill_is_detected_in_a_downscaled_image() -> None:
     noise = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     data = cv2.imencode(".jpg", noise)[1].tobytes()
     image, error = decode_image(data[: len(data) // 2] + b"\xff\xd9", WIDTH, HEIGHT, 2)
     assert image is None and "ran out of data" in error
 
 
-def test_fewer_large_frames_are_kept() -> None:
+def test_the_frame_store_keeps_fewer_large_frames() -> None:
     store = MemoryFrameStore()
     for i in range(7):
         store.put(i, np.zeros((4168, 6252, 3), np.uint8))

@@ -1,4 +1,4 @@
-"""Photos: order, focal length, heading, height and start out of EXIF and XMP."""
+"""Photos: order, focal length, heading, height and initial position from EXIF and XMP."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import rot_w_b
 from terrafix.core.initial_position import start_is_unknown
 from terrafix.vision.sources import open_source
-from terrafix.vision.sources.photos import body_of_gimbal
+from terrafix.vision.sources.photos import body_angles_from_gimbal
 
 XMP = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -33,7 +33,7 @@ def photo(path: Path, seconds: int | None = 0, *, focal35: int | None = 24, gps:
     Image.fromarray(picture(1)).save(path, exif=exif, xmp=XMP.format(xmp).encode())
 
 
-def test_photos_say_everything_by_themselves(tmp_path: Path) -> None:
+def test_photos_provide_all_metadata(tmp_path: Path) -> None:
     photo(tmp_path / "b.jpg", 0)
     photo(tmp_path / "a.jpg", 7)
     source = open_source(str(tmp_path))
@@ -48,13 +48,13 @@ def test_photos_say_everything_by_themselves(tmp_path: Path) -> None:
     assert not {"lat", "lon"} & {name[:3] for name in state.__struct_fields__}
 
 
-def test_photos_of_one_second_share_it(tmp_path: Path) -> None:
+def test_photos_of_one_second_are_distributed_in_it(tmp_path: Path) -> None:
     for name, second in (("a", 0), ("b", 0), ("c", 1), ("d", 1)):
         photo(tmp_path / f"{name}.jpg", second)
     assert [s.frame.t_ns for s in open_source(str(tmp_path)).shots()] == [0, 500_000_000, 10**9, 1_500_000_000]
 
 
-def test_a_broken_photo_costs_that_photo_only(tmp_path: Path) -> None:
+def test_a_broken_photo_loses_one_frame_only(tmp_path: Path) -> None:
     for i in range(3):
         photo(tmp_path / f"{i}.jpg", i * 5)
     whole = (tmp_path / "1.jpg").read_bytes()
@@ -65,7 +65,7 @@ def test_a_broken_photo_costs_that_photo_only(tmp_path: Path) -> None:
     assert shots[0].frame.t_ns < shots[1].frame.t_ns < shots[2].frame.t_ns
 
 
-def test_without_coordinate_the_start_is_unknown_and_without_focal_length_it_says_what_to_do(tmp_path: Path) -> None:
+def test_photos_without_coordinate_have_an_unknown_start_and_without_focal_length_are_an_error(tmp_path: Path) -> None:
     photo(tmp_path / "a.jpg", gps=False)
     assert start_is_unknown(open_source(str(tmp_path)).origin())
     assert open_source(str(tmp_path), start=(3.0, 4.0)).origin().lon_deg == 4.0
@@ -79,7 +79,7 @@ def test_without_coordinate_the_start_is_unknown_and_without_focal_length_it_say
     assert [s.states for s in source.shots()] == [()]
 
 
-def test_without_any_time_names_give_the_order(tmp_path: Path) -> None:
+def test_photos_without_times_are_ordered_by_name(tmp_path: Path) -> None:
     for name in ("2.jpg", "1.jpg"):
         photo(tmp_path / name, None)
     assert [(s.frame.file, s.frame.t_ns) for s in open_source(str(tmp_path)).shots()] == [
@@ -88,23 +88,23 @@ def test_without_any_time_names_give_the_order(tmp_path: Path) -> None:
     ]
 
 
-def test_unreadable_photos_only(tmp_path: Path) -> None:
+def test_a_folder_of_unreadable_photos_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(b"nothing")
     with pytest.raises(SourceError, match="none of the 1 photos can be read"):
         open_source(str(tmp_path))
 
 
 @pytest.mark.parametrize("gimbal", [(45.0, -90.0, 0.0), (45.0, -80.0, 0.0), (-120.0, -85.0, 4.0), (10.0, -90.0, 3.0)])
-def test_the_virtual_body_carries_the_camera_where_the_gimbal_points(gimbal: tuple[float, float, float]) -> None:
-    """The camera looks along the gimbal's forward axis; the top of its image is against the gimbal's down axis."""
+def test_the_virtual_body_attitude_points_the_camera_along_the_gimbal(gimbal: tuple[float, float, float]) -> None:
+    """The camera looks along the gimbal's forward axis; its image top is opposite to the gimbal's down axis."""
     r_w_gimbal = rot_w_b(*(math.radians(angle) for angle in gimbal))
-    r_w_b = rot_w_b(*body_of_gimbal(*gimbal))
+    r_w_b = rot_w_b(*body_angles_from_gimbal(*gimbal))
     r_w_c = r_w_b @ Mount().r_b_c()
     assert r_w_c[:, 2] == pytest.approx(r_w_gimbal[:, 0], abs=1e-9)
     assert r_w_c[:, 1] == pytest.approx(r_w_gimbal[:, 2], abs=1e-9)
 
 
-def test_real_photos(data_set: Callable[[str], Path]) -> None:
+def test_real_photos_are_read(data_set: Callable[[str], Path]) -> None:
     source = open_source(str(data_set("photos/brighton_beach")))
     assert source.origin().camera.fx == pytest.approx(3.61 / 6.17 * 4000 / 2)  # read at half their size
     assert (source.origin().lat_deg, source.origin().lon_deg) == pytest.approx((46.842607, -91.994560), abs=1e-6)

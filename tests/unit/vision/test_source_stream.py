@@ -1,4 +1,4 @@
-"""Frames over HTTP: exact times, lost connections, foreign cameras, and a stream to the real source."""
+"""Frames over HTTP: exposure times, lost connections, other cameras, and a stream to the real source."""
 
 import http.server
 import threading
@@ -28,7 +28,7 @@ def description(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def watch() -> Iterator[Callable[[Source], list[Shot]]]:
-    """``watch(source)``: the list that its shots go into, from a thread as in flight."""
+    """``watch(source)``: a list to which a thread appends the shots, as in flight."""
     running: list[tuple[Source, threading.Thread]] = []
 
     def start(source: Source) -> list[Shot]:
@@ -52,13 +52,13 @@ def until(true: Callable[[], bool], limit_s: float = 20.0) -> None:
         time.sleep(0.005)
 
 
-def test_frames_arrive_with_their_own_times(description: Path, watch: Callable[[Source], list[Shot]]) -> None:
+def test_mjpeg_frames_carry_their_exposure_times(description: Path, watch: Callable[[Source], list[Shot]]) -> None:
     with FrameStream(jpeg_quality=95) as stream:
         source = open_source(stream.url, camera=description, rate_hz=100.0)
         assert source.live
         seen = watch(source)
         assert stream.wait_for_viewer(10.0)
-        base_ns = now_ns() - 5_000_000_000  # exposed long before they are sent, as late frames are
+        base_ns = now_ns() - 5_000_000_000  # exposed long before they are sent, like delayed frames
         for i in range(5):
             stream.push(picture(i), base_ns + i * 50_000_001)
         until(lambda: len(seen) == 5)
@@ -69,7 +69,7 @@ def test_frames_arrive_with_their_own_times(description: Path, watch: Callable[[
         assert float(np.abs(shot.image.astype(float) - picture(i)).mean()) < 6.0
 
 
-def test_a_lost_stream_is_waited_for(description: Path, watch: Callable[[Source], list[Shot]]) -> None:
+def test_a_lost_stream_is_reconnected(description: Path, watch: Callable[[Source], list[Shot]]) -> None:
     first = FrameStream()
     port = int(first.url.rstrip("/").rsplit(":", 1)[1])
     seen = watch(open_source(first.url, camera=description, rate_hz=1e6))
@@ -87,7 +87,7 @@ def test_a_lost_stream_is_waited_for(description: Path, watch: Callable[[Source]
     assert errors[0] == "" and "decoded" in errors[1] and "wrong size: 160x120" in errors[2] and errors[3] == ""
 
 
-def test_nobody_waits_for_a_slow_viewer(description: Path) -> None:
+def test_a_slow_mjpeg_client_does_not_block_the_server(description: Path) -> None:
     with FrameStream() as stream:
         source = open_source(stream.url, camera=description, rate_hz=1000.0)
         assert stream.wait_for_viewer(10.0)
@@ -101,7 +101,7 @@ def test_nobody_waits_for_a_slow_viewer(description: Path) -> None:
 
 
 class ForeignCamera(http.server.BaseHTTPRequestHandler):
-    """Neither lengths nor times, and a boundary with the dashes in the header, as some cameras do it."""
+    """Sends no lengths or times, and a boundary with the dashes in the header, as some cameras do."""
 
     def do_GET(self) -> None:
         if self.path != "/video":
@@ -118,7 +118,7 @@ class ForeignCamera(http.server.BaseHTTPRequestHandler):
         pass
 
 
-def test_a_camera_of_another_make(description: Path) -> None:
+def test_an_mjpeg_stream_without_lengths_and_times_is_read(description: Path) -> None:
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), ForeignCamera)
     threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     address = f"http://127.0.0.1:{server.server_address[1]}"
@@ -140,16 +140,16 @@ def test_a_camera_of_another_make(description: Path) -> None:
         server.server_close()
 
 
-def test_mistakes_are_one_clear_line(description: Path) -> None:
+def test_stream_errors_are_one_line(description: Path) -> None:
     with FrameStream() as stream:
         url = stream.url
         with pytest.raises(UsageError, match="cannot be streamed there"):
             FrameStream(int(url.rstrip("/").rsplit(":", 1)[1]))
         with pytest.raises(SourceError, match=r"set \[source\] camera"):
             open_source(url)
-    with pytest.raises(SourceError, match="nobody sends pictures there"):
+    with pytest.raises(SourceError, match="no response from the stream"):
         open_source(url, camera=description)
-    with pytest.raises(SourceError, match="nobody sends pictures there"):
+    with pytest.raises(SourceError, match="no response from the stream"):
         open_source("http://127.0.0.1:99999/", camera=description)
     source = open_source(url, camera=description, wait_for_camera=True)  # a restart in flight
     source.close()

@@ -1,4 +1,4 @@
-"""Videos, cameras and telemetry logs: the sources with a clock of their own."""
+"""Videos, cameras and telemetry logs: sources with their own clock."""
 
 import math
 import struct
@@ -33,7 +33,7 @@ def video(path: Path, seconds: float = 3.0, fps: float = 10.0) -> Path:
     return path
 
 
-def test_a_video_is_sampled_at_its_own_times(tmp_path: Path) -> None:
+def test_a_video_is_sampled_by_its_timestamps(tmp_path: Path) -> None:
     path = video(tmp_path / "flight.mp4")
     path.with_suffix(".csv").write_text("t_s,agl_m\n0,50\n0.2,51\n0.4,52\n")
     source = open_source(str(path))
@@ -41,7 +41,7 @@ def test_a_video_is_sampled_at_its_own_times(tmp_path: Path) -> None:
     assert [round(s.frame.t_ns / 1e9, 3) for s in shots] == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
     assert [s.frame.frame_id for s in shots] == list(range(6))
     assert source.length() == 6
-    for i, shot in enumerate(shots):  # the picture is the one of that time
+    for i, shot in enumerate(shots):  # the image is the one of that time
         assert shot.image is not None and abs(float(shot.image.mean()) - i * 40) < 6
     assert [[s.agl_m for s in shot.states] for shot in shots[:2]] == [[50.0], [51.0, 52.0]]
     again = list(source.shots(from_s=1.2))
@@ -50,7 +50,7 @@ def test_a_video_is_sampled_at_its_own_times(tmp_path: Path) -> None:
     assert len(every) == 30
 
 
-def test_bad_videos(tmp_path: Path) -> None:
+def test_invalid_videos_are_reported(tmp_path: Path) -> None:
     path = video(tmp_path / "flight.mp4", 1.0)
     path.with_suffix(".toml").write_text(TOML.replace("width = 320", "width = 640"))
     with pytest.raises(SourceError, match="the video is 320x240"):
@@ -66,7 +66,7 @@ def test_bad_videos(tmp_path: Path) -> None:
 
 
 class FakeCamera:
-    """A device that delivers ``frames`` pictures and is then unplugged."""
+    """A device that delivers ``frames`` images and is then unplugged."""
 
     def __init__(self, frames: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
         self.left = frames
@@ -100,7 +100,7 @@ def live(tmp_path: Path, devices: Iterable[FakeCamera | None], **more: bool) -> 
     )
 
 
-def test_an_unplugged_camera_is_waited_for(tmp_path: Path) -> None:
+def test_an_unplugged_camera_is_reconnected(tmp_path: Path) -> None:
     first, second = FakeCamera(2), FakeCamera(3)
     camera = live(tmp_path, [first, None, None, second])
     began_ns = now_ns()
@@ -111,11 +111,11 @@ def test_an_unplugged_camera_is_waited_for(tmp_path: Path) -> None:
     assert times == sorted(times) and began_ns <= times[0] <= now_ns()
     assert first.released and camera.spec == "/dev/video0" and camera.live
     threading.Timer(0.05, camera.close).start()
-    assert list(shots) == []  # ends when it is closed, though no camera is there
+    assert list(shots) == []  # ends when it is closed, also without a camera
     assert second.released
 
 
-def test_a_camera_of_another_size_or_none_at_all(tmp_path: Path) -> None:
+def test_a_camera_of_another_size_or_a_missing_camera_is_reported(tmp_path: Path) -> None:
     small = FakeCamera(1, (160, 120))
     with pytest.raises(SourceError, match="the camera gives 160x120, its description says 320x240"):
         live(tmp_path, [small])
@@ -129,7 +129,7 @@ def test_a_camera_of_another_size_or_none_at_all(tmp_path: Path) -> None:
     assert probed.released
 
 
-def test_cameras_say_what_they_miss(tmp_path: Path) -> None:
+def test_missing_camera_settings_are_reported(tmp_path: Path) -> None:
     description = tmp_path / "camera.toml"
     description.write_text(DESCRIPTION)
     with pytest.raises(SourceError, match=r"set \[source\] camera"):
@@ -169,7 +169,7 @@ def hud(offset_s: float, alt_m: float) -> bytes:
     return record(offset_s, mavlink.MAVLink_vfr_hud_message(0, 0, 350, 0, alt_m, 0))
 
 
-def test_a_telemetry_log_gives_attitude_and_height(tmp_path: Path) -> None:
+def test_a_tlog_yields_attitude_and_height(tmp_path: Path) -> None:
     log = tmp_path / "t.tlog"
     log.write_bytes(attitude(0, 1.0) + hud(0.1, 300) + height(0.5, 80.5) + attitude(1, 1.1) + attitude(1.2, 2, 154))
     states = read_tlog(log)
@@ -179,7 +179,7 @@ def test_a_telemetry_log_gives_attitude_and_height(tmp_path: Path) -> None:
     assert read_tlog(log, T0_US + 250_000)[0].t_ns == -250_000_000
 
 
-def test_a_log_with_little_in_it(tmp_path: Path) -> None:
+def test_a_tlog_with_few_messages_is_read(tmp_path: Path) -> None:
     log = tmp_path / "t.tlog"
     log.write_bytes(hud(0, 300) + hud(1, 340))
     states = read_tlog(log)
@@ -187,7 +187,7 @@ def test_a_log_with_little_in_it(tmp_path: Path) -> None:
     assert [s.yaw_rad for s in states if s.yaw_rad is not None] == pytest.approx([math.radians(-10)] * 2)
 
 
-def test_damage_in_a_log_costs_the_damaged_records(tmp_path: Path) -> None:
+def test_damage_in_a_tlog_loses_the_damaged_records_only(tmp_path: Path) -> None:
     log = tmp_path / "t.tlog"
     good = [attitude(i, 0.1 * i) for i in range(5)]
     crc = bytearray(good[1])
@@ -199,11 +199,11 @@ def test_damage_in_a_log_costs_the_damaged_records(tmp_path: Path) -> None:
         read_tlog(log)
 
 
-def test_a_flight_folder_with_a_log_needs_only_file_and_time(tmp_path: Path) -> None:
+def test_a_flight_folder_with_a_tlog_needs_only_file_and_time(tmp_path: Path) -> None:
     rows = "\n".join(f"{i:04}.jpg,{i * 0.5}" for i in range(3))
     toml = TOML.replace("yaw_sigma_deg = 3.0", f"yaw_sigma_deg = 3.0\ntlog_t0_us = {T0_US}")
     folder = flight(tmp_path / "f", 3, toml=toml, csv=f"file,t_s\n{rows}\n")
-    said = [attitude(t, t) for t in (-1.0, 0.0, 0.2, 0.4, 0.9, 7.0)]
-    (folder / "telemetry.tlog").write_bytes(b"".join(said))
+    records = [attitude(t, t) for t in (-1.0, 0.0, 0.2, 0.4, 0.9, 7.0)]
+    (folder / "telemetry.tlog").write_bytes(b"".join(records))
     shots = list(open_source(str(folder)).shots())
     assert [[round(s.t_ns / 1e9, 1) for s in shot.states] for shot in shots] == [[0.0], [0.2, 0.4], [0.9]]

@@ -1,4 +1,4 @@
-"""The vision node: what it says of pictures that are no measurement."""
+"""The vision node: verdicts of images that are not usable as measurements."""
 
 import msgspec
 import numpy as np
@@ -34,54 +34,54 @@ def noisy(image: np.ndarray, seed: int) -> np.ndarray:
 
 
 def odometry(images: list[np.ndarray], origins: dict[int, Origin] | None = None) -> list[Odometry]:
-    """``origins``: said before the frame of that number, besides the first."""
+    """``origins``: published before the frame of that index, after the first one."""
     store = MemoryFrameStore()
     node = VisionNode(store)
     list(node.on(ORIGIN))
-    said = []
+    published = []
     for i, image in enumerate(images):
         if origins and i in origins:
             list(node.on(origins[i]))
         store.put(i, image)
-        said += list(node.on(Frame(t_ns=i * 500_000_000, frame_id=i, file=f"{i}.jpg", width=640, height=480)))
-    return [m for m in said if isinstance(m, Odometry)]
+        published += list(node.on(Frame(t_ns=i * 500_000_000, frame_id=i, file=f"{i}.jpg", width=640, height=480)))
+    return [m for m in published if isinstance(m, Odometry)]
 
 
 def verdicts(images: list[np.ndarray]) -> list[Verdict]:
     return [m.verdict for m in odometry(images)]
 
 
-def test_a_camera_that_repeats_its_picture_is_stalled_until_a_new_one_comes() -> None:
+def test_identical_images_are_stalled_until_a_new_one_arrives() -> None:
     still = picture(1)
     frames = [noisy(still, 1), noisy(still, 2), noisy(still, 2), noisy(still, 2), noisy(still, 3)]
-    said = verdicts(frames)
-    assert said[2:4] == [Verdict.STALLED, Verdict.STALLED]
-    assert said[1] is Verdict.ACCEPTED and said[4] is Verdict.ACCEPTED
+    published = verdicts(frames)
+    assert published[2:4] == [Verdict.STALLED, Verdict.STALLED]
+    assert published[1] is Verdict.ACCEPTED and published[4] is Verdict.ACCEPTED
 
 
-def test_standing_still_over_the_same_ground_is_not_a_stall() -> None:
+def test_a_stationary_camera_is_not_stalled() -> None:
     still = picture(2)
     assert Verdict.STALLED not in verdicts([noisy(still, i) for i in range(5)])
 
 
-def test_a_picture_that_repeats_the_one_before_but_for_noise_is_called_static() -> None:
-    said = odometry([noisy(picture(1), 1), noisy(picture(1), 2), noisy(picture(2), 3)])
-    assert [m.static for m in said] == [False, True, False]
+def test_an_image_that_equals_the_previous_one_except_for_noise_is_static() -> None:
+    published = odometry([noisy(picture(1), 1), noisy(picture(1), 2), noisy(picture(2), 3)])
+    assert [m.static for m in published] == [False, True, False]
 
 
 def test_a_stale_buffer_is_stalled() -> None:
-    said = verdicts([noisy(picture(1), 1), noisy(picture(2), 2), noisy(picture(1), 3)])
-    assert said[2] is Verdict.STALLED
+    published = verdicts([noisy(picture(1), 1), noisy(picture(2), 2), noisy(picture(1), 3)])
+    assert published[2] is Verdict.STALLED
 
 
-def test_an_origin_that_is_said_again_changes_nothing_and_another_one_begins_anew() -> None:
+def test_a_repeated_origin_changes_nothing_and_a_different_one_resets_the_tracker() -> None:
     still = noisy(picture(1), 1)
     assert odometry([still, still], {1: ORIGIN})[1].verdict is Verdict.STALLED
     other = odometry([still, still], {1: msgspec.structs.replace(ORIGIN, start_sigma_m=20.0)})[1]
     assert other.verdict is Verdict.ACCEPTED and other.becomes_keyframe
 
 
-def test_points_that_three_keyframes_saw_name_the_first_of_them() -> None:
+def test_three_view_matches_carry_the_id_of_the_previous_keyframe() -> None:
     store = MemoryFrameStore()
     node = VisionNode(store)
     list(node.on(ORIGIN))
@@ -90,7 +90,7 @@ def test_points_that_three_keyframes_saw_name_the_first_of_them() -> None:
     assert node._tracker is not None
     node._tracker.register = lambda frame_id, gray: motion  # type: ignore[method-assign]
     store.put(5, picture(1))
-    (said,) = node.on(Frame(t_ns=0, frame_id=5, file="5.jpg", width=640, height=480))
-    assert isinstance(said, Odometry)
-    assert (said.before_id, said.keyframe_id, said.triples_sigma_norm) == (2, 4, 0.002)
-    assert said.pairs == [(0.0, 1.0, 2.0, 3.0)] and said.triples == [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
+    (published,) = node.on(Frame(t_ns=0, frame_id=5, file="5.jpg", width=640, height=480))
+    assert isinstance(published, Odometry)
+    assert (published.before_id, published.keyframe_id, published.triples_sigma_norm) == (2, 4, 0.002)
+    assert published.pairs == [(0.0, 1.0, 2.0, 3.0)] and published.triples == [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]

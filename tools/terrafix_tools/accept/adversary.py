@@ -1,7 +1,7 @@
-"""The lies of lies.py over several places and seeds, in one table: python -m terrafix_tools.accept.adversary --help.
+"""The scenarios of lies.py over several places and seeds: python -m terrafix_tools.accept.adversary --help.
 
-Places: pairs of images of one place at two dates (camera on one, map of the other), the generated world, recorded
-flights. Everything lies in --out; what is there already is not flown again."""
+Places: pairs of images of one place at two dates (one for the camera, one for the map), the generated world, recorded
+flights. All results are in --out; existing ones are not flown again."""
 
 import json
 import shutil
@@ -18,15 +18,15 @@ from rasterio.errors import RasterioIOError
 
 from terrafix.core.errors import OutputError, UsageError
 from terrafix_tools.accept.cases_table import Case, Line, lines_of, markdown
-from terrafix_tools.accept.run import Wanted, accept, truth_of
+from terrafix_tools.accept.run import AcceptOptions, accept, truth_of
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.flights import make as making
 from terrafix_tools.standalone import run_standalone
 
-DURATION_S = 50.0  # of a simulated flight: 100 frames
-# Who flies over an image, and how high: the first for whose turns there is room.
+DURATION_S = 50.0  # of a simulated flight; 100 frames
+# Vehicle and height over an image: the first one whose turns fit into it.
 FLOWN_BY = ((Kind.PLANE, 130.0), (Kind.COPTER, 110.0), (Kind.COPTER, 90.0))
-COARSEST_M = 1.0  # pixel of an image: a coarser one does not show what a frame shows
+MAX_PIXEL_M = 1.0  # of an image: a coarser one lacks the detail of a frame
 BROKEN_FLOOR = 1  # exit code
 NAME = "adversary"
 
@@ -41,30 +41,29 @@ class Pair:
 
 
 def pairs(imagery: Path) -> list[Pair]:
-    """Of the folders in ``imagery`` with two or more colour images: the first two by name, then the other way round.
-
-    All places come once before one comes again. Raises UsageError: there is none."""
+    """One pair of each folder in ``imagery`` with two or more colour images (the first two by name), then all pairs
+    with camera and map exchanged. Raises UsageError: there is none."""
     folders = [sorted(filter(_is_image, folder.glob("*.tif"))) for folder in sorted(imagery.glob("*/"))]
-    known = [images[:2] for images in folders if len(images) >= 2]
-    if not known:
+    dates = [images[:2] for images in folders if len(images) >= 2]
+    if not dates:
         raise UsageError(
-            f"{imagery}: no folder there has two GeoTIFFs in colour with pixels of {COARSEST_M:g} m or less"
+            f"{imagery}: no folder there has two GeoTIFFs in colour with pixels of {MAX_PIXEL_M:g} m or less"
         )
-    there = [Pair(a.parent.name, a, b) for a, b in known]
-    return there + [Pair(f"{p.name}, reversed", p.map_path, p.camera) for p in there]
+    forward = [Pair(a.parent.name, a, b) for a, b in dates]
+    return forward + [Pair(f"{p.name}, reversed", p.map_path, p.camera) for p in forward]
 
 
 def _is_image(path: Path) -> bool:
     try:
         with rasterio.open(path) as source:
-            fine = source.crs.is_projected and abs(source.transform.a) <= COARSEST_M
+            fine = source.crs.is_projected and abs(source.transform.a) <= MAX_PIXEL_M
             return bool(source.count >= 3 and source.dtypes[0] == "uint8" and fine)
     except RasterioIOError:
         return False
 
 
-def over_pairs(chosen: list[Pair], seeds: list[int], out: Path, wanted: Wanted) -> Iterator[Case]:
-    """Makes each flight when its turn comes. "Another town" is the next place of the list."""
+def over_pairs(chosen: list[Pair], seeds: list[int], out: Path, options: AcceptOptions) -> Iterator[Case]:
+    """Makes each flight on demand. The map of another town is that of the next place in the list."""
     for seed in seeds:
         for number, pair in enumerate(chosen):
             name = f"{pair.name}, seed {seed}"
@@ -73,22 +72,22 @@ def over_pairs(chosen: list[Pair], seeds: list[int], out: Path, wanted: Wanted) 
                 p.map_path for p in chosen[number + 1 :] + chosen[:number] if p.map_path.parent != pair.camera.parent
             ]
             _make(folder, pair, seed)
-            yield Case(name, _of(wanted, name, out, folder, pair.map_path, others[0] if others else None))
+            yield Case(name, _of(options, name, out, folder, pair.map_path, others[0] if others else None))
 
 
 def _make(folder: Path, pair: Pair, seed: int) -> None:
-    """The flight folder, if it is not there. Raises UsageError: no room over the image."""
+    """Makes the flight folder if it does not exist. Raises UsageError: no flight fits over the image."""
     if folder.is_dir():
         return
     part = folder.with_suffix(".partial")
     shutil.rmtree(part, ignore_errors=True)
     why = ""
     for kind, agl_m in FLOWN_BY:
-        wished = making.Wanted(
+        request = making.FlightOptions(
             seed=seed, image=pair.camera, map_path=pair.map_path, vehicle=kind, duration_s=DURATION_S, agl_m=agl_m
         )
         try:
-            making.make(part, wished, progress=False)
+            making.make(part, request, progress=False)
         except UsageError as error:
             why = str(error)
             continue
@@ -97,25 +96,27 @@ def _make(folder: Path, pair: Pair, seed: int) -> None:
     raise UsageError(f"{pair.camera}: no flight has room over it; {why}")
 
 
-def over_flights(flights: list[str], out: Path, wanted: Wanted) -> Iterator[Case]:
+def over_flights(flights: list[str], out: Path, options: AcceptOptions) -> Iterator[Case]:
     """``flights``: FLIGHT,MAP each."""
     for text in flights:
         flight, comma, map_path = text.rpartition(",")
         if not comma:
             raise UsageError(f"--flight '{text}': write FLIGHT,MAP")
         name = f"{Path(flight).name}, {Path(map_path).stem}"
-        yield Case(name, _of(wanted, name, out, Path(flight), Path(map_path), None))
+        yield Case(name, _of(options, name, out, Path(flight), Path(map_path), None))
 
 
-def over_generated(seeds: list[int], out: Path, wanted: Wanted) -> Iterator[Case]:
+def over_generated(seeds: list[int], out: Path, options: AcceptOptions) -> Iterator[Case]:
     for seed in seeds:
         name = f"generated, seed {seed}"
-        yield Case(name, replace(wanted, out=out / _folder(name), seed=seed))
+        yield Case(name, replace(options, out=out / _folder(name), seed=seed))
 
 
-def _of(wanted: Wanted, name: str, out: Path, flight: Path, map_path: Path, other_map: Path | None) -> Wanted:
+def _of(
+    options: AcceptOptions, name: str, out: Path, flight: Path, map_path: Path, other_map: Path | None
+) -> AcceptOptions:
     return replace(
-        wanted,
+        options,
         out=out / _folder(name),
         flight=str(flight),
         map_path=map_path,
@@ -129,11 +130,11 @@ def _folder(name: str) -> str:
 
 
 def fly(cases: Iterator[Case], out: Path) -> list[Line]:
-    """One case after the other; adversary.json and adversary.md are written anew after each. Raises TerrafixError."""
+    """Flies the cases in order and rewrites adversary.json and adversary.md after each. Raises TerrafixError."""
     lines: list[Line] = []
     for case in cases:
         typer.echo(f"== {case.name}", err=True)
-        lines += lines_of(case, accept(case.wanted))
+        lines += lines_of(case, accept(case.options))
         _write(out, lines)
     return lines
 
@@ -161,20 +162,22 @@ def main(
     quick: Annotated[bool, typer.Option("--quick", help="120 frames of each flight.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Scenarios at a time; each keeps a core busy.")] = 1,
 ) -> None:
-    """Every lie over several places and seeds. Exit code 0: all floors hold; 1: one does not."""
+    """All scenarios with false inputs over several places and seeds. Exit code 0: all floors hold; 1: one does not."""
     if not (imagery or generated or flight):
         raise UsageError("nowhere to fly; give --imagery, --generated or --flight")
     try:
         numbers = [int(text) for text in seeds.split(",")]
     except ValueError:
         raise UsageError(f"--seeds '{seeds}': write numbers, for example 1,2") from None
-    wanted = Wanted(out=out, scenarios=tuple(scenario or ()), quick=quick, resume=True, lies=True, workers=workers)
+    options = AcceptOptions(
+        out=out, scenarios=tuple(scenario or ()), quick=quick, resume=True, lies=True, workers=workers
+    )
     out.mkdir(parents=True, exist_ok=True)
     chosen = pairs(imagery)[:places] if imagery else []
     cases = chain(
-        over_generated(numbers, out, wanted) if generated else (),
-        over_flights(flight or [], out, wanted),
-        over_pairs(chosen, numbers, out, wanted),
+        over_generated(numbers, out, options) if generated else (),
+        over_flights(flight or [], out, options),
+        over_pairs(chosen, numbers, out, options),
     )
     lines = fly(cases, out)
     typer.echo(f"{sum(line.broken > 0 for line in lines)} of {len(lines)} flights break a floor; {out / NAME}.md")

@@ -1,4 +1,4 @@
-"""The table of many flights: a line for each scenario over each place, and one for each scenario over all places."""
+"""Table of many flights: one line per scenario and place, and one per scenario over all places."""
 
 import statistics
 from collections.abc import Callable
@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import msgspec
 
-from terrafix_tools.accept.criteria import CRITERIA
 from terrafix_tools.accept.fly import Result
-from terrafix_tools.accept.judged import BROKEN, JudgedRow, Verdict, shown
-from terrafix_tools.accept.run import Wanted
+from terrafix_tools.accept.measuring.criteria import CRITERIA
+from terrafix_tools.accept.measuring.judged import BROKEN, JudgedRow, Verdict, with_unit
+from terrafix_tools.accept.run import AcceptOptions
 from terrafix_tools.accept.table import Acceptance
 
 NEVER = "never"
@@ -17,22 +17,22 @@ NEVER = "never"
 
 @dataclass(frozen=True)
 class Case:
-    """One flight to fly all scenarios with."""
+    """One flight, with which all scenarios are flown."""
 
     name: str
-    wanted: Wanted
+    options: AcceptOptions
 
 
 class Line(msgspec.Struct, frozen=True, kw_only=True):
-    """One scenario over one place. None: not measured, ``why`` has the reason when nothing was."""
+    """One scenario over one place. None: not measured. ``why``: the reason if nothing was measured."""
 
     scenario: str
     place: str
     frames: int
     within_20m: float | None  # share
-    false_fixes: float | None  # in all
-    late_false_fixes: float | None  # later than what may take to notice
-    notice_s: float | None  # from the lie's beginning to the last false fix
+    false_fixes: float | None  # total
+    late_false_fixes: float | None  # later than the allowed detection time
+    notice_s: float | None  # from the start of the false input to the last false fix
     recovery_frames: float | None
     never_recovered: bool
     claim_width: float | None
@@ -48,7 +48,7 @@ def _line(place: str, result: Result) -> Line:
     rows = {row.what: row for row in result.rows}
 
     def value(*names: str) -> float | None:
-        """Of the first of these criteria that the scenario has."""
+        """Of the first of these criteria in the scenario's rows."""
         return next((rows[CRITERIA[n].what].measured for n in names if CRITERIA[n].what in rows), None)
 
     recovery: JudgedRow | None = rows.get(CRITERIA["recovery"].what)
@@ -69,7 +69,7 @@ def _line(place: str, result: Result) -> Line:
 
 
 def markdown(lines: list[Line]) -> str:
-    """Over all places first, then each flight."""
+    """First the table over all places, then that of each flight."""
     names = list(dict.fromkeys(line.scenario for line in lines))
     head = ("frames", "within 20 m", "false", "late false", "to notice", "recovery", "claim", "broken")
     return "\n".join(
@@ -101,7 +101,7 @@ def _pooled(name: str, lines: list[Line]) -> tuple[str, ...]:
         name,
         str(len(flown)),
         str(frames),
-        shown(within, "%"),
+        with_unit(within, "%"),
         _over(sum, [line.false_fixes for line in flown], ""),
         _over(sum, [line.late_false_fixes for line in flown], ""),
         _over(max, [line.notice_s for line in flown], "s"),
@@ -118,16 +118,16 @@ def _one(line: Line) -> tuple[str, ...]:
         line.scenario,
         line.place,
         str(line.frames),
-        shown(line.within_20m, "%"),
-        shown(line.false_fixes, ""),
-        shown(line.late_false_fixes, ""),
-        shown(line.notice_s, "s"),
-        NEVER if line.never_recovered else shown(line.recovery_frames, ""),
-        shown(line.claim_width, ""),
+        with_unit(line.within_20m, "%"),
+        with_unit(line.false_fixes, ""),
+        with_unit(line.late_false_fixes, ""),
+        with_unit(line.notice_s, "s"),
+        NEVER if line.never_recovered else with_unit(line.recovery_frames, ""),
+        with_unit(line.claim_width, ""),
         str(line.broken),
     )
 
 
 def _over(how: Callable[[list[float]], float], values: list[float | None], unit: str) -> str:
     known = [value for value in values if value is not None]
-    return shown(how(known) if known else None, unit)
+    return with_unit(how(known) if known else None, unit)

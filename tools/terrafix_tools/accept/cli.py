@@ -22,7 +22,7 @@ def accept(
     out: Annotated[Path, typer.Option(help="Folder for the table and every scenario's replay.")] = Path("out/accept"),
     scenario: Annotated[list[str] | None, typer.Option(help="Only this scenario; may be given several times.")] = None,
     lies: Annotated[
-        bool, typer.Option("--lies", help="The scenarios in which an input lies, instead of the ordinary ones.")
+        bool, typer.Option("--lies", help="The scenarios with false inputs, instead of the ordinary ones.")
     ] = False,
     other_map: Annotated[
         Path | None, typer.Option(help="GeoTIFF of another town, for the scenarios that fly with one.")
@@ -39,11 +39,11 @@ def accept(
     ] = None,
 ) -> None:
     """The acceptance table AC-1 to AC-17 over named scenarios. Exit code 0: all floors hold; 1: one does not."""
-    from terrafix_tools.accept.run import Wanted, truth_of
+    from terrafix_tools.accept.run import AcceptOptions, truth_of
     from terrafix_tools.accept.run import accept as run_accept
     from terrafix_tools.accept.table import headline
 
-    wanted = Wanted(
+    options = AcceptOptions(
         out=out,
         flight=flight,
         map_path=map_path,
@@ -58,6 +58,6 @@ def accept(
         other_map=other_map,
         workers=workers,
     )
-    acceptance = run_accept(wanted)
+    acceptance = run_accept(options)
     typer.echo(f"{headline(acceptance)} Written to {out / 'acceptance.html'}")
     raise typer.Exit(BROKEN_FLOOR if acceptance.broken else 0)

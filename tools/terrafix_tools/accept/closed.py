@@ -1,4 +1,4 @@
-"""Scenarios that need an aircraft: the closed loop, in which the autopilot steers by what it is told."""
+"""Closed-loop scenarios: the autopilot of a simulated aircraft navigates by GPS_INPUT."""
 
 import csv
 import json
@@ -16,11 +16,11 @@ from terrafix.link.integrity.fix_type import FIX_3D
 from terrafix.messages import Frame, GpsInput
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept.closed_lies import LIES_IN_THE_LOOP
-from terrafix_tools.accept.evidence import Evidence, SentFix, gather
-from terrafix_tools.accept.faults import Edit
+from terrafix_tools.accept.faults.faults import Edit
 from terrafix_tools.accept.generated import KINDS
-from terrafix_tools.accept.judged import Marks, Span
+from terrafix_tools.accept.lies.closed_loop import LIES_IN_THE_LOOP
+from terrafix_tools.accept.measuring.evidence import Evidence, SentFix, gather
+from terrafix_tools.accept.measuring.judged import Marks, Span
 from terrafix_tools.estimates import ESTIMATES, read_rows
 from terrafix_tools.evaluate import read_truth
 from terrafix_tools.sim.closed_loop.flight import FRAME_HZ as LOOP_HZ
@@ -32,17 +32,17 @@ from terrafix_tools.sim.interfaces import State
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Jam
 from terrafix_tools.sim.world import place as world
 
-AFTER_S = 40.0  # of flight with GNSS as it should be
+AFTER_S = 40.0  # of flight with undisturbed GNSS
 DRAG_MPS = 2.0
 EVENTS: dict[str, tuple[AnyEvent, str]] = {
     "GNSS jam": (Jam(start_s=AFTER_S), "GNSS jammed"),
     "slow spoof": (Drag(start_s=AFTER_S, east_mps=DRAG_MPS), f"GNSS walks off at {DRAG_MPS:g} m/s"),
 }
-LIE = Span(60.0, 75.0, "the camera lies")  # GNSS is given up some 10 s after its jamming has begun
-SPEED_MPS = 26.0  # over ground, more than any leg: the course is longer than the flight
-WITHOUT_LIE = "without-lie"  # folder of the flight that shows the way
-ALONG_S = 10.0  # either way: how far the two flights may be apart in time at the same place
-FINE_S = 0.02  # of the way, between two points that distances are taken from
+LIE = Span(60.0, 75.0, "the camera lies")  # the autopilot switches away from GNSS some 10 s after the jamming begins
+SPEED_MPS = 26.0  # over ground, more than in any leg: the course must be longer than the flight
+WITHOUT_LIE = "without-lie"  # folder of the reference flight
+MAX_LAG_S = 10.0  # in both directions: time difference of the two flights at the same place
+FINE_S = 0.02  # spacing of the points of the reference trajectory for distances
 
 
 def fly_closed(
@@ -56,7 +56,7 @@ def fly_closed(
     event, text = EVENTS[scenario]
     plan = _plan(package, (event,), LOOP_HZ, seed=seed, frames=frames)
     fly(plan, out)
-    zero_s = read_rows(out / ESTIMATES)[0].t_s  # the first picture is taken at the start
+    zero_s = read_rows(out / ESTIMATES)[0].t_s  # the first frame is taken at the start
     marks = Marks(spans=(Span(zero_s + AFTER_S, zero_s + plan.duration_s, text),))
     return _gathered(out, marks, truth_offset_m)
 
@@ -64,7 +64,7 @@ def fly_closed(
 def _fly_with_lie(
     scenario: str, package: Path, out: Path, *, seed: int, frames: int, truth_offset_m: tuple[float, float]
 ) -> Evidence:
-    """First on GNSS alone and without a camera, for the way that it flies when nothing lies."""
+    """With a reference flight first: on GNSS only, without a camera and without the false input."""
     fly(
         replace(_plan(package, (), FRAME_HZ, seed=seed, frames=frames), view=lambda _state, _index: None),
         out / WITHOUT_LIE,
@@ -77,11 +77,11 @@ def _fly_with_lie(
 
 
 def _plan(package: Path, events: tuple[AnyEvent, ...], frame_hz: float, *, seed: int, frames: int) -> Plan:
-    """``frames``: of a recorded flight that lasts as long."""
+    """``frames``: gives the duration, as of a recorded flight."""
     place = world.generate(seed)
     duration_s = frames / FRAME_HZ
     return plan_over(
-        scene_of_world(place, place.look(KINDS["base"].looks[1])),
+        scene_of_world(place, place.render(KINDS["base"].looks[1])),
         package,
         seed=seed,
         length_m=SPEED_MPS * duration_s,
@@ -98,7 +98,7 @@ def _gathered(out: Path, marks: Marks, truth_offset_m: tuple[float, float]) -> E
 
 
 class EditedCamera:
-    """The pictures of ``view`` after an edit that has one shot out for each shot in."""
+    """A view that applies ``edit``, which must give one shot for each shot, to the pictures of another view."""
 
     def __init__(self, view: Callable[[State, int], Image | None], edit: Edit) -> None:
         self._view = view
@@ -119,26 +119,26 @@ class EditedCamera:
 
 
 def sent_fixes(out: Path, without_lie: Path, frame: LocalFrame) -> list[SentFix]:
-    """Every GPS_INPUT of the closed loop in ``out``; the flight in ``without_lie`` shows the way.
+    """All GPS_INPUT messages of the closed loop in ``out``, compared with the reference flight in ``without_lie``.
 
-    ``frame``: of both."""
+    ``frame``: the local frame of both."""
     t_s, true_m = _track(out)
-    way_s, way_m = _track(without_lie)
-    fine_s = np.arange(way_s[0], way_s[-1], FINE_S)
-    fine_m = _at(fine_s, way_s, way_m)
+    reference_s, reference_m = _track(without_lie)
+    fine_s = np.arange(reference_s[0], reference_s[-1], FINE_S)
+    fine_m = _at(fine_s, reference_s, reference_m)
     sent = []
     for _, _, message in read_flight(out):
         if not isinstance(message, GpsInput):
             continue
         now_s = message.t_ns / 1e9
         here_m = _at(np.array([now_s]), t_s, true_m)[0]
-        near_m = fine_m[np.searchsorted(fine_s, now_s - ALONG_S) : np.searchsorted(fine_s, now_s + ALONG_S)]
+        near_m = fine_m[np.searchsorted(fine_s, now_s - MAX_LAG_S) : np.searchsorted(fine_s, now_s + MAX_LAG_S)]
         error_m = None
         if message.fix_type >= FIX_3D:
-            said_m = np.array(frame.to_local(message.lat_deg, message.lon_deg))
-            error_m = float(np.hypot(*(said_m - here_m)))
-        aside_m = float(np.hypot(*(near_m - here_m).T).min())
-        sent.append(SentFix(now_s, error_m, message.horiz_accuracy_m, aside_m, message.reason))
+            reported_m = np.array(frame.to_local(message.lat_deg, message.lon_deg))
+            error_m = float(np.hypot(*(reported_m - here_m)))
+        deviation_m = float(np.hypot(*(near_m - here_m).T).min())
+        sent.append(SentFix(now_s, error_m, message.horiz_accuracy_m, deviation_m, message.reason))
     return sent
 
 
@@ -150,6 +150,6 @@ def _track(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return table[:, 0], table[:, 1:]
 
 
-def _at(wanted_s: np.ndarray, t_s: np.ndarray, place_m: np.ndarray) -> np.ndarray:
-    """(M, 2), between the rows along a straight line."""
-    return np.column_stack([np.interp(wanted_s, t_s, place_m[:, axis]) for axis in (0, 1)])
+def _at(query_s: np.ndarray, t_s: np.ndarray, p_m: np.ndarray) -> np.ndarray:
+    """(M, 2) at ``query_s`` (M,), linearly interpolated."""
+    return np.column_stack([np.interp(query_s, t_s, p_m[:, axis]) for axis in (0, 1)])

@@ -1,6 +1,6 @@
-"""One scenario in a process of its own, so that its memory is its own: python -m terrafix_tools.accept.fly JOB.json.
+"""One scenario in a separate process, so that its memory can be measured: python -m terrafix_tools.accept.fly JOB.json.
 
-Writes the replay, then result.json beside it: only a scenario that has been judged has one."""
+Writes the replay, then result.json beside it, which exists only for scenarios that were judged."""
 
 import json
 import sys
@@ -20,12 +20,12 @@ from terrafix.core.node import Node, NodeContext
 from terrafix.map.format import CE90_SIGMAS
 from terrafix.messages import Frame, Message
 from terrafix.vision.sources import Source
-from terrafix_tools.accept.criteria import judge, unmeasured
-from terrafix_tools.accept.evidence import Evidence, gather
-from terrafix_tools.accept.faults import AlteredSource, ThereAndBack, same_origin
+from terrafix_tools.accept.faults.faults import AlteredSource, ThereAndBack, unchanged_origin
 from terrafix_tools.accept.flight import Flight, open_flight
-from terrafix_tools.accept.integrity import claim_width, in_lie
-from terrafix_tools.accept.judged import JudgedRow, Span
+from terrafix_tools.accept.lies.integrity import claim_width, in_lie
+from terrafix_tools.accept.measuring.criteria import judge, unmeasured
+from terrafix_tools.accept.measuring.evidence import Evidence, gather
+from terrafix_tools.accept.measuring.judged import JudgedRow, Span
 from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
 from terrafix_tools.accept.scenarios import BY_NAME, LONG_FRAMES
 from terrafix_tools.bench.flights import program_age_s
@@ -37,25 +37,25 @@ RESULT = "result.json"
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
-    """What the process is told."""
+    """Input of the process."""
 
     scenario: str
-    flight: str  # what open_source takes
+    flight: str  # argument of open_source
     truth: str
     map: str = ""
     dem: str = ""
     out: str
-    frames: int | None = None  # only so many of the flight
+    frames: int | None = None  # limit of the frames of the flight
     models: list[str] = []
     configs: list[str] = []
     threads: int = 1
     seed: int = 0
-    other_map: str = ""  # GeoTIFF of another place, for the scenarios that fly with one
-    generated: bool = False  # a perfect map: its error is drawn from what the configuration claims
+    other_map: str = ""  # GeoTIFF of another place, for the scenarios with a wrong map
+    generated: bool = False  # a perfect map: its error is drawn with the configured CE90
 
 
 class Point(msgspec.Struct, frozen=True):
-    """One frame in the picture."""
+    """One frame in the chart."""
 
     t_s: float
     error_m: float | None
@@ -64,7 +64,7 @@ class Point(msgspec.Struct, frozen=True):
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
-    """What result.json says of one scenario."""
+    """Content of result.json: one scenario."""
 
     scenario: str
     promise: str
@@ -77,11 +77,11 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float = 0.0
 
 
-class StartWatch:
-    """A vision node that notes when the first frame came: map and models are open then."""
+class StartupTimer:
+    """A vision node that records the time of the first frame, when map and models are open."""
 
     def __init__(self, vision: Node, began_s: float) -> None:
-        """``began_s``: when the nodes began to be made."""
+        """``began_s``: start of the construction of the nodes."""
         self._vision, self._began_s = vision, began_s
         self.start_up_s: float | None = None
 
@@ -95,10 +95,10 @@ class StartWatch:
 
 
 def fly(job: Job, imports_s: float = 0.0) -> Result:
-    """Flies and judges. ``imports_s``: age of the program when it began. Raises the TerrafixError family."""
+    """Flies and judges. ``imports_s``: age of the process at its start. Raises TerrafixError."""
     scenario, out = BY_NAME[job.scenario], Path(job.out)
     if scenario.ground == CLOSED_LOOP:
-        from terrafix_tools.accept.closed import fly_closed  # only here: the whole simulator
+        from terrafix_tools.accept.closed import fly_closed  # here, because it loads the whole simulator
 
         evidence = fly_closed(
             job.scenario,
@@ -116,16 +116,16 @@ def fly(job: Job, imports_s: float = 0.0) -> Result:
     plan = scenario.plan(flight)
     if isinstance(plan, str):
         return _not_flown(scenario, plan)
-    package, why_not = _package(flight, plan, out)
-    if why_not:
-        return _not_flown(scenario, why_not)
+    package, reason = _package(flight, plan, out)
+    if reason:
+        return _not_flown(scenario, reason)
     config = load([Path(path) for path in job.configs])
-    watch: list[StartWatch] = []
+    watch: list[StartupTimer] = []
 
     def nodes(ctx: NodeContext) -> Mapping[str, Node]:
         began_s = time.perf_counter()
         made = dict(plan.nodes(ctx))
-        made["vision"] = watched = StartWatch(made["vision"], began_s)
+        made["vision"] = watched = StartupTimer(made["vision"], began_s)
         watch.append(watched)
         return made
 
@@ -137,10 +137,10 @@ def fly(job: Job, imports_s: float = 0.0) -> Result:
             models=job.models,
             configs=[Path(path) for path in job.configs],
             nodes=nodes,
-            altered=lambda source: _altered(source, flight, plan, job.frames),
+            wrap_source=lambda source: _altered(source, flight, plan, job.frames),
         )
     except MapError as error:
-        if plan.origin is same_origin:
+        if plan.origin is unchanged_origin:
             raise
         return _not_flown(scenario, f"the map does not reach the wrong start: {error}")
     evidence = gather(
@@ -177,17 +177,17 @@ def _not_flown(scenario: Scenario, why: str) -> Result:
 
 
 def _altered(source: Source, flight: Flight, plan: Plan, frames: int | None) -> Source:
-    if plan.long_route and len(flight.stops) < LONG_FRAMES:
-        source, frames = ThereAndBack(source, flight.stops, LONG_FRAMES), None
+    if plan.long_route and len(flight.frame_refs) < LONG_FRAMES:
+        source, frames = ThereAndBack(source, flight.frame_refs, LONG_FRAMES), None
     return AlteredSource(source, plan.edit, frames=frames, origin=plan.origin)
 
 
 def _package(flight: Flight, plan: Plan, out: Path) -> tuple[Path | None, str]:
-    """The map to fly with (None: as the flight says), or why it cannot be made."""
+    """-> the map to fly with (None: that of the flight), or the reason why it cannot be made."""
     if plan.other_map is None:
         if flight.map_path is None:
             return None, ""
-        beside = flight.map_path.with_suffix(".gpkg")  # of a generated place, made with its DEM
+        beside = flight.map_path.with_suffix(".gpkg")  # of a generated place: the package with its DEM
         return (beside if beside.is_file() else ensure_package(flight.map_path, map_cache_dir())), ""
     assert flight.map_path is not None
     changed = out / "map.tif"
@@ -199,8 +199,8 @@ def _package(flight: Flight, plan: Plan, out: Path) -> tuple[Path | None, str]:
 
 
 def _map_error_m(job: Job, config: Config) -> tuple[float, float]:
-    """East, north. A generated map is where it says it is; a real one is off by what its CE90 says, and the estimates
-    claim so. One draw for each scenario makes the claim testable."""
+    """Error of the map, east and north. A generated map has none, but the published covariance includes the CE90 of a
+    real map. One draw per scenario makes the covariance testable."""
     if not job.generated:
         return 0.0, 0.0
     east_m, north_m = np.random.default_rng([job.seed, *job.scenario.encode()]).normal(

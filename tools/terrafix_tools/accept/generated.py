@@ -1,4 +1,4 @@
-"""Ground of the generated world that scenarios fly over, and the flight over it. The only file that knows the world."""
+"""Ground of the generated world for scenarios, and the flight over it. The only file that depends on the world."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ from terrafix_tools.sim.flights.folder import FRAME_HZ, Flight, plan_flight, wri
 from terrafix_tools.sim.world import place as world
 
 MAP_LOOK, CAMERA_LOOK, WINTER_LOOK = "summer", "autumn", "winter"
-WATER = (0.40, 0.75)  # of the frames: over the lake
-LAKE_M = 330.0  # from the track to the shore: more than a frame sees
+WATER = (0.40, 0.75)  # share of the frames over the lake
+LAKE_M = 330.0  # from the track to the shore: more than the footprint of a frame
 WATER_BGR = (92, 84, 56)
 WATER_WAVES = 3.0  # grey values, 1-sigma
 LOW_CONTRAST = 1 / 8
@@ -24,7 +24,7 @@ HILL_SIGMA_POSTS = 40.0
 
 @dataclass(frozen=True)
 class Kind:
-    """One piece of ground: what is painted over the looks of the place, and what is added to its relief."""
+    """One kind of ground: changes to the looks of the place and to its relief."""
 
     looks: tuple[str, str] = (MAP_LOOK, CAMERA_LOOK)
     hills: bool = False
@@ -46,12 +46,12 @@ def make(
 ) -> None:
     """Writes ``folder``/flight (a flight folder), map.tif, dem.tif and map.gpkg. Raises OutputError."""
     folder.mkdir(parents=True, exist_ok=True)
-    wanted, place = KINDS[kind], world.generate(seed)
-    if wanted.hills:
+    ground, place = KINDS[kind], world.generate(seed)
+    if ground.hills:
         place = replace(place, layout=replace(place.layout, dem_amsl_m=_with_hills(place.dem_amsl_m, seed)))
-    looks = [_flattened(place.look(name), wanted.contrast) for name in wanted.looks]
+    looks = [_flattened(place.render(name), ground.contrast) for name in ground.looks]
     flight = plan_flight(place, looks[1], frames / FRAME_HZ)
-    if wanted.lake:
+    if ground.lake:
         lake = _lake(place, flight, looks[1].shape)
         looks = [_flooded(image, lake, [seed, number]) for number, image in enumerate(looks)]
         flight = plan_flight(place, looks[1], frames / FRAME_HZ)
@@ -72,7 +72,7 @@ def _flattened(image: np.ndarray, contrast: float) -> np.ndarray:
 
 
 def _lake(place: world.World, flight: Flight, shape: tuple[int, ...]) -> np.ndarray:
-    """(H, W) uint8, 255 where there is water: around the track in the share WATER of the flight."""
+    """(H, W) uint8, 255 for water: around the track in the share WATER of the flight."""
     times_s = flight.frame_times_s()
     inside = times_s[round(WATER[0] * len(times_s)) : round(WATER[1] * len(times_s)) + 1]
     to_map = Transformer.from_crs(4326, world.EPSG, always_xy=True)
@@ -87,7 +87,7 @@ def _lake(place: world.World, flight: Flight, shape: tuple[int, ...]) -> np.ndar
 
 
 def _flooded(image: np.ndarray, lake: np.ndarray, seed: list[int]) -> np.ndarray:
-    """Waves are of the moment: map and camera do not share them."""
+    """With water where ``lake`` is set. Map and camera have different waves, drawn from ``seed``."""
     waves = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=lake.shape).astype(np.float32), (0, 0), 2.0)
     water = np.clip(np.array(WATER_BGR) + (WATER_WAVES * waves / waves.std())[..., None], 0, 255).astype(np.uint8)
     return np.where(lake[..., None] > 0, water, image)

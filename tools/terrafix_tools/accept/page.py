@@ -1,19 +1,19 @@
-"""acceptance.html: one page without any outside resource. What does not pass comes first."""
+"""acceptance.html: one self-contained page. Failed rows come first."""
 
 from html import escape
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
 from terrafix_tools.accept.fly import Result
-from terrafix_tools.accept.judged import BROKEN, JudgedRow, Verdict, shown
+from terrafix_tools.accept.measuring.judged import BROKEN, JudgedRow, Verdict, with_unit
 from terrafix_tools.report.charts import Chart, spans_of
 
 if TYPE_CHECKING:
     from terrafix_tools.accept.table import Acceptance
 
 ERROR_FLOOR_M = 0.5  # of the logarithmic axis
-ERROR_TOP_M = 2000.0  # the same for all pictures, so that they can be compared
-WIDTH, HEIGHT = 400, 190  # of one picture, in its own units
+ERROR_TOP_M = 2000.0  # the same for all charts, to compare them
+WIDTH, HEIGHT = 400, 190  # of one chart, in its own units
 STRIP = 6  # height of the source labels under the chart
 WORDS = {"satellite_anchored": "map match", "visual_propagated": "odometry", "dead_reckoned": "dead reckoning"}
 MARKS = {
@@ -82,7 +82,9 @@ def _broken(acceptance: "Acceptance") -> str:
 
 
 def _number(row: JudgedRow) -> str:
-    return f'<b class="bad">{escape(shown(row.measured, row.unit) if row.measured is not None else row.verdict)}</b>'
+    return (
+        f'<b class="bad">{escape(with_unit(row.measured, row.unit) if row.measured is not None else row.verdict)}</b>'
+    )
 
 
 def _matrix(acceptance: "Acceptance") -> str:
@@ -108,8 +110,10 @@ def _cell(rows: list[JudgedRow]) -> str:
         return "<td></td>"
     order = (Verdict.BELOW, Verdict.NOT_BUILT, Verdict.PASS, Verdict.NOT_MEASURABLE)
     worst = min(rows, key=lambda row: order.index(row.verdict))
-    tip = "\n".join(f"{r.what}: {shown(r.measured, r.unit)}, {r.verdict}{'; ' + r.why if r.why else ''}" for r in rows)
-    text = shown(worst.measured, worst.unit) if worst.measured is not None else MARKS[worst.verdict][1]
+    tip = "\n".join(
+        f"{r.what}: {with_unit(r.measured, r.unit)}, {r.verdict}{'; ' + r.why if r.why else ''}" for r in rows
+    )
+    text = with_unit(worst.measured, worst.unit) if worst.measured is not None else MARKS[worst.verdict][1]
     css = MARKS[worst.verdict][0]
     return f'<td class="m-{css}" title="{escape(tip)}">{escape(text)}</td>'
 
@@ -118,8 +122,8 @@ def _pictures(results: list[Result]) -> str:
     figures = "".join(_picture(result) for result in results)
     return (
         "<h2>Error and claim, scenario by scenario</h2>"
-        '<p class="lead">The line is the error, the shaded area the claimed 95 % radius: an honest claim covers the '
-        "line. Grey: something is wrong there. Below each picture, where the position came from.</p>"
+        '<p class="lead">The line is the error, the shaded area the claimed 95 % radius: a consistent covariance '
+        "covers the line. Grey: a fault. Below each picture, where the position came from.</p>"
         f'<div class="multiples">{figures}</div><div class="legend">'
         '<span><i class="key k-ink"></i> error</span><span><i class="key k-claim"></i> claimed 95 % radius</span>'
         '<span><i class="key k-sat"></i> map match</span><span><i class="key k-vis"></i> odometry</span>'
@@ -143,7 +147,7 @@ def _picture(result: Result) -> str:
     chart.line([(p.t_s - zero_s, p.error_m) for p in result.points], "error")
     labels = spans_of([(p.t_s - zero_s, p.label) for p in result.points], end_s - zero_s)
     for low, high, label in labels:
-        chart.foot(low, high, f"f-{label or 'none'}", WORDS.get(label, "no position"), STRIP)
+        chart.bottom_strip(low, high, f"f-{label or 'none'}", WORDS.get(label, "no position"), STRIP)
     broken = sum(row.verdict in BROKEN for row in result.rows)
     css, words = ("bad", f"{broken} below floor or not built") if broken else ("good", "holds")
     return (
@@ -155,7 +159,7 @@ def _picture(result: Result) -> str:
 def _rows(acceptance: "Acceptance") -> str:
     body = "".join(
         f"<tr><td>{escape(row.scenario)}</td><td>{row.ac}</td><td>{escape(row.what)}</td>"
-        f"<td>{escape(shown(row.measured, row.unit))}</td><td>{escape(row.floor)}</td><td>{escape(row.goal)}</td>"
+        f"<td>{escape(with_unit(row.measured, row.unit))}</td><td>{escape(row.floor)}</td><td>{escape(row.goal)}</td>"
         f'<td class="{MARKS[row.verdict][0]}">{row.verdict}{", goal met" if row.goal_met else ""}</td>'
         f"<td>{escape(row.why)}</td></tr>"
         for row in acceptance.rows

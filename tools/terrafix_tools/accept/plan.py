@@ -1,26 +1,30 @@
-"""What a scenario is: a name, what it promises, the rows that judge it, and how a flight becomes it."""
+"""Definition of a scenario: name, requirement, rows, and the edits that turn a flight into it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from terrafix.messages import Origin
-from terrafix_tools.accept import faults
+from terrafix_tools.accept.faults import faults
 from terrafix_tools.accept.flight import Flight
-from terrafix_tools.accept.judged import Marks
+from terrafix_tools.accept.measuring.judged import Marks
 from terrafix_tools.replay import MakeNodes, make_nodes
 
-CLOSED_LOOP = "closed loop"  # ground of a scenario in which an aircraft steers by the estimate; over the base ground
+CLOSED_LOOP = (
+    "closed loop"  # ground of a scenario in which the autopilot navigates by the estimate; over the base ground
+)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How one flight becomes the scenario."""
+    """Edits that turn one flight into the scenario."""
 
-    edit: faults.Edit = faults.same
-    origin: Callable[[Origin], Origin] = faults.same_origin
+    edit: faults.Edit = faults.unchanged
+    origin: Callable[[Origin], Origin] = faults.unchanged_origin
     nodes: MakeNodes = make_nodes
-    other_map: Callable[[Path, Path], str] | None = None  # (map of the flight, map to write) -> why not, or ""
+    other_map: Callable[[Path, Path], str] | None = (
+        None  # (map of the flight, map to write) -> reason for failure, or ""
+    )
     long_route: bool = False
     marks: Marks = field(default_factory=Marks)
 
@@ -30,6 +34,6 @@ class Scenario:
     name: str
     promise: str
     criteria: tuple[str, ...]
-    plan: Callable[[Flight], Plan | str]  # a text: why it cannot be flown with this flight
-    ground: str = "base"  # of the generated world; a flight that is given has only "base"
+    plan: Callable[[Flight], Plan | str]  # a text: the reason why this flight cannot be used
+    ground: str = "base"  # of the generated world; a given flight has only "base"
     frames: int = 160  # of a generated flight

@@ -1,4 +1,4 @@
-"""The named scenarios: which ground, what goes wrong, what is promised. In words: docs/acceptance.md."""
+"""The named scenarios: ground, fault, requirement. Described in docs/acceptance.md."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,26 +6,26 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.node import Image, Node, NodeContext
-from terrafix_tools.accept import faults
-from terrafix_tools.accept.criteria import EVERYWHERE
-from terrafix_tools.accept.fault_nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_tools.accept.faults import faults
+from terrafix_tools.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_tools.accept.faults.stale_map import REACH, stale_along
 from terrafix_tools.accept.flight import Flight
-from terrafix_tools.accept.judged import Marks, Span
-from terrafix_tools.accept.lies import LIES
+from terrafix_tools.accept.lies.lies import LIES
+from terrafix_tools.accept.measuring.criteria import EVERYWHERE
+from terrafix_tools.accept.measuring.judged import Marks, Span
 from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
-from terrafix_tools.accept.stale_map import REACH, stale_along
 from terrafix_tools.replay import make_nodes
 
 FOREIGN_AT = (0.3, 0.55, 0.8)  # of the frames
 FAR_M = 350.0
 BLACKOUT_S, STALL_S = 60.0, 10.0
-BEFORE_S, AFTER_S = 20.0, 25.0  # of flight, around a blackout
-UNMATCHABLE, UNMATCHABLE_WITHIN = 0.20, (0.10, 0.90)  # of the frames: a fifth of the route, neither end of it
+BEFORE_S, AFTER_S = 20.0, 25.0  # flight time before and after a blackout
+UNMATCHABLE, UNMATCHABLE_WITHIN = 0.20, (0.10, 0.90)  # shares of the frames: a fifth of the route, not at its ends
 UNMATCHABLE_STEP = 0.05
 HOT = (1 / 3, 2 / 3)
 LONG_FRAMES = 1500
-OUTLIER_EVERY = 10  # up to 10 % wrong map matches do no harm (AC-5)
-KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the other way: 990 m, while the start claims some tens
+OUTLIER_EVERY = 10  # up to 10 % wrong map matches are tolerated (AC-5)
+KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the opposite: 990 m, with a stated sigma of tens of metres
 
 WITH_SPAN = ("claims", "coverage", "false fixes", "both estimates", "within 50 m outside", "says so", "found again")
 
@@ -35,21 +35,21 @@ def _as_it_is(_: Flight) -> Plan:
 
 
 def _foreign_frame(flight: Flight) -> Plan | str:
-    if len(flight.stops) < 8:
-        return f"the flight has only {len(flight.stops)} frames"
+    if len(flight.frame_refs) < 8:
+        return f"the flight has only {len(flight.frame_refs)} frames"
     mirrored = np.ascontiguousarray(flight.picture(0)[:, ::-1])
-    return _foreign({flight.stops[flight.at(share)].file: mirrored for share in FOREIGN_AT})
+    return _foreign({flight.frame_refs[flight.at(share)].file: mirrored for share in FOREIGN_AT})
 
 
 def _far_frame(flight: Flight) -> Plan | str:
     track = flight.track_m()
     away = np.hypot(*(track[:, None] - track[None, :]).transpose(2, 0, 1))
-    there = np.where(away >= FAR_M, away, np.inf).argmin(axis=1)  # the nearest one that is far enough
+    there = np.where(away >= FAR_M, away, np.inf).argmin(axis=1)  # the nearest frame that is far enough
     has = np.flatnonzero((away[np.arange(len(track)), there] >= FAR_M) & (np.arange(len(track)) > 0))
     if len(has) < len(FOREIGN_AT):
         return f"no two places of the flight are {FAR_M:.0f} m apart"
     at = [int(has[round(share * (len(has) - 1))]) for share in FOREIGN_AT]
-    return _foreign({flight.stops[i].file: flight.picture(int(there[i])) for i in at})
+    return _foreign({flight.frame_refs[i].file: flight.picture(int(there[i])) for i in at})
 
 
 def _foreign(pictures: dict[str, Image]) -> Plan:
@@ -57,7 +57,7 @@ def _foreign(pictures: dict[str, Image]) -> Plan:
 
 
 def _outlier_fix(flight: Flight) -> Plan:
-    wrong = frozenset(s.file for s in flight.stops[OUTLIER_EVERY // 2 :: OUTLIER_EVERY])
+    wrong = frozenset(s.file for s in flight.frame_refs[OUTLIER_EVERY // 2 :: OUTLIER_EVERY])
 
     def nodes(ctx: NodeContext) -> Mapping[str, Node]:
         made = make_nodes(ctx)
@@ -68,9 +68,9 @@ def _outlier_fix(flight: Flight) -> Plan:
 
 
 def _gap(flight: Flight, low: int, high: int, turning: bool) -> tuple[int, int] | str:
-    """(first, end) of the frames to delete so that the frames around them share no ground.
+    """(first, end) of the frames to delete so that the frames before and after them do not overlap.
 
-    Between the frames ``low`` and ``high``, where the track turns most, or (``turning`` False) the shortest gap."""
+    Between the frames ``low`` and ``high``: where the track turns most, or (``turning`` False) the shortest gap."""
     track = flight.track_m()
     best: tuple[float, int, int] | None = None
     for first in range(low + 1, high):
@@ -94,10 +94,10 @@ def _gaps(flight: Flight, parts: tuple[tuple[float, float], ...], turning: bool)
         gap = _gap(flight, max(2, flight.at(low)), flight.at(high), turning)
         if isinstance(gap, str):
             return gap
-        gone |= {s.file for s in flight.stops[gap[0] : gap[1]]}
-        breaks.append(flight.stops[gap[1]].t_s)
-        spans.append(Span(flight.stops[gap[0]].t_s, breaks[-1], "no frames"))
-    return Plan(faults.without(frozenset(gone)), marks=Marks(spans=tuple(spans), breaks_s=tuple(breaks)))
+        gone |= {s.file for s in flight.frame_refs[gap[0] : gap[1]]}
+        breaks.append(flight.frame_refs[gap[1]].t_s)
+        spans.append(Span(flight.frame_refs[gap[0]].t_s, breaks[-1], "no frames"))
+    return Plan(faults.without_frames(frozenset(gone)), marks=Marks(spans=tuple(spans), breaks_s=tuple(breaks)))
 
 
 def _sharp_turn(flight: Flight) -> Plan | str:
@@ -109,7 +109,7 @@ def _three_fragments(flight: Flight) -> Plan | str:
 
 
 def _share_of(flight: Flight, shares: tuple[float, float], text: str) -> Span:
-    return Span(flight.stops[flight.at(shares[0])].t_s, flight.stops[flight.at(shares[1])].t_s, text)
+    return Span(flight.frame_refs[flight.at(shares[0])].t_s, flight.frame_refs[flight.at(shares[1])].t_s, text)
 
 
 def _unmatchable(flight: Flight) -> Plan | str:
@@ -117,7 +117,7 @@ def _unmatchable(flight: Flight) -> Plan | str:
         return "needs the map as a GeoTIFF, to make it stale along a fifth of the route"
     shares = _fifth(flight)
     first, last = (flight.at(share) for share in shares)
-    stretch = [flight.truth[s.file] for s in flight.stops[first : last + 1] if s.file in flight.truth]
+    stretch = [flight.truth[s.file] for s in flight.frame_refs[first : last + 1] if s.file in flight.truth]
 
     def other_map(given: Path, out: Path) -> str:
         return stale_along(given, out, stretch, flight.footprint_m)
@@ -126,17 +126,17 @@ def _unmatchable(flight: Flight) -> Plan | str:
 
 
 def _fifth(flight: Flight) -> tuple[float, float]:
-    """Where it begins and ends, as shares of the frames: the fifth of whose ground the other frames see least.
+    """Start and end, as shares of the frames, of the fifth whose ground is least visible in the other frames.
 
-    A flight that circles over a stretch would find no map at all."""
-    track, seen = flight.track_m(), {}
+    Otherwise a flight that circles over this ground would have no usable map."""
+    track, visible = flight.track_m(), {}
     for begin in np.arange(UNMATCHABLE_WITHIN[0], UNMATCHABLE_WITHIN[1] - UNMATCHABLE + 1e-6, UNMATCHABLE_STEP):
         first, end = flight.at(begin), flight.at(begin + UNMATCHABLE) + 1
         others = np.delete(track, np.s_[first:end], axis=0)
         away = np.hypot(*(others[:, None] - track[None, first:end]).transpose(2, 0, 1))
         near = np.nan_to_num(away, nan=np.inf).min(axis=1) < REACH * flight.footprint_m
-        seen[float(begin)] = int(near.sum())
-    begin = min(seen, key=seen.__getitem__)
+        visible[float(begin)] = int(near.sum())
+    begin = min(visible, key=visible.__getitem__)
     return begin, begin + UNMATCHABLE
 
 
@@ -148,21 +148,21 @@ def _blackout(flight: Flight) -> Plan | str:
     needed_s = BEFORE_S + BLACKOUT_S + AFTER_S
     if flight.duration_s < needed_s:
         return f"the flight lasts {flight.duration_s:.0f} s, and {needed_s:.0f} s are needed"
-    from_s = flight.stops[0].t_s + (flight.duration_s - BLACKOUT_S) * BEFORE_S / (BEFORE_S + AFTER_S)
+    from_s = flight.frame_refs[0].t_s + (flight.duration_s - BLACKOUT_S) * BEFORE_S / (BEFORE_S + AFTER_S)
     span = Span(from_s, from_s + BLACKOUT_S, "black pictures")
-    return Plan(faults.dark(span), marks=Marks(spans=(span,)))
+    return Plan(faults.black(span), marks=Marks(spans=(span,)))
 
 
 def _stall(flight: Flight) -> Plan | str:
     if flight.duration_s < 3 * STALL_S:
         return f"the flight lasts only {flight.duration_s:.0f} s"
-    from_s = flight.stops[flight.at(0.5)].t_s
+    from_s = flight.frame_refs[flight.at(0.5)].t_s
     span = Span(from_s, from_s + STALL_S, "the same picture again and again")
     return Plan(faults.frozen(span), marks=Marks(spans=(span,)))
 
 
 def _over_water(flight: Flight) -> Plan:
-    from terrafix_tools.accept.generated import WATER  # only generated ground has it
+    from terrafix_tools.accept.generated import WATER  # only for generated ground
 
     return Plan(marks=Marks(spans=(_share_of(flight, WATER, "over open water"),)))
 
@@ -180,7 +180,7 @@ def _heading_unknown(_: Flight) -> Plan:
 
 
 def _kidnapped(flight: Flight) -> Plan:
-    # Towards the middle of the flight: the map is there.
+    # Towards the centre of the flight, where the map is.
     ahead = np.where(np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0)
     return Plan(origin=faults.start_moved(*(ahead * KIDNAPPED_M).tolist()))
 
@@ -203,51 +203,51 @@ BASELINE = (
     *EVERYWHERE, "latency", "odometry", "odometry px", "map px", "drift", "drift share", "first position", "memory"
 )  # fmt: skip
 SCENARIOS: tuple[Scenario, ...] = (
-    Scenario("baseline", "A flight as it should be.", BASELINE, _as_it_is),
+    Scenario("baseline", "A flight without faults.", BASELINE, _as_it_is),
     Scenario(
-        "foreign frame", "Three pictures of another place among the frames: rejected, and nothing follows from them.",
+        "foreign frame", "Three pictures of another place among the frames: rejected, without effect on the next ones.",
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _foreign_frame),
     Scenario(
-        "350 m frame", "Three frames come again, 350 m from where they belong: rejected, and the next one is right.",
+        "350 m frame", "Three frames are repeated 350 m from their place: rejected, and the next one is correct.",
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _far_frame),
     Scenario(
-        "350 m outlier fix", "Every tenth map fix is wrong by 350 m and sure of itself: refused.",
+        "350 m outlier fix", "Every tenth map fix has an error of 350 m and a small covariance: it is rejected.",
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _outlier_fix),
     Scenario(
-        "sharp turn", "Frames are missing where the track turns most, no ground is shared: a new fragment.",
+        "sharp turn", "Frames are missing where the track turns most, without overlap: a new fragment.",
         (*EVERYWHERE, "fragments", "fragments accurate"), _sharp_turn),
     Scenario(
         "three fragments", "Two such gaps: three fragments, merged through geography.",
         (*EVERYWHERE, "fragments", "fragments accurate"), _three_fragments),
     Scenario(
-        "20 % unmatchable", "The map shows other ground along a fifth of the route: odometry carries on, and says so.",
+        "20 % unmatchable", "Other ground on the map along a fifth of the route: odometry goes on, the label changes.",
         (*EVERYWHERE, "says so", "asks", "drift", "drift share", "found again"), _unmatchable),
     Scenario(
         "long route", "1500 frames.", (*EVERYWHERE, "odometry", "drift", "memory"), _long_route, frames=LONG_FRAMES),
     Scenario(
-        "60 s blackout", "Black pictures for 60 s: never sure and wrong, and found again afterwards.",
+        "60 s blackout", "Black pictures for 60 s: no false fix, and a correct position again afterwards.",
         (*WITH_SPAN, "asks"), _blackout, frames=270),
     Scenario(
         "GNSS jam", "Jammed after 40 s, with Terrafix as second GPS: the aircraft flies on. Closed loop.",
         IN_THE_LOOP, _as_it_is, ground=CLOSED_LOOP),
     Scenario(
-        "slow spoof", "GNSS is right for 40 s, then walks off at 2 m/s: the aircraft is not led astray. Closed loop.",
+        "slow spoof", "GNSS is correct for 40 s, then drifts at 2 m/s: the aircraft does not follow it. Closed loop.",
         IN_THE_LOOP, _as_it_is, ground=CLOSED_LOOP, frames=300),
     Scenario(
         "season change", "Camera and map in the two seasons that differ most.", EVERYWHERE, _as_it_is, ground="season"),
     Scenario("low texture", "Ground of an eighth of the contrast.", EVERYWHERE, _as_it_is, ground="low texture"),
     Scenario(
-        "water", "A third of the route over open water: no fix there, and none that is wrong.",
+        "water", "A third of the route over open water: no map fix there, and no false one.",
         WITH_SPAN, _over_water, ground="water"),
     Scenario("hill country", "Relief of some 300 m, a kilometre wide.", EVERYWHERE, _as_it_is, ground="hills"),
     Scenario("height wrong by 10 %", "The reported height is 10 % too large.", EVERYWHERE, _height_wrong),
     Scenario("compass wrong by 15 degrees", "The reported heading is off by 15 degrees.", EVERYWHERE, _compass_wrong),
     Scenario("heading unknown", "No heading is reported.", EVERYWHERE, _heading_unknown),
     Scenario(
-        "kidnapped", "The start coordinate is wrong by a kilometre and claims some tens of metres.",
+        "kidnapped", "The start coordinate has an error of a kilometre and a stated sigma of tens of metres.",
         ("claims", "coverage", "false fixes", "found again", "asks"), _kidnapped),
     Scenario(
-        "hot day", "The computer throttles in the middle third: the cheap covariance, and back.",
+        "hot day", "The computer throttles in the middle third: the cheaper covariance mode, and back.",
         (*EVERYWHERE, "mode"), _hot_day),
     Scenario("camera stall", "The camera repeats one picture for 10 s.", WITH_SPAN, _stall),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The whole table: rows of all scenarios, what holds over all of them, and acceptance.json and acceptance.md."""
+"""The whole table: rows of all scenarios and rows over all of them; acceptance.json and acceptance.md."""
 
 import json
 import math
@@ -10,7 +10,7 @@ import msgspec
 
 from terrafix.core.errors import OutputError
 from terrafix_tools.accept.fly import Result
-from terrafix_tools.accept.judged import BROKEN, Bounds, JudgedRow, Verdict, shown
+from terrafix_tools.accept.measuring.judged import BROKEN, Bounds, JudgedRow, Verdict, with_unit
 from terrafix_tools.accept.page import page
 from terrafix_tools.bench.run import machine
 from terrafix_tools.evaluate import ELLIPSE95
@@ -18,13 +18,13 @@ from terrafix_tools.evaluate import ELLIPSE95
 NAME = "acceptance"
 OVERALL = "all scenarios"
 COVERAGE = Bounds(0.93, 0.98)
-WIDEST = Bounds(high=2.0)  # a claim may be twice as wide as the error, and no wider
+MAX_WIDTH = Bounds(high=2.0)  # published 1-sigma over that of the error
 NEES_QUANTILES = (-1.959964, 1.959964)  # of the normal distribution: 2.5 and 97.5 %
-LEAST_FLIGHTS = 5  # fewer draws of the map's error cannot tell an honest claim from a modest one
+MIN_FLIGHTS = 5  # with fewer draws of the map's error the band of the NEES is too wide
 
 
 class Acceptance(msgspec.Struct, frozen=True, kw_only=True):
-    """acceptance.json."""
+    """Content of acceptance.json."""
 
     flight: str
     map: str
@@ -39,8 +39,8 @@ class Acceptance(msgspec.Struct, frozen=True, kw_only=True):
 def conclude(
     results: list[Result], *, flight: str, map_path: str, quick: bool, seed: int | None, whole: bool
 ) -> Acceptance:
-    """``whole``: all scenarios were wanted; then the rows that belong to no scenario are there, too."""
-    overall = [_honest(results), _width(results)] + (_elsewhere() if whole else [])
+    """``whole``: all scenarios were selected; adds the rows that belong to no scenario."""
+    overall = [_coverage_row(results), _width_row(results)] + (_not_replayable() if whole else [])
     rows = [row for result in results for row in result.rows] + overall
     return Acceptance(
         flight=flight,
@@ -66,8 +66,8 @@ def nees_band(flights: int) -> tuple[float, float]:
     return low, high
 
 
-def _honest(results: list[Result]) -> JudgedRow:
-    """AC-13 over all flights: every flight counts once, because its errors are of one piece."""
+def _coverage_row(results: list[Result]) -> JudgedRow:
+    """AC-13 over all flights: every flight counts once, because its errors are correlated."""
     flown = [r.nees for r in results if r.nees]
     row = {
         "scenario": OVERALL,
@@ -78,8 +78,8 @@ def _honest(results: list[Result]) -> JudgedRow:
         "goal": "",
         "goal_met": None,
     }
-    if len(flown) < LEAST_FLIGHTS:
-        why = f"{len(flown)} flights; {LEAST_FLIGHTS} are the least that can tell"
+    if len(flown) < MIN_FLIGHTS:
+        why = f"{len(flown)} flights; {MIN_FLIGHTS} are the least that can tell"
         return JudgedRow(**row, measured=None, verdict=Verdict.NOT_MEASURABLE, why=why)  # type: ignore[arg-type]
     inside = sum(sum(v <= ELLIPSE95 for v in nees) / len(nees) for nees in flown) / len(flown)
     mean = sum(sum(nees) / len(nees) for nees in flown) / len(flown)
@@ -87,34 +87,34 @@ def _honest(results: list[Result]) -> JudgedRow:
     holds = COVERAGE.holds(inside) and low <= mean <= high
     why = f"{len(flown)} flights; mean NEES {mean:.2f}, its 95 % band {low:.2f} to {high:.2f}"
     if not holds:
-        why += "; too modest" if mean < low or (mean <= high and inside > 0.98) else "; too sure"
+        why += "; too wide" if mean < low or (mean <= high and inside > 0.98) else "; too narrow"
     verdict = Verdict.PASS if holds else Verdict.BELOW
     return JudgedRow(**row, measured=round(inside, 6), verdict=verdict, why=why)  # type: ignore[arg-type]
 
 
-def _width(results: list[Result]) -> JudgedRow:
-    """Over all flights, each counted once: the median of claimed over real 1-sigma where inputs are true."""
+def _width_row(results: list[Result]) -> JudgedRow:
+    """Median over all flights of published over real 1-sigma, where inputs are true."""
     widths = [r.claim_width for r in results if r.claim_width is not None]
     row = {
         "scenario": OVERALL,
         "ac": "AC-13",
         "what": "claimed 1-sigma over that of the error, median of the flights",
         "unit": "",
-        "floor": WIDEST.text(""),
+        "floor": MAX_WIDTH.text(""),
         "goal": "",
         "goal_met": None,
     }
-    if len(widths) < LEAST_FLIGHTS:
-        why = f"{len(widths)} flights; {LEAST_FLIGHTS} are the least that can tell"
+    if len(widths) < MIN_FLIGHTS:
+        why = f"{len(widths)} flights; {MIN_FLIGHTS} are the least that can tell"
         return JudgedRow(**row, measured=None, verdict=Verdict.NOT_MEASURABLE, why=why)  # type: ignore[arg-type]
     width = statistics.median(widths)
-    verdict = Verdict.PASS if WIDEST.holds(width) else Verdict.BELOW
+    verdict = Verdict.PASS if MAX_WIDTH.holds(width) else Verdict.BELOW
     why = f"{len(widths)} flights, {min(widths):.1f} to {max(widths):.1f}"
     return JudgedRow(**row, measured=round(width, 6), verdict=verdict, why=why)  # type: ignore[arg-type]
 
 
-def _elsewhere() -> list[JudgedRow]:
-    """Rows that no replay can show."""
+def _not_replayable() -> list[JudgedRow]:
+    """Rows that a replay cannot measure."""
     return [
         JudgedRow(
             scenario=OVERALL, ac="AC-17", what="object in a frame to position", measured=None, unit="m",
@@ -151,13 +151,22 @@ def markdown(acceptance: Acceptance) -> str:
     for row in acceptance.rows:
         verdict = row.verdict + (", goal met" if row.goal_met else "")
         verdict = f"**{verdict}**" if row.verdict in BROKEN else verdict
-        cells = (row.scenario, row.ac, row.what, shown(row.measured, row.unit), row.floor, row.goal, verdict, row.why)
+        cells = (
+            row.scenario,
+            row.ac,
+            row.what,
+            with_unit(row.measured, row.unit),
+            row.floor,
+            row.goal,
+            verdict,
+            row.why,
+        )
         lines.append("| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def headline(acceptance: Acceptance) -> str:
-    """One line: how many rows hold."""
+    """One line: number of rows by verdict."""
     counts = {verdict: sum(row.verdict is verdict for row in acceptance.rows) for verdict in Verdict}
     flown = sum(bool(result.points) for result in acceptance.results)
     words = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)

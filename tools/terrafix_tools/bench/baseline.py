@@ -1,8 +1,9 @@
-"""The baseline of the benchmark: what most people try first. python -m terrafix_tools.bench.baseline FLIGHT MAP OUT.
+"""Baseline of the benchmark, the usual first approach: python -m terrafix_tools.bench.baseline FLIGHT MAP OUT.
 
-The frame, rectified with the same prediction as the matcher gets, against the map around the predicted place: SIFT,
-Lowe's ratio test, a homography by RANSAC; the point under the camera, carried over by it, is the position. It is
-given the estimator's prediction, which has seen all frames before; alone it would have less."""
+The frame is orthorectified with the prediction that the matcher gets, and matched against the map around the predicted
+position: SIFT, ratio test (Lowe 2004), homography by RANSAC. The position is the nadir point, transformed by the
+homography. The prediction is the estimator's, which has used all earlier frames: a system of this method alone would
+have a worse one."""
 
 import time
 from pathlib import Path
@@ -22,11 +23,11 @@ from terrafix.vision.sources import open_source
 from terrafix_tools.bench.flights import run_part, spread
 from terrafix_tools.evaluate import offset_m, read_truth
 
-HALF_WINDOW_M = 70.0  # around the predicted footprint: the prior of the probes that this is compared with
-GSD_PER_AGL = 1 / 200  # the scale of our own fixes; at a finer one SIFT is slower, and the ratio would flatter us
+HALF_WINDOW_M = 70.0  # margin of the map window around the predicted footprint, and limit of the correction
+GSD_PER_AGL = 1 / 200  # the scale of our own map fixes; at a finer one SIFT is slower, which would favour us
 RATIO = 0.8  # Lowe 2004
-RANSAC_PX = 5.0  # generous: relief and leaning houses
-MIN_INLIERS = 8  # chance gives 4 to 7; fewer is no answer
+RANSAC_PX = 5.0  # wide, for relief and the perspective of buildings
+MIN_INLIERS = 8  # wrong homographies have 4 to 7
 METHOD = "SIFT, ratio test 0.8, RANSAC homography"
 RESULT = "baseline.json"
 
@@ -38,7 +39,7 @@ class SiftBaseline:
         self._matcher = cv2.BFMatcher(cv2.NORM_L2)
 
     def locate(self, image: Image, prediction: Prediction) -> tuple[float, float] | None:
-        """-> (e_m, n_m) of the camera, or None when nothing agreed."""
+        """-> (e_m, n_m) of the camera; None: no homography with enough inliers."""
         e_m, n_m, _ = prediction.p_c_in_w_m
         gsd_m = max(self._map.gsd_m, prediction.agl_m / self._camera.fx, prediction.agl_m * GSD_PER_AGL)
         frame = rectify(image, self._camera, rot_from_quat(prediction.q_w_c), prediction.agl_m, gsd_m)
@@ -48,16 +49,16 @@ class SiftBaseline:
         margin = round(HALF_WINDOW_M / gsd_m)
         west, north = e_m + frame.e_min_m - margin * gsd_m, n_m + frame.n_max_m + margin * gsd_m
         window, valid = self._map.window(west, north, w + 2 * margin, h + 2 * margin, gsd_m)
-        seen, seen_at = self._describe(frame.image, frame.mask)
-        known, known_at = self._describe(window, valid)
-        if len(seen_at) < MIN_INLIERS or len(known_at) < MIN_INLIERS:
+        frame_descriptors, frame_px = self._describe(frame.image, frame.mask)
+        map_descriptors, map_px = self._describe(window, valid)
+        if len(frame_px) < MIN_INLIERS or len(map_px) < MIN_INLIERS:
             return None
-        pairs = [p for p in self._matcher.knnMatch(seen, known, k=2) if len(p) == 2]
-        good = [a for a, b in pairs if a.distance < RATIO * b.distance]
+        neighbours = [p for p in self._matcher.knnMatch(frame_descriptors, map_descriptors, k=2) if len(p) == 2]
+        good = [a for a, b in neighbours if a.distance < RATIO * b.distance]
         if len(good) < MIN_INLIERS:
             return None
-        here, there = seen_at[[g.queryIdx for g in good]], known_at[[g.trainIdx for g in good]]
-        matrix, inliers = cv2.findHomography(here, there, cv2.RANSAC, RANSAC_PX)
+        from_px, to_px = frame_px[[g.queryIdx for g in good]], map_px[[g.trainIdx for g in good]]
+        matrix, inliers = cv2.findHomography(from_px, to_px, cv2.RANSAC, RANSAC_PX)
         if matrix is None or int(inliers.sum()) < MIN_INLIERS:
             return None
         nadir_px = np.array([-frame.e_min_m / gsd_m - 0.5, frame.n_max_m / gsd_m - 0.5, 1.0])
@@ -69,7 +70,7 @@ class SiftBaseline:
         return (at_e_m, at_n_m) if inside else None
 
     def _describe(self, image: Image, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Descriptors (N, 128) and where they are (N, 2) px."""
+        """-> descriptors (N, 128) float32 and their pixels (N, 2)."""
         gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         keypoints, descriptors = self._sift.detectAndCompute(gray, mask.astype(np.uint8) * 255)
         if descriptors is None:
@@ -78,10 +79,11 @@ class SiftBaseline:
 
 
 def measure(flight: Path, map_path: Path, replayed: Path, _xfeat: Path | None = None) -> dict[str, Any]:
-    """The baseline on every frame of ``flight`` for which the replay in ``replayed`` had a prediction."""
-    said = [message for _, _, message in read_flight(replayed)]
-    origin = next(message for message in said if isinstance(message, Origin))
-    predictions = {message.frame_id: message for message in said if isinstance(message, Prediction)}
+    """Runs the baseline on every frame of ``flight`` for which the replay in ``replayed`` has a prediction. -> times
+    and accuracy."""
+    messages = [message for _, _, message in read_flight(replayed)]
+    origin = next(message for message in messages if isinstance(message, Origin))
+    predictions = {message.frame_id: message for message in messages if isinstance(message, Prediction)}
     place = LocalFrame(origin.lat_deg, origin.lon_deg)
     truth = read_truth(flight / "truth.csv")
     package = MapPackage.open(map_path)
@@ -91,18 +93,18 @@ def measure(flight: Path, map_path: Path, replayed: Path, _xfeat: Path | None = 
     shots = source.shots()
     while True:
         began_s, cpu_s = time.perf_counter(), time.process_time()
-        shot = next(shots, None)  # reads and decodes the image, which is in our own time per frame, too
+        shot = next(shots, None)  # timed: reading and decoding are part of our own time per frame, too
         if shot is None:
             break
         prediction = predictions.get(shot.frame.frame_id)
         if shot.image is None or prediction is None or shot.frame.file not in truth:
             continue
-        found = baseline.locate(shot.image, prediction)
+        position_m = baseline.locate(shot.image, prediction)
         times_ms.append((time.perf_counter() - began_s) * 1e3)
         cpu_ms.append((time.process_time() - cpu_s) * 1e3)
         frames += 1
-        if found is not None:
-            errors_m.append(float(np.hypot(*offset_m(truth[shot.frame.file], *place.to_wgs84(*found)))))
+        if position_m is not None:
+            errors_m.append(float(np.hypot(*offset_m(truth[shot.frame.file], *place.to_wgs84(*position_m)))))
     source.close()
     package.close()
     return {

@@ -1,15 +1,16 @@
-"""Claimed accuracy against errors, over flights whose inputs are true: is it right, and as narrow as it may be?
+"""Consistency of the claimed covariance over flights with correct inputs: NEES, coverage, and the terms of the claim.
 
 python -m terrafix_tools.bench.claims REPLAY [REPLAY ...] [--truth FILE] [--json FILE]
 
-A REPLAY is an output folder of ``terrafix replay``; truth is the ``truth.csv`` of the flight that its summary names, or
-``--truth`` (of one REPLAY). Errors and claims are those of the immediate estimates, with the error of the truth itself
-(``[truth] sigma_m``) added to the claim. The map's error is one draw for a whole flight, so that flights are counted
-alike however many frames they have, and the spread of NEES is that between flights. The claimed variance is split into
-its terms: map, principal point, at most so much of the time offset, and the rest (graph and hypotheses).
+A REPLAY is an output folder of ``terrafix replay``; the truth is the ``truth.csv`` of the flight named in its summary,
+or ``--truth`` (with one REPLAY). Errors and claims are those of the immediate estimates; the error of the truth
+(``[truth] sigma_m``) is added to the claim. The map error is constant over a flight. Therefore flights have equal
+weights, whatever their number of frames, and the standard error of NEES follows from the spread between flights. The
+claimed variance is split into its terms: map, principal point, an upper bound of the time offset, and the rest (graph
+and position hypotheses).
 
-Simulated flights are often over a map that is exact, while its package states an error. For those there is the NEES
-that would be expected if the map were off as it is claimed to be: what it lacks to 1 the rest claims too much."""
+Simulated flights often use an exact map, while its package states an error. For these, the table has the NEES that is
+expected with a map error as claimed: below 1, the rest of the claim is too wide."""
 
 import argparse
 import json
@@ -24,7 +25,7 @@ import typer
 from terrafix.core.camera import Mount
 from terrafix.core.errors import EvaluationError, OutputError, TerrafixError, UsageError
 from terrafix.core.geodesy import rot_from_quat
-from terrafix.estimator.integrity.time_offset import PRIOR_S
+from terrafix.estimator.integrity.time_offset import PRIOR_SIGMA_S
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.messages import Camera, LearntLens, NavEstimate, Origin, SlowErrors
 from terrafix.recorder.reader import read_flight
@@ -37,22 +38,22 @@ MEDIAN_SIGMAS = 1.1774  # median of a circular normal error, in its sigmas: sqrt
 
 @dataclass(frozen=True)
 class Claims:
-    """One flight. Variances and squared errors are means over its frames, per horizontal axis, m^2."""
+    """One flight. Variances and squared errors are means over its frames, per horizontal axis [m^2]."""
 
     flight: str
     frames: int
     inside_95: float  # share of frames whose truth is in the claimed 95 % ellipse
-    nees: float  # per degree of freedom: 1 when claims are right
-    nees_if_map_off: float  # the same, expected if an exact map had the error that is claimed of it
+    nees: float  # per degree of freedom: 1 if the claims are consistent
+    nees_if_map_off: float  # expected NEES if an exact map had its claimed error
     median_error_m: float  # horizontal
     median_claim_m: float  # 1-sigma per horizontal axis
     error_m2: float
-    bias_m2: float  # of the error that all frames of the flight share
-    claimed_m2: float  # with truth_m2
+    bias_m2: float  # of the mean error of the flight
+    claimed_m2: float  # includes truth_m2
     truth_m2: float
     map_m2: float
     principal_m2: float
-    time_m2: float  # at most: by the prior of the time offset
+    time_m2: float  # upper bound, from the prior of the time offset
 
     @property
     def rest_m2(self) -> float:
@@ -60,18 +61,18 @@ class Claims:
 
     @property
     def ratio(self) -> float:
-        """Of the claimed 1-sigma to the root mean square of the error."""
+        """Claimed 1-sigma divided by the RMS error."""
         return _root(self.claimed_m2, self.error_m2)
 
     @property
     def median_ratio(self) -> float:
-        """The same of medians: of a usual frame, whatever a few of them claim."""
+        """The same ratio of medians, which outliers among the claims do not affect."""
         return _root(self.median_claim_m**2, (self.median_error_m / MEDIAN_SIGMAS) ** 2)
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Several flights, each counted alike. ``nees_sigma``: 1-sigma of the mean, from the spread between flights."""
+    """Several flights with equal weights. ``nees_sigma``: standard error of the mean, from the spread between them."""
 
     flights: int
     inside_95: float
@@ -84,7 +85,9 @@ class Pool:
 
 
 def claims_of(replay: Path, truth_path: Path | None = None) -> Claims:
-    """Raises EvaluationError and SourceError: a file is missing or does not fit."""
+    """-> the claims of one replay. ``truth_path``: default: truth.csv of its flight.
+
+    Raises EvaluationError and SourceError: a file is missing or does not fit."""
     if truth_path is None:
         truth_path = _truth_beside(replay)
     truth_m2 = (truth_sigma_of(truth_path) or 0.0) ** 2
@@ -100,17 +103,17 @@ def claims_of(replay: Path, truth_path: Path | None = None) -> Claims:
     if not nees:
         raise EvaluationError(f"{replay}: no frame has both a claim and truth; same flight? check {truth_path}")
     terms = _terms(replay)
-    both = np.array(errors, dtype=np.float64)
+    errors_m = np.array(errors, dtype=np.float64)
     return Claims(
         flight=replay.name,
         frames=len(nees),
         inside_95=float(np.mean(np.array(nees) <= ELLIPSE95)),
         nees=float(np.mean(nees)) / 2.0,
         nees_if_map_off=float(np.mean(nees) + terms[0] * np.mean(information)) / 2.0,
-        median_error_m=float(np.median(np.hypot(both[:, 0], both[:, 1]))),
+        median_error_m=float(np.median(np.hypot(errors_m[:, 0], errors_m[:, 1]))),
         median_claim_m=math.sqrt(float(np.median(claimed))),
-        error_m2=float(np.mean(both**2)),
-        bias_m2=float(np.mean(both.mean(0) ** 2)),
+        error_m2=float(np.mean(errors_m**2)),
+        bias_m2=float(np.mean(errors_m.mean(0) ** 2)),
         claimed_m2=float(np.mean(claimed)),
         truth_m2=truth_m2,
         map_m2=float(terms[0]),
@@ -139,7 +142,7 @@ def pool(flights: list[Claims]) -> Pool:
 
 
 def table(flights: list[Claims]) -> list[str]:
-    """Rows of a Markdown table, metres per axis, and one line for the pool."""
+    """-> rows of a Markdown table (metres per axis), and one line for the pool."""
     lines = [
         "| flight | frames | inside 95 % | NEES / dof | ... if the map is off | error, rms | shared by the flight "
         "| claimed | map | principal point | time offset, at most | rest | claimed / error | ... of medians |",
@@ -166,7 +169,7 @@ def table(flights: list[Claims]) -> list[str]:
 
 
 def _information(row: Row, truth_m2: float) -> float:
-    """Trace of the inverse of the claimed covariance (2, 2) of a row, 1/m^2."""
+    """-> trace of the inverse of the claimed covariance (2, 2) of a row [1/m^2]."""
     ee, nn = (row.sigma_e_m or 0.0) ** 2 + truth_m2, (row.sigma_n_m or 0.0) ** 2 + truth_m2
     return (ee + nn) / (ee * nn - (row.cov_en_m2 or 0.0) ** 2)
 
@@ -184,10 +187,11 @@ def _truth_beside(replay: Path) -> Path:
 
 
 def _terms(replay: Path) -> np.ndarray:
-    """(3,) m^2 per axis, means: what map, principal point and, at most, the time offset add to the claimed variance."""
+    """-> (3,) m^2 per axis, means over the frames: contributions of map, principal point and time offset (upper bound)
+    to the claimed variance."""
     camera: Camera | None = None
     lens: LearntLens | None = None
-    last: dict[int, tuple[float, float, float]] = {}  # the last estimate of a frame is the one in the table
+    last: dict[int, tuple[float, float, float]] = {}  # of the last estimate of a frame, which is the one in the table
     for _, _, message in read_flight(replay):
         if isinstance(message, Origin):
             camera = message.camera
@@ -198,14 +202,15 @@ def _terms(replay: Path) -> np.ndarray:
             last[message.frame_id] = (
                 message.map_sigma_m**2,
                 _principal_m2(message, camera, lens),
-                PRIOR_S**2 * speed2 / 2.0,
+                PRIOR_SIGMA_S**2 * speed2 / 2.0,
             )
     return np.mean(list(last.values()), axis=0) if last else np.zeros(3)
 
 
-def _principal_m2(said: NavEstimate, camera: Camera, lens: LearntLens | None) -> float:
-    lever = said.agl_m * (rot_from_quat(said.q_w_b) @ Mount.of(camera).r_b_c())[:2, :2]
-    return float(np.trace(PrincipalPointFilter(camera, lens).aside(lever)[1])) / 2.0
+def _principal_m2(estimate: NavEstimate, camera: Camera, lens: LearntLens | None) -> float:
+    """-> variance of the position from the principal point, per axis [m^2]."""
+    jacobian = estimate.agl_m * (rot_from_quat(estimate.q_w_b) @ Mount.of(camera).r_b_c())[:2, :2]
+    return float(np.trace(PrincipalPointFilter(camera, lens).shift(jacobian)[1])) / 2.0
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -228,9 +233,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _write(path: Path, flights: list[Claims]) -> None:
-    said = {"flights": [asdict(f) for f in flights], "pool": asdict(pool(flights))}
+    result = {"flights": [asdict(f) for f in flights], "pool": asdict(pool(flights))}
     try:
-        path.write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
 

@@ -1,8 +1,8 @@
-"""Cost as the flight grows: the estimator on synthetic messages. python -m terrafix_tools.bench.growth FRAMES OUT.
+"""Cost of the estimator as the flight grows, on synthetic messages: python -m terrafix_tools.bench.growth FRAMES OUT.
 
-Frames of a camera would take minutes and cost the same in every frame; what could grow is the estimator. Beside its
-own covariance query the same one from scratch, as GTSAM offers it: ``gtsam.Marginals`` over the window, over all.
-Times are those of the processor, all threads: other programs do not lengthen them."""
+The cost of image processing does not depend on the length of the flight and is left out. The estimator's covariance
+query is compared with the same query from scratch: ``gtsam.Marginals`` over the window, and over the whole flight.
+Times are processor times of all threads, which other programs do not lengthen."""
 
 import json
 import sys
@@ -17,23 +17,25 @@ import gtsam
 import numpy as np
 
 from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.filter_state import FrameInput
 from terrafix.estimator.graph.marginalized import MarginalizedHistory
 from terrafix.estimator.graph.pose_graph import PoseGraph
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Imu
 from terrafix_tools.bench.flights import spread
-from terrafix_tools.bench.stream import ORIGIN, spoken
+from terrafix_tools.bench.stream import ORIGIN, frame_messages
 from terrafix_tools.replay import peak_memory_mb
 
 RESULT = "growth.json"
-LAST = 80  # frames at the end of the flight, over which the time of one is taken
-LATER = 500  # ... and over which that of the graph alone, whose rare long ones are asked for
-QUERIES = 10  # of a covariance from scratch
-ASKED_BEFORE = 10  # nodes before the newest: the middle of the window
+LAST = 80  # last frames of the flight, for the statistics of the time per frame
+LATER = 500  # last frames for the statistics of the graph alone: more, for the 99th percentile
+QUERIES = 10  # covariance queries from scratch
+QUERIED_BEFORE = 10  # number of nodes from the queried one to the newest: the middle of the window
 
 
 class _TimedGraph(PoseGraph):
-    """``spent_ms`` since it was set to zero: nodes and map fixes put in, iSAM2's update, the covariances asked for."""
+    """``spent_ms``: processor time since it was set to zero: new nodes and map fixes, iSAM2 updates, covariance
+    queries."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -43,9 +45,9 @@ class _TimedGraph(PoseGraph):
         with self._stopwatch():
             return super().extend(*node, **more)
 
-    def add_pose(self, *fix: Any) -> None:
+    def add(self, *new: Any) -> None:
         with self._stopwatch():
-            super().add_pose(*fix)
+            super().add(*new)
 
     def _marginal(self, key: int) -> np.ndarray:
         with self._stopwatch():
@@ -59,7 +61,7 @@ class _TimedGraph(PoseGraph):
 
 
 class _WholeFlight(MarginalizedHistory):
-    """Every factor of the flight, linear, beside the few that the estimator keeps: for the queries from scratch."""
+    """Also stores every factor of the flight and the last values, for the queries from scratch."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -70,38 +72,39 @@ class _WholeFlight(MarginalizedHistory):
         super().add(factors)
         self.factors.push_back(factors)
 
-    def leave(self, nodes: list[int], estimate: gtsam.Values) -> None:
-        super().leave(nodes, estimate)
+    def marginalize(self, nodes: list[int], estimate: gtsam.Values) -> None:
+        super().marginalize(nodes, estimate)
         for node in nodes:
             self.values.insert(_camera(node), estimate.atPose3(_camera(node)))
             self.values.insert(_bias(node), estimate.atVector(_bias(node)))
             self.values.insert(_velocity(node), estimate.atVector(_velocity(node)))
 
     def linear(self) -> gtsam.NonlinearFactorGraph:
-        """A factor written in Python costs much in a large graph: GTSAM hands each call a copy of all values."""
+        """-> all factors, linearized. Factors in Python are slow in a large graph, because GTSAM copies all values for
+        each call."""
         graph = gtsam.NonlinearFactorGraph()
         for i in range(self.factors.size()):
             factor = self.factors.at(i)
-            around = gtsam.Values()
-            for key in factor.keys():  # noqa: SIM118 (a factor is no dict)
+            point = gtsam.Values()
+            for key in factor.keys():  # noqa: SIM118 (a factor is not a dict)
                 is_pose = key == _camera(gtsam.symbolIndex(key))
-                around.insert(key, self.values.atPose3(key) if is_pose else self.values.atVector(key))
-            graph.push_back(gtsam.LinearContainerFactor(factor.linearize(around), around))
+                point.insert(key, self.values.atPose3(key) if is_pose else self.values.atVector(key))
+            graph.push_back(gtsam.LinearContainerFactor(factor.linearize(point), point))
         return graph
 
 
 def measure(frames: int) -> dict[str, Any]:
-    """-> time for each of the last frames, of the refinement after landing, of covariance queries; memory."""
-    estimator, graph = Estimator(ORIGIN), _TimedGraph()
-    estimator.graph = graph
+    """-> times per frame (of the last ones), of the refinement after landing and of covariance queries; memory."""
+    graph = _TimedGraph()
+    estimator = Estimator(ORIGIN, graph=graph)
     times_ms: list[float] = []
     update_ms: list[float] = []
     query_ms: list[float] = []
     for frame_ms in _flown(estimator, frames):
         times_ms.append(frame_ms)
         update_ms.append(graph.spent_ms)
-        # Not of the newest: the smoother still has that one from this very frame.
-        query_ms.append(_ms(partial(estimator.graph.covariance, max(0, estimator.graph.newest - ASKED_BEFORE))))
+        # Not the newest node: the smoother has computed its covariance in this frame.
+        query_ms.append(_ms(partial(estimator.graph.covariance, max(0, estimator.graph.newest - QUERIED_BEFORE))))
         graph.spent_ms = 0.0
     in_flight_mb = peak_memory_mb()
     began_s = time.process_time()
@@ -121,27 +124,28 @@ def measure(frames: int) -> dict[str, Any]:
 
 
 def _flown(estimator: Estimator, frames: int) -> Iterator[float]:
-    """Processor time of each frame, ms: with all that came since the one before."""
+    """-> processor time of each frame [ms], with all messages since the previous one."""
     telemetry = Telemetry()
-    for said in spoken(frames):
+    for frame in frame_messages(frames):
         began_s = time.process_time()
-        for message in said.telemetry:
+        for message in frame.telemetry:
             if isinstance(message, Imu):
                 telemetry.add_imu(message)
             else:
                 telemetry.add(message)
-        t_ns = said.odometry.t_ns
+        t_ns = frame.odometry.t_ns
         attitude = telemetry.at(t_ns)
-        estimator.advance(said.odometry.frame_id, t_ns * 1e-9, said.odometry, attitude, telemetry.felt)
-        if said.match is not None:
-            estimator.fix(said.match)
+        imu = telemetry.world_acceleration
+        estimator.feed_frame(FrameInput(frame.odometry.frame_id, t_ns * 1e-9, frame.odometry, attitude, imu))
+        if frame.match is not None:
+            estimator.feed_map_match(frame.match)
         yield (time.process_time() - began_s) * 1e3
 
 
 def _from_scratch(frames: int) -> dict[str, dict[str, float]]:
-    """The same covariance as GTSAM computes it without a smoother, after the same flight."""
-    estimator, flight = Estimator(ORIGIN), _WholeFlight()
-    estimator.graph = PoseGraph(flight)
+    """-> times of the same covariance query with ``gtsam.Marginals``, after the same flight."""
+    flight = _WholeFlight()
+    estimator = Estimator(ORIGIN, graph=PoseGraph(flight))
     for _ in _flown(estimator, frames):
         pass
     newest = estimator.graph.newest
@@ -152,19 +156,19 @@ def _from_scratch(frames: int) -> dict[str, dict[str, float]]:
         "window": (_window(factors, flight.values, in_window), QUERIES),
         "whole flight": ((factors, flight.values), 2),
     }
-    asked = _camera(newest - ASKED_BEFORE)
+    queried = _camera(newest - QUERIED_BEFORE)
     return {
         f"gtsam.Marginals, {name}": spread(
-            [_ms(lambda: gtsam.Marginals(*graph).marginalCovariance(asked)) for _ in range(times)]  # noqa: B023
+            [_ms(lambda: gtsam.Marginals(*graph).marginalCovariance(queried)) for _ in range(count)]  # noqa: B023
         )
-        for name, (graph, times) in graphs.items()
+        for name, (graph, count) in graphs.items()
     }
 
 
 def _window(
     whole: gtsam.NonlinearFactorGraph, all_values: gtsam.Values, nodes: set[int]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The factors among ``nodes``, with a prior on the oldest in place of what lies before."""
+    """-> factors and values of ``nodes``, with a prior on the oldest one instead of the earlier nodes."""
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for i in range(whole.size()):
         factor = whole.at(i)

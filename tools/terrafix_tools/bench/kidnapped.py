@@ -1,12 +1,14 @@
-"""Kidnapped starts: from the middle of a flight, without any position. How soon is the place found, and is it right?
+"""Kidnapped starts: relocalisation from the middle of a flight without a position prior.
+
+Measures the number of frames until the position is found, and the wrong results:
 
 python -m terrafix_tools.bench.kidnapped FLIGHT [FLIGHT ...] [--map MAP] [--mirrored] [--tries 20] [--frames 10]
     [--stride 1] [--seed 1] [--no-compass] [--json FILE]
 
-Each try begins at another frame of the flight, one in each stretch, with the processes of ``terrafix replay`` just
-started and no start coordinate; it takes 4 to 10 s of one core. A row is printed, and --json written, when a flight is
-through. In two tests nothing may be found: ``--map`` of another place; and ``--mirrored``: with left and right
-exchanged a frame shows ground of the same kind that is nowhere on the map."""
+The flight is divided into as many sections as there are tries; each try begins at a random frame of its section, with
+new nodes of ``terrafix replay`` and without a start coordinate. It takes 4 to 10 s of one core. After each flight a row
+is printed, and --json written. In two tests any result is wrong: with ``--map`` of another place; and with
+``--mirrored``, because a mirrored frame shows ground of the same kind that is nowhere on the map."""
 
 import argparse
 import csv
@@ -28,7 +30,7 @@ from terrafix.core.config import load
 from terrafix.core.errors import SourceError, TerrafixError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.initial_position import placed
+from terrafix.core.initial_position import with_map_center
 from terrafix.core.node import NodeContext
 from terrafix.map.package import MapPackage
 from terrafix.messages import MapMatch, Message, NavEstimate, Origin
@@ -37,16 +39,17 @@ from terrafix.vision.sources import Source, open_source
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay import FRAMES_KEPT, make_nodes, map_cache_dir
 
-RIGHT_M, RIGHT_PER_AGL = 50.0, 0.1  # a place is right within this, or within this share of the height if that is more
-CLAIM_SIGMAS = 3.2  # an error beyond this many claimed sigmas, and not right: a wrong place was announced
-CLAIMED_FIX = 1.0  # heights: a 1-sigma below this claims a place
+RIGHT_M, RIGHT_PER_AGL = 50.0, 0.1  # largest error of a correct position: the larger of [m] and [share of the height]
+CLAIM_SIGMAS = 3.2  # an incorrect position with an error of more sigmas than this counts as wrong
+CLAIMED_FIX = 1.0  # heights: an estimate with a larger 1-sigma does not claim a position
 
 Truth = dict[str, tuple[float, float]]  # file -> (lat_deg, lon_deg)
 
 
 @dataclass(frozen=True)
-class How:
-    """How a try is flown: ``frames``, of which every ``stride``-th counts; with the heading of the autopilot or not."""
+class TryOptions:
+    """``frames``: number of used frames; ``stride``: every such frame is used; ``compass``: with the autopilot's yaw;
+    ``mirrored``: images with left and right exchanged."""
 
     frames: int
     stride: int
@@ -56,78 +59,80 @@ class How:
 
 @dataclass(frozen=True)
 class Try:
-    """One kidnapped start. ``found_after``: frames, None if it was not found; ``wrong``: frames on which a wrong place
-    was announced."""
+    """One kidnapped start at frame ``first``. ``found_after``: number of frames; None: not found. ``error_m``: of the
+    position then. ``wrong``: number of frames with a wrong position. ``way_agl``: flown distance, in heights."""
 
     first: int
     found_after: int | None
     error_m: float | None
     wrong: int
     frames: int
-    way_agl: float  # flown within the frames, in heights
+    way_agl: float
     cpu_s_a_frame: float
 
 
-def attempt(source: Source, package: Path, truth: Truth, first: int, how: How) -> Try:
-    """The processes from frame ``first`` on."""
-    store, heard = MemoryFrameStore(FRAMES_KEPT), list[Message]()
+def attempt(source: Source, package: Path, truth: Truth, first: int, options: TryOptions) -> Try:
+    """Runs the nodes of ``terrafix replay`` from frame ``first`` on."""
+    store, published = MemoryFrameStore(FRAMES_KEPT), list[Message]()
     with tempfile.TemporaryDirectory(prefix="terrafix-kidnapped-") as out:
         ctx = NodeContext(config=load([]), frames=store, map_path=package.resolve(), out_dir=Path(out))
-        shell = InProcessShell(make_nodes(ctx), lambda _who, message: heard.append(message))
-    shell.feed(_nowhere(source, package))
-    found_after, error_m, wrong, used, way_agl, cpu_s = None, None, 0, 0, 0.0, 0.0
-    before: tuple[float, float] | None = None
-    for i, shot in enumerate(itertools.islice(source.shots(), first, first + how.frames * how.stride)):
+        shell = InProcessShell(make_nodes(ctx), lambda _process, message: published.append(message))
+    shell.feed(_origin_without_start(source, package))
+    found_after, error_m, wrong, used, path_agl, cpu_s = None, None, 0, 0, 0.0, 0.0
+    previous: tuple[float, float] | None = None
+    for i, shot in enumerate(itertools.islice(source.shots(), first, first + options.frames * options.stride)):
         for state in shot.states:
-            shell.feed(state if how.compass else msgspec.structs.replace(state, yaw_rad=None))
+            shell.feed(state if options.compass else msgspec.structs.replace(state, yaw_rad=None))
         for readings in shot.imu:
             shell.feed(readings)
-        if i % how.stride:
+        if i % options.stride:
             continue
         if shot.image is not None:
-            store.put(shot.frame.frame_id, np.ascontiguousarray(shot.image[:, ::-1]) if how.mirrored else shot.image)
-        heard.clear()
+            store.put(
+                shot.frame.frame_id, np.ascontiguousarray(shot.image[:, ::-1]) if options.mirrored else shot.image
+            )
+        published.clear()
         began_s = time.process_time()
         shell.feed(shot.frame)
         cpu_s += time.process_time() - began_s
         used += 1
-        here = truth.get(shot.frame.file)
-        estimates = [m for m in heard if isinstance(m, NavEstimate)]
-        if here is None or not estimates:
+        true_deg = truth.get(shot.frame.file)
+        estimates = [m for m in published if isinstance(m, NavEstimate)]
+        if true_deg is None or not estimates:
             continue
         estimate = estimates[-1]
-        way_agl += 0.0 if before is None else _apart_m(before, here) / estimate.agl_m
-        before = here
-        off_m = _apart_m(here, (estimate.lat_deg, estimate.lon_deg))
-        right = not how.mirrored and off_m <= max(RIGHT_M, RIGHT_PER_AGL * estimate.agl_m)
+        path_agl += 0.0 if previous is None else _apart_m(previous, true_deg) / estimate.agl_m
+        previous = true_deg
+        off_m = _apart_m(true_deg, (estimate.lat_deg, estimate.lon_deg))
+        correct = not options.mirrored and off_m <= max(RIGHT_M, RIGHT_PER_AGL * estimate.agl_m)
         sigma_m = max(estimate.cov[0], estimate.cov[7]) ** 0.5
-        found = any(m.found for m in heard if isinstance(m, MapMatch))
-        if found and right and found_after is None:
+        found = any(m.found for m in published if isinstance(m, MapMatch))
+        if found and correct and found_after is None:
             found_after, error_m = used, off_m
         claims = sigma_m < CLAIMED_FIX * estimate.agl_m and off_m > CLAIM_SIGMAS * sigma_m
-        wrong += not right and (found or claims)
-    return Try(first, found_after, error_m, wrong, used, round(way_agl, 2), round(cpu_s / max(used, 1), 2))
+        wrong += not correct and (found or claims)
+    return Try(first, found_after, error_m, wrong, used, round(path_agl, 2), round(cpu_s / max(used, 1), 2))
 
 
-def measure(flight: str, map_path: Path | None, tries: int, seed: int, how: How) -> list[Try]:
-    """Raises the TerrafixError family."""
+def measure(flight: str, map_path: Path | None, tries: int, seed: int, options: TryOptions) -> list[Try]:
+    """-> all tries of a flight. ``map_path``: default: the map that the flight names. Raises TerrafixError."""
     source = open_source(flight)
-    wanted = map_path or source.map_hint()
-    if wanted is None:
+    map_source = map_path or source.map_hint()
+    if map_source is None:
         raise UsageError(f"{flight}: the flight names no map; give one with --map")
-    package = ensure_package(wanted, map_cache_dir())
+    package = ensure_package(map_source, map_cache_dir())
     truth = _truth(Path(flight))
-    starts = max(1, (source.length() or 0) - how.frames * how.stride + 1)
-    draw = random.Random(seed)
-    drawn = {min(int((k + draw.random()) * starts / tries), starts - 1) for k in range(tries)}
-    return [attempt(source, package, truth, first, how) for first in sorted(drawn)]
+    starts = max(1, (source.length() or 0) - options.frames * options.stride + 1)
+    rng = random.Random(seed)
+    first_frames = {min(int((k + rng.random()) * starts / tries), starts - 1) for k in range(tries)}
+    return [attempt(source, package, truth, first, options) for first in sorted(first_frames)]
 
 
-def _nowhere(source: Source, package: Path) -> Origin:
-    """The origin of the source without its start: the middle of the map, as wide as the map."""
+def _origin_without_start(source: Source, package: Path) -> Origin:
+    """-> the origin of the source with an unknown start: the centre of the map, with a sigma as wide as the map."""
     opened = MapPackage.open(package)
     unknown = msgspec.structs.replace(source.origin(), start_sigma_m=float("inf"))
-    origin = placed(unknown, opened.manifest.bounds_wgs84)
+    origin = with_map_center(unknown, opened.manifest.bounds_wgs84)
     return msgspec.structs.replace(origin, ground_amsl_m=opened.ground_amsl_m(origin.lat_deg, origin.lon_deg))
 
 
@@ -157,24 +162,24 @@ def row(name: str, tries: list[Try]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("flights", nargs="+", metavar="FLIGHT")
-    parser.add_argument("--map", type=Path, help="instead of the one that each flight names")
-    parser.add_argument("--mirrored", action="store_true", help="left and right exchanged: nothing may be found")
+    parser.add_argument("--map", type=Path, help="instead of the map that each flight names")
+    parser.add_argument("--mirrored", action="store_true", help="left and right exchanged: any result is wrong")
     parser.add_argument("--tries", type=int, default=20)
     parser.add_argument("--frames", type=int, default=10)
-    parser.add_argument("--stride", type=int, default=1, help="uses every so-manieth frame")
+    parser.add_argument("--stride", type=int, default=1, help="uses every Nth frame")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--no-compass", action="store_true")
     parser.add_argument("--json", type=Path, help="writes every try")
     given = parser.parse_args()
-    how = How(given.frames, given.stride, compass=not given.no_compass, mirrored=given.mirrored)
+    options = TryOptions(given.frames, given.stride, compass=not given.no_compass, mirrored=given.mirrored)
     typer.echo(f"{'flight':28} tries found  {'frames, median':22} wrong  heights  CPU s a frame")
     all_tries: dict[str, list[Try]] = {}
     try:
         for flight in given.flights:
             name = Path(flight).name
-            all_tries[name] = measure(flight, given.map, given.tries, given.seed, how)
+            all_tries[name] = measure(flight, given.map, given.tries, given.seed, options)
             typer.echo(row(name, all_tries[name]))
-            if given.json is not None:  # after each flight: an hour's work may be stopped
+            if given.json is not None:  # after each flight, because a run of an hour may be stopped
                 _write(given.json, all_tries)
     except TerrafixError as error:
         sys.exit(f"{error}")

@@ -1,7 +1,9 @@
-"""Cost as the map grows: build, open, read, search. python -m terrafix_tools.bench.map_size KM2 WORK OUT.
+"""Cost of a map as its area grows: build, open, read, correlate.
 
-The ground is coloured noise of many sizes, half a metre a pixel, different everywhere; the frame is a piece of it.
-Times called cpu are those of the processor, all threads; the others are by the clock."""
+python -m terrafix_tools.bench.map_size KM2 WORK OUT builds WORK/map.gpkg; ``map_size search WORK OUT`` measures it.
+
+The imagery is noise of several scales without repetition, 0.5 m per pixel; the frame is a part of it. Times with "cpu"
+in their name are processor times of all threads; the others are wall-clock times."""
 
 import filecmp
 import json
@@ -20,7 +22,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
-from terrafix.anchor.matching.point_mass_filter import Belief, cell_for
+from terrafix.anchor.matching.point_mass_filter import Belief, belief_cell_m
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import LocalMap, MapPackage
@@ -34,14 +36,14 @@ BLOCK_PX = 512
 AGL_M = 150.0
 CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
 EPSG, WEST_M, NORTH_M = 32632, 690_000.0, 5_330_000.0
-BELIEFS_M = {"in flight": 20.0, "lost": 300.0}  # sigma of the belief that is looked with
-LOOKS = 8
+BELIEFS_M = {"in flight": 20.0, "lost": 300.0}  # 1-sigma of the belief for the correlation
+CORRELATIONS = 8
 WORKERS = 4
 WINDOW_GSD_M, WINDOWS = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 1.8, 2.0, 3.0, 4.0), 30
 
 
 def measure(area_km2: float, work: Path) -> dict[str, Any]:
-    """-> what it takes to build by one process and by several, all of it, from the image to the file; size."""
+    """-> times of a whole build, from the image to the package, with one process and with WORKERS; size."""
     side_px = round(math.sqrt(area_km2) * 1000.0 / GSD_M)
     image, package, other = work / "map.tif", work / "map.gpkg", work / "by-several" / "map.gpkg"
     _draw(image, side_px)
@@ -67,33 +69,35 @@ def measure(area_km2: float, work: Path) -> dict[str, Any]:
 
 
 def search(package: Path) -> dict[str, Any]:
-    """In a process of its own: what a vehicle pays for a map of this size."""
+    """-> costs of this map on board. Needs its own process, because it measures memory."""
     before_mb = peak_memory_mb()
     began_s = time.monotonic()
     opened = MapPackage.open(package)
-    place = _middle(opened)
+    place = _centre(opened)
     local = opened.bind(place)
     open_ms = (time.monotonic() - began_s) * 1e3
     matcher = FrameMatcher(CAMERA, local, open_describer(""))
     frame = _frame(local)
     view = View(0.0, 0.0, np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), AGL_M, 0.0, 0.03, 0.02, 0.02)
-    looks = {}
+    correlations_ms = {}
     for name, sigma_m in BELIEFS_M.items():
-        belief = Belief(0.0, 0.0, sigma_m, cell_for(AGL_M, matcher.look_cell_m(AGL_M)))
-        looks[name] = spread([_ms(partial(matcher.look, frame, view, belief)) for _ in range(LOOKS)])
+        belief = Belief(0.0, 0.0, sigma_m, belief_cell_m(AGL_M, matcher.correlation_cell_m(AGL_M)))
+        correlations_ms[name] = spread(
+            [_ms(partial(matcher.correlate, frame, view, belief)) for _ in range(CORRELATIONS)]
+        )
     grown_mb = peak_memory_mb() - before_mb
     windows = {f"{gsd_m:g} m/px": spread(_windows_ms(local, gsd_m)) for gsd_m in WINDOW_GSD_M}
     opened.close()
     return {
         "open_ms": round(open_ms, 1),
         "window_ms": windows,
-        "look_cpu_ms": looks,
+        "look_cpu_ms": correlations_ms,
         "memory_mb": round(grown_mb, 1),
     }
 
 
 def _windows_ms(local: LocalMap, gsd_m: float) -> list[float]:
-    """Of windows of a kilometre around the middle, once their tiles are there."""
+    """-> times of reading windows of 1 km around the centre, with their tiles in the cache."""
     side_px = round(1000.0 / gsd_m)
     shifts_m = np.random.default_rng(5).uniform(-100.0, 100.0, (WINDOWS, 2)).tolist()
     reads = [partial(local.window, e_m - 500.0, n_m + 500.0, side_px, side_px, gsd_m) for e_m, n_m in shifts_m]
@@ -102,20 +106,20 @@ def _windows_ms(local: LocalMap, gsd_m: float) -> list[float]:
     return [_ms(read, time.monotonic) for read in reads]
 
 
-def _middle(package: MapPackage) -> LocalFrame:
+def _centre(package: MapPackage) -> LocalFrame:
     west, south, east, north = package.manifest.bounds_wgs84
     return LocalFrame((south + north) / 2, (west + east) / 2)
 
 
 def _frame(local: LocalMap) -> np.ndarray:
-    """What CAMERA sees straight down, north up."""
+    """-> image of CAMERA that looks straight down at the centre, north up."""
     gsd_m = AGL_M / CAMERA.fx
     image, _ = local.window(-CAMERA.width / 2 * gsd_m, CAMERA.height / 2 * gsd_m, CAMERA.width, CAMERA.height, gsd_m)
     return image
 
 
 def _draw(path: Path, side_px: int) -> None:
-    """Block by block: a hundred square kilometres are never in memory."""
+    """Writes the imagery block by block, because 100 km2 do not fit into memory."""
     profile = {
         "driver": "GTiff", "width": side_px, "height": side_px, "count": 3, "dtype": "uint8", "crs": f"EPSG:{EPSG}",
         "transform": Affine(GSD_M, 0.0, WEST_M, 0.0, -GSD_M, NORTH_M), "tiled": True,

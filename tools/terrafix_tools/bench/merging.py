@@ -1,8 +1,8 @@
-"""Merge of the fragments of a flight: python -m terrafix_tools.bench.merging KEYFRAMES OUT.
+"""Merge of the submaps of a flight by the Sim(3) pose graph: python -m terrafix_tools.bench.merging KEYFRAMES OUT.
 
-A synthetic flight that was torn into pieces, each in a frame and a unit of its own, with map fixes of which some are
-wrong. Beside it, on the same graph from the same beginning, least squares without any robustness
-(``gtsam.LevenbergMarquardtOptimizer``). Times are those of the processor."""
+A synthetic flight in submaps, each with its own frame and unit of length, with absolute constraints of which some are
+outliers. It is compared with least squares without a robust loss on the same graph and initial values
+(``gtsam.LevenbergMarquardtOptimizer``). Times are processor times."""
 
 import json
 import sys
@@ -24,46 +24,47 @@ from terrafix_tools.finalise.sim3_pose_graph import merge
 from terrafix_tools.finalise.submap_types import AbsoluteConstraint, MergedSubmaps, Submap
 
 RESULT = "merging.json"
-FRAGMENTS, ANCHOR_EVERY, WRONG_SHARE, WRONG_M = 10, 10, 0.05, 350.0
+SUBMAPS, ANCHOR_EVERY, WRONG_SHARE, WRONG_M = 10, 10, 0.05, 350.0
 STEP_M, AGL_M = 12.0, 120.0
-# Of a keyframe in the one before: rotation about the camera's axes [rad], way [m].
+# 1-sigma of the relative pose of two consecutive keyframes: rotation about the camera's axes [rad], translation [m].
 STEP_SIGMAS = np.array([0.002, 0.002, 0.002, 0.15, 0.15, 0.15])
 ANCHOR_SIGMAS = np.array([0.015, 0.015, 0.015, 2.0, 2.0, 3.0])
-SCALE_WALK = 0.002
+SCALE_WALK = 0.002  # 1-sigma of the random walk of the log scale, per keyframe
 
 
 @dataclass(frozen=True)
-class Torn:
-    """A flight in pieces; truth is ``r_w_c`` and ``p_w_m`` of every fragment, ``wrong`` (A,) says of every anchor."""
+class SubmapFlight:
+    """A flight in submaps (``submaps``) with absolute constraints (``anchors``). Truth: ``r_w_c`` and ``p_w_m`` of
+    the keyframes of every submap; ``wrong`` (A,): outliers among the constraints."""
 
-    fragments: list[Submap]
+    submaps: list[Submap]
     anchors: list[AbsoluteConstraint]
     wrong: np.ndarray
     r_w_c: list[np.ndarray]
     p_w_m: list[np.ndarray]
 
-    def right_anchors(self) -> list[AbsoluteConstraint]:
+    def inlier_anchors(self) -> list[AbsoluteConstraint]:
         return [a for a, wrong in zip(self.anchors, self.wrong, strict=True) if not wrong]
 
 
-def torn_flight(
+def make_submap_flight(
     seed: int,
     *,
-    fragments: int = FRAGMENTS,
+    submaps: int = SUBMAPS,
     keyframes: int = 300,
     anchor_every: int = ANCHOR_EVERY,
     wrong_share: float = WRONG_SHARE,
     scale_known: bool = False,
-) -> Torn:
-    """Every error is drawn from what its covariance says; a wrong anchor is WRONG_M off, and as sure as the others."""
+) -> SubmapFlight:
+    """Draws every error from its covariance. An outlier is WRONG_M off, with the same covariance as the others."""
     rng = np.random.default_rng([seed, 91])
-    r_w, p_w = _course(rng, fragments * keyframes)
-    pieces, anchors, truth_r, truth_p = [], [], [], []
-    for f in range(fragments):
+    r_w, p_w = _course(rng, submaps * keyframes)
+    submap_list, anchors, truth_r, truth_p = [], [], [], []
+    for f in range(submaps):
         at = slice(f * keyframes, (f + 1) * keyframes)
         truth_r.append(r_w[at])
         truth_p.append(p_w[at])
-        pieces.append(_fragment(rng, r_w[at], p_w[at], scale_known))
+        submap_list.append(_submap(rng, r_w[at], p_w[at], scale_known))
         for k in range(f % anchor_every, keyframes, anchor_every):
             error = ANCHOR_SIGMAS * rng.normal(size=6)
             r, p = r_w[at][k], p_w[at][k]
@@ -73,14 +74,14 @@ def torn_flight(
     wrong = np.zeros(len(anchors), bool)
     wrong[rng.permutation(len(anchors))[: round(wrong_share * len(anchors))]] = True
     for i in np.flatnonzero(wrong):
-        a, towards = anchors[i], float(rng.uniform(0.0, 2.0 * np.pi))
-        away_m = WRONG_M * np.array([np.cos(towards), np.sin(towards), 0.0])
-        anchors[i] = AbsoluteConstraint(a.fragment, a.keyframe, a.r_w_c, a.p_c_in_w_m + away_m, a.cov)
-    return Torn(pieces, anchors, wrong, truth_r, truth_p)
+        a, direction_rad = anchors[i], float(rng.uniform(0.0, 2.0 * np.pi))
+        shift_m = WRONG_M * np.array([np.cos(direction_rad), np.sin(direction_rad), 0.0])
+        anchors[i] = AbsoluteConstraint(a.submap, a.keyframe, a.r_w_c, a.p_c_in_w_m + shift_m, a.cov)
+    return SubmapFlight(submap_list, anchors, wrong, truth_r, truth_p)
 
 
 def _course(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cameras (n, 3, 3), (n, 3) of a flight with turns and climbs."""
+    """-> attitudes R_w_c (n, 3, 3) and positions (n, 3) of a flight with turns and climbs."""
     phase = rng.uniform(0.0, 2.0 * np.pi, 3)
     t = np.arange(n)
     yaw = np.cumsum(0.03 * np.sin(t / 23.0 + phase[0]) + 0.02 * np.sin(t / 61.0 + phase[1]))
@@ -92,7 +93,7 @@ def _course(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
     return r, p
 
 
-def _fragment(rng: np.random.Generator, r_w: np.ndarray, p_w: np.ndarray, scale_known: bool) -> Submap:
+def _submap(rng: np.random.Generator, r_w: np.ndarray, p_w: np.ndarray, scale_known: bool) -> Submap:
     n = len(r_w)
     scale = np.exp(np.cumsum(SCALE_WALK * rng.normal(size=n)))
     scale *= 1.0 if scale_known else float(np.exp(rng.normal(0.0, 0.5)))
@@ -110,16 +111,17 @@ def _fragment(rng: np.random.Generator, r_w: np.ndarray, p_w: np.ndarray, scale_
     return Submap(r_f, p_f, parent, np.broadcast_to(cov, (n, 6, 6)), 0.01 if scale_known else None, SCALE_WALK)
 
 
-def positions(fragments: list[Submap], anchors: list[AbsoluteConstraint]) -> list[np.ndarray]:
-    """(N, 3) of the keyframes of every fragment, as merged; not a number where it was not placed."""
-    placed = merge(fragments, anchors).placements
-    return [np.full((len(f), 3), np.nan) if p is None else p.p_c_in_w_m for f, p in zip(fragments, placed, strict=True)]
+def positions(submaps: list[Submap], anchors: list[AbsoluteConstraint]) -> list[np.ndarray]:
+    """-> for every submap the merged positions of its keyframes (N, 3); NaN if the submap was not placed."""
+    placed = merge(submaps, anchors).placements
+    return [np.full((len(f), 3), np.nan) if p is None else p.p_c_in_w_m for f, p in zip(submaps, placed, strict=True)]
 
 
-def pose_errors(torn: Torn, merged: MergedSubmaps) -> tuple[np.ndarray, np.ndarray]:
-    """(M, 6) tangent of the error, of placed keyframes, and the covariances (M, 6, 6) that were claimed."""
+def pose_errors(flight: SubmapFlight, merged: MergedSubmaps) -> tuple[np.ndarray, np.ndarray]:
+    """-> of all placed keyframes the errors (M, 6; rotation, translation in the camera frame), and their covariances
+    (M, 6, 6)."""
     errors, covs = [], []
-    for placed, r_true, p_true in zip(merged.placements, torn.r_w_c, torn.p_w_m, strict=True):
+    for placed, r_true, p_true in zip(merged.placements, flight.r_w_c, flight.p_w_m, strict=True):
         if placed is None:
             continue
         for r, p, cov, rt, pt in zip(placed.r_w_c, placed.p_c_in_w_m, placed.cov, r_true, p_true, strict=True):
@@ -129,23 +131,23 @@ def pose_errors(torn: Torn, merged: MergedSubmaps) -> tuple[np.ndarray, np.ndarr
 
 
 def measure(keyframes: int) -> dict[str, Any]:
-    """``keyframes`` of the whole flight, in FRAGMENTS pieces."""
-    torn = torn_flight(1, keyframes=keyframes // FRAGMENTS)
-    right = torn.right_anchors()
-    ways: list[
+    """-> times and accuracy of the methods. ``keyframes``: of the whole flight, in FRAGMENTS submaps."""
+    flight = make_submap_flight(1, keyframes=keyframes // SUBMAPS)
+    inliers = flight.inlier_anchors()
+    methods: list[
         tuple[str, Callable[[list[Submap], list[AbsoluteConstraint]], list[np.ndarray]], list[AbsoluteConstraint]]
     ] = [
-        ("merge", positions, torn.anchors),
-        ("merge, no wrong anchors", positions, right),
-        (merging_baseline.METHOD, merging_baseline.positions, torn.anchors),
+        ("merge", positions, flight.anchors),
+        ("merge, no wrong anchors", positions, inliers),
+        (merging_baseline.METHOD, merging_baseline.positions, flight.anchors),
     ]
-    found: dict[str, Any] = {"keyframes": keyframes, "fragments": FRAGMENTS, "ways": {}}
-    found |= {"anchors": len(torn.anchors), "wrong_anchors": int(torn.wrong.sum())}
-    for name, work, anchors in ways:
+    found: dict[str, Any] = {"keyframes": keyframes, "fragments": SUBMAPS, "ways": {}}
+    found |= {"anchors": len(flight.anchors), "wrong_anchors": int(flight.wrong.sum())}
+    for name, method, anchors in methods:
         began_s = time.process_time()
-        placed = work(torn.fragments, anchors)
+        placed = method(flight.submaps, anchors)
         cpu_s = time.process_time() - began_s
-        off_m = np.linalg.norm(np.concatenate(placed) - np.concatenate(torn.p_w_m), axis=1)
+        off_m = np.linalg.norm(np.concatenate(placed) - np.concatenate(flight.p_w_m), axis=1)
         found["ways"][name] = {
             "cpu_s": round(cpu_s, 3),
             "placed": float(np.mean(np.isfinite(off_m))),
@@ -156,9 +158,9 @@ def measure(keyframes: int) -> dict[str, Any]:
 
 
 def show(found: dict[str, Any], console: Console) -> None:
-    pieces = f"{found['fragments']} fragments of unknown size, {found['keyframes']} keyframes"
+    submaps = f"{found['fragments']} submaps of unknown scale, {found['keyframes']} keyframes"
     table = Table(
-        title=f"merge of {pieces}, {found['wrong_anchors']} of {found['anchors']} anchors wrong", title_justify="left"
+        title=f"merge of {submaps}, {found['wrong_anchors']} of {found['anchors']} anchors wrong", title_justify="left"
     )
     for column in ("", "processor time", "placed", "median error", "largest"):
         table.add_column(column, justify="right" if column else "left")

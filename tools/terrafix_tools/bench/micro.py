@@ -1,6 +1,6 @@
-"""The parts of the benchmark one by one, on a recorded flight: python -m terrafix_tools.bench.micro FLIGHT MAP OUT.
+"""Times of single parts on a recorded flight: python -m terrafix_tools.bench.micro FLIGHT MAP OUT.
 
-Every part is given what it was given in flight, taken from the record of a replay."""
+The inputs of each part are those of the replay in OUT, from its record."""
 
 import time
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
-from terrafix.anchor.matching.point_mass_filter import Belief, cell_for
+from terrafix.anchor.matching.point_mass_filter import Belief, belief_cell_m
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Config
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
@@ -38,79 +38,82 @@ from terrafix_engines.features import open_describer
 from terrafix_tools.bench.flights import run_part, spread
 
 RESULT = "micro.json"
-FRAMES = 40  # of the flight's beginning
-LOOKS = 10  # of these, spread over them, for what takes long
-NODES = 20  # the estimator's window: from here on it is full
-UNIX_NS = 1_750_000_000 * 10**9  # of the link's wall clock: any time since GPS began
-BELIEF_SIGMA_M = 20.0  # start of the belief that is looked with: a usual one
+FRAMES = 40  # first frames of the flight
+CORRELATIONS = 10  # evenly spread frames among these, for the slow parts
+NODES = 20  # window of the estimator; it is full after so many frames
+UNIX_NS = 1_750_000_000 * 10**9  # of the link's wall clock: any time after the GPS epoch
+BELIEF_SIGMA_M = 20.0  # initial 1-sigma of the belief: a usual value in flight
 
 
 def measure(flight: Path, map_path: Path, replayed: Path, xfeat: Path | None) -> dict[str, Any]:
     """-> part -> {median, p95} in ms."""
-    said = [message for _, _, message in read_flight(replayed)]
-    origin = next(message for message in said if isinstance(message, Origin))
+    messages = [message for _, _, message in read_flight(replayed)]
+    origin = next(message for message in messages if isinstance(message, Origin))
     camera = CameraCalibration.of(origin.camera)
     images = _images(flight)
     tracker = FrameTracker(camera)
     result = {"odometry": spread([_ms(partial(tracker.track, i, p)) for i, p in images.items()])}
     package = MapPackage.open(map_path)
     local = package.bind(LocalFrame(origin.lat_deg, origin.lon_deg))
-    predictions = [m for m in said if isinstance(m, Prediction) and m.frame_id in images]
-    chosen = predictions[:: max(1, len(predictions) // LOOKS)]
+    predictions = [m for m in messages if isinstance(m, Prediction) and m.frame_id in images]
+    chosen = predictions[:: max(1, len(predictions) // CORRELATIONS)]
     for model in ("", str(xfeat)) if xfeat else ("",):
         matcher = FrameMatcher(camera, local, open_describer(model))
-        result |= _looks(matcher, chosen, images, origin.ground_amsl_m or 0.0, " (xfeat)" if model else "")
+        result |= _correlations(matcher, chosen, images, origin.ground_amsl_m or 0.0, " (xfeat)" if model else "")
     package.close()
     for band, name in ((ThermalBand.NORMAL, "marginals"), (ThermalBand.HOT, "jacobian")):
-        times_ms = _estimator(said, band)
+        times_ms = _estimator(messages, band)
         result[f"estimator frame, {NODES} nodes, {name}"] = spread(times_ms) if times_ms else {}
-    result["link, one second"] = spread(_link(said))
+    result["link, one second"] = spread(_link(messages))
     return result
 
 
-def _looks(
+def _correlations(
     matcher: FrameMatcher, predictions: list[Prediction], images: dict[int, Image], ground_m: float, suffix: str
 ) -> dict[str, Any]:
-    look_ms, update_ms, fix_ms = [], [], []
+    """-> times of correlation, belief update and map fix; ``suffix`` is added to their names."""
+    correlate_ms, update_ms, fix_ms = [], [], []
     for prediction in predictions:
         image, view = images[prediction.frame_id], _view(prediction, ground_m)
-        belief = Belief(view.e_m, view.n_m, BELIEF_SIGMA_M, cell_for(view.agl_m, matcher.look_cell_m(view.agl_m)))
-        matcher.look(image, view, belief)  # the map's descriptors are there from the frame before
+        belief = Belief(
+            view.e_m, view.n_m, BELIEF_SIGMA_M, belief_cell_m(view.agl_m, matcher.correlation_cell_m(view.agl_m))
+        )
+        matcher.correlate(image, view, belief)  # not timed: in flight the map's descriptors are in the cache
         began_s = time.perf_counter()
-        look = matcher.look(image, view, belief)
-        look_ms.append((time.perf_counter() - began_s) * 1e3)
-        if not look.surfaces:
+        correlation = matcher.correlate(image, view, belief)
+        correlate_ms.append((time.perf_counter() - began_s) * 1e3)
+        if not correlation.surfaces:
             continue
-        update_ms.append(_ms(partial(belief.update, look.surfaces, 1.0)))
+        update_ms.append(_ms(partial(belief.update, correlation.surfaces, 1.0)))
         mode = belief.mode()
-        hypothesis, _ = look.best_at(mode.e_m, mode.n_m)
+        hypothesis, _ = correlation.best_at(mode.e_m, mode.n_m)
         matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m)
         fix_ms.append(_ms(partial(matcher.fix, image, view, hypothesis, mode.e_m, mode.n_m)))
-    parts = {"look (search)": look_ms, "belief update": update_ms, "fix (patches + PnP)": fix_ms}
+    parts = {"look (search)": correlate_ms, "belief update": update_ms, "fix (patches + PnP)": fix_ms}
     return {name + suffix: spread(values) for name, values in parts.items() if values}
 
 
-def _estimator(said: list[Message], band: ThermalBand) -> list[float]:
-    """Time for each frame once the window is full: odometry in, prediction and estimate out, map match in, estimate
-    out; covariance included."""
+def _estimator(messages: list[Message], band: ThermalBand) -> list[float]:
+    """-> time of each frame [ms] after the window is full: odometry in, prediction and estimate out, map match in,
+    estimate out, with covariance."""
     node = EstimatorNode()
     list(node.on(Health(t_ns=0, band=band, temperature_c=None, throttled=False, disk_free_mb=None, cause="benchmark")))
     times: dict[int, float] = {}
-    for message in said:
+    for message in messages:
         if isinstance(message, Origin | VehicleState):
             list(node.on(message))
         elif isinstance(message, Odometry | MapMatch):
-            elapsed = _ms(partial(_all_said, node, message))
+            elapsed = _ms(partial(_process, node, message))
             times[message.frame_id] = times.get(message.frame_id, 0.0) + elapsed
     return list(times.values())[NODES:]
 
 
-def _link(said: list[Message]) -> list[float]:
-    """The ticks of each second of the flight, at the link's own rate, with the estimates as they came."""
+def _link(messages: list[Message]) -> list[float]:
+    """-> time of the ticks of each second [ms], at the link's tick rate, with the estimates of the record."""
     node = LinkNode(Config().link.rate_hz)
-    list(node.on(WallClock(t_ns=0, unix_ns=UNIX_NS, source="system")))  # without one there is nothing to send
+    list(node.on(WallClock(t_ns=0, unix_ns=UNIX_NS, source="system")))  # without a clock the link sends nothing
     times_ms, now_ns = [], 0
-    for message in said:
+    for message in messages:
         if isinstance(message, Origin | NavEstimate | VehicleState):
             while now_ns < message.t_ns:
                 now_ns += round(1e9 / TICK_HZ)
@@ -120,7 +123,7 @@ def _link(said: list[Message]) -> list[float]:
     return [sum(times_ms[i : i + second]) for i in range(0, len(times_ms), second)]
 
 
-def _all_said(node: EstimatorNode, message: Message) -> list[Message]:
+def _process(node: EstimatorNode, message: Message) -> list[Message]:
     return list(node.on(message))
 
 

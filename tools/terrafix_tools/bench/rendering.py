@@ -1,4 +1,4 @@
-"""One frame of the simulator's camera. python -m terrafix_tools.bench.rendering OUT."""
+"""Time to render a frame of the simulator's camera: python -m terrafix_tools.bench.rendering OUT."""
 
 import json
 import sys
@@ -15,9 +15,9 @@ SEED, SIZE_M, FRAMES = 3, (1600.0, 1200.0), 40
 
 
 def measure() -> dict[str, Any]:
-    """Processor time of all threads, frame after frame of a flight with the usual film."""
+    """-> processor time of all threads per frame of a flight, with the default image noise and blur (Film)."""
     place = world.generate(SEED, width_m=SIZE_M[0], height_m=SIZE_M[1])
-    flight = plan_flight(place, place.look("autumn"), duration_s=FRAMES / 2)
+    flight = plan_flight(place, place.render("autumn"), duration_s=FRAMES / 2)
     renderer = Renderer(flight.ground, CAMERA, film=Film(), seed=SEED)
     times_ms = []
     for i, t_s in enumerate(flight.frame_times_s().tolist()):

@@ -1,8 +1,9 @@
-"""`terrafix bench`: time, memory and accuracy of whole replays, beside a SIFT + RANSAC baseline on the same frames.
+"""`terrafix bench`: time, memory and accuracy of whole replays, compared with a SIFT + RANSAC baseline on the same
+frames.
 
-Every measurement is a process of its own, one after the other. Milliseconds depend on the machine and on what else it
-does; the ratio to the baseline, measured minutes apart on the same machine, does so less, and the ratio of processor
-times least: these are the headline."""
+Every measurement runs in its own process, one after the other. Milliseconds depend on the machine and its load; the
+ratio to the baseline, measured minutes apart on the same machine, depends on them less, and the ratio of processor
+times least. These ratios are the main result."""
 
 import json
 import os
@@ -31,10 +32,10 @@ from terrafix_tools.sim.world import place as world
 
 FLIGHTS = ("village-1", "town-a")
 GENERATED = "generated"
-GENERATED_S, GENERATED_SEED = 20.0, 3  # seconds of flight; any seed will do
+GENERATED_S, GENERATED_SEED = 20.0, 3  # seconds of flight; an arbitrary seed
 GENERATED_SIZE_M = (1600.0, 1200.0)
 WEIGHTS_FREE, XFEAT = "weights-free", "xfeat"
-_MISTAKES = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}
+_ERROR_OF_EXIT_CODE = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}
 
 
 def bench(
@@ -46,11 +47,11 @@ def bench(
     xfeat: bool = True,
     growing: bool = False,
 ) -> dict[str, Any]:
-    """Writes ``out`` (JSON), prints tables, returns what it wrote.
+    """Writes the results to ``out`` (JSON), prints tables, and returns the results.
 
     ``data``: folder with flights/ and models/. ``flights``: names in it, or "generated"; default: FLIGHTS, or the
-    generated one when the data are absent. ``frames``: only so many of each. ``growing``: also the cost of larger maps
-    and longer flights. Raises the TerrafixError family."""
+    generated one if the data are absent. ``frames``: number of first frames of each flight; None: all. ``xfeat``: also
+    with XFeat. ``growing``: also the cost of larger maps and longer flights. Raises TerrafixError."""
     if frames is not None and frames < 2:
         raise UsageError(f"--frames {frames}: two frames are the least that can be measured")
     try:
@@ -89,7 +90,7 @@ def bench(
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
+    """-> processor, memory, load and versions of this machine."""
     info = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     model = next((line.partition(":")[2].strip() for line in info if line.startswith("model name")), "")
     memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
@@ -110,14 +111,15 @@ def _model(data: Path, missing: list[str]) -> Path | None:
     return None
 
 
-def _present(data: Path, wanted: list[str], missing: list[str]) -> list[str]:
-    found = [name for name in wanted if name == GENERATED or (data / "flights" / name / "flight.toml").is_file()]
-    missing += [f"flight {name}: not in {data / 'flights'}" for name in wanted if name not in found]
+def _present(data: Path, names: list[str], missing: list[str]) -> list[str]:
+    """-> the flights that exist; the others are added to ``missing``."""
+    found = [name for name in names if name == GENERATED or (data / "flights" / name / "flight.toml").is_file()]
+    missing += [f"flight {name}: not in {data / 'flights'}" for name in names if name not in found]
     return found
 
 
 def _prepare(data: Path, name: str, work: Path, frames: int | None, console: Console) -> tuple[Path, Path]:
-    """A flight folder with only the wanted frames, and the package of its map."""
+    """-> a flight folder with only the first ``frames`` frames, and the package of its map."""
     work.mkdir()
     if name == GENERATED:
         with console.status("a place and a flight over it"):
@@ -142,10 +144,10 @@ def _prepare(data: Path, name: str, work: Path, frames: int | None, console: Con
 
 def _generate(work: Path, duration_s: float) -> tuple[Path, Path]:
     place = world.generate(GENERATED_SEED, width_m=GENERATED_SIZE_M[0], height_m=GENERATED_SIZE_M[1])
-    world.write_image(work / "map.tif", place, place.look("summer"))
+    world.write_image(work / "map.tif", place, place.render("summer"))
     world.write_dem(work / "dem.tif", place)
     package = build(work / "map.tif", work / "map.gpkg", dem=work / "dem.tif")
-    flight = plan_flight(place, place.look("autumn"), duration_s)
+    flight = plan_flight(place, place.render("autumn"), duration_s)
     write_flight(work / GENERATED, flight, "../map.gpkg", seed=GENERATED_SEED)
     return work / GENERATED, package
 
@@ -162,7 +164,7 @@ def _flight(flight: Path, package: Path, work: Path, model: Path | None, console
 
 
 def _ratios(run: dict[str, Any], baseline: dict[str, Any]) -> dict[str, float | None]:
-    """Ours by the baseline's: below 1 is faster, above 1 is more frames."""
+    """-> our values divided by the baseline's. Times: below 1 is faster; accuracy: above 1 is more frames."""
     out: dict[str, float | None] = {}
     for key in ("frame_ms", "cpu_ms"):
         theirs_ms = baseline[key]["median"] if baseline[key] else None
@@ -174,10 +176,11 @@ def _ratios(run: dict[str, Any], baseline: dict[str, Any]) -> dict[str, float | 
 
 
 def _part(module: Any, flight: Path, package: Path, out: Path, model: Path | None) -> dict[str, Any]:
-    """Runs one measurement in a process of its own; what it says on stderr is what went wrong."""
+    """Runs one measurement in its own process. Raises the TerrafixError of its exit code, with the text of its
+    stderr."""
     arguments = [str(path) for path in (flight, package, out, model) if path is not None]
     done = subprocess.run([sys.executable, "-m", module.__name__, *arguments], stderr=subprocess.PIPE, text=True)
-    if kind := _MISTAKES.get(done.returncode):
+    if kind := _ERROR_OF_EXIT_CODE.get(done.returncode):
         raise kind(done.stderr.strip())
     if done.returncode != 0:
         raise RuntimeError(f"{module.__name__} failed with exit code {done.returncode}:\n{done.stderr}")

@@ -1,4 +1,4 @@
-"""What grows with the map and with the flight: each size in a process of its own, so that its memory is its own."""
+"""Costs that grow with the map or the flight. Each size is measured in its own process, because of its peak memory."""
 
 import json
 import subprocess
@@ -23,8 +23,8 @@ def measure(
     areas_km2: tuple[float, ...] = AREAS_KM2,
     flights_frames: tuple[int, ...] = FLIGHTS_FRAMES,
 ) -> dict[str, Any]:
-    """-> "map": one entry for each area, "flight": one for each length, "merge": of the fragments of a torn flight,
-    "render": one frame of the simulator, "photos": the first position of photos of 26 megapixels."""
+    """-> "map": one entry per area, "flight": one per length, "merge": of the submaps of a flight, "render": one frame
+    of the simulator, "photos": first position of photos of 26 megapixels."""
     maps, flights = [], []
     for area_km2 in areas_km2:
         folder = work / f"map-{area_km2:g}"
@@ -47,10 +47,12 @@ def measure(
 
 
 def show(grown: dict[str, Any], console: Console) -> None:
-    """Tables: what grows with the map, what with the flight, the merge. Times are processor times."""
+    """Prints tables: map, flight, merge; and lines: rendering, photos. Times are processor times if not marked."""
     by_size = []
     for one in grown["map"]:
-        looks = {f"look {name}": f"{one['look_cpu_ms'][name]['median']:.0f} ms" for name in map_size.BELIEFS_M}
+        correlations = {
+            f"correlation, {name}": f"{one['look_cpu_ms'][name]['median']:.0f} ms" for name in map_size.BELIEFS_M
+        }
         read_ms = max(window["p95"] for window in one["window_ms"].values())
         by_size.append({
             "": f"{one['area_km2']:g} km2",
@@ -60,19 +62,19 @@ def show(grown: dict[str, Any], console: Console) -> None:
             "size": f"{one['package_mb']:.0f} MB",
             "open, by the clock": f"{one['open_ms']:.0f} ms",
             "window of 1 km, p95 at the slowest scale, by the clock": f"{read_ms:.0f} ms",
-            **looks,
+            **correlations,
             "memory": f"{one['memory_mb']:.0f} MB",
         })  # fmt: skip
     console.print(_side_by_side("as the map grows (processor time)", by_size))
     by_length = []
     for one in grown["flight"]:
-        asked = {f"covariance: {name}": f"{ms['median']:.2f} ms" for name, ms in one["covariance_cpu_ms"].items()}
+        queries = {f"covariance: {name}": f"{ms['median']:.2f} ms" for name, ms in one["covariance_cpu_ms"].items()}
         update = one["update_cpu_ms"]
         by_length.append({
             "": f"{one['frames']} frames",
             "one frame": f"{one['frame_cpu_ms']['median']:.1f} ms",
-            "of it the graph (median / p99)": f"{update['median']:.1f} / {update['p99']:.1f} ms",
-            **asked,
+            "graph alone (median / p99)": f"{update['median']:.1f} / {update['p99']:.1f} ms",
+            **queries,
             "refinement": f"{one['refine_cpu_s']:.1f} s",
             "memory": f"{one['peak_memory_mb']:.0f} MB",
         })  # fmt: skip
@@ -91,7 +93,7 @@ def show(grown: dict[str, Any], console: Console) -> None:
 
 
 def _side_by_side(title: str, cases: list[dict[str, str]]) -> Table:
-    """A column for each case, a row for each quantity."""
+    """-> a table with a column per case and a row per quantity."""
     table = Table(title=title, title_justify="left")
     for i, head in enumerate(["", *(case[""] for case in cases)]):
         table.add_column(head, justify="right" if i else "left")

@@ -1,10 +1,10 @@
-"""What the search of an unknown place costs: one decision over a whole map, one over 25 tiles, one sweep of headings.
+"""Cost of the relocalisation search: one decision over a whole map, one over 25 tiles, one sweep of headings.
 
 python -m terrafix_tools.bench.searching MAP.gpkg [--agl 120] [--json FILE]
 
-The camera sees a piece of the map itself, from place to place along a way: this is about time, not about finding.
-Every line begins with a fresh reader of the package: *first* includes what is read and described for the first time,
-*next* is the slowest of those that follow. Seconds by the clock, and of the processor (all threads)."""
+The images are parts of the map itself, along a straight path: this measures time, not recall. Every line begins with a
+new reader of the package: *first* includes the reading and description of the tiles, *next* is the slowest of the
+later decisions. Wall-clock seconds, and processor seconds of all threads."""
 
 import argparse
 import json
@@ -19,13 +19,13 @@ import numpy as np
 import typer
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
-from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, WideSearch, blocks_of
+from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, BlockCorrelator, blocks_of
 from terrafix.anchor.relocalization.map_search import FINE_CELL_PER_AGL, MapSearch
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import TerrafixError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
-from terrafix.map.null_model import USUAL, FlightBudget
+from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 
@@ -33,13 +33,15 @@ CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
 NORTH_UP = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 COMPASS_RAD, UNKNOWN_RAD = math.radians(11.0), math.radians(180.0)  # 1-sigma of a heading
 SCALE_SIGMA, TILT_SIGMA_RAD = 0.06, math.radians(1.2)
-STEP = 0.2  # of the height, between decisions: each is a look at the whole region
+STEP = 0.2  # motion between two decisions, in heights; each decision correlates the whole region
 DECISIONS = 4
 TILES, SWEEP_TILES, SWEEP_HEADINGS = 25, 1, 12
 
 
 @dataclass(frozen=True)
 class Cost:
+    """``first_*``: of the first decision; ``next_*``: of the slowest later one."""
+
     what: str
     first_s: float
     first_cpu_s: float
@@ -48,7 +50,7 @@ class Cost:
 
 
 def measure(package: Path, agl_m: float) -> list[Cost]:
-    """Raises MapError."""
+    """-> one row per kind of search. Raises MapError."""
 
     def fresh() -> tuple[LocalMap, FrameMatcher]:
         opened = MapPackage.open(package)
@@ -56,15 +58,15 @@ def measure(package: Path, agl_m: float) -> list[Cost]:
         local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
         return local, FrameMatcher(CAMERA, local, GradientDescriber())
 
-    shown, _ = fresh()
-    frames = [_frame(shown, k * STEP * agl_m, agl_m) for k in range(DECISIONS)]
+    imagery, _ = fresh()
+    frames = [_frame(imagery, k * STEP * agl_m, agl_m) for k in range(DECISIONS)]
     return [
         _cost("whole map, heading by compass", _decisions(*fresh(), frames, agl_m, COMPASS_RAD)),
         _cost("whole map, heading unknown", _decisions(*fresh(), frames, agl_m, UNKNOWN_RAD)),
-        _cost(f"{TILES} tiles, heading by compass", _looks(*fresh(), frames, agl_m, TILES, None)),
+        _cost(f"{TILES} tiles, heading by compass", _correlations(*fresh(), frames, agl_m, TILES, None)),
         _cost(
             f"sweep of {SWEEP_HEADINGS} headings, {SWEEP_TILES} tile",
-            _looks(*fresh(), frames, agl_m, SWEEP_TILES, SWEEP_HEADINGS),
+            _correlations(*fresh(), frames, agl_m, SWEEP_TILES, SWEEP_HEADINGS),
         ),
     ]
 
@@ -74,7 +76,7 @@ def _view(agl_m: float, yaw_sigma_rad: float) -> View:
 
 
 def _frame(source: LocalMap, east_m: float, agl_m: float) -> Image:
-    """What CAMERA sees straight down, north up."""
+    """-> image of CAMERA that looks straight down, ``east_m`` from the centre, north up."""
     gsd_m, (w, h) = agl_m / CAMERA.fx, (CAMERA.width, CAMERA.height)
     return source.window(east_m - w / 2 * gsd_m, h / 2 * gsd_m, w, h, gsd_m)[0]
 
@@ -82,31 +84,36 @@ def _frame(source: LocalMap, east_m: float, agl_m: float) -> Image:
 def _decisions(
     source: LocalMap, matcher: FrameMatcher, frames: list[Image], agl_m: float, yaw_sigma_rad: float
 ) -> list[Callable[[], object]]:
-    """Joint look and tracks of each frame."""
-    search, view = MapSearch(source, matcher, agl_m, None, USUAL, FlightBudget()), _view(agl_m, yaw_sigma_rad)
+    """-> for each frame the joint correlation over the whole map with the update of the hypotheses."""
+    search, view = (
+        MapSearch(source, matcher, agl_m, None, DEFAULT_NULL, FalseAlarmBudget()),
+        _view(agl_m, yaw_sigma_rad),
+    )
 
     def decide(frame: Image) -> None:
-        search.look(frame, view)
-        search.move(STEP * agl_m, 0.0, 0.01 * agl_m)
+        search.process_frame(frame, view)
+        search.predict(STEP * agl_m, 0.0, 0.01 * agl_m)
 
     return [lambda frame=frame: decide(frame) for frame in frames]  # type: ignore[misc]
 
 
-def _looks(
+def _correlations(
     source: LocalMap, matcher: FrameMatcher, frames: list[Image], agl_m: float, tiles: int, headings: int | None
 ) -> list[Callable[[], object]]:
-    """Looks at the tiles around the middle on fine cells, as a search does that begins around the last place.
-    ``headings``: evenly over the circle; None: those that a compass leaves open, with their scales."""
+    """-> for each frame the correlation with the ``tiles`` around the centre on fine cells, as in a search around the
+    last position. ``headings``: number of headings over the full circle; None: heading and scale hypotheses of the
+    compass."""
     view, cell_m = _view(agl_m, COMPASS_RAD), matcher.cell_m(agl_m, FINE_CELL_PER_AGL)
-    wide, half = WideSearch(source, GradientDescriber()), BLOCK_CELLS / 2
+    correlator, half = BlockCorrelator(source, GradientDescriber()), BLOCK_CELLS / 2
     blocks = sorted(blocks_of(source.bounds_m, cell_m), key=lambda b: math.hypot(b.row + half, b.column + half))
-    turns = [Hypothesis(2.0 * math.pi * k / headings, 1.0) for k in range(headings)] if headings else None
+    sweep = [Hypothesis(2.0 * math.pi * k / headings, 1.0) for k in range(headings)] if headings else None
 
-    def look(frame: Image) -> None:
-        seen = matcher.rectified(frame, view, turns or matcher.wide_hypotheses(view), cell_m, 1)
-        wide.look([wide.describe(one) for one in seen if one is not None], blocks[:tiles], cell_m)
+    def correlate(frame: Image) -> None:
+        rectified = matcher.rectify_all(frame, view, sweep or matcher.map_search_hypotheses(view), cell_m, 1)
+        described = [correlator.describe(one) for one in rectified if one is not None]
+        correlator.correlate(described, blocks[:tiles], cell_m)
 
-    return [lambda frame=frame: look(frame) for frame in frames]  # type: ignore[misc]
+    return [lambda frame=frame: correlate(frame) for frame in frames]  # type: ignore[misc]
 
 
 def _cost(what: str, works: list[Callable[[], object]]) -> Cost:

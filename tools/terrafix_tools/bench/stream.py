@@ -1,7 +1,7 @@
-"""What vision, anchor and autopilot would say of a long flight, without a picture: for what grows with the flight.
+"""Synthetic messages of vision, anchor and autopilot for a long flight, without images.
 
-Straight legs over flat ground and level turns, 12 m/s, two frames a second, a map fix at every second frame, inertial
-readings at 100 Hz and attitudes at 50 Hz. Errors are drawn from what the messages claim."""
+Straight legs and level turns over flat ground at 12 m/s; 2 frames per second, a map match at every second frame, IMU
+at 100 Hz and attitudes at 50 Hz. Errors are drawn from the distributions that the messages state."""
 
 import math
 from collections.abc import Iterator
@@ -15,11 +15,11 @@ from terrafix.core.mavlink.imu import GRAVITY_MPS2
 from terrafix.messages import Camera, Imu, ImuSample, MapMatch, Odometry, Origin, VehicleState, Verdict
 
 FRAME_S, SPEED_MPS, HEIGHT_M = 0.5, 12.0, 100.0
-LEG_S, TURN_S, TURN_RADPS = 60.0, 6.0, math.radians(15.0)  # a right turn ends each leg
-IMU_S, STATE_EVERY, IMU_BATCH = 0.01, 2, 5  # readings: every second with an attitude, five in a message
-FORCE_NOISE_MPS2, FORCE_BIAS_MPS2 = 0.3, 0.05  # of a reading: vibration, and what calibration left
+LEG_S, TURN_S, TURN_RADPS = 60.0, 6.0, math.radians(15.0)  # each leg ends with a right turn
+IMU_S, STATE_EVERY, IMU_BATCH = 0.01, 2, 5  # period; readings per attitude; readings per message
+FORCE_NOISE_MPS2, FORCE_BIAS_MPS2 = 0.3, 0.05  # vibration; residual bias after calibration
 KEYFRAME_EVERY, FIX_EVERY = 3, 2
-PAIRS, SIGMA_NORM = 48, 1 / 560  # as many as odometry says at most
+PAIRS, SIGMA_NORM = 48, 1 / 560  # PAIRS: the most that odometry publishes
 FIX_SIGMA_M, FIX_SIGMA_RAD = 2.0, math.radians(1.0)
 CAMERA = Camera(width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, mount_tolerance_deg=2.0)
 ORIGIN = Origin(
@@ -36,22 +36,22 @@ ORIGIN = Origin(
 
 
 @dataclass(frozen=True)
-class Spoken:
-    """Of one frame, in the order in which it is said."""
+class FrameMessages:
+    """Messages of one frame, in the order of publication."""
 
-    telemetry: list[VehicleState | Imu]  # since the frame before
+    telemetry: list[VehicleState | Imu]  # since the previous frame
     odometry: Odometry
     match: MapMatch | None
-    p_m: np.ndarray  # (3,) the truth: east, north, up
+    p_m: np.ndarray  # (3,) true position: east, north, up
 
 
-def spoken(frames: int, seed: int = 0) -> Iterator[Spoken]:
-    """Frame by frame. The truth is a level camera at HEIGHT_M, image top ahead."""
+def frame_messages(frames: int, seed: int = 0) -> Iterator[FrameMessages]:
+    """-> the messages frame by frame. Truth: a camera at HEIGHT_M that looks straight down, image top forward."""
     rng = np.random.default_rng([seed, 100])
     mount = Mount.of(CAMERA).r_b_c()
     p_m, yaw, i = np.array([0.0, 0.0, HEIGHT_M]), 0.0, 0
-    keyframe, seen = 0, (np.eye(3), p_m)
-    waiting, batch = list[VehicleState | Imu](), list[ImuSample]()
+    keyframe, keyframe_pose = 0, (np.eye(3), p_m)
+    telemetry, batch = list[VehicleState | Imu](), list[ImuSample]()
     for step in range((frames - 1) * round(FRAME_S / IMU_S) + 1):
         t_s, t_ns = step * IMU_S, round(step * IMU_S * 1e9)
         turning = TURN_RADPS if t_s % LEG_S >= LEG_S - TURN_S else 0.0
@@ -59,19 +59,20 @@ def spoken(frames: int, seed: int = 0) -> Iterator[Spoken]:
         before_ns = round((IMU_BATCH - 1 - len(batch)) * IMU_S * 1e9)
         batch.append((before_ns, *force.tolist(), 0.0, 0.0, turning))
         if len(batch) == IMU_BATCH:
-            waiting.append(Imu(t_ns=t_ns, source="benchmark", samples=batch))
+            telemetry.append(Imu(t_ns=t_ns, source="benchmark", samples=batch))
             batch = []
         if step % STATE_EVERY == 0:
-            waiting.append(_state(t_ns, yaw, rng))
+            telemetry.append(_state(t_ns, yaw, rng))
         if step % round(FRAME_S / IMU_S) == 0:
-            now = (rot_w_b(yaw, 0.0, 0.0) @ mount, p_m)
-            odometry = _odometry(i, keyframe, t_ns, seen, now, rng)
+            pose = (rot_w_b(yaw, 0.0, 0.0) @ mount, p_m)
+            odometry = _odometry(i, keyframe, t_ns, keyframe_pose, pose, rng)
             if odometry.becomes_keyframe:
-                keyframe, seen = i, now
-            yield Spoken(waiting, odometry, _fix(i, t_ns, p_m, now[0], rng) if i % FIX_EVERY == 0 else None, p_m)
-            waiting, i = [], i + 1
-        middle = yaw + 0.5 * turning * IMU_S
-        p_m = p_m + IMU_S * SPEED_MPS * np.array([math.sin(middle), math.cos(middle), 0.0])
+                keyframe, keyframe_pose = i, pose
+            match = _fix(i, t_ns, p_m, pose[0], rng) if i % FIX_EVERY == 0 else None
+            yield FrameMessages(telemetry, odometry, match, p_m)
+            telemetry, i = [], i + 1
+        mean_yaw = yaw + 0.5 * turning * IMU_S
+        p_m = p_m + IMU_S * SPEED_MPS * np.array([math.sin(mean_yaw), math.cos(mean_yaw), 0.0])
         yaw += turning * IMU_S
 
 
@@ -90,19 +91,19 @@ def _odometry(
     i: int,
     keyframe: int,
     t_ns: int,
-    before: tuple[np.ndarray, np.ndarray],
-    now: tuple[np.ndarray, np.ndarray],
+    keyframe_pose: tuple[np.ndarray, np.ndarray],
+    pose: tuple[np.ndarray, np.ndarray],
     rng: np.random.Generator,
 ) -> Odometry:
-    """Rays of points on the ground under the keyframe, seen from both."""
-    (r_kf, p_kf), (r_k, p_k) = before, now
+    """Correspondences of ground points seen from the keyframe and the frame. Poses: R_w_c, position."""
+    (r_kf, p_kf), (r_k, p_k) = keyframe_pose, pose
     if i == 0:
         return Odometry(t_ns=t_ns, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
-    seen = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.35, 0.35, PAIRS), np.ones(PAIRS)])
-    points = p_kf + (seen * HEIGHT_M) @ r_kf.T
+    keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.35, 0.35, PAIRS), np.ones(PAIRS)])
+    points = p_kf + (keyframe_xy * HEIGHT_M) @ r_kf.T
     in_k = (points - p_k) @ r_k
-    there = in_k[:, :2] / in_k[:, 2:] + rng.normal(0.0, SIGMA_NORM, (PAIRS, 2))
-    pairs = np.column_stack([seen[:, :2], there])
+    frame_xy = in_k[:, :2] / in_k[:, 2:] + rng.normal(0.0, SIGMA_NORM, (PAIRS, 2))
+    pairs = np.column_stack([keyframe_xy[:, :2], frame_xy])
     return Odometry(
         t_ns=t_ns,
         frame_id=i,

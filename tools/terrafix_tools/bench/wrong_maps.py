@@ -1,12 +1,13 @@
-"""Flights on maps of other places: what does the best wrong place come to, and is one found?
+"""False alarms of the map search: flights on maps of other places.
 
 python -m terrafix_tools.bench.wrong_maps FLIGHT --map MAP [--map MAP ...] [--mirrored] [--step 0.25] [--frames 40]
     [--json FILE]
 
-The flight goes through vision and estimator without a map and without a start; each map is searched with what they
-predict, a frame every ``--step`` heights. No map may be of the place of the flight, unless it is ``--mirrored``. For
-each map a row: stretches of new ground, the best sum of a stretch (90 % quantile and most), what a find needed at the
-end, and how many places were found. The last line is the tail of all of them, as a null model has it."""
+Vision and estimator process the flight without a map and without a start position; each map is searched with their
+predictions, one frame every ``--step`` heights. No map may show the area of the flight, unless it is ``--mirrored``.
+Each row: number of segments of new ground, best log odds of a segment (90 % quantile and largest), log odds that an
+acceptance required at the end, and number of accepted (wrong) positions. The last lines are the tails of all values,
+in the form of a null model."""
 
 import argparse
 import itertools
@@ -33,7 +34,7 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import start_is_unknown
 from terrafix.core.node import Image, NodeContext
-from terrafix.map.null_model import TAIL_FROM, USUAL, FlightBudget, Tail, null_at
+from terrafix.map.null_model import DEFAULT_NULL, TAIL_QUANTILE, FalseAlarmBudget, Tail, null_row_for
 from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, Prediction
 from terrafix.runtime.executor import InProcessShell
@@ -47,8 +48,9 @@ UNKNOWN_START_M = 1000.0
 
 @dataclass(frozen=True)
 class WrongMap:
-    """One flight on one map. ``best``: sum of the best place, for each stretch of 0.4 heights; ``sigmas``: of every
-    frame at every place that was checked; ``needed`` by a find in the last one; ``found``: frames that found one."""
+    """One flight on one map. ``places``: number of candidates. ``best``: log odds of the best hypothesis, for each
+    segment of NEW_EVIDENCE heights. ``sigmas``: scores of every frame at every checked position. ``needed``: log odds
+    required in the last frame. ``found``: number of frames that accepted a position."""
 
     places: float
     best: list[float]
@@ -58,26 +60,26 @@ class WrongMap:
 
 
 def predicted(source: Source, *, mirrored: bool) -> Iterator[tuple[Prediction, Image]]:
-    """Every frame with what vision and estimator predict of it, on no map."""
-    store, heard = MemoryFrameStore(FRAMES_KEPT), list[Message]()
+    """-> every frame with its prediction by vision and estimator, without a map."""
+    store, published = MemoryFrameStore(FRAMES_KEPT), list[Message]()
     with tempfile.TemporaryDirectory(prefix="terrafix-wrong-") as out:
         ctx = NodeContext(config=load([]), frames=store, map_path=None, out_dir=Path(out))
-        shell = InProcessShell(make_nodes(ctx), lambda _who, message: heard.append(message))
-    shell.feed(_somewhere(source.origin()))
+        shell = InProcessShell(make_nodes(ctx), lambda _process, message: published.append(message))
+    shell.feed(_with_unknown_start(source.origin()))
     for shot in source.shots():
-        for told in itertools.chain(shot.states, shot.imu):
-            shell.feed(told)
+        for telemetry in itertools.chain(shot.states, shot.imu):
+            shell.feed(telemetry)
         if shot.image is None:
             continue
         image = np.ascontiguousarray(shot.image[:, ::-1]) if mirrored else shot.image
         store.put(shot.frame.frame_id, image)
-        heard.clear()
+        published.clear()
         shell.feed(shot.frame)
-        yield from ((m, image) for m in heard if isinstance(m, Prediction))
+        yield from ((m, image) for m in published if isinstance(m, Prediction))
 
 
-def _somewhere(origin: Origin) -> Origin:
-    """An unknown start has no coordinate: any will do, for the search does not look at it."""
+def _with_unknown_start(origin: Origin) -> Origin:
+    """-> the origin with an unknown start. If it has no coordinate, an arbitrary one: the search does not use it."""
     lat_deg, lon_deg = (0.0, 0.0) if start_is_unknown(origin) else (origin.lat_deg, origin.lon_deg)
     return msgspec.structs.replace(origin, lat_deg=lat_deg, lon_deg=lon_deg, start_sigma_m=UNKNOWN_START_M)
 
@@ -85,40 +87,42 @@ def _somewhere(origin: Origin) -> Origin:
 def searched(
     flight: Iterator[tuple[Prediction, Image]], camera: CameraCalibration, package: Path, step: float, frames: int
 ) -> WrongMap:
-    """``step``: heights between frames, of which there are ``frames``. Raises MapError."""
+    """Searches a map with the first ``frames`` frames that are ``step`` heights apart. Raises MapError."""
     opened = MapPackage.open(package)
     west, south, east, north = opened.manifest.bounds_wgs84
     local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
     matcher = FrameMatcher(camera, local, GradientDescriber())
     search: MapSearch | None = None
     best, sigmas = dict[int, float](), list[float]()
-    found, looks, way_m, since_m, variance_m2 = 0, 0, 0.0, np.zeros(2), 0.0
+    found, searched_frames, path_m, step_m, variance_m2 = 0, 0, 0.0, np.zeros(2), 0.0
     for prediction, image in flight:
         agl_m = prediction.agl_m
         if search is None:
-            null = null_at(opened.layer().null_model, GradientDescriber.name, agl_m)
-            search = MapSearch(local, matcher, agl_m, None, null, FlightBudget())
+            null = null_row_for(opened.layer().null_model, GradientDescriber.name, agl_m)
+            search = MapSearch(local, matcher, agl_m, None, null, FalseAlarmBudget())
         else:
-            since_m += prediction.step_m
+            step_m += prediction.step_m
             variance_m2 += max(prediction.step_cov_m2[0], prediction.step_cov_m2[3])
-            if np.hypot(*since_m) < step * agl_m:
+            if np.hypot(*step_m) < step * agl_m:
                 continue
-            search.move(float(since_m[0]), float(since_m[1]), math.sqrt(variance_m2))
-            way_m += float(np.hypot(*since_m))
-            since_m, variance_m2 = np.zeros(2), 0.0
-        found += search.look(image, view_of(prediction, None, 0.0)) is not None
-        sigmas += search.tracks.sigmas
-        stretch = int(way_m / (NEW_EVIDENCE * agl_m))
-        best[stretch] = max([best.get(stretch, -math.inf), *(track.odds for track in search.tracks.all)])
-        looks += 1
-        if looks == frames:
+            search.predict(float(step_m[0]), float(step_m[1]), math.sqrt(variance_m2))
+            path_m += float(np.hypot(*step_m))
+            step_m, variance_m2 = np.zeros(2), 0.0
+        found += search.process_frame(image, view_of(prediction, None, 0.0)) is not None
+        sigmas += search.tracker.sigmas
+        segment = int(path_m / (NEW_EVIDENCE * agl_m))
+        best[segment] = max([best.get(segment, -math.inf), *(track.log_odds for track in search.tracker.tracks)])
+        searched_frames += 1
+        if searched_frames == frames:
             break
     assert search is not None
-    return WrongMap(search.places, [v for v in best.values() if math.isfinite(v)], sigmas, search.enough, found)
+    return WrongMap(
+        search.candidate_count, [v for v in best.values() if math.isfinite(v)], sigmas, search.required_evidence, found
+    )
 
 
 def row(name: str, result: WrongMap) -> str:
-    high = float(np.quantile(result.best, TAIL_FROM))
+    high = float(np.quantile(result.best, TAIL_QUANTILE))
     return (
         f"{name:40} {len(result.best):9} {high:9.1f} {max(result.best):6.1f} {result.needed:7.1f} {result.found:6}"
         f" {result.places:8.0f}"
@@ -139,16 +143,16 @@ def main() -> None:
     try:
         source = open_source(given.flight)
         camera = CameraCalibration.of(source.origin().camera)
-        for wanted in given.map:
-            name = f"{Path(given.flight).name} on {wanted.stem}"
+        for map_source in given.map:
+            name = f"{Path(given.flight).name} on {map_source.stem}"
             flight = predicted(open_source(given.flight), mirrored=given.mirrored)
-            package = ensure_package(wanted, map_cache_dir())
+            package = ensure_package(map_source, map_cache_dir())
             results[name] = searched(flight, camera, package, given.step, given.frames)
             typer.echo(row(name, results[name]))
     except TerrafixError as error:
         sys.exit(f"{error}")
-    typer.echo(f"sums: {Tail.of([v for r in results.values() for v in r.best], USUAL.search)}")
-    typer.echo(f"single frames: {Tail.of([v for r in results.values() for v in r.sigmas], USUAL.frame)}")
+    typer.echo(f"sums: {Tail.fit([v for r in results.values() for v in r.best], DEFAULT_NULL.search)}")
+    typer.echo(f"single frames: {Tail.fit([v for r in results.values() for v in r.sigmas], DEFAULT_NULL.frame)}")
     if given.json is not None:
         given.json.write_text(json.dumps({k: asdict(v) for k, v in results.items()}, indent=1) + "\n", encoding="utf-8")
 

@@ -10,7 +10,7 @@ def finalise(
     folder: Annotated[Path, typer.Argument(help="Output of replay or run: a folder with a flight record.")],
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
-    """After landing: the whole flight in one solution; writes finalised.csv and finalised.json beside the record."""
+    """After landing: smooths the whole flight at once; writes finalised.csv and finalised.json beside the record."""
     from terrafix_tools.finalise.run import finalise as run_finalise
     from terrafix_tools.finalise.run import last_lines
 

@@ -1,8 +1,8 @@
-"""Which measurements to believe: graduated non-convexity with a truncated least squares loss, over one GTSAM graph.
+"""Inlier selection by graduated non-convexity with a truncated least squares loss, over one GTSAM graph.
 
 Yang, Antonante, Tzoumas, Carlone: Graduated Non-Convexity for Robust Spatial Perception (RA-L 2020). At first every
-measurement counts nearly in full; from step to step the loss gets flatter, until each is either believed or not.
-GTSAM's own GncOptimizer solves to the end at every step; here a step is one Gauss-Newton step."""
+measurement has nearly full weight. From step to step the loss becomes flatter, until each is an inlier or an outlier.
+GTSAM's own GncOptimizer solves to convergence at every step; here a step is one Gauss-Newton step."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,22 +10,20 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-FLATTER = (
-    2.5  # growth of mu from one step to the next; with 1.4 of the paper it takes three times the steps to the same end
-)
-FLAT = 8.0  # mu at which what is still between believed and not lies within an eighth of the limit
-MOST_STEPS = 60
-LAST_STEPS = 8
-DONE_M = 1e-3  # largest part of a step that moves nothing any more, metres and radians
-BELIEVED = 0.5
+MU_GROWTH = 2.5  # of mu per step; the paper's 1.4 takes three times the steps to the same result
+MAX_MU = 8.0  # at which squares with a weight between 0 and 1 lie within an eighth of the limit
+MAX_STEPS = 60
+MAX_FINAL_STEPS = 8
+STEP_TOLERANCE = 1e-3  # root mean square of a converged step, metres and radians
+INLIER_WEIGHT = 0.5
 
 Covariances = gtsam.Marginals | gtsam.GaussianBayesTree
 
 
 @dataclass(frozen=True)
 class OutlierCandidate:
-    """A measurement that may be wrong: its factor, ``weighted`` the same with its information times a weight, and the
-    squared Mahalanobis distance from which on it is an outlier."""
+    """A measurement that may be an outlier: its factor; ``weighted``, the factor with its information times a weight;
+    and the squared Mahalanobis distance above which it is an outlier."""
 
     factor: gtsam.NonlinearFactor
     weighted: Callable[[float], gtsam.NonlinearFactor]
@@ -33,51 +31,51 @@ class OutlierCandidate:
 
 
 def solve(
-    certain: gtsam.NonlinearFactorGraph, doubtful: list[OutlierCandidate], values: gtsam.Values
+    certain: gtsam.NonlinearFactorGraph, candidates: list[OutlierCandidate], values: gtsam.Values
 ) -> tuple[gtsam.Values, np.ndarray]:
-    """-> estimate, and which of ``doubtful`` are believed (bool). RuntimeError when the system is indeterminate."""
-    limits = np.array([d.limit for d in doubtful])
-    weights = np.ones(len(doubtful))
-    squares = _squares(doubtful, values)
+    """-> estimate, and which ``candidates`` are inliers (bool). RuntimeError for an indeterminate system."""
+    limits = np.array([d.limit for d in candidates])
+    weights = np.ones(len(candidates))
+    squares = _squares(candidates, values)
     worst = float(np.max(squares / limits, initial=0.0))
     if worst > 1.0:
         mu = 1.0 / (2.0 * worst - 1.0)
-        for _ in range(MOST_STEPS):
-            values, _ = _step(weighted(certain, doubtful, weights), values)
-            weights = _weights(_squares(doubtful, values), limits, mu)
-            if mu > FLAT:
+        for _ in range(MAX_STEPS):
+            values, _ = _step(weighted(certain, candidates, weights), values)
+            weights = _weights(_squares(candidates, values), limits, mu)
+            if mu > MAX_MU:
                 break
-            mu *= FLATTER
-    believed = weights > BELIEVED
-    return settle(certain, doubtful, believed, values), believed
+            mu *= MU_GROWTH
+    inliers = weights > INLIER_WEIGHT
+    return settle(certain, candidates, inliers, values), inliers
 
 
 def settle(
-    certain: gtsam.NonlinearFactorGraph, doubtful: list[OutlierCandidate], believed: np.ndarray, values: gtsam.Values
+    certain: gtsam.NonlinearFactorGraph, candidates: list[OutlierCandidate], inliers: np.ndarray, values: gtsam.Values
 ) -> gtsam.Values:
-    """Gauss-Newton over what is believed, to its end."""
-    graph = weighted(certain, doubtful, believed.astype(float))
-    for _ in range(LAST_STEPS):
+    """Gauss-Newton over ``certain`` and the inliers, to convergence."""
+    graph = weighted(certain, candidates, inliers.astype(float))
+    for _ in range(MAX_FINAL_STEPS):
         values, moved = _step(graph, values)
-        if moved < DONE_M:
+        if moved < STEP_TOLERANCE:
             break
     return values
 
 
 def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Covariances:
-    """To be asked for covariances. RuntimeError when the system is indeterminate."""
+    """Marginal covariances. RuntimeError for an indeterminate system."""
     try:
         return gtsam.Marginals(graph, values)
-    except RuntimeError:  # as in a step
+    except RuntimeError:  # Cholesky fails, as in _step
         return graph.linearize(values).eliminateMultifrontal(function=gtsam.EliminateQR)
 
 
 def weighted(
-    certain: gtsam.NonlinearFactorGraph, doubtful: list[OutlierCandidate], weights: np.ndarray
+    certain: gtsam.NonlinearFactorGraph, candidates: list[OutlierCandidate], weights: np.ndarray
 ) -> gtsam.NonlinearFactorGraph:
-    """One graph of both; ``weights`` 0 to 1."""
+    """One graph of ``certain`` and the candidates with ``weights`` from 0 to 1."""
     graph = gtsam.NonlinearFactorGraph(certain)
-    for measurement, weight in zip(doubtful, weights, strict=True):
+    for measurement, weight in zip(candidates, weights, strict=True):
         if weight >= 1.0:
             graph.push_back(measurement.factor)
         elif weight > 0.0:
@@ -89,13 +87,13 @@ def _step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gtsa
     linear = graph.linearize(values)
     try:
         delta = linear.optimize()
-    except RuntimeError:  # Cholesky gives up on what hardly anything holds; QR takes three times as long
+    except RuntimeError:  # Cholesky fails on a badly conditioned system; QR takes three times as long
         delta = linear.optimize(gtsam.EliminateQR)
     return values.retract(delta), float(delta.norm()) / max(1.0, float(np.sqrt(values.size())))
 
 
-def _squares(doubtful: list[OutlierCandidate], values: gtsam.Values) -> np.ndarray:
-    return np.array([2.0 * d.factor.error(values) for d in doubtful])
+def _squares(candidates: list[OutlierCandidate], values: gtsam.Values) -> np.ndarray:
+    return np.array([2.0 * d.factor.error(values) for d in candidates])
 
 
 def _weights(squares: np.ndarray, limits: np.ndarray, mu: float) -> np.ndarray:

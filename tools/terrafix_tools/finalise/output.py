@@ -1,4 +1,4 @@
-"""finalised.csv: one row for each frame of a record, by all that was measured; docs/finalise.md has the columns."""
+"""finalised.csv: one row per frame of a record, smoothed over the whole flight; docs/finalise.md has the columns."""
 
 import csv
 import json
@@ -35,7 +35,7 @@ OTHER_DIGITS = 4
 
 
 def write(folder: Path, rows: list[FinalRow], summary: dict[str, Any]) -> None:
-    """Raises OutputError. Both files get their names when they are whole."""
+    """Writes both files, each renamed into place when complete. Raises OutputError."""
     try:
         with (folder / (TABLE + PARTIAL)).open("w", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream, lineterminator="\n")
@@ -50,8 +50,8 @@ def write(folder: Path, rows: list[FinalRow], summary: dict[str, Any]) -> None:
 
 
 def read_track(path: Path) -> list[tuple[float, float]]:
-    """Latitude and longitude of the rows that have them. Raises EvaluationError. Frames of a live camera have no file
-    name: here a row is known by its time."""
+    """Latitude and longitude of the rows that have them. Rows are identified by their time, because frames of a live
+    camera have no file name. Raises EvaluationError."""
     track = []
     for line, row in read_table(path, ("t_s", "lat_deg", "lon_deg"), "write it with 'terrafix finalise'", key="t_s"):
         lat_deg, lon_deg = (number(path, line, name, row[name]) for name in ("lat_deg", "lon_deg"))

@@ -1,4 +1,4 @@
-"""`terrafix finalise`: the record of a flight, smoothed as a whole after landing."""
+"""`terrafix finalise`: batch smoothing of a flight record after landing."""
 
 import math
 import time
@@ -16,6 +16,7 @@ from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame, yaw_of
 from terrafix.core.pose import exp_so3, tangent_to_world
+from terrafix.estimator.state import EAST, HORIZONTAL, MOUNT_TILT, NORTH, UP
 from terrafix.messages import Frame, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.reader import ReadResult, read_flight
@@ -25,8 +26,8 @@ from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.output import TABLE, FinalRow, write
 
-# What the estimator decided by; its own refinement at the end is what this is to be better than.
-HEARD = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.subscribes if t is not SourceEnded)
+# Messages that the estimator subscribes to. SourceEnded is left out: it starts the estimator's own refinement.
+REPLAYED = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.subscribes if t is not SourceEnded)
 
 Step = Callable[[str, int, int | None], None]
 
@@ -38,10 +39,10 @@ def finalise(folder: Path, *, progress: bool = False) -> dict[str, Any]:
     began_s = time.process_time()
     result = ReadResult()
     with _bar(progress) as step:
-        rows, flights = _told(folder, result, step)
+        rows, flights = _replay(folder, result, step)
         summary: dict[str, Any] = {
             "record": [path.name for path in result.files],
-            "cut_off": [path.name for path in result.cut_off],
+            "cut_off": [path.name for path in result.truncated_files],
             "undecodable": result.undecodable,
             "frames": len(rows),
             "versions": versions(),
@@ -54,7 +55,7 @@ def finalise(folder: Path, *, progress: bool = False) -> dict[str, Any]:
 
 
 def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
-    """What a person should know of it."""
+    """Lines of the summary for the user."""
     for name in summary["cut_off"]:
         yield f"{name} ends in the middle of a record: what came before was used."
     if summary["undecodable"]:
@@ -62,9 +63,9 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
     for flight in summary["flights"]:
         fixes = flight["map_matches"]
         if not fixes["believed"]:
-            yield "No map match is believed: the track hangs on the start coordinate and on odometry alone."
+            yield "No map match was accepted: the track follows from the start coordinate and odometry alone."
         for why in flight["not_placed"]:
-            yield f"{why['frames']} frames have no place: {why['why']}."
+            yield f"{why['frames']} frames have no position: {why['why']}."
     found = [f["map_matches"] for f in summary["flights"]]
     yield (
         f"{summary['finalised']} of {summary['frames']} frames placed by {sum(f['believed'] for f in found)} map "
@@ -72,16 +73,16 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
     )
 
 
-def _told(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, FinalRow], list[FlightGraph]]:
+def _replay(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, FinalRow], list[FlightGraph]]:
     """-> a row for every frame, in order of arrival; the flights of the record."""
-    storyteller = FlightReplayer()
+    replayer = FlightReplayer()
     rows: dict[int, FinalRow] = {}
     for _, _, message in read_flight(folder, result):
         if isinstance(message, Frame):
             rows.setdefault(message.frame_id, FinalRow(message.file, message.t_ns / NS))
             step("read", len(rows), None)
-        if isinstance(message, HEARD):
-            storyteller.on(message)
+        if isinstance(message, REPLAYED):
+            replayer.on(message)
     where = ", ".join(path.name for path in result.files)
     if not result.header:
         raise SourceError(f"{folder}: {where} is not a flight record, or ends before its head; give another")
@@ -90,22 +91,22 @@ def _told(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, Final
             f"{folder}: {where} is a record of format '{result.header['format']}', and this program reads "
             f"'{RECORD_FORMAT}'; finalise it with the version that wrote it"
         )
-    if not storyteller.flights or not rows:
-        missing = "no frame" if storyteller.flights else "no origin of a flight"
+    if not replayer.flights or not rows:
+        missing = "no frame" if replayer.flights else "no origin of a flight"
         also = f" ({result.undecodable} messages are of another version)" if result.undecodable else ""
         raise SourceError(f"{folder}: {where} has {missing}{also}; was the source of the flight opened?")
-    for flight in storyteller.flights:
-        flight.graph.remember()
-    return rows, [flight for flight in storyteller.flights if flight.node_of]
+    for flight in replayer.flights:
+        flight.recorder.store_estimates()
+    return rows, [flight for flight in replayer.flights if flight.node_of]
 
 
 def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> dict[str, Any]:
-    """Fills the rows of one flight. -> what the summary says of it."""
+    """Fills the rows of one flight. -> its part of the summary."""
     try:
         found = smooth(flight, lambda done, of: step("smooth", done, of))
-    except RuntimeError as error:  # how GTSAM says that a system is indeterminate
+    except RuntimeError as error:  # GTSAM: the system is indeterminate
         reason = f"what was measured leaves the track open ({str(error).strip().splitlines()[0]})"
-        return _said(flight, None, [{"frames": len(flight.node_of), "why": reason}])
+        return _summary(flight, None, [{"frames": len(flight.node_of), "why": reason}])
     frame = LocalFrame(flight.origin.lat_deg, flight.origin.lon_deg)
     r_b_c = Mount.of(flight.origin.camera).r_b_c()
     lost: Counter[int] = Counter()
@@ -115,40 +116,40 @@ def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> dic
         elif frame_id in rows:
             _fill(rows[frame_id], found, node, frame, r_b_c)
     why = "no map match is believed there, and where it began is not known"
-    return _said(flight, found, [{"frames": count, "why": why} for count in lost.values()])
+    return _summary(flight, found, [{"frames": count, "why": why} for count in lost.values()])
 
 
 def _fill(row: FinalRow, found: Smoothed, node: int, frame: LocalFrame, r_b_c: np.ndarray) -> None:
     pose = found.poses[node]
     r_w_c, p = pose.rotation().matrix(), pose.translation()
     cov = tangent_to_world(found.covs[node], r_w_c)
-    tilt = exp_so3(np.array([*found.bias[node][:2], 0.0]))
-    row.lat_deg, row.lon_deg = frame.to_wgs84(float(p[0]), float(p[1]))
-    row.alt_amsl_m = float(p[2])
-    row.sigma_e_m, row.sigma_n_m, row.sigma_u_m = (math.sqrt(float(cov[i, i])) for i in range(3))
-    row.cov_en_m2 = float(cov[0, 1])
+    tilt = exp_so3(np.array([*found.bias[node][MOUNT_TILT], 0.0]))
+    row.lat_deg, row.lon_deg = frame.to_wgs84(float(p[EAST]), float(p[NORTH]))
+    row.alt_amsl_m = float(p[UP])
+    row.sigma_e_m, row.sigma_n_m, row.sigma_u_m = (math.sqrt(float(cov[i, i])) for i in (EAST, NORTH, UP))
+    row.cov_en_m2 = float(cov[EAST, NORTH])
     row.yaw_deg = math.degrees(yaw_of(r_w_c @ (r_b_c @ tilt).T)) % 360.0
 
 
-def _said(flight: FlightGraph, found: Smoothed | None, not_placed: list[dict[str, Any]]) -> dict[str, Any]:
-    believed = int(found.believed.sum()) if found else 0
+def _summary(flight: FlightGraph, found: Smoothed | None, not_placed: list[dict[str, Any]]) -> dict[str, Any]:
+    accepted = int(found.inliers.sum()) if found else 0
     offsets = found.map_offset_m if found else {}
-    tilt_deg = np.degrees(np.median(found.bias[:, :2], axis=0)) if found else None
+    tilt_deg = np.degrees(np.median(found.bias[:, MOUNT_TILT], axis=0)) if found else None
     return {
         "frames": len(flight.node_of),
         "map_matches": {
-            "believed": believed,
-            "refused": len(flight.fixes) - believed,
+            "believed": accepted,
+            "refused": len(flight.fixes) - accepted,
             "none": dict(sorted(flight.refused.items())),
         },
         "pieces": len(set(found.begins.tolist())) if found else 0,
-        "starts_believed": sum(found.start_believed.values()) if found else 0,
+        "starts_believed": sum(found.start_inliers.values()) if found else 0,
         "mount_tilt_deg": None if tilt_deg is None else [round(float(v), 3) for v in tilt_deg],
         "map_offset_m": [
             {
                 "map_sigma_m": round(sigma_m, 3),
-                "offset_m": [round(float(v), 3) for v in offset[:2]],
-                "sigma_m": [round(float(v), 3) for v in sigmas[:2]],
+                "offset_m": [round(float(v), 3) for v in offset[HORIZONTAL]],
+                "sigma_m": [round(float(v), 3) for v in sigmas[HORIZONTAL]],
             }
             for sigma_m, (offset, sigmas) in offsets.items()
         ],

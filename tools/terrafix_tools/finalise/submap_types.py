@@ -1,4 +1,4 @@
-"""Pieces of a flight that hang together by what was seen, and what ties them to the world and to each other."""
+"""Submaps of a flight, and the constraints that tie them to the world and to each other."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Submap:
-    """Keyframes in a frame and a unit of their own.
+    """Keyframes connected by odometry, in a frame f and a unit of length of their own.
 
-    ``r_f_c`` (N, 3, 3) and ``p_c_in_f`` (N, 3): the cameras. ``parent`` (N,): the keyframe against which each was
-    measured, before it in the order; -1 for the first. ``step_cov`` (N, 6, 6): of each in its parent, tangent order
-    (rotation, translation), in the own unit. ``scale_sigma``: the unit is a metre to this share; None: nobody knows
-    how long it is. ``scale_walk``: by what share it changes from a keyframe to the next, 1-sigma."""
+    ``r_f_c`` (N, 3, 3) and ``p_c_in_f`` (N, 3): the cameras. ``parent`` (N,): index of the keyframe that each was
+    measured against, which comes before it; -1 for the first. ``step_cov`` (N, 6, 6): covariance of each in its parent,
+    tangent order (rotation, translation), in the own unit. ``scale_sigma``: 1-sigma of the unit in metres, as a share;
+    None: the scale is unknown. ``scale_walk``: 1-sigma of its change from a keyframe to the next, as a share."""
 
     r_f_c: np.ndarray
     p_c_in_f: np.ndarray
@@ -25,7 +25,7 @@ class Submap:
         return len(self.parent)
 
     def steps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Each keyframe in its parent: (N, 3, 3) and (N, 3), own unit; those of the first mean nothing."""
+        """Each keyframe in its parent: (N, 3, 3) and (N, 3), own unit; the first entry is undefined."""
         r_parent = self.r_f_c[self.parent]
         r = np.einsum("nji,njk->nik", r_parent, self.r_f_c)
         p = np.einsum("nji,nj->ni", r_parent, self.p_c_in_f - self.p_c_in_f[self.parent])
@@ -34,9 +34,10 @@ class Submap:
 
 @dataclass(frozen=True)
 class AbsoluteConstraint:
-    """A map fix: the camera of a keyframe in the world, with its covariance (6, 6), tangent order, metres."""
+    """A map match: camera pose of a keyframe in the world, with covariance (6, 6), tangent order, metres. ``submap``:
+    its index."""
 
-    fragment: int
+    submap: int
     keyframe: int
     r_w_c: np.ndarray  # (3, 3)
     p_c_in_w_m: np.ndarray  # (3,)
@@ -45,9 +46,9 @@ class AbsoluteConstraint:
 
 @dataclass(frozen=True)
 class RelativeConstraint:
-    """A relocalisation: keyframe ``second`` of one fragment seen from keyframe ``first`` of another.
+    """A relocalisation: keyframe ``second`` of one submap seen from keyframe ``first`` of another.
 
-    ``first`` and ``second``: (fragment, keyframe). ``p_b_in_a`` (3,) and ``cov`` (6, 6) are in the unit of the first;
+    ``first`` and ``second``: (submap, keyframe). ``p_b_in_a`` (3,) and ``cov`` (6, 6) are in the unit of the first;
     ``ratio``: units of the first in one of the second, known to the share ``ratio_sigma``."""
 
     first: tuple[int, int]
@@ -61,7 +62,7 @@ class RelativeConstraint:
 
 @dataclass(frozen=True)
 class SubmapPose:
-    """A fragment in the world: ``r_w_c`` (N, 3, 3), ``p_c_in_w_m`` (N, 3), ``cov`` (N, 6, 6) of each keyframe, tangent
+    """A submap in the world: ``r_w_c`` (N, 3, 3), ``p_c_in_w_m`` (N, 3), ``cov`` (N, 6, 6) of each keyframe, tangent
     order, metres; ``m_per_unit`` (N,)."""
 
     r_w_c: np.ndarray
@@ -72,8 +73,8 @@ class SubmapPose:
 
 @dataclass(frozen=True)
 class MergedSubmaps:
-    """``placements``: of every fragment, None for one that nothing places. ``why``: for those, one line each.
-    ``anchors`` (A,) and ``joins`` (J,), bool: which were believed."""
+    """``placements``: pose of every submap, None where it is undetermined; ``why``: the reason, one line each.
+    ``anchors`` (A,) and ``joins`` (J,), bool: which absolute and relative constraints are inliers."""
 
     placements: list[SubmapPose | None]
     why: list[str]

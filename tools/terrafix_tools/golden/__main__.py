@@ -1,8 +1,9 @@
-"""Are all messages the same as before? python -m terrafix_tools.golden --help
+"""Regression test on message digests: python -m terrafix_tools.golden --help
 
-Each case (cases.py) runs in a process of its own, with one thread for linear algebra. References hold on the kind of
-processor that wrote them; --against REVISION makes them anew from another revision of this repository, on this
-computer, and compares with those."""
+Each case (cases.py) runs in its own process, with one thread for linear algebra. The references are valid for the kind
+of processor that wrote them; --against REVISION computes them from another revision of this repository on this
+computer instead.
+"""
 
 import os
 import subprocess
@@ -21,13 +22,15 @@ from terrafix_tools.standalone import run_standalone
 
 REFERENCES = Path("tests/golden/references.json")
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-LONGEST_S = 1200.0  # of one case
-DIFFERENT = 1  # exit code
+CASE_TIMEOUT_S = 1200.0  # time-out of one case
+EXIT_DIFFERENT = 1  # exit code when a case differs
 DATA = Path(os.environ.get("TERRAFIX_DATA", "../shared/data"))
 
 
-def found(case: Case, data: Path, sources: Path | None = None) -> dict[str, Digest]:
-    """Of one case, in a process of its own. ``sources``: root of another revision. Raises UsageError: it failed."""
+def run_case(case: Case, data: Path, sources: Path | None = None) -> dict[str, Digest]:
+    """Runs one case in its own process and returns its digests. ``sources``: root of another revision. Raises
+    UsageError when it fails.
+    """
     paths = [str(sources / part) for part in ("daemon", "engines", "tools")] if sources is not None else []
     env = {**os.environ, **ONE_THREAD, **({"PYTHONPATH": os.pathsep.join(paths)} if paths else {})}
     with tempfile.TemporaryDirectory() as folder:
@@ -35,17 +38,17 @@ def found(case: Case, data: Path, sources: Path | None = None) -> dict[str, Dige
         command = [sys.executable, "-m", "terrafix_tools.golden.one", case.name, str(data.resolve()), str(out)]
         try:
             done = subprocess.run(
-                command, env=env, capture_output=True, text=True, timeout=LONGEST_S, check=False, cwd=folder
+                command, env=env, capture_output=True, text=True, timeout=CASE_TIMEOUT_S, check=False, cwd=folder
             )
         except subprocess.TimeoutExpired:
-            raise UsageError(f"{case.name}: not done after {LONGEST_S:.0f} s") from None
+            raise UsageError(f"{case.name}: not done after {CASE_TIMEOUT_S:.0f} s") from None
         if done.returncode != 0:
-            raise UsageError(f"{case.name}: failed; {(done.stderr.strip().splitlines() or ['no word'])[-1]}")
+            raise UsageError(f"{case.name}: failed; {(done.stderr.strip().splitlines() or ['no output'])[-1]}")
         return msgspec.json.decode(out.read_bytes(), type=dict[str, Digest])
 
 
 def references(path: Path) -> References:
-    """Raises UsageError."""
+    """Reads the reference file. Raises UsageError."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=References)
     except FileNotFoundError:
@@ -55,7 +58,7 @@ def references(path: Path) -> References:
 
 
 def write(path: Path, digests: References) -> None:
-    """Raises OutputError."""
+    """Writes the reference file. Raises OutputError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(msgspec.json.format(msgspec.json.encode(digests), indent=1) + b"\n")
@@ -64,40 +67,40 @@ def write(path: Path, digests: References) -> None:
 
 
 def wanted_cases(names: list[str], data: Path) -> list[Case]:
-    """``names``: none for all. Cases whose data are absent are said to be left out. Raises UsageError."""
+    """Selects the cases by ``names`` (empty: all). Prints which are skipped for missing data. Raises UsageError."""
     unknown = sorted(set(names) - {case.name for case in CASES})
     if unknown:
-        raise UsageError(f"--case '{unknown[0]}': there is none; choose from: {', '.join(c.name for c in CASES)}")
+        raise UsageError(f"--case '{unknown[0]}': unknown; choose from: {', '.join(c.name for c in CASES)}")
     cases = []
     for case in CASES:
         missing = [need for need in case.needs if not (data / need).exists()]
         if names and case.name not in names:
             continue
         if missing:
-            typer.echo(f"{case.name}: left out, {data / missing[0]} is not there (--data)", err=True)
+            typer.echo(f"{case.name}: skipped, {data / missing[0]} does not exist (--data)", err=True)
             continue
         cases.append(case)
     return cases
 
 
 def compare(cases: list[Case], data: Path, expected: References) -> int:
-    """-> how many cases differ."""
+    """Returns the number of cases that differ."""
     different = 0
     for case in cases:
         if case.name not in expected:
             typer.echo(f"{case.name}: no reference; write it with --update-refs")
             different += 1
             continue
-        lines = differences(expected[case.name], found(case, data))
+        lines = differences(expected[case.name], run_case(case, data))
         different += bool(lines)
-        typer.echo(f"{case.name}: {'different' if lines else 'the same'}")
+        typer.echo(f"{case.name}: {'different' if lines else 'equal'}")
         for line in lines:
             typer.echo(f"  {line}")
     return different
 
 
-def of_revision(revision: str, cases: list[Case], data: Path) -> References:
-    """Digests of another revision, from a worktree of its own. Raises UsageError."""
+def revision_digests(revision: str, cases: list[Case], data: Path) -> References:
+    """Returns the digests of another revision, from its own worktree. Raises UsageError."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         added = subprocess.run(
@@ -106,7 +109,7 @@ def of_revision(revision: str, cases: list[Case], data: Path) -> References:
         if added.returncode != 0:
             raise UsageError(f"--against {revision}: {added.stderr.strip().splitlines()[-1]}")
         try:
-            return {case.name: found(case, data, tree) for case in cases}
+            return {case.name: run_case(case, data, tree) for case in cases}
         finally:
             subprocess.run(["git", "worktree", "remove", "--force", str(tree)], capture_output=True, check=False)
 
@@ -118,19 +121,19 @@ def main(
     update_refs: Annotated[bool, typer.Option("--update-refs", help="Write the references instead.")] = False,
     against: Annotated[str, typer.Option(help="Compare with this revision instead of the references.")] = "",
 ) -> None:
-    """Compares the messages of every case with the references. Exit code 0: all are the same; 1: one is not."""
+    """Compare the messages of each case with the references. Exit code 0: all are equal; 1: at least one differs."""
     cases = wanted_cases(case or [], data)
     if update_refs:
         known = references(refs) if refs.exists() else {}
         for one in cases:
-            known[one.name] = found(one, data)
+            known[one.name] = run_case(one, data)
             write(refs, known)
             typer.echo(f"{one.name}: {sum(digest.count for digest in known[one.name].values())} messages")
         return
-    expected = of_revision(against, cases, data) if against else references(refs)
+    expected = revision_digests(against, cases, data) if against else references(refs)
     different = compare(cases, data, expected)
     typer.echo(f"{different} of {len(cases)} cases differ")
-    raise typer.Exit(DIFFERENT if different else 0)
+    raise typer.Exit(EXIT_DIFFERENT if different else 0)
 
 
 if __name__ == "__main__":

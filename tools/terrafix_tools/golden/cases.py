@@ -1,7 +1,8 @@
 """The runs whose messages are compared: recorded flights, simulated ones, a restart in flight, the link, finalise.
 
-A case takes a folder to work in and gives its digests. All are deterministic on one computer with one thread for linear
-algebra (``run.py`` sees to that); another processor may round otherwise."""
+A case takes the data folder and a working folder and returns its digests. All are deterministic on one computer with
+one thread for linear algebra (``one.py`` and ``__main__.py`` set that); another processor may round differently.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -38,22 +39,22 @@ from terrafix_tools.sim.flights import make as making
 VILLAGE, TOWN = "flights/village-1", "flights/town-a"
 SIMULATED_S = 60.0
 MONTECARLO_SEED, MONTECARLO_FLIGHTS, MONTECARLO_S = 3, 12, 120.0
-RESTARTED_AT = 40  # frame of the simulated flight after which the estimator's process is another one
-UNIX_NS = 1_750_000_000_000_000_000  # of the link's wall clock: any time at which GPS week and leap seconds are known
+RESTARTED_AT = 40  # frame id of the simulated flight after which the estimator runs in a new process
+UNIX_NS = 1_750_000_000_000_000_000  # wall clock of the link: any time for which GPS week and leap seconds are known
 
-DigestsOf = Callable[[Path, Path], dict[str, Digest]]  # of the data folder and a folder to work in
+DigestsOf = Callable[[Path, Path], dict[str, Digest]]  # (data folder, working folder) -> digests
 
 
 @dataclass(frozen=True)
 class Case:
-    """``needs``: files of the data folder."""
+    """``needs``: required files of the data folder."""
 
     name: str
     digests: DigestsOf
     needs: tuple[str, ...] = ()
 
 
-def of_record(folder: Path) -> Digests:
+def record_digests(folder: Path) -> Digests:
     digests = Digests()
     for _, _, message in read_flight(folder):
         digests.take(message)
@@ -64,47 +65,47 @@ def _replayed(flight: str, map_name: str, models: tuple[str, ...] = ()) -> Diges
     def digests(data: Path, work: Path) -> dict[str, Digest]:
         wanted = [f"{name}={data / path}" for name, path in (model.split("=") for model in models)]
         replay(data / flight, data / map_name, work / "out", models=wanted)
-        return of_record(work / "out").result()
+        return record_digests(work / "out").result()
 
     return digests
 
 
 def _fly(work: Path, kind: Kind, seed: int, nodes: MakeNodes = make_nodes) -> Path:
-    """-> the folder with the replay of a simulated flight."""
-    making.make(work / "flight", making.Wanted(seed=seed, vehicle=kind, duration_s=SIMULATED_S), progress=False)
+    """Simulates and replays a flight; returns the folder of the replay."""
+    making.make(work / "flight", making.FlightOptions(seed=seed, vehicle=kind, duration_s=SIMULATED_S), progress=False)
     replay(work / "flight", None, work / "out", nodes=nodes)
     return work / "out"
 
 
 def _simulated(kind: Kind, seed: int, nodes: MakeNodes = make_nodes) -> DigestsOf:
     def digests(_: Path, work: Path) -> dict[str, Digest]:
-        return of_record(_fly(work, kind, seed, nodes)).result()
+        return record_digests(_fly(work, kind, seed, nodes)).result()
 
     return digests
 
 
 def montecarlo(_: Path, __: Path) -> dict[str, Digest]:
-    """Every message that the estimator says in a round of simulated flights."""
+    """Digests of every message that the estimator publishes in a round of simulated flights."""
     digests = Digests()
     for number in range(MONTECARLO_FLIGHTS):
-        flight = _Heard(plan(MONTECARLO_SEED, number, fault=None, duration_s=MONTECARLO_S, lie_share=0.05))
+        flight = _DigestedRun(plan(MONTECARLO_SEED, number, fault=None, duration_s=MONTECARLO_S, lie_share=0.05))
         flight.digests = digests
         flight.record(refine=True)
     return digests.result()
 
 
-class _Heard(Run):
+class _DigestedRun(Run):
     digests: Digests
 
-    def hear(self, message: Message) -> list[Message]:
-        said = super().hear(message)
-        for one in said:
+    def process(self, message: Message) -> list[Message]:
+        published = super().process(message)
+        for one in published:
             self.digests.take(one)
-        return said
+        return published
 
 
 class RestartedEstimator:
-    """The estimator, in a process that is another one from frame ``at`` on: that has what the first one kept."""
+    """The estimator node, replaced at frame ``at`` by a new one that starts from the checkpoint of the first."""
 
     def __init__(self, ctx: NodeContext, node: Node, at: int) -> None:
         self._ctx, self._node, self._at = ctx, node, at
@@ -119,10 +120,10 @@ class RestartedEstimator:
             again = replace(self._ctx, checkpoint=self._file, epoch_ns=self._origin.t_ns)
             self._node = make_nodes(again)["estimator"]
             yield from self._node.on(self._origin)
-        self._edge.heard(message)
-        for said in self._node.on(message):
-            self._edge.heard(said)
-            yield said
+        self._edge.on_message(message)
+        for published in self._node.on(message):
+            self._edge.on_message(published)
+            yield published
 
     def tick(self, now_ns: int) -> Iterable[Message]:
         return self._node.tick(now_ns)
@@ -134,7 +135,7 @@ def restarted(ctx: NodeContext) -> dict[str, Node]:
 
 
 def finalised(data: Path, work: Path) -> dict[str, Digest]:
-    """The whole-flight solution of a recorded flight; its record is not compared again."""
+    """Digest of the whole-flight solution of a recorded flight; its record is not compared again."""
     replay(data / VILLAGE, data / "maps/village-2014-01.tif", work / "out")
     finalise(work / "out")
     digests = Digests()
@@ -143,26 +144,26 @@ def finalised(data: Path, work: Path) -> dict[str, Digest]:
 
 
 def link(_: Path, work: Path) -> dict[str, Digest]:
-    """A simulated flight as the link hears it, with its ticks: GpsInput and the bytes of GPS_INPUT, texts, verdicts."""
+    """Digests of the link on a simulated flight with ticks: GpsInput, the bytes of GPS_INPUT, texts, verdicts."""
     record = _fly(work, Kind.COPTER, 33)
     digests, node, wire = Digests(), LinkNode(10.0), mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     tick_ns = round(1e9 / TICK_HZ)
     now_ns = 0
-    heard = (Origin, NavEstimate, CalibrationFault, SearchState, VehicleState)
-    node_says = [*node.on(WallClock(t_ns=0, source="golden", unix_ns=UNIX_NS))]
+    subscribed = (Origin, NavEstimate, CalibrationFault, SearchState, VehicleState)
+    outputs = [*node.on(WallClock(t_ns=0, source="golden", unix_ns=UNIX_NS))]
     for _topic, _log_ns, message in read_flight(record):
-        if not isinstance(message, heard):
+        if not isinstance(message, subscribed):
             continue
         while now_ns + tick_ns <= message.t_ns:
             now_ns += tick_ns
-            node_says += node.tick(now_ns)
+            outputs += node.tick(now_ns)
         if isinstance(message, NavEstimate):
             message = msgspec.structs.replace(message, emitted_at_ns=message.t_ns)
-        node_says += node.on(message)
-    for said in node_says:
-        digests.take(said)
-        if isinstance(said, GpsInput):
-            digests.take_bytes("GPS_INPUT", bytes(encode(said, 0).pack(wire)))
+        outputs += node.on(message)
+    for published in outputs:
+        digests.take(published)
+        if isinstance(published, GpsInput):
+            digests.take_bytes("GPS_INPUT", bytes(encode(published, 0).pack(wire)))
     return digests.result()
 
 

@@ -1,7 +1,8 @@
-"""SHA-256 over the messages of a run, one digest for each type and in the order in which they were said.
+"""SHA-256 over the messages of a run, one digest per type, in the order of publication.
 
-As openpilot's process_replay: a change that must not alter behaviour leaves every digest as it was, and a digest that
-changes names the message where it begins to differ from what was meant."""
+Like openpilot's process_replay: a change that must not alter behaviour leaves every digest unchanged, and a changed
+digest names the message type that differs.
+"""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ import msgspec
 
 from terrafix.messages import Message
 
-# Written by the shell, from the clock of the computer.
+# Set by the process shell from the computer's clock.
 NOT_COMPARED = ("emitted_at_ns",)
 
 
@@ -31,7 +32,9 @@ class _Stream:
 
 
 class Digests:
-    """Of one case: by the tag of a message, which stays when its class is renamed, or by the name of other bytes."""
+    """The digests of one case, keyed by the tag of a message, which stays when its class is renamed, or by a given
+    name.
+    """
 
     def __init__(self) -> None:
         self._streams: dict[str, _Stream] = {}
@@ -53,7 +56,7 @@ References = dict[str, dict[str, Digest]]  # case -> stream -> digest
 
 
 def differences(expected: dict[str, Digest], found: dict[str, Digest]) -> list[str]:
-    """One line for each stream that is not the same; nothing when all are."""
+    """Returns one line for each stream that differs; empty when all are equal."""
     lines = []
     for name in sorted(expected.keys() | found.keys()):
         before, now = expected.get(name), found.get(name)

@@ -1,4 +1,4 @@
-"""One case, in this process: python -m terrafix_tools.golden.one CASE DATA OUT."""
+"""Runs one case in this process: python -m terrafix_tools.golden.one CASE DATA OUT."""
 
 import sys
 import tempfile

@@ -1,4 +1,4 @@
-"""Builds a map package: imagery layers as tiles at several scales, elevation, vectors, manifest. Streams; any size."""
+"""Builds a map package: imagery tiles at several scales, elevation, vectors, manifest. Streams inputs of any size."""
 
 import contextlib
 import hashlib
@@ -19,20 +19,27 @@ from terrafix.core.errors import MapError, OutputError
 from terrafix.map.format import FORMAT_VERSION, IMAGERY_TABLE, Ce90Origin, DemGrid, Layer, Manifest, VectorTable
 from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
-from terrafix_tools.mapping.accuracy import estimate_into
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
-from terrafix_tools.mapping.collar import find_collar
-from terrafix_tools.mapping.dem import TILES_PER_WORKER, DemSource, height_places, open_heights, write_elevation
-from terrafix_tools.mapping.descriptors import write_descriptors
-from terrafix_tools.mapping.descriptors_kind import Descriptors
-from terrafix_tools.mapping.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
-from terrafix_tools.mapping.null_model import learn_into
-from terrafix_tools.mapping.parallel import CHUNKS_PER_WORKER, GDAL_CACHE_MB, Crew, Piece, Processes, render_pieces
+from terrafix_tools.mapping.mosaic.accuracy import add_accuracy_estimates
+from terrafix_tools.mapping.mosaic.collar import find_collar
+from terrafix_tools.mapping.package.dem import TILES_PER_WORKER, DemSource, height_places, open_heights, write_elevation
+from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
+from terrafix_tools.mapping.package.descriptors import write_descriptors
+from terrafix_tools.mapping.package.gpkg import GpkgWriter, new_package
+from terrafix_tools.mapping.package.null_model import add_null_models
+from terrafix_tools.mapping.package.pyramid import BUILT_WITH, Pyramid, levels_of, open_renderer
+from terrafix_tools.mapping.parallel import (
+    CHUNKS_PER_WORKER,
+    GDAL_CACHE_MB,
+    Piece,
+    PoolProvider,
+    Processes,
+    render_pieces,
+)
 from terrafix_tools.mapping.progress import Bar, progress_bar
-from terrafix_tools.mapping.pyramid import BUILT_WITH, Pyramid, levels_of, open_renderer
 from terrafix_tools.mapping.source import ImagerySource
-from terrafix_tools.mapping.vectors import write_vectors
+from terrafix_tools.mapping.vectors.tables import write_vectors
 
 HASH_CHUNK = 1 << 20
 
@@ -48,7 +55,7 @@ def build(
     workers: int = 1,
     progress: bool = False,
 ) -> Path:
-    """``build_package`` of one image (any GDAL raster with a CRS) and an elevation raster in metres AMSL."""
+    """Builds a package from one image (any GDAL raster with a CRS) and an elevation raster in metres AMSL."""
     check_out(out, imagery)
     layer = layer_of(imagery, date=date, licence=licence, ce90_m=ce90_m)
     elevation = ElevationInput(partial(DemSource, dem.absolute()), source=dem.name) if dem else None
@@ -56,13 +63,13 @@ def build(
 
 
 def layer_of(imagery: Path, *, date: str = "", licence: str = "", ce90_m: float | None = None) -> LayerInput:
-    """An image as a layer. ``ce90_m``: radius that holds 90 % of its errors of position, as its producer states it.
+    """An image as a layer. ``ce90_m``: stated accuracy, the radius that contains 90 % of the position errors.
 
     Raises MapError and UsageError."""
-    with ImagerySource(imagery) as source:  # says what is wrong with it before it is read to the end
+    with ImagerySource(imagery) as source:  # validates it before the full read
         check_reach(imagery, source)
     return LayerInput(
-        open=partial(ImagerySource, imagery.absolute()),  # a worker may stand in another folder
+        open=partial(ImagerySource, imagery.absolute()),  # a worker may have another working directory
         source=imagery.name,
         source_sha256=_sha256(imagery),
         where=str(imagery),
@@ -81,20 +88,20 @@ def build_package(
     descriptors: Descriptors = Descriptors.WEIGHTS_FREE,
     null_agl_m: Sequence[float] = (),
     workers: int = 1,
-    cluster: Crew | None = None,
+    cluster: PoolProvider | None = None,
     progress: bool = False,
 ) -> Path:
-    """Writes the package `out`. ``workers``: processes that read and encode imagery and elevation and describe the
-    imagery; ``cluster``: other computers that do so in their place. Neither changes a byte. ``null_agl_m``: heights
-    above ground at which the null model is learnt.
+    """Writes the package `out`. ``workers``: processes that read and encode imagery and elevation and compute
+    descriptors; ``cluster``: other computers that do it instead. Neither changes the bytes. ``null_agl_m``: heights
+    above ground for which a null model is fitted.
 
-    The same input gives the same bytes. Nothing is left at `out` or beside it when this fails or is interrupted.
-    With several workers this must be called from a program that may be imported again (``multiprocessing`` forkserver).
-    Raises MapError (something that goes in is unusable), UsageError and OutputError."""
+    The result is deterministic. On failure or interruption, no file is left at `out` or beside it.
+    With several workers the main module must be importable (``multiprocessing`` forkserver).
+    Raises MapError (an input is unusable), UsageError and OutputError."""
     for layer in layers:
         check_date(layer.date)
     check_out(out)
-    # Newest first; unknown dates last, and in the order given.
+    # Newest first; unknown dates last, in the given order.
     ordered = sorted(layers, key=lambda layer: layer.date, reverse=True)
     with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), contextlib.ExitStack() as stack:
         try:
@@ -107,13 +114,13 @@ def build_package(
                 one = _Build(writer, db, scratch, out.stem, descriptors, crew, bar)
                 one.write(ordered, elevation, vectors)
             if len(layers) > 1:
-                estimate_into(part)
+                add_accuracy_estimates(part)
             if null_agl_m:
-                learn_into(part, null_agl_m)
+                add_null_models(part, null_agl_m)
             with part.open("rb") as file:
                 os.fsync(file.fileno())
             part.replace(out)
-        except RasterioError as error:  # some of them are OSErrors, too
+        except RasterioError as error:  # some subclasses are OSErrors, too
             raise MapError(
                 f"{out}: not built, a raster cannot be read or kept ({error}); check it, and space"
             ) from None
@@ -127,9 +134,9 @@ def build_package(
 def ensure_package(
     path: Path, cache_dir: Path, *, dem: Path | None = None, date: str = "", licence: str = "", progress: bool = False
 ) -> Path:
-    """A map package for `path`: itself when it is one, else built once into `cache_dir` and used again.
+    """A map package for `path`: the path itself if it is a package, else one that is built once and cached.
 
-    The name of the cached file carries path, size and modification time of the sources. Raises like `build`."""
+    The cached file's name contains path, size and modification time of the sources. Raises like `build`."""
     if path.suffix.lower() == ".gpkg":
         return path
     if not path.is_file():
@@ -144,14 +151,14 @@ def ensure_package(
         try:
             MapPackage.open(cached).close()
         except MapError:
-            pass  # damaged in the cache: built again below
+            pass  # the cached file is damaged and is built again
         else:
             return cached
     return build(path, cached, dem=dem, date=date, licence=licence, progress=progress)
 
 
 class _Build:
-    """One package while it is written."""
+    """State of a package that is being written."""
 
     def __init__(
         self,
@@ -160,7 +167,7 @@ class _Build:
         scratch: Path,
         name: str,
         descriptors: Descriptors,
-        crew: Crew,
+        crew: PoolProvider,
         bar: Bar,
     ) -> None:
         self._writer, self._db, self._scratch, self._name = writer, db, scratch.absolute(), name
@@ -202,14 +209,14 @@ class _Build:
         self._writer.add_imagery_table(layer, self._name)
         pyramid = Pyramid(source, levels, table, self._writer)
         places = pyramid.places()
-        self._crew.get_ready(len(places), CHUNKS_PER_WORKER)
+        self._crew.prepare(len(places), CHUNKS_PER_WORKER)
         collar_file = self._scratch / f"{table}-collar.tif"
         collar = None if source.has_mask else find_collar(source, collar_file, self._bar)
         if collar:
             collar.close()
         opener = partial(open_renderer, given.open, collar_file if collar else None, levels[-1].zoom)
         rendered = render_pieces(opener, places, len(places), self._crew)
-        with contextlib.closing(_counted(rendered, self._bar(table, len(places)))) as chunks:
+        with contextlib.closing(_count_steps(rendered, self._bar(table, len(places)))) as chunks:
             if not pyramid.write(chunks):
                 raise MapError(f"{given.where or given.source}: no valid pixel in the whole image")
         described = None
@@ -220,12 +227,12 @@ class _Build:
         return msgspec.structs.replace(layer, tiles=self._writer.tiles[table], descriptors=described)
 
     def _elevation(self, given: ElevationInput, source: Imagery) -> DemGrid:
-        with given.open(source.crs, source.bounds) as elevation:  # says what is wrong with it
+        with given.open(source.crs, source.bounds) as elevation:  # validates it
             grid = elevation.grid
         places = height_places(grid)
         opener = partial(open_heights, given.open, source.crs, source.bounds)
         tiles = render_pieces(opener, places, len(places), self._crew, per_worker=TILES_PER_WORKER)
-        with contextlib.closing(_counted(tiles, self._bar("elevation", len(places)))) as counted:
+        with contextlib.closing(_count_steps(tiles, self._bar("elevation", len(places)))) as counted:
             return write_elevation(self._writer, given, grid, source.crs, counted)
 
     def _manifest(self, layers: list[Layer], dem: DemGrid | None, vectors: tuple[VectorTable, ...]) -> None:
@@ -256,7 +263,7 @@ class _Build:
         )
 
 
-def _counted(pieces: Generator[Piece, None, None], step: Callable[[], None]) -> Generator[Piece, None, None]:
+def _count_steps(pieces: Generator[Piece, None, None], step: Callable[[], None]) -> Generator[Piece, None, None]:
     with contextlib.closing(pieces):
         for piece in pieces:
             step()

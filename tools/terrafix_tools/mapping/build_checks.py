@@ -1,4 +1,4 @@
-"""What is refused before a package is built: images that lie where no map can be, outputs and dates that are none."""
+"""Checks before a build: position of the imagery, output path, date."""
 
 import datetime
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 from pyproj import Transformer
 
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix_tools.mapping.area_checks import POLAR_DEG
+from terrafix_tools.mapping.area.checks import POLAR_DEG
 from terrafix_tools.mapping.layers import Imagery
 
 
 def check_reach(imagery: Path, source: Imagery) -> None:
-    """Raises MapError: over the antimeridian, where west is east of east, or polar."""
+    """Raises MapError: across the antimeridian, where west is greater than east, or polar."""
     to_wgs84 = Transformer.from_crs(source.crs, 4326, always_xy=True)
     west, south, east, north = to_wgs84.transform_bounds(*source.bounds, densify_pts=51)
     if west > east:
@@ -27,19 +27,19 @@ def check_reach(imagery: Path, source: Imagery) -> None:
 
 
 def check_out(out: Path, imagery: Path | None = None) -> None:
-    """Raises OutputError: no place or no name for a package, or the imagery itself."""
+    """Raises OutputError: no folder or no name for a package, or the imagery itself."""
     if out.is_dir():
         raise OutputError(f"{out}: is a folder; give the name of a file to write, for example {out / 'map.gpkg'}")
     if out.suffix.lower() != ".gpkg":
         raise OutputError(f"{out}: a map package is a GeoPackage; let its name end in .gpkg")
     if out.exists() and not out.is_file():
-        raise OutputError(f"{out}: is there and is no file; give another --out")
+        raise OutputError(f"{out}: exists and is not a regular file; give another --out")
     if imagery is not None and out.exists() and imagery.exists() and out.samefile(imagery):
         raise OutputError(f"{out}: would overwrite the imagery; give another --out")
 
 
 def check_date(date: str) -> None:
-    """Raises UsageError: neither empty nor YYYY-MM-DD."""
+    """Raises UsageError unless it is empty or YYYY-MM-DD."""
     try:
         good = not date or datetime.date.fromisoformat(date).isoformat() == date
     except ValueError:

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from terrafix_tools.mapping import cli_package
-from terrafix_tools.mapping.descriptors_kind import Descriptors
-from terrafix_tools.mapping.heights_datum import Datum
+from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
+from terrafix_tools.mapping.package.height_datums import Datum
 
 app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
 
@@ -20,50 +20,50 @@ def map_build(
     area: Annotated[
         str, typer.Option(help="W,S,E,N in degrees, .kml, .geojson, QGroundControl .plan or ArduPilot .waypoints.")
     ] = "",
-    buffer: Annotated[float | None, typer.Option(help="Kilometres around the area; 20 when nothing is said.")] = None,
+    buffer: Annotated[float | None, typer.Option(help="Kilometres around the area; default 20.")] = None,
     corridor: Annotated[
-        float | None, typer.Option(help="Kilometres to either side of a mission: the sensible choice for one.")
+        float | None, typer.Option(help="Kilometres to either side of a mission; recommended for missions.")
     ] = None,
     source: Annotated[
         list[str] | None,
-        typer.Option(help="File, {z}/{x}/{y} address or sentinel-2; may be repeated, the first with a pixel wins."),
+        typer.Option(help="File, {z}/{x}/{y} address or sentinel-2; repeatable, the first valid pixel is used."),
     ] = None,
     sources: Annotated[Path | None, typer.Option(help="TOML file of sources, after those of --source.")] = None,
     gsd: Annotated[
         float | None,
-        typer.Option(help="Metres per pixel wanted: chooses the zoom of tiles, makes finer images coarser."),
+        typer.Option(help="Requested metres per pixel: selects the zoom of tiles, downsamples finer images."),
     ] = None,
     dem: Annotated[str, typer.Option(help="Elevation raster, metres AMSL; or glo-30 (Copernicus).")] = "",
-    dem_datum: Annotated[Datum, typer.Option(help="What the heights of --dem count from.")] = Datum.EGM96,
-    geoid: Annotated[Path | None, typer.Option(help="Grid of the geoid EGM96, where PROJ has none.")] = None,
+    dem_datum: Annotated[Datum, typer.Option(help="Vertical datum of --dem.")] = Datum.EGM96,
+    geoid: Annotated[Path | None, typer.Option(help="Grid of the geoid EGM96, if PROJ has none.")] = None,
     osm: Annotated[str, typer.Option(help="Roads, water, buildings: an .osm.pbf, 'overpass' or its address.")] = "",
     date: Annotated[str, typer.Option(help="Date of the imagery, YYYY-MM-DD.")] = "",
-    licence: Annotated[str, typer.Option(help="Licence of the imagery; needed for what comes over a network.")] = "",
+    licence: Annotated[str, typer.Option(help="Licence of the imagery; required for network sources.")] = "",
     ce90: Annotated[
         float | None,
         typer.Option(min=0.0, max=200.0, help="Stated position error of the imagery: radius of 90 %, metres."),
     ] = None,
     descriptors: Annotated[
-        Descriptors, typer.Option(help="Of the ground, for the search of a vehicle that is lost.")
+        Descriptors, typer.Option(help="Precomputed descriptors for the search of the whole map.")
     ] = Descriptors.WEIGHTS_FREE,
     null_agl: Annotated[
         list[float] | None,
-        typer.Option(min=30.0, help="Height of flights, m: learns what wrong places score there; may be repeated."),
+        typer.Option(min=30.0, help="Height of flights, m: fits a null model for it; repeatable."),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(help="Requests a second that the servers of --source allow; 5 when nothing is said.")
+        float | None, typer.Option(help="Requests per second that the servers of --source allow; default 5.")
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, max=64, help="Processes that read and encode; default: one a core, at most 8."),
+        typer.Option(min=1, max=64, help="Processes that read and encode; default: one per core, at most 8."),
     ] = None,
-    scheduler: Annotated[str, typer.Option(help="tcp://host:port of a Dask cluster that does so instead.")] = "",
-    cache: Annotated[Path | None, typer.Option(help="Folder that keeps downloads; default ~/.cache/terrafix.")] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Agree to a large download.")] = False,
-    estimate: Annotated[bool, typer.Option("--estimate", help="Say what would be downloaded, and stop.")] = False,
+    scheduler: Annotated[str, typer.Option(help="tcp://host:port of a Dask cluster to use instead.")] = "",
+    cache: Annotated[Path | None, typer.Option(help="Folder for downloads; default ~/.cache/terrafix.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Confirm a large download.")] = False,
+    estimate: Annotated[bool, typer.Option("--estimate", help="Print what would be downloaded, and stop.")] = False,
 ) -> None:
     """Imagery, elevation and vectors -> map package: of a whole image, or of an area from several sources."""
-    from terrafix_tools.mapping.area_build import Order, build_order
+    from terrafix_tools.mapping.area.build import Order, build_order
 
     build_order(
         Order(

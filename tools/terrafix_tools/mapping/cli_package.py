@@ -1,4 +1,4 @@
-"""The commands `terrafix map info|check|preview|sign|keygen`: what one does with a package that exists."""
+"""The commands `terrafix map info|check|preview|sign|keygen` for existing packages."""
 
 import getpass
 from pathlib import Path
@@ -19,8 +19,8 @@ LayerOption = Annotated[str | None, typer.Option(help="Layer of the package. Def
 
 
 def info(package: PackageArgument) -> None:
-    """What is in a map package, as JSON, after a check of every tile."""
-    from terrafix_tools.mapping.preview import info
+    """Verify every tile, then print the contents of a map package as JSON."""
+    from terrafix_tools.mapping.check.preview import info
 
     info(package)
 
@@ -33,15 +33,15 @@ def check(
     layer: LayerOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
-    """Will this map do? Coverage, detail, age, and where the camera will see. Fails when the mission leaves the map."""
-    from terrafix_tools.mapping.preview import say_check
+    """Suitability of a map: coverage, resolution, age, matchable ground. Fails when the mission leaves the map."""
+    from terrafix_tools.mapping.check.preview import print_check
 
-    say_check(package, mission, camera, agl, layer, as_json=as_json)
+    print_check(package, mission, camera, agl, layer, as_json=as_json)
 
 
 def preview(
     package: PackageArgument,
-    out: Annotated[Path, typer.Option(help="PNG (the map), or HTML (with where the camera will see).")] = Path(
+    out: Annotated[Path, typer.Option(help="PNG (the map), or HTML (with the matchable ground).")] = Path(
         "preview.png"
     ),
     size: Annotated[int, typer.Option(min=64, max=8192, help="Longer side of the PNG, pixels.")] = 1024,
@@ -50,8 +50,8 @@ def preview(
     agl: AglOption = None,
     layer: LayerOption = None,
 ) -> None:
-    """The whole map, north up, as a picture or a page; where it is transparent the map has nothing."""
-    from terrafix_tools.mapping.preview import preview, preview_page
+    """The whole map, north up, as an image or a page; transparent where the map has no imagery."""
+    from terrafix_tools.mapping.check.preview import preview, preview_page
 
     if out.suffix.lower() in (".html", ".htm"):
         preview_page(package, out, mission, camera, agl, layer)
@@ -60,10 +60,10 @@ def preview(
 
 
 def keygen(
-    out: Annotated[Path, typer.Option(help="Names of the two files without their endings: OUT.key and OUT.pub.")],
-    owner: Annotated[str, typer.Option(help="Who signs with it; a remark in OUT.pub.")] = "",
+    out: Annotated[Path, typer.Option(help="Name of the two files without suffix: OUT.key and OUT.pub.")],
+    owner: Annotated[str, typer.Option(help="Owner of the key; a comment in OUT.pub.")] = "",
 ) -> None:
-    """A new pair of keys for signing map packages. Keep OUT.key to yourself; vehicles get OUT.pub."""
+    """Generate a key pair for signing map packages. Keep OUT.key secret; vehicles get OUT.pub."""
     from terrafix.core.signature import generate
 
     private, public = out.with_name(f"{out.name}.key"), out.with_name(f"{out.name}.pub")
@@ -74,7 +74,7 @@ def keygen(
 def sign(
     package: PackageArgument, key: Annotated[Path, typer.Option(help="Private key of `terrafix map keygen`.")]
 ) -> None:
-    """Sign a map package, after a check of every tile."""
-    from terrafix_tools.mapping.sign import sign_package
+    """Verify every tile, then sign a map package."""
+    from terrafix_tools.mapping.package.sign import sign_package
 
     typer.echo(f"{package}: signed by key {sign_package(package, key).key_id}")

@@ -1,4 +1,4 @@
-"""What goes into a map package: imagery layers, elevation and vectors, each with where it came from."""
+"""Inputs of a map package: imagery layers, elevation and vectors, with their origin."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ Feature = tuple[
 class Imagery(Protocol):
     """North-up pixels in one projected CRS: pixel (r, c) covers [x_min + c pixel_x, y_max - r pixel_y).
 
-    A context manager. ``ImagerySource`` is one; a mosaic of several sources is another."""
+    A context manager. Implemented by ``ImagerySource`` and by ``Mosaic``."""
 
     @property
     def crs(self) -> CRS: ...
@@ -44,11 +44,11 @@ class Imagery(Protocol):
 
     @property
     def has_mask(self) -> bool:
-        """False: the source says nothing about validity, and a black or white collar is looked for."""
+        """False: the source has no validity mask; it is searched for a black or white collar."""
         ...
 
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-        """(height, width, 3) uint8 BGR and (height, width) uint8 mask of 0 and 255, of a window inside the image."""
+        """A window inside the image: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -58,13 +58,13 @@ class Imagery(Protocol):
 
 
 class Elevation(Protocol):
-    """Metres AMSL on a square north-up grid in the CRS that it was opened for. A context manager."""
+    """Metres AMSL on a square north-up grid in the requested CRS. A context manager."""
 
     @property
     def grid(self) -> DemGrid: ...
 
     def read_tile(self, column: int, row: int) -> np.ndarray:
-        """(256, 256) float32, NaN = void; tiles count from the grid's corner, beyond the grid is void."""
+        """(256, 256) float32, NaN = void. Tile indices start at the grid's corner; outside the grid is void."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -75,16 +75,16 @@ class Elevation(Protocol):
 
 @dataclass(frozen=True)
 class LayerInput:
-    """One layer of imagery. ``open`` must be picklable (a function or a ``functools.partial`` of a class): every
-    worker process opens the imagery for itself."""
+    """One imagery layer. ``open`` must be picklable (a function or a ``functools.partial`` of a class), because every
+    worker process opens the imagery itself."""
 
     open: Callable[[], Imagery]
-    source: str  # file name, or what a person would call it
-    source_sha256: str = ""  # of the file; empty: not one file
+    source: str  # file name or title
+    source_sha256: str = ""  # of the file; empty: not a single file
     where: str = ""  # its path, for messages; empty: ``source``
     date: str = ""  # YYYY-MM-DD; empty = unknown
     licence: str = ""
-    ce90_m: float | None = None  # radius that holds 90 % of the errors of position, as the producer states it
+    ce90_m: float | None = None  # stated accuracy: radius that contains 90 % of the position errors
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class ElevationInput:
 
 @dataclass(frozen=True)
 class VectorInput:
-    """Features of all tables, in any order; read once."""
+    """Features of all tables in any order; read once."""
 
     features: Iterable[Feature]
     source: str

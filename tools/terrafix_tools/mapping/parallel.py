@@ -1,4 +1,4 @@
-"""Renders the pieces of a table, in this process, in several, or on a cluster, and gives them back in order."""
+"""Renders the pieces of a table in this process, in several, or on a cluster, and returns them in order."""
 
 import contextlib
 import multiprocessing
@@ -17,95 +17,97 @@ import rasterio
 
 from terrafix.core.errors import MapError
 
-CHUNKS_PER_WORKER = 4  # of imagery; a process needs about two seconds to start: fewer are not worth one
-AHEAD = 3  # pieces in work or waiting, for each worker: what is finished too early stays in memory
-GDAL_CACHE_MB = 256  # two rows of chunks of an image 20 000 px wide; GDAL's own choice is 5 % of the memory
-GDAL_CACHES_MB = 1024  # of all workers together
-PRELOADED = ["__main__", "terrafix_tools.mapping.build"]  # what a process needs, imported once for all of them
-MOST_WORKERS = 8  # chosen without being asked: each takes 150 to 300 MB
+CHUNKS_PER_WORKER = 4  # imagery chunks; a process needs about two seconds to start, fewer chunks do not compensate it
+MAX_PENDING_PER_WORKER = (
+    3  # pieces in progress or waiting per worker; limits the memory of pieces that are finished out of order
+)
+GDAL_CACHE_MB = 256  # two rows of chunks of an image 20 000 px wide; GDAL's default is 5 % of the memory
+GDAL_CACHES_MB = 1024  # limit over all workers
+PRELOADED = ["__main__", "terrafix_tools.mapping.build"]  # modules that the fork server imports once for all workers
+MAX_DEFAULT_WORKERS = 8  # of the default; each needs 150 to 300 MB
 
 Piece = TypeVar("Piece")
-Made = TypeVar("Made", covariant=True)
+RenderedPiece = TypeVar("RenderedPiece", covariant=True)
 Wanted = TypeVar("Wanted")
-Asked = TypeVar("Asked", contravariant=True)
+PieceRequest = TypeVar("PieceRequest", contravariant=True)
 
 
-class Renderer(Protocol[Asked, Made]):
-    """Makes one piece of a table: the tiles under one tile of imagery, a tile of elevation, descriptors of a block."""
+class Renderer(Protocol[PieceRequest, RenderedPiece]):
+    """Renders one piece of a table: the tiles under one imagery tile, an elevation tile, descriptors of a block."""
 
-    def render(self, wanted: Asked) -> Made: ...
+    def render(self, wanted: PieceRequest) -> RenderedPiece: ...
 
 
-class Pending(Protocol[Made]):
+class Pending(Protocol[RenderedPiece]):
     """A piece that is being rendered."""
 
-    def result(self) -> Made: ...
+    def result(self) -> RenderedPiece: ...
 
 
-class Hands(Protocol[Asked, Made]):
-    """Whoever renders pieces of one table. Any piece may be asked for in any order; each comes out the same."""
+class RenderPool(Protocol[PieceRequest, RenderedPiece]):
+    """A pool that renders pieces of one table. Pieces may be requested in any order; the result is the same."""
 
-    def submit(self, wanted: Asked) -> Pending[Made]: ...
+    def submit(self, wanted: PieceRequest) -> Pending[RenderedPiece]: ...
 
     def count(self) -> int:
-        """Pieces that are rendered at the same time."""
+        """Number of pieces that are rendered in parallel."""
         ...
 
 
 OpenRenderer = Callable[[], Renderer[Wanted, Piece]]
 
 
-class Crew(Protocol):
-    """Processes of this computer, or other computers (`parallel_cluster.py`), that lend their hands."""
+class PoolProvider(Protocol):
+    """Processes of this computer, or other computers (`parallel_cluster.py`), that provide pools."""
 
-    def worth(self, pieces: int, per_worker: int) -> bool:
-        """Whether so many pieces go faster through these hands than in the process that asks."""
+    def is_worthwhile(self, pieces: int, per_worker: int) -> bool:
+        """True when this number of pieces is faster here than in the calling process."""
         ...
 
-    def get_ready(self, pieces: int, per_worker: int) -> None:
-        """So many will be asked for soon: begins what takes time to start, if they are worth it."""
+    def prepare(self, pieces: int, per_worker: int) -> None:
+        """Announces a number of pieces: starts what takes time to start, if it is worthwhile."""
         ...
 
-    def hands(
+    def open_pool(
         self, open_renderer: OpenRenderer[Wanted, Piece]
-    ) -> contextlib.AbstractContextManager[Hands[Wanted, Piece]]: ...
+    ) -> contextlib.AbstractContextManager[RenderPool[Wanted, Piece]]: ...
 
 
-def usual_workers() -> int:
-    """One for each core that this process may use."""
+def default_workers() -> int:
+    """One per core that this process may use, at most MOST_WORKERS."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST_WORKERS)
+    return min(cores, MAX_DEFAULT_WORKERS)
 
 
 def render_pieces(
     open_renderer: OpenRenderer[Wanted, Piece],
     wanted: Iterable[Wanted],
     pieces: int,
-    crew: Crew,
+    crew: PoolProvider,
     *,
     per_worker: int = CHUNKS_PER_WORKER,
 ) -> Generator[Piece, None, None]:
-    """All that is wanted, ``pieces`` of them, in that order, whoever renders them. ``open_renderer`` and what is wanted
-    must be picklable.
+    """Renders all ``wanted`` pieces, ``pieces`` in number, and yields them in that order. ``open_renderer`` and the
+    wanted pieces must be picklable.
 
-    ``per_worker``: with fewer pieces for each of them, no processes are started.
+    ``per_worker``: no processes are started for fewer pieces per process.
     Raises what a renderer raises, and MapError when a worker process dies."""
-    if not crew.worth(pieces, per_worker):
+    if not crew.is_worthwhile(pieces, per_worker):
         yield from map(open_renderer().render, wanted)
         return
-    with crew.hands(open_renderer) as hands:
+    with crew.open_pool(open_renderer) as pool:
         waiting: deque[Pending[Piece]] = deque()
         for one in wanted:
-            waiting.append(hands.submit(one))
-            if len(waiting) >= AHEAD * hands.count():
+            waiting.append(pool.submit(one))
+            if len(waiting) >= MAX_PENDING_PER_WORKER * pool.count():
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
 
 
 class Processes:
-    """Up to ``most`` processes of this computer, started when they are first worth it and kept for every table of a
-    package. A context manager."""
+    """Up to ``most`` processes of this computer, started when needed and reused for every table of a package. A context
+    manager."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -122,40 +124,40 @@ class Processes:
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def worth(self, pieces: int, per_worker: int) -> bool:
-        """As ``Crew.worth``; decides how many processes there are when it says yes for the first time."""
+    def is_worthwhile(self, pieces: int, per_worker: int) -> bool:
+        """Implements ``Crew.worth``; the first True fixes the number of processes."""
         if self._pool is not None:
             return pieces > 1
         self._count = min(self._most, pieces // per_worker)
         return self._count > 1
 
-    def get_ready(self, pieces: int, per_worker: int) -> None:
-        """As ``Crew.get_ready``: the server that processes are forked from imports meanwhile."""
-        if self.worth(pieces, per_worker):
+    def prepare(self, pieces: int, per_worker: int) -> None:
+        """Implements ``Crew.get_ready``: the fork server imports its modules in the meantime."""
+        if self.is_worthwhile(pieces, per_worker):
             multiprocessing.set_forkserver_preload(PRELOADED)
-            with _no_interrupt():
+            with _block_interrupt():
                 forkserver.ensure_running()
 
     @contextlib.contextmanager
-    def hands(self, open_renderer: OpenRenderer[Wanted, Piece]) -> Iterator[Hands[Wanted, Piece]]:
-        """As ``Crew.hands``."""
+    def open_pool(self, open_renderer: OpenRenderer[Wanted, Piece]) -> Iterator[RenderPool[Wanted, Piece]]:
+        """Implements ``Crew.hands``."""
         if self._pool is None:
             cache_mb = max(32, min(GDAL_CACHE_MB, GDAL_CACHES_MB // self._count))
-            # Not forked from here: GDAL's and OpenCV's threads do not survive it. The server has only imported, which
-            # would cost each process half a second.
+            # Not forked from this process, because GDAL's and OpenCV's threads do not survive a fork. The fork server
+            # has only imported modules, which saves half a second per process.
             multiprocessing.set_forkserver_preload(PRELOADED)
             context = multiprocessing.get_context("forkserver")
             self._pool = ProcessPoolExecutor(self._count, context, _start_worker, (cache_mb,))
         self._tables += 1
         try:
-            yield _Hands(self._pool, self._count, self._tables, open_renderer)
+            yield _ProcessPool(self._pool, self._count, self._tables, open_renderer)
         except BrokenProcessPool:
             raise MapError(
                 "a worker process died, perhaps for want of memory; build again with fewer --workers"
             ) from None
 
 
-class _Hands(Generic[Wanted, Piece]):
+class _ProcessPool(Generic[Wanted, Piece]):
     def __init__(
         self, pool: ProcessPoolExecutor, count: int, table: int, open_renderer: OpenRenderer[Wanted, Piece]
     ) -> None:
@@ -163,7 +165,7 @@ class _Hands(Generic[Wanted, Piece]):
         self._table, self._open_renderer = table, open_renderer
 
     def submit(self, wanted: Wanted) -> Pending[Piece]:
-        with _no_interrupt():
+        with _block_interrupt():
             return self._pool.submit(_render, self._table, self._open_renderer, wanted)
 
     def count(self) -> int:
@@ -171,10 +173,10 @@ class _Hands(Generic[Wanted, Piece]):
 
 
 @contextlib.contextmanager
-def _no_interrupt() -> Iterator[None]:
-    """Ctrl-C reaches all processes, and the parent ends the others: one that is started within never sees it, not even
-    while it imports. In the parent it waits for the end."""
-    resource_tracker.ensure_running()  # else it is started within, and that lets interrupts through again
+def _block_interrupt() -> Iterator[None]:
+    """Blocks SIGINT while processes start: Ctrl-C reaches all processes, and the parent ends the others. Processes that
+    are started in this context ignore it, even during imports; in the parent it is pending until the end."""
+    resource_tracker.ensure_running()  # otherwise it is started inside and unblocks the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -183,19 +185,19 @@ def _no_interrupt() -> Iterator[None]:
 
 
 class _Worker:
-    """What a worker process keeps between pieces: the renderer of the table that it worked on last."""
+    """State of a worker process between pieces: the renderer of the most recent table."""
 
     table = 0
     renderer: Renderer[Any, Any] | None = None
 
 
 def _start_worker(cache_mb: int) -> None:
-    cv2.setNumThreads(1)  # one process for each core: threads would fight
+    cv2.setNumThreads(1)  # one process per core, so threads would compete
     rasterio.Env(GDAL_CACHEMAX=cache_mb).__enter__()
 
 
 def _render(table: int, open_renderer: OpenRenderer[Any, Any], wanted: Any) -> Any:
     if _Worker.renderer is None or _Worker.table != table:
-        _Worker.renderer = None  # its file is closed before the next one is opened
+        _Worker.renderer = None  # closes its file before the next one is opened
         _Worker.renderer, _Worker.table = open_renderer(), table
     return _Worker.renderer.render(wanted)

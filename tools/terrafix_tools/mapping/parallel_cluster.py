@@ -1,7 +1,7 @@
-"""Renders the pieces of a table on a Dask cluster: any number of computers that see the same files.
+"""Renders the pieces of a table on a Dask cluster: any number of computers with access to the same files.
 
-A worker that dies costs only its own pieces: the scheduler gives them to another one. The bytes are those of a build
-on one computer, because a worker with other versions of what reads and encodes is refused."""
+A worker that dies loses only its own pieces: the scheduler reassigns them. The bytes are those of a build on one
+computer, because workers with other versions of the decoding and encoding libraries are rejected."""
 
 import contextlib
 import logging
@@ -20,13 +20,13 @@ from distributed import CancelledError, Client, Future, KilledWorker
 from distributed.comm.core import CommClosedError
 
 from terrafix.core.errors import MapError, UsageError
-from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, Hands, OpenRenderer, Pending, Piece, Renderer, Wanted
-from terrafix_tools.mapping.pyramid import BUILT_WITH
+from terrafix_tools.mapping.package.pyramid import BUILT_WITH
+from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, OpenRenderer, Pending, Piece, Renderer, RenderPool, Wanted
 
-CONNECT_S = 10.0  # a scheduler that is there answers in less
-WORKERS_S = 60.0  # without any worker for so long: nobody will come
-GREETING_BYTES = 1 << 20  # more than any greeting has
-LOOK_S = 2.0  # between two looks whether there are workers
+CONNECT_S = 10.0  # time-out of the connection to the scheduler
+WORKERS_S = 60.0  # time-out without any worker
+GREETING_BYTES = 1 << 20  # upper bound of a greeting
+POLL_WORKERS_S = 2.0  # polling interval while waiting for workers
 ADDRESS = re.compile(r"tcp://([^/:\s]+|\[[0-9a-fA-F:.]+\]):(\d+)")
 
 
@@ -34,17 +34,17 @@ class DaskCluster:
     """A connection to the scheduler at ``address`` (tcp://host:port). A context manager."""
 
     def __init__(self, address: str) -> None:
-        """Raises UsageError: nobody answers there."""
+        """Raises UsageError: no scheduler at the address."""
         self._address = address
         place = ADDRESS.fullmatch(address)
         if not place:
             raise UsageError(
-                f"--scheduler {address}: is no address; write it tcp://host:port, as 'dask scheduler' says it"
+                f"--scheduler {address}: not an address; write tcp://host:port, as 'dask scheduler' prints it"
             )
-        for name in ("", ".client", ".core", ".comm", ".utils"):  # what matters is said below, in one line
+        for name in ("", ".client", ".core", ".comm", ".utils"):  # errors are reported below in one line
             logging.getLogger(f"distributed{name}").setLevel(logging.CRITICAL)
         try:
-            _greet(place[1].strip("[]"), int(place[2]))
+            _check_scheduler(place[1].strip("[]"), int(place[2]))
             self._client = Client(address, timeout=CONNECT_S, set_as_default=False, name="terrafix-map-build")
         except (OSError, OverflowError) as error:
             raise UsageError(
@@ -58,20 +58,20 @@ class DaskCluster:
     def __exit__(self, *_: object) -> None:
         self._client.close()
 
-    def worth(self, pieces: int, per_worker: int) -> bool:
-        """As ``parallel.Crew.worth``: what is small is not worth that other computers must have its file."""
+    def is_worthwhile(self, pieces: int, per_worker: int) -> bool:
+        """Implements ``parallel.Crew.worth``: small tables do not need their file on other computers."""
         return pieces >= per_worker
 
-    def get_ready(self, pieces: int, per_worker: int) -> None:
-        """As ``parallel.Crew.get_ready``."""
+    def prepare(self, pieces: int, per_worker: int) -> None:
+        """Implements ``parallel.Crew.get_ready``."""
 
     @contextlib.contextmanager
-    def hands(self, open_renderer: OpenRenderer[Wanted, Piece]) -> Iterator[Hands[Wanted, Piece]]:
-        """As ``parallel.Crew.hands``. Raises MapError: workers that die or are unfit, or the scheduler is lost."""
+    def open_pool(self, open_renderer: OpenRenderer[Wanted, Piece]) -> Iterator[RenderPool[Wanted, Piece]]:
+        """Implements ``parallel.Crew.hands``. MapError: workers die or are rejected, or the scheduler is lost."""
         table = uuid.uuid4().hex
         try:
             yield _Remote(self._client, self._address, table, open_renderer)
-            self._client.run(_forget, table, on_error="ignore")
+            self._client.run(_close_renderer, table, on_error="ignore")
         except KilledWorker:
             raise MapError(
                 f"{self._address}: workers died again and again at one piece, perhaps for want of memory; "
@@ -87,13 +87,13 @@ class DaskCluster:
 
 
 class _Remote(Generic[Wanted, Piece]):
-    """Has the contract of ``parallel.Hands``."""
+    """Implements ``parallel.Hands``."""
 
     def __init__(self, client: Client, address: str, table: str, open_renderer: OpenRenderer[Wanted, Piece]) -> None:
         self._client, self._address, self._table = client, address, table
         self._submitted = 0
-        # A task, not scattered data: these are lost with the worker that holds them.
-        self._open_renderer = client.submit(_same, open_renderer, key=f"terrafix-{table}")
+        # A task, not scattered data, which is lost with the worker that holds it.
+        self._open_renderer = client.submit(_identity, open_renderer, key=f"terrafix-{table}")
 
     def submit(self, wanted: Wanted) -> Pending[Piece]:
         self._submitted += 1
@@ -105,12 +105,12 @@ class _Remote(Generic[Wanted, Piece]):
         return sum(self._client.nthreads().values())
 
     def wait_for_workers(self) -> None:
-        """Raises MapError when there is none for a long time."""
+        """Raises MapError when there is no worker within the time-out."""
         began_s = time.monotonic()
         while not self.count():
             if time.monotonic() - began_s > WORKERS_S:
                 raise MapError(f"{self._address}: the scheduler has no workers; start some with 'dask worker'")
-            time.sleep(LOOK_S)
+            time.sleep(POLL_WORKERS_S)
 
 
 class _Task(Generic[Piece]):
@@ -120,30 +120,30 @@ class _Task(Generic[Piece]):
     def result(self) -> Piece:
         while True:
             with contextlib.suppress(TimeoutError):
-                return self._future.result(timeout=LOOK_S)
+                return self._future.result(timeout=POLL_WORKERS_S)
             self._remote.wait_for_workers()
 
 
-def _greet(host: str, port: int) -> None:
-    """Is it Dask that answers? A client that finds something else waits long and fails in many ways.
+def _check_scheduler(host: str, port: int) -> None:
+    """Checks that a Dask scheduler listens there, because Dask's client waits long and fails in many ways otherwise.
 
-    Whoever listens in Dask speaks first: the length of what follows, little endian (distributed/comm/tcp.py).
-    Raises OSError, OverflowError (a port that is none)."""
+    The listening side of Dask sends first: the length of the message, little endian (distributed/comm/tcp.py).
+    Raises OSError, OverflowError (an invalid port)."""
     with socket.create_connection((host, port), timeout=CONNECT_S) as peer:
-        said = peer.recv(8)
-    if len(said) < 8 or int.from_bytes(said, "little") > GREETING_BYTES:
-        raise OSError("what answers is no Dask")
+        greeting = peer.recv(8)
+    if len(greeting) < 8 or int.from_bytes(greeting, "little") > GREETING_BYTES:
+        raise OSError("the reply is not from Dask")
 
 
 def _built_with() -> str:
     return f"{BUILT_WITH}, {platform.machine()}"
 
 
-# What follows runs on the workers. GDAL's datasets belong to one thread; a worker may have several.
+# The code below runs on the workers. GDAL's datasets belong to one thread; a worker may have several.
 _renderers: dict[int, tuple[str, Renderer[Any, Any]]] = {}  # by thread: table, renderer
 
 
-def _same(open_renderer: OpenRenderer[Wanted, Piece]) -> OpenRenderer[Wanted, Piece]:
+def _identity(open_renderer: OpenRenderer[Wanted, Piece]) -> OpenRenderer[Wanted, Piece]:
     return open_renderer
 
 
@@ -153,7 +153,7 @@ def _render(table: str, open_renderer: OpenRenderer[Any, Any], wanted: Any, buil
         if _renderers.get(thread, ("",))[0] != table:
             if built_with != _built_with():
                 raise MapError(f"has {_built_with()}, the computer that builds has {built_with}; make them the same")
-            cv2.setNumThreads(1)  # the worker's threads share the cores already
+            cv2.setNumThreads(1)  # the worker's threads already use all cores
             with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
                 _renderers[thread] = table, open_renderer()
         return _renderers[thread][1].render(wanted)
@@ -161,8 +161,8 @@ def _render(table: str, open_renderer: OpenRenderer[Any, Any], wanted: Any, buil
         raise MapError(f"worker on {platform.node()}: {error}; workers need the same files at the same paths") from None
 
 
-def _forget(table: str) -> None:
-    """Closes what was opened for a table; after a failure that waits until the thread opens another one."""
+def _close_renderer(table: str) -> None:
+    """Closes the renderer of a table; after a failure this happens when the thread opens another one."""
     for thread, (kept, _) in list(_renderers.items()):
         if kept == table:
             del _renderers[thread]

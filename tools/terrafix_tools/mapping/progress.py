@@ -12,7 +12,7 @@ Bar = Callable[[str, int | None], Step]
 
 @contextlib.contextmanager
 def progress_bar(shown: bool) -> Iterator[Bar]:
-    """Gives a function (name, steps or None) -> step()."""
+    """Yields a function (name, steps or None) -> step()."""
     columns = (TextColumn("{task.description:>9}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
 

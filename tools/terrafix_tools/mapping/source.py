@@ -1,4 +1,4 @@
-"""Imagery and elevation files for the map builder: any GDAL raster becomes north-up 8-bit BGR windows with a mask."""
+"""Imagery for the map builder: any GDAL raster as north-up windows of 8-bit BGR with a mask."""
 
 import math
 import warnings
@@ -19,8 +19,8 @@ from rasterio.windows import Window
 
 from terrafix.core.errors import MapError
 
-SAMPLE_PX = 1024  # side of the reduced picture from which the stretch of deep pixels is taken
-STRETCH_PERCENT = (0.5, 99.5)  # of the sample; outside it 16-bit and float pixels saturate
+SAMPLE_PX = 1024  # side of the downsampled image that determines the value range of deep pixels
+STRETCH_PERCENT = (0.5, 99.5)  # percentiles of the sample; 16-bit and float pixels outside saturate
 
 
 class ImagerySource:
@@ -44,7 +44,7 @@ class ImagerySource:
         self.pixel_x, self.pixel_y = float(self._data.transform.a), -float(self._data.transform.e)
         self.x_min, self.y_max = float(self._data.transform.c), float(self._data.transform.f)
         self.bands = self._choose_bands()
-        # A mask of the file's own (alpha, nodata, mask band) is believed; without one a black collar is looked for.
+        # A mask in the file (alpha, nodata, mask band) is used; without one a black collar is searched.
         flags = [f for band in self._file.mask_flag_enums for f in band]
         self.has_mask = self.warped or any(f.name != "all_valid" for f in flags)
         self._stretch = self._find_stretch()
@@ -75,13 +75,13 @@ class ImagerySource:
 
     @property
     def gsd_m(self) -> float:
-        """Ground metres per pixel at the centre, on the ellipsoid: EPSG:3857 pixels are smaller than they claim."""
+        """Ground metres per pixel at the centre, on the ellipsoid; EPSG:3857 pixels are smaller than nominal."""
         x = self.x_min + 0.5 * self.width_px * self.pixel_x
         y = self.y_max - 0.5 * self.height_px * self.pixel_y
         return ground_pixel_m(self.crs, x, y, self.pixel_x, self.pixel_y)
 
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-        """(height, width, 3) uint8 BGR and (height, width) uint8 mask of 0 and 255, of a window inside the image."""
+        """A window inside the image: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255."""
         window = Window(column, row, width, height)
         try:
             bands = self._data.read(self.bands, window=window)
@@ -152,21 +152,21 @@ class ImagerySource:
             return [names.index(c) + 1 for c in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
         colours = [i + 1 for i, c in enumerate(names) if c != ColorInterp.alpha]
         if not colours:
-            raise MapError(f"{self.path}: has no picture band, only alpha; give an image with 1, 3 or more bands")
+            raise MapError(f"{self.path}: has no colour band, only alpha; give an image with 1, 3 or more bands")
         if len(colours) < 3 and np.dtype(self._file.dtypes[colours[0] - 1]).kind in "if":
             raise MapError(
                 f"{self.path}: one band of {self._file.dtypes[colours[0] - 1]} is elevation (give it as --dem) or a "
-                "measurement; make a picture of it first: gdal_translate -ot Byte -scale"
+                "measurement; convert it to an image first: gdal_translate -ot Byte -scale"
             )
         return colours[:3] if len(colours) >= 3 else colours[:1]
 
     def _find_stretch(self) -> tuple[float, float] | None:
-        """Value range that becomes 0..255, one for all bands so that colours keep their balance; None = bytes."""
+        """Value range that maps to 0..255, the same for all bands to keep the colour balance; None for 8-bit images."""
         kind = np.dtype(self._file.dtypes[self.bands[0] - 1])
         if kind == np.uint8:
             return None
         if kind.kind == "c":
-            raise MapError(f"{self.path}: complex pixels are no picture; give an image with 8, 16 bit or float bands")
+            raise MapError(f"{self.path}: complex pixels are not an image; give an image with 8, 16 bit or float bands")
         shrink = max(1.0, max(self.width_px, self.height_px) / SAMPLE_PX)
         shape = (max(1, int(self.height_px / shrink)), max(1, int(self.width_px / shrink)))
         try:
@@ -183,12 +183,12 @@ class ImagerySource:
 
 
 def open_raster(path: Path) -> Any:
-    """Dataset, or MapError."""
+    """Opens a raster. Raises MapError."""
     if not path.is_file():
         raise MapError(f"{path}: no such file; check the path of the imagery")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)  # said below, as an error
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)  # reported below as an error
             return rasterio.open(path)
     except RasterioError:
         raise MapError(f"{path}: not an image that GDAL can read; give a GeoTIFF") from None
@@ -207,7 +207,7 @@ def ground_distance_m(crs: CRS, a: tuple[float, float], b: tuple[float, float]) 
 
 
 def crs_of(dataset: Any, path: Path) -> CRS:
-    """Horizontal CRS of a raster. Raises MapError when it is not placed on the earth."""
+    """Horizontal CRS of a raster. Raises MapError when it is not georeferenced."""
     if dataset.transform == Affine.identity():
         raise MapError(f"{path}: has no georeference; give a GeoTIFF, or add one with gdal_translate -a_ullr -a_srs")
     if dataset.crs is None:
@@ -222,7 +222,7 @@ def crs_of(dataset: Any, path: Path) -> CRS:
 
 
 def _check_place(dataset: Any, crs: CRS, path: Path) -> None:
-    """Raises MapError when the centre of a raster has no place on the earth: there and back leads elsewhere."""
+    """Raises MapError when the centre of a raster has no valid position: forward and inverse projection differ."""
     x, y = dataset.transform @ (dataset.width / 2, dataset.height / 2)
     step = math.hypot(dataset.transform.a, dataset.transform.d)
     try:
@@ -232,7 +232,7 @@ def _check_place(dataset: Any, crs: CRS, path: Path) -> None:
         raise MapError(
             f"{path}: no way from '{crs.name}' to WGS 84 ({error}); reproject with gdalwarp -t_srs"
         ) from None
-    if not math.hypot(back_x - x, back_y - y) <= step:  # also when they are not finite
+    if not math.hypot(back_x - x, back_y - y) <= step:  # True for NaN and infinity, too
         raise MapError(
             f"{path}: its coordinates ({x:.6g}, {y:.6g}) lie outside the area of '{crs.name}'; check its georeference"
         )

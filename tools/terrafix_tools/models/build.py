@@ -1,16 +1,16 @@
-"""`terrafix models build`: engines of TensorRT, on the computer that will fly, before it flies."""
+"""`terrafix models build`: builds TensorRT engines before the flight, on the computer that will fly."""
 
 import typer
 
 from terrafix.core.errors import ModelError
 from terrafix_engines import gpu, providers
-from terrafix_tools.models.known import fetched, plain_errors
-from terrafix_tools.models.listing import opened_whole
+from terrafix_tools.models.known import as_model_errors, fetched_models
+from terrafix_tools.models.listing import open_complete
 
 
 def build_all(names: list[str], folder: str) -> None:
-    """Raises ModelError when there is no TensorRT, or an engine cannot be built."""
-    models = fetched(names, folder)
+    """Raises ModelError when TensorRT is not available or an engine cannot be built."""
+    models = fetched_models(names, folder)
     try:
         providers.check(providers.TENSORRT)
     except providers.UnavailableError as error:
@@ -19,11 +19,13 @@ def build_all(names: list[str], folder: str) -> None:
     for model in models:
         m = model.manifest
         if not m.presets:
-            typer.echo(f"{m.name}: has no preset, TensorRT is not for it")
+            typer.echo(f"{m.name}: has no preset, no TensorRT engine possible")
             continue
-        typer.echo(f"{m.name}: {len(m.presets)} engines; minutes each, unless they are there")
-        with plain_errors():
-            opened = opened_whole(model, build=True)
+        typer.echo(f"{m.name}: {len(m.presets)} engines; minutes each, unless already built")
+        with as_model_errors():
+            opened = open_complete(model, build=True)
         if opened.provider != providers.TENSORRT:
-            raise ModelError(f"{m.name}: no engine ({opened.passed_over[0]}); it would be run by {opened.provider}")
+            raise ModelError(
+                f"{m.name}: no engine ({opened.rejected_providers[0]}); it would be run by {opened.provider}"
+            )
         typer.echo(f"{m.name}: ready in {model.engines / opened.sha256[:16]}")

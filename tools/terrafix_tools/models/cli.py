@@ -7,7 +7,7 @@ import typer
 
 app = typer.Typer(no_args_is_help=True, help="Fetch, check, build and measure learned models.")
 
-Names = Annotated[list[str] | None, typer.Argument(help="Names of models; default: all that are meant.")]
+Names = Annotated[list[str] | None, typer.Argument(help="Names of models; see the default of the command.")]
 Folder = Annotated[
     str, typer.Option("--folder", help="Models folder; default: TERRAFIX_MODELS, or ~/.local/share/terrafix/models.")
 ]
@@ -17,7 +17,7 @@ Folder = Annotated[
 def models_list(
     folder: Folder = "", as_json: Annotated[bool, typer.Option("--json", help="JSON instead of a table.")] = False
 ) -> None:
-    """What is known, what is there, and which providers this computer has."""
+    """List the known models, their state, and the providers of this computer."""
     from terrafix_tools.models.listing import show
 
     show(folder, as_json=as_json)
@@ -31,7 +31,7 @@ def fetch(
     ] = "",
     folder: Folder = "",
 ) -> None:
-    """Bring weights into the models folder: goes on where it was cut off, checks the checksum, shows the licence."""
+    """Download weights into the models folder: resumes a partial download, verifies the checksum, shows the licence."""
     from terrafix_tools.models.fetch import fetch_all
 
     fetch_all(names, source, folder)
@@ -39,7 +39,7 @@ def fetch(
 
 @app.command()
 def verify(names: Names = None, folder: Folder = "") -> None:
-    """Whole, as published, and does it run here? Default: all models that were fetched."""
+    """Check that models are complete, match the published checksum and run here. Default: all fetched models."""
     from terrafix_tools.models.listing import verify_all
 
     verify_all(names or [], folder)
@@ -47,7 +47,7 @@ def verify(names: Names = None, folder: Folder = "") -> None:
 
 @app.command()
 def build(names: Names = None, folder: Folder = "") -> None:
-    """Build the engines of TensorRT, so that none is built in flight. Default: all models that were fetched."""
+    """Build TensorRT engines, so that none is built in flight. Default: all fetched models."""
     from terrafix_tools.models.build import build_all
 
     build_all(names or [], folder)
@@ -58,16 +58,16 @@ def bench(
     names: Names = None,
     folder: Folder = "",
     out: Annotated[Path, typer.Option(help="JSON to write.")] = Path("out/models.json"),
-    runs: Annotated[int, typer.Option(min=1, help="Answers that are timed, for each size.")] = 20,
+    runs: Annotated[int, typer.Option(min=1, help="Timed runs per input size.")] = 20,
     pair: Annotated[
         tuple[Path, Path] | None,
         typer.Option(
-            help="Two images of one place at two dates: how often is a patch of the first found on the second?"
+            help="Two images of one place at two dates: measures how often a patch of the first is found in the second."
         ),
     ] = None,
-    trials: Annotated[int, typer.Option(min=1, help="Places that are tried on the pair.")] = 40,
+    trials: Annotated[int, typer.Option(min=1, help="Number of patches tried on the pair.")] = 40,
 ) -> None:
-    """Time of every model beside what needs no weights, and with --pair how well features find a place."""
+    """Measure run times of models next to a baseline without weights; with --pair also the localisation rate."""
     from terrafix_tools.models.bench import bench_all
 
     bench_all(names or [], folder, out, runs=runs, pair=pair, trials=trials)

@@ -1,4 +1,4 @@
-"""One file over HTTP that goes on where it was cut off (RFC 9110, 14: range requests)."""
+"""Resumable download of one file over HTTP (RFC 9110, section 14: range requests)."""
 
 import os
 import time
@@ -9,9 +9,9 @@ import urllib3
 
 from terrafix.core.errors import ModelError
 from terrafix_engines.manifest import Manifest
-from terrafix_tools.mapping.fetch import AGAIN, plain, proxy_of
+from terrafix_tools.mapping.fetching.fetch import RETRY_STATUS, describe_error, proxy_of
 
-ATTEMPTS = 4  # without a byte in between
+ATTEMPTS = 4  # number of successive attempts without a received byte
 FIRST_WAIT_S = 0.5  # before the second attempt; doubles from there
 TIMEOUT_S = 30.0
 BLOCK_BYTES = 1 << 16
@@ -19,32 +19,34 @@ USER_AGENT = "Terrafix models"
 
 
 class CutOffError(Exception):
-    """The download ended too early, and why; what came is kept."""
+    """The download ended early, with the reason; the received part is kept."""
 
 
-def download(manifest: Manifest, url: str, part: Path, seen: Callable[[int], None]) -> None:
-    """Adds to ``part`` until all is there; ``seen`` is told how much that is. Raises ModelError."""
+def download(manifest: Manifest, url: str, part: Path, on_progress: Callable[[int], None]) -> None:
+    """Appends to ``part`` until it is complete; ``on_progress`` receives the number of bytes so far. Raises
+    ModelError.
+    """
     attempt, reason = 0, ""
-    while (there := part.stat().st_size) < manifest.size_bytes:
+    while (received := part.stat().st_size) < manifest.size_bytes:
         if attempt == ATTEMPTS:
-            size = f"{there / 1e6:.1f} of {manifest.size_bytes / 1e6:.1f} MB"
+            size = f"{received / 1e6:.1f} of {manifest.size_bytes / 1e6:.1f} MB"
             raise ModelError(f"{url}: {reason}, {size} are here; run it again to go on, or give a file with --from")
         if attempt:
             time.sleep(FIRST_WAIT_S * 2 ** (attempt - 1))
         try:
-            _go_on(manifest, url, part, seen)
+            _resume(manifest, url, part, on_progress)
             reason = "the answer was cut off"
         except CutOffError as error:
             reason = str(error)
-        attempt = 1 if part.stat().st_size > there else attempt + 1
+        attempt = 1 if part.stat().st_size > received else attempt + 1
 
 
-def _go_on(manifest: Manifest, url: str, part: Path, seen: Callable[[int], None]) -> None:
-    """One answer, from where the last one ended. Raises CutOffError, and ModelError for what will not get better."""
-    there = part.stat().st_size
+def _resume(manifest: Manifest, url: str, part: Path, on_progress: Callable[[int], None]) -> None:
+    """Processes one response, from the current end of ``part``. Raises CutOffError; ModelError for permanent errors."""
+    received = part.stat().st_size
     headers = {"User-Agent": USER_AGENT, "Accept-Encoding": "identity"}
-    if there:
-        headers["Range"] = f"bytes={there}-"
+    if received:
+        headers["Range"] = f"bytes={received}-"
     proxy = proxy_of(url)
     try:
         with (
@@ -54,35 +56,35 @@ def _go_on(manifest: Manifest, url: str, part: Path, seen: Callable[[int], None]
             ) as response,
         ):
             if response.status not in (200, 206):
-                _refused(manifest, url, response.status)
-            if response.status == 200:  # all of it again: it knows no ranges
+                _raise_for_status(manifest, url, response.status)
+            if response.status == 200:  # the server does not support ranges and sends the whole file
                 os.truncate(part, 0)
-                there = 0
-            elif not response.headers.get("Content-Range", "").startswith(f"bytes {there}-"):
+                received = 0
+            elif not response.headers.get("Content-Range", "").startswith(f"bytes {received}-"):
                 os.truncate(part, 0)
-                raise CutOffError("the server sends another part than was asked for")
+                raise CutOffError("the server sent another range than requested")
             _check_size(manifest, url, response)
             with part.open("ab") as out:
-                while block := response.read1(BLOCK_BYTES):  # not stream(): of a block that is cut off it gives nothing
-                    there += len(block)
-                    if there > manifest.size_bytes:
-                        raise ModelError(f"{url}: larger than the published file; it was not taken")
+                while block := response.read1(BLOCK_BYTES):  # not stream(): it discards a block that is cut off
+                    received += len(block)
+                    if received > manifest.size_bytes:
+                        raise ModelError(f"{url}: larger than the published file; it was discarded")
                     out.write(block)
-                    seen(there)
+                    on_progress(received)
     except urllib3.exceptions.HTTPError as error:
-        raise CutOffError(plain(error)) from None
+        raise CutOffError(describe_error(error)) from None
 
 
 def _check_size(manifest: Manifest, url: str, response: urllib3.BaseHTTPResponse) -> None:
-    """A page that says "not found", or another version, is told from an answer that was cut off. Raises ModelError."""
-    told = response.headers.get("Content-Range", "").rpartition("/")[2] or response.headers.get("Content-Length", "")
-    if told.isdigit() and int(told) != manifest.size_bytes:
-        raise ModelError(f"{url}: has {told} bytes, the published file {manifest.size_bytes}; it was not taken")
+    """Distinguishes an error page or another version from a response that was cut off. Raises ModelError."""
+    stated = response.headers.get("Content-Range", "").rpartition("/")[2] or response.headers.get("Content-Length", "")
+    if stated.isdigit() and int(stated) != manifest.size_bytes:
+        raise ModelError(f"{url}: has {stated} bytes, the published file {manifest.size_bytes}; it was discarded")
 
 
-def _refused(manifest: Manifest, url: str, status: int) -> None:
-    if status in AGAIN:
-        raise CutOffError(f"the server says {status}")
+def _raise_for_status(manifest: Manifest, url: str, status: int) -> None:
+    if status in RETRY_STATUS:
+        raise CutOffError(f"the server returned status {status}")
     raise ModelError(f"{url}: the server refuses (status {status}); check the address, or give a file with --from")
 
 

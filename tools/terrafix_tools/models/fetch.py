@@ -1,7 +1,8 @@
-"""`terrafix models fetch`: weights into the models folder, whole or not at all.
+"""`terrafix models fetch`: downloads weights into the models folder.
 
-What has come stands in NAME.part, and the next try goes on with it (HTTP range). A file gets its own name when its
-checksum is right."""
+A partial download is NAME.part, which the next attempt resumes (HTTP range). The file gets its final name when its
+checksum is correct, so that the folder never contains an incomplete model.
+"""
 
 import fcntl
 import os
@@ -16,15 +17,15 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from terrafix.core.errors import ModelError, OutputError
 from terrafix_engines.manifest import Manifest
-from terrafix_engines.store import State, Stored, sha256_of
-from terrafix_tools.models.known import chosen, state_of
+from terrafix_engines.store import State, StoredModel, sha256_of
+from terrafix_tools.models.known import select_models, state_of
 
-OnBytes = Callable[[int], None]  # all that is there so far
+OnBytes = Callable[[int], None]  # called with the number of bytes received so far
 
 
 def fetch_all(names: list[str], source: str, folder: str) -> None:
-    """Raises ModelError (no such model, network, checksum) and OutputError (folder cannot be written)."""
-    for model in chosen(names, folder):
+    """Raises ModelError (unknown model, network, checksum) and OutputError (folder not writable)."""
+    for model in select_models(names, folder):
         m = model.manifest
         if state_of(model) is State.READY:
             typer.echo(f"{m.name}: is there already, as published ({model.path})")
@@ -42,7 +43,7 @@ def fetch_all(names: list[str], source: str, folder: str) -> None:
 
 
 def _origin(manifest: Manifest, source: str) -> str | Path:
-    """An address, or a file that exists. Raises ModelError."""
+    """Returns a URL or an existing file. Raises ModelError."""
     if not source:
         if not manifest.source:
             raise ModelError(f"{manifest.name}: is not to be had from a network; give the file with --from")
@@ -56,7 +57,7 @@ def _origin(manifest: Manifest, source: str) -> str | Path:
     return path
 
 
-def _fetch(model: Stored, origin: str | Path) -> None:
+def _fetch(model: StoredModel, origin: str | Path) -> None:
     m = model.manifest
     model.path.parent.mkdir(parents=True, exist_ok=True)
     part = model.path.with_name(model.path.name + ".part")
@@ -66,14 +67,14 @@ def _fetch(model: Stored, origin: str | Path) -> None:
         except BlockingIOError:
             raise ModelError(f"{part}: another terrafix is fetching this model; wait for it") from None
         try:
-            with _bar(m) as seen:
-                _bring(m, origin, part, seen)
+            with _bar(m) as on_progress:
+                _transfer(m, origin, part, on_progress)
             found = sha256_of(part)
             if found != m.sha256:
                 os.truncate(part, 0)
                 raise ModelError(
                     f"{origin}: not the published file (sha256 {found[:12]}..., expected {m.sha256[:12]}...); "
-                    "it was not taken, try another --from"
+                    "it was discarded, try another --from"
                 )
             os.fsync(lock.fileno())
             part.replace(model.path)
@@ -82,26 +83,26 @@ def _fetch(model: Stored, origin: str | Path) -> None:
                 part.unlink()
 
 
-def _bring(manifest: Manifest, origin: str | Path, part: Path, seen: OnBytes) -> None:
-    """Raises ModelError and OSError."""
+def _transfer(manifest: Manifest, origin: str | Path, part: Path, on_progress: OnBytes) -> None:
+    """Transfers from ``origin`` to ``part``. Raises ModelError and OSError."""
     if isinstance(origin, Path):
-        _copy(origin, part, seen)
+        _copy(origin, part, on_progress)
         return
-    from terrafix_tools.models.download import download  # needs urllib3, which a vehicle has not
+    from terrafix_tools.models.download import download  # needs urllib3, which a vehicle does not have
 
-    went_on = part.stat().st_size > 0
-    download(manifest, origin, part, seen)
-    if went_on and sha256_of(part) != manifest.sha256:  # what was there before may be of another file
+    resumed = part.stat().st_size > 0
+    download(manifest, origin, part, on_progress)
+    if resumed and sha256_of(part) != manifest.sha256:  # the existing part may be of another file
         os.truncate(part, 0)
-        download(manifest, origin, part, seen)
+        download(manifest, origin, part, on_progress)
 
 
-def _copy(origin: Path, part: Path, seen: OnBytes) -> None:
-    """Raises ModelError when the file cannot be read."""
+def _copy(origin: Path, part: Path, on_progress: OnBytes) -> None:
+    """Copies a local file. Raises ModelError when it cannot be read."""
     try:
         with origin.open("rb") as file, part.open("wb") as out:
             shutil.copyfileobj(file, out)
-            seen(out.tell())
+            on_progress(out.tell())
     except PermissionError as error:
         raise ModelError(f"{error.filename}: cannot be read ({error.strerror}); check its permissions") from None
 
@@ -112,4 +113,4 @@ def _bar(manifest: Manifest) -> Iterator[OnBytes]:
     columns = (TextColumn(manifest.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(manifest.name, total=manifest.size_bytes)
-        yield lambda there: progress.update(task, completed=there)
+        yield lambda received: progress.update(task, completed=received)

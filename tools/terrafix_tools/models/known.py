@@ -1,51 +1,51 @@
-"""Models by name, for all commands; what the engines say becomes an error of the command line."""
+"""Models by name, for all commands; converts errors of the engines to errors of the command line."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from terrafix.core.errors import ModelError
-from terrafix_engines.manifest import ManifestError, known
+from terrafix_engines.manifest import ManifestError, read_all
 from terrafix_engines.runtime import ModelFileError, ModelRunError
-from terrafix_engines.store import State, Stored, models_folder, stored
+from terrafix_engines.store import State, StoredModel, models_folder, stored_model
 
 
 @contextmanager
-def plain_errors() -> Iterator[None]:
-    """Raises ModelError for what the engines raise."""
+def as_model_errors() -> Iterator[None]:
+    """Raises ModelError in place of the errors of terrafix_engines."""
     try:
         yield
     except (ManifestError, ModelFileError, ModelRunError) as error:
         raise ModelError(str(error)) from None
 
 
-def chosen(names: list[str], folder: str) -> list[Stored]:
-    """Those with these names, or all that are known. Raises ModelError."""
+def select_models(names: list[str], folder: str) -> list[StoredModel]:
+    """Returns the models with these names, or all known ones. Raises ModelError."""
     where = models_folder(folder)
     _readable(where)
-    with plain_errors():
-        every = known(where)
+    with as_model_errors():
+        known = read_all(where)
     for name in names:
-        if name not in every:
-            raise ModelError(f"no model is called '{name}'; known: {', '.join(every)} (terrafix models list)")
-    return [stored(every[name], where) for name in names or every]
+        if name not in known:
+            raise ModelError(f"no model is called '{name}'; known: {', '.join(known)} (terrafix models list)")
+    return [stored_model(known[name], where) for name in names or known]
 
 
-def fetched(names: list[str], folder: str) -> list[Stored]:
-    """Those with these names, or all whose file is there. Raises ModelError when there is none."""
-    models = chosen(names, folder)
+def fetched_models(names: list[str], folder: str) -> list[StoredModel]:
+    """Returns the models with these names, or all whose file exists. Raises ModelError when there is none."""
+    models = select_models(names, folder)
     if names:
         return models
-    with plain_errors():
-        there = [model for model in models if model.is_there()]
-    if not there:
+    with as_model_errors():
+        existing = [model for model in models if model.exists()]
+    if not existing:
         raise ModelError(f"{models_folder(folder)}: no model is there yet; terrafix models fetch NAME")
-    return there
+    return existing
 
 
-def state_of(model: Stored) -> State:
-    """Raises ModelError."""
-    with plain_errors():
+def state_of(model: StoredModel) -> State:
+    """Returns the state of the model file. Raises ModelError."""
+    with as_model_errors():
         return model.state()
 
 

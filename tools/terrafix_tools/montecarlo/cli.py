@@ -12,29 +12,35 @@ BROKEN_FLOOR = 1  # exit code
 
 def montecarlo(
     out: Annotated[Path, typer.Option(help="Folder for montecarlo.json and montecarlo.png.")] = Path("out/montecarlo"),
-    flights: Annotated[int, typer.Option(help="How many.")] = 100,
+    flights: Annotated[int, typer.Option(help="Number of flights.")] = 100,
     first: Annotated[int, typer.Option(help="Number of the first flight: --first 17 --flights 1 flies that one.")] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws.")] = 1,
     duration: Annotated[float, typer.Option(help="Seconds of every flight.")] = 600.0,
-    fault: Annotated[Fault | None, typer.Option(help="Only this one, in every flight.")] = None,
+    fault: Annotated[
+        Fault | None, typer.Option(help="This fault in every flight, instead of the usual sequence.")
+    ] = None,
     lies: Annotated[
-        float, typer.Option(help="Probability of each lie of an input in a flight, on top of its fault; 0.05 is usual.")
+        float,
+        typer.Option(help="Probability of each false input in a flight, in addition to its fault; 0.05 is usual."),
     ] = 0.0,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one for each processor.")] = None,
     long: Annotated[
-        bool, typer.Option("--endurance", help="Instead one flight of two hours: are time and memory flat?")
+        bool,
+        typer.Option(
+            "--endurance", help="Instead one flight of two hours: test that processor time and memory do not grow."
+        ),
     ] = False,
 ) -> None:
-    """Many simulated flights, as messages, through the real estimator: is it as good as it says?
+    """Many simulated flights, as messages, through the real estimator: tests its accuracy and consistency.
 
     Exit code 0: all floors hold; 1: one does not."""
     from terrafix_tools.montecarlo.endurance import endurance
-    from terrafix_tools.montecarlo.run import Wanted
+    from terrafix_tools.montecarlo.run import RunOptions
     from terrafix_tools.montecarlo.run import montecarlo as run
 
     if long:
         raise typer.Exit(0 if endurance(seed)["flat"] else BROKEN_FLOOR)
-    wanted = Wanted(out, flights, first, seed, duration, fault, lies, workers)
-    result = run(wanted)
+    options = RunOptions(out, flights, first, seed, duration, fault, lies, workers)
+    result = run(options)
     typer.echo(f"Written to {out}")
     raise typer.Exit(0 if all(result["floors"].values()) else BROKEN_FLOOR)

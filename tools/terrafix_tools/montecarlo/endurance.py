@@ -1,9 +1,8 @@
-"""`terrafix montecarlo --endurance`: one long flight, whether time and memory of the estimator stay as they are.
+"""`terrafix montecarlo --endurance`: one long flight. Tests that time and memory per frame do not grow.
 
-How long a frame takes depends on what else the machine does, more than on anything that is looked for here. So in the
-last part of the flight a second estimator hears the same messages, which knows no more of it than one that was started
-again there: what is compared is the time that the old and the young one take for the same frames. Memory is that of
-the part before."""
+The time for a frame depends more on the load of the machine than on the growth that is tested for. So in the last part
+of the flight a second estimator, restarted from a checkpoint there, processes the same messages. The processor times of
+the old and the restarted estimator for the same frames are compared. Memory is measured in the part before."""
 
 import math
 import time
@@ -21,17 +20,17 @@ from terrafix_tools.montecarlo.flight import Run
 from terrafix_tools.montecarlo.plan import FlightPlan, plan
 
 HOURS = 2.0
-# At first caches and windows fill, and what is kept for the refinement: 128 nodes, ten frames apart at least.
+# Until then caches, the window and the nodes for the refinement fill up: 128 nodes, at least ten frames apart.
 SETTLED_S = 1800.0
 YOUNG_FROM_S = 4500.0
-BLOCK = 30  # frames: the ratio of their sums is one of the ratios, memory a point of its line
-TIME_SHARE_PER_H = 0.01  # of the time for one frame
-MEMORY_MB_PER_H = 2.0
+BLOCK = 30  # frames: each block gives one ratio of times and one point of the line through the memory
+TIME_SHARE_PER_H = 0.01  # largest growth per hour, share of the time for one frame
+MEMORY_MB_PER_H = 2.0  # largest growth
 
 
-class OldAndYoung(Run):
-    """``young_from_s``: when the second estimator begins. ``frames_ms``: of each frame from then on what the old and
-    the young one took, processor time."""
+class RestartComparison(Run):
+    """A run with a second estimator from ``young_from_s`` on. ``frames_ms``: processor time [ms] of the old and of the
+    young estimator, (2,) for each frame from then on."""
 
     def __init__(self, flight: FlightPlan, young_from_s: float) -> None:
         super().__init__(flight)
@@ -42,25 +41,25 @@ class OldAndYoung(Run):
         self._slow: SlowErrors | None = None
         self._ground: MapMatch | None = None
 
-    def hear(self, message: Message) -> list[Message]:
+    def process(self, message: Message) -> list[Message]:
         if self._young is None:
-            said = super().hear(message)
-            self._remember([message, *said])
-            return said
+            published = super().process(message)
+            self._update_checkpoint([message, *published])
+            return published
         if isinstance(message, Odometry):
             self.frames_ms.append(np.zeros(2))
         spent_ms = self.frames_ms[-1] if self.frames_ms else np.zeros(2)
-        said = []
-        # Who is first finds the message in no cache: they take turns.
+        published = []
+        # The first of the two runs with cold caches: the order alternates.
         for i in (0, 1) if len(self.frames_ms) % 2 else (1, 0):
-            began_s = time.process_time()
-            heard = list(self._young.on(message)) if i else super().hear(message)
-            spent_ms[i] += 1e3 * (time.process_time() - began_s)
-            said = said if i else heard
-        return said
+            start_s = time.process_time()
+            output = list(self._young.on(message)) if i else super().process(message)
+            spent_ms[i] += 1e3 * (time.process_time() - start_s)
+            published = published if i else output
+        return published
 
-    def _remember(self, messages: list[Message]) -> None:
-        """What a process that is started again would know; the last estimate starts the young one."""
+    def _update_checkpoint(self, messages: list[Message]) -> None:
+        """Collects the checkpoint of a restarted process; an estimate from ``young_from_s`` on starts the young one."""
         for message in messages:
             match message:
                 case Origin():
@@ -78,8 +77,8 @@ class OldAndYoung(Run):
 
 
 def endurance(seed: int) -> dict[str, Any]:
-    """Flies for HOURS without the refinement after landing. -> slopes, and whether they are flat."""
-    flight = OldAndYoung(plan(seed, 0, fault=Fault.NONE, duration_s=3600.0 * HOURS), YOUNG_FROM_S)
+    """Flies for HOURS without the refinement after landing. -> ``slopes``, which are printed as well."""
+    flight = RestartComparison(plan(seed, 0, fault=Fault.NONE, duration_s=3600.0 * HOURS), YOUNG_FROM_S)
     record = flight.record(refine=False)
     alone = (record.t_s >= SETTLED_S) & (record.t_s < YOUNG_FROM_S)
     compared = np.array(flight.frames_ms)[-int((record.t_s >= YOUNG_FROM_S + SETTLED_S).sum()) :]
@@ -95,13 +94,13 @@ def endurance(seed: int) -> dict[str, Any]:
 
 
 def slopes(t_s: np.ndarray, memory_mb: np.ndarray, compared_ms: np.ndarray, older_h: float) -> dict[str, Any]:
-    """A straight line through the memory (N,) of each frame; and ``compared_ms`` (M, 2), what an estimator and one that
-    is ``older_h`` younger took for the same frames."""
+    """Growth of memory and time. ``memory_mb`` (N,) at ``t_s`` (N,): a straight line is fitted. ``compared_ms`` (M, 2):
+    times of an estimator and of one that is ``older_h`` younger for the same frames."""
     whole = len(compared_ms) // BLOCK * BLOCK
     sums = compared_ms[:whole].reshape(-1, BLOCK, 2).sum(axis=1)
     ratios = sums[:, 0] / sums[:, 1]
     share_per_h = float(np.median(ratios) - 1.0) / older_h
-    # Of a median: pi/2 times the variance of a mean (for a normal distribution, whose sigma is 1.48 times the MAD).
+    # Variance of a median: pi/2 times that of a mean. Normal distribution: sigma is 1.48 times the MAD.
     spread = 1.4826 * float(np.median(np.abs(ratios - np.median(ratios))))
     points = len(t_s) // BLOCK * BLOCK
     hours, memory = (np.median(v[:points].reshape(-1, BLOCK), axis=1) for v in (t_s / 3600.0, memory_mb))

@@ -1,23 +1,23 @@
-"""What may go wrong in a flight of the Monte Carlo run. The command line knows it without all that it takes to fly."""
+"""Faults of a flight of the Monte Carlo run. Apart from the rest: the command line does not load the simulator."""
 
 from enum import StrEnum
 
 
 class Fault(StrEnum):
-    """One kind of trouble; a flight has one, or none, and with --lies some of LIES beside it."""
+    """A flight has one fault or none; with --lies in addition some of LIES, its false inputs."""
 
     NONE = "none"
-    WRONG = "10 % wrong matches"  # each somewhere else
+    WRONG = "10 % wrong matches"  # each at another place
     JUMPS = "350 m jumps"
-    BLACKOUT = "60 s blackouts"  # nothing is seen at all
+    BLACKOUT = "60 s blackouts"  # no odometry and no match
     HEIGHT = "height 10 % wrong"
     COMPASS = "compass 10-15 deg off"
-    ROWS = "repeated rows"  # wrong matches that agree with each other for half a minute
+    ROWS = "repeated rows"  # wrong matches that agree with each other for 30 s
     LATE = "matches 0-2 s late"  # and out of order
-    DRIFT = "no map after 90 s"  # odometry alone
-    HILLS = "hills without elevation"  # against the rules; this and the next only when asked for
-    PHOTOS = "photos 5 s apart"  # that hardly overlap, with what the autopilot said at each and nothing between
-    FOREIGN = "foreign motion"  # from here on: an input lies
+    DRIFT = "no map after 90 s"  # odometry only
+    HILLS = "hills without elevation"  # outside of the specification; this and the next only with --fault
+    PHOTOS = "photos 5 s apart"  # with little overlap; telemetry at each photo and none between
+    FOREIGN = "foreign motion"  # from here on: a false input
     FROZEN = "frozen camera"
     STALE = "late pictures"
     SCALE = "height scale wrong"

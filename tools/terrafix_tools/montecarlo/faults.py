@@ -1,4 +1,4 @@
-"""Faults of a flight: when nothing is seen, and map matches that are sure of a wrong place."""
+"""Faults of a flight: frames without features, and overconfident map matches at a wrong place."""
 
 import math
 
@@ -10,18 +10,22 @@ from terrafix.messages import MapMatch, Verdict
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flown import Shot
 
-WRONG_SHARE, WRONG_M = 0.10, (30.0, 400.0)
+WRONG_SHARE, WRONG_M = 0.10, (30.0, 400.0)  # share of the matches, offset from the true position
 JUMP_M, JUMPS = 350.0, 6
-BLACKOUT_S, BLACKOUTS_AT = 60.0, (0.25, 0.65)  # of the flight
-ROWS_S, ROWS_AT, ROWS_M = 30.0, 0.35, (20.0, 90.0)  # houses alike, rows of fields
-QUIET_S = 20.0  # at the start: a map match that is wrong from the first on is another question
-LATEST_FRAMES = 2
-LEARNT_S = 90.0  # how long there is a map in a flight that then has none
-SURE_M, SURE_RAD = 2.5, math.radians(1.0)  # what a wrong match claims, 1-sigma
+BLACKOUT_S, BLACKOUTS_AT = 60.0, (0.25, 0.65)  # duration; starts as shares of the flight
+ROWS_S, ROWS_AT, ROWS_M = (
+    30.0,
+    0.35,
+    (20.0, 90.0),
+)  # duration, start (share of the flight), offset: similar houses, rows of fields
+QUIET_S = 20.0  # without faults at the start: a wrong first map match is tested elsewhere
+MAX_LATE_FRAMES = 2
+MAPPED_S = 90.0  # with map matches, before they end
+WRONG_SIGMA_M, WRONG_SIGMA_RAD = 2.5, math.radians(1.0)  # stated 1-sigma of a wrong match
 
 
 class Faults:
-    """Of one flight. ``alter`` once for every frame, in order."""
+    """Of one flight. Call ``alter`` once for every frame, in order."""
 
     def __init__(self, fault: Fault, duration_s: float, seed: int) -> None:
         self._fault, self._duration_s = fault, duration_s
@@ -29,54 +33,54 @@ class Faults:
         self._late = np.random.default_rng([seed, 58])
         self._jumps_s = np.sort(self._rng.uniform(QUIET_S, duration_s, JUMPS)).tolist()
         towards = float(self._rng.uniform(0.0, 2.0 * math.pi))
-        away_m = float(self._rng.uniform(*ROWS_M))
-        self._row_m = away_m * np.array([math.sin(towards), math.cos(towards)])
+        offset_m = float(self._rng.uniform(*ROWS_M))
+        self._row_m = offset_m * np.array([math.sin(towards), math.cos(towards)])
 
-    def blind(self, t_s: float) -> bool:
-        """Nothing is seen: fog, a lens cap, a camera that is off."""
+    def is_blacked_out(self, t_s: float) -> bool:
+        """No features: fog, a lens cap, a camera that is off."""
         since = [t_s - at * self._duration_s for at in BLACKOUTS_AT]
         return self._fault is Fault.BLACKOUT and any(0.0 <= s < BLACKOUT_S for s in since)
 
-    def unmapped(self, t_s: float) -> bool:
-        return self._fault is Fault.DRIFT and t_s >= LEARNT_S
+    def is_unmapped(self, t_s: float) -> bool:
+        return self._fault is Fault.DRIFT and t_s >= MAPPED_S
 
     def late_frames(self) -> int:
-        """How many frames later the match of this one is heard."""
-        return int(self._late.integers(LATEST_FRAMES + 1)) if self._fault is Fault.LATE else 0
+        """Delay of the match of this frame, in frames."""
+        return int(self._late.integers(MAX_LATE_FRAMES + 1)) if self._fault is Fault.LATE else 0
 
     def alter(self, match: MapMatch, shot: Shot) -> MapMatch:
-        """What the estimator hears instead of ``match``."""
-        if self.blind(shot.t_s) or self.unmapped(shot.t_s):
-            return nothing_found(match)
-        moved_m = self._moved(shot.t_s)
-        return match if moved_m is None else sure_of(match, shot, moved_m, self._rng)
+        """The match that is published instead of ``match``."""
+        if self.is_blacked_out(shot.t_s) or self.is_unmapped(shot.t_s):
+            return no_match(match)
+        offset_m = self._offset_m(shot.t_s)
+        return match if offset_m is None else wrong_match(match, shot, offset_m, self._rng)
 
-    def _moved(self, t_s: float) -> np.ndarray | None:
-        """(2,) how far the match of this frame is off; None: it is as it is."""
-        wrong, away = self._rng.uniform() < WRONG_SHARE, float(self._rng.uniform(*WRONG_M))
+    def _offset_m(self, t_s: float) -> np.ndarray | None:
+        """(2,) offset of the match of this frame; None: no fault. Draws the same random numbers for all faults."""
+        wrong, distance_m = self._rng.uniform() < WRONG_SHARE, float(self._rng.uniform(*WRONG_M))
         towards = float(self._rng.uniform(0.0, 2.0 * math.pi))
-        way = np.array([math.sin(towards), math.cos(towards)])
+        direction = np.array([math.sin(towards), math.cos(towards)])
         if self._fault is Fault.WRONG and wrong and t_s >= QUIET_S:
-            return away * way
+            return distance_m * direction
         if self._fault is Fault.JUMPS and self._jumps_s and t_s >= self._jumps_s[0]:
             self._jumps_s.pop(0)
-            return JUMP_M * way
+            return JUMP_M * direction
         if self._fault is Fault.ROWS and 0.0 <= t_s - ROWS_AT * self._duration_s < ROWS_S:
             return self._row_m
         return None
 
 
-def nothing_found(match: MapMatch) -> MapMatch:
-    """Of a frame that the map does not know."""
+def no_match(match: MapMatch) -> MapMatch:
+    """``match`` without a pose: the frame was not found on the map."""
     return msgspec.structs.replace(
         match, verdict=Verdict.FEW_INLIERS, coarse=False, p_c_in_w_m=None, q_w_c=None, cov=None, inliers=0
     )
 
 
-def sure_of(match: MapMatch, shot: Shot, moved_m: np.ndarray, rng: np.random.Generator) -> MapMatch:
-    """A match that is sure of a place ``moved_m`` (2,) from the true one."""
-    p = shot.p_m + np.array([*(moved_m + SURE_M * rng.normal(size=2)), SURE_M * rng.normal()])
-    cov = np.diag([SURE_M**2] * 3 + [SURE_RAD**2] * 3)
+def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.random.Generator) -> MapMatch:
+    """An accepted match with a small covariance, ``offset_m`` (2,) from the true position."""
+    p = shot.p_m + np.array([*(offset_m + WRONG_SIGMA_M * rng.normal(size=2)), WRONG_SIGMA_M * rng.normal()])
+    cov = np.diag([WRONG_SIGMA_M**2] * 3 + [WRONG_SIGMA_RAD**2] * 3)
     return msgspec.structs.replace(
         match,
         verdict=Verdict.ACCEPTED,

@@ -1,4 +1,4 @@
-"""One flight of the run: messages into the real EstimatorNode, one after the other as in the in-process shell."""
+"""One flight of the run: messages into the real EstimatorNode, in the order of the in-process executor."""
 
 import os
 import time
@@ -30,19 +30,19 @@ from terrafix_tools.montecarlo.lens import Lens
 from terrafix_tools.montecarlo.lies import Lies
 from terrafix_tools.montecarlo.matches import MapMatches
 from terrafix_tools.montecarlo.plan import FlightPlan
-from terrafix_tools.montecarlo.sightings import Sightings
+from terrafix_tools.montecarlo.sightings import SimulatedOdometry
 
 
 @dataclass
 class Record:
-    """What a flight gave. Arrays have a row for each frame, of the last estimate that was said of it."""
+    """Result of a flight. Arrays have one row for each frame, of its last estimate."""
 
     plan: FlightPlan
     t_s: np.ndarray
-    way_m: np.ndarray  # (N,) flown over ground
+    path_m: np.ndarray  # (N,) flown over ground
     truth_m: np.ndarray  # (N, 2)
     error_m: np.ndarray  # (N, 6): east, north, up [m], rotation about them [rad]; estimate minus truth
-    cov: np.ndarray  # (N, 6, 6) as claimed
+    cov: np.ndarray  # (N, 6, 6) as published
     velocity_error_mps: np.ndarray  # (N, 3)
     velocity_sigma_mps: np.ndarray  # (N,)
     anchor_age_ms: np.ndarray  # (N,)
@@ -53,12 +53,12 @@ class Record:
     refine_cpu_s: float = 0.0
     rebuilds: int = 0
     restarts: int = 0
-    lie_from_s: float | None = None  # when the first lie begins; None: there is none
+    lie_from_s: float | None = None  # start of the first false input; None: there is none
     fixes: dict[str, int] = field(default_factory=dict)  # verdicts on map matches
 
 
 def run(plan: FlightPlan, *, refine: bool = True) -> Record:
-    """Deterministic but for times and memory."""
+    """Deterministic except for processor time and memory."""
     return Run(plan).record(refine)
 
 
@@ -74,7 +74,7 @@ class Run:
         self._record = Record(
             plan=plan,
             t_s=np.array([shot.t_s for shot in flown.frames]),
-            way_m=flown.way_m,
+            path_m=flown.path_m,
             truth_m=np.array([shot.p_m[:2] for shot in flown.frames]),
             error_m=np.full((n, 6), np.nan),
             cov=np.full((n, 6, 6), np.nan),
@@ -90,7 +90,7 @@ class Run:
     def record(self, refine: bool) -> Record:
         plan, flown, record = self._plan, self._flown, self._record
         lens = Lens(CameraCalibration.of(plan.camera), plan.focal_error, plan.k1_error)
-        sightings = Sightings(lens, flown.terrain, plan.seed)
+        sightings = SimulatedOdometry(lens, flown.terrain, plan.seed)
         matches = MapMatches(
             lens,
             flown.terrain,
@@ -100,51 +100,53 @@ class Run:
             seed=plan.seed,
         )
         faults, lies = Faults(plan.fault, plan.duration_s, plan.seed), Lies(plan, flown)
-        record.lie_from_s = lies.begins_s()
-        self._tell(flown.origin)
-        late: list[tuple[int, MapMatch]] = []  # frame at which it is heard
+        record.lie_from_s = lies.start_s()
+        self._send(flown.origin)
+        late: list[tuple[int, MapMatch]] = []  # frame at which it is published
         for i, shot in enumerate(flown.frames):
-            odometry = sightings.see(i, lies.picture(i), blind=faults.blind(shot.t_s))
+            odometry = sightings.odometry(i, lies.picture(i), blind=faults.is_blacked_out(shot.t_s))
             with self._stopwatch(record.cpu_ms, i):
                 for state in flown.telemetry[i]:
-                    self._tell(state)
-                said = self._tell(odometry)
+                    self._send(state)
+                published = self._send(odometry)
             late += [
                 (i + faults.late_frames(), faults.alter(lies.match(i, prediction, matches.match), shot))
-                for prediction in said
+                for prediction in published
                 if isinstance(prediction, Prediction)
             ]
             with self._stopwatch(record.cpu_ms, i):
                 for due, match in late:
                     if due <= i:
-                        self._tell(match)
+                        self._send(match)
             late = [(due, match) for due, match in late if due > i]
             record.memory_mb[i] = self._page_mb * int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         if refine:
             refine_ms = np.zeros(1)
             with self._stopwatch(refine_ms, 0):
-                self._tell(SourceEnded(t_ns=round(flown.frames[-1].t_s * 1e9), frames=len(flown.frames)))
+                self._send(SourceEnded(t_ns=round(flown.frames[-1].t_s * 1e9), frames=len(flown.frames)))
             record.refine_cpu_s = 1e-3 * float(refine_ms[0])
-        estimator = self._node._estimator  # what no message says
+        estimator = self._node.estimator  # no message has this number
         record.rebuilds = estimator.graph.rebuilds if estimator is not None else 0
         return record
 
     @contextmanager
     def _stopwatch(self, into_ms: np.ndarray, i: int) -> Iterator[None]:
-        """Adds the processor time of what is done inside."""
-        began_s = time.process_time()
+        """Adds the processor time of the block to ``into_ms[i]``."""
+        start_s = time.process_time()
         yield
-        into_ms[i] += 1e3 * (time.process_time() - began_s)
+        into_ms[i] += 1e3 * (time.process_time() - start_s)
 
-    def hear(self, message: Message) -> list[Message]:
+    def process(self, message: Message) -> list[Message]:
+        """-> the messages that the estimator publishes."""
         return list(self._node.on(message))
 
-    def _tell(self, message: Message) -> list[Message]:
-        said = self.hear(message)
-        for answer in said:
+    def _send(self, message: Message) -> list[Message]:
+        """Processes ``message`` and records what is published, which is returned."""
+        published = self.process(message)
+        for answer in published:
             match answer:
                 case NavEstimate():
-                    self._estimate(answer)
+                    self._record_estimate(answer)
                 case MeasurementVerdict(measurement="map"):
                     fixes = self._record.fixes
                     fixes[str(answer.verdict)] = fixes.get(str(answer.verdict), 0) + 1
@@ -156,22 +158,22 @@ class Run:
                         truth_m = self._truth(pose.frame_id).p_m[:2]
                         self._record.refined_error_m[pose.frame_id] = np.array(at) - truth_m
                         self._record.refined_sigma_m[pose.frame_id] = pose.sigma_e_m, pose.sigma_n_m
-        return said
+        return published
 
     def _truth(self, frame_id: int) -> Shot:
-        """At the time that the newest estimate of the frame is of: an estimator that knows how late its pictures are
-        has that before the frame's stamp."""
+        """At the time of the newest estimate of the frame. That is earlier than the frame's time stamp if the estimator
+        corrects a time offset of the camera."""
         shot, t_ns = self._flown.frames[frame_id], self._times_ns[frame_id]
         return shot if round(shot.t_s * 1e9) == t_ns else self._flown.at(t_ns * 1e-9)
 
-    def _estimate(self, said: NavEstimate) -> None:
-        i, record = said.frame_id, self._record
-        self._times_ns[i] = said.t_ns
+    def _record_estimate(self, estimate: NavEstimate) -> None:
+        i, record = estimate.frame_id, self._record
+        self._times_ns[i] = estimate.t_ns
         shot = self._truth(i)
-        e_m, n_m = self._frame.to_local(said.lat_deg, said.lon_deg)
-        record.error_m[i, :3] = np.array([e_m, n_m, said.alt_amsl_m]) - shot.p_m
-        record.error_m[i, 3:] = log_so3(rot_from_quat(said.q_w_b) @ shot.r_w_b.T)
-        record.cov[i] = np.array(said.cov).reshape(6, 6)
-        record.velocity_error_mps[i] = np.array(said.velocity_enu_mps) - shot.velocity_mps
-        record.velocity_sigma_mps[i] = said.velocity_sigma_mps
-        record.anchor_age_ms[i] = said.last_anchor_age_ms
+        e_m, n_m = self._frame.to_local(estimate.lat_deg, estimate.lon_deg)
+        record.error_m[i, :3] = np.array([e_m, n_m, estimate.alt_amsl_m]) - shot.p_m
+        record.error_m[i, 3:] = log_so3(rot_from_quat(estimate.q_w_b) @ shot.r_w_b.T)
+        record.cov[i] = np.array(estimate.cov).reshape(6, 6)
+        record.velocity_error_mps[i] = np.array(estimate.velocity_enu_mps) - shot.velocity_mps
+        record.velocity_sigma_mps[i] = estimate.velocity_sigma_mps
+        record.anchor_age_ms[i] = estimate.last_anchor_age_ms

@@ -1,7 +1,7 @@
-"""A flight flown on the truth, with what its autopilot says meanwhile.
+"""The true trajectory of a flight, and the telemetry of its autopilot.
 
-World: east, north, up AMSL in metres around the start coordinate as the pilot gave it, the estimator's own frame. The
-ground here is flat as the estimator's world is; geodesy plays no part in this."""
+World: east, north, up AMSL [m] around the start coordinate of the pilot, which is the estimator's local frame. The
+earth is flat here as in the estimator; geodesy is not tested."""
 
 import math
 from dataclasses import dataclass, replace
@@ -25,41 +25,39 @@ from terrafix_tools.sim.sensors.suite import VehicleSensors
 from terrafix_tools.sim.vehicle.copter import Copter, CopterLimits
 from terrafix_tools.sim.vehicle.plane import Plane, PlaneLimits
 
-LAT_DEG, LON_DEG = 48.0, 11.0  # anywhere: only the estimator's way there and back passes through them
+LAT_DEG, LON_DEG = 48.0, 11.0  # any place: only the estimator's conversions to and from the local frame use it
 STEP_S = 0.02
 HALF_BOX_M = 1500.0
-SPARE = 1.2  # the course is longer than what is flown of it
-CLIMBS = 0.25  # 1-sigma of a waypoint's height, share of the flight's
-LEAST_AGL_M = 60.0
-TELEMETRY_EVERY, SLOW_EVERY = 2, 5  # steps: attitude at 25 Hz beside inertial readings, 10 Hz without
+SPARE = 1.2  # length of the course over what is flown of it
+CLIMBS = 0.25  # 1-sigma of a waypoint's height, as a share of the flight's
+MIN_AGL_M = 60.0
+TELEMETRY_EVERY, SLOW_EVERY = 2, 5  # steps: attitude at 25 Hz with inertial readings, 10 Hz without
 IMU_BATCH = 5  # readings in a message, at 50 Hz
-YAW_SIGMA_DEG, AGL_SIGMA_M, ATTITUDE_SIGMA_DEG = 3.0, 3.0, 0.7  # as `terrafix sim make` claims them
+YAW_SIGMA_DEG, AGL_SIGMA_M, ATTITUDE_SIGMA_DEG = 3.0, 3.0, 0.7  # as `terrafix sim make` states them
 
 
 @dataclass(frozen=True)
 class Shot:
-    """The truth of one frame."""
+    """True pose and velocity of one frame."""
 
     t_s: float
-    p_m: np.ndarray  # (3,) of the camera, which is at the vehicle's place
+    p_m: np.ndarray  # (3,) of the camera, which is at the origin of the body
     r_w_c: np.ndarray  # (3, 3)
-    r_w_b: np.ndarray  # (3, 3) of what the camera is mounted on: the body, or the frame of a gimbal
+    r_w_b: np.ndarray  # (3, 3) of the body, or of the stabilised frame of a gimbal
     velocity_mps: np.ndarray  # (3,)
 
 
 @dataclass(frozen=True)
-class Flown:
+class SimulatedFlight:
     origin: Origin
     frames: list[Shot]
-    pictures: list[
-        Shot
-    ]  # what each frame shows: the truth of the moment when it was really taken, with its stated time
+    pictures: list[Shot]  # content of each frame: the truth at its exposure, with the stated time
     telemetry: list[list[Message]]  # before each frame
-    way_m: np.ndarray  # (N,) flown over ground up to each frame
-    terrain: Terrain  # in the estimator's world
+    path_m: np.ndarray  # (N,) flown over ground up to each frame
+    terrain: Terrain  # in the estimator's local frame
 
     def at(self, t_s: float) -> Shot:
-        """The truth at any time of the flight: cubic in position, one rotation at constant rate, between two frames."""
+        """The truth at any time of the flight. Between frames: cubic Hermite position, constant angular rate."""
         times_s = [shot.t_s for shot in self.frames]
         i = int(np.clip(np.searchsorted(times_s, t_s, side="right") - 1, 0, len(times_s) - 2))
         a, b = self.frames[i], self.frames[i + 1]
@@ -75,8 +73,8 @@ class Flown:
         return Shot(t_s, p_m, turned[0], turned[1], (1 - u) * a.velocity_mps + u * b.velocity_mps)
 
 
-def fly(plan: FlightPlan, terrain: Terrain) -> Flown:
-    """``terrain`` in the frame of the mission."""
+def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
+    """Flies ``plan``. ``terrain``: in the frame of the mission."""
     frame = LocalFrame(LAT_DEG, LON_DEG)
     vehicle = _vehicle(plan, terrain, frame)
     errors = SensorErrors(yaw_constant_rad=plan.compass_rad)
@@ -92,11 +90,11 @@ def fly(plan: FlightPlan, terrain: Terrain) -> Flown:
     lag = round(plan.picture_lag_s / STEP_S)
     frames: list[Shot] = []
     pictures: list[Shot] = []
-    taken: Shot | None = None  # the picture that is under way, when pictures are late
+    taken: Shot | None = None  # the picture that is delivered next, when pictures are late
     telemetry: list[list[Message]] = []
     waiting: list[Message] = []
     batch: list[Readings] = []
-    way_m, way = 0.0, []
+    path_m, paths_m = 0.0, []
     state = first
 
     def shot(at: State) -> Shot:
@@ -107,25 +105,27 @@ def fly(plan: FlightPlan, terrain: Terrain) -> Flown:
     for i in range(math.floor(plan.duration_s / STEP_S)):
         if i:
             state = vehicle.step(STEP_S, None)
-            way_m += float(np.hypot(*state.velocity_enu_mps[:2])) * STEP_S
+            path_m += float(np.hypot(*state.velocity_enu_mps[:2])) * STEP_S
         if plan.has_imu or i % every == 0:
             readings = sensors.read(state)
             if i % every == 0:
-                waiting.append(_said(plan, readings, home_m))
+                waiting.append(_vehicle_state(plan, readings, home_m))
             if plan.has_imu:
                 batch.append(readings)
         if len(batch) == IMU_BATCH:
-            waiting.append(_inertial(batch))
+            waiting.append(_imu(batch))
             batch = []
         if i % frame_every == 0:
             frames.append(shot(state))
             pictures.append(replace(taken or frames[-1], t_s=state.t_s))
             telemetry.append(waiting[-1:] if plan.fault is Fault.PHOTOS else waiting)
             waiting = []
-            way.append(way_m)
+            paths_m.append(path_m)
         if lag and (i + lag) % frame_every == 0:
             taken = shot(state)
-    return Flown(_origin(plan, home_m), frames, pictures, telemetry, np.array(way), terrain.seen_from(claimed))
+    return SimulatedFlight(
+        _origin(plan, home_m), frames, pictures, telemetry, np.array(paths_m), terrain.seen_from(claimed)
+    )
 
 
 def _vehicle(plan: FlightPlan, terrain: Terrain, frame: LocalFrame) -> Plane | Copter:
@@ -138,20 +138,20 @@ def _vehicle(plan: FlightPlan, terrain: Terrain, frame: LocalFrame) -> Plane | C
 
 
 def _mission(plan: FlightPlan, frame: LocalFrame) -> Mission:
-    """A closed course with a height of its own at every corner."""
+    """A closed course with another height at every waypoint."""
     box = Box(-HALF_BOX_M, -HALF_BOX_M, HALF_BOX_M, HALF_BOX_M)
     length_m = SPARE * (plan.cruise_mps + plan.wind.speed_mps()) * plan.duration_s
     drawn = course(plan.seed, length_m, box, frame, agl_m=plan.agl_m)
     heights = np.random.default_rng([plan.seed, 54]).normal(1.0, CLIMBS, len(drawn.items))
     items = [
-        replace(item, height_m=max(LEAST_AGL_M, plan.agl_m * float(share)))
+        replace(item, height_m=max(MIN_AGL_M, plan.agl_m * float(share)))
         for item, share in zip(drawn.items, heights, strict=True)
     ]
     return replace(drawn, items=tuple(items))
 
 
-def _said(plan: FlightPlan, readings: Readings, home_m: float) -> VehicleState:
-    """As the link says it; with a gimbal nobody knows the camera's roll and pitch."""
+def _vehicle_state(plan: FlightPlan, readings: Readings, home_m: float) -> VehicleState:
+    """As the link publishes it. With a gimbal the roll and pitch of the camera are not reported."""
     return VehicleState(
         t_ns=round(readings.t_s * 1e9),
         source="montecarlo",
@@ -164,7 +164,7 @@ def _said(plan: FlightPlan, readings: Readings, home_m: float) -> VehicleState:
     )
 
 
-def _inertial(batch: list[Readings]) -> Imu:
+def _imu(batch: list[Readings]) -> Imu:
     newest_ns = round(batch[-1].t_s * 1e9)
     samples = [(newest_ns - round(r.t_s * 1e9), *r.accel_b_mps2.tolist(), *r.gyro_b_radps.tolist()) for r in batch]
     return Imu(t_ns=newest_ns, source="montecarlo", samples=samples)

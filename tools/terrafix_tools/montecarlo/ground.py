@@ -1,26 +1,26 @@
-"""The ground of a simulated flight, as functions of place: its relief, what stands on it, and how its map errs.
+"""The ground of a simulated flight as functions of position: relief, objects on it, and the error of its map.
 
-No picture is made of it: odometry and map matches are computed from points of it."""
+No picture is rendered. Odometry and map matches are computed from points of the ground."""
 
 import copy
 import math
 
 import numpy as np
 
-WAVES = 24  # of the relief
+WAVES = 24  # plane waves of a field
 RELIEF_WAVES_M = (300.0, 3000.0)
 # How two orthophotos of one place differ, beyond a constant: 25 m patches of the two dates of the village map were
 # matched with each other. Covariance 1.1 m^2 at 50 m, 0.6 at 100 m, 0.2 at 160 m, 0 beyond; half of it is one map's,
-# and that is the least: what both dates share, as the elevation model under them, does not show. So a map that states
-# a large error is stretched in proportion, as the estimator has to expect of it.
+# and that is a lower bound: errors that both dates share, as of the elevation model, do not show. So the warp of a map
+# that states a large error is scaled in proportion, as the estimator has to expect.
 WARP_M, WARP_SHARE, WARP_WAVES_M = 0.8, 0.33, (200.0, 700.0)
-# What is left of map matches after the pose, on real flights: 0.5 % of the height in each coordinate, four fifths of it
-# the same when the ground is seen again half a second later, unrelated beyond a tenth of the height.
+# Residuals of map matches after the pose, on real flights: 0.5 % of the height in each coordinate. Four fifths of it
+# repeat when the same ground is observed half a second later; uncorrelated beyond a tenth of the height.
 DETAIL_M, DETAIL_WAVES_M = 0.35, (25.0, 60.0)
 HOUSE_CELL_M, HOUSE_HALF_M, HOUSE_HEIGHT_M = 24.0, (4.0, 9.0), (3.0, 9.0)
 TREE_CELL_M, TREE_HALF_M, TREE_HEIGHT_M = 11.0, (1.5, 4.0), (3.0, 12.0)
 SETTLED_WAVES_M = (400.0, 1500.0)
-MAP_SEES_TOPS = 0.5  # share of what stands there by which a patch of a frame seems to lie off the map's bare ground
+MAP_SEES_TOPS = 0.5  # share of an object's height that shifts a patch against the map's bare ground
 
 
 class _Waves:
@@ -31,7 +31,7 @@ class _Waves:
         course = rng.uniform(0.0, 2.0 * math.pi, count)
         self._k = np.stack([np.sin(course), np.cos(course)]) * (2.0 * math.pi / length)  # (2, count)
         self._phase = rng.uniform(0.0, 2.0 * math.pi, count)
-        weight = length if lengths_m == RELIEF_WAVES_M else np.ones(count)  # long hills are high
+        weight = length if lengths_m == RELIEF_WAVES_M else np.ones(count)  # the amplitude grows with the wavelength
         self._amplitude = weight * math.sqrt(2.0 / float((weight**2).sum()))
 
     def __call__(self, places_m: np.ndarray) -> np.ndarray:
@@ -40,7 +40,7 @@ class _Waves:
 
 
 class Terrain:
-    """``hills_m``: 1-sigma of the relief. ``settled`` 0..1: how much of it houses and trees cover."""
+    """``hills_m``: 1-sigma of the relief. ``settled`` 0..1: share of the ground that houses and trees cover."""
 
     def __init__(self, seed: int, hills_m: float, settled: float) -> None:
         rng = np.random.default_rng([seed, 51])
@@ -51,7 +51,7 @@ class Terrain:
         self._origin_m = np.zeros(2)
 
     def seen_from(self, origin_m: np.ndarray) -> "Terrain":
-        """The same ground in a frame whose zero lies at ``origin_m`` (2,) of this one."""
+        """The same ground in a frame with its origin at ``origin_m`` (2,) of this one."""
         moved = copy.copy(self)
         moved._origin_m = self._origin_m + origin_m
         return moved
@@ -64,7 +64,7 @@ class Terrain:
         return float(self.bare_m(np.array([[e_m, n_m]]))[0])
 
     def standing_m(self, places_m: np.ndarray) -> np.ndarray:
-        """Height over the bare ground of what stands at (N, 2): roofs, crowns, or nothing."""
+        """Height of objects (roofs, tree crowns) above the bare ground at (N, 2); 0 where there is none."""
         places_m = places_m + self._origin_m
         settled = np.clip(self._settled * (1.0 + self._settlement(places_m)), 0.0, 0.9)
         houses = self._blocks(places_m, 1, HOUSE_CELL_M, HOUSE_HALF_M, HOUSE_HEIGHT_M, settled)
@@ -80,7 +80,7 @@ class Terrain:
         height_m: tuple[float, float],
         share: np.ndarray,
     ) -> np.ndarray:
-        """One block at most in each cell of a grid; size, place and height from the cell's number."""
+        """At most one block in each cell of a grid; size, position and height are a hash of the cell."""
         cells = np.floor(places_m / cell_m).astype(np.int64)
         there, size, east, north, height = self._uniform(cells, kind)
         half = half_m[0] + size * (half_m[1] - half_m[0])
@@ -100,11 +100,11 @@ class Terrain:
 
 
 class MapError:
-    """Where the map shows a place, minus where it is: a constant of the map, a slow warp, and fine detail."""
+    """Mapped less true position: a constant offset, a smooth warp, and fine detail."""
 
     def __init__(self, seed: int, offset_m: np.ndarray, sigma_m: float) -> None:
-        """``offset_m`` (2,): the registration error of the map, the same everywhere; ``sigma_m`` is what the map
-        states of it, for each axis."""
+        """``offset_m`` (2,): the constant registration error of the map; ``sigma_m``: the 1-sigma per axis that
+        the map states."""
         rng = np.random.default_rng([seed, 52])
         self.offset_m = offset_m
         self._warp_m = max(WARP_M, WARP_SHARE * sigma_m)

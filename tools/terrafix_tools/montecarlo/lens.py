@@ -1,4 +1,4 @@
-"""A camera that is not quite as its description says: focal length and distortion are never known exactly."""
+"""A camera with errors of its calibration: focal length and radial distortion."""
 
 from dataclasses import dataclass
 
@@ -9,25 +9,25 @@ from terrafix.core.camera import CameraCalibration
 
 @dataclass(frozen=True)
 class Lens:
-    """The real camera behind a described one. ``focal`` and ``k1``: error of the focal length, relative, and of the
-    first radial coefficient."""
+    """The true camera. ``described``: its stated calibration. ``focal``: relative error of the focal length; ``k1``:
+    error of the first radial coefficient."""
 
     described: CameraCalibration
     focal: float = 0.0
     k1: float = 0.0
 
     def project(self, in_c: np.ndarray) -> np.ndarray:
-        """Points in the camera's axes (N, 3), z > 0 -> pixels (N, 2) of the picture as it really is."""
+        """Points in the camera's axes (N, 3), z > 0 -> pixels (N, 2) of the true camera."""
         xy = in_c[:, :2] / in_c[:, 2:]
-        bent = xy * (1.0 + self.focal) * (1.0 + self.k1 * (xy**2).sum(axis=1, keepdims=True))
-        return np.column_stack([bent, np.ones(len(bent))]) @ self.described.matrix()[:2].T
+        distorted = xy * (1.0 + self.focal) * (1.0 + self.k1 * (xy**2).sum(axis=1, keepdims=True))
+        return np.column_stack([distorted, np.ones(len(distorted))]) @ self.described.matrix()[:2].T
 
     def rays(self, px: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) -> where they really look: (N, 3) in the camera's axes, depth 1."""
-        seen = self.described.normalise(px) / (1.0 + self.focal)
-        xy = seen
-        for _ in range(3):  # the distortion is small: each turn is a hundred times nearer
-            xy = seen / (1.0 + self.k1 * (xy**2).sum(axis=1, keepdims=True))
+        """Pixels (N, 2) -> true rays (N, 3) in camera axes, depth 1."""
+        distorted = self.described.normalise(px) / (1.0 + self.focal)
+        xy = distorted
+        for _ in range(3):  # the distortion is small: each iteration reduces the error by a factor of 100
+            xy = distorted / (1.0 + self.k1 * (xy**2).sum(axis=1, keepdims=True))
         return np.column_stack([xy, np.ones(len(xy))])
 
     def scaled(self, factor: float) -> "Lens":

@@ -1,42 +1,42 @@
-"""MapMatch as the anchor would say it: patches of the frame found on a map that errs, then the real PnP.
+"""MapMatch as the anchor publishes it: patches of the frame on a map with errors, then the real PnP.
 
-The belief over the map is not simulated: its mode is where the frame shows that the camera is, while that lies in the
-window that it searches. What the anchor does to views, planes and verdicts is done here in the same way."""
+The belief over the map is not simulated. Its mode is the camera position that the frame shows, if that lies in the
+search window. Views, ground planes and verdicts are computed as in the anchor."""
 
 import math
 
 import msgspec
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, REACH, Fix, View
+from terrafix.anchor.frame_pose import COARSE_SCORE
+from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, SEARCH_RADIUS, Fix, View
 from terrafix.anchor.matching.match_message import mode_match, pose_match
 from terrafix.anchor.matching.patch_matcher import MAX_PATCHES
-from terrafix.anchor.matching.pnp import THRESHOLD, solve
-from terrafix.anchor.matching.point_mass_filter import Mode, cell_for
-from terrafix.anchor.node import COARSE_SCORE
+from terrafix.anchor.matching.pnp import INLIER_THRESHOLD, solve
+from terrafix.anchor.matching.point_mass_filter import Mode, belief_cell_m
 from terrafix.core.geodesy import rot_from_quat
-from terrafix.core.limits import LEAST_LOOK_AGL_M
+from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.pose import log_so3
 from terrafix.messages import MapMatch, Prediction, Vec3, Verdict
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import MAP_SEES_TOPS, MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens
 
-FOUND_SHARE = (0.4, 0.9)  # of the patches that are found at all, on poor and on good ground ...
+FOUND_SHARE = (0.4, 0.9)  # of the patches that are found, on poor and on good ground ...
 RIGHT_SHARE = (0.5, 0.98)  # ... and of these at the right place
-TEXTURE_S = 25.0  # how fast the ground changes between the two
-WHITE_SHARE = 0.002  # of the height: error of a patch that is new in every frame
-WEIGHT = (math.log(0.09), 0.5)  # of a patch, logarithm: mean and spread on village-1
-DEM_ERROR_M = 1.0  # of a flight; from place to place the elevation has no error here
-WINDOW_M, WINDOW_SIGMAS = 120.0, 4.0  # half of what the belief searches, at least, and by its prediction
+TEXTURE_S = 25.0  # time constant of the change between poor and good ground
+WHITE_SHARE = 0.002  # of the height: 1-sigma of the white error of a patch
+WEIGHT = (math.log(0.09), 0.5)  # of the logarithm of a patch weight: mean and 1-sigma on village-1
+DEM_ERROR_M = 1.0  # 1-sigma of a constant per flight; the elevation has no local error here
+WINDOW_M, WINDOW_SIGMAS = 120.0, 4.0  # half of the search window: at least, and in sigmas of the prediction
 HYPOTHESES = 1.5  # sigmas of heading and scale that are searched ...
-YAW_TOLERANCE_RAD, SCALE_TOLERANCE = math.radians(6.0), 0.08  # ... and what the descriptors bear beyond
-MASS, SCORE, SCORE_SPREAD = 0.995, 6.5, 2.0  # of the belief's mode: real flights have 0.97 to 1, 2.8 to 10
-GRID = np.array([-0.4, 0.0, 0.4])  # of a patch: where it is asked what stands there
+YAW_TOLERANCE_RAD, SCALE_TOLERANCE = math.radians(6.0), 0.08  # ... and the tolerance of the descriptors beyond
+MASS, SCORE, SCORE_SPREAD = 0.995, 6.5, 2.0  # of the belief's mode; real flights: mass 0.97 to 1, score 2.8 to 10
+GRID = np.array([-0.4, 0.0, 0.4])  # of a patch: points at which the height of objects is sampled
 
 
 class MapMatches:
-    """``match`` for every Prediction, with the truth of its frame."""
+    """Call ``match`` for every Prediction, with the true pose of its frame."""
 
     def __init__(
         self, lens: Lens, terrain: Terrain, error: MapError, *, has_dem: bool, map_sigma_m: float, seed: int
@@ -52,7 +52,7 @@ class MapMatches:
 
     def match(self, prediction: Prediction, shot: Shot) -> MapMatch:
         ground, relief_m = self._plane(prediction)
-        answer = MapMatch(
+        result = MapMatch(
             t_ns=prediction.t_ns,
             frame_id=prediction.frame_id,
             verdict=Verdict.AMBIGUOUS,
@@ -61,28 +61,28 @@ class MapMatches:
             relief_m=relief_m,
             map_sigma_m=self._map_sigma_m,
         )
-        good = self._good(shot.t_s)
+        good = self._texture_quality(shot.t_s)
         r_w_c, p_m = rot_from_quat(prediction.q_w_c), np.array(prediction.p_c_in_w_m)
         agl_m = prediction.agl_m if ground is None else float(p_m[2]) - ground[0]
-        if agl_m < LEAST_LOOK_AGL_M:
-            return msgspec.structs.replace(answer, verdict=Verdict.TOO_LOW)
+        if agl_m < MIN_MATCHING_AGL_M:
+            return msgspec.structs.replace(result, verdict=Verdict.TOO_LOW)
         place = self._apparent(shot, r_w_c, agl_m)
         if not self._in_reach(prediction, shot, place, agl_m):
-            return answer
+            return result
         score = SCORE + SCORE_SPREAD * (float(self._rng.normal()) + 0.5 * (good - 0.5))
-        mode = Mode(float(place[0]), float(place[1]), MASS, 0.0, cell_for(agl_m, 0.0) ** 2)
+        mode = Mode(float(place[0]), float(place[1]), MASS, 0.0, belief_cell_m(agl_m, 0.0) ** 2)
         view = View(mode.e_m, mode.n_m, r_w_c, agl_m, float(p_m[2]) - agl_m, 0.0, 0.0, 0.0)
-        answer = msgspec.structs.replace(answer, margin=score, mode_mass=MASS, mode_e_m=mode.e_m, mode_n_m=mode.n_m)
-        answer = pose_match(answer, self._fix(shot, good, view), view)
-        if answer.verdict is Verdict.ACCEPTED or score < COARSE_SCORE:
-            return answer
-        return mode_match(answer, mode, cell_for(agl_m, 0.0), view, None)
+        result = msgspec.structs.replace(result, margin=score, mode_mass=MASS, mode_e_m=mode.e_m, mode_n_m=mode.n_m)
+        result = pose_match(result, self._fix(shot, good, view), view)
+        if result.verdict is Verdict.ACCEPTED or score < COARSE_SCORE:
+            return result
+        return mode_match(result, mode, belief_cell_m(agl_m, 0.0), view, None)
 
     def _fix(self, shot: Shot, good: float, view: View) -> Fix:
         xy, points = self._patches(shot, good)
         weights = np.exp(self._rng.normal(*WEIGHT, len(xy)))
         gsd_share = FIX_GSD_PER_AGL["gradient"]
-        pnp = solve(points, xy, weights, view.r_w_c, view.agl_m, 0.3 * gsd_share, THRESHOLD, REACH)
+        pnp = solve(points, xy, weights, view.r_w_c, view.agl_m, 0.3 * gsd_share, INLIER_THRESHOLD, SEARCH_RADIUS)
         return Fix(xy, points, weights, pnp, gsd_share * view.agl_m)
 
     def _patches(self, shot: Shot, good: float) -> tuple[np.ndarray, np.ndarray]:
@@ -96,28 +96,28 @@ class MapMatches:
         xy = camera.normalise(px)
         rays = self._lens.rays(px) @ shot.r_w_c.T
         places = shot.p_m[:2] + rays[:, :2] * (agl_m / np.maximum(-rays[:, 2:], 0.2))
-        for _ in range(3):  # the ray meets the ground, and half of what stands on it there
+        for _ in range(3):  # intersection of the ray with the ground plus MAP_SEES_TOPS of the objects on it
             up_m = self._terrain.bare_m(places) + MAP_SEES_TOPS * self._standing(places, PATCH_PER_AGL * agl_m)
             places = shot.p_m[:2] + rays[:, :2] * ((shot.p_m[2] - up_m) / np.maximum(-rays[:, 2], 0.2))[:, None]
         on_map = places + self._error.at(places) + WHITE_SHARE * agl_m * rng.normal(size=(count, 2))
         wrong = rng.uniform(size=count) > _between(RIGHT_SHARE, good)
-        on_map[wrong] += REACH * agl_m * rng.uniform(-1.0, 1.0, (int(wrong.sum()), 2))
+        on_map[wrong] += SEARCH_RADIUS * agl_m * rng.uniform(-1.0, 1.0, (int(wrong.sum()), 2))
         return xy, np.column_stack([on_map, self._elevation(on_map)])
 
     def _standing(self, places_m: np.ndarray, side_m: float) -> np.ndarray:
-        """Mean height of what stands in patches around (N, 2)."""
+        """Mean height of objects in patches around (N, 2)."""
         de, dn = (axis.ravel() * side_m for axis in np.meshgrid(GRID, GRID))
         asked = places_m[:, None, :] + np.stack([de, dn], 1)[None]
         return self._terrain.standing_m(asked.reshape(-1, 2)).reshape(len(places_m), -1).mean(axis=1)
 
     def _elevation(self, places_m: np.ndarray) -> np.ndarray:
-        """Of the map's elevation model; without one the height of the start everywhere."""
+        """(N,) of the map's elevation model; without one the height of the start."""
         if not self._has_dem:
             return np.full(len(places_m), self._home_m)
         return self._terrain.bare_m(places_m) + self._dem_error_m
 
     def _plane(self, prediction: Prediction) -> tuple[Vec3 | None, float]:
-        """As the anchor fits it: the ground around the predicted camera, and what departs from it."""
+        """Plane through the ground around the predicted camera, as the anchor fits it, and the residual relief [m]."""
         if not self._has_dem:
             return None, 0.0
         axis = np.linspace(-0.7, 0.7, 7) * prediction.agl_m
@@ -129,16 +129,16 @@ class MapMatches:
         return (float(plane[0]), float(plane[1]), float(plane[2])), relief_m
 
     def _apparent(self, shot: Shot, r_w_c: np.ndarray, agl_m: float) -> np.ndarray:
-        """(2,) where the camera seems to be to one who believes this rotation and height: the middle of the picture
-        shows the same ground."""
-        true, believed = shot.r_w_c[:, 2], r_w_c[:, 2]
+        """(2,) camera position that follows from the assumed rotation and height: the optical axis meets the same
+        ground as with the true ones."""
+        true, assumed = shot.r_w_c[:, 2], r_w_c[:, 2]
         agl_true_m = float(shot.p_m[2]) - self._terrain.bare_at_m(float(shot.p_m[0]), float(shot.p_m[1]))
-        seen = shot.p_m[:2] + true[:2] * agl_true_m / max(-float(true[2]), 0.2)
-        on_map = seen + self._error.at(seen[None])[0]
-        return np.asarray(on_map - believed[:2] * agl_m / max(-float(believed[2]), 0.2))
+        ground_m = shot.p_m[:2] + true[:2] * agl_true_m / max(-float(true[2]), 0.2)
+        on_map = ground_m + self._error.at(ground_m[None])[0]
+        return np.asarray(on_map - assumed[:2] * agl_m / max(-float(assumed[2]), 0.2))
 
     def _in_reach(self, prediction: Prediction, shot: Shot, place_m: np.ndarray, agl_m: float) -> bool:
-        """Whether place, heading, scale and tilt lie in what the anchor searches."""
+        """Whether position, heading, scale and tilt are within the search range of the anchor."""
         cov = np.array(prediction.cov).reshape(6, 6)
         window_m = max(WINDOW_M, WINDOW_SIGMAS * float(np.sqrt(max(cov[0, 0], cov[1, 1]))))
         turn = log_so3(shot.r_w_c @ rot_from_quat(prediction.q_w_c).T)
@@ -151,8 +151,8 @@ class MapMatches:
             and float(np.hypot(*turn[:2])) < math.radians(20.0)
         )
 
-    def _good(self, t_s: float) -> float:
-        """0..1: how well the ground below can be matched, changing with the way."""
+    def _texture_quality(self, t_s: float) -> float:
+        """0..1: quality of the ground below for matching, a first-order process in time."""
         keep = math.exp(-(t_s - self._last_s) / TEXTURE_S)
         self._last_s = t_s
         self._texture = keep * self._texture + math.sqrt(1.0 - keep * keep) * float(self._rng.normal())

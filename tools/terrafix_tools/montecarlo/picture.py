@@ -1,4 +1,4 @@
-"""The picture of a run: normalised errors against what they should be, and the track of the worst flight."""
+"""The plot of a run: normalised errors against their theoretical densities, and the track of the worst flight."""
 
 import math
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from terrafix_tools.montecarlo.statistics import Seen
+from terrafix_tools.montecarlo.statistics import FlightResult
 
 PANEL = (560, 420)  # width, height
 MARGIN = (52, 34, 16, 42)  # left, top, right, bottom
@@ -16,8 +16,8 @@ BARS, LAW, RED = (214, 176, 120), (40, 40, 40), (40, 40, 220)  # BGR
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-def draw(path: Path, flights: list[Seen]) -> None:
-    """Raises OSError."""
+def draw(path: Path, flights: list[FlightResult]) -> None:
+    """Writes the plot. Raises OSError."""
     worst = max(flights, key=lambda f: float(np.percentile(f.nees, 95)))
     panels = [
         _histogram("position / claim, against chi (2)", [np.sqrt(f.nees) for f in flights], _rayleigh),
@@ -91,23 +91,23 @@ def _histogram(title: str, values: list[np.ndarray], law: Callable[[np.ndarray],
     return axes.image
 
 
-def _track(worst: Seen) -> np.ndarray:
+def _track(worst: FlightResult) -> np.ndarray:
     record = worst.record
-    truth, said = record.truth_m, record.truth_m + record.error_m[:, :2]
-    middle = 0.5 * (truth.min(0) + truth.max(0))
+    truth, estimate = record.truth_m, record.truth_m + record.error_m[:, :2]
+    centre = 0.5 * (truth.min(0) + truth.max(0))
     half = 0.55 * float(np.ptp(truth, axis=0).max())
     wide = half * (PANEL[0] - MARGIN[0] - MARGIN[2]) / (PANEL[1] - MARGIN[1] - MARGIN[3])
     plan = record.plan
     title = f"worst flight: number {plan.number}, {plan.kind}, {plan.fault}"
-    axes = _Axes(title, (middle[0] - wide, middle[0] + wide), (middle[1] - half, middle[1] + half))
+    axes = _Axes(title, (centre[0] - wide, centre[0] + wide), (centre[1] - half, centre[1] + half))
     axes.line(truth[:, 0], truth[:, 1], INK, 1)
-    axes.line(said[:, 0], said[:, 1], RED, 1)
+    axes.line(estimate[:, 0], estimate[:, 1], RED, 1)
     axes.text(0, "truth")
     axes.text(1, "estimate", RED)
     return axes.image
 
 
-def _growth(worst: Seen) -> np.ndarray:
+def _growth(worst: FlightResult) -> np.ndarray:
     record = worst.record
     sigma = 2.448 * np.sqrt(np.linalg.eigvalsh(record.cov[:, :2, :2])[:, 1])  # 95 % radius along the worst axis
     top = float(min(max(worst.distance_m.max(), np.percentile(sigma, 95)) * 1.1, 1000.0))

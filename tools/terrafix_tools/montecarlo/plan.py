@@ -1,4 +1,4 @@
-"""What a flight of the Monte Carlo run is, drawn from its seed: vehicle, weather, ground, camera, errors, faults."""
+"""Parameters of one flight of the Monte Carlo run, drawn from its seed: vehicle, weather, ground, errors, faults."""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,19 +12,24 @@ from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.vehicle.wind import Wind
 
 DURATION_S = 600.0
-HALTON = (5, 7)  # bases of the map errors' sequence (Halton 1960); they share no factor with the round of faults
+HALTON = (5, 7)  # bases of the sequence of map errors (Halton 1960), coprime to the length of ROUND
 # Cameras of the real flights and of the simulated ones: width, height, focal length in pixels.
 CAMERAS = ((1280, 720, 684.0), (1600, 900, 1164.4), (960, 540, 560.0))
-FLAT_M = 2.0  # 1-sigma of the relief over which a map without elevation may be flown: the ground must be flat then
+FLAT_M = 2.0  # largest 1-sigma of the relief for a map without elevation
 PHOTOS_HZ = 0.2
-HEIGHT_SCALES = (0.7, 1.3, 3.28084, 1.0 / 3.28084)  # of a lie: 30 % off, and feet for metres both ways
-FOCAL_FACTORS = (0.5, 2.0)  # described over true, by a lie; the logarithm is uniform between them
-LAG_S = (0.2, 1.0)  # how old the pictures of a lie are
-START_OFF_M, START_CLAIM_M = 300.0, 50.0
-FOCAL_SIGMA, K1_SIGMA = 0.01, 0.005  # of a lens that was calibrated once, or whose maker's numbers were taken
+HEIGHT_SCALES = (
+    0.7,
+    1.3,
+    3.28084,
+    1.0 / 3.28084,
+)  # false: 30 % wrong, and feet confused with metres in both directions
+FOCAL_FACTORS = (0.5, 2.0)  # false, stated over true; log-uniform between them
+LAG_S = (0.2, 1.0)  # range of the age of late pictures
+START_ERROR_M, START_SIGMA_M = 300.0, 50.0  # of a false start: error and stated 1-sigma
+FOCAL_SIGMA, K1_SIGMA = 0.01, 0.005  # of a lens with a single calibration or the manufacturer's data
 
 
-# Of twelve flights. A third are without fault: rates there are what a customer sees.
+# Faults of twelve successive flights. A third has none: their rates are those of ordinary operation.
 ROUND = (
     Fault.NONE,
     Fault.WRONG,
@@ -43,9 +48,9 @@ ROUND = (
 
 @dataclass(frozen=True)
 class FlightPlan:
-    """Everything that is drawn. The same seed and number give the same flight."""
+    """All drawn parameters. The same seed and number give the same flight."""
 
-    seed: int  # of all that is random in it
+    seed: int  # of all random numbers of this flight
     number: int
     kind: Kind
     fault: Fault
@@ -63,14 +68,14 @@ class FlightPlan:
     has_imu: bool  # the autopilot streams inertial readings
     mount_error_rad: tuple[float, float]  # about the camera's x and y
     gimbal: bool
-    map_sigma_m: float  # what the map's package states
+    map_sigma_m: float  # stated by the map package
     map_offset_m: tuple[float, float]
     start_sigma_m: float
     start_error_m: tuple[float, float]
     height_scale: float
-    compass_rad: float | None  # None: of ordinary size
+    compass_rad: float | None  # constant error of the heading; None: drawn by the sensor model
     lies: frozenset[Fault] = frozenset()  # of LIES
-    picture_lag_s: float = 0.0  # so much older than its time says is each picture
+    picture_lag_s: float = 0.0  # age of each picture at its time stamp
 
 
 def plan(
@@ -81,24 +86,14 @@ def plan(
     duration_s: float = DURATION_S,
     lie_share: float = 0.0,
 ) -> FlightPlan:
-    """Flight ``number`` of a run. ``fault``: this one, instead of the round's. ``lie_share``: probability of each of
-    LIES in a flight, on top of its fault."""
+    """Flight ``number`` of a run. ``fault``: instead of that of ROUND. ``lie_share``: probability of each of LIES in a
+    flight, in addition to its fault."""
     rng = np.random.default_rng([run_seed, number, 50])
     chosen = ROUND[number % len(ROUND)] if fault is None else fault
     kind = Kind.PLANE if rng.uniform() < 0.5 else Kind.COPTER
     width, height, focal = CAMERAS[int(rng.integers(len(CAMERAS)))]
     gimbal = kind is Kind.COPTER and rng.uniform() < 0.5
     tolerance_deg = float(rng.choice([2.0, 5.0]))
-    camera = Camera(
-        width=width,
-        height=height,
-        fx=focal,
-        fy=focal,
-        cx=(width - 1) / 2,
-        cy=(height - 1) / 2,
-        focal_sigma=FOCAL_SIGMA,
-        mount_tolerance_deg=tolerance_deg,
-    )
     tilt = np.radians(tolerance_deg) * rng.normal(size=2)
     wind_mps, wind_from = float(rng.uniform(0.0, 8.0)), float(rng.uniform(0.0, 2.0 * math.pi))
     ce90_m = float(rng.choice([3.0, 5.0, 10.0]))
@@ -118,7 +113,7 @@ def plan(
         hills_m=hills_m,
         settled=float(rng.uniform(0.02, 0.35)),
         has_dem=hills_m > FLAT_M or bool(rng.uniform() < 0.5),
-        camera=camera,
+        camera=_camera(width, height, focal, tolerance_deg),
         has_imu=bool(number % 2),
         focal_error=float(rng.normal(0.0, FOCAL_SIGMA)),
         k1_error=float(rng.normal(0.0, K1_SIGMA)),
@@ -131,14 +126,32 @@ def plan(
         height_scale=1.0 + float(rng.normal(0.0, 0.01)),
         compass_rad=None,
     )
-    drawn = _lying(drawn, _lies(run_seed, number, chosen, lie_share))
-    if chosen is Fault.HILLS:
+    drawn = _with_lies(drawn, _lies(run_seed, number, chosen, lie_share))
+    return _with_fault(drawn, sign, rng)
+
+
+def _camera(width: int, height: int, focal_px: float, mount_tolerance_deg: float) -> Camera:
+    return Camera(
+        width=width,
+        height=height,
+        fx=focal_px,
+        fy=focal_px,
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
+        focal_sigma=FOCAL_SIGMA,
+        mount_tolerance_deg=mount_tolerance_deg,
+    )
+
+
+def _with_fault(drawn: FlightPlan, sign: float, rng: np.random.Generator) -> FlightPlan:
+    """With the parameters that the fault of the flight changes. ``sign``: of an error of height or heading."""
+    if drawn.fault is Fault.HILLS:
         return replace(drawn, hills_m=20.0, has_dem=False)
-    if chosen is Fault.PHOTOS:
+    if drawn.fault is Fault.PHOTOS:
         return replace(drawn, frame_hz=PHOTOS_HZ, has_imu=False)
-    if chosen is Fault.HEIGHT:
+    if drawn.fault is Fault.HEIGHT:
         return replace(drawn, height_scale=1.0 + sign * 0.1)
-    if chosen is Fault.COMPASS:
+    if drawn.fault is Fault.COMPASS:
         return replace(drawn, compass_rad=sign * math.radians(float(rng.uniform(10.0, 15.0))))
     return drawn
 
@@ -148,8 +161,8 @@ def _lies(run_seed: int, number: int, chosen: Fault, share: float) -> frozenset[
     return frozenset(lie for lie, draw in zip(LIES, draws.tolist(), strict=True) if draw < share or lie is chosen)
 
 
-def _lying(drawn: FlightPlan, lies: frozenset[Fault]) -> FlightPlan:
-    """With the lies that are there from the first frame to the last; montecarlo/lies.py has the others."""
+def _with_lies(drawn: FlightPlan, lies: frozenset[Fault]) -> FlightPlan:
+    """With the false inputs that last for the whole flight; montecarlo/lies.py has the others."""
     rng = np.random.default_rng([drawn.seed, 60])
     scale = float(rng.choice(HEIGHT_SCALES))
     factor = math.exp(float(rng.uniform(*np.log(FOCAL_FACTORS))))
@@ -165,14 +178,16 @@ def _lying(drawn: FlightPlan, lies: frozenset[Fault]) -> FlightPlan:
     if Fault.STALE in lies:
         changes |= {"picture_lag_s": lag_s}
     if Fault.START in lies:
-        off_m = (START_OFF_M * math.sin(towards), START_OFF_M * math.cos(towards))
-        changes |= {"start_sigma_m": START_CLAIM_M, "start_error_m": off_m}
+        error_m = (START_ERROR_M * math.sin(towards), START_ERROR_M * math.cos(towards))
+        changes |= {"start_sigma_m": START_SIGMA_M, "start_error_m": error_m}
     return replace(drawn, **changes)  # type: ignore[arg-type]
 
 
 def _map_offset(run_seed: int, number: int, sigma_m: float) -> tuple[float, float]:
-    """One draw of the map's registration holds for a whole flight and would make the result a lottery of a hundred
-    tickets: radius and direction come from a low-discrepancy sequence, which covers the distribution evenly."""
+    """Registration error (east, north) [m] of the map of one flight, normally distributed with ``sigma_m`` per axis.
+
+    It is constant in a flight, so that a hundred flights have only a hundred draws. Radius and direction come from a
+    low-discrepancy sequence, which covers the distribution evenly."""
     radius = sigma_m * math.sqrt(-2.0 * math.log(1.0 - _halton(number + 1, HALTON[0])))
     first = float(np.random.default_rng([run_seed, 53]).uniform())
     towards = 2.0 * math.pi * (first + _halton(number + 1, HALTON[1]))

@@ -1,4 +1,4 @@
-"""`terrafix montecarlo`: many flights in several processes, a table, JSON and a picture."""
+"""`terrafix montecarlo`: many flights in several processes; a table, JSON and a plot."""
 
 import json
 import multiprocessing
@@ -22,16 +22,16 @@ from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Record, run
 from terrafix_tools.montecarlo.picture import draw
 from terrafix_tools.montecarlo.plan import DURATION_S, plan
-from terrafix_tools.montecarlo.statistics import Seen, floors, summary
+from terrafix_tools.montecarlo.statistics import FlightResult, floors, summary
 
-TABLE_WIDTH = 130  # a narrower terminal breaks lines; so does a file
+TABLE_WIDTH = 130  # characters, also where the terminal is narrower or the output is a file
 RESULT, PICTURE = "montecarlo.json", "montecarlo.png"
-SHORTEST_S, LONGEST_S = 60.0, 7200.0
+MIN_DURATION_S, MAX_DURATION_S = 60.0, 7200.0
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What the command line asks for."""
+class RunOptions:
+    """Options of the command line."""
 
     out: Path
     flights: int = 100
@@ -40,62 +40,62 @@ class Wanted:
     duration_s: float = DURATION_S
     fault: Fault | None = None
     lie_share: float = 0.0  # probability of each of LIES in a flight
-    workers: int | None = None  # None: one for each processor that this program may use
+    workers: int | None = None  # None: one per available processor
 
 
-def montecarlo(wanted: Wanted) -> dict[str, Any]:
+def montecarlo(options: RunOptions) -> dict[str, Any]:
     """Writes montecarlo.json and montecarlo.png into ``wanted.out``. Raises UsageError, OutputError."""
-    _check(wanted)
-    began_s = time.perf_counter()
+    _check(options)
+    start_s = time.perf_counter()
     console = Console(stderr=True)
     try:
-        wanted.out.mkdir(parents=True, exist_ok=True)
+        options.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{wanted.out}: cannot be made ({error.strerror}); choose another --out") from None
-    seen = [Seen.of(record) for record in _flown(wanted, console)]
-    result = _result(wanted, seen)
-    result["wall_s"] = round(time.perf_counter() - began_s, 1)
-    path = wanted.out / RESULT
+        raise OutputError(f"{options.out}: cannot be made ({error.strerror}); choose another --out") from None
+    flights = [FlightResult.of(record) for record in _fly_all(options, console)]
+    result = _result(options, flights)
+    result["wall_s"] = round(time.perf_counter() - start_s, 1)
+    path = options.out / RESULT
     try:
         path.write_text(json.dumps(_rounded(result), indent=2) + "\n", encoding="utf-8")
-        draw(wanted.out / PICTURE, seen)
+        draw(options.out / PICTURE, flights)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another --out") from None
     show(result, Console(width=max(TABLE_WIDTH, console.width)))
     return result
 
 
-def _check(wanted: Wanted) -> None:
-    if wanted.flights < 1 or wanted.first < 0:
-        raise UsageError(f"--flights {wanted.flights} --first {wanted.first}: at least one flight, from number 0 on")
-    if not SHORTEST_S <= wanted.duration_s <= LONGEST_S:
-        raise UsageError(f"--duration {wanted.duration_s:g}: choose {SHORTEST_S:g} to {LONGEST_S:g} seconds")
-    if not 0.0 <= wanted.lie_share <= 1.0:
-        raise UsageError(f"--lies {wanted.lie_share:g}: a probability is from 0 to 1")
-    if wanted.workers is not None and wanted.workers < 1:
-        raise UsageError(f"--workers {wanted.workers}: choose at least 1")
+def _check(options: RunOptions) -> None:
+    if options.flights < 1 or options.first < 0:
+        raise UsageError(f"--flights {options.flights} --first {options.first}: at least one flight, from number 0 on")
+    if not MIN_DURATION_S <= options.duration_s <= MAX_DURATION_S:
+        raise UsageError(f"--duration {options.duration_s:g}: choose {MIN_DURATION_S:g} to {MAX_DURATION_S:g} seconds")
+    if not 0.0 <= options.lie_share <= 1.0:
+        raise UsageError(f"--lies {options.lie_share:g}: a probability is from 0 to 1")
+    if options.workers is not None and options.workers < 1:
+        raise UsageError(f"--workers {options.workers}: choose at least 1")
 
 
-def _flown(wanted: Wanted, console: Console) -> list[Record]:
-    """In order of their numbers, whoever was ready first."""
-    numbers = range(wanted.first, wanted.first + wanted.flights)
+def _fly_all(options: RunOptions, console: Console) -> list[Record]:
+    """Sorted by the number of the flight."""
+    numbers = range(options.first, options.first + options.flights)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     records: dict[int, Record] = {}
     with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("flights", total=wanted.flights)
-        for number, record in _results(wanted, numbers):
+        task = progress.add_task("flights", total=options.flights)
+        for number, record in _results(options, numbers):
             records[number] = record
             progress.advance(task)
     return [records[number] for number in numbers]
 
 
-def _results(wanted: Wanted, numbers: range) -> Iterator[tuple[int, Record]]:
-    workers = min(wanted.workers or len(os.sched_getaffinity(0)), len(numbers))
-    one = partial(_one, wanted)
+def _results(options: RunOptions, numbers: range) -> Iterator[tuple[int, Record]]:
+    workers = min(options.workers or len(os.sched_getaffinity(0)), len(numbers))
+    one = partial(_fly_one, options)
     if workers == 1:
         yield from map(one, numbers)
         return
-    # A fresh interpreter for each: GTSAM's threads do not survive a fork.
+    # "spawn" starts a new interpreter: GTSAM's threads do not survive a fork.
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             for done in as_completed([pool.submit(one, number) for number in numbers]):
@@ -104,29 +104,29 @@ def _results(wanted: Wanted, numbers: range) -> Iterator[tuple[int, Record]]:
             raise UsageError("a process of the run was killed, by lack of memory perhaps; try --workers 1") from None
 
 
-def _one(wanted: Wanted, number: int) -> tuple[int, Record]:
+def _fly_one(options: RunOptions, number: int) -> tuple[int, Record]:
     return number, run(
-        plan(wanted.seed, number, fault=wanted.fault, duration_s=wanted.duration_s, lie_share=wanted.lie_share)
+        plan(options.seed, number, fault=options.fault, duration_s=options.duration_s, lie_share=options.lie_share)
     )
 
 
-def _result(wanted: Wanted, seen: list[Seen]) -> dict[str, Any]:
-    groups = {fault: [s for s in seen if fault in {s.record.plan.fault, *s.record.plan.lies}] for fault in Fault}
-    total = summary(seen)
+def _result(options: RunOptions, flights: list[FlightResult]) -> dict[str, Any]:
+    groups = {fault: [s for s in flights if fault in {s.record.plan.fault, *s.record.plan.lies}] for fault in Fault}
+    total = summary(flights)
     return {
-        "seed": wanted.seed,
-        "first": wanted.first,
-        "duration_s": wanted.duration_s,
+        "seed": options.seed,
+        "first": options.first,
+        "duration_s": options.duration_s,
         "versions": versions(),
         "floors": floors(total),
         "all": total,
-        "by_fault": {str(fault): summary(flights) for fault, flights in groups.items() if flights},
-        "flights": [_flight(s) for s in seen],
+        "by_fault": {str(fault): summary(group) for fault, group in groups.items() if group},
+        "flights": [_flight_row(s) for s in flights],
     }
 
 
-def _flight(seen: Seen) -> dict[str, Any]:
-    p = seen.record.plan
+def _flight_row(flight: FlightResult) -> dict[str, Any]:
+    p = flight.record.plan
     return {
         "number": p.number,
         "fault": str(p.fault),
@@ -139,8 +139,8 @@ def _flight(seen: Seen) -> dict[str, Any]:
         "has_imu": p.has_imu,
         "map_sigma_m": p.map_sigma_m,
         "map_offset_m": list(p.map_offset_m),
-        "fixes": seen.record.fixes,
-        **summary([seen]),
+        "fixes": flight.record.fixes,
+        **summary([flight]),
     }
 
 

@@ -1,9 +1,10 @@
 """Consistency of many flights: NEES and its chi-square band, coverage, false fixes, velocity, drift.
 
-NEES: normalised estimation error squared, the squared Mahalanobis distance of the error in the claimed covariance; its
-mean is the number of dimensions when the claims are true (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to
-Tracking and Navigation", 2001, 5.4). Errors of one flight follow each other closely, so N frames are not N draws: the
-band is that of as many draws as the autocorrelation of the normalised error leaves."""
+NEES: normalised estimation error squared, the squared Mahalanobis distance of the error in the published covariance.
+Its mean is the number of dimensions when the covariance is consistent (Bar-Shalom, Li, Kirubarajan, "Estimation with
+Applications to Tracking and Navigation", 2001, 5.4). Errors of one flight are correlated in time, so N frames are not N
+independent draws. The band is that of the effective number of draws, from the autocorrelation of the normalised
+error."""
 
 import math
 from collections.abc import Sequence
@@ -18,17 +19,17 @@ from terrafix_tools.montecarlo.flight import Record
 
 POSE95 = 12.592  # chi-square with 6 degrees of freedom, 95 %
 NORMAL95 = 1.959964  # two-sided
-FARTHEST = 4.0  # sigmas: errors beyond count as so large for the correlation
-LEAST_DRIFT_M = 1000.0  # of way since the last map fix: shorter says nothing about per cent
+MAX_SIGMAS = 4.0  # errors are limited to this for the correlation
+MIN_DRIFT_PATH_M = 1000.0  # since the last map fix; a ratio over a shorter path has no meaning
 COVERAGE_FLOORS = (0.93, 0.98)
 
 
 @dataclass(frozen=True)
 class Nees:
     mean: float
-    low: float  # the 95 % band of the mean when the claims are true
+    low: float  # 95 % band of the mean for a consistent covariance
     high: float
-    draws: float  # independent ones
+    draws: float  # effective number of independent draws
 
     @property
     def holds(self) -> bool:
@@ -36,16 +37,16 @@ class Nees:
 
 
 def nees_of(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """(N, k), (N, k, k) -> (N,); inf where the claim is no covariance."""
+    """(N, k), (N, k, k) -> (N,); inf where ``cov`` is not positive definite."""
     out = np.full(len(error), math.inf)
-    sound = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
-    sound[sound] &= np.linalg.eigvalsh(cov[sound])[:, 0] > 0.0
-    out[sound] = np.einsum("ni,ni->n", error[sound], np.linalg.solve(cov[sound], error[sound][..., None])[..., 0])
+    valid = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+    valid[valid] &= np.linalg.eigvalsh(cov[valid])[:, 0] > 0.0
+    out[valid] = np.einsum("ni,ni->n", error[valid], np.linalg.solve(cov[valid], error[valid][..., None])[..., 0])
     return out
 
 
 def band(flights: Sequence[np.ndarray], draws: float, dimensions: int) -> Nees:
-    """Mean over the frames of all flights (N,), and the band of a mean of so many independent draws."""
+    """Mean over the frames of all flights (N,), and the 95 % band of a mean of ``draws`` independent draws."""
     values = np.concatenate(flights) if flights else np.zeros(0)
     freedom = max(draws * dimensions, 1.0)
     low, high = (chi2(freedom, z) / max(draws, 1.0 / dimensions) for z in (-NORMAL95, NORMAL95))
@@ -59,48 +60,48 @@ def chi2(freedom: float, z: float) -> float:
 
 
 def draws_in(flights: Sequence[np.ndarray]) -> float:
-    """Independent draws in some flights together: each ``whitened`` (N, k), in order of time.
+    """Effective number of independent draws in some flights together: each ``whitened`` (N, k), in order of time.
 
-    The squares of a Gaussian process with correlation r are correlated by r squared. The mean of the errors is known,
-    zero, and not estimated: an error that holds for a whole flight leaves one draw. One flight cannot tell a constant
-    that happens to be small from none, so the correlation is that of all flights together."""
+    The squares of a Gaussian process with correlation r have the correlation r squared. The mean of the errors is known
+    to be zero and is not estimated, so that a constant error of a flight leaves one draw. One flight cannot distinguish
+    a small constant from none, so that the correlation is estimated over all flights together."""
     longest = max((len(w) for w in flights), default=0)
     size = 1 << (2 * max(longest, 1) - 1).bit_length()
     products, pairs = np.zeros(longest), np.zeros(longest)
     for w in flights:
         length = np.linalg.norm(w, axis=1, keepdims=True)
-        held = w * np.minimum(1.0, FARTHEST / np.maximum(length, FARTHEST))  # one lost flight must not stand for all
-        spectrum = np.fft.rfft(held, size, axis=0)
+        limited = w * np.minimum(1.0, MAX_SIGMAS / np.maximum(length, MAX_SIGMAS))  # one lost flight must not dominate
+        spectrum = np.fft.rfft(limited, size, axis=0)
         n = len(w)
         products[:n] += np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=1), size)[:n]
         pairs[:n] += np.arange(n, 0, -1)
     if longest < 2 or products[0] <= 0.0:
         return float(pairs[0]) if longest else 0.0
     r2 = (products / pairs / (products[0] / pairs[0])) ** 2
-    noise = r2 < 4.0 / pairs  # what the square of an estimated zero may be
+    noise = r2 < 4.0 / pairs  # indistinguishable from zero correlation
     first = int(np.argmax(noise)) if noise.any() else longest
-    share = pairs[1:first] / pairs[0]  # of the frames that have another one so much later
+    share = pairs[1:first] / pairs[0]  # of the frames that have another one at this lag
     return float(pairs[0] / (1.0 + 2.0 * float((r2[1:first] * share).sum())))
 
 
 def whitened(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """(N, k): the error in units of its claim, uncorrelated."""
+    """(N, k): the error in units of its 1-sigma, uncorrelated."""
     return np.linalg.solve(np.linalg.cholesky(cov), error[..., None])[..., 0]
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What counts of one flight."""
+class FlightResult:
+    """Errors and consistency of one flight."""
 
     record: Record
     distance_m: np.ndarray  # (N,) horizontal error
-    nees: np.ndarray  # (N,) position, against the earth
-    map_nees: np.ndarray  # (N,) position, against the map: without the map's own error on either side
-    pose_nees: np.ndarray  # (N,) six dimensions
-    whitened: tuple[np.ndarray, np.ndarray, np.ndarray]  # the errors of the three, in units of their claims
+    nees: np.ndarray  # (N,) of the position on earth
+    map_nees: np.ndarray  # (N,) of the position on the map: without the error of the map and its variance
+    pose_nees: np.ndarray  # (N,) of the pose, six dimensions
+    whitened: tuple[np.ndarray, np.ndarray, np.ndarray]  # errors of these three
 
     @classmethod
-    def of(cls, record: Record) -> "Seen":
+    def of(cls, record: Record) -> "FlightResult":
         error, cov = record.error_m, record.cov
         placed = record.anchor_age_ms >= 0
         map_cov = cov[:, :2, :2] - (placed * record.plan.map_sigma_m**2)[:, None, None] * np.eye(2)
@@ -116,45 +117,45 @@ class Seen:
 
     @property
     def notice_s(self) -> float | None:
-        """From the beginning of the first lie to the last false fix after it; None: no lie, or no false fix."""
-        begins_s, wrong = self.record.lie_from_s, self._false()
+        """From the start of the first false input to the last false fix after it; None: there is none of either."""
+        start_s, wrong = self.record.lie_from_s, self._false()
         last_s = max(self.record.t_s[wrong].tolist(), default=-math.inf)
-        return last_s - begins_s if begins_s is not None and last_s >= begins_s else None
+        return last_s - start_s if start_s is not None and last_s >= start_s else None
 
     def _false(self) -> np.ndarray:
         """(N,) bool"""
         return np.asarray((self.distance_m > FALSE_FIX_ERROR_M) & (self.nees > FALSE_FIX_MAHALANOBIS2))
 
     def refined_nees(self) -> np.ndarray:
-        """Of the frames that were refined."""
+        """(M,) of the frames that were refined."""
         nees = ((self.record.refined_error_m / self.record.refined_sigma_m) ** 2).sum(axis=1)
         return np.asarray(nees[np.isfinite(nees)])
 
     def velocity_share(self) -> np.ndarray:
-        """(2N,) horizontal velocity errors in units of the claim."""
+        """(2N,) horizontal velocity errors in units of their 1-sigma."""
         return np.asarray((self.record.velocity_error_mps[:, :2] / self.record.velocity_sigma_mps[:, None]).ravel())
 
     def drift(self) -> float | None:
-        """Error since the last map fix, share of the way since; None where the map never went away for long."""
+        """Error since the last map fix over the path since then; None for a flight with a map or a short path."""
         fixed = np.flatnonzero(self.record.anchor_age_ms == 0)
         if self.record.plan.fault is not Fault.DRIFT or not len(fixed):
             return None
-        way_m = float(self.record.way_m[-1] - self.record.way_m[fixed[-1]])
+        path_m = float(self.record.path_m[-1] - self.record.path_m[fixed[-1]])
         grown = self.record.error_m[-1, :2] - self.record.error_m[fixed[-1], :2]
-        return float(np.hypot(*grown)) / way_m if way_m >= LEAST_DRIFT_M else None
+        return float(np.hypot(*grown)) / path_m if path_m >= MIN_DRIFT_PATH_M else None
 
 
-def parts(flights: list[Seen]) -> dict[str, float]:
-    """Mean squared error over its claimed variance, of each kind of number alone: one when the claims are true. The
-    claim of a velocity is that of its worst direction."""
+def parts(flights: list[FlightResult]) -> dict[str, float]:
+    """Mean squared error over its published variance, by quantity: 1 when consistent. The variance of a velocity is
+    that of its worst direction."""
     ratio = np.concatenate([f.record.error_m**2 / np.einsum("nii->ni", f.record.cov) for f in flights])
     velocity = np.concatenate([f.velocity_share() for f in flights])
     numbers = {"east_north": ratio[:, :2], "up": ratio[:, 2], "tilt": ratio[:, 3:5], "heading": ratio[:, 5]}
     return {name: float(np.mean(values)) for name, values in {**numbers, "velocity": velocity**2}.items()}
 
 
-def summary(flights: list[Seen]) -> dict[str, Any]:
-    """The row of a table: over all frames of some flights."""
+def summary(flights: list[FlightResult]) -> dict[str, Any]:
+    """Row of the table: over all frames of some flights."""
     nees = np.concatenate([f.nees for f in flights])
     refined = np.concatenate([f.refined_nees() for f in flights])
     on_map = np.concatenate([f.map_nees for f in flights])
@@ -208,7 +209,7 @@ def _row(nees: Nees) -> dict[str, float | bool]:
 
 
 def floors(total: dict[str, Any]) -> dict[str, bool]:
-    """Whether each floor holds, by what it says."""
+    """Text of each floor -> whether it holds."""
     low, high = COVERAGE_FLOORS
     return {
         "95 % ellipse holds 93 to 98 % of the positions": low <= total["coverage"] <= high,

@@ -12,16 +12,18 @@ def preflight(
     mission: Annotated[
         Path | None, typer.Option(help="QGroundControl plan or waypoint file. Default: the mission on board.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the flight records, and of the old parameters.")] = Path("out"),
-    write: Annotated[bool, typer.Option("--write", help="Set the parameters that are wrong, after asking.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder of the flight records and of the previous parameters.")] = Path(
+        "out"
+    ),
+    write: Annotated[bool, typer.Option("--write", help="Set wrong parameters, after confirmation.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Skip the confirmation.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
-    autopilot_only: Annotated[bool, typer.Option("--autopilot-only", help="Leave out map, camera, computer.")] = False,
+    autopilot_only: Annotated[bool, typer.Option("--autopilot-only", help="Skip map, camera and computer.")] = False,
     config: Annotated[
         list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")
     ] = None,
 ) -> None:
-    """Before take-off: is everything as it must be? Autopilot, map, camera, clocks. Exit code 1: something is not."""
+    """Check autopilot, map, camera and clocks before take-off. Exit code 1: a check failed."""
     from terrafix_tools.preflight.run import preflight as run_preflight
 
     ready = run_preflight(

@@ -1,4 +1,4 @@
-"""What is checked on this computer: map, camera, models, clock, disk, temperature."""
+"""Checks of this computer: map, camera, models, clock, disk, temperature."""
 
 import time
 from collections.abc import Iterator
@@ -18,23 +18,23 @@ from terrafix.vision.sources import open_configured, parse_start
 from terrafix.vision.sources.description import read_description
 from terrafix_engines.features import open_describer
 from terrafix_engines.features.xfeat import XFeatDescriber
-from terrafix_engines.providers import short
+from terrafix_engines.providers import short_name
 from terrafix_engines.runtime import ModelFileError
-from terrafix_tools.live import swapped
-from terrafix_tools.mapping.check_mission import uncovered, way_of
-from terrafix_tools.mapping.check_text import where
+from terrafix_tools.live import swapped_hint
+from terrafix_tools.mapping.check.mission import mission_route, uncovered
+from terrafix_tools.mapping.check.text import where
 from terrafix_tools.mission.file import read_mission
 from terrafix_tools.preflight.lines import Line, fail, ok, warn
 
 FRAMES = 3
-FREE_MB = 2000  # a flight of an hour with thumbnails
-DARK, BRIGHT = 15.0, 240.0  # mean of 255
-FLAT = 6.0  # standard deviation: a lens cap, a wall, fog
-BLURRED = 0.08  # share of the contrast that lies within two pixels; sharp pictures of ground have 0.2 and more
+MIN_FREE_MB = 2000  # space for a flight of an hour with thumbnails
+MIN_MEAN, MAX_MEAN = 15.0, 240.0  # limits of the mean grey value, of 255
+MIN_CONTRAST = 6.0  # least standard deviation of an image; below: lens cap, a wall, fog
+MIN_FINE_SHARE = 0.08  # share of the contrast within two pixels; sharp images of ground have 0.2 and more
 LIVE = ("/dev/", "http://", "https://")
 
 
-def about(config: Config, mission: Path | None, out: Path) -> Iterator[Line]:
+def check_lines(config: Config, mission: Path | None, out: Path) -> Iterator[Line]:
     yield from _map(config, mission)
     yield from _camera(config)
     yield _models(config)
@@ -45,72 +45,72 @@ def about(config: Config, mission: Path | None, out: Path) -> Iterator[Line]:
 
 def _map(config: Config, mission: Path | None) -> Iterator[Line]:
     if not config.map.path:
-        yield fail("map", "the configuration names none", "set [map] path, or give --map")
+        yield fail("map", "the configuration has none", "set [map] path, or give --map")
         return
     required = config.map.require_signature
     try:
         trusted = trusted_keys(config.map.trusted_keys, required=required)
         package = MapPackage.open(Path(config.map.path), verify=True, trusted=trusted)
     except TerrafixError as error:
-        yield fail("map", *_told(error))
+        yield fail("map", *_text_and_fix(error))
         return
     try:
-        yield from _checked("map", _whole(package))
-        yield from _checked("start", _start(package, config))
+        yield from _guarded("map", _integrity(package))
+        yield from _guarded("start", _start(package, config))
         if mission is not None:
-            yield from _checked("mission", _cover(package, mission))
+            yield from _guarded("mission", _cover(package, mission))
     finally:
         package.close()
 
 
-def _checked(check: str, lines: Iterator[Line]) -> Iterator[Line]:
-    """What cannot be read is a failure of its own check, and not the end of the others."""
+def _guarded(check: str, lines: Iterator[Line]) -> Iterator[Line]:
+    """Turns an exception into a failure of its own check, so that the other checks run."""
     try:
         yield from lines
     except TerrafixError as error:
-        yield fail(check, *_told(error))
+        yield fail(check, *_text_and_fix(error))
 
 
-def _whole(package: MapPackage) -> Iterator[Line]:
+def _integrity(package: MapPackage) -> Iterator[Line]:
     newest = package.layer(None)
     signed = f"signed by {', '.join(package.signed_by)}" if package.signed_by else "not signed"
-    yield ok("map", f"{package.path.name}: every tile is whole; {signed}; imagery of {newest.date or 'unknown date'}")
+    yield ok("map", f"{package.path.name}: all tiles valid; {signed}; imagery of {newest.date or 'unknown date'}")
 
 
 def _start(package: MapPackage, config: Config) -> Iterator[Line]:
-    """As the flight will take it: of the configuration, else of the camera's description."""
-    place = parse_start(config.source.start)
-    if place is None and config.source.camera:
+    """The start that the flight will use: from the configuration, else from the camera description."""
+    start_lat_lon = parse_start(config.source.start)
+    if start_lat_lon is None and config.source.camera:
         described = read_description(Path(config.source.camera).expanduser()).start
-        place = None if described is None else (described.lat_deg, described.lon_deg)
-    if place is None:
-        receiver = "where the autopilot's GNSS says before arming, or else " if config.link.gnss_start else ""
-        text = f"not said: {receiver}the whole map is searched for the first position"
+        start_lat_lon = None if described is None else (described.lat_deg, described.lon_deg)
+    if start_lat_lon is None:
+        receiver = "the autopilot's GNSS position before arming is used, or else " if config.link.gnss_start else ""
+        text = f"not configured: {receiver}the whole map is searched for the first position"
         yield warn("start", text, "set [source] start, or [start] in the description of the camera")
         return
-    at = f"{place[0]:.6f}, {place[1]:.6f}"
-    if package.covers(*place):
-        yield ok("start", f"{at} lies on the map")
+    start_text = f"{start_lat_lon[0]:.6f}, {start_lat_lon[1]:.6f}"
+    if package.covers(*start_lat_lon):
+        yield ok("start", f"{start_text} lies on the map")
     else:
-        todo = swapped(package, *place, 0.0) or "correct the start, or take another map"
-        yield fail("start", f"{at} does not lie on the map", todo)
+        todo = swapped_hint(package, *start_lat_lon, 0.0) or "correct the start, or take another map"
+        yield fail("start", f"{start_text} does not lie on the map", todo)
 
 
 def _cover(package: MapPackage, mission: Path) -> Iterator[Line]:
-    plan = read_mission(mission, way_only=True)
+    plan = read_mission(mission, course_only=True)
     west, south, east, north = package.manifest.bounds_wgs84
-    way = way_of(plan, LocalFrame((south + north) / 2, (west + east) / 2))
-    outside = way.stretches(uncovered(way, package, package.layer(None).table))
+    course = mission_route(plan, LocalFrame((south + north) / 2, (west + east) / 2))
+    outside = course.stretches(uncovered(course, package, package.layer(None).table))
     if outside:
         yield fail("mission", f"leaves the map for {where(outside[0])}", "move the mission, or build a larger map")
     else:
-        yield ok("mission", f"its {way.along_m[-1] / 1000:.1f} km lie on the map")
+        yield ok("mission", f"its {course.along_m[-1] / 1000:.1f} km lie on the map")
 
 
 def _camera(config: Config) -> Iterator[Line]:
     spec = config.source.path
     if not spec:
-        yield fail("camera", "the configuration names no source", "set [source] path")
+        yield fail("camera", "the configuration has no source", "set [source] path")
         return
     if not (spec.startswith(LIVE) or "!" in spec or spec.isdecimal()):
         yield warn("camera", f"{spec} is a recording, not a camera", "for a flight set [source] path to the camera")
@@ -129,26 +129,26 @@ def _camera(config: Config) -> Iterator[Line]:
         finally:
             source.close()
     except TerrafixError as error:
-        yield fail("camera", *_told(error))
+        yield fail("camera", *_text_and_fix(error))
         return
-    yield picture(images)
+    yield check_images(images)
 
 
-def picture(images: list[np.ndarray]) -> Line:
-    """A line about a few frames (H, W, 3) in a row."""
+def check_images(images: list[np.ndarray]) -> Line:
+    """Checks a few successive frames (H, W, 3)."""
     if len(images) < FRAMES:
-        return fail("camera", f"only {len(images)} frames came", "check cable and driver")
+        return fail("camera", f"only {len(images)} frames received", "check cable and driver")
     if all(np.array_equal(images[0], image) for image in images[1:]):
         return fail("camera", "repeats the same picture", "start the camera again")
     grey = cv2.cvtColor(images[-1], cv2.COLOR_BGR2GRAY).astype(np.float32)
     size = f"{grey.shape[1]} x {grey.shape[0]} px"
     mean, spread = float(grey.mean()), float(grey.std())
-    if not DARK <= mean <= BRIGHT or spread < FLAT:
+    if not MIN_MEAN <= mean <= MAX_MEAN or spread < MIN_CONTRAST:
         return warn("camera", f"{size}, but the picture is empty (mean {mean:.0f}, spread {spread:.0f})", "lens cap?")
     fine = float((grey - cv2.GaussianBlur(grey, (0, 0), 2.0)).std()) / spread
-    if fine < BLURRED:
+    if fine < MIN_FINE_SHARE:
         return warn("camera", f"{size}, but it looks blurred", "point it at something 10 m away or more, and focus")
-    return ok("camera", f"{size}, sharp, and it moves on")
+    return ok("camera", f"{size}, sharp, new images")
 
 
 def _models(config: Config) -> Line:
@@ -158,14 +158,14 @@ def _models(config: Config) -> Line:
         describer = open_describer(config.models.xfeat, config.models.folder)
     except ModelFileError as error:
         return fail("models", str(error), "correct [models] xfeat, or empty it")
-    by = f" by {short(describer.model.provider)}" if isinstance(describer, XFeatDescriber) else ""
+    by = f" by {short_name(describer.model.provider)}" if isinstance(describer, XFeatDescriber) else ""
     return ok("models", f"{config.models.xfeat} can be run{by}")
 
 
 def _clock() -> Line:
-    if gps_time.plausible(time.time_ns()):
+    if gps_time.is_plausible(time.time_ns()):
         return ok("clock", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()))
-    text = f"says {time.strftime('%Y', time.gmtime())}: the GPS week will be left out"
+    text = f"year {time.strftime('%Y', time.gmtime())}: GPS_INPUT will have no GPS week"
     return warn("clock", text, "set it (timedatectl set-time), or give the board a battery")
 
 
@@ -174,8 +174,8 @@ def _disk(config: Config, out: Path) -> Line:
     free_mb = read_disk_free_mb(folder)
     if free_mb is None:
         return warn("disk", f"{folder}: free space cannot be read", "check the file system")
-    if free_mb < FREE_MB:
-        return fail("disk", f"{free_mb} MB free in {folder}, a flight may need {FREE_MB}", "delete old records")
+    if free_mb < MIN_FREE_MB:
+        return fail("disk", f"{free_mb} MB free in {folder}, a flight may need {MIN_FREE_MB}", "delete old records")
     if free_mb < config.recorder.budget_mb:
         text = f"{free_mb} MB free in {folder}, below [recorder] budget_mb = {config.recorder.budget_mb}"
         return warn("disk", text, "delete old records, or lower the budget")
@@ -198,7 +198,7 @@ def _temperature(config: Config) -> Line:
     return ok("temperature", text)
 
 
-def _told(error: TerrafixError) -> tuple[str, str]:
-    """Text and fix: what stands behind the last semicolon of a message says what to do."""
+def _text_and_fix(error: TerrafixError) -> tuple[str, str]:
+    """Splits an error text into text and fix: the part behind the last semicolon is the remedy."""
     text, _, todo = str(error).rpartition("; ")
     return (text, todo) if text else (str(error), "")

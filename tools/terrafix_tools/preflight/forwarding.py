@@ -1,29 +1,30 @@
-"""Whether the autopilot hands GPS_INPUT on to its other links, and how to stop that.
+"""Check whether the autopilot forwards GPS_INPUT to its other links, and how to disable that.
 
-ArduPilot forwards what has no target to every link on which somebody was heard (MAVLink_routing.cpp), unless the port
-that it came from is private: bit 10 of SERIALn_OPTIONS (AP_SerialManager.cpp, to 4.6), since 4.7 bit 1 of MAVn_OPTIONS
-(GCS_MAVLink_Parameters.cpp), where n counts the ports that speak MAVLink from 1."""
+ArduPilot forwards messages without target to every link on which a system was seen (MAVLink_routing.cpp), unless the
+receiving port is private: bit 10 of SERIALn_OPTIONS (AP_SerialManager.cpp, up to 4.6), since 4.7 bit 1 of MAVn_OPTIONS
+(GCS_MAVLink_Parameters.cpp), where n counts the ports that speak MAVLink from 1.
+"""
 
 from terrafix_tools.preflight.lines import Line, ok, warn
 from terrafix_tools.preflight.rules import Context, Values
 
 SERIALS = range(10)
 MAVLINK_PROTOCOLS = (1.0, 2.0)
-USB = 0  # SERIAL0: nobody is there in flight
+USB = 0  # SERIAL0: not connected in flight
 CHANNEL_OPTIONS_SINCE = (4, 7)
 NO_FORWARD, NO_FORWARD_4_6 = 2, 1024
 WIRE_BYTES = 80  # GPS_INPUT, signed 93
 
 
-def names_of(context: Context) -> list[str]:
-    """Parameters that ``forwarding`` looks at; a firmware does not answer for those that it has not."""
+def parameter_names(context: Context) -> list[str]:
+    """Parameters that ``forwarding`` needs; a firmware does not reply for those that it does not have."""
     if context.firmware >= CHANNEL_OPTIONS_SINCE:
         return [f"MAV{n}_OPTIONS" for n in range(1, 7)]
     return [f"SERIAL{i}_OPTIONS" for i in SERIALS]
 
 
 def mavlink_ports(values: Values) -> list[int]:
-    """Numbers of the serial ports that speak MAVLink."""
+    """Returns the numbers of the serial ports that speak MAVLink."""
     return [i for i in SERIALS if values.get(f"SERIAL{i}_PROTOCOL") in MAVLINK_PROTOCOLS]
 
 
@@ -31,12 +32,14 @@ def forwarding(values: Values, context: Context) -> Line:
     ports = mavlink_ports(values)
     private = [i for i in ports if _is_private(i, ports, values)]
     if private:
-        which = ", ".join(f"SERIAL{i}" for i in private)
+        port_names = ", ".join(f"SERIAL{i}" for i in private)
         if context.link.ground_devices:
-            return ok("forwarding", f"{which} does not forward: if it is ours, GPS_INPUT stays off the other links")
+            return ok(
+                "forwarding", f"{port_names} does not forward: if it is ours, GPS_INPUT stays off the other links"
+            )
         return warn(
             "forwarding",
-            f"{which} does not forward: if it is ours, our texts and the operator's hints do not pass the autopilot",
+            f"{port_names} does not forward: if it is ours, our texts and the operator's hints are not forwarded",
             "name a link to the ground in link.ground_devices",
         )
     in_flight = [f"SERIAL{i}" for i in ports if i != USB]

@@ -1,32 +1,32 @@
-"""The autopilot's parameters against the rules: a line for each that matters, and the changes that follow."""
+"""Checks the autopilot's parameters against the rules: a line per relevant parameter, and the proposed changes."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from terrafix.link.output.selection import LOCAL
+from terrafix.link.output.selection import LOCAL_FRAME_OUTPUTS
 from terrafix_tools.preflight import forwarding
 from terrafix_tools.preflight.forwarding import SERIALS, mavlink_ports
 from terrafix_tools.preflight.lines import Change, Line, Status, number, ok
 from terrafix_tools.preflight.rules import ALWAYS, EXTERNAL_NAV, GPS_INPUT_RULES, LOCAL_RULES, Context, Rule, Values
 
-SETS = (1, 2, 3)
+SOURCE_SETS = (1, 2, 3)
 
 
-def names_of(context: Context) -> list[str]:
-    """Every parameter that a rule may ask for."""
+def parameter_names(context: Context) -> list[str]:
+    """Returns every parameter that a rule may need."""
     rules = [_name(rule, context) for rule in (*ALWAYS, *GPS_INPUT_RULES, *LOCAL_RULES)]
-    sources = [f"EK3_SRC{k}_{what}" for k in SETS for what in ("POSXY", "VELXY", "YAW")]
+    sources = [f"EK3_SRC{k}_{what}" for k in SOURCE_SETS for what in ("POSXY", "VELXY", "YAW")]
     serial = [f"SERIAL{i}_{what}" for i in SERIALS for what in ("PROTOCOL", "BAUD")]
-    names = [*rules, f"GPS{context.other}_TYPE", *sources, *serial, *forwarding.names_of(context)]
+    names = [*rules, f"GPS{context.other}_TYPE", *sources, *serial, *forwarding.parameter_names(context)]
     return list(dict.fromkeys(names))
 
 
-def judge(values: Values, context: Context) -> Iterator[Line]:
-    """A line for each parameter that matters to the configured outputs."""
+def check_parameters(values: Values, context: Context) -> Iterator[Line]:
+    """Yields a line for each parameter that matters to the configured outputs."""
     outputs = context.outputs
     rules: list[Rule] = [*(GPS_INPUT_RULES if "gps_input" in outputs else ())]
-    local = [name for name in outputs if name in LOCAL]
+    local = [name for name in outputs if name in LOCAL_FRAME_OUTPUTS]
     rules += LOCAL_RULES if local else ()
-    skipped = set() if "gps_input" in outputs else {"EK3_SRC1_YAW"}  # asked of the set that is used, below
+    skipped = set() if "gps_input" in outputs else {"EK3_SRC1_YAW"}  # checked for the source set in use, below
     rules += [rule for rule in ALWAYS if rule.name not in skipped]
     for rule in rules:
         if rule.applies(context, values):
@@ -40,7 +40,7 @@ def judge(values: Values, context: Context) -> Iterator[Line]:
     yield _identity(context)
 
 
-def changes_of(lines: Iterable[Line]) -> list[Change]:
+def proposed_changes(lines: Iterable[Line]) -> list[Change]:
     return [line.change for line in lines if line.change is not None]
 
 
@@ -58,21 +58,21 @@ def _line(rule: Rule, values: Values, context: Context) -> Line:
             text="this firmware has no such parameter",
             fix="the names are those of ArduPilot 4.6; check its documentation",
         )
-    if rule.good(value):
+    if rule.valid(value):
         return ok(name, number(value))
     new = rule.fix(value, context)
     return Line(
         check=name,
         status=rule.status,
-        text=f"is {number(value)}: {rule.why}",
+        text=f"is {number(value)}: {rule.reason}",
         fix="" if new is None else f"set {number(new)}",
         change=None if new is None else Change(name=name, old=value, new=new),
     )
 
 
 def _source_set(values: Values, outputs: Sequence[str]) -> Line:
-    """One set of sources must be external navigation, without its yaw."""
-    found = [k for k in SETS if values.get(f"EK3_SRC{k}_POSXY") == EXTERNAL_NAV]
+    """One source set must use external navigation, without its yaw."""
+    found = [k for k in SOURCE_SETS if values.get(f"EK3_SRC{k}_POSXY") == EXTERNAL_NAV]
     if not found:
         text = f"no EK3_SRCn_POSXY is 6, so that {', '.join(outputs)} is not used"
         return Line(check="source set", status=Status.FAIL, text=text, fix="set EK3_SRC2_POSXY 6 (and VELXY 6)")
@@ -95,8 +95,8 @@ def _serial(values: Values, baud: int) -> Line:
     same = [i for i, code in ports.items() if code is not None and code in (baud, baud // 1000)]
     if same:
         return ok("serial port", f"SERIAL{same[0]} speaks MAVLink at {baud} baud")
-    said = ", ".join(f"SERIAL{i} {code:g}" for i, code in ports.items() if code is not None) or "none"
-    text = f"no port speaks MAVLink at {baud} baud (MAVLink: {said})"
+    port_bauds = ", ".join(f"SERIAL{i} {code:g}" for i, code in ports.items() if code is not None) or "none"
+    text = f"no port speaks MAVLink at {baud} baud (MAVLink: {port_bauds})"
     return Line(check="serial port", status=Status.WARN, text=text, fix="compare link.baud and SERIALn_BAUD")
 
 

@@ -1,4 +1,4 @@
-"""What a check says: one line, with a reason and, where there is one, the fix."""
+"""Result of a check: one line with a reason and, if there is one, a fix."""
 
 from enum import StrEnum
 
@@ -7,12 +7,12 @@ import msgspec
 
 class Status(StrEnum):
     OK = "ok"
-    WARN = "warn"  # it will fly, less well, or it cannot be seen from here
-    FAIL = "fail"  # it will not work, or will end badly
+    WARN = "warn"  # flight possible with reduced performance, or the state cannot be determined from here
+    FAIL = "fail"  # will not work, or is unsafe
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True):
-    """A parameter that ``--write`` sets."""
+    """A parameter change that ``--write`` applies."""
 
     name: str
     old: float
@@ -22,8 +22,8 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
 class Line(msgspec.Struct, frozen=True, kw_only=True):
     check: str
     status: Status
-    text: str  # what is, and why that is good or bad
-    fix: str = ""  # what to do
+    text: str  # current state, and why that is good or bad
+    fix: str = ""  # remedy
     change: Change | None = None
 
 
@@ -40,5 +40,5 @@ def fail(check: str, text: str, fix: str) -> Line:
 
 
 def number(value: float) -> str:
-    """A parameter's value as parameter files have it: whole numbers whole, others to the 7 digits of a float32."""
+    """Formats a parameter as in parameter files: integers without fraction, others with the 7 digits of a float32."""
     return str(int(value)) if value == int(value) else f"{value:.7g}"

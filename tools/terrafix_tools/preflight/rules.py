@@ -1,10 +1,10 @@
-"""What the autopilot's parameters have to be, and why. The facts: docs/autopilot.md."""
+"""Required values of the autopilot's parameters, with reasons. The facts: docs/autopilot.md."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from terrafix.core.config import LinkSection
-from terrafix.link.output.selection import Outputs
+from terrafix.link.output.selection import PositionOutputs
 from terrafix_tools.preflight.lines import Status
 
 MAV_GPS = 14
@@ -16,17 +16,17 @@ DELAY_MS = (1.0, 50.0)
 
 @dataclass(frozen=True)
 class Context:
-    """What the rules depend on besides the parameters."""
+    """Inputs of the rules other than the parameters."""
 
     link: LinkSection
     plane: bool
     sysid: int
-    delay_ms: int  # advice for GPSn_DELAY_MS
+    delay_ms: int  # recommended value of GPSn_DELAY_MS
     firmware: tuple[int, int] = (4, 6)  # major, minor
 
     @property
     def gps(self) -> int:
-        """Our number among the GPS parameters."""
+        """Our index among the GPS parameters."""
         return self.link.gps_id + 1
 
     @property
@@ -35,7 +35,7 @@ class Context:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        return Outputs(self.link.outputs, 0).names("ardupilot")
+        return PositionOutputs(self.link.outputs, 0).names("ardupilot")
 
 
 Values = dict[str, float]
@@ -43,21 +43,23 @@ Values = dict[str, float]
 
 @dataclass(frozen=True)
 class Rule:
-    """``name`` has {n} for our GPS and {m} for the other one. ``fix``: the value that would do; None: ask a person."""
+    """``name`` contains {n} for our GPS and {m} for the other one. ``fix``: a valid value; None: the operator has to
+    decide.
+    """
 
     name: str
-    good: Callable[[float], bool]
+    valid: Callable[[float], bool]
     fix: Callable[[float, Context], float | None]
     status: Status
-    why: str
+    reason: str
     applies: Callable[[Context, Values], bool] = lambda _c, _v: True
 
 
-def _is(*allowed: float) -> Callable[[float], bool]:
+def _one_of(*allowed: float) -> Callable[[float], bool]:
     return lambda value: value in allowed
 
 
-def _to(value: float) -> Callable[[float, Context], float | None]:
+def _constant(value: float) -> Callable[[float, Context], float | None]:
     return lambda _value, _context: value
 
 
@@ -69,13 +71,13 @@ def _copter(context: Context, _values: Values) -> bool:
     return not context.plane
 
 
-def _beside(context: Context, values: Values) -> bool:
-    """There is a real receiver, too."""
+def _has_receiver(context: Context, values: Values) -> bool:
+    """There is also a real receiver."""
     return values.get(f"GPS{context.other}_TYPE", 0.0) > 0
 
 
 GPS_INPUT_RULES = (
-    Rule("GPS{n}_TYPE", _is(MAV_GPS), _to(MAV_GPS), Status.FAIL, "GPS_INPUT is taken by type 14 alone"),
+    Rule("GPS{n}_TYPE", _one_of(MAV_GPS), _constant(MAV_GPS), Status.FAIL, "only type 14 accepts GPS_INPUT"),
     Rule(
         "GPS{n}_DELAY_MS",
         lambda v: DELAY_MS[0] <= v <= DELAY_MS[1],
@@ -85,29 +87,29 @@ GPS_INPUT_RULES = (
     ),
     Rule(
         "GPS_AUTO_SWITCH",
-        _is(0, 4),
-        _to(4),
+        _one_of(0, 4),
+        _constant(4),
         Status.WARN,
         "4 flies on the receiver while it has a 3D fix, and on Terrafix when not; 1 and 2 choose by number or blend",
-        _beside,
+        _has_receiver,
     ),
     Rule(
         "GPS_PRIMARY",
-        _is(0, 1),
+        _one_of(0, 1),
         lambda _v, c: float(c.other - 1),
         Status.WARN,
         "the real receiver is the primary one on the ground",
-        _beside,
+        _has_receiver,
     ),
-    Rule("EK3_SRC1_POSXY", _is(GPS), _to(GPS), Status.FAIL, "position comes as GPS"),
+    Rule("EK3_SRC1_POSXY", _one_of(GPS), _constant(GPS), Status.FAIL, "position comes as GPS"),
     Rule(
         "EK3_SRC1_VELXY",
-        _is(GPS),
-        _to(GPS),
+        _one_of(GPS),
+        _constant(GPS),
         Status.FAIL,
         "velocity is sent; without it the filter follows a wrong position within seconds",
     ),
-    Rule("EK3_SRC1_VELZ", _is(0, GPS), _to(GPS), Status.WARN, "vertical velocity is sent"),
+    Rule("EK3_SRC1_VELZ", _one_of(0, GPS), _constant(GPS), Status.WARN, "vertical velocity is sent"),
     Rule(
         "EK3_GPS_CHECK",
         lambda v: not int(v) & POSITION_ACCURACY,
@@ -115,38 +117,59 @@ GPS_INPUT_RULES = (
         Status.FAIL,
         "with bit 3 an honest accuracy above 5 m never aligns the filter, not even in the air",
     ),
-    Rule("EK3_CHECK_SCALE", lambda v: 100 <= v <= 200, _to(100), Status.WARN, "tighter limits never align it"),
+    Rule(
+        "EK3_CHECK_SCALE",
+        lambda v: 100 <= v <= 200,
+        _constant(100),
+        Status.WARN,
+        "with tighter limits the filter does not align",
+    ),
     Rule(
         "EK3_VELNE_M_NSE",
         lambda v: 0.8 <= v < 1.0,
-        _to(0.9),
+        _constant(0.9),
         Status.FAIL,
         "its velocity gate takes this: with 0.3 a copter ended in its failsafe, with 1 or more it does not align",
     ),
-    Rule("EK3_VEL_I_GATE", lambda v: v >= 800, _to(800), Status.WARN, "the same gate, in hundredths of sigma"),
-    Rule("EK3_POS_I_GATE", lambda v: 300 <= v <= 1000, _to(500), Status.WARN, "hundredths of sigma of our accuracy"),
-    Rule("GPS_HDOP_GOOD", lambda v: v >= 110, _to(140), Status.FAIL, "we say 1.0, and it must be below", _copter),
+    Rule("EK3_VEL_I_GATE", lambda v: v >= 800, _constant(800), Status.WARN, "the same gate, in hundredths of sigma"),
+    Rule(
+        "EK3_POS_I_GATE", lambda v: 300 <= v <= 1000, _constant(500), Status.WARN, "hundredths of sigma of our accuracy"
+    ),
+    Rule(
+        "GPS_HDOP_GOOD",
+        lambda v: v >= 110,
+        _constant(140),
+        Status.FAIL,
+        "GPS_INPUT has an HDOP of 1.0, which must be below it",
+        _copter,
+    ),
     Rule(
         "ARMING_CHECK",
         lambda v: v != 1 and not int(v) & GPS_ARMING,
-        _to(ALL_BUT_GPS),
+        _constant(ALL_BUT_GPS),
         Status.WARN,
-        "arming wants a 3D fix of every GPS, and Terrafix has none on the ground",
-        _beside,
+        "arming requires a 3D fix of every GPS, and Terrafix has none on the ground",
+        _has_receiver,
     ),
 )
 LOCAL_RULES = (
-    Rule("VISO_TYPE", _is(1), _to(1), Status.FAIL, "1 (MAVLink) takes ODOMETRY and VISION_POSITION_ESTIMATE"),
-    Rule("VISO_DELAY_MS", lambda v: v <= 50, lambda _v, c: float(c.delay_ms), Status.WARN, "what is sent is of now"),
+    Rule("VISO_TYPE", _one_of(1), _constant(1), Status.FAIL, "1 (MAVLink) takes ODOMETRY and VISION_POSITION_ESTIMATE"),
+    Rule(
+        "VISO_DELAY_MS",
+        lambda v: v <= 50,
+        lambda _v, c: float(c.delay_ms),
+        Status.WARN,
+        "positions are for the moment of sending",
+    ),
 )
 ALWAYS = (
-    Rule("EK3_ENABLE", _is(1), _to(1), Status.FAIL, "the facts are of EKF3"),
-    Rule("AHRS_EKF_TYPE", _is(3), _to(3), Status.FAIL, "the facts are of EKF3"),
-    Rule("EK3_SRC1_POSZ", _is(BARO), _to(BARO), Status.WARN, "our height is no better than the barometer's"),
+    Rule("EK3_ENABLE", _one_of(1), _constant(1), Status.FAIL, "the rules apply to EKF3"),
+    Rule("AHRS_EKF_TYPE", _one_of(3), _constant(3), Status.FAIL, "the rules apply to EKF3"),
+    Rule("EK3_SRC1_POSZ", _one_of(BARO), _constant(BARO), Status.WARN, "our height is no better than the barometer's"),
     Rule(
         "EK3_SRC1_YAW",
         lambda v: v not in (2, 3, EXTERNAL_NAV),
-        _to(COMPASS),
+        _constant(COMPASS),
         Status.FAIL,
         "we send no yaw of our own",
     ),
@@ -169,7 +192,7 @@ ALWAYS = (
     Rule(
         "FS_EKF_THRESH",
         lambda v: v > 0,
-        _to(0.8),
+        _constant(0.8),
         Status.WARN,
         "0 switches the failsafe for a lost position off",
         _copter,

@@ -1,7 +1,8 @@
-"""`terrafix preflight`: every check, what it says to people and programs, and the parameters that it may set."""
+"""`terrafix preflight`: runs all checks, prints text or JSON, and optionally sets parameters."""
 
 import tempfile
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -11,7 +12,7 @@ from terrafix.core.config import Config, load
 from terrafix.core.errors import LinkError, OutputError, UsageError
 from terrafix_tools.preflight import computer, ground, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
-from terrafix_tools.preflight.judge import changes_of, judge, names_of
+from terrafix_tools.preflight.judge import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.lines import Change, Line, Status, fail, number
 from terrafix_tools.preflight.rules import Context
 
@@ -19,12 +20,12 @@ MARKS = {Status.OK: "ok  ", Status.WARN: "warn", Status.FAIL: "FAIL"}
 
 
 class Preflight(msgspec.Struct, frozen=True, kw_only=True):
-    """What ``--json`` prints. ``ready``: nothing failed."""
+    """Output of ``--json``. ``ready``: no check failed."""
 
     ready: bool
     lines: list[Line]
     written: list[Change] = []
-    saved_to: str = ""  # the old values of what was written
+    saved_to: str = ""  # file with the previous values of the written parameters
 
 
 def preflight(
@@ -39,56 +40,85 @@ def preflight(
     as_json: bool = False,
     with_computer: bool = True,
 ) -> bool:
-    """Prints every line. -> nothing failed. Raises ConfigError, OutputError, UsageError; LinkError in writing."""
+    """Runs and prints all checks; returns True when none failed. Raises ConfigError, OutputError, UsageError;
+    LinkError while writing.
+    """
     if write and as_json and not yes:
-        raise UsageError("--write asks before it sets anything, which --json cannot; add --yes")
-    config = _configured(load(configs), link, map_path)
-    lines, written, saved_to = [], [], ""
+        raise UsageError("--write needs a confirmation, which --json cannot request; add --yes")
+    config = _with_options(load(configs), link, map_path)
+    checks = _Checks(mission=mission)
     with tempfile.TemporaryDirectory() as folder:
         try:
-            with Autopilot(config.link) as autopilot:
-                autopilot.connect()
-                if write and autopilot.armed:
-                    raise UsageError("the autopilot is armed; disarm it before parameters are set")
-                of_vehicle = list(_of_vehicle(autopilot, config))
-                lines += of_vehicle
-                if mission is None:
-                    on_board = Path(folder) / "mission on board"
-                    none = vehicle.save_mission(autopilot, on_board)
-                    lines += [none] if none is not None else []
-                    mission = on_board if none is None else None
-                if not as_json:
-                    show(lines)
-                changes = changes_of(of_vehicle)
-                if write and changes and (yes or _confirmed(changes)):
-                    saved_to = str(_save(changes, out))
-                    for change in changes:
-                        autopilot.write(change.name, change.new)
-                        written.append(change)
+            _check_autopilot(
+                checks, config, Path(folder), quiet=as_json, write_to=out if write else None, confirmed=yes
+            )
         except LinkError as error:
-            if written or saved_to:
+            if checks.written or checks.saved_to:
                 raise
             text, _, todo = str(error).partition("; ")
-            lines.append(fail("autopilot", text, todo))
+            checks.lines.append(fail("autopilot", text, todo))
             if not as_json:
-                show(lines)
-        shown = len(lines)
+                show(checks.lines)
+        shown = len(checks.lines)
         if with_computer:
-            lines += [*ground.about(config.link), *computer.about(config, mission, out)]
-    said = Preflight(
-        ready=all(
-            line.status is not Status.FAIL for line in lines if line.change not in written or line.change is None
-        ),
-        lines=lines,
-        written=written,
-        saved_to=saved_to,
-    )
+            checks.lines += [*ground.check_lines(config.link), *computer.check_lines(config, checks.mission, out)]
+    result = checks.result()
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(said), indent=2).decode())
+        typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=2).decode())
     else:
-        show(lines[shown:])
-        _conclude(said)
-    return said.ready
+        show(checks.lines[shown:])
+        _print_summary(result)
+    return result.ready
+
+
+@dataclass
+class _Checks:
+    """State of a run. ``mission``: mission file to check; None: none is known."""
+
+    mission: Path | None
+    lines: list[Line] = field(default_factory=list)
+    written: list[Change] = field(default_factory=list)
+    saved_to: str = ""
+
+    def result(self) -> Preflight:
+        """``ready`` disregards failures that a written change has fixed."""
+        return Preflight(
+            ready=all(
+                line.status is not Status.FAIL
+                for line in self.lines
+                if line.change not in self.written or line.change is None
+            ),
+            lines=self.lines,
+            written=self.written,
+            saved_to=self.saved_to,
+        )
+
+
+def _check_autopilot(
+    checks: _Checks, config: Config, folder: Path, *, quiet: bool, write_to: Path | None, confirmed: bool
+) -> None:
+    """Adds the autopilot's lines to ``checks`` and sets wrong parameters if ``write_to`` (folder of the previous
+    values) is given. Without a mission file the mission on board is saved in ``folder``. Raises LinkError, UsageError.
+    """
+    with Autopilot(config.link) as autopilot:
+        autopilot.connect()
+        if write_to is not None and autopilot.armed:
+            raise UsageError("the autopilot is armed; disarm it before parameters are set")
+        vehicle_lines = list(_vehicle_lines(autopilot, config))
+        checks.lines += vehicle_lines
+        if checks.mission is None:
+            on_board = folder / "mission on board"
+            none = vehicle.save_mission(autopilot, on_board)
+            checks.lines += [none] if none is not None else []
+            checks.mission = on_board if none is None else None
+        if not quiet:
+            show(checks.lines)
+        changes = proposed_changes(vehicle_lines)
+        if write_to is not None and changes and (confirmed or _confirmed(changes)):
+            checks.saved_to = str(_save(changes, write_to))
+            for change in changes:
+                autopilot.write(change.name, change.new)
+                checks.written.append(change)
 
 
 def show(lines: list[Line]) -> None:
@@ -97,8 +127,8 @@ def show(lines: list[Line]) -> None:
         typer.echo(f"{MARKS[line.status]}  {line.check:<16} {line.text}{fix}")
 
 
-def _configured(config: Config, link: str, map_path: Path | None) -> Config:
-    """The command line wins."""
+def _with_options(config: Config, link: str, map_path: Path | None) -> Config:
+    """Applies the options of the command line, which override the configuration."""
     if link:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, device=link))
     if map_path is not None:
@@ -106,24 +136,24 @@ def _configured(config: Config, link: str, map_path: Path | None) -> Config:
     return config
 
 
-def _of_vehicle(autopilot: Autopilot, config: Config) -> list[Line]:
+def _vehicle_lines(autopilot: Autopilot, config: Config) -> list[Line]:
     round_trip_ms = autopilot.round_trip_ms()
-    lines = list(vehicle.about(autopilot, config.link, round_trip_ms))
+    lines = list(vehicle.check_lines(autopilot, config.link, round_trip_ms))
     delay_ms = vehicle.delay_advice_ms(config.link, round_trip_ms)
-    firmware = vehicle.firmware_of(autopilot.newest.get(("AUTOPILOT_VERSION", autopilot.sysid)))
+    firmware = vehicle.firmware_version(autopilot.newest.get(("AUTOPILOT_VERSION", autopilot.sysid)))
     context = Context(config.link, autopilot.plane, autopilot.sysid, delay_ms, firmware)
-    return lines + list(judge(autopilot.read(names_of(context)), context))
+    return lines + list(check_parameters(autopilot.read(parameter_names(context)), context))
 
 
 def _confirmed(changes: list[Change]) -> bool:
-    typer.echo("\nThese parameters of the autopilot would be set:")
+    typer.echo("\nThese parameters of the autopilot will be set:")
     for change in changes:
         typer.echo(f"  {change.name:<16} {number(change.old)} -> {number(change.new)}")
     return typer.confirm("Set them?", default=False)
 
 
 def _save(changes: list[Change], out: Path) -> Path:
-    """The old values as a parameter file, before anything is set. Raises OutputError."""
+    """Saves the previous values as a parameter file before anything is set. Raises OutputError."""
     path = out / f"parameters-before-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}.param"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -133,15 +163,15 @@ def _save(changes: list[Change], out: Path) -> Path:
     return path
 
 
-def _conclude(said: Preflight) -> None:
-    count = {status: sum(line.status is status for line in said.lines) for status in Status}
-    if said.written:
-        typer.echo(f"\n{len(said.written)} parameters set; their old values are in {said.saved_to}")
-        typer.echo("Restart the autopilot, and run this again.")
+def _print_summary(result: Preflight) -> None:
+    count = {status: sum(line.status is status for line in result.lines) for status in Status}
+    if result.written:
+        typer.echo(f"\n{len(result.written)} parameters set; their previous values are in {result.saved_to}")
+        typer.echo("Restart the autopilot and run preflight again.")
     typer.echo(
-        f"\n{count[Status.OK]} ok, {_many(count[Status.WARN], 'warning')}, {_many(count[Status.FAIL], 'failure')}"
+        f"\n{count[Status.OK]} ok, {_plural(count[Status.WARN], 'warning')}, {_plural(count[Status.FAIL], 'failure')}"
     )
 
 
-def _many(number: int, what: str) -> str:
+def _plural(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"

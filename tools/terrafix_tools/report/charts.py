@@ -1,25 +1,25 @@
-"""Charts of the report as plain SVG: no library, no script needed to read them."""
+"""Charts of the report as plain SVG; readable without a library or a script."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 
-WIDTH = 1000  # of a chart over the whole page, in its own units
-HALF_WIDTH = 540  # of a chart in a column
-GUTTER = 70  # left, for the labels of the y axis
+WIDTH = 1000  # of a chart across the whole page, in SVG units
+HALF_WIDTH = 540  # of a chart in a column, SVG units
+GUTTER = 70  # left margin for the labels of the y axis
 RIGHT = 14
 TOP = 12
-AXIS = 26  # bottom, for the labels of the x axis
+AXIS = 26  # bottom margin for the labels of the x axis
 TICKS_X = 9
-MOST_LOG_TICKS = 10  # of 1, 2, 5, 10 ...; beyond, only the powers of ten
+MAX_LOG_TICKS = 10  # number of ticks at 1, 2, 5, 10 ...; with more, only powers of ten are labelled
 
 Point = tuple[float, float | None]
 
 
 @dataclass
 class Chart:
-    """A frame with axes; marks are added in order and drawn in that order. x is linear, y linear or logarithmic."""
+    """Axes and marks, drawn in the order of the calls. The y axis is linear or logarithmic, as is x."""
 
     x_max: float
     y_min: float
@@ -31,7 +31,7 @@ class Chart:
     log_y: bool = False
     x_unit: str = "s"
     y_unit: str = "m"
-    follow: bool = True  # the pointer's moment is marked in this chart
+    follow: bool = True  # the pointer's time is marked in this chart
     marks: list[str] = field(default_factory=list)
 
     def x(self, value: float) -> float:
@@ -53,13 +53,13 @@ class Chart:
         return self.height - AXIS - span * min(1.0, max(0.0, share))
 
     def line(self, points: Sequence[Point], css: str) -> None:
-        """A line that breaks where a value is None."""
+        """Draws a line with gaps where a value is None."""
         for run in _runs(points):
             text = " ".join(f"{self.x(a):.1f},{self.y(b):.1f}" for a, b in run)
             self.marks.append(f'<polyline class="line {css}" points="{text}"/>')
 
     def area(self, points: Sequence[Point], css: str) -> None:
-        """Filled from the bottom of the chart up to the line."""
+        """Fills the area between the bottom of the chart and the line."""
         floor = self.height - AXIS
         for run in _runs(points):
             text = " ".join(f"{self.x(a):.1f},{self.y(b):.1f}" for a, b in run)
@@ -74,11 +74,11 @@ class Chart:
         )
 
     def band(self, x_low: float, x_high: float, css: str, tip: str) -> None:
-        """A stretch of the x axis, from the top of the chart to its bottom."""
+        """Marks an interval of the x axis over the full height of the chart."""
         self._block(x_low, x_high, TOP, self.height - AXIS, css, tip)
 
-    def foot(self, x_low: float, x_high: float, css: str, tip: str, height: int) -> None:
-        """A stretch of the x axis, as a strip on the bottom of the chart."""
+    def bottom_strip(self, x_low: float, x_high: float, css: str, tip: str, height: int) -> None:
+        """Marks an interval of the x axis as a strip at the bottom of the chart."""
         self._block(x_low, x_high, self.height - AXIS - height, self.height - AXIS, css, tip)
 
     def _block(self, x_low: float, x_high: float, top: int, bottom: int, css: str, tip: str) -> None:
@@ -88,8 +88,8 @@ class Chart:
             f'height="{bottom - top}"><title>{escape(tip)}</title></rect>'
         )
 
-    def upright(self, value: float, text: str, row: int = 0) -> None:
-        """A vertical line with words in the ``row``-th line of text beside it; rows keep neighbours apart."""
+    def vertical_line(self, value: float, text: str, row: int = 0) -> None:
+        """Draws a vertical line with a label in the ``row``-th text line; rows separate neighbouring labels."""
         x = self.x(value)
         anchor, dx = ("end", -5) if x > self.width * 0.6 else ("start", 5)
         self.marks.append(
@@ -99,7 +99,7 @@ class Chart:
         )
 
     def level(self, value: float, text: str = "") -> None:
-        """A horizontal line, with a word at its right end."""
+        """Draws a horizontal line with a label at its right end."""
         y = self.y(value)
         self.marks.append(
             f'<line class="level" x1="{GUTTER}" x2="{self.width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
@@ -131,14 +131,14 @@ class Chart:
 
 @dataclass
 class Band:
-    """One row of a strip: (from, to, css class, what the pointer reads)."""
+    """One row of a strip chart: (from, to, css class, tooltip)."""
 
     name: str
     spans: list[tuple[float, float, str, str]]
 
 
 def strips(bands: Sequence[Band], x_max: float, label: str) -> str:
-    """Rows of coloured spans over one time axis."""
+    """Draws rows of coloured intervals over one time axis."""
     row, gap = 20, 8
     height = len(bands) * (row + gap) + AXIS
     axis = Chart(x_max=x_max, y_min=0, y_max=1, height=height)
@@ -164,11 +164,11 @@ def strips(bands: Sequence[Band], x_max: float, label: str) -> str:
 
 
 def ticks(low: float, high: float, count: int, log: bool = False, sixties: bool = False) -> list[float]:
-    """Round values inside [low, high]; ``sixties``: round as minutes are."""
+    """Returns round values inside [low, high]; ``sixties``: multiples suited to minutes."""
     if log:
         decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
         values = [v for d in decades for v in (10.0**d, 2 * 10.0**d, 5 * 10.0**d) if low <= v <= high]
-        return values if len(values) <= MOST_LOG_TICKS else [10.0**d for d in decades if low <= 10.0**d <= high]
+        return values if len(values) <= MAX_LOG_TICKS else [10.0**d for d in decades if low <= 10.0**d <= high]
     span = high - low
     if span <= 0:
         return [low]
@@ -181,7 +181,7 @@ def ticks(low: float, high: float, count: int, log: bool = False, sixties: bool 
 
 
 def clock(seconds: float) -> str:
-    """75 -> 1:15"""
+    """Formats seconds: 75 -> 1:15."""
     whole = round(seconds)
     if abs(seconds - whole) > 1e-6 and seconds < 60:
         return f"{seconds:g} s"
@@ -191,7 +191,7 @@ def clock(seconds: float) -> str:
 
 
 def spans_of(samples: Sequence[tuple[float, str]], end: float) -> list[tuple[float, float, str]]:
-    """Samples of a state -> stretches of one state, each until the next sample."""
+    """Converts samples of a state to intervals of constant state, each until the next sample."""
     spans: list[tuple[float, float, str]] = []
     for i, (at, state) in enumerate(samples):
         until = samples[i + 1][0] if i + 1 < len(samples) else max(end, at)

@@ -1,4 +1,4 @@
-"""What a report shows, gathered from the folder of a replay or of a live run."""
+"""Collects the data of a report from the folder of a replay or of a live run."""
 
 import json
 import math
@@ -22,7 +22,7 @@ from terrafix.messages import (
     SlowErrors,
     StatusText,
 )
-from terrafix.recorder.reader import ReadResult, read_heard, read_thumbnails
+from terrafix.recorder.reader import ReadResult, read_received, read_thumbnails
 from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, Row, RowTable, read_rows
 from terrafix_tools.evaluate import (
     ELLIPSE95,
@@ -40,15 +40,15 @@ from terrafix_tools.finalise.output import read_track
 
 @dataclass
 class FlightView:
-    """Everything in order of time; times in seconds from the first frame."""
+    """Data of a report, in order of time; times in seconds from the first frame."""
 
     title: str
     rows: list[Row]
     frame_ids: list[int]
     origin: Origin | None = None
-    learnt: SlowErrors | None = None  # the newest
-    unfinished: bool = False  # a replay that was killed
-    live: bool = False  # from a record of the live processes; process_ms is then the delay of the estimate
+    calibration: SlowErrors | None = None  # the last one
+    unfinished: bool = False  # an interrupted replay
+    live: bool = False  # from a live record; process_ms is then the delay of the estimate
     summary: dict[str, Any] = field(default_factory=dict)
     header: dict[str, Any] = field(default_factory=dict)
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
@@ -60,12 +60,12 @@ class FlightView:
     pilot_texts: list[tuple[float, StatusText]] = field(default_factory=list)
     dropped: Counter[str] = field(default_factory=Counter)  # "process: message"
     thumbnails: dict[int, bytes] = field(default_factory=dict)
-    compared: dict[str, Compared] = field(default_factory=dict)  # by file, when there is truth
+    compared: dict[str, Compared] = field(default_factory=dict)  # by file, if there is ground truth
     truth_track: list[Truth] = field(default_factory=list)
     finalised: list[tuple[float, float]] = field(default_factory=list)  # latitude, longitude of finalised.csv
     evaluation: dict[str, Any] | None = None
-    peer: dict[str, Any] = field(default_factory=dict)  # what the simulated autopilot noted
-    cut_off: int = 0  # record files without their end
+    peer: dict[str, Any] = field(default_factory=dict)  # peer.json of the simulated autopilot
+    cut_off: int = 0  # number of record files without end
 
     @property
     def duration_s(self) -> float:
@@ -74,32 +74,36 @@ class FlightView:
         return max(ends, default=0.0)
 
     def error_m(self, row: Row) -> float | None:
-        found = self.compared.get(row.file)
-        return found.error_m if found else None
+        compared = self.compared.get(row.file)
+        return compared.error_m if compared else None
 
     def refined_error_m(self, row: Row) -> float | None:
-        found = self.compared.get(row.file)
-        return found.refined_error_m if found else None
+        compared = self.compared.get(row.file)
+        return compared.refined_error_m if compared else None
 
 
 def radius95_m(row: Row) -> float | None:
-    """Longer half axis of the claimed 95 % ellipse."""
+    """Semi-major axis of the reported 95 % ellipse, m."""
     axes = ellipse95(row)
     return axes[0] if axes else None
 
 
 def ellipse95(row: Row) -> tuple[float, float, float] | None:
-    """Half axes a >= b (m) and the direction of a (radians from east towards north) of the claimed 95 % ellipse."""
+    """Returns the semi-axes a >= b (m) and the direction of a (radians from east towards north) of the reported 95 %
+    ellipse.
+    """
     if row.sigma_e_m is None or row.sigma_n_m is None or row.cov_en_m2 is None:
         return None
     ee, nn, en = row.sigma_e_m**2, row.sigma_n_m**2, row.cov_en_m2
-    middle, spread = (ee + nn) / 2, math.hypot((ee - nn) / 2, en)
+    mean, spread = (ee + nn) / 2, math.hypot((ee - nn) / 2, en)
     angle = math.atan2(2 * en, ee - nn) / 2
-    return math.sqrt(ELLIPSE95 * (middle + spread)), math.sqrt(ELLIPSE95 * max(0.0, middle - spread)), angle
+    return math.sqrt(ELLIPSE95 * (mean + spread)), math.sqrt(ELLIPSE95 * max(0.0, mean - spread)), angle
 
 
 def gather(folder: Path, truth_path: Path | None) -> FlightView:
-    """Raises SourceError when the folder holds no flight, EvaluationError for a truth that does not fit."""
+    """Collects the data. Raises SourceError when the folder has no flight, EvaluationError when the truth does not
+    match.
+    """
     if not folder.is_dir():
         raise SourceError(f"{folder}: no such folder; give the output of replay, run or demo")
     summary = read_summary(folder)
@@ -113,7 +117,7 @@ def gather(folder: Path, truth_path: Path | None) -> FlightView:
         view.rows = list(table.rows.values())
     view.frame_ids = list(table.rows)
     if not view.rows:
-        raise SourceError(f"{folder}: the record holds no frame; was the source of the flight opened?")
+        raise SourceError(f"{folder}: the record contains no frame; was the source of the flight opened?")
     for row in view.rows:
         row.t_s -= zero_ns / NS
     view.summary = summary
@@ -122,9 +126,9 @@ def gather(folder: Path, truth_path: Path | None) -> FlightView:
     view.peer = _read_peer(folder / "peer.json")
     if (folder / FINALISED).is_file():
         view.finalised = read_track(folder / FINALISED)
-    beside = folder / "truth.csv"
-    if truth_path is None and beside.is_file():
-        truth_path = beside
+    default_truth = folder / "truth.csv"
+    if truth_path is None and default_truth.is_file():
+        truth_path = default_truth
     if truth_path is not None:
         _add_truth(view, truth_path)
     return view
@@ -139,27 +143,28 @@ def _add_truth(view: FlightView, truth_path: Path) -> None:
 
 def _read_peer(path: Path) -> dict[str, Any]:
     try:
-        noted = json.loads(path.read_text(encoding="utf-8"))
+        peer = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
         raise EvaluationError(f"{path}: cannot be read ({error})") from None
-    return noted if isinstance(noted, dict) else {}
+    return peer if isinstance(peer, dict) else {}
 
 
 def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
-    """One pass over the record. -> rows, time of the first frame, the rest of the view."""
+    """Reads the record in one pass. Returns the rows, the time of the first frame, and the view without rows."""
     result = ReadResult()
     table = RowTable()
     view = FlightView(title="", rows=[], frame_ids=[])
     verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     sent_ns: dict[int, int] = {}
     timed: list[tuple[int, Message]] = []
-    for _, t_ns, heard_ns, message in read_heard(folder, result):
+    for _, t_ns, received_ns, message in read_received(folder, result):
         table.take(message)
         if isinstance(message, NavEstimate):
-            # Of the estimate that the row shows, the last one; the recorder looks at its clock every 10 ms.
-            sent_ns[message.frame_id] = heard_ns - message.t_ns
+            # Delay of the last estimate of a frame, which is the one in its row; the recorder's clock has a resolution
+            # of 10 ms.
+            sent_ns[message.frame_id] = received_ns - message.t_ns
         elif isinstance(message, MeasurementVerdict):
             verdicts[message.measurement][str(message.verdict)] += 1
             if message.measurement == "map":
@@ -169,7 +174,7 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
         elif isinstance(message, Origin):
             view.origin = message
         elif isinstance(message, SlowErrors):
-            view.learnt = message
+            view.calibration = message
         elif isinstance(message, Dropped):
             view.dropped[f"{message.process}: {message.message}"] += message.count
         elif isinstance(message, Health | GpsInput | ProcessEvent | StatusText | CalibrationFault):
@@ -178,6 +183,15 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
         if frame_id in sent_ns:
             row.process_ms = sent_ns[frame_id] / 1e6
     zero_ns = round(min((row.t_s for row in table.rows.values()), default=0.0) * NS)
+    _add_timed(view, timed, zero_ns)
+    view.verdicts = dict(sorted(verdicts.items()))
+    view.header = result.header
+    view.cut_off = len(result.truncated_files)
+    return table, zero_ns, view
+
+
+def _add_timed(view: FlightView, timed: list[tuple[int, Message]], zero_ns: int) -> None:
+    """Adds messages with their record times (ns) to the series of the view, in order of time."""
     for t_ns, message in sorted(timed, key=lambda item: item[0]):
         t_s = (t_ns - zero_ns) / NS
         if isinstance(message, Health):
@@ -190,7 +204,3 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
             view.events.append((t_s, message))
         elif isinstance(message, StatusText):
             view.pilot_texts.append((t_s, message))
-    view.verdicts = dict(sorted(verdicts.items()))
-    view.header = result.header
-    view.cut_off = len(result.cut_off)
-    return table, zero_ns, view

@@ -13,17 +13,18 @@ from terrafix_tools.report.charts import clock
 from terrafix_tools.report.data import FlightView, gather, radius95_m
 from terrafix_tools.report.map_picture import map_svg
 from terrafix_tools.report.sections import accuracy, states, verdicts
-from terrafix_tools.report.sections_run import link, pictures, provenance, timing
-from terrafix_tools.report.text import figures, moments, stamp
+from terrafix_tools.report.sections_run import camera_images, link, provenance, timing
+from terrafix_tools.report.text import events, figures, stamp
 
 NAME = "report.html"
-ONE_ROW = 7  # so many figures fit beside each other; more are set in two even rows
+MAX_IN_ROW = 7  # number of figures in one row; more are set in two even rows
 
 
 def report(folder: Path, truth_path: Path | None = None, map_path: Path | None = None) -> Path:
-    """Writes FOLDER/report.html and returns its path. Raises the TerrafixError family.
+    """Writes FOLDER/report.html and returns its path. Raises subclasses of TerrafixError.
 
-    Without ``truth_path`` a truth.csv in the folder is taken; without ``map_path`` the map that the flight used."""
+    Defaults: ``truth_path``: truth.csv in the folder, if it exists; ``map_path``: the map of the flight.
+    """
     view = gather(folder, truth_path)
     page = _page(view, _map_package(folder, view, map_path))
     target = folder / NAME
@@ -36,10 +37,10 @@ def report(folder: Path, truth_path: Path | None = None, map_path: Path | None =
     return target
 
 
-def _map_package(folder: Path, view: FlightView, given: Path | None) -> Path | None:
-    """The map given, or the one that the summary, the recorded configuration or the folder itself names."""
-    if given is not None:
-        return ensure_package(given, map_cache_dir())
+def _map_package(folder: Path, view: FlightView, map_path_option: Path | None) -> Path | None:
+    """Returns the given map, or the one named in the summary, the recorded configuration or found in the folder."""
+    if map_path_option is not None:
+        return ensure_package(map_path_option, map_cache_dir())
     config = view.header.get("config", {})
     named = [view.summary.get("map", {}).get("path", ""), config.get("map", {}).get("path", "")]
     candidates = [Path(name) for name in named if name.endswith(".gpkg")] + sorted(folder.glob("*.gpkg"))
@@ -48,14 +49,14 @@ def _map_package(folder: Path, view: FlightView, given: Path | None) -> Path | N
 
 def _page(view: FlightView, map_path: Path | None) -> str:
     sections = [
-        _stage(view, map_path),
-        _moments(view),
+        _map_section(view, map_path),
+        _events(view),
         accuracy(view),
         states(view),
         verdicts(view),
         timing(view),
         link(view),
-        pictures(view),
+        camera_images(view),
         provenance(view),
     ]
     data = json.dumps([{"t": round(r.t_s, 3), "h": _tip(view, r)} for r in view.rows]).replace("</", "<\\/")
@@ -85,7 +86,7 @@ def _head(view: FlightView) -> str:
         f"<span>{escape(f.name)}</span></div>"
         for f in shown
     )
-    wide = " wide" if len(shown) > ONE_ROW else ""
+    wide = " wide" if len(shown) > MAX_IN_ROW else ""
     line = " · ".join(escape(fact) for fact in facts if fact)
     return (
         f'<header><div class="eyebrow">Terrafix flight report, {kind}</div><h1>{escape(view.title)}</h1>'
@@ -93,12 +94,12 @@ def _head(view: FlightView) -> str:
     )
 
 
-def _stage(view: FlightView, map_path: Path | None) -> str:
+def _map_section(view: FlightView, map_path: Path | None) -> str:
     svg = map_svg(view, map_path)
     labels = {row.source_label for row in view.rows}
     keys = [
         ("k-sat", "map match", "satellite_anchored"),
-        ("k-vis", "carried by odometry", "visual_propagated"),
+        ("k-vis", "propagated by odometry", "visual_propagated"),
         ("k-dead", "dead reckoning", "dead_reckoned"),
     ]
     shown = "".join(f'<span><i class="key {css}"></i> {text}</span>&ensp;' for css, text, key in keys if key in labels)
@@ -121,13 +122,13 @@ def _stage(view: FlightView, map_path: Path | None) -> str:
     return f'<div class="stage">{svg}{buttons}</div><div class="legend">{boxes}</div>'
 
 
-def _moments(view: FlightView) -> str:
-    rows = "".join(f"<li><time>{stamp(t)}</time><span>{escape(text)}</span></li>" for t, text in moments(view))
-    return f'<h2>What happened</h2><ol class="moments">{rows}</ol>'
+def _events(view: FlightView) -> str:
+    rows = "".join(f"<li><time>{stamp(t)}</time><span>{escape(text)}</span></li>" for t, text in events(view))
+    return f'<h2>Events</h2><ol class="moments">{rows}</ol>'
 
 
 def _tip(view: FlightView, row: Row) -> str:
-    """What the pointer reads about a frame; HTML."""
+    """HTML tooltip of a frame."""
     lines = [f"<b>{escape(row.file) or 'frame'}</b> <span>{clock(round(row.t_s, 1))}</span>"]
     if not row.localised:
         lines.append("no position")
@@ -136,7 +137,7 @@ def _tip(view: FlightView, row: Row) -> str:
         if (error := view.error_m(row)) is not None:
             lines.append(f"error <b>{error:.1f} m</b>")
         if (radius := radius95_m(row)) is not None:
-            lines.append(f"claimed 95 % radius {radius:.1f} m")
+            lines.append(f"reported 95 % radius {radius:.1f} m")
         if row.anchor_age_ms is not None and row.anchor_age_ms >= 0:
             lines.append(f"last map match {row.anchor_age_ms / 1000:.1f} s ago")
         if row.agl_m is not None:

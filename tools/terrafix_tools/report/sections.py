@@ -1,4 +1,4 @@
-"""The upper sections of the report: accuracy, states, verdicts. HTML, or nothing when there is nothing to show."""
+"""Upper sections of the report: accuracy, states, verdicts. Each returns HTML, or "" when there is no data."""
 
 from html import escape
 from typing import Any
@@ -6,50 +6,52 @@ from typing import Any
 from terrafix_tools.report.charts import HALF_WIDTH, Band, Chart, Point, clock, spans_of, strips
 from terrafix_tools.report.data import FlightView, radius95_m
 
-ERROR_FLOOR_M = 0.5  # of the logarithmic axis; smaller errors are not told apart by any truth that we have
-WORDS = {
+ERROR_FLOOR_M = 0.5  # lower end of the logarithmic axis; the available ground truth does not resolve smaller errors
+LABELS = {
     "satellite_anchored": "map match",
-    "visual_propagated": "carried by odometry",
+    "visual_propagated": "propagated by odometry",
     "dead_reckoned": "dead reckoning",
     "": "no position",
 }
 
 
 def accuracy(view: FlightView) -> str:
-    """Error and claim over time; without truth the claim and the age of the last anchor."""
-    claim: list[Point] = [(r.t_s, radius95_m(r)) for r in view.rows]
-    known = [v for _, v in claim if v is not None]
-    if not known:
+    """Error and reported accuracy over time; without ground truth the reported accuracy and the age of the last map
+    match.
+    """
+    reported: list[Point] = [(r.t_s, radius95_m(r)) for r in view.rows]
+    values = [v for _, v in reported if v is not None]
+    if not values:
         return ""
     errors: list[Point] = [(r.t_s, view.error_m(r)) for r in view.rows]
     refined: list[Point] = [(r.t_s, view.refined_error_m(r)) for r in view.rows]
-    seen = [v for _, v in errors if v is not None]
-    if not seen:
-        return _claim_only(view, claim, max(known))
-    top = max([*known, *seen, 60.0]) * 1.15
+    error_values = [v for _, v in errors if v is not None]
+    if not error_values:
+        return _reported_only(view, reported, max(values))
+    top = max([*values, *error_values, 60.0]) * 1.15
     chart = Chart(x_max=end_s(view), y_min=ERROR_FLOOR_M, y_max=top, height=330, log_y=True)
-    chart.area(claim, "claim")
-    chart.line(claim, "claim")
+    chart.area(reported, "claim")
+    chart.line(reported, "claim")
     for limit in (20.0, 50.0):
         chart.level(limit)
     chart.line(refined, "refined")
     chart.line(errors, "error")
-    legend = [("k-ink", "error of the immediate estimate"), ("k-claim", "claimed 95 % radius")]
+    legend = [("k-ink", "error of the immediate estimate"), ("k-claim", "reported 95 % radius")]
     if any(v is not None for _, v in refined):
         legend.insert(1, ("k-good", "error after refinement"))
     return (
-        "<h2>Error and claim</h2>"
-        '<p class="lead">Honest accuracy: the line stays inside the shaded claim for 95 of 100 frames, '
-        "and the claim is no wider than it must be.</p>"
-        f'<div class="scroll">{chart.svg("Error and claimed radius over time")}</div>'
+        "<h2>Error and reported accuracy</h2>"
+        '<p class="lead">Consistent accuracy: the error is inside the shaded 95 % radius in 95 of 100 frames, '
+        "and the radius is not larger than necessary.</p>"
+        f'<div class="scroll">{chart.svg("Error and reported radius over time")}</div>'
         f"{_legend(legend)}{_cumulative(view)}"
     )
 
 
-def _claim_only(view: FlightView, claim: list[Point], top: float) -> str:
+def _reported_only(view: FlightView, reported: list[Point], top: float) -> str:
     chart = Chart(x_max=end_s(view), y_min=0.0, y_max=top * 1.15, height=240)
-    chart.area(claim, "claim")
-    chart.line(claim, "claim")
+    chart.area(reported, "claim")
+    chart.line(reported, "claim")
     age: list[Point] = [
         (r.t_s, r.anchor_age_ms / 1000 if r.anchor_age_ms is not None and r.anchor_age_ms >= 0 else None)
         for r in view.rows
@@ -59,14 +61,14 @@ def _claim_only(view: FlightView, claim: list[Point], top: float) -> str:
     second.area(age, "age")
     second.line(age, "age")
     return (
-        '<h2>Claimed accuracy</h2><p class="lead">Radius of the claimed 95 % ellipse, and below it the time since the '
+        '<h2>Reported accuracy</h2><p class="lead">Radius of the reported 95 % ellipse; below it the time since the '
         "last accepted map match. There is no ground truth for this flight.</p>"
-        f'<div class="scroll">{chart.svg("Claimed radius over time")}{second.svg("Age of the last map match")}</div>'
+        f'<div class="scroll">{chart.svg("Reported radius over time")}{second.svg("Age of the last map match")}</div>'
     )
 
 
 def _cumulative(view: FlightView) -> str:
-    """Share of the frames within a distance; a frame without position never arrives."""
+    """Share of the frames within a distance; frames without position count as not within any."""
     total = len(view.compared)
     immediate = sorted(c.error_m for c in view.compared.values() if c.error_m is not None)
     refined = sorted(c.refined_error_m for c in view.compared.values() if c.refined_error_m is not None)
@@ -85,7 +87,7 @@ def _cumulative(view: FlightView) -> str:
     )
     for i, limit in enumerate((20.0, 50.0)):
         share = 100 * sum(e <= limit for e in immediate) / total
-        chart.upright(limit, f"{share:.1f} % within {limit:.0f} m", row=12 - i)
+        chart.vertical_line(limit, f"{share:.1f} % within {limit:.0f} m", row=12 - i)
     for errors, css in ((refined, "refined"), (immediate, "error")):
         steps: list[Point] = [(max(1.0, e), 100 * (i + 1) / total) for i, e in enumerate(errors)]
         chart.line([*steps, (top, 100 * len(errors) / total)] if steps else [], css)
@@ -95,37 +97,37 @@ def _cumulative(view: FlightView) -> str:
     )
     return (
         f'<div class="two" style="margin-top:34px"><div><h3>Share of frames within a distance of the truth</h3>'
-        f"{chart.svg('Cumulative error')}</div><div><h3>In numbers</h3><table>{rows}</table></div></div>"
+        f"{chart.svg('Cumulative error')}</div><div><h3>Metrics</h3><table>{rows}</table></div></div>"
     )
 
 
-def _accuracy_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
+def _accuracy_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     def pair(key: str, scale: float, unit: str) -> str:
-        values = [found.get(key), found.get(f"refined_{key}")]
+        values = [metrics.get(key), metrics.get(f"refined_{key}")]
         texts = [f"{scale * v:.1f} {unit}" for v in values if v is not None]
         return " → ".join(texts) if texts else "-"
 
     rows = [(f"within {limit} m", pair(f"within_{limit}m", 100, "%")) for limit in (5, 10, 20, 50)]
     rows += [("median error", pair("median_m", 1, "m")), ("95 % of errors below", pair("p95_m", 1, "m"))]
     rows += [("largest error", pair("max_m", 1, "m"))]
-    if found.get("ellipse95_coverage") is not None:
-        rows.append(("truth inside the 95 % ellipse", f"{100 * found['ellipse95_coverage']:.1f} %"))
-    if found.get("mean_nees") is not None:
-        rows.append(("mean NEES (2 when honest)", f"{found['mean_nees']:.2f}"))
-    rows.append(("errors over 50 m and 3 sigma", str(found.get("false_fixes", 0))))
+    if metrics.get("ellipse95_coverage") is not None:
+        rows.append(("truth inside the 95 % ellipse", f"{100 * metrics['ellipse95_coverage']:.1f} %"))
+    if metrics.get("mean_nees") is not None:
+        rows.append(("mean NEES (2 when consistent)", f"{metrics['mean_nees']:.2f}"))
+    rows.append(("errors over 50 m and 3 sigma", str(metrics.get("false_fixes", 0))))
     return rows
 
 
 def states(view: FlightView) -> str:
-    """What the estimates stood on, frame by frame, and in which state the computer was."""
+    """Source of the estimates frame by frame, and the state of the computer."""
     end = end_s(view)
-    bands = [Band("position", spans([(r.t_s, r.source_label) for r in view.rows], end, "f-", WORDS))]
+    bands = [Band("position", spans([(r.t_s, r.source_label) for r in view.rows], end, "f-", LABELS))]
     matches = [(r.t_s, view.map_verdict.get(i, "")) for i, r in zip(view.frame_ids, view.rows, strict=False)]
     ticks = []
-    for at, until, verdict in spans_of([(t, v) for t, v in matches], end):
+    for from_s, to_s, verdict in spans_of([(t, v) for t, v in matches], end):
         if verdict:
             css = "f-accepted" if verdict == "accepted" else "f-rejected"
-            ticks.append((at, until, css, f"{clock(round(at))}  {verdict.replace('_', ' ')}"))
+            ticks.append((from_s, to_s, css, f"{clock(round(from_s))}  {verdict.replace('_', ' ')}"))
     bands.append(Band("map", ticks))
     bands.append(Band("covar.", spans([(r.t_s, r.covariance_mode) for r in view.rows], end, "f-", {"": "none"})))
     if view.health:
@@ -138,7 +140,7 @@ def states(view: FlightView) -> str:
     ]
     body = strips(bands, end, "States over time")
     return (
-        '<h2>What it stood on</h2><p class="lead">Where each position came from, whether the map match of the '
+        '<h2>Sources and states</h2><p class="lead">The source of each position, whether the map match of the '
         "frame was accepted, how the covariance was computed, and the temperature band.</p>"
         f'<div class="scroll">{body}</div>{_legend(legend)}{_temperature(view, end)}'
     )
@@ -146,16 +148,16 @@ def states(view: FlightView) -> str:
 
 def _temperature(view: FlightView, end: float) -> str:
     points: list[Point] = [(t, celsius) for t, _, celsius in view.health]
-    known = [v for _, v in points if v is not None]
-    if not known:
+    values = [v for _, v in points if v is not None]
+    if not values:
         return ""
-    chart = Chart(x_max=end, y_min=min(known) - 5, y_max=max(known) + 5, height=140, y_unit="°C")
+    chart = Chart(x_max=end, y_min=min(values) - 5, y_max=max(values) + 5, height=140, y_unit="°C")
     chart.line(points, "temperature")
     return f'<div class="scroll" style="margin-top:20px">{chart.svg("Temperature")}</div>'
 
 
 def verdicts(view: FlightView) -> str:
-    """Every measurement and what became of it."""
+    """The verdicts on all measurements."""
     if not view.verdicts:
         return ""
     blocks = []
@@ -171,7 +173,7 @@ def verdicts(view: FlightView) -> str:
             )
         blocks.append(f'<div class="verdict"><h3>{escape(measurement)}</h3>{"".join(rows)}</div>')
     return (
-        '<h2>Verdicts</h2><p class="lead">Every measurement gets an answer; a rejected one names its reason.</p>'
+        '<h2>Verdicts</h2><p class="lead">Verdicts per measurement; rejected ones by reason.</p>'
         f'<div class="two">{"".join(blocks)}</div>'
     )
 
@@ -181,11 +183,11 @@ def end_s(view: FlightView) -> float:
 
 
 def spans(
-    samples: list[tuple[float, str]], end: float, prefix: str, words: dict[str, str]
+    samples: list[tuple[float, str]], end: float, prefix: str, labels: dict[str, str]
 ) -> list[tuple[float, float, str, str]]:
     return [
-        (at, until, f"{prefix}{state or 'none'}", f"{clock(round(max(0.0, at)))}  {words.get(state, state)}")
-        for at, until, state in spans_of(samples, end)
+        (from_s, to_s, f"{prefix}{state or 'none'}", f"{clock(round(max(0.0, from_s)))}  {labels.get(state, state)}")
+        for from_s, to_s, state in spans_of(samples, end)
     ]
 
 

@@ -1,17 +1,17 @@
-"""The figures at the head of the report, and the moments that a person should know of, in words."""
+"""Key figures of the report, and its list of events as text."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.link.pilot_text.statustext import fault_words
+from terrafix.link.pilot_text.statustext import fault_text
 from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.lens_words import lens_words
 from terrafix_tools.report.charts import clock
 from terrafix_tools.report.data import FlightView, radius95_m
 
-GAP_S = 0.245  # AC-14: a longer silence is a gap that an autopilot may notice
+GAP_S = 0.245  # AC-14: an autopilot may notice a longer interval
 FIX_3D = 3
 UNPLANNED = ("died", "stuck", "gave_up")
 
@@ -21,7 +21,7 @@ class Figure:
     value: str
     unit: str
     name: str
-    mood: str = ""  # "good", "fair", "bad"; empty = no judgement
+    mood: str = ""  # "good", "fair", "bad"; empty: not rated
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class GpsStats:
 
 
 def gps_stats(view: FlightView) -> GpsStats | None:
-    """None when the record has no GPS_INPUT."""
+    """Statistics of GPS_INPUT; None when the record has none."""
     if len(view.gps) < 2:
         return None
     times = np.array([t for t, _ in view.gps])
@@ -54,34 +54,34 @@ def gps_stats(view: FlightView) -> GpsStats | None:
 
 
 def figures(view: FlightView) -> list[Figure]:
-    """Six to eight figures; with truth they speak of errors, without it of what was claimed."""
+    """Returns six to eight figures: errors when there is ground truth, otherwise reported accuracy."""
     times_ms = [r.process_ms for r in view.rows if r.process_ms is not None]
     located = sum(r.localised for r in view.rows)
     shown = [_share("frames localised", located / len(view.rows), 0.99, 0.9)]
-    if (found := view.evaluation) is not None:
+    if (metrics := view.evaluation) is not None:
         shown += [
-            _share("within 20 m", found["within_20m"], 0.8, 0.6),
-            _share("within 50 m", found["within_50m"], 0.95, 0.8),
+            _share("within 20 m", metrics["within_20m"], 0.8, 0.6),
+            _share("within 50 m", metrics["within_50m"], 0.95, 0.8),
         ]
-        if found["median_m"] is not None:
-            shown.append(Figure(f"{found['median_m']:.1f}", "m", "median error"))
-            coverage = found["ellipse95_coverage"]
+        if metrics["median_m"] is not None:
+            shown.append(Figure(f"{metrics['median_m']:.1f}", "m", "median error"))
+            coverage = metrics["ellipse95_coverage"]
             mood = "good" if 0.9 <= coverage <= 0.99 else "fair" if coverage > 0.85 else "bad"
             shown.append(Figure(f"{100 * coverage:.0f}", "%", "truth inside the 95 % ellipse", mood))
-        false = found["false_fixes"]
-        shown.append(Figure(str(false), "", "confident errors over 50 m", "good" if false == 0 else "bad"))
+        false = metrics["false_fixes"]
+        shown.append(Figure(str(false), "", "false fixes over 50 m", "good" if false == 0 else "bad"))
     else:
         radii = [r for row in view.rows if (r := radius95_m(row)) is not None]
         if radii:
-            shown.append(Figure(f"{np.median(radii):.1f}", "m", "claimed 95 % radius, median"))
-            shown.append(Figure(f"{max(radii):.0f}", "m", "claimed 95 % radius, worst"))
+            shown.append(Figure(f"{np.median(radii):.1f}", "m", "reported 95 % radius, median"))
+            shown.append(Figure(f"{max(radii):.0f}", "m", "reported 95 % radius, worst"))
     if times_ms:
         name = "delay of an estimate, median" if view.live else "per frame, median"
         shown.append(Figure(f"{np.median(times_ms):.0f}", "ms", name))
     if (gps := gps_stats(view)) is not None:
         shown.append(_share("GPS_INPUT with a 3D fix", gps.share_3d, 0.9, 0.5))
         mood = "good" if gps.longest_s <= GAP_S else "fair" if gps.longest_s <= 2.0 else "bad"
-        shown.append(Figure(f"{1000 * gps.longest_s:.0f}", "ms", "longest GPS_INPUT silence", mood))
+        shown.append(Figure(f"{1000 * gps.longest_s:.0f}", "ms", "longest GPS_INPUT gap", mood))
     return shown
 
 
@@ -92,51 +92,51 @@ def _share(name: str, value: float, good: float, fair: float) -> Figure:
     )
 
 
-def moments(view: FlightView) -> list[tuple[float | None, str]]:
-    """(time or None, sentence), in order of time; what has no time comes last."""
-    said: list[tuple[float | None, str]] = []
-    said += _positions(view) + _anchors(view) + _errors(view) + _gps(view)
-    said += [(t_s, f"{fault_words(fault).capitalize()}: {fault.detail}.") for t_s, fault in view.faults]
-    said.append((None, f"Verdict: {flight_verdict(view.rows, view.faults, view.verdicts).text()}"))
-    lens = lens_words(view.origin.camera, view.learnt) if view.origin and view.learnt else None
+def events(view: FlightView) -> list[tuple[float | None, str]]:
+    """Returns (time or None, sentence), in order of time; events without time come last."""
+    entries: list[tuple[float | None, str]] = []
+    entries += _positions(view) + _anchors(view) + _errors(view) + _gps(view)
+    entries += [(t_s, f"{fault_text(fault).capitalize()}: {fault.detail}.") for t_s, fault in view.faults]
+    entries.append((None, f"Verdict: {flight_verdict(view.rows, view.faults, view.verdicts).text()}"))
+    lens = lens_words(view.origin.camera, view.calibration) if view.origin and view.calibration else None
     if lens is not None:
-        said.append((None, lens))
+        entries.append((None, lens))
     for t_s, event in view.events:
         if event.event in UNPLANNED or event.event == "restarted":
             detail = f" ({event.detail})" if event.detail else ""
-            said.append((t_s, f"Process {event.process}: {event.event.replace('_', ' ')}{detail}."))
+            entries.append((t_s, f"Process {event.process}: {event.event.replace('_', ' ')}{detail}."))
     if view.dropped:
         total = sum(view.dropped.values())
         worst = ", ".join(name for name, _ in view.dropped.most_common(3))
         were = "message was" if total == 1 else "messages were"
-        said.append((None, f"{total} {were} dropped on the way ({worst})."))
+        entries.append((None, f"{total} {were} dropped ({worst})."))
     if view.cut_off:
-        said.append((None, f"{view.cut_off} file(s) of the record end abruptly; all before their end is shown."))
-    return sorted(said, key=lambda m: math.inf if m[0] is None else m[0])
+        entries.append((None, f"{view.cut_off} file(s) of the record are truncated; their readable part is shown."))
+    return sorted(entries, key=lambda m: math.inf if m[0] is None else m[0])
 
 
 def _positions(view: FlightView) -> list[tuple[float | None, str]]:
     first = next((row for row in view.rows if row.localised), None)
     if first is None:
         return [(None, "No frame was localised.")]
-    said: list[tuple[float | None, str]] = [(first.t_s, "First position.")]
+    entries: list[tuple[float | None, str]] = [(first.t_s, "First position.")]
     empty = [row for row in view.rows if not row.localised]
     if empty:
-        said.append((empty[0].t_s, f"{len(empty)} of {len(view.rows)} frames have no position; this is the first."))
-    return said
+        entries.append((empty[0].t_s, f"{len(empty)} of {len(view.rows)} frames have no position; this is the first."))
+    return entries
 
 
 def _anchors(view: FlightView) -> list[tuple[float | None, str]]:
     first = next((row for row in view.rows if row.anchor_age_ms is not None and row.anchor_age_ms >= 0), None)
     if first is None:
-        return [(None, "No map match was ever accepted: every position is carried forward from the start.")]
-    said: list[tuple[float | None, str]] = [(first.t_s, "First accepted map match.")]
+        return [(None, "No map match was accepted: every position is propagated from the start.")]
+    entries: list[tuple[float | None, str]] = [(first.t_s, "First accepted map match.")]
     oldest = max(view.rows, key=lambda row: row.anchor_age_ms or 0)
     if (oldest.anchor_age_ms or 0) > 2000:
         age_s = (oldest.anchor_age_ms or 0) / 1000
         begin_s = max(0.0, oldest.t_s - age_s)
-        said.append((begin_s, f"Longest stretch without a map match begins: {age_s:.1f} s."))
-    return said
+        entries.append((begin_s, f"Start of the longest interval without a map match: {age_s:.1f} s."))
+    return entries
 
 
 def _errors(view: FlightView) -> list[tuple[float | None, str]]:
@@ -145,24 +145,24 @@ def _errors(view: FlightView) -> list[tuple[float | None, str]]:
         return []
     error, row = max(known, key=lambda pair: pair[0])
     radius = radius95_m(row)
-    claim = f", claimed 95 % radius {radius:.1f} m" if radius is not None else ""
+    claim = f", reported 95 % radius {radius:.1f} m" if radius is not None else ""
     return [(row.t_s, f"Largest error: {error:.1f} m{claim} ({row.source_label.replace('_', ' ')}).")]
 
 
 def _gps(view: FlightView) -> list[tuple[float | None, str]]:
-    said: list[tuple[float | None, str]] = []
+    entries: list[tuple[float | None, str]] = []
     stats = gps_stats(view)
     if stats is not None and stats.longest_s > GAP_S:
-        said.append((stats.longest_at_s, f"Longest GPS_INPUT silence: {stats.longest_s:.2f} s."))
+        entries.append((stats.longest_at_s, f"Longest GPS_INPUT gap: {stats.longest_s:.2f} s."))
     first = next((t for t, g in view.gps if g.fix_type >= FIX_3D), None)
     if first is not None:
-        said.append((first, "First GPS_INPUT with a 3D fix."))
+        entries.append((first, "First GPS_INPUT with a 3D fix."))
     corrected = [(t, math.hypot(*g.map_offset_m)) for t, g in view.gps if any(g.map_offset_m)]
     if corrected:
-        most_m = max(off_m for _, off_m in corrected)
-        text = f"GPS_INPUT leaves the map, which a trusted receiver shows to be off, by {most_m:.1f} m at most."
-        said.append((corrected[0][0], text + " Estimates are positions on the map."))
-    return said
+        max_m = max(off_m for _, off_m in corrected)
+        text = f"GPS_INPUT is corrected for the map offset estimated from a trusted receiver, by {max_m:.1f} m at most."
+        entries.append((corrected[0][0], text + " Estimates are not corrected."))
+    return entries
 
 
 def stamp(t_s: float | None) -> str:

@@ -1,4 +1,4 @@
-"""`terrafix sim`: the world to fly in. Every command imports what it needs when it is called."""
+"""`terrafix sim`: simulated flights. Each command imports its modules when it is called."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,8 +8,8 @@ import typer
 from terrafix.core.errors import UsageError
 from terrafix_tools.sim.autopilot.parameters import Gps, Kind
 
-# What `make` and `fly` have in common.
-Seed = Annotated[int, typer.Option(help="Of the generated place, of the course and of all errors.")]
+# Options of both `make` and `fly`.
+Seed = Annotated[int, typer.Option(help="Seed of the generated place, the course and all errors.")]
 SizeKm = Annotated[float | None, typer.Option(help="Side of the generated place; default: 3 by 2 km.")]
 Image = Annotated[Path | None, typer.Option(help="GeoTIFF that the camera sees; default: a generated place.")]
 Map = Annotated[
@@ -17,12 +17,12 @@ Map = Annotated[
     typer.Option("--map", help="GeoTIFF or map package of the same place, of another date; default: --image."),
 ]
 Dem = Annotated[Path | None, typer.Option(help="Elevation GeoTIFF under --image; default: flat at 0 m.")]
-Vehicle = Annotated[Kind, typer.Option(help="Who flies.")]
+Vehicle = Annotated[Kind, typer.Option(help="Vehicle type.")]
 MissionFile = Annotated[
     Path | None, typer.Option(help="QGroundControl .plan or waypoint file; default: a closed course.")
 ]
-Agl = Annotated[float, typer.Option(help="Height of that course above ground, metres.")]
-Duration = Annotated[float | None, typer.Option(help="Seconds; default: until the mission is flown.")]
+Agl = Annotated[float, typer.Option(help="Height of the closed course above ground, metres.")]
+Duration = Annotated[float | None, typer.Option(help="Seconds; default: until the end of the mission.")]
 Events = Annotated[Path | None, typer.Option(help="TOML with [[gnss]] tables: outage, jam, jump, drag.")]
 
 app = typer.Typer(
@@ -34,7 +34,7 @@ app = typer.Typer(
 def ardupilot(
     binary: Annotated[
         Path | None,
-        typer.Option(help="arduplane or arducopter for SITL; default: what TERRAFIX_ARDUPILOT_SITL names."),
+        typer.Option(help="arduplane or arducopter for SITL; default: TERRAFIX_ARDUPILOT_SITL."),
     ] = None,
     vehicle: Annotated[Kind | None, typer.Option(help="Default: by the binary's name.")] = None,
     out: Annotated[Path, typer.Option(help="Output folder.")] = Path("out/ardupilot"),
@@ -44,12 +44,13 @@ def ardupilot(
     parameters: Annotated[
         list[Path] | None, typer.Option(help="Parameter file of the vehicle; default: second-gps.param.")
     ] = None,
-    kills: Annotated[int, typer.Option(min=0, help="Kill Terrafix so often without GNSS, and start it again.")] = 0,
+    kills: Annotated[int, typer.Option(min=0, help="Number of kills and restarts of Terrafix without GNSS.")] = 0,
     gnss_start: Annotated[
-        bool, typer.Option("--gnss-start", help="Nobody says where it begins but the autopilot's GNSS, on the ground.")
+        bool,
+        typer.Option("--gnss-start", help="No configured start: take the autopilot's GNSS position on the ground."),
     ] = False,
 ) -> None:
-    """ArduPilot's own firmware flies a mission on Terrafix' GPS_INPUT, in real time."""
+    """Fly a mission with ArduPilot SITL on Terrafix' GPS_INPUT, in real time."""
     try:
         from terrafix_tools.sim.sitl.fly import fly as fly_firmware
     except ModuleNotFoundError as error:
@@ -73,16 +74,18 @@ def ardupilot(
 
 @app.command()
 def fly(
-    out: Annotated[Path, typer.Option(help="Folder for everything that the flight makes.")] = Path("out/fly"),
+    out: Annotated[Path, typer.Option(help="Folder for all output of the flight.")] = Path("out/fly"),
     seed: Seed = 1,
     size_km: SizeKm = None,
     image: Image = None,
     map_path: Map = None,
     dem: Dem = None,
     vehicle: Vehicle = Kind.PLANE,
-    gps: Annotated[Gps, typer.Option(help="Terrafix beside a real receiver, or as the only GPS.")] = Gps.SECOND,
+    gps: Annotated[
+        Gps, typer.Option(help="Terrafix as second GPS of a real receiver, or as the only GPS.")
+    ] = Gps.SECOND,
     mission: MissionFile = None,
-    length_km: Annotated[float | None, typer.Option(help="Length of that course; default 10.")] = None,
+    length_km: Annotated[float | None, typer.Option(help="Length of the closed course; default 10.")] = None,
     agl: Agl = 130.0,
     duration: Duration = None,
     frame_hz: Annotated[float, typer.Option(help="Frames a second.")] = 1.5,
@@ -90,14 +93,14 @@ def fly(
         float | None, typer.Option(help="Seconds until GNSS is jammed; default 60 without --spoof-after or --events.")
     ] = None,
     spoof_after: Annotated[float | None, typer.Option(help="Seconds until a spoofer drags GNSS off.")] = None,
-    spoof_mps: Annotated[float, typer.Option(help="... so fast, to the east.")] = 2.0,
+    spoof_mps: Annotated[float, typer.Option(help="Speed of the spoofing drag to the east, m/s.")] = 2.0,
     events: Events = None,
 ) -> None:
-    """Fly in closed loop: the vehicle steers by what the autopilot believes, the autopilot by GPS_INPUT."""
+    """Fly in closed loop: the vehicle steers by the autopilot's position, which depends on GPS_INPUT."""
     from terrafix_tools.sim.closed_loop.command import Request, run
-    from terrafix_tools.sim.flights.make import Wanted
+    from terrafix_tools.sim.flights.make import FlightOptions
 
-    wanted = Wanted(
+    wanted = FlightOptions(
         seed=seed,
         size_km=size_km,
         image=image,
@@ -124,18 +127,20 @@ def make(
     dem: Dem = None,
     vehicle: Vehicle = Kind.PLANE,
     mission: MissionFile = None,
-    length_km: Annotated[float | None, typer.Option(help="Length of that course.")] = None,
-    from_ground: Annotated[bool, typer.Option("--from-ground", help="That course has take-off and landing.")] = False,
+    length_km: Annotated[float | None, typer.Option(help="Length of the closed course.")] = None,
+    from_ground: Annotated[
+        bool, typer.Option("--from-ground", help="Closed course with take-off and landing.")
+    ] = False,
     duration: Duration = None,
     agl: Agl = 130.0,
     events: Events = None,
     jam_after: Annotated[float | None, typer.Option(help="GNSS is jammed from this second on.")] = None,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
-    """Make a flight folder: pictures, telemetry.tlog, truth.csv and the map, of a simulated vehicle."""
+    """Write a flight folder of a simulated vehicle: images, telemetry.tlog, truth.csv and the map."""
     from terrafix_tools.sim.flights import make as making
 
-    wanted = making.Wanted(
+    wanted = making.FlightOptions(
         seed=seed,
         size_km=size_km,
         image=image,
@@ -159,10 +164,10 @@ def make(
 def telemetry(
     flight: Annotated[Path, typer.Argument(help="Flight folder with frames.csv and truth.csv.")],
     out: Annotated[Path, typer.Option(help="Flight folder to write; new or empty.")],
-    seed: Annotated[int, typer.Option(help="Decides about the errors of the sensors.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the sensor errors.")] = 1,
 ) -> None:
-    """Give real frames the telemetry.tlog that an autopilot would have kept, with IMU, from their truth."""
+    """Add to real frames the telemetry.tlog of a simulated autopilot with IMU, computed from their ground truth."""
     from terrafix_tools.sim.flights.recorded import write_recorded
 
-    way = write_recorded(flight, out, seed=seed)
-    typer.echo(f"{out}: telemetry.tlog along a smooth way, {way.level.off:.1f} m off the truth in the mean (rms)")
+    path = write_recorded(flight, out, seed=seed)
+    typer.echo(f"{out}: telemetry.tlog along a smooth path, {path.level.rms:.1f} m rms from the truth")

@@ -1,7 +1,9 @@
-"""What the parts of a simulated flight say to each other: truth, readings, beliefs. One flight, one local frame.
+"""Data types shared by the parts of a simulated flight: true state, sensor readings, navigation. One local frame per
+flight.
 
 World frame w: east, north, up of the flight's LocalFrame; "up" is metres AMSL. Body frame b: forward, right, down.
-Angles in radians, yaw clockwise from true north; seconds count from the start of the flight."""
+Angles in radians, yaw clockwise from true north; seconds count from the start of the flight.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,7 +15,7 @@ from terrafix.core.geodesy import rot_w_b
 
 @dataclass(frozen=True)
 class State:
-    """The truth about the vehicle at one moment."""
+    """True state of the vehicle at one time."""
 
     t_s: float
     p_b_in_w_m: np.ndarray  # (3,)
@@ -21,9 +23,9 @@ class State:
     yaw_rad: float
     pitch_rad: float
     roll_rad: float
-    agl_m: float  # above the ground straight below
+    agl_m: float  # above the ground vertically below
     rates_b_radps: np.ndarray  # (3,) angular velocity of the body against the world, in b
-    force_b_mps2: np.ndarray  # (3,) specific force in b: what an accelerometer without error shows
+    force_b_mps2: np.ndarray  # (3,) specific force in b, the output of an error-free accelerometer
     airspeed_mps: float
 
     def r_w_b(self) -> np.ndarray:
@@ -33,7 +35,7 @@ class State:
 
 @dataclass(frozen=True)
 class Navigation:
-    """What the autopilot believes of itself and steers by."""
+    """The autopilot's navigation solution, which it steers by."""
 
     p_b_in_w_m: np.ndarray  # (3,)
     velocity_enu_mps: np.ndarray  # (3,)
@@ -44,7 +46,7 @@ class Navigation:
 
 
 def navigation_of(state: State) -> Navigation:
-    """What an autopilot believes that knows the truth."""
+    """Returns an error-free navigation solution."""
     return Navigation(
         state.p_b_in_w_m, state.velocity_enu_mps, state.yaw_rad, state.pitch_rad, state.roll_rad, state.airspeed_mps
     )
@@ -52,14 +54,14 @@ def navigation_of(state: State) -> Navigation:
 
 @dataclass(frozen=True)
 class GnssFix:
-    """A receiver's fix; with ``fix_type`` below 3 the rest means nothing."""
+    """A receiver's fix; with ``fix_type`` below 3 the other fields are invalid."""
 
     fix_type: int
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float
     velocity_ned_mps: tuple[float, float, float]
-    horizontal_m: float  # accuracies as the receiver claims them, 1-sigma
+    horizontal_m: float  # accuracies as reported by the receiver, 1-sigma
     vertical_m: float
     speed_mps: float
     satellites: int
@@ -68,13 +70,13 @@ class GnssFix:
 
 @dataclass(frozen=True)
 class Readings:
-    """What the sensors of the vehicle show at ``t_s``; None where that sensor has nothing new at this moment."""
+    """Sensor readings at ``t_s``; None for a sensor without a new sample."""
 
     t_s: float
     gyro_b_radps: np.ndarray  # (3,)
     accel_b_mps2: np.ndarray  # (3,)
     yaw_rad: float  # compass, true north as the autopilot computes it
-    pitch_rad: float  # attitude as the autopilot's filter has it
+    pitch_rad: float  # attitude of the autopilot's filter
     roll_rad: float
     baro_amsl_m: float
     airspeed_mps: float | None
@@ -83,10 +85,10 @@ class Readings:
 
 
 class Vehicle(Protocol):
-    """A vehicle that flies its mission on what it is told."""
+    """A vehicle that flies its mission on a given navigation solution."""
 
     def step(self, dt_s: float, navigation: Navigation | None) -> State:
-        """``navigation`` None: it flies on the truth."""
+        """Advances by ``dt_s``. ``navigation`` None: it steers by the truth."""
 
 
 class Sensors(Protocol):
@@ -96,15 +98,15 @@ class Sensors(Protocol):
 
 
 class Autopilot(Protocol):
-    """Lock-step: no thread, no socket, no clock but ``now_s``."""
+    """Lock-step autopilot: no thread, socket or clock other than ``now_s``."""
 
     def step(self, now_s: float, readings: Readings) -> None: ...
 
     def receive(self, packets: bytes, now_s: float) -> None:
-        """MAVLink bytes from the companion."""
+        """Processes MAVLink bytes from the companion."""
 
     def transmit(self) -> bytes:
-        """MAVLink bytes for the companion since the last call."""
+        """Returns the MAVLink bytes for the companion since the last call."""
 
     def navigation(self) -> Navigation | None:
-        """None before it has a position."""
+        """Returns the navigation solution; None before there is a position."""

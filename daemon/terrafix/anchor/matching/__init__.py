@@ -1,1 +1,1 @@
-"""One frame against the map."""
+"""Matching of one frame with the map."""

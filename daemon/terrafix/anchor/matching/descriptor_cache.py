@@ -1,4 +1,4 @@
-"""Dense descriptors of the map, computed tile by tile when first needed and kept while there is room."""
+"""Dense descriptors of the map, computed tile by tile on first use and cached with least-recently-used eviction."""
 
 from collections import OrderedDict
 from typing import Protocol
@@ -7,13 +7,15 @@ import numpy as np
 
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 
-TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride
-PAD_PX = 32  # context around a tile, so that its rim is described as if there were no rim; a multiple of every stride
-CACHE_BYTES = 192 * 1024 * 1024
+TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride [tuned]
+# pixels of context around a tile, so that descriptors at its border equal those of a larger image; a multiple of every
+# stride [tuned]
+PAD_PX = 32
+CACHE_BYTES = 192 * 1024 * 1024  # memory for the tiles of all layers, bytes [tuned]
 
 
 class MapWindows(Protocol):
-    """What is needed of the map: ``LocalMap`` of the package reader."""
+    """The part of the map that descriptors need; ``LocalMap`` implements it."""
 
     gsd_m: float
 
@@ -23,7 +25,7 @@ class MapWindows(Protocol):
 
 
 class Describer(Protocol):
-    """Image in, dense descriptors out; one for each kind of feature."""
+    """Dense feature extractor; one implementation per kind of feature."""
 
     name: str
     stride: int
@@ -41,23 +43,25 @@ class MapFeatures:
         describer: Describer,
         cache_bytes: int = CACHE_BYTES,
         pad_px: int = PAD_PX,
-        shelf: DescriptorStore | None = None,
+        store: DescriptorStore | None = None,
     ) -> None:
-        """``shelf``: where they are kept for the next process, too."""
+        """``store``: file store in which tiles outlive this process."""
         self._source = source
         self._describer = describer
         self._pad_px = pad_px
-        self._shelf = shelf
+        self._store = store
         self._tiles: OrderedDict[tuple[float, int, int], tuple[np.ndarray, np.ndarray]] = OrderedDict()
-        self._bytes, self._most_bytes = 0, cache_bytes
+        self._bytes, self._max_bytes = 0, cache_bytes
 
     def window(
         self, e_min_m: float, n_max_m: float, width: int, height: int, gsd_m: float
     ) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """``width`` x ``height`` cells (a cell is ``stride`` pixels of ``gsd_m``) from about (e_min_m, n_max_m).
+        """``width`` x ``height`` cells (a cell is ``stride`` pixels of ``gsd_m``) with the north-west corner near
+        (e_min_m, n_max_m), local metres.
 
-        -> descriptors (C, height, width) float32, valid (height, width) bool, and the corner that was really used:
-        the nearest one on the grid of cells."""
+        -> descriptors (C, height, width) float32, valid (height, width) bool, and the corner used: the nearest one on
+        the grid of cells.
+        """
         cell = gsd_m * self._describer.stride
         per_tile = TILE_CELLS_PX // self._describer.stride
         column, row = round(e_min_m / cell), round(-n_max_m / cell)
@@ -83,17 +87,17 @@ class MapFeatures:
         name = f"{self._describer.name} {gsd_m!r} {tx} {ty}"
         if key in self._tiles:
             self._tiles.move_to_end(key)
-            if self._shelf is not None:
-                self._shelf.used(name)
+            if self._store is not None:
+                self._store.touch(name)
             return self._tiles[key]
-        tile = None if self._shelf is None else self._shelf.take(name)
+        tile = None if self._store is None else self._store.read(name)
         if tile is None:
             tile = self._computed(gsd_m, tx, ty, cell, per_tile)
-            if self._shelf is not None:
-                self._shelf.put(name, *tile)
+            if self._store is not None:
+                self._store.write(name, *tile)
         self._tiles[key] = tile
         self._bytes += tile[0].nbytes + tile[1].nbytes
-        while self._bytes > self._most_bytes and len(self._tiles) > 1:
+        while self._bytes > self._max_bytes and len(self._tiles) > 1:
             _, (old, old_valid) = self._tiles.popitem(last=False)
             self._bytes -= old.nbytes + old_valid.nbytes
         return tile
@@ -110,4 +114,4 @@ class MapFeatures:
         if valid.any():
             descriptors = self._describer.describe(image)[:, inner, inner]
             return np.where(valid, descriptors, 0.0).astype(np.float16), valid
-        return np.zeros((self._describer.channels, *valid.shape), np.float16), valid  # beside the map
+        return np.zeros((self._describer.channels, *valid.shape), np.float16), valid  # no map data in this tile

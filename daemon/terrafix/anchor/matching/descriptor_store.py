@@ -1,7 +1,8 @@
-"""Descriptors of the map that outlive the process that computed them.
+"""Map descriptors as files in the run directory (memory), so that a restarted process does not compute them again.
 
-Half of the first look of a new process is computing what the one before it had already; and after a restart in flight
-that look is what the autopilot waits for. So what was computed lies in the folder of the run, too, which is memory."""
+Half of the time of a new process's first correlation is computing these descriptors, and after a restart in flight the
+autopilot waits for that correlation.
+"""
 
 import hashlib
 from collections import OrderedDict
@@ -11,55 +12,56 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from terrafix.runtime.run_dir import load, save
+from terrafix.runtime.checkpoint import CheckpointFile
 
-MOST = 96  # of all layers, of 1 MB each: what a flight in sight of one place uses is some 20
+MAX_TILES = 96  # Tiles of all layers together, 1 MB each. A flight around one place uses about 20. [tuned]
 
 
-class _Written(msgspec.Struct, frozen=True):
+class _StoredTile(msgspec.Struct, frozen=True):
     shape: tuple[int, int, int]
     descriptors: bytes  # float16
     valid: bytes  # bool
 
 
 class DescriptorStore:
-    """``of``: all that the descriptors follow from, but for who describes and which tile it is. At ``most`` so many."""
+    """``identity``: text on which the descriptors depend, apart from describer and tile name; it is hashed into the
+    file names. ``max_tiles``: limit above which the least recently used file is deleted."""
 
-    def __init__(self, folder: Path, of: str, most: int = MOST) -> None:
+    def __init__(self, folder: Path, identity: str, max_tiles: int = MAX_TILES) -> None:
         self._folder = folder
-        self._most = most
-        self._prefix = hashlib.sha256(of.encode()).hexdigest()[:16]
-        with suppress(OSError):  # no room: nothing is kept
+        self._max_tiles = max_tiles
+        self._prefix = hashlib.sha256(identity.encode()).hexdigest()[:16]
+        with suppress(OSError):  # no space left: nothing is stored
             folder.mkdir(exist_ok=True)
         found = folder.glob(f"{self._prefix} *.tile")
         self._files = OrderedDict.fromkeys(sorted(found, key=lambda file: file.stat().st_mtime_ns))
 
-    def take(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """-> descriptors (C, n, n) float16, valid (n, n) bool; None: not here, or not whole."""
-        self.used(name)
-        written = load(self._file(name), msgspec.msgpack.Decoder(_Written).decode)
-        if written is None:
+    def read(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """-> descriptors (C, n, n) float16, valid (n, n) bool; None: not stored, or the file is incomplete."""
+        self.touch(name)
+        tile = CheckpointFile(self._file(name), _StoredTile).load()
+        if tile is None:
             return None
         try:
-            descriptors = np.frombuffer(written.descriptors, np.float16).reshape(written.shape)
-            return descriptors, np.frombuffer(written.valid, bool).reshape(written.shape[1:])
+            descriptors = np.frombuffer(tile.descriptors, np.float16).reshape(tile.shape)
+            return descriptors, np.frombuffer(tile.valid, bool).reshape(tile.shape[1:])
         except ValueError:
             return None
 
-    def used(self, name: str) -> None:
-        """It gives way after all that were not."""
+    def touch(self, name: str) -> None:
+        """Marks a tile as most recently used."""
         file = self._file(name)
         if file in self._files:
             self._files.move_to_end(file)
 
-    def put(self, name: str, descriptors: np.ndarray, valid: np.ndarray) -> None:
-        """Those that were not used for longest give way."""
+    def write(self, name: str, descriptors: np.ndarray, valid: np.ndarray) -> None:
+        """Writes a tile and deletes the least recently used ones above the limit."""
         c, h, w = descriptors.shape
         file = self._file(name)
-        save(file, msgspec.msgpack.encode(_Written((c, h, w), descriptors.tobytes(), valid.tobytes())))
+        CheckpointFile(file, _StoredTile).save(_StoredTile((c, h, w), descriptors.tobytes(), valid.tobytes()))
         self._files[file] = None
         self._files.move_to_end(file)
-        while len(self._files) > self._most:
+        while len(self._files) > self._max_tiles:
             oldest, _ = self._files.popitem(last=False)
             with suppress(OSError):
                 oldest.unlink()

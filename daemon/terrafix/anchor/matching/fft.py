@@ -1,29 +1,29 @@
-"""Fourier transforms of real pictures by OpenCV, as NumPy's ``rfft2`` gives them: at a quarter of the cost where OpenCV
-has Intel's primitives, and no dearer elsewhere. The inverse of the few spectra that are left after the product is
-NumPy's."""
+"""Real 2-D Fourier transforms by OpenCV in the layout of NumPy's ``rfft2``: a quarter of NumPy's cost where OpenCV is
+built with Intel's primitives, no slower elsewhere. The inverse transform of the few spectra that remain after
+multiplication uses NumPy."""
 
 import cv2
 import numpy as np
 
 
 def transform_shape(height: int, width: int) -> tuple[int, int]:
-    """Sides that are quickly transformed, not smaller than these, and even."""
+    """Smallest even sides >= (height, width) that OpenCV transforms fast."""
     return 2 * cv2.getOptimalDFTSize((height + 1) // 2), 2 * cv2.getOptimalDFTSize((width + 1) // 2)
 
 
 def spectra(x: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(..., h, w) float32 -> (..., H, W // 2 + 1) complex64 with zeros up to ``shape`` (H, W), of ``transform_shape``:
-    ``np.fft.rfft2(x, shape)``."""
+    """(..., h, w) float32 -> (..., H, W // 2 + 1) complex64, zero-padded to ``shape`` (H, W) from ``transform_shape``;
+    equals ``np.fft.rfft2(x, shape)``."""
     (h, w), (height, width) = x.shape[-2:], shape
-    pictures = x.reshape(-1, h, w)
+    images = x.reshape(-1, h, w)
     padded = np.zeros(shape, np.float32)
-    packed = np.empty((len(pictures), height, width), np.float32)
-    for picture, into in zip(pictures, packed, strict=True):
-        padded[:h, :w] = picture
-        cv2.dft(padded, into)  # without nonzeroRows, which leaves the fast path
-    out = np.empty((len(pictures), height, width // 2 + 1), np.complex64)
-    # Packed as OpenCV documents for `dft`: of columns 1 to W / 2 - 1 real and imaginary parts side by side; column 0,
-    # and W / 2 in the last one, are spectra of real numbers, and half of each is left out.
+    packed = np.empty((len(images), height, width), np.float32)
+    for image, into in zip(images, packed, strict=True):
+        padded[:h, :w] = image
+        cv2.dft(padded, into)  # without nonzeroRows, which disables the fast path
+    out = np.empty((len(images), height, width // 2 + 1), np.complex64)
+    # OpenCV's packed layout, see the documentation of `dft`: columns 1 to W / 2 - 1 hold real and imaginary parts side
+    # by side. Column 0, and column W / 2 in the last one, are spectra of real sequences; half of each is omitted.
     out[:, :, 1:-1] = packed[:, :, 1:-1].view(np.complex64)
     middle = height // 2
     for column in (0, -1):

@@ -1,4 +1,5 @@
-"""The frame as the map would show it: north-up, at a chosen scale, from attitude and height (PB-6)."""
+"""Orthorectification of the frame: north-up at a chosen ground sampling distance, from attitude and height above ground
+(PB-6)."""
 
 from dataclasses import dataclass
 
@@ -8,14 +9,16 @@ import numpy as np
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 
-MAX_REACH = 1.6  # heights: ground farther than this from the nadir (58 degrees) is seen too flat to be matched
-MIN_DOWN = 0.3  # cosine of the ray with the vertical at that limit, with margin for the corners
+# heights: ground farther than this from the nadir (58 degrees) is seen too obliquely to be matched [tuned]
+MAX_GROUND_DISTANCE = 1.6
+# smallest cosine between optical axis and vertical: that limit with a margin for the image corners [tuned]
+MIN_DOWN = 0.3
 
 
 @dataclass(frozen=True)
 class Rectified:
-    """``image`` (H, W, 3) and ``mask`` (H, W) bool, north-up; the centre of pixel (r, c) lies at
-    east = e_min_m + (c + 0.5) gsd, north = n_max_m - (r + 0.5) gsd, relative to the point below the camera."""
+    """``image`` (H, W, 3) and ``mask`` (H, W) bool, north-up. The centre of pixel (r, c) lies at east = e_min_m + (c +
+    0.5) gsd, north = n_max_m - (r + 0.5) gsd, relative to the point below the camera."""
 
     image: np.ndarray
     mask: np.ndarray
@@ -25,14 +28,15 @@ class Rectified:
 
 
 def footprint(camera: CameraCalibration, r_w_c: np.ndarray, agl_m: float) -> tuple[float, float, float, float] | None:
-    """Outer box of the seen ground (e_min, n_min, e_max, n_max) in metres from the nadir point; None: no ground."""
+    """Bounding box of the visible ground (e_min, n_min, e_max, n_max) in metres from the nadir point; None: no ground
+    is visible. ``r_w_c``: camera to world (east, north, up)."""
     w, h = camera.width - 1.0, camera.height - 1.0
     rim = [(x * w, y * h) for x, y in ((0, 0), (0.5, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.5))]
     rays = np.column_stack([camera.normalise(np.array(rim)), np.ones(len(rim))]) @ r_w_c.T
-    if float(r_w_c[2, 2]) > -MIN_DOWN:  # the optical axis looks too close to the horizon
+    if float(r_w_c[2, 2]) > -MIN_DOWN:  # the optical axis is too close to the horizon
         return None
     ground = rays[:, :2] / np.maximum(-rays[:, 2:], 1e-3) * agl_m
-    ground = np.clip(ground, -MAX_REACH * agl_m, MAX_REACH * agl_m)
+    ground = np.clip(ground, -MAX_GROUND_DISTANCE * agl_m, MAX_GROUND_DISTANCE * agl_m)
     low, high = ground.min(0), ground.max(0)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
@@ -46,8 +50,9 @@ def rectify(
     stride: int = 1,
     blurred: dict[float, Image] | None = None,
 ) -> Rectified | None:
-    """Onto flat ground ``agl_m`` below the camera. Sides are multiples of ``stride`` pixels. ``blurred``: the same
-    image by how far it was blurred, kept for other headings."""
+    """Projects ``image`` on flat ground ``agl_m`` below the camera. Sides are multiples of ``stride`` pixels.
+    ``blurred``: cache of blurred copies of the image by scale factor, shared between yaw hypotheses. None: no ground is
+    visible."""
     box = footprint(camera, r_w_c, agl_m)
     if box is None:
         return None
@@ -59,12 +64,12 @@ def rectify(
     to_camera = r_w_c.T @ ground  # rectified pixel (x, y, 1) -> ray in the camera
     shrink = gsd_m / (agl_m / camera.fx)
     source = image
-    if shrink > 1.4:  # against aliasing
+    if shrink > 1.4:  # anti-aliasing
         blurred = {} if blurred is None else blurred
         if shrink not in blurred:
             blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
         source = blurred[shrink]
-    if camera.distortion or camera.bend:
+    if camera.distortion or camera.radial_k1:
         x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
         rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ to_camera.T
         px = camera.project(rays).astype(np.float32).reshape(height, width, 2)

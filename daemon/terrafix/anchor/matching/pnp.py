@@ -1,4 +1,5 @@
-"""Camera pose from 2D-3D matches with the map: IPPE inside RANSAC, then robust refinement (ON-1)."""
+"""Camera pose from 2D-3D matches with the map: IPPE (SQPnP over relief) inside RANSAC, then robust refinement
+(ON-1)."""
 
 from dataclasses import dataclass, replace
 
@@ -8,16 +9,18 @@ import numpy as np
 from terrafix.core.pose import PoseFit, exp_so3, fit_pose, log_so3
 from terrafix.messages import Verdict
 
-RANSAC_ITERATIONS = 300
-CONFIDENCE = 0.999
-THRESHOLD = 0.03  # of the height: relief, leaning buildings and the map's own warps stay below this
-MIN_INLIERS = 8
-MIN_INLIER_SHARE = 0.35
-# Patches that are neighbours share a third of their error, farther ones nothing (docs/monte-carlo.md): with four
-# neighbours 1 in 1 + 4/3 is independent.
+RANSAC_ITERATIONS = 300  # most RANSAC iterations [tuned]
+CONFIDENCE = 0.999  # RANSAC confidence [tuned]
+# inlier threshold as a share of the height: relief, leaning buildings and distortions of the map stay below it [tuned]
+INLIER_THRESHOLD = 0.03
+MIN_INLIERS = 8  # fewest inliers of a pose [tuned]
+MIN_INLIER_SHARE = 0.35  # smallest share of inliers [tuned]
+# Effective share of independent patches. Neighbours share a third of their error, patches farther apart nothing; with
+# four neighbours 1 in 1 + 4/3 is independent. [measured: docs/monte-carlo.md]
 INDEPENDENT_SHARE = 3 / 7
-MAX_TILT_CHANGE_RAD = np.radians(20.0)  # from the prediction; more is the mirror solution of a flat scene
-PLANAR_RELIEF = 0.02  # of the height: flatter ground than this is treated as a plane
+# largest angle between pose and prediction; the mirrored solution of a planar scene exceeds it [tuned]
+MAX_TILT_CHANGE_RAD = np.radians(20.0)
+PLANAR_RELIEF = 0.02  # share of the height: ground with less relief is treated as a plane [tuned]
 
 
 @dataclass(frozen=True)
@@ -35,15 +38,23 @@ def solve(
     agl_m: float,
     sigma_floor: float,
     threshold: float,
-    reach: float,
-    least: int = MIN_INLIERS,
+    search_radius: float,
+    min_inliers: int = MIN_INLIERS,
 ) -> PnpResult:
-    """``points_w_m`` (N, 3), ``xy`` (N, 2) normalised; ``r_w_c`` predicted. ``threshold`` of an inlier and
-    ``reach`` of the search as shares of the height. ``least`` inliers there must be."""
+    """Pose from ``points_w_m`` (N, 3) and ``xy`` (N, 2) normalised image coordinates; ``r_w_c``: predicted rotation.
+    ``threshold`` of an inlier and ``search_radius`` of the patches: shares of the height. ``min_inliers``: fewest
+    inliers.
+
+    Verdict FEW_INLIERS or DEGENERATE (tilt too far from the prediction) without a pose, else ACCEPTED.
+    """
     n = len(xy)
-    chance = min(1.0, np.pi * threshold**2 / (2 * reach) ** 2)  # that a patch that was matched at random agrees
+    p_random_inlier = min(
+        1.0, np.pi * threshold**2 / (2 * search_radius) ** 2
+    )  # probability that a randomly matched patch is an inlier
     none = np.zeros(n, bool)
-    needed = max(least, MIN_INLIER_SHARE * n, n * chance + 4.0 * float(np.sqrt(n * chance)) + 3.0)
+    needed = max(
+        min_inliers, MIN_INLIER_SHARE * n, n * p_random_inlier + 4.0 * float(np.sqrt(n * p_random_inlier)) + 3.0
+    )
     if n < needed:
         return PnpResult(Verdict.FEW_INLIERS, None, none)
     centre = points_w_m.mean(0)
@@ -71,15 +82,21 @@ def solve(
     tilt = np.asarray(log_so3(r_w_c.T @ fit.r_w_c))[:2]
     if float(np.linalg.norm(tilt)) > MAX_TILT_CHANGE_RAD:
         return PnpResult(Verdict.DEGENERATE, None, inlier)
-    return PnpResult(Verdict.ACCEPTED, replace(fit, cov=fit.cov * _by_chance(n, int(inlier.sum()), chance)), inlier)
+    return PnpResult(
+        Verdict.ACCEPTED, replace(fit, cov=fit.cov * _outlier_inflation(n, int(inlier.sum()), p_random_inlier)), inlier
+    )
 
 
-def _by_chance(matches: int, inliers: int, chance: float) -> float:
-    """Factor on the covariance for inliers that are none: of the wrong matches a share of ``chance`` agrees with any
-    pose. They say nothing of it, and it leans to where there are most of them: over a background of wrong ones a
-    truncated mean of n has the variance that the right ones alone would give, times n over these (Huber 1981, "Robust
-    statistics", section 3.2: E psi^2 over (E psi')^2; the background adds to the first and takes from the second)."""
-    wrong = (matches - inliers) / (1.0 - chance) * chance
+def _outlier_inflation(matches: int, inliers: int, p_random_inlier: float) -> float:
+    """Factor on the covariance for false inliers: of the wrong matches a share ``p_random_inlier`` agrees with any
+    pose.
+
+    They carry no information, and the estimate is biased towards them. With uniform outliers in the background, a
+    truncated mean of n values has the variance of the true inliers alone times n over their number (Huber 1981, "Robust
+    statistics", section 3.2: E psi^2 over (E psi')^2; the background adds to the first and subtracts from the second).
+    The factor is the square of that ratio.
+    """
+    wrong = (matches - inliers) / (1.0 - p_random_inlier) * p_random_inlier
     return float(inliers / max(inliers - wrong, 1.0)) ** 2
 
 
@@ -93,7 +110,7 @@ def _refine(
     sigma_floor: float,
     threshold: float,
 ) -> tuple[PoseFit | None, np.ndarray]:
-    """Twice: on RANSAC's inliers, then on all that agree with that pose."""
+    """Two refinements: on RANSAC's inliers, then on all matches that agree with the first result."""
     inlier = np.zeros(len(xy), bool)
     inlier[index] = True
     fit: PoseFit | None = None

@@ -1,32 +1,38 @@
-"""A belief over the map: a point-mass filter on a grid of camera positions.
+"""Point-mass filter on a grid of horizontal camera positions.
 
-Every frame's whole correlation surface multiplies it, odometry moves it, so that every hypothesis lives until the
-frames decide (Bergman, "Recursive Bayesian estimation: navigation and tracking applications", 1999, ch. 5)."""
+The update multiplies the mass by the likelihood of the frame's whole correlation surface; the prediction shifts and
+blurs it by odometry. All position hypotheses are kept until the frames discriminate between them (Bergman, "Recursive
+Bayesian estimation: navigation and tracking applications", 1999, ch. 5).
+"""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-# Log-likelihood ratio "here against elsewhere" of a standardised correlation z. Fitted to what right and wrong places
-# scored on seven pairs of real images of the same ground at two dates: the right place has z = 3 to 8 (median 3.6 to
-# 6.9 by pair), the best of tens of thousands of wrong ones 3.0 (98 % below 4.1).
+# Log likelihood ratio "here against elsewhere" as a function of the standardised correlation z: slope, and z at which
+# it is zero. Fitted to the scores of right and wrong places on seven pairs of real images of the same ground at two
+# dates. Right places have z = 3 to 8 (median 3.6 to 6.9 by pair); the best of tens of thousands of wrong places has 3.0
+# in the median (98 % below 4.1). [measured: this comment]
 LLR_SLOPE = 3.0
-LLR_ZERO_Z = 1.9
-LLR_MIN, LLR_MAX = -3.0, 9.0
-LEAK = 0.004  # share of the mass that is spread over the window each full look: nothing is ever quite excluded
-CELL_PER_AGL = 1 / 50  # a cell is 2 m at 100 m: two pixels of the look
-MIN_CELL_M = 1.0
-MIN_HALF_CELLS = 60  # the window never shrinks below this: the next error must still lie inside
-MAX_HALF_CELLS = 750
-MARGIN_CELLS = 30  # of the window beyond three or four sigmas of the belief
-WIDE_BLUR_CELLS = 6.0  # a blur wider than this is made at lower resolution
-MODE_RADIUS_CELLS = 7  # mass within this radius counts as one mode
+LLR_ZERO_Z = 1.9  # [measured: comment of LLR_SLOPE]
+LLR_MIN, LLR_MAX = -3.0, 9.0  # bounds of the log likelihood ratio of one frame [tuned]
+# share of the mass that a full observation redistributes uniformly over the window, so that no position is excluded
+# [tuned]
+LEAK = 0.004
+CELL_PER_AGL = 1 / 50  # belief cell as a share of the height: 2 m at 100 m, two cells of the correlation [tuned]
+MIN_CELL_M = 1.0  # metres [tuned]
+# smallest half width of the window, cells, so that the next position error still lies inside [tuned]
+MIN_HALF_CELLS = 60
+MAX_HALF_CELLS = 750  # largest half width of the window, cells; bounds time and memory [tuned]
+MARGIN_CELLS = 30  # cells of the window beyond three (when fitted) or four (at the start) sigmas of the belief [tuned]
+WIDE_BLUR_CELLS = 6.0  # sigma in cells above which the blur is computed at a lower resolution [tuned]
+MODE_RADIUS_CELLS = 7  # radius around a peak whose mass is one mode [tuned]
 
 
-def cell_for(agl_m: float, look_cell_m: float) -> float:
-    """Size of a belief cell, in steps of an octave: a share of the height, and not finer than what is looked at."""
-    wanted = max(agl_m * CELL_PER_AGL, look_cell_m, MIN_CELL_M)
+def belief_cell_m(agl_m: float, correlation_cell_m: float) -> float:
+    """Size of a belief cell in metres, in octaves: a share of the height, not finer than the correlation's cells."""
+    wanted = max(agl_m * CELL_PER_AGL, correlation_cell_m, MIN_CELL_M)
     return float(2.0 ** round(np.log2(wanted)))
 
 
@@ -35,24 +41,24 @@ class Mode:
     e_m: float
     n_m: float
     mass: float
-    rival: float  # largest mass of another mode
-    var_m2: float  # of a position within the mode, per axis
+    second_mass: float  # largest mass of another mode
+    var_m2: float  # variance of the position within the mode, per axis
 
 
 @dataclass(frozen=True)
 class Surface:
-    """``z`` (H, W): standardised correlation with the camera at east e0_m + c cell_m, north n0_m - r cell_m; NaN = not
-    known."""
+    """``z`` (H, W): standardised correlation with the camera at east e0_m + c cell_m, north n0_m - r cell_m; NaN =
+    unknown."""
 
     z: np.ndarray
     e0_m: float
     n0_m: float
     cell_m: float
 
-    def best(self, e_m: float, n_m: float, reach_m: float) -> tuple[float, float, float]:
-        """Best value within ``reach_m`` of a position, and where (east, north); -9 outside."""
+    def best(self, e_m: float, n_m: float, radius_m: float) -> tuple[float, float, float]:
+        """Highest value within ``radius_m`` of a position, and its east and north; -9 outside of the surface."""
         r, c = (self.n0_m - n_m) / self.cell_m, (e_m - self.e0_m) / self.cell_m
-        k = max(reach_m / self.cell_m, 1.0)
+        k = max(radius_m / self.cell_m, 1.0)
         rows = slice(max(round(r - k), 0), max(round(r + k) + 1, 0))
         columns = slice(max(round(c - k), 0), max(round(c + k) + 1, 0))
         near = np.nan_to_num(self.z[rows, columns], nan=-9.0)
@@ -62,32 +68,33 @@ class Surface:
         there_e_m = self.e0_m + (columns.start + int(dc)) * self.cell_m
         return float(near[dr, dc]), there_e_m, self.n0_m - (rows.start + int(dr)) * self.cell_m
 
-    def at(self, e_m: float, n_m: float, reach_m: float) -> float:
-        """Best value within ``reach_m`` of a position; -9 outside."""
-        return self.best(e_m, n_m, reach_m)[0]
+    def at(self, e_m: float, n_m: float, radius_m: float) -> float:
+        """Highest value within ``radius_m`` of a position; -9 outside of the surface."""
+        return self.best(e_m, n_m, radius_m)[0]
 
 
 class Belief:
-    """Mass over camera positions (east, north). The grid travels with the camera, so motion costs no resampling."""
+    """Probability mass over horizontal camera positions (local east, north). The grid moves with the camera, so that a
+    motion needs no resampling."""
 
     def __init__(
-        self, e_m: float, n_m: float, sigma_m: float, cell_m: float, stray: float = 0.0, reach_m: float = 0.0
+        self, e_m: float, n_m: float, sigma_m: float, cell_m: float, uniform_share: float = 0.0, min_half_m: float = 0.0
     ) -> None:
-        """A normal density of ``sigma_m`` per axis; the share ``stray`` of the mass is uniform over the window, which
-        reaches ``reach_m`` at least until ``confirm``."""
-        self._reach_m = reach_m
+        """Normal density with ``sigma_m`` per axis. The share ``uniform_share`` of the mass is uniform over the window,
+        whose half width is at least ``min_half_m`` until ``confirm``."""
+        self._min_half_m = min_half_m
         self.cell_m = cell_m
-        half = min(max(4.0 * sigma_m / cell_m + MARGIN_CELLS, MIN_HALF_CELLS, reach_m / cell_m), MAX_HALF_CELLS)
+        half = min(max(4.0 * sigma_m / cell_m + MARGIN_CELLS, MIN_HALF_CELLS, min_half_m / cell_m), MAX_HALF_CELLS)
         cells = 2 * int(np.ceil(half)) + 1
-        self._e0 = e_m - (cells // 2) * self.cell_m  # position of column 0
-        self._n0 = n_m + (cells // 2) * self.cell_m  # position of row 0
+        self._e0 = e_m - (cells // 2) * self.cell_m  # east of column 0
+        self._n0 = n_m + (cells // 2) * self.cell_m  # north of row 0
         axis = (np.arange(cells) - cells // 2) * self.cell_m
         log = -0.5 * (axis**2) / sigma_m**2
         normal = np.exp(log[:, None] + log[None, :])
-        self._mass = (1.0 - stray) * normal / normal.sum() + stray / normal.size
+        self._mass = (1.0 - uniform_share) * normal / normal.sum() + uniform_share / normal.size
 
-    def move(self, east_m: float, north_m: float, sigma_m: float) -> None:
-        """Odometry: shift by the step, spread by its error."""
+    def predict(self, east_m: float, north_m: float, sigma_m: float) -> None:
+        """Prediction by odometry: shifts by the step and blurs by its 1-sigma."""
         self._e0 += east_m
         self._n0 += north_m
         cells = min(sigma_m / self.cell_m, MAX_HALF_CELLS / 3)
@@ -98,12 +105,13 @@ class Belief:
             self._mass /= self._mass.sum()
 
     def update(self, surfaces: tuple[Surface, ...], weight: float) -> float:
-        """One frame's surfaces, one for each rotation and scale that was tried; ``weight`` 0..1: share of the look that
-        is new ground (the same ground seen again proves little).
+        """Measurement update with the surfaces of one frame, one per rotation and scale; the best hypothesis counts in
+        each cell. ``weight`` 0..1: share of new ground (a second observation of the same ground is not independent).
 
-        -> log likelihood ratio of the belief as a whole, "the camera is where it says against elsewhere"."""
+        -> log of the evidence: log likelihood ratio "the camera is distributed as the belief says, against elsewhere".
+        """
         llr = self._log_likelihood(surfaces[0])
-        for surface in surfaces[1:]:  # one at a time: of a wide window and many headings all together are a gigabyte
+        for surface in surfaces[1:]:  # one at a time: a wide window with many yaw hypotheses would need a gigabyte
             np.maximum(llr, self._log_likelihood(surface), out=llr)
         self._mass = self._mass * np.exp(weight * llr)
         total = float(self._mass.sum())
@@ -113,9 +121,10 @@ class Belief:
         return float(np.log(total))
 
     def _log_likelihood(self, surface: Surface) -> np.ndarray:
-        """On the belief's grid; what is not known counts as a little worse than chance."""
+        """Log likelihood ratio of a surface on the belief's grid; unknown cells count slightly worse than random
+        alignment."""
         z = np.nan_to_num(surface.z, nan=-9.0).astype(np.float32)
-        if surface.cell_m < self.cell_m:  # the best of the finer cells stands for the coarse one
+        if surface.cell_m < self.cell_m:  # a coarse cell takes the maximum of the finer ones
             k = int(np.ceil(self.cell_m / surface.cell_m)) | 1
             z = cv2.dilate(z, np.ones((k, k), np.uint8))
         axis = np.arange(len(self._mass)) * self.cell_m
@@ -127,21 +136,21 @@ class Belief:
         return log_likelihood_ratio(here)
 
     def mode(self) -> Mode:
-        """The heaviest mode: centroid and mass within MODE_RADIUS_CELLS, and the mass of its best rival."""
+        """The heaviest mode: centroid and mass within MODE_RADIUS_CELLS, and the mass of the second one."""
         return self.modes(1)[0]
 
     def modes(self, count: int) -> list[Mode]:
-        """The heaviest ones, apart by twice that radius."""
+        """The ``count`` heaviest modes, at least two mode radii apart."""
         radius = MODE_RADIUS_CELLS
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)).astype(np.float64)
         gathered = cv2.filter2D(self._mass, -1, disc, borderType=cv2.BORDER_CONSTANT)
-        found = []
-        left = gathered.copy()
+        modes = []
+        remaining = gathered.copy()
         for _ in range(count):
-            r, c = (int(v) for v in np.unravel_index(int(np.argmax(left)), left.shape))
-            found.append(self._mode_at(r, c, gathered))
-            left[max(r - 2 * radius, 0) : r + 2 * radius + 1, max(c - 2 * radius, 0) : c + 2 * radius + 1] = 0.0
-        return found
+            r, c = (int(v) for v in np.unravel_index(int(np.argmax(remaining)), remaining.shape))
+            modes.append(self._mode_at(r, c, gathered))
+            remaining[max(r - 2 * radius, 0) : r + 2 * radius + 1, max(c - 2 * radius, 0) : c + 2 * radius + 1] = 0.0
+        return modes
 
     def _mode_at(self, r: int, c: int, gathered: np.ndarray) -> Mode:
         radius = MODE_RADIUS_CELLS
@@ -151,13 +160,14 @@ class Belief:
         mass = float(near.sum())
         e_m = self._e0 + float((near.sum(0) * np.arange(len(self._mass))).sum()) / mass * self.cell_m
         n_m = self._n0 - float((near.sum(1) * np.arange(len(self._mass))).sum()) / mass * self.cell_m
-        rival = float(np.where(distance2 > (2 * radius) ** 2, gathered, 0.0).max())
+        second_mass = float(np.where(distance2 > (2 * radius) ** 2, gathered, 0.0).max())
         var = float((near * distance2).sum()) / mass / 2 * self.cell_m**2
-        return Mode(e_m, n_m, min(mass, 1.0), rival, var)
+        return Mode(e_m, n_m, min(mass, 1.0), second_mass, var)
 
     def confirm(self, mode: Mode, likelihood_ratio: float) -> None:
-        """Evidence from another source that the camera is in this mode."""
-        self._reach_m = 0.0
+        """Multiplies the mass within the mode by the likelihood ratio of independent evidence that the camera is
+        there."""
+        self._min_half_m = 0.0
         axis = np.arange(len(self._mass)) * self.cell_m
         distance2 = (self._n0 - axis - mode.n_m)[:, None] ** 2 + (self._e0 + axis - mode.e_m)[None, :] ** 2
         self._mass = np.where(
@@ -166,7 +176,7 @@ class Belief:
         self._mass /= self._mass.sum()
 
     def covariance(self) -> tuple[float, float, float]:
-        """(ee, en, nn) in m^2 of the whole belief, all modes."""
+        """(ee, en, nn) in m^2 of the whole belief, over all modes."""
         axis = np.arange(len(self._mass)) * self.cell_m
         p_e, p_n = self._mass.sum(0), self._mass.sum(1)
         mean_e, mean_n = float(p_e @ axis), float(p_n @ axis)
@@ -175,18 +185,19 @@ class Belief:
 
     @property
     def mean(self) -> tuple[float, float]:
-        """East and north of the whole belief, all modes."""
+        """East and north of the whole belief, over all modes."""
         axis = np.arange(len(self._mass)) * self.cell_m
         return self._e0 + float(self._mass.sum(0) @ axis), self._n0 - float(self._mass.sum(1) @ axis)
 
     def fit_window(self, at_least_half_m: float) -> None:
-        """Window around the mean, as wide as the belief needs."""
+        """Centres the window on the mean and makes it as wide as the belief needs: three sigmas and a margin."""
         ee, _, nn = self.covariance()
         spread = 3.0 * float(np.sqrt(max(ee, nn))) / self.cell_m + MARGIN_CELLS
-        self._resize(max(MIN_HALF_CELLS, max(at_least_half_m, self._reach_m) / self.cell_m, spread))
+        self._resize(max(MIN_HALF_CELLS, max(at_least_half_m, self._min_half_m) / self.cell_m, spread))
 
     def set_cell(self, cell_m: float) -> None:
-        """Another resolution, when the height has changed much; as fine as so wide a window can have."""
+        """Resamples to another cell size after a large change of height; coarser than asked if the window would exceed
+        MAX_HALF_CELLS."""
         while self.half_m / cell_m > MAX_HALF_CELLS:
             cell_m *= 2.0
         if cell_m == self.cell_m:
@@ -213,7 +224,7 @@ class Belief:
         p_e, p_n = self._mass.sum(0), self._mass.sum(1)
         mean_c, mean_r = round(float(p_e @ np.arange(len(p_e)))), round(float(p_n @ np.arange(len(p_n))))
         new = np.full((cells, cells), 1e-12 / cells**2)
-        r0, c0 = cells // 2 - mean_r, cells // 2 - mean_c  # where the old row 0 and column 0 land
+        r0, c0 = cells // 2 - mean_r, cells // 2 - mean_c  # where the old row 0 and column 0 go
         rs = slice(max(r0, 0), min(r0 + len(self._mass), cells))
         cs = slice(max(c0, 0), min(c0 + len(self._mass), cells))
         new[rs, cs] += self._mass[rs.start - r0 : rs.stop - r0, cs.start - c0 : cs.stop - c0]
@@ -223,14 +234,14 @@ class Belief:
 
 
 def log_likelihood_ratio(z: np.ndarray) -> np.ndarray:
-    """Of a standardised correlation, "here against elsewhere"; what is not known (NaN or below -5) counts as a little
-    worse than chance."""
+    """Log likelihood ratio "here against elsewhere" of a standardised correlation; an unknown one (NaN or below -5)
+    counts slightly worse than random alignment."""
     known = np.nan_to_num(z, nan=-9.0)
     return np.where(known < -5.0, -1.0, np.clip(LLR_SLOPE * (known - LLR_ZERO_Z), LLR_MIN, LLR_MAX))
 
 
 def _blurred(mass: np.ndarray, sigma: float) -> np.ndarray:
-    """Gaussian blur; a wide one is made on a smaller picture, where it costs no more than a narrow one."""
+    """Gaussian blur of ``sigma`` cells; a wide one is computed on a reduced grid at the cost of a narrow one."""
     shrink = max(1, int(sigma / WIDE_BLUR_CELLS))
     side = len(mass)
     small = cv2.resize(mass, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA) if shrink > 1 else mass

@@ -1,4 +1,4 @@
-"""The predicted camera over the ground as the map has it."""
+"""The predicted camera above the ground of the map."""
 
 import numpy as np
 
@@ -7,10 +7,15 @@ from terrafix.core.geodesy import rot_from_quat
 from terrafix.map.package import LocalMap
 from terrafix.messages import Prediction, Vec3
 
+# Variances in ``Prediction.cov``, (6, 6) row by row: east, north, rotation about east, north and up; and in
+# ``Prediction.step_cov_m2``, (2, 2): east and north. [spec: messages.Prediction]
+VAR_E, VAR_N, VAR_TILT_E, VAR_TILT_N, VAR_YAW = 0, 7, 21, 28, 35
+VAR_STEP_E, VAR_STEP_N = 0, 3  # [spec: messages.Prediction]
+
 
 def ground_plane(source: LocalMap, e_m: float, n_m: float, agl_m: float) -> tuple[Vec3 | None, float]:
-    """Least squares over the ground that is seen: AMSL below the camera, slope east, slope north; and what is left
-    (rms)."""
+    """Least-squares plane through the map's elevation below the camera: (AMSL below the camera, slope east, slope
+    north), and the rms of its residuals in metres. (None, 0) if less than half of the ground is known."""
     axis = np.linspace(-0.7, 0.7, 7) * agl_m
     de, dn = (a.ravel() for a in np.meshgrid(axis, axis))
     up = source.elevation(e_m + de, n_m + dn)
@@ -24,8 +29,8 @@ def ground_plane(source: LocalMap, e_m: float, n_m: float, agl_m: float) -> tupl
 
 
 def view_of(prediction: Prediction, ground: Vec3 | None, ground_m: float) -> View:
-    """``ground``: the plane below the prediction; None: not known, or not to be believed. Then the height above ground
-    is the reported one, over the level ``ground_m`` (AMSL)."""
+    """``ground``: plane below the prediction; None: unknown, or the position is not trusted. Then the reported height
+    above ground is used, over the level ``ground_m`` (AMSL)."""
     e_m, n_m, up_m = prediction.p_c_in_w_m
     agl_m = prediction.agl_m if ground is None else up_m - ground[0]
     return View(
@@ -34,7 +39,17 @@ def view_of(prediction: Prediction, ground: Vec3 | None, ground_m: float) -> Vie
         rot_from_quat(prediction.q_w_c),
         agl_m,
         ground_m if ground is None else ground[0],
-        float(np.sqrt(prediction.cov[35])),
+        float(np.sqrt(prediction.cov[VAR_YAW])),
         prediction.agl_sigma_m / max(agl_m, 1.0),
-        float(np.sqrt(max(prediction.cov[21], prediction.cov[28]))),
+        tilt_sigma_rad(prediction),
     )
+
+
+def position_sigma_m(prediction: Prediction) -> float:
+    """Horizontal 1-sigma of the predicted position, the larger of both axes."""
+    return float(np.sqrt(max(prediction.cov[VAR_E], prediction.cov[VAR_N])))
+
+
+def tilt_sigma_rad(prediction: Prediction) -> float:
+    """1-sigma of the predicted tilt, the larger of both axes."""
+    return float(np.sqrt(max(prediction.cov[VAR_TILT_E], prediction.cov[VAR_TILT_N])))

@@ -1,1 +1,1 @@
-"""The search for a place that is not known."""
+"""Search for an unknown position on the map."""

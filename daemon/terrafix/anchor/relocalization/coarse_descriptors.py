@@ -1,7 +1,8 @@
-"""What the search of an unknown place asks of the map: descriptors of its ground on coarse cells.
+"""Coarse descriptors of the map's ground for the search.
 
-They are read from the package where it has them, else computed from its imagery when they are first needed: that takes
-seconds for 100 km2, in flight, in the first look."""
+They are read from the package if it stores them. Otherwise they are computed from its imagery on first use, in flight,
+which takes seconds for 100 km2.
+"""
 
 import math
 
@@ -11,19 +12,22 @@ from terrafix.anchor.matching.descriptor_cache import Describer, MapFeatures, Ma
 from terrafix.map.descriptor_table import StoredDescriptors
 from terrafix.map.package import LocalMap
 
-PAD_PX = 8  # context of a tile: gradients and their blur reach six pixels, and a whole map has many rims
-OCTAVES = 0.6  # between the scale that is wanted and one that the package has: beyond this it is computed
+# pixels of context of a tile: gradients and their blur reach six pixels; small, because a whole map has many tile
+# borders [tuned]
+PAD_PX = 8
+# largest distance in octaves between the wanted scale and a stored one; beyond it descriptors are computed [tuned]
+MAX_OCTAVES = 0.6
 
 
-class TileIndex:
-    """Has the contract of ``MapFeatures``, for pixels of ``gsd_m(wanted)`` only."""
+class CoarseDescriptors:
+    """Same interface as ``MapFeatures``, for pixel sizes from ``gsd_m(wanted)`` only."""
 
     def __init__(self, source: MapWindows, describer: Describer) -> None:
         self._computed = MapFeatures(source, describer, pad_px=PAD_PX)
         self._stored = source.descriptors(describer.name) if isinstance(source, LocalMap) else None
 
     def gsd_m(self, wanted_m: float) -> float:
-        """The scale nearest to the wanted one that costs nothing; the wanted one where there is none."""
+        """The stored scale nearest to the wanted one; the wanted one if none is near enough."""
         return _nearest(self._stored, wanted_m) or wanted_m
 
     def window(
@@ -35,12 +39,12 @@ class TileIndex:
         return self._computed.window(e_min_m, n_max_m, width, height, gsd_m)
 
 
-def is_kept(source: LocalMap, name: str, wanted_m: float) -> bool:
-    """Whether the package has descriptors near a scale, so that the search need not compute them."""
+def has_stored_scale(source: LocalMap, name: str, wanted_m: float) -> bool:
+    """Whether the package stores descriptors near this scale."""
     return _nearest(source.descriptors(name), wanted_m) is not None
 
 
 def _nearest(stored: StoredDescriptors | None, wanted_m: float) -> float | None:
     scales_m = stored.gsds_m if stored else ()
     nearest_m = min(scales_m, key=lambda gsd_m: abs(math.log2(gsd_m / wanted_m)), default=math.inf)
-    return nearest_m if abs(math.log2(nearest_m / wanted_m)) <= OCTAVES else None
+    return nearest_m if abs(math.log2(nearest_m / wanted_m)) <= MAX_OCTAVES else None

@@ -1,8 +1,10 @@
-"""Where on the map, when nobody knows: a joint look of the last frames proposes places, tracks of camera poses decide.
+"""Global localization: joint correlations of the last frames propose places, tracks of camera poses decide between
+them.
 
-A joint look correlates the mosaic of the last frames with every cell of a region. Its best places are handed to the
-tracks, and how far a track leads all other places is evidence. The region grows by whole tiles around the last place
-that was believed, and ends with the whole map."""
+A joint correlation compares the mosaic of the last frames with every cell of a region. Its best places become tracks,
+and the lead of a track over all other places is evidence. The region grows in steps of whole blocks around the last
+believed position, up to the whole map.
+"""
 
 from dataclasses import dataclass
 
@@ -10,39 +12,56 @@ import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.matching.ncc import standardise
-from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, WideSearch, blocks_of
-from terrafix.anchor.relocalization.hypothesis_tracker import NEAR, NEW_EVIDENCE, SAME, Found, HypothesisTracker
+from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, BlockCorrelator, blocks_of
+from terrafix.anchor.relocalization.hypothesis_tracker import (
+    MERGE_RADIUS,
+    NEIGHBOUR_RADIUS,
+    NEW_EVIDENCE,
+    AcceptedPlace,
+    HypothesisTracker,
+)
 from terrafix.anchor.relocalization.mosaic import Mosaic
 from terrafix.core.node import Image
-from terrafix.map.null_model import FlightBudget, NullRow
+from terrafix.map.null_model import FalseAlarmBudget, NullRow
 from terrafix.map.package import LocalMap
 from terrafix.messages import SearchStep
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 
-# Dense gradients on small cells tell places apart best; where heading or map leave too much open, gradients that are
-# pooled over larger cells do: a heading that is off by degrees does not matter to them. Measured: docs/search.md.
+# Cells and number of hypotheses up to which dense gradients on small cells are used; they discriminate best. With more
+# hypotheses or a larger map, gradients pooled over larger cells are used: they tolerate yaw errors of some degrees.
+# [measured: docs/search.md]
 FINE_CELL_PER_AGL, FINE_HYPOTHESES = 1 / 50, 25
-CELL_PER_AGL = 1 / 13  # of pooled cells
-MAX_WORK = 35e6  # cells times headings times scales of one look: about 2 s of one core. A larger map gets larger cells
-LOOK_EVERY = 0.15  # of the height: motion between two looks at the whole region
-VERIFY_EVERY = 0.03  # ... and between two attempts at a pose
-NEW_GROUND = 0.6  # of the height: after this much motion a look counts as a new one; one that joins it is a wide one
-RINGS = (1, 4, 9, 16, 25)  # blocks of each step of the search, nearest first; then the whole map
-LOOKS_PER_RING = 0.5  # full looks without a track before the next step
-LOOKS_TO_ASK = 6.0  # full looks at the whole map before the operator is asked
-DRIFT = 0.06  # of the height: frames that odometry places less well than this are not joined
-UNSEEN = 0.1  # of the height: where odometry knows less, the ground may be another; hovering is no way
-JOINED = 2.0  # heights: frames farther away than this are not joined; the cost of a look grows with what is
-PROPOSED = 12  # places that a look may propose
-NEIGHBOURS = 4  # of the best of them that also propose the best place beside them
-LEAD_REACH = 0.2  # of the height: a track's place in the joint look is the best within this
-UNKNOWN = -9.0  # standard deviations, where the map does not cover the frames
+CELL_PER_AGL = 1 / 13  # pooled cell as a share of the height [measured: docs/search.md]
+# Largest cells x yaws x scales of one joint correlation, about 2 s of one core; a larger map is correlated on larger
+# cells [measured: docs/search.md]
+MAX_WORK = 35e6
+CORRELATION_INTERVAL = 0.15  # share of the height: motion between two joint correlations [tuned]
+VERIFICATION_INTERVAL = 0.03  # share of the height: motion between two comparisons of the tracks with a frame [tuned]
+# Share of the height: motion after which a joint correlation counts as new; one whose mosaic is that long is a wide one
+# [tuned]
+NEW_GROUND = 0.6
+REGION_BLOCKS = (1, 4, 9, 16, 25)  # blocks of each step of the search, nearest first; then the whole map [tuned]
+# joint correlations (full new ground) without a confirmed track before the next step [tuned]
+CORRELATIONS_PER_REGION = 0.5
+CORRELATIONS_TO_ASK = 6.0  # joint correlations of the whole map before the operator is asked for a position [tuned]
+# share of the height: frames whose relative position by odometry has a larger 1-sigma are not joined [tuned]
+MAX_JOIN_SIGMA = 0.06
+# share of the height: a step with a larger 1-sigma counts as path, because the ground may have changed; below it, noise
+# of hovering does not count [tuned]
+UNCERTAIN_STEP = 0.1
+# heights: frames farther apart are not joined; the cost grows with the size of the mosaic [tuned]
+MAX_JOIN_DISTANCE = 2.0
+MAX_PROPOSALS = 12  # places that one joint correlation may propose [tuned]
+# number of these, from the best, that also propose the best place beside them [measured: docs/search.md]
+NEIGHBOUR_PROPOSALS = 4
+LEAD_SEARCH_RADIUS = 0.2  # share of the height: search radius for a track's own value in the joint correlation [tuned]
+UNKNOWN = -9.0  # value in standard deviations where the map does not cover the frames [spec: below any correlation]
 
 
 @dataclass(frozen=True)
 class Peak:
-    """A place of the joint look: cell, standard deviations above what chance gives, heading and scale."""
+    """A local maximum of the joint correlation: cell, standard deviations above the median, yaw and scale."""
 
     row: int
     column: int
@@ -58,110 +77,125 @@ class MapSearch:
         agl_m: float,
         around_m: tuple[float, float] | None,
         null: NullRow,
-        budget: FlightBudget,
+        budget: FalseAlarmBudget,
     ) -> None:
-        """``around_m``: the last place that was believed, where the search begins; None: nowhere. ``null``: of the map
-        at this height; ``budget``: of the flight, from which every stretch of new ground takes a share."""
+        """``around_m``: last believed position (local east, north) around which the search begins; None: the whole map.
+        ``null``: null model of the map at this height; ``budget``: false-alarm budget of the flight, of which every
+        stretch of new ground spends a share."""
         self._map = source
         self._matcher = matcher
         self.agl_m = agl_m
         self._around_m = around_m
-        self._ring = 0 if around_m is not None else len(RINGS)
-        self._ring_looks = 0.0
+        self._region = 0 if around_m is not None else len(REGION_BLOCKS)
+        self._region_weight = 0.0
         self._blocks: list[Block] = []
         self._cell_m = 0.0
         self._hypotheses: tuple[Hypothesis, ...] = ()
         self._mosaic = Mosaic((), 1.0)
         self._null = null
         self._budget = budget
-        self.tracks = HypothesisTracker(source, matcher, null.patches)
-        self._p_m = np.zeros(2)  # by odometry, since the search began
+        self.tracker = HypothesisTracker(source, matcher, null.patches)
+        self._p_m = np.zeros(2)  # position by odometry since the search began
         self._var_m2 = 0.0
-        self._way_m = 0.0  # flown since the search began
-        self._looked_way_m = self._verified_way_m = self._decided_way_m = -np.inf
+        self._path_m = 0.0  # length flown since the search began
+        self._correlated_path_m = self._verified_path_m = self._decided_path_m = -np.inf
 
     @property
     def step(self) -> SearchStep:
-        if self._ring < len(RINGS) and (not self._blocks or self.tiles < len(self._blocks)):
+        if self._region < len(REGION_BLOCKS) and (not self._blocks or self.block_count < len(self._blocks)):
             return SearchStep.WIDEN
-        return SearchStep.ASK if self._ring_looks >= LOOKS_TO_ASK else SearchStep.WHOLE_MAP
+        return SearchStep.ASK if self._region_weight >= CORRELATIONS_TO_ASK else SearchStep.WHOLE_MAP
 
     @property
-    def tiles(self) -> int:
-        """Blocks of the map that are searched."""
-        return min(RINGS[self._ring], len(self._blocks)) if self._ring < len(RINGS) else len(self._blocks)
+    def block_count(self) -> int:
+        """Number of blocks that are searched."""
+        return (
+            min(REGION_BLOCKS[self._region], len(self._blocks))
+            if self._region < len(REGION_BLOCKS)
+            else len(self._blocks)
+        )
 
-    def move(self, east_m: float, north_m: float, sigma_m: float) -> None:
-        """Odometry. A step of which little is known counts as a way too: the ground is another. After one of which
-        nothing is known, all evidence before it is of another place and counts no more."""
+    def predict(self, east_m: float, north_m: float, sigma_m: float) -> None:
+        """Prediction by odometry. A step with a large 1-sigma adds to the path, because the ground may differ. After a
+        step with a 1-sigma above the neighbour radius all tracks are dropped: their evidence belongs to other
+        ground."""
         self._p_m += (east_m, north_m)
         self._var_m2 += sigma_m**2
-        self._way_m += float(np.hypot(np.hypot(east_m, north_m), sigma_m if sigma_m > UNSEEN * self.agl_m else 0.0))
-        self.tracks.move(np.array([east_m, north_m]))
-        if sigma_m > NEAR * self.agl_m:
-            self.tracks.all = []
+        self._path_m += float(
+            np.hypot(np.hypot(east_m, north_m), sigma_m if sigma_m > UNCERTAIN_STEP * self.agl_m else 0.0)
+        )
+        self.tracker.predict(np.array([east_m, north_m]))
+        if sigma_m > NEIGHBOUR_RADIUS * self.agl_m:
+            self.tracker.tracks = []
 
-    def look(self, image: Image, view: View) -> Found | None:
-        """``view``: height, attitude and how well they are known; its place counts for nothing."""
-        if self._way_m - self._looked_way_m >= LOOK_EVERY * view.agl_m:
-            self._look_wide(image, view)
-        if self._way_m - self._verified_way_m < VERIFY_EVERY * view.agl_m:
+    def process_frame(self, image: Image, view: View) -> AcceptedPlace | None:
+        """Processes one frame. ``view``: height, attitude and their uncertainty; its position is not used."""
+        if self._path_m - self._correlated_path_m >= CORRELATION_INTERVAL * view.agl_m:
+            self._correlate_region(image, view)
+        if self._path_m - self._verified_path_m < VERIFICATION_INTERVAL * view.agl_m:
             return None
-        self._verified_way_m = self._way_m
-        if self._way_m - self._decided_way_m >= NEW_EVIDENCE * view.agl_m:
-            self._decided_way_m = self._way_m
+        self._verified_path_m = self._path_m
+        if self._path_m - self._decided_path_m >= NEW_EVIDENCE * view.agl_m:
+            self._decided_path_m = self._path_m
             self._budget.spend()
-        return self.tracks.look(image, view, self._way_m, self.enough)
+        return self.tracker.update(image, view, self._path_m, self.required_evidence)
 
     @property
-    def enough(self) -> float:
-        """Evidence that a place needs by now."""
-        return self._null.enough(self.places, self._budget.log_probability)
+    def required_evidence(self) -> float:
+        """Evidence in nats that a track must have to be accepted, at this point of the flight."""
+        return self._null.detection_threshold(self.candidate_count, self._budget.log_probability)
 
     @property
-    def places(self) -> float:
-        """That could be the best one by chance: neighbours of the whole map, times headings and scales."""
+    def candidate_count(self) -> float:
+        """Number of places among which the best wrong one is selected: cells of neighbour radius over the map, times
+        yaws and scales."""
         e_min, n_min, e_max, n_max = self._map.bounds_m
-        area = (e_max - e_min) * (n_max - n_min) / (NEAR * self.agl_m) ** 2
+        area = (e_max - e_min) * (n_max - n_min) / (NEIGHBOUR_RADIUS * self.agl_m) ** 2
         return max(area, 1.0) * max(len(self._hypotheses), 1)
 
-    def _look_wide(self, image: Image, view: View) -> None:
+    def _correlate_region(self, image: Image, view: View) -> None:
         if not self._blocks:
-            self._begin(view)
-        stride = self._wide.stride
-        frames = self._matcher.rectified(image, view, self._hypotheses, self._cell_m / stride, stride)
-        templates = [self._wide.describe(frame) for frame in frames if frame is not None]
+            self._initialize(view)
+        stride = self._correlator.stride
+        frames = self._matcher.rectify_all(image, view, self._hypotheses, self._cell_m / stride, stride)
+        templates = [self._correlator.describe(frame) for frame in frames if frame is not None]
         if len(templates) < len(frames):
             return
-        new = min((self._way_m - self._looked_way_m) / (NEW_GROUND * view.agl_m), 1.0)
-        self._looked_way_m = self._way_m
-        self._mosaic.add(self._p_m, self._var_m2, templates, DRIFT * view.agl_m, JOINED * view.agl_m)
+        new = min((self._path_m - self._correlated_path_m) / (NEW_GROUND * view.agl_m), 1.0)
+        self._correlated_path_m = self._path_m
+        self._mosaic.add(
+            self._p_m, self._var_m2, templates, MAX_JOIN_SIGMA * view.agl_m, MAX_JOIN_DISTANCE * view.agl_m
+        )
         correlation = np.full(self._shape, np.nan, np.float32)
         index = np.zeros(self._shape, np.uint8)
-        blocks = self._blocks[: self.tiles]
-        looks = self._wide.look(self._mosaic.templates(), blocks, self._cell_m)
-        for block, found in zip(blocks, looks, strict=True):
+        blocks = self._blocks[: self.block_count]
+        results = self._correlator.correlate(self._mosaic.templates(), blocks, self._cell_m)
+        for block, found in zip(blocks, results, strict=True):
             at = self._cells(block)
             correlation[at], index[at] = found.correlation, found.index
-        self._judge(np.nan_to_num(standardise(correlation), nan=UNKNOWN), index, view.agl_m)
-        self._ring_looks += new
-        follows = any(track.frames for track in self.tracks.all)
-        if self.tiles < len(self._blocks) and self._ring_looks >= LOOKS_PER_RING and not follows:
-            self._ring, self._ring_looks = self._ring + 1, 0.0
+        self._update_tracks(np.nan_to_num(standardise(correlation), nan=UNKNOWN), index, view.agl_m)
+        self._region_weight += new
+        has_confirmed = any(track.frames for track in self.tracker.tracks)
+        if (
+            self.block_count < len(self._blocks)
+            and self._region_weight >= CORRELATIONS_PER_REGION
+            and not has_confirmed
+        ):
+            self._region, self._region_weight = self._region + 1, 0.0
 
-    def _begin(self, view: View) -> None:
-        self._hypotheses = self._matcher.wide_hypotheses(view)
+    def _initialize(self, view: View) -> None:
+        self._hypotheses = self._matcher.map_search_hypotheses(view)
         e_min, n_min, e_max, n_max = self._map.bounds_m
         places_m2 = (e_max - e_min) * (n_max - n_min) * len(self._hypotheses)
         cell_m = self._matcher.cell_m(view.agl_m, FINE_CELL_PER_AGL)
         if len(self._hypotheses) <= FINE_HYPOTHESES and places_m2 / cell_m**2 <= MAX_WORK:
-            self._wide = WideSearch(self._map, GradientDescriber())
+            self._correlator = BlockCorrelator(self._map, GradientDescriber())
         else:
-            self._wide = WideSearch(self._map, PooledGradientDescriber())
-            stride = self._wide.stride
-            cell_m = self._wide.cell_m(stride * self._matcher.cell_m(view.agl_m, CELL_PER_AGL / stride))
+            self._correlator = BlockCorrelator(self._map, PooledGradientDescriber())
+            stride = self._correlator.stride
+            cell_m = self._correlator.cell_m(stride * self._matcher.cell_m(view.agl_m, CELL_PER_AGL / stride))
             while places_m2 / cell_m**2 > MAX_WORK:
-                cell_m *= 2.0  # the next level of the map
+                cell_m *= 2.0  # the next octave of the map
         self._cell_m = cell_m
         blocks = blocks_of(self._map.bounds_m, cell_m)
         self._row0, self._column0 = min(b.row for b in blocks), min(b.column for b in blocks)
@@ -172,45 +206,48 @@ class MapSearch:
         e_m, n_m = self._around_m or (0.5 * (e_min + e_max), 0.5 * (n_min + n_max))
         half = BLOCK_CELLS / 2
 
-        def away(block: Block) -> float:
+        def distance_m(block: Block) -> float:
             return float(np.hypot((block.column + half) * cell_m - e_m, -(block.row + half) * cell_m - n_m))
 
-        self._blocks = sorted(blocks, key=away)
+        self._blocks = sorted(blocks, key=distance_m)
 
     def _cells(self, block: Block) -> tuple[slice, slice]:
         r, c = block.row - self._row0, block.column - self._column0
         return slice(r, r + BLOCK_CELLS), slice(c, c + BLOCK_CELLS)
 
-    def _judge(self, z: np.ndarray, index: np.ndarray, agl_m: float) -> None:
-        """How far each track leads all other places, and the best places as tracks, unless one is followed there."""
-        near, same, reach = (max(round(share * agl_m / self._cell_m), 1) for share in (NEAR, SAME, LEAD_REACH))
-        left, peaks, beside = z.copy(), list[Peak](), list[Peak]()
+    def _update_tracks(self, z: np.ndarray, index: np.ndarray, agl_m: float) -> None:
+        """Proposes the best places of the joint correlation as tracks and updates the lead of every track."""
+        near, same, radius = (
+            max(round(share * agl_m / self._cell_m), 1)
+            for share in (NEIGHBOUR_RADIUS, MERGE_RADIUS, LEAD_SEARCH_RADIUS)
+        )
+        remaining, peaks, beside = z.copy(), list[Peak](), list[Peak]()
 
         def best_of(region: np.ndarray, r0: int = 0, c0: int = 0) -> Peak:
             r, c = (int(v) for v in np.unravel_index(int(np.argmax(region)), region.shape))
             return Peak(r0 + r, c0 + c, float(region[r, c]), self._hypotheses[int(index[r0 + r, c0 + c])])
 
-        for k in range(PROPOSED):
-            peaks.append(best_of(left))
+        for k in range(MAX_PROPOSALS):
+            peaks.append(best_of(remaining))
             r, c = peaks[-1].row, peaks[-1].column
-            if k < NEIGHBOURS:
-                left[max(r - same, 0) : r + same + 1, max(c - same, 0) : c + same + 1] = UNKNOWN
+            if k < NEIGHBOUR_PROPOSALS:
+                remaining[max(r - same, 0) : r + same + 1, max(c - same, 0) : c + same + 1] = UNKNOWN
                 r0, c0 = max(r - near, 0), max(c - near, 0)
-                beside.append(best_of(left[r0 : r + near + 1, c0 : c + near + 1], r0, c0))
-            left[max(r - near, 0) : r + near + 1, max(c - near, 0) : c + near + 1] = UNKNOWN
+                beside.append(best_of(remaining[r0 : r + near + 1, c0 : c + near + 1], r0, c0))
+            remaining[max(r - near, 0) : r + near + 1, max(c - near, 0) : c + near + 1] = UNKNOWN
         for peak in (*peaks, *beside):
             e_m = (peak.column + self._column0 + 0.5) * self._cell_m
             n_m = -(peak.row + self._row0 + 0.5) * self._cell_m
             if peak.z > UNKNOWN:
-                self.tracks.propose(e_m, n_m, peak.hypothesis, agl_m)
+                self.tracker.propose(e_m, n_m, peak.hypothesis, agl_m)
         wide = self._mosaic.length_m >= NEW_GROUND * agl_m
-        for track in self.tracks.all:
+        for track in self.tracker.tracks:
             r = round(-track.n_m / self._cell_m - 0.5) - self._row0
             c = round(track.e_m / self._cell_m - 0.5) - self._column0
             here, beside_it = (
                 float(z[max(r - k, 0) : max(r + k + 1, 0), max(c - k, 0) : max(c + k + 1, 0)].max(initial=UNKNOWN))
-                for k in (reach, near)
+                for k in (radius, near)
             )
             rivals = [p.z for p in peaks if np.hypot(p.row - r, p.column - c) > near]
-            # What is better beside it counts against it, and not for it.
-            track.looked_at(here - max(rivals, default=UNKNOWN) - (beside_it - here), wide=wide)
+            # A better value beside the track counts against it.
+            track.add_lead(here - max(rivals, default=UNKNOWN) - (beside_it - here), wide=wide)

@@ -1,1 +1,1 @@
-"""Whether a place is right: evidence of patches, and of looks in a row."""
+"""Verification of a position: evidence of patches in one frame, and over frames."""

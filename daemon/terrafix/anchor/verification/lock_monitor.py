@@ -1,59 +1,68 @@
-"""Whether the place that is followed is still believed: log odds over looks and poses.
+"""Lock monitor: log odds, over frames and poses, that the tracked position is right.
 
-A belief always has a best place, and wrong ones look good one at a time. Over many looks they do not: what the frames
-say for the belief as a whole is less, and no camera pose stands."""
+A belief always has a best position, and a wrong one can score well in single frames. Over many frames the evidence for
+the belief as a whole is lower at a wrong position, and no camera pose is found.
+"""
 
 import numpy as np
 
-START_ODDS = 6.0  # log odds of a start coordinate: one in 400 is wrong by far more than it claims
-MOST_ODDS = 20.0  # of a place that poses have confirmed: bare ground, or a map of other years, may last for a kilometre
-# What a full look says for the belief, in nats: 4 to 9 where it is right, -0.4 to 3 where it is not (measured on real
-# flights with the right start and with one that is 700 m off). In between lies chance. A look that says nothing is weak
-# evidence, and the next one over the same kind of ground is hardly new: a copter that climbs over fields was right
-# through six full looks of -2 (twice as many must not outweigh a start).
-CHANCE = 3.0
-LOOK_MIN, LOOK_MAX = -0.4, 2.0
-DOUBT_ODDS = 2.94  # 5 %: from here on a 95 % ellipse around the place would not be one
-# What a pose says, by the patches that agree. Measured on nine flights and maps: at 70 right places a pose was found on
-# 25 to 90 % of the frames, with 20 inliers in the median; at 930 wrong ones on 0.5 %, with 9 to 11 (one had 20).
-POSE_LLR = ((8, 3.0), (12, 5.0), (20, 6.0))  # inliers, gain
-WIDE, WIDE_M = 0.5, 40.0  # share of the height, and metres: a 1-sigma above both claims little
+START_LOG_ODDS = 6.0  # log odds of a start coordinate: one in 400 is wrong by far more than its 1-sigma [tuned]
+# upper bound for a position confirmed by poses; bare ground or an outdated map may follow for a kilometre [tuned]
+MAX_LOG_ODDS = 20.0
+# Nats of a full observation under the null hypothesis. The right position gives 4 to 9, a wrong one -0.4 to 3 (real
+# flights with the right start and with one 700 m off). [measured: docs/search.md]
+NULL_GAIN = 3.0
+# Bounds of one full observation's gain, nats. An observation without evidence counts little against the position, and
+# the next one over the same kind of ground is not independent: a copter that climbed over fields was right through six
+# full observations of -2, and twice as many must not outweigh a start. [measured: this comment]
+MIN_GAIN, MAX_GAIN = -0.4, 2.0
+# log odds of 5 %: below it a 95 % ellipse around the position would not hold 95 % [spec: ln(0.95 / 0.05)]
+DOUBT_LOG_ODDS = 2.94
+# Evidence of a pose by its number of inliers. On nine flights and maps a pose was found at 70 right places in 25 to 90
+# % of the frames, with 20 inliers in the median, and at 930 wrong places in 0.5 %, with 9 to 11 inliers (one had 20).
+# [measured: docs/search.md]
+POSE_LLR = ((8, 3.0), (12, 5.0), (20, 6.0))  # (inliers, nats)
+# share of the height, and metres: a position whose 1-sigma exceeds both is not tested [tuned]
+WIDE_SIGMA, WIDE_SIGMA_M = 0.5, 40.0
 
 
 class LockMonitor:
     def __init__(self) -> None:
-        self.odds = START_ODDS
+        self.log_odds = START_LOG_ODDS
 
     @property
     def lost(self) -> bool:
-        """At even odds: from here the position is more likely wrong than right."""
-        return self.odds < 0.0
+        """At even odds the position is more likely wrong than right."""
+        return self.log_odds < 0.0
 
     @property
-    def doubt(self) -> float:
-        """Probability that the place is wrong, once that is too much to be left out of the covariance."""
-        return 0.0 if self.odds > DOUBT_ODDS else 1.0 / (1.0 + float(np.exp(self.odds)))
+    def wrong_probability(self) -> float:
+        """Probability that the position is wrong; 0 while it is too small to matter in the covariance."""
+        return 0.0 if self.log_odds > DOUBT_LOG_ODDS else 1.0 / (1.0 + float(np.exp(self.log_odds)))
 
-    def looked(self, gain: float, weight: float, new: float, inliers: int, claimed_m: float, agl_m: float) -> None:
-        """``gain`` of the belief (``Belief.update``) for a look of this weight; ``new``: what new ground gives
-        of it, since a hundred looks at one field are not evidence against it; ``inliers`` of the pose, 0: none.
+    def update(self, gain: float, weight: float, new: float, inliers: int, sigma_m: float, agl_m: float) -> None:
+        """Measurement update. ``gain``: evidence of the belief in nats (``Belief.update``) for an observation of this
+        weight; ``new``: share of new ground, since repeated observations of one field are no evidence against it;
+        ``inliers`` of the pose, 0: no pose.
 
-        ``claimed_m``: 1-sigma of the position. One that claims little is not wrong by more, and over so wide a belief
-        the right place gains little, too; what comes after a way that nobody saw is no surer than a start."""
-        if claims_little(claimed_m, agl_m):
-            self.odds = min(self.odds, START_ODDS)
+        ``sigma_m``: 1-sigma of the position. If it is large the log odds are not updated, because over a wide belief
+        the right position gains little too; they are limited to those of a start, because the flight since then was not
+        observed.
+        """
+        if has_wide_sigma(sigma_m, agl_m):
+            self.log_odds = min(self.log_odds, START_LOG_ODDS)
             return
-        self.odds += min(max(gain - CHANCE * weight, LOOK_MIN * new), LOOK_MAX * weight)
+        self.log_odds += min(max(gain - NULL_GAIN * weight, MIN_GAIN * new), MAX_GAIN * weight)
         if inliers:
-            self.odds += weight * pose_gain(inliers)
-        self.odds = min(self.odds, MOST_ODDS)
+            self.log_odds += weight * pose_gain(inliers)
+        self.log_odds = min(self.log_odds, MAX_LOG_ODDS)
 
 
-def claims_little(sigma_m: float, agl_m: float) -> bool:
-    """A position with this 1-sigma."""
-    return sigma_m > max(WIDE * agl_m, WIDE_M)
+def has_wide_sigma(sigma_m: float, agl_m: float) -> bool:
+    """Whether the 1-sigma of a position is so large that evidence against the position is not counted."""
+    return sigma_m > max(WIDE_SIGMA * agl_m, WIDE_SIGMA_M)
 
 
 def pose_gain(inliers: int) -> float:
-    """Log likelihood ratio, "here against elsewhere", of a pose on which so many patches agree."""
-    return max((gain for least, gain in POSE_LLR if inliers >= least), default=0.0)
+    """Log likelihood ratio "here against elsewhere" of a pose with so many inliers."""
+    return max((gain for fewest, gain in POSE_LLR if inliers >= fewest), default=0.0)

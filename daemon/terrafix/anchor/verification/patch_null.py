@@ -1,52 +1,55 @@
-"""What the patches of a frame come to at wrong places: learnt in the search itself, from the places that it checks.
+"""Null model of the patch consensus: mean and spread at wrong places, estimated during the search from the places that
+it compares.
 
-Ground that repeats itself gives wrong places more: at the best ones of `village-1` a third more than at those of
-`adiyaman-6`. Whoever counts the same for both is rash over the one and blind over the other."""
+Repetitive ground scores higher at wrong places: at the best ones of `village-1` a third more than at those of
+`adiyaman-6`. One fixed null model would be too permissive over the first and too strict over the second.
+"""
 
 import numpy as np
 
 from terrafix.anchor.verification.patch_consensus import PatchConsensus
 
-PATCHES = 48
-# Of so many patches at the best wrong places of eight flights and maps, on coarse and on fine cells: mean and standard
-# deviation. What is learnt is learnt in these units, for both kinds of cells at once.
-COARSE, FINE = (8.3, 2.1), (8.4, 2.7)
-PRIOR_PLACES = 15.0  # that they count as
-LEAST_VARIANCE = 0.2
-LEAST_SHARE = 0.8  # of the patches: fewer say too little
-LEARNT_PLACES = 24  # enough to know what chance comes to here
+REFERENCE_PATCHES = 48  # number of patches to which the values below refer [spec: MAX_PATCHES of the patch matcher]
+# Mean and standard deviation at the best wrong places of eight flights and maps, on coarse and on fine cells. Learned
+# values are expressed in these units, for both kinds of cells at once. [measured: docs/search.md]
+COARSE_NULL, FINE_NULL = (8.3, 2.1), (8.4, 2.7)
+PRIOR_PLACES = 15.0  # number of places as which the prior counts [tuned]
+MIN_VARIANCE = 0.2  # lower bound of the learned variance [tuned]
+MIN_PATCH_SHARE = 0.8  # smallest share of REFERENCE_PATCHES for a place to be learned from [tuned]
+MIN_PLACES = 24  # number of learned places from which the null model counts as known [measured: docs/search.md]
 
 
 class PatchNull:
     def __init__(self, patches: tuple[float, float] = (0.0, 1.0)) -> None:
-        """``patches``: mean and standard deviation of the map's null model, in units of ``COARSE`` and ``FINE``."""
+        """``patches``: mean and standard deviation of the map's null model, in units of ``COARSE_NULL`` and
+        ``FINE_NULL``."""
         mean, sigma = patches
-        self._sums = PRIOR_PLACES * np.array([1.0, mean, mean**2 + sigma**2])  # places, values, squares
+        self._sums = PRIOR_PLACES * np.array([1.0, mean, mean**2 + sigma**2])  # number, sum and sum of squares
 
     @property
-    def is_known(self) -> bool:
-        return bool(self._sums[0] >= PRIOR_PLACES + LEARNT_PLACES)
+    def is_estimated(self) -> bool:
+        return bool(self._sums[0] >= PRIOR_PLACES + MIN_PLACES)
 
-    def learn(self, found: PatchConsensus, *, fine: bool) -> None:
-        """From a place that is hardly the right one."""
-        if len(found.agrees) >= LEAST_SHARE * PATCHES:
-            value = _usual_sigmas(found, fine=fine)
+    def add(self, found: PatchConsensus, *, fine: bool) -> None:
+        """Adds a place that is probably wrong."""
+        if len(found.inliers) >= MIN_PATCH_SHARE * REFERENCE_PATCHES:
+            value = _default_sigmas(found, fine=fine)
             self._sums += (1.0, value, value**2)
 
     def sigmas(self, found: PatchConsensus, *, fine: bool) -> float:
-        """How far a place is above chance, in standard deviations."""
+        """Standard deviations of a place above the null model."""
         mean, sigma = self.patches
-        return (_usual_sigmas(found, fine=fine) - mean) / sigma
+        return (_default_sigmas(found, fine=fine) - mean) / sigma
 
     @property
     def patches(self) -> tuple[float, float]:
-        """Mean and standard deviation of what wrong places come to, as far as they are known by now."""
+        """Mean and standard deviation at wrong places, as estimated so far."""
         count, total, squares = self._sums
         mean = total / count
-        return float(mean), float(np.sqrt(max(squares / count - mean**2, LEAST_VARIANCE)))
+        return float(mean), float(np.sqrt(max(squares / count - mean**2, MIN_VARIANCE)))
 
 
-def _usual_sigmas(found: PatchConsensus, *, fine: bool) -> float:
-    """By what chance usually comes to. Fewer patches come to less by chance, too."""
-    (mean, sigma), share = FINE if fine else COARSE, len(found.agrees) / PATCHES
+def _default_sigmas(found: PatchConsensus, *, fine: bool) -> float:
+    """Standard deviations above the default null model. With fewer patches its mean and spread are smaller."""
+    (mean, sigma), share = FINE_NULL if fine else COARSE_NULL, len(found.inliers) / REFERENCE_PATCHES
     return float((found.llr - mean * share) / (sigma * np.sqrt(share)))

@@ -1,1 +1,1 @@
-"""Fields of MAVLink in SI units, for the live link and for recorded logs."""
+"""MAVLink message fields in SI units, for the live link and for recorded logs."""

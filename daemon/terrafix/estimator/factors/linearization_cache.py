@@ -1,8 +1,8 @@
-"""Factors written in Python, which remember what they answered last.
+"""Custom factors with a cache of their last linearization.
 
-iSAM2 asks a factor again whenever its part of the tree is eliminated anew, mostly around the very values of the time
-before: values change only when a variable has moved far enough (fixed_lag.py). The answer is the same to the last
-bit."""
+iSAM2 linearises a factor again whenever its part of the tree is eliminated again, mostly at the same values: these
+change only when a variable exceeds its relinearization threshold (fixed_lag.py). The cached result is identical to the
+last bit."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -12,33 +12,33 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import C
 
-# As many factors remember: four for each node, of two windows. Those that left the window have no need to.
-MOST = 160
+MAX_ENTRIES = 160  # factors in the cache: four per node, of two windows [spec: size of the window]
 
 Error = Callable[[Any, gtsam.Values, list[np.ndarray] | None], np.ndarray]
-_answers = OrderedDict[Error, tuple[list[bytes], np.ndarray, gtsam.JacobianVector]]()  # the newest at the end
-_POSE = gtsam.symbolChr(C(0))
+# Error function -> values of its keys, residual, Jacobians; the most recently used at the end.
+_cache = OrderedDict[Error, tuple[list[bytes], np.ndarray, gtsam.JacobianVector]]()
+_POSE_SYMBOL = gtsam.symbolChr(C(0))  # [spec: symbol of C_k]
 
 
 def custom_factor(noise: gtsam.noiseModel.Base, keys: list[int], error: Error) -> gtsam.CustomFactor:
-    """gtsam.CustomFactor; ``error`` is a function of the values of ``keys`` alone (C_k: Pose3; the others: vectors)."""
-    variables = [(key, gtsam.symbolChr(key) == _POSE) for key in keys]
+    """gtsam.CustomFactor whose ``error`` depends on the values of ``keys`` alone (C_k: Pose3; the others: vectors)."""
+    variables = [(key, gtsam.symbolChr(key) == _POSE_SYMBOL) for key in keys]
 
-    def asked(this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+    def cached_error(this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
         if jacobians is None:
             return error(this, values, None)
-        around = [
+        at = [
             (values.atPose3(key).matrix() if is_pose else values.atVector(key)).tobytes() for key, is_pose in variables
         ]
-        known = _answers.get(error)
-        if known is None or known[0] != around:
-            by = [np.zeros((0, 0))] * len(keys)
-            residual = error(this, values, by)
-            known = _answers[error] = (around, residual, gtsam.JacobianVector(by))
-            if len(_answers) > MOST:
-                _answers.popitem(last=False)
-        _answers.move_to_end(error)
-        jacobians[:] = known[2]
-        return known[1]
+        entry = _cache.get(error)
+        if entry is None or entry[0] != at:
+            computed = [np.zeros((0, 0))] * len(keys)
+            residual = error(this, values, computed)
+            entry = _cache[error] = (at, residual, gtsam.JacobianVector(computed))
+            if len(_cache) > MAX_ENTRIES:
+                _cache.popitem(last=False)
+        _cache.move_to_end(error)
+        jacobians[:] = entry[2]
+        return entry[1]
 
-    return gtsam.CustomFactor(noise, keys, asked)
+    return gtsam.CustomFactor(noise, keys, cached_error)

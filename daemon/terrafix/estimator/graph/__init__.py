@@ -1,1 +1,1 @@
-"""The iSAM2 window, and what has left it."""
+"""Factor graph: the iSAM2 window, and the linear system of what has left it."""

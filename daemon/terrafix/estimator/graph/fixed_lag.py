@@ -1,64 +1,68 @@
-"""iSAM2 over the newest nodes; what leaves is marginalised.
+"""Fixed-lag smoother: iSAM2 over the newest nodes; older ones are marginalised.
 
-GTSAM's IncrementalFixedLagSmoother does the same, but its order of elimination puts the newest variables anywhere when
-others leave: the two updates after that eliminate nearly everything again. Here older nodes are always eliminated
-before newer ones, so that those that leave are the leaves of the tree, and nothing else is asked again."""
+GTSAM's IncrementalFixedLagSmoother does the same, but its elimination order puts the newest variables anywhere when
+others leave, and the two updates after that eliminate nearly everything again. Here older nodes are always eliminated
+before newer ones, so that the nodes that leave are leaves of the tree and nothing else is relinearised."""
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
-from terrafix.estimator.models.motion_model import V_SIZE
+from terrafix.core.limits import WINDOW_NODES
+from terrafix.estimator.state import MOTION_SIZE
 
-# ON-3: 10-20 keyframes. So many, and up to a batch more: iSAM2 takes nodes out, and puts them in order, by the batch.
-LAG_NODES, BATCH_NODES = 15, 5
-# Steps from which a factor is linearised anew. Angles bend the geometry; metres and metres per second hardly do.
+# Least lag and batch, in nodes: requirement ON-3 asks for 10 to 20 keyframes. iSAM2 marginalises and orders nodes by
+# the batch, so the window holds up to a batch more. [spec: ON-3]
+BATCH_NODES = 5
+# Changes of a variable from which its factors are relinearised (rad, m; B_k; V_k). Angles make the geometry nonlinear;
+# metres and metres per second hardly do. [tuned]
 RELINEARIZE = {
     "c": np.array([0.03, 0.03, 0.03, 1.0, 1.0, 1.0]),
     "b": np.array([0.03, 0.03, 0.03, 10.0, 1.0, 0.05]),
-    "v": np.full(V_SIZE, 100.0),
+    "v": np.full(MOTION_SIZE, 100.0),
 }
-# A change below which iSAM2 looks at no older variable. Its own 0.001 is 0.06 degrees: a fifth of what headings err by.
+# Change below which iSAM2 does not update older variables. Its default of 0.001 is 0.06 degrees, a fifth of a usual
+# heading error. [tuned]
 WILDFIRE = 1e-6
 
 
 class FixedLagSmoother:
-    """Raises RuntimeError, as GTSAM does, when the system is indeterminate: it is of no use any more."""
+    """Raises RuntimeError, as GTSAM does, for an indeterminate system; the object cannot be used after that."""
 
     def __init__(self) -> None:
         params = gtsam.ISAM2Params()
         exact = gtsam.ISAM2GaussNewtonParams()
         exact.setWildfireThreshold(WILDFIRE)
         params.setOptimizationParams(exact)
-        params.setFactorization("QR")  # Cholesky gives up on long stretches without an absolute fix
+        params.setFactorization("QR")  # Cholesky fails on long stretches without an absolute fix
         thresholds = gtsam.ISAM2ThresholdMap()
         for letter, limits in RELINEARIZE.items():
             thresholds.insert((letter, limits))
         params.setRelinearizeThreshold(thresholds)
-        params.findUnusedFactorSlots = True  # or its lists of factors grow with the flight
-        params.relinearizeSkip = 1  # looked for at every update; the thresholds make it rare
+        params.findUnusedFactorSlots = True  # otherwise the list of factors grows with the flight
+        params.relinearizeSkip = 1  # checked at every update; the thresholds make relinearization rare
         self._isam = gtsam.ISAM2(params)
-        self._batches: dict[int, int] = {}  # node -> in which it came, or was kept
-        self._again: set[int] = set()  # nodes whose place in the order has changed
+        self._batches: dict[int, int] = {}  # node -> batch in which it was added or last retained
+        self._reordered: set[int] = set()  # nodes whose place in the elimination order has changed
 
     def leaving(self, node: int) -> list[int]:
-        """The nodes that leave when ``node`` comes."""
-        first = (node // BATCH_NODES) - LAG_NODES // BATCH_NODES
+        """The nodes that leave when ``node`` is added."""
+        first = (node // BATCH_NODES) - WINDOW_NODES // BATCH_NODES
         return [n for n, batch in self._batches.items() if batch < first]
 
     def keep(self, node: int) -> None:
-        """Holds it for another full lag."""
+        """Retains a node for another full lag."""
         newest = max(self._batches.values())
         if self._batches[node] != newest:
             self._batches[node] = newest
-            self._again.add(node)
+            self._reordered.add(node)
 
     def add(self, factors: gtsam.NonlinearFactorGraph) -> None:
-        """Of nodes that are there."""
+        """Adds factors of nodes in the window."""
         self._update(factors, gtsam.Values())
 
     def insert(self, node: int, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """The newest node, with its factors. Others leave (``leaving``)."""
+        """Adds the newest node with its factors, and marginalises the nodes that leave (``leaving``)."""
         leaving = self.leaving(node)
         self._batches[node] = node // BATCH_NODES
         self._update(factors, values)
@@ -71,36 +75,39 @@ class FixedLagSmoother:
             self._isam.marginalizeLeaves(leaves)
 
     def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """What is eliminated again is put in the order of the batches, the newest node last, of which most is asked.
-        So nothing but what came in its own batch or an older one is ever below a node in the tree, and leaves with it.
+        """Orders variables that are eliminated again by batch, with the newest node last, because most queries are for
+        it. So only variables of the same batch or an older one are below a node in the tree, and leave with it.
 
-        The two newest nodes are always among it: COLAMD takes no more groups than there are variables."""
+        The two newest nodes are always reordered: COLAMD takes no more groups than there are variables."""
         oldest = min(self._batches.values())
         newest = sorted(self._batches)[-2:]
-        groups, again = gtsam.KeyGroupMap(), gtsam.KeyList()
+        groups, reordered = gtsam.KeyGroupMap(), gtsam.KeyList()
         for n, batch in self._batches.items():
             for key in _keys(n):
                 groups.insert2(key, batch - oldest + (n == newest[-1]))
-                if (n in newest or n in self._again) and not values.exists(key):
-                    again.push_back(key)
-        self._again.clear()
-        self._isam.update(factors, values, [], groups, None, again)
+                if (n in newest or n in self._reordered) and not values.exists(key):
+                    reordered.push_back(key)
+        self._reordered.clear()
+        self._isam.update(factors, values, [], groups, None, reordered)
 
     def estimate(self) -> gtsam.Values:
-        """Of everything."""
+        """Of all variables in the window."""
         return self._isam.calculateEstimate()
 
-    def linear_around(self) -> gtsam.Values:
-        """Where its factors are linear: nearer to the estimate than RELINEARIZE says."""
+    def linearization_point(self) -> gtsam.Values:
+        """Of all factors in the window: within RELINEARIZE of the estimate."""
         return self._isam.getLinearizationPoint()
 
     def pose(self, node: int) -> gtsam.Pose3:
+        """Estimate of C."""
         return self._isam.calculateEstimatePose3(C(node))
 
     def vector(self, key: int) -> np.ndarray:
+        """Estimate of a B or a V."""
         return self._isam.calculateEstimateVector(key)
 
     def marginal(self, key: int) -> np.ndarray:
+        """Marginal covariance of a variable."""
         return self._isam.marginalCovariance(key)
 
 

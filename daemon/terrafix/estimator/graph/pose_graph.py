@@ -1,10 +1,9 @@
-"""The one graph: iSAM2 in a fixed lag of nodes; what leaves it is kept for the refinement after landing
-(marginalized.py).
+"""The estimator's factor graph: iSAM2 over a fixed lag of nodes. What leaves the lag is kept as a linear system for the
+refinement after landing (marginalized.py).
 
-A node is a frame: C_k, the camera pose in the world, B_k, the slow errors, and V_k, the velocity (see
-custom_factors.py)."""
+A node is one frame with the variables C_k, B_k and V_k (terrafix.estimator.state)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,61 +11,86 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
-from terrafix.estimator.factors.custom_factors import (
-    BIAS_SIZE,
-    HEIGHT,
-    map_fix_factor,
-    motion_factor,
-    plane_two_view_factor,
-    robust,
-)
+from terrafix.estimator.factors.motion import motion_factor
+from terrafix.estimator.factors.noise import robust_noise
+from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
 from terrafix.estimator.factors.three_view import ThreeViewConstraint, three_view_factor
 from terrafix.estimator.graph.fixed_lag import FixedLagSmoother
 from terrafix.estimator.graph.marginalized import MarginalizedHistory
-from terrafix.estimator.measurements.airspeed import AirspeedObservation, air_factor
-from terrafix.estimator.measurements.ekf_dead_reckoning import PropagatedState
-from terrafix.estimator.models.lens_prior import LENS_SIGMA
-from terrafix.estimator.models.motion_model import V_SIZE, MotionIncrement, standing_cov, unknown_cov
+from terrafix.estimator.models.bias_walk import walk_sigmas
+from terrafix.estimator.models.lens_prior import RADIAL_K1_SIGMA
+from terrafix.estimator.models.motion_model import MotionIncrement, stationary_motion_cov, unknown_motion_cov
 from terrafix.estimator.models.plane_motion import RelativePose
+from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, TRANSLATION, UP, NodeState
 
-LEFT_TO_LEG_M = 1e4  # 1-sigma of a guessed way, which its leg says already
-UNTOLD = 1e8  # variance of what a factor says nothing of
-# Random walk of the slow errors per square root of a second: mount tilt (a gimbal creeps), heading (a gyro drifts),
-# barometer (a front brings 1 hPa, 8 m, in an hour), lens (it warms up: a tenth of its error in ten minutes), scale
-# (air warms up by 4 degrees an hour, 1.5 %). A looser barometer lets minutes of dead reckoning carry the height off.
-WALK_SIGMAS = np.array([np.radians(0.15), np.radians(0.15), np.radians(0.3), 0.15, 2e-5, 2.5e-4])
-COMPASS_BY_TURN_RAD = np.radians(2.5)  # ... and of the compass per square root of a radian turned: iron on board
-
-
-def walk_sigmas(dt_s: float, turned_rad: float, rise_sigma_m: float) -> np.ndarray:
-    """1-sigma (6,) of what the slow errors have changed by. ``rise_sigma_m``: of the ground, when no map tells."""
-    sigmas = WALK_SIGMAS * np.sqrt(dt_s)
-    sigmas[2] = np.hypot(sigmas[2], COMPASS_BY_TURN_RAD * np.sqrt(abs(turned_rad)))
-    sigmas[HEIGHT] = np.hypot(sigmas[HEIGHT], rise_sigma_m)
-    return sigmas
+LOOSE_TRANSLATION_M = 1e4  # 1-sigma of a predicted translation, which the motion increment constrains already [tuned]
+MIN_STEP_S = 1e-3  # lower bound of the time between nodes [tuned]
+# 1-sigma of C (rad, m) after a rebuild, in tangent order: much less certain than any estimate in flight. [tuned]
+REBUILD_POSE_SIGMAS = np.array([0.1, 0.1, 0.2, 50.0, 50.0, 20.0])
+REBUILD_CALIBRATION_SIGMAS = np.array([0.1, 0.1, 0.1, 5.0, RADIAL_K1_SIGMA, 0.1])  # ... and of B [tuned]
 
 
 @dataclass(frozen=True)
-class NodeState:
-    pose: gtsam.Pose3
-    bias: np.ndarray  # (6,) B_k
-    velocity: np.ndarray  # (8,) V_k
+class GraphPrior:
+    """The first node of a graph: ``cov`` (6, 6) of its pose in tangent order, ``bias_cov`` (6, 6) of B, ``velocity_cov``
+    (8, 8) of V, and a factor of the reported attitude and height. ``gauge_fixed_cov`` (6, 6): enters the graph instead
+    of ``cov`` where part of the pose is unobservable and fixed by choice (yaw_gauge.py)."""
 
-    @property
-    def up_by_barometer_m(self) -> float:
-        """AMSL as seen heights have it, where no map tells the ground and C is above whatever is seen."""
-        return float(self.pose.translation()[2] + self.bias[HEIGHT])
+    state: NodeState
+    cov: np.ndarray
+    bias_cov: np.ndarray
+    velocity_cov: np.ndarray
+    attitude: gtsam.CustomFactor | None = None
+    gauge_fixed_cov: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class NewNode:
+    """A node that is tied to ``parent`` (in the window) by ``motion``, and to the newest node by ``increment``; None:
+    the vehicle is stationary. ``rise_sigma_m``: change of ground elevation since the newest node, without a DEM.
+    ``three_view``: an earlier node, and the constraint of that node, ``parent`` and this one."""
+
+    state: NodeState
+    parent: int
+    motion: RelativePose
+    increment: MotionIncrement | None
+    attitude: gtsam.CustomFactor | None
+    rise_sigma_m: float = 0.0
+    three_view: tuple[int, ThreeViewConstraint] | None = None
+
+
+class GraphObserver:
+    """Is called before each change of the graph. This one does nothing; post-flight analysis records the nodes."""
+
+    def before_node(self, graph: "PoseGraph") -> None:
+        """A node is about to be added, and others leave the window."""
+
+    def started(self, graph: "PoseGraph", t_s: float, prior: GraphPrior, others: list[gtsam.NonlinearFactor]) -> None:
+        """``others``: all factors of the first node but the prior of its pose."""
+
+    def extended(
+        self,
+        graph: "PoseGraph",
+        t_s: float,
+        new: NewNode,
+        odometry: gtsam.NonlinearFactor,
+        others: list[gtsam.NonlinearFactor],
+    ) -> None:
+        """``others``: all factors of the node but that of ``odometry``."""
 
 
 class PoseGraph:
-    def __init__(self, past: MarginalizedHistory | None = None) -> None:
-        self._past = past or MarginalizedHistory()
-        self._kept = gtsam.Values()  # the window, as it was before the last nodes came
+    """``rebuilds``: how often the smoother failed and was built anew from the last good estimate."""
+
+    def __init__(self, history: MarginalizedHistory | None = None, observer: GraphObserver | None = None) -> None:
+        self._observer = observer or GraphObserver()
+        self._history = history or MarginalizedHistory()
+        self._last_good = gtsam.Values()  # estimate of the window before the newest nodes were added
         self.rebuilds = 0
         self._smoother = FixedLagSmoother()
-        self._states: dict[int, NodeState] = {}  # asked for since the last update
-        self._marginals: dict[int, np.ndarray] = {}  # the same, by key
-        self._times: dict[int, float] = {}  # nodes in the window: measurement time, s
+        self._states: dict[int, NodeState] = {}  # cache, cleared by each update
+        self._marginals: dict[int, np.ndarray] = {}  # cache by key, cleared by each update
+        self._times: dict[int, float] = {}  # nodes in the window -> measurement time, s
         self._next = 0
 
     @property
@@ -77,28 +101,35 @@ class PoseGraph:
     def next_node(self) -> int:
         return self._next
 
+    @property
+    def window(self) -> tuple[int, ...]:
+        """Nodes in the window."""
+        return tuple(self._times)
+
     def holds(self, node: int) -> bool:
+        """Whether the node is in the window."""
         return node in self._times
 
     def state(self, node: int) -> NodeState:
         """Newest estimate of a node in the window."""
         if node not in self._states:
             pose = self._smoother.pose(node)
-            # Rounding makes rotations drift off SO(3), and every frame builds on the last one: the drift would double.
-            upright = gtsam.Pose3(gtsam.Rot3.ClosestTo(pose.rotation().matrix()), pose.translation())
+            # Rounding moves rotations off SO(3), and each frame builds on the last one: without this the error doubles.
+            orthonormal = gtsam.Pose3(gtsam.Rot3.ClosestTo(pose.rotation().matrix()), pose.translation())
             bias, velocity = (self._smoother.vector(key(node)) for key in (B, V))
-            self._states[node] = NodeState(upright, bias, velocity)
+            self._states[node] = NodeState(orthonormal, bias, velocity)
         return self._states[node]
 
     def covariance(self, node: int) -> np.ndarray:
-        """Marginal of C_node, 6x6, tangent order (rotation, translation); asked of the smoother itself."""
+        """Marginal of C, (6, 6), tangent order, from the smoother."""
         return self._marginal(C(node))
 
     def velocity_covariance(self, node: int) -> np.ndarray:
-        """Marginal of V_node, 8x8."""
+        """Marginal of V, (8, 8)."""
         return self._marginal(V(node))
 
     def bias_covariance(self, node: int) -> np.ndarray:
+        """Marginal of B, (6, 6)."""
         return self._marginal(B(node))
 
     def _marginal(self, key: int) -> np.ndarray:
@@ -110,150 +141,107 @@ class PoseGraph:
         """Measurement time of a node in the window, s."""
         return self._times[node]
 
-    def start(
-        self,
-        t_s: float,
-        state: NodeState,
-        cov: np.ndarray,
-        bias_cov: np.ndarray,
-        velocity_cov: np.ndarray,
-        attitude: gtsam.CustomFactor | None = None,
-        held: np.ndarray | None = None,
-    ) -> int:
-        """First node, or the first after a loss: priors on C (tangent covariance 6x6), B (6x6) and V (8x8).
-        ``held`` stands for that of C here, when part of the pose is not known but chosen.
-
-        The past stays as it was estimated."""
+    def start(self, t_s: float, prior: GraphPrior) -> int:
+        """Begins a new graph with one node. Nodes so far become history, as they were estimated. -> the node."""
+        self._observer.before_node(self)
         node = self._next
-        self._leave_all()
-        self._renew()
-        factors = _priors(node, state, cov if held is None else held, bias_cov, velocity_cov)
-        if attitude is not None:
-            factors.add(attitude)
-        self._insert(t_s, state, factors)
+        self._marginalize_all()
+        self._new_smoother()
+        pose_prior, others = _prior_factors(node, prior)
+        self._observer.started(self, t_s, prior, others)
+        self._insert(t_s, prior.state, [pose_prior, *others])
         return node
 
-    def extend(
-        self,
-        t_s: float,
-        state: NodeState,
-        parent: int,
-        motion: RelativePose,
-        leg: MotionIncrement | None,
-        attitude: gtsam.CustomFactor | None,
-        rise_sigma_m: float = 0.0,
-        three: tuple[int, ThreeViewConstraint] | None = None,
-    ) -> int:
-        """A node that follows ``parent`` (in the window) by ``motion``, and the newest by ``leg``; None: it stands.
-        ``rise_sigma_m``: of the ground since the newest, when no map tells. ``three``: what an earlier node, ``parent``
-        and this one saw together."""
-        node = self._next
-        newest = self.newest
-        dt_s = max(t_s - self._times[newest], 1e-3)
-        factors = gtsam.NonlinearFactorGraph()
-        if motion.seen is None:
+    def extend(self, t_s: float, new: NewNode) -> int:
+        """Adds a node. -> the node."""
+        self._observer.before_node(self)
+        node, others = self._next, list[gtsam.NonlinearFactor]()
+        odometry = self._odometry_factor(node, new)
+        others.append(self._motion_factor(node, self.newest, new.increment))
+        others.append(self._walk_factor(node, self.newest, t_s, new))
+        if new.attitude is not None:
+            others.append(new.attitude)
+        if new.three_view is not None and new.three_view[0] not in self._smoother.leaving(node):
+            first, middle, last = ((C(n), B(n)) for n in (new.three_view[0], new.parent, node))
+            rises = new.rise_sigma_m > 0.0
+            others.append(three_view_factor((first, middle, last), new.three_view[1], rises=rises))
+        self._observer.extended(self, t_s, new, odometry, others)
+        self._insert(t_s, new.state, [odometry, *others])
+        return node
+
+    def _odometry_factor(self, node: int, new: NewNode) -> gtsam.NonlinearFactor:
+        motion, parent = new.motion, new.parent
+        if motion.rays is None:
             between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
             cov = motion.cov.copy()
-            if leg is not None:
-                cov[3:, 3:] += LEFT_TO_LEG_M**2 * np.eye(3)
-            factors.add(gtsam.BetweenFactorPose3(C(parent), C(node), between, robust(cov)))
-        else:
-            seen, keyframe = motion.seen, self.state(parent).pose
-            factors.add(
-                plane_two_view_factor(
-                    C(parent),
-                    C(node),
-                    B(node),
-                    keyframe,
-                    state.pose,
-                    seen.pairs,
-                    seen.sigma,
-                    seen.ground,
-                    B(parent),
-                    seen.lens,
-                )
-            )
-        if leg is not None:
-            factors.add(motion_factor((C(newest), V(newest)), (C(node), V(node)), (B(newest), B(node)), leg))
-        else:
-            standing = gtsam.noiseModel.Gaussian.Covariance(standing_cov())
-            factors.add(gtsam.PriorFactorVector(V(node), np.zeros(V_SIZE), standing))
-        turned = state.pose.rotation().compose(self.state(newest).pose.rotation().inverse())
-        sigmas = walk_sigmas(dt_s, float(gtsam.Rot3.Logmap(turned)[2]), rise_sigma_m)
-        walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        factors.add(gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(BIAS_SIZE), walk))
-        if attitude is not None:
-            factors.add(attitude)
-        if three is not None and three[0] not in self._smoother.leaving(node):
-            first, middle, last = ((C(n), B(n)) for n in (three[0], parent, node))
-            factors.add(three_view_factor((first, middle, last), three[1], rises=rise_sigma_m > 0.0))
-        self._insert(t_s, state, factors)
-        return node
-
-    def add_pose(
-        self, node: int, pose: gtsam.Pose3, cov: np.ndarray, by_lens: np.ndarray | None = None, lens: float = 0.0
-    ) -> None:
-        """A map fix of a node in the window: camera pose with its covariance (tangent order), seen through ``lens``,
-        and what one of more bend would have moved it by."""
-        if by_lens is None:
-            self._join(gtsam.PriorFactorPose3(C(node), pose, robust(cov)))
-        else:
-            self._join(map_fix_factor(C(node), B(node), pose, cov, by_lens, lens))
-
-    def add_motion(self, node: int, carried: PropagatedState) -> None:
-        """Where a node in the window was led to, and how fast it was then."""
-        wide = np.diag([UNTOLD] * V_SIZE)
-        wide[:3, :3] = carried.velocity_cov
-        level = np.diag([UNTOLD] * 3)
-        level[:2, :2] = carried.cov_m2
-        gaussian = gtsam.noiseModel.Gaussian.Covariance
-        at_m, velocity = np.array([*carried.at_m, 0.0]), np.array([*carried.velocity_mps, *[0.0] * (V_SIZE - 3)])
-        self._join(
-            gtsam.GPSFactor(C(node), at_m, gaussian(level)), gtsam.PriorFactorVector(V(node), velocity, gaussian(wide))
+            if new.increment is not None:
+                cov[TRANSLATION, TRANSLATION] += LOOSE_TRANSLATION_M**2 * np.eye(3)
+            return gtsam.BetweenFactorPose3(C(parent), C(node), between, robust_noise(cov))
+        rays, keyframe = motion.rays, self.state(parent).pose
+        return plane_two_view_factor(
+            C(parent),
+            C(node),
+            B(node),
+            keyframe,
+            new.state.pose,
+            rays.pairs,
+            rays.sigma,
+            rays.ground,
+            B(parent),
+            rays.k1,
         )
 
-    def add_air(self, node: int, air: AirspeedObservation, cov: np.ndarray) -> None:
-        """The velocity of a node in the window, by what flows past it; ``cov`` (2, 2)."""
-        self._join(air_factor(V(node), B(node), air, cov))
+    def _motion_factor(self, node: int, newest: int, increment: MotionIncrement | None) -> gtsam.NonlinearFactor:
+        if increment is not None:
+            return motion_factor((C(newest), V(newest)), (C(node), V(node)), (B(newest), B(node)), increment)
+        stationary = gtsam.noiseModel.Gaussian.Covariance(stationary_motion_cov())
+        return gtsam.PriorFactorVector(V(node), np.zeros(MOTION_SIZE), stationary)
 
-    def _join(self, *new: gtsam.NonlinearFactor) -> None:
-        """Of nodes in the window."""
-        factors = gtsam.NonlinearFactorGraph()
-        for factor in new:
-            factors.add(factor)
-        self._past.add(factors)
+    def _walk_factor(self, node: int, newest: int, t_s: float, new: NewNode) -> gtsam.NonlinearFactor:
+        dt_s = max(t_s - self._times[newest], MIN_STEP_S)
+        turned = new.state.pose.rotation().compose(self.state(newest).pose.rotation().inverse())
+        sigmas = walk_sigmas(dt_s, float(gtsam.Rot3.Logmap(turned)[UP]), new.rise_sigma_m)
+        walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        return gtsam.BetweenFactorVector(B(newest), B(node), np.zeros(CALIBRATION_SIZE), walk)
+
+    def add(self, *new: gtsam.NonlinearFactor) -> None:
+        """Adds factors of nodes in the window."""
+        factors = _graph_of(new)
+        self._history.add(factors)
         self._update(partial(self._smoother.add, factors))
 
     def keep(self, node: int) -> None:
-        """Holds a node of the window in it for another full lag."""
+        """Retains a node in the window for another full lag."""
         self._smoother.keep(node)
 
     def next_keys(self) -> tuple[int, int]:
+        """Keys of C and B of the node that is added next."""
         return C(self._next), B(self._next)
 
     def refine(self) -> tuple[np.ndarray, np.ndarray]:
-        """After landing: positions (N, 3) of all nodes by all that was measured, covariances (N, 3, 3), world axes;
-        nan where that is indeterminate."""
-        self._leave_all()
-        return self._past.refine()
+        """After landing: position (N, 3) of every node given all measurements, and covariance (N, 3, 3), world axes;
+        nan where these are indeterminate."""
+        self._marginalize_all()
+        return self._history.refine()
 
-    def _insert(self, t_s: float, state: NodeState, factors: gtsam.NonlinearFactorGraph) -> None:
+    def _insert(self, t_s: float, state: NodeState, new: list[gtsam.NonlinearFactor]) -> None:
+        factors = _graph_of(new)
         node = self._next
         leaving = self._smoother.leaving(node)
         if leaving:
-            self._kept = self._smoother.estimate()
-            self._past.leave(leaving, self._smoother.linear_around())
+            self._last_good = self._smoother.estimate()
+            self._history.marginalize(leaving, self._smoother.linearization_point())
         else:
-            self._past.tidy()
+            self._history.reduce_step()
         values = _values(node, state)
-        self._kept.insert(values)
+        self._last_good.insert(values)
         self._next += 1
         self._times[node] = t_s
         for n in leaving:
             del self._times[n]
         if not any({C(node), B(node)} <= set(factors.at(i).keys()) for i in range(factors.size())):
-            factors.add(_tie(node))
-        self._past.add(factors)
+            factors.add(_empty_factor(node))
+        self._history.add(factors)
         self._update(partial(self._smoother.insert, node, factors, values))
 
     def _update(self, work: Callable[[], None]) -> None:
@@ -262,60 +250,69 @@ class PoseGraph:
         try:
             work()
             healthy = bool(np.isfinite(self.state(self.newest).pose.matrix()).all())
-        # How GTSAM, and a factor, say that a system is indeterminate; or that the tree has lost a variable.
+        # Raised by GTSAM and by factors for an indeterminate system, and for a variable missing from the tree.
         except (RuntimeError, OverflowError, ValueError, IndexError):
             healthy = False
         if not healthy:
             self._rebuild()
 
     def _rebuild(self) -> None:
-        """From the last good estimate, with little confidence."""
+        """A new graph of the newest node alone, from the last good estimate, with wide priors."""
         self.rebuilds += 1
         node = self.newest
-        state = NodeState(self._kept.atPose3(C(node)), self._kept.atVector(B(node)), self._kept.atVector(V(node)))
-        self._past.leave([n for n in self._times if n != node], self._kept)
-        self._past.begin(node)
-        self._renew()
+        state = NodeState(
+            self._last_good.atPose3(C(node)), self._last_good.atVector(B(node)), self._last_good.atVector(V(node))
+        )
+        self._history.marginalize([n for n in self._times if n != node], self._last_good)
+        self._history.begin_segment(node)
+        self._new_smoother()
         self._times = {node: self._times[node]}
-        wide = np.array([0.1, 0.1, 0.2, 50.0, 50.0, 20.0])
-        slow = np.array([0.1, 0.1, 0.1, 5.0, LENS_SIGMA, 0.1])
-        factors = _priors(node, state, np.diag(wide**2), np.diag(slow**2), unknown_cov())
-        self._past.add(factors)
+        pose_cov, bias_cov = np.diag(REBUILD_POSE_SIGMAS**2), np.diag(REBUILD_CALIBRATION_SIGMAS**2)
+        pose_prior, others = _prior_factors(node, GraphPrior(state, pose_cov, bias_cov, unknown_motion_cov()))
+        factors = _graph_of([pose_prior, *others])
+        self._history.add(factors)
         self._smoother.insert(node, factors, _values(node, state))
 
-    def _renew(self) -> None:
+    def _new_smoother(self) -> None:
         self._smoother = FixedLagSmoother()
         self._states.clear()
         self._marginals.clear()
 
-    def _leave_all(self) -> None:
-        """The window becomes the past."""
+    def _marginalize_all(self) -> None:
+        """Marginalises the whole window."""
         if self._times:
-            self._past.leave(list(self._times), self._smoother.estimate())
-        self._past.begin(self._next)
+            self._history.marginalize(list(self._times), self._smoother.estimate())
+        self._history.begin_segment(self._next)
         self._times.clear()
 
 
-def _tie(node: int) -> gtsam.LinearContainerFactor:
-    """Of C and B, and says nothing. ISAM2.marginalizeLeaves forgets a variable that leaves together with one that is
-    above it in the tree, if nothing ties the two, and raises (GTSAM 4.3: it climbs to the clique of the latter, and
-    takes out only what is below that by name). B of a node that begins a graph may be such a one."""
-    nothing = np.zeros((1, 6))
+def _empty_factor(node: int) -> gtsam.LinearContainerFactor:
+    """A factor of C and B without information. ISAM2.marginalizeLeaves drops a variable that leaves together with one
+    that is above it in the tree when no factor ties the two, and raises (GTSAM 4.3: it climbs to the clique of the
+    latter, and removes only what is below that by name). B of the first node of a graph may be such a variable."""
+    zero_row = np.zeros((1, 6))
     return gtsam.LinearContainerFactor(
-        gtsam.JacobianFactor(C(node), nothing, B(node), nothing, np.zeros(1), gtsam.noiseModel.Unit.Create(1))
+        gtsam.JacobianFactor(C(node), zero_row, B(node), zero_row, np.zeros(1), gtsam.noiseModel.Unit.Create(1))
     )
 
 
-def _priors(
-    node: int, state: NodeState, cov: np.ndarray, bias_cov: np.ndarray, velocity_cov: np.ndarray
-) -> gtsam.NonlinearFactorGraph:
-    """``cov`` 6x6, tangent order; ``bias_cov`` 6x6; ``velocity_cov`` 8x8."""
+def _graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def _prior_factors(node: int, prior: GraphPrior) -> tuple[gtsam.NonlinearFactor, list[gtsam.NonlinearFactor]]:
+    """-> the prior of the pose, and all others of the first node of a graph."""
     gaussian = gtsam.noiseModel.Gaussian.Covariance
-    factors = gtsam.NonlinearFactorGraph()
-    factors.add(gtsam.PriorFactorPose3(C(node), state.pose, gaussian(cov)))
-    factors.add(gtsam.PriorFactorVector(B(node), state.bias, gaussian(bias_cov)))
-    factors.add(gtsam.PriorFactorVector(V(node), state.velocity, gaussian(velocity_cov)))
-    return factors
+    cov = prior.cov if prior.gauge_fixed_cov is None else prior.gauge_fixed_cov
+    pose_prior = gtsam.PriorFactorPose3(C(node), prior.state.pose, gaussian(cov))
+    others: list[gtsam.NonlinearFactor] = [
+        gtsam.PriorFactorVector(B(node), prior.state.bias, gaussian(prior.bias_cov)),
+        gtsam.PriorFactorVector(V(node), prior.state.velocity, gaussian(prior.velocity_cov)),
+    ]
+    return pose_prior, others if prior.attitude is None else [*others, prior.attitude]
 
 
 def _values(node: int, state: NodeState) -> gtsam.Values:

@@ -1,98 +1,107 @@
-"""Where every node of a flight was: nodes that are unknowns, and between them positions that follow these."""
+"""Position of every node of a flight: unknowns, and nodes between them that depend on these."""
 
 import gtsam
 import numpy as np
 
-from terrafix.estimator.graph.elimination import NODE, Conditional, GaussianMarginal
+from terrafix.estimator.graph.elimination import NODE_SIZE, Conditional, GaussianMarginal
+from terrafix.estimator.state import POSE_SIZE, ROTATION, TRANSLATION
 
-_GROWS_BY = 1024  # rows
-_UPPER = np.triu_indices(3)
+_ROW_BLOCK = 1024  # rows by which the arrays grow [tuned]
+_UPPER = np.triu_indices(3)  # upper triangle of a position covariance [spec: 3 axes]
 
 
 class Trajectory:
-    """For each node its position where the unknowns are as they left the window; how it follows the two unknowns around
-    it, and its covariance when these are known. World axes. Of an unknown only the position counts."""
+    """Position of each node in world axes, with the unknowns at the state in which they left the window. For a node
+    that has been eliminated: the Jacobian of its position by the two unknowns around it, and its covariance given
+    these."""
 
     def __init__(self) -> None:
         self.size = 0
         self._p_m = np.zeros((0, 3))
-        # By the unknown before and the one after; good to a thousandth of what these move, in a quarter of the memory.
-        self._by = np.zeros((0, 3, 2 * NODE), np.float16)
+        # By the unknown before and the one after. float16 is good to a thousandth of their change, in a quarter of the
+        # memory.
+        self._by_ends = np.zeros((0, 3, 2 * NODE_SIZE), np.float16)
         self._cov = np.zeros((0, 6), np.float32)
 
     def put(self, node: int, p_m: np.ndarray) -> None:
-        """The next node, or an unknown that has moved."""
+        """Position of the next node, or the new position of an unknown."""
         if node == len(self._p_m):
-            self._p_m, self._by, self._cov = (
-                np.concatenate([rows, np.zeros((_GROWS_BY, *rows.shape[1:]), rows.dtype)])
-                for rows in (self._p_m, self._by, self._cov)
+            self._p_m, self._by_ends, self._cov = (
+                np.concatenate([rows, np.zeros((_ROW_BLOCK, *rows.shape[1:]), rows.dtype)])
+                for rows in (self._p_m, self._by_ends, self._cov)
             )
         self.size = max(self.size, node + 1)
         self._p_m[node] = p_m
 
-    def follow(self, known: Conditional, poses: list[gtsam.Pose3], ends: tuple[int, int]) -> None:
-        """The nodes of ``known``, at ``poses``, are unknowns no more, and all that lies between the unknowns ``ends``
-        follows these."""
-        inverse = np.linalg.inv(known.root)
-        change, cov, by = inverse @ known.rhs, inverse @ inverse.T, self._by_ends(known, inverse, ends)
-        moves = [_moves(pose) for pose in poses]
-        if len(known.nodes) == 1:
-            # What followed this node follows the ends through it, and so does the node itself.
-            node = known.nodes[0]
-            self._by[node] = np.hstack([np.zeros((3, NODE)), moves[0]])
-            for rows, its in ((slice(ends[0] + 1, node + 1), 1), (slice(node + 1, ends[1]), 0)):
-                through = self._by[rows, :, its * NODE : (its + 1) * NODE].astype(float)
+    def eliminate(self, conditional: Conditional, poses: list[gtsam.Pose3], ends: tuple[int, int]) -> None:
+        """The nodes of ``conditional``, at ``poses``, are no longer unknowns. All nodes between the unknowns ``ends``
+        depend on these from now on."""
+        inverse = np.linalg.inv(conditional.r)
+        change, cov = inverse @ conditional.d, inverse @ inverse.T
+        by_ends = _by_ends(conditional, inverse, ends)
+        jacobians = [_position_jacobian(pose) for pose in poses]
+        if len(conditional.nodes) == 1:
+            # Nodes that depended on this node depend on the ends through it, and so does the node itself.
+            node = conditional.nodes[0]
+            self._by_ends[node] = np.hstack([np.zeros((3, NODE_SIZE)), jacobians[0]])
+            for rows, side in ((slice(ends[0] + 1, node + 1), 1), (slice(node + 1, ends[1]), 0)):
+                columns = slice(side * NODE_SIZE, (side + 1) * NODE_SIZE)
+                through = self._by_ends[rows, :, columns].astype(float)
                 self._p_m[rows] += through @ change
                 self._cov[rows] += (through @ cov @ through.transpose(0, 2, 1))[:, *_UPPER]
-                self._by[rows, :, its * NODE : (its + 1) * NODE] = 0.0
-                self._by[rows] += through @ by
+                self._by_ends[rows, :, columns] = 0.0
+                self._by_ends[rows] += through @ by_ends
             return
-        for i, (node, move) in enumerate(zip(known.nodes, moves, strict=True)):
-            at = slice(NODE * i, NODE * (i + 1))
-            self._p_m[node] += move @ change[at]
-            self._cov[node] = (move @ cov[at, at] @ move.T)[_UPPER]
-            self._by[node] = move @ by[at]
+        for i, (node, jacobian) in enumerate(zip(conditional.nodes, jacobians, strict=True)):
+            at = slice(NODE_SIZE * i, NODE_SIZE * (i + 1))
+            self._p_m[node] += jacobian @ change[at]
+            self._cov[node] = (jacobian @ cov[at, at] @ jacobian.T)[_UPPER]
+            self._by_ends[node] = jacobian @ by_ends[at]
 
-    def lose(self, ends: tuple[int, int]) -> None:
-        """Nothing is known between these two."""
+    def mark_indeterminate(self, ends: tuple[int, int]) -> None:
+        """The nodes between these two have no position."""
         self._p_m[ends[0] + 1 : ends[1]] = np.nan
 
     def solved(
-        self, known: dict[int, GaussianMarginal], poses: dict[int, gtsam.Pose3], tied: list[tuple[int, int]]
+        self,
+        marginals: dict[int, GaussianMarginal],
+        poses: dict[int, gtsam.Pose3],
+        intervals: list[tuple[int, int]],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``known`` of the unknowns, which were at ``poses``, and what follows them between those that are ``tied``.
-        -> positions (N, 3), covariances (N, 3, 3); nan where nothing is known."""
+        """``marginals`` of the unknowns, linear around ``poses``; ``intervals``: pairs of unknowns that factors tie,
+        with the nodes between them. -> positions (N, 3), covariances (N, 3, 3); nan where indeterminate."""
         p_m, cov = np.full((self.size, 3), np.nan), np.full((self.size, 3, 3), np.nan)
-        for node, its in known.items():
-            change, its_cov = its.of([node])
-            move = _moves(poses[node])
-            p_m[node] = poses[node].retract(change[:6]).translation()
-            cov[node] = move @ its_cov @ move.T
-        for a, b in tied:
-            if b in known and a in known[b].nodes:
-                change, its_cov = known[b].of([a, b])
-                by = self._by[a + 1 : b].astype(float)
-                # Where the way turns, what moves far moves on an arc: the exponential map, to second order.
-                turn = 0.5 * sum(poses[n].rotation().rotate(known[n].of([n])[0][:3]) for n in (a, b))
-                moved = by @ change
+        for node, marginal in marginals.items():
+            change, node_cov = marginal.marginal([node])
+            jacobian = _position_jacobian(poses[node])
+            p_m[node] = poses[node].retract(change[:POSE_SIZE]).translation()
+            cov[node] = jacobian @ node_cov @ jacobian.T
+        for a, b in intervals:
+            if b in marginals and a in marginals[b].nodes:
+                change, ends_cov = marginals[b].marginal([a, b])
+                by_ends = self._by_ends[a + 1 : b].astype(float)
+                # With a rotation, large changes follow an arc: the exponential map, to second order.
+                turn = 0.5 * sum(poses[n].rotation().rotate(marginals[n].marginal([n])[0][ROTATION]) for n in (a, b))
+                moved = by_ends @ change
                 p_m[a + 1 : b] = self._p_m[a + 1 : b] + moved + 0.5 * np.cross(turn, moved)
-                full = np.zeros((b - a - 1, 3, 3))
-                full[:, *_UPPER] = full[:, *_UPPER[::-1]] = self._cov[a + 1 : b]
-                cov[a + 1 : b] = full + by @ its_cov @ by.transpose(0, 2, 1)
+                own_cov = np.zeros((b - a - 1, 3, 3))
+                own_cov[:, *_UPPER] = own_cov[:, *_UPPER[::-1]] = self._cov[a + 1 : b]
+                cov[a + 1 : b] = own_cov + by_ends @ ends_cov @ by_ends.transpose(0, 2, 1)
         return p_m, cov
 
-    @staticmethod
-    def _by_ends(known: Conditional, inverse: np.ndarray, ends: tuple[int, int]) -> np.ndarray:
-        """(NODE * nodes, 2 * NODE). A node far back, on which many hang that stand there, moves like the end before."""
-        by = np.zeros((len(inverse), 2 * NODE))
-        for i, node in enumerate(known.given):
-            first = NODE if node == ends[1] else 0
-            by[:, first : first + NODE] -= inverse @ known.by_given[:, NODE * i : NODE * (i + 1)]
-        return by
+
+def _by_ends(conditional: Conditional, inverse: np.ndarray, ends: tuple[int, int]) -> np.ndarray:
+    """(NODE_SIZE * nodes, 2 * NODE_SIZE) Jacobian by the two ends. An older parent, which many nodes of a stationary
+    vehicle share, is taken to change like the end before."""
+    by_ends = np.zeros((len(inverse), 2 * NODE_SIZE))
+    for i, node in enumerate(conditional.parents):
+        first = NODE_SIZE if node == ends[1] else 0
+        by_ends[:, first : first + NODE_SIZE] -= inverse @ conditional.s[:, NODE_SIZE * i : NODE_SIZE * (i + 1)]
+    return by_ends
 
 
-def _moves(pose: gtsam.Pose3) -> np.ndarray:
-    """(3, NODE): how the position changes with the changes of a node."""
-    by = np.zeros((3, NODE))
-    by[:, 3:6] = pose.rotation().matrix()
-    return by
+def _position_jacobian(pose: gtsam.Pose3) -> np.ndarray:
+    """(3, NODE_SIZE) of the position by the tangent of a node."""
+    jacobian = np.zeros((3, NODE_SIZE))
+    jacobian[:, TRANSLATION] = pose.rotation().matrix()
+    return jacobian

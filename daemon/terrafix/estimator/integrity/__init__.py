@@ -1,1 +1,1 @@
-"""Monitors of what a flight is described by: height, focal length, mount, mirrored pictures. Pure; no graph."""
+"""Fault detection: innovation gates, alternative positions, time offset, unobservable yaw. None changes the graph."""

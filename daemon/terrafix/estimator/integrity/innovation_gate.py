@@ -1,36 +1,45 @@
-"""A told height or heading that cannot be: a range finder without an echo, a zero that stands for nothing, a compass
-that turns over beside a power line.
+"""Innovation gate of a reported height or heading, with a time-out after which the measurement is accepted.
 
-A graph believes what is told as it believes the rest; one height of 300 m in a flight at 80 m takes all of it along,
-and what is seen is then another way. So such a word counts as one that nobody said."""
+It rejects readings that cannot be true: a range finder without an echo, a zero in place of "no data", a compass beside
+a power line. The graph would weight such a reading like any other: one height of 300 m in a flight at 80 m pulls the
+whole trajectory along, and later odometry is interpreted with the wrong scale. A rejected reading is treated as a
+missing one. Compare the innovation gates and the fusion time-out of PX4's EKF2."""
 
-SIGMAS = 8.0  # of sensor, graph and motion together: gusts, steps of a filter, rising ground and soft iron pass
-REPEATED = 10  # refused in a row without a map fix since the first of them: the flight may be what is wrong
-TWICE = 2  # ... and where there never was one, and FEW were believed: these may be what nobody could know yet
-FEW = 10
+# Consecutive rejections without a map fix since the first of them, after which the next reading is accepted: the
+# estimate itself may be wrong. [tuned]
+FUSION_TIMEOUT_SAMPLES = 10
+# Consecutive rejections after which a flight without any map fix is re-initialised, while not more than
+# REINIT_MAX_ACCEPTED readings were accepted: the early ones may be defaults of a sensor without data. [tuned]
+REINIT_SAMPLES = 2
+REINIT_MAX_ACCEPTED = 10  # readings [tuned]
 
 
 class InnovationGate:
-    def __init__(self) -> None:
-        self._believed = 0  # since the flight began
-        self._refused = 0
-        self._fixed_s: float | None = None
+    """Gate of one scalar measurement at ``gate_sigmas``. Counts accepted readings since (re-)initialisation and
+    consecutive rejections."""
 
-    def begun(self) -> None:
-        """With the word of its first frame."""
-        self._believed, self._refused = 1, 0
+    def __init__(self, gate_sigmas: float) -> None:
+        self.gate_sigmas = gate_sigmas
+        self._accepted = 0  # since the (re-)initialisation
+        self._rejected = 0  # consecutive
+        self._fixed_s: float | None = None  # time of the last map fix at the first of these rejections
+
+    def accept_initial(self) -> None:
+        """The state was (re-)initialised with the reading of its first frame."""
+        self._accepted, self._rejected = 1, 0
 
     @property
-    def begins(self) -> bool:
-        """What was refused last tells a flight without any map fix anew: those before it may be wrong as well."""
-        return self._believed == 1 or (self._refused >= TWICE and self._believed <= FEW)
+    def should_reinitialise(self) -> bool:
+        """For a flight without any map fix: the accepted readings may be wrong, begin again with the rejected one."""
+        return self._accepted == 1 or (self._rejected >= REINIT_SAMPLES and self._accepted <= REINIT_MAX_ACCEPTED)
 
-    def refuses(self, off: float, sigma: float, fixed_s: float | None) -> bool:
-        """``off`` from what is expected, to ``sigma``; ``fixed_s``: time of the last map fix."""
-        if abs(off) <= SIGMAS * sigma:
-            self._believed, self._refused = self._believed + 1, 0
+    def rejects(self, innovation: float, sigma: float, fixed_s: float | None) -> bool:
+        """Whether a reading is rejected. ``innovation`` and its 1-sigma in the same unit; ``fixed_s``: time of the last
+        map fix, None if there was none."""
+        if abs(innovation) <= self.gate_sigmas * sigma:
+            self._accepted, self._rejected = self._accepted + 1, 0
             return False
-        if not self._refused or fixed_s != self._fixed_s:
-            self._refused, self._fixed_s = 0, fixed_s
-        self._refused += 1
-        return self._refused <= REPEATED
+        if not self._rejected or fixed_s != self._fixed_s:
+            self._rejected, self._fixed_s = 0, fixed_s
+        self._rejected += 1
+        return self._rejected <= FUSION_TIMEOUT_SAMPLES

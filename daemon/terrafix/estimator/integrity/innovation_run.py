@@ -1,36 +1,41 @@
-"""Fixes that are not believed one by one, as offsets from the estimate: what they say when they agree."""
+"""Runs of consecutive map fixes whose innovations agree with each other.
+
+A single rejected fix is an outlier. Several with the same offset from the estimate are evidence that the estimate is
+wrong."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-AGREE_M = 15.0  # from their mean
+CONSISTENT_M = 15.0  # m: largest distance of an offset from the mean of its run [tuned]
 
 
 @dataclass
 class InnovationRun:
-    """Of fixes in a row, each ``offset`` (east, north) from the estimate of its frame."""
+    """``offsets_m``: horizontal offsets (2,), east and north, of consecutive fixes from the estimate of their frame."""
 
     offsets_m: list[np.ndarray] = field(default_factory=list)
-    poses: int = 0  # of them; the others are coarse
-    _began_at_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
-    _reached_m: float = 0.0
+    poses: int = 0  # number of camera poses among them; the others are coarse
+    _first_m: np.ndarray = field(default_factory=lambda: np.zeros(2))  # estimate at the first fix of the run
+    _span_m: float = 0.0  # from there to the estimate at the last fix
 
-    def add(self, offset_m: np.ndarray, here_m: np.ndarray, *, coarse: bool) -> bool:
-        """One more, with the estimate at ``here_m``. -> whether it agrees with the row; else it begins a new one."""
-        if self.offsets_m and float(np.hypot(*(offset_m - np.mean(self.offsets_m, axis=0)))) > AGREE_M:
+    def add(self, offset_m: np.ndarray, p_m: np.ndarray, *, coarse: bool) -> bool:
+        """Adds a fix, with the estimate at ``p_m`` (2,). -> whether it agrees with the run. If not, the run is cleared
+        and the fix begins a new one."""
+        if self.offsets_m and float(np.hypot(*(offset_m - np.mean(self.offsets_m, axis=0)))) > CONSISTENT_M:
             self.clear()
         agrees = bool(self.offsets_m)
         if not agrees:
-            self._began_at_m = here_m
+            self._first_m = p_m
         self.offsets_m.append(offset_m)
         self.poses += not coarse
-        self._reached_m = float(np.hypot(*(here_m - self._began_at_m)))
+        self._span_m = float(np.hypot(*(p_m - self._first_m)))
         return agrees
 
-    def holds(self, count: int, over_m: float, *, poses: bool = False) -> bool:
-        """So many agree (so many ``poses``), over so much way that they are not one mistake seen again and again."""
-        return (self.poses if poses else len(self.offsets_m)) >= count and self._reached_m > over_m
+    def is_confirmed(self, count: int, min_span_m: float, *, poses_only: bool = False) -> bool:
+        """At least ``count`` fixes (with ``poses_only``: camera poses) agree, over more than ``min_span_m`` of flight.
+        The span excludes one mistake that repeats over the same ground."""
+        return (self.poses if poses_only else len(self.offsets_m)) >= count and self._span_m > min_span_m
 
     def clear(self) -> None:
-        self.offsets_m, self.poses, self._reached_m = [], 0, 0.0
+        self.offsets_m, self.poses, self._span_m = [], 0, 0.0

@@ -1,47 +1,53 @@
-"""Whether camera poses on the map agree with the flight at all, or are those of a map that shows some other ground.
+"""Probability that the map does not show the ground below, from camera poses that the innovation gate rejects.
 
-Two hypotheses in log odds: the map shows the ground below, and now and then a pose is wrong; or it does not, and poses
-are wherever patterns look alike, so that hardly one agrees with the estimate. Looks that find no pose say nothing here:
-over bare ground they are many (registration.py, anchor/verification/lock_monitor.py)."""
+Two hypotheses in log odds. H0: the map shows the ground, and a small share of the poses is wrong. H1: it does not, and
+poses are wherever patterns look alike, so that hardly one agrees with the estimate. Correlations that find no pose are
+not used: over bare ground they are frequent under both (registration.py, anchor/verification/lock_monitor.py)."""
 
 import math
 
 import numpy as np
 
-from terrafix.core.gate import LEAST_WEIGHT
+from terrafix.core.gate import MIN_COMPONENT_WEIGHT
 
-# Probabilities that a pose is refused by the innovation gate and agrees with no other one.
-REFUSED, REFUSED_ELSEWHERE = 0.1, 0.9  # up to a tenth of the poses is wrong on a map of another year
-LEAST, MOST = -6.0, 4.0  # log odds: a map that was right for a kilometre may end all the same
-REMEMBERED = 0.7  # of the squared distances of refused poses, from one to the next
+# Probability under H0 and under H1 that a pose is rejected and agrees with no other one. Up to a tenth of the poses is
+# wrong on a map of another year. [measured: docs/integrity.md]
+P_REJECTED, P_REJECTED_WRONG_MAP = 0.1, 0.9
+# Limits of the log odds of H1 [nats]. The lower one keeps the test alert: a map that was right for a kilometre can
+# still end. [tuned]
+MIN_LOG_ODDS, MAX_LOG_ODDS = -6.0, 4.0
+OFFSET_MEMORY = 0.7  # weight of the earlier mean in that of the squared offsets of rejected poses [tuned]
 
 
 class MapConsistency:
     def __init__(self) -> None:
-        self._log_odds = LEAST  # of "elsewhere"
-        self._away_m2 = 0.0  # squared distance of refused poses from the estimate
+        self._log_odds = MIN_LOG_ODDS  # of H1
+        self._offset2_m2 = 0.0  # mean squared distance of rejected poses from the estimate
 
     @property
     def probability(self) -> float:
-        """That the map shows other ground than that below."""
+        """Of H1: the map shows other ground."""
         return 1.0 / (1.0 + math.exp(-self._log_odds))
 
     @property
     def variance_m2(self) -> float:
-        """Per horizontal axis, to be added to what is claimed: the vehicle may be as far off as refused poses are."""
-        return self.probability * self._away_m2 if self.probability >= LEAST_WEIGHT else 0.0
+        """Addition to the published variance per horizontal axis: the vehicle may be as far away as rejected poses are.
+        0 while the probability is below MIN_COMPONENT_WEIGHT."""
+        return self.probability * self._offset2_m2 if self.probability >= MIN_COMPONENT_WEIGHT else 0.0
 
-    def refused(self, offset_m: np.ndarray) -> None:
-        """A camera pose, ``offset_m`` (2,) from the estimate and beyond the gate, that agrees with none before it."""
-        self._add(math.log(REFUSED_ELSEWHERE / REFUSED))
-        away_m2 = float(offset_m @ offset_m)
-        self._away_m2 = REMEMBERED * self._away_m2 + (1.0 - REMEMBERED) * away_m2 if self._away_m2 else away_m2
+    def add_rejected(self, offset_m: np.ndarray) -> None:
+        """A camera pose outside the gate, ``offset_m`` (2,) from the estimate, that agrees with no pose before it."""
+        self._add(math.log(P_REJECTED_WRONG_MAP / P_REJECTED))
+        offset2_m2 = float(offset_m @ offset_m)
+        self._offset2_m2 = (
+            OFFSET_MEMORY * self._offset2_m2 + (1.0 - OFFSET_MEMORY) * offset2_m2 if self._offset2_m2 else offset2_m2
+        )
 
-    def agreed(self, new_share: float) -> None:
-        """A camera pose passed the gate; ``new_share`` 0..1 of the ground that it saw is new."""
-        self._add(new_share * math.log((1.0 - REFUSED_ELSEWHERE) / (1.0 - REFUSED)))
-        if self._log_odds <= LEAST:
-            self._away_m2 = 0.0
+    def add_accepted(self, information_share: float) -> None:
+        """A camera pose inside the gate, weighted by the share 0..1 of the ground in it that is new."""
+        self._add(information_share * math.log((1.0 - P_REJECTED_WRONG_MAP) / (1.0 - P_REJECTED)))
+        if self._log_odds <= MIN_LOG_ODDS:
+            self._offset2_m2 = 0.0
 
-    def _add(self, nats: float) -> None:
-        self._log_odds = min(MOST, max(LEAST, self._log_odds + nats))
+    def _add(self, llr: float) -> None:
+        self._log_odds = min(MAX_LOG_ODDS, max(MIN_LOG_ODDS, self._log_odds + llr))

@@ -1,39 +1,49 @@
 """Innovation gate of odometry: the motion between two frames against velocity, inertial readings and time."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from terrafix.core.gate import GATE
+from terrafix.estimator.integrity.innovation import Innovation
 
-GATE_D2 = 30.66  # chi-square, 3 degrees of freedom: a true motion is refused once in a million frames
-# What the process noise of the motion model leaves out, as an acceleration. Without inertial readings: no small vehicle
-# changes its velocity faster (4 g; survey multirotors reach 1 g, aerobatic ones 5 g for tenths of a second). With
-# them: a tilt of the autopilot that is wrong by 30 degrees.
-UNMEASURED_MPS2, UNMEASURED_BY_IMU_MPS2 = 40.0, 5.0
+# Squared Mahalanobis distance. A true motion is rejected once in a million frames.
+GATE_D2 = 30.66  # [spec: chi-square, 3 degrees of freedom, 1 - 1e-6]
+# Acceleration that the process noise of the motion model does not cover, without and with inertial readings [m/s^2].
+# Without: the hardest manoeuvre of a small vehicle, 4 g (survey multirotors reach 1 g, aerobatic ones 5 g for tenths
+# of a second). With: an attitude of the autopilot with a tilt error of 30 degrees. [tuned]
+MAX_MANOEUVRE_MPS2, MAX_MANOEUVRE_WITH_IMU_MPS2 = 40.0, 5.0
 
 
 @dataclass(frozen=True)
 class MotionInnovation:
-    """``off_m`` (3,): where odometry has the camera, less where velocity leads, world axes. ``cov_m2`` (3, 3) of it.
-    ``dt_s``: over which velocity led there. ``inertial``: by inertial readings."""
+    """``residual_m`` (3,): camera position by odometry less the predicted one, world axes, with covariance ``cov_m2``
+    (3, 3). ``dt_s``: duration of the prediction. ``inertial``: the prediction used inertial readings."""
 
-    off_m: np.ndarray
+    residual_m: np.ndarray
     cov_m2: np.ndarray
     dt_s: float
     inertial: bool
 
     @property
-    def is_possible(self) -> bool:
-        return self.d2(UNMEASURED_BY_IMU_MPS2 if self.inertial else UNMEASURED_MPS2) <= GATE_D2
+    def passes_gate(self) -> bool:
+        return self.gated.is_accepted
+
+    @cached_property
+    def gated(self) -> Innovation:
+        """The part of the residual that no manoeuvre explains."""
+        manoeuvre_mps2 = MAX_MANOEUVRE_WITH_IMU_MPS2 if self.inertial else MAX_MANOEUVRE_MPS2
+        return Innovation(self._unexplained_m(manoeuvre_mps2), self.cov_m2, GATE_D2)
 
     @property
-    def may_stand(self) -> bool:
-        """Of odometry that shows no motion at all: no manoeuvre ends so from one frame to the next."""
-        return self.d2(0.0) <= GATE[3]
+    def allows_standstill(self) -> bool:
+        """For odometry that shows no motion at all. No manoeuvre is allowed for: none ends in a standstill from one
+        frame to the next."""
+        return Innovation(self._unexplained_m(0.0), self.cov_m2, GATE[3]).is_accepted
 
-    def d2(self, manoeuvre_mps2: float) -> float:
-        """Squared Mahalanobis distance, 3 degrees of freedom, beyond what such a manoeuvre explains."""
+    def _unexplained_m(self, manoeuvre_mps2: float) -> np.ndarray:
+        """(3,): the part of the residual that an acceleration of ``manoeuvre_mps2`` over ``dt_s`` does not explain."""
         manoeuvre_m = 0.5 * manoeuvre_mps2 * self.dt_s**2
-        beyond_m = self.off_m * max(0.0, 1.0 - manoeuvre_m / max(float(np.linalg.norm(self.off_m)), 1e-9))
-        return float(beyond_m @ np.linalg.solve(self.cov_m2, beyond_m))
+        scale = max(0.0, 1.0 - manoeuvre_m / max(float(np.linalg.norm(self.residual_m)), 1e-9))
+        return self.residual_m * scale

@@ -1,28 +1,28 @@
-"""Where the vehicle may be, as one mixture: where the graph has it, other places that the map speaks for, anywhere.
+"""Position as a Gaussian mixture: the graph's estimate, other positions that the map supports, and anywhere.
 
-What is published is the heaviest component, with the second moments of the mixture about it: the mean of two places
+The heaviest component is published, with the second moments of the mixture about it. The mean of two separate places
 would be neither of them (Gaussian sum filter: Alspach and Sorenson 1972)."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.core.gate import GATE, LEAST_WEIGHT
-from terrafix.core.initial_position import SEARCHED_START_M
+from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
+from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.other_place import OtherPlace
 from terrafix.messages import MapMatch, Origin, Verdict
 
-# Of the height: with a position that is known better, poses have placed the graph. A mode of the belief elsewhere
-# widens the claim then and does not move it: a pose on the other place is what it takes to leave.
-PLACED = 0.15
-# What a mode is believed at most without a pose in it: of eight over wide beliefs, with up to 0.97 of the mass, one was
-# the wrong place.
-MOST_WEIGHT = 0.8
-# What a mode must hold, and how many times the weight of its best rival, to be the best single place. The rest of the
-# mixture is in the moments about it, so that this decides where the ellipse is, not how far it reaches.
-LEADING_WEIGHT, LEADS = 0.25, 2.5
-MODE_SIGMA = 0.03  # of the height: buildings that lean shift a whole picture (anchor/matching/match_message.py)
+# Share of the height above ground. With a smaller 1-sigma, map poses have placed the graph. A mode of the belief
+# elsewhere then widens the published covariance and does not move the position; that takes a pose. [tuned]
+PLACED_SIGMA_HEIGHTS = 0.15
+# Largest weight of a mode without a pose in it. [measured: of 8 modes over wide beliefs, mass up to 0.97, 1 was wrong]
+MAX_WEIGHT_WITHOUT_POSE = 0.8
+# A mode is published as the best place from this weight on, and from this ratio to the weight of the second one. The
+# rest of the mixture is in the moments about it: these decide on the centre of the ellipse, not on its size. [tuned]
+MIN_LEADING_WEIGHT, MIN_LEADING_RATIO = 0.25, 2.5
+# 1-sigma of a mode as a share of the height: relief displacement of buildings (anchor/matching/match_message.py)
+MODE_SIGMA_HEIGHTS = 0.03  # [tuned]
 
 
 @dataclass(frozen=True)
@@ -33,102 +33,109 @@ class Component:
     cov_m2: np.ndarray
     weight: float
 
-    def about(self, at_m: np.ndarray) -> np.ndarray:
-        """Second moments (2, 2) about a place."""
-        return np.asarray(self.cov_m2 + np.outer(self.offset_m - at_m, self.offset_m - at_m))
+    def moments_about(self, p_m: np.ndarray) -> np.ndarray:
+        """Second moments (2, 2) about ``p_m`` (2,), an offset from the estimate as well."""
+        return np.asarray(self.cov_m2 + np.outer(self.offset_m - p_m, self.offset_m - p_m))
 
 
 class PositionHypotheses:
-    """``anywhere_m``: 1-sigma per horizontal axis of "the place may be wrong", its probability counted in. ``other``:
-    the place that map matches in a row speak for, against the graph."""
+    """``anywhere_m``: 1-sigma per horizontal axis of a position that is wrong, times the root of its probability.
+    ``other``: the alternative position, which consecutive map matches support against the graph."""
 
     def __init__(self, origin: Origin | None = None) -> None:
-        """``origin``: of a flight that begins. A start that is searched is all doubt: as a prior so wide it would make
-        the graph ill-conditioned."""
-        searched = origin is not None and origin.start_sigma_m > SEARCHED_START_M
-        self._start_m = origin.start_sigma_m if origin is not None and searched else 0.0
+        """``origin``: of a new flight. The uncertainty of a start that has to be searched for is held here and not in
+        the graph's prior, which would make the graph ill-conditioned."""
+        searched = origin is not None and origin.start_sigma_m > SEARCH_START_SIGMA_M
+        self._start_sigma_m = origin.start_sigma_m if origin is not None and searched else 0.0
         self.anywhere_m = 0.0
         self.other = OtherPlace()
         self.map_consistency = MapConsistency()
-        self._modes: tuple[Component, ...] = ()  # of the belief, heaviest first
-        self._belief: Component | None = None  # all of it, while no pose has placed the graph
-        self._own_m2 = np.zeros((2, 2))  # of the estimate that these were weighed against
+        self._modes: tuple[Component, ...] = ()  # of the anchor's belief, heaviest first
+        self._belief: Component | None = None  # moments of the whole belief, while no pose has placed the graph
+        self._estimate_cov_m2 = np.zeros((2, 2))  # of the estimate that modes and belief were compared with
 
     @property
-    def are_several(self) -> bool:
-        several = bool(self._modes) or self._belief is not None or self.other.probability > 0.0
-        return several or self.map_consistency.variance_m2 > 0.0
+    def is_multimodal(self) -> bool:
+        """Whether the published position may differ from the estimate, or its covariance is inflated by the map."""
+        multimodal = bool(self._modes) or self._belief is not None or self.other.probability > 0.0
+        return multimodal or self.map_consistency.variance_m2 > 0.0
 
-    def hear(self, match: MapMatch) -> str:
-        """-> what to say of a match whose verdict is LOST; empty for any other."""
+    def on_match(self, match: MapMatch) -> str:
+        """-> detail of the verdict on a match that is LOST; empty for any other."""
         self.anywhere_m = match.lost_sigma_m
         return f"lost; search: {match.step.value}" if match.verdict is Verdict.LOST else ""
 
-    def weigh(self, match: MapMatch, p_m: np.ndarray, cov: np.ndarray, height_m: float) -> None:
-        """The anchor's belief against the estimate of that frame: ``p_m`` (3,) with ``cov`` (6, 6), world axes. Where
-        poses have placed the graph, a mode that is as near as both claim is the estimate's own place; else the belief,
-        whose prior the estimate was, knows the place better than that."""
-        lever_m2 = height_m**2 * np.diag([cov[4, 4], cov[3, 3]])  # of a place that is seen, by tilt
-        placed = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1])) < PLACED * height_m
-        modes, self._own_m2 = [], cov[:2, :2].copy()
+    def update_modes(self, match: MapMatch, p_m: np.ndarray, cov: np.ndarray, agl_m: float) -> None:
+        """Compares the anchor's belief with the estimate of the same frame: ``p_m`` (3,), ``cov`` (6, 6), world axes.
+
+        Where poses have placed the graph, a mode inside the gate is the estimate's own position and is left out.
+        Elsewhere the belief replaces the estimate: the estimate was its prior, so that the belief contains it."""
+        lever_m2 = agl_m**2 * np.diag([cov[4, 4], cov[3, 3]])  # of a position on the ground, by tilt
+        placed = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1])) < PLACED_SIGMA_HEIGHTS * agl_m
+        modes, self._estimate_cov_m2 = [], cov[:2, :2].copy()
         for e_m, n_m, mass, var_m2 in match.modes:
-            cov_m2 = (var_m2 + (MODE_SIGMA * height_m) ** 2) * np.eye(2) + lever_m2
+            cov_m2 = (var_m2 + (MODE_SIGMA_HEIGHTS * agl_m) ** 2) * np.eye(2) + lever_m2
             mode = Component(np.array([e_m, n_m]) - p_m[:2], cov_m2, mass)
-            apart_m2 = cov[:2, :2] + lever_m2 + cov_m2
-            own = placed and float(mode.offset_m @ np.linalg.solve(apart_m2, mode.offset_m)) <= GATE[2]
-            if mass >= LEAST_WEIGHT and not own:
+            innovation_m2 = cov[:2, :2] + lever_m2 + cov_m2
+            own = placed and float(mode.offset_m @ np.linalg.solve(innovation_m2, mode.offset_m)) <= GATE[2]
+            if mass >= MIN_COMPONENT_WEIGHT and not own:
                 modes.append(mode)
         self._modes = tuple(sorted(modes, key=lambda mode: -mode.weight))
         belief_m2 = np.array(match.belief_cov_m2).reshape(2, 2) + lever_m2
         self._belief = None if placed else Component(np.array(match.belief_m) - p_m[:2], belief_m2, 1.0)
 
-    def confirmed(self) -> None:
+    def on_match_accepted(self) -> None:
         """A map match agreed with the estimate."""
-        self._start_m, self._modes, self._belief = 0.0, (), None
+        self._start_sigma_m, self._modes, self._belief = 0.0, (), None
 
-    def moved(self, anywhere_m: float) -> None:
-        """The graph has begun anew where the map has it, a place that is still tested when ``anywhere_m`` is not 0."""
-        self.confirmed()
+    def on_reset(self, anywhere_m: float) -> None:
+        """The graph was reset to a map match. ``anywhere_m``: not 0 while the anchor still verifies that place."""
+        self.on_match_accepted()
         self.anywhere_m = anywhere_m
 
     def claim(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """-> by how much (2,) what is published is off the estimate, and its covariance (6, 6), from that of the
-        estimate, east and north first."""
+        """-> offset (2,) of the published position from the estimate, and its covariance (6, 6), from ``cov`` (6, 6) of
+        the estimate; east and north first."""
         cov = cov.copy()
-        at_m, moments_m2, own = self._of_belief(cov[:2, :2]) if self._belief else self._of_modes(cov[:2, :2])
-        # Only in the estimate's own share are place, height and attitude correlated.
-        cov[:2, 2:] *= own
-        cov[2:, :2] *= own
-        anywhere_m2 = max(self.anywhere_m, self._start_m) ** 2 + self.map_consistency.variance_m2
-        cov[:2, :2] = moments_m2 + self.other.spread_m2() + anywhere_m2 * np.eye(2)
-        return at_m, cov
+        offset_m, moments_m2, own_weight = (
+            self._moments_with_belief(cov[:2, :2]) if self._belief else self._moments_with_modes(cov[:2, :2])
+        )
+        # Only within the estimate's own component are position, height and attitude correlated.
+        cov[:2, 2:] *= own_weight
+        cov[2:, :2] *= own_weight
+        anywhere_m2 = max(self.anywhere_m, self._start_sigma_m) ** 2 + self.map_consistency.variance_m2
+        cov[:2, :2] = moments_m2 + self.other.inflation_m2() + anywhere_m2 * np.eye(2)
+        return offset_m, cov
 
-    def _of_modes(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """The estimate, known to ``own_m2`` (2, 2), and the places that the belief has elsewhere. -> offset (2,),
-        moments (2, 2) about it, and the weight of the estimate in these."""
-        modes = [self._by_now(mode, own_m2) for mode in self._modes]
-        own = Component(np.zeros(2), own_m2, 1.0 - sum(mode.weight for mode in modes))
-        moments_m2 = np.sum([c.weight * c.about(own.offset_m) for c in (own, *modes)], axis=0)
+    def _moments_with_modes(self, estimate_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Mixture of the estimate, with covariance ``estimate_m2`` (2, 2), and the modes elsewhere. -> offset (2,) of
+        the published position, moments (2, 2) about it, and the weight of the estimate in these."""
+        modes = [self._propagated(mode, estimate_m2) for mode in self._modes]
+        own = Component(np.zeros(2), estimate_m2, 1.0 - sum(mode.weight for mode in modes))
+        moments_m2 = np.sum([c.weight * c.moments_about(own.offset_m) for c in (own, *modes)], axis=0)
         return own.offset_m, moments_m2, own.weight
 
-    def _of_belief(self, own_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """An estimate that no pose has placed: the belief, and what is left to the prior. Returns as ``_of_modes``."""
+    def _moments_with_belief(self, estimate_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """For an estimate that no pose has placed: the leading mode, and the wider one of belief and prior as the rest.
+        Returns the same as ``_moments_with_modes``."""
         assert self._belief is not None
-        prior, belief = Component(np.zeros(2), own_m2, 1.0), self._by_now(self._belief, own_m2)
+        prior, belief = Component(np.zeros(2), estimate_m2, 1.0), self._propagated(self._belief, estimate_m2)
         mode = self._leading_mode or Component(np.zeros(2), np.zeros((2, 2)), 0.0)
-        weight = min(mode.weight, MOST_WEIGHT)
-        rest = max(prior, belief, key=lambda component: float(np.trace(component.about(mode.offset_m))))
-        moments_m2 = weight * self._by_now(mode, own_m2).cov_m2 + (1.0 - weight) * rest.about(mode.offset_m)
+        weight = min(mode.weight, MAX_WEIGHT_WITHOUT_POSE)
+        rest = max(prior, belief, key=lambda component: float(np.trace(component.moments_about(mode.offset_m))))
+        mode_m2 = self._propagated(mode, estimate_m2).cov_m2
+        moments_m2 = weight * mode_m2 + (1.0 - weight) * rest.moments_about(mode.offset_m)
         return mode.offset_m, moments_m2, 1.0 - weight if rest is prior else 0.0
 
     @property
     def _leading_mode(self) -> Component | None:
-        mode, rival = (*self._modes, None, None)[:2]
-        if mode is None or mode.weight < max(LEADING_WEIGHT, LEADS * (rival.weight if rival else 0.0)):
+        mode, second = (*self._modes, None, None)[:2]
+        second_weight = second.weight if second else 0.0
+        if mode is None or mode.weight < max(MIN_LEADING_WEIGHT, MIN_LEADING_RATIO * second_weight):
             return None
         return mode
 
-    def _by_now(self, place: Component, own_m2: np.ndarray) -> Component:
-        """A place that was weighed against an older estimate, by now as much wider as the estimate has become."""
-        values, axes = np.linalg.eigh(own_m2 - self._own_m2)
-        return replace(place, cov_m2=place.cov_m2 + (axes * np.maximum(values, 0.0)) @ axes.T)
+    def _propagated(self, component: Component, estimate_m2: np.ndarray) -> Component:
+        """``component``, from an earlier frame, widened by the growth of the estimate's covariance since then."""
+        values, axes = np.linalg.eigh(estimate_m2 - self._estimate_cov_m2)
+        return replace(component, cov_m2=component.cov_m2 + (axes * np.maximum(values, 0.0)) @ axes.T)

@@ -1,22 +1,79 @@
-"""The pose of a map match, as the graph takes it: whether it is one, and how sure."""
+"""The pose of a map match as a measurement: whether it is determined, and its covariance."""
+
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import B, C
 
+from terrafix.core.gate import GATE
 from terrafix.core.geodesy import rot_from_quat
-from terrafix.core.pose import MAX_CONDITION, project_with_jacobian, world_to_tangent
+from terrafix.core.pose import MAX_CONDITION, project_with_jacobian, tangent_to_world, world_to_tangent
+from terrafix.estimator.factors.map_pose import map_pose_factor
+from terrafix.estimator.factors.noise import robust_noise
+from terrafix.estimator.filter_state import FilterState
+from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.models.terrain import Terrain
+from terrafix.estimator.state import TRANSLATION
 from terrafix.messages import MapMatch
 
-LOCAL_WARP = 0.33  # of the map's own error: by so much orthophotos are stretched over one footprint
-ROOFS = 0.03  # of the height, 1-sigma: roofs and crowns lift the ground that is seen, and with it the height
+LOCAL_WARP = 0.33  # of the map's error: how orthophotos are stretched within one footprint [tuned]
+ROOFS = 0.03  # of the height, 1-sigma: roofs and trees raise the ground that is seen, and the height with it [tuned]
+
+
+@dataclass(frozen=True)
+class MapPoseMeasurement:
+    """The pose of one map match: as it was seen, and with the lens as it is estimated now; each with its covariance
+    (6, 6), tangent order. ``by_lens`` (6,): change of the pose by the radial coefficient, which was ``lens`` when it
+    was seen; None for a coarse match. ``information_share``: of the match that no other match has given."""
+
+    seen: gtsam.Pose3
+    seen_cov: np.ndarray
+    pose: gtsam.Pose3
+    cov: np.ndarray
+    by_lens: np.ndarray | None
+    lens: float
+    information_share: float = 1.0
+    name: str = "map"
+
+    @classmethod
+    def of(cls, match: MapMatch, terrain: Terrain, lens_estimate: tuple[float, float]) -> "MapPoseMeasurement":
+        """Of a match that is ``determined``. ``lens_estimate``: radial coefficient and its 1-sigma."""
+        seen, seen_cov = measured_pose(match, terrain)
+        by_lens, (distortion, sigma) = moved_by_lens(match), lens_estimate
+        pose, cov = undistorted_pose(seen, seen_cov, by_lens, distortion - match.lens, sigma)
+        return cls(seen, seen_cov, pose, cov, by_lens, match.lens)
+
+    @property
+    def position_m(self) -> np.ndarray:
+        """(2,) east and north."""
+        return np.asarray(self.pose.translation()[:2])
+
+    def innovation(self, state: FilterState, node: int) -> Innovation:
+        """6 degrees of freedom, tangent order."""
+        residual = state.graph.state(node).pose.logmap(self.pose)
+        return Innovation(residual, state.covariance(node) + self.cov, GATE[6])
+
+    def position_innovation(self, pose: gtsam.Pose3, pose_cov: np.ndarray) -> Innovation:
+        """Against a predicted ``pose`` with ``pose_cov`` (6, 6), tangent order: 2 degrees of freedom, east and north,
+        whatever the heading is."""
+        both = [tangent_to_world(c, p.rotation().matrix()) for p, c in ((pose, pose_cov), (self.pose, self.cov))]
+        residual = (self.pose.translation() - pose.translation())[:2]
+        return Innovation(residual, (both[0] + both[1])[:2, :2], GATE[2])
+
+    def add_to(self, state: FilterState, node: int) -> None:
+        cov = self.seen_cov / self.information_share
+        if self.by_lens is None:
+            state.graph.add(gtsam.PriorFactorPose3(C(node), self.seen, robust_noise(cov)))
+        else:
+            state.graph.add(map_pose_factor(C(node), B(node), self.seen, cov, self.by_lens, self.lens))
 
 
 def measured_pose(match: MapMatch, terrain: Terrain) -> tuple[gtsam.Pose3, np.ndarray]:
-    """Of a match that is ``determined``: pose and covariance (6x6, tangent order).
+    """Of a match that is ``determined``: pose and covariance (6, 6), tangent order.
 
-    A slope that the map does not tell looks like a tilt of the camera about the ground below it: it turns the pose and
-    moves it by the height times as much."""
+    A slope that the map does not have looks like a tilt of the camera about the ground below it: it rotates the pose
+    and moves it by the height times as much."""
     assert match.p_c_in_w_m is not None and match.q_w_c is not None
     r_w_c = rot_from_quat(match.q_w_c)
     local_m, height_m = LOCAL_WARP * match.map_sigma_m, max(match.p_c_in_w_m[2] - terrain.ground_m, 1.0)
@@ -24,14 +81,14 @@ def measured_pose(match: MapMatch, terrain: Terrain) -> tuple[gtsam.Pose3, np.nd
     about_north[[0, 4]], about_east[[1, 3]] = (height_m, 1.0), (-height_m, 1.0)
     slope = terrain.slope_sigma(height_m) ** 2 * (np.outer(about_north, about_north) + np.outer(about_east, about_east))
     cov = world_to_tangent(np.array(match.cov).reshape(6, 6) + slope, r_w_c)
-    cov[3:, 3:] += r_w_c.T @ np.diag([local_m, local_m, ROOFS * height_m]) ** 2 @ r_w_c
+    cov[TRANSLATION, TRANSLATION] += r_w_c.T @ np.diag([local_m, local_m, ROOFS * height_m]) ** 2 @ r_w_c
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array(match.p_c_in_w_m)), cov
 
 
 def moved_by_lens(match: MapMatch) -> np.ndarray | None:
-    """(6,) tangent order: what the pose of a match that is ``determined`` would have moved by, had the lens one more of
-    bend than it was seen through. Around the middle of the picture that is the height; where the ground that counted
-    lies aside, it is tilt and place. None: a coarse fix, which has no points."""
+    """(6,) tangent order: change of the pose of a match that is ``determined`` by one unit of the radial coefficient of
+    the lens. For points around the principal point that is height; for points to one side it is tilt and position.
+    None: a coarse match, which has no points."""
     if not match.matches:
         return None
     assert match.p_c_in_w_m is not None and match.q_w_c is not None
@@ -39,25 +96,26 @@ def moved_by_lens(match: MapMatch) -> np.ndarray | None:
     xy = points[:, :2]
     _, jacobian, _ = project_with_jacobian(rot_from_quat(match.q_w_c), np.array(match.p_c_in_w_m), points[:, 2:5])
     by_pose = jacobian.reshape(-1, 6)
-    by_lens = -(np.sum(np.square(xy), axis=1, keepdims=True) * xy).ravel()  # a ray is straightened by as much
+    by_lens = -(np.sum(np.square(xy), axis=1, keepdims=True) * xy).ravel()  # change of a ray by the coefficient
     weighted = by_pose.T * np.repeat(points[:, 5], 2)
     return np.asarray(np.linalg.solve(weighted @ by_pose, weighted @ by_lens))
 
 
-def straightened_pose(
+def undistorted_pose(
     seen: gtsam.Pose3, cov: np.ndarray, by_lens: np.ndarray | None, more: float, sigma: float
 ) -> tuple[gtsam.Pose3, np.ndarray]:
-    """The pose of a match and its covariance, had the lens ``more`` of bend than it was seen through, known to
-    ``sigma``. ``by_lens``: ``moved_by_lens`` of the match."""
+    """Pose and covariance of a match, had the radial coefficient been larger by ``more``, known to ``sigma``.
+    ``by_lens``: ``moved_by_lens`` of the match."""
     if by_lens is None:
         return seen, cov
     return seen.retract(by_lens * more), cov + sigma**2 * np.outer(by_lens, by_lens)
 
 
 def determined(match: MapMatch) -> bool:
-    """Whether pose and covariance are numbers, and the 2D-3D matches (when it has any) fix six degrees of freedom.
+    """Whether pose and covariance are finite, and the 2D-3D matches (when there are any) determine six degrees of
+    freedom.
 
-    The anchor has looked already; a graph that was given such a pose would be sure of it for ever."""
+    The anchor checks this too; a graph that fused such a pose would be overconfident for good."""
     if match.p_c_in_w_m is None or match.q_w_c is None or match.cov is None:
         return False
     p_m, q = np.array(match.p_c_in_w_m), np.array(match.q_w_c)

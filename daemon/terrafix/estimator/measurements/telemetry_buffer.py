@@ -1,4 +1,5 @@
-"""What the autopilot said around a frame's time: attitude, height, inertial readings, each with its absence."""
+"""Telemetry of the autopilot by time: attitude, height and inertial readings around a frame; what is missing is
+None."""
 
 from bisect import bisect_left, bisect_right
 from collections import deque
@@ -6,19 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.estimator.models.motion_model import GRAVITY_MPS2, WorldAcceleration
+from terrafix.core.geodesy import GRAVITY_MPS2
+from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.messages import Imu, VehicleState
 
-KEPT = 400  # states; 8 s at 50 Hz
-# Attitudes and readings: two minutes at 25 and 50 Hz, which a camera may be away; 30 s at 200 Hz.
-KEPT_TURNS, KEPT_READINGS = 3000, 6000
-STANDS_BELOW_M = 10.0  # what a barometer may have drifted before take-off
-MAX_GAP_NS = 1_000_000_000  # older than this against the frame says nothing about it
-BOX = np.linspace(-1.0, 1.0, 9)  # where reported angles are averaged about a time, in intervals between reports
-MOMENT_NS = 200_000_000  # by which states may come out of order
-# Between readings, and from the last one to the frame: the acceleration is taken to go straight from one to the next.
-MAX_READING_GAP_NS = 120_000_000
-MAX_ATTITUDE_GAP_NS = 260_000_000  # ATTITUDE at 4 Hz, ArduPilot's own rate, turns a vehicle too far between two
+BUFFER_STATES = 400  # 8 s at 50 Hz [tuned]
+# Two minutes at 25 and 50 Hz, for which a camera may fail; 30 s at 200 Hz.
+BUFFER_ATTITUDES, BUFFER_READINGS = 3000, 6000  # [tuned]
+STANDS_BELOW_M = 10.0  # drift of a barometer before take-off [tuned]
+MAX_GAP_NS = 1_000_000_000  # between a state and a frame [tuned]
+BOX = np.linspace(-1.0, 1.0, 9)  # where reported angles are averaged about a time, in report intervals [tuned]
+REORDER_NS = 200_000_000  # by which states may come out of order [tuned]
+# Between readings, and from the last one to the frame: acceleration is interpolated linearly.
+MAX_READING_GAP_NS = 120_000_000  # [tuned]
+MAX_ATTITUDE_GAP_NS = (
+    260_000_000  # at 4 Hz, ArduPilot's default, a vehicle turns too far between two [spec: ATTITUDE rate]
+)
 
 
 Timed = tuple[np.ndarray, np.ndarray]  # times (N,) [ns], values (3, N)
@@ -32,11 +36,11 @@ class Attitude:
     agl_m: float | None
     armed: bool | None = None
     airspeed_mps: float | None = None
-    righted_rad: float = 0.0  # by how much tilt may be off beyond what is always said of it (ahrs_correction.py)
+    righted_rad: float = 0.0  # 1-sigma of the tilt beyond the configured one (ahrs_correction.py)
 
     @property
     def stands(self) -> bool:
-        """On the ground, motors off. An autopilot that reports a height is not believed to be off in the air."""
+        """On the ground, disarmed. With a reported height in the air it is not."""
         return self.armed is False and (self.agl_m is None or self.agl_m < STANDS_BELOW_M)
 
 
@@ -45,10 +49,10 @@ _FIELDS = ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed", "airspeed_mps")
 
 class Telemetry:
     def __init__(self) -> None:
-        self._states: deque[VehicleState] = deque(maxlen=KEPT)
-        self._turns = _Series(KEPT_TURNS)  # yaw, pitch, roll
-        self._forces = _Series(KEPT_READINGS)  # forward, right, down
-        self._rates = _Series(KEPT_READINGS)  # about the same axes
+        self._states: deque[VehicleState] = deque(maxlen=BUFFER_STATES)
+        self._turns = _Series(BUFFER_ATTITUDES)  # yaw, pitch, roll
+        self._forces = _Series(BUFFER_READINGS)  # forward, right, down
+        self._rates = _Series(BUFFER_READINGS)  # about the same axes
 
     def add(self, state: VehicleState) -> None:
         self._states.append(state)
@@ -62,29 +66,29 @@ class Telemetry:
             self._rates.add(imu.t_ns - before_ns, *rates)
 
     def at(self, t_ns: int) -> Attitude:
-        """Field by field the value measured nearest to ``t_ns``; ``None`` where nobody said it within a second."""
+        """Each field as measured nearest to ``t_ns``; None where there is no value within a second."""
         best: dict[str, tuple[int, float | bool]] = {}
         unsettled = list(_FIELDS)
         for state in reversed(self._states):
             away_ns = abs(state.t_ns - t_ns)
             if away_ns > MAX_GAP_NS:
                 if state.t_ns < t_ns - 2 * MAX_GAP_NS:
-                    break  # they come in order of time, to a moment
+                    break  # they come in order of time, but for REORDER_NS
                 continue
             for name in unsettled.copy():
                 value = getattr(state, name)
                 if value is not None and (name not in best or away_ns <= best[name][0]):
                     best[name] = (away_ns, value)
-                elif name in best and state.t_ns + MOMENT_NS < t_ns - best[name][0]:
+                elif name in best and state.t_ns + REORDER_NS < t_ns - best[name][0]:
                     unsettled.remove(name)  # whatever is left is farther away
             if not unsettled:
                 break
-        said = {name: value for name, (_, value) in best.items()}
-        return Attitude(*(said.get(name) for name in _FIELDS))  # type: ignore[arg-type]
+        nearest = {name: value for name, (_, value) in best.items()}
+        return Attitude(*(nearest.get(name) for name in _FIELDS))  # type: ignore[arg-type]
 
-    def felt(self, t0_ns: int, t1_ns: int, turned: np.ndarray | None = None) -> WorldAcceleration | None:
-        """Acceleration from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that. ``turned``
-        (3, 2): by how much attitudes are turned about east, north and up at both ends [rad], which is taken out."""
+    def world_acceleration(self, t0_ns: int, t1_ns: int, turned: np.ndarray | None = None) -> WorldAcceleration | None:
+        """Acceleration in the world from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that.
+        ``turned`` (3, 2): attitude errors about east, north and up at both ends [rad], which are removed."""
         known = self._with_attitudes(self._forces, t0_ns, t1_ns)
         if known is None:
             return None
@@ -100,15 +104,15 @@ class Telemetry:
             accel = accel - first + 0.5 * np.cross(away, first)  # turned back, to the second order
             yaw = yaw + away[:, 2]  # clockwise
         accel[:, 2] -= GRAVITY_MPS2
-        # What the readings scatter from one to the next is vibration, whatever its frequency was.
+        # The scatter from reading to reading is vibration, whatever its frequency.
         spacing_s = (t_f[-1] - t_f[0]) * 1e-9 / (len(t_f) - 1)
         scatter = float(np.mean(np.square(np.diff(f, 2)))) / 6.0 if f.shape[1] > 3 else 0.0
-        unfelt_s = max(0.0, (t1_ns - int(t_f[-1])) * 1e-9)
-        return WorldAcceleration((t - t0_ns) * 1e-9, accel, yaw, float(np.sqrt(scatter * spacing_s)), unfelt_s)
+        uncovered_s = max(0.0, (t1_ns - int(t_f[-1])) * 1e-9)
+        return WorldAcceleration((t - t0_ns) * 1e-9, accel, yaw, float(np.sqrt(scatter * spacing_s)), uncovered_s)
 
     @property
     def newest_turn_ns(self) -> int:
-        """Time of the newest whole attitude; -1: there was none."""
+        """Time of the newest complete attitude; -1: there was none."""
         return self._turns.newest_ns
 
     def turned_about(self, t_ns: np.ndarray) -> np.ndarray | None:
@@ -123,9 +127,9 @@ class Telemetry:
         at_ns = t_ns[:, None] + about_ns
         return np.stack([np.interp(at_ns, turns[0], angle).mean(axis=1) for angle in _unwrapped(turns[1])])
 
-    def turned_otherwise(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
-        """The turn (3,) about east, north and up by which the attitude turned from ``t0_ns`` to ``t1_ns`` and
-        gyroscopes did not, and by how much these turned at all [rad]; None when readings or attitudes do not cover
+    def turn_without_gyro(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
+        """-> rotation (3,) about east, north and up [rad] by which the attitude turned from ``t0_ns`` to ``t1_ns`` and
+        the gyroscopes did not, and the angle by which these turned. None when readings or attitudes do not cover
         that."""
         known = self._with_attitudes(self._rates, t0_ns, t1_ns)
         if known is None:
@@ -139,10 +143,10 @@ class Telemetry:
         turned = 0.5 * np.column_stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
         # The integral of the rates, from one attitude to the next, in the world by the attitude between them.
         summed = [np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t_g) * 1e-9)]) for a in w]
-        felt = [np.diff(np.interp(t, t_g, axis)) for axis in summed]
+        by_gyro = [np.diff(np.interp(t, t_g, axis)) for axis in summed]
         between = (0.5 * (angle[1:] + angle[:-1]) for angle in (yaw, pitch, roll))
-        apart = turned.sum(axis=0) - _in_world(felt, *between).sum(axis=0)
-        return apart, float(np.linalg.norm(felt, axis=0).sum())
+        apart = turned.sum(axis=0) - _in_world(by_gyro, *between).sum(axis=0)
+        return apart, float(np.linalg.norm(by_gyro, axis=0).sum())
 
     def _with_attitudes(self, readings: "_Series", t0_ns: int, t1_ns: int) -> tuple[Timed, Timed] | None:
         """Readings and attitudes around a span; None when they do not cover it."""
@@ -154,10 +158,10 @@ class Telemetry:
 
 
 class _Series:
-    """The newest ``kept`` readings of three axes, in order of time; older than the newest is not taken."""
+    """The newest ``size`` readings of three axes, in order of time; one older than the newest is dropped."""
 
-    def __init__(self, kept: int) -> None:
-        self._kept = kept
+    def __init__(self, size: int) -> None:
+        self._size = size
         self._t_ns: list[int] = []
         self._axes: tuple[list[float], list[float], list[float]] = ([], [], [])
 
@@ -167,9 +171,9 @@ class _Series:
         self._t_ns.append(t_ns)
         for axis, value in zip(self._axes, (x, y, z), strict=True):
             axis.append(value)
-        if len(self._t_ns) > 2 * self._kept:
+        if len(self._t_ns) > 2 * self._size:
             for column in (self._t_ns, *self._axes):
-                del column[: -self._kept]
+                del column[: -self._size]
 
     @property
     def newest_ns(self) -> int:
@@ -185,7 +189,7 @@ class _Series:
 
 
 def _unwrapped(angles: np.ndarray) -> np.ndarray:
-    """(3, N); numpy's own takes long to find that nothing turns over."""
+    """(3, N). np.unwrap is slow, also where nothing wraps."""
     return np.unwrap(angles, axis=1) if np.abs(np.diff(angles, axis=1)).max() >= np.pi else angles
 
 

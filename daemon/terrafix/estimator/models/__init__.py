@@ -1,1 +1,1 @@
-"""Motion, terrain and lens: no measurement and no graph."""
+"""Process models and priors: motion, ground plane, terrain, lens, calibration walk. No measurement and no graph."""

@@ -1,28 +1,32 @@
-"""What is not known of a lens that nobody has calibrated."""
+"""Prior uncertainty of radial distortion and principal point of a camera that is described and not calibrated."""
 
 from terrafix.messages import Camera
 
-# 1-sigma of what a lens bends beyond its description (custom_factors.py): after a calibration, or as its maker says ...
-LENS_SIGMA = 0.02
-# ... and by the 1-sigma of the focal length. Whoever knows that to 10 % only has calibrated nothing: an action camera
-# bends by -0.3, and that is two sigmas.
-LENS_PER_FOCAL_SIGMA = 1.5
-# 1-sigma of the middle of the picture, a share of its width, by that of the focal length: of a lens that nobody has
-# calibrated it is 2 % aside (a sensor that is glued on, a picture that is cut to 16:9 or held still by software).
-CENTRE_PER_FOCAL_SIGMA = 0.2
-CALIBRATED = 0.01  # 1-sigma of the focal length: who knows it so well knows the middle to a pixel or two
+# 1-sigma of the radial coefficient beyond the description of the lens, after a calibration or by its maker's data ...
+RADIAL_K1_SIGMA = 0.02  # [tuned]
+# ... and per 1-sigma of the focal length. With a focal length known to 10 % only, nothing was calibrated: an action
+# camera has a coefficient of -0.3, which is two sigmas. [tuned]
+RADIAL_K1_PER_FOCAL_SIGMA = 1.5
+# 1-sigma of the principal point, share of the image width, per 1-sigma of the focal length: without a calibration it is
+# 2 % off (sensor glue, crop to 16:9, electronic stabilisation). [tuned]
+PRINCIPAL_POINT_PER_FOCAL_SIGMA = 0.2
+# 1-sigma of the focal length at which a camera counts as calibrated: its principal point is then known to a pixel or
+# two. [tuned]
+CALIBRATED_FOCAL_SIGMA = 0.01
 
 
-def lens_sigma(camera: Camera) -> float:
-    """1-sigma of what the lens bends beyond its description, before anything was seen."""
-    return LENS_SIGMA if camera.distortion else max(LENS_SIGMA, LENS_PER_FOCAL_SIGMA * camera.focal_sigma)
+def radial_k1_sigma(camera: Camera) -> float:
+    """1-sigma of the radial coefficient beyond the description of the lens, before flight."""
+    return (
+        RADIAL_K1_SIGMA if camera.distortion else max(RADIAL_K1_SIGMA, RADIAL_K1_PER_FOCAL_SIGMA * camera.focal_sigma)
+    )
 
 
-def centre_sigma(camera: Camera) -> float:
-    """1-sigma by which all ground is seen aside, along each axis of the picture, a share of the height above it.
+def principal_point_sigma(camera: Camera) -> float:
+    """1-sigma of the ground offset by the principal point, along each image axis, as a share of the height.
 
-    Rays that are all aside by as much are a place that is: no picture, and no map, tells one from the other. So no
-    number of fixes makes less of it, as of the map's own error."""
-    if camera.focal_sigma <= CALIBRATED:
+    An equal offset of all rays cannot be told from a shift of position, by any image or map. So it does not average out
+    over fixes, like the map's own error."""
+    if camera.focal_sigma <= CALIBRATED_FOCAL_SIGMA:
         return 0.0
-    return CENTRE_PER_FOCAL_SIGMA * camera.focal_sigma * camera.width / camera.fx
+    return PRINCIPAL_POINT_PER_FOCAL_SIGMA * camera.focal_sigma * camera.width / camera.fx

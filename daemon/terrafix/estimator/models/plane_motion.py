@@ -1,50 +1,58 @@
-"""Metric camera motion between two frames, from matched rays and the height above the ground."""
+"""Metric camera motion between two frames, from matched rays and the height above the ground plane."""
 
 from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
-from terrafix.core.camera import straightened
+from terrafix.core.camera import undistort_division
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import fit_pose, log_so3
+from terrafix.estimator.state import HORIZONTAL, ROTATION, TRANSLATION, UP
 
-EFFECTIVE_PAIRS = 16.0  # relief moves whole blocks of matches together: never more independent ones than this
-SCALE_SIGMA = 0.02  # houses and trees lift the mean ground by this share of the height, beyond the height's own error
-ROOF_SCALE_SIGMA = 0.12  # ... and by this when hardly any match lies on the plane: tall buildings at 100 m
-MIN_PAIRS = 8
-FIRST_TOLERANCE = 1e-3  # rad and relative metres; the graph solves for the motion again, from the same rays
-# Beyond the guess: matches in a narrow band trade translation for tilt, and a wrong tilt rarely fits. One that fits as
-# well as the matches are good may be larger where nobody reports tilt: a vehicle leans into a turn.
+EFFECTIVE_PAIRS = 16.0  # most independent matches: relief moves whole blocks of matches together [tuned]
+# 1-sigma of the mean ground level, share of the height, beyond the height's own error: houses and trees. [tuned]
+SCALE_SIGMA = 0.02
+ROOF_SCALE_SIGMA = 0.12  # ... further, where hardly any match lies on the plane: tall buildings seen from 100 m [tuned]
+MIN_PAIRS = 8  # matches [tuned]
+FIRST_TOLERANCE = 1e-3  # convergence, rad and relative metres: the graph solves again, from the same rays [tuned]
+# Largest tilt change beyond the guess: matches in a narrow band confuse translation and tilt, and a wrong tilt rarely
+# fits. A motion that fits as well as the matches allow may have a larger change where tilt is not reported: a vehicle
+# leans into a turn. [tuned]
 MAX_TILT_CHANGE_RAD = np.radians(15.0)
-TILT_SIGMAS = 5.2  # chi-square, 2 degrees of freedom, 99.9 %, of the difference of two leans that are known as well
-FITS = 1.3  # of the sigma that matches claim: three sigmas of the median of 48
-MIN_DOWN = -0.2  # up component of a unit-depth ray that meets the ground no farther than five heights away
+TILT_SIGMAS = 5.2  # of the difference of two tilts of equal sigma [spec: root of twice the chi-square, 2 dof, 99.9 %]
+GOOD_FIT = 1.3  # residual sigma over stated sigma: three sigmas of the median of 48 [spec: order statistics]
+MIN_DOWN = -0.2  # up component of a unit-depth ray: the ground lies within five heights [tuned]
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Matched rays (N, 4), the 1-sigma of a coordinate with all that makes them less independent, their plane, and
-    what of a lens they were straightened by."""
+class MatchedRays:
+    """``pairs`` (N, 4): matched rays, normalised (keyframe x, y, camera x, y), undistorted by radial coefficient
+    ``k1``; ``sigma``: 1-sigma of a coordinate, enlarged for correlated matches; ``ground``: their plane."""
 
     pairs: np.ndarray
     sigma: float
     ground: "Ground"
-    lens: float = 0.0
+    k1: float = 0.0
 
 
 @dataclass(frozen=True)
 class RelativePose:
-    """Camera k in the camera of the keyframe: ``r`` (3x3), ``p_m`` (3,), ``cov`` 6x6 (tangent order)."""
+    """Camera in the keyframe: ``r`` (3x3), ``p_m`` (3,), ``cov`` (6, 6), tangent order. ``rays``: the measurement; None
+    for a prediction."""
 
     r: np.ndarray
     p_m: np.ndarray
     cov: np.ndarray
-    seen: "Seen | None" = None  # what it was computed from; None: a guess
+    rays: "MatchedRays | None" = None
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The plane under the keyframe: its distance straight down, and its slope towards east and north."""
+    """Plane under the keyframe: distance straight down, and slope towards east and north.
+
+    ``level_share``: 1-sigma of the mean level, share of the height. ``curvature_sigma``: 1-sigma of its curvature in
+    any direction, 1/m. ``rise_sigma_m``: 1-sigma of the change of elevation from below the keyframe to below the other
+    camera, without a DEM. ``share`` of the matches that agreed: a plane that few matches support may be a roof."""
 
     height_m: float
     height_sigma_m: float
@@ -52,19 +60,19 @@ class Ground:
     slope_e: float = 0.0
     slope_n: float = 0.0
     slope_sigma: float = 0.0
-    level_share: float = SCALE_SIGMA  # 1-sigma of the mean plane, share of the height
-    bend_sigma: float = 0.0  # 1-sigma of its curvature in any direction, 1/m: how far it may be from being a plane
-    rise_sigma_m: float = 0.0  # from the ground below the keyframe to that below the other camera, where nobody tells
-    share: float = 1.0  # of the matches that agreed: a plane that few share may be a roof instead of the ground
+    level_share: float = SCALE_SIGMA
+    curvature_sigma: float = 0.0
+    rise_sigma_m: float = 0.0
+    share: float = 1.0
 
     @property
     def level_sigma_m(self) -> float:
-        """Of the plane, beyond what is wrong with the height itself."""
+        """1-sigma of the level of the plane, beyond the error of the height."""
         return (self.level_share + ROOF_SCALE_SIGMA * (1.0 - self.share) ** 2) * self.height_m
 
     @property
-    def stretch_sigma(self) -> float:
-        """Of a way over it, a share of that."""
+    def translation_scale_sigma(self) -> float:
+        """1-sigma of a translation over the plane, as a share of it."""
         return float(np.hypot(self.height_sigma_m, self.level_sigma_m)) / self.height_m
 
 
@@ -75,63 +83,63 @@ def relative_pose(
     r_w_k: np.ndarray,
     tilt_sigma_rad: float,
     ground: Ground,
-    lens: float = 0.0,
+    k1: float = 0.0,
 ) -> RelativePose | None:
-    """``pairs`` (N, 4) normalised (x_kf, y_kf, x, y), as a lens that bends by ``lens`` shows them; ``r_w_kf`` and
-    ``ground`` give the plane that is seen; ``r_w_k`` is a first guess of the new camera, whose tilt is known to
-    ``tilt_sigma_rad``: a plane seen from two places has a mirror solution. ``None`` when the matches do not determine
-    the motion."""
+    """``pairs`` (N, 4): normalised (x_kf, y_kf, x, y), distorted by radial coefficient ``k1``, with 1-sigma
+    ``sigma_norm``; ``r_w_kf`` and ``ground`` give the plane; ``r_w_k`` is a first guess of the camera, whose tilt is
+    known to ``tilt_sigma_rad``, because a plane seen from two places has a mirror solution. None: the matches do not
+    determine the motion."""
     if len(pairs) < MIN_PAIRS:
         return None
-    pairs = np.hstack([straightened(pairs[:, :2], lens), straightened(pairs[:, 2:], lens)])
+    pairs = np.hstack([undistort_division(pairs[:, :2], k1), undistort_division(pairs[:, 2:], k1)])
     rays_w = np.column_stack([pairs[:, :2], np.ones(len(pairs))]) @ r_w_kf.T
     rays_k = np.column_stack([pairs[:, 2:], np.ones(len(pairs))]) @ r_w_k.T
-    ahead = (rays_w[:, 2] < MIN_DOWN) & (rays_k[:, 2] < MIN_DOWN)
-    if ahead.sum() < MIN_PAIRS:
+    downward = (rays_w[:, UP] < MIN_DOWN) & (rays_k[:, UP] < MIN_DOWN)
+    if downward.sum() < MIN_PAIRS:
         return None
     slope = np.array([ground.slope_e, ground.slope_n])
     height_m = ground.height_m
-    depth = height_m / np.maximum(rays_w[ahead, :2] @ slope - rays_w[ahead, 2], -MIN_DOWN / 2)
-    points = rays_w[ahead] * depth[:, None]  # world axes, from the keyframe's camera
-    offsets = rays_k[ahead, :2] / -rays_k[ahead, 2:] * height_m
+    depth = height_m / np.maximum(rays_w[downward, HORIZONTAL] @ slope - rays_w[downward, UP], -MIN_DOWN / 2)
+    points = rays_w[downward] * depth[:, None]  # world axes, origin at the keyframe
+    offsets = rays_k[downward, :2] / -rays_k[downward, 2:] * height_m
     turn, scale, shift = _similarity(offsets, points[:, :2])
     start = np.array([*shift, height_m * (scale - 1.0)])
     effective = min(1.0, EFFECTIVE_PAIRS / len(points))
     fit = fit_pose(
         points,
-        pairs[ahead, 2:],
+        pairs[downward, 2:],
         turn @ r_w_k,
         start,
         sigma_norm,
-        effective=effective,
+        independent_share=effective,
         tilt_sigma_rad=tilt_sigma_rad,
         tolerance=FIRST_TOLERANCE,
     )
     if fit is None:
         return None
-    tilted_rad = float(np.linalg.norm(log_so3((turn @ r_w_k).T @ fit.r_w_c)[:2]))
-    possible_rad = TILT_SIGMAS * tilt_sigma_rad if fit.sigma < FITS * sigma_norm else 0.0
-    if tilted_rad > max(MAX_TILT_CHANGE_RAD, possible_rad):
+    tilt_change_rad = float(np.linalg.norm(log_so3((turn @ r_w_k).T @ fit.r_w_c)[:2]))
+    allowed_rad = TILT_SIGMAS * tilt_sigma_rad if fit.sigma < GOOD_FIT * sigma_norm else 0.0
+    if tilt_change_rad > max(MAX_TILT_CHANGE_RAD, allowed_rad):
         return None
     cov = fit.cov.copy()
-    # A wrong height scales the translation; the tangent's translation is in the new camera's axes.
+    # An error of the height scales the translation. The tangent's translation is in the axes of the new camera.
     t_new = fit.r_w_c.T @ fit.p_c_in_w_m
-    cov[3:, 3:] += np.outer(t_new, t_new) * ground.stretch_sigma**2
-    up = fit.r_w_c[2]
-    cov[3:, 3:] += ground.rise_sigma_m**2 * np.outer(up, up)
-    # A wrong slope of the plane turns the camera by about slope times base over height.
-    cov[:3, :3] += (ground.slope_sigma * float(np.linalg.norm(t_new)) / height_m) ** 2 * np.eye(3)
-    seen = Seen(pairs[ahead], fit.sigma / float(np.sqrt(effective)), ground, lens)
-    return RelativePose(r_w_kf.T @ fit.r_w_c, r_w_kf.T @ fit.p_c_in_w_m, cov, seen)
+    cov[TRANSLATION, TRANSLATION] += np.outer(t_new, t_new) * ground.translation_scale_sigma**2
+    up = fit.r_w_c[UP]
+    cov[TRANSLATION, TRANSLATION] += ground.rise_sigma_m**2 * np.outer(up, up)
+    # An error of the slope rotates the camera by about that slope times translation over height.
+    cov[ROTATION, ROTATION] += (ground.slope_sigma * float(np.linalg.norm(t_new)) / height_m) ** 2 * np.eye(3)
+    used = MatchedRays(pairs[downward], fit.sigma / float(np.sqrt(effective)), ground, k1)
+    return RelativePose(r_w_kf.T @ fit.r_w_c, r_w_kf.T @ fit.p_c_in_w_m, cov, used)
 
 
 def similarity_ratio(a: np.ndarray, b: np.ndarray) -> complex:
-    """b = ratio * a by least squares over complex numbers (N,) of zero mean: scale and turn (Umeyama 1991)."""
+    """b = ratio * a by least squares over complex numbers (N,) of zero mean: scale and rotation (Umeyama 1991)."""
     return complex(np.vdot(a, b) / max(float(np.vdot(a, a).real), 1e-12))
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """b = scale * turn * a + shift by least squares (Umeyama 1991) in the plane; turn as (3x3) about up."""
+    """b = scale * turn * a + shift in the plane, by least squares (Umeyama 1991). -> turn (3x3), scale, shift."""
     mean_a, mean_b = a.mean(0), b.mean(0)
     za, zb = (a - mean_a) @ (1, 1j), (b - mean_b) @ (1, 1j)
     ratio = similarity_ratio(za, zb)

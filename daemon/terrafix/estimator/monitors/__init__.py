@@ -1,1 +1,1 @@
-"""Monitors of what the flight was described as: scale, mount, heading, attitude, registration."""
+"""Monitors of the configured description of a flight: scale, mount, heading, attitude, registration with the map."""

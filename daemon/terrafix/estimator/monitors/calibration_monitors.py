@@ -1,4 +1,4 @@
-"""All monitors of one flight: messages in, CalibrationFault on every change out, and what to add to the covariance."""
+"""All calibration monitors of one flight: messages in, CalibrationFault on every change and a covariance term out."""
 
 import math
 from dataclasses import dataclass
@@ -11,128 +11,137 @@ from terrafix.core.pose import exp_so3
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.monitors.inertial import MOUNT_YAWS_DEG, InertialMonitor
 from terrafix.estimator.monitors.levelling import LevellingMonitor
-from terrafix.estimator.monitors.map_offsets import SCATTER, OffsetMonitor, told_over_seen
+from terrafix.estimator.monitors.map_offsets import HEIGHT_NOISE, OffsetMonitor, log_height_ratio
 from terrafix.estimator.monitors.registration import Registration
-from terrafix.estimator.monitors.sighting import sighting
 from terrafix.estimator.monitors.turns import TurnMonitor
+from terrafix.estimator.monitors.visual_motion import visual_motion
 from terrafix.messages import CalibrationFault, MapMatch, Odometry, Origin, Verdict
 
-UNKNOWN_M = 1000.0  # 1-sigma per horizontal axis while a description is known to be wrong
-SPACING_S = 1.0  # between turns that count: pictures of one keyframe share their errors
-# Constant errors, 1-sigma, beyond the described ones: a compass beside motors, a barometer over uneven ground.
-HEADING_RAD, HEIGHT_SHARE = math.radians(10.0), 0.05
-YAW_SCATTER_RAD = math.radians(3.0)
-ANOTHER = 0.2  # of a factor, by which it changes to be said again
-NOT_LOOKED = (Verdict.BAD_IMAGE, Verdict.NO_FEATURES, Verdict.NO_PREDICTION, Verdict.OUTSIDE_MAP, Verdict.TOO_LOW)
+FAULT_SIGMA_M = 1000.0  # m: 1-sigma per horizontal axis while the description is known to be wrong [tuned]
+MIN_TURN_SPACING_S = 1.0  # s between turns that count: pictures of one keyframe share their errors [tuned]
+# Constant errors, 1-sigma, beyond the configured ones: heading [rad] of a compass beside motors, and height as a share
+# of it, of a barometer over uneven ground. [tuned]
+HEADING_SIGMA_RAD, HEIGHT_SIGMA_SHARE = math.radians(10.0), 0.05
+YAW_NOISE_RAD = math.radians(3.0)  # 1-sigma of the heading of one pose against the reported one [tuned]
+REPORT_CHANGE = 0.2  # relative change of a factor or an angle after which a fault is reported again [tuned]
+# Verdicts on frames that were not correlated with the map.
+NOT_CORRELATED = (Verdict.BAD_IMAGE, Verdict.NO_FEATURES, Verdict.NO_PREDICTION, Verdict.OUTSIDE_MAP, Verdict.TOO_LOW)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """``factor``: told over true; for angles degrees; None where nothing tells."""
+    """``factor``: reported over true value; degrees for angles; None where no monitor measures it."""
 
     factor: float | None
     detail: str
 
 
 class Monitors:
+    """All monitors of the flight that ``origin`` describes."""
+
     def __init__(self, origin: Origin) -> None:
         self._origin = origin
         self._r_b_c = Mount.of(origin.camera).r_b_c()
-        turns = [exp_so3(np.array([0.0, 0.0, math.radians(deg)])) for deg in MOUNT_YAWS_DEG[1:]]  # the first is none
+        turns = [exp_so3(np.array([0.0, 0.0, math.radians(deg)])) for deg in MOUNT_YAWS_DEG[1:]]  # [0]: as configured
         self._other_mounts = [turn @ self._r_b_c for turn in turns]
         self._inertial = InertialMonitor()
         self._turns = TurnMonitor(math.radians(origin.yaw_sigma_deg))
         self._levelling = LevellingMonitor()
         self._registration = Registration()
-        heading = math.hypot(HEADING_RAD, math.radians(origin.yaw_sigma_deg))
-        self._heading = OffsetMonitor(heading, YAW_SCATTER_RAD)
-        self._height: OffsetMonitor | None = None  # until a height was told
-        self._times_ns: dict[int, int] = {}  # frame -> time, of keyframes that may be referred to
-        self._turned_s = -math.inf
-        self._textured: int | None = None  # the newest frame whose motion was seen
-        self._said: dict[str, Finding] = {}
+        heading = math.hypot(HEADING_SIGMA_RAD, math.radians(origin.yaw_sigma_deg))
+        self._heading = OffsetMonitor(heading, YAW_NOISE_RAD)
+        self._height: OffsetMonitor | None = None  # None until a height is reported
+        self._times_ns: dict[int, int] = {}  # frame -> time, of frames that may be the keyframe of a later one
+        self._turned_s = -math.inf  # time of the last turn that counted
+        self._textured: int | None = None  # the newest frame with accepted odometry
+        self._reported: dict[str, Finding] = {}
 
     @property
     def sigma_m(self) -> float:
-        """1-sigma per horizontal axis, to be added to what is claimed."""
-        return UNKNOWN_M if self._said else min(UNKNOWN_M, self._registration.sigma_m)
+        """1-sigma per horizontal axis, to be added to the published covariance."""
+        return FAULT_SIGMA_M if self._reported else min(FAULT_SIGMA_M, self._registration.sigma_m)
 
-    def odometry(self, odometry: Odometry, telemetry: Telemetry, way_m: float, height_m: float) -> None:
-        """A frame, with its way since the frame before and its height above the ground, both as the graph has them."""
+    def on_odometry(self, odometry: Odometry, telemetry: Telemetry, path_m: float, agl_m: float) -> None:
+        """A frame. ``path_m`` since the frame before and ``agl_m``: by the graph's estimate."""
         self._times_ns[odometry.frame_id] = odometry.t_ns
-        self._registration.flew(way_m, height_m)
-        began_ns = self._times_ns.get(odometry.keyframe_id)
+        self._registration.add_path(path_m, agl_m)
+        keyframe_ns = self._times_ns.get(odometry.keyframe_id)
         self._times_ns = {f: t for f, t in self._times_ns.items() if f >= odometry.keyframe_id}
-        if odometry.verdict is not Verdict.ACCEPTED or began_ns is None or began_ns >= odometry.t_ns:
+        if odometry.verdict is not Verdict.ACCEPTED or keyframe_ns is None or keyframe_ns >= odometry.t_ns:
             return
         self._textured = odometry.frame_id
-        before, now = telemetry.at(began_ns), telemetry.at(odometry.t_ns)
+        before, now = telemetry.at(keyframe_ns), telemetry.at(odometry.t_ns)
         pairs = np.array(odometry.pairs)
-        seen = sighting(pairs, before, now, self._r_b_c)
-        if seen is None:
+        motion = visual_motion(pairs, before, now, self._r_b_c)
+        if motion is None:
             return
-        if odometry.t_ns * 1e-9 - self._turned_s >= SPACING_S:
+        if odometry.t_ns * 1e-9 - self._turned_s >= MIN_TURN_SPACING_S:
             self._turned_s = odometry.t_ns * 1e-9
-            self._turns.add(seen.said_rad, seen.turned_rad)
-            span_s = began_ns * 1e-9, odometry.t_ns * 1e-9
+            self._turns.add(motion.reported_rad, motion.turned_rad)
+            span_s = keyframe_ns * 1e-9, odometry.t_ns * 1e-9
             self._levelling.add(pairs, before, now, self._r_b_c, span_s)
         if now.agl_m is None:
             return
-        mounted = (seen, *(sighting(pairs, before, now, r_b_c) for r_b_c in self._other_mounts))
-        moved = [complex(*one.moved) for one in mounted if one is not None]
-        if len(moved) == len(mounted):
-            velocities = np.array(moved) * now.agl_m / ((odometry.t_ns - began_ns) * 1e-9)
-            self._velocity(velocities, (began_ns + odometry.t_ns) // 2, telemetry)
+        mounted = (motion, *(visual_motion(pairs, before, now, r_b_c) for r_b_c in self._other_mounts))
+        displacements = [complex(*one.displacement) for one in mounted if one is not None]
+        if len(displacements) == len(mounted):
+            velocities = np.array(displacements) * now.agl_m / ((odometry.t_ns - keyframe_ns) * 1e-9)
+            self._add_velocity(velocities, (keyframe_ns + odometry.t_ns) // 2, telemetry)
 
-    def _velocity(self, seen_mps: np.ndarray, t_ns: int, telemetry: Telemetry) -> None:
+    def _add_velocity(self, visual_mps: np.ndarray, t_ns: int, telemetry: Telemetry) -> None:
+        """``visual_mps`` (4,) complex, for each of MOUNT_YAWS_DEG."""
         t_s = t_ns * 1e-9
-        began_s = self._inertial.window(t_s)
-        felt = None if began_s is None else telemetry.felt(round(began_s * 1e9), t_ns)
-        if felt is not None:
-            change_mps = np.trapezoid(felt.accel_w_mps2[:, :2], felt.s_s, axis=0)
-            self._inertial.compare(t_s, seen_mps, complex(*change_mps))
-        self._inertial.add(t_s, seen_mps)
+        start_s = self._inertial.window_start_s(t_s)
+        acceleration = None if start_s is None else telemetry.world_acceleration(round(start_s * 1e9), t_ns)
+        if acceleration is not None:
+            change_mps = np.trapezoid(acceleration.accel_w_mps2[:, :2], acceleration.s_s, axis=0)
+            self._inertial.compare(t_s, visual_mps, complex(*change_mps))
+        self._inertial.add(t_s, visual_mps)
 
-    def matched(self, match: MapMatch, telemetry: Telemetry, *, accepted: bool) -> None:
-        """What the map said of a frame. ``accepted``: it has entered the graph; one whose height is off seldom does."""
+    def on_map_match(self, match: MapMatch, telemetry: Telemetry, *, accepted: bool) -> None:
+        """``accepted``: the match has entered the graph. Rejected poses are used as well, because one whose height is
+        off is rarely accepted."""
         pose = match.verdict is Verdict.ACCEPTED and not match.coarse
         found = accepted and pose
-        # A coarse fix in the graph is no look that finds nothing: 15 % of the looks of true flights give one, and 3 of
-        # 900 with a mount, heading, focal length or map that is wrong. Too rare there to be measured, it counts for
-        # nothing.
-        nothing = not accepted and match.frame_id == self._textured and match.verdict not in NOT_LOOKED
+        # A coarse fix in the graph counts neither as found nor as nothing found. 15 % of the correlations of correct
+        # flights give one, and 3 of 900 with a wrong mount, heading, focal length or map: too rare to be measured.
+        nothing = not accepted and match.frame_id == self._textured and match.verdict not in NOT_CORRELATED
         if found or nothing:
-            self._registration.looked(found=found)
+            self._registration.add_attempt(found=found)
         if not pose or match.p_c_in_w_m is None or match.q_w_c is None:
             return
-        told = telemetry.at(match.t_ns)
-        if told.yaw_rad is not None:
-            seen_rad = yaw_of(rot_from_quat(match.q_w_c) @ self._r_b_c.T)
-            self._heading.add(math.remainder(told.yaw_rad - seen_rad, math.tau))
-        if told.agl_m is not None and match.ground is not None and self._origin.ground_amsl_m is not None:
-            told_m = self._origin.ground_amsl_m + told.agl_m - match.ground[0]
-            seen_m = match.p_c_in_w_m[2] - match.ground[0]
+        reported = telemetry.at(match.t_ns)
+        if reported.yaw_rad is not None:
+            observed_rad = yaw_of(rot_from_quat(match.q_w_c) @ self._r_b_c.T)
+            self._heading.add(math.remainder(reported.yaw_rad - observed_rad, math.tau))
+        if reported.agl_m is not None and match.ground is not None and self._origin.ground_amsl_m is not None:
+            reported_m = self._origin.ground_amsl_m + reported.agl_m - match.ground[0]
+            observed_m = match.p_c_in_w_m[2] - match.ground[0]
             if self._height is None:
-                sigma = math.hypot(self._origin.camera.focal_sigma, HEIGHT_SHARE, self._origin.agl_sigma_m / seen_m)
-                self._height = OffsetMonitor(sigma, SCATTER)
-            self._height.add(told_over_seen(told_m, seen_m))
+                sigma = math.hypot(
+                    self._origin.camera.focal_sigma, HEIGHT_SIGMA_SHARE, self._origin.agl_sigma_m / observed_m
+                )
+                self._height = OffsetMonitor(sigma, HEIGHT_NOISE)
+            self._height.add(log_height_ratio(reported_m, observed_m))
 
-    def changes(self, t_ns: int) -> list[CalibrationFault]:
-        """What has begun or ended since the last call."""
-        now = self._found()
-        said = [self._fault(t_ns, name, self._said[name], active=False) for name in self._said if name not in now]
-        said += [
+    def take_changes(self, t_ns: int) -> list[CalibrationFault]:
+        """Faults that have begun, changed or ended since the last call."""
+        now = self._active_findings()
+        changes = [
+            self._fault(t_ns, name, self._reported[name], active=False) for name in self._reported if name not in now
+        ]
+        changes += [
             self._fault(t_ns, name, finding, active=True)
             for name, finding in now.items()
-            if name not in self._said or _differs(finding.factor, self._said[name].factor)
+            if name not in self._reported or _differs(finding.factor, self._reported[name].factor)
         ]
-        for name, finding in now.items():  # what was said stays the measure of what is another finding
-            if name in self._said and not _differs(finding.factor, self._said[name].factor):
-                now[name] = self._said[name]
-        self._said = now
-        return said
+        for name, finding in now.items():  # the reported value remains the reference for the next change
+            if name in self._reported and not _differs(finding.factor, self._reported[name].factor):
+                now[name] = self._reported[name]
+        self._reported = now
+        return changes
 
-    def _found(self) -> dict[str, Finding]:
+    def _active_findings(self) -> dict[str, Finding]:
         found: dict[str, Finding] = {}
         if (hypothesis := self._inertial.fault) is not None:
             found[hypothesis.quantity] = Finding(
@@ -158,5 +167,5 @@ class Monitors:
 
 
 def _differs(now: float | None, before: float | None) -> bool:
-    """Factors or degrees that are two findings, not one that is known better by now."""
-    return now is not None and before is not None and abs(now - before) > ANOTHER * max(abs(now), abs(before))
+    """Whether a factor or an angle differs so much that it is reported again, and is no mere refinement."""
+    return now is not None and before is not None and abs(now - before) > REPORT_CHANGE * max(abs(now), abs(before))

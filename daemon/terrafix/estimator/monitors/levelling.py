@@ -1,8 +1,8 @@
-"""Roll and pitch that are swapped or of the wrong sign, from pictures that they level.
+"""Swapped or inverted roll and pitch, from the visual velocity of pictures that are levelled with them.
 
-Levelled with the true attitude, pictures show a velocity that changes slowly; levelled with a wrong one they show a
-jump by twice the change of tilt. So each way to be wrong is tried: the attitude that levels best is the true one. It
-needs neither a map nor inertial readings, and tells nothing while the vehicle does not tilt."""
+With the true attitude the visual velocity changes slowly. With a wrong one it jumps by twice the change of tilt. Each
+possible fault is tested: the attitude that gives the smoothest velocity is the true one. The test needs neither a map
+nor inertial readings, and gains no information while the vehicle does not tilt."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,16 +11,16 @@ import numpy as np
 
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.monitors.cusum import Cusum, threshold
-from terrafix.estimator.monitors.sighting import sighting
+from terrafix.estimator.monitors.visual_motion import visual_motion
 
-STEPS_PER_HOUR = 3600.0  # at most one comparison a second
-TILT_RAD = np.radians(0.7)  # 1-sigma of a reported change of tilt between two frames
-ACCELERATION_MPS2 = 3.0  # 1-sigma of what a vehicle's velocity changes by
-REMEMBERED = 0.95  # of how badly a way fits, from one comparison to the next
-LONGEST_S = 3.0  # between two velocities that are compared
+STEPS_PER_HOUR = 3600.0  # 1/h: at most one comparison a second [spec: MIN_TURN_SPACING_S]
+TILT_CHANGE_SIGMA_RAD = np.radians(0.7)  # 1-sigma of a reported change of tilt between two frames [tuned]
+ACCELERATION_SIGMA_MPS2 = 3.0  # m/s^2, 1-sigma of a vehicle's acceleration [tuned]
+MISFIT_MEMORY = 0.95  # exponential forgetting of the misfit of a fault, per comparison [tuned]
+MAX_INTERVAL_S = 3.0  # s between two velocities that are compared [tuned]
 
 
-def _tilted(roll: float, pitch: float) -> Callable[[Attitude], Attitude]:
+def _scaled(roll: float, pitch: float) -> Callable[[Attitude], Attitude]:
     def change(attitude: Attitude) -> Attitude:
         assert attitude.roll_rad is not None and attitude.pitch_rad is not None
         return replace(attitude, roll_rad=roll * attitude.roll_rad, pitch_rad=pitch * attitude.pitch_rad)
@@ -32,34 +32,38 @@ def _swapped(attitude: Attitude) -> Attitude:
     return replace(attitude, roll_rad=attitude.pitch_rad, pitch_rad=attitude.roll_rad)
 
 
-WAYS: dict[str, Callable[[Attitude], Attitude]] = {
-    "sign of roll": _tilted(-1.0, 1.0),
-    "sign of pitch": _tilted(1.0, -1.0),
-    "signs of roll and pitch": _tilted(-1.0, -1.0),
+# Fault -> the true attitude from the reported one.
+TILT_FAULTS: dict[str, Callable[[Attitude], Attitude]] = {
+    "sign of roll": _scaled(-1.0, 1.0),
+    "sign of pitch": _scaled(1.0, -1.0),
+    "signs of roll and pitch": _scaled(-1.0, -1.0),
     "roll and pitch swapped": _swapped,
 }
 
 
 @dataclass(frozen=True)
 class _Velocity:
-    """East and north [heights/s], (2,): as reported, and by each of WAYS; over ``span_s`` before ``t_s``."""
+    """Visual velocity, east and north [heights/s], (2,), over ``span_s`` before ``t_s``: levelled with the reported
+    attitude, and with that of each of TILT_FAULTS."""
 
     t_s: float
     span_s: float
     reported: np.ndarray
-    otherwise: list[np.ndarray]
+    by_fault: list[np.ndarray]
 
 
 class LevellingMonitor:
+    """One CUSUM per fault."""
+
     def __init__(self) -> None:
-        limit = threshold(STEPS_PER_HOUR, len(WAYS))
-        self._tests = {name: Cusum(limit) for name in WAYS}
-        self._misfits = dict.fromkeys(WAYS, 0.0)  # squares of the last jumps, in sigmas: which way it is
+        limit = threshold(STEPS_PER_HOUR, len(TILT_FAULTS))
+        self._tests = {name: Cusum(limit) for name in TILT_FAULTS}
+        self._misfits = dict.fromkeys(TILT_FAULTS, 0.0)  # squared jumps in sigmas: select among active faults
         self._last: _Velocity | None = None
 
     @property
     def fault(self) -> str:
-        """Of the ways that have been accepted the one that levels best; empty: none was."""
+        """The fault with the smallest misfit among those whose alarm is active; empty: none is."""
         active = [name for name, test in self._tests.items() if test.active]
         return min(active, key=self._misfits.__getitem__, default="")
 
@@ -70,20 +74,20 @@ class LevellingMonitor:
         if None in (before.roll_rad, before.pitch_rad, now.roll_rad, now.pitch_rad, now.agl_m):
             return
         span_s = span[1] - span[0]
-        ways = (lambda attitude: attitude, *WAYS.values())
-        seen = [sighting(pairs, way(before), way(now), r_b_c) for way in ways]
-        moved = [one.moved / span_s for one in seen if one is not None]
-        if len(moved) < len(ways):
+        attitudes = (lambda attitude: attitude, *TILT_FAULTS.values())
+        motions = [visual_motion(pairs, corrected(before), corrected(now), r_b_c) for corrected in attitudes]
+        velocities = [one.displacement / span_s for one in motions if one is not None]
+        if len(velocities) < len(attitudes):
             return
-        last, self._last = self._last, _Velocity(span[1], span_s, moved[0], moved[1:])
-        if last is None or not 0.0 < span[1] - last.t_s <= LONGEST_S:
+        last, self._last = self._last, _Velocity(span[1], span_s, velocities[0], velocities[1:])
+        if last is None or not 0.0 < span[1] - last.t_s <= MAX_INTERVAL_S:
             return
         assert now.agl_m is not None
-        tilt = TILT_RAD * np.hypot(1.0 / span_s, 1.0 / last.span_s)
-        gain = ACCELERATION_MPS2 * (span[1] - last.t_s + 0.5 * (span_s + last.span_s)) / max(now.agl_m, 10.0)
+        tilt = TILT_CHANGE_SIGMA_RAD * np.hypot(1.0 / span_s, 1.0 / last.span_s)
+        gain = ACCELERATION_SIGMA_MPS2 * (span[1] - last.t_s + 0.5 * (span_s + last.span_s)) / max(now.agl_m, 10.0)
         variance = 2.0 * (tilt**2 + gain**2)
-        as_reported = float(np.sum((moved[0] - last.reported) ** 2))
+        reported_jump2 = float(np.sum((velocities[0] - last.reported) ** 2))
         for i, (name, test) in enumerate(self._tests.items()):
-            other = float(np.sum((moved[1 + i] - last.otherwise[i]) ** 2))
-            self._misfits[name] = REMEMBERED * self._misfits[name] + other / variance
-            test.add((as_reported - other) / variance)
+            jump2 = float(np.sum((velocities[1 + i] - last.by_fault[i]) ** 2))
+            self._misfits[name] = MISFIT_MEMORY * self._misfits[name] + jump2 / variance
+            test.add((reported_jump2 - jump2) / variance)

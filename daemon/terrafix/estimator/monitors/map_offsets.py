@@ -1,20 +1,21 @@
-"""Heights and headings of camera poses on the map against those that were told."""
+"""Reported heights and headings against those of camera poses on the map."""
 
 import math
 
 from terrafix.estimator.monitors.cusum import Cusum, threshold
 
-POSES_PER_HOUR = 3600.0
-# What is allowed of a constant error: 3 of its described sigmas (0.3 % of descriptions that are honest are beyond).
-ALLOWED = 3.0
-SCATTER = 0.05  # 1-sigma of one pose's height, a share of it
+POSES_PER_HOUR = 3600.0  # 1/h: at most one pose a second counts for the false alarm rate [tuned]
+# Allowed constant error, in its configured 1-sigmas.
+ALLOWED_SIGMAS = 3.0  # [spec: 0.3 % of correct descriptions are beyond 3 sigmas]
+HEIGHT_NOISE = 0.05  # 1-sigma of one pose's height, share of it [tuned]
 
 
 class OffsetMonitor:
-    """One told quantity against the map's. ``sigma``: of its constant error as described; ``scatter``: of one pose."""
+    """CUSUM of one reported quantity less that of map poses. ``sigma``: 1-sigma of its constant error as configured;
+    ``noise``: 1-sigma of one pose."""
 
-    def __init__(self, sigma: float, scatter: float) -> None:
-        self._allowed, self._scatter = ALLOWED * sigma, scatter
+    def __init__(self, sigma: float, noise: float) -> None:
+        self._allowed, self._noise = ALLOWED_SIGMAS * sigma, noise
         self._test = Cusum(threshold(POSES_PER_HOUR))
         self.mean = 0.0
 
@@ -22,13 +23,13 @@ class OffsetMonitor:
     def active(self) -> bool:
         return self._test.active
 
-    def add(self, off: float) -> None:
-        """Told less seen. The fault is an error of 2 scatters beyond what is allowed; its absence, the allowed one."""
-        beyond = (abs(off) - self._allowed) / self._scatter
-        self._test.add(2.0 * (beyond - 1.0))  # of N(allowed + 2 scatters) over N(allowed)
-        self.mean += 0.2 * (off - self.mean) if self.mean else off
+    def add(self, offset: float) -> None:
+        """Reported less observed. H1: an error of 2 noise sigmas beyond the allowed one; H0: the allowed error."""
+        excess = (abs(offset) - self._allowed) / self._noise
+        self._test.add(2.0 * (excess - 1.0))  # log ratio of N(allowed + 2 noise, noise^2) and N(allowed, noise^2)
+        self.mean += 0.2 * (offset - self.mean) if self.mean else offset
 
 
-def told_over_seen(told_m: float, seen_m: float) -> float:
-    """Logarithm of two heights above the ground below."""
-    return math.log(max(told_m, 1.0) / max(seen_m, 1.0))
+def log_height_ratio(reported_m: float, observed_m: float) -> float:
+    """Logarithm of the ratio of two heights above the ground below."""
+    return math.log(max(reported_m, 1.0) / max(observed_m, 1.0))

@@ -1,1 +1,1 @@
-"""Whose packets are heard, and which are believed."""
+"""Decides which packets on the autopilot's link are accepted, and from which sender."""

@@ -1,12 +1,12 @@
-"""Which packets are heard, and as whose: who speaks (served_autopilot.py), and whether what is said contradicts
-itself."""
+"""Admission of packets on the autopilot's link: classifies the sender (``ServedAutopilot``) and rejects telemetry that
+contradicts earlier telemetry (``TelemetryCheck``)."""
 
 from collections.abc import Iterator
 from typing import Any
 
 from terrafix.core.config import LinkSection
-from terrafix.link.admission.refusals import Reason, Refusals
-from terrafix.link.admission.served_autopilot import Role, Served, note, pilot_text
+from terrafix.link.admission.refusals import RejectionLog, RejectionReason
+from terrafix.link.admission.served_autopilot import Role, ServedAutopilot, pilot_text, status_note
 from terrafix.link.admission.telemetry_check import TelemetryCheck
 from terrafix.link.autopilot.checkpoint import LinkCheckpoint
 from terrafix.link.mavlink.transport import Address
@@ -14,46 +14,47 @@ from terrafix.messages import MeasurementVerdict
 
 
 class Admission:
-    """``take`` every packet of the autopilot's link. ``reboots``: of the autopilot, since this link began."""
+    """Classifies every packet of the autopilot's link. ``reboots``: reboots of the autopilot since this link began."""
 
-    def __init__(self, config: LinkSection, *, listens: bool, found: LinkCheckpoint | None) -> None:
-        """``listens``, ``found``: see Served."""
-        self.served = Served(config.autopilot_sysid, listens=listens, found=found)
+    def __init__(self, config: LinkSection, *, is_listening: bool, checkpoint: LinkCheckpoint | None) -> None:
+        """``is_listening``, ``checkpoint``: see ``ServedAutopilot``."""
+        self.served = ServedAutopilot(config.autopilot_sysid, is_listening=is_listening, checkpoint=checkpoint)
         self.reboots = 0
-        self._named = bool(config.autopilot_sysid)
+        self._sysid_configured = bool(config.autopilot_sysid)
         self._check = TelemetryCheck()
-        self._checked = (self.served.sysid, self.served.address)  # whose
-        self._refusals = Refusals()
+        self._checked_sender = (self.served.sysid, self.served.address)  # of the packets that _check has seen
+        self._rejections = RejectionLog()
 
-    def take(self, message: Any, sender: Address | None, now_ns: int) -> Role:
+    def classify(self, message: Any, sender: Address | None, now_ns: int) -> Role:
+        """-> role of the sender. A packet rejected for its content, or from a second sender, is recorded."""
         served = self.served
-        role = served.take(message, sender, now_ns)
-        if role is Role.REFUSED and message.get_srcSystem() == served.sysid and sender is not None:
-            self._refusals.add(Reason.SENDER, f"system {served.sysid} at {sender[0]}:{sender[1]}", now_ns)
-        return Role.CONTRADICTS if role is Role.AUTOPILOT and self._contradicts(message, now_ns) else role
+        role = served.classify(message, sender, now_ns)
+        if role is Role.REJECTED and message.get_srcSystem() == served.sysid and sender is not None:
+            self._rejections.add(RejectionReason.SENDER, f"system {served.sysid} at {sender[0]}:{sender[1]}", now_ns)
+        return Role.INCONSISTENT if role is Role.AUTOPILOT and self._is_inconsistent(message, now_ns) else role
 
     def verdicts(self, now_ns: int) -> Iterator[MeasurementVerdict]:
-        return self._refusals.verdicts(now_ns)
+        return self._rejections.verdicts(now_ns)
 
     def pilot_texts(self, now_ns: int) -> Iterator[str]:
-        """Of what is new since the last call, at most 40 characters each."""
-        for other in self.served.warnings(now_ns):
+        """-> warnings that are new since the last call, at most 40 characters each."""
+        for other in self.served.new_others(now_ns):
             yield pilot_text(other, self.served.sysid)
-        yield from self._refusals.pilot_texts()
+        yield from self._rejections.pilot_texts()
 
     def notes(self, now_ns: int) -> Iterator[str]:
-        """For LinkStatus; an empty one says nothing."""
-        yield note(self.served.others(now_ns), self.served.sysid, named=self._named)
-        yield from self._refusals.notes(now_ns)
+        """-> texts for ``LinkStatus``; may be empty strings."""
+        yield status_note(self.served.others(now_ns), self.served.sysid, sysid_configured=self._sysid_configured)
+        yield from self._rejections.notes(now_ns)
 
-    def _contradicts(self, message: Any, now_ns: int) -> bool:
-        """The autopilot, or who passes for it, contradicts what it has said before."""
-        whose = (self.served.sysid, self.served.address)
-        if whose != self._checked:
-            self._checked, self._check = whose, TelemetryCheck()
+    def _is_inconsistent(self, message: Any, now_ns: int) -> bool:
+        """True if a packet of the autopilot, or of a sender with its id and address, contradicts earlier packets."""
+        sender_identity = (self.served.sysid, self.served.address)
+        if sender_identity != self._checked_sender:
+            self._checked_sender, self._check = sender_identity, TelemetryCheck()
         reboots = self._check.reboots
-        why = self._check.refuses(message, now_ns)
+        why = self._check.rejection(message, now_ns)
         if why is not None:
-            self._refusals.add(*why, now_ns)
+            self._rejections.add(*why, now_ns)
         self.reboots += self._check.reboots - reboots
         return why is not None

@@ -1,4 +1,4 @@
-"""Telemetry that is not believed, for the record, the pilot and LinkStatus."""
+"""Rejected telemetry, reported to the record (MeasurementVerdict), the pilot (STATUSTEXT) and LinkStatus."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,77 +6,84 @@ from enum import StrEnum
 
 from terrafix.messages import MeasurementVerdict, Verdict
 
-EVERY_NS = 1_000_000_000  # between two verdicts for the same reason
-EPISODE_NS = 10_000_000_000  # without a refusal: it is over
-MANY = 10  # messages of an episode that are worth a word to the pilot; a gap in the numbers costs five
-NO_FRAME = -1
+VERDICT_PERIOD_NS = 1_000_000_000  # shortest time between two verdicts for the same reason [tuned]
+EPISODE_TIMEOUT_NS = 10_000_000_000  # an episode ends after this time without a rejection [tuned]
+# Rejected messages of an episode before the pilot is informed; a gap in the sequence numbers alone costs five. [tuned]
+MIN_PILOT_TEXT_MESSAGES = 10
+NO_FRAME_ID = -1  # frame_id of a verdict that belongs to no frame [spec: MeasurementVerdict]
 
 
-class Reason(StrEnum):
+class RejectionReason(StrEnum):
+    """The values are published in verdicts and LinkStatus."""
+
     SENDER = "second sender"  # another address with the autopilot's system id
-    SEQUENCE = "sequence"  # packet numbers that do not go on
-    BOOT_TIME = "boot time"
-    ATTITUDE = "attitude"
+    SEQUENCE = "sequence"  # sequence number outside of the series
+    BOOT_TIME = "boot time"  # step in the time since boot
+    ATTITUDE = "attitude"  # turn that the gyroscopes did not measure
 
 
-PILOT_TEXTS = {  # at most 40 characters; of a second sender served_autopilot.py tells
-    Reason.SEQUENCE: "telemetry of two senders, one ignored",
-    Reason.BOOT_TIME: "autopilot rebooted, or its time jumps",
-    Reason.ATTITUDE: "attitude jumps without gyros, ignored",
+PILOT_TEXTS = {  # at most 40 characters; served_autopilot.py has the text for a second sender
+    RejectionReason.SEQUENCE: "telemetry of two senders, one ignored",
+    RejectionReason.BOOT_TIME: "autopilot rebooted, or its time jumps",
+    RejectionReason.ATTITUDE: "attitude jumps without gyros, ignored",
 }
 
 
 @dataclass
 class _Episode:
+    """Rejections for one reason without a pause of ``EPISODE_TIMEOUT_NS``."""
+
     detail: str = ""
     newest_ns: int | None = None
     messages: int = 0
-    unsaid: int = 0  # messages since the last verdict
-    said_ns: int | None = None
-    told: bool = False  # the pilot was
+    unreported: int = 0  # messages since the last verdict
+    reported_ns: int | None = None
+    pilot_informed: bool = False
 
 
-class Refusals:
-    """``add`` each message that is refused; ``verdicts`` and ``pilot_texts`` at every look."""
+class RejectionLog:
+    """Collects rejected messages by reason. ``verdicts`` and ``pilot_texts`` return what is due to be published."""
 
     def __init__(self) -> None:
-        self._episodes: dict[Reason, _Episode] = {}
+        self._episodes: dict[RejectionReason, _Episode] = {}
 
-    def add(self, reason: Reason, detail: str, now_ns: int) -> None:
+    def add(self, reason: RejectionReason, detail: str, now_ns: int) -> None:
         episode = self._episodes.get(reason)
-        if episode is None or not _goes_on(episode, now_ns):
+        if episode is None or not _is_current(episode, now_ns):
             episode = self._episodes[reason] = _Episode()
         episode.detail, episode.newest_ns = detail, now_ns
-        episode.messages, episode.unsaid = episode.messages + 1, episode.unsaid + 1
+        episode.messages, episode.unreported = episode.messages + 1, episode.unreported + 1
 
     def verdicts(self, now_ns: int) -> Iterator[MeasurementVerdict]:
-        """At once for each reason, then one a second with how many messages it stands for."""
+        """-> one verdict per reason: at its first rejection, then at most one per second with the message count."""
         for reason, episode in self._episodes.items():
-            if not episode.unsaid or (episode.said_ns is not None and now_ns - episode.said_ns < EVERY_NS):
+            if not episode.unreported or (
+                episode.reported_ns is not None and now_ns - episode.reported_ns < VERDICT_PERIOD_NS
+            ):
                 continue
-            times = f" ({episode.unsaid} messages)" if episode.unsaid > 1 else ""
-            episode.unsaid, episode.said_ns = 0, now_ns
+            times = f" ({episode.unreported} messages)" if episode.unreported > 1 else ""
+            episode.unreported, episode.reported_ns = 0, now_ns
             yield MeasurementVerdict(
                 t_ns=now_ns,
-                frame_id=NO_FRAME,
+                frame_id=NO_FRAME_ID,
                 measurement="telemetry",
                 verdict=Verdict.IMPLAUSIBLE,
                 detail=f"{reason}: {episode.detail}{times}",
             )
 
     def pilot_texts(self) -> Iterator[str]:
-        """Once an episode."""
+        """-> one text per episode."""
         for reason, episode in self._episodes.items():
-            if reason in PILOT_TEXTS and episode.messages >= MANY and not episode.told:
-                episode.told = True
+            if reason in PILOT_TEXTS and episode.messages >= MIN_PILOT_TEXT_MESSAGES and not episode.pilot_informed:
+                episode.pilot_informed = True
                 yield PILOT_TEXTS[reason]
 
     def notes(self, now_ns: int) -> Iterator[str]:
-        """For LinkStatus."""
+        """-> texts for ``LinkStatus`` about the current episodes."""
         for reason, episode in self._episodes.items():
-            if reason in PILOT_TEXTS and _goes_on(episode, now_ns):
+            if reason in PILOT_TEXTS and _is_current(episode, now_ns):
                 yield f"telemetry refused, {reason}: {episode.detail}"
 
 
-def _goes_on(episode: _Episode, now_ns: int) -> bool:
-    return episode.newest_ns is not None and now_ns - episode.newest_ns < EPISODE_NS
+def _is_current(episode: _Episode, now_ns: int) -> bool:
+    return episode.newest_ns is not None and now_ns - episode.newest_ns < EPISODE_TIMEOUT_NS

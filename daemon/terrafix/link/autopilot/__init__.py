@@ -1,1 +1,1 @@
-"""The autopilot that is served, and its state."""
+"""The served autopilot and its state."""

@@ -1,4 +1,4 @@
-"""The autopilot that we talk to: what it says becomes messages, and what is known of it is kept for what is sent."""
+"""The served autopilot: converts its MAVLink packets to messages and stores the state that the outputs need."""
 
 import math
 from collections.abc import Iterator
@@ -6,24 +6,25 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.link.autopilot.gnss_receiver import RECEIVERS, reading_of
+from terrafix.link.autopilot.gnss_receiver import RECEIVERS, gnss_reading
 from terrafix.link.autopilot.telemetry import Telemetry
 from terrafix.link.mavlink.timesync import TimeSync
-from terrafix.link.output.odometry import Attitude, Place
-from terrafix.link.output.selection import Autopilot
+from terrafix.link.output.odometry import Attitude, GeodeticPoint
+from terrafix.link.output.selection import AutopilotState
 from terrafix.messages import FilterStatus, Message, VehicleState
 
-ATTITUDE_FRESH_NS = 500_000_000
-SHARED_FLAGS = 2 * mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS - 1  # those below are the same as in EKF_STATUS_FLAGS
+ATTITUDE_TIMEOUT_NS = 500_000_000  # an older attitude is not used for the outputs [tuned]
+# The bits that mean the same in ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS. [spec: MAVLink common.xml]
+COMMON_EKF_FLAGS = 2 * mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS - 1
 
 
 class AutopilotPeer:
-    """``take`` every message of the autopilot that is served (served_autopilot.py)."""
+    """Processes the messages of the served autopilot (served_autopilot.py)."""
 
     def __init__(self, timesync: TimeSync) -> None:
         self.telemetry = Telemetry(timesync)
         self._state: VehicleState | None = None  # the newest
-        self._origin: Place | None = None  # of its filter
+        self._origin: GeodeticPoint | None = None  # of its EKF
 
     @property
     def sysid(self) -> int:
@@ -31,41 +32,45 @@ class AutopilotPeer:
 
     @property
     def firmware(self) -> str:
-        return self.telemetry.autopilot
+        return self.telemetry.firmware
 
-    def take(self, message: Any, now_ns: int, our_receiver: int | None) -> Iterator[Message]:
-        """``our_receiver``: the GPS that is we ourselves, and no receiver; None: none is."""
-        state = self.telemetry.take(message, now_ns)
+    def on_message(self, message: Any, now_ns: int, own_receiver: int | None) -> Iterator[Message]:
+        """``own_receiver``: index of the GPS instance that carries our GPS_INPUT; it is not reported as a receiver.
+        None: there is none."""
+        state = self.telemetry.on_message(message, now_ns)
         if state is not None:
             if isinstance(state, VehicleState):
                 self._state = state
             yield state
         kind = message.get_type()
-        if kind in RECEIVERS and RECEIVERS[kind] != our_receiver:
-            yield reading_of(message, now_ns)
+        if kind in RECEIVERS and RECEIVERS[kind] != own_receiver:
+            yield gnss_reading(message, now_ns)
         elif kind == "GPS_GLOBAL_ORIGIN":
-            self._origin = Place(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+            self._origin = GeodeticPoint(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
         elif kind == "EKF_STATUS_REPORT":
             yield from _filter_status(message, now_ns)
         elif kind == "ESTIMATOR_STATUS":
             yield _estimator_status(message, now_ns)
 
-    def now(self, now_ns: int) -> Autopilot:
+    def snapshot(self, now_ns: int) -> AutopilotState:
+        """-> the state that the outputs need, without the attitude if that is too old."""
         state, attitude = self._state, None
-        if state is not None and now_ns - state.t_ns < ATTITUDE_FRESH_NS:
-            angles = [a for a in (state.roll_rad, state.pitch_rad, state.yaw_rad) if a is not None]
-            attitude = Attitude(*angles) if len(angles) == 3 else None
-        return Autopilot(self.firmware, self.sysid, attitude, self._origin)
+        if state is not None and now_ns - state.t_ns < ATTITUDE_TIMEOUT_NS:
+            angles_rad = [a for a in (state.roll_rad, state.pitch_rad, state.yaw_rad) if a is not None]
+            attitude = Attitude(*angles_rad) if len(angles_rad) == 3 else None
+        return AutopilotState(self.firmware, self.sysid, attitude, self._origin)
 
 
 def _filter_status(message: Any, now_ns: int) -> Iterator[FilterStatus]:
-    ratios = (message.pos_horiz_variance, message.velocity_variance)  # "variance" by name, test ratios in truth
+    """ArduPilot's EKF_STATUS_REPORT. Its ``*_variance`` fields contain innovation test ratios."""
+    ratios = (message.pos_horiz_variance, message.velocity_variance)
     if all(math.isfinite(ratio) for ratio in ratios):
         yield FilterStatus(t_ns=now_ns, flags=message.flags, position_ratio=ratios[0], velocity_ratio=ratios[1])
 
 
 def _estimator_status(message: Any, now_ns: int) -> FilterStatus:
-    """PX4's. A ratio is NaN where nothing of that kind comes in: without a receiver, that of the velocity."""
+    """PX4's ESTIMATOR_STATUS. A test ratio is NaN if no such measurement arrives, as the one of the velocity without a
+    receiver."""
     ratios = [ratio if math.isfinite(ratio) else 0.0 for ratio in (message.pos_horiz_ratio, message.vel_ratio)]
-    flags = message.flags & SHARED_FLAGS
+    flags = message.flags & COMMON_EKF_FLAGS
     return FilterStatus(t_ns=now_ns, flags=flags, position_ratio=ratios[0], velocity_ratio=ratios[1])

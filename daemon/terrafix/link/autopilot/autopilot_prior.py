@@ -1,41 +1,42 @@
-"""Started again in flight: the map is searched first where the autopilot believes to be.
+"""Publishes the autopilot's position as a position hint after a restart in flight, so that the map search begins there.
 
-The start coordinate is where the flight began. The autopilot has flown on, by its inertial sensors and, a plane, by
-its airspeed; it may also have been led astray by a receiver. So its position is a hint like that of a person
-(position_prior.py): where a search begins, believed by nobody."""
+The start coordinate is where the flight began. Meanwhile the autopilot has dead reckoned with its inertial sensors and,
+in a plane, its airspeed; a spoofed receiver may also have displaced it. Its position is therefore treated like an
+operator's hint (position_prior.py): it sets where a search begins, and is not fused."""
 
 from typing import Any
 
-from terrafix.core.limits import LEAST_LOOK_AGL_M
-from terrafix.link.ground_station.position_prior import is_place
+from terrafix.core.limits import MIN_MATCHING_AGL_M
+from terrafix.link.ground_station.position_prior import is_valid_position
 from terrafix.link.integrity.fix_type import STARTED_IN_FLIGHT
 from terrafix.messages import GpsInput, PositionHint
 
-RADIUS_M = 300.0  # what a plane without airspeed loses in two minutes without any position is 170 m
-
-AGAIN_NS = 20_000_000_000
-TIMES = 3
+RADIUS_M = 300.0  # a plane without airspeed drifts 170 m in two minutes without any position [tuned]
+HINT_PERIOD_NS = 20_000_000_000  # [tuned]
+MAX_HINTS = 3  # per restart [tuned]
 
 
 class AutopilotPrior:
-    """``said`` everything that goes to the autopilot as GPS_INPUT, ``take`` what it says."""
+    """Reads our GPS_INPUT and the autopilot's messages."""
 
     def __init__(self) -> None:
-        self._wanted = False
-        self._given = 0
-        self._given_ns = 0
+        self._started_in_flight = False
+        self._published = 0
+        self._published_ns = 0
 
-    def said(self, gps: GpsInput) -> None:
-        """An estimate is there that only the start coordinate holds: so vision, estimator and anchor are up."""
-        self._wanted = gps.reason == STARTED_IN_FLIGHT.text
+    def on_gps_input(self, gps: GpsInput) -> None:
+        """The reason STARTED_IN_FLIGHT means that there is an estimate from the start coordinate alone: vision,
+        estimator and anchor are running."""
+        self._started_in_flight = gps.reason == STARTED_IN_FLIGHT.text
 
-    def take(self, message: Any, now_ns: int) -> PositionHint | None:
-        if not self._wanted or self._given == TIMES or message.get_type() != "GLOBAL_POSITION_INT":
+    def on_message(self, message: Any, now_ns: int) -> PositionHint | None:
+        """-> a hint from GLOBAL_POSITION_INT if one is due and the vehicle is high enough for the map search."""
+        if not self._started_in_flight or self._published == MAX_HINTS or message.get_type() != "GLOBAL_POSITION_INT":
             return None
-        if self._given and now_ns - self._given_ns < AGAIN_NS:
+        if self._published and now_ns - self._published_ns < HINT_PERIOD_NS:
             return None
         lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
-        if not is_place(lat_deg, lon_deg) or message.relative_alt < LEAST_LOOK_AGL_M * 1e3:
+        if not is_valid_position(lat_deg, lon_deg) or message.relative_alt < MIN_MATCHING_AGL_M * 1e3:
             return None
-        self._given, self._given_ns = self._given + 1, now_ns
+        self._published, self._published_ns = self._published + 1, now_ns
         return PositionHint(t_ns=now_ns, lat_deg=lat_deg, lon_deg=lon_deg, radius_m=RADIUS_M, source="autopilot")

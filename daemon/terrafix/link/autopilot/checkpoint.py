@@ -1,10 +1,11 @@
-"""What a link leaves to the one that is started in its place: which autopilot it served, while that was armed, where
-its filter was with our last fix (ekf_dead_reckoning.py), where its heights begin (pressure_height.py,
-core/mavlink/home_altitude.py), how far off the map is (map_registration.py), and by which time GPS_INPUT goes
-(gps_time.py).
+"""Checkpoint of the link, for its successor after a restart in flight. It exists only while the autopilot is armed.
 
-An autopilot says who it is once a second, and its attitude long before. Who knows it already can say where it leans
-with the first packet, which is what the estimator waits for after a restart in flight."""
+Contents: the identity of the served autopilot, the state of its EKF at our last fix (ekf_dead_reckoning.py), the zero
+of its heights (pressure_height.py, core/mavlink/home_altitude.py), the map offset (map_registration.py), and the clock
+of GPS_INPUT (gps_time.py).
+
+The autopilot identifies itself once a second, by its heartbeat, but sends its attitude more often. With the checkpoint
+the attitude is published from the first packet on; the estimator waits for it after a restart in flight."""
 
 from pathlib import Path
 
@@ -13,13 +14,14 @@ import msgspec
 from terrafix.link.autopilot.ekf_dead_reckoning import LastFix
 from terrafix.link.mavlink.transport import Address
 from terrafix.messages import MapOffset
-from terrafix.runtime.run_dir import load, save
+from terrafix.runtime.checkpoint import CheckpointFile
 
-SAME_TIME_NS = 2_000_000
+# A change of the clock below this is not saved: GPS_INPUT states its time in whole milliseconds. [tuned]
+CLOCK_TOLERANCE_NS = 2_000_000
 
 
 class ArmedAutopilot(msgspec.Struct, frozen=True):
-    """Of its HEARTBEAT: system id, MAV_AUTOPILOT, MAV_TYPE."""
+    """From its HEARTBEAT: system id, MAV_AUTOPILOT, MAV_TYPE."""
 
     sysid: int
     firmware: int
@@ -27,62 +29,69 @@ class ArmedAutopilot(msgspec.Struct, frozen=True):
 
 
 class LinkCheckpoint(msgspec.Struct, frozen=True):
+    """Content of the checkpoint file, as JSON."""
+
     autopilot: ArmedAutopilot
     last: LastFix | None = None
-    home_moved_m: float = 0.0
+    home_moved_m: float = 0.0  # see Telemetry.home_moved_m
     map_offset: MapOffset | None = None
-    pressure_zero_m: float | None = None  # where it took off (pressure_height.PressureHeight)
-    peer: Address | None = None  # where it speaks from, on a listening port
-    unix_minus_monotonic_ns: int | None = None  # by which GPS_INPUT states the time (gps_time.LatchedClock)
+    pressure_zero_m: float | None = None  # see PressureHeight
+    peer: Address | None = None  # address of the autopilot, on a listening port
+    unix_minus_monotonic_ns: int | None = None  # clock of GPS_INPUT (gps_time.LatchedClock)
 
 
 def load_checkpoint(file: Path | None) -> LinkCheckpoint | None:
-    """What the link before this one left; None: there was none in this flight."""
-    return load(file, msgspec.json.Decoder(LinkCheckpoint).decode)
+    """-> checkpoint of the previous link process of this flight; None if there is none."""
+    return _checkpoint_file(file).load()
+
+
+def _checkpoint_file(file: Path | None) -> CheckpointFile[LinkCheckpoint]:
+    return CheckpointFile(file, LinkCheckpoint, "json")
 
 
 class CheckpointWriter:
-    """``heard`` after every HEARTBEAT of the autopilot, ``flies`` and ``timed`` after each fix, ``learnt`` with each
-    MapOffset.
+    """Writes the checkpoint when its content changes. ``restored``: checkpoint found at the start.
 
-    One that is not armed is not kept: a vehicle on the ground stands where its flight begins, and nobody may believe
-    that of one that has taken off meanwhile."""
+    The file is deleted when the autopilot is not armed: a vehicle on the ground is at the start of its flight, and this
+    must not be assumed of one that has taken off since."""
 
     def __init__(self, file: Path | None) -> None:
-        """``file`` None: nothing is kept."""
-        self._file = file
-        self.found = load_checkpoint(file)
-        self._kept = self.found
+        """``file`` None: nothing is saved."""
+        self._checkpoint = None if file is None else _checkpoint_file(file)
+        self.restored = None if self._checkpoint is None else self._checkpoint.load()
+        self._saved = self.restored
 
-    def heard(self, autopilot: ArmedAutopilot | None, peer: Address | None = None) -> None:
-        """None: it is not armed."""
+    def on_heartbeat(self, autopilot: ArmedAutopilot | None, peer: Address | None = None) -> None:
+        """After every HEARTBEAT of the autopilot. ``autopilot`` None: it is not armed."""
         if autopilot is None:
-            self._keep(None)
-        elif self._kept is None or (self._kept.autopilot, self._kept.peer) != (autopilot, peer):
-            self._keep(LinkCheckpoint(autopilot, peer=peer))
+            self._save(None)
+        elif self._saved is None or (self._saved.autopilot, self._saved.peer) != (autopilot, peer):
+            self._save(LinkCheckpoint(autopilot, peer=peer))
 
-    def flies(self, last: LastFix | None, home_moved_m: float, pressure_zero_m: float | None = None) -> None:
-        if self._kept is not None:
+    def on_fix(self, last: LastFix | None, home_moved_m: float, pressure_zero_m: float | None = None) -> None:
+        """After every GPS_INPUT."""
+        if self._saved is not None:
             heights = {"home_moved_m": home_moved_m, "pressure_zero_m": pressure_zero_m}
-            self._keep(msgspec.structs.replace(self._kept, last=last, **heights))
+            self._save(msgspec.structs.replace(self._saved, last=last, **heights))
 
-    def timed(self, unix_minus_monotonic_ns: int | None) -> None:
-        """With each GPS_INPUT, to the millisecond that it states: what differs by less is the same."""
-        before = None if self._kept is None else self._kept.unix_minus_monotonic_ns
-        if self._kept is None or unix_minus_monotonic_ns is None:
+    def on_gps_time(self, unix_minus_monotonic_ns: int | None) -> None:
+        """After every GPS_INPUT, by the time that it states. Differences up to ``CLOCK_TOLERANCE_NS`` are ignored."""
+        before = None if self._saved is None else self._saved.unix_minus_monotonic_ns
+        if self._saved is None or unix_minus_monotonic_ns is None:
             return
-        if before is None or abs(unix_minus_monotonic_ns - before) > SAME_TIME_NS:
-            self._keep(msgspec.structs.replace(self._kept, unix_minus_monotonic_ns=unix_minus_monotonic_ns))
+        if before is None or abs(unix_minus_monotonic_ns - before) > CLOCK_TOLERANCE_NS:
+            self._save(msgspec.structs.replace(self._saved, unix_minus_monotonic_ns=unix_minus_monotonic_ns))
 
-    def learnt(self, map_offset: MapOffset) -> None:
-        if self._kept is not None:
-            self._keep(msgspec.structs.replace(self._kept, map_offset=map_offset))
+    def on_map_offset(self, map_offset: MapOffset) -> None:
+        """After every MapOffset message."""
+        if self._saved is not None:
+            self._save(msgspec.structs.replace(self._saved, map_offset=map_offset))
 
-    def _keep(self, kept: LinkCheckpoint | None) -> None:
-        if self._file is None or kept == self._kept:
+    def _save(self, checkpoint: LinkCheckpoint | None) -> None:
+        if self._checkpoint is None or checkpoint == self._saved:
             return
-        self._kept = kept
-        if kept is None:
-            self._file.unlink(missing_ok=True)
+        self._saved = checkpoint
+        if checkpoint is None:
+            self._checkpoint.remove()
         else:
-            save(self._file, msgspec.json.encode(kept))
+            self._checkpoint.save(checkpoint)

@@ -1,12 +1,12 @@
-"""Where the autopilot's own filter has gone since our last fix, while it had nothing else to go by.
+"""Dead reckoning of the autopilot's EKF since our last fix, published as Coasted while there is no new fix.
 
-It coasts: by its inertial sensors, and a plane by its airspeed. Over six seconds ArduPilot's plane was off by 3 m then,
-in turns too, where nobody knows better. Who is started again in the flight begins there
-(estimator/measurements/ekf_dead_reckoning.py). What counts is how far the filter moved and by how much its velocity
-changed: where it believed to be before is our own word.
+Without GPS the EKF dead reckons with its inertial sensors and, in a plane, with its airspeed. Over six seconds the
+error of ArduPilot's plane was 3 m, in turns as well. After a restart in flight the estimator continues from there
+(estimator/measurements/ekf_dead_reckoning.py). Only the displacement of the EKF and its change of velocity are used;
+its position before was our own fix.
 
-Not while any other receiver has a fix: it may be spoofed, and lead the filter astray. Nor when the filter itself says
-that it has lost its velocity."""
+Nothing is published while any other receiver has a fix, because a spoofed one would displace the EKF, nor while the EKF
+reports that its velocity is invalid."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -22,19 +22,19 @@ from terrafix.link.integrity.fix_type import FIX_3D
 from terrafix.link.integrity.output_predictor import metres_per_degree, offset
 from terrafix.messages import Coasted, GpsInput
 
-MAX_COAST_MS = 60_000  # as long as it is the same flight (runtime/run_dir.py)
-FIXES_APART_NS = 300_000_000  # two between which ours is interpolated
-STATUS_FRESH_NS = 1_500_000_000  # it comes once a second
-RECEIVER_FRESH_NS = 1_500_000_000  # readings come five times a second
-ASK_NS, ASK_TIMES = 200_000_000, 10  # what it says seldom, after a restart
-MOVES = mavlink.EKF_VELOCITY_HORIZ
-WITHOUT = mavlink.EKF_CONST_POS_MODE | mavlink.EKF_UNINITIALIZED
+MAX_DEAD_RECKONING_MS = 60_000  # the time for which a restart counts as the same flight (runtime/run_dir.py) [tuned]
+MAX_FIX_INTERVAL_NS = 300_000_000  # longest interval between two fixes for interpolation between them [tuned]
+STATUS_TIMEOUT_NS = 1_500_000_000  # EKF_STATUS_REPORT arrives at 1 Hz [tuned]
+RECEIVER_TIMEOUT_NS = 1_500_000_000  # receiver messages arrive at 5 Hz [tuned]
+REQUEST_PERIOD_NS, MAX_REQUESTS = 200_000_000, 10  # of the slow messages, after a restart [tuned]
+VELOCITY_FLAG = mavlink.EKF_VELOCITY_HORIZ
+NO_POSITION_FLAGS = mavlink.EKF_CONST_POS_MODE | mavlink.EKF_UNINITIALIZED
 
 Vec3 = tuple[float, float, float]
 
 
-class Filter(msgspec.Struct, frozen=True):
-    """What an autopilot believes of itself, from GLOBAL_POSITION_INT; velocity east, north, up [m/s]."""
+class EkfState(msgspec.Struct, frozen=True):
+    """State of the autopilot's EKF, from GLOBAL_POSITION_INT. ``boot_ms``: its time since boot."""
 
     boot_ms: int
     lat_deg: float
@@ -43,74 +43,79 @@ class Filter(msgspec.Struct, frozen=True):
 
 
 class LastFix(msgspec.Struct, frozen=True):
-    """Our last 3D fix in the frame of the map, with its 1-sigma, and the autopilot's filter at the same time."""
+    """Our last 3D fix in the frame of the map with its 1-sigma, and the autopilot's EKF at the same time."""
 
-    filter: Filter
+    filter: EkfState
     lat_deg: float
     lon_deg: float
     velocity_enu_mps: Vec3
     position_sigma_m: float
     velocity_sigma_mps: float
-    receivers: frozenset[str]  # besides us, that the autopilot has: the messages in which it tells of them
+    receivers: frozenset[str]  # the autopilot's other receivers, as names of their MAVLink messages
 
 
 class DeadReckoningRecorder:
-    """``take`` each message of the autopilot, ``sent`` each GPS_INPUT: Coasted comes out while there is no 3D fix.
+    """Stores the EKF state at our last fix, and publishes Coasted while there is no 3D fix.
 
-    ``last``: None while another receiver has a fix, too, or there was none of ours."""
+    ``last``: None while another receiver has a fix, or before our first fix."""
 
     def __init__(self, last: LastFix | None, measured_ns: Callable[[int, int], int]) -> None:
-        """``last``: of a link that this one is started in the place of. ``measured_ns``: see Telemetry."""
+        """``last``: from the checkpoint of the previous link process. ``measured_ns``: see ``Telemetry``."""
         self.last = last
         self._measured_ns = measured_ns
-        self._fixed = False
-        self._said: Filter | None = None
-        self._said_ns = 0
-        self._before: GpsInput | None = None
-        self._receivers: dict[str, tuple[int, bool]] = {}  # when heard, whether it has a fix
-        self._status: tuple[int, bool] | None = None  # when heard, whether the filter knows its velocity
-        self._asked, self._asked_ns = 0, 0
+        self._has_fix = False
+        self._ekf_state: EkfState | None = None
+        self._ekf_state_ns = 0
+        self._previous_gps: GpsInput | None = None
+        self._receivers: dict[str, tuple[int, bool]] = {}  # (time received, has a fix)
+        self._status: tuple[int, bool] | None = None  # (time received, EKF velocity is valid)
+        self._request_count, self._requested_ns = 0, 0
 
-    def take(self, message: Any, now_ns: int, our_receiver: int | None) -> Iterator[Coasted]:
-        """``our_receiver``: see Partner.take."""
+    def on_message(self, message: Any, now_ns: int, own_receiver: int | None) -> Iterator[Coasted]:
+        """Processes a message of the autopilot. ``own_receiver``: see ``AutopilotPeer.on_message``."""
         kind = message.get_type()
-        if kind in RECEIVERS and RECEIVERS[kind] != our_receiver:
+        if kind in RECEIVERS and RECEIVERS[kind] != own_receiver:
             self._receivers[kind] = (now_ns, message.fix_type >= FIX_2D)
         elif kind == "EKF_STATUS_REPORT":
-            self._status = (now_ns, bool(message.flags & MOVES) and not message.flags & WITHOUT)
+            self._status = (now_ns, bool(message.flags & VELOCITY_FLAG) and not message.flags & NO_POSITION_FLAGS)
         elif kind == "GLOBAL_POSITION_INT":
             velocity = (message.vy / 100.0, message.vx / 100.0, -message.vz / 100.0)
-            self._said = Filter(message.time_boot_ms, message.lat / 1e7, message.lon / 1e7, velocity)
-            self._said_ns = self._measured_ns(message.time_boot_ms * 1_000_000, now_ns)
+            self._ekf_state = EkfState(message.time_boot_ms, message.lat / 1e7, message.lon / 1e7, velocity)
+            self._ekf_state_ns = self._measured_ns(message.time_boot_ms * 1_000_000, now_ns)
             if any(has_fix for _, has_fix in self._receivers.values()):
                 self.last = None
-            elif self.last is not None and not self._fixed and self._knows(self.last, now_ns):
-                yield from _moved(self.last, self._said, self._said_ns)
+            elif self.last is not None and not self._has_fix and self._is_dead_reckoning(self.last, now_ns):
+                yield from _dead_reckoning_since(self.last, self._ekf_state, self._ekf_state_ns)
 
-    def sent(self, gps: GpsInput) -> None:
-        before, self._before = self._before, gps
-        self._fixed = gps.fix_type == FIX_3D
-        said = self._said
-        if said is None or before is None or not self._fixed or before.fix_type != FIX_3D:
+    def on_gps_input(self, gps: GpsInput) -> None:
+        """Processes each GPS_INPUT that is sent. Two successive 3D fixes around the time of the EKF state are
+        interpolated to that time and stored in ``last``."""
+        before, self._previous_gps = self._previous_gps, gps
+        self._has_fix = gps.fix_type == FIX_3D
+        ekf_state = self._ekf_state
+        if ekf_state is None or before is None or not self._has_fix or before.fix_type != FIX_3D:
             return
         span_ns = gps.t_ns - before.t_ns
-        if not before.t_ns <= self._said_ns <= gps.t_ns or not 0 < span_ns <= FIXES_APART_NS:
+        if not before.t_ns <= self._ekf_state_ns <= gps.t_ns or not 0 < span_ns <= MAX_FIX_INTERVAL_NS:
             return
         if any(has_fix for _, has_fix in self._receivers.values()):
             return
-        share = (self._said_ns - before.t_ns) / span_ns
-        values = [a + share * (b - a) for a, b in zip(_place(before), _place(gps), strict=True)]
+        share = (self._ekf_state_ns - before.t_ns) / span_ns
+        values = [
+            a + share * (b - a)
+            for a, b in zip(_position_and_velocity(before), _position_and_velocity(gps), strict=True)
+        ]
         lat_deg, lon_deg, *velocity = values
         accuracy = gps.horiz_accuracy_m, gps.speed_accuracy_mps
-        self.last = LastFix(said, lat_deg, lon_deg, _vec3(velocity), *accuracy, frozenset(self._receivers))
+        self.last = LastFix(ekf_state, lat_deg, lon_deg, _vec3(velocity), *accuracy, frozenset(self._receivers))
 
     def requests(self, sysid: int, compid: int, now_ns: int) -> Iterator[Any]:
-        """After a restart, for what the autopilot would say within a second."""
-        if self.last is None or self._fixed or self._asked == ASK_TIMES:
+        """-> after a restart: requests for messages that the autopilot would otherwise send within a second."""
+        if self.last is None or self._has_fix or self._request_count == MAX_REQUESTS:
             return
-        if self._knows(self.last, now_ns) or now_ns - self._asked_ns < ASK_NS:
+        if self._is_dead_reckoning(self.last, now_ns) or now_ns - self._requested_ns < REQUEST_PERIOD_NS:
             return
-        self._asked, self._asked_ns = self._asked + 1, now_ns
+        self._request_count, self._requested_ns = self._request_count + 1, now_ns
         for message_id in (
             mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
@@ -119,23 +124,29 @@ class DeadReckoningRecorder:
             command = mavlink.MAV_CMD_REQUEST_MESSAGE
             yield mavlink.MAVLink_command_long_message(sysid, compid, command, 0, message_id, *(0.0,) * 6)
 
-    def _knows(self, last: LastFix, now_ns: int) -> bool:
-        """Nothing but inertial sensors and airspeed has moved the filter, and it still knows its velocity."""
-        heard = {kind for kind, (heard_ns, _) in self._receivers.items() if now_ns - heard_ns < RECEIVER_FRESH_NS}
-        if self._status is None or not last.receivers <= heard:
+    def _is_dead_reckoning(self, last: LastFix, now_ns: int) -> bool:
+        """True if the EKF has no position source besides us and its velocity is valid: all receivers that were known
+        at the last fix were received recently (``on_message`` has checked that they have no fix)."""
+        receivers = {
+            kind for kind, (received_ns, _) in self._receivers.items() if now_ns - received_ns < RECEIVER_TIMEOUT_NS
+        }
+        if self._status is None or not last.receivers <= receivers:
             return False
-        heard_ns, moves = self._status
-        return moves and now_ns - heard_ns < STATUS_FRESH_NS
+        received_ns, velocity_valid = self._status
+        return velocity_valid and now_ns - received_ns < STATUS_TIMEOUT_NS
 
 
-def _moved(last: LastFix, said: Filter, t_ns: int) -> Iterator[Coasted]:
+def _dead_reckoning_since(last: LastFix, ekf_state: EkfState, t_ns: int) -> Iterator[Coasted]:
     before = last.filter
-    coast_ms = boot_step_ms(before.boot_ms, said.boot_ms)
-    if not 0 < coast_ms <= MAX_COAST_MS:
-        return  # another boot, or another flight
-    coast_s = coast_ms / 1e3
+    elapsed_ms = boot_step_ms(before.boot_ms, ekf_state.boot_ms)
+    if not 0 < elapsed_ms <= MAX_DEAD_RECKONING_MS:
+        return  # after a reboot, or in another flight
+    coast_s = elapsed_ms / 1e3
     north_m, east_m = metres_per_degree(before.lat_deg)
-    moved_m = (math.remainder(said.lon_deg - before.lon_deg, 360.0) * east_m, (said.lat_deg - before.lat_deg) * north_m)
+    moved_m = (
+        math.remainder(ekf_state.lon_deg - before.lon_deg, 360.0) * east_m,
+        (ekf_state.lat_deg - before.lat_deg) * north_m,
+    )
     yield Coasted(
         t_ns=t_ns,
         coast_s=coast_s,
@@ -145,12 +156,12 @@ def _moved(last: LastFix, said: Filter, t_ns: int) -> Iterator[Coasted]:
         position_sigma_m=last.position_sigma_m,
         velocity_sigma_mps=last.velocity_sigma_mps,
         way_m=(moved_m[0] - coast_s * before.velocity_enu_mps[0], moved_m[1] - coast_s * before.velocity_enu_mps[1]),
-        gain_mps=_vec3(np.subtract(said.velocity_enu_mps, before.velocity_enu_mps)),
+        gain_mps=_vec3(np.subtract(ekf_state.velocity_enu_mps, before.velocity_enu_mps)),
     )
 
 
-def _place(gps: GpsInput) -> tuple[float, ...]:
-    """On the map, as the estimator knows it, with the map's own error."""
+def _position_and_velocity(gps: GpsInput) -> tuple[float, ...]:
+    """-> latitude and longitude [deg] in the frame of the map (with the map offset), velocity ENU [m/s]."""
     return *offset(gps.lat_deg, gps.lon_deg, *gps.map_offset_m), gps.ve_mps, gps.vn_mps, -gps.vd_mps
 
 

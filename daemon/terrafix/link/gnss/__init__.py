@@ -1,1 +1,1 @@
-"""GNSS receivers: whether to trust them, and the map error that a trusted one shows."""
+"""GNSS receivers of the autopilot: spoofing detection, and the map offset that a trusted receiver shows."""

@@ -1,65 +1,69 @@
-"""Is a GNSS receiver to be believed? Its position against the vision estimate, both with what they claim.
+"""Spoofing detection for one GNSS receiver: its position against the vision estimate, each with its claimed accuracy.
 
-Two tests, each on runs of readings:
+Two tests, each over a run of readings:
 
-* the distance, beyond 5.5 sigma of what both claim, in three readings in a row: a sudden spoofer, within a second;
-* its change: where the receiver should be by how it was so far in this flight, and by our velocity
-  (offset_predictor.py), and is not, for a second: a slow drag-off.
+* distance: beyond 5.5 sigma of both claims in three readings in a row. It detects a sudden spoofing within a second;
+* change of the distance: improbable, for a second, under the prediction from the offsets of this flight and from our
+  velocity (offset_predictor.py). It detects a slow drag-off.
 
-Errors of both sides last for seconds to minutes (a map fix, the map itself, multipath). For such errors a cumulative
-sum of the distance (Page 1954) was measured and is worse: where it sees a drag-off as early, it has ten times the false
-alarms. What these tests reach is in docs/autopilot.md, "The GNSS judge"."""
+The errors of both sides are correlated over seconds to minutes (a map fix, the map itself, multipath). For such errors
+a cumulative sum of the distance (Page 1954) was measured and is worse: where it detects a drag-off as early, it has ten
+times the false alarms. The performance of these tests is in docs/autopilot.md, "The GNSS judge"."""
 
 import math
 from dataclasses import dataclass
 
-from terrafix.link.gnss.offset_predictor import LAG_S, OffsetForecast
-from terrafix.link.integrity.output_predictor import PredictedState, apart_m
+from terrafix.link.gnss.offset_predictor import HORIZON_S, OffsetPredictor
+from terrafix.link.integrity.output_predictor import PredictedState, east_north_m
 from terrafix.messages import GnssReading, GnssState
 
-FIX_3D = 3
-SILENT_NS = 1_500_000_000  # readings come five times a second
-USELESS_M = 25.0  # accuracy that a receiver claims of itself; jamming raises it before the fix goes
-LEAST_M = 1.5  # 1-sigma; receivers claim less in the open, their slow error is not in it (u-blox M8: 2.5 m CEP)
-UNKNOWN_M = 5.0  # of a receiver that claims nothing
-DELAY_S, DELAY_SIGMA_S = 0.15, 0.1  # age of a reading on arrival: receiver, autopilot, stream
-VISION_OLD_S = 2.0  # an estimate that is older says nothing about a receiver
-VISION_VAGUE_M = 50.0
-JUMP_SIGMAS, JUMP_READINGS = 5.5, 3
-DRAG_CHANCE = 2e-4  # of being so far from the forecast, while nothing happens: one false alarm in 100 h is allowed ...
-DRAG_S, DRAG_READINGS = 0.8, 3  # ... for so long: the fifth reading at 5 Hz
-READING_MAX_S = 1.0  # a reading counts for the time since the last one, not for a gap
-AGREE_SIGMAS, AGREE_CHANCE = 3.0, 1e-3
-AGREE_VAGUE_M = 20.0  # 1-sigma of the distance: agreement within more proves nothing
-FIRST_TRUST_S, AFTER_LOSS_S, AFTER_SPOOFING_S = 10.0, 30.0, 60.0  # of agreement without a break
-DISPUTE_SHARE = 0.5  # a step of our own this large against the distance: it may be we who are wrong
+FIX_3D = 3  # [spec: MAVLink GPS_FIX_TYPE]
+READING_TIMEOUT_NS = 1_500_000_000  # ns; readings arrive five times a second [tuned]
+MAX_RECEIVER_SIGMA_M = 25.0  # m, claimed by the receiver; jamming raises it before the fix is lost [tuned]
+# m, 1-sigma. Receivers claim less under open sky, without their slowly varying error (u-blox M8: 2.5 m CEP). [tuned]
+MIN_RECEIVER_SIGMA_M = 1.5
+DEFAULT_RECEIVER_SIGMA_M = 5.0  # m, 1-sigma of a receiver without a claim [tuned]
+READING_DELAY_S, READING_DELAY_SIGMA_S = 0.15, 0.1  # s; age on arrival: receiver, autopilot, stream [tuned]
+MAX_VISION_AGE_S = 2.0  # s; an older estimate is not compared [tuned]
+MAX_VISION_SIGMA_M = 50.0  # m; an estimate with a larger 1-sigma is not compared [tuned]
+JUMP_GATE_SIGMAS, JUMP_READINGS = 5.5, 3  # chosen in 5000 h with 5 alarms [measured: docs/autopilot.md]
+# Drag-off test: p-value below which a reading counts, and how long that must last (the fifth reading at 5 Hz). One
+# false alarm in 100 h is allowed; measured was one in 770 h. [measured: docs/autopilot.md]
+DRAG_P_VALUE = 2e-4
+DRAG_MIN_S, DRAG_MIN_READINGS = 0.8, 3  # s, readings in a row [measured: docs/autopilot.md]
+MAX_READING_INTERVAL_S = 1.0  # s; a reading counts for the time since the last one, up to this [tuned]
+AGREEMENT_SIGMAS, AGREEMENT_P_VALUE = 3.0, 1e-3  # within these a reading agrees with the estimate [tuned]
+AGREEMENT_MAX_SIGMA_M = 20.0  # m, 1-sigma of the distance; with a larger one agreement has no weight [tuned]
+# s of agreement without a break before a receiver is trusted. [tuned]
+TRUST_AFTER_START_S, TRUST_AFTER_LOSS_S, TRUST_AFTER_SPOOFING_S = 10.0, 30.0, 60.0
+DISPUTE_STEP_SHARE = 0.5  # step of our estimate over the distance, above which our estimate may be wrong [tuned]
 
 
 @dataclass(frozen=True)
-class Opinion:
-    """What is thought of a receiver now."""
+class Assessment:
+    """Result for a receiver at present."""
 
     state: GnssState
     distance_m: float | None = None  # from the vision estimate
-    sigmas: float | None = None  # the same in standard deviations, when both are honest
+    sigmas: float | None = None  # the distance in claimed standard deviations
     reason: str = ""
 
 
 @dataclass(frozen=True)
-class Offset:
-    """Of a receiver from the estimate."""
+class ReceiverOffset:
+    """Offset of a receiver from the estimate."""
 
-    metres: complex  # east + j north
-    sigma_m: float  # 1-sigma per axis that both claim, across the track
-    along_sigma_m: float  # and along it, where the age of the reading adds, which is not known
-    sigmas: float  # the distance in standard deviations
-    slip_m: complex  # how much further the receiver has moved since its last reading than our velocity says
-    slip_sigma_m: float  # 1-sigma per axis of all slip in LAG_S
+    offset_m: complex  # east + j north
+    sigma_m: float  # claimed 1-sigma per axis of both sides, across the track
+    along_sigma_m: float  # along the track, with the term of the unknown age of the reading
+    sigmas: float  # length of the offset in standard deviations
+    drift_m: complex  # displacement of the receiver since its last reading minus the integral of our velocity
+    drift_sigma_m: float  # 1-sigma per axis of the drift over HORIZON_S
 
 
 @dataclass(frozen=True)
-class _Last:
-    """A reading that was compared: when and where it came, and our velocity (east + j north)."""
+class _ComparedReading:
+    """A reading that was compared, with our velocity (east + j north)."""
 
     t_ns: int
     lat_deg: float
@@ -67,123 +71,127 @@ class _Last:
     velocity_mps: complex
 
 
-class Run:
-    """Readings in a row of which something is true."""
+class ReadingRun:
+    """Readings in a row for which a condition holds. ``seconds``: from the first to the last of them."""
 
     def __init__(self) -> None:
         self.count = 0
-        self.seconds = 0.0  # from the first to the last of them
+        self.seconds = 0.0
 
-    def take(self, is_so: bool, dt_s: float) -> None:
-        self.seconds = self.seconds + dt_s if is_so and self.count else 0.0
-        self.count = self.count + 1 if is_so else 0
+    def update(self, holds: bool, dt_s: float) -> None:
+        self.seconds = self.seconds + dt_s if holds and self.count else 0.0
+        self.count = self.count + 1 if holds else 0
 
 
 class SpoofingDetector:
-    """One receiver. ``take`` each reading, ``look`` in between for its silence."""
+    """Detector for one receiver. ``update`` with each reading, ``check_timeout`` between readings."""
 
     def __init__(self) -> None:
-        self.opinion = Opinion(GnssState.UNKNOWN)
-        self._heard_ns: int | None = None
-        self._jumped = Run()
-        self._dragged = Run()
-        self._forecast = OffsetForecast()
-        self._last: _Last | None = None
-        self._agreed_s = 0.0
-        self._trust_after_s = FIRST_TRUST_S
+        self.assessment = Assessment(GnssState.UNKNOWN)
+        self._reading_t_ns: int | None = None
+        self._jump_run = ReadingRun()
+        self._drag_run = ReadingRun()
+        self._predictor = OffsetPredictor()
+        self._last: _ComparedReading | None = None
+        self._agreement_s = 0.0
+        self._trust_after_s = TRUST_AFTER_START_S
 
-    def take(self, reading: GnssReading, vision: PredictedState | None, own_step_m: float) -> Opinion:
-        """``vision``: the estimate at the time of the reading; None: none that counts. ``own_step_m``: the largest step
-        that our own estimate has made lately."""
-        since_ns = reading.t_ns if self._heard_ns is None else self._heard_ns
-        dt_s = min(READING_MAX_S, max(0.0, (reading.t_ns - since_ns) * 1e-9))
-        self._heard_ns = reading.t_ns
-        lost = _why_lost(reading)
-        if lost:
-            return self._lose(lost)
+    def update(self, reading: GnssReading, vision: PredictedState | None, own_step_m: float) -> Assessment:
+        """``vision``: the estimate at the time of the reading, None when there is none to compare with. ``own_step_m``:
+        the largest recent step of our own estimate."""
+        since_ns = reading.t_ns if self._reading_t_ns is None else self._reading_t_ns
+        dt_s = min(MAX_READING_INTERVAL_S, max(0.0, (reading.t_ns - since_ns) * 1e-9))
+        self._reading_t_ns = reading.t_ns
+        loss = _loss_reason(reading)
+        if loss:
+            return self._mark_lost(loss)
         if vision is None or reading.lat_deg is None or reading.lon_deg is None:
-            self._forecast.pause()
+            self._predictor.clear_pending()
             self._last = None
-            return self._keep()
+            return self._without_comparison()
         velocity_mps = complex(*vision.velocity_enu_mps[:2])
-        here = _Last(reading.t_ns, reading.lat_deg, reading.lon_deg, velocity_mps)
-        offset = _offset(here, reading.horizontal_m, vision, self._last)
+        here = _ComparedReading(reading.t_ns, reading.lat_deg, reading.lon_deg, velocity_mps)
+        offset = _receiver_offset(here, reading.horizontal_m, vision, self._last)
         self._last = here
         return self._compare(offset, dt_s, own_step_m)
 
-    def look(self, now_ns: int) -> Opinion:
-        if self._heard_ns is not None and now_ns - self._heard_ns > SILENT_NS:
-            return self._lose("silent")
-        return self.opinion
+    def check_timeout(self, now_ns: int) -> Assessment:
+        if self._reading_t_ns is not None and now_ns - self._reading_t_ns > READING_TIMEOUT_NS:
+            return self._mark_lost("silent")
+        return self.assessment
 
-    def _compare(self, offset: Offset, dt_s: float, own_step_m: float) -> Opinion:
-        bad = self.opinion.state in (GnssState.SPOOFED, GnssState.DISPUTED)
-        claimed = offset.along_sigma_m, offset.slip_m, offset.slip_sigma_m
-        chance, off_m = self._forecast.take(offset.metres, *claimed, dt_s, learn=not bad)
-        if off_m is not None and not bad and own_step_m > DISPUTE_SHARE * off_m and chance < AGREE_CHANCE:
-            self._forecast, chance = OffsetForecast(), 1.0  # it was we who moved: what is usual has to be learnt anew
-        away_m = abs(offset.metres)
-        self._jumped.take(offset.sigmas > JUMP_SIGMAS, dt_s)
-        self._dragged.take(chance < DRAG_CHANCE, dt_s)
-        if offset.sigmas >= AGREE_SIGMAS or chance < AGREE_CHANCE:
-            self._agreed_s = 0.0
-        elif offset.sigma_m < AGREE_VAGUE_M:
-            self._agreed_s += dt_s
-        state, reason = self._keep().state, self.opinion.reason
-        dragged = self._dragged.count >= DRAG_READINGS and self._dragged.seconds >= DRAG_S
-        if self._jumped.count >= JUMP_READINGS or dragged:
-            mine = state is not GnssState.SPOOFED and own_step_m > DISPUTE_SHARE * away_m
-            state = GnssState.DISPUTED if mine else GnssState.SPOOFED
-            reason = f"{away_m:.0f} m away, {offset.sigmas:.1f} sigma"
-            if dragged and off_m is not None:
-                reason += f", {off_m:.0f} m from where it should be"
-            self._forecast.pause()
-            self._trust_after_s = AFTER_SPOOFING_S
-        elif state is not GnssState.TRUSTED and self._agreed_s >= self._trust_after_s:
+    def _compare(self, offset: ReceiverOffset, dt_s: float, own_step_m: float) -> Assessment:
+        distrusted = self.assessment.state in (GnssState.SPOOFED, GnssState.DISPUTED)
+        claims = offset.along_sigma_m, offset.drift_m, offset.drift_sigma_m
+        p_value, error_m = self._predictor.update(offset.offset_m, *claims, dt_s, learn=not distrusted)
+        own_step = error_m is not None and not distrusted and own_step_m > DISPUTE_STEP_SHARE * error_m
+        if own_step and p_value < AGREEMENT_P_VALUE:
+            self._predictor, p_value = OffsetPredictor(), 1.0  # our estimate moved: the statistics restart
+        distance_m = abs(offset.offset_m)
+        self._jump_run.update(offset.sigmas > JUMP_GATE_SIGMAS, dt_s)
+        self._drag_run.update(p_value < DRAG_P_VALUE, dt_s)
+        if offset.sigmas >= AGREEMENT_SIGMAS or p_value < AGREEMENT_P_VALUE:
+            self._agreement_s = 0.0
+        elif offset.sigma_m < AGREEMENT_MAX_SIGMA_M:
+            self._agreement_s += dt_s
+        state, reason = self._without_comparison().state, self.assessment.reason
+        dragged = self._drag_run.count >= DRAG_MIN_READINGS and self._drag_run.seconds >= DRAG_MIN_S
+        if self._jump_run.count >= JUMP_READINGS or dragged:
+            disputed = state is not GnssState.SPOOFED and own_step_m > DISPUTE_STEP_SHARE * distance_m
+            state = GnssState.DISPUTED if disputed else GnssState.SPOOFED
+            reason = f"{distance_m:.0f} m away, {offset.sigmas:.1f} sigma"
+            if dragged and error_m is not None:
+                reason += f", {error_m:.0f} m from where it should be"
+            self._predictor.clear_pending()
+            self._trust_after_s = TRUST_AFTER_SPOOFING_S
+        elif state is not GnssState.TRUSTED and self._agreement_s >= self._trust_after_s:
             state, reason = GnssState.TRUSTED, ""
-        self.opinion = Opinion(state, away_m, offset.sigmas, reason)
-        return self.opinion
+        self.assessment = Assessment(state, distance_m, offset.sigmas, reason)
+        return self.assessment
 
-    def _lose(self, reason: str) -> Opinion:
-        """A receiver that was spoofed and goes silent stays spoofed: it has to earn its way back all the same."""
-        self._jumped, self._dragged, self._agreed_s = Run(), Run(), 0.0
-        self._forecast.pause()
+    def _mark_lost(self, reason: str) -> Assessment:
+        """The reading is unusable or missing. A spoofed receiver stays spoofed: it still needs the long agreement."""
+        self._jump_run, self._drag_run, self._agreement_s = ReadingRun(), ReadingRun(), 0.0
+        self._predictor.clear_pending()
         self._last = None
-        if self.opinion.state is not GnssState.SPOOFED:
-            if self.opinion.state is GnssState.TRUSTED:
-                self._trust_after_s = max(self._trust_after_s, AFTER_LOSS_S)
-            self.opinion = Opinion(GnssState.LOST, reason=reason)
-        return self.opinion
+        if self.assessment.state is not GnssState.SPOOFED:
+            if self.assessment.state is GnssState.TRUSTED:
+                self._trust_after_s = max(self._trust_after_s, TRUST_AFTER_LOSS_S)
+            self.assessment = Assessment(GnssState.LOST, reason=reason)
+        return self.assessment
 
-    def _keep(self) -> Opinion:
-        """Nothing to compare with: what was thought stays, and what was lost is there again, unproved."""
-        if self.opinion.state is GnssState.LOST:
-            self.opinion = Opinion(GnssState.UNKNOWN)
-        return self.opinion
+    def _without_comparison(self) -> Assessment:
+        """A usable reading without a comparison: LOST becomes UNKNOWN, every other state remains."""
+        if self.assessment.state is GnssState.LOST:
+            self.assessment = Assessment(GnssState.UNKNOWN)
+        return self.assessment
 
 
-def _why_lost(reading: GnssReading) -> str:
+def _loss_reason(reading: GnssReading) -> str:
+    """Why the receiver counts as lost; empty when it does not."""
     if reading.fix_type < FIX_3D:
         return "no 3D fix"
-    if reading.horizontal_m is not None and reading.horizontal_m > USELESS_M:
+    if reading.horizontal_m is not None and reading.horizontal_m > MAX_RECEIVER_SIGMA_M:
         return f"says itself that it is only good to {reading.horizontal_m:.0f} m"
     return ""
 
 
-def _offset(here: _Last, claimed_m: float | None, vision: PredictedState, last: _Last | None) -> Offset:
-    """``claimed_m``: 1-sigma of the receiver, by its own word. ``last``: the reading before."""
-    metres = complex(*apart_m((vision.lat_deg, vision.lon_deg), (here.lat_deg, here.lon_deg)))
-    receiver_m = UNKNOWN_M if claimed_m is None else max(LEAST_M, claimed_m)
+def _receiver_offset(
+    here: _ComparedReading, claimed_m: float | None, vision: PredictedState, last: _ComparedReading | None
+) -> ReceiverOffset:
+    """``claimed_m``: 1-sigma claimed by the receiver. ``last``: the reading before ``here``."""
+    offset_m = complex(*east_north_m((vision.lat_deg, vision.lon_deg), (here.lat_deg, here.lon_deg)))
+    receiver_m = DEFAULT_RECEIVER_SIGMA_M if claimed_m is None else max(MIN_RECEIVER_SIGMA_M, claimed_m)
     sigma_m = math.hypot(vision.horizontal_sigma_m, receiver_m)
     speed_mps = abs(here.velocity_mps)
-    along_m = (metres * here.velocity_mps.conjugate()).real / speed_mps if speed_mps > 0.0 else 0.0
-    across_m2 = max(0.0, abs(metres) ** 2 - along_m**2)
-    along_sigma_m = math.hypot(sigma_m, DELAY_SIGMA_S * speed_mps)
+    along_m = (offset_m * here.velocity_mps.conjugate()).real / speed_mps if speed_mps > 0.0 else 0.0
+    across_m2 = max(0.0, abs(offset_m) ** 2 - along_m**2)
+    along_sigma_m = math.hypot(sigma_m, READING_DELAY_SIGMA_S * speed_mps)
     sigmas = math.sqrt((along_m / along_sigma_m) ** 2 + across_m2 / sigma_m**2)
-    slip_m = 0j
+    drift_m = 0j
     if last is not None:
-        way_m = 0.5 * (last.velocity_mps + here.velocity_mps) * ((here.t_ns - last.t_ns) * 1e-9)
-        slip_m = complex(*apart_m((last.lat_deg, last.lon_deg), (here.lat_deg, here.lon_deg))) - way_m
-    at_its_ends_m = math.sqrt(2.0) * math.hypot(receiver_m, DELAY_SIGMA_S * speed_mps)
-    slip_sigma_m = math.hypot(LAG_S * vision.speed_sigma_mps, at_its_ends_m)
-    return Offset(metres, sigma_m, along_sigma_m, sigmas, slip_m, slip_sigma_m)
+        own_m = 0.5 * (last.velocity_mps + here.velocity_mps) * ((here.t_ns - last.t_ns) * 1e-9)
+        drift_m = complex(*east_north_m((last.lat_deg, last.lon_deg), (here.lat_deg, here.lon_deg))) - own_m
+    endpoints_sigma_m = math.sqrt(2.0) * math.hypot(receiver_m, READING_DELAY_SIGMA_S * speed_mps)
+    drift_sigma_m = math.hypot(HORIZON_S * vision.speed_sigma_mps, endpoints_sigma_m)
+    return ReceiverOffset(offset_m, sigma_m, along_sigma_m, sigmas, drift_m, drift_sigma_m)

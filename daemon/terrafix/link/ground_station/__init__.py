@@ -1,1 +1,1 @@
-"""Ground stations."""
+"""Own links to ground stations, the ghost vehicle, and position hints from operators."""

@@ -1,47 +1,50 @@
-"""When the operator is asked for a coarse position (AC-6), and in which words."""
+"""Decides when the operator is asked for a coarse position (AC-6), and with which text."""
 
+from terrafix.core.clock import NS_PER_S
 from terrafix.link.integrity.output_predictor import worst_horizontal_variance
 from terrafix.messages import NavEstimate, SearchStep
 
-NS_PER_S = 1_000_000_000
-FRAMES, AFTER_NS = 3, 2 * NS_PER_S  # AC-6: so many frames and so long without a place
-# 1-sigma: a place that is known worse is searched on the map (SEARCHED_START_M of core/initial_position.py, which loads
-# more than this process may), and only then does a hint say anything.
-NOT_KNOWN_M = 100.0
-AGAIN_NS = 30 * NS_PER_S  # a pilot who reads it every few seconds stops reading
-FRESH_NS = 10 * NS_PER_S  # who has not said anything for so long is not lost: something else is wrong, and is said
-HINTED_NS = 60 * NS_PER_S  # after a hint the search has its time
+# Frames in a row and time without a known position before the first request. [spec: requirement AC-6]
+MIN_FRAMES, MIN_DURATION_NS = 3, 2 * NS_PER_S
+# m, 1-sigma. A position with a larger one is searched on the map, and only a search can use a hint. Equal to
+# SEARCH_START_SIGMA_M of core/initial_position.py, which imports more than this process may load. [tuned]
+UNKNOWN_POSITION_SIGMA_M = 100.0
+REPEAT_NS = 30 * NS_PER_S  # ns between requests; a pilot ignores a text that comes every few seconds [tuned]
+# ns; without an estimate for so long the cause is another fault, which has its own text. [tuned]
+MAX_ESTIMATE_AGE_NS = 10 * NS_PER_S
+HOLD_OFF_NS = 60 * NS_PER_S  # ns without requests after a hint: time for the search [tuned]
 
 
 class PriorRequest:
-    """``estimate`` each one that is heard, ``due`` at every send."""
+    """``on_estimate`` for each estimate, ``on_hint`` for each accepted hint, ``due`` at every transmission.
+    ``search_step``: step of the search as the anchor published it last."""
 
     def __init__(self) -> None:
-        self._frames = 0  # in a row whose place was not known
+        self._frames = 0  # frames in a row without a known position
         self._frame_id: int | None = None
         self._since_ns: int | None = None
-        self._heard_ns = 0
+        self._estimate_t_ns = 0
         self._next_ns = 0
-        self.step = SearchStep.NORMAL  # of the search, as the anchor says it
+        self.search_step = SearchStep.NORMAL
 
-    def estimate(self, estimate: NavEstimate) -> None:
-        known = worst_horizontal_variance(estimate.cov) <= NOT_KNOWN_M**2
+    def on_estimate(self, estimate: NavEstimate) -> None:
+        known = worst_horizontal_variance(estimate.cov) <= UNKNOWN_POSITION_SIGMA_M**2
         if known:
             self._frames, self._since_ns = 0, None
         elif estimate.frame_id != self._frame_id:
             self._frames += 1
             self._since_ns = estimate.t_ns if self._since_ns is None else self._since_ns
-        self._frame_id, self._heard_ns = estimate.frame_id, estimate.t_ns
+        self._frame_id, self._estimate_t_ns = estimate.frame_id, estimate.t_ns
 
-    def hinted(self, now_ns: int) -> None:
-        """The operator has answered."""
-        self._next_ns = max(self._next_ns, now_ns + HINTED_NS)
+    def on_hint(self, now_ns: int) -> None:
+        """The operator has sent a hint."""
+        self._next_ns = max(self._next_ns, now_ns + HOLD_OFF_NS)
 
     def due(self, now_ns: int) -> str:
-        """What to ask now; empty: nothing."""
-        if self._since_ns is None or self._frames < FRAMES or now_ns - self._since_ns < AFTER_NS:
+        """-> the text of the request to send now; empty when there is none."""
+        if self._since_ns is None or self._frames < MIN_FRAMES or now_ns - self._since_ns < MIN_DURATION_NS:
             return ""
-        if now_ns < self._next_ns or now_ns - self._heard_ns > FRESH_NS:
+        if now_ns < self._next_ns or now_ns - self._estimate_t_ns > MAX_ESTIMATE_AGE_NS:
             return ""
-        self._next_ns = now_ns + AGAIN_NS
-        return "whole map searched, send a hint" if self.step is SearchStep.ASK else "lost, send a position hint"
+        self._next_ns = now_ns + REPEAT_NS
+        return "whole map searched, send a hint" if self.search_step is SearchStep.ASK else "lost, send a position hint"

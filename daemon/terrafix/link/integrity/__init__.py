@@ -1,1 +1,1 @@
-"""Which estimate is sent, as which fix, and carried to when."""
+"""Gate for estimates, fix type with accuracies, and prediction of the estimate to the time of sending."""

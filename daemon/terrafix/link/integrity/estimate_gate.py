@@ -1,108 +1,115 @@
-"""Which estimates the link believes: plausibility, order, freshness, and no jump that was not announced (ON-6, AC-3).
+"""Gate for the estimates that the link sends: plausibility, order, freshness and confirmation of jumps (ON-6, AC-3).
 
-A persistent wrong position always wins in the autopilot: what its filter rejects for 10 s becomes a hard reset onto
-our value. So a jump is stopped here: the fix is lowered at once and the new place must prove itself."""
+The autopilot's filter rejects an inconsistent position for 10 s and then resets onto it. A wrong position that persists
+is therefore accepted there in the end. So a jump must be stopped here: the fix is lowered at once, and the new position
+is accepted after further estimates have confirmed it."""
 
 import math
 from dataclasses import dataclass
 
-from terrafix.link.integrity.output_predictor import Attitudes, distance_m, predict_to
+from terrafix.link.integrity.output_predictor import EE, NN, UU, InertialBuffer, distance_m, predict_to
 from terrafix.messages import NavEstimate, Verdict
 
-FUTURE_NS = 50_000_000  # an estimate of the future beyond clock reading jitter is a bug elsewhere
-MAX_LATE_NS = 5_000_000_000  # older than this on arrival it cannot be carried to now by anybody
-MAX_SPEED_MPS = 100.0  # no vehicle this is for flies faster over ground
-MAX_CLIMB_MPS = 30.0
-MIN_AMSL_M, MAX_AMSL_M = -500.0, 10_000.0  # Dead Sea shore to beyond any small vehicle's ceiling
-MAX_ABOVE_GROUND_M = 5_000.0
-MAX_BELOW_GROUND_M = 300.0  # terrain falls away from the origin
-JUMP_SIGMAS = 5.0  # the autopilot's own gate is 5 sigma (EK3_POS_I_GATE 500)
-JUMP_FLOOR_M = 10.0  # steps of this size are the autopilot's to average
-BIG_STEP_M = 200.0  # ON-6: no bigger step is promoted on one estimate's word, whatever it claims
+# Jitter of clock readings between two processes. An estimate further in the future is a bug of its sender. [tuned]
+MAX_FUTURE_NS = 50_000_000
+MAX_DELAY_NS = 5_000_000_000  # on arrival, ns; too old to be predicted to the present by any means [tuned]
+MAX_SPEED_MPS = 100.0  # ground speed; above that of all vehicles that this is made for [tuned]
+MAX_CLIMB_MPS = 30.0  # m/s, climb or descent; same reason [tuned]
+MIN_AMSL_M, MAX_AMSL_M = -500.0, 10_000.0  # shore of the Dead Sea; above the ceiling of small vehicles [tuned]
+MAX_ABOVE_GROUND_M = 5_000.0  # m above the ground at the origin [tuned]
+MAX_BELOW_GROUND_M = 300.0  # m below the ground at the origin: terrain may descend from there [tuned]
+JUMP_GATE_SIGMAS = 5.0  # as the autopilot's own position gate [spec: ArduPilot EK3_POS_I_GATE 500, hundredths of sigma]
+JUMP_GATE_MIN_M = 10.0  # m; the autopilot's filter averages smaller steps [tuned]
+LARGE_JUMP_M = 200.0  # m; a larger jump needs confirmation whatever accuracy is claimed (ON-6) [tuned]
 
 
 @dataclass(frozen=True)
 class JumpConfirmation:
-    """What a new place must show: so many estimates in a row that agree with each other, over so long."""
+    """Requirement on a new position: this many estimates in a row, consistent with each other, over this duration."""
 
     estimates: int
-    seconds: float
+    duration_s: float
 
 
-# Both end well before a copter without position gives up (measured: 7 s to "EKF variance", LAND at 7.8 s).
-PROOF_OF_STEP = JumpConfirmation(3, 1.0)
-PROOF_OF_BIG_STEP = JumpConfirmation(5, 3.0)
+# Both are shorter than the time after which a copter without position starts its failsafe: 7 s to "EKF variance" and
+# 7.8 s to LAND, measured on ArduPilot's firmware. [tuned]
+JUMP_CONFIRMATION = JumpConfirmation(3, 1.0)
+LARGE_JUMP_CONFIRMATION = JumpConfirmation(5, 3.0)  # the same bound [tuned]
 
 
 class EstimateGate:
-    """``accepted`` is the newest believed estimate; ``holding`` names the jump that is being proved, or is empty.
-    ``steps``: how many jumps were accepted."""
+    """``accepted``: the newest accepted estimate, or None. ``pending_jump``: text about the jump that waits for
+    confirmation, or empty. ``jumps_accepted``: number of jumps that were confirmed."""
 
     def __init__(self) -> None:
         self.accepted: NavEstimate | None = None
-        self.holding = ""
-        self.steps = 0
+        self.pending_jump = ""
+        self.jumps_accepted = 0
         self._candidate: NavEstimate | None = None
         self._candidate_since_ns = 0
-        self._candidates = 0
-        self._needed = PROOF_OF_STEP
+        self._candidate_count = 0
+        self._required = JUMP_CONFIRMATION
 
-    def consider(
-        self, estimate: NavEstimate, now_ns: int, attitudes: Attitudes, ground_amsl_m: float | None
+    def evaluate(
+        self, estimate: NavEstimate, now_ns: int, inertial: InertialBuffer, ground_amsl_m: float | None
     ) -> tuple[Verdict, str]:
-        """-> (verdict, detail). ACCEPTED makes it ``accepted``."""
-        problem = _implausible(estimate, ground_amsl_m)
+        """-> (verdict, detail). With ACCEPTED ``estimate`` becomes ``accepted``. ``ground_amsl_m``: height of the
+        ground at the origin, None when unknown."""
+        problem = _why_implausible(estimate, ground_amsl_m)
         if problem:
             return Verdict.IMPLAUSIBLE, problem
-        if estimate.t_ns > now_ns + FUTURE_NS:
+        if estimate.t_ns > now_ns + MAX_FUTURE_NS:
             return Verdict.IMPLAUSIBLE, f"from the future by {(estimate.t_ns - now_ns) / 1e6:.0f} ms"
-        if now_ns - estimate.t_ns > MAX_LATE_NS:
+        if now_ns - estimate.t_ns > MAX_DELAY_NS:
             return Verdict.STALE, f"{(now_ns - estimate.t_ns) / 1e9:.1f} s old on arrival"
         newest = self._candidate or self.accepted
         if newest is not None and estimate.t_ns < newest.t_ns:
             return Verdict.STALE, "older than one already heard"
         if self.accepted is None:
             return self._accept(estimate)
-        step_m, allowed_m = _step(self.accepted, estimate, attitudes)
-        if step_m <= min(allowed_m, BIG_STEP_M):
+        jump_m, gate_m = _jump_and_gate(self.accepted, estimate, inertial)
+        if jump_m <= min(gate_m, LARGE_JUMP_M):
             return self._accept(estimate)
-        return self._hold(estimate, step_m, attitudes)
+        return self._confirm_jump(estimate, jump_m, inertial)
 
     def _accept(self, estimate: NavEstimate, detail: str = "") -> tuple[Verdict, str]:
-        self.accepted, self._candidate, self._candidates, self.holding = estimate, None, 0, ""
+        self.accepted, self._candidate, self._candidate_count, self.pending_jump = estimate, None, 0, ""
         return Verdict.ACCEPTED, detail
 
-    def _hold(self, estimate: NavEstimate, step_m: float, attitudes: Attitudes) -> tuple[Verdict, str]:
-        agrees = False
+    def _confirm_jump(self, estimate: NavEstimate, jump_m: float, inertial: InertialBuffer) -> tuple[Verdict, str]:
+        """Counts estimates that are consistent with the candidate; accepts the newest when there are enough."""
+        consistent = False
         if self._candidate is not None:
-            between_m, allowed_m = _step(self._candidate, estimate, attitudes)
-            agrees = between_m <= min(allowed_m, BIG_STEP_M)
-        if agrees:
-            self._candidates += 1
+            between_m, gate_m = _jump_and_gate(self._candidate, estimate, inertial)
+            consistent = between_m <= min(gate_m, LARGE_JUMP_M)
+        if consistent:
+            self._candidate_count += 1
         else:
-            self._candidates, self._candidate_since_ns = 1, estimate.t_ns
-            self._needed = PROOF_OF_STEP
+            self._candidate_count, self._candidate_since_ns = 1, estimate.t_ns
+            self._required = JUMP_CONFIRMATION
         self._candidate = estimate
-        if step_m > BIG_STEP_M:
-            self._needed = PROOF_OF_BIG_STEP
-        held_s = (estimate.t_ns - self._candidate_since_ns) * 1e-9
-        if self._candidates >= self._needed.estimates and held_s >= self._needed.seconds:
-            self.steps += 1
-            return self._accept(estimate, f"step of {step_m:.0f} m after {self._candidates} estimates that agree")
-        self.holding = f"step of {step_m:.0f} m, {self._candidates} of {self._needed.estimates} estimates agree"
-        return Verdict.IMPLAUSIBLE, self.holding
+        if jump_m > LARGE_JUMP_M:
+            self._required = LARGE_JUMP_CONFIRMATION
+        duration_s = (estimate.t_ns - self._candidate_since_ns) * 1e-9
+        if self._candidate_count >= self._required.estimates and duration_s >= self._required.duration_s:
+            self.jumps_accepted += 1
+            return self._accept(estimate, f"step of {jump_m:.0f} m after {self._candidate_count} estimates that agree")
+        self.pending_jump = (
+            f"step of {jump_m:.0f} m, {self._candidate_count} of {self._required.estimates} estimates agree"
+        )
+        return Verdict.IMPLAUSIBLE, self.pending_jump
 
 
-def _step(old: NavEstimate, new: NavEstimate, attitudes: Attitudes) -> tuple[float, float]:
-    """-> (distance between ``new`` and ``old`` carried to its time, distance that both claims allow)."""
-    carried, fresh = predict_to(old, new.t_ns, attitudes), predict_to(new, new.t_ns, attitudes)
-    step_m = distance_m(carried.lat_deg, carried.lon_deg, new.lat_deg, new.lon_deg)
-    allowed_m = JUMP_SIGMAS * math.hypot(carried.horizontal_sigma_m, fresh.horizontal_sigma_m)
-    return step_m, max(JUMP_FLOOR_M, allowed_m)
+def _jump_and_gate(old: NavEstimate, new: NavEstimate, inertial: InertialBuffer) -> tuple[float, float]:
+    """-> (distance of ``new`` from ``old`` predicted to the time of ``new`` [m]; gate for it from both claims [m])."""
+    predicted, fresh = predict_to(old, new.t_ns, inertial), predict_to(new, new.t_ns, inertial)
+    jump_m = distance_m(predicted.lat_deg, predicted.lon_deg, new.lat_deg, new.lon_deg)
+    gate_m = JUMP_GATE_SIGMAS * math.hypot(predicted.horizontal_sigma_m, fresh.horizontal_sigma_m)
+    return jump_m, max(JUMP_GATE_MIN_M, gate_m)
 
 
-def _implausible(estimate: NavEstimate, ground_amsl_m: float | None) -> str:
-    """Why this cannot be a vehicle's state; empty when it can."""
+def _why_implausible(estimate: NavEstimate, ground_amsl_m: float | None) -> str:
+    """Reason why this cannot be the state of a vehicle; empty when it can."""
     numbers = (
         estimate.lat_deg,
         estimate.lon_deg,
@@ -116,7 +123,7 @@ def _implausible(estimate: NavEstimate, ground_amsl_m: float | None) -> str:
         return "not finite, or covariance not 6x6"
     if abs(estimate.lat_deg) > 90.0 or abs(estimate.lon_deg) > 180.0:
         return f"latitude {estimate.lat_deg}, longitude {estimate.lon_deg} is nowhere"
-    if min(estimate.cov[0], estimate.cov[7], estimate.cov[14]) <= 0.0 or estimate.velocity_sigma_mps < 0.0:
+    if min(estimate.cov[EE], estimate.cov[NN], estimate.cov[UU]) <= 0.0 or estimate.velocity_sigma_mps < 0.0:
         return "claims a variance that is not positive"
     if math.hypot(ve, vn) > MAX_SPEED_MPS or abs(vu) > MAX_CLIMB_MPS:
         return f"speed {math.hypot(ve, vn):.0f} m/s, climb {vu:.0f} m/s"

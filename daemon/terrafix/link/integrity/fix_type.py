@@ -1,95 +1,103 @@
-"""The fix type as the gate: 3 only while covariance, freshness and speed accuracy allow it, 1 otherwise, never 0.
+"""Fix type and reported accuracies: 3 while age, covariance and speed accuracy are good enough, otherwise 1, never 0.
 
-fix_type 0 on a booting copter keeps its filter from starting at all, and anything below 3 is dropped by the filter,
-so 1 says "no fix" at no cost. Silence does the same to the filter, is seen only after 4 s, and spoils the rate health
-on return; it is kept for when nobody has said anything for so long that a live GPS would be a lie."""
+Fix type 0 keeps the filter of a booting copter from starting at all. Every sample below 3 is dropped by the filter, so
+fix type 1 means "no fix" without a side effect. Silence has the same effect on the filter, but it shows only after 4 s
+and lowers the rate health on return. It is used only after a long time without any estimate, when the messages would
+make a dead position source look like a live GPS."""
 
 import math
 from dataclasses import dataclass
 
+from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.link.integrity.output_predictor import PredictedState
 from terrafix.messages import SourceLabel
 
-FIX_3D, NO_FIX = 3, 1
+FIX_3D, NO_FIX = 3, 1  # GPS_FIX_TYPE of GPS_INPUT [spec: MAVLink GPS_INPUT]
 
-# Up to here the link carries; beyond it the autopilot's own inertial coasting is better (0.2-0.5 m after 3 s of
-# silence, measured) than constant velocity, and silence of up to 4 s has no effect on it.
+# Age of the estimate up to which the link predicts it, ns. Beyond it the autopilot's own inertial dead reckoning is
+# better (0.2 to 0.5 m after 3 s of silence, measured on the firmware) than constant velocity, and silence of up to 4 s
+# has no effect on the autopilot. [tuned]
 MAX_AGE_NS = 2_000_000_000
-SILENT_AFTER_NS = 35_000_000_000  # the last rung of the ladder: every vehicle has given this GPS up long before
-MAX_HORIZONTAL_SIGMA_M = 50.0  # the autopilot's gate is 7 times this: wider, it would take any position for true
-MAX_SPEED_SIGMA_MPS = 1.5  # its filter calls the GPS glitching above
-BACK_HORIZONTAL_SIGMA_M = 40.0  # hysteresis: the way back to 3 is narrower than the way out
-BACK_SPEED_SIGMA_MPS = 1.45
-# Reported accuracy passes a peak hold of 5 s time constant: one bad report keeps the gate open for ~15 s. A sudden
-# spike is therefore answered with the fix type, and becomes a number only if it lasts.
-SPIKE_RATIO = 3.0
-SPIKE_FLOOR_M = 15.0
-SPIKE_HOLD_NS = 2_000_000_000
-MIN_HORIZONTAL_ACCURACY_M = 0.5  # EK3_POSNE_M_NSE: the filter clips to it
-MAX_ACCURACY_M = 100.0  # and to this
-MIN_SPEED_ACCURACY_MPS = 0.1
+SILENCE_AFTER_NS = 35_000_000_000  # ns; last degradation level, by then every vehicle has rejected this GPS [tuned]
+MAX_HORIZONTAL_SIGMA_M = 50.0  # m; the autopilot's gate is 7 times this, above it any position would pass [tuned]
+RECOVERY_HORIZONTAL_SIGMA_M = 40.0  # m; hysteresis: narrower limit for the return to fix type 3 [tuned]
+RECOVERY_SPEED_SIGMA_MPS = 1.45  # m/s; hysteresis, as above [tuned]
+# The autopilot applies a peak hold with a time constant of 5 s to the reported accuracy: one bad report keeps its gate
+# open for about 15 s. A sudden increase therefore lowers the fix type at first, and is reported only if it lasts.
+SPIKE_RATIO = 3.0  # accuracy over the last one that was sent [tuned]
+SPIKE_MIN_M = 15.0  # m; smaller accuracies are no spike [tuned]
+SPIKE_HOLD_NS = 2_000_000_000  # ns of no fix before the larger accuracy is reported [tuned]
+MIN_HORIZONTAL_ACCURACY_M = 0.5  # m; lower limit in the filter [spec: ArduPilot EK3_POSNE_M_NSE]
+MAX_ACCURACY_M = 100.0  # m; upper limit in the filter [measured: docs/autopilot-facts.md]
+MIN_SPEED_ACCURACY_MPS = 0.1  # m/s, per axis [tuned]
 
-# ON-6, the caution ladder: (seconds without a map fix, factor on the position accuracy, MAV_SEVERITY).
+# ON-6, degradation levels: (seconds without a map fix, factor on the position accuracy, MAV_SEVERITY). [tuned]
 DEGRADATION_LEVELS = ((0.0, 1.0, 6), (5.0, 1.2, 5), (15.0, 1.5, 4), (35.0, 2.0, 2))
 
 
 def degradation_level(unanchored_s: float) -> int:
-    """0..3: how far up the ladder so long without a map fix is."""
+    """Index into DEGRADATION_LEVELS, 0 to 3, after ``unanchored_s`` seconds without a map fix."""
     return sum(unanchored_s >= after_s for after_s, _, _ in DEGRADATION_LEVELS) - 1
 
 
 @dataclass(frozen=True)
 class NoFixReason:
-    """Why there is no fix: ``text`` for the record, ``short`` for the pilot's screen (40 characters at most)."""
+    """Reason for fix type 1. ``text``: for the record. ``short``: for the pilot's screen, 40 characters at most."""
 
     text: str
     short: str
 
 
-# The computer was started again in the air: its start coordinate is where the flight began, and claims to be good.
+# The computer was restarted in the air: its start coordinate is where the flight began, and claims a good accuracy.
 STARTED_IN_FLIGHT = NoFixReason("started in flight, and no map fix yet", "the map must confirm the start")
 
 
 class FixGate:
-    """Decides the fix type at every send; remembers only what hysteresis and the spike hold need."""
+    """Decides the fix type at every transmission. Its state: hysteresis, and the spike hold."""
 
     def __init__(self) -> None:
-        self.good = False
-        self._sent_accuracy_m: float | None = None  # last horizontal accuracy that went out with a 3D fix
+        self.has_fix = False
+        self._sent_accuracy_m: float | None = None  # last horizontal accuracy that was sent with a 3D fix
         self._spike_since_ns: int | None = None
 
-    def lower(self) -> None:
-        """There is no estimate to judge."""
-        self.good = False
+    def withdraw(self) -> None:
+        """No fix now, for a reason outside of this gate."""
+        self.has_fix = False
 
-    def judge(self, carried: PredictedState, accuracy_m: float, step: int, label: SourceLabel) -> NoFixReason | None:
-        """Why fix_type is not 3; None when it is. ``accuracy_m`` is what would be sent, ``step`` the ladder's rung."""
-        why = self._judge(carried, accuracy_m, step, label)
-        self.good = why is None
-        if self.good:
+    def evaluate(
+        self, predicted: PredictedState, accuracy_m: float, level: int, label: SourceLabel
+    ) -> NoFixReason | None:
+        """-> the reason why fix_type is not 3, or None when it is 3.
+
+        ``accuracy_m``: horizontal accuracy that would be sent, 1-sigma. ``level``: degradation level."""
+        reason = self._no_fix_reason(predicted, accuracy_m, level, label)
+        self.has_fix = reason is None
+        if self.has_fix:
             self._sent_accuracy_m = accuracy_m
-        return why
+        return reason
 
-    def _judge(self, carried: PredictedState, accuracy_m: float, step: int, label: SourceLabel) -> NoFixReason | None:
-        if carried.age_s * 1e9 > MAX_AGE_NS:
-            return NoFixReason(f"estimate is {carried.age_s:.1f} s old", "the estimate is too old")
-        if step == len(DEGRADATION_LEVELS) - 1 and label is SourceLabel.DEAD_RECKONED:
+    def _no_fix_reason(
+        self, predicted: PredictedState, accuracy_m: float, level: int, label: SourceLabel
+    ) -> NoFixReason | None:
+        if predicted.age_s * 1e9 > MAX_AGE_NS:
+            return NoFixReason(f"estimate is {predicted.age_s:.1f} s old", "the estimate is too old")
+        if level == len(DEGRADATION_LEVELS) - 1 and label is SourceLabel.DEAD_RECKONED:
             text = f"no map and no odometry, {DEGRADATION_LEVELS[-1][0]:.0f} s without a map fix"
             return NoFixReason(text, "neither map nor odometry")
-        limit_m = MAX_HORIZONTAL_SIGMA_M if self.good else BACK_HORIZONTAL_SIGMA_M
+        limit_m = MAX_HORIZONTAL_SIGMA_M if self.has_fix else RECOVERY_HORIZONTAL_SIGMA_M
         if accuracy_m > limit_m:
             return NoFixReason(
                 f"accuracy {accuracy_m:.0f} m is worse than {limit_m:.0f} m", f"worse than {limit_m:.0f} m"
             )
-        limit_mps = MAX_SPEED_SIGMA_MPS if self.good else BACK_SPEED_SIGMA_MPS
-        if carried.speed_sigma_mps > limit_mps:
-            text = f"speed accuracy {carried.speed_sigma_mps:.1f} m/s is worse than {limit_mps:.1f} m/s"
+        limit_mps = MAX_SENT_VELOCITY_SIGMA_MPS if self.has_fix else RECOVERY_SPEED_SIGMA_MPS
+        if predicted.speed_sigma_mps > limit_mps:
+            text = f"speed accuracy {predicted.speed_sigma_mps:.1f} m/s is worse than {limit_mps:.1f} m/s"
             return NoFixReason(text, "the speed is too uncertain")
-        return self._spike(carried.t_ns, accuracy_m)
+        return self._accuracy_spike(predicted.t_ns, accuracy_m)
 
-    def _spike(self, now_ns: int, accuracy_m: float) -> NoFixReason | None:
+    def _accuracy_spike(self, now_ns: int, accuracy_m: float) -> NoFixReason | None:
         before_m = self._sent_accuracy_m
-        if before_m is None or accuracy_m <= max(SPIKE_FLOOR_M, SPIKE_RATIO * before_m):
+        if before_m is None or accuracy_m <= max(SPIKE_MIN_M, SPIKE_RATIO * before_m):
             self._spike_since_ns = None
             return None
         if self._spike_since_ns is None:
@@ -100,16 +108,17 @@ class FixGate:
         return NoFixReason(f"accuracy went from {before_m:.0f} to {accuracy_m:.0f} m at once", "suddenly less accurate")
 
 
-def reported_accuracy(carried: PredictedState, step: int) -> tuple[float, float, float]:
-    """-> (horizontal m, vertical m, speed m/s): 1-sigma per axis, widened by the ladder."""
-    factor = DEGRADATION_LEVELS[step][1]
+def reported_accuracy(predicted: PredictedState, level: int) -> tuple[float, float, float]:
+    """-> (horizontal [m], vertical [m], speed [m/s]), 1-sigma per axis. The degradation level widens the position."""
+    factor = DEGRADATION_LEVELS[level][1]
     return (
-        max(MIN_HORIZONTAL_ACCURACY_M, carried.horizontal_sigma_m * factor),
-        max(MIN_HORIZONTAL_ACCURACY_M, carried.vertical_sigma_m * factor),
-        max(MIN_SPEED_ACCURACY_MPS, carried.speed_sigma_mps),
+        max(MIN_HORIZONTAL_ACCURACY_M, predicted.horizontal_sigma_m * factor),
+        max(MIN_HORIZONTAL_ACCURACY_M, predicted.vertical_sigma_m * factor),
+        max(MIN_SPEED_ACCURACY_MPS, predicted.speed_sigma_mps),
     )
 
 
-def bounded(accuracy_m: float) -> float:
-    """What goes into the message: the autopilot clips to 100 m anyway, and infinity is no number."""
+def clamp_accuracy_m(accuracy_m: float) -> float:
+    """Limits an accuracy to MAX_ACCURACY_M, as the autopilot does. Infinity and NaN become MAX_ACCURACY_M, because the
+    field must hold a finite number."""
     return min(MAX_ACCURACY_M, accuracy_m) if math.isfinite(accuracy_m) else MAX_ACCURACY_M

@@ -1,1 +1,1 @@
-"""The wire."""
+"""The MAVLink connection: transport, framing, signing, message rates, time synchronisation."""

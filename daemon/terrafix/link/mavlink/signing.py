@@ -1,9 +1,8 @@
-"""MAVLink 2 signing (mavlink.io/en/guide/message_signing.html): who has not the key is not heard.
+"""MAVLink 2 message signing (mavlink.io/en/guide/message_signing.html): packets without a valid signature are rejected.
 
-A signature is the first 6 bytes of sha256(key, packet up to here), after a link id and a time in units of 10 us
-since 2015. The time of a stream only grows, so that a packet cannot be played again. Checked here and not by
-pymavlink: it notes the time of a packet before it has checked the signature, so one forged packet would shut a true
-sender out."""
+A signature is the first 6 bytes of sha256(key, packet up to here), after a link id and a timestamp in units of 10 us
+since 2015. The timestamps of a stream increase strictly, which prevents replay. pymavlink's own check is not used: it
+stores the timestamp of a packet before it verifies the signature, so one forged packet would block the true sender."""
 
 import hashlib
 import hmac
@@ -14,16 +13,19 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import ConfigError
-from terrafix.link.mavlink.framing import SIGNATURE, SIGNED, V2
+from terrafix.link.mavlink.framing import SIGNATURE_BYTES, SIGNED_FLAG, V2
 
-KEY_BYTES = 32
-EPOCH_UNIX_NS = 1_420_070_400 * 1_000_000_000  # 2015-01-01 00:00:00 UTC
-UNIT_NS = 10_000
-NEW_STREAM_BEHIND = 6_000_000  # a stream not heard before may be this far behind our time: one minute (the guide)
+KEY_BYTES = 32  # [spec: MAVLink 2 message signing]
+EPOCH_UNIX_NS = 1_420_070_400 * 1_000_000_000  # 2015-01-01 00:00:00 UTC [spec: MAVLink 2 message signing]
+TIMESTAMP_UNIT_NS = 10_000  # [spec: MAVLink 2 message signing]
+# Timestamp units (10 us): a new stream may be one minute behind our time. [spec: MAVLink 2 message signing]
+NEW_STREAM_MAX_AGE = 6_000_000
 
 
 def read_key(path: Path) -> bytes:
-    """64 hexadecimal digits, or 32 bytes. Raises ConfigError: no key there, or one that everybody can read."""
+    """Reads a key file with 64 hexadecimal digits or 32 bytes -> key of 32 bytes.
+
+    Raises ConfigError when the file cannot be read, has other content, or is accessible to other users."""
     try:
         mode, content = path.stat().st_mode, path.read_bytes()
     except OSError as error:
@@ -42,44 +44,50 @@ def read_key(path: Path) -> bytes:
 
 
 def timestamp(unix_ns: int) -> int:
-    """Unix time -> units of 10 us since 2015; 0 before."""
-    return max(0, unix_ns - EPOCH_UNIX_NS) // UNIT_NS
+    """Unix time -> signing timestamp in units of 10 us since 2015; 0 before."""
+    return max(0, unix_ns - EPOCH_UNIX_NS) // TIMESTAMP_UNIT_NS
 
 
 class Signing:
-    """One key: ``prepare`` what sends, ask ``accepts`` for what has come."""
+    """Signs outgoing and verifies incoming packets with one key."""
 
     def __init__(self, key: bytes, link_id: int = 0) -> None:
-        """``link_id``: each of our links has its own, and with it its own stream of times."""
+        """``link_id``: one for each of our links, so that each has its own sequence of timestamps."""
         self._key, self._link_id = key, link_id
-        self._time = 0  # the latest of our clock and of what true packets have said
-        self._streams: dict[tuple[int, int, int], int] = {}  # (link id, system, component) -> newest time
+        self._timestamp = 0  # maximum of our clock and the timestamps of verified packets
+        self._streams: dict[tuple[int, int, int], int] = {}  # (link id, system, component) -> newest timestamp
         self.refused = 0
 
-    def prepare(self, mav: mavlink.MAVLink, unix_ns: int) -> None:
-        """The next packet of ``mav`` is signed, with the time of now or, if that is later, the one after the last."""
-        self._time = max(self._time + 1, timestamp(unix_ns))
+    def sign_next(self, mav: mavlink.MAVLink, unix_ns: int) -> None:
+        """Sets up ``mav`` to sign its next packet. The timestamp is ``unix_ns``, or the previous one plus 1 if that is
+        later."""
+        self._timestamp = max(self._timestamp + 1, timestamp(unix_ns))
         mav.signing.secret_key, mav.signing.link_id, mav.signing.sign_outgoing = self._key, self._link_id, True
-        mav.signing.timestamp = self._time
+        mav.signing.timestamp = self._timestamp
 
     def accepts(self, message: Any, unix_ns: int) -> bool:
-        """Whether a message with a right checksum was signed with our key, and is not an old one again."""
-        good = self._check(bytes(message.get_msgbuf()), message.get_srcSystem(), message.get_srcComponent(), unix_ns)
-        self.refused += not good
-        return good
+        """True if the message (whose checksum is valid) carries a valid signature and is not a replay."""
+        accepted = self._is_valid(
+            bytes(message.get_msgbuf()), message.get_srcSystem(), message.get_srcComponent(), unix_ns
+        )
+        self.refused += not accepted
+        return accepted
 
-    def _check(self, packet: bytes, sysid: int, compid: int, unix_ns: int) -> bool:
-        if packet[0] != V2 or not packet[2] & SIGNED:
+    def _is_valid(self, packet: bytes, sysid: int, compid: int, unix_ns: int) -> bool:
+        if packet[0] != V2 or not packet[2] & SIGNED_FLAG:
             return False
         digest = hashlib.sha256(self._key + packet[:-6]).digest()[:6]
         if not hmac.compare_digest(digest, packet[-6:]):
             return False
-        link_id, time = packet[-SIGNATURE], int.from_bytes(packet[-SIGNATURE + 1 : -6], "little")
+        link_id, packet_timestamp = (
+            packet[-SIGNATURE_BYTES],
+            int.from_bytes(packet[-SIGNATURE_BYTES + 1 : -6], "little"),
+        )
         stream = (link_id, sysid, compid)
         newest = self._streams.get(stream)
-        oldest = max(self._time, timestamp(unix_ns)) - NEW_STREAM_BEHIND if newest is None else newest + 1
-        if time < oldest:
+        oldest = max(self._timestamp, timestamp(unix_ns)) - NEW_STREAM_MAX_AGE if newest is None else newest + 1
+        if packet_timestamp < oldest:
             return False
-        self._streams[stream] = time
-        self._time = max(self._time, time)
+        self._streams[stream] = packet_timestamp
+        self._timestamp = max(self._timestamp, packet_timestamp)
         return True

@@ -1,7 +1,7 @@
-"""Bytes to and from an autopilot over UDP, TCP or a serial port; never blocks after opening.
+"""Byte transport to an autopilot over UDP, TCP or a serial port; does not block after opening.
 
 pymavlink's own connections are not used in flight: they sleep while reconnecting, resolve names while sending and
-print. ``read`` and ``write`` raise OSError when the other side is gone; the edge then opens again."""
+print. ``read`` and ``write`` raise OSError when the connection is lost; ``Connection`` then opens it again."""
 
 import contextlib
 import errno
@@ -16,34 +16,34 @@ import serial
 
 from terrafix.core.errors import LinkError
 
-CONNECT_S = 3.0  # a TCP peer that does not answer at start
-READ_MAX = 65_536  # bytes taken per look: a flood costs its share of a tick, not the tick
-DATAGRAMS_MAX = 200
-PEERS_MAX = 8  # who is answered on a listening port
-ANY_PORT = 0
+CONNECT_TIMEOUT_S = 3.0  # for a TCP peer at start [tuned]
+MAX_READ_BYTES = 65_536  # bytes per read: bounds the share of a tick that a flood of data can take [tuned]
+MAX_DATAGRAMS_PER_READ = 200  # for the same reason [tuned]
+MAX_PEERS = 8  # senders that get broadcast packets on a listening port [tuned]
+ANY_PORT = 0  # the operating system chooses a free port [spec: bind(2)]
 IN_PROGRESS = (errno.EINPROGRESS, errno.EWOULDBLOCK, errno.EALREADY)
 
 
 Address = tuple[str, int]
-Chunk = tuple[bytes, Address | None]  # the sender on a listening port; None where there is one other end only
+Chunk = tuple[bytes, Address | None]  # with the sender on a listening port; None on point-to-point transports
 
 
 class Transport(Protocol):
     def read(self) -> list[Chunk]:
-        """What has come, in order; empty when there is nothing."""
+        """-> received data in order; empty when there is none."""
         ...
 
     def write(self, packet: bytes, to: Address | None = None) -> bool:
-        """``to``: one peer of a listening port; None: all that it answers, or the other end.
+        """``to``: one peer of a listening port; None: all of its peers, or the only other end.
 
-        False: there was no room (or nobody to send to) and the packet is lost; it is never sent late."""
+        -> False if the buffer is full or there is no peer. The packet is then lost; it is not sent later."""
         ...
 
     def close(self) -> None: ...
 
 
 def open_at_start(device: str, baud: int) -> Transport:
-    """As ``open_transport``, waiting for a TCP peer. Raises LinkError with what to check."""
+    """As ``open_transport``, and waits for a TCP peer. Raises LinkError with advice."""
     try:
         return open_transport(device, baud, wait=True)
     except OSError as error:
@@ -52,15 +52,15 @@ def open_at_start(device: str, baud: int) -> Transport:
             "udpout": "is there a network?",
             "tcp": "is the other side listening?",
         }.get(device.partition(":")[0], "is it plugged in, free, and may this user read and write it?")
-        why = os.strerror(error.errno) if error.errno else str(error)  # pyserial wraps the text into its own
+        why = os.strerror(error.errno) if error.errno else str(error)  # pyserial puts the text into a longer one
         raise LinkError(f"link '{device}' cannot be opened ({why}); {advice}") from None
 
 
 def open_transport(device: str, baud: int, *, wait: bool) -> Transport:
-    """``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or the path of a serial device.
+    """``device``: ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or the path of a serial device.
 
-    ``wait``: at start a TCP connection is waited for, in flight it completes in the background.
-    Raises LinkError for what cannot be understood, OSError for what cannot be opened."""
+    ``wait``: block until a TCP connection is established (at start); otherwise it completes in the background.
+    Raises LinkError for a malformed device name or an unknown host, OSError when the device cannot be opened."""
     kind, _, rest = device.partition(":")
     if kind in ("udpin", "udpout", "tcp"):
         address = _address(device, rest)
@@ -74,7 +74,7 @@ def open_transport(device: str, baud: int, *, wait: bool) -> Transport:
     return Serial(device, baud)
 
 
-@cache  # once per run, so that nothing in flight waits for a name server
+@cache  # resolved once per run: a name server must not block the link in flight
 def _address(device: str, rest: str) -> Address:
     host, _, port = rest.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65_536:
@@ -99,23 +99,23 @@ class _Udp:
 
     def read(self) -> list[Chunk]:
         chunks: list[Chunk] = []
-        for _ in range(DATAGRAMS_MAX):
+        for _ in range(MAX_DATAGRAMS_PER_READ):
             try:
-                data, sender = self._socket.recvfrom(READ_MAX)
+                data, sender = self._socket.recvfrom(MAX_READ_BYTES)
             except (BlockingIOError, ConnectionRefusedError):
                 break
-            if (chunk := self._from(data, sender)) is not None:
+            if (chunk := self._accept(data, sender)) is not None:
                 chunks.append(chunk)
         return chunks
 
-    def _from(self, data: bytes, sender: Address) -> Chunk | None:
-        """What becomes of a datagram; None: it is not for us."""
+    def _accept(self, data: bytes, sender: Address) -> Chunk | None:
+        """-> the chunk for a received datagram; None: it is ignored."""
         raise NotImplementedError
 
     def _send(self, packet: bytes, to: Address) -> bool:
         try:
             return self._socket.sendto(packet, to) == len(packet)
-        except OSError:  # no buffer, no route, nobody listening: UDP has no connection to lose
+        except OSError:  # no buffer, no route or no listener; UDP has no connection that could be lost
             return False
 
     def close(self) -> None:
@@ -123,10 +123,10 @@ class _Udp:
 
 
 class UdpOut(_Udp):
-    """To one address, and heard from that one only; a loopback address is spoken to from loopback.
+    """Sends to one address and accepts datagrams from it only. Binds to loopback if that address is a loopback one.
 
-    The socket is not connected: it would be tied to the address that this computer has now, and a network that is
-    not there yet would be an error. ``ignored``: datagrams of other senders, ``ignored_from`` the newest of them."""
+    The socket is not connected: it would be bound to the present address of this computer, and a network that is
+    not up yet would be an error. ``ignored``: number of datagrams of other senders; ``ignored_from``: the newest."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(("127.0.0.1", ANY_PORT) if ipaddress.ip_address(address[0]).is_loopback else None)
@@ -134,7 +134,7 @@ class UdpOut(_Udp):
         self.ignored = 0
         self.ignored_from: Address | None = None
 
-    def _from(self, data: bytes, sender: Address) -> Chunk | None:
+    def _accept(self, data: bytes, sender: Address) -> Chunk | None:
         if sender == self._to:
             return data, None
         self.ignored, self.ignored_from = self.ignored + 1, sender
@@ -145,21 +145,22 @@ class UdpOut(_Udp):
 
 
 class UdpIn(_Udp):
-    """Listens, and answers who has spoken (the last few of them), less those that are to be forgotten."""
+    """Listens on one port. Its peers are the ``MAX_PEERS`` most recent senders, without those removed by
+    ``forget_peer``."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address)
         self._peers: dict[Address, None] = {}
 
-    def _from(self, data: bytes, sender: Address) -> Chunk | None:
+    def _accept(self, data: bytes, sender: Address) -> Chunk | None:
         self._peers.pop(sender, None)
         self._peers[sender] = None
-        while len(self._peers) > PEERS_MAX:
+        while len(self._peers) > MAX_PEERS:
             del self._peers[next(iter(self._peers))]
         return data, sender
 
-    def forget(self, peer: Address) -> None:
-        """It gets nothing until it speaks again."""
+    def forget_peer(self, peer: Address) -> None:
+        """Removes the peer until it sends again."""
         self._peers.pop(peer, None)
 
     def write(self, packet: bytes, to: Address | None = None) -> bool:
@@ -167,33 +168,37 @@ class UdpIn(_Udp):
 
 
 class _Stream:
-    """A byte stream: the rest of a packet that went out in part goes first, or the receiver would lose its place."""
+    """A byte stream. The remainder of a partially written packet is sent first; otherwise the receiver would lose
+    synchronisation."""
 
     def __init__(self) -> None:
-        self._rest = b""
+        self._unsent = b""
 
     def write(self, packet: bytes, to: Address | None = None) -> bool:
-        if self._rest:
-            self._rest = self._rest[self._put(self._rest) :]
-            if self._rest:
+        if self._unsent:
+            self._unsent = self._unsent[self._write_some(self._unsent) :]
+            if self._unsent:
                 return False
-        sent = self._put(packet)
-        self._rest = packet[sent:] if sent else b""
+        sent = self._write_some(packet)
+        self._unsent = packet[sent:] if sent else b""
         return sent > 0
 
-    def _put(self, data: bytes) -> int:
+    def _write_some(self, data: bytes) -> int:
+        """-> number of bytes written without blocking."""
         raise NotImplementedError
 
 
 class Tcp(_Stream):
+    """TCP client."""
+
     def __init__(self, address: Address, *, wait: bool) -> None:
         super().__init__()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # 10 Hz of small packets, each at once
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # small packets at 10 Hz, without delay
         self._connected = wait
         try:
             if wait:
-                self._socket.settimeout(CONNECT_S)
+                self._socket.settimeout(CONNECT_TIMEOUT_S)
                 self._socket.connect(address)
             self._socket.setblocking(False)
             code = 0 if wait else self._socket.connect_ex(address)
@@ -207,16 +212,16 @@ class Tcp(_Stream):
         if not self._connected:
             if not select.select([], [self._socket], [], 0)[1]:
                 return []
-            self._connected = True  # or refused: then receiving says so
+            self._connected = True  # or refused: then recv raises
         try:
-            data = self._socket.recv(READ_MAX)
+            data = self._socket.recv(MAX_READ_BYTES)
         except BlockingIOError:
             return []
         if not data:
             raise ConnectionResetError(errno.ECONNRESET, "the other side has closed")
         return [(data, None)]
 
-    def _put(self, data: bytes) -> int:
+    def _write_some(self, data: bytes) -> int:
         try:
             return self._socket.send(data)
         except OSError as error:
@@ -229,7 +234,8 @@ class Tcp(_Stream):
 
 
 class Serial(_Stream):
-    """pyserial sets the port up; reading and writing go to its descriptor, since pyserial's write can wait."""
+    """Serial port. pyserial configures it; reads and writes use its file descriptor, because pyserial's write can
+    block."""
 
     def __init__(self, device: str, baud: int) -> None:
         super().__init__()
@@ -245,18 +251,18 @@ class Serial(_Stream):
         for _, events in self._poll.poll(0):
             if events & (select.POLLHUP | select.POLLERR | select.POLLNVAL):
                 raise OSError(errno.EIO, "the device is gone")
-            data = os.read(self._fd, READ_MAX)
-            if not data:  # ready, yet empty: a USB converter that was pulled
+            data = os.read(self._fd, MAX_READ_BYTES)
+            if not data:  # readable but empty: a USB converter was unplugged
                 raise OSError(errno.EIO, "the device is gone")
             return [(data, None)]
         return []
 
-    def _put(self, data: bytes) -> int:
+    def _write_some(self, data: bytes) -> int:
         try:
             return os.write(self._fd, data)
         except BlockingIOError:
             return 0
 
     def close(self) -> None:
-        with contextlib.suppress(OSError):  # a port that is gone cannot be closed in order
+        with contextlib.suppress(OSError):  # closing an unplugged port fails
             self._port.close()

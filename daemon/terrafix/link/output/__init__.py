@@ -1,1 +1,1 @@
-"""What is sent, in which protocol and when."""
+"""Encoders of the position for each protocol, and the schedule of transmissions."""

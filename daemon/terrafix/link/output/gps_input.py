@@ -1,21 +1,21 @@
-"""GpsInput as MAVLink GPS_INPUT (232). All fields, always: what is ignored once keeps its last value there."""
+"""GpsInput as MAVLink GPS_INPUT (232). All fields are always sent: ArduPilot keeps the last value of ignored fields."""
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.messages import GpsInput
 
-NOTHING_IGNORED = (
-    0  # velocity above all: an ignored one stays at its last value and is fused for ever (ArduPilot #19633)
-)
-YAW_UNKNOWN = 0  # 0 is "none", north would be 36000
+# An ignored velocity would stay at its last value and be fused for ever. [spec: ArduPilot issue 19633]
+IGNORE_NONE = 0
+YAW_UNKNOWN = 0  # centidegrees; 0 means "not available", north would be 36000 [spec: MAVLink GPS_INPUT yaw]
 
 
 def encode(gps: GpsInput, gps_id: int) -> mavlink.MAVLink_gps_input_message:
-    """SI and degrees into the units of the message; ``gps_id`` must be the autopilot's instance or it is dropped."""
+    """Converts SI units and degrees into the units of the message. ``gps_id`` must be the autopilot's instance,
+    otherwise the autopilot drops the message."""
     return mavlink.MAVLink_gps_input_message(
-        time_usec=gps.t_ns // 1000,  # ignored by ArduPilot, of use in logs
+        time_usec=gps.t_ns // 1000,  # ArduPilot ignores it; useful in logs
         gps_id=gps_id,
-        ignore_flags=NOTHING_IGNORED,
+        ignore_flags=IGNORE_NONE,
         time_week_ms=gps.time_week_ms,
         time_week=gps.time_week,
         fix_type=gps.fix_type,

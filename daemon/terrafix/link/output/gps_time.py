@@ -1,17 +1,18 @@
 """GPS week and millisecond from Unix time, with the leap seconds.
 
-GPS time runs without leap seconds from 1980-01-06 00:00:00 UTC (IS-GPS-200, 20.3.3.5.2.4); Unix time leaves them
-out. The difference is the table below: the dates on which a leap second had just been inserted, from IERS
-Bulletin C (the same list as ``leap-seconds.list`` of the IANA time zone database). None since 2017-01-01; the
-27th General Conference on Weights and Measures (resolution 4) ends the practice by 2035."""
+GPS time starts at 1980-01-06 00:00:00 UTC and counts all seconds (IS-GPS-200, 20.3.3.5.2.4); Unix time does not count
+leap seconds. The difference follows from the table below: the dates on which a leap second had just been inserted,
+from IERS Bulletin C (the same list as ``leap-seconds.list`` of the IANA time zone database). There was none after
+2017-01-01, and the 27th General Conference on Weights and Measures (resolution 4) ends the practice by 2035."""
 
 from bisect import bisect_right
 
-GPS_EPOCH_UNIX_S = 315_964_800  # 1980-01-06 00:00:00 UTC
-WEEK_MS = 7 * 24 * 3600 * 1000
-NS_PER_S = 1_000_000_000
+from terrafix.core.clock import NS_PER_S
 
-# Unix second from which GPS is ahead of UTC by (position in the list + 1) seconds.
+GPS_EPOCH_UNIX_S = 315_964_800  # 1980-01-06 00:00:00 UTC [spec: IS-GPS-200]
+WEEK_MS = 7 * 24 * 3600 * 1000  # [spec: unit]
+
+# Unix second from which GPS time is ahead of UTC by (index + 1) seconds. [spec: IERS Bulletin C]
 LEAP_SECONDS_UNIX_S = (
     362_793_600,  # 1981-07-01
     394_329_600,  # 1982-07-01
@@ -33,54 +34,59 @@ LEAP_SECONDS_UNIX_S = (
     1_483_228_800,  # 2017-01-01
 )
 
-# A board without a battery-backed clock starts in 1970, or at the date of its image; nothing flies this before 2025. A
-# receiver counts weeks in 10 bits (IS-GPS-200, 20.3.3.3.1.1): one that takes them for those of another round is off by
-# 1024 weeks, 19.6 years. So of two dates that may be mistaken so one alone is plausible. The range ends in August 2044.
-EARLIEST_PLAUSIBLE_UNIX_NS = 1_735_689_600 * NS_PER_S  # 2025-01-01
-LATEST_PLAUSIBLE_UNIX_NS = EARLIEST_PLAUSIBLE_UNIX_NS + 1024 * WEEK_MS * 1_000_000
+# A board without a battery-backed clock starts in 1970 or at the date of its image. This program does not fly before
+# 2025. A receiver counts weeks with 10 bits (IS-GPS-200, 20.3.3.3.1.1); one with the wrong rollover is off by 1024
+# weeks, 19.6 years. The range below has that length and ends in August 2044, so that only one of two dates that differ
+# by a rollover is plausible.
+EARLIEST_PLAUSIBLE_UNIX_NS = 1_735_689_600 * NS_PER_S  # 2025-01-01 [tuned]
+LATEST_PLAUSIBLE_UNIX_NS = EARLIEST_PLAUSIBLE_UNIX_NS + 1024 * WEEK_MS * 1_000_000  # [spec: IS-GPS-200 10 bit week]
 
-STEP_NS = 500_000_000  # a wall clock that is off by less stays latched: the week keeps the monotonic clock's rhythm
-CONFIRM_NS = 20 * NS_PER_S  # a step is believed when the clock has gone on from there for so long
+# Smaller differences of the wall clock are ignored, ns: GPS time keeps the rate of the monotonic clock. [tuned]
+MIN_CLOCK_STEP_NS = 500_000_000
+# ns for which a clock must stay at its new offset before the step is taken. [tuned]
+CLOCK_STEP_CONFIRM_NS = 20 * NS_PER_S
 
 
-def plausible(unix_ns: int) -> bool:
-    """A wall clock that can be right."""
+def is_plausible(unix_ns: int) -> bool:
+    """Whether a wall clock with this reading can be right."""
     return EARLIEST_PLAUSIBLE_UNIX_NS <= unix_ns < LATEST_PLAUSIBLE_UNIX_NS
 
 
 class LatchedClock:
-    """The wall clock as it was first heard, carried on by the monotonic one: GPS time in GPS_INPUT has no steps.
+    """Wall time as the first plausible reading plus the monotonic clock, so that GPS time in GPS_INPUT has no steps.
 
-    A clock that steps may be right or wrong (a network that comes up; an autopilot that stepped by -25 hours and then
-    by 20 years was measured). On the ground it is learnt anew when it has gone on from there for a while; in flight
-    never: an autopilot that is told another time takes the next position for older, or for one of the future."""
+    A step of the wall clock may be right or wrong: a network that comes up corrects it, and an autopilot was measured
+    that stepped by -25 hours and then by 20 years. On the ground a step is taken after CLOCK_STEP_CONFIRM_NS at the new
+    offset. In flight none is taken, because an autopilot takes a position with a stepped time for an older one or for
+    one of the future."""
 
     def __init__(self, unix_minus_monotonic_ns: int | None = None) -> None:
-        """``unix_minus_monotonic_ns``: of a link that this one is started in the place of."""
+        """``unix_minus_monotonic_ns``: offset of the link process that this one replaces, if there was one."""
         self._offset_ns = unix_minus_monotonic_ns
-        self._new: tuple[int, int] | None = None  # (offset, monotonic time at which it was heard first)
+        self._candidate: tuple[int, int] | None = None  # (offset, monotonic time of its first reading)
 
-    def hear(self, unix_ns: int, t_ns: int, *, in_flight: bool) -> str:
-        """``unix_ns`` at ``t_ns`` of the monotonic clock. -> why it is not taken; empty: it is, or agrees."""
-        if not plausible(unix_ns):
+    def update(self, unix_ns: int, t_ns: int, *, in_flight: bool) -> str:
+        """``unix_ns``: reading at ``t_ns`` of the monotonic clock. -> reason of a rejection; empty when the reading is
+        taken or agrees."""
+        if not is_plausible(unix_ns):
             return f"Unix time {unix_ns // NS_PER_S} cannot be"
         offset_ns = unix_ns - t_ns
         if self._offset_ns is None:
             self._offset_ns = offset_ns
         step_ns = offset_ns - self._offset_ns
-        if abs(step_ns) <= STEP_NS:
-            self._new = None
+        if abs(step_ns) <= MIN_CLOCK_STEP_NS:
+            self._candidate = None
             return ""
-        if self._new is None or abs(offset_ns - self._new[0]) > STEP_NS:
-            self._new = (offset_ns, t_ns)
-        if in_flight or t_ns - self._new[1] < CONFIRM_NS:
+        if self._candidate is None or abs(offset_ns - self._candidate[0]) > MIN_CLOCK_STEP_NS:
+            self._candidate = (offset_ns, t_ns)
+        if in_flight or t_ns - self._candidate[1] < CLOCK_STEP_CONFIRM_NS:
             return f"steps by {step_ns / NS_PER_S:.1f} s" + (" in flight" if in_flight else "")
-        self._offset_ns, self._new = offset_ns, None
+        self._offset_ns, self._candidate = offset_ns, None
         return ""
 
-    def week(self, t_ns: int) -> tuple[int, int]:
-        """GPS week and its millisecond at ``t_ns``; (0, 0), "use the time of arrival", while no clock was plausible: a
-        wrong week would set the autopilot's clock."""
+    def week_and_ms(self, t_ns: int) -> tuple[int, int]:
+        """-> (GPS week, millisecond of the week) at ``t_ns`` of the monotonic clock; (0, 0), "use the time of arrival",
+        while no reading was plausible, because a wrong week would set the autopilot's clock."""
         return (0, 0) if self._offset_ns is None else week_and_ms(t_ns + self._offset_ns)
 
 
@@ -97,7 +103,7 @@ def week_and_ms(unix_ns: int) -> tuple[int, int]:
 
 
 def unix_ms(week: int, week_ms: int) -> int | None:
-    """The way back: GPS week and millisecond -> Unix milliseconds; None for week 0, "not known"."""
+    """Inverse of week_and_ms: GPS week and millisecond -> Unix milliseconds; None for week 0, "not known"."""
     if week == 0:
         return None
     gps_ms = week * WEEK_MS + week_ms + GPS_EPOCH_UNIX_S * 1000

@@ -10,19 +10,19 @@ from datetime import UTC, datetime
 from terrafix.link.output.gps_time import unix_ms
 from terrafix.messages import GpsInput
 
-MSP2_SENSOR_GPS = 0x1F03
-WEEK_UNKNOWN, YAW_UNKNOWN = 0xFFFF, 0xFFFF
-UINT16_MAX = 0xFFFF
+MSP2_SENSOR_GPS = 0x1F03  # message id [spec: iNav msp_protocol_v2_sensor.h]
+WEEK_UNKNOWN, YAW_UNKNOWN = 0xFFFF, 0xFFFF  # [spec: iNav msp_protocol_v2_sensor_msg.h]
+UINT16_MAX = 0xFFFF  # [spec: 16 bits]
 # instance, week, ms of week, fix, satellites, accuracies h, v [cm], speed [cm/s], hdop * 100, longitude, latitude
-# [1e-7 deg], height [cm], velocity north, east, down [cm/s], course, yaw [0.01 deg], year, month, day, h, min, s
+# [1e-7 deg], height AMSL [cm], velocity north, east, down [cm/s], course, yaw [0.01 deg], year, month, day, h, min, s
 PAYLOAD = struct.Struct("<BHIBBHHHHiiiiiiHHHBBBBB")
 
 
 def frame(gps: GpsInput) -> bytes:
-    """One message to the flight controller; it is a command, not an answer ('<')."""
-    good = gps.fix_type >= 3
+    """One MSP frame with direction '<', a request to the flight controller."""
+    has_fix = gps.fix_type >= 3
     ms = unix_ms(gps.time_week, gps.time_week_ms)
-    when = datetime.fromtimestamp(ms / 1000, UTC) if ms is not None else None
+    utc = datetime.fromtimestamp(ms / 1000, UTC) if ms is not None else None
     payload = PAYLOAD.pack(
         0,
         gps.time_week or WEEK_UNKNOWN,
@@ -39,16 +39,16 @@ def frame(gps: GpsInput) -> bytes:
         round(gps.vn_mps * 100),
         round(gps.ve_mps * 100),
         round(gps.vd_mps * 100),
-        round(math.degrees(math.atan2(gps.ve_mps, gps.vn_mps)) * 100) % 36_000 if good else 0,
+        round(math.degrees(math.atan2(gps.ve_mps, gps.vn_mps)) * 100) % 36_000 if has_fix else 0,
         YAW_UNKNOWN,
-        *((when.year, when.month, when.day, when.hour, when.minute, when.second) if when else (0,) * 6),
+        *((utc.year, utc.month, utc.day, utc.hour, utc.minute, utc.second) if utc else (0,) * 6),
     )
-    head = struct.pack("<BHH", 0, MSP2_SENSOR_GPS, len(payload))
-    return b"$X<" + head + payload + bytes([crc8_dvb_s2(head + payload)])
+    header = struct.pack("<BHH", 0, MSP2_SENSOR_GPS, len(payload))
+    return b"$X<" + header + payload + bytes([crc8_dvb_s2(header + payload)])
 
 
 def crc8_dvb_s2(data: bytes) -> int:
-    """Polynomial 0xD5, start 0 (ETSI EN 302 307)."""
+    """CRC with polynomial 0xD5 and initial value 0 (ETSI EN 302 307)."""
     crc = 0
     for byte in data:
         crc ^= byte
@@ -58,4 +58,5 @@ def crc8_dvb_s2(data: bytes) -> int:
 
 
 def _centi(value: float) -> int:
+    """``value`` in hundredths, clamped to 16 bits."""
     return min(UINT16_MAX, max(0, round(value * 100)))

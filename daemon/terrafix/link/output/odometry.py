@@ -1,8 +1,9 @@
-"""The position as a pose around the autopilot's own origin: ODOMETRY (331) and VISION_POSITION_ESTIMATE (102).
+"""The position as a pose in the local frame of the autopilot: ODOMETRY (331) and VISION_POSITION_ESTIMATE (102).
 
-Both say the position of this moment, north, east and down of the filter's origin in metres, made of degrees as the
-firmware itself does it, so that it comes back to the same latitude and longitude. Without a 3D fix nothing is said:
-neither message can say "no fix", and the filter gives the stream up after 300 ms."""
+Both carry the position at the time of transmission, north, east and down of the origin of the autopilot's filter in
+metres. Metres are computed from degrees as the firmware does it, so that it computes the same latitude and longitude.
+Without a 3D fix nothing is sent: neither message can state "no fix", and the filter stops using the stream after
+300 ms."""
 
 import math
 from dataclasses import dataclass
@@ -12,18 +13,21 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.messages import GpsInput
 
 # ArduPilot's Location: metres per 1e-7 degree, on both axes, times the cosine of the mean latitude for east
-# (AP_Math/definitions.h LATLON_TO_M; Location::get_distance_NE). A true ellipsoid would be 10 m off after 10 km.
+# (AP_Math/definitions.h LATLON_TO_M; Location::get_distance_NE). The true ellipsoid would differ by 10 m after 10 km.
+# [spec: ArduPilot LATLON_TO_M]
 ARDUPILOT_M_PER_E7 = 0.011131884502145034
-PX4_RADIUS_M = 6_371_000.0  # of PX4's sphere (geo.h), on which it has an azimuthal equidistant projection
-YAW_UNKNOWN_RAD = math.pi  # 1-sigma: the attitude in these messages is the autopilot's own, and no news to it
-QUALITY_GOOD = 100  # of ODOMETRY; what is not good is not sent
-RESETS = 256  # reset_counter has 8 bits: a receiver sees that it has changed, and does not take the step for a motion
-_XX, _YY, _ZZ, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20  # diagonal of the upper triangle, row by row
+PX4_RADIUS_M = 6_371_000.0  # m; sphere of its azimuthal equidistant projection [spec: PX4 geo.h]
+YAW_UNKNOWN_RAD = math.pi  # 1-sigma: the attitude in these messages is the autopilot's own, no measurement [tuned]
+QUALITY_GOOD = 100  # %, field of ODOMETRY; nothing is sent without a fix [spec: MAVLink ODOMETRY quality]
+# Modulus of the 8 bits of reset_counter. A receiver that sees it change does not take the step for a motion.
+RESET_COUNTER_MODULUS = 256  # [spec: MAVLink ODOMETRY reset_counter]
+# Diagonal of a 6x6 covariance in its upper triangle, row by row. [spec: MAVLink ODOMETRY pose_covariance]
+_XX, _YY, _ZZ, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20
 
 
 @dataclass(frozen=True)
-class Place:
-    """The origin of the autopilot's filter (GPS_GLOBAL_ORIGIN)."""
+class GeodeticPoint:
+    """A point such as the origin of the autopilot's filter (GPS_GLOBAL_ORIGIN)."""
 
     lat_deg: float
     lon_deg: float
@@ -32,30 +36,30 @@ class Place:
 
 @dataclass(frozen=True)
 class Attitude:
-    """The autopilot's newest: body (forward, right, down) against north, east, down."""
+    """The autopilot's newest attitude: rotation of the body (FRD) in the frame north, east, down."""
 
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
 
 
-def north_east_down(gps: GpsInput, origin: Place, *, ardupilot: bool) -> tuple[float, float, float]:
-    """Metres from the origin, on ArduPilot's plane or PX4's sphere: 10 km are 11 m longer on the one."""
+def position_ned_m(gps: GpsInput, origin: GeodeticPoint, *, ardupilot: bool) -> tuple[float, float, float]:
+    """-> (north, east, down) [m] of ``origin``, on ArduPilot's plane or PX4's sphere; at 10 km they differ by 11 m."""
     if not ardupilot:
-        return *_on_sphere(gps, origin), origin.alt_amsl_m - gps.alt_amsl_m
+        return *_project_on_sphere(gps, origin), origin.alt_amsl_m - gps.alt_amsl_m
     north = (gps.lat_deg - origin.lat_deg) * 1e7 * ARDUPILOT_M_PER_E7
     east_deg = math.remainder(gps.lon_deg - origin.lon_deg, 360.0)
-    middle = math.radians((gps.lat_deg + origin.lat_deg) / 2)
-    return north, east_deg * 1e7 * ARDUPILOT_M_PER_E7 * math.cos(middle), origin.alt_amsl_m - gps.alt_amsl_m
+    mean_lat = math.radians((gps.lat_deg + origin.lat_deg) / 2)
+    return north, east_deg * 1e7 * ARDUPILOT_M_PER_E7 * math.cos(mean_lat), origin.alt_amsl_m - gps.alt_amsl_m
 
 
-def _on_sphere(gps: GpsInput, origin: Place) -> tuple[float, float]:
-    """As PX4's MapProjection::project."""
+def _project_on_sphere(gps: GpsInput, origin: GeodeticPoint) -> tuple[float, float]:
+    """-> (north, east) [m], as PX4's MapProjection::project."""
     lat, lat0 = math.radians(gps.lat_deg), math.radians(origin.lat_deg)
     east_rad = math.radians(gps.lon_deg - origin.lon_deg)
     north = math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(east_rad)
     east = math.cos(lat) * math.sin(east_rad)
-    sine = math.hypot(north, east)  # of the angle between the two places
+    sine = math.hypot(north, east)  # of the angle between the two points
     if sine == 0.0:
         return 0.0, 0.0
     cosine = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(east_rad)
@@ -63,21 +67,21 @@ def _on_sphere(gps: GpsInput, origin: Place) -> tuple[float, float]:
     return k * north, k * east
 
 
-def variance_for_ardupilot(sigma: float) -> float:
-    """The variance from which ArduPilot makes the error ``sigma``.
+def ardupilot_variance(sigma: float) -> float:
+    """The variance from which ArduPilot computes the standard deviation ``sigma``.
 
-    It takes cbrt(xx^2 + yy^2 + zz^2) of three variances for a standard deviation (GCS_Common.cpp, handle_odometry);
-    three equal ones give sigma when each is sqrt(sigma^3 / 3)."""
+    It takes cbrt(xx^2 + yy^2 + zz^2) of the three variances as the standard deviation (GCS_Common.cpp,
+    handle_odometry). Three equal variances of sqrt(sigma^3 / 3) give sigma."""
     return math.sqrt(sigma**3 / 3.0)
 
 
 def pose_covariance(gps: GpsInput, *, ardupilot: bool) -> list[float]:
-    """(21,) upper triangle of x, y, z, roll, pitch, yaw. ArduPilot gets three equal ones for its rule: the horizontal
-    error, since height is the barometer's there (EK3_SRCn_POSZ 1)."""
+    """(21,) upper triangle over x, y, z, roll, pitch, yaw [m^2, rad^2]. For ArduPilot's rule the three variances of the
+    position are equal, from the horizontal accuracy, since its height source is the barometer (EK3_SRCn_POSZ 1)."""
     cov = [0.0] * 21
     if ardupilot:
-        cov[_XX] = cov[_YY] = cov[_ZZ] = variance_for_ardupilot(gps.horiz_accuracy_m)
-        cov[_ROLL] = cov[_PITCH] = cov[_YAW] = variance_for_ardupilot(YAW_UNKNOWN_RAD)
+        cov[_XX] = cov[_YY] = cov[_ZZ] = ardupilot_variance(gps.horiz_accuracy_m)
+        cov[_ROLL] = cov[_PITCH] = cov[_YAW] = ardupilot_variance(YAW_UNKNOWN_RAD)
     else:
         cov[_XX] = cov[_YY] = gps.horiz_accuracy_m**2
         cov[_ZZ] = gps.vert_accuracy_m**2
@@ -85,49 +89,51 @@ def pose_covariance(gps: GpsInput, *, ardupilot: bool) -> list[float]:
     return cov
 
 
-def odometry(gps: GpsInput, origin: Place, attitude: Attitude, *, ardupilot: bool) -> mavlink.MAVLink_odometry_message:
-    """The velocity is in body axes; the receiver turns it back with the quaternion of the same message.
+def odometry(
+    gps: GpsInput, origin: GeodeticPoint, attitude: Attitude, *, ardupilot: bool
+) -> mavlink.MAVLink_odometry_message:
+    """ODOMETRY with the velocity in body axes; the autopilot rotates it back with the quaternion of the same message.
 
-    North, east and down is MAV_FRAME_LOCAL_FRD to ArduPilot, which takes no other. For PX4 it is MAV_FRAME_LOCAL_NED:
-    in FRD the distance from the origin times the error of our yaw, which we call unknown, would be error of the
-    position."""
-    q = quaternion(attitude)
+    The frame of the pose is MAV_FRAME_LOCAL_FRD for ArduPilot, which accepts no other and reads it as north, east,
+    down. For PX4 it is MAV_FRAME_LOCAL_NED: in LOCAL_FRD PX4 would add the distance from the origin times the yaw
+    error, which is unknown here, to the position error."""
+    q = quaternion_from_euler(attitude)
     velocity_cov = [0.0] * 21
     velocity_cov[_XX] = velocity_cov[_YY] = velocity_cov[_ZZ] = gps.speed_accuracy_mps**2
     return mavlink.MAVLink_odometry_message(
         gps.t_ns // 1000,
         mavlink.MAV_FRAME_LOCAL_FRD if ardupilot else mavlink.MAV_FRAME_LOCAL_NED,
         mavlink.MAV_FRAME_BODY_FRD,
-        *north_east_down(gps, origin, ardupilot=ardupilot),
+        *position_ned_m(gps, origin, ardupilot=ardupilot),
         q,
-        *into_body(q, (gps.vn_mps, gps.ve_mps, gps.vd_mps)),
-        math.nan,  # turn rates: the autopilot's gyroscopes know better
+        *rotate_to_body(q, (gps.vn_mps, gps.ve_mps, gps.vd_mps)),
+        math.nan,  # angular rates are not sent: the autopilot's gyroscopes are better
         math.nan,
         math.nan,
         pose_covariance(gps, ardupilot=ardupilot),
         velocity_cov,
-        reset_counter=gps.resets % RESETS,
+        reset_counter=gps.resets % RESET_COUNTER_MODULUS,
         estimator_type=mavlink.MAV_ESTIMATOR_TYPE_VISION,
         quality=QUALITY_GOOD,
     )
 
 
 def vision_position(
-    gps: GpsInput, origin: Place, attitude: Attitude, *, ardupilot: bool
+    gps: GpsInput, origin: GeodeticPoint, attitude: Attitude, *, ardupilot: bool
 ) -> mavlink.MAVLink_vision_position_estimate_message:
     return mavlink.MAVLink_vision_position_estimate_message(
         gps.t_ns // 1000,
-        *north_east_down(gps, origin, ardupilot=ardupilot),
+        *position_ned_m(gps, origin, ardupilot=ardupilot),
         attitude.roll_rad,
         attitude.pitch_rad,
         attitude.yaw_rad,
         pose_covariance(gps, ardupilot=ardupilot),
-        reset_counter=gps.resets % RESETS,
+        reset_counter=gps.resets % RESET_COUNTER_MODULUS,
     )
 
 
-def quaternion(attitude: Attitude) -> tuple[float, float, float, float]:
-    """(w, x, y, z), body to north-east-down; yaw, then pitch, then roll."""
+def quaternion_from_euler(attitude: Attitude) -> tuple[float, float, float, float]:
+    """-> (w, x, y, z), body to north, east, down; rotations in the order yaw, pitch, roll."""
     cr, sr = math.cos(attitude.roll_rad / 2), math.sin(attitude.roll_rad / 2)
     cp, sp = math.cos(attitude.pitch_rad / 2), math.sin(attitude.pitch_rad / 2)
     cy, sy = math.cos(attitude.yaw_rad / 2), math.sin(attitude.yaw_rad / 2)
@@ -139,8 +145,8 @@ def quaternion(attitude: Attitude) -> tuple[float, float, float, float]:
     )
 
 
-def into_body(q: tuple[float, float, float, float], v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """A vector in north-east-down, in body axes: the inverse rotation of ``q``."""
+def rotate_to_body(q: tuple[float, float, float, float], v: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Rotates ``v`` from north, east, down into body axes, by the inverse of ``q`` (w, x, y, z)."""
     w, (x, y, z) = q[0], (-q[1], -q[2], -q[3])
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
     return (

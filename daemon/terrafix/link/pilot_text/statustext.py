@@ -1,16 +1,16 @@
-"""Words to the pilot: STATUSTEXT."""
+"""STATUSTEXT messages for the pilot."""
 
 from terrafix.messages import CalibrationFault, StatusText
 
-CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
+CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY [spec: MAVLink MAV_SEVERITY]
 
 
 def statustext(t_ns: int, severity: int, text: str) -> StatusText:
     return StatusText(t_ns=t_ns, severity=severity, text=f"Terrafix: {text}")
 
 
-def fault_words(fault: CalibrationFault) -> str:
-    """At most 40 characters of a monitor's finding."""
+def fault_text(fault: CalibrationFault) -> str:
+    """Text of 40 characters at most about a fault that a monitor found or ended."""
     if fault.quantity == "registration":
         return "the map is found nowhere: no fix" if fault.active else "the map is found again"
     if not fault.active:

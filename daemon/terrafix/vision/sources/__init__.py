@@ -1,4 +1,4 @@
-"""Sources of a flight: one small contract (``Source``), five kinds behind it, one door (``open_source``)."""
+"""Sources of a flight: the contract (``Source``), five implementations, one factory (``open_source``)."""
 
 import os
 from pathlib import Path
@@ -23,10 +23,10 @@ def open_source(
 ) -> Source:
     """Opens a flight folder, photos, a video file, a V4L2 device, a GStreamer pipeline or MJPEG over HTTP.
 
-    ``start`` (lat_deg, lon_deg) wins over what the source says. ``camera``: a camera description; live cameras
-    need it, for photos and videos it wins over theirs. ``rate_hz``: frames per second taken from a video or camera.
-    ``wait_for_camera``: a camera that is not there is waited for in ``shots`` (a restart in flight), not an error.
-    Raises SourceError, one line that says what to do."""
+    ``start`` (lat_deg, lon_deg) overrides the initial position of the source. ``camera``: a camera description; live
+    cameras require it, for photos and videos it overrides theirs. ``rate_hz``: frame rate taken from a video or camera.
+    ``wait_for_camera``: a missing camera is no error; ``shots`` waits for it (a restart in flight).
+    Raises SourceError: one line with the problem and the remedy."""
     if not spec.strip():
         raise SourceError(
             "no source given; name a flight folder, photos, a video, /dev/videoN, http://... or a GStreamer pipeline"
@@ -53,18 +53,18 @@ def open_source(
 
 
 def open_configured(
-    wanted: SourceSection,
+    section: SourceSection,
     spec: str = "",
     start: tuple[float, float] | None = None,
     *,
     wait_for_camera: bool = False,
 ) -> Source:
-    """open_source with the [source] section of the configuration; ``spec`` and ``start`` win when they are given."""
+    """``open_source`` with the [source] section of the configuration; ``spec`` and ``start`` override it when given."""
     return open_source(
-        spec or wanted.path,
-        start=start or parse_start(wanted.start),
-        camera=Path(wanted.camera).expanduser() if wanted.camera else None,
-        rate_hz=wanted.rate_hz,
+        spec or section.path,
+        start=start or parse_start(section.start),
+        camera=Path(section.camera).expanduser() if section.camera else None,
+        rate_hz=section.rate_hz,
         wait_for_camera=wait_for_camera,
     )
 

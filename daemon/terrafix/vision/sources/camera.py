@@ -1,4 +1,4 @@
-"""A live camera: V4L2 device, GStreamer pipeline, MJPEG over HTTP. Lost, it is waited for; it never ends by itself."""
+"""Live camera: V4L2 device, GStreamer pipeline, or MJPEG over HTTP. Reconnects after a loss and does not end."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -15,13 +15,13 @@ from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
 from terrafix.vision.sources.mjpeg import MjpegCapture
 
-RECONNECT_S = 1.0  # a USB camera needs about this long to come back
-READ_TIMEOUT_MS = 2000  # OpenCV's own 10 s would hold up the end of the process
-MAX_DRIVER_AGE_NS = 1_000_000_000  # an older stamp of the driver is of another clock
+RECONNECT_S = 1.0  # a USB camera needs about this long to re-enumerate
+READ_TIMEOUT_MS = 2000  # OpenCV's default of 10 s would delay the exit of the process
+MAX_DRIVER_AGE_NS = 1_000_000_000  # an older driver timestamp belongs to another clock
 
 
 class Capture(Protocol):
-    """What is used of cv2.VideoCapture."""
+    """The used part of cv2.VideoCapture."""
 
     def grab(self) -> bool: ...
 
@@ -33,7 +33,7 @@ class Capture(Protocol):
 
 
 class LiveCamera:
-    """Frames with ``t_ns`` on the monotonic clock: the driver's stamp where it has one, else the time of arrival."""
+    """Frames with ``t_ns`` on the monotonic clock: the driver's timestamp if there is one, else the time of arrival."""
 
     live = True
 
@@ -48,7 +48,9 @@ class LiveCamera:
         open_capture: Callable[[str, Camera], Capture | None] | None = None,
         reconnect_s: float = RECONNECT_S,
     ) -> None:
-        """``wait``: no error when the device is not there now. ``open_capture(spec, camera)`` -> None: it is not."""
+        """``wait``: no error when the device is missing now. ``open_capture(spec, camera)`` -> None: it is missing.
+
+        Raises SourceError: no camera description, the device cannot be opened, or it has another image size."""
         if camera is None:
             raise SourceError(
                 f"{spec}: a camera does not say its own focal length; set [source] camera in the configuration to a "
@@ -62,7 +64,7 @@ class LiveCamera:
         self._reconnect_s = reconnect_s
         self._closed = threading.Event()
         self._streaming = False
-        self._capture = self._reopened() if wait else self._open(self.spec, self._origin.camera)
+        self._capture = self._try_open() if wait else self._open(self.spec, self._origin.camera)
         if self._capture is not None:
             self._check_size(self._capture)
         elif not wait:
@@ -81,29 +83,29 @@ class LiveCamera:
         return None
 
     def close(self) -> None:
-        """Ends ``shots``, from any thread; the thread that runs it gives the device back."""
+        """Ends ``shots``, from any thread; the thread that runs ``shots`` releases the device."""
         self._closed.set()
         if not self._streaming:
             self._disconnect()
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
-        """A camera has no past: ``from_s`` does not matter."""
+        """``from_s`` is ignored: a camera has no earlier frames."""
         frame_id, due_ns = 0, 0
         self._streaming = True
         try:
             while not self._closed.is_set():
-                capture = self._connected()
+                capture = self._ensure_connected()
                 if capture is None:
                     continue
                 if not capture.grab():
                     self._disconnect()
                     if not self._closed.is_set():
-                        logs.get().warning("camera lost; it is waited for", source=self.spec)
+                        logs.get().warning("camera lost; reconnecting", source=self.spec)
                     continue
-                t_ns = _stamp(capture, now_ns())
+                t_ns = _timestamp_ns(capture, now_ns())
                 if t_ns < due_ns:
                     continue
-                due_ns = max(due_ns + self._period_ns, t_ns + self._period_ns // 2)  # keeps the mean, no bursts
+                due_ns = max(due_ns + self._period_ns, t_ns + self._period_ns // 2)  # keeps the mean rate, no bursts
                 yield self._shot(capture, frame_id, t_ns)
                 frame_id += 1
         finally:
@@ -112,27 +114,27 @@ class LiveCamera:
 
     def _shot(self, capture: Capture, frame_id: int, t_ns: int) -> Shot:
         camera = self._origin.camera
-        whole, image = capture.retrieve()
-        error = "" if whole else "cannot be decoded"
-        if whole and image.shape != (camera.height, camera.width, 3):
+        decoded, image = capture.retrieve()
+        error = "" if decoded else "cannot be decoded"
+        if decoded and image.shape != (camera.height, camera.width, 3):
             error = f"wrong size: {image.shape[1]}x{image.shape[0]}, the camera says {camera.width}x{camera.height}"
         frame = Frame(t_ns=t_ns, frame_id=frame_id, file="", width=camera.width, height=camera.height, error=error)
         return Shot(frame, (), None if error else image)
 
-    def _connected(self) -> Capture | None:
-        """The capture, opened again when it was lost; None after a wait in vain."""
+    def _ensure_connected(self) -> Capture | None:
+        """The capture, reopened after a loss; None when the attempt failed after a wait."""
         if self._capture is None and not self._closed.wait(self._reconnect_s):
-            self._capture = self._reopened()
+            self._capture = self._try_open()
             if self._capture is not None:
-                logs.get().info("camera is there", source=self.spec)
+                logs.get().info("camera connected", source=self.spec)
         return self._capture
 
-    def _reopened(self) -> Capture | None:
-        """In mid-flight a camera that cannot be opened now is not a mistake of the user's."""
+    def _try_open(self) -> Capture | None:
+        """Opens the capture; None on failure, since in flight a missing camera is not a configuration error."""
         try:
             return self._open(self.spec, self._origin.camera)
         except SourceError as error:
-            logs.get().debug("camera not there yet", source=self.spec, why=str(error))
+            logs.get().debug("camera not available yet", source=self.spec, why=str(error))
             return None
 
     def _disconnect(self) -> None:
@@ -143,7 +145,7 @@ class LiveCamera:
     def _check_size(self, capture: Capture) -> None:
         camera = self._origin.camera
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        unknown = size == (0, 0)  # a stream does not say its size before the first picture
+        unknown = size == (0, 0)  # the size of a stream is unknown before its first image
         if not unknown and size != (camera.width, camera.height):
             self._disconnect()
             raise SourceError(
@@ -152,13 +154,14 @@ class LiveCamera:
             )
 
 
-def is_address(spec: str) -> bool:
-    """Whether ``spec`` is the URL of a stream; a pipeline may hold one."""
+def is_stream_url(spec: str) -> bool:
+    """True when ``spec`` is a stream URL; a GStreamer pipeline may contain one."""
     return spec.startswith(("http://", "https://")) and "!" not in spec
 
 
-def _stamp(capture: Capture, arrival_ns: int) -> int:
-    """V4L2 stamps a buffer on the monotonic clock (V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC); OpenCV shows it as POS_MSEC."""
+def _timestamp_ns(capture: Capture, arrival_ns: int) -> int:
+    """Timestamp of the grabbed frame. V4L2 uses the monotonic clock (V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC) and OpenCV
+    returns it as POS_MSEC."""
     if isinstance(capture, MjpegCapture):
         return capture.stamp_ns or arrival_ns
     driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
@@ -166,7 +169,7 @@ def _stamp(capture: Capture, arrival_ns: int) -> int:
 
 
 def _open_capture(spec: str, camera: Camera) -> Capture | None:
-    if is_address(spec):
+    if is_stream_url(spec):
         return MjpegCapture(spec)
     if "!" in spec:
         if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
@@ -181,7 +184,7 @@ def _open_capture(spec: str, camera: Camera) -> Capture | None:
         capture = cv2.VideoCapture(spec, cv2.CAP_V4L2)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not the oldest one
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # deliver the newest frame, not the oldest
     capture.set(cv2.CAP_PROP_READ_TIMEOUT_MSEC, READ_TIMEOUT_MS)
     if not capture.isOpened():
         capture.release()

@@ -1,4 +1,4 @@
-"""The source contract: what every flight, photo folder, video and camera looks like to the rest."""
+"""The source contract: the common interface of flight folders, photo folders, videos and cameras."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,51 +9,53 @@ import numpy as np
 
 from terrafix.messages import Frame, Imu, Origin, VehicleState
 
-Said = TypeVar("Said", VehicleState, Imu)
+TimedMessage = TypeVar("TimedMessage", VehicleState, Imu)
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame of a source, with what the vehicle reported on the way to it."""
+    """One frame of a source, with the telemetry since the previous one."""
 
-    frame: Frame  # frame.error is set and image is None when the pixels cannot be trusted
+    frame: Frame  # when the pixels are not usable, frame.error is set and image is None
     states: tuple[VehicleState, ...]  # measured since the previous shot, up to this frame, in time order
     image: np.ndarray | None  # (H, W, 3) uint8 BGR
-    imu: tuple[Imu, ...] = ()  # inertial readings of the same time
+    imu: tuple[Imu, ...] = ()  # IMU samples of the same interval
 
 
-class UpTo(Generic[Said]):
-    """What was said since the last call, up to a time. ``said`` in time order; what is before ``from_ns`` falls out."""
+class TelemetryCursor(Generic[TimedMessage]):
+    """Cursor over a time-ordered sequence: a call returns the messages since the last call, up to ``t_ns``.
 
-    def __init__(self, said: Sequence[Said], from_ns: int) -> None:
-        self._said: Sequence[Said] = said
+    Messages before ``from_ns`` are dropped."""
+
+    def __init__(self, messages: Sequence[TimedMessage], from_ns: int) -> None:
+        self._messages: Sequence[TimedMessage] = messages
         self._from_ns, self._at = from_ns, 0
 
-    def __call__(self, t_ns: int) -> tuple[Said, ...]:
+    def __call__(self, t_ns: int) -> tuple[TimedMessage, ...]:
         first = self._at
-        while self._at < len(self._said) and self._said[self._at].t_ns <= t_ns:
+        while self._at < len(self._messages) and self._messages[self._at].t_ns <= t_ns:
             self._at += 1
-        return tuple(m for m in self._said[first : self._at] if m.t_ns >= self._from_ns)
+        return tuple(m for m in self._messages[first : self._at] if m.t_ns >= self._from_ns)
 
 
 class Source(Protocol):
-    """``t_ns`` of everything is relative to the flight's zero (``live`` False: a recording), or on the
-    monotonic clock (``live`` True: a camera). ``frame_id`` counts from 0 in source order."""
+    """Recordings (``live`` False) have ``t_ns`` relative to the start of the flight; cameras (``live`` True) on the
+    monotonic clock. ``frame_id`` counts from 0 in source order."""
 
     live: bool
 
     def origin(self) -> Origin: ...
 
     def length(self) -> int | None:
-        """Expected number of shots; None: not known."""
+        """Expected number of shots; None: unknown."""
         ...
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
-        """Shots from ``from_s`` on; what lies before is skipped without reading its pixels, ids stay the same."""
+        """Shots from ``from_s`` on. Earlier ones are skipped without reading their pixels; frame ids do not change."""
         ...
 
     def map_hint(self) -> Path | None:
-        """Map that the flight names, resolved; it may not exist."""
+        """Resolved path of the map that the flight names; the file may not exist."""
         ...
 
     def name(self) -> str: ...

@@ -1,7 +1,7 @@
-"""flight.toml and camera descriptions: who took the pictures, from where, and how good the telemetry is.
+"""flight.toml and camera descriptions: camera, mount, initial position, accuracy of the telemetry.
 
-One format for three places: ``flight.toml`` in a flight folder, the sidecar of a video, and a camera
-description in ``config/cameras`` (no [start]). Strict: a key that is not here is an error with the nearest name."""
+The same format serves ``flight.toml`` in a flight folder, the sidecar of a video, and a camera description in
+``config/cameras`` (without [start]). Parsing is strict: an unknown key is an error that names the closest key."""
 
 import difflib
 import math
@@ -17,14 +17,14 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import Camera, Origin
 from terrafix.vision.sources.plausible import check_camera
 
-START_SIGMA_M = 10.0  # a coordinate read off a map or a phone before take-off
+START_SIGMA_M = 10.0  # a coordinate from a map or a phone before take-off
 YAW_SIGMA_DEG = 5.0  # compass of a small multirotor near its motors
-AGL_SIGMA_M = 5.0  # barometer drift over a flight, and ground that is not as flat as at take-off
+AGL_SIGMA_M = 5.0  # barometer drift over a flight, and terrain relief relative to the take-off point
 ATTITUDE_SIGMA_DEG = 2.0  # EKF attitude under acceleration
-# 1-sigma of a focal length: of a lens that was calibrated, which gives distortion, too, and of a nominal one. A wide
-# lens that is described by its field of view, as if it were a pinhole, was 30 % off in a public data set.
+# Relative 1-sigma of the focal length: calibrated (a calibration also gives distortion), and nominal. A wide-angle lens
+# that was described by its field of view as a pinhole was 30 % off in a public data set.
 CALIBRATED_FOCAL_SIGMA, FOCAL_SIGMA = 0.01, 0.1
-DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)  # what OpenCV's projectPoints takes
+DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)  # accepted by OpenCV's projectPoints
 
 Positive = Annotated[float, Meta(gt=0)]
 Degrees = Annotated[float, Meta(ge=-360, le=360)]
@@ -35,7 +35,7 @@ class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class CameraTable(_Table, frozen=True, kw_only=True):
-    """Pinhole camera in pixels of the stored frames."""
+    """Pinhole camera; all lengths in pixels of the stored frames."""
 
     width: Annotated[int, Meta(ge=16, le=65_535)]
     height: Annotated[int, Meta(ge=16, le=65_535)]
@@ -49,7 +49,7 @@ class CameraTable(_Table, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, camera: Camera) -> "CameraTable":
-        """As a file would describe it."""
+        """The table that describes this camera."""
         return cls(
             width=camera.width,
             height=camera.height,
@@ -73,7 +73,7 @@ class StartTable(_Table, frozen=True, kw_only=True):
     lat_deg: Annotated[float, Meta(ge=-90, le=90)]
     lon_deg: Annotated[float, Meta(ge=-180, le=180)]
     ground_amsl_m: Annotated[float, Meta(ge=-500, le=9000)] | None = None
-    alt_amsl_m: Annotated[float, Meta(ge=-500, le=9000)] | None = None  # another name for ground_amsl_m
+    alt_amsl_m: Annotated[float, Meta(ge=-500, le=9000)] | None = None  # alias of ground_amsl_m
     sigma_m: Annotated[float, Meta(gt=0, le=100_000)] = START_SIGMA_M
 
 
@@ -81,11 +81,11 @@ class TelemetryTable(_Table, frozen=True, kw_only=True):
     yaw_sigma_deg: Positive = YAW_SIGMA_DEG
     agl_sigma_m: Positive = AGL_SIGMA_M
     attitude_sigma_deg: Positive = ATTITUDE_SIGMA_DEG
-    tlog_t0_us: int | None = None  # UNIX microseconds of t_s = 0; absent: the first record of the log
+    tlog_t0_us: int | None = None  # UNIX microseconds of t_s = 0; absent: time of the first record of the log
 
 
 class Description(_Table, frozen=True, kw_only=True):
-    """A whole file. ``truth`` is for the evaluation and is not looked into."""
+    """A whole file. ``truth`` is for the evaluation and is not read."""
 
     version: Literal[1] = 1
     name: str = ""
@@ -102,7 +102,7 @@ class Description(_Table, frozen=True, kw_only=True):
 
 
 def read_description(path: Path) -> Description:
-    """Raises SourceError: missing or broken file, unknown key, value out of bounds."""
+    """Reads and validates a file. Raises SourceError: missing or broken file, unknown key, value out of bounds."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
@@ -112,11 +112,11 @@ def read_description(path: Path) -> Description:
     except tomllib.TOMLDecodeError as error:
         raise SourceError(f"{path}: not valid TOML ({error})") from None
     try:
-        read = msgspec.convert(table, Description)
+        description = msgspec.convert(table, Description)
     except msgspec.ValidationError as error:
         raise SourceError(f"{path}: {_explain(str(error))}") from None
     _check_numbers(path, table)
-    camera = read.camera
+    camera = description.camera
     if camera and len(camera.distortion) not in DISTORTION_LENGTHS:
         raise SourceError(
             f"{path}: [camera] distortion has {len(camera.distortion)} numbers; OpenCV takes 0, 4, 5, 8, 12 or 14"
@@ -126,16 +126,16 @@ def read_description(path: Path) -> Description:
             f"{path}: [camera] cx, cy ({camera.cx:g}, {camera.cy:g}) lies outside the {camera.width}x{camera.height} "
             "image; all of [camera] is in pixels of the stored frames"
         )
-    if read.start and read.start.ground_amsl_m is not None and read.start.alt_amsl_m is not None:
+    if description.start and description.start.ground_amsl_m is not None and description.start.alt_amsl_m is not None:
         raise SourceError(f"{path}: [start] has both ground_amsl_m and alt_amsl_m; they mean the same, keep one")
-    return read
+    return description
 
 
-def camera_of(path: Path, read: Description) -> Camera:
-    """Camera and mount of the description in ``path``. SourceError: there is no [camera], or it cannot be."""
-    if read.camera is None:
+def camera_of(path: Path, description: Description) -> Camera:
+    """Camera and mount of the description in ``path``. Raises SourceError: no [camera], or implausible values."""
+    if description.camera is None:
         raise SourceError(f"{path}: there is no [camera]; add one with width, height, fx, fy, cx, cy in pixels")
-    c, m = read.camera, read.mount
+    c, m = description.camera, description.mount
     camera = Camera(
         width=c.width,
         height=c.height,
@@ -154,29 +154,35 @@ def camera_of(path: Path, read: Description) -> Camera:
     return camera
 
 
-def origin_of(read: Description, camera: Camera, start: tuple[float, float] | None) -> Origin:
-    """The flight's Origin at t 0. ``start`` (lat_deg, lon_deg) wins over [start]; with neither the start is unknown
-    (``core.start``)."""
-    known = read.start is not None or start is not None
-    lat_deg, lon_deg = start if start else (read.start.lat_deg, read.start.lon_deg) if read.start else (0.0, 0.0)
+def origin_of(description: Description, camera: Camera, start: tuple[float, float] | None) -> Origin:
+    """The flight's Origin at t 0. ``start`` (lat_deg, lon_deg) overrides [start]; without both, the initial position is
+    unknown (infinite sigma, ``core.initial_position``)."""
+    known = description.start is not None or start is not None
+    lat_deg, lon_deg = (
+        start if start else (description.start.lat_deg, description.start.lon_deg) if description.start else (0.0, 0.0)
+    )
     ground_m = None
-    if read.start:
-        ground_m = read.start.ground_amsl_m if read.start.ground_amsl_m is not None else read.start.alt_amsl_m
+    if description.start:
+        ground_m = (
+            description.start.ground_amsl_m
+            if description.start.ground_amsl_m is not None
+            else description.start.alt_amsl_m
+        )
     return Origin(
         t_ns=0,
         camera=camera,
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         ground_amsl_m=ground_m,
-        start_sigma_m=read.start.sigma_m if read.start else START_SIGMA_M if known else math.inf,
-        yaw_sigma_deg=read.telemetry.yaw_sigma_deg,
-        agl_sigma_m=read.telemetry.agl_sigma_m,
-        attitude_sigma_deg=read.telemetry.attitude_sigma_deg,
+        start_sigma_m=description.start.sigma_m if description.start else START_SIGMA_M if known else math.inf,
+        yaw_sigma_deg=description.telemetry.yaw_sigma_deg,
+        agl_sigma_m=description.telemetry.agl_sigma_m,
+        attitude_sigma_deg=description.telemetry.attitude_sigma_deg,
     )
 
 
 def _check_numbers(path: Path, table: dict[str, Any], where: str = "") -> None:
-    """TOML knows nan and inf; no key here can mean anything with them."""
+    """Raises SourceError for nan and inf, which TOML permits but no key accepts."""
     for key, value in table.items():
         if where == "" and key == "truth":
             continue
@@ -188,7 +194,7 @@ def _check_numbers(path: Path, table: dict[str, Any], where: str = "") -> None:
 
 
 def _explain(text: str) -> str:
-    """msgspec's message in the words of the file, with the nearest known key."""
+    """msgspec's message in terms of the file, with the closest known key."""
     missing = re.search(r"missing required field `(.+?)`(?: - at `\$\.?(.*?)`)?", text)
     if missing:
         return f"[{missing.group(2)}] has no '{missing.group(1)}'; add it"

@@ -1,4 +1,4 @@
-"""EXIF and XMP of one photo: time, focal length, coordinate, and what a DJI drone says about height and gimbal.
+"""EXIF and XMP of one photo: time, focal length, coordinate; height and gimbal attitude of DJI drones.
 
 References: EXIF 2.32 (JEITA CP-3451E) for the tags; DJI's XMP namespace ``drone-dji`` for the rest."""
 
@@ -21,7 +21,7 @@ _EXIF_WIDTH = 0xA002
 _PLANE_X_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
 _PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}  # inch (also the default), centimetre, millimetre
 
-# Width of the whole sensor, mm, as the makers publish it; every mode of these cameras uses the whole width.
+# Width of the whole sensor in mm, from the manufacturers; every mode of these cameras uses the whole width.
 SENSOR_WIDTH_MM = {
     "FC220": 6.17,  # Mavic Pro
     "FC300C": 6.17,  # Phantom 3 Standard
@@ -35,8 +35,8 @@ SENSOR_WIDTH_MM = {
     "L1D-20c": 13.2,  # Mavic 2 Pro
     "M3E": 17.3,  # Mavic 3 Enterprise
 }
-DIAGONAL_35_MM = 43.267  # of a 36x24 mm frame: the 35 mm equivalent compares diagonals (CIPA DCG-001)
-WIDE_ASPECT = 1.6  # a photo wider than this is a crop of a 4:3 sensor, whose diagonal the equivalent refers to
+DIAGONAL_35_MM = 43.267  # diagonal of 36x24 mm: the 35 mm equivalent focal length refers to diagonals (CIPA DCG-001)
+WIDE_ASPECT = 1.6  # a wider photo is a crop of a 4:3 sensor; the 35 mm equivalent refers to the sensor's diagonal
 XMP_NUMBERS = (
     "RelativeAltitude",
     "GimbalYawDegree",
@@ -51,11 +51,11 @@ XMP_NUMBERS = (
 
 @dataclass(frozen=True)
 class PhotoInfo:
-    """What a photo says about itself; None and absent keys are not known."""
+    """Metadata of a photo; None and absent keys are unknown."""
 
     width: int
     height: int
-    taken: datetime | None = None  # wall time of the camera, good for differences only
+    taken: datetime | None = None  # local time of the camera; valid for differences only
     has_subsec: bool = False
     focal_px: float | None = None
     focal_from: str = ""
@@ -65,7 +65,7 @@ class PhotoInfo:
 
 
 def read_info(path: Path) -> PhotoInfo | None:
-    """None: not readable as an image at all."""
+    """Metadata of a photo; None when it is not a readable image."""
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             width, height = image.size
@@ -74,17 +74,18 @@ def read_info(path: Path) -> PhotoInfo | None:
             gps: dict[int, Any] = dict(exif.get_ifd(_GPS_IFD))
             packet = image.info.get("xmp", b"")
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return None  # what Pillow raises for broken headers and directories
+        return None  # Pillow raises these for broken headers and directories
     xmp = _xmp(packet if isinstance(packet, bytes) else str(packet).encode())
-    taken, has_subsec = _taken(main)
+    taken, has_subsec = _capture_time(main)
     focal_px, focal_from = _focal_px(main, xmp, width, height)
     lat_deg, lon_deg = _angle(gps, 2, 1, "S", 90.0), _angle(gps, 4, 3, "W", 180.0)
     if lat_deg == 0.0 and lon_deg == 0.0:
-        lat_deg = lon_deg = None  # what cameras write before they have a fix
+        lat_deg = lon_deg = None  # cameras write 0, 0 before they have a fix
     return PhotoInfo(width, height, taken, has_subsec, focal_px, focal_from, lat_deg, lon_deg, xmp)
 
 
-def _taken(main: dict[int, Any]) -> tuple[datetime | None, bool]:
+def _capture_time(main: dict[int, Any]) -> tuple[datetime | None, bool]:
+    """Time of capture, and whether it has a fraction of a second."""
     text = _text(main.get(_DATETIME_ORIGINAL)) or _text(main.get(_DATETIME))
     try:
         taken = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
@@ -97,7 +98,7 @@ def _taken(main: dict[int, Any]) -> tuple[datetime | None, bool]:
 
 
 def _focal_px(main: dict[int, Any], xmp: dict[str, float], width: int, height: int) -> tuple[float | None, str]:
-    """Focal length in pixels of the stored photo, best evidence first, and where it comes from."""
+    """Focal length in pixels of the stored photo from the most accurate tag available, and the name of that tag."""
     stored = _number(main.get(_EXIF_WIDTH)) or float(width)
     resized = width / stored if stored >= 1 else 1.0
     if xmp.get("CalibratedFocalLength", 0.0) > 0:
@@ -118,7 +119,7 @@ def _focal_px(main: dict[int, Any], xmp: dict[str, float], width: int, height: i
 
 
 def _xmp(packet: bytes) -> dict[str, float]:
-    """DJI's numbers, written as attributes or as elements."""
+    """DJI's numeric XMP fields, written as attributes or as elements."""
     text = packet.decode("utf-8", errors="replace")
     found: dict[str, float] = {}
     for key in XMP_NUMBERS:
@@ -129,7 +130,7 @@ def _xmp(packet: bytes) -> dict[str, float]:
 
 
 def _angle(gps: dict[int, Any], value: int, reference: int, negative: str, limit_deg: float) -> float | None:
-    """Degrees, minutes, seconds -> degrees; None when a part is missing or out of range."""
+    """Degrees, minutes, seconds -> signed degrees; None when a part is missing or out of range."""
     try:
         degrees, minutes, seconds = (float(part) for part in gps[value])
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
@@ -141,7 +142,7 @@ def _angle(gps: dict[int, Any], value: int, reference: int, negative: str, limit
 
 
 def _number(value: Any) -> float | None:
-    """A positive finite number, or None. EXIF rationals may be 0/0."""
+    """A positive finite number, else None. EXIF rationals may be 0/0."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -150,5 +151,5 @@ def _number(value: Any) -> float | None:
 
 
 def _text(value: Any) -> str:
-    """Cameras pad with NUL."""
+    """A string without the NUL padding of some cameras; "" for other types."""
     return value.replace("\0", " ").strip() if isinstance(value, str) else ""

@@ -1,6 +1,6 @@
-"""A flight folder: flight.toml, frames.csv, frames/ and optionally telemetry.tlog (docs/flight-folder.md).
+"""Flight folder: flight.toml, frames.csv, frames/ and optionally telemetry.tlog (docs/flight-folder.md).
 
-truth.csv may lie there too; nothing here opens it."""
+It may also contain truth.csv, which is not read here."""
 
 import os
 from collections.abc import Iterator
@@ -9,15 +9,15 @@ from pathlib import Path, PurePosixPath
 from terrafix.core.errors import SourceError
 from terrafix.core.mavlink.tlog import read_imu, read_tlog
 from terrafix.messages import Frame, Imu, Origin, VehicleState
-from terrafix.vision.sources.contract import Shot, UpTo
+from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
-from terrafix.vision.sources.images import WRONG_SIZE, read_image, reduced
+from terrafix.vision.sources.images import WRONG_SIZE, downscaled_camera, read_image
 from terrafix.vision.sources.plausible import check_heights
 from terrafix.vision.sources.table import Row, read_table
 
 
 class FlightFolder:
-    """Opens everything but the pixels, so that a mistake is found before the flight and not in it."""
+    """Validates everything except the pixels when it is opened, so that errors are found before the flight."""
 
     live = False
 
@@ -26,10 +26,10 @@ class FlightFolder:
         toml = folder / "flight.toml"
         self._description = read_description(toml)
         self._stored = camera_of(toml, self._description)
-        self._origin = origin_of(self._description, reduced(self._stored), start)
+        self._origin = origin_of(self._description, downscaled_camera(self._stored), start)
         self._rows = read_table(folder / "frames.csv", "frames.csv", with_file=True)
-        told = [row.state.agl_m for row in self._rows if row.state is not None and row.state.agl_m is not None]
-        check_heights(folder / "frames.csv", told)
+        heights_m = [row.state.agl_m for row in self._rows if row.state is not None and row.state.agl_m is not None]
+        check_heights(folder / "frames.csv", heights_m)
         self._check_files()
         self._check_size()
         self._states = self._telemetry()
@@ -48,12 +48,12 @@ class FlightFolder:
         return (self.folder / self._description.map).resolve() if self._description.map else None
 
     def close(self) -> None:
-        """Nothing stays open between shots."""
+        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         from_ns = round(from_s * 1e9)
         camera, stored = self._origin.camera, self._stored
-        states_of, imu_of = UpTo(self._states, from_ns), UpTo(self._imu, from_ns)
+        states_of, imu_of = TelemetryCursor(self._states, from_ns), TelemetryCursor(self._imu, from_ns)
         for frame_id, row in enumerate(self._rows):
             states, imu = states_of(row.t_ns), imu_of(row.t_ns)
             if row.t_ns < from_ns:
@@ -84,7 +84,9 @@ class FlightFolder:
                 )
 
     def _check_size(self) -> None:
-        """One frame of another size is a bad frame; the first, the middle and the last are a wrong [camera]."""
+        """Raises SourceError when the first, middle and last frame have another size than [camera].
+
+        A single frame of another size is only a bad frame."""
         stored = self._stored
         for row in (self._rows[0], self._rows[len(self._rows) // 2], self._rows[-1]):
             _, error = read_image(self.folder / "frames" / row.file, stored.width, stored.height)
@@ -95,7 +97,7 @@ class FlightFolder:
         )
 
     def _telemetry(self) -> list[VehicleState]:
-        """States of frames.csv and of telemetry.tlog in time order. A tlog starts before the first frame or after."""
+        """States of frames.csv and telemetry.tlog in time order. A tlog may start before or after the first frame."""
         states = [row.state for row in self._rows if row.state is not None]
         log = self._log()
         if log is not None:

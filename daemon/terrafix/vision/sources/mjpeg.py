@@ -1,7 +1,7 @@
-"""Pictures over HTTP, as IP cameras send them: multipart/x-mixed-replace, one JPEG a part.
+"""MJPEG over HTTP, as IP cameras send it: multipart/x-mixed-replace (RFC 2046, section 5.1), one JPEG per part.
 
-A part may say when its exposure was, in ``X-Timestamp-Ns`` on CLOCK_MONOTONIC of this machine; without it the time of
-arrival counts. Format: RFC 2046, section 5.1."""
+The header ``X-Timestamp-Ns`` of a part may carry the exposure time on CLOCK_MONOTONIC of this computer; without it, the
+time of arrival is used."""
 
 import http.client
 import urllib.parse
@@ -12,95 +12,95 @@ import numpy as np
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
 
-STALL_S = 5.0  # a camera that is silent for longer is taken for lost: at 2 Hz that is ten pictures
-MAX_PART_BYTES = 64 << 20  # no camera sends more; what does is not a camera
+TIMEOUT_S = 5.0  # time-out without data after which the camera counts as lost; ten images at 2 Hz
+MAX_PART_BYTES = 64 << 20  # limit; larger than the images of any camera
 MAX_LINE_BYTES = 8192
-MAX_AGE_NS = 60_000_000_000  # an older stamp, or one of the future, is of another clock
+MAX_AGE_NS = 60_000_000_000  # a timestamp that is older, or in the future, belongs to another clock
 STAMP_HEADER = "x-timestamp-ns"
 
 
 class MjpegCapture:
-    """An open stream, with the methods of cv2.VideoCapture that a live camera needs."""
+    """An open stream with the cv2.VideoCapture methods that ``LiveCamera`` uses."""
 
     def __init__(self, url: str) -> None:
-        """Raises SourceError: nobody answers there, or the answer is no MJPEG stream."""
-        self.stamp_ns: int | None = None  # of the grabbed picture, on our clock; None: it did not say
+        """Raises SourceError: no connection, or the response is not an MJPEG stream."""
+        self.stamp_ns: int | None = None  # timestamp of the grabbed image on the monotonic clock; None: it has none
         self._jpeg = b""
-        self._at_part = False  # the boundary before the next part was already read
-        place = urllib.parse.urlsplit(url)
-        kind = http.client.HTTPSConnection if place.scheme == "https" else http.client.HTTPConnection
+        self._at_part = False  # the boundary before the next part is already read
+        address = urllib.parse.urlsplit(url)
+        connection_type = http.client.HTTPSConnection if address.scheme == "https" else http.client.HTTPConnection
         try:
-            self._connection = kind(place.hostname or "", place.port, timeout=STALL_S)
-            self._connection.request("GET", place._replace(scheme="", netloc="").geturl() or "/")
-            self._answer = self._connection.getresponse()
+            self._connection = connection_type(address.hostname or "", address.port, timeout=TIMEOUT_S)
+            self._connection.request("GET", address._replace(scheme="", netloc="").geturl() or "/")
+            self._response = self._connection.getresponse()
         except (OSError, ValueError, http.client.HTTPException) as error:
-            raise SourceError(f"{url}: nobody sends pictures there ({error}); is the camera on?") from None
-        said = self._answer.headers
-        boundary = said.get_boundary() if said.get_content_maintype() == "multipart" else None
-        if self._answer.status != http.client.OK or not boundary:
+            raise SourceError(f"{url}: no response from the stream ({error}); is the camera on?") from None
+        headers = self._response.headers
+        boundary = headers.get_boundary() if headers.get_content_maintype() == "multipart" else None
+        if self._response.status != http.client.OK or not boundary:
             self.release()
             raise SourceError(
-                f"{url}: answers {self._answer.status} {said.get_content_type()}, not an MJPEG stream "
+                f"{url}: answers {self._response.status} {headers.get_content_type()}, not an MJPEG stream "
                 "(multipart/x-mixed-replace); look up the address of the stream in the camera's manual"
             )
-        self._boundary = b"--" + boundary.removeprefix("--").encode()  # some cameras write the dashes into the header
+        self._boundary = b"--" + boundary.removeprefix("--").encode()  # some cameras include the dashes in the header
 
     def grab(self) -> bool:
-        """Waits for the next picture; False: the stream ended, was silent for STALL_S, or is no stream of pictures."""
+        """Waits for the next image. False: end of stream, time-out (STALL_S), or malformed stream."""
         try:
             while not self._at_part:
-                self._at_part = self._line().startswith(self._boundary)
+                self._at_part = self._read_line().startswith(self._boundary)
             self._at_part = False
-            said = http.client.parse_headers(self._answer)
-            length = said.get("content-length")
-            self._jpeg = self._up_to_boundary() if length is None else self._exactly(int(length))
+            headers = http.client.parse_headers(self._response)
+            length = headers.get("content-length")
+            self._jpeg = self._read_to_boundary() if length is None else self._read_exactly(int(length))
         except (OSError, ValueError, http.client.HTTPException):
             return False
-        self.stamp_ns = _plausible(said.get(STAMP_HEADER, ""), now_ns())
+        self.stamp_ns = _valid_stamp(headers.get(STAMP_HEADER, ""), now_ns())
         return True
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
-        """-> whether the grabbed picture could be decoded, (H, W, 3) uint8 BGR."""
+        """-> whether the grabbed image could be decoded, and the image (H, W, 3) uint8 BGR."""
         image = cv2.imdecode(np.frombuffer(self._jpeg, np.uint8), cv2.IMREAD_COLOR) if self._jpeg else None
         return image is not None, image
 
     def get(self, prop: int) -> float:
-        """0, "not known", for every property: a stream does not say its size before the first picture."""
+        """0 (unknown) for every property: the size of a stream is unknown before its first image."""
         return 0.0
 
     def release(self) -> None:
         self._connection.close()
-        self._answer.close()
+        self._response.close()
 
-    def _line(self) -> bytes:
-        line = self._answer.readline(MAX_LINE_BYTES)
+    def _read_line(self) -> bytes:
+        line = self._response.readline(MAX_LINE_BYTES)
         if not line:
             raise ConnectionResetError("the stream ended")
         return line
 
-    def _exactly(self, size: int) -> bytes:
+    def _read_exactly(self, size: int) -> bytes:
         if not 0 <= size <= MAX_PART_BYTES:
-            raise ValueError(f"a picture of {size} bytes")
-        body = self._answer.read(size)
+            raise ValueError(f"a part of {size} bytes")
+        body = self._response.read(size)
         if len(body) < size:
-            raise ConnectionResetError("the stream ended inside a picture")
+            raise ConnectionResetError("the stream ended inside a part")
         return body
 
-    def _up_to_boundary(self) -> bytes:
-        """The part of a camera that does not say how long it is."""
+    def _read_to_boundary(self) -> bytes:
+        """Reads a part without a content length."""
         lines: list[bytes] = []
         size = 0
-        while not (line := self._line()).startswith(self._boundary):
+        while not (line := self._read_line()).startswith(self._boundary):
             lines.append(line)
             size += len(line)
             if size > MAX_PART_BYTES:
-                raise ValueError("a picture without an end")
+                raise ValueError("a part without an end")
         self._at_part = True
         return b"".join(lines).removesuffix(b"\r\n")
 
 
-def _plausible(text: str, arrival_ns: int) -> int | None:
-    """A stamp of our own clock, or None."""
+def _valid_stamp(text: str, arrival_ns: int) -> int | None:
+    """A plausible timestamp of the monotonic clock, else None."""
     if not text.strip().isdecimal():
         return None
     stamp_ns = int(text)

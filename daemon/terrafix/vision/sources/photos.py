@@ -1,7 +1,7 @@
-"""A folder of photos as a camera leaves them: everything that is known comes from EXIF and XMP.
+"""Folder of photos as a camera stores them; all metadata comes from EXIF and XMP.
 
-The body of such a flight is the gimbal's: a virtual vehicle that carries the camera straight down with the image
-top forward. At gimbal pitch -90 the image top points to the gimbal's yaw, so that is the body's yaw."""
+The body frame of such a flight is a virtual vehicle that carries the camera straight down with the image top forward.
+At gimbal pitch -90 the image top points along the gimbal's yaw, so that is the body's yaw."""
 
 import math
 from collections.abc import Iterator
@@ -12,22 +12,22 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.errors import SourceError
-from terrafix.core.geodesy import angles_of, rot_w_b
+from terrafix.core.geodesy import euler_from_rot, rot_w_b
 from terrafix.messages import Camera, Frame, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import Description, StartTable, camera_of, origin_of, read_description
 from terrafix.vision.sources.exif import PhotoInfo, read_info
-from terrafix.vision.sources.images import IMAGE_SUFFIXES, read_image, reduced
+from terrafix.vision.sources.images import IMAGE_SUFFIXES, downscaled_camera, read_image
 
-GIMBAL_TOLERANCE_DEG = 3.0  # a stabilised gimbal that says where it points
-EXIF_FOCAL_SIGMA = 0.03  # in EXIF it is rounded, or that of a film camera; and lenses bend
-UNKNOWN_TOLERANCE_DEG = 10.0  # nothing says how the camera hangs
-UNTIMED_STEP_S = 1.0  # photos without any time: order by name, one a second
+GIMBAL_TOLERANCE_DEG = 3.0  # a stabilised gimbal that reports its attitude
+EXIF_FOCAL_SIGMA = 0.03  # the focal length in EXIF is rounded, or a 35 mm equivalent, and ignores distortion
+UNKNOWN_TOLERANCE_DEG = 10.0  # the mount angle of the camera is unknown
+UNTIMED_STEP_S = 1.0  # photos without times: ordered by name, one per second
 EXIF_STEP_S = 1.0  # resolution of an EXIF time without SubSecTime
 
 
 class Photos:
-    """Photos in the order of their times, then names. GPS of the first serves as start coordinate, never more."""
+    """Photos ordered by time, then name. The GPS coordinate of the first one serves as initial position, no other."""
 
     live = False
 
@@ -43,8 +43,10 @@ class Photos:
         self._photos = in_time_order(infos)
         self._description, self._where = self._describe(camera)
         first = next(info for _, info, _ in self._photos if info is not None)
-        self._stored = camera_of(self._where, self._description) if self._description.camera else self._of_exif(first)
-        self._origin = self._make_origin(first, reduced(self._stored), start)
+        self._stored = (
+            camera_of(self._where, self._description) if self._description.camera else self._camera_from_exif(first)
+        )
+        self._origin = self._make_origin(first, downscaled_camera(self._stored), start)
 
     def origin(self) -> Origin:
         return self._origin
@@ -59,7 +61,7 @@ class Photos:
         return (self._where.parent / self._description.map).resolve() if self._description.map else None
 
     def close(self) -> None:
-        """Nothing stays open between shots."""
+        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         camera, stored = self._origin.camera, self._stored
@@ -75,25 +77,25 @@ class Photos:
             yield Shot(frame, (state,) if state else (), image)
 
     def _describe(self, camera: Path | None) -> tuple[Description, Path]:
-        """What a person wrote wins over EXIF: the camera description given, else a flight.toml beside the photos."""
+        """The camera description that was given, else a flight.toml beside the photos; both override EXIF."""
         beside = self.folder / "flight.toml"
         if camera is not None:
             return read_description(camera), camera
         return (read_description(beside), beside) if beside.is_file() else (Description(), beside)
 
     def _make_origin(self, first: PhotoInfo, camera: Camera, start: tuple[float, float] | None) -> Origin:
-        written = self._description
-        if start is None and written.start is None and first.lat_deg is not None and first.lon_deg is not None:
-            written = _with_start(written, first.lat_deg, first.lon_deg)
-        return origin_of(written, camera, start)
+        description = self._description
+        if start is None and description.start is None and first.lat_deg is not None and first.lon_deg is not None:
+            description = _with_start(description, first.lat_deg, first.lon_deg)
+        return origin_of(description, camera, start)
 
-    def _of_exif(self, first: PhotoInfo) -> Camera:
+    def _camera_from_exif(self, first: PhotoInfo) -> Camera:
         source = next((info for _, info, _ in self._photos if info is not None and info.focal_px), None)
         if source is None or source.focal_px is None:
             raise SourceError(
                 f"{self.folder}: no photo says its focal length; write a flight.toml with [camera] beside the photos"
             )
-        pointed = "GimbalPitchDegree" in first.xmp
+        has_gimbal = "GimbalPitchDegree" in first.xmp
         scale = source.width / first.width
         return Camera(
             width=first.width,
@@ -103,28 +105,28 @@ class Photos:
             cx=source.xmp.get("CalibratedOpticalCenterX", source.width / 2) / scale,
             cy=source.xmp.get("CalibratedOpticalCenterY", source.height / 2) / scale,
             focal_sigma=EXIF_FOCAL_SIGMA,
-            mount_tolerance_deg=GIMBAL_TOLERANCE_DEG if pointed else UNKNOWN_TOLERANCE_DEG,
+            mount_tolerance_deg=GIMBAL_TOLERANCE_DEG if has_gimbal else UNKNOWN_TOLERANCE_DEG,
         )
 
 
-def _with_start(written: Description, lat_deg: float, lon_deg: float) -> Description:
+def _with_start(description: Description, lat_deg: float, lon_deg: float) -> Description:
     return Description(
-        name=written.name,
-        map=written.map,
-        telemetry=written.telemetry,
+        name=description.name,
+        map=description.map,
+        telemetry=description.telemetry,
         start=StartTable(lat_deg=lat_deg, lon_deg=lon_deg),
     )
 
 
 def state_of(info: PhotoInfo, t_ns: int) -> VehicleState | None:
-    """Heading, tilt and height of the virtual vehicle; None when the photo says nothing of the kind."""
+    """Attitude and height of the virtual vehicle; None when the photo has neither yaw nor height."""
     xmp = info.xmp
     agl_m = xmp.get("RelativeAltitude")
     yaw_deg = xmp.get("GimbalYawDegree", xmp.get("FlightYawDegree"))
     yaw_rad = None if yaw_deg is None else math.remainder(math.radians(yaw_deg), math.tau)
     pitch_rad = roll_rad = None
     if "GimbalYawDegree" in xmp and "GimbalPitchDegree" in xmp:
-        yaw_rad, pitch_rad, roll_rad = body_of_gimbal(
+        yaw_rad, pitch_rad, roll_rad = body_angles_from_gimbal(
             xmp["GimbalYawDegree"], xmp["GimbalPitchDegree"], xmp.get("GimbalRollDegree", 0.0)
         )
     if agl_m is None and yaw_rad is None:
@@ -132,17 +134,17 @@ def state_of(info: PhotoInfo, t_ns: int) -> VehicleState | None:
     return VehicleState(t_ns=t_ns, source="exif", yaw_rad=yaw_rad, pitch_rad=pitch_rad, roll_rad=roll_rad, agl_m=agl_m)
 
 
-def body_of_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
+def body_angles_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
     """(yaw, pitch, roll) in rad of a body whose camera is mounted at pitch -90, from the gimbal's Z-Y-X angles."""
     r_w_gimbal = rot_w_b(math.radians(yaw_deg), math.radians(pitch_deg), math.radians(roll_deg))
     r_gimbal_b = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # Ry(+90)
-    return angles_of(r_w_gimbal @ r_gimbal_b)  # undoes the mount
+    return euler_from_rot(r_w_gimbal @ r_gimbal_b)  # undoes the mount
 
 
 def in_time_order(photos: list[tuple[Path, PhotoInfo | None]]) -> list[tuple[Path, PhotoInfo | None, float]]:
-    """(path, info, t_s) by time then name, the first at 0. ``photos`` are sorted by name.
+    """(path, info, t_s) ordered by time, then name; the first at 0. ``photos`` are sorted by name.
 
-    A photo without a time follows the one before it by name. Photos of one whole second share it evenly."""
+    A photo without a time gets that of the previous one by name. Photos of one second are distributed evenly in it."""
     first = next((info.taken for _, info in photos if info is not None and info.taken is not None), None)
     if first is None:
         return [(path, info, index * UNTIMED_STEP_S) for index, (path, info) in enumerate(photos)]
@@ -154,9 +156,9 @@ def in_time_order(photos: list[tuple[Path, PhotoInfo | None]]) -> list[tuple[Pat
     timed.sort(key=lambda photo: (photo[0], photo[1].name))
     ordered: list[tuple[Path, PhotoInfo | None, float]] = []
     for taken, group in groupby(timed, key=lambda photo: photo[0]):
-        same = list(group)
+        group_photos = list(group)
         later = next((other for other, _, _ in timed if other > taken), taken + timedelta(seconds=EXIF_STEP_S))
-        room_s = min(EXIF_STEP_S, (later - taken).total_seconds())
-        for k, (_, path, info) in enumerate(same):
-            ordered.append((path, info, (taken - timed[0][0]).total_seconds() + room_s * k / len(same)))
+        interval_s = min(EXIF_STEP_S, (later - taken).total_seconds())
+        for k, (_, path, info) in enumerate(group_photos):
+            ordered.append((path, info, (taken - timed[0][0]).total_seconds() + interval_s * k / len(group_photos)))
     return ordered

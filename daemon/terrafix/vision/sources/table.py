@@ -1,4 +1,4 @@
-"""frames.csv and telemetry tables: strict about columns, order and numbers; an empty cell means unknown."""
+"""Parser for frames.csv and telemetry tables: strict about columns, order and numbers; an empty cell is unknown."""
 
 import csv
 import math
@@ -8,19 +8,19 @@ from pathlib import Path
 from terrafix.core.errors import SourceError
 from terrafix.messages import VehicleState
 
-# column -> bounds of what can be; outside it is another unit or another column
+# column -> plausible range; a value outside it has another unit or is in the wrong column
 TELEMETRY_BOUNDS: dict[str, tuple[float, float]] = {
-    "yaw_deg": (-720.0, 720.0),  # a heading with a bias or a declination added may pass 360
+    "yaw_deg": (-720.0, 720.0),  # a heading plus a bias or declination may exceed 360
     "pitch_deg": (-90.0, 90.0),
     "roll_deg": (-180.0, 180.0),
     "agl_m": (-500.0, 20_000.0),
 }
-MAX_T_S = 1e6  # 11 days: more is a wall-clock time in the wrong column
+MAX_T_S = 1e6  # 11 days; a larger value is a wall-clock time
 
 
 @dataclass(frozen=True)
 class Row:
-    number: int  # line in the file, the header is 1
+    number: int  # line number in the file; the header is 1
     file: str
     t_ns: int
     state: VehicleState | None  # None: every telemetry cell is empty
@@ -29,8 +29,8 @@ class Row:
 def read_table(path: Path, source: str, *, with_file: bool) -> list[Row]:
     """Rows of a table with columns t_s, telemetry columns, and ``file`` when ``with_file``.
 
-    Raises SourceError with the row: unknown or missing column, not a number, out of bounds, times that do not
-    increase, a file named twice."""
+    Raises SourceError with the row number: unknown or missing column, not a number, out of range, times that do not
+    increase, duplicate file name."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -42,7 +42,7 @@ def read_table(path: Path, source: str, *, with_file: bool) -> list[Row]:
     reader = csv.reader(text.splitlines(), strict=True)
     rows: list[Row] = []
     columns: list[str] = []
-    seen: dict[str, int] = {}
+    row_of_file: dict[str, int] = {}
     try:
         for cells in reader:
             number = reader.line_num
@@ -59,9 +59,9 @@ def read_table(path: Path, source: str, *, with_file: bool) -> list[Row]:
                     f"{path} row {number}: t_s {row.t_ns / 1e9:g} is not later than the row before "
                     f"({rows[-1].t_ns / 1e9:g}); sort the rows by time"
                 )
-            if with_file and row.file in seen:
-                raise SourceError(f"{path} row {number}: '{row.file}' is already in row {seen[row.file]}")
-            seen[row.file] = number
+            if with_file and row.file in row_of_file:
+                raise SourceError(f"{path} row {number}: '{row.file}' is already in row {row_of_file[row.file]}")
+            row_of_file[row.file] = number
             rows.append(row)
     except csv.Error as error:
         raise SourceError(f"{path} row {reader.line_num}: not valid CSV ({error})") from None

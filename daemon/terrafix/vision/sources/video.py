@@ -1,4 +1,4 @@
-"""A video file with a description beside it: VIDEO.toml or flight.toml, optionally VIDEO.csv and VIDEO.tlog."""
+"""Video file with a description beside it (VIDEO.toml or flight.toml), optionally VIDEO.csv and VIDEO.tlog."""
 
 import math
 import os
@@ -10,15 +10,15 @@ import cv2
 from terrafix.core.errors import SourceError
 from terrafix.core.mavlink.tlog import read_imu, read_tlog
 from terrafix.messages import Frame, Imu, Origin, VehicleState
-from terrafix.vision.sources.contract import Shot, UpTo
+from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
 from terrafix.vision.sources.table import read_table
 
-FFMPEG_QUIET = "-8"  # AV_LOG_QUIET: a damaged picture would print one line for every block
+FFMPEG_QUIET = "-8"  # AV_LOG_QUIET; a damaged image would otherwise print one line per block
 
 
 class Video:
-    """Takes ``rate_hz`` pictures a second. Times are the container's; ids count the pictures taken."""
+    """Takes ``rate_hz`` images per second. Times are those of the container; frame ids count the images taken."""
 
     live = False
 
@@ -42,11 +42,11 @@ class Video:
         self._frames = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         capture.release()
-        ours = self._origin.camera
-        if size != (ours.width, ours.height):
+        expected = self._origin.camera
+        if size != (expected.width, expected.height):
             raise SourceError(
-                f"{path}: the video is {size[0]}x{size[1]}, [camera] in {where} says {ours.width}x{ours.height}; "
-                "describe the camera in pixels of this video"
+                f"{path}: the video is {size[0]}x{size[1]}, [camera] in {where} says "
+                f"{expected.width}x{expected.height}; describe the camera in pixels of this video"
             )
 
     def origin(self) -> Origin:
@@ -64,7 +64,7 @@ class Video:
         return (self._map_base / self._description.map).resolve() if self._description.map else None
 
     def close(self) -> None:
-        """Nothing stays open between shots."""
+        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         capture = self._open()
@@ -77,27 +77,27 @@ class Video:
         camera = self._origin.camera
         step_s = 1.0 / self._fps if self._fps > 0 else self._period_s
         from_ns = round(from_s * 1e9)
-        states_of, imu_of = UpTo(self._states, from_ns), UpTo(self._imu, from_ns)
+        states_of, imu_of = TelemetryCursor(self._states, from_ns), TelemetryCursor(self._imu, from_ns)
         frame_id, t_s, due_s = 0, -step_s, 0.0
         while capture.grab():
-            said_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-            t_s = said_s if said_s > t_s else t_s + step_s  # some containers carry no times
+            container_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            t_s = container_s if container_s > t_s else t_s + step_s  # some containers have no timestamps
             if t_s < due_s - step_s / 2:
                 continue
             due_s += self._period_s * max(1, math.ceil((t_s + step_s / 2 - due_s) / self._period_s))
             t_ns = round(t_s * 1e9)
             states, imu = states_of(t_ns), imu_of(t_ns)
             if t_s >= from_s:
-                whole, image = capture.retrieve()
+                decoded, image = capture.retrieve()
                 frame = Frame(
                     t_ns=t_ns,
                     frame_id=frame_id,
                     file=f"{self.path.name}@{t_s:.3f}",
                     width=camera.width,
                     height=camera.height,
-                    error="" if whole else "cannot be decoded",
+                    error="" if decoded else "cannot be decoded",
                 )
-                yield Shot(frame, states, image if whole else None, imu)
+                yield Shot(frame, states, image if decoded else None, imu)
             frame_id += 1
 
     def _find_description(self) -> Path:

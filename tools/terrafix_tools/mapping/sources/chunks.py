@@ -1,4 +1,4 @@
-"""Pictures of the Process API on a fixed raster of one UTM zone, kept as files: a place is fetched once."""
+"""Images of the Process API on a fixed raster of one UTM zone, cached as files: an area is fetched once."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -15,31 +15,31 @@ from rasterio.io import MemoryFile
 from rasterio.transform import Affine
 
 from terrafix.core.errors import OutputError
-from terrafix_tools.mapping.area import Area, Placed
-from terrafix_tools.mapping.fetch_progress import OnProgress, Progressed
-from terrafix_tools.mapping.sources.copernicus import MOST_PX, Copernicus
+from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.fetching.progress import DownloadProgress, OnProgress
+from terrafix_tools.mapping.sources.copernicus import MAX_REQUEST_PX, Copernicus
 
 RGBA = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
 OGC_EPSG = "http://www.opengis.net/def/crs/EPSG/0/"
 
 
 class Chunk(NamedTuple):
-    """Place on the raster, counted in chunks from the zone's origin."""
+    """Position on the raster, in chunks from the zone's origin."""
 
     column: int
-    row: int  # grows to the south
+    row: int  # increases to the south
 
 
 @dataclass(frozen=True)
 class ChunkRaster:
-    """Chunks of MOST_PX pixels a side in one UTM zone."""
+    """Chunks of MOST_PX pixels per side in one UTM zone."""
 
     epsg: int
     pixel_m: float
 
     @property
     def span_m(self) -> float:
-        return MOST_PX * self.pixel_m
+        return MAX_REQUEST_PX * self.pixel_m
 
     def bounds(self, chunk: Chunk) -> tuple[float, float, float, float]:
         """x_min, y_min, x_max, y_max."""
@@ -65,8 +65,8 @@ def process_request(raster: ChunkRaster, chunk: Chunk, data: dict[str, Any], eva
             "data": [data],
         },
         "output": {
-            "width": MOST_PX,
-            "height": MOST_PX,
+            "width": MAX_REQUEST_PX,
+            "height": MAX_REQUEST_PX,
             "responses": [{"identifier": "default", "format": {"type": "image/tiff"}}],
         },
         "evalscript": evalscript,
@@ -79,15 +79,15 @@ def fetch_chunks(
     wanted: Mapping[Path, tuple[Chunk, dict[str, Any]]],
     on_progress: OnProgress,
 ) -> None:
-    """Fetches each request into its file; a file is whole or not there.
+    """Fetches each request into its file; a file is complete or missing.
 
-    Raises FetchError, RefusedError, OutputError; what came before is kept."""
-    progressed = Progressed(len(wanted))
+    Raises FetchError, RefusedError, OutputError; completed files remain."""
+    progressed = DownloadProgress(len(wanted))
 
     def one(path: Path) -> int:
         chunk, request = wanted[path]
         data = copernicus.picture(request)
-        _keep(data, raster, chunk, path)
+        _write_file(data, raster, chunk, path)
         return len(data)
 
     with ThreadPoolExecutor(copernicus.client.limits.connections) as pool:
@@ -103,8 +103,8 @@ def fetch_chunks(
             raise
 
 
-def _keep(data: bytes, raster: ChunkRaster, chunk: Chunk, path: Path) -> None:
-    """As a GeoTIFF whose fourth band is said to be the mask, which the service leaves open."""
+def _write_file(data: bytes, raster: ChunkRaster, chunk: Chunk, path: Path) -> None:
+    """Writes a GeoTIFF whose fourth band is marked as the mask, which the service does not do."""
     x_min, _, _, y_max = raster.bounds(chunk)
     place = Affine(raster.pixel_m, 0, x_min, 0, -raster.pixel_m, y_max)
     part = path.with_name(f".{path.name}.part")

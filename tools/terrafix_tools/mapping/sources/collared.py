@@ -1,4 +1,4 @@
-"""A raster without a mask of its own, as a part of a mosaic: its collar is found once and kept beside the downloads."""
+"""A raster without a mask as part of a mosaic: its collar is searched once and cached beside the downloads."""
 
 import hashlib
 from collections.abc import Callable
@@ -9,15 +9,15 @@ from typing import Self
 
 import numpy as np
 
-from terrafix_tools.mapping.collar import BLEED_PX, TRIM_PX, Collar, find_collar
-from terrafix_tools.mapping.mosaic import Opener
+from terrafix_tools.mapping.mosaic.collar import BLEED_PX, TRIM_PX, Collar, find_collar
+from terrafix_tools.mapping.mosaic.mosaic import Opener
 from terrafix_tools.mapping.source import ImagerySource
 
 Bar = Callable[[str, int | None], Callable[[], None]]
 
 
 class Collared(ImagerySource):
-    """An ImagerySource that knows its collar."""
+    """An ImagerySource with a known collar."""
 
     def __init__(self, path: Path, collar_path: Path) -> None:
         super().__init__(path)
@@ -44,24 +44,24 @@ class Collared(ImagerySource):
 
 
 def raster_opener(path: Path, cache: Path, bar: Bar) -> Opener:
-    """Raises MapError: not an image, or not placed on the earth."""
-    path, cache = path.absolute(), cache.absolute()  # a worker may stand in another folder
+    """Opener of a raster. Raises MapError: not an image, or not georeferenced."""
+    path, cache = path.absolute(), cache.absolute()  # a worker may have another working directory
     with ImagerySource(path) as source:
         if source.has_mask:
             return partial(ImagerySource, path)
         stat = path.stat()
         key = hashlib.sha256(f"{path.resolve()}|{stat.st_size}|{stat.st_mtime_ns}".encode()).hexdigest()[:16]
-        kept = cache / f"collar-{key}.tif"
-        if kept.is_file():
-            return partial(Collared, path, kept)
+        cached = cache / f"collar-{key}.tif"
+        if cached.is_file():
+            return partial(Collared, path, cached)
         cache.mkdir(parents=True, exist_ok=True)
-        part = cache / f".{kept.name}.part.tif"
+        part = cache / f".{cached.name}.part.tif"
         try:
             collar = find_collar(source, part, bar)
             if collar is None:
                 return partial(ImagerySource, path)
             collar.close()
-            part.replace(kept)
+            part.replace(cached)
         finally:
             part.unlink(missing_ok=True)
-    return partial(Collared, path, kept)
+    return partial(Collared, path, cached)

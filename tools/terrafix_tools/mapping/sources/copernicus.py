@@ -1,7 +1,7 @@
-"""Copernicus Data Space: a token for a user's OAuth client, the catalogue of scenes, and pictures made on request.
+"""Copernicus Data Space: OAuth token, catalogue of scenes, and images rendered on request.
 
 Protocols as documented at documentation.dataspace.copernicus.eu (APIs, Sentinel Hub: Authentication, Catalog, Process).
-The service makes the mosaic, so that pictures of 2500 px travel and not whole scenes of 800 MB."""
+The service computes the mosaic, so that images of 2500 px are transferred and not whole scenes of 800 MB."""
 
 import os
 import threading
@@ -18,21 +18,21 @@ from rasterio.errors import RasterioError
 from rasterio.io import MemoryFile
 
 from terrafix.core.errors import MapError, UsageError
-from terrafix_tools.mapping.fetch import Client, Damaged, FetchError
-from terrafix_tools.mapping.fetch_pace import Limits
+from terrafix_tools.mapping.fetching.fetch import Client, Damaged, FetchError
+from terrafix_tools.mapping.fetching.pace import Limits
 
-LICENCE = "Contains modified Copernicus Sentinel data"  # the notice that the licence of the data asks for
+LICENCE = "Contains modified Copernicus Sentinel data"  # the notice that the data licence requires
 CREDENTIALS = ("COPERNICUS_CLIENT_ID", "COPERNICUS_CLIENT_SECRET")
 CREDENTIALS_FILE = Path("~/.config/terrafix/copernicus.toml")
-LIMITS = Limits(requests_per_s=1.0, connections=2, timeout_s=180.0)  # a picture is computed while we wait
-MOST_PX = 2500  # a side, of one request
-EARLY_S = 60.0  # a token is renewed this long before it ends
-MOST_SCENES = 500
+LIMITS = Limits(requests_per_s=1.0, connections=2, timeout_s=180.0)  # the image is computed during the request
+MAX_REQUEST_PX = 2500  # maximum side of one request
+TOKEN_MARGIN_S = 60.0  # a token is renewed this long before it expires
+MAX_SCENES = 500
 
 
 @dataclass(frozen=True)
 class Service:
-    """Addresses of the public service; another for a mirror."""
+    """URLs of the public service; others for a mirror."""
 
     token_url: str = "https://identity.dataspace.copernicus.eu/auth/realms/CDSE/protocol/openid-connect/token"
     api_url: str = "https://sh.dataspace.copernicus.eu/api/v1"
@@ -66,7 +66,7 @@ def read_credentials(file: Path = CREDENTIALS_FILE) -> Credentials:
 
 
 class Copernicus:
-    """Used by several threads."""
+    """Client of the service. Thread-safe."""
 
     def __init__(self, credentials: Credentials, service: Service, limits: Limits = LIMITS) -> None:
         self._credentials, self._service = credentials, service
@@ -77,7 +77,7 @@ class Copernicus:
     def scenes(
         self, collection: str, bbox: tuple[float, ...], period: tuple[str, str], cloud_percent: int
     ) -> list[str]:
-        """Times (RFC 3339) of the scenes in a box of degrees with at most so many clouds, newest first.
+        """Times (RFC 3339) of the scenes in a box in degrees with at most this cloud cover, newest first.
 
         Raises FetchError, RefusedError."""
         query: dict[str, Any] = {
@@ -90,33 +90,39 @@ class Copernicus:
             "limit": 100,
         }
         found: list[str] = []
-        while len(found) < MOST_SCENES:
-            answer = self._post("/catalog/1.0.0/search", query, "application/geo+json")
+        while len(found) < MAX_SCENES:
+            response = self._post("/catalog/1.0.0/search", query, "application/geo+json")
             try:
-                page = msgspec.json.decode(answer)
+                page = msgspec.json.decode(response)
                 found += [feature["properties"]["datetime"] for feature in page["features"]]
                 following = page.get("context", {}).get("next")
             except (msgspec.DecodeError, KeyError, TypeError, AttributeError):
-                raise FetchError("Copernicus Data Space: the catalogue's answer is not understood; try later") from None
+                raise FetchError(
+                    "Copernicus Data Space: the catalogue returned an invalid response; try later"
+                ) from None
             if following is None:
                 break
             query["next"] = following
         return sorted(found, reverse=True)
 
     def picture(self, request: dict[str, Any]) -> bytes:
-        """A GeoTIFF by the Process API, whole and readable. Raises FetchError, RefusedError."""
+        """A complete GeoTIFF from the Process API. Raises FetchError, RefusedError."""
         return self._post("/process", request, "image/tiff", check=_check_tiff)
 
     def _post(self, path: str, body: dict[str, Any], accept: str, check: Any = None) -> bytes:
-        headers = {"Authorization": f"Bearer {self._bearer()}", "Content-Type": "application/json", "Accept": accept}
+        headers = {
+            "Authorization": f"Bearer {self._access_token()}",
+            "Content-Type": "application/json",
+            "Accept": accept,
+        }
         url = self._service.api_url + path
-        answer = self.client.request("POST", url, headers=headers, body=msgspec.json.encode(body), check=check)
-        if answer is None:
+        response = self.client.request("POST", url, headers=headers, body=msgspec.json.encode(body), check=check)
+        if response is None:
             raise MapError(f"{url}: nothing there; the service has moved")
-        return answer
+        return response
 
-    def _bearer(self) -> str:
-        """OAuth 2, client credentials (RFC 6749, 4.4)."""
+    def _access_token(self) -> str:
+        """Access token by OAuth 2 client credentials (RFC 6749, 4.4)."""
         with self._lock:
             if time.monotonic() < self._token_until_s:
                 return self._token
@@ -126,15 +132,15 @@ class Copernicus:
                 "client_secret": self._credentials.client_secret,
             }
             headers = {"Content-Type": "application/x-www-form-urlencoded"}
-            answer = self.client.request(
+            response = self.client.request(
                 "POST", self._service.token_url, headers=headers, body=urlencode(form).encode()
             )
             try:
-                granted = msgspec.json.decode(answer or b"")
+                granted = msgspec.json.decode(response or b"")
                 self._token = str(granted["access_token"])
-                self._token_until_s = time.monotonic() + float(granted["expires_in"]) - EARLY_S
+                self._token_until_s = time.monotonic() + float(granted["expires_in"]) - TOKEN_MARGIN_S
             except (msgspec.DecodeError, KeyError, TypeError, ValueError):
-                raise FetchError("Copernicus Data Space: gave no token; check the credentials") from None
+                raise FetchError("Copernicus Data Space: no access token received; check the credentials") from None
             return self._token
 
 

@@ -6,10 +6,10 @@ from xml.sax.saxutils import escape
 import rasterio
 
 from terrafix.core.errors import OutputError
-from terrafix_tools.mapping.area import Area
-from terrafix_tools.mapping.fetch_progress import OnProgress
+from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.fetching.progress import OnProgress
 from terrafix_tools.mapping.sources.chunks import ChunkRaster, fetch_chunks, process_request
-from terrafix_tools.mapping.sources.copernicus import MOST_PX, Copernicus, Service, read_credentials
+from terrafix_tools.mapping.sources.copernicus import MAX_REQUEST_PX, Copernicus, Service, read_credentials
 from terrafix_tools.mapping.sources.utm import utm_epsg
 
 NAME = "glo-30"
@@ -27,7 +27,7 @@ DATA = {"type": "dem", "dataFilter": {"demInstance": "COPERNICUS_30"}, "processi
 
 
 def fetch_glo30(area: Area, cache: Path, on_progress: OnProgress, service: Service | None = None) -> Path:
-    """A GDAL VRT of the chunks that the area touches.
+    """Fetches elevation; returns a GDAL VRT of the chunks that the area touches.
 
     Raises UsageError (no credentials), FetchError, RefusedError, OutputError."""
     west, south, east, north = area.bounds_deg
@@ -53,7 +53,7 @@ def _vrt(raster: ChunkRaster, paths: list[Path]) -> Path:
         f"<GeoTransform>{left}, {GSD_M}, 0, {top}, 0, {-GSD_M}</GeoTransform>",
         '<VRTRasterBand dataType="Float32" band="1"><NoDataValue>nan</NoDataValue>',
     ]
-    size = f'xSize="{MOST_PX}" ySize="{MOST_PX}"'
+    size = f'xSize="{MAX_REQUEST_PX}" ySize="{MAX_REQUEST_PX}"'
     for path, b in zip(paths, bounds, strict=True):
         offset = f'xOff="{(b.left - left) / GSD_M:.0f}" yOff="{(top - b.top) / GSD_M:.0f}"'
         lines.append(

@@ -1,4 +1,4 @@
-"""From an area and its sources to the layers of a map: estimate, ask, download, put together."""
+"""From an area and its sources to the layers of a map: estimate, confirmation, download, assembly."""
 
 import contextlib
 from collections.abc import Sequence
@@ -9,12 +9,12 @@ from typing import Protocol
 
 from rich.console import Console
 
-from terrafix_tools.mapping.area import Area
-from terrafix_tools.mapping.fetch_progress import OnProgress, shown, steps_shown
+from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.fetching.plan import PACKAGE_BYTES_PER_PX, Estimate, check_consent, check_room, describe
+from terrafix_tools.mapping.fetching.progress import OnProgress, shown, steps_display
 from terrafix_tools.mapping.layers import LayerInput
-from terrafix_tools.mapping.mosaic import Mosaic, MosaicPlan, Opener
-from terrafix_tools.mapping.mosaic_grid import grid_for
-from terrafix_tools.mapping.plan import PACKAGE_BYTES_PER_PX, Estimate, check_consent, check_room, said
+from terrafix_tools.mapping.mosaic.grid import grid_for
+from terrafix_tools.mapping.mosaic.mosaic import Mosaic, MosaicPlan, Opener
 from terrafix_tools.mapping.sources.collared import raster_opener
 from terrafix_tools.mapping.sources.sentinel import SentinelJob
 from terrafix_tools.mapping.sources.spec import SourceSpec
@@ -23,7 +23,7 @@ from terrafix_tools.mapping.sources.tile_job import TileJob, tile_file_opener
 
 @dataclass(frozen=True)
 class Request:
-    """What a person asked for. ``gsd_m`` None: as fine as the first source."""
+    """The options of a build. ``gsd_m`` None: the resolution of the first source."""
 
     area: Area
     specs: Sequence[SourceSpec]
@@ -33,7 +33,7 @@ class Request:
 
 
 class Job(Protocol):
-    """One source of one area that comes over the network."""
+    """One network source for one area."""
 
     spec: SourceSpec
 
@@ -60,24 +60,24 @@ class Preparation:
                 self._jobs[i] = TileJob(spec, request.area, request.gsd_m, request.cache)
 
     def estimate(self) -> list[Estimate]:
-        """What is still to be downloaded, said in one line a source. Raises as the jobs do.
+        """Prints and returns the remaining download of each source. Raises as the jobs do.
 
-        Where a better source comes over the network too, what it leaves open is known only when it is there."""
+        The gaps of a better network source are unknown until it is downloaded."""
         made = []
         for i, job in self._jobs.items():
             if isinstance(job, TileJob):
-                job.leave_out(self._better(i, fetched=False))
+                job.drop_covered(self._better_sources(i, fetched=False))
             made.append(job.estimate())
-            self._say.print(said(made[-1]), highlight=False)
+            self._say.print(describe(made[-1]), highlight=False)
         return made
 
     def fetch(self, estimates: Sequence[Estimate], *, agreed: bool) -> None:
-        """Raises UsageError when the download is large and nobody agreed, OutputError when it does not fit."""
+        """Raises UsageError when the download is large and not confirmed, OutputError when it does not fit."""
         check_consent(estimates, agreed)
         check_room(estimates, self._request.cache, 0.0, self._request.out)
         for i, job in self._jobs.items():
             if isinstance(job, TileJob) and any(j < i for j in self._jobs):
-                job.leave_out(self._better(i, fetched=True))
+                job.drop_covered(self._better_sources(i, fetched=True))
             try:
                 with shown(self._say, job.spec.title) as on_progress:
                     job.fetch(on_progress)
@@ -85,14 +85,14 @@ class Preparation:
                 self._say.print("stopped; what came is kept, the same command goes on from here")
                 raise
 
-    def _better(self, i: int, *, fetched: bool) -> tuple[Opener, ...]:
-        """Sources of the same layer that come before this one; those of the network only when they are ``fetched``."""
+    def _better_sources(self, i: int, *, fetched: bool) -> tuple[Opener, ...]:
+        """Sources of the same layer with higher priority; network sources only when they are ``fetched``."""
         specs = self._request.specs
         chosen = [j for j in range(i) if specs[j].layer == specs[i].layer and (fetched or j not in self._jobs)]
         return tuple(opener for j in chosen for opener in self._openers(j))
 
     def layers(self) -> list[LayerInput]:
-        """One for each `layer` of the sources, in the order of their first one. Raises MapError, OutputError."""
+        """One per `layer` of the sources, in order of first appearance. Raises MapError, OutputError."""
         made = []
         for layer in dict.fromkeys(spec.layer for spec in self._request.specs):
             chosen = [i for i, spec in enumerate(self._request.specs) if spec.layer == layer]
@@ -102,7 +102,7 @@ class Preparation:
     def _layer(self, layer: str, chosen: list[int]) -> LayerInput:
         request = self._request
         openers = [opener for i in chosen for opener in self._openers(i)]
-        # Tiles have been given their detail by the choice of the zoom.
+        # The resolution of tiles is already determined by their zoom level.
         first = request.specs[chosen[0]]
         gsd_m = None if first.of_tiles else request.gsd_m
         with contextlib.ExitStack() as stack:
@@ -116,7 +116,7 @@ class Preparation:
         return LayerInput(
             open=partial(Mosaic, MosaicPlan(request.area, grid, tuple(openers))),
             source=layer or ", ".join(dict.fromkeys(spec.title for spec in specs)),
-            date=min((d for d in dates if d), default=""),  # a mosaic is as old as its oldest part
+            date=min((d for d in dates if d), default=""),  # the date of a mosaic is that of its oldest part
             licence="; ".join(dict.fromkeys(text for text in licences if text)),
             ce90_m=None if None in stated else max(v for v in stated if v is not None),
         )
@@ -127,5 +127,5 @@ class Preparation:
             return self._jobs[i].openers()
         if spec.of_tiles:
             return [tile_file_opener(spec, request.area, request.gsd_m)]
-        with steps_shown(self._say) as bar:
+        with steps_display(self._say) as bar:
             return [raster_opener(Path(spec.path), request.cache, bar)]

@@ -1,4 +1,4 @@
-"""Sentinel-2 L2A: a cloudless mosaic at 10 m, made by the service of the clear looks of a period."""
+"""Sentinel-2 L2A: a cloudless mosaic at 10 m, computed by the service from the clear observations of a period."""
 
 import datetime
 import hashlib
@@ -6,10 +6,10 @@ from functools import partial
 from pathlib import Path
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area import Area
-from terrafix_tools.mapping.fetch_progress import OnProgress
-from terrafix_tools.mapping.mosaic import Opener
-from terrafix_tools.mapping.plan import Estimate
+from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.fetching.plan import Estimate
+from terrafix_tools.mapping.fetching.progress import OnProgress
+from terrafix_tools.mapping.mosaic.mosaic import Opener
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.sources.chunks import Chunk, ChunkRaster, fetch_chunks, process_request
 from terrafix_tools.mapping.sources.copernicus import LICENCE, Copernicus, Service, read_credentials
@@ -18,10 +18,10 @@ from terrafix_tools.mapping.sources.utm import utm_epsg
 
 COLLECTION = "sentinel-2-l2a"
 GSD_M = 10.0
-CLOUD_PERCENT = 50  # scenes with more are not used
+CLOUD_PERCENT = 50  # maximum cloud cover of a scene
 CHUNK_BYTES, CHUNK_S = 20e6, 30.0  # for the estimate: 2500 x 2500 px of four bands, and its computation
-# Of the clear looks at a pixel the one with the median red is taken: a real look, neither haze nor shadow.
-# Classes that are not clear: 0 nothing, 1 saturated, 3 shadow, 8 to 10 cloud (L2A product definition, SCL).
+# Of the clear observations of a pixel, the one with the median red is used: a real observation without haze or shadow.
+# Classes that are not clear: 0 no data, 1 saturated, 3 shadow, 8 to 10 cloud (L2A product definition, SCL).
 EVALSCRIPT = """//VERSION=3
 function setup() {
   return {
@@ -42,7 +42,7 @@ function evaluatePixel(samples) {
 
 
 class SentinelJob:
-    """One spec with service = "sentinel-2", for one area."""
+    """One source with service = "sentinel-2", for one area."""
 
     def __init__(self, spec: SourceSpec, area: Area, cache: Path, service: Service | None = None) -> None:
         self.spec, self._area = spec, area
@@ -57,7 +57,7 @@ class SentinelJob:
 
     @property
     def date(self) -> str:
-        """Last day of the period: its scenes are up to spec.days older."""
+        """Last day of the period; its scenes are up to spec.days older."""
         return self._period[1]
 
     @property
@@ -71,7 +71,7 @@ class SentinelJob:
             scenes = self._copernicus.scenes(COLLECTION, self._area.bounds_deg, self._period, CLOUD_PERCENT)
             if not scenes:
                 raise MapError(
-                    f"{self._area.name}: Sentinel-2 saw it never with under {CLOUD_PERCENT} % clouds between "
+                    f"{self._area.name}: no Sentinel-2 scene with under {CLOUD_PERCENT} % clouds between "
                     f"{self._period[0]} and {self._period[1]}; give another date or more days"
                 )
         connections = self._copernicus.client.limits.connections

@@ -1,4 +1,4 @@
-"""What a person says of a source of imagery: on the command line, or in a TOML file with the keys of SourceSpec."""
+"""Specification of an imagery source: on the command line, or in a TOML file with the keys of SourceSpec."""
 
 import os
 import tomllib
@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 
 from terrafix.core.errors import ConfigError, UsageError
-from terrafix_tools.mapping.fetch_pace import USER_AGENT, Limits
-from terrafix_tools.mapping.sources.tile_grid import DEEPEST_ZOOM
+from terrafix_tools.mapping.fetching.pace import USER_AGENT, Limits
+from terrafix_tools.mapping.sources.tile_grid import MAX_ZOOM
 from terrafix_tools.mapping.sources.url_template import UrlTemplate
 
 SENTINEL = "sentinel-2"
@@ -19,17 +19,17 @@ class SourceSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """One [[source]] of a TOML file; the order in the file is the priority. Exactly one of path, url, wmts, service."""
 
     path: str = ""  # GeoTIFF, COG, VRT, GeoPackage or any other GDAL raster; .mbtiles, .pmtiles
-    url: str = ""  # template of tiles: {z} {x} {y} or {-y}; ${NAME} comes from the environment
-    wmts: str = ""  # address of a GetCapabilities document; `layer_name` says which of its layers
+    url: str = ""  # template of tiles: {z} {x} {y} or {-y}; ${NAME} is an environment variable
+    wmts: str = ""  # address of a GetCapabilities document; `layer_name` selects one of its layers
     layer_name: str = ""
     service: str = ""  # "sentinel-2"
     name: str = ""  # for messages and the manifest
-    licence: str = ""  # needed for everything that comes over the network
+    licence: str = ""  # required for network sources
     date: str = ""  # of the imagery, YYYY-MM-DD; for sentinel-2 the last day of the search
-    days: int = 90  # sentinel-2: how far before `date` scenes may be
-    ce90_m: float | None = None  # radius that holds 90 % of the errors of position
-    layer: str = ""  # sources of one layer fill each other's gaps; other layers are other dates of the place
-    zoom: int | None = None  # tiles: this zoom instead of the one that the wanted detail asks for
+    days: int = 90  # sentinel-2: maximum age of scenes before `date`
+    ce90_m: float | None = None  # radius that contains 90 % of the position errors
+    layer: str = ""  # sources of one layer fill each other's gaps; other layers are other dates of the same area
+    zoom: int | None = None  # tiles: this zoom instead of that of the requested resolution
     tile_px: int = 256
     requests_per_s: float = 5.0
     connections: int = 2
@@ -60,7 +60,7 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def parse_sources(
     texts: list[str], *, licence: str = "", date: str = "", ce90_m: float | None = None, rate: float | None = None
 ) -> list[SourceSpec]:
-    """--source values in their order: a path, a template, or the name of a service. ``rate``: requests a second.
+    """--source values in order: a path, a template, or the name of a service. ``rate``: requests per second.
 
     Raises UsageError."""
     specs = []
@@ -76,7 +76,7 @@ def parse_sources(
 
 
 def read_sources(path: Path) -> list[SourceSpec]:
-    """Raises ConfigError. Paths in the file are relative to it."""
+    """Reads a source file. Raises ConfigError. Paths in the file are relative to it."""
     try:
         parsed = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
     except FileNotFoundError:
@@ -99,7 +99,7 @@ def read_sources(path: Path) -> list[SourceSpec]:
 
 
 def check_spec(spec: SourceSpec, where: str) -> None:
-    """Raises UsageError: what is missing or out of bounds."""
+    """Raises UsageError: a missing or invalid value."""
     given = [key for key in ("path", "url", "wmts", "service") if getattr(spec, key)]
     if len(given) != 1:
         raise UsageError(f"{where}: give exactly one of path, url, wmts and service (given: {', '.join(given) or '-'})")
@@ -107,10 +107,10 @@ def check_spec(spec: SourceSpec, where: str) -> None:
         raise UsageError(f"{where}: service '{spec.service}' is not known; there is {SENTINEL}")
     if spec.from_network and not spec.service and not spec.licence.strip():
         raise UsageError(
-            f"{where}: say under which licence its imagery may be kept and used offline: --licence, or licence = ..."
+            f"{where}: needs the licence for storage and offline use of its imagery: --licence, or licence = ..."
         )
     if spec.wmts and not spec.layer_name:
-        raise UsageError(f"{where}: layer_name says which layer of the WMTS is wanted")
+        raise UsageError(f"{where}: a WMTS source needs layer_name")
     if spec.url:
         UrlTemplate(spec.url).check()
     bounds = {
@@ -118,7 +118,7 @@ def check_spec(spec: SourceSpec, where: str) -> None:
         "requests_per_s": (0.01, 1000.0),
         "connections": (1, 32),
         "days": (1, 3650),
-        "zoom": (0, DEEPEST_ZOOM),
+        "zoom": (0, MAX_ZOOM),
     }
     for key, (low, high) in bounds.items():
         value = getattr(spec, key)

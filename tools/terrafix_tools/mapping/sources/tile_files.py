@@ -1,4 +1,4 @@
-"""Local files of tiles: MBTiles (1.3, which the store of downloads is too) and PMTiles (version 3)."""
+"""Local tile files: MBTiles (1.3, also the format of the download store) and PMTiles (version 3)."""
 
 import gzip
 import mmap
@@ -23,12 +23,12 @@ from pmtiles.tile import (
 
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping.sources.tile_grid import Tile
-from terrafix_tools.mapping.sources.tile_store import flipped
+from terrafix_tools.mapping.sources.tile_store import mbtiles_row
 
 PICTURES = (TileType.PNG, TileType.JPEG, TileType.WEBP)
-DIRECTORIES = 64  # of a PMTiles file, kept unpacked
+DIRECTORIES = 64  # decompressed directories of a PMTiles file in the cache
 HEADER_BYTES = 127
-DEEPEST = 4  # a PMTiles directory is at most three levels below the root
+MAX_DIRECTORY_DEPTH = 4  # maximum depth; a PMTiles directory is at most three levels below the root
 
 
 class MbtilesReader:
@@ -48,13 +48,13 @@ class MbtilesReader:
     def get(self, tile: Tile) -> bytes | None:
         query = "SELECT CAST(tile_data AS BLOB) FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
         try:
-            found = self._db.execute(query, (tile.zoom, tile.column, flipped(tile.zoom, tile.row))).fetchone()
+            found = self._db.execute(query, (tile.zoom, tile.column, mbtiles_row(tile.zoom, tile.row))).fetchone()
         except sqlite3.DatabaseError as error:
             raise MapError(f"{self.path}: damaged near tile {tile} ({error}); copy or download it again") from None
         return found[0] if found else None
 
     def first(self, zoom: int) -> bytes:
-        """Any tile of the zoom that is not empty; nothing when all are."""
+        """Any non-empty tile of the zoom; empty when there is none."""
         query = "SELECT CAST(tile_data AS BLOB) FROM tiles WHERE zoom_level = ? AND length(tile_data) > 0 LIMIT 1"
         try:
             found = self._db.execute(query, (zoom,)).fetchone()
@@ -67,7 +67,7 @@ class MbtilesReader:
 
 
 class PmtilesReader:
-    """Directories stay unpacked: the library's own reader unpacks them again for every tile."""
+    """Caches decompressed directories; the library's own reader decompresses them for every tile."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -80,7 +80,7 @@ class PmtilesReader:
         except (OSError, ValueError, IndexError, struct.error, MagicNumberNotFound, SpecVersionUnsupported):
             raise MapError(f"{path}: not a PMTiles file of version 3; check the source") from None
         if header["tile_type"] not in PICTURES:
-            raise MapError(f"{path}: holds no pictures but {header['tile_type'].name} tiles; give imagery")
+            raise MapError(f"{path}: contains no images but {header['tile_type'].name} tiles; give imagery")
         if header["internal_compression"] != Compression.GZIP:
             raise MapError(f"{path}: its directories are not gzip; write it again with the pmtiles program")
         self._header = header
@@ -90,21 +90,21 @@ class PmtilesReader:
     def get(self, tile: Tile) -> bytes | None:
         wanted = zxy_to_tileid(*tile)
         offset, length = self._header["root_offset"], self._header["root_length"]
-        for _ in range(DEEPEST):
+        for _ in range(MAX_DIRECTORY_DEPTH):
             entry = find_tile(self._directory(offset, length), wanted)
             if entry is None:
                 return None
             if entry.run_length:
-                return self._unpacked(self._bytes(self._header["tile_data_offset"] + entry.offset, entry.length))
+                return self._decompress(self._bytes(self._header["tile_data_offset"] + entry.offset, entry.length))
             offset, length = self._header["leaf_directory_offset"] + entry.offset, entry.length
         raise MapError(f"{self.path}: damaged directory near tile {tile}; copy or download it again")
 
     def first(self, zoom: int) -> bytes:
-        """Any tile: PMTiles of pictures have one size."""
+        """Any tile: all images of a PMTiles file have the same size."""
         entry = self._directory(self._header["root_offset"], self._header["root_length"])[0]
         while not entry.run_length:
             entry = self._directory(self._header["leaf_directory_offset"] + entry.offset, entry.length)[0]
-        return self._unpacked(self._bytes(self._header["tile_data_offset"] + entry.offset, entry.length))
+        return self._decompress(self._bytes(self._header["tile_data_offset"] + entry.offset, entry.length))
 
     def close(self) -> None:
         self._map.close()
@@ -118,7 +118,7 @@ class PmtilesReader:
         except (OSError, EOFError, ValueError, IndexError, zlib.error) as error:
             raise MapError(f"{self.path}: damaged directory ({error}); copy or download it again") from None
 
-    def _unpacked(self, data: bytes) -> bytes:
+    def _decompress(self, data: bytes) -> bytes:
         if self._header["tile_compression"] != Compression.GZIP:
             return data
         try:
@@ -128,5 +128,5 @@ class PmtilesReader:
 
 
 def open_tiles(path: Path) -> MbtilesReader | PmtilesReader:
-    """By the file's name. Raises MapError."""
+    """Reader by file name. Raises MapError."""
     return PmtilesReader(path) if path.suffix.lower() == ".pmtiles" else MbtilesReader(path)

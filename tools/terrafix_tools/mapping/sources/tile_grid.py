@@ -1,4 +1,4 @@
-"""Web Mercator tiles (EPSG:3857, the "Google Maps compatible" matrix set of OGC 17-083r4): numbers and places."""
+"""Web Mercator tiles (EPSG:3857, the "Google Maps compatible" matrix set of OGC 17-083r4): indices and positions."""
 
 import math
 from collections.abc import Iterator
@@ -9,12 +9,12 @@ import numpy as np
 from pyproj import CRS
 from rasterio.transform import Affine
 
-from terrafix_tools.mapping.area import Placed
+from terrafix_tools.mapping.area.area import Placed
 
 MERCATOR = CRS.from_epsg(3857)
 EARTH_RADIUS_M = 6_378_137.0  # of the sphere of EPSG:3857
-HALF_M = math.pi * EARTH_RADIUS_M  # the world reaches from -HALF_M to HALF_M
-DEEPEST_ZOOM = 23  # 2 cm a pixel
+HALF_M = math.pi * EARTH_RADIUS_M  # the extent of the projection is -HALF_M to HALF_M
+MAX_ZOOM = 23  # 2 cm per pixel
 
 
 class Tile(NamedTuple):
@@ -27,7 +27,7 @@ class Tile(NamedTuple):
 
 @dataclass(frozen=True)
 class TileRange:
-    """Tiles of one zoom around an area, and which of them touch it."""
+    """Tiles of one zoom around an area, and a mask of those that touch it."""
 
     zoom: int
     column: int  # of the first tile
@@ -51,14 +51,14 @@ def tile_span_m(zoom: int) -> float:
 
 
 def ground_pixel_m(zoom: int, lat_deg: float, tile_px: int) -> float:
-    """Metres on the ground of a tile's pixel, on the sphere (within 0.7 % of the ellipsoid)."""
+    """Ground metres per pixel of a tile, on the sphere (within 0.7 % of the ellipsoid)."""
     return tile_span_m(zoom) / tile_px * math.cos(math.radians(lat_deg))
 
 
 def zoom_for(gsd_m: float, lat_deg: float, tile_px: int) -> int:
-    """The coarsest zoom whose pixels are not larger than ``gsd_m`` (a hundredth more is let pass)."""
+    """The coarsest zoom whose pixels are not larger than ``gsd_m`` (with a tolerance of a hundredth)."""
     exact = math.log2(2.0 * HALF_M * math.cos(math.radians(lat_deg)) / (tile_px * gsd_m * 1.01))
-    return min(max(math.ceil(exact), 0), DEEPEST_ZOOM)
+    return min(max(math.ceil(exact), 0), MAX_ZOOM)
 
 
 def tiles_of(placed: Placed, zoom: int) -> TileRange:

@@ -1,4 +1,4 @@
-"""Tiles of one zoom as one picture, with the contract of ImagerySource."""
+"""Tiles of one zoom as one image; implements Imagery."""
 
 from collections import OrderedDict
 from pathlib import Path
@@ -8,16 +8,16 @@ from typing import Protocol
 import numpy as np
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area import Placed
+from terrafix_tools.mapping.area.area import Placed
 from terrafix_tools.mapping.source import ground_pixel_m
 from terrafix_tools.mapping.sources.tile_grid import HALF_M, MERCATOR, Tile, tile_span_m, tiles_of
 from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode
 
-CACHE_BYTES = 64 << 20  # decoded tiles; neighbouring windows share a row of them
+CACHE_BYTES = 64 << 20  # decoded tiles; adjacent windows share a row of them
 
 
 class TileReader(Protocol):
-    """Where tiles lie: a store, an MBTiles or a PMTiles file."""
+    """Source of tiles: a download store, an MBTiles or a PMTiles file."""
 
     path: Path
 
@@ -63,7 +63,7 @@ class TileImagery:
         return ground_pixel_m(self.crs, (x_min + x_max) / 2, (y_min + y_max) / 2, self.pixel_x, self.pixel_y)
 
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-        """(height, width, 3) uint8 BGR and (height, width) uint8 mask of 0 and 255, of a window inside the picture.
+        """A window inside the image: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255.
 
         Raises MapError: a tile is damaged."""
         out = np.zeros((height, width, 4), np.uint8)

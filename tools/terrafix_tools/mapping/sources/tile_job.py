@@ -1,4 +1,4 @@
-"""A source of tiles on a server: what is wanted of it, what is still missing, and its download."""
+"""A tile server as a source: required tiles, missing tiles, and their download."""
 
 import hashlib
 import time
@@ -6,27 +6,27 @@ from functools import partial
 from pathlib import Path
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area import Area, Placed
-from terrafix_tools.mapping.fetch import Client
-from terrafix_tools.mapping.fetch_progress import OnProgress
-from terrafix_tools.mapping.fetch_tiles import TileDownload
-from terrafix_tools.mapping.mosaic import Opener
-from terrafix_tools.mapping.mosaic_cover import uncovered
-from terrafix_tools.mapping.plan import Estimate, sampled
+from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.fetching.fetch import Client
+from terrafix_tools.mapping.fetching.plan import Estimate, spread_sample
+from terrafix_tools.mapping.fetching.progress import OnProgress
+from terrafix_tools.mapping.fetching.tiles import TileDownload
+from terrafix_tools.mapping.mosaic.cover import uncovered
+from terrafix_tools.mapping.mosaic.mosaic import Opener
 from terrafix_tools.mapping.sources.spec import SourceSpec
 from terrafix_tools.mapping.sources.tile_files import open_tiles
 from terrafix_tools.mapping.sources.tile_grid import MERCATOR, tiles_of, zoom_for
 from terrafix_tools.mapping.sources.tile_imagery import TileImagery
-from terrafix_tools.mapping.sources.tile_picture import picture_side
+from terrafix_tools.mapping.sources.tile_picture import image_side
 from terrafix_tools.mapping.sources.tile_store import TileStore
 from terrafix_tools.mapping.sources.url_template import UrlTemplate
 from terrafix_tools.mapping.sources.wmts import read_capabilities
 
-DEFAULT_GSD_M = 0.5  # a server has any detail; this is fine enough for flights above 100 m
+DEFAULT_GSD_M = 0.5  # default for a server; fine enough for flights above 100 m
 
 
 class TileJob:
-    """One spec with a url or a wmts, for one area."""
+    """One source with a url or a wmts, for one area."""
 
     def __init__(self, spec: SourceSpec, area: Area, gsd_m: float | None, cache: Path) -> None:
         self.spec, self._area = spec, area
@@ -43,18 +43,18 @@ class TileJob:
         key = hashlib.sha256(self.template.text.encode()).hexdigest()[:16]
         self.path = cache / f"{key}.mbtiles"
 
-    def leave_out(self, better: tuple[Opener, ...]) -> None:
-        """Drops the tiles that better sources make needless."""
+    def drop_covered(self, better: tuple[Opener, ...]) -> None:
+        """Drops the tiles that better sources cover completely."""
         self.tiles = uncovered(self._area, better, self.tiles)
 
     def estimate(self) -> Estimate:
-        """Fetches a few tiles to know their size. Raises as `TileDownload.run`, and MapError."""
+        """Fetches a few tiles to measure their size. Raises as `TileDownload.run`, and MapError."""
         with self._store() as store:
             missing = store.missing(self.tiles)
             if not missing.count:
                 return Estimate(self.spec.title, self.tiles.count, 0, 0.0, 0.0)
             began_s = time.monotonic()
-            sample = sampled(missing)
+            sample = spread_sample(missing)
             download = self._download(store)
             download.run(sample, lambda _: None)
         done = download.progressed
@@ -63,7 +63,7 @@ class TileJob:
         return Estimate(self.spec.title, self.tiles.count, left, left * done.size_bytes / done.done, left / rate)
 
     def fetch(self, on_progress: OnProgress) -> None:
-        """Raises as `TileDownload.run`, and MapError when the server has nothing at all in the area."""
+        """Raises as `TileDownload.run`, and MapError when the server has no tile in the area."""
         with self._store() as store:
             missing = store.missing(self.tiles)
             if missing.count:
@@ -95,12 +95,12 @@ def open_tile_imagery(path: Path, zoom: int, tile_px: int, area: Area) -> TileIm
 
 
 def tile_file_opener(spec: SourceSpec, area: Area, gsd_m: float | None) -> Opener:
-    """A local MBTiles or PMTiles file at its finest zoom, or at that which the wanted detail asks for."""
+    """A local MBTiles or PMTiles file at its finest zoom, or at that of the requested resolution."""
     path = Path(spec.path)
     reader = open_tiles(path)
     try:
         zoom = max(reader.zooms)
-        tile_px = picture_side(reader.first(zoom), path)
+        tile_px = image_side(reader.first(zoom), path)
         if gsd_m:
             lat_deg = (area.bounds_deg[1] + area.bounds_deg[3]) / 2
             zoom = min(zoom, max(zoom_for(gsd_m, lat_deg, tile_px), min(reader.zooms)))
@@ -114,7 +114,7 @@ def tile_file_opener(spec: SourceSpec, area: Area, gsd_m: float | None) -> Opene
 
 
 def _capabilities(spec: SourceSpec) -> bytes:
-    answer = Client(spec.title, spec.limits, spec.headers).request("GET", spec.wmts)
-    if answer is None:
+    response = Client(spec.title, spec.limits, spec.headers).request("GET", spec.wmts)
+    if response is None:
         raise MapError(f"{spec.wmts}: nothing there; give the address of the server's GetCapabilities")
-    return answer
+    return response

@@ -1,4 +1,4 @@
-"""One tile as it comes from a file or a server: is it whole, and its pixels."""
+"""Validates and decodes one tile from a file or a server."""
 
 from pathlib import Path
 
@@ -9,15 +9,15 @@ from terrafix.core.errors import MapError
 
 JPEG, PNG, WEBP = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"RIFF"
 PNG_END = b"IEND\xaeB`\x82"
-TAIL_BYTES = 64  # some servers append a few bytes after the end mark
+TAIL_BYTES = 64  # some servers append a few bytes after the end marker
 
 
 class TileDamage(Exception):
-    """Why bytes are no whole picture. Caught where it is known which tile it is."""
+    """Why the bytes are not a complete image. Caught by callers that know the tile index."""
 
 
-def check_whole(data: bytes) -> None:
-    """Raises TileDamage. Decoders are lenient: they paint the missing part of a cut JPEG grey and say nothing."""
+def check_complete(data: bytes) -> None:
+    """Raises TileDamage. Needed because decoders are lenient: they silently fill a truncated JPEG with grey."""
     if not data:
         raise TileDamage("empty answer")
     if data.startswith(JPEG):
@@ -34,28 +34,28 @@ def check_whole(data: bytes) -> None:
 
 
 def decode(data: bytes, side_px: int) -> np.ndarray:
-    """(side, side, 4) uint8 BGR and mask of 0 and 255. Raises TileDamage: not whole, not decodable, another size."""
-    check_whole(data)
+    """(side, side, 4) uint8 BGR and mask of 0 and 255. Raises TileDamage: incomplete, not decodable, another size."""
+    check_complete(data)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise TileDamage("does not decode")
     if image.shape[:2] != (side_px, side_px):
         raise TileDamage(f"is {image.shape[1]}x{image.shape[0]} px, not {side_px}: set tile_px of the source")
     if image.dtype == np.uint16:
-        image = (image.astype(np.uint16) >> 8).astype(np.uint8)  # PNG of 16 bits
+        image = (image.astype(np.uint16) >> 8).astype(np.uint8)  # 16-bit PNG
     if image.ndim == 2:
         image = image[:, :, None]
     out = np.empty((side_px, side_px, 4), np.uint8)
     channels = image.shape[2]
     out[:, :, :3] = image[:, :, :3] if channels >= 3 else image[:, :, :1]
-    # Half transparent is the rim of a mosaic: its colour is blended with nothing.
+    # Partly transparent pixels are at the edge of a mosaic; their colour is blended with the void.
     out[:, :, 3] = np.where(image[:, :, -1] == 255, 255, 0) if channels in (2, 4) else 255
     return out
 
 
-def picture_side(data: bytes, path: Path) -> int:
-    """Side of a tile, px. Raises MapError."""
+def image_side(data: bytes, path: Path) -> int:
+    """Side of a tile in px. Raises MapError."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None or image.shape[0] != image.shape[1]:
-        raise MapError(f"{path}: its tiles are no square pictures (JPEG, PNG or WebP); check the source")
+        raise MapError(f"{path}: its tiles are not square images (JPEG, PNG or WebP); check the source")
     return int(image.shape[0])

@@ -1,6 +1,6 @@
-"""Downloaded tiles in one MBTiles file (github.com/mapbox/mbtiles-spec 1.3): what is in it is never fetched again.
+"""Downloaded tiles in one MBTiles file (github.com/mapbox/mbtiles-spec 1.3); stored tiles are not fetched again.
 
-Every tile is its own transaction in write-ahead mode, so that a killed process loses at most the tile in its hands."""
+Every tile is a transaction of its own in write-ahead mode, so that a killed process loses at most the current tile."""
 
 import sqlite3
 import threading
@@ -14,9 +14,9 @@ import numpy as np
 from terrafix.core.errors import MapError, OutputError
 from terrafix_tools.mapping.sources.tile_grid import Tile, TileRange
 
-ABSENT_FOR_S = 7 * 86_400.0  # after this a tile that the server did not have is asked for again
+ABSENT_FOR_S = 7 * 86_400.0  # after this time an absent tile is requested again
 ROWS_AT_A_TIME = 100_000
-BUSY_S = 60.0  # another process may be writing
+BUSY_S = 60.0  # time-out when another process is writing
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS metadata (name TEXT PRIMARY KEY, value TEXT);
 CREATE TABLE IF NOT EXISTS tiles (
@@ -30,7 +30,7 @@ WITHIN = "zoom_level = ? AND tile_column BETWEEN ? AND ? AND tile_row BETWEEN ? 
 
 
 class TileStore:
-    """Written by several threads. A context manager."""
+    """Thread-safe. A context manager."""
 
     def __init__(self, path: Path, name: str) -> None:
         self.path = path
@@ -56,8 +56,8 @@ class TileStore:
         self._db.close()
 
     def add(self, tile: Tile, data: bytes | None) -> None:
-        """None: the server has nothing there. Raises OutputError when the disk is full."""
-        key = tile.zoom, tile.column, flipped(tile.zoom, tile.row)
+        """Stores a tile; None: absent on the server. Raises OutputError when the disk is full."""
+        key = tile.zoom, tile.column, mbtiles_row(tile.zoom, tile.row)
         with self._lock:
             try:
                 if data is None:
@@ -68,7 +68,7 @@ class TileStore:
                 raise OutputError(f"{self.path}: a tile cannot be stored ({error}); check the space") from None
 
     def missing(self, wanted: TileRange) -> TileRange:
-        """What of a range is not here, and not known to be absent."""
+        """The tiles of a range that are neither stored nor known to be absent."""
         left = wanted.touched.copy()
         recent = f"SELECT tile_column, tile_row FROM absent WHERE {WITHIN} AND asked_s > ?"
         with self._lock:
@@ -79,27 +79,27 @@ class TileStore:
                 found = self._db.execute(query, (*_box(wanted), *more))
                 while here := found.fetchmany(ROWS_AT_A_TIME):
                     columns, tms_rows = np.array(here).T
-                    left[flipped(wanted.zoom, tms_rows) - wanted.row, columns - wanted.column] = False
+                    left[mbtiles_row(wanted.zoom, tms_rows) - wanted.row, columns - wanted.column] = False
         return TileRange(wanted.zoom, wanted.column, wanted.row, left)
 
     def any_of(self, wanted: TileRange) -> bool:
-        """Whether there is a picture in the box around a range."""
+        """True when there is a tile in the box around a range."""
         with self._lock:
             return self._db.execute(f"SELECT 1 FROM tiles WHERE {WITHIN} LIMIT 1", _box(wanted)).fetchone() is not None
 
 
 def _expired() -> float:
-    """Unix time before which an absence is no longer believed."""
+    """Unix time before which a recorded absence has expired."""
     return time.time() - ABSENT_FOR_S
 
 
 def _box(wanted: TileRange) -> tuple[int, int, int, int, int]:
-    """Zoom, first and last column, first and last row as MBTiles counts."""
+    """Zoom, first and last column, first and last row in MBTiles numbering."""
     rows, columns = wanted.touched.shape
-    south, north = flipped(wanted.zoom, wanted.row + rows - 1), flipped(wanted.zoom, wanted.row)
+    south, north = mbtiles_row(wanted.zoom, wanted.row + rows - 1), mbtiles_row(wanted.zoom, wanted.row)
     return wanted.zoom, wanted.column, wanted.column + columns - 1, south, north
 
 
-def flipped(zoom: int, row: Any) -> Any:
-    """MBTiles counts rows from the south."""
+def mbtiles_row(zoom: int, row: Any) -> Any:
+    """Row in MBTiles numbering, which counts from the south."""
     return (1 << zoom) - 1 - row

@@ -1,4 +1,4 @@
-"""Addresses of tiles: XYZ, TMS and WMTS templates become the address of one tile."""
+"""URL templates of tiles: XYZ, TMS and WMTS."""
 
 import os
 import re
@@ -18,9 +18,9 @@ HINT = "write {z}, {x} and {y} (or {-y}, rows from the south) into it"
 @dataclass(frozen=True)
 class UrlTemplate:
     """``text`` with {z} {x} {y}, or {-y} where rows count from the south, or {TileMatrix} {TileCol} {TileRow};
-    {a,b,c} is one of these, in turn; ${NAME} is taken from the environment, so that keys need not stand in files.
+    {a,b,c} alternates between these values; ${NAME} is an environment variable, so that keys need not be in files.
 
-    ``matrix_of_zoom``: names of the matrices of a WMTS where they are not just the zoom."""
+    ``matrix_of_zoom``: names of the matrices of a WMTS, if they are not the zoom."""
 
     text: str
     matrix_of_zoom: Mapping[int, str] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class UrlTemplate:
             choices = name.split(",")
             return choices[(tile.column + tile.row) % len(choices)]
 
-        # Placeholders first: what comes from the environment is taken as it is.
+        # Placeholders first: values of environment variables are inserted unchanged.
         protected = SECRET.sub(lambda m: f"\0{m[1]}\0", self.text)
         return re.sub("\0(\\w+)\0", lambda m: os.environ.get(m[1], ""), FIELD.sub(fill, protected))
 

@@ -1,4 +1,4 @@
-"""The capabilities of a WMTS server: addresses of one layer's tiles in Web Mercator (OGC 07-057r7, version 1.0.0)."""
+"""Capabilities of a WMTS server: URL templates of one layer's tiles in Web Mercator (OGC 07-057r7, version 1.0.0)."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from urllib.parse import quote
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.sources.tile_grid import DEEPEST_ZOOM, tile_span_m
+from terrafix_tools.mapping.sources.tile_grid import MAX_ZOOM, tile_span_m
 from terrafix_tools.mapping.sources.url_template import UrlTemplate
 
 WMTS = "{http://www.opengis.net/wmts/1.0}"
 OWS = "{http://www.opengis.net/ows/1.1}"
 LINK = "{http://www.w3.org/1999/xlink}href"
-PIXEL_M = 0.28e-3  # of the standard's screen, in which scale denominators are given (clause 6.1)
+PIXEL_M = 0.28e-3  # pixel size of the standard's display, to which scale denominators refer (clause 6.1)
 FORMATS = ("image/jpeg", "image/jpg", "image/png", "image/webp")  # in this order of preference
 WORLD_CORNER_M = -20_037_508.34
 
@@ -25,7 +25,7 @@ class WmtsLayer:
 
 
 def read_capabilities(data: bytes, name: str, url: str) -> WmtsLayer:
-    """The layer ``name`` of the answer to GetCapabilities. Raises MapError: no such layer, not in Web Mercator."""
+    """The layer ``name`` of a GetCapabilities document. Raises MapError: no such layer, not in Web Mercator."""
     try:
         root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
@@ -47,7 +47,7 @@ def read_capabilities(data: bytes, name: str, url: str) -> WmtsLayer:
 
 
 def _template(root: ElementTree.Element, layer: ElementTree.Element, name: str, set_name: str, url: str) -> str:
-    """RESTful where the server offers it, else the key-value form of GetTile."""
+    """URL template: RESTful if the server supports it, else the key-value form of GetTile."""
     styles = [_text(s, OWS + "Identifier") for s in layer.iter(WMTS + "Style") if s.get("isDefault") == "true"]
     style = styles[0] if styles else _text(layer.find(f".//{WMTS}Style"), OWS + "Identifier")
     formats = [f.text or "" for f in layer.iter(WMTS + "Format")]
@@ -82,7 +82,7 @@ def _is_mercator(matrix_set: ElementTree.Element) -> bool:
 
 
 def _matrices(matrix_set: ElementTree.Element) -> tuple[dict[int, str], int]:
-    """Zoom -> name of those matrices that are the tiles of the whole world, by corner and pixel size; their side."""
+    """Zoom -> name of the matrices that are tiles of the whole world, by corner and pixel size; side of the tiles."""
     found: dict[int, str] = {}
     side_px = 0
     for matrix in matrix_set.iter(WMTS + "TileMatrix"):
@@ -93,7 +93,7 @@ def _matrices(matrix_set: ElementTree.Element) -> tuple[dict[int, str], int]:
         except (ValueError, IndexError):
             continue
         span_m = pixel_m * width_px
-        zoom = next((z for z in range(DEEPEST_ZOOM + 1) if abs(tile_span_m(z) / span_m - 1.0) < 1e-4), None)
+        zoom = next((z for z in range(MAX_ZOOM + 1) if abs(tile_span_m(z) / span_m - 1.0) < 1e-4), None)
         if zoom is None or abs(corner_m - WORLD_CORNER_M) > 1.0 or (side_px and width_px != side_px):
             continue
         side_px = width_px

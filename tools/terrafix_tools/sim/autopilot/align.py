@@ -1,4 +1,4 @@
-"""Before the first use of GPS: the checks of ArduPilot's filter, and what its pre-arm tests complain about."""
+"""Alignment before the first use of GPS: the checks of ArduPilot's filter, and its pre-arm checks."""
 
 from collections.abc import Sequence
 
@@ -8,21 +8,21 @@ from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.autopilot.switch import BLEND
 
 CHECK_SATS, CHECK_HDOP, CHECK_SPEED, CHECK_POSITION = 1, 2, 4, 8  # EK3_GPS_CHECK; 16, yaw, is not simulated
-SATS, HDOP = 6, 2.5
+MIN_SATELLITES, MAX_HDOP = 6, 2.5
 SPEED_MPS, HORIZONTAL_M, VERTICAL_M = 1.0, 5.0, 7.5  # at EK3_CHECK_SCALE 100
-ALIGN_S = 10.0  # the checks must hold this long; then the origin is set
+ALIGN_S = 10.0  # the checks must pass this long; then the origin is set
 USE_AFTER_S = {Kind.PLANE: 1.4, Kind.COPTER: 10.6}  # from the origin to "is using GPS"
-ARM_AFTER_S = 1.0  # from there until the pre-arm tests are content
-GPS_APART_M = 50.0
+ARM_AFTER_S = 1.0  # time from there until the pre-arm checks pass
+MAX_GPS_DISTANCE_M = 50.0
 ARM_ALL, ARM_GPS = 1, 8  # ARMING_CHECK
 
 
-def passes(fix: Fix, check: int, scale: float) -> bool:
-    """EK3_GPS_CHECK over one fix; ``scale``: EK3_CHECK_SCALE in per cent."""
+def passes_checks(fix: Fix, check: int, scale: float) -> bool:
+    """Applies EK3_GPS_CHECK to one fix; ``scale``: EK3_CHECK_SCALE in per cent."""
     s = scale / 100.0
     return not (
-        (check & CHECK_SATS and fix.satellites < SATS)
-        or (check & CHECK_HDOP and fix.hdop > HDOP)
+        (check & CHECK_SATS and fix.satellites < MIN_SATELLITES)
+        or (check & CHECK_HDOP and fix.hdop > MAX_HDOP)
         or (check & CHECK_SPEED and (fix.speed_mps or 0.0) > SPEED_MPS * s)
         or (check & CHECK_POSITION and (fix.horizontal_m or 0.0) > HORIZONTAL_M * s)
         or (check & CHECK_POSITION and (fix.vertical_m or 0.0) > VERTICAL_M * s)
@@ -30,16 +30,16 @@ def passes(fix: Fix, check: int, scale: float) -> bool:
 
 
 class Alignment:
-    """Feed it every fix in use until ``done``."""
+    """Alignment state of the filter. Call ``update`` with every fix of the GPS in use until it returns True."""
 
     def __init__(self, kind: Kind) -> None:
         self._kind = kind
         self._passing_since_s: float | None = None
-        self.origin_s: float | None = None  # when the origin was set
+        self.origin_s: float | None = None  # time at which the origin was set
 
-    def take(self, fix: Fix, now_s: float, check: int, scale: float) -> bool:
-        """Can the filter use GPS now?"""
-        if not passes(fix, check, scale):
+    def update(self, fix: Fix, now_s: float, check: int, scale: float) -> bool:
+        """Returns True when the filter can use GPS."""
+        if not passes_checks(fix, check, scale):
             self._passing_since_s = None
         elif self._passing_since_s is None:
             self._passing_since_s = now_s
@@ -47,12 +47,12 @@ class Alignment:
             self.origin_s = now_s
         return self.origin_s is not None and now_s - self.origin_s >= USE_AFTER_S[self._kind]
 
-    def broken(self) -> None:
-        """No 3D fix: the checks begin again."""
+    def restart(self) -> None:
+        """No 3D fix: restarts the checks."""
         self._passing_since_s = None
 
 
-def complaints(
+def prearm_failures(
     gps: Sequence[GpsInstance | None],
     alignment: Alignment,
     using_since_s: float | None,
@@ -60,38 +60,39 @@ def complaints(
     kind: Kind,
     now_s: float,
 ) -> list[str]:
-    """What stands against arming, in ArduPilot's words without "PreArm: "; empty: it arms.
+    """Returns the reasons not to arm, in ArduPilot's words without "PreArm: "; empty: arming is possible.
 
-    ``using_since_s``: since when the filter uses GPS."""
+    ``using_since_s``: time since when the filter uses GPS.
+    """
     checks = int(parameters["ARMING_CHECK"])
-    said = _of_gps(gps, int(parameters["GPS_AUTO_SWITCH"]), now_s) if checks & (ARM_ALL | ARM_GPS) else []
+    failures = _gps_failures(gps, int(parameters["GPS_AUTO_SWITCH"]), now_s) if checks & (ARM_ALL | ARM_GPS) else []
     if kind is Kind.COPTER and any(isinstance(g, GpsInputDriver) and _configuring(g) for g in gps):
-        return [*said, "EKF attitude is bad"]
+        return [*failures, "EKF attitude is bad"]
     if alignment.origin_s is None:
-        return [*said, "AHRS: waiting for home"]
+        return [*failures, "AHRS: waiting for home"]
     if using_since_s is None or now_s - using_since_s < ARM_AFTER_S:
-        return [*said, "Need Position Estimate"]
-    return said
+        return [*failures, "Need Position Estimate"]
+    return failures
 
 
 def _configuring(gps: GpsInstance) -> bool:
-    """Fix type 0 at boot keeps a copter's filter from starting: it waits for the receiver to be set up."""
-    return gps.heard() and gps.fix_type == NO_GPS and not gps.gone
+    """Fix type 0 at boot keeps a copter's filter from starting: it waits for the receiver's configuration."""
+    return gps.has_reported() and gps.fix_type == NO_GPS and not gps.timed_out
 
 
-def _of_gps(gps: Sequence[GpsInstance | None], switch: int, now_s: float) -> list[str]:
-    there = [g for g in gps if g is not None]
-    said = []
-    for g in there:
+def _gps_failures(gps: Sequence[GpsInstance | None], switch: int, now_s: float) -> list[str]:
+    present = [g for g in gps if g is not None]
+    failures = []
+    for g in present:
         if not g.has_fix():
-            said.append(f"GPS {g.instance + 1}: Bad fix")
+            failures.append(f"GPS {g.instance + 1}: Bad fix")
         elif not g.healthy(now_s):
-            said.append(f"GPS {g.instance + 1}: not healthy")
-    fixes = [g.fix for g in there if g.has_fix() and g.fix is not None]
+            failures.append(f"GPS {g.instance + 1}: not healthy")
+    fixes = [g.fix for g in present if g.has_fix() and g.fix is not None]
     if len(fixes) == 2:
-        apart_m = distance_m(fixes[0].lat_deg, fixes[0].lon_deg, fixes[1].lat_deg, fixes[1].lon_deg)
-        if apart_m > GPS_APART_M:
-            said.append(f"GPS positions differ by {apart_m:.0f}m")
-    if switch == BLEND and len(there) == 2 and said:
-        said.append("GPS blending unhealthy")
-    return said
+        distance_apart_m = distance_m(fixes[0].lat_deg, fixes[0].lon_deg, fixes[1].lat_deg, fixes[1].lon_deg)
+        if distance_apart_m > MAX_GPS_DISTANCE_M:
+            failures.append(f"GPS positions differ by {distance_apart_m:.0f}m")
+    if switch == BLEND and len(present) == 2 and failures:
+        failures.append("GPS blending unhealthy")
+    return failures

@@ -1,4 +1,4 @@
-"""The true course that the autopilot peer flies, and its file: one row a moment, interpolated in between."""
+"""True course of the autopilot peer, and its CSV file: one row per time, interpolated in between."""
 
 import csv
 import math
@@ -12,12 +12,12 @@ import numpy as np
 from terrafix.core.errors import OutputError, SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.sim.interfaces import State
-from terrafix_tools.sim.vehicle.motion import GRAVITY_MPS2, quat_of, rotate_back, turned
+from terrafix_tools.sim.vehicle.motion import GRAVITY_MPS2, mean_rates, quat_of, rotate_to_body
 
 
 @dataclass(frozen=True)
 class PeerState:
-    """Where the vehicle truly is; angles in radians (yaw clockwise from true north), velocity north, east, down."""
+    """True state of the vehicle; angles in radians (yaw clockwise from true north), velocity north, east, down."""
 
     lat_deg: float
     lon_deg: float
@@ -29,10 +29,10 @@ class PeerState:
     vn_mps: float
     ve_mps: float
     vd_mps: float
-    airspeed_mps: float = math.nan  # nan: not known, as if there were no sensor
+    airspeed_mps: float = math.nan  # nan: unknown, as without sensor
 
 
-Course = Callable[[float], PeerState]  # seconds of the flight -> truth
+Course = Callable[[float], PeerState]  # seconds of the flight -> true state
 
 COLUMNS = ("t_s", *(f.name for f in fields(PeerState)))
 OPTIONAL = {"airspeed_mps"}
@@ -40,7 +40,7 @@ _ANGLES = {"yaw_rad", "roll_rad", "pitch_rad"}
 
 
 def write_course(path: Path, rows: Iterable[tuple[float, PeerState]]) -> None:
-    """(seconds, state) in order of time -> CSV. Raises OutputError."""
+    """Writes (seconds, state) in order of time as CSV. Raises OutputError."""
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
@@ -52,7 +52,7 @@ def write_course(path: Path, rows: Iterable[tuple[float, PeerState]]) -> None:
 
 
 def read_course(path: Path) -> Course:
-    """CSV -> course; before the first and after the last row the vehicle stands still there. Raises SourceError."""
+    """Reads a course from CSV; before the first and after the last row the vehicle stands still. Raises SourceError."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = [[_cell(row, name) for name in COLUMNS] for row in csv.DictReader(file)]
@@ -61,7 +61,7 @@ def read_course(path: Path) -> Course:
     except (KeyError, TypeError, ValueError):
         raise SourceError(f"{path}: not a course; needs the columns {', '.join(COLUMNS[:-1])}") from None
     if not rows:
-        raise SourceError(f"{path}: holds no rows")
+        raise SourceError(f"{path}: no rows")
     times = [row[0] for row in rows]
 
     def state(t_s: float) -> PeerState:
@@ -71,7 +71,7 @@ def read_course(path: Path) -> Course:
         before, after = rows[i - 1], rows[i]
         share = (t_s - before[0]) / (after[0] - before[0]) if after[0] > before[0] else 0.0
         return PeerState(
-            *(_between(n, a, b, share) for n, a, b in zip(COLUMNS, before, after, strict=True) if n != "t_s")
+            *(_interpolate(n, a, b, share) for n, a, b in zip(COLUMNS, before, after, strict=True) if n != "t_s")
         )
 
     return state
@@ -81,38 +81,40 @@ def _cell(row: dict[str, str], name: str) -> float:
     return float(row.get(name, "nan") if name in OPTIONAL else row[name])
 
 
-def _between(name: str, a: float, b: float, share: float) -> float:
+def _interpolate(name: str, a: float, b: float, share: float) -> float:
     return a + share * (math.remainder(b - a, math.tau) if name in _ANGLES else b - a)
 
 
-class Along:
-    """A course as states with the inertial readings that belong to it, moment after moment."""
+class CourseFollower:
+    """Follows a course and computes states with consistent inertial readings, in order of time."""
 
     def __init__(self, course: Course, frame: LocalFrame) -> None:
         self._course, self._frame = course, frame
         self._before: tuple[float, PeerState] | None = None
 
     def state(self, now_s: float, t_s: float) -> State:
-        """At ``now_s`` of the autopilot the vehicle is where the course has it at ``t_s``. In order of time."""
-        at = self._course(t_s)
-        before_s, before = self._before or (now_s, at)
-        self._before = (now_s, at)
+        """Returns the state at the autopilot's ``now_s``, where the vehicle is at ``t_s`` of the course. Call in order
+        of time.
+        """
+        current = self._course(t_s)
+        before_s, before = self._before or (now_s, current)
+        self._before = (now_s, current)
         dt_s = max(1e-3, now_s - before_s)
-        rates, middle = turned(_quat(before), _quat(at), dt_s)
-        push = ((a - b) / dt_s for a, b in zip(_ned(at), _ned(before), strict=True))
-        north, east, down = push
-        e_m, n_m = self._frame.to_local(at.lat_deg, at.lon_deg)
+        rates, mid_quat = mean_rates(_quat(before), _quat(current), dt_s)
+        accel_ned = ((a - b) / dt_s for a, b in zip(_ned(current), _ned(before), strict=True))
+        north, east, down = accel_ned
+        e_m, n_m = self._frame.to_local(current.lat_deg, current.lon_deg)
         return State(
             t_s=now_s,
-            p_b_in_w_m=np.array((e_m, n_m, at.amsl_m)),
-            velocity_enu_mps=np.array((at.ve_mps, at.vn_mps, -at.vd_mps)),
-            yaw_rad=math.remainder(at.yaw_rad, math.tau),
-            pitch_rad=at.pitch_rad,
-            roll_rad=at.roll_rad,
-            agl_m=at.agl_m,
+            p_b_in_w_m=np.array((e_m, n_m, current.amsl_m)),
+            velocity_enu_mps=np.array((current.ve_mps, current.vn_mps, -current.vd_mps)),
+            yaw_rad=math.remainder(current.yaw_rad, math.tau),
+            pitch_rad=current.pitch_rad,
+            roll_rad=current.roll_rad,
+            agl_m=current.agl_m,
             rates_b_radps=np.array(rates),
-            force_b_mps2=np.array(rotate_back(middle, north, east, down - GRAVITY_MPS2)),
-            airspeed_mps=at.airspeed_mps,
+            force_b_mps2=np.array(rotate_to_body(mid_quat, north, east, down - GRAVITY_MPS2)),
+            airspeed_mps=current.airspeed_mps,
         )
 
 

@@ -1,10 +1,11 @@
-"""The link on a bad wire: damaged, lost, doubled and reordered packets, and random bytes between them.
+"""Fuzz test of the link on a bad wire: damaged, lost, duplicated and reordered packets, and random bytes between them.
 
-A vehicle flies straight on; its autopilot's telemetry reaches the real edge and node through the bad wire, estimates
-reach them through a good one. Whatever comes over the wire, nothing may crash and what is sent must stay right.
+A vehicle flies straight; its autopilot's telemetry reaches the link's edge and node over the bad wire, estimates over
+a good one. Nothing may crash, and the sent positions must stay correct.
 
     python -m terrafix_tools.sim.autopilot.fuzz --bytes 10000000 --seconds 600
-    python -m terrafix_tools.sim.autopilot.fuzz --seconds 3600 --loss 0.2 --double 0.1 --late 0.1"""
+    python -m terrafix_tools.sim.autopilot.fuzz --seconds 3600 --loss 0.2 --double 0.1 --late 0.1
+"""
 
 import argparse
 import json
@@ -29,9 +30,9 @@ from terrafix_tools.sim.autopilot.fuzz_wire import (
     YAW,
     Autopilot,
     BadWire,
-    cut,
-    mixed,
-    through,
+    add_garbage,
+    split,
+    transmit,
 )
 from terrafix_tools.sim.closed_loop.loopback import Loopback
 
@@ -42,7 +43,7 @@ LAT, LON, ALT_M, EAST_MPS = 48.0, 11.0, 620.0, 20.0
 
 @dataclass
 class Result:
-    """``wrong``: 3D fixes further than 5 m from the truth; ``false_states``: attitudes that nobody sent."""
+    """``wrong``: 3D fixes more than 5 m from the truth; ``false_states``: attitudes that were not sent."""
 
     bytes: int = 0
     packets_taken: int = 0
@@ -60,47 +61,47 @@ class Result:
 
 
 def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) -> Result:
-    """Flies ``seconds`` of simulated time."""
+    """Simulates a flight of ``seconds``."""
     with tempfile.TemporaryDirectory() as folder:
         key = Path(folder) / "key"
         key.touch(mode=0o600)
         key.write_bytes(KEY)
         loopback = Loopback()
         edge = MavlinkEdge(LinkSection(signing_key=str(key) if signed else ""), loopback, lambda: UNIX_NS)
-    node, autopilot, draw = LinkNode(10.0), Autopilot(signed), random.Random(seed)
+    node, autopilot, rng = LinkNode(10.0), Autopilot(signed), random.Random(seed)
     result = Result(seconds=seconds, wire=asdict(wire))
     steps = round(seconds * TICK_HZ)
-    held: list[bytes] = []
+    delayed: list[bytes] = []
     last_sent_ns: int | None = None
     for step in range(steps):
         now_ns = step * STEP_NS
-        true = autopilot.packets(step, now_ns, loopback.take())
-        arriving, held = through(wire, true, held, draw)
+        telemetry = autopilot.packets(step, now_ns, loopback.take())
+        arriving, delayed = transmit(wire, telemetry, delayed, rng)
         garbage = wire.garbage_bytes * (step + 1) // steps - wire.garbage_bytes * step // steps
-        chunk = mixed(arriving, garbage, autopilot.examples, draw)
+        chunk = add_garbage(arriving, garbage, autopilot.examples, rng)
         result.bytes += len(chunk)
-        for piece in cut(chunk, draw):
-            loopback.give(piece)
+        for piece in split(chunk, rng):
+            loopback.to_companion(piece)
         if step % 25 == 5:
-            _tell(node, _estimate(now_ns - 100 * MS, now_ns))
+            _feed(node, _estimate(now_ns - 100 * MS, now_ns))
         for message in edge.poll(now_ns):
             if isinstance(message, VehicleState):
                 result.states += 1
                 result.false_states += not _true_state(message)
-            _tell(node, message)
-        for said in node.tick(now_ns):
-            edge.heard(said)
-            if isinstance(said, GpsInput):
-                _judge(said, result)
+            _feed(node, message)
+        for output in node.tick(now_ns):
+            edge.on_message(output)
+            if isinstance(output, GpsInput):
+                _check_output(output, result)
                 if last_sent_ns is not None:
                     result.longest_gap_ms = max(result.longest_gap_ms, (now_ns - last_sent_ns) / MS)
                 last_sent_ns = now_ns
-    status = edge.status.at(steps * STEP_NS)
+    status = edge.status.snapshot(steps * STEP_NS)
     result.packets_taken, result.bytes_skipped, result.refused = status.received, status.bad, status.refused
     return result
 
 
-def _tell(node: LinkNode, message: Any) -> None:
+def _feed(node: LinkNode, message: Any) -> None:
     for _ in node.on(message):
         pass
 
@@ -128,16 +129,16 @@ def _estimate(t_ns: int, emitted_ns: int) -> NavEstimate:
 
 
 def _true_state(state: VehicleState) -> bool:
-    said = (state.yaw_rad, state.pitch_rad, state.roll_rad)
-    return all(a is not None and abs(a - b) < 1e-6 for a, b in zip(said, (YAW, PITCH, ROLL), strict=True))
+    attitude = (state.yaw_rad, state.pitch_rad, state.roll_rad)
+    return all(a is not None and abs(a - b) < 1e-6 for a, b in zip(attitude, (YAW, PITCH, ROLL), strict=True))
 
 
-def _judge(said: GpsInput, result: Result) -> None:
+def _check_output(output: GpsInput, result: Result) -> None:
     result.sent += 1
-    if said.fix_type != 3:
+    if output.fix_type != 3:
         return
     result.sent_3d += 1
-    error_m = distance_m(said.lat_deg, said.lon_deg, *offset(LAT, LON, EAST_MPS * said.t_ns / S, 0.0))
+    error_m = distance_m(output.lat_deg, output.lon_deg, *offset(LAT, LON, EAST_MPS * output.t_ns / S, 0.0))
     result.wrong += not error_m < 5.0
     result.worst_m = max(result.worst_m, error_m)
 

@@ -1,4 +1,4 @@
-"""The bad wire of the link's fuzz test, and the telemetry that goes over it: a vehicle that flies east."""
+"""The bad wire of the link's fuzz test, and the telemetry on it: a vehicle that flies east."""
 
 import math
 import random
@@ -18,24 +18,24 @@ BOOT_AHEAD_NS = 77_000 * MS
 
 @dataclass(frozen=True)
 class BadWire:
-    garbage_bytes: int = 0  # in all: random, and packets with changed bytes
-    loss: float = 0.0  # share of true packets
+    garbage_bytes: int = 0  # total: random bytes, and packets with changed bytes
+    loss: float = 0.0  # share of valid packets
     double: float = 0.0
-    late: float = 0.0  # comes after the packets of the next step
+    late: float = 0.0  # arrives after the packets of the next step
 
 
 class Autopilot:
-    """The true telemetry of a vehicle that flies east."""
+    """True telemetry of a vehicle that flies east."""
 
     def __init__(self, signed: bool) -> None:
         self._mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
         if signed:
             self._mav.signing.secret_key, self._mav.signing.sign_outgoing = KEY, True
             self._mav.signing.timestamp = timestamp(UNIX_NS)
-        self._ear = mavlink.MAVLink(None)
-        self.examples: list[bytes] = []  # what garbage is made of
+        self._parser = mavlink.MAVLink(None)
+        self.examples: list[bytes] = []  # packets from which garbage is made
 
-    def packets(self, step: int, now_ns: int, asked: bytes) -> list[bytes]:
+    def packets(self, step: int, now_ns: int, requests: bytes) -> list[bytes]:
         boot_ms = (now_ns + BOOT_AHEAD_NS) // MS
         due: list[Any] = []
         if step % 50 == 0:
@@ -47,7 +47,7 @@ class Autopilot:
         if step % 10 == 0:
             due.append(mavlink.MAVLink_global_position_int_message(boot_ms, 1, 2, 3, 120_000, 4, 5, 6, 7))
             due.append(mavlink.MAVLink_gps_raw_int_message(boot_ms * 1000, 1, 0, 0, 0, 9999, 9999, 0, 0, 0))
-        for message in self._ear.parse_buffer(asked) or ():
+        for message in self._parser.parse_buffer(requests) or ():
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                 due.append(mavlink.MAVLink_timesync_message(now_ns + BOOT_AHEAD_NS, message.ts1))
         packets = []
@@ -58,49 +58,49 @@ class Autopilot:
         return packets
 
 
-def through(
-    wire: BadWire, packets: list[bytes], held: list[bytes], draw: random.Random
+def transmit(
+    wire: BadWire, packets: list[bytes], delayed: list[bytes], rng: random.Random
 ) -> tuple[list[bytes], list[bytes]]:
     """-> (what arrives now, what comes with the next step)."""
     arriving: list[bytes] = []
     later: list[bytes] = []
     for packet in packets:
-        if draw.random() < wire.loss:
+        if rng.random() < wire.loss:
             continue
-        (later if draw.random() < wire.late else arriving).append(packet)
-        if draw.random() < wire.double:
+        (later if rng.random() < wire.late else arriving).append(packet)
+        if rng.random() < wire.double:
             arriving.append(packet)
-    return arriving + held, later
+    return arriving + delayed, later
 
 
-def mixed(packets: list[bytes], garbage: int, examples: list[bytes], draw: random.Random) -> bytes:
-    """Whole packets with garbage between them, ``garbage`` bytes of it: half of it is damaged packets."""
+def add_garbage(packets: list[bytes], garbage: int, examples: list[bytes], rng: random.Random) -> bytes:
+    """Inserts ``garbage`` bytes between whole packets; half of them are damaged packets."""
     pieces = list(packets)
     while garbage > 0:
-        piece = _damaged(draw.choice(examples), draw) if examples and draw.random() < 0.5 else draw.randbytes(40)
-        pieces.insert(draw.randint(0, len(pieces)), piece[:garbage])
+        piece = _damaged(rng.choice(examples), rng) if examples and rng.random() < 0.5 else rng.randbytes(40)
+        pieces.insert(rng.randint(0, len(pieces)), piece[:garbage])
         garbage -= len(piece[:garbage])
     return b"".join(pieces)
 
 
-def _damaged(packet: bytes, draw: random.Random) -> bytes:
-    """Bits flipped, bytes exchanged, cut, or with a piece of itself inside."""
+def _damaged(packet: bytes, rng: random.Random) -> bytes:
+    """Flips bits, replaces bytes, truncates, or inserts a part of the packet."""
     data = bytearray(packet)
-    match draw.randrange(4):
+    match rng.randrange(4):
         case 0:
-            data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
         case 1:
-            for _ in range(draw.randint(1, 8)):
-                data[draw.randrange(len(data))] = draw.randrange(256)
+            for _ in range(rng.randint(1, 8)):
+                data[rng.randrange(len(data))] = rng.randrange(256)
         case 2:
-            del data[draw.randrange(1, len(data)) :]
+            del data[rng.randrange(1, len(data)) :]
         case _:
-            at = draw.randrange(len(data))
-            data[at:at] = data[: draw.randrange(1, len(data))]
+            at = rng.randrange(len(data))
+            data[at:at] = data[: rng.randrange(1, len(data))]
     return bytes(data) if bytes(data) != packet else bytes(data[:-1])
 
 
-def cut(chunk: bytes, draw: random.Random) -> list[bytes]:
-    """As a serial port hands it over: anywhere."""
-    at = draw.randint(0, len(chunk))
+def split(chunk: bytes, rng: random.Random) -> list[bytes]:
+    """Splits at a random position, as a serial port delivers."""
+    at = rng.randint(0, len(chunk))
     return [piece for piece in (chunk[:at], chunk[at:]) if piece]

@@ -6,20 +6,20 @@ from terrafix.core.errors import UsageError
 
 
 class Kind(StrEnum):
-    """Which firmware is simulated."""
+    """The simulated firmware."""
 
     PLANE = "plane"
     COPTER = "copter"
 
 
 class Gps(StrEnum):
-    """What the autopilot has besides Terrafix."""
+    """GPS configuration of the autopilot."""
 
     SECOND = "second"  # a real receiver is GPS1, Terrafix is GPS2 (config/vehicles/second-gps.param)
     ALONE = "alone"  # Terrafix is the only GPS (plane.param, copter.param)
 
 
-FIRMWARE = {  # ArduPilot 4.6 as it comes
+FIRMWARE = {  # defaults of ArduPilot 4.6
     "AHRS_OPTIONS": 0.0,  # bit 0: no fall-back to DCM in a fixed wing
     "ARMING_CHECK": 1.0,  # bit 0 all, bit 3 GPS
     "ARSPD_USE": 1.0,
@@ -40,9 +40,9 @@ FIRMWARE = {  # ArduPilot 4.6 as it comes
     "GPS_AUTO_SWITCH": 1.0,  # 0 the primary alone, 1 the best, 2 blend, 4 the primary if it has a 3D fix
     "GPS_PRIMARY": 0.0,
 }
-OF_PLANE = {"EK3_CHECK_SCALE": 150.0}  # where the plane's defaults differ
+PLANE_DEFAULTS = {"EK3_CHECK_SCALE": 150.0}  # defaults that differ in a plane
 
-# config/vehicles: what docs/link.md recommends; a test compares with the files.
+# config/vehicles, as recommended in docs/link.md; a test compares with the files.
 GPS_INPUT_ALONE = {
     "GPS1_TYPE": 14.0,
     "GPS1_DELAY_MS": 5.0,
@@ -64,8 +64,8 @@ NO_DCM = {"AHRS_OPTIONS": 1.0}  # plane.param
 
 
 def parameters_of(kind: Kind, changes: dict[str, float] | None = None) -> dict[str, float]:
-    """The firmware's defaults with ``changes``. Raises UsageError for a name that is not simulated."""
-    defaults = FIRMWARE | (OF_PLANE if kind is Kind.PLANE else {})
+    """Returns the firmware's defaults with ``changes``. Raises UsageError for a name that is not simulated."""
+    defaults = FIRMWARE | (PLANE_DEFAULTS if kind is Kind.PLANE else {})
     unknown = set(changes or {}) - set(defaults)
     if unknown:
         raise UsageError(f"parameter {', '.join(sorted(unknown))}: not simulated; known: {', '.join(defaults)}")

@@ -1,4 +1,4 @@
-"""What was noted about an autopilot in flight: the GPS_INPUT that it was given, and where that led it."""
+"""Monitors an autopilot in flight: the GPS_INPUT that it receives, and its position error."""
 
 import json
 import math
@@ -14,33 +14,33 @@ from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
 from terrafix_tools.sim.autopilot.gps import GpsInputDriver
 from terrafix_tools.sim.interfaces import State
 
-TRUTH_KEPT_S = 1.0  # longer than a fix is old
+TRUTH_HISTORY_S = 1.0  # longer than the age of a fix
 
 
 @dataclass
 class PeerReport:
-    """Shares are of the time from the first GPS_INPUT to the end; errors are against the truth, horizontal."""
+    """Shares refer to the time from the first GPS_INPUT to the end; errors are horizontal, against the truth."""
 
     duration_s: float = 0.0
     gps_input_received: int = 0
-    other_instance: int = 0  # GPS_INPUT for a gps_id that is no GPS of that type
-    no_fix: int = 0  # below 3D: not offered to the filter
+    other_instance: int = 0  # GPS_INPUT for a gps_id that is not a GPS of that type
+    no_fix: int = 0  # below 3D: not passed to the filter
     accepted: int = 0  # fused by the position gate
     rejected: int = 0
     resets: int = 0  # hard resets onto the GPS position
-    not_in_use: int = 0  # with a fix, while another GPS was used
+    not_in_use: int = 0  # with a fix, while another GPS was in use
     velocity_rejected: int = 0
-    waiting_for_alignment: int = 0  # 3D, but the checks before first use did not hold
+    waiting_for_alignment: int = 0  # 3D, but the checks before first use did not pass
     healthy_share: float = 0.0
     fix3_share: float = 0.0
     longest_without_fix3_s: float = 0.0
     longest_gap_ms: float | None = None
     interval_median_ms: float | None = None
     interval_p99_ms: float | None = None
-    gps_error_median_m: float | None = None  # the position in the message, at the time it is for
+    gps_error_median_m: float | None = None  # position in the message, at its time of validity
     gps_error_p95_m: float | None = None
     gps_error_max_m: float | None = None
-    position_error_median_m: float | None = None  # what the autopilot steers by
+    position_error_median_m: float | None = None  # of the navigation solution
     position_error_p95_m: float | None = None
     position_error_max_m: float | None = None
     position_error_final_m: float | None = None
@@ -52,24 +52,24 @@ class PeerReport:
     timesync_answers: int = 0  # to our own requests
     timesync_requests: int = 0
     bad_packets: int = 0
-    status_texts: list[str] = field(default_factory=list)  # by the companion
-    autopilot_texts: list[str] = field(default_factory=list)  # by the autopilot, with seconds of the flight
+    status_texts: list[str] = field(default_factory=list)  # received from the companion
+    autopilot_texts: list[str] = field(default_factory=list)  # sent by the autopilot, with seconds of the flight
 
     def write(self, path: Path) -> None:
-        """As JSON. Raises OutputError."""
+        """Writes JSON. Raises OutputError."""
         try:
             path.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
-class Witness:
-    """Watches an autopilot beside the truth, which it alone knows. ``look`` after every step."""
+class PeerMonitor:
+    """Monitors an autopilot with knowledge of the truth. Call ``observe`` after every step."""
 
     def __init__(self, autopilot: SimAutopilot, frame: LocalFrame) -> None:
         self._autopilot, self._frame = autopilot, frame
         self._truths: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
-        self._began_s: float | None = None
+        self._start_s: float | None = None
         self._first_gps_s: float | None = None
         self._now_s = 0.0
         self._healthy_s = self._fix3_s = self._without_s = self._longest_without_s = 0.0
@@ -77,40 +77,40 @@ class Witness:
         self._glitches = 0
         self._gps_errors: list[float] = []
         self._accuracies: list[float] = []
-        self.errors_m: list[float] = []  # of what the autopilot steers by, since the first GPS_INPUT
+        self.errors_m: list[float] = []  # error of the navigation solution since the first GPS_INPUT
 
-    def look(self, now_s: float, truth: State) -> None:
-        self._began_s = now_s if self._began_s is None else self._began_s
+    def observe(self, now_s: float, truth: State) -> None:
+        self._start_s = now_s if self._start_s is None else self._start_s
         dt_s, self._now_s = now_s - self._now_s, now_s
         self._truths.append((now_s, truth.p_b_in_w_m[:2], truth.velocity_enu_mps[:2]))
-        while now_s - self._truths[0][0] > TRUTH_KEPT_S:
+        while now_s - self._truths[0][0] > TRUTH_HISTORY_S:
             self._truths.popleft()
-        for fix in self._autopilot.taken:
-            given = np.array(self._frame.to_local(fix.lat_deg, fix.lon_deg))
-            self._gps_errors.append(float(np.hypot(*(given - self._truth_at(fix.t_s)))))
+        for fix in self._autopilot.gps_input_fixes:
+            reported = np.array(self._frame.to_local(fix.lat_deg, fix.lon_deg))
+            self._gps_errors.append(float(np.hypot(*(reported - self._truth_at(fix.t_s)))))
             if fix.horizontal_m is not None:
                 self._accuracies.append(fix.horizontal_m)
-        self._autopilot.taken.clear()
+        self._autopilot.gps_input_fixes.clear()
         if self._first_gps_s is None:
             if not self._autopilot.counts.received:
                 return
             self._first_gps_s, dt_s = now_s, 0.0
-        self._look_at_gps(now_s, dt_s)
+        self._update_gps_times(now_s, dt_s)
         glitching = self._autopilot.status.glitching
         self._glitches += glitching and not self._glitching
         self._glitching = glitching
-        believed = self._autopilot.navigation()
-        if believed is not None:
-            self.errors_m.append(float(np.hypot(*(believed.p_b_in_w_m[:2] - truth.p_b_in_w_m[:2]))))
+        navigation = self._autopilot.navigation()
+        if navigation is not None:
+            self.errors_m.append(float(np.hypot(*(navigation.p_b_in_w_m[:2] - truth.p_b_in_w_m[:2]))))
 
     def report(self) -> PeerReport:
-        autopilot, heard = self._autopilot, self._autopilot.wire.heard
+        autopilot, traffic = self._autopilot, self._autopilot.wire.received
         counts = autopilot.counts
-        heard_s = max(1e-9, self._now_s - (self._now_s if self._first_gps_s is None else self._first_gps_s))
+        served_s = max(1e-9, self._now_s - (self._now_s if self._first_gps_s is None else self._first_gps_s))
         gaps_ms = [1e3 * g for gps in autopilot.gps if isinstance(gps, GpsInputDriver) for g in gps.gaps_s]
         errors = self.errors_m
         return PeerReport(
-            duration_s=self._now_s - (self._began_s or 0.0),
+            duration_s=self._now_s - (self._start_s or 0.0),
             gps_input_received=counts.received,
             other_instance=counts.other_instance,
             no_fix=counts.no_fix,
@@ -120,8 +120,8 @@ class Witness:
             not_in_use=counts.not_in_use,
             velocity_rejected=autopilot.ekf.velocity_rejected if autopilot.ekf is not None else 0,
             waiting_for_alignment=counts.waiting_for_alignment,
-            healthy_share=min(1.0, self._healthy_s / heard_s),
-            fix3_share=min(1.0, self._fix3_s / heard_s),
+            healthy_share=min(1.0, self._healthy_s / served_s),
+            fix3_share=min(1.0, self._fix3_s / served_s),
             longest_without_fix3_s=self._longest_without_s,
             longest_gap_ms=max(gaps_ms, default=None),
             interval_median_ms=quantile(gaps_ms, 0.5),
@@ -136,16 +136,16 @@ class Witness:
             horiz_accuracy_median_m=quantile(self._accuracies, 0.5),
             failsafes=autopilot.status.failsafes,
             glitches=self._glitches,
-            companion_heartbeats=heard.heartbeats,
-            message_intervals_set=heard.message_intervals_set,
-            timesync_answers=heard.timesync_answers,
-            timesync_requests=heard.timesync_requests,
-            bad_packets=heard.bad_packets,
-            status_texts=heard.texts,
-            autopilot_texts=[f"{t_s:.1f} s: {text}" for t_s, text in autopilot.wire.said],
+            companion_heartbeats=traffic.heartbeats,
+            message_intervals_set=traffic.message_intervals_set,
+            timesync_answers=traffic.timesync_answers,
+            timesync_requests=traffic.timesync_requests,
+            bad_packets=traffic.bad_packets,
+            status_texts=traffic.texts,
+            autopilot_texts=[f"{t_s:.1f} s: {text}" for t_s, text in autopilot.wire.sent_texts],
         )
 
-    def _look_at_gps(self, now_s: float, dt_s: float) -> None:
+    def _update_gps_times(self, now_s: float, dt_s: float) -> None:
         gps = next((g for g in self._autopilot.gps if isinstance(g, GpsInputDriver)), None)
         fix3 = gps is not None and gps.has_fix()
         self._healthy_s += dt_s * (gps is not None and gps.healthy(now_s))
@@ -154,13 +154,13 @@ class Witness:
         self._longest_without_s = max(self._longest_without_s, self._without_s)
 
     def _truth_at(self, t_s: float) -> np.ndarray:
-        """(2,) east, north at a moment of the last second."""
-        at_s, place, velocity = min(self._truths, key=lambda known: abs(known[0] - t_s))
-        return place + velocity * (t_s - at_s)
+        """Returns the true position (2,) east, north at a time of the last second."""
+        at_s, position, velocity = min(self._truths, key=lambda sample: abs(sample[0] - t_s))
+        return position + velocity * (t_s - at_s)
 
 
 def quantile(values: list[float], share: float) -> float | None:
-    """Nearest rank; None without values."""
+    """Nearest rank quantile; None without values."""
     if not values:
         return None
     return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]

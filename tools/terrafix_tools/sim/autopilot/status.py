@@ -1,6 +1,7 @@
-"""What the simulated autopilot concludes from its filter: flags, glitches, fail-safe, fall-back; and what it says then.
+"""Status of the simulated autopilot derived from its filter: flags, glitches, fail-safe, DCM fallback, and texts.
 
-Times and texts as measured on ArduPilot 4.6.3."""
+Times and texts as measured on ArduPilot 4.6.3.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,36 +13,36 @@ from terrafix_tools.sim.autopilot.gps import Fix
 from terrafix_tools.sim.autopilot.parameters import Kind
 
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
-GLITCH_AFTER_S = 1.2  # of rejected positions
-DCM_AFTER_S = 4.0  # of rejected positions: a fixed wing falls back to DCM, which takes the raw GPS
-FAILSAFE_AFTER_S = 0.8  # without a position, in a copter
-CLEARED_AFTER_S = 1.0  # with one again
-SPEED_BAD_MPS, SPEED_GOOD_MPS = 1.5, 1.0  # filtered speed accuracy: a glitch above the first, gone below the second
-SPEED_FILTER_S = 5.0  # not measured: of the order of the other holds
-EXTERNAL_AFTER_S = 1.0  # an external position is taken when GPS has not been fused for so long
+GLITCH_AFTER_S = 1.2  # time of rejected positions
+DCM_AFTER_S = 4.0  # time of rejected positions, after which a fixed wing falls back to DCM, which uses the raw GPS
+FAILSAFE_AFTER_S = 0.8  # time without a position, in a copter
+CLEARED_AFTER_S = 1.0  # time with a position again
+SPEED_BAD_MPS, SPEED_GOOD_MPS = 1.5, 1.0  # filtered speed accuracy: a glitch above the first, cleared below the second
+SPEED_FILTER_S = 5.0  # not measured; of the order of the other hold times
+EXTERNAL_AFTER_S = 1.0  # an external position is accepted when GPS has not been fused for this time
 ALWAYS = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
 RELATIVE = mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_PRED_POS_HORIZ_REL
 ABSOLUTE = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
 GLITCHING = 32768  # EKF_GPS_GLITCHING of ardupilotmega.xml
-Said = tuple[int, str]  # severity, text
+StatusMessage = tuple[int, str]  # severity, text
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What the active source set takes from GPS."""
+    """Use of GPS by the active source set."""
 
     position: bool
     velocity: bool
 
 
 class Status:
-    """``look`` at every step; what changed comes out as texts."""
+    """Call ``update`` at every step; it yields texts on changes."""
 
-    def __init__(self, kind: Kind, *, placed: bool) -> None:
-        """``placed``: it begins with a known position."""
+    def __init__(self, kind: Kind, *, has_position: bool) -> None:
+        """``has_position``: starts with a known position."""
         self._kind = kind
-        self.absolute = placed  # EKF_POS_HORIZ_ABS: a position in the world
-        self.aiding = placed  # anything that bounds the velocity
+        self.absolute = has_position  # EKF_POS_HORIZ_ABS: absolute position available
+        self.aiding = has_position  # aiding that bounds the velocity
         self.glitching = False
         self.on_dcm = False
         self.in_failsafe = False
@@ -60,31 +61,31 @@ class Status:
         flags = ALWAYS | (RELATIVE if self.aiding else mavlink.EKF_CONST_POS_MODE)
         return int(flags | (ABSOLUTE if self.absolute else 0) | (GLITCHING if self.glitching else 0))
 
-    def heard(self, fix: Fix, now_s: float) -> None:
-        """Every fix in use: its speed accuracy may be a glitch of its own."""
+    def update_speed_accuracy(self, fix: Fix, now_s: float) -> None:
+        """Filters the reported speed accuracy of every fix in use, which can indicate a glitch."""
         share = min(1.0, max(0.0, now_s - self._speed_s) / SPEED_FILTER_S)
         self._speed_m, self._speed_s = self._speed_m + share * ((fix.speed_mps or 0.0) - self._speed_m), now_s
         self._speed_bad = self._speed_m > (SPEED_GOOD_MPS if self._speed_bad else SPEED_BAD_MPS)
 
-    def look(
+    def update(
         self, ekf: Ekf | None, sources: Sources, now_s: float, *, flying: bool, gps_3d: bool, dcm: bool
-    ) -> Iterator[Said]:
-        """``dcm``: AHRS_OPTIONS allows the fall-back."""
+    ) -> Iterator[StatusMessage]:
+        """``dcm``: AHRS_OPTIONS permits the fallback."""
         if ekf is None:
             return
-        by_air = self._kind is Kind.PLANE and flying
-        passed_s = ekf.passed_s
-        was = self.aiding
-        recent = passed_s is not None and now_s - passed_s <= ekf.retry_s()
+        airborne_plane = self._kind is Kind.PLANE and flying
+        last_pass_s = ekf.last_pass_s
+        previously_aiding = self.aiding
+        recent = last_pass_s is not None and now_s - last_pass_s <= ekf.position_timeout_s()
         self.absolute = recent and (sources.position or flying)
-        self.aiding = by_air or (recent and (sources.position or sources.velocity))
-        if self.aiding != was:
+        self.aiding = airborne_plane or (recent and (sources.position or sources.velocity))
+        if self.aiding != previously_aiding:
             yield NOTICE, "EKF3 IMU0 is using GPS" if self.aiding else "EKF3 IMU0 stopped aiding"
-        yield from self._look_for_glitches(ekf, now_s, gps_3d=gps_3d, dcm=dcm and by_air)
+        yield from self._update_glitch(ekf, now_s, gps_3d=gps_3d, dcm=dcm and airborne_plane)
         if self._kind is Kind.COPTER and flying:
-            yield from self._fail_safe(now_s)
+            yield from self._update_failsafe(now_s)
 
-    def _look_for_glitches(self, ekf: Ekf, now_s: float, *, gps_3d: bool, dcm: bool) -> Iterator[Said]:
+    def _update_glitch(self, ekf: Ekf, now_s: float, *, gps_3d: bool, dcm: bool) -> Iterator[StatusMessage]:
         since_s = ekf.rejecting_since_s
         rejected = since_s is not None and now_s - since_s >= GLITCH_AFTER_S
         if rejected and not self._rejected:
@@ -98,7 +99,7 @@ class Status:
             yield WARNING, "AHRS: DCM active" if on_dcm else "AHRS: EKF3 active"
         self.on_dcm = on_dcm
 
-    def _fail_safe(self, now_s: float) -> Iterator[Said]:
+    def _update_failsafe(self, now_s: float) -> Iterator[StatusMessage]:
         if self.absolute:
             self._without_s = None
             self._with_s = now_s if self._with_s is None else self._with_s

@@ -1,4 +1,4 @@
-"""What the simulated autopilot says about itself, message by message, from its readings and its own belief."""
+"""Telemetry messages of the simulated autopilot, from its readings and its navigation solution."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.interfaces import Navigation, Readings
 
 GRAVITY_MPS2 = 9.80665
-RATES_HZ = {  # before anybody asks; 0: only when asked for
+RATES_HZ = {  # default rates; 0: only on request
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 4.0,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 3.0,
@@ -38,10 +38,10 @@ AIR_CDEGC = 1500  # temperature of the sensor, centidegrees
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All that a message may be made of; the truth is not among it."""
+    """Inputs of all messages; the truth is not among them."""
 
     boot_ns: int
-    unix_us: int  # 0: no receiver ever told it
+    unix_us: int  # 0: not known from any receiver
     kind: Kind
     frame: LocalFrame
     home_amsl_m: float
@@ -59,7 +59,7 @@ class Snapshot:
 
 
 def message(message_id: int, now: Snapshot) -> Any | None:
-    """The message ``message_id`` of ``RATES_HZ``; None when there is nothing to say."""
+    """Returns the message ``message_id`` of ``RATES_HZ``; None when there is no data for it."""
     match message_id:
         case mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             return _heartbeat(now)
@@ -101,7 +101,7 @@ def _heartbeat(now: Snapshot) -> Any:
 
 
 def _global_position(now: Snapshot) -> Any:
-    """Before there is a position, latitude and longitude are 0 and the height is the barometer's."""
+    """Without a position, latitude and longitude are 0 and the height is the barometer's."""
     lat = lon = 0
     up_m, ve, vn, vu = now.readings.baro_amsl_m, 0.0, 0.0, 0.0
     if now.navigation is not None:
@@ -123,7 +123,7 @@ def _vfr_hud(now: Snapshot) -> Any:
 
 
 def _airspeed(now: Snapshot) -> Any | None:
-    """Of a sensor; raw pressure in Pa, as ArduPilot has it, where air at sea level gives that speed."""
+    """AIRSPEED of a sensor; raw pressure in Pa: the dynamic pressure at sea level for that speed, as in ArduPilot."""
     air_mps = now.readings.airspeed_mps
     if air_mps is None:
         return None
@@ -149,12 +149,12 @@ def _gps_raw(now: Snapshot, instance: int) -> Any | None:
 
 
 def _raw_imu(now: Snapshot) -> Any:
-    """Units of ArduPilot's RAW_IMU: milli-g and milliradians per second, as far as 16 bits reach."""
+    """Units of ArduPilot's RAW_IMU: milli-g and milliradians per second, clipped to 16 bits."""
     milli_g = (_int16(float(a) / GRAVITY_MPS2 * 1e3) for a in now.readings.accel_b_mps2)
     milli_rad = (_int16(float(w) * 1e3) for w in now.readings.gyro_b_radps)
     return mavlink.MAVLink_raw_imu_message(now.boot_ns // 1000, *milli_g, *milli_rad, 0, 0, 0)
 
 
 def _int16(value: float) -> int:
-    """A vehicle that is let go in mid-air is pushed by more than any sensor shows."""
+    """Rounds and clips: a vehicle released in mid-air exceeds the range of the sensor."""
     return max(-32768, min(32767, round(value)))

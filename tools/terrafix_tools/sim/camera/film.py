@@ -1,4 +1,4 @@
-"""From an ideal picture to what a camera delivers. Every error is a function of (seed, index)."""
+"""Sensor model: converts an ideal image to a camera's output. Every error is a function of (seed, index)."""
 
 import math
 from dataclasses import dataclass
@@ -6,28 +6,29 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-STEP_FRAMES = 12  # an automatic exposure holds its choice for about this many pictures
-NOISE_ROOM_PX = 256  # the bank of noise is larger than a picture by this: every picture gets another part of it
-LONGEST_BLUR_PX = 40.0  # beyond it there is nothing left to see
+STEP_FRAMES = 12  # number of images for which automatic exposure keeps its gain
+NOISE_ROOM_PX = 256  # the noise array is larger than an image by this; every image gets another part of it
+LONGEST_BLUR_PX = 40.0  # longer blur leaves no usable image
 
 
 @dataclass(frozen=True)
 class Film:
-    """How a picture departs from the ideal one."""
+    """Image errors of a camera."""
 
     noise: float = 2.0  # grey values, 1-sigma
-    vignette: float = 0.2  # brightness lost in the corners
+    vignette: float = 0.2  # brightness loss in the corners
     blur_px: float = 0.6
     exposure_jitter: float = 0.04  # 1-sigma of the gain from frame to frame
-    exposure_step: float = 0.0  # 1-sigma of the gain of an automatic exposure, which changes in steps
+    exposure_step: float = 0.0  # 1-sigma of the gain of automatic exposure, which changes in steps
     detail: float = 0.05  # contrast of the fine texture on the ground
-    exposure_s: float = 0.0  # how long the shutter is open: motion blur
-    readout_s: float = 0.0  # from the first row to the last: rolling shutter; the pose is that of the middle row
-    jpeg_quality: int | None = None  # 1..100; None: not compressed
+    exposure_s: float = 0.0  # exposure time: motion blur
+    # readout time from the first row to the last: rolling shutter; the pose is that of the middle row
+    readout_s: float = 0.0
+    jpeg_quality: int | None = None  # 1..100; None: no compression
 
 
 class Developer:
-    """Applies a film to pictures of one size."""
+    """Applies a ``Film`` to images of one size."""
 
     def __init__(self, film: Film, width: int, height: int, centre_px: tuple[float, float], seed: int) -> None:
         self._film, self._seed = film, seed
@@ -36,15 +37,17 @@ class Developer:
         radius2 = ((x - centre_px[0]) ** 2 + (y - centre_px[1]) ** 2) / (centre_px[0] ** 2 + centre_px[1] ** 2)
         shade = (255.0 * (1.0 - film.vignette * radius2)).clip(0, 255).astype(np.uint8)
         self._vignette = cv2.merge([shade, shade, shade])
-        room = (height + NOISE_ROOM_PX, width + NOISE_ROOM_PX, 3)
-        self._noise = np.clip(rng.normal(0.0, film.noise, room).round(), -127, 127).astype(np.int8)
+        noise_shape = (height + NOISE_ROOM_PX, width + NOISE_ROOM_PX, 3)
+        self._noise = np.clip(rng.normal(0.0, film.noise, noise_shape).round(), -127, 127).astype(np.int8)
 
     def develop(self, image: np.ndarray, index: int, flow_px_per_s: np.ndarray | None = None) -> np.ndarray:
-        """Picture number ``index`` (H, W, 3) uint8. ``flow_px_per_s`` (H, W, 2) float32: how the ground moves in it."""
+        """Returns image number ``index`` (H, W, 3) uint8. ``flow_px_per_s`` (H, W, 2) float32: motion of the ground in
+        the image.
+        """
         film = self._film
         height, width = image.shape[:2]
         if film.exposure_s and flow_px_per_s is not None:
-            image = _smeared(image, flow_px_per_s * np.float32(film.exposure_s))
+            image = _motion_blurred(image, flow_px_per_s * np.float32(film.exposure_s))
         if film.blur_px:
             image = cv2.GaussianBlur(image, (0, 0), film.blur_px)
         rng = np.random.default_rng([self._seed, 11, index])
@@ -62,16 +65,16 @@ class Developer:
         return image
 
 
-def _smeared(image: np.ndarray, path_px: np.ndarray) -> np.ndarray:
-    """Motion blur: the mean of the picture along each pixel's path (H, W, 2), centred on the pixel."""
+def _motion_blurred(image: np.ndarray, path_px: np.ndarray) -> np.ndarray:
+    """Motion blur: the mean of the image along each pixel's path (H, W, 2), centred on the pixel."""
     longest = float(np.abs(path_px).max())
-    if longest < 0.3:  # less than the optics blur
+    if longest < 0.3:  # less than the blur of the optics
         return image
     path_px = path_px * np.float32(min(1.0, LONGEST_BLUR_PX / longest))
-    looks = math.ceil(min(longest, LONGEST_BLUR_PX)) + 1
+    samples = math.ceil(min(longest, LONGEST_BLUR_PX)) + 1
     x, y = np.meshgrid(np.arange(image.shape[1], dtype=np.float32), np.arange(image.shape[0], dtype=np.float32))
     total = np.zeros(image.shape, np.float32)
-    for share in (np.arange(looks) + 0.5) / looks - 0.5:
+    for share in (np.arange(samples) + 0.5) / samples - 0.5:
         moved = x + np.float32(share) * path_px[..., 0], y + np.float32(share) * path_px[..., 1]
         cv2.accumulate(cv2.remap(image, *moved, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), total)
-    return cv2.convertScaleAbs(total, alpha=1.0 / looks)
+    return cv2.convertScaleAbs(total, alpha=1.0 / samples)

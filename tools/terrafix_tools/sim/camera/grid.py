@@ -1,4 +1,4 @@
-"""The coarse grid of rays over a frame, what lies between its points, and the look-up of pixels under them."""
+"""Coarse grid of rays over a frame: interpolation between its points, and image look-up at them."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -9,14 +9,14 @@ import numpy as np
 from terrafix_tools.sim.ground.tiles import TOP_LEVEL, Pyramid, level_for
 
 GRID_PX = 16  # spacing; a divisor of 32, so that OpenCV's fixed-point weights are exact at every pixel
-LARGEST_WINDOW_PX = 4096  # a side; what is larger is looked up coarser
+LARGEST_WINDOW_PX = 4096  # of a side; a larger window is sampled at a coarser level
 
 Block = tuple[slice, slice]  # rows and columns
 Dense = Callable[[np.ndarray], np.ndarray]  # values at grid points -> at pixels, float32
 
 
 class Grid:
-    """Points every GRID_PX pixels, the last ones at or beyond the edge of the frame."""
+    """Points every GRID_PX pixels; the last ones are at or beyond the edge of the frame."""
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
@@ -28,19 +28,21 @@ class Grid:
         self._x, self._y = np.meshgrid(across, down)
 
     def dense(self, coarse: np.ndarray, size: tuple[int, ...] | None = None) -> np.ndarray:
-        """Values at grid points -> at pixels (height, width) from the first point on, float32; None: of the frame."""
+        """Interpolates values at grid points to pixels (height, width) from the first point on, float32; ``size``
+        None: the frame.
+        """
         height, width = size or (self.height, self.width)
         at = self._x[:height, :width], self._y[:height, :width]
         values = np.ascontiguousarray(coarse, np.float32)
         return cv2.remap(values, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def projective(self, nearness: np.ndarray, size: tuple[int, ...]) -> Dense:
-        """``dense`` for an oblique view: on a plane, values times nearness (1 / distance) are linear in the frame."""
+        """``dense`` for an oblique view: on a plane, values times nearness (1 / distance) are linear in the image."""
         weight = self.dense(nearness, size)
         return lambda coarse: self.dense(coarse * nearness, size) / weight
 
     def blocks(self, cells: int) -> Iterator[tuple[Block, Block]]:
-        """The frame in blocks of ``cells`` grid cells a side: their pixels, their grid points."""
+        """Splits the frame in blocks of ``cells`` grid cells a side; yields their pixels and their grid points."""
         step = cells * GRID_PX
         for y in range(0, self.height, step):
             for x in range(0, self.width, step):
@@ -50,21 +52,23 @@ class Grid:
 
 
 def cell_steps(x: np.ndarray, y: np.ndarray, spacing_px: int) -> np.ndarray:
-    """Steps on the ground for one pixel of the frame, in the cells (rows - 1, columns - 1) between points."""
+    """Returns the ground distance per image pixel in the cells (rows - 1, columns - 1) between points."""
     across = np.diff(x, axis=1)[:-1] * np.diff(y, axis=0)[:, :-1]
     down = np.diff(y, axis=1)[:-1] * np.diff(x, axis=0)[:, :-1]
     return np.sqrt(np.abs(across - down)) / spacing_px
 
 
-def looked_up(picture: Pyramid, x: np.ndarray, y: np.ndarray, step_px: float, dense: Dense) -> np.ndarray:
-    """Pixels (H, W[, 3]) uint8 of a picture at level-0 places ``x``, ``y``, which ``dense`` takes to every pixel.
+def sample_image(pyramid: Pyramid, x: np.ndarray, y: np.ndarray, step_px: float, dense: Dense) -> np.ndarray:
+    """Samples an image at level-0 positions ``x``, ``y``, which ``dense`` interpolates to every pixel: (H, W[, 3])
+    uint8.
 
-    ``step_px``: their distance, which decides the level."""
+    ``step_px``: distance of neighbouring samples, which determines the level.
+    """
     level = level_for(step_px)
     while level < TOP_LEVEL and max(np.ptp(x), np.ptp(y)) / 2**level > LARGEST_WINDOW_PX:
         level += 1
     x, y = (x + 0.5) / 2**level - 0.5, (y + 0.5) / 2**level - 0.5
     left, top = math.floor(x.min()) - 1, math.floor(y.min()) - 1
     width, height = math.ceil(x.max()) + 3 - left, math.ceil(y.max()) + 3 - top
-    window = picture.window(level, left, top, min(width, 2 * LARGEST_WINDOW_PX), min(height, 2 * LARGEST_WINDOW_PX))
+    window = pyramid.window(level, left, top, min(width, 2 * LARGEST_WINDOW_PX), min(height, 2 * LARGEST_WINDOW_PX))
     return cv2.remap(window, dense(x - left), dense(y - top), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

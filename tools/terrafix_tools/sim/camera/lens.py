@@ -1,4 +1,4 @@
-"""Lenses: which ray a pixel sees, and which pixel a ray meets."""
+"""Lens models: rays of pixels, and pixels of rays."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from terrafix import messages as m
 from terrafix.core.camera import CameraCalibration
 
-NEWTON = 12  # steps; the angle of a real lens converges in five
+NEWTON_STEPS = 12  # Newton steps; the angle of a real lens converges in five
 
 
 class Lens(Protocol):
@@ -22,15 +22,15 @@ class Lens(Protocol):
     def height(self) -> int: ...
 
     def rays(self, px: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) -> unit rays in c (N, 3)."""
+        """Converts pixels (N, 2) to unit rays in c (N, 3)."""
 
     def project(self, p_in_c: np.ndarray) -> np.ndarray:
-        """Points in c (N, 3), in front of the camera -> pixels (N, 2)."""
+        """Projects points in c (N, 3), in front of the camera, to pixels (N, 2)."""
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A pinhole with OpenCV's distortion."""
+    """A pinhole camera with OpenCV's distortion."""
 
     calibration: CameraCalibration
 
@@ -66,14 +66,14 @@ class Fisheye:
         x, y = (px[:, 0] - self.cx) / self.fx, (px[:, 1] - self.cy) / self.fy
         radius = np.hypot(x, y)
         angle = np.minimum(radius, math.pi)
-        for _ in range(NEWTON):
-            angle = np.clip(angle - (self._radius(angle) - radius) / self._growth(angle), 0.0, math.pi)
+        for _ in range(NEWTON_STEPS):
+            angle = np.clip(angle - (self._radius(angle) - radius) / self._radius_derivative(angle), 0.0, math.pi)
         out = np.sin(angle) / np.maximum(radius, 1e-12)
         return np.column_stack([x * out, y * out, np.cos(angle)])
 
     def project(self, p_in_c: np.ndarray) -> np.ndarray:
-        across = np.hypot(p_in_c[:, 0], p_in_c[:, 1])
-        scale = self._radius(np.arctan2(across, p_in_c[:, 2])) / np.maximum(across, 1e-12)
+        lateral = np.hypot(p_in_c[:, 0], p_in_c[:, 1])
+        scale = self._radius(np.arctan2(lateral, p_in_c[:, 2])) / np.maximum(lateral, 1e-12)
         return p_in_c[:, :2] * scale[:, None] * (self.fx, self.fy) + (self.cx, self.cy)
 
     def _radius(self, angle: np.ndarray) -> np.ndarray:
@@ -81,12 +81,12 @@ class Fisheye:
         t2 = angle * angle
         return angle * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 
-    def _growth(self, angle: np.ndarray) -> np.ndarray:
+    def _radius_derivative(self, angle: np.ndarray) -> np.ndarray:
         k1, k2, k3, k4 = self.distortion
         t2 = angle * angle
         return np.maximum(1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4))), 1e-3)
 
 
 def lens_of(camera: m.Camera) -> Lens:
-    """The lens of a camera description."""
+    """Returns the lens model of a camera description."""
     return Pinhole(CameraCalibration.of(camera))

@@ -1,4 +1,4 @@
-"""How the camera hangs in the vehicle, and how it moves while one picture is taken."""
+"""Mount of the camera in the vehicle, and its motion during an exposure."""
 
 import math
 from dataclasses import dataclass
@@ -11,18 +11,18 @@ from terrafix.core.geodesy import rot_w_b
 from terrafix_tools.sim.interfaces import State
 
 DOWN = Mount()
-WANDER_S = (2.3, 5.9, 13.7)  # periods of a gimbal's error: quick corrections to slow creep
+WANDER_S = (2.3, 5.9, 13.7)  # periods of a gimbal's error, from fast corrections to slow drift
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Velocity and turn of the camera at the moment of a picture; constant while it is taken."""
+    """Velocity and angular rate of the camera at the time of an image, constant during the exposure."""
 
     velocity_enu_mps: np.ndarray  # (3,)
     rates_c_radps: np.ndarray  # (3,) angular velocity of the camera against the world, in c
 
     def pose(self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray, after_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """-> positions (N, 3) and rotations R_w_c (N, 3, 3) at ``after_s`` (N,) seconds from the given pose."""
+        """Returns positions (N, 3) and rotations R_w_c (N, 3, 3) at ``after_s`` (N,) seconds from the given pose."""
         positions = p_c_in_w_m + after_s[:, None] * self.velocity_enu_mps
         speed_radps = float(np.linalg.norm(self.rates_c_radps))
         x, y, z = np.asarray(self.rates_c_radps, np.float64) / max(speed_radps, 1e-12)
@@ -31,8 +31,8 @@ class Motion:
         return positions, r_w_c @ (np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross))
 
 
-class Hanging(Protocol):
-    """How a camera is held: pose and motion from the state of the vehicle; the camera is at the vehicle's place."""
+class CameraMount(Protocol):
+    """Mount of a camera: pose and motion from the state of the vehicle. The camera is at the vehicle's position."""
 
     def r_w_c(self, state: State) -> np.ndarray:
         """R_w_c (3, 3)."""
@@ -42,7 +42,7 @@ class Hanging(Protocol):
 
 @dataclass(frozen=True)
 class Fixed:
-    """A camera that is bolted to the body."""
+    """A camera fixed to the body."""
 
     mount: Mount = DOWN
 
@@ -55,21 +55,21 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Gimbal:
-    """A camera that follows the heading and is held against the horizon, to ``error_deg``."""
+    """A camera that follows the heading and is stabilised against the horizon, with an error of ``error_deg``."""
 
     mount: Mount = DOWN
-    error_deg: float = 0.5  # 1-sigma of pitch and roll, wandering slowly
+    error_deg: float = 0.5  # 1-sigma of pitch and roll, slowly varying
     seed: int = 0
 
     def r_w_c(self, state: State) -> np.ndarray:
-        """R_w_c (3, 3); the body's pitch and roll do not reach the camera."""
+        """R_w_c (3, 3), independent of the body's pitch and roll."""
         phases = np.random.default_rng([self.seed, 23]).uniform(0.0, 2 * math.pi, (2, len(WANDER_S)))
         waves = np.sin(2 * math.pi * state.t_s / np.array(WANDER_S) + phases).sum(axis=1)
         pitch_rad, roll_rad = np.radians(self.error_deg) * waves / math.sqrt(len(WANDER_S) / 2)
         return rot_w_b(state.yaw_rad, float(pitch_rad), float(roll_rad)) @ self.mount.r_b_c()
 
     def motion(self, state: State) -> Motion:
-        """It turns as the heading does (Euler's kinematic equation); its own corrections are slow beside that."""
+        """Turns with the heading (Euler's kinematic equation); the gimbal's own corrections are negligible."""
         _, q, r = (float(v) for v in state.rates_b_radps)
         yaw_rate_radps = (q * math.sin(state.roll_rad) + r * math.cos(state.roll_rad)) / math.cos(state.pitch_rad)
         return Motion(state.velocity_enu_mps, self.r_w_c(state).T @ np.array([0.0, 0.0, -yaw_rate_radps]))

@@ -1,4 +1,4 @@
-"""What a simulated frame costs: for `terrafix bench`."""
+"""Run time of a simulated frame, for `terrafix bench`."""
 
 import math
 import time
@@ -17,7 +17,7 @@ AGL_M, STEP_M, BANK_RAD = 120.0, 10.0, 0.1  # 20 m/s at 2 Hz
 
 
 def frame_costs(frames: int, *, seed: int = 1, season: str = "autumn") -> list[tuple[float, float]]:
-    """(wall ms, CPU ms of this process) of each frame of a flight over ground that is new to it; default film."""
+    """Returns (wall ms, CPU ms of this process) of each frame of a flight over uncached ground; default film."""
     place = world.generate(seed, width_m=SIZE_M, height_m=SIZE_M)
     ground = place.ground(season, LocalFrame(*place.wgs84(SIZE_M / 2, SIZE_M / 2)))
     renderer = Renderer(ground, CAMERA, film=Film(), seed=seed)

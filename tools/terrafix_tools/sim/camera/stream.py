@@ -1,7 +1,8 @@
-"""Rendered frames to the real daemon without touching the disk: a camera on the network that only this machine sees.
+"""Streams rendered frames to the daemon without disk access, as a network camera on this machine.
 
-MJPEG over HTTP, which `terrafix run --source http://127.0.0.1:PORT/` opens as any IP camera; every picture says when it
-was exposed. Nobody waits: a viewer that is slower than the camera gets the newest pictures."""
+MJPEG over HTTP, which `terrafix run --source http://127.0.0.1:PORT/` opens like any IP camera; every image has a
+header with its exposure time. The sender does not block: a slow viewer gets only the newest images.
+"""
 
 import contextlib
 import http.server
@@ -16,7 +17,7 @@ import numpy as np
 from terrafix.core.errors import UsageError
 
 JPEG_QUALITY = 92
-BACKLOG = 8  # pictures that wait for a slow viewer; what a camera's own buffer holds
+BACKLOG = 8  # images queued for a slow viewer; the size of a camera's buffer
 BOUNDARY = "frame"
 
 
@@ -24,7 +25,7 @@ class FrameStream:
     """A server on 127.0.0.1 for any number of viewers. A context manager."""
 
     def __init__(self, port: int = 0, *, jpeg_quality: int = JPEG_QUALITY) -> None:
-        """``port`` 0: any free one. Raises UsageError: the port is taken."""
+        """``port`` 0: any free one. Raises UsageError when the port is taken."""
         self._quality = jpeg_quality
         self._changed = threading.Condition()
         self._viewers: list[deque[bytes]] = []
@@ -36,12 +37,12 @@ class FrameStream:
                 self.send_response(200)
                 self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
                 self.end_headers()
-                with contextlib.suppress(OSError):  # the viewer went away: its right
+                with contextlib.suppress(OSError):  # the viewer has disconnected
                     for part in stream._parts():
                         self.wfile.write(part)
 
             def log_message(self, format: str, *args: object) -> None:
-                """A camera does not talk."""
+                """No log output."""
 
         try:
             self._server = http.server.ThreadingHTTPServer(("127.0.0.1", port), Handler)
@@ -53,26 +54,26 @@ class FrameStream:
 
     @property
     def url(self) -> str:
-        """For ``terrafix run --source``."""
+        """URL for ``terrafix run --source``."""
         return f"http://127.0.0.1:{self._server.server_address[1]}/"
 
     def push(self, image_bgr: np.ndarray, t_ns: int) -> None:
-        """A picture (H, W, 3) uint8 whose exposure was at ``t_ns`` on CLOCK_MONOTONIC, to everybody who looks now."""
+        """Sends an image (H, W, 3) uint8 with exposure time ``t_ns`` on CLOCK_MONOTONIC to all connected viewers."""
         quality = [cv2.IMWRITE_JPEG_QUALITY, self._quality]
         self.push_jpeg(cv2.imencode(".jpg", image_bgr, quality)[1].tobytes(), t_ns)
 
     def push_jpeg(self, jpeg: bytes, t_ns: int) -> None:
-        """As ``push``, for a picture that is already compressed; broken bytes go out as they are."""
+        """Like ``push``, for a compressed image; invalid bytes are sent unchanged."""
         head = (
             f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\nX-Timestamp-Ns: {t_ns}\r\n\r\n"
         )
         with self._changed:
-            for waiting in self._viewers:
-                waiting.append(head.encode() + jpeg + b"\r\n")
+            for queue in self._viewers:
+                queue.append(head.encode() + jpeg + b"\r\n")
             self._changed.notify_all()
 
     def wait_for_viewer(self, timeout_s: float) -> bool:
-        """True as soon as somebody looks."""
+        """Returns True as soon as a viewer is connected."""
         with self._changed:
             return self._changed.wait_for(lambda: bool(self._viewers), timeout_s)
 
@@ -94,19 +95,19 @@ class FrameStream:
         self.close()
 
     def _parts(self) -> Iterator[bytes]:
-        """What one viewer is sent, until the stream is closed."""
-        mine: deque[bytes] = deque(maxlen=BACKLOG)
+        """Yields the parts for one viewer until the stream is closed."""
+        queue: deque[bytes] = deque(maxlen=BACKLOG)
         with self._changed:
-            self._viewers.append(mine)
+            self._viewers.append(queue)
             self._changed.notify_all()
         try:
             while True:
                 with self._changed:
-                    self._changed.wait_for(lambda: bool(mine) or self._closed)
+                    self._changed.wait_for(lambda: bool(queue) or self._closed)
                     if self._closed:
                         return
-                    part = mine.popleft()
+                    part = queue.popleft()
                 yield part
         finally:
             with self._changed:
-                self._viewers = [one for one in self._viewers if one is not mine]
+                self._viewers = [one for one in self._viewers if one is not queue]

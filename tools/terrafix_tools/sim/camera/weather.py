@@ -1,6 +1,7 @@
-"""Light and air between the ground and the camera: sun on the slopes, clouds and their shadows, haze.
+"""Illumination and atmosphere between ground and camera: sun on slopes, clouds and their shadows, haze.
 
-All of it is computed on the coarse grid of rays that the renderer has anyway."""
+All effects are computed on the renderer's coarse grid of rays.
+"""
 
 import math
 from dataclasses import dataclass
@@ -11,25 +12,26 @@ import numpy as np
 from terrafix_tools.sim.ground.relief import Relief
 from terrafix_tools.sim.world.noise import periodic_noise
 
-CLOUD_PX, CLOUD_M = 512, 16.0  # the cloud field and its pixel: it repeats after 8 km
-CLOUD_SOFT = 0.5  # deviations of the field from the edge of a cloud to its full thickness
+CLOUD_PX, CLOUD_M = 512, 16.0  # size of the cloud field and of its pixel: it repeats after 8 km
+CLOUD_EDGE_WIDTH = 0.5  # distance, in units of the field, from the edge of a cloud to its full thickness
 CLOUD_BGR = (244, 240, 238)
 AIR_BGR = (226, 214, 204)
-SHADOW = 0.45  # share of the light that a thick cloud takes away
-SKY_LIGHT = 0.35  # share of the light that comes from the whole sky and knows no slope
+SHADOW = 0.45  # share of the light that a thick cloud blocks
+DIFFUSE_LIGHT = 0.35  # share of diffuse light, independent of the slope
 KOSCHMIEDER = 3.912  # optical depth at which a black object has 2 % contrast: the definition of visibility (WMO No. 8)
 
 
 @dataclass(frozen=True)
 class Weather:
-    """The default is clear air, and light as the picture of the ground already has it."""
+    """The default is clear air, and the illumination that the ground image already has."""
 
     visibility_m: float = math.inf
     sun_azimuth_deg: float = 150.0
     sun_elevation_deg: float = 45.0
-    relight: bool = False  # slopes are lit anew by this sun: for pictures of flat light, or another time of day
+    # shading of slopes by this sun: for ground images in diffuse light, or for another time of day
+    relight: bool = False
     cloud_cover: float = 0.0  # 0..1 share of the sky
-    cloud_base_amsl_m: float = 1500.0  # below the camera they hide the ground; above it they only shade it
+    cloud_base_amsl_m: float = 1500.0  # below the camera they hide the ground; above it they only cast shadows
     cloud_opacity: float = 0.9
     wind_enu_mps: tuple[float, float] = (6.0, 3.0)  # of the clouds: east, north
 
@@ -41,7 +43,7 @@ class Weather:
 
 
 class Sky:
-    """The weather of one flight: a function of place, time and seed."""
+    """Weather of one flight: a function of position, time and seed."""
 
     def __init__(self, weather: Weather, relief: Relief, seed: int) -> None:
         self._weather, self._relief = weather, relief
@@ -50,10 +52,10 @@ class Sky:
         if weather.cloud_cover > 0.0:
             field = periodic_noise(rng, CLOUD_PX, 14.0) + 0.35 * periodic_noise(rng, CLOUD_PX, 4.0)
             edge = float(np.quantile(field, 1.0 - min(weather.cloud_cover, 1.0)))
-            self._clouds = np.clip((field - edge) / CLOUD_SOFT, 0.0, 1.0).astype(np.float32)
+            self._clouds = np.clip((field - edge) / CLOUD_EDGE_WIDTH, 0.0, 1.0).astype(np.float32)
 
     def light(self, points_m: np.ndarray, t_s: float) -> np.ndarray | None:
-        """Factor of brightness (h, w) at points of the ground (h, w, 3); None: as it is."""
+        """Brightness factor (h, w) at ground points (h, w, 3); None: unchanged."""
         weather = self._weather
         if self._clouds is None and not weather.relight:
             return None
@@ -63,14 +65,14 @@ class Sky:
             east, north = self._relief.slope(points_m[..., 0], points_m[..., 1])
             facing = (sun[2] - east * sun[0] - north * sun[1]) / np.sqrt(1.0 + east**2 + north**2)
             direct = np.maximum(facing, 0.0) * ~self._relief.shaded(points_m, sun)
-            light = SKY_LIGHT + (1.0 - SKY_LIGHT) * direct / sun[2]
+            light = DIFFUSE_LIGHT + (1.0 - DIFFUSE_LIGHT) * direct / sun[2]
         if self._clouds is not None:
             climb = np.maximum(weather.cloud_base_amsl_m - points_m[..., 2], 0.0) / sun[2]
             light = light * (1.0 - SHADOW * self._thickness(points_m[..., :2] + climb[..., None] * sun[:2], t_s))
         return light
 
     def cover(self, from_m: np.ndarray, rays: np.ndarray, t_s: float) -> np.ndarray | None:
-        """Share (h, w) of each ray (h, w, 3) from (..., 3) that a cloud below hides; None: no cloud is below."""
+        """Opacity (h, w) of clouds along rays (h, w, 3) from (..., 3); None: no clouds below."""
         drop_m = from_m[..., 2] - self._weather.cloud_base_amsl_m
         if self._clouds is None or np.max(drop_m) <= 0.0:
             return None
@@ -79,21 +81,21 @@ class Sky:
         return self._weather.cloud_opacity * self._thickness(at, t_s)
 
     def haze(self, distance_m: np.ndarray) -> np.ndarray | None:
-        """Share (h, w) of air in the light from ``distance_m``; None: clear."""
+        """Share (h, w) of air light over ``distance_m``; None: clear air."""
         if math.isinf(self._weather.visibility_m):
             return None
         return 1.0 - np.exp(-KOSCHMIEDER * np.minimum(distance_m, 1e6) / self._weather.visibility_m)
 
     def _thickness(self, points_m: np.ndarray, t_s: float) -> np.ndarray:
-        """0..1 (h, w) at points (h, w, 2) of the cloud layer."""
+        """Cloud thickness 0..1 (h, w) at points (h, w, 2) of the cloud layer."""
         assert self._clouds is not None
         drift = np.array(self._weather.wind_enu_mps) * t_s
         px = (((points_m - drift) / CLOUD_M) % CLOUD_PX).astype(np.float32)
         return cv2.remap(self._clouds, px[..., 0], px[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
 
 
-def blended(image: np.ndarray, share: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
-    """``share`` (H, W) float32 of a colour over a picture (H, W, 3) uint8."""
-    keep = cv2.merge([1.0 - share] * 3)
+def blend(image: np.ndarray, share: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
+    """Blends a colour over an image (H, W, 3) uint8 with weight ``share`` (H, W) float32."""
+    image_weight = cv2.merge([1.0 - share] * 3)
     colour = cv2.merge([share * np.float32(c) for c in bgr])
-    return cv2.add(cv2.multiply(image, keep, dtype=cv2.CV_32F), colour, dtype=cv2.CV_8U)
+    return cv2.add(cv2.multiply(image, image_weight, dtype=cv2.CV_32F), colour, dtype=cv2.CV_8U)

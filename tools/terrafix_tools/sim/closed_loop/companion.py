@@ -1,7 +1,8 @@
-"""The onboard computer in lock-step: the real nodes and the real MAVLink edge, with a clock that is given.
+"""The companion computer in lock-step: the flight's nodes and MAVLink edge, driven by a simulated clock.
 
-The time that vision and anchor take is modelled and constant, whatever this machine needs: the same flight gives the
-same result, and estimates are as late for the autopilot as in the air."""
+The processing times of vision and anchor are modelled as constants, independent of this machine: the same flight gives
+the same result, and the autopilot receives estimates with the delay of a real flight.
+"""
 
 import importlib
 from collections import deque
@@ -28,29 +29,30 @@ from terrafix.messages import (
 from terrafix.processes import PROCESSES
 from terrafix.runtime.executor import InProcessShell
 
-ALL = ("vision", "anchor", "estimator", "link", "health")
+PROCESS_NAMES = ("vision", "anchor", "estimator", "link", "health")
 HEALTH_NS = 1_000_000_000
 COOL_C = 50.0
-UNIX_NS_AT_ZERO = 1_782_900_000 * 1_000_000_000  # 2026-07-01: the simulated computer has a clock
-Hear = Callable[[list[Message]], None]
+UNIX_NS_AT_ZERO = 1_782_900_000 * 1_000_000_000  # 2026-07-01: the simulated computer has a wall clock
+OnMessages = Callable[[list[Message]], None]
 
 
 @dataclass(frozen=True)
 class Delays:
-    """How long the computer takes, seconds; of the order of a Jetson Orin Nano."""
+    """Processing times of the computer, seconds; of the order of a Jetson Orin Nano."""
 
-    vision_s: float = 0.05  # from the exposure to the estimate by odometry
-    anchor_s: float = 0.20  # from there to the estimate by the map
+    vision_s: float = 0.05  # from the exposure to the odometry estimate
+    anchor_s: float = 0.20  # from there to the estimate with the map match
 
 
-class Slow:
-    """A node whose answers come later. What arrives while it works waits, and only the newest of it
-    (runtime/inbox.py)."""
+class DelayedNode:
+    """A node whose outputs are delayed. Of the predictions that arrive while it is busy only the newest is processed,
+    as in runtime/inbox.py.
+    """
 
     def __init__(self, node: Node, delay_ns: int) -> None:
         self._node, self._delay_ns = node, delay_ns
         self._waiting: Prediction | None = None
-        self._answers: list[Message] = []
+        self._outputs: list[Message] = []
         self._done_ns: int | None = None
         self.now_ns = 0
         self.skipped = 0
@@ -60,66 +62,66 @@ class Slow:
             return list(self._node.on(message))
         self.skipped += self._waiting is not None
         self._waiting = message
-        self._begin()
+        self._start_next()
         return []
 
     def tick(self, now_ns: int) -> Iterable[Message]:
         return ()
 
-    def answers(self) -> list[Message]:
-        """What is ready at ``now_ns``."""
+    def ready_outputs(self) -> list[Message]:
+        """Returns the outputs that are ready at ``now_ns``."""
         if self._done_ns is None or self.now_ns < self._done_ns:
             return []
-        ready, self._answers, self._done_ns = self._answers, [], None
-        self._begin()
+        ready, self._outputs, self._done_ns = self._outputs, [], None
+        self._start_next()
         return ready
 
-    def hurry(self) -> None:
-        """The work in hand is done now."""
+    def finish_now(self) -> None:
+        """Completes the current work immediately."""
         if self._done_ns is not None:
             self._done_ns = self.now_ns
 
-    def _begin(self) -> None:
+    def _start_next(self) -> None:
         if self._done_ns is None and self._waiting is not None:
             message, self._waiting = self._waiting, None
-            self._answers, self._done_ns = list(self._node.on(message)), self.now_ns + self._delay_ns
+            self._outputs, self._done_ns = list(self._node.on(message)), self.now_ns + self._delay_ns
 
 
 class Companion:
-    """``step`` at every step of the flight, ``expose`` for every frame, ``end`` once."""
+    """Interface: ``step`` at every step of the flight, ``expose`` for every frame, ``end`` once."""
 
     def __init__(
-        self, ctx: NodeContext, frames: MemoryFrameStore, transport: Transport, delays: Delays, hear: Hear
+        self, ctx: NodeContext, frames: MemoryFrameStore, transport: Transport, delays: Delays, on_messages: OnMessages
     ) -> None:
-        """``hear`` gets everything that is said. The computer's clock is 0 at the start of the flight."""
-        made: dict[str, Node] = {
-            p.name: importlib.import_module(p.module).make_node(ctx) for p in PROCESSES if p.name in ALL
+        """``on_messages`` receives all published messages. The computer's clock is 0 at the start of the flight."""
+        nodes: dict[str, Node] = {
+            p.name: importlib.import_module(p.module).make_node(ctx) for p in PROCESSES if p.name in PROCESS_NAMES
         }
-        self._link = made["link"]
-        self._anchor = Slow(made["anchor"], round(delays.anchor_s * 1e9))
-        self._shell = InProcessShell({**made, "anchor": self._anchor}, self._sink)
-        self._frames, self._hear = frames, hear
+        self._link = nodes["link"]
+        self._anchor = DelayedNode(nodes["anchor"], round(delays.anchor_s * 1e9))
+        self._shell = InProcessShell({**nodes, "anchor": self._anchor}, self._sink)
+        self._frames, self._on_messages = frames, on_messages
         self._edge = MavlinkEdge(ctx.config.link, transport, lambda: UNIX_NS_AT_ZERO + self._now_ns)
         self._vision_ns = round(delays.vision_s * 1e9)
         self._queue: deque[Frame] = deque()
-        self._heard: list[Message] = []
+        self._published: list[Message] = []
         self._now_ns = 0
         self._health_ns = 0
         self._count = 0
-        self.temperature_c: Callable[[float], float] = lambda _: COOL_C  # of the computer, at seconds of the flight
-        self.said_ns: dict[int, int] = {}  # frame id -> when its last estimate was said
+        self.temperature_c: Callable[[float], float] = lambda _: COOL_C  # of the computer, by seconds of the flight
+        self.estimated_ns: dict[int, int] = {}  # frame id -> time at which its last estimate was published
 
     @property
     def skipped(self) -> int:
-        """Predictions that the anchor was too busy for."""
+        """Number of predictions that arrived while the anchor was busy and were dropped."""
         return self._anchor.skipped
 
-    def begin(self, origin: Origin) -> None:
+    def start(self, origin: Origin) -> None:
         self._shell.feed(origin)
         self._flush()
 
     def expose(self, frame: Frame, image: Image | None) -> None:
-        """A picture was taken now; it is worked on when vision has had its time."""
+        """Adds an image taken now; it is processed after the delay of vision."""
         if image is not None:
             self._frames.put(frame.frame_id, image)
         self._queue.append(frame)
@@ -129,11 +131,11 @@ class Companion:
         self._now_ns = self._anchor.now_ns = now_ns
         for message in self._edge.poll(now_ns):
             self._shell.feed(message)
-            for answer in self._link.on(message):  # the edge's words reach the node of its own process too
+            for answer in self._link.on(message):  # the edge's messages also go to the node of its own process
                 self._shell.feed(answer)
         while self._queue and now_ns - self._queue[0].t_ns >= self._vision_ns:
             self._shell.feed(self._queue.popleft())
-        for message in self._anchor.answers():
+        for message in self._anchor.ready_outputs():
             self._shell.feed(message)
         if now_ns >= self._health_ns:
             self._health_ns += HEALTH_NS
@@ -143,23 +145,23 @@ class Companion:
         self._flush()
 
     def end(self) -> None:
-        """The camera has stopped: what is under way is finished, and the flight is refined."""
+        """After the last frame: finishes pending work, and lets the nodes refine the flight."""
         while self._queue:
             self._shell.feed(self._queue.popleft())
-        self._anchor.hurry()
-        for message in self._anchor.answers():
+        self._anchor.finish_now()
+        for message in self._anchor.ready_outputs():
             self._shell.feed(message)
         self._shell.feed(SourceEnded(t_ns=self._now_ns, frames=self._count))
         self._edge.close()
         self._flush()
 
     def _sink(self, _who: str, message: Message) -> None:
-        self._heard.append(message)
+        self._published.append(message)
         if isinstance(message, GpsInput | PositionSource | StatusText):
-            self._edge.heard(message)
+            self._edge.on_message(message)
         elif isinstance(message, NavEstimate):
-            self.said_ns[message.frame_id] = self._now_ns
+            self.estimated_ns[message.frame_id] = self._now_ns
 
     def _flush(self) -> None:
-        heard, self._heard = self._heard, []
-        self._hear(heard)
+        published, self._published = self._published, []
+        self._on_messages(published)

@@ -1,4 +1,4 @@
-"""A closed-loop flight put together from a scene: vehicle, sensors, autopilot, camera and the pilot's start."""
+"""Assembles a closed-loop flight from a scene: vehicle, sensors, autopilot, camera and the pilot's start."""
 
 import math
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from terrafix_tools.sim.flights.folder import (
     AGL_SIGMA_M,
     ATTITUDE_SIGMA_DEG,
     CAMERA,
-    LONGEST_S,
+    MAX_DURATION_S,
     START_ERROR_M,
     START_SIGMA_M,
     YAW_SIGMA_DEG,
@@ -41,13 +41,13 @@ from terrafix_tools.sim.vehicle.plane import Plane
 from terrafix_tools.sim.vehicle.wind import BREEZE, Wind
 
 FRAME_HZ = 1.5  # ten kilometres are simulated within five minutes
-FASTEST_HZ = 10.0
-SPARE = 1.3  # the course is longer than what is flown of it: rounded corners cut some off
+MAX_FRAME_HZ = 10.0
+LENGTH_MARGIN = 1.3  # the generated course is longer than the flown distance, since rounded corners cut some off
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a flight meets."""
+    """Wind, disturbances, sensor errors, camera and delays of a flight."""
 
     events: Sequence[AnyEvent] = ()
     wind: Wind = BREEZE
@@ -72,26 +72,29 @@ def plan_over(
     conditions: Conditions | None = None,
     config: Config | None = None,
 ) -> Plan:
-    """``mission`` None: ``length_m`` of a course of the seed. It is flown to its end, or for ``duration_s``.
+    """Builds the plan of a flight. ``mission`` None: a course of ``length_m`` from the seed. The flight lasts to its
+    end, or ``duration_s``.
 
-    ``config``: of the companion; which GPS it is follows from ``gps``. Raises UsageError, SourceError: what cannot be
-    flown."""
+    ``config``: of the companion; ``gps`` sets its GPS number. Raises UsageError, SourceError when it cannot be flown.
+    """
     check_rates(duration_s, frame_hz)
-    met = conditions or Conditions()
+    flight_conditions = conditions or Conditions()
     if mission is not None:
         length_m = math.inf
     else:
-        mission = mission_over(scene, kind, seed=seed, length_m=SPARE * length_m, agl_m=agl_m)
+        mission = mission_over(scene, kind, seed=seed, length_m=LENGTH_MARGIN * length_m, agl_m=agl_m)
     check(mission, scene.frame, scene.box)
-    vehicle = (Plane if kind is Kind.PLANE else Copter)(mission, scene.frame, scene.height(), wind=met.wind, seed=seed)
+    vehicle = (Plane if kind is Kind.PLANE else Copter)(
+        mission, scene.frame, scene.height(), wind=flight_conditions.wind, seed=seed
+    )
     first = vehicle.state
     ground_m = float(first.p_b_in_w_m[2]) - first.agl_m
-    known = None if mission.starts_on_ground() else navigation_of(first)
+    navigation = None if mission.starts_on_ground() else navigation_of(first)
     autopilot = SimAutopilot(
         scene.frame,
         kind,
-        start=known,
-        home_amsl_m=ground_m if known is not None else None,
+        start=navigation,
+        home_amsl_m=ground_m if navigation is not None else None,
         parameters=parameters_of(kind, gps),
         boot_ns=Clock.of(seed).boot_ns,
     )
@@ -101,40 +104,46 @@ def plan_over(
         frame=scene.frame,
         vehicle=vehicle,
         sensors=VehicleSensors(
-            scene.frame, seed=seed, errors=met.errors, events=met.events, airspeed=kind is Kind.PLANE
+            scene.frame,
+            seed=seed,
+            errors=flight_conditions.errors,
+            events=flight_conditions.events,
+            airspeed=kind is Kind.PLANE,
         ),
         autopilot=autopilot,
-        view=_Camera(scene, met, seed),
+        view=_Camera(scene, flight_conditions, seed),
         origin=_origin(scene, first, ground_m, seed),
         map_path=map_path,
-        duration_s=duration_s or LONGEST_S,
+        duration_s=duration_s or MAX_DURATION_S,
         length_m=length_m,
         frame_hz=frame_hz,
-        delays=met.delays,
+        delays=flight_conditions.delays,
         config=msgspec.structs.replace(companion, link=_link(companion.link, gps)),
         over=lambda: vehicle.finished,
     )
 
 
 def check_rates(duration_s: float | None, frame_hz: float) -> None:
-    """Raises UsageError for what no flight can have."""
-    if duration_s is not None and not 0.0 < duration_s <= LONGEST_S:
-        raise UsageError(f"--duration {duration_s:g}: choose more than 0 and at most {LONGEST_S:g} seconds")
-    if not 0.0 < frame_hz <= FASTEST_HZ:
-        raise UsageError(f"--frame-hz {frame_hz:g}: choose more than 0 and at most {FASTEST_HZ:g}")
+    """Raises UsageError for an invalid duration or frame rate."""
+    if duration_s is not None and not 0.0 < duration_s <= MAX_DURATION_S:
+        raise UsageError(f"--duration {duration_s:g}: choose more than 0 and at most {MAX_DURATION_S:g} seconds")
+    if not 0.0 < frame_hz <= MAX_FRAME_HZ:
+        raise UsageError(f"--frame-hz {frame_hz:g}: choose more than 0 and at most {MAX_FRAME_HZ:g}")
 
 
 def parameters_of(kind: Kind, gps: Gps) -> dict[str, float]:
-    """What config/vehicles sets."""
+    """Returns the parameters that config/vehicles sets."""
     chosen = BESIDE_A_RECEIVER if gps is Gps.SECOND else GPS_INPUT_ALONE
     return chosen | (NO_DCM if kind is Kind.PLANE else {})
 
 
 class _Camera:
-    """The picture at the vehicle's true pose."""
+    """Renders the image at the vehicle's true pose."""
 
-    def __init__(self, scene: Scene, met: Conditions, seed: int) -> None:
-        self._renderer = Renderer(scene.ground, CAMERA, film=met.film, weather=met.weather, seed=seed)
+    def __init__(self, scene: Scene, flight_conditions: Conditions, seed: int) -> None:
+        self._renderer = Renderer(
+            scene.ground, CAMERA, film=flight_conditions.film, weather=flight_conditions.weather, seed=seed
+        )
         self._r_b_c = Mount.of(CAMERA).r_b_c()
 
     def __call__(self, state: State, index: int) -> Image:
@@ -142,7 +151,7 @@ class _Camera:
 
 
 def _origin(scene: Scene, first: State, ground_m: float, seed: int) -> m.Origin:
-    """The start as a pilot gives it: near the truth."""
+    """Returns the start as a pilot gives it: the truth plus START_ERROR_M."""
     start_m = first.p_b_in_w_m[:2] + np.random.default_rng([seed, 42]).normal(0.0, START_ERROR_M, 2)
     lat_deg, lon_deg = scene.frame.to_wgs84(float(start_m[0]), float(start_m[1]))
     return m.Origin(

@@ -1,7 +1,8 @@
-"""A flight in closed loop: the vehicle steers by what the autopilot believes, and the autopilot by what we tell it.
+"""Flight in closed loop: the vehicle steers by the autopilot's position, which depends on our GPS_INPUT.
 
-Vehicle, sensors, autopilot, MAVLink bytes, the real edge and nodes, bytes back: one thread, one simulated clock, as
-fast as this machine can. Truth reaches the renderer, the sensors and the evaluation, nothing else."""
+Vehicle, sensors, autopilot, MAVLink bytes, the flight's edge and nodes, and bytes back: one thread, one simulated
+clock, as fast as this machine can. Only the renderer, the sensors and the evaluation use the truth.
+"""
 
 import csv
 import math
@@ -23,15 +24,15 @@ from terrafix.messages import Frame, Message, Origin
 from terrafix.recorder.writer import versions
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
-from terrafix_tools.sim.autopilot.report import PeerReport, Witness
+from terrafix_tools.sim.autopilot.report import PeerMonitor, PeerReport
 from terrafix_tools.sim.closed_loop.companion import Companion, Delays
 from terrafix_tools.sim.closed_loop.loopback import Loopback
 from terrafix_tools.sim.interfaces import Navigation, Sensors, State, Vehicle
 
 STEP_S = 0.02
-ZERO_NS = 0  # of the flight on the companion's clock: t_s in estimates.csv counts from it
+ZERO_NS = 0  # start of the flight on the companion's clock: t_s in estimates.csv counts from it
 FRAMES_KEPT = 32
-SETTLED_S = 1.0  # after this long a frame's row does not change any more but by refinement
+ROW_FINAL_S = 1.0  # after this time a frame's row changes only by refinement
 TRACK_EVERY = 10  # steps between two rows of track.csv
 TRUTH_COLUMNS = ("file", "lat_deg", "lon_deg", "agl_m", "yaw_deg")
 TRACK_COLUMNS = ("t_s", "east_m", "north_m", "up_m", "agl_m", "believed_east_m", "believed_north_m", "error_m")
@@ -40,28 +41,28 @@ Progress = Callable[[float], None]  # seconds of the flight
 
 @dataclass(frozen=True)
 class Plan:
-    """Who flies, and through what it sees."""
+    """Everything that a closed-loop flight consists of."""
 
     name: str
     frame: LocalFrame  # of vehicle, sensors and autopilot
     vehicle: Vehicle
     sensors: Sensors
     autopilot: SimAutopilot
-    view: Callable[[State, int], Image | None]  # the picture at a moment, number of the frame; None: the camera stalls
-    origin: Origin  # camera and start, as the pilot gives them
+    view: Callable[[State, int], Image | None]  # renders the image of a frame number; None: the camera stalls
+    origin: Origin  # camera and start, as given by the pilot
     map_path: Path  # map package
     duration_s: float
-    length_m: float = math.inf  # over ground; it ends when one of the three is reached
+    length_m: float = math.inf  # over ground; the flight ends when duration, length or mission is complete
     frame_hz: float = 1.0
     delays: Delays = field(default_factory=Delays)
     config: Config = field(default_factory=Config)
-    over: Callable[[], bool] = lambda: False  # the mission is flown
-    temperature_c: Callable[[float], float] | None = None  # of the companion computer; None: cool
+    over: Callable[[], bool] = lambda: False  # True when the mission is complete
+    temperature_c: Callable[[float], float] | None = None  # of the companion computer; None: constant and cool
 
 
 @dataclass(frozen=True)
 class Flown:
-    """What came of it."""
+    """Result of a flight."""
 
     summary: dict[str, Any]
     peer: PeerReport
@@ -70,7 +71,8 @@ class Flown:
 def fly(plan: Plan, out: Path, *, progress: Progress = lambda _: None) -> Flown:
     """Writes estimates.csv, flight.mcap, summary.json, truth.csv, track.csv and peer.json into ``out``.
 
-    Raises OutputError, and what the nodes raise for a bad map or model."""
+    Raises OutputError, and the nodes' errors for a bad map or model.
+    """
     with ReplayOutput(out, plan.config) as output:
         began_s, cpu_s = time.perf_counter(), time.process_time()
         loop = _Loop(plan, out, output)
@@ -102,41 +104,41 @@ class _Loop:
         frames = MemoryFrameStore(FRAMES_KEPT)
         ctx = NodeContext(config=plan.config, frames=frames, map_path=plan.map_path.resolve(), out_dir=out.resolve())
         self._wire = Loopback()
-        self.companion = Companion(ctx, frames, self._wire, plan.delays, self._hear)
+        self.companion = Companion(ctx, frames, self._wire, plan.delays, self._record_messages)
         if plan.temperature_c is not None:
             self.companion.temperature_c = plan.temperature_c
-        self._witness = Witness(plan.autopilot, plan.frame)
-        self._open: deque[tuple[Frame, Image | None]] = deque()  # frames whose row may still change
+        self._monitor = PeerMonitor(plan.autopilot, plan.frame)
+        self._pending_frames: deque[tuple[Frame, Image | None]] = deque()  # frames whose row may still change
         self._steps = self._frames = 0
         self._state: State | None = None
         self.t_s = self.flown_m = 0.0
         self.truth: list[list[str]] = []
         self.track: list[list[str]] = []
-        self.companion.begin(msgspec.structs.replace(plan.origin, t_ns=ZERO_NS))
+        self.companion.start(msgspec.structs.replace(plan.origin, t_ns=ZERO_NS))
 
     def step(self) -> None:
         plan, autopilot = self._plan, self._plan.autopilot
         before, state = self._state, plan.vehicle.step(STEP_S, autopilot.navigation())
         self._steps, self._state, self.t_s = self._steps + 1, state, state.t_s
         autopilot.step(self.t_s, plan.sensors.read(state))
-        self._wire.give(autopilot.transmit())
+        self._wire.to_companion(autopilot.transmit())
         self.companion.step(_ns(self.t_s))
         autopilot.receive(self._wire.take(), self.t_s)
-        self._witness.look(self.t_s, state)
+        self._monitor.observe(self.t_s, state)
         if self.t_s * plan.frame_hz >= self._frames:
             self._expose(state)
-        self._close_frames(_ns(self.t_s - SETTLED_S))
+        self._close_frames(_ns(self.t_s - ROW_FINAL_S))
         if before is not None:
             self.flown_m += math.dist(before.p_b_in_w_m[:2], state.p_b_in_w_m[:2])
         if self._steps % TRACK_EVERY == 0:
-            self._note(state, autopilot.navigation())
+            self._append_track(state, autopilot.navigation())
 
     def finish(self) -> PeerReport:
         self.companion.end()
-        self._close_frames(_ns(self.t_s + SETTLED_S))
-        return self._witness.report()
+        self._close_frames(_ns(self.t_s + ROW_FINAL_S))
+        return self._monitor.report()
 
-    def _hear(self, messages: list[Message]) -> None:
+    def _record_messages(self, messages: list[Message]) -> None:
         self._output.take(messages)
 
     def _expose(self, state: State) -> None:
@@ -149,28 +151,28 @@ class _Loop:
             file=f"{self._frames:05d}",
             width=camera.width,
             height=camera.height,
-            error="" if image is not None else "the camera gave no picture",
+            error="" if image is not None else "no image from the camera",
         )
-        self._open.append((frame, image))
+        self._pending_frames.append((frame, image))
         self.companion.expose(frame, image)
         lat_deg, lon_deg = self._plan.frame.to_wgs84(float(state.p_b_in_w_m[0]), float(state.p_b_in_w_m[1]))
         yaw_deg = math.degrees(state.yaw_rad) % 360.0
         self.truth.append([frame.file, f"{lat_deg:.7f}", f"{lon_deg:.7f}", f"{state.agl_m:.2f}", f"{yaw_deg:.2f}"])
 
     def _close_frames(self, until_ns: int) -> None:
-        """Rows of frames from before ``until_ns`` go to the disk; their delay is the modelled one."""
-        while self._open and self._open[0][0].t_ns <= until_ns:
-            frame, image = self._open.popleft()
-            late_ns = self.companion.said_ns.get(frame.frame_id, frame.t_ns) - frame.t_ns
-            self._output.frame_done(frame, image, late_ns / 1e6)
+        """Writes the rows of frames from before ``until_ns`` to disk; their processing time is the modelled one."""
+        while self._pending_frames and self._pending_frames[0][0].t_ns <= until_ns:
+            frame, image = self._pending_frames.popleft()
+            delay_ns = self.companion.estimated_ns.get(frame.frame_id, frame.t_ns) - frame.t_ns
+            self._output.frame_done(frame, image, delay_ns / 1e6)
 
-    def _note(self, state: State, believed: Navigation | None) -> None:
+    def _append_track(self, state: State, navigation: Navigation | None) -> None:
         place = [*map(float, state.p_b_in_w_m), state.agl_m]
         cells = [f"{state.t_s:.2f}", *(f"{v:.2f}" for v in place)]
-        if believed is None:
+        if navigation is None:
             cells += ["", "", ""]
         else:
-            e_m, n_m = (float(v) for v in believed.p_b_in_w_m[:2])
+            e_m, n_m = (float(v) for v in navigation.p_b_in_w_m[:2])
             cells += [f"{e_m:.2f}", f"{n_m:.2f}", f"{math.hypot(e_m - place[0], n_m - place[1]):.2f}"]
         self.track.append(cells)
 

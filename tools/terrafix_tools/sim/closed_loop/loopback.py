@@ -1,10 +1,12 @@
-"""A wire in memory between the companion's MAVLink edge and an autopilot in the same process."""
+"""In-memory transport between the companion's MAVLink edge and an autopilot in the same process."""
 
 from terrafix.link.mavlink.transport import Address, Chunk
 
 
 class Loopback:
-    """The companion's ``Transport`` (link/mavlink/transport.py) on one side, bytes for the autopilot on the other."""
+    """The companion's ``Transport`` (link/mavlink/transport.py) on one side, byte streams of the autopilot on the
+    other.
+    """
 
     def __init__(self) -> None:
         self._to_companion: list[bytes] = []
@@ -19,14 +21,14 @@ class Loopback:
         return True
 
     def close(self) -> None:
-        """Nothing is open."""
+        """No resource is open."""
 
-    def give(self, packets: bytes) -> None:
-        """From the autopilot."""
+    def to_companion(self, packets: bytes) -> None:
+        """Queues bytes from the autopilot for the companion."""
         if packets:
             self._to_companion.append(packets)
 
     def take(self) -> bytes:
-        """For the autopilot, since the last call."""
+        """Returns the bytes for the autopilot since the last call."""
         packets, self._to_autopilot = self._to_autopilot, []
         return b"".join(packets)

@@ -1,7 +1,8 @@
-"""`terrafix demo`: a flight over a generated place, with the real processes and an autopilot that uses their GPS_INPUT.
+"""`terrafix demo`: a flight over a generated place, with the real processes and a simulated autopilot on GPS_INPUT.
 
-Camera and map show the place in different seasons. The autopilot peer flies the true course and tells the link its
-attitude and height over MAVLink; truth reaches nothing else. The exit code says whether the autopilot was served."""
+Camera and map show the place in different seasons. The autopilot peer follows the true course and sends its attitude
+and height over MAVLink; no other part receives the truth. The exit code tells whether the autopilot used GPS_INPUT.
+"""
 
 import shutil
 import time
@@ -15,21 +16,21 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from terrafix.core.errors import EvaluationError, SourceError, UsageError
 from terrafix_tools.report.data import gather
 from terrafix_tools.report.page import report
-from terrafix_tools.sim.autopilot.verdict import key_figures, not_served
+from terrafix_tools.sim.autopilot.verdict import gps_input_failure, key_figures
 from terrafix_tools.sim.demo.flight import fly
 from terrafix_tools.sim.flights.folder import Flight, add_telemetry, plan_flight, write_flight
-from terrafix_tools.sim.out_folder import make_room, write_json
+from terrafix_tools.sim.out_folder import prepare_folder, write_json
 from terrafix_tools.sim.world import place as world
 from terrafix_tools.sim.world.mapped import CAMERA_SEASON, write_map
 
-MARK = "demo.json"  # a folder with this file in it is ours to empty
-SHORTEST_S, LONGEST_S = 10.0, 1800.0
-NOT_SERVED = 1  # exit code
+MARKER_FILE = "demo.json"  # a folder that contains this file may be emptied
+MIN_DURATION_S, MAX_DURATION_S = 10.0, 1800.0
+EXIT_FAILED = 1  # exit code
 
 
 @dataclass(frozen=True)
-class Made:
-    """What the demo generated."""
+class Generated:
+    """Output of the generation."""
 
     flight: Flight
     folder: Path
@@ -37,50 +38,52 @@ class Made:
 
 
 def demo(out: Path, *, seed: int, duration_s: float) -> int:
-    """Everything into ``out``: map.gpkg, flight/, the record, peer.json, report.html. -> exit code.
+    """Writes map.gpkg, flight/, the record, peer.json and report.html into ``out``. Returns the exit code.
 
-    0 only when the autopilot got GPS_INPUT, called it healthy and used it. Raises the TerrafixError family."""
-    if not SHORTEST_S <= duration_s <= LONGEST_S:
-        raise UsageError(f"--duration {duration_s:g}: choose {SHORTEST_S:g} to {LONGEST_S:g} seconds")
+    It is 0 only when the autopilot received GPS_INPUT, reported it healthy and used it. Raises subclasses of
+    TerrafixError.
+    """
+    if not MIN_DURATION_S <= duration_s <= MAX_DURATION_S:
+        raise UsageError(f"--duration {duration_s:g}: choose {MIN_DURATION_S:g} to {MAX_DURATION_S:g} seconds")
     began_s = time.perf_counter()
     console = Console()
-    make_room(out, MARK, {"seed": seed, "duration_s": duration_s})
-    made = _generate(out, seed, duration_s, console)
-    exit_code, peer = fly(made.flight, made.folder, made.map_path, out, seed=seed, console=console)
+    prepare_folder(out, MARKER_FILE, {"seed": seed, "duration_s": duration_s})
+    generated = _generate(out, seed, duration_s, console)
+    exit_code, peer = fly(generated.flight, generated.folder, generated.map_path, out, seed=seed, console=console)
     peer.write(out / "peer.json")
     if exit_code != 0:
         typer.echo(
             f"terrafix demo: the daemon stopped with exit code {exit_code}; see {out / 'terrafix.log'}", err=True
         )
         return exit_code
-    shutil.copyfile(made.folder / "truth.csv", out / "truth.csv")
-    add_telemetry(made.folder, made.flight)  # only now: in flight it came over MAVLink
+    shutil.copyfile(generated.folder / "truth.csv", out / "truth.csv")
+    add_telemetry(generated.folder, generated.flight)  # after the flight, in which telemetry came over MAVLink
     with console.status("writing the report"):
         try:
             evaluation = gather(out, out / "truth.csv").evaluation or {}
-            page = report(out, out / "truth.csv", made.map_path)
+            page = report(out, out / "truth.csv", generated.map_path)
         except (SourceError, EvaluationError) as error:
             typer.echo(f"terrafix demo: nothing to report: {error}; see {out / 'terrafix.log'}", err=True)
-            return NOT_SERVED
+            return EXIT_FAILED
     write_json(out / "evaluation.json", evaluation)
-    problem = not_served(peer)
+    problem = gps_input_failure(peer)
     for line in key_figures(evaluation, peer):
         console.print(line, highlight=False, soft_wrap=True)
     console.print(f"report   {page}", highlight=False, soft_wrap=True)
     console.print(f"done in {time.perf_counter() - began_s:.0f} s", highlight=False)
     if problem:
-        typer.echo(f"terrafix demo: the autopilot was not served: {problem}; see {out / 'terrafix.log'}", err=True)
-        return NOT_SERVED
+        typer.echo(f"terrafix demo: GPS_INPUT was not used: {problem}; see {out / 'terrafix.log'}", err=True)
+        return EXIT_FAILED
     return 0
 
 
-def _generate(out: Path, seed: int, duration_s: float, console: Console) -> Made:
+def _generate(out: Path, seed: int, duration_s: float, console: Console) -> Generated:
     map_path, folder = out / "map.gpkg", out / "flight"
-    with console.status("a place: fields, woods, a river, villages, and its map in summer"):
+    with console.status("generating a place and its summer map"):
         place = world.generate(seed)
         write_map(place, map_path)
-    with console.status("the same place in autumn, for the camera"):
-        flight = plan_flight(place, place.look(CAMERA_SEASON), duration_s)
+    with console.status("rendering the place in autumn for the camera"):
+        flight = plan_flight(place, place.render(CAMERA_SEASON), duration_s)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task("the camera", total=len(flight.frame_times_s()))
@@ -95,4 +98,4 @@ def _generate(out: Path, seed: int, duration_s: float, console: Console) -> Made
     length_km = flight.path.length_m(flight.duration_s) / 1e3
     frames = len(flight.frame_times_s())
     console.print(f"world    seed {seed}: map in summer, camera in autumn; {length_km:.1f} km, {frames} frames")
-    return Made(flight, folder, map_path)
+    return Generated(flight, folder, map_path)

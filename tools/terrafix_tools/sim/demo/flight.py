@@ -1,4 +1,4 @@
-"""The flight of the demo: the real supervisor and processes on one side, the autopilot peer on the other."""
+"""Flight of the demo: the supervisor and its processes, and the autopilot peer."""
 
 import threading
 import time
@@ -14,18 +14,18 @@ from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 from terrafix_tools.sim.autopilot.report import PeerReport
 from terrafix_tools.sim.flights.folder import Flight
 
-LOOK_S = 1.0  # between two looks at the autopilot
-LOG_S = 15.0  # between two lines where lines cannot be rewritten
+POLL_S = 1.0  # polling interval of the autopilot's status
+LOG_INTERVAL_S = 15.0  # interval of status lines on a non-interactive console
 
 
 class FlightClock:
-    """Seconds of the flight. They begin with the source's clock, which is known when the source is opened."""
+    """Seconds of the flight. They start with the source's clock, which is known when the source is open."""
 
     def __init__(self) -> None:
         self._epoch_ns: int | None = None
 
-    def begin(self, epoch_ns: int) -> None:
-        """``epoch_ns``: the source's zero on the monotonic clock; the peer lives on the same."""
+    def start(self, epoch_ns: int) -> None:
+        """``epoch_ns``: the source's time zero on the monotonic clock, which the peer uses too."""
         self._epoch_ns = epoch_ns
 
     @property
@@ -33,14 +33,15 @@ class FlightClock:
         return self._epoch_ns is not None
 
     def __call__(self) -> float:
-        """Zero until it runs."""
+        """Zero until the clock runs."""
         return 0.0 if self._epoch_ns is None else max(0.0, (time.monotonic_ns() - self._epoch_ns) / 1e9)
 
 
 class Course:
-    """Seconds of the flight -> truth for the peer, whose sensors have errors of their own.
+    """True course of the flight for the peer, which adds its own sensor errors.
 
-    At time zero the vehicle is held in the air: the clock does not run while the processes start."""
+    At time zero the vehicle is held in the air: the clock does not run while the processes start.
+    """
 
     def __init__(self, flight: Flight) -> None:
         self._flight = flight
@@ -69,7 +70,7 @@ class Course:
 def fly(
     flight: Flight, folder: Path, map_path: Path, out: Path, *, seed: int, console: Console
 ) -> tuple[int, PeerReport]:
-    """Flies ``folder`` over ``map_path`` in real time. -> exit code of the supervisor, what the peer noted."""
+    """Flies ``folder`` over ``map_path`` in real time. Returns the supervisor's exit code and the peer's report."""
     clock = FlightClock()
     peer = AutopilotPeer(seed=seed, home_amsl_m=flight.ground_amsl_m)
     landed = threading.Event()
@@ -82,7 +83,7 @@ def fly(
 
     def on_event(event: ProcessEvent) -> None:
         if event.event == "stopped":
-            land()  # the processes end one after the other: what the peer hears from here on is not the flight
+            land()  # the processes end one after the other: messages from here on are not part of the flight
         elif event.event != "started":
             console.print(f"         {event.process} {event.event}: {event.detail}", highlight=False)
 
@@ -100,7 +101,7 @@ def fly(
             configs=[],
             stop_after_source=True,
             on_event=on_event,
-            on_epoch=clock.begin,
+            on_epoch=clock.start,
             log_to=out / "terrafix.log",
         )
     finally:
@@ -112,17 +113,17 @@ def fly(
 def _watch(
     peer: AutopilotPeer, clock: FlightClock, duration_s: float, landed: threading.Event, console: Console
 ) -> None:
-    """A line that is rewritten: the time, and what the autopilot has and believes."""
-    said_s = 0.0
-    with console.status("flight: the processes start") as status:
-        while not landed.wait(LOOK_S):
+    """Prints a status line: the time, and the autopilot's fix and position error."""
+    logged_s = 0.0
+    with console.status("flight: starting processes") as status:
+        while not landed.wait(POLL_S):
             if not clock.runs:
                 continue
-            fix_type, error_m = peer.glance()
+            fix_type, error_m = peer.latest()
             fix = "3D fix" if fix_type >= 3 else "no fix"
-            error = "" if error_m is None else f", its position is off by {error_m:.1f} m"
+            error = "" if error_m is None else f", position error {error_m:.1f} m"
             line = f"flight: {min(clock(), duration_s):.0f} of {duration_s:.0f} s; autopilot: {fix}{error}"
             status.update(line)
-            if not console.is_terminal and clock() - said_s >= LOG_S:
-                said_s = clock()
+            if not console.is_terminal and clock() - logged_s >= LOG_INTERVAL_S:
+                logged_s = clock()
                 console.print(line, highlight=False, soft_wrap=True)

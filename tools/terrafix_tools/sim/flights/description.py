@@ -1,4 +1,4 @@
-"""flight.toml from a Description."""
+"""Writes a flight description (flight.toml)."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from terrafix.vision.sources.description import Description
 
 
 def write_toml(path: Path, flight: Description, note: str) -> None:
-    """``note``: first line, a comment. What is at its default is left out. Raises OutputError."""
+    """``note``: first line, a comment. Default values are omitted. Raises OutputError."""
     values, tables = _split(flight)
     lines = [f"# {note}", *values]
     for name, table in tables.items():
@@ -24,20 +24,20 @@ def write_toml(path: Path, flight: Description, note: str) -> None:
 def _split(
     table: msgspec.Struct | dict[str, object],
 ) -> tuple[list[str], dict[str, msgspec.Struct | dict[str, object]]]:
-    """-> "key = value" lines; the tables inside."""
+    """Returns "key = value" lines, and the nested tables."""
     lines, tables = [], {}
     items = table if isinstance(table, dict) else _changed(table)
     for name, value in items.items():
         if isinstance(value, msgspec.Struct | dict):
             tables[name] = value
         else:
-            # JSON's strings, numbers and lists are TOML's.
+            # Strings, numbers and lists of JSON are valid TOML.
             lines.append(f"{name} = {json.dumps(value, ensure_ascii=False)}")
     return lines, tables
 
 
 def _changed(table: msgspec.Struct) -> dict[str, object]:
-    """Fields that are not at their default; a camera says all of its numbers."""
+    """Returns the fields that differ from their default; required fields are always included."""
     return {
         field.name: value
         for field in msgspec.structs.fields(table)

@@ -1,6 +1,7 @@
-"""A simulated flight, planned and flown in the open loop, and written as a flight folder.
+"""A simulated flight in open loop, written as a flight folder.
 
-The vehicle flies on the truth here; ``telemetry.tlog`` is what its autopilot says meanwhile, errors and all."""
+The vehicle flies on the truth; ``telemetry.tlog`` is the telemetry of its autopilot, with sensor errors.
+"""
 
 import csv
 import math
@@ -46,22 +47,22 @@ CAMERA = m.Camera(
 FRAME_HZ = 2.0
 JPEG_QUALITY = 92
 AGL_M = 130.0
-EDGE_PER_AGL = 1.3  # the course keeps this far from the edge of the image, in heights: so far does the camera look
-TURN_ROOM_M = {Kind.PLANE: 120.0, Kind.COPTER: 10.0}  # ... and this much, for what a turn needs outside its corner
-LONGEST_S = 3600.0
-AFTER_S = 20.0  # flown beyond the end: who follows the flight in real time is late
+EDGE_MARGIN_PER_AGL = 1.3  # distance of the course from the edge of the image, in heights: the camera's reach
+TURN_ROOM_M = {Kind.PLANE: 120.0, Kind.COPTER: 10.0}  # additional distance, for turns outside their corner
+MAX_DURATION_S = 3600.0
+EXTRA_S = 20.0  # flown beyond the end, for a consumer that lags behind in real time
 START_SIGMA_M = 25.0
-START_ERROR_M = 12.0  # 1-sigma of what the start coordinate is really off, smaller than it claims
+START_ERROR_M = 12.0  # 1-sigma of the true error of the start coordinate, smaller than the stated one
 YAW_SIGMA_DEG = 3.0
 AGL_SIGMA_M = 3.0
 ATTITUDE_SIGMA_DEG = 0.7
 
-Progress = Callable[[int, int], None]  # frames done, frames in all
+Progress = Callable[[int, int], None]  # frames done, frames in total
 
 
 @dataclass(frozen=True)
 class Flight:
-    """Everything about a simulated flight that is not a picture."""
+    """A simulated flight without its images."""
 
     kind: Kind
     frame: LocalFrame
@@ -69,30 +70,32 @@ class Flight:
     mission: Mission
     path: FlownPath
     telemetry: TelemetryLog
-    start_wgs84: tuple[float, float]  # what the pilot says: near the position at time zero
-    ground_amsl_m: float  # under the start: the zero of the reported height
+    start_wgs84: tuple[float, float]  # start given by the pilot: near the position at time zero
+    ground_amsl_m: float  # under the start: zero of the reported height
     duration_s: float
 
     def frame_times_s(self) -> np.ndarray:
-        """Times of the pictures, from zero."""
+        """Exposure times, from zero."""
         return np.arange(math.floor(self.duration_s * FRAME_HZ + 1e-6)) / FRAME_HZ
 
     def camera_pose(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """-> p_c_in_w_m (3,), R_w_c (3, 3)"""
+        """Returns p_c_in_w_m (3,) and R_w_c (3, 3)."""
         return state.p_b_in_w_m, state.r_w_b() @ Mount.of(CAMERA).r_b_c()
 
 
-def plan_flight(place: World, camera_look_bgr: np.ndarray, duration_s: float) -> Flight:
-    """A fixed wing on a closed course over a generated place, in the season of ``camera_look_bgr``."""
-    scene = scene_of_world(place, camera_look_bgr)
+def plan_flight(place: World, camera_image_bgr: np.ndarray, duration_s: float) -> Flight:
+    """Plans a fixed-wing flight on a closed course over a generated place, in the season of ``camera_image_bgr``."""
+    scene = scene_of_world(place, camera_image_bgr)
     return flight_over(scene, seed=place.seed, duration_s=duration_s)
 
 
 def mission_over(
     scene: Scene, kind: Kind, *, seed: int, length_m: float, agl_m: float, from_ground: bool = False
 ) -> Mission:
-    """A closed course inside the scene; ``from_ground``: with take-off and landing. Raises UsageError: no room."""
-    box = scene.box.shrunk(EDGE_PER_AGL * agl_m + TURN_ROOM_M[kind])
+    """Returns a closed course inside the scene; ``from_ground``: with take-off and landing. Raises UsageError: no
+    room.
+    """
+    box = scene.box.shrunk(EDGE_MARGIN_PER_AGL * agl_m + TURN_ROOM_M[kind])
     return course(seed, length_m, box, scene.frame, agl_m=agl_m, from_ground=from_ground)
 
 
@@ -107,11 +110,13 @@ def flight_over(
     events: Sequence[AnyEvent] = (),
     wind: Wind = BREEZE,
 ) -> Flight:
-    """Flies ``mission`` (None: a course of its own, long enough) for ``duration_s`` (None: until it is done).
+    """Flies ``mission`` (None: a generated course of sufficient length) for ``duration_s`` (None: until it is
+    complete).
 
-    Raises UsageError, SourceError: duration or mission cannot be flown."""
-    if duration_s is not None and not 0.0 < duration_s <= LONGEST_S:
-        raise UsageError(f"--duration {duration_s:g}: choose more than 0 and at most {LONGEST_S:g} seconds")
+    Raises UsageError, SourceError when duration or mission cannot be flown.
+    """
+    if duration_s is not None and not 0.0 < duration_s <= MAX_DURATION_S:
+        raise UsageError(f"--duration {duration_s:g}: choose more than 0 and at most {MAX_DURATION_S:g} seconds")
     if mission is None:
         mission = mission_over(scene, kind, seed=seed, length_m=30.0 * (duration_s or 200.0), agl_m=agl_m)
     check(mission, scene.frame, scene.box)
@@ -120,17 +125,21 @@ def flight_over(
     first = vehicle.state
     ground_amsl_m = float(first.p_b_in_w_m[2]) - first.agl_m
     sensors = VehicleSensors(scene.frame, seed=seed, events=events, airspeed=kind is Kind.PLANE)
-    known = None if mission.starts_on_ground() else navigation_of(first)
+    navigation = None if mission.starts_on_ground() else navigation_of(first)
     autopilot = SimAutopilot(
-        scene.frame, kind, start=known, home_amsl_m=ground_amsl_m if known else None, boot_ns=Clock.of(seed).boot_ns
+        scene.frame,
+        kind,
+        start=navigation,
+        home_amsl_m=ground_amsl_m if navigation else None,
+        boot_ns=Clock.of(seed).boot_ns,
     )
     log = TelemetryLog(autopilot, T0_US)
     until = (lambda: False) if duration_s is not None else (lambda: vehicle.finished)
-    path = fly(vehicle, sensors, first, (duration_s or LONGEST_S) + AFTER_S, until=until, each=log.step)
+    path = fly(vehicle, sensors, first, (duration_s or MAX_DURATION_S) + EXTRA_S, until=until, on_reading=log.step)
     if vehicle.crashed:
         raise SourceError(
             f"{mission.name}: the vehicle flew into the ground after {vehicle.state.t_s:.0f} s; raise the heights, or "
-            "let them count from the ground below"
+            "use heights above the ground below"
         )
     start = first.p_b_in_w_m[:2] + np.random.default_rng([seed, 42]).normal(0.0, START_ERROR_M, 2)
     return Flight(
@@ -149,45 +158,46 @@ def flight_over(
 def write_flight(
     folder: Path, flight: Flight, map_name: str, *, seed: int, telemetry: bool = True, progress: Progress | None = None
 ) -> None:
-    """The flight folder. ``telemetry=False``: attitude and height come over MAVLink, there is no telemetry.tlog.
+    """Writes the flight folder. ``telemetry=False``: no telemetry.tlog, attitude and height come over MAVLink.
 
-    ``map_name`` is relative to the folder. Raises OutputError."""
+    ``map_name`` is relative to the folder. Raises OutputError.
+    """
     renderer = Renderer(flight.ground, CAMERA, film=Film(), seed=seed)
     times = flight.frame_times_s()
-    said, truth = [], []
+    frame_rows, truth = [], []
     try:
         (folder / "frames").mkdir(parents=True, exist_ok=True)
         for i, t_s in enumerate(times.tolist()):
             state = flight.path.state(t_s)
             name = f"{i + 1:04d}.jpg"
             _write_jpeg(folder / "frames" / name, renderer.frame(*flight.camera_pose(state), i))
-            said.append([name, f"{t_s:.3f}"])
+            frame_rows.append([name, f"{t_s:.3f}"])
             truth.append([name, *truth_row(flight.frame, state)])
             if progress:
                 progress(i + 1, len(times))
-        write_csv(folder / "frames.csv", ["file", "t_s"], said)
+        write_csv(folder / "frames.csv", ["file", "t_s"], frame_rows)
         write_csv(folder / "truth.csv", ["file", "lat_deg", "lon_deg", "agl_m", "yaw_deg"], truth)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error}); choose another --out") from None
-    write_toml(folder / "flight.toml", _describe(flight, map_name), "A simulated flight: nothing in it was flown.")
+    write_toml(folder / "flight.toml", _describe(flight, map_name), "A simulated flight.")
     if telemetry:
         add_telemetry(folder, flight)
 
 
 def add_telemetry(folder: Path, flight: Flight) -> None:
-    """telemetry.tlog into the folder. Raises OutputError."""
+    """Writes telemetry.tlog into the folder. Raises OutputError."""
     flight.telemetry.write(folder / "telemetry.tlog")
 
 
 def truth_row(frame: LocalFrame, state: State) -> list[str]:
-    """The cells of truth.csv after the file."""
+    """Returns the cells of truth.csv after the file name."""
     lat_deg, lon_deg = frame.to_wgs84(float(state.p_b_in_w_m[0]), float(state.p_b_in_w_m[1]))
     yaw_deg = math.degrees(state.yaw_rad) % 360.0
     return [f"{lat_deg:.7f}", f"{lon_deg:.7f}", f"{state.agl_m:.2f}", f"{yaw_deg:.2f}"]
 
 
 def write_csv(path: Path, columns: list[str], rows: list[list[str]]) -> None:
-    """Raises OSError."""
+    """Writes a CSV file. Raises OSError."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)

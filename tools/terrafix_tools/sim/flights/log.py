@@ -1,4 +1,4 @@
-"""The telemetry.tlog that a ground station keeps of a simulated flight: what the autopilot said, packet by packet."""
+"""telemetry.tlog of a simulated flight: the autopilot's packets as a ground station records them."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from terrafix.core.mavlink.tlog import record
 from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
 from terrafix_tools.sim.interfaces import Readings
 
-RATES_HZ = {  # as a companion asks for them
+RATES_HZ = {  # rates that a companion requests
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 50.0,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 50.0,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
@@ -18,13 +18,14 @@ RATES_HZ = {  # as a companion asks for them
     mavlink.MAVLINK_MSG_ID_VFR_HUD: 4.0,
     mavlink.MAVLINK_MSG_ID_AIRSPEED: 5.0,
 }
-T0_US = 1_717_236_000_000_000  # 2024-06-01 10:00 UTC: of t_s 0, UNIX microseconds
+T0_US = 1_717_236_000_000_000  # 2024-06-01 10:00 UTC, UNIX microseconds of t_s 0
 COMPANION = 190  # MAV_COMP_ID_MISSIONPLANNER
 
 
 class TelemetryLog:
-    """``step`` with every reading, then ``write``. Records are stamped with our own time, at the moment of measurement;
-    what is inside them has the autopilot's."""
+    """Records an autopilot: ``step`` with every reading, then ``write``. Record times are on our clock at the time of
+    measurement; message times are on the autopilot's clock.
+    """
 
     def __init__(self, autopilot: SimAutopilot, t0_us: int) -> None:
         """``t0_us``: UNIX time of the flight's zero, in microseconds."""
@@ -32,10 +33,10 @@ class TelemetryLog:
         self._records: list[bytes] = []
         sender = mavlink.MAVLink(None, srcSystem=255, srcComponent=COMPANION)
         for message_id, rate_hz in RATES_HZ.items():
-            wish = mavlink.MAVLink_command_long_message(
+            request = mavlink.MAVLink_command_long_message(
                 1, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message_id, 1e6 / rate_hz, 0, 0, 0, 0, 0
             )
-            autopilot.receive(bytes(wish.pack(sender)), 0.0)
+            autopilot.receive(bytes(request.pack(sender)), 0.0)
 
     def step(self, readings: Readings) -> None:
         self._autopilot.step(readings.t_s, readings)
@@ -44,7 +45,7 @@ class TelemetryLog:
             self._records.append(record(self._t0_us + round(readings.t_s * 1e6), packets))
 
     def write(self, path: Path) -> None:
-        """Raises OutputError."""
+        """Writes the file. Raises OutputError."""
         try:
             path.write_bytes(b"".join(self._records))
         except OSError as error:

@@ -11,7 +11,7 @@ from terrafix.core.errors import OutputError, UsageError
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
 from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.flights.folder import AGL_M, LONGEST_S, Flight, flight_over, mission_over, write_flight
+from terrafix_tools.sim.flights.folder import AGL_M, MAX_DURATION_S, Flight, flight_over, mission_over, write_flight
 from terrafix_tools.sim.flights.scene import Scene, scene_of_image, scene_of_place
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Jam, read_events
 from terrafix_tools.sim.world import mapped
@@ -22,12 +22,12 @@ MAP_NAME = "map.gpkg"
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What the command line asks for; None and 0 where it says nothing."""
+class FlightOptions:
+    """Options of the command line; None and 0 where not given."""
 
     seed: int = 1
     size_km: float | None = None  # side of a generated place
-    image: Path | None = None  # what the camera sees; None: a generated place
+    image: Path | None = None  # image that the camera sees; None: a generated place
     map_path: Path | None = None
     dem: Path | None = None
     vehicle: Kind = Kind.PLANE
@@ -40,15 +40,15 @@ class Wanted:
     jam_after_s: float | None = None
 
 
-def make(out: Path, wanted: Wanted, *, progress: bool = True) -> Flight:
-    """Writes the folder ``out``, which must be new or empty. Raises the TerrafixError family."""
-    check_wanted(wanted)
+def make(out: Path, wanted: FlightOptions, *, progress: bool = True) -> Flight:
+    """Writes the folder ``out``, which must be new or empty. Raises subclasses of TerrafixError."""
+    check_options(wanted)
     events = gnss_events(wanted)
     mission = None if wanted.mission is None else read_mission(wanted.mission)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise OutputError(f"{out}: is there already and not an empty folder; choose another --out")
+        raise OutputError(f"{out}: exists and is not an empty folder; choose another --out")
     console = Console(stderr=True, quiet=not progress)
-    with console.status("the ground"):
+    with console.status("generating the ground"):
         scene, place = scene_of(wanted)
     if mission is None:
         length_m = 1e3 * wanted.length_km if wanted.length_km is not None else 30.0 * (wanted.duration_s or 200.0)
@@ -60,7 +60,7 @@ def make(out: Path, wanted: Wanted, *, progress: bool = True) -> Flight:
             agl_m=wanted.agl_m,
             from_ground=wanted.from_ground,
         )
-    with console.status("the flight"):
+    with console.status("simulating the flight"):
         flight = flight_over(
             scene, wanted.vehicle, seed=wanted.seed, mission=mission, duration_s=wanted.duration_s, events=events
         )
@@ -68,7 +68,7 @@ def make(out: Path, wanted: Wanted, *, progress: bool = True) -> Flight:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-    with console.status("the map"):
+    with console.status("writing the map"):
         write_map(out / MAP_NAME, wanted, place)
     write_mission(out / "mission.waypoints", mission)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
@@ -78,8 +78,8 @@ def make(out: Path, wanted: Wanted, *, progress: bool = True) -> Flight:
     return flight
 
 
-def scene_of(wanted: Wanted) -> tuple[Scene, world.World | None]:
-    """What the camera sees; and the place, when it is a generated one. Raises MapError, UsageError."""
+def scene_of(wanted: FlightOptions) -> tuple[Scene, world.World | None]:
+    """Returns the scene of the camera, and the place if it is a generated one. Raises MapError, UsageError."""
     if wanted.image is not None:
         return scene_of_image(wanted.image, wanted.dem), None
     size = {} if wanted.size_km is None else {"width_m": 1e3 * wanted.size_km, "height_m": 1e3 * wanted.size_km}
@@ -87,34 +87,34 @@ def scene_of(wanted: Wanted) -> tuple[Scene, world.World | None]:
     return scene_of_place(place, mapped.CAMERA_SEASON), place
 
 
-def write_map(package: Path, wanted: Wanted, place: world.World | None) -> None:
-    """The map package of another date or season. Raises MapError, OutputError."""
+def write_map(package: Path, wanted: FlightOptions, place: world.World | None) -> None:
+    """Writes the map package of another date or season. Raises MapError, OutputError."""
     if place is None:
         source = wanted.map_path or wanted.image
-        assert source is not None  # there is an image where there is no place
+        assert source is not None  # without a place there is an image
         build(source, package, dem=wanted.dem)
         return
     mapped.write_map(place, package)
 
 
-def gnss_events(wanted: Wanted) -> tuple[AnyEvent, ...]:
-    """Of the file, and the jammer that has an option of its own. Raises SourceError."""
+def gnss_events(wanted: FlightOptions) -> tuple[AnyEvent, ...]:
+    """Returns the events of the file, and the jammer of --jam-after. Raises SourceError."""
     events = () if wanted.events is None else read_events(wanted.events)
     return events if wanted.jam_after_s is None else (*events, Jam(start_s=wanted.jam_after_s))
 
 
-def check_wanted(wanted: Wanted) -> None:
-    """Raises UsageError."""
+def check_options(wanted: FlightOptions) -> None:
+    """Raises UsageError for invalid options."""
     if wanted.image is None and (wanted.map_path or wanted.dem):
         raise UsageError("--map and --dem belong to --image; a generated place has its own")
     if wanted.image is not None and wanted.size_km is not None:
-        raise UsageError("--size-km is that of a generated place; with --image leave it out")
+        raise UsageError("--size-km applies to a generated place; omit it with --image")
     if wanted.mission is not None and (wanted.length_km is not None or wanted.from_ground):
-        raise UsageError("--mission says itself how far and from where; leave --length-km and --from-ground out")
+        raise UsageError("--mission defines length and start; omit --length-km and --from-ground")
     if wanted.length_km is not None and not 0.0 < wanted.length_km < math.inf:
         raise UsageError(f"--length-km {wanted.length_km:g}: choose a positive length")
-    if wanted.duration_s is not None and not 0.0 < wanted.duration_s <= LONGEST_S:
-        raise UsageError(f"--duration {wanted.duration_s:g}: choose more than 0 and at most {LONGEST_S:g} seconds")
+    if wanted.duration_s is not None and not 0.0 < wanted.duration_s <= MAX_DURATION_S:
+        raise UsageError(f"--duration {wanted.duration_s:g}: choose more than 0 and at most {MAX_DURATION_S:g} seconds")
     if not AGL_LIMITS_M[0] <= wanted.agl_m <= AGL_LIMITS_M[1]:
         raise UsageError(f"--agl {wanted.agl_m:g}: choose {AGL_LIMITS_M[0]:g} to {AGL_LIMITS_M[1]:g} metres")
     if wanted.jam_after_s is not None and not wanted.jam_after_s >= 0.0:

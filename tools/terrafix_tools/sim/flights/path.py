@@ -1,4 +1,4 @@
-"""A flight that was flown: the truth, step after step, and at any moment between."""
+"""True path of a flown flight: states per step, with interpolation."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ STEP_S = 0.02  # of the simulation
 
 
 class FlownPath:
-    """``states``: one for each STEP_S, from time zero."""
+    """``states``: one per STEP_S, from time zero."""
 
     def __init__(self, states: list[State]) -> None:
         self.states = states
@@ -21,13 +21,13 @@ class FlownPath:
         return (len(self.states) - 1) * STEP_S
 
     def state(self, t_s: float) -> State:
-        """Truth at ``t_s``; before the first step and after the last the vehicle is where it was then."""
+        """Returns the true state at ``t_s``; before the first and after the last step the vehicle stands still."""
         at = min(max(t_s / STEP_S, 0.0), len(self.states) - 1.0)
         i = min(int(at), len(self.states) - 2)
-        return between(self.states[i], self.states[i + 1], at - i)
+        return interpolate(self.states[i], self.states[i + 1], at - i)
 
     def length_m(self, until_s: float = math.inf) -> float:
-        """Flown over ground, horizontally."""
+        """Horizontal distance flown."""
         places = np.array([s.p_b_in_w_m[:2] for s in self.states if s.t_s <= until_s])
         return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
@@ -39,21 +39,25 @@ def fly(
     duration_s: float,
     *,
     until: Callable[[], bool] = lambda: False,
-    each: Callable[[Readings], None],
+    on_reading: Callable[[Readings], None],
 ) -> FlownPath:
-    """``duration_s`` from ``first``, on the truth; ``until`` ends it earlier. ``each`` hears every reading."""
+    """Flies for ``duration_s`` from ``first``, steering by the truth; ``until`` ends it earlier. ``on_reading`` is
+    called with every reading.
+    """
     states = [first]
-    each(sensors.read(first))
+    on_reading(sensors.read(first))
     for _ in range(math.ceil(duration_s / STEP_S)):
         states.append(vehicle.step(STEP_S, None))
-        each(sensors.read(states[-1]))
+        on_reading(sensors.read(states[-1]))
         if until():
             break
     return FlownPath(states)
 
 
-def between(a: State, b: State, share: float) -> State:
-    """The state at ``share`` of the way from ``a`` to ``b``; a step apart, so that a straight line will do."""
+def interpolate(a: State, b: State, share: float) -> State:
+    """Interpolates the state at ``share`` between ``a`` and ``b``, which are one step apart, so that linear is
+    sufficient.
+    """
 
     def angle(from_rad: float, to_rad: float) -> float:
         return math.remainder(from_rad + share * math.remainder(to_rad - from_rad, math.tau), math.tau)

@@ -1,4 +1,4 @@
-"""What a simulated flight flies over: a ground in the local frame, and how far it reaches."""
+"""Scene of a simulated flight: a ground in the local frame, and its bounds."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +15,12 @@ from terrafix_tools.sim.world.place import EPSG, World
 
 @dataclass(frozen=True)
 class Scene:
-    frame: LocalFrame  # around the middle of the image
+    frame: LocalFrame  # origin at the centre of the image
     ground: Ground
     box: Box  # inside the image
 
     def height(self) -> HeightOf:
-        """Ground height of one point."""
+        """Returns a function for the ground height of one point."""
         ground = self.ground
 
         def height_m(e_m: float, n_m: float) -> float:
@@ -30,26 +30,26 @@ class Scene:
 
 
 def scene_of_place(place: World, season: str) -> Scene:
-    """A generated place in a season (a key of SEASONS), made where the camera looks: any size."""
+    """A generated place in a season (a key of SEASONS) of any size, rendered on demand."""
     frame = _frame(place)
     return Scene(frame, place.ground(season, frame), _box(place, frame))
 
 
-def scene_of_world(place: World, camera_look_bgr: np.ndarray) -> Scene:
-    """A generated place as the image ``camera_look_bgr`` has it, in memory."""
+def scene_of_world(place: World, camera_image_bgr: np.ndarray) -> Scene:
+    """A generated place with the image ``camera_image_bgr``, in memory."""
     frame, crs = _frame(place), CRS.from_epsg(EPSG)
-    ground = drape(camera_look_bgr, place.utm_from_px, place.dem_amsl_m, place.utm_from_dem, crs, frame)
+    ground = drape(camera_image_bgr, place.utm_from_px, place.dem_amsl_m, place.utm_from_dem, crs, frame)
     return Scene(frame, ground, _box(place, frame))
 
 
 def scene_of_image(image: Path, dem: Path | None) -> Scene:
-    """Any georeferenced image over an elevation model; flat at 0 m without one. Raises MapError."""
+    """A georeferenced image over an elevation model; flat at 0 m without one. Raises MapError."""
     with ImagerySource(image) as source:
         x_min, y_min, x_max, y_max = source.bounds
         to_wgs84 = Transformer.from_crs(source.crs, 4326, always_xy=True)
         corners = [to_wgs84.transform(x, y)[::-1] for x in (x_min, x_max) for y in (y_min, y_max)]
-        middle = to_wgs84.transform((x_min + x_max) / 2, (y_min + y_max) / 2)[::-1]
-    frame = LocalFrame(*middle)
+        centre = to_wgs84.transform((x_min + x_max) / 2, (y_min + y_max) / 2)[::-1]
+    frame = LocalFrame(*centre)
     box = _inside([frame.to_local(*corner) for corner in corners])
     return Scene(frame, open_ground(image, dem, frame), box)
 
@@ -64,6 +64,6 @@ def _box(place: World, frame: LocalFrame) -> Box:
 
 
 def _inside(corners_m: list[tuple[float, float]]) -> Box:
-    """The box inside a slightly turned rectangle, from its corners (any order)."""
+    """Returns the box inside a slightly rotated rectangle, from its corners (any order)."""
     east, north = (np.sort(np.array(axis)) for axis in zip(*corners_m, strict=True))
     return Box(float(east[1]), float(north[1]), float(east[2]), float(north[2]))

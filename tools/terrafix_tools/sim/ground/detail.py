@@ -1,4 +1,6 @@
-"""The fine texture of the ground, finer than maps show it. It never repeats: repeated ground would deceive matching."""
+"""Fine texture of the ground, finer than the resolution of maps. It is not periodic: repeated ground would produce
+false matches.
+"""
 
 import math
 
@@ -9,15 +11,16 @@ from terrafix_tools.sim.ground.tiles import TILE_PX, Pyramid
 from terrafix_tools.sim.world.noise import white
 
 DETAIL_M = 0.15  # metres a pixel
-NEUTRAL = 128  # value that changes nothing
-GRAINS_PX = ((0.8, 1.0), (1.6, 1.0), (4.0, -0.5))  # deviation of a smoothing, weight: clods and tufts, no patches
-BORDER_PX = 16  # that the widest smoothing reaches
-COARSEST_LEVEL = 3  # above it nothing of the texture is left
+NEUTRAL = 128  # value of factor 1
+# (sigma of a smoothing, weight): structure of clods and tufts without larger patches
+GRAINS_PX = ((0.8, 1.0), (1.6, 1.0), (4.0, -0.5))
+BORDER_PX = 16  # reach of the widest smoothing
+COARSEST_LEVEL = 3  # coarser levels average the texture out
 CACHE_BYTES = 48 << 20
 
 
 def detail(seed: int, contrast: float) -> Pyramid:
-    """The texture as factors of brightness, NEUTRAL = 1: tiles (TILE_PX, TILE_PX) uint8, DETAIL_M a pixel."""
+    """Returns the texture as brightness factors, NEUTRAL = 1: tiles (TILE_PX, TILE_PX) uint8, DETAIL_M a pixel."""
 
     def make(level: int, i: int, j: int) -> np.ndarray | None:
         if level > 0:
@@ -26,7 +29,8 @@ def detail(seed: int, contrast: float) -> Pyramid:
         grain = white(seed, i * TILE_PX - BORDER_PX, j * TILE_PX - BORDER_PX, size, size)
         out = np.zeros_like(grain)
         for sigma_px, weight in GRAINS_PX:
-            unit = 2.0 * math.sqrt(math.pi) * sigma_px  # smoothing divides the deviation of white noise by this
+            # smoothing divides the standard deviation of white noise by this
+            unit = 2.0 * math.sqrt(math.pi) * sigma_px
             cv2.scaleAdd(cv2.GaussianBlur(grain, (0, 0), sigma_px), weight * unit, out, out)
         inside = out[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX]
         return np.clip(NEUTRAL * (1.0 + contrast * inside) + 0.5, 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The ground of a simulated flight: a picture over an elevation model in the local frame, of any size and origin."""
+"""Ground of a simulated flight: an image over an elevation model in the local frame, of any size and origin."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,27 +14,27 @@ from rasterio.windows import Window
 
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mapping.dem import PLAUSIBLE_M
+from terrafix_tools.mapping.package.dem import PLAUSIBLE_M
 from terrafix_tools.mapping.source import ImagerySource, crs_of, open_raster
 from terrafix_tools.sim.ground.relief import Relief
 from terrafix_tools.sim.ground.tiles import TILE_PX, Make, Pyramid, blank, of_array, outside
 from terrafix_tools.sim.ground.warp import Warp, fit
 
-MOST_POSTS = 4096  # a side; a finer elevation model is thinned out to 64 MB
-DEM_MARGIN_M = 2000.0  # beyond the picture: hills there hide nothing of it but look real
+MAX_POSTS = 4096  # of a side; a finer elevation model is averaged down to 64 MB
+DEM_MARGIN_M = 2000.0  # beyond the image: hills there do not occlude it but appear in oblique views
 SEA_LEVEL = np.zeros((2, 2), np.float32)
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Everything that a camera can see. Immutable but for the tiles that it keeps."""
+    """Everything that a camera can see. Immutable except for the tile cache."""
 
     picture: Pyramid
     px_from_local: Warp  # of level 0
     relief: Relief
 
     def height_amsl_m(self, e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray:
-        """Ground height at local points (any shape), bilinear; beyond the DEM its edge goes on."""
+        """Returns the ground height at local points (any shape), bilinear; beyond the DEM its edge value."""
         return self.relief.height_amsl_m(e_m, n_m)
 
 
@@ -46,16 +46,19 @@ def drape(
     crs: CRS,
     frame: LocalFrame,
 ) -> Ground:
-    """Rasters in memory: (H, W, 3) uint8 and (h, w) in one projected CRS. Raises MapError: not near ``frame``."""
+    """Creates the ground from rasters in memory: (H, W, 3) uint8 and (h, w) in one projected CRS. Raises MapError: not
+    near ``frame``.
+    """
     relief = Relief(dem_amsl_m, fit(crs_from_dem, dem_amsl_m.shape, crs, frame))
     return Ground(Pyramid(of_array(image_bgr)), fit(crs_from_px, image_bgr.shape[:2], crs, frame), relief)
 
 
 def open_ground(image: Path, dem: Path | None, frame: LocalFrame) -> Ground:
-    """A georeferenced image (any CRS, bands and depth that GDAL reads) over an elevation model, metres AMSL.
+    """Opens a georeferenced image (any CRS, bands and depth that GDAL reads) over an elevation model, metres AMSL.
 
-    Without ``dem`` the ground is flat at 0 m. Where the image knows nothing, the ground has its mean colour. The files
-    stay open while the ground is used. Raises MapError: not readable, no georeference, not near ``frame``."""
+    Without ``dem`` the ground is flat at 0 m. Where the image has no data, the ground has its mean colour. The files
+    stay open while the ground is used. Raises MapError: not readable, no georeference, not near ``frame``.
+    """
     source = ImagerySource(image)
     warp = fit(source.transform, (source.height_px, source.width_px), source.crs, frame, str(image))
     if dem is None:
@@ -65,7 +68,7 @@ def open_ground(image: Path, dem: Path | None, frame: LocalFrame) -> Ground:
 
 
 def of_file(source: ImagerySource) -> Make:
-    """Tiles of an image file, read when they are looked at."""
+    """Returns the tiles of an image file, read on demand."""
     colour = _mean_colour(source)
 
     def make(level: int, i: int, j: int) -> np.ndarray | None:
@@ -83,7 +86,7 @@ def of_file(source: ImagerySource) -> Make:
 
 
 def _mean_colour(source: ImagerySource) -> np.ndarray:
-    """(3,) uint8 of a few windows across the image."""
+    """Mean colour (3,) uint8 of a few windows across the image."""
     sums, count = np.zeros(3), 0
     side = min(256, source.width_px, source.height_px)
     for share in (0.15, 0.5, 0.85):
@@ -95,14 +98,14 @@ def _mean_colour(source: ImagerySource) -> np.ndarray:
 
 
 def _read_relief(path: Path, source: ImagerySource, frame: LocalFrame) -> Relief:
-    """The part of an elevation file under and around the image. Raises MapError."""
+    """Reads the part of an elevation file under and around the image. Raises MapError."""
     with open_raster(path) as file:
         crs = crs_of(file, path)
-        window = _under(file, crs, source)
+        window = _dem_window(file, crs, source)
         if window is None:
             raise MapError(f"{path}: no elevation under {source.path}; give a DEM that covers it")
-        thin = max(1.0, window.width / MOST_POSTS, window.height / MOST_POSTS)
-        shape = (max(2, int(window.height / thin)), max(2, int(window.width / thin)))
+        decimation = max(1.0, window.width / MAX_POSTS, window.height / MAX_POSTS)
+        shape = (max(2, int(window.height / decimation)), max(2, int(window.width / decimation)))
         try:
             band = file.read(1, window=window, out_shape=shape, resampling=Resampling.average, masked=True)
         except RasterioError as error:
@@ -114,14 +117,14 @@ def _read_relief(path: Path, source: ImagerySource, frame: LocalFrame) -> Relief
     west, north = a.a * window.col_off + a.b * window.row_off + a.c, a.d * window.col_off + a.e * window.row_off + a.f
     corner = Affine(a.a, a.b, west, a.d, a.e, north)
     crs_from_post = _scaled(corner, window.width / shape[1], window.height / shape[0])
-    known = (amsl_m >= PLAUSIBLE_M[0]) & (amsl_m <= PLAUSIBLE_M[1])
-    if not known.any():
+    valid = (amsl_m >= PLAUSIBLE_M[0]) & (amsl_m <= PLAUSIBLE_M[1])
+    if not valid.any():
         raise MapError(f"{path}: no elevation under {source.path}; give a DEM that covers it")
-    return Relief(_filled(amsl_m, known), fit(crs_from_post, shape, crs, frame, str(path)))
+    return Relief(_fill_voids(amsl_m, valid), fit(crs_from_post, shape, crs, frame, str(path)))
 
 
-def _under(file: Any, crs: CRS, source: ImagerySource) -> Window | None:
-    """The window of an elevation file under the image and DEM_MARGIN_M around it."""
+def _dem_window(file: Any, crs: CRS, source: ImagerySource) -> Window | None:
+    """Returns the window of an elevation file under the image with DEM_MARGIN_M around it; None without overlap."""
     x_min, y_min, x_max, y_max = source.bounds
     margin = DEM_MARGIN_M * source.pixel_x / source.gsd_m
     edge = np.linspace(0.0, 1.0, 21)
@@ -137,17 +140,19 @@ def _under(file: Any, crs: CRS, source: ImagerySource) -> Window | None:
     return Window(left, top, right - left, bottom - top) if right - left >= 2 and bottom - top >= 2 else None
 
 
-def _filled(amsl_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Voids get the height of the nearest known post."""
-    if known.all():
+def _fill_voids(amsl_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Fills voids with the height of the nearest valid post."""
+    if valid.all():
         return amsl_m
-    void = (~known).astype(np.uint8)
+    void = (~valid).astype(np.uint8)
     labels = cv2.distanceTransformWithLabels(void, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
     height_of = np.zeros(int(labels.max()) + 1, np.float32)
-    height_of[labels[known]] = amsl_m[known]
-    return np.where(known, amsl_m, height_of[labels])
+    height_of[labels[valid]] = amsl_m[valid]
+    return np.where(valid, amsl_m, height_of[labels])
 
 
 def _scaled(affine: Affine, across: float, down: float) -> Affine:
-    """Of pixels that are larger by these factors. (Affine's own product is `*` in old versions and `@` in new ones.)"""
+    """Returns the affine of pixels larger by these factors. (Affine's own product is `*` in old versions and `@` in
+    new ones.)
+    """
     return Affine(affine.a * across, affine.b * down, affine.c, affine.d * across, affine.e * down, affine.f)

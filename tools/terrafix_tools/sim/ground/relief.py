@@ -1,4 +1,4 @@
-"""The shape of the ground, and where rays meet it: at the first slope that they hit, not at one behind it."""
+"""Relief of the ground, and its first intersection with rays."""
 
 import math
 
@@ -6,16 +6,16 @@ import numpy as np
 
 from terrafix_tools.sim.ground.warp import Warp
 
-VIEW_M = 12_000.0  # what is farther away is air
-STEP_POSTS = 0.5  # of a marching ray, in posts of the elevation model
-STEP_SHARE = 0.01  # ... or this share of the distance, where that is more: what is narrower there covers few pixels
-MAX_STEPS = 1500  # towards the sun
-REFINE = 4  # steps of false position after the march has found the place
-LEVEL_RAY = 1e-3  # sine below the horizon: flatter rays meet nothing in view
+VIEW_M = 12_000.0  # range of view; beyond it only air is visible
+STEP_POSTS = 0.5  # step of the ray marching, in posts of the elevation model
+STEP_SHARE = 0.01  # or this share of the distance if larger: narrower features cover few pixels there
+MAX_STEPS = 1500  # steps towards the sun
+REFINE_STEPS = 4  # false position steps after the march
+MIN_DESCENT = 1e-3  # sine below the horizon: flatter rays meet no ground within VIEW_M
 
 
 class Relief:
-    """Elevation posts (h, w) float32, metres AMSL, bilinear between them; beyond them their edge goes on."""
+    """Elevation posts (h, w) float32, metres AMSL, bilinear in between; constant beyond the edge."""
 
     def __init__(self, amsl_m: np.ndarray, px_from_local: Warp) -> None:
         self._amsl_m = np.ascontiguousarray(amsl_m, np.float32)
@@ -38,20 +38,20 @@ class Relief:
         return upper * (1.0 - v) + lower * v
 
     def slope(self, e_m: np.ndarray, n_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rise per metre to the east and to the north, over one post."""
+        """Slope to the east and to the north (m/m), over one post."""
         half = self.post_m / 2
         east = self.height_amsl_m(e_m + half, n_m) - self.height_amsl_m(e_m - half, n_m)
         north = self.height_amsl_m(e_m, n_m + half) - self.height_amsl_m(e_m, n_m - half)
         return east / self.post_m, north / self.post_m
 
-    def steepest(self, e_m: np.ndarray, n_m: np.ndarray) -> float:
-        """Steepest rise per metre between neighbouring posts in the box around local points."""
+    def max_slope(self, e_m: np.ndarray, n_m: np.ndarray) -> float:
+        """Largest slope between neighbouring posts in the bounding box of local points."""
         part = self._posts(e_m, n_m)
         rise = max(float(np.abs(np.diff(part, axis=a)).max()) if part.shape[a] > 1 else 0.0 for a in (0, 1))
         return math.sqrt(2.0) * rise / self.post_m
 
     def _posts(self, e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray:
-        """The posts in the box around local points, and the next ones outside it."""
+        """Posts in the bounding box of local points, and the next ones outside it."""
         x, y = self._warp(np.array([e_m.min(), e_m.min(), e_m.max(), e_m.max()]), np.array([n_m.min(), n_m.max()] * 2))
         rows, columns = self._amsl_m.shape
         x0, x1 = (int(v) for v in np.clip([x.min() - 1, x.max() + 2], 0, columns - 1))
@@ -59,28 +59,30 @@ class Relief:
         return self._amsl_m[y0 : max(y1, y0 + 1) + 1, x0 : max(x1, x0 + 1) + 1]
 
     def shaded(self, points_m: np.ndarray, sun_enu: np.ndarray) -> np.ndarray:
-        """Whether hills stand between points of the ground (..., 3) and the sun (unit vector): bool (...)."""
-        climb = sun_enu[2] / max(float(np.hypot(sun_enu[0], sun_enu[1])), 1e-6)  # metres up for a metre of level way
-        way_m = (self.highest_m - points_m[..., 2].min()) / climb
+        """Whether hills are between ground points (..., 3) and the sun (unit vector): bool (...)."""
+        climb = sun_enu[2] / max(float(np.hypot(sun_enu[0], sun_enu[1])), 1e-6)  # metres up per horizontal metre
+        max_m = (self.highest_m - points_m[..., 2].min()) / climb
         shaded = np.zeros(points_m.shape[:-1], bool)
-        for along_m in np.arange(1.0, min(way_m / self.post_m, MAX_STEPS) + 1.0) * self.post_m:
+        for along_m in np.arange(1.0, min(max_m / self.post_m, MAX_STEPS) + 1.0) * self.post_m:
             at = points_m + sun_enu * (along_m * climb / sun_enu[2])
             shaded |= self.height_amsl_m(at[..., 0], at[..., 1]) > at[..., 2]
         return shaded
 
-    def meet(
+    def intersect(
         self,
         from_m: np.ndarray,
         rays: np.ndarray,
         after_m: np.ndarray | float = 0.0,
         before_m: np.ndarray | float = VIEW_M,
     ) -> np.ndarray:
-        """Distance (N,) along unit rays (N, 3) from points (N, 3) above the ground to the ground; inf: none in view.
+        """Distance (N,) along unit rays (N, 3) from points (N, 3) above the ground to the ground; inf: none within the
+        limits.
 
-        ``after_m``, ``before_m`` (N,): where on the rays to look.
-        Rays march from the height of the highest post under them on in steps of half a post, then close in."""
+        ``after_m``, ``before_m`` (N,): limits along the rays. The rays march in steps of half a post, from the height
+        of the highest post below them, and the hit is refined by false position.
+        """
         out = np.full(len(rays), math.inf)
-        which = np.flatnonzero(rays[:, 2] < -LEVEL_RAY)
+        which = np.flatnonzero(rays[:, 2] < -MIN_DESCENT)
         start, ray = from_m[which], rays[which]
         if not len(which):
             return out
@@ -96,12 +98,16 @@ class Relief:
             beyond = np.minimum(near + np.maximum(step_m, STEP_SHARE * near), far)
             above_beyond = self._above(start, ray, beyond)
             hit = above_beyond <= 0.0
-            out[which[hit]] = self._close_in(
-                start[hit], ray[hit], near[hit], beyond[hit], above[hit], above_beyond[hit]
+            out[which[hit]] = self._refine(start[hit], ray[hit], near[hit], beyond[hit], above[hit], above_beyond[hit])
+            continuing = ~hit & (beyond < far)
+            which, start, ray, far, step_m = (
+                which[continuing],
+                start[continuing],
+                ray[continuing],
+                far[continuing],
+                step_m[continuing],
             )
-            go = ~hit & (beyond < far)
-            which, start, ray, far, step_m = which[go], start[go], ray[go], far[go], step_m[go]
-            near, above = beyond[go], above_beyond[go]
+            near, above = beyond[continuing], above_beyond[continuing]
         return out
 
     def _above(self, start: np.ndarray, ray: np.ndarray, at_m: np.ndarray) -> np.ndarray:
@@ -109,7 +115,7 @@ class Relief:
         points = start + ray * at_m[:, None]
         return points[:, 2] - self.height_amsl_m(points[:, 0], points[:, 1])
 
-    def _close_in(
+    def _refine(
         self,
         start: np.ndarray,
         ray: np.ndarray,
@@ -118,8 +124,8 @@ class Relief:
         above_near: np.ndarray,
         above_far: np.ndarray,
     ) -> np.ndarray:
-        """False position: the ground between two points half a post apart is nearly a plane."""
-        for _ in range(REFINE):
+        """False position: the ground between two points half a post apart is nearly planar."""
+        for _ in range(REFINE_STEPS):
             share = above_near / np.maximum(above_near - above_far, 1e-9)
             at = near + (far - near) * np.clip(share, 0.0, 1.0)
             above = self._above(start, ray, at)

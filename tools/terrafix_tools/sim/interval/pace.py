@@ -1,4 +1,4 @@
-"""How steadily GPS_INPUT left, and how old the picture behind it was: from a flight record."""
+"""Interval of GPS_INPUT, and age of the image behind it, from a flight record."""
 
 from collections.abc import Iterable
 from itertools import pairwise
@@ -10,14 +10,14 @@ from terrafix.messages import GpsInput, Message, ProcessEvent
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.sim.autopilot.report import quantile
 
-MEDIAN_MS, P99_MS, GAP_MS = 100.0, 120.0, 245.0  # AC-14; the autopilot calls a GPS unhealthy after two longer gaps
+MEDIAN_MS, P99_MS, GAP_MS = 100.0, 120.0, 245.0  # AC-14; the autopilot reports a GPS as unhealthy after two longer gaps
 MEDIAN_WITHIN_MS = 2.0
-ROUNDING_NS = 1_000_000  # of the age: pictures are further apart
-TROUBLE = ("died", "stuck", "gave_up", "restarted")
+ROUNDING_NS = 1_000_000  # of the age: images are further apart
+UNPLANNED_EVENTS = ("died", "stuck", "gave_up", "restarted")
 
 
-class Pace(msgspec.Struct, frozen=True, kw_only=True):
-    """Times in milliseconds; None where there was nothing to measure."""
+class IntervalStats(msgspec.Struct, frozen=True, kw_only=True):
+    """Times in milliseconds; None without data."""
 
     gps_inputs: int
     duration_s: float
@@ -26,14 +26,14 @@ class Pace(msgspec.Struct, frozen=True, kw_only=True):
     longest_gap_ms: float | None
     over_p99_floor: int  # intervals above 120 ms
     over_gap_floor: int  # ... above 245 ms
-    first_age_median_ms: float | None  # from a picture to the first GPS_INPUT that it had a part in
+    first_age_median_ms: float | None  # from an image to the first GPS_INPUT that it contributed to
     first_age_p95_ms: float | None
-    age_p95_ms: float | None  # of the picture behind every GPS_INPUT; it grows until the next picture
+    age_p95_ms: float | None  # of the image behind every GPS_INPUT; it grows until the next image
     fix3_share: float
-    trouble: list[str]  # processes that died, stood still or were started again
+    trouble: list[str]  # processes that died, hung or were restarted
 
     @property
-    def holds(self) -> bool:
+    def meets_ac14(self) -> bool:
         """AC-14."""
         median, p99, gap = self.interval_median_ms, self.interval_p99_ms, self.longest_gap_ms
         if median is None or p99 is None or gap is None:
@@ -41,12 +41,12 @@ class Pace(msgspec.Struct, frozen=True, kw_only=True):
         return abs(median - MEDIAN_MS) <= MEDIAN_WITHIN_MS and p99 <= P99_MS and gap <= GAP_MS
 
 
-def pace_of(record: Path) -> Pace:
-    """Raises SourceError: no record there."""
+def read_stats(record: Path) -> IntervalStats:
+    """Measures a record. Raises SourceError when there is none."""
     return measure(message for _, _, message in read_flight(record))
 
 
-def measure(messages: Iterable[Message]) -> Pace:
+def measure(messages: Iterable[Message]) -> IntervalStats:
     times_ns: list[int] = []
     ages_ms: list[float] = []
     first_ages_ms: list[float] = []
@@ -65,12 +65,12 @@ def measure(messages: Iterable[Message]) -> Pace:
                 if newest_image_ns is None or image_ns - newest_image_ns > ROUNDING_NS:
                     first_ages_ms.append(message.estimate_age_ms)
                     newest_image_ns = image_ns
-            case ProcessEvent() if message.event in TROUBLE:
+            case ProcessEvent() if message.event in UNPLANNED_EVENTS:
                 trouble.append(f"{message.process} {message.event}")
             case _:
                 pass
     gaps_ms = [(b - a) * 1e-6 for a, b in pairwise(times_ns)]
-    return Pace(
+    return IntervalStats(
         gps_inputs=len(times_ns),
         duration_s=(times_ns[-1] - times_ns[0]) * 1e-9 if times_ns else 0.0,
         interval_median_ms=quantile(gaps_ms, 0.5),

@@ -1,7 +1,8 @@
-"""The interval of GPS_INPUT under full load: ``python -m terrafix_tools.sim.interval.run --minutes 30 --burners 4``.
+"""Interval of GPS_INPUT under full load: ``python -m terrafix_tools.sim.interval.run --minutes 30 --burners 4``.
 
-The real processes fly a generated flight at its own pace, beside programs that take every processor they can get. The
-flight is drawn once and kept in the folder."""
+The real processes fly a generated flight in real time, next to programs that use all processors. The flight is
+rendered once and kept in the folder.
+"""
 
 import json
 import os
@@ -20,50 +21,55 @@ from rich.console import Console
 from terrafix.core.errors import UsageError
 from terrafix_tools.sim.demo.flight import fly
 from terrafix_tools.sim.flights.folder import plan_flight, write_flight
-from terrafix_tools.sim.interval.pace import Pace, pace_of
-from terrafix_tools.sim.out_folder import make_room, write_json
+from terrafix_tools.sim.interval.pace import IntervalStats, read_stats
+from terrafix_tools.sim.out_folder import prepare_folder, write_json
 from terrafix_tools.sim.world import place as world
 from terrafix_tools.sim.world.mapped import CAMERA_SEASON, write_map
 from terrafix_tools.standalone import run_standalone
 
-MARK, RESULT = "interval.json", "pace.json"
-LONGEST_MIN = 60.0
+MARKER_FILE, RESULT = "interval.json", "pace.json"
+MAX_MINUTES = 60.0
 BURN = "while True: pass"
 
 
 def interval(
-    minutes: Annotated[float, typer.Option(help="Of flight.")] = 30.0,
-    burners: Annotated[int, typer.Option(help="Programs that do nothing but compute; by default two a core.")] = -1,
-    burner_nice: Annotated[int, typer.Option(help="How much less priority than ours they have.")] = 0,
+    minutes: Annotated[float, typer.Option(help="Duration of the flight.")] = 30.0,
+    burners: Annotated[int, typer.Option(help="Number of CPU load programs; default: two per core.")] = -1,
+    burner_nice: Annotated[int, typer.Option(help="Nice value of the load programs.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder for flight, record and result.")] = Path("out/interval"),
     seed: Annotated[int, typer.Option(help="Seed of the world and of the noise.")] = 1,
 ) -> None:
-    """Exit code 1: AC-14 does not hold, or a process died."""
-    if not 0.2 <= minutes <= LONGEST_MIN:
-        raise UsageError(f"--minutes {minutes:g}: choose 0.2 to {LONGEST_MIN:g}")
-    burning = 2 * (os.cpu_count() or 1) if burners < 0 else burners
+    """Measure the interval of GPS_INPUT. Exit code 1: AC-14 is not met, or a process died."""
+    if not 0.2 <= minutes <= MAX_MINUTES:
+        raise UsageError(f"--minutes {minutes:g}: choose 0.2 to {MAX_MINUTES:g}")
+    burner_count = 2 * (os.cpu_count() or 1) if burners < 0 else burners
     console = Console()
     about = {"minutes": minutes, "seed": seed}
-    drawn = out / MARK
-    fresh = not (out / "flight" / "flight.toml").is_file() or json.loads(drawn.read_text(encoding="utf-8")) != about
-    if fresh:
-        make_room(out, MARK, about)
-    with console.status("the place"):
+    marker = out / MARKER_FILE
+    generate = not (out / "flight" / "flight.toml").is_file() or json.loads(marker.read_text(encoding="utf-8")) != about
+    if generate:
+        prepare_folder(out, MARKER_FILE, about)
+    with console.status("generating the place"):
         place = world.generate(seed)
-        flight = plan_flight(place, place.look(CAMERA_SEASON), 60.0 * minutes)
-    if fresh:
-        with console.status("its map, and the pictures"):
+        flight = plan_flight(place, place.render(CAMERA_SEASON), 60.0 * minutes)
+    if generate:
+        with console.status("writing the map and the images"):
             write_map(place, out / "map.gpkg")
             write_flight(out / "flight", flight, "../map.gpkg", seed=seed, telemetry=False)
     for old in out.glob("flight-*.mcap"):
         old.unlink()
-    with _burning(burning, burner_nice):
+    with _burning(burner_count, burner_nice):
         exit_code, peer = fly(flight, out / "flight", out / "map.gpkg", out, seed=seed, console=console)
-    pace = pace_of(out)
-    load = {"cores": os.cpu_count(), "burners": burning, "burner_nice": burner_nice, "load_average": os.getloadavg()}
+    pace = read_stats(out)
+    load = {
+        "cores": os.cpu_count(),
+        "burners": burner_count,
+        "burner_nice": burner_nice,
+        "load_average": os.getloadavg(),
+    }
     write_json(out / RESULT, load | {"record": msgspec.to_builtins(pace), "autopilot": asdict(peer)})
     console.print(
-        f"{os.cpu_count()} cores, {burning} burners (nice {burner_nice}), load {os.getloadavg()[0]:.1f}",
+        f"{os.cpu_count()} cores, {burner_count} burners (nice {burner_nice}), load {os.getloadavg()[0]:.1f}",
         highlight=False,
     )
     for line in _lines(pace):
@@ -71,12 +77,12 @@ def interval(
     for name, value in (("median", peer.interval_median_ms), ("p99", peer.interval_p99_ms)):
         console.print(f"at the autopilot: {name} {_ms(value)}", highlight=False)
     console.print(f"at the autopilot: longest {_ms(peer.longest_gap_ms)}", highlight=False)
-    raise typer.Exit(exit_code or (0 if pace.holds and not pace.trouble else 1))
+    raise typer.Exit(exit_code or (0 if pace.meets_ac14 and not pace.trouble else 1))
 
 
 @contextmanager
 def _burning(number: int, nice: int) -> Iterator[None]:
-    """``nice`` 0: with the priority of this program, so that they compete as equals."""
+    """Runs CPU load programs; ``nice`` 0: at the priority of this program."""
     command = ["nice", "-n", str(nice), sys.executable, "-c", BURN]
     programs = [subprocess.Popen(command) for _ in range(number)]
     try:
@@ -87,18 +93,18 @@ def _burning(number: int, nice: int) -> Iterator[None]:
             program.wait()
 
 
-def _lines(pace: Pace) -> Iterator[str]:
+def _lines(pace: IntervalStats) -> Iterator[str]:
     yield f"GPS_INPUT       {pace.gps_inputs} in {pace.duration_s:.0f} s, 3D fix in {pace.fix3_share:.1%}"
     yield f"interval        median {_ms(pace.interval_median_ms)}, p99 {_ms(pace.interval_p99_ms)}"
     over = f"over 120 ms: {pace.over_p99_floor}, over 245 ms: {pace.over_gap_floor}"
     yield f"longest gap     {_ms(pace.longest_gap_ms)}; {over}"
-    yield f"picture to first GPS_INPUT   median {_ms(pace.first_age_median_ms)}, p95 {_ms(pace.first_age_p95_ms)}"
-    yield f"picture behind a GPS_INPUT   p95 {_ms(pace.age_p95_ms)} old"
-    yield f"processes       {', '.join(pace.trouble) or 'none died or stood still'}"
+    yield f"image to first GPS_INPUT   median {_ms(pace.first_age_median_ms)}, p95 {_ms(pace.first_age_p95_ms)}"
+    yield f"age of the image behind GPS_INPUT   p95 {_ms(pace.age_p95_ms)}"
+    yield f"processes       {', '.join(pace.trouble) or 'none died or hung'}"
 
 
 def _ms(value: float | None) -> str:
-    return "nothing" if value is None else f"{value:.1f} ms"
+    return "no data" if value is None else f"{value:.1f} ms"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""What the map's error, learnt from a receiver before that is jammed, is worth: the same flights with and without.
+"""Benefit of a map offset estimated from a receiver before it is jammed: the same flights with and without.
 
-python -m terrafix_tools.sim.judge.offset --flights 100"""
+python -m terrafix_tools.sim.judge.offset --flights 100
+"""
 
 import argparse
 import json
@@ -13,34 +14,37 @@ import numpy as np
 from terrafix_tools.sim.judge.flight import Vision, fly
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Outage
 
-LEARNT_S = (180.0, 300.0, 600.0)  # from take-off to the jamming
+GNSS_PERIODS_S = (180.0, 300.0, 600.0)  # from take-off to the jamming
 AFTER_S = 300.0
 INSIDE_95 = 5.991  # chi-square, 2 degrees of freedom
 
 
-def measured(
-    flights: int, before_s: float, steady_share: float | None, drag_mps: float, seed: int
+def compare_offsets(
+    flights: int, before_s: float, constant_share: float | None, drag_mps: float, seed: int
 ) -> dict[str, dict[str, float]]:
-    """``steady_share``: of the estimate's variance, the map's own; None: 0 to 0.8. ``drag_mps``: a spoofer leads
-    the receiver away from the first minute on, until the jamming; 0: nobody does."""
+    """Simulates ``flights`` flights and returns the errors after the jamming, with and without the offset estimate.
+    ``constant_share``: share of the map's constant error in the estimate's variance; None: random, 0 to 0.8.
+    ``drag_mps``: speed at which a spoofer drags the receiver away from the first minute until the jamming; 0: no
+    spoofer.
+    """
     sent: dict[bool, list[np.ndarray]] = {False: [], True: []}
     for number in range(flights):
-        draw = random.Random(f"{seed} {number} offset")
+        rng = random.Random(f"{seed} {number} offset")
         vision = Vision(
-            sigma_m=draw.uniform(2.0, 6.0),
-            steady_share=draw.uniform(0.0, 0.8) if steady_share is None else steady_share,
-            wander_s=draw.choice((5.0, 20.0, 60.0, 150.0)),
-            velocity_sigma_mps=draw.uniform(0.3, 0.9),
+            sigma_m=rng.uniform(2.0, 6.0),
+            constant_share=rng.uniform(0.0, 0.8) if constant_share is None else constant_share,
+            wander_s=rng.choice((5.0, 20.0, 60.0, 150.0)),
+            velocity_sigma_mps=rng.uniform(0.3, 0.9),
         )
-        angle = draw.uniform(0.0, math.tau)
+        angle = rng.uniform(0.0, math.tau)
         events: list[AnyEvent] = [Outage(start_s=before_s, end_s=math.inf)]
         if drag_mps > 0.0:
             east, north = drag_mps * math.cos(angle), drag_mps * math.sin(angle)
             events.append(Drag(start_s=60.0, end_s=before_s, east_mps=east, north_mps=north))
-        for learns, errors in sent.items():
-            told = fly(before_s + AFTER_S, vision, tuple(events), seed * 100_000 + number, map_offset=learns)
-            errors.append(np.array([row for row in told.sent if row[0] >= before_s]))
-    return {"learnt" if learns else "not learnt": _summary(errors) for learns, errors in sent.items()}
+        for with_offset, errors in sent.items():
+            result = fly(before_s + AFTER_S, vision, tuple(events), seed * 100_000 + number, map_offset=with_offset)
+            errors.append(np.array([row for row in result.sent if row[0] >= before_s]))
+    return {"learnt" if with_offset else "not learnt": _summary(errors) for with_offset, errors in sent.items()}
 
 
 def _summary(flights: list[np.ndarray]) -> dict[str, float]:
@@ -64,8 +68,11 @@ def main() -> int:
     parser.add_argument("--drag", type=float, default=0.0, help="a spoofer's speed, m/s")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    for before_s in LEARNT_S:
-        row = {"seconds with GNSS": before_s, **measured(args.flights, before_s, args.steady, args.drag, args.seed)}
+    for before_s in GNSS_PERIODS_S:
+        row = {
+            "seconds with GNSS": before_s,
+            **compare_offsets(args.flights, before_s, args.steady, args.drag, args.seed),
+        }
         sys.stdout.write(json.dumps(row) + "\n")
         sys.stdout.flush()
     return 0

@@ -1,4 +1,4 @@
-"""What happens to GNSS in a flight: outage, jamming, spoofing; from a TOML file or from code."""
+"""GNSS events of a flight: outage, jamming, spoofing; defined in a TOML file or in code."""
 
 import math
 import tomllib
@@ -14,7 +14,7 @@ NotNegative = Annotated[float, Meta(ge=0.0)]
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
-    """From ``start_s`` to ``end_s`` (absent: to the end of the flight)."""
+    """An event from ``start_s`` to ``end_s`` (absent: to the end of the flight)."""
 
     start_s: NotNegative
     end_s: NotNegative | None = None
@@ -24,24 +24,24 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_
 
 
 class Outage(Event, frozen=True, kw_only=True, tag="outage"):
-    """No signal at once, as under a roof."""
+    """Immediate loss of all signals, as under a roof."""
 
 
 class Jam(Event, frozen=True, kw_only=True, tag="jam"):
-    """The carrier-to-noise ratio falls: accuracies grow, satellites drop, after ``fade_s`` there is no fix."""
+    """The carrier-to-noise ratio falls: accuracies grow, satellites are lost, and after ``fade_s`` there is no fix."""
 
     fade_s: NotNegative = 8.0
 
 
 class Jump(Event, frozen=True, kw_only=True, tag="jump"):
-    """Spoofed: from one fix to the next the position is somewhere else."""
+    """Spoofing with a step: the position jumps from one fix to the next."""
 
     east_m: float = 300.0
     north_m: float = 0.0
 
 
 class Drag(Event, frozen=True, kw_only=True, tag="drag"):
-    """Spoofed with care: the position is right at first and walks off; the velocity agrees with it."""
+    """Spoofing with a ramp: the position starts correct and drifts away, with a consistent velocity."""
 
     east_mps: float = 2.0
     north_mps: float = 0.0
@@ -55,7 +55,9 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_events(path: Path) -> tuple[AnyEvent, ...]:
-    """A TOML file with ``[[gnss]]`` tables, each with a ``kind`` and the fields of that event. Raises SourceError."""
+    """Reads a TOML file with ``[[gnss]]`` tables, each with a ``kind`` and the fields of that event. Raises
+    SourceError.
+    """
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
         read = msgspec.convert(table, _File)
@@ -68,7 +70,7 @@ def read_events(path: Path) -> tuple[AnyEvent, ...]:
     for number, event in enumerate(read.gnss, start=1):
         values = [value for value in msgspec.structs.astuple(event) if value is not None]
         if not all(math.isfinite(value) for value in values):
-            raise SourceError(f"{path}: [[gnss]] number {number} holds nan or inf; write numbers")
+            raise SourceError(f"{path}: [[gnss]] number {number} contains nan or inf; write numbers")
         if event.end_s is not None and event.end_s <= event.start_s:
             raise SourceError(
                 f"{path}: [[gnss]] number {number} ends at {event.end_s:g} s, before it starts ({event.start_s:g} s)"

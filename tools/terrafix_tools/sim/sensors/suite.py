@@ -1,6 +1,7 @@
-"""The sensors of a vehicle: what its autopilot reads and computes of attitude and height, with seeded errors.
+"""The sensor suite of a vehicle, with the attitude and height of its autopilot, and seeded errors.
 
-Errors are drawn once (biases, scales) or walk with the flight; reading the same flight again gives the same."""
+Errors are drawn once (biases, scales) or are random walks; reading the same flight again gives the same values.
+"""
 
 import math
 from collections.abc import Sequence
@@ -14,8 +15,8 @@ from terrafix_tools.sim.sensors.gnss import Gnss
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent
 from terrafix_tools.sim.vehicle.motion import GRAVITY_MPS2
 
-BLOCK = 512  # moments for which numbers are drawn at once
-FLYING_M = 0.5  # above this height the motor runs
+BLOCK = 512  # number of samples for which random numbers are drawn at once
+AIRBORNE_M = 0.5  # height above which the motors run
 GYRO, ACCEL, GYRO_WALK, ACCEL_WALK, ATTITUDE, YAW, BARO, BARO_WALK, AIR, RANGE = (
     slice(0, 3),
     slice(3, 6),
@@ -32,7 +33,9 @@ DRAWS = 19
 
 
 class VehicleSensors:
-    """``read`` once for every state, in order of time. ``airspeed``, ``rangefinder``: whether it has them."""
+    """Call ``read`` once for every state, in order of time. ``airspeed``, ``rangefinder``: whether the vehicle has
+    them.
+    """
 
     def __init__(
         self,
@@ -55,12 +58,12 @@ class VehicleSensors:
         self._level = (rng.normal(0.0, 1.0, 2) * errors.attitude_level_rad).tolist()
         drawn = float(rng.normal(0.0, 1.0)) * errors.yaw_sigma_rad
         self._yaw_bias_rad = drawn if errors.yaw_constant_rad is None else errors.yaw_constant_rad
-        self._iron = rng.uniform(0.0, 2.0 * math.pi, 2).tolist()
+        self._magnetic_phases = rng.uniform(0.0, 2.0 * math.pi, 2).tolist()
         self._baro_bias_m = float(rng.normal(0.0, 1.0)) * errors.baro_bias_m
         self._baro_scale = 1.0 + float(rng.normal(0.0, 1.0)) * errors.baro_scale
         self._air_scale = 1.0 + float(rng.normal(0.0, 1.0)) * errors.airspeed_scale
-        self._slow = (rng.normal(0.0, 1.0, 2) * errors.attitude_slow_rad).tolist()
-        self._yaw_slow = float(rng.normal(0.0, 1.0)) * errors.yaw_slow_rad
+        self._attitude_drift = (rng.normal(0.0, 1.0, 2) * errors.attitude_slow_rad).tolist()
+        self._yaw_drift = float(rng.normal(0.0, 1.0)) * errors.yaw_slow_rad
         self._baro_static = float(rng.normal(0.0, 1.0)) * errors.baro_static
         self._last_s: float | None = None
         self._start_m = 0.0
@@ -76,7 +79,7 @@ class VehicleSensors:
         root = math.sqrt(dt_s)
         self._gyro_bias = self._gyro_bias + draws[GYRO_WALK] * (e.gyro_walk * root)
         self._accel_bias = self._accel_bias + draws[ACCEL_WALK] * (e.accel_walk * root)
-        flying = state.agl_m > FLYING_M
+        flying = state.agl_m > AIRBORNE_M
         gyro_sigma = math.hypot(e.gyro_noise / root, e.vibration_radps * flying)
         accel_sigma = math.hypot(e.accel_noise / root, e.vibration_mps2 * flying)
         pitch_error, roll_error = self._attitude_errors(dt_s, draws[ATTITUDE])
@@ -94,34 +97,39 @@ class VehicleSensors:
         )
 
     def _next_draws(self) -> np.ndarray:
-        """(DRAWS,) of the unit normal distribution."""
+        """Next standard normal numbers (DRAWS,)."""
         if self._at >= len(self._draws):
             self._draws, self._at = self._noise.normal(size=(BLOCK, DRAWS)), 0
         self._at += 1
         return self._draws[self._at - 1]
 
     def _attitude_errors(self, dt_s: float, draws: np.ndarray) -> tuple[float, float]:
-        """Pitch, roll."""
-        keep = math.exp(-dt_s / self._errors.attitude_slow_s) if self._errors.attitude_slow_s else 0.0
-        kick = self._errors.attitude_slow_rad * math.sqrt(1.0 - keep * keep)
-        self._slow = [keep * self._slow[0] + kick * float(draws[0]), keep * self._slow[1] + kick * float(draws[1])]
-        return self._level[0] + self._slow[0], self._level[1] + self._slow[1]
+        """Returns pitch and roll error, rad."""
+        decay = math.exp(-dt_s / self._errors.attitude_slow_s) if self._errors.attitude_slow_s else 0.0
+        driving_sigma = self._errors.attitude_slow_rad * math.sqrt(1.0 - decay * decay)
+        self._attitude_drift = [
+            decay * self._attitude_drift[0] + driving_sigma * float(draws[0]),
+            decay * self._attitude_drift[1] + driving_sigma * float(draws[1]),
+        ]
+        return self._level[0] + self._attitude_drift[0], self._level[1] + self._attitude_drift[1]
 
     def _yaw_error(self, yaw_rad: float, dt_s: float, draw: float) -> float:
         e = self._errors
-        keep = math.exp(-dt_s / e.yaw_slow_s) if e.yaw_slow_s else 0.0
-        self._yaw_slow = keep * self._yaw_slow + e.yaw_slow_rad * math.sqrt(1.0 - keep * keep) * draw
-        iron = math.sin(yaw_rad + self._iron[0]) + 0.5 * math.sin(2.0 * yaw_rad + self._iron[1])
-        return self._yaw_bias_rad + e.yaw_by_heading_rad * iron + self._yaw_slow
+        decay = math.exp(-dt_s / e.yaw_slow_s) if e.yaw_slow_s else 0.0
+        self._yaw_drift = decay * self._yaw_drift + e.yaw_slow_rad * math.sqrt(1.0 - decay * decay) * draw
+        deviation = math.sin(yaw_rad + self._magnetic_phases[0]) + 0.5 * math.sin(
+            2.0 * yaw_rad + self._magnetic_phases[1]
+        )
+        return self._yaw_bias_rad + e.yaw_by_heading_rad * deviation + self._yaw_drift
 
     def _baro(self, state: State, draw: float, walk: float) -> float:
         self._baro_bias_m += self._errors.baro_walk * walk
         climbed_m = float(state.p_b_in_w_m[2]) - self._start_m
-        over_ground_mps = float(np.linalg.norm(state.velocity_enu_mps))  # stands in for an airspeed that is not known
+        over_ground_mps = float(np.linalg.norm(state.velocity_enu_mps))  # replaces an unknown airspeed
         wind_mps = over_ground_mps if math.isnan(state.airspeed_mps) else state.airspeed_mps
-        by_wind_m = self._baro_static * wind_mps**2 / (2.0 * GRAVITY_MPS2)
-        off_m = self._baro_bias_m + by_wind_m + self._errors.baro_noise_m * draw
-        return self._start_m + self._baro_scale * climbed_m + off_m
+        dynamic_m = self._baro_static * wind_mps**2 / (2.0 * GRAVITY_MPS2)
+        error_m = self._baro_bias_m + dynamic_m + self._errors.baro_noise_m * draw
+        return self._start_m + self._baro_scale * climbed_m + error_m
 
     def _airspeed(self, state: State, draw: float) -> float | None:
         if not self._has_airspeed:
@@ -129,7 +137,7 @@ class VehicleSensors:
         return max(0.0, state.airspeed_mps * self._air_scale + self._errors.airspeed_noise_mps * draw)
 
     def _range(self, state: State, draw: float) -> float | None:
-        """Along the body's down axis over level ground."""
+        """Distance along the body's down axis over level ground."""
         if not self._has_range:
             return None
         near_m, far_m = self._errors.range_limits_m

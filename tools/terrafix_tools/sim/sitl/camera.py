@@ -1,4 +1,4 @@
-"""The camera of a vehicle on ArduPilot's firmware: pictures of the generated world at the simulator's true pose."""
+"""Camera of a vehicle in ArduPilot SITL: renders the generated world at the simulator's true pose."""
 
 import threading
 import time
@@ -15,13 +15,14 @@ from terrafix_tools.sim.flights.folder import CAMERA, FRAME_HZ
 from terrafix_tools.sim.ground.ground import Ground
 from terrafix_tools.sim.sitl.observer import Truth
 
-DEVELOP_NS = 60_000_000  # the pose of a moment is known when the states around it have arrived; they come at 40 Hz,
-AGAIN_S = 0.01  # or later, from a firmware that has to wait for its processor
-LENS_M = 0.3  # above the ground when the vehicle stands: the simulator's flat ground is not the world's
+# Rendering delay: a pose can be interpolated when the states around it have arrived; they come at 40 Hz,
+RENDER_DELAY_NS = 60_000_000
+RETRY_S = 0.01  # or later, when the firmware has to wait for its processor
+MIN_CAMERA_HEIGHT_M = 0.3  # least camera height above ground: the simulator's flat ground differs from the world's
 
 
 class SimulatedCamera:
-    """Pushes pictures into ``stream`` at FRAME_HZ, exposed at the moment that their stamp says. A context manager."""
+    """A context manager that pushes images into ``stream`` at FRAME_HZ, exposed at the time of their stamp."""
 
     def __init__(
         self,
@@ -39,11 +40,11 @@ class SimulatedCamera:
         self.frames = 0
 
     def pose(self, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
-        """-> p_c_in_w_m (3,), R_w_c (3, 3)"""
+        """Returns p_c_in_w_m (3,) and R_w_c (3, 3)."""
         e_m, n_m = self._frame.to_local(truth.lat_deg, truth.lon_deg)
         ground_m = float(self._ground.height_amsl_m(np.array([[e_m]]), np.array([[n_m]]))[0, 0])
         r_w_b = rot_w_b(truth.yaw_rad, truth.pitch_rad, truth.roll_rad)
-        return np.array([e_m, n_m, max(truth.amsl_m, ground_m + LENS_M)]), r_w_b @ self._r_b_c
+        return np.array([e_m, n_m, max(truth.amsl_m, ground_m + MIN_CAMERA_HEIGHT_M)]), r_w_b @ self._r_b_c
 
     def __enter__(self) -> "SimulatedCamera":
         self._thread.start()
@@ -57,9 +58,9 @@ class SimulatedCamera:
         cv2.setNumThreads(1)  # the daemon's processes need the cores
         period_ns = round(1e9 / FRAME_HZ)
         due_ns = time.monotonic_ns()
-        while not self._stopping.wait(max(0, due_ns + DEVELOP_NS - time.monotonic_ns()) / 1e9):
+        while not self._stopping.wait(max(0, due_ns + RENDER_DELAY_NS - time.monotonic_ns()) / 1e9):
             truth = self._truth_at(due_ns)
-            while truth is None and time.monotonic_ns() < due_ns + period_ns and not self._stopping.wait(AGAIN_S):
+            while truth is None and time.monotonic_ns() < due_ns + period_ns and not self._stopping.wait(RETRY_S):
                 truth = self._truth_at(due_ns)
             if truth is not None:
                 self._stream.push(self._renderer.frame(*self.pose(truth), self.frames), due_ns)

@@ -1,7 +1,8 @@
-"""ArduPilot's own firmware, built for software-in-the-loop: found, checked, started in a folder of its own, ended.
+"""ArduPilot SITL (software in the loop): finds and checks the binary, starts it in its own folder, and stops it.
 
-It speaks MAVLink over three of its serial ports, each a UDP connection to a port of this machine that somebody of ours
-listens on. Options: `arduplane --help`, and "Using SITL" in ArduPilot's developer documentation."""
+The firmware speaks MAVLink on three serial ports, each a UDP connection to a port of this machine on which a part of
+the harness listens. Options: `arduplane --help`, and "Using SITL" in ArduPilot's developer documentation.
+"""
 
 import contextlib
 import os
@@ -16,12 +17,12 @@ from terrafix_tools.sim.autopilot.parameters import Kind
 
 BINARY_VARIABLE = "TERRAFIX_ARDUPILOT_SITL"
 HELP = "docs/sitl.md says how to get one"
-STOP_S = 5.0  # it ends within a tick of its own clock; a process that hangs is killed
+STOP_S = 5.0  # it stops within a tick of its clock; a process that hangs is killed
 CONSOLE = "firmware.log"
-TAIL_CHARS = 160  # of the console's last line, in a message
+TAIL_CHARS = 160  # of the last console line, in an error message
 
 
-MODELS = {Kind.PLANE: "plane", Kind.COPTER: "quad"}  # flight models that the firmware brings with it
+MODELS = {Kind.PLANE: "plane", Kind.COPTER: "quad"}  # flight models built into the firmware
 
 
 @dataclass(frozen=True)
@@ -29,14 +30,14 @@ class Ports:
     """UDP ports on 127.0.0.1."""
 
     ground: int  # SERIAL0: the ground station
-    companion: int  # SERIAL1: Terrafix
-    observer: int  # SERIAL2: who takes notes
+    companion: int  # SERIAL2: the observer, which records the flight
+    observer: int  # RC input port of the firmware; the fixed default would allow only one flight at a time
     rc_in: int  # the firmware listens here for a radio; its fixed default would let one flight at a time
 
 
 @dataclass(frozen=True)
 class Home:
-    """Where the vehicle stands at the start."""
+    """Position and heading of the vehicle at the start."""
 
     lat_deg: float
     lon_deg: float
@@ -45,7 +46,9 @@ class Home:
 
 
 def find_binary(given: Path | None) -> Path:
-    """``given``, else what the environment variable names. Raises UsageError: none, not there, cannot be run."""
+    """Returns ``given``, else the path in the environment variable. Raises UsageError: none set, not found, not
+    executable.
+    """
     named = given or (Path(os.environ[BINARY_VARIABLE]) if os.environ.get(BINARY_VARIABLE) else None)
     if named is None:
         raise UsageError(f"no ArduPilot binary: give --binary, or set {BINARY_VARIABLE}; {HELP}")
@@ -58,17 +61,18 @@ def find_binary(given: Path | None) -> Path:
 
 
 def kind_of(binary: Path, given: Kind | None) -> Kind:
-    """``given``, else by the file's name. Raises UsageError: the name does not say it."""
+    """Returns ``given``, else the kind in the file name. Raises UsageError when the name is not conclusive."""
     named = [kind for kind in Kind if kind in binary.name.lower()]
     if given is None and len(named) != 1:
-        raise UsageError(f"{binary}: the name does not say plane or copter; give --vehicle")
+        raise UsageError(f"{binary}: the name contains neither plane nor copter; give --vehicle")
     return given or named[0]
 
 
 def take_ports(first: int = 0) -> Ports:
-    """``first`` and the three after it, or with 0 free ones. Raises UsageError: taken.
+    """Returns ``first`` and the three ports after it, or with 0 four free ones. Raises UsageError when one is taken.
 
-    They are free at this moment; whoever listens on them opens them right after."""
+    The ports are free at the time of the call; the caller must open them right after.
+    """
     numbers = [0] * 4 if first == 0 else [first + i for i in range(4)]
     taken = []
     with contextlib.ExitStack() as stack:
@@ -88,7 +92,9 @@ class Firmware:
     def __init__(
         self, binary: Path, kind: Kind, folder: Path, home: Home, ports: Ports, parameters: list[Path]
     ) -> None:
-        """``parameters``: files in this order, the later wins. Raises UsageError: no program; OutputError: folder."""
+        """``parameters``: files in load order, later ones override. Raises UsageError: not executable; OutputError:
+        folder.
+        """
         self._console = folder / CONSOLE
         command = [str(binary), "--model", MODELS[kind], "--speedup", "1", "--rc-in-port", str(ports.rc_in)]
         command += ["--home", f"{home.lat_deg:.8f},{home.lon_deg:.8f},{home.amsl_m:.2f},{home.heading_deg:.1f}"]
@@ -107,13 +113,13 @@ class Firmware:
             raise OutputError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
 
     def check(self) -> None:
-        """Raises UsageError when it has ended by itself, with the last thing that it said."""
+        """Raises UsageError with the last console line when the firmware has ended by itself."""
         code = self._process.poll()
         if code is None:
             return
         lines = self._console.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        said = lines[-1].strip()[:TAIL_CHARS] if lines else "nothing"
-        raise UsageError(f"the firmware ended with code {code} and said: {said}; see {self._console}")
+        last_line = lines[-1].strip()[:TAIL_CHARS] if lines else "nothing"
+        raise UsageError(f"the firmware ended with code {code}, last output: {last_line}; see {self._console}")
 
     def stop(self) -> None:
         if self._process.poll() is None:

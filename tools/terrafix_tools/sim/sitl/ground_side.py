@@ -1,6 +1,7 @@
-"""The ground station of a flight on ArduPilot's firmware: MAVSDK uploads the mission, arms and sends it off.
+"""Ground station of a SITL flight: MAVSDK uploads the mission, arms and starts it.
 
-MAVSDK 4 has no server process: it is a library, called here in its blocking form."""
+MAVSDK 4 has no server process; it is a library, used here through its blocking interface.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,16 +15,16 @@ from mavsdk.plugins.param import Param
 
 from terrafix.core.errors import LinkError
 from terrafix_tools.mission.file import COMMANDS
-from terrafix_tools.mission.mission import Above, Do, Mission
+from terrafix_tools.mission.mission import AltitudeFrame, Do, Mission
 
-FIND_S = 60.0  # the firmware boots in a few seconds; a loaded machine takes its time
+DISCOVERY_TIMEOUT_S = 60.0  # time-out: the firmware boots in a few seconds, longer on a loaded machine
 # MISSION_ITEM_INT frames (MAVLink common.xml, MAV_FRAME)
-FRAMES = {Above.SEA: 0, Above.HOME: 3, Above.GROUND: 10}
+FRAMES = {AltitudeFrame.SEA: 0, AltitudeFrame.HOME: 3, AltitudeFrame.GROUND: 10}
 TAKE_OFF_PITCH_DEG = 12.0  # least pitch of a plane until the height is reached; a copter ignores it
 
 
 class Ground:
-    """One autopilot. Raises LinkError for everything that it does not do."""
+    """Connection to one autopilot. Raises LinkError when a command fails."""
 
     def __init__(self, system: Any) -> None:
         self._action, self._mission, self._param = Action(system), MissionRaw(system), Param(system)
@@ -32,7 +33,7 @@ class Ground:
         self._try("upload the mission", lambda: self._mission.upload_mission(items(mission)))
 
     def start_mission(self) -> None:
-        """Into the mode that flies the mission; on the ground it waits to be armed."""
+        """Switches to the mode that flies the mission; on the ground the vehicle waits to be armed."""
         self._try("switch to the mission", self._mission.start_mission)
 
     def arm(self) -> None:
@@ -51,21 +52,23 @@ class Ground:
 
 @contextmanager
 def connected(port: int) -> Iterator[Ground]:
-    """The autopilot that speaks to UDP ``port`` of this machine. Raises LinkError: taken, or nobody there."""
-    mavsdk.log_subscribe(lambda *_: True)  # it would write to the console
+    """Connects to the autopilot that sends to UDP ``port`` of this machine. Raises LinkError: port taken, or no
+    autopilot.
+    """
+    mavsdk.log_subscribe(lambda *_: True)  # suppresses MAVSDK's output on the console
     configuration = mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION)
     with mavsdk.Mavsdk(configuration) as station:
         result = station.add_any_connection(f"udpin://127.0.0.1:{port}")
         if result != mavsdk.ConnectionResult.SUCCESS:
             raise LinkError(f"UDP port {port} cannot be listened on ({result.name}); choose another --port")
-        system = station.first_autopilot(FIND_S)
+        system = station.first_autopilot(DISCOVERY_TIMEOUT_S)
         if system is None:
-            raise LinkError(f"no autopilot spoke to UDP port {port} within {FIND_S:.0f} s")
+            raise LinkError(f"no autopilot sent to UDP port {port} within {DISCOVERY_TIMEOUT_S:.0f} s")
         yield Ground(system)
 
 
 def items(mission: Mission) -> list[MissionItem]:
-    """As MISSION_ITEM_INT; item 0 is home, which ArduPilot replaces by its own."""
+    """Converts to MISSION_ITEM_INT; item 0 is home, which ArduPilot replaces by its own."""
     numbers = {do: number for number, do in COMMANDS.items()}
     home = MissionItem(
         seq=0,
@@ -74,26 +77,26 @@ def items(mission: Mission) -> list[MissionItem]:
         x=round(mission.home_lat_deg * 1e7),
         y=round(mission.home_lon_deg * 1e7),
     )
-    made = [home]
+    mission_items = [home]
     for item in mission.items:
-        amounts = (item.amount, 0.0, item.radius_m)
+        params = (item.amount, 0.0, item.radius_m)
         if item.do is Do.SPEED:
-            amounts = (1.0, item.amount, -1.0)  # ground speed, m/s, throttle as it is
+            params = (1.0, item.amount, -1.0)  # ground speed, m/s, throttle unchanged
         elif item.do is Do.TAKE_OFF:
-            amounts = (TAKE_OFF_PITCH_DEG, 0.0, 0.0)
-        made.append(
+            params = (TAKE_OFF_PITCH_DEG, 0.0, 0.0)
+        mission_items.append(
             MissionItem(
-                seq=len(made),
-                frame=FRAMES[item.above],
+                seq=len(mission_items),
+                frame=FRAMES[item.altitude_frame],
                 command=numbers[item.do],
-                current=int(len(made) == 1),
+                current=int(len(mission_items) == 1),
                 autocontinue=1,
-                param1=amounts[0],
-                param2=amounts[1],
-                param3=amounts[2],
+                param1=params[0],
+                param2=params[1],
+                param3=params[2],
                 x=round((item.lat_deg or 0.0) * 1e7),
                 y=round((item.lon_deg or 0.0) * 1e7),
                 z=item.height_m or 0.0,
             )
         )
-    return made
+    return mission_items

@@ -1,4 +1,4 @@
-"""What is generated for a flight on ArduPilot's firmware: the place, its map, the camera's season, home."""
+"""Generates the scene of a SITL flight: place, map, the camera's season, home."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +23,13 @@ class Scene:
 
 
 def generate_scene(out: Path, place: World, mission: Mission) -> Scene:
-    """Writes the map into ``out``. Raises OutputError."""
+    """Writes the map into ``out`` and returns the scene. Raises OutputError."""
     map_path = out / "map.gpkg"
-    write_map(place, map_path, ce90_m=None)  # as a real map would be taken for
-    seen = scene_of_world(place, place.look(CAMERA_SEASON))  # whole in memory: in flight there is no time to paint
+    write_map(place, map_path, ce90_m=None)  # stated as for a real map
+    # rendered completely in advance: in flight there is no time for it
+    camera_scene = scene_of_world(place, place.render(CAMERA_SEASON))
     lat_deg, lon_deg = place_of(place)
-    home_amsl_m = seen.height()(*seen.frame.to_local(lat_deg, lon_deg))
-    return Scene(seen.frame, seen.ground, Home(lat_deg, lon_deg, home_amsl_m, HEADING_DEG), mission, map_path)
+    home_amsl_m = camera_scene.height()(*camera_scene.frame.to_local(lat_deg, lon_deg))
+    return Scene(
+        camera_scene.frame, camera_scene.ground, Home(lat_deg, lon_deg, home_amsl_m, HEADING_DEG), mission, map_path
+    )

@@ -1,6 +1,7 @@
-"""The simulated vehicle: parameters for the firmware, the mission, and where both lie in the generated world.
+"""The simulated vehicle: firmware parameters, mission, and their position in the generated world.
 
-The parameters that concern Terrafix are not here but in config/vehicles/: what is tested is what people load."""
+The parameters that concern Terrafix are in config/vehicles/, so that the tested files are those that users load.
+"""
 
 from pathlib import Path
 
@@ -11,18 +12,18 @@ from terrafix_tools.sim.world.place import World
 
 CRUISE_M = 120.0  # above home
 APPROACH_M = 55.0  # height of the last waypoint before the landing, for a plane
-APPROACH_FROM_M = 480.0  # ... and how far from the landing point it lies: a glide path of 6.5 degrees
+APPROACH_FROM_M = 480.0  # its distance from the landing point: a glide path of 6.5 degrees
 WORLD_M = (4000.0, 2000.0)  # east-west, north-south
-WEST_EAST_M = (500.0, 3500.0)  # the loop, in plan metres of the world: the camera sees
+WEST_EAST_M = (500.0, 3500.0)  # the loop, in plan metres of the world: the camera covers
 NORTH_SOUTH_M = (500.0, 1500.0)  # about 110 m to each side, and a plane turns wide
-HOME_EAST_M = 2000.0  # on the southern side, so that there is room for climb and glide path
-LEAD_M = 2800.0  # what may be flown before the GNSS is lost, and what a plane cuts off at the corners
+HOME_EAST_M = 2000.0  # on the southern side, which leaves room for climb and glide path
+EXTRA_M = 2800.0  # distance that may be flown before the GNSS loss, plus what a plane cuts off at the corners
 LAPS_MAX = 20
 HEADING_DEG = 90.0  # take-off and landing, to the east
-SPEED_MPS = {Kind.PLANE: 22.0, Kind.COPTER: 9.0}  # with 12 the copter leans into the wind as far as it may
+SPEED_MPS = {Kind.PLANE: 22.0, Kind.COPTER: 9.0}  # at 12 m/s the copter reaches its lean limit into the wind
 
-# Two accelerometers that count as calibrated (any offset but zero), a radio that nobody touches, no terrain database:
-# the simulated ground is flat at the height of home.
+# Two accelerometers that count as calibrated (any offset but zero), no radio input, no terrain database: the simulated
+# ground is flat at the height of home.
 BOTH = {
     "SERIAL1_PROTOCOL": 2,
     "SERIAL2_PROTOCOL": 2,
@@ -33,14 +34,14 @@ BOTH = {
     "SIM_WIND_TURB": 0.5,
     **{f"INS_ACC{n}OFFS_{axis}": 0.001 for n in ("", "2") for axis in "XYZ"},
     **{f"INS_ACC{n}SCAL_{axis}": 1.001 for n in ("", "2") for axis in "XYZ"},
-    # the simulated compasses have these offsets (SIM_MAG1_OFS), with the opposite sign they calibrate them
+    # the simulated compasses have these offsets (SIM_MAG1_OFS); the opposite sign calibrates them
     **{f"COMPASS_OFS{n}_{axis}": v for n in ("", "2", "3") for axis, v in (("X", 5), ("Y", 13), ("Z", -18))},
     **{f"RC{n}_MIN": 1000 for n in range(1, 9)},
     **{f"RC{n}_MAX": 2000 for n in range(1, 9)},
 }
 PLANE = {
     "RC3_TRIM": 1000,
-    "SERVO3_MIN": 1000,  # the simulated motor stands still at 1000, and pulls the plane along at 1100
+    "SERVO3_MIN": 1000,  # the simulated motor stands still at 1000, and drives the plane at 1100
     "SERVO3_MAX": 2000,
     "THR_FAILSAFE": 0,
     "AIRSPEED_CRUISE": SPEED_MPS[Kind.PLANE],
@@ -52,7 +53,7 @@ PLANE = {
     "KFF_RDDRMIX": 0.5,
     "WP_RADIUS": 60,
     "NAVL1_PERIOD": 15,
-    # rate loops of the simulated airframe, which answers faster than the defaults expect
+    # rate loops of the simulated airframe, which responds faster than the defaults expect
     "RLL_RATE_P": 0.3,
     "RLL_RATE_I": 0.25,
     "RLL_RATE_D": 0.017,
@@ -66,7 +67,7 @@ COPTER = {
     "FRAME_CLASS": 1,
     "FRAME_TYPE": 0,
     "FS_THR_ENABLE": 0,
-    "AUTO_OPTIONS": 3,  # may be armed in AUTO, and takes off without a raised stick: nobody holds one
+    "AUTO_OPTIONS": 3,  # may be armed in AUTO, and takes off without raised throttle: there is no pilot
     "WPNAV_SPEED": SPEED_MPS[Kind.COPTER] * 100,
     "WPNAV_SPEED_UP": 400,
     "WPNAV_SPEED_DN": 300,
@@ -78,7 +79,7 @@ VEHICLE = {Kind.PLANE: BOTH | PLANE, Kind.COPTER: BOTH | COPTER}
 
 
 def write_parameters(path: Path, kind: Kind) -> None:
-    """Defaults of the simulated vehicle. Raises OutputError."""
+    """Writes the defaults of the simulated vehicle. Raises OutputError."""
     lines = [f"{name},{value:g}" for name, value in VEHICLE[kind].items()]
     try:
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -87,19 +88,21 @@ def write_parameters(path: Path, kind: Kind) -> None:
 
 
 def place_of(world: World) -> tuple[float, float]:
-    """Where the vehicle takes off and lands: (lat_deg, lon_deg), on the southern side of the loop."""
+    """Returns the take-off and landing position (lat_deg, lon_deg), on the southern side of the loop."""
     return world.wgs84(HOME_EAST_M, NORTH_SOUTH_M[1])
 
 
 def laps_for(length_m: float) -> tuple[int, float]:
-    """-> how many rounds of the loop ``length_m`` needs after the loss, and the length of one [m]."""
+    """Returns the number of laps that ``length_m`` needs after the GNSS loss, and the length of one lap, m."""
     (west, east), (north, south) = WEST_EAST_M, NORTH_SOUTH_M
     lap_m = 2 * (east - west) + 2 * (south - north)
-    return max(1, -int(-(length_m + LEAD_M) // lap_m)), lap_m
+    return max(1, -int(-(length_m + EXTRA_M) // lap_m)), lap_m
 
 
 def mission_for(world: World, kind: Kind, length_m: float) -> Mission:
-    """Take-off, as many rounds of the loop as ``length_m`` needs after the loss, landing at home. Raises UsageError."""
+    """Builds the mission: take-off, laps of the loop for ``length_m`` after the GNSS loss, landing at home. Raises
+    UsageError.
+    """
     (west, east), (north, south) = WEST_EAST_M, NORTH_SOUTH_M
     laps, lap_m = laps_for(length_m)
     if length_m <= 0.0 or laps > LAPS_MAX:
@@ -112,4 +115,4 @@ def mission_for(world: World, kind: Kind, length_m: float) -> Mission:
     items += [Item(Do.WAYPOINT, len(items), *world.wgs84(x, y), height_m=up) for x, y, up in places]
     home = place_of(world)
     items.append(Item(Do.LAND, len(items), *home, height_m=0.0))
-    return Mission("the mission of the harness", *home, tuple(items))
+    return Mission("SITL harness mission", *home, tuple(items))

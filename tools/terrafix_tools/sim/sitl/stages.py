@@ -1,4 +1,4 @@
-"""The stages of a flight on ArduPilot's firmware, from the boot to the landing, and Terrafix beside it."""
+"""The stages of a SITL flight from boot to landing, with Terrafix as a separate process."""
 
 import contextlib
 import os
@@ -24,40 +24,41 @@ from terrafix_tools.sim.sitl.report import FIX_3D, Kill, Times
 from terrafix_tools.sim.sitl.scene import Scene
 
 GPS_ID = 1  # Terrafix is the second GPS
-BOOT_S = 120.0  # until the filter has a position
-READY_S = 60.0  # until the first GPS_INPUT
-STREAMS_S = 10.0  # until the IMU comes at the rate that was asked for: a take-off that it felt is one that is known
-ARM_S = 120.0  # until the pre-arm checks pass
+BOOT_S = 120.0  # time-out until the filter has a position
+READY_S = 60.0  # time-out until the first GPS_INPUT
+STREAMS_S = 10.0  # until the IMU arrives at the requested rate: the initialisation needs the IMU data of the take-off
+ARM_S = 120.0  # time-out until the pre-arm checks pass
 ARM_AGAIN_S = 3.0
-TAKE_OVER_S = 240.0  # from arming until Terrafix has a 3D fix at SAFE_M
-SAFE_M = 80.0  # height above home from which the GNSS may be lost: above what Terrafix needs to see
-SETTLED_S = 10.0  # Terrafix had its fix for so long
+TAKE_OVER_S = 240.0  # time-out from arming until Terrafix has a 3D fix at SAFE_M
+SAFE_M = 80.0  # height above home for the GNSS loss: above the least height at which Terrafix can match
+SETTLED_S = 10.0  # Terrafix must have had its fix for this long
 LOSS_S = 10.0
-LOOK_S = 0.2
-GNSS_OFF = (("SIM_GPS_DISABLE", 1), ("SIM_GPS1_ENABLE", 0))  # ArduPilot 4.6 and before, later
-NO_FIX = 1  # GPS_INPUT comes, without a fix
-KILL_AFTER_S = 25.0  # without GNSS, and after the one before
-DOWN_S = 5.0  # the firmware notices after 4 s
-BACK_S = 120.0  # from the restart to a 3D fix
-STOP_S = 45.0  # as systemd waits for the ordered stop (TimeoutStopSec)
+POLL_S = 0.2
+GNSS_OFF = (("SIM_GPS_DISABLE", 1), ("SIM_GPS1_ENABLE", 0))  # parameters of ArduPilot up to 4.6, and of later versions
+NO_FIX = 1  # GPS_INPUT is received, without a fix
+KILL_AFTER_S = 25.0  # time without GNSS before a kill, and between kills
+DOWN_S = 5.0  # downtime; the firmware notices after 4 s
+BACK_S = 120.0  # time-out from the restart to a 3D fix
+STOP_S = 45.0  # time of systemd for an ordered stop (TimeoutStopSec)
 
 
-class NotFlown(Exception):
-    """The flight cannot go on: not a mistake of the user but a result."""
+class FlightAborted(Exception):
+    """The flight cannot continue; a result, not a usage error."""
 
 
 class Daemon:
-    """`terrafix run` as on a vehicle, a program of its own: begun by ``start``, ended by ``kill``,
-    by this context, or with this process."""
+    """`terrafix run` as on a vehicle, in its own process: started by ``start``, ended by ``kill``, by this context or
+    with this process.
+    """
 
-    def __init__(self, out: Path, scene: Scene, source: str, link: str, *, says_start: bool = True) -> None:
-        """``says_start``: the description of the camera does. Raises OutputError."""
+    def __init__(self, out: Path, scene: Scene, source: str, link: str, *, start_configured: bool = True) -> None:
+        """``start_configured``: the camera description contains the start. Raises OutputError."""
         self._process: subprocess.Popen[bytes] | None = None
         self._log = out / "terrafix.log"
         camera, config = out / "camera.toml", out / "terrafix.toml"
         home = scene.home
         start = StartTable(lat_deg=home.lat_deg, lon_deg=home.lon_deg, ground_amsl_m=round(home.amsl_m, 1))
-        write_toml(camera, _description(start if says_start else None), "The camera of the simulated vehicle.")
+        write_toml(camera, _description(start if start_configured else None), "The camera of the simulated vehicle.")
         try:
             config.write_text(f'[source]\ncamera = "{camera}"\n[link]\ngps_id = {GPS_ID}\n', encoding="utf-8")
         except OSError as error:
@@ -74,16 +75,16 @@ class Daemon:
             )
 
     def kill(self) -> None:
-        """Without a word, and all of it: its processes die with their supervisor."""
+        """Kills it without notice; its child processes end with the supervisor."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
             self._process = None
 
     def check(self) -> None:
-        """Raises NotFlown when it has ended."""
+        """Raises FlightAborted when it has ended."""
         if self._process is not None and self._process.poll() is not None:
-            raise NotFlown(f"Terrafix ended with exit code {self._process.returncode}; see {self._log}")
+            raise FlightAborted(f"Terrafix ended with exit code {self._process.returncode}; see {self._log}")
 
     def __enter__(self) -> "Daemon":
         return self
@@ -97,7 +98,7 @@ class Daemon:
 
 
 class Stages:
-    """One method a stage, in this order. Raises NotFlown when a stage does not come to its end."""
+    """One method per stage, to be called in this order. Each raises FlightAborted when the stage does not complete."""
 
     def __init__(
         self, firmware: Firmware, station: Ground, observer: Observer, daemon: Daemon, scene: Scene, console: Console
@@ -106,46 +107,46 @@ class Stages:
         self._daemon, self._scene, self._console = daemon, scene, console
         self.times = Times()
 
-    def get_ready(self) -> None:
-        """The autopilot has a position by GNSS; then Terrafix starts, as by a pilot who is about to take off."""
-        self._wait("a position by GNSS", BOOT_S, self._has_position)
+    def prepare(self) -> None:
+        """Waits for the autopilot's GNSS position, then starts Terrafix, as a pilot does before take-off."""
+        self._wait("position by GNSS", BOOT_S, self._has_position)
         self._station.upload(self._scene.mission)
         self._daemon.start()
-        self._wait("the first GPS_INPUT", READY_S, lambda: self._fix(GPS_ID) >= NO_FIX)
+        self._wait("GPS_INPUT", READY_S, lambda: self._fix(GPS_ID) >= NO_FIX)
         self._pause(STREAMS_S)
-        self._say("autopilot and Terrafix are ready")
+        self._print("autopilot and Terrafix ready")
 
     def take_off(self) -> None:
-        """Armed as soon as the checks allow it, and off."""
+        """Arms as soon as the checks allow it, and starts the mission."""
         deadline_s = time.monotonic() + ARM_S
         while True:
             try:
                 self._station.arm()
-                self._station.start_mission()  # only now: MAVSDK arms in a mode of its own choice
+                self._station.start_mission()  # after arming, since MAVSDK arms in a mode of its own choice
                 break
             except LinkError as error:
                 if time.monotonic() > deadline_s:
-                    raise NotFlown(f"{error}; last text: {self._last_text()}") from None
+                    raise FlightAborted(f"{error}; last text: {self._last_text()}") from None
                 self._pause(ARM_AGAIN_S)
         self.times = replace(self.times, armed_ns=time.monotonic_ns())
-        self._say("armed; take-off on GNSS")
+        self._print("armed; take-off on GNSS")
 
     def lose_gnss(self) -> None:
-        """When the vehicle is high enough and Terrafix had a 3D fix for a while."""
-        self._wait(f"{SAFE_M:.0f} m above home and a 3D fix of Terrafix", TAKE_OVER_S, self._may_lose)
+        """Disables the GNSS when the vehicle is high enough and Terrafix has had a 3D fix for a while."""
+        self._wait(f"{SAFE_M:.0f} m above home and 3D fix of Terrafix", TAKE_OVER_S, self._ready_for_gnss_loss)
         for name, value in GNSS_OFF:
-            with contextlib.suppress(LinkError):  # another firmware's name
+            with contextlib.suppress(LinkError):  # parameter of another firmware version
                 self._station.set_parameter(name, value)
                 break
-        self._wait("the loss of the GNSS", LOSS_S, lambda: self._fix(0) < FIX_3D)
-        # The first report without a fix: a busy machine looks only after several of them have come.
-        without = takewhile(lambda report: report[1] < FIX_3D, reversed(self._observer.notes.fix_types[0]))
+        self._wait("loss of the GNSS", LOSS_S, lambda: self._fix(0) < FIX_3D)
+        # Time of the first report without a fix; on a busy machine several may have arrived before this check.
+        without = takewhile(lambda report: report[1] < FIX_3D, reversed(self._observer.log.fix_types[0]))
         *_, (lost_ns, _fix) = without
         self.times = replace(self.times, lost_ns=lost_ns)
-        self._say("GNSS lost; GPS_INPUT alone")
+        self._print("GNSS lost; GPS_INPUT alone")
 
     def kill_terrafix(self) -> None:
-        """All of it, and started again as systemd would."""
+        """Kills all of Terrafix and restarts it, as systemd would."""
         self._pause(KILL_AFTER_S)
         self._daemon.kill()
         killed_ns = time.monotonic_ns()
@@ -153,59 +154,59 @@ class Stages:
         self._daemon.start()
         kill, before = Kill(killed_ns, time.monotonic_ns()), self.times.kills
         self.times = replace(self.times, kills=(*before, kill))
-        self._say("Terrafix was killed, and started again")
+        self._print("Terrafix killed and restarted")
 
-        def back_ns() -> int | None:
-            reports = self._observer.notes.fix_types[GPS_ID]
+        def recovered_ns() -> int | None:
+            reports = self._observer.log.fix_types[GPS_ID]
             return next((t_ns for t_ns, fix in reports if t_ns > kill.restarted_ns and fix >= FIX_3D), None)
 
-        self._wait("a 3D fix after the restart", BACK_S, lambda: back_ns() is not None)
-        self.times = replace(self.times, kills=(*before, replace(kill, back_ns=back_ns())))
-        self._say(f"3D fix again {((back_ns() or 0) - kill.restarted_ns) / 1e9:.2f} s after that")
+        self._wait("3D fix after the restart", BACK_S, lambda: recovered_ns() is not None)
+        self.times = replace(self.times, kills=(*before, replace(kill, recovered_ns=recovered_ns())))
+        self._print(f"3D fix again {((recovered_ns() or 0) - kill.restarted_ns) / 1e9:.2f} s after the restart")
 
     def land(self, limit_s: float) -> None:
-        """The rest of the mission; it disarms by itself when it stands."""
-        self._wait("the landing", limit_s, lambda: not self._observer.notes.armed[-1][1])
+        """Waits for the rest of the mission; the vehicle disarms itself after landing."""
+        self._wait("landing", limit_s, lambda: not self._observer.log.armed[-1][1])
         self.times = replace(self.times, landed_ns=time.monotonic_ns())
-        self._say("landed")
+        self._print("landed")
 
     def _has_position(self) -> bool:
-        flags = self._observer.notes.ekf_flags
+        flags = self._observer.log.ekf_flags
         return bool(flags) and bool(flags[-1][1] & mavlink.EKF_POS_HORIZ_ABS)
 
-    def _may_lose(self) -> bool:
-        fixes, truth = self._observer.notes.fix_types[GPS_ID], self._observer.notes.truth[-1]
+    def _ready_for_gnss_loss(self) -> bool:
+        fixes, truth = self._observer.log.fix_types[GPS_ID], self._observer.log.truth[-1]
         since_ns = time.monotonic_ns() - round(SETTLED_S * 1e9)
         recent = [fix for t_ns, fix in fixes[-200:] if t_ns >= since_ns]
         high = truth.amsl_m - self._scene.home.amsl_m >= SAFE_M
         return high and len(recent) >= SETTLED_S and min(recent) >= FIX_3D
 
     def _fix(self, gps: int) -> int:
-        fixes = self._observer.notes.fix_types[gps]
+        fixes = self._observer.log.fix_types[gps]
         return fixes[-1][1] if fixes else 0
 
     def _last_text(self) -> str:
-        said = self._observer.notes.said
-        return said[-1].text if said else "none"
+        texts = self._observer.log.texts
+        return texts[-1].text if texts else "none"
 
     def _wait(self, what: str, limit_s: float, until: Callable[[], bool]) -> None:
         deadline_s = time.monotonic() + limit_s
         while not until():
             if time.monotonic() > deadline_s:
-                raise NotFlown(f"{what} did not come within {limit_s:.0f} s; last text: {self._last_text()}")
-            self._pause(LOOK_S)
+                raise FlightAborted(f"no {what} within {limit_s:.0f} s; last text: {self._last_text()}")
+            self._pause(POLL_S)
 
     def _pause(self, pause_s: float) -> None:
         time.sleep(pause_s)
         self._firmware.check()
         self._daemon.check()
 
-    def _say(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         self._console.print(text, highlight=False)
 
 
 def _description(start: StartTable | None) -> Description:
-    """What the pilot knows: the camera, and where the vehicle stands."""
+    """Returns the description that a pilot writes: the camera, and optionally the start."""
     return Description(
         name="ardupilot",
         camera=CameraTable.of(CAMERA),

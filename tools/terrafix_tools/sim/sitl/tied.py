@@ -1,18 +1,19 @@
-"""The program `terrafix`, ended with SIGTERM when the one that started it has ended, however that ended.
+"""`terrafix` as a child process that receives SIGTERM when its parent ends for any reason.
 
-``python -m terrafix_tools.sim.sitl.tied PID ARGUMENTS``; PID: of who starts it. A flight that was killed ends nobody,
-and a Terrafix whose autopilot and camera are gone waits for them to come back."""
+``python -m terrafix_tools.sim.sitl.tied PID ARGUMENTS``; PID: of the parent. A killed flight cannot stop its children,
+and without this Terrafix would wait for autopilot and camera to return.
+"""
 
 import signal
 import sys
 
-from terrafix.runtime.fork_server import end_with
+from terrafix.runtime.fork_server import set_parent_death_signal
 from terrafix_tools import program
 
 
 def main() -> None:
     parent_pid = int(sys.argv.pop(1))
-    if end_with(parent_pid, signal.SIGTERM):
+    if set_parent_death_signal(parent_pid, signal.SIGTERM):
         program.main()
 
 

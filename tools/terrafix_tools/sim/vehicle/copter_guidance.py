@@ -1,24 +1,24 @@
-"""Guidance of the multicopter: the velocity that brings it along its mission, by what it believes of itself."""
+"""Guidance of the multicopter: velocity command along the mission, from the navigation solution."""
 
 import math
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.mission.mission import Do, HeightOf, Mission, Target
 from terrafix_tools.sim.interfaces import Navigation
-from terrafix_tools.sim.vehicle.guided import Guided
+from terrafix_tools.sim.vehicle.guided import MissionGuidance
 
-GAIN_PER_S = 0.8  # velocity for a metre beside the leg, or above it
+GAIN_PER_S = 0.8  # velocity per metre of cross-track or height error
 CLIMB_MPS, SINK_MPS, SLOW_SINK_MPS = 2.5, 1.5, 0.5  # WPNAV_SPEED_UP, WPNAV_SPEED_DN, LAND_SPEED
 SLOW_BELOW_M = 10.0  # LAND_ALT_LOW
 CORNER_MPS = 3.0  # speed in the corner between two legs
 REACHED_M = 4.0
-HOVER_REACHED_M = 2.0  # where it is to stop (WPNAV_RADIUS)
+HOVER_REACHED_M = 2.0  # radius of a stop (WPNAV_RADIUS)
 LOITER_RADIUS_M = 20.0
-RETURN_HEIGHT_M = 15.0  # RTL_ALT: at least so high above home
+RETURN_HEIGHT_M = 15.0  # RTL_ALT: least height above home
 
 
-class Guidance(Guided):
-    """Of the multicopter; see Guided."""
+class Guidance(MissionGuidance):
+    """Guidance of the multicopter; see MissionGuidance."""
 
     return_height_m = RETURN_HEIGHT_M
 
@@ -32,62 +32,64 @@ class Guidance(Guided):
 
     @property
     def finished(self) -> bool:
-        """Nothing new will happen: the last item is done, or it hovers where it is to stay."""
-        return self._over or (self._targets[self._at].do is Do.LOITER and self._arrived_s is not None)
+        """True when the last item is complete, or the vehicle hovers at its final position."""
+        return self._complete or (self._targets[self._index].do is Do.LOITER and self._arrived_s is not None)
 
     @property
     def landing(self) -> bool:
-        return not self._over and self._targets[self._at].do in (Do.LAND, Do.RETURN)
+        return not self._complete and self._targets[self._index].do in (Do.LAND, Do.RETURN)
 
-    def step(self, dt_s: float, seen: Navigation, agl_m: float) -> tuple[float, float, float]:
-        """-> wished velocity east, north, up [m/s]. ``agl_m`` (a rangefinder's) serves the landing alone."""
-        e, n, up = seen.p_b_in_w_m.tolist()
+    def step(self, dt_s: float, navigated: Navigation, agl_m: float) -> tuple[float, float, float]:
+        """Returns the velocity command east, north, up [m/s]. ``agl_m`` (of a rangefinder) is used for the landing
+        only.
+        """
+        e, n, up = navigated.p_b_in_w_m.tolist()
         self._pass_time(dt_s, e, n)
-        while not self._over and self._done(self._targets[self._at], e, n, up):
+        while not self._complete and self._done(self._targets[self._index], e, n, up):
             self._next(e, n)
-        if self._over:
+        if self._complete:
             return *self._toward(self._from, e, n, True), self._climb(up)
-        target = self._targets[self._at]
+        target = self._targets[self._index]
         place = self._place(target)
         if target.do is Do.RETURN and math.dist(place, (e, n)) < HOVER_REACHED_M:
             self._from = place
             return *self._toward(place, e, n, True), self._sink(agl_m)
         if target.do is Do.LAND:
-            there = math.dist(place, (e, n)) < HOVER_REACHED_M
-            return *self._toward(place, e, n, True), self._sink(agl_m) if there else self._climb(up)
+            arrived = math.dist(place, (e, n)) < HOVER_REACHED_M
+            return *self._toward(place, e, n, True), self._sink(agl_m) if arrived else self._climb(up)
         if target.do is Do.LOITER_TURNS:
             return *self._circle(target, e, n), self._climb(up)
-        stop = target.do is not Do.WAYPOINT or target.amount > 0.0 or self._at + 1 == len(self._targets)
+        stop = target.do is not Do.WAYPOINT or target.amount > 0.0 or self._index + 1 == len(self._targets)
         return *self._toward(place, e, n, stop), self._climb(up)
 
-    # --- how ---
+    # --- velocity ---
 
     def _toward(self, place: tuple[float, float], e: float, n: float, stop: bool) -> tuple[float, float]:
-        """Along the leg to ``place``, braking in time, and back to its line."""
+        """Along the leg to ``place``, with braking and cross-track correction."""
         east, north = place[0] - self._from[0], place[1] - self._from[1]
         length = math.hypot(east, north)
         if length < 1.0:
             gap = math.hypot(place[0] - e, place[1] - n)
-            fast = min(self._speed_mps, GAIN_PER_S * gap) / max(gap, 1e-6)
-            return fast * (place[0] - e), fast * (place[1] - n)
+            rate = min(self._speed_mps, GAIN_PER_S * gap) / max(gap, 1e-6)
+            return rate * (place[0] - e), rate * (place[1] - n)
         east, north = east / length, north / length
-        to_go = (place[0] - e) * east + (place[1] - n) * north
-        beside = (place[0] - e) * north - (place[1] - n) * east
+        distance_left = (place[0] - e) * east + (place[1] - n) * north
+        cross_track = (place[0] - e) * north - (place[1] - n) * east
         last_mps = 0.0 if stop else CORNER_MPS
-        along = min(self._speed_mps, math.sqrt(last_mps**2 + self._brake_mps2 * abs(to_go)))
+        along = min(self._speed_mps, math.sqrt(last_mps**2 + self._brake_mps2 * abs(distance_left)))
         if stop:
-            along = min(along, GAIN_PER_S * abs(to_go))
-        along = math.copysign(along, to_go)
-        aside = min(max(GAIN_PER_S * beside, -self._speed_mps / 2), self._speed_mps / 2)
-        return along * east + aside * north, along * north - aside * east
+            along = min(along, GAIN_PER_S * abs(distance_left))
+        along = math.copysign(along, distance_left)
+        lateral = min(max(GAIN_PER_S * cross_track, -self._speed_mps / 2), self._speed_mps / 2)
+        return along * east + lateral * north, along * north - lateral * east
 
     def _circle(self, target: Target, e: float, n: float) -> tuple[float, float]:
         radius_m, sense = abs(target.radius_m) or LOITER_RADIUS_M, math.copysign(1.0, target.radius_m)
         east, north = e - target.e_m, n - target.n_m
         gap = max(0.1, math.hypot(east, north))
         if abs(gap - radius_m) > 0.5 * radius_m:
-            fast = min(self._speed_mps, abs(gap - radius_m)) * (1.0 if gap < radius_m else -1.0) / gap
-            return fast * east, fast * north
+            rate = min(self._speed_mps, abs(gap - radius_m)) * (1.0 if gap < radius_m else -1.0) / gap
+            return rate * east, rate * north
         bearing = math.atan2(east, north)
         if self._arrived_s is None:
             self._arrived_s, self._turned_rad = self._t_s, 0.0
@@ -109,11 +111,11 @@ class Guidance(Guided):
     def _sink(agl_m: float) -> float:
         return -SLOW_SINK_MPS if agl_m < SLOW_BELOW_M else -SINK_MPS
 
-    # --- what next ---
+    # --- mission progress ---
 
     def _done(self, target: Target, e: float, n: float, up: float) -> bool:
         if target.do is not Do.LAND:
-            self._want_height(target)
+            self._set_height(target)
         goal_m = self._goal_up_m
         match target.do:
             case Do.SPEED:
@@ -121,7 +123,7 @@ class Guidance(Guided):
                 return True
             case Do.TAKE_OFF | Do.ALTITUDE:
                 return math.isnan(goal_m) or abs(up - goal_m) < HOVER_REACHED_M
-            case Do.WAYPOINT if target.amount == 0.0 and self._at + 1 < len(self._targets):
+            case Do.WAYPOINT if target.amount == 0.0 and self._index + 1 < len(self._targets):
                 return math.dist((e, n), (target.e_m, target.n_m)) < REACHED_M
             case Do.WAYPOINT | Do.LOITER_TIME:
                 return self._waited(target, e, n)
@@ -131,7 +133,7 @@ class Guidance(Guided):
                 return self._turned_rad >= math.tau * target.amount
             case Do.RETURN:
                 self._over_ground = False
-                self._wanted_m = max(self._wanted_m, self._home_amsl_m + RETURN_HEIGHT_M)
+                self._target_height_m = max(self._target_height_m, self._home_amsl_m + RETURN_HEIGHT_M)
         return False
 
     def _waited(self, target: Target, e: float, n: float) -> bool:
@@ -140,10 +142,10 @@ class Guidance(Guided):
         return self._arrived_s is not None and self._t_s - self._arrived_s >= target.amount
 
     def _next(self, e: float, n: float) -> None:
-        self._from = self._place(self._targets[self._at]) if self._targets[self._at].do is Do.WAYPOINT else (e, n)
+        self._from = self._place(self._targets[self._index]) if self._targets[self._index].do is Do.WAYPOINT else (e, n)
         self._arrived_s, self._turned_rad = None, 0.0
-        self._at += 1
-        self._over = self._at >= len(self._targets)
+        self._index += 1
+        self._complete = self._index >= len(self._targets)
 
     def _place(self, target: Target) -> tuple[float, float]:
         return self._from if math.isnan(target.e_m) else (target.e_m, target.n_m)

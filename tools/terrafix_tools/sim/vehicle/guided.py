@@ -1,17 +1,17 @@
-"""What the guidance of every vehicle keeps: the items of the mission, how far it has come, the height it wants."""
+"""Base of all guidance: mission items, progress, and target height."""
 
 import math
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.mission.mission import HeightOf, Mission, Target, targets
 
-GROUND_EVERY_S = 0.2  # between two looks at the ground, for heights that count from it
+GROUND_INTERVAL_S = 0.2  # interval of ground height updates, for heights above ground
 
 
-class Guided:
-    """Knows nothing but the mission and what it is told."""
+class MissionGuidance:
+    """Mission guidance that depends only on the mission and the given navigation solution."""
 
-    return_height_m: float  # above home, of a return without a height of its own
+    return_height_m: float  # above home, for a return without own height
 
     def __init__(self, mission: Mission, frame: LocalFrame, height: HeightOf, cruise_mps: float) -> None:
         self._targets = targets(mission, frame, height)
@@ -20,35 +20,35 @@ class Guided:
         self._home_amsl_m = height(*self._home)
         self._on_ground = mission.starts_on_ground()
         self._speed_mps = cruise_mps
-        self._at = 0
-        self._over = False  # the last item is done
-        self._wanted_m, self._over_ground = math.nan, False
+        self._index = 0
+        self._complete = False  # the last item is complete
+        self._target_height_m, self._over_ground = math.nan, False
         self._ground_m, self._ground_at_s, self._t_s = self._home_amsl_m, -math.inf, 0.0
         e_m, n_m, _ = self.start()
         self._from = (e_m, n_m)
 
     def start(self) -> tuple[float, float, float]:
-        """-> east, north [m] and heading [rad] of the vehicle at time zero."""
+        """Returns east, north [m] and heading [rad] of the vehicle at time zero."""
         places = [(t.e_m, t.n_m) for t in self._targets if not math.isnan(t.e_m)]
-        begin = self._home if self._on_ground else places[0]
-        ahead = next((p for p in places if math.dist(p, begin) > 1.0), (begin[0], begin[1] + 1.0))
-        return *begin, math.atan2(ahead[0] - begin[0], ahead[1] - begin[1])
+        start_m = self._home if self._on_ground else places[0]
+        next_m = next((p for p in places if math.dist(p, start_m) > 1.0), (start_m[0], start_m[1] + 1.0))
+        return *start_m, math.atan2(next_m[0] - start_m[0], next_m[1] - start_m[1])
 
     def first_height_m(self, ground_m: float) -> float:
-        """AMSL of a vehicle that begins in the air over ground of this height."""
+        """Initial height AMSL of a vehicle that starts in the air over ground of this height."""
         heights = (t.up_m(ground_m) for t in self._targets if not math.isnan(t.height_m))
         return next(heights, ground_m + self.return_height_m)
 
     def _pass_time(self, dt_s: float, e_m: float, n_m: float) -> None:
         self._t_s += dt_s
-        if self._t_s - self._ground_at_s >= GROUND_EVERY_S:
+        if self._t_s - self._ground_at_s >= GROUND_INTERVAL_S:
             self._ground_m, self._ground_at_s = self._height(e_m, n_m), self._t_s
 
-    def _want_height(self, target: Target) -> None:
+    def _set_height(self, target: Target) -> None:
         if not math.isnan(target.height_m):
-            self._wanted_m, self._over_ground = target.height_m, target.over_ground
+            self._target_height_m, self._over_ground = target.height_m, target.over_ground
 
     @property
     def _goal_up_m(self) -> float:
-        """AMSL that it wants to have here; not a number: nobody said."""
-        return self._wanted_m + (self._ground_m if self._over_ground else 0.0)
+        """Target height AMSL at the current position; nan: not set."""
+        return self._target_height_m + (self._ground_m if self._over_ground else 0.0)

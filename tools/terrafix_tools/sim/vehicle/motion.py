@@ -1,8 +1,9 @@
-"""From velocity and attitude, step after step, to a State whose inertial readings belong to that motion exactly.
+"""Integrates velocity and attitude steps to a State with exactly consistent inertial readings.
 
-Rates and specific force are the means over the step that ends at the state's time, as a sensor that integrates
-between two samples shows them: a strapdown that turns by the rates and pushes along the attitude at mid-step comes
-back to the same velocities and, with mean velocities, to the same positions."""
+Rates and specific force are the means over the step that ends at the state's time, like those of a sensor that
+integrates between two samples: a strapdown integration that rotates by the rates and applies the force in the mid-step
+attitude reproduces the velocities and, with mean velocities, the positions.
+"""
 
 import math
 
@@ -12,14 +13,16 @@ from terrafix_tools.mission.mission import HeightOf
 from terrafix_tools.sim.interfaces import State
 
 GRAVITY_MPS2 = 9.80665
-AIRBORNE_M = 1.0  # below this height after a take-off the ground still carries the vehicle
-HEIGHT_EVERY = 10  # steps between two looks at the ground; in between its slope along the way goes on
+AIRBORNE_M = 1.0  # below this height after take-off the vehicle still stands on the ground
+HEIGHT_INTERVAL_STEPS = (
+    10  # steps between two ground height look-ups; in between the slope along the path is extrapolated
+)
 
 Quat = tuple[float, float, float, float]
 
 
 class Motion:
-    """The truth of one vehicle. ``state`` is the newest."""
+    """True motion of one vehicle. ``state`` is the latest."""
 
     def __init__(
         self,
@@ -37,11 +40,11 @@ class Motion:
         self._height = height
         self.t_s, self.e_m, self.n_m, self.up_m = 0.0, e_m, n_m, up_m
         self.ve_mps, self.vn_mps, self.vu_mps = velocity_enu_mps
-        self.ground_m = self._seen_m = height(e_m, n_m)
-        self._slope_m = 0.0  # rise of the ground in one step
+        self.ground_m = self._sampled_ground_m = height(e_m, n_m)
+        self._slope_m = 0.0  # rise of the ground per step
         self._steps = 0
         self._attitude = quat_of(yaw_rad, pitch_rad, roll_rad)
-        still = (0.0, 0.0, 0.0), rotate_back(self._attitude, 0.0, 0.0, -GRAVITY_MPS2)
+        still = (0.0, 0.0, 0.0), rotate_to_body(self._attitude, 0.0, 0.0, -GRAVITY_MPS2)
         self.state = self._state((yaw_rad, pitch_rad, roll_rad), *still, airspeed_mps)
 
     @property
@@ -55,16 +58,16 @@ class Motion:
         angles_rad: tuple[float, float, float],
         airspeed_mps: float,
     ) -> State:
-        """One step to a new velocity and attitude (yaw, pitch, roll)."""
+        """Advances one step to a new velocity and attitude (yaw, pitch, roll)."""
         ve, vn, vu = velocity_enu_mps
         self.t_s += dt_s
         self.e_m += 0.5 * (self.ve_mps + ve) * dt_s
         self.n_m += 0.5 * (self.vn_mps + vn) * dt_s
         self.up_m += 0.5 * (self.vu_mps + vu) * dt_s
         attitude = quat_of(*angles_rad)
-        rates, middle = turned(self._attitude, attitude, dt_s)
-        force = rotate_back(
-            middle,
+        rates, mid_attitude = mean_rates(self._attitude, attitude, dt_s)
+        force = rotate_to_body(
+            mid_attitude,
             (vn - self.vn_mps) / dt_s,
             (ve - self.ve_mps) / dt_s,
             -(vu - self.vu_mps) / dt_s - GRAVITY_MPS2,
@@ -76,9 +79,13 @@ class Motion:
 
     def _follow_ground(self) -> None:
         self._steps += 1
-        if self._steps % HEIGHT_EVERY == 0:
+        if self._steps % HEIGHT_INTERVAL_STEPS == 0:
             now_m = self._height(self.e_m, self.n_m)
-            self._slope_m, self._seen_m, self.ground_m = (now_m - self._seen_m) / HEIGHT_EVERY, now_m, now_m
+            self._slope_m, self._sampled_ground_m, self.ground_m = (
+                (now_m - self._sampled_ground_m) / HEIGHT_INTERVAL_STEPS,
+                now_m,
+                now_m,
+            )
         else:
             self.ground_m += self._slope_m
 
@@ -105,7 +112,7 @@ class Motion:
 
 
 def quat_of(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Quat:
-    """Body (FRD) into north, east, down: unit quaternion (w, x, y, z) of the aerospace angles (Z-Y-X)."""
+    """Unit quaternion (w, x, y, z), body (FRD) to north, east, down, of the aerospace angles (Z-Y-X)."""
     cy, sy = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
     cp, sp = math.cos(0.5 * pitch_rad), math.sin(0.5 * pitch_rad)
     cr, sr = math.cos(0.5 * roll_rad), math.sin(0.5 * roll_rad)
@@ -117,15 +124,15 @@ def quat_of(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Quat:
     )
 
 
-def turned(a: Quat, b: Quat, dt_s: float) -> tuple[tuple[float, float, float], Quat]:
-    """-> mean body rates [rad/s] that take attitude ``a`` to ``b`` in ``dt_s``, and the attitude half way."""
+def mean_rates(a: Quat, b: Quat, dt_s: float) -> tuple[tuple[float, float, float], Quat]:
+    """Returns the mean body rates [rad/s] from attitude ``a`` to ``b`` in ``dt_s``, and the mid-step attitude."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     w = aw * bw + ax * bx + ay * by + az * bz  # conj(a) * b
     x = aw * bx - ax * bw - ay * bz + az * by
     y = aw * by + ax * bz - ay * bw - az * bx
     z = aw * bz - ax * by + ay * bx - az * bw
-    if w < 0.0:  # the same attitude from the other side of the sphere
+    if w < 0.0:  # same attitude with the opposite sign
         w, x, y, z, bw, bx, by, bz = -w, -x, -y, -z, -bw, -bx, -by, -bz
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 / dt_s if sine < 1e-9 else 2.0 * math.atan2(sine, w) / (sine * dt_s)
@@ -134,8 +141,8 @@ def turned(a: Quat, b: Quat, dt_s: float) -> tuple[tuple[float, float, float], Q
     return (x * scale, y * scale, z * scale), (mw * norm, mx * norm, my * norm, mz * norm)
 
 
-def rotate_back(q: Quat, north: float, east: float, down: float) -> tuple[float, float, float]:
-    """A vector in north, east, down -> in the body whose attitude is ``q``."""
+def rotate_to_body(q: Quat, north: float, east: float, down: float) -> tuple[float, float, float]:
+    """Transforms a vector from north, east, down to the body with attitude ``q``."""
     w, x, y, z = q
     # v + 2 w (u x v) + 2 u x (u x v) with u = -(x, y, z)
     tx, ty, tz = 2.0 * (z * east - y * down), 2.0 * (x * down - z * north), 2.0 * (y * north - x * east)

@@ -1,4 +1,4 @@
-"""The strokes of a painted place: fields, lots, ways, water and shadows on one canvas."""
+"""Drawing of fields, lots, roads, water and shadows of a generated place on a canvas."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,24 +10,24 @@ from terrafix_tools.sim.world.season import Bgr, Season
 from terrafix_tools.sim.world.shapes import House, Line, Parcel
 
 SHIFT = 4  # sub-pixel bits of OpenCV's drawing coordinates
-NEUTRAL = 128  # value of the texture layer that changes nothing
-TRAM_M = 21.0  # distance of a sprayer's wheel tracks
-ROWS_SEEN_M = 1.0  # with larger pixels the rows are not seen, and would alias
+NEUTRAL = 128  # value of the texture layer with factor 1
+WHEEL_TRACK_SPACING_M = 21.0  # spacing of a sprayer's wheel tracks
+ROWS_MAX_GSD_M = 1.0  # with larger pixels crop rows are not resolved and would alias
 
 
 @dataclass
 class Canvas:
-    """What grows while a season is drawn. ``gsd_m`` metres a pixel; arrays are (H, W[, 3]) uint8."""
+    """Layers of a season while it is drawn. ``gsd_m`` metres a pixel; arrays are (H, W[, 3]) uint8."""
 
     gsd_m: float
     season: Season
-    origin_px: tuple[int, int]  # of the canvas in the place; all that is drawn counts its metres from here
+    origin_px: tuple[int, int]  # of the canvas in the place; coordinates of drawn objects are relative to it
     colour: np.ndarray
     texture: np.ndarray
     shadow: np.ndarray
     soil: np.ndarray
     grain: np.ndarray
-    sun_step: tuple[float, float] = field(init=False)  # metres of shadow (x, y) for a metre of height
+    sun_step: tuple[float, float] = field(init=False)  # shadow vector (x, y), m per metre of height
 
     def __post_init__(self) -> None:
         azimuth, length = (
@@ -37,12 +37,12 @@ class Canvas:
         self.sun_step = (-math.sin(azimuth) * length, math.cos(azimuth) * length)
 
     def px(self, points_m: np.ndarray) -> np.ndarray:
-        """Metres (N, 2) -> fixed-point pixels for OpenCV (N, 2) int32; pixel centres at whole numbers."""
+        """Converts metres (N, 2) to fixed-point pixels for OpenCV (N, 2) int32; pixel centres at integers."""
         return np.round((points_m / self.gsd_m - 0.5) * (1 << SHIFT)).astype(np.int32)
 
 
 def _window(canvas: Canvas, outline_m: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray] | None:
-    """The part of the image around an outline, and the mask (bool) of its inside."""
+    """Returns the image window around an outline, and the mask (bool) of its inside; None when it is outside."""
     height, width = canvas.texture.shape
     px = outline_m / canvas.gsd_m
     x0, y0 = np.maximum(np.floor(px.min(axis=0)).astype(int) - 1, 0)
@@ -71,7 +71,7 @@ def draw_field(canvas: Canvas, parcel: Parcel) -> None:
     soil_gain, grain_gain = rng.choice([-0.7, 0.7]), rng.uniform(0.25, 0.5)
     soil, grain = canvas.soil[window], canvas.grain[window]
     patch = cv2.addWeighted(soil, soil_gain, grain, grain_gain, NEUTRAL * (1.0 - soil_gain - grain_gain))
-    if rows and canvas.gsd_m < ROWS_SEEN_M:
+    if rows and canvas.gsd_m < ROWS_MAX_GSD_M:
         patch = cv2.add(patch, _rows(canvas, window, parcel.row_angle_rad, rows, rng), dtype=cv2.CV_8U)
     np.copyto(canvas.texture[window], patch, where=mask)
 
@@ -81,12 +81,12 @@ def _rows(
 ) -> np.ndarray:
     """Crop rows and wheel tracks along ``angle`` in a window of the canvas: (h, w) int16, added to texture."""
     steps = 256  # samples of one period between two wheel tracks
-    across_m = np.arange(steps) / steps * TRAM_M
-    row_m = TRAM_M / rng.integers(7, 12)
+    across_m = np.arange(steps) / steps * WHEEL_TRACK_SPACING_M
+    row_m = WHEEL_TRACK_SPACING_M / rng.integers(7, 12)
     profile = NEUTRAL * strength * np.sin(2 * math.pi * across_m / row_m + rng.uniform(0, 6.0))
     for wheel_m in (9.5, 11.5):
         profile -= NEUTRAL * 0.16 * np.exp(-(((across_m - wheel_m) / 0.45) ** 2))
-    scale = steps * canvas.gsd_m / TRAM_M
+    scale = steps * canvas.gsd_m / WHEEL_TRACK_SPACING_M
     columns = np.arange(window[1].start, window[1].stop) + canvas.origin_px[0]
     rows = np.arange(window[0].start, window[0].stop) + canvas.origin_px[1]
     x = columns * (-math.sin(angle) * scale) % steps
@@ -119,13 +119,13 @@ def draw_line(canvas: Canvas, line: Line) -> None:
 
     verge = canvas.season.meadow
     if line.kind == "border":
-        stroke(_dimmed(verge, 0.86), line.width_m, canvas.colour)
+        stroke(_dim(verge, 0.86), line.width_m, canvas.colour)
     elif line.kind == "track":
         stroke(verge, line.width_m + 3.0, canvas.colour)
         stroke((138, 160, 172), line.width_m, canvas.colour)
         stroke(verge, 0.9, canvas.colour)  # grass between the wheel tracks
     else:
-        stroke(_dimmed(verge, 0.95), line.width_m + 4.0, canvas.colour)
+        stroke(_dim(verge, 0.95), line.width_m + 4.0, canvas.colour)
         stroke((128, 126, 124), line.width_m, canvas.colour)
         if line.kind == "road":
             stroke((176, 178, 178), 0.4, canvas.colour)
@@ -133,18 +133,18 @@ def draw_line(canvas: Canvas, line: Line) -> None:
         stroke((NEUTRAL, NEUTRAL, NEUTRAL), line.width_m, canvas.texture)
 
 
-def _dimmed(colour: Bgr, factor: float) -> Bgr:
+def _dim(colour: Bgr, factor: float) -> Bgr:
     return round(colour[0] * factor), round(colour[1] * factor), round(colour[2] * factor)
 
 
 def draw_water(canvas: Canvas, river: np.ndarray, mask: np.ndarray) -> None:
     """Draws river and lakes, also into ``mask`` (H, W) uint8."""
-    middle, half = river[:, :2], river[:, 2:] / 2
-    along = np.gradient(middle, axis=0)
+    centre_line, half = river[:, :2], river[:, 2:] / 2
+    along = np.gradient(centre_line, axis=0)
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(along[:, 0], along[:, 1])[:, None]
     for spread_m, colour in ((6.0, (56, 96, 80)), (1.5, (110, 136, 146)), (0.0, canvas.season.water)):
-        reach = half + spread_m
-        outline = np.concatenate([middle + normal * reach, (middle - normal * reach)[::-1]])
+        half_width = half + spread_m
+        outline = np.concatenate([centre_line + normal * half_width, (centre_line - normal * half_width)[::-1]])
         cv2.fillPoly(canvas.colour, [canvas.px(outline)], colour, cv2.LINE_AA, SHIFT)
     cv2.fillPoly(mask, [canvas.px(outline)], 255, cv2.LINE_AA, SHIFT)
 
@@ -157,8 +157,8 @@ def draw_shadows(canvas: Canvas, houses: list[House], trees: np.ndarray) -> None
         cv2.fillConvexPoly(canvas.shadow, canvas.px(hull.reshape(-1, 2)), 0, cv2.LINE_AA, SHIFT)
     feet, tips = canvas.px(trees[:, :2]), canvas.px(trees[:, :2] + step * trees[:, 3:4] * 0.75)
     width = np.maximum(1, np.round(trees[:, 2] * 1.7 / canvas.gsd_m).astype(int))
-    for foot, tip, thick in zip(feet.tolist(), tips.tolist(), width.tolist(), strict=True):
-        cv2.line(canvas.shadow, foot, tip, 0, thick, cv2.LINE_8, SHIFT)
+    for foot, tip, thickness in zip(feet.tolist(), tips.tolist(), width.tolist(), strict=True):
+        cv2.line(canvas.shadow, foot, tip, 0, thickness, cv2.LINE_8, SHIFT)
     cv2.blur(canvas.shadow, (3, 3), canvas.shadow)
 
 

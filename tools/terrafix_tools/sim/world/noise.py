@@ -1,16 +1,16 @@
-"""Noise of two kinds: tiles that repeat without a seam, and endless fields that are a function of place and seed."""
+"""Noise of two kinds: periodic tiles, and unbounded fields that are a function of position and seed."""
 
 import math
 
 import cv2
 import numpy as np
 
-LATTICE_SIGMA = 1.5  # lattice points for one deviation of a smooth field
-BORDER = 9  # lattice points around a window that smoothing and interpolation reach
+LATTICE_SIGMA = 1.5  # lattice points per standard deviation of a smooth field
+BORDER = 9  # lattice points around a window that smoothing and interpolation need
 
 
 def periodic_noise(rng: np.random.Generator, size: int, sigma_px: float) -> np.ndarray:
-    """Smooth noise that repeats without a seam: (size, size) float32, zero mean, unit deviation."""
+    """Returns smooth periodic noise: (size, size) float32, zero mean, unit deviation."""
     frequency = np.fft.fftfreq(size)
     gauss = np.exp(-2.0 * (math.pi * sigma_px * frequency) ** 2)
     spectrum = np.fft.rfft2(rng.normal(size=(size, size))) * gauss[:, None] * gauss[None, : size // 2 + 1]
@@ -19,31 +19,34 @@ def periodic_noise(rng: np.random.Generator, size: int, sigma_px: float) -> np.n
 
 
 def white(seed: int, column: int, row: int, width: int, height: int) -> np.ndarray:
-    """A window of an endless field of independent values: (height, width) float32, zero mean, unit deviation, uniform.
+    """Returns a window of an unbounded field of independent uniform values: (height, width) float32, zero mean, unit
+    deviation.
 
-    Integer hash of the place: "lowbias32" of C. Wellons (public domain)."""
+    Integer hash of the position: "lowbias32" of C. Wellons (public domain).
+    """
     x = np.arange(column, column + width).astype(np.uint32) * np.uint32(0x9E3779B1)
     y = (np.arange(row, row + height).astype(np.uint32) ^ np.uint32(seed & 0xFFFFFFFF)) * np.uint32(0x85EBCA77)
-    mixed = _mixed(y ^ np.uint32((seed >> 16) & 0xFFFFFFFF))[:, None] + x[None, :]
-    return (_mixed(mixed).astype(np.float32) - np.float32(2**31)) * np.float32(math.sqrt(12.0) / 2**32)
+    hashed = _hash(y ^ np.uint32((seed >> 16) & 0xFFFFFFFF))[:, None] + x[None, :]
+    return (_hash(hashed).astype(np.float32) - np.float32(2**31)) * np.float32(math.sqrt(12.0) / 2**32)
 
 
-def _mixed(h: np.ndarray) -> np.ndarray:
+def _hash(h: np.ndarray) -> np.ndarray:
     h = (h ^ (h >> np.uint32(16))) * np.uint32(0x7FEB352D)
     h = (h ^ (h >> np.uint32(15))) * np.uint32(0x846CA68B)
     return h ^ (h >> np.uint32(16))
 
 
 def smooth(seed: int, sigma_px: float, column: int, row: int, width: int, height: int) -> np.ndarray:
-    """A window of an endless smooth field: (height, width) float32, zero mean, unit deviation.
+    """Returns a window of an unbounded smooth field: (height, width) float32, zero mean, unit deviation.
 
-    White noise on a lattice, smoothed there and then interpolated: it is smooth enough for that to leave no trace of
-    the lattice, which would be a pattern that repeats."""
+    White noise on a lattice is smoothed and then interpolated; it is smooth enough that interpolation leaves no trace
+    of the lattice, which would be a periodic pattern.
+    """
     spacing_px = max(sigma_px / LATTICE_SIGMA, 1.0)
     sigma = sigma_px / spacing_px
     i, j = math.floor(column / spacing_px) - BORDER, math.floor(row / spacing_px) - BORDER
     columns, rows = math.ceil(width / spacing_px) + 2 * BORDER + 2, math.ceil(height / spacing_px) + 2 * BORDER + 2
-    unit = 2.0 * math.sqrt(math.pi) * sigma  # smoothing divides the deviation of white noise by this
+    unit = 2.0 * math.sqrt(math.pi) * sigma  # smoothing divides the standard deviation of white noise by this
     lattice = cv2.GaussianBlur(white(seed, i, j, columns, rows), (0, 0), sigma) * np.float32(unit)
     if spacing_px == 1.0:
         return np.ascontiguousarray(lattice[BORDER : BORDER + height, BORDER : BORDER + width])

@@ -1,7 +1,8 @@
-"""Draws a piece of a place (world_cells) as it looks from above in one season: ground, shadows, what stands on it.
+"""Renders a part of a place (world/cells.py) from above in one season: ground, shadows, objects.
 
-Two seasons share every edge and hardly any grey value: crops, ploughing, leaves, sun, cars and exposure differ. Every
-stroke is a function of the seed and of its place, so that pieces fit together without a seam."""
+Two seasons share every edge and hardly any grey value: crops, ploughing, leaves, sun, cars and exposure differ. All
+drawing is a function of the seed and of the position, so that parts join without a seam.
+"""
 
 import functools
 import math
@@ -16,13 +17,13 @@ from terrafix_tools.sim.world.piece import Piece, piece_of
 from terrafix_tools.sim.world.season import Season
 from terrafix_tools.sim.world.sprites import Sprites, crown_sprites, stamp_cars, stamp_houses, stamp_trees
 
-SOIL_M = (2.0, 6.0, 15.0, 45.0)  # sizes (1-sigma) of patches of soil, which show through any crop
-GRAIN_M, FINE_PX = 1.5, 0.7  # tufts and clods; what is finer than a pixel
-MARGIN_M = 56.0  # around a piece: the longest shadow of the lowest sun reaches this far
+SOIL_M = (2.0, 6.0, 15.0, 45.0)  # sizes (1-sigma) of soil patches, which are visible through any crop
+GRAIN_M, FINE_PX = 1.5, 0.7  # tufts and clods; structure below the pixel size
+MARGIN_M = 56.0  # around a part: the longest shadow of the lowest sun
 
 
 class Painter:
-    """A place in one season, north up, ``gsd_m`` metres a pixel. The country goes on beyond the place."""
+    """Renders a place in one season, north up, ``gsd_m`` metres a pixel; also beyond the edges of the place."""
 
     def __init__(self, layout: Layout, season: Season, gsd_m: float) -> None:
         self._layout, self._season, self._gsd_m = layout, season, gsd_m
@@ -33,12 +34,12 @@ class Painter:
         self._hills = np.clip(NEUTRAL * lit / math.sin(elevation), 0, 255).astype(np.uint8)
 
     def paint(self, column: int, row: int, width: int, height: int) -> np.ndarray:
-        """The pixels (height, width, 3) uint8 BGR from (column, row) of the place on, which may be negative."""
+        """Returns the pixels (height, width, 3) uint8 BGR from (column, row) of the place, which may be negative."""
         margin = math.ceil(MARGIN_M / self._gsd_m)
         canvas = self._canvas(column - margin, row - margin, width + 2 * margin, height + 2 * margin)
         x0_m, y0_m = canvas.origin_px[0] * self._gsd_m, canvas.origin_px[1] * self._gsd_m
         size_m = (width + 2 * margin) * self._gsd_m, (height + 2 * margin) * self._gsd_m
-        whole = self._drawn(canvas, piece_of(self._layout.seed, x0_m, y0_m, *size_m))
+        whole = self._draw(canvas, piece_of(self._layout.seed, x0_m, y0_m, *size_m))
         return np.ascontiguousarray(whole[margin : margin + height, margin : margin + width])
 
     def _canvas(self, column: int, row: int, width: int, height: int) -> Canvas:
@@ -54,11 +55,11 @@ class Painter:
             colour=np.full((height, width, 3), season.meadow, np.uint8),
             texture=np.full((height, width), NEUTRAL, np.uint8),
             shadow=np.full((height, width), 255, np.uint8),
-            soil=_layer(soil, 0.45),  # the soil stays where it is from season to season
+            soil=_layer(soil, 0.45),  # the soil is the same in all seasons
             grain=_layer(grain, 0.7),
         )
 
-    def _drawn(self, canvas: Canvas, piece: Piece) -> np.ndarray:
+    def _draw(self, canvas: Canvas, piece: Piece) -> np.ndarray:
         season, gsd_m = self._season, self._gsd_m
         for parcel in piece.parcels:
             draw_field(canvas, parcel)
@@ -70,10 +71,10 @@ class Painter:
         water = np.zeros_like(canvas.texture)
         for river in piece.rivers:
             draw_water(canvas, river, water)
-        ways = [one for one in piece.lines if one.kind in ("street", "road")]
-        for line in ways:
+        roads = [one for one in piece.lines if one.kind in ("street", "road")]
+        for line in roads:
             draw_line(canvas, line)
-        stamp_cars(canvas.colour, season, ways, gsd_m)
+        stamp_cars(canvas.colour, season, roads, gsd_m)
         houses = [h for h in piece.houses if season.name not in h.absent]
         draw_shadows(canvas, houses, piece.trees)
         image = _ground(canvas, self._hills, water)
@@ -94,12 +95,12 @@ def _sprites(seed: int, season: Season, gsd_m: float) -> Sprites:
 
 
 def _layer(noise: np.ndarray, weight: float) -> np.ndarray:
-    """(H, W) uint8 around NEUTRAL, 32 grey values for one deviation."""
+    """Converts noise to (H, W) uint8 around NEUTRAL, 32 grey values per standard deviation."""
     return np.clip(NEUTRAL + 32.0 * weight * noise, 0, 255).astype(np.uint8)
 
 
 def _ground(canvas: Canvas, hills: np.ndarray, water: np.ndarray) -> np.ndarray:
-    """Colour x texture x shadow x slope: (H, W, 3). ``hills``: the light on the posts of the elevation model."""
+    """Colour x texture x shadow x slope: (H, W, 3). ``hills``: illumination at the posts of the elevation model."""
     height, width = canvas.texture.shape
     canvas.texture[water > 0] = NEUTRAL
     dark = cv2.LUT(canvas.shadow, np.linspace(255 * canvas.season.shadow, 255, 256).astype(np.uint8))
@@ -115,7 +116,7 @@ def _ground(canvas: Canvas, hills: np.ndarray, water: np.ndarray) -> np.ndarray:
 
 
 def _expose(image: np.ndarray, season: Season) -> np.ndarray:
-    """The optics, the air and the film."""
+    """Applies optics, atmosphere and exposure."""
     image = cv2.GaussianBlur(image, (3, 3), 0.6)
     grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
     image = cv2.addWeighted(image, season.saturation, grey, 1.0 - season.saturation, 0.0)

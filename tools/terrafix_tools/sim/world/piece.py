@@ -1,4 +1,4 @@
-"""What of the country's cells lies in a box: the material for one canvas."""
+"""The content of the country's cells inside a box, for one canvas."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from terrafix_tools.sim.world.shapes import House, Line, Parcel
 
 @dataclass(frozen=True)
 class Piece:
-    """Metres count from the box's upper left corner. Lines are sorted as they are drawn: narrow ones first."""
+    """Metres are relative to the box's upper left corner. Lines are in drawing order: narrow ones first."""
 
     parcels: list[Parcel]
     lots: list[Parcel]
@@ -22,7 +22,7 @@ class Piece:
 
 
 def piece_of(seed: int, x0_m: float, y0_m: float, width_m: float, height_m: float) -> Piece:
-    """All that touches a box of plan metres."""
+    """Collects everything that touches a box of plan metres."""
     corner, far = np.array([x0_m, y0_m]), np.array([x0_m + width_m, y0_m + height_m])
     cells = [cell(seed, i, j) for i, j in cells_around(*corner, *far)]
 

@@ -1,7 +1,8 @@
-"""A generated place of any size: one plan, its looks in several seasons, a DEM, all georeferenced.
+"""A generated place of any size: one plan, rendered in several seasons, with a DEM, georeferenced.
 
-Nothing here is real; the seed decides everything. A place is a piece of an endless country that is made where somebody
-looks, so that its size costs no memory."""
+The place is a function of the seed and has no real counterpart. It is a part of an unbounded country that is rendered
+on demand, so that its size needs no memory.
+"""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -32,11 +33,11 @@ EPSG = 32633  # UTM 33 north
 WEST_M, NORTH_M = (
     451_000.0,
     5_334_000.0,
-)  # upper left corner, UTM; west of the central meridian: grid north is not north
-SMALLEST_M, LARGEST_KM2 = 100.0, 100.0
-PIECE_PX = 2048  # a whole look is painted in pieces of this size; a multiple of the blocks of a GeoTIFF
-COARSE = 3  # level of the view that is painted anew: from high up the country is drawn coarser, not made smaller
-JPEG_QUALITY = 90  # of the map's tiles: invisible, and a tenth of the size
+)  # upper left corner, UTM; west of the central meridian, so that grid north differs from true north
+MIN_SIDE_M, MAX_AREA_KM2 = 100.0, 100.0
+PIECE_PX = 2048  # a whole season is rendered in parts of this size; a multiple of the blocks of a GeoTIFF
+COARSE_LEVEL = 3  # pyramid level that is rendered at its own resolution instead of by downsampling
+JPEG_QUALITY = 90  # of the map's tiles: no visible loss at a tenth of the size
 
 
 @dataclass(frozen=True)
@@ -72,28 +73,30 @@ class World:
         """Rows and columns of the image."""
         return round(self.layout.height_m / self.gsd_m), round(self.layout.width_m / self.gsd_m)
 
-    def look(self, season: str) -> np.ndarray:
-        """The whole place in a season (a key of SEASONS) in memory, 12 MB a km2: (H, W, 3) uint8 BGR."""
+    def render(self, season: str) -> np.ndarray:
+        """Renders the whole place in a season (a key of SEASONS) in memory, 12 MB a km2: (H, W, 3) uint8 BGR."""
         image = np.empty((*self.shape, 3), np.uint8)
         for rows, columns, part in self._pieces(season):
             image[rows, columns] = part
         return image
 
     def ground(self, season: str, frame: LocalFrame) -> Ground:
-        """The place in a season as a camera sees it, made where it looks: any size. It goes on beyond its edges."""
+        """Returns the ground in a season for a camera, rendered on demand; it continues beyond the place's edges."""
         crs = CRS.from_epsg(EPSG)
-        fine, coarse = (Painter(self.layout, SEASONS[season], gsd_m) for gsd_m in (self.gsd_m, self.gsd_m * 2**COARSE))
+        fine, coarse = (
+            Painter(self.layout, SEASONS[season], gsd_m) for gsd_m in (self.gsd_m, self.gsd_m * 2**COARSE_LEVEL)
+        )
 
         def make(level: int, i: int, j: int) -> np.ndarray | None:
-            if level not in (0, COARSE):
+            if level not in (0, COARSE_LEVEL):
                 return None
             return (fine if level == 0 else coarse).paint(i * TILE_PX, j * TILE_PX, TILE_PX, TILE_PX)
 
         relief = Relief(self.dem_amsl_m, fit(self.utm_from_dem, self.dem_amsl_m.shape, crs, frame))
         return Ground(Pyramid(make), fit(self.utm_from_px, self.shape, crs, frame), relief)
 
-    def write_look(self, path: Path, season: str) -> None:
-        """The place in a season as a georeferenced RGB GeoTIFF, piece by piece. Raises OutputError."""
+    def write_rendering(self, path: Path, season: str) -> None:
+        """Writes the place in a season as a georeferenced RGB GeoTIFF, part by part. Raises OutputError."""
         with _image_file(path, self, self.shape) as file:
             for rows, columns, part in self._pieces(season):
                 file.write(_rgb(part), window=Window.from_slices(rows, columns))
@@ -108,25 +111,26 @@ class World:
 
 
 def generate(seed: int, *, width_m: float = WIDTH_M, height_m: float = HEIGHT_M, gsd_m: float = GSD_M) -> World:
-    """The place that belongs to ``seed``. The plan does not depend on ``gsd_m``, nor on the size: more is seen of it.
+    """Returns the place of ``seed``. The plan is independent of ``gsd_m`` and of the size, which only sets the extent.
 
-    Raises UsageError: no size, or more than LARGEST_KM2."""
-    if not (width_m >= SMALLEST_M and height_m >= SMALLEST_M and width_m * height_m <= LARGEST_KM2 * 1e6):
+    Raises UsageError when it is too small or larger than MAX_AREA_KM2.
+    """
+    if not (width_m >= MIN_SIDE_M and height_m >= MIN_SIDE_M and width_m * height_m <= MAX_AREA_KM2 * 1e6):
         raise UsageError(
-            f"a world of {width_m:g} x {height_m:g} m: choose at least {SMALLEST_M:g} m a side and at most "
-            f"{LARGEST_KM2:g} km2"
+            f"a world of {width_m:g} x {height_m:g} m: choose at least {MIN_SIDE_M:g} m a side and at most "
+            f"{MAX_AREA_KM2:g} km2"
         )
     return World(seed, plan(seed, width_m, height_m), gsd_m)
 
 
 def write_image(path: Path, world: World, image_bgr: np.ndarray) -> None:
-    """Georeferenced RGB GeoTIFF of a look in memory. Raises OutputError."""
+    """Writes a rendered image as a georeferenced RGB GeoTIFF. Raises OutputError."""
     with _image_file(path, world, image_bgr.shape[:2]) as file:
         file.write(_rgb(image_bgr))
 
 
 def write_dem(path: Path, world: World) -> None:
-    """Georeferenced elevation GeoTIFF, metres AMSL. Raises OutputError."""
+    """Writes the DEM as a georeferenced GeoTIFF, metres AMSL. Raises OutputError."""
     height, width = world.dem_amsl_m.shape
     profile = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "float32"}
     with _file(path, profile | {"compress": "deflate", "transform": world.utm_from_dem}) as file:

@@ -11,12 +11,12 @@ from terrafix_tools.sim.world.shapes import House, Line, Parcel, Warp, densify, 
 
 LOT_AREA_M2 = (700.0, 1_300.0)  # a house with its garden
 TREE_SPACING_M = 6.5  # in a wood
-LIVED_IN = 0.85  # share of the lots with a house
-UNCHANGED = 0.88  # share of the houses that stand at both dates
+HOUSE_SHARE = 0.85  # share of the lots with a house
+PERMANENT_SHARE = 0.88  # share of the houses that exist at both dates
 
 
 def trees_at(rng: np.random.Generator, points: np.ndarray, kind: int | np.ndarray) -> np.ndarray:
-    """(N, 2) -> (N, 6): the columns of Cell.trees."""
+    """Converts (N, 2) positions to (N, 6): the columns of Cell.trees."""
     kinds = np.broadcast_to(np.asarray(kind), len(points))
     radius = rng.uniform(0.75, 1.3, len(points)) * np.array([3.6, 2.6, 2.0, 1.3])[kinds]
     height = rng.uniform(0.8, 1.2, len(points)) * np.array([11.0, 14.0, 4.0, 2.0])[kinds]
@@ -24,7 +24,7 @@ def trees_at(rng: np.random.Generator, points: np.ndarray, kind: int | np.ndarra
 
 
 def _grid_in(rng: np.random.Generator, outline: np.ndarray, angle: float, step_m: float, jitter_m: float) -> np.ndarray:
-    """Points of a jittered grid inside an outline (N, 2)."""
+    """Returns points of a jittered grid inside an outline (N, 2)."""
     centre = outline.mean(axis=0)
     reach = float(np.hypot(*(outline - centre).T).max())
     ticks = np.arange(-reach, reach, step_m)
@@ -32,8 +32,8 @@ def _grid_in(rng: np.random.Generator, outline: np.ndarray, angle: float, step_m
     c, s = math.cos(angle), math.sin(angle)
     points = grid @ np.array([[c, s], [-s, c]]) + centre + rng.normal(0.0, jitter_m, grid.shape)
     contour = outline.astype(np.float32)
-    keep = [cv2.pointPolygonTest(contour, (float(x), float(y)), False) > 0 for x, y in points]
-    return points[np.array(keep, dtype=bool)]
+    inside = [cv2.pointPolygonTest(contour, (float(x), float(y)), False) > 0 for x, y in points]
+    return points[np.array(inside, dtype=bool)]
 
 
 def wood(rng: np.random.Generator, outline: np.ndarray) -> np.ndarray:
@@ -48,19 +48,19 @@ def orchard(rng: np.random.Generator, outline: np.ndarray, angle: float) -> np.n
 
 
 def scattered(rng: np.random.Generator, outline: np.ndarray, per_ha: float) -> np.ndarray:
-    """Trees and bushes that stand alone in a field, some in twos and threes."""
+    """Single trees and bushes in a field, partly in small groups."""
     low, high = outline.min(axis=0), outline.max(axis=0)
     count = rng.poisson(per_ha * float(np.prod(high - low)) / 1e4)
     places = rng.uniform(low, high, (count, 2))
     groups = rng.integers(1, 4, count)
     spots = np.repeat(places, groups, axis=0) + rng.normal(0.0, 4.0, (int(groups.sum()), 2))
     contour = outline.astype(np.float32)
-    keep = np.array([cv2.pointPolygonTest(contour, (float(x), float(y)), False) > 0 for x, y in spots], dtype=bool)
-    return trees_at(rng, spots[keep], rng.choice([0, 1, 3, 3], int(keep.sum())))
+    inside = np.array([cv2.pointPolygonTest(contour, (float(x), float(y)), False) > 0 for x, y in spots], dtype=bool)
+    return trees_at(rng, spots[inside], rng.choice([0, 1, 3, 3], int(inside.sum())))
 
 
 def row_of_trees(rng: np.random.Generator, points: np.ndarray, width_m: float) -> np.ndarray:
-    """A hedge or an avenue beside a line."""
+    """A hedge or an avenue along a line."""
     side = width_m / 2 + 2.5
     spots = []
     for start, end in itertools.pairwise(points):
@@ -87,9 +87,9 @@ def village(
         angle = long_axis(outline) + (math.pi / 2 if rng.random() < 0.3 else 0.0)
         lots.append(Parcel(outline, "garden", angle, int(rng.integers(1 << 31))))
         centre = outline.mean(axis=0)
-        if rng.random() < LIVED_IN:
+        if rng.random() < HOUSE_SHARE:
             size = (rng.uniform(9.0, 15.0), rng.uniform(7.0, 10.0))
-            changed = rng.random() >= UNCHANGED
+            changed = rng.random() >= PERMANENT_SHARE
             absent = (
                 tuple(str(n) for n in rng.choice(list(SEASONS), len(SEASONS) // 2, replace=False)) if changed else ()
             )
@@ -105,7 +105,7 @@ def village(
 
 
 def farms(rng: np.random.Generator, lines: list[Line], houses: list[House], lots: list[Parcel], count: int) -> None:
-    """A few yards with big barns beside tracks."""
+    """A few yards with large barns next to tracks."""
     tracks = [line for line in lines if line.kind == "track" and len(line.points_m) > 4]
     for index in rng.choice(len(tracks), min(count, len(tracks)), replace=False):
         points = tracks[index].points_m

@@ -1,4 +1,4 @@
-"""How a generated place looks at a date: sun, crops, leaves, water, exposure."""
+"""Appearance of a generated place at a date: sun, crops, leaves, water, exposure."""
 
 from dataclasses import dataclass
 
@@ -8,10 +8,10 @@ Bgr = tuple[int, int, int]
 @dataclass(frozen=True)
 class Season:
     name: str
-    key: int  # seed of what this date alone decides
+    key: int  # seed of everything specific to this date
     sun_azimuth_deg: float
     sun_elevation_deg: float
-    crops: tuple[tuple[Bgr, float], ...]  # mean colour, strength of the rows
+    crops: tuple[tuple[Bgr, float], ...]  # mean colour, contrast of the rows
     meadow: Bgr
     forest_floor: Bgr
     water: Bgr
@@ -20,7 +20,7 @@ class Season:
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)  # exposure and white balance
     gamma: float = 1.0
     saturation: float = 0.75
-    haze: float = 0.0  # share of bluish white mixed in
+    haze: float = 0.0  # share of bluish white
 
 
 SUMMER = Season(

@@ -1,4 +1,4 @@
-"""Shapes of a generated place: parcels, lines, houses, and the cutting and bending that makes them."""
+"""Shapes of a generated place: parcels, lines, houses, and their subdivision and warping."""
 
 import math
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-WARP_M = 9.0  # nothing in a landscape is quite straight
+WARP_M = 9.0  # amplitude: natural boundaries are not straight
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Parcel:
     outline_m: np.ndarray  # (N, 2)
     kind: str  # "crop", "meadow", "wood", "orchard", "village"
     row_angle_rad: float  # direction of the crop rows
-    key: int  # seed of everything that a season draws for this parcel
+    key: int  # seed of the season's variation of this parcel
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class House:
     angle_rad: float
     height_m: float
     roof: int  # colour index
-    key: int  # seed of what a season draws for it
-    absent: tuple[str, ...] = ()  # seasons in which it is not there: it was built or pulled down in between
+    key: int  # seed of the season's variation of this house
+    absent: tuple[str, ...] = ()  # seasons in which it does not exist: built or demolished in between
 
 
 class Warp:
-    """Bends straight plans a little: plan metres (N, 2) -> plan metres (N, 2)."""
+    """Warps straight plans slightly: plan metres (N, 2) -> plan metres (N, 2)."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._waves = [(rng.uniform(350.0, 900.0), rng.uniform(0.0, 2 * math.pi, 2)) for _ in range(3)]
@@ -53,7 +53,7 @@ class Warp:
 
 
 def densify(points: np.ndarray, step_m: float = 25.0) -> np.ndarray:
-    """More points along the edges; a polygon is closed, a line of two points is not."""
+    """Adds points along the edges; a polygon is closed, a line of two points is not."""
     ends = np.roll(points, -1, axis=0) if len(points) > 2 else points[1:]
     pieces = []
     for start, end in zip(points, ends, strict=False):
@@ -81,7 +81,7 @@ def divide(
     cuts: list[tuple[int, np.ndarray]],
     depth: int = 0,
 ) -> Iterator[np.ndarray]:
-    """Cuts a convex polygon across its long axis until the pieces are as small as a draw from ``area_m2``."""
+    """Cuts a convex polygon across its long axis until the parts are as small as a random value from ``area_m2``."""
     if _area(poly) < rng.uniform(*area_m2) * 1.5:
         yield poly
         return
@@ -97,7 +97,9 @@ def divide(
 
 
 def _cut(poly: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Convex polygon and signed distances of its corners -> the negative part, the positive part, the cut (2, 2)."""
+    """Splits a convex polygon by the signed distances of its corners; returns the negative part, the positive part and
+    the cut (2, 2).
+    """
     parts: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     crossing: list[np.ndarray] = []
     for i in range(len(poly)):

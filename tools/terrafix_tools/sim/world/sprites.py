@@ -1,4 +1,4 @@
-"""Things that stand on the ground of a generated place, drawn on top of it: tree crowns, roofs, cars."""
+"""Objects on the ground of a generated place, drawn on top of it: tree crowns, roofs, cars."""
 
 import math
 
@@ -19,18 +19,18 @@ ROOFS: tuple[Bgr, ...] = (
     (96, 108, 150),
 )
 CARS: tuple[Bgr, ...] = ((235, 235, 235), (40, 40, 44), (60, 60, 190), (170, 120, 60), (150, 150, 150))
-VARIANTS = 4  # different crowns for a size and colour
+VARIANTS = 4  # number of different crowns per size and colour
 SIZES_M = np.arange(0.75, 5.25, 0.5)  # crown radii
 ROOF_COLOUR_CHANGES = 0.08  # share of the houses whose roof differs between two dates
 
 Sprite = tuple[np.ndarray, np.ndarray]  # colours (n, n, 3) uint8, mask (n, n) bool
-Sprites = list[list[list[Sprite]]]  # by kind of tree, by size, the variants
+Sprites = list[list[list[Sprite]]]  # by kind of tree and size, the variants
 
 
 def crown_sprites(
     rng: np.random.Generator, palette: tuple[tuple[Bgr, ...], ...], sun_azimuth_deg: float, gsd_m: float
 ) -> Sprites:
-    """Crowns for every kind of tree: lit from the sun's side, ragged at the edge."""
+    """Crowns for every kind of tree: lit from the sun's side, with an irregular edge."""
     azimuth = math.radians(sun_azimuth_deg)
     sun = (math.sin(azimuth), -math.cos(azimuth))
     return [
@@ -44,16 +44,16 @@ def _crown(rng: np.random.Generator, colour: Bgr, sun: tuple[float, float], radi
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1] / radius_px
     angle = np.arctan2(y, x)
     edge = 1.0 + sum(0.09 * np.sin(k * angle + rng.uniform(0, 6.3)) for k in (3, 5, 8))
-    away = np.hypot(x, y) / edge
-    dome = np.sqrt(np.clip(1.0 - away**2, 0.0, 1.0))
+    radius = np.hypot(x, y) / edge
+    dome = np.sqrt(np.clip(1.0 - radius**2, 0.0, 1.0))
     light = 0.62 + 0.30 * dome + 0.38 * (x * sun[0] + y * sun[1])
     light = light * (1.0 + 0.14 * rng.normal(size=x.shape)) * rng.normal(1.0, 0.08)
     pixels = np.clip(light[..., None] * np.array(colour) * 1.1, 0, 255).astype(np.uint8)
-    return pixels, away < 1.0
+    return pixels, radius < 1.0
 
 
 def stamp_trees(image: np.ndarray, trees: np.ndarray, sprites: Sprites, gsd_m: float) -> None:
-    """Puts a crown at every tree (N, 6), low ones first."""
+    """Draws a crown at every tree (N, 6), low ones first."""
     height, width = image.shape[:2]
     order = trees[np.argsort(trees[:, 3], kind="stable")]
     size = np.clip(np.searchsorted(SIZES_M, order[:, 2] - 0.25), 0, len(SIZES_M) - 1)
@@ -69,7 +69,7 @@ def stamp_trees(image: np.ndarray, trees: np.ndarray, sprites: Sprites, gsd_m: f
 
 
 def stamp_houses(image: np.ndarray, houses: list[House], season: Season, gsd_m: float) -> None:
-    """Gable roofs: the side that faces the sun is brighter."""
+    """Draws gable roofs; the side that faces the sun is brighter."""
     azimuth = math.radians(season.sun_azimuth_deg)
     sun = np.array([math.sin(azimuth), -math.cos(azimuth)])
     for house in houses:
@@ -89,7 +89,7 @@ def stamp_houses(image: np.ndarray, houses: list[House], season: Season, gsd_m: 
 
 
 def stamp_cars(image: np.ndarray, season: Season, lines: list[Line], gsd_m: float) -> None:
-    """Traffic: other cars in every season."""
+    """Draws traffic, different in every season."""
     for line in lines:
         rng = np.random.default_rng([line.key, season.key])
         for start, end in zip(line.points_m[:-1], line.points_m[1:], strict=True):

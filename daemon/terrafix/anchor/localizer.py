@@ -1,0 +1,305 @@
+"""Localization of one frame on the map: correlation, point-mass filter, camera pose, verdict."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from terrafix.anchor.frame_pose import (
+    REPORTED_MODES,
+    Observation,
+    PoseResult,
+    decide,
+    estimate_pose,
+    heading_is_unknown,
+    with_belief,
+)
+from terrafix.anchor.matching.descriptor_cache import Describer
+from terrafix.anchor.matching.frame_matcher import View, view_at
+from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
+from terrafix.anchor.matching.match_message import pose_match
+from terrafix.anchor.matching.point_mass_filter import Belief, belief_cell_m
+from terrafix.anchor.matching.predicted_view import (
+    VAR_E,
+    VAR_N,
+    VAR_STEP_E,
+    VAR_STEP_N,
+    ground_plane,
+    position_sigma_m,
+    tilt_sigma_rad,
+    view_of,
+)
+from terrafix.anchor.relocalization.hypothesis_tracker import NEIGHBOUR_RADIUS
+from terrafix.anchor.relocalization.position_prior import distance_outside_m
+from terrafix.anchor.relocalization.relocalizer import Relocalizer, mixed_sigma_m, search_centre
+from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
+from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.core.limits import MIN_MATCHING_AGL_M
+from terrafix.core.node import Image
+from terrafix.map.null_model import FalseAlarmBudget
+from terrafix.map.package import MapPackage
+from terrafix.messages import HintVerdict, MapMatch, Origin, PositionHint, Prediction, SearchStep, Verdict
+
+NEW_GROUND_SHARE = 0.35  # share of the footprint: motion after which an observation counts in full [tuned]
+MIN_OBSERVATION_WEIGHT = 0.08  # weight of another observation of the same ground [tuned]
+# A start coordinate that is wrong by far more than its 1-sigma: its probability (the belief's uniform share), and the
+# window that the belief keeps for it until a pose confirms the position, in sigmas and at most in metres. [tuned]
+START_UNIFORM_SHARE, START_WINDOW_SIGMAS, START_WINDOW_MAX_M = float(np.exp(-START_LOG_ODDS)), 8.0, 500.0
+# 1-sigma, metres: the apparent position also contains the tilt error, which is not known at the start [tuned]
+START_SIGMA_FLOOR_M = 8.0
+# Radians, upper bound of the process noise by tilt: the belief follows the position from which the image seems to be
+# taken, and a change of the tilt error by one degree between frames moves it. A tilt that is known better contributes
+# less. It is added per frame, and a slow copter at two frames a second observes little new ground to remove it. [tuned]
+TILT_JITTER = 0.02
+# Standardised correlation at the mode that counts as poor; a frame at the right place has 3 to 10. [tuned]
+POOR_SCORE = 2.0
+MAX_POOR_WEIGHT = 4.0  # consecutive full observations below it before the window is widened [tuned]
+WIDEN_FACTOR = 1.6  # of the window's half width [tuned]
+CELL_RATIO_MIN, CELL_RATIO_MAX = 0.4, 2.5  # hysteresis of a belief cell's octave [tuned]
+OFF_MAP_SIGMAS = 3.0  # sigmas outside of the map within which the vehicle may still be over it [tuned]
+FOUND_SIGMA_M = 10.0  # 1-sigma of a relocalized place, for the initial belief there [tuned]
+
+
+class Localizer:
+    """State of the localization in one flight. Per frame: ``predict``, ``apply_prior`` if there is one, ``localize``,
+    ``label_step``.
+
+    ``ce90_m``: accuracy of map layers that state none; ``store_folder``: folder in memory for computed descriptors.
+    """
+
+    def __init__(
+        self, package: MapPackage | None, describer: Describer, ce90_m: float, store_folder: Path | None = None
+    ) -> None:
+        self._package = package
+        self._describer = describer
+        self._ce90_m = ce90_m
+        self._store_folder = store_folder
+        self._layers: MapLayers | None = None
+        self._origin: Origin | None = None
+        self._ground_m = 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Discards all knowledge of the position."""
+        self._belief: Belief | None = None
+        self._lock_monitor = LockMonitor()
+        self._relocalizer = Relocalizer()
+        self._single_frame_budget = FalseAlarmBudget()
+        self._since_observation_m = np.inf  # motion since the last observation
+        self._poor_weight = 0.0
+        self._variance_m2 = 0.0  # horizontal position variance of the last prediction
+        self._disconnected = False  # odometry does not connect this frame to the one before
+        self._fragment_open = False  # no match since then connects the frames to what came before
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there is a map, and an origin of the flight on it."""
+        return self._layers is not None
+
+    def begin_flight(self, origin: Origin) -> None:
+        """Binds the map to the flight's local frame and camera."""
+        self._origin = origin
+        self._ground_m = origin.ground_amsl_m or 0.0
+        self.reset()
+        self._open_layers(origin)
+
+    def _open_layers(self, origin: Origin) -> None:
+        if self._package is not None:
+            frame, camera = LocalFrame(origin.lat_deg, origin.lon_deg), CameraCalibration.of(origin.camera)
+            self._layers = MapLayers(self._package, frame, camera, self._describer, self._ce90_m, self._store_folder)
+
+    def replace_describer(self, describer: Describer, agl_m: float) -> None:
+        """Continues with another describer. The belief is kept; a running search restarts."""
+        self._describer = describer
+        if self._origin is not None and self._layers is not None:
+            self._open_layers(self._origin)
+            if self._relocalizer.is_active:
+                self._relocalizer.start(self._layers.best, agl_m, None)
+
+    def predict(self, prediction: Prediction) -> None:
+        """Moves belief and search by odometry. The first prediction of a flight initialises the belief."""
+        if self._layers is None or self._origin is None:
+            return
+        self._layers.set_distortion(prediction.lens)
+        best = self._layers.best
+        cell_m = belief_cell_m(prediction.agl_m, best.matcher.correlation_cell_m(prediction.agl_m))
+        step_m = float(np.hypot(*prediction.step_m))
+        variance = max(prediction.cov[VAR_E], prediction.cov[VAR_N])
+        step_var = max(prediction.step_cov_m2[VAR_STEP_E], prediction.step_cov_m2[VAR_STEP_N])
+        # Without matches the position error grows by the velocity error, faster than the sum of the steps' own errors.
+        growth = variance - self._variance_m2
+        self._variance_m2 = variance
+        unknown_heading = heading_is_unknown(prediction)  # the direction of the step is unknown
+        sigma_m = float(np.sqrt(step_var if unknown_heading else max(step_var, growth)))
+        self._disconnected = self._belief is not None and sigma_m > NEIGHBOUR_RADIUS * prediction.agl_m
+        if self._belief is None:
+            sigma_m = self._initialize_belief(prediction, best, self._origin, cell_m)
+        elif self._relocalizer.is_active:
+            # The search has its own yaw and scale per track, so their error is not part of the step's error.
+            self._relocalizer.predict(prediction.step_m, float(np.sqrt(step_var)))
+        else:
+            if unknown_heading:
+                sigma_m = float(np.sqrt(max(step_var + step_m**2, growth)))
+            self._relocalizer.predict(prediction.step_m, float(np.sqrt(step_var)))  # for the sequential test
+            self._predict_belief(self._belief, prediction, sigma_m, cell_m)
+        self._since_observation_m += float(np.hypot(step_m, sigma_m))
+
+    def _initialize_belief(self, prediction: Prediction, best: MapLayer, origin: Origin, cell_m: float) -> float:
+        """Belief around the first prediction; starts a search if the start is unknown. -> 1-sigma of the belief."""
+        e_m, n_m, _ = prediction.p_c_in_w_m
+        start = position_sigma_m(prediction)
+        tilt = prediction.agl_m * tilt_sigma_rad(prediction)
+        sigma_m = float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt))
+        window_m = min(START_WINDOW_SIGMAS * sigma_m, START_WINDOW_MAX_M)
+        self._belief = Belief(e_m, n_m, sigma_m, cell_m, START_UNIFORM_SHARE, window_m)
+        # A prediction more precise than that start was found before: this process was restarted in flight.
+        if origin.start_sigma_m > SEARCH_START_SIGMA_M and start > 0.5 * SEARCH_START_SIGMA_M:
+            self._relocalizer.start(best, prediction.agl_m, search_centre(e_m, n_m, origin.start_sigma_m, best.map))
+        return sigma_m
+
+    @staticmethod
+    def _predict_belief(belief: Belief, prediction: Prediction, sigma_m: float, cell_m: float) -> None:
+        jitter = min(TILT_JITTER, tilt_sigma_rad(prediction))
+        belief.predict(*prediction.step_m, float(np.hypot(sigma_m, jitter * prediction.agl_m)))
+        belief.fit_window(0.0)
+        if not CELL_RATIO_MIN < cell_m / belief.cell_m < CELL_RATIO_MAX:
+            belief.set_cell(cell_m)
+
+    def apply_prior(self, hint: PositionHint, prediction: Prediction) -> HintVerdict:
+        """An external position prior at this prediction; needs ``is_ready``."""
+        assert self._layers is not None and self._origin is not None
+        return self._relocalizer.apply_prior(
+            hint, self._origin, prediction, self._layers.best, self._lock_monitor.log_odds
+        )
+
+    def localize(self, prediction: Prediction, image: Image | None) -> MapMatch:
+        """Matches the frame of this prediction with the map. ``image`` None: the frame is not usable. Raises
+        ModelRunError."""
+        match = self.no_match(prediction, Verdict.OUTSIDE_MAP)
+        if self._layers is None or self._belief is None:
+            return match
+        best = self._layers.best
+        match = msgspec.structs.replace(match, map_sigma_m=best.sigma_m, lens=prediction.lens)
+        if self._relocalizer.is_active:
+            return self._search(match, prediction, image, best)
+        if image is None:
+            return msgspec.structs.replace(match, verdict=Verdict.BAD_IMAGE, step=SearchStep.SKIP)
+        return self._track(match, prediction, image, self._layers, self._belief)
+
+    def no_match(self, prediction: Prediction, verdict: Verdict) -> MapMatch:
+        """A MapMatch without a result."""
+        return MapMatch(
+            t_ns=prediction.t_ns,
+            frame_id=prediction.frame_id,
+            verdict=verdict,
+            matcher=self._describer.name,
+            lost_sigma_m=self._relocalizer.sigma_m,
+        )
+
+    def model_failed(self, prediction: Prediction) -> MapMatch:
+        """The MapMatch of a frame on which the learned model failed."""
+        match = msgspec.structs.replace(self.no_match(prediction, Verdict.MODEL_FAILED), step=SearchStep.SKIP)
+        return self._relocalizer.search_match(match) if self._relocalizer.is_active else match
+
+    def label_step(self, match: MapMatch) -> MapMatch:
+        """``match`` with the step of the search escalation, where that is a new fragment or a merge."""
+        if match.step is SearchStep.SKIP:
+            return match
+        if self._disconnected:
+            self._fragment_open = True
+            return msgspec.structs.replace(match, step=SearchStep.NEW_FRAGMENT)
+        if match.found or (self._fragment_open and match.verdict is Verdict.ACCEPTED and not match.coarse):
+            self._fragment_open = False
+            return msgspec.structs.replace(match, step=SearchStep.MERGE)
+        return match
+
+    def _search(self, match: MapMatch, prediction: Prediction, image: Image | None, best: MapLayer) -> MapMatch:
+        usable = image if prediction.agl_m >= MIN_MATCHING_AGL_M else None
+        match = self._relocalizer.process_frame(match, prediction, usable, best, self._ground_m)
+        if match.found:
+            self._lock_monitor = LockMonitor()
+            cell_m = belief_cell_m(prediction.agl_m, best.matcher.correlation_cell_m(prediction.agl_m))
+            self._belief = Belief(match.mode_e_m, match.mode_n_m, FOUND_SIGMA_M, cell_m)
+        return match
+
+    def _track(
+        self, match: MapMatch, prediction: Prediction, image: Image, layers: MapLayers, belief: Belief
+    ) -> MapMatch:
+        """Update of the belief with one frame, and the pose in its best mode."""
+        best = layers.best
+        e_m, n_m, _ = prediction.p_c_in_w_m
+        ground, relief_m = ground_plane(best.map, e_m, n_m, prediction.agl_m)
+        view = view_of(prediction, ground, self._ground_m)
+        match = msgspec.structs.replace(match, ground=ground, relief_m=relief_m)
+        if view.agl_m < MIN_MATCHING_AGL_M:
+            return msgspec.structs.replace(match, verdict=Verdict.TOO_LOW)
+        seen = self._correlate(image, view, layers, belief)
+        match = msgspec.structs.replace(match, map_sigma_m=seen.layer.sigma_m)
+        if seen.correlation.verdict is Verdict.OUTSIDE_MAP and self._may_be_on_map(best, prediction):
+            # Dead reckoning over minutes can leave the map; no further correlation would be possible there.
+            self._relocalizer.start(best, prediction.agl_m, None)
+            return self._relocalizer.search_match(match)
+        if seen.correlation.verdict is not Verdict.ACCEPTED:
+            return msgspec.structs.replace(match, verdict=seen.correlation.verdict)
+        self._since_observation_m = 0.0
+        gain = belief.update(seen.correlation.surfaces, seen.weight)
+        modes = belief.modes(REPORTED_MODES)
+        hypothesis, score = seen.correlation.best_at(modes[0].e_m, modes[0].n_m)
+        self._widen_if_poor(belief, score, seen.weight)
+        match = with_belief(match, belief, modes, score)
+        sigma_m = position_sigma_m(prediction)
+        pose = estimate_pose(match, prediction, seen, modes[0], hypothesis)
+        if not pose.attempted and seen.new >= 1.0 and has_wide_sigma(sigma_m, view.agl_m):
+            pose = self._localize_alone(pose, seen, belief)
+        self._lock_monitor.update(gain, seen.weight, seen.new, pose.inliers, sigma_m, view.agl_m)
+        mode_view = view_at(view, hypothesis, pose.mode.e_m, pose.mode.n_m) if pose.attempted else None
+        tested = self._relocalizer.test_frame(image, mode_view)
+        # Mixture "believed position, or anywhere": the variance that the second component adds.
+        wrong = max(self._lock_monitor.wrong_probability, tested)
+        self._relocalizer.sigma_m = mixed_sigma_m(wrong, best.map)
+        match = msgspec.structs.replace(pose.match, lost_sigma_m=self._relocalizer.sigma_m)
+        if self._lock_monitor.lost or wrong == 1.0:
+            around_m = prediction.p_c_in_w_m[:2] if tested < 1.0 else None
+            self._relocalizer.start(best, prediction.agl_m, around_m)
+            return self._relocalizer.search_match(match)
+        return decide(match, pose, belief, seen, score)
+
+    def _correlate(self, image: Image, view: View, layers: MapLayers, belief: Belief) -> Observation:
+        results = layers.correlate(image, view, belief)
+        footprint_m = max(result.footprint_m for result in results.values())
+        new = min(self._since_observation_m / (NEW_GROUND_SHARE * footprint_m), 1.0)
+        weight = max(new, MIN_OBSERVATION_WEIGHT)
+        used, correlation = layers.select(results, belief.mode(), weight)
+        return Observation(image, view, used, correlation, new, weight)
+
+    @staticmethod
+    def _may_be_on_map(best: MapLayer, prediction: Prediction) -> bool:
+        """Whether a position outside of the map has so large a sigma that the vehicle may be over the map."""
+        e_m, n_m, _ = prediction.p_c_in_w_m
+        off_m = distance_outside_m((e_m, n_m), best.map.bounds_m)
+        sigma_m = position_sigma_m(prediction)
+        return has_wide_sigma(sigma_m, prediction.agl_m) and off_m <= OFF_MAP_SIGMAS * sigma_m
+
+    def _widen_if_poor(self, belief: Belief, score: float, weight: float) -> None:
+        """Widens the window after several observations that do not fit the best mode."""
+        self._poor_weight = self._poor_weight + weight if score < POOR_SCORE else 0.0
+        if self._poor_weight >= MAX_POOR_WEIGHT:
+            self._poor_weight = 0.0
+            belief.fit_window(belief.half_m * WIDEN_FACTOR)
+
+    def _localize_alone(self, pose: PoseResult, seen: Observation, belief: Belief) -> PoseResult:
+        """Selection of a mode by the patches of this frame alone; ``pose`` itself if no mode is selected."""
+        view, layer = seen.view, seen.layer
+        self._single_frame_budget.spend()
+        null, log_probability = layer.null_at(view.agl_m), self._single_frame_budget.log_probability
+        place = localize_single_frame(
+            seen.image, view, seen.correlation, belief.modes(MAX_MODES), layer.map, layer.matcher, null, log_probability
+        )
+        if place is None:
+            return pose
+        mode, fix = place
+        match = pose_match(msgspec.structs.replace(pose.match, mode_e_m=mode.e_m, mode_n_m=mode.n_m), fix, view)
+        return PoseResult(match, mode, attempted=match.verdict is Verdict.ACCEPTED, likelihood_ratio=LIKELIHOOD_RATIO)

@@ -1,0 +1,63 @@
+"""The claim: position, height and covariance that are published with an estimate. Every term is added here, once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.filter_state import FrameState
+from terrafix.estimator.state import HORIZONTAL, UP, WORLD_POSITION, WORLD_TILT
+
+
+@dataclass(frozen=True)
+class Claim:
+    """``position_m`` (2,): published, east and north. ``cov`` (6, 6): position, then orientation, world axes.
+    ``amsl_m``: published height. ``terms_m2``: mean horizontal variance that each term adds, by its name; their sum is
+    that of ``cov``."""
+
+    position_m: np.ndarray
+    cov: np.ndarray
+    amsl_m: float
+    terms_m2: dict[str, float]
+
+
+def claim(estimator: Estimator, frame: FrameState, time_offset_sigma_s: float, calibration_sigma_m: float) -> Claim:
+    """Of ``frame``, the newest one. ``time_offset_sigma_s``: of the camera against telemetry; ``calibration_sigma_m``:
+    position error by a description that monitors have found wrong."""
+    state = estimator.state
+    budget = _Budget(tangent_to_world(frame.cov, frame.pose.rotation().matrix()))
+    cov = budget.cov
+    # The error of the map is the same everywhere: no number of matches averages it away.
+    cov[WORLD_POSITION, WORLD_POSITION] += estimator.map_sigma_m**2 * np.eye(3)
+    budget.close("map")
+    shift_m, shift_cov = state.principal_point.shift(state.lever(frame.pose))
+    cov[HORIZONTAL, HORIZONTAL] += shift_cov
+    budget.close("principal_point")
+    cov[WORLD_TILT, WORLD_TILT] += state.camera.body_sigma_rad**2 * np.eye(2)
+    v = frame.velocity_mps
+    cov[WORLD_POSITION, WORLD_POSITION] += time_offset_sigma_s**2 * np.outer(v, v)
+    budget.close("time_offset")
+    other_m, budget.cov = estimator.hypotheses.claim(cov)
+    cov = budget.cov
+    budget.close("hypotheses")
+    cov[HORIZONTAL, HORIZONTAL] += calibration_sigma_m**2 * np.eye(2)
+    budget.close("calibration")
+    amsl_m, amsl_sigma_m = state.amsl(frame)
+    cov[UP, UP] += amsl_sigma_m**2
+    return Claim(frame.pose.translation()[HORIZONTAL] + shift_m + other_m, cov, amsl_m, budget.terms_m2)
+
+
+class _Budget:
+    """A covariance (6, 6), and the mean horizontal variance by which each term changes it."""
+
+    def __init__(self, cov: np.ndarray) -> None:
+        self.cov = cov
+        self.terms_m2 = {"graph": self._horizontal_m2()}
+
+    def close(self, term: str) -> None:
+        """All that was added since the call before belongs to ``term``."""
+        self.terms_m2[term] = self._horizontal_m2() - sum(self.terms_m2.values())
+
+    def _horizontal_m2(self) -> float:
+        return 0.5 * float(np.trace(self.cov[HORIZONTAL, HORIZONTAL]))

@@ -1,0 +1,194 @@
+"""What the parts of the estimator share, as `State` of OpenVINS does: graph, window and newest frame.
+
+`Propagation` adds frames, `MapUpdate` adds map poses, `reset` begins a new graph. All work on one `FilterState`."""
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.graph.pose_graph import PoseGraph
+from terrafix.estimator.integrity.fragments import Fragment, Fragments
+from terrafix.estimator.integrity.yaw_gauge import YawGauge
+from terrafix.estimator.keyframe_substitution import KeyframeSubstitution
+from terrafix.estimator.measurements.attitude_height import MountedCamera
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.models.bias_walk import BAROMETER_SCALE_SIGMA, WALK_SIGMAS
+from terrafix.estimator.models.lens_prior import radial_k1_sigma
+from terrafix.estimator.models.motion_model import WorldAcceleration
+from terrafix.estimator.models.speed_prior import SpeedPrior
+from terrafix.estimator.models.terrain import Terrain
+from terrafix.estimator.state import HEIGHT, LOG_HEIGHT_SCALE, MOTION_SIZE, RADIAL_K1, UP, VELOCITY
+from terrafix.messages import Camera, CovarianceMode, LearntLens, Odometry, Origin
+
+LENS_SURE = 3.0  # sigmas, from which a lens distortion is applied: no lens has exactly none [tuned]
+
+
+ImuQuery = Callable[[int, int], WorldAcceleration | None]  # of two times [ns]; None where readings do not cover them
+
+
+def no_imu(_t0_ns: int, _t1_ns: int) -> None:
+    """There are no inertial readings."""
+
+
+@dataclass(frozen=True)
+class FrameInput:
+    """What is measured at a frame. ``imu(t0_ns, t1_ns)``: world acceleration between two times."""
+
+    frame_id: int
+    t_s: float
+    odometry: Odometry
+    attitude: Attitude
+    imu: ImuQuery = no_imu
+
+
+@dataclass(frozen=True)
+class FrameState:
+    """The camera at a frame: pose in the world, covariance (6, 6) in tangent order, velocity (3,) with covariance
+    (3, 3) in ENU, and the node of the graph."""
+
+    frame_id: int
+    t_s: float
+    pose: gtsam.Pose3
+    cov: np.ndarray
+    velocity_mps: np.ndarray
+    velocity_cov: np.ndarray
+    node: int
+
+
+@dataclass
+class FrameContinuity:
+    """What ties the newest frame to the frames before it. A reset of the graph voids all of it.
+
+    ``substitution``: for the keyframe of vision that the graph no longer has. ``last_increment_inertial``: whether the
+    last motion increment came from inertial readings; None: there was none. ``stationary_node``: node at which a
+    disarmed vehicle stands. ``keyframe_motion``: node of the keyframe of the newest odometry, and the position (3,) of
+    the newest frame in that camera."""
+
+    substitution: KeyframeSubstitution | None = None
+    last_increment_inertial: bool | None = None
+    stationary_node: int | None = None
+    keyframe_motion: tuple[int, np.ndarray] | None = None
+
+
+class FilterState:
+    """``last_fix_s``: time of the newest frame with an accepted map match; None: there is none.
+
+    ``yaw_gauge``: None while the heading is observable. ``has_height``: the autopilot reported one when the graph
+    began, at ``began_s``."""
+
+    def __init__(self, origin: Origin, graph: PoseGraph | None = None, lens: LearntLens | None = None) -> None:
+        """``lens``: lens calibration of an estimator that ran before in this flight."""
+        self.origin = origin
+        self.graph = graph or PoseGraph()
+        self.camera = MountedCamera(origin)
+        self.terrain = Terrain(origin.ground_amsl_m or 0.0)
+        self.mode = CovarianceMode.MARGINALS
+        self.principal_point = PrincipalPointFilter(origin.camera, lens)
+        self.speed_prior = SpeedPrior()
+        self.fragments = Fragments()
+        self.fragment = Fragment(0.0, joined=True)  # of the newest frame
+        self.continuity = FrameContinuity()
+        self.yaw_gauge: YawGauge | None = None
+        self.last: FrameState | None = None  # newest frame
+        self.last_fix_s: float | None = None
+        self.last_seen_s = 0.0  # time of the newest frame with fused odometry or an accepted map match
+        self.has_height = False
+        self.began_s = 0.0
+        self.newest_odometry: Odometry | None = None  # as vision published it
+        self.velocity_cov = np.zeros((MOTION_SIZE, MOTION_SIZE))  # of V of the newest node
+        self.lens_sigma = radial_k1_sigma(origin.camera)
+        self.node_of: dict[int, int] = {}  # frame -> node, for nodes in the window
+        self.cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C (6, 6), for the cheap mode
+        self.frames = array("q")  # frame of each node since the flight began
+        self.levers = array("f")  # ... and its principal point lever (2, 2)
+
+    def covariance(self, node: int) -> np.ndarray:
+        """Covariance (6, 6) of C_node, tangent order: the smoother's marginal; under thermal throttle the propagated
+        one, from odometry and the inliers of map matches (O(inliers), ON-2)."""
+        if self.mode is CovarianceMode.MARGINALS or node not in self.cov_of:
+            self.cov_of[node] = self.graph.covariance(node)
+        return self.cov_of[node]
+
+    def frame_state(self, frame_id: int, t_s: float, node: int) -> FrameState:
+        """Newest estimate of a frame whose node is in the window."""
+        if self.mode is CovarianceMode.MARGINALS and node == self.graph.newest:
+            self.velocity_cov = self.graph.velocity_covariance(node)
+            self.lens_sigma = float(np.sqrt(self.graph.bias_covariance(node)[RADIAL_K1, RADIAL_K1]))
+        state = self.graph.state(node)
+        velocity, velocity_cov, cov = state.velocity[:3], self.velocity_cov[VELOCITY, VELOCITY], self.covariance(node)
+        if self.yaw_gauge is not None:
+            cov, velocity_cov = self.yaw_gauge.marginal_cov(state.pose, cov, velocity, velocity_cov)
+        return FrameState(frame_id, t_s, state.pose, cov, velocity, velocity_cov, node)
+
+    def register_frame(self, node: int, frame_id: int, fragment: Fragment) -> None:
+        """The newest node belongs to ``frame_id``, in ``fragment``."""
+        pose = self.graph.state(node).pose
+        if fragment.frames == 1 and not fragment.joined:
+            fragment.start_m = pose.translation()[:2]
+            fragment.start_cov_m2 = tangent_to_world(self.covariance(node), pose.rotation().matrix())[:2, :2]
+        self.fragment = fragment
+        self.fragments.add(node, fragment)
+        self.fragments.retain({n for n in self.node_of.values() if self.graph.holds(n)} | {node})
+        self.node_of = {frame: n for frame, n in self.node_of.items() if self.graph.holds(n)}
+        self.node_of[frame_id] = node
+        self.frames.append(frame_id)
+        self.levers.extend(self.lever(pose).ravel())
+
+    def velocity_changed(self, node: int) -> None:
+        """A factor on the velocity of the newest ``node`` was added: its covariances are read from the graph again."""
+        self.cov_of.pop(node, None)
+        self.velocity_cov = self.graph.velocity_covariance(node)
+
+    def lever(self, pose: gtsam.Pose3) -> np.ndarray:
+        """(2, 2): shift of the camera [m, east and north] by an offset of the principal point [normalised image]."""
+        p = pose.translation()
+        return np.asarray((float(p[UP]) - self.terrain.elevation_m(p)) * pose.rotation().matrix()[:2, :2])
+
+    def body(self, frame: FrameState) -> np.ndarray:
+        """R_w_b (3, 3) of a frame, with the estimated mount."""
+        return self.camera.body(frame.pose.rotation().matrix(), self.graph.state(frame.node).bias)
+
+    def lens(self, node: int) -> float:
+        """Radial distortion beyond the camera's description; 0 where it is not significant."""
+        distortion = float(self.graph.state(node).bias[RADIAL_K1])
+        return distortion if abs(distortion) > LENS_SURE * self.lens_sigma else 0.0
+
+    @property
+    def lens_estimate(self) -> tuple[float, float]:
+        """Radial distortion beyond the camera's description at the newest node, and its 1-sigma."""
+        return float(self.graph.state(self.graph.newest).bias[RADIAL_K1]), self.lens_sigma
+
+    def height_scale(self, node: int) -> tuple[float, float]:
+        """True height over the height in the graph, and its relative 1-sigma: the part of the estimated scale between
+        barometer and pictures that the focal length explains."""
+        focal = self.origin.camera.focal_sigma
+        if not self.has_height:
+            return 1.0, focal
+        both = scale_sigma(self.origin.camera)
+        part = (focal / both) ** 2 * float(self.graph.state(node).bias[LOG_HEIGHT_SCALE])
+        return float(np.exp(part)), focal * BAROMETER_SCALE_SIGMA / both
+
+    def amsl(self, frame: FrameState) -> tuple[float, float]:
+        """Height of the camera AMSL [m], and its 1-sigma beyond the covariance of the graph. Without a DEM the graph
+        has the height above the ground that is seen, and the barometer tells how high that ground lies."""
+        p = frame.pose.translation()
+        scale, sigma = self.height_scale(frame.node)
+        if self.terrain.has_dem or not self.has_height:
+            ground_m = self.terrain.elevation_m(p)
+            seen_m = float(p[UP]) - ground_m
+            return ground_m + scale * seen_m, sigma * seen_m
+        seen_m = self.graph.state(frame.node).barometric_up_m - self.terrain.ground_m
+        drift_m = WALK_SIGMAS[HEIGHT] * np.sqrt(frame.t_s - self.began_s)
+        return self.terrain.ground_m + scale * seen_m, float(
+            np.linalg.norm([self.origin.agl_sigma_m, drift_m, sigma * seen_m])
+        )
+
+
+def scale_sigma(camera: Camera) -> float:
+    """1-sigma of the height scale before anything was measured."""
+    return float(np.hypot(camera.focal_sigma, BAROMETER_SCALE_SIGMA))

@@ -1,0 +1,271 @@
+"""Map matches: gated, fused, and compared with other positions that the vehicle may have."""
+
+import math
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from terrafix.core.gate import GATE
+from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.filter_state import FilterState, FrameState
+from terrafix.estimator.graph.pose_graph import GraphPrior
+from terrafix.estimator.initialization import ResetReason, reset
+from terrafix.estimator.integrity.correlated_fixes import CorrelatedFixes
+from terrafix.estimator.integrity.fragments import MapHitRate
+from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
+from terrafix.estimator.integrity.innovation_run import InnovationRun
+from terrafix.estimator.integrity.map_consistency import MapConsistency
+from terrafix.estimator.integrity.other_place import MIN_CONSISTENT, OtherPlace
+from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
+from terrafix.estimator.measurements.contract import fuse
+from terrafix.estimator.measurements.map_pose import MapPoseMeasurement, determined
+from terrafix.estimator.models.motion_model import unknown_motion_cov
+from terrafix.estimator.propagation import STEP_SHARE
+from terrafix.estimator.state import HEIGHT, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
+from terrafix.messages import CovarianceMode, MapMatch, Verdict
+
+# Of the height: 1-sigma of the estimate up to which a coarse match, the mode of the belief alone, is fused.
+COARSE_CONTINUES = 0.5  # [tuned]
+COARSE_FINDS_AFTER, COARSE_FINDS_OVER = (
+    6,
+    1.0,
+)  # consistent coarse matches, over so many heights, that are fused [tuned]
+RECOVER_AFTER = 3  # map matches that are consistent with each other and rejected by the gate [tuned]
+RECOVER_OVER = 0.5  # of the height: the motion that they must span, so that they are not one error seen thrice [tuned]
+RECOVER_MASS = 0.97  # of the belief's mode [tuned]
+# Inliers: of 930 wrong places one gave a pose on so many, and of 400 starts one is wrong.
+OUTWEIGHS_START = 20  # [measured: anchor/verification/lock_monitor.py]
+RESTART_INFLATION = 4.0  # of the covariance of the map match at which the graph begins anew [tuned]
+# Verdicts of a frame that was matched without a pose.
+NOTHING_FOUND = (Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE)
+
+
+@dataclass(frozen=True)
+class MapResult:
+    """What was done with a map match: ``fusion``, the verdict on it, and ``others``: on a start coordinate that the map
+    contradicts, and on a reset of the graph."""
+
+    fusion: FusionVerdict
+    others: tuple[FusionVerdict, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        return self.fusion.verdict
+
+    @property
+    def verdicts(self) -> tuple[FusionVerdict, ...]:
+        return (self.fusion, *self.others)
+
+
+class MapUpdate:
+    """``apply`` every map match, in the order in which they come.
+
+    ``map_sigma_m``: error of the map of the newest accepted match; 0: there was none."""
+
+    def __init__(self, state: FilterState) -> None:
+        self._state = state
+        self.hypotheses = PositionHypotheses(state.origin)
+        self.map_sigma_m = 0.0
+        self._fixes = CorrelatedFixes()
+        self._map_hit_rate = MapHitRate()
+        self._newest_match_ns = -1
+        self._rejected = InnovationRun()
+        self._coarse = InnovationRun()  # coarse matches of a graph that does not know its position
+
+    def apply(self, match: MapMatch) -> MapResult:
+        """``match``: of a frame that ``Propagation.advance`` has had. It enters the graph at the node of that frame."""
+        state = self._state
+        node = state.node_of.get(match.frame_id)
+        if node is not None and not state.graph.holds(node):
+            node = None
+        if match.found or match.t_ns >= self._newest_match_ns:  # ground and belief: of the newest frame, or of a search
+            self._newest_match_ns = max(match.t_ns, self._newest_match_ns)
+            if lost := self._update_belief(match, node):
+                return _result(Verdict.LOST, lost)
+        if node is not None and (match.coarse or match.verdict in NOTHING_FOUND):
+            self._map_hit_rate.update(state.fragments.of(node), found=False)
+        if match.verdict is not Verdict.ACCEPTED:
+            return _result(match.verdict)
+        if not determined(match):
+            return _result(Verdict.DEGENERATE)
+        if node is None:
+            return _result(Verdict.STALE)
+        measurement = MapPoseMeasurement.of(match, state.terrain, state.lens_estimate)
+        if match.found:  # by a search over several frames: it outweighs whatever the graph has
+            self.hypotheses.other, self.hypotheses.map_consistency = OtherPlace(), MapConsistency()
+            return self._reset(match, node, measurement, "found")
+        if state.yaw_gauge is not None:
+            return self._apply_without_heading(match, node, measurement)
+        if refusal := self._coarse_refusal(match, node, measurement):
+            return refusal
+        return self._fuse(match, node, measurement)
+
+    def _update_belief(self, match: MapMatch, node: int | None) -> str:
+        """Ground and belief of the newest frame. -> detail of the verdict on a match that is LOST; else empty."""
+        state = self._state
+        state.terrain.update(match, None if node is None else state.graph.state(node).pose.translation())
+        lost = self.hypotheses.on_match(match)
+        if node is not None and match.modes:
+            frame = self._frame_state(match.frame_id, node)
+            p_m = np.asarray(frame.pose.translation())
+            height_m = max(float(p_m[UP]) - state.terrain.ground_m, 1.0)
+            cov = tangent_to_world(frame.cov, frame.pose.rotation().matrix())
+            self.hypotheses.update_modes(match, p_m, cov, height_m)
+        return lost
+
+    def _apply_without_heading(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult:
+        """The first pose that agrees with the position gives the heading."""
+        if match.coarse:  # its heading is one of those that were tried
+            return _result(Verdict.AMBIGUOUS, "a coarse fix does not tell the heading")
+        frame = self._frame_state(match.frame_id, node)
+        innovation = measurement.position_innovation(frame.pose, frame.cov)
+        if not innovation.is_accepted:
+            return self._reject(match, node, measurement, innovation)
+        return self._reset(match, node, measurement, "heading found")
+
+    def _coarse_refusal(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult | None:
+        """Why a coarse match is not fused; None: it is, or the match is none."""
+        state = self._state
+        if match.coarse and not state.fragments.of(node).joined:  # it is of the belief's memory, not of this picture
+            return _result(Verdict.UNCONFIRMED, "a coarse fix does not join a fragment to the flight")
+        predicted, height_m = state.graph.state(node).pose, self._height_m(measurement)
+        r_w_c = measurement.pose.rotation().matrix()
+        sigma_m = float(np.sqrt(np.max(np.diag(tangent_to_world(state.covariance(node), r_w_c))[:2])))
+        if match.coarse and sigma_m > COARSE_CONTINUES * height_m:
+            offset = (measurement.pose.translation() - predicted.translation())[:2]
+            self._coarse.add(offset, predicted.translation()[:2], coarse=True)
+            if not self._coarse.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height_m):
+                return _result(Verdict.AMBIGUOUS, "a coarse fix continues a track, several find one")
+        self._coarse.clear()
+        return None
+
+    def _fuse(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult:
+        state, height_m, here = self._state, self._height_m(measurement), measurement.position_m
+        fixed_s, before = state.graph.time_of(node), state.graph.state(node)
+        share = self._fixes.information_share(fixed_s, here, height_m)
+        measurement = replace(measurement, information_share=share)
+        fusion = fuse(state, node, measurement)
+        if fusion.verdict is not Verdict.ACCEPTED:
+            assert fusion.innovation is not None
+            return self._reject(match, node, measurement, fusion.innovation)
+        self._rejected.clear()
+        if state.mode is CovarianceMode.JACOBIAN:
+            information = np.linalg.inv(state.cov_of[node]) + np.linalg.inv(measurement.cov / share)
+            state.cov_of[node] = np.linalg.inv(information)
+        if not match.coarse:
+            self._learn_from_pose(match, node, before, measurement)
+        self._accept(match, fixed_s, here)
+        return MapResult(replace(fusion, detail=f"new ground {share:.2f}"))
+
+    def _learn_from_pose(self, match: MapMatch, node: int, before: NodeState, measurement: MapPoseMeasurement) -> None:
+        """What an accepted pose tells of ground, fragment and other positions. ``before``: the node without it."""
+        state, height_m, here = self._state, self._height_m(measurement), measurement.position_m
+        if state.has_height and not state.terrain.has_dem:
+            cov = tangent_to_world(measurement.cov, measurement.pose.rotation().matrix())
+            level_m = float(before.barometric_up_m - measurement.pose.translation()[UP])
+            state.terrain.roughness.update(here, height_m, level_m, float(np.sqrt(cov[UP, UP])))
+        if self._fixes.newest_s is not None:
+            new_m = self._fixes.new_ground_m(state.graph.time_of(node), here, math.inf)
+            self.hypotheses.other.decay(new_m / height_m, match.mode_mass)
+        self._map_hit_rate.update(state.fragments.of(node), found=True)
+        self.hypotheses.map_consistency.add_accepted(measurement.information_share)
+
+    def _accept(self, match: MapMatch, t_s: float, here_m: np.ndarray) -> None:
+        state = self._state
+        self._fixes.add(t_s, here_m)
+        state.last_seen_s = max(state.last_seen_s, t_s)
+        state.last_fix_s = self._fixes.newest_s
+        self.hypotheses.on_match_accepted()
+        self.map_sigma_m = match.map_sigma_m
+        assert state.last is not None
+        state.last = state.frame_state(state.last.frame_id, state.last.t_s, state.graph.newest)
+        state.speed_prior.update_by_map(state.last.t_s, state.last.velocity_mps, state.last.velocity_cov)
+
+    def _reject(self, match: MapMatch, node: int, measurement: MapPoseMeasurement, innovation: Innovation) -> MapResult:
+        """Rejected by the gate, unless several matches over new ground agree with each other: then the graph is
+        wrong."""
+        state = self._state
+        predicted = state.graph.state(node).pose
+        position = measurement.position_innovation(predicted, state.covariance(node))
+        offset, apart = position.residual, position.covariance
+        run, other = self._rejected, self.hypotheses.other
+        agrees = run.add(offset, predicted.translation()[:2], coarse=match.coarse)
+        if not match.coarse and not agrees:  # those that agree with each other support another position
+            self.hypotheses.map_consistency.add_rejected(offset)
+        height = float(measurement.pose.translation()[UP]) - state.terrain.ground_m
+        # A pose stands on patches of its own frame. A coarse match is of the belief's memory: one look that went
+        # astray is in all that follow. While no other position is supported, coarse matches count against the graph
+        # when they would find a position without it; later they are more support of that position.
+        certain = other.probability == 0.0
+        found = run.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height)
+        if found or (run.poses if certain else len(run.offsets_m)) >= MIN_CONSISTENT:
+            other.spawn(run.offsets_m, apart, fixed=state.last_fix_s is not None)
+            # Before the first fix only the start coordinate supports the graph: as much as one such pose against it.
+            first = state.last_fix_s is None and match.inliers >= OUTWEIGHS_START
+            needed = (MIN_CONSISTENT, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
+            if (found or run.is_confirmed(*needed, poses_only=certain)) and match.mode_mass >= RECOVER_MASS:
+                other.switch(offset, apart)
+                return self._reset(match, node, measurement, "restarted")
+        detail = f"{float(np.hypot(*offset)):.0f} m from the estimate"
+        return MapResult(FusionVerdict(measurement.name, Verdict.INNOVATION, innovation, detail))
+
+    def _reset(self, match: MapMatch, node: int, measurement: MapPoseMeasurement, how: str) -> MapResult:
+        """A new graph at the map match, and since a match comes late, moved on to the newest frame by what the graph
+        has of the motion since."""
+        state = self._state
+        was, now = state.graph.state(node), state.graph.state(state.graph.newest)
+        fixed_s, now_s = state.graph.time_of(node), state.graph.time_of(state.graph.newest)
+        position = measurement.position_innovation(was.pose, state.covariance(node))
+        offset = position.residual
+        start_off = self._start_off(offset, position.covariance)
+        onward = was.pose.between(now.pose)
+        cov = self._moved_cov(measurement.cov, onward, now_s - fixed_s)
+        bias = now.bias.copy()
+        if match.found:  # the ground there lies at another height than the one that was assumed
+            bias[HEIGHT] -= float(measurement.pose.translation()[UP] - was.pose.translation()[UP])
+        bias_cov = state.graph.bias_covariance(state.graph.newest)
+        velocity, velocity_cov = now.velocity, RESTART_INFLATION * state.graph.velocity_covariance(state.graph.newest)
+        if state.yaw_gauge is not None:  # it was a velocity in gauge-fixed axes
+            velocity, velocity_cov, state.yaw_gauge = np.zeros(MOTION_SIZE), unknown_motion_cov(), None
+        assert state.last is not None
+        first = NodeState(measurement.pose.compose(onward), bias, velocity)
+        reset(state, state.last.frame_id, now_s, GraphPrior(first, cov, bias_cov, velocity_cov))
+        self._rejected.clear()
+        self.hypotheses.on_reset(match.lost_sigma_m)
+        self._fixes = CorrelatedFixes()
+        self._accept(match, fixed_s, measurement.position_m)
+        detail = f"{how} {float(np.hypot(*offset)):.0f} m away"
+        others = [FusionVerdict("start", Verdict.INNOVATION, position, start_off)] if start_off else []
+        others.append(FusionVerdict("reset", Verdict.ACCEPTED, None, f"{ResetReason.MAP_MATCH}: {how}"))
+        return MapResult(FusionVerdict(measurement.name, Verdict.ACCEPTED, None, detail), tuple(others))
+
+    def _moved_cov(self, cov: np.ndarray, onward: gtsam.Pose3, dt_s: float) -> np.ndarray:
+        """``cov`` (6, 6), tangent order, of a pose, inflated, at the end of the motion ``onward`` of ``dt_s``."""
+        moved = onward.inverse().AdjointMap()
+        cov = RESTART_INFLATION * moved @ cov @ moved.T
+        velocity_sigma = float(np.sqrt(np.linalg.eigvalsh(self._state.velocity_cov[VELOCITY, VELOCITY])[-1]))
+        way_m = float(np.linalg.norm(onward.translation()))
+        cov[TRANSLATION, TRANSLATION] += np.hypot(STEP_SHARE * way_m, velocity_sigma * dt_s) ** 2 * np.eye(3)
+        return cov
+
+    def _start_off(self, offset: np.ndarray, apart_m2: np.ndarray) -> str:
+        """``offset`` (2,): from where a flight that no match has placed was to where the first ones place it, with
+        covariance ``apart_m2`` (2, 2). Nothing on board tells which of the two is in the wrong place."""
+        state, distance2 = self._state, float(offset @ np.linalg.solve(apart_m2, offset))
+        searched = state.origin.start_sigma_m > SEARCH_START_SIGMA_M
+        if state.last_fix_s is not None or searched or distance2 <= GATE[2]:
+            return ""
+        return f"start and map are {float(np.hypot(*offset)):.0f} m apart: one of them is wrong"
+
+    def _height_m(self, measurement: MapPoseMeasurement) -> float:
+        """Above the ground, 1 m at least."""
+        return max(float(measurement.pose.translation()[UP]) - self._state.terrain.ground_m, 1.0)
+
+    def _frame_state(self, frame_id: int, node: int) -> FrameState:
+        return self._state.frame_state(frame_id, self._state.graph.time_of(node), node)
+
+
+def _result(verdict: Verdict, detail: str = "") -> MapResult:
+    return MapResult(FusionVerdict("map", verdict, None, detail))

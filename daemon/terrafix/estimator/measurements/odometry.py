@@ -1,0 +1,221 @@
+"""Visual odometry as a measurement: the motion of a frame over the ground since its keyframe, gated against the motion
+model, and what three keyframes saw together."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from terrafix.core.geodesy import yaw_of
+from terrafix.estimator.factors.three_view import ThreeViewConstraint, ThreeViewPose, three_view_constraint
+from terrafix.estimator.filter_state import FilterState, FrameInput
+from terrafix.estimator.integrity.fragments import Fragment, MotionEvidence
+from terrafix.estimator.integrity.innovation import Innovation
+from terrafix.estimator.integrity.motion_gate import MotionInnovation
+from terrafix.estimator.integrity.static_picture import StaticPicture
+from terrafix.estimator.integrity.time_offset import Turn
+from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
+from terrafix.estimator.measurements.heading import heading_innovation
+from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
+from terrafix.estimator.models.plane_motion import Ground, RelativePose, relative_pose
+from terrafix.estimator.models.terrain import RELIEF_REPEATS
+from terrafix.estimator.state import HEADING, HEIGHT, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
+from terrafix.messages import Odometry, Verdict
+
+MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
+# Share of the height by which the level of the ground below may be unknown. Beyond it odometry tells no distance, and
+# its noise, a share of the estimated distance, would make the graph sure that there is none.
+MAX_LEVEL_SIGMA = 0.5  # [tuned]
+MIN_HEIGHT_M = 2.0  # above the ground: below it the ground is no plane to a camera [tuned]
+HEADING_GATE = 3.0  # sigmas between the turn of a new fragment and the reported heading [tuned]
+
+
+@dataclass(frozen=True)
+class KeyframeMotion:
+    """Motion of a frame since its keyframe, whose node is ``parent``."""
+
+    parent: int
+    motion: RelativePose
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Odometry of one frame. ``motion``: None without one. ``fused``: the same, if it enters the graph. ``fragment``:
+    to which the frame belongs. ``local_step_m`` (2,): since the frame before, in a fragment that was not joined yet.
+    ``innovation``: against the motion model; None where that predicts nothing."""
+
+    verdict: Verdict
+    motion: KeyframeMotion | None
+    fragment: Fragment
+    local_step_m: np.ndarray | None = None
+    innovation: Innovation | None = None
+
+    @property
+    def fused(self) -> KeyframeMotion | None:
+        return self.motion if self.verdict is Verdict.ACCEPTED else None
+
+
+class OdometryMeasurement:
+    """``sighting`` of each frame, in order; then ``turn`` and ``three_view`` of the same."""
+
+    def __init__(self, state: FilterState) -> None:
+        self._state = state
+        self._static_picture = StaticPicture()
+        # Of the newest frame: time, keyframe, heading since that.
+        self._heading_seen: tuple[int, int, float] | None = None
+
+    def sighting(self, frame: FrameInput, before: NodeState, increment: Callable[[], MotionIncrement]) -> Sighting:
+        """``before``: the newest node; ``increment()``: of the motion model, from there to the frame."""
+        odometry, attitude, t_s = frame.odometry, frame.attitude, frame.t_s
+        if odometry.verdict in (Verdict.BAD_IMAGE, Verdict.STALLED):  # no new view
+            return Sighting(odometry.verdict, None, Fragment(t_s))
+        answer = self._relative_motion(odometry, frame)
+        if isinstance(answer, Verdict):
+            frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False)
+            return Sighting(Verdict.STALLED if frozen else answer, None, Fragment(t_s))
+        state, parent = self._state, answer.parent
+        fragment, keyframe = state.fragments.of(parent), state.graph.state(parent).pose
+        moved_m = keyframe.rotation().matrix() @ answer.motion.p_m
+        in_fragment_m = state.fragments.displacement_m(parent) + moved_m[:2]
+        local_step_m = None if fragment.joined else in_fragment_m - fragment.displacement_m
+        innovation = None
+        if attitude.stands or state.yaw_gauge is not None:  # nothing predicts the motion
+            if self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False):
+                return Sighting(Verdict.STALLED, None, Fragment(t_s))
+            fragment.joined = True
+        else:
+            motion = self._innovation(t_s, keyframe.translation() + moved_m, answer, before, increment())
+            innovation, moves = motion.gated, not motion.allows_standstill
+            frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=moves)
+            if frozen or not motion.passes_gate:
+                verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
+                return Sighting(verdict, None, Fragment(t_s), innovation=innovation)
+            if not fragment.joined:
+                self._weigh_fragment(fragment, frame, answer, before, motion)
+        verdict = Verdict.ACCEPTED if fragment.joined else Verdict.UNCONFIRMED
+        fragment.displacement_m = in_fragment_m
+        return Sighting(verdict, answer, fragment, local_step_m, innovation)
+
+    def _weigh_fragment(
+        self,
+        fragment: Fragment,
+        frame: FrameInput,
+        seen: KeyframeMotion,
+        before: NodeState,
+        innovation: MotionInnovation,
+    ) -> None:
+        """Whether motion and turn of a fragment that is not joined are those of this flight."""
+        over_s = max(frame.t_s - self._state.graph.time_of(seen.parent), 1e-3)
+        heading = heading_innovation(self._state, frame.attitude, seen.parent, seen.motion.r, before)
+        turns_agree = abs(heading.off_rad) <= HEADING_GATE * heading.sigma_rad
+        evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree)
+        fragment.add_frame(frame.t_s, evidence)
+
+    def turn(self, odometry: Odometry, sighting: Sighting) -> Turn | None:
+        """Change of heading since the frame before, when both were seen from one keyframe, or that frame is the
+        keyframe."""
+        before, self._heading_seen = self._heading_seen, None
+        if sighting.motion is None:
+            return None
+        state, parent = self._state, sighting.motion.parent
+        node = state.graph.state(parent)
+        r_w_kf = node.pose.rotation().matrix()
+        rotations = (r_w_kf, r_w_kf @ sighting.motion.motion.r)
+        yaw_kf_rad, yaw_rad = (yaw_of(state.camera.body(r_w_c, node.bias)) for r_w_c in rotations)
+        since_rad = yaw_rad - yaw_kf_rad
+        self._heading_seen = (odometry.t_ns, odometry.keyframe_id, since_rad)
+        if before is not None and before[1] == odometry.keyframe_id:
+            return Turn(before[0], odometry.t_ns, math.remainder(since_rad - before[2], math.tau))
+        if before is not None and parent == state.graph.newest:
+            return Turn(before[0], odometry.t_ns, math.remainder(since_rad, math.tau))
+        return None
+
+    def three_view(self, odometry: Odometry, seen: KeyframeMotion) -> tuple[int, ThreeViewConstraint] | None:
+        """The constraint of points that the keyframe before, the keyframe and the frame saw, and the node of the
+        first; None: there are too few."""
+        state = self._state
+        first = state.node_of.get(odometry.before_id)
+        if not odometry.triples or first is None or not state.graph.holds(first):
+            return None
+        before, middle = state.graph.state(first), state.graph.state(seen.parent)
+        ground_m = state.terrain.elevation_m(middle.pose.translation())
+        risen = 0.0 if state.terrain.has_dem else float(before.bias[HEIGHT] - middle.bias[HEIGHT])
+        moved = gtsam.Pose3(before.pose.rotation(), before.pose.translation() + np.array([0.0, 0.0, risen]))
+        guess = ThreeViewPose(
+            middle.pose.between(moved),
+            gtsam.Pose3(gtsam.Rot3.ClosestTo(seen.motion.r), seen.motion.p_m),
+            float(middle.pose.translation()[UP]) - ground_m,
+            ground_m,
+            float(middle.bias[RADIAL_K1]),
+        )
+        triples, sigma_norm = np.array(odometry.triples), odometry.triples_sigma_norm
+        constraint = three_view_constraint(triples, sigma_norm, guess, state.origin.camera.focal_sigma)
+        if constraint is None:
+            return None
+        state.principal_point.update(triples, sigma_norm, constraint.at)
+        return first, constraint
+
+    def _innovation(
+        self, t_s: float, p_m: np.ndarray, seen: KeyframeMotion, before: NodeState, increment: MotionIncrement
+    ) -> MotionInnovation:
+        """Of a camera at ``p_m`` (3,) by odometry, against the motion model."""
+        state = self._state
+        predicted_m, _ = increment.predict(before.pose.translation(), before.velocity, float(before.bias[HEADING]))
+        dt_s = max(t_s - state.graph.time_of(state.graph.newest), 1e-3)
+        cov_m2 = predict_covariance(increment, state.velocity_cov)[:3, :3]
+        if not state.fragments.of(seen.parent).joined:  # the motion model alone led here from the keyframe
+            since_s = t_s - state.graph.time_of(seen.parent)
+            cov_m2 += state.velocity_cov[VELOCITY, VELOCITY] * max(since_s**2 - dt_s**2, 0.0)
+        r_w_c = state.graph.state(seen.parent).pose.rotation().matrix() @ seen.motion.r
+        seen_m2 = r_w_c @ seen.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T
+        return MotionInnovation(p_m - predicted_m, cov_m2 + seen_m2, dt_s, increment.inertial)
+
+    def _relative_motion(self, odometry: Odometry, frame: FrameInput) -> KeyframeMotion | Verdict:
+        """Motion since the keyframe; or why there is none."""
+        if odometry.verdict is not Verdict.ACCEPTED or not odometry.pairs:
+            return Verdict.FEW_INLIERS if odometry.verdict is Verdict.ACCEPTED else odometry.verdict
+        state = self._state
+        parent = state.node_of.get(odometry.keyframe_id)
+        if parent is None or not state.graph.holds(parent):
+            return Verdict.STALE
+        keyframe = state.graph.state(parent)
+        r_w_kf, p = keyframe.pose.rotation().matrix(), keyframe.pose.translation()
+        place_cov = r_w_kf @ state.cov_of[parent][TRANSLATION, TRANSLATION] @ r_w_kf.T
+        height = float(p[UP]) - state.terrain.elevation_m(p)
+        if height < MIN_HEIGHT_M:
+            return Verdict.TOO_LOW
+        r_w_k, tilt_sigma = self._expected_rotation(frame, keyframe)
+        share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
+        ground = self.ground(p, height, place_cov, share)
+        if ground.level_sigma_m > MAX_LEVEL_SIGMA * height:
+            return Verdict.DEGENERATE
+        newest = state.graph.state(state.graph.newest)
+        onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - state.graph.time_of(state.graph.newest))
+        way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
+        ground = replace(ground, rise_sigma_m=state.terrain.rise_sigma_m(way_m))
+        pairs, lens = np.array(odometry.pairs), float(newest.bias[RADIAL_K1])
+        motion = relative_pose(pairs, odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground, lens)
+        if motion is None:
+            return Verdict.FEW_INLIERS
+        dt_s = max(odometry.t_ns * 1e-9 - state.graph.time_of(parent), 1e-3)
+        possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + height
+        return KeyframeMotion(parent, motion) if possible else Verdict.IMPLAUSIBLE
+
+    def _expected_rotation(self, frame: FrameInput, keyframe: NodeState) -> tuple[np.ndarray, float]:
+        """R_w_c (3, 3) of the frame by the reported attitude, and the 1-sigma of its tilt [rad]."""
+        r_w_kf = keyframe.pose.rotation().matrix()
+        if frame.attitude.pitch_rad is None or frame.attitude.roll_rad is None:
+            return r_w_kf, UNKNOWN_ATTITUDE_RAD
+        r_w_k = self._state.camera.expected(frame.attitude, keyframe.bias, r_w_kf)
+        return r_w_k, np.radians(max(self._state.origin.attitude_sigma_deg, 1.0))
+
+    def ground(self, p_m: np.ndarray, height_m: float, place_cov: np.ndarray, share: float) -> Ground:
+        """The plane below a camera at ``p_m`` (3,), known to ``place_cov`` (3, 3). ``share``: of inliers among the
+        tracked corners."""
+        ground = self._state.terrain.ground_plane(p_m, height_m, float(np.sqrt(place_cov[UP, UP])), share)
+        # Its slope was fitted at one place: where the camera may be elsewhere, the ground may lie higher or lower.
+        slope = np.array([ground.slope_e, ground.slope_n])
+        level_m = RELIEF_REPEATS * float(np.sqrt(slope @ place_cov[:2, :2] @ slope))
+        return replace(ground, level_share=float(np.hypot(ground.level_share, level_m / height_m)))

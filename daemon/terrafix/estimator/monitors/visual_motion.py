@@ -1,0 +1,53 @@
+"""Camera motion between two frames from the picture alone, levelled with the autopilot's attitude."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafix.core.geodesy import rot_w_b
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.models.plane_motion import similarity_ratio
+
+# Smallest down component of a unit-depth ray: it meets the ground within five heights.
+MIN_DOWN = 0.2  # [spec: 1 / 5]
+MIN_PAIRS = 8  # point pairs [tuned]
+
+
+@dataclass(frozen=True)
+class VisualMotion:
+    """``displacement`` (2,): horizontal, east and north, in heights above ground. ``turned_rad``: rotation about the
+    optical axis by the picture, clockwise; it does not depend on the mount. ``reported_rad``: the same by the
+    attitude."""
+
+    displacement: np.ndarray
+    turned_rad: float
+    reported_rad: float
+
+
+def visual_motion(pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarray) -> VisualMotion | None:
+    """Motion from a keyframe to a frame by a 2D similarity on the ground plane.
+
+    ``pairs`` (N, 4): normalised image points of the keyframe and of the frame; ``before``, ``now``: their attitudes;
+    R_b_c (3x3): the configured mount. None where an attitude has no heading or too few rays point down."""
+    if before.yaw_rad is None or now.yaw_rad is None or len(pairs) < MIN_PAIRS:
+        return None
+    rays_kf, rays_k = (_rays(pairs[:, i : i + 2], a, r_b_c) for i, a in ((0, before), (2, now)))
+    down = (rays_kf[:, 2] < -MIN_DOWN) & (rays_k[:, 2] < -MIN_DOWN)
+    if int(down.sum()) < MIN_PAIRS:
+        return None
+    kf, k = (rays[down, 0] / -rays[down, 2] + 1j * rays[down, 1] / -rays[down, 2] for rays in (rays_kf, rays_k))
+    displacement = complex(kf.mean() - _ratio(k, kf) * k.mean())
+    turned = _ratio(pairs[:, 2] + 1j * pairs[:, 3], pairs[:, 0] + 1j * pairs[:, 1])
+    reported_rad = float(np.remainder(now.yaw_rad - before.yaw_rad + np.pi, 2 * np.pi) - np.pi)
+    return VisualMotion(np.array([displacement.real, displacement.imag]), float(np.angle(turned)), reported_rad)
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> complex:
+    """Ratio of b = ratio * a + shift, by least squares over complex numbers (N,)."""
+    return similarity_ratio(a - a.mean(), b - b.mean())
+
+
+def _rays(xy: np.ndarray, attitude: Attitude, r_b_c: np.ndarray) -> np.ndarray:
+    """World directions (N, 3) of normalised image points (N, 2)."""
+    r_w_b = rot_w_b(attitude.yaw_rad or 0.0, attitude.pitch_rad or 0.0, attitude.roll_rad or 0.0)
+    return np.asarray(np.column_stack([xy, np.ones(len(xy))]) @ (r_w_b @ r_b_c).T)

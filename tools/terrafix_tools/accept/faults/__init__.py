@@ -1,0 +1,1 @@
+"""Faults that a scenario adds to a flight."""

@@ -1,0 +1,1 @@
+"""How the numbers of acceptance are measured and judged."""

@@ -1,0 +1,286 @@
+"""One function per number of the acceptance table. It returns the measured value, or the reason for having none."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.link.ground_station.prior_request import PriorRequest
+from terrafix.messages import CovarianceMode, NavEstimate, SourceLabel
+from terrafix.messages import Verdict as Answer
+from terrafix_tools.accept.measuring.epipolar import reprojection_error
+from terrafix_tools.accept.measuring.evidence import Evidence, FrameEvidence
+from terrafix_tools.accept.measuring.judged import Measured, Span, Verdict
+
+NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
+MIN_PATH_M = 100.0  # a relative drift over a shorter path has no meaning
+REQUEST_FRAMES, REQUEST_S = 3, 2.0  # AC-6
+SETTLE_S = 10.0  # after a marked span, until frames count as outside of it
+
+
+def within_50m(e: Evidence) -> Measured:
+    return Measured(e.metrics["within_50m"])
+
+
+def within_20m(e: Evidence) -> Measured:
+    return Measured(e.metrics["within_20m"])
+
+
+def within_50m_outside(e: Evidence) -> Measured:
+    spans = [Span(s.from_s, s.to_s + SETTLE_S, s.text) for s in e.marks.spans]
+    frames = [f for f in e.frames if f.compared and not any(s.has(f.t_s) for s in spans)]
+    return _share([_near(f) for f in frames], f"from {SETTLE_S:.0f} s after it on; {len(frames)} frames")
+
+
+def wrong_rejected(e: Evidence) -> Measured:
+    wrong = [f for f in e.frames if f.row.file in e.marks.wrong_files]
+    return _share([not f.fixed for f in wrong], f"{sum(not f.fixed for f in wrong)} of {len(wrong)}")
+
+
+def error_after_wrong(e: Evidence) -> Measured:
+    after = [b for a, b in pairwise(e.frames) if a.row.file in e.marks.wrong_files]
+    errors = [f.error_m for f in after if f.compared]
+    if any(error is None for error in errors):
+        return Measured(None, "a frame after a wrong one has no position", Verdict.BELOW)
+    known = [error for error in errors if error is not None]
+    return Measured(max(known)) if known else Measured(None, "no truth for the frames after the wrong ones")
+
+
+def fragments_localised(e: Evidence) -> Measured:
+    """A fragment survives if it has a frame with a map fix within 50 m."""
+    parts = _fragments(e)
+    alive = sum(any(f.fixed and _near(f) for f in part) for part in parts)
+    return Measured(alive / len(parts), f"{alive} of {len(parts)}")
+
+
+def worst_fragment(e: Evidence) -> Measured:
+    shares = [float(np.mean([_near(f) for f in part if f.compared])) for part in _fragments(e)]
+    return Measured(min(shares), ", ".join(f"{100 * s:.0f} %" for s in shares))
+
+
+def not_localised(e: Evidence) -> Measured:
+    """Share of the frames with truth that have no position, or one of dead reckoning only."""
+    frames = [f for f in e.frames if f.compared]
+    lost = [not f.row.localised or f.row.source_label == SourceLabel.DEAD_RECKONED for f in frames]
+    return _share(lost, "no position, or dead reckoning alone")
+
+
+def label_change_s(e: Evidence) -> Measured:
+    """Time from the first marked frame until the label is not satellite_anchored for the rest of the span."""
+    frames = e.within(0)
+    if not frames:
+        return Measured(None, "no frame in the marked time")
+    anchored = [f.t_s for f in frames if f.row.source_label == SourceLabel.SATELLITE_ANCHORED]
+    if not anchored:
+        return Measured(0.0)
+    later = [f.t_s for f in frames if f.t_s > anchored[-1]]
+    return Measured((later[0] if later else frames[-1].t_s) - frames[0].t_s, "" if later else "the label never changes")
+
+
+def prior_request_delay_s(e: Evidence) -> Measured:
+    """Delay of the request for a position: from the condition of AC-6 (position unknown for 3 frames and 2 s) to the
+    request by the code of the link."""
+    estimates = [estimate for frame in e.frames for estimate in frame.estimates]
+    required_ns = _lost_ns(e)
+    if required_ns is None:
+        worst_m = max((_worst_sigma_m(estimate) for estimate in estimates), default=0.0)
+        return Measured(None, f"its place was never lost: it claims {worst_m:.0f} m at worst")
+    asking, searches = PriorRequest(), list(e.searches)
+    for estimate in estimates:
+        while searches and searches[0].t_ns <= estimate.t_ns:
+            asking.search_step = searches.pop(0).step
+        asking.on_estimate(estimate)
+        if asking.due(estimate.t_ns):
+            return Measured(
+                (estimate.t_ns - required_ns) * 1e-9, f"asked {_in_flight_s(e, estimate.t_ns):.0f} s into the flight"
+            )
+    return Measured(None, f"lost {_in_flight_s(e, required_ns):.0f} s into the flight, and never asks", Verdict.BELOW)
+
+
+def latency_p95(e: Evidence) -> Measured:
+    return Measured(e.metrics["frame_ms_p95"])
+
+
+def both_estimates(e: Evidence) -> Measured:
+    return _share([f.row.localised and f.row.refined_lat_deg is not None for f in e.frames])
+
+
+def odometry_rate(e: Evidence) -> Measured:
+    return Measured(e.metrics["odometry_rate"])
+
+
+def odometry_px(e: Evidence) -> Measured:
+    """Mean over the published point pairs, with a free depth for each; pixels of the frames."""
+    means = [
+        reprojection_error(np.array(frame.odometry.pairs)) * e.origin.camera.fx
+        for frame in e.frames
+        if frame.odometry is not None and len(frame.odometry.pairs) >= 8
+    ]
+    return Measured(float(np.mean(means)), "pixels of the stored frames") if means else Measured(None, "no odometry")
+
+
+def map_px(e: Evidence) -> Measured:
+    """Mean over the matched points of accepted fixes, projected with the published pose; pixels of the frames."""
+    means = []
+    for frame in e.frames:
+        match = frame.match
+        if frame.fixed and match is not None and match.matches and match.p_c_in_w_m and match.q_w_c:
+            points = np.array(match.matches)
+            in_c = (points[:, 2:5] - np.array(match.p_c_in_w_m)) @ rot_from_quat(match.q_w_c)
+            off = (in_c[:, :2] / in_c[:, 2:] - points[:, :2]) * e.origin.camera.fx
+            means.append(float(np.linalg.norm(off, axis=1).mean()))
+    return Measured(float(np.mean(means)), "pixels of the stored frames") if means else Measured(None, "no map fix")
+
+
+def drift(e: Evidence) -> Measured:
+    paths = _paths_between_fixes(e)
+    if not paths:
+        return Measured(None, "no two map fixes with odometry all the way between them")
+    drift_m, path_m = max(paths)
+    return Measured(drift_m, f"over {path_m:.0f} m")
+
+
+def drift_share(e: Evidence) -> Measured:
+    paths = _paths_between_fixes(e)
+    drift_m, path_m = max(paths, key=lambda path: path[1], default=(0.0, 0.0))
+    if path_m < MIN_PATH_M:
+        return Measured(None, f"the longest way between two fixes is {path_m:.0f} m")
+    return Measured(drift_m / path_m, f"{drift_m:.0f} m over {path_m:.0f} m")
+
+
+def complete_estimates(e: Evidence) -> Measured:
+    estimates = [estimate for frame in e.frames for estimate in frame.estimates]
+    return _share([_complete(estimate) for estimate in estimates], f"{len(estimates)} estimates")
+
+
+def coverage(e: Evidence) -> Measured:
+    """Errors of one flight are correlated (constant error of the map), so that the upper limit applies to all flights
+    together."""
+    nees = e.metrics["mean_nees"]
+    return Measured(e.metrics["ellipse95_coverage"], "" if nees is None else f"mean NEES {nees:.2f}")
+
+
+def false_fixes(e: Evidence) -> Measured:
+    return Measured(float(e.metrics["false_fixes"]))
+
+
+def first_position_s(e: Evidence) -> Measured:
+    first = next((f for f in e.frames if f.fixed and _near(f)), None)
+    if first is None:
+        return Measured(None, "never", Verdict.BELOW)
+    in_flight_s = first.t_s - e.frames[0].t_s
+    return Measured(e.start_up_s + in_flight_s, f"{e.start_up_s:.1f} s to start, {in_flight_s:.1f} s of flight")
+
+
+def relocalized_after_s(e: Evidence) -> Measured:
+    """From the end of the last marked span, or from the start, to the first of 5 consecutive frames within 50 m."""
+    end_s = e.marks.spans[-1].to_s if e.marks.spans else e.frames[0].t_s
+    after = [f for f in e.frames if f.t_s >= end_s and f.compared]
+    for i, frame in enumerate(after):
+        if all(_near(f) for f in after[i : i + 5]):
+            return Measured(frame.t_s - end_s)
+    return Measured(None, "never", Verdict.BELOW) if after else Measured(None, "the flight ends before")
+
+
+def memory_mb(e: Evidence) -> Measured:
+    return Measured(e.summary["peak_memory_mb"], "vision, anchor and estimator in one process")
+
+
+def right_mode(e: Evidence) -> Measured:
+    estimates = [estimate for frame in e.frames for estimate in frame.estimates]
+    right = [
+        (estimate.covariance_mode is CovarianceMode.JACOBIAN) == (estimate.emitted_at_ns in e.hot)
+        for estimate in estimates
+    ]
+    return _share(right, f"{len(e.hot)} of {len(e.frames)} frames hot")
+
+
+def gps_interval_p99_ms(e: Evidence) -> Measured:
+    return _of_peer(e, "interval_p99_ms", "in simulated time")
+
+
+def gps_longest_gap_ms(e: Evidence) -> Measured:
+    return _of_peer(e, "longest_gap_ms", "in simulated time")
+
+
+def vehicle_error_m(e: Evidence) -> Measured:
+    return _of_peer(e, "position_error_max_m", "what it steers by, against the truth")
+
+
+def failsafes(e: Evidence) -> Measured:
+    return _of_peer(e, "failsafes", "")
+
+
+def _lost_ns(e: Evidence) -> int | None:
+    """Time at which the 1-sigma had exceeded that of an unknown start for three consecutive frames and two seconds."""
+    since: list[int] = []
+    for frame in e.frames:
+        if not frame.estimates:
+            continue
+        first = frame.estimates[0]
+        since = [*since, first.t_ns] if min(map(_worst_sigma_m, frame.estimates)) > SEARCH_START_SIGMA_M else []
+        if len(since) >= REQUEST_FRAMES and since[-1] - since[0] >= REQUEST_S * 1e9:
+            return since[-1]
+    return None
+
+
+def _worst_sigma_m(estimate: NavEstimate) -> float:
+    cov = np.array(estimate.cov).reshape(6, 6)[:2, :2]
+    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(cov)[-1])))
+
+
+def _in_flight_s(e: Evidence, t_ns: int) -> float:
+    return (t_ns - next(f.estimates[0].t_ns for f in e.frames if f.estimates)) * 1e-9
+
+
+def _of_peer(e: Evidence, key: str, why: str) -> Measured:
+    value = e.peer.get(key)
+    return Measured(None, "the autopilot did not say") if value is None else Measured(float(value), why)
+
+
+def _near(frame: FrameEvidence) -> bool:
+    return frame.error_m is not None and frame.error_m <= NEAR_M
+
+
+def _share(values: list[bool], why: str = "") -> Measured:
+    return Measured(sum(values) / len(values), why) if values else Measured(None, "no such frame in this flight")
+
+
+def _fragments(e: Evidence) -> list[list[FrameEvidence]]:
+    edges = [-np.inf, *e.marks.breaks_s, np.inf]
+    parts = ([f for f in e.frames if low <= f.t_s < high] for low, high in pairwise(edges))
+    return [part for part in parts if part]
+
+
+def _paths_between_fixes(e: Evidence) -> list[tuple[float, float]]:
+    """(drift, path) [m] for each pair of successive fixes with odometry in all frames between them.
+
+    Drift: motion from the estimate at a fix to the prediction at the next one, less the true motion."""
+    place = LocalFrame(e.origin.lat_deg, e.origin.lon_deg)
+    paths: list[tuple[float, float]] = []
+    from_m = true_from_m = true_last_m = None
+    path_m = 0.0
+    for frame in e.frames:
+        true_m = e.local_truth_m(frame)
+        if true_m is None or frame.odometry_verdict is not Answer.ACCEPTED:
+            from_m = None
+            continue
+        path_m += 0.0 if true_last_m is None else float(np.hypot(*(true_m - true_last_m)))
+        true_last_m = true_m
+        if not frame.fixed:
+            continue
+        if from_m is not None and true_from_m is not None and frame.prediction is not None:
+            motion = np.array(frame.prediction.p_c_in_w_m[:2]) - from_m
+            paths.append((float(np.hypot(*(motion - (true_m - true_from_m)))), path_m))
+        from_m = None
+        if frame.row.lat_deg is not None and frame.row.lon_deg is not None:
+            from_m = np.array(place.to_local(frame.row.lat_deg, frame.row.lon_deg), dtype=float)
+        true_from_m, path_m = true_m, 0.0
+    return paths
+
+
+def _complete(estimate: NavEstimate) -> bool:
+    cov = np.array(estimate.cov).reshape(6, 6) if len(estimate.cov) == 36 else np.full((6, 6), np.nan)
+    finite = bool(np.isfinite(cov).all()) and bool(np.allclose(cov, cov.T, rtol=1e-6, atol=1e-9))
+    return finite and bool(np.linalg.eigvalsh(cov)[0] > 0.0) and estimate.last_anchor_age_ms >= -1

@@ -1,0 +1,1 @@
+"""The area of a map: polygons, files, checks."""

@@ -1,0 +1,202 @@
+"""`terrafix map build`: area, sources, estimate, downloads, elevation, vectors, package."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from terrafix.core.errors import MapError, OutputError, UsageError
+from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.area.checks import check_area
+from terrafix_tools.mapping.area.files import DEFAULT_BUFFER_KM, is_line, read_area
+from terrafix_tools.mapping.build import build_package, layer_of
+from terrafix_tools.mapping.fetching.progress import shown
+from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
+from terrafix_tools.mapping.package.dem import DemSource
+from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
+from terrafix_tools.mapping.package.height_datums import Datum
+from terrafix_tools.mapping.package.heights import to_amsl
+from terrafix_tools.mapping.parallel import default_workers
+from terrafix_tools.mapping.sources import glo30
+from terrafix_tools.mapping.sources.prepare import Preparation, Request
+from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
+from terrafix_tools.mapping.vectors.overpass import PUBLIC, fetch_overpass, overpass_features
+from terrafix_tools.mapping.vectors.pbf import pbf_features
+from terrafix_tools.mapping.vectors.tags import LICENCE as OSM_LICENCE
+
+if TYPE_CHECKING:
+    from terrafix_tools.mapping.parallel_cluster import DaskCluster
+
+OVERPASS = "overpass"
+OFFERED_CORRIDOR_KM = 2.0
+FINEST_GSD_M, COARSEST_GSD_M = 0.01, 100.0
+
+
+@dataclass(frozen=True)
+class Order:
+    """The command line options of a build; the field names are those of the options."""
+
+    out: Path
+    area: str = ""
+    buffer_km: float | None = None
+    corridor_km: float | None = None
+    source: Sequence[str] = ()
+    sources: Path | None = None
+    gsd_m: float | None = None
+    dem: str = ""
+    dem_datum: Datum = Datum.EGM96
+    geoid: Path | None = None
+    osm: str = ""
+    date: str = ""
+    licence: str = ""
+    ce90_m: float | None = None
+    descriptors: Descriptors = Descriptors.WEIGHTS_FREE
+    null_agl_m: tuple[float, ...] = ()
+    rate: float | None = None
+    workers: int | None = None  # None: ``usual_workers``
+    scheduler: str = ""
+    cache: Path | None = None
+    agreed: bool = False
+    estimate_only: bool = False
+    say: Console = field(default_factory=lambda: Console(stderr=True, soft_wrap=True))
+
+    @property
+    def cache_dir(self) -> Path:
+        """Folder that keeps downloads between runs (freedesktop.org, XDG base directories)."""
+        return self.cache or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "terrafix"
+
+
+def build_order(order: Order) -> Path | None:
+    """Writes the package and returns its path; None when only an estimate was requested.
+
+    Raises UsageError, ConfigError, SourceError, MapError, OutputError: one line each."""
+    _check_files(order)
+    with contextlib.ExitStack() as stack:
+        cluster = stack.enter_context(_cluster(order.scheduler)) if order.scheduler else None
+        if not order.area:
+            layers, area = [_whole_image(order)], None
+        else:
+            area = read_area(order.area, buffer_km=order.buffer_km, corridor_km=order.corridor_km)
+            found = _layers(order, area)
+            if found is None:
+                return None
+            layers = found
+        try:
+            order.out.parent.mkdir(parents=True, exist_ok=True)
+            made = tempfile.TemporaryDirectory(dir=order.out.parent, prefix=f".{order.out.name}.")
+        except OSError as error:
+            raise OutputError(f"{order.out}: cannot be written ({error.strerror}); choose another --out") from None
+        scratch = stack.enter_context(made)
+        elevation = _elevation(order, area, Path(scratch))
+        vectors = _vectors(order, area)
+        return build_package(
+            layers,
+            order.out,
+            elevation=elevation,
+            vectors=vectors,
+            descriptors=order.descriptors,
+            null_agl_m=order.null_agl_m,
+            workers=order.workers or default_workers(),
+            cluster=cluster,
+            progress=True,
+        )
+
+
+def _cluster(address: str) -> "DaskCluster":
+    """Connects to the scheduler before the download, which may take hours. Raises UsageError."""
+    try:
+        from terrafix_tools.mapping.parallel_cluster import DaskCluster
+    except ModuleNotFoundError as error:
+        raise UsageError(f"--scheduler needs {error.name}; install it: pip install 'terrafix[cluster]'") from None
+    return DaskCluster(address)
+
+
+def _check_files(order: Order) -> None:
+    """Checks that needed files exist before the download, which may take hours."""
+    for option, text in (("--dem", order.dem), ("--osm", order.osm), ("--geoid", str(order.geoid or ""))):
+        if text and text not in (glo30.NAME, OVERPASS) and "://" not in text and not Path(text).is_file():
+            raise MapError(f"{text}: no such file; check {option}")
+
+
+def _whole_image(order: Order) -> LayerInput:
+    if len(order.source) != 1 or order.sources or "://" in order.source[0]:
+        raise UsageError("give one image (it is taken whole), or --area with --source for several or for the network")
+    lengths = order.gsd_m, order.buffer_km, order.corridor_km
+    if order.osm or order.dem == glo30.NAME or any(length is not None for length in lengths):
+        raise UsageError("--osm, --dem glo-30, --gsd, --buffer and --corridor need --area, for example W,S,E,N")
+    imagery = Path(order.source[0])
+    if order.out.exists() and imagery.exists() and order.out.samefile(imagery):
+        raise OutputError(f"{order.out}: would overwrite the imagery; give another --out")
+    return layer_of(imagery, date=order.date, licence=order.licence, ce90_m=order.ce90_m)
+
+
+def _layers(order: Order, area: Area) -> list[LayerInput] | None:
+    if order.gsd_m is not None and not FINEST_GSD_M <= order.gsd_m <= COARSEST_GSD_M:
+        raise UsageError(f"--gsd {order.gsd_m:g}: give metres per pixel between {FINEST_GSD_M} and {COARSEST_GSD_M:g}")
+    specs = _specs(order)
+    size_km2 = check_area(area)
+    order.say.print(f"{area.name}: {size_km2:,.1f} km2 with its buffer", highlight=False)
+    if order.buffer_km is None and order.corridor_km is None:
+        order.say.print(_area_hint(order.area), highlight=False)
+    preparation = Preparation(Request(area, specs, order.cache_dir, order.out, order.gsd_m), order.say)
+    estimates = preparation.estimate()
+    if order.estimate_only:
+        return None
+    preparation.fetch(estimates, agreed=order.agreed)
+    return preparation.layers()
+
+
+def _area_hint(area: str) -> str:
+    """Hint at smaller areas, for a user who did not set the buffer."""
+    if not is_line(area):
+        return f"the buffer is {DEFAULT_BUFFER_KM:g} km, for an open search; --buffer KM sets it, 0 is the area itself"
+    size_km2 = read_area(area, corridor_km=OFFERED_CORRIDOR_KM).size_km2()
+    return (
+        f"the buffer is {DEFAULT_BUFFER_KM:g} km, for an open search; "
+        f"--corridor {OFFERED_CORRIDOR_KM:g} along the mission would be {size_km2:,.1f} km2"
+    )
+
+
+def _specs(order: Order) -> list[SourceSpec]:
+    specs = parse_sources(
+        list(order.source), licence=order.licence, date=order.date, ce90_m=order.ce90_m, rate=order.rate
+    )
+    if order.sources:
+        specs += read_sources(order.sources)
+    if not specs:
+        raise UsageError("--area needs a --source: a GeoTIFF, .mbtiles, a {z}/{x}/{y} address, ...")
+    return specs
+
+
+def _elevation(order: Order, area: Area | None, scratch: Path) -> ElevationInput | None:
+    if not order.dem:
+        return None
+    datum, licence, path = order.dem_datum, "", Path(order.dem)
+    if order.dem == glo30.NAME:
+        assert area is not None
+        datum, licence = Datum.EGM2008, glo30.LICENCE
+        with shown(order.say, glo30.NAME) as on_progress:
+            path = glo30.fetch_glo30(area, order.cache_dir, on_progress)
+    used, note = to_amsl(path, datum, scratch / "amsl.tif", order.geoid)
+    if datum is not Datum.EGM96:
+        order.say.print(f"{order.dem}: {note}", highlight=False)
+    return ElevationInput(partial(DemSource, used.absolute()), source=path.name, licence=licence)
+
+
+def _vectors(order: Order, area: Area | None) -> VectorInput | None:
+    if not order.osm:
+        return None
+    assert area is not None
+    if order.osm == OVERPASS or "://" in order.osm:
+        url = PUBLIC if order.osm == OVERPASS else order.osm
+        with shown(order.say, "OpenStreetMap") as on_progress:
+            paths = fetch_overpass(url, area, order.cache_dir, on_progress)
+        return VectorInput(overpass_features(paths, area), source=url, licence=OSM_LICENCE)
+    path = Path(order.osm)
+    return VectorInput(pbf_features(path, area), source=path.name, licence=OSM_LICENCE)

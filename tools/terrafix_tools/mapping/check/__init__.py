@@ -1,0 +1,1 @@
+"""Whether a map will do, and pictures of it."""

@@ -1,0 +1,108 @@
+"""A self-contained HTML page about a map package: the image, its matchability, and the mission."""
+
+import base64
+import html
+import importlib.resources
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from terrafix.core.errors import OutputError
+from terrafix_tools.mapping.check.check import CheckResult, MapCheck
+from terrafix_tools.mapping.check.sight import Sight
+from terrafix_tools.mapping.check.text import lines_of
+
+PICTURE_PX = 1400  # longer side of the inlined image
+JPEG_QUALITY = 82
+VOID_BGR = (226, 230, 230)  # outside of the map
+# BGRA; blue, orange and crimson are distinguishable for the colour-blind, and blind is also the darkest.
+COLOURS = {
+    Sight.NO_MAP: (0, 0, 0, 0),
+    Sight.BLIND: (92, 30, 170, 175),
+    Sight.WEAK: (23, 154, 233, 140),
+    Sight.SEES: (216, 114, 34, 70),
+}
+WORDS = {
+    Sight.SEES: "sees: fixes come",
+    Sight.WEAK: "weak: fixes come now and then",
+    Sight.BLIND: "blind: water, bare ground, or a pattern that repeats itself",
+}
+
+
+def write_page(checked: CheckResult, out: Path) -> None:
+    """Writes the page. Raises OutputError."""
+    try:
+        out.write_text(page(checked), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror}); give another name") from None
+
+
+def page(checked: CheckResult) -> str:
+    report = checked.report
+    css = importlib.resources.files("terrafix_tools").joinpath("assets/map.css").read_text(encoding="utf-8")
+    name = html.escape(Path(report.package).name)
+    rows = "".join(f"<dt>{html.escape(what)}</dt><dd>{html.escape(text)}</dd>" for what, text in lines_of(report))
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>{name}</title><style>{css}</style><main><header><p>Map package</p><h1>{name}</h1>"
+        f"<p>{_headline(report)}</p></header>"
+        f'<input type="checkbox" id="sight" checked><label for="sight">Where the camera will see</label>'
+        f"{_svg(checked)}{_legend()}<dl>{rows}</dl></main></html>\n"
+    )
+
+
+def _headline(report: MapCheck) -> str:
+    mission = report.mission
+    if mission is not None and mission.outside:
+        return "The mission leaves this map."
+    if mission is not None:
+        return f"The mission stays on this map; fixes are to be expected on {mission.seen_share:.0%} of it."
+    return (
+        f"Fixes are to be expected over {report.sees + report.weak:.0%} of it, from {report.agl_m:.0f} m above ground."
+    )
+
+
+def _svg(checked: CheckResult) -> str:
+    e_min, n_min, e_max, n_max = checked.local.bounds_m
+    gsd_m = max(e_max - e_min, n_max - n_min) / PICTURE_PX
+    width, height = max(1, round((e_max - e_min) / gsd_m)), max(1, round((n_max - n_min) / gsd_m))
+    image, valid = checked.local.window(e_min, n_max, width, height, gsd_m, checked.report.layer)
+    image[~valid] = VOID_BGR
+    ground = _data_uri("image/jpeg", cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+    table = np.array([COLOURS[Sight(k)] for k in range(len(Sight))], np.uint8)
+    overlay = _data_uri("image/png", cv2.imencode(".png", table[checked.grid.sight])[1])
+    cells_h, cells_w = checked.grid.sight.shape
+    side = checked.grid.step_m / gsd_m
+    body = [
+        f'<image width="{width}" height="{height}" href="{ground}"/>',
+        f'<image class="sight" width="{cells_w * side:.1f}" height="{cells_h * side:.1f}" '
+        f'preserveAspectRatio="none" href="{overlay}"/>',
+        _mission(checked, e_min, n_max, gsd_m),
+    ]
+    return f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="The map, north up">{"".join(body)}</svg>'
+
+
+def _mission(checked: CheckResult, e_min_m: float, n_max_m: float, gsd_m: float) -> str:
+    if checked.route is None:
+        return ""
+    xy = (checked.route.points_m - (e_min_m, n_max_m)) * (1 / gsd_m, -1 / gsd_m)
+    line = " ".join(f"{x:.1f},{y:.1f}" for x, y in xy)
+    x, y = xy[0]
+    return (
+        f'<polyline class="casing" points="{line}"/><polyline class="way" points="{line}"/>'
+        f'<circle class="way" cx="{x:.1f}" cy="{y:.1f}" r="7"/>'
+    )
+
+
+def _legend() -> str:
+    items = []
+    for sight, words in WORDS.items():
+        blue, green, red, alpha = COLOURS[sight]
+        items.append(f'<li><i style="background:rgba({red},{green},{blue},{alpha / 255:.2f})"></i>{words}</li>')
+    items.append("<li><i></i>no colour: less than a whole frame of map</li>")
+    return f'<ul class="legend">{"".join(items)}</ul>'
+
+
+def _data_uri(kind: str, data: np.ndarray) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data.tobytes()).decode()}"

@@ -1,0 +1,1 @@
+"""Parts of a map package as they are written."""

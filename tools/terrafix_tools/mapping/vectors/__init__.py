@@ -1,0 +1,1 @@
+"""Vector features of a map, from OpenStreetMap."""
