@@ -26,7 +26,8 @@ ImuSample = tuple[int, float, float, float, float, float, float]
 class SourceLabel(StrEnum):
     """Source of a position (AC-12)."""
 
-    SATELLITE_ANCHORED = "satellite_anchored"  # a map match was fused within the last keyframes
+    # A map match (satellite imagery, not GNSS) was fused for a frame at most 1.5 s old.
+    SATELLITE_ANCHORED = "satellite_anchored"
     VISUAL_PROPAGATED = "visual_propagated"  # visual odometry since the last map match
     DEAD_RECKONED = "dead_reckoned"  # neither map match nor odometry: prediction with growing covariance
 
@@ -34,8 +35,8 @@ class SourceLabel(StrEnum):
 class CovarianceMode(StrEnum):
     """Method by which the 6x6 covariance was computed (ON-2)."""
 
-    MARGINALS = "marginals"
-    JACOBIAN = "jacobian"
+    MARGINALS = "marginals"  # of C_k, from iSAM2
+    JACOBIAN = "jacobian"  # propagated from frame to frame under thermal throttle, without marginals
 
 
 class ThermalBand(StrEnum):
@@ -57,10 +58,10 @@ class Verdict(StrEnum):
     TOO_LOW = "too_low"  # the footprint is too small for matching
     AMBIGUOUS = "ambiguous"  # more than one position fits
     DEGENERATE = "degenerate"
-    INNOVATION = "innovation"  # the innovation exceeds its gate
+    INNOVATION = "innovation"  # map match, airspeed, dead reckoning, start or estimate beyond its gate
     STALE = "stale"
-    UNCONFIRMED = "unconfirmed"  # match of a trajectory fragment that is not yet joined to the flight
-    IMPLAUSIBLE = "implausible"  # impossible jump, speed or height
+    UNCONFIRMED = "unconfirmed"  # odometry or coarse match of a fragment that is not yet joined to the flight
+    IMPLAUSIBLE = "implausible"  # odometry, height or heading beyond its gate; impossible estimate, telemetry or time
     MODEL_FAILED = "model_failed"  # the learned model gave no usable output; ModelEvent has the reason
     LOST = "lost"  # the images contradict the estimated position; relocalisation is active
 
@@ -201,7 +202,7 @@ class Prediction(Message, frozen=True, kw_only=True):
     step_m: Vec2  # camera motion (east, north) since the previous Prediction, from odometry alone
     step_cov_m2: Mat2  # covariance of step_m (ee, en, ne, nn)
     lens: float = 0.0  # estimated residual radial distortion, if significant (core.camera.undistort_division)
-    start_ns: int = 0  # t_ns of the Start or Coasted that reset the position; 0: no reset
+    start_ns: int = 0  # t_ns of the Start or EkfDeadReckoning that reset the position; 0: no reset
 
 
 # --- anchor ---------------------------------------------------------------------------------------
@@ -256,21 +257,20 @@ class PositionHint(Message, frozen=True, kw_only=True):
     source: str  # "ground station 255", "command line", "autopilot"
 
 
-class Coasted(Message, frozen=True, kw_only=True):
-    """Dead reckoning of the autopilot's EKF, without aiding, over ``coast_s`` from our last 3D fix to ``t_ns``.
+class EkfDeadReckoning(Message, frozen=True, kw_only=True):
+    """Dead reckoning of the autopilot's EKF, without aiding, over ``duration_s`` from our last 3D fix to ``t_ns``.
 
-    Position and velocity with their 1-sigma per axis are those of that fix. ``gain_mps``: change of the EKF velocity
-    since (delta v). ``way_m``: displacement (east, north) since, less the EKF velocity at the fix times ``coast_s``
-    (delta p)."""
+    Position and velocity with their 1-sigma per axis are those of that fix. ``delta_v_mps``: change of the EKF velocity
+    since. ``delta_p_m``: displacement (east, north) since, less the EKF velocity at the fix times ``duration_s``."""
 
-    coast_s: float
+    duration_s: float
     lat_deg: float
     lon_deg: float
     velocity_enu_mps: Vec3
     position_sigma_m: float
     velocity_sigma_mps: float
-    way_m: tuple[float, float]
-    gain_mps: Vec3
+    delta_p_m: tuple[float, float]
+    delta_v_mps: Vec3
 
 
 class HintVerdict(Message, frozen=True, kw_only=True):
@@ -349,7 +349,7 @@ class CalibrationFault(Message, frozen=True, kw_only=True):
     active: bool
 
 
-class LearntLens(msgspec.Struct, frozen=True, kw_only=True):
+class LensEstimate(msgspec.Struct, frozen=True, kw_only=True):
     """Estimated intrinsics in normalised coordinates with information matrix.
 
     ``value``: k1, k2, p1, p2, relative error of the focal length, offset of the principal point from its calibration
@@ -359,15 +359,16 @@ class LearntLens(msgspec.Struct, frozen=True, kw_only=True):
     information: tuple[float, ...]  # 7x7, row-major
 
 
-class SlowErrors(Message, frozen=True, kw_only=True):
-    """Estimated calibration errors that are constant in a flight (mount, compass, barometer, lens), once a second."""
+class CalibrationEstimate(Message, frozen=True, kw_only=True):
+    """Estimated calibration errors that are constant in a flight (mount, compass, barometer, lens): 1 Hz, not while
+    hot."""
 
     frame_id: int
     # Tilt of the mount about the camera's x and y [rad], heading [rad], height [m], first radial coefficient [-],
     # logarithm of the ratio of reported to observed heights [-]
-    error: tuple[float, float, float, float, float, float]
+    state: tuple[float, float, float, float, float, float]
     cov: tuple[float, ...]  # 6x6, row-major
-    lens: LearntLens | None = None  # only of an uncalibrated camera; estimator/measurements/principal_point.py
+    lens: LensEstimate | None = None  # only of an uncalibrated camera; estimator/measurements/principal_point.py
 
 
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
@@ -380,7 +381,7 @@ class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ClaimBudget(Message, frozen=True, kw_only=True):
-    """1 Hz: which terms the horizontal covariance of a NavEstimate is made of."""
+    """Terms of the horizontal covariance of a NavEstimate, once a second after the first map match, not while hot."""
 
     frame_id: int
     # Mean horizontal variance [m^2] of each term: "graph", "map", "principal_point", "time_offset", "hypotheses",
@@ -395,16 +396,19 @@ class Refinement(Message, frozen=True, kw_only=True):
 
 
 class MeasurementVerdict(Message, frozen=True, kw_only=True):
-    """Result of the checks of one measurement; every measurement gets one (law 3)."""
+    """Result of the checks of one measurement. Every rejection has one (law 3); of heights and headings only those."""
 
     frame_id: int  # -1: not related to a frame
-    # From the estimator "odometry", "map", "attitude", "height", "airspeed", "dead_reckoning", "start", "reset" (of the
-    # graph); from the link "estimate", "telemetry", "wall clock"
+    # From the estimator "odometry", "map", "attitude" (the reported heading), "height", "airspeed", "dead_reckoning",
+    # "start", "reset" (of the graph); from the link "estimate", "telemetry", "wall clock"
     measurement: str
     verdict: Verdict
     detail: str = ""
     mahalanobis2: float | None = None  # squared Mahalanobis distance of the innovation
-    innovation: tuple[float, ...] = ()  # measured less predicted, in units of the measurement
+    # Measured less predicted. "map": GTSAM Pose3 tangent (rotation [rad], then translation [m], axes of the camera);
+    # while the heading is unknown, and of "start", "dead_reckoning": east and north [m]. Others: units of the
+    # measurement.
+    innovation: tuple[float, ...] = ()
     innovation_variance: tuple[float, ...] = ()  # of each component, measurement and prediction together
     test_ratio: float | None = None  # mahalanobis2 over the limit of its gate: above 1 it is rejected
 
@@ -514,7 +518,7 @@ class PositionSource(Message, frozen=True, kw_only=True):
     receiver: int
 
 
-class FilterStatus(Message, frozen=True, kw_only=True):
+class EkfStatus(Message, frozen=True, kw_only=True):
     """Status of the autopilot's EKF (EKF_STATUS_REPORT, PX4: ESTIMATOR_STATUS), which shows whether it fuses our
     position."""
 
@@ -591,12 +595,12 @@ AnyMessage = (
     | ModelEvent
     | SearchState
     | PositionHint
-    | Coasted
+    | EkfDeadReckoning
     | HintVerdict
     | Start
     | NavEstimate
     | CalibrationFault
-    | SlowErrors
+    | CalibrationEstimate
     | ClaimBudget
     | Refinement
     | MeasurementVerdict
@@ -607,7 +611,7 @@ AnyMessage = (
     | GnssVerdict
     | MapOffset
     | PositionSource
-    | FilterStatus
+    | EkfStatus
     | WallClock
     | StatusText
     | ThermalReading

@@ -60,7 +60,7 @@ def test_fact_px4_flies_a_mission_and_lands_on_the_sent_position_alone(
         newest = {type(x): x for x in flight.published}
         for kind in ("ATTITUDE", "HIGHRES_IMU", "ALTITUDE"):
             assert kind not in newest[m.LinkStatus].detail  # named there if they arrive too slowly
-        assert newest[m.FilterStatus].flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
+        assert newest[m.EkfStatus].flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
         assert m.Imu in newest
 
 

@@ -5,16 +5,16 @@ import numpy as np
 from terrafix.core.camera import distort_division, undistort_division
 from terrafix.core.gate import GATE
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
-from terrafix.messages import Camera, SlowErrors
+from terrafix.messages import CalibrationEstimate, Camera
 
-RADIAL_K1 = 4  # index of radial_k1 in SlowErrors.error
+RADIAL_K1 = 4  # index of radial_k1 in CalibrationEstimate.state
 MIN_SIGMAS = 3.0  # sigmas by which the estimate must differ from zero to be reported
 MIN_WIDTH_SHARE = (
     0.01  # of the image width: least displacement by distortion (corner) or by the principal point that is reported
 )
 
 
-def lens_words(camera: Camera, calibration: SlowErrors) -> str | None:
+def lens_words(camera: Camera, calibration: CalibrationEstimate) -> str | None:
     """Returns one or two sentences; None when the estimate does not differ significantly from the described lens."""
     return (
         " ".join(
@@ -26,7 +26,7 @@ def lens_words(camera: Camera, calibration: SlowErrors) -> str | None:
     )
 
 
-def _principal_point_text(camera: Camera, calibration: SlowErrors) -> str:
+def _principal_point_text(camera: Camera, calibration: CalibrationEstimate) -> str:
     principal_point = PrincipalPointFilter(camera, calibration.lens)
     px = principal_point.offset * (camera.fx, camera.fy)
     sigma_px = np.sqrt(np.diag(principal_point.cov)) * (camera.fx, camera.fy)
@@ -44,9 +44,9 @@ def _principal_point_text(camera: Camera, calibration: SlowErrors) -> str:
     )
 
 
-def _distortion_text(camera: Camera, calibration: SlowErrors) -> str:
-    radial_k1 = calibration.error[RADIAL_K1]
-    n = len(calibration.error)
+def _distortion_text(camera: Camera, calibration: CalibrationEstimate) -> str:
+    radial_k1 = calibration.state[RADIAL_K1]
+    n = len(calibration.state)
     sigma = float(np.sqrt(calibration.cov[RADIAL_K1 * n + RADIAL_K1]))
     corner = float(
         np.hypot(

@@ -14,6 +14,7 @@ from terrafix.core.config import Config
 from terrafix.core.errors import OutputError
 from terrafix.core.node import Image
 from terrafix.messages import (
+    CalibrationEstimate,
     CalibrationFault,
     Frame,
     MapMatch,
@@ -21,7 +22,6 @@ from terrafix.messages import (
     Message,
     Odometry,
     Origin,
-    SlowErrors,
     Verdict,
 )
 from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
@@ -47,7 +47,7 @@ class ReplayOutput:
         self._matcher: Counter[str] = Counter()
         self._registered: dict[int, bool] = {}
         self._origin: Origin | None = None
-        self._calibration: SlowErrors | None = None
+        self._calibration: CalibrationEstimate | None = None
         self._faults: list[tuple[float, CalibrationFault]] = []
 
     def __enter__(self) -> Self:
@@ -138,7 +138,7 @@ class ReplayOutput:
             self._origin = message
         elif isinstance(message, CalibrationFault):
             self._faults.append((message.t_ns / NS, message))
-        elif isinstance(message, SlowErrors):
+        elif isinstance(message, CalibrationEstimate):
             self._calibration = message
         elif isinstance(message, MapMatch):
             self._matcher[str(message.verdict)] += 1

@@ -23,7 +23,7 @@ from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.estimator.models.speed_prior import SpeedPrior
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.state import HEIGHT, LOG_HEIGHT_SCALE, MOTION_SIZE, RADIAL_K1, UP, VELOCITY
-from terrafix.messages import Camera, CovarianceMode, LearntLens, Odometry, Origin
+from terrafix.messages import Camera, CovarianceMode, LensEstimate, Odometry, Origin
 
 LENS_SURE = 3.0  # sigmas, from which a lens distortion is applied: no lens has exactly none [tuned]
 
@@ -81,7 +81,7 @@ class FilterState:
     ``yaw_gauge``: None while the heading is observable. ``has_height``: the autopilot reported one when the graph
     began, at ``began_s``."""
 
-    def __init__(self, origin: Origin, graph: PoseGraph | None = None, lens: LearntLens | None = None) -> None:
+    def __init__(self, origin: Origin, graph: PoseGraph | None = None, lens: LensEstimate | None = None) -> None:
         """``lens``: lens calibration of an estimator that ran before in this flight."""
         self.origin = origin
         self.graph = graph or PoseGraph()
@@ -109,7 +109,8 @@ class FilterState:
 
     def covariance(self, node: int) -> np.ndarray:
         """Covariance (6, 6) of C_node, tangent order: the smoother's marginal; under thermal throttle the propagated
-        one, from odometry and the inliers of map matches (O(inliers), ON-2)."""
+        one: that of the parent through the motion, plus that of the motion. A map match adds its information to the
+        node of its own frame (ON-2)."""
         if self.mode is CovarianceMode.MARGINALS or node not in self.cov_of:
             self.cov_of[node] = self.graph.covariance(node)
         return self.cov_of[node]

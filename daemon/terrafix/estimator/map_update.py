@@ -33,7 +33,7 @@ COARSE_FINDS_AFTER, COARSE_FINDS_OVER = (
     1.0,
 )  # consistent coarse matches, over so many heights, that are fused [tuned]
 RECOVER_AFTER = 3  # map matches that are consistent with each other and rejected by the gate [tuned]
-RECOVER_OVER = 0.5  # of the height: the motion that they must span, so that they are not one error seen thrice [tuned]
+RECOVER_OVER = 0.5  # of the height: the motion that they must span, so that they are not one repeated error [tuned]
 RECOVER_MASS = 0.97  # of the belief's mode [tuned]
 # Inliers: of 930 wrong places one gave a pose on so many, and of 400 starts one is wrong.
 OUTWEIGHS_START = 20  # [measured: anchor/verification/lock_monitor.py]
@@ -118,7 +118,7 @@ class MapUpdate:
     def _apply_without_heading(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult:
         """The first pose that agrees with the position gives the heading."""
         if match.coarse:  # its heading is one of those that were tried
-            return _result(Verdict.AMBIGUOUS, "a coarse fix does not tell the heading")
+            return _result(Verdict.AMBIGUOUS, "coarse match gives no heading")
         frame = self._frame_state(match.frame_id, node)
         innovation = measurement.position_innovation(frame.pose, frame.cov)
         if not innovation.is_accepted:
@@ -126,10 +126,10 @@ class MapUpdate:
         return self._reset(match, node, measurement, "heading found")
 
     def _coarse_refusal(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult | None:
-        """Why a coarse match is not fused; None: it is, or the match is none."""
+        """Why a coarse match is not fused; None: it is to be fused, or the match is not coarse."""
         state = self._state
-        if match.coarse and not state.fragments.of(node).joined:  # it is of the belief's memory, not of this picture
-            return _result(Verdict.UNCONFIRMED, "a coarse fix does not join a fragment to the flight")
+        if match.coarse and not state.fragments.of(node).joined:  # its position comes from earlier frames
+            return _result(Verdict.UNCONFIRMED, "coarse match cannot confirm an odometry fragment")
         predicted, height_m = state.graph.state(node).pose, self._height_m(measurement)
         r_w_c = measurement.pose.rotation().matrix()
         sigma_m = float(np.sqrt(np.max(np.diag(tangent_to_world(state.covariance(node), r_w_c))[:2])))
@@ -137,7 +137,9 @@ class MapUpdate:
             offset = (measurement.pose.translation() - predicted.translation())[:2]
             self._coarse.add(offset, predicted.translation()[:2], coarse=True)
             if not self._coarse.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height_m):
-                return _result(Verdict.AMBIGUOUS, "a coarse fix continues a track, several find one")
+                return _result(
+                    Verdict.AMBIGUOUS, "coarse match: the estimate is too uncertain, six consistent ones are needed"
+                )
         self._coarse.clear()
         return None
 
@@ -195,9 +197,9 @@ class MapUpdate:
         if not match.coarse and not agrees:  # those that agree with each other support another position
             self.hypotheses.map_consistency.add_rejected(offset)
         height = float(measurement.pose.translation()[UP]) - state.terrain.ground_m
-        # A pose stands on patches of its own frame. A coarse match is of the belief's memory: one look that went
-        # astray is in all that follow. While no other position is supported, coarse matches count against the graph
-        # when they would find a position without it; later they are more support of that position.
+        # A pose uses patches of its own frame only. A coarse match depends on earlier frames: one wrong correlation
+        # affects all later ones. While no other position is supported, coarse matches count against the graph when they
+        # would find a position without it; later they support that position.
         certain = other.probability == 0.0
         found = run.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height)
         if found or (run.poses if certain else len(run.offsets_m)) >= MIN_CONSISTENT:
@@ -208,7 +210,7 @@ class MapUpdate:
             if (found or run.is_confirmed(*needed, poses_only=certain)) and match.mode_mass >= RECOVER_MASS:
                 other.switch(offset, apart)
                 return self._reset(match, node, measurement, "restarted")
-        detail = f"{float(np.hypot(*offset)):.0f} m from the estimate"
+        detail = f"horizontally {float(np.hypot(*offset)):.0f} m from the estimate"
         return MapResult(FusionVerdict(measurement.name, Verdict.INNOVATION, innovation, detail))
 
     def _reset(self, match: MapMatch, node: int, measurement: MapPoseMeasurement, how: str) -> MapResult:

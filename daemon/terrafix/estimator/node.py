@@ -34,8 +34,8 @@ from terrafix.estimator.propagation import PropagationResult
 from terrafix.estimator.state import UP
 from terrafix.messages import (
     ClaimBudget,
-    Coasted,
     CovarianceMode,
+    EkfDeadReckoning,
     Health,
     Imu,
     MapMatch,
@@ -51,7 +51,7 @@ from terrafix.messages import (
     Verdict,
 )
 
-CALIBRATION_EVERY_NS = 1_000_000_000  # between two SlowErrors [spec: 1 Hz]
+CALIBRATION_EVERY_NS = 1_000_000_000  # between two CalibrationEstimate [spec: 1 Hz]
 TELEMETRY_WAIT_NS = 1_000_000_000  # the autopilot's heartbeat comes once a second [spec: MAVLink heartbeat]
 BEFORE_TELEMETRY = "older than the autopilot's first messages after the restart"
 
@@ -80,10 +80,12 @@ class EstimatorNode:
         sent_ns = None if checkpoint is None else checkpoint.estimate.t_ns
         self._ahrs = AhrsCorrectionMonitor(self._telemetry, sent_ns)
         self._attitude: Attitude | None = None  # at the newest frame
-        self._early_dead_reckoning: list[Coasted] = []  # before the Origin: the link may run before vision does
+        self._early_dead_reckoning: list[
+            EkfDeadReckoning
+        ] = []  # before the Origin: the link may run before vision does
         self._mode = CovarianceMode.MARGINALS
         self._tracked = True  # the newest frame has odometry or a map match
-        self._calibration_ns = 0  # of the newest SlowErrors
+        self._calibration_ns = 0  # of the newest CalibrationEstimate
         self._first_ns: int | None = None  # time of the first frame or telemetry
         self._waiting: list[Odometry] = []  # for telemetry, to which the calibration of the checkpoint refers
         self._time_offset = TimeOffset()
@@ -98,7 +100,7 @@ class EstimatorNode:
             Start: self._on_start,
             VehicleState: self._on_vehicle_state,
             Imu: self._on_imu,
-            Coasted: self._on_dead_reckoning,
+            EkfDeadReckoning: self._on_dead_reckoning,
             Health: self._on_health,
             Odometry: self._on_odometry,
             MapMatch: self._on_map_match,
@@ -183,7 +185,7 @@ class EstimatorNode:
         self._mode = CovarianceMode.MARGINALS if cool else CovarianceMode.JACOBIAN
         return ()
 
-    def _on_dead_reckoning(self, sample: Coasted) -> Iterable[Message]:
+    def _on_dead_reckoning(self, sample: EkfDeadReckoning) -> Iterable[Message]:
         if self._checkpoint is None:
             return
         estimator, axes = self._estimator, self._axes

@@ -13,13 +13,13 @@ from terrafix.estimator.filter_state import FrameState
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.state import UP
 from terrafix.messages import (
+    CalibrationEstimate,
     MeasurementVerdict,
     NavEstimate,
     Odometry,
     Prediction,
     RefinedPose,
     Refinement,
-    SlowErrors,
     SourceEnded,
     SourceLabel,
     Verdict,
@@ -112,15 +112,15 @@ def _source(age_ms: int, *, tracked: bool) -> SourceLabel:
     return SourceLabel.SATELLITE_ANCHORED if anchored else SourceLabel.VISUAL_PROPAGATED
 
 
-def calibration_of(estimator: Estimator, frame: FrameState) -> SlowErrors:
+def calibration_of(estimator: Estimator, frame: FrameState) -> CalibrationEstimate:
     """The calibration state of ``frame``, the newest one."""
     bias = estimator.graph.state(frame.node).bias
     cov = estimator.graph.bias_covariance(frame.node)
     tilt_x, tilt_y, heading, height, lens, scale = (float(e) for e in bias)
-    return SlowErrors(
+    return CalibrationEstimate(
         t_ns=round(frame.t_s * 1e9),
         frame_id=frame.frame_id,
-        error=(tilt_x, tilt_y, heading, height, lens, scale),
+        state=(tilt_x, tilt_y, heading, height, lens, scale),
         cov=tuple(float(c) for c in cov.ravel()),
         lens=estimator.state.principal_point.learnt,
     )

@@ -34,7 +34,7 @@ class PnpFailureError(Exception):
 
 
 class CovarianceDegradedWarning(UserWarning):
-    """Thermal throttle: the covariance is from odometry and inliers, not from the marginals of the graph."""
+    """Thermal throttle: the covariance is propagated from frame to frame, not the marginal of the graph."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class PoseEstimator:
         if verdict.verdict is not Verdict.ACCEPTED or said is None:
             raise PnpFailureError(verdict.verdict, verdict.detail)
         if said.covariance_mode is CovarianceMode.JACOBIAN:
-            warnings.warn(f"covariance from inliers: {thermal.cause}", CovarianceDegradedWarning, stacklevel=2)
+            warnings.warn(f"propagated covariance: {thermal.cause}", CovarianceDegradedWarning, stacklevel=2)
         return PoseEstimate(
             frame_id=said.frame_id,
             position_wgs84=(said.lat_deg, said.lon_deg, said.alt_amsl_m),

@@ -14,7 +14,7 @@ from terrafix.estimator.measurements.principal_point import graph_shift
 from terrafix.estimator.models.motion_model import MAX_SPEED_SIGMA_MPS, MIN_SPEED_MPS, integrate_motion
 from terrafix.estimator.models.speed_prior import TYPICAL_SPEED_MPS
 from terrafix.estimator.state import CALIBRATION_SIZE, HEADING
-from terrafix.messages import Camera, LearntLens, MapMatch, Message, NavEstimate, Origin, SlowErrors, Start
+from terrafix.messages import CalibrationEstimate, Camera, LensEstimate, MapMatch, Message, NavEstimate, Origin, Start
 from terrafix.runtime.checkpoint import CheckpointFile
 
 CHECKPOINT_EVERY_NS = 200_000_000  # [tuned]
@@ -31,7 +31,7 @@ class EstimatorCheckpoint(msgspec.Struct, frozen=True):
     with the elevation of the ground, without its points; None: the map has none. ``start``: the newest Start."""
 
     estimate: NavEstimate
-    slow: SlowErrors | None = None
+    slow: CalibrationEstimate | None = None
     match: MapMatch | None = None
     start: Start | None = None
 
@@ -59,7 +59,7 @@ class NavPrior:
     yaw_rad: float | None = None
     learnt: CalibrationPrior | None = None
     match: MapMatch | None = None
-    lens: LearntLens | None = None
+    lens: LensEstimate | None = None
 
     @classmethod
     def start(cls, origin: Origin, t_s: float) -> "NavPrior":
@@ -87,7 +87,7 @@ class NavPrior:
             at_m -= graph_shift(estimate, camera, lens)
         if slow is not None and estimate.t_ns - slow.t_ns <= MAX_CALIBRATION_AGE_NS:
             cov = np.array(slow.cov).reshape(CALIBRATION_SIZE, CALIBRATION_SIZE)
-            learnt = CalibrationPrior(slow.t_ns * 1e-9, np.array(slow.error), cov)
+            learnt = CalibrationPrior(slow.t_ns * 1e-9, np.array(slow.state), cov)
         return cls(
             t_s, at_m, sigma_m, velocity_mps, estimate.velocity_sigma_mps, yaw_rad, learnt, checkpoint.match, lens
         )
@@ -135,7 +135,7 @@ class CheckpointWriter:
     def __init__(self, file: Path) -> None:
         self._checkpoint = CheckpointFile(file, EstimatorCheckpoint)
         self._written_ns = -CHECKPOINT_EVERY_NS
-        self._slow: SlowErrors | None = None
+        self._slow: CalibrationEstimate | None = None
         self._match: MapMatch | None = None
         last = self._checkpoint.load()
         self._start = None if last is None else last.start  # published once, before take-off
@@ -144,7 +144,7 @@ class CheckpointWriter:
         return ()
 
     def on_message(self, message: Message) -> None:
-        if isinstance(message, SlowErrors):
+        if isinstance(message, CalibrationEstimate):
             self._slow = message
         elif isinstance(message, Start):
             self._start = message

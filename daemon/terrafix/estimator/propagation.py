@@ -60,9 +60,9 @@ TURN_UNSEEN_RAD = 0.3  # 1-sigma of the heading of an unseen frame without a rep
 
 @dataclass(frozen=True)
 class PropagationResult:
-    """What became of a frame. ``verdict``: on its odometry. ``step_m`` (2,): east, north since the frame before, by
-    odometry alone, and its 1-sigma. ``turn``: since the frame before, by pictures. ``verdicts``: on all measurements,
-    and on a reset of the graph, in the order in which they were made."""
+    """Result of ``advance``. ``verdict``: on the odometry of the frame. ``step_m`` (2,): east, north since the frame
+    before, by odometry alone, and its 1-sigma. ``turn``: since the frame before, by pictures. ``verdicts``: on all
+    measurements, and on a reset of the graph, in the order in which they were made."""
 
     verdict: Verdict
     placed: FrameState
@@ -74,8 +74,9 @@ class PropagationResult:
 
 @dataclass
 class _Step:
-    """One frame on its way into the graph. ``increment``: of the motion model since ``before``, the newest node; None:
-    the vehicle stands. ``predicted_cov``: of position and velocity at its end, ``predicted_m`` (3,), ``velocity``."""
+    """One frame before it is added to the graph. ``increment``: of the motion model since ``before``, the newest node;
+    None: the vehicle stands. ``predicted_cov``: of position and velocity at its end, ``predicted_m`` (3,),
+    ``velocity``."""
 
     frame: FrameInput
     before: NodeState
@@ -134,7 +135,7 @@ class Propagation:
         turn = self._odometry.turn(frame.odometry, sighting)
         rejected = self._gate_heading(frame, sighting, before)
         if rejected is not None and self._heading_gate.should_reinitialise and state.last_fix_s is None:
-            return self._initialize(frame, ResetReason.HEADING_GATE)
+            return self._initialize(frame, ResetReason.HEADING_GATE, rejected)
         if rejected is not None:
             frame = replace(frame, attitude=replace(frame.attitude, yaw_rad=None))
         step = self._predict(frame, before, sighting, increment if rejected is None else None)
@@ -144,8 +145,12 @@ class Propagation:
         if result := self._reset_before_fusion(step):
             return result
         self._apply_odometry(step)
-        if not self._gate_height(step):
-            return self._initialize(step.frame, ResetReason.HEIGHT_GATE)
+        rejected = self._gate_height(step)
+        if rejected is not None and self._height_gate.should_reinitialise and state.last_fix_s is None:
+            return self._initialize(step.frame, ResetReason.HEIGHT_GATE, rejected)
+        if rejected is not None:
+            step.frame = replace(step.frame, attitude=replace(step.frame.attitude, agl_m=None))
+            step.verdicts.append(rejected)
         if is_below_map_matching(state, step.frame.attitude, step.p_m):
             return self._reset_height(step)
         return self._add_node(step)
@@ -267,7 +272,7 @@ class Propagation:
                 step.increment, step.predicted_cov, gained = fuse_odometry_increment(
                     step.increment, off_m, step.predicted_cov, seen
                 )
-                # Else an increment that is right would be in the tail of its factor (factors/motion.py).
+                # Otherwise a correct increment would fall in the robust tail of its factor (factors/motion.py).
                 step.velocity = step.velocity + gained
         self._fragment_step(step)
 
@@ -281,7 +286,7 @@ class Propagation:
             # would be in the step of every frame of it, and add up in the belief that follows these steps.
             step.step_m = (step.p_m - keyframe.transformFrom(continuity.keyframe_motion[1]))[:2]
             if known.motion.rays is not None:
-                # A wrong height scales all of the way since the keyframe alike; the frame before had its part of it.
+                # A height error scales the whole distance since the keyframe; the frame before contains its share.
                 way_m2 = float(np.sum((step.p_m - keyframe.translation())[:2] ** 2))
                 scale2 = known.motion.rays.ground.translation_scale_sigma**2
                 aside_m2 = max(aside_m2 - way_m2 * scale2, 0.0) + float(step.step_m @ step.step_m) * scale2
@@ -404,22 +409,14 @@ class Propagation:
         innovation = heading_innovation(state, frame.attitude, known.parent, known.motion.r, before)
         return self._rejection("attitude", self._heading_gate, innovation.off_rad, innovation.sigma_rad)
 
-    def _gate_height(self, step: _Step) -> bool:
-        """The reported height against the predicted one. A rejected one is left out of the frame. -> False where
-        rejected heights agree with each other before any map match: the graph begins anew."""
+    def _gate_height(self, step: _Step) -> FusionVerdict | None:
+        """The reported height against the predicted one. -> the verdict on a height that is rejected."""
         state, attitude = self._state, step.frame.attitude
         if attitude.agl_m is None or attitude.stands:
-            return True
+            return None
         climb_m2 = float(step.predicted_cov[UP, UP])
         off_m, sigma_m = height_innovation(state, attitude.agl_m, step.p_m, step.before, climb_m2)
-        rejected = self._rejection("height", self._height_gate, off_m, sigma_m)
-        if rejected is None:
-            return True
-        if self._height_gate.should_reinitialise and state.last_fix_s is None:
-            return False
-        step.frame = replace(step.frame, attitude=replace(attitude, agl_m=None))
-        step.verdicts.append(rejected)
-        return True
+        return self._rejection("height", self._height_gate, off_m, sigma_m)
 
     def _rejection(self, name: str, gate: InnovationGate, residual: float, sigma: float) -> FusionVerdict | None:
         """The verdict on a scalar that ``gate`` rejects; None: it is accepted."""
@@ -459,7 +456,10 @@ class Propagation:
         state.last = state.frame_state(last.frame_id, last.t_s, last.node)
         return True
 
-    def _initialize(self, frame: FrameInput, reason: ResetReason) -> PropagationResult:
+    def _initialize(
+        self, frame: FrameInput, reason: ResetReason, rejected: FusionVerdict | None = None
+    ) -> PropagationResult:
+        """``rejected``: verdict that led to it, if the reason is a gate."""
         state = self._state
         self._height_gate.accept_initial()
         self._heading_gate.accept_initial()
@@ -467,7 +467,8 @@ class Propagation:
         sample = AidSample(placed.node, frame.t_s, frame.attitude, frame.imu, 0.0, True)
         fused = self._fuse_aid(self._dead_reckoning, sample)
         state.last = state.frame_state(frame.frame_id, frame.t_s, placed.node)
-        verdicts = [FusionVerdict("odometry", Verdict.ACCEPTED), _reset_verdict(reason)]
+        verdicts = [FusionVerdict("odometry", Verdict.ACCEPTED)]
+        verdicts += [_reset_verdict(reason)] if rejected is None else [rejected, _reset_verdict(reason)]
         verdicts += [] if fused is None else [fused]
         way_m, sigma_m = initial.way_m, initial.way_sigma_m
         return PropagationResult(Verdict.ACCEPTED, state.last, way_m, sigma_m, verdicts=tuple(verdicts))

@@ -23,7 +23,7 @@ from terrafix.link.pilot_text.debounce import Debounce
 from terrafix.link.pilot_text.statustext import CRITICAL, INFO, NOTICE, WARNING, fault_text, statustext
 from terrafix.messages import (
     CalibrationFault,
-    FilterStatus,
+    EkfStatus,
     GnssReading,
     GpsInput,
     Health,
@@ -115,7 +115,7 @@ class LinkNode:
             WallClock: self._on_wall_clock,
             ProcessEvent: self._on_process_event,
             Health: self._on_health,
-            FilterStatus: self._on_filter_status,
+            EkfStatus: self._on_ekf_status,
             SearchState: self._on_search_state,
             HintVerdict: self._on_hint_verdict,
             CalibrationFault: self._on_calibration_fault,
@@ -209,7 +209,7 @@ class LinkNode:
         degrees = "" if health.temperature_c is None else f", {health.temperature_c:.0f} C"
         return [statustext(health.t_ns, severity, f"computer is {health.band}{degrees}")]
 
-    def _on_filter_status(self, status: FilterStatus) -> list[Message]:
+    def _on_ekf_status(self, status: EkfStatus) -> list[Message]:
         self._ekf_monitor.on_status(status)
         return []
 

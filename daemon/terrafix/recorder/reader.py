@@ -16,7 +16,8 @@ from mcap.stream_reader import StreamReader
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import Message
-from terrafix.recorder.schema import THUMBNAIL_TOPIC, TYPE_BY_TOPIC
+from terrafix.recorder.old_format import OLD_TOPICS
+from terrafix.recorder.schema import THUMBNAIL_TOPIC, TYPE_BY_TOPIC, topic_of
 from terrafix.recorder.writer import HEADER_NAME, decode_thumbnail
 
 _SEGMENT = re.compile(r"flight-(\d+)\.mcap$")
@@ -64,7 +65,7 @@ def read_received(path: Path, result: ReadResult | None = None) -> Iterator[tupl
     """Like read_flight, with the reception time at the recorder: (topic, log_time_ns, received_ns, message)."""
     result = ReadResult() if result is None else result
     for channel, record in _records(path, result):
-        decoder = _decoders.get(channel.topic)
+        decoder = _decoders.get(channel.topic) or OLD_TOPICS.get(channel.topic)
         if decoder is None:
             continue
         try:
@@ -72,7 +73,7 @@ def read_received(path: Path, result: ReadResult | None = None) -> Iterator[tupl
         except msgspec.MsgspecError:
             result.undecodable += 1
             continue
-        yield channel.topic, record.log_time, record.publish_time, message
+        yield topic_of(type(message)), record.log_time, record.publish_time, message
 
 
 def read_thumbnails(path: Path) -> Iterator[tuple[int, bytes]]:

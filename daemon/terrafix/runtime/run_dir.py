@@ -34,7 +34,7 @@ class RunDir:
 
     def user_error(self, process: str) -> Path:
         """Why ``process`` could not start, if it is a user error: one line."""
-        return self.path / f"{process}.mistake"
+        return self.path / f"{process}.user_error"
 
     def gave_up(self, process: str) -> Path:
         """Exists when ``process`` will not be restarted."""
@@ -46,7 +46,7 @@ class RunDir:
 
     def cache_dir(self, process: str) -> Path:
         """Folder for results that ``process`` could compute again, but only slowly."""
-        return self.path / f"{process}.shelf"
+        return self.path / f"{process}.cache"
 
     @property
     def frames(self) -> Path:
@@ -78,7 +78,7 @@ class RunDir:
             return False
         for file in (killed._epoch, *killed.path.glob("*.checkpoint")):
             write_atomic(self.path / file.name, file.read_bytes())
-        for folder in killed.path.glob("*.shelf"):
+        for folder in killed.path.glob("*.cache"):
             with suppress(OSError):  # a cache is optional
                 folder.rename(self.path / folder.name)
         return True

@@ -12,7 +12,7 @@ from terrafix.estimator.measurements.ekf_dead_reckoning import MAX_AHEAD_S, Dead
 from terrafix.estimator.models.motion_model import TILT_CORRELATION_S, TILT_VARYING_SHARE
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, load_checkpoint
-from terrafix.messages import Coasted, NavEstimate, Odometry, Prediction, Verdict
+from terrafix.messages import EkfDeadReckoning, NavEstimate, Odometry, Prediction, Verdict
 
 KILLED, BACK = 61, 73  # frames: six seconds
 LINK_LETS_MPS = 1.45  # velocity sigma below which the link sends a fix
@@ -37,27 +37,31 @@ def velocity(flight: Flight, i: int) -> np.ndarray:
     return (flight.p_m[i + 1] - flight.p_m[i - 1]) / ((t_ns(i + 1) - t_ns(i - 1)) * 1e-9)
 
 
-def autopilot_dead_reckoning(flight: Flight, off_m: tuple[float, float] = (0.0, 0.0)) -> Coasted:
+def autopilot_dead_reckoning(flight: Flight, off_m: tuple[float, float] = (0.0, 0.0)) -> EkfDeadReckoning:
     """From the second last frame before the kill to the first after the restart, with an error of ``off_m``."""
     since, until = KILLED - 2, BACK
     v0, v1, dt_s = velocity(flight, since), velocity(flight, until), (t_ns(until) - t_ns(since)) * 1e-9
     way = flight.p_m[until] - flight.p_m[since] - v0 * dt_s + (*off_m, 0.0)
     lat_deg, lon_deg = PLACE.to_wgs84(*(float(m) for m in flight.p_m[since, :2]))
-    return Coasted(
+    return EkfDeadReckoning(
         t_ns=t_ns(until),
-        coast_s=dt_s,
+        duration_s=dt_s,
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         velocity_enu_mps=(float(v0[0]), float(v0[1]), float(v0[2])),
         position_sigma_m=4.0,
         velocity_sigma_mps=0.4,
-        way_m=(float(way[0]), float(way[1])),
-        gain_mps=(float(v1[0] - v0[0]), float(v1[1] - v0[1]), float(v1[2] - v0[2])),
+        delta_p_m=(float(way[0]), float(way[1])),
+        delta_v_mps=(float(v1[0] - v0[0]), float(v1[1] - v0[1]), float(v1[2] - v0[2])),
     )
 
 
 def resumed(
-    flight: Flight, last: EstimatorCheckpoint | None, dead_reckoning: Coasted | None, *, received_first: bool = True
+    flight: Flight,
+    last: EstimatorCheckpoint | None,
+    dead_reckoning: EkfDeadReckoning | None,
+    *,
+    received_first: bool = True,
 ) -> EstimatorRun:
     run = EstimatorRun()
     run.node = EstimatorNode(0, last)
@@ -101,12 +105,14 @@ def test_dead_reckoning_slightly_after_a_frame_is_fused_at_that_frame(
 ) -> None:
     moment_s = 0.2
     dead_reckoning = autopilot_dead_reckoning(flight)
-    way_m = (np.array(dead_reckoning.velocity_enu_mps) + dead_reckoning.gain_mps)[:2] * moment_s
+    way_m = (np.array(dead_reckoning.velocity_enu_mps) + dead_reckoning.delta_v_mps)[:2] * moment_s
     late = msgspec.structs.replace(
         dead_reckoning,
         t_ns=dead_reckoning.t_ns + round(moment_s * 1e9),
-        coast_s=dead_reckoning.coast_s + moment_s,
-        way_m=tuple(np.add(dead_reckoning.way_m, way_m - np.array(dead_reckoning.velocity_enu_mps[:2]) * moment_s)),
+        duration_s=dead_reckoning.duration_s + moment_s,
+        delta_p_m=tuple(
+            np.add(dead_reckoning.delta_p_m, way_m - np.array(dead_reckoning.velocity_enu_mps[:2]) * moment_s)
+        ),
     )
     run = resumed(flight, killed, late, received_first=received_first)
     first = [m for m in run.published if isinstance(m, NavEstimate) and m.frame_id == BACK][-1]
@@ -131,16 +137,16 @@ def test_dead_reckoning_propagates_backwards_and_forwards() -> None:
     """Its covariance follows from that of the velocity, whose error has the same sign backwards."""
     frame = LocalFrame(48.0, 11.0)
     lat_deg, lon_deg = frame.to_wgs84(0.0, 0.0)
-    dead_reckoning = Coasted(
+    dead_reckoning = EkfDeadReckoning(
         t_ns=2_000_000_000,
-        coast_s=2.0,
+        duration_s=2.0,
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         velocity_enu_mps=(20.0, 0.0, 0.0),
         position_sigma_m=4.0,
         velocity_sigma_mps=2.0,
-        way_m=(0.0, 0.0),
-        gain_mps=(0.0, 0.0, 0.0),
+        delta_p_m=(0.0, 0.0),
+        delta_v_mps=(0.0, 0.0, 0.0),
     )
     coast = DeadReckoning.of(dead_reckoning, frame)
     tilts_rad = (math.radians(0.7), math.radians(0.7))
@@ -168,13 +174,13 @@ def test_without_a_checkpoint_dead_reckoning_is_not_used(flight: Flight) -> None
     assert run.estimate(BACK).cov == without.estimate(BACK).cov
 
 
-@pytest.mark.parametrize("coast_s", [3.0, 6.0, 20.0])
-def test_dead_reckoning_is_consistent_with_the_stated_tilt_sigma(coast_s: float) -> None:
+@pytest.mark.parametrize("duration_s", [3.0, 6.0, 20.0])
+def test_dead_reckoning_is_consistent_with_the_stated_tilt_sigma(duration_s: float) -> None:
     """The tilt error of the filter, and with it the gravity error, is a first-order process."""
     rng, frame, tilt_rad = np.random.default_rng(5), LocalFrame(48.0, 11.0), math.radians(0.7)
     nees, step_s = [], 0.02
     for _ in range(300):
-        n = round(coast_s / step_s)
+        n = round(duration_s / step_s)
         drift = np.zeros((n, 2))
         drift[0] = rng.normal(0.0, 1.0, 2)
         keep = math.exp(-step_s / TILT_CORRELATION_S)
@@ -185,19 +191,19 @@ def test_dead_reckoning_is_consistent_with_the_stated_tilt_sigma(coast_s: float)
         way = gain.sum(axis=0) * step_s
         v0_off, p0_off = rng.normal(0.0, 0.4, 2), rng.normal(0.0, 4.0, 2)
         lat_deg, lon_deg = frame.to_wgs84(*(float(m) for m in p0_off))
-        dead_reckoning = Coasted(
-            t_ns=round(coast_s * 1e9),
-            coast_s=coast_s,
+        dead_reckoning = EkfDeadReckoning(
+            t_ns=round(duration_s * 1e9),
+            duration_s=duration_s,
             lat_deg=lat_deg,
             lon_deg=lon_deg,
             velocity_enu_mps=(20.0 + float(v0_off[0]), float(v0_off[1]), 0.0),
             position_sigma_m=4.0,
             velocity_sigma_mps=0.4,
-            way_m=(float(way[0]), float(way[1])),
-            gain_mps=(float(gain[-1, 0]), float(gain[-1, 1]), 0.0),
+            delta_p_m=(float(way[0]), float(way[1])),
+            delta_v_mps=(float(gain[-1, 0]), float(gain[-1, 1]), 0.0),
         )
-        got = DeadReckoning.of(dead_reckoning, frame).until(coast_s, None, 0.3, 0.0, (tilt_rad, tilt_rad))
-        off_m, off_mps = got.at_m - (20.0 * coast_s, 0.0), got.velocity_mps[:2] - (20.0, 0.0)
+        got = DeadReckoning.of(dead_reckoning, frame).until(duration_s, None, 0.3, 0.0, (tilt_rad, tilt_rad))
+        off_m, off_mps = got.at_m - (20.0 * duration_s, 0.0), got.velocity_mps[:2] - (20.0, 0.0)
         of_position = off_m @ np.linalg.solve(got.cov_m2, off_m)
         nees.append([of_position, off_mps @ np.linalg.solve(got.velocity_cov[:2, :2], off_mps)])
     position, speed = np.mean(nees, axis=0)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from simulated_flight import ORIGIN, EstimatorRun, Flight, cov_of, error_m
+from terrafix.estimator.initialization import ResetReason
 from terrafix.estimator.integrity.innovation_gate import FUSION_TIMEOUT_SAMPLES, InnovationGate
 from terrafix.estimator.measurements.heading import HEADING_GATE_SIGMAS
 from terrafix.estimator.measurements.height import HEIGHT_GATE_SIGMAS
@@ -80,7 +81,7 @@ def test_plausible_heights_and_headings_are_all_accepted() -> None:
     assert rejected_frames(listener) == rejected_frames(listener, "attitude") == []
 
 
-@pytest.mark.parametrize(("agl_m", "frames", "rejected_at"), [(0.0, 1, []), (1000.0, 1, []), (0.0, 6, [6])])
+@pytest.mark.parametrize(("agl_m", "frames", "rejected_at"), [(0.0, 1, [1]), (1000.0, 1, [1]), (0.0, 6, [6, 7])])
 def test_wrong_initial_heights_are_replaced_by_later_consistent_ones(
     agl_m: float, frames: int, rejected_at: list[int]
 ) -> None:
@@ -99,7 +100,8 @@ def test_after_the_time_out_without_a_map_fix_a_rejected_reading_is_accepted() -
 
 def test_a_wrong_initial_heading_is_replaced_by_the_second_one() -> None:
     flight, listener = flown({0: turned(150.0)}, without_fix=True)
-    assert rejected_frames(listener, "attitude") == []
+    assert rejected_frames(listener, "attitude") == [1]  # at which the graph begins anew
+    assert listener.verdicts("reset")[1].detail == ResetReason.HEADING_GATE
     assert np.linalg.norm(error_m(listener.estimate(FRAMES - 1), flight)[:2]) < 60.0
 
 

@@ -15,7 +15,7 @@ from terrafix.estimator.factors.map_pose import map_pose_factor
 from terrafix.estimator.measurements.map_pose import moved_by_lens
 from terrafix.estimator.models.lens_prior import principal_point_sigma, radial_k1_sigma
 from terrafix.estimator.state import CALIBRATION_SIZE, RADIAL_K1
-from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, Prediction, SlowErrors, Verdict
+from terrafix.messages import CalibrationEstimate, MapMatch, Message, NavEstimate, Odometry, Prediction, Verdict
 from terrafix_tools.lens_words import lens_words
 
 ACTION_CAMERA_K1 = -0.28  # an action camera
@@ -130,15 +130,15 @@ def test_an_undescribed_lens_is_estimated_within_a_few_frames() -> None:
     published_k1 = [m.lens for m in published if isinstance(m, Prediction)]
     assert published_k1[0] == 0.0
     assert published_k1[-1] == pytest.approx(ACTION_CAMERA_K1, abs=0.04)
-    learnt = [m for m in published if isinstance(m, SlowErrors)][-1]
-    assert abs(learnt.error[RADIAL_K1] - ACTION_CAMERA_K1) < 3.0 * np.sqrt(
+    learnt = [m for m in published if isinstance(m, CalibrationEstimate)][-1]
+    assert abs(learnt.state[RADIAL_K1] - ACTION_CAMERA_K1) < 3.0 * np.sqrt(
         learnt.cov[RADIAL_K1 * CALIBRATION_SIZE + RADIAL_K1]
     )
     words = lens_words(UNCALIBRATED, learnt)
     assert words is not None and "k1 = -0.2" in words and "distortion = [-0.2" in words and "focal_sigma = 0.1" in words
     stated = msgspec.structs.replace(UNCALIBRATED, distortion=(-0.1, 0.0, 0.0, 0.0))
     assert "calibrate it again" in (lens_words(stated, learnt) or "")
-    straight = msgspec.structs.replace(learnt, error=(*learnt.error[:RADIAL_K1], -0.01, learnt.error[RADIAL_K1 + 1]))
+    straight = msgspec.structs.replace(learnt, state=(*learnt.state[:RADIAL_K1], -0.01, learnt.state[RADIAL_K1 + 1]))
     assert lens_words(UNCALIBRATED, straight) is None
 
 

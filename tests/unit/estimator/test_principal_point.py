@@ -9,7 +9,7 @@ from simulated_flight import CAMERA
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.factors.three_view import ThreeViewPose
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter, graph_shift
-from terrafix.messages import Camera, CovarianceMode, NavEstimate, SlowErrors, SourceLabel
+from terrafix.messages import CalibrationEstimate, Camera, CovarianceMode, NavEstimate, SourceLabel
 from terrafix_tools.lens_words import lens_words
 
 UNCALIBRATED = msgspec.structs.replace(CAMERA, focal_sigma=0.1)
@@ -105,8 +105,8 @@ def test_the_estimate_is_restored_from_its_message() -> None:
 
 
 def test_the_estimated_principal_point_is_reported() -> None:
-    slow = SlowErrors(
-        t_ns=0, frame_id=0, error=(0.0,) * 6, cov=tuple((np.eye(6) * 1e-4).ravel()), lens=learnt(1).learnt
+    slow = CalibrationEstimate(
+        t_ns=0, frame_id=0, state=(0.0,) * 6, cov=tuple((np.eye(6) * 1e-4).ravel()), lens=learnt(1).learnt
     )
     words = lens_words(UNCALIBRATED, slow)
     assert words is not None and "cx = 500 and cy = 28" in words

@@ -16,7 +16,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.link.autopilot.checkpoint import CheckpointWriter
 from terrafix.link.autopilot.ekf_dead_reckoning import EkfState, LastFix, _dead_reckoning_since
 from terrafix.link.edge import MavlinkEdge
-from terrafix.messages import Coasted, GpsInput, Message
+from terrafix.messages import EkfDeadReckoning, GpsInput, Message
 
 S, MS = 1_000_000_000, 1_000_000
 GPS_ID = 1
@@ -107,8 +107,8 @@ class Autopilot:
             self.edge.on_message(fix(0.1 * tenth))
 
 
-def coasted(messages: Iterable[Message]) -> list[Coasted]:
-    return [x for x in messages if isinstance(x, Coasted)]
+def coasted(messages: Iterable[Message]) -> list[EkfDeadReckoning]:
+    return [x for x in messages if isinstance(x, EkfDeadReckoning)]
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(autopilot: Aut
         autopilot.sends(RESTARTED_S - 0.2, ekf_position(RESTARTED_S - 0.2))
     )  # EKF status and receivers are not known yet
     (message,) = coasted(autopilot.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S)))
-    since_s = RESTARTED_S - message.coast_s
+    since_s = RESTARTED_S - message.duration_s
     assert KILLED_S - 0.3 < since_s <= KILLED_S and message.t_ns == round(RESTARTED_S * S)
     # Position and velocity are those of our fix at the time of the EKF state.
     before, now = truth(since_s), truth(RESTARTED_S)
@@ -131,9 +131,9 @@ def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(autopilot: Aut
     assert message.velocity_enu_mps == pytest.approx((*before[2:], 1.0), abs=0.05)
     assert (message.position_sigma_m, message.velocity_sigma_mps) == (5.0, 0.4)
     # Displacement and change of velocity do not contain the error that the EKF had at that time.
-    way_m = [now[i] - before[i] - message.coast_s * before[2 + i] for i in range(2)]
-    assert message.way_m == pytest.approx(way_m, abs=0.3) and math.hypot(*way_m) > 50.0
-    assert message.gain_mps == pytest.approx((now[2] - before[2], now[3] - before[3], 0.0), abs=0.02)
+    way_m = [now[i] - before[i] - message.duration_s * before[2 + i] for i in range(2)]
+    assert message.delta_p_m == pytest.approx(way_m, abs=0.3) and math.hypot(*way_m) > 50.0
+    assert message.delta_v_mps == pytest.approx((now[2] - before[2], now[3] - before[3], 0.0), abs=0.02)
 
 
 def test_a_restarted_link_requests_the_slow_messages(autopilot: Autopilot) -> None:
@@ -190,5 +190,5 @@ def test_dead_reckoning_continues_through_the_wrap_of_the_boot_time() -> None:
     at_fix = EkfState(2**32 - 1000, 48.0, 11.0, (0.0, 0.0, 0.0))
     last = LastFix(at_fix, 48.0, 11.0, (0.0, 0.0, 0.0), 3.0, 0.5, frozenset())
     (coasted,) = _dead_reckoning_since(last, msgspec.structs.replace(at_fix, boot_ms=1000), S)
-    assert coasted.coast_s == 2.0
+    assert coasted.duration_s == 2.0
     assert list(_dead_reckoning_since(last, msgspec.structs.replace(at_fix, boot_ms=70_000), S)) == []

@@ -28,7 +28,7 @@ def autopilot_texts(flags: Any, seconds: int = 60, sigma_m: float = 4.0) -> list
     for second in range(seconds):
         value = flags(second)
         if value is not None:
-            list(node.on(m.FilterStatus(t_ns=second * S, flags=value, position_ratio=0.1, velocity_ratio=0.1)))
+            list(node.on(m.EkfStatus(t_ns=second * S, flags=value, position_ratio=0.1, velocity_ratio=0.1)))
         texts_now = texts(fly(node, second * S, (second + 1) * S, feed))
         found += [(second, text) for text in texts_now if "autopilot" in text]
     return found
@@ -63,7 +63,7 @@ def test_ekf_status_report_is_requested_and_recorded() -> None:
     report = mavlink.MAVLink_ekf_status_report_message(USING_FLAGS, 0.2, 0.3, 0.1, 0.1, 0.0)
     broken = mavlink.MAVLink_ekf_status_report_message(USING_FLAGS, float("nan"), 0.3, 0.1, 0.1, 0.0)
     wire.arrive(packed(heartbeat(), autopilot), packed(report, autopilot), packed(broken, autopilot))
-    (status,) = [x for x in edge.poll(S) if isinstance(x, m.FilterStatus)]
+    (status,) = [x for x in edge.poll(S) if isinstance(x, m.EkfStatus)]
     assert (status.flags, status.t_ns) == (USING_FLAGS, S)
     assert (status.velocity_ratio, status.position_ratio) == pytest.approx((0.2, 0.3))
     requested = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
@@ -76,7 +76,7 @@ def test_px4_estimator_status_is_converted_to_filter_status() -> None:
     flags = USING_FLAGS | mavlink.ESTIMATOR_GPS_GLITCH  # the same bit as ArduPilot's EKF_UNINITIALIZED
     report = mavlink.MAVLink_estimator_status_message(0, flags, math.nan, 0.3, 0.1, 0.1, 0.0, 0.0, 1.0, 1.0)
     wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_PX4), autopilot), packed(report, autopilot))
-    (status,) = [x for x in edge.poll(S) if isinstance(x, m.FilterStatus)]
+    (status,) = [x for x in edge.poll(S) if isinstance(x, m.EkfStatus)]
     assert (status.flags, status.velocity_ratio) == (USING_FLAGS, 0.0)
     assert status.position_ratio == pytest.approx(0.3)
     requested = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}

@@ -78,11 +78,11 @@ def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verd
     assert (heard.lat_deg, heard.lon_deg, heard.radius_m, heard.source) == (48.1, -11.5, 3000.0, "command line")
 
 
-def test_without_a_frame_it_says_that_the_hint_waits(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_frame_the_reply_states_that_the_hint_applies_to_the_next_one(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(send, "ANSWER_S", 0.1)
     flying = Flying(run, None)
     try:
-        assert "waits for the next one" in hint(48.1, 11.5, 3000.0, str(run.path))
+        assert "it applies to the next one" in hint(48.1, 11.5, 3000.0, str(run.path))
     finally:
         flying.land()
 
@@ -93,21 +93,21 @@ def test_processes_that_do_not_listen_yet_are_said(run: RunDir, monkeypatch: pyt
         hint(48.1, 11.5, 3000.0)
 
 
-def test_nobody_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_run_the_command_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_dir, "SHM", tmp_path)
     (tmp_path / "terrafix-dead").mkdir()
     (tmp_path / "terrafix-dead" / "lock").touch()
-    with pytest.raises(LinkError, match="no Terrafix flies on this computer"):
+    with pytest.raises(LinkError, match="Terrafix does not run on this computer"):
         hint(48.1, 11.5, 3000.0)
     with pytest.raises(UsageError, match="no such folder"):
         hint(48.1, 11.5, 3000.0, str(tmp_path / "nothing"))
 
 
-def test_of_several_one_must_be_named(run: RunDir) -> None:
+def test_with_several_runs_one_must_be_chosen(run: RunDir) -> None:
     other = OwnedRunDir()
     try:
         assert {r.path for r in live_runs()} == {run.path, other.run_dir.path}
-        with pytest.raises(UsageError, match="several fly here; name one: --run "):
+        with pytest.raises(UsageError, match="several runs on this computer; choose one: --run "):
             hint(48.1, 11.5, 3000.0)
     finally:
         other.remove()

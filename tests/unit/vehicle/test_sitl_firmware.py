@@ -117,7 +117,7 @@ def test_the_error_of_a_firmware_that_ended_quotes_its_last_output(tmp_path: Pat
         (["--binary", "/nowhere/arduplane"], "/nowhere/arduplane: no such ArduPilot binary; docs/sitl.md says how"),
         (["--binary", sys.executable, "--vehicle", "plane", "--length", "-1"], "--length -1: choose more than 0"),
         (["--binary", sys.executable, "--vehicle", "plane", "--parameters", "no.param"], "no.param: no such parameter"),
-        (["--binary", sys.executable], "the name does not say plane or copter; give --vehicle"),
+        (["--binary", sys.executable], "the name contains neither plane nor copter; give --vehicle"),
     ],
 )
 def test_a_usage_error_is_one_line(arguments: list[str], text: str, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from terrafix.core.errors import EvaluationError, OutputError, TerrafixError, Us
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.estimator.integrity.time_offset import PRIOR_SIGMA_S
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
-from terrafix.messages import Camera, LearntLens, NavEstimate, Origin, SlowErrors
+from terrafix.messages import CalibrationEstimate, Camera, LensEstimate, NavEstimate, Origin
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import ESTIMATES, Row, read_rows
 from terrafix_tools.evaluate import ELLIPSE95, compare, mahalanobis2, read_summary, read_truth, truth_sigma_of
@@ -190,12 +190,12 @@ def _terms(replay: Path) -> np.ndarray:
     """-> (3,) m^2 per axis, means over the frames: contributions of map, principal point and time offset (upper bound)
     to the claimed variance."""
     camera: Camera | None = None
-    lens: LearntLens | None = None
+    lens: LensEstimate | None = None
     last: dict[int, tuple[float, float, float]] = {}  # of the last estimate of a frame, which is the one in the table
     for _, _, message in read_flight(replay):
         if isinstance(message, Origin):
             camera = message.camera
-        elif isinstance(message, SlowErrors):
+        elif isinstance(message, CalibrationEstimate):
             lens = message.lens
         elif isinstance(message, NavEstimate) and camera is not None:
             speed2 = message.velocity_enu_mps[0] ** 2 + message.velocity_enu_mps[1] ** 2
@@ -207,7 +207,7 @@ def _terms(replay: Path) -> np.ndarray:
     return np.mean(list(last.values()), axis=0) if last else np.zeros(3)
 
 
-def _principal_m2(estimate: NavEstimate, camera: Camera, lens: LearntLens | None) -> float:
+def _principal_m2(estimate: NavEstimate, camera: Camera, lens: LensEstimate | None) -> float:
     """-> variance of the position from the principal point, per axis [m^2]."""
     jacobian = estimate.agl_m * (rot_from_quat(estimate.q_w_b) @ Mount.of(camera).r_b_c())[:2, :2]
     return float(np.trace(PrincipalPointFilter(camera, lens).shift(jacobian)[1])) / 2.0

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import EstimatorCheckpoint
-from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, Origin, SlowErrors
+from terrafix.messages import CalibrationEstimate, MapMatch, Message, NavEstimate, Odometry, Origin
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Run
 from terrafix_tools.montecarlo.plan import FlightPlan, plan
@@ -38,7 +38,7 @@ class RestartComparison(Run):
         self._from_ns = round(young_from_s * 1e9)
         self._young: EstimatorNode | None = None
         self._origin: Origin | None = None
-        self._slow: SlowErrors | None = None
+        self._slow: CalibrationEstimate | None = None
         self._ground: MapMatch | None = None
 
     def process(self, message: Message) -> list[Message]:
@@ -64,7 +64,7 @@ class RestartComparison(Run):
             match message:
                 case Origin():
                     self._origin = message
-                case SlowErrors():
+                case CalibrationEstimate():
                     self._slow = message
                 case MapMatch() if message.ground is not None:
                     self._ground = msgspec.structs.replace(message, matches=[])

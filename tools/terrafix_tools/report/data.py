@@ -9,6 +9,7 @@ from typing import Any
 
 from terrafix.core.errors import EvaluationError, SourceError
 from terrafix.messages import (
+    CalibrationEstimate,
     CalibrationFault,
     Dropped,
     GpsInput,
@@ -19,7 +20,6 @@ from terrafix.messages import (
     NavEstimate,
     Origin,
     ProcessEvent,
-    SlowErrors,
     StatusText,
 )
 from terrafix.recorder.reader import ReadResult, read_received, read_thumbnails
@@ -46,7 +46,7 @@ class FlightView:
     rows: list[Row]
     frame_ids: list[int]
     origin: Origin | None = None
-    calibration: SlowErrors | None = None  # the last one
+    calibration: CalibrationEstimate | None = None  # the last one
     unfinished: bool = False  # an interrupted replay
     live: bool = False  # from a live record; process_ms is then the delay of the estimate
     summary: dict[str, Any] = field(default_factory=dict)
@@ -173,7 +173,7 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
             view.map_verdict.setdefault(message.frame_id, str(message.verdict))
         elif isinstance(message, Origin):
             view.origin = message
-        elif isinstance(message, SlowErrors):
+        elif isinstance(message, CalibrationEstimate):
             view.calibration = message
         elif isinstance(message, Dropped):
             view.dropped[f"{message.process}: {message.message}"] += message.count

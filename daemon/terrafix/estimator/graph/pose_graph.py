@@ -32,7 +32,7 @@ REBUILD_CALIBRATION_SIGMAS = np.array([0.1, 0.1, 0.1, 5.0, RADIAL_K1_SIGMA, 0.1]
 
 @dataclass(frozen=True)
 class GraphPrior:
-    """The first node of a graph: ``cov`` (6, 6) of its pose in tangent order, ``bias_cov`` (6, 6) of B, ``velocity_cov``
+    """First node of a graph: ``cov`` (6, 6) of its pose in tangent order, ``bias_cov`` (6, 6) of B, ``velocity_cov``
     (8, 8) of V, and a factor of the reported attitude and height. ``gauge_fixed_cov`` (6, 6): enters the graph instead
     of ``cov`` where part of the pose is unobservable and fixed by choice (yaw_gauge.py)."""
 

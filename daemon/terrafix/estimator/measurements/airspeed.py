@@ -22,7 +22,7 @@ from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.state import HEADING, UP, NodeState
 from terrafix.messages import Verdict
 
-MIN_TAS_MPS = 8.0  # below it a pitot tube reads noise, and wings do not carry [tuned]
+MIN_TAS_MPS = 8.0  # below stall speed, where a pitot tube reads noise [tuned]
 WIND_SIGMA_MPS, SCALE_SIGMA = 15.0, 0.1  # 1-sigma of the prior [tuned]
 # A fixed wing in 7 m/s of wind (thor_flight75: 329 s, 20 to 80 m above the ground): velocity less airspeed and wind
 # scatters by 1.5 m/s along and 1.9 across, correlated over 4 s; the rest changes by 1.0 in half a minute.
@@ -32,7 +32,9 @@ WIND_WALK, SCALE_WALK = 0.2, 5e-4  # [m/s] and relative, per square root of a se
 GUST_AVERAGE_S = 60.0  # time constant of the estimated gust strength [tuned]
 UPDATE_EVERY_S = 1.0  # [tuned]
 MAX_UPDATE_SIGMA_MPS = 3.0  # 1-sigma of a velocity that updates the wind, and of a wind that updates gusts [tuned]
-MAX_PREDICT_SIGMA_MPS = 8.0  # of a predicted velocity: a straight leg does not show the wind of the way back [tuned]
+MAX_PREDICT_SIGMA_MPS = (
+    8.0  # of a predicted velocity: wind estimated on one heading is poorly known on the opposite one [tuned]
+)
 MAX_TAS_CHANGE = 0.25  # relative, without odometry: autopilots hold airspeed, a tube that ices up does not [tuned]
 FUSION_TIMEOUT_S = 5.0  # after which a sensor that contradicts odometry is estimated anew [tuned]
 

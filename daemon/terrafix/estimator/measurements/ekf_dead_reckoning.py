@@ -24,7 +24,7 @@ from terrafix.estimator.models.motion_model import (
     unknown_motion_cov,
 )
 from terrafix.estimator.state import HEADING, MOTION_SIZE, VELOCITY
-from terrafix.messages import Coasted, Verdict
+from terrafix.messages import EkfDeadReckoning, Verdict
 
 UNCONSTRAINED = 1e8  # variance of what a factor does not constrain [spec: far beyond any state]
 MAX_AHEAD_S = 0.3  # by which a frame may be older than the sample: filter status comes at 3 Hz [spec: link rates]
@@ -74,10 +74,10 @@ class DeadReckoning:
 
     t_s: float
     at_m: np.ndarray
-    sample: Coasted
+    sample: EkfDeadReckoning
 
     @classmethod
-    def of(cls, sample: Coasted, frame: LocalFrame) -> "DeadReckoning":
+    def of(cls, sample: EkfDeadReckoning, frame: LocalFrame) -> "DeadReckoning":
         return cls(sample.t_ns * 1e-9, np.array(frame.to_local(sample.lat_deg, sample.lon_deg)), sample)
 
     def until(
@@ -97,11 +97,11 @@ class DeadReckoning:
         cov = unknown_motion_cov()
         cov[:3, :3] = sample.velocity_sigma_mps**2 * np.eye(3)
         cov[6:, 6:] = 0.0  # the filter knows the bias of its accelerometers
-        unknown = WorldAcceleration(np.array([0.0, sample.coast_s]), np.zeros((2, 3)), np.array(yaws), 0.0)
+        unknown = WorldAcceleration(np.array([0.0, sample.duration_s]), np.zeros((2, 3)), np.array(yaws), 0.0)
         coast = integrate_motion(
-            sample.coast_s, unknown, yaws, heading_bias_rad, speed_mps, sigmas_rad[0], same_source=False
+            sample.duration_s, unknown, yaws, heading_bias_rad, speed_mps, sigmas_rad[0], same_source=False
         )
-        coast = replace(coast, delta_p_m=np.array([*sample.way_m, 0.0]), delta_v_mps=np.array(sample.gain_mps))
+        coast = replace(coast, delta_p_m=np.array([*sample.delta_p_m, 0.0]), delta_v_mps=np.array(sample.delta_v_mps))
         spread = predict_covariance(coast, cov)
         p, v = coast.predict(np.array([*self.at_m, 0.0]), before, heading_bias_rad)
         spread[9:, 9:] = STEADY_ACCEL_SIGMA_MPS2**2 * np.eye(2)

@@ -21,7 +21,7 @@ from terrafix.estimator.factors.three_view import (
 )
 from terrafix.estimator.models.lens_prior import RADIAL_K1_PER_FOCAL_SIGMA, principal_point_sigma
 from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS
-from terrafix.messages import Camera, LearntLens, NavEstimate
+from terrafix.messages import Camera, LensEstimate, NavEstimate
 
 # k1, k2, p1, p2, focal length (relative), principal point; normalised image coordinates.
 SIZE, FOCAL, PRINCIPAL_POINT = 7, 4, slice(5, 7)  # [spec: order of OpenCV]
@@ -37,7 +37,7 @@ class PrincipalPointFilter:
     """``offset`` (2,): of the principal point from the described one, normalised coordinates, right and down, with
     covariance ``cov`` (2, 2)."""
 
-    def __init__(self, camera: Camera, learnt: LearntLens | None = None) -> None:
+    def __init__(self, camera: Camera, learnt: LensEstimate | None = None) -> None:
         """``learnt``: by an estimator that ran before in this flight."""
         offset_sigma = principal_point_sigma(camera)
         self._uncertain = offset_sigma > 0.0
@@ -59,11 +59,11 @@ class PrincipalPointFilter:
         return self._x[PRINCIPAL_POINT]
 
     @property
-    def learnt(self) -> LearntLens | None:
+    def learnt(self) -> LensEstimate | None:
         """For a checkpoint; None: nothing is estimated."""
         if not self._estimates:
             return None
-        return LearntLens(value=tuple(map(float, self._x)), information=tuple(map(float, self._information.ravel())))
+        return LensEstimate(value=tuple(map(float, self._x)), information=tuple(map(float, self._information.ravel())))
 
     def update(self, triples: np.ndarray, sigma_norm: float, at: ThreeViewPose) -> None:
         """``triples`` (N, 6): normalised points in the first, middle and last camera, ``sigma_norm`` of a coordinate;
@@ -93,7 +93,7 @@ class PrincipalPointFilter:
         )
 
 
-def graph_shift(published: NavEstimate, camera: Camera, learnt: LearntLens) -> np.ndarray:
+def graph_shift(published: NavEstimate, camera: Camera, learnt: LensEstimate) -> np.ndarray:
     """(2,): from the camera of the graph to the published position [m]."""
     r_w_c = rot_from_quat(published.q_w_b) @ Mount.of(camera).r_b_c()
     return PrincipalPointFilter(camera, learnt).shift(published.agl_m * r_w_c[:2, :2])[0]

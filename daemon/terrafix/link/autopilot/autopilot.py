@@ -11,7 +11,7 @@ from terrafix.link.autopilot.telemetry import Telemetry
 from terrafix.link.mavlink.timesync import TimeSync
 from terrafix.link.output.odometry import Attitude, GeodeticPoint
 from terrafix.link.output.selection import AutopilotState
-from terrafix.messages import FilterStatus, Message, VehicleState
+from terrafix.messages import EkfStatus, Message, VehicleState
 
 ATTITUDE_TIMEOUT_NS = 500_000_000  # an older attitude is not used for the outputs [tuned]
 # The bits that mean the same in ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS. [spec: MAVLink common.xml]
@@ -48,7 +48,7 @@ class AutopilotPeer:
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._origin = GeodeticPoint(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
         elif kind == "EKF_STATUS_REPORT":
-            yield from _filter_status(message, now_ns)
+            yield from _ekf_status(message, now_ns)
         elif kind == "ESTIMATOR_STATUS":
             yield _estimator_status(message, now_ns)
 
@@ -61,16 +61,16 @@ class AutopilotPeer:
         return AutopilotState(self.firmware, self.sysid, attitude, self._origin)
 
 
-def _filter_status(message: Any, now_ns: int) -> Iterator[FilterStatus]:
+def _ekf_status(message: Any, now_ns: int) -> Iterator[EkfStatus]:
     """ArduPilot's EKF_STATUS_REPORT. Its ``*_variance`` fields contain innovation test ratios."""
     ratios = (message.pos_horiz_variance, message.velocity_variance)
     if all(math.isfinite(ratio) for ratio in ratios):
-        yield FilterStatus(t_ns=now_ns, flags=message.flags, position_ratio=ratios[0], velocity_ratio=ratios[1])
+        yield EkfStatus(t_ns=now_ns, flags=message.flags, position_ratio=ratios[0], velocity_ratio=ratios[1])
 
 
-def _estimator_status(message: Any, now_ns: int) -> FilterStatus:
+def _estimator_status(message: Any, now_ns: int) -> EkfStatus:
     """PX4's ESTIMATOR_STATUS. A test ratio is NaN if no such measurement arrives, as the one of the velocity without a
     receiver."""
     ratios = [ratio if math.isfinite(ratio) else 0.0 for ratio in (message.pos_horiz_ratio, message.vel_ratio)]
     flags = message.flags & COMMON_EKF_FLAGS
-    return FilterStatus(t_ns=now_ns, flags=flags, position_ratio=ratios[0], velocity_ratio=ratios[1])
+    return EkfStatus(t_ns=now_ns, flags=flags, position_ratio=ratios[0], velocity_ratio=ratios[1])

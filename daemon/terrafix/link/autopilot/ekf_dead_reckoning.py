@@ -1,4 +1,4 @@
-"""Dead reckoning of the autopilot's EKF since our last fix, published as Coasted while there is no new fix.
+"""Dead reckoning of the autopilot's EKF since our last fix, published as EkfDeadReckoning while there is no new fix.
 
 Without GPS the EKF dead reckons with its inertial sensors and, in a plane, with its airspeed. Over six seconds the
 error of ArduPilot's plane was 3 m, in turns as well. After a restart in flight the estimator continues from there
@@ -20,7 +20,7 @@ from terrafix.link.admission.boot_clock import boot_step_ms
 from terrafix.link.autopilot.gnss_receiver import FIX_2D, RECEIVERS
 from terrafix.link.integrity.fix_type import FIX_3D
 from terrafix.link.integrity.output_predictor import metres_per_degree, offset
-from terrafix.messages import Coasted, GpsInput
+from terrafix.messages import EkfDeadReckoning, GpsInput
 
 MAX_DEAD_RECKONING_MS = 60_000  # the time for which a restart counts as the same flight (runtime/run_dir.py) [tuned]
 MAX_FIX_INTERVAL_NS = 300_000_000  # longest interval between two fixes for interpolation between them [tuned]
@@ -55,7 +55,7 @@ class LastFix(msgspec.Struct, frozen=True):
 
 
 class DeadReckoningRecorder:
-    """Stores the EKF state at our last fix, and publishes Coasted while there is no 3D fix.
+    """Stores the EKF state at our last fix, and publishes EkfDeadReckoning while there is no 3D fix.
 
     ``last``: None while another receiver has a fix, or before our first fix."""
 
@@ -71,7 +71,7 @@ class DeadReckoningRecorder:
         self._status: tuple[int, bool] | None = None  # (time received, EKF velocity is valid)
         self._request_count, self._requested_ns = 0, 0
 
-    def on_message(self, message: Any, now_ns: int, own_receiver: int | None) -> Iterator[Coasted]:
+    def on_message(self, message: Any, now_ns: int, own_receiver: int | None) -> Iterator[EkfDeadReckoning]:
         """Processes a message of the autopilot. ``own_receiver``: see ``AutopilotPeer.on_message``."""
         kind = message.get_type()
         if kind in RECEIVERS and RECEIVERS[kind] != own_receiver:
@@ -136,27 +136,30 @@ class DeadReckoningRecorder:
         return velocity_valid and now_ns - received_ns < STATUS_TIMEOUT_NS
 
 
-def _dead_reckoning_since(last: LastFix, ekf_state: EkfState, t_ns: int) -> Iterator[Coasted]:
+def _dead_reckoning_since(last: LastFix, ekf_state: EkfState, t_ns: int) -> Iterator[EkfDeadReckoning]:
     before = last.filter
     elapsed_ms = boot_step_ms(before.boot_ms, ekf_state.boot_ms)
     if not 0 < elapsed_ms <= MAX_DEAD_RECKONING_MS:
         return  # after a reboot, or in another flight
-    coast_s = elapsed_ms / 1e3
+    duration_s = elapsed_ms / 1e3
     north_m, east_m = metres_per_degree(before.lat_deg)
     moved_m = (
         math.remainder(ekf_state.lon_deg - before.lon_deg, 360.0) * east_m,
         (ekf_state.lat_deg - before.lat_deg) * north_m,
     )
-    yield Coasted(
+    yield EkfDeadReckoning(
         t_ns=t_ns,
-        coast_s=coast_s,
+        duration_s=duration_s,
         lat_deg=last.lat_deg,
         lon_deg=last.lon_deg,
         velocity_enu_mps=last.velocity_enu_mps,
         position_sigma_m=last.position_sigma_m,
         velocity_sigma_mps=last.velocity_sigma_mps,
-        way_m=(moved_m[0] - coast_s * before.velocity_enu_mps[0], moved_m[1] - coast_s * before.velocity_enu_mps[1]),
-        gain_mps=_vec3(np.subtract(ekf_state.velocity_enu_mps, before.velocity_enu_mps)),
+        delta_p_m=(
+            moved_m[0] - duration_s * before.velocity_enu_mps[0],
+            moved_m[1] - duration_s * before.velocity_enu_mps[1],
+        ),
+        delta_v_mps=_vec3(np.subtract(ekf_state.velocity_enu_mps, before.velocity_enu_mps)),
     )
 
 

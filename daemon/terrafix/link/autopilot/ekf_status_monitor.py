@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.clock import NS_PER_S
 from terrafix.link.pilot_text.debounce import Debounce
-from terrafix.messages import FilterStatus
+from terrafix.messages import EkfStatus
 
 # Time from the first 3D fix after which the EKF must use it. Measured: an EKF on the ground takes 21 s until it uses a
 # GPS; in the air it returns to one after 10 s. [tuned]
@@ -16,15 +16,15 @@ NO_POSITION_FLAGS = mavlink.EKF_CONST_POS_MODE | mavlink.EKF_UNINITIALIZED
 
 
 class EkfStatusMonitor:
-    """``on_status`` stores each FilterStatus; ``check`` is called at every send and returns the texts for the pilot."""
+    """``on_status`` stores each EkfStatus; ``check`` is called at every send and returns the texts for the pilot."""
 
     def __init__(self) -> None:
-        self._status: FilterStatus | None = None
+        self._status: EkfStatus | None = None
         self._fix_since_ns: int | None = None
         self._debounce = Debounce[bool]()
         self._debounce.reported = True
 
-    def on_status(self, status: FilterStatus) -> None:
+    def on_status(self, status: EkfStatus) -> None:
         self._status = status
 
     def check(self, now_ns: int, *, has_fix: bool) -> Iterator[tuple[bool, str]]:

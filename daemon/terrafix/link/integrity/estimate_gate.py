@@ -64,7 +64,7 @@ class EstimateGate:
             return Verdict.STALE, f"{(now_ns - estimate.t_ns) / 1e9:.1f} s old on arrival"
         newest = self._candidate or self.accepted
         if newest is not None and estimate.t_ns < newest.t_ns:
-            return Verdict.STALE, "older than one already heard"
+            return Verdict.STALE, "older than one already received"
         if self.accepted is None:
             return self._accept(estimate)
         jump_m, gate_m = _jump_and_gate(self.accepted, estimate, inertial)

@@ -10,7 +10,7 @@ import numpy as np
 
 from terrafix import messages as m
 from terrafix.core.camera import Mount
-from terrafix.core.config import Config, LinkSection
+from terrafix.core.config import Config
 from terrafix.core.errors import UsageError
 from terrafix.core.node import Image
 from terrafix_tools.mission.mission import Mission, check
@@ -72,21 +72,18 @@ def plan_over(
     conditions: Conditions | None = None,
     config: Config | None = None,
 ) -> Plan:
-    """Builds the plan of a flight. ``mission`` None: a course of ``length_m`` from the seed. The flight lasts to its
-    end, or ``duration_s``.
+    """Builds the plan of a flight to the end of ``mission`` (None: a course of ``length_m``), or for ``duration_s``.
 
-    ``config``: of the companion; ``gps`` sets its GPS number. Raises UsageError, SourceError when it cannot be flown.
-    """
+    ``config``: of the companion; ``gps`` sets its GPS number. Raises UsageError, SourceError."""
     check_rates(duration_s, frame_hz)
-    flight_conditions = conditions or Conditions()
+    applied = conditions or Conditions()
     if mission is not None:
         length_m = math.inf
     else:
         mission = mission_over(scene, kind, seed=seed, length_m=LENGTH_MARGIN * length_m, agl_m=agl_m)
     check(mission, scene.frame, scene.box)
-    vehicle = (Plane if kind is Kind.PLANE else Copter)(
-        mission, scene.frame, scene.height(), wind=flight_conditions.wind, seed=seed
-    )
+    make_vehicle = Plane if kind is Kind.PLANE else Copter
+    vehicle = make_vehicle(mission, scene.frame, scene.height(), wind=applied.wind, seed=seed)
     first = vehicle.state
     ground_m = float(first.p_b_in_w_m[2]) - first.agl_m
     navigation = None if mission.starts_on_ground() else navigation_of(first)
@@ -98,7 +95,6 @@ def plan_over(
         parameters=parameters_of(kind, gps),
         boot_ns=Clock.of(seed).boot_ns,
     )
-    companion = config or Config()
     return Plan(
         name=f"closed loop, {mission.name}",
         frame=scene.frame,
@@ -106,19 +102,19 @@ def plan_over(
         sensors=VehicleSensors(
             scene.frame,
             seed=seed,
-            errors=flight_conditions.errors,
-            events=flight_conditions.events,
+            errors=applied.errors,
+            events=applied.events,
             airspeed=kind is Kind.PLANE,
         ),
         autopilot=autopilot,
-        view=_Camera(scene, flight_conditions, seed),
+        view=_Camera(scene, applied, seed),
         origin=_origin(scene, first, ground_m, seed),
         map_path=map_path,
         duration_s=duration_s or MAX_DURATION_S,
         length_m=length_m,
         frame_hz=frame_hz,
-        delays=flight_conditions.delays,
-        config=msgspec.structs.replace(companion, link=_link(companion.link, gps)),
+        delays=applied.delays,
+        config=_with_gps(config or Config(), gps),
         over=lambda: vehicle.finished,
     )
 
@@ -140,10 +136,8 @@ def parameters_of(kind: Kind, gps: Gps) -> dict[str, float]:
 class _Camera:
     """Renders the image at the vehicle's true pose."""
 
-    def __init__(self, scene: Scene, flight_conditions: Conditions, seed: int) -> None:
-        self._renderer = Renderer(
-            scene.ground, CAMERA, film=flight_conditions.film, weather=flight_conditions.weather, seed=seed
-        )
+    def __init__(self, scene: Scene, applied: Conditions, seed: int) -> None:
+        self._renderer = Renderer(scene.ground, CAMERA, film=applied.film, weather=applied.weather, seed=seed)
         self._r_b_c = Mount.of(CAMERA).r_b_c()
 
     def __call__(self, state: State, index: int) -> Image:
@@ -167,5 +161,7 @@ def _origin(scene: Scene, first: State, ground_m: float, seed: int) -> m.Origin:
     )
 
 
-def _link(link: LinkSection, gps: Gps) -> LinkSection:
-    return msgspec.structs.replace(link, gps_id=1 if gps is Gps.SECOND else 0)
+def _with_gps(config: Config, gps: Gps) -> Config:
+    """Returns the configuration with the GPS number of Terrafix."""
+    link = msgspec.structs.replace(config.link, gps_id=1 if gps is Gps.SECOND else 0)
+    return msgspec.structs.replace(config, link=link)
