@@ -78,7 +78,9 @@ def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verd
     assert (heard.lat_deg, heard.lon_deg, heard.radius_m, heard.source) == (48.1, -11.5, 3000.0, "command line")
 
 
-def test_without_a_frame_the_reply_states_that_the_hint_applies_to_the_next_one(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_frame_the_reply_states_that_the_hint_applies_to_the_next_one(
+    run: RunDir, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(send, "ANSWER_S", 0.1)
     flying = Flying(run, None)
     try:
