@@ -45,6 +45,7 @@ def test_a_killed_acceptance_run_is_resumed_without_repeating_finished_scenarios
     assert page.count("<figure") == len(SCENARIOS) and not re.search(r'(src|href)="', page)
 
 
+@pytest.mark.slow
 def test_an_unknown_scenario_is_a_usage_error_of_one_line(tmp_path: Path) -> None:
     done = subprocess.run(
         [*COMMAND, "--scenario", "moon", "--out", str(tmp_path)], capture_output=True, text=True, timeout=120

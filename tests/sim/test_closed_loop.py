@@ -138,6 +138,7 @@ def test_an_impossible_flight_is_an_error_of_one_line(
     assert expected in done.stderr
 
 
+@pytest.mark.slow
 def test_sim_fly_does_not_write_into_a_foreign_folder(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
     done = subprocess.run([*COMMAND, "--out", str(tmp_path)], capture_output=True, text=True, timeout=60)

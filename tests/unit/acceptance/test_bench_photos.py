@@ -16,6 +16,7 @@ from terrafix_tools.bench.photos import ADVANCE, FOCAL, SEEN_PX, write_photos
 SIZE_PX = 1200, 800
 
 
+@pytest.mark.slow
 def test_photos_have_content_and_metadata_of_their_positions(tmp_path: Path) -> None:
     both = map_rasters.utm(tmp_path / "a.tif", map_rasters.texture(1300, 900))
     write_photos(both, both, tmp_path / "photos", SIZE_PX)

@@ -27,6 +27,7 @@ def dates(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return first, map_rasters.write_tif(folder / "second.tif", later, "EPSG:32651", moved)
 
 
+@pytest.mark.slow
 def test_only_frames_near_the_prediction_are_accepted(
     dates: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

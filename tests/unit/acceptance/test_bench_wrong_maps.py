@@ -31,6 +31,7 @@ def flight(frames: int) -> Iterator[tuple[Prediction, np.ndarray]]:
         yield predicted(i, 10.0, at_m=at_m, step_m=STEP_M if i else 0.0), view(ground, PINHOLE, R, at_m)
 
 
+@pytest.mark.slow
 def test_a_flight_on_another_map_has_a_best_score_per_segment_and_finds_no_position(package: Path) -> None:
     result = searched(flight(6), PINHOLE, package, 0.3, 3)
     assert len(result.best) == 3  # every second frame, one segment each

@@ -217,6 +217,7 @@ def test_without_a_heading_the_belief_spreads_by_the_length_of_the_step(
     assert belief is not None and (np.sqrt(belief.covariance()[2]) > 25.0) == spreads
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("heading_sigma_rad", "tried"), [(0.03, False), (3.0, True)])
 def test_without_a_heading_a_pose_is_attempted_in_a_light_mode(
     ground: np.ndarray, heading_sigma_rad: float, tried: bool
@@ -233,6 +234,7 @@ def test_without_a_heading_a_pose_is_attempted_in_a_light_mode(
     assert (answer.inliers > 0) == tried
 
 
+@pytest.mark.slow
 def test_during_a_search_an_unknown_heading_does_not_disconnect_the_frames(ground: np.ndarray) -> None:
     """Tracks move by their own yaw: the part of the position error that comes from the heading is no error of the
     step."""
@@ -272,6 +274,7 @@ class TwoDates:
         return self._maps[layer]
 
 
+@pytest.mark.slow
 def test_the_layer_that_fits_is_selected_in_flight(ground: np.ndarray) -> None:
     package: Any = TwoDates(ground)
     frames = MemoryFrameStore(8)

@@ -47,6 +47,7 @@ def observation(ground: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, 
     return view(ground, PINHOLE, R, here_m), here_m, believed_view
 
 
+@pytest.mark.slow
 def test_over_changed_and_leaning_ground_the_pose_is_found_with_a_consistent_covariance(
     estimator: ConsensusPose,
 ) -> None:

@@ -130,6 +130,7 @@ def test_the_place_stands_out(matcher: FrameMatcher, frame: np.ndarray) -> None:
     assert (mode.e_m, mode.n_m) == pytest.approx(tuple(TRUE_M[:2]), abs=4.0)
 
 
+@pytest.mark.slow
 def test_yaw_and_scale_are_found_with_the_position(matcher: FrameMatcher, frame: np.ndarray) -> None:
     off = local_rotation_up(np.radians(-14.0)) @ TRUE_R
     wrong = predicted_view(r=off, agl_m=AGL_M / 1.08, yaw_sigma_deg=12.0, scale_sigma=0.08)

@@ -88,6 +88,7 @@ def fly(search: MapSearch, ground: np.ndarray, count: int) -> tuple[AcceptedPlac
     return None, p_m, count
 
 
+@pytest.mark.slow
 def test_an_unknown_position_is_found(ground: np.ndarray) -> None:
     search = searched(BoundedMap(ground), None)
     assert search.step is SearchStep.WHOLE_MAP
@@ -108,6 +109,7 @@ def test_one_frame_is_not_enough_even_if_it_is_repeated(ground: np.ndarray) -> N
     assert search.tracker.tracks[0].frames == 1
 
 
+@pytest.mark.slow
 def test_a_null_model_with_higher_scores_requires_more_evidence(ground: np.ndarray) -> None:
     null = msgspec.structs.replace(DEFAULT_NULL, search=msgspec.structs.replace(DEFAULT_NULL.search, above=60.0))
     search = searched(BoundedMap(ground), None, null)
@@ -162,6 +164,7 @@ def test_a_joint_correlation_is_wide_once_its_mosaic_is_long_enough(
     assert wide == [False, False, False, False, True]  # 15 m per frame
 
 
+@pytest.mark.slow
 def test_ground_that_is_not_on_the_map_is_not_found() -> None:
     search = searched(BoundedMap(texture(21, SIDE_M)), None)
     assert fly(search, texture(8, SIDE_M), 2)[0] is None

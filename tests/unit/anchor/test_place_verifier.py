@@ -91,6 +91,7 @@ def leaning(ground: np.ndarray, seed: int) -> np.ndarray:
     return cv2.remap(ground, x + dx, y + dy, cv2.INTER_LINEAR)
 
 
+@pytest.mark.slow
 def test_the_covariance_of_a_relocalized_pose_covers_the_displacement_by_leaning_ground(
     verifier: PlaceVerifier,
 ) -> None:

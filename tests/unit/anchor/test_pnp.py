@@ -87,6 +87,7 @@ def test_random_matches_are_rejected(relief_m: float) -> None:
     assert passed <= 1
 
 
+@pytest.mark.slow
 def test_random_matches_of_the_wide_search_are_rejected() -> None:
     passed = 0
     for seed in range(100):
@@ -135,6 +136,7 @@ def mean_nees(wrong: int) -> float:
     return float(np.mean(errors))
 
 
+@pytest.mark.slow
 def test_false_inliers_inflate_the_covariance() -> None:
     """Counted as inliers, the wrong matches raise the mean NEES by half."""
     assert mean_nees(wrong=26) < 1.3 * mean_nees(wrong=0)

@@ -99,6 +99,7 @@ def test_the_same_ground_gives_no_evidence(ground: np.ndarray) -> None:
     assert test.wrong_probability == little  # the path was already counted
 
 
+@pytest.mark.slow
 def test_a_place_without_evidence_fails_after_some_stretches_of_ground(ground: np.ndarray) -> None:
     source: Any = SingleMapPackage(ground)
     tracks = HypothesisTracker(source, FrameMatcher(PINHOLE, source, GradientDescriber()))
@@ -170,6 +171,7 @@ def match_flight(
     return matches
 
 
+@pytest.mark.slow
 def test_a_relocalized_place_reports_the_mixture_sigma_until_it_has_passed(
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,6 +184,7 @@ def test_a_relocalized_place_reports_the_mixture_sigma_until_it_has_passed(
     assert all(m.verdict is not Verdict.LOST for m in matches)
 
 
+@pytest.mark.slow
 def test_a_wrong_relocalization_is_withdrawn_and_the_whole_map_is_searched(
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -95,6 +95,7 @@ def test_repeated_ground_selects_no_mode(ground: np.ndarray) -> None:
     assert selected_mode(twice, frame, [mode(*places[0][:2])]) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigma_m", "verdict"), [(90.0, Verdict.ACCEPTED), (30.0, Verdict.AMBIGUOUS)])
 def test_an_undecided_correlation_is_decided_by_patches_if_the_position_sigma_is_large(
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch, sigma_m: float, verdict: Verdict

@@ -106,6 +106,7 @@ def write_continuously(path: str, ready: "multiprocessing.synchronize.Event") ->
         frame_id += 1
 
 
+@pytest.mark.slow
 def test_no_image_is_torn_while_another_process_writes_continuously(tmp_path: Path) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready = spawn.Event()

@@ -123,6 +123,7 @@ def raster(path: Path, image: np.ndarray, x_m: float = 500_000.0, crs: int = 326
     return path
 
 
+@pytest.mark.slow
 def test_bench_of_an_image_pair_shows_which_features_find_the_place(folder: Path, tmp_path: Path) -> None:
     """The second image begins 30 px further east and is darker; positions are compared in ground coordinates."""
     from textured_ground import texture

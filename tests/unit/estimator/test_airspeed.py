@@ -63,6 +63,7 @@ def test_wind_and_airspeed_scale_are_estimated_consistently_in_turns() -> None:
     assert 0.5 < np.mean(off2) < 2.6  # 2 for an exactly consistent covariance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_s", [10.0, 60.0])
 @pytest.mark.parametrize("gust_mps", [0.5, 1.5, 3.0])
 def test_dead_reckoning_by_airspeed_is_consistent(gap_s: float, gust_mps: float) -> None:
@@ -118,6 +119,7 @@ def test_the_airspeed_factor_has_the_expected_error_and_linearization() -> None:
     assert factor.linearize(values).error(step) == pytest.approx(factor.error(values.retract(step)), rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("imu", [True, False])
 def test_airspeed_bounds_the_drift_of_a_40_s_blackout(imu: bool) -> None:
     blind = (70, 110)
@@ -134,6 +136,7 @@ def test_airspeed_bounds_the_drift_of_a_40_s_blackout(imu: bool) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("imu", [True, False])
 @pytest.mark.parametrize("iced", [0.4, 0.7])
 def test_an_icing_pitot_tube_in_a_blackout_keeps_the_estimate_consistent(imu: bool, iced: float) -> None:

@@ -174,6 +174,7 @@ def test_without_a_checkpoint_dead_reckoning_is_not_used(flight: Flight) -> None
     assert run.estimate(BACK).cov == without.estimate(BACK).cov
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration_s", [3.0, 6.0, 20.0])
 def test_dead_reckoning_is_consistent_with_the_stated_tilt_sigma(duration_s: float) -> None:
     """The tilt error of the filter, and with it the gravity error, is a first-order process."""

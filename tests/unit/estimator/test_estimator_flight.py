@@ -476,6 +476,7 @@ def test_nothing_is_said_before_the_origin() -> None:
 # --- covariance modes -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_jacobian_claims_about_what_marginals_do() -> None:
     long_flight = Flight(120, seed=3, dem=True)
     cool, hot = EstimatorRun(), EstimatorRun()

@@ -37,6 +37,7 @@ def test_the_order_is_an_odd_one() -> None:
     assert sorted(at) == list(range(0, 60, 2)) and sum(b < a for a, b in pairwise(at)) >= 5
 
 
+@pytest.mark.slow
 def test_the_same_odd_order_gives_the_same_bytes() -> None:
     said = late(Flight(60, seed=5, fix_every=2), 60, seed=1)
     runs = [EstimatorRun(), EstimatorRun()]
@@ -60,6 +61,7 @@ def test_late_matches_are_worth_as_much_as_those_in_time(seed: int) -> None:
     assert sigma_m(b) == pytest.approx(sigma_m(a), rel=0.1)
 
 
+@pytest.mark.slow
 def test_estimates_are_honest_while_matches_are_late() -> None:
     nees = []
     for seed in range(3):

@@ -179,6 +179,7 @@ def test_refinement_equals_the_batch_optimisation_of_the_whole_flight(
     assert sigmas(cov) == pytest.approx(sigmas(exact_cov), rel=0.06)
 
 
+@pytest.mark.slow
 def test_retained_nodes_and_factors_are_bounded_in_a_long_flight() -> None:
     past = Chain(1700, fixes=set(range(0, 1700, 20))).flown(MarginalizedHistory())
     assert marginalized.MAX_RETAINED - 2 <= len(past._retained) <= marginalized.MAX_RETAINED

@@ -215,11 +215,13 @@ def _fly(edit: object = None, frames: int = 120, **flight: object) -> tuple[Esti
     return listener, [message for message in listener.published if isinstance(message, CalibrationFault)]
 
 
+@pytest.mark.slow
 def test_a_correctly_described_flight_has_no_fault() -> None:
     for seed in range(3):
         assert _fly(seed=seed)[1] == []
 
 
+@pytest.mark.slow
 def test_heights_in_feet_raise_a_scale_fault_and_withdraw_the_position() -> None:
     def feet(message: Message) -> Message:
         if isinstance(message, VehicleState) and message.agl_m is not None:
@@ -232,6 +234,7 @@ def test_heights_in_feet_raise_a_scale_fault_and_withdraw_the_position() -> None
     assert sigma_m(listener.estimate(119)) >= FAULT_SIGMA_M
 
 
+@pytest.mark.slow
 def test_correlations_without_a_match_withdraw_the_position() -> None:
     def nothing(message: Message) -> Message:
         if not isinstance(message, MapMatch):
@@ -251,6 +254,7 @@ def _coarsely(message: Message) -> Message:
     return msgspec.structs.replace(message, coarse=True, inliers=0)
 
 
+@pytest.mark.slow
 def test_accepted_coarse_matches_do_not_count_against_registration() -> None:
     listener, faults = _fly(_coarsely, fix_every=1)
     verdicts = listener.verdicts("map").values()
@@ -259,6 +263,7 @@ def test_accepted_coarse_matches_do_not_count_against_registration() -> None:
     assert max(sigma_m(listener.estimate(i)) for i in range(120)) < 20.0
 
 
+@pytest.mark.slow
 def test_rejected_coarse_matches_count_against_registration() -> None:
     def aside(message: Message) -> Message:
         match = _coarsely(message)

@@ -409,6 +409,7 @@ def test_the_first_prediction_after_frames_without_odometry_contains_the_whole_d
     )  # and the one after it the displacement since this one
 
 
+@pytest.mark.slow
 def test_a_camera_outage_of_40_s_is_bridged_by_one_inertial_increment() -> None:
     """Without pictures there are no frames: the outage is one increment."""
     far, sigma_m = [], []

@@ -52,6 +52,7 @@ def learnt(
     return found
 
 
+@pytest.mark.slow
 def test_radial_distortion_makes_the_principal_point_observable() -> None:
     found = [learnt(seed) for seed in range(8)]
     for one in found:

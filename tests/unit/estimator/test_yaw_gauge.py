@@ -102,6 +102,7 @@ def test_a_turn_without_odometry_frees_the_yaw_gauge_again(frames: int, seed: in
     assert np.hypot(*error_m(listener.estimate(flight.frames - 1), flight)[:2]) < 15.0
 
 
+@pytest.mark.slow
 def test_the_yaw_sigma_grows_with_the_time_without_odometry() -> None:
     sigmas_rad = []
     for frames in (0, 1, 4, 16):

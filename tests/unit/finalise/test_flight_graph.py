@@ -118,6 +118,7 @@ def test_a_lost_position_that_is_not_found_again_keeps_its_sigma() -> None:
     assert covs[30, 0, 0] < 10.0**2 and covs[50, 0, 0] > 300.0**2
 
 
+@pytest.mark.slow
 def test_map_matches_that_arrived_after_the_window_are_used() -> None:
     """Map matches of the middle of the flight arrive at its end."""
     flight = Flight(80, seed=5)
@@ -137,6 +138,7 @@ def test_map_matches_that_arrived_after_the_window_are_used() -> None:
     assert np.hypot(*errors_m[36]) < 8.0
 
 
+@pytest.mark.slow
 def test_without_map_matches_the_track_follows_from_start_and_odometry() -> None:
     flight = Flight(60, seed=6)
     graph = replayed_graph(flight, lambda m: None if isinstance(m, MapMatch) else m)
@@ -147,6 +149,7 @@ def test_without_map_matches_the_track_follows_from_start_and_odometry() -> None
     assert nees(errors_m, covs).max() < 13.8
 
 
+@pytest.mark.slow
 def test_consistent_outliers_at_the_end_widen_the_covariance_over_both_positions() -> None:
     """One odometry error could explain them, and no later map match contradicts that."""
     flight = Flight(90, seed=7, fix_every=6)

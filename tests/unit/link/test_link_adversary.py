@@ -65,6 +65,7 @@ class Forger:
         self._speaker.send(self._to, leaning, station_heartbeat(), hint)
 
 
+@pytest.mark.slow
 def test_of_two_copters_on_one_port_only_the_first_receives_gps_input() -> None:
     port = free_port()
     edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
@@ -85,6 +86,7 @@ def test_of_two_copters_on_one_port_only_the_first_receives_gps_input() -> None:
     assert "Terrafix: vehicle 2 on our port gets nothing" in first.status_texts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
 def test_forged_telemetry_and_hints_have_no_effect(kind: str) -> None:
     peer, estimates = AutopilotPeer(seed=3), Estimates()

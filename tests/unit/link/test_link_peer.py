@@ -257,6 +257,7 @@ class Flight:
         return [msgspec.structs.replace(late, t_ns=at_ns, emitted_at_ns=now_ns)]
 
 
+@pytest.mark.slow
 def test_the_simulated_autopilot_navigates_on_the_gps_input_of_the_link(tmp_path: Path) -> None:
     flight, peer = Flight(), AutopilotPeer(seed=3)
     port = peer.start(0, course, flight.clock)

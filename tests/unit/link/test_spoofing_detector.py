@@ -299,6 +299,7 @@ def test_a_flight_without_spoofing_gives_no_alarm() -> None:
     assert {state for _, state in flight.states} <= {GnssState.UNKNOWN, GnssState.TRUSTED}
 
 
+@pytest.mark.slow
 def test_the_table_of_the_gnss_judge_counts_events_and_delays() -> None:
     result = table(5, 6.0, seed=7)
     assert dict(result.flights) == {"clean": 1, "outage": 1, "jam": 1, "jump": 1, "drag": 1}

@@ -280,6 +280,7 @@ def test_elevation_that_does_not_cover_the_imagery_is_reported(tmp_path: Path) -
         build(tif, tmp_path / "m.gpkg", dem=elsewhere)
 
 
+@pytest.mark.slow
 def test_an_interrupted_build_leaves_no_file(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 12, 12)))
     out = tmp_path / "out" / "m.gpkg"
@@ -316,6 +317,7 @@ def test_an_imagery_error_in_a_worker_is_reported(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["i.tif"]
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_a_one_line_error_and_leaves_no_file(tmp_path: Path) -> None:
     """A file size limit simulates a full disk: the system returns an error in the same place."""
     tif = map_rasters.utm(tmp_path / "i.tif", np.tile(map_rasters.texture(500, 500), (1, 4, 4)))

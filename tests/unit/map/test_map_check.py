@@ -94,6 +94,7 @@ def test_the_check_grid_and_its_fractions(package: Path) -> None:
     opened.close()
 
 
+@pytest.mark.slow
 def test_a_mission_check_lists_the_stretches_without_fixes(tmp_path: Path, package: Path) -> None:
     opened, frame = opened_with_frame(package)
     path = mission_over(tmp_path, frame, (-420.0, 0.0), (0.0, 0.0), (0.0, 60.0))
@@ -107,6 +108,7 @@ def test_a_mission_check_lists_the_stretches_without_fixes(tmp_path: Path, packa
     opened.close()
 
 
+@pytest.mark.slow
 def test_a_mission_check_lists_where_it_leaves_the_map(tmp_path: Path, package: Path) -> None:
     opened, frame = opened_with_frame(package)
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-400.0, 300.0), (-300.0, 300.0), (-300.0, 0.0))
@@ -168,6 +170,7 @@ def test_a_map_that_is_too_coarse_or_a_height_that_is_too_low_is_reported(tmp_pa
     opened.close()
 
 
+@pytest.mark.slow
 def test_the_preview_page_needs_no_other_file(tmp_path: Path, package: Path) -> None:
     opened, frame = opened_with_frame(package)
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-300.0, 0.0))

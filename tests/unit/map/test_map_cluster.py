@@ -62,6 +62,7 @@ def test_a_cluster_build_is_byte_identical_also_when_a_worker_is_killed(tmp_path
     assert [path.name for path in there.parent.iterdir()] == ["m.gpkg"]
 
 
+@pytest.mark.slow
 def test_an_unreachable_cluster_is_reported(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
     with socket.socket() as free:

@@ -164,6 +164,7 @@ def test_a_server_that_is_down_is_not_requested_for_every_tile(tmp_path: Path) -
         assert len(server.requests) <= (MAX_CONSECUTIVE_FAILURES + 4) * 3
 
 
+@pytest.mark.slow
 def test_an_unreachable_tile_server_is_reported(tmp_path: Path) -> None:
     with serving(WORLD.answer) as server:
         pass

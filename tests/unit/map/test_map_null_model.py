@@ -58,6 +58,7 @@ def test_a_package_stores_its_null_model(measured: Path) -> None:
     assert row.detection_threshold(row.places, -8.0) > row.search.above
 
 
+@pytest.mark.slow
 def test_the_null_model_is_deterministic(measured: Path) -> None:
     model = MapPackage.open(measured).layer().null_model
     assert model is not None and null_model.fit_null_row(bound(measured), AGL_M, 2, 2) == model.rows[0]
@@ -81,6 +82,7 @@ def test_an_altered_null_model_is_detected(measured: Path, tmp_path: Path) -> No
         MapPackage.open(path)
 
 
+@pytest.mark.slow
 def test_a_map_too_small_for_a_null_model_is_reported_and_leaves_no_file(image: Path, tmp_path: Path) -> None:
     with pytest.raises(
         UsageError, match=r"no straight path of 720 m at 300 m above ground fits on the map; give --null-agl"

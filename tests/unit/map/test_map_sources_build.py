@@ -77,6 +77,7 @@ def test_an_estimate_fetches_a_sample_and_writes_nothing(tmp_path: Path) -> None
     assert not (tmp_path / "m.gpkg").exists() and "MB in" in output.getvalue()
 
 
+@pytest.mark.slow
 def test_a_failed_download_leaves_no_package_and_resumes_later(tmp_path: Path) -> None:
     broken = True
 
@@ -190,6 +191,7 @@ def test_workers_change_no_byte_and_a_mission_gets_a_corridor_hint(tmp_path: Pat
     assert 0.2 < valid.mean() < 0.9 and valid[-5:].any() and not valid[0, 0] and not valid[-1, -1]
 
 
+@pytest.mark.slow
 def test_an_area_build_includes_elevation_and_vectors(tmp_path: Path) -> None:
     west, south, east, north = (float(v) for v in WORLD.box_deg(1.0).split(","))
     (tmp_path / "a.osm").write_text(

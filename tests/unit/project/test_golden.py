@@ -90,6 +90,7 @@ def test_cases_are_compared_with_their_references(monkeypatch: pytest.MonkeyPatc
     assert golden.compare([case], tmp_path, {}) == 1
 
 
+@pytest.mark.slow
 def test_a_failed_case_gives_its_reason_in_one_line(tmp_path: Path) -> None:
     town = next(case for case in CASES if case.name == "town-a")
     with pytest.raises(UsageError, match=r"town-a: failed; .*town-a"):

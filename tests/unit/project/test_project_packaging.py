@@ -54,6 +54,7 @@ def test_daemon_and_engines_import_only_the_core_dependencies() -> None:
     assert imported("daemon", "engines", training=False) <= modules(CORE)
 
 
+@pytest.mark.slow
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
     declared |= modules(EXTRAS["train"]) - EXPORTER

@@ -168,6 +168,7 @@ def prediction(frame_id: int) -> m.Prediction:
     )
 
 
+@pytest.mark.slow
 def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_ones(
     context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
 ) -> None:

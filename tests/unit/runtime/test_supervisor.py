@@ -229,6 +229,7 @@ def is_gone(pid: int) -> bool:
         return True
 
 
+@pytest.mark.slow
 def test_systemd_receives_ready_watchdog_and_stopping_and_sigterm_stops_in_order(tmp_path: Path) -> None:
     others = {run.path for run in run_dir.live_runs()}
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:

@@ -192,6 +192,7 @@ def test_fact_in_a_gap_of_12_s_a_plane_dead_reckons_and_then_resets() -> None:
     assert LAND not in rig.texts()
 
 
+@pytest.mark.slow
 def test_fact_a_plane_dead_reckons_for_two_minutes_with_airspeed() -> None:
     rig = flying(Kind.PLANE, 60.0)
     for seconds, error_m in ((20.0, 3.2), (40.0, 4.1), (60.0, 11.0)):

@@ -147,6 +147,7 @@ def test_faults_have_their_stated_times_and_sizes(flown: tuple[FlightPlan, Simul
     assert sum(blind) == 120
 
 
+@pytest.mark.slow
 def test_a_flight_is_reproducible_and_close_to_the_truth() -> None:
     drawn = replace(plan(5, 2, fault=Fault.NONE, duration_s=SHORT_S), start_sigma_m=5.0)
     one, two = run(drawn), run(drawn)
@@ -156,6 +157,7 @@ def test_a_flight_is_reproducible_and_close_to_the_truth() -> None:
     assert np.median(np.hypot(*(one.error_m[:, :2] - np.array(drawn.map_offset_m)).T)) < 8.0
 
 
+@pytest.mark.slow
 def test_consistent_wrong_matches_cause_no_false_fix() -> None:
     """Regression: flight 22 had an error of 80 m for half a minute with a sigma of 3 m."""
     seen = FlightResult.of(run(plan(1, 22, fault=Fault.ROWS, duration_s=100.0)))
@@ -174,6 +176,7 @@ def test_an_unmapped_slope_is_not_taken_for_a_tilt_of_the_camera() -> None:
     assert float((seen.nees < 5.991).mean()) > 0.93
 
 
+@pytest.mark.slow
 def test_three_view_constraints_reduce_the_drift_over_hills_without_a_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two flights over relief of 20 m, 150 s without a map."""
     hills = [plan(1, number, fault=Fault.DRIFT, duration_s=240.0) for number in (2, 8)]
@@ -192,6 +195,7 @@ def test_three_view_constraints_reduce_the_drift_over_hills_without_a_map(monkey
     assert error_m < claim_m < 0.8 * claim_without_m
 
 
+@pytest.mark.slow
 def test_sparse_photos_have_a_covariance_for_speed_and_turns() -> None:
     """Regression: flight 16 flies 22 m/s with map matches only. With a speed prior of odometry only, 10 m/s, a turn led
     it out of the search window, and 23 of its 120 positions were false."""
@@ -200,6 +204,7 @@ def test_sparse_photos_have_a_covariance_for_speed_and_turns() -> None:
     assert float((seen.nees < 5.991).mean()) > 0.93
 
 
+@pytest.mark.slow
 def test_the_command_writes_its_table_and_picture(tmp_path: Path) -> None:
     result = montecarlo(RunOptions(tmp_path, flights=1, seed=5, duration_s=SHORT_S, workers=1))
     written = json.loads((tmp_path / RESULT).read_text())

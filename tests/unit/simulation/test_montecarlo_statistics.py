@@ -87,6 +87,7 @@ def test_slopes_are_independent_of_the_load_of_the_machine(
     assert found["flat"] is flat
 
 
+@pytest.mark.slow
 def test_a_restarted_estimator_processes_the_same_messages_and_agrees() -> None:
     flight = RestartComparison(plan(1, 0, fault=Fault.NONE, duration_s=60.0), 30.0)
     alone = run(plan(1, 0, fault=Fault.NONE, duration_s=60.0), refine=False)

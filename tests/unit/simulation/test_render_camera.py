@@ -87,6 +87,7 @@ def test_fisheye_rays_and_pixels_are_those_of_opencv() -> None:
     assert np.abs(LENS.project(rays * 7.0) - px).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_dots_on_hills_appear_at_their_fisheye_projection() -> None:
     places = lattice()
     ground = ground_of(dotted(places), hills, 8.0)
@@ -169,6 +170,7 @@ def test_a_ridge_occludes_the_ground_behind_it() -> None:
     assert wrong == 0  # no dot behind the ridge is visible
 
 
+@pytest.mark.slow
 def test_haze_light_and_clouds_follow_their_formulas() -> None:
     image = np.full((SIZE_PX, SIZE_PX, 3), 100, np.uint8)
 

@@ -71,6 +71,7 @@ def test_the_compass_error_has_a_deviation_by_heading_and_a_constant() -> None:
     assert 1.5 < np.ptp(found) / 2 < 3.2
 
 
+@pytest.mark.slow
 def test_the_attitude_error_is_a_gauss_markov_process() -> None:
     """A first-order process with standard deviation s and time constant T changes by s * sqrt(2 - 2 exp(-t / T))."""
     flights = [VehicleSensors(PLACE, seed=seed) for seed in range(24)]

@@ -133,12 +133,14 @@ def test_the_errors_of_the_log_match_flight_toml(flight: Flight, tmp_path: Path)
     assert np.abs(height).max() < 9.0
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_flight(place: world.World) -> None:
     scene = scene_of_world(place, GREY)
     ends = [flight_over(scene, Kind.COPTER, seed=seed, duration_s=5.0).path.states[-1].p_b_in_w_m for seed in (5, 5, 6)]
     assert np.array_equal(ends[0], ends[1]) and not np.allclose(ends[0], ends[2])
 
 
+@pytest.mark.slow
 def test_without_a_duration_the_flight_ends_with_the_mission(small: Scene) -> None:
     mission = mission_over(small, Kind.PLANE, seed=1, length_m=2500.0, agl_m=120.0)
     done = flight_over(small, seed=1, mission=mission)
@@ -146,6 +148,7 @@ def test_without_a_duration_the_flight_ends_with_the_mission(small: Scene) -> No
     assert done.duration_s == pytest.approx(2500.0 / 22.0, rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_command_makes_a_readable_flight_folder(image: Path, tmp_path: Path) -> None:
     """Over an image, from a mission file, with a jammed receiver."""
     make(tmp_path / "a", FlightOptions(image=image, vehicle=Kind.COPTER, agl_m=60.0, length_km=0.5, duration_s=1.0))
@@ -161,6 +164,7 @@ def test_the_command_makes_a_readable_flight_folder(image: Path, tmp_path: Path)
     assert (out / "map.gpkg").is_file() and (out / "telemetry.tlog").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_command_generates_a_place_and_its_map(tmp_path: Path) -> None:
     arguments = ["sim", "make", "--out", str(tmp_path / "a"), "--size-km", "0.6", "--seed", "3", "--vehicle", "copter"]
     arguments += ["--agl", "50", "--duration", "1", "--quiet"]

@@ -413,6 +413,7 @@ def test_the_mission_on_board_is_saved_as_a_file(tmp_path: Path) -> None:
     assert plan.items[-1].height_m == 120.0
 
 
+@pytest.mark.slow
 def test_a_mission_on_board_with_any_items_is_checked_against_the_map(tmp_path: Path, wired: Any) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=1.0)
     package = build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
