@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from terrafix.core.gate import GATE
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState, FrameState
@@ -221,7 +220,7 @@ class MapUpdate:
         fixed_s, now_s = state.graph.time_of(node), state.graph.time_of(state.graph.newest)
         position = measurement.position_innovation(was.pose, state.covariance(node))
         offset = position.residual
-        start_off = self._start_off(offset, position.covariance)
+        start_off = self._start_off(position)
         onward = was.pose.between(now.pose)
         cov = self._moved_cov(measurement.cov, onward, now_s - fixed_s)
         bias = now.bias.copy()
@@ -252,14 +251,13 @@ class MapUpdate:
         cov[TRANSLATION, TRANSLATION] += np.hypot(STEP_SHARE * way_m, velocity_sigma * dt_s) ** 2 * np.eye(3)
         return cov
 
-    def _start_off(self, offset: np.ndarray, apart_m2: np.ndarray) -> str:
-        """``offset`` (2,): from where a flight that no match has placed was to where the first ones place it, with
-        covariance ``apart_m2`` (2, 2). Nothing on board tells which of the two is in the wrong place."""
-        state, distance2 = self._state, float(offset @ np.linalg.solve(apart_m2, offset))
-        searched = state.origin.start_sigma_m > SEARCH_START_SIGMA_M
-        if state.last_fix_s is not None or searched or distance2 <= GATE[2]:
+    def _start_off(self, position: Innovation) -> str:
+        """``position``: of the first matches against a flight that none has placed. Nothing on board tells which of the
+        two is in the wrong place."""
+        searched = self._state.origin.start_sigma_m > SEARCH_START_SIGMA_M
+        if self._state.last_fix_s is not None or searched or position.is_accepted:
             return ""
-        return f"start and map are {float(np.hypot(*offset)):.0f} m apart: one of them is wrong"
+        return f"start and map are {float(np.hypot(*position.residual)):.0f} m apart: one of them is wrong"
 
     def _height_m(self, measurement: MapPoseMeasurement) -> float:
         """Above the ground, 1 m at least."""

@@ -12,7 +12,7 @@ from terrafix.estimator.aiding import AID_SOURCES
 from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState, ImuQuery
 from terrafix.estimator.graph.pose_graph import NewNode
 from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffDetector, continue_from, start_at
-from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
+from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation, ScalarInnovation
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
 from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
@@ -185,7 +185,7 @@ class Propagation:
         r_w_c = before.pose.rotation().matrix()
         yaws = tuple(state.camera.yaw_rad(r) for r in (r_w_c, state.camera.expected(attitude, before.bias, r_w_c)))
         return integrate_motion(
-            max(frame.t_s - from_s, 1e-3),
+            state.graph.since_newest_s(frame.t_s),
             measured,
             (yaws[0], yaws[1]),
             float(before.bias[HEADING]),
@@ -201,7 +201,7 @@ class Propagation:
         """A new graph at the predicted pose, where the one that is there would be sure of what is not known."""
         state, frame, verdict = self._state, step.frame, step.sighting.verdict
         if self._is_motion_timed_out(step.sighting, frame.t_s) and step.increment is not None:
-            dt_s = max(frame.t_s - state.graph.time_of(state.graph.newest), 1e-3)
+            dt_s = state.graph.since_newest_s(frame.t_s)
             step.predicted_cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
             step.predicted_cov[DELTA_P, DELTA_P] += unknown_motion_cov()[VELOCITY, VELOCITY] * dt_s**2
             detail = f"odometry contradicts velocity for {MOTION_TIMEOUT_S:.0f} s"
@@ -227,8 +227,7 @@ class Propagation:
         if unseen and (gauge is None or not gauge.unobserved):
             return self._continue(step, step.sighting.verdict, _reset_verdict(ResetReason.HEADING_UNKNOWN))
         if unseen and gauge is not None:  # an unseen stretch is one turn
-            dt_s = max(step.frame.t_s - self._state.graph.time_of(self._state.graph.newest), 1e-3)
-            self._state.yaw_gauge = gauge.after_unobserved(dt_s)
+            self._state.yaw_gauge = gauge.after_unobserved(self._state.graph.since_newest_s(step.frame.t_s))
         elif step.known is not None and gauge is not None:
             gauge.unobserved = False
         return None
@@ -330,8 +329,7 @@ class Propagation:
         """The frame enters the graph, with attitude, height, motion increment and odometry."""
         state, frame, p = self._state, step.frame, step.p_m
         assert step.motion is not None
-        before_s = state.graph.time_of(state.graph.newest)
-        dt_s = max(frame.t_s - before_s, 1e-3)
+        dt_s = state.graph.since_newest_s(frame.t_s)
         if state.mode is CovarianceMode.JACOBIAN:
             state.cov_of[state.graph.next_node] = _compose_cov(state.cov_of[step.parent], step.motion)
         r_w_c, ground_m = step.pose.rotation().matrix(), state.terrain.elevation_m(p)
@@ -407,7 +405,7 @@ class Propagation:
         if known is None or frame.attitude.yaw_rad is None or frame.attitude.stands or state.yaw_gauge is not None:
             return None
         innovation = heading_innovation(state, frame.attitude, known.parent, known.motion.r, before)
-        return self._rejection("attitude", self._heading_gate, innovation.off_rad, innovation.sigma_rad)
+        return self._rejection("attitude", self._heading_gate, innovation)
 
     def _gate_height(self, step: _Step) -> FusionVerdict | None:
         """The reported height against the predicted one. -> the verdict on a height that is rejected."""
@@ -415,11 +413,12 @@ class Propagation:
         if attitude.agl_m is None or attitude.stands:
             return None
         climb_m2 = float(step.predicted_cov[UP, UP])
-        off_m, sigma_m = height_innovation(state, attitude.agl_m, step.p_m, step.before, climb_m2)
-        return self._rejection("height", self._height_gate, off_m, sigma_m)
+        innovation = height_innovation(state, attitude.agl_m, step.p_m, step.before, climb_m2)
+        return self._rejection("height", self._height_gate, innovation)
 
-    def _rejection(self, name: str, gate: InnovationGate, residual: float, sigma: float) -> FusionVerdict | None:
+    def _rejection(self, name: str, gate: InnovationGate, innovation: ScalarInnovation) -> FusionVerdict | None:
         """The verdict on a scalar that ``gate`` rejects; None: it is accepted."""
+        residual, sigma = innovation.residual, innovation.sigma
         if not gate.rejects(residual, sigma, self._state.last_fix_s):
             return None
         return FusionVerdict(name, Verdict.IMPLAUSIBLE, Innovation.scalar(residual, sigma, gate.gate_sigmas))

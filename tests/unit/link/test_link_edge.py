@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from gps_input_message import GPS
+from gps_messages import GPS
 from link_rig import ALT, MS, S, estimate, live
 from link_wire import packed
 from terrafix import messages as m

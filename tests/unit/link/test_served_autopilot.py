@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from gps_input_message import GPS
+from gps_messages import GPS
 from link_port import Port, Speaker, armed, free_port, listening, station_heartbeat
 from link_rig import MS, S
 from link_wire import MemoryWire, attitude, heartbeat, packed, states

@@ -141,6 +141,10 @@ class PoseGraph:
         """Measurement time of a node in the window, s."""
         return self._times[node]
 
+    def since_newest_s(self, t_s: float) -> float:
+        """Time from the newest node to ``t_s``, MIN_STEP_S at least."""
+        return max(t_s - self._times[self.newest], MIN_STEP_S)
+
     def start(self, t_s: float, prior: GraphPrior) -> int:
         """Begins a new graph with one node. Nodes so far become history, as they were estimated. -> the node."""
         self._observer.before_node(self)
@@ -198,7 +202,7 @@ class PoseGraph:
         return gtsam.PriorFactorVector(V(node), np.zeros(MOTION_SIZE), stationary)
 
     def _walk_factor(self, node: int, newest: int, t_s: float, new: NewNode) -> gtsam.NonlinearFactor:
-        dt_s = max(t_s - self._times[newest], MIN_STEP_S)
+        dt_s = self.since_newest_s(t_s)
         turned = new.state.pose.rotation().compose(self.state(newest).pose.rotation().inverse())
         sigmas = walk_sigmas(dt_s, float(gtsam.Rot3.Logmap(turned)[UP]), new.rise_sigma_m)
         walk = gtsam.noiseModel.Diagonal.Sigmas(sigmas)

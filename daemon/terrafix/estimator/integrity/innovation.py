@@ -38,6 +38,14 @@ class Innovation:
 
 
 @dataclass(frozen=True)
+class ScalarInnovation:
+    """Measured less predicted, and the 1-sigma of the difference, in the unit of the measurement."""
+
+    residual: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class FusionVerdict:
     """What was done with one measurement. ``innovation``: None where it was not evaluated."""
 

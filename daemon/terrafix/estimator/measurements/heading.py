@@ -1,12 +1,12 @@
 """The reported heading against the one to which odometry has turned."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState
+from terrafix.estimator.integrity.innovation import ScalarInnovation
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.state import WORLD_YAW, NodeState
 
@@ -14,19 +14,11 @@ HEADING_GATE_SIGMAS = 8.0  # of compass, graph and motion together: soft iron st
 COMPASS_SWING_RAD = np.radians(5.0)  # 1-sigma, by which the bias of a compass changes with the heading [tuned]
 
 
-@dataclass(frozen=True)
-class HeadingInnovation:
-    """The reported heading less the predicted one, and the 1-sigma of the difference [rad]."""
-
-    off_rad: float
-    sigma_rad: float
-
-
 def heading_innovation(
     state: FilterState, attitude: Attitude, parent: int, r_kf_c: np.ndarray, before: NodeState
-) -> HeadingInnovation:
-    """Of a frame that has turned by ``r_kf_c`` (3, 3) since its keyframe, node ``parent``; ``before``: the newest node.
-    Zero where no heading is reported."""
+) -> ScalarInnovation:
+    """The reported heading less the predicted one [rad], of a frame that has turned by ``r_kf_c`` (3, 3) since its
+    keyframe, node ``parent``. ``before``: the newest node. Zero where no heading is reported."""
     assert state.last is not None
     yaw_rad = state.camera.yaw_rad(state.graph.state(parent).pose.rotation().matrix() @ r_kf_c)
     cov = tangent_to_world(state.last.cov, before.pose.rotation().matrix())
@@ -34,6 +26,6 @@ def heading_innovation(
         np.sqrt(np.radians(state.origin.yaw_sigma_deg) ** 2 + COMPASS_SWING_RAD**2 + cov[WORLD_YAW, WORLD_YAW])
     )
     if attitude.yaw_rad is None:
-        return HeadingInnovation(0.0, sigma_rad)
+        return ScalarInnovation(0.0, sigma_rad)
     reported_rad = state.camera.yaw_rad(state.camera.expected(attitude, before.bias))
-    return HeadingInnovation(math.remainder(reported_rad - yaw_rad, math.tau), sigma_rad)
+    return ScalarInnovation(math.remainder(reported_rad - yaw_rad, math.tau), sigma_rad)

@@ -109,7 +109,7 @@ class OdometryMeasurement:
         """Whether motion and turn of a fragment that is not joined are those of this flight."""
         over_s = max(frame.t_s - self._state.graph.time_of(seen.parent), 1e-3)
         heading = heading_innovation(self._state, frame.attitude, seen.parent, seen.motion.r, before)
-        turns_agree = abs(heading.off_rad) <= HEADING_GATE * heading.sigma_rad
+        turns_agree = abs(heading.residual) <= HEADING_GATE * heading.sigma
         evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree)
         fragment.add_frame(frame.t_s, evidence)
 
@@ -163,7 +163,7 @@ class OdometryMeasurement:
         """Of a camera at ``p_m`` (3,) by odometry, against the motion model."""
         state = self._state
         predicted_m, _ = increment.predict(before.pose.translation(), before.velocity, float(before.bias[HEADING]))
-        dt_s = max(t_s - state.graph.time_of(state.graph.newest), 1e-3)
+        dt_s = state.graph.since_newest_s(t_s)
         cov_m2 = predict_covariance(increment, state.velocity_cov)[:3, :3]
         if not state.fragments.of(seen.parent).joined:  # the motion model alone led here from the keyframe
             since_s = t_s - state.graph.time_of(seen.parent)
