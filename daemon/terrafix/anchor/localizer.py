@@ -144,29 +144,18 @@ class Localizer:
             if unknown_heading:
                 sigma_m = float(np.sqrt(max(step_var + step_m**2, growth)))
             self._relocalizer.predict(prediction.step_m, float(np.sqrt(step_var)))  # for the sequential test
-            self._predict_belief(self._belief, prediction, sigma_m, cell_m)
+            predict_belief(self._belief, prediction, sigma_m, cell_m)
         self._since_observation_m += float(np.hypot(step_m, sigma_m))
 
     def _initialize_belief(self, prediction: Prediction, best: MapLayer, origin: Origin, cell_m: float) -> float:
         """Belief around the first prediction; starts a search if the start is unknown. -> 1-sigma of the belief."""
         e_m, n_m, _ = prediction.p_c_in_w_m
         start = position_sigma_m(prediction)
-        tilt = prediction.agl_m * tilt_sigma_rad(prediction)
-        sigma_m = float(np.hypot(max(start, START_SIGMA_FLOOR_M), tilt))
-        window_m = min(START_WINDOW_SIGMAS * sigma_m, START_WINDOW_MAX_M)
-        self._belief = Belief(e_m, n_m, sigma_m, cell_m, START_UNIFORM_SHARE, window_m)
+        self._belief, sigma_m = initial_belief(prediction, cell_m)
         # A prediction more precise than that start was found before: this process was restarted in flight.
         if origin.start_sigma_m > SEARCH_START_SIGMA_M and start > 0.5 * SEARCH_START_SIGMA_M:
             self._relocalizer.start(best, prediction.agl_m, search_centre(e_m, n_m, origin.start_sigma_m, best.map))
         return sigma_m
-
-    @staticmethod
-    def _predict_belief(belief: Belief, prediction: Prediction, sigma_m: float, cell_m: float) -> None:
-        jitter = min(TILT_JITTER, tilt_sigma_rad(prediction))
-        belief.predict(*prediction.step_m, float(np.hypot(sigma_m, jitter * prediction.agl_m)))
-        belief.fit_window(0.0)
-        if not CELL_RATIO_MIN < cell_m / belief.cell_m < CELL_RATIO_MAX:
-            belief.set_cell(cell_m)
 
     def apply_prior(self, hint: PositionHint, prediction: Prediction) -> HintVerdict:
         """An external position prior at this prediction; needs ``is_ready``."""
@@ -303,3 +292,21 @@ class Localizer:
         mode, fix = place
         match = pose_match(msgspec.structs.replace(pose.match, mode_e_m=mode.e_m, mode_n_m=mode.n_m), fix, view)
         return PoseResult(match, mode, attempted=match.verdict is Verdict.ACCEPTED, likelihood_ratio=LIKELIHOOD_RATIO)
+
+
+def initial_belief(prediction: Prediction, cell_m: float) -> tuple[Belief, float]:
+    """Belief around a start coordinate, and its 1-sigma [m]."""
+    e_m, n_m, _ = prediction.p_c_in_w_m
+    tilt = prediction.agl_m * tilt_sigma_rad(prediction)
+    sigma_m = float(np.hypot(max(position_sigma_m(prediction), START_SIGMA_FLOOR_M), tilt))
+    window_m = min(START_WINDOW_SIGMAS * sigma_m, START_WINDOW_MAX_M)
+    return Belief(e_m, n_m, sigma_m, cell_m, START_UNIFORM_SHARE, window_m), sigma_m
+
+
+def predict_belief(belief: Belief, prediction: Prediction, sigma_m: float, cell_m: float) -> None:
+    """Moves the belief by the step of odometry, with the 1-sigma ``sigma_m`` of that step."""
+    jitter = min(TILT_JITTER, tilt_sigma_rad(prediction))
+    belief.predict(*prediction.step_m, float(np.hypot(sigma_m, jitter * prediction.agl_m)))
+    belief.fit_window(0.0)
+    if not CELL_RATIO_MIN < cell_m / belief.cell_m < CELL_RATIO_MAX:
+        belief.set_cell(cell_m)

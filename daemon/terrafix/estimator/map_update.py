@@ -156,6 +156,9 @@ class MapUpdate:
             information = np.linalg.inv(state.cov_of[node]) + np.linalg.inv(measurement.cov / share)
             state.cov_of[node] = np.linalg.inv(information)
         if not match.coarse:
+            assert fusion.innovation is not None
+            gate = tangent_to_world(fusion.innovation.covariance, before.pose.rotation().matrix())
+            self.hypotheses.map_consistency.add_accepted(share, gate[:2, :2])
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
         return MapResult(replace(fusion, detail=f"new ground {share:.2f}"))
@@ -171,7 +174,6 @@ class MapUpdate:
             new_m = self._fixes.new_ground_m(state.graph.time_of(node), here, math.inf)
             self.hypotheses.other.decay(new_m / height_m, match.mode_mass)
         self._map_hit_rate.update(state.fragments.of(node), found=True)
-        self.hypotheses.map_consistency.add_accepted(measurement.information_share)
 
     def _accept(self, match: MapMatch, t_s: float, here_m: np.ndarray) -> None:
         state = self._state

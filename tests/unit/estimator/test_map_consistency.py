@@ -7,6 +7,7 @@ from terrafix.core.gate import MIN_COMPONENT_WEIGHT
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 
 OFFSET_M = np.array([90.0, -120.0])  # 150 m
+NARROW_M2 = 5.0**2 * np.eye(2)  # innovation covariance of an estimate that is placed
 
 
 def after_rejected(consistency: MapConsistency, times: int) -> MapConsistency:
@@ -35,7 +36,7 @@ def test_a_map_with_a_tenth_of_wrong_poses_is_not_taken_for_another_place(seed: 
         if rng.uniform() < 0.1:
             consistency.add_rejected(OFFSET_M)
         else:
-            consistency.add_accepted(0.5)
+            consistency.add_accepted(0.5, NARROW_M2)
         inflated += consistency.variance_m2 > 0.0
     assert inflated < 0.1 * 500
 
@@ -43,8 +44,8 @@ def test_a_map_with_a_tenth_of_wrong_poses_is_not_taken_for_another_place(seed: 
 def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
     hovering, flying = (after_rejected(MapConsistency(), 4) for _ in range(2))
     for _ in range(10):
-        hovering.add_accepted(0.0)
-        flying.add_accepted(0.5)
+        hovering.add_accepted(0.0, NARROW_M2)
+        flying.add_accepted(0.5, NARROW_M2)
     assert hovering.probability == after_rejected(MapConsistency(), 4).probability
     assert flying.variance_m2 == 0.0
 
@@ -52,7 +53,16 @@ def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
 def test_the_distance_of_earlier_rejected_poses_is_forgotten_after_accepted_ones() -> None:
     consistency = after_rejected(MapConsistency(), 1)
     for _ in range(20):
-        consistency.add_accepted(1.0)
+        consistency.add_accepted(1.0, NARROW_M2)
     for _ in range(4):
         consistency.add_rejected(0.1 * OFFSET_M)
     assert consistency.variance_m2 == pytest.approx(consistency.probability * 15.0**2)
+
+
+@pytest.mark.parametrize(("sigma_m", "ends"), [(5.0, True), (300.0, False)])
+def test_poses_inside_a_gate_wider_than_the_rejected_ones_do_not_end_the_inflation(sigma_m: float, ends: bool) -> None:
+    consistency = after_rejected(MapConsistency(), 4)
+    before_m2 = consistency.variance_m2
+    for _ in range(5):
+        consistency.add_accepted(1.0, sigma_m**2 * np.eye(2))
+    assert (consistency.variance_m2 == 0.0) if ends else (consistency.variance_m2 > 0.9 * before_m2)

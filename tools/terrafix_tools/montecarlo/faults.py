@@ -71,9 +71,17 @@ class Faults:
 
 
 def no_match(match: MapMatch) -> MapMatch:
-    """``match`` without a pose: the frame was not found on the map."""
+    """``match`` without a pose and without a belief: the frame was not compared with the map."""
     return msgspec.structs.replace(
-        match, verdict=Verdict.FEW_INLIERS, coarse=False, p_c_in_w_m=None, q_w_c=None, cov=None, inliers=0
+        match,
+        verdict=Verdict.FEW_INLIERS,
+        coarse=False,
+        p_c_in_w_m=None,
+        q_w_c=None,
+        cov=None,
+        inliers=0,
+        mode_mass=0.0,
+        modes=[],
     )
 
 
@@ -90,6 +98,7 @@ def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.rando
         cov=tuple(float(v) for v in cov.ravel()),
         inliers=30,
         margin=7.0,
+        modes=[],
         mode_mass=0.99,
         mode_e_m=float(p[0]),
         mode_n_m=float(p[1]),

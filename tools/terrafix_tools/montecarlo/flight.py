@@ -5,10 +5,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from terrafix.anchor.localizer import NEW_GROUND_SHARE
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.pose import log_so3
@@ -26,7 +28,7 @@ from terrafix.messages import (
 from terrafix_tools.montecarlo.faults import Faults
 from terrafix_tools.montecarlo.flown import Shot, fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
-from terrafix_tools.montecarlo.lens import Lens
+from terrafix_tools.montecarlo.lens import Lens, footprint_m
 from terrafix_tools.montecarlo.lies import Lies
 from terrafix_tools.montecarlo.matches import MapMatches
 from terrafix_tools.montecarlo.plan import FlightPlan
@@ -40,6 +42,7 @@ class Record:
     plan: FlightPlan
     t_s: np.ndarray
     path_m: np.ndarray  # (N,) flown over ground
+    new_ground: np.ndarray  # (N,) 0..1, share that the frame before did not show, as the anchor counts it
     truth_m: np.ndarray  # (N, 2)
     error_m: np.ndarray  # (N, 6): east, north, up [m], rotation about them [rad]; estimate minus truth
     cov: np.ndarray  # (N, 6, 6) as published
@@ -75,6 +78,7 @@ class Run:
             plan=plan,
             t_s=np.array([shot.t_s for shot in flown.frames]),
             path_m=flown.path_m,
+            new_ground=_new_ground(plan, flown.path_m),
             truth_m=np.array([shot.p_m[:2] for shot in flown.frames]),
             error_m=np.full((n, 6), np.nan),
             cov=np.full((n, 6, 6), np.nan),
@@ -109,8 +113,10 @@ class Run:
                 for state in flown.telemetry[i]:
                     self._send(state)
                 published = self._send(odometry)
+            dark = faults.is_blacked_out(shot.t_s) or faults.is_unmapped(shot.t_s)
+            find = matches.match if not dark else partial(matches.match, usable=False)
             late += [
-                (i + faults.late_frames(), faults.alter(lies.match(i, prediction, matches.match), shot))
+                (i + faults.late_frames(), faults.alter(lies.match(i, prediction, find), shot))
                 for prediction in published
                 if isinstance(prediction, Prediction)
             ]
@@ -177,3 +183,9 @@ class Run:
         record.velocity_error_mps[i] = np.array(estimate.velocity_enu_mps) - shot.velocity_mps
         record.velocity_sigma_mps[i] = estimate.velocity_sigma_mps
         record.anchor_age_ms[i] = estimate.last_anchor_age_ms
+
+
+def _new_ground(plan: FlightPlan, path_m: np.ndarray) -> np.ndarray:
+    """(N,) 0..1 of each frame, from the way since the frame before; 1 for the first one."""
+    side_m = footprint_m(plan.camera, plan.agl_m)
+    return np.append(1.0, np.minimum(np.diff(path_m) / (NEW_GROUND_SHARE * side_m), 1.0))

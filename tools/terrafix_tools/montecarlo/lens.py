@@ -1,10 +1,12 @@
 """A camera with errors of its calibration: focal length and radial distortion."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from terrafix.core.camera import CameraCalibration
+from terrafix.messages import Camera
 
 
 @dataclass(frozen=True)
@@ -32,3 +34,8 @@ class Lens:
 
     def scaled(self, factor: float) -> "Lens":
         return Lens(self.described.scaled(factor), self.focal, self.k1)
+
+
+def footprint_m(camera: Camera | CameraCalibration, agl_m: float) -> float:
+    """Side of a square of the area that a level picture shows from ``agl_m`` above the ground."""
+    return agl_m * math.sqrt(camera.width / camera.fx * camera.height / camera.fy)

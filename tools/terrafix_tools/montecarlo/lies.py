@@ -4,8 +4,8 @@ False numbers (height, focal length, heading, start, late pictures) are part of 
 inputs that begin in flight, and a model of the anchor's search after a long series of frames without a match."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -30,7 +30,11 @@ TOWN_SHARE, TOWN_AGAIN, TOWN_AWAY_M = 0.2, 0.5, (40.0, 110.0)
 # found after 5 frames that can be matched, if heading and scale are within the range that is searched.
 LOST_FRAMES, FOUND_FRAMES, LOST_SIGMA_M = 15, 5, 300.0
 
-FindMatch = Callable[[Prediction, Shot], MapMatch]
+
+class FindMatch(Protocol):
+    """MapMatches.match"""
+
+    def __call__(self, prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch: ...
 
 
 class Lies:
@@ -74,7 +78,7 @@ class Lies:
     def match(self, i: int, prediction: Prediction, find: FindMatch) -> MapMatch:
         """Map match of frame ``i``. ``find``: the match of a prediction and a shot without false inputs."""
         shot = self.picture(i)
-        found = find(prediction, shot)
+        found = find(prediction, shot, usable=self._search is None or not self._search.is_lost)
         if self._is_foreign(i):
             found = no_match(found)
         if Fault.TOWN in self._lies and i >= self._town_from:
@@ -122,15 +126,19 @@ class Search:
     def __init__(self) -> None:
         self._missed = self._matched = 0
 
+    @property
+    def is_lost(self) -> bool:
+        return self._missed >= LOST_FRAMES
+
     def update(self, match: MapMatch, prediction: Prediction, shot: Shot, find: FindMatch) -> MapMatch:
-        if match.verdict is Verdict.ACCEPTED and self._missed < LOST_FRAMES:
+        if match.verdict is Verdict.ACCEPTED and not self.is_lost:
             self._missed = 0
             return match
         self._missed += 1
-        if self._missed < LOST_FRAMES:
+        if not self.is_lost:
             return match
         e_m, n_m, up_m = float(shot.p_m[0]), float(shot.p_m[1]), prediction.p_c_in_w_m[2]
-        there = find(msgspec.structs.replace(prediction, p_c_in_w_m=(e_m, n_m, up_m)), shot)
+        there = find(msgspec.structs.replace(prediction, p_c_in_w_m=(e_m, n_m, up_m)), shot, usable=False)
         self._matched += there.verdict is Verdict.ACCEPTED and not there.coarse
         if self._matched >= FOUND_FRAMES and there.verdict is Verdict.ACCEPTED and not there.coarse:
             self._missed = self._matched = 0

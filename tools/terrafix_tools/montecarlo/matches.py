@@ -1,14 +1,15 @@
 """MapMatch as the anchor publishes it: patches of the frame on a map with errors, then the real PnP.
 
-The belief over the map is not simulated. Its mode is the camera position that the frame shows, if that lies in the
-search window. Views, ground planes and verdicts are computed as in the anchor."""
+The mode of the belief is the camera position that the frame shows, if that lies in the search window of the prediction.
+Elsewhere the anchor's filter runs on simulated correlation surfaces (tracked_belief.py). Views, ground planes and
+verdicts are computed as in the anchor."""
 
 import math
 
 import msgspec
 import numpy as np
 
-from terrafix.anchor.frame_pose import COARSE_SCORE
+from terrafix.anchor.frame_pose import COARSE_SCORE, MIN_POSE_MODE_MASS, MODE_MASS, POSE_LIKELIHOOD_RATIO, with_belief
 from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, SEARCH_RADIUS, Fix, View
 from terrafix.anchor.matching.match_message import mode_match, pose_match
 from terrafix.anchor.matching.patch_matcher import MAX_PATCHES
@@ -20,7 +21,8 @@ from terrafix.core.pose import log_so3
 from terrafix.messages import MapMatch, Prediction, Vec3, Verdict
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import MAP_SEES_TOPS, MapError, Terrain
-from terrafix_tools.montecarlo.lens import Lens
+from terrafix_tools.montecarlo.lens import Lens, footprint_m
+from terrafix_tools.montecarlo.tracked_belief import TrackedBelief
 
 FOUND_SHARE = (0.4, 0.9)  # of the patches that are found, on poor and on good ground ...
 RIGHT_SHARE = (0.5, 0.98)  # ... and of these at the right place
@@ -49,8 +51,12 @@ class MapMatches:
         self._last_s = 0.0
         self._home_m = terrain.bare_at_m(0.0, 0.0)
         self._dem_error_m = DEM_ERROR_M * float(self._rng.normal())
+        self._belief_rng = np.random.default_rng([seed, 62])
+        self._belief: TrackedBelief | None = None  # while the frames are not found near their predictions
+        self._has_found = False
 
-    def match(self, prediction: Prediction, shot: Shot) -> MapMatch:
+    def match(self, prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch:
+        """``usable`` False: the belief gets nothing, since the picture shows nothing or a search is active."""
         ground, relief_m = self._plane(prediction)
         result = MapMatch(
             t_ns=prediction.t_ns,
@@ -67,8 +73,10 @@ class MapMatches:
         if agl_m < MIN_MATCHING_AGL_M:
             return msgspec.structs.replace(result, verdict=Verdict.TOO_LOW)
         place = self._apparent(shot, r_w_c, agl_m)
-        if not self._in_reach(prediction, shot, place, agl_m):
-            return result
+        in_range = self._in_range(prediction, shot, agl_m)
+        if not (in_range and self._in_window(prediction, place)):
+            return self._match_in_belief(result, prediction, shot, place if in_range else None) if usable else result
+        self._belief, self._has_found = None, True
         score = SCORE + SCORE_SPREAD * (float(self._rng.normal()) + 0.5 * (good - 0.5))
         mode = Mode(float(place[0]), float(place[1]), MASS, 0.0, belief_cell_m(agl_m, 0.0) ** 2)
         view = View(mode.e_m, mode.n_m, r_w_c, agl_m, float(p_m[2]) - agl_m, 0.0, 0.0, 0.0)
@@ -137,19 +145,46 @@ class MapMatches:
         on_map = ground_m + self._error.at(ground_m[None])[0]
         return np.asarray(on_map - assumed[:2] * agl_m / max(-float(assumed[2]), 0.2))
 
-    def _in_reach(self, prediction: Prediction, shot: Shot, place_m: np.ndarray, agl_m: float) -> bool:
-        """Whether position, heading, scale and tilt are within the search range of the anchor."""
+    def _in_window(self, prediction: Prediction, place_m: np.ndarray) -> bool:
         cov = np.array(prediction.cov).reshape(6, 6)
         window_m = max(WINDOW_M, WINDOW_SIGMAS * float(np.sqrt(max(cov[0, 0], cov[1, 1]))))
+        return float(np.abs(place_m - prediction.p_c_in_w_m[:2]).max()) < window_m
+
+    def _in_range(self, prediction: Prediction, shot: Shot, agl_m: float) -> bool:
+        """Whether heading, scale and tilt are within the search range of the anchor."""
+        cov = np.array(prediction.cov).reshape(6, 6)
         turn = log_so3(shot.r_w_c @ rot_from_quat(prediction.q_w_c).T)
         agl_true_m = float(shot.p_m[2]) - self._terrain.bare_at_m(float(shot.p_m[0]), float(shot.p_m[1]))
         scale_sigma = prediction.agl_sigma_m / max(agl_m, 1.0)
         return bool(
-            float(np.abs(place_m - prediction.p_c_in_w_m[:2]).max()) < window_m
-            and abs(turn[2]) < HYPOTHESES * math.sqrt(cov[5, 5]) + YAW_TOLERANCE_RAD
+            abs(turn[2]) < HYPOTHESES * math.sqrt(cov[5, 5]) + YAW_TOLERANCE_RAD
             and abs(agl_true_m / agl_m - 1.0) < HYPOTHESES * scale_sigma + SCALE_TOLERANCE
             and float(np.hypot(*turn[:2])) < math.radians(20.0)
         )
+
+    def _match_in_belief(
+        self, result: MapMatch, prediction: Prediction, shot: Shot, place_m: np.ndarray | None
+    ) -> MapMatch:
+        """``place_m`` (2,): apparent position of the camera; None: the frame correlates nowhere."""
+        if self._belief is None:
+            side_m = footprint_m(self._lens.described, prediction.agl_m)
+            self._belief = TrackedBelief(prediction, side_m, at_start=not self._has_found, rng=self._belief_rng)
+        tracked, good = self._belief, self._texture_quality(shot.t_s)
+        score = SCORE + SCORE_SPREAD * (float(self._belief_rng.normal()) + 0.5 * (good - 0.5))
+        modes = tracked.update(prediction, place_m, score)
+        result = with_belief(result, tracked.belief, modes, score)
+        if modes[0].mass < MIN_POSE_MODE_MASS or not tracked.is_at(modes[0], place_m):
+            return result
+        agl_m = prediction.agl_m if result.ground is None else float(prediction.p_c_in_w_m[2]) - result.ground[0]
+        ground_m = float(prediction.p_c_in_w_m[2]) - agl_m
+        view = View(modes[0].e_m, modes[0].n_m, rot_from_quat(prediction.q_w_c), agl_m, ground_m, 0.0, 0.0, 0.0)
+        result = pose_match(result, self._fix(shot, good, view), view)
+        if result.verdict is not Verdict.ACCEPTED:
+            return result
+        tracked.belief.confirm(modes[0], POSE_LIKELIHOOD_RATIO)
+        modes = tracked.belief.modes(len(modes))
+        verdict = Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS
+        return msgspec.structs.replace(with_belief(result, tracked.belief, modes, score), verdict=verdict)
 
     def _texture_quality(self, t_s: float) -> float:
         """0..1: quality of the ground below for matching, a first-order process in time."""

@@ -7,11 +7,13 @@ the tracks scatter about their homography as those of the real flights do (docs/
 from dataclasses import dataclass
 
 import cv2
+import msgspec
 import numpy as np
 
 from terrafix.core.limits import MAX_KEYFRAME_AGE
 from terrafix.messages import Odometry, Verdict
 from terrafix.vision import feature_tracker as real
+from terrafix.vision import repeated_picture
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.lens import Lens
@@ -50,8 +52,25 @@ class SimulatedOdometry:
         self._rng = np.random.default_rng([seed, 55])
         self._keyframe: _Keyframe | None = None
         self._misses = 0
+        self._before: Shot | None = None  # of the frame before
 
     def odometry(self, frame_id: int, shot: Shot, *, blind: bool = False) -> Odometry:
+        before, self._before = self._before, shot
+        odometry = self._registered(frame_id, shot, blind)
+        if blind or before is None or not self._is_same_view(before, shot):
+            return odometry
+        return msgspec.structs.replace(odometry, static=True)
+
+    def _is_same_view(self, before: Shot, shot: Shot) -> bool:
+        """Whether vision/repeated_picture.py finds no displacement between two pictures, whatever their noise."""
+        size = np.array([self._camera.width, self._camera.height])
+        quadrants = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]) * size
+        points_m = self._on_level_ground(quadrants, before)
+        shift_px = np.hypot(*(self._projected(points_m, shot)[0] - self._projected(points_m, before)[0]).T)
+        scale = repeated_picture.WIDTH_PX / self._camera.width
+        return bool((scale * shift_px <= repeated_picture.MAX_SHIFT_PX).all())
+
+    def _registered(self, frame_id: int, shot: Shot, blind: bool) -> Odometry:
         t_ns = round(shot.t_s * 1e9)
         keyframe = self._keyframe
         if keyframe is None:
@@ -149,10 +168,7 @@ class SimulatedOdometry:
     def _new_keyframe(self, frame_id: int, shot: Shot, *, blind: bool = False) -> _Keyframe:
         """A keyframe with random corners on the ground, on roofs and in tree crowns."""
         corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * (self._camera.width, self._camera.height)
-        rays = self._lens.rays(corners) @ shot.r_w_c.T
-        ground_m = self._terrain.bare_at_m(float(shot.p_m[0]), float(shot.p_m[1]))
-        reach = (shot.p_m[2] - ground_m) / np.maximum(-rays[:, 2], 0.2)
-        box = shot.p_m[:2] + rays[:, :2] * reach[:, None]
+        box = self._on_level_ground(corners, shot)[:, :2]
         places = self._rng.uniform(box.min(0), box.max(0), (CANDIDATES, 2))
         up = self._terrain.bare_m(places) + self._terrain.standing_m(places)
         points = np.column_stack([places, up])
@@ -162,6 +178,13 @@ class SimulatedOdometry:
         return _Keyframe(
             frame_id, points[chosen], px[chosen], none, np.ones(len(chosen), bool), none.copy(), none + np.nan, -1
         )
+
+    def _on_level_ground(self, px: np.ndarray, shot: Shot) -> np.ndarray:
+        """(N, 3) where the rays of pixels (N, 2) meet a level plane at the height of the ground below the camera."""
+        rays = self._lens.rays(px) @ shot.r_w_c.T
+        ground_m = self._terrain.bare_at_m(float(shot.p_m[0]), float(shot.p_m[1]))
+        reach = (shot.p_m[2] - ground_m) / np.maximum(-rays[:, 2], 0.2)
+        return np.asarray(np.column_stack([shot.p_m[:2] + rays[:, :2] * reach[:, None], np.full(len(px), ground_m)]))
 
     def _projected(self, points_m: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
         """-> pixels (N, 2) of the scaled picture, and (N,) which of them lie in it."""

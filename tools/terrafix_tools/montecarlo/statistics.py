@@ -22,6 +22,9 @@ NORMAL95 = 1.959964  # two-sided
 MAX_SIGMAS = 4.0  # errors are limited to this for the correlation
 MIN_DRIFT_PATH_M = 1000.0  # since the last map fix; a ratio over a shorter path has no meaning
 COVERAGE_FLOORS = (0.93, 0.98)
+# A false input is to be noticed within this time of its beginning, or within this many frames of new ground: a camera
+# above the same ground sees nothing new that could contradict it.
+NOTICE_S, NOTICE_FRAMES = 3.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,17 @@ class FlightResult:
         last_s = max(self.record.t_s[wrong].tolist(), default=-math.inf)
         return last_s - start_s if start_s is not None and last_s >= start_s else None
 
+    @property
+    def late_false_fixes(self) -> int:
+        """False fixes but those at the beginning of the first false input, while nothing can show it yet."""
+        start_s, times_s = self.record.lie_from_s, self.record.t_s
+        if start_s is None:
+            return self.false_fixes
+        since = times_s >= start_s
+        shown = np.cumsum(np.where(since, self.record.new_ground, 0.0))
+        excused = since & ((times_s - start_s <= NOTICE_S) | (shown <= NOTICE_FRAMES))
+        return int((self._false() & ~excused).sum())
+
     def _false(self) -> np.ndarray:
         """(N,) bool"""
         return np.asarray((self.distance_m > FALSE_FIX_ERROR_M) & (self.nees > FALSE_FIX_MAHALANOBIS2))
@@ -178,6 +192,7 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
         "max_m": float(distance.max()),
         "refined_median_m": float(np.median(refined_m)) if len(refined_m) else None,
         "false_fixes": sum(f.false_fixes for f in flights),
+        "late_false_fixes": sum(f.late_false_fixes for f in flights),
         "notice_s": max((f.notice_s for f in flights if f.notice_s is not None), default=None),
         "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
         "coverage": float((nees <= ELLIPSE95).mean()),
@@ -214,6 +229,6 @@ def floors(total: dict[str, Any]) -> dict[str, bool]:
     return {
         "95 % ellipse holds 93 to 98 % of the positions": low <= total["coverage"] <= high,
         "95 % ellipse holds 93 to 98 % of the refined positions": low <= (total["coverage_refined"] or 0.0) <= high,
-        "no false fix (beyond 50 m and 3 sigma)": total["false_fixes"] == 0,
+        "no false fix (beyond 50 m and 3 sigma) but at the beginning of a false input": total["late_false_fixes"] == 0,
         "mean NEES of the position in its 95 % band": total["nees"]["holds"],
     }

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from terrafix.core.gate import MIN_COMPONENT_WEIGHT
+from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 
 # Probability under H0 and under H1 that a pose is rejected and agrees with no other one. Up to a tenth of the poses is
 # wrong on a map of another year. [measured: docs/integrity.md]
@@ -43,9 +43,14 @@ class MapConsistency:
             OFFSET_MEMORY * self._offset2_m2 + (1.0 - OFFSET_MEMORY) * offset2_m2 if self._offset2_m2 else offset2_m2
         )
 
-    def add_accepted(self, information_share: float) -> None:
-        """A camera pose inside the gate, weighted by the share 0..1 of the ground in it that is new."""
-        self._add(information_share * math.log((1.0 - P_REJECTED_WRONG_MAP) / (1.0 - P_REJECTED)))
+    def add_accepted(self, information_share: float, gate_m2: np.ndarray) -> None:
+        """A camera pose inside the gate, weighted by the share 0..1 of the ground in it that is new. ``gate_m2``
+        (2, 2): covariance of its innovation. Poses of a wrong map are as far away as the rejected ones; a gate that is
+        wider than that accepts them too, and its poses tell nothing."""
+        reach2_m2 = GATE[2] * math.sqrt(max(float(np.linalg.det(gate_m2)), 0.0))
+        in_gate = 1.0 - math.exp(-reach2_m2 / self._offset2_m2) if self._offset2_m2 else 0.0
+        p_accepted_wrong_map = max(1.0 - P_REJECTED_WRONG_MAP, in_gate)
+        self._add(information_share * min(math.log(p_accepted_wrong_map / (1.0 - P_REJECTED)), 0.0))
         if self._log_odds <= MIN_LOG_ODDS:
             self._offset2_m2 = 0.0
 
