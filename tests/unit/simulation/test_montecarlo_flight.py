@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -123,6 +124,42 @@ def test_positions_outside_of_the_search_range_are_not_matched(flown: tuple[Flig
         _prediction(10, shot, up_m=60.0),
     ):
         assert matches.match(wrong, shot).verdict is Verdict.AMBIGUOUS
+
+
+def test_a_wrong_start_widens_the_belief_over_new_ground_until_it_finds_the_place(
+    flown: tuple[FlightPlan, SimulatedFlight],
+) -> None:
+    """As the anchor on real imagery: 1-sigma 54, 60, 70, 90, 120 m, and then a mode at the true place."""
+    drawn, flight = flown
+    matches, found, sigmas_m = _matches(drawn, flight, np.zeros(2)), [], []
+    for i, shot in enumerate(flight.frames[20:], start=20):  # in cruise
+        prediction = _moving(_prediction(i, shot, east_m=300.0), flight.frames[i - 1], shot)
+        match = matches.match(prediction, shot)
+        found.append(match.verdict is Verdict.ACCEPTED)
+        sigmas_m.append(float(np.sqrt(match.belief_cov_m2[0])))
+        if found[-1]:
+            assert match.p_c_in_w_m is not None
+            assert np.hypot(*(np.array(match.p_c_in_w_m) - shot.p_m)[:2]) < 20.0
+            break
+        assert len(match.modes) == 2 and match.p_c_in_w_m is None
+    assert found[-1] and 1 <= len(found) - 1 <= 20
+    assert max(sigmas_m) > 1.3 * sigmas_m[0] > 60.0
+
+
+def test_an_unusable_picture_tells_the_belief_nothing(flown: tuple[FlightPlan, SimulatedFlight]) -> None:
+    drawn, flight = flown
+    matches = _matches(drawn, flight, np.zeros(2))
+    for i, shot in enumerate(flight.frames):
+        match = matches.match(_prediction(i, shot, east_m=300.0), shot, usable=False)
+        assert match.verdict is Verdict.AMBIGUOUS and match.modes == []
+
+
+def test_only_a_repeated_view_is_static(flown: tuple[FlightPlan, SimulatedFlight]) -> None:
+    drawn, flight = flown
+    sightings = SimulatedOdometry(Lens(CameraCalibration.of(drawn.camera)), flight.terrain, 1)
+    cruise = flight.frames[20:30]
+    shown = [*cruise[:3], cruise[2], cruise[2], *cruise[3:]]
+    assert [sightings.odometry(i, shot).static for i, shot in enumerate(shown)] == [i in (3, 4) for i in range(12)]
 
 
 def test_faults_have_their_stated_times_and_sizes(flown: tuple[FlightPlan, SimulatedFlight]) -> None:
@@ -252,3 +289,10 @@ def _prediction(i: int, shot: Shot, east_m: float = 0.0, up_m: float = 0.0, turn
         step_m=(0.0, 0.0),
         step_cov_m2=(1.0, 0.0, 0.0, 1.0),
     )
+
+
+def _moving(prediction: Prediction, before: Shot, shot: Shot) -> Prediction:
+    """With the true step since ``before``, and a start known to 50 m."""
+    cov = np.diag([2500.0, 2500.0, 9.0, 1e-4, 1e-4, 4e-4])
+    e_m, n_m = (shot.p_m - before.p_m)[:2].tolist()
+    return msgspec.structs.replace(prediction, step_m=(e_m, n_m), cov=tuple(float(v) for v in cov.ravel()))

@@ -23,6 +23,13 @@ PREDICTION = Prediction(
     agl_sigma_m=3.0, step_m=(0.0, 0.0), step_cov_m2=(1.0, 0.0, 0.0, 1.0))  # fmt: skip
 
 
+def always(match: MapMatch) -> of.FindMatch:
+    def find(prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch:
+        return match
+
+    return find
+
+
 def flown(fault: Fault, number: int = 0) -> tuple[FlightPlan, SimulatedFlight]:
     drawn = plan(5, number, fault=fault, duration_s=SHORT_S)
     return drawn, fly(drawn, Terrain(drawn.seed, drawn.hills_m, drawn.settled))
@@ -81,7 +88,7 @@ def test_foreign_motion_is_far_away_and_consistent_and_has_no_map_match() -> Non
     lies = Lies(drawn, flight)
     steps, foreign = [], []
     for i, true in enumerate(flight.frames):
-        match = lies.match(i, PREDICTION, lambda *_: FOUND)
+        match = lies.match(i, PREDICTION, always(FOUND))
         if match.verdict is not Verdict.ACCEPTED:
             foreign.append(i)
             away_m = float(np.hypot(*(lies.picture(i).p_m - true.p_m)[:2]))
@@ -103,19 +110,19 @@ def test_over_the_map_of_another_town_a_fifth_of_the_frames_have_wrong_matches()
     assert start_s is not None
     after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= start_s]
     for i in after * 20:  # enough matches to estimate a share
-        match = lies.match(i, PREDICTION, lambda *_: FOUND)
+        match = lies.match(i, PREDICTION, always(FOUND))
         if match.p_c_in_w_m is not None:
             off.append(float(np.hypot(*(np.array(match.p_c_in_w_m) - flight.frames[i].p_m)[:2])))
     assert 0.15 < len(off) / (20 * len(after)) < 0.25
     assert min(off) > 30.0 and max(off) < 120.0
     assert 0.3 < np.mean(np.abs(np.diff(off)) < 8.0) < 0.8  # half of them agree with the one before
-    assert lies.match(0, PREDICTION, lambda *_: FOUND) == FOUND
+    assert lies.match(0, PREDICTION, always(FOUND)) == FOUND
 
 
 def test_the_search_model_is_lost_without_matches_and_finds_a_visible_place() -> None:
     shot = Shot(0.0, np.array([300.0, 0.0, 100.0]), np.eye(3), np.eye(3), np.zeros(3))
 
-    def visible(prediction: Prediction, _: Shot) -> MapMatch:
+    def visible(prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch:
         return FOUND if prediction.p_c_in_w_m[0] == 300.0 else NOTHING
 
     search = Search()
@@ -127,25 +134,36 @@ def test_the_search_model_is_lost_without_matches_and_finds_a_visible_place() ->
     assert found.found and found.step is SearchStep.MERGE and found.lost_sigma_m == 0.0
     assert matches[-1] == NOTHING  # the counters restart
     blind = Search()
-    never = [blind.update(NOTHING, PREDICTION, shot, lambda *_: NOTHING) for _ in range(60)]
+    never = [blind.update(NOTHING, PREDICTION, shot, always(NOTHING)) for _ in range(60)]
     assert not any(m.found for m in never) and never[-1].verdict is Verdict.LOST
     reset = Search()
     looks = [reset.update(FOUND if i % 10 == 9 else NOTHING, PREDICTION, shot, visible) for i in range(60)]
     assert not any(m.verdict is Verdict.LOST for m in looks)
 
 
-def test_time_to_notice_ends_at_the_last_false_fix_after_the_start_of_the_lie() -> None:
-    def noticed(lie_from_s: float | None, false_at: list[int]) -> float | None:
-        n = 40
-        error = np.zeros((n, 6))
-        error[false_at, 0] = 80.0
-        cov = np.tile(np.eye(6), (n, 1, 1))
-        record = Record(
-            plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n), truth_m=np.zeros((n, 2)), error_m=error,
-            cov=cov, velocity_error_mps=np.zeros((n, 3)), velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1),
-            refined_error_m=np.zeros((n, 2)), refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n),
-            memory_mb=np.zeros(n), lie_from_s=lie_from_s)  # fmt: skip
-        return FlightResult.of(record).notice_s
+def judged(lie_from_s: float | None, false_at: list[int], new_ground: float = 1.0) -> FlightResult:
+    """A flight of 40 frames, one a second, false at some."""
+    n = 40
+    error = np.zeros((n, 6))
+    error[false_at, 0] = 80.0
+    cov = np.tile(np.eye(6), (n, 1, 1))
+    record = Record(
+        plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n), new_ground=np.full(n, new_ground),
+        truth_m=np.zeros((n, 2)), error_m=error, cov=cov, velocity_error_mps=np.zeros((n, 3)),
+        velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1), refined_error_m=np.zeros((n, 2)),
+        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n), memory_mb=np.zeros(n), lie_from_s=lie_from_s)  # fmt: skip
+    return FlightResult.of(record)
 
-    assert noticed(10.0, [12, 13]) == 3.0
-    assert noticed(10.0, [4]) is None and noticed(10.0, []) is None and noticed(None, [12]) is None
+
+def test_time_to_notice_ends_at_the_last_false_fix_after_the_start_of_the_lie() -> None:
+    assert judged(10.0, [12, 13]).notice_s == 3.0
+    assert judged(10.0, [4]).notice_s is None and judged(10.0, []).notice_s is None
+    assert judged(None, [12]).notice_s is None
+
+
+def test_false_fixes_are_late_after_three_seconds_and_five_frames_of_new_ground() -> None:
+    assert judged(10.0, [10, 13, 14]).late_false_fixes == 0  # the fifth frame is that of 14 s
+    assert judged(10.0, [14, 15, 30]).late_false_fixes == 2
+    assert judged(10.0, [15, 19, 20], new_ground=0.5).late_false_fixes == 1
+    assert judged(10.0, [9]).late_false_fixes == 1  # before the lie
+    assert judged(None, [0, 1]).late_false_fixes == 2
