@@ -207,6 +207,23 @@ def test_several_matches_end_the_registration_alarm() -> None:
     assert not monitor.active and monitor.confirmed and monitor.sigma_m == 0.0
 
 
+def test_the_path_since_the_last_match_bounds_the_error_of_a_wrong_description() -> None:
+    monitor = Registration()
+    _attempts(monitor, 1, found=True)
+    assert monitor.path_error_m == 0.0
+    _attempts(monitor, 1, found=False)
+    once_m = monitor.path_error_m
+    _attempts(monitor, 3, found=False)
+    assert once_m == ERROR_PER_PATH * MIN_SPACING_HEIGHTS * HEIGHT_M
+    assert monitor.path_error_m == pytest.approx(4.0 * once_m)
+    _attempts(monitor, 6, found=True)
+    assert monitor.confirmed
+    _attempts(monitor, 2, found=False)
+    assert monitor.path_error_m == pytest.approx(2.0 * once_m)
+    _attempts(monitor, 1, found=True)  # also of a confirmed description
+    assert monitor.path_error_m == 0.0
+
+
 def _fly(edit: object = None, frames: int = 120, **flight: object) -> tuple[EstimatorRun, list[CalibrationFault]]:
     listener, flown = EstimatorRun(), Flight(frames, **({"fix_every": 3, "dem": True} | flight))  # type: ignore[arg-type]
     listener.feed([ORIGIN])
@@ -241,10 +258,11 @@ def test_correlations_without_a_match_withdraw_the_position() -> None:
             return message
         return MapMatch(t_ns=message.t_ns, frame_id=message.frame_id, verdict=Verdict.AMBIGUOUS, matcher="gradient")
 
-    listener, faults = _fly(nothing, fix_every=1)
+    listener, faults = _fly(nothing, fix_every=1, frames=350)
     assert [(fault.quantity, fault.active) for fault in faults] == [("registration", True)]
     assert sigma_m(listener.estimate(119)) >= FAULT_SIGMA_M
     assert sigma_m(listener.estimate(12)) > 50.0  # of 72 m
+    assert sigma_m(listener.estimate(349)) > 1.5 * FAULT_SIGMA_M  # it may have flown 2 km the other way
 
 
 def _coarsely(message: Message) -> Message:

@@ -17,7 +17,7 @@ from terrafix.estimator.monitors.turns import TurnMonitor
 from terrafix.estimator.monitors.visual_motion import visual_motion
 from terrafix.messages import CalibrationFault, MapMatch, Odometry, Origin, Verdict
 
-FAULT_SIGMA_M = 1000.0  # m: 1-sigma per horizontal axis while the description is known to be wrong [tuned]
+FAULT_SIGMA_M = 1000.0  # m: least 1-sigma per horizontal axis while the description is known to be wrong [tuned]
 MIN_TURN_SPACING_S = 1.0  # s between turns that count: pictures of one keyframe share their errors [tuned]
 # Constant errors, 1-sigma, beyond the configured ones: heading [rad] of a compass beside motors, and height as a share
 # of it, of a barometer over uneven ground. [tuned]
@@ -59,7 +59,9 @@ class Monitors:
     @property
     def sigma_m(self) -> float:
         """1-sigma per horizontal axis, to be added to the published covariance."""
-        return FAULT_SIGMA_M if self._reported else min(FAULT_SIGMA_M, self._registration.sigma_m)
+        if self._reported:
+            return max(FAULT_SIGMA_M, self._registration.path_error_m)
+        return self._registration.sigma_m
 
     def on_odometry(self, odometry: Odometry, telemetry: Telemetry, path_m: float, agl_m: float) -> None:
         """A frame. ``path_m`` since the frame before and ``agl_m``: by the graph's estimate."""

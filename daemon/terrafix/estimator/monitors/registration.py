@@ -43,7 +43,12 @@ class Registration:
         """1-sigma per horizontal axis of the position error that a wrong description may have caused.
 
         Only the probability beyond the prior counts: the covariance of the graph covers the prior's share."""
-        return math.sqrt(max(0.0, self.probability - PRIOR_WRONG)) * ERROR_PER_PATH * self._path_m
+        return math.sqrt(max(0.0, self.probability - PRIOR_WRONG)) * self.path_error_m
+
+    @property
+    def path_error_m(self) -> float:
+        """Largest position error that a wrong description causes over the path since the last accepted pose."""
+        return ERROR_PER_PATH * self._path_m
 
     def add_path(self, path_m: float, agl_m: float) -> None:
         """Path since the frame before and height above ground, both by the estimate; their ratio does not depend on
@@ -53,11 +58,11 @@ class Registration:
 
     def add_attempt(self, *, found: bool) -> None:
         """A correlation over textured ground. ``found``: the estimator accepted a camera pose on the map."""
+        if found and not self.active:
+            self._path_m = 0.0
         if self.confirmed or self._heights < MIN_SPACING_HEIGHTS:
             return
         self._heights = 0.0
         self._log_odds = min(self._limit, self._log_odds + (LLR_FOUND if found else LLR_NOTHING))
         self.active = self._log_odds >= self._limit or (self.active and self._log_odds > 0.0)
-        if found and not self.active:
-            self._path_m = 0.0
         self.confirmed = self._log_odds <= CONFIRMED
