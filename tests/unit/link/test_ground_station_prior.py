@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -200,6 +201,35 @@ def test_the_verdict_on_a_hint_is_reported_to_the_pilot() -> None:
 def test_no_hint_is_requested_while_the_vehicle_is_disarmed() -> None:
     standing = m.VehicleState(t_ns=0, source="mavlink", armed=False)
     assert requests(1000.0, until_s=10, events={0: standing}) == []
+
+
+def unanchored_request_s(anchored_s: int, *, speed_mps: float = 20.0, until_s: int = 600) -> tuple[int | None, str]:
+    """A flight of accurate estimates, one a second, whose map fixes end at ``anchored_s``. -> seconds from there to
+    the first request, and its text."""
+    request = PriorRequest()
+    for second in range(until_s):
+        age_ms = 1000 * max(second - anchored_s, 0) if anchored_s >= 0 else -1
+        known = estimate(second * S, frame_id=second, cov=covariance(5.0), anchor_age_ms=age_ms)
+        request.on_estimate(msgspec.structs.replace(known, velocity_enu_mps=(0.6 * speed_mps, 0.8 * speed_mps, 1.0)))
+        if text := request.due(second * S):
+            return second - max(anchored_s, 0), text
+    return None, ""
+
+
+@pytest.mark.parametrize(("anchored_s", "after_s"), [(20, 35), (200, 50), (-1, 35), (1000, None)])
+def test_a_hint_is_requested_after_a_fifth_of_the_route_without_a_map_fix(anchored_s: int, after_s: int | None) -> None:
+    asked_s, text = unanchored_request_s(anchored_s)
+    assert asked_s == after_s
+    assert text == ("" if after_s is None else f"dead reckoning for {0.02 * after_s:.1f} km, send a hint")
+
+
+def test_a_hint_is_requested_after_two_kilometres_without_a_map_fix_on_any_route() -> None:
+    assert unanchored_request_s(3000, until_s=4000)[0] == 100
+    assert unanchored_request_s(3000, speed_mps=10.0, until_s=4000)[0] == 200
+
+
+def test_no_hint_is_requested_before_a_vehicle_has_moved() -> None:
+    assert unanchored_request_s(5, speed_mps=0.0) == (None, "")
 
 
 def test_no_hint_is_requested_when_estimates_have_stopped() -> None:
