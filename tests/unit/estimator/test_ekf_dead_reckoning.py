@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from simulated_flight import ORIGIN, PLACE, EstimatorRun, Flight, blind, error_m, sigma_m, t_ns
-from terrafix.core.geodesy import GRAVITY_MPS2, LocalFrame
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.inertial import GRAVITY_MPS2
 from terrafix.estimator.measurements.ekf_dead_reckoning import MAX_AHEAD_S, DeadReckoning
 from terrafix.estimator.models.motion_model import TILT_CORRELATION_S, TILT_VARYING_SHARE
 from terrafix.estimator.node import EstimatorNode
