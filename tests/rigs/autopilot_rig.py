@@ -10,7 +10,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.geodesy import LocalFrame, rot_w_b
-from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
+from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.parameters import GPS_INPUT_ALONE, NO_DCM, Kind
 from terrafix_tools.sim.interfaces import GnssFix, Navigation, Readings
 

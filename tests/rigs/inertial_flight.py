@@ -27,7 +27,7 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix_tools.mission.course import course
-from terrafix_tools.mission.mission import Box
+from terrafix_tools.mission.items import Box
 from terrafix_tools.sim.sensors.suite import VehicleSensors
 from terrafix_tools.sim.vehicle.plane import Plane
 from terrafix_tools.sim.vehicle.wind import Wind

@@ -110,25 +110,25 @@ def test_below_the_reached_probability_the_offset_covariance_is_scaled_down() ->
 
 
 def test_an_unconfirmed_start_decays_faster_than_a_mapped_position() -> None:
-    start, told = OtherPlace(), OtherPlace()
-    for other, fixed in ((start, False), (told, True)):
+    unconfirmed, mapped = OtherPlace(), OtherPlace()
+    for other, fixed in ((unconfirmed, False), (mapped, True)):
         other.spawn([np.array([200.0, 200.0])] * 2, OFFSET_COV, fixed=fixed)
         other.switch(np.array([200.0, 200.0]), OFFSET_COV)
         other.decay(DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
-    assert start.probability == pytest.approx(INITIAL_PROBABILITY * np.exp(-1.0))
-    start.decay(3.0 * DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
-    told.decay(3.0 * DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
-    assert start.probability == 0.0 and told.probability > 0.3
+    assert unconfirmed.probability == pytest.approx(INITIAL_PROBABILITY * np.exp(-1.0))
+    unconfirmed.decay(3.0 * DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
+    mapped.decay(3.0 * DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
+    assert unconfirmed.probability == 0.0 and mapped.probability > 0.3
 
 
 def test_a_start_without_mass_in_the_belief_is_removed_without_new_ground() -> None:
-    """The belief began at the start: its mass there is outside of the mode of the pose."""
-    start, told = OtherPlace(), OtherPlace()
-    for other, fixed in ((start, False), (told, True)):
+    """The belief began at the unconfirmed: its mass there is outside of the mode of the pose."""
+    unconfirmed, mapped = OtherPlace(), OtherPlace()
+    for other, fixed in ((unconfirmed, False), (mapped, True)):
         other.spawn([np.array([200.0, 200.0])] * 2, OFFSET_COV, fixed=fixed)
         other.switch(np.array([200.0, 200.0]), OFFSET_COV)
         other.decay(0.0, 0.7)
         assert other.probability == pytest.approx(INITIAL_PROBABILITY if fixed else 0.3)
         other.decay(0.0, 0.995)
-    assert start.probability == 0.0
-    assert told.probability == pytest.approx(INITIAL_PROBABILITY)
+    assert unconfirmed.probability == 0.0
+    assert mapped.probability == pytest.approx(INITIAL_PROBABILITY)

@@ -10,7 +10,7 @@ from terrafix.core.pose import exp_so3
 from terrafix.estimator.factors.three_view import ThreeViewPose
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter, graph_shift
 from terrafix.messages import CalibrationEstimate, Camera, CovarianceMode, NavEstimate, SourceLabel
-from terrafix_tools.lens_words import lens_words
+from terrafix_tools.lens_report import lens_words
 
 UNCALIBRATED = msgspec.structs.replace(CAMERA, focal_sigma=0.1)
 HEIGHT_M = 80.0

@@ -107,7 +107,7 @@ class Autopilot:
             self.edge.on_message(fix(0.1 * tenth))
 
 
-def coasted(messages: Iterable[Message]) -> list[EkfDeadReckoning]:
+def dead_reckonings(messages: Iterable[Message]) -> list[EkfDeadReckoning]:
     return [x for x in messages if isinstance(x, EkfDeadReckoning)]
 
 
@@ -119,10 +119,10 @@ def autopilot(tmp_path: Path) -> Autopilot:
 def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(autopilot: Autopilot) -> None:
     autopilot.fly_until_killed()
     autopilot.restart()
-    assert not coasted(
+    assert not dead_reckonings(
         autopilot.sends(RESTARTED_S - 0.2, ekf_position(RESTARTED_S - 0.2))
     )  # EKF status and receivers are not known yet
-    (message,) = coasted(autopilot.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S)))
+    (message,) = dead_reckonings(autopilot.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S)))
     since_s = RESTARTED_S - message.duration_s
     assert KILLED_S - 0.3 < since_s <= KILLED_S and message.t_ns == round(RESTARTED_S * S)
     # Position and velocity are those of our fix at the time of the EKF state.
@@ -154,41 +154,45 @@ def test_no_dead_reckoning_is_published_while_another_receiver_has_a_fix(
 ) -> None:
     autopilot.fly_until_killed(receiver_fix=before)
     autopilot.restart()
-    assert not coasted(autopilot.sends(RESTARTED_S, status(), receiver(after), ekf_position(RESTARTED_S)))
-    assert not coasted(autopilot.sends(RESTARTED_S + 0.2, status(), receiver(1), ekf_position(RESTARTED_S + 0.2)))
+    assert not dead_reckonings(autopilot.sends(RESTARTED_S, status(), receiver(after), ekf_position(RESTARTED_S)))
+    assert not dead_reckonings(
+        autopilot.sends(RESTARTED_S + 0.2, status(), receiver(1), ekf_position(RESTARTED_S + 0.2))
+    )
 
 
 def test_no_dead_reckoning_is_published_before_the_known_receiver_is_received(autopilot: Autopilot) -> None:
     autopilot.fly_until_killed()
     autopilot.restart()
-    assert not coasted(autopilot.sends(RESTARTED_S, status(), ekf_position(RESTARTED_S)))
-    assert coasted(autopilot.sends(RESTARTED_S + 0.2, receiver(1), ekf_position(RESTARTED_S + 0.2)))
+    assert not dead_reckonings(autopilot.sends(RESTARTED_S, status(), ekf_position(RESTARTED_S)))
+    assert dead_reckonings(autopilot.sends(RESTARTED_S + 0.2, receiver(1), ekf_position(RESTARTED_S + 0.2)))
 
 
 @pytest.mark.parametrize("flags", [mavlink.EKF_ATTITUDE, HEALTHY_FLAGS | mavlink.EKF_CONST_POS_MODE])
 def test_no_dead_reckoning_is_published_without_a_valid_ekf_velocity(autopilot: Autopilot, flags: int) -> None:
     autopilot.fly_until_killed()
     autopilot.restart()
-    assert not coasted(autopilot.sends(RESTARTED_S, status(flags), receiver(1), ekf_position(RESTARTED_S)))
+    assert not dead_reckonings(autopilot.sends(RESTARTED_S, status(flags), receiver(1), ekf_position(RESTARTED_S)))
 
 
 def test_no_dead_reckoning_is_published_after_a_reboot_or_more_than_a_minute(autopilot: Autopilot) -> None:
     autopilot.fly_until_killed()
     autopilot.restart()
-    assert not coasted(autopilot.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S, boot_s=1.0)))
-    assert not coasted(autopilot.sends(80.0, status(), receiver(1), ekf_position(80.0)))
+    assert not dead_reckonings(
+        autopilot.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S, boot_s=1.0))
+    )
+    assert not dead_reckonings(autopilot.sends(80.0, status(), receiver(1), ekf_position(80.0)))
 
 
 def test_no_dead_reckoning_is_published_while_we_send_a_fix(autopilot: Autopilot) -> None:
     autopilot.fly_until_killed()
-    assert not coasted(autopilot.sends(KILLED_S + 0.1, ekf_position(KILLED_S + 0.1)))
+    assert not dead_reckonings(autopilot.sends(KILLED_S + 0.1, ekf_position(KILLED_S + 0.1)))
     autopilot.edge.on_message(fix(KILLED_S + 0.2, fix_type=1))
-    assert coasted(autopilot.sends(KILLED_S + 0.3, status(), receiver(1), ekf_position(KILLED_S + 0.3)))
+    assert dead_reckonings(autopilot.sends(KILLED_S + 0.3, status(), receiver(1), ekf_position(KILLED_S + 0.3)))
 
 
 def test_dead_reckoning_continues_through_the_wrap_of_the_boot_time() -> None:
     at_fix = EkfState(2**32 - 1000, 48.0, 11.0, (0.0, 0.0, 0.0))
     last = LastFix(at_fix, 48.0, 11.0, (0.0, 0.0, 0.0), 3.0, 0.5, frozenset())
-    (coasted,) = _dead_reckoning_since(last, msgspec.structs.replace(at_fix, boot_ms=1000), S)
-    assert coasted.duration_s == 2.0
+    (sample,) = _dead_reckoning_since(last, msgspec.structs.replace(at_fix, boot_ms=1000), S)
+    assert sample.duration_s == 2.0
     assert list(_dead_reckoning_since(last, msgspec.structs.replace(at_fix, boot_ms=70_000), S)) == []

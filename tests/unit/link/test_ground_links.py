@@ -270,12 +270,12 @@ def test_an_inconsistent_configuration_of_ground_links_raises(
 
 def test_preflight_checks_the_ground_links(station: Station) -> None:
     taken = f"udpin:127.0.0.1:{station.socket.getsockname()[1]}"
-    asked = {
+    by_status = {
         "ok": {"ground_devices": [station.device], "view_sysid": GHOST_SYSID},
         "warn": {"ground_devices": [taken]},
         "fail": {"view_sysid": GHOST_SYSID},
     }
-    for status, changes in asked.items():
+    for status, changes in by_status.items():
         (line,) = check_lines(LinkSection(**changes))  # type: ignore[arg-type]
         assert line.status == status and bool(line.fix) == (status != "ok")
     assert list(check_lines(LinkSection())) == []

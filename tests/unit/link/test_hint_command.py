@@ -1,4 +1,4 @@
-"""`terrafix hint`: from the command line over the bus to whoever hears it, and the answer back."""
+"""`terrafix hint`: from the command line over the bus to the processes of the run, and their reply."""
 
 import threading
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ class Flying:
 
     def __init__(self, run: RunDir, verdict: Verdict | None) -> None:
         self._run, self._verdict = run, verdict
-        self.heard: list[PositionHint] = []
+        self.hints: list[PositionHint] = []
         self._stop, self._ready = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._live, daemon=True)
         self._thread.start()
@@ -41,15 +41,15 @@ class Flying:
                     subscriber.socket.poll(5)
                     for message in subscriber.receive():
                         if i == 0 and isinstance(message, PositionHint):
-                            self.heard.append(message)
+                            self.hints.append(message)
                             self._answer(says, message)
             for socket in (says, *hears):
                 socket.close()
 
-    def _answer(self, says: Publisher, said: PositionHint) -> None:
-        for of in (said.t_ns - 1, said.t_ns):  # the first one answers somebody else
+    def _answer(self, says: Publisher, hint: PositionHint) -> None:
+        for of in (hint.t_ns - 1, hint.t_ns):  # the first one answers somebody else
             if self._verdict is not None:
-                text = "hint not used, 12 km from us" if of == said.t_ns else "of another"
+                text = "hint not used, 12 km from us" if of == hint.t_ns else "of another"
                 says.publish(
                     HintVerdict(t_ns=of, hint_t_ns=of, verdict=self._verdict, distance_m=1.0, sigma_m=1.0, text=text)
                 )
@@ -74,8 +74,13 @@ def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verd
         assert hint(48.1, -11.5, 3000.0) == "hint not used, 12 km from us"
     finally:
         flying.land()
-    (heard,) = flying.heard
-    assert (heard.lat_deg, heard.lon_deg, heard.radius_m, heard.source) == (48.1, -11.5, 3000.0, "command line")
+    (received,) = flying.hints
+    assert (received.lat_deg, received.lon_deg, received.radius_m, received.source) == (
+        48.1,
+        -11.5,
+        3000.0,
+        "command line",
+    )
 
 
 def test_without_a_frame_the_reply_states_that_the_hint_applies_to_the_next_one(
@@ -89,7 +94,7 @@ def test_without_a_frame_the_reply_states_that_the_hint_applies_to_the_next_one(
         flying.land()
 
 
-def test_processes_that_do_not_listen_yet_are_said(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_that_do_not_subscribe_yet_are_named(run: RunDir, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(send, "SUBSCRIBE_TIMEOUT_S", 0.1)
     with pytest.raises(LinkError, match="is Terrafix still starting"):
         hint(48.1, 11.5, 3000.0)
@@ -120,6 +125,6 @@ def test_with_several_runs_one_must_be_chosen(run: RunDir) -> None:
     ("lat", "lon", "radius", "text"),
     [(91.0, 0.0, 5000.0, "is no place"), (0.0, 181.0, 5000.0, "is no place"), (48.0, 11.0, 10.0, "--radius 10")],
 )
-def test_what_cannot_be_is_said(lat: float, lon: float, radius: float, text: str) -> None:
+def test_impossible_arguments_are_named(lat: float, lon: float, radius: float, text: str) -> None:
     with pytest.raises(UsageError, match=text):
         hint(lat, lon, radius)

@@ -20,8 +20,8 @@ from terrafix.link.mavlink.transport import Address
 from terrafix.link.node import LinkNode
 from terrafix.messages import GnssState
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
-from terrafix_tools.sim.judge.flight import Vision, fly
-from terrafix_tools.sim.judge.table import summary, table
+from terrafix_tools.sim.gnss_evaluation.flight import Vision, fly
+from terrafix_tools.sim.gnss_evaluation.table import summary, table
 
 
 def verdicts(published: list[m.Message]) -> list[tuple[float, GnssState]]:

@@ -20,7 +20,7 @@ from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import POOL, PooledGradientDescriber
 from terrafix_tools.mapping.build import build, build_package, layer_of
-from terrafix_tools.mapping.check import check
+from terrafix_tools.mapping.check import suitability
 from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
 
 SIDE_PX, LAT_DEG, LON_DEG = 800, 68.0, 17.4
@@ -49,8 +49,8 @@ def test_stored_descriptors_equal_computed_ones(local: LocalMap) -> None:
     index, computed = CoarseDescriptors(local, describer), MapFeatures(local, describer)
     gsd_m = index.gsd_m(2.1)
     assert gsd_m == pytest.approx(2.0, rel=0.01) and local.descriptors(describer.name) is not None
-    asked = (-600.0, 600.0, 135, 140, gsd_m)
-    (ours, valid, *corner), (theirs, known, *other) = index.window(*asked), computed.window(*asked)
+    window = (-600.0, 600.0, 135, 140, gsd_m)
+    (ours, valid, *corner), (theirs, known, *other) = index.window(*window), computed.window(*window)
     assert corner == other and valid.mean() > 0.9
     assert known[~valid].mean() < 0.3  # the hole is invalid, with a margin of one cell
     both = valid & known
@@ -66,8 +66,8 @@ def test_a_scale_without_stored_descriptors_is_computed(tmp_path: Path) -> None:
     local, describer = package.bind(LocalFrame(LAT_DEG, LON_DEG)), PooledGradientDescriber()
     index = CoarseDescriptors(local, describer)
     assert index.gsd_m(0.7) == 0.7
-    asked = (0.0, 300.0, 60, 50, 2.5)
-    ours, theirs = index.window(*asked), MapFeatures(local, describer).window(*asked)  # with other surroundings
+    window = (0.0, 300.0, 60, 50, 2.5)
+    ours, theirs = index.window(*window), MapFeatures(local, describer).window(*window)  # with other surroundings
     assert np.array_equal(ours[1], theirs[1])
     assert np.abs(ours[0] - theirs[0]).max() < 0.05 and np.abs(ours[0] - theirs[0]).mean() < 1e-4
 
@@ -75,17 +75,21 @@ def test_a_scale_without_stored_descriptors_is_computed(tmp_path: Path) -> None:
 def test_a_package_without_descriptors_is_valid_and_the_check_reports_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(check, "SEARCH_WARNING_S", 0.01)  # a small map is below the default threshold
+    monkeypatch.setattr(suitability, "SEARCH_WARNING_S", 0.01)  # a small map is below the default threshold
     tif = placed(tmp_path / "i.tif", "EPSG:32634")
     without = build_package([layer_of(tif)], tmp_path / "m.gpkg", descriptors=Descriptors.NONE)
     package = MapPackage.open(without, verify=True)
     local = package.bind(LocalFrame(LAT_DEG, LON_DEG))
     assert package.layer().descriptors is None and local.descriptors(PooledGradientDescriber.name) is None
     assert CoarseDescriptors(local, PooledGradientDescriber()).gsd_m(2.1) == 2.1
-    (warning,) = check._search_warnings(local, FrameMatcher(check.DEFAULT_CAMERA, local, GradientDescriber()), 110.0)
+    (warning,) = suitability._search_warnings(
+        local, FrameMatcher(suitability.DEFAULT_CAMERA, local, GradientDescriber()), 110.0
+    )
     assert warning.startswith("no descriptors for a search at 110 m")
     local = MapPackage.open(build(tif, tmp_path / "with.gpkg")).bind(LocalFrame(LAT_DEG, LON_DEG))
-    assert not check._search_warnings(local, FrameMatcher(check.DEFAULT_CAMERA, local, GradientDescriber()), 110.0)
+    assert not suitability._search_warnings(
+        local, FrameMatcher(suitability.DEFAULT_CAMERA, local, GradientDescriber()), 110.0
+    )
 
 
 def test_descriptors_are_covered_by_checksum_and_hashes(tmp_path: Path) -> None:

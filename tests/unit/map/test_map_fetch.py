@@ -18,8 +18,8 @@ import rasterio
 import map_servers
 from map_servers import Pyramid, Reply, Request, Server, serving
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix_tools.mapping.area.area import Placed
 from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.area.polygons import Placed
 from terrafix_tools.mapping.fetching import plan
 from terrafix_tools.mapping.fetching.fetch import Client, FetchError, RefusedError
 from terrafix_tools.mapping.fetching.pace import Limits

@@ -14,8 +14,8 @@ from pyproj import CRS
 
 import map_servers
 from terrafix.core.errors import ConfigError, MapError, UsageError
-from terrafix_tools.mapping.area.area import Area, Placed
 from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
 from terrafix_tools.mapping.sources.tile_files import open_tiles
 from terrafix_tools.mapping.sources.tile_grid import Tile, ground_pixel_m, tiles_of, zoom_for

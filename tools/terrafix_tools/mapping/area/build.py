@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix_tools.mapping.area.area import Area
 from terrafix_tools.mapping.area.checks import check_area
 from terrafix_tools.mapping.area.files import DEFAULT_BUFFER_KM, is_line, read_area
+from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.fetching.progress import shown
 from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput

@@ -15,7 +15,7 @@ from rasterio.io import MemoryFile
 from rasterio.transform import Affine
 
 from terrafix.core.errors import OutputError
-from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.fetching.progress import DownloadProgress, OnProgress
 from terrafix_tools.mapping.sources.copernicus import MAX_REQUEST_PX, Copernicus
 

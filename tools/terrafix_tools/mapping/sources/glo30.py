@@ -6,7 +6,7 @@ from xml.sax.saxutils import escape
 import rasterio
 
 from terrafix.core.errors import OutputError
-from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.fetching.progress import OnProgress
 from terrafix_tools.mapping.sources.chunks import ChunkRaster, fetch_chunks, process_request
 from terrafix_tools.mapping.sources.copernicus import MAX_REQUEST_PX, Copernicus, Service, read_credentials

@@ -6,10 +6,10 @@ from functools import partial
 from pathlib import Path
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.fetching.plan import Estimate
 from terrafix_tools.mapping.fetching.progress import OnProgress
-from terrafix_tools.mapping.mosaic.mosaic import Opener
+from terrafix_tools.mapping.mosaic.compositing import Opener
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.sources.chunks import Chunk, ChunkRaster, fetch_chunks, process_request
 from terrafix_tools.mapping.sources.copernicus import LICENCE, Copernicus, Service, read_credentials

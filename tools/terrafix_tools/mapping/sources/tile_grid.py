@@ -9,7 +9,7 @@ import numpy as np
 from pyproj import CRS
 from rasterio.transform import Affine
 
-from terrafix_tools.mapping.area.area import Placed
+from terrafix_tools.mapping.area.polygons import Placed
 
 MERCATOR = CRS.from_epsg(3857)
 EARTH_RADIUS_M = 6_378_137.0  # of the sphere of EPSG:3857

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area.area import Placed
+from terrafix_tools.mapping.area.polygons import Placed
 from terrafix_tools.mapping.source import ground_pixel_m
 from terrafix_tools.mapping.sources.tile_grid import HALF_M, MERCATOR, Tile, tile_span_m, tiles_of
 from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode

@@ -6,13 +6,13 @@ from functools import partial
 from pathlib import Path
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.fetching.fetch import Client
 from terrafix_tools.mapping.fetching.plan import Estimate, spread_sample
 from terrafix_tools.mapping.fetching.progress import OnProgress
 from terrafix_tools.mapping.fetching.tiles import TileDownload
+from terrafix_tools.mapping.mosaic.compositing import Opener
 from terrafix_tools.mapping.mosaic.cover import uncovered
-from terrafix_tools.mapping.mosaic.mosaic import Opener
 from terrafix_tools.mapping.sources.spec import SourceSpec
 from terrafix_tools.mapping.sources.tile_files import open_tiles
 from terrafix_tools.mapping.sources.tile_grid import MERCATOR, tiles_of, zoom_for

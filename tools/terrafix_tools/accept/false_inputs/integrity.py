@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from terrafix_tools.accept.measuring.evidence import Evidence, FrameEvidence
-from terrafix_tools.accept.measuring.judged import Measured, Span, Verdict
+from terrafix_tools.accept.measuring.results import Measured, Span, Verdict
 from terrafix_tools.evaluate import FALSE_FIX_ERROR_M, is_false_fix
 
 ALLOWED_S, ALLOWED_FRAMES = 3.0, 5  # from the start of the lie: allowed time to withdraw the fix

@@ -1,6 +1,6 @@
 """Benefit of a map offset estimated from a receiver before it is jammed: the same flights with and without.
 
-python -m terrafix_tools.sim.judge.offset --flights 100
+python -m terrafix_tools.sim.gnss_evaluation.offset --flights 100
 """
 
 import argparse
@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 
-from terrafix_tools.sim.judge.flight import Vision, fly
+from terrafix_tools.sim.gnss_evaluation.flight import Vision, fly
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Outage
 
 GNSS_PERIODS_S = (180.0, 300.0, 600.0)  # from take-off to the jamming

@@ -1,7 +1,7 @@
 """`terrafix` as a child process that receives SIGTERM when its parent ends for any reason.
 
-``python -m terrafix_tools.sim.sitl.tied PID ARGUMENTS``; PID: of the parent. A killed flight cannot stop its children,
-and without this Terrafix would wait for autopilot and camera to return.
+``python -m terrafix_tools.sim.sitl.child_process PID ARGUMENTS``; PID: of the parent. A killed flight cannot stop
+its children, and without this Terrafix would wait for autopilot and camera to return.
 """
 
 import signal

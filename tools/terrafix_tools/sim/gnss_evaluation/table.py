@@ -1,6 +1,6 @@
 """Detection delays and false alarms of the GNSS spoofing detector over many simulated flights, as messages.
 
-python -m terrafix_tools.sim.judge.table --flights 200 --minutes 60
+python -m terrafix_tools.sim.gnss_evaluation.table --flights 200 --minutes 60
 """
 
 import argparse
@@ -13,7 +13,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from terrafix.messages import GnssState
-from terrafix_tools.sim.judge.flight import DetectorResult, Vision, fly
+from terrafix_tools.sim.gnss_evaluation.flight import DetectorResult, Vision, fly
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Jam, Jump, Outage
 
 KINDS = ("clean", "outage", "jam", "jump", "drag")

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept.faults.faults import Edit
-from terrafix_tools.accept.lies import inputs as lying
-from terrafix_tools.accept.measuring.judged import Span
+from terrafix_tools.accept.false_inputs import inputs as lying
+from terrafix_tools.accept.faults.flight_edits import Edit
+from terrafix_tools.accept.measuring.results import Span
 
 SEED = 1  # of the noise
 BUFFERS = 4

@@ -3,9 +3,9 @@
 A false GPS_INPUT has a 3D fix with an error of more than 50 m and more than 3 times its stated accuracy. The deviation
 ("aside") is the distance from the trajectory of the same vehicle with GNSS, in the same wind and without the lie."""
 
-from terrafix_tools.accept.lies.integrity import ALLOWED_FRAMES, ALLOWED_S, RECOVERED_M, lie_of
+from terrafix_tools.accept.false_inputs.integrity import ALLOWED_FRAMES, ALLOWED_S, RECOVERED_M, lie_of
 from terrafix_tools.accept.measuring.evidence import Evidence, SentFix
-from terrafix_tools.accept.measuring.judged import Measured, Verdict
+from terrafix_tools.accept.measuring.results import Measured, Verdict
 from terrafix_tools.evaluate import FALSE_FIX_ERROR_M
 
 FALSE_FIX_SIGMAS = 3.0

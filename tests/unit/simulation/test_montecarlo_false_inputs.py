@@ -28,7 +28,7 @@ def flown(fault: Fault, number: int = 0) -> tuple[FlightPlan, SimulatedFlight]:
     return drawn, fly(drawn, Terrain(drawn.seed, drawn.hills_m, drawn.settled))
 
 
-def test_each_lie_has_its_probability_and_changes_nothing_else() -> None:
+def test_each_false_input_has_its_probability_and_changes_nothing_else() -> None:
     plans = [plan(1, n, lie_share=0.05) for n in range(600)]
     for lie in LIES:
         assert 0.025 < np.mean([lie in p.lies for p in plans]) < 0.08, lie
@@ -134,7 +134,7 @@ def test_the_search_model_is_lost_without_matches_and_finds_a_visible_place() ->
     assert not any(m.verdict is Verdict.LOST for m in looks)
 
 
-def test_time_to_notice_ends_at_the_last_false_fix_after_the_start_of_the_lie() -> None:
+def test_time_to_notice_ends_at_the_last_false_fix_after_the_start_of_the_false_input() -> None:
     def noticed(lie_from_s: float | None, false_at: list[int]) -> float | None:
         n = 40
         error = np.zeros((n, 6))

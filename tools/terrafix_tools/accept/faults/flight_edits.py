@@ -17,7 +17,7 @@ from terrafix.core.node import Image
 from terrafix.messages import Origin, VehicleState
 from terrafix.vision.sources import Shot, Source
 from terrafix_tools.accept.flight import FrameRef
-from terrafix_tools.accept.measuring.judged import Span
+from terrafix_tools.accept.measuring.results import Span
 
 Edit = Callable[[Iterator[Shot]], Iterator[Shot]]
 StateEdit = Callable[[VehicleState], VehicleState]

@@ -1,6 +1,6 @@
 """Edits that falsify an input of a flight: pictures of another place, stale or late ones, telemetry, camera, start.
 
-As in faults.py an edit is a function over the shots of a source, or over its Origin."""
+As in faults/flight_edits.py an edit is a function over the shots of a source, or over its Origin."""
 
 import math
 from collections import deque
@@ -16,8 +16,8 @@ from terrafix.core.node import Image
 from terrafix.messages import Imu, Origin, VehicleState
 from terrafix.vision.sources import Shot
 from terrafix.vision.sources.contract import TimedMessage
-from terrafix_tools.accept.faults.faults import Edit, StateEdit, telemetry
-from terrafix_tools.accept.measuring.judged import Span
+from terrafix_tools.accept.faults.flight_edits import Edit, StateEdit, telemetry
+from terrafix_tools.accept.measuring.results import Span
 
 FEET_IN_A_METRE = 3.28084
 NOISE_GREY = 2.0  # 1-sigma of a picture's noise from frame to frame, grey values: a small camera by day

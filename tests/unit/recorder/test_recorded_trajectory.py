@@ -114,8 +114,8 @@ def test_the_written_flight_folder_opens_and_has_all_telemetry_messages(recorded
     assert len(shots) == 25 and not any(shot.frame.error for shot in shots)
     assert source.map_hint() == (tmp_path / "map.tif").resolve()
     assert source.origin().camera.fx == 50.0
-    said = packets(out / "telemetry.tlog")
-    kinds = [message.get_type() for _, message in said]  # type: ignore[attr-defined]
+    telemetry = packets(out / "telemetry.tlog")
+    kinds = [message.get_type() for _, message in telemetry]  # type: ignore[attr-defined]
     for kind, least in (("ATTITUDE", 590), ("RAW_IMU", 590), ("GLOBAL_POSITION_INT", 115), ("HEARTBEAT", 12)):
         assert kinds.count(kind) >= least, kind
     assert {"SCALED_PRESSURE", "GPS_RAW_INT", "SYSTEM_TIME"} <= set(kinds)

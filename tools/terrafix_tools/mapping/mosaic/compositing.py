@@ -10,7 +10,7 @@ import numpy as np
 from pyproj import CRS
 from rasterio.transform import Affine
 
-from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.layers import Imagery
 from terrafix_tools.mapping.mosaic.grid import Grid
 from terrafix_tools.mapping.mosaic.warp import Warped

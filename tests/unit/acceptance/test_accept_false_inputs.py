@@ -17,12 +17,12 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import start_is_unknown
 from terrafix.messages import Camera, Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept.faults import faults
+from terrafix_tools.accept.false_inputs import inputs as lying
+from terrafix_tools.accept.false_inputs import maps as lying_maps
+from terrafix_tools.accept.false_inputs.scenarios import LIES
+from terrafix_tools.accept.faults import flight_edits
 from terrafix_tools.accept.flight import Flight, FrameRef
-from terrafix_tools.accept.lies import inputs as lying
-from terrafix_tools.accept.lies import maps as lying_maps
-from terrafix_tools.accept.lies.lies import LIES
-from terrafix_tools.accept.measuring.judged import Span
+from terrafix_tools.accept.measuring.results import Span
 from terrafix_tools.accept.plan import CLOSED_LOOP, Plan
 from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
 from terrafix_tools.evaluate import Truth
@@ -54,7 +54,7 @@ def shots(frames: int = FRAMES) -> Iterator[Shot]:
         yield Shot(Frame(t_ns=t_ns, frame_id=i, file=f"{i}.jpg", width=8, height=4), (state,), image, (imu,))
 
 
-def flown(edit: faults.Edit, frames: int = FRAMES) -> list[Shot]:
+def flown(edit: flight_edits.Edit, frames: int = FRAMES) -> list[Shot]:
     return list(edit(shots(frames)))
 
 
@@ -278,7 +278,7 @@ def test_a_wrong_or_unknown_start() -> None:
     assert flown(planned("height unknown").edit)[0].states[0].agl_m is None
 
 
-def test_a_lie_longer_than_the_flight_gives_a_reason() -> None:
+def test_a_false_input_longer_than_the_flight_gives_a_reason() -> None:
     assert str(BY_NAME["frozen picture with noise"].plan(flight(60))) == "the flight lasts only 30 s"
     assert str(BY_NAME["ten foreign frames"].plan(flight(20))) == "the flight has only 20 frames"
     assert "GeoTIFF" in str(BY_NAME["map shifted by 300 m"].plan(flight(map_path=Path("map.gpkg"))))
@@ -366,7 +366,7 @@ def test_another_map_is_centred_on_the_own_one_and_keeps_its_pixel_size(tmp_path
         assert placed.width == 30
 
 
-def test_every_lie_is_documented_and_has_criteria() -> None:
+def test_every_false_input_is_documented_and_has_criteria() -> None:
     page = (Path(__file__).resolve().parents[3] / "docs" / "acceptance.md").read_text(encoding="utf-8")
     names = [scenario.name for scenario in LIES]
     assert len(set(names)) == len(names) and not {s.name for s in SCENARIOS} & set(names)

@@ -4,10 +4,10 @@ The last group has true inputs with gaps: the position must stay correct."""
 
 from functools import partial
 
-from terrafix_tools.accept.faults import faults
-from terrafix_tools.accept.lies import inputs as lying
-from terrafix_tools.accept.lies import plans
-from terrafix_tools.accept.lies.plans import SEED, START_SIGMA_M
+from terrafix_tools.accept.false_inputs import inputs as lying
+from terrafix_tools.accept.false_inputs import plans
+from terrafix_tools.accept.false_inputs.plans import SEED, START_SIGMA_M
+from terrafix_tools.accept.faults import flight_edits
 from terrafix_tools.accept.measuring.criteria import EVERYWHERE, LYING_IN_THE_LOOP, PERMANENT, TEMPORARY
 from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
 
@@ -95,7 +95,7 @@ LIES: tuple[Scenario, ...] = (
             f"heading {off} degrees off",
             f"The reported heading is off by {off} degrees throughout.",
             PERMANENT,
-            plans.throughout("the heading is off", edit=faults.yaw_plus(off)),
+            plans.throughout("the heading is off", edit=flight_edits.yaw_plus(off)),
         )
         for off in (90, 180)
     ),
@@ -118,16 +118,18 @@ LIES: tuple[Scenario, ...] = (
         "roll and pitch swapped",
         "Roll is reported as pitch, and pitch as roll.",
         PERMANENT,
-        plans.throughout("swapped", edit=faults.telemetry(lying.roll_pitch_swapped)),
+        plans.throughout("swapped", edit=flight_edits.telemetry(lying.roll_pitch_swapped)),
     ),
     _scenario(
         "roll and pitch negated",
         "Roll and pitch are reported with the wrong sign.",
         PERMANENT,
-        plans.throughout("of wrong sign", edit=faults.telemetry(lying.roll_pitch_negated)),
+        plans.throughout("of wrong sign", edit=flight_edits.telemetry(lying.roll_pitch_negated)),
     ),
     *(
-        _scenario(name, promise, PERMANENT, plans.throughout("the height is wrong", edit=faults.height_times(factor)))
+        _scenario(
+            name, promise, PERMANENT, plans.throughout("the height is wrong", edit=flight_edits.height_times(factor))
+        )
         for name, promise, factor in HEIGHTS
     ),
     *(
@@ -189,7 +191,7 @@ LIES: tuple[Scenario, ...] = (
         "forged heading",
         "For 10 s the reported heading jumps by 90 degrees.",
         TEMPORARY,
-        plans.for_seconds(FORGED_S, "forged", lambda span: lying.forged(span, faults.turned(90.0))),
+        plans.for_seconds(FORGED_S, "forged", lambda span: lying.forged(span, flight_edits.turned(90.0))),
     ),
     _scenario(
         "dropped and doubled frames",
@@ -208,7 +210,10 @@ LIES: tuple[Scenario, ...] = (
         "gap of minutes", "No frame and no telemetry for three minutes.", (*SCARCE, "recovery"), plans.gap_of_minutes
     ),
     _scenario(
-        "height unknown", "No height is reported.", SCARCE, plans.true_inputs(faults.telemetry(lying.height_unknown))
+        "height unknown",
+        "No height is reported.",
+        SCARCE,
+        plans.true_inputs(flight_edits.telemetry(lying.height_unknown)),
     ),
     _scenario(
         "start unknown",

@@ -8,12 +8,12 @@ import numpy as np
 
 from terrafix.core.node import Image
 from terrafix.messages import Origin
-from terrafix_tools.accept.faults import faults
-from terrafix_tools.accept.faults.faults import Edit
+from terrafix_tools.accept.false_inputs import inputs as lying
+from terrafix_tools.accept.false_inputs import maps as lying_maps
+from terrafix_tools.accept.faults import flight_edits
+from terrafix_tools.accept.faults.flight_edits import Edit
 from terrafix_tools.accept.flight import Flight
-from terrafix_tools.accept.lies import inputs as lying
-from terrafix_tools.accept.lies import maps as lying_maps
-from terrafix_tools.accept.measuring.judged import Marks, Span
+from terrafix_tools.accept.measuring.results import Marks, Span
 from terrafix_tools.accept.plan import Plan
 
 MIN_FRAMES = 24  # of a flight, for frames before and after the lie
@@ -126,7 +126,9 @@ def elsewhere_reversed(flight: Flight) -> Plan | str:
 
 
 def with_map(
-    text: str, change: Callable[[Flight, Path, Path], str], origin: Callable[[Origin], Origin] = faults.unchanged_origin
+    text: str,
+    change: Callable[[Flight, Path, Path], str],
+    origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin,
 ) -> Callable[[Flight], Plan | str]:
     """``change`` (flight, map of the flight, map to write) makes the map of the scenario."""
 
@@ -165,7 +167,7 @@ def start_off(flight: Flight) -> Plan:
     )  # towards the centre of the flight, where the map is
     east_m, north_m = (ahead * START_ERROR_M).tolist()
     return _lying(
-        _span(flight, 0, 0, "the start is 300 m off"), origin=faults.start_moved(east_m, north_m, START_SIGMA_M)
+        _span(flight, 0, 0, "the start is 300 m off"), origin=flight_edits.start_moved(east_m, north_m, START_SIGMA_M)
     )
 
 
@@ -195,6 +197,6 @@ def gap_of_minutes(flight: Flight) -> Plan | str:
 
 
 def true_inputs(
-    edit: Edit = faults.unchanged, origin: Callable[[Origin], Origin] = faults.unchanged_origin
+    edit: Edit = flight_edits.unchanged, origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin
 ) -> Callable[[Flight], Plan]:
     return lambda _: Plan(edit, origin)

@@ -1,4 +1,4 @@
-"""The link of Terrafix as one program, for tests that kill it: ``python standing_link.py PORT``.
+"""The link of Terrafix as one program, for tests that kill it: ``python stationary_link.py PORT``.
 
 It runs the real edge and node. The estimates have the simulator's true position and velocity (SIM_STATE), at 2.5 Hz.
 With the first 3D fix it prints ``fix MONOTONIC_S CPU_S``: the time of the monotonic clock, and its processor time."""
@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from standing_copter import stationary_estimate
+from stationary_copter import stationary_estimate
 
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import open_edge
