@@ -11,8 +11,8 @@ from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameInput
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Imu
-from terrafix_tools.bench import growth, map_size
-from terrafix_tools.bench.stream import FIX_EVERY, FRAME_S, LEG_S, ORIGIN, frame_messages
+from terrafix_tools.bench.growth import estimator_cost, map_size
+from terrafix_tools.bench.growth.stream import FIX_EVERY, FRAME_S, LEG_S, ORIGIN, frame_messages
 
 
 def test_the_estimator_follows_the_synthetic_flight() -> None:
@@ -39,7 +39,7 @@ def test_the_estimator_follows_the_synthetic_flight() -> None:
 
 @pytest.mark.slow
 def test_the_growth_benchmark_has_all_fields() -> None:
-    found = growth.measure(30)
+    found = estimator_cost.measure(30)
     assert found["frames"] == 30 and found["peak_memory_mb"] >= found["memory_in_flight_mb"] > 50.0
     assert list(found["covariance_cpu_ms"]) == [
         "of the smoother", "gtsam.Marginals, window", "gtsam.Marginals, whole flight"

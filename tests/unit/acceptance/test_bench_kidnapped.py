@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from terrafix.core.errors import SourceError
-from terrafix_tools.bench import kidnapped
-from terrafix_tools.bench.kidnapped import Try, row
+from terrafix_tools.bench.search import kidnapped
+from terrafix_tools.bench.search.kidnapped import Try, row
 
 
 def attempt(found_after: int | None, wrong: int = 0) -> Try:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from terrafix_tools.bench import map_size, searching
+from terrafix_tools.bench.growth import map_size
+from terrafix_tools.bench.search import search_cost
 from terrafix_tools.mapping.build import build
 
 
@@ -18,10 +19,10 @@ def test_the_search_benchmark_measures_every_line(
     package, out = tmp_path / "map.gpkg", tmp_path / "out.json"
     build(tmp_path / "map.tif", package)
     monkeypatch.setattr(sys, "argv", ["searching", str(package), "--json", str(out)])
-    searching.main()
+    search_cost.main()
     written = json.loads(out.read_text(encoding="utf-8"))
     assert len(written) == len(capsys.readouterr().out.splitlines()) - 1 == 4
     assert all(line["first_cpu_s"] > 0.0 and line["next_s"] > 0.0 for line in written)
     monkeypatch.setattr(sys, "argv", ["searching", str(out)])
     with pytest.raises(SystemExit, match=r"out\.json"):
-        searching.main()
+        search_cost.main()

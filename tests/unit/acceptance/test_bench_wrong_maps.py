@@ -10,8 +10,8 @@ import pytest
 import map_rasters
 from single_map_place import AGL_M, ORIGIN, TRUE_M, R, predicted
 from terrafix.messages import Prediction
-from terrafix_tools.bench import wrong_maps
-from terrafix_tools.bench.wrong_maps import UNKNOWN_START_M, WrongMap, row, searched
+from terrafix_tools.bench.search import wrong_maps
+from terrafix_tools.bench.search.wrong_maps import UNKNOWN_START_M, WrongMap, row, searched
 from terrafix_tools.mapping.build import build
 from textured_ground import PINHOLE, texture, view
 

@@ -25,10 +25,10 @@ from terrafix_tools.mapping.fetching.fetch import Client, FetchError, RefusedErr
 from terrafix_tools.mapping.fetching.pace import Limits
 from terrafix_tools.mapping.fetching.plan import Estimate
 from terrafix_tools.mapping.fetching.tiles import MAX_CONSECUTIVE_FAILURES, TileDownload
-from terrafix_tools.mapping.sources.tile_files import MbtilesReader
-from terrafix_tools.mapping.sources.tile_grid import MERCATOR, Tile, TileRange, tiles_of
-from terrafix_tools.mapping.sources.tile_store import TileStore
-from terrafix_tools.mapping.sources.url_template import UrlTemplate
+from terrafix_tools.mapping.sources.tiles.files import MbtilesReader
+from terrafix_tools.mapping.sources.tiles.grid import MERCATOR, Tile, TileRange, tiles_of
+from terrafix_tools.mapping.sources.tiles.store import TileStore
+from terrafix_tools.mapping.sources.tiles.url_template import UrlTemplate
 
 FAST = Limits(requests_per_s=500.0, connections=4, first_wait_s=0.01, timeout_s=10.0)
 WORLD = map_servers.pyramid(4, 5)

@@ -18,7 +18,7 @@ from terrafix_tools.mapping.mosaic.cover import uncovered
 from terrafix_tools.mapping.mosaic.grid import grid_for
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.sources.collared import raster_opener
-from terrafix_tools.mapping.sources.tile_grid import tiles_of
+from terrafix_tools.mapping.sources.tiles.grid import tiles_of
 
 WORLD = map_servers.pyramid(3, 4, zoom=16)
 

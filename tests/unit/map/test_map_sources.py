@@ -17,13 +17,13 @@ from terrafix.core.errors import ConfigError, MapError, UsageError
 from terrafix_tools.mapping.area.files import read_area
 from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
-from terrafix_tools.mapping.sources.tile_files import open_tiles
-from terrafix_tools.mapping.sources.tile_grid import Tile, ground_pixel_m, tiles_of, zoom_for
-from terrafix_tools.mapping.sources.tile_imagery import TileImagery
-from terrafix_tools.mapping.sources.tile_job import tile_file_opener
-from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode, image_side
-from terrafix_tools.mapping.sources.tile_store import TileStore
-from terrafix_tools.mapping.sources.url_template import UrlTemplate
+from terrafix_tools.mapping.sources.tiles.files import open_tiles
+from terrafix_tools.mapping.sources.tiles.grid import Tile, ground_pixel_m, tiles_of, zoom_for
+from terrafix_tools.mapping.sources.tiles.image import TileDamage, decode, image_side
+from terrafix_tools.mapping.sources.tiles.imagery import TileImagery
+from terrafix_tools.mapping.sources.tiles.job import tile_file_opener
+from terrafix_tools.mapping.sources.tiles.store import TileStore
+from terrafix_tools.mapping.sources.tiles.url_template import UrlTemplate
 
 BERLIN = Tile(17, 70406, 42987)  # the tile of the Brandenburg Gate, by the formula of the OpenStreetMap wiki
 

@@ -18,8 +18,8 @@ from terrafix_tools.mapping.area.files import read_area
 from terrafix_tools.mapping.fetching.fetch import FetchError, RefusedError
 from terrafix_tools.mapping.fetching.pace import Limits
 from terrafix_tools.mapping.package.dem import DemSource
-from terrafix_tools.mapping.sources import copernicus, glo30, sentinel
-from terrafix_tools.mapping.sources.copernicus import Copernicus, Credentials, Service, read_credentials
+from terrafix_tools.mapping.sources.copernicus import data_space, glo30, sentinel
+from terrafix_tools.mapping.sources.copernicus.data_space import Copernicus, Credentials, Service, read_credentials
 from terrafix_tools.mapping.sources.spec import SourceSpec
 
 AREA = read_area("11.97,47.0,12.01,47.02", buffer_km=0.0)  # on the border of UTM zones 32 and 33
@@ -99,8 +99,8 @@ def picture(request: dict) -> bytes:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COPERNICUS_CLIENT_ID", "me")
     monkeypatch.setenv("COPERNICUS_CLIENT_SECRET", SECRET)
-    monkeypatch.setattr(copernicus, "MAX_REQUEST_PX", 250)
-    monkeypatch.setattr("terrafix_tools.mapping.sources.chunks.MAX_REQUEST_PX", 250)
+    monkeypatch.setattr(data_space, "MAX_REQUEST_PX", 250)
+    monkeypatch.setattr("terrafix_tools.mapping.sources.copernicus.chunks.MAX_REQUEST_PX", 250)
     monkeypatch.setattr(glo30, "MAX_REQUEST_PX", 250)
     monkeypatch.setattr(Copernicus.__init__, "__defaults__", (Limits(500.0, 2, first_wait_s=0.01),))
 

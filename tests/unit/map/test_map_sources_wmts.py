@@ -9,8 +9,8 @@ from map_servers import Reply, Request, serving
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping.area.files import read_area
 from terrafix_tools.mapping.sources.spec import SourceSpec
-from terrafix_tools.mapping.sources.tile_job import TileJob
-from terrafix_tools.mapping.sources.wmts import read_capabilities
+from terrafix_tools.mapping.sources.tiles.job import TileJob
+from terrafix_tools.mapping.sources.tiles.wmts import read_capabilities
 
 WORLD = map_servers.pyramid(3, 4, zoom=16)
 

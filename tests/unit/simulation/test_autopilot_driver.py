@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from autopilot_rig import HOME_M, LAT, LON, Rig, changed
-from terrafix_tools.sim.autopilot.gps import GpsInputDriver
+from terrafix_tools.sim.autopilot.navigation.gps import GpsInputDriver
 from terrafix_tools.sim.autopilot.parameters import Kind
 
 ACCURACIES = (

@@ -23,7 +23,7 @@ from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
 from terrafix_tools.mapping.package.height_datums import Datum
 from terrafix_tools.mapping.package.heights import to_amsl
 from terrafix_tools.mapping.parallel import default_workers
-from terrafix_tools.mapping.sources import glo30
+from terrafix_tools.mapping.sources.copernicus import glo30
 from terrafix_tools.mapping.sources.prepare import Preparation, Request
 from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
 from terrafix_tools.mapping.vectors.overpass import PUBLIC, fetch_overpass, overpass_features

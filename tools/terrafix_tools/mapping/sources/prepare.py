@@ -16,9 +16,9 @@ from terrafix_tools.mapping.layers import LayerInput
 from terrafix_tools.mapping.mosaic.compositing import Mosaic, MosaicPlan, Opener
 from terrafix_tools.mapping.mosaic.grid import grid_for
 from terrafix_tools.mapping.sources.collared import raster_opener
-from terrafix_tools.mapping.sources.sentinel import SentinelJob
+from terrafix_tools.mapping.sources.copernicus.sentinel import SentinelJob
 from terrafix_tools.mapping.sources.spec import SourceSpec
-from terrafix_tools.mapping.sources.tile_job import TileJob, tile_file_opener
+from terrafix_tools.mapping.sources.tiles.job import TileJob, tile_file_opener
 
 
 @dataclass(frozen=True)

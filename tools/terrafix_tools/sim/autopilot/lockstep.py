@@ -21,12 +21,19 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.link.output.gps_time import GPS_EPOCH_UNIX_S, gps_minus_utc_s
-from terrafix_tools.sim.autopilot.align import Alignment, prearm_failures
-from terrafix_tools.sim.autopilot.ekf import Ekf, Fusion
-from terrafix_tools.sim.autopilot.gps import WEEK_S, Fix, GpsInputDriver, GpsInstance
+from terrafix_tools.sim.autopilot.navigation.align import Alignment, prearm_failures
+from terrafix_tools.sim.autopilot.navigation.ekf import Ekf, Fusion
+from terrafix_tools.sim.autopilot.navigation.gps import WEEK_S, Fix, GpsInputDriver, GpsInstance
+from terrafix_tools.sim.autopilot.navigation.receivers import Receivers
+from terrafix_tools.sim.autopilot.navigation.status import (
+    CRITICAL,
+    EXTERNAL_AFTER_S,
+    INFO,
+    Sources,
+    Status,
+    StatusMessage,
+)
 from terrafix_tools.sim.autopilot.parameters import Kind, parameters_of
-from terrafix_tools.sim.autopilot.receivers import Receivers
-from terrafix_tools.sim.autopilot.status import CRITICAL, EXTERNAL_AFTER_S, INFO, Sources, Status, StatusMessage
 from terrafix_tools.sim.autopilot.streams import Snapshot
 from terrafix_tools.sim.autopilot.wire import Wire
 from terrafix_tools.sim.interfaces import Navigation, Readings

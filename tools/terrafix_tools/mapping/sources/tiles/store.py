@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from terrafix.core.errors import MapError, OutputError
-from terrafix_tools.mapping.sources.tile_grid import Tile, TileRange
+from terrafix_tools.mapping.sources.tiles.grid import Tile, TileRange
 
 ABSENT_FOR_S = 7 * 86_400.0  # after this time an absent tile is requested again
 ROWS_AT_A_TIME = 100_000

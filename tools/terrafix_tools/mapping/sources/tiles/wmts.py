@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from urllib.parse import quote
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.sources.tile_grid import MAX_ZOOM, tile_span_m
-from terrafix_tools.mapping.sources.url_template import UrlTemplate
+from terrafix_tools.mapping.sources.tiles.grid import MAX_ZOOM, tile_span_m
+from terrafix_tools.mapping.sources.tiles.url_template import UrlTemplate
 
 WMTS = "{http://www.opengis.net/wmts/1.0}"
 OWS = "{http://www.opengis.net/ows/1.1}"

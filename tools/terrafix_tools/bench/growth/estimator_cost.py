@@ -1,4 +1,6 @@
-"""Cost of the estimator as the flight grows, on synthetic messages: python -m terrafix_tools.bench.growth FRAMES OUT.
+"""Cost of the estimator as the flight grows, on synthetic messages.
+
+python -m terrafix_tools.bench.growth.estimator_cost FRAMES OUT
 
 The cost of image processing does not depend on the length of the flight and is left out. The estimator's covariance
 query is compared with the same query from scratch: ``gtsam.Marginals`` over the window, and over the whole flight.
@@ -23,7 +25,7 @@ from terrafix.estimator.graph.pose_graph import PoseGraph
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Imu
 from terrafix_tools.bench.flights import spread
-from terrafix_tools.bench.stream import ORIGIN, frame_messages
+from terrafix_tools.bench.growth.stream import ORIGIN, frame_messages
 from terrafix_tools.replay import peak_memory_mb
 
 RESULT = "growth.json"

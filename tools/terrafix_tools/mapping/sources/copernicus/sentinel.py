@@ -11,8 +11,8 @@ from terrafix_tools.mapping.fetching.plan import Estimate
 from terrafix_tools.mapping.fetching.progress import OnProgress
 from terrafix_tools.mapping.mosaic.compositing import Opener
 from terrafix_tools.mapping.source import ImagerySource
-from terrafix_tools.mapping.sources.chunks import Chunk, ChunkRaster, fetch_chunks, process_request
-from terrafix_tools.mapping.sources.copernicus import LICENCE, Copernicus, Service, read_credentials
+from terrafix_tools.mapping.sources.copernicus.chunks import Chunk, ChunkRaster, fetch_chunks, process_request
+from terrafix_tools.mapping.sources.copernicus.data_space import LICENCE, Copernicus, Service, read_credentials
 from terrafix_tools.mapping.sources.spec import SourceSpec
 from terrafix_tools.mapping.sources.utm import utm_epsg
 

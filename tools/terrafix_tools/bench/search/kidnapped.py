@@ -2,7 +2,7 @@
 
 Measures the number of frames until the position is found, and the wrong results:
 
-python -m terrafix_tools.bench.kidnapped FLIGHT [FLIGHT ...] [--map MAP] [--mirrored] [--tries 20] [--frames 10]
+python -m terrafix_tools.bench.search.kidnapped FLIGHT [FLIGHT ...] [--map MAP] [--mirrored] [--tries 20] [--frames 10]
     [--stride 1] [--seed 1] [--no-compass] [--json FILE]
 
 The flight is divided into as many sections as there are tries; each try begins at a random frame of its section, with

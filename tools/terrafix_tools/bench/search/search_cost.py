@@ -1,6 +1,6 @@
 """Cost of the relocalisation search: one decision over a whole map, one over 25 tiles, one sweep of headings.
 
-python -m terrafix_tools.bench.searching MAP.gpkg [--agl 120] [--json FILE]
+python -m terrafix_tools.bench.search.search_cost MAP.gpkg [--agl 120] [--json FILE]
 
 The images are parts of the map itself, along a straight path: this measures time, not recall. Every line begins with a
 new reader of the package: *first* includes the reading and description of the tiles, *next* is the slowest of the

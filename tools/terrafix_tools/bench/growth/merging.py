@@ -1,4 +1,6 @@
-"""Merge of the submaps of a flight by the Sim(3) pose graph: python -m terrafix_tools.bench.merging KEYFRAMES OUT.
+"""Merge of the submaps of a flight by the Sim(3) pose graph.
+
+python -m terrafix_tools.bench.growth.merging KEYFRAMES OUT
 
 A synthetic flight in submaps, each with its own frame and unit of length, with absolute constraints of which some are
 outliers. It is compared with least squares without a robust loss on the same graph and initial values
@@ -19,7 +21,7 @@ from rich.table import Table
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix_tools.bench import merging_baseline
+from terrafix_tools.bench.growth import merging_baseline
 from terrafix_tools.finalise.sim3_pose_graph import merge
 from terrafix_tools.finalise.submap_types import AbsoluteConstraint, MergedSubmaps, Submap
 

@@ -5,7 +5,7 @@ Blending (2) selects like 1 and does not average: on the firmware both switched 
 
 from collections.abc import Sequence
 
-from terrafix_tools.sim.autopilot.gps import GpsInstance
+from terrafix_tools.sim.autopilot.navigation.gps import GpsInstance
 
 USE_PRIMARY, USE_BEST, BLEND, PRIMARY_IF_3D = 0, 1, 2, 4
 ONE_SATELLITE_S = 20.0  # one more satellite must persist this long to be preferred,

@@ -17,7 +17,7 @@ from rasterio.transform import Affine
 from terrafix.core.errors import OutputError
 from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.fetching.progress import DownloadProgress, OnProgress
-from terrafix_tools.mapping.sources.copernicus import MAX_REQUEST_PX, Copernicus
+from terrafix_tools.mapping.sources.copernicus.data_space import MAX_REQUEST_PX, Copernicus
 
 RGBA = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
 OGC_EPSG = "http://www.opengis.net/def/crs/EPSG/0/"

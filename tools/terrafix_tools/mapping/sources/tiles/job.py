@@ -14,13 +14,13 @@ from terrafix_tools.mapping.fetching.tiles import TileDownload
 from terrafix_tools.mapping.mosaic.compositing import Opener
 from terrafix_tools.mapping.mosaic.cover import uncovered
 from terrafix_tools.mapping.sources.spec import SourceSpec
-from terrafix_tools.mapping.sources.tile_files import open_tiles
-from terrafix_tools.mapping.sources.tile_grid import MERCATOR, tiles_of, zoom_for
-from terrafix_tools.mapping.sources.tile_imagery import TileImagery
-from terrafix_tools.mapping.sources.tile_picture import image_side
-from terrafix_tools.mapping.sources.tile_store import TileStore
-from terrafix_tools.mapping.sources.url_template import UrlTemplate
-from terrafix_tools.mapping.sources.wmts import read_capabilities
+from terrafix_tools.mapping.sources.tiles.files import open_tiles
+from terrafix_tools.mapping.sources.tiles.grid import MERCATOR, tiles_of, zoom_for
+from terrafix_tools.mapping.sources.tiles.image import image_side
+from terrafix_tools.mapping.sources.tiles.imagery import TileImagery
+from terrafix_tools.mapping.sources.tiles.store import TileStore
+from terrafix_tools.mapping.sources.tiles.url_template import UrlTemplate
+from terrafix_tools.mapping.sources.tiles.wmts import read_capabilities
 
 DEFAULT_GSD_M = 0.5  # default for a server; fine enough for flights above 100 m
 

@@ -10,8 +10,8 @@ import numpy as np
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping.area.polygons import Placed
 from terrafix_tools.mapping.source import ground_pixel_m
-from terrafix_tools.mapping.sources.tile_grid import HALF_M, MERCATOR, Tile, tile_span_m, tiles_of
-from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode
+from terrafix_tools.mapping.sources.tiles.grid import HALF_M, MERCATOR, Tile, tile_span_m, tiles_of
+from terrafix_tools.mapping.sources.tiles.image import TileDamage, decode
 
 CACHE_BYTES = 64 << 20  # decoded tiles; adjacent windows share a row of them
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix_tools.sim.autopilot.ekf import Ekf
-from terrafix_tools.sim.autopilot.gps import Fix
+from terrafix_tools.sim.autopilot.navigation.ekf import Ekf
+from terrafix_tools.sim.autopilot.navigation.gps import Fix
 from terrafix_tools.sim.autopilot.parameters import Kind
 
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY

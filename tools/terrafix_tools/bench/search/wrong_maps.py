@@ -1,7 +1,7 @@
 """False alarms of the map search: flights on maps of other places.
 
-python -m terrafix_tools.bench.wrong_maps FLIGHT --map MAP [--map MAP ...] [--mirrored] [--step 0.25] [--frames 40]
-    [--json FILE]
+python -m terrafix_tools.bench.search.wrong_maps FLIGHT --map MAP [--map MAP ...] [--mirrored] [--step 0.25]
+    [--frames 40] [--json FILE]
 
 Vision and estimator process the flight without a map and without a start position; each map is searched with their
 predictions, one frame every ``--step`` heights. No map may show the area of the flight, unless it is ``--mirrored``.

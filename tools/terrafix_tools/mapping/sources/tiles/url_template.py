@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from urllib.parse import quote, urlsplit
 
 from terrafix.core.errors import UsageError
-from terrafix_tools.mapping.sources.tile_grid import Tile
+from terrafix_tools.mapping.sources.tiles.grid import Tile
 
 FIELD = re.compile(r"\{([^{}]*)\}")
 SECRET = re.compile(r"\$\{(\w+)\}")

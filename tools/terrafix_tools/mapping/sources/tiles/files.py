@@ -22,8 +22,8 @@ from pmtiles.tile import (
 )
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.sources.tile_grid import Tile
-from terrafix_tools.mapping.sources.tile_store import mbtiles_row
+from terrafix_tools.mapping.sources.tiles.grid import Tile
+from terrafix_tools.mapping.sources.tiles.store import mbtiles_row
 
 PICTURES = (TileType.PNG, TileType.JPEG, TileType.WEBP)
 DIRECTORIES = 64  # decompressed directories of a PMTiles file in the cache

@@ -14,7 +14,7 @@ from enum import StrEnum
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, rot_w_b
-from terrafix_tools.sim.autopilot.gps import Fix
+from terrafix_tools.sim.autopilot.navigation.gps import Fix
 from terrafix_tools.sim.interfaces import Navigation, Readings
 
 GRAVITY_MPS2 = 9.80665

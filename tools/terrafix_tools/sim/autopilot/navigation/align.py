@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from terrafix.link.integrity.output_predictor import distance_m
-from terrafix_tools.sim.autopilot.gps import NO_GPS, Fix, GpsInputDriver, GpsInstance
+from terrafix_tools.sim.autopilot.navigation.gps import NO_GPS, Fix, GpsInputDriver, GpsInstance
+from terrafix_tools.sim.autopilot.navigation.switch import BLEND
 from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.autopilot.switch import BLEND
 
 CHECK_SATS, CHECK_HDOP, CHECK_SPEED, CHECK_POSITION = 1, 2, 4, 8  # EK3_GPS_CHECK; 16, yaw, is not simulated
 MIN_SATELLITES, MAX_HDOP = 6, 2.5

@@ -8,8 +8,8 @@ import rasterio
 from terrafix.core.errors import OutputError
 from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.fetching.progress import OnProgress
-from terrafix_tools.mapping.sources.chunks import ChunkRaster, fetch_chunks, process_request
-from terrafix_tools.mapping.sources.copernicus import MAX_REQUEST_PX, Copernicus, Service, read_credentials
+from terrafix_tools.mapping.sources.copernicus.chunks import ChunkRaster, fetch_chunks, process_request
+from terrafix_tools.mapping.sources.copernicus.data_space import MAX_REQUEST_PX, Copernicus, Service, read_credentials
 from terrafix_tools.mapping.sources.utm import utm_epsg
 
 NAME = "glo-30"

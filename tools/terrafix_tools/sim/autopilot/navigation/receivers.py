@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from terrafix_tools.sim.autopilot.gps import TYPE_MAV, TYPE_NONE, Fix, GpsInputDriver, GpsInstance, Receiver
-from terrafix_tools.sim.autopilot.status import INFO, NOTICE, StatusMessage
-from terrafix_tools.sim.autopilot.switch import Switch
+from terrafix_tools.sim.autopilot.navigation.gps import TYPE_MAV, TYPE_NONE, Fix, GpsInputDriver, GpsInstance, Receiver
+from terrafix_tools.sim.autopilot.navigation.status import INFO, NOTICE, StatusMessage
+from terrafix_tools.sim.autopilot.navigation.switch import Switch
 from terrafix_tools.sim.interfaces import GnssFix
 
 InstanceFix = tuple[GpsInstance, Fix | None]  # instance and its fix; None: below 3D

@@ -1,6 +1,7 @@
 """Cost of a map as its area grows: build, open, read, correlate.
 
-python -m terrafix_tools.bench.map_size KM2 WORK OUT builds WORK/map.gpkg; ``map_size search WORK OUT`` measures it.
+python -m terrafix_tools.bench.growth.map_size KM2 WORK OUT builds WORK/map.gpkg; ``map_size search WORK OUT``
+measures it.
 
 The imagery is noise of several scales without repetition, 0.5 m per pixel; the frame is a part of it. Times with "cpu"
 in their name are processor times of all threads; the others are wall-clock times."""
