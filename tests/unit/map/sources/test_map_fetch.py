@@ -271,7 +271,15 @@ def test_a_killed_download_resumes(tmp_path: Path, how: signal.Signals) -> None:
         return MANY.answer(request)
 
     with serving(answer) as server:
-        command = [sys.executable, "-c", FETCHER, server.url, str(store), str(HERE), str(HERE.parents[1] / "rigs")]
+        command = [
+            sys.executable,
+            "-c",
+            FETCHER,
+            server.url,
+            str(store),
+            str(HERE),
+            str(HERE.parents[2] / "rigs" / "map"),
+        ]
         fetcher = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             assert half.wait(60)
