@@ -27,7 +27,7 @@ from terrafix.messages import (
 )
 from terrafix.recorder.writer import FlightWriter, header
 from terrafix_tools.accept.measuring.evidence import Evidence, gather
-from terrafix_tools.accept.measuring.judged import Marks
+from terrafix_tools.accept.measuring.results import Marks
 from terrafix_tools.estimates import ESTIMATES, RowTable, write_rows
 from terrafix_tools.evaluate import Truth
 

@@ -13,7 +13,7 @@ import pytest
 
 from terrafix_tools.accept.fly import Job, fly
 from terrafix_tools.accept.generated import make
-from terrafix_tools.accept.measuring.judged import JudgedRow, Verdict
+from terrafix_tools.accept.measuring.results import JudgedRow, Verdict
 
 COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "accept"]
 SCENARIOS = ("baseline", "foreign frame", "350 m outlier fix")

@@ -1,5 +1,5 @@
 """Rig of the SITL tests in flight: a ground station that flies ArduPilot's copter, and the Terrafix program beside it
-(standing_link.py)."""
+(stationary_link.py)."""
 
 import math
 import socket
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from standing_copter import HOME, WAIT_S
+from stationary_copter import HOME, WAIT_S
 
 GUIDED = 4  # ArduCopter, mode.h
 HOVER_M = 15.0
@@ -102,7 +102,7 @@ class Pilot:
 
 
 def start_terrafix(port: int) -> subprocess.Popen[str]:
-    command = [sys.executable, str(Path(__file__).parent / "standing_link.py"), str(port)]
+    command = [sys.executable, str(Path(__file__).parent / "stationary_link.py"), str(port)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
 
 

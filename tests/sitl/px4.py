@@ -23,7 +23,7 @@ from typing import Any
 import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from standing_copter import stationary_estimate
+from stationary_copter import stationary_estimate
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection

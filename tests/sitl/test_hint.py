@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from standing_copter import ReceivedMessages, copter, free_port, run_link
+from stationary_copter import ReceivedMessages, copter, free_port, run_link
 
 from terrafix.core.config import LinkSection
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from pilot import HOVER_M, Pilot, kill_terrafix, start_terrafix, take_off
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from standing_copter import HOME, copter, free_port
+from stationary_copter import HOME, copter, free_port
 
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from standing_copter import HOME, WAIT_S, ReceivedMessages, copter, free_port, run_link
+from stationary_copter import HOME, WAIT_S, ReceivedMessages, copter, free_port, run_link
 
 from terrafix.core.config import LinkSection
 from terrafix.link.mavlink.signing import timestamp

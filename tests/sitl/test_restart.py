@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from pilot import GUIDED, Pilot, kill_terrafix, start_terrafix, take_off
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from standing_copter import HOME, SENT, ReceivedMessages, copter, free_port, run_link
+from stationary_copter import HOME, SENT, ReceivedMessages, copter, free_port, run_link
 
 from terrafix.core.config import LinkSection
 

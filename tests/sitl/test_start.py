@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-from standing_copter import HOME, WAIT_S, copter, free_port
+from stationary_copter import HOME, WAIT_S, copter, free_port
 
 from terrafix import messages as m
 from terrafix.anchor.node import AnchorNode

@@ -138,7 +138,7 @@ def demo(
     duration: Annotated[float, typer.Option(help="Seconds of flight.")] = 90.0,
 ) -> None:
     """Fly over a generated world with the real processes and a simulated autopilot, and write a report."""
-    from terrafix_tools.sim.demo.demo import demo as run_demo
+    from terrafix_tools.sim.demo.command import demo as run_demo
 
     raise typer.Exit(run_demo(out, seed=seed, duration_s=duration))
 

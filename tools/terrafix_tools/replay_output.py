@@ -29,7 +29,7 @@ from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, RowTable, write_row
 from terrafix_tools.finalise.output import SUMMARY as FINALISED_SUMMARY
 from terrafix_tools.finalise.output import TABLE as FINALISED_TABLE
 from terrafix_tools.flight_verdict import flight_verdict
-from terrafix_tools.lens_words import lens_words
+from terrafix_tools.lens_report import lens_words
 
 RECORD, SUMMARY = "flight.mcap", "summary.json"
 # Derived from the three files above: those of an earlier replay would be stale.

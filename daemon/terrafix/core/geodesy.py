@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-GRAVITY_MPS2 = 9.81  # of specific force and of banked turns
-
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
 

@@ -68,18 +68,18 @@ class PoseEstimator:
             raise ValueError("the camera is not the one that Origin named")
         answers = [*self._node.on(thermal), *self._node.on(match)]
         verdict = next(a for a in answers if isinstance(a, MeasurementVerdict))
-        said = next((a for a in answers if isinstance(a, NavEstimate)), None)
-        if verdict.verdict is not Verdict.ACCEPTED or said is None:
+        estimate = next((a for a in answers if isinstance(a, NavEstimate)), None)
+        if verdict.verdict is not Verdict.ACCEPTED or estimate is None:
             raise PnpFailureError(verdict.verdict, verdict.detail)
-        if said.covariance_mode is CovarianceMode.JACOBIAN:
+        if estimate.covariance_mode is CovarianceMode.JACOBIAN:
             warnings.warn(f"propagated covariance: {thermal.cause}", CovarianceDegradedWarning, stacklevel=2)
         return PoseEstimate(
-            frame_id=said.frame_id,
-            position_wgs84=(said.lat_deg, said.lon_deg, said.alt_amsl_m),
-            orientation_world_T_body=said.q_w_b,
-            covariance_6x6=np.array(said.cov).reshape(6, 6),
-            covariance_mode=said.covariance_mode,
-            source_label=said.source_label,
-            last_satellite_anchor_age_ms=said.last_anchor_age_ms,
-            emitted_at=said.emitted_at_ns,
+            frame_id=estimate.frame_id,
+            position_wgs84=(estimate.lat_deg, estimate.lon_deg, estimate.alt_amsl_m),
+            orientation_world_T_body=estimate.q_w_b,
+            covariance_6x6=np.array(estimate.cov).reshape(6, 6),
+            covariance_mode=estimate.covariance_mode,
+            source_label=estimate.source_label,
+            last_satellite_anchor_age_ms=estimate.last_anchor_age_ms,
+            emitted_at=estimate.emitted_at_ns,
         )

@@ -10,12 +10,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.clock import NS_PER_S
 from terrafix.core.config import LinkSection
-from terrafix.link.admission.admission import Admission
+from terrafix.link.admission.packet_filter import Admission
 from terrafix.link.admission.served_autopilot import AUTOPILOT_COMPONENT, Role
-from terrafix.link.autopilot.autopilot import AutopilotPeer
 from terrafix.link.autopilot.autopilot_prior import AutopilotPrior
 from terrafix.link.autopilot.checkpoint import CheckpointWriter
 from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder
+from terrafix.link.autopilot.packet_decoder import AutopilotPeer
 from terrafix.link.gnss.source_switch import SourceSwitch
 from terrafix.link.ground_station.links import GroundLinks
 from terrafix.link.ground_station.named_values import NamedValues

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from terrafix.core import logs
 from terrafix.core.clock import NS_PER_S
 from terrafix.core.config import LinkSection
-from terrafix.link.admission.admission import Admission
-from terrafix.link.autopilot.autopilot import AutopilotPeer
+from terrafix.link.admission.packet_filter import Admission
+from terrafix.link.autopilot.packet_decoder import AutopilotPeer
 from terrafix.link.gnss.source_switch import SourceSwitch
 from terrafix.link.ground_station.links import GroundLinks
 from terrafix.link.mavlink.bandwidth import LinkBandwidth

@@ -12,7 +12,7 @@ from terrafix_tools.accept import adversary
 from terrafix_tools.accept.cases_table import Case, Line, lines_of, markdown
 from terrafix_tools.accept.fly import Result
 from terrafix_tools.accept.measuring.criteria import PERMANENT, TEMPORARY, unmeasured
-from terrafix_tools.accept.measuring.judged import JudgedRow, Verdict
+from terrafix_tools.accept.measuring.results import JudgedRow, Verdict
 from terrafix_tools.accept.run import AcceptOptions
 from terrafix_tools.accept.table import conclude
 from terrafix_tools.sim.autopilot.parameters import Kind

@@ -14,12 +14,12 @@ from terrafix.messages import GpsInput
 from terrafix.recorder.writer import FlightWriter, header
 from terrafix_tools.accept import closed
 from terrafix_tools.accept.closed import EditedCamera, sent_fixes
-from terrafix_tools.accept.lies import lies
-from terrafix_tools.accept.lies import loop_integrity as of
-from terrafix_tools.accept.lies.closed_loop import LIES_IN_THE_LOOP
+from terrafix_tools.accept.false_inputs import loop_integrity as of
+from terrafix_tools.accept.false_inputs import scenarios
+from terrafix_tools.accept.false_inputs.closed_loop import LIES_IN_THE_LOOP
 from terrafix_tools.accept.measuring.criteria import judge
 from terrafix_tools.accept.measuring.evidence import Evidence, SentFix
-from terrafix_tools.accept.measuring.judged import Marks, Span, Verdict
+from terrafix_tools.accept.measuring.results import Marks, Span, Verdict
 from terrafix_tools.accept.plan import CLOSED_LOOP
 from terrafix_tools.accept.run import QUICK_LEAVES_OUT
 from terrafix_tools.accept.scenarios import BY_NAME
@@ -59,7 +59,7 @@ def test_a_deviation_of_more_than_50_m_with_a_3d_fix_breaks_the_floor(tmp_path: 
     )
 
 
-def test_the_deviation_counts_from_the_start_of_the_lie_and_only_with_a_fix(tmp_path: Path) -> None:
+def test_the_deviation_counts_from_the_start_of_the_false_input_and_only_with_a_fix(tmp_path: Path) -> None:
     assert of.deviation_on_a_fix_m(loop(tmp_path / "before", during(3.0, 9.9, deviation_m=80.0))).value == 3.0
     assert of.deviation_on_a_fix_m(loop(tmp_path / "after", during(25.0, 25.0, deviation_m=80.0))).value == 80.0
     withdrawn = loop(tmp_path / "without", lambda t_s: none(t_s, 80.0) if 12.0 <= t_s <= 14.0 else fix(t_s))
@@ -84,7 +84,7 @@ def test_a_false_gps_input_has_an_error_beyond_50_m_and_three_times_its_accuracy
     assert not of.is_false_gps_input(none(0.0))
 
 
-def test_false_gps_input_is_allowed_for_the_first_three_seconds_of_the_lie(tmp_path: Path) -> None:
+def test_false_gps_input_is_allowed_for_the_first_three_seconds_of_the_false_input(tmp_path: Path) -> None:
     early = loop(tmp_path / "early", during(10.0, 13.0, error_m=80.0))
     assert of.late_false_fixes_sent(early) == of.Measured(0.0, "of 31")
     longer = loop(tmp_path / "longer", during(10.0, 13.5, error_m=80.0))
@@ -102,7 +102,7 @@ def test_false_gps_input_is_allowed_for_five_frames_if_these_are_longer_than_thr
     assert of.late_false_fixes_sent(found).value == 0.0  # the fifth frame of the lie is at 18 s
 
 
-def test_a_correct_fix_for_a_second_is_required_within_five_seconds_after_the_lie(tmp_path: Path) -> None:
+def test_a_correct_fix_for_a_second_is_required_within_five_seconds_after_the_false_input(tmp_path: Path) -> None:
     assert of.fix_again_s(loop(tmp_path / "at once", fix)).value == pytest.approx(0.1)
     for name, wrong in (("none", none), ("off", lambda t_s: fix(t_s, 25.0)), ("false", lambda t_s: fix(t_s, 90.0))):
         found = loop(tmp_path / name, lambda t_s, wrong=wrong: wrong(t_s) if t_s < 24.0 or t_s == 24.5 else fix(t_s))  # type: ignore[misc]
@@ -193,7 +193,7 @@ FIRST, LAST = 120, 150  # frames of the lie
         ("GNSS jam, late pictures", lambda i: i + 1 - 2),
     ],
 )
-def test_earlier_pictures_are_shown_only_within_the_lie(name: str, shown: Callable[[int], int]) -> None:
+def test_earlier_pictures_are_shown_only_within_the_false_input(name: str, shown: Callable[[int], int]) -> None:
     for i, image in enumerate(pictures(name)):
         assert image[:, :20].mean() == pytest.approx(shown(i) if FIRST <= i <= LAST else i + 1, abs=0.3), i
 
@@ -214,8 +214,8 @@ def test_an_edit_keeps_missing_pictures() -> None:
     assert [camera(state(t_s), 0) for t_s in (0.0, 61.0)] == [None, None]
 
 
-def test_every_closed_loop_lie_is_a_scenario_that_quick_skips() -> None:
-    names = {scenario.name for scenario in lies.LIES if scenario.ground == CLOSED_LOOP}
+def test_every_closed_loop_false_input_is_a_scenario_that_quick_skips() -> None:
+    names = {scenario.name for scenario in scenarios.LIES if scenario.ground == CLOSED_LOOP}
     assert names == set(LIES_IN_THE_LOOP) and names <= set(QUICK_LEAVES_OUT)
     for name in names:
         assert BY_NAME[name].frames / 2.0 >= closed.LIE.to_s + 20.0, name

@@ -14,11 +14,11 @@ from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, Frame, Health, MapMatch, Message, Origin, Prediction, VehicleState, Verdict
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept.faults import faults
+from terrafix_tools.accept.faults import flight_edits
 from terrafix_tools.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
 from terrafix_tools.accept.faults.stale_map import stale_along
 from terrafix_tools.accept.flight import Flight, FrameRef, read_any_truth
-from terrafix_tools.accept.measuring.judged import Span
+from terrafix_tools.accept.measuring.results import Span
 from terrafix_tools.accept.plan import Plan
 from terrafix_tools.accept.scenarios import BY_NAME
 from terrafix_tools.evaluate import Truth
@@ -60,8 +60,8 @@ class Counting:
         pass
 
 
-def altered(edit: faults.Edit, **more: object) -> list[Shot]:
-    source = faults.AlteredSource(Counting(), edit, origin=faults.unchanged_origin, **more)  # type: ignore[arg-type]
+def altered(edit: flight_edits.Edit, **more: object) -> list[Shot]:
+    source = flight_edits.AlteredSource(Counting(), edit, origin=flight_edits.unchanged_origin, **more)  # type: ignore[arg-type]
     return list(source.shots())
 
 
@@ -75,7 +75,7 @@ def grey(shot: Shot) -> int:
 
 
 def test_an_altered_source_limits_and_renumbers_frames() -> None:
-    shots = altered(faults.without_frames(frozenset({"1.jpg", "2.jpg"})), frames=6)
+    shots = altered(flight_edits.without_frames(frozenset({"1.jpg", "2.jpg"})), frames=6)
     assert files(shots) == ["0.jpg", "3.jpg", "4.jpg", "5.jpg"]
     assert [s.frame.frame_id for s in shots] == [0, 1, 2, 3]
     assert [len(s.states) for s in shots] == [1, 3, 1, 1]  # telemetry continues
@@ -83,30 +83,30 @@ def test_an_altered_source_limits_and_renumbers_frames() -> None:
 
 def test_a_foreign_frame_is_inserted_between_two_others() -> None:
     stranger = np.full((4, 8, 3), 99, np.uint8)
-    shots = altered(faults.foreign_frames({"5.jpg": stranger}))
+    shots = altered(flight_edits.foreign_frames({"5.jpg": stranger}))
     assert len(shots) == FRAMES + 1
     foreign = shots[5]
-    assert foreign.frame.file == faults.foreign_name("5.jpg") and shots[6].frame.file == "5.jpg"
+    assert foreign.frame.file == flight_edits.foreign_name("5.jpg") and shots[6].frame.file == "5.jpg"
     assert shots[4].frame.t_ns < foreign.frame.t_ns < shots[6].frame.t_ns
     assert foreign.image is stranger and foreign.states == ()
 
 
 def test_black_and_frozen_pictures() -> None:
     span = Span(3.0, 5.0, "")
-    assert [grey(s) for s in altered(faults.black(span))] == [1, 2, 3, 0, 0, 0, *range(7, 13)]
-    assert [grey(s) for s in altered(faults.frozen(span))] == [1, 2, 3, 3, 3, 3, *range(7, 13)]
+    assert [grey(s) for s in altered(flight_edits.black(span))] == [1, 2, 3, 0, 0, 0, *range(7, 13)]
+    assert [grey(s) for s in altered(flight_edits.frozen(span))] == [1, 2, 3, 3, 3, 3, *range(7, 13)]
 
 
 def test_edits_of_telemetry() -> None:
-    assert altered(faults.height_times(1.1))[5].states[0].agl_m == pytest.approx(115.5)
-    turned = altered(faults.yaw_plus(15.0))[0].states[0].yaw_rad
+    assert altered(flight_edits.height_times(1.1))[5].states[0].agl_m == pytest.approx(115.5)
+    turned = altered(flight_edits.yaw_plus(15.0))[0].states[0].yaw_rad
     assert turned is not None and np.degrees(turned) == pytest.approx(np.degrees(3.0) + 15.0 - 360.0)
-    unknown = altered(faults.yaw_unknown())[0].states[0]
+    unknown = altered(flight_edits.yaw_unknown())[0].states[0]
     assert unknown.yaw_rad is None and unknown.agl_m == 100.0
 
 
 def test_a_moved_start_keeps_its_stated_sigma() -> None:
-    moved = faults.start_moved(700.0, -300.0)(ORIGIN)
+    moved = flight_edits.start_moved(700.0, -300.0)(ORIGIN)
     east_m, north_m = LocalFrame(48.0, 11.0).to_local(moved.lat_deg, moved.lon_deg)
     assert (east_m, north_m) == pytest.approx((700.0, -300.0), abs=0.01)
     assert moved.start_sigma_m == ORIGIN.start_sigma_m
@@ -114,12 +114,14 @@ def test_a_moved_start_keeps_its_stated_sigma() -> None:
 
 def test_a_long_route_is_the_flight_forwards_and_backwards() -> None:
     states = [shot.states[0] for shot in Counting().shots()]
-    source = faults.ThereAndBack(Counting(), [FrameRef(f"{i}.jpg", float(i), s) for i, s in enumerate(states)], 30)
+    source = flight_edits.ThereAndBack(
+        Counting(), [FrameRef(f"{i}.jpg", float(i), s) for i, s in enumerate(states)], 30
+    )
     shots = list(source.shots())
     assert [grey(s) for s in shots[9:14]] == [10, 11, 12, 11, 10]  # reverses at the last frame
     times = [s.frame.t_ns for s in shots]
     assert len(shots) == 30 and times == [i * 10**9 for i in range(30)]
-    assert len(set(files(shots))) == 30 and faults.original(files(shots)[11:13]) == ["11.jpg", "10.jpg"]
+    assert len(set(files(shots))) == 30 and flight_edits.original(files(shots)[11:13]) == ["11.jpg", "10.jpg"]
     assert all(s.states[0].t_ns == s.frame.t_ns for s in shots)
     assert [s.states[0].agl_m for s in shots[10:13]] == [110.0, 111.0, 110.0]
 
@@ -128,10 +130,10 @@ class Saying:
     """A node that publishes the same messages for every input, and stores its inputs."""
 
     def __init__(self, *answers: Message) -> None:
-        self.answers, self.heard = answers, list[Message]()
+        self.answers, self.received = answers, list[Message]()
 
     def on(self, message: Message) -> Iterator[Message]:
-        self.heard.append(message)
+        self.received.append(message)
         return iter(self.answers)
 
     def tick(self, now_ns: int) -> Iterator[Message]:
@@ -158,7 +160,7 @@ def test_throttling_is_reported_within_its_span() -> None:
     node = HotComputer(inner, Span(1.0, 2.0, ""))
     for i in range(4):
         list(node.on(Frame(t_ns=i * 10**9, frame_id=i, file="", width=8, height=4)))
-    assert [m.throttled for m in inner.heard if isinstance(m, Health)] == [False, True, True, False]
+    assert [m.throttled for m in inner.received if isinstance(m, Health)] == [False, True, True, False]
 
 
 def straight(frames: int = 40, step_m: float = 20.0, map_path: Path | None = None) -> Flight:

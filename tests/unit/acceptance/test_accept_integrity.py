@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from accept_case import STEP_S, FrameCase, evidence
+from terrafix_tools.accept.false_inputs import integrity as of
 from terrafix_tools.accept.fly import Result
-from terrafix_tools.accept.lies import integrity as of
 from terrafix_tools.accept.measuring.criteria import judge
-from terrafix_tools.accept.measuring.judged import Marks, Span, Verdict
+from terrafix_tools.accept.measuring.results import Marks, Span, Verdict
 from terrafix_tools.accept.table import conclude
 
 GOOD = FrameCase()
@@ -29,7 +29,7 @@ def flight(tmp_path: Path, **changed: FrameCase):  # type: ignore[no-untyped-def
     return evidence(tmp_path, frames, MARKS)
 
 
-def test_false_fixes_are_allowed_for_three_seconds_or_five_frames_of_a_lie(tmp_path: Path) -> None:
+def test_false_fixes_are_allowed_for_three_seconds_or_five_frames_of_a_false_input(tmp_path: Path) -> None:
     assert of.late_false_fixes(flight(tmp_path / "a", f10_16=FALSE)).value == 0.0  # frame 16 is 3 s into it
     assert of.late_false_fixes(flight(tmp_path / "b", f10_18=FALSE)).value == 2.0
     assert of.late_false_fixes(flight(tmp_path / "c", f10_30=COVERED)).value == 0.0
@@ -47,15 +47,15 @@ def test_five_frames_are_allowed_if_these_are_longer_than_three_seconds(tmp_path
     assert of.late_false_fixes(slow).value == 0.0  # the last of them is 6 s into it
 
 
-def test_false_fixes_before_and_after_the_lie_count_as_late(tmp_path: Path) -> None:
+def test_false_fixes_before_and_after_the_false_input_count_as_late(tmp_path: Path) -> None:
     found = flight(tmp_path, f3=FALSE, f10=FALSE, f22_23=FALSE)  # frame 10 is the first of the lie
     assert of.late_false_fixes(found).value == 3.0
     assert of.false_fixes_in_all(found) == of.Measured(4.0, "1 before the lie, 1 in it, 2 after it")
 
 
-def test_the_allowance_does_not_depend_on_the_length_of_the_lie(tmp_path: Path) -> None:
+def test_the_allowance_does_not_depend_on_the_length_of_the_false_input(tmp_path: Path) -> None:
     found = flight(tmp_path, f10_13=FALSE, f30=FALSE)
-    short = Span(10 * STEP_S, 10 * STEP_S, "told once")
+    short = Span(10 * STEP_S, 10 * STEP_S, "reported once")
     found.marks = Marks(spans=(short,), lie=short)
     assert of.late_false_fixes(found).value == 1.0
 

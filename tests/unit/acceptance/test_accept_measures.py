@@ -14,7 +14,7 @@ from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.measuring import measures as of
 from terrafix_tools.accept.measuring.criteria import CRITERIA, judge
-from terrafix_tools.accept.measuring.judged import Bounds, Marks, Span, Verdict, with_unit
+from terrafix_tools.accept.measuring.results import Bounds, Marks, Span, Verdict, with_unit
 from terrafix_tools.accept.table import nees_band
 
 GOOD = FrameCase()
@@ -160,9 +160,9 @@ def test_the_reprojection_error_of_a_hovering_camera_is_finite(tmp_path: Path) -
 
 def test_a_lost_flight_must_request_a_position(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lost = [FrameCase(fixed=False, sigma_m=800.0)] * 20
-    asked = of.prior_request_delay_s(evidence(tmp_path / "a", [*[FrameCase()] * 4, *lost]))
-    assert asked.value == pytest.approx(0.0, abs=0.5)  # up to one frame
-    assert asked.why == "asked 4 s into the flight"  # lost from frame 4, at 2 s; 3 frames and 2 s later
+    delay = of.prior_request_delay_s(evidence(tmp_path / "a", [*[FrameCase()] * 4, *lost]))
+    assert delay.value == pytest.approx(0.0, abs=0.5)  # up to one frame
+    assert delay.why == "asked 4 s into the flight"  # lost from frame 4, at 2 s; 3 frames and 2 s later
     for short in ([FrameCase()] * 10, [*[FrameCase()] * 4, *lost[:4], *[FrameCase()] * 4]):
         found = of.prior_request_delay_s(evidence(tmp_path / f"b{len(short)}", short))
         assert (found.value, found.verdict) == (None, None) and "never lost" in found.why

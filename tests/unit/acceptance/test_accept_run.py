@@ -14,10 +14,10 @@ from rich.console import Console
 from accept_case import FrameCase, evidence
 from terrafix.core.errors import MapError, OutputError, UsageError
 from terrafix_tools.accept import fly, run
+from terrafix_tools.accept.false_inputs.scenarios import LIES
 from terrafix_tools.accept.fly import Job, Point, Result
-from terrafix_tools.accept.lies.lies import LIES
 from terrafix_tools.accept.measuring.criteria import EVERYWHERE, unmeasured
-from terrafix_tools.accept.measuring.judged import JudgedRow, Marks, Span, Verdict
+from terrafix_tools.accept.measuring.results import JudgedRow, Marks, Span, Verdict
 from terrafix_tools.accept.run import AcceptOptions, accept, truth_of
 from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
 from terrafix_tools.accept.table import conclude, headline, markdown, write
@@ -97,7 +97,7 @@ def test_the_three_files_agree(tmp_path: Path) -> None:
     assert headline(acceptance).startswith("1 scenarios flown: 1 pass, 1 below floor")
 
 
-def test_lies_replace_the_ordinary_scenarios_and_names_select_any() -> None:
+def test_false_inputs_replace_the_ordinary_scenarios_and_names_select_any() -> None:
     out = Path("out")
     assert run._chosen(AcceptOptions(out=out)) == list(SCENARIOS)
     assert run._chosen(AcceptOptions(out=out, lies=True)) == list(LIES)
@@ -114,7 +114,7 @@ def test_a_job_has_the_other_map_and_quick_limits_its_frames(tmp_path: Path) -> 
     assert whole["start 300 m off"].frames is None
 
 
-def test_frames_in_a_lie_are_excluded_from_nees_and_claim_width(tmp_path: Path) -> None:
+def test_frames_in_a_false_input_are_excluded_from_nees_and_claim_width(tmp_path: Path) -> None:
     lie = Span(5.0, 10.0, "lie")
     frames = [FrameCase(error_m=3.0)] * 10 + [FrameCase(error_m=90.0)] * 11 + [FrameCase(error_m=3.0)] * 9
     found = evidence(tmp_path, frames, Marks(spans=(lie,), lie=lie))

@@ -49,10 +49,10 @@ class StubEstimator:
             case m.Odometry(frame_id=i):
                 if i == self._die_at:
                     raise RuntimeError("a bug")
-                said = m.MeasurementVerdict(
+                verdict = m.MeasurementVerdict(
                     t_ns=message.t_ns, frame_id=i, measurement="odometry", verdict=message.verdict
                 )
-                yield said
+                yield verdict
                 if i != LOST:
                     yield estimate(i, 999.0, 999.0)
                     yield estimate(i, 10.0 * i, -10.0)
@@ -128,8 +128,12 @@ def test_the_summary_has_a_verdict_from_rows_faults_and_map_matches(folder: Path
                 fault = {"t_ns": message.t_ns, "quantity": "scale", "factor": 2.0, "detail": ""}
                 yield m.CalibrationFault(**fault, active=True)
 
-    said = replay(folder, None, tmp_path / "right", nodes=nodes)["verdict"]
-    assert said["verdict"] == "trust it in part" and said["reasons"] == ["no position"] and said["active_faults"] == []
+    verdict = replay(folder, None, tmp_path / "right", nodes=nodes)["verdict"]
+    assert (
+        verdict["verdict"] == "trust it in part"
+        and verdict["reasons"] == ["no position"]
+        and verdict["active_faults"] == []
+    )
     wrong = replay(folder, None, tmp_path / "wrong", nodes=lambda ctx: nodes(ctx) | {"estimator": Faulty()})["verdict"]
     assert wrong["verdict"] == "do not trust it"
     assert wrong["active_faults"] == ["height/focal seems x2.00 off"]
@@ -167,15 +171,15 @@ def test_the_ground_height_at_the_start_comes_from_the_map(folder: Path, tmp_pat
         file.write(np.full((1, 20, 20), 512.5, np.float32))
     package = build(tmp_path / "maps" / "here.tif", tmp_path / "with-dem.gpkg", dem=dem)
     replay(folder, package, tmp_path / "out", nodes=nodes)
-    said = next(x for _, _, x in read_flight(tmp_path / "out") if isinstance(x, m.Origin))
-    assert said.ground_amsl_m is not None
-    assert math.isclose(said.ground_amsl_m, 512.5, abs_tol=0.1)
+    origin = next(x for _, _, x in read_flight(tmp_path / "out") if isinstance(x, m.Origin))
+    assert origin.ground_amsl_m is not None
+    assert math.isclose(origin.ground_amsl_m, 512.5, abs_tol=0.1)
 
 
 def test_a_given_start_overrides_that_of_the_source(folder: Path, tmp_path: Path) -> None:
     replay(folder, None, tmp_path / "out", start=(48.0001, 11.0), nodes=nodes)
-    said = next(x for _, _, x in read_flight(tmp_path / "out") if isinstance(x, m.Origin))
-    assert (said.lat_deg, said.lon_deg) == (48.0001, 11.0)
+    origin = next(x for _, _, x in read_flight(tmp_path / "out") if isinstance(x, m.Origin))
+    assert (origin.lat_deg, origin.lon_deg) == (48.0001, 11.0)
 
 
 def test_the_error_of_a_map_elsewhere_states_the_distance(folder: Path, tmp_path: Path) -> None:

@@ -86,10 +86,10 @@ def test_build_reports_its_result(
 ) -> None:
     """Only the report; tests/unit/runtime builds on a simulated machine with TensorRT."""
     monkeypatch.setattr(build.providers, "check", lambda _: None)
-    asked: list[dict[str, Any]] = []
+    options: list[dict[str, Any]] = []
 
     def opened(_model: object, **more: Any) -> Any:
-        asked.append(more)
+        options.append(more)
         return type(
             "Opened", (), {"provider": provider, "sha256": "f" * 64, "rejected_providers": ["TensorRT: out of memory"]}
         )
@@ -97,7 +97,7 @@ def test_build_reports_its_result(
     monkeypatch.setattr(build, "open_complete", opened)
     provider = TENSORRT
     build_all(["tiny"], str(folder))
-    assert asked == [{"build": True}] and f"ready in {folder}/engines/{'f' * 16}" in capsys.readouterr().out
+    assert options == [{"build": True}] and f"ready in {folder}/engines/{'f' * 16}" in capsys.readouterr().out
     provider = CUDA
     with pytest.raises(ModelError, match=r"tiny: no engine \(TensorRT: out of memory\)"):
         build_all(["tiny"], str(folder))

@@ -115,7 +115,7 @@ shape = ["pairs"]
 DataSet = Callable[[str], Path]
 
 
-def kept(folder: Path, text: str, content: bytes) -> StoredModel:
+def stored(folder: Path, text: str, content: bytes) -> StoredModel:
     path = tiny_onnx.write(folder, text, content)
     return stored_model(manifest.read(path.with_suffix(".toml")), folder)
 
@@ -125,7 +125,7 @@ def exported(folder: Path, keypoints: np.ndarray, scores: np.ndarray, descriptor
     content = tiny_onnx.constants(
         {"image": ([1, 1, "h", "w"], "float32")}, {k: v.astype(np.float32) for k, v in outputs.items()}
     )
-    return kept(folder, DETECTOR, content)
+    return stored(folder, DETECTOR, content)
 
 
 def test_an_image_is_converted_as_the_manifest_specifies() -> None:
@@ -227,7 +227,7 @@ def test_a_matcher_runs_by_its_manifest_and_must_not_match_missing_keypoints(tmp
     partner = np.full((1, 9), -1, np.int64)
     partner[0, 3] = 8
     outputs = {"m": partner, "s": np.full((1, 9), 0.7, np.float32)}
-    matcher = open_matcher(kept(tmp_path, MATCHER, tiny_onnx.constants(inputs, outputs)))
+    matcher = open_matcher(stored(tmp_path, MATCHER, tiny_onnx.constants(inputs, outputs)))
     first, second = points(np.ones((9, 4), np.float32)), points(np.ones((12, 4), np.float32))
     pairs, scores = matcher.match(first, second)
     assert pairs.tolist() == [[3, 8]] and np.allclose(scores, 0.7)
@@ -241,7 +241,7 @@ def test_a_model_of_fixed_size_pads_small_images_and_rejects_larger_ones(tmp_pat
     content = tiny_onnx.constants(
         {"image": ([1, 1, 64, 96], "float32")}, {k: v.astype(np.float32) for k, v in outputs.items()}
     )
-    detector = open_detector(kept(tmp_path, DETECTOR.replace('"height", "width"', "64, 96"), content))
+    detector = open_detector(stored(tmp_path, DETECTOR.replace('"height", "width"', "64, 96"), content))
     assert len(detector.detect(np.zeros((60, 90, 3), np.uint8), 10).xy_px) == 3
     with pytest.raises(ModelRunError, match="takes images of 96x64 px, not 97x60"):
         detector.detect(np.zeros((60, 97, 3), np.uint8), 10)
@@ -255,7 +255,7 @@ def test_swapped_outputs_in_a_keypoint_manifest_are_reported(tmp_path: Path) -> 
     content = tiny_onnx.constants(
         {"image": ([1, 1, "h", "w"], "float32")}, {k: v.astype(np.float32) for k, v in outputs.items()}
     )
-    detector = open_detector(kept(tmp_path, text, content))
+    detector = open_detector(stored(tmp_path, text, content))
     with pytest.raises(ModelRunError, match=r"points: 3 keypoints, 3 scores, 4 descriptors; check \[keypoints\]"):
         detector.detect(np.zeros((64, 64, 3), np.uint8), 10)
 
@@ -265,7 +265,7 @@ def test_an_image_pair_model_returns_corresponding_points(tmp_path: Path) -> Non
     first, second = np.zeros((8, 20, 3), np.uint8), np.zeros((6, 24, 3), np.uint8)
     for row, (x0, x1) in enumerate(((3, 5), (19, 23), (0, 11), (7, 9), (2, 1), (4, 6))):
         first[row, x0], second[row, x1] = 51 * row, 255
-    matcher = open_pair_matcher(kept(tmp_path, SEMI_DENSE, tiny_onnx.brightest_of_rows()))
+    matcher = open_pair_matcher(stored(tmp_path, SEMI_DENSE, tiny_onnx.brightest_of_rows()))
     found = matcher.match(first, second)
     # Both are padded to 24 x 8. Rows 6 and 7 of the second one are padding, and bright: they must be dropped.
     assert matcher.name == "both"
@@ -282,12 +282,12 @@ def test_swapped_outputs_in_a_pair_manifest_are_reported(tmp_path: Path) -> None
         (SEMI_DENSE.split("[pair]")[0] + "[[inputs]]" + SEMI_DENSE.split("[[inputs]]", 1)[1], r"a section \[pair\]"),
     ):
         with pytest.raises(manifest.ManifestError, match=reason):
-            kept(tmp_path, text, b"no model")
+            stored(tmp_path, text, b"no model")
     outputs = {"mkpts0": np.zeros((3, 2)), "mkpts1": np.zeros((3, 2)), "mconf": np.zeros(2)}
     pictures: dict[str, tuple[tiny_onnx.Shape, str]] = {f"image{k}": ([1, 1, "h", "w"], "float32") for k in (0, 1)}
     content = tiny_onnx.constants(pictures, {k: v.astype(np.float32) for k, v in outputs.items()})
     stated = SEMI_DENSE.replace('name = "mconf"\nshape = ["pairs"]', 'name = "mconf"\nshape = ["scores"]')
-    matcher = open_pair_matcher(kept(tmp_path, stated, content))
+    matcher = open_pair_matcher(stored(tmp_path, stated, content))
     with pytest.raises(ModelRunError, match=r"both: 3 and 3 points, 2 scores; check \[pair\]"):
         matcher.match(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8, 3), np.uint8))
 

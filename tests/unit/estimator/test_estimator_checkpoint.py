@@ -34,7 +34,7 @@ def flight() -> Flight:
 
 @pytest.fixture(scope="module")
 def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> EstimatorCheckpoint:
-    """What it said last, through the file."""
+    """Its last checkpoint, through the file."""
     file = tmp_path_factory.mktemp("run") / "estimator.checkpoint"
     assert load_checkpoint(file) is None
     keeper = CheckpointWriter(file)
@@ -50,10 +50,10 @@ def resumed(flight: Flight, last: EstimatorCheckpoint | None) -> EstimatorRun:
     run.node = EstimatorNode(0, last)
     run.feed([ORIGIN])
     for i in range(BACK, flight.frames):
-        said = flight.messages(i)
+        messages = flight.messages(i)
         if i == BACK:  # its keyframe is not known to this one
-            said = [blind(m) if isinstance(m, Odometry) else m for m in said]
-        run.feed(said)
+            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
+        run.feed(messages)
     return run
 
 
@@ -63,15 +63,15 @@ def test_it_goes_on_from_there(flight: Flight, killed: EstimatorCheckpoint) -> N
     assert np.linalg.norm(error_m(first, flight)[:2]) < 25.0
     assert sigma_m(killed.estimate) < sigma_m(first) < 40.0
     for i in range(BACK, flight.frames):
-        said = run.estimate(i)
-        assert np.linalg.norm(error_m(said, flight)[:2]) < 3.5 * np.sqrt(2.0) * sigma_m(said)
+        estimate = run.estimate(i)
+        assert np.linalg.norm(error_m(estimate, flight)[:2]) < 3.5 * np.sqrt(2.0) * sigma_m(estimate)
     assert sigma_m(run.estimate(flight.frames - 1)) < 10.0
 
 
-def test_the_anchor_is_told_of_the_way_in_between(flight: Flight, killed: EstimatorCheckpoint) -> None:
-    told = next(m for m in resumed(flight, killed).published if isinstance(m, Prediction))
+def test_the_prediction_has_the_step_since_the_checkpoint(flight: Flight, killed: EstimatorCheckpoint) -> None:
+    prediction = next(m for m in resumed(flight, killed).published if isinstance(m, Prediction))
     flown_m = flight.p_m[BACK, :2] - flight.p_m[KILLED - 1, :2]
-    assert np.linalg.norm(told.step_m - flown_m) < 20.0 < np.linalg.norm(flown_m)
+    assert np.linalg.norm(prediction.step_m - flown_m) < 20.0 < np.linalg.norm(flown_m)
 
 
 def test_without_what_it_left_it_knows_the_start_only(flight: Flight) -> None:
@@ -102,18 +102,18 @@ def test_frames_wait_for_the_words_to_which_belongs_what_was_learnt(
 ) -> None:
     """Vision is there before the link: a graph that began blind would begin anew, and lose its keyframe."""
     node = EstimatorNode(0, killed)
-    said = list(node.on(ORIGIN))
+    messages = list(node.on(ORIGIN))
     frames = [next(m for m in flight.messages(i) if isinstance(m, Odometry)) for i in (BACK, BACK + 1)]
     frames[0] = blind(frames[0])
     for odometry in frames:
-        said += node.on(odometry)
-    assert not said
+        messages += node.on(odometry)
+    assert not messages
     words = [m for i in (BACK, BACK + 1) for m in flight.messages(i) if isinstance(m, VehicleState)]
     for message in words:
-        said += node.on(message)
-    first = next(m for m in said if isinstance(m, Prediction))
+        messages += node.on(message)
+    first = next(m for m in messages if isinstance(m, Prediction))
     assert first.frame_id == BACK and np.sqrt(first.cov[35]) < 0.1
-    assert sum(isinstance(m, Prediction) for m in said) == 2
+    assert sum(isinstance(m, Prediction) for m in messages) == 2
 
 
 def test_a_picture_that_is_older_than_the_first_words_is_not_begun_with(
@@ -121,44 +121,44 @@ def test_a_picture_that_is_older_than_the_first_words_is_not_begun_with(
 ) -> None:
     """A camera has buffers. Begun with it, the graph was blind, and the anchor looked at all headings for 8 s."""
     node = EstimatorNode(0, killed)
-    said = list(node.on(ORIGIN))
+    messages = list(node.on(ORIGIN))
     old, new = BACK, BACK + 4  # two seconds
     for message in [m for m in flight.messages(new) if isinstance(m, VehicleState)]:
-        said += node.on(message)
+        messages += node.on(message)
     for i in (old, new, new + 1):
-        said += [x for m in flight.messages(i) if isinstance(m, Odometry) for x in node.on(blind(m))]
-    told = [m for m in said if isinstance(m, Prediction)]
-    assert [m.frame_id for m in told] == [new, new + 1]
-    verdicts = {m.frame_id: m.verdict for m in said if isinstance(m, MeasurementVerdict)}
+        messages += [x for m in flight.messages(i) if isinstance(m, Odometry) for x in node.on(blind(m))]
+    predictions = [m for m in messages if isinstance(m, Prediction)]
+    assert [m.frame_id for m in predictions] == [new, new + 1]
+    verdicts = {m.frame_id: m.verdict for m in messages if isinstance(m, MeasurementVerdict)}
     assert verdicts.pop(old) is Verdict.STALE and sorted(verdicts) == [new, new + 1]
-    assert np.sqrt(told[0].cov[35]) < 0.1
+    assert np.sqrt(predictions[0].cov[35]) < 0.1
 
 
 def test_odometry_against_a_picture_that_was_left_out_is_not_lost(flight: Flight, killed: EstimatorCheckpoint) -> None:
     """It is the keyframe of the pictures after it, for up to five seconds where a vehicle is slow."""
     old, new, features = BACK, BACK + 4, some_features()
     node = EstimatorNode(0, killed)
-    said = list(node.on(ORIGIN))
-    said += node.on(blind(next(m for m in flight.messages(old) if isinstance(m, Odometry))))
+    messages = list(node.on(ORIGIN))
+    messages += node.on(blind(next(m for m in flight.messages(old) if isinstance(m, Odometry))))
     for i in (new, new + 1, new + 2):
         for message in [m for m in flight.messages(i) if isinstance(m, VehicleState)]:
-            said += node.on(message)
-        said += node.on(same_features(flight, old, i, features[5 * (i - new) :]))  # no two show the same of them
-    judged = [m for m in said if isinstance(m, MeasurementVerdict) and m.measurement == "odometry"]
-    verdicts = {m.frame_id: m.verdict for m in judged}
+            messages += node.on(message)
+        messages += node.on(same_features(flight, old, i, features[5 * (i - new) :]))  # no two show the same of them
+    odometry_verdicts = [m for m in messages if isinstance(m, MeasurementVerdict) and m.measurement == "odometry"]
+    verdicts = {m.frame_id: m.verdict for m in odometry_verdicts}
     assert verdicts == {old: Verdict.STALE} | dict.fromkeys((new, new + 1, new + 2), Verdict.ACCEPTED)
-    told = [m for m in said if isinstance(m, Prediction)]
-    for i, step in ((new + 1, told[1]), (new + 2, told[2])):
+    predictions = [m for m in messages if isinstance(m, Prediction)]
+    for i, step in ((new + 1, predictions[1]), (new + 2, predictions[2])):
         flown_m = flight.p_m[i, :2] - flight.p_m[i - 1, :2]
         assert np.linalg.norm(step.step_m - flown_m) < 1.5 < 0.5 * np.linalg.norm(flown_m)
 
 
-def test_an_autopilot_that_says_nothing_is_not_waited_for(flight: Flight, killed: EstimatorCheckpoint) -> None:
+def test_an_autopilot_without_telemetry_is_not_waited_for(flight: Flight, killed: EstimatorCheckpoint) -> None:
     node = EstimatorNode(0, killed)
-    said = list(node.on(ORIGIN))
+    messages = list(node.on(ORIGIN))
     for i in range(BACK, BACK + 5):
-        said += [x for m in flight.messages(i) if isinstance(m, Odometry) for x in node.on(blind(m))]
-    assert sum(isinstance(m, Prediction) for m in said) >= 4
+        messages += [x for m in flight.messages(i) if isinstance(m, Odometry) for x in node.on(blind(m))]
+    assert sum(isinstance(m, Prediction) for m in messages) >= 4
 
 
 def flown_on(turned_deg: float, from_s: float) -> np.ndarray:
@@ -203,7 +203,7 @@ def test_a_compass_that_is_off_as_it_was_learnt_has_not_turned() -> None:
     assert way_m == pytest.approx([PLANE_MPS * DOWN_S, 0.0], abs=0.1)
 
 
-def test_the_heading_of_a_copter_that_flies_sideways_tells_nothing() -> None:
+def test_the_heading_of_a_copter_that_flies_sideways_is_no_course() -> None:
     sideways = plane(heads_rad=0.0)
     assert np.array_equal(sideways.path_until(DOWN_S, 1.0)[0], sideways.path_until(DOWN_S, None)[0])
     hovers = NavPrior(0.0, np.zeros(2), 5.0, np.array([1.0, 0.0]), 0.4, math.radians(90.0))

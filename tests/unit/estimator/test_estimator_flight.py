@@ -65,38 +65,38 @@ def long_run(long_flight: Flight) -> EstimatorRun:
 
 
 @pytest.mark.slow
-def test_the_position_is_right_all_the_way(long_flight: Flight, long_run: EstimatorRun) -> None:
+def test_the_position_is_right_in_the_whole_flight(long_flight: Flight, long_run: EstimatorRun) -> None:
     errors = [np.linalg.norm(error_m(long_run.estimate(i), long_flight)[:2]) for i in range(20, 300)]
     assert np.median(errors) < 4.0 and max(errors) < 15.0
     heights = [abs(error_m(long_run.estimate(i), long_flight)[2]) for i in range(20, 300)]
     assert np.median(heights) < 4.0
 
 
-def test_the_covariance_is_honest(long_flight: Flight, long_run: EstimatorRun) -> None:
+def test_the_covariance_is_consistent(long_flight: Flight, long_run: EstimatorRun) -> None:
     nees, inside = [], 0
     for i in range(10, 300):
-        said = long_run.estimate(i)
-        e = error_m(said, long_flight)[:2]
-        nees.append(float(e @ np.linalg.solve(cov_of(said)[:2, :2], e)))
+        estimate = long_run.estimate(i)
+        e = error_m(estimate, long_flight)[:2]
+        nees.append(float(e @ np.linalg.solve(cov_of(estimate)[:2, :2], e)))
         inside += nees[-1] <= 5.991
     assert 0.5 < np.mean(nees) < 3.0  # 2 would be exact; the errors of neighbours are one error
     assert inside / len(nees) > 0.9
 
 
 def test_every_covariance_is_one(long_run: EstimatorRun) -> None:
-    for said in long_run.published:
-        if isinstance(said, NavEstimate | Prediction):
-            cov = np.array(said.cov).reshape(6, 6)
+    for message in long_run.published:
+        if isinstance(message, NavEstimate | Prediction):
+            cov = np.array(message.cov).reshape(6, 6)
             assert np.allclose(cov, cov.T, rtol=1e-6, atol=1e-9)
             assert np.linalg.eigvalsh(cov).min() > 0.0
 
 
-def test_attitude_is_right_and_its_sigma_honest(long_flight: Flight, long_run: EstimatorRun) -> None:
+def test_the_attitude_is_right_and_its_sigma_consistent(long_flight: Flight, long_run: EstimatorRun) -> None:
     errors, claimed = [], []
     for i in range(20, 300):
-        said = long_run.estimate(i)
-        errors.append(log_so3(rot_from_quat(said.q_w_b) @ long_flight.r_w_b[i].T))
-        claimed.append(cov_of(said).diagonal()[3:])
+        estimate = long_run.estimate(i)
+        errors.append(log_so3(rot_from_quat(estimate.q_w_b) @ long_flight.r_w_b[i].T))
+        claimed.append(cov_of(estimate).diagonal()[3:])
     assert np.degrees(np.abs(errors).max()) < 3.0
     assert (np.mean(np.square(errors) / claimed, axis=0) < 2.0).all()
 
@@ -107,7 +107,7 @@ def test_velocity_is_right(long_flight: Flight, long_run: EstimatorRun) -> None:
     assert np.abs(np.mean(errors, axis=0)).max() < 0.4
 
 
-def test_velocity_is_as_good_as_its_sigma_says(long_flight: Flight, long_run: EstimatorRun) -> None:
+def test_the_velocity_error_agrees_with_its_sigma(long_flight: Flight, long_run: EstimatorRun) -> None:
     """It goes to the autopilot as speed accuracy, and dead reckoning lives on it."""
     sigmas = np.array([long_run.estimate(i).velocity_sigma_mps for i in range(20, 299)])
     normalised = np.square(velocity_errors(long_flight, long_run)[:, :2] / sigmas[:, None])
@@ -122,9 +122,11 @@ def velocity_errors(flight: Flight, run: EstimatorRun) -> np.ndarray:
 
 def test_a_step_is_claimed_as_well_as_it_is_seen(long_flight: Flight, long_run: EstimatorRun) -> None:
     """The anchor's belief and searches live on it. How the ground rises, which no map tells here, is no part of it."""
-    said = [m for m in long_run.published if isinstance(m, Prediction) and m.frame_id > 20]
-    sigmas_m = np.sqrt([m.step_cov_m2[0] for m in said])
-    errors_m = [m.step_m - np.diff(long_flight.p_m[m.frame_id - 1 : m.frame_id + 1], axis=0)[0, :2] for m in said]
+    predictions = [m for m in long_run.published if isinstance(m, Prediction) and m.frame_id > 20]
+    sigmas_m = np.sqrt([m.step_cov_m2[0] for m in predictions])
+    errors_m = [
+        m.step_m - np.diff(long_flight.p_m[m.frame_id - 1 : m.frame_id + 1], axis=0)[0, :2] for m in predictions
+    ]
     assert np.mean(np.square(errors_m) / sigmas_m[:, None] ** 2) < 1.5
     assert np.median(sigmas_m) < 0.2 * SPEED_MPS * FRAME_S
 
@@ -154,9 +156,11 @@ def test_an_error_of_a_keyframe_is_in_one_step_and_not_in_each_one_from_it() -> 
                 run.feed([msgspec.structs.replace(message, pairs=pairs)])
             elif not isinstance(message, MapMatch):
                 run.feed([message])
-    said = {m.frame_id: m for m in run.published if isinstance(m, Prediction)}
+    predictions = {m.frame_id: m for m in run.published if isinstance(m, Prediction)}
     off_m = [
-        np.hypot(*(np.array(said[i].step_m) - np.diff(flight.p_m[i - 1 : i + 1], axis=0)[0, :2])) for i in said if i
+        np.hypot(*(np.array(predictions[i].step_m) - np.diff(flight.p_m[i - 1 : i + 1], axis=0)[0, :2]))
+        for i in predictions
+        if i
     ]
     assert run.verdicts("odometry")[end - 1].verdict is Verdict.ACCEPTED
     assert off_m[first - 1] > 4.0
@@ -168,9 +172,9 @@ def test_refined_positions_are_no_worse(long_flight: Flight, long_run: Estimator
     assert sorted(p.frame_id for p in last.poses) == list(range(300))
     refined, immediate = [], []
     for pose in last.poses:
-        said = long_run.estimate(pose.frame_id)
-        immediate.append(np.linalg.norm(error_m(said, long_flight)[:2]))
-        moved = msgspec.structs.replace(said, lat_deg=pose.lat_deg, lon_deg=pose.lon_deg)
+        estimate = long_run.estimate(pose.frame_id)
+        immediate.append(np.linalg.norm(error_m(estimate, long_flight)[:2]))
+        moved = msgspec.structs.replace(estimate, lat_deg=pose.lat_deg, lon_deg=pose.lon_deg)
         refined.append(np.linalg.norm(error_m(moved, long_flight)[:2]))
     assert np.mean(refined) <= np.mean(immediate)
 
@@ -200,7 +204,7 @@ def test_before_the_first_fix_there_is_no_age() -> None:
     assert sigma_m(run.estimate(3)) > ORIGIN.start_sigma_m * 0.9
 
 
-def test_two_runs_say_the_same() -> None:
+def test_two_runs_publish_the_same() -> None:
     flight = Flight(40, seed=5)
     runs = [EstimatorRun() for _ in range(2)]
     for run in runs:
@@ -358,13 +362,13 @@ def test_coarse_matches_that_would_find_a_position_do_and_the_old_place_is_not_f
     flight, run, away_m = coarsely_led(last=68)
     restarted = [i for i in range(40, 69, 4) if run.verdicts("map")[i].detail.startswith("restarted")]
     assert restarted == [60]  # the sixth, after 120 m at 100 m height
-    said = run.estimate(62)
-    assert np.linalg.norm(error_m(said, flight, away_m)[:2]) < 15.0
-    off_m = error_m(said, flight)[:2]
-    assert float(off_m @ np.linalg.solve(cov_of(said)[:2, :2], off_m)) < 9.0
+    estimate = run.estimate(62)
+    assert np.linalg.norm(error_m(estimate, flight, away_m)[:2]) < 15.0
+    off_m = error_m(estimate, flight)[:2]
+    assert float(off_m @ np.linalg.solve(cov_of(estimate)[:2, :2], off_m)) < 9.0
 
 
-def test_coarse_matches_confirm_a_doubt_that_poses_have_raised() -> None:
+def test_coarse_matches_confirm_another_place_that_poses_have_shown() -> None:
     """Rows led a flight aside, and where they end no pose stands."""
     flight, away_m = Flight(60, seed=9), (180.0, -140.0)
     run = EstimatorRun().fly(flight, 0, 40)
@@ -399,8 +403,8 @@ def test_a_place_that_was_found_late_is_carried_to_the_newest_frame() -> None:
     for i in range(30, 41):
         run.feed(without_fix(flight.messages(i)))
     found = msgspec.structs.replace(flight.fix(36, offset), found=True)
-    said = [m for m in run.feed([found]) if isinstance(m, NavEstimate)]
-    assert [(m.frame_id, m.last_anchor_age_ms) for m in said] == [(40, 2000)]
+    estimates = [m for m in run.feed([found]) if isinstance(m, NavEstimate)]
+    assert [(m.frame_id, m.last_anchor_age_ms) for m in estimates] == [(40, 2000)]
     for i in range(40, 60):
         if i > 40:
             run.feed(without_fix(flight.messages(i)))
@@ -427,10 +431,10 @@ def test_a_match_that_comes_late_still_helps() -> None:
     before = sigma_m(run.estimate(45))
     answers = run.feed([flight.fix(41)])  # the matcher took two seconds
     assert run.verdicts("map")[41].verdict is Verdict.ACCEPTED
-    said = [m for m in answers if isinstance(m, NavEstimate)]
-    assert [m.frame_id for m in said] == [45]  # the newest frame, made better
-    assert sigma_m(said[0]) < 0.8 * before
-    assert said[0].last_anchor_age_ms == 2000
+    estimates = [m for m in answers if isinstance(m, NavEstimate)]
+    assert [m.frame_id for m in estimates] == [45]  # the newest frame, made better
+    assert sigma_m(estimates[0]) < 0.8 * before
+    assert estimates[0].last_anchor_age_ms == 2000
 
 
 @pytest.mark.parametrize("why", [Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.OUTSIDE_MAP])
@@ -469,7 +473,7 @@ def test_no_telemetry_at_all() -> None:
     assert np.linalg.norm(error_m(run.estimate(39), flight)[:2]) < 15.0
 
 
-def test_nothing_is_said_before_the_origin() -> None:
+def test_nothing_is_published_before_the_origin() -> None:
     assert EstimatorRun().feed(Flight(3).messages(0)) == []
 
 
@@ -526,8 +530,8 @@ def test_another_origin_begins_another_flight() -> None:
     run = EstimatorRun().fly(flight, 0, 20)
     run.feed([msgspec.structs.replace(ORIGIN, t_ns=5)])
     run.feed(without_fix(flight.messages(20)))
-    said = run.estimate(20)
-    assert said.last_anchor_age_ms == -1 and sigma_m(said) > 10.0
+    estimate = run.estimate(20)
+    assert estimate.last_anchor_age_ms == -1 and sigma_m(estimate) > 10.0
 
 
 def test_the_error_of_the_map_is_added_once_a_map_has_placed_us() -> None:
@@ -537,9 +541,9 @@ def test_the_error_of_the_map_is_added_once_a_map_has_placed_us() -> None:
     for run, map_sigma_m in ((exact, 0.0), (off, 5.0)):
         run.feed([ORIGIN])
         for i in range(30):
-            said = flight.messages(i)
+            messages = flight.messages(i)
             run.feed(
-                msgspec.structs.replace(m, map_sigma_m=map_sigma_m) if isinstance(m, MapMatch) else m for m in said
+                msgspec.structs.replace(m, map_sigma_m=map_sigma_m) if isinstance(m, MapMatch) else m for m in messages
             )
     first = [next(m for m in run.published if isinstance(m, NavEstimate)) for run in (exact, off)]
     assert first[0].cov == first[1].cov
@@ -556,8 +560,8 @@ def test_over_hills_odometry_is_trusted_less() -> None:
         run = EstimatorRun()
         run.feed([ORIGIN])
         for i in range(30):
-            said = flight.messages(i)
-            kept = [m for m in said if i < 10 or not isinstance(m, MapMatch)]
+            messages = flight.messages(i)
+            kept = [m for m in messages if i < 10 or not isinstance(m, MapMatch)]
             run.feed(
                 msgspec.structs.replace(m, ground=(0.0, 0.0, 0.0), relief_m=relief_m) if isinstance(m, MapMatch) else m
                 for m in kept
@@ -586,10 +590,10 @@ def test_telemetry_that_begins_after_the_first_frame_is_a_new_beginning() -> Non
     run = EstimatorRun()
     run.feed([ORIGIN])
     for i in range(40):
-        said = flight.messages(i)
+        messages = flight.messages(i)
         if i == 0:
-            said = [m for m in said if not isinstance(m, VehicleState | MapMatch)]
-        run.feed(without_fix(said) if i < 3 else said)
+            messages = [m for m in messages if not isinstance(m, VehicleState | MapMatch)]
+        run.feed(without_fix(messages) if i < 3 else messages)
     errors = [float(np.linalg.norm(error_m(run.estimate(i), flight)[:2])) for i in range(10, 40)]
     heights = [abs(error_m(run.estimate(i), flight)[2]) for i in range(1, 40)]
     assert max(errors) < 15.0 and max(heights) < 30.0

@@ -194,7 +194,7 @@ def frozen(flight: Flight, i: int) -> Odometry:
     )
 
 
-def test_a_frozen_camera_is_not_taken_for_a_standing_vehicle() -> None:
+def test_a_frozen_camera_is_not_taken_for_a_stationary_vehicle() -> None:
     flight = Flight(FRAMES, seed=7)
     # The last true picture is a keyframe.
     listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)

@@ -17,18 +17,18 @@ LATEST = 4  # frames: two seconds
 def late(flight: Flight, frames: int, seed: int, latest: int = LATEST) -> list[Message]:
     """All messages of a flight, each match 0 to ``latest`` frames late, so that they also overtake each other."""
     rng = np.random.default_rng([seed, 6])
-    said: list[Message] = [ORIGIN]
+    published: list[Message] = [ORIGIN]
     due: list[tuple[int, float, MapMatch]] = []
     for i in range(frames):
         for message in flight.messages(i):
             if isinstance(message, MapMatch):
                 due.append((i + int(rng.integers(latest + 1)), float(rng.uniform()), message))
             else:
-                said.append(message)
-        said += [m for at, _, m in sorted(due, key=lambda d: d[1]) if at <= i]
+                published.append(message)
+        published += [m for at, _, m in sorted(due, key=lambda d: d[1]) if at <= i]
         due = [d for d in due if d[0] > i]
-    said += [m for _, _, m in due]
-    return [*said, SourceEnded(t_ns=t_ns(frames - 1), frames=frames)]
+    published += [m for _, _, m in due]
+    return [*published, SourceEnded(t_ns=t_ns(frames - 1), frames=frames)]
 
 
 def test_the_order_is_an_odd_one() -> None:
@@ -39,17 +39,17 @@ def test_the_order_is_an_odd_one() -> None:
 
 @pytest.mark.slow
 def test_the_same_odd_order_gives_the_same_bytes() -> None:
-    said = late(Flight(60, seed=5, fix_every=2), 60, seed=1)
+    messages = late(Flight(60, seed=5, fix_every=2), 60, seed=1)
     runs = [EstimatorRun(), EstimatorRun()]
     for run in runs:
-        run.feed(said)
+        run.feed(messages)
     assert msgspec.json.encode(runs[0].published) == msgspec.json.encode(runs[1].published)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_late_matches_are_worth_as_much_as_those_in_time(seed: int) -> None:
-    """Once they are heard: within a fifth of what both claim, and the claims within a tenth."""
+    """Once they have arrived: within a fifth of what both claim, and the claims within a tenth."""
     flight, frames = Flight(90, seed=seed, fix_every=3), 90
     timely, tardy = EstimatorRun().fly(flight, 0, frames), EstimatorRun()
     tardy.feed(late(flight, frames, seed))
@@ -62,7 +62,7 @@ def test_late_matches_are_worth_as_much_as_those_in_time(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_estimates_are_honest_while_matches_are_late() -> None:
+def test_covariance_is_consistent_while_matches_are_late() -> None:
     nees = []
     for seed in range(3):
         flight = Flight(80, seed=seed, fix_every=3)
@@ -74,14 +74,14 @@ def test_estimates_are_honest_while_matches_are_late() -> None:
     assert 0.4 < np.mean(nees) < 3.0  # 2 would be exact; neighbours share their errors
 
 
-def test_an_answer_to_an_old_frame_says_the_newest_place() -> None:
+def test_a_match_of_an_old_frame_publishes_the_newest_position() -> None:
     flight = Flight(40, seed=2)
     run = EstimatorRun().fly(flight, 0, 35)
     for i in range(35, 40):
         run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
-    said = [m for m in run.feed([flight.fix(37)]) if isinstance(m, NavEstimate)]
-    assert [(m.frame_id, m.t_ns, m.emitted_at_ns) for m in said] == [(39, t_ns(39), t_ns(39))]
-    assert said[0].last_anchor_age_ms == 1000
+    estimates = [m for m in run.feed([flight.fix(37)]) if isinstance(m, NavEstimate)]
+    assert [(m.frame_id, m.t_ns, m.emitted_at_ns) for m in estimates] == [(39, t_ns(39), t_ns(39))]
+    assert estimates[0].last_anchor_age_ms == 1000
     older = [m for m in run.feed([flight.fix(35)]) if isinstance(m, NavEstimate)]
     assert [m.last_anchor_age_ms for m in older] == [1000]  # the newest fix is still that of frame 37
 
@@ -90,8 +90,8 @@ def test_a_late_match_does_not_make_a_blind_frame_a_seen_one() -> None:
     flight = Flight(40, seed=2)
     run = EstimatorRun().fly(flight, 0, 37)
     for i in range(37, 40):
-        said = [m for m in flight.messages(i) if not isinstance(m, MapMatch)]
-        run.feed([blind(m) if isinstance(m, Odometry) else m for m in said])
+        messages = [m for m in flight.messages(i) if not isinstance(m, MapMatch)]
+        run.feed([blind(m) if isinstance(m, Odometry) else m for m in messages])
     run.feed([flight.fix(36)])
     assert run.verdicts("map")[36].verdict is Verdict.ACCEPTED
     assert run.estimate(39).source_label is SourceLabel.DEAD_RECKONED
@@ -118,11 +118,11 @@ def test_what_a_search_found_knows_its_ground_however_late_it_is() -> None:
     newer = msgspec.structs.replace(flight.fix(41), verdict=Verdict.AMBIGUOUS, ground=(0.0, 0.0, 0.0))
     found = msgspec.structs.replace(flight.fix(36, (300.0, 200.0)), found=True, ground=(20.0, 0.0, 0.0))
     run.feed([newer, found])
-    said = run.estimate(41)
-    assert said.alt_amsl_m - said.agl_m == pytest.approx(20.0, abs=0.5)
+    estimate = run.estimate(41)
+    assert estimate.alt_amsl_m - estimate.agl_m == pytest.approx(20.0, abs=0.5)
 
 
-def test_one_that_is_too_old_says_so_and_changes_nothing() -> None:
+def test_a_match_that_has_left_the_window_is_stale_and_changes_nothing() -> None:
     flight = Flight(60, seed=3)
     run = EstimatorRun().fly(flight, 0, 60)
     before = run.estimate(59)
@@ -131,7 +131,7 @@ def test_one_that_is_too_old_says_so_and_changes_nothing() -> None:
     assert not any(isinstance(m, NavEstimate) for m in answers) and run.estimate(59) == before
 
 
-def test_one_that_comes_after_the_flight_says_so() -> None:
+def test_a_match_after_the_end_of_the_flight_is_stale() -> None:
     """The anchor is still at its last picture when the source has ended."""
     flight = Flight(60, seed=3)
     run = EstimatorRun().fly(flight, 0, 59)
@@ -165,7 +165,7 @@ def test_ground_far_away_is_all_new() -> None:
 
 
 @pytest.mark.parametrize("hz", [0.5, 2.0, 5.0, 30.0])
-def test_more_frames_a_second_over_the_same_ground_do_not_tell_more(hz: float) -> None:
+def test_more_frames_a_second_over_the_same_ground_add_no_information(hz: float) -> None:
     """A vehicle that hovers for half a minute, 100 m up, after its first fix."""
     seen, counted = CorrelatedFixes(), 0.0
     seen.add(0.0, np.zeros(2))

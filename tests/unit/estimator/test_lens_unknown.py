@@ -16,7 +16,7 @@ from terrafix.estimator.measurements.map_pose import moved_by_lens
 from terrafix.estimator.models.lens_prior import principal_point_sigma, radial_k1_sigma
 from terrafix.estimator.state import CALIBRATION_SIZE, RADIAL_K1
 from terrafix.messages import CalibrationEstimate, MapMatch, Message, NavEstimate, Odometry, Prediction, Verdict
-from terrafix_tools.lens_words import lens_words
+from terrafix_tools.lens_report import lens_words
 
 ACTION_CAMERA_K1 = -0.28  # an action camera
 UNCALIBRATED, CALIBRATED = msgspec.structs.replace(CAMERA, focal_sigma=0.1), CAMERA

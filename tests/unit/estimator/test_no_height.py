@@ -1,4 +1,4 @@
-"""A flight whose height nobody says: the estimator does not make one up, and the first map match tells it."""
+"""A flight without a reported height: the estimator does not invent one, and the first map match measures it."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ FIRST_MATCH = 36
 
 
 @pytest.mark.parametrize("knows", [{"yaw", "attitude"}, set()], ids=["attitude", "nothing"])
-def test_the_height_stays_open_until_a_match_says_it(knows: set[str]) -> None:
+def test_the_height_stays_unknown_until_a_match_measures_it(knows: set[str]) -> None:
     flight, listener = Flight(72, seed=3, telemetry=frozenset(knows)), EstimatorRun()
     listener.feed([ORIGIN])
     for i in range(flight.frames):

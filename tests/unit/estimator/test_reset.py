@@ -29,11 +29,11 @@ def flight() -> Flight:
 
 
 def of_one_keyframe(flight: Flight, i: int) -> list[Message]:
-    """What is heard of frame i, all features of which are of frame 0; without a map match."""
+    """What is published of frame i, all features of which are of frame 0; without a map match."""
     features = some_features()[2 * i :]  # some are lost on the way
-    said = flight.messages(i)
-    odometry = next(m for m in said if isinstance(m, Odometry)) if i == 0 else same_features(flight, 0, i, features)
-    return [m for m in said if isinstance(m, VehicleState)] + [odometry]
+    messages = flight.messages(i)
+    odometry = next(m for m in messages if isinstance(m, Odometry)) if i == 0 else same_features(flight, 0, i, features)
+    return [m for m in messages if isinstance(m, VehicleState)] + [odometry]
 
 
 def without_telemetry(messages: list[Message]) -> list[Message]:
@@ -50,8 +50,8 @@ def test_odometry_of_the_keyframe_before_a_late_heading_is_fused(flight: Flight)
     run = EstimatorRun()
     run.feed([ORIGIN])
     for i in range(FRAMES):
-        said = of_one_keyframe(flight, i)
-        run.feed(said if i >= FIRST_TELEMETRY else without_telemetry(said))
+        messages = of_one_keyframe(flight, i)
+        run.feed(messages if i >= FIRST_TELEMETRY else without_telemetry(messages))
     assert {i: v.verdict for i, v in run.verdicts("odometry").items()} == dict.fromkeys(range(FRAMES), Verdict.ACCEPTED)
     reasons = {frame: verdict.detail for frame, verdict in run.verdicts("reset").items()}
     assert reasons == {0: ResetReason.FIRST_FRAME, FIRST_TELEMETRY: ResetReason.FIRST_TELEMETRY}
@@ -75,10 +75,10 @@ def test_where_the_first_frame_tracks_nothing_its_keyframe_stays_lost(flight: Fl
     run = EstimatorRun()
     run.feed([ORIGIN])
     for i in range(FRAMES):
-        said = of_one_keyframe(flight, i)
+        messages = of_one_keyframe(flight, i)
         if i == FIRST_TELEMETRY:
-            said = [blind(m) if isinstance(m, Odometry) else m for m in said]
-        run.feed(said if i >= FIRST_TELEMETRY else without_telemetry(said))
+            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
+        run.feed(messages if i >= FIRST_TELEMETRY else without_telemetry(messages))
     assert run.verdicts("odometry")[FIRST_TELEMETRY + 1].verdict is Verdict.STALE
 
 
@@ -89,8 +89,8 @@ def test_no_frame_of_the_first_second_is_looked_at_without_telemetry(
     run = EstimatorRun()
     run.feed([ORIGIN])
     for i in range(FRAMES):
-        heard = telemetry_from_s is not None and i * FRAME_S >= telemetry_from_s
-        run.feed(of_one_keyframe(flight, i) if heard else without_telemetry(of_one_keyframe(flight, i)))
+        has_telemetry = telemetry_from_s is not None and i * FRAME_S >= telemetry_from_s
+        run.feed(of_one_keyframe(flight, i) if has_telemetry else without_telemetry(of_one_keyframe(flight, i)))
     first_s = 1.0 if telemetry_from_s is None else min(telemetry_from_s, 1.0)
     looked_at = [m.frame_id for m in run.published if isinstance(m, Prediction)]
     assert looked_at == list(range(round(first_s / FRAME_S), FRAMES))
@@ -98,13 +98,13 @@ def test_no_frame_of_the_first_second_is_looked_at_without_telemetry(
 
 
 def test_telemetry_that_lasts_for_a_second_is_all_there_will_be(flight: Flight) -> None:
-    """An autopilot that tells no height, and that was heard before the camera was."""
+    """An autopilot that reports no height, and that is received before the camera is."""
     run = EstimatorRun()
     run.feed([ORIGIN])
     for i in range(4):
-        said = [
+        messages = [
             msgspec.structs.replace(m, agl_m=None) if isinstance(m, VehicleState) else m
             for m in of_one_keyframe(flight, i)
         ]
-        run.feed(said if i >= 2 else [m for m in said if isinstance(m, VehicleState)])
+        run.feed(messages if i >= 2 else [m for m in messages if isinstance(m, VehicleState)])
     assert [m.frame_id for m in run.published if isinstance(m, Prediction)] == [2, 3]

@@ -27,7 +27,7 @@ from terrafix.link.mavlink.message_rates import STREAMS_HZ
 from terrafix.link.node import LinkNode
 from terrafix.link.output import gps_input
 from terrafix_tools.sim.autopilot.course import PeerState, read_course, write_course
-from terrafix_tools.sim.autopilot.gps import GpsInputDriver, JitterCorrection
+from terrafix_tools.sim.autopilot.navigation.gps import GpsInputDriver, JitterCorrection
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, GPS_INPUT_ALONE, NO_DCM
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 

@@ -10,9 +10,9 @@ from pyproj import CRS, Geod
 from rasterio.transform import Affine
 
 from terrafix.core.errors import SourceError, TerrafixError, UsageError
-from terrafix_tools.mapping.area.area import Area, Placed
 from terrafix_tools.mapping.area.checks import check_area
 from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.area.polygons import Area, Placed
 
 EARTH = Geod(ellps="WGS84")
 SQUARE = [[13.0, 47.0], [13.1, 47.0], [13.1, 47.1], [13.0, 47.1], [13.0, 47.0]]

@@ -17,13 +17,13 @@ from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build
-from terrafix_tools.mapping.check.check import check
 from terrafix_tools.mapping.check.mission import mission_route
 from terrafix_tools.mapping.check.preview_page import page
 from terrafix_tools.mapping.check.sight import MatchabilityProbe, Sight
+from terrafix_tools.mapping.check.suitability import check
 from terrafix_tools.mapping.check.text import lines_of
 from terrafix_tools.mission.file import write_mission
-from terrafix_tools.mission.mission import Do, Item, Mission
+from terrafix_tools.mission.items import Do, Item, Mission
 
 WIDTH_PX, HEIGHT_PX = 1050, 350  # three kinds of ground side by side, a metre a pixel
 TEXTURE_E_M, FLAT_E_M, ROWS_E_M = -350.0, 0.0, 350.0  # their middles

@@ -11,14 +11,14 @@ from rasterio.transform import Affine
 import map_rasters
 import map_servers
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area.area import Area, Placed
 from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.area.polygons import Area, Placed
+from terrafix_tools.mapping.mosaic.compositing import Mosaic, MosaicPlan
 from terrafix_tools.mapping.mosaic.cover import uncovered
 from terrafix_tools.mapping.mosaic.grid import grid_for
-from terrafix_tools.mapping.mosaic.mosaic import Mosaic, MosaicPlan
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.sources.collared import raster_opener
-from terrafix_tools.mapping.sources.tile_grid import tiles_of
+from terrafix_tools.mapping.sources.tiles.grid import tiles_of
 
 WORLD = map_servers.pyramid(3, 4, zoom=16)
 

@@ -19,8 +19,8 @@ OWNERS = {
     "gtsam": (
         "terrafix.estimator",
         "terrafix_tools.finalise",
-        "terrafix_tools.bench.growth",
-        "terrafix_tools.bench.merging_baseline",
+        "terrafix_tools.bench.growth.estimator_cost",
+        "terrafix_tools.bench.growth.merging_baseline",
     ),
     "pymavlink": (
         "terrafix.link",

@@ -11,7 +11,7 @@ import pytest
 from terrafix.core.errors import SourceError, UsageError
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.file import read_mission, write_mission
-from terrafix_tools.mission.mission import AltitudeFrame, Box, Do, Item, check, targets
+from terrafix_tools.mission.items import AltitudeFrame, Box, Do, Item, check, targets
 from vehicle_missions import HOME, PLACE, at, flat, hills, mission
 
 WAYPOINTS = """QGC WPL 110

@@ -15,7 +15,7 @@ from terrafix_tools.sim.camera.lens import Fisheye
 from terrafix_tools.sim.camera.mount import Fixed, Gimbal, Motion
 from terrafix_tools.sim.camera.render import Film, Renderer
 from terrafix_tools.sim.camera.weather import Weather
-from terrafix_tools.sim.ground.ground import Ground, drape
+from terrafix_tools.sim.ground.draped_image import Ground, drape
 from terrafix_tools.sim.interfaces import State
 
 FRAME = LocalFrame(48.0, 15.0)  # on the central meridian of UTM 33

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafix_tools.mission.course import course
-from terrafix_tools.mission.mission import AltitudeFrame, Box, Do, Item
+from terrafix_tools.mission.items import AltitudeFrame, Box, Do, Item
 from terrafix_tools.sim.vehicle.copter import Copter, CopterLimits
 from terrafix_tools.sim.vehicle.plane import Plane, PlaneLimits
 from terrafix_tools.sim.vehicle.wind import Gusts, Wind

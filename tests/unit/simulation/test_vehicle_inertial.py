@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from terrafix.core.geodesy import rot_w_b
-from terrafix_tools.mission.mission import Do, Item, Mission
+from terrafix_tools.mission.items import Do, Item, Mission
 from terrafix_tools.sim.interfaces import State
 from terrafix_tools.sim.vehicle.copter import Copter
 from terrafix_tools.sim.vehicle.plane import Plane

@@ -16,7 +16,7 @@ from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageE
 from terrafix.core.mavlink.tlog import read_tlog
 from terrafix.vision.sources import open_source
 from terrafix_tools.cli import app
-from terrafix_tools.mission.mission import Box
+from terrafix_tools.mission.items import Box
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.camera.render import Renderer
 from terrafix_tools.sim.flights.folder import (

@@ -24,12 +24,12 @@ from terrafix.map.package import MapPackage
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
-from terrafix_tools.mission.mission import Do, Item, Mission
+from terrafix_tools.mission.items import Do, Item, Mission
 from terrafix_tools.preflight import autopilot as conversation
 from terrafix_tools.preflight import computer, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
-from terrafix_tools.preflight.judge import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.lines import Line, Status, number
+from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.rules import Context
 from terrafix_tools.preflight.run import _vehicle_lines, preflight
 from terrafix_tools.sim.autopilot.parameters import FIRMWARE
@@ -150,15 +150,15 @@ def test_only_parameters_of_the_firmware_version_are_requested() -> None:
 
 
 def test_the_firmware_version_comes_from_autopilot_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[int, int]] = []
+    firmwares: list[tuple[int, int]] = []
     monkeypatch.setattr(
-        "terrafix_tools.preflight.run.parameter_names", lambda at: asked.append(at.firmware) or parameter_names(at)
+        "terrafix_tools.preflight.run.parameter_names", lambda at: firmwares.append(at.firmware) or parameter_names(at)
     )
     for version in (4 << 24 | 6 << 16, 4 << 24 | 7 << 16):
         with Autopilot(LinkSection(), GroundAutopilot(TWO_PORTS, version=version)) as autopilot:
             autopilot.connect()
             list(_vehicle_lines(autopilot, Config()))
-    assert asked == [(4, 6), (4, 7)]
+    assert firmwares == [(4, 6), (4, 7)]
 
 
 @pytest.mark.parametrize(
@@ -250,11 +250,11 @@ def connected(there: GroundAutopilot, **link: Any) -> Autopilot:
 
 def test_parameters_are_read_despite_packet_loss() -> None:
     there = GroundAutopilot(DEFAULTS, loses=20)
-    with connected(there) as asked:
-        asked.connect(1.0)
-        read = asked.read([*DEFAULTS, "NO_SUCH_PARAMETER"])
+    with connected(there) as autopilot:
+        autopilot.connect(1.0)
+        read = autopilot.read([*DEFAULTS, "NO_SUCH_PARAMETER"])
     assert read == pytest.approx(DEFAULTS)
-    assert (asked.plane, asked.sysid, asked.armed) == (True, 1, False)
+    assert (autopilot.plane, autopilot.sysid, autopilot.armed) == (True, 1, False)
 
 
 @pytest.mark.parametrize(
@@ -267,8 +267,8 @@ def test_parameters_are_read_despite_packet_loss() -> None:
     ],
 )
 def test_a_wrong_or_ambiguous_autopilot_is_an_error(there: GroundAutopilot, link: dict[str, Any], says: str) -> None:
-    with connected(there, **link) as asked, pytest.raises(LinkError, match=says) as caught:
-        asked.connect(0.3)
+    with connected(there, **link) as autopilot, pytest.raises(LinkError, match=says) as caught:
+        autopilot.connect(0.3)
     assert "\n" not in str(caught.value)
 
 
@@ -277,7 +277,7 @@ class Streaming(GroundAutopilot):
 
     def __init__(self, share: float) -> None:
         super().__init__({})
-        self._share, self._asked, self.now_s = share, dict[int, float](), 0.0
+        self._share, self._requested, self.now_s = share, dict[int, float](), 0.0
 
     def clock(self) -> float:
         self.now_s += 0.001
@@ -286,13 +286,13 @@ class Streaming(GroundAutopilot):
     def write(self, packet: bytes, to: Address | None = None) -> bool:
         message = self._parser.decode(bytearray(packet))
         if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            self._asked[int(message.param1)] = 1e6 / message.param2
+            self._requested[int(message.param1)] = 1e6 / message.param2
             return True
         return super().write(packet)
 
     def read(self) -> list[Chunk]:
         before_s, self._read_s = getattr(self, "_read_s", 0.0), self.now_s
-        for message_id, rate_hz in self._asked.items():
+        for message_id, rate_hz in self._requested.items():
             each = rate_hz * self._share
             for _ in range(int(each * self.now_s) - int(each * before_s)):
                 kind = mavlink.mavlink_map[message_id]
@@ -309,24 +309,24 @@ def test_the_streams_of_the_link_are_requested_and_counted(
 ) -> None:
     monkeypatch.setattr(conversation, "RATES_S", 6.5)
     there = Streaming(share)
-    with Autopilot(LinkSection(), there, there.clock) as asked:
-        asked.connect(0.3)
-        line = vehicle.rates(asked.rates())
+    with Autopilot(LinkSection(), there, there.clock) as autopilot:
+        autopilot.connect(0.3)
+        line = vehicle.rates(autopilot.rates())
     assert (line.status, says in line.text) == (status, True), line.text
 
 
 def test_unreadable_parameters_are_one_line() -> None:
-    with connected(GroundAutopilot({})) as asked:
-        asked.connect(0.3)
+    with connected(GroundAutopilot({})) as autopilot:
+        autopilot.connect(0.3)
         with pytest.raises(LinkError, match="does not answer requests for parameters"):
-            asked.read(["GPS1_TYPE"])
+            autopilot.read(["GPS1_TYPE"])
 
 
 def test_a_parameter_that_keeps_its_value_is_an_error() -> None:
-    with connected(GroundAutopilot(DEFAULTS, read_only=("GPS1_TYPE",))) as asked:
-        asked.connect(0.3)
+    with connected(GroundAutopilot(DEFAULTS, read_only=("GPS1_TYPE",))) as autopilot:
+        autopilot.connect(0.3)
         with pytest.raises(LinkError, match="GPS1_TYPE could not be set to 14"):
-            asked.write("GPS1_TYPE", 14)
+            autopilot.write("GPS1_TYPE", 14)
 
 
 # --- the command ---
@@ -396,18 +396,18 @@ def test_an_invalid_device_is_one_failure_with_a_fix(device: str, tmp_path: Path
 
 def test_an_old_firmware_is_a_failure(wired: Any, tmp_path: Path) -> None:
     there = GroundAutopilot(DEFAULTS | preset("plane"), version=4 << 24 | 5 << 16)
-    with connected(there) as asked:
-        asked.connect(0.3)
-        lines = {line.check: line for line in vehicle.check_lines(asked, LinkSection(), 5.0)}
+    with connected(there) as autopilot:
+        autopilot.connect(0.3)
+        lines = {line.check: line for line in vehicle.check_lines(autopilot, LinkSection(), 5.0)}
     assert lines["firmware"].status == "fail"
     assert "4.5.0" in lines["firmware"].text
 
 
 def test_the_mission_on_board_is_saved_as_a_file(tmp_path: Path) -> None:
     there = GroundAutopilot(DEFAULTS, mission=((22, 48.0, 11.0, 50.0), (16, 48.01, 11.02, 120.0)))
-    with connected(there) as asked:
-        asked.connect(0.3)
-        assert vehicle.save_mission(asked, tmp_path / "m") is None
+    with connected(there) as autopilot:
+        autopilot.connect(0.3)
+        assert vehicle.save_mission(autopilot, tmp_path / "m") is None
     plan = read_mission(tmp_path / "m")
     assert plan.items[-1].lat_deg == pytest.approx(48.01)
     assert plan.items[-1].height_m == 120.0

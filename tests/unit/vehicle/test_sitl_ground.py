@@ -2,7 +2,7 @@
 
 import pytest
 
-from terrafix_tools.mission.mission import AltitudeFrame, Do, Item, Mission
+from terrafix_tools.mission.items import AltitudeFrame, Do, Item, Mission
 
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
 

@@ -1,4 +1,4 @@
-"""The scenarios of lies.py over several places and seeds: python -m terrafix_tools.accept.adversary --help.
+"""Scenarios with false inputs over several places and seeds: python -m terrafix_tools.accept.adversary --help.
 
 Places: pairs of images of one place at two dates (one for the camera, one for the map), the generated world, recorded
 flights. All results are in --out; existing ones are not flown again."""

@@ -8,7 +8,7 @@ import msgspec
 
 from terrafix_tools.accept.fly import Result
 from terrafix_tools.accept.measuring.criteria import CRITERIA
-from terrafix_tools.accept.measuring.judged import BROKEN, JudgedRow, Verdict, with_unit
+from terrafix_tools.accept.measuring.results import BROKEN, JudgedRow, Verdict, with_unit
 from terrafix_tools.accept.run import AcceptOptions
 from terrafix_tools.accept.table import Acceptance
 

@@ -16,11 +16,11 @@ from terrafix.link.integrity.fix_type import FIX_3D
 from terrafix.messages import Frame, GpsInput
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept.faults.faults import Edit
+from terrafix_tools.accept.false_inputs.closed_loop import LIES_IN_THE_LOOP
+from terrafix_tools.accept.faults.flight_edits import Edit
 from terrafix_tools.accept.generated import KINDS
-from terrafix_tools.accept.lies.closed_loop import LIES_IN_THE_LOOP
 from terrafix_tools.accept.measuring.evidence import Evidence, SentFix, gather
-from terrafix_tools.accept.measuring.judged import Marks, Span
+from terrafix_tools.accept.measuring.results import Marks, Span
 from terrafix_tools.estimates import ESTIMATES, read_rows
 from terrafix_tools.evaluate import read_truth
 from terrafix_tools.sim.closed_loop.flight import FRAME_HZ as LOOP_HZ

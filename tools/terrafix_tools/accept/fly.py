@@ -20,12 +20,12 @@ from terrafix.core.node import Node, NodeContext
 from terrafix.map.format import CE90_SIGMAS
 from terrafix.messages import Frame, Message
 from terrafix.vision.sources import Source
-from terrafix_tools.accept.faults.faults import AlteredSource, ThereAndBack, unchanged_origin
+from terrafix_tools.accept.false_inputs.integrity import claim_width, in_lie
+from terrafix_tools.accept.faults.flight_edits import AlteredSource, ThereAndBack, unchanged_origin
 from terrafix_tools.accept.flight import Flight, open_flight
-from terrafix_tools.accept.lies.integrity import claim_width, in_lie
 from terrafix_tools.accept.measuring.criteria import judge, unmeasured
 from terrafix_tools.accept.measuring.evidence import Evidence, gather
-from terrafix_tools.accept.measuring.judged import JudgedRow, Span
+from terrafix_tools.accept.measuring.results import JudgedRow, Span
 from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
 from terrafix_tools.accept.scenarios import BY_NAME, LONG_FRAMES
 from terrafix_tools.bench.flights import program_age_s

@@ -5,7 +5,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING
 
 from terrafix_tools.accept.fly import Result
-from terrafix_tools.accept.measuring.judged import BROKEN, JudgedRow, Verdict, with_unit
+from terrafix_tools.accept.measuring.results import BROKEN, JudgedRow, Verdict, with_unit
 from terrafix_tools.report.charts import Chart, spans_of
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from terrafix.messages import Origin
-from terrafix_tools.accept.faults import faults
+from terrafix_tools.accept.faults import flight_edits
 from terrafix_tools.accept.flight import Flight
-from terrafix_tools.accept.measuring.judged import Marks
+from terrafix_tools.accept.measuring.results import Marks
 from terrafix_tools.replay import MakeNodes, make_nodes
 
 CLOSED_LOOP = (
@@ -19,8 +19,8 @@ CLOSED_LOOP = (
 class Plan:
     """Edits that turn one flight into the scenario."""
 
-    edit: faults.Edit = faults.unchanged
-    origin: Callable[[Origin], Origin] = faults.unchanged_origin
+    edit: flight_edits.Edit = flight_edits.unchanged
+    origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin
     nodes: MakeNodes = make_nodes
     other_map: Callable[[Path, Path], str] | None = (
         None  # (map of the flight, map to write) -> reason for failure, or ""

@@ -15,11 +15,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from terrafix.core.errors import MapError, OutputError, TerrafixError, UsageError
 from terrafix.vision.sources import open_source
 from terrafix_tools.accept import fly
+from terrafix_tools.accept.false_inputs.closed_loop import LIES_IN_THE_LOOP
+from terrafix_tools.accept.false_inputs.scenarios import LIES
 from terrafix_tools.accept.fly import RESULT, Job, Result
-from terrafix_tools.accept.lies.closed_loop import LIES_IN_THE_LOOP
-from terrafix_tools.accept.lies.lies import LIES
 from terrafix_tools.accept.measuring.criteria import failed, unmeasured
-from terrafix_tools.accept.measuring.judged import BROKEN, with_unit
+from terrafix_tools.accept.measuring.results import BROKEN, with_unit
 from terrafix_tools.accept.plan import CLOSED_LOOP, Scenario
 from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
 from terrafix_tools.accept.table import Acceptance, conclude, write
@@ -59,7 +59,7 @@ class AcceptOptions:
     seed: int = 1
     models: tuple[str, ...] = ()
     configs: tuple[Path, ...] = ()
-    lies: bool = False  # the scenarios of lies.py, instead of the ordinary ones
+    lies: bool = False  # the scenarios of false_inputs/, instead of the ordinary ones
     other_map: Path | None = None  # GeoTIFF of another place
     workers: int = DEFAULT_WORKERS  # scenarios at a time
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.node import Image, Node, NodeContext
-from terrafix_tools.accept.faults import faults
+from terrafix_tools.accept.false_inputs.scenarios import LIES
+from terrafix_tools.accept.faults import flight_edits
 from terrafix_tools.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
 from terrafix_tools.accept.faults.stale_map import REACH, stale_along
 from terrafix_tools.accept.flight import Flight
-from terrafix_tools.accept.lies.lies import LIES
 from terrafix_tools.accept.measuring.criteria import EVERYWHERE
-from terrafix_tools.accept.measuring.judged import Marks, Span
+from terrafix_tools.accept.measuring.results import Marks, Span
 from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
 from terrafix_tools.replay import make_nodes
 
@@ -53,7 +53,10 @@ def _far_frame(flight: Flight) -> Plan | str:
 
 
 def _foreign(pictures: dict[str, Image]) -> Plan:
-    return Plan(faults.foreign_frames(pictures), marks=Marks(wrong_files=frozenset(map(faults.foreign_name, pictures))))
+    return Plan(
+        flight_edits.foreign_frames(pictures),
+        marks=Marks(wrong_files=frozenset(map(flight_edits.foreign_name, pictures))),
+    )
 
 
 def _outlier_fix(flight: Flight) -> Plan:
@@ -97,7 +100,7 @@ def _gaps(flight: Flight, parts: tuple[tuple[float, float], ...], turning: bool)
         gone |= {s.file for s in flight.frame_refs[gap[0] : gap[1]]}
         breaks.append(flight.frame_refs[gap[1]].t_s)
         spans.append(Span(flight.frame_refs[gap[0]].t_s, breaks[-1], "no frames"))
-    return Plan(faults.without_frames(frozenset(gone)), marks=Marks(spans=tuple(spans), breaks_s=tuple(breaks)))
+    return Plan(flight_edits.without_frames(frozenset(gone)), marks=Marks(spans=tuple(spans), breaks_s=tuple(breaks)))
 
 
 def _sharp_turn(flight: Flight) -> Plan | str:
@@ -150,7 +153,7 @@ def _blackout(flight: Flight) -> Plan | str:
         return f"the flight lasts {flight.duration_s:.0f} s, and {needed_s:.0f} s are needed"
     from_s = flight.frame_refs[0].t_s + (flight.duration_s - BLACKOUT_S) * BEFORE_S / (BEFORE_S + AFTER_S)
     span = Span(from_s, from_s + BLACKOUT_S, "black pictures")
-    return Plan(faults.black(span), marks=Marks(spans=(span,)))
+    return Plan(flight_edits.black(span), marks=Marks(spans=(span,)))
 
 
 def _stall(flight: Flight) -> Plan | str:
@@ -158,7 +161,7 @@ def _stall(flight: Flight) -> Plan | str:
         return f"the flight lasts only {flight.duration_s:.0f} s"
     from_s = flight.frame_refs[flight.at(0.5)].t_s
     span = Span(from_s, from_s + STALL_S, "the same picture again and again")
-    return Plan(faults.frozen(span), marks=Marks(spans=(span,)))
+    return Plan(flight_edits.frozen(span), marks=Marks(spans=(span,)))
 
 
 def _over_water(flight: Flight) -> Plan:
@@ -168,21 +171,21 @@ def _over_water(flight: Flight) -> Plan:
 
 
 def _height_wrong(_: Flight) -> Plan:
-    return Plan(faults.height_times(1.10))
+    return Plan(flight_edits.height_times(1.10))
 
 
 def _compass_wrong(_: Flight) -> Plan:
-    return Plan(faults.yaw_plus(15.0))
+    return Plan(flight_edits.yaw_plus(15.0))
 
 
 def _heading_unknown(_: Flight) -> Plan:
-    return Plan(faults.yaw_unknown())
+    return Plan(flight_edits.yaw_unknown())
 
 
 def _kidnapped(flight: Flight) -> Plan:
     # Towards the centre of the flight, where the map is.
     ahead = np.where(np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0)
-    return Plan(origin=faults.start_moved(*(ahead * KIDNAPPED_M).tolist()))
+    return Plan(origin=flight_edits.start_moved(*(ahead * KIDNAPPED_M).tolist()))
 
 
 def _hot_day(flight: Flight) -> Plan:

@@ -10,7 +10,7 @@ import msgspec
 
 from terrafix.core.errors import OutputError
 from terrafix_tools.accept.fly import Result
-from terrafix_tools.accept.measuring.judged import BROKEN, Bounds, JudgedRow, Verdict, with_unit
+from terrafix_tools.accept.measuring.results import BROKEN, Bounds, JudgedRow, Verdict, with_unit
 from terrafix_tools.accept.page import page
 from terrafix_tools.bench.run import machine
 from terrafix_tools.evaluate import ELLIPSE95

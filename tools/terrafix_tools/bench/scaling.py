@@ -9,7 +9,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from terrafix_tools.bench import growth, map_size, merging, photos, rendering
+from terrafix_tools.bench import photos, rendering
+from terrafix_tools.bench.growth import estimator_cost, map_size, merging
 
 AREAS_KM2 = (1.0, 10.0, 100.0)
 FLIGHTS_FRAMES = (100, 1000, 3000)
@@ -36,7 +37,7 @@ def measure(
         maps.append(built | searched)
     for frames in flights_frames:
         with console.status(f"a flight of {frames} frames"):
-            flights.append(_run(growth.__name__, str(frames), out=work / f"flight-{frames}.json"))
+            flights.append(_run(estimator_cost.__name__, str(frames), out=work / f"flight-{frames}.json"))
     with console.status(f"a merge of {MERGED_KEYFRAMES} keyframes"):
         merged = _run(merging.__name__, str(MERGED_KEYFRAMES), out=work / "merging.json")
     with console.status("frames of the simulator"):

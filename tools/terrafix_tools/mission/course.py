@@ -7,7 +7,7 @@ import numpy as np
 
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mission.mission import AltitudeFrame, Box, Do, Item, Mission
+from terrafix_tools.mission.items import AltitudeFrame, Box, Do, Item, Mission
 
 LEG_M = 380.0  # approximate leg length; a fixed wing needs room to turn
 MIN_LEG_M = 120.0

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafix.core.errors import OutputError, SourceError
-from terrafix_tools.mission.mission import POSITIONED, AltitudeFrame, Do, Item, Mission
+from terrafix_tools.mission.items import POSITIONED, AltitudeFrame, Do, Item, Mission
 from terrafix_tools.mission.plan_complex import simple_items
 
 HEADER = "QGC WPL 110"

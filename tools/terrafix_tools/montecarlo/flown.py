@@ -13,7 +13,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Imu, Message, Origin, VehicleState
 from terrafix_tools.mission.course import course
-from terrafix_tools.mission.mission import Box, Mission
+from terrafix_tools.mission.items import Box, Mission
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.plan import FlightPlan

@@ -12,8 +12,8 @@ from terrafix.core.config import Config, load
 from terrafix.core.errors import LinkError, OutputError, UsageError
 from terrafix_tools.preflight import computer, ground, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
-from terrafix_tools.preflight.judge import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.lines import Change, Line, Status, fail, number
+from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.rules import Context
 
 MARKS = {Status.OK: "ok  ", Status.WARN: "warn", Status.FAIL: "FAIL"}

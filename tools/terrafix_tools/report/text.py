@@ -7,7 +7,7 @@ import numpy as np
 
 from terrafix.link.pilot_text.statustext import fault_text
 from terrafix_tools.flight_verdict import flight_verdict
-from terrafix_tools.lens_words import lens_words
+from terrafix_tools.lens_report import lens_words
 from terrafix_tools.report.charts import clock
 from terrafix_tools.report.data import FlightView, radius95_m
 

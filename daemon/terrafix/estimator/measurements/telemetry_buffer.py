@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.core.geodesy import GRAVITY_MPS2
+from terrafix.core.inertial import GRAVITY_MPS2, covers, rotate_to_world
 from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.messages import Imu, VehicleState
 
@@ -97,7 +97,7 @@ class Telemetry:
         t = np.concatenate([[t0_ns], inside, [t1_ns]])
         f_b = [np.interp(t, t_f, axis) for axis in f]
         yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
-        accel = _in_world(f_b, yaw, pitch, roll)
+        accel = rotate_to_world(f_b, yaw, pitch, roll)
         if turned is not None:
             away = np.column_stack([np.interp(t, [t0_ns, t1_ns], axis) for axis in turned])
             first = np.cross(away, accel)
@@ -138,14 +138,14 @@ class Telemetry:
         inside = t_a[(t_a > t0_ns) & (t_a < t1_ns)]
         t = np.concatenate([[t0_ns], inside, [t1_ns]])
         yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
-        r_w_b = np.stack([_in_world([*axis], yaw, pitch, roll) for axis in np.eye(3)], axis=2)
+        r_w_b = np.stack([rotate_to_world([*axis], yaw, pitch, roll) for axis in np.eye(3)], axis=2)
         step = np.einsum("nij,nkj->nik", r_w_b[1:], r_w_b[:-1])
         turned = 0.5 * np.column_stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
         # The integral of the rates, from one attitude to the next, in the world by the attitude between them.
         summed = [np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t_g) * 1e-9)]) for a in w]
         by_gyro = [np.diff(np.interp(t, t_g, axis)) for axis in summed]
         between = (0.5 * (angle[1:] + angle[:-1]) for angle in (yaw, pitch, roll))
-        apart = turned.sum(axis=0) - _in_world(by_gyro, *between).sum(axis=0)
+        apart = turned.sum(axis=0) - rotate_to_world(by_gyro, *between).sum(axis=0)
         return apart, float(np.linalg.norm(by_gyro, axis=0).sum())
 
     def _with_attitudes(self, readings: "_Series", t0_ns: int, t1_ns: int) -> tuple[Timed, Timed] | None:
@@ -153,8 +153,8 @@ class Telemetry:
         read, turns = readings.around(t0_ns, t1_ns), self._turns.around(t0_ns, t1_ns)
         if t1_ns <= t0_ns or read is None or turns is None:
             return None
-        covered = _covers(read[0], t0_ns, t1_ns, MAX_READING_GAP_NS)
-        return (read, turns) if covered and _covers(turns[0], t0_ns, t1_ns, MAX_ATTITUDE_GAP_NS) else None
+        covered = covers(read[0], t0_ns, t1_ns, MAX_READING_GAP_NS)
+        return (read, turns) if covered and covers(turns[0], t0_ns, t1_ns, MAX_ATTITUDE_GAP_NS) else None
 
 
 class _Series:
@@ -191,18 +191,3 @@ class _Series:
 def _unwrapped(angles: np.ndarray) -> np.ndarray:
     """(3, N). np.unwrap is slow, also where nothing wraps."""
     return np.unwrap(angles, axis=1) if np.abs(np.diff(angles, axis=1)).max() >= np.pi else angles
-
-
-def _covers(t_ns: np.ndarray, t0_ns: int, t1_ns: int, gap_ns: int) -> bool:
-    edges = t_ns[0] <= t0_ns + gap_ns and t_ns[-1] >= t1_ns - gap_ns
-    return bool(edges and np.diff(t_ns).max() <= gap_ns)
-
-
-def _in_world(f_b: list[np.ndarray], yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """Three axes (N,) of body FRD -> (N, 3) in world ENU; ``rot_w_b`` for many at once."""
-    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
-    x, y, z = f_b
-    ahead = cp * x + sp * (sr * y + cr * z)  # level axes of the heading: forward, right
-    right = cr * y - sr * z
-    down = -sp * x + cp * (sr * y + cr * z)
-    return np.column_stack([sy * ahead + cy * right, cy * ahead - sy * right, -down])

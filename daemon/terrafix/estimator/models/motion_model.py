@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.core.gate import GATE
-from terrafix.core.geodesy import GRAVITY_MPS2, local_rotation_up
+from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.inertial import GRAVITY_MPS2, trapezoid_weights
 from terrafix.estimator.state import (
     ACCELERATIONS,
     DELTA_ACCELERATIONS,
@@ -183,9 +184,7 @@ def integrate_motion(
     else:
         s, accel, noise = imu.s_s, imu.accel_w_mps2, max(imu.noise_mps2, NOISE_FLOOR_MPS2)
         yaw = imu.yaw_rad - heading_bias_rad
-    weight = np.zeros(len(s))  # trapezoids
-    weight[1:] += 0.5 * np.diff(s)
-    weight[:-1] += 0.5 * np.diff(s)
+    weight = trapezoid_weights(s)
     to_p, to_v = weight * _decay_integral(dt_s - s, course_s), weight * np.exp(-(dt_s - s) / course_s)
     decay = np.exp(-s / memory_s)
     heading = np.array([np.cos(yaw), np.sin(yaw), np.ones(len(yaw))])

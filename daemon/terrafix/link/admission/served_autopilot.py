@@ -32,7 +32,7 @@ class Role(Enum):
 
     AUTOPILOT = "autopilot"  # the served autopilot
     OTHER = "other"  # a ground station, a gimbal, a vehicle behind the same router
-    INCONSISTENT = "inconsistent"  # the served autopilot, but the packet contradicts earlier ones (admission.py)
+    INCONSISTENT = "inconsistent"  # the served autopilot, but the packet contradicts earlier ones (packet_filter.py)
     REJECTED = "rejected"  # at the address of another vehicle, or of a second sender with the autopilot's id
 
 

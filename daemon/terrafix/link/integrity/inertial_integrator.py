@@ -5,11 +5,11 @@ an image that is 0.6 s old would then be 3 m/s off. Specific forces are rotated 
 estimator."""
 
 from collections import deque
-from itertools import pairwise
 
 import numpy as np
 
-from terrafix.core.geodesy import GRAVITY_MPS2, rot_w_b
+from terrafix.core.geodesy import rot_w_b
+from terrafix.core.inertial import GRAVITY_MPS2, covers, integrate_held
 from terrafix.messages import Imu, VehicleState
 
 BUFFER_NS = 4_000_000_000  # ns of readings; longer than any prediction (fix_type.MAX_AGE_NS) [tuned]
@@ -55,22 +55,12 @@ class InertialIntegrator:
 
     def delta(self, t0_ns: int, t1_ns: int) -> tuple[Vec3, Vec3] | None:
         """-> (velocity increment [m/s], position increment that it causes [m]) from ``t0_ns`` to ``t1_ns``, in east,
-        north, up by the compass; None when the readings do not cover the interval.
-
-        The acceleration is piecewise constant: each reading holds between the midpoints to its neighbours."""
+        north, up by the compass; None when the readings do not cover the interval."""
         inside = [a for a in self._accel if t0_ns - MAX_GAP_NS <= a[0] <= t1_ns + MAX_GAP_NS]
-        if not inside or inside[0][0] > t0_ns + MAX_GAP_NS or inside[-1][0] < t1_ns - MAX_GAP_NS:
-            return None
         times = [a[0] for a in inside]
-        if max((b - a for a, b in pairwise(times)), default=0) > MAX_GAP_NS:
+        if not covers(times, t0_ns, t1_ns, MAX_GAP_NS):
             return None
-        midpoints = [(a + b) // 2 for a, b in pairwise(times)]
-        delta_v, delta_p = np.zeros(3), np.zeros(3)
-        for begin, end, a in zip([t0_ns, *midpoints], [*midpoints, t1_ns], inside, strict=True):
-            dt_s = (min(max(end, t0_ns), t1_ns) - min(max(begin, t0_ns), t1_ns)) * 1e-9
-            accel = np.array(a[1:])
-            delta_p += delta_v * dt_s + 0.5 * accel * dt_s**2
-            delta_v += accel * dt_s
+        delta_v, delta_p = integrate_held(times, [a[1:] for a in inside], t0_ns, t1_ns)
         return _vec3(delta_v), _vec3(delta_p)
 
 

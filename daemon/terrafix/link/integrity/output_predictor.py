@@ -9,7 +9,8 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from terrafix.core.geodesy import GRAVITY_MPS2, rot_from_quat, yaw_of
+from terrafix.core.geodesy import rot_from_quat, yaw_of
+from terrafix.core.inertial import GRAVITY_MPS2
 from terrafix.link.integrity.inertial_integrator import BUFFER_NS, InertialIntegrator
 from terrafix.messages import Imu, NavEstimate, VehicleState
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from terrafix.core.node import Node
 from terrafix.messages import Frame, Health, MapMatch, Message, Prediction, ThermalBand, Verdict
-from terrafix_tools.accept.measuring.judged import Span
+from terrafix_tools.accept.measuring.results import Span
 
 OUTLIER_M = 350.0  # AC-3
 OUTLIER_SIGMA_M, OUTLIER_SIGMA_RAD = 2.0, 0.01  # stated 1-sigma of the wrong fix

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from terrafix_tools.accept.lies import integrity, loop_integrity
+from terrafix_tools.accept.false_inputs import integrity, loop_integrity
 from terrafix_tools.accept.measuring import measures as of
 from terrafix_tools.accept.measuring.evidence import Evidence
-from terrafix_tools.accept.measuring.judged import Bounds, JudgedRow, Measured, Verdict
+from terrafix_tools.accept.measuring.results import Bounds, JudgedRow, Measured, Verdict
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix.recorder.reader import read_flight
-from terrafix_tools.accept.faults.faults import original
-from terrafix_tools.accept.measuring.judged import Marks
+from terrafix_tools.accept.faults.flight_edits import original
+from terrafix_tools.accept.measuring.results import Marks
 from terrafix_tools.estimates import ESTIMATES, Row, read_rows
 from terrafix_tools.evaluate import Compared, Truth, compare, metrics, read_summary
 

@@ -11,7 +11,7 @@ from terrafix.messages import CovarianceMode, NavEstimate, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.measuring.epipolar import reprojection_error
 from terrafix_tools.accept.measuring.evidence import Evidence, FrameEvidence
-from terrafix_tools.accept.measuring.judged import Measured, Span, Verdict
+from terrafix_tools.accept.measuring.results import Measured, Span, Verdict
 
 NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
 MIN_PATH_M = 100.0  # a relative drift over a shorter path has no meaning

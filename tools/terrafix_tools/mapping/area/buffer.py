@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from terrafix_tools.mapping.area.area import EARTH, cut_edges, densify
+from terrafix_tools.mapping.area.polygons import EARTH, cut_edges, densify
 
 HALF_CIRCLE_STEPS = 12  # the polygon circumscribes the circle, so the buffer is not narrower than asked; +0.9 % at most
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix_tools.mapping.area.area import Area
 from terrafix_tools.mapping.area.checks import check_area
 from terrafix_tools.mapping.area.files import DEFAULT_BUFFER_KM, is_line, read_area
+from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.fetching.progress import shown
 from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
@@ -23,7 +23,7 @@ from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
 from terrafix_tools.mapping.package.height_datums import Datum
 from terrafix_tools.mapping.package.heights import to_amsl
 from terrafix_tools.mapping.parallel import default_workers
-from terrafix_tools.mapping.sources import glo30
+from terrafix_tools.mapping.sources.copernicus import glo30
 from terrafix_tools.mapping.sources.prepare import Preparation, Request
 from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
 from terrafix_tools.mapping.vectors.overpass import PUBLIC, fetch_overpass, overpass_features

@@ -3,7 +3,7 @@
 import numpy as np
 
 from terrafix.core.errors import UsageError
-from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.area.polygons import Area
 
 POLAR_DEG = 84.0  # limit of Web Mercator and UTM; a compass is inaccurate beyond
 LARGEST_KM2 = 10_000.0

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from terrafix.core.errors import SourceError, UsageError
-from terrafix_tools.mapping.area.area import Area
 from terrafix_tools.mapping.area.buffer import around_line, around_ring
 from terrafix_tools.mapping.area.checks import check_points, check_ring
+from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mission.file import read_mission
 
 DEFAULT_BUFFER_KM = 20.0  # allows for a vehicle that arrives from anywhere or is blown off its path

@@ -10,7 +10,7 @@ import numpy as np
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.check.sight import MatchabilityProbe, Sight
-from terrafix_tools.mission.mission import POSITIONED, AltitudeFrame, Do, Mission
+from terrafix_tools.mission.items import POSITIONED, AltitudeFrame, Do, Mission
 
 STEP_M = 20.0  # distance of the sample points of the path
 MAX_SIGHT_POINTS = 600  # points of the path at which matchability is computed: half a minute

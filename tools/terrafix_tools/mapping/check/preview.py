@@ -11,8 +11,8 @@ import typer
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
-from terrafix_tools.mapping.check.check import check
 from terrafix_tools.mapping.check.preview_page import write_page
+from terrafix_tools.mapping.check.suitability import check
 from terrafix_tools.mapping.check.text import lines_of, where
 
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from terrafix.core.errors import OutputError
-from terrafix_tools.mapping.check.check import CheckResult, MapCheck
 from terrafix_tools.mapping.check.sight import Sight
+from terrafix_tools.mapping.check.suitability import CheckResult, MapCheck
 from terrafix_tools.mapping.check.text import lines_of
 
 PICTURE_PX = 1400  # longer side of the inlined image

@@ -1,7 +1,7 @@
 """Text output of `terrafix map check`."""
 
-from terrafix_tools.mapping.check.check import MapCheck
 from terrafix_tools.mapping.check.mission import Stretch
+from terrafix_tools.mapping.check.suitability import MapCheck
 
 MAX_LISTED = 3  # stretches listed per kind; the others are counted
 

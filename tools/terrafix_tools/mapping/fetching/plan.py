@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.errors import OutputError, UsageError
-from terrafix_tools.mapping.sources.tile_grid import TileRange
+from terrafix_tools.mapping.sources.tiles.grid import TileRange
 
 PACKAGE_BYTES_PER_PX = 1.3  # JPEG of quality 95 with its pyramid: 8 to 11 MB/km2 at 0.3 m/px, rounded up
 STORE_OVERHEAD = 1.15  # SQLite's pages around tiles of 10 to 50 kB

@@ -7,9 +7,9 @@ from terrafix.core.errors import TerrafixError
 from terrafix_tools.mapping.fetching.fetch import Client, Damaged, FetchError, RefusedError
 from terrafix_tools.mapping.fetching.pace import Stopped
 from terrafix_tools.mapping.fetching.progress import DownloadProgress, OnProgress
-from terrafix_tools.mapping.sources.tile_grid import Tile, TileRange
-from terrafix_tools.mapping.sources.tile_picture import TileDamage, decode
-from terrafix_tools.mapping.sources.tile_store import TileStore
+from terrafix_tools.mapping.sources.tiles.grid import Tile, TileRange
+from terrafix_tools.mapping.sources.tiles.image import TileDamage, decode
+from terrafix_tools.mapping.sources.tiles.store import TileStore
 
 MAX_TILE_BYTES = 8 << 20
 POLL_S = 0.2  # interval of the progress display

@@ -3,10 +3,10 @@
 import numpy as np
 from rasterio.transform import Affine
 
-from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.polygons import Area, Placed
+from terrafix_tools.mapping.mosaic.compositing import Mosaic, MosaicPlan, Opener
 from terrafix_tools.mapping.mosaic.grid import Grid
-from terrafix_tools.mapping.mosaic.mosaic import Mosaic, MosaicPlan, Opener
-from terrafix_tools.mapping.sources.tile_grid import HALF_M, MERCATOR, TileRange, tile_span_m
+from terrafix_tools.mapping.sources.tiles.grid import HALF_M, MERCATOR, TileRange, tile_span_m
 
 TILE_CELLS = 16  # cells per side of a tile; a cell counts as covered when all of it is valid
 BLOCK_TILES = 32  # tiles per side of a block that is examined at a time

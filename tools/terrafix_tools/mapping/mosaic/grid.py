@@ -8,7 +8,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.layers import Bounds, Imagery
 
 SLIVER_PX = 0.01

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from terrafix_tools.mapping.mosaic.collar import BLEED_PX, TRIM_PX, Collar, find_collar
-from terrafix_tools.mapping.mosaic.mosaic import Opener
+from terrafix_tools.mapping.mosaic.compositing import Opener
 from terrafix_tools.mapping.source import ImagerySource
 
 Bar = Callable[[str, int | None], Callable[[], None]]

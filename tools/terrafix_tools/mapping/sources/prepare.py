@@ -9,16 +9,16 @@ from typing import Protocol
 
 from rich.console import Console
 
-from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.fetching.plan import PACKAGE_BYTES_PER_PX, Estimate, check_consent, check_room, describe
 from terrafix_tools.mapping.fetching.progress import OnProgress, shown, steps_display
 from terrafix_tools.mapping.layers import LayerInput
+from terrafix_tools.mapping.mosaic.compositing import Mosaic, MosaicPlan, Opener
 from terrafix_tools.mapping.mosaic.grid import grid_for
-from terrafix_tools.mapping.mosaic.mosaic import Mosaic, MosaicPlan, Opener
 from terrafix_tools.mapping.sources.collared import raster_opener
-from terrafix_tools.mapping.sources.sentinel import SentinelJob
+from terrafix_tools.mapping.sources.copernicus.sentinel import SentinelJob
 from terrafix_tools.mapping.sources.spec import SourceSpec
-from terrafix_tools.mapping.sources.tile_job import TileJob, tile_file_opener
+from terrafix_tools.mapping.sources.tiles.job import TileJob, tile_file_opener
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import msgspec
 
 from terrafix.core.errors import ConfigError, UsageError
 from terrafix_tools.mapping.fetching.pace import USER_AGENT, Limits
-from terrafix_tools.mapping.sources.tile_grid import MAX_ZOOM
-from terrafix_tools.mapping.sources.url_template import UrlTemplate
+from terrafix_tools.mapping.sources.tiles.grid import MAX_ZOOM
+from terrafix_tools.mapping.sources.tiles.url_template import UrlTemplate
 
 SENTINEL = "sentinel-2"
 TILE_FILES = (".mbtiles", ".pmtiles")

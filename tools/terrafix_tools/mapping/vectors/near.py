@@ -6,7 +6,7 @@ import numpy as np
 from pyproj import CRS
 from rasterio.transform import Affine
 
-from terrafix_tools.mapping.area.area import Area, Placed
+from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.vectors.rings import Ring, contains
 
 GRID_PX = 512  # side of the raster of the area

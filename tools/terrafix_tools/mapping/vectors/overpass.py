@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.errors import MapError, OutputError
-from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.fetching.fetch import Client, Damaged
 from terrafix_tools.mapping.fetching.pace import Limits
 from terrafix_tools.mapping.fetching.progress import DownloadProgress, OnProgress

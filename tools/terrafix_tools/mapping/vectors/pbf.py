@@ -6,7 +6,7 @@ from pathlib import Path
 import osmium
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.area.area import Area
+from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.layers import Feature
 from terrafix_tools.mapping.vectors.near import AreaFilter
 from terrafix_tools.mapping.vectors.tags import TABLES, is_surface, line_wkb, polygon_wkb, table_of

@@ -13,8 +13,8 @@ from collections.abc import Callable
 
 from terrafix.core.errors import LinkError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
 from terrafix_tools.sim.autopilot.course import Course, CourseFollower
+from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.parameters import GPS_INPUT_ALONE, NO_DCM, Kind
 from terrafix_tools.sim.autopilot.report import PeerMonitor, PeerReport
 from terrafix_tools.sim.interfaces import navigation_of

@@ -10,8 +10,8 @@ import numpy as np
 
 from terrafix.core.errors import OutputError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
-from terrafix_tools.sim.autopilot.gps import GpsInputDriver
+from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
+from terrafix_tools.sim.autopilot.navigation.gps import GpsInputDriver
 from terrafix_tools.sim.interfaces import State
 
 TRUTH_HISTORY_S = 1.0  # longer than the age of a fix

@@ -8,7 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.autopilot.gps import GpsInstance
+from terrafix_tools.sim.autopilot.navigation.gps import GpsInstance
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.interfaces import Navigation, Readings
 

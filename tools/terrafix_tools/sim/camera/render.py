@@ -17,7 +17,7 @@ from terrafix_tools.sim.camera.lens import Lens, lens_of
 from terrafix_tools.sim.camera.mount import Motion
 from terrafix_tools.sim.camera.weather import AIR_BGR, CLOUD_BGR, Sky, Weather, blend
 from terrafix_tools.sim.ground.detail import DETAIL_M, NEUTRAL, detail
-from terrafix_tools.sim.ground.ground import Ground, drape, open_ground
+from terrafix_tools.sim.ground.draped_image import Ground, drape, open_ground
 from terrafix_tools.sim.ground.relief import VIEW_M
 
 __all__ = ["Film", "Ground", "Motion", "Renderer", "Weather", "drape", "open_ground"]

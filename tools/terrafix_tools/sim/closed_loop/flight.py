@@ -13,8 +13,8 @@ from terrafix.core.camera import Mount
 from terrafix.core.config import Config
 from terrafix.core.errors import UsageError
 from terrafix.core.node import Image
-from terrafix_tools.mission.mission import Mission, check
-from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
+from terrafix_tools.mission.items import Mission, check
+from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, GPS_INPUT_ALONE, NO_DCM, Gps, Kind
 from terrafix_tools.sim.camera.render import Film, Renderer, Weather
 from terrafix_tools.sim.closed_loop.companion import Delays

@@ -23,7 +23,7 @@ from terrafix.core.node import Image, NodeContext
 from terrafix.messages import Frame, Message, Origin
 from terrafix.recorder.writer import versions
 from terrafix_tools.replay_output import ReplayOutput
-from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
+from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.report import PeerMonitor, PeerReport
 from terrafix_tools.sim.closed_loop.companion import Companion, Delays
 from terrafix_tools.sim.closed_loop.loopback import Loopback

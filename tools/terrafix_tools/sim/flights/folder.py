@@ -24,8 +24,8 @@ from terrafix.vision.sources.description import (
     TelemetryTable,
 )
 from terrafix_tools.mission.course import course
-from terrafix_tools.mission.mission import Mission, check
-from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
+from terrafix_tools.mission.items import Mission, check
+from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.camera.render import Film, Ground, Renderer
 from terrafix_tools.sim.flights.description import write_toml

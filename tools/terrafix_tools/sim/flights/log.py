@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import OutputError
 from terrafix.core.mavlink.tlog import record
-from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
+from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.interfaces import Readings
 
 RATES_HZ = {  # rates that a companion requests

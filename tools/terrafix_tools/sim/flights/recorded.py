@@ -19,7 +19,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.sources.description import Description, read_description
 from terrafix.vision.sources.table import read_table as read_frames
 from terrafix_tools.estimates import number, read_table
-from terrafix_tools.sim.autopilot.autopilot import SimAutopilot
+from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.flights.description import write_toml
 from terrafix_tools.sim.flights.log import T0_US, TelemetryLog

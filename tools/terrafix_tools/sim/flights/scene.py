@@ -8,8 +8,8 @@ from pyproj import CRS, Transformer
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.mapping.source import ImagerySource
-from terrafix_tools.mission.mission import Box, HeightOf
-from terrafix_tools.sim.ground.ground import Ground, drape, open_ground
+from terrafix_tools.mission.items import Box, HeightOf
+from terrafix_tools.sim.ground.draped_image import Ground, drape, open_ground
 from terrafix_tools.sim.world.place import EPSG, World
 
 

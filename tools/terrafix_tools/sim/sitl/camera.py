@@ -12,7 +12,7 @@ from terrafix.core.geodesy import LocalFrame, rot_w_b
 from terrafix_tools.sim.camera.render import Renderer
 from terrafix_tools.sim.camera.stream import FrameStream
 from terrafix_tools.sim.flights.folder import CAMERA, FRAME_HZ
-from terrafix_tools.sim.ground.ground import Ground
+from terrafix_tools.sim.ground.draped_image import Ground
 from terrafix_tools.sim.sitl.observer import Truth
 
 # Rendering delay: a pose can be interpolated when the states around it have arrived; they come at 40 Hz,

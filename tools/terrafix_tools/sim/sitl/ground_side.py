@@ -15,7 +15,7 @@ from mavsdk.plugins.param import Param
 
 from terrafix.core.errors import LinkError
 from terrafix_tools.mission.file import COMMANDS
-from terrafix_tools.mission.mission import AltitudeFrame, Do, Mission
+from terrafix_tools.mission.items import AltitudeFrame, Do, Mission
 
 DISCOVERY_TIMEOUT_S = 60.0  # time-out: the firmware boots in a few seconds, longer on a loaded machine
 # MISSION_ITEM_INT frames (MAVLink common.xml, MAV_FRAME)

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mission.mission import Mission
+from terrafix_tools.mission.items import Mission
 from terrafix_tools.sim.flights.scene import scene_of_world
-from terrafix_tools.sim.ground.ground import Ground
+from terrafix_tools.sim.ground.draped_image import Ground
 from terrafix_tools.sim.sitl.firmware import Home
 from terrafix_tools.sim.sitl.setup import HEADING_DEG, place_of
 from terrafix_tools.sim.world.mapped import CAMERA_SEASON, write_map

@@ -6,7 +6,7 @@ The parameters that concern Terrafix are in config/vehicles/, so that the tested
 from pathlib import Path
 
 from terrafix.core.errors import OutputError, UsageError
-from terrafix_tools.mission.mission import Do, Item, Mission
+from terrafix_tools.mission.items import Do, Item, Mission
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.world.place import World
 

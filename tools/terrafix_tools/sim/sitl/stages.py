@@ -63,7 +63,7 @@ class Daemon:
             config.write_text(f'[source]\ncamera = "{camera}"\n[link]\ngps_id = {GPS_ID}\n', encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-        self._command = [sys.executable, "-m", "terrafix_tools.sim.sitl.tied", str(os.getpid())]
+        self._command = [sys.executable, "-m", "terrafix_tools.sim.sitl.child_process", str(os.getpid())]
         self._command += ["run", "--config", str(config)]
         self._command += ["--source", source, "--map", str(scene.map_path)]
         self._command += ["--link", link, "--out", str(out / "record")]

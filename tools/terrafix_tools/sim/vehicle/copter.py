@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mission.mission import HeightOf, Mission
+from terrafix_tools.mission.items import HeightOf, Mission
 from terrafix_tools.sim.interfaces import Navigation, State, navigation_of
 from terrafix_tools.sim.vehicle.copter_guidance import Guidance
 from terrafix_tools.sim.vehicle.motion import AIRBORNE_M, GRAVITY_MPS2, Motion

@@ -3,7 +3,7 @@
 import math
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mission.mission import Do, HeightOf, Mission, Target
+from terrafix_tools.mission.items import Do, HeightOf, Mission, Target
 from terrafix_tools.sim.interfaces import Navigation
 from terrafix_tools.sim.vehicle.guided import MissionGuidance
 

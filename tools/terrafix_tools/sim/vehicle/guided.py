@@ -3,7 +3,7 @@
 import math
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mission.mission import HeightOf, Mission, Target, targets
+from terrafix_tools.mission.items import HeightOf, Mission, Target, targets
 
 GROUND_INTERVAL_S = 0.2  # interval of ground height updates, for heights above ground
 

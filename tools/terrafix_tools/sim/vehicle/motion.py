@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from terrafix_tools.mission.mission import HeightOf
+from terrafix_tools.mission.items import HeightOf
 from terrafix_tools.sim.interfaces import State
 
 GRAVITY_MPS2 = 9.80665

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.mission.mission import Do, HeightOf, Mission, Target
+from terrafix_tools.mission.items import Do, HeightOf, Mission, Target
 from terrafix_tools.sim.interfaces import Navigation
 from terrafix_tools.sim.vehicle.guided import MissionGuidance
 from terrafix_tools.sim.vehicle.motion import GRAVITY_MPS2

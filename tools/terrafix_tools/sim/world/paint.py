@@ -10,10 +10,10 @@ import math
 import cv2
 import numpy as np
 
+from terrafix_tools.sim.world.box_content import Piece, piece_of
 from terrafix_tools.sim.world.canvas import NEUTRAL, Canvas, draw_field, draw_line, draw_lot, draw_shadows, draw_water
 from terrafix_tools.sim.world.layout import DEM_MARGIN_M, DEM_POST_M, Layout
 from terrafix_tools.sim.world.noise import smooth
-from terrafix_tools.sim.world.piece import Piece, piece_of
 from terrafix_tools.sim.world.season import Season
 from terrafix_tools.sim.world.sprites import Sprites, crown_sprites, stamp_cars, stamp_houses, stamp_trees
 

@@ -19,7 +19,7 @@ from rasterio.windows import Window
 
 from terrafix.core.errors import OutputError, UsageError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.ground.ground import Ground
+from terrafix_tools.sim.ground.draped_image import Ground
 from terrafix_tools.sim.ground.relief import Relief
 from terrafix_tools.sim.ground.tiles import TILE_PX, Pyramid
 from terrafix_tools.sim.ground.warp import fit

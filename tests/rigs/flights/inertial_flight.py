@@ -1,0 +1,203 @@
+"""A simulated plane with the sensors of an autopilot, and the odometry and map matches of its
+frames."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from simulated_flight import CAMERA, FIX_SIGMAS, PAIRS, PLACE, ROOFS, SIGMA_NORM
+from simulated_flight import ORIGIN as STEADY_ORIGIN
+from terrafix.core.camera import Mount
+from terrafix.core.geodesy import quat_from_rot
+from terrafix.core.pose import exp_so3
+from terrafix.estimator.node import EstimatorNode
+from terrafix.messages import (
+    Health,
+    Imu,
+    ImuSample,
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Odometry,
+    ThermalBand,
+    VehicleState,
+    Verdict,
+)
+from terrafix_tools.mission.course import course
+from terrafix_tools.mission.items import Box
+from terrafix_tools.sim.sensors.suite import VehicleSensors
+from terrafix_tools.sim.vehicle.plane import Plane
+from terrafix_tools.sim.vehicle.wind import Wind
+from textured_ground import apply, homography
+
+STEP_S, FRAME_EVERY, STATE_EVERY, BATCH = 0.02, 50, 2, 3
+FIX_EVERY = 4
+KEYFRAME_EVERY = 3
+ORIGIN = msgspec.structs.replace(STEADY_ORIGIN, yaw_sigma_deg=3.0, agl_sigma_m=3.0, attitude_sigma_deg=0.7)
+
+
+class InertialFlight:
+    """One frame per second. ``messages_by_frame[i]``: telemetry since the previous frame, then odometry and map match.
+
+    Truth per frame: ``poses`` (R_w_c, position of the camera in ENU relative to the start coordinate),
+    ``velocity_mps`` (ENU)."""
+
+    def __init__(self, seed: int, seconds: int = 70) -> None:
+        rng = np.random.default_rng([seed, 78])
+        mission = course(seed, 40.0 * seconds, Box(-1500.0, -1500.0, 1500.0, 1500.0), PLACE, agl_m=120.0)
+        plane = Plane(mission, PLACE, lambda e, n: 0.0, wind=Wind(5.4, 1.0), seed=seed)
+        sensors = VehicleSensors(PLACE, seed=seed)
+        tilt = np.radians(rng.normal(0.0, CAMERA.mount_tolerance_deg / 2, 2))
+        mount = Mount.of(CAMERA).r_b_c() @ exp_so3(np.array([*tilt, 0.0]))
+        start = plane.state.p_b_in_w_m[:2] + rng.normal(0.0, ORIGIN.start_sigma_m, 2)
+        self.poses: list[tuple[np.ndarray, np.ndarray]] = []
+        self.velocity_mps: list[np.ndarray] = []
+        self.messages_by_frame: list[list[Message]] = []
+        telemetry: list[Message] = []
+        batch: list[tuple[int, np.ndarray]] = []
+        for i in range(round(seconds / STEP_S)):
+            state = plane.step(STEP_S, None) if i else plane.state
+            readings, t_ns = sensors.read(state), round(state.t_s * 1e9)
+            if i % STATE_EVERY == 0:
+                telemetry.append(
+                    VehicleState(
+                        t_ns=t_ns,
+                        source="simulated",
+                        yaw_rad=readings.yaw_rad,
+                        pitch_rad=readings.pitch_rad,
+                        roll_rad=readings.roll_rad,
+                        agl_m=readings.baro_amsl_m,
+                        armed=True,
+                        airspeed_mps=readings.airspeed_mps,
+                    )
+                )
+            batch.append((t_ns, np.concatenate([readings.accel_b_mps2, readings.gyro_b_radps])))
+            if len(batch) == BATCH:
+                samples: list[ImuSample] = [(t_ns - at_ns, *values.tolist()) for at_ns, values in batch]
+                telemetry.append(Imu(t_ns=t_ns, source="simulated", samples=samples))
+                batch = []
+            if i % FRAME_EVERY == 0:
+                self.poses.append((state.r_w_b() @ mount, state.p_b_in_w_m - np.array([*start, 0.0])))
+                self.velocity_mps.append(state.velocity_enu_mps)
+                frame_id = len(self.messages_by_frame)
+                messages = [*telemetry, self._odometry(frame_id, t_ns, rng)]
+                if frame_id and frame_id % FIX_EVERY == 0:
+                    messages.append(self._fix(frame_id, t_ns, rng))
+                self.messages_by_frame.append(messages)
+                telemetry = []
+
+    def _odometry(self, i: int, t_ns: int, rng: np.random.Generator) -> Odometry:
+        if i == 0:
+            return Odometry(t_ns=t_ns, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
+        keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
+        keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
+        frame_xy = apply(homography(self.poses[keyframe], self.poses[i]), keyframe_xy) + rng.normal(
+            0.0, SIGMA_NORM, keyframe_xy.shape
+        )
+        return Odometry(
+            t_ns=t_ns,
+            frame_id=i,
+            keyframe_id=keyframe,
+            verdict=Verdict.ACCEPTED,
+            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
+            sigma_norm=SIGMA_NORM,
+            inliers=PAIRS,
+            tracked=PAIRS,
+            becomes_keyframe=i % KEYFRAME_EVERY == 0,
+        )
+
+    def _fix(self, i: int, t_ns: int, rng: np.random.Generator) -> MapMatch:
+        r_w_c, p_m = self.poses[i]
+        error = rng.normal(0.0, np.hypot(FIX_SIGMAS, [0.0, 0.0, ROOFS * p_m[2], 0.0, 0.0, 0.0]))
+        p = p_m + error[:3]
+        return MapMatch(
+            t_ns=t_ns,
+            frame_id=i,
+            verdict=Verdict.ACCEPTED,
+            matcher="gradient",
+            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+            q_w_c=quat_from_rot(exp_so3(error[3:]) @ r_w_c),
+            cov=tuple(float(v) for v in np.diag(FIX_SIGMAS**2).ravel()),
+            inliers=30,
+            mode_mass=0.99,
+            mode_e_m=float(p[0]),
+            mode_n_m=float(p[1]),
+            ground=(0.0, 0.0, 0.0),
+        )
+
+
+@dataclass(frozen=True)
+class Flown:
+    """One row per frame: the last published estimate. Errors are estimate minus truth, ENU."""
+
+    estimates: list[NavEstimate]
+    position_error_m: np.ndarray  # (N, 2)
+    position_sigma_m: np.ndarray  # (N, 2)
+    velocity_error_mps: np.ndarray  # (N, 3)
+    velocity_sigma_mps: np.ndarray  # (N,)
+    verdicts: list[MeasurementVerdict]  # all of the flight
+
+
+def flown(
+    flight: InertialFlight,
+    *,
+    imu: bool,
+    band: ThermalBand = ThermalBand.NORMAL,
+    blind: tuple[int, int] = (0, 0),
+    no_imu: tuple[float, float] = (0.0, 0.0),
+    airspeed: bool = False,
+    iced: float = 1.0,
+    no_camera: tuple[int, int] = (0, 0),
+    frames: int = 1000,
+) -> Flown:
+    """Runs an EstimatorNode on the first ``frames`` frames of a flight.
+
+    ``imu``, ``airspeed``: the telemetry has them. ``blind``: frames (first, end) without tracked features and map
+    match. ``no_imu``: interval (begin, end) [s] without inertial readings. ``iced``: scale factor of the airspeed
+    sensor in the blind frames. ``no_camera``: frames (first, end) that are missing."""
+    node = EstimatorNode()
+    cause = Health(t_ns=0, band=band, temperature_c=60.0, throttled=False, disk_free_mb=1000, cause="test")
+    for message in (ORIGIN, cause):
+        assert list(node.on(message)) == []
+    last: dict[int, NavEstimate] = {}
+    verdicts: list[MeasurementVerdict] = []
+    for i, messages in enumerate(flight.messages_by_frame[:frames]):
+        for message in _with_outages(messages, imu, range(*blind), i, no_imu):
+            if isinstance(message, VehicleState):
+                read_mps = (message.airspeed_mps or 0.0) * (iced if i in range(*blind) else 1.0)
+                message = msgspec.structs.replace(message, airspeed_mps=read_mps if airspeed else None)
+            if i in range(*no_camera) and isinstance(message, (Odometry, MapMatch)):
+                continue
+            for reply in node.on(message):
+                if isinstance(reply, NavEstimate):
+                    last[reply.frame_id] = reply
+                elif isinstance(reply, MeasurementVerdict):
+                    verdicts.append(reply)
+    rows = [last[i] for i in sorted(last)]
+    errors_m = [np.array([*PLACE.to_local(e.lat_deg, e.lon_deg)]) - flight.poses[e.frame_id][1][:2] for e in rows]
+    return Flown(
+        rows,
+        np.array(errors_m),
+        np.sqrt(np.array([[e.cov[0], e.cov[7]] for e in rows])),
+        np.array([e.velocity_enu_mps for e in rows]) - np.array([flight.velocity_mps[e.frame_id] for e in rows]),
+        np.array([e.velocity_sigma_mps for e in rows]),
+        verdicts,
+    )
+
+
+def _with_outages(
+    messages: list[Message], imu: bool, blind: range, i: int, no_imu: tuple[float, float]
+) -> Iterable[Message]:
+    """The messages of frame i as they arrive with these outages (see ``flown``)."""
+    for message in messages:
+        if isinstance(message, Imu) and (not imu or no_imu[0] <= message.t_ns * 1e-9 < no_imu[1]):
+            continue
+        if i in blind and isinstance(message, MapMatch):
+            continue
+        if i in blind and isinstance(message, Odometry):
+            yield Odometry(t_ns=message.t_ns, frame_id=i, keyframe_id=message.keyframe_id, verdict=Verdict.FEW_INLIERS)
+        else:
+            yield message

@@ -1,0 +1,65 @@
+"""Rig of the tests of simulated vehicles and sensors: a place, missions there, and their simulation."""
+
+import math
+
+import numpy as np
+
+from terrafix.core.geodesy import LocalFrame
+from terrafix_tools.mission.items import AltitudeFrame, Do, Item, Mission
+from terrafix_tools.sim.interfaces import Navigation, State, Vehicle, navigation_of
+
+PLACE = LocalFrame(48.0, 11.0)
+STEP_S = 0.02
+HOME = (100.0, -50.0)  # east, north
+
+
+def flat(e_m: float, n_m: float) -> float:
+    """-> terrain height [m AMSL]."""
+    return 400.0
+
+
+def hills(e_m: float, n_m: float) -> float:
+    return 400.0 + 20.0 * math.sin(e_m / 300.0) + 10.0 * math.cos(n_m / 200.0)
+
+
+def at(
+    do: Do,
+    e_m: float,
+    n_m: float,
+    height_m: float = 100.0,
+    *,
+    altitude_frame: AltitudeFrame = AltitudeFrame.HOME,
+    **more: float,
+) -> Item:
+    """-> mission item at a local position."""
+    lat_deg, lon_deg = PLACE.to_wgs84(e_m, n_m)
+    return Item(do, 0, lat_deg, lon_deg, height_m, altitude_frame, **more)
+
+
+def mission(*items: Item) -> Mission:
+    return Mission("test", *PLACE.to_wgs84(*HOME), items)
+
+
+def fly(vehicle: Vehicle, first: State, seconds: float, offset_m: np.ndarray | None = None) -> list[State]:
+    """-> the states of all steps, with the first one. ``offset_m``: (3,) error of the position that the vehicle's
+    controller gets; None: it gets the true state."""
+    states = [first]
+    for _ in range(round(seconds / STEP_S)):
+        navigation: Navigation | None = None
+        if offset_m is not None:
+            navigation = navigation_of(states[-1])
+            navigation = Navigation(
+                navigation.p_b_in_w_m + offset_m,
+                navigation.velocity_enu_mps,
+                navigation.yaw_rad,
+                navigation.pitch_rad,
+                navigation.roll_rad,
+                navigation.airspeed_mps,
+            )
+        states.append(vehicle.step(STEP_S, navigation))
+    return states
+
+
+def positions(states: list[State]) -> np.ndarray:
+    """(N, 3)"""
+    return np.array([s.p_b_in_w_m for s in states])

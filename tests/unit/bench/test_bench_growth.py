@@ -1,0 +1,67 @@
+"""Benchmarks of growing maps and flights: the synthetic flight is consistent, and all result fields are present."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.filter_state import FrameInput
+from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.messages import Imu
+from terrafix_tools.bench.growth import estimator_cost, map_size
+from terrafix_tools.bench.growth.stream import FIX_EVERY, FRAME_S, LEG_S, ORIGIN, frame_messages
+
+
+def test_the_estimator_follows_the_synthetic_flight() -> None:
+    """Until after the first turn. The messages must describe one motion, or the benchmark would time a lost
+    estimator."""
+    estimator, telemetry = Estimator(ORIGIN), Telemetry()
+    frames, rejected, inertial = round((LEG_S + 10.0) / FRAME_S), 0, 0
+    for frame in frame_messages(frames):
+        for message in frame.telemetry:
+            (telemetry.add_imu if isinstance(message, Imu) else telemetry.add)(message)  # type: ignore[operator]
+        t_ns = frame.odometry.t_ns
+        imu, attitude = telemetry.world_acceleration, telemetry.at(t_ns)
+        propagated = estimator.feed_frame(
+            FrameInput(frame.odometry.frame_id, t_ns * 1e-9, frame.odometry, attitude, imu)
+        )
+        inertial += telemetry.world_acceleration(t_ns - round(FRAME_S * 1e9), t_ns) is not None
+        if frame.match is not None:
+            rejected += estimator.feed_map_match(frame.match).verdict != "accepted"
+        error_m = propagated.placed.pose.translation() - frame.p_m
+        assert np.hypot(*error_m[:2]) < (40.0 if frame.odometry.frame_id < 5 else 6.0)
+    assert inertial == frames - 1
+    assert rejected <= 0.05 * frames / FIX_EVERY
+
+
+@pytest.mark.slow
+def test_the_growth_benchmark_has_all_fields() -> None:
+    found = estimator_cost.measure(30)
+    assert found["frames"] == 30 and found["peak_memory_mb"] >= found["memory_in_flight_mb"] > 50.0
+    assert list(found["covariance_cpu_ms"]) == [
+        "of the smoother", "gtsam.Marginals, window", "gtsam.Marginals, whole flight"
+    ]  # fmt: skip
+    assert found["frame_cpu_ms"]["median"] > found["update_cpu_ms"]["median"] > 0.0
+    assert found["update_cpu_ms"]["p99"] > found["update_cpu_ms"]["median"]
+
+
+@pytest.mark.slow
+def test_the_map_size_benchmark_has_all_fields(tmp_path: Path) -> None:
+    built = map_size.measure(0.25, tmp_path)
+    assert min(built[key] for key in ("build_cpu_s", "build_s", "build_by_several_s", "speed_up")) > 0.0
+    assert built["same_bytes"]
+    assert built["area_km2"] == 0.25 and built["package_mb"] > 0.05 and not (tmp_path / "map.tif").exists()
+    found = map_size.search(tmp_path / "map.gpkg")
+    json.dumps(built | found, allow_nan=False)
+    assert set(found["look_cpu_ms"]) == {"in flight", "lost"}
+    assert len(found["window_ms"]) == len(map_size.WINDOW_GSD_M) and found["open_ms"] > 0.0
+    assert all(0.0 < correlation["median"] <= correlation["p95"] for correlation in found["look_cpu_ms"].values())
+
+
+def test_the_noise_imagery_does_not_repeat() -> None:
+    first, second = (map_size._block(np.random.default_rng([0, i * map_size.BLOCK_PX]))[..., 1] for i in (0, 1))
+    correlation = float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
+    assert abs(correlation) < 0.2 and math.isfinite(correlation) and first.std() > 20.0

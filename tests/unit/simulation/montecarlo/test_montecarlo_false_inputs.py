@@ -1,0 +1,169 @@
+"""Monte Carlo flights with false inputs: times and sizes of each."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
+from terrafix_tools.montecarlo import lies as of
+from terrafix_tools.montecarlo.fault import LIES, Fault
+from terrafix_tools.montecarlo.flight import Record
+from terrafix_tools.montecarlo.flown import Shot, SimulatedFlight, fly
+from terrafix_tools.montecarlo.ground import Terrain
+from terrafix_tools.montecarlo.lies import Lies, Search
+from terrafix_tools.montecarlo.plan import FlightPlan, plan
+from terrafix_tools.montecarlo.statistics import FlightResult
+
+SHORT_S = 60.0
+FOUND = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", inliers=20)
+NOTHING = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.AMBIGUOUS, matcher="gradient")
+PREDICTION = Prediction(
+    t_ns=0, frame_id=0, p_c_in_w_m=(0.0, 0.0, 100.0), q_w_c=(0.0, 1.0, 0.0, 0.0), cov=(0.0,) * 36, agl_m=100.0,
+    agl_sigma_m=3.0, step_m=(0.0, 0.0), step_cov_m2=(1.0, 0.0, 0.0, 1.0))  # fmt: skip
+
+
+def always(match: MapMatch) -> of.FindMatch:
+    def find(prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch:
+        return match
+
+    return find
+
+
+def flown(fault: Fault, number: int = 0) -> tuple[FlightPlan, SimulatedFlight]:
+    drawn = plan(5, number, fault=fault, duration_s=SHORT_S)
+    return drawn, fly(drawn, Terrain(drawn.seed, drawn.hills_m, drawn.settled))
+
+
+def test_each_false_input_has_its_probability_and_changes_nothing_else() -> None:
+    plans = [plan(1, n, lie_share=0.05) for n in range(600)]
+    for lie in LIES:
+        assert 0.025 < np.mean([lie in p.lies for p in plans]) < 0.08, lie
+    honest = [n for n, p in enumerate(plans) if not p.lies]
+    assert all(plans[n] == plan(1, n) for n in honest[:20])
+    lying = next(n for n, p in enumerate(plans) if p.lies == {Fault.FROZEN})
+    assert replace(plans[lying], lies=frozenset()) == plan(1, lying)
+    assert plans[lying].fault is plan(1, lying).fault
+
+
+def test_false_numbers_have_their_stated_sizes() -> None:
+    def numbers(fault: Fault, name: str) -> np.ndarray:
+        drawn = [plan(1, n, fault=fault) for n in range(40)]
+        assert all(p.lies == {fault} for p in drawn)
+        return np.array([getattr(p, name) for p in drawn])
+
+    assert set(np.round(numbers(Fault.SCALE, "height_scale"), 2)) == {0.7, 1.3, 3.28, 0.3}
+    assert set(np.round(np.degrees(numbers(Fault.HEADING, "compass_rad")))) == {-90, 90, 180}
+    described = 1.0 / (1.0 + numbers(Fault.FOCAL, "focal_error"))  # over the true one
+    assert 0.5 <= described.min() < 0.7 and 1.4 < described.max() <= 2.0
+    lag_s = numbers(Fault.STALE, "picture_lag_s")
+    assert 0.2 <= lag_s.min() < 0.4 and 0.8 < lag_s.max() <= 1.0
+    assert np.hypot(*numbers(Fault.START, "start_error_m").T) == pytest.approx(300.0)
+    assert set(numbers(Fault.START, "start_sigma_m")) == {50.0}
+
+
+def test_late_pictures_show_the_earlier_position() -> None:
+    drawn, flight = flown(Fault.STALE)
+    for seen, true in list(zip(flight.pictures, flight.frames, strict=True))[2:]:
+        assert seen.t_s == true.t_s
+        behind_m = float(np.hypot(*(true.p_m - seen.p_m)[:2]))
+        assert behind_m == pytest.approx(drawn.picture_lag_s * np.hypot(*true.velocity_mps[:2]), abs=1.5)
+    _, honest = flown(Fault.NONE)
+    assert all(np.array_equal(a.p_m, b.p_m) for a, b in zip(honest.pictures, honest.frames, strict=True))
+
+
+def test_a_frozen_camera_repeats_one_pose_with_new_times() -> None:
+    drawn, flight = flown(Fault.FROZEN)
+    lies = Lies(drawn, flight)
+    shown = [lies.picture(i) for i in range(len(flight.frames))]
+    held = [i for i, shot in enumerate(shown) if not np.array_equal(shot.p_m, flight.frames[i].p_m)]
+    assert held == list(range(held[0], held[-1] + 1)) and 14 <= len(held) <= 40
+    assert all(np.array_equal(shown[i].p_m, flight.frames[held[0] - 1].p_m) for i in held)
+    assert [shot.t_s for shot in shown] == [shot.t_s for shot in flight.frames]
+    assert lies.start_s() == flight.frames[held[0] - 1].t_s
+
+
+def test_foreign_motion_is_far_away_and_consistent_and_has_no_map_match() -> None:
+    drawn, flight = flown(Fault.FOREIGN)
+    lies = Lies(drawn, flight)
+    steps, foreign = [], []
+    for i, true in enumerate(flight.frames):
+        match = lies.match(i, PREDICTION, always(FOUND))
+        if match.verdict is not Verdict.ACCEPTED:
+            foreign.append(i)
+            away_m = float(np.hypot(*(lies.picture(i).p_m - true.p_m)[:2]))
+            assert away_m > 200.0
+            assert lies.picture(i).p_m[2] == true.p_m[2]
+    for i in foreign[1:]:
+        own_m = np.hypot(*(flight.frames[i].p_m - flight.frames[i - 1].p_m)[:2])
+        steps.append(float(np.hypot(*(lies.picture(i).p_m - lies.picture(i - 1).p_m)[:2]) / own_m))
+    assert 5 <= len(foreign) <= 15 and np.std(steps) < 1e-6 and 0.5 <= steps[0] <= 3.0
+    turned = lies.picture(foreign[0]).r_w_c
+    assert turned.T @ turned == pytest.approx(np.eye(3), abs=1e-9)
+    assert not np.allclose(turned, flight.frames[foreign[0]].r_w_c)
+
+
+def test_over_the_map_of_another_town_a_fifth_of_the_frames_have_wrong_matches() -> None:
+    drawn, flight = flown(Fault.TOWN)
+    lies, off = Lies(drawn, flight), []
+    start_s = lies.start_s()
+    assert start_s is not None
+    after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= start_s]
+    for i in after * 20:  # enough matches to estimate a share
+        match = lies.match(i, PREDICTION, always(FOUND))
+        if match.p_c_in_w_m is not None:
+            off.append(float(np.hypot(*(np.array(match.p_c_in_w_m) - flight.frames[i].p_m)[:2])))
+    assert 0.15 < len(off) / (20 * len(after)) < 0.25
+    assert min(off) > 30.0 and max(off) < 120.0
+    assert 0.3 < np.mean(np.abs(np.diff(off)) < 8.0) < 0.8  # half of them agree with the one before
+    assert lies.match(0, PREDICTION, always(FOUND)) == FOUND
+
+
+def test_the_search_model_is_lost_without_matches_and_finds_a_visible_place() -> None:
+    shot = Shot(0.0, np.array([300.0, 0.0, 100.0]), np.eye(3), np.eye(3), np.zeros(3))
+
+    def visible(prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch:
+        return FOUND if prediction.p_c_in_w_m[0] == 300.0 else NOTHING
+
+    search = Search()
+    matches = [search.update(NOTHING, PREDICTION, shot, visible) for _ in range(of.LOST_FRAMES + of.FOUND_FRAMES)]
+    lost = [m.verdict is Verdict.LOST for m in matches]
+    assert lost.index(True) == of.LOST_FRAMES - 1 and sum(lost) == of.FOUND_FRAMES - 1
+    assert matches[of.LOST_FRAMES].lost_sigma_m == 300.0 and matches[of.LOST_FRAMES].step is SearchStep.WIDEN
+    found = matches[of.LOST_FRAMES + of.FOUND_FRAMES - 2]
+    assert found.found and found.step is SearchStep.MERGE and found.lost_sigma_m == 0.0
+    assert matches[-1] == NOTHING  # the counters restart
+    blind = Search()
+    never = [blind.update(NOTHING, PREDICTION, shot, always(NOTHING)) for _ in range(60)]
+    assert not any(m.found for m in never) and never[-1].verdict is Verdict.LOST
+    reset = Search()
+    looks = [reset.update(FOUND if i % 10 == 9 else NOTHING, PREDICTION, shot, visible) for i in range(60)]
+    assert not any(m.verdict is Verdict.LOST for m in looks)
+
+
+def judged(lie_from_s: float | None, false_at: list[int], new_ground: float = 1.0) -> FlightResult:
+    """A flight of 40 frames, one a second, false at some."""
+    n = 40
+    error = np.zeros((n, 6))
+    error[false_at, 0] = 80.0
+    cov = np.tile(np.eye(6), (n, 1, 1))
+    record = Record(
+        plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n), new_ground=np.full(n, new_ground),
+        truth_m=np.zeros((n, 2)), error_m=error, cov=cov, velocity_error_mps=np.zeros((n, 3)),
+        velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1), refined_error_m=np.zeros((n, 2)),
+        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n), memory_mb=np.zeros(n), lie_from_s=lie_from_s)  # fmt: skip
+    return FlightResult.of(record)
+
+
+def test_time_to_notice_ends_at_the_last_false_fix_after_the_start_of_the_false_input() -> None:
+    assert judged(10.0, [12, 13]).notice_s == 3.0
+    assert judged(10.0, [4]).notice_s is None and judged(10.0, []).notice_s is None
+    assert judged(None, [12]).notice_s is None
+
+
+def test_false_fixes_are_late_after_three_seconds_and_five_frames_of_new_ground() -> None:
+    assert judged(10.0, [10, 13, 14]).late_false_fixes == 0  # the fifth frame is that of 14 s
+    assert judged(10.0, [14, 15, 30]).late_false_fixes == 2
+    assert judged(10.0, [15, 19, 20], new_ground=0.5).late_false_fixes == 1
+    assert judged(10.0, [9]).late_false_fixes == 1  # before the lie
+    assert judged(None, [0, 1]).late_false_fixes == 2

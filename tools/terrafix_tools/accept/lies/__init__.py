@@ -1,1 +1,0 @@
-"""Scenarios in which an input lies."""

@@ -1,0 +1,1 @@
+"""Costs that grow with the flight or the map."""

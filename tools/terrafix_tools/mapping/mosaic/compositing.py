@@ -1,0 +1,81 @@
+"""Mosaic of several sources on one grid inside an area; each pixel comes from the first source that has it."""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+
+import cv2
+import numpy as np
+from pyproj import CRS
+from rasterio.transform import Affine
+
+from terrafix_tools.mapping.area.polygons import Area, Placed
+from terrafix_tools.mapping.layers import Imagery
+from terrafix_tools.mapping.mosaic.grid import Grid
+from terrafix_tools.mapping.mosaic.warp import Warped
+from terrafix_tools.mapping.source import ground_pixel_m
+
+Opener = Callable[[], Imagery]
+
+
+@dataclass(frozen=True)
+class MosaicPlan:
+    """Picklable description of a mosaic for worker processes. ``parts``: openers of the sources, the best first."""
+
+    area: Area
+    grid: Grid
+    parts: tuple[Opener, ...]
+
+
+class Mosaic:
+    """Implements Imagery. A context manager."""
+
+    has_mask = True
+
+    def __init__(self, plan: MosaicPlan) -> None:
+        grid = plan.grid
+        self.crs = CRS.from_user_input(grid.crs)
+        self.width_px, self.height_px = grid.width_px, grid.height_px
+        self.pixel_x, self.pixel_y = grid.pixel_x, grid.pixel_y
+        self.x_min, self.y_max, self.bounds = grid.x_min, grid.y_max, grid.bounds
+        self._placed = Placed(plan.area, self.crs)
+        self._open = contextlib.ExitStack()
+        with self._open:  # closes the open sources when a later one fails to open
+            parts = [self._open.enter_context(part()) for part in plan.parts]
+            self._parts = [Warped(part, grid, self.crs) for part in parts]
+            self._open = self._open.pop_all()
+
+    def __enter__(self) -> "Mosaic":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.close()
+
+    @property
+    def gsd_m(self) -> float:
+        """Ground metres per pixel at the centre."""
+        x_min, y_min, x_max, y_max = self.bounds
+        return ground_pixel_m(self.crs, (x_min + x_max) / 2, (y_min + y_max) / 2, self.pixel_x, self.pixel_y)
+
+    def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+        """A window inside the mosaic: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255."""
+        x_min, y_max = self.x_min + column * self.pixel_x, self.y_max - row * self.pixel_y
+        transform = Affine(self.pixel_x, 0, x_min, 0, -self.pixel_y, y_max)
+        open_: np.ndarray = np.where(self._placed.burn(transform, width, height), 255, 0).astype(np.uint8)
+        image = np.zeros((height, width, 3), np.uint8)
+        mask: np.ndarray = np.zeros((height, width), np.uint8)
+        for part in self._parts:
+            if not open_.any():
+                break
+            found = part.read(column, row, width, height)
+            if found is None:
+                continue
+            pixels, valid = found
+            taken = cv2.bitwise_and(open_, valid)
+            cv2.copyTo(pixels, taken, image)
+            mask = cv2.bitwise_or(mask, taken)
+            open_ = cv2.subtract(open_, taken)
+        return image, mask

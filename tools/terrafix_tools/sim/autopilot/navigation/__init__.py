@@ -1,0 +1,1 @@
+"""Navigation of the simulated autopilot: GPS library, selection of a receiver, filter and its status."""
