@@ -164,25 +164,25 @@ class SourceEnded(Message, frozen=True, kw_only=True):
 class Odometry(Message, frozen=True, kw_only=True):
     """Feature matches of frame ``frame_id`` with keyframe ``keyframe_id``, the input of visual odometry.
 
-    ``pairs``: (x_kf, y_kf, x, y) in undistorted normalised image coordinates (tangents of the ray angles) of ground
+    ``two_view``: (x_kf, y_kf, x, y) in undistorted normalised image coordinates (tangents of the ray angles) of ground
     features in both frames: RANSAC inliers, spread over the image. The estimator adds the metric scale from its
     height.
 
-    ``triples``: (x_before, y_before, x_kf, y_kf, x, y) of features that are also in the previous keyframe
-    ``before_id``; only of frames that become a keyframe. They determine the ratio of two successive baselines
-    independently of the shape of the ground."""
+    ``three_view``: (x_prev, y_prev, x_kf, y_kf, x, y) of features that are also in the previous keyframe,
+    ``previous_keyframe_id``; only of frames that become a keyframe. They determine the ratio of two successive
+    baselines independently of the shape of the ground."""
 
     frame_id: int
     keyframe_id: int
     verdict: Verdict
-    pairs: list[tuple[float, float, float, float]] = []
-    sigma_norm: float = 0.0  # 1-sigma of one coordinate of ``pairs``, normalised units
+    two_view: list[tuple[float, float, float, float]] = []
+    sigma_norm: float = 0.0  # 1-sigma of one coordinate of ``two_view``, normalised units
     inliers: int = 0
     tracked: int = 0
     becomes_keyframe: bool = False  # the following frames are matched with this frame
-    before_id: int = -1  # previous keyframe; -1: no triples
-    triples: list[tuple[float, float, float, float, float, float]] = []
-    triples_sigma_norm: float = 0.0  # 1-sigma of one coordinate of ``triples``, normalised units
+    previous_keyframe_id: int = -1  # -1: ``three_view`` is empty
+    three_view: list[tuple[float, float, float, float, float, float]] = []
+    three_view_sigma_norm: float = 0.0  # 1-sigma of one coordinate of ``three_view``, normalised units
     # The view equals that of the previous frame to 0.006 degrees: the vehicle is stationary, or the camera is frozen.
     static: bool = False
 
@@ -201,11 +201,68 @@ class Prediction(Message, frozen=True, kw_only=True):
     agl_sigma_m: float
     step_m: Vec2  # camera motion (east, north) since the previous Prediction, from odometry alone
     step_cov_m2: Mat2  # covariance of step_m (ee, en, ne, nn)
-    lens: float = 0.0  # estimated residual radial distortion, if significant (core.camera.undistort_division)
-    start_ns: int = 0  # t_ns of the Start or EkfDeadReckoning that reset the position; 0: no reset
+    # Coefficient [-] of the division model for the distortion that the description of the camera leaves
+    # (core.camera.undistort_division); 0: not significant
+    radial_k1: float = 0.0
+    prior_t_ns: int = 0  # t_ns of the InitialPosition or EkfDeadReckoning that reset the position; 0: no reset
 
 
 # --- anchor ---------------------------------------------------------------------------------------
+
+
+class MapPose(msgspec.Struct, frozen=True, kw_only=True):
+    """Camera pose of a map match."""
+
+    p_c_in_w_m: Vec3
+    q_w_c: Quat
+    cov: Mat6
+    # Position of a mode of the posterior, attitude as predicted: there are no consistent 2D-3D matches.
+    position_only: bool = False
+
+
+class MatchPlace(msgspec.Struct, frozen=True, kw_only=True):
+    """Place about which the pose of a frame was estimated: the strongest mode of the posterior, the mode that the
+    patches of the frame alone have selected, or the place that a search has found."""
+
+    e_m: float
+    n_m: float
+    mass: float  # probability mass of the strongest mode of the posterior, 0..1; 1 after a search
+
+
+class BeliefMode(msgspec.Struct, frozen=True, kw_only=True):
+    """One mode of the posterior over position."""
+
+    e_m: float
+    n_m: float
+    mass: float  # probability mass, 0..1
+    variance_m2: float  # within the mode, per axis
+
+
+class BeliefSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """The posterior over camera positions, east and north, after a frame (point mass filter of the anchor)."""
+
+    mean_m: Vec2  # of the whole posterior
+    cov_m2: Mat2  # of the whole posterior, all modes (ee, en, ne, nn)
+    modes: list[BeliefMode]  # the strongest ones, the best first
+    mode_score: float  # standardised correlation of the frame at the best mode
+
+
+class GroundPlane(msgspec.Struct, frozen=True, kw_only=True):
+    """Plane fitted to the map's DEM below the camera."""
+
+    amsl_m: float  # AMSL height below the predicted camera, or below the place that a search has found
+    slope_e: float  # rise per metre towards east
+    slope_n: float  # rise per metre towards north
+    relief_m: float = 0.0  # RMS deviation of the DEM from the plane
+
+
+class SearchResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What the relocalisation search says of a frame."""
+
+    step: SearchStep = SearchStep.NORMAL
+    # 1-sigma per horizontal axis, for the case that the position is wrong; in addition to the predicted covariance.
+    sigma_m: float = 0.0
+    relocalized: bool = False  # the search has found the pose: the prior position is to be discarded
 
 
 class MapMatch(Message, frozen=True, kw_only=True):
@@ -214,30 +271,21 @@ class MapMatch(Message, frozen=True, kw_only=True):
     frame_id: int
     verdict: Verdict
     matcher: str  # "gradient", "xfeat"
-    coarse: bool = False  # position of the posterior mode only: no consistent 2D-3D matches
-    matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight
-    p_c_in_w_m: Vec3 | None = None
-    q_w_c: Quat | None = None
-    cov: Mat6 | None = None
-    lens: float = 0.0  # residual radial distortion used for this frame (as in Prediction)
     inliers: int = 0
     reprojection_px: float = 0.0
-    margin: float = 0.0  # best peak less second-best peak of the correlation surface, in its standard deviations
-    mode_mass: float = 0.0  # probability mass of the strongest mode of the posterior, 0..1
-    mode_e_m: float = 0.0  # centre of the strongest mode
-    mode_n_m: float = 0.0
-    # The strongest modes of the posterior: east, north [m], probability mass, variance within the mode per axis [m^2]
-    modes: list[tuple[float, float, float, float]] = []
-    belief_m: Vec2 = (0.0, 0.0)  # mean of the whole posterior, east and north
-    belief_cov_m2: Mat2 = (0.0, 0.0, 0.0, 0.0)  # covariance of the whole posterior, all modes
-    # Plane fitted to the ground below in the DEM of the map: AMSL height at p_c_in_w_m, slope east, slope north.
-    ground: Vec3 | None = None
-    relief_m: float = 0.0  # RMS deviation of the visible ground from that plane
+    matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight
+    radial_k1: float = 0.0  # radial coefficient by which the matches are undistorted (as in Prediction)
     map_sigma_m: float = 0.0  # error of the map itself, 1-sigma per horizontal axis, common to all matches
-    step: SearchStep = SearchStep.NORMAL
-    # 1-sigma per horizontal axis, for the case that the position is wrong; in addition to the predicted covariance.
-    lost_sigma_m: float = 0.0
-    found: bool = False  # found by relocalisation: the prior position is to be discarded
+    pose: MapPose | None = None
+    place: MatchPlace | None = None
+    belief: BeliefSummary | None = None  # None: the frame was not correlated around the believed position
+    ground: GroundPlane | None = None  # None: no DEM
+    search: SearchResult = SearchResult()
+
+    @property
+    def position_only(self) -> bool:
+        """A coarse match: its pose is the position of a mode alone."""
+        return self.pose is not None and self.pose.position_only
 
 
 class SearchState(Message, frozen=True, kw_only=True):
@@ -286,11 +334,11 @@ class HintVerdict(Message, frozen=True, kw_only=True):
     text: str  # for the operator, at most 40 characters
 
 
-class Start(Message, frozen=True, kw_only=True):
-    """Initial position if Origin has none: the reply to a GnssStart, with the ground height of the map.
+class InitialPosition(Message, frozen=True, kw_only=True):
+    """Initial position if Origin has none: the reply to a GnssInitialPosition, with the ground height of the map.
 
-    ``t_ns`` is that of the GnssStart. OUTSIDE_MAP: rejected. Without coordinates (None) the initial position is
-    unknown."""
+    ``t_ns`` is that of the GnssInitialPosition. OUTSIDE_MAP: rejected. Without coordinates (None) the initial position
+    is unknown."""
 
     verdict: Verdict
     lat_deg: float | None
@@ -435,10 +483,10 @@ class GpsInput(Message, frozen=True, kw_only=True):
     vert_accuracy_m: float
     satellites_visible: int
     estimate_age_ms: float  # age of the estimate that was propagated to this time; -1: none
-    caution: int = 0  # degradation level: 1, 2, 3 from 5, 15, 35 s without a map fix
+    degradation: int = 0  # level: 1, 2, 3 from 5, 15, 35 s without a map fix
     unanchored_s: float | None = None  # seconds since the last map fix; None: no estimate accepted yet
     map_offset_m: tuple[float, float] = (0.0, 0.0)  # east, north: subtracted error of the map (MapOffset)
-    reason: str = ""  # reason for a fix_type other than 3
+    no_fix_reason: str = ""  # of a fix_type other than 3
     resets: int = 0  # accepted jumps of the estimate since the start of the link: reset_counter of ODOMETRY
 
 
@@ -468,7 +516,7 @@ class GnssReading(Message, frozen=True, kw_only=True):
     satellites: int | None
 
 
-class GnssStart(Message, frozen=True, kw_only=True):
+class GnssInitialPosition(Message, frozen=True, kw_only=True):
     """Position of the vehicle before take-off from a GNSS receiver, until arming; repeated once a second.
 
     ``t_ns`` is that of the reading, also in its repetitions. Without coordinates (None) the previous one is
@@ -597,7 +645,7 @@ AnyMessage = (
     | PositionHint
     | EkfDeadReckoning
     | HintVerdict
-    | Start
+    | InitialPosition
     | NavEstimate
     | CalibrationFault
     | CalibrationEstimate
@@ -607,7 +655,7 @@ AnyMessage = (
     | GpsInput
     | LinkStatus
     | GnssReading
-    | GnssStart
+    | GnssInitialPosition
     | GnssVerdict
     | MapOffset
     | PositionSource

@@ -50,4 +50,4 @@ def test_a_foreign_frame_is_rejected_and_a_gap_in_a_turn_is_bridged(
     assert evidence.metrics["within_50m"] == 1.0 and evidence.metrics["within_20m"] >= 0.8
     assert evidence.metrics["false_fixes"] == 0 and evidence.metrics["ellipse95_coverage"] >= 0.9
     assert evidence.metrics["odometry_rate"] > 0.95  # the gap starts no new fragment: the remaining frames overlap
-    assert {frame.match.step for frame in evidence.frames if frame.match} <= {SearchStep.NORMAL, SearchStep.SKIP}
+    assert {frame.match.search.step for frame in evidence.frames if frame.match} <= {SearchStep.NORMAL, SearchStep.SKIP}

@@ -27,7 +27,7 @@ def test_fact_the_initial_position_is_that_of_the_firmwares_receiver(tmp_path: P
     port = free_port()
     with copter(tmp_path, {}, port, free_port(socket.SOCK_STREAM)):
         published = run_processes(port)
-    starts = [x for x in published if isinstance(x, m.Start)]
+    starts = [x for x in published if isinstance(x, m.InitialPosition)]
     estimates = [x for x in published if isinstance(x, m.NavEstimate)]
     texts = [x.text for x in published if isinstance(x, m.StatusText)]
     assert starts, texts

@@ -11,13 +11,13 @@ from terrafix.anchor.matching.point_mass_filter import Belief, Mode
 from terrafix.anchor.matching.predicted_view import VAR_YAW
 from terrafix.anchor.verification.place_verifier import SIGMA_FLOOR
 from terrafix.core.node import Image
-from terrafix.messages import MapMatch, Prediction, Verdict
+from terrafix.messages import BeliefMode, BeliefSummary, MapMatch, MatchPlace, Prediction, Verdict
 
 MODE_MASS = 0.9  # mass of one mode from which its position is published as a measurement [tuned]
 # Likelihood ratio of a pose with enough inliers, for the belief: such poses are found at most right places and in 0.5 %
 # of the frames at wrong ones (docs/search.md). [tuned]
 POSE_LIKELIHOOD_RATIO = 20.0
-REPORTED_MODES = 2  # the best mode and the second one [spec: MapMatch.modes]
+REPORTED_MODES = 2  # the best mode and the second one [spec: BeliefSummary.modes]
 MIN_POSE_MODE_MASS = 0.5  # mass of the mode from which a pose is estimated there [tuned]
 COARSE_SCORE = 3.0  # standardised correlation in the current frame that a position-only match needs [tuned]
 UNKNOWN_HEADING_RAD = 1.5  # 1-sigma above which the heading counts as unknown [tuned]
@@ -61,7 +61,7 @@ def estimate_pose(
     if match.verdict is Verdict.ACCEPTED:
         inliers = match.inliers
     # Single patches with less information than all together may share a bias; the consensus is more precise.
-    if match.verdict is not Verdict.ACCEPTED or ground_sigma_m(match, view.agl_m) > SIGMA_FLOOR * view.agl_m:
+    if match.verdict is not Verdict.ACCEPTED or ground_sigma_m(match.pose, view.agl_m) > SIGMA_FLOOR * view.agl_m:
         consensus = seen.layer.consensus.estimate(seen.image, view_at(view, hypothesis, mode.e_m, mode.n_m))
         joint = match if consensus is None else pose_match(match, consensus, view)
         match = joint if joint.verdict is Verdict.ACCEPTED else match
@@ -74,17 +74,19 @@ def heading_is_unknown(prediction: Prediction) -> bool:
 
 
 def with_belief(match: MapMatch, belief: Belief, modes: list[Mode], score: float) -> MapMatch:
+    """``match`` with the belief, and its best mode as the place of the pose."""
     ee, en, nn = belief.covariance()
     return msgspec.structs.replace(
         match,
-        margin=score,
-        mode_mass=modes[0].mass,
-        mode_e_m=modes[0].e_m,
-        mode_n_m=modes[0].n_m,
-        modes=[(m.e_m, m.n_m, m.mass, m.var_m2) for m in modes],
-        belief_m=belief.mean,
-        belief_cov_m2=(ee, en, en, nn),
+        place=MatchPlace(e_m=modes[0].e_m, n_m=modes[0].n_m, mass=modes[0].mass),
+        belief=BeliefSummary(
+            mean_m=belief.mean, cov_m2=(ee, en, en, nn), modes=reported_modes(modes), mode_score=score
+        ),
     )
+
+
+def reported_modes(modes: list[Mode]) -> list[BeliefMode]:
+    return [BeliefMode(e_m=m.e_m, n_m=m.n_m, mass=m.mass, variance_m2=m.var_m2) for m in modes]
 
 
 def decide(match: MapMatch, pose: PoseResult, belief: Belief, seen: Observation, score: float) -> MapMatch:
@@ -94,9 +96,13 @@ def decide(match: MapMatch, pose: PoseResult, belief: Belief, seen: Observation,
     if match.verdict is Verdict.ACCEPTED:
         belief.confirm(pose.mode, pose.likelihood_ratio)
         modes = belief.modes(REPORTED_MODES)
-        reported = [(m.e_m, m.n_m, m.mass, m.var_m2) for m in modes]
-        verdict = Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS
-        return msgspec.structs.replace(match, verdict=verdict, mode_mass=modes[0].mass, modes=reported)
+        assert match.place is not None and match.belief is not None
+        return msgspec.structs.replace(
+            match,
+            verdict=Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS,
+            place=msgspec.structs.replace(match.place, mass=modes[0].mass),
+            belief=msgspec.structs.replace(match.belief, modes=reported_modes(modes)),
+        )
     if pose.mode.mass < MODE_MASS:
         return msgspec.structs.replace(match, verdict=Verdict.AMBIGUOUS)
     if score < COARSE_SCORE:

@@ -41,7 +41,17 @@ from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget
 from terrafix.map.package import MapPackage
-from terrafix.messages import HintVerdict, MapMatch, Origin, PositionHint, Prediction, SearchStep, Verdict
+from terrafix.messages import (
+    HintVerdict,
+    MapMatch,
+    MatchPlace,
+    Origin,
+    PositionHint,
+    Prediction,
+    SearchResult,
+    SearchStep,
+    Verdict,
+)
 
 NEW_GROUND_SHARE = 0.35  # share of the footprint: motion after which an observation counts in full [tuned]
 MIN_OBSERVATION_WEIGHT = 0.08  # weight of another observation of the same ground [tuned]
@@ -123,7 +133,7 @@ class Localizer:
         """Moves belief and search by odometry. The first prediction of a flight initialises the belief."""
         if self._layers is None or self._origin is None:
             return
-        self._layers.set_distortion(prediction.lens)
+        self._layers.set_distortion(prediction.radial_k1)
         best = self._layers.best
         cell_m = belief_cell_m(prediction.agl_m, best.matcher.correlation_cell_m(prediction.agl_m))
         step_m = float(np.hypot(*prediction.step_m))
@@ -171,11 +181,11 @@ class Localizer:
         if self._layers is None or self._belief is None:
             return match
         best = self._layers.best
-        match = msgspec.structs.replace(match, map_sigma_m=best.sigma_m, lens=prediction.lens)
+        match = msgspec.structs.replace(match, map_sigma_m=best.sigma_m, radial_k1=prediction.radial_k1)
         if self._relocalizer.is_active:
             return self._search(match, prediction, image, best)
         if image is None:
-            return msgspec.structs.replace(match, verdict=Verdict.BAD_IMAGE, step=SearchStep.SKIP)
+            return with_step(msgspec.structs.replace(match, verdict=Verdict.BAD_IMAGE), SearchStep.SKIP)
         return self._track(match, prediction, image, self._layers, self._belief)
 
     def no_match(self, prediction: Prediction, verdict: Verdict) -> MapMatch:
@@ -185,33 +195,35 @@ class Localizer:
             frame_id=prediction.frame_id,
             verdict=verdict,
             matcher=self._describer.name,
-            lost_sigma_m=self._relocalizer.sigma_m,
+            search=SearchResult(sigma_m=self._relocalizer.sigma_m),
         )
 
     def model_failed(self, prediction: Prediction) -> MapMatch:
         """The MapMatch of a frame on which the learned model failed."""
-        match = msgspec.structs.replace(self.no_match(prediction, Verdict.MODEL_FAILED), step=SearchStep.SKIP)
+        match = with_step(self.no_match(prediction, Verdict.MODEL_FAILED), SearchStep.SKIP)
         return self._relocalizer.search_match(match) if self._relocalizer.is_active else match
 
     def label_step(self, match: MapMatch) -> MapMatch:
         """``match`` with the step of the search escalation, where that is a new fragment or a merge."""
-        if match.step is SearchStep.SKIP:
+        if match.search.step is SearchStep.SKIP:
             return match
         if self._disconnected:
             self._fragment_open = True
-            return msgspec.structs.replace(match, step=SearchStep.NEW_FRAGMENT)
-        if match.found or (self._fragment_open and match.verdict is Verdict.ACCEPTED and not match.coarse):
+            return with_step(match, SearchStep.NEW_FRAGMENT)
+        joins = self._fragment_open and match.verdict is Verdict.ACCEPTED and not match.position_only
+        if match.search.relocalized or joins:
             self._fragment_open = False
-            return msgspec.structs.replace(match, step=SearchStep.MERGE)
+            return with_step(match, SearchStep.MERGE)
         return match
 
     def _search(self, match: MapMatch, prediction: Prediction, image: Image | None, best: MapLayer) -> MapMatch:
         usable = image if prediction.agl_m >= MIN_MATCHING_AGL_M else None
         match = self._relocalizer.process_frame(match, prediction, usable, best, self._ground_m)
-        if match.found:
+        if match.search.relocalized:
+            assert match.place is not None
             self._lock_monitor = LockMonitor()
             cell_m = belief_cell_m(prediction.agl_m, best.matcher.correlation_cell_m(prediction.agl_m))
-            self._belief = Belief(match.mode_e_m, match.mode_n_m, FOUND_SIGMA_M, cell_m)
+            self._belief = Belief(match.place.e_m, match.place.n_m, FOUND_SIGMA_M, cell_m)
         return match
 
     def _track(
@@ -220,9 +232,9 @@ class Localizer:
         """Update of the belief with one frame, and the pose in its best mode."""
         best = layers.best
         e_m, n_m, _ = prediction.p_c_in_w_m
-        ground, relief_m = ground_plane(best.map, e_m, n_m, prediction.agl_m)
+        ground = ground_plane(best.map, e_m, n_m, prediction.agl_m)
         view = view_of(prediction, ground, self._ground_m)
-        match = msgspec.structs.replace(match, ground=ground, relief_m=relief_m)
+        match = msgspec.structs.replace(match, ground=ground)
         if view.agl_m < MIN_MATCHING_AGL_M:
             return msgspec.structs.replace(match, verdict=Verdict.TOO_LOW)
         seen = self._correlate(image, view, layers, belief)
@@ -249,7 +261,7 @@ class Localizer:
         # Mixture "believed position, or anywhere": the variance that the second component adds.
         wrong = max(self._lock_monitor.wrong_probability, tested)
         self._relocalizer.sigma_m = mixed_sigma_m(wrong, best.map)
-        match = msgspec.structs.replace(pose.match, lost_sigma_m=self._relocalizer.sigma_m)
+        match = msgspec.structs.replace(pose.match, search=SearchResult(sigma_m=self._relocalizer.sigma_m))
         if self._lock_monitor.lost or wrong == 1.0:
             around_m = prediction.p_c_in_w_m[:2] if tested < 1.0 else None
             self._relocalizer.start(best, prediction.agl_m, around_m)
@@ -290,7 +302,9 @@ class Localizer:
         if place is None:
             return pose
         mode, fix = place
-        match = pose_match(msgspec.structs.replace(pose.match, mode_e_m=mode.e_m, mode_n_m=mode.n_m), fix, view)
+        assert pose.match.place is not None
+        there = MatchPlace(e_m=mode.e_m, n_m=mode.n_m, mass=pose.match.place.mass)
+        match = pose_match(msgspec.structs.replace(pose.match, place=there), fix, view)
         return PoseResult(match, mode, attempted=match.verdict is Verdict.ACCEPTED, likelihood_ratio=LIKELIHOOD_RATIO)
 
 
@@ -310,3 +324,8 @@ def predict_belief(belief: Belief, prediction: Prediction, sigma_m: float, cell_
     belief.fit_window(0.0)
     if not CELL_RATIO_MIN < cell_m / belief.cell_m < CELL_RATIO_MAX:
         belief.set_cell(cell_m)
+
+
+def with_step(match: MapMatch, step: SearchStep) -> MapMatch:
+    """``match`` with another stage of the search."""
+    return msgspec.structs.replace(match, search=msgspec.structs.replace(match.search, step=step))

@@ -12,7 +12,8 @@ from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.map.package import MapPackage
 from terrafix.messages import (
-    GnssStart,
+    GnssInitialPosition,
+    InitialPosition,
     MapMatch,
     Message,
     Origin,
@@ -20,7 +21,6 @@ from terrafix.messages import (
     Prediction,
     SearchState,
     SearchStep,
-    Start,
 )
 from terrafix_engines.features import open_describer
 from terrafix_engines.features.gradient import GradientDescriber
@@ -45,8 +45,8 @@ class AnchorNode:
         self._localizer = Localizer(package, describer, ce90_m, cache_dir)
         self._origin: Origin | None = None
         self._hint: PositionHint | None = None  # not yet applied
-        self._start: Start | None = None  # result of the newest GnssStart
-        self._prior_t_ns = 0  # of the Start on which the predictions are based
+        self._initial: InitialPosition | None = None  # result of the newest GnssInitialPosition
+        self._prior_t_ns = 0  # of the InitialPosition on which the predictions are based
         self._pending: list[Message] = []  # to be published after the MapMatch
         self._published_step = SearchStep.NORMAL
 
@@ -58,10 +58,10 @@ class AnchorNode:
                 yield from self._model.opened(message.t_ns)
             case PositionHint():
                 self._hint = message  # applied with the next prediction, which has height and position
-            case GnssStart():
-                if self._start is None or self._start.t_ns != message.t_ns:
-                    self._start = check_initial_position(message, self._package)
-                yield self._start
+            case GnssInitialPosition():
+                if self._initial is None or self._initial.t_ns != message.t_ns:
+                    self._initial = check_initial_position(message, self._package)
+                yield self._initial
             case Prediction():
                 yield from self._on_prediction(message)
             case _:
@@ -71,16 +71,16 @@ class AnchorNode:
         return ()
 
     def _on_prediction(self, prediction: Prediction) -> Iterable[Message]:
-        if prediction.start_ns > self._prior_t_ns:  # the belief refers to another position
-            self._prior_t_ns = prediction.start_ns
+        if prediction.prior_t_ns > self._prior_t_ns:  # the belief refers to another position
+            self._prior_t_ns = prediction.prior_t_ns
             self._localizer.reset()
         match = self._localizer.label_step(self._localized(prediction))
         yield match
         yield from self._pending
         self._pending.clear()
-        if match.step is not self._published_step:
-            self._published_step = match.step
-            yield SearchState(t_ns=prediction.t_ns, step=match.step)
+        if match.search.step is not self._published_step:
+            self._published_step = match.search.step
+            yield SearchState(t_ns=prediction.t_ns, step=match.search.step)
 
     def _localized(self, prediction: Prediction) -> MapMatch:
         """The MapMatch of a frame. A failure of the learned model costs this frame; after several in a row the model is

@@ -8,7 +8,7 @@ import msgspec
 
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
-from terrafix.messages import Origin, Start
+from terrafix.messages import InitialPosition, Origin
 
 # 1-sigma per axis: the map is searched for an initial position that is less certain than this.
 SEARCH_START_SIGMA_M = 100.0
@@ -38,13 +38,13 @@ def with_map_center(origin: Origin, bounds: Bounds) -> Origin:
     return msgspec.structs.replace(origin, lat_deg=lat_deg, lon_deg=lon_deg, start_sigma_m=half_m)
 
 
-def with_initial_position(origin: Origin, start: Start | None) -> Origin:
-    """The origin with the position sigma and the ground height of the initial position ``start``. The reference point
+def with_initial_position(origin: Origin, initial: InitialPosition | None) -> Origin:
+    """The origin with the position sigma and the ground height of the initial position ``initial``. The reference point
     of the local frame does not change."""
-    if start is None or start.sigma_m is None:
+    if initial is None or initial.sigma_m is None:
         return origin
-    ground_m = origin.ground_amsl_m if start.ground_amsl_m is None else start.ground_amsl_m
-    return msgspec.structs.replace(origin, start_sigma_m=start.sigma_m, ground_amsl_m=ground_m)
+    ground_m = origin.ground_amsl_m if initial.ground_amsl_m is None else initial.ground_amsl_m
+    return msgspec.structs.replace(origin, start_sigma_m=initial.sigma_m, ground_amsl_m=ground_m)
 
 
 def map_bounds(package: Path) -> Bounds:

@@ -154,14 +154,14 @@ class FilterState:
         """R_w_b (3, 3) of a frame, with the estimated mount."""
         return self.camera.body(frame.pose.rotation().matrix(), self.graph.state(frame.node).bias)
 
-    def lens(self, node: int) -> float:
-        """Radial distortion beyond the camera's description; 0 where it is not significant."""
-        distortion = float(self.graph.state(node).bias[RADIAL_K1])
-        return distortion if abs(distortion) > LENS_SURE * self.lens_sigma else 0.0
+    def radial_k1(self, node: int) -> float:
+        """Coefficient of the radial distortion beyond the camera's description; 0 where it is not significant."""
+        radial_k1 = float(self.graph.state(node).bias[RADIAL_K1])
+        return radial_k1 if abs(radial_k1) > LENS_SURE * self.lens_sigma else 0.0
 
     @property
-    def lens_estimate(self) -> tuple[float, float]:
-        """Radial distortion beyond the camera's description at the newest node, and its 1-sigma."""
+    def radial_k1_estimate(self) -> tuple[float, float]:
+        """Coefficient of the radial distortion beyond the camera's description at the newest node, and its 1-sigma."""
         return float(self.graph.state(self.graph.newest).bias[RADIAL_K1]), self.lens_sigma
 
     def height_scale(self, node: int) -> tuple[float, float]:

@@ -212,8 +212,8 @@ class Initializer:
         """The prior, moved on to ``t_s``."""
         self._has_heading, self._has_height = attitude.yaw_rad is not None, attitude.agl_m is not None
         self._prior = prior = self._prior or NavPrior.start(self._origin, t_s)
-        if prior.match is not None:
-            terrain.update(prior.match, np.array([prior.match.mode_e_m, prior.match.mode_n_m]))
+        if prior.ground is not None:
+            terrain.update(prior.ground.plane, np.array(prior.ground.at_m))
         way_m, way_sigma_m = prior.path_until(t_s, attitude.yaw_rad)
         sigma_m = float(np.hypot(prior.sigma_m, way_sigma_m))
         rise_m = terrain.rise_sigma_m(float(np.hypot(*way_m)) + way_sigma_m)

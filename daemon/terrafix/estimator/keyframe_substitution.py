@@ -26,21 +26,21 @@ class KeyframeSubstitution:
     def of(cls, first: Odometry) -> "KeyframeSubstitution | None":
         """``first``: odometry, as vision published it, of the first frame of the graph. None: it has no earlier
         keyframe."""
-        if first.verdict is not Verdict.ACCEPTED or not first.pairs or first.keyframe_id == first.frame_id:
+        if first.verdict is not Verdict.ACCEPTED or not first.two_view or first.keyframe_id == first.frame_id:
             return None
-        seen = {(x_kf, y_kf): (x, y) for x_kf, y_kf, x, y in first.pairs}
+        seen = {(x_kf, y_kf): (x, y) for x_kf, y_kf, x, y in first.two_view}
         return cls(first.keyframe_id, first.frame_id, seen, first.sigma_norm)
 
     def applied(self, odometry: Odometry) -> Odometry:
-        """The same motion against ``frame_id``, without triples, which need the lost keyframe; unchanged
+        """The same motion against ``frame_id``, without ``three_view``, which need the lost keyframe; unchanged
         where it refers to another keyframe."""
         if odometry.keyframe_id != self.keyframe_id or odometry.frame_id == self.frame_id:
             return odometry
-        pairs = [(*self.seen[x_kf, y_kf], x, y) for x_kf, y_kf, x, y in odometry.pairs if (x_kf, y_kf) in self.seen]
+        pairs = [(*self.seen[x_kf, y_kf], x, y) for x_kf, y_kf, x, y in odometry.two_view if (x_kf, y_kf) in self.seen]
         return msgspec.structs.replace(
             odometry,
             keyframe_id=self.frame_id,
-            pairs=pairs,
+            two_view=pairs,
             sigma_norm=math.hypot(self.sigma_norm, odometry.sigma_norm),  # the keyframe's own points have no error
-            triples=[],
+            three_view=[],
         )

@@ -79,11 +79,12 @@ class MapUpdate:
         node = state.node_of.get(match.frame_id)
         if node is not None and not state.graph.holds(node):
             node = None
-        if match.found or match.t_ns >= self._newest_match_ns:  # ground and belief: of the newest frame, or of a search
+        # Ground and belief: of the newest frame, or of a search.
+        if match.search.relocalized or match.t_ns >= self._newest_match_ns:
             self._newest_match_ns = max(match.t_ns, self._newest_match_ns)
             if lost := self._update_belief(match, node):
                 return _result(Verdict.LOST, lost)
-        if node is not None and (match.coarse or match.verdict in NOTHING_FOUND):
+        if node is not None and (match.position_only or match.verdict in NOTHING_FOUND):
             self._map_hit_rate.update(state.fragments.of(node), found=False)
         if match.verdict is not Verdict.ACCEPTED:
             return _result(match.verdict)
@@ -91,8 +92,8 @@ class MapUpdate:
             return _result(Verdict.DEGENERATE)
         if node is None:
             return _result(Verdict.STALE)
-        measurement = MapPoseMeasurement.of(match, state.terrain, state.lens_estimate)
-        if match.found:  # by a search over several frames: it outweighs whatever the graph has
+        measurement = MapPoseMeasurement.of(match, state.terrain, state.radial_k1_estimate)
+        if match.search.relocalized:  # by a search over several frames: it outweighs whatever the graph has
             self.hypotheses.other, self.hypotheses.map_consistency = OtherPlace(), MapConsistency()
             return self._reset(match, node, measurement, "found")
         if state.yaw_gauge is not None:
@@ -104,19 +105,19 @@ class MapUpdate:
     def _update_belief(self, match: MapMatch, node: int | None) -> str:
         """Ground and belief of the newest frame. -> detail of the verdict on a match that is LOST; else empty."""
         state = self._state
-        state.terrain.update(match, None if node is None else state.graph.state(node).pose.translation())
-        lost = self.hypotheses.on_match(match)
-        if node is not None and match.modes:
+        state.terrain.update(match.ground, None if node is None else state.graph.state(node).pose.translation())
+        lost = self.hypotheses.on_match(match.verdict, match.search)
+        if node is not None and match.belief is not None:
             frame = self._frame_state(match.frame_id, node)
             p_m = np.asarray(frame.pose.translation())
             height_m = max(float(p_m[UP]) - state.terrain.ground_m, 1.0)
             cov = tangent_to_world(frame.cov, frame.pose.rotation().matrix())
-            self.hypotheses.update_modes(match, p_m, cov, height_m)
+            self.hypotheses.update_modes(match.belief, p_m, cov, height_m)
         return lost
 
     def _apply_without_heading(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult:
         """The first pose that agrees with the position gives the heading."""
-        if match.coarse:  # its heading is one of those that were tried
+        if match.position_only:  # its heading is one of those that were tried
             return _result(Verdict.AMBIGUOUS, "coarse match gives no heading")
         frame = self._frame_state(match.frame_id, node)
         innovation = measurement.position_innovation(frame.pose, frame.cov)
@@ -127,14 +128,14 @@ class MapUpdate:
     def _coarse_refusal(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult | None:
         """Why a coarse match is not fused; None: it is to be fused, or the match is not coarse."""
         state = self._state
-        if match.coarse and not state.fragments.of(node).joined:  # its position comes from earlier frames
+        if match.position_only and not state.fragments.of(node).joined:  # its position comes from earlier frames
             return _result(Verdict.UNCONFIRMED, "coarse match cannot confirm an odometry fragment")
         predicted, height_m = state.graph.state(node).pose, self._height_m(measurement)
         r_w_c = measurement.pose.rotation().matrix()
         sigma_m = float(np.sqrt(np.max(np.diag(tangent_to_world(state.covariance(node), r_w_c))[:2])))
-        if match.coarse and sigma_m > COARSE_CONTINUES * height_m:
+        if match.position_only and sigma_m > COARSE_CONTINUES * height_m:
             offset = (measurement.pose.translation() - predicted.translation())[:2]
-            self._coarse.add(offset, predicted.translation()[:2], coarse=True)
+            self._coarse.add(offset, predicted.translation()[:2], position_only=True)
             if not self._coarse.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height_m):
                 return _result(
                     Verdict.AMBIGUOUS, "coarse match: the estimate is too uncertain, six consistent ones are needed"
@@ -155,7 +156,7 @@ class MapUpdate:
         if state.mode is CovarianceMode.JACOBIAN:
             information = np.linalg.inv(state.cov_of[node]) + np.linalg.inv(measurement.cov / share)
             state.cov_of[node] = np.linalg.inv(information)
-        if not match.coarse:
+        if not match.position_only:
             assert fusion.innovation is not None
             gate = tangent_to_world(fusion.innovation.covariance, before.pose.rotation().matrix())
             self.hypotheses.map_consistency.add_accepted(share, gate[:2, :2])
@@ -172,7 +173,7 @@ class MapUpdate:
             state.terrain.roughness.update(here, height_m, level_m, float(np.sqrt(cov[UP, UP])))
         if self._fixes.newest_s is not None:
             new_m = self._fixes.new_ground_m(state.graph.time_of(node), here, math.inf)
-            self.hypotheses.other.decay(new_m / height_m, match.mode_mass)
+            self.hypotheses.other.decay(new_m / height_m, _place_mass(match))
         self._map_hit_rate.update(state.fragments.of(node), found=True)
 
     def _accept(self, match: MapMatch, t_s: float, here_m: np.ndarray) -> None:
@@ -194,8 +195,8 @@ class MapUpdate:
         position = measurement.position_innovation(predicted, state.covariance(node))
         offset, apart = position.residual, position.covariance
         run, other = self._rejected, self.hypotheses.other
-        agrees = run.add(offset, predicted.translation()[:2], coarse=match.coarse)
-        if not match.coarse and not agrees:  # those that agree with each other support another position
+        agrees = run.add(offset, predicted.translation()[:2], position_only=match.position_only)
+        if not match.position_only and not agrees:  # those that agree with each other support another position
             self.hypotheses.map_consistency.add_rejected(offset)
         height = float(measurement.pose.translation()[UP]) - state.terrain.ground_m
         # A pose uses patches of its own frame only. A coarse match depends on earlier frames: one wrong correlation
@@ -208,7 +209,7 @@ class MapUpdate:
             # Before the first fix only the start coordinate supports the graph: as much as one such pose against it.
             first = state.last_fix_s is None and match.inliers >= OUTWEIGHS_START
             needed = (MIN_CONSISTENT, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
-            if (found or run.is_confirmed(*needed, poses_only=certain)) and match.mode_mass >= RECOVER_MASS:
+            if (found or run.is_confirmed(*needed, poses_only=certain)) and _place_mass(match) >= RECOVER_MASS:
                 other.switch(offset, apart)
                 return self._reset(match, node, measurement, "restarted")
         detail = f"horizontally {float(np.hypot(*offset)):.0f} m from the estimate"
@@ -226,7 +227,7 @@ class MapUpdate:
         onward = was.pose.between(now.pose)
         cov = self._moved_cov(measurement.cov, onward, now_s - fixed_s)
         bias = now.bias.copy()
-        if match.found:  # the ground there lies at another height than the one that was assumed
+        if match.search.relocalized:  # the ground there lies at another height than the one that was assumed
             bias[HEIGHT] -= float(measurement.pose.translation()[UP] - was.pose.translation()[UP])
         bias_cov = state.graph.bias_covariance(state.graph.newest)
         velocity, velocity_cov = now.velocity, RESTART_INFLATION * state.graph.velocity_covariance(state.graph.newest)
@@ -236,7 +237,7 @@ class MapUpdate:
         first = NodeState(measurement.pose.compose(onward), bias, velocity)
         reset(state, state.last.frame_id, now_s, GraphPrior(first, cov, bias_cov, velocity_cov))
         self._rejected.clear()
-        self.hypotheses.on_reset(match.lost_sigma_m)
+        self.hypotheses.on_reset(match.search.sigma_m)
         self._fixes = CorrelatedFixes()
         self._accept(match, fixed_s, measurement.position_m)
         detail = f"{how} {float(np.hypot(*offset)):.0f} m away"
@@ -267,6 +268,10 @@ class MapUpdate:
 
     def _frame_state(self, frame_id: int, node: int) -> FrameState:
         return self._state.frame_state(frame_id, self._state.graph.time_of(node), node)
+
+
+def _place_mass(match: MapMatch) -> float:
+    return 0.0 if match.place is None else match.place.mass
 
 
 def _result(verdict: Verdict, detail: str = "") -> MapResult:

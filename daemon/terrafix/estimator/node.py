@@ -38,6 +38,7 @@ from terrafix.messages import (
     EkfDeadReckoning,
     Health,
     Imu,
+    InitialPosition,
     MapMatch,
     Message,
     NavEstimate,
@@ -45,7 +46,6 @@ from terrafix.messages import (
     Origin,
     Prediction,
     SourceEnded,
-    Start,
     ThermalBand,
     VehicleState,
     Verdict,
@@ -71,9 +71,10 @@ class EstimatorNode:
         before."""
         self._began_ns, self._checkpoint, self._make_estimator = began_ns, checkpoint, make_estimator
         self._origin: Origin | None = None  # as vision published it
-        self._start = None if checkpoint is None else checkpoint.start  # newest Start, which the Origin lacks
-        self._start_pending = False  # it is applied with the next frame
-        self._first_frame_id = 0  # of the flight from the newest Start
+        # Newest InitialPosition, which the Origin lacks
+        self._initial = None if checkpoint is None else checkpoint.initial_position
+        self._initial_pending = False  # it is applied with the next frame
+        self._first_frame_id = 0  # of the flight from the newest InitialPosition
         self._estimator: Estimator | None = None
         self._axes: LocalFrame | None = None
         self._telemetry = Telemetry()
@@ -97,7 +98,7 @@ class EstimatorNode:
         self._rebuilds = 0  # of the graph
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
             Origin: self._on_origin,
-            Start: self._on_start,
+            InitialPosition: self._on_initial_position,
             VehicleState: self._on_vehicle_state,
             Imu: self._on_imu,
             EkfDeadReckoning: self._on_dead_reckoning,
@@ -137,29 +138,30 @@ class EstimatorNode:
         self._axes = LocalFrame(origin.lat_deg, origin.lon_deg)
         self._time_offset, self._predicted_id = TimeOffset(), None  # of another camera, in other axes
         prior = self._prior(origin, self._axes)
-        self._estimator = self._make_estimator(with_initial_position(origin, self._start), prior)
+        self._estimator = self._make_estimator(with_initial_position(origin, self._initial), prior)
         waiting, self._early_dead_reckoning = self._early_dead_reckoning, []
         for sample in waiting:
             yield from self._on_dead_reckoning(sample)
 
-    def _on_start(self, start: Start) -> Iterable[Message]:
-        if not self._is_placed_by_map and (self._start is None or start.t_ns != self._start.t_ns):
-            self._start, self._start_pending = start, True
+    def _on_initial_position(self, initial: InitialPosition) -> Iterable[Message]:
+        if not self._is_placed_by_map and (self._initial is None or initial.t_ns != self._initial.t_ns):
+            self._initial, self._initial_pending = initial, True
         return ()
 
     @property
     def _is_placed_by_map(self) -> bool:
-        """A map match was accepted, so that no Start counts any more."""
+        """A map match was accepted, so that no InitialPosition counts any more."""
         if self._estimator is not None and self._estimator.last_fix_s is not None:
             return True
         return self._checkpoint is not None and self._checkpoint.estimate.last_anchor_age_ms >= 0
 
-    def _apply_start(self, frame_id: int, t_ns: int, *, stands: bool) -> Estimator:
-        """With the first frame after a Start. A vehicle that still stands is where that says; another one was there."""
-        assert self._origin is not None and self._axes is not None and self._start is not None
-        self._start_pending, self._predicted_id, self._first_frame_id = False, None, frame_id
-        prior = NavPrior.at_start(self._start, self._axes, (t_ns if stands else self._start.t_ns) * 1e-9)
-        self._estimator = self._make_estimator(with_initial_position(self._origin, self._start), prior)
+    def _apply_initial_position(self, frame_id: int, t_ns: int, *, stands: bool) -> Estimator:
+        """With the first frame after an InitialPosition. A vehicle that still stands is at that position;
+        another one was there."""
+        assert self._origin is not None and self._axes is not None and self._initial is not None
+        self._initial_pending, self._predicted_id, self._first_frame_id = False, None, frame_id
+        prior = NavPrior.at_initial_position(self._initial, self._axes, (t_ns if stands else self._initial.t_ns) * 1e-9)
+        self._estimator = self._make_estimator(with_initial_position(self._origin, self._initial), prior)
         return self._estimator
 
     def _prior(self, origin: Origin, axes: LocalFrame) -> NavPrior | None:
@@ -214,7 +216,7 @@ class EstimatorNode:
         if not self._waiting:
             return
         begins = self._estimator is not None and self._estimator.last is None
-        if begins and self._checkpoint is not None and self._checkpoint.slow is not None:
+        if begins and self._checkpoint is not None and self._checkpoint.calibration is not None:
             attitudes = [self._telemetry.at(odometry.t_ns) for odometry in self._waiting]
             known = [attitude.yaw_rad is not None and attitude.agl_m is not None for attitude in attitudes]
             if any(known):
@@ -271,12 +273,12 @@ class EstimatorNode:
         return msgspec.structs.replace(odometry, t_ns=stamp_ns - round(self._time_offset.applied_s * 1e9))
 
     def _frame_input(self, estimator: Estimator, odometry: Odometry) -> tuple[Estimator, FrameInput]:
-        """-> the estimator, which is a new one if a Start is pending, and what it takes of the frame."""
+        """-> the estimator, a new one if an InitialPosition is pending, and what it takes of the frame."""
         origin = estimator.origin
         sigmas_rad = math.radians(origin.attitude_sigma_deg), math.radians(origin.yaw_sigma_deg)
         attitude = self._attitude = self._ahrs.attitude_at(odometry.t_ns, *sigmas_rad)
-        if self._start_pending:
-            estimator = self._apply_start(odometry.frame_id, odometry.t_ns, stands=attitude.stands)
+        if self._initial_pending:
+            estimator = self._apply_initial_position(odometry.frame_id, odometry.t_ns, stands=attitude.stands)
         estimator.state.mode = self._mode
         imu = self._ahrs.world_acceleration
         return estimator, FrameInput(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, imu)
@@ -313,8 +315,8 @@ class EstimatorNode:
             cov = tangent_to_world(frame.cov, frame.pose.rotation().matrix())
             step_m = np.asarray(frame.pose.translation()[:2]) - self._predicted_m
             step_var_m2 += max(float(np.linalg.eigvalsh(cov[:2, :2] - self._predicted_m2)[-1]), 0.0)
-        start_ns = 0 if self._start is None else self._start.t_ns
-        return prediction_of(estimator, frame, t_ns, step_m, step_var_m2, start_ns)
+        prior_t_ns = 0 if self._initial is None else self._initial.t_ns
+        return prediction_of(estimator, frame, t_ns, step_m, step_var_m2, prior_t_ns)
 
     def _is_slow_due(self, frame: FrameState, estimator: Estimator) -> bool:
         """Whether calibration state and claim are published with this frame: once a second, not before a map match (it
@@ -340,7 +342,7 @@ class EstimatorNode:
         estimator = self._estimator
         if estimator is None:
             return
-        if match.frame_id < self._first_frame_id:  # of ground and belief before the Start
+        if match.frame_id < self._first_frame_id:  # of ground and belief before the InitialPosition
             yield verdict_of(match.t_ns, match.frame_id, FusionVerdict("map", Verdict.STALE))
             return
         estimator.state.mode = self._mode

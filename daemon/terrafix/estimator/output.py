@@ -56,7 +56,7 @@ def odometry_verdict(odometry: Odometry, verdict: Verdict, detail: str = "") -> 
 
 
 def prediction_of(
-    estimator: Estimator, frame: FrameState, t_ns: int, step_m: np.ndarray, step_var_m2: float, start_ns: int
+    estimator: Estimator, frame: FrameState, t_ns: int, step_m: np.ndarray, step_var_m2: float, prior_t_ns: int
 ) -> Prediction:
     """``step_m`` (2,): of the camera since the frame of the Prediction before, with its variance on each axis."""
     r_w_c, p = frame.pose.rotation().matrix(), frame.pose.translation()
@@ -71,8 +71,8 @@ def prediction_of(
         agl_sigma_m=float(np.sqrt(cov[UP, UP])),
         step_m=(float(step_m[0]), float(step_m[1])),
         step_cov_m2=(step_var_m2, 0.0, 0.0, step_var_m2),
-        lens=estimator.state.lens(frame.node),
-        start_ns=max(start_ns, round(estimator.dead_reckoned_s * 1e9)),
+        radial_k1=estimator.state.radial_k1(frame.node),
+        prior_t_ns=max(prior_t_ns, round(estimator.dead_reckoned_s * 1e9)),
     )
 
 
@@ -116,11 +116,11 @@ def calibration_of(estimator: Estimator, frame: FrameState) -> CalibrationEstima
     """The calibration state of ``frame``, the newest one."""
     bias = estimator.graph.state(frame.node).bias
     cov = estimator.graph.bias_covariance(frame.node)
-    tilt_x, tilt_y, heading, height, lens, scale = (float(e) for e in bias)
+    tilt_x, tilt_y, heading, height, radial_k1, scale = (float(e) for e in bias)
     return CalibrationEstimate(
         t_ns=round(frame.t_s * 1e9),
         frame_id=frame.frame_id,
-        state=(tilt_x, tilt_y, heading, height, lens, scale),
+        state=(tilt_x, tilt_y, heading, height, radial_k1, scale),
         cov=tuple(float(c) for c in cov.ravel()),
         lens=estimator.state.principal_point.learnt,
     )

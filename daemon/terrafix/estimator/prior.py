@@ -1,4 +1,4 @@
-"""Where an estimator starts from: the start coordinate, a Start message, or the checkpoint of the process before it."""
+"""Where an estimator starts from: the start coordinate, an InitialPosition, or the checkpoint of the process before."""
 
 import math
 from collections.abc import Iterable
@@ -14,7 +14,18 @@ from terrafix.estimator.measurements.principal_point import graph_shift
 from terrafix.estimator.models.motion_model import MAX_SPEED_SIGMA_MPS, MIN_SPEED_MPS, integrate_motion
 from terrafix.estimator.models.speed_prior import TYPICAL_SPEED_MPS
 from terrafix.estimator.state import CALIBRATION_SIZE, HEADING
-from terrafix.messages import CalibrationEstimate, Camera, LensEstimate, MapMatch, Message, NavEstimate, Origin, Start
+from terrafix.messages import (
+    CalibrationEstimate,
+    Camera,
+    GroundPlane,
+    InitialPosition,
+    LensEstimate,
+    MapMatch,
+    Message,
+    NavEstimate,
+    Origin,
+    Vec2,
+)
 from terrafix.runtime.checkpoint import CheckpointFile
 
 CHECKPOINT_EVERY_NS = 200_000_000  # [tuned]
@@ -26,14 +37,21 @@ TURN_MPS2 = 8.0  # across the course: a bank of 40 degrees [tuned]
 TURN_STARTS = (np.arange(8) + 0.5) / 8  # of a turn, in shares of the time before its latest start [tuned]
 
 
+class CheckpointGround(msgspec.Struct, frozen=True):
+    """Ground plane of a map match, and the place of the match: ``at_m``, east and north."""
+
+    plane: GroundPlane
+    at_m: Vec2
+
+
 class EstimatorCheckpoint(msgspec.Struct, frozen=True):
-    """Last messages of an estimator. ``slow``: calibration state; None: there was none yet. ``match``: the newest one
-    with the elevation of the ground, without its points; None: the map has none. ``start``: the newest Start."""
+    """Last messages of an estimator. ``calibration``: None: there was none yet. ``ground``: of the newest map match
+    that has one; None: the map has no DEM."""
 
     estimate: NavEstimate
-    slow: CalibrationEstimate | None = None
-    match: MapMatch | None = None
-    start: Start | None = None
+    calibration: CalibrationEstimate | None = None
+    ground: CheckpointGround | None = None
+    initial_position: InitialPosition | None = None
 
 
 @dataclass(frozen=True)
@@ -48,7 +66,7 @@ class CalibrationPrior:
 @dataclass(frozen=True)
 class NavPrior:
     """Position ``at_m`` (2,), east and north, at ``t_s`` with ``sigma_m``; ``velocity_mps`` (2,) with its 1-sigma (each
-    axis); ``yaw_rad``: heading of the vehicle, None: unknown. ``learnt``, ``match``, ``lens``: calibration, ground and
+    axis); ``yaw_rad``: heading of the vehicle, None: unknown. ``learnt``, ``ground``, ``lens``: calibration, ground and
     lens of a checkpoint."""
 
     t_s: float
@@ -58,7 +76,7 @@ class NavPrior:
     velocity_sigma_mps: float
     yaw_rad: float | None = None
     learnt: CalibrationPrior | None = None
-    match: MapMatch | None = None
+    ground: CheckpointGround | None = None
     lens: LensEstimate | None = None
 
     @classmethod
@@ -68,28 +86,28 @@ class NavPrior:
         return cls(t_s, np.zeros(2), sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
 
     @classmethod
-    def at_start(cls, start: Start, frame: LocalFrame, t_s: float) -> "NavPrior | None":
-        """Position of a Start at ``t_s``; None when it has none."""
-        if start.lat_deg is None or start.lon_deg is None or start.sigma_m is None:
+    def at_initial_position(cls, initial: InitialPosition, frame: LocalFrame, t_s: float) -> "NavPrior | None":
+        """That position at ``t_s``; None when it is unknown."""
+        if initial.lat_deg is None or initial.lon_deg is None or initial.sigma_m is None:
             return None
-        at_m = np.array(frame.to_local(start.lat_deg, start.lon_deg))
-        return cls(t_s, at_m, start.sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
+        at_m = np.array(frame.to_local(initial.lat_deg, initial.lon_deg))
+        return cls(t_s, at_m, initial.sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
 
     @classmethod
     def of(cls, checkpoint: EstimatorCheckpoint, frame: LocalFrame, camera: Camera) -> "NavPrior":
-        estimate, slow = checkpoint.estimate, checkpoint.slow
+        estimate, calibration = checkpoint.estimate, checkpoint.calibration
         at_m = np.array(frame.to_local(estimate.lat_deg, estimate.lon_deg))
         sigma_m = float(np.sqrt(max(estimate.cov[0], estimate.cov[7])))
         t_s, velocity_mps = estimate.t_ns * 1e-9, np.array(estimate.velocity_enu_mps[:2])
         learnt, yaw_rad = None, yaw_of(rot_from_quat(estimate.q_w_b))
-        lens = None if slow is None else slow.lens
+        lens = None if calibration is None else calibration.lens
         if lens is not None:
             at_m -= graph_shift(estimate, camera, lens)
-        if slow is not None and estimate.t_ns - slow.t_ns <= MAX_CALIBRATION_AGE_NS:
-            cov = np.array(slow.cov).reshape(CALIBRATION_SIZE, CALIBRATION_SIZE)
-            learnt = CalibrationPrior(slow.t_ns * 1e-9, np.array(slow.state), cov)
+        if calibration is not None and estimate.t_ns - calibration.t_ns <= MAX_CALIBRATION_AGE_NS:
+            cov = np.array(calibration.cov).reshape(CALIBRATION_SIZE, CALIBRATION_SIZE)
+            learnt = CalibrationPrior(calibration.t_ns * 1e-9, np.array(calibration.state), cov)
         return cls(
-            t_s, at_m, sigma_m, velocity_mps, estimate.velocity_sigma_mps, yaw_rad, learnt, checkpoint.match, lens
+            t_s, at_m, sigma_m, velocity_mps, estimate.velocity_sigma_mps, yaw_rad, learnt, checkpoint.ground, lens
         )
 
     def path_until(self, t_s: float, yaw_rad: float | None) -> tuple[np.ndarray, float]:
@@ -135,27 +153,34 @@ class CheckpointWriter:
     def __init__(self, file: Path) -> None:
         self._checkpoint = CheckpointFile(file, EstimatorCheckpoint)
         self._written_ns = -CHECKPOINT_EVERY_NS
-        self._slow: CalibrationEstimate | None = None
-        self._match: MapMatch | None = None
+        self._calibration: CalibrationEstimate | None = None
+        self._ground: CheckpointGround | None = None
         last = self._checkpoint.load()
-        self._start = None if last is None else last.start  # published once, before take-off
+        self._initial = None if last is None else last.initial_position  # published once, before take-off
 
     def poll(self, now_ns: int) -> Iterable[Message]:
         return ()
 
     def on_message(self, message: Message) -> None:
         if isinstance(message, CalibrationEstimate):
-            self._slow = message
-        elif isinstance(message, Start):
-            self._start = message
-        elif isinstance(message, MapMatch) and message.ground is not None and message.mode_mass > 0.0:
-            self._match = msgspec.structs.replace(message, matches=[])
+            self._calibration = message
+        elif isinstance(message, InitialPosition):
+            self._initial = message
+        elif isinstance(message, MapMatch):
+            self._ground = ground_of(message) or self._ground
         elif isinstance(message, NavEstimate) and message.t_ns - self._written_ns >= CHECKPOINT_EVERY_NS:
             self._written_ns = message.t_ns
-            self._checkpoint.save(EstimatorCheckpoint(message, self._slow, self._match, self._start))
+            self._checkpoint.save(EstimatorCheckpoint(message, self._calibration, self._ground, self._initial))
 
     def close(self) -> None:
         pass
+
+
+def ground_of(match: MapMatch) -> CheckpointGround | None:
+    """What a checkpoint keeps of a match; None: no ground, or no place to which it belongs."""
+    if match.ground is None or match.place is None:
+        return None
+    return CheckpointGround(match.ground, (match.place.e_m, match.place.n_m))
 
 
 def load_checkpoint(file: Path | None) -> EstimatorCheckpoint | None:

@@ -29,13 +29,13 @@ from terrafix.messages import (
     Health,
     HintVerdict,
     Imu,
+    InitialPosition,
     MeasurementVerdict,
     Message,
     NavEstimate,
     Origin,
     ProcessEvent,
     SearchState,
-    Start,
     StatusText,
     ThermalBand,
     VehicleState,
@@ -111,7 +111,7 @@ class LinkNode:
             Imu: self._on_imu,
             GnssReading: self._on_gnss_reading,
             Origin: self._on_origin,
-            Start: self._on_start,
+            InitialPosition: self._on_initial_position,
             WallClock: self._on_wall_clock,
             ProcessEvent: self._on_process_event,
             Health: self._on_health,
@@ -170,8 +170,8 @@ class LinkNode:
         self._starts.on_origin(origin)
         return []
 
-    def _on_start(self, start: Start) -> list[Message]:
-        text = self._starts.on_start(start)
+    def _on_initial_position(self, initial: InitialPosition) -> list[Message]:
+        text = self._starts.on_answer(initial)
         return [] if text is None else [text]
 
     def _on_wall_clock(self, clock: WallClock) -> list[Message]:

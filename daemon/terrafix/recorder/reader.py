@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import Message
-from terrafix.recorder.old_format import OLD_TOPICS
+from terrafix.recorder.old_format import OLD_DECODERS, OLD_FORMAT
 from terrafix.recorder.schema import THUMBNAIL_TOPIC, TYPE_BY_TOPIC, topic_of
 from terrafix.recorder.writer import HEADER_NAME, decode_thumbnail
 
@@ -26,7 +26,8 @@ _RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # more than any valid record; a corrupt 
 # Exceptions of a truncated or corrupt record: invalid length, compression or text in bytes that were never written.
 _CORRUPT = (McapError, struct.error, zstandard.ZstdError, UnicodeDecodeError, msgspec.DecodeError)
 
-_decoders = {topic: msgspec.json.Decoder(t) for topic, t in TYPE_BY_TOPIC.items()}
+_DECODERS = {topic: msgspec.json.Decoder(t).decode for topic, t in TYPE_BY_TOPIC.items()}
+_DECODERS_OF_OLD = {**_DECODERS, **OLD_DECODERS}
 
 
 @dataclass
@@ -64,12 +65,12 @@ def read_flight(path: Path, result: ReadResult | None = None) -> Iterator[tuple[
 def read_received(path: Path, result: ReadResult | None = None) -> Iterator[tuple[str, int, int, Message]]:
     """Like read_flight, with the reception time at the recorder: (topic, log_time_ns, received_ns, message)."""
     result = ReadResult() if result is None else result
-    for channel, record in _records(path, result):
-        decoder = _decoders.get(channel.topic) or OLD_TOPICS.get(channel.topic)
-        if decoder is None:
+    for file_format, channel, record in _records(path, result):
+        decode = (_DECODERS_OF_OLD if file_format == OLD_FORMAT else _DECODERS).get(channel.topic)
+        if decode is None:
             continue
         try:
-            message = decoder.decode(record.data)
+            message = decode(record.data)
         except msgspec.MsgspecError:
             result.undecodable += 1
             continue
@@ -78,7 +79,7 @@ def read_received(path: Path, result: ReadResult | None = None) -> Iterator[tupl
 
 def read_thumbnails(path: Path) -> Iterator[tuple[int, bytes]]:
     """Yields (frame id, JPEG) in the order of the record."""
-    for channel, record in _records(path, ReadResult()):
+    for _, channel, record in _records(path, ReadResult()):
         if channel.topic == THUMBNAIL_TOPIC:
             yield decode_thumbnail(record.data)
 
@@ -96,26 +97,28 @@ class _ExactReadStream:
         return data
 
 
-def _records(path: Path, result: ReadResult) -> Iterator[tuple[Channel, McapMessage]]:
+def _records(path: Path, result: ReadResult) -> Iterator[tuple[str, Channel, McapMessage]]:
+    """Yields (format of the file, channel, message)."""
     for file in flight_files(path):
         result.files.append(file)
         with file.open("rb") as stream:
             yield from _records_of(file, stream, result)
 
 
-def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[tuple[Channel, McapMessage]]:
+def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[tuple[str, Channel, McapMessage]]:
     """Reads sequentially, because the index is at the end of the file, which a truncated file lacks."""
     channels: dict[int, Channel] = {}
-    first = True
+    file_format, first = "", True
     try:
         for record in StreamReader(
             cast(IO[bytes], _ExactReadStream(stream)), record_size_limit=_RECORD_LIMIT_BYTES
         ).records:
             if isinstance(record, Channel):
                 channels[record.id] = record
-            elif isinstance(record, Metadata) and record.name == HEADER_NAME and not result.header:
-                result.header = {
-                    "format": record.metadata.get("format", ""),
+            elif isinstance(record, Metadata) and record.name == HEADER_NAME:
+                file_format = record.metadata.get("format", "")
+                result.header = result.header or {
+                    "format": file_format,
                     "config": msgspec.json.decode(record.metadata.get("config", "{}")),
                     "versions": msgspec.json.decode(record.metadata.get("versions", "{}")),
                 }
@@ -123,7 +126,7 @@ def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[t
                 if first:
                     result.segment_starts_ns.append(record.publish_time)
                     first = False
-                yield channels[record.channel_id], record
+                yield file_format, channels[record.channel_id], record
     except _CORRUPT:
         # The file ends or is corrupt within a record; the records before it are valid.
         result.truncated_files.append(file)

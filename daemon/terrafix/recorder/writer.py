@@ -30,7 +30,7 @@ from terrafix.recorder.schema import (
 CHUNK_BYTES = 128 * 1024  # largest loss at a kill between two calls of flush(); also the unit of compression
 JPEG_QUALITY = 70  # sufficient for visual inspection of a thumbnail
 GIT_TIMEOUT_S = 2.0
-RECORD_FORMAT = "terrafix-flight/1"
+RECORD_FORMAT = "terrafix-flight/2"
 HEADER_NAME = "terrafix"
 _END_CHUNK = "_Writer__finalize_chunk"  # mcap ends chunks by size only; flush() calls this private method (tested)
 _VERSIONED = ("terrafix", "numpy", "gtsam", "opencv-python-headless", "onnxruntime", "pymavlink", "mcap", "msgspec")

@@ -53,22 +53,22 @@ class _Keyframe:
 
 @dataclass(frozen=True)
 class Motion:
-    """Matches of a frame with its keyframe. ``pairs`` (N, 4): normalised coordinates (x_kf, y_kf, x, y).
+    """Matches of a frame with its keyframe. ``two_view`` (N, 4): normalised coordinates (x_kf, y_kf, x, y).
 
-    ``triples`` (N, 6): normalised coordinates (x_prev, y_prev, x_kf, y_kf, x, y) of corners that the previous keyframe,
-    frame ``previous_keyframe_id``, observed as well; only for a frame that becomes a keyframe. ``sigma_norm``,
-    ``triples_sigma_norm``: 1-sigma of a coordinate, normalised."""
+    ``three_view`` (N, 6): normalised coordinates (x_prev, y_prev, x_kf, y_kf, x, y) of corners that the previous
+    keyframe, frame ``previous_keyframe_id``, observed as well; only for a frame that becomes a keyframe.
+    ``sigma_norm``, ``three_view_sigma_norm``: 1-sigma of a coordinate, normalised."""
 
     keyframe_id: int
     verdict: Verdict
-    pairs: np.ndarray
+    two_view: np.ndarray
     sigma_norm: float
     inliers: int
     tracked: int
     becomes_keyframe: bool
     previous_keyframe_id: int = -1
-    triples: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
-    triples_sigma_norm: float = 0.0
+    three_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    three_view_sigma_norm: float = 0.0
 
 
 class FrameTracker:

@@ -51,17 +51,17 @@ class VisionNode:
             frame_id=frame.frame_id,
             keyframe_id=motion.keyframe_id,
             verdict=motion.verdict,
-            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in motion.pairs],
+            two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in motion.two_view],
             sigma_norm=motion.sigma_norm,
             inliers=motion.inliers,
             tracked=motion.tracked,
             becomes_keyframe=motion.becomes_keyframe,
             static=repeat is Repeat.PREVIOUS,
-            before_id=motion.previous_keyframe_id,
-            triples=[
-                (float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in motion.triples
+            previous_keyframe_id=motion.previous_keyframe_id,
+            three_view=[
+                (float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in motion.three_view
             ],
-            triples_sigma_norm=motion.triples_sigma_norm,
+            three_view_sigma_norm=motion.three_view_sigma_norm,
         )
 
 

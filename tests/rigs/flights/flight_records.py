@@ -74,7 +74,7 @@ def gps_input(t_ns: int, fix_type: int = 3) -> m.GpsInput:
         vert_accuracy_m=5.0,
         satellites_visible=10,
         estimate_age_ms=100.0,
-        reason="" if fix_type == 3 else "no estimate yet",
+        no_fix_reason="" if fix_type == 3 else "no estimate yet",
     )
 
 

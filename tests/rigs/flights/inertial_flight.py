@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from map_matches import plane
 from simulated_flight import CAMERA, FIX_SIGMAS, PAIRS, PLACE, ROOFS, SIGMA_NORM
 from simulated_flight import ORIGIN as STEADY_ORIGIN
 from terrafix.core.camera import Mount
@@ -18,6 +19,8 @@ from terrafix.messages import (
     Imu,
     ImuSample,
     MapMatch,
+    MapPose,
+    MatchPlace,
     MeasurementVerdict,
     Message,
     NavEstimate,
@@ -102,7 +105,7 @@ class InertialFlight:
             frame_id=i,
             keyframe_id=keyframe,
             verdict=Verdict.ACCEPTED,
-            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
+            two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
             sigma_norm=SIGMA_NORM,
             inliers=PAIRS,
             tracked=PAIRS,
@@ -118,14 +121,14 @@ class InertialFlight:
             frame_id=i,
             verdict=Verdict.ACCEPTED,
             matcher="gradient",
-            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-            q_w_c=quat_from_rot(exp_so3(error[3:]) @ r_w_c),
-            cov=tuple(float(v) for v in np.diag(FIX_SIGMAS**2).ravel()),
+            pose=MapPose(
+                p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+                q_w_c=quat_from_rot(exp_so3(error[3:]) @ r_w_c),
+                cov=tuple(float(v) for v in np.diag(FIX_SIGMAS**2).ravel()),
+            ),
             inliers=30,
-            mode_mass=0.99,
-            mode_e_m=float(p[0]),
-            mode_n_m=float(p[1]),
-            ground=(0.0, 0.0, 0.0),
+            place=MatchPlace(e_m=float(p[0]), n_m=float(p[1]), mass=0.99),
+            ground=plane(0.0),
         )
 
 

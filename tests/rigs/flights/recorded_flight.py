@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 
 from flight_records import write_record
+from map_matches import pose_of, with_pose
 from simulated_flight import PLACE, Flight, blind, t_ns
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.messages import Frame, MapMatch, Message, Odometry, Verdict
@@ -57,18 +58,18 @@ def record(folder: Path, flight: Flight, alter: Alter = unaltered) -> Path:
 def shifted(match: MapMatch, by_m: tuple[float, float], turn: np.ndarray | None = None) -> MapMatch:
     """-> an outlier: the match rotated by ``turn`` (3, 3) about the origin, then shifted by ``by_m`` (east, north)."""
     turn = np.eye(3) if turn is None else turn
-    assert match.p_c_in_w_m is not None and match.q_w_c is not None
-    p = turn @ np.array(match.p_c_in_w_m) + (*by_m, 0.0)
-    return msgspec.structs.replace(
+    pose = pose_of(match)
+    p = turn @ np.array(pose.p_c_in_w_m) + (*by_m, 0.0)
+    return with_pose(
         match,
         p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-        q_w_c=quat_from_rot(turn @ rot_from_quat(match.q_w_c)),
+        q_w_c=quat_from_rot(turn @ rot_from_quat(pose.q_w_c)),
     )
 
 
 def unmatched(match: MapMatch) -> MapMatch:
     """-> the match of the same frame with a rejection."""
-    return msgspec.structs.replace(match, verdict=Verdict.FEW_INLIERS, p_c_in_w_m=None, q_w_c=None, cov=None)
+    return msgspec.structs.replace(match, verdict=Verdict.FEW_INLIERS, pose=None)
 
 
 def blind_between(first: int, end: int) -> Alter:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from map_matches import plane
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
 from terrafix.core.pose import exp_so3
@@ -17,6 +18,8 @@ from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import (
     Camera,
     MapMatch,
+    MapPose,
+    MatchPlace,
     MeasurementVerdict,
     Message,
     NavEstimate,
@@ -129,14 +132,14 @@ class Flight:
             frame_id=i,
             verdict=Verdict.ACCEPTED,
             matcher="gradient",
-            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-            q_w_c=quat_from_rot(exp_so3(error[3:]) @ self.r_w_c[i]),
-            cov=tuple(float(v) for v in np.diag(FIX_SIGMAS**2).ravel()),
+            pose=MapPose(
+                p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+                q_w_c=quat_from_rot(exp_so3(error[3:]) @ self.r_w_c[i]),
+                cov=tuple(float(v) for v in np.diag(FIX_SIGMAS**2).ravel()),
+            ),
             inliers=30,
-            mode_mass=0.99,
-            mode_e_m=float(p[0]),
-            mode_n_m=float(p[1]),
-            ground=(0.0, 0.0, 0.0) if self.dem else None,
+            place=MatchPlace(e_m=float(p[0]), n_m=float(p[1]), mass=0.99),
+            ground=plane(0.0) if self.dem else None,
         )
 
     def _state(self, i: int, yaw_rad: float, angles: np.ndarray, agl_m: float) -> VehicleState:
@@ -174,7 +177,7 @@ class Flight:
             frame_id=i,
             keyframe_id=keyframe,
             verdict=Verdict.ACCEPTED,
-            pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
+            two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
             sigma_norm=SIGMA_NORM,
             inliers=PAIRS,
             tracked=PAIRS,
@@ -225,7 +228,7 @@ def same_features(flight: Flight, keyframe: int, i: int, features: np.ndarray) -
         frame_id=i,
         keyframe_id=keyframe,
         verdict=Verdict.ACCEPTED,
-        pairs=[(a, b, c, d) for a, b, c, d in pairs],
+        two_view=[(a, b, c, d) for a, b, c, d in pairs],
         sigma_norm=SIGMA_NORM,
         inliers=len(pairs),
         tracked=len(pairs),

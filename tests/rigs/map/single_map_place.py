@@ -46,7 +46,7 @@ def predicted(
     at_m: np.ndarray = TRUE_M,
     step_m: float = 0.0,
     step_sigma_m: float = 1.0,
-    start_ns: int = 0,
+    prior_t_ns: int = 0,
 ) -> Prediction:
     """-> prediction of a frame, one frame per second. ``step_m``: motion to the east since the previous frame."""
     cov = np.diag([sigma_m**2, sigma_m**2, 4.0, 4e-4, 4e-4, 1e-3])
@@ -60,5 +60,5 @@ def predicted(
         agl_sigma_m=2.0,
         step_m=(step_m, 0.0),
         step_cov_m2=(step_sigma_m**2, 0.0, 0.0, step_sigma_m**2),
-        start_ns=start_ns,
+        prior_t_ns=prior_t_ns,
     )

@@ -136,7 +136,7 @@ def gps_input(t_s: float, e_m: float, n_m: float, fix_type: int = 3) -> GpsInput
         t_ns=round(t_s * 1e9), fix_type=fix_type, time_week=0, time_week_ms=0, lat_deg=lat_deg, lon_deg=lon_deg,
         alt_amsl_m=100.0, hdop=1.0, vdop=1.0, vn_mps=0.0, ve_mps=0.0, vd_mps=0.0, speed_accuracy_mps=0.3,
         horiz_accuracy_m=4.0, vert_accuracy_m=4.0, satellites_visible=6, estimate_age_ms=0.0,
-        reason="dark")  # fmt: skip
+        no_fix_reason="dark")  # fmt: skip
 
 
 def test_gps_input_is_compared_with_the_truth_and_the_vehicle_with_the_reference_flight(tmp_path: Path) -> None:

@@ -151,8 +151,8 @@ def test_a_wrong_fix_is_350_m_away_with_a_small_covariance() -> None:
     assert list(anchor.on(prediction)) == [published]
     names.on(Frame(t_ns=0, frame_id=1, file="1.jpg", width=8, height=4))
     (wrong,) = anchor.on(prediction)
-    assert isinstance(wrong, MapMatch) and wrong.verdict is Verdict.ACCEPTED and wrong.p_c_in_w_m is not None
-    assert np.hypot(wrong.p_c_in_w_m[0] - 10.0, wrong.p_c_in_w_m[1] - 20.0) == pytest.approx(350.0)
+    assert isinstance(wrong, MapMatch) and wrong.verdict is Verdict.ACCEPTED and wrong.pose is not None
+    assert np.hypot(wrong.pose.p_c_in_w_m[0] - 10.0, wrong.pose.p_c_in_w_m[1] - 20.0) == pytest.approx(350.0)
 
 
 def test_throttling_is_reported_within_its_span() -> None:

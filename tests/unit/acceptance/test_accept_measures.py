@@ -145,7 +145,7 @@ def test_the_reprojection_error_of_odometry_is_that_of_the_noise(tmp_path: Path,
         q = (np.column_stack([a, np.ones(48)]) * (1.0 - relief * rng.uniform(0.0, 1.0, (48, 1))) - way) @ turn
         seen = np.hstack([a, q[:, :2] / q[:, 2:]]) + rng.normal(0.0, 0.8 / 500.0, (48, 4))
         pairs = [(float(w), float(x), float(y), float(z)) for w, x, y, z in seen]
-        frame.odometry = Odometry(t_ns=0, frame_id=0, keyframe_id=0, verdict=Answer.ACCEPTED, pairs=pairs)
+        frame.odometry = Odometry(t_ns=0, frame_id=0, keyframe_id=0, verdict=Answer.ACCEPTED, two_view=pairs)
     expected = 0.8 * np.sqrt(np.pi / 2) * np.sqrt(1 - 8 / 96)
     assert of.odometry_px(found).value == pytest.approx(expected, rel=0.08)
 
@@ -154,7 +154,7 @@ def test_the_reprojection_error_of_a_hovering_camera_is_finite(tmp_path: Path) -
     found = evidence(tmp_path, [GOOD] * 3)
     still = [(x, y, x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.3, 0.0, 0.3)]
     for frame in found.frames:
-        frame.odometry = Odometry(t_ns=0, frame_id=0, keyframe_id=0, verdict=Answer.ACCEPTED, pairs=still)
+        frame.odometry = Odometry(t_ns=0, frame_id=0, keyframe_id=0, verdict=Answer.ACCEPTED, two_view=still)
     assert of.odometry_px(found).value == pytest.approx(0.0, abs=1e-6)
 
 

@@ -47,10 +47,10 @@ def anchor(ground: np.ndarray) -> tuple[AnchorNode, MemoryFrameStore]:
     return AnchorNode(frames, package, GradientDescriber(), 1.0), frames
 
 
-def gnss_start(t_ns: int, at_m: tuple[float, float] | None = PLACE_M) -> m.GnssStart:
+def gnss_start(t_ns: int, at_m: tuple[float, float] | None = PLACE_M) -> m.GnssInitialPosition:
     lat_deg, lon_deg = (None, None) if at_m is None else FRAME.to_wgs84(*at_m)
     sigma_m = None if at_m is None else SIGMA_M
-    return m.GnssStart(t_ns=t_ns, lat_deg=lat_deg, lon_deg=lon_deg, sigma_m=sigma_m, receiver=0)
+    return m.GnssInitialPosition(t_ns=t_ns, lat_deg=lat_deg, lon_deg=lon_deg, sigma_m=sigma_m, receiver=0)
 
 
 def test_every_gnss_start_is_answered_with_the_ground_height_of_the_map(ground: np.ndarray) -> None:
@@ -58,7 +58,7 @@ def test_every_gnss_start_is_answered_with_the_ground_height_of_the_map(ground: 
     start = gnss_start(S)
     (answer,) = node.on(start)
     place = {"lat_deg": start.lat_deg, "lon_deg": start.lon_deg, "sigma_m": SIGMA_M, "ground_amsl_m": GROUND_M}
-    assert answer == m.Start(t_ns=S, verdict=m.Verdict.ACCEPTED, **place)  # type: ignore[arg-type]
+    assert answer == m.InitialPosition(t_ns=S, verdict=m.Verdict.ACCEPTED, **place)  # type: ignore[arg-type]
     assert list(node.on(start)) == [answer]  # repeated for subscribers that missed it
 
 
@@ -66,10 +66,10 @@ def test_a_gnss_start_outside_the_map_is_rejected_and_invalidates_the_previous_o
     node, _ = anchor(ground)
     list(node.on(gnss_start(S)))
     (answer,) = node.on(gnss_start(2 * S, (SIDE_M, 0.0)))
-    assert isinstance(answer, m.Start)
+    assert isinstance(answer, m.InitialPosition)
     assert (answer.verdict, answer.lat_deg, answer.sigma_m) == (m.Verdict.OUTSIDE_MAP, None, None)
     (withdrawn,) = node.on(gnss_start(3 * S, None))
-    assert isinstance(withdrawn, m.Start)
+    assert isinstance(withdrawn, m.InitialPosition)
     assert (withdrawn.verdict, withdrawn.lat_deg, withdrawn.sigma_m) == (m.Verdict.ACCEPTED, None, None)
 
 
@@ -77,11 +77,11 @@ def test_the_first_prediction_based_on_a_start_ends_the_search(ground: np.ndarra
     node, frames = anchor(ground)
     list(node.on(UNKNOWN))
     steps = []
-    for frame_id, sigma_m, start_ns in ((1, 100.0, 0), (2, 10.0, S), (3, 10.0, S)):
+    for frame_id, sigma_m, prior_t_ns in ((1, 100.0, 0), (2, 10.0, S), (3, 10.0, S)):
         frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
-        match, *_ = node.on(predicted(frame_id, sigma_m, start_ns=start_ns))
+        match, *_ = node.on(predicted(frame_id, sigma_m, prior_t_ns=prior_t_ns))
         assert isinstance(match, m.MapMatch)
-        steps.append((match.verdict is m.Verdict.ACCEPTED, match.step))
+        steps.append((match.verdict is m.Verdict.ACCEPTED, match.search.step))
     assert steps == [(False, m.SearchStep.WHOLE_MAP), (True, m.SearchStep.NORMAL), (True, m.SearchStep.NORMAL)]
 
 
@@ -90,15 +90,15 @@ def test_a_prediction_without_prior_time_after_an_estimator_restart_does_not_res
 ) -> None:
     node, frames = anchor(ground)
     list(node.on(UNKNOWN))
-    for frame_id, sigma_m, start_ns in ((1, 10.0, S), (2, 100.0, 0)):
+    for frame_id, sigma_m, prior_t_ns in ((1, 10.0, S), (2, 100.0, 0)):
         frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
-        match, *_ = node.on(predicted(frame_id, sigma_m, start_ns=start_ns))
+        match, *_ = node.on(predicted(frame_id, sigma_m, prior_t_ns=prior_t_ns))
         assert isinstance(match, m.MapMatch) and match.verdict is m.Verdict.ACCEPTED
 
 
 def test_merged_predictions_are_the_newer_one_with_the_steps_of_both() -> None:
-    older, newer = predicted(1, 100.0, step_m=3.0), predicted(2, 10.0, step_m=4.0, start_ns=S)
-    newer = msgspec.structs.replace(newer, lens=0.01)
+    older, newer = predicted(1, 100.0, step_m=3.0), predicted(2, 10.0, step_m=4.0, prior_t_ns=S)
+    newer = msgspec.structs.replace(newer, radial_k1=0.01)
     merged = merge_predictions(older, newer)
     assert isinstance(merged, m.Prediction)
     assert merged.step_m == tuple(a + b for a, b in zip(older.step_m, newer.step_m, strict=True))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from anchor_rig import started
+from map_matches import position_of
 from single_map_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.matching.frame_matcher import FrameMatcher
 from terrafix.anchor.matching.match_message import ground_sigma_m
@@ -19,7 +20,7 @@ from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.anchor.verification.lock_monitor import LockMonitor
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.map.null_model import DEFAULT_NULL, VERSION, NullModel
-from terrafix.messages import MapMatch, SearchState, SearchStep, Verdict
+from terrafix.messages import MapMatch, MapPose, SearchState, SearchStep, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, texture, view
 
@@ -41,8 +42,8 @@ def test_a_right_position_is_tracked_with_accepted_poses(ground: np.ndarray) -> 
     node, frames = started(ground)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     result = match(node, 1, 10.0)
-    assert result.verdict is Verdict.ACCEPTED and not result.coarse and not result.found
-    assert (result.step, result.lost_sigma_m) == (SearchStep.NORMAL, 0.0)
+    assert result.verdict is Verdict.ACCEPTED and not result.position_only and not result.search.relocalized
+    assert (result.search.step, result.search.sigma_m) == (SearchStep.NORMAL, 0.0)
 
 
 def test_without_a_single_patch_pose_the_patch_consensus_gives_the_pose(
@@ -55,13 +56,13 @@ def test_without_a_single_patch_pose_the_patch_consensus_gives_the_pose(
     node, frames = started(ground)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     result = match(node, 1, 10.0)
-    assert result.verdict is Verdict.ACCEPTED and not result.coarse and result.p_c_in_w_m is not None
-    assert np.linalg.norm(np.array(result.p_c_in_w_m) - TRUE_M) < 3.0
+    assert result.verdict is Verdict.ACCEPTED and not result.position_only and result.pose is not None
+    assert np.linalg.norm(np.array(position_of(result)) - TRUE_M) < 3.0
     assert calls == [0]
     # without the consensus, the mode's position remains
     monkeypatch.setattr(ConsensusPose, "estimate", lambda *_: None)
     frames.put(2, view(ground, PINHOLE, R, TRUE_M))
-    assert match(node, 2, 10.0).coarse
+    assert match(node, 2, 10.0).position_only
 
 
 @pytest.mark.parametrize(("sigma_m", "expected"), [(0.019 * AGL_M, False), (0.021 * AGL_M, True)])
@@ -74,27 +75,27 @@ def test_a_single_patch_pose_with_a_large_sigma_is_replaced_by_the_patch_consens
     node, frames = started(ground)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     result = match(node, 1, 10.0)
-    assert result.verdict is Verdict.ACCEPTED and not result.coarse
-    assert np.linalg.norm(np.array(result.p_c_in_w_m) - TRUE_M) < 3.0
+    assert result.verdict is Verdict.ACCEPTED and not result.position_only
+    assert np.linalg.norm(np.array(position_of(result)) - TRUE_M) < 3.0
     assert bool(calls) is expected
     monkeypatch.setattr(ConsensusPose, "estimate", lambda *_: None)  # without a consensus the first pose is used
     frames.put(2, view(ground, PINHOLE, R, TRUE_M))
-    assert not match(node, 2, 10.0).coarse
+    assert not match(node, 2, 10.0).position_only
 
 
 def test_correlated_tilt_and_position_errors_do_not_move_the_observed_ground() -> None:
     jacobian = np.zeros((6, 1))
     jacobian[0], jacobian[4] = AGL_M, 1.0  # east, with the rotation about north that moves the ground back
     cov = np.diag([4.0, 1.0, 9.0, 1e-12, 1e-12, 1e-4]) + jacobian @ jacobian.T * np.radians(10.0) ** 2
-    result = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="", cov=tuple(cov.ravel()))
-    assert ground_sigma_m(result, AGL_M) == pytest.approx(2.0, abs=1e-3)
-    assert ground_sigma_m(msgspec.structs.replace(result, cov=None), AGL_M) == np.inf
+    pose = MapPose(p_c_in_w_m=(0.0, 0.0, AGL_M), q_w_c=(1.0, 0.0, 0.0, 0.0), cov=tuple(cov.ravel()))
+    assert ground_sigma_m(pose, AGL_M) == pytest.approx(2.0, abs=1e-3)
+    assert ground_sigma_m(None, AGL_M) == np.inf
 
 
 def test_a_missing_frame_gives_bad_image_and_step_skip(ground: np.ndarray) -> None:
     node, _ = started(ground)
     result = match(node, 1, 10.0)
-    assert (result.verdict, result.step) == (Verdict.BAD_IMAGE, SearchStep.SKIP)
+    assert (result.verdict, result.search.step) == (Verdict.BAD_IMAGE, SearchStep.SKIP)
 
 
 def test_an_unknown_start_is_searched_on_the_whole_map(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,8 +103,12 @@ def test_an_unknown_start_is_searched_on_the_whole_map(ground: np.ndarray, monke
     node, frames = started(ground, 5000.0)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     result = match(node, 1, 100.0)
-    assert (result.verdict, result.step, result.lost_sigma_m) == (Verdict.LOST, SearchStep.WHOLE_MAP, LOST_SIGMA_M)
-    assert result.p_c_in_w_m is None and result.cov is None and not result.found
+    assert (result.verdict, result.search.step, result.search.sigma_m) == (
+        Verdict.LOST,
+        SearchStep.WHOLE_MAP,
+        LOST_SIGMA_M,
+    )
+    assert result.pose is None and not result.search.relocalized
 
 
 def test_the_required_evidence_follows_the_null_model_of_the_map_at_this_height(
@@ -165,8 +170,8 @@ def test_a_lost_position_is_withdrawn_and_reported(ground: np.ndarray, monkeypat
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     monkeypatch.setattr(LockMonitor, "lost", True)
     result = match(node, 1, 10.0)
-    assert (result.verdict, result.step, result.lost_sigma_m) == (Verdict.LOST, SearchStep.WIDEN, LOST_SIGMA_M)
-    assert result.matches == [] and result.p_c_in_w_m is None
+    assert (result.verdict, result.search.step, result.search.sigma_m) == (Verdict.LOST, SearchStep.WIDEN, LOST_SIGMA_M)
+    assert result.matches == [] and result.pose is None
     assert match(node, 2, 10.0).verdict is Verdict.LOST  # also without a frame
 
 
@@ -288,7 +293,7 @@ def test_the_layer_that_fits_is_selected_in_flight(ground: np.ndarray) -> None:
     assert result[0].verdict is not Verdict.ACCEPTED and result[0].map_sigma_m == pytest.approx(10.0 / 2.146)
     assert [m.verdict for m in result[-2:]] == [Verdict.ACCEPTED] * 2
     assert result[-1].map_sigma_m == pytest.approx(5.0 / 2.146)
-    assert result[-1].p_c_in_w_m is not None and np.hypot(*(np.array(result[-1].p_c_in_w_m) - at_m)[:2]) < 3.0
+    assert np.hypot(*(np.array(position_of(result[-1])) - at_m)[:2]) < 3.0
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import map_rasters
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.pose import exp_so3
-from terrafix.messages import MapMatch, Verdict
+from terrafix.messages import MapMatch, MapPose, Verdict
 from terrafix_tools.bench.two_dates import FOCAL_PX, Places, centre_point_of, measure, row
 from textured_ground import texture
 
@@ -82,7 +82,9 @@ def test_the_covariance_of_the_centre_point_equals_that_of_sampled_poses() -> No
     cloud = np.array([centre_point(e) for e in rng.multivariate_normal(np.zeros(6), cov, 20_000)])
     match = MapMatch(
         t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", map_sigma_m=3.0,
-        p_c_in_w_m=(10.0, -20.0, 100.0), q_w_c=quat_from_rot(down), cov=tuple(cov.ravel().tolist()),
+        pose=MapPose(
+            p_c_in_w_m=(10.0, -20.0, 100.0), q_w_c=quat_from_rot(down), cov=tuple(cov.ravel().tolist())
+        ),
     )  # fmt: skip
     place_m, found = centre_point_of(match)
     assert place_m == pytest.approx([10.0, -20.0])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import tiny_onnx
+from map_matches import position_of
 from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.model_monitor import MAX_FAILURES
 from terrafix.anchor.node import AnchorNode, make_node
@@ -74,8 +75,8 @@ def test_the_provider_and_the_reasons_against_better_ones_are_published(tmp_path
 def test_a_failed_inference_loses_one_frame_only(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
     match, events = flight.frame(BLUE)
-    assert (match.verdict, match.step, match.matcher) == (Verdict.MODEL_FAILED, SearchStep.SKIP, "xfeat")
-    assert match.cov is None and match.p_c_in_w_m is None
+    assert (match.verdict, match.search.step, match.matcher) == (Verdict.MODEL_FAILED, SearchStep.SKIP, "xfeat")
+    assert match.pose is None
     assert [e.change for e in events] == [ModelChange.FAILED] and "has NaN" in events[0].detail
     match, events = flight.frame(flight.seen)
     assert match.verdict is not Verdict.MODEL_FAILED and match.matcher == "xfeat" and events == []
@@ -89,7 +90,7 @@ def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(tmp_pat
     assert [e.change for e in events] == [ModelChange.FAILED, ModelChange.GIVEN_UP]
     match, events = flight.frame(flight.seen)
     assert (match.verdict, match.matcher, events) == (Verdict.ACCEPTED, "gradient", [])
-    assert match.p_c_in_w_m is not None and np.hypot(*(np.array(match.p_c_in_w_m) - TRUE_M)[:2]) < 3.0
+    assert np.hypot(*(np.array(position_of(match)) - TRUE_M)[:2]) < 3.0
 
 
 def test_only_consecutive_failures_count(tmp_path: Path, ground: np.ndarray) -> None:
@@ -120,11 +121,11 @@ def test_a_failing_model_during_a_search_leaves_the_search_state_unchanged(
     flight = Flight(tmp_path, ground, start_sigma_m=5000.0)
     for _ in range(MAX_FAILURES):
         match, events = flight.frame(flight.seen, sigma_m=100.0)
-        assert (match.verdict, match.lost_sigma_m) == (Verdict.LOST, LOST_SIGMA_M)
+        assert (match.verdict, match.search.sigma_m) == (Verdict.LOST, LOST_SIGMA_M)
     assert events[-1].change is ModelChange.GIVEN_UP
     monkeypatch.setattr(MapSearch, "process_frame", lambda *_: None)
     match, _ = flight.frame(flight.seen, sigma_m=100.0)
-    assert (match.verdict, match.lost_sigma_m, match.matcher) == (Verdict.LOST, LOST_SIGMA_M, "gradient")
+    assert (match.verdict, match.search.sigma_m, match.matcher) == (Verdict.LOST, LOST_SIGMA_M, "gradient")
 
 
 def test_a_model_that_cannot_be_opened_is_an_error_on_the_ground_and_skipped_in_flight(tmp_path: Path) -> None:

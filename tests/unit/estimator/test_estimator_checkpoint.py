@@ -87,9 +87,9 @@ def heading_and_scale_sigma(run: EstimatorRun) -> tuple[float, float]:
 
 
 def test_what_was_learnt_of_compass_and_barometer_holds_on(flight: Flight, killed: EstimatorCheckpoint) -> None:
-    assert killed.slow is not None and killed.estimate.t_ns - killed.slow.t_ns < 1_500_000_000
+    assert killed.calibration is not None and killed.estimate.t_ns - killed.calibration.t_ns < 1_500_000_000
     with_it = heading_and_scale_sigma(resumed(flight, killed))
-    without = heading_and_scale_sigma(resumed(flight, EstimatorCheckpoint(killed.estimate, match=killed.match)))
+    without = heading_and_scale_sigma(resumed(flight, EstimatorCheckpoint(killed.estimate, ground=killed.ground)))
     assert with_it[0] < 0.6 * without[0] and with_it[1] <= without[1]
     # And it was learnt right: the heading that is begun with is no farther off than it claims.
     first = resumed(flight, killed).estimate(BACK)

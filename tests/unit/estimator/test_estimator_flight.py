@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import plane, with_pose, with_search
 from simulated_flight import (
     FRAME_S,
     KEYFRAME_EVERY,
@@ -152,8 +153,8 @@ def test_an_error_of_a_keyframe_is_in_one_step_and_not_in_each_one_from_it() -> 
     for i in range(first, end):
         for message in flight.messages(i):
             if isinstance(message, Odometry):
-                pairs = [(a + 0.06, b, c, d) for a, b, c, d in message.pairs]
-                run.feed([msgspec.structs.replace(message, pairs=pairs)])
+                pairs = [(a + 0.06, b, c, d) for a, b, c, d in message.two_view]
+                run.feed([msgspec.structs.replace(message, two_view=pairs)])
             elif not isinstance(message, MapMatch):
                 run.feed([message])
     predictions = {m.frame_id: m for m in run.published if isinstance(m, Prediction)}
@@ -344,7 +345,9 @@ def coarsely_led(last: int) -> tuple[Flight, EstimatorRun, tuple[float, float]]:
     for i in range(40, 80):
         wrong: list[Message] = []
         if i % 4 == 0 and i <= last:
-            wrong = [msgspec.structs.replace(flight.fix(i, away_m), coarse=True, inliers=0, matches=[])]
+            wrong = [
+                with_pose(msgspec.structs.replace(flight.fix(i, away_m), inliers=0, matches=[]), position_only=True)
+            ]
         run.feed([*without_fix(flight.messages(i)), *wrong])
     return flight, run, away_m
 
@@ -375,7 +378,7 @@ def test_coarse_matches_confirm_another_place_that_poses_have_shown() -> None:
     for i in range(40, 60):
         wrong = flight.fix(i, away_m)
         if i >= 42:
-            wrong = msgspec.structs.replace(wrong, coarse=True, inliers=0, matches=[])
+            wrong = with_pose(msgspec.structs.replace(wrong, inliers=0, matches=[]), position_only=True)
         run.feed([*without_fix(flight.messages(i)), wrong])
     restarted = [i for i in range(40, 60) if run.verdicts("map")[i].detail.startswith("restarted")]
     assert len(restarted) == 1 and 48 < restarted[0] < 52  # after half of the height
@@ -402,7 +405,7 @@ def test_a_place_that_was_found_late_is_carried_to_the_newest_frame() -> None:
     run = EstimatorRun().fly(flight, 0, 30)
     for i in range(30, 41):
         run.feed(without_fix(flight.messages(i)))
-    found = msgspec.structs.replace(flight.fix(36, offset), found=True)
+    found = with_search(flight.fix(36, offset), relocalized=True)
     estimates = [m for m in run.feed([found]) if isinstance(m, NavEstimate)]
     assert [(m.frame_id, m.last_anchor_age_ms) for m in estimates] == [(40, 2000)]
     for i in range(40, 60):
@@ -563,7 +566,7 @@ def test_over_hills_odometry_is_trusted_less() -> None:
             messages = flight.messages(i)
             kept = [m for m in messages if i < 10 or not isinstance(m, MapMatch)]
             run.feed(
-                msgspec.structs.replace(m, ground=(0.0, 0.0, 0.0), relief_m=relief_m) if isinstance(m, MapMatch) else m
+                msgspec.structs.replace(m, ground=plane(0.0, relief_m=relief_m)) if isinstance(m, MapMatch) else m
                 for m in kept
             )
         claims.append(sigma_m(run.estimate(29)))

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import position_of, with_pose, with_search
 from simulated_flight import FRAME_S, ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m, sigma_m, t_ns
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import MAX_STATIC_S
@@ -139,7 +140,7 @@ def test_correlations_without_a_pose_delay_joining_where_the_hit_rate_is_high(
         if i == FIRST:
             odometry = blind(odometry)
         if outcome == "coarse":
-            match = msgspec.structs.replace(match, coarse=True)
+            match = with_pose(match, position_only=True)
         elif isinstance(outcome, Verdict):
             match = msgspec.structs.replace(match, verdict=outcome)
         listener.feed([*without(flight.messages(i), Odometry, MapMatch), odometry, match])
@@ -188,9 +189,9 @@ def test_prediction_steps_follow_a_foreign_fragment_and_return_after_it() -> Non
 def frozen(flight: Flight, i: int) -> Odometry:
     """The picture of frame FIRST - 1 again: all image points are unchanged."""
     odometry = odometry_of(flight.messages(FIRST - 1))
-    pairs = [(x, y, x, y) for x, y, _, _ in odometry.pairs]
+    pairs = [(x, y, x, y) for x, y, _, _ in odometry.two_view]
     return msgspec.structs.replace(
-        odometry, t_ns=t_ns(i), frame_id=i, keyframe_id=FIRST - 1, pairs=pairs, becomes_keyframe=False, static=True
+        odometry, t_ns=t_ns(i), frame_id=i, keyframe_id=FIRST - 1, two_view=pairs, becomes_keyframe=False, static=True
     )
 
 
@@ -238,14 +239,14 @@ def test_a_frozen_picture_stays_stalled_after_a_reset_of_the_graph() -> None:
     for i in range(FIRST, END):
         listener.feed([*without(flight.messages(i), Odometry, MapMatch), frozen(flight, i)])
         if i == FIRST + 2:
-            listener.feed([msgspec.structs.replace(flight.fix(FIRST - 1), found=True)])
+            listener.feed([with_search(flight.fix(FIRST - 1), relocalized=True)])
     verdicts = listener.verdicts("odometry")
     assert all(verdicts[i].verdict is Verdict.STALLED for i in range(FIRST, END))
 
 
 def test_a_view_that_changed_while_nothing_was_tracked_ends_a_frozen_picture() -> None:
     flight = Flight(FRAMES, seed=7)
-    hover = msgspec.structs.replace(frozen(flight, FIRST), pairs=[])  # static, and nothing is tracked in it
+    hover = msgspec.structs.replace(frozen(flight, FIRST), two_view=[])  # static, and nothing is tracked in it
     lie = {FIRST: frozen(flight, FIRST), FIRST + 1: blind(frozen(flight, FIRST + 1))}
     lie[FIRST + 2] = msgspec.structs.replace(hover, t_ns=t_ns(FIRST + 2), frame_id=FIRST + 2)
     verdicts = flown(lie, flight).verdicts("odometry")
@@ -258,7 +259,7 @@ def test_skipped_pictures_do_not_end_a_frozen_picture() -> None:
     lie = {i: frozen(flight, i) for i in range(FIRST, END)}
     for i, verdict in ((FIRST + 1, Verdict.STALLED), (FIRST + 3, Verdict.BAD_IMAGE)):
         lie[i] = blind(lie[i], verdict)
-        lie[i + 1] = msgspec.structs.replace(lie[i + 1], pairs=[])
+        lie[i + 1] = msgspec.structs.replace(lie[i + 1], two_view=[])
     verdicts = flown(lie, flight).verdicts("odometry")
     assert [verdicts[i].verdict for i in (FIRST + 1, FIRST + 2)] == [Verdict.STALLED] * 2
     assert [verdicts[i].verdict for i in (FIRST + 3, FIRST + 4)] == [Verdict.BAD_IMAGE, Verdict.STALLED]
@@ -310,19 +311,23 @@ def test_a_coarse_match_does_not_join_a_fragment_to_the_flight() -> None:
     other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, turn_rad=2.0)
     listener = EstimatorRun().fly(flight, 0, FIRST)
     for i in range(FIRST, FIRST + 3):
-        coarse = msgspec.structs.replace(flight.fix(i), coarse=True)
+        coarse = with_pose(flight.fix(i), position_only=True)
         listener.feed([*without(flight.messages(i), Odometry, MapMatch), foreign(other, i), coarse])
     verdicts = listener.verdicts("map")
     assert [verdicts[i].verdict for i in range(FIRST, FIRST + 3)] == [Verdict.UNCONFIRMED] * 3
     assert listener.estimate(FIRST + 2).last_anchor_age_ms > 0
 
 
+def found_at_15_m(fix: MapMatch) -> MapMatch:
+    """``fix`` as the result of a search, at a height too low for matching."""
+    return with_search(with_pose(fix, p_c_in_w_m=(*position_of(fix)[:2], 15.0)), relocalized=True)
+
+
 def test_a_height_too_low_for_matching_is_reset_to_the_reported_one() -> None:
     flight = Flight(30, seed=3, dem=True)
     listener = EstimatorRun().fly(flight, 0, 20)
     fix = flight.fix(19)
-    assert fix.p_c_in_w_m is not None
-    low = msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))
+    low = found_at_15_m(fix)
     listener.feed([low])
     assert listener.estimate(19).agl_m < 20.0
     listener.feed(without(flight.messages(20), MapMatch))
@@ -339,8 +344,7 @@ def test_a_reported_height_near_the_matching_limit_causes_no_reset(reported_m: f
     flight = Flight(25, seed=3, dem=True)
     listener = EstimatorRun().fly(flight, 0, 20)
     fix = flight.fix(19)
-    assert fix.p_c_in_w_m is not None
-    listener.feed([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    listener.feed([found_at_15_m(fix)])
     state = next(m for m in flight.messages(20) if isinstance(m, VehicleState))
     listener.feed([msgspec.structs.replace(state, agl_m=reported_m), odometry_of(flight.messages(20))])
     assert listener.estimate(20).agl_m < 25.0 and resets(listener) == {0: STARTED, 19: FOUND}
@@ -350,8 +354,7 @@ def test_without_an_elevation_map_a_low_height_causes_no_reset() -> None:
     flight = Flight(25, seed=3)
     listener = EstimatorRun().fly(flight, 0, 20)
     fix = flight.fix(19)
-    assert fix.p_c_in_w_m is not None
-    listener.feed([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+    listener.feed([found_at_15_m(fix)])
     listener.feed(without(flight.messages(20), MapMatch))
     assert listener.estimate(20).agl_m < 25.0 and resets(listener) == {0: STARTED, 19: FOUND}
 
@@ -369,8 +372,7 @@ def test_the_height_after_a_reset_is_the_reported_one_above_the_take_off() -> No
                 listener.feed([m])
         if i == 19:
             fix = flight.fix(19)
-            assert fix.p_c_in_w_m is not None
-            listener.feed([msgspec.structs.replace(fix, found=True, p_c_in_w_m=(*fix.p_c_in_w_m[:2], 15.0))])
+            listener.feed([found_at_15_m(fix)])
     assert list(resets(listener)) == [0, 19, 20]
     assert listener.estimate(20).agl_m == pytest.approx(flight.p_m[20, 2], abs=15.0)
 

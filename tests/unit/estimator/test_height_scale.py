@@ -5,6 +5,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import position_of, with_pose
 from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight, cov_of, error_m
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
@@ -20,13 +21,12 @@ UNCALIBRATED = msgspec.structs.replace(ORIGIN, camera=msgspec.structs.replace(CA
 def seen_through(message: Message, focal: float) -> Message:
     """The message of a camera with ``focal`` times the described focal length: rays nearer to the optical axis, and map
     poses higher up."""
-    if isinstance(message, Odometry) and message.pairs:
-        pairs = focal * np.array(message.pairs)
-        return msgspec.structs.replace(message, pairs=[tuple(map(float, row)) for row in pairs])
+    if isinstance(message, Odometry) and message.two_view:
+        pairs = focal * np.array(message.two_view)
+        return msgspec.structs.replace(message, two_view=[tuple(map(float, row)) for row in pairs])
     if isinstance(message, MapMatch):
-        assert message.p_c_in_w_m is not None
-        e_m, n_m, up_m = message.p_c_in_w_m
-        return msgspec.structs.replace(message, p_c_in_w_m=(e_m, n_m, up_m / focal))
+        e_m, n_m, up_m = position_of(message)
+        return with_pose(message, p_c_in_w_m=(e_m, n_m, up_m / focal))
     return message
 
 

@@ -6,18 +6,20 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import plane
 from simulated_flight import FRAME_S, ORIGIN, PLACE, EstimatorRun, Flight, error_m, sigma_m
 from terrafix.core.codec import decode, decode_json, encode, encode_json
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import CheckpointWriter, load_checkpoint
 from terrafix.messages import (
+    InitialPosition,
     MapMatch,
     MeasurementVerdict,
     Message,
     NavEstimate,
     Odometry,
     Prediction,
-    Start,
+    SearchResult,
     VehicleState,
     Verdict,
 )
@@ -29,15 +31,15 @@ SIGMA_M, AT_M, GROUND_M = 3.0, (900.0, -400.0), 80.0
 START_AT = 4  # frames
 
 
-def start_at(i: int, e_m: float = AT_M[0], n_m: float = AT_M[1], ground_m: float | None = GROUND_M) -> Start:
+def start_at(i: int, e_m: float = AT_M[0], n_m: float = AT_M[1], ground_m: float | None = GROUND_M) -> InitialPosition:
     lat_deg, lon_deg = PLACE.to_wgs84(e_m, n_m)
     fields = {"lat_deg": lat_deg, "lon_deg": lon_deg, "sigma_m": SIGMA_M, "ground_amsl_m": ground_m}
-    return Start(t_ns=round(i * FRAME_S * 1e9), verdict=Verdict.ACCEPTED, **fields)
+    return InitialPosition(t_ns=round(i * FRAME_S * 1e9), verdict=Verdict.ACCEPTED, **fields)
 
 
-def withdrawn(i: int) -> Start:
+def withdrawn(i: int) -> InitialPosition:
     fields = {"lat_deg": None, "lon_deg": None, "sigma_m": None, "ground_amsl_m": None}
-    return Start(t_ns=round(i * FRAME_S * 1e9), verdict=Verdict.ACCEPTED, **fields)
+    return InitialPosition(t_ns=round(i * FRAME_S * 1e9), verdict=Verdict.ACCEPTED, **fields)
 
 
 def standing(i: int, armed: bool = False) -> list[Message]:
@@ -47,7 +49,7 @@ def standing(i: int, armed: bool = False) -> list[Message]:
 
 
 def stood(
-    frames: int = 10, start: Start | None = None, told_at: int = START_AT, node: EstimatorNode | None = None
+    frames: int = 10, start: InitialPosition | None = None, told_at: int = START_AT, node: EstimatorNode | None = None
 ) -> EstimatorRun:
     run = EstimatorRun()
     run.node = node or run.node
@@ -75,7 +77,7 @@ def test_it_begins_there_with_the_next_frame_as_sure_as_that_is() -> None:
 def test_a_prediction_names_the_start_it_is_based_on() -> None:
     run = stood(start=start_at(START_AT))
     predictions = {m.frame_id: m for m in run.published if isinstance(m, Prediction)}
-    assert [predictions[i].start_ns for i in (START_AT - 1, START_AT, 9)] == [0, *[start_at(START_AT).t_ns] * 2]
+    assert [predictions[i].prior_t_ns for i in (START_AT - 1, START_AT, 9)] == [0, *[start_at(START_AT).t_ns] * 2]
     assert predictions[START_AT].step_m == (0.0, 0.0)
 
 
@@ -120,8 +122,8 @@ def test_a_match_of_a_frame_before_the_start_is_stale() -> None:
         frame_id=START_AT - 1,
         verdict=Verdict.LOST,
         matcher="gradient",
-        ground=(300.0, 0.0, 0.0),
-        lost_sigma_m=1000.0,
+        ground=plane(300.0),
+        search=SearchResult(sigma_m=1000.0),
     )
     (verdict,) = run.feed([match])
     assert isinstance(verdict, MeasurementVerdict) and verdict.verdict is Verdict.STALE
@@ -206,5 +208,5 @@ def test_after_landing_the_flight_begins_there_too() -> None:
 
 
 @pytest.mark.parametrize("start", [start_at(3), withdrawn(3)])
-def test_it_survives_bus_and_record(start: Start) -> None:
+def test_it_survives_bus_and_record(start: InitialPosition) -> None:
     assert decode(encode(start)) == start and decode_json(encode_json(start)) == start

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import plane, with_search
 from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m, sigma_m, t_ns
 from terrafix.estimator.integrity.correlated_fixes import MAX_FIXES, CorrelatedFixes
 from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, SourceEnded, SourceLabel, Verdict
@@ -102,7 +103,7 @@ def test_a_late_match_does_not_make_a_blind_frame_a_seen_one() -> None:
 def test_of_two_matches_the_newer_one_knows_the_ground_below() -> None:
     flight = Flight(40, seed=2)
     run = EstimatorRun().fly(flight, 0, 40)
-    high, low = (msgspec.structs.replace(flight.fix(i), ground=(up, 0.0, 0.0)) for i, up in ((39, 12.0), (36, 4.0)))
+    high, low = (msgspec.structs.replace(flight.fix(i), ground=plane(up)) for i, up in ((39, 12.0), (36, 4.0)))
     run.feed([high])
     above_m = run.estimate(39).agl_m
     run.feed([low])
@@ -115,8 +116,8 @@ def test_what_a_search_found_knows_its_ground_however_late_it_is() -> None:
     run = EstimatorRun().fly(flight, 0, 30)
     for i in range(30, 42):
         run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
-    newer = msgspec.structs.replace(flight.fix(41), verdict=Verdict.AMBIGUOUS, ground=(0.0, 0.0, 0.0))
-    found = msgspec.structs.replace(flight.fix(36, (300.0, 200.0)), found=True, ground=(20.0, 0.0, 0.0))
+    newer = msgspec.structs.replace(flight.fix(41), verdict=Verdict.AMBIGUOUS, ground=plane(0.0))
+    found = with_search(msgspec.structs.replace(flight.fix(36, (300.0, 200.0)), ground=plane(20.0)), relocalized=True)
     run.feed([newer, found])
     estimate = run.estimate(41)
     assert estimate.alt_amsl_m - estimate.agl_m == pytest.approx(20.0, abs=0.5)

@@ -50,12 +50,12 @@ def test_the_radial_coefficient_is_estimated_in_flight_and_stays_zero_without_di
     flight, run = Flight(200, seed=2), EstimatorRun()
 
     def with_distortion(message: Message) -> Message:
-        if not isinstance(message, Odometry) or not message.pairs:
+        if not isinstance(message, Odometry) or not message.two_view:
             return message
-        pairs = np.array(message.pairs)
+        pairs = np.array(message.two_view)
         pairs = np.hstack([distorted(pairs[:, :2], k1), distorted(pairs[:, 2:], k1)])
         return msgspec.structs.replace(
-            message, pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in pairs]
+            message, two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in pairs]
         )
 
     run.feed([ORIGIN])

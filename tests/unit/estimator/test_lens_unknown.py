@@ -12,10 +12,19 @@ from terrafix.core.camera import CameraCalibration, distort_division, undistort_
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.pose import fit_pose
 from terrafix.estimator.factors.map_pose import map_pose_factor
-from terrafix.estimator.measurements.map_pose import moved_by_lens
+from terrafix.estimator.measurements.map_pose import moved_by_k1
 from terrafix.estimator.models.lens_prior import principal_point_sigma, radial_k1_sigma
 from terrafix.estimator.state import CALIBRATION_SIZE, RADIAL_K1
-from terrafix.messages import CalibrationEstimate, MapMatch, Message, NavEstimate, Odometry, Prediction, Verdict
+from terrafix.messages import (
+    CalibrationEstimate,
+    MapMatch,
+    MapPose,
+    Message,
+    NavEstimate,
+    Odometry,
+    Prediction,
+    Verdict,
+)
 from terrafix_tools.lens_report import lens_words
 
 ACTION_CAMERA_K1 = -0.28  # an action camera
@@ -70,9 +79,11 @@ def seen_through(k1: float, aside_m: float) -> MapMatch:
         verdict=Verdict.ACCEPTED,
         matcher="gradient",
         matches=[(float(a), float(b), float(c), float(d), 0.0, 1.0) for (a, b), (c, d) in zip(xy, ground, strict=True)],
-        p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-        q_w_c=quat_from_rot(fit.r_w_c),
-        cov=tuple(np.eye(6).ravel()),
+        pose=MapPose(
+            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+            q_w_c=quat_from_rot(fit.r_w_c),
+            cov=tuple(np.eye(6).ravel()),
+        ),
     )
 
 
@@ -80,14 +91,14 @@ def seen_through(k1: float, aside_m: float) -> MapMatch:
 def test_the_jacobian_of_a_map_pose_by_the_radial_coefficient_corrects_it(aside_m: float) -> None:
     k1 = -0.03
     match = seen_through(k1, aside_m)
-    assert match.p_c_in_w_m is not None and match.q_w_c is not None
-    wrong_m = float(np.linalg.norm(np.array(match.p_c_in_w_m) - (0.0, 0.0, 100.0)))
-    by_k1 = moved_by_lens(match)
+    assert match.pose is not None
+    wrong_m = float(np.linalg.norm(np.array(match.pose.p_c_in_w_m) - (0.0, 0.0, 100.0)))
+    by_k1 = moved_by_k1(match)
     assert by_k1 is not None
-    pose = gtsam.Pose3(gtsam.Rot3(rot_from_quat(match.q_w_c)), np.array(match.p_c_in_w_m))
+    pose = gtsam.Pose3(gtsam.Rot3(rot_from_quat(match.pose.q_w_c)), np.array(match.pose.p_c_in_w_m))
     corrected = pose.retract(by_k1 * k1).translation()
     assert float(np.linalg.norm(corrected - (0.0, 0.0, 100.0))) < 0.25 * wrong_m
-    assert moved_by_lens(msgspec.structs.replace(match, matches=[])) is None
+    assert moved_by_k1(msgspec.structs.replace(match, matches=[])) is None
 
 
 def test_the_lens_uncertainty_of_map_poses_does_not_average_out() -> None:
@@ -112,14 +123,14 @@ def test_an_undescribed_lens_is_estimated_within_a_few_frames() -> None:
     flight, run = Flight(24, seed=3), EstimatorRun()
 
     def with_distortion(message: Message) -> Message:
-        if not isinstance(message, Odometry) or not message.pairs:
+        if not isinstance(message, Odometry) or not message.two_view:
             return message
-        pairs = np.array(message.pairs)
+        pairs = np.array(message.two_view)
         pairs = np.hstack(
             [distort_division(pairs[:, :2], ACTION_CAMERA_K1), distort_division(pairs[:, 2:], ACTION_CAMERA_K1)]
         )
         return msgspec.structs.replace(
-            message, pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in pairs]
+            message, two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in pairs]
         )
 
     published: list[Message] = []
@@ -127,7 +138,7 @@ def test_an_undescribed_lens_is_estimated_within_a_few_frames() -> None:
     for i in range(flight.frames):
         for message in flight.messages(i):
             published += run.node.on(with_distortion(message))
-    published_k1 = [m.lens for m in published if isinstance(m, Prediction)]
+    published_k1 = [m.radial_k1 for m in published if isinstance(m, Prediction)]
     assert published_k1[0] == 0.0
     assert published_k1[-1] == pytest.approx(ACTION_CAMERA_K1, abs=0.04)
     learnt = [m for m in published if isinstance(m, CalibrationEstimate)][-1]

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import with_search
 from simulated_flight import (
     FRAME_S,
     ORIGIN,
@@ -64,7 +65,7 @@ def test_odometry_of_the_keyframe_before_a_find_is_fused(flight: Flight) -> None
     for i in range(FRAMES):
         run.feed(of_one_keyframe(flight, i))
         if i == FOUND:
-            run.feed([msgspec.structs.replace(flight.fix(i, offset_m=(300.0, 0.0)), found=True)])
+            run.feed([with_search(flight.fix(i, offset_m=(300.0, 0.0)), relocalized=True)])
     assert "found" in run.verdicts("map")[FOUND].detail
     assert {i: v.verdict for i, v in run.verdicts("odometry").items()} == dict.fromkeys(range(FRAMES), Verdict.ACCEPTED)
     assert max(steps_off_m(run, flight, FOUND)) < 1.5

@@ -128,8 +128,8 @@ def test_a_file_that_is_not_a_record_raises_a_source_error(tmp_path: Path) -> No
 
 def test_a_record_of_another_format_raises_an_error_with_the_format(flown: Path, tmp_path: Path) -> None:
     whole = (flown / "flight.mcap").read_bytes()
-    assert b"terrafix-flight/1" in whole
-    (tmp_path / "flight.mcap").write_bytes(whole.replace(b"terrafix-flight/1", b"terrafix-flight/9"))
+    assert b"terrafix-flight/2" in whole
+    (tmp_path / "flight.mcap").write_bytes(whole.replace(b"terrafix-flight/2", b"terrafix-flight/9"))
     with pytest.raises(SourceError, match="terrafix-flight/9"):
         finalise(tmp_path)
 

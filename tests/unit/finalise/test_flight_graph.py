@@ -4,10 +4,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import with_search
 from recorded_flight import blind_between, errors, nees, replayed_graph, shifted, unmatched
 from simulated_flight import ORIGIN, EstimatorRun, Flight, error_m
 from terrafix.core.geodesy import local_rotation_up
-from terrafix.messages import MapMatch, Message, Verdict
+from terrafix.messages import MapMatch, Message, SearchResult, Verdict
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import FlightReplayer
 
@@ -81,7 +82,7 @@ def test_the_track_before_a_reset_by_a_map_match_is_corrected(telemetry: set[str
             return message
         if message.frame_id < first:
             return unmatched(message)
-        return msgspec.structs.replace(shifted(message, moved, turn), found=message.frame_id == first)
+        return with_search(shifted(message, moved, turn), relocalized=message.frame_id == first)
 
     graph = replayed_graph(flight, alter)
     smoothed = smooth(graph)
@@ -110,7 +111,7 @@ def test_a_lost_position_that_is_not_found_again_keeps_its_sigma() -> None:
 
     def alter(message: Message) -> Message | None:
         if isinstance(message, MapMatch) and message.frame_id > 36:
-            return msgspec.structs.replace(unmatched(message), verdict=Verdict.LOST, lost_sigma_m=300.0)
+            return msgspec.structs.replace(unmatched(message), verdict=Verdict.LOST, search=SearchResult(sigma_m=300.0))
         return message
 
     graph = replayed_graph(flight, alter)

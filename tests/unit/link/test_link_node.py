@@ -111,7 +111,7 @@ def test_before_the_first_estimate_fix_type_is_1_without_a_position() -> None:
     )  # no silence before the first estimate: an autopilot that boots must receive fix type 1
     assert {(g.fix_type, g.lat_deg, g.lon_deg, g.satellites_visible) for g in published} == {(1, 0.0, 0.0, 0)}
     assert {g.alt_amsl_m for g in published} == {500.0}
-    assert {g.reason for g in published} == {"no estimate yet"}
+    assert {g.no_fix_reason for g in published} == {"no estimate yet"}
 
 
 def test_a_stale_estimate_gives_fix_type_1_then_silence_and_recovers_immediately() -> None:
@@ -123,7 +123,7 @@ def test_a_stale_estimate_gives_fix_type_1_then_silence_and_recovers_immediately
     last_estimate = 9_500 * MS
     for g in gps_since(published, S):
         assert g.fix_type == (3 if g.t_ns <= last_estimate + fix_type.MAX_AGE_NS or g.t_ns > 60 * S else 1)
-        assert g.fix_type == 3 or (g.lat_deg == g.lon_deg == 0.0 and "old" in g.reason)
+        assert g.fix_type == 3 or (g.lat_deg == g.lon_deg == 0.0 and "old" in g.no_fix_reason)
     quiet = [(a.t_ns, b.t_ns) for a, b in pairwise(gps(published)) if b.t_ns - a.t_ns > 200 * MS]
     assert len(quiet) == 1
     assert quiet[0][0] == pytest.approx(last_estimate + fix_type.SILENCE_AFTER_NS, abs=100 * MS)
@@ -164,7 +164,7 @@ def test_an_accuracy_spike_lowers_the_fix_instead_of_opening_the_gate() -> None:
     sent = gps(fly(LinkNode(10.0), 0, 16 * S, every(200 * MS, make)))
     during = [g for g in sent if 5_300 * MS < g.t_ns < 6_100 * MS]
     assert {g.fix_type for g in during} == {1}
-    assert all("at once" in g.reason for g in during)
+    assert all("at once" in g.no_fix_reason for g in during)
     assert {g.fix_type for g in sent if 6_500 * MS < g.t_ns < 10 * S} == {3}
     late = [g for g in sent if g.t_ns > 13 * S]  # a lasting increase is accepted
     assert {g.fix_type for g in late} == {3}
@@ -180,7 +180,7 @@ def test_a_single_350_m_jump_is_not_sent() -> None:
     assert max(abs(east_error_m(g)) for g in gps(published) if g.fix_type == 3) < 1.0
     no_fix = [g for g in gps_since(published, S) if g.fix_type == 1]
     assert 3 <= len(no_fix) <= 6  # from its arrival to the next estimate
-    assert all("350 m" in g.reason for g in no_fix)
+    assert all("350 m" in g.no_fix_reason for g in no_fix)
     wrong = [v for v in verdicts(published) if v.verdict is not m.Verdict.ACCEPTED]
     assert [(v.frame_id, v.verdict) for v in wrong] == [(5000, m.Verdict.IMPLAUSIBLE)]
 
@@ -311,7 +311,7 @@ def test_estimator_failure_and_overheating_are_reported_to_the_pilot() -> None:
         )
     )
     assert texts(list(died) + list(hot)) == ["Terrafix: estimator died", "Terrafix: computer is critical, 97 C"]
-    assert gps(list(node.tick(0)))[0].reason == "estimator died"
+    assert gps(list(node.tick(0)))[0].no_fix_reason == "estimator died"
     assert not list(node.on(m.ProcessEvent(t_ns=0, process="recorder", event="died")))
 
 

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import pose_of, with_pose
 from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight, cov_of, t_ns
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
@@ -94,16 +95,15 @@ def broken(match: MatchResult, flight: Flight) -> dict[str, MatchResult]:
     return {
         "on a line": change(match, matches=seen(flight, AT, line)),
         "three matches of one point": change(match, matches=match.matches[:1] * 3),
-        "behind the camera": change(match, q_w_c=_upside_down(match)),
-        "no number": change(match, p_c_in_w_m=(nan, 0.0, 100.0)),
-        "no covariance": change(match, cov=tuple([0.0] * 36)),
-        "no pose": change(match, p_c_in_w_m=None),
+        "behind the camera": with_pose(match, q_w_c=_upside_down(match)),
+        "no number": with_pose(match, p_c_in_w_m=(nan, 0.0, 100.0)),
+        "no covariance": with_pose(match, cov=tuple([0.0] * 36)),
+        "no pose": change(match, pose=None),
     }
 
 
 def _upside_down(match: MatchResult) -> tuple[float, float, float, float]:
-    assert match.q_w_c is not None
-    return quat_from_rot(rot_from_quat(match.q_w_c) @ exp_so3(np.array([np.pi - 1e-6, 0.0, 0.0])))
+    return quat_from_rot(rot_from_quat(pose_of(match).q_w_c) @ exp_so3(np.array([np.pi - 1e-6, 0.0, 0.0])))
 
 
 @pytest.mark.parametrize(

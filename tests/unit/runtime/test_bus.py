@@ -142,7 +142,7 @@ class SlowNode:
                 frame_id=message.frame_id,
                 verdict=m.Verdict.ACCEPTED,
                 matcher="test",
-                mode_e_m=message.step_m[0],
+                place=m.MatchPlace(e_m=message.step_m[0], n_m=0.0, mass=1.0),
             )
 
     def tick(self, now_ns: int) -> Iterable[m.Message]:
@@ -201,7 +201,9 @@ def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_on
     matches = [h for h in received if isinstance(h, m.MapMatch)]
     assert matches[-1].frame_id == 99
     assert 10 <= len(matches) < 30
-    assert sum(h.mode_e_m for h in matches) == 100.0, "the merged predictions contain the motion of the skipped ones"
+    assert sum(h.place.e_m for h in matches if h.place) == 100.0, (
+        "the merged predictions contain the motion of the skipped ones"
+    )
     dropped = [h for h in received if isinstance(h, m.Dropped)]
     assert {(d.process, d.message) for d in dropped} == {("slow", "Prediction")}
     assert sum(d.count for d in dropped) == 100 - len(matches)

@@ -33,8 +33,8 @@ def foreign(seed: int = 9) -> np.ndarray:
 
 def errors(motion: Motion, keyframe: Pose, now: Pose) -> np.ndarray:
     """Error of each match against the true motion of the ground, in pixels: (N, 2)."""
-    expected = apply(homography(keyframe, now), motion.pairs[:, :2])
-    return (motion.pairs[:, 2:] - expected) * PINHOLE.fx
+    expected = apply(homography(keyframe, now), motion.two_view[:, :2])
+    return (motion.two_view[:, 2:] - expected) * PINHOLE.fx
 
 
 def is_right(motion: Motion, keyframe: Pose, now: Pose) -> bool:
@@ -57,12 +57,12 @@ STEPS = {
 def test_tracking_recovers_the_motion(ground: np.ndarray, name: str) -> None:
     tracker, first, second = FrameTracker(PINHOLE), pose(0.0, 0.0), STEPS[name]
     start = tracker.track(4, picture(ground, first))
-    assert (start.keyframe_id, start.becomes_keyframe, len(start.pairs)) == (4, True, 0)
+    assert (start.keyframe_id, start.becomes_keyframe, len(start.two_view)) == (4, True, 0)
     motion = tracker.track(5, picture(ground, second))
     assert (motion.verdict, motion.keyframe_id) == (Verdict.ACCEPTED, 4)
-    assert 15 <= len(motion.pairs) <= MAX_PAIRS and motion.inliers >= len(motion.pairs)
+    assert 15 <= len(motion.two_view) <= MAX_PAIRS and motion.inliers >= len(motion.two_view)
     assert is_right(motion, first, second)
-    spread = np.ptp(motion.pairs[:, :2], axis=0) * PINHOLE.fx
+    spread = np.ptp(motion.two_view[:, :2], axis=0) * PINHOLE.fx
     assert spread[0] > 0.3 * PINHOLE.width  # matches cover the overlap, not one roof
     assert 0.2 / PINHOLE.fx < motion.sigma_norm < 5.0 / PINHOLE.fx
 
@@ -105,9 +105,9 @@ def test_corners_are_carried_over_keyframes_and_give_three_view_matches(ground: 
     for i in range(18):
         at[i] = pose(-80.0 + 9.0 * i, 0.4 * i, yaw_deg=2.0 * i)
         motion = tracker.track(i, picture(ground, at[i]))
-        if len(motion.triples):
+        if len(motion.three_view):
             assert motion.becomes_keyframe and [motion.previous_keyframe_id, motion.keyframe_id] == keyframes[-2:]
-            views = motion.triples.reshape(-1, 3, 2)
+            views = motion.three_view.reshape(-1, 3, 2)
             for which, before in enumerate(keyframes[-2:]):
                 error = (views[:, 2] - apply(homography(at[before], at[i]), views[:, which])) * PINHOLE.fx
                 # A frame-to-frame track drifts by 0.3 to 0.9 px.
@@ -124,7 +124,7 @@ def test_a_new_fragment_has_no_matches_with_earlier_keyframes(ground: np.ndarray
         tracker.track(i, picture(ground, pose(9.0 * i, 0.0)))
     for i in range(MAX_FAILURES + 1):
         tracker.track(6 + i, foreign())
-    assert len(tracker.track(20, foreign()).triples) == 0
+    assert len(tracker.track(20, foreign()).three_view) == 0
 
 
 def test_a_foreign_frame_loses_one_frame_only(ground: np.ndarray) -> None:
@@ -133,7 +133,7 @@ def test_a_foreign_frame_loses_one_frame_only(ground: np.ndarray) -> None:
     for i in range(2):
         tracker.track(i, picture(ground, track[i]))
     stranger = tracker.track(2, foreign())
-    assert (stranger.verdict, stranger.becomes_keyframe, len(stranger.pairs)) == (Verdict.FEW_INLIERS, False, 0)
+    assert (stranger.verdict, stranger.becomes_keyframe, len(stranger.two_view)) == (Verdict.FEW_INLIERS, False, 0)
     after = tracker.track(3, picture(ground, track[3]))
     assert after.verdict is Verdict.ACCEPTED and after.keyframe_id < 2
     assert is_right(after, track[after.keyframe_id], track[3])
@@ -198,9 +198,9 @@ def test_uniform_frames_from_the_start_are_not_registered(ground: np.ndarray) ->
     blank = np.zeros((PINHOLE.height, PINHOLE.width, 3), np.uint8)
     tracker = FrameTracker(PINHOLE)
     for i in range(3):
-        assert len(tracker.track(i, blank).pairs) == 0
+        assert len(tracker.track(i, blank).two_view) == 0
     found = [tracker.track(3 + i, picture(ground, pose(0.0, 9.0 * i))) for i in range(MAX_FAILURES + 3)]
-    assert found[-1].verdict is Verdict.ACCEPTED and len(found[-1].pairs) > 0
+    assert found[-1].verdict is Verdict.ACCEPTED and len(found[-1].two_view) > 0
 
 
 def test_repeated_registration_failures_start_a_new_fragment() -> None:
@@ -210,7 +210,7 @@ def test_repeated_registration_failures_start_a_new_fragment() -> None:
     motions = [tracker.track(1 + i, foreign(21 + i)) for i in range(MAX_FAILURES)]
     assert [m.verdict for m in motions[:-1]] == [Verdict.FEW_INLIERS] * (MAX_FAILURES - 1)
     last = motions[-1]
-    assert (last.verdict, last.keyframe_id, last.becomes_keyframe, len(last.pairs)) == (
+    assert (last.verdict, last.keyframe_id, last.becomes_keyframe, len(last.two_view)) == (
         Verdict.ACCEPTED,
         MAX_FAILURES,
         True,
@@ -239,7 +239,7 @@ def test_tracking_is_deterministic(ground: np.ndarray) -> None:
         tracker = FrameTracker(PINHOLE)
         runs.append([tracker.track(i, f) for i, f in enumerate(frames)])
     for a, b in zip(*runs, strict=True):
-        assert np.array_equal(a.pairs, b.pairs)
+        assert np.array_equal(a.two_view, b.two_view)
         assert (a.verdict, a.keyframe_id, a.sigma_norm, a.inliers) == (
             b.verdict,
             b.keyframe_id,

@@ -92,5 +92,5 @@ def test_three_view_matches_carry_the_id_of_the_previous_keyframe() -> None:
     store.put(5, picture(1))
     (published,) = node.on(Frame(t_ns=0, frame_id=5, file="5.jpg", width=640, height=480))
     assert isinstance(published, Odometry)
-    assert (published.before_id, published.keyframe_id, published.triples_sigma_norm) == (2, 4, 0.002)
-    assert published.pairs == [(0.0, 1.0, 2.0, 3.0)] and published.triples == [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
+    assert (published.previous_keyframe_id, published.keyframe_id, published.three_view_sigma_norm) == (2, 4, 0.002)
+    assert published.two_view == [(0.0, 1.0, 2.0, 3.0)] and published.three_view == [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]

@@ -138,7 +138,7 @@ def sent_fixes(out: Path, without_lie: Path, frame: LocalFrame) -> list[SentFix]
             reported_m = np.array(frame.to_local(message.lat_deg, message.lon_deg))
             error_m = float(np.hypot(*(reported_m - here_m)))
         deviation_m = float(np.hypot(*(near_m - here_m).T).min())
-        sent.append(SentFix(now_s, error_m, message.horiz_accuracy_m, deviation_m, message.reason))
+        sent.append(SentFix(now_s, error_m, message.horiz_accuracy_m, deviation_m, message.no_fix_reason))
     return sent
 
 

@@ -179,7 +179,7 @@ def measure(
         return Answer(
             error_px=float(np.hypot(*off_m)) / float(np.hypot(*sampler.pixel_m(true_px))),
             verdict=match.verdict.value,
-            sure=match.verdict is Verdict.ACCEPTED and not match.coarse,  # a coarse match only continues a track
+            sure=match.verdict is Verdict.ACCEPTED and not match.position_only,  # a coarse match only continues a track
             inside=float(off_m @ np.linalg.solve(cov_m2, off_m)) <= INSIDE_95,
             cpu_ms=cpu_ms,
         )
@@ -191,11 +191,12 @@ def centre_point_of(match: MapMatch) -> tuple[np.ndarray, np.ndarray]:
     """-> (2,) east, north [m] of the ground point at height zero in the image centre of a nadir image, and its
     covariance (2, 2). Without a pose: mode and covariance of the belief."""
     map_m2 = match.map_sigma_m**2 * np.eye(2)
-    if match.coarse or match.p_c_in_w_m is None or match.q_w_c is None or match.cov is None:
-        mode_m, cov_m2 = np.array([match.mode_e_m, match.mode_n_m]), np.reshape(match.belief_cov_m2, (2, 2))
+    if match.pose is None or match.pose.position_only:
+        mode_m = np.zeros(2) if match.place is None else np.array([match.place.e_m, match.place.n_m])
+        cov_m2 = np.zeros((2, 2)) if match.belief is None else np.reshape(match.belief.cov_m2, (2, 2))
         return mode_m, cov_m2 + map_m2 + 1e-6 * np.eye(2)
-    p, axis = np.array(match.p_c_in_w_m), rot_from_quat(match.q_w_c)[:, 2]
-    return (p - axis * (p[2] / axis[2]))[:2], ground_cov_m2(match.cov, p[2]) + map_m2
+    p, axis = np.array(match.pose.p_c_in_w_m), rot_from_quat(match.pose.q_w_c)[:, 2]
+    return (p - axis * (p[2] / axis[2]))[:2], ground_cov_m2(match.pose.cov, p[2]) + map_m2
 
 
 def row(name: str, places: list[Answer], elsewhere: list[Answer]) -> str:

@@ -57,7 +57,7 @@ def smooth(flight: FlightGraph, progress: Progress = lambda _done, _of: None) ->
 
 class _Smoothing:
     def __init__(self, flight: FlightGraph, progress: Progress) -> None:
-        k1, sigma = flight.lens
+        k1, sigma = flight.radial_k1
         fixes = []
         for fix in flight.fixes:  # with the final estimate of the radial coefficient
             pose, cov = undistorted_pose(fix.pose, fix.cov, fix.by_k1, k1 - fix.k1, sigma)

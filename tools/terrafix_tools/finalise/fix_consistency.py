@@ -46,7 +46,7 @@ def ambiguous_segments(
     Outlier map matches at the beginning or end of a segment that agree with each other may be right: one odometry error
     would explain them. Between inliers it would take two errors."""
     for begin in np.unique(begins):
-        own = [i for i, f in enumerate(fixes) if begins[f.node] == begin and not f.coarse]
+        own = [i for i, f in enumerate(fixes) if begins[f.node] == begin and not f.position_only]
         own.sort(key=lambda i: fixes[i].node)
         right = [k for k, i in enumerate(own) if inliers[i]]
         nodes = np.flatnonzero(begins == begin)

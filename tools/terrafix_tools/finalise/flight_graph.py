@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.graph.pose_graph import GraphObserver, GraphPrior, NewNode, PoseGraph
-from terrafix.estimator.measurements.map_pose import determined, measured_pose, moved_by_lens
+from terrafix.estimator.measurements.map_pose import determined, measured_pose, moved_by_k1
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.estimator.models.bias_walk import WALK_SIGMAS
 from terrafix.estimator.models.plane_motion import RelativePose
@@ -60,7 +60,7 @@ class Fix:
     pose: gtsam.Pose3
     cov: np.ndarray
     map_sigma_m: float
-    coarse: bool
+    position_only: bool
     by_k1: np.ndarray | None
     k1: float
     tried: bool
@@ -124,14 +124,14 @@ class FlightGraph:
     node_of: dict[int, int] = field(default_factory=dict)
     refused: dict[str, int] = field(default_factory=dict)  # number of map matches that are not used, by verdict
     lost_sigma_m: dict[int, float] = field(default_factory=dict)  # node -> 1-sigma of a position that may be wrong
-    lens: tuple[float, float] = 0.0, 0.0  # final radial coefficient, and its 1-sigma
+    radial_k1: tuple[float, float] = 0.0, 0.0  # final radial coefficient, and its 1-sigma
     principal_point: PrincipalPointFilter | None = None
     has_height: bool = False  # the autopilot reported one
 
 
 class FlightReplayer:
-    """Feeds a record, message after message, to the node that flew. ``flights``: one for each Origin, and each Start,
-    from which its estimator began."""
+    """Feeds a record, message after message, to the node that flew. ``flights``: one for each Origin, and each
+    InitialPosition, from which its estimator began."""
 
     def __init__(self) -> None:
         self.flights: list[FlightGraph] = []
@@ -151,7 +151,8 @@ class FlightReplayer:
             flight.has_height = flight.has_height or message.agl_m is not None
         elif isinstance(message, Odometry) and any(isinstance(s, NavEstimate) for s in published):
             flight.node_of[message.frame_id] = flight.recorder.graph.newest
-            flight.lens, flight.principal_point = estimator.state.lens_estimate, estimator.state.principal_point
+            flight.radial_k1 = estimator.state.radial_k1_estimate
+            flight.principal_point = estimator.state.principal_point
         elif isinstance(message, MapMatch):
             verdict = next((s.verdict for s in published if isinstance(s, MeasurementVerdict)), Verdict.STALE)
             self._add_match(message, verdict, estimator)
@@ -162,12 +163,12 @@ class FlightReplayer:
         node = flight.node_of.get(match.frame_id)
         if node is not None:
             flight.lost_sigma_m[node] = estimator.hypotheses.anywhere_m
-        if node is None or match.verdict is not Verdict.ACCEPTED or not determined(match):
+        if node is None or match.verdict is not Verdict.ACCEPTED or match.pose is None or not determined(match):
             reason = match.verdict if match.verdict is not Verdict.ACCEPTED else Verdict.STALE
             flight.refused[str(reason)] = flight.refused.get(str(reason), 0) + 1
             return
-        pose, cov = measured_pose(match, estimator.terrain)
+        pose, cov = measured_pose(match.pose, match.map_sigma_m, estimator.terrain)
         tried = verdict is not Verdict.AMBIGUOUS
         flight.fixes.append(
-            Fix(node, pose, cov, match.map_sigma_m, match.coarse, moved_by_lens(match), match.lens, tried)
+            Fix(node, pose, cov, match.map_sigma_m, match.position_only, moved_by_k1(match), match.radial_k1, tried)
         )

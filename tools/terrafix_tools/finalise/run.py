@@ -19,6 +19,7 @@ from terrafix.core.pose import exp_so3, tangent_to_world
 from terrafix.estimator.state import EAST, HORIZONTAL, MOUNT_TILT, NORTH, UP
 from terrafix.messages import Frame, SourceEnded
 from terrafix.processes import PROCESSES
+from terrafix.recorder.old_format import OLD_FORMAT
 from terrafix.recorder.reader import ReadResult, read_flight
 from terrafix.recorder.writer import RECORD_FORMAT, versions
 from terrafix_tools.estimates import NS
@@ -86,10 +87,10 @@ def _replay(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, Fin
     where = ", ".join(path.name for path in result.files)
     if not result.header:
         raise SourceError(f"{folder}: {where} is not a flight record, or ends before its head; give another")
-    if result.header["format"] != RECORD_FORMAT:
+    if result.header["format"] not in (RECORD_FORMAT, OLD_FORMAT):
         raise SourceError(
             f"{folder}: {where} is a record of format '{result.header['format']}', and this program reads "
-            f"'{RECORD_FORMAT}'; finalise it with the version that wrote it"
+            f"'{RECORD_FORMAT}' and '{OLD_FORMAT}'; finalise it with the version that wrote it"
         )
     if not replayer.flights or not rows:
         missing = "no frame" if replayer.flights else "no origin of a flight"

@@ -8,12 +8,11 @@ import math
 import time
 from typing import Any
 
-import msgspec
 import numpy as np
 from rich.console import Console
 
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.prior import EstimatorCheckpoint
+from terrafix.estimator.prior import CheckpointGround, EstimatorCheckpoint, ground_of
 from terrafix.messages import CalibrationEstimate, MapMatch, Message, NavEstimate, Odometry, Origin
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Run
@@ -38,8 +37,8 @@ class RestartComparison(Run):
         self._from_ns = round(young_from_s * 1e9)
         self._young: EstimatorNode | None = None
         self._origin: Origin | None = None
-        self._slow: CalibrationEstimate | None = None
-        self._ground: MapMatch | None = None
+        self._calibration: CalibrationEstimate | None = None
+        self._ground: CheckpointGround | None = None
 
     def process(self, message: Message) -> list[Message]:
         if self._young is None:
@@ -65,11 +64,11 @@ class RestartComparison(Run):
                 case Origin():
                     self._origin = message
                 case CalibrationEstimate():
-                    self._slow = message
-                case MapMatch() if message.ground is not None:
-                    self._ground = msgspec.structs.replace(message, matches=[])
+                    self._calibration = message
+                case MapMatch():
+                    self._ground = ground_of(message) or self._ground
                 case NavEstimate() if message.t_ns >= self._from_ns and self._origin is not None:
-                    self._young = EstimatorNode(0, EstimatorCheckpoint(message, self._slow, self._ground))
+                    self._young = EstimatorNode(0, EstimatorCheckpoint(message, self._calibration, self._ground))
                     list(self._young.on(self._origin))
                     return
                 case _:

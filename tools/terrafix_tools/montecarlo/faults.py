@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.messages import MapMatch, Verdict
+from terrafix.messages import MapMatch, MapPose, MatchPlace, Verdict
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flown import Shot
 
@@ -72,17 +72,7 @@ class Faults:
 
 def no_match(match: MapMatch) -> MapMatch:
     """``match`` without a pose and without a belief: the frame was not compared with the map."""
-    return msgspec.structs.replace(
-        match,
-        verdict=Verdict.FEW_INLIERS,
-        coarse=False,
-        p_c_in_w_m=None,
-        q_w_c=None,
-        cov=None,
-        inliers=0,
-        mode_mass=0.0,
-        modes=[],
-    )
+    return msgspec.structs.replace(match, verdict=Verdict.FEW_INLIERS, pose=None, place=None, belief=None, inliers=0)
 
 
 def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.random.Generator) -> MapMatch:
@@ -92,14 +82,12 @@ def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.rando
     return msgspec.structs.replace(
         match,
         verdict=Verdict.ACCEPTED,
-        coarse=False,
-        p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-        q_w_c=quat_from_rot(shot.r_w_c),
-        cov=tuple(float(v) for v in cov.ravel()),
         inliers=30,
-        margin=7.0,
-        modes=[],
-        mode_mass=0.99,
-        mode_e_m=float(p[0]),
-        mode_n_m=float(p[1]),
+        pose=MapPose(
+            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+            q_w_c=quat_from_rot(shot.r_w_c),
+            cov=tuple(float(v) for v in cov.ravel()),
+        ),
+        place=MatchPlace(e_m=float(p[0]), n_m=float(p[1]), mass=0.99),
+        belief=None,
     )

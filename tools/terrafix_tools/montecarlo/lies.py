@@ -10,7 +10,7 @@ from typing import Protocol
 import msgspec
 import numpy as np
 
-from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
+from terrafix.messages import MapMatch, Prediction, SearchResult, SearchStep, Verdict
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.faults import no_match, wrong_match
 from terrafix_tools.montecarlo.flown import Shot, SimulatedFlight
@@ -139,12 +139,12 @@ class Search:
             return match
         e_m, n_m, up_m = float(shot.p_m[0]), float(shot.p_m[1]), prediction.p_c_in_w_m[2]
         there = find(msgspec.structs.replace(prediction, p_c_in_w_m=(e_m, n_m, up_m)), shot, usable=False)
-        self._matched += there.verdict is Verdict.ACCEPTED and not there.coarse
-        if self._matched >= FOUND_FRAMES and there.verdict is Verdict.ACCEPTED and not there.coarse:
+        self._matched += there.verdict is Verdict.ACCEPTED and not there.position_only
+        if self._matched >= FOUND_FRAMES and there.verdict is Verdict.ACCEPTED and not there.position_only:
             self._missed = self._matched = 0
-            return msgspec.structs.replace(there, found=True, step=SearchStep.MERGE)
-        lost = no_match(match)
-        return msgspec.structs.replace(lost, verdict=Verdict.LOST, step=SearchStep.WIDEN, lost_sigma_m=LOST_SIGMA_M)
+            return msgspec.structs.replace(there, search=SearchResult(step=SearchStep.MERGE, relocalized=True))
+        search = SearchResult(step=SearchStep.WIDEN, sigma_m=LOST_SIGMA_M)
+        return msgspec.structs.replace(no_match(match), verdict=Verdict.LOST, search=search)
 
 
 def _random_offset_m(rng: np.random.Generator, range_m: tuple[float, float]) -> np.ndarray:

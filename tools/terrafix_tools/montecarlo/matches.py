@@ -18,7 +18,7 @@ from terrafix.anchor.matching.point_mass_filter import Mode, belief_cell_m
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.pose import log_so3
-from terrafix.messages import MapMatch, Prediction, Vec3, Verdict
+from terrafix.messages import GroundPlane, MapMatch, MatchPlace, Prediction, Verdict
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import MAP_SEES_TOPS, MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens, footprint_m
@@ -57,19 +57,18 @@ class MapMatches:
 
     def match(self, prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch:
         """``usable`` False: the belief gets nothing, since the picture shows nothing or a search is active."""
-        ground, relief_m = self._plane(prediction)
+        ground = self._plane(prediction)
         result = MapMatch(
             t_ns=prediction.t_ns,
             frame_id=prediction.frame_id,
             verdict=Verdict.AMBIGUOUS,
             matcher="gradient",
             ground=ground,
-            relief_m=relief_m,
             map_sigma_m=self._map_sigma_m,
         )
         good = self._texture_quality(shot.t_s)
         r_w_c, p_m = rot_from_quat(prediction.q_w_c), np.array(prediction.p_c_in_w_m)
-        agl_m = prediction.agl_m if ground is None else float(p_m[2]) - ground[0]
+        agl_m = prediction.agl_m if ground is None else float(p_m[2]) - ground.amsl_m
         if agl_m < MIN_MATCHING_AGL_M:
             return msgspec.structs.replace(result, verdict=Verdict.TOO_LOW)
         place = self._apparent(shot, r_w_c, agl_m)
@@ -80,7 +79,7 @@ class MapMatches:
         score = SCORE + SCORE_SPREAD * (float(self._rng.normal()) + 0.5 * (good - 0.5))
         mode = Mode(float(place[0]), float(place[1]), MASS, 0.0, belief_cell_m(agl_m, 0.0) ** 2)
         view = View(mode.e_m, mode.n_m, r_w_c, agl_m, float(p_m[2]) - agl_m, 0.0, 0.0, 0.0)
-        result = msgspec.structs.replace(result, margin=score, mode_mass=MASS, mode_e_m=mode.e_m, mode_n_m=mode.n_m)
+        result = msgspec.structs.replace(result, place=MatchPlace(e_m=mode.e_m, n_m=mode.n_m, mass=MASS))
         result = pose_match(result, self._fix(shot, good, view), view)
         if result.verdict is Verdict.ACCEPTED or score < COARSE_SCORE:
             return result
@@ -124,17 +123,17 @@ class MapMatches:
             return np.full(len(places_m), self._home_m)
         return self._terrain.bare_m(places_m) + self._dem_error_m
 
-    def _plane(self, prediction: Prediction) -> tuple[Vec3 | None, float]:
-        """Plane through the ground around the predicted camera, as the anchor fits it, and the residual relief [m]."""
+    def _plane(self, prediction: Prediction) -> GroundPlane | None:
+        """Plane through the ground around the predicted camera, as the anchor fits it."""
         if not self._has_dem:
-            return None, 0.0
+            return None
         axis = np.linspace(-0.7, 0.7, 7) * prediction.agl_m
         de, dn = (a.ravel() for a in np.meshgrid(axis, axis))
         up = self._elevation(np.stack([de, dn], 1) + prediction.p_c_in_w_m[:2])
         design = np.column_stack([np.ones(len(de)), de, dn])
         plane = np.linalg.lstsq(design, up, rcond=None)[0]
         relief_m = float(np.sqrt(np.mean((up - design @ plane) ** 2)))
-        return (float(plane[0]), float(plane[1]), float(plane[2])), relief_m
+        return GroundPlane(amsl_m=float(plane[0]), slope_e=float(plane[1]), slope_n=float(plane[2]), relief_m=relief_m)
 
     def _apparent(self, shot: Shot, r_w_c: np.ndarray, agl_m: float) -> np.ndarray:
         """(2,) camera position that follows from the assumed rotation and height: the optical axis meets the same
@@ -175,7 +174,7 @@ class MapMatches:
         result = with_belief(result, tracked.belief, modes, score)
         if modes[0].mass < MIN_POSE_MODE_MASS or not tracked.is_at(modes[0], place_m):
             return result
-        agl_m = prediction.agl_m if result.ground is None else float(prediction.p_c_in_w_m[2]) - result.ground[0]
+        agl_m = prediction.agl_m if result.ground is None else float(prediction.p_c_in_w_m[2]) - result.ground.amsl_m
         ground_m = float(prediction.p_c_in_w_m[2]) - agl_m
         view = View(modes[0].e_m, modes[0].n_m, rot_from_quat(prediction.q_w_c), agl_m, ground_m, 0.0, 0.0, 0.0)
         result = pose_match(result, self._fix(shot, good, view), view)

@@ -38,7 +38,7 @@ class _Keyframe:
     tracked: np.ndarray  # (N,) bool
     off_px: np.ndarray  # (N, 2): accumulated realignment error of a corner
     before_px: np.ndarray  # (N, 2), in the keyframe before; nan: not tracked there
-    before_id: int
+    previous_keyframe_id: int
     age: int = 0
 
 
@@ -101,14 +101,14 @@ class SimulatedOdometry:
             frame_id=frame_id,
             keyframe_id=keyframe.frame_id,
             verdict=Verdict.ACCEPTED,
-            pairs=[(float(p), float(q), float(r), float(s)) for p, q, r, s in pairs],
+            two_view=[(float(p), float(q), float(r), float(s)) for p, q, r, s in pairs],
             sigma_norm=real.SIGMA_PX / self._camera.fx / float(np.sqrt(len(a) / tracked)),
             inliers=len(a),
             tracked=tracked,
             becomes_keyframe=due,
-            before_id=keyframe.before_id if len(triples) else -1,
-            triples=[(float(p), float(q), float(r), float(s), float(t), float(u)) for p, q, r, s, t, u in triples],
-            triples_sigma_norm=real.ALIGNED_SIGMA_PX / self._camera.fx,
+            previous_keyframe_id=keyframe.previous_keyframe_id if len(triples) else -1,
+            three_view=[(float(p), float(q), float(r), float(s), float(t), float(u)) for p, q, r, s, t, u in triples],
+            three_view_sigma_norm=real.ALIGNED_SIGMA_PX / self._camera.fx,
         )
 
     def _next_keyframe(self, keyframe: _Keyframe, frame_id: int, shot: Shot) -> tuple[_Keyframe, np.ndarray]:

@@ -83,7 +83,8 @@ def link(view: FlightView) -> str:
     parts.append(f'<div class="scroll">{strips(bands, end, "Link and processes over time")}</div>')
     if stats is not None:
         parts.append(_intervals(view, end))
-        reasons = Counter(NUMBER.sub("…", g.reason) for _, g in view.gps if g.fix_type < FIX_3D and g.reason)
+        given = [g.no_fix_reason for _, g in view.gps if g.fix_type < FIX_3D and g.no_fix_reason]
+        reasons = Counter(NUMBER.sub("…", reason) for reason in given)
         rows = [
             ("messages", f"{stats.count}"),
             ("rate", f"{stats.rate_hz:.2f} Hz"),

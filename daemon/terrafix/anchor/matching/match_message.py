@@ -10,7 +10,7 @@ from terrafix.anchor.matching.frame_matcher import Fix, View
 from terrafix.anchor.matching.point_mass_filter import Mode
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pose import tangent_to_world
-from terrafix.messages import MapMatch, Verdict
+from terrafix.messages import MapMatch, MapPose, Verdict
 
 # 1-sigma of the attitude of a position-only match: large enough that the match does not constrain attitude [tuned]
 COARSE_TILT_RAD = np.radians(10.0)
@@ -53,25 +53,28 @@ def mode_match(match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tu
     return msgspec.structs.replace(
         match,
         verdict=Verdict.ACCEPTED,
-        coarse=True,
-        p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + agl_m),
-        q_w_c=quat_from_rot(view.r_w_c),
-        cov=tuple(float(v) for v in cov.ravel()),
+        pose=MapPose(
+            p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + agl_m),
+            q_w_c=quat_from_rot(view.r_w_c),
+            cov=tuple(float(v) for v in cov.ravel()),
+            position_only=True,
+        ),
     )
 
 
 def pose_match(match: MapMatch, fix: Fix | None, view: View) -> MapMatch:
     """Copies the pose of a fix, its inlier matches (normalised image coordinates, map points in metres, weights),
-    covariance and verdict into ``match``. ``match`` holds the mode at which the fix was computed; a pose that is more
-    than ``MAX_MODE_DRIFT`` heights away from it is DEGENERATE."""
+    covariance and verdict into ``match``. ``match.place`` is the place at which the fix was computed; a pose
+    that is more than ``MAX_MODE_DRIFT`` heights away from it is DEGENERATE."""
     if fix is None:
         return msgspec.structs.replace(match, verdict=Verdict.DEGENERATE)
     pnp = fix.pnp
     verdict = pnp.verdict
     if pnp.fit is None:
         return msgspec.structs.replace(match, verdict=verdict, inliers=int(pnp.inliers.sum()))
+    assert match.place is not None
     p = pnp.fit.p_c_in_w_m
-    drift = np.array([p[0] - match.mode_e_m, p[1] - match.mode_n_m])
+    drift = np.array([p[0] - match.place.e_m, p[1] - match.place.n_m])
     if float(np.hypot(*drift)) > MAX_MODE_DRIFT * view.agl_m:
         verdict = Verdict.DEGENERATE
     matches = np.column_stack([fix.xy, fix.points_w_m, fix.weights])[pnp.inliers]
@@ -80,9 +83,11 @@ def pose_match(match: MapMatch, fix: Fix | None, view: View) -> MapMatch:
         match,
         verdict=verdict,
         matches=[(float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in matches],
-        p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-        q_w_c=quat_from_rot(pnp.fit.r_w_c),
-        cov=tuple(float(v) for v in cov.ravel()),
+        pose=MapPose(
+            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
+            q_w_c=quat_from_rot(pnp.fit.r_w_c),
+            cov=tuple(float(v) for v in cov.ravel()),
+        ),
         inliers=int(pnp.inliers.sum()),
         reprojection_px=float(np.sqrt(np.mean(pnp.fit.residuals**2))) * view.agl_m / fix.cell_m,
     )
@@ -96,11 +101,11 @@ def ground_cov_m2(cov: Sequence[float], agl_m: float) -> np.ndarray:
     return np.asarray(jacobian @ np.reshape(cov, (6, 6)) @ jacobian.T)
 
 
-def ground_sigma_m(match: MapMatch, agl_m: float) -> float:
+def ground_sigma_m(pose: MapPose | None, agl_m: float) -> float:
     """1-sigma in metres of that ground point along the worst direction; infinity without a pose."""
-    if match.cov is None:
+    if pose is None:
         return float(np.inf)
-    return float(np.sqrt(np.linalg.eigvalsh(ground_cov_m2(match.cov, agl_m))[-1]))
+    return float(np.sqrt(np.linalg.eigvalsh(ground_cov_m2(pose.cov, agl_m))[-1]))
 
 
 def relocalized_match(match: MapMatch, fix: Fix, view: View, innovation_m: tuple[float, float]) -> MapMatch:
@@ -111,9 +116,11 @@ def relocalized_match(match: MapMatch, fix: Fix, view: View, innovation_m: tuple
     patches of the next frame agree under another one. ``RELOCALIZED_SIGMA`` is added for the common error of the
     patches.
     """
-    match = pose_match(msgspec.structs.replace(match, found=True), fix, view)
-    if match.cov is None:
+    search = msgspec.structs.replace(match.search, relocalized=True)
+    match = pose_match(msgspec.structs.replace(match, search=search), fix, view)
+    if match.pose is None:
         return match
-    cov = np.array(match.cov).reshape(6, 6)
+    cov = np.array(match.pose.cov).reshape(6, 6)
     cov[:2, :2] += (RELOCALIZED_SIGMA * view.agl_m) ** 2 * np.eye(2) + np.outer(innovation_m, innovation_m)
-    return msgspec.structs.replace(match, cov=tuple(float(v) for v in cov.ravel()))
+    pose = msgspec.structs.replace(match.pose, cov=tuple(float(v) for v in cov.ravel()))
+    return msgspec.structs.replace(match, pose=pose)

@@ -15,7 +15,16 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget
 from terrafix.map.package import LocalMap
-from terrafix.messages import HintVerdict, MapMatch, Origin, PositionHint, Prediction, Verdict
+from terrafix.messages import (
+    HintVerdict,
+    MapMatch,
+    MatchPlace,
+    Origin,
+    PositionHint,
+    Prediction,
+    SearchResult,
+    Verdict,
+)
 
 LOST_SIGMA_M = 1000.0  # smallest 1-sigma of an unknown position, metres; larger on a larger map [tuned]
 MAX_HEIGHT_RATIO = 1.5  # ratio of heights beyond which a search is restarted [tuned]
@@ -85,20 +94,18 @@ class Relocalizer:
             match,
             verdict=Verdict.LOST,
             matches=[],
-            p_c_in_w_m=None,
-            q_w_c=None,
-            cov=None,
+            pose=None,
             inliers=0,
-            found=False,
-            step=match.step if self._search is None else self._search.step,
-            lost_sigma_m=self.sigma_m,
+            search=SearchResult(
+                step=match.search.step if self._search is None else self._search.step, sigma_m=self.sigma_m
+            ),
         )
 
     def process_frame(
         self, no_match: MapMatch, prediction: Prediction, image: Image | None, best: MapLayer, ground_m: float
     ) -> MapMatch:
-        """Processes one frame of the search. Verdict ACCEPTED with ``found`` set and the place as the mode when a place
-        is accepted, else LOST. ``image`` None: no usable frame."""
+        """Processes one frame of the search. Verdict ACCEPTED with ``relocalized`` and ``place`` when a place is
+        accepted, else LOST. ``image`` None: no usable frame."""
         assert self._search is not None
         if not 1 / MAX_HEIGHT_RATIO < prediction.agl_m / self._search.agl_m < MAX_HEIGHT_RATIO:
             self.start(best, prediction.agl_m, None)
@@ -109,16 +116,15 @@ class Relocalizer:
         if place is None:
             return self.search_match(no_match)
         e_m, n_m = place.track.e_m, place.track.n_m
-        ground, relief_m = ground_plane(best.map, e_m, n_m, view.agl_m)
-        match = msgspec.structs.replace(
-            no_match, mode_e_m=e_m, mode_n_m=n_m, mode_mass=1.0, ground=ground, relief_m=relief_m
-        )
+        ground = ground_plane(best.map, e_m, n_m, view.agl_m)
+        match = msgspec.structs.replace(no_match, place=MatchPlace(e_m=e_m, n_m=n_m, mass=1.0), ground=ground)
         match = relocalized_match(match, place.fix, view, place.track.innovation_m)
         if match.verdict is not Verdict.ACCEPTED:
             return self.search_match(no_match)
         self._probation = Probation(self._search.tracker, best.null_at(prediction.agl_m).frame, prediction.agl_m)
         self._search, self.sigma_m = None, mixed_sigma_m(self._probation.wrong_probability, best.map)
-        return msgspec.structs.replace(match, lost_sigma_m=self.sigma_m)
+        search = msgspec.structs.replace(match.search, sigma_m=self.sigma_m)
+        return msgspec.structs.replace(match, search=search)
 
     def apply_prior(
         self, hint: PositionHint, origin: Origin, prediction: Prediction, best: MapLayer, log_odds: float

@@ -19,7 +19,7 @@ class InnovationRun:
     _first_m: np.ndarray = field(default_factory=lambda: np.zeros(2))  # estimate at the first fix of the run
     _span_m: float = 0.0  # from there to the estimate at the last fix
 
-    def add(self, offset_m: np.ndarray, p_m: np.ndarray, *, coarse: bool) -> bool:
+    def add(self, offset_m: np.ndarray, p_m: np.ndarray, *, position_only: bool) -> bool:
         """Adds a fix, with the estimate at ``p_m`` (2,). -> whether it agrees with the run. If not, the run is cleared
         and the fix begins a new one."""
         if self.offsets_m and float(np.hypot(*(offset_m - np.mean(self.offsets_m, axis=0)))) > CONSISTENT_M:
@@ -28,7 +28,7 @@ class InnovationRun:
         if not agrees:
             self._first_m = p_m
         self.offsets_m.append(offset_m)
-        self.poses += not coarse
+        self.poses += not position_only
         self._span_m = float(np.hypot(*(p_m - self._first_m)))
         return agrees
 

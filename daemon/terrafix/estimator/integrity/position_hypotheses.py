@@ -11,7 +11,7 @@ from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.other_place import OtherPlace
-from terrafix.messages import MapMatch, Origin, Verdict
+from terrafix.messages import BeliefSummary, Origin, SearchResult, Verdict
 
 # Share of the height above ground. With a smaller 1-sigma, map poses have placed the graph. A mode of the belief
 # elsewhere then widens the published covariance and does not move the position; that takes a pose. [tuned]
@@ -60,12 +60,12 @@ class PositionHypotheses:
         multimodal = bool(self._modes) or self._belief is not None or self.other.probability > 0.0
         return multimodal or self.map_consistency.variance_m2 > 0.0
 
-    def on_match(self, match: MapMatch) -> str:
+    def on_match(self, verdict: Verdict, search: SearchResult) -> str:
         """-> detail of the verdict on a match that is LOST; empty for any other."""
-        self.anywhere_m = match.lost_sigma_m
-        return f"lost; search: {match.step.value}" if match.verdict is Verdict.LOST else ""
+        self.anywhere_m = search.sigma_m
+        return f"lost; search: {search.step.value}" if verdict is Verdict.LOST else ""
 
-    def update_modes(self, match: MapMatch, p_m: np.ndarray, cov: np.ndarray, agl_m: float) -> None:
+    def update_modes(self, belief: BeliefSummary, p_m: np.ndarray, cov: np.ndarray, agl_m: float) -> None:
         """Compares the anchor's belief with the estimate of the same frame: ``p_m`` (3,), ``cov`` (6, 6), world axes.
 
         Where poses have placed the graph, a mode inside the gate is the estimate's own position and is left out.
@@ -73,16 +73,16 @@ class PositionHypotheses:
         lever_m2 = agl_m**2 * np.diag([cov[4, 4], cov[3, 3]])  # of a position on the ground, by tilt
         placed = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1])) < PLACED_SIGMA_HEIGHTS * agl_m
         modes, self._estimate_cov_m2 = [], cov[:2, :2].copy()
-        for e_m, n_m, mass, var_m2 in match.modes:
-            cov_m2 = (var_m2 + (MODE_SIGMA_HEIGHTS * agl_m) ** 2) * np.eye(2) + lever_m2
-            mode = Component(np.array([e_m, n_m]) - p_m[:2], cov_m2, mass)
+        for seen in belief.modes:
+            cov_m2 = (seen.variance_m2 + (MODE_SIGMA_HEIGHTS * agl_m) ** 2) * np.eye(2) + lever_m2
+            mode = Component(np.array([seen.e_m, seen.n_m]) - p_m[:2], cov_m2, seen.mass)
             innovation_m2 = cov[:2, :2] + lever_m2 + cov_m2
             own = placed and float(mode.offset_m @ np.linalg.solve(innovation_m2, mode.offset_m)) <= GATE[2]
-            if mass >= MIN_COMPONENT_WEIGHT and not own:
+            if seen.mass >= MIN_COMPONENT_WEIGHT and not own:
                 modes.append(mode)
         self._modes = tuple(sorted(modes, key=lambda mode: -mode.weight))
-        belief_m2 = np.array(match.belief_cov_m2).reshape(2, 2) + lever_m2
-        self._belief = None if placed else Component(np.array(match.belief_m) - p_m[:2], belief_m2, 1.0)
+        belief_m2 = np.array(belief.cov_m2).reshape(2, 2) + lever_m2
+        self._belief = None if placed else Component(np.array(belief.mean_m) - p_m[:2], belief_m2, 1.0)
 
     def on_match_accepted(self) -> None:
         """A map match agreed with the estimate."""

@@ -15,7 +15,7 @@ from terrafix.estimator.filter_state import FilterState
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.state import TRANSLATION
-from terrafix.messages import MapMatch
+from terrafix.messages import MapMatch, MapPose
 
 LOCAL_WARP = 0.33  # of the map's error: how orthophotos are stretched within one footprint [tuned]
 ROOFS = 0.03  # of the height, 1-sigma: roofs and trees raise the ground that is seen, and the height with it [tuned]
@@ -24,25 +24,26 @@ ROOFS = 0.03  # of the height, 1-sigma: roofs and trees raise the ground that is
 @dataclass(frozen=True)
 class MapPoseMeasurement:
     """The pose of one map match: as it was seen, and with the lens as it is estimated now; each with its covariance
-    (6, 6), tangent order. ``by_lens`` (6,): change of the pose by the radial coefficient, which was ``lens`` when it
-    was seen; None for a coarse match. ``information_share``: of the match that no other match has given."""
+    (6, 6), tangent order. ``by_k1`` (6,): change of the pose by the radial coefficient, which was ``radial_k1`` when
+    it was seen; None without 2D-3D matches. ``information_share``: of the match that no other match has given."""
 
     seen: gtsam.Pose3
     seen_cov: np.ndarray
     pose: gtsam.Pose3
     cov: np.ndarray
-    by_lens: np.ndarray | None
-    lens: float
+    by_k1: np.ndarray | None
+    radial_k1: float
     information_share: float = 1.0
     name: str = "map"
 
     @classmethod
-    def of(cls, match: MapMatch, terrain: Terrain, lens_estimate: tuple[float, float]) -> "MapPoseMeasurement":
-        """Of a match that is ``determined``. ``lens_estimate``: radial coefficient and its 1-sigma."""
-        seen, seen_cov = measured_pose(match, terrain)
-        by_lens, (distortion, sigma) = moved_by_lens(match), lens_estimate
-        pose, cov = undistorted_pose(seen, seen_cov, by_lens, distortion - match.lens, sigma)
-        return cls(seen, seen_cov, pose, cov, by_lens, match.lens)
+    def of(cls, match: MapMatch, terrain: Terrain, radial_k1_estimate: tuple[float, float]) -> "MapPoseMeasurement":
+        """Of a match that is ``determined``. ``radial_k1_estimate``: radial coefficient and its 1-sigma."""
+        assert match.pose is not None
+        seen, seen_cov = measured_pose(match.pose, match.map_sigma_m, terrain)
+        by_k1, (radial_k1, sigma) = moved_by_k1(match), radial_k1_estimate
+        pose, cov = undistorted_pose(seen, seen_cov, by_k1, radial_k1 - match.radial_k1, sigma)
+        return cls(seen, seen_cov, pose, cov, by_k1, match.radial_k1)
 
     @property
     def position_m(self) -> np.ndarray:
@@ -63,52 +64,52 @@ class MapPoseMeasurement:
 
     def add_to(self, state: FilterState, node: int) -> None:
         cov = self.seen_cov / self.information_share
-        if self.by_lens is None:
+        if self.by_k1 is None:
             state.graph.add(gtsam.PriorFactorPose3(C(node), self.seen, robust_noise(cov)))
         else:
-            state.graph.add(map_pose_factor(C(node), B(node), self.seen, cov, self.by_lens, self.lens))
+            state.graph.add(map_pose_factor(C(node), B(node), self.seen, cov, self.by_k1, self.radial_k1))
 
 
-def measured_pose(match: MapMatch, terrain: Terrain) -> tuple[gtsam.Pose3, np.ndarray]:
+def measured_pose(pose: MapPose, map_sigma_m: float, terrain: Terrain) -> tuple[gtsam.Pose3, np.ndarray]:
     """Of a match that is ``determined``: pose and covariance (6, 6), tangent order.
 
     A slope that the map does not have looks like a tilt of the camera about the ground below it: it rotates the pose
     and moves it by the height times as much."""
-    assert match.p_c_in_w_m is not None and match.q_w_c is not None
-    r_w_c = rot_from_quat(match.q_w_c)
-    local_m, height_m = LOCAL_WARP * match.map_sigma_m, max(match.p_c_in_w_m[2] - terrain.ground_m, 1.0)
+    r_w_c = rot_from_quat(pose.q_w_c)
+    local_m, height_m = LOCAL_WARP * map_sigma_m, max(pose.p_c_in_w_m[2] - terrain.ground_m, 1.0)
     about_north, about_east = np.zeros(6), np.zeros(6)
     about_north[[0, 4]], about_east[[1, 3]] = (height_m, 1.0), (-height_m, 1.0)
     slope = terrain.slope_sigma(height_m) ** 2 * (np.outer(about_north, about_north) + np.outer(about_east, about_east))
-    cov = world_to_tangent(np.array(match.cov).reshape(6, 6) + slope, r_w_c)
+    cov = world_to_tangent(np.array(pose.cov).reshape(6, 6) + slope, r_w_c)
     cov[TRANSLATION, TRANSLATION] += r_w_c.T @ np.diag([local_m, local_m, ROOFS * height_m]) ** 2 @ r_w_c
-    return gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array(match.p_c_in_w_m)), cov
+    return gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), np.array(pose.p_c_in_w_m)), cov
 
 
-def moved_by_lens(match: MapMatch) -> np.ndarray | None:
+def moved_by_k1(match: MapMatch) -> np.ndarray | None:
     """(6,) tangent order: change of the pose of a match that is ``determined`` by one unit of the radial coefficient of
     the lens. For points around the principal point that is height; for points to one side it is tilt and position.
-    None: a coarse match, which has no points."""
+    None: there are no points."""
     if not match.matches:
         return None
-    assert match.p_c_in_w_m is not None and match.q_w_c is not None
+    assert match.pose is not None
     points = np.array(match.matches)
     xy = points[:, :2]
-    _, jacobian, _ = project_with_jacobian(rot_from_quat(match.q_w_c), np.array(match.p_c_in_w_m), points[:, 2:5])
+    r_w_c, p_m = rot_from_quat(match.pose.q_w_c), np.array(match.pose.p_c_in_w_m)
+    _, jacobian, _ = project_with_jacobian(r_w_c, p_m, points[:, 2:5])
     by_pose = jacobian.reshape(-1, 6)
-    by_lens = -(np.sum(np.square(xy), axis=1, keepdims=True) * xy).ravel()  # change of a ray by the coefficient
+    by_k1 = -(np.sum(np.square(xy), axis=1, keepdims=True) * xy).ravel()  # change of a ray by the coefficient
     weighted = by_pose.T * np.repeat(points[:, 5], 2)
-    return np.asarray(np.linalg.solve(weighted @ by_pose, weighted @ by_lens))
+    return np.asarray(np.linalg.solve(weighted @ by_pose, weighted @ by_k1))
 
 
 def undistorted_pose(
-    seen: gtsam.Pose3, cov: np.ndarray, by_lens: np.ndarray | None, more: float, sigma: float
+    seen: gtsam.Pose3, cov: np.ndarray, by_k1: np.ndarray | None, more: float, sigma: float
 ) -> tuple[gtsam.Pose3, np.ndarray]:
     """Pose and covariance of a match, had the radial coefficient been larger by ``more``, known to ``sigma``.
-    ``by_lens``: ``moved_by_lens`` of the match."""
-    if by_lens is None:
+    ``by_k1``: ``moved_by_k1`` of the match."""
+    if by_k1 is None:
         return seen, cov
-    return seen.retract(by_lens * more), cov + sigma**2 * np.outer(by_lens, by_lens)
+    return seen.retract(by_k1 * more), cov + sigma**2 * np.outer(by_k1, by_k1)
 
 
 def determined(match: MapMatch) -> bool:
@@ -116,10 +117,10 @@ def determined(match: MapMatch) -> bool:
     freedom.
 
     The anchor checks this too; a graph that fused such a pose would be overconfident for good."""
-    if match.p_c_in_w_m is None or match.q_w_c is None or match.cov is None:
+    if match.pose is None:
         return False
-    p_m, q = np.array(match.p_c_in_w_m), np.array(match.q_w_c)
-    cov = np.array(match.cov, dtype=float)
+    p_m, q = np.array(match.pose.p_c_in_w_m), np.array(match.pose.q_w_c)
+    cov = np.array(match.pose.cov, dtype=float)
     if not (cov.shape == (36,) and np.isfinite(p_m).all() and np.isfinite(q).all() and np.isfinite(cov).all()):
         return False
     if abs(float(np.linalg.norm(q)) - 1.0) > 1e-3 or float(np.linalg.eigvalsh(cov.reshape(6, 6))[0]) <= 0.0:

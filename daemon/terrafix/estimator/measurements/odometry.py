@@ -136,8 +136,8 @@ class OdometryMeasurement:
         """The constraint of points that the keyframe before, the keyframe and the frame saw, and the node of the
         first; None: there are too few."""
         state = self._state
-        first = state.node_of.get(odometry.before_id)
-        if not odometry.triples or first is None or not state.graph.holds(first):
+        first = state.node_of.get(odometry.previous_keyframe_id)
+        if not odometry.three_view or first is None or not state.graph.holds(first):
             return None
         before, middle = state.graph.state(first), state.graph.state(seen.parent)
         ground_m = state.terrain.elevation_m(middle.pose.translation())
@@ -150,7 +150,7 @@ class OdometryMeasurement:
             ground_m,
             float(middle.bias[RADIAL_K1]),
         )
-        triples, sigma_norm = np.array(odometry.triples), odometry.triples_sigma_norm
+        triples, sigma_norm = np.array(odometry.three_view), odometry.three_view_sigma_norm
         constraint = three_view_constraint(triples, sigma_norm, guess, state.origin.camera.focal_sigma)
         if constraint is None:
             return None
@@ -174,7 +174,7 @@ class OdometryMeasurement:
 
     def _relative_motion(self, odometry: Odometry, frame: FrameInput) -> KeyframeMotion | Verdict:
         """Motion since the keyframe; or why there is none."""
-        if odometry.verdict is not Verdict.ACCEPTED or not odometry.pairs:
+        if odometry.verdict is not Verdict.ACCEPTED or not odometry.two_view:
             return Verdict.FEW_INLIERS if odometry.verdict is Verdict.ACCEPTED else odometry.verdict
         state = self._state
         parent = state.node_of.get(odometry.keyframe_id)
@@ -195,8 +195,8 @@ class OdometryMeasurement:
         onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - state.graph.time_of(state.graph.newest))
         way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
         ground = replace(ground, rise_sigma_m=state.terrain.rise_sigma_m(way_m))
-        pairs, lens = np.array(odometry.pairs), float(newest.bias[RADIAL_K1])
-        motion = relative_pose(pairs, odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground, lens)
+        pairs, radial_k1 = np.array(odometry.two_view), float(newest.bias[RADIAL_K1])
+        motion = relative_pose(pairs, odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground, radial_k1)
         if motion is None:
             return Verdict.FEW_INLIERS
         dt_s = max(odometry.t_ns * 1e-9 - state.graph.time_of(parent), 1e-3)

@@ -5,7 +5,7 @@ import numpy as np
 from terrafix.estimator.models.plane_motion import Ground
 from terrafix.estimator.models.terrain_roughness import TerrainRoughness
 from terrafix.estimator.state import HORIZONTAL
-from terrafix.messages import MapMatch
+from terrafix.messages import GroundPlane
 
 # 1-sigma of slope and of level (share of the height) of the visible ground: fields and towns without a DEM; with a DEM,
 # what houses and trees leave. [tuned]
@@ -28,11 +28,12 @@ class Terrain:
         self._slope: tuple[float, float] | None = None  # towards east and north; None: no DEM
         self.roughness = TerrainRoughness()
 
-    def update(self, match: MapMatch, at_m: np.ndarray | None) -> None:
-        """``at_m`` (east, north, ...): camera of the match; None: its node has left the graph."""
-        if match.ground is None:
+    def update(self, ground: GroundPlane | None, at_m: np.ndarray | None) -> None:
+        """``ground``: of a map match; None: no DEM. ``at_m`` (east, north, ...): camera of the match; None: its node
+        has left the graph."""
+        if ground is None:
             return
-        self.ground_m, self._slope, self._relief_m = match.ground[0], match.ground[1:], match.relief_m
+        self.ground_m, self._slope, self._relief_m = ground.amsl_m, (ground.slope_e, ground.slope_n), ground.relief_m
         if at_m is not None:
             self._at_m = at_m[HORIZONTAL]
 

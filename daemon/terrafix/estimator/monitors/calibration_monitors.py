@@ -73,7 +73,7 @@ class Monitors:
             return
         self._textured = odometry.frame_id
         before, now = telemetry.at(keyframe_ns), telemetry.at(odometry.t_ns)
-        pairs = np.array(odometry.pairs)
+        pairs = np.array(odometry.two_view)
         motion = visual_motion(pairs, before, now, self._r_b_c)
         if motion is None:
             return
@@ -103,22 +103,22 @@ class Monitors:
     def on_map_match(self, match: MapMatch, telemetry: Telemetry, *, accepted: bool) -> None:
         """``accepted``: the match has entered the graph. Rejected poses are used as well, because one whose height is
         off is rarely accepted."""
-        pose = match.verdict is Verdict.ACCEPTED and not match.coarse
+        pose = match.verdict is Verdict.ACCEPTED and not match.position_only
         found = accepted and pose
         # A coarse fix in the graph counts neither as found nor as nothing found. 15 % of the correlations of correct
         # flights give one, and 3 of 900 with a wrong mount, heading, focal length or map: too rare to be measured.
         nothing = not accepted and match.frame_id == self._textured and match.verdict not in NOT_CORRELATED
         if found or nothing:
             self._registration.add_attempt(found=found)
-        if not pose or match.p_c_in_w_m is None or match.q_w_c is None:
+        if not pose or match.pose is None:
             return
         reported = telemetry.at(match.t_ns)
         if reported.yaw_rad is not None:
-            observed_rad = yaw_of(rot_from_quat(match.q_w_c) @ self._r_b_c.T)
+            observed_rad = yaw_of(rot_from_quat(match.pose.q_w_c) @ self._r_b_c.T)
             self._heading.add(math.remainder(reported.yaw_rad - observed_rad, math.tau))
         if reported.agl_m is not None and match.ground is not None and self._origin.ground_amsl_m is not None:
-            reported_m = self._origin.ground_amsl_m + reported.agl_m - match.ground[0]
-            observed_m = match.p_c_in_w_m[2] - match.ground[0]
+            reported_m = self._origin.ground_amsl_m + reported.agl_m - match.ground.amsl_m
+            observed_m = match.pose.p_c_in_w_m[2] - match.ground.amsl_m
             if self._height is None:
                 sigma = math.hypot(
                     self._origin.camera.focal_sigma, HEIGHT_SIGMA_SHARE, self._origin.agl_sigma_m / observed_m
@@ -147,18 +147,22 @@ class Monitors:
         found: dict[str, Finding] = {}
         if (hypothesis := self._inertial.fault) is not None:
             found[hypothesis.quantity] = Finding(
-                hypothesis.factor, "velocity changes of pictures against accelerometers"
+                hypothesis.factor, "velocity changes by the images differ from those by the accelerometers"
             )
         if self._turns.mirrored:
-            found["mirrored picture"] = Finding(None, "pictures turn the other way than the attitude")
+            found["mirrored picture"] = Finding(None, "the images rotate opposite to the reported attitude")
         if self._levelling.fault:
-            found["attitude"] = Finding(None, f"{self._levelling.fault}: pictures that it levels jump")
+            found["attitude"] = Finding(None, f"{self._levelling.fault}: images that are levelled by it do not agree")
         if self._height is not None and self._height.active:
-            found["scale"] = Finding(math.exp(self._height.mean), "told heights against poses on the map")
+            found["scale"] = Finding(
+                math.exp(self._height.mean), "reported heights differ from the heights of map matches"
+            )
         if self._heading.active:
-            found["heading"] = Finding(math.degrees(self._heading.mean), "told headings against poses on the map")
+            found["heading"] = Finding(
+                math.degrees(self._heading.mean), "reported headings differ from the headings of map matches"
+            )
         if self._registration.active:
-            found["registration"] = Finding(None, "the map is found nowhere, over textured ground")
+            found["registration"] = Finding(None, "no map match is accepted, over textured ground")
         return found
 
     @staticmethod

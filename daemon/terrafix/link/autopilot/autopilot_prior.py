@@ -27,7 +27,7 @@ class AutopilotPrior:
     def on_gps_input(self, gps: GpsInput) -> None:
         """The reason STARTED_IN_FLIGHT means that there is an estimate from the start coordinate alone: vision,
         estimator and anchor are running."""
-        self._started_in_flight = gps.reason == STARTED_IN_FLIGHT.text
+        self._started_in_flight = gps.no_fix_reason == STARTED_IN_FLIGHT.text
 
     def on_message(self, message: Any, now_ns: int) -> PositionHint | None:
         """-> a hint from GLOBAL_POSITION_INT if one is due and the vehicle is high enough for the map search."""

@@ -20,7 +20,7 @@ from terrafix.link.gnss.spoofing_detector import (
 from terrafix.link.ground_station.prior_request import UNKNOWN_POSITION_SIGMA_M
 from terrafix.link.integrity.output_predictor import distance_m
 from terrafix.link.pilot_text.statustext import INFO, WARNING, statustext
-from terrafix.messages import GnssReading, GnssStart, Message, Origin, Start, StatusText, Verdict
+from terrafix.messages import GnssInitialPosition, GnssReading, InitialPosition, Message, Origin, StatusText, Verdict
 
 MAX_CLAIMED_SIGMA_M = 10.0  # m, 1-sigma; twice what ArduPilot requires before a copter is armed [tuned]
 STATIONARY_NS = 5_000_000_000  # ns at one position before it is used [tuned]
@@ -94,7 +94,7 @@ class _ReceiverTrack:
 
 
 class GnssInitializer:
-    """``on_reading`` yields GnssStart (the initial position), ``on_start`` the pilot's text about its acceptance."""
+    """``on_reading`` yields the GnssInitialPosition, ``on_answer`` the pilot's text about its acceptance."""
 
     def __init__(self, *, enabled: bool) -> None:
         self._enabled = enabled
@@ -105,9 +105,9 @@ class GnssInitializer:
         self._tracks: dict[int, _ReceiverTrack] = {}
         self._initial: tuple[int, _Fix] | None = None  # receiver and fix that are published as initial position
         self._moved_readings = 0  # readings in a row that differ from it
-        self._published: GnssStart | None = None
+        self._published: GnssInitialPosition | None = None
         self._published_ns = 0
-        self._answered_ns = 0  # t_ns of the newest Start
+        self._answered_ns = 0  # t_ns of the newest InitialPosition
 
     def on_origin(self, origin: Origin) -> None:
         self._start_unknown = origin.start_sigma_m > UNKNOWN_POSITION_SIGMA_M
@@ -131,16 +131,16 @@ class GnssInitializer:
             self._published_ns = now_ns
             yield self._published
 
-    def on_start(self, start: Start) -> StatusText | None:
-        """``start``: the anchor's answer to a GnssStart."""
-        if start.t_ns == self._answered_ns:
+    def on_answer(self, initial: InitialPosition) -> StatusText | None:
+        """``initial``: the anchor's answer to a GnssInitialPosition."""
+        if initial.t_ns == self._answered_ns:
             return None
-        self._answered_ns = start.t_ns
-        if start.verdict is not Verdict.ACCEPTED:
-            return statustext(start.t_ns, WARNING, "GPS is not on the map: no start")
-        if start.lat_deg is None:
+        self._answered_ns = initial.t_ns
+        if initial.verdict is not Verdict.ACCEPTED:
+            return statustext(initial.t_ns, WARNING, "GPS is not on the map: no start")
+        if initial.lat_deg is None:
             return None  # the text with the reason was sent with the withdrawal
-        return statustext(start.t_ns, INFO, f"start from GNSS, {start.sigma_m:.0f} m")
+        return statustext(initial.t_ns, INFO, f"start from GNSS, {initial.sigma_m:.0f} m")
 
     def _evaluate(self, now_ns: int, number: int) -> Iterator[Message]:
         """After a reading of receiver ``number``: publishes, replaces or withdraws the initial position."""
@@ -177,10 +177,10 @@ class GnssInitializer:
         self._moved_readings = self._moved_readings + 1 if moved else 0
         return self._moved_readings >= MOVED_READINGS
 
-    def _publish(self, now_ns: int, number: int, fix: _Fix | None) -> GnssStart:
+    def _publish(self, now_ns: int, number: int, fix: _Fix | None) -> GnssInitialPosition:
         """``fix`` None: withdraws the initial position."""
         self._initial, self._moved_readings, self._published_ns = None if fix is None else (number, fix), 0, now_ns
-        self._published = GnssStart(
+        self._published = GnssInitialPosition(
             # t_ns identifies a message, so it must differ from that of the one before.
             t_ns=now_ns if self._published is None else max(now_ns, self._published.t_ns + 1),
             lat_deg=None if fix is None else fix.lat_deg,

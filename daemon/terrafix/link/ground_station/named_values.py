@@ -28,7 +28,7 @@ class NamedValues:
             "TFX_FIX": float(gps.fix_type),
             "TFX_ACC_M": gps.horiz_accuracy_m if has_fix else math.nan,
             "TFX_MAP_S": math.nan if gps.unanchored_s is None else gps.unanchored_s,  # since the last map fix
-            "TFX_CAUT": float(gps.caution),  # degradation level, 0 to 3
+            "TFX_CAUT": float(gps.degradation),  # degradation level, 0 to 3
         }
         for name, value in values.items():
             boot_ms = gps.t_ns // 1_000_000 % 2**32

@@ -51,7 +51,7 @@ def with_fix(
         vert_accuracy_m=fix_type.clamp_accuracy_m(accuracy[1]),
         satellites_visible=SATELLITES_VISIBLE,
         estimate_age_ms=predicted.age_s * 1e3,
-        caution=degradation.level,
+        degradation=degradation.level,
         unanchored_s=degradation.unanchored_s,
         map_offset_m=map_offset_m,
         resets=resets,
@@ -88,7 +88,7 @@ def no_fix(
         vert_accuracy_m=fix_type.MAX_ACCURACY_M,
         satellites_visible=0,
         estimate_age_ms=age_ms,
-        caution=degradation.level,
+        degradation=degradation.level,
         unanchored_s=degradation.unanchored_s,
-        reason=reason,
+        no_fix_reason=reason,
     )

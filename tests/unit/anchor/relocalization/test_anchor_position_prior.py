@@ -125,7 +125,7 @@ def test_a_prior_against_an_unconfirmed_start_starts_a_search_there(
     node._localizer._lock_monitor.log_odds = START_LOG_ODDS - 1.0
     list(node.on(hint_at(1500.0, 0.0, 500.0)))
     match, verdict, state = messages_after(node, 1)
-    assert isinstance(match, MapMatch) and match.verdict is Verdict.LOST and match.p_c_in_w_m is None
+    assert isinstance(match, MapMatch) and match.verdict is Verdict.LOST and match.pose is None
     assert isinstance(verdict, HintVerdict) and "searching" in verdict.text
     assert isinstance(state, SearchState) and state.step is SearchStep.WIDEN
     assert around == [(pytest.approx(1500.0, abs=0.5), pytest.approx(0.0, abs=0.5))]

@@ -7,12 +7,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import pose_of
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
 from terrafix.anchor.matching.match_message import relocalized_match
 from terrafix.anchor.relocalization.hypothesis_tracker import LLR_MAX, evidence
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_CELL_PER_AGL, PlaceVerifier, VerifiedPlace
-from terrafix.messages import MapMatch, Verdict
+from terrafix.messages import MapMatch, MatchPlace, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
 
@@ -105,13 +106,11 @@ def test_the_covariance_of_a_relocalized_pose_covers_the_displacement_by_leaning
         image = view(leaning(ground, seed), PINHOLE, rotation(HEADING_DEG), here_m)
         proposed = replace(PROPOSED_VIEW, e_m=float(here_m[0]) + 5.0, n_m=float(here_m[1]) - 4.0, tilt_sigma_rad=0.005)
         fix = verified_place(verifier, image, proposed, FINE_CELL_PER_AGL).fix
-        before = msgspec.structs.replace(empty, mode_e_m=proposed.e_m, mode_n_m=proposed.n_m)
+        before = msgspec.structs.replace(empty, place=MatchPlace(e_m=proposed.e_m, n_m=proposed.n_m, mass=1.0))
         match = relocalized_match(before, fix, proposed, (0.0, 0.0))
-        assert (
-            match.verdict is Verdict.ACCEPTED and match.found and match.p_c_in_w_m is not None and match.cov is not None
-        )
-        off_m = np.array(match.p_c_in_w_m[:2]) - here_m[:2]
-        nees.append(off_m @ np.linalg.solve(np.array(match.cov).reshape(6, 6)[:2, :2], off_m))
+        assert match.verdict is Verdict.ACCEPTED and match.search.relocalized and match.pose is not None
+        off_m = np.array(match.pose.p_c_in_w_m[:2]) - here_m[:2]
+        nees.append(off_m @ np.linalg.solve(np.array(match.pose.cov).reshape(6, 6)[:2, :2], off_m))
     assert np.mean(nees) < 3.3 and max(nees) < 13.8  # 99.9 % of a single one
 
 
@@ -122,13 +121,12 @@ def test_the_innovation_between_frames_is_added_to_the_covariance(verifier: Plac
         frame_id=0,
         verdict=Verdict.LOST,
         matcher="gradient",
-        mode_e_m=PROPOSED_VIEW.e_m,
-        mode_n_m=PROPOSED_VIEW.n_m,
+        place=MatchPlace(e_m=PROPOSED_VIEW.e_m, n_m=PROPOSED_VIEW.n_m, mass=1.0),
     )
     still, jumped = (
-        relocalized_match(before, fix, PROPOSED_VIEW, innovation_m).cov for innovation_m in ((0.0, 0.0), (6.0, -8.0))
+        pose_of(relocalized_match(before, fix, PROPOSED_VIEW, innovation_m)).cov
+        for innovation_m in ((0.0, 0.0), (6.0, -8.0))
     )
-    assert still is not None and jumped is not None
     more = (np.array(jumped) - np.array(still)).reshape(6, 6)
     assert more[:2, :2] == pytest.approx(np.array([[36.0, -48.0], [-48.0, 64.0]]))
     assert not more[2:].any()

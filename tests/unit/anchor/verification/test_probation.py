@@ -177,10 +177,12 @@ def test_a_relocalized_place_reports_the_mixture_sigma_until_it_has_passed(
 ) -> None:
     matches = match_flight(ground, ground, monkeypatch, 6, 18.0)
     source: Any = SingleMapPackage(ground)
-    assert matches[0].found and matches[0].lost_sigma_m == pytest.approx(math.sqrt(0.5) * unknown_sigma_m(source))
-    assert matches[0].lost_sigma_m == mixed_sigma_m(0.5, source)
-    assert [m.lost_sigma_m for m in matches] == sorted((m.lost_sigma_m for m in matches), reverse=True)
-    assert matches[1].lost_sigma_m > 0.0 and matches[-1].lost_sigma_m == 0.0
+    assert matches[0].search.relocalized and matches[0].search.sigma_m == pytest.approx(
+        math.sqrt(0.5) * unknown_sigma_m(source)
+    )
+    assert matches[0].search.sigma_m == mixed_sigma_m(0.5, source)
+    assert [m.search.sigma_m for m in matches] == sorted((m.search.sigma_m for m in matches), reverse=True)
+    assert matches[1].search.sigma_m > 0.0 and matches[-1].search.sigma_m == 0.0
     assert all(m.verdict is not Verdict.LOST for m in matches)
 
 
@@ -192,5 +194,5 @@ def test_a_wrong_relocalization_is_withdrawn_and_the_whole_map_is_searched(
     lost = next(i for i, m in enumerate(matches) if m.verdict is Verdict.LOST)
     source: Any = SingleMapPackage(ground)
     assert lost > 0
-    assert all(m.lost_sigma_m >= 0.2 * unknown_sigma_m(source) for m in matches)  # the reported sigma stays large
-    assert matches[lost].step is SearchStep.WHOLE_MAP and matches[lost].lost_sigma_m == unknown_sigma_m(source)
+    assert all(m.search.sigma_m >= 0.2 * unknown_sigma_m(source) for m in matches)  # the reported sigma stays large
+    assert matches[lost].search.step is SearchStep.WHOLE_MAP and matches[lost].search.sigma_m == unknown_sigma_m(source)

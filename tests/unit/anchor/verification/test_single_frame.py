@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from map_matches import position_of
 from single_map_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, CorrelationResult, FrameMatcher, View
 from terrafix.anchor.matching.point_mass_filter import Belief, Mode
@@ -116,4 +117,4 @@ def test_an_undecided_correlation_is_decided_by_patches_if_the_position_sigma_is
     assert isinstance(match, MapMatch) and match.verdict is verdict
     assert log_probabilities == ([SHARE] if verdict is Verdict.ACCEPTED else [])
     if verdict is Verdict.ACCEPTED:
-        assert match.p_c_in_w_m is not None and np.linalg.norm(np.array(match.p_c_in_w_m) - TRUE_M) < 3.0
+        assert np.linalg.norm(np.array(position_of(match)) - TRUE_M) < 3.0

@@ -9,7 +9,7 @@ def make_run(offsets_m: list[tuple[float, float]], spacing_m: float = 20.0, *, c
     """``coarse``: the first ones of the fixes are coarse."""
     run = InnovationRun()
     for i, offset_m in enumerate(offsets_m):
-        run.add(np.array(offset_m), np.array([spacing_m * i, 0.0]), coarse=i < coarse)
+        run.add(np.array(offset_m), np.array([spacing_m * i, 0.0]), position_only=i < coarse)
     return run
 
 

@@ -4,23 +4,32 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import with_search
 from simulated_flight import FRAME_S, ORIGIN, SPEED_MPS, EstimatorRun, Flight, cov_of, error_m, sigma_m
 from terrafix.core.gate import MIN_COMPONENT_WEIGHT
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
-from terrafix.messages import MapMatch, Message, Refinement, SearchStep, SourceEnded, Verdict
+from terrafix.messages import (
+    BeliefMode,
+    BeliefSummary,
+    MapMatch,
+    Message,
+    Refinement,
+    SearchResult,
+    SearchStep,
+    SourceEnded,
+    Verdict,
+)
 
 WRONG_M = (700.0, -500.0)
 LOST_SIGMA_M = 900.0
 
 
 def lost(match: MapMatch, step: SearchStep = SearchStep.WIDEN) -> MapMatch:
-    return msgspec.structs.replace(
-        match, verdict=Verdict.LOST, step=step, lost_sigma_m=LOST_SIGMA_M, p_c_in_w_m=None, q_w_c=None, cov=None
-    )
+    return with_search(msgspec.structs.replace(match, verdict=Verdict.LOST, pose=None), step=step, sigma_m=LOST_SIGMA_M)
 
 
 def silent(match: MapMatch) -> MapMatch:
-    return msgspec.structs.replace(match, verdict=Verdict.BAD_IMAGE, p_c_in_w_m=None, q_w_c=None, cov=None)
+    return msgspec.structs.replace(match, verdict=Verdict.BAD_IMAGE, pose=None)
 
 
 def with_map(flight: Flight, i: int, match: MapMatch) -> list[Message]:
@@ -54,7 +63,7 @@ def test_a_lost_match_inflates_the_position_covariance_to_the_lost_sigma() -> No
 def test_a_relocalized_match_resets_the_position_at_once() -> None:
     flight = Flight(60, seed=3, dem=True)
     run = flown_wrong(flight)
-    found = msgspec.structs.replace(flight.fix(40, WRONG_M), found=True)
+    found = with_search(flight.fix(40, WRONG_M), relocalized=True)
     run.feed(with_map(flight, 40, found))
     verdict = run.verdicts("map")[40]
     assert verdict.verdict is Verdict.ACCEPTED and "found 8" in verdict.detail
@@ -69,11 +78,11 @@ def test_a_relocalized_match_resets_the_position_at_once() -> None:
 def test_a_relocalized_place_under_verification_keeps_its_lost_sigma_until_that_is_withdrawn() -> None:
     flight = Flight(60, seed=3, dem=True)
     run = flown_wrong(flight)
-    found = msgspec.structs.replace(flight.fix(40, WRONG_M), found=True, lost_sigma_m=700.0)
+    found = with_search(flight.fix(40, WRONG_M), relocalized=True, sigma_m=700.0)
     run.feed(with_map(flight, 40, found))
     assert run.verdicts("map")[40].verdict is Verdict.ACCEPTED
     assert 700.0 <= sigma_m(run.estimate(40)) < 720.0
-    run.feed(with_map(flight, 41, msgspec.structs.replace(flight.fix(41, WRONG_M), lost_sigma_m=200.0)))
+    run.feed(with_map(flight, 41, with_search(flight.fix(41, WRONG_M), sigma_m=200.0)))
     assert 200.0 <= sigma_m(run.estimate(41)) < 220.0
     run.feed(with_map(flight, 42, flight.fix(42, WRONG_M)))
     assert sigma_m(run.estimate(42)) < 15.0
@@ -87,7 +96,7 @@ def test_a_contradiction_of_start_and_map_is_recorded(offset_m: float, start_sig
     run.feed([msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m)])
     for i in range(5):
         run.feed(with_map(flight, i, lost(flight.fix(i))))
-    run.feed(with_map(flight, 5, msgspec.structs.replace(flight.fix(5, (offset_m, 0.0)), found=True)))
+    run.feed(with_map(flight, 5, with_search(flight.fix(5, (offset_m, 0.0)), relocalized=True)))
     verdicts = run.verdicts("start")
     assert list(verdicts) == ([5] if recorded else [])
     if recorded:
@@ -97,27 +106,28 @@ def test_a_contradiction_of_start_and_map_is_recorded(offset_m: float, start_sig
 def test_a_later_relocalization_is_not_compared_with_the_start() -> None:
     flight = Flight(60, seed=3, dem=True)
     run = flown_wrong(flight)
-    run.feed(with_map(flight, 40, msgspec.structs.replace(flight.fix(40, WRONG_M), found=True)))
+    run.feed(with_map(flight, 40, with_search(flight.fix(40, WRONG_M), relocalized=True)))
     assert run.verdicts("start") == {}
 
 
 def test_the_same_fix_without_relocalization_is_rejected() -> None:
     flight = Flight(60, seed=3)
     run = flown_wrong(flight)
-    with_lost_sigma = msgspec.structs.replace(flight.fix(40, WRONG_M), lost_sigma_m=LOST_SIGMA_M)
+    with_lost_sigma = with_search(flight.fix(40, WRONG_M), sigma_m=LOST_SIGMA_M)
     run.feed(with_map(flight, 40, with_lost_sigma))
     assert run.verdicts("map")[40].verdict is Verdict.INNOVATION
     assert sigma_m(run.estimate(40)) > 0.99 * LOST_SIGMA_M
 
 
 def test_the_lost_sigma_of_the_anchor_inflates_the_horizontal_axes_only() -> None:
-    hypotheses, flight = PositionHypotheses(), Flight(2)
-    assert hypotheses.on_match(lost(flight.fix(0), SearchStep.ASK)) == "lost; search: ask"
+    hypotheses = PositionHypotheses()
+    asked = SearchResult(step=SearchStep.ASK, sigma_m=LOST_SIGMA_M)
+    assert hypotheses.on_match(Verdict.LOST, asked) == "lost; search: ask"
     _, cov = hypotheses.claim(np.eye(6))
     assert cov[0, 0] == 1.0 + LOST_SIGMA_M**2 and cov[2, 2] == 1.0
-    assert hypotheses.on_match(msgspec.structs.replace(flight.fix(1), lost_sigma_m=5.0)) == ""
+    assert hypotheses.on_match(Verdict.ACCEPTED, SearchResult(sigma_m=5.0)) == ""
     assert hypotheses.claim(np.eye(6))[1][1, 1] == 26.0
-    hypotheses.on_match(flight.fix(1))
+    hypotheses.on_match(Verdict.ACCEPTED, SearchResult())
     at_m, cov = hypotheses.claim(np.eye(6))
     assert (cov == np.eye(6)).all() and (at_m == 0.0).all()
 
@@ -130,11 +140,10 @@ BELIEF = (50.0, 20.0), (9000.0, 0.0, 0.0, 400.0)  # mean and covariance of the b
 def with_modes(sigma_m: float, *modes: tuple[float, float, float], cov: np.ndarray | None = None) -> PositionHypotheses:
     """An estimate at (10, 20) with ``sigma_m`` or ``cov`` (6, 6), and modes: offset east and north, mass."""
     hypotheses = PositionHypotheses()
-    modes_of_match = [(10.0 + e, 20.0 + n, mass, MODE_VAR_M2) for e, n, mass in modes]
+    seen = [BeliefMode(e_m=10.0 + e, n_m=20.0 + n, mass=mass, variance_m2=MODE_VAR_M2) for e, n, mass in modes]
     cov = np.diag([sigma_m**2] * 3 + [0.0] * 3) if cov is None else cov
-    match = msgspec.structs.replace(Flight(2).fix(1), verdict=Verdict.AMBIGUOUS, modes=modes_of_match)
-    match = msgspec.structs.replace(match, belief_m=BELIEF[0], belief_cov_m2=BELIEF[1])
-    hypotheses.update_modes(match, np.array([10.0, 20.0, HEIGHT_M]), cov, HEIGHT_M)
+    belief = BeliefSummary(mean_m=BELIEF[0], cov_m2=BELIEF[1], modes=seen, mode_score=5.0)
+    hypotheses.update_modes(belief, np.array([10.0, 20.0, HEIGHT_M]), cov, HEIGHT_M)
     return hypotheses
 
 
@@ -277,10 +286,9 @@ def test_the_leading_mode_is_published_while_the_graph_has_no_pose() -> None:
     run.feed([msgspec.structs.replace(ORIGIN, start_sigma_m=100.0, lat_deg=ORIGIN.lat_deg, lon_deg=ORIGIN.lon_deg)])
     for i in range(12):
         at = flight.p_m[i] + np.array([300.0, 0.0, 0.0])  # the position on the map
-        modes = [(float(at[0]), float(at[1]), 0.7, MODE_VAR_M2)]
-        match = msgspec.structs.replace(
-            flight.fix(i), verdict=Verdict.AMBIGUOUS, modes=modes, belief_m=(float(at[0]), float(at[1]))
-        )
+        mode = BeliefMode(e_m=float(at[0]), n_m=float(at[1]), mass=0.7, variance_m2=MODE_VAR_M2)
+        belief = BeliefSummary(mean_m=(mode.e_m, mode.n_m), cov_m2=(0.0,) * 4, modes=[mode], mode_score=5.0)
+        match = msgspec.structs.replace(flight.fix(i), verdict=Verdict.AMBIGUOUS, belief=belief)
         run.feed(with_map(flight, i, match))
     error = error_m(run.estimate(11), flight, (300.0, 0.0))[:2]
     assert np.linalg.norm(error) < 25.0
@@ -290,7 +298,7 @@ def test_the_leading_mode_is_published_while_the_graph_has_no_pose() -> None:
 def test_a_lost_sigma_of_an_ambiguous_match_inflates_the_covariance_before_the_place_is_lost() -> None:
     flight = Flight(30, seed=3)
     run = EstimatorRun().fly(flight, 0, 20)
-    match = msgspec.structs.replace(flight.fix(20), verdict=Verdict.AMBIGUOUS, lost_sigma_m=134.0)
+    match = msgspec.structs.replace(flight.fix(20), verdict=Verdict.AMBIGUOUS, search=SearchResult(sigma_m=134.0))
     run.feed(with_map(flight, 20, match))
     run.feed(with_map(flight, 21, match))
     assert sigma_m(run.estimate(21)) > 134.0
@@ -304,7 +312,7 @@ def test_an_unknown_start_has_its_full_sigma_from_the_first_frame_and_the_flight
     for i in range(1, 10):
         run.feed(with_map(flight, i, lost(flight.fix(i)) if i % 2 else silent(flight.fix(i))))
     assert min(sigma_m(run.estimate(i)) for i in range(10)) > 5000.0
-    run.feed(with_map(flight, 10, msgspec.structs.replace(flight.fix(10, WRONG_M), found=True)))
+    run.feed(with_map(flight, 10, with_search(flight.fix(10, WRONG_M), relocalized=True)))
     for i in range(11, 30):
         run.feed(with_map(flight, i, flight.fix(i, WRONG_M)))
     assert np.linalg.norm(error_m(run.estimate(29), flight, WRONG_M)[:2]) < 10.0

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import position_of, with_pose
 from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_from_quat, yaw_of
@@ -22,7 +23,7 @@ def flown(knows: set[str], *, seed: int, coarse: bool = False) -> tuple[Flight, 
     for i in range(flight.frames):
         messages = [m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i < FIRST_MATCH)]
         if coarse and i == FIRST_MATCH:
-            messages = [msgspec.structs.replace(m, coarse=True) if isinstance(m, MapMatch) else m for m in messages]
+            messages = [with_pose(m, position_only=True) if isinstance(m, MapMatch) else m for m in messages]
         listener.feed(messages)
     return flight, listener
 
@@ -152,6 +153,5 @@ def test_a_match_far_outside_the_gate_does_not_fix_a_free_yaw_gauge() -> None:
 
 
 def moved(match: MapMatch, east_m: float) -> MapMatch:
-    assert match.p_c_in_w_m is not None
-    e_m, n_m, up_m = match.p_c_in_w_m
-    return msgspec.structs.replace(match, p_c_in_w_m=(e_m + east_m, n_m, up_m))
+    e_m, n_m, up_m = position_of(match)
+    return with_pose(match, p_c_in_w_m=(e_m + east_m, n_m, up_m))

@@ -96,7 +96,7 @@ def test_late_dead_reckoning_is_fused_at_the_second_frame(flight: Flight, killed
     assert sigma_m(run.estimate(BACK)) > 15.0
     assert sigma_m(run.estimate(BACK + 1)) < 7.0
     first, second, third = [m for m in run.published if isinstance(m, Prediction)][:3]
-    assert first.start_ns == 0 and second.start_ns == third.start_ns == second.t_ns
+    assert first.prior_t_ns == 0 and second.prior_t_ns == third.prior_t_ns == second.t_ns
     assert second.cov[0] < 0.2 * first.cov[0]
 
 
@@ -166,7 +166,7 @@ def test_dead_reckoning_with_a_jump_is_rejected(flight: Flight, killed: Estimato
     assert verdict.verdict is Verdict.INNOVATION and verdict.test_ratio is not None and verdict.test_ratio > 1.0
     assert np.linalg.norm(verdict.innovation) > 300.0
     assert without.verdicts("dead_reckoning") == {}
-    assert all(m.start_ns == 0 for m in with_jump.published if isinstance(m, Prediction))
+    assert all(m.prior_t_ns == 0 for m in with_jump.published if isinstance(m, Prediction))
 
 
 def test_without_a_checkpoint_dead_reckoning_is_not_used(flight: Flight) -> None:

@@ -397,7 +397,7 @@ def test_the_first_prediction_after_frames_without_odometry_contains_the_whole_d
             if first <= i < end and isinstance(message, Odometry):
                 message = Odometry(t_ns=message.t_ns, frame_id=i, keyframe_id=i, verdict=Verdict.STALLED)
             if i >= end and isinstance(message, Odometry) and message.keyframe_id < end:
-                message = msgspec.structs.replace(message, verdict=Verdict.FEW_INLIERS, pairs=[])
+                message = msgspec.structs.replace(message, verdict=Verdict.FEW_INLIERS, two_view=[])
             published |= {m.frame_id: m for m in node.on(message) if isinstance(m, Prediction)}
     assert not published.keys() & set(range(first, end))
     flown_m = plane.poses[end][1][:2] - plane.poses[first - 1][1][:2]

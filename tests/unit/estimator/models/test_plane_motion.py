@@ -59,7 +59,7 @@ def test_motion_from_rendered_pictures_is_within_its_covariance(name: str) -> No
     tracker = FrameTracker(PINHOLE)
     tracker.track(0, view(ground, PINHOLE, *FIRST))
     seen = tracker.track(1, view(ground, PINHOLE, *second))
-    motion = relative_pose(seen.pairs, seen.sigma_norm, FIRST[0], second[0], TILT_SIGMA_RAD, FLAT)
+    motion = relative_pose(seen.two_view, seen.sigma_norm, FIRST[0], second[0], TILT_SIGMA_RAD, FLAT)
     assert motion is not None
     r_true, p_true = between(FIRST, second)
     assert np.degrees(np.linalg.norm(log_so3(r_true.T @ motion.r))) < 0.5

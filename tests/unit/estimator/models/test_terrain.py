@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C
 
+from map_matches import plane
 from simulated_flight import FRAME_S, EstimatorRun, Flight, blind
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.estimator import Estimator
@@ -22,6 +23,7 @@ from terrafix.estimator.state import CALIBRATION_SIZE
 from terrafix.messages import (
     Camera,
     MapMatch,
+    MapPose,
     MeasurementVerdict,
     NavEstimate,
     Odometry,
@@ -65,7 +67,9 @@ def test_a_slightly_negative_height_on_the_ground_is_accepted_as_the_initial_hei
 def test_the_ground_plane_is_relative_to_the_place_of_the_match() -> None:
     estimator = begun(Attitude(0.0, 0.0, 0.0, 100.0))
     assert estimator.terrain.elevation_m(np.array([300.0, -200.0, 140.0])) == 40.0  # flat before the first map match
-    match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient", ground=(50.0, 0.1, -0.05))
+    match = MapMatch(
+        t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient", ground=plane(50.0, 0.1, -0.05)
+    )
     estimator.feed_map_match(match)
     assert estimator.terrain.elevation_m(np.array([0.0, 0.0, 140.0])) == pytest.approx(50.0, abs=0.5)
     here = estimator.terrain.elevation_m(np.array([0.0, 0.0, 140.0]))
@@ -77,8 +81,7 @@ def test_the_ground_plane_is_relative_to_the_place_of_the_match() -> None:
 def test_a_slope_is_extrapolated_over_a_limited_distance() -> None:
     """A minute without pictures at 17 m/s: a slope extrapolated over a kilometre would rise by 100 m."""
     terrain = Terrain(40.0)
-    match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", ground=(50.0, 0.1, 0.0))
-    terrain.update(match, np.zeros(3))
+    terrain.update(plane(50.0, 0.1, 0.0), np.zeros(3))
     assert terrain.elevation_m(np.array([100.0, 0.0, 0.0])) == pytest.approx(60.0)
     assert terrain.elevation_m(np.array([1000.0, 0.0, 0.0])) == pytest.approx(65.0)
     near, far = (terrain.ground_plane(np.array([e_m, 0.0, 0.0]), 130.0, 2.0, 1.0) for e_m in (100.0, 1000.0))
@@ -95,8 +98,7 @@ def test_without_a_dem_the_elevation_is_a_random_walk() -> None:
     # Half of the curvature times 50 m squared, on both sides: the rise of a random walk over 100 m.
     assert terrain.curvature_sigma(100.0) * 50.0**2 == pytest.approx(10.0 * RISE)
     assert terrain.ground_plane(np.zeros(3), 100.0, 2.0, 1.0).curvature_sigma == terrain.curvature_sigma(100.0)
-    match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", ground=(50.0, 0.1, 0.0))
-    terrain.update(match, np.zeros(3))
+    terrain.update(plane(50.0, 0.1, 0.0), np.zeros(3))
     assert terrain.rise_sigma_m(100.0) == terrain.slope_sigma(100.0) == terrain.curvature_sigma(100.0) == 0.0
 
 
@@ -119,20 +121,12 @@ def test_the_sigma_of_an_unknown_slope_accounts_for_repeated_views_and_roughness
 def test_a_map_pose_over_an_unknown_slope_is_within_its_covariance() -> None:
     """The PnP pose over ground with a slope of 3 % that is taken for flat is within its covariance."""
     known = Terrain(0.0)
-    known.update(MapMatch(t_ns=0, frame_id=0, verdict=Verdict.LOST, matcher="gradient", ground=(0.0, 0.0, 0.0)), None)
+    known.update(plane(0.0), None)
     exact = np.diag([0.01, 0.01, 0.01, 1e-6, 1e-6, 1e-6])
-    match = MapMatch(
-        t_ns=0,
-        frame_id=0,
-        verdict=Verdict.ACCEPTED,
-        matcher="gradient",
-        p_c_in_w_m=(0.0, 0.0, 100.0),
-        q_w_c=(0.0, 1.0, 0.0, 0.0),
-        cov=tuple(exact.ravel()),
-    )
+    seen = MapPose(p_c_in_w_m=(0.0, 0.0, 100.0), q_w_c=(0.0, 1.0, 0.0, 0.0), cov=tuple(exact.ravel()))
     sloped = np.array([3.0, 0.0, 0.0, 0.0, 0.03, 0.0])  # east by a turn about north; the order of the messages
     for terrain, low, high in ((known, 100.0, np.inf), (Terrain(0.0), 0.0, 2.0)):
-        pose, cov = measured_pose(match, terrain)
+        pose, cov = measured_pose(seen, 0.0, terrain)
         world = tangent_to_world(cov, pose.rotation().matrix())
         assert low < float(sloped @ np.linalg.solve(world, sloped)) < high
 
@@ -204,7 +198,7 @@ def test_a_sloping_plane_does_not_make_the_horizontal_position_observable() -> N
 
 def test_the_level_sigma_on_a_slope_grows_with_the_position_sigma() -> None:
     estimator = begun(Attitude(0.0, 0.0, 0.0, 100.0))
-    match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient", ground=(40.0, 0.1, 0.0))
+    match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient", ground=plane(40.0, 0.1, 0.0))
     estimator.feed_map_match(match)
     found, lost = (
         OdometryMeasurement(estimator.state)
@@ -263,7 +257,7 @@ def test_velocity_with_a_wrong_ground_level_is_within_its_sigma() -> None:
             frame_id=i,
             verdict=Verdict.FEW_INLIERS,
             matcher="gradient",
-            ground=(60.0, 0.15, 0.0),
+            ground=plane(60.0, 0.15, 0.0),
         )
         messages = [m for m in flight.messages(i) if not isinstance(m, MapMatch)]
         run.feed([blind(m) if i < 60 and isinstance(m, Odometry) else m for m in messages] + [elsewhere])
@@ -280,6 +274,6 @@ def test_rejected_odometry_has_a_verdict_with_the_reason() -> None:
     flight = Flight(4, dem=True)
     run = EstimatorRun().fly(flight, 0, 3)
     odometry = next(m for m in flight.messages(3) if isinstance(m, Odometry))
-    run.feed([msgspec.structs.replace(odometry, keyframe_id=777), msgspec.structs.replace(odometry, pairs=[])])
+    run.feed([msgspec.structs.replace(odometry, keyframe_id=777), msgspec.structs.replace(odometry, two_view=[])])
     verdicts = [m.verdict for m in run.published if isinstance(m, MeasurementVerdict) and m.measurement == "odometry"]
     assert verdicts[-2:] == [Verdict.STALE, Verdict.FEW_INLIERS]

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from map_matches import with_pose
 from simulated_flight import ORIGIN, EstimatorRun, Flight, sigma_m, t_ns
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
@@ -269,7 +270,7 @@ def _coarsely(message: Message) -> Message:
     """A coarse match: the mode of the belief without a pose."""
     if not isinstance(message, MapMatch):
         return message
-    return msgspec.structs.replace(message, coarse=True, inliers=0)
+    return with_pose(msgspec.structs.replace(message, inliers=0), position_only=True)
 
 
 @pytest.mark.slow
@@ -285,10 +286,10 @@ def test_accepted_coarse_matches_do_not_count_against_registration() -> None:
 def test_rejected_coarse_matches_count_against_registration() -> None:
     def aside(message: Message) -> Message:
         match = _coarsely(message)
-        if not isinstance(match, MapMatch) or match.p_c_in_w_m is None:
+        if not isinstance(match, MapMatch) or match.pose is None:
             return match
-        e_m, n_m, up_m = match.p_c_in_w_m
-        return msgspec.structs.replace(match, p_c_in_w_m=(e_m + 400.0 * (match.frame_id % 3), n_m - 500.0, up_m))
+        e_m, n_m, up_m = match.pose.p_c_in_w_m
+        return with_pose(match, p_c_in_w_m=(e_m + 400.0 * (match.frame_id % 3), n_m - 500.0, up_m))
 
     listener, faults = _fly(aside, fix_every=1)
     assert not any(v.verdict is Verdict.ACCEPTED for v in listener.verdicts("map").values())
@@ -298,7 +299,7 @@ def test_rejected_coarse_matches_count_against_registration() -> None:
 def test_correlations_over_ground_without_texture_are_ignored() -> None:
     def nothing(message: Message) -> Message:
         if isinstance(message, Odometry):
-            return msgspec.structs.replace(message, verdict=Verdict.NO_FEATURES, pairs=[])
+            return msgspec.structs.replace(message, verdict=Verdict.NO_FEATURES, two_view=[])
         if isinstance(message, MapMatch):
             return MapMatch(t_ns=message.t_ns, frame_id=message.frame_id, verdict=Verdict.AMBIGUOUS, matcher="gradient")
         return message

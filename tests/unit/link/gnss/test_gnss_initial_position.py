@@ -75,13 +75,13 @@ def run_standing(
     return fly(node or LinkNode(10.0), 0, round(seconds * S), feed)
 
 
-def starts(published: list[m.Message]) -> list[m.GnssStart]:
-    """The different GnssStart messages, without repetitions."""
-    found = {x.t_ns: x for x in published if isinstance(x, m.GnssStart)}
+def starts(published: list[m.Message]) -> list[m.GnssInitialPosition]:
+    """The different GnssInitialPosition messages, without repetitions."""
+    found = {x.t_ns: x for x in published if isinstance(x, m.GnssInitialPosition)}
     return list(found.values())
 
 
-def distance_to_m(start: m.GnssStart, at_m: tuple[float, float]) -> float:
+def distance_to_m(start: m.GnssInitialPosition, at_m: tuple[float, float]) -> float:
     assert start.lat_deg is not None and start.lon_deg is not None
     return distance_m(start.lat_deg, start.lon_deg, *offset(LAT, LON, *at_m))
 
@@ -91,7 +91,7 @@ def test_a_position_held_for_five_seconds_becomes_the_start_and_is_published_eve
     (start,) = starts(published)
     assert distance_to_m(start, here(0.0)) < 0.1 and start.sigma_m == 2.0 and start.receiver == 0
     assert start.t_ns == STATIONARY_NS
-    assert 14 <= sum(isinstance(x, m.GnssStart) for x in published) <= 16
+    assert 14 <= sum(isinstance(x, m.GnssInitialPosition) for x in published) <= 16
 
 
 @pytest.mark.parametrize(
@@ -131,11 +131,11 @@ def test_a_vehicle_that_may_be_armed_gets_no_start(armed: bool | None) -> None:
 
 
 def test_arming_ends_the_start_from_gnss_and_disarming_does_not_restart_it() -> None:
-    assert not [x for x in run_standing(armed=lambda t: t > 3.0) if isinstance(x, m.GnssStart)]
+    assert not [x for x in run_standing(armed=lambda t: t > 3.0) if isinstance(x, m.GnssInitialPosition)]
     assert not starts(run_standing(seconds=60.0, armed=lambda t: 3.0 < t < 20.0))
     published = run_standing(seconds=30.0, armed=lambda t: t > 10.0)
     assert max(x.t_ns for x in published if isinstance(x, m.GpsInput)) > 29 * S
-    repeated = [x for x in published if isinstance(x, m.GnssStart)]
+    repeated = [x for x in published if isinstance(x, m.GnssInitialPosition)]
     assert len(repeated) <= 6  # repetitions end at arming
 
 
@@ -182,8 +182,8 @@ def test_a_jump_that_no_transport_explains_withdraws_the_start_for_good() -> Non
     first, withdrawn = starts(published)
     assert first.sigma_m == 2.0 and withdrawn.lat_deg is None and withdrawn.t_ns == 10 * S
     assert [t for t in texts(published) if "GPS" in t] == ["Terrafix: GPS 1 jumped 500 m: no start"]
-    assert max(x.t_ns for x in published if isinstance(x, m.GnssStart)) == withdrawn.t_ns
-    assert sum(isinstance(x, m.GnssStart) and x.lat_deg is None for x in published) > 40
+    assert max(x.t_ns for x in published if isinstance(x, m.GnssInitialPosition)) == withdrawn.t_ns
+    assert sum(isinstance(x, m.GnssInitialPosition) and x.lat_deg is None for x in published) > 40
 
 
 def test_a_car_ride_without_reception_is_not_a_jump() -> None:
@@ -226,7 +226,8 @@ def test_a_receiver_without_readings_does_not_contradict_another() -> None:
 def test_the_start_remains_when_the_receiver_is_jammed_afterwards() -> None:
     published = run_standing(lambda t: here(t) if t < 10.0 else None, 60.0)
     assert len(starts(published)) == 1
-    assert sum(isinstance(x, m.GnssStart) for x in published) > 50  # repetitions, for subscribers that missed one
+    # Repetitions, for subscribers that missed one.
+    assert sum(isinstance(x, m.GnssInitialPosition) for x in published) > 50
 
 
 def test_two_receivers_that_disagree_give_no_start() -> None:
@@ -244,7 +245,7 @@ def test_two_receivers_that_disagree_give_no_start() -> None:
 
 def on_answer(**changes: Any) -> list[m.Message]:
     fields: dict[str, Any] = {"t_ns": S, "verdict": m.Verdict.ACCEPTED, "lat_deg": LAT, "lon_deg": LON, "sigma_m": 2.6}
-    node, start = LinkNode(10.0), m.Start(**fields | {"ground_amsl_m": None} | changes)
+    node, start = LinkNode(10.0), m.InitialPosition(**fields | {"ground_amsl_m": None} | changes)
     return [*node.on(start), *node.on(start)]
 
 

@@ -90,13 +90,13 @@ def test_gps_input_records_the_degradation_level_and_the_time_without_a_map_fix(
     sent = gps(fly(LinkNode(10.0), 0, 40 * S, feed))
     for seconds, level in ((3, 0), (10, 1), (20, 2), (38, 3)):
         at = next(g for g in sent if g.t_ns >= seconds * S)
-        assert at.caution == level
+        assert at.degradation == level
         assert at.unanchored_s == pytest.approx(seconds, abs=0.3)
 
 
 def test_before_the_first_estimate_the_time_without_a_map_fix_is_unknown() -> None:
     (first,) = gps(list(LinkNode(10.0).tick(0)))
-    assert (first.caution, first.unanchored_s) == (0, None)
+    assert (first.degradation, first.unanchored_s) == (0, None)
 
 
 def test_an_oscillating_degradation_level_is_reported_at_growing_intervals() -> None:
@@ -148,7 +148,7 @@ def test_named_values_are_sent_once_a_second_after_an_autopilot_is_connected() -
     wire = MemoryWire()
     edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
     (sent,) = gps(list(LinkNode(10.0).tick(0)))
-    known = msgspec.structs.replace(sent, fix_type=3, horiz_accuracy_m=6.5, caution=1, unanchored_s=7.25)
+    known = msgspec.structs.replace(sent, fix_type=3, horiz_accuracy_m=6.5, degradation=1, unanchored_s=7.25)
     for tenth in range(20):
         edge.on_message(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
     assert wire.take("NAMED_VALUE_FLOAT") == []

@@ -111,8 +111,8 @@ def test_over_the_map_of_another_town_a_fifth_of_the_frames_have_wrong_matches()
     after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= start_s]
     for i in after * 20:  # enough matches to estimate a share
         match = lies.match(i, PREDICTION, always(FOUND))
-        if match.p_c_in_w_m is not None:
-            off.append(float(np.hypot(*(np.array(match.p_c_in_w_m) - flight.frames[i].p_m)[:2])))
+        if match.pose is not None:
+            off.append(float(np.hypot(*(np.array(match.pose.p_c_in_w_m) - flight.frames[i].p_m)[:2])))
     assert 0.15 < len(off) / (20 * len(after)) < 0.25
     assert min(off) > 30.0 and max(off) < 120.0
     assert 0.3 < np.mean(np.abs(np.diff(off)) < 8.0) < 0.8  # half of them agree with the one before
@@ -129,13 +129,13 @@ def test_the_search_model_is_lost_without_matches_and_finds_a_visible_place() ->
     matches = [search.update(NOTHING, PREDICTION, shot, visible) for _ in range(of.LOST_FRAMES + of.FOUND_FRAMES)]
     lost = [m.verdict is Verdict.LOST for m in matches]
     assert lost.index(True) == of.LOST_FRAMES - 1 and sum(lost) == of.FOUND_FRAMES - 1
-    assert matches[of.LOST_FRAMES].lost_sigma_m == 300.0 and matches[of.LOST_FRAMES].step is SearchStep.WIDEN
+    assert matches[of.LOST_FRAMES].search.sigma_m == 300.0 and matches[of.LOST_FRAMES].search.step is SearchStep.WIDEN
     found = matches[of.LOST_FRAMES + of.FOUND_FRAMES - 2]
-    assert found.found and found.step is SearchStep.MERGE and found.lost_sigma_m == 0.0
+    assert found.search.relocalized and found.search.step is SearchStep.MERGE and found.search.sigma_m == 0.0
     assert matches[-1] == NOTHING  # the counters restart
     blind = Search()
     never = [blind.update(NOTHING, PREDICTION, shot, always(NOTHING)) for _ in range(60)]
-    assert not any(m.found for m in never) and never[-1].verdict is Verdict.LOST
+    assert not any(m.search.relocalized for m in never) and never[-1].verdict is Verdict.LOST
     reset = Search()
     looks = [reset.update(FOUND if i % 10 == 9 else NOTHING, PREDICTION, shot, visible) for i in range(60)]
     assert not any(m.verdict is Verdict.LOST for m in looks)

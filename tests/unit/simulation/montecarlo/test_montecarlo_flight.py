@@ -88,8 +88,8 @@ def test_tracks_scatter_about_their_homography_as_those_of_real_flights(
     for i, shot in enumerate(flight.frames):
         odometry = sightings.odometry(i, shot)
         age = i - odometry.keyframe_id
-        if age in scatter and len(odometry.pairs) > 8:
-            pairs = focal_px * np.array(odometry.pairs)
+        if age in scatter and len(odometry.two_view) > 8:
+            pairs = focal_px * np.array(odometry.two_view)
             homography, _ = cv2.findHomography(pairs[:, :2], pairs[:, 2:], 0)
             there = cv2.perspectiveTransform(pairs[:, None, :2], homography)[:, 0]
             freedom = (2 * len(pairs) - 8) / (2 * len(pairs))
@@ -105,9 +105,9 @@ def test_simulated_matches_have_small_and_consistent_errors(flown: tuple[FlightP
     off, share = [], []
     for i, shot in enumerate(flight.frames):
         match = matches.match(_prediction(i, shot), shot)
-        if match.verdict is Verdict.ACCEPTED and not match.coarse and match.p_c_in_w_m and match.cov:
-            error = np.array(match.p_c_in_w_m)[:2] - shot.p_m[:2] - offset
-            cov = np.array(match.cov).reshape(6, 6)[:2, :2]
+        if match.verdict is Verdict.ACCEPTED and match.pose is not None and not match.pose.position_only:
+            error = np.array(match.pose.p_c_in_w_m)[:2] - shot.p_m[:2] - offset
+            cov = np.array(match.pose.cov).reshape(6, 6)[:2, :2]
             off.append(error)
             share.append(float(error @ np.linalg.solve(cov, error)))
     assert len(off) > 0.5 * len(flight.frames)
@@ -136,12 +136,13 @@ def test_a_wrong_start_widens_the_belief_over_new_ground_until_it_finds_the_plac
         prediction = _moving(_prediction(i, shot, east_m=300.0), flight.frames[i - 1], shot)
         match = matches.match(prediction, shot)
         found.append(match.verdict is Verdict.ACCEPTED)
-        sigmas_m.append(float(np.sqrt(match.belief_cov_m2[0])))
+        assert match.belief is not None
+        sigmas_m.append(float(np.sqrt(match.belief.cov_m2[0])))
         if found[-1]:
-            assert match.p_c_in_w_m is not None
-            assert np.hypot(*(np.array(match.p_c_in_w_m) - shot.p_m)[:2]) < 20.0
+            assert match.pose is not None
+            assert np.hypot(*(np.array(match.pose.p_c_in_w_m) - shot.p_m)[:2]) < 20.0
             break
-        assert len(match.modes) == 2 and match.p_c_in_w_m is None
+        assert len(match.belief.modes) == 2 and match.pose is None
     assert found[-1] and 1 <= len(found) - 1 <= 20
     assert max(sigmas_m) > 1.3 * sigmas_m[0] > 60.0
 
@@ -151,7 +152,7 @@ def test_an_unusable_picture_tells_the_belief_nothing(flown: tuple[FlightPlan, S
     matches = _matches(drawn, flight, np.zeros(2))
     for i, shot in enumerate(flight.frames):
         match = matches.match(_prediction(i, shot, east_m=300.0), shot, usable=False)
-        assert match.verdict is Verdict.AMBIGUOUS and match.modes == []
+        assert match.verdict is Verdict.AMBIGUOUS and match.belief is None
 
 
 def test_only_a_repeated_view_is_static(flown: tuple[FlightPlan, SimulatedFlight]) -> None:
@@ -170,8 +171,8 @@ def test_faults_have_their_stated_times_and_sizes(flown: tuple[FlightPlan, Simul
         faults, out = Faults(fault, 600.0, 1), []
         for i in range(600):
             shot = replace(flight.frames[0], t_s=float(i))
-            p_m = faults.alter(right, shot).p_c_in_w_m
-            out.append(np.nan if p_m is None else np.hypot(*(np.array(p_m) - shot.p_m)[:2]))
+            pose = faults.alter(right, shot).pose
+            out.append(np.nan if pose is None else np.hypot(*(np.array(pose.p_c_in_w_m) - shot.p_m)[:2]))
         return np.array(out)
 
     jumps = moved(Fault.JUMPS)

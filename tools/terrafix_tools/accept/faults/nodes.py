@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.node import Node
-from terrafix.messages import Frame, Health, MapMatch, Message, Prediction, ThermalBand, Verdict
+from terrafix.messages import Frame, Health, MapMatch, MapPose, MatchPlace, Message, Prediction, ThermalBand, Verdict
 from terrafix_tools.accept.measuring.results import Span
 
 OUTLIER_M = 350.0  # AC-3
@@ -32,21 +32,17 @@ class WrongFixes:
 
     def _with_offset(self, prediction: Prediction, match: MapMatch) -> MapMatch:
         towards = self._rng.uniform(0.0, 2.0 * np.pi)
-        e_m, n_m, up_m = match.p_c_in_w_m or prediction.p_c_in_w_m
+        near = match.pose or prediction
+        e_m, n_m, up_m = near.p_c_in_w_m
         e_m, n_m = e_m + OUTLIER_M * float(np.sin(towards)), n_m + OUTLIER_M * float(np.cos(towards))
         cov = np.diag([OUTLIER_SIGMA_M**2] * 3 + [OUTLIER_SIGMA_RAD**2] * 3)
         return msgspec.structs.replace(
             match,
             verdict=Verdict.ACCEPTED,
-            coarse=False,
             matches=[],
-            p_c_in_w_m=(e_m, n_m, up_m),
-            q_w_c=match.q_w_c or prediction.q_w_c,
-            cov=tuple(float(v) for v in cov.ravel()),
             inliers=48,
-            mode_mass=0.99,
-            mode_e_m=e_m,
-            mode_n_m=n_m,
+            pose=MapPose(p_c_in_w_m=(e_m, n_m, up_m), q_w_c=near.q_w_c, cov=tuple(float(v) for v in cov.ravel())),
+            place=MatchPlace(e_m=e_m, n_m=n_m, mass=0.99),
         )
 
 

@@ -113,9 +113,9 @@ def odometry_rate(e: Evidence) -> Measured:
 def odometry_px(e: Evidence) -> Measured:
     """Mean over the published point pairs, with a free depth for each; pixels of the frames."""
     means = [
-        reprojection_error(np.array(frame.odometry.pairs)) * e.origin.camera.fx
+        reprojection_error(np.array(frame.odometry.two_view)) * e.origin.camera.fx
         for frame in e.frames
-        if frame.odometry is not None and len(frame.odometry.pairs) >= 8
+        if frame.odometry is not None and len(frame.odometry.two_view) >= 8
     ]
     return Measured(float(np.mean(means)), "pixels of the stored frames") if means else Measured(None, "no odometry")
 
@@ -125,9 +125,9 @@ def map_px(e: Evidence) -> Measured:
     means = []
     for frame in e.frames:
         match = frame.match
-        if frame.fixed and match is not None and match.matches and match.p_c_in_w_m and match.q_w_c:
+        if frame.fixed and match is not None and match.matches and match.pose is not None:
             points = np.array(match.matches)
-            in_c = (points[:, 2:5] - np.array(match.p_c_in_w_m)) @ rot_from_quat(match.q_w_c)
+            in_c = (points[:, 2:5] - np.array(match.pose.p_c_in_w_m)) @ rot_from_quat(match.pose.q_w_c)
             off = (in_c[:, :2] / in_c[:, 2:] - points[:, :2]) * e.origin.camera.fx
             means.append(float(np.linalg.norm(off, axis=1).mean()))
     return Measured(float(np.mean(means)), "pixels of the stored frames") if means else Measured(None, "no map fix")

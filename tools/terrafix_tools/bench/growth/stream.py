@@ -12,7 +12,18 @@ import numpy as np
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
 from terrafix.core.mavlink.imu import GRAVITY_MPS2
-from terrafix.messages import Camera, Imu, ImuSample, MapMatch, Odometry, Origin, VehicleState, Verdict
+from terrafix.messages import (
+    Camera,
+    Imu,
+    ImuSample,
+    MapMatch,
+    MapPose,
+    MatchPlace,
+    Odometry,
+    Origin,
+    VehicleState,
+    Verdict,
+)
 
 FRAME_S, SPEED_MPS, HEIGHT_M = 0.5, 12.0, 100.0
 LEG_S, TURN_S, TURN_RADPS = 60.0, 6.0, math.radians(15.0)  # each leg ends with a right turn
@@ -109,7 +120,7 @@ def _odometry(
         frame_id=i,
         keyframe_id=keyframe,
         verdict=Verdict.ACCEPTED,
-        pairs=[(float(a), float(b), float(c), float(d)) for a, b, c, d in pairs],
+        two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in pairs],
         sigma_norm=SIGMA_NORM,
         inliers=PAIRS,
         tracked=PAIRS,
@@ -124,11 +135,11 @@ def _fix(i: int, t_ns: int, p_m: np.ndarray, r_w_c: np.ndarray, rng: np.random.G
         frame_id=i,
         verdict=Verdict.ACCEPTED,
         matcher="gradient",
-        p_c_in_w_m=(e_m, n_m, up_m),
-        q_w_c=quat_from_rot(r_w_c),
-        cov=tuple(float(v) for v in np.diag([FIX_SIGMA_M**2] * 3 + [FIX_SIGMA_RAD**2] * 3).ravel()),
         inliers=40,
-        mode_mass=0.99,
-        mode_e_m=e_m,
-        mode_n_m=n_m,
+        pose=MapPose(
+            p_c_in_w_m=(e_m, n_m, up_m),
+            q_w_c=quat_from_rot(r_w_c),
+            cov=tuple(float(v) for v in np.diag([FIX_SIGMA_M**2] * 3 + [FIX_SIGMA_RAD**2] * 3).ravel()),
+        ),
+        place=MatchPlace(e_m=e_m, n_m=n_m, mass=0.99),
     )

@@ -106,7 +106,7 @@ def attempt(source: Source, package: Path, truth: Truth, first: int, options: Tr
         off_m = _apart_m(true_deg, (estimate.lat_deg, estimate.lon_deg))
         correct = not options.mirrored and off_m <= max(RIGHT_M, RIGHT_PER_AGL * estimate.agl_m)
         sigma_m = max(estimate.cov[0], estimate.cov[7]) ** 0.5
-        found = any(m.found for m in published if isinstance(m, MapMatch))
+        found = any(m.search.relocalized for m in published if isinstance(m, MapMatch))
         if found and correct and found_after is None:
             found_after, error_m = used, off_m
         claims = sigma_m < CLAIMED_FIX * estimate.agl_m and off_m > CLAIM_SIGMAS * sigma_m
