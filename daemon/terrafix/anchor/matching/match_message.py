@@ -53,6 +53,9 @@ def mode_match(match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tu
     return msgspec.structs.replace(
         match,
         verdict=Verdict.ACCEPTED,
+        inliers=0,  # those of a pose that was rejected
+        reprojection_px=0.0,
+        matches=[],
         pose=MapPose(
             p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + agl_m),
             q_w_c=quat_from_rot(view.r_w_c),
