@@ -63,6 +63,7 @@ class Verdict(StrEnum):
     UNCONFIRMED = "unconfirmed"  # odometry or coarse match of a fragment that is not yet joined to the flight
     IMPLAUSIBLE = "implausible"  # odometry, height or heading beyond its gate; impossible estimate, telemetry or time
     MODEL_FAILED = "model_failed"  # the learned model gave no usable output; ModelEvent has the reason
+    THROTTLED = "throttled"  # not matched: the map rate of the thermal band
     LOST = "lost"  # the images contradict the estimated position; relocalisation is active
 
 
@@ -352,6 +353,8 @@ class ModelChange(StrEnum):
     PROVIDER = "provider"  # the execution provider failed; the next one is used from now on
     FAILED = "failed"  # no usable output for this frame
     GIVEN_UP = "given_up"  # matching continues without the learned model
+    SUSPENDED = "suspended"  # matching continues without it while the thermal band is critical
+    RESUMED = "resumed"
 
 
 class ModelEvent(Message, frozen=True, kw_only=True):

@@ -128,7 +128,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "anchor",
         "terrafix.anchor.node",
-        (m.Origin, m.Prediction, m.PositionHint, m.GnssInitialPosition),
+        (m.Origin, m.Prediction, m.PositionHint, m.GnssInitialPosition, m.Health),
         (m.MapMatch, m.ModelEvent, m.SearchState, m.HintVerdict, m.InitialPosition),
         0.0,
         90.0,  # one correlation over a large map takes seconds, half a minute on a computer with ten times the load

@@ -198,9 +198,10 @@ class Localizer:
             search=SearchResult(sigma_m=self._relocalizer.sigma_m),
         )
 
-    def model_failed(self, prediction: Prediction) -> MapMatch:
-        """The MapMatch of a frame on which the learned model failed."""
-        match = with_step(self.no_match(prediction, Verdict.MODEL_FAILED), SearchStep.SKIP)
+    def skipped(self, prediction: Prediction, verdict: Verdict) -> MapMatch:
+        """The MapMatch of a frame that was not matched: the learned model failed, or the computer is hot. A running
+        search stays LOST."""
+        match = with_step(self.no_match(prediction, verdict), SearchStep.SKIP)
         return self._relocalizer.search_match(match) if self._relocalizer.is_active else match
 
     def label_step(self, match: MapMatch) -> MapMatch:

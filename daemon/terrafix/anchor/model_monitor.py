@@ -24,12 +24,12 @@ class ModelMonitor:
     def opened(self, t_ns: int) -> list[ModelEvent]:
         """Events at the start of a flight."""
         if self._not_opened:
-            return [self._event(t_ns, ModelChange.GIVEN_UP, self._not_opened)]
+            return [self.event(t_ns, ModelChange.GIVEN_UP, self._not_opened)]
         if self._model is None:
             return []
         self._reported = len(self._model.rejected_providers)
         why = "".join(f"; {rejected}" for rejected in self._model.rejected_providers)
-        return [self._event(t_ns, ModelChange.OPENED, f"sha256 {self._model.sha256[:12]}{why}")]
+        return [self.event(t_ns, ModelChange.OPENED, f"sha256 {self._model.sha256[:12]}{why}")]
 
     def succeeded(self, t_ns: int) -> list[ModelEvent]:
         """After a frame without a failure. Only a frame for which the model produced a result resets the failure
@@ -43,12 +43,15 @@ class ModelMonitor:
         on."""
         self._failures += 1
         self._results = self._model.run_count if self._model is not None else 0
-        events = [*self._provider_events(t_ns), self._event(t_ns, ModelChange.FAILED, reason)]
+        events = [*self._provider_events(t_ns), self.event(t_ns, ModelChange.FAILED, reason)]
         if self.given_up:
-            events.append(
-                self._event(t_ns, ModelChange.GIVEN_UP, f"{self._failures} frames in a row without an answer")
-            )
+            events.append(self.event(t_ns, ModelChange.GIVEN_UP, f"{self._failures} frames in a row without an answer"))
         return events
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the describer has weights."""
+        return self._model is not None
 
     @property
     def given_up(self) -> bool:
@@ -58,8 +61,8 @@ class ModelMonitor:
         if self._model is None or len(self._model.rejected_providers) == self._reported:
             return []
         new, self._reported = self._model.rejected_providers[self._reported :], len(self._model.rejected_providers)
-        return [self._event(t_ns, ModelChange.PROVIDER, "; ".join(str(rejected) for rejected in new))]
+        return [self.event(t_ns, ModelChange.PROVIDER, "; ".join(str(rejected) for rejected in new))]
 
-    def _event(self, t_ns: int, change: ModelChange, detail: str) -> ModelEvent:
+    def event(self, t_ns: int, change: ModelChange, detail: str) -> ModelEvent:
         provider = short_name(self._model.provider) if self._model is not None else ""
         return ModelEvent(t_ns=t_ns, model=self._name, change=change, provider=provider, detail=detail)

@@ -7,20 +7,25 @@ from terrafix.anchor.initial_position import check_initial_position
 from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.model_monitor import ModelMonitor
+from terrafix.anchor.thermal_load import ThermalLoad
+from terrafix.core.config import HealthSection
 from terrafix.core.errors import ModelError
 from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.map.package import MapPackage
 from terrafix.messages import (
     GnssInitialPosition,
+    Health,
     InitialPosition,
     MapMatch,
     Message,
+    ModelChange,
     Origin,
     PositionHint,
     Prediction,
     SearchState,
     SearchStep,
+    Verdict,
 )
 from terrafix_engines.features import open_describer
 from terrafix_engines.features.gradient import GradientDescriber
@@ -36,12 +41,15 @@ class AnchorNode:
         ce90_m: float,
         model: ModelMonitor | None = None,
         cache_dir: Path | None = None,
+        load: ThermalLoad | None = None,
     ) -> None:
         """``ce90_m``: accuracy of map layers that state none; ``cache_dir``: folder in memory for computed
-        descriptors of the map."""
+        descriptors of the map; ``load``: by thermal band; None: as the default configuration."""
         self._frames = frames
         self._package = package
+        self._describer = describer  # as configured
         self._model = model or ModelMonitor(describer)
+        self._load, self._model_suspended = load or ThermalLoad(HealthSection()), False
         self._localizer = Localizer(package, describer, ce90_m, cache_dir)
         self._origin: Origin | None = None
         self._hint: PositionHint | None = None  # not yet applied
@@ -56,6 +64,8 @@ class AnchorNode:
                 self._origin = message
                 self._localizer.begin_flight(message)
                 yield from self._model.opened(message.t_ns)
+            case Health():
+                self._load.band = message.band
             case PositionHint():
                 self._hint = message  # applied with the next prediction, which has height and position
             case GnssInitialPosition():
@@ -74,6 +84,8 @@ class AnchorNode:
         if prediction.prior_t_ns > self._prior_t_ns:  # the belief refers to another position
             self._prior_t_ns = prediction.prior_t_ns
             self._localizer.reset()
+        if self._model_suspended is self._load.allows_model:
+            self._switch_model(prediction)
         match = self._localizer.label_step(self._localized(prediction))
         yield match
         yield from self._pending
@@ -91,6 +103,8 @@ class AnchorNode:
             if self._hint is not None and self._localizer.is_ready:
                 self._pending.append(self._localizer.apply_prior(self._hint, prediction))
                 self._hint = None
+            if not self._load.takes_frame():
+                return self._localizer.skipped(prediction, Verdict.THROTTLED)
             match = self._localizer.localize(prediction, image)
         except ModelRunError as error:
             self._pending += self._model.failed(prediction.t_ns, str(error))
@@ -98,9 +112,19 @@ class AnchorNode:
                 describer = GradientDescriber()
                 self._model = ModelMonitor(describer)
                 self._localizer.replace_describer(describer, prediction.agl_m)
-            return self._localizer.model_failed(prediction)
+            return self._localizer.skipped(prediction, Verdict.MODEL_FAILED)
         self._pending += self._model.succeeded(prediction.t_ns)
         return match
+
+    def _switch_model(self, prediction: Prediction) -> None:
+        """Suspends the learned model, or resumes it."""
+        self._model_suspended = not self._model_suspended
+        if not self._model.is_learned:
+            return
+        describer = GradientDescriber() if self._model_suspended else self._describer
+        self._localizer.replace_describer(describer, prediction.agl_m)
+        change = ModelChange.SUSPENDED if self._model_suspended else ModelChange.RESUMED
+        self._pending.append(self._model.event(prediction.t_ns, change, f"thermal band {self._load.band.value}"))
 
 
 def make_node(ctx: NodeContext) -> AnchorNode:
@@ -117,4 +141,7 @@ def make_node(ctx: NodeContext) -> AnchorNode:
         if ctx.epoch_ns is None:
             raise ModelError(str(error)) from None
         describer, not_opened = GradientDescriber(), str(error)
-    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, ModelMonitor(describer, not_opened), ctx.cache_dir)
+    model = ModelMonitor(describer, not_opened)
+    return AnchorNode(
+        ctx.frames, package, describer, wanted.ce90_m, model, ctx.cache_dir, ThermalLoad(ctx.config.health)
+    )

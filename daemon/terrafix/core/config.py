@@ -69,6 +69,8 @@ class HealthSection(Section, frozen=True, kw_only=True):
     hot_c: Annotated[float, Meta(ge=30, le=120)] = 80.0
     critical_c: Annotated[float, Meta(ge=30, le=120)] = 95.0
     hysteresis_c: Annotated[float, Meta(ge=0, le=30)] = 5.0
+    hot_match_every: Annotated[int, Meta(ge=1, le=60)] = 2
+    critical_match_every: Annotated[int, Meta(ge=1, le=60)] = 4
 
 
 class Source(Section, frozen=True, kw_only=True):

@@ -20,7 +20,7 @@ from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.anchor.verification.lock_monitor import LockMonitor
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.map.null_model import DEFAULT_NULL, VERSION, NullModel
-from terrafix.messages import MapMatch, MapPose, SearchState, SearchStep, Verdict
+from terrafix.messages import Health, MapMatch, MapPose, SearchState, SearchStep, ThermalBand, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, texture, view
 
@@ -38,12 +38,53 @@ def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TR
     return answer
 
 
+def health(band: ThermalBand) -> Health:
+    return Health(t_ns=0, band=band, temperature_c=90.0, throttled=False, disk_free_mb=None, cause="test")
+
+
 def test_a_right_position_is_tracked_with_accepted_poses(ground: np.ndarray) -> None:
     node, frames = started(ground)
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
     result = match(node, 1, 10.0)
     assert result.verdict is Verdict.ACCEPTED and not result.position_only and not result.search.relocalized
     assert (result.search.step, result.search.sigma_m) == (SearchStep.NORMAL, 0.0)
+
+
+@pytest.mark.parametrize(("band", "every"), [(ThermalBand.NORMAL, 1), (ThermalBand.HOT, 2), (ThermalBand.CRITICAL, 4)])
+def test_a_hot_computer_matches_one_frame_of_several(ground: np.ndarray, band: ThermalBand, every: int) -> None:
+    node, frames = started(ground)
+    assert list(node.on(health(band))) == []
+    verdicts = []
+    for i in range(1, 9):
+        frames.put(i, view(ground, PINHOLE, R, TRUE_M))
+        result = match(node, i, 10.0)
+        verdicts.append(result.verdict)
+        assert (result.pose is None) is (result.verdict is Verdict.THROTTLED)
+    assert verdicts == [Verdict.ACCEPTED if i % every == 0 else Verdict.THROTTLED for i in range(1, 9)]
+    list(node.on(health(ThermalBand.NORMAL)))
+    frames.put(9, view(ground, PINHOLE, R, TRUE_M))
+    assert match(node, 9, 10.0).verdict is Verdict.ACCEPTED
+
+
+def test_the_belief_moves_by_odometry_while_frames_are_skipped(ground: np.ndarray) -> None:
+    node, frames = started(ground)
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    assert match(node, 1, 10.0).verdict is Verdict.ACCEPTED
+    list(node.on(health(ThermalBand.CRITICAL)))
+    for i in range(2, 6):
+        at_m = TRUE_M + np.array([6.0 * (i - 1), 0.0, 0.0])
+        frames.put(i, view(ground, PINHOLE, R, at_m))
+        result = match(node, i, 10.0, at_m=at_m, step_m=6.0)
+    assert result.verdict is Verdict.ACCEPTED
+    assert np.linalg.norm(np.array(position_of(result)) - at_m) < 3.0
+
+
+def test_a_search_of_a_hot_computer_stays_lost_in_the_frames_that_it_skips(ground: np.ndarray) -> None:
+    node, frames = started(ground, start_sigma_m=5000.0)
+    list(node.on(health(ThermalBand.HOT)))
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    result = match(node, 1, 100.0)
+    assert (result.verdict, result.search.sigma_m) == (Verdict.LOST, LOST_SIGMA_M)
 
 
 def test_without_a_single_patch_pose_the_patch_consensus_gives_the_pose(

@@ -19,11 +19,13 @@ from terrafix.core.errors import ModelError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import (
+    Health,
     MapMatch,
     Message,
     ModelChange,
     ModelEvent,
     SearchStep,
+    ThermalBand,
     Verdict,
 )
 from terrafix_engines.features import open_describer
@@ -100,6 +102,18 @@ def test_only_consecutive_failures_count(tmp_path: Path, ground: np.ndarray) -> 
     assert match.matcher == "xfeat"
     match, events = flight.frame(BLUE)
     assert events[-1].change is ModelChange.GIVEN_UP
+
+
+def test_a_learned_model_is_suspended_while_the_thermal_band_is_critical(tmp_path: Path, ground: np.ndarray) -> None:
+    flight = Flight(tmp_path, ground)
+    changes = []
+    for band in (ThermalBand.HOT, ThermalBand.CRITICAL, ThermalBand.CRITICAL, ThermalBand.NORMAL):
+        health = Health(t_ns=0, band=band, temperature_c=96.0, throttled=False, disk_free_mb=None, cause="test")
+        list(flight.node.on(health))
+        match, events = flight.frame(flight.seen)
+        changes.append((match.matcher, [event.change for event in events]))
+    suspended, resumed = [ModelChange.SUSPENDED], [ModelChange.RESUMED]
+    assert changes == [("xfeat", []), ("gradient", suspended), ("gradient", []), ("xfeat", resumed)]
 
 
 def test_a_failed_provider_is_published(tmp_path: Path, ground: np.ndarray) -> None:

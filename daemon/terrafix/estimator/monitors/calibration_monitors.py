@@ -25,7 +25,14 @@ HEADING_SIGMA_RAD, HEIGHT_SIGMA_SHARE = math.radians(10.0), 0.05
 YAW_NOISE_RAD = math.radians(3.0)  # 1-sigma of the heading of one pose against the reported one [tuned]
 REPORT_CHANGE = 0.2  # relative change of a factor or an angle after which a fault is reported again [tuned]
 # Verdicts on frames that were not correlated with the map.
-NOT_CORRELATED = (Verdict.BAD_IMAGE, Verdict.NO_FEATURES, Verdict.NO_PREDICTION, Verdict.OUTSIDE_MAP, Verdict.TOO_LOW)
+NOT_CORRELATED = (
+    Verdict.BAD_IMAGE,
+    Verdict.NO_FEATURES,
+    Verdict.NO_PREDICTION,
+    Verdict.OUTSIDE_MAP,
+    Verdict.TOO_LOW,
+    Verdict.THROTTLED,
+)
 
 
 @dataclass(frozen=True)

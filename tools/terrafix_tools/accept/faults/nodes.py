@@ -62,17 +62,17 @@ class FrameNames:
 
 
 class HotComputer:
-    """An estimator that receives a Health message with each frame, with throttling in ``span``; these are recorded."""
+    """An estimator that receives a Health message with each frame, with ``band`` in ``span``; they are published."""
 
-    def __init__(self, estimator: Node, span: Span) -> None:
-        self._estimator, self._span = estimator, span
+    def __init__(self, estimator: Node, span: Span, band: ThermalBand = ThermalBand.CRITICAL) -> None:
+        self._estimator, self._span, self._band = estimator, span, band
 
     def on(self, message: Message) -> Iterable[Message]:
         if isinstance(message, Frame):
             hot = self._span.has(message.t_ns / 1e9)
             health = Health(
                 t_ns=message.t_ns,
-                band=ThermalBand.CRITICAL if hot else ThermalBand.NORMAL,
+                band=self._band if hot else ThermalBand.NORMAL,
                 temperature_c=HOT_C if hot else 60.0,
                 throttled=hot,
                 disk_free_mb=None,
