@@ -7,8 +7,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from accept_case import FrameCase, evidence, file_of
+from accept_case import STEP_S, FrameCase, evidence, file_of
 from terrafix.core.pose import exp_so3
+from terrafix.link.ground_station import prior_request
 from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
@@ -66,12 +67,51 @@ def test_an_accepted_wrong_fix_breaks_the_floor(tmp_path: Path) -> None:
     assert of.error_after_wrong(found).value == pytest.approx(77.0, abs=0.1)
 
 
+GAPS = Marks(breaks_s=(2.0, 4.0))  # frames 0-3, 4-7, 8-11
+
+
+def linked(frames: list[FrameCase], keyframes: list[int]) -> list[FrameCase]:
+    """``keyframes``: of the odometry of each frame; its own number for the first frame of a fragment."""
+    return [replace(frame, keyframe_id=keyframe) for frame, keyframe in zip(frames, keyframes, strict=True)]
+
+
 def test_fragments_are_judged_separately(tmp_path: Path) -> None:
-    marks = Marks(breaks_s=(2.0, 4.0))  # frames 0-3, 4-7, 8-11
     frames = [GOOD] * 4 + [replace(GOOD, fixed=False, error_m=90.0)] * 4 + [GOOD] * 3 + [LOST]
-    found = evidence(tmp_path, frames, marks)
+    found = evidence(tmp_path, linked(frames, [0] * 4 + [4] * 4 + [8] * 4), GAPS)
     assert of.fragments_localised(found).value == pytest.approx(2 / 3)
     assert of.worst_fragment(found).value == 0.0
+
+
+def test_a_gap_that_odometry_bridges_counts_as_a_fragment_that_does_not_survive(tmp_path: Path) -> None:
+    begun = evidence(tmp_path / "begun", linked([GOOD] * 12, [0] * 4 + [4] * 4 + [8] * 4), GAPS)
+    assert judge("a", ("fragments",), begun)[0].verdict is Verdict.PASS
+    bridged = evidence(tmp_path / "bridged", linked([GOOD] * 12, [0] * 4 + [3, 4, 4, 4] + [8] * 4), GAPS)
+    row = judge("a", ("fragments",), bridged)[0]
+    assert (row.measured, row.verdict) == (pytest.approx(2 / 3), Verdict.BELOW)
+    assert row.why.startswith("2 of 3; 1 begun after 2 gaps")
+
+
+def test_a_fragment_counts_where_odometry_begins_it_and_not_where_the_scenario_has_its_gap(tmp_path: Path) -> None:
+    gap = Marks(breaks_s=(2.0,))
+    elsewhere = evidence(tmp_path / "a", linked([GOOD] * 14, [0] * 11 + [11] * 3), gap)  # at 5.5 s
+    assert of.fragments_localised(elsewhere).value == pytest.approx(2 / 3)
+    # Without a mark: two fragments, of which the second one has no map fix.
+    unfixed = [GOOD] * 6 + [replace(GOOD, fixed=False)] * 4
+    unmarked = evidence(tmp_path / "b", linked(unfixed, [0] * 6 + [6] * 4))
+    assert of.fragments_localised(unmarked).value == pytest.approx(1 / 2)
+
+
+def test_a_fragment_begins_at_the_first_of_two_frames_that_failed_and_match_each_other(tmp_path: Path) -> None:
+    failed = replace(GOOD, odometry=Answer.FEW_INLIERS)
+    frames = [GOOD] * 4 + [failed] + [GOOD] * 7
+    found = evidence(tmp_path, linked(frames, [0] * 4 + [0, 4, 5, 5] + [5] * 4), Marks(breaks_s=(2.0,)))
+    assert of.fragments_localised(found).why.startswith("2 of 2; 1 begun after 1 gaps")
+
+
+def test_a_single_frame_without_odometry_is_no_fragment(tmp_path: Path) -> None:
+    foreign = replace(GOOD, odometry=Answer.FEW_INLIERS, fixed=False)
+    found = evidence(tmp_path, [GOOD] * 4 + [foreign] + [GOOD] * 4)
+    assert of.fragments_localised(found).why.startswith("1 of 1")
 
 
 def test_the_delay_of_the_label_change_over_unmatchable_ground(tmp_path: Path) -> None:
@@ -168,6 +208,51 @@ def test_a_lost_flight_must_request_a_position(tmp_path: Path, monkeypatch: pyte
         assert (found.value, found.verdict) == (None, None) and "never lost" in found.why
     monkeypatch.setattr(PriorRequest, "due", lambda *_: "")
     assert of.prior_request_delay_s(evidence(tmp_path / "c", lost)).verdict is Verdict.BELOW
+
+
+def test_a_request_for_a_position_where_nothing_was_lost_breaks_the_floor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flights = {"known": [FrameCase()] * 10, "lost later": [FrameCase()] * 10 + [FrameCase(sigma_m=800.0)] * 10}
+    monkeypatch.setattr(PriorRequest, "due", lambda *_: "send a hint")
+    for name, frames in flights.items():
+        row = judge("a", ("asks",), evidence(tmp_path / name, frames))[0]
+        assert row.verdict is Verdict.BELOW and "requests without need, the first 0 s into the flight" in row.why
+
+
+def without_fix(from_frame: int, frames: int) -> list[FrameCase]:
+    """Two frames a second at 20 m/s, accurate, whose map fixes end at ``from_frame``."""
+    step_ms = round(1000 * STEP_S)
+    return [FrameCase(fixed=i <= from_frame, anchor_age_ms=step_ms * max(i - from_frame, 0)) for i in range(frames)]
+
+
+@pytest.mark.parametrize(("from_frame", "needed_s"), [(20, 45.0), (400, 250.0), (1000, 600.0)])
+def test_a_request_is_needed_after_a_fifth_of_the_route_and_35_s_without_a_map_fix(
+    tmp_path: Path, from_frame: int, needed_s: float
+) -> None:
+    found = evidence(tmp_path, without_fix(from_frame, 1250))
+    estimates = [estimate for frame in found.frames for estimate in frame.estimates]
+    assert of.request_is_needed(estimates).index(True) * STEP_S == needed_s  # 2 km at the latest: 100 s at 20 m/s
+    row = judge("a", ("asks",), found)[0]
+    assert (row.measured, row.verdict) == (0.0, Verdict.PASS)
+
+
+def test_a_request_before_a_fifth_of_the_route_without_a_map_fix_breaks_the_floor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prior_request, "UNANCHORED_SHARE", 0.15)
+    row = judge("a", ("asks",), evidence(tmp_path, without_fix(400, 600)))[0]
+    assert row.verdict is Verdict.BELOW and "requests without need" in row.why
+
+
+def test_a_request_that_does_not_come_after_a_fifth_of_the_route_without_a_map_fix_breaks_the_floor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prior_request, "UNANCHORED_SHARE", 0.3)
+    assert judge("a", ("asks",), evidence(tmp_path / "late", without_fix(400, 600)))[0].verdict is Verdict.BELOW
+    monkeypatch.setattr(prior_request, "UNANCHORED_SHARE", 1.1)
+    monkeypatch.setattr(prior_request, "MAX_UNANCHORED_M", 1e6)
+    assert judge("a", ("asks",), evidence(tmp_path / "never", without_fix(20, 120)))[0].verdict is Verdict.BELOW
 
 
 def test_bounds_and_their_texts() -> None:

@@ -46,7 +46,7 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
         "AC-4", "frames within 50 m, worst fragment", "%", _least(0.80), _least(0.99), of.worst_fragment),
     "not localised": ("AC-5", "frames not localised", "%", _most(0.10), _most(0.01), of.not_localised),
     "says so": ("AC-6", "time until it says that the map no longer holds it", "s", _most(2.0), None, of.label_change_s),
-    "asks": ("AC-6", "asks for a coarse position: late by", "s", _most(2.0), None, of.prior_request_delay_s),
+    "asks": ("AC-6", "asks for a position only when it must: late by", "s", _most(2.0), None, of.prior_request_delay_s),
     "latency": ("AC-7", "image to position, p95", "ms", _most(400.0), _most(120.0), of.latency_p95),
     "both estimates": ("AC-8", "frames with both, immediate and refined", "%", _least(0.80), None, of.both_estimates),
     "odometry": ("AC-9", "frames registered by odometry", "%", _least(0.95), None, of.odometry_rate),
