@@ -14,9 +14,9 @@ from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.measuring import measures as of
+from terrafix_tools.accept.measuring.consistency import nees_band
 from terrafix_tools.accept.measuring.criteria import CRITERIA, judge
-from terrafix_tools.accept.measuring.results import Bounds, Marks, Span, Verdict, with_unit
-from terrafix_tools.accept.table import nees_band
+from terrafix_tools.accept.measuring.results import Bounds, JudgedRow, Marks, Span, Verdict, with_unit
 
 GOOD = FrameCase()
 LOST = FrameCase(
@@ -34,7 +34,6 @@ def test_a_good_flight_holds_every_floor(tmp_path: Path) -> None:
         "both estimates",
         "odometry",
         "claims",
-        "coverage",
         "memory",
     )
     assert {row.verdict for row in judge("a", names, found)} == {Verdict.PASS}
@@ -264,8 +263,38 @@ def test_bounds_and_their_texts() -> None:
 
 def test_the_nees_band_agrees_with_simulated_draws() -> None:
     """Means of n squared Mahalanobis distances in two dimensions, by simulation."""
-    draws = (np.random.default_rng(3).normal(size=(40_000, 12, 2)) ** 2).sum(axis=2).mean(axis=1)
-    assert nees_band(12) == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.02)
+    for count in (1, 2, 12):
+        draws = (np.random.default_rng(3).normal(size=(40_000, count, 2)) ** 2).sum(axis=2).mean(axis=1)
+        assert nees_band(count) == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.05)
+
+
+def test_the_nees_band_of_one_draw_is_that_of_chi_square_with_two_degrees_of_freedom() -> None:
+    assert nees_band(1) == pytest.approx([-2.0 * np.log(0.975), -2.0 * np.log(0.025)])
+
+
+def coverage_row(tmp_path: Path, frames: list[FrameCase]) -> JudgedRow:
+    return judge("a", ("coverage",), evidence(tmp_path, frames))[0]
+
+
+def test_one_flight_that_is_inside_the_95_percent_ellipse_altogether_is_not_decidable(tmp_path: Path) -> None:
+    row = coverage_row(tmp_path, [replace(GOOD, error_m=4.0)] * 20)
+    assert (row.measured, row.verdict, row.floor) == (1.0, Verdict.NOT_MEASURABLE, "93 to 98 %")
+    assert "not decidable in one flight" in row.why
+
+
+def test_one_flight_within_the_band_of_coverage_passes(tmp_path: Path) -> None:
+    frames = [replace(GOOD, error_m=4.0)] * 19 + [replace(GOOD, error_m=13.0)]
+    assert coverage_row(tmp_path, frames).verdict is Verdict.PASS
+
+
+def test_one_flight_with_less_coverage_breaks_the_floor(tmp_path: Path) -> None:
+    row = coverage_row(tmp_path, [replace(GOOD, error_m=4.0)] * 18 + [replace(GOOD, error_m=13.0)] * 2)
+    assert row.verdict is Verdict.BELOW and row.why.endswith("too narrow")
+
+
+def test_one_flight_with_claims_that_one_consistent_flight_in_a_thousand_has_breaks_the_floor(tmp_path: Path) -> None:
+    row = coverage_row(tmp_path, [replace(GOOD, error_m=0.2)] * 20)  # of 5 m; the limit is 0.22 m
+    assert row.verdict is Verdict.BELOW and row.why.endswith("too wide")
 
 
 def test_every_row_has_a_requirement_number() -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from terrafix_tools.accept.false_inputs import integrity, loop_integrity
 from terrafix_tools.accept.measuring import measures as of
+from terrafix_tools.accept.measuring.consistency import COVERAGE
 from terrafix_tools.accept.measuring.evidence import Evidence
 from terrafix_tools.accept.measuring.results import Bounds, JudgedRow, Measured, Verdict
 
@@ -55,7 +56,7 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "drift": ("AC-11", "drift between map fixes, worst", "m", _most(100.0), _most(50.0), of.drift),
     "drift share": ("AC-11", "drift by distance, longest way without a fix", "%", None, _most(0.005), of.drift_share),
     "claims": ("AC-12", "estimates with covariance, label, mode, age of fix", "%", ALL, None, of.complete_estimates),
-    "coverage": ("AC-13", "truth inside the 95 % ellipse", "%", _least(0.93), None, of.coverage),
+    "coverage": ("AC-13", "truth inside the 95 % ellipse", "%", COVERAGE, None, of.coverage),
     "false fixes": ("AC-13", "frames wrong by over 50 m and sure of it", "", _most(0.0), None, of.false_fixes),
     "interval": ("AC-14", "GPS_INPUT interval, p99", "ms", _most(120.0), None, of.gps_interval_p99_ms),
     "gap": ("AC-14", "longest gap between GPS_INPUT", "ms", _most(245.0), None, of.gps_longest_gap_ms),

@@ -9,6 +9,7 @@ from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, NavEstimate, SearchState, SearchStep, SourceLabel
 from terrafix.messages import Verdict as Answer
+from terrafix_tools.accept.measuring.consistency import FLIGHT_CONFIDENCE, judge_claims
 from terrafix_tools.accept.measuring.epipolar import reprojection_error
 from terrafix_tools.accept.measuring.evidence import Evidence, FrameEvidence
 from terrafix_tools.accept.measuring.results import Measured, Span, Verdict
@@ -178,10 +179,14 @@ def complete_estimates(e: Evidence) -> Measured:
 
 
 def coverage(e: Evidence) -> Measured:
-    """Errors of one flight are correlated (constant error of the map), so that the upper limit applies to all flights
-    together."""
-    nees = e.metrics["mean_nees"]
-    return Measured(e.metrics["ellipse95_coverage"], "" if nees is None else f"mean NEES {nees:.2f}")
+    """One flight is one draw of the map's error: it may be inside altogether, which all flights together decide."""
+    inside, nees = e.metrics["ellipse95_coverage"], e.metrics["mean_nees"]
+    if inside is None:
+        return Measured(None, "no position")
+    if nees is None:
+        return Measured(inside, "no valid covariance", Verdict.BELOW)
+    verdict, why = judge_claims(inside, nees, 1, FLIGHT_CONFIDENCE)
+    return Measured(inside, why, verdict)
 
 
 def false_fixes(e: Evidence) -> Measured:
