@@ -18,6 +18,10 @@ pytestmark = pytest.mark.slow
 DataSet = Callable[[str], Path]
 FIRST_FRAMES = 60
 PROCESSORS_M = 0.35  # change of the difference of two median errors between processors
+# 2.5 % quantile of chi-square with 2 degrees of freedom: the least mean NEES of a flight with one independent error
+LEAST_NEES_OF_ONE_DRAW = 0.0506
+AC_9_REGISTERED = 0.95  # share of the frames that odometry is required to register
+TOWN_A_REGISTERED = 0.70  # what it keeps on town-a, photos with 55 % overlap; measured: 23 of 30
 FEW_FRAMES = 50  # below this, the offset of the map determines the median error
 
 
@@ -62,7 +66,9 @@ def check_floors(result: dict[str, Any], flight: Path, out: Path) -> None:
     assert result["within_20m"] >= 0.80
     assert result["false_fixes"] == 0
     assert result["covariance_invalid"] == 0
-    assert 0.90 <= result["ellipse95_coverage"] <= 1.0
+    # Inside 100 % is consistent in one flight, whose map has one error. Claims that are far too wide show in the NEES.
+    assert result["ellipse95_coverage"] >= 0.90
+    assert result["mean_nees"] >= LEAST_NEES_OF_ONE_DRAW
     for limit in (20, 50):
         assert result[f"refined_within_{limit}m"] >= result[f"within_{limit}m"]
     # Medians change by decimetres with the noise of the truth (4 to 7 m). A smaller scatter shows the common error of
@@ -95,15 +101,27 @@ def check_none_unlocalised_after_the_first_anchor(out: Path) -> None:
     assert all(row["lat_deg"] for row in rows[first:])
 
 
-@pytest.mark.parametrize("name", ["village-1", "town-a"])
-def test_real_flights_meet_the_limits_without_weights(name: str, data_set: DataSet, tmp_path: Path) -> None:
+def check_without_weights(name: str, map_name: str, data_set: DataSet, out: Path) -> float:
+    """The limits of every flight and of its finalised track -> share of the frames that odometry registers (AC-9)."""
     flight = data_set(f"flights/{name}")
-    data_set("maps/village-2014-01.tif" if name == "village-1" else "maps/town.tif")
-    result = run_flight(flight, tmp_path)
-    check_floors(result, flight, tmp_path)
-    check_none_unlocalised_after_the_first_anchor(tmp_path)
-    assert result["odometry_rate"] > 0.95 or name == "town-a"  # photos with 55 % overlap
-    check_finalised(flight, tmp_path, result["refined_median_m"])
+    data_set(f"maps/{map_name}")
+    result = run_flight(flight, out)
+    check_floors(result, flight, out)
+    check_none_unlocalised_after_the_first_anchor(out)
+    check_finalised(flight, out, result["refined_median_m"])
+    return float(result["odometry_rate"])
+
+
+def test_village_1_meets_the_limits_without_weights(data_set: DataSet, tmp_path: Path) -> None:
+    assert check_without_weights("village-1", "village-2014-01.tif", data_set, tmp_path) > AC_9_REGISTERED
+
+
+def test_town_a_without_weights_meets_the_limits_but_not_ac_9_and_keeps_70_percent_of_registered_frames(
+    data_set: DataSet, tmp_path: Path
+) -> None:
+    registered = check_without_weights("town-a", "town.tif", data_set, tmp_path)
+    # Fails also when the requirement is met: then this test, its name and docs/acceptance.md are to be changed.
+    assert TOWN_A_REGISTERED <= registered <= AC_9_REGISTERED
 
 
 @pytest.mark.parametrize("name", ["village-1", "town-a"])

@@ -50,6 +50,8 @@ class FrameCase:
     predicted_error_m: float = 0.0  # of the prediction before the map fix
     mode: CovarianceMode = CovarianceMode.MARGINALS
     odometry: Verdict = Verdict.ACCEPTED
+    keyframe_id: int = 0  # of its odometry
+    anchor_age_ms: int = 0
 
 
 def file_of(i: int) -> str:
@@ -101,7 +103,9 @@ def _frame(i: int, case: FrameCase) -> list[Message]:
     cov = tuple(float(v) for v in (np.eye(6) * case.sigma_m**2).ravel())
     return [
         Frame(t_ns=t_ns, frame_id=i, file=file_of(i), width=960, height=540),
-        Odometry(t_ns=t_ns, frame_id=i, keyframe_id=0, verdict=case.odometry),
+        Odometry(
+            t_ns=t_ns, frame_id=i, keyframe_id=case.keyframe_id, verdict=case.odometry,
+            two_view=[(0.0, 0.0, 0.0, 0.0)] if i != case.keyframe_id and case.odometry is Verdict.ACCEPTED else []),
         MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="odometry", verdict=case.odometry),
         Prediction(
             t_ns=t_ns, frame_id=i, p_c_in_w_m=(e_m + case.predicted_error_m, n_m, 100.0), q_w_c=LOOKING_DOWN, cov=cov,
@@ -112,5 +116,6 @@ def _frame(i: int, case: FrameCase) -> list[Message]:
             t_ns=t_ns - round(case.late_s * 1e9), frame_id=i, lat_deg=lat_deg, lon_deg=lon_deg,
             alt_amsl_m=100.0, agl_m=100.0,
             velocity_enu_mps=(0.0, 20.0, 0.0), velocity_sigma_mps=1.0, q_w_b=(1.0, 0.0, 0.0, 0.0), cov=cov,
-            source_label=case.label, covariance_mode=case.mode, last_anchor_age_ms=0, emitted_at_ns=t_ns),
+            source_label=case.label, covariance_mode=case.mode, last_anchor_age_ms=case.anchor_age_ms,
+            emitted_at_ns=t_ns),
     ]  # fmt: skip

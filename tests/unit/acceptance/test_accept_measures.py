@@ -7,15 +7,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from accept_case import FrameCase, evidence, file_of
+from accept_case import STEP_S, FrameCase, evidence, file_of
 from terrafix.core.pose import exp_so3
+from terrafix.link.ground_station import prior_request
 from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.measuring import measures as of
+from terrafix_tools.accept.measuring.consistency import nees_band
 from terrafix_tools.accept.measuring.criteria import CRITERIA, judge
-from terrafix_tools.accept.measuring.results import Bounds, Marks, Span, Verdict, with_unit
-from terrafix_tools.accept.table import nees_band
+from terrafix_tools.accept.measuring.results import Bounds, JudgedRow, Marks, Span, Verdict, with_unit
 
 GOOD = FrameCase()
 LOST = FrameCase(
@@ -33,7 +34,6 @@ def test_a_good_flight_holds_every_floor(tmp_path: Path) -> None:
         "both estimates",
         "odometry",
         "claims",
-        "coverage",
         "memory",
     )
     assert {row.verdict for row in judge("a", names, found)} == {Verdict.PASS}
@@ -66,12 +66,51 @@ def test_an_accepted_wrong_fix_breaks_the_floor(tmp_path: Path) -> None:
     assert of.error_after_wrong(found).value == pytest.approx(77.0, abs=0.1)
 
 
+GAPS = Marks(breaks_s=(2.0, 4.0))  # frames 0-3, 4-7, 8-11
+
+
+def linked(frames: list[FrameCase], keyframes: list[int]) -> list[FrameCase]:
+    """``keyframes``: of the odometry of each frame; its own number for the first frame of a fragment."""
+    return [replace(frame, keyframe_id=keyframe) for frame, keyframe in zip(frames, keyframes, strict=True)]
+
+
 def test_fragments_are_judged_separately(tmp_path: Path) -> None:
-    marks = Marks(breaks_s=(2.0, 4.0))  # frames 0-3, 4-7, 8-11
     frames = [GOOD] * 4 + [replace(GOOD, fixed=False, error_m=90.0)] * 4 + [GOOD] * 3 + [LOST]
-    found = evidence(tmp_path, frames, marks)
+    found = evidence(tmp_path, linked(frames, [0] * 4 + [4] * 4 + [8] * 4), GAPS)
     assert of.fragments_localised(found).value == pytest.approx(2 / 3)
     assert of.worst_fragment(found).value == 0.0
+
+
+def test_a_gap_that_odometry_bridges_counts_as_a_fragment_that_does_not_survive(tmp_path: Path) -> None:
+    begun = evidence(tmp_path / "begun", linked([GOOD] * 12, [0] * 4 + [4] * 4 + [8] * 4), GAPS)
+    assert judge("a", ("fragments",), begun)[0].verdict is Verdict.PASS
+    bridged = evidence(tmp_path / "bridged", linked([GOOD] * 12, [0] * 4 + [3, 4, 4, 4] + [8] * 4), GAPS)
+    row = judge("a", ("fragments",), bridged)[0]
+    assert (row.measured, row.verdict) == (pytest.approx(2 / 3), Verdict.BELOW)
+    assert row.why.startswith("2 of 3; 1 begun after 2 gaps")
+
+
+def test_a_fragment_counts_where_odometry_begins_it_and_not_where_the_scenario_has_its_gap(tmp_path: Path) -> None:
+    gap = Marks(breaks_s=(2.0,))
+    elsewhere = evidence(tmp_path / "a", linked([GOOD] * 14, [0] * 11 + [11] * 3), gap)  # at 5.5 s
+    assert of.fragments_localised(elsewhere).value == pytest.approx(2 / 3)
+    # Without a mark: two fragments, of which the second one has no map fix.
+    unfixed = [GOOD] * 6 + [replace(GOOD, fixed=False)] * 4
+    unmarked = evidence(tmp_path / "b", linked(unfixed, [0] * 6 + [6] * 4))
+    assert of.fragments_localised(unmarked).value == pytest.approx(1 / 2)
+
+
+def test_a_fragment_begins_at_the_first_of_two_frames_that_failed_and_match_each_other(tmp_path: Path) -> None:
+    failed = replace(GOOD, odometry=Answer.FEW_INLIERS)
+    frames = [GOOD] * 4 + [failed] + [GOOD] * 7
+    found = evidence(tmp_path, linked(frames, [0] * 4 + [0, 4, 5, 5] + [5] * 4), Marks(breaks_s=(2.0,)))
+    assert of.fragments_localised(found).why.startswith("2 of 2; 1 begun after 1 gaps")
+
+
+def test_a_single_frame_without_odometry_is_no_fragment(tmp_path: Path) -> None:
+    foreign = replace(GOOD, odometry=Answer.FEW_INLIERS, fixed=False)
+    found = evidence(tmp_path, [GOOD] * 4 + [foreign] + [GOOD] * 4)
+    assert of.fragments_localised(found).why.startswith("1 of 1")
 
 
 def test_the_delay_of_the_label_change_over_unmatchable_ground(tmp_path: Path) -> None:
@@ -170,6 +209,51 @@ def test_a_lost_flight_must_request_a_position(tmp_path: Path, monkeypatch: pyte
     assert of.prior_request_delay_s(evidence(tmp_path / "c", lost)).verdict is Verdict.BELOW
 
 
+def test_a_request_for_a_position_where_nothing_was_lost_breaks_the_floor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flights = {"known": [FrameCase()] * 10, "lost later": [FrameCase()] * 10 + [FrameCase(sigma_m=800.0)] * 10}
+    monkeypatch.setattr(PriorRequest, "due", lambda *_: "send a hint")
+    for name, frames in flights.items():
+        row = judge("a", ("asks",), evidence(tmp_path / name, frames))[0]
+        assert row.verdict is Verdict.BELOW and "requests without need, the first 0 s into the flight" in row.why
+
+
+def without_fix(from_frame: int, frames: int) -> list[FrameCase]:
+    """Two frames a second at 20 m/s, accurate, whose map fixes end at ``from_frame``."""
+    step_ms = round(1000 * STEP_S)
+    return [FrameCase(fixed=i <= from_frame, anchor_age_ms=step_ms * max(i - from_frame, 0)) for i in range(frames)]
+
+
+@pytest.mark.parametrize(("from_frame", "needed_s"), [(20, 45.0), (400, 250.0), (1000, 600.0)])
+def test_a_request_is_needed_after_a_fifth_of_the_route_and_35_s_without_a_map_fix(
+    tmp_path: Path, from_frame: int, needed_s: float
+) -> None:
+    found = evidence(tmp_path, without_fix(from_frame, 1250))
+    estimates = [estimate for frame in found.frames for estimate in frame.estimates]
+    assert of.request_is_needed(estimates).index(True) * STEP_S == needed_s  # 2 km at the latest: 100 s at 20 m/s
+    row = judge("a", ("asks",), found)[0]
+    assert (row.measured, row.verdict) == (0.0, Verdict.PASS)
+
+
+def test_a_request_before_a_fifth_of_the_route_without_a_map_fix_breaks_the_floor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prior_request, "UNANCHORED_SHARE", 0.15)
+    row = judge("a", ("asks",), evidence(tmp_path, without_fix(400, 600)))[0]
+    assert row.verdict is Verdict.BELOW and "requests without need" in row.why
+
+
+def test_a_request_that_does_not_come_after_a_fifth_of_the_route_without_a_map_fix_breaks_the_floor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prior_request, "UNANCHORED_SHARE", 0.3)
+    assert judge("a", ("asks",), evidence(tmp_path / "late", without_fix(400, 600)))[0].verdict is Verdict.BELOW
+    monkeypatch.setattr(prior_request, "UNANCHORED_SHARE", 1.1)
+    monkeypatch.setattr(prior_request, "MAX_UNANCHORED_M", 1e6)
+    assert judge("a", ("asks",), evidence(tmp_path / "never", without_fix(20, 120)))[0].verdict is Verdict.BELOW
+
+
 def test_bounds_and_their_texts() -> None:
     assert Bounds(0.93, 0.98).holds(0.93) and not Bounds(0.93, 0.98).holds(0.985)
     assert Bounds(low=0.8).text("%") == ">= 80 %" and Bounds(high=50.0).text("m") == "<= 50 m"
@@ -179,8 +263,38 @@ def test_bounds_and_their_texts() -> None:
 
 def test_the_nees_band_agrees_with_simulated_draws() -> None:
     """Means of n squared Mahalanobis distances in two dimensions, by simulation."""
-    draws = (np.random.default_rng(3).normal(size=(40_000, 12, 2)) ** 2).sum(axis=2).mean(axis=1)
-    assert nees_band(12) == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.02)
+    for count in (1, 2, 12):
+        draws = (np.random.default_rng(3).normal(size=(40_000, count, 2)) ** 2).sum(axis=2).mean(axis=1)
+        assert nees_band(count) == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.05)
+
+
+def test_the_nees_band_of_one_draw_is_that_of_chi_square_with_two_degrees_of_freedom() -> None:
+    assert nees_band(1) == pytest.approx([-2.0 * np.log(0.975), -2.0 * np.log(0.025)])
+
+
+def coverage_row(tmp_path: Path, frames: list[FrameCase]) -> JudgedRow:
+    return judge("a", ("coverage",), evidence(tmp_path, frames))[0]
+
+
+def test_one_flight_that_is_inside_the_95_percent_ellipse_altogether_is_not_decidable(tmp_path: Path) -> None:
+    row = coverage_row(tmp_path, [replace(GOOD, error_m=4.0)] * 20)
+    assert (row.measured, row.verdict, row.floor) == (1.0, Verdict.NOT_MEASURABLE, "93 to 98 %")
+    assert "not decidable in one flight" in row.why
+
+
+def test_one_flight_within_the_band_of_coverage_passes(tmp_path: Path) -> None:
+    frames = [replace(GOOD, error_m=4.0)] * 19 + [replace(GOOD, error_m=13.0)]
+    assert coverage_row(tmp_path, frames).verdict is Verdict.PASS
+
+
+def test_one_flight_with_less_coverage_breaks_the_floor(tmp_path: Path) -> None:
+    row = coverage_row(tmp_path, [replace(GOOD, error_m=4.0)] * 18 + [replace(GOOD, error_m=13.0)] * 2)
+    assert row.verdict is Verdict.BELOW and row.why.endswith("too narrow")
+
+
+def test_one_flight_with_claims_that_one_consistent_flight_in_a_thousand_has_breaks_the_floor(tmp_path: Path) -> None:
+    row = coverage_row(tmp_path, [replace(GOOD, error_m=0.2)] * 20)  # of 5 m; the limit is 0.22 m
+    assert row.verdict is Verdict.BELOW and row.why.endswith("too wide")
 
 
 def test_every_row_has_a_requirement_number() -> None:

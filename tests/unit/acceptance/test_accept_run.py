@@ -46,13 +46,39 @@ def flights(nees: list[float]) -> list[Result]:
     return [result(f"s{i}", row(Verdict.PASS), nees=(value,) * 50) for i, value in enumerate(nees)]
 
 
-def nees_row(nees: list[float]) -> JudgedRow:
-    found = conclude(flights(nees), flight="", map_path="", quick=False, seed=1, whole=False)
+def nees_row(nees: list[float], seed: int | None = 1) -> JudgedRow:
+    """``seed`` None: scenarios of one given flight."""
+    found = conclude(flights(nees), flight="", map_path="", quick=False, seed=seed, whole=False)
     return next(r for r in found.rows if r.scenario == "all scenarios")
 
 
 def test_the_nees_is_not_judged_for_too_few_flights() -> None:
     assert nees_row([2.0, 1.0]).verdict is Verdict.NOT_MEASURABLE
+
+
+def test_flights_that_are_inside_altogether_are_decidable_once_there_are_enough_of_them() -> None:
+    some, many = nees_row([2.0] * 71), nees_row([2.0] * 72)  # 0.95^72 = 2.5 %
+    assert some.verdict is Verdict.NOT_MEASURABLE and "not decidable in 71 flights" in some.why
+    assert many.verdict is Verdict.BELOW and many.why.endswith("too wide")
+
+
+def test_claims_ten_times_wider_break_the_floor_of_the_run() -> None:
+    quantiles = [-2.0 * np.log(1.0 - (i + 0.5) / 20) for i in range(20)]  # of chi-square, 2 degrees of freedom
+    assert nees_row(quantiles).verdict is Verdict.PASS
+    for consistent in ([2.0], [2.0, 4.0], [0.5, 1.0, 2.0, 4.0], quantiles):
+        assert nees_row(consistent).verdict is not Verdict.BELOW
+        wide = nees_row([value / 100.0 for value in consistent])
+        assert wide.verdict is Verdict.BELOW and wide.why.endswith("too wide"), consistent
+
+
+def test_scenarios_over_one_given_map_are_one_draw_of_its_error() -> None:
+    assert nees_row([0.2] * 20).verdict is Verdict.BELOW
+    given = nees_row([0.2] * 20, seed=None)
+    assert (
+        given.verdict is Verdict.NOT_MEASURABLE and "not decidable in one flight, or several over one map" in given.why
+    )
+    wide = nees_row([0.002] * 20, seed=None)
+    assert wide.verdict is Verdict.BELOW and wide.why.endswith("too wide")
 
 
 def test_a_covariance_five_times_too_wide_breaks_the_floor() -> None:

@@ -203,7 +203,8 @@ IN_THE_LOOP = (
     "interval", "gap", "vehicle error", "failsafes",
 )  # fmt: skip
 BASELINE = (
-    *EVERYWHERE, "latency", "odometry", "odometry px", "map px", "drift", "drift share", "first position", "memory"
+    *EVERYWHERE, "latency", "odometry", "odometry px", "map px", "drift", "drift share", "first position", "memory",
+    "asks",
 )  # fmt: skip
 SCENARIOS: tuple[Scenario, ...] = (
     Scenario("baseline", "A flight without faults.", BASELINE, _as_it_is),

@@ -1,7 +1,6 @@
 """The whole table: rows of all scenarios and rows over all of them; acceptance.json and acceptance.md."""
 
 import json
-import math
 import statistics
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import msgspec
 
 from terrafix.core.errors import OutputError
 from terrafix_tools.accept.fly import Result
+from terrafix_tools.accept.measuring.consistency import COVERAGE, RUN_CONFIDENCE, judge_claims
 from terrafix_tools.accept.measuring.results import BROKEN, Bounds, JudgedRow, Verdict, with_unit
 from terrafix_tools.accept.page import page
 from terrafix_tools.bench.run import machine
@@ -17,10 +17,8 @@ from terrafix_tools.evaluate import ELLIPSE95
 
 NAME = "acceptance"
 OVERALL = "all scenarios"
-COVERAGE = Bounds(0.93, 0.98)
 MAX_WIDTH = Bounds(high=2.0)  # published 1-sigma over that of the error
-NEES_QUANTILES = (-1.959964, 1.959964)  # of the normal distribution: 2.5 and 97.5 %
-MIN_FLIGHTS = 5  # with fewer draws of the map's error the band of the NEES is too wide
+MIN_FLIGHTS = 5  # with fewer the median of the widths says little
 
 
 class Acceptance(msgspec.Struct, frozen=True, kw_only=True):
@@ -39,8 +37,10 @@ class Acceptance(msgspec.Struct, frozen=True, kw_only=True):
 def conclude(
     results: list[Result], *, flight: str, map_path: str, quick: bool, seed: int | None, whole: bool
 ) -> Acceptance:
-    """``whole``: all scenarios were selected; adds the rows that belong to no scenario."""
-    overall = [_coverage_row(results), _width_row(results)] + (_not_replayable() if whole else [])
+    """``seed``: of the generated world, where each scenario has a map error of its own; None: a given flight.
+    ``whole``: all scenarios were selected; adds the rows that belong to no scenario."""
+    overall = [_coverage_row(results, one_map=seed is None), _width_row(results)]
+    overall += _not_replayable() if whole else []
     rows = [row for result in results for row in result.rows] + overall
     return Acceptance(
         flight=flight,
@@ -54,20 +54,10 @@ def conclude(
     )
 
 
-def nees_band(flights: int) -> tuple[float, float]:
-    """95 % of the means of ``flights`` independent squared Mahalanobis distances with 2 degrees of freedom each.
+def _coverage_row(results: list[Result], *, one_map: bool) -> JudgedRow:
+    """AC-13 over all flights: every flight counts once, because its errors are correlated.
 
-    Chi-square quantiles by Wilson and Hilferty (1931), good to a few per mille from 10 degrees of freedom on."""
-    dof = 2.0 * flights
-    low, high = (
-        dof * max(0.0, 1.0 - 2.0 / (9.0 * dof) + z * math.sqrt(2.0 / (9.0 * dof))) ** 3 / flights
-        for z in NEES_QUANTILES
-    )
-    return low, high
-
-
-def _coverage_row(results: list[Result]) -> JudgedRow:
-    """AC-13 over all flights: every flight counts once, because its errors are correlated."""
+    ``one_map``: all flights are over the same map with the same error, one draw together."""
     flown = [r.nees for r in results if r.nees]
     row = {
         "scenario": OVERALL,
@@ -78,17 +68,13 @@ def _coverage_row(results: list[Result]) -> JudgedRow:
         "goal": "",
         "goal_met": None,
     }
-    if len(flown) < MIN_FLIGHTS:
-        why = f"{len(flown)} flights; {MIN_FLIGHTS} are the least that can tell"
+    if not flown:
+        why = "no flight with truth and true inputs"
         return JudgedRow(**row, measured=None, verdict=Verdict.NOT_MEASURABLE, why=why)  # type: ignore[arg-type]
     inside = sum(sum(v <= ELLIPSE95 for v in nees) / len(nees) for nees in flown) / len(flown)
     mean = sum(sum(nees) / len(nees) for nees in flown) / len(flown)
-    low, high = nees_band(len(flown))
-    holds = COVERAGE.holds(inside) and low <= mean <= high
-    why = f"{len(flown)} flights; mean NEES {mean:.2f}, its 95 % band {low:.2f} to {high:.2f}"
-    if not holds:
-        why += "; too wide" if mean < low or (mean <= high and inside > 0.98) else "; too narrow"
-    verdict = Verdict.PASS if holds else Verdict.BELOW
+    verdict, why = judge_claims(inside, mean, 1 if one_map else len(flown), RUN_CONFIDENCE)
+    why = f"{len(flown)} flights; {why}"
     return JudgedRow(**row, measured=round(inside, 6), verdict=verdict, why=why)  # type: ignore[arg-type]
 
 

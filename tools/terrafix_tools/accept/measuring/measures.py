@@ -1,21 +1,26 @@
 """One function per number of the acceptance table. It returns the measured value, or the reason for having none."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
-from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.link.ground_station.prior_request import PriorRequest
-from terrafix.messages import CovarianceMode, NavEstimate, SourceLabel
+from terrafix.messages import CovarianceMode, NavEstimate, SearchState, SearchStep, SourceLabel
 from terrafix.messages import Verdict as Answer
+from terrafix_tools.accept.measuring.consistency import FLIGHT_CONFIDENCE, judge_claims
 from terrafix_tools.accept.measuring.epipolar import reprojection_error
 from terrafix_tools.accept.measuring.evidence import Evidence, FrameEvidence
 from terrafix_tools.accept.measuring.results import Measured, Span, Verdict
 
 NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
 MIN_PATH_M = 100.0  # a relative drift over a shorter path has no meaning
-REQUEST_FRAMES, REQUEST_S = 3, 2.0  # AC-6
+UNKNOWN_M, REQUEST_FRAMES, REQUEST_S = 100.0, 3, 2.0  # AC-6: 1-sigma of an unknown position, for so long
+# AC-6: time without a map fix, and the share of the route so far, or the way, that was flown in it
+NO_FIX_S, NO_FIX_SHARE, NO_FIX_M = 35.0, 0.2, 2000.0
+ROUNDING_M = 0.1  # of a way at its limit
+BEGIN_FRAMES = 6  # PB-5: five frames are tried with the same local map before a new fragment starts
 SETTLE_S = 10.0  # after a marked span, until frames count as outside of it
 
 
@@ -48,14 +53,24 @@ def error_after_wrong(e: Evidence) -> Measured:
 
 
 def fragments_localised(e: Evidence) -> Measured:
-    """A fragment survives if it has a frame with a map fix within 50 m."""
-    parts = _fragments(e)
+    """Share of the fragments of odometry that have a map fix within 50 m, which joins them to the flight.
+
+    A gap of the scenario after which odometry begins no fragment counts as one without a map fix."""
+    parts, gaps = _fragments(e), e.marks.breaks_s
     alive = sum(any(f.fixed and _near(f) for f in part) for part in parts)
-    return Measured(alive / len(parts), f"{alive} of {len(parts)}")
+    begun = sum(_begins_within(e, parts[1:], a_s, b_s) for a_s, b_s in pairwise([*gaps, np.inf]))
+    total = len(parts) + len(gaps) - begun
+    steps = [state.step for state in e.searches]
+    named = f"new_fragment {steps.count(SearchStep.NEW_FRAGMENT)}, merge {steps.count(SearchStep.MERGE)}"
+    return Measured(alive / total, f"{alive} of {total}; {begun} begun after {len(gaps)} gaps; search: {named}")
 
 
 def worst_fragment(e: Evidence) -> Measured:
-    shares = [float(np.mean([_near(f) for f in part if f.compared])) for part in _fragments(e)]
+    """Of the fragments of odometry."""
+    known = [[_near(f) for f in part if f.compared] for part in _fragments(e)]
+    shares = [float(np.mean(part)) for part in known if part]
+    if not shares:
+        return Measured(None, "no frame with truth")
     return Measured(min(shares), ", ".join(f"{100 * s:.0f} %" for s in shares))
 
 
@@ -79,23 +94,32 @@ def label_change_s(e: Evidence) -> Measured:
 
 
 def prior_request_delay_s(e: Evidence) -> Measured:
-    """Delay of the request for a position: from the condition of AC-6 (position unknown for 3 frames and 2 s) to the
-    request by the code of the link."""
+    """Delay of the first request for a position by the code of the link since AC-6 requires one.
+
+    A request at a time without that need breaks the criterion."""
     estimates = [estimate for frame in e.frames for estimate in frame.estimates]
-    required_ns = _lost_ns(e)
-    if required_ns is None:
+    needed = request_is_needed(estimates)
+    requests = _requests(estimates, e.searches)
+    needless = [i for i in requests if not needed[i]]
+    if needless:
+        first_s = _in_flight_s(e, estimates[needless[0]].t_ns)
+        why = f"{len(needless)} of {len(requests)} requests without need, the first {first_s:.0f} s into the flight"
+        return Measured(None, why, Verdict.BELOW)
+    if not any(needed):
         worst_m = max((_worst_sigma_m(estimate) for estimate in estimates), default=0.0)
-        return Measured(None, f"its place was never lost: it claims {worst_m:.0f} m at worst")
-    asking, searches = PriorRequest(), list(e.searches)
-    for estimate in estimates:
-        while searches and searches[0].t_ns <= estimate.t_ns:
-            asking.search_step = searches.pop(0).step
-        asking.on_estimate(estimate)
-        if asking.due(estimate.t_ns):
-            return Measured(
-                (estimate.t_ns - required_ns) * 1e-9, f"asked {_in_flight_s(e, estimate.t_ns):.0f} s into the flight"
-            )
-    return Measured(None, f"lost {_in_flight_s(e, required_ns):.0f} s into the flight, and never asks", Verdict.BELOW)
+        return Measured(None, f"its place was never lost and it never asks: it claims {worst_m:.0f} m at worst")
+    required_ns = estimates[needed.index(True)].t_ns
+    if not requests:
+        return Measured(
+            None, f"lost {_in_flight_s(e, required_ns):.0f} s into the flight, and never asks", Verdict.BELOW
+        )
+    asked_ns = estimates[requests[0]].t_ns
+    return Measured((asked_ns - required_ns) * 1e-9, f"asked {_in_flight_s(e, asked_ns):.0f} s into the flight")
+
+
+def request_is_needed(estimates: Sequence[NavEstimate]) -> list[bool]:
+    """For each estimate, in order, whether AC-6 lets the operator be asked for a coarse position."""
+    return [a or b for a, b in zip(_unknown(estimates), _far_without_fix(estimates), strict=True)]
 
 
 def latency_p95(e: Evidence) -> Measured:
@@ -155,10 +179,14 @@ def complete_estimates(e: Evidence) -> Measured:
 
 
 def coverage(e: Evidence) -> Measured:
-    """Errors of one flight are correlated (constant error of the map), so that the upper limit applies to all flights
-    together."""
-    nees = e.metrics["mean_nees"]
-    return Measured(e.metrics["ellipse95_coverage"], "" if nees is None else f"mean NEES {nees:.2f}")
+    """One flight is one draw of the map's error: it may be inside altogether, which all flights together decide."""
+    inside, nees = e.metrics["ellipse95_coverage"], e.metrics["mean_nees"]
+    if inside is None:
+        return Measured(None, "no position")
+    if nees is None:
+        return Measured(inside, "no valid covariance", Verdict.BELOW)
+    verdict, why = judge_claims(inside, nees, 1, FLIGHT_CONFIDENCE)
+    return Measured(inside, why, verdict)
 
 
 def false_fixes(e: Evidence) -> Measured:
@@ -212,17 +240,46 @@ def failsafes(e: Evidence) -> Measured:
     return _of_peer(e, "failsafes", "")
 
 
-def _lost_ns(e: Evidence) -> int | None:
-    """Time at which the 1-sigma had exceeded that of an unknown start for three consecutive frames and two seconds."""
-    since: list[int] = []
-    for frame in e.frames:
-        if not frame.estimates:
-            continue
-        first = frame.estimates[0]
-        since = [*since, first.t_ns] if min(map(_worst_sigma_m, frame.estimates)) > SEARCH_START_SIGMA_M else []
-        if len(since) >= REQUEST_FRAMES and since[-1] - since[0] >= REQUEST_S * 1e9:
-            return since[-1]
-    return None
+def _requests(estimates: Sequence[NavEstimate], searches: Sequence[SearchState]) -> list[int]:
+    """Numbers of the estimates after which the code of the link sends a request."""
+    asking, waiting, sent = PriorRequest(), list(searches), []
+    for number, estimate in enumerate(estimates):
+        while waiting and waiting[0].t_ns <= estimate.t_ns:
+            asking.search_step = waiting.pop(0).step
+        asking.on_estimate(estimate)
+        if asking.due(estimate.t_ns):
+            sent.append(number)
+    return sent
+
+
+def _unknown(estimates: Sequence[NavEstimate]) -> list[bool]:
+    """For each estimate, whether the 1-sigma has exceeded UNKNOWN_M for three frames in a row and two seconds."""
+    unknown: list[bool] = []
+    frames_ns: dict[int, int] = {}  # time of the first estimate, by frame
+    for estimate in estimates:
+        if _worst_sigma_m(estimate) <= UNKNOWN_M:
+            frames_ns = {}
+        else:
+            frames_ns.setdefault(estimate.frame_id, estimate.t_ns)
+        since_ns = estimate.t_ns - min(frames_ns.values(), default=estimate.t_ns)
+        unknown.append(len(frames_ns) >= REQUEST_FRAMES and since_ns >= REQUEST_S * 1e9)
+    return unknown
+
+
+def _far_without_fix(estimates: Sequence[NavEstimate]) -> list[bool]:
+    """For each estimate, whether a fifth of the way so far, or 2 km, was flown without a map fix, for 35 s or more.
+
+    Before the first map fix the first estimate counts as one."""
+    if not estimates:
+        return []
+    t_s = np.maximum.accumulate([(estimate.t_ns - estimates[0].t_ns) * 1e-9 for estimate in estimates])
+    speed_mps = np.array([np.hypot(*estimate.velocity_enu_mps[:2]) for estimate in estimates])
+    way_m = np.cumsum(speed_mps * np.diff(t_s, prepend=0.0))
+    age_s = np.array([estimate.last_anchor_age_ms * 1e-3 for estimate in estimates])
+    fix_s = np.maximum.accumulate(np.where(age_s >= 0.0, np.maximum(t_s - age_s, 0.0), 0.0))
+    since_fix_m = way_m - np.interp(fix_s, t_s, way_m)
+    far = since_fix_m + ROUNDING_M >= np.minimum(NO_FIX_SHARE * way_m, NO_FIX_M)
+    return [bool(v) for v in far & (since_fix_m > 0.0) & (t_s - fix_s >= NO_FIX_S - 1e-3)]
 
 
 def _worst_sigma_m(estimate: NavEstimate) -> float:
@@ -248,9 +305,29 @@ def _share(values: list[bool], why: str = "") -> Measured:
 
 
 def _fragments(e: Evidence) -> list[list[FrameEvidence]]:
-    edges = [-np.inf, *e.marks.breaks_s, np.inf]
-    parts = ([f for f in e.frames if low <= f.t_s < high] for low, high in pairwise(edges))
-    return [part for part in parts if part]
+    """Frames of each fragment of odometry, in the order of their beginnings.
+
+    Two or more frames are a fragment if accepted odometry connects each to another, by its keyframe. A frame without
+    odometry belongs to the fragment of the frame before."""
+    numbers = {f.odometry.frame_id: i for i, f in enumerate(e.frames) if f.odometry is not None}
+    fragment = list(range(len(e.frames)))  # by frame: number of the first frame of its fragment
+    for i, frame in enumerate(e.frames):
+        seen = frame.odometry
+        if seen is not None and seen.verdict is Answer.ACCEPTED and seen.two_view and seen.keyframe_id in numbers:
+            a, b = sorted((fragment[i], fragment[numbers[seen.keyframe_id]]))
+            fragment = [a if number == b else number for number in fragment]
+    parts: dict[int, list[FrameEvidence]] = {}
+    last = 0
+    for frame, first in zip(e.frames, fragment, strict=True):
+        last = first if fragment.count(first) > 1 else last
+        parts.setdefault(last, []).append(frame)
+    return list(parts.values())
+
+
+def _begins_within(e: Evidence, parts: list[list[FrameEvidence]], from_s: float, to_s: float) -> bool:
+    """Whether one of these fragments begins with one of the first frames of this time."""
+    first = [f for f in e.frames if from_s <= f.t_s < to_s][:BEGIN_FRAMES]
+    return any(part[0] is frame for part in parts for frame in first)
 
 
 def _paths_between_fixes(e: Evidence) -> list[tuple[float, float]]:
