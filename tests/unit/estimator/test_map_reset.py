@@ -10,7 +10,7 @@ from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
 from terrafix.estimator.measurements.map_pose import MapPoseMeasurement
 from terrafix.estimator.state import VELOCITY
-from terrafix.messages import MapMatch
+from terrafix.messages import MapMatch, MatchPlace, Odometry, VehicleState, Verdict
 
 FRAMES = 14
 FAR_M = (300.0, -200.0)
@@ -80,3 +80,22 @@ def test_a_place_found_at_another_height_keeps_the_height_of_the_barometer(flown
     after = newest(run)[1]
     assert float(after.pose.translation()[2]) - up_m == pytest.approx(40.0, abs=10.0)
     assert estimator.graph.state(after.node).barometric_up_m == pytest.approx(barometric_m, abs=0.1)
+
+
+@pytest.mark.parametrize(("mass", "restarts"), [(0.98, True), (0.96, False)])
+def test_only_matches_in_a_mode_with_almost_all_mass_restart_the_graph(mass: float, restarts: bool) -> None:
+    """They agree with each other, 120 m from the estimate, over a hundred metres of flight."""
+    flight = Flight(30, seed=6, dem=True)
+    run = EstimatorRun().fly(flight, 0, 10)
+    details = []
+    for i in range(10, 30):
+        run.feed(m for m in flight.messages(i) if isinstance(m, VehicleState | Odometry))
+        match = flight.fix(i, offset_m=(120.0, 0.0))
+        assert match.place is not None
+        place = MatchPlace(e_m=match.place.e_m, n_m=match.place.n_m, mass=mass)
+        run.feed([msgspec.structs.replace(match, place=place)])
+        details.append(run.verdicts("map")[i].detail)
+        if "restarted" in details[-1]:
+            break
+        assert run.verdicts("map")[i].verdict is Verdict.INNOVATION
+    assert any("restarted" in detail for detail in details) is restarts
