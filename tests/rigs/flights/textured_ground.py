@@ -1,4 +1,4 @@
-"""Textured flat ground at height zero, views of it by a camera, and the ground as a map."""
+"""Textured ground, flat at height zero or sloped, views of it by a camera, and the ground as a map."""
 
 import cv2
 import numpy as np
@@ -33,12 +33,21 @@ def rotation(yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0
     return rot_w_b(*np.radians([yaw_deg, pitch_deg, roll_deg])) @ DOWN
 
 
-def view(ground: np.ndarray, camera: CameraCalibration, r_w_c: np.ndarray, p_c_in_w_m: np.ndarray) -> np.ndarray:
-    """-> (H, W, 3) uint8 image of the camera; exact except for interpolation."""
+def view(
+    ground: np.ndarray,
+    camera: CameraCalibration,
+    r_w_c: np.ndarray,
+    p_c_in_w_m: np.ndarray,
+    slope: tuple[float, float] = (0.0, 0.0),
+) -> np.ndarray:
+    """-> (H, W, 3) uint8 image of the camera; exact except for interpolation. ``slope``: rise of the ground per metre,
+    east and north, from height zero at (0, 0)."""
     x, y = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
     rays = np.column_stack([camera.normalise(np.column_stack([x.ravel(), y.ravel()])), np.ones(x.size)]) @ r_w_c.T
     assert rays[:, 2].max() < 0, "the camera sees the sky"
-    points = p_c_in_w_m[:2] - rays[:, :2] / rays[:, 2:] * p_c_in_w_m[2]
+    rise = np.array(slope)
+    along = rays[:, :2] / (rays[:, 2:] - (rays[:, :2] @ rise)[:, None])  # per metre above the ground below the camera
+    points = p_c_in_w_m[:2] - along * (p_c_in_w_m[2] - rise @ p_c_in_w_m[:2])
     centre = len(ground) / 2
     column = (points[:, 0] / GSD_M + centre - 0.5).astype(np.float32).reshape(x.shape)
     row = (centre - points[:, 1] / GSD_M - 0.5).astype(np.float32).reshape(x.shape)
@@ -85,3 +94,14 @@ class FlatMap:
 
     def elevation(self, e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray | None:
         return None
+
+
+class SlopedMap(FlatMap):
+    """The ground with a DEM: a plane with ``slope`` (rise per metre, east and north), at ``amsl_m`` in (0, 0)."""
+
+    def __init__(self, ground: np.ndarray, slope: tuple[float, float], amsl_m: float) -> None:
+        super().__init__(ground)
+        self._slope, self._amsl_m = slope, amsl_m
+
+    def elevation(self, e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray | None:
+        return np.asarray(self._amsl_m + self._slope[0] * e_m + self._slope[1] * n_m)

@@ -3,10 +3,16 @@
 from itertools import pairwise
 
 import msgspec
+import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, EstimatorRun, Flight
-from terrafix.messages import ClaimBudget, MapMatch, NavEstimate
+from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight
+from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.claim import claim
+from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.filter_state import FrameState
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
+from terrafix.messages import ClaimBudget, LensEstimate, MapMatch, NavEstimate
 
 FRAMES = 24
 TERMS = {"graph", "map", "principal_point", "time_offset", "hypotheses", "calibration"}
@@ -38,3 +44,64 @@ def test_the_term_of_the_map_is_the_variance_that_the_map_states() -> None:
 def test_the_budget_is_published_once_a_second_after_the_first_map_match(run: EstimatorRun) -> None:
     times_s = [m.t_ns * 1e-9 for m in run.published if isinstance(m, ClaimBudget)]
     assert min(b - a for a, b in pairwise(times_s)) >= 1.0
+
+
+# --- each term --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def placed(run: EstimatorRun) -> tuple[Estimator, FrameState]:
+    """The estimator after the flight and its newest frame; no other position is supported there."""
+    estimator = run.node._estimator
+    assert estimator is not None and estimator.last is not None and not estimator.hypotheses.is_multimodal
+    return estimator, estimator.last
+
+
+def test_the_time_offset_widens_the_position_along_the_velocity(placed: tuple[Estimator, FrameState]) -> None:
+    added = claim(*placed, 0.2, 0.0).cov - claim(*placed, 0.0, 0.0).cov
+    v = placed[1].velocity_mps
+    assert np.linalg.norm(v) > 10.0
+    expected = np.zeros((6, 6))
+    expected[:3, :3] = 0.2**2 * np.outer(v, v)
+    assert added == pytest.approx(expected)
+
+
+def test_a_wrong_calibration_widens_the_horizontal_position_alike_in_all_directions(
+    placed: tuple[Estimator, FrameState],
+) -> None:
+    added = claim(*placed, 0.0, 7.0).cov - claim(*placed, 0.0, 0.0).cov
+    assert added == pytest.approx(np.diag([49.0, 49.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def test_tilt_and_height_have_what_the_graph_cannot_know_beside_its_covariance(
+    placed: tuple[Estimator, FrameState],
+) -> None:
+    """A constant tilt of the autopilot looks like one of the mount; the barometer's scale like one of the height."""
+    estimator, frame = placed
+    added = claim(estimator, frame, 0.0, 0.0).cov - tangent_to_world(frame.cov, frame.pose.rotation().matrix())
+    tilt = np.radians(ORIGIN.attitude_sigma_deg)
+    _, amsl_sigma_m = estimator.state.amsl(frame)
+    assert amsl_sigma_m > 0.3 and estimator.map_sigma_m == 0.0
+    assert added.diagonal()[2:] == pytest.approx([amsl_sigma_m**2, tilt**2, tilt**2, 0.0])
+
+
+def test_a_learnt_principal_point_shifts_the_position_by_its_lever() -> None:
+    """Right in the image by 0.02 of the depth: the camera is that much to the right of the graph's."""
+    run = EstimatorRun().fly(Flight(FRAMES, seed=4, dem=True), 0, FRAMES)
+    estimator = run.node._estimator
+    assert estimator is not None and estimator.last is not None
+    frame, state = estimator.last, estimator.state
+    before = claim(estimator, frame, 0.0, 0.0)
+    sigmas = np.array([0.01, 0.01, 5e-4, 5e-4, 0.01, 0.003, 0.004])
+    value = (0.0, 0.0, 0.0, 0.0, 0.0, 0.02, -0.01)
+    learnt = LensEstimate(value=value, information=tuple(map(float, np.diag(sigmas**-2).ravel())))
+    state.principal_point = PrincipalPointFilter(msgspec.structs.replace(CAMERA, focal_sigma=0.1), learnt)
+    after = claim(estimator, frame, 0.0, 0.0)
+    r_w_c = frame.pose.rotation().matrix()
+    height_m = float(frame.pose.translation()[2]) - state.terrain.elevation_m(frame.pose.translation())
+    shift_m = height_m * (0.02 * r_w_c[:2, 0] - 0.01 * r_w_c[:2, 1])
+    assert after.position_m - before.position_m == pytest.approx(shift_m)
+    lever = height_m * r_w_c[:2, :2]
+    expected = lever @ np.diag([0.003**2, 0.004**2]) @ lever.T
+    assert (after.cov - before.cov)[:2, :2] == pytest.approx(expected, abs=0.01)
+    assert 0.05 < expected[0, 0] < 0.25

@@ -1,5 +1,7 @@
 """Frame matcher: grid of hypotheses, correlation surface, and the fix at a known position."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,17 +10,19 @@ from terrafix.anchor.matching.frame_matcher import (
     LEARNED_INLIERS,
     MAX_HYPOTHESES,
     CorrelationResult,
+    Fix,
     FrameMatcher,
     Hypothesis,
     View,
     _hypotheses,
 )
+from terrafix.anchor.matching.match_message import pose_match
 from terrafix.anchor.matching.point_mass_filter import Belief, Surface
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.messages import Verdict
+from terrafix.messages import MapMatch, MatchPlace, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
-from textured_ground import PINHOLE, FlatMap, rotation, texture, view
+from textured_ground import PINHOLE, FlatMap, SlopedMap, rotation, texture, view
 
 AGL_M = 100.0
 CELL_M = 2.0  # of the belief
@@ -165,6 +169,54 @@ def test_the_fix_at_a_known_position_gives_the_pose(matcher: FrameMatcher, frame
     assert np.degrees(np.linalg.norm(log_so3(TRUE_R.T @ fix.pnp.fit.r_w_c))) < 0.6
     assert fix.pnp.inliers.mean() > 0.9
     assert fix.xy.shape == (len(fix.weights), 2) and fix.points_w_m.shape == (len(fix.weights), 3)
+
+
+SLOPE, AMSL_M = (0.06, -0.03), 500.0
+
+
+class PartlyKnownDem(SlopedMap):
+    """The DEM is unknown west of the camera."""
+
+    def elevation(self, e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray | None:
+        return np.where(e_m < TRUE_M[0], np.nan, super().elevation(e_m, n_m))
+
+
+def fix_over_slope(ground: np.ndarray, world: SlopedMap) -> tuple[Fix, View, np.ndarray]:
+    """The fix with a plane through the ground below the camera as the prediction, that prediction, and the true
+    position (3,), AGL_M above the slope."""
+    below_m = float(np.dot(SLOPE, TRUE_M[:2]))
+    image = view(ground, PINHOLE, TRUE_R, np.array([*TRUE_M[:2], below_m + AGL_M]), SLOPE)
+    believed = replace(predicted_view(*TRUE_M[:2].tolist()), ground_m=AMSL_M + below_m)
+    matcher = FrameMatcher(PINHOLE, world, GradientDescriber())  # type: ignore[arg-type]
+    fix = matcher.fix(image, believed, Hypothesis(0.0, 1.0), *TRUE_M[:2].tolist())
+    assert fix is not None and fix.pnp.verdict is Verdict.ACCEPTED
+    return fix, believed, np.array([*TRUE_M[:2], AMSL_M + below_m + AGL_M])
+
+
+def test_the_matched_map_points_have_the_heights_of_the_dem(ground: np.ndarray) -> None:
+    """Taken for a plane, a slope of 6 % would tilt the pose by three degrees."""
+    world = SlopedMap(ground, SLOPE, AMSL_M)
+    fix, believed, true_m = fix_over_slope(ground, world)
+    e_m, n_m, up_m = fix.points_w_m.T
+    assert up_m == pytest.approx(AMSL_M + SLOPE[0] * e_m + SLOPE[1] * n_m)
+    assert np.ptp(up_m) > 4.0
+    assert fix.pnp.fit is not None
+    assert np.linalg.norm(fix.pnp.fit.p_c_in_w_m - true_m) < 1.5
+    assert np.degrees(np.linalg.norm(log_so3(TRUE_R.T @ fix.pnp.fit.r_w_c))) < 0.6
+    place = MatchPlace(e_m=float(TRUE_M[0]), n_m=float(TRUE_M[1]), mass=1.0)
+    empty = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", place=place)
+    published = np.array(pose_match(empty, fix, believed).matches)
+    assert len(published) == fix.pnp.inliers.sum() >= 8
+    assert published[:, 4] == pytest.approx(AMSL_M + published[:, 2:4] @ SLOPE)
+
+
+def test_where_the_dem_is_unknown_matched_map_points_have_the_predicted_ground_height(ground: np.ndarray) -> None:
+    fix, believed, _ = fix_over_slope(ground, PartlyKnownDem(ground, SLOPE, AMSL_M))
+    e_m, n_m, up_m = fix.points_w_m.T
+    unknown = e_m < TRUE_M[0]
+    assert 3 <= unknown.sum() <= len(e_m) - 3
+    assert (up_m[unknown] == believed.ground_m).all()
+    assert up_m[~unknown] == pytest.approx((AMSL_M + SLOPE[0] * e_m + SLOPE[1] * n_m)[~unknown])
 
 
 def test_an_unknown_tilt_is_found(ground: np.ndarray, matcher: FrameMatcher) -> None:

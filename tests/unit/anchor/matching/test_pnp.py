@@ -1,9 +1,10 @@
 """Pose from patch matches: right despite many wrong matches, none from random ones."""
 
+import cv2
 import numpy as np
 import pytest
 
-from terrafix.anchor.matching.pnp import INLIER_THRESHOLD, MIN_INLIERS, PnpResult, solve
+from terrafix.anchor.matching.pnp import INLIER_THRESHOLD, MIN_INLIERS, PLANAR_RELIEF, PnpResult, solve
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Verdict
 from textured_ground import rotation
@@ -50,6 +51,63 @@ def test_large_coordinates_do_not_reduce_precision() -> None:
     near, far = solve_equal_weights(points, xy), solve_equal_weights(points + away, xy)
     assert near.fit is not None and far.fit is not None
     assert far.fit.p_c_in_w_m - away == pytest.approx(near.fit.p_c_in_w_m, abs=0.01)
+
+
+def exact_scene(relief_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """As ``scene``, with heights over exactly ``relief_m`` and image coordinates without noise."""
+    points, _ = scene(np.random.default_rng(6), 40, 0.0)
+    points[:, 2] += np.random.default_rng(7).permutation(np.linspace(0.0, relief_m, 40))
+    in_c = (points - P) @ R
+    return points, in_c[:, :2] / in_c[:, 2:]
+
+
+@pytest.mark.parametrize(
+    ("relief_share", "method"),
+    [
+        (0.0, cv2.SOLVEPNP_IPPE),
+        (0.95 * PLANAR_RELIEF, cv2.SOLVEPNP_IPPE),
+        (1.05 * PLANAR_RELIEF, cv2.SOLVEPNP_SQPNP),
+        (0.3, cv2.SOLVEPNP_SQPNP),
+    ],
+)
+def test_near_planar_ground_is_solved_by_ippe_as_a_plane_and_relief_by_sqpnp(
+    relief_share: float, method: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[tuple[int, np.ndarray]] = []
+    ransac = cv2.solvePnPRansac
+
+    def recorded(object_points: np.ndarray, *args: object, flags: int, **options: object) -> object:
+        used.append((flags, object_points.copy()))
+        return ransac(object_points, *args, flags=flags, **options)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(cv2, "solvePnPRansac", recorded)
+    points, xy = exact_scene(relief_share * AGL_M)
+    assert solve_equal_weights(points, xy).verdict is Verdict.ACCEPTED
+    [(flags, solved)] = used
+    assert flags == method
+    local = points - points.mean(0)
+    assert solved[:, :2] == pytest.approx(local[:, :2])
+    assert solved[:, 2] == pytest.approx(local[:, 2] if method == cv2.SOLVEPNP_SQPNP else np.zeros(len(points)))
+
+
+def test_near_planar_ground_counts_from_two_per_cent_of_the_height() -> None:
+    assert PLANAR_RELIEF == 0.02
+
+
+@pytest.mark.parametrize("relief_share", [0.95 * PLANAR_RELIEF, 1.05 * PLANAR_RELIEF])
+def test_the_refined_pose_uses_the_heights_of_near_planar_ground(relief_share: float) -> None:
+    """As a plane, these exact matches would have residuals, and a pose that is off by decimetres."""
+    points, xy = exact_scene(relief_share * AGL_M)
+    given = points.copy()
+    found = solve_equal_weights(points, xy)
+    assert np.array_equal(points, given)
+    assert found.fit is not None and found.inliers.all()
+    assert np.linalg.norm(found.fit.p_c_in_w_m - P) < 1e-3
+    assert found.fit.residuals.max() < 1e-5
+    points[:, 2] = points[:, 2].mean()
+    plane = solve_equal_weights(points, xy)
+    assert plane.fit is not None and plane.fit.residuals.max() > 1e-3
+    assert np.linalg.norm(plane.fit.p_c_in_w_m - P) > 0.05
 
 
 @pytest.mark.parametrize("count", [0, 3, MIN_INLIERS - 1])

@@ -8,9 +8,10 @@ import pytest
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
 from terrafix.anchor.verification.consensus_pose import ConsensusPose
+from terrafix.core.pose import log_so3
 from terrafix.messages import Verdict
 from terrafix_engines.features.gradient import GradientDescriber
-from textured_ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
+from textured_ground import GSD_M, PINHOLE, FlatMap, SlopedMap, rotation, texture, view
 
 AGL_M = 100.0
 SIDE_M = 400.0
@@ -64,6 +65,23 @@ def test_over_changed_and_leaning_ground_the_pose_is_found_with_a_consistent_cov
         middle_m = (fit.p_c_in_w_m - fit.r_w_c[:, 2] * fit.p_c_in_w_m[2] / fit.r_w_c[2, 2])[:2]
         assert np.hypot(*(middle_m - here_m[:2])) < 2.5
     assert np.mean(nees) < 5.0
+
+
+def test_the_consensus_pose_is_from_map_points_with_the_heights_of_the_dem() -> None:
+    """Taken for a plane, a slope of 6 % would tilt the pose by three degrees."""
+    ground, slope, amsl_m = texture(8, SIDE_M), (0.06, -0.03), 500.0
+    world, here_m = SlopedMap(ground, slope, amsl_m), np.array([10.0, -20.0])
+    below_m = float(np.dot(slope, here_m))
+    image = view(ground, PINHOLE, R, np.array([*here_m, below_m + AGL_M]), slope)
+    believed = View(10.0, -20.0, R, AGL_M, amsl_m + below_m, float(np.radians(3.0)), 0.03, TILT_SIGMA_RAD)
+    estimator = ConsensusPose(world, FrameMatcher(PINHOLE, world, GradientDescriber()))  # type: ignore[arg-type]
+    fix = estimator.estimate(image, believed)
+    assert fix is not None and fix.pnp.fit is not None
+    e_m, n_m, up_m = fix.points_w_m.T
+    assert up_m == pytest.approx(amsl_m + slope[0] * e_m + slope[1] * n_m)
+    assert np.ptp(up_m) > 4.0
+    assert np.linalg.norm(fix.pnp.fit.p_c_in_w_m - [*here_m, amsl_m + below_m + AGL_M]) < 2.0
+    assert np.degrees(np.linalg.norm(log_so3(R.T @ fix.pnp.fit.r_w_c))) < 1.0
 
 
 def test_wrong_places_give_no_consensus_pose(estimator: ConsensusPose) -> None:

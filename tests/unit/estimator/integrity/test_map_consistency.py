@@ -66,3 +66,21 @@ def test_poses_inside_a_gate_wider_than_the_rejected_ones_do_not_end_the_inflati
     for _ in range(5):
         consistency.add_accepted(1.0, sigma_m**2 * np.eye(2))
     assert (consistency.variance_m2 == 0.0) if ends else (consistency.variance_m2 > 0.9 * before_m2)
+
+
+def test_after_many_rejected_poses_four_accepted_ones_over_new_ground_end_the_inflation() -> None:
+    """The evidence against a map is bounded: a long flight over changed ground must not outweigh the map after it."""
+    consistency = after_rejected(MapConsistency(), 200)
+    for _ in range(3):
+        consistency.add_accepted(1.0, NARROW_M2)
+        assert consistency.variance_m2 > 0.0
+    consistency.add_accepted(1.0, NARROW_M2)
+    assert consistency.variance_m2 == 0.0
+
+
+def test_after_any_number_of_accepted_poses_three_rejected_ones_inflate_the_covariance() -> None:
+    """The evidence for a map is bounded, too: a map that was right for a long way can still end."""
+    consistency = MapConsistency()
+    for _ in range(500):
+        consistency.add_accepted(1.0, NARROW_M2)
+    assert after_rejected(consistency, 3).probability > 0.5
