@@ -167,7 +167,7 @@ class FilterState:
 
     def height_scale(self, node: int) -> tuple[float, float]:
         """True height over the height in the graph, and its relative 1-sigma: the part of the estimated scale between
-        barometer and pictures that the focal length explains."""
+        barometer and images that the focal length explains."""
         focal = self.origin.camera.focal_sigma
         if not self.has_height:
             return 1.0, focal

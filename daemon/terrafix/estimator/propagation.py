@@ -61,7 +61,7 @@ TURN_UNSEEN_RAD = 0.3  # 1-sigma of the heading of an unseen frame without a rep
 @dataclass(frozen=True)
 class PropagationResult:
     """Result of ``advance``. ``verdict``: on the odometry of the frame. ``step_m`` (2,): east, north since the frame
-    before, by odometry alone, and its 1-sigma. ``turn``: since the frame before, by pictures. ``verdicts``: on all
+    before, by odometry alone, and its 1-sigma. ``turn``: since the frame before, by images. ``verdicts``: on all
     measurements, and on a reset of the graph, in the order in which they were made."""
 
     verdict: Verdict
@@ -294,7 +294,7 @@ class Propagation:
         step.step_sigma_m = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step.step_m), np.sqrt(aside_m2)))
 
     def _fragment_step(self, step: _Step) -> None:
-        """The step for the anchor's belief follows the pictures, also those of a fragment that is not joined."""
+        """The step for the anchor's belief follows the images, also those of a fragment that is not joined."""
         state, sighting = self._state, step.sighting
         last = state.fragment
         if sighting.fragment is last and sighting.local_step_m is not None:

@@ -73,7 +73,7 @@ class PrincipalPointFilter:
         seen = triples.reshape(-1, 3, 2)[:, [1, 0, 2]]  # the middle camera comes first
         try:
             added = _information(seen, sigma_norm, at, self._x)
-        except np.linalg.LinAlgError:  # an iterate whose distortion folds the picture
+        except np.linalg.LinAlgError:  # an iterate whose distortion folds the image
             added = None
         if added is None or not all(np.isfinite(numbers).all() for numbers in added):
             return

@@ -1,4 +1,4 @@
-"""Scale and mount faults from velocity changes: pictures against accelerometers, without a map.
+"""Scale and mount faults from velocity changes: images against accelerometers, without a map.
 
 A wrong reported height or focal length scales every visual velocity; a wrong mount yaw rotates it. Neither affects the
 accelerometers, and a compass error rotates both alike. So dv_visual = gain * dv_inertial, with gain 1 where the
