@@ -220,7 +220,7 @@ class Propagation:
         return self._reset_yaw_gauge(step)
 
     def _reset_yaw_gauge(self, step: _Step) -> PropagationResult | None:
-        """The heading becomes known, or unobservable in unseen motion."""
+        """A new graph when the heading becomes known, or unobservable in motion without odometry. None: no reset."""
         gauge, heading_reported = self._state.yaw_gauge, step.frame.attitude.yaw_rad is not None
         unseen = step.known is None and step.increment is not None and not heading_reported
         if gauge is not None and heading_reported:

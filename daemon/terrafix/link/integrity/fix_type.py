@@ -48,7 +48,7 @@ class NoFixReason:
     short: str
 
 
-# The computer was restarted in the air: its start coordinate is where the flight began, and claims a good accuracy.
+# The computer was restarted in flight: the start coordinate is the place of take-off, with a small stated sigma.
 STARTED_IN_FLIGHT = NoFixReason("started in flight, and no map fix yet", "the map must confirm the start")
 
 
