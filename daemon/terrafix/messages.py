@@ -36,13 +36,14 @@ class CovarianceMode(StrEnum):
     """Method by which the 6x6 covariance was computed (ON-2)."""
 
     MARGINALS = "marginals"  # of C_k, from iSAM2
-    JACOBIAN = "jacobian"  # propagated from frame to frame under thermal throttle, without marginals
+    # Propagated from frame to frame while the thermal band is not normal; pose marginals are not computed per frame.
+    JACOBIAN = "jacobian"
 
 
 class ThermalBand(StrEnum):
     NORMAL = "normal"
-    HOT = "hot"  # throttled or close to it: the estimator computes the cheaper covariance
-    CRITICAL = "critical"
+    HOT = "hot"  # at ``hot_c``, or throttled: propagated covariance (JACOBIAN), fewer map matches
+    CRITICAL = "critical"  # at ``critical_c``: also without the learned model; a warning to the pilot
 
 
 class Verdict(StrEnum):
@@ -52,13 +53,19 @@ class Verdict(StrEnum):
     BAD_IMAGE = "bad_image"  # unreadable, truncated, wrong size
     STALLED = "stalled"  # the camera repeats an earlier image while the vehicle moves
     NO_FEATURES = "no_features"  # no features to track
-    FEW_INLIERS = "few_inliers"
+    FEW_INLIERS = "few_inliers"  # too few or too small a share of the matches agree with one motion or camera pose
     NO_PREDICTION = "no_prediction"  # no prior position
     OUTSIDE_MAP = "outside_map"
     TOO_LOW = "too_low"  # the footprint is too small for matching
-    AMBIGUOUS = "ambiguous"  # more than one position fits
+    # More than one position fits: a mode below 90 % of the mass, or a coarse match where a pose is needed (unknown
+    # heading, or an estimate with a large sigma).
+    AMBIGUOUS = "ambiguous"
+    # The matches do not determine the pose: it is too far from the mode or too much tilted, there is no ground in view,
+    # the refinement failed, the geometry is ill-conditioned, or (odometry) the height of the ground is unknown.
     DEGENERATE = "degenerate"
     INNOVATION = "innovation"  # map match, airspeed, dead reckoning, start or estimate beyond its gate
+    # Frame or keyframe has left the window of the graph, or is older than the start or the first telemetry after a
+    # restart; estimate late or out of order.
     STALE = "stale"
     UNCONFIRMED = "unconfirmed"  # odometry or coarse match of a fragment that is not yet joined to the flight
     IMPLAUSIBLE = "implausible"  # odometry, height or heading beyond its gate; impossible estimate, telemetry or time
@@ -378,7 +385,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     alt_amsl_m: float
     agl_m: float
     velocity_enu_mps: Vec3
-    velocity_sigma_mps: float
+    velocity_sigma_mps: float  # 1-sigma in the worst direction
     q_w_b: Quat
     cov: Mat6  # of the body pose
     map_sigma_m: float = 0.0  # part of cov: stated error of the map itself, 1-sigma per horizontal axis

@@ -247,7 +247,7 @@ class Localizer:
         if seen.correlation.verdict is not Verdict.ACCEPTED:
             return msgspec.structs.replace(match, verdict=seen.correlation.verdict)
         self._since_observation_m = 0.0
-        gain = belief.update(seen.correlation.surfaces, seen.weight)
+        evidence_nats = belief.update(seen.correlation.surfaces, seen.weight)
         modes = belief.modes(REPORTED_MODES)
         hypothesis, score = seen.correlation.best_at(modes[0].e_m, modes[0].n_m)
         self._widen_if_poor(belief, score, seen.weight)
@@ -256,7 +256,7 @@ class Localizer:
         pose = estimate_pose(match, prediction, seen, modes[0], hypothesis)
         if not pose.attempted and seen.new >= 1.0 and has_wide_sigma(sigma_m, view.agl_m):
             pose = self._localize_alone(pose, seen, belief)
-        self._lock_monitor.update(gain, seen.weight, seen.new, pose.inliers, sigma_m, view.agl_m)
+        self._lock_monitor.update(evidence_nats, seen.weight, seen.new, pose.inliers, sigma_m, view.agl_m)
         mode_view = view_at(view, hypothesis, pose.mode.e_m, pose.mode.n_m) if pose.attempted else None
         tested = self._relocalizer.test_frame(image, mode_view)
         # Mixture "believed position, or anywhere": the variance that the second component adds.

@@ -23,15 +23,15 @@ class Claim:
 
 
 def claim(estimator: Estimator, frame: FrameState, time_offset_sigma_s: float, calibration_sigma_m: float) -> Claim:
-    """Of ``frame``, the newest one. ``time_offset_sigma_s``: of the camera against telemetry; ``calibration_sigma_m``:
-    position error by a description that monitors have found wrong."""
+    """Claim of ``frame``, the newest one. ``time_offset_sigma_s``: 1-sigma of the camera against telemetry;
+    ``calibration_sigma_m``: 1-sigma of the position by a description that monitors have found wrong."""
     state = estimator.state
     budget = _Budget(tangent_to_world(frame.cov, frame.pose.rotation().matrix()))
     cov = budget.cov
     # The error of the map is the same everywhere: no number of matches averages it away.
     cov[WORLD_POSITION, WORLD_POSITION] += estimator.map_sigma_m**2 * np.eye(3)
     budget.close("map")
-    shift_m, shift_cov = state.principal_point.shift(state.lever(frame.pose))
+    shift_m, shift_cov = state.principal_point.shift(state.principal_point_jacobian(frame.pose))
     cov[HORIZONTAL, HORIZONTAL] += shift_cov
     budget.close("principal_point")
     cov[WORLD_TILT, WORLD_TILT] += state.camera.body_sigma_rad**2 * np.eye(2)

@@ -57,7 +57,7 @@ class Estimator:
 
     @property
     def last(self) -> FrameState | None:
-        """The newest frame, with all that is known of it by now."""
+        """Newest frame, with its newest estimate; None: there was no frame."""
         return self.state.last
 
     @property
@@ -82,12 +82,12 @@ class Estimator:
     def refine(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """After landing: frame -> position (3,) and covariance (3, 3), by all that was measured in the flight."""
         result, state = {}, self.state
-        levers = np.array(state.levers).reshape(-1, 2, 2)
-        for frame, lever, p_m, cov in zip(state.frames, levers, *state.graph.refine(), strict=True):
+        jacobians = np.array(state.principal_point_jacobians).reshape(-1, 2, 2)
+        for frame, jacobian, p_m, cov in zip(state.frames, jacobians, *state.graph.refine(), strict=True):
             if np.isfinite(p_m).all() and np.isfinite(cov).all():
                 if frame in self._ambiguous:
                     cov[:2, :2] += self._ambiguous[frame]
-                shift_m, shift_cov = state.principal_point.shift(lever)
+                shift_m, shift_cov = state.principal_point.shift(jacobian)
                 p_m[:2] += shift_m
                 cov[:2, :2] += shift_cov
                 result[frame] = (p_m, cov)

@@ -103,9 +103,9 @@ class FilterState:
         self.velocity_cov = np.zeros((MOTION_SIZE, MOTION_SIZE))  # of V of the newest node
         self.lens_sigma = radial_k1_sigma(origin.camera)
         self.node_of: dict[int, int] = {}  # frame -> node, for nodes in the window
-        self.cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C (6, 6), for the cheap mode
+        self.cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C (6, 6), to propagate from
         self.frames = array("q")  # frame of each node since the flight began
-        self.levers = array("f")  # ... and its principal point lever (2, 2)
+        self.principal_point_jacobians = array("f")  # ... and its ``principal_point_jacobian`` (2, 2)
 
     def covariance(self, node: int) -> np.ndarray:
         """Covariance (6, 6) of C_node, tangent order: the smoother's marginal; under thermal throttle the propagated
@@ -138,15 +138,16 @@ class FilterState:
         self.node_of = {frame: n for frame, n in self.node_of.items() if self.graph.holds(n)}
         self.node_of[frame_id] = node
         self.frames.append(frame_id)
-        self.levers.extend(self.lever(pose).ravel())
+        self.principal_point_jacobians.extend(self.principal_point_jacobian(pose).ravel())
 
     def velocity_changed(self, node: int) -> None:
         """A factor on the velocity of the newest ``node`` was added: its covariances are read from the graph again."""
         self.cov_of.pop(node, None)
         self.velocity_cov = self.graph.velocity_covariance(node)
 
-    def lever(self, pose: gtsam.Pose3) -> np.ndarray:
-        """(2, 2): shift of the camera [m, east and north] by an offset of the principal point [normalised image]."""
+    def principal_point_jacobian(self, pose: gtsam.Pose3) -> np.ndarray:
+        """Jacobian (2, 2) of the camera position (east and north) with respect to the principal point [m per unit of
+        normalised image coordinates]."""
         p = pose.translation()
         return np.asarray((float(p[UP]) - self.terrain.elevation_m(p)) * pose.rotation().matrix()[:2, :2])
 
@@ -166,7 +167,7 @@ class FilterState:
 
     def height_scale(self, node: int) -> tuple[float, float]:
         """True height over the height in the graph, and its relative 1-sigma: the part of the estimated scale between
-        barometer and pictures that the focal length explains."""
+        barometer and images that the focal length explains."""
         focal = self.origin.camera.focal_sigma
         if not self.has_height:
             return 1.0, focal

@@ -243,7 +243,7 @@ class TakeOffDetector:
         self.launching = True
 
     def was_unmeasured(self, increment: MotionIncrement | None, seen_at_m: float | None) -> bool:
-        """The vehicle is seen in flight after a take-off that neither pictures nor IMU measured. ``increment``: to the
+        """The vehicle is seen in flight after a take-off that neither images nor IMU measured. ``increment``: to the
         newest frame, None: it stands; ``seen_at_m``: its height above the ground, None: it was not seen."""
         if not self.launching or increment is None:
             return False

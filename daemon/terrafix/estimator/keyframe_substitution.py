@@ -1,6 +1,6 @@
 """Odometry against a keyframe that the graph does not have.
 
-A graph that begins anew at a frame drops the keyframe of vision, which remains vision's keyframe while the pictures
+A graph that begins anew at a frame drops the keyframe of vision, which remains vision's keyframe while the images
 overlap: for a slow vehicle that is seconds, of which all odometry would be lost. The first frame of the new graph
 replaces it, for features that both it and a later frame have matched to the keyframe."""
 

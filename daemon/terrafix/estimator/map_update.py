@@ -11,12 +11,12 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState, FrameState
 from terrafix.estimator.graph.pose_graph import GraphPrior
 from terrafix.estimator.initialization import ResetReason, reset
+from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT, AlternativePosition
 from terrafix.estimator.integrity.correlated_fixes import CorrelatedFixes
 from terrafix.estimator.integrity.fragments import MapHitRate
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_run import InnovationRun
 from terrafix.estimator.integrity.map_consistency import MapConsistency
-from terrafix.estimator.integrity.other_place import MIN_CONSISTENT, OtherPlace
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.map_pose import MapPoseMeasurement, determined
@@ -87,14 +87,14 @@ class MapUpdate:
         if node is not None and (match.position_only or match.verdict in NOTHING_FOUND):
             self._map_hit_rate.update(state.fragments.of(node), found=False)
         if match.verdict is not Verdict.ACCEPTED:
-            return _result(match.verdict)
+            return _result(match.verdict, f"{match.inliers} inliers" if match.verdict in NOTHING_FOUND else "")
         if not determined(match):
-            return _result(Verdict.DEGENERATE)
+            return _result(Verdict.DEGENERATE, "2D-3D matches do not determine the pose")
         if node is None:
-            return _result(Verdict.STALE)
+            return _result(Verdict.STALE, "frame has left the window")
         measurement = MapPoseMeasurement.of(match, state.terrain, state.radial_k1_estimate)
         if match.search.relocalized:  # by a search over several frames: it outweighs whatever the graph has
-            self.hypotheses.other, self.hypotheses.map_consistency = OtherPlace(), MapConsistency()
+            self.hypotheses.other, self.hypotheses.map_consistency = AlternativePosition(), MapConsistency()
             return self._reset(match, node, measurement, "found")
         if state.yaw_gauge is not None:
             return self._apply_without_heading(match, node, measurement)
@@ -162,10 +162,11 @@ class MapUpdate:
             self.hypotheses.map_consistency.add_accepted(share, gate[:2, :2])
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
-        return MapResult(replace(fusion, detail=f"new ground {share:.2f}"))
+        return MapResult(replace(fusion, detail=f"information share {share:.2f}"))
 
     def _learn_from_pose(self, match: MapMatch, node: int, before: NodeState, measurement: MapPoseMeasurement) -> None:
-        """What an accepted pose tells of ground, fragment and other positions. ``before``: the node without it."""
+        """Updates terrain roughness, alternative position and map hit rate with an accepted pose. ``before``: the node
+        without it."""
         state, height_m, here = self._state, self._height_m(measurement), measurement.position_m
         if state.has_height and not state.terrain.has_dem:
             cov = tangent_to_world(measurement.cov, measurement.pose.rotation().matrix())
@@ -255,8 +256,9 @@ class MapUpdate:
         return cov
 
     def _start_off(self, position: Innovation) -> str:
-        """``position``: of the first matches against a flight that none has placed. Nothing on board tells which of the
-        two is in the wrong place."""
+        """Detail of the verdict on the start coordinate; empty: there is none. ``position``: innovation of the first
+        matches in a flight that none has placed. Start and map disagree, and no on-board measurement can decide between
+        them."""
         searched = self._state.origin.start_sigma_m > SEARCH_START_SIGMA_M
         if self._state.last_fix_s is not None or searched or position.is_accepted:
             return ""

@@ -59,7 +59,7 @@ MakeEstimator = Callable[[Origin, NavPrior | None], Estimator]
 
 
 class EstimatorNode:
-    """Function of messages, as every node."""
+    """Node of the estimator: odometry, telemetry and map matches in; estimates, predictions and verdicts out."""
 
     def __init__(
         self,
@@ -67,8 +67,8 @@ class EstimatorNode:
         checkpoint: EstimatorCheckpoint | None = None,
         make_estimator: MakeEstimator = Estimator,
     ) -> None:
-        """``began_ns``: of the flight, when this process was started again in it. ``checkpoint``: of the process
-        before."""
+        """``began_ns``: time at which the flight began, if this process was restarted in flight; else None.
+        ``checkpoint``: last messages of the process before, if it left any."""
         self._began_ns, self._checkpoint, self._make_estimator = began_ns, checkpoint, make_estimator
         self._origin: Origin | None = None  # as vision published it
         # Newest InitialPosition, which the Origin lacks
@@ -110,16 +110,17 @@ class EstimatorNode:
 
     @property
     def origin(self) -> Origin | None:
+        """Origin of the estimator, with the InitialPosition applied; None before the Origin."""
         return None if self._estimator is None else self._estimator.origin
 
     @property
     def estimator(self) -> Estimator | None:
-        """None before the Origin."""
+        """The estimator of the flight; None before the Origin."""
         return self._estimator
 
     @property
     def mode(self) -> CovarianceMode:
-        """Of the next estimate."""
+        """Covariance mode of the next estimate, by the thermal band."""
         return self._mode
 
     def on(self, message: Message) -> Iterable[Message]:
@@ -307,8 +308,9 @@ class EstimatorNode:
         return unknown and 0 <= t_ns - self._first_ns < TELEMETRY_WAIT_NS
 
     def _prediction(self, t_ns: int, result: PropagationResult, estimator: Estimator, *, follows: bool) -> Prediction:
-        """``follows``: the frame before had a Prediction, too. Else the step is what is known by now of the motion
-        since the last one: odometry that begins again tells of the velocity in between."""
+        """The Prediction of a frame. ``follows``: the frame before had one, too. Else the step is the displacement of
+        the present estimate since the last Prediction: odometry that begins again determines the velocity in
+        between."""
         frame = result.placed
         step_m, step_var_m2 = result.step_m, result.step_sigma_m**2
         if not follows and self._predicted_id is not None:
@@ -319,8 +321,8 @@ class EstimatorNode:
         return prediction_of(estimator, frame, t_ns, step_m, step_var_m2, prior_t_ns)
 
     def _is_slow_due(self, frame: FrameState, estimator: Estimator) -> bool:
-        """Whether calibration state and claim are published with this frame: once a second, not before a map match (it
-        is the prior until then), and not under thermal throttle."""
+        """Whether CalibrationEstimate and ClaimBudget are published with this frame: once a second, not before a map
+        match (they are the prior until then), and only in the normal thermal band."""
         t_ns, hot = round(frame.t_s * 1e9), self._mode is CovarianceMode.JACOBIAN
         if hot or estimator.last_fix_s is None or t_ns - self._calibration_ns < CALIBRATION_EVERY_NS:
             return False

@@ -1,4 +1,4 @@
-"""What the estimator publishes, made of its state."""
+"""Builds the messages that the estimator publishes from its state."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -29,6 +29,7 @@ ANCHORED_FOR_S = 1.5  # after a map match the odometry since is too short to mat
 
 
 def verdict_of(t_ns: int, frame_id: int, fusion: FusionVerdict) -> MeasurementVerdict:
+    """MeasurementVerdict of the measurement at ``t_ns``, with the innovation of ``fusion`` where there is one."""
     return MeasurementVerdict(
         t_ns=t_ns,
         frame_id=frame_id,
@@ -40,7 +41,7 @@ def verdict_of(t_ns: int, frame_id: int, fusion: FusionVerdict) -> MeasurementVe
 
 
 def _logged(innovation: Innovation | None) -> dict[str, Any]:
-    """Fields of a MeasurementVerdict."""
+    """Fields of a MeasurementVerdict for an innovation; none without one."""
     if innovation is None:
         return {}
     return {

@@ -81,13 +81,14 @@ class NavPrior:
 
     @classmethod
     def start(cls, origin: Origin, t_s: float) -> "NavPrior":
-        """The start coordinate; the velocity is unknown."""
+        """Prior at the start coordinate at ``t_s``, with unknown velocity."""
         sigma_m = min(max(origin.start_sigma_m, 1.0), SEARCH_START_SIGMA_M)
         return cls(t_s, np.zeros(2), sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
 
     @classmethod
     def at_initial_position(cls, initial: InitialPosition, frame: LocalFrame, t_s: float) -> "NavPrior | None":
-        """That position at ``t_s``; None when it is unknown."""
+        """Prior at the position of ``initial`` at ``t_s``, with unknown velocity; None when ``initial`` has no
+        position."""
         if initial.lat_deg is None or initial.lon_deg is None or initial.sigma_m is None:
             return None
         at_m = np.array(frame.to_local(initial.lat_deg, initial.lon_deg))
@@ -95,6 +96,7 @@ class NavPrior:
 
     @classmethod
     def of(cls, checkpoint: EstimatorCheckpoint, frame: LocalFrame, camera: Camera) -> "NavPrior":
+        """Prior at the last estimate of ``checkpoint``, with its calibration where it is of the same ``camera``."""
         estimate, calibration = checkpoint.estimate, checkpoint.calibration
         at_m = np.array(frame.to_local(estimate.lat_deg, estimate.lon_deg))
         sigma_m = float(np.sqrt(max(estimate.cov[0], estimate.cov[7])))

@@ -61,7 +61,7 @@ TURN_UNSEEN_RAD = 0.3  # 1-sigma of the heading of an unseen frame without a rep
 @dataclass(frozen=True)
 class PropagationResult:
     """Result of ``advance``. ``verdict``: on the odometry of the frame. ``step_m`` (2,): east, north since the frame
-    before, by odometry alone, and its 1-sigma. ``turn``: since the frame before, by pictures. ``verdicts``: on all
+    before, by odometry alone, and its 1-sigma. ``turn``: since the frame before, by images. ``verdicts``: on all
     measurements, and on a reset of the graph, in the order in which they were made."""
 
     verdict: Verdict
@@ -178,7 +178,8 @@ class Propagation:
         return _Step(frame, before, sighting, increment, cov, p_m, velocity)
 
     def _increment(self, frame: FrameInput, before: NodeState, *, seen: bool) -> MotionIncrement:
-        """Of the motion model, from ``before``, the newest node, to ``frame``. ``seen``: odometry is fused."""
+        """Increment of the motion model, from ``before``, the newest node, to ``frame``. ``seen``: odometry is
+        fused."""
         state, attitude = self._state, frame.attitude
         from_s = state.graph.time_of(state.graph.newest)
         measured = frame.imu(round(from_s * 1e9), round(frame.t_s * 1e9))
@@ -198,7 +199,7 @@ class Propagation:
         )
 
     def _reset_before_fusion(self, step: _Step) -> PropagationResult | None:
-        """A new graph at the predicted pose, where the one that is there would be sure of what is not known."""
+        """A new graph at the predicted pose, where the present one would be overconfident. None: no reset is due."""
         state, frame, verdict = self._state, step.frame, step.sighting.verdict
         if self._is_motion_timed_out(step.sighting, frame.t_s) and step.increment is not None:
             dt_s = state.graph.since_newest_s(frame.t_s)
@@ -219,7 +220,7 @@ class Propagation:
         return self._reset_yaw_gauge(step)
 
     def _reset_yaw_gauge(self, step: _Step) -> PropagationResult | None:
-        """The heading becomes known, or unobservable in unseen motion."""
+        """A new graph when the heading becomes known, or unobservable in motion without odometry. None: no reset."""
         gauge, heading_reported = self._state.yaw_gauge, step.frame.attitude.yaw_rad is not None
         unseen = step.known is None and step.increment is not None and not heading_reported
         if gauge is not None and heading_reported:
@@ -252,7 +253,8 @@ class Propagation:
         return self._result(step, placed)
 
     def _apply_odometry(self, step: _Step) -> None:
-        """Pose of the new node, by odometry or the motion model alone, and the step for the anchor's belief."""
+        """Sets the pose of the new node, by odometry or the motion model alone, and the step for the anchor's
+        belief."""
         state, known = self._state, step.known
         if known is None:
             step.parent, step.motion = self._unseen_motion(step)
@@ -276,8 +278,8 @@ class Propagation:
         self._fragment_step(step)
 
     def _seen_step(self, step: _Step, known: KeyframeMotion, seen_m2: np.ndarray) -> None:
-        """Step over the ground by odometry, whose position has covariance ``seen_m2`` (3, 3), world axes: where no map
-        tells how the ground rises, the height is known far less well."""
+        """Sets the step over the ground by odometry, whose position has covariance ``seen_m2`` (3, 3), world axes.
+        Without a DEM the height has a far larger sigma than the horizontal position."""
         keyframe, continuity = self._state.graph.state(step.parent).pose, self._state.continuity
         aside_m2 = float(np.linalg.eigvalsh(seen_m2[:2, :2])[-1])
         if continuity.keyframe_motion is not None and continuity.keyframe_motion[0] == step.parent:
@@ -292,7 +294,7 @@ class Propagation:
         step.step_sigma_m = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step.step_m), np.sqrt(aside_m2)))
 
     def _fragment_step(self, step: _Step) -> None:
-        """The step for the anchor's belief follows the pictures, also those of a fragment that is not joined."""
+        """The step for the anchor's belief follows the images, also those of a fragment that is not joined."""
         state, sighting = self._state, step.sighting
         last = state.fragment
         if sighting.fragment is last and sighting.local_step_m is not None:
@@ -308,8 +310,9 @@ class Propagation:
         step.step_sigma_m = float(np.hypot(step.step_sigma_m, np.sqrt(grown_m2)))
 
     def _unseen_motion(self, step: _Step) -> tuple[int, RelativePose]:
-        """Of a frame without odometry: the motion model, with the heading of the compass. A vehicle that stands is at
-        the node at which that began: a long pause is one motion from there, not a chain of short ones."""
+        """-> parent node and motion from it, of a frame without odometry: by the motion model, with the heading of the
+        compass. A stationary vehicle has the node at which it stopped as parent: a long pause is one motion from there,
+        not a chain of short ones."""
         state, attitude, stands = self._state, step.frame.attitude, step.increment is None
         parent, stationary = state.graph.newest, state.continuity.stationary_node
         if stands and stationary is not None and state.graph.holds(stationary):
@@ -389,7 +392,7 @@ class Propagation:
         return verdicts
 
     def _fuse_aid(self, aid: AidSource, sample: AidSample) -> FusionVerdict | None:
-        """None: ``aid`` has no measurement there."""
+        """Verdict on the measurement of ``aid`` for this frame; None: it has none there."""
         measurement = aid.measurement(sample)
         if measurement is None:
             return None

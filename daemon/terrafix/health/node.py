@@ -1,4 +1,5 @@
-"""Health: thermal band of the computer, with hysteresis. When hot, the estimator computes the cheaper covariance."""
+"""Health: thermal band of the computer, with hysteresis. Outside of the normal band the estimator propagates the
+covariance."""
 
 from collections.abc import Iterable
 

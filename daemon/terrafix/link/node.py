@@ -234,7 +234,8 @@ class LinkNode:
         if silent != self._silent:
             self._silent = silent
             if silent:
-                yield statustext(now_ns, CRITICAL, f"silent: no estimate for {fix_type.SILENCE_AFTER_NS / 1e9:.0f} s")
+                after_s = fix_type.SILENCE_AFTER_NS / 1e9
+                yield statustext(now_ns, CRITICAL, f"GPS_INPUT stopped: no estimate for {after_s:.0f} s")
         if silent:
             self._fix_gate.withdraw()
             yield from self._gnss.tick(now_ns, has_fix=False)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from flight_records import frame, live_messages, origin, write_record, write_truth
+from flight_records import PERIOD_NS, frame, live_messages, origin, write_record, write_truth
 from terrafix.core.errors import SourceError
-from terrafix.messages import CalibrationFault
+from terrafix.messages import CalibrationFault, MapMatch, MeasurementVerdict, Message, Verdict
 from terrafix_tools.estimates import Row, write_rows
 from terrafix_tools.report.charts import clock, spans_of, ticks
 from terrafix_tools.report.page import report
@@ -72,6 +72,33 @@ def test_the_report_has_calibration_faults_and_the_verdict(tmp_path: Path) -> No
     text = page_of(tmp_path).text
     assert "Height/focal seems x2.00 off: no fix: stated against measured." in text
     assert "Verdict: Trust it from 8.0 s to 9.5 s, and no more than that (height/focal seems x2.00 off)." in text
+
+
+def test_the_report_has_the_rejected_map_matches_with_the_largest_test_ratios(tmp_path: Path) -> None:
+    def verdict(i: int, verdict: Verdict, detail: str, test_ratio: float | None = None) -> MeasurementVerdict:
+        return MeasurementVerdict(
+            t_ns=i * PERIOD_NS, frame_id=i, measurement="map", verdict=verdict, detail=detail, test_ratio=test_ratio
+        )
+
+    def match(i: int, verdict: Verdict) -> MapMatch:
+        return MapMatch(t_ns=i * PERIOD_NS, frame_id=i, verdict=verdict, matcher="gradient")
+
+    few = [match(0, Verdict.FEW_INLIERS), verdict(0, Verdict.FEW_INLIERS, "5 inliers")]
+    (tmp_path / "few").mkdir()
+    write_record(tmp_path / "few" / "flight.mcap", [origin(), *(frame(i) for i in range(3)), *few])
+    text = page_of(tmp_path / "few").text
+    assert "1 of 1 rejected map matches" in text
+    assert "0.0 s0few inliersanchor-5 inliers" in text
+
+    gated: list[Message] = []
+    for i in range(1, 24):
+        gated += [match(i, Verdict.ACCEPTED), verdict(i, Verdict.INNOVATION, f"<{i}> m", 1.0 + 0.01 * i)]
+    (tmp_path / "all").mkdir()
+    write_record(tmp_path / "all" / "flight.mcap", [origin(), *(frame(i) for i in range(24)), *few, *gated])
+    text = page_of(tmp_path / "all").text
+    assert "20 of 24 rejected map matches" in text
+    assert "11.5 s23innovationestimator1.23<23> m" in text
+    assert "<3> m" not in text and "5 inliers" not in text  # the smallest ratios, and none
 
 
 def test_without_truth_the_report_shows_the_reported_accuracy(tmp_path: Path) -> None:

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import gtsam
 import numpy as np
 
+from terrafix.estimator.integrity.alternative_position import AlternativePosition
 from terrafix.estimator.integrity.correlated_fixes import CorrelatedFixes
 from terrafix.estimator.integrity.innovation_run import CONSISTENT_M
-from terrafix.estimator.integrity.other_place import OtherPlace
 from terrafix.estimator.state import HORIZONTAL, UP
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph
 
@@ -57,7 +57,7 @@ def ambiguous_segments(
         for outside, at in sides:
             offsets = [(fixes[i].pose.translation() - poses[fixes[i].node].translation())[HORIZONTAL] for i in outside]
             middle = np.median(offsets, axis=0) if offsets else np.zeros(2)
-            other = OtherPlace()
+            other = AlternativePosition()
             # The error of their common offset is far less than the distance between them.
             other.spawn([o for o in offsets if np.hypot(*(o - middle)) <= CONSISTENT_M], np.zeros((2, 2)), fixed=True)
             if other.probability > 0.0:

@@ -70,7 +70,7 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
     found = [f["map_matches"] for f in summary["flights"]]
     yield (
         f"{summary['finalised']} of {summary['frames']} frames placed by {sum(f['believed'] for f in found)} map "
-        f"matches ({sum(f['refused'] for f in found)} refused); written to {folder / TABLE}"
+        f"matches ({sum(f['refused'] for f in found)} rejected); written to {folder / TABLE}"
     )
 
 
@@ -106,7 +106,7 @@ def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> dic
     try:
         found = smooth(flight, lambda done, of: step("smooth", done, of))
     except RuntimeError as error:  # GTSAM: the system is indeterminate
-        reason = f"what was measured leaves the track open ({str(error).strip().splitlines()[0]})"
+        reason = f"the measurements do not determine the track ({str(error).strip().splitlines()[0]})"
         return _summary(flight, None, [{"frames": len(flight.node_of), "why": reason}])
     frame = LocalFrame(flight.origin.lat_deg, flight.origin.lon_deg)
     r_b_c = Mount.of(flight.origin.camera).r_b_c()
@@ -116,7 +116,7 @@ def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> dic
             lost[int(found.begins[node])] += 1
         elif frame_id in rows:
             _fill(rows[frame_id], found, node, frame, r_b_c)
-    why = "no map match is believed there, and where it began is not known"
+    why = "no map match is accepted there, and its start is unknown"
     return _summary(flight, found, [{"frames": count, "why": why} for count in lost.values()])
 
 

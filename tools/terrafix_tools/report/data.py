@@ -21,6 +21,7 @@ from terrafix.messages import (
     Origin,
     ProcessEvent,
     StatusText,
+    Verdict,
 )
 from terrafix.recorder.reader import ReadResult, read_received, read_thumbnails
 from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, Row, RowTable, read_rows
@@ -38,6 +39,19 @@ from terrafix_tools.finalise.output import TABLE as FINALISED
 from terrafix_tools.finalise.output import read_track
 
 
+@dataclass(frozen=True)
+class RejectedMatch:
+    """A map match that was rejected. ``by_anchor``: its MapMatch has that verdict already; else the estimator raised
+    it."""
+
+    t_s: float
+    frame_id: int
+    verdict: str
+    by_anchor: bool
+    test_ratio: float | None
+    detail: str
+
+
 @dataclass
 class FlightView:
     """Data of a report, in order of time; times in seconds from the first frame."""
@@ -53,6 +67,7 @@ class FlightView:
     header: dict[str, Any] = field(default_factory=dict)
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
     map_verdict: dict[int, str] = field(default_factory=dict)  # by frame id
+    rejected_maps: list[RejectedMatch] = field(default_factory=list)
     health: list[tuple[float, str, float | None]] = field(default_factory=list)  # t_s, band, temperature
     gps: list[tuple[float, GpsInput]] = field(default_factory=list)
     faults: list[tuple[float, CalibrationFault]] = field(default_factory=list)
@@ -159,6 +174,8 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
     verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     sent_ns: dict[int, int] = {}
     timed: list[tuple[int, Message]] = []
+    anchor_verdict: dict[int, Verdict] = {}  # by frame id
+    rejected: list[MeasurementVerdict] = []
     for _, t_ns, received_ns, message in read_received(folder, result):
         table.take(message)
         if isinstance(message, NavEstimate):
@@ -169,8 +186,11 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
             verdicts[message.measurement][str(message.verdict)] += 1
             if message.measurement == "map":
                 view.map_verdict[message.frame_id] = str(message.verdict)
+                if message.verdict is not Verdict.ACCEPTED:
+                    rejected.append(message)
         elif isinstance(message, MapMatch):
             view.map_verdict.setdefault(message.frame_id, str(message.verdict))
+            anchor_verdict[message.frame_id] = message.verdict
         elif isinstance(message, Origin):
             view.origin = message
         elif isinstance(message, CalibrationEstimate):
@@ -184,6 +204,17 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
             row.process_ms = sent_ns[frame_id] / 1e6
     zero_ns = round(min((row.t_s for row in table.rows.values()), default=0.0) * NS)
     _add_timed(view, timed, zero_ns)
+    view.rejected_maps = [
+        RejectedMatch(
+            (m.t_ns - zero_ns) / NS,
+            m.frame_id,
+            str(m.verdict),
+            anchor_verdict.get(m.frame_id) is m.verdict,
+            m.test_ratio,
+            m.detail,
+        )
+        for m in rejected
+    ]
     view.verdicts = dict(sorted(verdicts.items()))
     view.header = result.header
     view.cut_off = len(result.truncated_files)

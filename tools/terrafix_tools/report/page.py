@@ -12,7 +12,7 @@ from terrafix_tools.replay import map_cache_dir
 from terrafix_tools.report.charts import clock
 from terrafix_tools.report.data import FlightView, gather, radius95_m
 from terrafix_tools.report.map_picture import map_svg
-from terrafix_tools.report.sections import accuracy, states, verdicts
+from terrafix_tools.report.sections import accuracy, rejected_map_matches, states, verdicts
 from terrafix_tools.report.sections_run import camera_images, link, provenance, timing
 from terrafix_tools.report.text import events, figures, stamp
 
@@ -54,6 +54,7 @@ def _page(view: FlightView, map_path: Path | None) -> str:
         accuracy(view),
         states(view),
         verdicts(view),
+        rejected_map_matches(view),
         timing(view),
         link(view),
         camera_images(view),

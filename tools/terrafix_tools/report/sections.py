@@ -4,8 +4,9 @@ from html import escape
 from typing import Any
 
 from terrafix_tools.report.charts import HALF_WIDTH, Band, Chart, Point, clock, spans_of, strips
-from terrafix_tools.report.data import FlightView, radius95_m
+from terrafix_tools.report.data import FlightView, RejectedMatch, radius95_m
 
+MAX_REJECTED = 20  # rows of the table of rejected map matches
 ERROR_FLOOR_M = 0.5  # lower end of the logarithmic axis; the available ground truth does not resolve smaller errors
 LABELS = {
     "satellite_anchored": "map match",
@@ -176,6 +177,28 @@ def verdicts(view: FlightView) -> str:
         '<h2>Verdicts</h2><p class="lead">Verdicts per measurement; rejected ones by reason.</p>'
         f'<div class="two">{"".join(blocks)}</div>'
     )
+
+
+def rejected_map_matches(view: FlightView) -> str:
+    """Table of the rejected map matches with the largest test ratios; those without one fill the rest."""
+    if not view.rejected_maps:
+        return ""
+    ranked = sorted(view.rejected_maps, key=lambda match: 0.0 if match.test_ratio is None else -match.test_ratio)
+    shown = sorted(ranked[:MAX_REJECTED], key=lambda match: match.t_s)
+    head = "".join(f"<th>{name}</th>" for name in ("time", "frame", "verdict", "raised by", "test ratio", "detail"))
+    rows = "".join(_rejected_row(match) for match in shown)
+    return (
+        f'<h2>Rejected map matches</h2><p class="lead">{len(shown)} of {len(view.rejected_maps)} rejected map matches, '
+        "those with the largest test ratios (squared Mahalanobis distance over the limit of the gate).</p>"
+        f'<div class="scroll"><table><tr>{head}</tr>{rows}</table></div>'
+    )
+
+
+def _rejected_row(match: RejectedMatch) -> str:
+    ratio = "-" if match.test_ratio is None else f"{match.test_ratio:.2f}"
+    raised_by = "anchor" if match.by_anchor else "estimator"
+    cells = (f"{match.t_s:.1f} s", str(match.frame_id), match.verdict.replace("_", " "), raised_by, ratio, match.detail)
+    return "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
 
 
 def end_s(view: FlightView) -> float:

@@ -41,11 +41,15 @@ def solve(
     search_radius: float,
     min_inliers: int = MIN_INLIERS,
 ) -> PnpResult:
-    """Pose from ``points_w_m`` (N, 3) and ``xy`` (N, 2) normalised image coordinates; ``r_w_c``: predicted rotation.
-    ``threshold`` of an inlier and ``search_radius`` of the patches: shares of the height. ``min_inliers``: fewest
-    inliers.
+    """Pose from ``points_w_m`` (N, 3) and ``xy`` (N, 2) normalised image coordinates, with ``weights`` (N,) of the
+    matches in the refinement. ``r_w_c`` (3, 3): predicted rotation. ``agl_m``: height above ground; relief below
+    ``PLANAR_RELIEF`` of it counts as a plane. ``sigma_floor``: smallest 1-sigma of a match, normalised image
+    coordinates. ``threshold`` of an inlier and ``search_radius`` of the patches: shares of the height.
 
-    Verdict FEW_INLIERS or DEGENERATE (tilt too far from the prediction) without a pose, else ACCEPTED.
+    Required inliers: the largest of ``min_inliers``, ``MIN_INLIER_SHARE`` of N, and N p + 4 sqrt(N p) + 3, where p is
+    the probability that a randomly matched patch is an inlier. With fewer the verdict is FEW_INLIERS; DEGENERATE if the
+    refinement fails or the tilt is more than ``MAX_TILT_CHANGE_RAD`` from the prediction; both without a pose. Else
+    ACCEPTED.
     """
     n = len(xy)
     p_random_inlier = min(

@@ -108,7 +108,7 @@ class Belief:
         """Measurement update with the surfaces of one frame, one per rotation and scale; the best hypothesis counts in
         each cell. ``weight`` 0..1: share of new ground (a second observation of the same ground is not independent).
 
-        -> log of the evidence: log likelihood ratio "the camera is distributed as the belief says, against elsewhere".
+        -> evidence [nats]: log likelihood ratio "the camera is distributed as the belief says, against elsewhere".
         """
         llr = self._log_likelihood(surfaces[0])
         for surface in surfaces[1:]:  # one at a time: a wide window with many yaw hypotheses would need a gigabyte

@@ -110,13 +110,13 @@ class PlaceHypothesis:
     def is_near(self, e_m: float, n_m: float, agl_m: float) -> bool:
         return float(np.hypot(self.e_m - e_m, self.n_m - n_m)) <= MERGE_RADIUS * agl_m
 
-    def update_score(self, gain: float, path_m: float, agl_m: float) -> None:
-        """Measurement update of the score. ``gain``: nats of a frame; ``path_m``: length flown since the search
+    def update_score(self, evidence_nats: float, path_m: float, agl_m: float) -> None:
+        """Measurement update of the score. ``evidence_nats``: of a frame; ``path_m``: length flown since the search
         began."""
         new = float(np.clip((path_m - self.scored_path_m) / (NEW_EVIDENCE * agl_m), MIN_EVIDENCE_WEIGHT, 1.0))
         self.scored_path_m = path_m
-        self.score = max(self.score + new * gain, LLR_MIN)
-        self.frames += gain >= CONFIRMATION_LLR
+        self.score = max(self.score + new * evidence_nats, LLR_MIN)
+        self.frames += evidence_nats >= CONFIRMATION_LLR
 
 
 @dataclass(frozen=True)
@@ -198,10 +198,10 @@ class HypothesisTracker:
         self.sigmas.append(z)
         if self.tracks and track is not self.tracks[0]:
             self.null.add(found.consensus, fine=is_strong)
-        gain, had_confirmation = evidence(z), track.frames > 0
-        track.update_score(gain, path_m, view.agl_m)
+        evidence_nats, had_confirmation = evidence(z), track.frames > 0
+        track.update_score(evidence_nats, path_m, view.agl_m)
         track.mahalanobis2 = _mahalanobis2(track.hypothesis, view)
-        if gain <= 0.0:
+        if evidence_nats <= 0.0:
             return None
         east, north, yaw_rad, scale, tilt_e, tilt_n = (float(v) for v in found.consensus.motion)
         moved_m = (east + tilt_e) * here.agl_m, (north + tilt_n) * here.agl_m

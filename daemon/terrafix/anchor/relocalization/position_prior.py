@@ -63,13 +63,15 @@ def evaluate_prior(
         return PriorDecision(Verdict.OUTSIDE_MAP, False, distance_m, f"hint is {distance_text(off_m)} outside the map")
     if searching or radius_m < SIGMAS_95 * belief.sigma_m:
         return PriorDecision(
-            Verdict.ACCEPTED, True, distance_m, f"hint taken, searching within {distance_text(radius_m)}"
+            Verdict.ACCEPTED, True, distance_m, f"hint accepted, searching within {distance_text(radius_m)}"
         )
     if distance_m <= radius_m + AGREEMENT_SIGMAS * belief.sigma_m:
-        return PriorDecision(Verdict.ACCEPTED, False, distance_m, f"hint agrees, {distance_text(distance_m)} from us")
+        text = f"hint agrees, {distance_text(distance_m)} from the estimate"
+        return PriorDecision(Verdict.ACCEPTED, False, distance_m, text)
     if belief.log_odds < START_LOG_ODDS:
         return PriorDecision(Verdict.ACCEPTED, True, distance_m, f"hint is {distance_text(distance_m)} off, searching")
-    return PriorDecision(Verdict.INNOVATION, False, distance_m, f"hint not used, {distance_text(distance_m)} from us")
+    text = f"hint not used, {distance_text(distance_m)} from the estimate"
+    return PriorDecision(Verdict.INNOVATION, False, distance_m, text)
 
 
 def distance_text(metres: float) -> str:

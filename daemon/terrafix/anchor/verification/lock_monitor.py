@@ -40,9 +40,11 @@ class LockMonitor:
         """Probability that the position is wrong; 0 while it is too small to matter in the covariance."""
         return 0.0 if self.log_odds > DOUBT_LOG_ODDS else 1.0 / (1.0 + float(np.exp(self.log_odds)))
 
-    def update(self, gain: float, weight: float, new: float, inliers: int, sigma_m: float, agl_m: float) -> None:
-        """Measurement update. ``gain``: evidence of the belief in nats (``Belief.update``) for an observation of this
-        weight; ``new``: share of new ground, since repeated observations of one field are no evidence against it;
+    def update(
+        self, evidence_nats: float, weight: float, new: float, inliers: int, sigma_m: float, agl_m: float
+    ) -> None:
+        """Measurement update. ``evidence_nats``: result of ``Belief.update`` for an observation with ``weight``;
+        ``new``: share of new ground, since repeated observations of one field are no evidence against it;
         ``inliers`` of the pose, 0: no pose.
 
         ``sigma_m``: 1-sigma of the position. If it is large the log odds are not updated, because over a wide belief
@@ -52,7 +54,7 @@ class LockMonitor:
         if has_wide_sigma(sigma_m, agl_m):
             self.log_odds = min(self.log_odds, START_LOG_ODDS)
             return
-        self.log_odds += min(max(gain - NULL_GAIN * weight, MIN_GAIN * new), MAX_GAIN * weight)
+        self.log_odds += min(max(evidence_nats - NULL_GAIN * weight, MIN_GAIN * new), MAX_GAIN * weight)
         if inliers:
             self.log_odds += weight * pose_gain(inliers)
         self.log_odds = min(self.log_odds, MAX_LOG_ODDS)
@@ -65,4 +67,4 @@ def has_wide_sigma(sigma_m: float, agl_m: float) -> bool:
 
 def pose_gain(inliers: int) -> float:
     """Log likelihood ratio "here against elsewhere" of a pose with so many inliers."""
-    return max((gain for fewest, gain in POSE_LLR if inliers >= fewest), default=0.0)
+    return max((llr for fewest, llr in POSE_LLR if inliers >= fewest), default=0.0)

@@ -26,11 +26,11 @@ from terrafix.estimator.state import (
 )
 
 MIN_TRIPLES = 12  # points [tuned]
-# A focal length error is equal in all pictures: n errors of one sigma add up to n sigmas, not to the root of n as
+# A focal length error is equal in all images: n errors of one sigma add up to n sigmas, not to the root of n as
 # independent ones do. Root of an n of 25: a turn or two, in which it looks like a change of heading. [tuned]
 FOCAL_REPEATS = 5.0
 MIN_TRANSLATION = 0.05  # least length of both translations, share of the height: shorter ones give no depth [tuned]
-SHARED_TRIPLES = 3.0  # constraints that share a picture, with the same errors of its points [spec: three views each]
+SHARED_TRIPLES = 3.0  # constraints that share an image, with the same errors of its points [spec: three views each]
 MAX_ITERATIONS = 5  # of Gauss-Newton [tuned]
 STEP_TOLERANCE = 1e-5  # convergence, rad and heights [tuned]
 HUBER_K = 1.5  # Huber threshold of a point, in sigmas [tuned]
@@ -44,7 +44,7 @@ MAX_BEHIND = 0.1  # largest share of points behind the camera [tuned]
 K2_SIGMA = 0.03
 # Prior of the outer cameras during the iteration, rad and share of the translation: it bounds directions that the
 # points leave open. It is not part of the factor; a solution beyond PRIOR_GATE_SIGMAS of it contradicts the pairs of
-# the same pictures. [tuned]
+# the same images. [tuned]
 PRIOR_RAD, PRIOR_SHARE, PRIOR_GATE_SIGMAS = 0.03, 0.1, 3.0
 NULL_EIGENVALUE = 1e-9  # share of the largest eigenvalue, below which a direction is null: absolute scale [tuned]
 # Estimated: tangents of both outer cameras, and k1; eliminated: k2 and the relative focal length. [spec: layout]

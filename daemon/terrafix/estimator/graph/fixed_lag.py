@@ -91,11 +91,11 @@ class FixedLagSmoother:
         self._isam.update(factors, values, [], groups, None, reordered)
 
     def estimate(self) -> gtsam.Values:
-        """Of all variables in the window."""
+        """Newest estimate of all variables in the window."""
         return self._isam.calculateEstimate()
 
     def linearization_point(self) -> gtsam.Values:
-        """Of all factors in the window: within RELINEARIZE of the estimate."""
+        """Linearisation point of all factors in the window: within RELINEARIZE of the estimate."""
         return self._isam.getLinearizationPoint()
 
     def pose(self, node: int) -> gtsam.Pose3:

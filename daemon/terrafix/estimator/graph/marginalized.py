@@ -90,7 +90,7 @@ class MarginalizedHistory:
 
     def refine(self) -> tuple[np.ndarray, np.ndarray]:
         """After landing, when all nodes have left: position (N, 3) of each node given all measurements, and its
-        covariance (N, 3, 3), world axes; nan where indeterminate: the estimate of the flight stands there."""
+        covariance (N, 3, 3), world axes; nan where indeterminate: the caller keeps the estimate made in flight."""
         self._close()
         intervals = [(a, b) for a, b in pairwise(self._retained) if b not in self._segment_starts]
         poses = {node: self._values[node][0] for node in self._retained}

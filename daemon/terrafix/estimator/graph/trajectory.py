@@ -59,7 +59,7 @@ class Trajectory:
             self._by_ends[node] = jacobian @ by_ends[at]
 
     def mark_indeterminate(self, ends: tuple[int, int]) -> None:
-        """The nodes between these two have no position."""
+        """Sets the positions of the nodes between these two to nan, which means indeterminate."""
         self._p_m[ends[0] + 1 : ends[1]] = np.nan
 
     def solved(

@@ -1,7 +1,7 @@
 """Fragments of odometry, and the test whether a fragment belongs to this flight.
 
 Frames that odometry registers to each other form a fragment (a map of ORB-SLAM3's atlas, Campos et al. 2021). The
-fragment that begins after a loss of tracking may show another flight: pictures of another camera, or an old buffer.
+fragment that begins after a loss of tracking may show another flight: images of another camera, or an old buffer.
 Its frames are consistent with each other, as those of a true one are. So odometry of a new fragment is not fused until
 independent evidence joins it to this flight: a camera pose on the map, or motion as velocity and inertial readings
 predict it."""
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-FOREIGN_SPEED_MPS = 30.0  # m/s: pictures of another flight move with up to this, in any direction [tuned]
+FOREIGN_SPEED_MPS = 30.0  # m/s: images of another flight move with up to this, in any direction [tuned]
 JOIN_LLR = 3.0  # nats per frame: 1 in 20 foreign motions is as close to the prediction by chance [tuned]
 CONSISTENT_D2 = 1.39  # squared Mahalanobis distance [spec: chi-square, 2 degrees of freedom, 50 %]
 HIT_RATE_MEMORY = 10.0  # correlations over which the hit rate is averaged [tuned]
@@ -91,7 +91,7 @@ class MotionEvidence:
     """Residual of one motion, as evidence that it belongs to this flight.
 
     ``residual_m`` (2,): horizontal motion by odometry less the predicted one, with covariance ``cov_m2`` (2, 2).
-    ``dt_s``: duration of the motion. ``turns_agree``: the pictures turn as the reported heading does."""
+    ``dt_s``: duration of the motion. ``turns_agree``: the images turn as the reported heading does."""
 
     residual_m: np.ndarray
     cov_m2: np.ndarray
@@ -102,7 +102,7 @@ class MotionEvidence:
         """Whether the evidence is sufficient, together with ``other_llr`` [nats] of other sources.
 
         Where velocity is so uncertain that no motion reaches JOIN_LLR, motion within the 50 % ellipse is sufficient:
-        foreign pictures are rare."""
+        foreign images are rare."""
         required_llr = min(JOIN_LLR, self.max_llr - 0.5 * CONSISTENT_D2)
         return self.turns_agree and self.llr + other_llr >= required_llr
 

@@ -26,7 +26,7 @@ class MapConsistency:
 
     @property
     def probability(self) -> float:
-        """Of H1: the map shows other ground."""
+        """Probability, 0..1, of H1: the map shows other ground."""
         return 1.0 / (1.0 + math.exp(-self._log_odds))
 
     @property

@@ -9,8 +9,8 @@ import numpy as np
 
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.estimator.integrity.alternative_position import AlternativePosition
 from terrafix.estimator.integrity.map_consistency import MapConsistency
-from terrafix.estimator.integrity.other_place import OtherPlace
 from terrafix.messages import BeliefSummary, Origin, SearchResult, Verdict
 
 # Share of the height above ground. With a smaller 1-sigma, map poses have placed the graph. A mode of the belief
@@ -48,7 +48,7 @@ class PositionHypotheses:
         searched = origin is not None and origin.start_sigma_m > SEARCH_START_SIGMA_M
         self._start_sigma_m = origin.start_sigma_m if origin is not None and searched else 0.0
         self.anywhere_m = 0.0
-        self.other = OtherPlace()
+        self.other = AlternativePosition()
         self.map_consistency = MapConsistency()
         self._modes: tuple[Component, ...] = ()  # of the anchor's belief, heaviest first
         self._belief: Component | None = None  # moments of the whole belief, while no pose has placed the graph

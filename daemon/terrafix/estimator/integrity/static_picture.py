@@ -1,21 +1,21 @@
-"""Distinguishes a hovering vehicle from a frozen camera when consecutive pictures show the same view."""
+"""Distinguishes a hovering vehicle from a frozen camera when consecutive images show the same view."""
 
 import math
 
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 
-# Change of roll or pitch under a static picture. An attitude filter of a vehicle at rest drifts less in a minute.
+# Change of roll or pitch under a static image. An attitude filter of a vehicle at rest drifts less in a minute.
 MIN_TILT_CHANGE_RAD = math.radians(1.0)  # [tuned]
-# Longest static picture in the air [s]. "Static" means below 0.006 degrees; no multirotor holds its attitude that well.
+# Longest static image in the air [s]. "Static" means below 0.006 degrees; no multirotor holds its attitude that well.
 MAX_STATIC_S = 3.0  # [tuned]
 
 
 class StaticPicture:
-    """State of the current run of static pictures."""
+    """State of the current run of static images."""
 
     def __init__(self) -> None:
         self._since_s: float | None = None
-        self._attitude: Attitude | None = None  # at the first static picture
+        self._attitude: Attitude | None = None  # at the first static image
         self._frozen = False
 
     def is_frozen(self, t_s: float, attitude: Attitude, *, static: bool, is_moving: bool) -> bool:

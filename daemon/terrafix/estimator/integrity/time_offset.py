@@ -30,7 +30,7 @@ MAX_SLEW = 0.2  # s/s: rate of change of the applied offset [tuned]
 
 @dataclass(frozen=True)
 class Turn:
-    """Change of heading from ``t0_ns`` to ``t1_ns`` as pictures show it, clockwise."""
+    """Change of heading from ``t0_ns`` to ``t1_ns`` as images show it, clockwise."""
 
     t0_ns: int
     t1_ns: int

@@ -1,4 +1,4 @@
-"""Wind estimator, and airspeed as a measurement of velocity where no picture shows the ground.
+"""Wind estimator, and airspeed as a measurement of velocity where no image shows the ground.
 
 While odometry gives the velocity, a Kalman filter estimates the wind, the scale of the airspeed sensor (air density: a
 tenth at 2000 m; the position error of the pitot tube is of the same size) and the strength of gusts. Without odometry,

@@ -12,10 +12,10 @@ class Measurement(Protocol):
 
     @property
     def name(self) -> str:
-        """Of its verdicts."""
+        """Name of the measurement in its verdicts (``MeasurementVerdict.measurement``)."""
 
     def innovation(self, state: FilterState, node: int) -> Innovation:
-        """Against the newest estimate of ``node``."""
+        """Measurement minus prediction by the newest estimate of ``node``, with covariance and gate."""
 
     def add_to(self, state: FilterState, node: int) -> None:
         """Adds its factors to the graph."""

@@ -38,7 +38,8 @@ class MapPoseMeasurement:
 
     @classmethod
     def of(cls, match: MapMatch, terrain: Terrain, radial_k1_estimate: tuple[float, float]) -> "MapPoseMeasurement":
-        """Of a match that is ``determined``. ``radial_k1_estimate``: radial coefficient and its 1-sigma."""
+        """Measurement from a match that is ``determined``. ``radial_k1_estimate``: radial coefficient and its
+        1-sigma."""
         assert match.pose is not None
         seen, seen_cov = measured_pose(match.pose, match.map_sigma_m, terrain)
         by_k1, (radial_k1, sigma) = moved_by_k1(match), radial_k1_estimate
@@ -47,17 +48,17 @@ class MapPoseMeasurement:
 
     @property
     def position_m(self) -> np.ndarray:
-        """(2,) east and north."""
+        """Position (2,) [m], east and north."""
         return np.asarray(self.pose.translation()[:2])
 
     def innovation(self, state: FilterState, node: int) -> Innovation:
-        """6 degrees of freedom, tangent order."""
+        """Innovation of the pose, 6 degrees of freedom, tangent order."""
         residual = state.graph.state(node).pose.logmap(self.pose)
         return Innovation(residual, state.covariance(node) + self.cov, GATE[6])
 
     def position_innovation(self, pose: gtsam.Pose3, pose_cov: np.ndarray) -> Innovation:
-        """Against a predicted ``pose`` with ``pose_cov`` (6, 6), tangent order: 2 degrees of freedom, east and north,
-        whatever the heading is."""
+        """Innovation of the position against a predicted ``pose`` with ``pose_cov`` (6, 6), tangent order: 2 degrees
+        of freedom, east and north, whatever the heading is."""
         both = [tangent_to_world(c, p.rotation().matrix()) for p, c in ((pose, pose_cov), (self.pose, self.cov))]
         residual = (self.pose.translation() - pose.translation())[:2]
         return Innovation(residual, (both[0] + both[1])[:2, :2], GATE[2])
@@ -71,7 +72,7 @@ class MapPoseMeasurement:
 
 
 def measured_pose(pose: MapPose, map_sigma_m: float, terrain: Terrain) -> tuple[gtsam.Pose3, np.ndarray]:
-    """Of a match that is ``determined``: pose and covariance (6, 6), tangent order.
+    """Pose and covariance (6, 6), tangent order, of a match that is ``determined``.
 
     A slope that the map does not have looks like a tilt of the camera about the ground below it: it rotates the pose
     and moves it by the height times as much."""

@@ -160,7 +160,7 @@ class OdometryMeasurement:
     def _innovation(
         self, t_s: float, p_m: np.ndarray, seen: KeyframeMotion, before: NodeState, increment: MotionIncrement
     ) -> MotionInnovation:
-        """Of a camera at ``p_m`` (3,) by odometry, against the motion model."""
+        """Innovation of a camera position ``p_m`` (3,) by odometry, against the motion model."""
         state = self._state
         predicted_m, _ = increment.predict(before.pose.translation(), before.velocity, float(before.bias[HEADING]))
         dt_s = state.graph.since_newest_s(t_s)

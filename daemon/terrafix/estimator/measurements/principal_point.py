@@ -73,7 +73,7 @@ class PrincipalPointFilter:
         seen = triples.reshape(-1, 3, 2)[:, [1, 0, 2]]  # the middle camera comes first
         try:
             added = _information(seen, sigma_norm, at, self._x)
-        except np.linalg.LinAlgError:  # an iterate whose distortion folds the picture
+        except np.linalg.LinAlgError:  # an iterate whose distortion folds the image
             added = None
         if added is None or not all(np.isfinite(numbers).all() for numbers in added):
             return
@@ -82,10 +82,10 @@ class PrincipalPointFilter:
         self._x = self._x - np.linalg.solve(self._information, gradient)
         self.cov = self._covariance()
 
-    def shift(self, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def shift(self, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """-> shift (2,), east and north [m], from the camera of the graph to the true one, and its covariance (2, 2).
-        ``lever``: the horizontal part (2, 2) of R_w_c, times the height [m]."""
-        return lever @ self.offset, lever @ self.cov @ lever.T
+        ``jacobian`` (2, 2): ``FilterState.principal_point_jacobian``."""
+        return jacobian @ self.offset, jacobian @ self.cov @ jacobian.T
 
     def _covariance(self) -> np.ndarray:
         return (

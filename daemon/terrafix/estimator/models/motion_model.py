@@ -55,7 +55,7 @@ NOISE_FLOOR_MPS2 = 0.03  # per root hertz: interpolated attitude, readings that 
 UNCOVERED_ACCEL_MPS2 = 2.0  # 1-sigma change of acceleration in the time that no reading covers [tuned]
 NO_DECAY_S = 1e6  # correlation time of a velocity that does not decay [spec: long against any increment]
 STATIONARY_M, STATIONARY_MPS = 0.3, 0.1  # 1-sigma of a vehicle whose motors may not turn [tuned]
-CLOCK_JITTER_S = 0.005  # 1-sigma of the time of a picture against the autopilot's clock [tuned]
+CLOCK_JITTER_S = 0.005  # 1-sigma of the time of an image against the autopilot's clock [tuned]
 POSITION_NOISE_M = 0.02  # 1-sigma of each increment beside the model: numerical floor [tuned]
 MODEL_SAMPLES = 9  # samples of an increment without readings [tuned]
 _QUADRATURE_NODES, _QUADRATURE_WEIGHTS = np.polynomial.legendre.leggauss(8)  # order per panel [tuned]
@@ -238,7 +238,7 @@ def fuse_odometry_increment(
     -> the increment, its noise widened where the innovation exceeds the gate; the updated covariance (11, 11); and the
     correction (8,) of V at the end."""
     d2 = float(innovation_m @ np.linalg.solve(predicted_cov[DELTA_P, DELTA_P] + odometry_cov, innovation_m))
-    if d2 > GATE[3]:  # the model missed something: a gust, a manoeuvre, a picture with a wrong time
+    if d2 > GATE[3]:  # the model missed something: a gust, a manoeuvre, an image with a wrong time
         wider = (d2 / GATE[3] - 1.0) * increment.cov
         increment, predicted_cov = replace(increment, cov=increment.cov + wider), predicted_cov + wider
     innovation_cov = predicted_cov[DELTA_P, DELTA_P] + odometry_cov

@@ -18,7 +18,7 @@ from terrafix.estimator.monitors.visual_motion import visual_motion
 from terrafix.messages import CalibrationFault, MapMatch, Odometry, Origin, Verdict
 
 FAULT_SIGMA_M = 1000.0  # m: least 1-sigma per horizontal axis while the description is known to be wrong [tuned]
-MIN_TURN_SPACING_S = 1.0  # s between turns that count: pictures of one keyframe share their errors [tuned]
+MIN_TURN_SPACING_S = 1.0  # s between turns that count: images of one keyframe share their errors [tuned]
 # Constant errors, 1-sigma, beyond the configured ones: heading [rad] of a compass beside motors, and height as a share
 # of it, of a barometer over uneven ground. [tuned]
 HEADING_SIGMA_RAD, HEIGHT_SIGMA_SHARE = math.radians(10.0), 0.05

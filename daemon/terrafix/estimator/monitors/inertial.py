@@ -1,4 +1,4 @@
-"""Scale and mount faults from velocity changes: pictures against accelerometers, without a map.
+"""Scale and mount faults from velocity changes: images against accelerometers, without a map.
 
 A wrong reported height or focal length scales every visual velocity; a wrong mount yaw rotates it. Neither affects the
 accelerometers, and a compass error rotates both alike. So dv_visual = gain * dv_inertial, with gain 1 where the
@@ -85,6 +85,6 @@ class InertialMonitor:
 
 
 def _log_likelihood(visual: complex, expected: complex, span_s: float) -> float:
-    """Of a visual velocity change [m/s] over ``span_s``, up to a constant."""
+    """Log likelihood of a visual velocity change [m/s] over ``span_s``, up to a constant."""
     variance = (TILT_ACCEL_MPS2 * span_s) ** 2 + 2.0 * VISUAL_VELOCITY_MPS**2 + (GAIN_SIGMA * abs(expected)) ** 2
     return -0.5 * abs(visual - expected) ** 2 / variance - float(np.log(variance))

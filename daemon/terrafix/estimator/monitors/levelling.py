@@ -1,4 +1,4 @@
-"""Swapped or inverted roll and pitch, from the visual velocity of pictures that are levelled with them.
+"""Swapped or inverted roll and pitch, from the visual velocity of images that are levelled with them.
 
 With the true attitude the visual velocity changes slowly. With a wrong one it jumps by twice the change of tilt. Each
 possible fault is tested: the attitude that gives the smoothest velocity is the true one. The test needs neither a map

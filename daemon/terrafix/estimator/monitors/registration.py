@@ -35,7 +35,7 @@ class Registration:
 
     @property
     def probability(self) -> float:
-        """Of H1, a wrong description."""
+        """Probability, 0..1, of H1: the description is wrong; 0 once H0 is confirmed."""
         return 0.0 if self.confirmed else 1.0 / (1.0 + math.exp(-self._log_odds))
 
     @property

@@ -1,11 +1,11 @@
-"""Turns by the picture against turns by the attitude: in a mirrored picture they have opposite signs."""
+"""Turns by the image against turns by the attitude: in a mirrored image they have opposite signs."""
 
 import math
 
 from terrafix.estimator.monitors.cusum import Cusum, threshold
 
 STEPS_PER_HOUR = 3600.0  # 1/h: at most one turn a second [spec: MIN_TURN_SPACING_S]
-VISUAL_TURN_SIGMA_RAD = math.radians(1.0)  # 1-sigma of a turn between two pictures [tuned]
+VISUAL_TURN_SIGMA_RAD = math.radians(1.0)  # 1-sigma of a turn between two images [tuned]
 
 
 class TurnMonitor:
@@ -20,5 +20,5 @@ class TurnMonitor:
         return self._test.active
 
     def add(self, reported_rad: float, turned_rad: float) -> None:
-        """A turn by the attitude and by the picture. H0: they are equal; H1: opposite."""
+        """A turn by the attitude and by the image. H0: they are equal; H1: opposite."""
         self._test.add(-2.0 * reported_rad * turned_rad / self._variance)

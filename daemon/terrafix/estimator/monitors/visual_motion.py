@@ -1,4 +1,4 @@
-"""Camera motion between two frames from the picture alone, levelled with the autopilot's attitude."""
+"""Camera motion between two frames from the image alone, levelled with the autopilot's attitude."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ MIN_PAIRS = 8  # point pairs [tuned]
 @dataclass(frozen=True)
 class VisualMotion:
     """``displacement`` (2,): horizontal, east and north, in heights above ground. ``turned_rad``: rotation about the
-    optical axis by the picture, clockwise; it does not depend on the mount. ``reported_rad``: the same by the
+    optical axis by the image, clockwise; it does not depend on the mount. ``reported_rad``: the same by the
     attitude."""
 
     displacement: np.ndarray

@@ -28,7 +28,7 @@ AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 
 class Role(Enum):
-    """Of the sender of one packet."""
+    """Role of the sender of one packet."""
 
     AUTOPILOT = "autopilot"  # the served autopilot
     OTHER = "other"  # a ground station, a gimbal, a vehicle behind the same router

@@ -3,7 +3,7 @@
 A receiver is used on the ground only, before the vehicle is armed for the first time: while it has a 3D fix, claims
 10 m or better, has been stationary for five seconds, and nothing contradicts it. When the vehicle is carried to another
 place, the initial position follows. A receiver that jumps faster than a vehicle can be moved, or that another receiver
-contradicts, is jammed, spoofed or broken. Nothing on the ground tells which of the two positions is the true one, so no
+contradicts, is jammed, spoofed or broken. No measurement on the ground can decide between the two positions, so no
 receiver is used from then on."""
 
 import math

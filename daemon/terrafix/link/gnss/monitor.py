@@ -159,4 +159,4 @@ class GnssMonitor:
         self._on_vision, self._switched_ns = vision, now_ns
         receiver = next((n for n, d in self._detectors.items() if d.assessment.state is GnssState.TRUSTED), 0)
         yield PositionSource(t_ns=now_ns, vision=vision, receiver=receiver)
-        yield statustext(now_ns, NOTICE, f"flying on the {'map' if vision else 'GPS'} now")
+        yield statustext(now_ns, NOTICE, f"position source: {'map' if vision else 'GPS'}")

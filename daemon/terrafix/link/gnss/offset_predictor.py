@@ -12,7 +12,7 @@ A drag-off appears in both errors in full; little else does. They are combined w
 and Granger, The combination of forecasts, 1969), and the combined error is compared with earlier errors of this flight.
 The claims of both sides are the prior of the variance, so that the error follows a bivariate Student t distribution
 (Gelman et al., Bayesian Data Analysis, 3.2): with few samples an alarm needs a large error. The constants were chosen
-on flights of other seeds than those of docs/autopilot.md, "The GNSS judge"."""
+on flights of other seeds than those of docs/autopilot.md, "The spoofing detector"."""
 
 from collections import deque
 from dataclasses import dataclass

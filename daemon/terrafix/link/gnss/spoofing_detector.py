@@ -8,7 +8,7 @@ Two tests, each over a run of readings:
 
 The errors of both sides are correlated over seconds to minutes (a map fix, the map itself, multipath). For such errors
 a cumulative sum of the distance (Page 1954) was measured and is worse: where it detects a drag-off as early, it has ten
-times the false alarms. The performance of these tests is in docs/autopilot.md, "The GNSS judge"."""
+times the false alarms. The performance of these tests is in docs/autopilot.md, "The spoofing detector"."""
 
 import math
 from dataclasses import dataclass

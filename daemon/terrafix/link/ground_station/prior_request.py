@@ -17,6 +17,7 @@ UNKNOWN_POSITION_SIGMA_M = 100.0
 UNANCHORED_SHARE, MIN_UNANCHORED_NS = 0.2, round(DEGRADATION_LEVELS[-1][0] * NS_PER_S)
 # From this way in metres on whatever the share is. [spec: AC-2, 20 m, over a drift of 1 %]
 MAX_UNANCHORED_M = 2000.0
+AGE_STEP_NS = 1_000_000  # ns: the age of a fix is in whole milliseconds [spec: NavEstimate.last_anchor_age_ms]
 REPEAT_NS = 30 * NS_PER_S  # ns between requests; a pilot ignores a text that comes every few seconds [tuned]
 # ns; without an estimate for so long the cause is another fault, which has its own text. [tuned]
 MAX_ESTIMATE_AGE_NS = 10 * NS_PER_S
@@ -40,8 +41,8 @@ class _Route:
             speed_mps = math.hypot(*estimate.velocity_enu_mps[:2])
             self.way_m += speed_mps * (estimate.t_ns - self.t_ns) / NS_PER_S
         self.t_ns = estimate.t_ns if self.t_ns is None else max(self.t_ns, estimate.t_ns)
-        fix_ns = estimate.t_ns - estimate.last_anchor_age_ms * 1_000_000
-        if estimate.last_anchor_age_ms >= 0 and fix_ns > self.fix_ns:
+        fix_ns = estimate.t_ns - estimate.last_anchor_age_ms * AGE_STEP_NS
+        if estimate.last_anchor_age_ms >= 0 and fix_ns > self.fix_ns + AGE_STEP_NS:
             self.fix_ns, self.fix_way_m = fix_ns, self.way_m
 
     @property

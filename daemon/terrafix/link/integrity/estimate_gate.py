@@ -1,6 +1,6 @@
 """Gate for the estimates that the link sends: plausibility, order, freshness and confirmation of jumps (ON-6, AC-3).
 
-The autopilot's filter rejects an inconsistent position for 10 s and then resets onto it. A wrong position that persists
+The autopilot's EKF rejects an inconsistent position for 10 s and then resets onto it. A wrong position that persists
 is therefore accepted there in the end. So a jump must be stopped here: the fix is lowered at once, and the new position
 is accepted after further estimates have confirmed it."""
 
@@ -19,7 +19,7 @@ MIN_AMSL_M, MAX_AMSL_M = -500.0, 10_000.0  # shore of the Dead Sea; above the ce
 MAX_ABOVE_GROUND_M = 5_000.0  # m above the ground at the origin [tuned]
 MAX_BELOW_GROUND_M = 300.0  # m below the ground at the origin: terrain may descend from there [tuned]
 JUMP_GATE_SIGMAS = 5.0  # as the autopilot's own position gate [spec: ArduPilot EK3_POS_I_GATE 500, hundredths of sigma]
-JUMP_GATE_MIN_M = 10.0  # m; the autopilot's filter averages smaller steps [tuned]
+JUMP_GATE_MIN_M = 10.0  # m; the autopilot's EKF averages smaller steps [tuned]
 LARGE_JUMP_M = 200.0  # m; a larger jump needs confirmation whatever accuracy is claimed (ON-6) [tuned]
 
 

@@ -1,9 +1,9 @@
 """Fix type and reported accuracies: 3 while age, covariance and speed accuracy are good enough, otherwise 1, never 0.
 
-Fix type 0 keeps the filter of a booting copter from starting at all. Every sample below 3 is dropped by the filter, so
-fix type 1 means "no fix" without a side effect. Silence has the same effect on the filter, but it shows only after 4 s
-and lowers the rate health on return. It is used only after a long time without any estimate, when the messages would
-make a dead position source look like a live GPS."""
+Fix type 0 keeps the EKF of a booting copter from starting at all. Every sample below 3 is dropped by the EKF, so fix
+type 1 means "no fix" without a side effect. No GPS_INPUT at all has the same effect on the EKF, but the autopilot
+detects it only after 4 s, and it lowers the rate health on return. Sending stops only after a long time without any
+estimate, when further messages would report a failed position source as a working GPS."""
 
 import math
 from dataclasses import dataclass
@@ -27,9 +27,9 @@ RECOVERY_SPEED_SIGMA_MPS = 1.45  # m/s; hysteresis, as above [tuned]
 SPIKE_RATIO = 3.0  # accuracy over the last one that was sent [tuned]
 SPIKE_MIN_M = 15.0  # m; smaller accuracies are no spike [tuned]
 SPIKE_HOLD_NS = 2_000_000_000  # ns of no fix before the larger accuracy is reported [tuned]
-MIN_HORIZONTAL_ACCURACY_M = 0.5  # m; lower limit in the filter [spec: ArduPilot EK3_POSNE_M_NSE]
-MAX_ACCURACY_M = 100.0  # m; upper limit in the filter [measured: docs/autopilot-facts.md]
-MIN_SPEED_ACCURACY_MPS = 0.1  # m/s, per axis [tuned]
+MIN_HORIZONTAL_ACCURACY_M = 0.5  # m; lower limit in the EKF [spec: ArduPilot EK3_POSNE_M_NSE]
+MAX_ACCURACY_M = 100.0  # m; upper limit in the EKF [measured: docs/autopilot-facts.md]
+MIN_SPEED_ACCURACY_MPS = 0.1  # m/s, in the worst direction [tuned]
 
 # ON-6, degradation levels: (seconds without a map fix, factor on the position accuracy, MAV_SEVERITY). [tuned]
 DEGRADATION_LEVELS = ((0.0, 1.0, 6), (5.0, 1.2, 5), (15.0, 1.5, 4), (35.0, 2.0, 2))
@@ -48,7 +48,7 @@ class NoFixReason:
     short: str
 
 
-# The computer was restarted in the air: its start coordinate is where the flight began, and claims a good accuracy.
+# The computer was restarted in flight: the start coordinate is the place of take-off, with a small stated sigma.
 STARTED_IN_FLIGHT = NoFixReason("started in flight, and no map fix yet", "the map must confirm the start")
 
 
@@ -109,7 +109,8 @@ class FixGate:
 
 
 def reported_accuracy(predicted: PredictedState, level: int) -> tuple[float, float, float]:
-    """-> (horizontal [m], vertical [m], speed [m/s]), 1-sigma per axis. The degradation level widens the position."""
+    """-> (horizontal [m], vertical [m], speed [m/s]), 1-sigma, horizontal and speed in the worst direction. The
+    degradation level widens horizontal and vertical accuracy."""
     factor = DEGRADATION_LEVELS[level][1]
     return (
         max(MIN_HORIZONTAL_ACCURACY_M, predicted.horizontal_sigma_m * factor),

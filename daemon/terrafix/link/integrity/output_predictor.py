@@ -1,7 +1,7 @@
 """Predicts an estimate to the present with the inertial increments since then (inertial_integrator.py), and grows its
 covariance with the age. The same task as that of PX4's output predictor.
 
-The autopilot's velocity is not used: it is computed by the filter to which this position is sent. Feeding it back with
+The autopilot's velocity is not used: it is computed by the EKF to which this position is sent. Feeding it back with
 the delay of the camera path would close a loop that can oscillate. The attitude comes from the gyroscopes."""
 
 import math
@@ -41,7 +41,7 @@ class PredictedState:
     velocity_enu_mps: tuple[float, float, float]
     horizontal_sigma_m: float  # 1-sigma along the worst horizontal axis
     vertical_sigma_m: float
-    speed_sigma_mps: float  # 1-sigma per axis
+    speed_sigma_mps: float  # 1-sigma of the velocity in its worst direction
 
 
 class InertialBuffer:

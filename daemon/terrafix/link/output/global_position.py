@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.link.integrity.output_predictor import offset
 from terrafix.messages import GpsInput
 
-# Field id of GLOBAL_POSITION_SENSOR. PX4 disables the slot of its filter whose EKF2_AGPn_ID is 0, so 0 is no sensor.
+# Field id of GLOBAL_POSITION_SENSOR. PX4 disables the slot of its EKF whose EKF2_AGPn_ID is 0, so 0 is no sensor.
 SENSOR_ID = 1  # [measured: docs/autopilot.md]
 # The position is already predicted to the time of transmission. [spec: MAVLink field processing_time]
 PROCESSING_TIME = 0
@@ -19,7 +19,7 @@ def global_position_sensor(gps: GpsInput, sysid: int) -> mavlink.MAVLink_global_
     have a 3D fix.
 
     Without a fix the message must not be sent: PX4 1.18 does not read the flag "unhealthy", takes a NaN accuracy for
-    the best one, and after 5 s resets its filter to a latitude that is marked invalid (INT32_MAX): measured, 25 798 km
+    the best one, and after 5 s resets its EKF to a latitude that is marked invalid (INT32_MAX): measured, 25 798 km
     away."""
     return mavlink.MAVLink_global_position_sensor_message(
         sysid,
@@ -39,8 +39,8 @@ def global_position_sensor(gps: GpsInput, sysid: int) -> mavlink.MAVLink_global_
 
 
 def external_position_estimate(gps: GpsInput, sysid: int) -> mavlink.MAVLink_command_int_message:
-    """ArduPilot accepts it only as COMMAND_INT, in a global frame, without height (z NaN), and only when its filter has
-    had no position for a second. It is a hard reset of the filter without a gate.
+    """ArduPilot accepts it only as COMMAND_INT, in a global frame, without height (z NaN), and only when its EKF has
+    had no position for a second. It is a hard reset of the EKF without a gate.
 
     Its time is a float32 in seconds of our clock: the resolution is 8 ms after a day and half a second after 50 days
     (11 m at 22 m/s). So the position is moved back, with the velocity of ``gps``, to the newest time that the field can

@@ -1,8 +1,8 @@
 """The position as a pose in the local frame of the autopilot: ODOMETRY (331) and VISION_POSITION_ESTIMATE (102).
 
-Both carry the position at the time of transmission, north, east and down of the origin of the autopilot's filter in
+Both carry the position at the time of transmission, north, east and down of the origin of the autopilot's EKF in
 metres. Metres are computed from degrees as the firmware does it, so that it computes the same latitude and longitude.
-Without a 3D fix nothing is sent: neither message can state "no fix", and the filter stops using the stream after
+Without a 3D fix nothing is sent: neither message can state "no fix", and the EKF stops using the stream after
 300 ms."""
 
 import math
@@ -27,7 +27,7 @@ _XX, _YY, _ZZ, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20
 
 @dataclass(frozen=True)
 class GeodeticPoint:
-    """A point such as the origin of the autopilot's filter (GPS_GLOBAL_ORIGIN)."""
+    """A point such as the origin of the autopilot's EKF (GPS_GLOBAL_ORIGIN)."""
 
     lat_deg: float
     lon_deg: float

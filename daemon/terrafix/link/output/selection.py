@@ -12,7 +12,7 @@ from terrafix.link.output import global_position, gps_input, odometry
 from terrafix.link.output.odometry import Attitude, GeodeticPoint
 from terrafix.messages import GpsInput
 
-EXTERNAL_POSITION_PERIOD_NS = 5 * NS_PER_S  # ns; rare, because each one is a hard reset of the filter [tuned]
+EXTERNAL_POSITION_PERIOD_NS = 5 * NS_PER_S  # ns; rare, because each one is a hard reset of the EKF [tuned]
 EXTERNAL_POSITION_MAX_SIGMA_M = 30.0  # m, 1-sigma; the autopilot has no gate for it [tuned]
 ORIGIN_REQUEST_PERIOD_NS = 3 * NS_PER_S  # ns between requests until the origin is known [tuned]
 LOCAL_FRAME_OUTPUTS: tuple[OutputName, ...] = ("odometry", "vision_position")
@@ -58,7 +58,7 @@ class PositionOutputs:
                     yield from self._local_frame(name, gps, autopilot)
 
     def requests(self, start: GeodeticPoint | None, autopilot: AutopilotState, now_ns: int) -> Iterator[Any]:
-        """Requests for the origin of the autopilot's filter, when an output needs it. From the second request on the
+        """Requests for the origin of the autopilot's EKF, when an output needs it. From the second request on the
         start of the flight (``start``) is sent as the origin: an autopilot that never had a GPS position has none.
         ArduPilot ignores it when it has an origin."""
         if autopilot.origin is not None or not set(LOCAL_FRAME_OUTPUTS) & set(self.names(autopilot.firmware)):

@@ -2,7 +2,7 @@
 
 from terrafix.core.clock import NS_PER_S
 
-# ns; the autopilot's filter drops samples that are closer together. [spec: ArduPilot EKF3 sensorIntervalMin_ms]
+# ns; the autopilot's EKF drops samples that are closer together. [spec: ArduPilot EKF3 sensorIntervalMin_ms]
 MIN_INTERVAL_NS = 50_000_000
 
 

@@ -46,11 +46,11 @@ def ground() -> np.ndarray:
 @pytest.mark.parametrize(
     ("belief", "east_m", "radius_m", "searching", "verdict", "begins", "text"),
     [
-        (KNOWN, 3000.0, 5000.0, False, Verdict.ACCEPTED, False, "hint agrees, 3.0 km from us"),
-        (KNOWN, 8000.0, 5000.0, False, Verdict.INNOVATION, False, "hint not used, 8.0 km from us"),
-        (START, 3000.0, 5000.0, False, Verdict.ACCEPTED, False, "hint agrees, 3.0 km from us"),
+        (KNOWN, 3000.0, 5000.0, False, Verdict.ACCEPTED, False, "hint agrees, 3.0 km from the estimate"),
+        (KNOWN, 8000.0, 5000.0, False, Verdict.INNOVATION, False, "hint not used, 8.0 km from the estimate"),
+        (START, 3000.0, 5000.0, False, Verdict.ACCEPTED, False, "hint agrees, 3.0 km from the estimate"),
         (START, 8000.0, 5000.0, False, Verdict.ACCEPTED, True, "hint is 8.0 km off, searching"),
-        (KNOWN, 200.0, 5000.0, True, Verdict.ACCEPTED, True, "hint taken, searching within 5.0 km"),
+        (KNOWN, 200.0, 5000.0, True, Verdict.ACCEPTED, True, "hint accepted, searching within 5.0 km"),
         (CurrentBelief(0.0, 0.0, 400.0, MAX_LOG_ODDS), 10.0, 500.0, False, Verdict.ACCEPTED, True, "within 500 m"),
         (KNOWN, 16_000.0, 5000.0, True, Verdict.OUTSIDE_MAP, False, "hint is 6.0 km outside the map"),
         (KNOWN, 14_000.0, 5000.0, True, Verdict.ACCEPTED, True, "searching within"),

@@ -228,6 +228,17 @@ def test_a_hint_is_requested_after_two_kilometres_without_a_map_fix_on_any_route
     assert unanchored_request_s(3000, speed_mps=10.0, until_s=4000)[0] == 200
 
 
+def test_rounding_of_the_age_of_a_map_fix_is_not_taken_for_a_new_one() -> None:
+    request, asked_s = PriorRequest(), None
+    for frame in range(3000):
+        t_ns = round(frame * S / 7.29)
+        fixed_ns = min(t_ns, 200 * S)
+        known = estimate(t_ns, frame_id=frame, cov=covariance(5.0), anchor_age_ms=(t_ns - fixed_ns) // 1_000_000)
+        request.on_estimate(known)
+        asked_s = asked_s or (t_ns / S if request.due(t_ns) else None)
+    assert asked_s == pytest.approx(250.0, abs=0.3)  # a fifth of the route at a constant speed
+
+
 def test_no_hint_is_requested_before_a_vehicle_has_moved() -> None:
     assert unanchored_request_s(5, speed_mps=0.0) == (None, "")
 

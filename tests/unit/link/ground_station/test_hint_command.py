@@ -49,7 +49,7 @@ class Flying:
     def _answer(self, says: Publisher, hint: PositionHint) -> None:
         for of in (hint.t_ns - 1, hint.t_ns):  # the first one answers somebody else
             if self._verdict is not None:
-                text = "hint not used, 12 km from us" if of == hint.t_ns else "of another"
+                text = "hint not used, 12 km from the estimate" if of == hint.t_ns else "of another"
                 says.publish(
                     HintVerdict(t_ns=of, hint_t_ns=of, verdict=self._verdict, distance_m=1.0, sigma_m=1.0, text=text)
                 )
@@ -71,7 +71,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunDir]:
 def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verdict) -> None:
     flying = Flying(run, verdict)
     try:
-        assert hint(48.1, -11.5, 3000.0) == "hint not used, 12 km from us"
+        assert hint(48.1, -11.5, 3000.0) == "hint not used, 12 km from the estimate"
     finally:
         flying.land()
     (received,) = flying.hints

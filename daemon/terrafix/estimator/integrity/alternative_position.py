@@ -1,10 +1,10 @@
 """The alternative position: where the vehicle is if the estimate follows wrong map matches, and its probability.
 
-Map matches that agree with each other and not with the graph mean that one of the two is wrong, and nothing on board
-shows which: rows of houses and fields are self-consistent for minutes. Whichever position the estimate follows, the
-published covariance includes the other one until matches over enough new ground support the estimate. A position that
-the map supported before the disagreement, and supports again after it, is more reliable: to be wrong it takes two such
-repeating patterns."""
+Map matches that agree with each other and not with the graph mean that one of the two is wrong, and no on-board
+measurement can decide between them: rows of houses and fields are self-consistent for minutes. Whichever position the
+estimate follows, the published covariance includes the other one until matches over enough new ground support the
+estimate. A position that the map supported before the disagreement, and supports again after it, is more reliable: to
+be wrong it takes two such repeating patterns."""
 
 from dataclasses import dataclass, field
 
@@ -29,7 +29,7 @@ REACHED_PROBABILITY = 1 / 9  # [spec: probability p gives sigma = offset * sqrt(
 
 
 @dataclass
-class OtherPlace:
+class AlternativePosition:
     """``offset_m`` (2,): from the estimate to the alternative position, with covariance ``cov_m2`` (2, 2)."""
 
     offset_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
@@ -42,7 +42,7 @@ class OtherPlace:
 
     @property
     def probability(self) -> float:
-        """Of the alternative position."""
+        """Probability, 0..1, of the alternative position; 0: there is none."""
         return self._pattern_probability**2 if self._needs_two_patterns else self._pattern_probability
 
     def spawn(self, offsets_m: list[np.ndarray], cov_m2: np.ndarray, *, fixed: bool) -> None:

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from terrafix.estimator.integrity.other_place import (
+from terrafix.estimator.integrity.alternative_position import (
     DECAY_FACTOR_START,
     DECAY_HEIGHTS,
     INITIAL_PROBABILITY,
     REACHED_PROBABILITY,
-    OtherPlace,
+    AlternativePosition,
 )
 
 ESTIMATE_COV = np.diag([4.0, 4.0, 9.0, 1e-4, 1e-4, 1e-4])
@@ -20,7 +20,7 @@ def mahalanobis2(cov: np.ndarray, error_m: np.ndarray) -> float:
     return float(error_m @ np.linalg.solve(cov[:2, :2], error_m))
 
 
-def inflated(other: OtherPlace, cov: np.ndarray) -> np.ndarray:
+def inflated(other: AlternativePosition, cov: np.ndarray) -> np.ndarray:
     """``cov`` (6, 6) with the inflation by the alternative position."""
     cov = cov.copy()
     cov[:2, :2] += other.inflation_m2()
@@ -28,13 +28,13 @@ def inflated(other: OtherPlace, cov: np.ndarray) -> np.ndarray:
 
 
 def test_a_single_rejected_match_does_not_spawn_an_alternative_position() -> None:
-    other = OtherPlace()
+    other = AlternativePosition()
     other.spawn([np.array([350.0, 0.0])], OFFSET_COV, fixed=True)
     assert np.array_equal(inflated(other, ESTIMATE_COV), ESTIMATE_COV)
 
 
 def test_two_consistent_rejected_matches_extend_the_ellipse_to_the_alternative_position_only() -> None:
-    other, offset = OtherPlace(), np.array([60.0, -30.0])
+    other, offset = AlternativePosition(), np.array([60.0, -30.0])
     other.spawn([offset + 1.0, offset - 1.0], OFFSET_COV, fixed=True)
     cov = inflated(other, ESTIMATE_COV)
     assert mahalanobis2(cov, offset) < 5.991
@@ -44,7 +44,7 @@ def test_two_consistent_rejected_matches_extend_the_ellipse_to_the_alternative_p
 
 
 def test_after_a_switch_the_old_position_decays_over_new_ground() -> None:
-    other, offset = OtherPlace(), np.array([0.0, 80.0])
+    other, offset = AlternativePosition(), np.array([0.0, 80.0])
     other.switch(offset, OFFSET_COV)
     assert mahalanobis2(inflated(other, ESTIMATE_COV), -offset) < 5.991
     other.decay(0.0, NO_MASS)  # without new ground there is no decay
@@ -58,12 +58,12 @@ def test_after_a_switch_the_old_position_decays_over_new_ground() -> None:
 
 def test_the_alternative_position_has_the_covariance_of_its_offset() -> None:
     """A plane without IMU had drifted by 8 m at the switch, and the old position lay aside of the offset."""
-    other, offset = OtherPlace(), np.array([-75.0, -3.0])
+    other, offset = AlternativePosition(), np.array([-75.0, -3.0])
     other.switch(offset, OFFSET_COV)
     other.decay(0.5 * DECAY_HEIGHTS, NO_MASS)
     aside = -offset + np.array([3.0, 7.0])
     assert mahalanobis2(inflated(other, ESTIMATE_COV), aside) < 9.0
-    sure = OtherPlace()
+    sure = AlternativePosition()
     sure.switch(offset, 0.0 * OFFSET_COV)
     sure.decay(0.5 * DECAY_HEIGHTS, NO_MASS)
     assert mahalanobis2(inflated(sure, ESTIMATE_COV), aside) > 9.0
@@ -72,7 +72,7 @@ def test_the_alternative_position_has_the_covariance_of_its_offset() -> None:
 @pytest.mark.parametrize("fixed", [True, False])
 def test_a_position_mapped_before_and_after_the_disagreement_is_wrong_only_if_two_patterns_repeat(fixed: bool) -> None:
     """Rows of fields move a flight by 60 m, and at their end it returns. A start coordinate is no map match."""
-    other, offset = OtherPlace(), np.array([60.0, 0.0])
+    other, offset = AlternativePosition(), np.array([60.0, 0.0])
     for away, map_told in ((offset, fixed), (-offset + 4.0, True)):
         other.spawn([away, away], OFFSET_COV, fixed=map_told)
         assert other.probability == pytest.approx(INITIAL_PROBABILITY)
@@ -84,7 +84,7 @@ def test_a_position_mapped_before_and_after_the_disagreement_is_wrong_only_if_tw
 
 
 def test_a_position_after_a_switch_needs_one_repeating_pattern_only() -> None:
-    other, offset = OtherPlace(), np.array([60.0, 0.0])
+    other, offset = AlternativePosition(), np.array([60.0, 0.0])
     other.spawn([offset, offset], OFFSET_COV, fixed=True)
     other.switch(offset, OFFSET_COV)
     other.decay(0.0, NO_MASS)
@@ -92,7 +92,7 @@ def test_a_position_after_a_switch_needs_one_repeating_pattern_only() -> None:
 
 
 def test_a_previously_mapped_position_outlasts_half_a_minute_over_repeating_rows() -> None:
-    other, offset = OtherPlace(), np.array([26.0, 45.0])
+    other, offset = AlternativePosition(), np.array([26.0, 45.0])
     other.spawn([offset, offset], OFFSET_COV, fixed=True)
     other.switch(offset, OFFSET_COV)
     for _ in range(30):
@@ -101,7 +101,7 @@ def test_a_previously_mapped_position_outlasts_half_a_minute_over_repeating_rows
 
 
 def test_below_the_reached_probability_the_offset_covariance_is_scaled_down() -> None:
-    other, offset = OtherPlace(), np.array([60.0, 0.0])
+    other, offset = AlternativePosition(), np.array([60.0, 0.0])
     other.switch(offset, OFFSET_COV)
     other.decay(DECAY_HEIGHTS * np.log(INITIAL_PROBABILITY / REACHED_PROBABILITY), NO_MASS)
     assert other.inflation_m2()[1, 1] == pytest.approx(OFFSET_COV[1, 1])
@@ -110,7 +110,7 @@ def test_below_the_reached_probability_the_offset_covariance_is_scaled_down() ->
 
 
 def test_an_unconfirmed_start_decays_faster_than_a_mapped_position() -> None:
-    unconfirmed, mapped = OtherPlace(), OtherPlace()
+    unconfirmed, mapped = AlternativePosition(), AlternativePosition()
     for other, fixed in ((unconfirmed, False), (mapped, True)):
         other.spawn([np.array([200.0, 200.0])] * 2, OFFSET_COV, fixed=fixed)
         other.switch(np.array([200.0, 200.0]), OFFSET_COV)
@@ -123,7 +123,7 @@ def test_an_unconfirmed_start_decays_faster_than_a_mapped_position() -> None:
 
 def test_a_start_without_mass_in_the_belief_is_removed_without_new_ground() -> None:
     """The belief began at the unconfirmed: its mass there is outside of the mode of the pose."""
-    unconfirmed, mapped = OtherPlace(), OtherPlace()
+    unconfirmed, mapped = AlternativePosition(), AlternativePosition()
     for other, fixed in ((unconfirmed, False), (mapped, True)):
         other.spawn([np.array([200.0, 200.0])] * 2, OFFSET_COV, fixed=fixed)
         other.switch(np.array([200.0, 200.0]), OFFSET_COV)
