@@ -104,6 +104,8 @@ class FilterState:
         self.lens_sigma = radial_k1_sigma(origin.camera)
         self.node_of: dict[int, int] = {}  # frame -> node, for nodes in the window
         self.cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C (6, 6), to propagate from
+        # node -> node of its keyframe, and covariance (6, 6) of the motion between them, tangent order at the node
+        self.motion_of: dict[int, tuple[int, np.ndarray]] = {}
         self.frames = array("q")  # frame of each node since the flight began
         self.principal_point_jacobians = array("f")  # ... and its ``principal_point_jacobian`` (2, 2)
 
@@ -114,6 +116,20 @@ class FilterState:
         if self.mode is CovarianceMode.MARGINALS or node not in self.cov_of:
             self.cov_of[node] = self.graph.covariance(node)
         return self.cov_of[node]
+
+    def set_fused_covariance(self, node: int, cov: np.ndarray) -> None:
+        """Covariance ``cov`` (6, 6) of C_node after a measurement there, while covariances are propagated.
+
+        The frames to come descend from the keyframe of ``node``. Seen from ``node`` its covariance is ``cov`` plus that
+        of the motion between them; where that is less than it had, it takes its place."""
+        self.cov_of[node] = cov
+        keyframe, motion_cov = self.motion_of.get(node, (node, cov))
+        if keyframe == node or keyframe not in self.cov_of:
+            return
+        back = self.graph.state(keyframe).pose.between(self.graph.state(node).pose).AdjointMap()
+        seen = back @ (cov + motion_cov) @ back.T
+        if np.linalg.slogdet(seen)[1] < np.linalg.slogdet(self.cov_of[keyframe])[1]:
+            self.cov_of[keyframe] = seen
 
     def frame_state(self, frame_id: int, t_s: float, node: int) -> FrameState:
         """Newest estimate of a frame whose node is in the window."""

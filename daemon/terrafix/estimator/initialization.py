@@ -72,6 +72,7 @@ def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior) -> i
     state.velocity_cov = prior.velocity_cov
     node = state.graph.start(t_s, prior)
     state.cov_of.clear()
+    state.motion_of.clear()
     state.continuity = FrameContinuity(KeyframeSubstitution.of(state.newest_odometry))
     state.register_frame(node, frame_id, Fragment(t_s, joined=True))
     return node

@@ -155,7 +155,7 @@ class MapUpdate:
         self._rejected.clear()
         if state.mode is CovarianceMode.JACOBIAN:
             information = np.linalg.inv(state.cov_of[node]) + np.linalg.inv(measurement.cov / share)
-            state.cov_of[node] = np.linalg.inv(information)
+            state.set_fused_covariance(node, np.linalg.inv(information))
         if not match.position_only:
             assert fusion.innovation is not None
             gate = tangent_to_world(fusion.innovation.covariance, before.pose.rotation().matrix())

@@ -335,6 +335,7 @@ class Propagation:
         dt_s = state.graph.since_newest_s(frame.t_s)
         if state.mode is CovarianceMode.JACOBIAN:
             state.cov_of[state.graph.next_node] = _compose_cov(state.cov_of[step.parent], step.motion)
+        state.motion_of[state.graph.next_node] = step.parent, step.motion.cov
         r_w_c, ground_m = step.pose.rotation().matrix(), state.terrain.elevation_m(p)
         attitude = state.camera.factor(state.graph.next_keys(), frame.attitude, r_w_c, ground_m, dt_s)
         rise_m = state.terrain.rise_sigma_m(float(np.hypot(*step.step_m)))
@@ -350,6 +351,7 @@ class Propagation:
         self._continuity_of(step, node)
         state.register_frame(node, frame.frame_id, step.sighting.fragment)
         state.cov_of = {n: cov for n, cov in state.cov_of.items() if state.graph.holds(n)}
+        state.motion_of = {n: motion for n, motion in state.motion_of.items() if state.graph.holds(n)}
         state.velocity_cov = step.predicted_cov[DELTA_MOTION, DELTA_MOTION]
         step.verdicts += self._fuse_aids(step, node, dt_s)
         state.last = state.frame_state(frame.frame_id, frame.t_s, node)

@@ -148,3 +148,34 @@ def test_a_map_match_over_known_ground_adds_its_share_of_information_to_the_prop
     assert shares[0] > 0.9 and 0.1 < shares[1] < 0.2
     expected = np.full(6, shares[1] / shares[0])
     assert gained[1].diagonal() / gained[0].diagonal() == pytest.approx(expected, rel=0.15)
+
+
+def _hot_flight_until_the_fix() -> tuple[EstimatorRun, Flight]:
+    flight = Flight(END, seed=2)
+    run = EstimatorRun().fly(flight, 0, HOT_FROM)
+    run.feed([health(ThermalBand.HOT)])
+    return run.fly(flight, HOT_FROM, FIX), flight
+
+
+def test_under_thermal_throttle_a_map_match_improves_its_keyframe_and_the_frames_after_it() -> None:
+    run, flight = _hot_flight_until_the_fix()
+    state = estimator_of(run).state
+    without = {n: np.linalg.slogdet(cov)[1] for n, cov in state.cov_of.items()}
+    run.fly(flight, FIX, FIX + 1)
+    node = state.node_of[FIX]
+    keyframe, motion_cov = state.motion_of[node]
+    back = state.graph.state(keyframe).pose.between(state.graph.state(node).pose).AdjointMap()
+    assert state.cov_of[keyframe] == pytest.approx(back @ (state.cov_of[node] + motion_cov) @ back.T)
+    assert np.linalg.slogdet(state.cov_of[keyframe])[1] < without[keyframe]
+    fixed, after = sigma_m(run.estimate(FIX)), run.fly(flight, FIX + 1, FIX + 2).estimate(FIX + 1)
+    assert sigma_m(after) < 1.5 * fixed
+
+
+def test_under_thermal_throttle_the_propagated_covariance_is_not_smaller_than_the_marginal() -> None:
+    run, flight = _hot_flight_until_the_fix()
+    for i in range(FIX, COOL_FROM):
+        run.fly(flight, i, i + 1)
+        estimator, last = newest(run)
+        propagated, marginal = estimator.state.cov_of[last.node], marginal_of(run)
+        for part in (slice(0, 3), slice(3, 6)):
+            assert np.trace(propagated[part, part]) > 0.95 * np.trace(marginal[part, part]), f"frame {i}"
