@@ -193,6 +193,25 @@ class Odometry(Message, frozen=True, kw_only=True):
     three_view_sigma_norm: float = 0.0  # 1-sigma of one coordinate of ``three_view``, normalised units
     # The view equals that of the previous frame to 0.006 degrees: the vehicle is stationary, or the camera is frozen.
     static: bool = False
+    # Fragment of the frame (frames that odometry connects to each other), numbered from 0 in the order in which they
+    # begin; a fragment that is continued keeps its number. -1: none, the frame is registered to no keyframe.
+    fragment_id: int = -1
+
+
+class Relocalization(Message, frozen=True, kw_only=True):
+    """Frame ``frame_id`` sees the ground of an older keyframe, which the keyframe database of vision has kept.
+
+    A loop closure if both are of one fragment; else it joins two fragments. Vision has verified it by geometry; the
+    estimator gates it. ``two_view`` as in Odometry: (x_kf, y_kf, x, y), normalised, RANSAC inliers."""
+
+    frame_id: int
+    fragment_id: int  # of the frame
+    keyframe_id: int
+    keyframe_fragment_id: int
+    two_view: list[tuple[float, float, float, float]]
+    sigma_norm: float  # 1-sigma of one coordinate of ``two_view``, normalised units
+    inliers: int
+    tracked: int  # matches, of which ``inliers`` agree with one motion
 
 
 # --- estimator to anchor --------------------------------------------------------------------------
@@ -213,6 +232,8 @@ class Prediction(Message, frozen=True, kw_only=True):
     # (core.camera.undistort_division); 0: not significant
     radial_k1: float = 0.0
     prior_t_ns: int = 0  # t_ns of the InitialPosition or EkfDeadReckoning that reset the position; 0: no reset
+    fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
+    joined: bool = True  # something other than dead reckoning ties that fragment to the flight; True without a fragment
 
 
 # --- anchor ---------------------------------------------------------------------------------------
@@ -300,6 +321,8 @@ class SearchState(Message, frozen=True, kw_only=True):
     """Stage of the relocalisation search, published on every change; ``normal`` when no search is active."""
 
     step: SearchStep
+    fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
+    joined: bool = True  # ... is joined to the flight (as in Prediction), with the match of this frame
 
 
 class PositionHint(Message, frozen=True, kw_only=True):
@@ -393,6 +416,8 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     covariance_mode: CovarianceMode
     last_anchor_age_ms: int  # age of the last map fix; -1: none yet
     emitted_at_ns: int  # time of publication; in a replay, the time of the frame
+    fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
+    joined: bool = True  # ... is joined to the flight (as in Prediction)
 
 
 class CalibrationFault(Message, frozen=True, kw_only=True):
@@ -457,8 +482,8 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
     """Result of the checks of one measurement. Every rejection has one (law 3); of heights and headings only those."""
 
     frame_id: int  # -1: not related to a frame
-    # From the estimator "odometry", "map", "attitude" (the reported heading), "height", "airspeed", "dead_reckoning",
-    # "start", "reset" (of the graph); from the link "estimate", "telemetry", "wall clock"
+    # From the estimator "odometry", "map", "relocalization", "attitude" (the reported heading), "height", "airspeed",
+    # "dead_reckoning", "start", "reset" (of the graph); from the link "estimate", "telemetry", "wall clock"
     measurement: str
     verdict: Verdict
     detail: str = ""
@@ -469,6 +494,8 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
     innovation: tuple[float, ...] = ()
     innovation_variance: tuple[float, ...] = ()  # of each component, measurement and prediction together
     test_ratio: float | None = None  # mahalanobis2 over the limit of its gate: above 1 it is rejected
+    fragment_id: int = -1  # "odometry", "map", "relocalization": fragment of the frame (as in Odometry); -1: none
+    joined: bool = True  # ... is joined to the flight (as in Prediction), with this measurement
 
 
 # --- link -----------------------------------------------------------------------------------------
@@ -648,6 +675,7 @@ AnyMessage = (
     | Imu
     | SourceEnded
     | Odometry
+    | Relocalization
     | Prediction
     | MapMatch
     | ModelEvent

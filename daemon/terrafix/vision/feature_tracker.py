@@ -49,6 +49,7 @@ class _Keyframe:
     sift: tuple[np.ndarray, np.ndarray] | None = None  # points (N, 2) px, descriptors (N, 128); computed on demand
     age: int = 0
     registered: bool = False  # registered to an earlier keyframe, or a later frame was registered to it
+    fragment_id: int = -1
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ class Motion:
 
     ``three_view`` (N, 6): normalised coordinates (x_prev, y_prev, x_kf, y_kf, x, y) of corners that the previous
     keyframe, frame ``previous_keyframe_id``, observed as well; only for a frame that becomes a keyframe.
-    ``sigma_norm``, ``three_view_sigma_norm``: 1-sigma of a coordinate, normalised."""
+    ``sigma_norm``, ``three_view_sigma_norm``: 1-sigma of a coordinate, normalised. ``fragment_id``: of the frame, as in
+    Odometry; -1: it was not registered."""
 
     keyframe_id: int
     verdict: Verdict
@@ -69,12 +71,15 @@ class Motion:
     previous_keyframe_id: int = -1
     three_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     three_view_sigma_norm: float = 0.0
+    fragment_id: int = -1
 
 
 class FrameTracker:
-    """Registers frames in order; stores one keyframe and the last tracked frame."""
+    """Registers frames in order; stores one keyframe and the last tracked frame.
 
-    def __init__(self, camera: CameraCalibration) -> None:
+    ``first_fragment_id``: number of the first fragment."""
+
+    def __init__(self, camera: CameraCalibration, first_fragment_id: int = 0) -> None:
         self._scale = min(1.0, WORK_WIDTH_PX / camera.width)
         self._camera = camera.scaled(self._scale)
         self._keyframe: _Keyframe | None = None
@@ -82,6 +87,7 @@ class FrameTracker:
         self._last_points = np.zeros((0, 2), np.float32)  # (N, 2) px: the keyframe's corners in that frame
         self._last_index = np.zeros(0, int)  # (N,) their indices in the keyframe
         self._failures = 0
+        self._fragment_id = self._newest_fragment_id = first_fragment_id - 1  # of the keyframe; of the newest fragment
         self._failed_frame: _Keyframe | None = None  # last frame that failed: candidate for the start of a new fragment
         self._previous_fragment: _Keyframe | None = None  # last keyframe of the previous fragment
         self._sift = cv2.SIFT.create(nfeatures=SIFT_FEATURES, enable_precise_upscale=True)
@@ -118,9 +124,9 @@ class FrameTracker:
             points_kf, points = points_kf[inlier], points[inlier]
             if self._determines_motion(points_kf, points, matched, MIN_INLIERS_FEATURES, MIN_INLIER_RATIO_FEATURES):
                 if candidate is self._failed_frame:
-                    self._end_fragment()
+                    self._begin_fragment()
                 elif candidate is self._previous_fragment:
-                    self._previous_fragment = None
+                    self._previous_fragment, self._fragment_id = None, candidate.fragment_id
                 # The KLT chain is broken; it restarts from this frame.
                 self._start_keyframe(frame_id, gray)
                 return self._build_motion(candidate, points_kf, points, len(points), matched, due=True)
@@ -245,6 +251,7 @@ class FrameTracker:
             keyframe.previous_keyframe_id if len(triples) else -1,
             triples,
             ALIGNED_SIGMA_PX / self._camera.fx,
+            self._fragment_id,
         )
 
     def _reject(self, keyframe: _Keyframe, current: _Keyframe, tracked: int) -> Motion:
@@ -255,17 +262,19 @@ class FrameTracker:
         self._failed_frame = current
         return Motion(keyframe.frame_id, Verdict.FEW_INLIERS, np.zeros((0, 4)), 0.0, 0, tracked, False)
 
-    def _end_fragment(self) -> None:
-        """Ends the fragment. A keyframe to which no other frame was registered is not a candidate for a return."""
+    def _begin_fragment(self) -> None:
+        """The next fragment. A keyframe to which no other frame was registered is not a candidate for a return."""
         if self._keyframe is not None and self._keyframe.registered:
             self._previous_fragment = self._keyframe
+        self._newest_fragment_id += 1
+        self._fragment_id = self._newest_fragment_id
 
     def _new_fragment(self, frame_id: int, gray: np.ndarray) -> Motion:
         """The frame starts a fragment: it has no motion, later frames are registered to it."""
-        self._end_fragment()
+        self._begin_fragment()
         self._start_keyframe(frame_id, gray)
         self._failures, self._failed_frame = 0, None
-        return Motion(frame_id, Verdict.ACCEPTED, np.zeros((0, 4)), 0.0, 0, 0, True)
+        return Motion(frame_id, Verdict.ACCEPTED, np.zeros((0, 4)), 0.0, 0, 0, True, fragment_id=self._fragment_id)
 
     def _start_keyframe(
         self,
@@ -289,7 +298,14 @@ class FrameTracker:
         new = corners.reshape(-1, 2).astype(np.float32) if corners is not None else _NO_POINTS
         found = np.vstack([carried, new])
         unseen = np.full((len(new), 2), np.nan, np.float32)
-        self._keyframe = _Keyframe(frame_id, gray, found, np.vstack([previous_corners, unseen]), previous_keyframe_id)
+        self._keyframe = _Keyframe(
+            frame_id,
+            gray,
+            found,
+            np.vstack([previous_corners, unseen]),
+            previous_keyframe_id,
+            fragment_id=self._fragment_id,
+        )
         self._last_gray, self._last_points, self._last_index = gray, found, np.arange(len(found))
 
 

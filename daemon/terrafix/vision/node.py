@@ -13,8 +13,10 @@ from terrafix.vision.repeated_picture import PictureHistory, Repeat
 class VisionNode:
     """In: Origin, Frame. Out: Odometry."""
 
-    def __init__(self, frames: FrameStore) -> None:
+    def __init__(self, frames: FrameStore, *, restarted: bool = False) -> None:
+        """``restarted``: in flight. Fragments of the process before keep their numbers."""
         self._frames = frames
+        self._restarted = restarted
         self._origin: Origin | None = None
         self._tracker: FrameTracker | None = None
         self._history = PictureHistory()
@@ -22,8 +24,7 @@ class VisionNode:
     def on(self, message: Message) -> Iterable[Message]:
         match message:
             case Origin() if message != self._origin:  # published again after a restart of the source
-                self._origin = message
-                self._tracker = FrameTracker(CameraCalibration.of(message.camera))
+                self._origin, self._tracker = message, None
                 self._history = PictureHistory()
             case Frame():
                 yield self._odometry(message)
@@ -35,6 +36,10 @@ class VisionNode:
 
     def _odometry(self, frame: Frame) -> Odometry:
         image = None if frame.error else self._frames.get(frame.frame_id)
+        if self._tracker is None and self._origin is not None:
+            # Frame ids go on after a restart, and there were not more fragments than frames.
+            first_fragment_id = frame.frame_id if self._restarted else 0
+            self._tracker = FrameTracker(CameraCalibration.of(self._origin.camera), first_fragment_id)
         if image is None or self._tracker is None:
             return Odometry(
                 t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.BAD_IMAGE
@@ -62,11 +67,12 @@ class VisionNode:
                 (float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in motion.three_view
             ],
             three_view_sigma_norm=motion.three_view_sigma_norm,
+            fragment_id=motion.fragment_id,
         )
 
 
 def make_node(ctx: NodeContext) -> VisionNode:
-    return VisionNode(ctx.frames)
+    return VisionNode(ctx.frames, restarted=ctx.epoch_ns is not None)
 
 
 def make_edge(ctx: NodeContext) -> Edge:

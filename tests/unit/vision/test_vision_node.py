@@ -3,9 +3,10 @@
 import msgspec
 import numpy as np
 
+from terrafix.core.camera import CameraCalibration
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import Camera, Frame, Odometry, Origin, Verdict
-from terrafix.vision.feature_tracker import Motion
+from terrafix.vision.feature_tracker import FrameTracker, Motion
 from terrafix.vision.node import VisionNode
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
@@ -33,13 +34,15 @@ def noisy(image: np.ndarray, seed: int) -> np.ndarray:
     return np.clip(image + noise, 0, 255).astype(np.uint8)
 
 
-def odometry(images: list[np.ndarray], origins: dict[int, Origin] | None = None) -> list[Odometry]:
-    """``origins``: published before the frame of that index, after the first one."""
+def odometry(
+    images: list[np.ndarray], origins: dict[int, Origin] | None = None, *, restarted: bool = False, first_id: int = 0
+) -> list[Odometry]:
+    """``origins``: published before the frame of that index, after the first one. ``first_id``: of the first frame."""
     store = MemoryFrameStore()
-    node = VisionNode(store)
+    node = VisionNode(store, restarted=restarted)
     list(node.on(ORIGIN))
     published = []
-    for i, image in enumerate(images):
+    for i, image in enumerate(images, first_id):
         if origins and i in origins:
             list(node.on(origins[i]))
         store.put(i, image)
@@ -86,11 +89,23 @@ def test_three_view_matches_carry_the_id_of_the_previous_keyframe() -> None:
     node = VisionNode(store)
     list(node.on(ORIGIN))
     seen = np.arange(6.0).reshape(1, 6)
-    motion = Motion(4, Verdict.ACCEPTED, seen[:, :4], 0.001, 30, 40, True, 2, seen, 0.002)
-    assert node._tracker is not None
+    motion = Motion(4, Verdict.ACCEPTED, seen[:, :4], 0.001, 30, 40, True, 2, seen, 0.002, fragment_id=3)
+    node._tracker = FrameTracker(CameraCalibration.of(ORIGIN.camera))
     node._tracker.register = lambda frame_id, gray: motion  # type: ignore[method-assign]
     store.put(5, picture(1))
     (published,) = node.on(Frame(t_ns=0, frame_id=5, file="5.jpg", width=640, height=480))
     assert isinstance(published, Odometry)
     assert (published.previous_keyframe_id, published.keyframe_id, published.three_view_sigma_norm) == (2, 4, 0.002)
+    assert published.fragment_id == 3
     assert published.two_view == [(0.0, 1.0, 2.0, 3.0)] and published.three_view == [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
+
+
+def test_frames_that_overlap_are_of_one_fragment_and_one_without_overlap_begins_the_next() -> None:
+    first, second = noisy(picture(1), 1), [noisy(picture(2), seed) for seed in (2, 3)]
+    assert [m.fragment_id for m in odometry([first, noisy(picture(1), 4), *second])] == [0, 0, -1, 1]
+
+
+def test_a_process_that_restarts_in_flight_numbers_no_fragment_as_the_one_before_did() -> None:
+    images = [noisy(picture(1), 1), noisy(picture(2), 2), noisy(picture(2), 3)]
+    assert [m.fragment_id for m in odometry(images, restarted=True, first_id=70)] == [70, -1, 71]
+    assert [m.fragment_id for m in odometry(images, first_id=70)] == [0, -1, 1]
