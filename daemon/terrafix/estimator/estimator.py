@@ -7,6 +7,7 @@ import numpy as np
 
 from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState, ImuQuery
 from terrafix.estimator.graph.pose_graph import PoseGraph
+from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.map_update import MapResult, MapUpdate
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
@@ -14,18 +15,20 @@ from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.prior import NavPrior
 from terrafix.estimator.propagation import Propagation, PropagationResult
-from terrafix.messages import MapMatch, Origin
+from terrafix.estimator.relocalization_update import RelocalizationUpdate
+from terrafix.messages import MapMatch, Origin, Relocalization
 
 
 class Estimator:
-    """``feed_frame`` with every frame in order of time; ``feed_map_match`` with the map match of a frame that was fed,
-    whenever it comes; ``feed_dead_reckoning`` with what the autopilot did while no estimator ran."""
+    """``feed_frame`` with every frame in order of time; ``feed_map_match`` and ``feed_relocalization`` with those of a
+    frame that was fed, whenever they come; ``feed_dead_reckoning`` with what the autopilot did while none ran."""
 
     def __init__(self, origin: Origin, prior: NavPrior | None = None, graph: PoseGraph | None = None) -> None:
         """``prior``: where an estimator that ran before in this flight left off. ``graph``: None: a new one."""
         self.state = FilterState(origin, graph, None if prior is None else prior.lens)
         self._propagation = Propagation(self.state, prior)
         self._map_update = MapUpdate(self.state)
+        self._relocalization_update = RelocalizationUpdate(self.state)
         self._ambiguous: dict[int, np.ndarray] = {}  # frame -> covariance (2, 2) of two positions that it may have had
 
     def feed_frame(self, frame: FrameInput) -> PropagationResult:
@@ -38,6 +41,10 @@ class Estimator:
     def feed_map_match(self, match: MapMatch) -> MapResult:
         """Gated, and fused at the node of its frame."""
         return self._map_update.apply(match)
+
+    def feed_relocalization(self, seen: Relocalization) -> FusionVerdict:
+        """Gated, and fused at the node of its frame."""
+        return self._relocalization_update.apply(seen)
 
     def feed_dead_reckoning(self, sample: DeadReckoning, attitude: Attitude | None, imu: ImuQuery) -> bool:
         """-> whether the newest frame, whose ``attitude`` is given, is placed by ``sample``."""

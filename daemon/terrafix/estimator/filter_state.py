@@ -3,7 +3,7 @@
 `Propagation` adds frames, `MapUpdate` adds map poses, `reset` begins a new graph. All work on one `FilterState`."""
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import gtsam
@@ -13,7 +13,9 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.graph.pose_graph import PoseGraph
 from terrafix.estimator.integrity.fragments import Fragment, Fragments
 from terrafix.estimator.integrity.yaw_gauge import YawGauge
+from terrafix.estimator.keyframe_store import KeptKeyframe, KeyframeStore
 from terrafix.estimator.keyframe_substitution import KeyframeSubstitution
+from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.attitude_height import MountedCamera
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
@@ -67,12 +69,14 @@ class FrameContinuity:
     ``substitution``: for the keyframe of vision that the graph no longer has. ``last_increment_inertial``: whether the
     last motion increment came from inertial readings; None: there was none. ``stationary_node``: node at which a
     disarmed vehicle stands. ``keyframe_motion``: node of the keyframe of the newest odometry, and the position (3,) of
-    the newest frame in that camera."""
+    the newest frame in that camera. ``unseen_inertial``: inertial readings have measured all of the motion since the
+    last frame with fused odometry."""
 
     substitution: KeyframeSubstitution | None = None
     last_increment_inertial: bool | None = None
     stationary_node: int | None = None
     keyframe_motion: tuple[int, np.ndarray] | None = None
+    unseen_inertial: bool = True
 
 
 class FilterState:
@@ -91,7 +95,8 @@ class FilterState:
         self.principal_point = PrincipalPointFilter(origin.camera, lens)
         self.speed_prior = SpeedPrior()
         self.fragments = Fragments()
-        self.fragment = Fragment(0.0, joined=True)  # of the newest frame
+        self.fragment = Fragment.joined_at(0.0)  # of the newest frame
+        self.keyframes = KeyframeStore()
         self.continuity = FrameContinuity()
         self.yaw_gauge: YawGauge | None = None
         self.last: FrameState | None = None  # newest frame
@@ -103,6 +108,7 @@ class FilterState:
         self.velocity_cov = np.zeros((MOTION_SIZE, MOTION_SIZE))  # of V of the newest node
         self.lens_sigma = radial_k1_sigma(origin.camera)
         self.node_of: dict[int, int] = {}  # frame -> node, for nodes in the window
+        self.keyframe_of: dict[int, int] = {}  # node -> frame, of the keyframes among them
         self.cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C (6, 6), to propagate from
         # node -> node of its keyframe, and covariance (6, 6) of the motion between them, tangent order at the node
         self.motion_of: dict[int, tuple[int, np.ndarray]] = {}
@@ -145,7 +151,7 @@ class FilterState:
     def register_frame(self, node: int, frame_id: int, fragment: Fragment) -> None:
         """The newest node belongs to ``frame_id``, in ``fragment``."""
         pose = self.graph.state(node).pose
-        if fragment.frames == 1 and not fragment.joined:
+        if fragment.frames == 1 and not fragment.confirmed:
             fragment.start_m = pose.translation()[:2]
             fragment.start_cov_m2 = tangent_to_world(self.covariance(node), pose.rotation().matrix())[:2, :2]
         self.fragment = fragment
@@ -153,8 +159,38 @@ class FilterState:
         self.fragments.retain({n for n in self.node_of.values() if self.graph.holds(n)} | {node})
         self.node_of = {frame: n for frame, n in self.node_of.items() if self.graph.holds(n)}
         self.node_of[frame_id] = node
+        self.keyframe_of = {n: frame for n, frame in self.keyframe_of.items() if self.graph.holds(n)}
+        becomes_keyframe = self.newest_odometry is not None and self.newest_odometry.becomes_keyframe
+        if becomes_keyframe and self.yaw_gauge is None:  # poses in axes that were chosen are not kept
+            self.keyframe_of[node] = frame_id
         self.frames.append(frame_id)
         self.principal_point_jacobians.extend(self.principal_point_jacobian(pose).ravel())
+
+    def fragment_of(self, frame_id: int) -> Fragment | None:
+        """The fragment of a frame in the window; None: it has left the window, or is registered to no fragment."""
+        node = self.node_of.get(frame_id)
+        if node is None or not self.graph.holds(node) or self.fragments.of(node).fragment_id < 0:
+            return None
+        return self.fragments.of(node)
+
+    def keyframe(self, frame_id: int) -> KeptKeyframe | None:
+        """A keyframe in the window, with its newest estimate, or one that has left it; None: neither."""
+        node = self.node_of.get(frame_id)
+        if node is None or node not in self.keyframe_of or not self.graph.holds(node):
+            return self.keyframes.get(frame_id)
+        return self._keyframe_at(node)
+
+    def _keyframe_at(self, node: int) -> KeptKeyframe:
+        pose = self.graph.state(node).pose
+        view = KeyframeView(pose, self.covariance(node), self.terrain.elevation_m(pose.translation()))
+        return KeptKeyframe(view, self.fragments.of(node))
+
+    def keep_keyframes(self, leaving: Iterable[int]) -> None:
+        """The nodes ``leaving`` are about to leave the window."""
+        for node in leaving:
+            frame_id = self.keyframe_of.get(node)
+            if frame_id is not None:
+                self.keyframes.add(frame_id, self._keyframe_at(node))
 
     def velocity_changed(self, node: int) -> None:
         """A factor on the velocity of the newest ``node`` was added: its covariances are read from the graph again."""

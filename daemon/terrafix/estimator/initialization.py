@@ -66,15 +66,18 @@ class ResetReason(StrEnum):
     INDETERMINATE = "the graph was numerically indeterminate"
 
 
-def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior) -> int:
-    """A new graph whose only node is the newest frame. -> its node. The nodes before stay as they were estimated."""
+def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior, *, joined: bool = True) -> int:
+    """A new graph whose only node is the newest frame. -> its node. The nodes before stay as they were estimated.
+    ``joined``: a measurement ties the frame to the flight; False: dead reckoning alone."""
     assert state.newest_odometry is not None
+    state.keep_keyframes(state.graph.window)
     state.velocity_cov = prior.velocity_cov
     node = state.graph.start(t_s, prior)
     state.cov_of.clear()
     state.motion_of.clear()
     state.continuity = FrameContinuity(KeyframeSubstitution.of(state.newest_odometry))
-    state.register_frame(node, frame_id, Fragment(t_s, joined=True))
+    fragment = Fragment(t_s, state.newest_odometry.fragment_id, confirmed=True, joined=joined)
+    state.register_frame(node, frame_id, fragment)
     return node
 
 
@@ -109,13 +112,20 @@ def start_at(
 
 
 def continue_from(
-    state: FilterState, frame: FrameInput, at_m: np.ndarray, velocity: np.ndarray, predicted_cov: np.ndarray
+    state: FilterState,
+    frame: FrameInput,
+    at_m: np.ndarray,
+    velocity: np.ndarray,
+    predicted_cov: np.ndarray,
+    *,
+    joined: bool,
 ) -> FrameState:
     """A new graph where the motion model predicts the camera, with the heading that is reported now, or with an
     unobservable one: a vehicle that was not seen may have turned, and the graph would take its course as a measurement
     of the turn.
 
-    ``at_m`` (3,), ``velocity`` (8,), ``predicted_cov``: of position and velocity, without what the newest node has."""
+    ``at_m`` (3,), ``velocity`` (8,), ``predicted_cov``: of position and velocity, without what the newest node has.
+    ``joined``: as in ``reset``."""
     last, attitude = state.last, frame.attitude
     assert last is not None
     dt_s = frame.t_s - last.t_s
@@ -136,7 +146,8 @@ def continue_from(
     velocity_cov = predicted_cov[DELTA_MOTION, DELTA_MOTION].copy()
     velocity_cov[VELOCITY, VELOCITY] += now.sigma_share**2 * float(velocity[:2] @ velocity[:2]) * level
     node = NodeState(gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), at_m), before.bias, velocity)
-    return _start(state, frame, node, (cov, bias_cov, velocity_cov), state.terrain.elevation_m(at_m))
+    covs = cov, bias_cov, velocity_cov
+    return _start(state, frame, node, covs, state.terrain.elevation_m(at_m), joined=joined)
 
 
 def _start(
@@ -145,9 +156,11 @@ def _start(
     first: NodeState,
     covs: tuple[np.ndarray, np.ndarray, np.ndarray],
     ground_m: float,
+    *,
+    joined: bool = True,
 ) -> FrameState:
     """A new graph with the reported attitude and height. ``covs``: of the pose (6, 6) in world axes, of B (6, 6) and of
-    V (8, 8). ``ground_m``: AMSL, below the camera."""
+    V (8, 8). ``ground_m``: AMSL, below the camera. ``joined``: as in ``reset``."""
     cov, bias_cov, velocity_cov = covs
     r_w_c = first.pose.rotation().matrix()
     gauge = state.yaw_gauge
@@ -159,7 +172,7 @@ def _start(
         state.camera.factor(state.graph.next_keys(), frame.attitude, r_w_c, ground_m),
         world_to_tangent(cov if gauge is None else gauge.gauge_fixed_cov(cov), r_w_c),
     )
-    node = reset(state, frame.frame_id, frame.t_s, prior)
+    node = reset(state, frame.frame_id, frame.t_s, prior, joined=joined)
     state.last = state.frame_state(frame.frame_id, frame.t_s, node)
     return state.last
 

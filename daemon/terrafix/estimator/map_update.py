@@ -128,7 +128,7 @@ class MapUpdate:
     def _coarse_refusal(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult | None:
         """Why a coarse match is not fused; None: it is to be fused, or the match is not coarse."""
         state = self._state
-        if match.position_only and not state.fragments.of(node).joined:  # its position comes from earlier frames
+        if match.position_only and not state.fragments.of(node).confirmed:  # its position comes from earlier frames
             return _result(Verdict.UNCONFIRMED, "coarse match cannot confirm an odometry fragment")
         predicted, height_m = state.graph.state(node).pose, self._height_m(measurement)
         r_w_c = measurement.pose.rotation().matrix()
@@ -237,6 +237,8 @@ class MapUpdate:
         assert state.last is not None
         first = NodeState(measurement.pose.compose(onward), bias, velocity)
         reset(state, state.last.frame_id, now_s, GraphPrior(first, cov, bias_cov, velocity_cov))
+        if not position.is_accepted:  # what led to the wrong estimate is in the kept keyframes, too
+            state.keyframes.clear()
         self._rejected.clear()
         self.hypotheses.on_reset(match.search.sigma_m)
         self._fixes = CorrelatedFixes()

@@ -45,6 +45,7 @@ from terrafix.messages import (
     Odometry,
     Origin,
     Prediction,
+    Relocalization,
     SourceEnded,
     ThermalBand,
     VehicleState,
@@ -94,6 +95,7 @@ class EstimatorNode:
         self._predicted_id: int | None = None  # frame of the newest Prediction ...
         self._predicted_m = np.zeros(2)  # ... its position, after its map match,
         self._predicted_m2 = np.zeros((2, 2))  # ... with this covariance
+        self._relocated = False  # a relocalisation has moved the estimate since
         self._monitors: Monitors | None = None
         self._rebuilds = 0  # of the graph
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
@@ -104,6 +106,7 @@ class EstimatorNode:
             EkfDeadReckoning: self._on_dead_reckoning,
             Health: self._on_health,
             Odometry: self._on_odometry,
+            Relocalization: self._on_relocalization,
             MapMatch: self._on_map_match,
             SourceEnded: self._on_source_ended,
         }
@@ -236,13 +239,15 @@ class EstimatorNode:
         before_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
         odometry = self._in_telemetry_time(odometry)
         estimator, frame = self._frame_input(self._estimator, odometry)
-        follows = self._note_predicted_frame(estimator)
+        follows = not self._relocated and self._note_predicted_frame(estimator)
+        self._relocated = False
         result = estimator.feed_frame(frame)
         self._tracked = result.verdict is Verdict.ACCEPTED
         if result.turn is not None:
             self._time_offset.add(replace(result.turn, t0_ns=before_ns, t1_ns=stamp_ns), self._telemetry)
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
-        yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict) for verdict in verdicts)
+        fragment = estimator.state.fragment_of(odometry.frame_id)
+        yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict, fragment) for verdict in verdicts)
         no_new_view = Verdict.STALLED in (odometry.verdict, result.verdict) or odometry.verdict is Verdict.BAD_IMAGE
         if not no_new_view and not self._awaits_telemetry(odometry.t_ns, frame.attitude, estimator):
             yield self._prediction(odometry.t_ns, result, estimator, follows=follows)
@@ -338,6 +343,23 @@ class EstimatorNode:
         estimator.state.mode = self._mode
         return estimate_of(estimator, frame, self._axes, budget, t_ns, tracked=self._tracked)
 
+    def _on_relocalization(self, seen: Relocalization) -> Iterable[Message]:
+        estimator = self._estimator
+        if estimator is None:
+            return
+        estimator.state.mode = self._mode
+        if not self._relocated:
+            self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
+        fusion = estimator.feed_relocalization(seen)
+        fragment = estimator.state.fragment_of(seen.frame_id)
+        for verdict in (fusion, *self._rebuild_verdicts(estimator)):
+            yield verdict_of(seen.t_ns, seen.frame_id, verdict, fragment)
+        if fusion.verdict is not Verdict.ACCEPTED or estimator.last is None:
+            return
+        self._relocated = True
+        self._tracked = self._tracked or seen.frame_id == estimator.last.frame_id
+        yield self._estimate(estimator, estimator.last, self._claim(estimator, estimator.last), seen.t_ns)
+
     # --- map matches ---------------------------------------------------------------------------------------------
 
     def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
@@ -351,7 +373,8 @@ class EstimatorNode:
         was_multimodal = estimator.hypotheses.is_multimodal
         result = estimator.feed_map_match(match)
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
-        yield from (verdict_of(match.t_ns, match.frame_id, verdict) for verdict in verdicts)
+        fragment = estimator.state.fragment_of(match.frame_id)
+        yield from (verdict_of(match.t_ns, match.frame_id, verdict, fragment) for verdict in verdicts)
         accepted = result.verdict is Verdict.ACCEPTED
         if self._monitors is not None:
             self._monitors.on_map_match(match, self._telemetry, accepted=accepted)

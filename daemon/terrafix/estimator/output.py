@@ -10,6 +10,7 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.claim import Claim
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
+from terrafix.estimator.integrity.fragments import Fragment
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.state import UP
 from terrafix.messages import (
@@ -28,8 +29,9 @@ from terrafix.messages import (
 ANCHORED_FOR_S = 1.5  # after a map match the odometry since is too short to matter [tuned]
 
 
-def verdict_of(t_ns: int, frame_id: int, fusion: FusionVerdict) -> MeasurementVerdict:
-    """MeasurementVerdict of the measurement at ``t_ns``, with the innovation of ``fusion`` where there is one."""
+def verdict_of(t_ns: int, frame_id: int, fusion: FusionVerdict, fragment: Fragment | None = None) -> MeasurementVerdict:
+    """MeasurementVerdict of the measurement at ``t_ns``, with the innovation of ``fusion`` where there is one.
+    ``fragment``: of its frame."""
     return MeasurementVerdict(
         t_ns=t_ns,
         frame_id=frame_id,
@@ -37,7 +39,13 @@ def verdict_of(t_ns: int, frame_id: int, fusion: FusionVerdict) -> MeasurementVe
         verdict=fusion.verdict,
         detail=fusion.detail,
         **_logged(fusion.innovation),
+        **_named(fragment),
     )
+
+
+def _named(fragment: Fragment | None) -> dict[str, Any]:
+    """Fields ``fragment_id`` and ``joined`` of a message."""
+    return {} if fragment is None else {"fragment_id": fragment.fragment_id, "joined": fragment.joined}
 
 
 def _logged(innovation: Innovation | None) -> dict[str, Any]:
@@ -74,13 +82,17 @@ def prediction_of(
         step_cov_m2=(step_var_m2, 0.0, 0.0, step_var_m2),
         radial_k1=estimator.state.radial_k1(frame.node),
         prior_t_ns=max(prior_t_ns, round(estimator.dead_reckoned_s * 1e9)),
+        **_named(estimator.state.fragment_of(frame.frame_id)),
     )
 
 
 def estimate_of(
     estimator: Estimator, frame: FrameState, axes: LocalFrame, claim: Claim, t_ns: int, *, tracked: bool
 ) -> NavEstimate:
-    """``tracked``: odometry or a map match of this frame was fused. ``t_ns``: of the newest measurement in it."""
+    """``tracked``: odometry, a relocalisation or a map match of this frame was fused. ``t_ns``: of the newest
+    measurement in it."""
+    fragment = estimator.state.fragment_of(frame.frame_id)
+    connected = fragment is None or fragment.joined
     state, p, v = estimator.state, frame.pose.translation(), frame.velocity_mps
     scale, _ = state.height_scale(frame.node)
     lat_deg, lon_deg = axes.to_wgs84(*claim.position_m.tolist())
@@ -99,10 +111,11 @@ def estimate_of(
         q_w_b=quat_from_rot(state.body(frame)),
         cov=tuple(float(c) for c in claim.cov.ravel()),
         map_sigma_m=estimator.map_sigma_m,
-        source_label=_source(age_ms, tracked=tracked),
+        source_label=_source(age_ms, tracked=tracked and connected),
         covariance_mode=state.mode,
         last_anchor_age_ms=age_ms,
         emitted_at_ns=max(t_ns, round(frame.t_s * 1e9)),  # the live executor sets the time of publishing here
+        **_named(fragment),
     )
 
 

@@ -235,7 +235,10 @@ class Propagation:
 
     def _continue(self, step: _Step, verdict: Verdict, reset: FusionVerdict) -> PropagationResult:
         step_m = (step.predicted_m - step.before.pose.translation())[:2]
-        placed = continue_from(self._state, step.frame, step.predicted_m, step.velocity, step.predicted_cov)
+        joined = step.known is not None and step.sighting.fragment.joined
+        placed = continue_from(
+            self._state, step.frame, step.predicted_m, step.velocity, step.predicted_cov, joined=joined
+        )
         sigma_m, verdicts = _worst_sigma(step.predicted_cov[:2, :2]), (*step.verdicts, reset)
         return PropagationResult(verdict, placed, step_m, sigma_m, verdicts=verdicts)
 
@@ -268,7 +271,7 @@ class Propagation:
             r_w_c = step.pose.rotation().matrix()
             seen = r_w_c @ known.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T
             self._seen_step(step, known, seen)
-            if step.increment is not None:
+            if step.increment is not None and not step.sighting.begins_disconnected:
                 off_m = step.p_m - step.predicted_m
                 step.increment, step.predicted_cov, gained = fuse_odometry_increment(
                     step.increment, off_m, step.predicted_cov, seen
@@ -294,16 +297,16 @@ class Propagation:
         step.step_sigma_m = float(np.hypot(STEP_FLOOR_M + STEP_SHARE * np.hypot(*step.step_m), np.sqrt(aside_m2)))
 
     def _fragment_step(self, step: _Step) -> None:
-        """The step for the anchor's belief follows the images, also those of a fragment that is not joined."""
+        """The step for the anchor's belief follows the images, also those of a fragment that is not confirmed."""
         state, sighting = self._state, step.sighting
         last = state.fragment
         if sighting.fragment is last and sighting.local_step_m is not None:
             length_m = float(np.hypot(*sighting.local_step_m))
             step.step_m, step.step_sigma_m = sighting.local_step_m, STEP_FLOOR_M + STEP_SHARE * length_m
             return
-        if sighting.fragment is last or last.joined or state.last is None:
+        if sighting.fragment is last or last.confirmed or state.last is None:
             return
-        # A fragment ends that nothing has joined: the belief returns to where it began, and continues from there.
+        # A fragment ends that nothing has confirmed: the belief returns to where it began, and continues from there.
         cov = tangent_to_world(state.last.cov, state.last.pose.rotation().matrix())[:2, :2]
         grown_m2 = max(float(np.linalg.eigvalsh(cov - last.start_cov_m2)[-1]), 0.0)
         step.step_m = step.p_m[:2] - last.start_m - last.displacement_m
@@ -340,13 +343,16 @@ class Propagation:
         attitude = state.camera.factor(state.graph.next_keys(), frame.attitude, r_w_c, ground_m, dt_s)
         rise_m = state.terrain.rise_sigma_m(float(np.hypot(*step.step_m)))
         increment = step.increment
+        # No velocity bridge: what the fragment tells of its velocity says nothing of the way that was not seen.
+        velocity_cov = step.predicted_cov[DELTA_MOTION, DELTA_MOTION] if step.sighting.begins_disconnected else None
         if increment is not None:
             increment = replace(increment, terrain_unknown=not state.terrain.has_dem)
             if step.known is not None:
                 increment = increment.in_height_units(max(float(p[UP]) - ground_m, 1.0), ground_m)
         three = None if step.known is None else self._odometry.three_view(frame.odometry, step.known)
         first = NodeState(step.pose, step.before.bias, step.velocity)
-        new = NewNode(first, step.parent, step.motion, increment, attitude, rise_m, three)
+        new = NewNode(first, step.parent, step.motion, increment, attitude, rise_m, three, velocity_cov)
+        state.keep_keyframes(state.graph.leaving)
         node = state.graph.extend(frame.t_s, new)
         self._continuity_of(step, node)
         state.register_frame(node, frame.frame_id, step.sighting.fragment)
@@ -375,6 +381,8 @@ class Propagation:
         elif continuity.stationary_node is None:
             continuity.stationary_node = node
         known = step.known
+        measured = step.increment is None or step.increment.inertial
+        continuity.unseen_inertial = known is not None or (continuity.unseen_inertial and measured)
         continuity.keyframe_motion = None if known is None else (known.parent, known.motion.p_m)
 
     def _fuse_aids(self, step: _Step, node: int, dt_s: float) -> list[FusionVerdict]:
@@ -468,6 +476,7 @@ class Propagation:
         self._height_gate.accept_initial()
         self._heading_gate.accept_initial()
         placed, initial = self._initializer.initialize(state, frame)
+        state.keyframes.clear()  # what was assumed for them has turned out to be wrong
         sample = AidSample(placed.node, frame.t_s, frame.attitude, frame.imu, 0.0, True)
         fused = self._fuse_aid(self._dead_reckoning, sample)
         state.last = state.frame_state(frame.frame_id, frame.t_s, placed.node)

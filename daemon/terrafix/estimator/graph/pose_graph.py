@@ -48,7 +48,8 @@ class GraphPrior:
 class NewNode:
     """A node that is tied to ``parent`` (in the window) by ``motion``, and to the newest node by ``increment``; None:
     the vehicle is stationary. ``rise_sigma_m``: change of ground elevation since the newest node, without a DEM.
-    ``three_view``: an earlier node, and the constraint of that node, ``parent`` and this one."""
+    ``three_view``: an earlier node, and the constraint of that node, ``parent`` and this one. ``velocity_cov`` (8, 8):
+    V of the node is known to this, independently of the nodes before; None: through ``increment``."""
 
     state: NodeState
     parent: int
@@ -57,6 +58,7 @@ class NewNode:
     attitude: gtsam.CustomFactor | None
     rise_sigma_m: float = 0.0
     three_view: tuple[int, ThreeViewConstraint] | None = None
+    velocity_cov: np.ndarray | None = None
 
 
 class GraphObserver:
@@ -110,6 +112,11 @@ class PoseGraph:
         """Whether the node is in the window."""
         return node in self._times
 
+    @property
+    def leaving(self) -> list[int]:
+        """Nodes that leave the window when the next one is added."""
+        return self._smoother.leaving(self._next)
+
     def state(self, node: int) -> NodeState:
         """Newest estimate of a node in the window."""
         if node not in self._states:
@@ -161,7 +168,7 @@ class PoseGraph:
         self._observer.before_node(self)
         node, others = self._next, list[gtsam.NonlinearFactor]()
         odometry = self._odometry_factor(node, new)
-        others.append(self._motion_factor(node, self.newest, new.increment))
+        others.append(self._motion_factor(node, new))
         others.append(self._walk_factor(node, self.newest, t_s, new))
         if new.attitude is not None:
             others.append(new.attitude)
@@ -195,7 +202,11 @@ class PoseGraph:
             rays.k1,
         )
 
-    def _motion_factor(self, node: int, newest: int, increment: MotionIncrement | None) -> gtsam.NonlinearFactor:
+    def _motion_factor(self, node: int, new: NewNode) -> gtsam.NonlinearFactor:
+        newest, increment = self.newest, new.increment
+        if new.velocity_cov is not None:
+            noise = gtsam.noiseModel.Gaussian.Covariance(new.velocity_cov)
+            return gtsam.PriorFactorVector(V(node), new.state.velocity, noise)
         if increment is not None:
             return motion_factor((C(newest), V(newest)), (C(node), V(node)), (B(newest), B(node)), increment)
         stationary = gtsam.noiseModel.Gaussian.Covariance(stationary_motion_cov())

@@ -3,7 +3,7 @@ model, and what three keyframes saw together."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -16,19 +16,16 @@ from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture
 from terrafix.estimator.integrity.time_offset import Turn
+from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
+from terrafix.estimator.measurements.ground_plane_motion import plane_motion
 from terrafix.estimator.measurements.heading import heading_innovation
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
-from terrafix.estimator.models.plane_motion import Ground, RelativePose, relative_pose
-from terrafix.estimator.models.terrain import RELIEF_REPEATS
+from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.state import HEADING, HEIGHT, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import Odometry, Verdict
 
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
-# Share of the height by which the level of the ground below may be unknown. Beyond it odometry tells no distance, and
-# its noise, a share of the estimated distance, would make the graph sure that there is none.
-MAX_LEVEL_SIGMA = 0.5  # [tuned]
-MIN_HEIGHT_M = 2.0  # above the ground: below it the ground is no plane to a camera [tuned]
 HEADING_GATE = 3.0  # sigmas between the turn of a new fragment and the reported heading [tuned]
 
 
@@ -43,14 +40,16 @@ class KeyframeMotion:
 @dataclass(frozen=True)
 class Sighting:
     """Odometry of one frame. ``motion``: None without one. ``fused``: the same, if it enters the graph. ``fragment``:
-    to which the frame belongs. ``local_step_m`` (2,): since the frame before, in a fragment that was not joined yet.
-    ``innovation``: against the motion model; None where that predicts nothing."""
+    to which the frame belongs. ``local_step_m`` (2,): since the frame before, in a fragment that was not confirmed yet.
+    ``innovation``: against the motion model; None where that predicts nothing. ``begins_disconnected``: the first frame
+    of a fragment that is fused, while only dead reckoning ties the fragment to the flight."""
 
     verdict: Verdict
     motion: KeyframeMotion | None
     fragment: Fragment
     local_step_m: np.ndarray | None = None
     innovation: Innovation | None = None
+    begins_disconnected: bool = False
 
     @property
     def fused(self) -> KeyframeMotion | None:
@@ -69,34 +68,38 @@ class OdometryMeasurement:
     def sighting(self, frame: FrameInput, before: NodeState, increment: Callable[[], MotionIncrement]) -> Sighting:
         """``before``: the newest node; ``increment()``: of the motion model, from there to the frame."""
         odometry, attitude, t_s = frame.odometry, frame.attitude, frame.t_s
+        alone = Fragment(t_s, odometry.fragment_id)  # of a frame without odometry that is fused
         if odometry.verdict in (Verdict.BAD_IMAGE, Verdict.STALLED):  # no new view
-            return Sighting(odometry.verdict, None, Fragment(t_s))
+            return Sighting(odometry.verdict, None, alone)
         answer = self._relative_motion(odometry, frame)
         if isinstance(answer, Verdict):
             frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False)
-            return Sighting(Verdict.STALLED if frozen else answer, None, Fragment(t_s))
+            return Sighting(Verdict.STALLED if frozen else answer, None, alone)
         state, parent = self._state, answer.parent
         fragment, keyframe = state.fragments.of(parent), state.graph.state(parent).pose
+        fragment.fragment_id = odometry.fragment_id  # the fragment may begin at a frame that was registered to none
         moved_m = keyframe.rotation().matrix() @ answer.motion.p_m
         in_fragment_m = state.fragments.displacement_m(parent) + moved_m[:2]
-        local_step_m = None if fragment.joined else in_fragment_m - fragment.displacement_m
-        innovation = None
+        local_step_m = None if fragment.confirmed else in_fragment_m - fragment.displacement_m
+        innovation, was_confirmed = None, fragment.confirmed
         if attitude.stands or state.yaw_gauge is not None:  # nothing predicts the motion
             if self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False):
-                return Sighting(Verdict.STALLED, None, Fragment(t_s))
-            fragment.joined = True
+                return Sighting(Verdict.STALLED, None, alone)
+            fragment.confirmed = True
+            fragment.joined = fragment.joined or attitude.stands
         else:
             motion = self._innovation(t_s, keyframe.translation() + moved_m, answer, before, increment())
             innovation, moves = motion.gated, not motion.allows_standstill
             frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=moves)
             if frozen or not motion.passes_gate:
                 verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
-                return Sighting(verdict, None, Fragment(t_s), innovation=innovation)
-            if not fragment.joined:
+                return Sighting(verdict, None, alone, innovation=innovation)
+            if not fragment.confirmed:
                 self._weigh_fragment(fragment, frame, answer, before, motion)
-        verdict = Verdict.ACCEPTED if fragment.joined else Verdict.UNCONFIRMED
+        verdict = Verdict.ACCEPTED if fragment.confirmed else Verdict.UNCONFIRMED
         fragment.displacement_m = in_fragment_m
-        return Sighting(verdict, answer, fragment, local_step_m, innovation)
+        disconnected = fragment.confirmed and not was_confirmed and not fragment.joined
+        return Sighting(verdict, answer, fragment, local_step_m, innovation, disconnected)
 
     def _weigh_fragment(
         self,
@@ -106,11 +109,12 @@ class OdometryMeasurement:
         before: NodeState,
         innovation: MotionInnovation,
     ) -> None:
-        """Whether motion and turn of a fragment that is not joined are those of this flight."""
+        """Whether motion and turn of a fragment that is not confirmed are those of this flight."""
         over_s = max(frame.t_s - self._state.graph.time_of(seen.parent), 1e-3)
         heading = heading_innovation(self._state, frame.attitude, seen.parent, seen.motion.r, before)
         turns_agree = abs(heading.residual) <= HEADING_GATE * heading.sigma
-        evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree)
+        inertial = innovation.inertial and self._state.continuity.unseen_inertial
+        evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree, inertial)
         fragment.add_frame(frame.t_s, evidence)
 
     def turn(self, odometry: Odometry, sighting: Sighting) -> Turn | None:
@@ -165,7 +169,7 @@ class OdometryMeasurement:
         predicted_m, _ = increment.predict(before.pose.translation(), before.velocity, float(before.bias[HEADING]))
         dt_s = state.graph.since_newest_s(t_s)
         cov_m2 = predict_covariance(increment, state.velocity_cov)[:3, :3]
-        if not state.fragments.of(seen.parent).joined:  # the motion model alone led here from the keyframe
+        if not state.fragments.of(seen.parent).confirmed:  # the motion model alone led here from the keyframe
             since_s = t_s - state.graph.time_of(seen.parent)
             cov_m2 += state.velocity_cov[VELOCITY, VELOCITY] * max(since_s**2 - dt_s**2, 0.0)
         r_w_c = state.graph.state(seen.parent).pose.rotation().matrix() @ seen.motion.r
@@ -181,26 +185,16 @@ class OdometryMeasurement:
         if parent is None or not state.graph.holds(parent):
             return Verdict.STALE
         keyframe = state.graph.state(parent)
-        r_w_kf, p = keyframe.pose.rotation().matrix(), keyframe.pose.translation()
-        place_cov = r_w_kf @ state.cov_of[parent][TRANSLATION, TRANSLATION] @ r_w_kf.T
-        height = float(p[UP]) - state.terrain.elevation_m(p)
-        if height < MIN_HEIGHT_M:
-            return Verdict.TOO_LOW
-        r_w_k, tilt_sigma = self._expected_rotation(frame, keyframe)
-        share = min(1.0, odometry.inliers / max(odometry.tracked, 1))
-        ground = self.ground(p, height, place_cov, share)
-        if ground.level_sigma_m > MAX_LEVEL_SIGMA * height:
-            return Verdict.DEGENERATE
+        p = keyframe.pose.translation()
+        view = KeyframeView(keyframe.pose, state.cov_of[parent], state.terrain.elevation_m(p))
         newest = state.graph.state(state.graph.newest)
         onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - state.graph.time_of(state.graph.newest))
         way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
-        ground = replace(ground, rise_sigma_m=state.terrain.rise_sigma_m(way_m))
-        pairs, radial_k1 = np.array(odometry.two_view), float(newest.bias[RADIAL_K1])
-        motion = relative_pose(pairs, odometry.sigma_norm, r_w_kf, r_w_k, tilt_sigma, ground, radial_k1)
-        if motion is None:
-            return Verdict.FEW_INLIERS
+        motion = plane_motion(state, view, odometry, self._expected_rotation(frame, keyframe), way_m)
+        if isinstance(motion, Verdict):
+            return motion
         dt_s = max(odometry.t_ns * 1e-9 - state.graph.time_of(parent), 1e-3)
-        possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + height
+        possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + view.height_m
         return KeyframeMotion(parent, motion) if possible else Verdict.IMPLAUSIBLE
 
     def _expected_rotation(self, frame: FrameInput, keyframe: NodeState) -> tuple[np.ndarray, float]:
@@ -210,12 +204,3 @@ class OdometryMeasurement:
             return r_w_kf, UNKNOWN_ATTITUDE_RAD
         r_w_k = self._state.camera.expected(frame.attitude, keyframe.bias, r_w_kf)
         return r_w_k, np.radians(max(self._state.origin.attitude_sigma_deg, 1.0))
-
-    def ground(self, p_m: np.ndarray, height_m: float, place_cov: np.ndarray, share: float) -> Ground:
-        """The plane below a camera at ``p_m`` (3,), known to ``place_cov`` (3, 3). ``share``: of inliers among the
-        tracked corners."""
-        ground = self._state.terrain.ground_plane(p_m, height_m, float(np.sqrt(place_cov[UP, UP])), share)
-        # Its slope was fitted at one place: where the camera may be elsewhere, the ground may lie higher or lower.
-        slope = np.array([ground.slope_e, ground.slope_n])
-        level_m = RELIEF_REPEATS * float(np.sqrt(slope @ place_cov[:2, :2] @ slope))
-        return replace(ground, level_share=float(np.hypot(ground.level_share, level_m / height_m)))

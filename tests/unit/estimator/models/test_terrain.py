@@ -12,8 +12,9 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
 from terrafix.estimator.filter_state import FrameInput
+from terrafix.estimator.keyframe_view import KeyframeView
+from terrafix.estimator.measurements.ground_plane_motion import ground_below
 from terrafix.estimator.measurements.map_pose import measured_pose
-from terrafix.estimator.measurements.odometry import OdometryMeasurement
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.plane_motion import Ground
 from terrafix.estimator.models.terrain import Terrain
@@ -200,10 +201,13 @@ def test_the_level_sigma_on_a_slope_grows_with_the_position_sigma() -> None:
     estimator = begun(Attitude(0.0, 0.0, 0.0, 100.0))
     match = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient", ground=plane(40.0, 0.1, 0.0))
     estimator.feed_map_match(match)
+    pose = gtsam.Pose3(gtsam.Rot3.Rx(np.pi), np.array([0.0, 0.0, 140.0]))
     found, lost = (
-        OdometryMeasurement(estimator.state)
-        .ground(np.array([0.0, 0.0, 140.0]), 100.0, np.diag([sigma_m, sigma_m, 3.0]) ** 2, 1.0)
-        .level_sigma_m
+        ground_below(
+            estimator.state,
+            KeyframeView(pose, np.diag([0.1, 0.1, 0.1, sigma_m, sigma_m, 3.0]) ** 2, 40.0),
+            1.0,
+        ).level_sigma_m
         for sigma_m in (1.0, 60.0)
     )
     assert found < 1.8 and lost == pytest.approx(4.0 * 6.0, rel=0.05)

@@ -1,15 +1,16 @@
-"""Trajectory fragments: the evidence for and against the hypothesis that a fragment belongs to the flight."""
+"""Fragments of odometry: whether one belongs to the flight, and whether it is joined to it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from terrafix.estimator.integrity.fragments import (
+    CONFIRM_FRAMES,
+    CONFIRM_LLR,
     CONSISTENT_D2,
     FOREIGN_SPEED_MPS,
-    JOIN_FRAMES,
-    JOIN_LLR,
     Fragment,
     Fragments,
     MapHitRate,
@@ -35,25 +36,40 @@ def test_motion_supports_the_flight_when_it_is_20_times_as_likely_as_a_uniform_m
         assert evidence(off_m, sigma_m).supports_same_flight(0.0) is supports
 
 
-def test_motion_as_predicted_joins_a_fragment_after_two_consecutive_frames() -> None:
+def test_motion_as_predicted_confirms_a_fragment_after_two_consecutive_frames() -> None:
     fragment = Fragment(0.0)
     for i, off_m in enumerate([0.3, 6.0, 0.3, 0.3]):
-        assert not fragment.joined
+        assert not fragment.confirmed
         fragment.add_frame(0.5 * i, evidence(off_m))
-    assert fragment.joined and JOIN_FRAMES == 2
+    assert fragment.confirmed and CONFIRM_FRAMES == 2
 
 
-def test_a_joined_fragment_stays_joined() -> None:
-    fragment = Fragment(0.0, joined=True)
+@pytest.mark.parametrize("inertial", [True, False])
+def test_motion_as_predicted_joins_a_fragment_only_by_inertial_readings(inertial: bool) -> None:
+    fragment = Fragment(0.0)
+    for i in range(3):
+        fragment.add_frame(0.5 * i, replace(evidence(0.1), inertial=inertial))
+    assert fragment.confirmed and fragment.joined is inertial
+
+
+def test_inertial_readings_that_contradict_the_motion_join_no_fragment() -> None:
+    fragment = Fragment(0.0)
+    for i in range(40):
+        fragment.add_frame(float(i), replace(evidence(6.0), inertial=True))
+    assert fragment.confirmed and not fragment.joined  # confirmed by its duration
+
+
+def test_a_confirmed_fragment_stays_confirmed() -> None:
+    fragment = Fragment.joined_at(0.0)
     fragment.add_frame(0.5, evidence(6.0))
-    assert fragment.joined
+    assert fragment.confirmed
 
 
-def test_the_motion_of_another_flight_does_not_join_a_fragment() -> None:
+def test_the_motion_of_another_flight_does_not_confirm_a_fragment() -> None:
     fragment = Fragment(0.0)
     for i in range(20):
         fragment.add_frame(0.5 * i, evidence(6.0))
-    assert not fragment.joined
+    assert not fragment.confirmed
 
 
 def test_at_most_one_foreign_motion_in_20_supports_the_flight_by_chance() -> None:
@@ -63,18 +79,18 @@ def test_at_most_one_foreign_motion_in_20_supports_the_flight_by_chance() -> Non
     direction = rng.uniform(0.0, 2.0 * math.pi, 4000)
     foreign = radius[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
     supported = [MotionEvidence(m - predicted, np.eye(2), 0.5).supports_same_flight(0.0) for m in foreign]
-    assert np.mean(supported) < math.exp(-JOIN_LLR)
+    assert np.mean(supported) < math.exp(-CONFIRM_LLR)
 
 
 def test_with_unknown_velocity_a_consistent_innovation_is_sufficient() -> None:
     wide_m = 15.0 * 0.5
-    assert evidence(0.0, wide_m).max_llr < JOIN_LLR
+    assert evidence(0.0, wide_m).max_llr < CONFIRM_LLR
     assert evidence(0.99 * math.sqrt(CONSISTENT_D2) * wide_m, wide_m).supports_same_flight(0.0)
     assert not evidence(1.01 * math.sqrt(CONSISTENT_D2) * wide_m, wide_m).supports_same_flight(0.0)
 
 
 def test_missing_map_poses_are_evidence_against_a_fragment_if_the_map_usually_gives_poses() -> None:
-    hits, own = MapHitRate(), Fragment(0.0, joined=True)
+    hits, own = MapHitRate(), Fragment.joined_at(0.0)
     for _ in range(50):
         hits.update(own, found=True)
     new = Fragment(0.0)
@@ -83,13 +99,13 @@ def test_missing_map_poses_are_evidence_against_a_fragment_if_the_map_usually_gi
     assert new.map_llr == pytest.approx(3.0 * math.log(0.1))
     for i in range(10):
         new.add_frame(0.5 * i, evidence(0.1))
-    assert not new.joined
+    assert not new.confirmed
     hits.update(new, found=True)
-    assert new.joined
+    assert new.confirmed and new.joined
 
 
 def test_the_map_hit_rate_is_an_average_over_ten_correlations() -> None:
-    hits, own, new = MapHitRate(), Fragment(0.0, joined=True), Fragment(0.0)
+    hits, own, new = MapHitRate(), Fragment.joined_at(0.0), Fragment(0.0)
     for _ in range(10):
         hits.update(own, found=True)
     hits.update(new, found=False)
@@ -104,7 +120,7 @@ def test_the_map_hit_rate_is_an_average_over_ten_correlations() -> None:
 def test_missing_map_poses_are_no_evidence_if_the_map_never_gives_poses() -> None:
     hits, new = MapHitRate(), Fragment(0.0)
     for _ in range(20):
-        hits.update(Fragment(0.0, joined=True), found=False)
+        hits.update(Fragment.joined_at(0.0), found=False)
         hits.update(new, found=False)
     assert new.map_llr == 0.0
 
@@ -114,17 +130,18 @@ def test_images_whose_rotation_contradicts_the_heading_do_not_support_the_flight
     assert not MotionEvidence(np.array([0.1, 0.0]), 0.25 * np.eye(2), 0.5, turns_agree=False).supports_same_flight(0.0)
 
 
-def test_a_fragment_that_lasts_long_enough_is_joined() -> None:
+def test_a_fragment_that_lasts_long_enough_is_confirmed_but_not_joined() -> None:
     often, long = Fragment(0.0), Fragment(0.0)
     for i in range(25):
         often.add_frame(0.1 * i, evidence(6.0, over_s=0.1))
     often.add_frame(29.9, evidence(6.0))
     for i in range(18):
         long.add_frame(31.0 + i, evidence(6.0))
-    assert not often.joined and not long.joined
+    assert not often.confirmed and not long.confirmed
     often.add_frame(30.0, evidence(6.0))
     long.add_frame(50.0, evidence(6.0))
-    assert often.joined and long.joined
+    assert often.confirmed and long.confirmed
+    assert not often.joined and not long.joined
 
 
 def test_fragment_and_displacement_are_stored_for_each_node() -> None:

@@ -1,0 +1,74 @@
+"""The pose of a frame by an older keyframe that sees the same ground, as a measurement (loop closure)."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import C
+
+from terrafix.core.gate import GATE
+from terrafix.estimator.filter_state import FilterState
+from terrafix.estimator.integrity.innovation import Innovation
+from terrafix.estimator.keyframe_view import KeyframeView
+from terrafix.estimator.measurements.ground_plane_motion import plane_motion
+from terrafix.estimator.state import ROTATION
+from terrafix.messages import Relocalization, Verdict
+
+# Variance of the keyframe's pose over that of the estimate, below which a component is corrected. Between this and 1
+# there is little to gain, and the correction extrapolates. [spec: half]
+GAINED = 0.5
+NO_INFORMATION = 1e8  # variance of the other components, in variances of the estimate [spec: far beyond any state]
+
+
+@dataclass(frozen=True)
+class RelocalizationMeasurement:
+    """``pose`` of the camera with covariance ``cov`` (6, 6), tangent order: that of the keyframe moved on by what both
+    cameras see, plus that of this motion.
+
+    Keyframe and estimate descend from each other, so that their errors are correlated, and by how much is not known.
+    So they are fused as safe fusion does (Gustafsson, "Statistical Sensor Fusion", 2010): in the axes in which both
+    covariances are diagonal, each component comes from the one that knows it better, and from it alone. The result
+    claims no component better than its source did."""
+
+    pose: gtsam.Pose3
+    cov: np.ndarray
+    name: str = "relocalization"
+
+    @classmethod
+    def of(
+        cls, seen: Relocalization, keyframe: KeyframeView, state: FilterState, node: int
+    ) -> "RelocalizationMeasurement | Verdict":
+        """The pose of ``node``, the frame of ``seen``; or why there is none."""
+        r_w_c = state.graph.state(node).pose.rotation().matrix()
+        tilt_sigma = float(np.sqrt(np.max(np.diag(state.covariance(node)[ROTATION, ROTATION])[:2])))
+        # Cameras whose views overlap are at most about a height apart.
+        motion = plane_motion(state, keyframe, seen, (r_w_c, tilt_sigma), keyframe.height_m)
+        if isinstance(motion, Verdict):
+            return motion
+        between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
+        moved = between.inverse().AdjointMap()
+        return cls(keyframe.pose.compose(between), moved @ keyframe.cov @ moved.T + motion.cov)
+
+    def innovation(self, state: FilterState, node: int) -> Innovation:
+        """Innovation of the pose, 6 degrees of freedom, tangent order. Its covariance is the largest that both errors
+        can have unless they oppose each other."""
+        residual = state.graph.state(node).pose.logmap(self.pose)
+        return Innovation(residual, state.covariance(node) + self.cov, GATE[6])
+
+    def correction(self, state: FilterState, node: int) -> tuple[gtsam.Pose3, np.ndarray]:
+        """Pose and covariance (6, 6), tangent order, of an independent measurement of ``node`` after which each
+        component has the value and the variance of the better source."""
+        estimate, cov = state.graph.state(node).pose, state.covariance(node)
+        root = np.linalg.cholesky(cov)
+        whitened = np.linalg.solve(root, np.linalg.solve(root, self.cov).T)
+        variances, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
+        residual = axes.T @ np.linalg.solve(root, estimate.logmap(self.pose))
+        gains = variances < GAINED
+        rest = np.where(gains, 1.0 - variances, 1.0)
+        value = np.where(gains, residual / rest, 0.0)
+        spread = root @ axes * np.sqrt(np.where(gains, variances / rest, NO_INFORMATION))
+        return estimate.retract(root @ axes @ value), spread @ spread.T
+
+    def add_to(self, state: FilterState, node: int) -> None:
+        pose, cov = self.correction(state, node)
+        state.graph.add(gtsam.PriorFactorPose3(C(node), pose, gtsam.noiseModel.Gaussian.Covariance(cov)))

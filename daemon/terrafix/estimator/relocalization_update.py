@@ -1,0 +1,70 @@
+"""Relocalisations: gated, confirmed by a second one, and fused."""
+
+import numpy as np
+
+from terrafix.estimator.filter_state import FilterState
+from terrafix.estimator.integrity.fragments import CONFIRM_FRAMES
+from terrafix.estimator.integrity.innovation import FusionVerdict
+from terrafix.estimator.integrity.innovation_run import InnovationRun
+from terrafix.estimator.measurements.contract import fuse
+from terrafix.estimator.measurements.relocalization import RelocalizationMeasurement
+from terrafix.messages import CovarianceMode, Relocalization, Verdict
+
+
+class RelocalizationUpdate:
+    """``apply`` every Relocalization, after its frame."""
+
+    def __init__(self, state: FilterState) -> None:
+        self._state = state
+        self._run = InnovationRun()  # of those that passed the gate, since the last rejection or the last fused one
+
+    def apply(self, seen: Relocalization) -> FusionVerdict:
+        """-> the verdict. An accepted one joins the fragment of its frame to the flight, if that of the keyframe is."""
+        state = self._state
+        node, keyframe = state.node_of.get(seen.frame_id), state.keyframe(seen.keyframe_id)
+        if node is None or not state.graph.holds(node):
+            return _refused(Verdict.STALE, "frame has left the window")
+        if keyframe is None:
+            return _refused(Verdict.STALE, "the pose of the keyframe is not known")
+        if state.yaw_gauge is not None:
+            return _refused(Verdict.NO_PREDICTION, "the heading is unknown")
+        measurement = RelocalizationMeasurement.of(seen, keyframe.view, state, node)
+        if isinstance(measurement, Verdict):
+            return _refused(measurement, f"{seen.inliers} inliers")
+        innovation, here_m = measurement.innovation(state, node), state.graph.state(node).pose.translation()[:2]
+        offset_m = np.asarray(measurement.pose.translation())[:2] - here_m
+        if innovation.is_accepted:
+            self._run.add(offset_m, here_m, position_only=False)
+        else:
+            self._run.clear()
+        if innovation.is_accepted and not self._run.is_confirmed(CONFIRM_FRAMES, 0.0):
+            return FusionVerdict(measurement.name, Verdict.UNCONFIRMED, innovation, _detail(seen, offset_m))
+        fusion = self._fuse(node, measurement)
+        if fusion.verdict is Verdict.ACCEPTED:
+            self._run.clear()  # it goes on at the corrected estimate: the next one near it needs no other
+            self._run.add(np.zeros(2), here_m, position_only=False)
+            if keyframe.fragment.joined:
+                state.fragments.of(node).join()
+        return FusionVerdict(fusion.measurement, fusion.verdict, fusion.innovation, _detail(seen, offset_m))
+
+    def _fuse(self, node: int, measurement: RelocalizationMeasurement) -> FusionVerdict:
+        state = self._state
+        _, cov = measurement.correction(state, node)
+        fusion = fuse(state, node, measurement)
+        if fusion.verdict is not Verdict.ACCEPTED:
+            return fusion
+        if state.mode is CovarianceMode.JACOBIAN:
+            state.set_fused_covariance(node, np.linalg.inv(np.linalg.inv(state.cov_of[node]) + np.linalg.inv(cov)))
+        assert state.last is not None
+        state.last_seen_s = max(state.last_seen_s, state.graph.time_of(node))
+        state.last = state.frame_state(state.last.frame_id, state.last.t_s, state.graph.newest)
+        return fusion
+
+
+def _refused(verdict: Verdict, detail: str) -> FusionVerdict:
+    return FusionVerdict("relocalization", verdict, None, detail)
+
+
+def _detail(seen: Relocalization, offset_m: np.ndarray) -> str:
+    away_m = float(np.hypot(*offset_m))
+    return f"keyframe {seen.keyframe_id} of fragment {seen.keyframe_fragment_id}, {away_m:.0f} m from the estimate"
