@@ -5,13 +5,15 @@ from collections.abc import Iterable
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Edge, FrameStore, NodeContext
 from terrafix.messages import Frame, Message, Odometry, Origin, Verdict
+from terrafix.vision.edge import DROPPED_ERROR
 from terrafix.vision.edge import make_edge as make_source_edge
-from terrafix.vision.feature_tracker import FrameTracker
+from terrafix.vision.feature_tracker import FrameTracker, Motion
+from terrafix.vision.relocalization import RelocalizationSearch
 from terrafix.vision.repeated_picture import PictureHistory, Repeat
 
 
 class VisionNode:
-    """In: Origin, Frame. Out: Odometry."""
+    """In: Origin, Frame. Out: Odometry, Relocalization."""
 
     def __init__(self, frames: FrameStore, *, restarted: bool = False) -> None:
         """``restarted``: in flight. Fragments of the process before keep their numbers."""
@@ -20,55 +22,69 @@ class VisionNode:
         self._origin: Origin | None = None
         self._tracker: FrameTracker | None = None
         self._history = PictureHistory()
+        self._search: RelocalizationSearch | None = None
+        self._busy = False  # frames were dropped since the last one that was registered
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
             case Origin() if message != self._origin:  # published again after a restart of the source
-                self._origin, self._tracker = message, None
+                self._origin, self._tracker, self._search = message, None, None
                 self._history = PictureHistory()
             case Frame():
-                yield self._odometry(message)
+                yield from self._process(message)
             case _:
                 pass
 
     def tick(self, now_ns: int) -> Iterable[Message]:
         return ()
 
-    def _odometry(self, frame: Frame) -> Odometry:
+    def _process(self, frame: Frame) -> Iterable[Message]:
         image = None if frame.error else self._frames.get(frame.frame_id)
         if self._tracker is None and self._origin is not None:
             # Frame ids go on after a restart, and there were not more fragments than frames.
             first_fragment_id = frame.frame_id if self._restarted else 0
-            self._tracker = FrameTracker(CameraCalibration.of(self._origin.camera), first_fragment_id)
-        if image is None or self._tracker is None:
-            return Odometry(
-                t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.BAD_IMAGE
-            )
+            camera = CameraCalibration.of(self._origin.camera)
+            self._tracker, self._search = FrameTracker(camera, first_fragment_id), RelocalizationSearch(camera)
+        self._busy = self._busy or frame.error == DROPPED_ERROR
+        if image is None or self._tracker is None or self._search is None:
+            yield _without_motion(frame, Verdict.BAD_IMAGE)
+            return
         gray = self._tracker.working_copy(image)
         repeat = self._history.classify(gray)
         if repeat in (Repeat.IDENTICAL, Repeat.OLDER):  # a stale buffer does not show the current position
-            return Odometry(
-                t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=Verdict.STALLED
-            )
+            yield _without_motion(frame, Verdict.STALLED)
+            return
         motion = self._tracker.register(frame.frame_id, gray)
-        return Odometry(
-            t_ns=frame.t_ns,
-            frame_id=frame.frame_id,
-            keyframe_id=motion.keyframe_id,
-            verdict=motion.verdict,
-            two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in motion.two_view],
-            sigma_norm=motion.sigma_norm,
-            inliers=motion.inliers,
-            tracked=motion.tracked,
-            becomes_keyframe=motion.becomes_keyframe,
-            static=repeat is Repeat.PREVIOUS,
-            previous_keyframe_id=motion.previous_keyframe_id,
-            three_view=[
-                (float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in motion.three_view
-            ],
-            three_view_sigma_norm=motion.three_view_sigma_norm,
-            fragment_id=motion.fragment_id,
-        )
+        yield _odometry(frame, motion, static=repeat is Repeat.PREVIOUS)
+        found = self._search.on_frame(frame, gray, motion, busy=self._busy)  # after the odometry, which must not wait
+        self._busy = False
+        if found is not None:
+            yield found
+
+
+def _odometry(frame: Frame, motion: Motion, *, static: bool) -> Odometry:
+    return Odometry(
+        t_ns=frame.t_ns,
+        frame_id=frame.frame_id,
+        keyframe_id=motion.keyframe_id,
+        verdict=motion.verdict,
+        two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in motion.two_view],
+        sigma_norm=motion.sigma_norm,
+        inliers=motion.inliers,
+        tracked=motion.tracked,
+        becomes_keyframe=motion.becomes_keyframe,
+        static=static,
+        previous_keyframe_id=motion.previous_keyframe_id,
+        three_view=[
+            (float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in motion.three_view
+        ],
+        three_view_sigma_norm=motion.three_view_sigma_norm,
+        fragment_id=motion.fragment_id,
+    )
+
+
+def _without_motion(frame: Frame, verdict: Verdict) -> Odometry:
+    return Odometry(t_ns=frame.t_ns, frame_id=frame.frame_id, keyframe_id=frame.frame_id, verdict=verdict)
 
 
 def make_node(ctx: NodeContext) -> VisionNode:

@@ -8,6 +8,7 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import Camera, Frame, Odometry, Origin, Verdict
 from terrafix.vision.feature_tracker import FrameTracker, Motion
 from terrafix.vision.node import VisionNode
+from terrafix.vision.relocalization import RelocalizationSearch
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 ORIGIN = Origin(
@@ -90,7 +91,8 @@ def test_three_view_matches_carry_the_id_of_the_previous_keyframe() -> None:
     list(node.on(ORIGIN))
     seen = np.arange(6.0).reshape(1, 6)
     motion = Motion(4, Verdict.ACCEPTED, seen[:, :4], 0.001, 30, 40, True, 2, seen, 0.002, fragment_id=3)
-    node._tracker = FrameTracker(CameraCalibration.of(ORIGIN.camera))
+    camera = CameraCalibration.of(ORIGIN.camera)
+    node._tracker, node._search = FrameTracker(camera), RelocalizationSearch(camera)
     node._tracker.register = lambda frame_id, gray: motion  # type: ignore[method-assign]
     store.put(5, picture(1))
     (published,) = node.on(Frame(t_ns=0, frame_id=5, file="5.jpg", width=640, height=480))
