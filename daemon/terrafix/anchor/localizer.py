@@ -5,6 +5,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from terrafix.anchor.fragment_labels import FragmentLabels
 from terrafix.anchor.frame_pose import (
     REPORTED_MODES,
     Observation,
@@ -29,7 +30,6 @@ from terrafix.anchor.matching.predicted_view import (
     tilt_sigma_rad,
     view_of,
 )
-from terrafix.anchor.relocalization.hypothesis_tracker import NEIGHBOUR_RADIUS
 from terrafix.anchor.relocalization.position_prior import distance_outside_m
 from terrafix.anchor.relocalization.relocalizer import Relocalizer, mixed_sigma_m, search_centre
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
@@ -101,8 +101,7 @@ class Localizer:
         self._since_observation_m = np.inf  # motion since the last observation
         self._poor_weight = 0.0
         self._variance_m2 = 0.0  # horizontal position variance of the last prediction
-        self._disconnected = False  # odometry does not connect this frame to the one before
-        self._fragment_open = False  # no match since then connects the frames to what came before
+        self._labels = FragmentLabels()
 
     @property
     def is_ready(self) -> bool:
@@ -144,7 +143,6 @@ class Localizer:
         self._variance_m2 = variance
         unknown_heading = heading_is_unknown(prediction)  # the direction of the step is unknown
         sigma_m = float(np.sqrt(step_var if unknown_heading else max(step_var, growth)))
-        self._disconnected = self._belief is not None and sigma_m > NEIGHBOUR_RADIUS * prediction.agl_m
         if self._belief is None:
             sigma_m = self._initialize_belief(prediction, best, self._origin, cell_m)
         elif self._relocalizer.is_active:
@@ -204,18 +202,10 @@ class Localizer:
         match = with_step(self.no_match(prediction, verdict), SearchStep.SKIP)
         return self._relocalizer.search_match(match) if self._relocalizer.is_active else match
 
-    def label_step(self, match: MapMatch) -> MapMatch:
+    def label_step(self, match: MapMatch, prediction: Prediction) -> MapMatch:
         """``match`` with the step of the search escalation, where that is a new fragment or a merge."""
-        if match.search.step is SearchStep.SKIP:
-            return match
-        if self._disconnected:
-            self._fragment_open = True
-            return with_step(match, SearchStep.NEW_FRAGMENT)
-        joins = self._fragment_open and match.verdict is Verdict.ACCEPTED and not match.position_only
-        if match.search.relocalized or joins:
-            self._fragment_open = False
-            return with_step(match, SearchStep.MERGE)
-        return match
+        step = self._labels.step_of(match, prediction)
+        return match if step is None else with_step(match, step)
 
     def _search(self, match: MapMatch, prediction: Prediction, image: Image | None, best: MapLayer) -> MapMatch:
         usable = image if prediction.agl_m >= MIN_MATCHING_AGL_M else None

@@ -86,13 +86,19 @@ class AnchorNode:
             self._localizer.reset()
         if self._model_suspended is self._load.allows_model:
             self._switch_model(prediction)
-        match = self._localizer.label_step(self._localized(prediction))
+        match = self._localizer.label_step(self._localized(prediction), prediction)
         yield match
         yield from self._pending
         self._pending.clear()
         if match.search.step is not self._published_step:
             self._published_step = match.search.step
-            yield SearchState(t_ns=prediction.t_ns, step=match.search.step)
+            joined = prediction.joined or match.search.step is SearchStep.MERGE
+            yield SearchState(
+                t_ns=prediction.t_ns,
+                step=match.search.step,
+                fragment_id=prediction.fragment_id,
+                joined=joined,
+            )
 
     def _localized(self, prediction: Prediction) -> MapMatch:
         """The MapMatch of a frame. A failure of the learned model costs this frame; after several in a row the model is

@@ -219,36 +219,35 @@ def test_a_lost_position_is_withdrawn_and_reported(ground: np.ndarray, monkeypat
 def test_every_change_of_the_search_step_is_published(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     node, frames = started(ground)
     image_of_place = view(ground, PINHOLE, R, TRUE_M)
-    result: list[SearchStep] = []
+    states: list[SearchState] = []
 
-    def fly(frame_id: int, image: np.ndarray | None, step_sigma_m: float = 1.0) -> None:
+    def fly(frame_id: int, image: np.ndarray | None, fragment_id: int = 0) -> None:
         if image is not None:
             frames.put(frame_id, image)
-        result.extend(
-            m.step for m in node.on(predicted(frame_id, 10.0, step_sigma_m=step_sigma_m)) if isinstance(m, SearchState)
-        )
+        prediction = msgspec.structs.replace(predicted(frame_id, 10.0), fragment_id=fragment_id, joined=not fragment_id)
+        states.extend(m for m in node.on(prediction) if isinstance(m, SearchState))
 
     fly(1, image_of_place)
     fly(2, None)
     fly(3, image_of_place)
-    fly(4, image_of_place, step_sigma_m=60.0)
-    fly(5, image_of_place)
-    fly(6, image_of_place)
-    assert result == [
-        SearchStep.SKIP,
-        SearchStep.NORMAL,
-        SearchStep.NEW_FRAGMENT,
-        SearchStep.MERGE,
-        SearchStep.NORMAL,
+    fly(4, image_of_place, fragment_id=1)
+    fly(5, image_of_place, fragment_id=1)
+    fly(6, image_of_place, fragment_id=1)
+    assert [(m.step, m.fragment_id, m.joined) for m in states] == [
+        (SearchStep.SKIP, 0, True),
+        (SearchStep.NORMAL, 0, True),
+        (SearchStep.NEW_FRAGMENT, 1, False),
+        (SearchStep.MERGE, 1, True),
+        (SearchStep.NORMAL, 1, False),
     ]
-    result.clear()
+    states.clear()
     with monkeypatch.context() as patched:
         patched.setattr(LockMonitor, "lost", True)
         patched.setattr(MapSearch, "process_frame", lambda *_: None)
         fly(7, image_of_place)
         patched.setattr(MapSearch, "step", SearchStep.ASK)
         fly(8, image_of_place)
-    assert result == [SearchStep.WIDEN, SearchStep.ASK]
+    assert [m.step for m in states] == [SearchStep.WIDEN, SearchStep.ASK]
 
 
 @pytest.mark.parametrize(("heading_sigma_rad", "spreads"), [(0.03, False), (3.0, True)])
@@ -280,18 +279,6 @@ def test_without_a_heading_a_pose_is_attempted_in_a_light_mode(
     assert (answer.inliers > 0) == tried
 
 
-@pytest.mark.slow
-def test_during_a_search_an_unknown_heading_does_not_disconnect_the_frames(ground: np.ndarray) -> None:
-    """Tracks move by their own yaw: the part of the position error that comes from the heading is no error of the
-    step."""
-    node, frames = started(ground, start_sigma_m=500.0)
-    for frame_id, sigma_m in ((1, 500.0), (2, 600.0)):
-        frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
-        result = predicted(frame_id, sigma_m, step_m=5.0)
-        list(node.on(msgspec.structs.replace(result, cov=(*result.cov[:35], 9.0))))
-    assert not node._localizer._disconnected
-
-
 def test_a_new_origin_resets_the_localizer(ground: np.ndarray) -> None:
     node, frames = started(ground)
     fresh = vars(started(ground)[0]._localizer)
@@ -299,7 +286,7 @@ def test_a_new_origin_resets_the_localizer(ground: np.ndarray) -> None:
     match(node, 1, 10.0)
     node._localizer._poor_weight = 3.0
     list(node.on(msgspec.structs.replace(ORIGIN, t_ns=1)))
-    for name in ("_belief", "_since_observation_m", "_poor_weight", "_variance_m2", "_disconnected", "_fragment_open"):
+    for name in ("_belief", "_since_observation_m", "_poor_weight", "_variance_m2", "_labels"):
         assert vars(node._localizer)[name] == fresh[name], name
 
 
