@@ -51,6 +51,7 @@ class FrameCase:
     mode: CovarianceMode = CovarianceMode.MARGINALS
     odometry: Verdict = Verdict.ACCEPTED
     keyframe_id: int = 0  # of its odometry
+    fragment_id: int = 0
     anchor_age_ms: int = 0
 
 
@@ -104,7 +105,7 @@ def _frame(i: int, case: FrameCase) -> list[Message]:
     return [
         Frame(t_ns=t_ns, frame_id=i, file=file_of(i), width=960, height=540),
         Odometry(
-            t_ns=t_ns, frame_id=i, keyframe_id=case.keyframe_id, verdict=case.odometry,
+            t_ns=t_ns, frame_id=i, keyframe_id=case.keyframe_id, verdict=case.odometry, fragment_id=case.fragment_id,
             two_view=[(0.0, 0.0, 0.0, 0.0)] if i != case.keyframe_id and case.odometry is Verdict.ACCEPTED else []),
         MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="odometry", verdict=case.odometry),
         Prediction(

@@ -6,6 +6,7 @@ deliver. The memory is bounded: where ground was seen most often, keyframes are 
 fragment as a whole."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -69,22 +70,21 @@ class KeyframeDatabase:
         while self._size_bytes > self._max_bytes and len(self._keyframes) > 1:
             self._size_bytes -= self._keyframes.pop(self._most_redundant()).size_bytes
 
-    def candidates(self, features: Features, fragment_id: int, path: float, apart: float, count: int) -> list[int]:
-        """Frame ids of the keyframes, the most similar first, that share most words with an image of ``features``.
-        ``fragment_id``, ``path``: of the image; keyframes of its fragment closer than ``apart`` are left out."""
-        others = [k for k in self._keyframes.values() if k.fragment_id != fragment_id or abs(path - k.path) >= apart]
+    def candidates(
+        self, features: Features, is_recent: Callable[[StoredKeyframe], bool], count: int
+    ) -> list[StoredKeyframe]:
+        """The keyframes that share most words with an image of ``features``, the most similar first, without those that
+        are ``is_recent``."""
+        others = [k for k in self._keyframes.values() if not is_recent(k)]
         if self._words is None or not others:
-            return [k.frame_id for k in others][:count]
+            return others[:count]
         histograms = np.stack([k.histogram for k in others])
         # Words that many keyframes have say little (inverse document frequency).
         weights = np.log(len(others) / np.maximum(np.count_nonzero(histograms, axis=0), 1)) + 1e-3
         seen = _histogram(features, self._words) * weights
         lengths = np.linalg.norm(histograms * weights, axis=1)
         scores = (histograms * weights) @ seen / np.maximum(lengths, 1e-9)
-        return [others[i].frame_id for i in np.argsort(-scores, kind="stable")[:count]]
-
-    def get(self, frame_id: int) -> StoredKeyframe:
-        return self._keyframes[frame_id]
+        return [others[i] for i in np.argsort(-scores, kind="stable")[:count]]
 
     def has_fragment(self, fragment_id: int) -> bool:
         return any(k.fragment_id == fragment_id for k in self._keyframes.values())

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from terrafix.core.camera import CameraCalibration
+from terrafix.core.limits import WINDOW_NODES
 from terrafix.messages import Frame, Relocalization
 from terrafix.vision.feature_tracker import KEYFRAME_SHIFT, MAX_PAIRS, SIGMA_PX, Motion
 from terrafix.vision.features import Features, SiftMatcher
@@ -18,7 +19,9 @@ from terrafix.vision.two_view import TwoView, select_spread, verify
 WIDTH_PX, FEATURES = 480, 300
 CANDIDATES = 5  # that are verified: 3 ms each
 INTERVAL_NS = 1_000_000_000  # between two searches: 50 ms of one core, 5 % of its time
-APART = 1.5  # image widths of way, from which a keyframe of the same fragment is another visit to its ground
+# Image widths of way in the same fragment, up to which odometry connects a frame to a keyframe through others, if no
+# more frames lie between than the estimator's window has nodes.
+APART = 1.5
 OLDEST_SHARE = 0.5  # of the inliers of the best candidate: an older one with so many has drifted less
 
 
@@ -30,6 +33,11 @@ class _View:
     fragment_id: int
     path: float
     features: Features
+
+    def is_recent(self, keyframe: StoredKeyframe) -> bool:
+        """Whether odometry connects the frame to the keyframe within the estimator's window."""
+        near = keyframe.fragment_id == self.fragment_id and abs(self.path - keyframe.path) < APART
+        return near and self.frame_id - keyframe.frame_id <= WINDOW_NODES
 
 
 class RelocalizationSearch:
@@ -100,8 +108,7 @@ class RelocalizationSearch:
     def _find(self, view: _View) -> tuple[StoredKeyframe, TwoView] | None:
         """The keyframe whose ground ``view`` shows; of several the oldest, with OLDEST_SHARE of the most inliers."""
         size, verified = (self._camera.width, self._camera.height), []
-        for frame_id in self.database.candidates(view.features, view.fragment_id, view.path, APART, CANDIDATES):
-            keyframe = self.database.get(frame_id)
+        for keyframe in self.database.candidates(view.features, view.is_recent, CANDIDATES):
             two_view = verify(self._matcher.match(_unpacked(keyframe.features), view.features), size)
             if two_view is not None:
                 verified.append((keyframe, two_view))

@@ -94,7 +94,9 @@ class InertialFlight:
 
     def _odometry(self, i: int, t_ns: int, rng: np.random.Generator) -> Odometry:
         if i == 0:
-            return Odometry(t_ns=t_ns, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
+            return Odometry(
+                t_ns=t_ns, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True, fragment_id=0
+            )
         keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
         keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
         frame_xy = apply(homography(self.poses[keyframe], self.poses[i]), keyframe_xy) + rng.normal(
@@ -110,6 +112,7 @@ class InertialFlight:
             inliers=PAIRS,
             tracked=PAIRS,
             becomes_keyframe=i % KEYFRAME_EVERY == 0,
+            fragment_id=0,
         )
 
     def _fix(self, i: int, t_ns: int, rng: np.random.Generator) -> MapMatch:

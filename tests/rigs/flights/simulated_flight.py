@@ -166,7 +166,9 @@ class Flight:
         keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
         is_keyframe = i % KEYFRAME_EVERY == 0
         if i == 0:
-            return Odometry(t_ns=0, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
+            return Odometry(
+                t_ns=0, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True, fragment_id=0
+            )
         rng = self.rng_of
         keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
         below = np.array([0.0, 0.0, self.ground_m[keyframe]])
@@ -182,6 +184,7 @@ class Flight:
             inliers=PAIRS,
             tracked=PAIRS,
             becomes_keyframe=is_keyframe,
+            fragment_id=0,
         )
 
 

@@ -69,22 +69,22 @@ def test_an_accepted_wrong_fix_breaks_the_floor(tmp_path: Path) -> None:
 GAPS = Marks(breaks_s=(2.0, 4.0))  # frames 0-3, 4-7, 8-11
 
 
-def linked(frames: list[FrameCase], keyframes: list[int]) -> list[FrameCase]:
-    """``keyframes``: of the odometry of each frame; its own number for the first frame of a fragment."""
-    return [replace(frame, keyframe_id=keyframe) for frame, keyframe in zip(frames, keyframes, strict=True)]
+def numbered(frames: list[FrameCase], fragments: list[int]) -> list[FrameCase]:
+    """``fragments``: fragment id of the odometry of each frame."""
+    return [replace(frame, fragment_id=fragment) for frame, fragment in zip(frames, fragments, strict=True)]
 
 
 def test_fragments_are_judged_separately(tmp_path: Path) -> None:
     frames = [GOOD] * 4 + [replace(GOOD, fixed=False, error_m=90.0)] * 4 + [GOOD] * 3 + [LOST]
-    found = evidence(tmp_path, linked(frames, [0] * 4 + [4] * 4 + [8] * 4), GAPS)
+    found = evidence(tmp_path, numbered(frames, [0] * 4 + [1] * 4 + [2] * 4), GAPS)
     assert of.fragments_localised(found).value == pytest.approx(2 / 3)
     assert of.worst_fragment(found).value == 0.0
 
 
 def test_a_gap_that_odometry_bridges_counts_as_a_fragment_that_does_not_survive(tmp_path: Path) -> None:
-    begun = evidence(tmp_path / "begun", linked([GOOD] * 12, [0] * 4 + [4] * 4 + [8] * 4), GAPS)
+    begun = evidence(tmp_path / "begun", numbered([GOOD] * 12, [0] * 4 + [1] * 4 + [2] * 4), GAPS)
     assert judge("a", ("fragments",), begun)[0].verdict is Verdict.PASS
-    bridged = evidence(tmp_path / "bridged", linked([GOOD] * 12, [0] * 4 + [3, 4, 4, 4] + [8] * 4), GAPS)
+    bridged = evidence(tmp_path / "bridged", numbered([GOOD] * 12, [0] * 8 + [1] * 4), GAPS)
     row = judge("a", ("fragments",), bridged)[0]
     assert (row.measured, row.verdict) == (pytest.approx(2 / 3), Verdict.BELOW)
     assert row.why.startswith("2 of 3; 1 begun after 2 gaps")
@@ -92,24 +92,44 @@ def test_a_gap_that_odometry_bridges_counts_as_a_fragment_that_does_not_survive(
 
 def test_a_fragment_counts_where_odometry_begins_it_and_not_where_the_scenario_has_its_gap(tmp_path: Path) -> None:
     gap = Marks(breaks_s=(2.0,))
-    elsewhere = evidence(tmp_path / "a", linked([GOOD] * 14, [0] * 11 + [11] * 3), gap)  # at 5.5 s
+    elsewhere = evidence(tmp_path / "a", numbered([GOOD] * 14, [0] * 11 + [1] * 3), gap)  # at 5.5 s
     assert of.fragments_localised(elsewhere).value == pytest.approx(2 / 3)
     # Without a mark: two fragments, of which the second one has no map fix.
     unfixed = [GOOD] * 6 + [replace(GOOD, fixed=False)] * 4
-    unmarked = evidence(tmp_path / "b", linked(unfixed, [0] * 6 + [6] * 4))
+    unmarked = evidence(tmp_path / "b", numbered(unfixed, [0] * 6 + [1] * 4))
     assert of.fragments_localised(unmarked).value == pytest.approx(1 / 2)
 
 
-def test_a_fragment_begins_at_the_first_of_two_frames_that_failed_and_match_each_other(tmp_path: Path) -> None:
+def test_a_fragment_begins_with_the_first_frame_of_its_number_after_frames_of_none(tmp_path: Path) -> None:
     failed = replace(GOOD, odometry=Answer.FEW_INLIERS)
     frames = [GOOD] * 4 + [failed] + [GOOD] * 7
-    found = evidence(tmp_path, linked(frames, [0] * 4 + [0, 4, 5, 5] + [5] * 4), Marks(breaks_s=(2.0,)))
+    found = evidence(tmp_path, numbered(frames, [0] * 4 + [-1] + [1] * 7), Marks(breaks_s=(2.0,)))
     assert of.fragments_localised(found).why.startswith("2 of 2; 1 begun after 1 gaps")
+
+
+def test_a_fragment_that_goes_on_after_another_one_is_the_same_fragment(tmp_path: Path) -> None:
+    found = evidence(tmp_path, numbered([GOOD] * 12, [0] * 4 + [1] * 4 + [0] * 4))
+    assert of.fragments_localised(found).why.startswith("2 of 2;")
+
+
+def test_a_fragment_is_counted_by_its_number_also_where_frames_refer_to_one_keyframe(tmp_path: Path) -> None:
+    frames = [replace(frame, keyframe_id=0) for frame in numbered([GOOD] * 12, [0] * 6 + [1] * 6)]
+    assert of.fragments_localised(evidence(tmp_path, frames)).why.startswith("2 of 2;")
+
+
+def test_a_fragment_of_one_frame_is_none(tmp_path: Path) -> None:
+    found = evidence(tmp_path, numbered([GOOD] * 9, [0] * 4 + [1] + [0] * 4))
+    assert of.fragments_localised(found).why.startswith("1 of 1;")
+
+
+def test_frames_before_the_first_fragment_belong_to_it(tmp_path: Path) -> None:
+    found = evidence(tmp_path, numbered([GOOD] * 8, [-1] * 2 + [0] * 6))
+    assert of.fragments_localised(found).why.startswith("1 of 1;")
 
 
 def test_a_single_frame_without_odometry_is_no_fragment(tmp_path: Path) -> None:
     foreign = replace(GOOD, odometry=Answer.FEW_INLIERS, fixed=False)
-    found = evidence(tmp_path, [GOOD] * 4 + [foreign] + [GOOD] * 4)
+    found = evidence(tmp_path, numbered([GOOD] * 4 + [foreign] + [GOOD] * 4, [0] * 4 + [-1] + [0] * 4))
     assert of.fragments_localised(found).why.startswith("1 of 1")
 
 

@@ -52,6 +52,7 @@ class SimulatedOdometry:
         self._rng = np.random.default_rng([seed, 55])
         self._keyframe: _Keyframe | None = None
         self._misses = 0
+        self._fragment_id = -1  # of the keyframe
         self._before: Shot | None = None  # of the frame before
 
     def odometry(self, frame_id: int, shot: Shot, *, blind: bool = False) -> Odometry:
@@ -109,6 +110,7 @@ class SimulatedOdometry:
             previous_keyframe_id=keyframe.previous_keyframe_id if len(triples) else -1,
             three_view=[(float(p), float(q), float(r), float(s), float(t), float(u)) for p, q, r, s, t, u in triples],
             three_view_sigma_norm=real.ALIGNED_SIGMA_PX / self._camera.fx,
+            fragment_id=self._fragment_id,
         )
 
     def _next_keyframe(self, keyframe: _Keyframe, frame_id: int, shot: Shot) -> tuple[_Keyframe, np.ndarray]:
@@ -161,8 +163,14 @@ class SimulatedOdometry:
     def _new_fragment(self, frame_id: int, t_ns: int, shot: Shot, blind: bool) -> Odometry:
         """The frame is a keyframe without a predecessor."""
         self._keyframe, self._misses = self._new_keyframe(frame_id, shot, blind=blind), 0
+        self._fragment_id += 1
         return Odometry(
-            t_ns=t_ns, frame_id=frame_id, keyframe_id=frame_id, verdict=Verdict.ACCEPTED, becomes_keyframe=True
+            t_ns=t_ns,
+            frame_id=frame_id,
+            keyframe_id=frame_id,
+            verdict=Verdict.ACCEPTED,
+            becomes_keyframe=True,
+            fragment_id=self._fragment_id,
         )
 
     def _new_keyframe(self, frame_id: int, shot: Shot, *, blind: bool = False) -> _Keyframe:

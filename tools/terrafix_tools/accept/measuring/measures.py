@@ -1,5 +1,6 @@
 """One function per number of the acceptance table. It returns the measured value, or the reason for having none."""
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -305,23 +306,19 @@ def _share(values: list[bool], why: str = "") -> Measured:
 
 
 def _fragments(e: Evidence) -> list[list[FrameEvidence]]:
-    """Frames of each fragment of odometry, in the order of their beginnings.
+    """Frames of each fragment of odometry, as vision has numbered them, in the order of their beginnings.
 
-    Two or more frames are a fragment if accepted odometry connects each to another, by its keyframe. A frame without
-    odometry belongs to the fragment of the frame before."""
-    numbers = {f.odometry.frame_id: i for i, f in enumerate(e.frames) if f.odometry is not None}
-    fragment = list(range(len(e.frames)))  # by frame: number of the first frame of its fragment
-    for i, frame in enumerate(e.frames):
-        seen = frame.odometry
-        if seen is not None and seen.verdict is Answer.ACCEPTED and seen.two_view and seen.keyframe_id in numbers:
-            a, b = sorted((fragment[i], fragment[numbers[seen.keyframe_id]]))
-            fragment = [a if number == b else number for number in fragment]
+    A fragment has two or more frames: one to which no frame was registered, and frames of no fragment, belong to the
+    fragment of the frame before."""
+    ids = [-1 if frame.odometry is None else frame.odometry.fragment_id for frame in e.frames]
+    frames_of = Counter(ids)
     parts: dict[int, list[FrameEvidence]] = {}
-    last = 0
-    for frame, first in zip(e.frames, fragment, strict=True):
-        last = first if fragment.count(first) > 1 else last
+    last = -1
+    for frame, fragment_id in zip(e.frames, ids, strict=True):
+        last = fragment_id if fragment_id >= 0 and frames_of[fragment_id] > 1 else last
         parts.setdefault(last, []).append(frame)
-    return list(parts.values())
+    lost_first = parts.pop(-1, [])  # before the first fragment
+    return [lost_first + part if i == 0 else part for i, part in enumerate(parts.values())] or [lost_first]
 
 
 def _begins_within(e: Evidence, parts: list[list[FrameEvidence]], from_s: float, to_s: float) -> bool:
