@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.limits import WINDOW_NODES
 from terrafix.messages import Frame, Relocalization
 from terrafix.vision.feature_tracker import KEYFRAME_SHIFT, MAX_PAIRS, SIGMA_PX, Motion
 from terrafix.vision.features import Features, SiftMatcher
@@ -19,8 +18,8 @@ from terrafix.vision.two_view import TwoView, select_spread, verify
 WIDTH_PX, FEATURES = 480, 300
 CANDIDATES = 5  # that are verified: 3 ms each
 INTERVAL_NS = 1_000_000_000  # between two searches: 50 ms of one core, 5 % of its time
-# Image widths of way in the same fragment, up to which odometry connects a frame to a keyframe through others, if no
-# more frames lie between than the estimator's window has nodes.
+# Image widths of way, from which a keyframe of the same fragment is another visit to its ground. Shorter loops would be
+# a second odometry whose scale errors, which are those of the first, the estimator would take for independent.
 APART = 1.5
 OLDEST_SHARE = 0.5  # of the inliers of the best candidate: an older one with so many has drifted less
 
@@ -35,9 +34,8 @@ class _View:
     features: Features
 
     def is_recent(self, keyframe: StoredKeyframe) -> bool:
-        """Whether odometry connects the frame to the keyframe within the estimator's window."""
-        near = keyframe.fragment_id == self.fragment_id and abs(self.path - keyframe.path) < APART
-        return near and self.frame_id - keyframe.frame_id <= WINDOW_NODES
+        """Whether this is still the same visit to the ground of the keyframe."""
+        return keyframe.fragment_id == self.fragment_id and abs(self.path - keyframe.path) < APART
 
 
 class RelocalizationSearch:
@@ -66,11 +64,11 @@ class RelocalizationSearch:
         self._searched_ns = frame.t_ns
         path = self._path.get(motion.fragment_id, 0.0)
         view = _View(frame.frame_id, motion.fragment_id, path, self._describe(gray))
-        found = self._find(view)
-        known = found is not None and self.database.has_fragment(view.fragment_id) and self._is_same_ground(found[1])
-        if not lost and not known:
+        verified = self._verified(view)
+        known = any(self._is_same_ground(two_view) for _, two_view in verified)
+        if not lost and not (known and self.database.has_fragment(view.fragment_id)):
             self._store(view, registered=len(motion.two_view) > 0)
-        return None if found is None else self._message(frame, view, *found)
+        return self._message(frame, view, *_oldest(verified)) if verified else None
 
     def _is_due(self, t_ns: int) -> bool:
         return self._searched_ns is None or t_ns - self._searched_ns >= INTERVAL_NS
@@ -105,18 +103,14 @@ class RelocalizationSearch:
             gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         return self._matcher.describe(gray)
 
-    def _find(self, view: _View) -> tuple[StoredKeyframe, TwoView] | None:
-        """The keyframe whose ground ``view`` shows; of several the oldest, with OLDEST_SHARE of the most inliers."""
-        size, verified = (self._camera.width, self._camera.height), []
+    def _verified(self, view: _View) -> list[tuple[StoredKeyframe, TwoView]]:
+        """The candidates whose ground ``view`` shows."""
+        size, verified = (self._camera.width, self._camera.height), list[tuple[StoredKeyframe, TwoView]]()
         for keyframe in self.database.candidates(view.features, view.is_recent, CANDIDATES):
             two_view = verify(self._matcher.match(_unpacked(keyframe.features), view.features), size)
             if two_view is not None:
                 verified.append((keyframe, two_view))
-        if not verified:
-            return None
-        most = max(len(two_view.a_px) for _, two_view in verified)
-        good = [found for found in verified if len(found[1].a_px) >= OLDEST_SHARE * most]
-        return min(good, key=lambda found: found[0].frame_id)
+        return verified
 
     def _is_same_ground(self, two_view: TwoView) -> bool:
         """Whether a kept keyframe shows the ground of the frame so well that the frame need not be kept: their centres
@@ -143,6 +137,13 @@ class RelocalizationSearch:
             inliers=len(two_view.a_px),
             tracked=two_view.matches,
         )
+
+
+def _oldest(verified: list[tuple[StoredKeyframe, TwoView]]) -> tuple[StoredKeyframe, TwoView]:
+    """The oldest keyframe with OLDEST_SHARE of the most inliers."""
+    most = max(len(two_view.a_px) for _, two_view in verified)
+    good = [found for found in verified if len(found[1].a_px) >= OLDEST_SHARE * most]
+    return min(good, key=lambda found: found[0].frame_id)
 
 
 def _unpacked(features: Features) -> Features:

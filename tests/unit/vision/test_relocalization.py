@@ -112,7 +112,9 @@ def test_a_new_fragment_is_connected_to_an_old_one_over_the_same_ground(ground: 
 def test_the_oldest_of_several_keyframes_of_one_place_is_preferred(ground: np.ndarray) -> None:
     there = line((0.0, -100.0), (0.0, 100.0), 0.0)
     away = line((300.0, -100.0), (300.0, 100.0), 0.0)
-    run = Flown(ground).fly(there).fly([None] * 8).fly(away).fly([None] * 8).fly(there).fly([None] * 8).fly(there)
+    run = Flown(ground).fly(there)
+    for offset_m in (7.0, 14.0):  # the very same views would be repeated images
+        run.fly([None] * 8).fly(away).fly([None] * 8).fly([(e_m + offset_m, n_m, 5.0) for e_m, n_m, _ in there])
     third = [m for m in run.found() if m.frame_id >= len(run.places) - len(there)]
     assert third and all(m.keyframe_id < len(there) for m in third)
 
@@ -158,5 +160,5 @@ def test_ground_that_a_kept_keyframe_shows_is_not_kept_again(ground: np.ndarray)
     run = Flown(ground).fly(there + away)
     assert run.node._search is not None
     once = len(run.node._search.database)
-    run.fly([*there, *away, *there])
+    run.fly([(e_m + 5.0, n_m, 3.0) for e_m, n_m, _ in [*there, *away, *there]])
     assert len(run.node._search.database) <= once + 4
