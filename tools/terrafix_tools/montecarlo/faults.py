@@ -50,8 +50,6 @@ class Faults:
 
     def alter(self, match: MapMatch, shot: Shot) -> MapMatch:
         """The match that is published instead of ``match``."""
-        if self.is_blacked_out(shot.t_s) or self.is_unmapped(shot.t_s):
-            return no_match(match)
         offset_m = self._offset_m(shot.t_s)
         return match if offset_m is None else wrong_match(match, shot, offset_m, self._rng)
 
