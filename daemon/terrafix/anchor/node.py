@@ -7,6 +7,7 @@ from terrafix.anchor.initial_position import check_initial_position
 from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.model_monitor import ModelMonitor
+from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.anchor.thermal_load import ThermalLoad
 from terrafix.core.config import HealthSection
 from terrafix.core.errors import ModelError
@@ -42,15 +43,17 @@ class AnchorNode:
         model: ModelMonitor | None = None,
         cache_dir: Path | None = None,
         load: ThermalLoad | None = None,
+        places: PlaceMemory | None = None,
     ) -> None:
         """``ce90_m``: accuracy of map layers that state none; ``cache_dir``: folder in memory for computed
-        descriptors of the map; ``load``: by thermal band; None: as the default configuration."""
+        descriptors of the map; ``load``: by thermal band; None: as the default configuration; ``places``:
+        place index for the search of a large map."""
         self._frames = frames
         self._package = package
         self._describer = describer  # as configured
         self._model = model or ModelMonitor(describer)
         self._load, self._model_suspended = load or ThermalLoad(HealthSection()), False
-        self._localizer = Localizer(package, describer, ce90_m, cache_dir)
+        self._localizer = Localizer(package, describer, ce90_m, cache_dir, places)
         self._origin: Origin | None = None
         self._hint: PositionHint | None = None  # not yet applied
         self._initial: InitialPosition | None = None  # result of the newest GnssInitialPosition
@@ -142,6 +145,7 @@ def make_node(ctx: NodeContext) -> AnchorNode:
             raise ModelError(str(error)) from None
         describer, not_opened = GradientDescriber(), str(error)
     model = ModelMonitor(describer, not_opened)
-    return AnchorNode(
-        ctx.frames, package, describer, wanted.ce90_m, model, ctx.cache_dir, ThermalLoad(ctx.config.health)
-    )
+    # A restart in flight does not read the whole index again to compare its checksum.
+    places = PlaceMemory.open(ctx.config.places, models.folder, verify=ctx.epoch_ns is None)
+    load = ThermalLoad(ctx.config.health)
+    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, model, ctx.cache_dir, load, places)

@@ -1,0 +1,87 @@
+"""Place recognition on imagery of another date: how often is the right place among the best five of the whole map?
+
+python -m terrafix_tools.bench.search.recall CAMERA.tif MAP.tif --agl 120 [--places 30] [--seed 1] [--json FILE]
+
+One frame of the camera's date, heading unknown; the map is the other date. *Proposed*: the order in which the joint
+correlation of the search proposes places. *Checked*: the same places in the order of their evidence, after patches of
+the frame were compared with each (re-ranking). A place is right within 0.2 heights."""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import typer
+
+from terrafix.anchor.relocalization.hypothesis_tracker import MERGE_RADIUS
+from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.core.errors import TerrafixError
+from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget
+from terrafix_tools.bench.search.views import TrueView, TwoDates
+
+AMONG = (1, 5, 12)  # 12 is the number of places that a joint correlation proposes
+SEED = 1
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Rank of the right place, 1 is the best; None: it is not among them."""
+
+    proposed: int | None
+    checked: int | None
+
+
+def measure(first: Path, second: Path, agl_m: float, places: int, seed: int = SEED) -> list[Ranks]:
+    """-> ranks of the right place in ``places`` frames. Raises MapError."""
+    dates = TwoDates(first, second)
+    source, matcher = dates.open()
+
+    def ranks(view: TrueView) -> Ranks:
+        search = MapSearch(source, matcher, agl_m, None, DEFAULT_NULL, FalseAlarmBudget())
+        search.process_frame(view.frame, view.predicted)
+        right_m = MERGE_RADIUS * agl_m
+        return Ranks(
+            proposed=rank_of(view.place_m, [(p.e_m, p.n_m) for p in search.proposed], right_m),
+            checked=rank_of(view.place_m, [(t.e_m, t.n_m) for t in search.tracker.tracks], right_m),
+        )
+
+    return [ranks(view) for view in dates.draw(places, agl_m, seed)]
+
+
+def rank_of(place_m: np.ndarray, ranked_m: Iterable[tuple[float, float]], right_m: float) -> int | None:
+    """Rank of the first place within ``right_m`` of the true one."""
+    distances_m = (float(np.hypot(*(np.array(at_m) - place_m))) for at_m in ranked_m)
+    return next((rank for rank, off_m in enumerate(distances_m, 1) if off_m <= right_m), None)
+
+
+def recall(ranks: Sequence[int | None], among: int) -> float:
+    """Share of the ranks that are at most ``among``."""
+    return float(np.mean([rank is not None and rank <= among for rank in ranks]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("first", type=Path, metavar="CAMERA.tif", help="imagery that the camera sees")
+    parser.add_argument("second", type=Path, metavar="MAP.tif", help="the map, in the same coordinate system")
+    parser.add_argument("--agl", type=float, required=True, help="height above ground, m")
+    parser.add_argument("--places", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--json", type=Path, help="writes the rank of every place")
+    given = parser.parse_args()
+    try:
+        found = measure(given.first, given.second, given.agl, given.places, given.seed)
+    except TerrafixError as error:
+        sys.exit(f"{error}")
+    typer.echo(f"{given.first.stem} on {given.second.stem} from {given.agl:g} m, {len(found)} places, heading unknown")
+    for name, ranks in (("proposed", [r.proposed for r in found]), ("checked", [r.checked for r in found])):
+        shares = ", ".join(f"{100 * recall(ranks, k):.0f} % among {k}" for k in AMONG)
+        typer.echo(f"{name:9} {shares}")
+    if given.json is not None:
+        given.json.write_text(json.dumps([asdict(r) for r in found], indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
