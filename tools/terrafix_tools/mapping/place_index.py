@@ -29,8 +29,10 @@ from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.retrieval.places import PlaceDescriber, disc, open_place_describer
 from terrafix_engines.runtime import ModelFileError
 
-SIDE_PER_AGL = 0.8  # a frame of 45 degrees shows a disc of this diameter, in heights, whatever its heading
-STEPS_PER_SIDE = 4  # discs of a row or column within a side: one is within an eighth of the side of any place
+# Diameter of the discs in heights: a frame whose shorter side is 0.87 heights (60 degrees, 4:3) shows them whatever its
+# heading, with the squares beside its middle.
+SIDE_PER_AGL = 0.75
+STEPS_PER_SIDE = 4  # discs of a row or column within a side
 VALID_SHARE = 0.95  # least share of a disc with imagery
 ROW_CHUNK = 256  # discs that are described at a time
 

@@ -8,12 +8,16 @@ import numpy as np
 
 from terrafix.core.errors import MapError, UsageError
 
-# Number of inverted lists in square roots of the number of vectors. [spec: FAISS's guidelines, 4 to 16]
-LISTS_PER_ROOT = 4.0
+# Number of inverted lists in square roots of the number of vectors. More of them are slower to learn, with the same
+# recall for the same share that is read. [measured: docs/search.md]
+LISTS_PER_ROOT = 1.0
 TRAIN_PER_LIST = 40  # vectors from which the centre of a list is learnt, FAISS's lowest number [spec: FAISS]
 ADD_CHUNK = 100_000  # vectors that are added at a time, 51 MB of float32 at 128 numbers [tuned]
 # Share of the lists that a query reads, and the least number of them [measured: docs/search.md]
-PROBED_SHARE, MIN_PROBED = 1 / 16, 16
+PROBED_SHARE, MIN_PROBED = 1 / 8, 16
+# share of the range of values by which the 8 bits reach beyond that of the vectors that they are learnt from: values
+# beyond would be clipped [tuned]
+RANGE_MARGIN = 0.2
 SEED = 3  # of the vectors from which lists are learnt [spec: any]
 
 
@@ -51,6 +55,7 @@ def write_faiss(vectors: np.ndarray, path: Path) -> None:
     total, size = vectors.shape
     lists = max(min(round(LISTS_PER_ROOT * total**0.5), total // TRAIN_PER_LIST), 1)
     index = faiss.index_factory(size, f"IVF{lists},SQ8", faiss.METRIC_INNER_PRODUCT)
+    index.sq.rangestat_arg = RANGE_MARGIN
     chosen = np.random.default_rng(SEED).choice(total, min(lists * TRAIN_PER_LIST, total), replace=False)
     index.train(vectors[np.sort(chosen)].astype(np.float32))
     for first in range(0, total, ADD_CHUNK):

@@ -17,9 +17,24 @@ from terrafix.core.node import Image
 from terrafix_engines.retrieval.places import PlaceDescriber, disc, open_place_describer
 from terrafix_engines.runtime import ModelFileError
 
-SEEN_SHARE = 0.97  # least share of the disc that the frame must show [tuned]
+SEEN_SHARE = 0.95  # least share of the disc that the frame must show: the rest is black [tuned]
 MIN_SHARE_OF_FRAME = 0.15  # least share of the frame that the disc covers: a smaller disc is a poor sample [tuned]
-DISCS_PER_HYPOTHESIS = 200  # most similar discs of each yaw and scale [tuned]
+DISCS_PER_QUERY = 200  # most similar discs of each square of a yaw and scale [tuned]
+
+
+# Rows and columns, shares of the side, by which the squares of a frame are moved from the middle of its ground. Discs
+# of the map are a quarter of the side apart; with these the nearest one is at most a sixteenth off in each axis.
+# [spec: half of the distance of the map's discs]
+SHIFTS = tuple((row, column) for row in (-1 / 16, 1 / 16) for column in (-1 / 16, 1 / 16))
+
+
+@dataclass(frozen=True)
+class Square:
+    """``image`` (S, S, 3), north up; its centre in metres east and north of the camera."""
+
+    image: np.ndarray
+    east_m: float
+    north_m: float
 
 
 @dataclass(frozen=True)
@@ -61,15 +76,13 @@ class PlaceRecognizer:
     def __init__(self, memory: PlaceMemory, layer: IndexedLayer, frame: LocalFrame) -> None:
         self._index, self._describer, self._frame = memory.index, memory.describer, frame
         self._allowed = memory.index.within(layer)
-        side_px = memory.describer.side_px
-        self._gsd_m = memory.index.header.side_m / side_px
-        self._disc = disc(side_px, 0.0) > 0.0
+        self._gsd_m = memory.index.header.side_m / memory.describer.side_px
 
     def fits(self, view: View, hypotheses: Sequence[Hypothesis], matcher: FrameMatcher) -> bool:
         """Whether a frame shows the disc of the index completely at every hypothesis, and the disc is no small part of
         it: the flight is at a height for which the index was made."""
         blank = np.zeros((matcher.camera.height, matcher.camera.width, 3), np.uint8)
-        return len(self._squares(blank, view, hypotheses, matcher)) == len(hypotheses)
+        return len(self._squares(blank, view, hypotheses, matcher)) == len(hypotheses) * len(SHIFTS)
 
     def candidates(
         self, image: Image, view: View, hypotheses: Sequence[Hypothesis], matcher: FrameMatcher
@@ -78,33 +91,35 @@ class PlaceRecognizer:
         squares = self._squares(image, view, hypotheses, matcher)
         if not squares:
             return []
-        queries = self._describer.describe(np.array([pixels for pixels, _ in squares]))
+        queries = self._describer.describe(np.array([square.image for square in squares]))
         candidates = []
-        for found in self._index.find(queries, DISCS_PER_HYPOTHESIS, self._allowed):
+        for found in self._index.find(queries, DISCS_PER_QUERY, self._allowed):
             e_m, n_m = self._frame.to_local(*self._index.position_deg(found.id))
-            offset_m = squares[found.query][1]
-            candidates.append(Candidate(e_m - offset_m[0], n_m - offset_m[1], found.score))
+            square = squares[found.query]
+            candidates.append(Candidate(e_m - square.east_m, n_m - square.north_m, found.score))
         return candidates
 
     def _squares(
         self, image: Image, view: View, hypotheses: Sequence[Hypothesis], matcher: FrameMatcher
-    ) -> list[tuple[np.ndarray, tuple[float, float]]]:
+    ) -> list[Square]:
         frames = matcher.rectify_all(image, view, hypotheses, self._gsd_m, 1)
-        found = [self._square(frame) for frame in frames if frame is not None]
-        return [square for square in found if square is not None]
+        return [s for frame in frames if frame is not None for s in squares_of(frame, self._describer.side_px)]
 
-    def _square(self, frame: Rectified) -> tuple[np.ndarray, tuple[float, float]] | None:
-        """The square around the middle of the visible ground, and its centre east and north of the camera."""
-        side = self._describer.side_px
-        middle = [round(float(v.mean() + 0.5 - side / 2)) for v in np.nonzero(frame.mask)]
-        row, column = (max(v, 0) for v in middle)
-        inside = frame.mask[row : row + side, column : column + side]
-        if inside.shape != (side, side) or self._disc.sum() < MIN_SHARE_OF_FRAME * frame.mask.sum():
-            return None
-        if float(inside[self._disc].mean()) < SEEN_SHARE:
-            return None
-        centre_m = (
-            frame.e_min_m + (column + side / 2) * frame.gsd_m,
-            frame.n_max_m - (row + side / 2) * frame.gsd_m,
-        )
-        return frame.image[row : row + side, column : column + side], centre_m
+
+def squares_of(frame: Rectified, side_px: int) -> list[Square]:
+    """The squares around the middle of the visible ground, moved by SHIFTS; none if the frame does not show their
+    discs, or if these are a small part of it."""
+    inside = disc(side_px, 0.0) > 0.0
+    if inside.sum() < MIN_SHARE_OF_FRAME * frame.mask.sum():
+        return []
+    middle = [float(v.mean()) + 0.5 for v in np.nonzero(frame.mask)]
+    squares = []
+    for shift in SHIFTS:
+        row, column = (max(round(m + s * side_px - side_px / 2), 0) for m, s in zip(middle, shift, strict=True))
+        seen = frame.mask[row : row + side_px, column : column + side_px]
+        if seen.shape != (side_px, side_px) or float(seen[inside].mean()) < SEEN_SHARE:
+            return []
+        east_m = frame.e_min_m + (column + side_px / 2) * frame.gsd_m
+        north_m = frame.n_max_m - (row + side_px / 2) * frame.gsd_m
+        squares.append(Square(frame.image[row : row + side_px, column : column + side_px], east_m, north_m))
+    return squares
