@@ -136,7 +136,7 @@ class MapSearch:
     def process_frame(self, image: Image, view: View) -> AcceptedPlace | None:
         """Processes one frame. ``view``: height, attitude and their uncertainty; its position is not used."""
         if self._path_m - self._correlated_path_m >= CORRELATION_INTERVAL * view.agl_m:
-            self._correlate_region(image, view)
+            self.correlate_region(image, view)
         if self._path_m - self._verified_path_m < VERIFICATION_INTERVAL * view.agl_m:
             return None
         self._verified_path_m = self._path_m
@@ -158,7 +158,8 @@ class MapSearch:
         area = (e_max - e_min) * (n_max - n_min) / (NEIGHBOUR_RADIUS * self.agl_m) ** 2
         return max(area, 1.0) * max(len(self._hypotheses), 1)
 
-    def _correlate_region(self, image: Image, view: View) -> None:
+    def correlate_region(self, image: Image, view: View) -> None:
+        """Joint correlation of the frame and those before with the region: new tracks, and the leads of all."""
         if not self._blocks:
             self._initialize(view)
         stride = self._correlator.stride

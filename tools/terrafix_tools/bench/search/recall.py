@@ -28,20 +28,26 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Ranks:
-    """Rank of the right place, 1 is the best; None: it is not among them."""
+    """Rank of the right place, 1 is the best; None: it is not among them. ``checked`` is None, too, if no place was
+    checked."""
 
     proposed: int | None
     checked: int | None
 
 
-def measure(first: Path, second: Path, agl_m: float, places: int, seed: int = SEED) -> list[Ranks]:
-    """-> ranks of the right place in ``places`` frames. Raises MapError."""
+def measure(
+    first: Path, second: Path, agl_m: float, places: int, seed: int = SEED, *, check: bool = True
+) -> list[Ranks]:
+    """-> ranks of the right place in ``places`` frames. ``check``: the proposed places are checked. Raises MapError."""
     dates = TwoDates(first, second)
     source, matcher = dates.open()
 
     def ranks(view: TrueView) -> Ranks:
         search = MapSearch(source, matcher, agl_m, None, DEFAULT_NULL, FalseAlarmBudget())
-        search.process_frame(view.frame, view.predicted)
+        if check:
+            search.process_frame(view.frame, view.predicted)
+        else:
+            search.correlate_region(view.frame, view.predicted)
         right_m = MERGE_RADIUS * agl_m
         return Ranks(
             proposed=rank_of(view.place_m, [(p.e_m, p.n_m) for p in search.proposed], right_m),
