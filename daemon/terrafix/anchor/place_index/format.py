@@ -5,7 +5,7 @@ vectors.npy     (N, D) float16, unit vectors
 positions.npy   (N, 2) int32, latitude and longitude of the disc's centre, degrees times 1e7
 ivf.faiss       the same vectors for FAISS; only in an index that is searched by FAISS
 
-The sha256 of each file is in the header. The header is an index of data that the packages hold, so it is not signed: a
+The sha256 of each file is in the header. The header is made of data that the packages hold, so it is not signed: a
 wrong index can only make a search slower or without a result, because every place that it proposes is verified with the
 signed map."""
 
