@@ -17,9 +17,14 @@ from terrafix.core.node import Image
 from terrafix_engines.retrieval.places import PlaceDescriber, disc, open_place_describer
 from terrafix_engines.runtime import ModelFileError
 
-SEEN_SHARE = 0.95  # least share of the disc that the frame must show: the rest is black [tuned]
-MIN_SHARE_OF_FRAME = 0.15  # least share of the frame that the disc covers: a smaller disc is a poor sample [tuned]
-DISCS_PER_QUERY = 200  # most similar discs of each square of a yaw and scale [tuned]
+# Least share of the disc that the frame must show; the rest is black.
+# [spec: VALID_SHARE of the discs of the map]
+SEEN_SHARE = 0.95
+# Least share of the frame that the disc covers: a smaller disc is a poor sample of it. At the height of the index it is
+# 0.44, at twice that height a quarter of that, so that indices an octave apart serve all heights.
+# [spec: pi / 4 * 0.75^2 / 4]
+MIN_SHARE_OF_FRAME = 0.11
+DISCS_PER_QUERY = 200  # most similar discs of each square of a yaw and scale [measured: docs/search.md]
 
 
 # Rows and columns, shares of the side, by which the squares of a frame are moved from the middle of its ground. Discs
