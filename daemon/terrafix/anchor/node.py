@@ -10,7 +10,7 @@ from terrafix.anchor.model_monitor import ModelMonitor
 from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.anchor.thermal_load import ThermalLoad
 from terrafix.core.config import HealthSection
-from terrafix.core.errors import ModelError
+from terrafix.core.errors import ModelError, TerrafixError
 from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.map.package import MapPackage
@@ -131,8 +131,8 @@ class AnchorNode:
 
 
 def make_node(ctx: NodeContext) -> AnchorNode:
-    """Opens the map and the model before take-off. Raises ConfigError, MapError, ModelError. After a restart in flight
-    a model that cannot be opened is replaced by the describer without weights."""
+    """Opens the map and the model before take-off. Raises ConfigError, MapError, ModelError, UsageError. After a
+    restart in flight a model that cannot be opened is replaced by the describer without weights."""
     wanted = ctx.config.map
     trusted = trusted_keys(wanted.trusted_keys, required=wanted.require_signature)
     package = MapPackage.open(ctx.map_path, trusted=trusted) if ctx.map_path is not None else None
@@ -145,7 +145,17 @@ def make_node(ctx: NodeContext) -> AnchorNode:
             raise ModelError(str(error)) from None
         describer, not_opened = GradientDescriber(), str(error)
     model = ModelMonitor(describer, not_opened)
-    # A restart in flight does not read the whole index again to compare its checksum.
-    places = PlaceMemory.open(ctx.config.places, models.folder, verify=ctx.epoch_ns is None)
-    load = ThermalLoad(ctx.config.health)
+    load, places = ThermalLoad(ctx.config.health), _open_places(ctx)
     return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, model, ctx.cache_dir, load, places)
+
+
+def _open_places(ctx: NodeContext) -> PlaceMemory | None:
+    """The configured place index. A restart in flight compares no checksum, which would read the whole index, and flies
+    without an index that cannot be opened. Raises MapError, ModelError, UsageError before take-off."""
+    restarted = ctx.epoch_ns is not None
+    try:
+        return PlaceMemory.open(ctx.config.places, ctx.config.models.folder, verify=not restarted)
+    except TerrafixError:
+        if not restarted:
+            raise
+        return None

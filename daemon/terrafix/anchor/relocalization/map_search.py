@@ -29,6 +29,7 @@ from terrafix.map.package import LocalMap
 from terrafix.messages import SearchStep
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
+from terrafix_engines.runtime import ModelRunError
 
 # Cells and number of hypotheses up to which dense gradients on small cells are used; they discriminate best. With more
 # hypotheses or a larger map, gradients pooled over larger cells are used: they tolerate yaw errors of some degrees.
@@ -193,14 +194,22 @@ class MapSearch:
 
     def _blocks_to_correlate(self, image: Image, view: View) -> list[Block]:
         """Blocks of the region; of a region that one joint correlation cannot afford those of the tracks, then those
-        that the place index proposes."""
+        that the place index proposes. Raises ModelRunError: its model has failed; then the next frames are searched
+        without the index, on larger cells."""
         region = self._blocks[: self.block_count]
         if self._recognizer is None or len(region) <= self._max_blocks:
             return region
-        candidates = self._recognizer.candidates(image, view, self._hypotheses, self._matcher)
+        try:
+            candidates = self._recognizer.candidates(image, view, self._hypotheses, self._matcher)
+        except ModelRunError:
+            self._recognizer, self._blocks, self.tracker.tracks = None, [], []
+            raise
         places = [(track.e_m, track.n_m) for track in self.tracker.tracks]
         places += [(candidate.e_m, candidate.n_m) for candidate in candidates]
         return select_blocks(places, region, self._cell_m, self._max_blocks)
+
+    def _index_fits(self, view: View) -> bool:
+        return self._recognizer is not None and self._recognizer.fits(view, self._hypotheses, self._matcher)
 
     def _initialize(self, view: View) -> None:
         self._hypotheses = self._matcher.map_search_hypotheses(view)
@@ -213,10 +222,7 @@ class MapSearch:
             self._correlator = BlockCorrelator(self._map, PooledGradientDescriber())
             stride = self._correlator.stride
             cell_m = self._correlator.cell_m(stride * self._matcher.cell_m(view.agl_m, CELL_PER_AGL / stride))
-            is_large = places_m2 / cell_m**2 > MAX_WORK
-            if self._recognizer is not None and not (
-                is_large and self._recognizer.fits(view, self._hypotheses, self._matcher)
-            ):
+            if places_m2 / cell_m**2 <= MAX_WORK or not self._index_fits(view):
                 self._recognizer = None
             while places_m2 / cell_m**2 > MAX_WORK and self._recognizer is None:
                 cell_m *= 2.0  # the next octave of the map

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 
 import map_rasters
+from terrafix.anchor.node import make_node
 from terrafix.anchor.place_index import index as place_index
 from terrafix.anchor.place_index.faiss_ivf import FaissSearch
 from terrafix.anchor.place_index.format import FAISS, HEADER, POSITIONS, VECTORS, Header, read_header
 from terrafix.anchor.place_index.index import PlaceIndex
 from terrafix.anchor.place_index.recognizer import PlaceMemory
-from terrafix.core.config import Places
+from terrafix.core.config import Places, load
 from terrafix.core.errors import MapError, ModelError, OutputError
+from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.node import NodeContext
 from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.places import PooledGradientPlaces
 from terrafix_tools.mapping.build import build
@@ -179,6 +182,19 @@ def test_the_index_of_the_configuration_is_opened_with_its_descriptor(folder: Pa
     unknown = changed(folder, tmp_path / "unknown", model="dinov2")
     with pytest.raises(ModelError, match=r"dinov2.*pooled-gradient"):
         PlaceMemory.open(Places(index=str(unknown)), str(tmp_path), verify=True)
+
+
+def test_a_broken_index_stops_the_start_but_not_a_restart_in_flight(folder: Path, tmp_path: Path) -> None:
+    def started(index: Path, epoch_ns: int | None) -> PlaceMemory | None:
+        config = msgspec.structs.replace(load([]), places=Places(index=str(index)))
+        node = make_node(NodeContext(config, MemoryFrameStore(2), None, tmp_path, epoch_ns=epoch_ns))
+        return node._localizer._places
+
+    broken = changed(folder, tmp_path / "broken", version=0)
+    with pytest.raises(MapError, match="version 0"):
+        started(broken, None)
+    assert started(broken, 5) is None
+    assert started(folder, None) is not None and started(folder, 5) is not None
 
 
 def test_an_existing_folder_is_not_overwritten_and_an_aborted_build_leaves_nothing(

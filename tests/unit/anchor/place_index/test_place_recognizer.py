@@ -20,6 +20,7 @@ from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.places import PooledGradientPlaces
+from terrafix_engines.runtime import ModelRunError
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.place_index import IndexOptions, write_index
 
@@ -183,9 +184,34 @@ def test_a_map_that_is_small_enough_or_of_another_height_is_searched_without_the
 ) -> None:
     image = seen(local, PLACE_M)
     monkeypatch.setattr(PlaceRecognizer, "candidates", lambda *_: pytest.fail("the index was asked"))
-    searched(local, matcher, recognizer).process_frame(image, predicted())
+    small = searched(local, matcher, recognizer)
+    small.process_frame(image, predicted())
+    only_a_few_blocks(matcher, monkeypatch)
+    e_min, n_min, e_max, n_max = local.bounds_m
+    work = len(small._hypotheses) * (e_max - e_min) * (n_max - n_min) / small._cell_m**2
+    monkeypatch.setattr(map_search, "MAX_WORK", 1.01 * work)
+    barely = searched(local, matcher, recognizer)
+    barely.process_frame(image, predicted())
+    assert barely._cell_m == small._cell_m and len(barely._blocks) > barely._max_blocks  # blocks reach beyond the map
     monkeypatch.setattr(map_search, "MAX_WORK", 1e5)
     searched(local, matcher, recognizer).process_frame(image, predicted(40.0))
+
+
+def test_a_model_that_fails_costs_a_frame_and_the_search_goes_on_without_the_index(
+    local: LocalMap, matcher: FrameMatcher, recognizer: PlaceRecognizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failed(*_: object) -> None:
+        raise ModelRunError("out of memory")
+
+    only_a_few_blocks(matcher, monkeypatch)
+    monkeypatch.setattr(PlaceRecognizer, "candidates", failed)
+    search, image = searched(local, matcher, recognizer), seen(local, PLACE_M)
+    with pytest.raises(ModelRunError):
+        search.process_frame(image, predicted())
+    search.process_frame(image, predicted())
+    coarse = searched(local, matcher, None)
+    coarse.process_frame(image, predicted())
+    assert search._cell_m == coarse._cell_m and search.proposed == coarse.proposed != []
 
 
 def test_a_frame_for_which_the_index_has_no_place_is_not_correlated(
