@@ -83,10 +83,11 @@ def test_the_benchmark_finds_places_of_the_same_ground_and_prints_both_orders(
     bench.main()
     ranks = json.loads(out.read_text(encoding="utf-8"))
     assert (ranks["proposed"], ranks["checked"]) == ([1] * 3, [1] * 3)
+    assert ranks["search, pooled-gradient"] == [1] * 3
     assert len(ranks["pooled-gradient"]) == 3 and all(
         rank is not None and rank <= 5 for rank in ranks["pooled-gradient"]
     )
-    assert capsys.readouterr().out.count("100 % among 5") == 3
+    assert capsys.readouterr().out.count("100 % among 5") == 4
     with pytest.raises(MapError, match="too small for frames at 900 m"):
         measure(*dates, 900.0, 1)
 

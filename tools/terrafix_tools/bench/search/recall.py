@@ -6,7 +6,8 @@ python -m terrafix_tools.bench.search.recall CAMERA.tif MAP.tif --agl 120 [--pla
 One frame of the camera's date, heading unknown; the map is the other date. *Proposed*: the order in which the joint
 correlation of the search proposes places. *Checked*: the same places in the order of their evidence, after patches of
 the frame were compared with each (re-ranking). With --descriptor also: the places of a place index with that
-descriptor, searched exactly; neighbours within 0.4 heights count as one place. A place is right within 0.2 heights, of
+descriptor, searched exactly (neighbours within 0.4 heights count as one place), and those that the
+search proposes with this index: of a map that a correlation cannot afford. A place is right within 0.2 heights, of
 an index within 0.3, because its discs are 0.19 apart."""
 
 import argparse
@@ -67,10 +68,11 @@ def measure(
 
 def measure_index(
     first: Path, second: Path, agl_m: float, places: int, seed: int, descriptor: str, folder: str = ""
-) -> list[int | None]:
-    """-> ranks of the right place among those of a place index of the map. Raises MapError, ModelError."""
+) -> dict[str, list[int | None]]:
+    """-> ranks of the right place among those of a place index of the map, and among those that the search proposes
+    with this index. Raises MapError, ModelError."""
     dates = TwoDates(first, second)
-    _, matcher = dates.open()
+    source, matcher = dates.open()
     with tempfile.TemporaryDirectory() as made:
         out = Path(made) / "index"
         header = write_index([dates.package_path], out, IndexOptions(agl_m, descriptor, folder))
@@ -84,7 +86,13 @@ def measure_index(
             ranked_m = distinct([(c.e_m, c.n_m) for c in found], NEIGHBOUR_RADIUS * agl_m)
             return rank_of(view.place_m, ranked_m, INDEX_RIGHT * agl_m)
 
-        return [rank(view) for view in dates.draw(places, agl_m, seed)]
+        def rank_in_search(view: TrueView) -> int | None:
+            search = MapSearch(source, matcher, agl_m, None, DEFAULT_NULL, FalseAlarmBudget(), recognizer)
+            search.correlate_region(view.frame, view.predicted)
+            return rank_of(view.place_m, [(p.e_m, p.n_m) for p in search.proposed], MERGE_RADIUS * agl_m)
+
+        views = list(dates.draw(places, agl_m, seed))
+        return {descriptor: [rank(v) for v in views], f"search, {descriptor}": [rank_in_search(v) for v in views]}
 
 
 def distinct(ranked_m: Sequence[tuple[float, float]], radius_m: float) -> list[tuple[float, float]]:
@@ -121,13 +129,13 @@ def main() -> None:
         found = measure(given.first, given.second, given.agl, given.places, given.seed)
         rows = {"proposed": [r.proposed for r in found], "checked": [r.checked for r in found]}
         for name in given.descriptor:
-            rows[name] = measure_index(given.first, given.second, given.agl, given.places, given.seed, name)
+            rows |= measure_index(given.first, given.second, given.agl, given.places, given.seed, name)
     except TerrafixError as error:
         sys.exit(f"{error}")
     typer.echo(f"{given.first.stem} on {given.second.stem} from {given.agl:g} m, {len(found)} places, heading unknown")
     for name, ranks in rows.items():
         shares = ", ".join(f"{100 * recall(ranks, k):.0f} % among {k}" for k in AMONG)
-        typer.echo(f"{name:16} {shares}")
+        typer.echo(f"{name:24} {shares}")
     if given.json is not None:
         given.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
 
