@@ -72,7 +72,9 @@ class Faults:
 
 def no_match(match: MapMatch) -> MapMatch:
     """``match`` without a pose and without a belief: the frame was not compared with the map."""
-    return msgspec.structs.replace(match, verdict=Verdict.FEW_INLIERS, pose=None, place=None, belief=None, inliers=0)
+    return msgspec.structs.replace(
+        match, verdict=Verdict.FEW_INLIERS, matches=[], pnp=None, pose=None, place=None, belief=None, inliers=0
+    )
 
 
 def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.random.Generator) -> MapMatch:
@@ -82,6 +84,8 @@ def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.rando
     return msgspec.structs.replace(
         match,
         verdict=Verdict.ACCEPTED,
+        matches=[],
+        pnp=None,
         inliers=30,
         pose=MapPose(
             p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
