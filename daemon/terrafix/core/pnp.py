@@ -93,7 +93,7 @@ def solved(match: MapMatch) -> MapMatch:
 
 def method_of(match: MapMatch) -> PoseMethod:
     """How ``solved`` computes the pose of ``match``."""
-    if match.verdict is not Verdict.ACCEPTED or not (match.pnp or match.pose):
+    if match.verdict is not Verdict.ACCEPTED or not (match.pose or (match.pnp and match.matches)):
         return PoseMethod.NONE
     if match.pnp is None:
         return PoseMethod.MATCHER

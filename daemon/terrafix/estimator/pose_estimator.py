@@ -119,13 +119,13 @@ class OpenCVGtsamPoseEstimator:
     ) -> None:
         """``clock``: monotonic time [ns] for ``emitted_at``; None: the time of the newest measurement, as in a replay.
         ``warn``: receives CovarianceDegradedWarning."""
-        self._flight, self._clock, self._warn = flight, clock, warn
+        self.flight, self._clock, self._warn = flight, clock, warn
 
     def current_covariance_mode(self) -> CovarianceMode:
-        return self._flight.estimator.state.mode
+        return self.flight.estimator.state.mode
 
     def estimate(self, match: MatchResult, camera: CameraCalibration, thermal: ThermalState) -> PoseEstimate:
-        flight, estimator = self._flight, self._flight.estimator
+        flight, estimator = self.flight, self.flight.estimator
         if camera != CameraCalibration.of(estimator.origin.camera):
             raise ValueError("the camera is not the one that Origin named: give CameraCalibration.of(origin.camera)")
         estimator.state.mode = covariance_mode(thermal)
@@ -144,7 +144,7 @@ class OpenCVGtsamPoseEstimator:
     def _with_pnp_input(self, match: MatchResult, camera: CameraCalibration) -> MatchResult:
         """``match``; where its matcher states neither a pose nor the input of PnP, with that of the graph and of
         matches that are good to a pixel."""
-        state = self._flight.estimator.state
+        state = self.flight.estimator.state
         node = state.node_of.get(match.frame_id)
         if not match.matches or match.pnp or match.pose or node is None or not state.graph.holds(node):
             return match
@@ -177,7 +177,7 @@ class OpenCVGtsamPoseEstimator:
         )
 
     def _frame_of(self, match: MatchResult) -> FrameState:
-        state = self._flight.estimator.state
+        state = self.flight.estimator.state
         node = state.node_of.get(match.frame_id)
         assert state.last is not None
         if node is None or not state.graph.holds(node) or node == state.last.node:
@@ -185,7 +185,7 @@ class OpenCVGtsamPoseEstimator:
         return state.frame_state(match.frame_id, state.graph.time_of(node), node)
 
     def _estimate(self, frame: FrameState, outcome: MatchOutcome) -> PoseEstimate:
-        flight = self._flight
+        flight = self.flight
         assert flight.estimator.last is not None
         newest_ns = round(flight.estimator.last.t_s * 1e9)
         nav = estimate_of(flight.estimator, frame, flight.axes, flight.claim(frame), newest_ns, tracked=True)
