@@ -212,3 +212,23 @@ def mean_nees(wrong: int) -> float:
 def test_false_inliers_inflate_the_covariance() -> None:
     """Counted as inliers, the wrong matches raise the mean NEES by half."""
     assert mean_nees(wrong=26) < 1.3 * mean_nees(wrong=0)
+
+
+def test_numbers_that_are_not_finite_are_degenerate() -> None:
+    points, xy = scene(np.random.default_rng(1), 20, 0.0)
+    for spoilt in (0, 1):
+        arrays = [points.copy(), xy.copy()]
+        arrays[spoilt][3, 1] = np.nan
+        found = solve_equal_weights(*arrays)
+        assert (found.verdict, found.fit) == (Verdict.DEGENERATE, None)
+    weights = np.ones(20)
+    weights[3] = np.inf
+    assert solve(points, xy, weights, GIVEN).verdict is Verdict.DEGENERATE
+
+
+def test_weights_count_in_the_refinement() -> None:
+    points, xy = scene(np.random.default_rng(1), 20, 0.0)
+    xy[:10] += 0.005
+    heavy, light = (solve(points, xy, np.r_[np.full(10, weight), np.ones(10)], GIVEN).fit for weight in (1.0, 0.01))
+    assert heavy is not None and light is not None
+    assert light.residuals[10:].mean() < 0.7 * heavy.residuals[10:].mean()
