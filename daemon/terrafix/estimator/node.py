@@ -104,7 +104,6 @@ class EstimatorNode:
         self._calibration_ns = 0  # of the newest CalibrationEstimate
         self._first_ns: int | None = None  # time of the first frame or telemetry
         self._waiting: list[Odometry] = []  # for telemetry, to which the calibration of the checkpoint refers
-        self._time_offset = TimeOffset()
         self._stamp_ns: int | None = None  # of the newest frame, by the camera
         self._predicted_id: int | None = None  # frame of the newest Prediction ...
         self._predicted_m = np.zeros(2)  # ... its position, after its map match,
@@ -157,9 +156,9 @@ class EstimatorNode:
             return
         self._origin, self._monitors = origin, Monitors(origin)
         self._axes = LocalFrame(origin.lat_deg, origin.lon_deg)
-        self._time_offset, self._predicted_id = TimeOffset(), None  # of another camera, in other axes
+        self._predicted_id = None  # in other axes
         prior = self._prior(origin, self._axes)
-        self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior))
+        self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior), TimeOffset())
         waiting, self._early_dead_reckoning = self._early_dead_reckoning, []
         for sample in waiting:
             yield from self._on_dead_reckoning(sample)
@@ -182,12 +181,15 @@ class EstimatorNode:
         assert self._origin is not None and self._axes is not None and self._initial is not None
         self._initial_pending, self._predicted_id, self._first_frame_id = False, None, frame_id
         prior = NavPrior.at_initial_position(self._initial, self._axes, (t_ns if stands else self._initial.t_ns) * 1e-9)
-        return self._begin(self._make_estimator(with_initial_position(self._origin, self._initial), prior))
+        assert self._flight is not None
+        estimator = self._make_estimator(with_initial_position(self._origin, self._initial), prior)
+        return self._begin(estimator, self._flight.time_offset)
 
-    def _begin(self, estimator: Estimator) -> Estimator:
+    def _begin(self, estimator: Estimator, time_offset: TimeOffset) -> Estimator:
+        """``time_offset``: of the camera, so far."""
         assert self._axes is not None and self._monitors is not None
         self._estimator = estimator
-        self._flight = EstimatedFlight(estimator, self._axes, self._time_offset, self._monitors, self._telemetry)
+        self._flight = EstimatedFlight(estimator, self._axes, time_offset, self._monitors, self._telemetry)
         # Without a warning for each estimate: Health and NavEstimate state the mode.
         self._poses = OpenCVGtsamPoseEstimator(self._flight, warn=lambda _: None)
         return estimator
@@ -256,17 +258,17 @@ class EstimatorNode:
             yield from self._frame(odometry)
 
     def _frame(self, odometry: Odometry) -> Iterable[Message]:
-        if self._estimator is None:
+        if self._estimator is None or self._flight is None:
             return
-        stamp_ns = odometry.t_ns
+        stamp_ns, time_offset = odometry.t_ns, self._flight.time_offset
         before_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
-        odometry = self._in_telemetry_time(odometry)
+        odometry = self._in_telemetry_time(odometry, time_offset)
         estimator, frame = self._frame_input(self._estimator, odometry)
         follows = self._note_predicted_frame(estimator)
         result = estimator.feed_frame(frame)
         self._tracked = result.verdict is Verdict.ACCEPTED
         if result.turn is not None:
-            self._time_offset.add(replace(result.turn, t0_ns=before_ns, t1_ns=stamp_ns), self._telemetry)
+            time_offset.add(replace(result.turn, t0_ns=before_ns, t1_ns=stamp_ns), self._telemetry)
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
         yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict) for verdict in verdicts)
         no_new_view = Verdict.STALLED in (odometry.verdict, result.verdict) or odometry.verdict is Verdict.BAD_IMAGE
@@ -289,15 +291,15 @@ class EstimatorNode:
             self._ahrs.position_published(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
 
-    def _in_telemetry_time(self, odometry: Odometry) -> Odometry:
+    def _in_telemetry_time(self, odometry: Odometry, time_offset: TimeOffset) -> Odometry:
         """``odometry``, with the estimated time offset of the camera taken from its time."""
         stamp_ns = odometry.t_ns
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         before_ns, self._stamp_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns, stamp_ns
-        self._time_offset.step((stamp_ns - before_ns) * 1e-9)
-        if not self._time_offset.applied_s:
+        time_offset.step((stamp_ns - before_ns) * 1e-9)
+        if not time_offset.applied_s:
             return odometry
-        return msgspec.structs.replace(odometry, t_ns=stamp_ns - round(self._time_offset.applied_s * 1e9))
+        return msgspec.structs.replace(odometry, t_ns=stamp_ns - round(time_offset.applied_s * 1e9))
 
     def _frame_input(self, estimator: Estimator, odometry: Odometry) -> tuple[Estimator, FrameInput]:
         """-> the estimator, a new one if an InitialPosition is pending, and what it takes of the frame."""

@@ -38,7 +38,7 @@ MatchResult = MapMatch  # 2D-3D matches of a frame, or the camera pose that the 
 ThermalState = Health
 
 
-@dataclass(frozen=True)
+@dataclass
 class EstimatedFlight:
     """The estimator of a flight and what its estimates are published with. ``axes``: of its local frame;
     ``time_offset``: of the camera; ``monitors``: of the calibration, against ``telemetry``."""
