@@ -61,7 +61,12 @@ def estimate_pose(
     if match.verdict is Verdict.ACCEPTED:
         inliers = match.inliers
     # Single patches with less information than all together may share a bias; the consensus is more precise.
-    if match.verdict is not Verdict.ACCEPTED or ground_sigma_m(match.pose, view.agl_m) > SIGMA_FLOOR * view.agl_m:
+    fit = None if fix is None else fix.pnp.fit
+    if (
+        match.verdict is not Verdict.ACCEPTED
+        or fit is None
+        or ground_sigma_m(fit, view.agl_m) > SIGMA_FLOOR * view.agl_m
+    ):
         consensus = seen.layer.consensus.estimate(seen.image, view_at(view, hypothesis, mode.e_m, mode.n_m))
         joint = match if consensus is None else pose_match(match, consensus, view)
         match = joint if joint.verdict is Verdict.ACCEPTED else match

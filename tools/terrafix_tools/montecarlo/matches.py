@@ -16,15 +16,15 @@ from terrafix.anchor.frame_pose import (
     confirm_pose,
     with_belief,
 )
-from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, SEARCH_RADIUS, Fix, View
+from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, Fix, View
 from terrafix.anchor.matching.match_message import mode_match, pose_match
 from terrafix.anchor.matching.patch_matcher import MAX_PATCHES
-from terrafix.anchor.matching.pnp import INLIER_THRESHOLD, solve
 from terrafix.anchor.matching.point_mass_filter import Mode, belief_cell_m
-from terrafix.core.geodesy import rot_from_quat
+from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.limits import MIN_MATCHING_AGL_M
+from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, solve
 from terrafix.core.pose import log_so3
-from terrafix.messages import GroundPlane, MapMatch, MatchPlace, Prediction, Verdict
+from terrafix.messages import GroundPlane, MapMatch, MatchPlace, PnpInput, Prediction, Verdict
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import MAP_SEES_TOPS, MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens, footprint_m
@@ -97,8 +97,15 @@ class MapMatches:
         xy, points = self._patches(shot, good)
         weights = np.exp(self._rng.normal(*WEIGHT, len(xy)))
         gsd_share = FIX_GSD_PER_AGL["gradient"]
-        pnp = solve(points, xy, weights, view.r_w_c, view.agl_m, 0.3 * gsd_share, INLIER_THRESHOLD, SEARCH_RADIUS)
-        return Fix(xy, points, weights, pnp, gsd_share * view.agl_m)
+        given = PnpInput(
+            q_w_c=quat_from_rot(view.r_w_c),
+            agl_m=view.agl_m,
+            sigma_floor=0.3 * gsd_share,
+            threshold=INLIER_THRESHOLD,
+            search_radius=SEARCH_RADIUS,
+            min_inliers=MIN_INLIERS,
+        )
+        return Fix(xy, points, weights, solve(points, xy, weights, given), gsd_share * view.agl_m, given)
 
     def _patches(self, shot: Shot, good: float) -> tuple[np.ndarray, np.ndarray]:
         """2D-3D matches: normalised (N, 2) and world points (N, 3), as the map and its elevation have them."""

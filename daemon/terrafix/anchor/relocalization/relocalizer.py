@@ -95,6 +95,7 @@ class Relocalizer:
             match,
             verdict=Verdict.LOST,
             matches=[],
+            pnp=None,
             pose=None,
             inliers=0,
             search=SearchResult(
