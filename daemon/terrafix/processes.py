@@ -41,6 +41,7 @@ ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.HintVerdict,
     m.InitialPosition,
     m.NavEstimate,
+    m.PoseSolution,
     m.CalibrationFault,
     m.CalibrationEstimate,
     m.ClaimBudget,
@@ -118,6 +119,7 @@ PROCESSES: tuple[Process, ...] = (
         (
             m.Prediction,
             m.NavEstimate,
+            m.PoseSolution,
             m.CalibrationFault,
             m.CalibrationEstimate,
             m.ClaimBudget,
