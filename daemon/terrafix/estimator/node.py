@@ -139,7 +139,7 @@ class EstimatorNode:
         self._axes = LocalFrame(origin.lat_deg, origin.lon_deg)
         self._time_offset, self._predicted_id = TimeOffset(), None  # of another camera, in other axes
         prior = self._prior(origin, self._axes)
-        self._estimator = self._make_estimator(with_initial_position(origin, self._initial), prior)
+        self._begin(with_initial_position(origin, self._initial), prior)
         waiting, self._early_dead_reckoning = self._early_dead_reckoning, []
         for sample in waiting:
             yield from self._on_dead_reckoning(sample)
@@ -162,7 +162,12 @@ class EstimatorNode:
         assert self._origin is not None and self._axes is not None and self._initial is not None
         self._initial_pending, self._predicted_id, self._first_frame_id = False, None, frame_id
         prior = NavPrior.at_initial_position(self._initial, self._axes, (t_ns if stands else self._initial.t_ns) * 1e-9)
-        self._estimator = self._make_estimator(with_initial_position(self._origin, self._initial), prior)
+        return self._begin(with_initial_position(self._origin, self._initial), prior)
+
+    def _begin(self, origin: Origin, prior: NavPrior | None) -> Estimator:
+        """-> a new estimator, in the present covariance mode."""
+        self._estimator = self._make_estimator(origin, prior)
+        self._estimator.state.covariances.set_mode(self._mode)
         return self._estimator
 
     def _prior(self, origin: Origin, axes: LocalFrame) -> NavPrior | None:
@@ -186,6 +191,8 @@ class EstimatorNode:
     def _on_health(self, health: Health) -> Iterable[Message]:
         cool = health.band is ThermalBand.NORMAL
         self._mode = CovarianceMode.MARGINALS if cool else CovarianceMode.JACOBIAN
+        if self._estimator is not None:
+            self._estimator.state.covariances.set_mode(self._mode)
         return ()
 
     def _on_dead_reckoning(self, sample: EkfDeadReckoning) -> Iterable[Message]:
@@ -280,7 +287,6 @@ class EstimatorNode:
         attitude = self._attitude = self._ahrs.attitude_at(odometry.t_ns, *sigmas_rad)
         if self._initial_pending:
             estimator = self._apply_initial_position(odometry.frame_id, odometry.t_ns, stands=attitude.stands)
-        estimator.state.mode = self._mode
         imu = self._ahrs.world_acceleration
         return estimator, FrameInput(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, imu)
 
@@ -335,7 +341,6 @@ class EstimatorNode:
 
     def _estimate(self, estimator: Estimator, frame: FrameState, budget: Claim, t_ns: int) -> NavEstimate:
         assert self._axes is not None
-        estimator.state.mode = self._mode
         return estimate_of(estimator, frame, self._axes, budget, t_ns, tracked=self._tracked)
 
     # --- map matches ---------------------------------------------------------------------------------------------
@@ -347,7 +352,6 @@ class EstimatorNode:
         if match.frame_id < self._first_frame_id:  # of ground and belief before the InitialPosition
             yield verdict_of(match.t_ns, match.frame_id, FusionVerdict("map", Verdict.STALE))
             return
-        estimator.state.mode = self._mode
         was_multimodal = estimator.hypotheses.is_multimodal
         result = estimator.feed_map_match(match)
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))

@@ -28,6 +28,7 @@ from terrafix.estimator.measurements.height import (
 )
 from terrafix.estimator.measurements.odometry import KeyframeMotion, OdometryMeasurement, Sighting
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.models.bias_walk import walk_sigmas
 from terrafix.estimator.models.motion_model import (
     STATIONARY_M,
     MotionIncrement,
@@ -50,7 +51,7 @@ from terrafix.estimator.state import (
     WORLD_POSITION,
     NodeState,
 )
-from terrafix.messages import CovarianceMode, Verdict
+from terrafix.messages import Verdict
 
 STEP_SHARE = 0.04  # of a step: error of odometry over real ground, for the point mass filter of the anchor [tuned]
 STEP_FLOOR_M = 0.5  # [tuned]
@@ -333,9 +334,6 @@ class Propagation:
         state, frame, p = self._state, step.frame, step.p_m
         assert step.motion is not None
         dt_s = state.graph.since_newest_s(frame.t_s)
-        if state.mode is CovarianceMode.JACOBIAN:
-            state.cov_of[state.graph.next_node] = _compose_cov(state.cov_of[step.parent], step.motion)
-        state.motion_of[state.graph.next_node] = step.parent, step.motion.cov
         r_w_c, ground_m = step.pose.rotation().matrix(), state.terrain.elevation_m(p)
         attitude = state.camera.factor(state.graph.next_keys(), frame.attitude, r_w_c, ground_m, dt_s)
         rise_m = state.terrain.rise_sigma_m(float(np.hypot(*step.step_m)))
@@ -347,11 +345,11 @@ class Propagation:
         three = None if step.known is None else self._odometry.three_view(frame.odometry, step.known)
         first = NodeState(step.pose, step.before.bias, step.velocity)
         new = NewNode(first, step.parent, step.motion, increment, attitude, rise_m, three)
+        walk, parent = self._walk_sigmas(step), state.graph.state(step.parent)
         node = state.graph.extend(frame.t_s, new)
+        state.covariances.extended(new, parent, walk, step.predicted_cov[DELTA_MOTION, DELTA_MOTION])
         self._continuity_of(step, node)
         state.register_frame(node, frame.frame_id, step.sighting.fragment)
-        state.cov_of = {n: cov for n, cov in state.cov_of.items() if state.graph.holds(n)}
-        state.motion_of = {n: motion for n, motion in state.motion_of.items() if state.graph.holds(n)}
         state.velocity_cov = step.predicted_cov[DELTA_MOTION, DELTA_MOTION]
         step.verdicts += self._fuse_aids(step, node, dt_s)
         state.last = state.frame_state(frame.frame_id, frame.t_s, node)
@@ -361,6 +359,14 @@ class Propagation:
             for aid in self._aids:
                 aid.after_frame(state.last, frame.attitude)
         return self._result(step, state.last)
+
+    def _walk_sigmas(self, step: _Step) -> np.ndarray:
+        """1-sigma (6,) of the change of B since the parent."""
+        state, parent = self._state, self._state.graph.state(step.parent).pose
+        turned = step.pose.rotation().compose(parent.rotation().inverse())
+        rise_m = state.terrain.rise_sigma_m(float(np.hypot(*(step.p_m - parent.translation())[:2])))
+        dt_s = state.graph.since_s(step.parent, step.frame.t_s)
+        return walk_sigmas(dt_s, float(gtsam.Rot3.Logmap(turned)[UP]), rise_m)
 
     @staticmethod
     def _result(step: _Step, placed: FrameState) -> PropagationResult:
@@ -485,9 +491,3 @@ def _reset_verdict(reason: ResetReason, detail: str = "") -> FusionVerdict:
 def _worst_sigma(cov: np.ndarray) -> float:
     """1-sigma along the longest axis of ``cov``."""
     return float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
-
-
-def _compose_cov(cov_parent: np.ndarray, motion: RelativePose) -> np.ndarray:
-    """Covariance (6, 6) of parent * motion, tangent order, first order."""
-    adjoint = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m).inverse().AdjointMap()
-    return adjoint @ cov_parent @ adjoint.T + motion.cov

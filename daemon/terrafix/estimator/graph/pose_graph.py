@@ -15,6 +15,7 @@ from terrafix.estimator.factors.motion import motion_factor
 from terrafix.estimator.factors.noise import robust_noise
 from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
 from terrafix.estimator.factors.three_view import ThreeViewConstraint, three_view_factor
+from terrafix.estimator.graph.elimination import NODE_SIZE
 from terrafix.estimator.graph.fixed_lag import FixedLagSmoother
 from terrafix.estimator.graph.marginalized import MarginalizedHistory
 from terrafix.estimator.models.bias_walk import walk_sigmas
@@ -43,6 +44,20 @@ class GraphPrior:
     attitude: gtsam.CustomFactor | None = None
     gauge_fixed_cov: np.ndarray | None = None
 
+    @property
+    def pose_cov(self) -> np.ndarray:
+        """(6, 6) of the pose, as it enters the graph."""
+        return self.cov if self.gauge_fixed_cov is None else self.gauge_fixed_cov
+
+    @property
+    def node_covariance(self) -> np.ndarray:
+        """(NODE_SIZE, NODE_SIZE), in the order C, B, V."""
+        cov, end = np.zeros((NODE_SIZE, NODE_SIZE)), 0
+        for block in (self.pose_cov, self.bias_cov, self.velocity_cov):
+            begin, end = end, end + len(block)
+            cov[begin:end, begin:end] = block
+        return cov
+
 
 @dataclass(frozen=True)
 class NewNode:
@@ -57,6 +72,14 @@ class NewNode:
     attitude: gtsam.CustomFactor | None
     rise_sigma_m: float = 0.0
     three_view: tuple[int, ThreeViewConstraint] | None = None
+
+
+@dataclass(frozen=True)
+class NodeTies:
+    """Factors by which the newest node was tied to its parent (``odometry``) and to the node before (``motion``)."""
+
+    odometry: gtsam.NonlinearFactor
+    motion: gtsam.NonlinearFactor
 
 
 class GraphObserver:
@@ -80,13 +103,15 @@ class GraphObserver:
 
 
 class PoseGraph:
-    """``rebuilds``: how often the smoother failed and was built anew from the last good estimate."""
+    """``rebuilds``: how often the smoother failed and was built anew from the last good estimate. ``ties``: of the
+    newest node that was added by ``extend``; None: there was none."""
 
     def __init__(self, history: MarginalizedHistory | None = None, observer: GraphObserver | None = None) -> None:
         self._observer = observer or GraphObserver()
         self._history = history or MarginalizedHistory()
         self._last_good = gtsam.Values()  # estimate of the window before the newest nodes were added
         self.rebuilds = 0
+        self.ties: NodeTies | None = None
         self._smoother = FixedLagSmoother()
         self._states: dict[int, NodeState] = {}  # cache, cleared by each update
         self._marginals: dict[int, np.ndarray] = {}  # cache by key, cleared by each update
@@ -132,6 +157,10 @@ class PoseGraph:
         """Marginal of B, (6, 6)."""
         return self._marginal(B(node))
 
+    def joint_covariance(self, node: int) -> np.ndarray:
+        """Joint marginal (NODE_SIZE, NODE_SIZE) of C, B and V of a node in the window."""
+        return self._smoother.joint_marginal(node)
+
     def _marginal(self, key: int) -> np.ndarray:
         if key not in self._marginals:
             self._marginals[key] = self._smoother.marginal(key)
@@ -143,7 +172,11 @@ class PoseGraph:
 
     def since_newest_s(self, t_s: float) -> float:
         """Time from the newest node to ``t_s``, MIN_STEP_S at least."""
-        return max(t_s - self._times[self.newest], MIN_STEP_S)
+        return self.since_s(self.newest, t_s)
+
+    def since_s(self, node: int, t_s: float) -> float:
+        """Time from a node in the window to ``t_s``, MIN_STEP_S at least."""
+        return max(t_s - self._times[node], MIN_STEP_S)
 
     def start(self, t_s: float, prior: GraphPrior) -> int:
         """Begins a new graph with one node. Nodes so far become history, as they were estimated. -> the node."""
@@ -161,7 +194,8 @@ class PoseGraph:
         self._observer.before_node(self)
         node, others = self._next, list[gtsam.NonlinearFactor]()
         odometry = self._odometry_factor(node, new)
-        others.append(self._motion_factor(node, self.newest, new.increment))
+        self.ties = NodeTies(odometry, self._motion_factor(node, self.newest, new.increment))
+        others.append(self.ties.motion)
         others.append(self._walk_factor(node, self.newest, t_s, new))
         if new.attitude is not None:
             others.append(new.attitude)
@@ -271,8 +305,7 @@ class PoseGraph:
         self._history.begin_segment(node)
         self._new_smoother()
         self._times = {node: self._times[node]}
-        pose_cov, bias_cov = np.diag(REBUILD_POSE_SIGMAS**2), np.diag(REBUILD_CALIBRATION_SIGMAS**2)
-        pose_prior, others = _prior_factors(node, GraphPrior(state, pose_cov, bias_cov, unknown_motion_cov()))
+        pose_prior, others = _prior_factors(node, rebuild_prior(state))
         factors = _graph_of([pose_prior, *others])
         self._history.add(factors)
         self._smoother.insert(node, factors, _values(node, state))
@@ -288,6 +321,12 @@ class PoseGraph:
             self._history.marginalize(list(self._times), self._smoother.estimate())
         self._history.begin_segment(self._next)
         self._times.clear()
+
+
+def rebuild_prior(state: NodeState) -> GraphPrior:
+    """Prior of the one node of a graph that was built anew."""
+    pose_cov, bias_cov = np.diag(REBUILD_POSE_SIGMAS**2), np.diag(REBUILD_CALIBRATION_SIGMAS**2)
+    return GraphPrior(state, pose_cov, bias_cov, unknown_motion_cov())
 
 
 def _empty_factor(node: int) -> gtsam.LinearContainerFactor:
@@ -310,8 +349,7 @@ def _graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactor
 def _prior_factors(node: int, prior: GraphPrior) -> tuple[gtsam.NonlinearFactor, list[gtsam.NonlinearFactor]]:
     """-> the prior of the pose, and all others of the first node of a graph."""
     gaussian = gtsam.noiseModel.Gaussian.Covariance
-    cov = prior.cov if prior.gauge_fixed_cov is None else prior.gauge_fixed_cov
-    pose_prior = gtsam.PriorFactorPose3(C(node), prior.state.pose, gaussian(cov))
+    pose_prior = gtsam.PriorFactorPose3(C(node), prior.state.pose, gaussian(prior.pose_cov))
     others: list[gtsam.NonlinearFactor] = [
         gtsam.PriorFactorVector(B(node), prior.state.bias, gaussian(prior.bias_cov)),
         gtsam.PriorFactorVector(V(node), prior.state.velocity, gaussian(prior.velocity_cov)),

@@ -182,7 +182,7 @@ class OdometryMeasurement:
             return Verdict.STALE
         keyframe = state.graph.state(parent)
         r_w_kf, p = keyframe.pose.rotation().matrix(), keyframe.pose.translation()
-        place_cov = r_w_kf @ state.cov_of[parent][TRANSLATION, TRANSLATION] @ r_w_kf.T
+        place_cov = r_w_kf @ state.covariances.recent_pose(parent)[TRANSLATION, TRANSLATION] @ r_w_kf.T
         height = float(p[UP]) - state.terrain.elevation_m(p)
         if height < MIN_HEIGHT_M:
             return Verdict.TOO_LOW
