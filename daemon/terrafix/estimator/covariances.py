@@ -71,7 +71,7 @@ class Covariances:
             self.measured(node, [] if prior.attitude is None else [prior.attitude])
 
     def extended(self, new: NewNode, parent: NodeState, walk_sigmas: np.ndarray, velocity_cov: np.ndarray) -> None:
-        """The newest node is ``new``. ``parent``: estimate of its parent; ``walk_sigmas`` (6,): 1-sigma of the change
+        """The newest node is ``new``. ``parent``: of its parent, before; ``walk_sigmas`` (6,): 1-sigma of the change
         of B since; ``velocity_cov`` (8, 8): of V, where the motion was seen."""
         window = self._graph.window
         if self._propagated is None:
@@ -89,13 +89,15 @@ class Covariances:
             known = gtsam.noiseModel.Gaussian.Covariance(velocity_cov)
             factors.append(gtsam.PriorFactorVector(V(node), new.state.velocity, known))
         factors += [] if new.attitude is None else [new.attitude]
-        self._propagated.extend(node, new.parent, factors, {node: self._graph.state(node), new.parent: parent})
+        # At the graph's linearization, whose robust weights are those of the estimate: with a stale one it uses less.
+        linear = parent if new.parent not in window else self._graph.linearization(new.parent)
+        self._propagated.extend(node, new.parent, factors, {node: self._graph.linearization(node), new.parent: linear})
         self._propagated.retain(window)
 
     def measured(self, node: int, factors: Iterable[gtsam.NonlinearFactor]) -> None:
         """``factors`` of the variables of ``node`` were added."""
         if self._propagated is not None and not self._restarted():
-            self._propagated.fuse(node, factors, self._graph.state(node))
+            self._propagated.fuse(node, factors, self._graph.linearization(node))
 
     def _restarted(self) -> bool:
         """Whether the graph was built anew since the call before: then it knows the newest node as little as its

@@ -51,7 +51,7 @@ from terrafix.estimator.state import (
     WORLD_POSITION,
     NodeState,
 )
-from terrafix.messages import Verdict
+from terrafix.messages import CovarianceMode, Verdict
 
 STEP_SHARE = 0.04  # of a step: error of odometry over real ground, for the point mass filter of the anchor [tuned]
 STEP_FLOOR_M = 0.5  # [tuned]
@@ -73,6 +73,14 @@ class PropagationResult:
     verdicts: tuple[FusionVerdict, ...] = ()
 
 
+@dataclass(frozen=True)
+class _SeenPosition:
+    """Position by odometry less the predicted one, ``off_m`` (3,), and covariance (3, 3) of the former, world axes."""
+
+    off_m: np.ndarray
+    cov_m2: np.ndarray
+
+
 @dataclass
 class _Step:
     """One frame before it is added to the graph. ``increment``: of the motion model since ``before``, the newest node;
@@ -91,6 +99,7 @@ class _Step:
     parent: int = -1
     motion: RelativePose | None = None
     pose: gtsam.Pose3 = field(default_factory=gtsam.Pose3)  # of the camera, as predicted
+    seen: "_SeenPosition | None" = None
     step_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     step_sigma_m: float = 0.0
 
@@ -270,9 +279,9 @@ class Propagation:
             seen = r_w_c @ known.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T
             self._seen_step(step, known, seen)
             if step.increment is not None:
-                off_m = step.p_m - step.predicted_m
+                step.seen = _SeenPosition(step.p_m - step.predicted_m, seen)
                 step.increment, step.predicted_cov, gained = fuse_odometry_increment(
-                    step.increment, off_m, step.predicted_cov, seen
+                    step.increment, step.seen.off_m, step.predicted_cov, seen
                 )
                 # Otherwise a correct increment would fall in the robust tail of its factor (factors/motion.py).
                 step.velocity = step.velocity + gained
@@ -347,10 +356,10 @@ class Propagation:
         new = NewNode(first, step.parent, step.motion, increment, attitude, rise_m, three)
         walk, parent = self._walk_sigmas(step), state.graph.state(step.parent)
         node = state.graph.extend(frame.t_s, new)
-        state.covariances.extended(new, parent, walk, step.predicted_cov[DELTA_MOTION, DELTA_MOTION])
+        state.velocity_cov = self._velocity_cov(step)
+        state.covariances.extended(new, parent, walk, state.velocity_cov)
         self._continuity_of(step, node)
         state.register_frame(node, frame.frame_id, step.sighting.fragment)
-        state.velocity_cov = step.predicted_cov[DELTA_MOTION, DELTA_MOTION]
         step.verdicts += self._fuse_aids(step, node, dt_s)
         state.last = state.frame_state(frame.frame_id, frame.t_s, node)
         if step.known is not None:
@@ -359,6 +368,18 @@ class Propagation:
             for aid in self._aids:
                 aid.after_frame(state.last, frame.attitude)
         return self._result(step, state.last)
+
+    def _velocity_cov(self, step: _Step) -> np.ndarray:
+        """Covariance (8, 8) of V of the newest node by the motion model and odometry. A motion factor that has less
+        weight in the graph has it here, too."""
+        state, predicted_cov = self._state, step.predicted_cov
+        if state.mode is CovarianceMode.JACOBIAN and step.seen is not None and step.increment is not None:
+            increment = replace(step.increment, cov=step.increment.cov / state.graph.motion_weight)
+            predicted_cov = predict_covariance(increment, state.velocity_cov)
+            _, predicted_cov, _ = fuse_odometry_increment(
+                increment, step.seen.off_m, predicted_cov, step.seen.cov_m2
+            )
+        return predicted_cov[DELTA_MOTION, DELTA_MOTION]
 
     def _walk_sigmas(self, step: _Step) -> np.ndarray:
         """1-sigma (6,) of the change of B since the parent."""

@@ -145,6 +145,21 @@ class PoseGraph:
             self._states[node] = NodeState(orthonormal, bias, velocity)
         return self._states[node]
 
+    def linearization(self, node: int) -> NodeState:
+        """Where the factors of a node in the window are linearised, and robust ones get their weight."""
+        at = self._smoother.linearization_point()
+        return NodeState(at.atPose3(C(node)), at.atVector(B(node)), at.atVector(V(node)))
+
+    @property
+    def motion_weight(self) -> float:
+        """Robust weight of the motion factor of the newest node, at its linearization; 1 where it is not robust."""
+        assert self.ties is not None
+        noise = self.ties.motion.noiseModel()
+        if not isinstance(noise, gtsam.noiseModel.Robust):
+            return 1.0
+        residual = self.ties.motion.unwhitenedError(self._smoother.linearization_point())
+        return float(noise.robust().weight(float(np.linalg.norm(noise.noise().whiten(residual)))))
+
     def covariance(self, node: int) -> np.ndarray:
         """Marginal of C, (6, 6), tangent order, from the smoother."""
         return self._marginal(C(node))
