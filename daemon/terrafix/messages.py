@@ -219,13 +219,25 @@ class Prediction(Message, frozen=True, kw_only=True):
 
 
 class MapPose(msgspec.Struct, frozen=True, kw_only=True):
-    """Camera pose of a map match."""
+    """Camera pose of a map match with its covariance."""
 
     p_c_in_w_m: Vec3
     q_w_c: Quat
     cov: Mat6
     # Position of a mode of the posterior, attitude as predicted: there are no consistent 2D-3D matches.
     position_only: bool = False
+
+
+class PnpInput(msgspec.Struct, frozen=True, kw_only=True):
+    """What PnP takes beside the 2D-3D matches of a frame (core/pnp.py). Normalised image coordinates are shares of the
+    height above ground."""
+
+    q_w_c: Quat  # predicted rotation of the camera
+    agl_m: float  # predicted height above ground
+    sigma_floor: float  # smallest 1-sigma of a match, normalised image coordinates
+    threshold: float  # largest reprojection error of an inlier, normalised image coordinates
+    search_radius: float  # within which each match was searched around its expected place, share of the height
+    min_inliers: int  # fewest inliers of a pose
 
 
 class MatchPlace(msgspec.Struct, frozen=True, kw_only=True):
@@ -274,7 +286,11 @@ class SearchResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapMatch(Message, frozen=True, kw_only=True):
-    """Result of matching a frame to the map: 2D-3D matches, their camera pose, and the posterior over position."""
+    """Result of matching a frame to the map: 2D-3D matches or a camera pose, and the posterior over position.
+
+    With ``pnp`` the estimator computes the pose from all ``matches`` (PoseSolution). Else the matcher has computed it
+    (``pose``), from the whole image, from several frames, or from a mode of the posterior; ``matches`` are then those
+    that agree with it. ``inliers`` and ``reprojection_px`` are of the matcher's own PnP."""
 
     frame_id: int
     verdict: Verdict
@@ -284,6 +300,7 @@ class MapMatch(Message, frozen=True, kw_only=True):
     matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight
     radial_k1: float = 0.0  # radial coefficient by which the matches are undistorted (as in Prediction)
     map_sigma_m: float = 0.0  # error of the map itself, 1-sigma per horizontal axis, common to all matches
+    pnp: PnpInput | None = None
     pose: MapPose | None = None
     place: MatchPlace | None = None
     belief: BeliefSummary | None = None  # None: the frame was not correlated around the believed position
@@ -393,6 +410,29 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     covariance_mode: CovarianceMode
     last_anchor_age_ms: int  # age of the last map fix; -1: none yet
     emitted_at_ns: int  # time of publication; in a replay, the time of the frame
+
+
+class PoseMethod(StrEnum):
+    """Method by which the camera pose of a map match was computed."""
+
+    IPPE = "ippe"  # PnP of near-planar ground
+    SQPNP = "sqpnp"  # PnP of ground with relief
+    MATCHER = "matcher"  # by the matcher: all patches together, a search, or a mode of the posterior
+    NONE = "none"  # there are no matches
+
+
+class PoseSolution(Message, frozen=True, kw_only=True):
+    """Camera pose of a MapMatch as the estimator computes it, before the gate; one for each MapMatch (ON-1).
+
+    ``verdict``: ACCEPTED, that of PnP, or that of a match without a pose."""
+
+    frame_id: int
+    verdict: Verdict
+    method: PoseMethod
+    inliers: int = 0  # 2D-3D matches that agree with the pose
+    residual_px: float | None = None  # RMS of their reprojection errors, pixels of the stored frame; None: no matches
+    covariance_mode: CovarianceMode  # of the estimate with this match
+    pose: MapPose | None = None
 
 
 class CalibrationFault(Message, frozen=True, kw_only=True):
@@ -657,6 +697,7 @@ AnyMessage = (
     | HintVerdict
     | InitialPosition
     | NavEstimate
+    | PoseSolution
     | CalibrationFault
     | CalibrationEstimate
     | ClaimBudget

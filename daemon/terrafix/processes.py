@@ -40,6 +40,7 @@ ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.HintVerdict,
     m.InitialPosition,
     m.NavEstimate,
+    m.PoseSolution,
     m.CalibrationFault,
     m.CalibrationEstimate,
     m.ClaimBudget,
@@ -116,6 +117,7 @@ PROCESSES: tuple[Process, ...] = (
         (
             m.Prediction,
             m.NavEstimate,
+            m.PoseSolution,
             m.CalibrationFault,
             m.CalibrationEstimate,
             m.ClaimBudget,

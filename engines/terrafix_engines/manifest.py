@@ -27,6 +27,7 @@ SECTIONS = {
     "keypoints": ("image", "keypoints"),
     "matcher": ("matcher",),
     "pair": ("image", "pair"),
+    "global": ("image", "vector"),
 }
 DENSE_INPUT, DENSE_OUTPUTS = "input", ("descriptors", "keypoint_logits", "reliability")  # tensors of role "dense"
 
@@ -62,6 +63,9 @@ class ImageInput(Section, frozen=True, kw_only=True):
     colour: Literal["gray", "rgb", "bgr"]
     scale: float = 1 / 255  # factor on grey levels
     multiple: Annotated[int, Meta(ge=1)] = 1  # sides are padded to multiples of this
+    # of each colour, after the scale: (value - mean) / std; empty: none. DINOv2: those of ImageNet
+    mean: list[float] = []
+    std: list[Annotated[float, Meta(gt=0)]] = []
 
 
 class KeypointOutputs(Section, frozen=True, kw_only=True):
@@ -96,13 +100,21 @@ class PairTensors(Section, frozen=True, kw_only=True):
     coordinates: Coordinates = "pixels"
 
 
+class VectorOutput(Section, frozen=True, kw_only=True):
+    """The output of a model with role "global": one vector for an image."""
+
+    output: str  # (1, size); leading axes of length one are ignored
+    size: Annotated[int, Meta(ge=1)]
+    side_px: Annotated[int, Meta(ge=16)]  # side of the square images that it is given; DINOv2: a multiple of 14
+
+
 class Manifest(Section, frozen=True, kw_only=True):
     """``role``: "dense" outputs the maps of XFeat, "keypoints" outputs keypoints, "matcher" matches the keypoints of
-    two images, "pair" takes two images."""
+    two images, "pair" takes two images, "global" makes one vector of an image."""
 
     name: Name
     title: str
-    role: Literal["dense", "keypoints", "matcher", "pair"]
+    role: Literal["dense", "keypoints", "matcher", "pair", "global"]
     file: File
     sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     size_bytes: Annotated[int, Meta(ge=1)]
@@ -116,6 +128,7 @@ class Manifest(Section, frozen=True, kw_only=True):
     keypoints: KeypointOutputs | None = None
     matcher: MatcherTensors | None = None
     pair: PairTensors | None = None
+    vector: VectorOutput | None = None
 
     def tensors(self, names: tuple[str, ...]) -> tuple[Tensor, ...]:
         """Input and output tensors by name, in this order."""
@@ -226,6 +239,8 @@ def _used_tensors(manifest: Manifest) -> tuple[set[str], set[str]]:
     if matcher := manifest.matcher:
         used_in |= {*matcher.keypoints, *matcher.descriptors}
         used_out |= {matcher.matches, matcher.scores}
+    if manifest.vector:
+        used_out |= {manifest.vector.output}
     if pair := manifest.pair:
         used_in |= {pair.second}
         used_out |= {*pair.keypoints, pair.scores}
@@ -233,10 +248,13 @@ def _used_tensors(manifest: Manifest) -> tuple[set[str], set[str]]:
 
 
 def _find_image_inconsistency(manifest: Manifest) -> str:
-    """First inconsistency of the shapes of the image inputs, or ""."""
+    """First inconsistency of the image inputs, or ""."""
     image, pair = manifest.image, manifest.pair
     if image and not _has_image_shape(manifest):
         return f'the shape of \'{image.input}\' must end with "height", "width", or with two numbers'
+    colours = 1 if image and image.colour == "gray" else 3
+    if image and any(len(values) not in (0, colours) for values in (image.mean, image.std)):
+        return f"`mean` and `std` of the image must have {colours} numbers, or be left out"
     if image and pair and _shape(manifest, pair.second) != _shape(manifest, image.input):
         return f"'{pair.second}' must have the shape of '{image.input}'"
     return ""

@@ -16,6 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("estimator", "anchor", "link")
+SHARED = ("core/pnp.py",)  # what several of them use
 TAG = re.compile(r"\[(?:(measured|spec): [^\]]+|(tuned))\]$")
 CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*$")
 
@@ -30,8 +31,10 @@ class Constant:
 
 
 def constants() -> list[Constant]:
-    """All constants of ``FOLDERS``, in the order of files and lines."""
-    files = [path for folder in FOLDERS for path in sorted((ROOT / "daemon" / "terrafix" / folder).rglob("*.py"))]
+    """All constants of ``FOLDERS`` and ``SHARED``, in the order of files and lines."""
+    terrafix = ROOT / "daemon" / "terrafix"
+    files = [path for folder in FOLDERS for path in sorted((terrafix / folder).rglob("*.py"))]
+    files += [terrafix / name for name in SHARED]
     return [constant for path in files for constant in _of(path)]
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import msgspec
 
+from terrafix.core.pnp import solved
 from terrafix.messages import GroundPlane, MapMatch, MapPose, SearchResult, Vec3
 
 
@@ -19,8 +20,10 @@ def with_search(match: MapMatch, **fields: Any) -> MapMatch:
 
 
 def pose_of(match: MapMatch) -> MapPose:
-    assert match.pose is not None
-    return match.pose
+    """The pose of the matcher, or that of PnP."""
+    pose = solved(match).pose
+    assert pose is not None
+    return pose
 
 
 def position_of(match: MapMatch) -> Vec3:

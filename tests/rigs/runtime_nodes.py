@@ -89,6 +89,8 @@ class Worker(SilentNode):
         if isinstance(message, m.Frame):
             self._maybe_trouble(message.frame_id)
             image = self._ctx.frames.get(message.frame_id)
+            if message.frame_id == 0:
+                yield m.SearchState(t_ns=message.t_ns, step=m.SearchStep.WIDEN)  # a message that the shell logs
             pixels_correct = image is not None and np.array_equal(image, image_of(message.frame_id))
             verdict = m.Verdict.ACCEPTED if pixels_correct and self._origin is not None else m.Verdict.BAD_IMAGE
             yield m.MeasurementVerdict(
@@ -157,7 +159,11 @@ TABLE: tuple[Process, ...] = (
     replace(_BASE, name="recorder", subscribes=ALL_MESSAGES, tick_hz=1.0),
     replace(_BASE, name="link", subscribes=(m.Origin,), publishes=(m.LinkStatus,), tick_hz=50.0, stuck_after_s=1.0),
     replace(
-        _BASE, name="estimator", subscribes=(m.Origin, m.Frame), publishes=(m.MeasurementVerdict,), stuck_after_s=0.7
+        _BASE,
+        name="estimator",
+        subscribes=(m.Origin, m.Frame),
+        publishes=(m.MeasurementVerdict, m.SearchState),
+        stuck_after_s=0.7,
     ),
     replace(_BASE, name="vision", publishes=(m.Origin, m.Frame, m.SourceEnded)),
 )

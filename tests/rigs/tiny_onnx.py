@@ -112,6 +112,16 @@ def brightest_of_rows() -> bytes:
     return model(nodes, [tensor(n, a) for n, a in initializers.items()], images, outputs)
 
 
+def mean_colours(cell_px: int) -> bytes:
+    """-> a model of one vector for an image: the mean of each colour of each cell, colour by colour."""
+    cell = [cell_px, cell_px]
+    nodes = [
+        node("AveragePool", ["image"], ["cells"], kernel_shape=cell, strides=cell),
+        node("Flatten", ["cells"], ["vector"], axis=1),
+    ]
+    return model(nodes, [], [value("image", [1, 3, "height", "width"])], [value("vector", [1, "n"])])
+
+
 def constants(inputs: dict[str, tuple[Shape, str]], outputs: dict[str, np.ndarray]) -> bytes:
     """-> a model whose outputs do not depend on its inputs."""
     nodes = [node("Identity", [f"{name}_is"], [name]) for name in outputs]

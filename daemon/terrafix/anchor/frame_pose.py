@@ -61,7 +61,12 @@ def estimate_pose(
     if match.verdict is Verdict.ACCEPTED:
         inliers = match.inliers
     # Single patches with less information than all together may share a bias; the consensus is more precise.
-    if match.verdict is not Verdict.ACCEPTED or ground_sigma_m(match.pose, view.agl_m) > SIGMA_FLOOR * view.agl_m:
+    fit = None if fix is None else fix.pnp.fit
+    if (
+        match.verdict is not Verdict.ACCEPTED
+        or fit is None
+        or ground_sigma_m(fit, view.agl_m) > SIGMA_FLOOR * view.agl_m
+    ):
         consensus = seen.layer.consensus.estimate(seen.image, view_at(view, hypothesis, mode.e_m, mode.n_m))
         joint = match if consensus is None else pose_match(match, consensus, view)
         match = joint if joint.verdict is Verdict.ACCEPTED else match
@@ -94,18 +99,24 @@ def decide(match: MapMatch, pose: PoseResult, belief: Belief, seen: Observation,
     if not pose.attempted:
         return msgspec.structs.replace(match, verdict=Verdict.AMBIGUOUS)
     if match.verdict is Verdict.ACCEPTED:
-        belief.confirm(pose.mode, pose.likelihood_ratio)
-        modes = belief.modes(REPORTED_MODES)
-        assert match.place is not None and match.belief is not None
-        return msgspec.structs.replace(
-            match,
-            verdict=Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS,
-            place=msgspec.structs.replace(match.place, mass=modes[0].mass),
-            belief=msgspec.structs.replace(match.belief, modes=reported_modes(modes)),
-        )
+        return confirm_pose(match, pose.mode, pose.likelihood_ratio, belief)
     if pose.mode.mass < MODE_MASS:
         return msgspec.structs.replace(match, verdict=Verdict.AMBIGUOUS)
     if score < COARSE_SCORE:
         return match
     scale = seen.correlation.scale_at(pose.mode.e_m, pose.mode.n_m)
     return mode_match(match, pose.mode, belief.cell_m, seen.view, scale)
+
+
+def confirm_pose(match: MapMatch, mode: Mode, likelihood_ratio: float, belief: Belief) -> MapMatch:
+    """``match`` with an accepted pose at ``mode``, after the belief has been updated with it; AMBIGUOUS unless one mode
+    holds ``MODE_MASS`` of the belief then."""
+    belief.confirm(mode, likelihood_ratio)
+    modes = belief.modes(REPORTED_MODES)
+    assert match.place is not None and match.belief is not None
+    return msgspec.structs.replace(
+        match,
+        verdict=Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS,
+        place=msgspec.structs.replace(match.place, mass=modes[0].mass),
+        belief=msgspec.structs.replace(match.belief, modes=reported_modes(modes)),
+    )

@@ -29,6 +29,7 @@ from terrafix.anchor.matching.predicted_view import (
     tilt_sigma_rad,
     view_of,
 )
+from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.anchor.relocalization.hypothesis_tracker import NEIGHBOUR_RADIUS
 from terrafix.anchor.relocalization.position_prior import distance_outside_m
 from terrafix.anchor.relocalization.relocalizer import Relocalizer, mixed_sigma_m, search_centre
@@ -77,13 +78,20 @@ class Localizer:
     """State of the localization in one flight. Per frame: ``predict``, ``apply_prior`` if there is one, ``localize``,
     ``label_step``.
 
-    ``ce90_m``: accuracy of map layers that state none; ``store_folder``: folder in memory for computed descriptors.
+    ``ce90_m``: accuracy of map layers that state none; ``store_folder``: folder in memory for computed descriptors;
+    ``places``: place index for the search of a large map.
     """
 
     def __init__(
-        self, package: MapPackage | None, describer: Describer, ce90_m: float, store_folder: Path | None = None
+        self,
+        package: MapPackage | None,
+        describer: Describer,
+        ce90_m: float,
+        store_folder: Path | None = None,
+        places: PlaceMemory | None = None,
     ) -> None:
         self._package = package
+        self._places = places
         self._describer = describer
         self._ce90_m = ce90_m
         self._store_folder = store_folder
@@ -119,7 +127,9 @@ class Localizer:
     def _open_layers(self, origin: Origin) -> None:
         if self._package is not None:
             frame, camera = LocalFrame(origin.lat_deg, origin.lon_deg), CameraCalibration.of(origin.camera)
-            self._layers = MapLayers(self._package, frame, camera, self._describer, self._ce90_m, self._store_folder)
+            self._layers = MapLayers(
+                self._package, frame, camera, self._describer, self._ce90_m, self._store_folder, self._places
+            )
 
     def replace_describer(self, describer: Describer, agl_m: float) -> None:
         """Continues with another describer. The belief is kept; a running search restarts."""

@@ -7,9 +7,10 @@ from terrafix.anchor.initial_position import check_initial_position
 from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.model_monitor import ModelMonitor
+from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.anchor.thermal_load import ThermalLoad
 from terrafix.core.config import HealthSection
-from terrafix.core.errors import ModelError
+from terrafix.core.errors import ModelError, TerrafixError
 from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.map.package import MapPackage
@@ -42,15 +43,17 @@ class AnchorNode:
         model: ModelMonitor | None = None,
         cache_dir: Path | None = None,
         load: ThermalLoad | None = None,
+        places: PlaceMemory | None = None,
     ) -> None:
         """``ce90_m``: accuracy of map layers that state none; ``cache_dir``: folder in memory for computed
-        descriptors of the map; ``load``: by thermal band; None: as the default configuration."""
+        descriptors of the map; ``load``: by thermal band; None: as the default configuration; ``places``:
+        place index for the search of a large map."""
         self._frames = frames
         self._package = package
         self._describer = describer  # as configured
         self._model = model or ModelMonitor(describer)
         self._load, self._model_suspended = load or ThermalLoad(HealthSection()), False
-        self._localizer = Localizer(package, describer, ce90_m, cache_dir)
+        self._localizer = Localizer(package, describer, ce90_m, cache_dir, places)
         self._origin: Origin | None = None
         self._hint: PositionHint | None = None  # not yet applied
         self._initial: InitialPosition | None = None  # result of the newest GnssInitialPosition
@@ -128,8 +131,8 @@ class AnchorNode:
 
 
 def make_node(ctx: NodeContext) -> AnchorNode:
-    """Opens the map and the model before take-off. Raises ConfigError, MapError, ModelError. After a restart in flight
-    a model that cannot be opened is replaced by the describer without weights."""
+    """Opens the map and the model before take-off. Raises ConfigError, MapError, ModelError, UsageError. After a
+    restart in flight a model that cannot be opened is replaced by the describer without weights."""
     wanted = ctx.config.map
     trusted = trusted_keys(wanted.trusted_keys, required=wanted.require_signature)
     package = MapPackage.open(ctx.map_path, trusted=trusted) if ctx.map_path is not None else None
@@ -142,6 +145,17 @@ def make_node(ctx: NodeContext) -> AnchorNode:
             raise ModelError(str(error)) from None
         describer, not_opened = GradientDescriber(), str(error)
     model = ModelMonitor(describer, not_opened)
-    return AnchorNode(
-        ctx.frames, package, describer, wanted.ce90_m, model, ctx.cache_dir, ThermalLoad(ctx.config.health)
-    )
+    load, places = ThermalLoad(ctx.config.health), _open_places(ctx)
+    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, model, ctx.cache_dir, load, places)
+
+
+def _open_places(ctx: NodeContext) -> PlaceMemory | None:
+    """The configured place index. A restart in flight compares no checksum, which would read the whole index, and flies
+    without an index that cannot be opened. Raises MapError, ModelError, UsageError before take-off."""
+    restarted = ctx.epoch_ns is not None
+    try:
+        return PlaceMemory.open(ctx.config.places, ctx.config.models.folder, verify=not restarted)
+    except TerrafixError:
+        if not restarted:
+            raise
+        return None

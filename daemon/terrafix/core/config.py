@@ -17,6 +17,7 @@ from terrafix.core.errors import ConfigError
 Positive = Annotated[float, Meta(gt=0)]
 OutputName = Literal["gps_input", "odometry", "vision_position", "external_position", "global_position"]
 GnssMode = Literal["off", "advise", "act"]
+PlaceSearch = Literal["auto", "exact", "faiss"]
 Baud = Annotated[int, Meta(ge=9600, le=3_000_000)]
 
 
@@ -34,6 +35,11 @@ class Map(Section, frozen=True, kw_only=True):
 class Models(Section, frozen=True, kw_only=True):
     xfeat: str = ""  # name of a fetched model, or path of an ONNX file; empty: matching without a learned model
     folder: str = ""  # folder of fetched models; empty: TERRAFIX_MODELS, or the user's data folder
+
+
+class Places(Section, frozen=True, kw_only=True):
+    index: str = ""  # folder of a place index (`terrafix map index`); empty: the whole map is correlated
+    search: PlaceSearch = "auto"  # auto: exact up to 200 000 vectors, FAISS beyond
 
 
 class LinkSection(Section, frozen=True, kw_only=True):
@@ -88,6 +94,7 @@ class LogSection(Section, frozen=True, kw_only=True):
 class Config(Section, frozen=True, kw_only=True):
     map: Map = Map()
     models: Models = Models()
+    places: Places = Places()
     source: Source = Source()
     link: LinkSection = LinkSection()
     recorder: RecorderSection = RecorderSection()

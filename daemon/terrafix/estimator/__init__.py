@@ -3,6 +3,7 @@
 from terrafix.estimator.pose_estimator import (
     CovarianceDegradedWarning,
     MatchResult,
+    OpenCVGtsamPoseEstimator,
     PnpFailureError,
     PoseEstimate,
     PoseEstimator,
@@ -14,6 +15,7 @@ __all__ = [
     "CovarianceDegradedWarning",
     "CovarianceMode",
     "MatchResult",
+    "OpenCVGtsamPoseEstimator",
     "PnpFailureError",
     "PoseEstimate",
     "PoseEstimator",

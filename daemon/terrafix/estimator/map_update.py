@@ -88,10 +88,10 @@ class MapUpdate:
             self._map_hit_rate.update(state.fragments.of(node), found=False)
         if match.verdict is not Verdict.ACCEPTED:
             return _result(match.verdict, f"{match.inliers} inliers" if match.verdict in NOTHING_FOUND else "")
-        if not determined(match):
-            return _result(Verdict.DEGENERATE, "2D-3D matches do not determine the pose")
         if node is None:
             return _result(Verdict.STALE, "frame has left the window")
+        if not determined(match):
+            return _result(Verdict.DEGENERATE, "2D-3D matches do not determine the pose")
         measurement = MapPoseMeasurement.of(match, state.terrain, state.radial_k1_estimate)
         if match.search.relocalized:  # by a search over several frames: it outweighs whatever the graph has
             self.hypotheses.other, self.hypotheses.map_consistency = AlternativePosition(), MapConsistency()

@@ -7,11 +7,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
 from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
-from terrafix.estimator.claim import Claim, claim
+from terrafix.estimator.claim import Claim
+from terrafix.estimator.edge import EstimatorEdge
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameInput, FrameState
 from terrafix.estimator.initialization import ResetReason
@@ -29,7 +31,14 @@ from terrafix.estimator.output import (
     refinement_of,
     verdict_of,
 )
-from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, NavPrior, load_checkpoint
+from terrafix.estimator.pose_estimator import (
+    EstimatedFlight,
+    OpenCVGtsamPoseEstimator,
+    PnpFailureError,
+    PoseEstimator,
+    covariance_mode,
+)
+from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpoint
 from terrafix.estimator.propagation import PropagationResult
 from terrafix.estimator.state import UP
 from terrafix.messages import (
@@ -53,6 +62,10 @@ from terrafix.messages import (
 
 CALIBRATION_EVERY_NS = 1_000_000_000  # between two CalibrationEstimate [spec: 1 Hz]
 TELEMETRY_WAIT_NS = 1_000_000_000  # the autopilot's heartbeat comes once a second [spec: MAVLink heartbeat]
+# Until the first Health
+COOL = Health(
+    t_ns=0, band=ThermalBand.NORMAL, temperature_c=None, throttled=False, disk_free_mb=None, cause="no reading yet"
+)
 BEFORE_TELEMETRY = "older than the autopilot's first messages after the restart"
 
 MakeEstimator = Callable[[Origin, NavPrior | None], Estimator]
@@ -77,6 +90,8 @@ class EstimatorNode:
         self._first_frame_id = 0  # of the flight from the newest InitialPosition
         self._estimator: Estimator | None = None
         self._axes: LocalFrame | None = None
+        self._flight: EstimatedFlight | None = None  # of the newest estimator ...
+        self._poses: PoseEstimator | None = None  # ... and what adds map matches to it
         self._telemetry = Telemetry()
         sent_ns = None if checkpoint is None else checkpoint.estimate.t_ns
         self._ahrs = AhrsCorrectionMonitor(self._telemetry, sent_ns)
@@ -84,12 +99,11 @@ class EstimatorNode:
         self._early_dead_reckoning: list[
             EkfDeadReckoning
         ] = []  # before the Origin: the link may run before vision does
-        self._mode = CovarianceMode.MARGINALS
+        self._thermal = COOL
         self._tracked = True  # the newest frame has odometry or a map match
         self._calibration_ns = 0  # of the newest CalibrationEstimate
         self._first_ns: int | None = None  # time of the first frame or telemetry
         self._waiting: list[Odometry] = []  # for telemetry, to which the calibration of the checkpoint refers
-        self._time_offset = TimeOffset()
         self._stamp_ns: int | None = None  # of the newest frame, by the camera
         self._predicted_id: int | None = None  # frame of the newest Prediction ...
         self._predicted_m = np.zeros(2)  # ... its position, after its map match,
@@ -119,9 +133,14 @@ class EstimatorNode:
         return self._estimator
 
     @property
+    def pose_estimator(self) -> PoseEstimator | None:
+        """What adds map matches to the graph of the flight, for callers without messages; None before the Origin."""
+        return None if self._flight is None else OpenCVGtsamPoseEstimator(self._flight)
+
+    @property
     def mode(self) -> CovarianceMode:
         """Covariance mode of the next estimate, by the thermal band."""
-        return self._mode
+        return covariance_mode(self._thermal)
 
     def on(self, message: Message) -> Iterable[Message]:
         handler = self._handlers.get(type(message))
@@ -137,9 +156,9 @@ class EstimatorNode:
             return
         self._origin, self._monitors = origin, Monitors(origin)
         self._axes = LocalFrame(origin.lat_deg, origin.lon_deg)
-        self._time_offset, self._predicted_id = TimeOffset(), None  # of another camera, in other axes
+        self._predicted_id = None  # in other axes
         prior = self._prior(origin, self._axes)
-        self._begin(with_initial_position(origin, self._initial), prior)
+        self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior), TimeOffset())
         waiting, self._early_dead_reckoning = self._early_dead_reckoning, []
         for sample in waiting:
             yield from self._on_dead_reckoning(sample)
@@ -162,13 +181,18 @@ class EstimatorNode:
         assert self._origin is not None and self._axes is not None and self._initial is not None
         self._initial_pending, self._predicted_id, self._first_frame_id = False, None, frame_id
         prior = NavPrior.at_initial_position(self._initial, self._axes, (t_ns if stands else self._initial.t_ns) * 1e-9)
-        return self._begin(with_initial_position(self._origin, self._initial), prior)
+        assert self._flight is not None
+        estimator = self._make_estimator(with_initial_position(self._origin, self._initial), prior)
+        return self._begin(estimator, self._flight.time_offset)
 
-    def _begin(self, origin: Origin, prior: NavPrior | None) -> Estimator:
-        """-> a new estimator, in the present covariance mode."""
-        self._estimator = self._make_estimator(origin, prior)
-        self._estimator.state.covariances.set_mode(self._mode)
-        return self._estimator
+    def _begin(self, estimator: Estimator, time_offset: TimeOffset) -> Estimator:
+        """``time_offset``: of the camera, so far."""
+        assert self._axes is not None and self._monitors is not None
+        self._estimator = estimator
+        self._flight = EstimatedFlight(estimator, self._axes, time_offset, self._monitors, self._telemetry)
+        # Without a warning for each estimate: Health and NavEstimate state the mode.
+        self._poses = OpenCVGtsamPoseEstimator(self._flight, warn=lambda _: None)
+        return estimator
 
     def _prior(self, origin: Origin, axes: LocalFrame) -> NavPrior | None:
         if self._began_ns is None:
@@ -189,10 +213,7 @@ class EstimatorNode:
         return ()
 
     def _on_health(self, health: Health) -> Iterable[Message]:
-        cool = health.band is ThermalBand.NORMAL
-        self._mode = CovarianceMode.MARGINALS if cool else CovarianceMode.JACOBIAN
-        if self._estimator is not None:
-            self._estimator.state.covariances.set_mode(self._mode)
+        self._thermal = health
         return ()
 
     def _on_dead_reckoning(self, sample: EkfDeadReckoning) -> Iterable[Message]:
@@ -208,7 +229,7 @@ class EstimatorNode:
             DeadReckoning.of(sample, axes), self._attitude, self._ahrs.world_acceleration
         )
         if placed and estimator.last is not None:
-            yield self._estimate(estimator, estimator.last, self._claim(estimator, estimator.last), sample.t_ns)
+            yield self._estimate(estimator, estimator.last, self._claim(estimator.last), sample.t_ns)
 
     # --- frames --------------------------------------------------------------------------------------------------
 
@@ -237,17 +258,17 @@ class EstimatorNode:
             yield from self._frame(odometry)
 
     def _frame(self, odometry: Odometry) -> Iterable[Message]:
-        if self._estimator is None:
+        if self._estimator is None or self._flight is None:
             return
-        stamp_ns = odometry.t_ns
+        stamp_ns, time_offset = odometry.t_ns, self._flight.time_offset
         before_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
-        odometry = self._in_telemetry_time(odometry)
+        odometry = self._in_telemetry_time(odometry, time_offset)
         estimator, frame = self._frame_input(self._estimator, odometry)
         follows = self._note_predicted_frame(estimator)
         result = estimator.feed_frame(frame)
         self._tracked = result.verdict is Verdict.ACCEPTED
         if result.turn is not None:
-            self._time_offset.add(replace(result.turn, t0_ns=before_ns, t1_ns=stamp_ns), self._telemetry)
+            time_offset.add(replace(result.turn, t0_ns=before_ns, t1_ns=stamp_ns), self._telemetry)
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
         yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict) for verdict in verdicts)
         no_new_view = Verdict.STALLED in (odometry.verdict, result.verdict) or odometry.verdict is Verdict.BAD_IMAGE
@@ -262,7 +283,7 @@ class EstimatorNode:
             agl_m = float(p[UP]) - estimator.terrain.elevation_m(p)
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m)
             yield from self._monitors.take_changes(odometry.t_ns)
-        budget = self._claim(estimator, result.placed)
+        budget = self._claim(result.placed)
         if slow_due:
             yield ClaimBudget(t_ns=odometry.t_ns, frame_id=odometry.frame_id, terms_m2=budget.terms_m2)
         estimate = self._estimate(estimator, result.placed, budget, odometry.t_ns)
@@ -270,15 +291,15 @@ class EstimatorNode:
             self._ahrs.position_published(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
 
-    def _in_telemetry_time(self, odometry: Odometry) -> Odometry:
+    def _in_telemetry_time(self, odometry: Odometry, time_offset: TimeOffset) -> Odometry:
         """``odometry``, with the estimated time offset of the camera taken from its time."""
         stamp_ns = odometry.t_ns
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         before_ns, self._stamp_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns, stamp_ns
-        self._time_offset.step((stamp_ns - before_ns) * 1e-9)
-        if not self._time_offset.applied_s:
+        time_offset.step((stamp_ns - before_ns) * 1e-9)
+        if not time_offset.applied_s:
             return odometry
-        return msgspec.structs.replace(odometry, t_ns=stamp_ns - round(self._time_offset.applied_s * 1e9))
+        return msgspec.structs.replace(odometry, t_ns=stamp_ns - round(time_offset.applied_s * 1e9))
 
     def _frame_input(self, estimator: Estimator, odometry: Odometry) -> tuple[Estimator, FrameInput]:
         """-> the estimator, a new one if an InitialPosition is pending, and what it takes of the frame."""
@@ -287,6 +308,7 @@ class EstimatorNode:
         attitude = self._attitude = self._ahrs.attitude_at(odometry.t_ns, *sigmas_rad)
         if self._initial_pending:
             estimator = self._apply_initial_position(odometry.frame_id, odometry.t_ns, stands=attitude.stands)
+        estimator.state.covariances.set_mode(self.mode)
         imu = self._ahrs.world_acceleration
         return estimator, FrameInput(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, imu)
 
@@ -329,15 +351,15 @@ class EstimatorNode:
     def _is_slow_due(self, frame: FrameState, estimator: Estimator) -> bool:
         """Whether CalibrationEstimate and ClaimBudget are published with this frame: once a second, not before a map
         match (they are the prior until then), and only in the normal thermal band."""
-        t_ns, hot = round(frame.t_s * 1e9), self._mode is CovarianceMode.JACOBIAN
+        t_ns, hot = round(frame.t_s * 1e9), self.mode is CovarianceMode.JACOBIAN
         if hot or estimator.last_fix_s is None or t_ns - self._calibration_ns < CALIBRATION_EVERY_NS:
             return False
         self._calibration_ns = t_ns
         return True
 
-    def _claim(self, estimator: Estimator, frame: FrameState) -> Claim:
-        sigma_m = 0.0 if self._monitors is None else self._monitors.sigma_m
-        return claim(estimator, frame, self._time_offset.sigma_s, sigma_m)
+    def _claim(self, frame: FrameState) -> Claim:
+        assert self._flight is not None
+        return self._flight.claim(frame)
 
     def _estimate(self, estimator: Estimator, frame: FrameState, budget: Claim, t_ns: int) -> NavEstimate:
         assert self._axes is not None
@@ -346,25 +368,29 @@ class EstimatorNode:
     # --- map matches ---------------------------------------------------------------------------------------------
 
     def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
-        estimator = self._estimator
-        if estimator is None:
+        estimator, poses = self._estimator, self._poses
+        if estimator is None or poses is None:
             return
         if match.frame_id < self._first_frame_id:  # of ground and belief before the InitialPosition
             yield verdict_of(match.t_ns, match.frame_id, FusionVerdict("map", Verdict.STALE))
             return
         was_multimodal = estimator.hypotheses.is_multimodal
-        result = estimator.feed_map_match(match)
+        try:
+            outcome = poses.estimate(match, CameraCalibration.of(estimator.origin.camera), self._thermal).outcome
+        except PnpFailureError as failure:
+            outcome = failure.outcome
+        result = outcome.result
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
         yield from (verdict_of(match.t_ns, match.frame_id, verdict) for verdict in verdicts)
+        yield outcome.solution
         accepted = result.verdict is Verdict.ACCEPTED
         if self._monitors is not None:
-            self._monitors.on_map_match(match, self._telemetry, accepted=accepted)
             yield from self._monitors.take_changes(match.t_ns)
         changed = accepted or was_multimodal or estimator.hypotheses.is_multimodal or result.verdict is Verdict.LOST
         if changed and estimator.last is not None:
             own = match.frame_id == estimator.last.frame_id  # a match of an older frame does not see this one's motion
             self._tracked = self._tracked or (own and accepted)
-            yield self._estimate(estimator, estimator.last, self._claim(estimator, estimator.last), match.t_ns)
+            yield self._estimate(estimator, estimator.last, self._claim(estimator.last), match.t_ns)
 
     def _on_source_ended(self, ended: SourceEnded) -> Iterable[Message]:
         if self._estimator is None or self._axes is None:
@@ -376,5 +402,5 @@ def make_node(ctx: NodeContext) -> EstimatorNode:
     return EstimatorNode(ctx.epoch_ns, load_checkpoint(ctx.checkpoint))
 
 
-def make_edge(ctx: NodeContext) -> Edge | None:
-    return None if ctx.checkpoint is None else CheckpointWriter(ctx.checkpoint)
+def make_edge(ctx: NodeContext) -> Edge:
+    return EstimatorEdge(OpenCVGtsamPoseEstimator.__name__, ctx.checkpoint)

@@ -1,36 +1,78 @@
-"""The estimator as a function call: a match goes in, a pose comes out. For callers without messages (ON-1).
-
-It drives the node that flies, with the same graph, gates and verdicts. Where the node publishes a rejection, a call
-raises."""
+"""PoseEstimator: a map match becomes a camera pose, a factor of the estimator's graph, and an estimate (ON-1)."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
+import msgspec
 import numpy as np
 
 from terrafix.core.camera import CameraCalibration
-from terrafix.estimator.node import EstimatorNode
+from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
+from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, method_of, solved
+from terrafix.core.pose import project_with_jacobian
+from terrafix.estimator.claim import Claim, claim
+from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.filter_state import FrameState
+from terrafix.estimator.integrity.time_offset import TimeOffset
+from terrafix.estimator.map_update import MapResult
+from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.estimator.monitors.calibration_monitors import Monitors
+from terrafix.estimator.output import estimate_of
+from terrafix.estimator.state import UP
 from terrafix.messages import (
     CovarianceMode,
     Health,
     MapMatch,
-    MeasurementVerdict,
-    NavEstimate,
+    PnpInput,
+    PoseSolution,
     SourceLabel,
+    ThermalBand,
     Verdict,
 )
 
-MatchResult = MapMatch  # 2D-3D matches of a frame, and the camera pose that PnP made of them
+MIN_AGL_M = 1.0  # of the predicted height, so that it stays positive [spec: as in map_update._height_m]
+
+MatchResult = MapMatch  # 2D-3D matches of a frame, or the camera pose that the matcher has computed
 ThermalState = Health
 
 
-class PnpFailureError(Exception):
-    """This match gave no pose: PnP failed, its geometry is degenerate, or the gate rejected it (``verdict``). The
-    estimator continues with odometry."""
+@dataclass
+class EstimatedFlight:
+    """The estimator of a flight and what its estimates are published with. ``axes``: of its local frame;
+    ``time_offset``: of the camera; ``monitors``: of the calibration, against ``telemetry``."""
 
-    def __init__(self, verdict: Verdict, detail: str) -> None:
-        super().__init__(f"{verdict.value}: {detail}" if detail else verdict.value)
-        self.verdict = verdict
+    estimator: Estimator
+    axes: LocalFrame
+    time_offset: TimeOffset
+    monitors: Monitors
+    telemetry: Telemetry
+
+    def claim(self, frame: FrameState) -> Claim:
+        return claim(self.estimator, frame, self.time_offset.sigma_s, self.monitors.sigma_m)
+
+
+@dataclass(frozen=True)
+class MatchOutcome:
+    """What was done with a match: the pose that was computed, and the result of the gate and the graph."""
+
+    solution: PoseSolution
+    result: MapResult
+
+
+class PnpFailureError(Exception):
+    """No estimate by this match: it gave no pose, its geometry is degenerate, or the gate rejected it (``verdict``).
+    The estimator continues with odometry (visual_propagated)."""
+
+    def __init__(self, outcome: MatchOutcome) -> None:
+        fusion = outcome.result.fusion
+        super().__init__(f"{fusion.verdict.value}: {fusion.detail}" if fusion.detail else fusion.verdict.value)
+        self.outcome = outcome
+
+    @property
+    def verdict(self) -> Verdict:
+        return self.outcome.result.verdict
 
 
 class CovarianceDegradedWarning(UserWarning):
@@ -39,6 +81,8 @@ class CovarianceDegradedWarning(UserWarning):
 
 @dataclass(frozen=True)
 class PoseEstimate:
+    """Pose of the frame of the match; of the newest frame, where the match has restarted the graph there."""
+
     frame_id: int
     position_wgs84: tuple[float, float, float]  # latitude, longitude [deg], height above mean sea level [m]
     orientation_world_T_body: tuple[float, float, float, float]
@@ -47,39 +91,126 @@ class PoseEstimate:
     source_label: SourceLabel
     last_satellite_anchor_age_ms: int
     emitted_at: int  # monotonic, ns
+    outcome: MatchOutcome
 
 
-class PoseEstimator:
-    """``node`` has received the Origin and receives the odometry of each frame; this adds matches to its graph."""
-
-    def __init__(self, node: EstimatorNode) -> None:
-        self._node = node
-
+class PoseEstimator(Protocol):
     def current_covariance_mode(self) -> CovarianceMode:
-        return self._node.mode
+        """Of the newest estimate."""
+        ...
 
     def estimate(self, match: MatchResult, camera: CameraCalibration, thermal: ThermalState) -> PoseEstimate:
-        """The newest pose, with ``match`` in the graph. ``thermal`` decides the covariance mode.
+        """The pose of the frame of ``match``, with ``match`` in the graph. ``thermal`` decides the covariance mode.
 
-        ``camera`` must be that of the Origin (ValueError). Raises PnpFailureError; warns with
+        ``camera`` must be that of the flight (ValueError). Raises PnpFailureError; warns with
         CovarianceDegradedWarning."""
-        origin = self._node.origin
-        if origin is None or camera != CameraCalibration.of(origin.camera):
-            raise ValueError("the camera is not the one that Origin named")
-        answers = [*self._node.on(thermal), *self._node.on(match)]
-        verdict = next(a for a in answers if isinstance(a, MeasurementVerdict))
-        estimate = next((a for a in answers if isinstance(a, NavEstimate)), None)
-        if verdict.verdict is not Verdict.ACCEPTED or estimate is None:
-            raise PnpFailureError(verdict.verdict, verdict.detail)
-        if estimate.covariance_mode is CovarianceMode.JACOBIAN:
-            warnings.warn(f"propagated covariance: {thermal.cause}", CovarianceDegradedWarning, stacklevel=2)
-        return PoseEstimate(
-            frame_id=estimate.frame_id,
-            position_wgs84=(estimate.lat_deg, estimate.lon_deg, estimate.alt_amsl_m),
-            orientation_world_T_body=estimate.q_w_b,
-            covariance_6x6=np.array(estimate.cov).reshape(6, 6),
-            covariance_mode=estimate.covariance_mode,
-            source_label=estimate.source_label,
-            last_satellite_anchor_age_ms=estimate.last_anchor_age_ms,
-            emitted_at=estimate.emitted_at_ns,
+        ...
+
+
+class OpenCVGtsamPoseEstimator:
+    """PnP by OpenCV (core/pnp.py), fusion by the GTSAM graph of ``flight``, which receives the frames and their
+    odometry from EstimatorNode."""
+
+    def __init__(
+        self,
+        flight: EstimatedFlight,
+        clock: Callable[[], int] | None = None,
+        warn: Callable[[Warning], object] = warnings.warn,
+    ) -> None:
+        """``clock``: monotonic time [ns] for ``emitted_at``; None: the time of the newest measurement, as in a replay.
+        ``warn``: receives CovarianceDegradedWarning."""
+        self.flight, self._clock, self._warn = flight, clock, warn
+
+    def current_covariance_mode(self) -> CovarianceMode:
+        return self.flight.estimator.state.mode
+
+    def estimate(self, match: MatchResult, camera: CameraCalibration, thermal: ThermalState) -> PoseEstimate:
+        flight, estimator = self.flight, self.flight.estimator
+        if camera != CameraCalibration.of(estimator.origin.camera):
+            raise ValueError("the camera is not the one that Origin named: give CameraCalibration.of(origin.camera)")
+        estimator.state.covariances.set_mode(covariance_mode(thermal))
+        given = self._with_pnp_input(match, camera)
+        found = solved(given)
+        result = estimator.feed_map_match(found)
+        outcome = MatchOutcome(self._solution(given, found, camera, result), result)
+        accepted = result.verdict is Verdict.ACCEPTED
+        flight.monitors.on_map_match(found, flight.telemetry, accepted=accepted)
+        if not accepted:
+            raise PnpFailureError(outcome)
+        if estimator.state.mode is CovarianceMode.JACOBIAN:
+            self._warn(CovarianceDegradedWarning(f"propagated covariance: {thermal.cause}"))
+        return self._estimate(self._frame_of(match), outcome)
+
+    def _with_pnp_input(self, match: MatchResult, camera: CameraCalibration) -> MatchResult:
+        """``match``; where its matcher states neither a pose nor the input of PnP, with that of the graph and of
+        matches that are good to a pixel."""
+        state = self.flight.estimator.state
+        node = state.node_of.get(match.frame_id)
+        if not match.matches or match.pnp or match.pose or node is None or not state.graph.holds(node):
+            return match
+        pose = state.graph.state(node).pose
+        p = pose.translation()
+        given = PnpInput(
+            q_w_c=quat_from_rot(pose.rotation().matrix()),
+            agl_m=max(float(p[UP]) - state.terrain.elevation_m(p), MIN_AGL_M),
+            sigma_floor=1.0 / camera.fx,
+            threshold=INLIER_THRESHOLD,
+            search_radius=SEARCH_RADIUS,
+            min_inliers=MIN_INLIERS,
         )
+        return msgspec.structs.replace(match, pnp=given)
+
+    def _solution(
+        self, given: MatchResult, found: MatchResult, camera: CameraCalibration, result: MapResult
+    ) -> PoseSolution:
+        """``found``: ``given``, solved; ``result``: of ``found``."""
+        degenerate = result.verdict is Verdict.DEGENERATE
+        return PoseSolution(
+            t_ns=found.t_ns,
+            frame_id=found.frame_id,
+            verdict=result.verdict if degenerate else found.verdict,
+            method=method_of(given),
+            inliers=found.inliers,
+            residual_px=None if degenerate else _residual_px(found, camera),
+            covariance_mode=self.current_covariance_mode(),
+            pose=None if degenerate else found.pose,
+        )
+
+    def _frame_of(self, match: MatchResult) -> FrameState:
+        state = self.flight.estimator.state
+        node = state.node_of.get(match.frame_id)
+        assert state.last is not None
+        if node is None or not state.graph.holds(node) or node == state.last.node:
+            return state.last
+        return state.frame_state(match.frame_id, state.graph.time_of(node), node)
+
+    def _estimate(self, frame: FrameState, outcome: MatchOutcome) -> PoseEstimate:
+        flight = self.flight
+        assert flight.estimator.last is not None
+        newest_ns = round(flight.estimator.last.t_s * 1e9)
+        nav = estimate_of(flight.estimator, frame, flight.axes, flight.claim(frame), newest_ns, tracked=True)
+        return PoseEstimate(
+            frame_id=nav.frame_id,
+            position_wgs84=(nav.lat_deg, nav.lon_deg, nav.alt_amsl_m),
+            orientation_world_T_body=nav.q_w_b,
+            covariance_6x6=np.array(nav.cov).reshape(6, 6),
+            covariance_mode=nav.covariance_mode,
+            source_label=nav.source_label,
+            last_satellite_anchor_age_ms=nav.last_anchor_age_ms,
+            emitted_at=nav.emitted_at_ns if self._clock is None else self._clock(),
+            outcome=outcome,
+        )
+
+
+def covariance_mode(thermal: ThermalState) -> CovarianceMode:
+    """JACOBIAN in any thermal band but the normal one (ON-2)."""
+    return CovarianceMode.MARGINALS if thermal.band is ThermalBand.NORMAL else CovarianceMode.JACOBIAN
+
+
+def _residual_px(found: MatchResult, camera: CameraCalibration) -> float | None:
+    """RMS distance of the matches from the projections of their points [px]; None: there is no pose, or no match."""
+    if found.pose is None or not found.matches:
+        return None
+    matches = np.array(found.matches)
+    xy, _, _ = project_with_jacobian(rot_from_quat(found.pose.q_w_c), np.array(found.pose.p_c_in_w_m), matches[:, 2:5])
+    return camera.fx * float(np.sqrt(np.mean(np.sum((matches[:, :2] - xy) ** 2, axis=1))))

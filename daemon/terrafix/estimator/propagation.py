@@ -99,7 +99,7 @@ class _Step:
     parent: int = -1
     motion: RelativePose | None = None
     pose: gtsam.Pose3 = field(default_factory=gtsam.Pose3)  # of the camera, as predicted
-    seen: "_SeenPosition | None" = None
+    seen: _SeenPosition | None = None
     step_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     step_sigma_m: float = 0.0
 

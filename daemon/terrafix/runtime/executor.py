@@ -17,6 +17,7 @@ from terrafix.messages import Dropped, Message, NavEstimate, Origin, PositionHin
 from terrafix.processes import OPERATOR, PROCESSES, SOURCE, SUPERVISOR, Process
 from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.inbox import Inbox
+from terrafix.runtime.message_log import log_message
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
 
@@ -179,13 +180,14 @@ class LiveShell:
         return True
 
     def _publish(self, messages: Iterable[Message]) -> None:
-        """Passes the messages of the node to the edge and to the bus."""
+        """Passes the messages of the node to the edge, to the bus and to the log."""
         for message in messages:
             if isinstance(message, NavEstimate):  # set here because a node has no clock
                 message = msgspec.structs.replace(message, emitted_at_ns=now_ns())
             if self._edge is not None:
                 self._edge.on_message(message)  # before the bus, so that output to the autopilot is not delayed
             self._publisher.publish(message)
+            log_message(message)
 
     def _publish_losses(self) -> None:
         """Publishes Dropped for lost and skipped messages, at most once per DROPPED_PERIOD_NS."""

@@ -17,4 +17,9 @@ def image_tensor(image: np.ndarray, spec: ImageInput, height: int, width: int) -
             planes = padded[:, :, ::-1].transpose(2, 0, 1)
         case "bgr":
             planes = padded.transpose(2, 0, 1)
-    return np.ascontiguousarray(planes[None], dtype=np.float32) * np.float32(spec.scale)
+    tensor = np.ascontiguousarray(planes[None], dtype=np.float32) * np.float32(spec.scale)
+    if spec.mean:
+        tensor -= np.array(spec.mean, np.float32)[:, None, None]
+    if spec.std:
+        tensor /= np.array(spec.std, np.float32)[:, None, None]
+    return tensor

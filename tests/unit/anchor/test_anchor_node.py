@@ -19,8 +19,9 @@ from terrafix.anchor.relocalization.relocalizer import LOST_SIGMA_M, search_cent
 from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.anchor.verification.lock_monitor import LockMonitor
 from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.pose import PoseFit, world_to_tangent
 from terrafix.map.null_model import DEFAULT_NULL, VERSION, NullModel
-from terrafix.messages import Health, MapMatch, MapPose, SearchState, SearchStep, ThermalBand, Verdict
+from terrafix.messages import Health, MapMatch, SearchState, SearchStep, ThermalBand, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, texture, view
 
@@ -59,7 +60,7 @@ def test_a_hot_computer_matches_one_frame_of_several(ground: np.ndarray, band: T
         frames.put(i, view(ground, PINHOLE, R, TRUE_M))
         result = match(node, i, 10.0)
         verdicts.append(result.verdict)
-        assert (result.pose is None) is (result.verdict is Verdict.THROTTLED)
+        assert (result.matches == []) is (result.verdict is Verdict.THROTTLED)
     assert verdicts == [Verdict.ACCEPTED if i % every == 0 else Verdict.THROTTLED for i in range(1, 9)]
     list(node.on(health(ThermalBand.NORMAL)))
     frames.put(9, view(ground, PINHOLE, R, TRUE_M))
@@ -128,9 +129,8 @@ def test_correlated_tilt_and_position_errors_do_not_move_the_observed_ground() -
     jacobian = np.zeros((6, 1))
     jacobian[0], jacobian[4] = AGL_M, 1.0  # east, with the rotation about north that moves the ground back
     cov = np.diag([4.0, 1.0, 9.0, 1e-12, 1e-12, 1e-4]) + jacobian @ jacobian.T * np.radians(10.0) ** 2
-    pose = MapPose(p_c_in_w_m=(0.0, 0.0, AGL_M), q_w_c=(1.0, 0.0, 0.0, 0.0), cov=tuple(cov.ravel()))
-    assert ground_sigma_m(pose, AGL_M) == pytest.approx(2.0, abs=1e-3)
-    assert ground_sigma_m(None, AGL_M) == np.inf
+    fit = PoseFit(np.eye(3), np.array([0.0, 0.0, AGL_M]), world_to_tangent(cov, np.eye(3)), np.zeros(0), 0.0)
+    assert ground_sigma_m(fit, AGL_M) == pytest.approx(2.0, abs=1e-3)
 
 
 def test_a_missing_frame_gives_bad_image_and_step_skip(ground: np.ndarray) -> None:

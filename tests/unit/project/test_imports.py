@@ -35,7 +35,7 @@ OWNERS = {
     "serial": ("terrafix.link",),
     "onnxruntime": ("terrafix_engines",),
     "torch": ("terrafix_engines.train",),
-    "faiss": ("terrafix.anchor",),
+    "faiss": ("terrafix.anchor.place_index.faiss_ivf",),
     "systemd": ("terrafix.runtime.supervisor",),
     "zmq": ("terrafix.runtime",),
     "pickle": (),

@@ -21,21 +21,29 @@ EXTRAS = {
     extra: {canonicalize_name(Requirement(r).name): Requirement(r) for r in requirements}
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
-IMPORTED_AS = {"opencv-python-headless": "cv2", "pyserial": "serial", "pyzmq": "zmq", "pillow": "PIL"}
+IMPORTED_AS = {
+    "opencv-python-headless": "cv2",
+    "pyserial": "serial",
+    "pyzmq": "zmq",
+    "pillow": "PIL",
+    "faiss-cpu": "faiss",
+}
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist"}  # used by scripts/check, not imported
 TRAINING = ROOT / "engines" / "terrafix_engines" / "train"  # part of the engines package, used on the ground only
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
+SEARCH = ROOT / "daemon" / "terrafix" / "anchor" / "place_index" / "faiss_ivf.py"  # the only file that imports FAISS
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools"}
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 
-def imported(*folders: str, training: bool = True) -> set[str]:
-    """Top-level names of all third-party modules imported below the folders; with or without the training code."""
+def imported(*folders: str, extras: bool = True) -> set[str]:
+    """Top-level names of all third-party modules imported below the folders; with or without the code of the extras of
+    what flies: training and FAISS."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
         for path in (ROOT / folder).rglob("*.py"):
-            if not training and TRAINING in path.parents:
+            if not extras and (TRAINING in path.parents or path == SEARCH):
                 continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Import):
@@ -51,13 +59,18 @@ def modules(requirements: dict[str, Requirement]) -> set[str]:
 
 
 def test_daemon_and_engines_import_only_the_core_dependencies() -> None:
-    assert imported("daemon", "engines", training=False) <= modules(CORE)
+    assert imported("daemon", "engines", extras=False) <= modules(CORE)
+
+
+def test_what_flies_starts_without_faiss() -> None:
+    code = "import sys; sys.modules['faiss'] = None; import terrafix.anchor.node, terrafix_tools.mapping.place_index"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.slow
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
-    declared |= modules(EXTRAS["train"]) - EXPORTER
+    declared |= (modules(EXTRAS["train"]) - EXPORTER) | modules(EXTRAS["faiss"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
@@ -66,7 +79,7 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
 def test_every_dependency_has_a_version_range() -> None:
     for requirement in [
         *CORE.values(),
-        *(one for extra in ("ground", "sim", "cluster", "train") for one in EXTRAS[extra].values()),
+        *(one for extra in ("ground", "sim", "cluster", "faiss", "train") for one in EXTRAS[extra].values()),
     ]:
         operators = {specifier.operator for specifier in requirement.specifier}
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"

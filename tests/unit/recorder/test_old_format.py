@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from mcap.writer import Writer
 
+from terrafix.core.pnp import solved
 from terrafix.messages import (
     BeliefMode,
     BeliefSummary,
@@ -171,6 +172,26 @@ def test_renamed_fields_keep_their_values(
     message = OLD_DECODERS[topic](data)
     assert type(message) is message_type
     assert {name: getattr(message, name) for name in expected} == expected
+
+
+# As it was written before the estimator computed the pose: inliers only, and the pose of the anchor's PnP.
+MATCH_WITH_POSE = (
+    b'{"type":"MapMatch","t_ns":9,"frame_id":4,"verdict":"accepted","matcher":"gradient","inliers":1,'
+    b'"reprojection_px":1.5,"matches":[[0.1,0.2,3.0,4.0,5.0,0.9]],"radial_k1":-0.02,"map_sigma_m":2.5,'
+    b'"pose":{"p_c_in_w_m":[1.0,2.0,3.0],"q_w_c":[0.0,1.0,0.0,0.0],"cov":[%s],"position_only":false},'
+    b'"place":{"e_m":1.5,"n_m":2.5,"mass":0.95},"belief":null,"ground":null,'
+    b'"search":{"step":"normal","sigma_m":0.0,"relocalized":false}}'
+) % COV.encode()
+
+
+def test_a_match_from_before_the_estimator_computed_poses_keeps_the_pose_of_the_anchor(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    write_old(path, RECORD_FORMAT, {"/map_match": MATCH_WITH_POSE})
+    ((_, _, match),) = read_flight(path)
+    assert isinstance(match, MapMatch) and match.pnp is None
+    assert match.pose == MapPose(p_c_in_w_m=(1.0, 2.0, 3.0), q_w_c=(0.0, 1.0, 0.0, 0.0), cov=(0.5,) * 36)
+    assert match.matches == [(0.1, 0.2, 3.0, 4.0, 5.0, 0.9)]
+    assert solved(match) is match
 
 
 def test_a_topic_that_is_not_one_of_today_has_the_type_that_replaced_it() -> None:

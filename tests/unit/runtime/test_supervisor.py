@@ -1,6 +1,7 @@
 """The supervisor with real processes: kills, hangs, bugs, user errors, and the ordered stop."""
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -115,6 +116,10 @@ def test_a_recorded_source_runs_to_its_end_without_loss_of_messages(tmp_path: Pa
     assert [v.frame_id for v in verdicts] == list(range(30))
     assert {v.verdict for v in verdicts} == {m.Verdict.ACCEPTED}, "all have the origin and the correct pixels"
     assert not [e for e in recorded if isinstance(e, m.Dropped)]
+
+    lines = [json.loads(line) for line in f.log.read_text().splitlines()]
+    steps = [(line["process"], line["level"], line["step"]) for line in lines if line["event"] == "search step"]
+    assert steps == [("estimator", "warning", "widen")], "published messages of interest are logged once"
 
     assert [e.process for e in f.events if e.event == "started"] == [p.name for p in TABLE]
     stopped = [e for e in f.events if e.event == "stopped"]

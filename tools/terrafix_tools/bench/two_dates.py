@@ -28,6 +28,7 @@ from terrafix.core.config import load
 from terrafix.core.errors import MapError, TerrafixError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import local_crs, quat_from_rot, rot_from_quat
+from terrafix.core.pnp import solved
 from terrafix.map.package import MapPackage
 from terrafix.messages import Camera, MapMatch, Origin, Prediction, Verdict
 from terrafix_engines.features import open_describer
@@ -191,6 +192,7 @@ def centre_point_of(match: MapMatch) -> tuple[np.ndarray, np.ndarray]:
     """-> (2,) east, north [m] of the ground point at height zero in the image centre of a nadir image, and its
     covariance (2, 2). Without a pose: mode and covariance of the belief."""
     map_m2 = match.map_sigma_m**2 * np.eye(2)
+    match = solved(match)
     if match.pose is None or match.pose.position_only:
         mode_m = np.zeros(2) if match.place is None else np.array([match.place.e_m, match.place.n_m])
         cov_m2 = np.zeros((2, 2)) if match.belief is None else np.reshape(match.belief.cov_m2, (2, 2))

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
+from terrafix.core.pnp import solved
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.graph.pose_graph import GraphObserver, GraphPrior, NewNode, PoseGraph
 from terrafix.estimator.measurements.map_pose import determined, measured_pose, moved_by_k1
@@ -159,7 +160,7 @@ class FlightReplayer:
         return published
 
     def _add_match(self, match: MapMatch, verdict: Verdict, estimator: Estimator) -> None:
-        flight = self.flights[-1]
+        flight, match = self.flights[-1], solved(match)
         node = flight.node_of.get(match.frame_id)
         if node is not None:
             flight.lost_sigma_m[node] = estimator.hypotheses.anywhere_m

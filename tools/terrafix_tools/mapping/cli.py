@@ -93,5 +93,12 @@ def map_build(
     )
 
 
-for command in (cli_package.info, cli_package.check, cli_package.preview, cli_package.keygen, cli_package.sign):
+for command in (
+    cli_package.info,
+    cli_package.check,
+    cli_package.preview,
+    cli_package.index,
+    cli_package.keygen,
+    cli_package.sign,
+):
     app.command()(command)

@@ -78,3 +78,24 @@ def sign(
     from terrafix_tools.mapping.package.sign import sign_package
 
     typer.echo(f"{package}: signed by key {sign_package(package, key).key_id}")
+
+
+def index(
+    packages: Annotated[list[Path], typer.Argument(help="Map packages, all into one index.")],
+    *,
+    out: Annotated[Path, typer.Option(help="Folder to write.")],
+    agl: Annotated[float, typer.Option(min=30.0, max=5000.0, help="Height of the flights above ground, metres.")],
+    descriptor: Annotated[
+        str, typer.Option(help="pooled-gradient, or a fetched model: xfeat, or one with the role global.")
+    ] = "pooled-gradient",
+    folder: Annotated[str, typer.Option(help="Models folder.")] = "",
+    faiss: Annotated[
+        bool, typer.Option("--faiss", help="Make the FAISS index of a small map, too; needs terrafix[faiss].")
+    ] = False,
+) -> None:
+    """Place index for the search of large maps: descriptors of the ground, and FAISS's index over them."""
+    from terrafix_tools.mapping.place_index import IndexOptions, write_index
+
+    header = write_index(packages, out, IndexOptions(agl, descriptor, folder, faiss))
+    size_mb = sum(file.size_bytes for file in header.files.values()) / 1e6
+    typer.echo(f"{out}: {header.count} places of {header.side_m:.0f} m, {size_mb:.0f} MB, by {header.descriptor}")

@@ -84,7 +84,7 @@ def _baseline(manifest: Manifest, sizes: dict[str, int]) -> tuple[str, Callable[
     if manifest.role == "matcher":
         points = [_points(count) for name, count in sorted(sizes.items()) if name != "batch"]
         return "nearest", lambda: MutualNearestMatcher().match(points[0], points[-1])
-    if manifest.role == "pair":
+    if manifest.role in ("pair", "global"):
         return None
     rng = np.random.default_rng(0)
     height, width = (sizes[side] if isinstance(side, str) else side for side in manifest.image_size())

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import quat_from_rot
+from terrafix.core.pnp import solved
 from terrafix.messages import MapMatch, MapPose, MatchPlace, Verdict
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flown import Shot
@@ -50,8 +51,6 @@ class Faults:
 
     def alter(self, match: MapMatch, shot: Shot) -> MapMatch:
         """The match that is published instead of ``match``."""
-        if self.is_blacked_out(shot.t_s) or self.is_unmapped(shot.t_s):
-            return no_match(match)
         offset_m = self._offset_m(shot.t_s)
         return match if offset_m is None else wrong_match(match, shot, offset_m, self._rng)
 
@@ -72,7 +71,9 @@ class Faults:
 
 def no_match(match: MapMatch) -> MapMatch:
     """``match`` without a pose and without a belief: the frame was not compared with the map."""
-    return msgspec.structs.replace(match, verdict=Verdict.FEW_INLIERS, pose=None, place=None, belief=None, inliers=0)
+    return msgspec.structs.replace(
+        match, verdict=Verdict.FEW_INLIERS, matches=[], pnp=None, pose=None, place=None, belief=None, inliers=0
+    )
 
 
 def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.random.Generator) -> MapMatch:
@@ -80,7 +81,7 @@ def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.rando
     p = shot.p_m + np.array([*(offset_m + WRONG_SIGMA_M * rng.normal(size=2)), WRONG_SIGMA_M * rng.normal()])
     cov = np.diag([WRONG_SIGMA_M**2] * 3 + [WRONG_SIGMA_RAD**2] * 3)
     return msgspec.structs.replace(
-        match,
+        solved(msgspec.structs.replace(match, verdict=Verdict.ACCEPTED)),
         verdict=Verdict.ACCEPTED,
         inliers=30,
         pose=MapPose(

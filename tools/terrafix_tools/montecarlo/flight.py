@@ -29,7 +29,7 @@ from terrafix_tools.montecarlo.faults import Faults
 from terrafix_tools.montecarlo.flown import Shot, fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens, footprint_m
-from terrafix_tools.montecarlo.lies import Lies
+from terrafix_tools.montecarlo.lies import FindMatch, Lies
 from terrafix_tools.montecarlo.matches import MapMatches
 from terrafix_tools.montecarlo.plan import FlightPlan
 from terrafix_tools.montecarlo.sightings import SimulatedOdometry
@@ -113,8 +113,7 @@ class Run:
                 for state in flown.telemetry[i]:
                     self._send(state)
                 published = self._send(odometry)
-            dark = faults.is_blacked_out(shot.t_s) or faults.is_unmapped(shot.t_s)
-            find = matches.match if not dark else partial(matches.match, usable=False)
+            find = find_match(matches, faults, shot.t_s)
             late += [
                 (i + faults.late_frames(), faults.alter(lies.match(i, prediction, find), shot))
                 for prediction in published
@@ -183,6 +182,15 @@ class Run:
         record.velocity_error_mps[i] = np.array(estimate.velocity_enu_mps) - shot.velocity_mps
         record.velocity_sigma_mps[i] = estimate.velocity_sigma_mps
         record.anchor_age_ms[i] = estimate.last_anchor_age_ms
+
+
+def find_match(matches: MapMatches, faults: Faults, t_s: float) -> FindMatch:
+    """The matches at ``t_s``: none in a blackout, or over ground that the map does not have."""
+    if faults.is_blacked_out(t_s):
+        return partial(matches.no_match, verdict=Verdict.BAD_IMAGE)
+    if faults.is_unmapped(t_s):
+        return partial(matches.no_match, verdict=Verdict.FEW_INLIERS)
+    return matches.match
 
 
 def _new_ground(plan: FlightPlan, path_m: np.ndarray) -> np.ndarray:

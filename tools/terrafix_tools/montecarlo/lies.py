@@ -81,7 +81,7 @@ class Lies:
         found = find(prediction, shot, usable=self._search is None or not self._search.is_lost)
         if self._is_foreign(i):
             found = no_match(found)
-        if Fault.TOWN in self._lies and i >= self._town_from:
+        if Fault.TOWN in self._lies and i >= self._town_from and found.verdict is not Verdict.BAD_IMAGE:
             return self._match_of_other_town(found, i)
         if self._search is None:
             return found
@@ -134,7 +134,7 @@ class Search:
         if match.verdict is Verdict.ACCEPTED and not self.is_lost:
             self._missed = 0
             return match
-        self._missed += 1
+        self._missed += match.verdict is not Verdict.BAD_IMAGE  # such a frame is no evidence against the position
         if not self.is_lost:
             return match
         e_m, n_m, up_m = float(shot.p_m[0]), float(shot.p_m[1]), prediction.p_c_in_w_m[2]

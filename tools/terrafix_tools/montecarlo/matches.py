@@ -9,16 +9,22 @@ import math
 import msgspec
 import numpy as np
 
-from terrafix.anchor.frame_pose import COARSE_SCORE, MIN_POSE_MODE_MASS, MODE_MASS, POSE_LIKELIHOOD_RATIO, with_belief
-from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, SEARCH_RADIUS, Fix, View
+from terrafix.anchor.frame_pose import (
+    COARSE_SCORE,
+    MIN_POSE_MODE_MASS,
+    POSE_LIKELIHOOD_RATIO,
+    confirm_pose,
+    with_belief,
+)
+from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, Fix, View
 from terrafix.anchor.matching.match_message import mode_match, pose_match
 from terrafix.anchor.matching.patch_matcher import MAX_PATCHES
-from terrafix.anchor.matching.pnp import INLIER_THRESHOLD, solve
 from terrafix.anchor.matching.point_mass_filter import Mode, belief_cell_m
-from terrafix.core.geodesy import rot_from_quat
+from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.limits import MIN_MATCHING_AGL_M
+from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, solve
 from terrafix.core.pose import log_so3
-from terrafix.messages import GroundPlane, MapMatch, MatchPlace, Prediction, Verdict
+from terrafix.messages import GroundPlane, MapMatch, MatchPlace, PnpInput, Prediction, Verdict
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import MAP_SEES_TOPS, MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens, footprint_m
@@ -56,41 +62,50 @@ class MapMatches:
         self._has_found = False
 
     def match(self, prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch:
-        """``usable`` False: the belief gets nothing, since the picture shows nothing or a search is active."""
-        ground = self._plane(prediction)
-        result = MapMatch(
-            t_ns=prediction.t_ns,
-            frame_id=prediction.frame_id,
-            verdict=Verdict.AMBIGUOUS,
-            matcher="gradient",
-            ground=ground,
-            map_sigma_m=self._map_sigma_m,
-        )
+        """``usable`` False: the belief is not updated, since a search is active."""
+        result = self.no_match(prediction, shot, verdict=Verdict.AMBIGUOUS)
         good = self._texture_quality(shot.t_s)
-        r_w_c, p_m = rot_from_quat(prediction.q_w_c), np.array(prediction.p_c_in_w_m)
-        agl_m = prediction.agl_m if ground is None else float(p_m[2]) - ground.amsl_m
+        agl_m = _agl_m(prediction, result.ground)
         if agl_m < MIN_MATCHING_AGL_M:
             return msgspec.structs.replace(result, verdict=Verdict.TOO_LOW)
-        place = self._apparent(shot, r_w_c, agl_m)
+        place = self._apparent(shot, rot_from_quat(prediction.q_w_c), agl_m)
         in_range = self._in_range(prediction, shot, agl_m)
         if not (in_range and self._in_window(prediction, place)):
             return self._match_in_belief(result, prediction, shot, place if in_range else None) if usable else result
         self._belief, self._has_found = None, True
         score = SCORE + SCORE_SPREAD * (float(self._rng.normal()) + 0.5 * (good - 0.5))
         mode = Mode(float(place[0]), float(place[1]), MASS, 0.0, belief_cell_m(agl_m, 0.0) ** 2)
-        view = View(mode.e_m, mode.n_m, r_w_c, agl_m, float(p_m[2]) - agl_m, 0.0, 0.0, 0.0)
+        view = _view_at(mode, prediction, agl_m)
         result = msgspec.structs.replace(result, place=MatchPlace(e_m=mode.e_m, n_m=mode.n_m, mass=MASS))
         result = pose_match(result, self._fix(shot, good, view), view)
         if result.verdict is Verdict.ACCEPTED or score < COARSE_SCORE:
             return result
         return mode_match(result, mode, belief_cell_m(agl_m, 0.0), view, None)
 
+    def no_match(self, prediction: Prediction, shot: Shot, *, verdict: Verdict, usable: bool = True) -> MapMatch:
+        """The match of a frame that is not compared with the map; the arguments of ``match``, and its verdict."""
+        return MapMatch(
+            t_ns=prediction.t_ns,
+            frame_id=prediction.frame_id,
+            verdict=verdict,
+            matcher="gradient",
+            ground=self._plane(prediction),
+            map_sigma_m=self._map_sigma_m,
+        )
+
     def _fix(self, shot: Shot, good: float, view: View) -> Fix:
         xy, points = self._patches(shot, good)
         weights = np.exp(self._rng.normal(*WEIGHT, len(xy)))
         gsd_share = FIX_GSD_PER_AGL["gradient"]
-        pnp = solve(points, xy, weights, view.r_w_c, view.agl_m, 0.3 * gsd_share, INLIER_THRESHOLD, SEARCH_RADIUS)
-        return Fix(xy, points, weights, pnp, gsd_share * view.agl_m)
+        given = PnpInput(
+            q_w_c=quat_from_rot(view.r_w_c),
+            agl_m=view.agl_m,
+            sigma_floor=0.3 * gsd_share,
+            threshold=INLIER_THRESHOLD,
+            search_radius=SEARCH_RADIUS,
+            min_inliers=MIN_INLIERS,
+        )
+        return Fix(xy, points, weights, solve(points, xy, weights, given), gsd_share * view.agl_m, given)
 
     def _patches(self, shot: Shot, good: float) -> tuple[np.ndarray, np.ndarray]:
         """2D-3D matches: normalised (N, 2) and world points (N, 3), as the map and its elevation have them."""
@@ -174,16 +189,11 @@ class MapMatches:
         result = with_belief(result, tracked.belief, modes, score)
         if modes[0].mass < MIN_POSE_MODE_MASS or not tracked.is_at(modes[0], place_m):
             return result
-        agl_m = prediction.agl_m if result.ground is None else float(prediction.p_c_in_w_m[2]) - result.ground.amsl_m
-        ground_m = float(prediction.p_c_in_w_m[2]) - agl_m
-        view = View(modes[0].e_m, modes[0].n_m, rot_from_quat(prediction.q_w_c), agl_m, ground_m, 0.0, 0.0, 0.0)
+        view = _view_at(modes[0], prediction, _agl_m(prediction, result.ground))
         result = pose_match(result, self._fix(shot, good, view), view)
         if result.verdict is not Verdict.ACCEPTED:
             return result
-        tracked.belief.confirm(modes[0], POSE_LIKELIHOOD_RATIO)
-        modes = tracked.belief.modes(len(modes))
-        verdict = Verdict.ACCEPTED if modes[0].mass >= MODE_MASS else Verdict.AMBIGUOUS
-        return msgspec.structs.replace(with_belief(result, tracked.belief, modes, score), verdict=verdict)
+        return confirm_pose(result, modes[0], POSE_LIKELIHOOD_RATIO, tracked.belief)
 
     def _texture_quality(self, t_s: float) -> float:
         """0..1: quality of the ground below for matching, a first-order process in time."""
@@ -191,6 +201,16 @@ class MapMatches:
         self._last_s = t_s
         self._texture = keep * self._texture + math.sqrt(1.0 - keep * keep) * float(self._rng.normal())
         return 0.5 * (1.0 + math.erf(self._texture / math.sqrt(2.0)))
+
+
+def _agl_m(prediction: Prediction, ground: GroundPlane | None) -> float:
+    """Predicted height above the map's ground, or the prediction's own without a map elevation."""
+    return prediction.agl_m if ground is None else float(prediction.p_c_in_w_m[2]) - ground.amsl_m
+
+
+def _view_at(mode: Mode, prediction: Prediction, agl_m: float) -> View:
+    up_m = float(prediction.p_c_in_w_m[2])
+    return View(mode.e_m, mode.n_m, rot_from_quat(prediction.q_w_c), agl_m, up_m - agl_m, 0.0, 0.0, 0.0)
 
 
 def _between(limits: tuple[float, float], share: float) -> float:

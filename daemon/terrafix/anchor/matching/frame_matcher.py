@@ -14,13 +14,13 @@ from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, rectify
 from terrafix.anchor.matching.patch_matcher import match_patches
-from terrafix.anchor.matching.pnp import INLIER_THRESHOLD, MIN_INLIERS, PnpResult, solve
 from terrafix.anchor.matching.point_mass_filter import LLR_SLOPE, Surface
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
+from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, PnpResult, solve
 from terrafix.map.package import LocalMap
-from terrafix.messages import Verdict
+from terrafix.messages import PnpInput, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 
 # Ground sampling distance of the correlation as a share of the height: coarse enough for speed and for tolerance to
@@ -36,7 +36,6 @@ MAX_WINDOW_VALUES = 8 * 640**2
 # side of a patch as a share of the height: 25 m at 100 m, one house and its surroundings [measured: docs/search.md]
 PATCH_PER_AGL = 0.25
 MIN_PATCH_CELLS = 8  # smallest side of a patch, cells [tuned]
-SEARCH_RADIUS = 0.08  # search radius of a patch around its expected place, share of the height [tuned]
 # Fewest inliers of a pose on learned descriptors. A cell of a learned model has a receptive field of a hundred pixels,
 # so that errors of neighbours are correlated. With 14 inliers required, 5 of 560 frames from other places had a pose;
 # with 20, none of 640. At right places 15 to 48 patches agree. [measured: docs/models.md]
@@ -126,13 +125,15 @@ class CorrelationResult:
 @dataclass(frozen=True)
 class Fix:
     """2D-3D matches of one frame and the pose from them. ``xy`` (N, 2): normalised image coordinates; ``points_w_m``
-    (N, 3): map points, local east, north and AMSL height; ``weights`` (N,); ``cell_m``: cell size of the patches."""
+    (N, 3): map points, local east, north and AMSL height; ``weights`` (N,); ``cell_m``: cell size of the patches;
+    ``given``: with which PnP has computed ``pnp``; None: another method has."""
 
     xy: np.ndarray
     points_w_m: np.ndarray
     weights: np.ndarray
     pnp: PnpResult
     cell_m: float
+    given: PnpInput | None = None
 
 
 class FrameMatcher:
@@ -289,11 +290,15 @@ class FrameMatcher:
         up = self._map.elevation(found.map_m[:, 0], found.map_m[:, 1]) if len(xy) else None
         up = np.full(len(xy), view.ground_m) if up is None else np.where(np.isfinite(up), up, view.ground_m)
         points = np.column_stack([found.map_m, up])
-        sigma_floor = 0.3 * cell / view.agl_m  # a third of a cell: the accuracy of sub-cell interpolation of the peak
-        radius_share = radius * cell / view.agl_m
-        min_inliers = MIN_INLIERS if describer.stride == 1 else LEARNED_INLIERS
-        pnp = solve(points, xy, found.weight, view.r_w_c, view.agl_m, sigma_floor, threshold, radius_share, min_inliers)
-        return Fix(xy, points, found.weight, pnp, cell)
+        given = PnpInput(
+            q_w_c=quat_from_rot(view.r_w_c),
+            agl_m=view.agl_m,
+            sigma_floor=0.3 * cell / view.agl_m,  # a third of a cell: accuracy of sub-cell interpolation of the peak
+            threshold=threshold,
+            search_radius=radius * cell / view.agl_m,
+            min_inliers=MIN_INLIERS if describer.stride == 1 else LEARNED_INLIERS,
+        )
+        return Fix(xy, points, found.weight, solve(points, xy, found.weight, given), cell, given)
 
     def _next_subset(self, hypotheses: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
         """Subset of the hypotheses that one frame can afford: some of the scales, beginning with the predicted one; the

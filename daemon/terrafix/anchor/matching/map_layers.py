@@ -8,6 +8,7 @@ from terrafix.anchor.matching.descriptor_store import MAX_TILES, DescriptorStore
 from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher, View
 from terrafix.anchor.matching.layer_selector import LayerSelector
 from terrafix.anchor.matching.point_mass_filter import Belief, Mode
+from terrafix.anchor.place_index.recognizer import PlaceMemory, PlaceRecognizer
 from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
@@ -21,13 +22,15 @@ from terrafix.messages import Verdict
 @dataclass(frozen=True)
 class MapLayer:
     """One map layer. ``sigma_m``: position error, 1-sigma per horizontal axis. ``null``: null model of this layer
-    (scores of the best wrong places), None if it was not measured."""
+    (scores of the best wrong places), None if it was not measured. ``recognizer``: place recognition by an index of
+    this layer, None if there is none."""
 
     map: LocalMap
     matcher: FrameMatcher
     consensus: ConsensusPose
     sigma_m: float
     null: NullModel | None
+    recognizer: PlaceRecognizer | None = None
 
     def null_at(self, agl_m: float) -> NullRow:
         return null_row_for(self.null, self.matcher.gradients.name, agl_m)
@@ -35,7 +38,7 @@ class MapLayer:
 
 class MapLayers:
     """All layers of one package. ``ce90_m``: accuracy of layers that state none. ``store_folder``: folder in memory for
-    computed descriptors."""
+    computed descriptors. ``places``: a place index, of this package or of others too."""
 
     def __init__(
         self,
@@ -45,6 +48,7 @@ class MapLayers:
         describer: Describer,
         ce90_m: float,
         store_folder: Path | None = None,
+        places: PlaceMemory | None = None,
     ) -> None:
         layers = package.manifest.layers
         self._all: dict[str, MapLayer] = {}
@@ -57,7 +61,11 @@ class MapLayers:
                 )
             matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers), store)
             sigma_m = accuracy_of(layer, ce90_m).sigma_m
-            self._all[layer.table] = MapLayer(bound, matcher, ConsensusPose(bound, matcher), sigma_m, layer.null_model)
+            recognizer = None
+            if places is not None and (indexed := places.index.layer(package.manifest.checksum, layer.table)):
+                recognizer = PlaceRecognizer(places, indexed, frame)
+            consensus = ConsensusPose(bound, matcher)
+            self._all[layer.table] = MapLayer(bound, matcher, consensus, sigma_m, layer.null_model, recognizer)
         self._selector = LayerSelector([layer.table for layer in layers])
 
     def set_distortion(self, radial_k1: float) -> None:

@@ -1,5 +1,5 @@
-"""Conversion of a match result into the MapMatch message: a camera pose from 2D-3D matches, or the position of the
-belief's mode alone."""
+"""Conversion of a match result into the MapMatch message: 2D-3D matches, a camera pose, or the position of the belief's
+mode alone."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,8 @@ import numpy as np
 from terrafix.anchor.matching.frame_matcher import Fix, View
 from terrafix.anchor.matching.point_mass_filter import Mode
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.core.pose import tangent_to_world
+from terrafix.core.pnp import map_pose
+from terrafix.core.pose import PoseFit, tangent_to_world
 from terrafix.messages import MapMatch, MapPose, Verdict
 
 # 1-sigma of the attitude of a position-only match: large enough that the match does not constrain attitude [tuned]
@@ -56,6 +57,7 @@ def mode_match(match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tu
         inliers=0,  # those of a pose that was rejected
         reprojection_px=0.0,
         matches=[],
+        pnp=None,
         pose=MapPose(
             p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + agl_m),
             q_w_c=quat_from_rot(view.r_w_c),
@@ -66,34 +68,36 @@ def mode_match(match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tu
 
 
 def pose_match(match: MapMatch, fix: Fix | None, view: View) -> MapMatch:
-    """Copies the pose of a fix, its inlier matches (normalised image coordinates, map points in metres, weights),
-    covariance and verdict into ``match``. ``match.place`` is the place at which the fix was computed; a pose
-    that is more than ``MAX_MODE_DRIFT`` heights away from it is DEGENERATE."""
+    """Copies a fix and its verdict into ``match``: all 2D-3D matches with what PnP takes beside them, or the pose if
+    another method has computed it. ``match.place`` is the place at which the fix was computed; a pose that is more than
+    ``MAX_MODE_DRIFT`` heights away from it is DEGENERATE."""
     if fix is None:
         return msgspec.structs.replace(match, verdict=Verdict.DEGENERATE)
-    pnp = fix.pnp
-    verdict = pnp.verdict
-    if pnp.fit is None:
-        return msgspec.structs.replace(match, verdict=verdict, inliers=int(pnp.inliers.sum()))
+    verdict, fit = fix.pnp.verdict, fix.pnp.fit
+    match = msgspec.structs.replace(match, verdict=verdict, inliers=int(fix.pnp.inliers.sum()))
+    if fit is None:
+        return match
     assert match.place is not None
-    p = pnp.fit.p_c_in_w_m
-    drift = np.array([p[0] - match.place.e_m, p[1] - match.place.n_m])
-    if float(np.hypot(*drift)) > MAX_MODE_DRIFT * view.agl_m:
-        verdict = Verdict.DEGENERATE
-    matches = np.column_stack([fix.xy, fix.points_w_m, fix.weights])[pnp.inliers]
-    cov = tangent_to_world(pnp.fit.cov, pnp.fit.r_w_c)
-    return msgspec.structs.replace(
+    drift = np.array([fit.p_c_in_w_m[0] - match.place.e_m, fit.p_c_in_w_m[1] - match.place.n_m])
+    match = msgspec.structs.replace(
         match,
-        verdict=verdict,
-        matches=[(float(a), float(b), float(c), float(d), float(e), float(f)) for a, b, c, d, e, f in matches],
-        pose=MapPose(
-            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-            q_w_c=quat_from_rot(pnp.fit.r_w_c),
-            cov=tuple(float(v) for v in cov.ravel()),
-        ),
-        inliers=int(pnp.inliers.sum()),
-        reprojection_px=float(np.sqrt(np.mean(pnp.fit.residuals**2))) * view.agl_m / fix.cell_m,
+        verdict=Verdict.DEGENERATE if float(np.hypot(*drift)) > MAX_MODE_DRIFT * view.agl_m else verdict,
+        reprojection_px=float(np.sqrt(np.mean(fit.residuals**2))) * view.agl_m / fix.cell_m,
     )
+    if fix.given is None:
+        return msgspec.structs.replace(match, matches=_agreeing(fix), pnp=None, pose=map_pose(fit))
+    return msgspec.structs.replace(match, matches=_matches(fix), pnp=fix.given, pose=None)
+
+
+def _matches(fix: Fix) -> list[tuple[float, float, float, float, float, float]]:
+    """All 2D-3D matches of ``fix``, as in MapMatch."""
+    rows = np.column_stack([fix.xy, fix.points_w_m, fix.weights]).tolist()
+    return [(x, y, e_m, n_m, up_m, weight) for x, y, e_m, n_m, up_m, weight in rows]
+
+
+def _agreeing(fix: Fix) -> list[tuple[float, float, float, float, float, float]]:
+    """Those of them that agree with the pose of ``fix``."""
+    return [one for one, agrees in zip(_matches(fix), fix.pnp.inliers, strict=True) if agrees]
 
 
 def ground_cov_m2(cov: Sequence[float], agl_m: float) -> np.ndarray:
@@ -104,11 +108,10 @@ def ground_cov_m2(cov: Sequence[float], agl_m: float) -> np.ndarray:
     return np.asarray(jacobian @ np.reshape(cov, (6, 6)) @ jacobian.T)
 
 
-def ground_sigma_m(pose: MapPose | None, agl_m: float) -> float:
-    """1-sigma in metres of that ground point along the worst direction; infinity without a pose."""
-    if pose is None:
-        return float(np.inf)
-    return float(np.sqrt(np.linalg.eigvalsh(ground_cov_m2(pose.cov, agl_m))[-1]))
+def ground_sigma_m(fit: PoseFit, agl_m: float) -> float:
+    """1-sigma in metres of that ground point along the worst direction."""
+    cov = tangent_to_world(fit.cov, fit.r_w_c)
+    return float(np.sqrt(np.linalg.eigvalsh(ground_cov_m2(cov.ravel().tolist(), agl_m))[-1]))
 
 
 def relocalized_match(match: MapMatch, fix: Fix, view: View, innovation_m: tuple[float, float]) -> MapMatch:
@@ -121,9 +124,10 @@ def relocalized_match(match: MapMatch, fix: Fix, view: View, innovation_m: tuple
     """
     search = msgspec.structs.replace(match.search, relocalized=True)
     match = pose_match(msgspec.structs.replace(match, search=search), fix, view)
-    if match.pose is None:
+    if fix.pnp.fit is None:
         return match
-    cov = np.array(match.pose.cov).reshape(6, 6)
+    pose = map_pose(fix.pnp.fit)
+    cov = np.array(pose.cov).reshape(6, 6)
     cov[:2, :2] += (RELOCALIZED_SIGMA * view.agl_m) ** 2 * np.eye(2) + np.outer(innovation_m, innovation_m)
-    pose = msgspec.structs.replace(match.pose, cov=tuple(float(v) for v in cov.ravel()))
-    return msgspec.structs.replace(match, pose=pose)
+    wider = msgspec.structs.replace(pose, cov=tuple(float(v) for v in cov.ravel()))
+    return msgspec.structs.replace(match, matches=_agreeing(fix), pnp=None, pose=wider)

@@ -7,6 +7,7 @@ standardised per block, because that would amplify blocks with little texture.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -70,6 +71,22 @@ def blocks_of(bounds_m: tuple[float, float, float, float], cell_m: float) -> lis
     columns = range(int(np.floor(e_min / cell_m)), int(np.ceil(e_max / cell_m)), BLOCK_CELLS)
     rows = range(int(np.floor(-n_max / cell_m)), int(np.ceil(-n_min / cell_m)), BLOCK_CELLS)
     return [Block(r, c) for r, c in itertools.product(rows, columns)]
+
+
+def select_blocks(
+    places_m: Sequence[tuple[float, float]], blocks: Sequence[Block], cell_m: float, count: int
+) -> list[Block]:
+    """The first ``count`` of ``blocks`` that contain one of the camera positions (local east, north), in the order of
+    these."""
+    chosen: list[Block] = []
+    for e_m, n_m in places_m:
+        row, column = math.floor(-n_m / cell_m), math.floor(e_m / cell_m)
+        inside = (b for b in blocks if 0 <= row - b.row < BLOCK_CELLS and 0 <= column - b.column < BLOCK_CELLS)
+        if (block := next(inside, None)) is not None and block not in chosen:
+            chosen.append(block)
+            if len(chosen) == count:
+                break
+    return chosen
 
 
 class BlockCorrelator:

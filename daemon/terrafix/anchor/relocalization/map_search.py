@@ -12,7 +12,8 @@ import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.matching.ncc import standardise
-from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, BlockCorrelator, blocks_of
+from terrafix.anchor.place_index.recognizer import PlaceRecognizer
+from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, BlockCorrelator, blocks_of, select_blocks
 from terrafix.anchor.relocalization.hypothesis_tracker import (
     MERGE_RADIUS,
     NEIGHBOUR_RADIUS,
@@ -21,18 +22,20 @@ from terrafix.anchor.relocalization.hypothesis_tracker import (
     HypothesisTracker,
 )
 from terrafix.anchor.relocalization.mosaic import Mosaic
+from terrafix.anchor.relocalization.peaks import UNKNOWN, Peak, find_peaks
 from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget, NullRow
 from terrafix.map.package import LocalMap
 from terrafix.messages import SearchStep
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
+from terrafix_engines.runtime import ModelRunError
 
 # Cells and number of hypotheses up to which dense gradients on small cells are used; they discriminate best. With more
 # hypotheses or a larger map, gradients pooled over larger cells are used: they tolerate yaw errors of some degrees.
 # [measured: docs/search.md]
 FINE_CELL_PER_AGL, FINE_HYPOTHESES = 1 / 50, 25
-CELL_PER_AGL = 1 / 13  # pooled cell as a share of the height [measured: docs/search.md]
+CELL_PER_AGL = 1 / 20  # pooled cell as a share of the height [measured: docs/search.md]
 # Largest cells x yaws x scales of one joint correlation, about 2 s of one core; a larger map is correlated on larger
 # cells [measured: docs/search.md]
 MAX_WORK = 35e6
@@ -56,16 +59,14 @@ MAX_PROPOSALS = 12  # places that one joint correlation may propose [tuned]
 # number of these, from the best, that also propose the best place beside them [measured: docs/search.md]
 NEIGHBOUR_PROPOSALS = 4
 LEAD_SEARCH_RADIUS = 0.2  # share of the height: search radius for a track's own value in the joint correlation [tuned]
-UNKNOWN = -9.0  # value in standard deviations where the map does not cover the frames [spec: below any correlation]
 
 
 @dataclass(frozen=True)
-class Peak:
-    """A local maximum of the joint correlation: cell, standard deviations above the median, yaw and scale."""
+class ProposedPlace:
+    """Camera position (local east, north) that a joint correlation proposes, with its yaw and scale."""
 
-    row: int
-    column: int
-    z: float
+    e_m: float
+    n_m: float
     hypothesis: Hypothesis
 
 
@@ -78,10 +79,12 @@ class MapSearch:
         around_m: tuple[float, float] | None,
         null: NullRow,
         budget: FalseAlarmBudget,
+        recognizer: PlaceRecognizer | None = None,
     ) -> None:
         """``around_m``: last believed position (local east, north) around which the search begins; None: the whole map.
         ``null``: null model of the map at this height; ``budget``: false-alarm budget of the flight, of which every
-        stretch of new ground spends a share."""
+        stretch of new ground spends a share. ``recognizer``: selects the blocks of a map that is too large for small
+        cells; None: such a map is correlated on larger cells."""
         self._map = source
         self._matcher = matcher
         self.agl_m = agl_m
@@ -92,9 +95,12 @@ class MapSearch:
         self._cell_m = 0.0
         self._hypotheses: tuple[Hypothesis, ...] = ()
         self._mosaic = Mosaic((), 1.0)
+        self._recognizer = recognizer
+        self._max_blocks = 0  # number of blocks that one joint correlation can afford
         self._null = null
         self._budget = budget
         self.tracker = HypothesisTracker(source, matcher, null.patches)
+        self.proposed: list[ProposedPlace] = []  # best places of the last joint correlation, best first
         self._p_m = np.zeros(2)  # position by odometry since the search began
         self._var_m2 = 0.0
         self._path_m = 0.0  # length flown since the search began
@@ -131,7 +137,7 @@ class MapSearch:
     def process_frame(self, image: Image, view: View) -> AcceptedPlace | None:
         """Processes one frame. ``view``: height, attitude and their uncertainty; its position is not used."""
         if self._path_m - self._correlated_path_m >= CORRELATION_INTERVAL * view.agl_m:
-            self._correlate_region(image, view)
+            self.correlate_region(image, view)
         if self._path_m - self._verified_path_m < VERIFICATION_INTERVAL * view.agl_m:
             return None
         self._verified_path_m = self._path_m
@@ -153,13 +159,17 @@ class MapSearch:
         area = (e_max - e_min) * (n_max - n_min) / (NEIGHBOUR_RADIUS * self.agl_m) ** 2
         return max(area, 1.0) * max(len(self._hypotheses), 1)
 
-    def _correlate_region(self, image: Image, view: View) -> None:
+    def correlate_region(self, image: Image, view: View) -> None:
+        """Joint correlation of the frame and those before with the region: new tracks, and the leads of all."""
         if not self._blocks:
             self._initialize(view)
         stride = self._correlator.stride
         frames = self._matcher.rectify_all(image, view, self._hypotheses, self._cell_m / stride, stride)
         templates = [self._correlator.describe(frame) for frame in frames if frame is not None]
         if len(templates) < len(frames):
+            return
+        blocks = self._blocks_to_correlate(image, view)
+        if not blocks:
             return
         new = min((self._path_m - self._correlated_path_m) / (NEW_GROUND * view.agl_m), 1.0)
         self._correlated_path_m = self._path_m
@@ -168,7 +178,6 @@ class MapSearch:
         )
         correlation = np.full(self._shape, np.nan, np.float32)
         index = np.zeros(self._shape, np.uint8)
-        blocks = self._blocks[: self.block_count]
         results = self._correlator.correlate(self._mosaic.templates(), blocks, self._cell_m)
         for block, found in zip(blocks, results, strict=True):
             at = self._cells(block)
@@ -183,6 +192,25 @@ class MapSearch:
         ):
             self._region, self._region_weight = self._region + 1, 0.0
 
+    def _blocks_to_correlate(self, image: Image, view: View) -> list[Block]:
+        """Blocks of the region; of a region that one joint correlation cannot afford those of the tracks, then those
+        that the place index proposes. Raises ModelRunError: its model has failed; then the next frames are searched
+        without the index, on larger cells."""
+        region = self._blocks[: self.block_count]
+        if self._recognizer is None or len(region) <= self._max_blocks:
+            return region
+        try:
+            candidates = self._recognizer.candidates(image, view, self._hypotheses, self._matcher)
+        except ModelRunError:
+            self._recognizer, self._blocks, self.tracker.tracks = None, [], []
+            raise
+        places = [(track.e_m, track.n_m) for track in self.tracker.tracks]
+        places += [(candidate.e_m, candidate.n_m) for candidate in candidates]
+        return select_blocks(places, region, self._cell_m, self._max_blocks)
+
+    def _index_fits(self, view: View) -> bool:
+        return self._recognizer is not None and self._recognizer.fits(view, self._hypotheses, self._matcher)
+
     def _initialize(self, view: View) -> None:
         self._hypotheses = self._matcher.map_search_hypotheses(view)
         e_min, n_min, e_max, n_max = self._map.bounds_m
@@ -194,9 +222,12 @@ class MapSearch:
             self._correlator = BlockCorrelator(self._map, PooledGradientDescriber())
             stride = self._correlator.stride
             cell_m = self._correlator.cell_m(stride * self._matcher.cell_m(view.agl_m, CELL_PER_AGL / stride))
-            while places_m2 / cell_m**2 > MAX_WORK:
+            if places_m2 / cell_m**2 <= MAX_WORK or not self._index_fits(view):
+                self._recognizer = None
+            while places_m2 / cell_m**2 > MAX_WORK and self._recognizer is None:
                 cell_m *= 2.0  # the next octave of the map
         self._cell_m = cell_m
+        self._max_blocks = max(int(MAX_WORK / (len(self._hypotheses) * BLOCK_CELLS**2)), 1)
         blocks = blocks_of(self._map.bounds_m, cell_m)
         self._row0, self._column0 = min(b.row for b in blocks), min(b.column for b in blocks)
         rows = max(b.row for b in blocks) - self._row0 + BLOCK_CELLS
@@ -221,25 +252,12 @@ class MapSearch:
             max(round(share * agl_m / self._cell_m), 1)
             for share in (NEIGHBOUR_RADIUS, MERGE_RADIUS, LEAD_SEARCH_RADIUS)
         )
-        remaining, peaks, beside = z.copy(), list[Peak](), list[Peak]()
-
-        def best_of(region: np.ndarray, r0: int = 0, c0: int = 0) -> Peak:
-            r, c = (int(v) for v in np.unravel_index(int(np.argmax(region)), region.shape))
-            return Peak(r0 + r, c0 + c, float(region[r, c]), self._hypotheses[int(index[r0 + r, c0 + c])])
-
-        for k in range(MAX_PROPOSALS):
-            peaks.append(best_of(remaining))
-            r, c = peaks[-1].row, peaks[-1].column
-            if k < NEIGHBOUR_PROPOSALS:
-                remaining[max(r - same, 0) : r + same + 1, max(c - same, 0) : c + same + 1] = UNKNOWN
-                r0, c0 = max(r - near, 0), max(c - near, 0)
-                beside.append(best_of(remaining[r0 : r + near + 1, c0 : c + near + 1], r0, c0))
-            remaining[max(r - near, 0) : r + near + 1, max(c - near, 0) : c + near + 1] = UNKNOWN
+        peaks, beside = find_peaks(z, MAX_PROPOSALS, near, NEIGHBOUR_PROPOSALS, same)
+        self.proposed = [self._place_of(peak, index) for peak in peaks if peak.z > UNKNOWN]
         for peak in (*peaks, *beside):
-            e_m = (peak.column + self._column0 + 0.5) * self._cell_m
-            n_m = -(peak.row + self._row0 + 0.5) * self._cell_m
             if peak.z > UNKNOWN:
-                self.tracker.propose(e_m, n_m, peak.hypothesis, agl_m)
+                place = self._place_of(peak, index)
+                self.tracker.propose(place.e_m, place.n_m, place.hypothesis, agl_m)
         wide = self._mosaic.length_m >= NEW_GROUND * agl_m
         for track in self.tracker.tracks:
             r = round(-track.n_m / self._cell_m - 0.5) - self._row0
@@ -251,3 +269,8 @@ class MapSearch:
             rivals = [p.z for p in peaks if np.hypot(p.row - r, p.column - c) > near]
             # A better value beside the track counts against it.
             track.add_lead(here - max(rivals, default=UNKNOWN) - (beside_it - here), wide=wide)
+
+    def _place_of(self, peak: Peak, index: np.ndarray) -> ProposedPlace:
+        e_m = (peak.column + self._column0 + 0.5) * self._cell_m
+        n_m = -(peak.row + self._row0 + 0.5) * self._cell_m
+        return ProposedPlace(e_m, n_m, self._hypotheses[int(index[peak.row, peak.column])])

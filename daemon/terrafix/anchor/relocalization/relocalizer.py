@@ -64,7 +64,8 @@ class Relocalizer:
 
     def start(self, best: MapLayer, agl_m: float, around_m: tuple[float, float] | None) -> None:
         """Starts a search around ``around_m`` (local east, north); None: on the whole map."""
-        self._search = MapSearch(best.map, best.matcher, agl_m, around_m, best.null_at(agl_m), self._budget)
+        null = best.null_at(agl_m)
+        self._search = MapSearch(best.map, best.matcher, agl_m, around_m, null, self._budget, best.recognizer)
         self.sigma_m = unknown_sigma_m(best.map)
 
     def predict(self, step_m: tuple[float, float], sigma_m: float) -> None:
@@ -94,6 +95,7 @@ class Relocalizer:
             match,
             verdict=Verdict.LOST,
             matches=[],
+            pnp=None,
             pose=None,
             inliers=0,
             search=SearchResult(

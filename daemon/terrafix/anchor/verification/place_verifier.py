@@ -8,7 +8,6 @@ import numpy as np
 from terrafix.anchor.matching.frame_matcher import (
     FIX_GSD_PER_AGL,
     PATCH_PER_AGL,
-    SEARCH_RADIUS,
     Fix,
     FrameMatcher,
     View,
@@ -16,10 +15,10 @@ from terrafix.anchor.matching.frame_matcher import (
 )
 from terrafix.anchor.matching.orthorectify import rectify
 from terrafix.anchor.matching.patch_matcher import correlate_patches
-from terrafix.anchor.matching.pnp import MIN_INLIERS, PnpResult
 from terrafix.anchor.verification.patch_consensus import PatchConsensus, estimate_consensus
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
+from terrafix.core.pnp import MIN_INLIERS, SEARCH_RADIUS, PnpResult
 from terrafix.core.pose import fit_pose
 from terrafix.map.package import LocalMap
 from terrafix.messages import Verdict

@@ -10,6 +10,7 @@ from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, t_ns
 from terrafix.core.geodesy import yaw_of
 from terrafix.estimator.integrity.time_offset import GRID_S, MAX_SLEW, PRIOR_SIGMA_S, TimeOffset, Turn
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.estimator.pose_estimator import EstimatedFlight
 from terrafix.messages import Odometry, Prediction, VehicleState
 
 FRAME_S, TELEMETRY_S = 0.5, 0.1
@@ -107,10 +108,16 @@ class LateCamera(TimeOffset):
         self.turns.append(turn)
 
 
+def flight_of(run: EstimatorRun) -> EstimatedFlight:
+    flight = run.node._flight
+    assert flight is not None
+    return flight
+
+
 def test_the_node_shifts_frame_times_by_the_slew_limited_offset_and_adds_turns_at_the_stamps() -> None:
     flight, late = Flight(30, seed=3), LateCamera()
     listener = EstimatorRun().fly(flight, 0, 10)
-    listener.node._time_offset = late
+    flight_of(listener).time_offset = late
     listener.fly(flight, 10, 30)
     shifted_s = [(t_ns(i) - listener.estimate(i).t_ns) * 1e-9 for i in range(10, 30)]
     assert shifted_s == pytest.approx([min(MAX_SLEW * 0.5 * (i + 1), 1.0) for i in range(20)])
@@ -121,7 +128,7 @@ def test_the_node_adds_the_turns_of_the_camera_except_beside_untracked_frames() 
     """Between and within keyframes, across north; none beside a frame without tracking."""
     flight, late, dark = Flight(50, seed=3, turn_rad=-4.0), LateCamera(), 25
     listener = EstimatorRun().fly(flight, 0, 10)
-    listener.node._time_offset = late
+    flight_of(listener).time_offset = late
     for i in range(10, 50):
         listener.feed([blind(m) if isinstance(m, Odometry) and i == dark else m for m in flight.messages(i)])
     heading_rad = {t_ns(i): yaw_of(r) for i, r in enumerate(flight.r_w_b)}
@@ -155,7 +162,7 @@ def test_the_uncertainty_of_the_time_offset_inflates_the_covariance_along_the_ve
     flight, covs_m2 = Flight(12, seed=3), []
     for offset in (KnownTo(0.3, unstamped), KnownTo(0.03, 0.0)):
         listener = EstimatorRun().fly(flight, 0, 11)
-        listener.node._time_offset = offset
+        flight_of(listener).time_offset = offset
         covs_m2.append(cov_of(listener.fly(flight, 11, 12).estimate(11))[:2, :2])
         left_s2 = offset.sigma_s**2
     way_m = (flight.p_m[11] - flight.p_m[10])[:2]
@@ -169,7 +176,7 @@ def test_the_uncertainty_of_the_time_offset_inflates_the_covariance_along_the_ve
 def test_a_new_origin_resets_the_time_offset() -> None:
     flight, late = Flight(12, seed=3), LateCamera()
     listener = EstimatorRun().fly(flight, 0, 2)
-    listener.node._time_offset = late
+    flight_of(listener).time_offset = late
     listener.fly(flight, 2, 12)
     assert late.applied_s > 0.5
     listener.feed([msgspec.structs.replace(ORIGIN, start_sigma_m=20.0)])

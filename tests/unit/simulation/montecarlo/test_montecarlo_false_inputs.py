@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -117,6 +118,8 @@ def test_over_the_map_of_another_town_a_fifth_of_the_frames_have_wrong_matches()
     assert min(off) > 30.0 and max(off) < 120.0
     assert 0.3 < np.mean(np.abs(np.diff(off)) < 8.0) < 0.8  # half of them agree with the one before
     assert lies.match(0, PREDICTION, always(FOUND)) == FOUND
+    dark = msgspec.structs.replace(NOTHING, verdict=Verdict.BAD_IMAGE)
+    assert all(lies.match(i, PREDICTION, always(dark)) == dark for i in after * 20)
 
 
 def test_the_search_model_is_lost_without_matches_and_finds_a_visible_place() -> None:
@@ -139,6 +142,15 @@ def test_the_search_model_is_lost_without_matches_and_finds_a_visible_place() ->
     reset = Search()
     looks = [reset.update(FOUND if i % 10 == 9 else NOTHING, PREDICTION, shot, visible) for i in range(60)]
     assert not any(m.verdict is Verdict.LOST for m in looks)
+
+
+def test_frames_without_a_picture_are_no_evidence_against_the_position() -> None:
+    shot = Shot(0.0, np.array([300.0, 0.0, 100.0]), np.eye(3), np.eye(3), np.zeros(3))
+    dark = msgspec.structs.replace(NOTHING, verdict=Verdict.BAD_IMAGE)
+    search = Search()
+    assert all(search.update(dark, PREDICTION, shot, always(dark)) == dark for _ in range(4 * of.LOST_FRAMES))
+    matches = [search.update(NOTHING, PREDICTION, shot, always(NOTHING)) for _ in range(of.LOST_FRAMES)]
+    assert [m.verdict is Verdict.LOST for m in matches].index(True) == of.LOST_FRAMES - 1
 
 
 def judged(lie_from_s: float | None, false_at: list[int], new_ground: float = 1.0) -> FlightResult:

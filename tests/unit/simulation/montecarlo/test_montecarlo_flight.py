@@ -12,11 +12,12 @@ import pytest
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
+from terrafix.core.pnp import solved
 from terrafix.estimator.measurements.odometry import OdometryMeasurement
 from terrafix.messages import MapMatch, Prediction, Verdict
 from terrafix_tools.montecarlo.fault import LIES, Fault
 from terrafix_tools.montecarlo.faults import JUMP_M, JUMPS, Faults
-from terrafix_tools.montecarlo.flight import run
+from terrafix_tools.montecarlo.flight import find_match, run
 from terrafix_tools.montecarlo.flown import Shot, SimulatedFlight, fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
 from terrafix_tools.montecarlo.lens import Lens
@@ -104,7 +105,7 @@ def test_simulated_matches_have_small_and_consistent_errors(flown: tuple[FlightP
     matches = _matches(drawn, flight, offset)
     off, share = [], []
     for i, shot in enumerate(flight.frames):
-        match = matches.match(_prediction(i, shot), shot)
+        match = solved(matches.match(_prediction(i, shot), shot))
         if match.verdict is Verdict.ACCEPTED and match.pose is not None and not match.pose.position_only:
             error = np.array(match.pose.p_c_in_w_m)[:2] - shot.p_m[:2] - offset
             cov = np.array(match.pose.cov).reshape(6, 6)[:2, :2]
@@ -134,7 +135,7 @@ def test_a_wrong_start_widens_the_belief_over_new_ground_until_it_finds_the_plac
     matches, found, sigmas_m = _matches(drawn, flight, np.zeros(2)), [], []
     for i, shot in enumerate(flight.frames[20:], start=20):  # in cruise
         prediction = _moving(_prediction(i, shot, east_m=300.0), flight.frames[i - 1], shot)
-        match = matches.match(prediction, shot)
+        match = solved(matches.match(prediction, shot))
         found.append(match.verdict is Verdict.ACCEPTED)
         assert match.belief is not None
         sigmas_m.append(float(np.sqrt(match.belief.cov_m2[0])))
@@ -183,6 +184,29 @@ def test_faults_have_their_stated_times_and_sizes(flown: tuple[FlightPlan, Simul
     assert not np.isfinite(moved(Fault.NONE)).any()
     blind = [Faults(Fault.BLACKOUT, 600.0, 1).is_blacked_out(float(t)) for t in range(600)]
     assert sum(blind) == 120
+
+
+@pytest.mark.parametrize(
+    ("fault", "t_s", "verdict"),
+    [
+        (Fault.BLACKOUT, 160.0, Verdict.BAD_IMAGE),  # a blackout begins at a quarter of the flight
+        (Fault.DRIFT, 100.0, Verdict.FEW_INLIERS),  # the map ends at 90 s
+        (Fault.BLACKOUT, 100.0, Verdict.ACCEPTED),
+        (Fault.DRIFT, 80.0, Verdict.ACCEPTED),
+    ],
+)
+def test_no_frame_is_matched_in_the_dark_or_over_ground_without_a_map(
+    flown: tuple[FlightPlan, SimulatedFlight], fault: Fault, t_s: float, verdict: Verdict
+) -> None:
+    drawn, flight = flown
+    matches = _matches(drawn, flight, np.zeros(2))
+    shot = flight.frames[20]
+    find = find_match(matches, Faults(fault, 600.0, 1), t_s)
+    found = [find(_prediction(20, shot), shot) for _ in range(20)]
+    if verdict is Verdict.ACCEPTED:
+        assert any(m.verdict is verdict and solved(m).pose is not None for m in found)
+    else:
+        assert all(m.verdict is verdict and solved(m).pose is None and m.belief is None for m in found)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.node import Node
+from terrafix.core.pnp import solved
 from terrafix.messages import Frame, Health, MapMatch, MapPose, MatchPlace, Message, Prediction, ThermalBand, Verdict
 from terrafix_tools.accept.measuring.results import Span
 
@@ -32,7 +33,7 @@ class WrongFixes:
 
     def _with_offset(self, prediction: Prediction, match: MapMatch) -> MapMatch:
         towards = self._rng.uniform(0.0, 2.0 * np.pi)
-        near = match.pose or prediction
+        near = solved(match).pose or prediction
         e_m, n_m, up_m = near.p_c_in_w_m
         e_m, n_m = e_m + OUTLIER_M * float(np.sin(towards)), n_m + OUTLIER_M * float(np.cos(towards))
         cov = np.diag([OUTLIER_SIGMA_M**2] * 3 + [OUTLIER_SIGMA_RAD**2] * 3)
@@ -40,6 +41,7 @@ class WrongFixes:
             match,
             verdict=Verdict.ACCEPTED,
             matches=[],
+            pnp=None,
             inliers=48,
             pose=MapPose(p_c_in_w_m=(e_m, n_m, up_m), q_w_c=near.q_w_c, cov=tuple(float(v) for v in cov.ravel())),
             place=MatchPlace(e_m=e_m, n_m=n_m, mass=0.99),

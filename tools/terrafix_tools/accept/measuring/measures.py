@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.pnp import solved
 from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, NavEstimate, SearchState, SearchStep, SourceLabel
 from terrafix.messages import Verdict as Answer
@@ -149,6 +150,7 @@ def map_px(e: Evidence) -> Measured:
     means = []
     for frame in e.frames:
         match = frame.match
+        match = None if frame.match is None else solved(frame.match)
         if frame.fixed and match is not None and match.matches and match.pose is not None:
             points = np.array(match.matches)
             in_c = (points[:, 2:5] - np.array(match.pose.p_c_in_w_m)) @ rot_from_quat(match.pose.q_w_c)

@@ -15,7 +15,7 @@ from terrafix_tools.mapping.package.pyramid import Place
 from terrafix_tools.mapping.parallel import PoolProvider, render_pieces
 from terrafix_tools.mapping.progress import Bar
 
-# Ground metres per pixel: four octaves. The search uses a 52nd of the height, so these serve 50 to 1500 m above ground;
+# Ground metres per pixel: four octaves. The search uses an 80th of the height, so these serve 75 to 1800 m;
 # finer ones would be as large as the imagery, and the search of a large map uses coarser cells anyway.
 FINEST_M, COARSEST_M = 1.4, 23.0
 PAD_PX = 32  # margin around a tile, so that its descriptors have no edge effect

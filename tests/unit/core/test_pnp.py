@@ -1,12 +1,16 @@
 """Pose from patch matches: right despite many wrong matches, none from random ones."""
 
+from typing import Any
+
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
-from terrafix.anchor.matching.pnp import INLIER_THRESHOLD, MIN_INLIERS, PLANAR_RELIEF, PnpResult, solve
+from terrafix.core.geodesy import quat_from_rot
+from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, PLANAR_RELIEF, PnpResult, solve
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.messages import Verdict
+from terrafix.messages import PnpInput, Verdict
 from textured_ground import rotation
 
 AGL_M = 100.0
@@ -22,8 +26,19 @@ def scene(rng: np.random.Generator, count: int, relief_m: float) -> tuple[np.nda
     return points, in_c[:, :2] / in_c[:, 2:] + rng.normal(0.0, SIGMA, (count, 2))
 
 
-def solve_equal_weights(points: np.ndarray, xy: np.ndarray, r: np.ndarray = R, reach: float = REACH) -> PnpResult:
-    return solve(points, xy, np.ones(len(xy)), r, AGL_M, SIGMA, INLIER_THRESHOLD, reach)
+GIVEN = PnpInput(
+    q_w_c=quat_from_rot(R),
+    agl_m=AGL_M,
+    sigma_floor=SIGMA,
+    threshold=INLIER_THRESHOLD,
+    search_radius=REACH,
+    min_inliers=MIN_INLIERS,
+)
+
+
+def solve_equal_weights(points: np.ndarray, xy: np.ndarray, r: np.ndarray = R, **given: Any) -> PnpResult:
+    """``given``: other fields of GIVEN."""
+    return solve(points, xy, np.ones(len(xy)), msgspec.structs.replace(GIVEN, q_w_c=quat_from_rot(r), **given))
 
 
 @pytest.mark.parametrize("relief_m", [0.0, 8.0])
@@ -119,9 +134,8 @@ def test_few_matches_give_no_pose(count: int) -> None:
 
 def test_the_required_number_of_inliers_is_an_argument() -> None:
     points, xy = scene(np.random.default_rng(1), 18, 5.0)
-    arguments = (points, xy, np.ones(len(xy)), R, AGL_M, SIGMA, INLIER_THRESHOLD, REACH)
-    assert solve(*arguments).verdict is Verdict.ACCEPTED
-    assert solve(*arguments, min_inliers=20).verdict is Verdict.FEW_INLIERS
+    assert solve_equal_weights(points, xy).verdict is Verdict.ACCEPTED
+    assert solve_equal_weights(points, xy, min_inliers=20).verdict is Verdict.FEW_INLIERS
 
 
 def test_a_quarter_of_right_matches_gives_no_wrong_pose() -> None:
@@ -152,7 +166,7 @@ def test_random_matches_of_the_wide_search_are_rejected() -> None:
         rng = np.random.default_rng([seed, 10])
         points, xy = scene(rng, int(rng.integers(10, 49)), 0.0)
         points[:, :2] += rng.uniform(-0.2, 0.2, (len(points), 2)) * AGL_M
-        found = solve(points, xy, np.ones(len(xy)), R, AGL_M, SIGMA, 0.05, 0.2)
+        found = solve_equal_weights(points, xy, threshold=0.05, search_radius=0.2)
         passed += found.verdict is Verdict.ACCEPTED
     assert passed <= 1
 
@@ -198,3 +212,23 @@ def mean_nees(wrong: int) -> float:
 def test_false_inliers_inflate_the_covariance() -> None:
     """Counted as inliers, the wrong matches raise the mean NEES by half."""
     assert mean_nees(wrong=26) < 1.3 * mean_nees(wrong=0)
+
+
+def test_numbers_that_are_not_finite_are_degenerate() -> None:
+    points, xy = scene(np.random.default_rng(1), 20, 0.0)
+    for spoilt in (0, 1):
+        arrays = [points.copy(), xy.copy()]
+        arrays[spoilt][3, 1] = np.nan
+        found = solve_equal_weights(*arrays)
+        assert (found.verdict, found.fit) == (Verdict.DEGENERATE, None)
+    weights = np.ones(20)
+    weights[3] = np.inf
+    assert solve(points, xy, weights, GIVEN).verdict is Verdict.DEGENERATE
+
+
+def test_weights_count_in_the_refinement() -> None:
+    points, xy = scene(np.random.default_rng(1), 20, 0.0)
+    xy[:10] += 0.005
+    heavy, light = (solve(points, xy, np.r_[np.full(10, weight), np.ones(10)], GIVEN).fit for weight in (1.0, 0.01))
+    assert heavy is not None and light is not None
+    assert light.residuals[10:].mean() < 0.7 * heavy.residuals[10:].mean()
