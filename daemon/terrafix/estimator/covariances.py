@@ -35,7 +35,7 @@ class Covariances:
             self._read = {node: self.pose(node) for node in self._graph.window}
             self._propagated = None
             return
-        self._propagated = PropagatedCovariance()
+        self._propagated, self._rebuilds = PropagatedCovariance(), self._graph.rebuilds
         for node in self._graph.window:
             self._propagated.begin(node, self._graph.joint_covariance(node))
 

@@ -376,9 +376,7 @@ class Propagation:
         if state.mode is CovarianceMode.JACOBIAN and step.seen is not None and step.increment is not None:
             increment = replace(step.increment, cov=step.increment.cov / state.graph.motion_weight)
             predicted_cov = predict_covariance(increment, state.velocity_cov)
-            _, predicted_cov, _ = fuse_odometry_increment(
-                increment, step.seen.off_m, predicted_cov, step.seen.cov_m2
-            )
+            _, predicted_cov, _ = fuse_odometry_increment(increment, step.seen.off_m, predicted_cov, step.seen.cov_m2)
         return predicted_cov[DELTA_MOTION, DELTA_MOTION]
 
     def _walk_sigmas(self, step: _Step) -> np.ndarray:

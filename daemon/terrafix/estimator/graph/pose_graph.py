@@ -3,7 +3,7 @@ refinement after landing (marginalized.py).
 
 A node is one frame with the variables C_k, B_k and V_k (terrafix.estimator.state)."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,7 +15,7 @@ from terrafix.estimator.factors.motion import motion_factor
 from terrafix.estimator.factors.noise import robust_noise
 from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
 from terrafix.estimator.factors.three_view import ThreeViewConstraint, three_view_factor
-from terrafix.estimator.graph.elimination import NODE_SIZE
+from terrafix.estimator.graph.elimination import NODE_SIZE, graph_of, values_of
 from terrafix.estimator.graph.fixed_lag import FixedLagSmoother
 from terrafix.estimator.graph.marginalized import MarginalizedHistory
 from terrafix.estimator.models.bias_walk import walk_sigmas
@@ -259,7 +259,7 @@ class PoseGraph:
 
     def add(self, *new: gtsam.NonlinearFactor) -> None:
         """Adds factors of nodes in the window."""
-        factors = _graph_of(new)
+        factors = graph_of(new)
         self._history.add(factors)
         self._update(partial(self._smoother.add, factors))
 
@@ -278,7 +278,7 @@ class PoseGraph:
         return self._history.refine()
 
     def _insert(self, t_s: float, state: NodeState, new: list[gtsam.NonlinearFactor]) -> None:
-        factors = _graph_of(new)
+        factors = graph_of(new)
         node = self._next
         leaving = self._smoother.leaving(node)
         if leaving:
@@ -286,7 +286,7 @@ class PoseGraph:
             self._history.marginalize(leaving, self._smoother.linearization_point())
         else:
             self._history.reduce_step()
-        values = _values(node, state)
+        values = values_of({node: state})
         self._last_good.insert(values)
         self._next += 1
         self._times[node] = t_s
@@ -321,9 +321,9 @@ class PoseGraph:
         self._new_smoother()
         self._times = {node: self._times[node]}
         pose_prior, others = _prior_factors(node, rebuild_prior(state))
-        factors = _graph_of([pose_prior, *others])
+        factors = graph_of([pose_prior, *others])
         self._history.add(factors)
-        self._smoother.insert(node, factors, _values(node, state))
+        self._smoother.insert(node, factors, values_of({node: state}))
 
     def _new_smoother(self) -> None:
         self._smoother = FixedLagSmoother()
@@ -354,13 +354,6 @@ def _empty_factor(node: int) -> gtsam.LinearContainerFactor:
     )
 
 
-def _graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph
-
-
 def _prior_factors(node: int, prior: GraphPrior) -> tuple[gtsam.NonlinearFactor, list[gtsam.NonlinearFactor]]:
     """-> the prior of the pose, and all others of the first node of a graph."""
     gaussian = gtsam.noiseModel.Gaussian.Covariance
@@ -370,11 +363,3 @@ def _prior_factors(node: int, prior: GraphPrior) -> tuple[gtsam.NonlinearFactor,
         gtsam.PriorFactorVector(V(node), prior.state.velocity, gaussian(prior.velocity_cov)),
     ]
     return pose_prior, others if prior.attitude is None else [*others, prior.attitude]
-
-
-def _values(node: int, state: NodeState) -> gtsam.Values:
-    values = gtsam.Values()
-    values.insert(C(node), state.pose)
-    values.insert(B(node), state.bias)
-    values.insert(V(node), state.velocity)
-    return values

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, C, V
 
-from terrafix.estimator.graph.elimination import NODE_SIZE, eliminate, linearize
+from terrafix.estimator.graph.elimination import NODE_SIZE, eliminate, graph_of, linearize, values_of
 from terrafix.estimator.state import CALIBRATION_SIZE, POSE_SIZE, NodeState
 
 # Blocks of the covariance of a node. [spec: order C, B, V]
@@ -50,7 +49,7 @@ class PropagatedCovariance:
 
         What the factors tell of the parent (its attitude, seen from the new node) improves the parent, and of its other
         relatives none: they may become parents only by a reference to an older keyframe."""
-        joint = linearize(_graph_of(factors), [node, parent], _values(states))
+        joint = linearize(graph_of(factors), [node, parent], values_of(states))
         conditional, of_parent = eliminate([joint], [node])
         self._cov[parent] = _updated(self._cov[parent], of_parent.a)
         inverse = np.linalg.inv(conditional.r)
@@ -61,7 +60,7 @@ class PropagatedCovariance:
     def fuse(self, node: int, factors: Iterable[gtsam.NonlinearFactor], state: NodeState) -> None:
         """Kalman update of ``node`` and its relatives. ``factors``: of the variables of ``node``, whose estimate is
         ``state``."""
-        measured = linearize(_graph_of(factors), [node], _values({node: state}))
+        measured = linearize(graph_of(factors), [node], values_of({node: state}))
         before = self._cov[node]
         self._cov[node] = _updated(before, measured.a)
         self._pass_on(node, before, None)
@@ -89,15 +88,6 @@ class PropagatedCovariance:
         return gains
 
 
-def _values(states: Mapping[int, NodeState]) -> gtsam.Values:
-    values = gtsam.Values()
-    for node, state in states.items():
-        values.insert(C(node), state.pose)
-        values.insert(B(node), state.bias)
-        values.insert(V(node), state.velocity)
-    return values
-
-
 def _updated(cov: np.ndarray, a: np.ndarray) -> np.ndarray:
     """``cov`` (n, n) after a measurement with Jacobian ``a`` (m, n) and unit noise."""
     cross = cov @ a.T
@@ -106,10 +96,3 @@ def _updated(cov: np.ndarray, a: np.ndarray) -> np.ndarray:
 
 def _symmetric(cov: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * (cov + cov.T))
-
-
-def _graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph
