@@ -104,7 +104,7 @@ class GraphObserver:
 
 class PoseGraph:
     """``rebuilds``: how often the smoother failed and was built anew from the last good estimate. ``ties``: of the
-    newest node that was added by ``extend``; None: there was none."""
+    newest node that was added by ``extend``; None: there was none, or the graph was built anew since."""
 
     def __init__(self, history: MarginalizedHistory | None = None, observer: GraphObserver | None = None) -> None:
         self._observer = observer or GraphObserver()
@@ -152,8 +152,10 @@ class PoseGraph:
 
     @property
     def motion_weight(self) -> float:
-        """Robust weight of the motion factor of the newest node, at its linearization; 1 where it is not robust."""
-        assert self.ties is not None
+        """Robust weight of the motion factor of the newest node, at its linearization; 1 where it is not robust, and
+        where the node has none since the graph was built anew."""
+        if self.ties is None:
+            return 1.0
         noise = self.ties.motion.noiseModel()
         if not isinstance(noise, gtsam.noiseModel.Robust):
             return 1.0
@@ -312,6 +314,7 @@ class PoseGraph:
     def _rebuild(self) -> None:
         """A new graph of the newest node alone, from the last good estimate, with wide priors."""
         self.rebuilds += 1
+        self.ties = None
         node = self.newest
         state = NodeState(
             self._last_good.atPose3(C(node)), self._last_good.atVector(B(node)), self._last_good.atVector(V(node))

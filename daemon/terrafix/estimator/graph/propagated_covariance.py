@@ -6,7 +6,6 @@ those that the graph gets. It leaves out what ties a node to more than its paren
 of frames with odometry), so that it claims no more than the graph knows."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -19,79 +18,71 @@ POSE, CALIBRATION = slice(0, POSE_SIZE), slice(POSE_SIZE, POSE_SIZE + CALIBRATIO
 MOTION = slice(POSE_SIZE + CALIBRATION_SIZE, NODE_SIZE)
 
 
-@dataclass(frozen=True)
-class _Edge:
-    """Changes of a node given those of its ``parent``: ``by_parent`` (NODE_SIZE, NODE_SIZE) times these, plus noise."""
-
-    parent: int
-    by_parent: np.ndarray
-
-
 class PropagatedCovariance:
     """Covariances (NODE_SIZE, NODE_SIZE) in the order of `elimination`: C, B, V."""
 
     def __init__(self) -> None:
         self._cov: dict[int, np.ndarray] = {}
-        self._edges: dict[int, _Edge] = {}  # of each node with a parent in the window
+        # Of a node with each node that it is joined to (its parent and its children): rows of the former
+        self._cross: dict[int, dict[int, np.ndarray]] = {}
 
     def __getitem__(self, node: int) -> np.ndarray:
         return self._cov[node]
 
     def begin(self, node: int, cov: np.ndarray) -> None:
-        """``node`` has covariance ``cov`` and no parent."""
-        self._cov[node] = cov
-        self._edges.pop(node, None)
+        """A new ``node`` has covariance ``cov`` and no parent."""
+        self._cov[node], self._cross[node] = cov, {}
 
     def extend(
         self, node: int, parent: int, factors: Iterable[gtsam.NonlinearFactor], states: Mapping[int, NodeState]
     ) -> None:
         """A new ``node``. ``factors``: of it and ``parent``; they determine it. ``states``: estimates of both.
 
-        What the factors tell of the parent (its attitude, seen from the new node) improves the parent, and of its other
-        relatives none: they may become parents only by a reference to an older keyframe."""
+        What the factors tell of the parent (its attitude, seen from the new node) is a measurement there."""
         joint = linearize(graph_of(factors), [node, parent], values_of(states))
         conditional, of_parent = eliminate([joint], [node])
-        self._cov[parent] = _updated(self._cov[parent], of_parent.a)
+        self._update(parent, of_parent.a)
         inverse = np.linalg.inv(conditional.r)
         by_parent = -inverse @ conditional.s
-        self._cov[node] = by_parent @ self._cov[parent] @ by_parent.T + inverse @ inverse.T
-        self._edges[node] = _Edge(parent, by_parent)
+        cross = by_parent @ self._cov[parent]
+        self.begin(node, _symmetric(cross @ by_parent.T + inverse @ inverse.T))
+        self._join(node, parent, cross)
 
     def fuse(self, node: int, factors: Iterable[gtsam.NonlinearFactor], state: NodeState) -> None:
-        """Kalman update of ``node`` and its relatives. ``factors``: of the variables of ``node``, whose estimate is
-        ``state``."""
-        measured = linearize(graph_of(factors), [node], values_of({node: state}))
-        before = self._cov[node]
-        self._cov[node] = _updated(before, measured.a)
-        self._pass_on(node, before, None)
+        """Kalman update of ``node`` and of all that it is joined to. ``factors``: of the variables of ``node``, whose
+        estimate is ``state``."""
+        self._update(node, linearize(graph_of(factors), [node], values_of({node: state})).a)
 
     def retain(self, nodes: tuple[int, ...]) -> None:
         """Drops all nodes but ``nodes``."""
         self._cov = {node: cov for node, cov in self._cov.items() if node in nodes}
-        self._edges = {n: edge for n, edge in self._edges.items() if n in self._cov and edge.parent in self._cov}
+        self._cross = {
+            node: {other: cross for other, cross in self._cross[node].items() if other in self._cov}
+            for node in self._cov
+        }
+
+    def _join(self, node: int, other: int, cross: np.ndarray) -> None:
+        self._cross[node][other], self._cross[other][node] = cross, cross.T
+
+    def _update(self, node: int, a: np.ndarray) -> None:
+        """Measurement of ``node`` with Jacobian ``a`` (m, NODE_SIZE) and unit noise."""
+        before = self._cov[node]
+        cross = before @ a.T
+        self._cov[node] = _symmetric(before - cross @ np.linalg.solve(a @ cross + np.eye(len(a)), cross.T))
+        self._pass_on(node, before, source=None)
 
     def _pass_on(self, node: int, before: np.ndarray, source: int | None) -> None:
-        """The covariance of ``node`` was ``before``: updates its neighbours but ``source``, and theirs. A neighbour x
-        is J times the node plus what the measurement tells nothing about (Rauch, Tung and Striebel 1965)."""
-        change = before - self._cov[node]
-        for neighbour, gain in self._gains(node, before).items():
-            if neighbour != source:
-                neighbour_before = self._cov[neighbour]
-                self._cov[neighbour] = _symmetric(neighbour_before - gain @ change @ gain.T)
-                self._pass_on(neighbour, neighbour_before, node)
-
-    def _gains(self, node: int, before: np.ndarray) -> dict[int, np.ndarray]:
-        """Neighbour -> its regression (NODE_SIZE, NODE_SIZE) on ``node``, whose covariance was ``before``."""
-        gains = {n: edge.by_parent for n, edge in self._edges.items() if edge.parent == node}
-        if edge := self._edges.get(node):
-            gains[edge.parent] = np.linalg.solve(before, edge.by_parent @ self._cov[edge.parent]).T
-        return gains
-
-
-def _updated(cov: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """``cov`` (n, n) after a measurement with Jacobian ``a`` (m, n) and unit noise."""
-    cross = cov @ a.T
-    return _symmetric(cov - cross @ np.linalg.solve(a @ cross + np.eye(len(a)), cross.T))
+        """The covariance of ``node`` was ``before``: updates the nodes that it is joined to but ``source``, and theirs.
+        Such a node is a gain times ``node`` plus what the measurement tells nothing about (Rauch, Tung, Striebel
+        1965), so the gain stays as it was."""
+        cov = self._cov[node]
+        for other, cross in list(self._cross[node].items()):
+            if other == source:
+                continue
+            gain, other_before = np.linalg.solve(before, cross).T, self._cov[other]
+            self._cov[other] = _symmetric(other_before - gain @ (before - cov) @ gain.T)
+            self._join(node, other, cov @ gain.T)
+            self._pass_on(other, other_before, node)
 
 
 def _symmetric(cov: np.ndarray) -> np.ndarray:
