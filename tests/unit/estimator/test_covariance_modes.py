@@ -113,6 +113,18 @@ def test_propagation_begins_with_the_marginals_of_the_window() -> None:
         )
 
 
+def test_a_flight_that_begins_hot_begins_with_the_covariance_of_the_graph() -> None:
+    """One node: with the reported attitude and height."""
+    run = EstimatorRun()
+    run.feed([health(ThermalBand.HOT)])
+    estimator, last = newest(run.fly(Flight(1, seed=2, fix_every=100), 0, 1))
+    state, graph = estimator.state, estimator.graph
+    assert state.covariances.pose(last.node) == pytest.approx(graph.covariance(last.node), rel=1e-3, abs=1e-9)
+    assert state.covariances.calibration(last.node) == pytest.approx(
+        graph.bias_covariance(last.node), rel=1e-3, abs=1e-9
+    )
+
+
 def test_the_propagated_covariance_grows_with_the_way_and_shrinks_with_a_map_match() -> None:
     flight = Flight(60, seed=2, fix_every=100)
     run = hot_run(flight, 60)
@@ -251,3 +263,10 @@ def test_a_rebuild_before_the_change_of_mode_leaves_no_trace_in_propagation(monk
     estimator, last = newest(run)
     marginal = estimator.graph.covariance(last.node)
     assert np.trace(last.cov[3:, 3:]) == pytest.approx(np.trace(marginal[3:, 3:]), rel=0.1)
+
+
+def test_propagation_holds_the_nodes_of_the_window_alone() -> None:
+    estimator, _ = newest(hot_run(Flight(60, seed=2), 60))
+    propagated = estimator.state.covariances._propagated
+    assert propagated is not None
+    assert set(propagated._cov) == set(propagated._cross) == set(estimator.graph.window)

@@ -79,7 +79,7 @@ class NodeTies:
     """Factors by which the newest node was tied to its parent (``odometry``) and to the node before (``motion``)."""
 
     odometry: gtsam.NonlinearFactor
-    motion: gtsam.NonlinearFactor
+    motion: gtsam.NoiseModelFactor
 
 
 class GraphObserver:
@@ -156,11 +156,9 @@ class PoseGraph:
         where the node has none since the graph was built anew."""
         if self.ties is None:
             return 1.0
-        noise = self.ties.motion.noiseModel()
-        if not isinstance(noise, gtsam.noiseModel.Robust):
-            return 1.0
         residual = self.ties.motion.unwhitenedError(self._smoother.linearization_point())
-        return float(noise.robust().weight(float(np.linalg.norm(noise.noise().whiten(residual)))))
+        noise = self.ties.motion.noiseModel()
+        return float(noise.weight(noise.unweightedWhiten(residual)))
 
     def covariance(self, node: int) -> np.ndarray:
         """Marginal of C, (6, 6), tangent order, from the smoother."""
@@ -246,7 +244,7 @@ class PoseGraph:
             rays.k1,
         )
 
-    def _motion_factor(self, node: int, newest: int, increment: MotionIncrement | None) -> gtsam.NonlinearFactor:
+    def _motion_factor(self, node: int, newest: int, increment: MotionIncrement | None) -> gtsam.NoiseModelFactor:
         if increment is not None:
             return motion_factor((C(newest), V(newest)), (C(node), V(node)), (B(newest), B(node)), increment)
         stationary = gtsam.noiseModel.Gaussian.Covariance(stationary_motion_cov())
