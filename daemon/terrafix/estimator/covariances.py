@@ -64,7 +64,6 @@ class Covariances:
 
     def started(self, node: int, prior: GraphPrior) -> None:
         """A new graph has begun with ``node``."""
-        self._read.clear()
         if self._propagated is not None:
             self._propagated = PropagatedCovariance()
             self._propagated.begin(node, prior.node_covariance)

@@ -119,7 +119,6 @@ class FilterState:
         """Factors of the variables of ``node``, of a measurement that was accepted."""
         self.graph.add(*factors)
         self.covariances.measured(node, factors)
-        self.velocity_cov = self.covariances.velocity(node) if node == self.graph.newest else self.velocity_cov
 
     def frame_state(self, frame_id: int, t_s: float, node: int) -> FrameState:
         """Newest estimate of a frame whose node is in the window."""

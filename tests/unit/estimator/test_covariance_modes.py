@@ -196,6 +196,23 @@ def test_the_propagated_covariance_covers_the_errors(fix_every: int) -> None:
     assert np.mean(np.array(rotation) < 7.81) > 0.95
 
 
+def test_the_propagated_velocity_covariance_covers_stops_and_starts() -> None:
+    """They lie in the tail of the motion factor, which has less weight then. Mean of the squared Mahalanobis distance
+    for 2 degrees of freedom."""
+    distances = []
+    for seed in range(4):
+        flight = Flight(90, seed=seed, stop_and_go=True)
+        run = EstimatorRun()
+        run.feed([health(ThermalBand.HOT)])
+        run.fly(flight, 0, HOT_FROM)
+        for i in range(HOT_FROM, 89):
+            run.fly(flight, i, i + 1)
+            last = newest(run)[1]
+            off_mps = last.velocity_mps[:2] - (flight.p_m[i + 1] - flight.p_m[i - 1])[:2]  # in the second between
+            distances.append(off_mps @ np.linalg.solve(last.velocity_cov[:2, :2], off_mps))
+    assert np.mean(distances) < 2.5
+
+
 def test_a_map_match_over_known_ground_adds_its_share_of_information_to_the_propagated_covariance() -> None:
     """One frame later most of the ground is known."""
     flight = Flight(END, seed=2)
