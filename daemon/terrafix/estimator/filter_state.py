@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.covariances import Covariances
 from terrafix.estimator.graph.pose_graph import PoseGraph
 from terrafix.estimator.integrity.fragments import Fragment, Fragments
 from terrafix.estimator.integrity.yaw_gauge import YawGauge
@@ -91,7 +92,7 @@ class FilterState:
         self.graph = graph or PoseGraph()
         self.camera = MountedCamera(origin)
         self.terrain = Terrain(origin.ground_amsl_m or 0.0)
-        self.mode = CovarianceMode.MARGINALS
+        self.covariances = Covariances(self.graph)
         self.principal_point = PrincipalPointFilter(origin.camera, lens)
         self.speed_prior = SpeedPrior()
         self.fragments = Fragments()
@@ -109,39 +110,27 @@ class FilterState:
         self.lens_sigma = radial_k1_sigma(origin.camera)
         self.node_of: dict[int, int] = {}  # frame -> node, for nodes in the window
         self.keyframe_of: dict[int, int] = {}  # node -> frame, of the keyframes among them
-        self.cov_of: dict[int, np.ndarray] = {}  # node -> newest covariance of C (6, 6), to propagate from
-        # node -> node of its keyframe, and covariance (6, 6) of the motion between them, tangent order at the node
-        self.motion_of: dict[int, tuple[int, np.ndarray]] = {}
         self.frames = array("q")  # frame of each node since the flight began
         self.principal_point_jacobians = array("f")  # ... and its ``principal_point_jacobian`` (2, 2)
 
+    @property
+    def mode(self) -> CovarianceMode:
+        return self.covariances.mode
+
     def covariance(self, node: int) -> np.ndarray:
-        """Covariance (6, 6) of C_node, tangent order: the smoother's marginal; under thermal throttle the propagated
-        one: that of the parent through the motion, plus that of the motion. A map match adds its information to the
-        node of its own frame (ON-2)."""
-        if self.mode is CovarianceMode.MARGINALS or node not in self.cov_of:
-            self.cov_of[node] = self.graph.covariance(node)
-        return self.cov_of[node]
+        """Covariance (6, 6) of C_node, tangent order."""
+        return self.covariances.pose(node)
 
-    def set_fused_covariance(self, node: int, cov: np.ndarray) -> None:
-        """Covariance ``cov`` (6, 6) of C_node after a measurement there, while covariances are propagated.
-
-        The frames to come descend from the keyframe of ``node``. Seen from ``node`` its covariance is ``cov`` plus that
-        of the motion between them; where that is less than it had, it takes its place."""
-        self.cov_of[node] = cov
-        keyframe, motion_cov = self.motion_of.get(node, (node, cov))
-        if keyframe == node or keyframe not in self.cov_of:
-            return
-        back = self.graph.state(keyframe).pose.between(self.graph.state(node).pose).AdjointMap()
-        seen = back @ (cov + motion_cov) @ back.T
-        if np.linalg.slogdet(seen)[1] < np.linalg.slogdet(self.cov_of[keyframe])[1]:
-            self.cov_of[keyframe] = seen
+    def add_factors(self, node: int, *factors: gtsam.NonlinearFactor) -> None:
+        """Factors of the variables of ``node``, of a measurement that was accepted."""
+        self.graph.add(*factors)
+        self.covariances.measured(node, factors)
 
     def frame_state(self, frame_id: int, t_s: float, node: int) -> FrameState:
         """Newest estimate of a frame whose node is in the window."""
-        if self.mode is CovarianceMode.MARGINALS and node == self.graph.newest:
-            self.velocity_cov = self.graph.velocity_covariance(node)
-            self.lens_sigma = float(np.sqrt(self.graph.bias_covariance(node)[RADIAL_K1, RADIAL_K1]))
+        if node == self.graph.newest:
+            self.velocity_cov = self.covariances.velocity(node)
+            self.lens_sigma = float(np.sqrt(self.covariances.calibration(node)[RADIAL_K1, RADIAL_K1]))
         state = self.graph.state(node)
         velocity, velocity_cov, cov = state.velocity[:3], self.velocity_cov[VELOCITY, VELOCITY], self.covariance(node)
         if self.yaw_gauge is not None:
@@ -191,11 +180,6 @@ class FilterState:
             frame_id = self.keyframe_of.get(node)
             if frame_id is not None:
                 self.keyframes.add(frame_id, self._keyframe_at(node))
-
-    def velocity_changed(self, node: int) -> None:
-        """A factor on the velocity of the newest ``node`` was added: its covariances are read from the graph again."""
-        self.cov_of.pop(node, None)
-        self.velocity_cov = self.graph.velocity_covariance(node)
 
     def principal_point_jacobian(self, pose: gtsam.Pose3) -> np.ndarray:
         """Jacobian (2, 2) of the camera position (east and north) with respect to the principal point [m per unit of

@@ -73,8 +73,7 @@ def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior, *, j
     state.keep_keyframes(state.graph.window)
     state.velocity_cov = prior.velocity_cov
     node = state.graph.start(t_s, prior)
-    state.cov_of.clear()
-    state.motion_of.clear()
+    state.covariances.started(node, prior)
     state.continuity = FrameContinuity(KeyframeSubstitution.of(state.newest_odometry))
     fragment = Fragment(t_s, state.newest_odometry.fragment_id, confirmed=True, joined=joined)
     state.register_frame(node, frame_id, fragment)
@@ -129,7 +128,7 @@ def continue_from(
     last, attitude = state.last, frame.attitude
     assert last is not None
     dt_s = frame.t_s - last.t_s
-    before, bias_cov = state.graph.state(last.node), state.graph.bias_covariance(last.node)
+    before, bias_cov = state.graph.state(last.node), state.covariances.calibration(last.node)
     r_before = before.pose.rotation().matrix()
     r_w_c = state.camera.expected(attitude, before.bias, r_before)
     step, level = (at_m - before.pose.translation())[:2], np.diag([1.0, 1.0, 0.0])

@@ -23,7 +23,7 @@ from terrafix.estimator.measurements.map_pose import MapPoseMeasurement, determi
 from terrafix.estimator.models.motion_model import unknown_motion_cov
 from terrafix.estimator.propagation import STEP_SHARE
 from terrafix.estimator.state import HEIGHT, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
-from terrafix.messages import CovarianceMode, MapMatch, Verdict
+from terrafix.messages import MapMatch, Verdict
 
 # Of the height: 1-sigma of the estimate up to which a coarse match, the mode of the belief alone, is fused.
 COARSE_CONTINUES = 0.5  # [tuned]
@@ -153,9 +153,6 @@ class MapUpdate:
             assert fusion.innovation is not None
             return self._reject(match, node, measurement, fusion.innovation)
         self._rejected.clear()
-        if state.mode is CovarianceMode.JACOBIAN:
-            information = np.linalg.inv(state.cov_of[node]) + np.linalg.inv(measurement.cov / share)
-            state.set_fused_covariance(node, np.linalg.inv(information))
         if not match.position_only:
             assert fusion.innovation is not None
             gate = tangent_to_world(fusion.innovation.covariance, before.pose.rotation().matrix())
@@ -230,8 +227,8 @@ class MapUpdate:
         bias = now.bias.copy()
         if match.search.relocalized:  # the ground there lies at another height than the one that was assumed
             bias[HEIGHT] -= float(measurement.pose.translation()[UP] - was.pose.translation()[UP])
-        bias_cov = state.graph.bias_covariance(state.graph.newest)
-        velocity, velocity_cov = now.velocity, RESTART_INFLATION * state.graph.velocity_covariance(state.graph.newest)
+        bias_cov = state.covariances.calibration(state.graph.newest)
+        velocity, velocity_cov = now.velocity, RESTART_INFLATION * state.covariances.velocity(state.graph.newest)
         if state.yaw_gauge is not None:  # it was a velocity in gauge-fixed axes
             velocity, velocity_cov, state.yaw_gauge = np.zeros(MOTION_SIZE), unknown_motion_cov(), None
         assert state.last is not None

@@ -313,7 +313,7 @@ class EstimatorNode:
         attitude = self._attitude = self._ahrs.attitude_at(odometry.t_ns, *sigmas_rad)
         if self._initial_pending:
             estimator = self._apply_initial_position(odometry.frame_id, odometry.t_ns, stands=attitude.stands)
-        estimator.state.mode = self.mode
+        estimator.state.covariances.set_mode(self.mode)
         imu = self._ahrs.world_acceleration
         return estimator, FrameInput(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, imu)
 
@@ -368,14 +368,12 @@ class EstimatorNode:
 
     def _estimate(self, estimator: Estimator, frame: FrameState, budget: Claim, t_ns: int) -> NavEstimate:
         assert self._axes is not None
-        estimator.state.mode = self.mode
         return estimate_of(estimator, frame, self._axes, budget, t_ns, tracked=self._tracked)
 
     def _on_relocalization(self, seen: Relocalization) -> Iterable[Message]:
         estimator = self._estimator
         if estimator is None:
             return
-        estimator.state.mode = self.mode
         if not self._relocated:
             self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
         fusion = estimator.feed_relocalization(seen)

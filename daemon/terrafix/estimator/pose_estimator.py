@@ -128,7 +128,7 @@ class OpenCVGtsamPoseEstimator:
         flight, estimator = self.flight, self.flight.estimator
         if camera != CameraCalibration.of(estimator.origin.camera):
             raise ValueError("the camera is not the one that Origin named: give CameraCalibration.of(origin.camera)")
-        estimator.state.mode = covariance_mode(thermal)
+        estimator.state.covariances.set_mode(covariance_mode(thermal))
         given = self._with_pnp_input(match, camera)
         found = solved(given)
         result = estimator.feed_map_match(found)

@@ -28,6 +28,7 @@ from terrafix.estimator.measurements.height import (
 )
 from terrafix.estimator.measurements.odometry import KeyframeMotion, OdometryMeasurement, Sighting
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.models.bias_walk import walk_sigmas
 from terrafix.estimator.models.motion_model import (
     STATIONARY_M,
     MotionIncrement,
@@ -72,6 +73,14 @@ class PropagationResult:
     verdicts: tuple[FusionVerdict, ...] = ()
 
 
+@dataclass(frozen=True)
+class _SeenPosition:
+    """Position by odometry less the predicted one, ``off_m`` (3,), and covariance (3, 3) of the former, world axes."""
+
+    off_m: np.ndarray
+    cov_m2: np.ndarray
+
+
 @dataclass
 class _Step:
     """One frame before it is added to the graph. ``increment``: of the motion model since ``before``, the newest node;
@@ -90,6 +99,7 @@ class _Step:
     parent: int = -1
     motion: RelativePose | None = None
     pose: gtsam.Pose3 = field(default_factory=gtsam.Pose3)  # of the camera, as predicted
+    seen: _SeenPosition | None = None
     step_m: np.ndarray = field(default_factory=lambda: np.zeros(2))
     step_sigma_m: float = 0.0
 
@@ -272,9 +282,9 @@ class Propagation:
             seen = r_w_c @ known.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T
             self._seen_step(step, known, seen)
             if step.increment is not None and not step.sighting.begins_disconnected:
-                off_m = step.p_m - step.predicted_m
+                step.seen = _SeenPosition(step.p_m - step.predicted_m, seen)
                 step.increment, step.predicted_cov, gained = fuse_odometry_increment(
-                    step.increment, off_m, step.predicted_cov, seen
+                    step.increment, step.seen.off_m, step.predicted_cov, seen
                 )
                 # Otherwise a correct increment would fall in the robust tail of its factor (factors/motion.py).
                 step.velocity = step.velocity + gained
@@ -336,9 +346,6 @@ class Propagation:
         state, frame, p = self._state, step.frame, step.p_m
         assert step.motion is not None
         dt_s = state.graph.since_newest_s(frame.t_s)
-        if state.mode is CovarianceMode.JACOBIAN:
-            state.cov_of[state.graph.next_node] = _compose_cov(state.cov_of[step.parent], step.motion)
-        state.motion_of[state.graph.next_node] = step.parent, step.motion.cov
         r_w_c, ground_m = step.pose.rotation().matrix(), state.terrain.elevation_m(p)
         attitude = state.camera.factor(state.graph.next_keys(), frame.attitude, r_w_c, ground_m, dt_s)
         rise_m = state.terrain.rise_sigma_m(float(np.hypot(*step.step_m)))
@@ -353,12 +360,12 @@ class Propagation:
         first = NodeState(step.pose, step.before.bias, step.velocity)
         new = NewNode(first, step.parent, step.motion, increment, attitude, rise_m, three, velocity_cov)
         state.keep_keyframes(state.graph.leaving)
+        walk, parent = self._walk_sigmas(step), state.graph.state(step.parent)
         node = state.graph.extend(frame.t_s, new)
+        state.velocity_cov = self._velocity_cov(step)
+        state.covariances.extended(new, parent, walk, state.velocity_cov)
         self._continuity_of(step, node)
         state.register_frame(node, frame.frame_id, step.sighting.fragment)
-        state.cov_of = {n: cov for n, cov in state.cov_of.items() if state.graph.holds(n)}
-        state.motion_of = {n: motion for n, motion in state.motion_of.items() if state.graph.holds(n)}
-        state.velocity_cov = step.predicted_cov[DELTA_MOTION, DELTA_MOTION]
         step.verdicts += self._fuse_aids(step, node, dt_s)
         state.last = state.frame_state(frame.frame_id, frame.t_s, node)
         if step.known is not None:
@@ -367,6 +374,24 @@ class Propagation:
             for aid in self._aids:
                 aid.after_frame(state.last, frame.attitude)
         return self._result(step, state.last)
+
+    def _velocity_cov(self, step: _Step) -> np.ndarray:
+        """Covariance (8, 8) of V of the newest node by the motion model and odometry. A motion factor that has less
+        weight in the graph has it here, too."""
+        state, predicted_cov = self._state, step.predicted_cov
+        if state.mode is CovarianceMode.JACOBIAN and step.seen is not None and step.increment is not None:
+            increment = replace(step.increment, cov=step.increment.cov / state.graph.motion_weight)
+            predicted_cov = predict_covariance(increment, state.velocity_cov)
+            _, predicted_cov, _ = fuse_odometry_increment(increment, step.seen.off_m, predicted_cov, step.seen.cov_m2)
+        return predicted_cov[DELTA_MOTION, DELTA_MOTION]
+
+    def _walk_sigmas(self, step: _Step) -> np.ndarray:
+        """1-sigma (6,) of the change of B since the parent."""
+        state, parent = self._state, self._state.graph.state(step.parent).pose
+        turned = step.pose.rotation().compose(parent.rotation().inverse())
+        rise_m = state.terrain.rise_sigma_m(float(np.hypot(*(step.p_m - parent.translation())[:2])))
+        dt_s = state.graph.since_s(step.parent, step.frame.t_s)
+        return walk_sigmas(dt_s, float(gtsam.Rot3.Logmap(turned)[UP]), rise_m)
 
     @staticmethod
     def _result(step: _Step, placed: FrameState) -> PropagationResult:
@@ -494,9 +519,3 @@ def _reset_verdict(reason: ResetReason, detail: str = "") -> FusionVerdict:
 def _worst_sigma(cov: np.ndarray) -> float:
     """1-sigma along the longest axis of ``cov``."""
     return float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
-
-
-def _compose_cov(cov_parent: np.ndarray, motion: RelativePose) -> np.ndarray:
-    """Covariance (6, 6) of parent * motion, tangent order, first order."""
-    adjoint = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m).inverse().AdjointMap()
-    return adjoint @ cov_parent @ adjoint.T + motion.cov

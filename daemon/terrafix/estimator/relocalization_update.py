@@ -8,8 +8,7 @@ from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.innovation_run import InnovationRun
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.relocalization import RelocalizationMeasurement
-from terrafix.estimator.state import POSE_SIZE, TRANSLATION
-from terrafix.messages import CovarianceMode, Relocalization, Verdict
+from terrafix.messages import Relocalization, Verdict
 
 
 class RelocalizationUpdate:
@@ -50,15 +49,9 @@ class RelocalizationUpdate:
 
     def _fuse(self, node: int, measurement: RelocalizationMeasurement) -> FusionVerdict:
         state = self._state
-        _, cov_m2 = measurement.correction(state, node)
-        by_position = np.zeros((3, POSE_SIZE))
-        by_position[:, TRANSLATION] = state.graph.state(node).pose.rotation().matrix()
         fusion = fuse(state, node, measurement)
         if fusion.verdict is not Verdict.ACCEPTED:
             return fusion
-        if state.mode is CovarianceMode.JACOBIAN:
-            gained = by_position.T @ np.linalg.solve(cov_m2, by_position)
-            state.set_fused_covariance(node, np.linalg.inv(np.linalg.inv(state.cov_of[node]) + gained))
         assert state.last is not None
         state.last_seen_s = max(state.last_seen_s, state.graph.time_of(node))
         state.last = state.frame_state(state.last.frame_id, state.last.t_s, state.graph.newest)

@@ -11,6 +11,7 @@ import pytest
 
 from map_matches import pose_of, with_pose, with_search
 from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of, error_m, t_ns
+from smoother_marginals import recorded_marginals
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, PLANAR_RELIEF, SEARCH_RADIUS, solved
@@ -25,7 +26,6 @@ from terrafix.estimator import (
     PoseEstimator,
     ThermalState,
 )
-from terrafix.estimator.graph.fixed_lag import FixedLagSmoother
 from terrafix.messages import (
     MapMatch,
     MeasurementVerdict,
@@ -318,13 +318,7 @@ def test_no_marginal_is_computed_for_a_match_while_hot(
     flight: Flight, run: EstimatorRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run.feed([HOT, *flight.messages(AT + 1)])
-    asked, marginal = [], FixedLagSmoother.marginal
-
-    def counted(smoother: FixedLagSmoother, key: int) -> np.ndarray:
-        asked.append(key)
-        return marginal(smoother, key)
-
-    monkeypatch.setattr(FixedLagSmoother, "marginal", counted)
+    asked = recorded_marginals(monkeypatch)
     with pytest.warns(CovarianceDegradedWarning):
         poses_of(run).estimate(match_of(flight, AT + 1), LENS, HOT)
     assert asked == []

@@ -3,14 +3,14 @@
 The tangent of a node is NODE_SIZE numbers: C (rotation, translation in the axes of the camera), B and V
 (terrafix.estimator.state)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
-from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, POSE_SIZE
+from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, POSE_SIZE, NodeState
 
 NODE_SIZE = POSE_SIZE + CALIBRATION_SIZE + MOTION_SIZE  # [spec: order C, B, V]
 # Variable, first component and size of each block of a node. [spec: order C, B, V]
@@ -53,6 +53,23 @@ class Conditional:
     r: np.ndarray
     s: np.ndarray
     d: np.ndarray
+
+
+def graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def values_of(states: Mapping[int, NodeState]) -> gtsam.Values:
+    """Of C, B and V of each node."""
+    values = gtsam.Values()
+    for node, state in states.items():
+        values.insert(C(node), state.pose)
+        values.insert(B(node), state.bias)
+        values.insert(V(node), state.velocity)
+    return values
 
 
 def nodes_of(factor: gtsam.NonlinearFactor) -> tuple[int, ...]:

@@ -110,6 +110,10 @@ class FixedLagSmoother:
         """Marginal covariance of a variable."""
         return self._isam.marginalCovariance(key)
 
+    def joint_marginal(self, node: int) -> np.ndarray:
+        """Joint marginal covariance of C, B and V of a node, in this order."""
+        return self._isam.jointMarginalCovariance(_keys(node)).fullMatrix()
+
 
 def _keys(node: int) -> tuple[int, int, int]:
     return C(node), B(node), V(node)

@@ -3,7 +3,7 @@ refinement after landing (marginalized.py).
 
 A node is one frame with the variables C_k, B_k and V_k (terrafix.estimator.state)."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,6 +15,7 @@ from terrafix.estimator.factors.motion import motion_factor
 from terrafix.estimator.factors.noise import robust_noise
 from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
 from terrafix.estimator.factors.three_view import ThreeViewConstraint, three_view_factor
+from terrafix.estimator.graph.elimination import NODE_SIZE, graph_of, values_of
 from terrafix.estimator.graph.fixed_lag import FixedLagSmoother
 from terrafix.estimator.graph.marginalized import MarginalizedHistory
 from terrafix.estimator.models.bias_walk import walk_sigmas
@@ -43,6 +44,20 @@ class GraphPrior:
     attitude: gtsam.CustomFactor | None = None
     gauge_fixed_cov: np.ndarray | None = None
 
+    @property
+    def pose_cov(self) -> np.ndarray:
+        """(6, 6) of the pose, as it enters the graph."""
+        return self.cov if self.gauge_fixed_cov is None else self.gauge_fixed_cov
+
+    @property
+    def node_covariance(self) -> np.ndarray:
+        """(NODE_SIZE, NODE_SIZE), in the order C, B, V."""
+        cov, end = np.zeros((NODE_SIZE, NODE_SIZE)), 0
+        for block in (self.pose_cov, self.bias_cov, self.velocity_cov):
+            begin, end = end, end + len(block)
+            cov[begin:end, begin:end] = block
+        return cov
+
 
 @dataclass(frozen=True)
 class NewNode:
@@ -59,6 +74,14 @@ class NewNode:
     rise_sigma_m: float = 0.0
     three_view: tuple[int, ThreeViewConstraint] | None = None
     velocity_cov: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class NodeTies:
+    """Factors by which the newest node was tied to its parent (``odometry``) and to the node before (``motion``)."""
+
+    odometry: gtsam.NonlinearFactor
+    motion: gtsam.NoiseModelFactor
 
 
 class GraphObserver:
@@ -82,13 +105,15 @@ class GraphObserver:
 
 
 class PoseGraph:
-    """``rebuilds``: how often the smoother failed and was built anew from the last good estimate."""
+    """``rebuilds``: how often the smoother failed and was built anew from the last good estimate. ``ties``: of the
+    newest node that was added by ``extend``; None: there was none, or the graph was built anew since."""
 
     def __init__(self, history: MarginalizedHistory | None = None, observer: GraphObserver | None = None) -> None:
         self._observer = observer or GraphObserver()
         self._history = history or MarginalizedHistory()
         self._last_good = gtsam.Values()  # estimate of the window before the newest nodes were added
         self.rebuilds = 0
+        self.ties: NodeTies | None = None
         self._smoother = FixedLagSmoother()
         self._states: dict[int, NodeState] = {}  # cache, cleared by each update
         self._marginals: dict[int, np.ndarray] = {}  # cache by key, cleared by each update
@@ -127,6 +152,21 @@ class PoseGraph:
             self._states[node] = NodeState(orthonormal, bias, velocity)
         return self._states[node]
 
+    def linearization(self, node: int) -> NodeState:
+        """Where the factors of a node in the window are linearised, and robust ones get their weight."""
+        at = self._smoother.linearization_point()
+        return NodeState(at.atPose3(C(node)), at.atVector(B(node)), at.atVector(V(node)))
+
+    @property
+    def motion_weight(self) -> float:
+        """Robust weight of the motion factor of the newest node, at its linearization; 1 where it is not robust, and
+        where the node has none since the graph was built anew."""
+        if self.ties is None:
+            return 1.0
+        residual = self.ties.motion.unwhitenedError(self._smoother.linearization_point())
+        noise = self.ties.motion.noiseModel()
+        return float(noise.weight(noise.unweightedWhiten(residual)))
+
     def covariance(self, node: int) -> np.ndarray:
         """Marginal of C, (6, 6), tangent order, from the smoother."""
         return self._marginal(C(node))
@@ -139,6 +179,10 @@ class PoseGraph:
         """Marginal of B, (6, 6)."""
         return self._marginal(B(node))
 
+    def joint_covariance(self, node: int) -> np.ndarray:
+        """Joint marginal (NODE_SIZE, NODE_SIZE) of C, B and V of a node in the window."""
+        return self._smoother.joint_marginal(node)
+
     def _marginal(self, key: int) -> np.ndarray:
         if key not in self._marginals:
             self._marginals[key] = self._smoother.marginal(key)
@@ -150,7 +194,11 @@ class PoseGraph:
 
     def since_newest_s(self, t_s: float) -> float:
         """Time from the newest node to ``t_s``, MIN_STEP_S at least."""
-        return max(t_s - self._times[self.newest], MIN_STEP_S)
+        return self.since_s(self.newest, t_s)
+
+    def since_s(self, node: int, t_s: float) -> float:
+        """Time from a node in the window to ``t_s``, MIN_STEP_S at least."""
+        return max(t_s - self._times[node], MIN_STEP_S)
 
     def start(self, t_s: float, prior: GraphPrior) -> int:
         """Begins a new graph with one node. Nodes so far become history, as they were estimated. -> the node."""
@@ -168,7 +216,8 @@ class PoseGraph:
         self._observer.before_node(self)
         node, others = self._next, list[gtsam.NonlinearFactor]()
         odometry = self._odometry_factor(node, new)
-        others.append(self._motion_factor(node, new))
+        self.ties = NodeTies(odometry, self._motion_factor(node, new))
+        others.append(self.ties.motion)
         others.append(self._walk_factor(node, self.newest, t_s, new))
         if new.attitude is not None:
             others.append(new.attitude)
@@ -202,7 +251,7 @@ class PoseGraph:
             rays.k1,
         )
 
-    def _motion_factor(self, node: int, new: NewNode) -> gtsam.NonlinearFactor:
+    def _motion_factor(self, node: int, new: NewNode) -> gtsam.NoiseModelFactor:
         newest, increment = self.newest, new.increment
         if new.velocity_cov is not None:
             noise = gtsam.noiseModel.Gaussian.Covariance(new.velocity_cov)
@@ -221,7 +270,7 @@ class PoseGraph:
 
     def add(self, *new: gtsam.NonlinearFactor) -> None:
         """Adds factors of nodes in the window."""
-        factors = _graph_of(new)
+        factors = graph_of(new)
         self._history.add(factors)
         self._update(partial(self._smoother.add, factors))
 
@@ -240,7 +289,7 @@ class PoseGraph:
         return self._history.refine()
 
     def _insert(self, t_s: float, state: NodeState, new: list[gtsam.NonlinearFactor]) -> None:
-        factors = _graph_of(new)
+        factors = graph_of(new)
         node = self._next
         leaving = self._smoother.leaving(node)
         if leaving:
@@ -248,7 +297,7 @@ class PoseGraph:
             self._history.marginalize(leaving, self._smoother.linearization_point())
         else:
             self._history.reduce_step()
-        values = _values(node, state)
+        values = values_of({node: state})
         self._last_good.insert(values)
         self._next += 1
         self._times[node] = t_s
@@ -274,6 +323,7 @@ class PoseGraph:
     def _rebuild(self) -> None:
         """A new graph of the newest node alone, from the last good estimate, with wide priors."""
         self.rebuilds += 1
+        self.ties = None
         node = self.newest
         state = NodeState(
             self._last_good.atPose3(C(node)), self._last_good.atVector(B(node)), self._last_good.atVector(V(node))
@@ -282,11 +332,10 @@ class PoseGraph:
         self._history.begin_segment(node)
         self._new_smoother()
         self._times = {node: self._times[node]}
-        pose_cov, bias_cov = np.diag(REBUILD_POSE_SIGMAS**2), np.diag(REBUILD_CALIBRATION_SIGMAS**2)
-        pose_prior, others = _prior_factors(node, GraphPrior(state, pose_cov, bias_cov, unknown_motion_cov()))
-        factors = _graph_of([pose_prior, *others])
+        pose_prior, others = _prior_factors(node, rebuild_prior(state))
+        factors = graph_of([pose_prior, *others])
         self._history.add(factors)
-        self._smoother.insert(node, factors, _values(node, state))
+        self._smoother.insert(node, factors, values_of({node: state}))
 
     def _new_smoother(self) -> None:
         self._smoother = FixedLagSmoother()
@@ -301,6 +350,12 @@ class PoseGraph:
         self._times.clear()
 
 
+def rebuild_prior(state: NodeState) -> GraphPrior:
+    """Prior of the one node of a graph that was built anew."""
+    pose_cov, bias_cov = np.diag(REBUILD_POSE_SIGMAS**2), np.diag(REBUILD_CALIBRATION_SIGMAS**2)
+    return GraphPrior(state, pose_cov, bias_cov, unknown_motion_cov())
+
+
 def _empty_factor(node: int) -> gtsam.LinearContainerFactor:
     """A factor of C and B without information. ISAM2.marginalizeLeaves drops a variable that leaves together with one
     that is above it in the tree when no factor ties the two, and raises (GTSAM 4.3: it climbs to the clique of the
@@ -311,28 +366,12 @@ def _empty_factor(node: int) -> gtsam.LinearContainerFactor:
     )
 
 
-def _graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph
-
-
 def _prior_factors(node: int, prior: GraphPrior) -> tuple[gtsam.NonlinearFactor, list[gtsam.NonlinearFactor]]:
     """-> the prior of the pose, and all others of the first node of a graph."""
     gaussian = gtsam.noiseModel.Gaussian.Covariance
-    cov = prior.cov if prior.gauge_fixed_cov is None else prior.gauge_fixed_cov
-    pose_prior = gtsam.PriorFactorPose3(C(node), prior.state.pose, gaussian(cov))
+    pose_prior = gtsam.PriorFactorPose3(C(node), prior.state.pose, gaussian(prior.pose_cov))
     others: list[gtsam.NonlinearFactor] = [
         gtsam.PriorFactorVector(B(node), prior.state.bias, gaussian(prior.bias_cov)),
         gtsam.PriorFactorVector(V(node), prior.state.velocity, gaussian(prior.velocity_cov)),
     ]
     return pose_prior, others if prior.attitude is None else [*others, prior.attitude]
-
-
-def _values(node: int, state: NodeState) -> gtsam.Values:
-    values = gtsam.Values()
-    values.insert(C(node), state.pose)
-    values.insert(B(node), state.bias)
-    values.insert(V(node), state.velocity)
-    return values

@@ -79,13 +79,12 @@ class AirspeedMeasurement:
         newest, observed = state.graph.state(node), self.observation
         residual = observed.velocity(float(newest.bias[HEADING])) - newest.velocity[:2]
         now = observed.common + observed.changed + observed.gust2 * np.eye(2)
-        return Innovation(residual, now + state.graph.velocity_covariance(node)[:2, :2], GATE[2])
+        return Innovation(residual, now + state.covariances.velocity(node)[:2, :2], GATE[2])
 
     def add_to(self, state: FilterState, node: int) -> None:
         cov = self.observation.cov(self.dt_s, self.unseen_s)
         air = self.observation
-        state.graph.add(airspeed_factor(V(node), B(node), air.wind_mps, air.still_mps, air.yaw_rad, cov))
-        state.velocity_changed(node)
+        state.add_factors(node, airspeed_factor(V(node), B(node), air.wind_mps, air.still_mps, air.yaw_rad, cov))
 
 
 class WindEstimator:

@@ -49,7 +49,7 @@ class DeadReckoningMeasurement:
 
     def innovation(self, state: FilterState, node: int) -> Innovation:
         pose = state.graph.state(node).pose
-        cov = tangent_to_world(state.graph.covariance(node), pose.rotation().matrix())
+        cov = tangent_to_world(state.covariance(node), pose.rotation().matrix())
         residual = self.propagated.at_m - pose.translation()[:2]
         return Innovation(residual, self.propagated.cov_m2 + cov[:2, :2], GATE[2])
 
@@ -61,11 +61,11 @@ class DeadReckoningMeasurement:
         position_cov[:2, :2] = propagated.cov_m2
         at_m = np.array([*propagated.at_m, 0.0])
         velocity = np.array([*propagated.velocity_mps, *[0.0] * (MOTION_SIZE - 3)])
-        state.graph.add(
+        state.add_factors(
+            node,
             gtsam.GPSFactor(C(node), at_m, gaussian(position_cov)),
             gtsam.PriorFactorVector(V(node), velocity, gaussian(velocity_cov)),
         )
-        state.velocity_changed(node)
 
 
 @dataclass(frozen=True)

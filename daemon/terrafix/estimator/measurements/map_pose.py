@@ -66,9 +66,10 @@ class MapPoseMeasurement:
     def add_to(self, state: FilterState, node: int) -> None:
         cov = self.seen_cov / self.information_share
         if self.by_k1 is None:
-            state.graph.add(gtsam.PriorFactorPose3(C(node), self.seen, robust_noise(cov)))
+            state.add_factors(node, gtsam.PriorFactorPose3(C(node), self.seen, robust_noise(cov)))
         else:
-            state.graph.add(map_pose_factor(C(node), B(node), self.seen, cov, self.by_k1, self.radial_k1))
+            factor = map_pose_factor(C(node), B(node), self.seen, cov, self.by_k1, self.radial_k1)
+            state.add_factors(node, factor)
 
 
 def measured_pose(pose: MapPose, map_sigma_m: float, terrain: Terrain) -> tuple[gtsam.Pose3, np.ndarray]:

@@ -186,7 +186,7 @@ class OdometryMeasurement:
             return Verdict.STALE
         keyframe = state.graph.state(parent)
         p = keyframe.pose.translation()
-        view = KeyframeView(keyframe.pose, state.cov_of[parent], state.terrain.elevation_m(p))
+        view = KeyframeView(keyframe.pose, state.covariances.recent_pose(parent), state.terrain.elevation_m(p))
         newest = state.graph.state(state.graph.newest)
         onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - state.graph.time_of(state.graph.newest))
         way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))

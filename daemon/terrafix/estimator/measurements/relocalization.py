@@ -75,7 +75,7 @@ class RelocalizationMeasurement:
 
     def add_to(self, state: FilterState, node: int) -> None:
         p_m, cov_m2 = self.correction(state, node)
-        state.graph.add(gtsam.GPSFactor(C(node), p_m, gtsam.noiseModel.Gaussian.Covariance(cov_m2)))
+        state.add_factors(node, gtsam.GPSFactor(C(node), p_m, gtsam.noiseModel.Gaussian.Covariance(cov_m2)))
 
 
 def safe_fusion_measurement(

@@ -7,13 +7,23 @@ import numpy as np
 import pytest
 
 from simulated_flight import ORIGIN, PLACE, EstimatorRun, Flight, blind, error_m, sigma_m, t_ns
+from smoother_marginals import recorded_marginals
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.inertial import GRAVITY_MPS2
 from terrafix.estimator.measurements.ekf_dead_reckoning import MAX_AHEAD_S, DeadReckoning
 from terrafix.estimator.models.motion_model import TILT_CORRELATION_S, TILT_VARYING_SHARE
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, load_checkpoint
-from terrafix.messages import EkfDeadReckoning, NavEstimate, Odometry, Prediction, Verdict
+from terrafix.messages import (
+    CovarianceMode,
+    EkfDeadReckoning,
+    Health,
+    NavEstimate,
+    Odometry,
+    Prediction,
+    ThermalBand,
+    Verdict,
+)
 
 KILLED, BACK = 61, 73  # frames: six seconds
 LINK_LETS_MPS = 1.45  # velocity sigma below which the link sends a fix
@@ -63,10 +73,12 @@ def resumed(
     dead_reckoning: EkfDeadReckoning | None,
     *,
     received_first: bool = True,
+    band: ThermalBand = ThermalBand.NORMAL,
 ) -> EstimatorRun:
     run = EstimatorRun()
     run.node = EstimatorNode(0, last)
-    run.feed([ORIGIN])
+    health = Health(t_ns=0, band=band, temperature_c=60.0, throttled=False, disk_free_mb=1000, cause="test")
+    run.feed([ORIGIN, health])
     for i in range(BACK, flight.frames):
         messages = flight.messages(i)
         if i == BACK:
@@ -87,6 +99,22 @@ def test_after_a_restart_position_and_velocity_are_known_at_the_first_frame(
     assert np.linalg.norm(off_mps) < 3.0 * first.velocity_sigma_mps
     without = resumed(flight, killed, None).estimate(BACK)
     assert sigma_m(without) > 2.0 * sigma_m(first) and without.velocity_sigma_mps > 10.0
+
+
+def test_under_thermal_throttle_dead_reckoning_after_a_restart_needs_no_marginal(
+    flight: Flight, killed: EstimatorCheckpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And it tells position and velocity as it does in the normal band."""
+    dead_reckoning = autopilot_dead_reckoning(flight)
+    cool = resumed(flight, killed, dead_reckoning).estimate(BACK)
+    computed = recorded_marginals(monkeypatch)
+    run = resumed(flight, killed, dead_reckoning, band=ThermalBand.HOT)
+    assert computed == []
+    assert run.verdicts("dead_reckoning")[BACK].verdict is Verdict.ACCEPTED
+    hot = run.estimate(BACK)
+    assert hot.covariance_mode is CovarianceMode.JACOBIAN
+    assert sigma_m(hot) == pytest.approx(sigma_m(cool), rel=0.05)
+    assert hot.velocity_sigma_mps == pytest.approx(cool.velocity_sigma_mps, rel=0.05)
 
 
 def test_late_dead_reckoning_is_fused_at_the_second_frame(flight: Flight, killed: EstimatorCheckpoint) -> None:
