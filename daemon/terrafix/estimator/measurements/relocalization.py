@@ -15,9 +15,10 @@ from terrafix.estimator.measurements.ground_plane_motion import plane_motion
 from terrafix.estimator.state import HORIZONTAL, ROTATION
 from terrafix.messages import Relocalization, Verdict
 
-# Variance of the keyframe's pose over that of the estimate, below which a component is corrected. Between this and 1
-# there is little to gain, and the correction extrapolates. [spec: half]
-GAINED = 0.5
+# Variance of the keyframe's pose over that of the estimate, below which a component is corrected. The measurement that
+# stands for safe fusion has the residual over one less this ratio, so that it extrapolates near 1, where there is
+# nothing to gain. [spec: a tenth of the variance]
+GAINED = 0.9
 NO_INFORMATION_M2 = 1e8  # variance of the other components [spec: far beyond any state]
 
 
