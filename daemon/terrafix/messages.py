@@ -674,12 +674,37 @@ class TemperatureZone(msgspec.Struct, frozen=True, kw_only=True):
     temperature_c: float
 
 
+class ProcessorClock(msgspec.Struct, frozen=True, kw_only=True):
+    """Clock of a group of CPU cores ("policy0") or of another processor (devfreq: "17000000.gpu")."""
+
+    name: str
+    mhz: float  # at present; a governor lowers it when the processor is idle
+    limit_mhz: float  # highest clock that power mode and thermal governor allow at present
+    max_mhz: float  # highest clock of the hardware
+
+
+class PowerRail(msgspec.Struct, frozen=True, kw_only=True):
+    name: str  # label of the channel; "VDD_IN" on a Jetson is the whole module
+    power_w: float
+
+
+class Fan(msgspec.Struct, frozen=True, kw_only=True):
+    name: str
+    rpm: int
+
+
 class ThermalReading(Message, frozen=True, kw_only=True):
-    """Raw readings of the computer's temperature sensors, at 1 Hz; Health is derived from them."""
+    """Raw readings of the computer's sensors (temperature, clocks, power), at 1 Hz; Health is derived from them.
+
+    A sensor that is absent or cannot be read is not in its list."""
 
     zones: list[TemperatureZone]
     throttling: list[str]  # cooling devices that currently throttle a processor
     disk_free_mb: int | None
+    clocks: list[ProcessorClock] = []
+    rails: list[PowerRail] = []
+    fans: list[Fan] = []
+    power_mode: str | None = None  # of nvpmodel: "2 (15W)", or "2" when its name is not known; None: no Jetson
 
 
 class Health(Message, frozen=True, kw_only=True):
@@ -690,6 +715,8 @@ class Health(Message, frozen=True, kw_only=True):
     throttled: bool
     disk_free_mb: int | None
     cause: str  # reason of the band
+    power_w: float | None = None  # of the whole computer; None: no rail measures it
+    clock_limit: float | None = None  # lowest ratio of limit_mhz and max_mhz over the processors; None: not readable
 
 
 class ProcessEvent(Message, frozen=True, kw_only=True):

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from terrafix.core.config import HealthSection
 from terrafix.core.errors import ConfigError
 from terrafix.core.node import Edge, NodeContext
+from terrafix.health.power import clock_limit, whole_computer_w
 from terrafix.health.sysfs import HealthEdge
 from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, ThermalReading
 
@@ -52,6 +53,8 @@ class HealthNode:
             throttled=bool(reading.throttling),
             disk_free_mb=reading.disk_free_mb,
             cause=cause,
+            power_w=whole_computer_w(reading.rails),
+            clock_limit=clock_limit(reading.clocks),
         )
 
     def _band(self, hottest: TemperatureZone | None) -> tuple[ThermalBand, str]:

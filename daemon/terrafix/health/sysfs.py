@@ -1,4 +1,4 @@
-"""Edge of the health process: reads thermal zones, cooling devices and the free disk space once a second.
+"""Edge of the health process: reads temperatures, cooling devices, clocks, power and free disk space once a second.
 
 Files: https://docs.kernel.org/driver-api/thermal/sysfs-api.html (temperatures in thousandths of a degree Celsius).
 A sensor that cannot be read is left out (on a Jetson the zones of powered-down units return EAGAIN)."""
@@ -10,6 +10,8 @@ from pathlib import Path
 from terrafix.core import logs
 from terrafix.core.clock import Ticker
 from terrafix.core.node import NodeContext
+from terrafix.health.power import read_clocks, read_fans, read_power_mode, read_rails
+from terrafix.health.sensor_files import read_number, read_text
 from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, ThermalReading
 
 RATE_HZ = 1.0  # readings per second
@@ -23,7 +25,7 @@ class HealthEdge:
     """Publishes ThermalReading; logs Health."""
 
     def __init__(self, ctx: NodeContext) -> None:
-        self._thermal = Path(ctx.config.health.sysfs_root) / "class" / "thermal"
+        self._sysfs = Path(ctx.config.health.sysfs_root)
         self._out_dir = ctx.out_dir
         self._ticker: Ticker | None = None
         self._band: ThermalBand | None = None
@@ -31,11 +33,16 @@ class HealthEdge:
     def poll(self, now_ns: int) -> Iterable[Message]:
         self._ticker = self._ticker or Ticker(RATE_HZ, now_ns)
         if self._ticker.due(now_ns):
+            thermal = self._sysfs / "class" / "thermal"
             yield ThermalReading(
                 t_ns=now_ns,
-                zones=read_zones(self._thermal),
-                throttling=read_throttling(self._thermal),
+                zones=read_zones(thermal),
+                throttling=read_throttling(thermal),
                 disk_free_mb=read_disk_free_mb(self._out_dir),
+                clocks=read_clocks(self._sysfs),
+                rails=read_rails(self._sysfs / "class" / "hwmon"),
+                fans=read_fans(self._sysfs / "class" / "hwmon"),
+                power_mode=read_power_mode(),
             )
 
     def on_message(self, message: Message) -> None:
@@ -43,7 +50,14 @@ class HealthEdge:
         if isinstance(message, Health) and message.band is not self._band:
             before, self._band = self._band, message.band
             log = logs.get().info if message.band is ThermalBand.NORMAL else logs.get().warning
-            log("thermal band", band=message.band, before=before, cause=message.cause)
+            log(
+                "thermal band",
+                band=message.band,
+                before=before,
+                cause=message.cause,
+                clock_limit=message.clock_limit,
+                power_w=message.power_w,
+            )
 
     def close(self) -> None:
         pass
@@ -53,12 +67,12 @@ def read_zones(thermal: Path) -> list[TemperatureZone]:
     """All zones with a plausible temperature. ``thermal``: sysfs folder class/thermal."""
     zones = []
     for folder in sorted(thermal.glob("thermal_zone*")):
-        millidegrees = _number(folder / "temp")
+        millidegrees = read_number(folder / "temp")
         if millidegrees is None:
             continue
         temperature_c = millidegrees / 1000
         if PLAUSIBLE_C[0] < temperature_c < PLAUSIBLE_C[1]:
-            zones.append(TemperatureZone(name=_text(folder / "type") or folder.name, temperature_c=temperature_c))
+            zones.append(TemperatureZone(name=read_text(folder / "type") or folder.name, temperature_c=temperature_c))
     return zones
 
 
@@ -66,8 +80,8 @@ def read_throttling(thermal: Path) -> list[str]:
     """Names of the cooling devices that slow a processor down at present."""
     active = []
     for folder in sorted(thermal.glob("cooling_device*")):
-        kind = _text(folder / "type") or ""
-        if any(word in kind.lower() for word in THROTTLING) and (_number(folder / "cur_state") or 0) > 0:
+        kind = read_text(folder / "type") or ""
+        if any(word in kind.lower() for word in THROTTLING) and (read_number(folder / "cur_state") or 0) > 0:
             active.append(kind)
     return active
 
@@ -77,19 +91,4 @@ def read_disk_free_mb(folder: Path) -> int | None:
     try:
         return shutil.disk_usage(folder).free // 10**6
     except OSError:
-        return None
-
-
-def _text(path: Path) -> str | None:
-    try:
-        return path.read_text(encoding="ascii", errors="replace").strip()
-    except OSError:
-        return None
-
-
-def _number(path: Path) -> int | None:
-    text = _text(path)
-    try:
-        return int(text) if text is not None else None
-    except ValueError:
         return None

@@ -68,7 +68,7 @@ class FlightView:
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
     map_verdict: dict[int, str] = field(default_factory=dict)  # by frame id
     rejected_maps: list[RejectedMatch] = field(default_factory=list)
-    health: list[tuple[float, str, float | None]] = field(default_factory=list)  # t_s, band, temperature
+    health: list[tuple[float, Health]] = field(default_factory=list)  # t_s, state of the computer
     gps: list[tuple[float, GpsInput]] = field(default_factory=list)
     faults: list[tuple[float, CalibrationFault]] = field(default_factory=list)
     events: list[tuple[float, ProcessEvent]] = field(default_factory=list)
@@ -226,7 +226,7 @@ def _add_timed(view: FlightView, timed: list[tuple[int, Message]], zero_ns: int)
     for t_ns, message in sorted(timed, key=lambda item: item[0]):
         t_s = (t_ns - zero_ns) / NS
         if isinstance(message, Health):
-            view.health.append((t_s, str(message.band), message.temperature_c))
+            view.health.append((t_s, message))
         elif isinstance(message, GpsInput):
             view.gps.append((t_s, message))
         elif isinstance(message, CalibrationFault):

@@ -132,7 +132,7 @@ def states(view: FlightView) -> str:
     bands.append(Band("map", ticks))
     bands.append(Band("covar.", spans([(r.t_s, r.covariance_mode) for r in view.rows], end, "f-", {"": "none"})))
     if view.health:
-        bands.append(Band("thermal", spans([(t, band) for t, band, _ in view.health], end, "f-", {})))
+        bands.append(Band("thermal", spans([(t, str(health.band)) for t, health in view.health], end, "f-", {})))
     legend = [
         ("k-sat", "map match, accepted, marginals"),
         ("k-vis", "odometry, Jacobian, hot"),
@@ -143,18 +143,24 @@ def states(view: FlightView) -> str:
     return (
         '<h2>Sources and states</h2><p class="lead">The source of each position, whether the map match of the '
         "frame was accepted, how the covariance was computed, and the temperature band.</p>"
-        f'<div class="scroll">{body}</div>{_legend(legend)}{_temperature(view, end)}'
+        f'<div class="scroll">{body}</div>{_legend(legend)}{_computer(view, end)}'
     )
 
 
-def _temperature(view: FlightView, end: float) -> str:
-    points: list[Point] = [(t, celsius) for t, _, celsius in view.health]
+def _computer(view: FlightView, end: float) -> str:
+    """Charts of temperature and power of the computer; none for a quantity without readings."""
+    temperature: list[Point] = [(t, health.temperature_c) for t, health in view.health]
+    power: list[Point] = [(t, health.power_w) for t, health in view.health]
+    return _series("Temperature", "°C", 5.0, temperature, end) + _series("Power", "W", 1.0, power, end)
+
+
+def _series(name: str, unit: str, margin: float, points: list[Point], end: float) -> str:
     values = [v for _, v in points if v is not None]
     if not values:
         return ""
-    chart = Chart(x_max=end, y_min=min(values) - 5, y_max=max(values) + 5, height=140, y_unit="°C")
-    chart.line(points, "temperature")
-    return f'<div class="scroll" style="margin-top:20px">{chart.svg("Temperature")}</div>'
+    chart = Chart(x_max=end, y_min=min(values) - margin, y_max=max(values) + margin, height=140, y_unit=unit)
+    chart.line(points, name.lower())
+    return f'<div class="scroll" style="margin-top:20px">{chart.svg(name)}</div>'
 
 
 def verdicts(view: FlightView) -> str:

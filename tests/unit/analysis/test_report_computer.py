@@ -1,0 +1,28 @@
+"""Charts of the computer's temperature and power in the report."""
+
+from terrafix.messages import Health, ThermalBand
+from terrafix_tools.report.data import FlightView
+from terrafix_tools.report.sections import states
+
+
+def _health(power_w: float | None) -> Health:
+    return Health(
+        t_ns=0,
+        band=ThermalBand.HOT,
+        temperature_c=81.0,
+        throttled=False,
+        disk_free_mb=None,
+        cause="test",
+        power_w=power_w,
+    )
+
+
+def _page(power_w: float | None) -> str:
+    view = FlightView(title="test", rows=[], frame_ids=[], health=[(0.0, _health(power_w)), (1.0, _health(power_w))])
+    return states(view)
+
+
+def test_power_is_drawn_where_it_was_measured() -> None:
+    assert 'aria-label="Power"' in _page(9.5)
+    assert 'aria-label="Power"' not in _page(None)
+    assert 'aria-label="Temperature"' in _page(None)
