@@ -727,6 +727,17 @@ class ProcessEvent(Message, frozen=True, kw_only=True):
     detail: str = ""
 
 
+class InputOrder(Message, frozen=True, kw_only=True):
+    """Messages in the order in which ``process`` handled them, by which its record is replayed to the same outputs.
+
+    The bus delivers each publisher's messages in order, but not those of two publishers, and the recorder receives them
+    in an order of its own. Published by the shell of the process before the outputs of the last of them."""
+
+    process: str
+    began_ns: int  # time of the start of this instance of the process: another one means that it was restarted
+    inputs: list[int]  # CRC-32 of each message in msgpack (terrafix.core.codec)
+
+
 class Dropped(Message, frozen=True, kw_only=True):
     """Messages lost to a queue overflow; published by the shell of a process."""
 
@@ -771,5 +782,6 @@ AnyMessage = (
     | ThermalReading
     | Health
     | ProcessEvent
+    | InputOrder
     | Dropped
 )

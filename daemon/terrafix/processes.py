@@ -60,6 +60,7 @@ ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.ThermalReading,
     m.Health,
     m.ProcessEvent,
+    m.InputOrder,
     m.Dropped,
 )
 
@@ -125,6 +126,7 @@ PROCESSES: tuple[Process, ...] = (
             m.ClaimBudget,
             m.Refinement,
             m.MeasurementVerdict,
+            m.InputOrder,
         ),
         0.0,
         20.0,

@@ -12,6 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from terrafix_tools.compare.alignment import read_record
+from terrafix_tools.compare.difference import compare_records
+from terrafix_tools.compare.text import summary
+from terrafix_tools.rerun.run import replay_record
+
 pytestmark = pytest.mark.real_time
 
 COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "demo"]
@@ -35,6 +40,13 @@ def children_of(pid: int) -> dict[str, int]:
     return found
 
 
+def assert_its_record_replays_to_the_same_messages(out: Path, folder: Path) -> None:
+    """Replays the record of a live run, and compares all messages."""
+    replay_record(out, folder)
+    comparison = compare_records(read_record(out), read_record(folder))
+    assert comparison["equal"], list(summary(comparison))
+
+
 @pytest.mark.slow
 def test_the_demo_sends_gps_input_without_gaps_and_writes_its_report(
     tmp_path: Path, stall_ms: Callable[[], float]
@@ -53,6 +65,7 @@ def test_the_demo_sends_gps_input_without_gaps_and_writes_its_report(
     evaluation = json.loads((out / "evaluation.json").read_text())
     assert evaluation["false_fixes"] == 0 and evaluation["within_50m"] > 0.95
     assert (out / "flight" / "telemetry.tlog").stat().st_size > 0  # the folder can be replayed
+    assert_its_record_replays_to_the_same_messages(out, tmp_path / "replay")
     page = (out / "report.html").read_text()
     assert "<svg" in page and not re.search(r'(src|href)="https?://', page)  # one file, works offline
 
@@ -78,6 +91,7 @@ def test_killed_processes_are_restarted_and_gps_input_continues(
     for victim in victims:
         assert f"{victim} died: killed by SIGKILL" in output and f"{victim} restarted" in output, output
         assert victim in (out / "report.html").read_text()
+    assert_its_record_replays_to_the_same_messages(out, tmp_path / "replay")
     peer = json.loads((out / "peer.json").read_text())
     if "link" in victims:
         assert peer["longest_gap_ms"] < 1e3 * RESUMES_WITHIN_S

@@ -8,6 +8,7 @@ import typer
 
 from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
+from terrafix_tools.compare.cli import compare
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.hint.cli import CONTEXT, hint
 from terrafix_tools.mapping.cli import app as map_app
@@ -27,6 +28,7 @@ app.add_typer(map_app, name="map")
 app.add_typer(models_app, name="models")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
+app.command()(compare)
 app.command()(finalise)
 app.command()(preflight)
 app.command(context_settings=CONTEXT)(hint)
@@ -81,7 +83,7 @@ def run(
 
 @app.command()
 def replay(
-    flight: Annotated[Path, typer.Argument(help="Flight folder, photo folder or video.")],
+    flight: Annotated[Path, typer.Argument(help="Flight folder, photo folder, video, or flight record.")],
     map_path: Annotated[
         Path | None, typer.Option("--map", help="Map package or GeoTIFF; default: the flight's.")
     ] = None,
@@ -93,10 +95,23 @@ def replay(
     config: ConfigOption = None,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
-    """Replay a recorded flight as fast as this machine can; the same input gives the same output."""
+    """Replay a recorded flight as fast as this machine can; the same input gives the same output.
+
+    A flight record (.mcap, or the folder of a run) is replayed from its messages: the estimator computes again."""
+    from terrafix.recorder.reader import is_record
     from terrafix.vision.sources import parse_start
     from terrafix_tools.replay import replay as run_replay
 
+    if is_record(flight):
+        from terrafix_tools.rerun.run import replay_record
+
+        if map_path or model or start or config:
+            raise UsageError(
+                f"{flight}: a record is replayed from its messages, without map and models; omit --map, --model, "
+                "--start and --config, or replay the source of the flight"
+            )
+        replay_record(flight, out, progress=not quiet)
+        return
     start_lat_lon = parse_start(start)
     summary = run_replay(
         flight, map_path, out, models=model or [], configs=config or [], progress=not quiet, start=start_lat_lon

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -84,6 +84,13 @@ class ReplayOutput:
             self._record.flush()
             write_rows(self._csv, [row], header=False)
             self._csv.flush()
+
+    def thumbnails(self, images: Iterable[tuple[int, bytes]]) -> None:
+        """Adds thumbnails that are already coded: (frame id, JPEG)."""
+        with self._writing():
+            for frame_id, jpeg in images:
+                row = self._table.rows.get(frame_id)
+                self._record.write_thumbnail(round((row.t_s if row else 0.0) * NS), frame_id, jpeg)
 
     def counts(self) -> dict[str, Any]:
         """Returns frames, verdicts and times for summary.json."""

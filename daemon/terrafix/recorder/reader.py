@@ -18,7 +18,7 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import Message
 from terrafix.recorder.old_format import OLD_DECODERS, OLD_FORMAT
 from terrafix.recorder.schema import THUMBNAIL_TOPIC, TYPE_BY_TOPIC, topic_of
-from terrafix.recorder.writer import HEADER_NAME, decode_thumbnail
+from terrafix.recorder.writer import HEADER_NAME, RECORD_FORMAT, decode_thumbnail
 
 _SEGMENT = re.compile(r"flight-(\d+)\.mcap$")
 _RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # more than any valid record; a corrupt length must not allocate gigabytes
@@ -54,6 +54,25 @@ def flight_files(path: Path) -> list[Path]:
             f"{path}: no flight record here (flight.mcap or flight-000.mcap); give a replay or run folder"
         )
     return files
+
+
+def is_record(path: Path) -> bool:
+    """Whether ``path`` is a record file by its name, or a folder with one that is no recorded source (flight.toml)."""
+    if path.is_dir():
+        return not (path / "flight.toml").is_file() and any(path.glob("flight*.mcap*"))
+    return path.name.endswith((".mcap", ".mcap.partial"))
+
+
+def check_format(path: Path, result: ReadResult) -> None:
+    """Raises SourceError when what was read of ``path`` is no flight record, or of a version that is not known."""
+    where = ", ".join(file.name for file in result.files)
+    if not result.header:
+        raise SourceError(f"{path}: {where} is not a flight record, or ends before its head; give another")
+    if result.header["format"] not in (RECORD_FORMAT, OLD_FORMAT):
+        raise SourceError(
+            f"{path}: {where} is a record of format '{result.header['format']}', and this program reads "
+            f"'{RECORD_FORMAT}' and '{OLD_FORMAT}'; read it with the version that wrote it"
+        )
 
 
 def read_flight(path: Path, result: ReadResult | None = None) -> Iterator[tuple[str, int, Message]]:

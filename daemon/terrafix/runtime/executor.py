@@ -13,10 +13,11 @@ import zmq
 
 from terrafix.core.clock import Ticker, now_ns
 from terrafix.core.node import Edge, Node, NodeContext
-from terrafix.messages import Dropped, Message, NavEstimate, Origin, PositionHint, ProcessEvent
+from terrafix.messages import Dropped, InputOrder, Message, NavEstimate, Origin, PositionHint, ProcessEvent
 from terrafix.processes import OPERATOR, PROCESSES, SOURCE, SUPERVISOR, Process
 from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.inbox import Inbox
+from terrafix.runtime.input_order import InputLog
 from terrafix.runtime.message_log import log_message
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
@@ -124,6 +125,7 @@ class LiveShell:
         self._publisher = Publisher(context, endpoints.address(process.name))
         self._subscriber = Subscriber(context, [endpoints.address(s) for s in publishers], process.subscribes)
         self._inbox = Inbox(process.newest)
+        self._inputs = InputLog(process.name, now_ns()) if InputOrder in process.publishes else None
         self._progress = Progress(endpoints.progress(process.name))
         self._ticker = Ticker(process.tick_hz, now_ns()) if process.tick_hz > 0 else None
         self._dropped_ticker = Ticker(1e9 / DROPPED_PERIOD_NS, now_ns())
@@ -176,18 +178,28 @@ class LiveShell:
             return False
         if self._edge is not None:
             self._edge.on_message(next_message)
+        if self._inputs is not None:
+            self._inputs.add(next_message)
+            if self._inputs.full:
+                self._publish_input_order()
         self._publish(self._node.on(next_message))
         return True
 
     def _publish(self, messages: Iterable[Message]) -> None:
         """Passes the messages of the node to the edge, to the bus and to the log."""
         for message in messages:
+            self._publish_input_order()  # before the output, so that a record with an output has its inputs
             if isinstance(message, NavEstimate):  # set here because a node has no clock
                 message = msgspec.structs.replace(message, emitted_at_ns=now_ns())
             if self._edge is not None:
                 self._edge.on_message(message)  # before the bus, so that output to the autopilot is not delayed
             self._publisher.publish(message)
             log_message(message)
+
+    def _publish_input_order(self) -> None:
+        order = None if self._inputs is None else self._inputs.take(now_ns())
+        if order is not None:
+            self._publisher.publish(order)
 
     def _publish_losses(self) -> None:
         """Publishes Dropped for lost and skipped messages, at most once per DROPPED_PERIOD_NS."""
@@ -227,6 +239,7 @@ class LiveShell:
         until = now_ns() + STOP_DRAIN_NS
         while now_ns() < until and (self._process_next() or self._subscriber.socket.poll(STOP_QUIET_MS)):
             self._progress.stamp(now_ns(), len(self._inbox))
+        self._publish_input_order()
 
 
 def publishes_any(process: Process, kinds: tuple[type[Message], ...]) -> bool:

@@ -19,9 +19,8 @@ from terrafix.core.pose import exp_so3, tangent_to_world
 from terrafix.estimator.state import EAST, HORIZONTAL, MOUNT_TILT, NORTH, UP
 from terrafix.messages import Frame, SourceEnded
 from terrafix.processes import PROCESSES
-from terrafix.recorder.old_format import OLD_FORMAT
-from terrafix.recorder.reader import ReadResult, read_flight
-from terrafix.recorder.writer import RECORD_FORMAT, versions
+from terrafix.recorder.reader import ReadResult, check_format, read_flight
+from terrafix.recorder.writer import versions
 from terrafix_tools.estimates import NS
 from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
@@ -84,16 +83,10 @@ def _replay(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, Fin
             step("read", len(rows), None)
         if isinstance(message, REPLAYED):
             replayer.on(message)
-    where = ", ".join(path.name for path in result.files)
-    if not result.header:
-        raise SourceError(f"{folder}: {where} is not a flight record, or ends before its head; give another")
-    if result.header["format"] not in (RECORD_FORMAT, OLD_FORMAT):
-        raise SourceError(
-            f"{folder}: {where} is a record of format '{result.header['format']}', and this program reads "
-            f"'{RECORD_FORMAT}' and '{OLD_FORMAT}'; finalise it with the version that wrote it"
-        )
+    check_format(folder, result)
     if not replayer.flights or not rows:
         missing = "no frame" if replayer.flights else "no origin of a flight"
+        where = ", ".join(path.name for path in result.files)
         also = f" ({result.undecodable} messages are of another version)" if result.undecodable else ""
         raise SourceError(f"{folder}: {where} has {missing}{also}; was the source of the flight opened?")
     for flight in replayer.flights:

@@ -1,0 +1,1 @@
+"""`terrafix compare A B`: where two records of one flight diverge, and by how much."""

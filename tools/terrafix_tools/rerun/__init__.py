@@ -1,0 +1,1 @@
+"""`terrafix replay RECORD`: the estimator once more, from the messages of a flight record."""
