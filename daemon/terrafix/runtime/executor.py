@@ -26,6 +26,9 @@ EDGE_PERIOD_NS = 10_000_000  # longest interval between polls of an edge; 100 id
 IDLE_NS = 50_000_000  # longest interval between progress stamps of a process that waits for messages
 DROPPED_PERIOD_NS = 1_000_000_000  # shortest interval between reports of lost messages
 SUBSCRIBERS_WAIT_NS = 20_000_000_000  # longest wait of the source for the subscribers of Origin and the first frames
+# Longest wait of a started process for the recorder's subscription (RECONNECT_MS and a turn of its loop): what is
+# published before it is used by others, and missing in the record.
+RECORDER_WAIT_NS = 200_000_000
 STOP_DRAIN_NS = 2_000_000_000  # at a stop, queued messages are still processed for at most this long
 STOP_QUIET_MS = 100  # the queues count as empty after this long without a message
 
@@ -122,6 +125,7 @@ class LiveShell:
         opens_source = Origin in process.publishes
         # The subscribers that the process which opens the source waits for before it starts.
         self._required = [p.name for p in table if opens_source and Origin in p.subscribes and p is not process]
+        self._is_recorded = any(Dropped in p.subscribes and p is not process for p in table)
         self._publisher = Publisher(context, endpoints.address(process.name))
         self._subscriber = Subscriber(context, [endpoints.address(s) for s in publishers], process.subscribes)
         self._inbox = Inbox(process.newest)
@@ -136,6 +140,7 @@ class LiveShell:
     def run(self, stopping: Callable[[], bool]) -> None:
         """Runs until ``stopping()``, then processes the queued messages for at most STOP_DRAIN_NS."""
         self._progress.stamp(now_ns())
+        self._wait_for_recorder(stopping)
         self._wait_for_subscribers(stopping)
         while not stopping():
             self._progress.begin()
@@ -220,6 +225,13 @@ class LiveShell:
             until = min(until, self._ticker.next_ns)
         if until > now:
             self._poller.poll(-((now - until) // 1_000_000))  # ms, rounded up: to wake up early would be useless
+
+    def _wait_for_recorder(self, stopping: Callable[[], bool]) -> None:
+        """All processes publish Dropped, and the process that subscribes to it is the recorder."""
+        until = now_ns() + (RECORDER_WAIT_NS if self._is_recorded else 0)
+        while self._publisher.subscriptions(Dropped) == 0 and now_ns() < until and not stopping():
+            self._publisher.serve()
+            self._poller.poll(1)
 
     def _wait_for_subscribers(self, stopping: Callable[[], bool]) -> None:
         """The process that opens the source publishes Origin once and then frames, so their subscribers must connect

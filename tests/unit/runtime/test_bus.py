@@ -309,3 +309,27 @@ def test_a_subscriber_that_joins_a_busy_stream_receives_retained_messages_first(
     finally:
         over.set()
         thread.join(10)
+
+
+@pytest.mark.parametrize("late_s", [0.05, None], ids=["a late recorder", "no recorder"])
+def test_a_started_process_waits_for_the_recorder_so_that_its_first_message_is_recorded(
+    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir, late_s: float | None
+) -> None:
+    process = Process("started", "", (), (m.Frame,), 0.0, 1.0)
+    Progress.create(run_dir.progress("started")).close()
+    shell = LiveShell(process, (process, LISTENER), TickingNode(), OneFrameEdge(), run_dir, context)
+    over = threading.Event()
+    began_s = time.monotonic()
+    thread = threading.Thread(target=shell.run, args=(over.is_set,))
+    thread.start()
+    try:
+        time.sleep(late_s or 0.5)
+        recorder = Subscriber(context, [run_dir.address("started")], (m.Frame, m.Dropped))
+        arrived = recorder.socket.poll(1000)
+        assert [*recorder.receive()] == ([frame(1)] if late_s else []), "without a recorder it goes on"
+        assert not late_s or arrived and time.monotonic() - began_s < 1.0
+        recorder.close()
+    finally:
+        over.set()
+        thread.join(10)
+        shell.close()
