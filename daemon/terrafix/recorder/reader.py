@@ -1,18 +1,23 @@
-"""Reads a flight record, complete or truncated: one file, or a folder with the segments of a flight."""
+"""Reads a flight record, complete, truncated or damaged: one file, or a folder with the segments of a flight."""
 
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any
 
 import msgspec
 import zstandard
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Metadata
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Metadata
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import CRCValidationError, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import Message
@@ -22,9 +27,10 @@ from terrafix.recorder.writer import HEADER_NAME, RECORD_FORMAT, decode_thumbnai
 
 _SEGMENT = re.compile(r"flight-(\d+)\.mcap$")
 _RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # more than any valid record; a corrupt length must not allocate gigabytes
+_FRAMING = struct.Struct("<BQ")  # opcode and length of each record (https://mcap.dev/spec)
 
-# Exceptions of a truncated or corrupt record: invalid length, compression or text in bytes that were never written.
-_CORRUPT = (McapError, struct.error, zstandard.ZstdError, UnicodeDecodeError, msgspec.DecodeError)
+# Exceptions of a truncated or corrupt record: invalid length, compression, checksum or text.
+_CORRUPT = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError, msgspec.DecodeError)
 
 _DECODERS = {topic: msgspec.json.Decoder(t).decode for topic, t in TYPE_BY_TOPIC.items()}
 _DECODERS_OF_OLD = {**_DECODERS, **OLD_DECODERS}
@@ -37,6 +43,7 @@ class ReadResult:
     header: dict[str, Any] = field(default_factory=dict)  # format, config, versions of the first file
     files: list[Path] = field(default_factory=list)
     truncated_files: list[Path] = field(default_factory=list)  # without their end (kill, power failure, full disk)
+    damaged: list[str] = field(default_factory=list)  # parts that were left out: file, place and reason
     undecodable: int = 0  # messages of another version of this program
     segment_starts_ns: list[int] = field(default_factory=list)  # publish time of the first message of each file
 
@@ -100,20 +107,8 @@ def read_thumbnails(path: Path) -> Iterator[tuple[int, bytes]]:
     """Yields (frame id, JPEG) in the order of the record."""
     for _, channel, record in _records(path, ReadResult()):
         if channel.topic == THUMBNAIL_TOPIC:
-            yield decode_thumbnail(record.data)
-
-
-class _ExactReadStream:
-    """A stream whose read() returns exactly ``length`` bytes or raises EndOfFile; mcap accepts short reads."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream = stream
-
-    def read(self, length: int) -> bytes:
-        data = self._stream.read(length)
-        if len(data) < length:
-            raise EndOfFile
-        return data
+            with suppress(msgspec.DecodeError, KeyError, TypeError, ValueError):
+                yield decode_thumbnail(record.data)
 
 
 def _records(path: Path, result: ReadResult) -> Iterator[tuple[str, Channel, McapMessage]]:
@@ -128,24 +123,73 @@ def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[t
     """Reads sequentially, because the index is at the end of the file, which a truncated file lacks."""
     channels: dict[int, Channel] = {}
     file_format, first = "", True
+    for record in _contents(file, stream, result):
+        if isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Metadata) and record.name == HEADER_NAME:
+            file_format = record.metadata.get("format", "")
+            result.header = result.header or _header(record.metadata)
+        elif isinstance(record, McapMessage) and record.channel_id in channels:
+            if first:
+                result.segment_starts_ns.append(record.publish_time)
+                first = False
+            yield file_format, channels[record.channel_id], record
+
+
+def _header(metadata: dict[str, str]) -> dict[str, Any]:
+    """Raises msgspec.DecodeError."""
+    return {
+        "format": metadata.get("format", ""),
+        "config": msgspec.json.decode(metadata.get("config", "{}")),
+        "versions": msgspec.json.decode(metadata.get("versions", "{}")),
+    }
+
+
+def _contents(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[McapRecord]:
+    """Yields the records of a file that matter here. A part that does not agree with its checksum or cannot be parsed
+    is left out whole and named in ``result``; the parts after it are read."""
     try:
-        for record in StreamReader(
-            cast(IO[bytes], _ExactReadStream(stream)), record_size_limit=_RECORD_LIMIT_BYTES
-        ).records:
-            if isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Metadata) and record.name == HEADER_NAME:
-                file_format = record.metadata.get("format", "")
-                result.header = result.header or {
-                    "format": file_format,
-                    "config": msgspec.json.decode(record.metadata.get("config", "{}")),
-                    "versions": msgspec.json.decode(record.metadata.get("versions", "{}")),
-                }
-            elif isinstance(record, McapMessage) and record.channel_id in channels:
-                if first:
-                    result.segment_starts_ns.append(record.publish_time)
-                    first = False
-                yield file_format, channels[record.channel_id], record
+        for offset, opcode, content in _framed(stream):
+            try:
+                yield from _parse(opcode, content)
+            except _CORRUPT as error:
+                result.damaged.append(f"{file.name}, byte {offset}: {error or type(error).__name__}")
     except _CORRUPT:
-        # The file ends or is corrupt within a record; the records before it are valid.
-        result.truncated_files.append(file)
+        result.truncated_files.append(file)  # ends within a record, or has a length that cannot be
+
+
+def _framed(stream: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
+    """Yields (offset in the file, opcode, content) up to the footer. Raises EndOfFile or another McapError."""
+    magic = stream.read(len(MCAP0_MAGIC))
+    if magic != MCAP0_MAGIC:
+        raise InvalidMagic(magic)
+    opcode = 0
+    while opcode != Opcode.FOOTER:
+        offset = stream.tell()
+        head = stream.read(_FRAMING.size)
+        if len(head) < _FRAMING.size:
+            raise EndOfFile
+        opcode, length = _FRAMING.unpack(head)
+        if length > _RECORD_LIMIT_BYTES:
+            raise McapError(f"a record of {length} bytes")
+        content = stream.read(length)
+        if len(content) < length:
+            raise EndOfFile
+        yield offset, opcode, content
+
+
+def _parse(opcode: int, content: bytes) -> list[McapRecord]:
+    """-> metadata, channels and messages in a record of a file; index, statistics and schemas are not needed.
+
+    Raises one of _CORRUPT."""
+    if opcode == Opcode.METADATA:
+        return [Metadata.read(ReadDataStream(BytesIO(content)))]
+    if opcode == Opcode.CHUNK:
+        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+        # Sizes are checked before the memory is allocated.
+        if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) > _RECORD_LIMIT_BYTES:
+            raise McapError("the size of the chunk is damaged")
+        if chunk.uncompressed_size > _RECORD_LIMIT_BYTES or chunk.uncompressed_crc == 0:
+            raise McapError("the head of the chunk is damaged")
+        return breakup_chunk(chunk, validate_crc=True)
+    return []
