@@ -14,7 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.errors import EvaluationError, OutputError
-from terrafix_tools.estimates import Row, number, read_rows, read_table
+from terrafix.recorder.reader import ReadResult, check_format, is_record, read_flight
+from terrafix_tools.estimates import ESTIMATES, Row, RowTable, number, read_rows, read_table
 from terrafix_tools.finalise.output import TABLE as FINALISED
 
 LIMITS_M = (5, 10, 20, 50)
@@ -196,9 +197,23 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return summary
 
 
+def flight_rows(folder: Path) -> list[Row]:
+    """-> the rows of estimates.csv, or of the record where there is none (a live run).
+
+    Raises EvaluationError, SourceError."""
+    if (folder / ESTIMATES).is_file() or not is_record(folder):
+        return read_rows(folder / ESTIMATES)
+    table = RowTable()
+    result = ReadResult()
+    for _, _, message in read_flight(folder, result):
+        table.take(message)
+    check_format(folder, result)
+    return list(table.rows.values())
+
+
 def evaluate(folder: Path, truth_path: Path, *, json_only: bool = False) -> dict[str, Any]:
     """Writes FOLDER/evaluation.json and prints it. Raises EvaluationError, OutputError."""
-    rows = read_rows(folder / "estimates.csv")
+    rows = flight_rows(folder)
     truth = read_truth(truth_path)
     result = metrics(rows, truth, read_summary(folder), truth_sigma_of(truth_path))
     if (folder / FINALISED).is_file():

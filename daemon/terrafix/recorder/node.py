@@ -78,8 +78,10 @@ class RecorderEdge:
             self._ring.write(message, received_ns)
             if isinstance(message, Frame):
                 self._thumbnail(message)
+        if self._ring.blocked:
+            return
         with self._dropped_lock:
-            lost, self._dropped = self._dropped, Counter()
+            lost, self._dropped = self._dropped + self._ring.take_lost(), Counter()
         for name, count in lost.items():
             now_ns = self._now_ns
             self._ring.write(Dropped(t_ns=now_ns, process="recorder", message=name, count=count), now_ns)
@@ -97,7 +99,7 @@ def make_node(ctx: NodeContext) -> Node:
 
 
 def make_edge(ctx: NodeContext) -> Edge:
-    """Raises OutputError when the folder cannot be written."""
+    """Raises OutputError when the path or its permissions allow no folder; a disk that is full is no error."""
     settings = ctx.config.recorder
     ring = SegmentRing(ctx.out_dir, header(ctx.config), settings.budget_mb)
     width_px = settings.thumbnail_width_px if settings.thumbnails else None

@@ -2,6 +2,7 @@
 kill."""
 
 import base64
+import os
 import platform
 import subprocess
 import sys
@@ -119,9 +120,15 @@ class FlightWriter:
         getattr(self._mcap, _END_CHUNK)()
         self._file.flush()
 
+    def sync(self) -> None:
+        """Passes what was flushed to the disk, so that a power cut does not lose it. A slow disk takes seconds."""
+        os.fsync(self._file.fileno())
+
     def close(self) -> None:
-        self._mcap.finish()  # type: ignore[no-untyped-call]
-        self._file.close()
+        try:
+            self._mcap.finish()  # type: ignore[no-untyped-call]
+        finally:
+            self._file.close()
 
     def _register(self, topic: str, schema_name: str, schema: bytes) -> None:
         schema_id = self._mcap.register_schema(schema_name, "jsonschema", schema)

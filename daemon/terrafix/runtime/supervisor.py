@@ -5,6 +5,7 @@ functions are in the processes. Only the failure of the link ends the unit. When
 others continue, and the state is reported."""
 
 import contextlib
+import errno
 import os
 import signal
 import socket
@@ -39,6 +40,9 @@ DRAIN_LIMIT_NS = 60_000_000_000  # ... or when this long has passed since
 FRESH_NS = 500_000_000  # a process with an older progress stamp is still working on a message
 NOTIFY_HZ = 2.0  # rate of WATCHDOG=1; WatchdogSec of the unit is several times the period
 SQLITE_MAGIC = b"SQLite format 3\0"  # a map package is a GeoPackage, and that is SQLite
+
+# The disk of the record is full (space or inodes), over its quota, read-only or broken.
+DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
 
 def run(
@@ -270,11 +274,15 @@ def _is_camera(source: str) -> bool:
 
 
 def _writable(out_dir: Path) -> Path:
+    """-> the absolute path. Raises OutputError for a folder that cannot be made or written, unless the disk is the
+    reason: then the vehicle flies without a record, and the recorder says so."""
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out_dir):
             pass
     except OSError as error:
+        if error.errno in DISK_FAILURES:
+            return out_dir.absolute()
         raise OutputError(f"{out_dir}: cannot be written ({error.strerror}); give another folder with --out") from None
     return out_dir.resolve()
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flight_records import ORIGIN
+from flight_records import ORIGIN, live_messages, write_record, write_truth
 from terrafix.core.errors import EvaluationError
 from terrafix_tools.estimates import COLUMNS, Row, write_rows
 from terrafix_tools.evaluate import evaluate, offset_m, read_truth
@@ -153,3 +153,12 @@ def test_the_columns_of_estimates_csv_are_as_specified() -> None:
         "file,t_s,lat_deg,lon_deg,alt_amsl_m,agl_m,sigma_e_m,sigma_n_m,cov_en_m2,yaw_deg,source_label,anchor_age_ms,"
         "covariance_mode,process_ms,refined_lat_deg,refined_lon_deg"
     )
+
+
+def test_the_record_of_a_live_run_is_evaluated_without_estimates_csv(tmp_path: Path) -> None:
+    write_record(tmp_path / "flight-000.mcap", live_messages())
+    write_truth(tmp_path / "truth.csv")
+    result = evaluate(tmp_path, tmp_path / "truth.csv", json_only=True)
+    assert (result["frames"], result["localised"]) == (20, 19)
+    assert result["median_m"] == pytest.approx(math.hypot(1.0, 2.0), abs=0.01)
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == result
