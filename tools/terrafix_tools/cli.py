@@ -11,6 +11,7 @@ from terrafix_tools.accept.cli import accept
 from terrafix_tools.compare.cli import compare
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.hint.cli import CONTEXT, hint
+from terrafix_tools.log.cli import app as log_app
 from terrafix_tools.mapping.cli import app as map_app
 from terrafix_tools.models.cli import app as models_app
 from terrafix_tools.montecarlo.cli import montecarlo
@@ -21,11 +22,12 @@ if TYPE_CHECKING:
     from terrafix.runtime.fork_server import ForkServer
 
 # optional packages of the extra `ground`; not installed on a vehicle
-GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium")
+GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow")
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
 app.add_typer(map_app, name="map")
 app.add_typer(models_app, name="models")
+app.add_typer(log_app, name="log")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
 app.command()(compare)

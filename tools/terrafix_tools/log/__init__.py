@@ -1,0 +1,1 @@
+"""`terrafix log`: what is in a flight record, as text and in the formats of other programs."""

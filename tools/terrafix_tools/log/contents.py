@@ -1,0 +1,111 @@
+"""`terrafix log info` and `check`: contents and damage of a record."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from terrafix.messages import Frame, NavEstimate, Origin, WallClock
+from terrafix.recorder.reader import ReadResult, check_format, read_received
+
+NS = 1_000_000_000
+
+
+@dataclass
+class Contents:
+    """What one pass over a record finds. Times in ns on the clock of the record."""
+
+    path: Path
+    result: ReadResult
+    counts: Counter[str] = field(default_factory=Counter)
+    first_ns: int | None = None
+    last_ns: int = 0
+    origin: Origin | None = None
+    unix_offset_ns: int | None = None  # Unix time minus the clock of the record
+    frames: set[int] = field(default_factory=set)
+    localised: set[int] = field(default_factory=set)
+
+    @property
+    def duration_s(self) -> float:
+        return 0.0 if self.first_ns is None else (self.last_ns - self.first_ns) / NS
+
+    @property
+    def start_utc(self) -> str | None:
+        """Wall clock time of the first message; None when no clock was plausible in flight."""
+        if self.unix_offset_ns is None or self.first_ns is None:
+            return None
+        return datetime.fromtimestamp((self.first_ns + self.unix_offset_ns) / NS, UTC).isoformat(timespec="seconds")
+
+    @property
+    def damage(self) -> list[str]:
+        return damage_of(self.result)
+
+
+def damage_of(result: ReadResult) -> list[str]:
+    """One line for each thing that is wrong with a record."""
+    lines = [f"{line}: left out" for line in result.damaged]
+    lines += [f"{file.name}: ends in the middle of a record" for file in result.truncated_files]
+    if result.undecodable:
+        lines.append(f"{result.undecodable} messages are of another version of this program: left out")
+    return lines
+
+
+def read_contents(path: Path) -> Contents:
+    """Reads a record: a file, or the folder of a replay or run. Raises SourceError."""
+    found = Contents(path, ReadResult())
+    for _, t_ns, _, message in read_received(path, found.result):
+        found.counts[type(message).__name__] += 1
+        if isinstance(message, Origin):
+            found.origin = found.origin or message
+            continue
+        found.first_ns = t_ns if found.first_ns is None else min(found.first_ns, t_ns)
+        found.last_ns = max(found.last_ns, t_ns)
+        if isinstance(message, Frame):
+            found.frames.add(message.frame_id)
+        elif isinstance(message, NavEstimate):
+            found.localised.add(message.frame_id)
+        elif isinstance(message, WallClock) and message.unix_ns is not None:
+            found.unix_offset_ns = message.unix_ns - message.t_ns
+    check_format(path, found.result)
+    return found
+
+
+def as_json(found: Contents) -> dict[str, Any]:
+    header, origin = found.result.header, found.origin
+    return {
+        "path": str(found.path),
+        "files": [{"name": file.name, "bytes": file.stat().st_size} for file in found.result.files],
+        "format": header["format"],
+        "versions": header["versions"],
+        "source": header["config"].get("source", {}).get("path", ""),
+        "map": header["config"].get("map", {}).get("path", ""),
+        "start_utc": found.start_utc,
+        "duration_s": round(found.duration_s, 3),
+        "start": None if origin is None else {"lat_deg": origin.lat_deg, "lon_deg": origin.lon_deg},
+        "frames": len(found.frames),
+        "localised": len(found.localised),
+        "messages": dict(sorted(found.counts.items())),
+        "damage": found.damage,
+    }
+
+
+def info_lines(found: Contents) -> Iterator[str]:
+    """Lines for a terminal."""
+    about = as_json(found)
+    size_mb = sum(file["bytes"] for file in about["files"]) / 1e6
+    yield f"{found.path}: {len(about['files'])} files, {size_mb:.1f} MB, format {about['format']}"
+    version = about["versions"]
+    yield f"terrafix {version.get('terrafix', '?')} {version.get('git', '')}, {version.get('platform', '')}"
+    yield f"duration {about['duration_s']:.1f} s, start {about['start_utc'] or 'at an unknown time of day'}"
+    if about["start"] is not None:
+        yield f"from {about['start']['lat_deg']:.6f}, {about['start']['lon_deg']:.6f}"
+    for name in ("source", "map"):
+        if about[name]:
+            yield f"{name} {about[name]}"
+    yield f"{about['localised']} of {about['frames']} frames localised"
+    for kind, count in about["messages"].items():
+        rate = count / found.duration_s if found.duration_s > 0 else 0.0
+        yield f"  {kind:<22} {count:>8}  {rate:8.2f} Hz"
+    yield from found.damage
