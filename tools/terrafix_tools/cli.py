@@ -11,6 +11,7 @@ from terrafix_tools.accept.cli import accept
 from terrafix_tools.compare.cli import compare
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.hint.cli import CONTEXT, hint
+from terrafix_tools.locate.cli import locate
 from terrafix_tools.log.cli import app as log_app
 from terrafix_tools.mapping.cli import app as map_app
 from terrafix_tools.models.cli import app as models_app
@@ -32,6 +33,7 @@ app.add_typer(sim_app, name="sim")
 app.command()(accept)
 app.command()(compare)
 app.command()(finalise)
+app.command()(locate)
 app.command()(preflight)
 app.command(context_settings=CONTEXT)(hint)
 app.command()(montecarlo)

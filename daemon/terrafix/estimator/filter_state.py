@@ -207,9 +207,10 @@ class FilterState:
         focal = self.origin.camera.focal_sigma
         if not self.has_height:
             return 1.0, focal
-        both = scale_sigma(self.origin.camera)
-        part = (focal / both) ** 2 * float(self.graph.state(node).bias[LOG_HEIGHT_SCALE])
-        return float(np.exp(part)), focal * BAROMETER_SCALE_SIGMA / both
+        log_scale = float(self.graph.state(node).bias[LOG_HEIGHT_SCALE])
+        return focal_scale(self.origin.camera, log_scale), focal * BAROMETER_SCALE_SIGMA / scale_sigma(
+            self.origin.camera
+        )
 
     def amsl(self, frame: FrameState) -> tuple[float, float]:
         """Height of the camera AMSL [m], and its 1-sigma beyond the covariance of the graph. Without a DEM the graph
@@ -225,6 +226,12 @@ class FilterState:
         return self.terrain.ground_m + scale * seen_m, float(
             np.linalg.norm([self.origin.agl_sigma_m, drift_m, sigma * seen_m])
         )
+
+
+def focal_scale(camera: Camera, log_height_scale: float) -> float:
+    """True height over the height in the graph: the part of the estimated ratio of reported to observed heights, given
+    as its logarithm, that an error of the focal length explains."""
+    return float(np.exp((camera.focal_sigma / scale_sigma(camera)) ** 2 * log_height_scale))
 
 
 def scale_sigma(camera: Camera) -> float:

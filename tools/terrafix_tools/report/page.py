@@ -7,8 +7,7 @@ from pathlib import Path
 
 from terrafix.core.errors import OutputError
 from terrafix_tools.estimates import Row
-from terrafix_tools.mapping.build import ensure_package
-from terrafix_tools.replay import map_cache_dir
+from terrafix_tools.flight_map import map_of_flight
 from terrafix_tools.report.charts import clock
 from terrafix_tools.report.data import FlightView, gather, radius95_m
 from terrafix_tools.report.map_picture import map_svg
@@ -26,7 +25,7 @@ def report(folder: Path, truth_path: Path | None = None, map_path: Path | None =
     Defaults: ``truth_path``: truth.csv in the folder, if it exists; ``map_path``: the map of the flight.
     """
     view = gather(folder, truth_path)
-    page = _page(view, _map_package(folder, view, map_path))
+    page = _page(view, map_of_flight(folder, map_path, view.summary, view.header))
     target = folder / NAME
     partial = folder / (NAME + ".partial")
     try:
@@ -35,16 +34,6 @@ def report(folder: Path, truth_path: Path | None = None, map_path: Path | None =
     except OSError as error:
         raise OutputError(f"{target}: cannot be written ({error.strerror})") from None
     return target
-
-
-def _map_package(folder: Path, view: FlightView, map_path_option: Path | None) -> Path | None:
-    """Returns the given map, or the one named in the summary, the recorded configuration or found in the folder."""
-    if map_path_option is not None:
-        return ensure_package(map_path_option, map_cache_dir())
-    config = view.header.get("config", {})
-    named = [view.summary.get("map", {}).get("path", ""), config.get("map", {}).get("path", "")]
-    candidates = [Path(name) for name in named if name.endswith(".gpkg")] + sorted(folder.glob("*.gpkg"))
-    return next((path for path in candidates if path.is_file()), None)
 
 
 def _page(view: FlightView, map_path: Path | None) -> str:

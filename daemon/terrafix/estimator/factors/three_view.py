@@ -97,6 +97,37 @@ def three_view_constraint(
     """``triples`` (N, 6): normalised (first, middle, last), with the 1-sigma of a coordinate; ``focal_sigma``: 1-sigma
     of the focal length, relative. None: too few points, too short translations, or a solution that contradicts
     ``guess``."""
+    solution = _solve(triples, sigma_norm, guess, focal_sigma)
+    if solution is None:
+        return None
+    _, at, normal = solution
+    values, vectors = np.linalg.eigh(normal.left)
+    keep = values > NULL_EIGENVALUE * values[-1]
+    root = np.sqrt(values[keep])
+    return ThreeViewConstraint(at, vectors[:, keep].T * root[:, None], vectors[:, keep].T @ normal.right / root)
+
+
+def triangulate(
+    triples: np.ndarray, sigma_norm: float, guess: ThreeViewPose, focal_sigma: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Arguments as of ``three_view_constraint``. -> points (N, 3) in the middle camera, in the unit of length that the
+    translations of ``guess`` give, and the relative 1-sigma of the depth of each (N,) by its image errors; points
+    behind the camera are left out. None: as there."""
+    solution = _solve(triples, sigma_norm, guess, focal_sigma)
+    if solution is None:
+        return None
+    points, _, normal = solution
+    points, inner = points[points[:, 2] > 0.0], normal.inner[points[:, 2] > 0.0]
+    # The weights count all points of an image as few independent ones; a single one has its own noise only.
+    independent = min(1.0, EFFECTIVE_PAIRS / len(triples)) / SHARED_TRIPLES
+    relative_sigma = np.sqrt(inner[:, 2, 2] * independent) / points[:, 2]
+    return np.column_stack([points[:, :2], np.ones(len(points))]) / points[:, 2:], relative_sigma
+
+
+def _solve(
+    triples: np.ndarray, sigma_norm: float, guess: ThreeViewPose, focal_sigma: float
+) -> tuple[np.ndarray, ThreeViewPose, _NormalEquations] | None:
+    """-> points (N, 3) as x, y and inverse depth in the middle camera; the cameras; the normal equations there."""
     lengths = [float(np.linalg.norm(pose.translation())) for pose in (guess.first, guess.last)]
     if len(triples) < MIN_TRIPLES or min(lengths) < MIN_TRANSLATION * guess.height_m:
         return None
@@ -110,10 +141,7 @@ def three_view_constraint(
         return None
     if np.abs(offset / prior_sigmas).max() > PRIOR_GATE_SIGMAS:
         return None
-    values, vectors = np.linalg.eigh(normal.left)
-    keep = values > NULL_EIGENVALUE * values[-1]
-    root = np.sqrt(values[keep])
-    return ThreeViewConstraint(at, vectors[:, keep].T * root[:, None], vectors[:, keep].T @ normal.right / root)
+    return points, at, normal
 
 
 def _bundle_adjustment(

@@ -1,0 +1,1 @@
+"""`terrafix locate`: the position of what a pixel of a frame shows."""
