@@ -11,6 +11,7 @@ from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.filter_state import focal_scale
+from terrafix.estimator.measurements.attitude_height import body_sigma_rad
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.estimator.state import (
     HORIZONTAL,
@@ -20,7 +21,16 @@ from terrafix.estimator.state import (
     UP,
     WORLD_TILT,
 )
-from terrafix.messages import CalibrationEstimate, Frame, GroundPlane, MapMatch, NavEstimate, Odometry, Origin
+from terrafix.messages import (
+    CalibrationEstimate,
+    Frame,
+    GroundPlane,
+    MapMatch,
+    NavEstimate,
+    Odometry,
+    Origin,
+    VehicleState,
+)
 from terrafix.recorder.reader import ReadResult, check_format, read_flight
 
 
@@ -77,7 +87,8 @@ def read_views(record: Path) -> FlightViews:
     result = ReadResult()
     origin: Origin | None = None
     frames: dict[int, Frame] = {}
-    estimates: dict[int, NavEstimate] = {}
+    estimates: dict[int, tuple[NavEstimate, bool]] = {}  # with whether roll and pitch were reported
+    tilt_reported = False
     grounds: dict[int, GroundPlane] = {}
     calibrations: list[CalibrationEstimate] = []
     triples: list[Odometry] = []
@@ -87,7 +98,10 @@ def read_views(record: Path) -> FlightViews:
         elif isinstance(message, Frame):
             frames[message.frame_id] = message
         elif isinstance(message, NavEstimate):
-            estimates[message.frame_id] = message  # the last one of a frame has its map match
+            # The last one of a frame has its map match.
+            estimates[message.frame_id] = message, tilt_reported
+        elif isinstance(message, VehicleState):
+            tilt_reported |= message.pitch_rad is not None and message.roll_rad is not None
         elif isinstance(message, MapMatch) and message.ground is not None:
             grounds[message.frame_id] = message.ground
         elif isinstance(message, CalibrationEstimate):
@@ -100,7 +114,7 @@ def read_views(record: Path) -> FlightViews:
     frame = LocalFrame(origin.lat_deg, origin.lon_deg)
     cameras = _Cameras(origin, frame, calibrations)
     views = {
-        frame_id: replace(cameras.view(estimate), file=frames[frame_id].file, ground=grounds.get(frame_id))
+        frame_id: replace(cameras.view(*estimate), file=frames[frame_id].file, ground=grounds.get(frame_id))
         for frame_id, estimate in estimates.items()
         if frame_id in frames
     }
@@ -111,13 +125,14 @@ class _Cameras:
     """Cameras from estimates of the body, by the calibration that was estimated nearest in time."""
 
     def __init__(self, origin: Origin, frame: LocalFrame, calibrations: list[CalibrationEstimate]) -> None:
+        self._origin = origin
         self._camera = origin.camera
         self._frame = frame
         self._calibrations = calibrations
         self._times_ns = np.array([calibration.t_ns for calibration in calibrations], np.int64)
 
-    def view(self, estimate: NavEstimate) -> CameraView:
-        """Camera of the body in ``estimate``, without file and ground plane."""
+    def view(self, estimate: NavEstimate, tilt_reported: bool) -> CameraView:
+        """Camera of the body in ``estimate``, without file and ground plane. ``tilt_reported``: of roll and pitch."""
         mount, cov = Mount.of(self._camera), np.array(estimate.cov).reshape(6, 6)
         calibration = CameraCalibration.of(self._camera)
         r_w_c = rot_from_quat(estimate.q_w_b) @ mount.r_b_c()
@@ -126,6 +141,8 @@ class _Cameras:
         if learnt is None:
             cov[WORLD_TILT, WORLD_TILT] += np.radians(mount.tolerance_deg) ** 2 * np.eye(2)
         else:
+            # The camera is known better than the body in it, and the estimate has the covariance of the body.
+            cov[WORLD_TILT, WORLD_TILT] -= body_sigma_rad(self._origin, tilt_reported=tilt_reported) ** 2 * np.eye(2)
             r_w_c = r_w_c @ exp_so3(np.append(learnt.state[MOUNT_TILT], 0.0))
             calibration = replace(calibration, radial_k1=learnt.state[RADIAL_K1])
             height_m /= focal_scale(self._camera, learnt.state[LOG_HEIGHT_SCALE])

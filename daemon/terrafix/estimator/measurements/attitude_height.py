@@ -68,12 +68,14 @@ class MountedCamera:
     def body_sigma_rad(self) -> float:
         """1-sigma of the body in the camera: a constant attitude error cannot be distinguished from one of the
         mount."""
-        reported = self._tilt_reported
-        return float(
-            np.radians(self._origin.attitude_sigma_deg if reported else self._origin.camera.mount_tolerance_deg)
-        )
+        return body_sigma_rad(self._origin, tilt_reported=self._tilt_reported)
 
     def body(self, r_w_c: np.ndarray, bias: np.ndarray) -> np.ndarray:
         """R_w_b (3, 3), with the estimated mount."""
         r_b_c = self._r_b_c @ exp_so3(np.array([bias[MOUNT_TILT_X], bias[MOUNT_TILT_Y], 0.0]))
         return np.asarray(r_w_c @ r_b_c.T)
+
+
+def body_sigma_rad(origin: Origin, *, tilt_reported: bool) -> float:
+    """1-sigma of the tilt of the body in the camera. ``tilt_reported``: the autopilot reports roll and pitch."""
+    return float(np.radians(origin.attitude_sigma_deg if tilt_reported else origin.camera.mount_tolerance_deg))
