@@ -51,7 +51,7 @@ def as_json(found: "ObjectPosition", locator: "FlightLocator", sightings: Sighti
     return {
         "lat_deg": round(lat_deg, 8),
         "lon_deg": round(lon_deg, 8),
-        "alt_amsl_m": round(float(found.p_m[2]), 3),
+        "alt_amsl_m": round(float(found.p_m[2]), 3) if locator.amsl_known else None,
         "radius95_m": round(found.radius95_m, 3),
         "sigma_e_m": sigma_e_m,
         "sigma_n_m": sigma_n_m,
@@ -68,8 +68,9 @@ def as_json(found: "ObjectPosition", locator: "FlightLocator", sightings: Sighti
 
 def text(found: "ObjectPosition", locator: "FlightLocator", sightings: Sightings) -> list[str]:
     values = as_json(found, locator, sightings)
+    level = "above sea level" if locator.amsl_known else "above the ground at the start"
     lines = [
-        f"{values['lat_deg']:.7f}, {values['lon_deg']:.7f}, {values['alt_amsl_m']:.1f} m above sea level",
+        f"{values['lat_deg']:.7f}, {values['lon_deg']:.7f}, {found.p_m[2]:.1f} m {level}",
         f"within {values['radius95_m']:.1f} m (95 %), by the {found.surface}; 1-sigma of the height "
         f"{values['sigma_u_m']:.1f} m",
     ]

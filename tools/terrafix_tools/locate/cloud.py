@@ -22,10 +22,17 @@ class PointCloud:
     points_m: np.ndarray
     sigma_m: np.ndarray
 
-    def near(self, at_m: np.ndarray, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Points (M, 3) and sigmas (M,) within a horizontal distance of ``at_m`` (east, north, ...)."""
-        inside = np.hypot(*(self.points_m[:, :UP] - at_m[:UP]).T) < radius_m
-        return self.points_m[inside], self.sigma_m[inside]
+    def seen_near(self, view: CameraView, xy: np.ndarray, radius: float, count: int) -> tuple["PointCloud", np.ndarray]:
+        """The ``count`` points that ``view`` sees nearest to ``xy`` (2,), at most ``radius`` away, and where it sees
+        them relative to that (M, 2), normalised image coordinates."""
+        in_c = (self.points_m - view.p_c_in_w_m) @ view.r_w_c
+        away = np.full((len(in_c), 2), np.inf)
+        ahead = in_c[:, 2] > 0.0
+        away[ahead] = in_c[ahead, :2] / in_c[ahead, 2:] - xy
+        distance = np.hypot(*away.T)
+        nearest = np.argsort(distance)[:count]
+        nearest = nearest[distance[nearest] < radius]
+        return PointCloud(self.points_m[nearest], self.sigma_m[nearest]), away[nearest]
 
 
 def build_cloud(flight: FlightViews, fragment_id: int, elevation: Elevation | None) -> PointCloud:

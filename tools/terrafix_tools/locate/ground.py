@@ -11,10 +11,11 @@ from terrafix.estimator.state import HORIZONTAL, UP
 from terrafix_tools.locate.cloud import Elevation, PointCloud
 from terrafix_tools.locate.views import CameraView
 
-MIN_POINTS = 6  # of a plane through the cloud: twice its unknowns
-NEAR_SHARE = 0.12  # radius about the end of the ray within which points count, share of the height above ground
-MAX_GAP_RAD = np.pi  # largest angle between two points as seen from the end of the ray: beyond, they lie on one side
-ITERATIONS = 4  # of ray and plane through the points near its end
+PLANE_SIZE = 3  # unknowns of a plane
+MIN_POINTS, MAX_POINTS = 6, 12  # of a plane through the cloud: two and four times its unknowns
+NEAR = 0.12  # radius about a pixel within which points count, normalised image coordinates: 7 degrees
+MAX_GAP_RAD = np.pi  # largest angle between neighbouring points about the pixel: beyond, all lie on one side
+MIN_SIGMA_SHARE = 0.1  # least sigma of a point, share of the median: none outweighs a hundred others
 MIN_DESCENT = 0.05  # least downward component of a unit ray: 3 degrees below the horizon
 REACH = 3.0  # how far a ray is followed, in distances to the plane below the camera
 STEPS = 400  # samples along a ray over the elevation model
@@ -53,7 +54,7 @@ def ground_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, elevation
     if ray[UP] > -MIN_DESCENT:
         raise SourceError(f"frame {view.frame_id}: the pixel shows no ground (horizon or sky); choose a lower one")
     reference = _elevation_patch(view, ray, elevation) or _plane_patch(view, ray)
-    return _cloud_patch(view, ray, cloud, reference) or reference
+    return _cloud_patch(view, ray, cloud, reference.sigma_m) or reference
 
 
 def _plane_patch(view: CameraView, ray: np.ndarray) -> GroundPatch:
@@ -84,44 +85,42 @@ def _elevation_patch(view: CameraView, ray: np.ndarray, elevation: Elevation | N
         return None
     i = int(below[0])
     share = above_m[i - 1] / (above_m[i - 1] - above_m[i])
-    at_m = (points_m[i - 1] + share * (points_m[i] - points_m[i - 1]))[HORIZONTAL]
-    steps = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * SLOPE_STEP_M
-    around_m = elevation(*(at_m + steps).T)
+    at_m = points_m[i - 1] + share * (points_m[i] - points_m[i - 1])
+    steps_m = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]) * SLOPE_STEP_M
+    around_m = elevation(*(at_m[HORIZONTAL] + steps_m).T)
     if around_m is None or not np.isfinite(around_m).all():
         return None
-    slope = np.array([around_m[1] - around_m[2], around_m[3] - around_m[4]]) / (2.0 * SLOPE_STEP_M)
+    slope = np.array([around_m[0] - around_m[1], around_m[2] - around_m[3]]) / (2.0 * SLOPE_STEP_M)
     sigma_m = float(np.hypot(LEVEL_M, DEM_SIGMAS[1] * view.height_m))
-    return GroundPatch(Surface.ELEVATION, at_m, float(around_m[0]), slope, sigma_m)
+    return GroundPatch(Surface.ELEVATION, at_m[HORIZONTAL], float(at_m[UP]), slope, sigma_m)
 
 
-def _cloud_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, reference: GroundPatch) -> GroundPatch | None:
-    """Plane through the points about the end of the ray; None: there are too few, or all lie on one side."""
-    patch = reference
-    for _ in range(ITERATIONS):
-        at_m = patch.intersect(view.p_c_in_w_m, ray)
-        points_m, sigma_m = cloud.near(at_m, NEAR_SHARE * view.height_m)
-        if len(points_m) < MIN_POINTS or _largest_gap_rad(points_m, at_m) > MAX_GAP_RAD:
-            return None
-        patch = _plane_through(points_m, sigma_m, at_m, reference.sigma_m)
-    return patch
+def _cloud_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, level_sigma_m: float) -> GroundPatch | None:
+    """Plane through the points about the ray; None: there are too few, or all lie on one side."""
+    x, y, z = view.r_w_c.T @ ray
+    near, away = cloud.seen_near(view, np.array([x, y]) / z, NEAR, MAX_POINTS)
+    if len(away) < MIN_POINTS or _largest_gap_rad(away) > MAX_GAP_RAD:
+        return None
+    about_points = _plane_through(near, near.points_m.mean(axis=0), level_sigma_m)
+    return _plane_through(near, about_points.intersect(view.p_c_in_w_m, ray), level_sigma_m)
 
 
-def _plane_through(points_m: np.ndarray, sigma_m: np.ndarray, at_m: np.ndarray, level_sigma_m: float) -> GroundPatch:
-    """Weighted least squares. The height of what the pixel shows departs from the plane as those of the points do:
-    houses, trees, the relief between them."""
-    design = np.column_stack([np.ones(len(points_m)), points_m[:, HORIZONTAL] - at_m[HORIZONTAL]])
-    weight = 1.0 / np.square(np.maximum(sigma_m, 0.1 * np.median(sigma_m)))
-    normal = (design * weight[:, None]).T @ design
-    fit = np.linalg.solve(normal, (design * weight[:, None]).T @ points_m[:, UP])
-    residual_m = points_m[:, UP] - design @ fit
-    departure_m2 = float(weight @ residual_m**2 / weight.sum()) * len(points_m) / (len(points_m) - 3)
-    of_fit_m2 = departure_m2 * float(np.linalg.inv(normal)[0, 0] * weight.sum() / len(points_m))
-    sigma = float(np.sqrt(departure_m2 + of_fit_m2 + level_sigma_m**2))
-    return GroundPatch(Surface.POINTS, at_m[HORIZONTAL], float(fit[0]), fit[1:], sigma)
+def _plane_through(near: PointCloud, at_m: np.ndarray, level_sigma_m: float) -> GroundPatch:
+    """Weighted least squares, about ``at_m`` (3,). The height of what a pixel shows departs from the plane as those of
+    the points do: houses, trees, the relief between them."""
+    away_m, count = near.points_m[:, HORIZONTAL] - at_m[HORIZONTAL], len(near.points_m)
+    design = np.column_stack([np.ones(count), away_m])
+    weight = 1.0 / np.square(np.maximum(near.sigma_m, MIN_SIGMA_SHARE * np.median(near.sigma_m)))
+    information = (design * weight[:, None]).T @ design
+    fit = np.linalg.solve(information, (design * weight[:, None]).T @ near.points_m[:, UP])
+    residual_m = near.points_m[:, UP] - design @ fit
+    departure_m2 = float(weight @ residual_m**2 / weight.sum()) * count / (count - PLANE_SIZE)
+    of_fit_m2 = departure_m2 * float(np.linalg.inv(information)[0, 0] * weight.sum() / count)
+    sigma_m = float(np.sqrt(departure_m2 + of_fit_m2 + level_sigma_m**2))
+    return GroundPatch(Surface.POINTS, at_m[HORIZONTAL], float(fit[0]), fit[1:], sigma_m)
 
 
-def _largest_gap_rad(points_m: np.ndarray, at_m: np.ndarray) -> float:
-    """Largest angle between neighbouring directions from ``at_m`` to the points."""
-    away_m = points_m[:, HORIZONTAL] - at_m[HORIZONTAL]
-    bearings = np.sort(np.arctan2(away_m[:, 1], away_m[:, 0]))
+def _largest_gap_rad(away: np.ndarray) -> float:
+    """Largest angle between neighbouring directions of ``away`` (N, 2)."""
+    bearings = np.sort(np.arctan2(away[:, 1], away[:, 0]))
     return float(np.diff(bearings, append=bearings[0] + 2.0 * np.pi).max())

@@ -29,6 +29,11 @@ class FlightLocator:
         self.elevation = elevation
         self._clouds: dict[int, PointCloud] = {}
 
+    @property
+    def amsl_known(self) -> bool:
+        """Whether heights are above mean sea level; else above the ground at the start."""
+        return self.elevation is not None or self.flight.origin.ground_amsl_m is not None
+
     @classmethod
     def open(cls, record: Path, map_path: Path | None = None) -> "FlightLocator":
         """``record``: a file, or the folder of a replay or run. ``map_path``: None: the map that the record names, if

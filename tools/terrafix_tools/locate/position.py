@@ -74,8 +74,9 @@ def locate_object(pixels: Sequence[Pixel], patches: Sequence[GroundPatch]) -> Ob
     """Position of the one object that all ``pixels`` show. ``patches``: ground at the ray of each pixel; the most exact
     one of the first kind in the order of ``Surface`` is used."""
     order = list(Surface)
-    ground = min(patches, key=lambda patch: (order.index(patch.surface), patch.sigma_m))
-    best = patches.index(ground)
+    rank = [(order.index(patch.surface), patch.sigma_m) for patch in patches]
+    best = rank.index(min(rank))
+    ground = patches[best]
     point_m = ground.intersect(pixels[best].view.p_c_in_w_m, pixels[best].ray())
     normal = np.array([*-ground.slope, 1.0]) / ground.sigma_m
     information = np.outer(normal, normal)

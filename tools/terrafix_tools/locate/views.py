@@ -87,7 +87,7 @@ def read_views(record: Path) -> FlightViews:
     result = ReadResult()
     origin: Origin | None = None
     frames: dict[int, Frame] = {}
-    estimates: dict[int, tuple[NavEstimate, bool]] = {}  # with whether roll and pitch were reported
+    estimates: dict[int, NavEstimate] = {}
     tilt_reported = False
     grounds: dict[int, GroundPlane] = {}
     calibrations: list[CalibrationEstimate] = []
@@ -98,8 +98,7 @@ def read_views(record: Path) -> FlightViews:
         elif isinstance(message, Frame):
             frames[message.frame_id] = message
         elif isinstance(message, NavEstimate):
-            # The last one of a frame has its map match.
-            estimates[message.frame_id] = message, tilt_reported
+            estimates[message.frame_id] = message  # the last one of a frame has its map match
         elif isinstance(message, VehicleState):
             tilt_reported |= message.pitch_rad is not None and message.roll_rad is not None
         elif isinstance(message, MapMatch) and message.ground is not None:
@@ -112,9 +111,9 @@ def read_views(record: Path) -> FlightViews:
     if origin is None or not estimates:
         raise SourceError(f"{record}: the record has no position; was a flight recorded?")
     frame = LocalFrame(origin.lat_deg, origin.lon_deg)
-    cameras = _Cameras(origin, frame, calibrations)
+    cameras = _Cameras(origin, frame, calibrations, body_sigma_rad(origin, tilt_reported=tilt_reported))
     views = {
-        frame_id: replace(cameras.view(*estimate), file=frames[frame_id].file, ground=grounds.get(frame_id))
+        frame_id: replace(cameras.view(estimate), file=frames[frame_id].file, ground=grounds.get(frame_id))
         for frame_id, estimate in estimates.items()
         if frame_id in frames
     }
@@ -124,15 +123,18 @@ def read_views(record: Path) -> FlightViews:
 class _Cameras:
     """Cameras from estimates of the body, by the calibration that was estimated nearest in time."""
 
-    def __init__(self, origin: Origin, frame: LocalFrame, calibrations: list[CalibrationEstimate]) -> None:
-        self._origin = origin
+    def __init__(
+        self, origin: Origin, frame: LocalFrame, calibrations: list[CalibrationEstimate], sigma_rad: float
+    ) -> None:
+        """``sigma_rad``: 1-sigma of the tilt of the body in the camera, which the estimates contain."""
+        self._body_sigma_rad = sigma_rad
         self._camera = origin.camera
         self._frame = frame
         self._calibrations = calibrations
         self._times_ns = np.array([calibration.t_ns for calibration in calibrations], np.int64)
 
-    def view(self, estimate: NavEstimate, tilt_reported: bool) -> CameraView:
-        """Camera of the body in ``estimate``, without file and ground plane. ``tilt_reported``: of roll and pitch."""
+    def view(self, estimate: NavEstimate) -> CameraView:
+        """Camera of the body in ``estimate``, without file and ground plane."""
         mount, cov = Mount.of(self._camera), np.array(estimate.cov).reshape(6, 6)
         calibration = CameraCalibration.of(self._camera)
         r_w_c = rot_from_quat(estimate.q_w_b) @ mount.r_b_c()
@@ -142,7 +144,7 @@ class _Cameras:
             cov[WORLD_TILT, WORLD_TILT] += np.radians(mount.tolerance_deg) ** 2 * np.eye(2)
         else:
             # The camera is known better than the body in it, and the estimate has the covariance of the body.
-            cov[WORLD_TILT, WORLD_TILT] -= body_sigma_rad(self._origin, tilt_reported=tilt_reported) ** 2 * np.eye(2)
+            cov[WORLD_TILT, WORLD_TILT] -= self._body_sigma_rad**2 * np.eye(2)
             r_w_c = r_w_c @ exp_so3(np.append(learnt.state[MOUNT_TILT], 0.0))
             calibration = replace(calibration, radial_k1=learnt.state[RADIAL_K1])
             height_m /= focal_scale(self._camera, learnt.state[LOG_HEIGHT_SCALE])

@@ -1,0 +1,144 @@
+"""Ground at the end of a ray: point cloud, elevation, plane."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pointed_flight as rig
+from terrafix import messages as m
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.errors import SourceError
+from terrafix_tools.locate.cloud import PointCloud, build_cloud
+from terrafix_tools.locate.ground import GroundPatch, Surface, ground_patch
+from terrafix_tools.locate.views import CameraView, read_views
+
+EMPTY = PointCloud(np.zeros((0, 3)), np.zeros(0))
+DOWN = np.array([0.0, 0.0, -1.0])
+OBLIQUE = np.array([0.6, 0.0, -0.8])
+
+
+def view() -> CameraView:
+    """100 m above ground of 500 m, at east 0, north 0."""
+    return CameraView(
+        frame_id=3,
+        file="",
+        t_ns=0,
+        p_c_in_w_m=np.array([0.0, 0.0, 600.0]),
+        r_w_c=rig.r_w_c(),
+        cov=np.eye(6),
+        calibration=CameraCalibration.of(rig.CAMERA),
+        ground_m=500.0,
+        fragment_id=0,
+    )
+
+
+def hit(patch: GroundPatch, ray: np.ndarray) -> np.ndarray:
+    return patch.intersect(view().p_c_in_w_m, ray)
+
+
+def around(at_e_m: float, up_m: float, *, count: int = 12, sigma_m: float = 0.2) -> PointCloud:
+    """Points on a circle of 5 m about (at_e_m, 0)."""
+    angle = np.arange(count) * 2.0 * np.pi / count
+    points = np.column_stack([at_e_m + 5.0 * np.cos(angle), 5.0 * np.sin(angle), np.full(count, up_m)])
+    return PointCloud(points, np.full(count, sigma_m))
+
+
+def test_without_map_and_points_the_ground_is_level_below_the_camera() -> None:
+    patch = ground_patch(view(), OBLIQUE, EMPTY, None)
+    assert patch.surface is Surface.PLANE
+    assert hit(patch, OBLIQUE) == pytest.approx([75.0, 0.0, 500.0])
+    # 1.2 m, 2 % of the height, slope of 3 % over 75 m
+    assert patch.sigma_m == pytest.approx(np.linalg.norm([1.2, 2.0, 2.25]))
+
+
+def test_plane_of_the_map_match_gives_slope_and_relief() -> None:
+    ground = m.GroundPlane(amsl_m=500.0, slope_e=0.2, slope_n=0.0, relief_m=4.0)
+    patch = ground_patch(replace(view(), ground=ground), OBLIQUE, EMPTY, None)
+    e_m = 75.0 / 1.15  # 0.75 (100 - 0.2 e) = e
+    assert hit(patch, OBLIQUE) == pytest.approx([e_m, 0.0, 500.0 + 0.2 * e_m])
+    assert patch.sigma_m == pytest.approx(np.linalg.norm([1.2, 1.0, 0.015 * e_m, 4.0]))
+
+
+def test_ray_ends_at_the_first_crossing_of_the_elevation() -> None:
+    def ridge(e_m: np.ndarray, _n_m: np.ndarray) -> np.ndarray:
+        return 500.0 + np.where(np.abs(e_m - 50.0) < 8.0, 60.0, 0.0)
+
+    patch = ground_patch(view(), OBLIQUE, EMPTY, ridge)
+    assert patch.surface is Surface.ELEVATION
+    assert hit(patch, OBLIQUE)[0] == pytest.approx(42.0, abs=1.0)
+
+
+def test_slope_of_the_elevation_is_that_of_the_patch() -> None:
+    patch = ground_patch(view(), OBLIQUE, EMPTY, lambda e_m, n_m: 500.0 + 0.2 * e_m - 0.1 * n_m)
+    assert patch.slope == pytest.approx([0.2, -0.1])
+    assert hit(patch, OBLIQUE) == pytest.approx([75.0 / 1.15, 0.0, 500.0 + 15.0 / 1.15], abs=0.01)
+    assert patch.sigma_m == pytest.approx(np.hypot(1.2, 1.0))
+
+
+def test_where_the_elevation_is_unknown_the_plane_is_used() -> None:
+    patch = ground_patch(view(), OBLIQUE, EMPTY, lambda e_m, _n_m: np.where(e_m < 40.0, 500.0, np.nan))
+    assert patch.surface is Surface.PLANE
+
+
+def test_points_about_the_end_of_the_ray_come_before_the_elevation() -> None:
+    patch = ground_patch(view(), DOWN, around(0.0, 512.0), lambda e_m, _n_m: 500.0 + 0.0 * e_m)
+    assert patch.surface is Surface.POINTS
+    assert hit(patch, DOWN) == pytest.approx([0.0, 0.0, 512.0])
+    assert patch.sigma_m == pytest.approx(np.hypot(1.2, 1.0))  # the points agree: the level is that of the elevation
+
+
+def test_ray_is_followed_to_the_points_where_they_stand_above_the_elevation() -> None:
+    patch = ground_patch(view(), OBLIQUE, around(66.0, 512.0, count=20), None)
+    assert patch.surface is Surface.POINTS
+    assert hit(patch, OBLIQUE) == pytest.approx([66.0, 0.0, 512.0])
+
+
+def test_points_that_do_not_lie_in_a_plane_widen_the_height() -> None:
+    cloud = around(0.0, 500.0)
+    rough = PointCloud(cloud.points_m + np.array([0.0, 0.0, 1.0]) * np.tile([3.0, -3.0], 6)[:, None], cloud.sigma_m)
+    patch = ground_patch(view(), DOWN, rough, None)
+    departure_m2 = 9.0 * 12 / 9  # of 12 points, less the three numbers of a plane
+    expected = np.sqrt(departure_m2 * (1.0 + 1.0 / 12) + 1.2**2 + 2.0**2)
+    assert patch.sigma_m == pytest.approx(expected)
+
+
+def test_points_with_large_errors_count_less() -> None:
+    cloud = around(0.0, 500.0)
+    points, sigma_m = cloud.points_m.copy(), cloud.sigma_m.copy()
+    points[::2, 2], sigma_m[::2] = 510.0, 20.0
+    assert hit(ground_patch(view(), DOWN, PointCloud(points, sigma_m), None), DOWN)[2] == pytest.approx(500.0, abs=0.05)
+
+
+@pytest.mark.parametrize("cloud", [around(0.0, 512.0, count=5), around(9.0, 512.0), around(40.0, 512.0)])
+def test_few_points_or_points_on_one_side_are_not_used(cloud: PointCloud) -> None:
+    assert ground_patch(view(), DOWN, cloud, None).surface is Surface.PLANE
+
+
+@pytest.mark.parametrize("up", [0.5, 0.0, -0.04])
+def test_pixel_of_horizon_or_sky_is_refused(up: float) -> None:
+    with pytest.raises(SourceError, match="frame 3: the pixel shows no ground"):
+        ground_patch(view(), np.array([np.sqrt(1.0 - up**2), 0.0, up]), EMPTY, None)
+
+
+def test_cloud_of_a_flight_has_ground_and_house(tmp_path: Path) -> None:
+    flight = read_views(rig.write_flight(tmp_path / "flight.mcap"))
+    cloud = build_cloud(flight, 0, None)
+    true_m = rig.ground_m(cloud.points_m[:, 0], cloud.points_m[:, 1])
+    on_house = true_m > rig.START_AMSL_M
+    assert len(cloud.points_m) > 2000 and on_house.sum() > 50
+    assert np.abs(cloud.points_m[:, 2] - true_m).max() < 0.05
+    assert cloud.sigma_m.min() > 0.0 and cloud.sigma_m.max() < 2.0
+
+
+def test_cloud_has_the_level_of_the_elevation(tmp_path: Path) -> None:
+    flight = read_views(rig.write_flight(tmp_path / "flight.mcap"))
+    cloud = build_cloud(flight, 0, lambda e_m, _n_m: np.full(e_m.shape, 503.0))
+    away = np.abs(cloud.points_m[:, 0] - rig.HOUSE_E_M) > 25.0
+    assert np.median(cloud.points_m[away, 2]) == pytest.approx(503.0, abs=0.05)
+
+
+def test_cloud_of_another_fragment_is_empty(tmp_path: Path) -> None:
+    flight = read_views(rig.write_flight(tmp_path / "flight.mcap"))
+    assert len(build_cloud(flight, 1, None).points_m) == 0

@@ -1,0 +1,123 @@
+"""The camera of a frame, from the estimate of the body and the estimated calibration."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import pointed_flight as rig
+from flight_records import write_record
+from terrafix import messages as m
+from terrafix.core.errors import SourceError, UsageError
+from terrafix.core.pose import exp_so3
+from terrafix.estimator.filter_state import focal_scale
+from terrafix_tools.locate.views import CameraView, FlightViews, read_views
+
+
+def views_of(tmp_path: Path, *after_frame: m.Message, given: m.NavEstimate | None = None) -> FlightViews:
+    frame = m.Frame(t_ns=0, frame_id=0, file="0000.jpg", width=800, height=600)
+    write_record(
+        tmp_path / "flight.mcap", [rig.origin(), frame, rig.attitude(), given or rig.estimate(0), *after_frame]
+    )
+    return read_views(tmp_path)
+
+
+def view_of(tmp_path: Path, *after_frame: m.Message, given: m.NavEstimate | None = None) -> CameraView:
+    return views_of(tmp_path, *after_frame, given=given).views[0]
+
+
+def test_camera_stands_at_the_body_and_looks_as_mounted(tmp_path: Path) -> None:
+    view = view_of(tmp_path, rig.calibration(0))
+    assert view.p_c_in_w_m == pytest.approx([0.0, 0.0, 600.0], abs=1e-6)
+    assert view.r_w_c == pytest.approx(rig.r_w_c(), abs=1e-9)
+    assert view.ground_m == pytest.approx(500.0) and view.height_m == pytest.approx(100.0)
+
+
+def test_estimated_mount_tilt_turns_the_camera(tmp_path: Path) -> None:
+    view = view_of(tmp_path, rig.calibration(0, (0.02, -0.01, 0.5, 3.0, 0.0, 0.0)))
+    assert view.r_w_c == pytest.approx(rig.r_w_c() @ exp_so3(np.array([0.02, -0.01, 0.0])), abs=1e-9)
+
+
+def test_nearest_calibration_in_time_counts(tmp_path: Path) -> None:
+    near, far = rig.calibration(1, (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)), rig.calibration(4, (0.3, 0.0, 0.0, 0.0, 0.0, 0.0))
+    view = view_of(tmp_path, near, far)
+    assert view.r_w_c == pytest.approx(rig.r_w_c() @ exp_so3(np.array([0.01, 0.0, 0.0])), abs=1e-9)
+
+
+def test_estimated_lens_distortion_is_in_the_rays(tmp_path: Path) -> None:
+    assert view_of(tmp_path, rig.calibration(0, (0.0, 0.0, 0.0, 0.0, -0.1, 0.0))).calibration.radial_k1 == -0.1
+
+
+def test_height_is_that_in_which_the_rays_of_the_described_focal_length_meet_the_ground(tmp_path: Path) -> None:
+    view = view_of(tmp_path, rig.calibration(0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.3)))
+    assert focal_scale(rig.CAMERA, 0.3) > 1.01
+    assert view.height_m == pytest.approx(100.0 / focal_scale(rig.CAMERA, 0.3))
+    assert view.ground_m == pytest.approx(500.0)
+
+
+def test_tilt_covariance_is_that_of_the_camera_without_the_error_of_the_body(tmp_path: Path) -> None:
+    heights_only = m.VehicleState(t_ns=0, source="mavlink", agl_m=100.0)
+    frame = m.Frame(t_ns=0, frame_id=0, file="0000.jpg", width=800, height=600)
+    messages = [rig.origin(), frame, rig.attitude(), heights_only, rig.estimate(0), rig.calibration(0)]
+    write_record(tmp_path / "flight.mcap", messages)
+    expected = rig.TILT_SIGMA_RAD**2 - math.radians(rig.origin().attitude_sigma_deg) ** 2
+    view = read_views(tmp_path).views[0]
+    assert np.diag(view.cov)[3:] == pytest.approx([expected, expected, rig.TILT_SIGMA_RAD**2])
+
+
+def test_without_a_calibration_the_tolerance_of_the_mount_is_in_the_tilt_covariance(tmp_path: Path) -> None:
+    expected = rig.TILT_SIGMA_RAD**2 + math.radians(rig.CAMERA.mount_tolerance_deg) ** 2
+    view = view_of(tmp_path)
+    assert np.diag(view.cov)[3:] == pytest.approx([expected, expected, rig.TILT_SIGMA_RAD**2])
+
+
+def test_estimated_principal_point_moves_the_camera_to_where_described_rays_start(tmp_path: Path) -> None:
+    camera = msgspec.structs.replace(rig.CAMERA, focal_sigma=0.1)
+    information = np.diag([1e4, 1e4, 1e8, 1e8, 1e3, 1e6, 1e6])
+    lens = m.LensEstimate(value=(0.0, 0.0, 0.0, 0.0, 0.0, 0.02, 0.0), information=tuple(information.ravel().tolist()))
+    learnt = msgspec.structs.replace(rig.calibration(0), lens=lens)
+    body = msgspec.structs.replace(rig.estimate(0), cov=tuple((10.0 * np.eye(6)).ravel().tolist()))
+    frame = m.Frame(t_ns=0, frame_id=0, file="0000.jpg", width=800, height=600)
+    write_record(
+        tmp_path / "flight.mcap",
+        [msgspec.structs.replace(rig.origin(), camera=camera), frame, rig.attitude(), body, learnt],
+    )
+    view = read_views(tmp_path).views[0]
+    # Heading east, the image's right is south: the camera of the graph is 2 m north of the published one.
+    assert view.p_c_in_w_m[:2] == pytest.approx([0.0, 2.0], abs=1e-6)
+    assert view.cov[0, 0] == pytest.approx(10.0 - (100.0 * 1e-3) ** 2)
+
+
+def test_last_estimate_of_a_frame_counts(tmp_path: Path) -> None:
+    corrected = msgspec.structs.replace(rig.estimate(0), alt_amsl_m=640.0, agl_m=120.0)
+    view = view_of(tmp_path, corrected)
+    assert view.ground_m == pytest.approx(520.0) and view.height_m == pytest.approx(120.0)
+
+
+def test_frames_are_named_by_number_or_file(tmp_path: Path) -> None:
+    flight = views_of(tmp_path)
+    assert flight.view("0") is flight.view("0000.jpg") is flight.views[0]
+    with pytest.raises(UsageError, match=r"--frame 17: the flight has no such frame; give a file name, or 0 to 0"):
+        flight.view("17")
+
+
+def test_frame_without_position_is_refused(tmp_path: Path) -> None:
+    later = m.Frame(t_ns=1, frame_id=1, file="0001.jpg", width=800, height=600)
+    with pytest.raises(SourceError, match="frame 1 has no position"):
+        views_of(tmp_path, later).view("1")
+
+
+def test_record_without_position_is_refused(tmp_path: Path) -> None:
+    write_record(tmp_path / "flight.mcap", [rig.origin()])
+    with pytest.raises(SourceError, match="the record has no position"):
+        read_views(tmp_path)
+
+
+def test_ground_plane_of_the_map_match_is_with_its_frame(tmp_path: Path) -> None:
+    ground = m.GroundPlane(amsl_m=500.0, slope_e=0.1, slope_n=-0.2, relief_m=1.5)
+    match = m.MapMatch(t_ns=0, frame_id=0, verdict=m.Verdict.ACCEPTED, matcher="gradient", ground=ground)
+    assert view_of(tmp_path, match).ground == ground
+    assert replace(view_of(tmp_path, match), ground=None).ground is None
