@@ -77,6 +77,21 @@ def test_slope_of_the_elevation_is_that_of_the_patch() -> None:
     assert patch.sigma_m == pytest.approx(np.hypot(1.2, 1.0))
 
 
+def test_edge_that_falls_steeper_than_the_ray_counts_as_level() -> None:
+    patch = ground_patch(view(), OBLIQUE, EMPTY, lambda e_m, _n_m: 500.0 - 60.0 * (e_m > 80.0))
+    assert patch.slope == pytest.approx([0.0, 0.0])
+    assert hit(patch, OBLIQUE) == pytest.approx([75.0, 0.0, 500.0], abs=0.01)
+
+
+def test_slope_under_points_is_that_of_the_elevation() -> None:
+    cloud = around(0.0, 512.0)
+    rising = PointCloud(cloud.points_m + cloud.points_m[:, :1] * [0.0, 0.0, 0.2], cloud.sigma_m)
+    patch = ground_patch(view(), DOWN, rising, lambda e_m, n_m: 500.0 + 0.2 * e_m)
+    assert patch.surface is Surface.POINTS and patch.slope == pytest.approx([0.2, 0.0])
+    assert hit(patch, DOWN)[2] == pytest.approx(512.0)
+    assert patch.sigma_m == pytest.approx(np.hypot(1.2, 1.0))
+
+
 def test_where_the_elevation_is_unknown_the_plane_is_used() -> None:
     patch = ground_patch(view(), OBLIQUE, EMPTY, lambda e_m, _n_m: np.where(e_m < 40.0, 500.0, np.nan))
     assert patch.surface is Surface.PLANE
@@ -99,7 +114,7 @@ def test_points_that_do_not_lie_in_a_plane_widen_the_height() -> None:
     cloud = around(0.0, 500.0)
     rough = PointCloud(cloud.points_m + np.array([0.0, 0.0, 1.0]) * np.tile([3.0, -3.0], 6)[:, None], cloud.sigma_m)
     patch = ground_patch(view(), DOWN, rough, None)
-    departure_m2 = 9.0 * 12 / 9  # of 12 points, less the three numbers of a plane
+    departure_m2 = 9.0 * 12 / 11  # of 12 points about their mean
     expected = np.sqrt(departure_m2 * (1.0 + 1.0 / 12) + 1.2**2 + 2.0**2)
     assert patch.sigma_m == pytest.approx(expected)
 

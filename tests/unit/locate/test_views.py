@@ -19,9 +19,8 @@ from terrafix_tools.locate.views import CameraView, FlightViews, read_views
 
 def views_of(tmp_path: Path, *after_frame: m.Message, given: m.NavEstimate | None = None) -> FlightViews:
     frame = m.Frame(t_ns=0, frame_id=0, file="0000.jpg", width=800, height=600)
-    write_record(
-        tmp_path / "flight.mcap", [rig.origin(), frame, rig.attitude(), given or rig.estimate(0), *after_frame]
-    )
+    messages = [rig.origin(), frame, rig.attitude(), given or rig.estimate(0), *after_frame]
+    write_record(tmp_path / "flight.mcap", messages)
     return read_views(tmp_path)
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from terrafix.estimator.factors.three_view import ThreeViewPose, triangulate
@@ -65,11 +64,9 @@ def _points(
     elevation: Elevation | None,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """-> points (N, 3) and the 1-sigma of their heights (N,); None: the three views do not determine them."""
-    first, middle, last = (gtsam.Pose3(gtsam.Rot3.ClosestTo(view.r_w_c), view.p_c_in_w_m) for view in seen)
     view = seen[1]
-    guess = ThreeViewPose(
-        middle.between(first), middle.between(last), view.height_m, view.ground_m, view.calibration.radial_k1
-    )
+    cameras = [(camera.r_w_c, camera.p_c_in_w_m) for camera in seen]
+    guess = ThreeViewPose.of(cameras, height_m=view.height_m, ground_m=view.ground_m, k1=view.calibration.radial_k1)
     found = triangulate(np.array(odometry.three_view), odometry.three_view_sigma_norm, guess, focal_sigma)
     if found is None:
         return None

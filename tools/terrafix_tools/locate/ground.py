@@ -1,6 +1,6 @@
 """Ground at the end of a ray: by the point cloud of the fragment, by the elevation of the map, or as a plane."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -11,8 +11,7 @@ from terrafix.estimator.state import HORIZONTAL, UP
 from terrafix_tools.locate.cloud import Elevation, PointCloud
 from terrafix_tools.locate.views import CameraView
 
-PLANE_SIZE = 3  # unknowns of a plane
-MIN_POINTS, MAX_POINTS = 6, 12  # of a plane through the cloud: two and four times its unknowns
+MIN_POINTS, MAX_POINTS = 6, 12  # that give the level about a pixel
 NEAR = 0.12  # radius about a pixel within which points count, normalised image coordinates: 7 degrees
 MAX_GAP_RAD = np.pi  # largest angle between neighbouring points about the pixel: beyond, all lie on one side
 MIN_SIGMA_SHARE = 0.1  # least sigma of a point, share of the median: none outweighs a hundred others
@@ -39,9 +38,13 @@ class GroundPatch:
     slope: np.ndarray
     sigma_m: float
 
+    def heights_m(self, points_m: np.ndarray) -> np.ndarray:
+        """AMSL heights (N,) of the plane at points (N, 2 or 3): east, north, ..."""
+        return self.up_m + (points_m[:, HORIZONTAL] - self.at_m) @ self.slope
+
     def height_m(self, at_m: np.ndarray) -> float:
         """AMSL height at (east, north, ...)."""
-        return self.up_m + float(self.slope @ (at_m[HORIZONTAL] - self.at_m))
+        return float(self.heights_m(at_m[None])[0])
 
     def intersect(self, from_m: np.ndarray, ray: np.ndarray) -> np.ndarray:
         """Point (3,) at which the ray from ``from_m`` meets the plane."""
@@ -54,7 +57,7 @@ def ground_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, elevation
     if ray[UP] > -MIN_DESCENT:
         raise SourceError(f"frame {view.frame_id}: the pixel shows no ground (horizon or sky); choose a lower one")
     reference = _elevation_patch(view, ray, elevation) or _plane_patch(view, ray)
-    return _cloud_patch(view, ray, cloud, reference.sigma_m) or reference
+    return _cloud_patch(view, ray, cloud, reference) or reference
 
 
 def _plane_patch(view: CameraView, ray: np.ndarray) -> GroundPatch:
@@ -91,33 +94,30 @@ def _elevation_patch(view: CameraView, ray: np.ndarray, elevation: Elevation | N
     if around_m is None or not np.isfinite(around_m).all():
         return None
     slope = np.array([around_m[0] - around_m[1], around_m[2] - around_m[3]]) / (2.0 * SLOPE_STEP_M)
+    if ray[UP] - slope @ ray[HORIZONTAL] > 0.5 * ray[UP]:  # an edge: the ray meets the ground at a flatter place
+        slope = np.zeros(2)
     sigma_m = float(np.hypot(LEVEL_M, DEM_SIGMAS[1] * view.height_m))
     return GroundPatch(Surface.ELEVATION, at_m[HORIZONTAL], float(at_m[UP]), slope, sigma_m)
 
 
-def _cloud_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, level_sigma_m: float) -> GroundPatch | None:
-    """Plane through the points about the ray; None: there are too few, or all lie on one side."""
+def _cloud_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, reference: GroundPatch) -> GroundPatch | None:
+    """Plane at the level of the points about the ray, with the slope of ``reference``, whose level the cloud has; None:
+    there are too few, or all lie on one side.
+
+    The height of what a pixel shows departs from that level as those of the points do: houses, trees, relief between
+    them."""
     x, y, z = view.r_w_c.T @ ray
     near, away = cloud.seen_near(view, np.array([x, y]) / z, NEAR, MAX_POINTS)
-    if len(away) < MIN_POINTS or _largest_gap_rad(away) > MAX_GAP_RAD:
+    count = len(away)
+    if count < MIN_POINTS or _largest_gap_rad(away) > MAX_GAP_RAD:
         return None
-    about_points = _plane_through(near, near.points_m.mean(axis=0), level_sigma_m)
-    return _plane_through(near, about_points.intersect(view.p_c_in_w_m, ray), level_sigma_m)
-
-
-def _plane_through(near: PointCloud, at_m: np.ndarray, level_sigma_m: float) -> GroundPatch:
-    """Weighted least squares, about ``at_m`` (3,). The height of what a pixel shows departs from the plane as those of
-    the points do: houses, trees, the relief between them."""
-    away_m, count = near.points_m[:, HORIZONTAL] - at_m[HORIZONTAL], len(near.points_m)
-    design = np.column_stack([np.ones(count), away_m])
     weight = 1.0 / np.square(np.maximum(near.sigma_m, MIN_SIGMA_SHARE * np.median(near.sigma_m)))
-    information = (design * weight[:, None]).T @ design
-    fit = np.linalg.solve(information, (design * weight[:, None]).T @ near.points_m[:, UP])
-    residual_m = near.points_m[:, UP] - design @ fit
-    departure_m2 = float(weight @ residual_m**2 / weight.sum()) * count / (count - PLANE_SIZE)
-    of_fit_m2 = departure_m2 * float(np.linalg.inv(information)[0, 0] * weight.sum() / count)
-    sigma_m = float(np.sqrt(departure_m2 + of_fit_m2 + level_sigma_m**2))
-    return GroundPatch(Surface.POINTS, at_m[HORIZONTAL], float(fit[0]), fit[1:], sigma_m)
+    weight /= weight.sum()
+    above_m = near.points_m[:, UP] - reference.heights_m(near.points_m)
+    mean_m = float(weight @ above_m)
+    departure_m2 = float(weight @ np.square(above_m - mean_m)) * count / (count - 1)
+    sigma_m = float(np.sqrt(departure_m2 * (1.0 + weight @ weight) + reference.sigma_m**2))
+    return replace(reference, surface=Surface.POINTS, up_m=reference.up_m + mean_m, sigma_m=sigma_m)
 
 
 def _largest_gap_rad(away: np.ndarray) -> float:

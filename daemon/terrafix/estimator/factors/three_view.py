@@ -6,6 +6,7 @@ each point is an unknown. It is solved when the third keyframe arrives, and the 
 complement (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, 6). The factor is linear in the poses of the
 two outer cameras in the middle one, and carries no information about absolute scale."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,6 +66,14 @@ class ThreeViewPose:
     height_m: float
     ground_m: float
     k1: float
+
+    @classmethod
+    def of(
+        cls, cameras: Sequence[tuple[np.ndarray, np.ndarray]], *, height_m: float, ground_m: float, k1: float
+    ) -> "ThreeViewPose":
+        """``cameras``: R_w_c (3, 3) and p_c_in_w_m (3,) of the first, the middle and the last one."""
+        first, middle, last = (gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), p_m) for r_w_c, p_m in cameras)
+        return cls(middle.between(first), middle.between(last), height_m, ground_m, k1)
 
 
 @dataclass(frozen=True)
