@@ -25,7 +25,8 @@ from terrafix.messages import (
     SourceLabel,
     Verdict,
 )
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.provenance import header
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.accept.measuring.evidence import Evidence, gather
 from terrafix_tools.accept.measuring.results import Marks
 from terrafix_tools.estimates import ESTIMATES, RowTable, write_rows

@@ -23,7 +23,7 @@ from terrafix.core.node import Node, NodeContext
 from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
-from terrafix.recorder.writer import versions
+from terrafix.recorder.provenance import header, versions
 from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
 from terrafix_engines.runtime import ModelFileError
@@ -70,7 +70,7 @@ def replay(
         raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
     package = ensure_package(_map_of(map_path, config, source), map_cache_dir(), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
-    with ReplayOutput(out, config) as output:
+    with ReplayOutput(out, header(config, package.resolve()), config.recorder) as output:
         frames = MemoryFrameStore(FRAMES_KEPT)
         ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
         published: list[Message] = []

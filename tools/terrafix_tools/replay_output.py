@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -10,7 +10,7 @@ from typing import Any, Self, TextIO
 
 import numpy as np
 
-from terrafix.core.config import Config
+from terrafix.core.config import RecorderSection
 from terrafix.core.errors import OutputError
 from terrafix.core.node import Image
 from terrafix.messages import (
@@ -24,7 +24,9 @@ from terrafix.messages import (
     Origin,
     Verdict,
 )
-from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
+from terrafix.recorder.images import ImagePolicy
+from terrafix.recorder.reader import read_frame_images, read_thumbnails
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, RowTable, write_rows
 from terrafix_tools.finalise.output import SUMMARY as FINALISED_SUMMARY
 from terrafix_tools.finalise.output import TABLE as FINALISED_TABLE
@@ -39,9 +41,12 @@ DERIVED = ("evaluation.json", "report.html", FINALISED_TABLE, FINALISED_SUMMARY)
 class ReplayOutput:
     """A context manager. On an exception the partial files stay and are readable."""
 
-    def __init__(self, out: Path, config: Config) -> None:
+    def __init__(self, out: Path, header: dict[str, str], recorder: RecorderSection) -> None:
+        """``header``: of the record (``recorder.provenance``); ``recorder``: which images it has."""
         self._out = out
-        self._config = config
+        self._header = header
+        self._images = ImagePolicy(recorder)
+        self._full_frames: set[int] = set()  # that are to be recorded at full size
         self._table = RowTable()
         self._verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._matcher: Counter[str] = Counter()
@@ -62,7 +67,7 @@ class ReplayOutput:
             where = f"{self._out}: cannot be written ({error.strerror})"
             raise OutputError(f"{where}; choose a folder that you may write with --out") from None
         write_rows(self._csv, [])
-        self._record = FlightWriter(self._out / (RECORD + PARTIAL), header(self._config))
+        self._record = FlightWriter(self._out / (RECORD + PARTIAL), self._header)
         return self
 
     def take(self, messages: list[Message]) -> None:
@@ -71,26 +76,36 @@ class ReplayOutput:
                 self._record.write(message, message.t_ns)
                 self._table.take(message)
                 self._count(message)
+                frame_id = self._images.full_frame(message)
+                if frame_id is not None:
+                    self._full_frames.add(frame_id)
 
     def frame_done(self, frame: Frame, image: Image | None, process_ms: float) -> None:
         """Writes the row of the frame to disk; its refined position follows in finish()."""
-        settings = self._config.recorder
         row = self._table.rows[frame.frame_id]
         row.process_ms = process_ms
         with self._writing():
-            if settings.thumbnails and image is not None:
-                jpeg = thumbnail_jpeg(image, settings.thumbnail_width_px)
-                self._record.write_thumbnail(frame.t_ns, frame.frame_id, jpeg)
+            if image is not None and self._images.thumbnails:
+                self._record.write_thumbnail(frame.t_ns, frame.frame_id, self._images.thumbnail(image))
+            if image is not None and frame.frame_id in self._full_frames:
+                image_format = self._images.settings.frame_format
+                self._record.write_frame_image(frame.t_ns, frame.frame_id, self._images.encoded(image), image_format)
+                self._full_frames.discard(frame.frame_id)
             self._record.flush()
             write_rows(self._csv, [row], header=False)
             self._csv.flush()
 
-    def thumbnails(self, images: Iterable[tuple[int, bytes]]) -> None:
-        """Adds thumbnails that are already coded: (frame id, JPEG)."""
+    def copy_images(self, record: Path) -> None:
+        """Adds the images of another record of this flight."""
         with self._writing():
-            for frame_id, jpeg in images:
-                row = self._table.rows.get(frame_id)
-                self._record.write_thumbnail(round((row.t_s if row else 0.0) * NS), frame_id, jpeg)
+            for frame_id, jpeg in read_thumbnails(record):
+                self._record.write_thumbnail(self._time_ns(frame_id), frame_id, jpeg)
+            for frame_id, image_format, data in read_frame_images(record):
+                self._record.write_frame_image(self._time_ns(frame_id), frame_id, data, image_format)
+
+    def _time_ns(self, frame_id: int) -> int:
+        row = self._table.rows.get(frame_id)
+        return round((row.t_s if row else 0.0) * NS)
 
     def counts(self) -> dict[str, Any]:
         """Returns frames, verdicts and times for summary.json."""

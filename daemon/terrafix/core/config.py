@@ -17,6 +17,7 @@ from terrafix.core.errors import ConfigError
 Positive = Annotated[float, Meta(gt=0)]
 OutputName = Literal["gps_input", "odometry", "vision_position", "external_position", "global_position"]
 GnssMode = Literal["off", "advise", "act"]
+RecordedFrames = Literal["none", "thumbnails", "keyframes", "all"]
 PlaceSearch = Literal["auto", "exact", "faiss"]
 Baud = Annotated[int, Meta(ge=9600, le=3_000_000)]
 
@@ -65,7 +66,8 @@ class LinkSection(Section, frozen=True, kw_only=True):
 
 
 class RecorderSection(Section, frozen=True, kw_only=True):
-    thumbnails: bool = True
+    frames: RecordedFrames = "thumbnails"
+    frame_format: Literal["jpeg", "png"] = "jpeg"  # of frames at full size; png: without loss
     thumbnail_width_px: Annotated[int, Meta(ge=64, le=1920)] = 320
     budget_mb: Annotated[int, Meta(ge=64)] = 64_000
 

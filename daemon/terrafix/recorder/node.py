@@ -7,8 +7,9 @@ from collections.abc import Iterable
 
 from terrafix.core.node import Edge, FrameStore, Node, NodeContext
 from terrafix.messages import Dropped, Frame, Message
-from terrafix.recorder.segments import SegmentRing
-from terrafix.recorder.writer import header, thumbnail_jpeg
+from terrafix.recorder.images import ImagePolicy
+from terrafix.recorder.provenance import header
+from terrafix.recorder.segments import FRAME_IMAGE, SegmentRing
 
 QUEUE_LENGTH = 8192  # about 30 s of all messages; a longer queue would only hide a disk that is too slow
 FLUSH_S = 0.25  # interval of flushes: at most this much of the record is lost when the process is killed
@@ -28,10 +29,10 @@ class RecorderNode:
 class RecorderEdge:
     """A queue and a writer thread. A full queue drops messages; their count is recorded as Dropped."""
 
-    def __init__(self, ring: SegmentRing, frames: FrameStore, thumbnail_width_px: int | None) -> None:
+    def __init__(self, ring: SegmentRing, frames: FrameStore, images: ImagePolicy) -> None:
         self._ring = ring
         self._frames = frames
-        self._thumbnail_width_px = thumbnail_width_px
+        self._images = images
         self._queue: queue.Queue[tuple[int, Message]] = queue.Queue(QUEUE_LENGTH)
         self._dropped: Counter[str] = Counter()
         self._dropped_lock = threading.Lock()
@@ -76,8 +77,7 @@ class RecorderEdge:
             except queue.Empty:
                 break
             self._ring.write(message, received_ns)
-            if isinstance(message, Frame):
-                self._thumbnail(message)
+            self._write_images(message)
         if self._ring.blocked:
             return
         with self._dropped_lock:
@@ -86,12 +86,21 @@ class RecorderEdge:
             now_ns = self._now_ns
             self._ring.write(Dropped(t_ns=now_ns, process="recorder", message=name, count=count), now_ns)
 
-    def _thumbnail(self, frame: Frame) -> None:
-        if self._thumbnail_width_px is None or frame.error:
+    def _write_images(self, message: Message) -> None:
+        """Thumbnail and full size of a frame. Its pixels are gone when this thread is seconds late."""
+        if isinstance(message, Frame) and self._images.thumbnails and not message.error:
+            image = self._frames.get(message.frame_id)
+            if image is not None:
+                self._ring.write_thumbnail(message.t_ns, message.frame_id, self._images.thumbnail(image))
+        frame_id = self._images.full_frame(message)
+        if frame_id is None:
             return
-        image = self._frames.get(frame.frame_id)
-        if image is not None:
-            self._ring.write_thumbnail(frame.t_ns, frame.frame_id, thumbnail_jpeg(image, self._thumbnail_width_px))
+        image = self._frames.get(frame_id)
+        if image is None:
+            self._ring.count_lost(FRAME_IMAGE)
+        else:
+            image_format = self._images.settings.frame_format
+            self._ring.write_frame_image(message.t_ns, frame_id, self._images.encoded(image), image_format)
 
 
 def make_node(ctx: NodeContext) -> Node:
@@ -101,6 +110,5 @@ def make_node(ctx: NodeContext) -> Node:
 def make_edge(ctx: NodeContext) -> Edge:
     """Raises OutputError when the path or its permissions allow no folder; a disk that is full is no error."""
     settings = ctx.config.recorder
-    ring = SegmentRing(ctx.out_dir, header(ctx.config), settings.budget_mb)
-    width_px = settings.thumbnail_width_px if settings.thumbnails else None
-    return RecorderEdge(ring, ctx.frames, width_px)
+    ring = SegmentRing(ctx.out_dir, header(ctx.config, ctx.map_path), settings.budget_mb)
+    return RecorderEdge(ring, ctx.frames, ImagePolicy(settings))

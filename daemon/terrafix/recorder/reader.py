@@ -21,9 +21,11 @@ from mcap.writer import MCAP0_MAGIC
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import Message
+from terrafix.recorder.foxglove import IMAGE_TOPIC, THUMBNAIL_TOPIC
 from terrafix.recorder.old_format import OLD_DECODERS, OLD_FORMAT
-from terrafix.recorder.schema import THUMBNAIL_TOPIC, TYPE_BY_TOPIC, topic_of
-from terrafix.recorder.writer import HEADER_NAME, RECORD_FORMAT, decode_thumbnail
+from terrafix.recorder.provenance import RECORD_FORMAT
+from terrafix.recorder.schema import TYPE_BY_TOPIC, topic_of
+from terrafix.recorder.writer import CALIBRATION_NAME, HEADER_NAME, decode_image
 
 _SEGMENT = re.compile(r"flight-(\d+)\.mcap$")
 _RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # more than any valid record; a corrupt length must not allocate gigabytes
@@ -40,7 +42,8 @@ _DECODERS_OF_OLD = {**_DECODERS, **OLD_DECODERS}
 class ReadResult:
     """Properties of the record, filled while the iterator of a read function runs."""
 
-    header: dict[str, Any] = field(default_factory=dict)  # format, config, versions of the first file
+    # Of the first file: format, config, versions, map, models, device; camera of the flight: calibration
+    header: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     truncated_files: list[Path] = field(default_factory=list)  # without their end (kill, power failure, full disk)
     damaged: list[str] = field(default_factory=list)  # parts that were left out: file, place and reason
@@ -105,10 +108,20 @@ def read_received(path: Path, result: ReadResult | None = None) -> Iterator[tupl
 
 def read_thumbnails(path: Path) -> Iterator[tuple[int, bytes]]:
     """Yields (frame id, JPEG) in the order of the record."""
+    for frame_id, _, data in _images(path, THUMBNAIL_TOPIC):
+        yield frame_id, data
+
+
+def read_frame_images(path: Path) -> Iterator[tuple[int, str, bytes]]:
+    """Yields (frame id, "jpeg" or "png", content) of the frames at full size, in the order of the record."""
+    yield from _images(path, IMAGE_TOPIC)
+
+
+def _images(path: Path, topic: str) -> Iterator[tuple[int, str, bytes]]:
     for _, channel, record in _records(path, ReadResult()):
-        if channel.topic == THUMBNAIL_TOPIC:
+        if channel.topic == topic:
             with suppress(msgspec.DecodeError, KeyError, TypeError, ValueError):
-                yield decode_thumbnail(record.data)
+                yield decode_image(record.data)
 
 
 def _records(path: Path, result: ReadResult) -> Iterator[tuple[str, Channel, McapMessage]]:
@@ -129,6 +142,8 @@ def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[t
         elif isinstance(record, Metadata) and record.name == HEADER_NAME:
             file_format = record.metadata.get("format", "")
             result.header = result.header or _header(record.metadata)
+        elif isinstance(record, Metadata) and record.name == CALIBRATION_NAME:
+            result.header.setdefault("calibration", _decoded(record.metadata.get("camera", "{}")))
         elif isinstance(record, McapMessage) and record.channel_id in channels:
             if first:
                 result.segment_starts_ns.append(record.publish_time)
@@ -137,12 +152,16 @@ def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[t
 
 
 def _header(metadata: dict[str, str]) -> dict[str, Any]:
-    """Raises msgspec.DecodeError."""
-    return {
-        "format": metadata.get("format", ""),
-        "config": msgspec.json.decode(metadata.get("config", "{}")),
-        "versions": msgspec.json.decode(metadata.get("versions", "{}")),
-    }
+    parts = {name: _decoded(text) for name, text in metadata.items() if name != "format"}
+    return {"config": {}, "versions": {}, **parts, "format": metadata.get("format", "")}
+
+
+def _decoded(text: str) -> Any:
+    """{} where the text is damaged: metadata records of MCAP have no checksum."""
+    try:
+        return msgspec.json.decode(text)
+    except msgspec.DecodeError:
+        return {}
 
 
 def _contents(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[McapRecord]:

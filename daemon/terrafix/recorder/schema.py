@@ -1,4 +1,4 @@
-"""Channels of the flight record: one per message type, JSON with a JSON schema, readable by Foxglove."""
+"""Channels of the flight record: one per message type, JSON with a JSON schema. Those of Foxglove: foxglove.py."""
 
 from typing import Any
 
@@ -8,37 +8,6 @@ from terrafix import messages as m
 from terrafix.messages import Message
 
 MESSAGE_TYPES: dict[str, type[Message]] = {t.__name__: t for t in m.AnyMessage.__args__}
-THUMBNAIL_TOPIC = "/thumbnail"
-THUMBNAIL_SCHEMA_NAME = "foxglove.CompressedImage"  # a schema that Foxglove's image panel supports
-
-THUMBNAIL_SCHEMA: dict[str, Any] = {
-    "title": THUMBNAIL_SCHEMA_NAME,
-    "type": "object",
-    "properties": {
-        "timestamp": {
-            "type": "object",
-            "title": "time",
-            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-        },
-        "frame_id": {"type": "string"},
-        "data": {"type": "string", "contentEncoding": "base64"},
-        "format": {"type": "string"},
-    },
-}
-
-
-class Stamp(msgspec.Struct, frozen=True, kw_only=True):
-    sec: int
-    nsec: int
-
-
-class Thumbnail(msgspec.Struct, frozen=True, kw_only=True):
-    """A small JPEG of a frame as foxglove.CompressedImage; ``frame_id`` is the frame id as text."""
-
-    timestamp: Stamp
-    frame_id: str
-    data: bytes  # base64 in JSON
-    format: str = "jpeg"
 
 
 def topic_of(message_type: type[Message]) -> str:

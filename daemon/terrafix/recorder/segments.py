@@ -26,6 +26,7 @@ FSYNC_S = 1.0  # a power cut loses this much, and what is written between two fl
 RETRY_S = 5.0  # interval of attempts to write again
 AT_FLOOR = "the free space of the disk is at its floor"
 PROTECTED = "KEEP"  # a file of this name in a run folder keeps its records from being deleted
+FRAME_IMAGE = "frame image"  # name of a frame at full size among what was lost
 BOOT_ID = re.compile(r"[0-9a-f]{32}")  # name of the run folders that the systemd unit makes (%b)
 
 
@@ -84,13 +85,23 @@ class SegmentRing:
             self._next(received_ns)
 
     def write_thumbnail(self, t_ns: int, frame_id: int, jpeg: bytes) -> None:
+        self._write_image("thumbnail", lambda writer: writer.write_thumbnail(t_ns, frame_id, jpeg))
+
+    def write_frame_image(self, t_ns: int, frame_id: int, data: bytes, image_format: str) -> None:
+        self._write_image(FRAME_IMAGE, lambda writer: writer.write_frame_image(t_ns, frame_id, data, image_format))
+
+    def count_lost(self, name: str) -> None:
+        """Something of this ``name`` cannot be recorded."""
+        self._lost[name] += 1
+
+    def _write_image(self, name: str, write: Callable[[FlightWriter], None]) -> None:
         if self._writer is None:
-            self._lost["thumbnail"] += 1
+            self._lost[name] += 1
             return
         try:
-            self._writer.write_thumbnail(t_ns, frame_id, jpeg)
+            write(self._writer)
         except OSError as error:
-            self._lost["thumbnail"] += 1
+            self._lost[name] += 1
             self._block(error.strerror or str(error))
 
     def take_lost(self) -> Counter[str]:

@@ -3,82 +3,23 @@ kill."""
 
 import base64
 import os
-import platform
-import subprocess
-import sys
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 
-import cv2
 import msgspec
-import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from terrafix.core.config import Config
 from terrafix.core.errors import OutputError
-from terrafix.messages import Message
-from terrafix.recorder.schema import (
-    MESSAGE_TYPES,
-    THUMBNAIL_SCHEMA,
-    THUMBNAIL_SCHEMA_NAME,
-    THUMBNAIL_TOPIC,
-    Stamp,
-    Thumbnail,
-    schema_of,
-    topic_of,
-)
+from terrafix.messages import Message, Origin
+from terrafix.recorder import foxglove
+from terrafix.recorder.foxglove import IMAGE_TOPIC, THUMBNAIL_TOPIC, CompressedImage, FoxgloveMessages, Time
+from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 
 CHUNK_BYTES = 128 * 1024  # largest loss at a kill between two calls of flush(); also the unit of compression
-JPEG_QUALITY = 70  # sufficient for visual inspection of a thumbnail
-GIT_TIMEOUT_S = 2.0
-RECORD_FORMAT = "terrafix-flight/2"
-HEADER_NAME = "terrafix"
+HEADER_NAME, CALIBRATION_NAME = "terrafix", "terrafix.calibration"  # metadata records
 _END_CHUNK = "_Writer__finalize_chunk"  # mcap ends chunks by size only; flush() calls this private method (tested)
-_VERSIONED = ("terrafix", "numpy", "gtsam", "opencv-python-headless", "onnxruntime", "pymavlink", "mcap", "msgspec")
 
 _encoder = msgspec.json.Encoder()
-
-
-def versions() -> dict[str, str]:
-    """Versions of this program and of its libraries; empty text where one is not installed."""
-    found = {"python": sys.version.split()[0], "platform": platform.platform(), "git": git_describe()}
-    for name in _VERSIONED:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = ""
-    return found
-
-
-def git_describe() -> str:
-    """Commit of the running source tree; empty text for an installed package."""
-    root = Path(__file__).resolve().parents[3]
-    if not (root / ".git").exists():
-        return ""
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--tags"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=GIT_TIMEOUT_S, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip()
-
-
-def header(config: Config) -> dict[str, str]:
-    """Header of every file of the record: format, configuration, versions."""
-    return {
-        "format": RECORD_FORMAT,
-        "config": _encoder.encode(config).decode(),
-        "versions": _encoder.encode(versions()).decode(),
-    }
-
-
-def thumbnail_jpeg(image: np.ndarray, width_px: int) -> bytes:
-    """(H, W, 3) uint8 BGR -> JPEG of ``width_px``, or of the original width if that is smaller."""
-    factor = min(1.0, width_px / image.shape[1])
-    size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    _, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return bytes(coded)
 
 
 class FlightWriter:
@@ -100,17 +41,26 @@ class FlightWriter:
         self._sequence = 0
         for message_type in MESSAGE_TYPES.values():
             self._register(topic_of(message_type), f"terrafix.{message_type.__name__}", schema_of(message_type))
-        self._register(THUMBNAIL_TOPIC, THUMBNAIL_SCHEMA_NAME, _encoder.encode(THUMBNAIL_SCHEMA))
+        for topic in foxglove.CHANNELS:
+            self._register(topic, foxglove.schema_name(topic), foxglove.schema_of(topic))
+        self._foxglove = FoxgloveMessages()
         self.flush()
 
     def write(self, message: Message, received_ns: int) -> None:
         """In MCAP, log_time is the time of the measurement and publish_time the time of reception at the recorder."""
         self._add(topic_of(type(message)), _encoder.encode(message), message.t_ns, received_ns)
+        if isinstance(message, Origin):
+            self._mcap.add_metadata(CALIBRATION_NAME, {"camera": _encoder.encode(message.camera).decode()})
+        for topic, derived in self._foxglove.of(message):
+            self._add(topic, _encoder.encode(derived), message.t_ns, received_ns)
 
     def write_thumbnail(self, t_ns: int, frame_id: int, jpeg: bytes) -> None:
-        stamp = Stamp(sec=t_ns // 1_000_000_000, nsec=t_ns % 1_000_000_000)
-        data = _encoder.encode(Thumbnail(timestamp=stamp, frame_id=str(frame_id), data=jpeg))
-        self._add(THUMBNAIL_TOPIC, data, t_ns, t_ns)
+        self._image(THUMBNAIL_TOPIC, t_ns, CompressedImage(timestamp=Time.of(t_ns), frame_id=str(frame_id), data=jpeg))
+
+    def write_frame_image(self, t_ns: int, frame_id: int, data: bytes, image_format: str) -> None:
+        """``data``: a frame at full size (``ImagePolicy.encoded``)."""
+        image = CompressedImage(timestamp=Time.of(t_ns), frame_id=str(frame_id), data=data, format=image_format)
+        self._image(IMAGE_TOPIC, t_ns, image)
 
     def size_bytes(self) -> int:
         return self._file.tell()
@@ -130,6 +80,9 @@ class FlightWriter:
         finally:
             self._file.close()
 
+    def _image(self, topic: str, t_ns: int, image: CompressedImage) -> None:
+        self._add(topic, _encoder.encode(image), t_ns, t_ns)
+
     def _register(self, topic: str, schema_name: str, schema: bytes) -> None:
         schema_id = self._mcap.register_schema(schema_name, "jsonschema", schema)
         self._channels[topic] = self._mcap.register_channel(topic, "json", schema_id)
@@ -140,7 +93,9 @@ class FlightWriter:
         self._mcap.add_message(self._channels[topic], max(0, log_ns), data, max(0, publish_ns), self._sequence)
 
 
-def decode_thumbnail(data: bytes) -> tuple[int, bytes]:
-    """Payload of the thumbnail topic -> (frame id, JPEG)"""
+def decode_image(data: bytes) -> tuple[int, str, bytes]:
+    """Payload of a foxglove.CompressedImage -> (frame id, format, content of the image file)
+
+    Raises msgspec.DecodeError, KeyError, TypeError, ValueError."""
     raw = msgspec.json.decode(data)
-    return int(raw["frame_id"]), base64.b64decode(raw["data"])
+    return int(raw["frame_id"]), raw["format"], base64.b64decode(raw["data"])

@@ -8,7 +8,9 @@ import numpy as np
 from terrafix import messages as m
 from terrafix.core.config import Config
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
-from terrafix.recorder.writer import FlightWriter, header, thumbnail_jpeg
+from terrafix.recorder.images import thumbnail_jpeg
+from terrafix.recorder.provenance import header
+from terrafix.recorder.writer import FlightWriter
 
 ORIGIN = LocalFrame(48.0, 11.0)
 PERIOD_NS = 500_000_000

@@ -8,7 +8,8 @@ from recorded_flight import messages
 from simulated_flight import Flight
 from terrafix.core.config import Config
 from terrafix.messages import MapMatch, Message, VehicleState
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.provenance import header
+from terrafix.recorder.writer import FlightWriter
 from terrafix.runtime.input_order import InputLog
 from terrafix_tools.rerun.estimator import NAME, PROCESS, ReplayedEstimator
 

@@ -11,7 +11,8 @@ from accept_case import PLACE, FrameCase, evidence
 from terrafix.core.config import Config
 from terrafix.core.node import Image
 from terrafix.messages import GpsInput
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.provenance import header
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.accept import closed
 from terrafix_tools.accept.closed import EditedCamera, sent_fixes
 from terrafix_tools.accept.false_inputs import loop_integrity as of

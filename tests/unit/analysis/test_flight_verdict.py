@@ -9,7 +9,8 @@ from flight_records import estimate, frame
 from terrafix import messages as m
 from terrafix.core.config import Config
 from terrafix.core.errors import SourceError
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.provenance import header
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools import cli
 from terrafix_tools.estimates import Row
 from terrafix_tools.flight_verdict import flight_verdict, verdict_of

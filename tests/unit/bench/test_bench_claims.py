@@ -10,7 +10,8 @@ import pytest
 from terrafix.core.config import Config
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, CovarianceMode, Message, NavEstimate, Origin, SourceLabel
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.provenance import header
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.bench.claims import claims_of, main, pool, table
 from terrafix_tools.estimates import Row, write_rows
 

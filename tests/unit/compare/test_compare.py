@@ -14,7 +14,8 @@ from simulated_flight import Flight
 from terrafix import messages as m
 from terrafix.core import gate
 from terrafix.core.errors import OutputError, SourceError
-from terrafix.recorder.writer import RECORD_FORMAT, FlightWriter
+from terrafix.recorder.provenance import RECORD_FORMAT
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.compare.alignment import read_record
 from terrafix_tools.compare.difference import compare_records

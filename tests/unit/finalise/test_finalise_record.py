@@ -14,9 +14,10 @@ from simulated_flight import Flight
 from terrafix.core.config import Config
 from terrafix.core.errors import SourceError
 from terrafix.messages import MapMatch, Message, Odometry, Origin
+from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import read_flight
 from terrafix.recorder.schema import topic_of
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.estimates import RowTable, write_rows
 from terrafix_tools.evaluate import evaluate

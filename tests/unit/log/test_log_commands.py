@@ -16,8 +16,9 @@ from flight_records import ORIGIN, PERIOD_NS, estimate, frame, live_messages, or
 from terrafix import messages as m
 from terrafix.core.config import Config
 from terrafix.core.errors import OutputError, SourceError, UsageError
+from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import ReadResult, read_flight, read_thumbnails
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.log.show import Selection, follow
 

@@ -16,13 +16,15 @@ import pytest
 from flight_records import estimate, frame, origin
 from terrafix import messages as m
 from terrafix.core import logs
-from terrafix.core.config import Config
+from terrafix.core.config import Config, RecorderSection
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.recorder import segments
+from terrafix.recorder.images import ImagePolicy
 from terrafix.recorder.node import RecorderEdge
+from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import ReadResult, read_flight
 from terrafix.recorder.segments import FSYNC_S, MEGABYTE, PROTECTED, RETRY_S, SegmentRing
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.writer import FlightWriter
 from terrafix.runtime.supervisor import _writable
 
 SEGMENT = 8 * MEGABYTE  # of a budget of 64 MB
@@ -247,7 +249,7 @@ def test_the_counts_of_lost_messages_are_recorded_when_the_disk_is_back(
 ) -> None:
     disk(24, 1)
     ring = ring_in(tmp_path, clock)
-    edge = RecorderEdge(ring, MemoryFrameStore(1), None)
+    edge = RecorderEdge(ring, MemoryFrameStore(1), ImagePolicy(RecorderSection(frames="none")))
     edge.poll(7)
     for i in range(5):
         edge.on_message(estimate(i, 0.0, 0.0))

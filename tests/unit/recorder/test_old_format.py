@@ -29,9 +29,10 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix.recorder.old_format import OLD_DECODERS, OLD_FORMAT
+from terrafix.recorder.provenance import RECORD_FORMAT
 from terrafix.recorder.reader import ReadResult, read_flight
 from terrafix.recorder.schema import TYPE_BY_TOPIC
-from terrafix.recorder.writer import HEADER_NAME, RECORD_FORMAT
+from terrafix.recorder.writer import HEADER_NAME
 
 COASTED = (
     b'{"type":"Coasted","t_ns":5,"coast_s":2.5,"lat_deg":48.0,"lon_deg":11.0,"velocity_enu_mps":[1.0,2.0,3.0],'

@@ -15,15 +15,16 @@ from mcap.reader import make_reader
 
 from flight_records import estimate, frame, live_messages, origin, write_record
 from terrafix import messages as m
-from terrafix.core.config import Config
+from terrafix.core.config import Config, RecorderSection
 from terrafix.core.errors import OutputError, SourceError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
+from terrafix.recorder.images import ImagePolicy
 from terrafix.recorder.node import QUEUE_LENGTH, RecorderEdge, make_edge
+from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import ReadResult, read_flight, read_thumbnails
 from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 from terrafix.recorder.segments import MEGABYTE, SegmentRing
-from terrafix.recorder.writer import header
 
 pytestmark = pytest.mark.real_time
 
@@ -31,7 +32,7 @@ WRITER = """
 import sys, time
 from pathlib import Path
 from terrafix import messages as m
-from terrafix.core.config import Config
+from terrafix.core.config import Config, RecorderSection
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.recorder.node import make_edge
@@ -54,7 +55,7 @@ def test_recorded_messages_are_read_back(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", messages)
     result = ReadResult()
     assert read(tmp_path, result) == messages
-    assert result.header["config"]["recorder"]["thumbnails"] is True
+    assert result.header["config"]["recorder"]["frames"] == "thumbnails"
     assert result.header["versions"]["python"] == sys.version.split()[0]
     assert result.truncated_files == []
     pictures = dict(read_thumbnails(tmp_path))
@@ -175,7 +176,7 @@ class BlockedRing(SegmentRing):
 
 def test_a_blocked_disk_does_not_block_the_recorder_and_losses_are_recorded(tmp_path: Path) -> None:
     ring = BlockedRing(tmp_path)
-    edge = RecorderEdge(ring, MemoryFrameStore(1), None)
+    edge = RecorderEdge(ring, MemoryFrameStore(1), ImagePolicy(RecorderSection(frames="none")))
     began = time.monotonic()
     for i in range(QUEUE_LENGTH + 500):
         edge.on_message(estimate(i, 0.0, 0.0))

@@ -7,7 +7,6 @@ times least. These ratios are the main result."""
 
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -20,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
-from terrafix.recorder.writer import versions
+from terrafix.recorder.provenance import device, versions
 from terrafix_tools.bench import baseline as bench_baseline
 from terrafix_tools.bench import flights as bench_run
 from terrafix_tools.bench import micro as bench_micro
@@ -91,13 +90,11 @@ def bench(
 
 def machine() -> dict[str, Any]:
     """-> processor, memory, load and versions of this machine."""
-    info = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    model = next((line.partition(":")[2].strip() for line in info if line.startswith("model name")), "")
-    memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
+    computer = device()
     return {
-        "cpu": model or platform.machine(),
+        "cpu": computer["processor"] or computer["machine"],
         "cores": len(os.sched_getaffinity(0)),
-        "memory_mb": memory_mb,
+        "memory_mb": computer["memory_mb"],
         "load_average_before": os.getloadavg(),
         "versions": versions(),
     }

@@ -19,8 +19,8 @@ from terrafix.core.pose import exp_so3, tangent_to_world
 from terrafix.estimator.state import EAST, HORIZONTAL, MOUNT_TILT, NORTH, UP
 from terrafix.messages import Frame, SourceEnded
 from terrafix.processes import PROCESSES
+from terrafix.recorder.provenance import versions
 from terrafix.recorder.reader import ReadResult, check_format, read_flight
-from terrafix.recorder.writer import versions
 from terrafix_tools.estimates import NS
 from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer

@@ -80,7 +80,7 @@ def as_json(found: Contents) -> dict[str, Any]:
         "format": header["format"],
         "versions": header["versions"],
         "source": header["config"].get("source", {}).get("path", ""),
-        "map": header["config"].get("map", {}).get("path", ""),
+        "map": header.get("map", {}).get("path", "") or header["config"].get("map", {}).get("path", ""),
         "start_utc": found.start_utc,
         "duration_s": round(found.duration_s, 3),
         "start": None if origin is None else {"lat_deg": origin.lat_deg, "lon_deg": origin.lon_deg},

@@ -3,12 +3,18 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import msgspec
-
 from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix.messages import Frame, Message, Origin
-from terrafix.recorder.reader import ReadResult, check_format, flight_files, read_received, read_thumbnails
-from terrafix.recorder.writer import RECORD_FORMAT, FlightWriter
+from terrafix.recorder.provenance import copied_header
+from terrafix.recorder.reader import (
+    ReadResult,
+    check_format,
+    flight_files,
+    read_frame_images,
+    read_received,
+    read_thumbnails,
+)
+from terrafix.recorder.writer import FlightWriter
 
 NS = 1_000_000_000
 
@@ -57,7 +63,7 @@ def origin_of(record: Path) -> Origin:
 
 
 def rewrite(records: list[Path], out: Path, takes: Takes, result: ReadResult | None = None) -> int:
-    """Writes a record of the messages that ``takes`` selects, of each Origin once, and of the thumbnails of their
+    """Writes a record of the messages that ``takes`` selects, of each Origin once, and of the images of their
     frames. -> number of messages."""
     header = _header(records[0])
     if out.suffix != ".mcap":
@@ -78,6 +84,9 @@ def rewrite(records: list[Path], out: Path, takes: Takes, result: ReadResult | N
             for frame_id, jpeg in read_thumbnails(record):
                 if frame_id in frames_ns:
                     writer.write_thumbnail(frames_ns[frame_id], frame_id, jpeg)
+            for frame_id, image_format, data in read_frame_images(record):
+                if frame_id in frames_ns:
+                    writer.write_frame_image(frames_ns[frame_id], frame_id, data, image_format)
         writer.close()
         partial.replace(out)
     except OSError as error:
@@ -105,8 +114,4 @@ def _header(record: Path) -> dict[str, str]:
     result = ReadResult()
     next(read_received(record, result), None)
     check_format(record, result)
-    return {
-        "format": RECORD_FORMAT,
-        "config": msgspec.json.encode(result.header["config"]).decode(),
-        "versions": msgspec.json.encode(result.header["versions"]).decode(),
-    }
+    return copied_header(result.header)

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from terrafix.core.errors import OutputError, UsageError
-from terrafix.recorder.writer import versions
+from terrafix.recorder.provenance import versions
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Record, run
 from terrafix_tools.montecarlo.picture import draw

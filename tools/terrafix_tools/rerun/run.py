@@ -5,14 +5,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from rich.console import Console
 
-from terrafix.core.config import Config
+from terrafix.core.config import RecorderSection
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.messages import InputOrder, MeasurementVerdict, Message, Origin
-from terrafix.recorder.reader import ReadResult, check_format, flight_files, read_received, read_thumbnails
-from terrafix.recorder.writer import versions
+from terrafix.recorder.provenance import copied_header, device, versions
+from terrafix.recorder.reader import ReadResult, check_format, flight_files, read_received
 from terrafix_tools.replay_output import RECORD, ReplayOutput
 from terrafix_tools.rerun.estimator import NAME, PROCESS, ReplayedEstimator
 from terrafix_tools.rerun.ordered_inputs import OrderedInputs
@@ -30,9 +29,9 @@ def replay_record(record: Path, out: Path, *, progress: bool = False) -> dict[st
     first, recorded_order = _examine(record)
     if any(file.resolve() == (out / RECORD).resolve() for file in first.files):
         raise UsageError(f"{out}: this folder has the record that is to be replayed; give another folder with --out")
-    config = msgspec.convert(first.header["config"], Config, strict=False)
     result = ReadResult()
-    with ReplayOutput(out, config) as output, ReplayedEstimator() as estimator:
+    header = copied_header(first.header, versions=versions(), device=device())
+    with ReplayOutput(out, header, RecorderSection()) as output, ReplayedEstimator() as estimator:
         inputs = OrderedInputs(NAME)
         source = _recorded_order(record, result) if recorded_order else _input_order(record, result, inputs)
         for message, began_ns in source:
@@ -40,7 +39,7 @@ def replay_record(record: Path, out: Path, *, progress: bool = False) -> dict[st
                 output.take([message])
             else:
                 output.take(estimator.on(message, began_ns))
-        output.thumbnails(read_thumbnails(record))
+        output.copy_images(record)
         summary = {
             "flight": record.resolve().name,
             "source": str(record),

@@ -21,7 +21,7 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image, NodeContext
 from terrafix.messages import Frame, Message, Origin
-from terrafix.recorder.writer import versions
+from terrafix.recorder.provenance import header, versions
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.report import PeerMonitor, PeerReport
@@ -73,7 +73,7 @@ def fly(plan: Plan, out: Path, *, progress: Progress = lambda _: None) -> Flown:
 
     Raises OutputError, and the nodes' errors for a bad map or model.
     """
-    with ReplayOutput(out, plan.config) as output:
+    with ReplayOutput(out, header(plan.config, plan.map_path), plan.config.recorder) as output:
         began_s, cpu_s = time.perf_counter(), time.process_time()
         loop = _Loop(plan, out, output)
         while loop.t_s < plan.duration_s and loop.flown_m < plan.length_m and not plan.over():

@@ -1,0 +1,269 @@
+"""Messages of the schemas that Foxglove displays without a plugin, derived from ours and recorded beside them.
+
+Schemas: https://docs.foxglove.dev/docs/visualization/message-schemas, JSON form. A derived message has the time of the
+message from which it follows. Reading a record ignores them."""
+
+from collections.abc import Callable, Iterator
+from enum import IntEnum
+from typing import Any
+
+import msgspec
+
+from terrafix.core.geodesy import LocalFrame
+from terrafix.messages import (
+    CalibrationFault,
+    Dropped,
+    HintVerdict,
+    MeasurementVerdict,
+    Message,
+    ModelChange,
+    ModelEvent,
+    NavEstimate,
+    Origin,
+    PositionSource,
+    ProcessEvent,
+    SearchState,
+    StatusText,
+    Verdict,
+)
+
+NS = 1_000_000_000
+LOCATION_TOPIC, POSE_TOPIC, LOG_TOPIC = "/location", "/pose", "/log"
+THUMBNAIL_TOPIC, IMAGE_TOPIC = "/thumbnail", "/image"
+LOCAL_FRAME = "local"  # frame of poses: east, north, up about the origin of the flight; up is AMSL
+BODY_FRAME = "body"
+KNOWN = 3  # position_covariance_type of foxglove.LocationFix: all elements
+
+
+class Level(IntEnum):
+    """Of foxglove.Log."""
+
+    DEBUG = 1
+    INFO = 2
+    WARNING = 3
+    ERROR = 4
+    FATAL = 5
+
+
+class Time(msgspec.Struct, frozen=True):
+    sec: int
+    nsec: int
+
+    @classmethod
+    def of(cls, t_ns: int) -> "Time":
+        """MCAP times are unsigned, so negative times are clamped."""
+        return cls(*divmod(max(0, t_ns), NS))
+
+
+class Stamped(msgspec.Struct, frozen=True, kw_only=True):
+    """Base class of these messages."""
+
+    timestamp: Time
+
+
+class CompressedImage(Stamped, frozen=True, kw_only=True):
+    """``frame_id`` is the frame id as text; ``format``: "jpeg" or "png"; ``data`` is base64 in JSON."""
+
+    frame_id: str
+    data: bytes
+    format: str = "jpeg"
+
+
+class LocationFix(Stamped, frozen=True, kw_only=True):
+    """``position_covariance``: 3x3, row-major, east, north, up [m^2]."""
+
+    frame_id: str
+    latitude: float
+    longitude: float
+    altitude: float
+    position_covariance: tuple[float, ...]
+    position_covariance_type: int = KNOWN
+
+
+class Vector3(msgspec.Struct, frozen=True):
+    x: float
+    y: float
+    z: float
+
+
+class Quaternion(msgspec.Struct, frozen=True):
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class Pose(msgspec.Struct, frozen=True):
+    position: Vector3
+    orientation: Quaternion
+
+
+class PoseInFrame(Stamped, frozen=True, kw_only=True):
+    frame_id: str
+    pose: Pose
+
+
+class Log(Stamped, frozen=True, kw_only=True):
+    """``name``: the process or the part that speaks."""
+
+    level: int
+    message: str
+    name: str
+    file: str = ""
+    line: int = 0
+
+
+# Channels: topic and type of message. The schema is named foxglove.<type>.
+CHANNELS: dict[str, type[Stamped]] = {
+    LOCATION_TOPIC: LocationFix,
+    POSE_TOPIC: PoseInFrame,
+    LOG_TOPIC: Log,
+    THUMBNAIL_TOPIC: CompressedImage,
+    IMAGE_TOPIC: CompressedImage,
+}
+
+_LOG_OF_SEVERITY = (
+    Level.FATAL,  # MAV_SEVERITY: emergency, alert, critical
+    Level.FATAL,
+    Level.FATAL,
+    Level.ERROR,
+    Level.WARNING,
+    Level.INFO,  # notice
+    Level.INFO,
+    Level.DEBUG,
+)
+_FAILED_PROCESS = ("died", "stuck", "gave_up")
+_LEVEL_OF_MODEL = {
+    ModelChange.FAILED: Level.ERROR,
+    ModelChange.GIVEN_UP: Level.ERROR,
+    ModelChange.PROVIDER: Level.WARNING,
+    ModelChange.SUSPENDED: Level.WARNING,
+}
+
+
+class FoxgloveMessages:
+    """Derives messages; keeps the origin of the flight."""
+
+    def __init__(self) -> None:
+        self._frame: LocalFrame | None = None
+
+    def of(self, message: Message) -> Iterator[tuple[str, Stamped]]:
+        """Yields (topic, derived message)."""
+        if isinstance(message, Origin):
+            self._frame = LocalFrame(message.lat_deg, message.lon_deg)
+        elif isinstance(message, NavEstimate):
+            yield LOCATION_TOPIC, _location(message)
+            if self._frame is not None:
+                yield POSE_TOPIC, _pose(message, self._frame)
+        elif type(message) in _LOGGED:
+            log = _LOGGED[type(message)](message)
+            if log is not None:
+                level, name, text = log
+                yield LOG_TOPIC, Log(timestamp=Time.of(message.t_ns), level=level, name=name, message=text)
+
+
+def _location(estimate: NavEstimate) -> LocationFix:
+    return LocationFix(
+        timestamp=Time.of(estimate.t_ns),
+        frame_id=BODY_FRAME,
+        latitude=estimate.lat_deg,
+        longitude=estimate.lon_deg,
+        altitude=estimate.alt_amsl_m,
+        position_covariance=tuple(estimate.cov[6 * row + column] for row in range(3) for column in range(3)),
+    )
+
+
+def _pose(estimate: NavEstimate, frame: LocalFrame) -> PoseInFrame:
+    e_m, n_m = frame.to_local(estimate.lat_deg, estimate.lon_deg)
+    w, x, y, z = estimate.q_w_b
+    return PoseInFrame(
+        timestamp=Time.of(estimate.t_ns),
+        frame_id=LOCAL_FRAME,
+        pose=Pose(Vector3(e_m, n_m, estimate.alt_amsl_m), Quaternion(x, y, z, w)),
+    )
+
+
+_Line = tuple[Level, str, str]  # level, name, text
+
+
+def _of_text(message: StatusText) -> _Line:
+    level = _LOG_OF_SEVERITY[message.severity] if 0 <= message.severity < len(_LOG_OF_SEVERITY) else Level.INFO
+    return level, "pilot", message.text
+
+
+def _of_process(message: ProcessEvent) -> _Line:
+    level = Level.ERROR if message.event in _FAILED_PROCESS else Level.INFO
+    return level, message.process, _joined(message.event, message.detail)
+
+
+def _of_model(message: ModelEvent) -> _Line:
+    level = _LEVEL_OF_MODEL.get(message.change, Level.INFO)
+    return level, message.model, _joined(message.change.value, message.provider, message.detail)
+
+
+def _of_fault(message: CalibrationFault) -> _Line:
+    level = Level.WARNING if message.active else Level.INFO
+    state = "calibration fault" if message.active else "calibration fault is over"
+    return level, "calibration", _joined(state, message.quantity, message.detail)
+
+
+def _of_hint(message: HintVerdict) -> _Line:
+    level = Level.INFO if message.verdict is Verdict.ACCEPTED else Level.WARNING
+    return level, "hint", _joined(message.verdict.value, message.text)
+
+
+def _of_search(message: SearchState) -> _Line:
+    return Level.INFO, "search", message.step.value
+
+
+def _of_dropped(message: Dropped) -> _Line:
+    return Level.WARNING, message.process, f"{message.count} {message.message} dropped"
+
+
+def _of_source(message: PositionSource) -> _Line:
+    used = "Terrafix" if message.vision else f"GNSS receiver {message.receiver}"
+    return Level.WARNING, "link", f"the autopilot is to navigate by {used}"
+
+
+def _of_verdict(message: MeasurementVerdict) -> _Line | None:
+    if message.verdict is Verdict.ACCEPTED:
+        return None
+    where = f"frame {message.frame_id}" if message.frame_id >= 0 else ""
+    return Level.DEBUG, message.measurement, _joined(message.verdict.value, where, message.detail)
+
+
+_LOGGED: dict[type[Message], Callable[[Any], _Line | None]] = {
+    StatusText: _of_text,
+    ProcessEvent: _of_process,
+    ModelEvent: _of_model,
+    CalibrationFault: _of_fault,
+    HintVerdict: _of_hint,
+    SearchState: _of_search,
+    Dropped: _of_dropped,
+    PositionSource: _of_source,
+    MeasurementVerdict: _of_verdict,
+}
+
+
+def _joined(*parts: str) -> str:
+    return ", ".join(part for part in parts if part)
+
+
+def schema_name(topic: str) -> str:
+    return f"foxglove.{CHANNELS[topic].__name__}"
+
+
+def schema_of(topic: str) -> bytes:
+    """JSON schema of a channel, without references."""
+    full = msgspec.json.schema(CHANNELS[topic])
+    return msgspec.json.encode(_resolved(full, full["$defs"]) | {"title": schema_name(topic)})
+
+
+def _resolved(node: dict[str, Any], defs: dict[str, Any]) -> dict[str, Any]:
+    if "$ref" in node:
+        name = node["$ref"].rsplit("/", 1)[-1]
+        title = "time" if name == "Time" else name  # the title by which Foxglove knows a time
+        return _resolved(defs[name], defs) | {"title": title}
+    if node["type"] == "object":
+        return {"type": "object", "properties": {k: _resolved(v, defs) for k, v in node["properties"].items()}}
+    return {key: node[key] for key in ("type", "contentEncoding", "items") if key in node}
