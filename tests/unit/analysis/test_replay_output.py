@@ -4,10 +4,10 @@ import csv
 import errno
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import msgspec
+import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -18,12 +18,14 @@ from source_folders import TOML, flight
 from terrafix import messages as m
 from terrafix.core.errors import ConfigError, MapError, ModelError, OutputError, UsageError
 from terrafix.core.node import Node, NodeContext
-from terrafix.recorder.reader import read_flight
+from terrafix.map.package import MapPackage
+from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images, read_thumbnails
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.estimates import COLUMNS, read_rows
 from terrafix_tools.replay import replay
 
 FRAMES = 6
+KEYFRAMES = [0, 3]
 LOST = 2  # the frame for which the stub estimator publishes no estimate
 
 
@@ -32,7 +34,13 @@ class StubVision:
         if isinstance(message, m.Frame):
             keyframe = max(0, message.frame_id - 1)
             verdict = m.Verdict.BAD_IMAGE if message.error else m.Verdict.ACCEPTED
-            yield m.Odometry(t_ns=message.t_ns, frame_id=message.frame_id, keyframe_id=keyframe, verdict=verdict)
+            yield m.Odometry(
+                t_ns=message.t_ns,
+                frame_id=message.frame_id,
+                keyframe_id=keyframe,
+                verdict=verdict,
+                becomes_keyframe=message.frame_id in KEYFRAMES,
+            )
 
     def tick(self, now_ns: int) -> Iterable[m.Message]:
         return ()
@@ -219,8 +227,8 @@ def test_models_are_checked_before_the_flight(folder: Path, tmp_path: Path, monk
 
 
 def test_a_bad_configuration_or_output_folder_is_an_error(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "bad.toml").write_text("[recorder]\nthumbnail = true\n")
-    with pytest.raises(ConfigError, match="did you mean 'thumbnails'"):
+    (tmp_path / "bad.toml").write_text("[recorder]\nframe = 3\n")
+    with pytest.raises(ConfigError, match="did you mean 'frames'"):
         replay(folder, None, tmp_path / "out", configs=[tmp_path / "bad.toml"], nodes=nodes)
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
@@ -238,9 +246,31 @@ def test_a_full_disk_is_one_line(folder: Path, tmp_path: Path, monkeypatch: pyte
     assert not (tmp_path / "out" / "estimates.csv").exists()
 
 
-def test_thumbnails_follow_the_configuration(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text("[recorder]\nthumbnails = false\n")
-    with_pictures = replay(folder, None, tmp_path / "a", nodes=nodes)
-    without = replay(folder, None, tmp_path / "b", configs=[tmp_path / "c.toml"], nodes=nodes)
-    assert (tmp_path / "a" / "flight.mcap").stat().st_size > (tmp_path / "b" / "flight.mcap").stat().st_size
-    assert msgspec.json.encode(without["config"]) != msgspec.json.encode(with_pictures["config"])
+@pytest.mark.parametrize(
+    ("setting", "thumbnails", "at_full_size"),
+    [("none", False, []), ("thumbnails", True, []), ("keyframes", True, KEYFRAMES), ("all", True, range(FRAMES))],
+)
+def test_recorded_images_follow_the_configuration(
+    folder: Path, tmp_path: Path, setting: str, thumbnails: bool, at_full_size: Sequence[int]
+) -> None:
+    (tmp_path / "c.toml").write_text(f'[recorder]\nframes = "{setting}"\nframe_format = "png"\n')
+    replay(folder, None, tmp_path / "out", configs=[tmp_path / "c.toml"], nodes=nodes)
+    small = dict(read_thumbnails(tmp_path / "out"))
+    assert sorted(small) == (list(range(FRAMES)) if thumbnails else [])
+    images = {frame_id: (form, data) for frame_id, form, data in read_frame_images(tmp_path / "out")}
+    assert sorted(images) == list(at_full_size)
+    for frame_id, (form, data) in images.items():
+        source = cv2.imread(str(sorted((folder / "frames").iterdir())[frame_id]))
+        assert form == "png"
+        assert np.array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), source)
+
+
+def test_header_of_the_record_names_map_and_computer(folder: Path, tmp_path: Path) -> None:
+    replay(folder, None, tmp_path / "out", nodes=nodes)
+    result = ReadResult()
+    messages = [message for _, _, message in read_flight(tmp_path / "out", result)]
+    (origin,) = (message for message in messages if isinstance(message, m.Origin))
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert result.header["map"]["checksum"] == MapPackage.open(Path(summary["map"]["path"])).manifest.checksum
+    assert result.header["calibration"]["fx"] == origin.camera.fx
+    assert result.header["device"]["cores"] >= 1

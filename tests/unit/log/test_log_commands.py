@@ -60,6 +60,23 @@ def test_info_names_files_duration_start_frames_and_rates(record: Path) -> None:
     assert any(line.split() == ["Frame", "20", "2.02", "Hz"] for line in lines)
 
 
+def test_info_names_map_models_and_computer(tmp_path: Path) -> None:
+    head = header(Config()) | {
+        "map": '{"path": "/maps/a.gpkg", "checksum": "0123456789abcdef"}',
+        "models": '{"xfeat": {"path": "/m/x.onnx", "sha256": "fedcba9876543210"}}',
+        "device": '{"product": "Jetson", "processor": "Cortex"}',
+    }
+    writer = FlightWriter(tmp_path / "flight-000.mcap", head)
+    writer.write(origin(), 0)
+    writer.close()
+    lines = call("info", tmp_path).output.splitlines()
+    assert "map /maps/a.gpkg, checksum 0123456789ab" in lines
+    assert "model xfeat: /m/x.onnx, sha256 fedcba987654" in lines
+    assert "computer Jetson, Cortex" in lines
+    found = json.loads(call("info", tmp_path, "--json").output)
+    assert found["map_checksum"] == "0123456789abcdef" and found["calibration"]["width"] == origin().camera.width
+
+
 def test_info_as_json_has_the_same(record: Path) -> None:
     found = json.loads(call("info", record, "--json").output)
     assert found["messages"]["NavEstimate"] == LOCATED and found["damage"] == []

@@ -22,6 +22,8 @@ EXTRAS = {
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
 IMPORTED_AS = {
+    "foxglove-schemas-protobuf": "foxglove_schemas_protobuf",
+    "protobuf": "google",
     "opencv-python-headless": "cv2",
     "pyserial": "serial",
     "pyzmq": "zmq",

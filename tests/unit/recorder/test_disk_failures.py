@@ -142,7 +142,7 @@ def test_a_flight_starts_on_a_disk_that_takes_no_file_and_is_recorded_when_it_do
     ], "said once, not at every attempt"
 
 
-@pytest.mark.parametrize("method", ["write", "flush", "sync", "write_thumbnail"])
+@pytest.mark.parametrize("method", ["write", "flush", "sync", "write_thumbnail", "write_frame_image"])
 def test_a_disk_that_fails_in_flight_ends_the_segment_and_raises_nothing(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
@@ -157,6 +157,7 @@ def test_a_disk_that_fails_in_flight_ends_the_segment_and_raises_nothing(
         broken.setattr(FlightWriter, method, fail)
         ring.write(frame(1), 1)
         ring.write_thumbnail(1, 1, b"x")
+        ring.write_frame_image(1, 1, b"x", "png")
         clock.now_s += FSYNC_S
         ring.flush()
         assert ring.blocked == os.strerror(errno.EIO)

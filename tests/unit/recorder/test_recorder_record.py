@@ -8,7 +8,9 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -22,7 +24,7 @@ from terrafix.core.node import NodeContext
 from terrafix.recorder.images import ImagePolicy
 from terrafix.recorder.node import QUEUE_LENGTH, RecorderEdge, make_edge
 from terrafix.recorder.provenance import header
-from terrafix.recorder.reader import ReadResult, read_flight, read_thumbnails
+from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images, read_thumbnails
 from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 from terrafix.recorder.segments import MEGABYTE, SegmentRing
 
@@ -44,6 +46,10 @@ for i in range(100000):
     sys.stdout.flush()
     time.sleep(0.002)
 """
+
+
+def odometry(i: int, *, becomes_keyframe: bool) -> m.Odometry:
+    return m.Odometry(t_ns=i, frame_id=i, keyframe_id=0, verdict=m.Verdict.ACCEPTED, becomes_keyframe=becomes_keyframe)
 
 
 def read(path: Path, result: ReadResult | None = None) -> list[m.Message]:
@@ -199,6 +205,45 @@ def test_frames_get_thumbnails_unless_their_pixels_are_gone(tmp_path: Path) -> N
     edge.close()
     pictures = dict(read_thumbnails(tmp_path))
     assert list(pictures) == [0]
+
+
+@pytest.mark.parametrize(("frames", "at_full_size"), [("thumbnails", []), ("keyframes", [1]), ("all", [0, 1])])
+def test_frames_are_recorded_at_full_size_as_configured(tmp_path: Path, frames: Any, at_full_size: list[int]) -> None:
+    store = MemoryFrameStore(2)
+    images = [np.full((48, 64, 3), shade, np.uint8) for shade in (40, 90)]
+    recorder = RecorderSection(frames=frames, frame_format="jpeg")
+    edge = make_edge(NodeContext(Config(recorder=recorder), store, None, tmp_path))
+    for i, image in enumerate(images):
+        store.put(i, image)
+        edge.on_message(frame(i))
+        edge.on_message(odometry(i, becomes_keyframe=i == 1))
+    edge.close()
+    found = {frame_id: (form, data) for frame_id, form, data in read_frame_images(tmp_path)}
+    assert sorted(found) == at_full_size
+    for frame_id, (form, data) in found.items():
+        assert form == "jpeg"
+        shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert np.abs(shown.astype(int) - images[frame_id]).max() <= 2
+    assert list(dict(read_thumbnails(tmp_path))) == [0, 1]
+
+
+def test_keyframe_whose_pixels_are_gone_is_counted_as_lost(tmp_path: Path) -> None:
+    recorder = RecorderSection(frames="keyframes")
+    edge = make_edge(NodeContext(Config(recorder=recorder), MemoryFrameStore(1), None, tmp_path))
+    edge.on_message(odometry(0, becomes_keyframe=True))
+    edge.on_message(odometry(1, becomes_keyframe=False))
+    edge.close()
+    (lost,) = (message for message in read(tmp_path) if isinstance(message, m.Dropped))
+    assert (lost.process, lost.message, lost.count) == ("recorder", "frame image", 1)
+
+
+def test_without_images_frames_have_no_thumbnails(tmp_path: Path) -> None:
+    store = MemoryFrameStore(1)
+    store.put(0, np.zeros((48, 64, 3), np.uint8))
+    edge = make_edge(NodeContext(Config(recorder=RecorderSection(frames="none")), store, None, tmp_path))
+    edge.on_message(frame(0))
+    edge.close()
+    assert not list(read_thumbnails(tmp_path)) and not list(read_frame_images(tmp_path))
 
 
 def test_an_output_folder_that_cannot_be_created_is_a_clear_error(tmp_path: Path) -> None:

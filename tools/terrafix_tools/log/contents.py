@@ -11,6 +11,7 @@ from terrafix.messages import Frame, NavEstimate, Origin, WallClock
 from terrafix.recorder.reader import ReadResult, check_format, read_received
 
 NS = 1_000_000_000
+CHECKSUM_DIGITS = 12  # that are shown
 
 
 @dataclass
@@ -81,6 +82,10 @@ def as_json(found: Contents) -> dict[str, Any]:
         "versions": header["versions"],
         "source": header["config"].get("source", {}).get("path", ""),
         "map": header.get("map", {}).get("path", "") or header["config"].get("map", {}).get("path", ""),
+        "map_checksum": header.get("map", {}).get("checksum", ""),
+        "models": header.get("models", {}),
+        "device": header.get("device", {}),
+        "calibration": header.get("calibration", {}),
         "start_utc": found.start_utc,
         "duration_s": round(found.duration_s, 3),
         "start": None if origin is None else {"lat_deg": origin.lat_deg, "lon_deg": origin.lon_deg},
@@ -101,9 +106,15 @@ def info_lines(found: Contents) -> Iterator[str]:
     yield f"duration {about['duration_s']:.1f} s, start {about['start_utc'] or 'at an unknown time of day'}"
     if about["start"] is not None:
         yield f"from {about['start']['lat_deg']:.6f}, {about['start']['lon_deg']:.6f}"
-    for name in ("source", "map"):
-        if about[name]:
-            yield f"{name} {about[name]}"
+    if about["source"]:
+        yield f"source {about['source']}"
+    if about["map"]:
+        checksum = about["map_checksum"][:CHECKSUM_DIGITS]
+        yield f"map {about['map']}" + (f", checksum {checksum}" if checksum else "")
+    for slot, model in about["models"].items():
+        yield f"model {slot}: {model['path']}, sha256 {model['sha256'][:CHECKSUM_DIGITS] or 'unknown'}"
+    if about["device"]:
+        yield "computer " + ", ".join(filter(None, (about["device"].get(key, "") for key in ("product", "processor"))))
     yield f"{about['localised']} of {about['frames']} frames localised"
     for kind, count in about["messages"].items():
         rate = count / found.duration_s if found.duration_s > 0 else 0.0

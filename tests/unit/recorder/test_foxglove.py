@@ -1,0 +1,236 @@
+"""Messages in the schemas that Foxglove displays, against the published ones, as the reference reader opens them."""
+
+import base64
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.json_format import ParseDict
+from mcap.reader import make_reader
+
+from flight_records import ORIGIN, PERIOD_NS, estimate, live_messages, origin, write_record
+from terrafix import messages as m
+from terrafix.recorder import foxglove
+from terrafix.recorder.foxglove import CHANNELS, FoxgloveMessages, Level, Stamped
+
+PUBLISHED = {message.DESCRIPTOR.full_name: message for message in (CompressedImage, LocationFix, Log, PoseInFrame)}
+JSON_TYPES = {
+    FieldDescriptor.CPPTYPE_STRING: "string",  # bytes too: base64
+    FieldDescriptor.CPPTYPE_DOUBLE: "number",
+    FieldDescriptor.CPPTYPE_UINT32: "integer",
+    FieldDescriptor.CPPTYPE_ENUM: "integer",
+    FieldDescriptor.CPPTYPE_MESSAGE: "object",
+}
+
+
+def derived(*messages: m.Message) -> list[tuple[str, Stamped]]:
+    source = FoxgloveMessages()
+    return [found for message in messages for found in source.of(message)]
+
+
+def logged(message: m.Message) -> tuple[int, str, str]:
+    ((topic, log),) = derived(message)
+    assert topic == "/log" and isinstance(log, foxglove.Log)
+    assert log.timestamp == foxglove.Time.of(message.t_ns)
+    return log.level, log.name, log.message
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[str, dict[str, Any]]]]:
+    """By topic, as the reference reader gives them: (name of the schema, message)."""
+    path = tmp_path_factory.mktemp("record") / "flight.mcap"
+    write_record(path, live_messages())
+    found = defaultdict(list)
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            assert schema is not None and channel.message_encoding == "json"
+            found[channel.topic].append((schema.name, json.loads(message.data)))
+    return found
+
+
+def check_schema(schema: dict[str, Any], published: Descriptor) -> None:
+    """The fields of ``schema`` are fields of the published message, of the same type."""
+    fields = {field.name: field for field in published.fields}
+    for name, node in schema["properties"].items():
+        field = fields[name]
+        if field.message_type is not None and field.message_type.full_name == "google.protobuf.Timestamp":
+            assert node["title"] == "time" and sorted(node["properties"]) == ["nsec", "sec"]
+        elif field.message_type is not None:
+            check_schema(node, field.message_type)
+        elif node["type"] == "array":
+            assert field.is_repeated and node["items"]["type"] == JSON_TYPES[field.cpp_type]
+        else:
+            assert node["type"] == JSON_TYPES[field.cpp_type]
+            assert (node.get("contentEncoding") == "base64") == (field.type == FieldDescriptor.TYPE_BYTES)
+
+
+@pytest.mark.parametrize("topic", CHANNELS)
+def test_schemas_are_those_that_are_published(topic: str) -> None:
+    schema = json.loads(foxglove.schema_of(topic))
+    assert schema["title"] == foxglove.schema_name(topic)
+    check_schema(schema, PUBLISHED[schema["title"]].DESCRIPTOR)
+
+
+@pytest.mark.parametrize("topic", ["/location", "/pose", "/log", "/thumbnail"])
+def test_recorded_messages_are_valid_by_the_published_schemas(
+    topic: str, recorded: dict[str, list[tuple[str, dict[str, Any]]]]
+) -> None:
+    assert recorded[topic]
+    for name, message in recorded[topic]:
+        assert sorted(message.pop("timestamp")) == ["nsec", "sec"]  # protobuf has another form of time in JSON
+        ParseDict(message, PUBLISHED[name]())
+
+
+def test_location_has_position_and_covariance_in_east_north_up() -> None:
+    cov = np.arange(36.0).reshape(6, 6)
+    given = msgspec.structs.replace(estimate(3, 40.0, 25.0), cov=tuple(cov.ravel().tolist()))
+    ((topic, fix),) = derived(given)
+    assert topic == "/location" and isinstance(fix, foxglove.LocationFix)
+    assert (fix.latitude, fix.longitude, fix.altitude) == (given.lat_deg, given.lon_deg, 600.0)
+    assert fix.position_covariance == tuple(cov[:3, :3].ravel())
+    assert fix.position_covariance_type == LocationFix.KNOWN
+    assert (fix.timestamp.sec, fix.timestamp.nsec) == divmod(3 * PERIOD_NS, 1_000_000_000)
+
+
+def test_pose_is_in_metres_about_the_origin_with_the_orientation_of_the_body() -> None:
+    given = estimate(3, 40.0, 25.0)
+    poses = [message for topic, message in derived(origin(), given) if topic == "/pose"]
+    (pose,) = poses
+    assert isinstance(pose, foxglove.PoseInFrame)
+    at, turn = pose.pose.position, pose.pose.orientation
+    assert (at.x, at.y, at.z) == pytest.approx((40.0, 25.0, 600.0), abs=1e-6)
+    assert (turn.w, turn.x, turn.y, turn.z) == given.q_w_b
+    assert ORIGIN.to_wgs84(at.x, at.y) == pytest.approx((given.lat_deg, given.lon_deg), abs=1e-9)
+
+
+def test_recorded_image_is_base64_of_the_file(recorded: dict[str, list[tuple[str, dict[str, Any]]]]) -> None:
+    _, image = recorded["/thumbnail"][2]
+    assert (image["frame_id"], image["format"]) == ("2", "jpeg")
+    assert base64.b64decode(image["data"]).startswith(b"\xff\xd8")
+
+
+@pytest.mark.parametrize(
+    ("severity", "level"),
+    [
+        (0, Level.FATAL),
+        (2, Level.FATAL),
+        (3, Level.ERROR),
+        (4, Level.WARNING),
+        (5, Level.INFO),
+        (6, Level.INFO),
+        (7, Level.DEBUG),
+        (9, Level.INFO),
+        (-1, Level.INFO),
+    ],
+)
+def test_texts_for_the_pilot_are_logged_by_severity(severity: int, level: Level) -> None:
+    assert logged(m.StatusText(t_ns=7, severity=severity, text="no map fix")) == (level, "pilot", "no map fix")
+
+
+@pytest.mark.parametrize(
+    ("event", "level"),
+    [
+        ("started", Level.INFO),
+        ("died", Level.ERROR),
+        ("stuck", Level.ERROR),
+        ("restarted", Level.INFO),
+        ("gave_up", Level.ERROR),
+        ("stopped", Level.INFO),
+    ],
+)
+def test_process_events_are_logged(event: str, level: Level) -> None:
+    message = m.ProcessEvent(t_ns=7, process="anchor", event=event, detail="signal 9")
+    assert logged(message) == (level, "anchor", f"{event}, signal 9")
+
+
+@pytest.mark.parametrize(
+    ("change", "level"),
+    [
+        (m.ModelChange.OPENED, Level.INFO),
+        (m.ModelChange.RESUMED, Level.INFO),
+        (m.ModelChange.PROVIDER, Level.WARNING),
+        (m.ModelChange.SUSPENDED, Level.WARNING),
+        (m.ModelChange.FAILED, Level.ERROR),
+        (m.ModelChange.GIVEN_UP, Level.ERROR),
+    ],
+)
+def test_model_events_are_logged(change: m.ModelChange, level: Level) -> None:
+    message = m.ModelEvent(t_ns=7, model="xfeat", change=change, provider="CPU", detail="sha256 12")
+    assert logged(message) == (level, "xfeat", f"{change.value}, CPU, sha256 12")
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        (
+            m.CalibrationFault(t_ns=7, quantity="scale", factor=1.2, detail="20 % too high", active=True),
+            (Level.WARNING, "calibration", "calibration fault, scale, 20 % too high"),
+        ),
+        (
+            m.CalibrationFault(t_ns=7, quantity="scale", factor=None, detail="", active=False),
+            (Level.INFO, "calibration", "calibration fault is over, scale"),
+        ),
+        (
+            m.HintVerdict(
+                t_ns=7, hint_t_ns=1, verdict=m.Verdict.ACCEPTED, distance_m=None, sigma_m=None, text="search begins"
+            ),
+            (Level.INFO, "hint", "accepted, search begins"),
+        ),
+        (
+            m.HintVerdict(
+                t_ns=7, hint_t_ns=1, verdict=m.Verdict.OUTSIDE_MAP, distance_m=None, sigma_m=None, text="not on the map"
+            ),
+            (Level.WARNING, "hint", "outside_map, not on the map"),
+        ),
+        (m.SearchState(t_ns=7, step=m.SearchStep.WHOLE_MAP), (Level.INFO, "search", "whole_map")),
+        (m.Dropped(t_ns=7, process="link", message="Imu", count=3), (Level.WARNING, "link", "3 Imu dropped")),
+        (
+            m.PositionSource(t_ns=7, vision=True, receiver=0),
+            (Level.WARNING, "link", "the autopilot is to navigate by Terrafix"),
+        ),
+        (
+            m.PositionSource(t_ns=7, vision=False, receiver=1),
+            (Level.WARNING, "link", "the autopilot is to navigate by GNSS receiver 1"),
+        ),
+        (
+            m.MeasurementVerdict(
+                t_ns=7, frame_id=4, measurement="map", verdict=m.Verdict.INNOVATION, detail="12 m off"
+            ),
+            (Level.DEBUG, "map", "innovation, frame 4, 12 m off"),
+        ),
+        (
+            m.MeasurementVerdict(t_ns=7, frame_id=-1, measurement="height", verdict=m.Verdict.IMPLAUSIBLE),
+            (Level.DEBUG, "height", "implausible"),
+        ),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_happens_is_logged_with_its_level(message: m.Message, expected: tuple[Level, str, str]) -> None:
+    assert logged(message) == expected
+
+
+def test_accepted_measurements_are_not_logged() -> None:
+    assert not derived(m.MeasurementVerdict(t_ns=7, frame_id=4, measurement="map", verdict=m.Verdict.ACCEPTED))
+
+
+def test_times_before_zero_are_clamped() -> None:
+    assert foxglove.Time.of(-5) == foxglove.Time(0, 0)
+
+
+def test_derived_messages_have_the_times_of_their_source(tmp_path: Path) -> None:
+    write_record(tmp_path / "flight.mcap", [origin(), estimate(4, 0.0, 0.0)])
+    with (tmp_path / "flight.mcap").open("rb") as stream:
+        times = {
+            channel.topic: (message.log_time, message.publish_time)
+            for _, channel, message in make_reader(stream).iter_messages()
+        }
+    assert times["/location"] == times["/pose"] == times["/nav_estimate"] == (4 * PERIOD_NS, 4 * PERIOD_NS)
