@@ -97,31 +97,53 @@ def replay(
     model: Annotated[list[str] | None, typer.Option(help="Name of a fetched model (xfeat), or NAME=PATH.")] = None,
     start: StartOption = "",
     config: ConfigOption = None,
+    frames: Annotated[
+        bool, typer.Option("--frames", help="Of a record with frames: compute vision and map matching again, too.")
+    ] = False,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
     """Replay a recorded flight as fast as this machine can; the same input gives the same output.
 
-    A flight record (.mcap, or the folder of a run) is replayed from its messages: the estimator computes again."""
+    A flight record (.mcap, or the folder of a run) is replayed from its messages: the estimator computes again. With
+    --frames all of it is computed again from its frames, also with another map, model or configuration."""
     from terrafix.recorder.reader import is_record
     from terrafix.vision.sources import parse_start
     from terrafix_tools.replay import replay as run_replay
+    from terrafix_tools.rerun.frames import RecordedFrames
 
+    source: Path | RecordedFrames = flight
     if is_record(flight):
-        from terrafix_tools.rerun.run import replay_record
-
-        if map_path or model or start or config:
-            raise UsageError(
-                f"{flight}: a record is replayed from its messages, without map and models; omit --map, --model, "
-                "--start and --config, or replay the source of the flight"
-            )
-        replay_record(flight, out, progress=not quiet)
-        return
-    start_lat_lon = parse_start(start)
+        if not frames:
+            _replay_from_messages(flight, out, other_inputs=bool(map_path or model or start or config), quiet=quiet)
+            return
+        if start:
+            raise UsageError(f"{flight}: the start is that of the record; omit --start")
+        source = RecordedFrames(flight)
+    elif frames:
+        raise UsageError(f"{flight}: --frames is for flight records; omit it")
     summary = run_replay(
-        flight, map_path, out, models=model or [], configs=config or [], progress=not quiet, start=start_lat_lon
+        source,
+        map_path,
+        out,
+        models=model or [],
+        configs=config or [],
+        progress=not quiet,
+        start=parse_start(start),
     )
     if summary["verdict"]["active_faults"]:
         raise typer.Exit(1)
+
+
+def _replay_from_messages(record: Path, out: Path, *, other_inputs: bool, quiet: bool) -> None:
+    """Raises UsageError for options that have no effect on the estimator alone."""
+    from terrafix_tools.rerun.run import replay_record
+
+    if other_inputs:
+        raise UsageError(
+            f"{record}: a record is replayed from its messages, without map and models; omit --map, --model, --start "
+            "and --config, or add --frames if the record has its frames, or replay the source of the flight"
+        )
+    replay_record(record, out, progress=not quiet)
 
 
 @app.command()

@@ -31,6 +31,7 @@ from terrafix_engines.store import StoredModel, models_folder, resolve_model
 from terrafix_tools.live import swapped_hint
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay_output import ReplayOutput
+from terrafix_tools.rerun.frames import RecordedFrames
 
 # processes that compute the estimate; link, health and recorder need a live system
 REPLAYED_PROCESSES = ("vision", "anchor", "estimator")
@@ -47,7 +48,7 @@ def make_nodes(ctx: NodeContext) -> dict[str, Node]:
 
 
 def replay(
-    flight: Path | str,
+    flight: Path | str | RecordedFrames,
     map_path: Path | None,
     out: Path,
     *,
@@ -60,12 +61,13 @@ def replay(
 ) -> dict[str, Any]:
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
-    ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg), overrides the source's. ``nodes`` and ``wrap_source`` wrap the
-    nodes and the source (to measure time, to inject faults). Raises subclasses of TerrafixError.
+    ``flight``: a source by its name, or the frames of a record. ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg),
+    overrides the source's. ``nodes`` and ``wrap_source`` wrap the nodes and the source (to measure time, to inject
+    faults). Raises subclasses of TerrafixError.
     """
     began_s = time.perf_counter()
     config = _with_models(load(configs or []), models or [])
-    source = wrap_source(open_source(str(flight), start=start))
+    source = wrap_source(flight if isinstance(flight, RecordedFrames) else open_source(str(flight), start=start))
     if source.live:
         raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
     package = ensure_package(_map_of(map_path, config, source), map_cache_dir(), progress=progress)
@@ -79,7 +81,7 @@ def replay(
         source.close()
         summary = {
             "flight": source.name(),
-            "source": str(flight),
+            "source": str(flight.record if isinstance(flight, RecordedFrames) else flight),
             "map": map_summary,
             "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v and k != FOLDER},
             "config": msgspec.to_builtins(config),
@@ -134,7 +136,7 @@ def _feed_flight(
                 break
             if shot.image is not None:
                 frames.put(shot.frame.frame_id, shot.image)
-            for message in (*shot.imu, *shot.states):
+            for message in (*shot.imu, *shot.states, *shot.others):
                 shell.feed(message)
             shell.feed(shot.frame)
             process_ms = (time.perf_counter() - began_s) * 1e3

@@ -100,8 +100,9 @@ class ReplayOutput:
         with self._writing():
             for frame_id, jpeg in read_thumbnails(record):
                 self._record.write_thumbnail(self._time_ns(frame_id), frame_id, jpeg)
-            for frame_id, image_format, data in read_frame_images(record):
-                self._record.write_frame_image(self._time_ns(frame_id), frame_id, data, image_format)
+            for image in read_frame_images(record):
+                t_ns = self._time_ns(image.frame_id)
+                self._record.write_frame_image(t_ns, image.frame_id, image.data, image.image_format)
 
     def _time_ns(self, frame_id: int) -> int:
         row = self._table.rows.get(frame_id)

@@ -34,6 +34,8 @@ _FRAMING = struct.Struct("<BQ")  # opcode and length of each record (https://mca
 # Exceptions of a truncated or corrupt record: invalid length, compression, checksum or text.
 _CORRUPT = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError, msgspec.DecodeError)
 
+_DAMAGED_IMAGE = (msgspec.DecodeError, KeyError, TypeError, ValueError)  # exceptions of decode_image
+
 _DECODERS = {topic: msgspec.json.Decoder(t).decode for topic, t in TYPE_BY_TOPIC.items()}
 _DECODERS_OF_OLD = {**_DECODERS, **OLD_DECODERS}
 
@@ -95,15 +97,43 @@ def read_received(path: Path, result: ReadResult | None = None) -> Iterator[tupl
     """Like read_flight, with the reception time at the recorder: (topic, log_time_ns, received_ns, message)."""
     result = ReadResult() if result is None else result
     for file_format, channel, record in _records(path, result):
-        decode = (_DECODERS_OF_OLD if file_format == OLD_FORMAT else _DECODERS).get(channel.topic)
-        if decode is None:
+        message = _message(file_format, channel, record, result)
+        if message is not None:
+            yield topic_of(type(message)), record.log_time, record.publish_time, message
+
+
+def _message(file_format: str, channel: Channel, record: McapMessage, result: ReadResult) -> Message | None:
+    """None: a channel that has none of our messages, or a message of another version."""
+    decode = (_DECODERS_OF_OLD if file_format == OLD_FORMAT else _DECODERS).get(channel.topic)
+    if decode is None:
+        return None
+    try:
+        return decode(record.data)
+    except msgspec.MsgspecError:
+        result.undecodable += 1
+        return None
+
+
+@dataclass(frozen=True)
+class FrameImage:
+    """A frame at full size. ``data``: content of an image file of ``image_format``, "jpeg" or "png"."""
+
+    frame_id: int
+    image_format: str
+    data: bytes
+
+
+def read_with_images(path: Path, result: ReadResult | None = None) -> Iterator[Message | FrameImage]:
+    """Yields messages and frames at full size in the order of the record."""
+    result = ReadResult() if result is None else result
+    for file_format, channel, record in _records(path, result):
+        if channel.topic == IMAGE_TOPIC:
+            with suppress(*_DAMAGED_IMAGE):
+                yield FrameImage(*decode_image(record.data))
             continue
-        try:
-            message = decode(record.data)
-        except msgspec.MsgspecError:
-            result.undecodable += 1
-            continue
-        yield topic_of(type(message)), record.log_time, record.publish_time, message
+        message = _message(file_format, channel, record, result)
+        if message is not None:
+            yield message
 
 
 def read_thumbnails(path: Path) -> Iterator[tuple[int, bytes]]:
@@ -112,15 +142,16 @@ def read_thumbnails(path: Path) -> Iterator[tuple[int, bytes]]:
         yield frame_id, data
 
 
-def read_frame_images(path: Path) -> Iterator[tuple[int, str, bytes]]:
-    """Yields (frame id, "jpeg" or "png", content) of the frames at full size, in the order of the record."""
-    yield from _images(path, IMAGE_TOPIC)
+def read_frame_images(path: Path) -> Iterator[FrameImage]:
+    """Yields the frames at full size, in the order of the record."""
+    for found in _images(path, IMAGE_TOPIC):
+        yield FrameImage(*found)
 
 
 def _images(path: Path, topic: str) -> Iterator[tuple[int, str, bytes]]:
     for _, channel, record in _records(path, ReadResult()):
         if channel.topic == topic:
-            with suppress(msgspec.DecodeError, KeyError, TypeError, ValueError):
+            with suppress(*_DAMAGED_IMAGE):
                 yield decode_image(record.data)
 
 

@@ -23,6 +23,7 @@ from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images,
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.estimates import COLUMNS, read_rows
 from terrafix_tools.replay import replay
+from terrafix_tools.rerun.frames import RecordedFrames
 
 FRAMES = 6
 KEYFRAMES = [0, 3]
@@ -257,7 +258,7 @@ def test_recorded_images_follow_the_configuration(
     replay(folder, None, tmp_path / "out", configs=[tmp_path / "c.toml"], nodes=nodes)
     small = dict(read_thumbnails(tmp_path / "out"))
     assert sorted(small) == (list(range(FRAMES)) if thumbnails else [])
-    images = {frame_id: (form, data) for frame_id, form, data in read_frame_images(tmp_path / "out")}
+    images = {image.frame_id: (image.image_format, image.data) for image in read_frame_images(tmp_path / "out")}
     assert sorted(images) == list(at_full_size)
     for frame_id, (form, data) in images.items():
         source = cv2.imread(str(sorted((folder / "frames").iterdir())[frame_id]))
@@ -274,3 +275,14 @@ def test_header_of_the_record_names_map_and_computer(folder: Path, tmp_path: Pat
     assert result.header["map"]["checksum"] == MapPackage.open(Path(summary["map"]["path"])).manifest.checksum
     assert result.header["calibration"]["fx"] == origin.camera.fx
     assert result.header["device"]["cores"] >= 1
+
+
+def test_replay_of_recorded_frames_gives_the_messages_of_the_replay(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text('[recorder]\nframes = "all"\nframe_format = "png"\n')
+    replay(folder, None, tmp_path / "a", configs=[tmp_path / "c.toml"], nodes=nodes)
+    summary = replay(RecordedFrames(tmp_path / "a"), None, tmp_path / "b", configs=[tmp_path / "c.toml"], nodes=nodes)
+    first, second = (list(read_flight(tmp_path / name)) for name in ("a", "b"))
+    assert first == second and len(first) > 3 * FRAMES
+    images = [list(read_frame_images(tmp_path / name)) for name in ("a", "b")]
+    assert images[0] == images[1]
+    assert summary["source"] == str(tmp_path / "a")

@@ -218,7 +218,7 @@ def test_frames_are_recorded_at_full_size_as_configured(tmp_path: Path, frames: 
         edge.on_message(frame(i))
         edge.on_message(odometry(i, becomes_keyframe=i == 1))
     edge.close()
-    found = {frame_id: (form, data) for frame_id, form, data in read_frame_images(tmp_path)}
+    found = {image.frame_id: (image.image_format, image.data) for image in read_frame_images(tmp_path)}
     assert sorted(found) == at_full_size
     for frame_id, (form, data) in found.items():
         assert form == "jpeg"

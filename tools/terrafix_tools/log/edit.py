@@ -84,9 +84,9 @@ def rewrite(records: list[Path], out: Path, takes: Takes, result: ReadResult | N
             for frame_id, jpeg in read_thumbnails(record):
                 if frame_id in frames_ns:
                     writer.write_thumbnail(frames_ns[frame_id], frame_id, jpeg)
-            for frame_id, image_format, data in read_frame_images(record):
-                if frame_id in frames_ns:
-                    writer.write_frame_image(frames_ns[frame_id], frame_id, data, image_format)
+            for image in read_frame_images(record):
+                if image.frame_id in frames_ns:
+                    writer.write_frame_image(frames_ns[image.frame_id], image.frame_id, image.data, image.image_format)
         writer.close()
         partial.replace(out)
     except OSError as error:

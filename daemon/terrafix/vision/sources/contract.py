@@ -7,7 +7,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from terrafix.messages import Frame, Imu, Origin, VehicleState
+from terrafix.messages import Frame, Imu, Message, Origin, VehicleState
 
 TimedMessage = TypeVar("TimedMessage", VehicleState, Imu)
 
@@ -20,6 +20,7 @@ class Shot:
     states: tuple[VehicleState, ...]  # measured since the previous shot, up to this frame, in time order
     image: np.ndarray | None  # (H, W, 3) uint8 BGR
     imu: tuple[Imu, ...] = ()  # IMU samples of the same interval
+    others: tuple[Message, ...] = ()  # what else the processes received in that interval, of a recorded flight
 
 
 class TelemetryCursor(Generic[TimedMessage]):
