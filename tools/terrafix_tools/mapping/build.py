@@ -29,17 +29,17 @@ from terrafix_tools.mapping.package.descriptors import write_descriptors
 from terrafix_tools.mapping.package.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.package.null_model import add_null_models
 from terrafix_tools.mapping.package.pyramid import BUILT_WITH, Pyramid, levels_of, open_renderer
-from terrafix_tools.mapping.parallel import (
+from terrafix_tools.mapping.source import ImagerySource
+from terrafix_tools.mapping.vectors.tables import write_vectors
+from terrafix_tools.mapping.workers import GDAL_CACHE_MB, MAP_BUILD
+from terrafix_tools.parallel.pool import (
     CHUNKS_PER_WORKER,
-    GDAL_CACHE_MB,
     Piece,
     PoolProvider,
     Processes,
     render_pieces,
 )
-from terrafix_tools.mapping.progress import Bar, progress_bar
-from terrafix_tools.mapping.source import ImagerySource
-from terrafix_tools.mapping.vectors.tables import write_vectors
+from terrafix_tools.progress import Bar, progress_bar
 
 HASH_CHUNK = 1 << 20
 
@@ -108,7 +108,7 @@ def build_package(
             out.parent.mkdir(parents=True, exist_ok=True)
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.")))
             bar = stack.enter_context(progress_bar(progress))
-            crew = cluster or stack.enter_context(Processes(workers))
+            crew = cluster or stack.enter_context(Processes(workers, MAP_BUILD))
             part = scratch / "part.gpkg"
             with new_package(part) as (writer, db):
                 one = _Build(writer, db, scratch, out.stem, descriptors, crew, bar)

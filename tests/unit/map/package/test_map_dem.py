@@ -15,9 +15,9 @@ from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping import build as build_module
-from terrafix_tools.mapping import parallel
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.package.dem import encode_heights
+from terrafix_tools.parallel import pool
 
 
 def mountains() -> np.ndarray:
@@ -112,8 +112,8 @@ def test_several_processes_write_the_same_heights(tmp_path: Path, monkeypatch: p
     corner = Affine(5, 0, 299_500, 0, -5, 2_600_500)
     dem = map_rasters.write_tif(tmp_path / "d.tif", mountains(), "EPSG:32651", corner, nodata=-32768)
     started: list[int] = []
-    pool = parallel.ProcessPoolExecutor
-    monkeypatch.setattr(parallel, "ProcessPoolExecutor", lambda n, *more: (started.append(n), pool(n, *more))[1])
+    executor = pool.ProcessPoolExecutor
+    monkeypatch.setattr(pool, "ProcessPoolExecutor", lambda n, *more: (started.append(n), executor(n, *more))[1])
     (tmp_path / "b").mkdir()
     one, two = build(tif, tmp_path / "m.gpkg", dem=dem), build(tif, tmp_path / "b" / "m.gpkg", dem=dem, workers=2)
     assert started == [2] and one.read_bytes() == two.read_bytes()

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -22,16 +21,14 @@ from terrafix_tools.mapping.package.dem import DemSource
 from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
 from terrafix_tools.mapping.package.height_datums import Datum
 from terrafix_tools.mapping.package.heights import to_amsl
-from terrafix_tools.mapping.parallel import default_workers
 from terrafix_tools.mapping.sources.copernicus import glo30
 from terrafix_tools.mapping.sources.prepare import Preparation, Request
 from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
 from terrafix_tools.mapping.vectors.overpass import PUBLIC, fetch_overpass, overpass_features
 from terrafix_tools.mapping.vectors.pbf import pbf_features
 from terrafix_tools.mapping.vectors.tags import LICENCE as OSM_LICENCE
-
-if TYPE_CHECKING:
-    from terrafix_tools.mapping.parallel_cluster import DaskCluster
+from terrafix_tools.mapping.workers import MAP_BUILD
+from terrafix_tools.parallel.pool import connect, default_workers
 
 OVERPASS = "overpass"
 OFFERED_CORRIDOR_KM = 2.0
@@ -78,7 +75,8 @@ def build_order(order: Order) -> Path | None:
     Raises UsageError, ConfigError, SourceError, MapError, OutputError: one line each."""
     _check_files(order)
     with contextlib.ExitStack() as stack:
-        cluster = stack.enter_context(_cluster(order.scheduler)) if order.scheduler else None
+        # Before the download, which may take hours.
+        cluster = stack.enter_context(connect(order.scheduler, MAP_BUILD)) if order.scheduler else None
         if not order.area:
             layers, area = [_whole_image(order)], None
         else:
@@ -106,15 +104,6 @@ def build_order(order: Order) -> Path | None:
             cluster=cluster,
             progress=True,
         )
-
-
-def _cluster(address: str) -> "DaskCluster":
-    """Connects to the scheduler before the download, which may take hours. Raises UsageError."""
-    try:
-        from terrafix_tools.mapping.parallel_cluster import DaskCluster
-    except ModuleNotFoundError as error:
-        raise UsageError(f"--scheduler needs {error.name}; install it: pip install 'terrafix[cluster]'") from None
-    return DaskCluster(address)
 
 
 def _check_files(order: Order) -> None:

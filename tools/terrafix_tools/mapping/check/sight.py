@@ -20,7 +20,7 @@ from terrafix.anchor.matching.frame_matcher import MIN_SIDE_CELLS
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.map.package import LocalMap
 from terrafix_engines.features.gradient import GradientDescriber
-from terrafix_tools.mapping.progress import Bar
+from terrafix_tools.progress import Bar
 
 REACH_CELLS = 60  # search range in each direction: half of the smallest window of the point-mass filter
 MAX_SIDE_CELLS = 160  # of a piece; a larger frame is matched at least as well

@@ -31,9 +31,9 @@ from terrafix_tools.mapping.check.mission import (
     uncovered,
 )
 from terrafix_tools.mapping.check.sight import MatchabilityProbe, Sight, SightGrid, sight_grid
-from terrafix_tools.mapping.progress import progress_bar
 from terrafix_tools.mission.file import read_mission
 from terrafix_tools.mission.items import Mission
+from terrafix_tools.progress import progress_bar
 
 DEFAULT_AGL_M = 100.0
 DEFAULT_CAMERA = CameraCalibration(1280, 720, 914.0, 914.0, 640.0, 360.0)  # a common lens, 70 degrees wide

@@ -12,8 +12,8 @@ from terrafix.map.tile_cache import Part, copy_tile_part, decode_tile
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.package.gpkg import GpkgWriter
 from terrafix_tools.mapping.package.pyramid import Place
-from terrafix_tools.mapping.parallel import PoolProvider, render_pieces
-from terrafix_tools.mapping.progress import Bar
+from terrafix_tools.parallel.pool import PoolProvider, render_pieces
+from terrafix_tools.progress import Bar
 
 # Ground metres per pixel: four octaves. The search uses an 80th of the height, so these serve 75 to 1800 m;
 # finer ones would be as large as the imagery, and the search of a large map uses coarser cells anyway.

@@ -8,28 +8,40 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from multiprocessing import forkserver, resource_tracker
 from types import TracebackType
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
-import cv2
-import rasterio
+from terrafix.core.errors import TerrafixError, UsageError
 
-from terrafix.core.errors import MapError
+if TYPE_CHECKING:
+    from terrafix_tools.parallel.cluster import DaskCluster
 
 CHUNKS_PER_WORKER = 4  # imagery chunks; a process needs about two seconds to start, fewer chunks do not compensate it
 MAX_PENDING_PER_WORKER = (
     3  # pieces in progress or waiting per worker; limits the memory of pieces that are finished out of order
 )
-GDAL_CACHE_MB = 256  # two rows of chunks of an image 20 000 px wide; GDAL's default is 5 % of the memory
-GDAL_CACHES_MB = 1024  # limit over all workers
-PRELOADED = ["__main__", "terrafix_tools.mapping.build"]  # modules that the fork server imports once for all workers
 MAX_DEFAULT_WORKERS = 8  # of the default; each needs 150 to 300 MB
 
 Piece = TypeVar("Piece")
 RenderedPiece = TypeVar("RenderedPiece", covariant=True)
 Wanted = TypeVar("Wanted")
 PieceRequest = TypeVar("PieceRequest", contravariant=True)
+
+
+@dataclass(frozen=True)
+class Workload:
+    """A kind of work: what its workers need, and which errors its failures raise. Picklable."""
+
+    name: str  # of the client at a Dask scheduler
+    module: str  # that the fork server imports once for all workers
+    # Context in which pieces are rendered, by the number of worker processes on this computer.
+    environment: Callable[[int], contextlib.AbstractContextManager[None]]
+    built_with: Callable[[], str]  # versions that determine the result; those of other computers must be equal
+    error: type[TerrafixError]  # of a renderer, and of a cluster that fails
+    died: type[TerrafixError]  # of a worker that ends while it renders
+    again: str  # what the user does after a failure
 
 
 class Renderer(Protocol[PieceRequest, RenderedPiece]):
@@ -58,7 +70,7 @@ OpenRenderer = Callable[[], Renderer[Wanted, Piece]]
 
 
 class PoolProvider(Protocol):
-    """Processes of this computer, or other computers (`parallel_cluster.py`), that provide pools."""
+    """Processes of this computer, or other computers (`cluster.py`), that provide pools."""
 
     def is_worthwhile(self, pieces: int, per_worker: int) -> bool:
         """True when this number of pieces is faster here than in the calling process."""
@@ -74,9 +86,18 @@ class PoolProvider(Protocol):
 
 
 def default_workers() -> int:
-    """One per core that this process may use, at most MOST_WORKERS."""
+    """One per core that this process may use, at most MAX_DEFAULT_WORKERS."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, MAX_DEFAULT_WORKERS)
+
+
+def connect(address: str, workload: Workload) -> "DaskCluster":
+    """The Dask cluster of ``--scheduler``. Raises UsageError: Dask is not installed, or no scheduler answers."""
+    try:
+        from terrafix_tools.parallel.cluster import DaskCluster
+    except ModuleNotFoundError as error:
+        raise UsageError(f"--scheduler needs {error.name}; install it: pip install 'terrafix[cluster]'") from None
+    return DaskCluster(address, workload)
 
 
 def render_pieces(
@@ -91,7 +112,7 @@ def render_pieces(
     wanted pieces must be picklable.
 
     ``per_worker``: no processes are started for fewer pieces per process.
-    Raises what a renderer raises, and MapError when a worker process dies."""
+    Raises what a renderer raises, and ``died`` of the workload when a worker process dies."""
     if not crew.is_worthwhile(pieces, per_worker):
         yield from map(open_renderer().render, wanted)
         return
@@ -106,11 +127,12 @@ def render_pieces(
 
 
 class Processes:
-    """Up to ``most`` processes of this computer, started when needed and reused for every table of a package. A context
-    manager."""
+    """Up to ``most`` processes of this computer, started when needed and reused for every table of a package; for less
+    work than ``least`` processes have, none. A context manager."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, most: int, workload: Workload, *, least: int = 2) -> None:
+        self._most, self._least = most, least
+        self._workload = workload
         self._count = 0
         self._pool: ProcessPoolExecutor | None = None
         self._tables = 0
@@ -125,36 +147,39 @@ class Processes:
             self._pool.shutdown(wait=True, cancel_futures=True)
 
     def is_worthwhile(self, pieces: int, per_worker: int) -> bool:
-        """Implements ``Crew.worth``; the first True fixes the number of processes."""
+        """Implements ``PoolProvider.is_worthwhile``; the first True fixes the number of processes."""
         if self._pool is not None:
-            return pieces > 1
+            return pieces >= self._least
         self._count = min(self._most, pieces // per_worker)
-        return self._count > 1
+        return self._count >= self._least
 
     def prepare(self, pieces: int, per_worker: int) -> None:
-        """Implements ``Crew.get_ready``: the fork server imports its modules in the meantime."""
+        """Implements ``PoolProvider.prepare``: the fork server imports its modules in the meantime."""
         if self.is_worthwhile(pieces, per_worker):
-            multiprocessing.set_forkserver_preload(PRELOADED)
+            multiprocessing.set_forkserver_preload(self._preloaded())
             with _block_interrupt():
                 forkserver.ensure_running()
 
     @contextlib.contextmanager
     def open_pool(self, open_renderer: OpenRenderer[Wanted, Piece]) -> Iterator[RenderPool[Wanted, Piece]]:
-        """Implements ``Crew.hands``."""
+        """Implements ``PoolProvider.open_pool``."""
         if self._pool is None:
-            cache_mb = max(32, min(GDAL_CACHE_MB, GDAL_CACHES_MB // self._count))
             # Not forked from this process, because GDAL's and OpenCV's threads do not survive a fork. The fork server
             # has only imported modules, which saves half a second per process.
-            multiprocessing.set_forkserver_preload(PRELOADED)
+            multiprocessing.set_forkserver_preload(self._preloaded())
             context = multiprocessing.get_context("forkserver")
-            self._pool = ProcessPoolExecutor(self._count, context, _start_worker, (cache_mb,))
+            initial = (self._workload.environment, self._count)
+            self._pool = ProcessPoolExecutor(self._count, context, _start_worker, initial)
         self._tables += 1
         try:
             yield _ProcessPool(self._pool, self._count, self._tables, open_renderer)
         except BrokenProcessPool:
-            raise MapError(
-                "a worker process died, perhaps for want of memory; build again with fewer --workers"
+            raise self._workload.died(
+                f"a worker process died, perhaps for want of memory; {self._workload.again} with fewer --workers"
             ) from None
+
+    def _preloaded(self) -> list[str]:
+        return ["__main__", self._workload.module]
 
 
 class _ProcessPool(Generic[Wanted, Piece]):
@@ -185,15 +210,16 @@ def _block_interrupt() -> Iterator[None]:
 
 
 class _Worker:
-    """State of a worker process between pieces: the renderer of the most recent table."""
+    """State of a worker process between pieces: the renderer of the most recent table, and what it works in."""
 
+    environment: contextlib.AbstractContextManager[None] | None = None
     table = 0
     renderer: Renderer[Any, Any] | None = None
 
 
-def _start_worker(cache_mb: int) -> None:
-    cv2.setNumThreads(1)  # one process per core, so threads would compete
-    rasterio.Env(GDAL_CACHEMAX=cache_mb).__enter__()
+def _start_worker(environment: Callable[[int], contextlib.AbstractContextManager[None]], count: int) -> None:
+    _Worker.environment = environment(count)
+    _Worker.environment.__enter__()
 
 
 def _render(table: int, open_renderer: OpenRenderer[Any, Any], wanted: Any) -> Any:

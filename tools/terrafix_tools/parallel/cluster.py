@@ -1,7 +1,7 @@
 """Renders the pieces of a table on a Dask cluster: any number of computers with access to the same files.
 
-A worker that dies loses only its own pieces: the scheduler reassigns them. The bytes are those of a build on one
-computer, because workers with other versions of the decoding and encoding libraries are rejected."""
+A worker that dies loses only its own pieces: the scheduler reassigns them. The results are those of one computer,
+because workers with other versions of the libraries that matter are rejected."""
 
 import contextlib
 import logging
@@ -14,14 +14,11 @@ import uuid
 from collections.abc import Iterator
 from typing import Any, Generic
 
-import cv2
-import rasterio
 from distributed import CancelledError, Client, Future, KilledWorker
 from distributed.comm.core import CommClosedError
 
-from terrafix.core.errors import MapError, UsageError
-from terrafix_tools.mapping.package.pyramid import BUILT_WITH
-from terrafix_tools.mapping.parallel import GDAL_CACHE_MB, OpenRenderer, Pending, Piece, Renderer, RenderPool, Wanted
+from terrafix.core.errors import UsageError
+from terrafix_tools.parallel.pool import OpenRenderer, Pending, Piece, Renderer, RenderPool, Wanted, Workload
 
 CONNECT_S = 10.0  # time-out of the connection to the scheduler
 WORKERS_S = 60.0  # time-out without any worker
@@ -33,9 +30,9 @@ ADDRESS = re.compile(r"tcp://([^/:\s]+|\[[0-9a-fA-F:.]+\]):(\d+)")
 class DaskCluster:
     """A connection to the scheduler at ``address`` (tcp://host:port). A context manager."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, workload: Workload) -> None:
         """Raises UsageError: no scheduler at the address."""
-        self._address = address
+        self._address, self._workload = address, workload
         place = ADDRESS.fullmatch(address)
         if not place:
             raise UsageError(
@@ -45,7 +42,7 @@ class DaskCluster:
             logging.getLogger(f"distributed{name}").setLevel(logging.CRITICAL)
         try:
             _check_scheduler(place[1].strip("[]"), int(place[2]))
-            self._client = Client(address, timeout=CONNECT_S, set_as_default=False, name="terrafix-map-build")
+            self._client = Client(address, timeout=CONNECT_S, set_as_default=False, name=workload.name)
         except (OSError, OverflowError) as error:
             raise UsageError(
                 f"--scheduler {address}: no Dask scheduler answers there ({error}); "
@@ -59,38 +56,48 @@ class DaskCluster:
         self._client.close()
 
     def is_worthwhile(self, pieces: int, per_worker: int) -> bool:
-        """Implements ``parallel.Crew.worth``: small tables do not need their file on other computers."""
+        """Implements ``PoolProvider.is_worthwhile``: small tables do not need their file on other computers."""
         return pieces >= per_worker
 
     def prepare(self, pieces: int, per_worker: int) -> None:
-        """Implements ``parallel.Crew.get_ready``."""
+        """Implements ``PoolProvider.prepare``."""
 
     @contextlib.contextmanager
     def open_pool(self, open_renderer: OpenRenderer[Wanted, Piece]) -> Iterator[RenderPool[Wanted, Piece]]:
-        """Implements ``parallel.Crew.hands``. MapError: workers die or are rejected, or the scheduler is lost."""
+        """Implements ``PoolProvider.open_pool``. Raises ``died`` of the workload when workers die, and its ``error``
+        when they are rejected or the scheduler is lost."""
         table = uuid.uuid4().hex
         try:
-            yield _Remote(self._client, self._address, table, open_renderer)
+            yield _Remote(self._client, self._address, table, open_renderer, self._workload)
             self._client.run(_close_renderer, table, on_error="ignore")
         except KilledWorker:
-            raise MapError(
+            raise self._workload.died(
                 f"{self._address}: workers died again and again at one piece, perhaps for want of memory; "
                 "give each more of it, or one thread"
             ) from None
         except (CancelledError, CommClosedError):
-            raise MapError(f"{self._address}: the scheduler was lost; start it and build again") from None
+            raise self._workload.error(
+                f"{self._address}: the scheduler was lost; start it and {self._workload.again}"
+            ) from None
         except ImportError as error:
-            raise MapError(
+            raise self._workload.error(
                 f"{self._address}: a worker cannot run Terrafix ({error}); install the same version, with the extras "
                 "'ground' and 'cluster', on every computer"
             ) from None
 
 
 class _Remote(Generic[Wanted, Piece]):
-    """Implements ``parallel.Hands``."""
+    """Implements ``RenderPool``."""
 
-    def __init__(self, client: Client, address: str, table: str, open_renderer: OpenRenderer[Wanted, Piece]) -> None:
-        self._client, self._address, self._table = client, address, table
+    def __init__(
+        self,
+        client: Client,
+        address: str,
+        table: str,
+        open_renderer: OpenRenderer[Wanted, Piece],
+        workload: Workload,
+    ) -> None:
+        self._client, self._address, self._table, self._workload = client, address, table, workload
         self._submitted = 0
         # A task, not scattered data, which is lost with the worker that holds it.
         self._open_renderer = client.submit(_identity, open_renderer, key=f"terrafix-{table}")
@@ -98,18 +105,21 @@ class _Remote(Generic[Wanted, Piece]):
     def submit(self, wanted: Wanted) -> Pending[Piece]:
         self._submitted += 1
         key = f"terrafix-{self._table}-{self._submitted}"
-        task = self._client.submit(_render, self._table, self._open_renderer, wanted, _built_with(), key=key)
+        expected = _built_with(self._workload)
+        task = self._client.submit(_render, self._table, self._open_renderer, wanted, self._workload, expected, key=key)
         return _Task(task, self)
 
     def count(self) -> int:
         return sum(self._client.nthreads().values())
 
     def wait_for_workers(self) -> None:
-        """Raises MapError when there is no worker within the time-out."""
+        """Raises ``error`` of the workload when there is no worker within the time-out."""
         began_s = time.monotonic()
         while not self.count():
             if time.monotonic() - began_s > WORKERS_S:
-                raise MapError(f"{self._address}: the scheduler has no workers; start some with 'dask worker'")
+                raise self._workload.error(
+                    f"{self._address}: the scheduler has no workers; start some with 'dask worker'"
+                )
             time.sleep(POLL_WORKERS_S)
 
 
@@ -135,8 +145,8 @@ def _check_scheduler(host: str, port: int) -> None:
         raise OSError("the reply is not from Dask")
 
 
-def _built_with() -> str:
-    return f"{BUILT_WITH}, {platform.machine()}"
+def _built_with(workload: Workload) -> str:
+    return f"{workload.built_with()}, {platform.machine()}"
 
 
 # The code below runs on the workers. GDAL's datasets belong to one thread; a worker may have several.
@@ -147,18 +157,20 @@ def _identity(open_renderer: OpenRenderer[Wanted, Piece]) -> OpenRenderer[Wanted
     return open_renderer
 
 
-def _render(table: str, open_renderer: OpenRenderer[Any, Any], wanted: Any, built_with: str) -> Any:
+def _render(table: str, open_renderer: OpenRenderer[Any, Any], wanted: Any, workload: Workload, built_with: str) -> Any:
     thread = threading.get_ident()
     try:
         if _renderers.get(thread, ("",))[0] != table:
-            if built_with != _built_with():
-                raise MapError(f"has {_built_with()}, the computer that builds has {built_with}; make them the same")
-            cv2.setNumThreads(1)  # the worker's threads already use all cores
-            with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
+            here = _built_with(workload)
+            if built_with != here:
+                raise workload.error(f"has {here}, the computer that builds has {built_with}; make them the same")
+            with workload.environment(1):
                 _renderers[thread] = table, open_renderer()
         return _renderers[thread][1].render(wanted)
-    except MapError as error:
-        raise MapError(f"worker on {platform.node()}: {error}; workers need the same files at the same paths") from None
+    except workload.error as error:
+        raise workload.error(
+            f"worker on {platform.node()}: {error}; workers need the same files at the same paths"
+        ) from None
 
 
 def _close_renderer(table: str) -> None:

@@ -1,4 +1,4 @@
-"""Progress bars of the map commands, on stderr."""
+"""Progress bars of the commands, on stderr."""
 
 import contextlib
 from collections.abc import Callable, Iterator
