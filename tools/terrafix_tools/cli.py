@@ -10,6 +10,7 @@ from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
 from terrafix_tools.compare.cli import compare
 from terrafix_tools.finalise.cli import finalise
+from terrafix_tools.fleet.cli import app as fleet_app
 from terrafix_tools.hint.cli import CONTEXT, hint
 from terrafix_tools.locate.cli import locate
 from terrafix_tools.log.cli import app as log_app
@@ -29,6 +30,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position wit
 app.add_typer(map_app, name="map")
 app.add_typer(models_app, name="models")
 app.add_typer(log_app, name="log")
+app.add_typer(fleet_app, name="fleet")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
 app.command()(compare)

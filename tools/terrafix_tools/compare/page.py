@@ -1,39 +1,26 @@
 """A comparison as one HTML page without other files."""
 
 from html import escape
-from importlib.resources import files
 from typing import Any
 
 from terrafix_tools.compare.text import divergence, summary
 from terrafix_tools.report.charts import Chart, Point
+from terrafix_tools.report.document import document, table
 
 MIN_DISTANCE_M = 0.01  # height of the chart where the positions are equal
 
 
 def page(comparison: dict[str, Any], distances_m: list[tuple[float, float]]) -> str:
     """``distances_m``: (time [s], distance of the two positions [m]) of each frame."""
-    style = (files("terrafix_tools") / "assets" / "report.css").read_text(encoding="utf-8")
     a, b = (escape(comparison[name]["path"]) for name in ("a", "b"))
     verdict = next(summary(comparison))
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{a} and {b}</title><style>{style}</style></head><body><main>"
+    return document(
+        f"{comparison['a']['path']} and {comparison['b']['path']}",
         f'<header><div class="eyebrow">Terrafix, two records of one flight</div><h1>{escape(verdict)}</h1>'
         f"<p>A: {a} · B: {b}</p></header>"
         f"{_distances(comparison, distances_m)}{_differences(comparison)}{_messages(comparison)}"
-        f"{_verdicts(comparison)}{_delays(comparison)}{_changes(comparison)}</main></body></html>\n"
+        f"{_verdicts(comparison)}{_delays(comparison)}{_changes(comparison)}",
     )
-
-
-def table(columns: list[str], rows: list[list[Any]]) -> str:
-    """An HTML table; the first column is text, the others are numbers."""
-    head = "".join(f"<th>{escape(name)}</th>" for name in columns)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{escape(str('-' if cell is None else cell))}</td>" for cell in row) + "</tr>"
-        for row in rows
-    )
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _distances(comparison: dict[str, Any], distances_m: list[tuple[float, float]]) -> str:

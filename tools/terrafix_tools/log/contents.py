@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from terrafix.messages import Frame, NavEstimate, Origin, WallClock
+from terrafix.messages import Frame, Message, NavEstimate, Origin, WallClock
 from terrafix.recorder.reader import ReadResult, check_format, read_received
 
 NS = 1_000_000_000
@@ -27,6 +27,21 @@ class Contents:
     unix_offset_ns: int | None = None  # Unix time minus the clock of the record
     frames: set[int] = field(default_factory=set)
     localised: set[int] = field(default_factory=set)
+
+    def take(self, t_ns: int, message: Message) -> None:
+        """Takes the next message of the record, whose time is ``t_ns``."""
+        self.counts[type(message).__name__] += 1
+        if isinstance(message, Origin):
+            self.origin = self.origin or message
+            return
+        self.first_ns = t_ns if self.first_ns is None else min(self.first_ns, t_ns)
+        self.last_ns = max(self.last_ns, t_ns)
+        if isinstance(message, Frame):
+            self.frames.add(message.frame_id)
+        elif isinstance(message, NavEstimate):
+            self.localised.add(message.frame_id)
+        elif isinstance(message, WallClock) and message.unix_ns is not None:
+            self.unix_offset_ns = message.unix_ns - message.t_ns
 
     @property
     def duration_s(self) -> float:
@@ -57,18 +72,7 @@ def read_contents(path: Path) -> Contents:
     """Reads a record: a file, or the folder of a replay or run. Raises SourceError."""
     found = Contents(path, ReadResult())
     for _, t_ns, _, message in read_received(path, found.result):
-        found.counts[type(message).__name__] += 1
-        if isinstance(message, Origin):
-            found.origin = found.origin or message
-            continue
-        found.first_ns = t_ns if found.first_ns is None else min(found.first_ns, t_ns)
-        found.last_ns = max(found.last_ns, t_ns)
-        if isinstance(message, Frame):
-            found.frames.add(message.frame_id)
-        elif isinstance(message, NavEstimate):
-            found.localised.add(message.frame_id)
-        elif isinstance(message, WallClock) and message.unix_ns is not None:
-            found.unix_offset_ns = message.unix_ns - message.t_ns
+        found.take(t_ns, message)
     check_format(path, found.result)
     return found
 

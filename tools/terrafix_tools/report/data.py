@@ -14,6 +14,7 @@ from terrafix.messages import (
     Dropped,
     GpsInput,
     Health,
+    LinkStatus,
     MapMatch,
     MeasurementVerdict,
     Message,
@@ -37,6 +38,7 @@ from terrafix_tools.evaluate import (
 )
 from terrafix_tools.finalise.output import TABLE as FINALISED
 from terrafix_tools.finalise.output import read_track
+from terrafix_tools.log.contents import Contents
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,9 @@ class FlightView:
     evaluation: dict[str, Any] | None = None
     peer: dict[str, Any] = field(default_factory=dict)  # peer.json of the simulated autopilot
     cut_off: int = 0  # number of record files without end
+    link: LinkStatus | None = None  # the last one
+    clocked: bool = False  # the record has times of reception: a live one, whose messages have a delay
+    contents: Contents = field(default_factory=lambda: Contents(Path(), ReadResult()))
 
     @property
     def duration_s(self) -> float:
@@ -122,7 +127,7 @@ def gather(folder: Path, truth_path: Path | None) -> FlightView:
     if not folder.is_dir():
         raise SourceError(f"{folder}: no such folder; give the output of replay, run or demo")
     summary = read_summary(folder)
-    table, zero_ns, view = _read_record(folder)
+    table, zero_ns, view = read_record(folder)
     tables = [path for name in (ESTIMATES, ESTIMATES + PARTIAL) if (path := folder / name).is_file()]
     if tables:
         view.rows = read_rows(tables[0])
@@ -166,18 +171,21 @@ def _read_peer(path: Path) -> dict[str, Any]:
     return peer if isinstance(peer, dict) else {}
 
 
-def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
-    """Reads the record in one pass. Returns the rows, the time of the first frame, and the view without rows."""
+def read_record(path: Path) -> tuple[RowTable, int, FlightView]:
+    """Reads a record (a file, or the folder of a replay or run) in one pass. Returns the rows, the time of the first
+    frame, and the view without rows."""
     result = ReadResult()
     table = RowTable()
-    view = FlightView(title="", rows=[], frame_ids=[])
+    view = FlightView(title="", rows=[], frame_ids=[], contents=Contents(path, result))
     verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     sent_ns: dict[int, int] = {}
     timed: list[tuple[int, Message]] = []
     anchor_verdict: dict[int, Verdict] = {}  # by frame id
     rejected: list[MeasurementVerdict] = []
-    for _, t_ns, received_ns, message in read_received(folder, result):
+    for _, t_ns, received_ns, message in read_received(path, result):
         table.take(message)
+        view.contents.take(t_ns, message)
+        view.clocked = view.clocked or received_ns != message.t_ns
         if isinstance(message, NavEstimate):
             # Delay of the last estimate of a frame, which is the one in its row; the recorder's clock has a resolution
             # of 10 ms.
@@ -195,6 +203,8 @@ def _read_record(folder: Path) -> tuple[RowTable, int, FlightView]:
             view.origin = message
         elif isinstance(message, CalibrationEstimate):
             view.calibration = message
+        elif isinstance(message, LinkStatus):
+            view.link = message
         elif isinstance(message, Dropped):
             view.dropped[f"{message.process}: {message.message}"] += message.count
         elif isinstance(message, Health | GpsInput | ProcessEvent | StatusText | CalibrationFault):

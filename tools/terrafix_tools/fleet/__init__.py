@@ -1,0 +1,1 @@
+"""`terrafix fleet`: many flight records as tables, with queries and a page of trends."""
