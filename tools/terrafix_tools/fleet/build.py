@@ -40,12 +40,16 @@ def build(source: str, out: Path, *, workers: int, scheduler: str = "", progress
     place = open_place(source)
     cluster = connect(scheduler, FLEET_BUILD) if scheduler else None
     with cluster or nullcontext():
-        records = find_records(place)
+        records, unlisted = find_records(place)
         opened: OpenWorkers = (lambda alone: nullcontext(cluster)) if cluster else partial(_processes, workers)
+        limit = 1 if cluster else DEATHS + DEATHS_ALONE
         with open_fleet(out) as fleet:
-            return _build(
-                fleet, place, records, opened, limit=1 if cluster else DEATHS + DEATHS_ALONE, progress=progress
-            )
+            result = _build(fleet, place, records, opened, limit=limit, progress=progress)
+            for path, reason in unlisted:
+                result.errors.append((path, reason))
+                fleet.put(Examined(Record(path, path, (), run=True, size=0, modified_ns=0), error=reason))
+            fleet.finish()
+            return result
 
 
 def _build(
@@ -62,7 +66,6 @@ def _build(
             if examined.error is not None:
                 result.errors.append((examined.record.path, examined.error))
             step()
-    fleet.finish()
     result.flights = len(fleet.flights)
     return result
 

@@ -59,7 +59,7 @@ class Examiner:
                 for identified in _flights(path):
                     flights.append(_flight(identified, wanted))  # those before an error are kept
         except _UNREADABLE as error:
-            reason = first_line(error) or type(error).__name__
+            reason = (isinstance(error, OSError) and error.strerror) or first_line(error) or type(error).__name__
             return Examined(wanted, tuple(flights), reason.removeprefix(f"{path}: "))
         return Examined(wanted, tuple(flights))
 
@@ -68,8 +68,9 @@ class Examiner:
 def _on_disk(place: Place, record: Record) -> Iterator[Path]:
     """-> the record as a file or folder of this computer; one of a bucket is copied for as long as it is read."""
     if place.local:
-        folder = Path(record.folder)
-        yield folder if record.run else folder / record.names[0]
+        path = Path(record.folder) if record.run else Path(record.folder) / record.names[0]
+        path.stat()  # raises OSError for a link without its file
+        yield path
         return
     with tempfile.TemporaryDirectory(prefix="terrafix-fleet-") as scratch:
         for name in record.names:

@@ -1,8 +1,10 @@
 """Finds flight records below a folder, or in a bucket."""
 
+import os
 import re
+import stat
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,45 +61,86 @@ def open_place(text: str) -> Place:
     return place
 
 
-def find_records(place: Place) -> list[Record]:
-    """All records below a place, by path. Raises SourceError when there is none, or when it cannot be listed."""
+def find_records(place: Place) -> tuple[list[Record], list[tuple[str, str]]]:
+    """-> all records below a place, by path, and the folders that cannot be listed, with the reason. Links to folders
+    are not followed.
+
+    Raises SourceError: there is no record, or a bucket cannot be listed."""
+    unlisted: list[tuple[str, str]] = []
     try:
-        infos = place.files.get_file_info(fs.FileSelector(place.root, recursive=True))
+        listed = list(_below_folder(place.root, unlisted) if place.local else _below_bucket(place))
     except OSError as error:
         raise SourceError(f"{place.path}: cannot be listed ({first_line(error)}); check the access") from None
-    found = _records(place, (info for info in infos if info.type == fs.FileType.File))
+    found = _records(place, listed)
     if not found:
         raise SourceError(f"{place.path}: no flight record below it (flight.mcap, flight-000.mcap, *.mcap)")
-    return found
+    return found, unlisted
 
 
-def _records(place: Place, infos: Iterable[fs.FileInfo]) -> list[Record]:
-    by_folder: defaultdict[str, list[fs.FileInfo]] = defaultdict(list)
-    for info in infos:
-        by_folder[info.path.rpartition("/")[0]].append(info)
+@dataclass(frozen=True)
+class _File:
+    folder: str
+    name: str
+    size: int
+    modified_ns: int
+
+
+def _below_folder(root: str, unlisted: list[tuple[str, str]]) -> Iterator[_File]:
+    """Names that are no text (UTF-8) are kept as Python keeps them, by surrogates."""
+
+    def note(error: OSError) -> None:
+        unlisted.append((_shown(error.filename), f"cannot be listed ({error.strerror})"))
+
+    for folder, _, names in os.walk(root, onerror=note):
+        for name in names:
+            path = os.path.join(folder, name)
+            try:
+                about = os.stat(path)
+            except OSError:  # a link without its file: an error when it is read
+                about = os.lstat(path)
+            if not stat.S_ISDIR(about.st_mode):
+                yield _File(folder, name, about.st_size, about.st_mtime_ns)
+
+
+def _below_bucket(place: Place) -> Iterator[_File]:
+    for info in place.files.get_file_info(fs.FileSelector(place.root, recursive=True)):
+        if info.type == fs.FileType.File:
+            folder = info.path.rpartition("/")[0]
+            yield _File(folder, info.base_name, info.size or 0, info.mtime_ns or 0)
+
+
+def _records(place: Place, listed: Iterable[_File]) -> list[Record]:
+    by_folder: defaultdict[str, list[_File]] = defaultdict(list)
+    for file in listed:
+        by_folder[file.folder].append(file)
     records = []
     for folder, inside in by_folder.items():
-        named = {info.base_name: info for info in inside}
-        run = [] if SOURCE in named else [info for name, info in named.items() if RECORD_NAMES.fullmatch(name)]
+        named = {file.name: file for file in inside}
+        run = [] if SOURCE in named else [file for file in inside if RECORD_NAMES.fullmatch(file.name)]
         if run:
             summary = [named[SUMMARY]] if SUMMARY in named else []
             records.append(_record(place, folder, [*run, *summary], run=True))
-        alone = [info for info in inside if info.base_name.endswith(RECORD_SUFFIXES) and info not in run]
-        records += [_record(place, folder, [info], run=False) for info in alone]
+        alone = [file for file in inside if file.name.endswith(RECORD_SUFFIXES) and file not in run]
+        records += [_record(place, folder, [file], run=False) for file in alone]
     return sorted(records, key=lambda record: record.path)
 
 
-def _record(place: Place, folder: str, infos: list[fs.FileInfo], *, run: bool) -> Record:
-    below = (folder if run else infos[0].path).removeprefix(place.root.rstrip("/")).strip("/")
+def _record(place: Place, folder: str, files: list[_File], *, run: bool) -> Record:
+    path = folder if run else f"{folder}/{files[0].name}"
+    below = path.removeprefix(place.root.rstrip("/")).strip("/")
     return Record(
-        path=f"{place.path.rstrip('/')}/{below}".rstrip("/"),
+        path=_shown(f"{place.path.rstrip('/')}/{below}".rstrip("/")),
         folder=folder,
-        names=tuple(sorted(info.base_name for info in infos)),
+        names=tuple(sorted(file.name for file in files)),
         run=run,
-        size=sum(info.size for info in infos),
-        modified_ns=max(info.mtime_ns or 0 for info in infos),
+        size=sum(file.size for file in files),
+        modified_ns=max(file.modified_ns for file in files),
     )
 
 
+def _shown(path: str) -> str:
+    return path.encode("utf-8", "backslashreplace").decode()
+
+
 def first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
+    return _shown(str(error).strip().partition("\n")[0])

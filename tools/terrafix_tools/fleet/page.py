@@ -1,0 +1,231 @@
+"""`terrafix fleet page`: trends of a fleet and where it fails, as one HTML page without other files."""
+
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from terrafix.core.errors import OutputError
+from terrafix_tools.fleet.places import Grid, grids, legend, picture, words, worst
+from terrafix_tools.fleet.query import FleetTables
+from terrafix_tools.report.charts import Chart, Point
+from terrafix_tools.report.document import document, table
+
+MAX_GROUPS = 12  # rows of a trend
+LEAST_MONTHS = 5  # of the chart by month; over fewer the trend by season says as much
+MAX_MAPS, MAX_WORST, MAX_ERRORS = 12, 12, 20
+
+# Of all flights, or of a group: sums over frames, so that a long flight counts for more than a short one.
+MEASURES = """
+    count(*) AS flights, sum(duration_s) / 3600 AS hours, sum(distance_m) / 1000 AS km, sum(frames) AS frames,
+    sum(localised) / nullif(sum(frames), 0) AS availability, sum(refusals) / nullif(sum(fixes + refusals), 0) AS refused
+"""
+SIGMAS = "SELECT {group} AS name, median(sigma_m) AS sigma_m FROM frames JOIN flights USING (flight) GROUP BY name"
+GROUPS = (
+    ("Map", "map"),
+    ("Season", "season"),
+    ("Camera", "camera"),
+    ("Height above ground", "CAST(floor(agl_median_m / 50) * 50 AS INTEGER)"),
+    ("Version", "concat_ws(' ', version, git)"),
+)
+HEIGHT = GROUPS[3][0]
+SEASONS = ("spring", "summer", "autumn", "winter")
+MONTHS = f"SELECT date_trunc('month', date) AS month, {MEASURES} FROM flights WHERE date IS NOT NULL GROUP BY month"
+REASONS = """
+SELECT reason, count(*) AS frames FROM frames WHERE reason IS NOT NULL GROUP BY reason ORDER BY frames DESC, reason
+"""
+
+
+def write_page(fleet: Path, out: Path) -> None:
+    """Raises SourceError, UsageError, OutputError."""
+    with FleetTables(fleet) as tables:
+        text = page(tables, fleet)
+    partial = out.with_name(f"{out.name}.partial")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(out)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+
+
+def page(tables: FleetTables, fleet: Path) -> str:
+    name = fleet.resolve().name
+    style = (files("terrafix_tools") / "assets" / "fleet.css").read_text(encoding="utf-8")
+    body = (
+        _head(tables, name) + _months(tables) + _trends(tables) + _reasons(tables) + _places(tables) + _errors(tables)
+    )
+    return document(f"{name} - fleet", body, style)
+
+
+def _head(tables: FleetTables, name: str) -> str:
+    about = tables.ask(f"SELECT {MEASURES}, min(date) AS first, max(date) AS last FROM flights").objects()[0]
+    sigma_m = tables.ask("SELECT median(sigma_m) FROM frames").rows[0][0]
+    figures = [
+        (f"{about['flights']}", "", "flights"),
+        (f"{about['hours'] or 0:.1f}", "h", "recorded"),
+        (f"{about['km'] or 0:.0f}", "km", "flown"),
+        (_percent(about["availability"]), "%", "frames with a position"),
+        (_percent(about["refused"]), "%", "map matches refused"),
+        ("-" if sigma_m is None else f"{sigma_m:.1f}", "m", "stated 1-sigma, median"),
+    ]
+    tiles = "".join(
+        f"<div><b>{value}<small>{unit}</small></b><span>{text}</span></div>" for value, unit, text in figures
+    )
+    dates = f"{about['first']} to {about['last']}" if about["first"] else "no flight has a date"
+    return (
+        f'<header><div class="eyebrow">Terrafix fleet</div><h1>{escape(name)}</h1><p>{dates}</p></header>'
+        f'<section class="figures">{tiles}</section>'
+    )
+
+
+def _months(tables: FleetTables) -> str:
+    rows = tables.ask(f"{MONTHS} ORDER BY month").objects()
+    if not rows:
+        return ""
+    first = rows[0]["month"].year * 12
+    at = [row["month"].year * 12 + row["month"].month - first for row in rows]
+    if at[-1] - at[0] + 1 < LEAST_MONTHS:
+        return ""
+    top = max(
+        5.0, *(100 * value for row in rows for value in (row["refused"], 1 - (row["availability"] or 0)) if value)
+    )
+    chart = Chart(
+        x_min=at[0] - 0.5,
+        x_max=at[-1] + 0.5,
+        y_min=0.0,
+        y_max=1.1 * top,
+        height=230,
+        x_unit="",
+        y_unit="%",
+        follow=False,
+    )
+    for month, row in zip(at, rows, strict=True):
+        tip = f"{row['month']:%Y-%m}: {_percent(row['refused'])} % refused, {row['flights']} flights"
+        chart.bar(month - 0.4, month + 0.4, 100 * (row["refused"] or 0), "refused", tip)
+    without: list[Point] = [
+        (month, None if row["availability"] is None else 100 * (1 - row["availability"]))
+        for month, row in zip(at, rows, strict=True)
+    ]
+    chart.line(without, "none")
+    return (
+        f'<h2>By month</h2><p class="lead">Months from January {rows[0]["month"].year}. Bars: share of the map matches '
+        "that were refused; line: frames without a position.</p>"
+        f'<div class="scroll">{chart.svg("Refused map matches by month")}</div>'
+    )
+
+
+def _trends(tables: FleetTables) -> str:
+    blocks = [_trend(tables, title, group) for title, group in GROUPS]
+    return (
+        '<h2>Trends</h2><p class="lead">Shares of all frames of a group; sigma is the median of the stated horizontal '
+        f"1-sigma. {_keys()}</p>{''.join(blocks)}"
+    )
+
+
+def _trend(tables: FleetTables, title: str, group: str) -> str:
+    rows = tables.ask(f"SELECT {group} AS name, {MEASURES} FROM flights GROUP BY name ORDER BY flights DESC").objects()
+    sigmas = dict(tables.ask(SIGMAS.format(group=group)).rows)
+    shown = sorted(rows[:MAX_GROUPS], key=lambda row: _order(row["name"]))
+    most = max([value for value in sigmas.values() if value is not None], default=1.0)
+    lines = "".join(_group(title, row, sigmas.get(row["name"]), most) for row in shown)
+    more = f'<p class="quiet">and {len(rows) - MAX_GROUPS} more</p>' if len(rows) > MAX_GROUPS else ""
+    heads = ("", "flights", "hours", "with a position", "refused", "sigma")
+    return (
+        f'<h3>{escape(title)}</h3><div class="scroll"><table class="trend"><thead><tr>'
+        f"{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead><tbody>{lines}</tbody></table></div>{more}"
+    )
+
+
+def _group(title: str, row: dict[str, Any], sigma_m: float | None, most_m: float) -> str:
+    name = "unknown" if row["name"] in (None, "") else str(row["name"])
+    if title == HEIGHT and row["name"] is not None:
+        name = f"{row['name']} to {row['name'] + 50} m"
+    sigma = "-" if sigma_m is None else f"{sigma_m:.1f} m"
+    return (
+        f"<tr><td>{escape(name)}</td><td>{row['flights']}</td><td>{row['hours'] or 0:.1f}</td>"
+        f"{_bar(row['availability'], 'k-good')}{_bar(row['refused'], 'k-dead')}"
+        f'<td><u class="k-claim" style="width:{100 * (sigma_m or 0) / max(most_m, 1e-9):.1f}%"></u>{sigma}</td></tr>'
+    )
+
+
+def _bar(share: float | None, css: str) -> str:
+    return f'<td><u class="{css}" style="width:{100 * (share or 0):.1f}%"></u>{_percent(share)} %</td>'
+
+
+def _keys() -> str:
+    return (
+        "Refused: map matches that a check has rejected, of all frames that were matched. Of a flight without a date "
+        "(a replay) the season is unknown."
+    )
+
+
+def _order(name: Any) -> tuple[int, Any]:
+    """Seasons as in the year, numbers by size, texts by the alphabet, unknown last."""
+    if name in (None, ""):
+        return 3, ""
+    if name in SEASONS:
+        return 0, SEASONS.index(name)
+    return (1, name) if isinstance(name, int) else (2, name)
+
+
+def _reasons(tables: FleetTables) -> str:
+    rows = tables.ask(REASONS).objects()
+    if not rows:
+        return ""
+    total = sum(row["frames"] for row in rows)
+    lines = "".join(
+        f'<div><span>{escape(words(row["reason"]))}</span><u class="k-dead" '
+        f'style="width:{100 * row["frames"] / total:.1f}%"></u>'
+        f"<span>{row['frames']} · {100 * row['frames'] / total:.0f} %</span></div>"
+        for row in rows
+    )
+    return f'<h2>Reasons of refusal</h2><div class="verdict">{lines}</div>'
+
+
+def _places(tables: FleetTables) -> str:
+    found = grids(tables)
+    if not found:
+        return ""
+    shown = "".join(
+        f"<div><h3>{escape(grid.map or 'map unknown')}</h3>"
+        f'<p class="quiet">{grid.frames} frames, cells of {grid.cell_m} m</p>{picture(grid)}</div>'
+        for grid in found[:MAX_MAPS]
+    )
+    more = f'<p class="quiet">and {len(found) - MAX_MAPS} more maps</p>' if len(found) > MAX_MAPS else ""
+    return (
+        '<h2>Where it fails</h2><p class="lead">Share of the matched frames in each cell that were refused, north up. '
+        "A frame without a position is in no cell.</p>"
+        f'{legend()}<div class="two places">{shown}</div>{more}{_worst(found)}'
+    )
+
+
+def _worst(found: list[Grid]) -> str:
+    cells = worst(found, MAX_WORST)
+    if not cells:
+        return ""
+    rows: list[list[object]] = [
+        [
+            grid.map or "unknown",
+            f"{cell.lat_deg:.5f}, {cell.lon_deg:.5f}",
+            cell.frames,
+            f"{cell.share:.0%}",
+            words(cell.reason),
+        ]
+        for grid, cell in cells
+    ]
+    return f"<h3>Worst cells</h3>{table(['map', 'latitude, longitude', 'frames', 'refused', 'mostly'], rows)}"
+
+
+def _errors(tables: FleetTables) -> str:
+    rows = tables.ask("SELECT record, error FROM errors ORDER BY record").rows
+    if not rows:
+        return ""
+    more = f'<p class="quiet">and {len(rows) - MAX_ERRORS} more</p>' if len(rows) > MAX_ERRORS else ""
+    return (
+        f"<h2>Records that could not be read</h2>{table(['record', 'reason'], [[*r] for r in rows[:MAX_ERRORS]])}{more}"
+    )
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.{0 if share in (0.0, 1.0) else 1}f}"
