@@ -10,7 +10,7 @@ from pathlib import Path
 from terrafix_tools.fleet.examine import FLEET_BUILD, Examined, Examiner, WorkerDied
 from terrafix_tools.fleet.find import Place, Record, find_records, open_place
 from terrafix_tools.fleet.store import FleetFolder, open_fleet
-from terrafix_tools.parallel.pool import PoolProvider, Processes, connect, render_pieces
+from terrafix_tools.parallel.pool import OpenRenderer, PoolProvider, Processes, connect, render_pieces
 from terrafix_tools.progress import progress_bar
 
 RECORDS_PER_WORKER = 4  # a process needs about a second to start, which fewer small records do not compensate
@@ -41,7 +41,7 @@ def build(source: str, out: Path, *, workers: int, scheduler: str = "", progress
     cluster = connect(scheduler, FLEET_BUILD) if scheduler else None
     with cluster or nullcontext():
         records, unlisted = find_records(place)
-        opened: OpenWorkers = (lambda alone: nullcontext(cluster)) if cluster else partial(_processes, workers)
+        opened: OpenWorkers = (lambda alone: nullcontext(cluster)) if cluster else partial(processes, workers)
         limit = 1 if cluster else DEATHS + DEATHS_ALONE
         with open_fleet(out) as fleet:
             result = _build(fleet, place, records, opened, limit=limit, progress=progress)
@@ -60,7 +60,7 @@ def _build(
     result = Result(found=len(records), unchanged=len(records) - len(changed))
     with progress_bar(progress) as bar:
         step = bar("records", len(changed))
-        for examined in _examine_all(place, changed, opened, limit):
+        for examined in examine_all(partial(Examiner, place), changed, opened, limit):
             new, grown = fleet.put(examined)
             result.new, result.grown = result.new + new, result.grown + grown
             if examined.error is not None:
@@ -70,16 +70,17 @@ def _build(
     return result
 
 
-def _processes(workers: int, after_death: bool) -> Processes:
+def processes(workers: int, after_death: bool) -> Processes:
     """After a death even a single record is read by another process, not by this one."""
     return Processes(workers, FLEET_BUILD, least=1 if after_death else 2)
 
 
-def _examine_all(place: Place, records: list[Record], opened: OpenWorkers, limit: int) -> Iterator[Examined]:
+def examine_all(
+    open_examiner: OpenRenderer[Record, Examined], records: list[Record], opened: OpenWorkers, limit: int
+) -> Iterator[Examined]:
     """Reads all records, in their order. When a worker dies, new ones read what is not finished; a record at which
     ``limit`` of them have died is given up."""
     waiting = deque(records)
-    examiner = partial(Examiner, place)
     deaths = 0  # since the last record that was finished
     died = False
     while waiting:
@@ -87,7 +88,7 @@ def _examine_all(place: Place, records: list[Record], opened: OpenWorkers, limit
         try:
             with opened(died) as workers:
                 per_worker = 1 if died else RECORDS_PER_WORKER
-                for examined in render_pieces(examiner, batch, len(batch), workers, per_worker=per_worker):
+                for examined in render_pieces(open_examiner, batch, len(batch), workers, per_worker=per_worker):
                     waiting.popleft()
                     deaths = 0
                     yield examined

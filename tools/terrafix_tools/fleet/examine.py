@@ -17,6 +17,7 @@ from terrafix.recorder.reader import ReadResult, check_format, flight_files, rea
 from terrafix_tools.fleet.find import Place, Record, first_line
 from terrafix_tools.fleet.flight import flight_id, flight_rows
 from terrafix_tools.fleet.tables import FLIGHTS, FRAMES, UNKNOWN_DATE, to_parquet
+from terrafix_tools.log.contents import damage_of
 from terrafix_tools.parallel.pool import Workload
 
 # Of a record whose header or times are damaged beyond what checksums cover, or that vanishes or cannot be read.
@@ -59,9 +60,16 @@ class Examiner:
                 for identified in _flights(path):
                     flights.append(_flight(identified, wanted))  # those before an error are kept
         except _UNREADABLE as error:
-            reason = (isinstance(error, OSError) and error.strerror) or first_line(error) or type(error).__name__
-            return Examined(wanted, tuple(flights), reason.removeprefix(f"{path}: "))
+            return Examined(wanted, tuple(flights), _reason(error).removeprefix(f"{path}: "))
         return Examined(wanted, tuple(flights))
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if isinstance(error, TerrafixError):
+        return first_line(error)
+    return f"its head or its times are damaged ({first_line(error) or type(error).__name__})"
 
 
 @contextlib.contextmanager
@@ -97,17 +105,22 @@ def _flights(path: Path) -> Iterator[_Identified]:
     Raises SourceError: no file has an origin."""
     summaries = path if path.is_dir() else path.parent / "none"
     identified: list[tuple[Path, str]] = []
+    damage: list[str] = []
     first = None
     for file in flight_files(path):
         result = ReadResult()
         origin = next((m for _, _, _, m in read_received(file, result) if isinstance(m, Origin)), None)
         first = first or result
+        damage += damage_of(result)
         found = flight_id(result.header, origin) if origin is not None and result.header else ""
         identified.append((file, found or (identified[-1][1] if identified else "")))
     named = [flight for _, flight in identified if flight]
     if not named:
         check_format(path, first or ReadResult())
-        raise SourceError(f"{path}: the record has no origin of a flight; was the source of the flight opened?")
+        reason = (
+            f"what is readable has no origin ({damage[0]})" if damage else "the source of the flight was not opened"
+        )
+        raise SourceError(f"{path}: no flight in the record, {reason}")
     groups = [
         (flight, [file for file, _ in files]) for flight, files in groupby(identified, lambda item: item[1] or named[0])
     ]

@@ -58,7 +58,7 @@ class FleetTables:
             raise UsageError("queries of a fleet need duckdb; install it: pip install 'terrafix[fleet]'") from None
         self._folder = folder
         self._duckdb_error = duckdb.Error
-        self._select = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
+        self._select = duckdb.StatementType.SELECT
         self._open: DuckDBPyConnection = duckdb.connect(":memory:")
         for name, schema in TABLES.items():
             columns = pyarrow.unify_schemas([PARTITIONS.schema, schema])
@@ -82,12 +82,12 @@ class FleetTables:
         file of the fleet cannot be read."""
         try:
             statements = self._open.extract_statements(sql)
-            if len(statements) != 1 or statements[0].type not in self._select:
+            if len(statements) != 1 or statements[0].type != self._select:
                 raise UsageError("SQL: give one SELECT; a query changes and writes nothing")
             done = self._open.execute(statements[0], values)
             return Answer([column[0] for column in done.description], done.fetchall())
         except self._duckdb_error as error:
-            text = " ".join(str(error).split("\\n\\nLINE ")[0].split())
+            text = " ".join(str(error).split("\n\nLINE ")[0].split())
             if "Parquet" in text or "parquet" in text:
                 raise SourceError(
                     f"{self._folder}: a file cannot be read ({text}); delete it and build again"

@@ -148,7 +148,8 @@ def open_fleet(folder: Path) -> Iterator[FleetFolder]:
     """The folder of a fleet to build, made when it is missing. Raises OutputError: it cannot be written, or another
     build has it."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for table in TABLES:  # also of a fleet without a readable record
+            (folder / table).mkdir(parents=True, exist_ok=True)
         with (folder / LOCK).open("wb") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process, also with a killed one
