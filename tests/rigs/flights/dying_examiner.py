@@ -11,19 +11,20 @@ from terrafix_tools.fleet.find import Place, Record
 
 @dataclass(frozen=True)
 class DyingExaminer:
-    """``deadly``: end of the path of the record at which the process is killed. ``once``: file that is made at the
-    first death, after which there is no other; None: at every attempt."""
+    """``deadly``: names of the run folders at which the process is killed: at each once, or at every attempt.
+    ``deaths``: folder with a file for each death."""
 
     place: Place
-    deadly: str
-    once: Path | None
+    deadly: tuple[str, ...]
+    deaths: Path
+    once: bool
 
     def __call__(self) -> "DyingExaminer":
         return self
 
     def render(self, wanted: Record) -> Examined:
-        if wanted.path.endswith(self.deadly) and not (self.once and self.once.exists()):
-            if self.once:
-                self.once.touch()
+        name = Path(wanted.path).name
+        if name in self.deadly and not (self.once and any(self.deaths.glob(f"{name}.*"))):
+            (self.deaths / f"{name}.{os.getpid()}").touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return Examiner(self.place).render(wanted)

@@ -28,6 +28,7 @@ from terrafix_tools.fleet.query import query
 from terrafix_tools.fleet.store import LIST, FleetFolder, open_fleet
 
 RECORDS = 12
+LIMIT = DEATHS + DEATHS_ALONE
 COUNTS = "SELECT count(*), count(DISTINCT flight), sum(frames) FROM flights"
 
 
@@ -101,11 +102,14 @@ def test_a_flight_under_two_paths_is_there_once_with_the_longer_record(records: 
         longer.write(message, received_ns)
     longer.close()
     shutil.copytree(run, records / "z-copy")
+    shutil.copytree(records / "vehicle-2" / "run-0002", records / "z-copy-2")
     result = build(str(records), tmp_path / "fleet", workers=1)
-    assert (result.found, result.flights) == (RECORDS + 2, RECORDS)
+    assert (result.found, result.flights) == (RECORDS + 3, RECORDS)
     flight = rows(tmp_path / "fleet", "SELECT flight FROM flights WHERE frames = 20")[0][0]
     assert rows(tmp_path / "fleet", f"SELECT count(*) FROM frames WHERE flight = '{flight}'") == [(20,)]
-    assert build(str(records), tmp_path / "fleet", workers=1).unchanged == RECORDS + 2
+    kept = [path for (path,) in rows(tmp_path / "fleet", "SELECT record FROM flights WHERE record LIKE '%run-0002'")]
+    assert kept == [f"{records}/vehicle-2/run-0002"], "of two equal records the first"
+    assert build(str(records), tmp_path / "fleet", workers=1).unchanged == RECORDS + 3
 
 
 def test_a_record_that_has_grown_replaces_its_rows_and_one_whose_beginning_was_deleted_does_not(
@@ -200,28 +204,62 @@ def test_an_address_of_the_local_file_system_is_read_in_place(records: Path, tmp
 
 
 @pytest.mark.slow
-def test_a_killed_worker_loses_and_doubles_nothing(records: Path, tmp_path: Path) -> None:
-    """Real processes; the one that reads the seventh record is killed with SIGKILL."""
+def test_killed_workers_lose_and_double_nothing(records: Path, tmp_path: Path) -> None:
+    """Real processes, killed with SIGKILL at six records, more often than one record may kill them."""
     build(str(records), tmp_path / "undisturbed", workers=1)
+    (tmp_path / "deaths").mkdir()
+    deadly = tuple(f"run-{number:04d}" for number in range(0, RECORDS, 2))
     place = open_place(str(records))
-    dying = DyingExaminer(place, "run-0006", once=tmp_path / "died")
+    dying = DyingExaminer(place, deadly, tmp_path / "deaths", once=True)
     with open_fleet(tmp_path / "killed") as fleet:
-        for examined in examine_all(dying, find_records(place)[0], partial(processes, 2), DEATHS + DEATHS_ALONE):
+        for examined in examine_all(dying, find_records(place)[0], partial(processes, 2), LIMIT):
             fleet.put(examined)
         fleet.finish()
-    assert (tmp_path / "died").exists()
+    assert len(list((tmp_path / "deaths").iterdir())) == len(deadly) > LIMIT
     assert tree(tmp_path / "killed") == tree(tmp_path / "undisturbed")
 
 
 @pytest.mark.slow
-def test_a_record_at_which_every_worker_dies_is_given_up_and_named(records: Path) -> None:
+def test_a_record_at_which_every_worker_dies_is_given_up_and_named(records: Path, tmp_path: Path) -> None:
     place = open_place(str(records))
-    dying = DyingExaminer(place, "run-0006", once=None)
-    found = list(examine_all(dying, find_records(place)[0], partial(processes, 2), DEATHS + DEATHS_ALONE))
+    dying = DyingExaminer(place, ("run-0006",), tmp_path, once=False)
+    found = list(examine_all(dying, find_records(place)[0], partial(processes, 2), LIMIT))
     assert [(examined.record.path[-8:], examined.error) for examined in found if examined.error] == [
         ("run-0006", KILLED)
     ]
     assert sum(len(examined.flights) for examined in found) == RECORDS - 1
+    assert len(list(tmp_path.glob("run-0006.*"))) <= LIMIT + 4
+
+
+def test_the_row_of_a_flight_is_written_after_its_frames(
+    records: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that a kill between the two leaves no flight without frames."""
+    place = open_place(str(records))
+    written: list[Path] = []
+
+    def fail_at_the_second(self: FleetFolder, path: Path, content: bytes) -> None:
+        written.append(path)
+        if len(written) == 2:
+            raise OSError(28, "No space left on device")
+        path.parent.mkdir(parents=True)
+        path.write_bytes(content)
+
+    monkeypatch.setattr(FleetFolder, "_write", fail_at_the_second)
+    with pytest.raises(OutputError, match="No space left on device"), open_fleet(tmp_path / "fleet") as fleet:
+        fleet.put(Examiner(place).render(find_records(place)[0][0]))
+    assert rows(tmp_path / "fleet", COUNTS)[0][0] == 0
+    assert (tmp_path / "fleet" / LIST).exists() is False
+
+
+def test_a_line_after_one_that_was_cut_off_is_read(records: Path, tmp_path: Path) -> None:
+    place = open_place(str(records))
+    record = find_records(place)[0][0]
+    (tmp_path / "fleet").mkdir()
+    (tmp_path / "fleet" / LIST).write_bytes(b'{"record": "')
+    with open_fleet(tmp_path / "fleet") as fleet:
+        fleet.put(Examiner(place).render(record))
+    assert list(FleetFolder(tmp_path / "fleet").listed) == [record.path]
 
 
 def test_a_build_that_was_cut_off_is_resumed(records: Path, tmp_path: Path) -> None:

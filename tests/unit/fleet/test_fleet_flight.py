@@ -12,6 +12,7 @@ from flight_records import PERIOD_NS, live_messages, write_record
 from terrafix import messages as m
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.bench.fleet_records import Invented, write_records
+from terrafix_tools.estimates import Row
 from terrafix_tools.fleet.build import build
 from terrafix_tools.fleet.examine import Examiner
 from terrafix_tools.fleet.find import find_records, open_place
@@ -121,6 +122,14 @@ def test_copies_parts_and_later_segments_of_a_record_are_the_same_flight(tmp_pat
     assert len(ids(tmp_path)) == 5 and len(set(ids(tmp_path))) == 1
 
 
+def test_the_start_is_that_of_the_flight_when_its_first_segments_were_deleted(tmp_path: Path) -> None:
+    later = [message for message in live_messages(FRAMES) if isinstance(message, m.Origin) or message.t_ns > 5e9]
+    clock = m.WallClock(t_ns=12 * PERIOD_NS, unix_ns=NOON_NS + 12 * PERIOD_NS, source="autopilot")
+    flight, frames = tables_of([*later, clock], tmp_path / "run")
+    assert flight["start_utc"] == datetime(2026, 7, 3, 12, 0, 0, tzinfo=UTC)
+    assert frames[0]["t_s"] == 5.5 and flight["duration_s"] < 6.0
+
+
 @pytest.mark.parametrize("changed", ["origin", "version", "configuration"])
 def test_another_origin_version_or_configuration_is_another_flight(tmp_path: Path, changed: str) -> None:
     flight = Invented(3, frames=2)
@@ -158,9 +167,7 @@ def test_seasons_are_meteorological_and_opposite_in_the_south(month: int, lat_de
     assert season(month, lat_deg) == expected
 
 
-def test_the_noise_of_a_hovering_vehicle_is_no_distance(tmp_path: Path) -> None:
-    from terrafix_tools.estimates import Row
-
+def test_the_noise_of_a_hovering_vehicle_is_no_distance() -> None:
     hovering = [Row(file="", t_s=0.0, lat_deg=48.0 + (i % 2) * 2e-5, lon_deg=11.0) for i in range(100)]  # 2.2 m
     assert distance_m(hovering) == 0.0
     moving = [Row(file="", t_s=0.0, lat_deg=48.0 + i * 1e-4, lon_deg=11.0) for i in range(11)]

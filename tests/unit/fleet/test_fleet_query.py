@@ -115,7 +115,7 @@ def test_a_wrong_statement_is_one_line(fleet: Path) -> None:
 
 @pytest.mark.parametrize("sql", ["SELECT nope FROM flights", "SELECT 1/", "SELECT CAST('x' AS INT)", "FROM flight"])
 def test_what_is_wrong_in_a_statement_is_said_in_one_line(fleet: Path, sql: str) -> None:
-    with pytest.raises(UsageError, match="^SQL: ") as caught:
+    with pytest.raises(UsageError, match=r"^SQL: ") as caught:
         query(fleet, sql)
     assert "\n" not in str(caught.value) and "LINE 1" not in str(caught.value)
 
