@@ -203,6 +203,14 @@ def test_an_address_of_the_local_file_system_is_read_in_place(records: Path, tmp
     assert build(f"file://{records}", tmp_path / "fleet", workers=1).new == RECORDS
 
 
+def test_no_message_and_no_path_has_the_keys_of_an_address(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"^ftp://host/folder: cannot be opened") as caught:
+        open_place("ftp://name:secret@host/folder?key=secret")
+    assert "secret" not in str(caught.value)
+    place = open_place(f"file://{tmp_path}")
+    assert place.path == f"file://{tmp_path}"
+
+
 @pytest.mark.slow
 def test_killed_workers_lose_and_double_nothing(records: Path, tmp_path: Path) -> None:
     """Real processes, killed with SIGKILL at six records, more often than one record may kill them."""

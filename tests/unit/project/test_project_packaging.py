@@ -72,7 +72,7 @@ def test_what_flies_starts_without_faiss() -> None:
 @pytest.mark.slow
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
-    declared |= (modules(EXTRAS["train"]) - EXPORTER) | modules(EXTRAS["faiss"])
+    declared |= (modules(EXTRAS["train"]) - EXPORTER) | modules(EXTRAS["faiss"]) | modules(EXTRAS["fleet"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
@@ -81,7 +81,7 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
 def test_every_dependency_has_a_version_range() -> None:
     for requirement in [
         *CORE.values(),
-        *(one for extra in ("ground", "sim", "cluster", "faiss", "train") for one in EXTRAS[extra].values()),
+        *(one for extra in ("ground", "sim", "cluster", "faiss", "fleet", "train") for one in EXTRAS[extra].values()),
     ]:
         operators = {specifier.operator for specifier in requirement.specifier}
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"

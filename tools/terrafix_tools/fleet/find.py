@@ -15,6 +15,7 @@ from terrafix.core.errors import SourceError
 
 RECORD_NAMES = re.compile(r"flight-\d+\.mcap|flight\.mcap(\.partial)?")  # of the run folders of recorder/reader.py
 RECORD_SUFFIXES = (".mcap", ".mcap.partial")
+KEYS = re.compile(r"//[^/]*@")  # of the account, in an address
 SOURCE = "flight.toml"  # a folder with it is a recorded source, not that of a run
 SUMMARY = "summary.json"  # of a replay: has the map
 
@@ -35,7 +36,7 @@ class Record:
 class Place:
     """A folder or a bucket. ``files`` is picklable, also for workers on other computers."""
 
-    path: str  # for people
+    path: str  # for people: absolute path, or address
     root: str  # in the file system
     files: fs.FileSystem
 
@@ -47,18 +48,26 @@ class Place:
 def open_place(text: str) -> Place:
     """A folder, or an address such as s3://bucket/folder. Raises SourceError: there is no such folder."""
     try:
-        if "://" in text:
-            files, root = fs.FileSystem.from_uri(text)
-        else:
-            files, root = fs.LocalFileSystem(), str(Path(text).absolute())
-        place = Place(text.rstrip("/") if "://" in text else root, root, files)
-        kind = files.get_file_info(root).type
+        place = _place(text)
+        kind = place.files.get_file_info(place.root).type
     except (OSError, ValueError, pyarrow.ArrowException) as error:
-        raise SourceError(f"{text}: cannot be opened ({first_line(error)}); check address and access") from None
+        shown = KEYS.sub("//", text.partition("?")[0])
+        reason = first_line(error).replace(text, shown)
+        raise SourceError(f"{shown}: cannot be opened ({reason}); check address and access") from None
     if kind != fs.FileType.Directory:
         reason = "no such folder" if kind == fs.FileType.NotFound else "not a folder"
-        raise SourceError(f"{text}: {reason}; give a folder or a bucket with flight records below it")
+        raise SourceError(f"{place.path}: {reason}; give a folder or a bucket with flight records below it")
     return place
+
+
+def _place(text: str) -> Place:
+    """The path that is shown and stored is without the keys and options that an address may have."""
+    scheme, separator, _ = text.partition("://")
+    if separator:
+        files, root = fs.FileSystem.from_uri(text)
+        return Place(f"{scheme}://{root}".rstrip("/"), root, files)
+    root = str(Path(text).absolute())
+    return Place(root, root, fs.LocalFileSystem())
 
 
 def find_records(place: Place) -> tuple[list[Record], list[tuple[str, str]]]:
