@@ -16,9 +16,10 @@ from terrafix_tools.estimates import Row
 from terrafix_tools.fleet.build import build
 from terrafix_tools.fleet.examine import Examiner
 from terrafix_tools.fleet.find import find_records, open_place
-from terrafix_tools.fleet.flight import distance_m, flight_rows, longest_without_fix_s, season
+from terrafix_tools.fleet.flight import _map, distance_m, flight_rows, longest_without_fix_s, season
 from terrafix_tools.fleet.query import query
 from terrafix_tools.log.edit import cut, recover
+from terrafix_tools.report.data import FlightView
 
 NOON_NS = 1_783_080_000_000_000_000  # 2026-07-03 12:00:00 UTC
 FRAMES = 20
@@ -106,6 +107,15 @@ def test_a_live_record_has_latencies_and_a_replay_has_the_map(tmp_path: Path) ->
     flight, _ = flight_rows(replayed, replayed)
     assert (flight["map"], flight["map_checksum"]) == ("coast-2024", "sum of coast-2024")
     assert flight["map_date"] == date(2024, 7, 1)
+
+
+def test_a_live_record_has_the_map_that_its_head_states(tmp_path: Path) -> None:
+    head = {"config": {"map": {"path": "configured.gpkg"}}}
+    stated = {"path": "flown.gpkg", "source": "town.tif", "checksum": "c1", "date": "2021-05-03"}
+    view = FlightView(title="", rows=[], frame_ids=[], header=head | {"map": stated})
+    assert _map(view, tmp_path) == {"map": "town", "map_checksum": "c1", "map_date": date(2021, 5, 3)}
+    view.header = head
+    assert _map(view, tmp_path) == {"map": "configured", "map_checksum": None, "map_date": None}
 
 
 def test_copies_parts_and_later_segments_of_a_record_are_the_same_flight(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from terrafix import messages as m
 from terrafix.core.config import Config, Map, Source
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
-from terrafix.recorder.writer import FlightWriter, header
+from terrafix.recorder.writer import RECORD_FORMAT, FlightWriter
 
 NS = 1_000_000_000
 FIRST_DAY_NS = 1_767_261_600 * NS  # 2026-01-01 10:00 UTC
@@ -62,7 +62,8 @@ class Invented:
         version = VERSIONS[min(len(VERSIONS) - 1, self.day * len(VERSIONS) // 365)]
         config = Config(map=Map(path=f"maps/{place}.gpkg"), source=Source(camera=f"config/cameras/{camera}.toml"))
         versions = {"terrafix": version, "git": f"v{version}", "python": "3.11"}
-        return header(config) | {"versions": msgspec.json.encode(versions).decode()}
+        encode = msgspec.json.encode
+        return {"format": RECORD_FORMAT, "config": encode(config).decode(), "versions": encode(versions).decode()}
 
     @property
     def summary(self) -> dict[str, Any]:

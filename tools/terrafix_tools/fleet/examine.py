@@ -112,7 +112,8 @@ def _flights(path: Path) -> Iterator[_Identified]:
         origin = next((m for _, _, _, m in read_received(file, result) if isinstance(m, Origin)), None)
         first = first or result
         damage += damage_of(result)
-        found = flight_id(result.header, origin) if origin is not None and result.header else ""
+        stated = bool(result.header.get("config") and result.header.get("versions"))  # else the head is damaged
+        found = flight_id(result.header, origin) if origin is not None and stated else ""
         identified.append((file, found or (identified[-1][1] if identified else "")))
     named = [flight for _, flight in identified if flight]
     if not named:

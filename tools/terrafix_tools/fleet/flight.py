@@ -134,12 +134,11 @@ def _vehicle(view: FlightView) -> str | None:
 
 
 def _map(view: FlightView, summaries: Path) -> dict[str, Any]:
-    """Only what the flight itself states: the file at the path of the map may be another one today."""
-    used = read_summary(summaries).get("map")
-    used = used if isinstance(used, dict) else {}
-    path = used.get("source") or used.get("path") or view.header["config"].get("map", {}).get("path", "")
+    """Only what summary or head of the record state: the file at the path of the map may be another one today."""
+    stated = (read_summary(summaries).get("map"), view.header.get("map"), view.header["config"].get("map"))
+    used = next((found for found in stated if isinstance(found, dict) and found), {})
     return {
-        "map": Path(path).stem or None,
+        "map": Path(used.get("source") or used.get("path", "")).stem or None,
         "map_checksum": used.get("checksum") or None,
         "map_date": date.fromisoformat(used["date"]) if used.get("date") else None,
     }
