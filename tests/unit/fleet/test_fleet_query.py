@@ -137,6 +137,8 @@ def test_a_damaged_file_of_the_fleet_is_named(fleet: Path, tmp_path: Path) -> No
     part.write_bytes(b"PAR1")
     with pytest.raises(SourceError, match=re.escape(str(part))):
         query(copy, "SELECT sum(frames) FROM flights")
+    with pytest.raises(SourceError, match=re.escape(str(part))):
+        write_page(copy, tmp_path / "page.html")
 
 
 def test_json_and_csv_together_are_refused(fleet: Path) -> None:

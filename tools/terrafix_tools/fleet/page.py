@@ -38,7 +38,7 @@ SELECT reason, count(*) AS frames FROM frames WHERE reason IS NOT NULL GROUP BY 
 
 def write_page(fleet: Path, out: Path) -> None:
     """Raises SourceError, UsageError, OutputError."""
-    with FleetTables(fleet) as tables:
+    with FleetTables(fleet, keep=True) as tables:
         text = page(tables, fleet)
     partial = out.with_name(f"{out.name}.partial")
     try:
@@ -61,10 +61,11 @@ def page(tables: FleetTables, fleet: Path) -> str:
 def _head(tables: FleetTables, name: str) -> str:
     about = tables.ask(f"SELECT {MEASURES}, min(date) AS first, max(date) AS last FROM flights").objects()[0]
     sigma_m = tables.ask("SELECT median(sigma_m) FROM frames").rows[0][0]
+    hours, km = about["hours"] or 0.0, about["km"] or 0.0
     figures = [
         (f"{about['flights']}", "", "flights"),
-        (f"{about['hours'] or 0:.1f}", "h", "recorded"),
-        (f"{about['km'] or 0:.0f}", "km", "flown"),
+        (f"{hours:.1f}", "h", "recorded") if hours >= 1 else (f"{60 * hours:.1f}", "min", "recorded"),
+        (f"{km:.0f}" if km >= 10 else f"{km:.1f}", "km", "flown"),
         (_percent(about["availability"]), "%", "frames with a position"),
         (_percent(about["refused"]), "%", "map matches refused"),
         ("-" if sigma_m is None else f"{sigma_m:.1f}", "m", "stated 1-sigma, median"),
@@ -143,7 +144,7 @@ def _group(title: str, row: dict[str, Any], sigma_m: float | None, most_m: float
         name = f"{row['name']} to {row['name'] + 50} m"
     sigma = "-" if sigma_m is None else f"{sigma_m:.1f} m"
     return (
-        f"<tr><td>{escape(name)}</td><td>{row['flights']}</td><td>{row['hours'] or 0:.1f}</td>"
+        f"<tr><td>{escape(name)}</td><td>{row['flights']}</td><td>{row['hours'] or 0:.2f}</td>"
         f"{_bar(row['availability'], 'k-good')}{_bar(row['refused'], 'k-dead')}"
         f'<td><u class="k-claim" style="width:{100 * (sigma_m or 0) / max(most_m, 1e-9):.1f}%"></u>{sigma}</td></tr>'
     )

@@ -13,7 +13,7 @@ LEAST_FRAMES = 5  # of a cell whose share is shown; that of fewer says little
 METRES_PER_DEG = 111_320.0  # of latitude; sizes of cells need no more than 1 %
 # Upper ends of the classes of the share of refused frames, and what the legend says.
 CLASSES = ((0.05, "under 5 %"), (0.15, "5 to 15 %"), (0.3, "15 to 30 %"), (0.6, "30 to 60 %"), (1.01, "60 % and more"))
-LEAST_COLUMNS = 12  # of a picture, so that few cells are not drawn large
+LEAST_COLUMNS = 20  # of a picture, so that few cells are not drawn large
 PX = 12  # side of a cell, SVG units
 MARGIN_PX = 22  # below the grid, for the scale
 

@@ -14,7 +14,7 @@ from pyarrow import dataset
 
 from terrafix.core.errors import SourceError, UsageError
 from terrafix_tools.fleet.store import check_fleet, read_list
-from terrafix_tools.fleet.tables import PARTITIONS, RECORDS, TABLES
+from terrafix_tools.fleet.tables import PART, PARTITIONS, RECORDS, TABLES
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 MAX_SHOWN = 50  # rows of a printed table
 
 VIEWS = """
-CREATE VIEW flights AS SELECT date, flight, * EXCLUDE (date, flight) FROM flights_files;
-CREATE VIEW frames AS SELECT date, flight, * EXCLUDE (date, flight) FROM frames_files
+CREATE {kind} flights AS SELECT date, flight, * EXCLUDE (date, flight) FROM flights_files;
+CREATE {kind} frames AS SELECT date, flight, * EXCLUDE (date, flight) FROM frames_files
     WHERE flight IN (SELECT flight FROM flights_files);
 CREATE VIEW records AS SELECT * EXCLUDE (modified_ns) FROM records_list;
 CREATE VIEW errors AS SELECT record, error FROM records_list WHERE error IS NOT NULL;
@@ -49,8 +49,9 @@ class Answer:
 class FleetTables:
     """The tables of a fleet, opened for queries. A context manager."""
 
-    def __init__(self, folder: Path) -> None:
-        """Raises SourceError: there is no fleet; UsageError: DuckDB is not installed."""
+    def __init__(self, folder: Path, *, keep: bool = False) -> None:
+        """``keep``: reads the files once, for many queries. Raises SourceError: there is no fleet, or a file of it
+        cannot be read; UsageError: DuckDB is not installed."""
         check_fleet(folder)
         try:
             import duckdb
@@ -69,7 +70,10 @@ class FleetTables:
             for one in read_list(folder).values()
         ]
         self._open.register("records_list", pyarrow.Table.from_pylist(listed, schema=RECORDS))
-        self._open.execute(VIEWS + CLOSED)
+        try:
+            self._open.execute(VIEWS.format(kind="TABLE" if keep else "VIEW") + CLOSED)
+        except duckdb.Error as error:
+            raise self._wrong(error) from None
 
     def __enter__(self) -> "FleetTables":
         return self
@@ -87,12 +91,13 @@ class FleetTables:
             done = self._open.execute(statements[0], values)
             return Answer([column[0] for column in done.description], done.fetchall())
         except self._duckdb_error as error:
-            text = " ".join(str(error).split("\n\nLINE ")[0].split())
-            if "Parquet" in text or "parquet" in text:
-                raise SourceError(
-                    f"{self._folder}: a file cannot be read ({text}); delete it and build again"
-                ) from None
-            raise UsageError(f"SQL: {text}") from None
+            raise self._wrong(error) from None
+
+    def _wrong(self, error: Exception) -> SourceError | UsageError:
+        text = " ".join(str(error).split("\n\nLINE ")[0].split())
+        if PART in text:
+            return SourceError(f"{self._folder}: a file cannot be read ({text}); delete it and build again")
+        return UsageError(f"SQL: {text}")
 
 
 def query(folder: Path, sql: str) -> Answer:
