@@ -353,16 +353,24 @@ def test_a_source_without_records_is_one_line(tmp_path: Path, source: str, messa
     assert "\n" not in str(caught.value) and not (tmp_path / "fleet").exists()
 
 
-def test_a_folder_that_cannot_be_listed_is_an_error_of_the_build(records: Path, tmp_path: Path) -> None:
-    closed = records / "vehicle-0"
-    closed.chmod(0)
-    if os.access(closed, os.R_OK):
-        closed.chmod(0o755)
-        pytest.skip("this user reads folders without permission")
+def test_a_folder_that_cannot_be_listed_is_an_error_of_the_build(
+    records: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed, scandir = records / "vehicle-0", os.scandir
+
+    def refuse(path: str) -> object:
+        if Path(path) == closed:
+            raise PermissionError(13, "Permission denied", path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
     result = build(str(records), tmp_path / "fleet", workers=1)
-    closed.chmod(0o755)
     assert result.errors == [(str(closed), "cannot be listed (Permission denied)")]
     assert result.new == RECORDS - 3
+    monkeypatch.undo()
+    assert rows(tmp_path / "fleet", "SELECT record FROM errors") == [(str(closed),)]
+    assert build(str(records), tmp_path / "fleet", workers=1).errors == []
+    assert rows(tmp_path / "fleet", "SELECT count(*) FROM errors") == [(0,)]
 
 
 def test_an_unreachable_scheduler_is_one_line(records: Path, tmp_path: Path) -> None:
