@@ -105,6 +105,7 @@ def test_a_live_record_has_latencies_and_a_replay_has_the_map(tmp_path: Path) ->
     assert (flight["camera"], flight["version"], flight["git"]) == ("wide", "1.0.0", "v1.0.0")
     replayed = tmp_path / "vehicle-0" / "run-0004"
     flight, _ = flight_rows(replayed, replayed)
+    assert (flight["live"], flight["start_utc"], flight["season"]) == (False, None, None)
     assert (flight["map"], flight["map_checksum"]) == ("coast-2024", "sum of coast-2024")
     assert flight["map_date"] == date(2024, 7, 1)
 

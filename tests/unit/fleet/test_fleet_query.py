@@ -37,11 +37,12 @@ def call(*arguments: object) -> Result:
 
 
 def test_json_has_an_object_for_each_row_with_dates_and_maps(fleet: Path) -> None:
-    sql = "SELECT flight, date, start_utc, refused, map_date FROM flights WHERE record LIKE '%run-0004'"
-    row = json.loads(call("query", fleet, sql, "--json").stdout)[0]
-    assert (row["date"], row["start_utc"]) == ("2026-01-29", "2026-01-29T10:00:00+00:00")
-    assert row["map_date"] == "2024-07-01" and row["refused"]["ambiguous"] > 0
-    assert re.fullmatch("[0-9a-f]{16}", row["flight"])
+    sql = """SELECT flight, date, start_utc, refused, map_date, live FROM flights
+        WHERE record LIKE '%run-0003' OR record LIKE '%run-0004' ORDER BY record"""
+    live, replay = sorted(json.loads(call("query", fleet, sql, "--json").stdout), key=lambda row: not row["live"])
+    assert (live["date"], live["start_utc"]) == ("2026-01-22", "2026-01-22T10:00:00+00:00")
+    assert (replay["date"], replay["start_utc"], replay["map_date"]) == (None, None, "2024-07-01")
+    assert live["refused"]["ambiguous"] > 0 and re.fullmatch("[0-9a-f]{16}", live["flight"])
 
 
 def test_csv_has_a_header_and_empty_cells_for_unknown(fleet: Path) -> None:
@@ -190,6 +191,9 @@ def test_the_page_has_trends_places_and_errors_and_needs_no_other_file(fleet: Pa
     assert not re.search(r"https?://|<script|<link|<img|url\(", text)
     for expected in ("valley-2025", "winter", "narrow", "50 to 100 m", "1.0.0 v1.0.0", "few inliers", "text.mcap"):
         assert expected in text, expected
+    with FleetTables(fleet) as tables:
+        dates = tables.ask("SELECT min(date), max(date) FROM flights").rows[0]
+    assert f"<p>{dates[0]} to {dates[1]}; {RECORDS // 5} of the flights are replays" in text
     shares = query(fleet, "SELECT sum(refusals) / sum(fixes + refusals) FROM flights WHERE season = 'winter'").rows
     winter = re.search(r"<tr><td>winter</td>.*?</tr>", text)
     assert winter and f"{100 * shares[0][0]:.1f} %" in winter[0]

@@ -132,7 +132,7 @@ def _estimate(
 
 def write_records(folder: Path, count: int, frames: int) -> list[Path]:
     """Writes ``count`` records, each in a run folder of its own, and returns these folders; every fifth is that of a
-    replay, with its summary."""
+    replay: with a summary, without clock and times of reception."""
     runs = []
     for number in range(count):
         flight = Invented(number, frames)
@@ -143,7 +143,10 @@ def write_records(folder: Path, count: int, frames: int) -> list[Path]:
             (run / "summary.json").write_text(json.dumps(flight.summary), encoding="utf-8")
         writer = FlightWriter(run / ("flight.mcap" if replayed else "flight-000.mcap"), flight.header)
         for message, received_ns in flight.messages():
-            writer.write(message, received_ns)
+            if not replayed:
+                writer.write(message, received_ns)
+            elif not isinstance(message, m.WallClock):
+                writer.write(message, message.t_ns)
         writer.close()
         runs.append(run)
     return runs

@@ -59,7 +59,8 @@ def page(tables: FleetTables, fleet: Path) -> str:
 
 
 def _head(tables: FleetTables, name: str) -> str:
-    about = tables.ask(f"SELECT {MEASURES}, min(date) AS first, max(date) AS last FROM flights").objects()[0]
+    more = "min(date) AS first, max(date) AS last, count(*) FILTER (NOT live) AS replays"
+    about = tables.ask(f"SELECT {MEASURES}, {more} FROM flights").objects()[0]
     sigma_m = tables.ask("SELECT median(sigma_m) FROM frames").rows[0][0]
     hours, km = about["hours"] or 0.0, about["km"] or 0.0
     figures = [
@@ -74,6 +75,7 @@ def _head(tables: FleetTables, name: str) -> str:
         f"<div><b>{value}<small>{unit}</small></b><span>{text}</span></div>" for value, unit, text in figures
     )
     dates = f"{about['first']} to {about['last']}" if about["first"] else "no flight has a date"
+    dates += f"; {about['replays']} of the flights are replays" if about["replays"] else ""
     return (
         f'<header><div class="eyebrow">Terrafix fleet</div><h1>{escape(name)}</h1><p>{dates}</p></header>'
         f'<section class="figures">{tiles}</section>'
