@@ -15,7 +15,8 @@ import numpy as np
 from terrafix import messages as m
 from terrafix.core.config import Config, Map, Source
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
-from terrafix.recorder.writer import RECORD_FORMAT, FlightWriter
+from terrafix.recorder.provenance import RECORD_FORMAT
+from terrafix.recorder.writer import FlightWriter
 
 NS = 1_000_000_000
 FIRST_DAY_NS = 1_767_261_600 * NS  # 2026-01-01 10:00 UTC
