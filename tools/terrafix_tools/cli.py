@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from terrafix.runtime.fork_server import ForkServer
 
 # optional packages of the extra `ground`; not installed on a vehicle
-GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow")
+GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog")
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
 app.add_typer(map_app, name="map")

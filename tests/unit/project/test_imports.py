@@ -30,6 +30,7 @@ OWNERS = {
         "terrafix_tools.sim.sitl",
         "terrafix_tools.preflight",
         "terrafix_tools.golden",
+        "terrafix_tools.autopilot_log",
     ),  # tlog: reads recorded telemetry
     "mavsdk": ("terrafix_tools.sim.sitl",),
     "serial": ("terrafix.link",),

@@ -1,15 +1,19 @@
 """The commands `terrafix log ...`."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Flight records: contents, damage, export, parts.")
+from terrafix.core.errors import OutputError
+
+app = typer.Typer(no_args_is_help=True, help="Flight records: contents, damage, export, parts, autopilot.")
 
 RecordArgument = Annotated[Path, typer.Argument(help="Record, or folder of replay or run.")]
 OutArgument = Annotated[Path, typer.Argument(help="Record to write (.mcap).")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 FromOption = Annotated[float, typer.Option("--from", help="Seconds since the start of the flight.")]
 ToOption = Annotated[float, typer.Option("--to", help="Seconds since the start of the flight.")]
 DAMAGED = 1  # exit code
@@ -17,17 +21,56 @@ DAMAGED = 1  # exit code
 
 @app.command()
 def info(
-    record: RecordArgument,
-    json_only: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+    record: Annotated[Path, typer.Argument(help="Record, folder of replay or run, or an autopilot's own log.")],
+    json_only: JsonOption = False,
 ) -> None:
-    """What is in a record: files, versions, duration, frames, messages with their rates."""
-    from terrafix_tools.log.contents import as_json, info_lines, read_contents
+    """What is in a record: files, versions, duration, frames, messages with their rates. Or in an autopilot's log."""
+    from terrafix_tools.autopilot_log.read import is_autopilot_log, read_autopilot_log
 
-    found = read_contents(record)
+    about: dict[str, Any]
+    if is_autopilot_log(record):
+        from terrafix_tools.autopilot_log import text
+
+        log = read_autopilot_log(record)
+        about, lines = text.as_json(log), text.info_lines(log)
+    else:
+        from terrafix_tools.log import contents
+
+        found = contents.read_contents(record)
+        about, lines = contents.as_json(found), contents.info_lines(found)
+    _print(about, lines, json_only)
+
+
+@app.command()
+def autopilot(
+    record: RecordArgument,
+    log: Annotated[Path, typer.Argument(help="Its autopilot's log: ArduPilot .bin or .log, .tlog, PX4 .ulg.")],
+    json_only: JsonOption = False,
+    out: Annotated[Path | None, typer.Option(help="Also write an HTML page.")] = None,
+) -> None:
+    """The autopilot's own log on the time of a record: what its EKF fused, innovations, receivers, lanes, modes.
+
+    The clocks are aligned by the attitude in both; the log of another flight is refused."""
+    from terrafix_tools.autopilot_log.flight import read_flight_side
+    from terrafix_tools.autopilot_log.overlay import overlay
+    from terrafix_tools.autopilot_log.page import page
+    from terrafix_tools.autopilot_log.read import read_autopilot_log
+    from terrafix_tools.autopilot_log.text import summary
+
+    found = overlay(read_flight_side(record), read_autopilot_log(log))
+    if out is not None:
+        try:
+            out.write_text(page(found), encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another file") from None
+    _print(found, summary(found), json_only)
+
+
+def _print(about: dict[str, Any], lines: Iterable[str], json_only: bool) -> None:
     if json_only:
-        typer.echo(json.dumps(as_json(found), indent=2))
+        typer.echo(json.dumps(about, indent=2))
         return
-    for line in info_lines(found):
+    for line in lines:
         typer.echo(line)
 
 

@@ -32,16 +32,17 @@ class Chart:
     x_unit: str = "s"
     y_unit: str = "m"
     follow: bool = True  # the pointer's time is marked in this chart
+    gutter: int = GUTTER  # left margin, SVG units
     marks: list[str] = field(default_factory=list)
 
     def x(self, value: float) -> float:
-        span = self.width - GUTTER - RIGHT
+        span = self.width - self.gutter - RIGHT
         if self.log_x:
             low, high = math.log10(self.x_min), math.log10(self.x_max)
             share = (math.log10(max(value, self.x_min)) - low) / (high - low)
         else:
             share = (value - self.x_min) / max(self.x_max - self.x_min, 1e-9)
-        return GUTTER + span * min(1.0, max(0.0, share))
+        return self.gutter + span * min(1.0, max(0.0, share))
 
     def y(self, value: float) -> float:
         span = self.height - TOP - AXIS
@@ -102,13 +103,15 @@ class Chart:
         """Draws a horizontal line with a label at its right end."""
         y = self.y(value)
         self.marks.append(
-            f'<line class="level" x1="{GUTTER}" x2="{self.width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<line class="level" x1="{self.gutter}" x2="{self.width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
             f'<text class="note" x="{self.width - RIGHT - 4}" y="{y - 4:.1f}" text-anchor="end">{escape(text)}</text>'
         )
 
     def svg(self, label: str) -> str:
         cursor = f'<line class="cursor" y1="{TOP}" y2="{self.height - AXIS}"/>' if self.follow else ""
-        data = f' data-x0="{GUTTER}" data-x1="{self.width - RIGHT}" data-t1="{self.x_max:.3f}"' if self.follow else ""
+        data = (
+            f' data-x0="{self.gutter}" data-x1="{self.width - RIGHT}" data-t1="{self.x_max:.3f}"' if self.follow else ""
+        )
         return (
             f'<svg class="chart" viewBox="0 0 {self.width} {self.height}" role="img"{data} '
             f'aria-label="{escape(label)}">'
@@ -120,9 +123,9 @@ class Chart:
         floor = self.height - AXIS
         for value in ticks(self.y_min, self.y_max, 5, self.log_y):
             y = self.y(value)
-            parts.append(f'<line class="grid" x1="{GUTTER}" x2="{self.width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
+            parts.append(f'<line class="grid" x1="{self.gutter}" x2="{self.width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
             text = escape(f"{value:g} {self.y_unit}".strip())
-            parts.append(f'<text x="{GUTTER - 8}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
+            parts.append(f'<text x="{self.gutter - 8}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
         for value in ticks(self.x_min, self.x_max, TICKS_X * self.width // WIDTH, self.log_x, self.x_unit == "s"):
             text = clock(value) if self.x_unit == "s" else f"{value:g} {self.x_unit}"
             parts.append(f'<text x="{self.x(value):.1f}" y="{floor + 18}" text-anchor="middle">{escape(text)}</text>')
@@ -137,16 +140,16 @@ class Band:
     spans: list[tuple[float, float, str, str]]
 
 
-def strips(bands: Sequence[Band], x_max: float, label: str) -> str:
-    """Draws rows of coloured intervals over one time axis."""
+def strips(bands: Sequence[Band], x_max: float, label: str, gutter: int = GUTTER) -> str:
+    """Draws rows of coloured intervals over one time axis. ``gutter``: left margin for their names, SVG units."""
     row, gap = 20, 8
     height = len(bands) * (row + gap) + AXIS
-    axis = Chart(x_max=x_max, y_min=0, y_max=1, height=height)
+    axis = Chart(x_max=x_max, y_min=0, y_max=1, height=height, gutter=gutter)
     parts = []
     for i, band in enumerate(bands):
         top = i * (row + gap)
-        parts.append(f'<text x="{GUTTER - 8}" y="{top + 14}" text-anchor="end">{escape(band.name)}</text>')
-        parts.append(f'<rect class="rail" x="{GUTTER}" y="{top}" width="{WIDTH - GUTTER - RIGHT}" height="{row}"/>')
+        parts.append(f'<text x="{gutter - 8}" y="{top + 14}" text-anchor="end">{escape(band.name)}</text>')
+        parts.append(f'<rect class="rail" x="{gutter}" y="{top}" width="{WIDTH - gutter - RIGHT}" height="{row}"/>')
         for low, high, css, tip in band.spans:
             left, right = axis.x(low), axis.x(high)
             parts.append(
@@ -156,7 +159,7 @@ def strips(bands: Sequence[Band], x_max: float, label: str) -> str:
     for value in ticks(0.0, x_max, TICKS_X, sixties=True):
         parts.append(f'<text x="{axis.x(value):.1f}" y="{height - 8}" text-anchor="middle">{clock(value)}</text>')
     parts.append(f'<line class="cursor" y1="0" y2="{height - AXIS}"/>')
-    data = f'data-x0="{GUTTER}" data-x1="{WIDTH - RIGHT}" data-t1="{x_max:.3f}"'
+    data = f'data-x0="{gutter}" data-x1="{WIDTH - RIGHT}" data-t1="{x_max:.3f}"'
     return (
         f'<svg class="chart strips" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(label)}" {data}>'
         f"{''.join(parts)}</svg>"

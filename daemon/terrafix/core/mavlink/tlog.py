@@ -48,7 +48,7 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
     One state for each ATTITUDE (yaw, pitch, roll), each AIRSPEED, and each height message of the preferred type in the
     log. Truncated and corrupt records are skipped. Raises SourceError when the file cannot be read or holds no
     record."""
-    t0_us, messages = _messages(path, _STATES, t0_us)
+    t0_us, messages = read_messages(path, _STATES, t0_us)
     heights: dict[str, list[VehicleState]] = {kind: [] for kind in _HEIGHTS}
     attitudes: list[VehicleState] = []
     headings: list[VehicleState] = []
@@ -96,7 +96,7 @@ def read_imu(path: Path, t0_us: int | None = None) -> list[Imu]:
     The time stamp of a record is its arrival time. Integration needs the intervals of the autopilot's own clock, so the
     samples keep their boot time plus a constant offset: the least difference between arrival and boot time in the log,
     that of the packet with the least latency. Raises SourceError as ``read_tlog``."""
-    t0_us, messages = _messages(path, _INERTIAL, t0_us)
+    t0_us, messages = read_messages(path, _INERTIAL, t0_us)
     selector = ImuStreamSelector()
     samples_of_boot: list[_TimedReadings] = []
     boots = [samples_of_boot]
@@ -137,9 +137,16 @@ def record(t_us: int, packets: bytes) -> bytes:
     return b"".join(records)
 
 
-def _messages(path: Path, wanted: set[int], t0_us: int | None) -> tuple[int, Iterator[tuple[int, Any]]]:
+def is_tlog(head: bytes) -> bool:
+    """Whether a file that begins with these bytes begins with a record."""
+    return len(head) > _STAMP + 2 and _packet_length(head, _STAMP) > 0 and _time_us(head, 0) > MIN_TIME_US
+
+
+def read_messages(
+    path: Path, wanted: set[int], t0_us: int | None = None, dialect: Any = mavlink
+) -> tuple[int, Iterator[tuple[int, Any]]]:
     """-> start time of the log [us], and (time [us], message) for all ``wanted`` message ids of the first autopilot
-    that sends one of them. Raises SourceError."""
+    that sends one of them. ``dialect``: module of pymavlink that decodes them. Raises SourceError."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -147,18 +154,18 @@ def _messages(path: Path, wanted: set[int], t0_us: int | None) -> tuple[int, Ite
     first = next(_records(data), None)
     if first is None:
         raise SourceError(f"{path}: holds no MAVLink record; is it a telemetry log (.tlog)?")
-    return first[0] if t0_us is None else t0_us, _decoded(data, wanted)
+    return first[0] if t0_us is None else t0_us, _decoded(data, wanted, dialect)
 
 
-def _decoded(data: bytes, wanted: set[int]) -> Iterator[tuple[int, Any]]:
-    parser, vehicle = mavlink.MAVLink(None), None
+def _decoded(data: bytes, wanted: set[int], dialect: Any) -> Iterator[tuple[int, Any]]:
+    parser, vehicle = dialect.MAVLink(None), None
     for t_us, packet in _records(data):
         sysid, compid, msgid = _address(packet)
         if compid != AUTOPILOT_COMPONENT or msgid not in wanted or vehicle not in (None, sysid):
             continue
         try:
             message = parser.decode(bytearray(packet))
-        except mavlink.MAVError:
+        except dialect.MAVError:
             continue
         vehicle = sysid
         yield t_us, message
@@ -169,7 +176,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
     offset, last_us = 0, None
     while offset + _STAMP + 8 <= len(data):
         length = _packet_length(data, offset + _STAMP)
-        t_us = int.from_bytes(data[offset : offset + _STAMP], "big")
+        t_us = _time_us(data, offset)
         plausible = t_us > MIN_TIME_US and (last_us is None or abs(t_us - last_us) < MAX_STEP_US)
         if length == 0 or not plausible or offset + _STAMP + length > len(data):
             offset += 1
@@ -177,6 +184,10 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
         yield t_us, data[offset + _STAMP : offset + _STAMP + length]
         last_us = t_us
         offset += _STAMP + length
+
+
+def _time_us(data: bytes, offset: int) -> int:
+    return int.from_bytes(data[offset : offset + _STAMP], "big")
 
 
 def _packet_length(data: bytes, offset: int) -> int:

@@ -1,0 +1,211 @@
+"""An overlay as one HTML page without other files."""
+
+import math
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+from terrafix_tools.autopilot_log.text import clock_line, percent
+from terrafix_tools.compare.page import table
+from terrafix_tools.report.charts import Band, Chart, Point, strips
+from terrafix_tools.report.text import stamp
+
+COLOURS = (("one", "k-sat"), ("two", "k-vis"), ("three", "k-dead"), ("four", "k-good"))  # classes of line and key
+NAME_WIDTH = 200  # SVG units for the name of a strip
+MAX_GAP_S = 5.0  # a line has a gap where samples are further apart [tuned]
+SPAN_COLOURS = ("f-accepted", "f-visual_propagated", "f-dead_reckoned", "f-good")  # of consecutive lanes, sets, modes
+MIN_RATIO_AXIS = 1.2  # so that the gate is in the chart
+CHARTS = (  # of innovations: title, unit, names
+    ("Position", "m", ("position_n_m", "position_e_m", "position_d_m")),
+    ("Velocity", "m/s", ("velocity_n_mps", "velocity_e_mps", "velocity_d_mps")),
+    ("Magnetic field", "G", ("mag_x_gauss", "mag_y_gauss", "mag_z_gauss")),
+    ("Yaw", "rad", ("yaw_rad",)),
+)
+AXES = {"n": "north", "e": "east", "d": "down", "x": "forward", "y": "right", "z": "down"}
+
+
+def page(found: dict[str, Any]) -> str:
+    """``found``: what ``overlay`` returns."""
+    style = (files("terrafix_tools") / "assets" / "report.css").read_text(encoding="utf-8")
+    record, log = escape(found["record"]), found["log"]
+    name = escape(log["path"].rsplit("/", 1)[-1])
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{name} - autopilot's log</title><style>{style}</style></head><body><main>"
+        f'<header><div class="eyebrow">Terrafix, log of the autopilot on the time of a record</div><h1>{name}</h1>'
+        f"<p>{escape(log['kind'])} · {escape(log['firmware'] or 'unknown firmware')} · record {record}</p></header>"
+        f"{_figures(found)}{_events(found)}{_states(found)}{_ratios(found)}{_sent(found)}{_innovations(found)}"
+        f"{_receivers(found)}{_clock(found['clock'])}</main></body></html>\n"
+    )
+
+
+def _figures(found: dict[str, Any]) -> str:
+    clock, ratios, sent = found["clock"], found["test_ratios"], found["sent_less_ekf"]
+    tiles = [
+        (f"{found['to_s'] - found['from_s']:.0f}", "s", "", "of the record are in the log"),
+        (f"{1e3 * clock['offset_sigma_s']:.1f}", "ms", "", "standard error of the clocks' offset"),
+        (f"{clock['aligned_correlation']:.2f}", "", "", "correlation of the body rates"),
+    ]
+    if ratios:
+        name, worst = max(ratios.items(), key=lambda item: item[1]["max"])
+        mood = "good" if worst["max"] <= 1.0 else "bad"
+        tiles.append((f"{worst['max']:.2f}", "", mood, f"largest test ratio ({name})"))
+    if sent is not None:
+        tiles.append((f"{sent['median_m']:.1f}", "m", "", "GPS_INPUT from the EKF, median"))
+    cells = "".join(
+        f'<div><b class="{mood}">{value}<small>{unit}</small></b><span>{escape(text)}</span></div>'
+        for value, unit, mood, text in tiles
+    )
+    return f'<section class="figures">{cells}</section>'
+
+
+def _events(found: dict[str, Any]) -> str:
+    rows = "".join(
+        f"<li><time>{stamp(event['t_s'])}</time><span>{escape(_event(event))}</span></li>" for event in found["events"]
+    )
+    return f'<h2>Events</h2><ol class="moments">{rows}</ol>' if rows else "<h2>Events</h2><p>None.</p>"
+
+
+def _event(event: dict[str, Any]) -> str:
+    """Its kind, unless the text begins with that: "mode: auto", "lane 0 -> 1"."""
+    text, kind = str(event["text"]), str(event["kind"])
+    return text if text.lower().startswith(kind) else f"{kind}: {text}"
+
+
+def _states(found: dict[str, Any]) -> str:
+    """Strips: receivers, what was fused, lanes, source sets, modes."""
+    bands = [Band("mode", _coloured([(s["from_s"], s["to_s"], s["name"]) for s in found["modes"]]))]
+    for receiver in found["gps"]:
+        fixes = [
+            (a, b, f"f-fix{min(3, int(fix))}" if fix > 0 else "f-fixnone", f"fix type {int(fix)}")
+            for a, b, fix in receiver["fixes"]
+        ]
+        bands.append(Band(f"{receiver['name']} fix", fixes))
+        if receiver["used_share"] is not None:
+            bands.append(Band(f"{receiver['name']} used", [(a, b, "f-accepted", "used") for a, b in receiver["used"]]))
+    for fusion in found["fused"]:
+        bands.append(Band(f"EKF: {fusion['name']}", [(a, b, "f-accepted", "fused") for a, b in fusion["spans"]]))
+    for title, key in (("lane", "lanes"), ("source set", "source_sets")):
+        if found[key]:
+            spans = [(s["from_s"], s["to_s"], str(s["value"])) for s in found[key]]
+            bands.append(Band(title, _coloured(spans)))
+    shown = [band for band in bands if band.name != "mode" or band.spans]
+    if not shown:
+        return ""
+    return (
+        '<h2>Receivers and what is fused</h2><p class="lead">Fix: green is 3D, orange 2D, red none. Used: what '
+        "the autopilot has selected. EKF: what its primary core fuses or is. The pointer on a stretch shows "
+        "its name.</p>"
+        f'<div class="scroll">{strips(shown, found["duration_s"], "Receivers and fusion", NAME_WIDTH)}</div>'
+    )
+
+
+def _coloured(spans: list[tuple[float, float, str]]) -> list[tuple[float, float, str, str]]:
+    """One colour for each name."""
+    names = list(dict.fromkeys(name for _, _, name in spans))
+    return [(a, b, SPAN_COLOURS[names.index(name) % len(SPAN_COLOURS)], name) for a, b, name in spans]
+
+
+def _ratios(found: dict[str, Any]) -> str:
+    ratios = found["test_ratios"]
+    if not ratios:
+        return "<h2>Test ratios</h2><p>The log has none.</p>"
+    shown = [name for name in ("velocity", "position", "height", "mag") if name in ratios] or list(ratios)[:4]
+    top = max(MIN_RATIO_AXIS, *(ratios[name]["max"] for name in shown))
+    chart = Chart(found["duration_s"], 0.0, 1.1 * top, y_unit="", follow=False)
+    chart.level(1.0, "gate")
+    for name, (css, _) in zip(shown, COLOURS, strict=False):
+        chart.line(_with_gaps(ratios[name]["series"]), css)
+    rows = [
+        [name, ratio["max"], f"{ratio['max_at_s']:.1f} s", f"{100 * ratio['above_gate_share']:.1f} %"]
+        for name, ratio in ratios.items()
+    ]
+    return (
+        '<h2>Test ratios</h2><p class="lead">Innovation over the limit of its gate, primary core: above 1 the EKF '
+        f"rejects the measurement.</p>{_legend(shown)}"
+        f'<div class="scroll">{chart.svg("Test ratios over time")}</div>'
+        f"{table(['measurement', 'largest', 'at', 'above the gate'], rows)}"
+    )
+
+
+def _innovations(found: dict[str, Any]) -> str:
+    innovations = found["innovations"]
+    parts = []
+    for title, unit, names in CHARTS:
+        shown = [name for name in names if name in innovations]
+        if shown:
+            series = [(name, innovations[name]["series"]) for name in shown]
+            labels = [AXES.get(name.split("_")[1], "yaw") for name in shown]
+            parts.append(f"<h3>{title}</h3>{_legend(labels)}{_lines(found, series, unit, f'{title} innovations')}")
+    if not parts:
+        return "<h2>Innovations</h2><p>The log has none.</p>"
+    return f'<h2>Innovations</h2><p class="lead">Of the primary core of the EKF.</p>{"".join(parts)}'
+
+
+def _sent(found: dict[str, Any]) -> str:
+    sent = found["sent_less_ekf"]
+    if sent is None:
+        return "<h2>GPS_INPUT against the EKF</h2><p>Nothing was sent, or the log has no position.</p>"
+    series = [(name, sent[f"{name}_m"]) for name in ("north", "east", "down")]
+    return (
+        '<h2>GPS_INPUT against the EKF</h2><p class="lead">Position that was sent less the position that the autopilot '
+        f"navigated by at that time. Horizontal distance: median {sent['median_m']:.2f} m, 95 % {sent['p95_m']:.2f} m, "
+        f"at most {sent['max_m']:.2f} m at {sent['max_at_s']:.1f} s.</p>"
+        f"{_legend([name for name, _ in series])}{_lines(found, series, 'm', 'GPS_INPUT less EKF')}"
+    )
+
+
+def _lines(found: dict[str, Any], series: list[tuple[str, list[list[float]]]], unit: str, label: str) -> str:
+    """Chart of up to four series about 0."""
+    top = max((abs(value) for _, points in series for _, value in points), default=0.0) or 1.0
+    chart = Chart(found["duration_s"], -1.1 * top, 1.1 * top, height=220, y_unit=unit, follow=False)
+    chart.level(0.0)
+    for (_, points), (css, _) in zip(series, COLOURS, strict=False):
+        chart.line(_with_gaps(points), css)
+    return f'<div class="scroll">{chart.svg(label)}</div>'
+
+
+def _with_gaps(points: list[list[float]]) -> list[Point]:
+    found: list[Point] = []
+    for t_s, value in points:
+        if found and t_s - found[-1][0] > MAX_GAP_S:
+            found.append((t_s, None))
+        found.append((t_s, value))
+    return found
+
+
+def _legend(names: list[str]) -> str:
+    keys = "".join(
+        f'<span><i class="key {css}"></i> {escape(name)}</span>' for name, (_, css) in zip(names, COLOURS, strict=False)
+    )
+    return f'<div class="legend">{keys}</div>'
+
+
+def _receivers(found: dict[str, Any]) -> str:
+    rows = [
+        [
+            receiver["name"],
+            receiver["samples"],
+            percent(receiver["fix_3d_share"]),
+            percent(receiver["used_share"]),
+            _number(receiver["satellites_median"], ""),
+            _number(receiver["accuracy_median_m"], " m"),
+        ]
+        for receiver in found["gps"]
+    ]
+    columns = ["receiver", "samples", "3D fix", "used", "satellites, median", "stated accuracy, median"]
+    return f"<h2>Receivers</h2>{table(columns, rows)}" if rows else ""
+
+
+def _number(value: float | None, unit: str) -> str:
+    return "-" if value is None or math.isnan(value) else f"{value:.3g}{unit}"
+
+
+def _clock(about: dict[str, Any]) -> str:
+    line = escape(clock_line(about).removeprefix("clocks: "))
+    return (
+        f'<h2>Clocks</h2><p class="lead">{line}. Line through the offsets '
+        f"of {about['windows']} windows, which scatter by {1e3 * about['scatter_s']:.1f} ms; the attitudes differ by "
+        f"{about['attitude_deg']:.2f} degrees (median).</p>"
+    )
