@@ -6,8 +6,8 @@ from importlib.resources import files
 from typing import Any
 
 from terrafix_tools.autopilot_log.text import clock_line, percent
-from terrafix_tools.compare.page import table
 from terrafix_tools.report.charts import Band, Chart, Point, strips
+from terrafix_tools.report.document import table
 from terrafix_tools.report.text import stamp
 
 COLOURS = (("one", "k-sat"), ("two", "k-vis"), ("three", "k-dead"), ("four", "k-good"))  # classes of line and key
