@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from terrafix_tools.mapping import cli_package
+from terrafix_tools.mapping import cli_mosaic, cli_package
 from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
 from terrafix_tools.mapping.package.height_datums import Datum
 
@@ -100,5 +100,6 @@ for command in (
     cli_package.index,
     cli_package.keygen,
     cli_package.sign,
+    cli_mosaic.mosaic,
 ):
     app.command()(command)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import msgspec
 from rich.console import Console
 
 from terrafix.core.errors import MapError, OutputError, UsageError
@@ -17,6 +18,7 @@ from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.fetching.progress import shown
 from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
+from terrafix_tools.mapping.orthomosaic.write import read_statement
 from terrafix_tools.mapping.package.dem import DemSource
 from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
 from terrafix_tools.mapping.package.height_datums import Datum
@@ -122,7 +124,8 @@ def _whole_image(order: Order) -> LayerInput:
     imagery = Path(order.source[0])
     if order.out.exists() and imagery.exists() and order.out.samefile(imagery):
         raise OutputError(f"{order.out}: would overwrite the imagery; give another --out")
-    return layer_of(imagery, date=order.date, licence=order.licence, ce90_m=order.ce90_m)
+    spec = with_statement(SourceSpec(path=str(imagery), date=order.date, ce90_m=order.ce90_m))
+    return layer_of(imagery, date=spec.date, licence=order.licence, ce90_m=spec.ce90_m)
 
 
 def _layers(order: Order, area: Area) -> list[LayerInput] | None:
@@ -160,7 +163,21 @@ def _specs(order: Order) -> list[SourceSpec]:
         specs += read_sources(order.sources)
     if not specs:
         raise UsageError("--area needs a --source: a GeoTIFF, .mbtiles, a {z}/{x}/{y} address, ...")
-    return specs
+    return [with_statement(spec) for spec in specs]
+
+
+def with_statement(spec: SourceSpec) -> SourceSpec:
+    """An orthomosaic of `terrafix map mosaic` is a layer of its own, of the date and accuracy that it states, where
+    nothing else was given."""
+    stated = read_statement(Path(spec.path)) if spec.path else None
+    if stated is None:
+        return spec
+    return msgspec.structs.replace(
+        spec,
+        date=spec.date or stated.date,
+        ce90_m=stated.ce90_m if spec.ce90_m is None else spec.ce90_m,
+        layer=spec.layer or f"flight {stated.flight} {stated.date}".strip(),
+    )
 
 
 def _elevation(order: Order, area: Area | None, scratch: Path) -> ElevationInput | None:

@@ -1,0 +1,90 @@
+"""Cameras and images of a recorded flight for an orthomosaic."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from terrafix.core.errors import SourceError
+from terrafix.estimator.state import HORIZONTAL
+from terrafix.messages import Refinement
+from terrafix.recorder.reader import read_flight, read_frame_images
+from terrafix.vision.sources import open_source
+from terrafix_tools.locate.locator import FlightLocator
+from terrafix_tools.locate.views import CameraView
+from terrafix_tools.replay_output import SUMMARY
+
+MIN_STEP_SHARE = 0.15  # of the height, between two frames that are used: nearer ones show the same ground again
+
+
+def refined_views(locator: FlightLocator, record: Path) -> dict[int, CameraView]:
+    """Cameras by frame id, moved to the positions that were refined after later map matches, with their variances,
+    where there are some."""
+    views = dict(locator.flight.views)
+    for _, _, message in read_flight(record):
+        if not isinstance(message, Refinement):
+            continue
+        for pose in message.poses:
+            view = views.get(pose.frame_id)
+            if view is None:
+                continue
+            p_m, cov = view.p_c_in_w_m.copy(), view.cov.copy()
+            p_m[HORIZONTAL] = locator.flight.frame.to_local(pose.lat_deg, pose.lon_deg)
+            refined = np.array([pose.sigma_e_m, pose.sigma_n_m])
+            shrink = np.ones(6)
+            shrink[HORIZONTAL] = np.minimum(1.0, refined / np.sqrt(np.diag(cov)[HORIZONTAL]))
+            views[pose.frame_id] = replace(view, p_c_in_w_m=p_m, cov=cov * np.outer(shrink, shrink))
+    return views
+
+
+def spread(views: dict[int, CameraView], max_sigma_m: float) -> list[CameraView]:
+    """Cameras in the order of the flight whose position is known to ``max_sigma_m`` (1-sigma, the worse axis), without
+    those that stand near the one before."""
+    chosen: list[CameraView] = []
+    for _, view in sorted(views.items()):
+        if np.sqrt(np.linalg.eigvalsh(view.cov[HORIZONTAL, HORIZONTAL])[-1]) > max_sigma_m:
+            continue
+        if chosen:
+            moved_m = float(np.linalg.norm(view.p_c_in_w_m - chosen[-1].p_c_in_w_m))
+            if moved_m < MIN_STEP_SHARE * view.height_m:
+                continue
+        chosen.append(view)
+    return chosen
+
+
+def images(record: Path, source: Path | None, wanted: set[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """Yields (frame id, image (H, W, 3) uint8 BGR) of the ``wanted`` frames: of the record where it has them, else of
+    ``source``, None: that which the summary of a replay names.
+
+    Raises SourceError."""
+    found = False
+    for image in read_frame_images(record):
+        found = True
+        pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+        if image.frame_id in wanted and pixels is not None:
+            yield image.frame_id, pixels
+    if found:
+        return
+    folder = record if record.is_dir() else record.parent
+    source = source or _source_of(folder)
+    if source is None:
+        raise SourceError(f"{record}: has no frames at full size, and names no source; give its flight with --frames")
+    shots = open_source(str(source))
+    for shot in shots.shots():
+        if shot.frame.frame_id in wanted and shot.image is not None:
+            yield shot.frame.frame_id, shot.image
+    shots.close()
+
+
+def _source_of(folder: Path) -> Path | None:
+    """The source that summary.json of a replay names, if it is there."""
+    try:
+        summary: Any = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    named = summary.get("source", "") if isinstance(summary, dict) else ""
+    return Path(named) if named and Path(named).exists() else None
