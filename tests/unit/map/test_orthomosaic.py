@@ -69,7 +69,8 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def mosaic(flight: Path) -> Path:
-    make(Request(flight, flight / "mosaic.tif", gsd_m=0.5, flown_by="crew 7"))
+    with rasterio.Env(GDAL_CACHEMAX=100_000):  # bytes: GDAL writes at once what it would keep of a large file
+        make(Request(flight, flight / "mosaic.tif", gsd_m=0.5, flown_by="crew 7"))
     return flight / "mosaic.tif"
 
 

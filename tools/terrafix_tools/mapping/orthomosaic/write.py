@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.shutil import copy
 from rasterio.transform import Affine
@@ -46,6 +45,7 @@ def write_cog(out: Path, made: Composite, statement: Statement) -> None:
         "transform": Affine(grid.gsd_m, 0.0, grid.x_min, 0.0, -grid.gsd_m, grid.y_max),
         "tiled": True,
         "photometric": "RGB",
+        "alpha": "YES",  # stated here: GDAL may have written the head of a large file before a later call
     }
     try:
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as scratch:
@@ -54,7 +54,6 @@ def write_cog(out: Path, made: Composite, statement: Statement) -> None:
                 for band, channel in enumerate((2, 1, 0), start=1):
                     file.write(made.image[..., channel], band)
                 file.write(np.where(made.valid, ALPHA, 0).astype(np.uint8), 4)
-                file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
                 file.update_tags(**statement.tags())
             copy(plain, finished, driver="COG", compress="DEFLATE", predictor="YES", overview_resampling="average")
             finished.replace(out)
