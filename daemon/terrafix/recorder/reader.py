@@ -2,7 +2,7 @@
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -153,6 +153,18 @@ def _images(path: Path, topic: str) -> Iterator[tuple[int, str, bytes]]:
         if channel.topic == topic:
             with suppress(*_DAMAGED_IMAGE):
                 yield decode_image(record.data)
+
+
+def read_with_thumbnails(path: Path, kinds: Collection[type[Message]]) -> Iterator[Message | tuple[int, bytes]]:
+    """Yields the messages of some types, and all thumbnails as (frame id, JPEG), in the order of the record."""
+    topics = {topic_of(kind) for kind in kinds}
+    for file_format, channel, record in _records(path, ReadResult()):
+        with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
+            if channel.topic == THUMBNAIL_TOPIC:
+                frame_id, _, jpeg = decode_image(record.data)
+                yield frame_id, jpeg
+            elif channel.topic in topics:
+                yield (_DECODERS_OF_OLD if file_format == OLD_FORMAT else _DECODERS)[channel.topic](record.data)
 
 
 def _records(path: Path, result: ReadResult) -> Iterator[tuple[str, Channel, McapMessage]]:

@@ -1,5 +1,6 @@
 """Channels of the flight record: one per message type, JSON with a JSON schema. Those of Foxglove: foxglove.py."""
 
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -10,6 +11,7 @@ from terrafix.messages import Message
 MESSAGE_TYPES: dict[str, type[Message]] = {t.__name__: t for t in m.AnyMessage.__args__}
 
 
+@cache
 def topic_of(message_type: type[Message]) -> str:
     """Topic of a message type: NavEstimate -> /nav_estimate"""
     name = message_type.__name__

@@ -2,7 +2,7 @@
 
 from terrafix.messages import Health, ThermalBand
 from terrafix_tools.report.data import FlightView
-from terrafix_tools.report.sections import states
+from terrafix_tools.report.sections_computer import computer
 
 
 def _health(power_w: float | None) -> Health:
@@ -19,7 +19,7 @@ def _health(power_w: float | None) -> Health:
 
 def _page(power_w: float | None) -> str:
     view = FlightView(title="test", rows=[], frame_ids=[], health=[(0.0, _health(power_w)), (1.0, _health(power_w))])
-    return states(view)
+    return computer(view)
 
 
 def test_power_is_drawn_where_it_was_measured() -> None:

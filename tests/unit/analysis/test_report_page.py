@@ -7,8 +7,21 @@ from pathlib import Path
 import pytest
 
 from flight_records import PERIOD_NS, frame, live_messages, origin, write_record, write_truth
+from terrafix.core.config import Config
 from terrafix.core.errors import SourceError
-from terrafix.messages import CalibrationFault, MapMatch, MeasurementVerdict, Message, Verdict
+from terrafix.messages import (
+    CalibrationFault,
+    EkfStatus,
+    GnssReading,
+    GnssState,
+    GnssVerdict,
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    Verdict,
+)
+from terrafix.recorder.provenance import header
+from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.estimates import Row, write_rows
 from terrafix_tools.report.charts import clock, spans_of, ticks
 from terrafix_tools.report.page import report
@@ -20,12 +33,14 @@ class Page(HTMLParser):
     def __init__(self, text: str) -> None:
         super().__init__()
         self.links: list[str] = []
+        self.ids: set[str] = set()
         self.text = ""
         self.open: list[str] = []
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "action")]
+        self.ids |= {value or "" for name, value in attrs if name == "id"}
         if tag not in ("meta", "img", "input", "br"):
             self.open.append(tag)
 
@@ -44,7 +59,7 @@ def page_of(folder: Path, **options: Path) -> Page:
     assert not re.search(r"https?:|url\(|@import", text)
     page = Page(text)
     assert page.open == []
-    assert all(link.startswith("data:") for link in page.links)
+    assert all(link.startswith("data:image/jpeg;base64,") or link[1:] in page.ids for link in page.links)
     return page
 
 
@@ -101,6 +116,51 @@ def test_the_report_has_the_rejected_map_matches_with_the_largest_test_ratios(tm
     assert "<3> m" not in text and "5 inliers" not in text  # the smallest ratios, and none
 
 
+def test_the_report_has_the_moments_with_links_and_commands(tmp_path: Path) -> None:
+    folder = tmp_path / "a flight"
+    folder.mkdir()
+    write_record(folder / "flight-000.mcap", live_messages(60))
+    write_truth(folder / "truth.csv", 60)
+    page = page_of(folder)
+    assert "#moment-1" in page.links and "moment-1" in page.ids
+    assert "Process link died: signal 9 <kill>" in page.text
+    assert f"terrafix log show '{folder}' --from 4.0 --to 6.0\nterrafix locate '{folder}' --frame 10" in page.text
+
+
+def test_a_damaged_picture_is_left_out_with_a_note(tmp_path: Path) -> None:
+    writer = FlightWriter(tmp_path / "flight.mcap", header(Config()))
+    for message in live_messages():
+        writer.write(message, message.t_ns)
+    for i in range(20):
+        writer.write_thumbnail(i * PERIOD_NS, i, b"\xff\xd8 no picture \xff\xd9" if i % 2 else b"cut off")
+    writer.close()
+    page = page_of(tmp_path)
+    assert "no readable picture of it in the record" in page.text
+    assert not any(link.startswith("data:") for link in page.links)
+
+
+def test_the_report_has_the_receivers_and_the_ekf_of_the_autopilot(tmp_path: Path) -> None:
+    def judged(t_ns: int, state: GnssState) -> GnssVerdict:
+        return GnssVerdict(t_ns=t_ns, receiver=1, state=state, distance_m=80.0, sigmas=20.0, reason="80 m away")
+
+    def reading(t_ns: int) -> GnssReading:
+        return GnssReading(
+            t_ns=t_ns, receiver=1, fix_type=3, lat_deg=48.0, lon_deg=11.0, horizontal_m=1.0, speed_mps=0.0, satellites=9
+        )
+
+    seconds = [i * 1_000_000_000 for i in range(10)]
+    more: list[Message] = [EkfStatus(t_ns=t, flags=831, position_ratio=0.4, velocity_ratio=0.1) for t in seconds[:5]]
+    more += [EkfStatus(t_ns=t, flags=0, position_ratio=1.4, velocity_ratio=0.1) for t in seconds[5:]]
+    more += [judged(t, GnssState.TRUSTED if t < 5e9 else GnssState.SPOOFED) for t in seconds]
+    more += [reading(t) for t in seconds]
+    write_record(tmp_path / "flight-000.mcap", [*live_messages(), *more])
+    page = page_of(tmp_path)
+    assert "with an absolute horizontal position50.0 %position beyond its gate50.0 %" in page.text
+    assert "0:05  GPS2spoofed: 80 m away" in page.text
+    assert "Changes of state (2)" in page.text
+    assert "GPS2" in page.text and "GPS1" not in page.text
+
+
 def test_without_truth_the_report_shows_the_reported_accuracy(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", live_messages())
     page = page_of(tmp_path)
@@ -114,6 +174,14 @@ def test_the_report_of_a_truncated_record_states_the_truncation(tmp_path: Path) 
     data = (tmp_path / "flight-000.mcap").read_bytes()
     (tmp_path / "flight-000.mcap").write_bytes(data[: len(data) * 3 // 4])
     assert "1 file(s) of the record are truncated" in page_of(tmp_path).text
+
+
+def test_damaged_parts_of_a_record_are_named(tmp_path: Path) -> None:
+    write_record(tmp_path / "flight-000.mcap", live_messages(400))
+    data = bytearray((tmp_path / "flight-000.mcap").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "flight-000.mcap").write_bytes(data)
+    assert "1 damaged part(s) of the record were left out: flight-000.mcap, byte " in page_of(tmp_path).text
 
 
 def test_the_report_of_an_interrupted_replay_says_unfinished(tmp_path: Path) -> None:

@@ -5,11 +5,12 @@
   const tip = document.getElementById("tip");
   const here = document.getElementById("here");
   const charts = [...document.querySelectorAll("svg[data-t1]")];
-  const dots = {};
+  const dots = {}, byRow = {};
+  frames.forEach((frame) => (byRow[frame.i] = frame));
   if (map) map.querySelectorAll(".dots circle").forEach((c) => (dots[c.dataset.i] = c));
 
   function show(i, event) {
-    const frame = frames[i], dot = dots[i];
+    const frame = byRow[i], dot = dots[i];
     if (here) {
       here.setAttribute("r", dot ? 2.8 * dot.getAttribute("r") : 0);
       if (dot) for (const a of ["cx", "cy"]) here.setAttribute(a, dot.getAttribute(a));
@@ -30,9 +31,9 @@
   const hide = () => (tip.style.opacity = 0);
 
   function nearest(t) {
-    let best = 0;
-    frames.forEach((f, i) => { if (Math.abs(f.t - t) < Math.abs(frames[best].t - t)) best = i; });
-    return best;
+    let best = frames[0];
+    for (const f of frames) if (Math.abs(f.t - t) < Math.abs(best.t - t)) best = f;
+    return best.i;
   }
   for (const svg of charts) {
     svg.addEventListener("pointermove", (event) => {
@@ -45,9 +46,10 @@
   }
   if (!map) return;
 
-  document.querySelectorAll("figure[data-i]").forEach((figure) =>
-    figure.addEventListener("click", () => {
-      show(+figure.dataset.i);
+  document.querySelectorAll("figure[data-i], a[data-i]").forEach((item) =>
+    item.addEventListener("click", (event) => {
+      event.preventDefault();
+      show(+item.dataset.i);
       map.scrollIntoView({ behavior: "smooth", block: "center" });
     }));
   document.querySelectorAll("[data-layer]").forEach((box) => {

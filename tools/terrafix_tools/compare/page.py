@@ -4,7 +4,7 @@ from html import escape
 from typing import Any
 
 from terrafix_tools.compare.text import divergence, summary
-from terrafix_tools.report.charts import Chart, Point
+from terrafix_tools.report.charts import Chart, Point, clock
 from terrafix_tools.report.document import document, table
 
 MIN_DISTANCE_M = 0.01  # height of the chart where the positions are equal
@@ -43,7 +43,8 @@ def _differences(comparison: dict[str, Any]) -> str:
     if comparison["equal"]:
         return ""
     items = "".join(
-        f"<li><span>{escape(divergence(found))}</span></li>" for found in comparison["first_of_each_message"]
+        f"<li><time>{clock(round(found['t_s']))}</time><span>{escape(divergence(found))}</span></li>"
+        for found in comparison["first_of_each_message"]
     )
     return f'<h2>First difference of each message</h2><ol class="moments">{items}</ol>'
 

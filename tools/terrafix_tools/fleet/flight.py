@@ -16,7 +16,8 @@ from terrafix.messages import Origin, Verdict
 from terrafix_tools.estimates import Row
 from terrafix_tools.evaluate import ELLIPSE95, read_summary
 from terrafix_tools.flight_verdict import flight_verdict
-from terrafix_tools.report.data import FlightView, ellipse95, read_record
+from terrafix_tools.report.data import FlightView, ellipse95
+from terrafix_tools.report.gather import read_record
 
 NS = 1_000_000_000
 ID_DIGITS = 16  # hexadecimal; two of a million flights have the same ID with a probability of 3e-8

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 
+from terrafix_tools.report.series import Span, thin_line, thin_marks, thin_spans
+
 WIDTH = 1000  # of a chart across the whole page, in SVG units
 HALF_WIDTH = 540  # of a chart in a column, SVG units
 GUTTER = 70  # left margin for the labels of the y axis
@@ -12,6 +14,7 @@ RIGHT = 14
 TOP = 12
 AXIS = 26  # bottom margin for the labels of the x axis
 TICKS_X = 9
+MARK = 3.0  # SVG units: marks that are nearer to each other are drawn once
 MAX_LOG_TICKS = 10  # number of ticks at 1, 2, 5, 10 ...; with more, only powers of ten are labelled
 
 Point = tuple[float, float | None]
@@ -55,17 +58,40 @@ class Chart:
 
     def line(self, points: Sequence[Point], css: str) -> None:
         """Draws a line with gaps where a value is None."""
-        for run in _runs(points):
-            text = " ".join(f"{self.x(a):.1f},{self.y(b):.1f}" for a, b in run)
+        for run in self._runs(points):
+            text = " ".join(f"{x:.1f},{y:.1f}" for x, y in run)
             self.marks.append(f'<polyline class="line {css}" points="{text}"/>')
+
+    def dots(self, points: Sequence[tuple[float, float]], css: str) -> None:
+        """Draws a mark at each point, one at most where several would cover each other."""
+        kept = thin_marks([(self.x(a), self.y(b)) for a, b in points], MARK)
+        if kept:
+            path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in kept)
+            self.marks.append(f'<path class="points {css}" d="{path}"/>')
+
+    def crosses(self, points: Sequence[tuple[float, float]], css: str) -> None:
+        kept = thin_marks([(self.x(a), self.y(b)) for a, b in points], MARK)
+        if kept:
+            path = "".join(f"M{x - 4:.1f} {y - 4:.1f}l8 8m0-8l-8 8" for x, y in kept)
+            self.marks.append(f'<path class="crosses {css}" d="{path}"/>')
 
     def area(self, points: Sequence[Point], css: str) -> None:
         """Fills the area between the bottom of the chart and the line."""
         floor = self.height - AXIS
-        for run in _runs(points):
-            text = " ".join(f"{self.x(a):.1f},{self.y(b):.1f}" for a, b in run)
-            left, right = self.x(run[0][0]), self.x(run[-1][0])
+        for run in self._runs(points):
+            text = " ".join(f"{x:.1f},{y:.1f}" for x, y in run)
+            left, right = run[0][0], run[-1][0]
             self.marks.append(f'<polygon class="area {css}" points="{left:.1f},{floor} {text} {right:.1f},{floor}"/>')
+
+    def _runs(self, points: Sequence[Point]) -> list[list[tuple[float, float]]]:
+        """SVG coordinates of the parts between gaps, thinned to what the width shows."""
+        runs: list[list[tuple[float, float]]] = [[]]
+        for a, b in points:
+            if b is None:
+                runs.append([])
+            else:
+                runs[-1].append((self.x(a), self.y(b)))
+        return [thin_line(run) for run in runs if run]
 
     def bar(self, x_low: float, x_high: float, value: float, css: str, tip: str) -> None:
         left, right, top = self.x(x_low), self.x(x_high), self.y(value)
@@ -137,7 +163,7 @@ class Band:
     """One row of a strip chart: (from, to, css class, tooltip)."""
 
     name: str
-    spans: list[tuple[float, float, str, str]]
+    spans: list[Span]
 
 
 def strips(bands: Sequence[Band], x_max: float, label: str, gutter: int = GUTTER) -> str:
@@ -150,7 +176,7 @@ def strips(bands: Sequence[Band], x_max: float, label: str, gutter: int = GUTTER
         top = i * (row + gap)
         parts.append(f'<text x="{gutter - 8}" y="{top + 14}" text-anchor="end">{escape(band.name)}</text>')
         parts.append(f'<rect class="rail" x="{gutter}" y="{top}" width="{WIDTH - gutter - RIGHT}" height="{row}"/>')
-        for low, high, css, tip in band.spans:
+        for low, high, css, tip in thin_spans(band.spans, x_max):
             left, right = axis.x(low), axis.x(high)
             parts.append(
                 f'<rect class="{css}" x="{left:.1f}" y="{top}" width="{max(0.8, right - left):.1f}" height="{row}">'
@@ -203,13 +229,3 @@ def spans_of(samples: Sequence[tuple[float, str]], end: float) -> list[tuple[flo
         else:
             spans.append((at, until, state))
     return spans
-
-
-def _runs(points: Sequence[Point]) -> list[list[tuple[float, float]]]:
-    runs: list[list[tuple[float, float]]] = [[]]
-    for a, b in points:
-        if b is None:
-            runs.append([])
-        else:
-            runs[-1].append((a, b))
-    return [run for run in runs if run]

@@ -22,4 +22,6 @@ def table(columns: list[str], rows: list[list[object]]) -> str:
         "<tr>" + "".join(f"<td>{escape(str('-' if cell is None else cell))}</td>" for cell in row) + "</tr>"
         for row in rows
     )
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return (
+        f'<div class="scroll"><table class="numbers"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    )

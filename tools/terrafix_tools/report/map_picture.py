@@ -13,6 +13,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
 from terrafix_tools.estimates import Row
 from terrafix_tools.report.data import FlightView, ellipse95
+from terrafix_tools.report.series import thin_path
 
 WIDTH_PX = 1280  # of the inlined image: sharp on a laptop, about 300 kB
 MARGIN = 0.12  # margin around the track, as a share of its extent
@@ -22,6 +23,7 @@ JPEG_QUALITY = 80
 VOID_BGR = (226, 230, 230)  # colour outside the map
 ELLIPSE_SPACING = 1.1  # spacing of ellipses in units of their length, so that they do not hide the track
 MIN_SPACING_PX = 24.0
+MIN_STEP_PX = 0.7  # of a track
 SCALE_BAR_SHARE = 0.22  # largest length, as a share of the image width
 LABELS = ("satellite_anchored", "visual_propagated", "dead_reckoned")
 
@@ -42,8 +44,10 @@ class MapImage:
         return (e_m - self.e_min_m) / self.gsd_m, (self.n_max_m - n_m) / self.gsd_m
 
 
-def map_svg(view: FlightView, map_path: Path | None) -> str:
-    """Returns the <svg>; without a readable map the tracks are drawn on a plain background."""
+def map_svg(view: FlightView, map_path: Path | None, marked: list[int], pointed: list[int]) -> str:
+    """Returns the <svg>; without a readable map the tracks are drawn on a plain background.
+
+    ``marked``: rows of the worst moments, drawn as numbers from 1. ``pointed``: rows that the pointer finds."""
     points = [(r.lat_deg, r.lon_deg) for r in view.rows if r.lat_deg is not None and r.lon_deg is not None]
     points += [(t.lat_deg, t.lon_deg) for t in view.truth_track]
     if not points and view.origin is not None:
@@ -59,8 +63,9 @@ def map_svg(view: FlightView, map_path: Path | None) -> str:
         _refined(view, map_image),
         _finalised(view, map_image),
         _truth(view, map_image),
-        _frame_dots(view, map_image, u),
+        _frame_dots(view, map_image, u, pointed),
         _end_labels(view, map_image, u),
+        _numbers(view, map_image, u, marked),
         _scale_bar(map_image, u),
         '<circle id="here" r="0"/>',
     ]
@@ -115,6 +120,7 @@ def _xy(row: Row, map_image: MapImage) -> tuple[float, float] | None:
 
 
 def _line(points: list[tuple[float, float]], css: str) -> str:
+    points = thin_path(points, MIN_STEP_PX)
     text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
     return f'<polyline class="{css}" points="{text}"/>'
 
@@ -183,10 +189,11 @@ def _estimates(view: FlightView, map_image: MapImage) -> str:
     return f'<g class="layer estimates">{"".join(casing)}{"".join(segments)}</g>'
 
 
-def _frame_dots(view: FlightView, map_image: MapImage, u: float) -> str:
-    """One dot per frame, the target of the pointer."""
+def _frame_dots(view: FlightView, map_image: MapImage, u: float, pointed: list[int]) -> str:
+    """Dots of frames, the targets of the pointer."""
     parts = []
-    for i, row in enumerate(view.rows):
+    for i in pointed:
+        row = view.rows[i]
         if (point := _xy(row, map_image)) is not None:
             parts.append(
                 f'<circle class="f-{row.source_label}" data-i="{i}" cx="{point[0]:.1f}" '
@@ -208,6 +215,17 @@ def _end_labels(view: FlightView, map_image: MapImage, u: float) -> str:
             f'text-anchor="{"start" if side > 0 else "end"}">{text}</text></g>'
         )
     return "".join(parts)
+
+
+def _numbers(view: FlightView, map_image: MapImage, u: float, marked: list[int]) -> str:
+    parts = []
+    for number, i in enumerate(marked, 1):
+        if (point := _xy(view.rows[i], map_image)) is not None:
+            parts.append(
+                f'<a href="#moment-{number}"><g transform="translate({point[0]:.1f} {point[1]:.1f})">'
+                f'<circle r="{10 * u:.1f}"/><text y="{4.4 * u:.1f}" text-anchor="middle">{number}</text></g></a>'
+            )
+    return f'<g class="layer worst-marks">{"".join(parts)}</g>' if parts else ""
 
 
 def _scale_bar(map_image: MapImage, u: float) -> str:

@@ -9,13 +9,21 @@ from terrafix.core.errors import OutputError
 from terrafix_tools.estimates import Row
 from terrafix_tools.flight_map import map_of_flight
 from terrafix_tools.report.charts import clock
-from terrafix_tools.report.data import FlightView, gather, radius95_m
+from terrafix_tools.report.data import FlightView, radius95_m
+from terrafix_tools.report.gather import gather
 from terrafix_tools.report.map_picture import map_svg
+from terrafix_tools.report.moments import Moment, worst_moments
 from terrafix_tools.report.sections import accuracy, rejected_map_matches, states, verdicts
-from terrafix_tools.report.sections_run import camera_images, link, provenance, timing
+from terrafix_tools.report.sections_autopilot import link
+from terrafix_tools.report.sections_computer import computer
+from terrafix_tools.report.sections_gnss import gnss
+from terrafix_tools.report.sections_innovations import innovations
+from terrafix_tools.report.sections_moments import moments_sections
+from terrafix_tools.report.sections_run import camera_images, picture_rows, provenance, timing
 from terrafix_tools.report.text import events, figures, stamp
 
 NAME = "report.html"
+MAX_POINTED = 2500  # frames that the pointer finds on the map and in the charts; of a longer flight, evenly spread ones
 MAX_IN_ROW = 7  # number of figures in one row; more are set in two even rows
 
 
@@ -37,19 +45,28 @@ def report(folder: Path, truth_path: Path | None = None, map_path: Path | None =
 
 
 def _page(view: FlightView, map_path: Path | None) -> str:
+    moments = worst_moments(view)
+    pointed = pointed_rows(view, moments)
+    worst, details = moments_sections(view, moments, map_path)
     sections = [
-        _map_section(view, map_path),
+        _map_section(view, map_path, moments, pointed),
         _events(view),
+        worst,
         accuracy(view),
         states(view),
+        innovations(view),
         verdicts(view),
         rejected_map_matches(view),
-        timing(view),
         link(view),
+        gnss(view),
+        timing(view),
+        computer(view),
+        details,
         camera_images(view),
         provenance(view),
     ]
-    data = json.dumps([{"t": round(r.t_s, 3), "h": _tip(view, r)} for r in view.rows]).replace("</", "<\\/")
+    tips = [{"i": i, "t": round(view.rows[i].t_s, 3), "h": _tip(view, view.rows[i])} for i in pointed]
+    data = json.dumps(tips).replace("</", "<\\/")
     assets = files("terrafix_tools") / "assets"
     style = (assets / "report.css").read_text(encoding="utf-8")
     script = (assets / "report.js").read_text(encoding="utf-8")
@@ -60,6 +77,13 @@ def _page(view: FlightView, map_path: Path | None) -> str:
         f'{_head(view)}{"".join(sections)}</main><div id="tip"></div>'
         f'<script type="application/json" id="frames">{data}</script><script>{script}</script></body></html>\n'
     )
+
+
+def pointed_rows(view: FlightView, moments: list[Moment]) -> list[int]:
+    """Rows with a dot on the map and a tooltip, in their order."""
+    stride = max(1, -(-len(view.rows) // MAX_POINTED))
+    chosen = {*range(0, len(view.rows), stride), *picture_rows(view), *(moment.row for moment in moments)}
+    return sorted(chosen)
 
 
 def _head(view: FlightView) -> str:
@@ -84,8 +108,8 @@ def _head(view: FlightView) -> str:
     )
 
 
-def _map_section(view: FlightView, map_path: Path | None) -> str:
-    svg = map_svg(view, map_path)
+def _map_section(view: FlightView, map_path: Path | None, moments: list[Moment], pointed: list[int]) -> str:
+    svg = map_svg(view, map_path, [moment.row for moment in moments], pointed)
     labels = {row.source_label for row in view.rows}
     keys = [
         ("k-sat", "map match", "satellite_anchored"),
@@ -101,6 +125,8 @@ def _map_section(view: FlightView, map_path: Path | None) -> str:
     if view.finalised:
         layers.append(("finalised", '<i class="key k-finalised"></i> finalised after landing', True))
     layers.append(("ellipses", "95 % ellipses", True))
+    if moments:
+        layers.append(("worst-marks", "worst moments", True))
     boxes = "".join(
         f'<label><input type="checkbox" data-layer="{name}"{" checked" if on else ""}>{text}</label>'
         for name, text, on in layers

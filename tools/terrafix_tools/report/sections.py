@@ -32,20 +32,20 @@ def accuracy(view: FlightView) -> str:
     top = max([*values, *error_values, 60.0]) * 1.15
     chart = Chart(x_max=end_s(view), y_min=ERROR_FLOOR_M, y_max=top, height=330, log_y=True)
     chart.area(reported, "claim")
-    chart.line(reported, "claim")
     for limit in (20.0, 50.0):
         chart.level(limit)
     chart.line(refined, "refined")
     chart.line(errors, "error")
-    legend = [("k-ink", "error of the immediate estimate"), ("k-claim", "reported 95 % radius")]
+    chart.line(reported, "claim")
+    keys = [("k-ink", "error of the immediate estimate"), ("k-claim", "reported 95 % radius")]
     if any(v is not None for _, v in refined):
-        legend.insert(1, ("k-good", "error after refinement"))
+        keys.insert(1, ("k-good", "error after refinement"))
     return (
         "<h2>Error and reported accuracy</h2>"
         '<p class="lead">Consistent accuracy: the error is inside the shaded 95 % radius in 95 of 100 frames, '
         "and the radius is not larger than necessary.</p>"
         f'<div class="scroll">{chart.svg("Error and reported radius over time")}</div>'
-        f"{_legend(legend)}{_cumulative(view)}"
+        f"{legend(keys)}{_cumulative(view)}"
     )
 
 
@@ -104,7 +104,7 @@ def _cumulative(view: FlightView) -> str:
 
 def _accuracy_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     def pair(key: str, scale: float, unit: str) -> str:
-        values = [metrics.get(key), metrics.get(f"refined_{key}")]
+        values = [metrics.get(key), metrics.get(f"refined_{key}") if metrics.get("refined") else None]
         texts = [f"{scale * v:.1f} {unit}" for v in values if v is not None]
         return " → ".join(texts) if texts else "-"
 
@@ -133,7 +133,7 @@ def states(view: FlightView) -> str:
     bands.append(Band("covar.", spans([(r.t_s, r.covariance_mode) for r in view.rows], end, "f-", {"": "none"})))
     if view.health:
         bands.append(Band("thermal", spans([(t, str(health.band)) for t, health in view.health], end, "f-", {})))
-    legend = [
+    keys = [
         ("k-sat", "map match, accepted, marginals"),
         ("k-vis", "odometry, Jacobian, hot"),
         ("k-dead", "dead reckoning, rejected, critical"),
@@ -143,24 +143,8 @@ def states(view: FlightView) -> str:
     return (
         '<h2>Sources and states</h2><p class="lead">The source of each position, whether the map match of the '
         "frame was accepted, how the covariance was computed, and the temperature band.</p>"
-        f'<div class="scroll">{body}</div>{_legend(legend)}{_computer(view, end)}'
+        f'<div class="scroll">{body}</div>{legend(keys)}'
     )
-
-
-def _computer(view: FlightView, end: float) -> str:
-    """Charts of temperature and power of the computer; none for a quantity without readings."""
-    temperature: list[Point] = [(t, health.temperature_c) for t, health in view.health]
-    power: list[Point] = [(t, health.power_w) for t, health in view.health]
-    return _series("Temperature", "°C", 5.0, temperature, end) + _series("Power", "W", 1.0, power, end)
-
-
-def _series(name: str, unit: str, margin: float, points: list[Point], end: float) -> str:
-    values = [v for _, v in points if v is not None]
-    if not values:
-        return ""
-    chart = Chart(x_max=end, y_min=min(values) - margin, y_max=max(values) + margin, height=140, y_unit=unit)
-    chart.line(points, name.lower())
-    return f'<div class="scroll" style="margin-top:20px">{chart.svg(name)}</div>'
 
 
 def verdicts(view: FlightView) -> str:
@@ -225,7 +209,7 @@ def table(rows: list[tuple[str, str]]) -> str:
     return f"<table>{body}</table>"
 
 
-def _legend(keys: list[tuple[str, str]]) -> str:
+def legend(keys: list[tuple[str, str]]) -> str:
     items = "".join(
         f'<label style="cursor:default"><i class="key {css}"></i>{escape(text)}</label>' for css, text in keys
     )

@@ -1,22 +1,16 @@
-"""Lower sections of the report: time per frame, autopilot link, images, provenance."""
+"""Lower sections of the report: time per frame, images, provenance."""
 
 import base64
 import json
-import re
-from collections import Counter
 from html import escape
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from terrafix_tools.report.charts import HALF_WIDTH, Band, Chart, Point, clock, strips
+from terrafix_tools.report.charts import HALF_WIDTH, Chart, clock
 from terrafix_tools.report.data import FlightView, radius95_m
-from terrafix_tools.report.sections import LABELS, end_s, spans, table
-from terrafix_tools.report.text import FIX_3D, GAP_S, UNPLANNED, gps_stats
+from terrafix_tools.report.sections import LABELS, table
 
 MAX_IMAGES = 8
-NUMBER = re.compile(r"\d+(\.\d+)?")  # reasons that differ only in their numbers are counted together
 BINS = 40
 
 
@@ -58,92 +52,31 @@ def timing(view: FlightView) -> str:
     )
 
 
-def link(view: FlightView) -> str:
-    """GPS_INPUT as sent to the autopilot, and process events."""
-    stats = gps_stats(view)
-    if stats is None and not view.events:
-        return ""
-    end = end_s(view)
-    parts = ['<h2>Autopilot link and processes</h2><p class="lead">GPS_INPUT messages as sent: fix type, ']
-    parts.append(f"interval, and process events. An interval over {1000 * GAP_S:.0f} ms is a gap.</p>")
-    bands: list[Band] = []
-    if stats is not None:
-        fixes = _fixes(view)
-        bands.append(
-            Band(
-                "fix type", spans(fixes, end, "f-fix", {"1": "no fix", "2": "2D fix", "3": "3D fix", "": "no message"})
-            )
-        )
-    by_process: dict[str, list[tuple[float, float, str, str]]] = {}
-    for t_s, event in view.events:
-        css = "f-bad" if event.event in UNPLANNED else "f-good"
-        text = f"{clock(round(max(0, t_s)))}  {event.process} {event.event.replace('_', ' ')} {event.detail}".strip()
-        by_process.setdefault(event.process, []).append((t_s, t_s + end * 0.004, css, text))
-    bands += [Band(name, spans) for name, spans in by_process.items()]
-    parts.append(f'<div class="scroll">{strips(bands, end, "Link and processes over time")}</div>')
-    if stats is not None:
-        parts.append(_intervals(view, end))
-        given = [g.no_fix_reason for _, g in view.gps if g.fix_type < FIX_3D and g.no_fix_reason]
-        reasons = Counter(NUMBER.sub("…", reason) for reason in given)
-        rows = [
-            ("messages", f"{stats.count}"),
-            ("rate", f"{stats.rate_hz:.2f} Hz"),
-            ("with a 3D fix", f"{100 * stats.share_3d:.1f} %"),
-            ("99 % of intervals below", f"{1000 * stats.interval_p99_s:.0f} ms"),
-            ("longest gap", f"{1000 * stats.longest_s:.0f} ms at {clock(round(max(0.0, stats.longest_at_s)))}"),
-            ("gaps", str(stats.gaps)),
-        ]
-        rows += [(f"no 3D fix: {reason}", f"{count}") for reason, count in reasons.most_common(6)]
-        received = [
-            (k.replace("_", " "), f"{round(v, 3):g}" if isinstance(v, float) else str(v))
-            for k, v in _scalars(view.peer)
-        ]
-        second = f"<div><h3>Received by the autopilot</h3>{table(received)}</div>" if received else ""
-        parts.append(f'<div class="two" style="margin-top:24px"><div><h3>Sent</h3>{table(rows)}</div>{second}</div>')
-    if view.pilot_texts:
-        texts = [(clock(round(max(0.0, t))), text.text) for t, text in view.pilot_texts[:40]]
-        parts.append(
-            f"<details><summary>Texts to the pilot ({len(view.pilot_texts)})</summary>{table(texts)}</details>"
-        )
-    return "".join(parts)
+def picture_rows(view: FlightView) -> list[int]:
+    """Rows whose pictures are shown under "Camera images": evenly over the flight, and the one with the largest
+    error."""
+    count = len(view.rows)
+    rows = sorted({round(k) for k in np.linspace(0, count - 1, min(MAX_IMAGES, count))})
+    worst = _worst_row(view)
+    if worst is not None and worst not in rows:
+        if len(rows) > 2:
+            rows.remove(min(rows[1:-1], key=lambda i: abs(i - worst)))
+        rows.append(worst)
+    return sorted(rows)
 
 
-def _fixes(view: FlightView) -> list[tuple[float, str]]:
-    """Returns (time, "1".."3" or "" from where a gap becomes noticeable)."""
-    fixes: list[tuple[float, str]] = []
-    for t_s, sent in view.gps:
-        if fixes and t_s - fixes[-1][0] > GAP_S:
-            fixes.append((fixes[-1][0] + GAP_S, ""))
-        fixes.append((t_s, str(min(3, max(1, sent.fix_type)))))
-    return fixes
-
-
-def _intervals(view: FlightView, end: float) -> str:
-    times = [t for t, _ in view.gps]
-    steps: list[Point] = [(b, 1000 * (b - a)) for a, b in pairwise(times)]
-    top = max(v for _, v in steps if v is not None)
-    chart = Chart(x_max=end, y_min=20.0, y_max=max(300.0, top * 1.2), height=170, log_y=True, y_unit="ms")
-    chart.level(1000 * GAP_S, f"{1000 * GAP_S:.0f} ms")
-    chart.line(steps, "error")
-    return f'<div class="scroll" style="margin-top:18px">{chart.svg("Interval of GPS_INPUT")}</div>'
+def _worst_row(view: FlightView) -> int | None:
+    errors = [(error, i) for i, row in enumerate(view.rows) if (error := view.error_m(row)) is not None]
+    return max(errors)[1] if errors else None
 
 
 def camera_images(view: FlightView) -> str:
     """Returns a few frames, evenly over the flight, and the one with the largest error."""
-    with_thumbnail = [
-        (i, row) for i, row in enumerate(view.rows) if i < len(view.frame_ids) and view.frame_ids[i] in view.thumbnails
-    ]
-    if not with_thumbnail:
+    with_picture = [i for i, frame_id in enumerate(view.frame_ids[: len(view.rows)]) if frame_id in view.thumbnails]
+    if not with_picture:
         return ""
-    chosen = {
-        with_thumbnail[round(k)][0]
-        for k in np.linspace(0, len(with_thumbnail) - 1, min(MAX_IMAGES, len(with_thumbnail)))
-    }
-    with_error = [(error, i) for i, row in with_thumbnail if (error := view.error_m(row)) is not None]
-    worst = max(with_error)[1] if with_error else None
-    if worst is not None and worst not in chosen and len(chosen) > 2:
-        chosen.discard(min(sorted(chosen)[1:-1], key=lambda i: abs(i - worst)))
-        chosen.add(worst)
+    chosen = {min(with_picture, key=lambda i: abs(i - wanted)) for wanted in picture_rows(view)}
+    worst = _worst_row(view)
     parts = []
     for i in sorted(chosen):
         row = view.rows[i]
@@ -179,7 +112,3 @@ def provenance(view: FlightView) -> str:
         f"<h2>Provenance</h2><details><summary>Versions, map and configuration</summary>{table(rows)}"
         f"<pre>{escape(config)}</pre></details>"
     )
-
-
-def _scalars(peer: dict[str, Any]) -> list[tuple[str, Any]]:
-    return [(k, v) for k, v in peer.items() if isinstance(v, int | float | str) and not isinstance(v, bool)]

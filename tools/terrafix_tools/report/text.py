@@ -112,6 +112,8 @@ def events(view: FlightView) -> list[tuple[float | None, str]]:
         entries.append((None, f"{total} {were} dropped ({worst})."))
     if view.cut_off:
         entries.append((None, f"{view.cut_off} file(s) of the record are truncated; their readable part is shown."))
+    if damaged := view.contents.result.damaged:
+        entries.append((None, f"{len(damaged)} damaged part(s) of the record were left out: {damaged[0]}."))
     return sorted(entries, key=lambda m: math.inf if m[0] is None else m[0])
 
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from terrafix.core.errors import EvaluationError, SourceError, UsageError
-from terrafix_tools.report.data import gather
+from terrafix_tools.report.gather import gather
 from terrafix_tools.report.page import report
 from terrafix_tools.sim.autopilot.verdict import gps_input_failure, key_figures
 from terrafix_tools.sim.demo.flight import fly

@@ -1,0 +1,134 @@
+"""The section of the worst moments: a list with links, then each with frame, map, matches and reasons."""
+
+import shlex
+from html import escape
+from pathlib import Path
+
+from terrafix.core.geodesy import LocalFrame
+from terrafix_tools.report.charts import clock
+from terrafix_tools.report.data import FlightView
+from terrafix_tools.report.map_crop import open_map
+from terrafix_tools.report.moment_picture import Pictures, pictures
+from terrafix_tools.report.moment_record import FrameRecord, read_frames, shown_frame
+from terrafix_tools.report.moment_text import facts
+from terrafix_tools.report.moments import Moment
+from terrafix_tools.report.sections import table
+from terrafix_tools.report.sections_run import picture_rows
+
+AROUND_S = 1.0  # `terrafix log show` of a moment: this much before and after it
+RULE = (
+    "Chosen by what the record says, in turns: longest loss of the fix, faults, links and processes lost, largest "
+    "error (if there is truth), measurements farthest beyond their gate, largest stated 95 % radius."
+)
+
+
+def moments_sections(view: FlightView, moments: list[Moment], map_path: Path | None) -> tuple[str, str]:
+    """-> list with links, details. Reads what the record holds of the moments, and the pictures of the page into
+    ``view.thumbnails``."""
+    shown = [shown_frame(view, moment) for moment in moments]
+    needed = {*shown, *(moment.frame_id for moment in moments)}
+    frames, view.thumbnails = read_frames(view, needed, picture_rows(view))
+    if not moments:
+        return "", ""
+    blocks = _blocks(view, moments, [frames[frame_id] for frame_id in shown], frames, map_path)
+    items = "".join(
+        f'<li><a href="#moment-{i}"><b>{i}</b></a><time>{_time(moment)}</time>'
+        f'<a href="#moment-{i}">{escape(_headline(moment))}</a></li>'
+        for i, moment in enumerate(moments, 1)
+    )
+    name = "moment" if len(moments) == 1 else f"{len(moments)} moments"
+    return (
+        f'<h2 id="worst">The worst {name}</h2><p class="lead">{RULE}</p><ol class="worst">{items}</ol>',
+        f"<h2>The worst {name} in detail</h2>{''.join(blocks)}",
+    )
+
+
+def _blocks(
+    view: FlightView,
+    moments: list[Moment],
+    shown: list[FrameRecord],
+    frames: dict[int, FrameRecord],
+    map_path: Path | None,
+) -> list[str]:
+    origin = view.origin
+    opened = open_map(map_path, LocalFrame(origin.lat_deg, origin.lon_deg)) if origin is not None else None
+    row_of = {frame_id: row for frame_id, row in zip(view.frame_ids, view.rows, strict=False)}
+    try:
+        blocks = []
+        for number, (moment, record) in enumerate(zip(moments, shown, strict=True), 1):
+            drawn = None
+            if origin is not None and (row := row_of.get(record.frame_id)) is not None:
+                compared = view.compared.get(row.file)
+                drawn = pictures(
+                    record,
+                    view.thumbnails.get(record.frame_id),
+                    origin,
+                    row,
+                    compared.truth if compared is not None else None,
+                    opened[1] if opened is not None else None,
+                )
+            blocks.append(_block(view, number, moment, record, frames[moment.frame_id], drawn))
+        return blocks
+    finally:
+        if opened is not None:
+            opened[0].close()
+
+
+def _block(
+    view: FlightView, number: int, moment: Moment, shown: FrameRecord, own: FrameRecord, drawn: Pictures | None
+) -> str:
+    row = view.rows[moment.row]
+    reasons = "".join(f"<li>{escape(text)}</li>" for text in list(moment.reasons.values())[1:])
+    frame = f"frame {moment.frame_id}" + (f" · {row.file}" if row.file else "")
+    return (
+        f'<article class="moment" id="moment-{number}">'
+        f'<h3><a href="#worst">{number}</a> {escape(_headline(moment))}</h3>'
+        f'<p class="quiet">{_time(moment)} · {escape(frame)} · '
+        f'<a href="#map" data-i="{moment.row}">on the map</a></p>'
+        f"{f'<ul>{reasons}</ul>' if reasons else ''}{_pair(view, shown, drawn)}"
+        f"{table(facts(view, moment, own, shown))}<pre>{escape(_commands(view, moment))}</pre></article>"
+    )
+
+
+def _pair(view: FlightView, shown: FrameRecord, drawn: Pictures | None) -> str:
+    if drawn is None:
+        return '<p class="quiet">No picture: the record has not this frame or no Origin.</p>'
+    notes = [f"Frame {shown.frame_id}"]
+    if shown.frame_id not in view.thumbnails:
+        notes.append("no readable picture of it in the record")
+    if drawn.matches is None:
+        notes.append("no matches with the map")
+    elif drawn.matches.inlier is None:
+        notes.append(f"{len(drawn.matches.xy)} matches, without a pose that agrees with them")
+    else:
+        inliers = int(drawn.matches.inlier.sum())
+        notes.append(f"{inliers} matches agree with the pose, {len(drawn.matches.xy) - inliers} do not")
+    ground = ["Map, turned like the frame and at its scale" if drawn.has_map else "No map here"]
+    ground.append("solid: the frame where the estimate puts it, with its 95 % ellipse")
+    if drawn.shows_rejected:
+        ground.append("dashed: where the map match that was not used puts it")
+    figures = [
+        f"<figure>{svg}<figcaption>{escape('; '.join(words))}.</figcaption></figure>"
+        for svg, words in ((drawn.frame, notes), (drawn.ground, ground))
+        if svg
+    ]
+    share = f' style="grid-template-columns:1fr {drawn.ratio:.3f}fr"' if len(figures) == 2 else ""
+    return f'<div class="pair"{share}>{"".join(figures)}</div>'
+
+
+def _commands(view: FlightView, moment: Moment) -> str:
+    record, at_s = shlex.quote(str(view.folder)), view.log_s(moment.t_s)
+    show = f"terrafix log show {record} --from {at_s - AROUND_S:.1f} --to {at_s + AROUND_S:.1f}"
+    if view.origin is None or moment.frame_id < 0:
+        return show
+    camera = view.origin.camera
+    pixel = f"{camera.width // 2},{camera.height // 2}"
+    return f"{show}\nterrafix locate {record} --frame {moment.frame_id} --pixel {pixel}"
+
+
+def _headline(moment: Moment) -> str:
+    return next(iter(moment.reasons.values()))
+
+
+def _time(moment: Moment) -> str:
+    return clock(round(max(0.0, moment.t_s)))
