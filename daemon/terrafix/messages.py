@@ -694,7 +694,7 @@ class Fan(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ThermalReading(Message, frozen=True, kw_only=True):
-    """Raw readings of the computer's sensors (temperature, clocks, power), at 1 Hz; Health is derived from them.
+    """Raw readings of the computer's sensors (temperature, clocks, power, load), at 1 Hz; Health is derived from them.
 
     A sensor that is absent or cannot be read is not in its list."""
 
@@ -705,6 +705,8 @@ class ThermalReading(Message, frozen=True, kw_only=True):
     rails: list[PowerRail] = []
     fans: list[Fan] = []
     power_mode: str | None = None  # of nvpmodel: "2 (15W)", or "2" when its name is not known; None: no Jetson
+    # Share since the reading before: of all cores ("all"), and of one core by process of this run ("vision")
+    cpu_load: dict[str, float] = {}
 
 
 class Health(Message, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ from pathlib import Path
 from terrafix.core import logs
 from terrafix.core.clock import Ticker
 from terrafix.core.node import NodeContext
+from terrafix.health.load import CpuLoad
 from terrafix.health.power import read_clocks, read_fans, read_power_mode, read_rails
 from terrafix.health.sensor_files import read_number, read_text
 from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, ThermalReading
@@ -29,6 +30,7 @@ class HealthEdge:
         self._out_dir = ctx.out_dir
         self._ticker: Ticker | None = None
         self._band: ThermalBand | None = None
+        self._load = CpuLoad()
 
     def poll(self, now_ns: int) -> Iterable[Message]:
         self._ticker = self._ticker or Ticker(RATE_HZ, now_ns)
@@ -43,6 +45,7 @@ class HealthEdge:
                 rails=read_rails(self._sysfs / "class" / "hwmon"),
                 fans=read_fans(self._sysfs / "class" / "hwmon"),
                 power_mode=read_power_mode(),
+                cpu_load=self._load.read(),
             )
 
     def on_message(self, message: Message) -> None:

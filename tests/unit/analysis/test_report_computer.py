@@ -1,6 +1,6 @@
 """Charts of the computer's temperature and power in the report."""
 
-from terrafix.messages import Health, ThermalBand
+from terrafix.messages import Health, ThermalBand, ThermalReading
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.sections_computer import computer
 
@@ -26,3 +26,18 @@ def test_power_is_drawn_where_it_was_measured() -> None:
     assert 'aria-label="Power"' in _page(9.5)
     assert 'aria-label="Power"' not in _page(None)
     assert 'aria-label="Temperature"' in _page(None)
+
+
+def _load_page(*loads: dict[str, float]) -> str:
+    readings = [
+        (float(i), ThermalReading(t_ns=i, zones=[], throttling=[], disk_free_mb=None, cpu_load=load))
+        for i, load in enumerate(loads)
+    ]
+    return computer(FlightView(title="test", rows=[], frame_ids=[], thermal=readings))
+
+
+def test_load_is_drawn_for_all_cores_and_by_process() -> None:
+    page = _load_page({}, {"all": 0.25, "vision": 0.9}, {"all": 0.5, "vision": 1.1, "link": 0.1})
+    assert 'aria-label="All cores"' in page and 'aria-label="By process"' in page
+    assert "vision" in page and "link" in page
+    assert "Processor load" not in _load_page({}, {})

@@ -6,6 +6,7 @@ from html import escape
 
 import numpy as np
 
+from terrafix.health.load import ALL
 from terrafix.messages import ThermalReading
 from terrafix_tools.report.charts import Band, Chart, Point, clock, strips
 from terrafix_tools.report.data import FlightView
@@ -23,7 +24,7 @@ KEYS = ("k-dead", "k-vis", "k-sat", "k-good", "k-ink", "k-soft")
 
 
 def computer(view: FlightView) -> str:
-    parts = [_latency(view), _heat(view), _processes(view)]
+    parts = [_latency(view), _load(view), _heat(view), _processes(view)]
     if not any(parts):
         return ""
     return f"<h2>Computer</h2>{''.join(parts)}"
@@ -68,6 +69,18 @@ def medians(points: list[tuple[float, float]], end: float) -> list[Point]:
     for t_s, value in points:
         parts[min(BINS - 1, max(0, int(BINS * t_s / end)))].append(value)
     return [((k + 0.5) * end / BINS, float(np.median(parts[k])) if k in parts else None) for k in range(BINS)]
+
+
+def _load(view: FlightView) -> str:
+    """Load of the cores as a whole, and of one core by process; "" where it was not recorded."""
+    whole = _lines(view, "All cores", "%", 2.0, lambda r: {k: 100 * v for k, v in r.cpu_load.items() if k == ALL})
+    by_process = _lines(view, "By process", "%", 2.0, lambda r: {k: 100 * v for k, v in r.cpu_load.items() if k != ALL})
+    if not whole:
+        return ""
+    return (
+        '<h3>Processor load</h3><p class="quiet">Of all cores together, other programs included; of one core by '
+        f'process, so that several threads may exceed 100 %.</p><div class="scroll">{whole}{by_process}</div>'
+    )
 
 
 def _heat(view: FlightView) -> str:
