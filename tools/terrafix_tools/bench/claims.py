@@ -13,7 +13,6 @@ Simulated flights often use an exact map, while its package states an error. For
 expected with a map error as claimed: below 1, the rest of the claim is too wide."""
 
 import argparse
-import json
 import math
 import sys
 from dataclasses import asdict, dataclass
@@ -23,12 +22,13 @@ import numpy as np
 import typer
 
 from terrafix.core.camera import Mount
-from terrafix.core.errors import EvaluationError, OutputError, TerrafixError, UsageError
+from terrafix.core.errors import EvaluationError, TerrafixError, UsageError
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.estimator.integrity.time_offset import PRIOR_SIGMA_S
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.messages import CalibrationEstimate, Camera, LensEstimate, NavEstimate, Origin
 from terrafix.recorder.reader import read_flight
+from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.estimates import ESTIMATES, Row, read_rows
 from terrafix_tools.evaluate import ELLIPSE95, compare, mahalanobis2, read_summary, read_truth, truth_sigma_of
 
@@ -223,21 +223,12 @@ def main(arguments: list[str] | None = None) -> None:
         if given.truth and len(given.replays) > 1:
             raise UsageError("--truth is that of one flight; give one REPLAY with it")
         flights = [claims_of(replay, given.truth) for replay in given.replays]
-        if given.json_path:
-            _write(given.json_path, flights)
+        write_result(given.json_path, {"flights": [asdict(f) for f in flights], "pool": asdict(pool(flights))})
     except TerrafixError as error:
         typer.echo(f"claims: {error}", err=True)
         sys.exit(error.exit_code)
     for line in table(flights):
         typer.echo(line)
-
-
-def _write(path: Path, flights: list[Claims]) -> None:
-    result = {"flights": [asdict(f) for f in flights], "pool": asdict(pool(flights))}
-    try:
-        path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 if __name__ == "__main__":

@@ -8,21 +8,18 @@ frames with a position are located, and compared with the intersection of the tr
 a simulated flight is exact, while its package states an error: the figures are given for the exact map, and for a map
 whose error is drawn, for each pixel, from what the package states."""
 
-import argparse
-import json
-import sys
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from terrafix.core.errors import OutputError, TerrafixError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import NavEstimate
 from terrafix.recorder.reader import read_flight
+from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.locate.locator import FlightLocator
 from terrafix_tools.locate.position import CHI2_95
 from terrafix_tools.replay import replay
@@ -31,6 +28,7 @@ from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.camera.lens import lens_of
 from terrafix_tools.sim.flights.folder import CAMERA, Flight, flight_over, mission_over
 from terrafix_tools.sim.flights.make import FlightOptions, make, scene_of
+from terrafix_tools.standalone import run_standalone
 
 TRUTH_SEED = 7  # of the pixels that are drawn
 
@@ -118,32 +116,25 @@ def _same_frame(p_m: np.ndarray, of: LocalFrame, to: LocalFrame) -> np.ndarray:
     return np.array(to.to_local(*of.to_wgs84(float(p_m[0]), float(p_m[1]))))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m terrafix_tools.bench.locate", description=__doc__)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--seed", type=int, default=3)
-    parser.add_argument("--size-km", type=float, default=1.2)
-    parser.add_argument("--agl", type=float, default=100.0)
-    parser.add_argument("--vehicle", type=Kind, default=Kind.COPTER)
-    parser.add_argument("--length-km", type=float, default=1.0)
-    parser.add_argument("--pixels", type=int, default=1000)
-    parser.add_argument("--json", type=Path, dest="json_path")
-    given = parser.parse_args()
-    wanted = FlightOptions(
-        seed=given.seed, size_km=given.size_km, vehicle=given.vehicle, length_km=given.length_km, agl_m=given.agl
-    )
-    try:
-        found = locate_pixels(simulate(given.out, wanted), given.out / "replay", given.pixels)
-        result: dict[str, Any] = {
-            "map_as_stated": asdict(accuracy(found, map_errors=True)),
-            "exact_map": asdict(accuracy(found, map_errors=False)),
-            "surfaces": dict(Counter(pixel.surface for pixel in found)),
-        }
-        if given.json_path is not None:
-            _write(given.json_path, result)
-    except TerrafixError as error:
-        typer.echo(f"locate: {error}", err=True)
-        sys.exit(error.exit_code)
+def bench(
+    out: Annotated[Path, typer.Argument(help="Folder for the flight and its replay.")],
+    seed: Annotated[int, typer.Option(help="Of place, course and errors.")] = 3,
+    size_km: Annotated[float, typer.Option(help="Side of the generated place.")] = 1.2,
+    agl: Annotated[float, typer.Option(help="Height of the course above ground, metres.")] = 100.0,
+    vehicle: Annotated[Kind, typer.Option(help="Vehicle type.")] = Kind.COPTER,
+    length_km: Annotated[float, typer.Option(help="Length of the course.")] = 1.0,
+    pixels: Annotated[int, typer.Option(help="Number of pixels.")] = 1000,
+    json_path: Annotated[Path | None, typer.Option("--json", help="File for the numbers of the table.")] = None,
+) -> None:
+    """Compare the error of object positions with their stated accuracy."""
+    wanted = FlightOptions(seed=seed, size_km=size_km, vehicle=vehicle, length_km=length_km, agl_m=agl)
+    found = locate_pixels(simulate(out, wanted), out / "replay", pixels)
+    result: dict[str, Any] = {
+        "map_as_stated": asdict(accuracy(found, map_errors=True)),
+        "exact_map": asdict(accuracy(found, map_errors=False)),
+        "surfaces": dict(Counter(pixel.surface for pixel in found)),
+    }
+    write_result(json_path, result)
     typer.echo("map          pixels  median m  p95 m  inside 95 %  NEES (2)")
     for name in ("map_as_stated", "exact_map"):
         row = result[name]
@@ -154,12 +145,5 @@ def main() -> None:
     typer.echo(", ".join(f"{surface} {number}" for surface, number in result["surfaces"].items()))
 
 
-def _write(path: Path, result: dict[str, Any]) -> None:
-    try:
-        path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
-
-
 if __name__ == "__main__":
-    main()
+    run_standalone("locate", bench)

@@ -6,21 +6,19 @@ Two tests that need no survey. Points of the map: the pixel of a map match, loca
 the map. One point in several keyframes: the pixel of a feature in two keyframes, located from each. Both errors are
 compared with the stated covariances; the error of the map is common to both sides and not tested."""
 
-import argparse
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.errors import TerrafixError
 from terrafix.messages import MapMatch, Odometry, Verdict
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.locate.locator import FlightLocator
 from terrafix_tools.locate.position import CHI2_95, ObjectPosition
+from terrafix_tools.standalone import run_standalone
 
 SEED = 5  # of the points that are drawn
 PER_FRAME = 4  # points drawn from one frame: neighbours have the same error
@@ -91,24 +89,18 @@ def _errors(found: list[tuple[np.ndarray, np.ndarray]]) -> Errors:
     return Errors(np.hypot(*error_m.T), squared <= CHI2_95)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m terrafix_tools.bench.located_points", description=__doc__)
-    parser.add_argument("replay", type=Path)
-    given = parser.parse_args()
-    try:
-        locator = FlightLocator.open(given.replay)
-        random = np.random.default_rng(SEED)
-        lines = [
-            map_points(locator, given.replay, random).line("map points"),
-            same_points(locator, given.replay, random).line("one point in two keyframes"),
-        ]
-    except TerrafixError as error:
-        typer.echo(f"located_points: {error}", err=True)
-        sys.exit(error.exit_code)
+def bench(replay: Annotated[Path, typer.Argument(help="Output of replay.")]) -> None:
+    """Compare object positions with the map and with each other."""
+    locator = FlightLocator.open(replay)
+    random = np.random.default_rng(SEED)
+    lines = [
+        map_points(locator, replay, random).line("map points"),
+        same_points(locator, replay, random).line("one point in two keyframes"),
+    ]
     typer.echo(f"{'':28} points  median m   p95 m  inside 95 %")
     for line in lines:
         typer.echo(line)
 
 
 if __name__ == "__main__":
-    main()
+    run_standalone("located_points", bench)

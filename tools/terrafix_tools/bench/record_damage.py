@@ -8,16 +8,14 @@ one that is read. Cuts: RECORD is truncated at random places; everything in chun
 of the reference reader, has to be read. After each, the messages are the first ones of RECORD, and export, comparison
 and report work."""
 
-import argparse
-import json
 import multiprocessing
 import random
 import shutil
-import sys
 import time
 from dataclasses import asdict, dataclass
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -30,10 +28,12 @@ from terrafix.core.node import NodeContext
 from terrafix.messages import Message, Origin
 from terrafix.recorder.node import make_edge
 from terrafix.recorder.reader import flight_files, read_received
+from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.compare.alignment import read_record
 from terrafix_tools.compare.difference import compare_records
 from terrafix_tools.log.export import export
 from terrafix_tools.report.page import report
+from terrafix_tools.standalone import run_standalone
 
 NS = 1e9
 SEED = 3
@@ -144,28 +144,21 @@ def _damage(lost_s: list[float], altered: int, usable: int) -> Damage:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m terrafix_tools.bench.record_damage", description=__doc__)
-    parser.add_argument("record", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--cuts", type=int, default=50)
-    parser.add_argument("--json", type=Path, dest="json_path")
-    given = parser.parse_args()
+def bench(
+    record: Annotated[Path, typer.Argument(help="Record file, or folder with one.")],
+    out: Annotated[Path, typer.Argument(help="New folder for the damaged copies; removed at the end.")],
+    kills_wanted: Annotated[int, typer.Option("--kills", help="Number of kills.")] = 50,
+    cuts_wanted: Annotated[int, typer.Option("--cuts", help="Number of truncations.")] = 50,
+    json_path: Annotated[Path | None, typer.Option("--json", help="File for the numbers of the table.")] = None,
+) -> None:
+    """Measure what kill -9 and truncation leave of a record."""
+    if out.exists():
+        raise OutputError(f"{out}: exists; give a new folder")
     try:
-        if given.out.exists():
-            raise OutputError(f"{given.out}: exists; give a new folder")
-        result = {
-            "cuts": asdict(cuts(given.record, given.out, given.cuts)),
-            "kills": asdict(kills(given.record, given.out, given.kills)),
-        }
-        if given.json_path is not None:
-            given.json_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    except TerrafixError as error:
-        typer.echo(f"record_damage: {error}", err=True)
-        sys.exit(error.exit_code)
+        result = {"cuts": asdict(cuts(record, out, cuts_wanted)), "kills": asdict(kills(record, out, kills_wanted))}
     finally:
-        shutil.rmtree(given.out, ignore_errors=True)
+        shutil.rmtree(out, ignore_errors=True)
+    write_result(json_path, result)
     typer.echo("damage    cases  lost s, median     max  altered  usable")
     for name, row in result.items():
         typer.echo(
@@ -175,4 +168,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_standalone("record_damage", bench)

@@ -7,24 +7,24 @@ new folder. ``--stall``: each synchronisation with the disk takes S seconds long
 the time of a call in milliseconds (median, 99th percentile, maximum), the processor time of both threads per second of
 flight, and the dropped messages."""
 
-import argparse
-import json
-import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import typer
 
 from terrafix.core.config import Config
-from terrafix.core.errors import OutputError, TerrafixError
+from terrafix.core.errors import OutputError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import Dropped, Message
 from terrafix.recorder.node import make_edge
 from terrafix.recorder.reader import ReadResult, check_format, read_received
 from terrafix.recorder.writer import FlightWriter
+from terrafix_tools.bench.result_file import write_result
+from terrafix_tools.standalone import run_standalone
 
 MS = 1e3
 NS = 1e9
@@ -91,24 +91,19 @@ def _stall(stall_s: float) -> None:
     FlightWriter.sync = stalled  # type: ignore[assignment, method-assign]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m terrafix_tools.bench.recorder", description=__doc__)
-    parser.add_argument("record", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--speed", type=float, default=10.0)
-    parser.add_argument("--stall", type=float, default=0.0)
-    parser.add_argument("--json", type=Path, dest="json_path")
-    given = parser.parse_args()
-    try:
-        cost = asdict(measure(given.record, given.out, speed=given.speed, stall_s=given.stall))
-        if given.json_path is not None:
-            given.json_path.write_text(json.dumps(cost, indent=2) + "\n", encoding="utf-8")
-    except TerrafixError as error:
-        typer.echo(f"recorder: {error}", err=True)
-        sys.exit(error.exit_code)
+def bench(
+    record: Annotated[Path, typer.Argument(help="Record, or folder of replay or run.")],
+    out: Annotated[Path, typer.Argument(help="New folder for the copy.")],
+    speed: Annotated[float, typer.Option(help="Times as fast as in flight.")] = 10.0,
+    stall: Annotated[float, typer.Option(help="Seconds by which each synchronisation takes longer.")] = 0.0,
+    json_path: Annotated[Path | None, typer.Option("--json", help="File for the numbers of the table.")] = None,
+) -> None:
+    """Measure what recording costs the process that hands its messages over."""
+    cost = asdict(measure(record, out, speed=speed, stall_s=stall))
+    write_result(json_path, cost)
     for name, value in cost.items():
         typer.echo(f"{name:16}{value}")
 
 
 if __name__ == "__main__":
-    main()
+    run_standalone("recorder", bench)
