@@ -207,10 +207,9 @@ class FilterState:
         focal = self.origin.camera.focal_sigma
         if not self.has_height:
             return 1.0, focal
+        both = scale_sigma(self.origin.camera)
         log_scale = float(self.graph.state(node).bias[LOG_HEIGHT_SCALE])
-        return focal_scale(self.origin.camera, log_scale), focal * BAROMETER_SCALE_SIGMA / scale_sigma(
-            self.origin.camera
-        )
+        return focal_scale(self.origin.camera, log_scale), focal * BAROMETER_SCALE_SIGMA / both
 
     def amsl(self, frame: FrameState) -> tuple[float, float]:
         """Height of the camera AMSL [m], and its 1-sigma beyond the covariance of the graph. Without a DEM the graph

@@ -88,19 +88,21 @@ class RecorderEdge:
 
     def _write_images(self, message: Message) -> None:
         """Thumbnail and full size of a frame. Its pixels are gone when this thread is seconds late."""
-        if isinstance(message, Frame) and self._images.thumbnails and not message.error:
-            image = self._frames.get(message.frame_id)
-            if image is not None:
-                self._ring.write_thumbnail(message.t_ns, message.frame_id, self._images.thumbnail(image))
-        frame_id = self._images.full_frame(message)
+        small = message if isinstance(message, Frame) and self._images.thumbnails and not message.error else None
+        full_id = self._images.full_frame(message)
+        frame_id = small.frame_id if small is not None else full_id
         if frame_id is None:
             return
-        image = self._frames.get(frame_id)
+        image = self._frames.get(frame_id)  # a copy
+        if small is not None and image is not None:
+            self._ring.write_thumbnail(small.t_ns, frame_id, self._images.thumbnail(image))
+        if full_id is None:
+            return
         if image is None:
             self._ring.count_lost(FRAME_IMAGE)
         else:
             image_format = self._images.settings.frame_format
-            self._ring.write_frame_image(message.t_ns, frame_id, self._images.encoded(image), image_format)
+            self._ring.write_frame_image(message.t_ns, full_id, self._images.encoded(image), image_format)
 
 
 def make_node(ctx: NodeContext) -> Node:

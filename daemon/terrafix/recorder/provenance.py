@@ -37,13 +37,17 @@ def header(config: Config, map_path: Path | None = None) -> dict[str, str]:
         "models": models_of(config.models),
         "device": device(),
     }
-    return {"format": RECORD_FORMAT, **{name: msgspec.json.encode(part).decode() for name, part in parts.items()}}
+    return _encoded(parts)
 
 
 def copied_header(found: dict[str, Any], **changed: Any) -> dict[str, str]:
     """Header of a record that is made of the messages of another one, in the present format, to which they were
     converted when read. ``found``: header of that record (ReadResult); ``changed``: parts that are new."""
-    parts = {name: part for name, part in {**found, **changed}.items() if name not in ("format", "calibration")}
+    parts = {**found, **changed}
+    return _encoded({name: part for name, part in parts.items() if name not in ("format", "calibration")})
+
+
+def _encoded(parts: dict[str, Any]) -> dict[str, str]:
     return {"format": RECORD_FORMAT, **{name: msgspec.json.encode(part).decode() for name, part in parts.items()}}
 
 

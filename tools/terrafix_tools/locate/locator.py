@@ -1,19 +1,17 @@
 """Object positions of one flight: what an external detector calls for every detection."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from terrafix.map.package import MapPackage
+from terrafix_tools.evaluate import read_summary
 from terrafix_tools.flight_map import map_of_flight
 from terrafix_tools.locate.cloud import Elevation, PointCloud, build_cloud
 from terrafix_tools.locate.ground import ground_patch
 from terrafix_tools.locate.position import ObjectPosition, Pixel, check_pixel, locate_object
 from terrafix_tools.locate.views import FlightViews, read_views
-from terrafix_tools.replay_output import SUMMARY
 
 
 class FlightLocator:
@@ -37,10 +35,10 @@ class FlightLocator:
     @classmethod
     def open(cls, record: Path, map_path: Path | None = None) -> "FlightLocator":
         """``record``: a file, or the folder of a replay or run. ``map_path``: None: the map that the record names, if
-        it is there. Raises SourceError, MapError."""
+        it is there. Raises SourceError, MapError, EvaluationError (summary.json is damaged)."""
         flight = read_views(record)
         folder = record if record.is_dir() else record.parent
-        package = map_of_flight(folder, map_path, _summary(folder), flight.header)
+        package = map_of_flight(folder, map_path, read_summary(folder), flight.header)
         elevation = None if package is None else MapPackage.open(package).bind(flight.frame).elevation
         return cls(flight, elevation)
 
@@ -65,12 +63,3 @@ class FlightLocator:
                 else PointCloud(np.zeros((0, 3)), np.zeros(0))
             )
         return self._clouds[fragment_id]
-
-
-def _summary(folder: Path) -> dict[str, Any]:
-    """summary.json of a replay; {} without a readable one."""
-    try:
-        found = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}

@@ -52,9 +52,9 @@ def recover(record: Path, out: Path) -> tuple[int, ReadResult]:
     return rewrite([record], out, lambda message, t_ns: True, result), result
 
 
-def origin_of(record: Path) -> Origin:
-    """Raises SourceError for a record without one."""
-    result = ReadResult()
+def origin_of(record: Path, result: ReadResult | None = None) -> Origin:
+    """Raises SourceError for a record without one. ``result``: gets the header."""
+    result = ReadResult() if result is None else result
     for _, _, _, message in read_received(record, result):
         if isinstance(message, Origin):
             return message

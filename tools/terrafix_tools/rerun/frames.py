@@ -20,8 +20,9 @@ from terrafix.messages import (
     PositionHint,
     VehicleState,
 )
-from terrafix.recorder.reader import FrameImage, ReadResult, check_format, read_flight, read_with_images
+from terrafix.recorder.reader import FrameImage, ReadResult, read_with_images
 from terrafix.vision.sources import Shot
+from terrafix_tools.log.edit import origin_of
 
 ALL_FRAMES = "all"  # of [recorder] frames
 # What the replayed processes receive from others, beside telemetry.
@@ -37,11 +38,7 @@ class RecordedFrames:
     def __init__(self, record: Path) -> None:
         self.record = record
         result = ReadResult()
-        origins = (message for _, _, message in read_flight(record, result) if isinstance(message, Origin))
-        origin = next(origins, None)
-        check_format(record, result)
-        if origin is None:
-            raise SourceError(f"{record}: the record has no origin of a flight; was the source of the flight opened?")
+        self._origin = origin_of(record, result)
         self.header: dict[str, Any] = result.header
         kept = self.header["config"].get("recorder", {}).get("frames", "thumbnails")
         if kept != ALL_FRAMES:
@@ -49,7 +46,6 @@ class RecordedFrames:
                 f'{record}: its frames were not recorded at full size ([recorder] frames = "{kept}"); replay it from '
                 f'its messages, without --frames, or record the next flight with frames = "{ALL_FRAMES}"'
             )
-        self._origin = origin
 
     def origin(self) -> Origin:
         return self._origin

@@ -1,10 +1,8 @@
 """Cameras and images of a recorded flight for an orthomosaic."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,9 +12,9 @@ from terrafix.estimator.state import HORIZONTAL
 from terrafix.messages import Refinement
 from terrafix.recorder.reader import read_flight, read_frame_images
 from terrafix.vision.sources import open_source
+from terrafix_tools.evaluate import read_summary
 from terrafix_tools.locate.locator import FlightLocator
 from terrafix_tools.locate.views import CameraView
-from terrafix_tools.replay_output import SUMMARY
 
 MIN_STEP_SHARE = 0.15  # of the height, between two frames that are used: nearer ones show the same ground again
 
@@ -82,9 +80,5 @@ def images(record: Path, source: Path | None, wanted: set[int]) -> Iterator[tupl
 
 def _source_of(folder: Path) -> Path | None:
     """The source that summary.json of a replay names, if it is there."""
-    try:
-        summary: Any = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    named = summary.get("source", "") if isinstance(summary, dict) else ""
+    named = read_summary(folder).get("source", "")
     return Path(named) if named and Path(named).exists() else None
