@@ -143,7 +143,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "vision",
         "terrafix.vision.node",
-        (m.Origin, m.Frame),
+        (m.Origin, m.Frame, m.Health),
         (m.Origin, m.Frame, m.VehicleState, m.Imu, m.SourceEnded, m.Odometry, m.Relocalization),
         0.0,
         30.0,

@@ -79,6 +79,8 @@ class HealthSection(Section, frozen=True, kw_only=True):
     hysteresis_c: Annotated[float, Meta(ge=0, le=30)] = 5.0
     hot_match_every: Annotated[int, Meta(ge=1, le=60)] = 2
     critical_match_every: Annotated[int, Meta(ge=1, le=60)] = 4
+    hot_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 5.0
+    critical_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0
 
 
 class Source(Section, frozen=True, kw_only=True):

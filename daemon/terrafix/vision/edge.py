@@ -16,7 +16,8 @@ from terrafix.core.errors import SourceError
 from terrafix.core.frames import FrameWriter
 from terrafix.core.initial_position import Bounds, map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import Edge, NodeContext
-from terrafix.messages import Message, SourceEnded
+from terrafix.messages import Health, Message, SourceEnded
+from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_configured
 
 QUEUE_SHOTS = 3  # shots with pixels; a frame that waits behind more than these is too old to be useful
@@ -30,7 +31,8 @@ class SourceEdge:
 
     ``epoch_ns``: time zero of the flight after a restart, else None. ``realtime``: a recording plays in real time and
     drops frames, else it is read as fast as it is processed. ``ground_amsl_m``: default ground height. ``bounds``: of
-    the map, for a source without an initial position."""
+    the map, for a source without an initial position. ``rate``: of the frames that are taken from a source in real
+    time; one that is not taken is not published, its telemetry is."""
 
     def __init__(
         self,
@@ -40,12 +42,14 @@ class SourceEdge:
         realtime: bool,
         ground_amsl_m: float | None = None,
         bounds: Bounds | None = None,
+        rate: FrameRateLimit | None = None,
     ) -> None:
         self._source = source
         self._frames = frames
         self._realtime = realtime
         self._ground_amsl_m = ground_amsl_m  # used when the source has none
         self._bounds = bounds  # of the map, for a source without an initial position
+        self._rate = rate if realtime or source.live else None
         self._epoch_ns = epoch_ns
         self._zero_ns = 0  # time zero of the source; set when the reader starts
         self._first_id = 0
@@ -87,7 +91,9 @@ class SourceEdge:
         return messages
 
     def on_message(self, message: Message) -> None:
-        """Ignores all messages: a source has no inputs."""
+        """Takes the thermal band of Health."""
+        if isinstance(message, Health) and self._rate is not None:
+            self._rate.band = message.band
 
     def close(self) -> None:
         self._stopping.set()
@@ -133,6 +139,10 @@ class SourceEdge:
         return Shot(frame, states, shot.image, imu)
 
     def _push(self, shot: Shot) -> None:
+        if self._rate is not None and not self._rate.takes_frame(shot.frame.t_ns):
+            with self._changed:
+                self._dropped.extend((*shot.imu, *shot.states))
+            return
         with self._changed:
             if not self._realtime and not self._source.live:  # lossless: the reader blocks until there is room
                 self._changed.wait_for(lambda: len(self._shots) < QUEUE_SHOTS or self._stopping.is_set())
@@ -156,4 +166,5 @@ def make_edge(ctx: NodeContext) -> Edge:
             f"{source.name()}: neither a start coordinate nor a map to search; give --map, or --start LAT,LON"
         )
     bounds = map_bounds(ctx.map_path) if ctx.map_path is not None and start_is_unknown(source.origin()) else None
-    return SourceEdge(source, ctx.frames, ctx.epoch_ns, section.realtime, ctx.ground_amsl_m, bounds)
+    rate = FrameRateLimit(ctx.config.health)
+    return SourceEdge(source, ctx.frames, ctx.epoch_ns, section.realtime, ctx.ground_amsl_m, bounds, rate)

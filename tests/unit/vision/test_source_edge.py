@@ -9,12 +9,13 @@ import pytest
 
 from source_folders import flight, picture
 from terrafix.core.clock import now_ns
-from terrafix.core.config import Config, Source
+from terrafix.core.config import Config, HealthSection, Source
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
-from terrafix.messages import Frame, Message, Origin, SourceEnded, VehicleState
+from terrafix.messages import Frame, Health, Message, Origin, SourceEnded, ThermalBand, VehicleState
 from terrafix.vision.edge import DROPPED_ERROR, SourceEdge, make_edge
+from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, open_source
 
 pytestmark = pytest.mark.real_time
@@ -183,3 +184,36 @@ def test_the_ground_height_of_the_map_is_the_default_for_a_source_without_one(
     listener = Listener(edge)
     listener.until(listener.ended)
     assert isinstance(listener.messages[0], Origin) and listener.messages[0].ground_amsl_m == expected_m
+
+
+def test_in_a_hot_computer_frames_above_the_rate_are_left_out_and_their_telemetry_is_not(
+    tmp_path: Path, closing: list[SourceEdge]
+) -> None:
+    limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
+    edge = SourceEdge(
+        open_source(str(flight(tmp_path / "f", 20, step_s=0.05))), MemoryFrameStore(), None, True, rate=limit
+    )
+    closing.append(edge)
+    edge.on_message(
+        Health(t_ns=0, band=ThermalBand.HOT, temperature_c=85.0, throttled=False, disk_free_mb=None, cause="test")
+    )
+    listener = Listener(edge)
+    listener.until(listener.ended)
+    assert [f.frame_id for f in listener.frames] == [0, 4, 8, 12, 16]
+    assert not any(f.error for f in listener.frames)
+    assert len([m for m in listener.messages if isinstance(m, VehicleState)]) == 20
+    assert listener.messages[-1].frames == 20  # type: ignore[attr-defined]
+
+
+def test_a_recording_that_is_not_played_in_real_time_is_read_whole_in_a_hot_computer(
+    tmp_path: Path, closing: list[SourceEdge]
+) -> None:
+    limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
+    limit.band = ThermalBand.HOT
+    edge = SourceEdge(
+        open_source(str(flight(tmp_path / "f", 12, step_s=0.05))), MemoryFrameStore(), None, False, rate=limit
+    )
+    closing.append(edge)
+    listener = Listener(edge)
+    listener.until(listener.ended)
+    assert len(listener.frames) == 12
