@@ -1,5 +1,6 @@
 """Localization of one frame on the map: correlation, point-mass filter, camera pose, verdict."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -16,7 +17,7 @@ from terrafix.anchor.frame_pose import (
     with_belief,
 )
 from terrafix.anchor.matching.descriptor_cache import Describer
-from terrafix.anchor.matching.frame_matcher import View, view_at
+from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, View, view_at
 from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
 from terrafix.anchor.matching.match_message import pose_match
 from terrafix.anchor.matching.point_mass_filter import Belief, belief_cell_m
@@ -107,6 +108,7 @@ class Localizer:
         self._relocalizer = Relocalizer()
         self._single_frame_budget = FalseAlarmBudget()
         self._since_observation_m = np.inf  # motion since the last observation
+        self._scale_matched = False  # the last frame had a pose at the predicted scale
         self._poor_weight = 0.0
         self._variance_m2 = 0.0  # horizontal position variance of the last prediction
         self._labels = FragmentLabels()
@@ -234,7 +236,7 @@ class Localizer:
         best = layers.best
         e_m, n_m, _ = prediction.p_c_in_w_m
         ground = ground_plane(best.map, e_m, n_m, prediction.agl_m)
-        view = view_of(prediction, ground, self._ground_m)
+        view = self._tracked_view(view_of(prediction, ground, self._ground_m))
         match = msgspec.structs.replace(match, ground=ground)
         if view.agl_m < MIN_MATCHING_AGL_M:
             return msgspec.structs.replace(match, verdict=Verdict.TOO_LOW)
@@ -267,7 +269,18 @@ class Localizer:
             around_m = prediction.p_c_in_w_m[:2] if tested < 1.0 else None
             self._relocalizer.start(best, prediction.agl_m, around_m)
             return self._relocalizer.search_match(match)
-        return decide(match, pose, belief, seen, score)
+        decided = decide(match, pose, belief, seen, score)
+        has_pose = decided.verdict is Verdict.ACCEPTED and not decided.position_only
+        self._scale_matched = has_pose and hypothesis.scale == AS_PREDICTED.scale
+        return decided
+
+    def _tracked_view(self, view: View) -> View:
+        """``view`` without the uncertainty of its scale if the last frame matched at the predicted scale and the ground
+        is mostly the same: an error of the height that did not matter there does not matter here either. One scale is
+        correlated then instead of three."""
+        matched, self._scale_matched = self._scale_matched, False
+        is_same_ground = self._since_observation_m < NEW_GROUND_SHARE * view.agl_m
+        return replace(view, scale_sigma=0.0) if matched and is_same_ground else view
 
     def _correlate(self, image: Image, view: View, layers: MapLayers, belief: Belief) -> Observation:
         results = layers.correlate(image, view, belief)

@@ -15,10 +15,12 @@ class GradientDescriber:
     name = "gradient"
     channels = CHANNELS
     stride = 1  # image pixels per descriptor cell
+    grayscale = True  # takes grey images
 
     def describe(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 BGR -> (CHANNELS, H, W) float32; the norm of each pixel's vector is below 1."""
-        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        """(H, W, 3) uint8 BGR, or (H, W) grey -> (CHANNELS, H, W) float32; the norm of each pixel's vector is below
+        1."""
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         dx = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
         dy = cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
         magnitude, angle = cv2.cartToPolar(dx, dy)

@@ -20,6 +20,7 @@ class XFeatDescriber:
     name = "xfeat"
     stride = STRIDE
     channels = 64
+    grayscale = False
 
     def __init__(self, model: Model, manifest: Manifest) -> None:
         """``model`` was opened with INPUTS and DESCRIPTORS_ONLY."""

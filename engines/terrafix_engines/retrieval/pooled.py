@@ -17,12 +17,13 @@ class PooledGradientDescriber:
     name = "pooled-gradient-1"  # stored in map packages: increment it when the descriptors of the same ground change
     channels = CHANNELS
     stride = POOL
+    grayscale = True  # takes grey images
 
     def __init__(self) -> None:
         self._dense = GradientDescriber()
 
     def describe(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 BGR -> (CHANNELS, H // POOL, W // POOL) float32"""
+        """(H, W, 3) uint8 BGR, or (H, W) grey -> (CHANNELS, H // POOL, W // POOL) float32"""
         dense = self._dense.describe(image)
         height, width = image.shape[0] // POOL, image.shape[1] // POOL
         cells = np.empty((CHANNELS, height, width), np.float32)

@@ -30,6 +30,7 @@ class Describer(Protocol):
     name: str
     stride: int
     channels: int
+    grayscale: bool  # ``describe`` takes grey images (H, W) as well
 
     def describe(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR -> (C, H // stride, W // stride) float32"""

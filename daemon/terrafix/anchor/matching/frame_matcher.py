@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, Describer, MapFeatures
@@ -210,6 +211,7 @@ class FrameMatcher:
         stride = describer.stride
         while 2 * belief.half_m / (gsd * stride) > max_cells:
             gsd *= 2.0
+        image = without_colour(image, describer)
         first = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, stride)
         if first is None or min(first.mask.shape) < MIN_SIDE_CELLS * stride / 2:
             return CorrelationResult(Verdict.TOO_LOW)
@@ -271,6 +273,7 @@ class FrameMatcher:
     ) -> Fix | None:
         gsd = self._gsd(view.agl_m, FIX_GSD_PER_AGL, describer)
         cell = gsd * describer.stride
+        image = without_colour(image, describer)
         frame = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, describer.stride)
         if frame is None:
             return None
@@ -336,6 +339,11 @@ def view_of_fix(view: View, fix: Fix) -> View:
     p = fix.pnp.fit.p_c_in_w_m
     agl_m = float(p[2]) - float(fix.points_w_m[:, 2].mean())
     return replace(view, e_m=float(p[0]), n_m=float(p[1]), r_w_c=fix.pnp.fit.r_w_c, agl_m=agl_m)
+
+
+def without_colour(image: Image, describer: Describer) -> Image:
+    """``image`` (H, W, 3) in grey (H, W) if ``describer`` needs no colour: it is rectified in a third of the time."""
+    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if describer.grayscale else image
 
 
 def _describe(frame: Rectified, describer: Describer) -> tuple[np.ndarray, np.ndarray]:

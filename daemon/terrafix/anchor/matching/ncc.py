@@ -1,8 +1,9 @@
 """Zero-mean normalised cross-correlation of dense descriptors by FFT; the result is the whole surface."""
 
+import cv2
 import numpy as np
 
-from terrafix.anchor.matching.fft import spectra, transform_shape
+from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
 
 MIN_OVERLAP = 0.8  # share of the template that must lie on valid map data; with less, the cell is NaN [tuned]
 # lower bound of the map's variance as a share of the template's, so that water and fields without texture are not
@@ -21,8 +22,7 @@ class CorrelationWindow:
         self._shape = descriptors.shape[1:]
         self._fft_shape = transform_shape(*self._shape)
         self._channels = spectra(descriptors, self._fft_shape)
-        self._energy = spectra(np.einsum("khw,khw->hw", descriptors, descriptors), self._fft_shape)
-        self._valid = None if valid.all() else spectra(valid.astype(np.float32), self._fft_shape)
+        self._local = _LocalSums(descriptors, None if valid.all() else valid)
 
     def correlate(self, template: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """``template`` (C, h, w), ``mask`` (h, w) bool -> correlation (H - h + 1, W - w + 1) in [-1, 1]. Cell (r, c):
@@ -33,20 +33,56 @@ class CorrelationWindow:
         centred = (template - ((template * weight).sum((1, 2)) / count)[:, None, None]) * weight
         template_energy = float((centred**2).sum())
         rows, columns = height - h + 1, width - w + 1
-        m = spectra(weight, self._fft_shape).conj()
+        variance, overlap = self._local.under(weight, rows, columns)
+        surface = cross_correlation(self._channels, spectra(centred, self._fft_shape))[:rows, :columns]
+        surface /= np.sqrt(np.maximum(np.maximum(variance, FLAT_VARIANCE * template_energy) * template_energy, 1e-12))
+        if overlap is not None:
+            surface[overlap < MIN_OVERLAP] = np.nan
+        return surface
 
-        def inverse(spectrum: np.ndarray) -> np.ndarray:
-            return np.fft.irfft2(spectrum, self._fft_shape)[..., :rows, :columns]
 
-        product = inverse((self._channels * spectra(centred, self._fft_shape).conj()).sum(0))
-        sums = inverse(self._channels * m)
-        variance = inverse(self._energy * m) - (sums**2).sum(0) / count
-        surface = product / np.sqrt(
-            np.maximum(np.maximum(variance, FLAT_VARIANCE * template_energy) * template_energy, 1e-12)
-        )
-        if self._valid is not None:
-            surface[inverse(self._valid * m) < MIN_OVERLAP * count] = np.nan
-        return surface.astype(np.float32)
+class _LocalSums:
+    """Variance and overlap of the map under a template, for every place of it.
+
+    They change little from cell to cell, because a template has hundreds of cells: computed for every second row and
+    column, on means of 2 x 2 cells, and interpolated."""
+
+    def __init__(self, descriptors: np.ndarray, valid: np.ndarray | None) -> None:
+        """``descriptors`` (C, H, W) float32; ``valid`` (H, W) bool, None: everywhere."""
+        layers = [*descriptors, np.einsum("khw,khw->hw", descriptors, descriptors)]
+        if valid is not None:
+            layers.append(valid.astype(np.float32))
+        halved = np.stack([_halved(layer, cv2.BORDER_REPLICATE) for layer in layers])
+        self._channels = len(descriptors)
+        self._fft_shape = transform_shape(*halved.shape[1:])
+        self._spectra = spectra(halved, self._fft_shape)
+
+    def under(self, weight: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """``weight`` (h, w) float32, 1 inside of the template, else 0 -> (rows, columns): sum over the channels of the
+        squared deviations from their mean; share of the template on valid map data, None: 1 everywhere."""
+        mask = spectra(_halved(weight, cv2.BORDER_CONSTANT)[None], self._fft_shape)
+        # a sum of products of means is a quarter of the sum of products
+        sums = [4.0 * cross_correlation(layer[None], mask) for layer in self._spectra]
+        count = float(weight.sum())
+        variance = sums[self._channels]
+        for channel in sums[: self._channels]:
+            variance -= channel**2 / count
+        overlap = sums[-1] / count if len(sums) > self._channels + 1 else None
+        return _doubled(variance, rows, columns), None if overlap is None else _doubled(overlap, rows, columns)
+
+
+def _halved(layer: np.ndarray, border: int) -> np.ndarray:
+    """(H, W) -> means of 2 x 2 cells ((H + 1) // 2, (W + 1) // 2)."""
+    height, width = layer.shape
+    even = cv2.copyMakeBorder(layer, 0, height % 2, 0, width % 2, border)
+    return np.asarray(cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA))
+
+
+def _doubled(half: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Values at every second row and column -> (rows, columns) of all."""
+    every_second = np.array([[0.5, 0.0, 0.0], [0.0, 0.5, 0.0]])
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(half, every_second, (columns, rows), flags=how, borderMode=cv2.BORDER_REPLICATE))
 
 
 def standardise(surface: np.ndarray) -> np.ndarray:

@@ -13,11 +13,15 @@ from terrafix.core.node import Image
 MAX_GROUND_DISTANCE = 1.6
 # smallest cosine between optical axis and vertical: that limit with a margin for the image corners [tuned]
 MIN_DOWN = 0.3
+# Pixels of the rectified image between two that a lens with distortion is evaluated for; between them it is
+# interpolated, to 0.1 px of the frame for a k1 of -0.3. [measured: test_orthorectify]
+LENS_STEP_PX = 4
+OUTSIDE_PX = -1e6  # of ground behind the camera, so that no interpolated pixel is inside [spec: any far pixel]
 
 
 @dataclass(frozen=True)
 class Rectified:
-    """``image`` (H, W, 3) and ``mask`` (H, W) bool, north-up. The centre of pixel (r, c) lies at east = e_min_m + (c +
+    """``image`` (H, W, 3) or (H, W) and ``mask`` (H, W) bool, north-up. The centre of pixel (r, c) lies at east = e_min_m + (c +
     0.5) gsd, north = n_max_m - (r + 0.5) gsd, relative to the point below the camera."""
 
     image: np.ndarray
@@ -50,7 +54,7 @@ def rectify(
     stride: int = 1,
     blurred: dict[float, Image] | None = None,
 ) -> Rectified | None:
-    """Projects ``image`` on flat ground ``agl_m`` below the camera. Sides are multiples of ``stride`` pixels.
+    """Projects ``image``, in colour or grey, on flat ground ``agl_m`` below the camera. Sides are multiples of ``stride`` pixels.
     ``blurred``: cache of blurred copies of the image by scale factor, shared between yaw hypotheses. None: no ground is
     visible."""
     box = footprint(camera, r_w_c, agl_m)
@@ -70,13 +74,9 @@ def rectify(
             blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
         source = blurred[shrink]
     if camera.distortion or camera.radial_k1:
-        x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-        rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ to_camera.T
-        px = camera.project(rays).astype(np.float32).reshape(height, width, 2)
+        px = _lens_map(camera, to_camera, width, height)
         flat = cv2.remap(source, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
-        inside = (px >= 0).all(-1) & (px[..., 0] <= camera.width - 1) & (px[..., 1] <= camera.height - 1)
-        behind = (rays[:, 2] <= 0).reshape(height, width)
-        mask = inside & ~behind
+        mask = (px >= 0).all(-1) & (px[..., 0] <= camera.width - 1) & (px[..., 1] <= camera.height - 1)
     else:
         matrix = camera.matrix() @ to_camera
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -84,3 +84,19 @@ def rectify(
         white = np.full(image.shape[:2], 255, np.uint8)
         mask = cv2.warpPerspective(white, matrix, (width, height), flags=how) > 250
     return Rectified(flat, mask, e_min, n_max, gsd_m)
+
+
+def _lens_map(camera: CameraCalibration, to_camera: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(height, width, 2) float32: pixel of the frame at each rectified pixel, far outside of it for ground behind the
+    camera. ``to_camera`` (3, 3): rectified pixel (x, y, 1) -> ray in the camera."""
+    columns, rows = (side // LENS_STEP_PX + 2 for side in (width, height))
+    x, y = np.meshgrid(np.arange(columns) * float(LENS_STEP_PX), np.arange(rows) * float(LENS_STEP_PX))
+    rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ to_camera.T
+    behind = rays[:, 2] <= 0
+    rays[behind] = (0.0, 0.0, 1.0)
+    px = camera.project(rays)
+    px[behind] = OUTSIDE_PX
+    coarse = px.reshape(rows, columns, 2).astype(np.float32)
+    scale = np.array([[1.0 / LENS_STEP_PX, 0.0, 0.0], [0.0, 1.0 / LENS_STEP_PX, 0.0]])
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(coarse, scale, (width, height), flags=how))

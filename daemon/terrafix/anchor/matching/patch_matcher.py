@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from terrafix.anchor.matching.fft import spectra, transform_shape
+from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
 from terrafix.anchor.matching.orthorectify import Rectified
 
 MAX_PATCHES = 48  # patches per frame [tuned]
@@ -128,21 +128,16 @@ def _correlate(
     """Zero-mean normalised correlation surface of every patch, (N, 2 radius + 1, 2 radius + 1)."""
     side = patch + 2 * radius
     fft = transform_shape(side, side)
-    small = np.stack([template[:, r : r + patch, c : c + patch] for r, c in corners])
-    small = small - small.mean(axis=(2, 3), keepdims=True)
-    own = (small**2).sum(axis=(1, 2, 3))
-    large = np.stack(
-        [
-            window[
-                :, row0 + r - radius : row0 + r + patch + radius, column0 + c - radius : column0 + c + patch + radius
-            ]
-            for r, c in corners
-        ]
-    )
     n = 2 * radius + 1
-    spectrum = spectra(large, fft)
-    spectrum *= spectra(small, fft).conj()
-    product = np.fft.irfft2(spectrum.sum(1), fft)[:, :n, :n]
+    product = np.empty((len(corners), n, n), np.float32)
+    own = np.empty(len(corners))
+    for i, (r, c) in enumerate(corners):
+        small = template[:, r : r + patch, c : c + patch]
+        small = small - small.mean(axis=(1, 2), keepdims=True)
+        own[i] = (small**2).sum()
+        top, left = row0 + r - radius, column0 + c - radius
+        large = window[:, top : top + side, left : left + side]
+        product[i] = cross_correlation(spectra(large, fft), spectra(small, fft))[:n, :n]
     # Energy and channel means of the map under every placement of a patch, by box sums over the whole window.
     count = patch * patch
     variance = _box_sums(np.einsum("khw,khw->hw", window, window), patch)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from terrafix.anchor.matching.descriptor_cache import Describer, MapWindows
-from terrafix.anchor.matching.fft import spectra, transform_shape
+from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
 from terrafix.anchor.matching.ncc import FLAT_VARIANCE, MIN_OVERLAP
 from terrafix.anchor.matching.orthorectify import Rectified
 from terrafix.anchor.relocalization.coarse_descriptors import CoarseDescriptors
@@ -127,7 +127,7 @@ class BlockCorrelator:
                 spectrum = spectra(descriptors, fft)
                 local_sums = _box_sums(descriptors, valid, prepared[0].count)
                 for i, template in zip(chunk, prepared, strict=True):
-                    product = np.fft.irfft2((spectrum * template.transform).sum(0), fft)
+                    product = cross_correlation(spectrum, template.transform)
                     correlation = _normalised(product, template, local_sums)
                     better = correlation > result.correlation
                     np.copyto(result.correlation, correlation, where=better)
@@ -149,7 +149,7 @@ def _prepare(template: Template, corner: tuple[int, int], fft: tuple[int, int]) 
     centred = (template.descriptors - mean[:, None, None]) * weight
     centre = tuple(round(float(v.mean())) for v in np.nonzero(template.mask))
     return _Prepared(
-        spectra(centred, fft).conj(),
+        spectra(centred, fft),
         count,
         float((centred**2).sum()),
         corner,

@@ -12,6 +12,7 @@ from terrafix.anchor.matching.frame_matcher import (
     FrameMatcher,
     View,
     view_of_fix,
+    without_colour,
 )
 from terrafix.anchor.matching.orthorectify import rectify
 from terrafix.anchor.matching.patch_matcher import correlate_patches
@@ -106,7 +107,8 @@ class PlaceVerifier:
             fine_m = self._matcher.cell_m(agl_m, FINE_CELL_PER_AGL)
             camera = self._matcher.camera.scaled(min(2.0 * (agl_m / self._matcher.camera.fx) / fine_m, 1.0))
             size = (camera.width, camera.height)
-            self._image, self._reduced_frame = image, (cv2.resize(image, size, interpolation=cv2.INTER_AREA), camera)
+            grey = without_colour(image, self._matcher.gradients)
+            self._image, self._reduced_frame = image, (cv2.resize(grey, size, interpolation=cv2.INTER_AREA), camera)
         return self._reduced_frame
 
     def _pose(

@@ -1,18 +1,28 @@
-"""Spectra compared with NumPy's."""
+"""Cross-correlation compared with NumPy's transforms."""
 
 import numpy as np
 import pytest
 
-from terrafix.anchor.matching.fft import spectra, transform_shape
+from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
 
 
 @pytest.mark.parametrize(("height", "width"), [(90, 90), (33, 64), (1, 7), (250, 121)])
-def test_spectra_equal_numpys_rfft2_with_zero_padding(height: int, width: int) -> None:
-    x = np.random.default_rng(height).normal(size=(3, 2, height, width)).astype(np.float32)
+def test_the_cross_correlation_equals_that_of_numpys_transforms_with_zero_padding(height: int, width: int) -> None:
+    rng = np.random.default_rng(height)
+    image, template = rng.normal(size=(2, 3, height, width)).astype(np.float32)
+    template = template[:, : (height + 1) // 2, : (width + 1) // 2]
     shape = transform_shape(height, width)
     assert shape[0] >= height and shape[1] >= width and shape[0] % 2 == shape[1] % 2 == 0
-    theirs = np.fft.rfft2(x.astype(float), shape)
-    ours = spectra(x, shape)
-    assert ours.dtype == np.complex64 and ours.shape == theirs.shape
-    np.testing.assert_allclose(ours, theirs, atol=1e-6 * np.abs(theirs).max())
-    np.testing.assert_allclose(spectra(x[0, 1], shape), ours[0, 1])
+    theirs = np.fft.irfft2(
+        (np.fft.rfft2(image.astype(float), shape) * np.fft.rfft2(template.astype(float), shape).conj()).sum(0), shape
+    )
+    ours = cross_correlation(spectra(image, shape), spectra(template, shape))
+    assert ours.dtype == np.float32 and ours.shape == shape
+    np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max())
+
+
+def test_the_peak_is_where_the_template_was_cut_from_the_image() -> None:
+    image = np.random.default_rng(1).normal(size=(2, 40, 50)).astype(np.float32)
+    shape = transform_shape(40, 50)
+    surface = cross_correlation(spectra(image, shape), spectra(image[:, 7:20, 11:30], shape))
+    assert np.unravel_index(int(np.argmax(surface)), shape) == (7, 11)

@@ -242,7 +242,7 @@ def test_a_wrong_position_gives_no_pose(matcher: FrameMatcher, frame: np.ndarray
 class Learned:
     """Stand-in for a learned model with coarse cells; counts its calls."""
 
-    name, stride, channels = "xfeat", 8, 16
+    name, stride, channels, grayscale = "xfeat", 8, 16, False
 
     def __init__(self) -> None:
         self.calls = 0
