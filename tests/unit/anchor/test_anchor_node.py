@@ -10,7 +10,7 @@ import pytest
 from anchor_rig import started
 from map_matches import position_of
 from single_map_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
-from terrafix.anchor.matching.frame_matcher import FrameMatcher
+from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher
 from terrafix.anchor.matching.match_message import ground_sigma_m
 from terrafix.anchor.matching.point_mass_filter import Belief
 from terrafix.anchor.node import AnchorNode
@@ -21,7 +21,7 @@ from terrafix.anchor.verification.lock_monitor import LockMonitor
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.pose import PoseFit, world_to_tangent
 from terrafix.map.null_model import DEFAULT_NULL, VERSION, NullModel
-from terrafix.messages import Health, MapMatch, SearchState, SearchStep, ThermalBand, Verdict
+from terrafix.messages import Health, MapMatch, Prediction, SearchState, SearchStep, ThermalBand, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, texture, view
 
@@ -78,6 +78,55 @@ def test_the_belief_moves_by_odometry_while_frames_are_skipped(ground: np.ndarra
         result = match(node, i, 10.0, at_m=at_m, step_m=6.0)
     assert result.verdict is Verdict.ACCEPTED
     assert np.linalg.norm(np.array(position_of(result)) - at_m) < 3.0
+
+
+@pytest.fixture
+def correlated_scales(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Number of scales of the height that each correlation tries, in order."""
+    counts, correlate = list[int](), FrameMatcher.correlate
+
+    def counted(*of: Any) -> CorrelationResult:
+        result = correlate(*of)
+        counts.append(len({h.scale for h in result.hypotheses}))
+        return result
+
+    monkeypatch.setattr(FrameMatcher, "correlate", counted)
+    return counts
+
+
+def at_uncertain_height(frame_id: int, at_m: np.ndarray = TRUE_M, step_m: float = 0.0) -> Prediction:
+    """A prediction whose height is known to 5 %, so that three scales fit it."""
+    return msgspec.structs.replace(predicted(frame_id, 10.0, at_m=at_m, step_m=step_m), agl_sigma_m=0.05 * AGL_M)
+
+
+def test_one_scale_is_correlated_after_a_match_at_the_predicted_scale_and_three_after_a_gap_or_a_miss(
+    ground: np.ndarray, correlated_scales: list[int]
+) -> None:
+    node, frames = started(ground)
+    steps_m = [0.0, 3.0, 3.0, 0.4 * AGL_M, 3.0]
+    for i, (east_m, step_m) in enumerate(zip(np.cumsum(steps_m), steps_m, strict=True)):
+        here_m = TRUE_M + np.array([east_m, 0.0, 0.0])
+        frames.put(i, view(ground, PINHOLE, R, here_m))
+        answer, *_ = node.on(at_uncertain_height(i, here_m, step_m))
+        assert isinstance(answer, MapMatch) and answer.verdict is Verdict.ACCEPTED
+    assert correlated_scales == [3, 1, 1, 3, 1]
+    frames.put(5, np.full_like(view(ground, PINHOLE, R, TRUE_M), 90))  # no texture: a miss
+    frames.put(6, view(ground, PINHOLE, R, here_m))
+    for i in (5, 6):
+        list(node.on(at_uncertain_height(i, here_m)))
+    assert correlated_scales[5:] == [1, 3]
+
+
+def test_three_scales_are_correlated_after_a_match_at_another_scale(
+    ground: np.ndarray, correlated_scales: list[int]
+) -> None:
+    node, frames = started(ground)
+    higher_m = TRUE_M * np.array([1.0, 1.0, 1.08])
+    for i in range(2):
+        frames.put(i, view(ground, PINHOLE, R, higher_m))
+        answer, *_ = node.on(at_uncertain_height(i))
+        assert isinstance(answer, MapMatch) and answer.verdict is Verdict.ACCEPTED
+    assert correlated_scales == [3, 3]
 
 
 def test_a_search_of_a_hot_computer_stays_lost_in_the_frames_that_it_skips(ground: np.ndarray) -> None:

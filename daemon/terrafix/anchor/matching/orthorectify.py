@@ -14,15 +14,15 @@ MAX_GROUND_DISTANCE = 1.6
 # smallest cosine between optical axis and vertical: that limit with a margin for the image corners [tuned]
 MIN_DOWN = 0.3
 # Pixels of the rectified image between two that a lens with distortion is evaluated for; between them it is
-# interpolated, to 0.1 px of the frame for a k1 of -0.3. [measured: test_orthorectify]
+# interpolated, to a twentieth of a rectified pixel for a k1 of -0.2. [measured: test_orthorectify]
 LENS_STEP_PX = 4
 OUTSIDE_PX = -1e6  # of ground behind the camera, so that no interpolated pixel is inside [spec: any far pixel]
 
 
 @dataclass(frozen=True)
 class Rectified:
-    """``image`` (H, W, 3) or (H, W) and ``mask`` (H, W) bool, north-up. The centre of pixel (r, c) lies at east = e_min_m + (c +
-    0.5) gsd, north = n_max_m - (r + 0.5) gsd, relative to the point below the camera."""
+    """``image`` (H, W, 3), or (H, W) if grey, and ``mask`` (H, W) bool, north-up. The centre of pixel (r, c) lies at
+    east = e_min_m + (c + 0.5) gsd, north = n_max_m - (r + 0.5) gsd, relative to the point below the camera."""
 
     image: np.ndarray
     mask: np.ndarray
@@ -54,9 +54,9 @@ def rectify(
     stride: int = 1,
     blurred: dict[float, Image] | None = None,
 ) -> Rectified | None:
-    """Projects ``image``, in colour or grey, on flat ground ``agl_m`` below the camera. Sides are multiples of ``stride`` pixels.
-    ``blurred``: cache of blurred copies of the image by scale factor, shared between yaw hypotheses. None: no ground is
-    visible."""
+    """Projects ``image``, in colour or grey, on flat ground ``agl_m`` below the camera. Sides are multiples of
+    ``stride`` pixels. ``blurred``: cache of blurred copies of the image by scale factor, shared between yaw hypotheses.
+    None: no ground is visible."""
     box = footprint(camera, r_w_c, agl_m)
     if box is None:
         return None

@@ -84,3 +84,35 @@ def test_an_oblique_view_has_a_bounded_footprint() -> None:
     flat = rectify(image, PINHOLE, rotation(0.0, 60.0), 100.0, GSD_M)
     assert flat is not None
     assert max(flat.mask.shape) <= 2 * 1.6 * 100.0 / GSD_M + 1
+
+
+@pytest.mark.parametrize("attitude", ATTITUDES)
+def test_the_lens_between_the_evaluated_pixels_is_interpolated_to_a_twentieth_of_a_pixel(
+    attitude: tuple[float, ...],
+) -> None:
+    camera = CameraCalibration(1280, 720, 760.0, 760.0, 640.0, 360.0, radial_k1=-0.2)
+    columns, rows = np.meshgrid(np.arange(1280, dtype=np.float32), np.arange(720, dtype=np.float32))
+    gsd_m, agl_m, r_w_c = 0.9, 90.0, rotation(*attitude)
+    where = [rectify(pixels, camera, r_w_c, agl_m, gsd_m) for pixels in (columns, rows)]
+    shown = where[0]
+    assert shown is not None and where[1] is not None
+    h, w = shown.mask.shape
+    x, y = np.meshgrid(np.arange(w), np.arange(h))
+    ground = np.column_stack([shown.e_min_m + (x.ravel() + 0.5) * gsd_m, shown.n_max_m - (y.ravel() + 0.5) * gsd_m])
+    px = camera.project(np.column_stack([ground, np.full(w * h, -agl_m)]) @ r_w_c).reshape(h, w, 2)
+    inner = cv2.erode(shown.mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    off_px = np.hypot(shown.image - px[..., 0], where[1].image - px[..., 1])[inner]
+    assert inner.sum() > 2000
+    assert off_px.max() * (agl_m / camera.fx) / gsd_m < 0.05
+
+
+def test_ground_behind_the_camera_is_not_inside_of_the_frame() -> None:
+    tilted = rotation(0.0, -60.0, -50.0)  # a corner of the bounding box of its ground lies behind it
+    flat = rectify(np.full((360, 640, 3), 200, np.uint8), LENS, tilted, 90.0, 2.0)
+    assert flat is not None
+    h, w = flat.mask.shape
+    x, y = np.meshgrid(np.arange(w), np.arange(h))
+    ground = np.column_stack([flat.e_min_m + (x.ravel() + 0.5) * 2.0, flat.n_max_m - (y.ravel() + 0.5) * 2.0])
+    depth = (np.column_stack([ground, np.full(w * h, -90.0)]) @ tilted)[:, 2].reshape(h, w)
+    assert (depth <= 0).any() and not flat.mask[depth <= 0].any()
+    assert flat.mask.any()
