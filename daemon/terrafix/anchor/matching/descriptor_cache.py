@@ -96,6 +96,7 @@ class MapFeatures:
             tile = self._computed(gsd_m, tx, ty, cell, per_tile)
             if self._store is not None:
                 self._store.write(name, *tile)
+        tile = tile[0].astype(np.float32), tile[1]  # once for each tile, not for each window
         self._tiles[key] = tile
         self._bytes += tile[0].nbytes + tile[1].nbytes
         while self._bytes > self._max_bytes and len(self._tiles) > 1:

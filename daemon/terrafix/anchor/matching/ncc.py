@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
+from terrafix.anchor.matching.fft import cross_correlation, each_correlation, spectra, transform_shape
 
 MIN_OVERLAP = 0.8  # share of the template that must lie on valid map data; with less, the cell is NaN [tuned]
 # lower bound of the map's variance as a share of the template's, so that water and fields without texture are not
@@ -50,6 +50,7 @@ class _LocalSums:
     def __init__(self, descriptors: np.ndarray, valid: np.ndarray | None) -> None:
         """``descriptors`` (C, H, W) float32; ``valid`` (H, W) bool, None: everywhere."""
         layers = [*descriptors, np.einsum("khw,khw->hw", descriptors, descriptors)]
+        self._is_valid_everywhere = valid is None
         if valid is not None:
             layers.append(valid.astype(np.float32))
         halved = np.stack([_halved(layer, cv2.BORDER_REPLICATE) for layer in layers])
@@ -62,13 +63,13 @@ class _LocalSums:
         squared deviations from their mean; share of the template on valid map data, None: 1 everywhere."""
         mask = spectra(_halved(weight, cv2.BORDER_CONSTANT)[None], self._fft_shape)
         # a sum of products of means is a quarter of the sum of products
-        sums = [4.0 * cross_correlation(layer[None], mask) for layer in self._spectra]
+        sums = 4.0 * each_correlation(self._spectra, mask)
         count = float(weight.sum())
-        variance = sums[self._channels]
-        for channel in sums[: self._channels]:
-            variance -= channel**2 / count
-        overlap = sums[-1] / count if len(sums) > self._channels + 1 else None
-        return _doubled(variance, rows, columns), None if overlap is None else _doubled(overlap, rows, columns)
+        variance = (
+            sums[self._channels] - np.einsum("khw,khw->hw", sums[: self._channels], sums[: self._channels]) / count
+        )
+        overlap = None if self._is_valid_everywhere else _doubled(sums[self._channels + 1] / count, rows, columns)
+        return _doubled(variance, rows, columns), overlap
 
 
 def _halved(layer: np.ndarray, border: int) -> np.ndarray:

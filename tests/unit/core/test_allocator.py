@@ -1,0 +1,38 @@
+"""Allocator of the C library: freed blocks are used again without page faults."""
+
+import resource
+import subprocess
+import sys
+
+import pytest
+
+FAULTS = """
+import resource
+{first}
+import numpy as np
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        held = [np.ones(1_250_000) for _ in range(6)]  # 60 MB, 14648 pages
+        del held
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+faults()
+print(faults())
+"""
+
+
+def page_faults(first: str) -> int:
+    """-> page faults of 20 times six temporary arrays of 10 MB in a new process that begins with the statement ``first``."""
+    done = subprocess.run(
+        [sys.executable, "-c", FAULTS.format(first=first)], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(sys.platform != "linux" or resource.getpagesize() != 4096, reason="counts pages of 4 kB of glibc")
+def test_arrays_of_a_frame_are_allocated_without_page_faults_once_terrafix_is_imported() -> None:
+    assert page_faults("import terrafix") < 500
+    assert page_faults("") > 5_000  # else this test cannot fail
