@@ -24,7 +24,7 @@ print(faults())
 
 
 def page_faults(first: str) -> int:
-    """-> page faults of 20 times six temporary arrays of 10 MB in a new process that begins with the statement ``first``."""
+    """-> page faults of 20 times six temporary arrays of 10 MB in a new process, after the statement ``first``."""
     done = subprocess.run(
         [sys.executable, "-c", FAULTS.format(first=first)], capture_output=True, text=True, timeout=60
     )

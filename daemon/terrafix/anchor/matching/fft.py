@@ -7,7 +7,7 @@ a third of NumPy's (90 x 90 cells, 8 channels)."""
 import cv2
 import numpy as np
 
-# Sides are multiples of it: Intel's transforms take a fifth less for 96 cells than for 90 or 81.
+# Sides are multiples of it: Intel's transforms take less time for 96 cells than for 90 or 81. [measured: 17, 20, 20 us]
 SIDE_MULTIPLE = 8
 
 
