@@ -130,6 +130,7 @@ PROCESSES: tuple[Process, ...] = (
         ),
         0.0,
         20.0,
+        (m.Odometry,),  # a frame that waits while a newer one is there only delays that one
     ),
     Process(
         "anchor",

@@ -6,7 +6,7 @@ from typing import cast
 
 import msgspec
 
-from terrafix.messages import Message, Origin, Prediction, SourceEnded
+from terrafix.messages import Message, Odometry, Origin, Prediction, SourceEnded
 
 CAPACITY = 2000  # messages; about 10 s of all messages that the busiest process receives
 NEVER_DROPPED: tuple[type[Message], ...] = (Origin, SourceEnded)  # published once a flight
@@ -22,13 +22,19 @@ def merge_predictions(older: Message, newer: Message) -> Message:
     return msgspec.structs.replace(b, step_m=step_m, step_cov_m2=(cov[0], cov[1], cov[2], cov[3]))
 
 
+def is_needed(message: Message) -> bool:
+    """Whether a message is kept although a newer one of its type is in the queue: a keyframe, to which the odometry of
+    later frames refers."""
+    return isinstance(message, Odometry) and message.becomes_keyframe
+
+
 # How two messages of a type of which only the newest is kept are merged. Without an entry the older one is dropped.
 MERGES: dict[type[Message], Callable[[Message, Message], Message]] = {Prediction: merge_predictions}
 
 
 class Inbox:
     """First in, first out. ``skipped`` counts messages that were dropped at ``capacity`` or replaced by a newer message
-    of a type in ``newest``, by type name."""
+    of a type in ``newest`` (unless ``is_needed``), by type name."""
 
     def __init__(self, newest: tuple[type[Message], ...] = (), capacity: int = CAPACITY) -> None:
         self._queue: deque[Message] = deque()
@@ -52,7 +58,7 @@ class Inbox:
     def _replace(self, message: Message) -> Message:
         kind = type(message)
         for i, older in enumerate(self._queue):
-            if type(older) is kind:
+            if type(older) is kind and not is_needed(older):
                 del self._queue[i]
                 self.skipped[kind.__name__] += 1
                 merge = MERGES.get(kind)

@@ -20,7 +20,7 @@ from terrafix.messages import Health, Message, SourceEnded
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_configured
 
-QUEUE_SHOTS = 3  # shots with pixels; a frame that waits behind more than these is too old to be useful
+QUEUE_SHOTS = 3  # shots with pixels that are read ahead from a recording that is not played in real time
 MAX_DROPPED_MESSAGES = 1024  # dropped frames and their telemetry, without pixels; 20 s at 50 Hz
 MAX_LATE_NS = 2_000_000_000  # a recording that lags real time by more than this skips ahead
 DROPPED_ERROR = "overtaken: a newer frame was there first"
@@ -148,7 +148,7 @@ class SourceEdge:
                 self._changed.wait_for(lambda: len(self._shots) < QUEUE_SHOTS or self._stopping.is_set())
             self._count += 1
             self._shots.append(shot)
-            if len(self._shots) > QUEUE_SHOTS:
+            if len(self._shots) > 1 and (self._realtime or self._source.live):  # the newest first, and it alone
                 old = self._shots.popleft()
                 self._dropped.extend((*old.imu, *old.states))
                 self._dropped.append(msgspec.structs.replace(old.frame, error=old.frame.error or DROPPED_ERROR))

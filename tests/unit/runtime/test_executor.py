@@ -135,6 +135,21 @@ def test_queued_predictions_are_merged_into_the_newest_without_loss_of_motion() 
     assert inbox.skipped == {"Prediction": 2}
 
 
+def odometry(frame_id: int, *, keyframe: bool = False) -> m.Odometry:
+    return m.Odometry(
+        t_ns=frame_id, frame_id=frame_id, keyframe_id=0, verdict=m.Verdict.ACCEPTED, becomes_keyframe=keyframe
+    )
+
+
+def test_queued_odometry_gives_way_to_a_newer_frame_unless_it_is_of_a_keyframe() -> None:
+    inbox = Inbox(newest=(m.Odometry,))
+    waiting = [odometry(1), odometry(2, keyframe=True), odometry(3), frame(3), odometry(4), odometry(5)]
+    for message in waiting:
+        inbox.put(message)
+    assert [inbox.take() for _ in range(4)] == [odometry(2, keyframe=True), frame(3), odometry(5), None]
+    assert inbox.skipped == {"Odometry": 3}
+
+
 def test_a_full_inbox_drops_and_counts_the_oldest_messages_except_the_origin() -> None:
     inbox = Inbox(capacity=3)
     inbox.put(ORIGIN)

@@ -107,7 +107,7 @@ def test_the_newest_frame_is_delivered_and_dropped_frames_are_published_with_an_
     listener.until(listener.ended)
     assert [f.frame_id for f in listener.frames] == list(range(10))
     whole = [f.frame_id for f in listener.frames if not f.error]
-    assert len(whole) <= 5 and whole[-3:] == [7, 8, 9]
+    assert whole == [0, 9]
     assert {f.error for f in listener.frames} == {"", DROPPED_ERROR}
     times = [m.t_ns for m in listener.messages[1:-1]]
     assert times == sorted(times)

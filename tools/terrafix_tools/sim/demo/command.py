@@ -18,7 +18,7 @@ from terrafix_tools.report.gather import gather
 from terrafix_tools.report.page import report
 from terrafix_tools.sim.autopilot.verdict import gps_input_failure, key_figures
 from terrafix_tools.sim.demo.flight import fly
-from terrafix_tools.sim.flights.folder import Flight, add_telemetry, plan_flight, write_flight
+from terrafix_tools.sim.flights.folder import FRAME_HZ, Flight, add_telemetry, plan_flight, write_flight
 from terrafix_tools.sim.out_folder import prepare_folder, write_json
 from terrafix_tools.sim.world import place as world
 from terrafix_tools.sim.world.mapped import CAMERA_SEASON, write_map
@@ -48,7 +48,7 @@ def demo(out: Path, *, seed: int, duration_s: float) -> int:
     began_s = time.perf_counter()
     console = Console()
     prepare_folder(out, MARKER_FILE, {"seed": seed, "duration_s": duration_s})
-    generated = _generate(out, seed, duration_s, console)
+    generated = generate(out, seed, duration_s, console)
     exit_code, peer = fly(generated.flight, generated.folder, generated.map_path, out, seed=seed, console=console)
     peer.write(out / "peer.json")
     if exit_code != 0:
@@ -77,13 +77,14 @@ def demo(out: Path, *, seed: int, duration_s: float) -> int:
     return 0
 
 
-def _generate(out: Path, seed: int, duration_s: float, console: Console) -> Generated:
+def generate(out: Path, seed: int, duration_s: float, console: Console, frame_hz: float = FRAME_HZ) -> Generated:
+    """Writes map.gpkg and flight/ into ``out``. Raises OutputError."""
     map_path, folder = out / "map.gpkg", out / "flight"
     with console.status("generating a place and its summer map"):
         place = world.generate(seed)
         write_map(place, map_path)
     with console.status("rendering the place in autumn for the camera"):
-        flight = plan_flight(place, place.render(CAMERA_SEASON), duration_s)
+        flight = plan_flight(place, place.render(CAMERA_SEASON), duration_s, frame_hz)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task("the camera", total=len(flight.frame_times_s()))

@@ -6,7 +6,7 @@ The vehicle flies on the truth; ``telemetry.tlog`` is the telemetry of its autop
 import csv
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -73,20 +73,21 @@ class Flight:
     start_wgs84: tuple[float, float]  # start given by the pilot: near the position at time zero
     ground_amsl_m: float  # under the start: zero of the reported height
     duration_s: float
+    frame_hz: float = FRAME_HZ  # of the camera
 
     def frame_times_s(self) -> np.ndarray:
         """Exposure times, from zero."""
-        return np.arange(math.floor(self.duration_s * FRAME_HZ + 1e-6)) / FRAME_HZ
+        return np.arange(math.floor(self.duration_s * self.frame_hz + 1e-6)) / self.frame_hz
 
     def camera_pose(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Returns p_c_in_w_m (3,) and R_w_c (3, 3)."""
         return state.p_b_in_w_m, state.r_w_b() @ Mount.of(CAMERA).r_b_c()
 
 
-def plan_flight(place: World, camera_image_bgr: np.ndarray, duration_s: float) -> Flight:
+def plan_flight(place: World, camera_image_bgr: np.ndarray, duration_s: float, frame_hz: float = FRAME_HZ) -> Flight:
     """Plans a fixed-wing flight on a closed course over a generated place, in the season of ``camera_image_bgr``."""
     scene = scene_of_world(place, camera_image_bgr)
-    return flight_over(scene, seed=place.seed, duration_s=duration_s)
+    return replace(flight_over(scene, seed=place.seed, duration_s=duration_s), frame_hz=frame_hz)
 
 
 def mission_over(
