@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.errors import EvaluationError, OutputError
+from terrafix.core.toml_file import read_toml
 from terrafix.recorder.reader import ReadResult, check_format, is_record, read_flight
 from terrafix_tools.estimates import ESTIMATES, Row, RowTable, number, read_rows, read_table
 from terrafix_tools.finalise.output import TABLE as FINALISED
@@ -175,7 +176,7 @@ def finalised_metrics(rows: list[Row], truth: dict[str, Truth]) -> dict[str, Any
 def truth_sigma_of(truth_path: Path) -> float | None:
     """Reads [truth] sigma_m of the flight.toml next to truth.csv; None when there is none."""
     try:
-        table = tomllib.loads((truth_path.parent / "flight.toml").read_text(encoding="utf-8"))
+        table = read_toml(truth_path.parent / "flight.toml")
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
         return None
     section = table.get("truth")

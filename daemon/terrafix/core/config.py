@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from terrafix.core.errors import ConfigError
+from terrafix.core.toml_file import read_toml
 
 Positive = Annotated[float, Meta(gt=0)]
 OutputName = Literal["gps_input", "odometry", "vision_position", "external_position", "global_position"]
@@ -123,7 +124,7 @@ def load(paths: list[Path]) -> Config:
 
 def _read(path: Path) -> dict[str, object]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return read_toml(path)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such configuration file; check the path given to --config") from None
     except (OSError, UnicodeDecodeError) as error:

@@ -179,6 +179,19 @@ def test_a_damaged_frame_loses_one_frame_only(tmp_path: Path, damage, expected_t
     assert shots[2].states
 
 
+def test_a_link_to_an_image_outside_of_the_folder_is_an_error_and_frames_itself_may_be_a_link(tmp_path: Path) -> None:
+    folder = flight(tmp_path / "f")
+    elsewhere = tmp_path / "disk"
+    (folder / "frames").rename(elsewhere)
+    (folder / "frames").symlink_to(elsewhere)
+    assert all(shot.image is not None for shot in open_source(str(folder)).shots())
+    secret = tmp_path / "secret.jpg"
+    (elsewhere / "0002.jpg").rename(secret)
+    (elsewhere / "0002.jpg").symlink_to(secret)
+    with pytest.raises(SourceError, match=r"row 4: frames/0002.jpg is a link that leaves frames/"):
+        open_source(str(folder))
+
+
 def test_a_camera_size_mismatch_is_reported_before_the_flight(tmp_path: Path) -> None:
     toml = TOML.replace("width = 320", "width = 640").replace("height = 240", "height = 480")
     with pytest.raises(SourceError) as error:

@@ -1,5 +1,7 @@
 """Large images are downscaled when they are read: the same rays, the same errors, a fraction of the memory."""
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -85,3 +87,29 @@ def test_the_frame_store_keeps_fewer_large_frames() -> None:
     for i in range(7):
         store.put(i, np.zeros((4168, 6252, 3), np.uint8))
     assert [i for i in range(7) if store.get(i) is not None] == list(range(7 - MIN_SLOTS, 7))
+
+
+def png_that_states(width: int, height: int) -> bytes:
+    """A PNG of 100 bytes whose header states a size."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    pixels = zlib.compress(bytes(1000))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+def test_an_image_that_states_another_size_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def decoded(*_: object) -> None:
+        raise AssertionError("the pixels were decoded")
+
+    monkeypatch.setattr(cv2, "imdecode", decoded)
+    image, error = decode_image(png_that_states(12_000, 10_000), WIDTH, HEIGHT, 2)
+    assert image is None and error == f"wrong size: 12000x10000, the camera says {WIDTH}x{HEIGHT}"
+
+
+@pytest.mark.parametrize("side", [20_000, 100_000])
+def test_an_image_larger_than_any_camera_gives_is_not_decoded(side: int) -> None:
+    image, error = decode_image(png_that_states(side, side), side, side, 8)
+    assert image is None and "cannot be decoded" in error

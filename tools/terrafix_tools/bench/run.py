@@ -10,7 +10,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
+from terrafix.core.toml_file import read_toml
 from terrafix.recorder.provenance import device, versions
 from terrafix_tools.bench import baseline as bench_baseline
 from terrafix_tools.bench import flights as bench_run
@@ -123,7 +123,7 @@ def _prepare(data: Path, name: str, work: Path, frames: int | None, console: Con
             flight, package = _generate(work, GENERATED_S if frames is None else min(GENERATED_S, frames / FRAME_HZ))
     else:
         flight = (data / "flights" / name).resolve()
-        table = tomllib.loads((flight / "flight.toml").read_text(encoding="utf-8"))
+        table = read_toml(flight / "flight.toml")
         if "map" not in table:
             raise SourceError(f"{flight / 'flight.toml'}: names no map, and the benchmark needs one")
         package = ensure_package(flight / str(table["map"]), map_cache_dir(), progress=True)

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from terrafix.core.errors import SourceError
+from terrafix.core.toml_file import read_toml
 from terrafix.messages import Camera, Origin
 from terrafix.vision.sources.plausible import check_camera
 
@@ -104,7 +105,7 @@ class Description(_Table, frozen=True, kw_only=True):
 def read_description(path: Path) -> Description:
     """Reads and validates a file. Raises SourceError: missing or broken file, unknown key, value out of bounds."""
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        table = read_toml(path)
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; docs/flight-folder.md shows what belongs in it") from None
     except (OSError, UnicodeDecodeError) as error:

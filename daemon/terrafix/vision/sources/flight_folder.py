@@ -73,6 +73,7 @@ class FlightFolder:
         table, frames = self.folder / "frames.csv", self.folder / "frames"
         if not frames.is_dir():
             raise SourceError(f"{frames}: no such folder; the images that frames.csv names belong in it")
+        inside = frames.resolve()  # frames/ itself may be a link, to a larger disk
         for row in self._rows:
             parts = PurePosixPath(row.file.replace("\\", "/"))
             if parts.is_absolute() or ".." in parts.parts:
@@ -81,6 +82,10 @@ class FlightFolder:
                 raise SourceError(
                     f"{table} row {row.number}: frames/{row.file} does not exist{_count_missing(frames, self._rows)}; "
                     "add the image or remove the row"
+                )
+            if not (frames / row.file).resolve().is_relative_to(inside):
+                raise SourceError(
+                    f"{table} row {row.number}: frames/{row.file} is a link that leaves frames/; copy the image there"
                 )
 
     def _check_size(self) -> None:

@@ -4,12 +4,16 @@ OpenCV decodes a truncated JPEG without an error and fills the rest with grey; s
 part of its ground is not real. So the JPEG segments are parsed up to the end marker, and the result is checked for
 grey fill."""
 
+import io
 import re
+import warnings
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
+from PIL import Image as HeaderReader
+from PIL import UnidentifiedImageError
 
 from terrafix.messages import Camera
 
@@ -64,6 +68,10 @@ def decode_image(data: bytes, width: int, height: int, by: int = 1) -> tuple[np.
     """Same as ``read_image``, for the bytes of a file and a downscale factor ``by`` of 1, 2, 4 or 8."""
     if not data:
         return None, "file is empty"
+    # Before the pixels are decoded: a file of 100 kB may state a size whose pixels take gigabytes.
+    stated = stated_size(data)
+    if stated is not None and stated != (width, height):
+        return None, f"{WRONG_SIZE}: {stated[0]}x{stated[1]}, the camera says {width}x{height}"
     jpeg = data[:2] == b"\xff\xd8"
     if jpeg and not jpeg_is_complete(data):
         return None, "truncated JPEG: the end of the image is missing"
@@ -84,6 +92,17 @@ def decode_image(data: bytes, width: int, height: int, by: int = 1) -> tuple[np.
         padded = cv2.copyMakeBorder(image, 0, -height % by, 0, -width % by, cv2.BORDER_REPLICATE)
         image = cv2.resize(padded, None, fx=1 / by, fy=1 / by, interpolation=cv2.INTER_AREA)
     return image, ""
+
+
+def stated_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) in the header of an image file; None: its header cannot be read."""
+    try:
+        with warnings.catch_warnings(action="ignore"), HeaderReader.open(io.BytesIO(data)) as header:
+            return header.size
+    except HeaderReader.DecompressionBombError:
+        return None  # larger than OpenCV decodes (terrafix/__init__.py)
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+        return None  # Pillow raises these for broken headers
 
 
 def _ends_in_grey_fill(image: np.ndarray, block: int) -> bool:

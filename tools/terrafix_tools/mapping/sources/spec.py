@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 
 from terrafix.core.errors import ConfigError, UsageError
+from terrafix.core.toml_file import read_toml
 from terrafix_tools.mapping.fetching.pace import USER_AGENT, Limits
 from terrafix_tools.mapping.sources.tiles.grid import MAX_ZOOM
 from terrafix_tools.mapping.sources.tiles.url_template import UrlTemplate
@@ -78,7 +79,7 @@ def parse_sources(
 def read_sources(path: Path) -> list[SourceSpec]:
     """Reads a source file. Raises ConfigError. Paths in the file are relative to it."""
     try:
-        parsed = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
+        parsed = msgspec.convert(read_toml(path), _File)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; check --sources") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from terrafix.core.errors import SourceError
+from terrafix.core.toml_file import read_toml
 
 NotNegative = Annotated[float, Meta(ge=0.0)]
 
@@ -59,7 +60,7 @@ def read_events(path: Path) -> tuple[AnyEvent, ...]:
     SourceError.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = read_toml(path)
         read = msgspec.convert(table, _File)
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; check --events") from None

@@ -18,6 +18,7 @@ from rasterio.errors import RasterioError
 from rasterio.io import MemoryFile
 
 from terrafix.core.errors import MapError, UsageError
+from terrafix.core.toml_file import read_toml
 from terrafix_tools.mapping.fetching.fetch import Client, Damaged, FetchError
 from terrafix_tools.mapping.fetching.pace import Limits
 
@@ -60,7 +61,7 @@ def read_credentials(file: Path = CREDENTIALS_FILE) -> Credentials:
     if path.stat().st_mode & 0o077:
         raise UsageError(f"{file}: others can read this secret; run: chmod 600 {file}")
     try:
-        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Credentials)
+        return msgspec.convert(read_toml(path), Credentials)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
         raise UsageError(f"{file}: {error}; it has two lines: client_id = '...' and client_secret = '...'") from None
 
