@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafix import __version__
 from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
 from terrafix_tools.compare.cli import compare
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 # optional packages of the extra `ground`; not installed on a vehicle
 GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog")
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Position without GNSS: a camera and a map.")
+app = typer.Typer(no_args_is_help=True)
 app.add_typer(map_app, name="map")
 app.add_typer(models_app, name="models")
 app.add_typer(log_app, name="log")
@@ -42,6 +43,24 @@ app.command()(montecarlo)
 
 StartOption = Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")]
 ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from terrafix.recorder.provenance import git_describe
+
+        commit = git_describe()
+        typer.echo(f"terrafix {__version__}{f' ({commit})' if commit else ''}, Python {sys.version.split()[0]}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Position without GNSS: a camera and a map."""
 
 
 @app.command()
