@@ -5,6 +5,7 @@ engine only if it was built before."""
 
 import functools
 import hashlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +161,7 @@ class Model:
 
         options = ort.SessionOptions()
         options.log_severity_level = 3
+        options.intra_op_num_threads = len(os.sched_getaffinity(0))  # by default as many as the computer has cores
         # Threads that spin after a run take CPU time from the estimator and the link.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         # ONNX Runtime's own fallback is silent; this class selects and reports the provider instead.

@@ -92,6 +92,10 @@ class Source(Section, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0  # frames per second taken from a video or a camera
 
 
+class RuntimeSection(Section, frozen=True, kw_only=True):
+    cores: Annotated[int, Meta(ge=0, le=256)] = 0
+
+
 class LogSection(Section, frozen=True, kw_only=True):
     level: Literal["DEBUG", "INFO", "WARN", "ERROR"] = "INFO"
 
@@ -104,6 +108,7 @@ class Config(Section, frozen=True, kw_only=True):
     link: LinkSection = LinkSection()
     recorder: RecorderSection = RecorderSection()
     health: HealthSection = HealthSection()
+    runtime: RuntimeSection = RuntimeSection()
     log: LogSection = LogSection()
 
 

@@ -18,6 +18,7 @@ from terrafix.core.errors import TerrafixError
 from terrafix.core.frames import SharedFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import Frame
+from terrafix.runtime.core_budget import limit_cores
 from terrafix.runtime.executor import run_process
 from terrafix.runtime.fork_server import FIELD_SEPARATOR, TRACEBACK_SIGNAL, set_parent_death_signal
 from terrafix.runtime.run_dir import RunDir
@@ -64,6 +65,7 @@ def run(name: str, run_dir: RunDir) -> int:
     faulthandler.register(TRACEBACK_SIGNAL, all_threads=True)
     spec = msgspec.json.decode(run_dir.spec.read_bytes(), type=Spec)
     logs.configure(spec.config.log.level, name)
+    limit_cores(spec.config.runtime.cores)  # before the node and its libraries are imported
     table = table_of(spec)
     process = next(p for p in table if p.name == name)
     ctx = NodeContext(

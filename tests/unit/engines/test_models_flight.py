@@ -154,3 +154,14 @@ def test_a_model_that_cannot_be_opened_is_an_error_on_the_ground_and_skipped_in_
     (event,) = make_node(context(5)).on(STARTED)
     assert isinstance(event, ModelEvent)
     assert (event.change, event.model) == (ModelChange.GIVEN_UP, "gradient") and "cannot be run" in event.detail
+
+
+def test_a_model_runs_on_as_many_threads_as_the_process_has_cores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiny_onnx.write(tmp_path, tiny_onnx.XFEAT_LIKE, tiny_onnx.xfeat_like())
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {3, 5, 7})
+    describer = open_describer("tiny", str(tmp_path))
+    assert isinstance(describer, XFeatDescriber)
+    options = [session.get_session_options() for session in describer.model._sessions.values()]
+    assert [one.intra_op_num_threads for one in options] == [3]

@@ -40,14 +40,16 @@ def children_find_the_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 class Flight:
     """A supervised run of the test table in a thread of this process."""
 
-    def __init__(self, folder: Path, frames: int, *, link: str = "", stop_after_source: bool = False) -> None:
+    def __init__(
+        self, folder: Path, frames: int, *, link: str = "", stop_after_source: bool = False, more_config: str = ""
+    ) -> None:
         self.out_dir = folder / "out"
         self.log = folder / "log.jsonl"
         self.events: list[m.ProcessEvent] = []
         self.code: int | None = None
         self._stop = threading.Event()
         config = folder / "test.toml"
-        config.write_text(f"[link]\nbaud = {9600 + frames}\n")
+        config.write_text(f"[link]\nbaud = {9600 + frames}\n{more_config}")
         self._thread = threading.Thread(target=self._run, args=(config, link, stop_after_source))
         self._thread.start()
 
@@ -368,3 +370,11 @@ def test_sd_notify_without_systemd_has_no_effect(monkeypatch: pytest.MonkeyPatch
     sd_notify("READY=1")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
     sd_notify("READY=1")
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="a budget below one core cannot be shown on one core")
+def test_all_processes_keep_to_the_cores_of_the_budget(tmp_path: Path) -> None:
+    first = min(os.sched_getaffinity(0))
+    with flight(tmp_path, more_config="[runtime]\ncores = 1\n") as f:
+        eventually(lambda: len([e for e in f.events if e.event == "started"]) == len(TABLE), within_s=10)
+        eventually(lambda: all(os.sched_getaffinity(f.pid(process.name)) == {first} for process in TABLE), within_s=10)
