@@ -192,6 +192,18 @@ def test_a_link_to_an_image_outside_of_the_folder_is_an_error_and_frames_itself_
         open_source(str(folder))
 
 
+def test_an_image_behind_a_linked_folder_outside_of_frames_is_an_error(tmp_path: Path) -> None:
+    folder = flight(tmp_path / "f")
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (folder / "frames" / "0002.jpg").rename(outside / "0002.jpg")
+    (folder / "frames" / "more").symlink_to(outside)
+    table = folder / "frames.csv"
+    table.write_text(table.read_text().replace("0002.jpg", "more/0002.jpg"))
+    with pytest.raises(SourceError, match=r"frames/more/0002.jpg is a link that leaves frames/"):
+        open_source(str(folder))
+
+
 def test_a_camera_size_mismatch_is_reported_before_the_flight(tmp_path: Path) -> None:
     toml = TOML.replace("width = 320", "width = 640").replace("height = 240", "height = 480")
     with pytest.raises(SourceError) as error:
