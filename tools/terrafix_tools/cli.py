@@ -20,6 +20,7 @@ from terrafix_tools.models.cli import app as models_app
 from terrafix_tools.montecarlo.cli import montecarlo
 from terrafix_tools.preflight.cli import preflight
 from terrafix_tools.sim.cli import app as sim_app
+from terrafix_tools.status.cli import status
 
 if TYPE_CHECKING:
     from terrafix.runtime.fork_server import ForkServer
@@ -38,6 +39,7 @@ app.command()(compare)
 app.command()(finalise)
 app.command()(locate)
 app.command()(preflight)
+app.command()(status)
 app.command(context_settings=CONTEXT)(hint)
 app.command()(montecarlo)
 

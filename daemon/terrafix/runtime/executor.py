@@ -125,7 +125,7 @@ class LiveShell:
         opens_source = Origin in process.publishes
         # The subscribers that the process which opens the source waits for before it starts.
         self._required = [p.name for p in table if opens_source and Origin in p.subscribes and p is not process]
-        self._is_recorded = any(Dropped in p.subscribes and p is not process for p in table)
+        self._is_recorded = any(InputOrder in p.subscribes and p is not process for p in table)
         self._publisher = Publisher(context, endpoints.address(process.name))
         self._subscriber = Subscriber(context, [endpoints.address(s) for s in publishers], process.subscribes)
         self._inbox = Inbox(process.newest)
@@ -227,9 +227,9 @@ class LiveShell:
             self._poller.poll(-((now - until) // 1_000_000))  # ms, rounded up: to wake up early would be useless
 
     def _wait_for_recorder(self, stopping: Callable[[], bool]) -> None:
-        """All processes publish Dropped, and the process that subscribes to it is the recorder."""
+        """The process that subscribes to InputOrder is the recorder; an observer such as `terrafix status` does not."""
         until = now_ns() + (RECORDER_WAIT_NS if self._is_recorded else 0)
-        while self._publisher.subscriptions(Dropped) == 0 and now_ns() < until and not stopping():
+        while self._publisher.subscriptions(InputOrder) == 0 and now_ns() < until and not stopping():
             self._publisher.serve()
             self._poller.poll(1)
 

@@ -324,7 +324,7 @@ def test_a_started_process_waits_for_the_recorder_so_that_its_first_message_is_r
     thread.start()
     try:
         time.sleep(late_s or 0.5)
-        recorder = Subscriber(context, [run_dir.address("started")], (m.Frame, m.Dropped))
+        recorder = Subscriber(context, [run_dir.address("started")], (m.Frame, m.InputOrder))
         arrived = recorder.socket.poll(1000)
         assert [*recorder.receive()] == ([frame(1)] if late_s else []), "without a recorder it goes on"
         assert not late_s or (arrived and time.monotonic() - began_s < 1.0)

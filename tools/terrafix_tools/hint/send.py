@@ -1,14 +1,11 @@
 """Sends an operator's position prior to the processes on this computer over their bus, and returns the result."""
 
-import os
-from pathlib import Path
-
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import LinkError, UsageError
 from terrafix.messages import HintVerdict, PositionHint
 from terrafix.processes import PROCESSES
 from terrafix.runtime.cli_client import Operator
-from terrafix.runtime.run_dir import RunDir, live_runs
+from terrafix_tools.run_choice import chosen_run
 
 SUBSCRIBERS = [process.name for process in PROCESSES if PositionHint in process.subscribes]
 SUBSCRIBE_TIMEOUT_S = (
@@ -26,9 +23,7 @@ def hint(lat_deg: float, lon_deg: float, radius_m: float, run: str = "") -> str:
         raise UsageError(f"{lat_deg:g}, {lon_deg:g} is no place; give latitude and longitude in degrees")
     if not RADIUS_M[0] <= radius_m <= RADIUS_M[1]:
         raise UsageError(f"--radius {radius_m:g}: choose {RADIUS_M[0]:.0f} to {RADIUS_M[1]:.0f} metres")
-    run_dir = _run_dir(run)
-    if not os.access(run_dir.path, os.W_OK | os.X_OK):
-        raise LinkError(f"{run_dir.path} belongs to another user; run this command as that user")
+    run_dir = chosen_run(run)
     prior = PositionHint(t_ns=now_ns(), lat_deg=lat_deg, lon_deg=lon_deg, radius_m=radius_m, source="command line")
     with Operator(run_dir, replies=HintVerdict, replier="anchor") as operator:
         if not operator.wait_for_subscribers(PositionHint, len(SUBSCRIBERS), SUBSCRIBE_TIMEOUT_S):
@@ -40,18 +35,3 @@ def hint(lat_deg: float, lon_deg: float, radius_m: float, run: str = "") -> str:
             if isinstance(answer, HintVerdict) and answer.hint_t_ns == prior.t_ns:
                 return answer.text
     return f"accepted; no frame arrived within {ANSWER_S:.0f} s, it applies to the next one"
-
-
-def _run_dir(run: str) -> RunDir:
-    if run:
-        if not Path(run).is_dir():
-            raise UsageError(f"{run}: no such folder; omit --run when only one Terrafix runs here")
-        return RunDir(Path(run))
-    runs = live_runs()
-    if not runs:
-        raise LinkError("Terrafix does not run on this computer; is the service started?")
-    if len(runs) > 1:
-        raise UsageError(
-            f"several runs on this computer; choose one: --run {' or --run '.join(str(r.path) for r in runs)}"
-        )
-    return runs[0]
