@@ -89,6 +89,10 @@ class Source(Section, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0  # frames per second taken from a video or a camera
 
 
+class SmootherSection(Section, frozen=True, kw_only=True):
+    enabled: bool = True
+
+
 class LogSection(Section, frozen=True, kw_only=True):
     level: Literal["DEBUG", "INFO", "WARN", "ERROR"] = "INFO"
 
@@ -101,6 +105,7 @@ class Config(Section, frozen=True, kw_only=True):
     link: LinkSection = LinkSection()
     recorder: RecorderSection = RecorderSection()
     health: HealthSection = HealthSection()
+    smoother: SmootherSection = SmootherSection()
     log: LogSection = LogSection()
 
 

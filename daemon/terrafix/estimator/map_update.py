@@ -44,10 +44,11 @@ NOTHING_FOUND = (Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE)
 @dataclass(frozen=True)
 class MapResult:
     """What was done with a map match: ``fusion``, the verdict on it, and ``others``: on a start coordinate that the map
-    contradicts, and on a reset of the graph."""
+    contradicts, and on a reset of the graph. ``measurement``: of an accepted match."""
 
     fusion: FusionVerdict
     others: tuple[FusionVerdict, ...] = ()
+    measurement: MapPoseMeasurement | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -159,7 +160,7 @@ class MapUpdate:
             self.hypotheses.map_consistency.add_accepted(share, gate[:2, :2])
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
-        return MapResult(replace(fusion, detail=f"information share {share:.2f}"))
+        return MapResult(replace(fusion, detail=f"information share {share:.2f}"), measurement=measurement)
 
     def _learn_from_pose(self, match: MapMatch, node: int, before: NodeState, measurement: MapPoseMeasurement) -> None:
         """Updates terrain roughness, alternative position and map hit rate with an accepted pose. ``before``: the node
@@ -243,7 +244,8 @@ class MapUpdate:
         detail = f"{how} {float(np.hypot(*offset)):.0f} m away"
         others = [FusionVerdict("start", Verdict.INNOVATION, position, start_off)] if start_off else []
         others.append(FusionVerdict("reset", Verdict.ACCEPTED, None, f"{ResetReason.MAP_MATCH}: {how}"))
-        return MapResult(FusionVerdict(measurement.name, Verdict.ACCEPTED, None, detail), tuple(others))
+        accepted = FusionVerdict(measurement.name, Verdict.ACCEPTED, None, detail)
+        return MapResult(accepted, tuple(others), measurement)
 
     def _moved_cov(self, cov: np.ndarray, onward: gtsam.Pose3, dt_s: float) -> np.ndarray:
         """``cov`` (6, 6), tangent order, of a pose, inflated, at the end of the motion ``onward`` of ``dt_s``."""
