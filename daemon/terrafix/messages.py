@@ -522,9 +522,10 @@ class PoseAnchor(Message, frozen=True, kw_only=True):
     cov: Mat6  # tangent order, as in PoseLink; what it shares with other matches over the same ground is in it
     map_sigma_m: float  # error of the map itself, 1-sigma per horizontal axis, common to all matches and not in cov
     covariance_mode: CovarianceMode  # of the estimate with this match
-    # Offset of the principal point (right, down) from its calibration as a share of the height, and its covariance
-    principal_point: Vec2 = (0.0, 0.0)
-    principal_point_cov: Mat2 = (0.0, 0.0, 0.0, 0.0)
+    # Where the optical axis meets the image beside its calibration (right, down; normalised coordinates): the estimated
+    # offset of the principal point, and the covariance of this and of the tilt of the mount, common to all matches
+    axis: Vec2 = (0.0, 0.0)
+    axis_cov: Mat2 = (0.0, 0.0, 0.0, 0.0)
 
 
 class RefinementSource(StrEnum):

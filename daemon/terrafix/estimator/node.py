@@ -418,8 +418,8 @@ class EstimatorNode:
             own = match.frame_id == estimator.last.frame_id  # a match of an older frame does not see this one's motion
             self._tracked = self._tracked or (own and accepted)
             yield self._estimate(estimator, estimator.last, self._claim(estimator.last), match.t_ns)
-        if result.measurement is not None:
-            yield map_anchor(estimator, match, result.measurement)
+        if result.fixed is not None:
+            yield map_anchor(estimator, match, result.fixed)
 
     def _on_source_ended(self, ended: SourceEnded) -> Iterable[Message]:
         if self._estimator is None or self._axes is None:

@@ -29,7 +29,7 @@ class RelocalizationUpdate:
         self._run = InnovationRun()  # of those that passed the gate, since the last rejection or the last fused one
 
     def apply(self, seen: Relocalization) -> RelocalizationResult:
-        """-> what was done. An accepted one joins the fragment of its frame to the flight, if that of the keyframe is."""
+        """An accepted one joins the fragment of its frame to the flight, if that of the keyframe is."""
         state = self._state
         node, keyframe = state.node_of.get(seen.frame_id), state.keyframe(seen.keyframe_id)
         if node is None or not state.graph.holds(node):

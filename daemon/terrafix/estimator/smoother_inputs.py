@@ -9,12 +9,12 @@ import numpy as np
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FilterState
-from terrafix.estimator.measurements.map_pose import MapPoseMeasurement
+from terrafix.estimator.measurements.map_pose import FixedPose
 from terrafix.estimator.measurements.odometry import KeyframeMotion
 from terrafix.estimator.measurements.relocalization import RelocalizationMeasurement
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.propagation import PropagationResult
-from terrafix.estimator.state import TRANSLATION, UP
+from terrafix.estimator.state import MOUNT_TILT, TRANSLATION, UP
 from terrafix.messages import MapMatch, PoseAnchor, PoseLink, Relocalization
 
 
@@ -59,9 +59,12 @@ def relocalization_link(estimator: Estimator, seen: Relocalization, by: Relocali
     )
 
 
-def map_anchor(estimator: Estimator, match: MapMatch, by: MapPoseMeasurement) -> PoseAnchor:
+def map_anchor(estimator: Estimator, match: MapMatch, by: FixedPose) -> PoseAnchor:
     """The pose of an accepted map match."""
     state, p = estimator.state, by.pose.translation()
+    # A tilt of the mount moves what is seen as the principal point does: about x it is down, about y to the right.
+    (xx, xy), (_, yy) = state.covariances.calibration(state.graph.newest)[MOUNT_TILT, MOUNT_TILT]
+    axis_cov = state.principal_point.cov + np.array([[yy, -xy], [-xy, xx]])
     fragment = state.fragment_of(match.frame_id)
     return PoseAnchor(
         t_ns=match.t_ns,
@@ -69,11 +72,11 @@ def map_anchor(estimator: Estimator, match: MapMatch, by: MapPoseMeasurement) ->
         fragment_id=-1 if fragment is None else fragment.fragment_id,
         p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
         q_w_c=quat_from_rot(by.pose.rotation().matrix()),
-        cov=_flat6(by.cov / by.information_share),
+        cov=_flat6(by.cov),
         map_sigma_m=match.map_sigma_m,
         covariance_mode=state.mode,
-        principal_point=(float(state.principal_point.offset[0]), float(state.principal_point.offset[1])),
-        principal_point_cov=_flat2(state.principal_point.cov),
+        axis=(float(state.principal_point.offset[0]), float(state.principal_point.offset[1])),
+        axis_cov=_flat2(axis_cov),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
 from terrafix.core.node import NodeContext
-from terrafix.core.pose import world_to_tangent
+from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.messages import (
     CovarianceMode,
     Message,
@@ -26,9 +26,10 @@ from terrafix.messages import (
     Vec3,
 )
 from terrafix.smoother.keyframe_graph import Anchor, FrameNode, Join, KeyframeGraph
-from terrafix.smoother.solution import Placed, follow, solve
+from terrafix.smoother.solution import Placed, follow, predict, solve
 
 PERIOD_NS = 1_000_000_000  # from one Refinement to the next, at least [spec: once a second]
+IDLE_NS = 5_000_000_000  # from one solution to the next, while map matches move nothing [spec: a merge within 5 s]
 MAX_POSES = 400  # of a Refinement; the others follow in the next ones [spec: 50 kB]
 # Change of a pose, or of its 1-sigma, in 1-sigma, from which it is published again. [spec: changes no decision below]
 MOVED_SIGMAS = 0.25
@@ -46,12 +47,14 @@ class SmootherNode:
         self._waiting: list[Message] = []  # for the Origin, which comes from another process
         self._solved: dict[int, Placed] = {}
         self._published: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # frame -> position (2,), covariance (2, 2)
-        self._changed = False  # there is a constraint that the solution does not have
+        self._changed = False  # there is a constraint that the solution does not have ...
+        self._urgent = False  # ... and that moves what was published
+        self._solved_ns: int | None = None  # time of the solution
         self._behind = False  # not all that has moved is published
         self._hot = False
-        self._period_ns: int | None = None  # begin of the newest period with a Refinement
+        self._published_ns: int | None = None  # time of the newest Refinement
         self._map_var_m2 = 0.0
-        self._principal_point, self._principal_point_cov = np.zeros(2), np.zeros((2, 2))
+        self._axis, self._axis_cov = np.zeros(2), np.zeros((2, 2))
         self._handlers: dict[type[Message], Callable[..., None]] = {
             Prediction: self._on_prediction,
             PoseLink: self._on_link,
@@ -82,15 +85,15 @@ class SmootherNode:
 
     def _take(self, message: Message) -> Iterable[Message]:
         self._handlers[type(message)](message)
-        due = self._period_ns is None or message.t_ns - self._period_ns >= PERIOD_NS
-        if not due or self._hot or not (self._changed or self._behind):
+        solves = self._changed and _passed(self._solved_ns, message.t_ns, PERIOD_NS if self._urgent else IDLE_NS)
+        if self._hot or not (solves or self._behind) or not _passed(self._published_ns, message.t_ns, PERIOD_NS):
             return
-        if self._changed:
-            self._changed = False
+        if solves:
+            self._changed, self._urgent, self._solved_ns = False, False, message.t_ns
             self._solve()
         poses = list(self._moved())
         if poses:
-            self._period_ns = message.t_ns
+            self._published_ns = message.t_ns
             yield Refinement(t_ns=message.t_ns, poses=poses, source=RefinementSource.SMOOTHER)
 
     # --- inputs --------------------------------------------------------------------------------------------------
@@ -104,7 +107,8 @@ class SmootherNode:
         between, cov = _pose(link.q_parent_c, link.p_in_parent_m), np.array(link.cov).reshape(6, 6)
         if link.relocalization:
             join = Join(link.parent_id, link.frame_id, between, cov, link.scale_sigma)
-            self._changed = self._graph.add_join(join) or self._changed
+            if self._graph.add_join(join):
+                self._changed = self._urgent = True
             return
         walk = KNOWN_HEIGHT_WALK if link.scale_sigma <= KNOWN_HEIGHT else ASSUMED_HEIGHT_WALK
         self._graph.add_link(
@@ -125,10 +129,22 @@ class SmootherNode:
     def _on_anchor(self, seen: PoseAnchor) -> None:
         self._hot = seen.covariance_mode is CovarianceMode.JACOBIAN
         self._map_var_m2 = seen.map_sigma_m**2
-        self._principal_point = np.array(seen.principal_point)
-        self._principal_point_cov = np.array(seen.principal_point_cov).reshape(2, 2)
+        self._axis, self._axis_cov = np.array(seen.axis), np.array(seen.axis_cov).reshape(2, 2)
         anchor = Anchor(_pose(seen.q_w_c, seen.p_c_in_w_m), np.array(seen.cov).reshape(6, 6))
-        self._changed = self._graph.add_anchor(seen.frame_id, anchor) or self._changed
+        if self._graph.add_anchor(seen.frame_id, anchor):
+            self._changed, self._urgent = True, self._urgent or self._moves(seen.frame_id, anchor)
+
+    def _moves(self, frame_id: int, anchor: Anchor) -> bool:
+        """Whether a map match of a frame moves the poses before it by more than MOVED_SIGMAS."""
+        expected = predict(self._graph, frame_id, self._solved)
+        if expected is None:
+            return True
+        offset_m = (anchor.pose.translation() - expected.pose.translation())[HORIZONTAL]
+        ours_m2 = expected.cov[HORIZONTAL, HORIZONTAL]
+        theirs_m2 = tangent_to_world(anchor.cov, anchor.pose.rotation().matrix())[HORIZONTAL, HORIZONTAL]
+        shift_m = ours_m2 @ np.linalg.solve(ours_m2 + theirs_m2, offset_m)
+        claimed_m2 = ours_m2 + self._map_var_m2 * np.eye(2)
+        return float(shift_m @ np.linalg.solve(claimed_m2, shift_m)) > MOVED_SIGMAS**2
 
     # --- outputs -------------------------------------------------------------------------------------------------
 
@@ -162,8 +178,8 @@ class SmootherNode:
     def _with_common_errors(self, node: FrameNode, placed: Placed) -> tuple[np.ndarray, np.ndarray]:
         """-> horizontal position (2,) and covariance (2, 2), with what no number of map matches averages away."""
         jacobian = node.agl_m * placed.pose.rotation().matrix()[HORIZONTAL, HORIZONTAL]
-        p_m = placed.pose.translation()[HORIZONTAL] + jacobian @ self._principal_point
-        common = self._map_var_m2 * np.eye(2) + jacobian @ self._principal_point_cov @ jacobian.T
+        p_m = placed.pose.translation()[HORIZONTAL] + jacobian @ self._axis
+        common = self._map_var_m2 * np.eye(2) + jacobian @ self._axis_cov @ jacobian.T
         return p_m, placed.cov[HORIZONTAL, HORIZONTAL] + common + node.ambiguity_m2
 
     def _has_moved(self, frame_id: int, p_m: np.ndarray, cov: np.ndarray) -> bool:
@@ -191,6 +207,10 @@ class SmootherNode:
             q_w_c=quat_from_rot(placed.pose.rotation().matrix()),
             rotation_sigma_rad=(float(rotation_sigma[0]), float(rotation_sigma[1]), float(rotation_sigma[2])),
         )
+
+
+def _passed(since_ns: int | None, now_ns: int, period_ns: int) -> bool:
+    return since_ns is None or now_ns - since_ns >= period_ns
 
 
 def _pose(q: Quat, p: Vec3) -> gtsam.Pose3:

@@ -111,6 +111,23 @@ def _submap(graph: KeyframeGraph, piece: list[int]) -> Submap:
     return Submap(r_f_c, p_c_in_f, parent, cov, scale_sigma, walk)
 
 
+def predict(graph: KeyframeGraph, frame_id: int, placed: dict[int, Placed]) -> Placed | None:
+    """A frame, world axes, by the relative poses from the nearest placed keyframe that its tree has before it; None:
+    there is none."""
+    between, cov = gtsam.Pose3(), np.zeros((6, 6))
+    while (keyframe := placed.get(frame_id)) is None:
+        node = graph.frames[frame_id]
+        if node.parent is None:
+            return None
+        back = between.inverse().AdjointMap()
+        cov = cov + back @ with_scale(node) @ back.T
+        between, frame_id = node.between.compose(between), node.parent
+    pose = keyframe.pose.compose(between)
+    moved = np.eye(6)
+    moved[:3, 3:] = -_skew(pose.translation() - keyframe.pose.translation())
+    return Placed(pose, moved @ keyframe.cov @ moved.T + tangent_to_world(cov, pose.rotation().matrix()))
+
+
 def follow(graph: KeyframeGraph, frame_id: int, placed: dict[int, Placed]) -> Placed | None:
     """A frame that is no keyframe, in world axes: by its keyframe, and what is left at the next keyframe of the same
     tree in proportion to the time; None: its keyframe is not placed."""
