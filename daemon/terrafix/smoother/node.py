@@ -52,6 +52,7 @@ class SmootherNode:
         self._solved_ns: int | None = None  # time of the solution
         self._behind = False  # not all that has moved is published
         self._hot = False
+        self._now_ns = 0  # time of the newest message
         self._published_ns: int | None = None  # time of the newest Refinement
         self._map_var_m2 = 0.0
         self._axis, self._axis_cov = np.zeros(2), np.zeros((2, 2))
@@ -85,16 +86,17 @@ class SmootherNode:
 
     def _take(self, message: Message) -> Iterable[Message]:
         self._handlers[type(message)](message)
-        solves = self._changed and _passed(self._solved_ns, message.t_ns, PERIOD_NS if self._urgent else IDLE_NS)
-        if self._hot or not (solves or self._behind) or not _passed(self._published_ns, message.t_ns, PERIOD_NS):
+        now_ns = self._now_ns = max(message.t_ns, self._now_ns)  # a map match has the time of its frame
+        solves = self._changed and _passed(self._solved_ns, now_ns, PERIOD_NS if self._urgent else IDLE_NS)
+        if self._hot or not (solves or self._behind) or not _passed(self._published_ns, now_ns, PERIOD_NS):
             return
         if solves:
-            self._changed, self._urgent, self._solved_ns = False, False, message.t_ns
+            self._changed, self._urgent, self._solved_ns = False, False, now_ns
             self._solve()
         poses = list(self._moved())
         if poses:
-            self._published_ns = message.t_ns
-            yield Refinement(t_ns=message.t_ns, poses=poses, source=RefinementSource.SMOOTHER)
+            self._published_ns = now_ns
+            yield Refinement(t_ns=now_ns, poses=poses, source=RefinementSource.SMOOTHER)
 
     # --- inputs --------------------------------------------------------------------------------------------------
 
