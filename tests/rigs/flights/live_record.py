@@ -34,7 +34,7 @@ def write(
     written: list[tuple[int, Message]] = []
     log, smoother = InputLog(NAME, 1), SmootherNode()
     first, *rest = messages(flight)
-    smoother.on(first)
+    list(smoother.on(first))
     with ReplayedEstimator() as estimator:
         began_ns = 1
         for number, message in enumerate([first, *rest]):

@@ -12,7 +12,7 @@ from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, RefinedP
 from terrafix.smoother.node import SmootherNode
 
 FRAMES = 240
-FRAGMENTS = (range(0, 72), range(87, 150), range(165, FRAMES))
+FRAGMENTS = (range(72), range(87, 150), range(165, FRAMES))
 MAPPED = 12  # last frames of each fragment, over ground that the map shows
 
 
