@@ -17,6 +17,7 @@ class Process:
     tick_hz: float  # rate of tick(); 0 = tick() is not called
     stuck_after_s: float  # a process without progress for this long is killed and restarted
     newest: tuple[type[m.Message], ...] = ()  # types of which only the newest is kept in the queue (runtime/inbox.py)
+    nice: int = 0  # above 0: gets what the processes with 0 leave of a busy processor
 
 
 # Publishers besides the processes of the table.
@@ -142,6 +143,7 @@ PROCESSES: tuple[Process, ...] = (
         (m.Refinement, m.InputOrder),
         0.0,
         30.0,
+        nice=10,
     ),
     Process(
         "anchor",

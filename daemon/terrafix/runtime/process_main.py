@@ -66,6 +66,7 @@ def run(name: str, run_dir: RunDir) -> int:
     logs.configure(spec.config.log.level, name)
     table = table_of(spec)
     process = next(p for p in table if p.name == name)
+    os.nice(process.nice)
     ctx = NodeContext(
         config=spec.config,
         frames=SharedFrameStore(run_dir.frames, writer=Frame in process.publishes),

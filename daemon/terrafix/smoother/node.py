@@ -4,6 +4,7 @@ It runs beside the estimator and never before it: it gets the relative poses and
 accepted, and no other process waits for what it publishes. All times are those of messages, so that a replay is equal.
 """
 
+import math
 from collections.abc import Callable, Iterable
 
 import gtsam
@@ -48,7 +49,7 @@ class SmootherNode:
         self._solved: dict[int, Placed] = {}
         self._published: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # frame -> position (2,), covariance (2, 2)
         self._changed = False  # there is a constraint that the solution does not have ...
-        self._urgent = False  # ... and that moves what was published
+        self._shift2 = 0.0  # ... and these move what was published by so much, in squared 1-sigma
         self._solved_ns: int | None = None  # time of the solution
         self._behind = False  # not all that has moved is published
         self._hot = False
@@ -87,11 +88,12 @@ class SmootherNode:
     def _take(self, message: Message) -> Iterable[Message]:
         self._handlers[type(message)](message)
         now_ns = self._now_ns = max(message.t_ns, self._now_ns)  # a map match has the time of its frame
-        solves = self._changed and _passed(self._solved_ns, now_ns, PERIOD_NS if self._urgent else IDLE_NS)
+        period_ns = PERIOD_NS if self._shift2 > MOVED_SIGMAS**2 else IDLE_NS
+        solves = self._changed and _passed(self._solved_ns, now_ns, period_ns)
         if self._hot or not (solves or self._behind) or not _passed(self._published_ns, now_ns, PERIOD_NS):
             return
         if solves:
-            self._changed, self._urgent, self._solved_ns = False, False, now_ns
+            self._changed, self._shift2, self._solved_ns = False, 0.0, now_ns
             self._solve()
         poses = list(self._moved())
         if poses:
@@ -110,7 +112,7 @@ class SmootherNode:
         if link.relocalization:
             join = Join(link.parent_id, link.frame_id, between, cov, link.scale_sigma)
             if self._graph.add_join(join):
-                self._changed = self._urgent = True
+                self._changed, self._shift2 = True, math.inf
             return
         walk = KNOWN_HEIGHT_WALK if link.scale_sigma <= KNOWN_HEIGHT else ASSUMED_HEIGHT_WALK
         self._graph.add_link(
@@ -134,19 +136,19 @@ class SmootherNode:
         self._axis, self._axis_cov = np.array(seen.axis), np.array(seen.axis_cov).reshape(2, 2)
         anchor = Anchor(_pose(seen.q_w_c, seen.p_c_in_w_m), np.array(seen.cov).reshape(6, 6))
         if self._graph.add_anchor(seen.frame_id, anchor):
-            self._changed, self._urgent = True, self._urgent or self._moves(seen.frame_id, anchor)
+            self._changed, self._shift2 = True, self._shift2 + self._shift2_of(seen.frame_id, anchor)
 
-    def _moves(self, frame_id: int, anchor: Anchor) -> bool:
-        """Whether a map match of a frame moves the poses before it by more than MOVED_SIGMAS."""
+    def _shift2_of(self, frame_id: int, anchor: Anchor) -> float:
+        """Square of the shift by which a map match of a frame moves the poses before it, in their published 1-sigma."""
         expected = predict(self._graph, frame_id, self._solved)
         if expected is None:
-            return True
+            return math.inf
         offset_m = (anchor.pose.translation() - expected.pose.translation())[HORIZONTAL]
         ours_m2 = expected.cov[HORIZONTAL, HORIZONTAL]
         theirs_m2 = tangent_to_world(anchor.cov, anchor.pose.rotation().matrix())[HORIZONTAL, HORIZONTAL]
         shift_m = ours_m2 @ np.linalg.solve(ours_m2 + theirs_m2, offset_m)
         claimed_m2 = ours_m2 + self._map_var_m2 * np.eye(2)
-        return float(shift_m @ np.linalg.solve(claimed_m2, shift_m)) > MOVED_SIGMAS**2
+        return float(shift_m @ np.linalg.solve(claimed_m2, shift_m))
 
     # --- outputs -------------------------------------------------------------------------------------------------
 
