@@ -6,6 +6,7 @@ accepted, and no other process waits for what it publishes. All times are those 
 
 import math
 from collections.abc import Callable, Iterable
+from itertools import chain
 
 import gtsam
 import numpy as np
@@ -27,7 +28,7 @@ from terrafix.messages import (
     Vec3,
 )
 from terrafix.smoother.keyframe_graph import Anchor, FrameNode, Join, KeyframeGraph
-from terrafix.smoother.solution import Placed, follow, predict, solve
+from terrafix.smoother.solution import Placed, followers, predict, solve
 
 PERIOD_NS = 1_000_000_000  # from one Refinement to the next, at least [spec: once a second]
 IDLE_NS = 5_000_000_000  # from one solution to the next, while map matches move nothing [spec: a merge within 5 s]
@@ -52,6 +53,7 @@ class SmootherNode:
         self._shift2 = 0.0  # ... and these move what was published by so much, in squared 1-sigma
         self._solved_ns: int | None = None  # time of the solution
         self._behind = False  # not all that has moved is published
+        self._moved_keyframes: set[int] = set()  # keyframes whose followers are to be published
         self._hot = False
         self._now_ns = 0  # time of the newest message
         self._published_ns: int | None = None  # time of the newest Refinement
@@ -115,7 +117,7 @@ class SmootherNode:
                 self._changed, self._shift2 = True, math.inf
             return
         walk = KNOWN_HEIGHT_WALK if link.scale_sigma <= KNOWN_HEIGHT else ASSUMED_HEIGHT_WALK
-        self._graph.add_link(
+        added = self._graph.add_link(
             FrameNode(
                 link.frame_id,
                 link.t_ns,
@@ -129,6 +131,8 @@ class SmootherNode:
                 np.array(link.ambiguity_m2).reshape(2, 2),
             )
         )
+        if added:
+            self._moved_keyframes.add(link.parent_id)
 
     def _on_anchor(self, seen: PoseAnchor) -> None:
         self._hot = seen.covariance_mode is CovarianceMode.JACOBIAN
@@ -160,24 +164,35 @@ class SmootherNode:
         self._behind = True
 
     def _moved(self) -> Iterable[RefinedPose]:
-        """Poses that have moved since they were published: of keyframes first, the newest first."""
-        self._behind, count = False, 0
-        self._published = {frame: was for frame, was in self._published.items() if frame in self._graph.frames}
-        keyframes = sorted(self._solved.keys() & self._graph.frames.keys(), reverse=True)
-        others = (child for keyframe in keyframes for child in reversed(self._graph.children(keyframe)))
-        for frame_id in (*keyframes, *(child for child in others if child not in self._solved)):
-            placed = self._solved.get(frame_id) or follow(self._graph, frame_id, self._solved)
-            if placed is None or not np.isfinite(placed.cov).all():
-                continue
+        """Poses that have moved since they were published: of keyframes first, the newest first, then of the frames
+        that follow those."""
+        self._behind, count = True, 0
+        if len(self._published) > 2 * len(self._graph.frames):
+            self._published = {frame: was for frame, was in self._published.items() if frame in self._graph.frames}
+        for frame_id, placed in chain(self._placed_keyframes(), self._followers()):
             p_m, cov = self._with_common_errors(self._graph.frames[frame_id], placed)
-            if not self._has_moved(frame_id, p_m, cov):
+            if not np.isfinite(placed.cov).all() or not self._has_moved(frame_id, p_m, cov):
                 continue
             if count == MAX_POSES:
-                self._behind = True
                 return
             count += 1
             self._published[frame_id] = p_m, cov
+            if frame_id in self._solved:
+                self._moved_keyframes |= {frame_id, self._graph.frames[frame_id].parent or frame_id}
             yield self._refined(frame_id, placed, p_m, cov)
+        self._behind = False
+
+    def _placed_keyframes(self) -> Iterable[tuple[int, Placed]]:
+        for keyframe in sorted(self._solved.keys() & self._graph.frames.keys(), reverse=True):
+            yield keyframe, self._solved[keyframe]
+
+    def _followers(self) -> Iterable[tuple[int, Placed]]:
+        """Of keyframes that have moved, and those with a new frame."""
+        self._moved_keyframes &= set(self._graph.keyframes)
+        for keyframe in sorted(self._moved_keyframes, reverse=True):
+            yield from followers(self._graph, keyframe, self._solved)
+            if keyframe in self._solved:
+                self._moved_keyframes.discard(keyframe)
 
     def _with_common_errors(self, node: FrameNode, placed: Placed) -> tuple[np.ndarray, np.ndarray]:
         """-> horizontal position (2,) and covariance (2, 2), with what no number of map matches averages away."""

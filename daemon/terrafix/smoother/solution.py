@@ -1,5 +1,6 @@
 """Poses of all keyframes that map matches or relocalisations place, and of the frames that follow them."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import gtsam
@@ -128,19 +129,29 @@ def predict(graph: KeyframeGraph, frame_id: int, placed: dict[int, Placed]) -> P
     return Placed(pose, moved @ keyframe.cov @ moved.T + tangent_to_world(cov, pose.rotation().matrix()))
 
 
-def follow(graph: KeyframeGraph, frame_id: int, placed: dict[int, Placed]) -> Placed | None:
-    """A frame that is no keyframe, in world axes: by its keyframe, and what is left at the next keyframe of the same
-    tree in proportion to the time; None: its keyframe is not placed."""
+def followers(graph: KeyframeGraph, keyframe: int, placed: dict[int, Placed]) -> Iterator[tuple[int, Placed]]:
+    """Frames that hang on a keyframe and are none, world axes, the newest first; none if the keyframe is not placed."""
+    if keyframe not in placed:
+        return
+    after_id: int | None = None
+    for frame_id in reversed(graph.children(keyframe)):
+        if frame_id in placed:
+            after_id = frame_id
+        else:
+            yield frame_id, _follower(graph, frame_id, after_id, placed)
+
+
+def _follower(graph: KeyframeGraph, frame_id: int, after_id: int | None, placed: dict[int, Placed]) -> Placed:
+    """A frame by its keyframe, and by what is left at the next keyframe ``after_id`` in proportion to the time."""
     node = graph.frames[frame_id]
-    if node.parent is None or (keyframe := placed.get(node.parent)) is None:
-        return None
+    assert node.parent is not None
+    keyframe = placed[node.parent]
     here = keyframe.pose.compose(node.between)
     own = tangent_to_world(with_scale(node), here.rotation().matrix())
     lever = here.translation() - keyframe.pose.translation()
     moved = np.eye(6)
     moved[:3, 3:] = -_skew(lever)
     begin_cov = moved @ keyframe.cov @ moved.T
-    after_id = next((k for k in graph.children(node.parent) if k > frame_id and k in placed), None)
     if after_id is None:
         return Placed(here, begin_cov + own)
     after, end = graph.frames[after_id], placed[after_id]
