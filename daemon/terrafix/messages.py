@@ -494,13 +494,60 @@ class CalibrationEstimate(Message, frozen=True, kw_only=True):
     lens: LensEstimate | None = None  # only of an uncalibrated camera; estimator/measurements/principal_point.py
 
 
+class PoseLink(Message, frozen=True, kw_only=True):
+    """Pose of the camera at frame ``frame_id`` relative to frame ``parent_id``, as odometry or a relocalisation has
+    measured it, without the map matches of the flight: the input of the smoother."""
+
+    frame_id: int
+    parent_id: int
+    fragment_id: int  # of the frame (as in Odometry)
+    p_in_parent_m: Vec3  # axes of the camera at the parent
+    q_parent_c: Quat
+    # Tangent order (rotation, then translation, axes of the camera at the frame), without the error of the scale
+    cov: Mat6
+    scale_sigma: float  # 1-sigma of the length of the translation by an error of the height, as a share
+    agl_m: float  # height of the camera above the ground below it
+    relocalization: bool = False  # the parent is an older keyframe whose ground the frame sees again
+    # Covariance by another place that the vehicle may have been at (ee, en, ne, nn)
+    ambiguity_m2: Mat2 = (0.0, 0.0, 0.0, 0.0)
+
+
+class PoseAnchor(Message, frozen=True, kw_only=True):
+    """Pose of the camera at frame ``frame_id`` by a map match that was fused: the input of the smoother."""
+
+    frame_id: int
+    fragment_id: int  # of the frame (as in Odometry); -1: none
+    p_c_in_w_m: Vec3
+    q_w_c: Quat
+    cov: Mat6  # tangent order, as in PoseLink; what it shares with other matches over the same ground is in it
+    map_sigma_m: float  # error of the map itself, 1-sigma per horizontal axis, common to all matches and not in cov
+    covariance_mode: CovarianceMode  # of the estimate with this match
+    # Where the optical axis meets the image beside its calibration (right, down; normalised coordinates): the estimated
+    # offset of the principal point, and the covariance of this and of the tilt of the mount, common to all matches
+    axis: Vec2 = (0.0, 0.0)
+    axis_cov: Mat2 = (0.0, 0.0, 0.0, 0.0)
+
+
+class RefinementSource(StrEnum):
+    """What has refined a pose."""
+
+    SMOOTHER = "smoother"  # in flight: pose graph of all fragments, map matches classified anew
+    FLIGHT = "flight"  # after the end of the source: the estimator's own graph, linear as each frame left it
+
+
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
+    """Camera at frame ``frame_id``. ``cov_en_m2``: covariance of east and north."""
+
     frame_id: int
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float
     sigma_e_m: float
     sigma_n_m: float
+    cov_en_m2: float = 0.0
+    fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none, or unknown
+    q_w_c: Quat | None = None  # orientation of the camera; None: not refined
+    rotation_sigma_rad: Vec3 | None = None  # 1-sigma about east, north, up
 
 
 class ClaimBudget(Message, frozen=True, kw_only=True):
@@ -513,9 +560,12 @@ class ClaimBudget(Message, frozen=True, kw_only=True):
 
 
 class Refinement(Message, frozen=True, kw_only=True):
-    """Smoothed positions of past frames, after later map fixes (AC-8)."""
+    """Smoothed poses of past frames, those that later map fixes, relocalisations and merges have moved (AC-8).
+
+    The newest one of a frame counts."""
 
     poses: list[RefinedPose]
+    source: RefinementSource = RefinementSource.FLIGHT
 
 
 class MeasurementVerdict(Message, frozen=True, kw_only=True):
@@ -769,6 +819,8 @@ AnyMessage = (
     | CalibrationFault
     | CalibrationEstimate
     | ClaimBudget
+    | PoseLink
+    | PoseAnchor
     | Refinement
     | MeasurementVerdict
     | GpsInput

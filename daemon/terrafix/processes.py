@@ -17,6 +17,7 @@ class Process:
     tick_hz: float  # rate of tick(); 0 = tick() is not called
     stuck_after_s: float  # a process without progress for this long is killed and restarted
     newest: tuple[type[m.Message], ...] = ()  # types of which only the newest is kept in the queue (runtime/inbox.py)
+    nice: int = 0  # above 0: gets what the processes with 0 leave of a busy processor
 
 
 # Publishers besides the processes of the table.
@@ -45,6 +46,8 @@ ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.CalibrationFault,
     m.CalibrationEstimate,
     m.ClaimBudget,
+    m.PoseLink,
+    m.PoseAnchor,
     m.Refinement,
     m.MeasurementVerdict,
     m.GpsInput,
@@ -124,6 +127,8 @@ PROCESSES: tuple[Process, ...] = (
             m.CalibrationFault,
             m.CalibrationEstimate,
             m.ClaimBudget,
+            m.PoseLink,
+            m.PoseAnchor,
             m.Refinement,
             m.MeasurementVerdict,
             m.InputOrder,
@@ -133,6 +138,15 @@ PROCESSES: tuple[Process, ...] = (
         (m.Odometry,),  # a frame that waits while a newer one is there only delays that one
     ),
     Process(
+        "smoother",
+        "terrafix.smoother.node",
+        (m.Origin, m.Prediction, m.PoseLink, m.PoseAnchor),
+        (m.Refinement, m.InputOrder),
+        0.0,
+        30.0,
+        nice=10,
+    ),
+    Process(
         "anchor",
         "terrafix.anchor.node",
         (m.Origin, m.Prediction, m.PositionHint, m.GnssInitialPosition, m.Health),
@@ -140,6 +154,7 @@ PROCESSES: tuple[Process, ...] = (
         0.0,
         90.0,  # one correlation over a large map takes seconds, half a minute on a computer with ten times the load
         (m.Prediction,),
+        nice=5,  # odometry and estimates do not wait for a map match
     ),
     Process(
         "vision",

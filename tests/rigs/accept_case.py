@@ -22,6 +22,7 @@ from terrafix.messages import (
     Prediction,
     RefinedPose,
     Refinement,
+    RefinementSource,
     SourceLabel,
     Verdict,
 )
@@ -54,6 +55,7 @@ class FrameCase:
     keyframe_id: int = 0  # of its odometry
     fragment_id: int = 0
     anchor_age_ms: int = 0
+    refined_after_s: float | None = None  # by the smoother, after the time stamp; None: not in flight
 
 
 def file_of(i: int) -> str:
@@ -79,6 +81,7 @@ def evidence(out: Path, frames: Sequence[FrameCase], marks: Marks = UNMARKED, **
         RefinedPose(frame_id=i, lat_deg=48.0, lon_deg=11.0, alt_amsl_m=0.0, sigma_e_m=1.0, sigma_n_m=1.0)
         for i in range(len(frames))
     ]
+    messages += [_refined_in_flight(i, case) for i, case in enumerate(frames) if case.refined_after_s is not None]
     messages.append(Refinement(t_ns=0, poses=poses))
     table = RowTable()
     writer = FlightWriter(out / "flight.mcap", header(Config()))
@@ -95,6 +98,15 @@ def evidence(out: Path, frames: Sequence[FrameCase], marks: Marks = UNMARKED, **
     (out / "summary.json").write_text(json.dumps(summary))
     truth = {file_of(i): Truth(*PLACE.to_wgs84(*true_m(i))) for i in range(len(frames))}
     return gather(out, truth, marks, **gathered)  # type: ignore[arg-type]
+
+
+def _refined_in_flight(i: int, case: FrameCase) -> Refinement:
+    assert case.refined_after_s is not None
+    pose = RefinedPose(
+        frame_id=i, lat_deg=48.0, lon_deg=11.0, alt_amsl_m=0.0, sigma_e_m=1.0, sigma_n_m=1.0,
+        fragment_id=case.fragment_id)  # fmt: skip
+    t_ns = round((i * STEP_S + case.refined_after_s) * 1e9)
+    return Refinement(t_ns=t_ns, poses=[pose], source=RefinementSource.SMOOTHER)
 
 
 def _frame(i: int, case: FrameCase) -> list[Message]:

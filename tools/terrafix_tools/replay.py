@@ -34,7 +34,7 @@ from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.rerun.frames import RecordedFrames
 
 # processes that compute the estimate; link, health and recorder need a live system
-REPLAYED_PROCESSES = ("vision", "anchor", "estimator")
+REPLAYED_PROCESSES = ("vision", "anchor", "estimator", "smoother")
 FOLDER = "folder"  # key of [models] that is not a model
 FRAMES_KEPT = 32  # frames that a node may still request; the size of the live frame ring
 

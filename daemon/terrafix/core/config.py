@@ -96,6 +96,10 @@ class RuntimeSection(Section, frozen=True, kw_only=True):
     cores: Annotated[int, Meta(ge=0, le=256)] = 0
 
 
+class SmootherSection(Section, frozen=True, kw_only=True):
+    enabled: bool = True
+
+
 class LogSection(Section, frozen=True, kw_only=True):
     level: Literal["DEBUG", "INFO", "WARN", "ERROR"] = "INFO"
 
@@ -109,6 +113,7 @@ class Config(Section, frozen=True, kw_only=True):
     recorder: RecorderSection = RecorderSection()
     health: HealthSection = HealthSection()
     runtime: RuntimeSection = RuntimeSection()
+    smoother: SmootherSection = SmootherSection()
     log: LogSection = LogSection()
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)  # of a tangent vector [spec: Pose3 tangent order]
 HUBER_K = 1.345  # threshold in sigmas: 95 % efficiency on Gaussian noise (Huber 1981)
 MAX_ITERATIONS = 15
 MAX_CONDITION = 1e9  # condition number of the scaled normal equations; a well-conditioned geometry has less than ten

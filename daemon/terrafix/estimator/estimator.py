@@ -7,7 +7,6 @@ import numpy as np
 
 from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState, ImuQuery
 from terrafix.estimator.graph.pose_graph import PoseGraph
-from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.map_update import MapResult, MapUpdate
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
@@ -15,7 +14,7 @@ from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.prior import NavPrior
 from terrafix.estimator.propagation import Propagation, PropagationResult
-from terrafix.estimator.relocalization_update import RelocalizationUpdate
+from terrafix.estimator.relocalization_update import RelocalizationResult, RelocalizationUpdate
 from terrafix.messages import MapMatch, Origin, Relocalization
 
 
@@ -42,7 +41,7 @@ class Estimator:
         """Gated, and fused at the node of its frame."""
         return self._map_update.apply(match)
 
-    def feed_relocalization(self, seen: Relocalization) -> FusionVerdict:
+    def feed_relocalization(self, seen: Relocalization) -> RelocalizationResult:
         """Gated, and fused at the node of its frame."""
         return self._relocalization_update.apply(seen)
 

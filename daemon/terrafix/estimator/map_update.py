@@ -19,7 +19,7 @@ from terrafix.estimator.integrity.innovation_run import InnovationRun
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.measurements.contract import fuse
-from terrafix.estimator.measurements.map_pose import MapPoseMeasurement, determined
+from terrafix.estimator.measurements.map_pose import FixedPose, MapPoseMeasurement, determined, levelled
 from terrafix.estimator.models.motion_model import unknown_motion_cov
 from terrafix.estimator.propagation import STEP_SHARE
 from terrafix.estimator.state import HEIGHT, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
@@ -44,10 +44,11 @@ NOTHING_FOUND = (Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE)
 @dataclass(frozen=True)
 class MapResult:
     """What was done with a map match: ``fusion``, the verdict on it, and ``others``: on a start coordinate that the map
-    contradicts, and on a reset of the graph."""
+    contradicts, and on a reset of the graph. ``fixed``: of an accepted match, for the smoother."""
 
     fusion: FusionVerdict
     others: tuple[FusionVerdict, ...] = ()
+    fixed: FixedPose | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -148,6 +149,7 @@ class MapUpdate:
         fixed_s, before = state.graph.time_of(node), state.graph.state(node)
         share = self._fixes.information_share(fixed_s, here, height_m)
         measurement = replace(measurement, information_share=share)
+        fixed = levelled(measurement, before.pose, state.covariance(node))
         fusion = fuse(state, node, measurement)
         if fusion.verdict is not Verdict.ACCEPTED:
             assert fusion.innovation is not None
@@ -159,7 +161,7 @@ class MapUpdate:
             self.hypotheses.map_consistency.add_accepted(share, gate[:2, :2])
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
-        return MapResult(replace(fusion, detail=f"information share {share:.2f}"))
+        return MapResult(replace(fusion, detail=f"information share {share:.2f}"), fixed=fixed)
 
     def _learn_from_pose(self, match: MapMatch, node: int, before: NodeState, measurement: MapPoseMeasurement) -> None:
         """Updates terrain roughness, alternative position and map hit rate with an accepted pose. ``before``: the node
@@ -220,6 +222,7 @@ class MapUpdate:
         was, now = state.graph.state(node), state.graph.state(state.graph.newest)
         fixed_s, now_s = state.graph.time_of(node), state.graph.time_of(state.graph.newest)
         position = measurement.position_innovation(was.pose, state.covariance(node))
+        fixed = levelled(measurement, was.pose, state.covariance(node))
         offset = position.residual
         start_off = self._start_off(position)
         onward = was.pose.between(now.pose)
@@ -243,7 +246,8 @@ class MapUpdate:
         detail = f"{how} {float(np.hypot(*offset)):.0f} m away"
         others = [FusionVerdict("start", Verdict.INNOVATION, position, start_off)] if start_off else []
         others.append(FusionVerdict("reset", Verdict.ACCEPTED, None, f"{ResetReason.MAP_MATCH}: {how}"))
-        return MapResult(FusionVerdict(measurement.name, Verdict.ACCEPTED, None, detail), tuple(others))
+        accepted = FusionVerdict(measurement.name, Verdict.ACCEPTED, None, detail)
+        return MapResult(accepted, tuple(others), fixed)
 
     def _moved_cov(self, cov: np.ndarray, onward: gtsam.Pose3, dt_s: float) -> np.ndarray:
         """``cov`` (6, 6), tangent order, of a pose, inflated, at the end of the motion ``onward`` of ``dt_s``."""

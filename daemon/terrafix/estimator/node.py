@@ -40,6 +40,7 @@ from terrafix.estimator.pose_estimator import (
 )
 from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpoint
 from terrafix.estimator.propagation import PropagationResult
+from terrafix.estimator.smoother_inputs import map_anchor, odometry_link, relocalization_link
 from terrafix.estimator.state import UP
 from terrafix.messages import (
     ClaimBudget,
@@ -295,6 +296,7 @@ class EstimatorNode:
         if estimator.last_fix_s is not None:  # before that the autopilot has, or had, another position
             self._ahrs.position_published(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
+        yield from odometry_link(estimator, result, odometry.t_ns)  # last: it delays nothing
 
     def _in_telemetry_time(self, odometry: Odometry, time_offset: TimeOffset) -> Odometry:
         """``odometry``, with the estimated time offset of the camera taken from its time."""
@@ -376,7 +378,8 @@ class EstimatorNode:
             return
         if not self._relocated:
             self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
-        fusion = estimator.feed_relocalization(seen)
+        result = estimator.feed_relocalization(seen)
+        fusion = result.fusion
         fragment = estimator.state.fragment_of(seen.frame_id)
         for verdict in (fusion, *self._rebuild_verdicts(estimator)):
             yield verdict_of(seen.t_ns, seen.frame_id, verdict, fragment)
@@ -385,6 +388,8 @@ class EstimatorNode:
         self._relocated = True
         self._tracked = self._tracked or seen.frame_id == estimator.last.frame_id
         yield self._estimate(estimator, estimator.last, self._claim(estimator.last), seen.t_ns)
+        if result.measurement is not None:
+            yield relocalization_link(estimator, seen, result.measurement)
 
     # --- map matches ---------------------------------------------------------------------------------------------
 
@@ -413,6 +418,8 @@ class EstimatorNode:
             own = match.frame_id == estimator.last.frame_id  # a match of an older frame does not see this one's motion
             self._tracked = self._tracked or (own and accepted)
             yield self._estimate(estimator, estimator.last, self._claim(estimator.last), match.t_ns)
+        if result.fixed is not None:
+            yield map_anchor(estimator, match, result.fixed)
 
     def _on_source_ended(self, ended: SourceEnded) -> Iterable[Message]:
         if self._estimator is None or self._axes is None:

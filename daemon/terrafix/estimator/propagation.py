@@ -63,7 +63,8 @@ TURN_UNSEEN_RAD = 0.3  # 1-sigma of the heading of an unseen frame without a rep
 class PropagationResult:
     """Result of ``advance``. ``verdict``: on the odometry of the frame. ``step_m`` (2,): east, north since the frame
     before, by odometry alone, and its 1-sigma. ``turn``: since the frame before, by images. ``verdicts``: on all
-    measurements, and on a reset of the graph, in the order in which they were made."""
+    measurements, and on a reset of the graph, in the order in which they were made. ``motion``: since the keyframe, by
+    odometry, also of a fragment that is not confirmed; None: there is none, or a graph has begun with the frame."""
 
     verdict: Verdict
     placed: FrameState
@@ -71,6 +72,12 @@ class PropagationResult:
     step_sigma_m: float
     turn: Turn | None = None
     verdicts: tuple[FusionVerdict, ...] = ()
+    motion: KeyframeMotion | None = None
+
+    @property
+    def fused(self) -> bool:
+        """Odometry has entered the graph."""
+        return self.verdict is Verdict.ACCEPTED
 
 
 @dataclass(frozen=True)
@@ -373,7 +380,7 @@ class Propagation:
             state.speed_prior.update(frame.t_s, state.last.velocity_mps, state.last.velocity_cov)
             for aid in self._aids:
                 aid.after_frame(state.last, frame.attitude)
-        return self._result(step, state.last)
+        return replace(self._result(step, state.last), motion=step.sighting.motion)
 
     def _velocity_cov(self, step: _Step) -> np.ndarray:
         """Covariance (8, 8) of V of the newest node by the motion model and odometry. A motion factor that has less

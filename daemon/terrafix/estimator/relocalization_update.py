@@ -1,5 +1,7 @@
 """Relocalisations: gated, confirmed by a second one, and fused."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from terrafix.estimator.filter_state import FilterState
@@ -11,6 +13,14 @@ from terrafix.estimator.measurements.relocalization import RelocalizationMeasure
 from terrafix.messages import Relocalization, Verdict
 
 
+@dataclass(frozen=True)
+class RelocalizationResult:
+    """``fusion``: the verdict. ``measurement``: of an accepted relocalisation."""
+
+    fusion: FusionVerdict
+    measurement: RelocalizationMeasurement | None = None
+
+
 class RelocalizationUpdate:
     """``apply`` every Relocalization, after its frame."""
 
@@ -18,8 +28,8 @@ class RelocalizationUpdate:
         self._state = state
         self._run = InnovationRun()  # of those that passed the gate, since the last rejection or the last fused one
 
-    def apply(self, seen: Relocalization) -> FusionVerdict:
-        """-> the verdict. An accepted one joins the fragment of its frame to the flight, if that of the keyframe is."""
+    def apply(self, seen: Relocalization) -> RelocalizationResult:
+        """An accepted one joins the fragment of its frame to the flight, if that of the keyframe is."""
         state = self._state
         node, keyframe = state.node_of.get(seen.frame_id), state.keyframe(seen.keyframe_id)
         if node is None or not state.graph.holds(node):
@@ -38,14 +48,16 @@ class RelocalizationUpdate:
         else:
             self._run.clear()
         if innovation.is_accepted and not self._run.is_confirmed(CONFIRM_FRAMES, 0.0):
-            return FusionVerdict(measurement.name, Verdict.UNCONFIRMED, innovation, _detail(seen, offset_m))
+            detail = _detail(seen, offset_m)
+            return RelocalizationResult(FusionVerdict(measurement.name, Verdict.UNCONFIRMED, innovation, detail))
         fusion = self._fuse(node, measurement)
         if fusion.verdict is Verdict.ACCEPTED:
             self._run.clear()  # it goes on at the corrected estimate: the next one near it needs no other
             self._run.add(np.zeros(2), here_m, position_only=False)
             if keyframe.fragment.joined:
                 state.fragments.of(node).join()
-        return FusionVerdict(fusion.measurement, fusion.verdict, fusion.innovation, _detail(seen, offset_m))
+        verdict = FusionVerdict(fusion.measurement, fusion.verdict, fusion.innovation, _detail(seen, offset_m))
+        return RelocalizationResult(verdict, measurement if fusion.verdict is Verdict.ACCEPTED else None)
 
     def _fuse(self, node: int, measurement: RelocalizationMeasurement) -> FusionVerdict:
         state = self._state
@@ -58,8 +70,8 @@ class RelocalizationUpdate:
         return fusion
 
 
-def _refused(verdict: Verdict, detail: str) -> FusionVerdict:
-    return FusionVerdict("relocalization", verdict, None, detail)
+def _refused(verdict: Verdict, detail: str) -> RelocalizationResult:
+    return RelocalizationResult(FusionVerdict("relocalization", verdict, None, detail))
 
 
 def _detail(seen: Relocalization, offset_m: np.ndarray) -> str:

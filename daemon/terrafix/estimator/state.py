@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from terrafix.core.pose import ROTATION as ROTATION
+from terrafix.core.pose import TRANSLATION as TRANSLATION
+
 # Axes of the world, and of a position or a velocity in it. [spec: east, north, up]
 EAST, NORTH, UP = range(3)
 HORIZONTAL = slice(0, 2)  # [spec: east, north]
 
-# Tangent of a pose, as in GTSAM's Pose3.
-ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)  # [spec: Pose3 tangent order]
 POSE_SIZE = 6  # [spec: Pose3]
 # Pose covariance in world axes, as core.pose.tangent_to_world returns it.
 WORLD_POSITION, WORLD_ROTATION = slice(0, 3), slice(3, 6)  # [spec: core.pose, position first]

@@ -68,6 +68,7 @@ def run(name: str, run_dir: RunDir) -> int:
     limit_cores(spec.config.runtime.cores)  # before the node and its libraries are imported
     table = table_of(spec)
     process = next(p for p in table if p.name == name)
+    os.nice(process.nice)
     ctx = NodeContext(
         config=spec.config,
         frames=SharedFrameStore(run_dir.frames, writer=Frame in process.publishes),

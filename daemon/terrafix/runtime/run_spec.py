@@ -20,6 +20,7 @@ class ProcessSpec(msgspec.Struct, frozen=True, kw_only=True):
     tick_hz: float
     stuck_after_s: float
     newest: list[str]
+    nice: int
 
 
 class Spec(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,6 +45,7 @@ def spec_of(
             tick_hz=p.tick_hz,
             stuck_after_s=p.stuck_after_s,
             newest=_names(p.newest),
+            nice=p.nice,
         )
         for p in table
     ]
@@ -54,7 +56,14 @@ def spec_of(
 def table_of(spec: Spec) -> tuple[Process, ...]:
     return tuple(
         Process(
-            r.name, r.module, _kinds(r.subscribes), _kinds(r.publishes), r.tick_hz, r.stuck_after_s, _kinds(r.newest)
+            r.name,
+            r.module,
+            _kinds(r.subscribes),
+            _kinds(r.publishes),
+            r.tick_hz,
+            r.stuck_after_s,
+            _kinds(r.newest),
+            r.nice,
         )
         for r in spec.table
     )

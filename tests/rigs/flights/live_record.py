@@ -11,6 +11,7 @@ from terrafix.messages import MapMatch, Message, VehicleState
 from terrafix.recorder.provenance import header
 from terrafix.recorder.writer import FlightWriter
 from terrafix.runtime.input_order import InputLog
+from terrafix.smoother.node import SmootherNode
 from terrafix_tools.rerun.estimator import NAME, PROCESS, ReplayedEstimator
 
 LATE = 3  # messages by which the recorder receives telemetry later than the estimator does
@@ -25,14 +26,15 @@ def handled(flight: Flight) -> list[Message]:
 def write(
     path: Path, flight: Flight, *, restart_at: int | None = None, lost: frozenset[int] = frozenset(), order: bool = True
 ) -> list[Message]:
-    """Writes the record and returns what the estimator published.
+    """Writes the record and returns what estimator and smoother published.
 
     ``restart_at``: number of the input before which the estimator was killed and restarted. ``lost``: numbers of inputs
     that the recorder received and the estimator did not. ``order`` False: without InputOrder, as old versions did."""
     published: list[Message] = []
     written: list[tuple[int, Message]] = []
-    log = InputLog(NAME, 1)
+    log, smoother = InputLog(NAME, 1), SmootherNode()
     first, *rest = messages(flight)
+    list(smoother.on(first))
     with ReplayedEstimator() as estimator:
         began_ns = 1
         for number, message in enumerate([first, *rest]):
@@ -51,8 +53,9 @@ def write(
             taken = log.take(received_ns) if outputs else None
             if order and taken is not None:
                 written.append((received_ns, taken))
-            written += [(received_ns, output) for output in outputs]
-            published += outputs
+            followed = [given for output in outputs for given in (output, *smoother.on(output))]
+            written += [(received_ns, given) for given in followed]
+            published += followed
     _write(path, written)
     return published
 
@@ -65,5 +68,5 @@ def _write(path: Path, written: list[tuple[int, Message]]) -> None:
 
 
 def estimator_messages(recorded: Iterator[tuple[str, int, Message]]) -> list[Message]:
-    """-> the messages of a record that the estimator has published, in order."""
+    """-> the messages of a record that estimator and smoother have published, in order."""
     return [message for _, _, message in recorded if isinstance(message, PROCESS.publishes)]

@@ -90,6 +90,21 @@ def test_a_gap_that_odometry_bridges_counts_as_a_fragment_that_does_not_survive(
     assert row.why.startswith("2 of 3; 1 begun after 2 gaps")
 
 
+def test_each_fragment_with_a_map_fix_is_refined_in_flight_within_five_seconds_of_it(tmp_path: Path) -> None:
+    unfixed, refined = replace(GOOD, fixed=False), replace(GOOD, refined_after_s=1.0)
+    late = [refined] * 4 + [unfixed] * 2 + [GOOD] + [replace(GOOD, refined_after_s=4.0)]  # fix at 3 s, refined at 7.5 s
+    found = evidence(tmp_path / "late", numbered(late, [0] * 4 + [1] * 4))
+    assert of.fragments_merged_after_s(found).value == pytest.approx(4.5)
+    assert judge("a", ("fragments merged",), found)[0].verdict is Verdict.PASS
+    later = evidence(tmp_path / "later", numbered([*late[:7], replace(GOOD, refined_after_s=5.0)], [0] * 4 + [1] * 4))
+    assert judge("a", ("fragments merged",), later)[0].verdict is Verdict.BELOW
+    never = evidence(tmp_path / "never", numbered([refined] * 4 + [GOOD] * 4, [0] * 4 + [1] * 4))
+    row = judge("a", ("fragments merged",), never)[0]
+    assert row.verdict is Verdict.BELOW and row.why == "fragment 1 has a map fix and was not refined in flight"
+    unanchored = evidence(tmp_path / "none", numbered([refined] * 4 + [unfixed] * 4, [0] * 4 + [1] * 4))
+    assert of.fragments_merged_after_s(unanchored).value == pytest.approx(1.0)
+
+
 def test_a_fragment_counts_where_odometry_begins_it_and_not_where_the_scenario_has_its_gap(tmp_path: Path) -> None:
     gap = Marks(breaks_s=(2.0,))
     elsewhere = evidence(tmp_path / "a", numbered([GOOD] * 14, [0] * 11 + [1] * 3), gap)  # at 5.5 s

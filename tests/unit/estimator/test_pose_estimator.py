@@ -31,6 +31,8 @@ from terrafix.messages import (
     MeasurementVerdict,
     NavEstimate,
     PnpInput,
+    PoseAnchor,
+    PoseLink,
     PoseMethod,
     PoseSolution,
     SourceLabel,
@@ -229,7 +231,8 @@ def test_the_pose_does_not_depend_on_who_computes_it(flight: Flight, run: Estima
 def test_estimate_adds_the_map_factor_to_the_graph_of_the_node(flight: Flight, run: EstimatorRun) -> None:
     pose = poses_of(run).estimate(match_of(flight), LENS, COOL)
     assert pose.last_satellite_anchor_age_ms == 0
-    estimate_after = run.feed(m for m in flight.messages(AT + 1) if not isinstance(m, MapMatch))[-1]
+    *_, estimate_after, link = run.feed(m for m in flight.messages(AT + 1) if not isinstance(m, MapMatch))
+    assert isinstance(link, PoseLink)  # for the smoother, after the estimate
     assert isinstance(estimate_after, NavEstimate) and estimate_after.last_anchor_age_ms == 500
     assert np.sqrt(cov_of(estimate_after)[0, 0]) < 5.0  # without the fix 15 m, the sigma of the start
 
@@ -250,7 +253,8 @@ def test_the_node_estimates_with_the_same_poses(flight: Flight) -> None:
     """A match as a message and as a call: the same verdict, estimate and covariance."""
     called, told = (EstimatorRun().fly(flight, 0, AT + 1) for _ in range(2))
     pose = poses_of(called).estimate(match_of(flight), LENS, COOL)
-    verdict, solution, estimate = told.feed([match_of(flight)])
+    verdict, solution, estimate, anchor = told.feed([match_of(flight)])
+    assert isinstance(anchor, PoseAnchor)  # for the smoother, after the estimate
     assert isinstance(verdict, MeasurementVerdict) and isinstance(estimate, NavEstimate)
     assert solution == solution_of(pose)
     assert (verdict.measurement, verdict.verdict) == ("map", Verdict.ACCEPTED)
@@ -277,7 +281,8 @@ def test_a_late_match_gives_the_pose_of_its_own_frame(flight: Flight, run: Estim
     pose = poses_of(run).estimate(match_of(flight), LENS, COOL)
     assert (pose.frame_id, pose.emitted_at) == (AT, t_ns(AT + 2))
     assert horizontal_off_m(pose, flight, AT) < 4.0  # the newest frame is 12 m on
-    told = EstimatorRun().fly(flight, 0, AT + 3).feed([match_of(flight)])[-1]
+    *_, told, anchor = EstimatorRun().fly(flight, 0, AT + 3).feed([match_of(flight)])
+    assert isinstance(anchor, PoseAnchor) and anchor.frame_id == AT
     assert isinstance(told, NavEstimate) and told.frame_id == AT + 2  # the node publishes the newest one again
 
 

@@ -18,6 +18,7 @@ PACKAGES = {
 OWNERS = {
     "gtsam": (
         "terrafix.estimator",
+        "terrafix.smoother",
         "terrafix_tools.finalise",
         "terrafix_tools.bench.growth.estimator_cost",
         "terrafix_tools.bench.growth.merging_baseline",

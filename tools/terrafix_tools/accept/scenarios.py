@@ -219,10 +219,10 @@ SCENARIOS: tuple[Scenario, ...] = (
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _outlier_fix),
     Scenario(
         "sharp turn", "Frames are missing where the track turns most, without overlap: a new fragment.",
-        (*EVERYWHERE, "fragments", "fragments accurate"), _sharp_turn),
+        (*EVERYWHERE, "fragments", "fragments merged", "fragments accurate"), _sharp_turn),
     Scenario(
         "three fragments", "Two such gaps: three fragments, merged through geography.",
-        (*EVERYWHERE, "fragments", "fragments accurate"), _three_fragments),
+        (*EVERYWHERE, "fragments", "fragments merged", "fragments accurate"), _three_fragments),
     Scenario(
         "20 % unmatchable", "Other ground on the map along a fifth of the route: odometry goes on, the label changes.",
         (*EVERYWHERE, "says so", "asks", "drift", "drift share", "found again"), _unmatchable),

@@ -17,9 +17,9 @@ from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
 from terrafix.estimator.measurements.map_pose import undistorted_pose
 from terrafix.estimator.state import CALIBRATION_SIZE, EAST, HORIZONTAL, NORTH, TRANSLATION, UP
+from terrafix.smoother.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
 from terrafix_tools.finalise.fix_consistency import ambiguous_segments, information_shares, lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, RecordedNode
-from terrafix_tools.finalise.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
 from terrafix_tools.finalise.submaps import placed_states
 
 ROUNDS = 4  # relinearizations of custom factors; the last one moves a flight by millimetres

@@ -9,9 +9,9 @@ import numpy as np
 from terrafix.estimator.filter_state import scale_sigma
 from terrafix.estimator.initialization import HEIGHT_BIAS
 from terrafix.estimator.state import TRANSLATION, VELOCITY, NodeState
+from terrafix.smoother.sim3_pose_graph import merge
+from terrafix.smoother.submap_types import AbsoluteConstraint, RelativeConstraint, Submap
 from terrafix_tools.finalise.flight_graph import SAME_FRAME_M, FlightGraph, RecordedNode
-from terrafix_tools.finalise.sim3_pose_graph import merge
-from terrafix_tools.finalise.submap_types import AbsoluteConstraint, RelativeConstraint, Submap
 
 # Random walk of the scale of a segment from frame to frame, as a share: a known height drifts; an assumed one changes
 # with every map match.
@@ -74,7 +74,8 @@ def _submap(nodes: list[RecordedNode], first: int, scale_sigma: float | None) ->
             cov[i, TRANSLATION, TRANSLATION] -= (
                 np.outer(translation, translation) * (rays.ground.height_sigma_m / rays.ground.height_m) ** 2
             )
-    return Submap(r, p, parent, cov, scale_sigma, ASSUMED_HEIGHT_WALK if scale_sigma is None else KNOWN_HEIGHT_WALK)
+    walk = ASSUMED_HEIGHT_WALK if scale_sigma is None else KNOWN_HEIGHT_WALK
+    return Submap(r, p, parent, cov, scale_sigma, np.full(n, walk))
 
 
 def _moved(state: NodeState, pose: gtsam.Pose3) -> NodeState:

@@ -20,11 +20,13 @@ from terrafix.messages import (
     MeasurementVerdict,
     Message,
     NavEstimate,
+    Origin,
     Prediction,
     Refinement,
     SourceEnded,
     Verdict,
 )
+from terrafix.smoother.node import SmootherNode
 from terrafix_tools.montecarlo.faults import Faults
 from terrafix_tools.montecarlo.flown import Shot, fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
@@ -56,6 +58,9 @@ class Record:
     refine_cpu_s: float = 0.0
     rebuilds: int = 0
     restarts: int = 0
+    smoother_cpu_s: float = 0.0
+    smoothed_error_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2); nan: not refined in flight
+    smoothed_cov: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))  # (N, 2, 2) as published
     lie_from_s: float | None = None  # start of the first false input; None: there is none
     fixes: dict[str, int] = field(default_factory=dict)  # verdicts on map matches
 
@@ -69,7 +74,7 @@ class Run:
     def __init__(self, plan: FlightPlan) -> None:
         flown = fly(plan, Terrain(plan.seed, plan.hills_m, plan.settled))
         self._plan, self._flown = plan, flown
-        self._node = EstimatorNode()
+        self._node, self._smoother = EstimatorNode(), SmootherNode()
         self._frame = LocalFrame(flown.origin.lat_deg, flown.origin.lon_deg)
         self._times_ns: dict[int, int] = {}  # frame -> time of its newest estimate
         self._page_mb = os.sysconf("SC_PAGE_SIZE") / 2**20
@@ -89,6 +94,8 @@ class Run:
             refined_sigma_m=np.full((n, 2), np.nan),
             cpu_ms=np.zeros(n),
             memory_mb=np.full(n, np.nan),
+            smoothed_error_m=np.full((n, 2), np.nan),
+            smoothed_cov=np.full((n, 2, 2), np.nan),
         )
 
     def record(self, refine: bool) -> Record:
@@ -148,6 +155,8 @@ class Run:
     def _send(self, message: Message) -> list[Message]:
         """Processes ``message`` and records what is published, which is returned."""
         published = self.process(message)
+        for given in (message, *published) if isinstance(message, Origin) else published:
+            self._record_smoothed(given)
         for answer in published:
             match answer:
                 case NavEstimate():
@@ -164,6 +173,18 @@ class Run:
                         self._record.refined_error_m[pose.frame_id] = np.array(at) - truth_m
                         self._record.refined_sigma_m[pose.frame_id] = pose.sigma_e_m, pose.sigma_n_m
         return published
+
+    def _record_smoothed(self, message: Message) -> None:
+        """What the smoother refines after ``message``. Its time is not the estimator's."""
+        began_s, record = time.process_time(), self._record
+        for answer in self._smoother.on(message):
+            if isinstance(answer, Refinement):
+                for pose in answer.poses:
+                    at = self._frame.to_local(pose.lat_deg, pose.lon_deg)
+                    record.smoothed_error_m[pose.frame_id] = np.array(at) - self._truth(pose.frame_id).p_m[:2]
+                    (e2, n2), en = np.square([pose.sigma_e_m, pose.sigma_n_m]), pose.cov_en_m2
+                    record.smoothed_cov[pose.frame_id] = [[e2, en], [en, n2]]
+        record.smoother_cpu_s += time.process_time() - began_s
 
     def _truth(self, frame_id: int) -> Shot:
         """At the time of the newest estimate of the frame. That is earlier than the frame's time stamp if the estimator

@@ -145,6 +145,13 @@ class FlightResult:
         nees = ((self.record.refined_error_m / self.record.refined_sigma_m) ** 2).sum(axis=1)
         return np.asarray(nees[np.isfinite(nees)])
 
+    def smoothed_nees(self) -> np.ndarray:
+        """(M,) of the frames that the smoother has refined in flight, two degrees of freedom."""
+        error_m, cov = self.record.smoothed_error_m, self.record.smoothed_cov
+        refined = np.isfinite(error_m).all(axis=1)
+        solved = np.linalg.solve(cov[refined], error_m[refined][..., None])[..., 0]
+        return np.asarray(np.einsum("ni,ni->n", error_m[refined], solved))
+
     def velocity_share(self) -> np.ndarray:
         """(2N,) horizontal velocity errors in units of their 1-sigma."""
         return np.asarray((self.record.velocity_error_mps[:, :2] / self.record.velocity_sigma_mps[:, None]).ravel())
@@ -172,6 +179,9 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
     """Row of the table: over all frames of some flights."""
     nees = np.concatenate([f.nees for f in flights])
     refined = np.concatenate([f.refined_nees() for f in flights])
+    smoothed = np.concatenate([f.smoothed_nees() for f in flights])
+    smoothed_m = np.concatenate([np.hypot(*f.record.smoothed_error_m.T) for f in flights])
+    smoothed_m = smoothed_m[np.isfinite(smoothed_m)]
     on_map = np.concatenate([f.map_nees for f in flights])
     pose = np.concatenate([f.pose_nees for f in flights])
     distance = np.concatenate([f.distance_m for f in flights])
@@ -191,12 +201,15 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
         "p95_m": float(np.percentile(distance, 95)),
         "max_m": float(distance.max()),
         "refined_median_m": float(np.median(refined_m)) if len(refined_m) else None,
+        "smoothed_median_m": float(np.median(smoothed_m)) if len(smoothed_m) else None,
         "false_fixes": sum(f.false_fixes for f in flights),
         "late_false_fixes": sum(f.late_false_fixes for f in flights),
         "notice_s": max((f.notice_s for f in flights if f.notice_s is not None), default=None),
         "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
         "coverage": float((nees <= ELLIPSE95).mean()),
         "coverage_refined": float((refined <= ELLIPSE95).mean()) if len(refined) else None,
+        "coverage_smoothed": float((smoothed <= ELLIPSE95).mean()) if len(smoothed) else None,
+        "nees_smoothed": float(np.mean(smoothed)) if len(smoothed) else None,
         "coverage_on_map": float((on_map <= ELLIPSE95).mean()),
         "coverage_pose": float((pose <= POSE95).mean()),
         "nees": _row(bands[0]),
@@ -213,6 +226,7 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
         "drift_p95": float(np.percentile(drifts, 95)) if drifts else None,
         "cpu_ms_median": float(np.median(cpu)),
         "cpu_ms_p99": float(np.percentile(cpu, 99)),
+        "smoother_cpu_share_max": max(f.record.smoother_cpu_s / f.record.plan.duration_s for f in flights),
         "refine_cpu_s_max": max(f.record.refine_cpu_s for f in flights),
         "rebuilds": sum(f.record.rebuilds for f in flights),
         "restarts": sum(f.record.restarts for f in flights),

@@ -1,4 +1,4 @@
-"""Replays the estimator from the messages of a flight record, and writes the same files as the replay of a source."""
+"""Replays estimator and smoother from a flight record, and writes the same files as the replay of a source."""
 
 import time
 from collections.abc import Iterator
@@ -15,6 +15,7 @@ from terrafix.recorder.reader import ReadResult, check_format, flight_files, rea
 from terrafix_tools.replay_output import RECORD, ReplayOutput
 from terrafix_tools.rerun.estimator import NAME, PROCESS, ReplayedEstimator
 from terrafix_tools.rerun.ordered_inputs import OrderedInputs
+from terrafix_tools.rerun.smoother import ReplayedSmoother
 
 # Measurements of the MeasurementVerdicts that the link publishes; all others are the estimator's.
 LINK_MEASUREMENTS = ("estimate", "wall clock", "telemetry")
@@ -23,8 +24,8 @@ LINK_MEASUREMENTS = ("estimate", "wall clock", "telemetry")
 def replay_record(record: Path, out: Path, *, progress: bool = False) -> dict[str, Any]:
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
-    Messages of the estimator are computed again, all others are those of ``record`` (a file, or a folder of replay or
-    run). Raises SourceError, UsageError, OutputError."""
+    Messages of estimator and smoother are computed again, all others are those of ``record`` (a file, or a folder of
+    replay or run). Raises SourceError, UsageError, OutputError."""
     began_s = time.perf_counter()
     first, recorded_order = _examine(record)
     if any(file.resolve() == (out / RECORD).resolve() for file in first.files):
@@ -32,13 +33,14 @@ def replay_record(record: Path, out: Path, *, progress: bool = False) -> dict[st
     result = ReadResult()
     header = copied_header(first.header, versions=versions(), device=device())
     with ReplayOutput(out, header, RecorderSection()) as output, ReplayedEstimator() as estimator:
-        inputs = OrderedInputs(NAME)
+        inputs, smoother = OrderedInputs(NAME), ReplayedSmoother(first.header["config"])
         source = _recorded_order(record, result) if recorded_order else _input_order(record, result, inputs)
         for message, began_ns in source:
             if began_ns is None:
-                output.take([message])
+                output.take([message, *smoother.on(message)])
             else:
-                output.take(estimator.on(message, began_ns))
+                for published in estimator.on(message, began_ns):
+                    output.take([published, *smoother.on(published)])
         output.copy_images(record)
         summary = {
             "flight": record.resolve().name,
@@ -50,7 +52,7 @@ def replay_record(record: Path, out: Path, *, progress: bool = False) -> dict[st
                 "input_order": not recorded_order,
                 "missing_inputs": inputs.missing,
                 "undelivered_inputs": inputs.undelivered,
-                "restarts": estimator.restarts,
+                "restarts": estimator.restarts + smoother.restarts,
             },
             "config": first.header["config"],
             "versions": versions(),
@@ -113,7 +115,7 @@ def _messages(record: Path, result: ReadResult) -> Iterator[tuple[int, int, Mess
 
 
 def _is_output(message: Message) -> bool:
-    """Whether the estimator has published ``message``. Its InputOrder stays: the replay follows it."""
+    """Whether estimator or smoother have published ``message``. Their InputOrder stays: the replay follows it."""
     if isinstance(message, MeasurementVerdict):
         return message.measurement not in LINK_MEASUREMENTS
     return isinstance(message, PROCESS.publishes) and not isinstance(message, InputOrder)

@@ -14,7 +14,7 @@ from terrafix.estimator.factors.noise import robust_noise
 from terrafix.estimator.filter_state import FilterState
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.models.terrain import Terrain
-from terrafix.estimator.state import TRANSLATION
+from terrafix.estimator.state import HORIZONTAL, ROTATION, TRANSLATION
 from terrafix.messages import MapMatch, MapPose
 
 LOCAL_WARP = 0.33  # of the map's error: how orthophotos are stretched within one footprint [tuned]
@@ -70,6 +70,30 @@ class MapPoseMeasurement:
         else:
             factor = map_pose_factor(C(node), B(node), self.seen, cov, self.by_k1, self.radial_k1)
             state.add_factors(node, factor)
+
+
+@dataclass(frozen=True)
+class FixedPose:
+    """Camera pose by an accepted map match, with covariance ``cov`` (6, 6), tangent order, that part included which it
+    shares with other matches over the same ground."""
+
+    pose: gtsam.Pose3
+    cov: np.ndarray
+
+
+def levelled(measurement: MapPoseMeasurement, predicted: gtsam.Pose3, predicted_cov: np.ndarray) -> FixedPose:
+    """Pose of a match with the tilt that was ``predicted`` for its frame, with ``predicted_cov`` (6, 6), tangent order:
+    a tilt that the matches do not determine well moves the camera by the height times as much. Of the prediction only
+    the tilt counts, which attitude and mount give; its position has other matches in it."""
+    pose, cov = measurement.pose, measurement.cov / measurement.information_share
+    r_w_c, r_predicted = pose.rotation().matrix(), predicted.rotation().matrix()
+    by_pose = np.zeros((2, 6))
+    by_pose[:, ROTATION] = r_w_c[HORIZONTAL]
+    residual = r_w_c[HORIZONTAL] @ pose.logmap(predicted)[ROTATION]
+    tilt_cov = r_predicted[HORIZONTAL] @ predicted_cov[ROTATION, ROTATION] @ r_predicted[HORIZONTAL].T
+    gain = np.linalg.solve(by_pose @ cov @ by_pose.T + tilt_cov, by_pose @ cov).T
+    cov = cov - gain @ by_pose @ cov
+    return FixedPose(pose.retract(gain @ residual), (cov + cov.T) / 2)
 
 
 def measured_pose(pose: MapPose, map_sigma_m: float, terrain: Terrain) -> tuple[gtsam.Pose3, np.ndarray]:

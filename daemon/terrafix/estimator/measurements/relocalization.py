@@ -12,6 +12,7 @@ from terrafix.estimator.filter_state import FilterState
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.ground_plane_motion import plane_motion
+from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.state import HORIZONTAL, ROTATION
 from terrafix.messages import Relocalization, Verdict
 
@@ -36,6 +37,7 @@ class RelocalizationMeasurement:
 
     pose: gtsam.Pose3
     cov: np.ndarray
+    motion: RelativePose  # since the keyframe
     name: str = "relocalization"
 
     @classmethod
@@ -51,7 +53,7 @@ class RelocalizationMeasurement:
             return motion
         between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
         moved = between.inverse().AdjointMap()
-        return cls(keyframe.pose.compose(between), moved @ keyframe.cov @ moved.T + motion.cov)
+        return cls(keyframe.pose.compose(between), moved @ keyframe.cov @ moved.T + motion.cov, motion)
 
     def innovation(self, state: FilterState, node: int) -> Innovation:
         """Innovation of the pose, 6 degrees of freedom, tangent order. Its covariance is the largest that both errors

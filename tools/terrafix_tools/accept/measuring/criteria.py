@@ -43,6 +43,9 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "wrong ones rejected": ("AC-3", "wrong frames or fixes rejected", "%", ALL, None, of.wrong_rejected),
     "next frame": ("AC-3", "error after a wrong frame or fix, worst", "m", _most(50.0), None, of.error_after_wrong),
     "fragments": ("AC-4", "disconnected fragments that survive", "%", ALL, None, of.fragments_localised),
+    "fragments merged": (
+        "AC-4", "from a fragment's map fix to its refined past, in flight", "s", _most(5.0), None,
+        of.fragments_merged_after_s),
     "fragments accurate": (
         "AC-4", "frames within 50 m, worst fragment", "%", _least(0.80), _least(0.99), of.worst_fragment),
     "not localised": ("AC-5", "frames not localised", "%", _most(0.10), _most(0.01), of.not_localised),

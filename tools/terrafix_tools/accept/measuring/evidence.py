@@ -17,6 +17,8 @@ from terrafix.messages import (
     Odometry,
     Origin,
     Prediction,
+    Refinement,
+    RefinementSource,
     SearchState,
     Verdict,
 )
@@ -79,6 +81,8 @@ class Evidence:
     peer: dict[str, Any]  # peer.json of a closed loop; empty for a replay
     searches: list[SearchState] = field(default_factory=list)  # state changes of the search, in order
     sent: list[SentFix] = field(default_factory=list)  # of a closed loop with a false input; empty otherwise
+    # Time at which the smoother has published the first refined pose of a frame in flight, by fragment
+    refined_ns: dict[int, int] = field(default_factory=dict)
 
     @property
     def span_s(self) -> float:
@@ -161,7 +165,7 @@ def gather(
     summary = read_summary(out)
     frames = [FrameEvidence(row) for row in rows]
     by_id: dict[int, FrameEvidence] = {}  # rows are in the order of the Frame messages
-    origin, hot, searches = None, set(), []
+    origin, hot, searches, refined_ns = None, set(), [], dict[int, int]()
     for _, _, message in read_flight(out):
         match message:
             case Origin():
@@ -170,6 +174,9 @@ def gather(
                 by_id.setdefault(message.frame_id, frames[min(len(by_id), len(frames) - 1)])
             case SearchState():
                 searches.append(message)
+            case Refinement(source=RefinementSource.SMOOTHER):
+                for pose in message.poses:
+                    refined_ns.setdefault(pose.fragment_id, message.t_ns)
             case Health() if message.throttled:
                 hot.add(message.t_ns)
             case _:
@@ -181,4 +188,6 @@ def gather(
     for frame in frames:
         frame.compared = compared.get(frame.row.file)
     of_all = metrics(rows, truth, summary, None)
-    return Evidence(origin, frames, marks, of_all, summary, hot, start_up_s, peer or {}, searches)
+    return Evidence(
+        origin, frames, marks, of_all, summary, hot, start_up_s, peer or {}, searches, refined_ns=refined_ns
+    )

@@ -67,6 +67,22 @@ def fragments_localised(e: Evidence) -> Measured:
     return Measured(alive / total, f"{alive} of {total}; {begun} begun after {len(gaps)} gaps; search: {named}")
 
 
+def fragments_merged_after_s(e: Evidence) -> Measured:
+    """From the first right map fix of each fragment of odometry to the first refined pose of it, in flight; worst."""
+    delays = []
+    for part in _fragments(e):
+        fixed = next((f for f in part if f.fixed and _near(f)), None)
+        if fixed is None:
+            continue
+        number = max(-1 if f.odometry is None else f.odometry.fragment_id for f in part)
+        if number not in e.refined_ns:
+            return Measured(None, f"fragment {number} has a map fix and was not refined in flight", Verdict.BELOW)
+        delays.append(max(0.0, e.refined_ns[number] * 1e-9 - fixed.t_s))
+    if not delays:
+        return Measured(None, "no fragment has a right map fix")
+    return Measured(max(delays), ", ".join(f"{delay:.1f} s" for delay in delays))
+
+
 def worst_fragment(e: Evidence) -> Measured:
     """Of the fragments of odometry."""
     known = [[_near(f) for f in part if f.compared] for part in _fragments(e)]

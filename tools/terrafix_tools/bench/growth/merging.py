@@ -21,9 +21,9 @@ from rich.table import Table
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
 from terrafix.core.pose import exp_so3, log_so3
+from terrafix.smoother.sim3_pose_graph import merge
+from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, Submap
 from terrafix_tools.bench.growth import merging_baseline
-from terrafix_tools.finalise.sim3_pose_graph import merge
-from terrafix_tools.finalise.submap_types import AbsoluteConstraint, MergedSubmaps, Submap
 
 RESULT = "merging.json"
 SUBMAPS, ANCHOR_EVERY, WRONG_SHARE, WRONG_M = 10, 10, 0.05, 350.0
@@ -110,7 +110,8 @@ def _submap(rng: np.random.Generator, r_w: np.ndarray, p_w: np.ndarray, scale_kn
         r_f[i] = r_f[i - 1] @ r_step @ exp_so3(error[:3])
         p_f[i] = p_f[i - 1] + r_f[i - 1] @ p_step
     parent = np.arange(-1, n - 1)
-    return Submap(r_f, p_f, parent, np.broadcast_to(cov, (n, 6, 6)), 0.01 if scale_known else None, SCALE_WALK)
+    steps_cov, walk = np.broadcast_to(cov, (n, 6, 6)), np.full(n, SCALE_WALK)
+    return Submap(r_f, p_f, parent, steps_cov, 0.01 if scale_known else None, walk)
 
 
 def positions(submaps: list[Submap], anchors: list[AbsoluteConstraint]) -> list[np.ndarray]:

@@ -3,8 +3,8 @@
 import gtsam
 import numpy as np
 
-from terrafix_tools.finalise.sim3_consensus import place
-from terrafix_tools.finalise.submap_types import AbsoluteConstraint, Submap
+from terrafix.smoother.sim3_consensus import place
+from terrafix.smoother.submap_types import AbsoluteConstraint, Submap
 
 METHOD = "gtsam.LevenbergMarquardtOptimizer, no robust loss"
 LOOSE = np.array([1e-2, 1e-2, 1e-2, 1e-6, 1e-6, 1e-6, 0.1])  # precisions of an uninformative prior
@@ -30,7 +30,7 @@ def positions(submaps: list[Submap], anchors: list[AbsoluteConstraint]) -> list[
             cov = np.zeros((7, 7))
             cov[:6, :6] = submap.step_cov[i]
             cov[3:6, 3:6] *= start.scale**2
-            cov[6, 6] = submap.scale_walk**2
+            cov[6, 6] = submap.scale_walk[i] ** 2
             step = gtsam.Similarity3(r_step[i], start.scale * p_step[i], 1.0)
             noise = gtsam.noiseModel.Gaussian.Covariance(cov)
             parent = first_key[number] + int(submap.parent[i])

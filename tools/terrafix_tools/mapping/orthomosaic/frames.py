@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from terrafix.core.errors import SourceError
-from terrafix.estimator.state import HORIZONTAL
+from terrafix.core.geodesy import rot_from_quat
+from terrafix.estimator.state import HORIZONTAL, WORLD_ROTATION
 from terrafix.messages import Refinement
 from terrafix.recorder.reader import read_flight, read_frame_images
 from terrafix.vision.sources import open_source
@@ -20,8 +21,8 @@ MIN_STEP_SHARE = 0.15  # of the height, between two frames that are used: nearer
 
 
 def refined_views(locator: FlightLocator, record: Path) -> dict[int, CameraView]:
-    """Cameras by frame id, moved to the positions that were refined after later map matches, with their variances,
-    where there are some."""
+    """Cameras by frame id, at the newest poses that were refined after later map matches, with their variances, where
+    there are some."""
     views = dict(locator.flight.views)
     for _, _, message in read_flight(record):
         if not isinstance(message, Refinement):
@@ -30,12 +31,14 @@ def refined_views(locator: FlightLocator, record: Path) -> dict[int, CameraView]
             view = views.get(pose.frame_id)
             if view is None:
                 continue
-            p_m, cov = view.p_c_in_w_m.copy(), view.cov.copy()
+            p_m, r_w_c, cov = view.p_c_in_w_m.copy(), view.r_w_c, view.cov.copy()
             p_m[HORIZONTAL] = locator.flight.frame.to_local(pose.lat_deg, pose.lon_deg)
-            refined = np.array([pose.sigma_e_m, pose.sigma_n_m])
-            shrink = np.ones(6)
-            shrink[HORIZONTAL] = np.minimum(1.0, refined / np.sqrt(np.diag(cov)[HORIZONTAL]))
-            views[pose.frame_id] = replace(view, p_c_in_w_m=p_m, cov=cov * np.outer(shrink, shrink))
+            refined = np.sqrt(np.diag(cov))
+            refined[HORIZONTAL] = pose.sigma_e_m, pose.sigma_n_m
+            if pose.q_w_c is not None and pose.rotation_sigma_rad is not None:
+                r_w_c, refined[WORLD_ROTATION] = rot_from_quat(pose.q_w_c), pose.rotation_sigma_rad
+            shrink = np.minimum(1.0, refined / np.sqrt(np.diag(cov)))
+            views[pose.frame_id] = replace(view, p_c_in_w_m=p_m, r_w_c=r_w_c, cov=cov * np.outer(shrink, shrink))
     return views
 
 

@@ -12,14 +12,14 @@ class Submap:
     ``r_f_c`` (N, 3, 3) and ``p_c_in_f`` (N, 3): the cameras. ``parent`` (N,): index of the keyframe that each was
     measured against, which comes before it; -1 for the first. ``step_cov`` (N, 6, 6): covariance of each in its parent,
     tangent order (rotation, translation), in the own unit. ``scale_sigma``: 1-sigma of the unit in metres, as a share;
-    None: the scale is unknown. ``scale_walk``: 1-sigma of its change from a keyframe to the next, as a share."""
+    None: the scale is unknown. ``scale_walk`` (N,): 1-sigma of its change from the parent to each, as a share."""
 
     r_f_c: np.ndarray
     p_c_in_f: np.ndarray
     parent: np.ndarray
     step_cov: np.ndarray
     scale_sigma: float | None
-    scale_walk: float
+    scale_walk: np.ndarray
 
     def __len__(self) -> int:
         return len(self.parent)

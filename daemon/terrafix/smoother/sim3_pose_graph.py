@@ -12,10 +12,10 @@ import gtsam
 import numpy as np
 
 from terrafix.core.gate import GATE
-from terrafix.estimator.state import TRANSLATION
-from terrafix_tools.finalise.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
-from terrafix_tools.finalise.sim3_consensus import Similarity, place
-from terrafix_tools.finalise.submap_types import (
+from terrafix.core.pose import TRANSLATION
+from terrafix.smoother.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
+from terrafix.smoother.sim3_consensus import Similarity, place
+from terrafix.smoother.submap_types import (
     AbsoluteConstraint,
     MergedSubmaps,
     RelativeConstraint,

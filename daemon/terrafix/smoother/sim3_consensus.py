@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.gate import GATE
-from terrafix.estimator.state import ROTATION, TRANSLATION
-from terrafix_tools.finalise.submap_types import AbsoluteConstraint, Submap
+from terrafix.core.pose import ROTATION, TRANSLATION
+from terrafix.smoother.submap_types import AbsoluteConstraint, Submap
 
 PROPOSERS, PARTNERS = 16, 8  # most anchors that propose, and most partners of each for a scale: more are redundant
 MIN_BASELINE_SIGMAS = 5.0  # distance of two anchors that propose a scale
@@ -42,7 +42,7 @@ class _Anchored:
         steps = np.trace(submap.step_cov[:, ROTATION, ROTATION], axis1=1, axis2=2) / 3.0
         shifts = np.trace(submap.step_cov[:, TRANSLATION, TRANSLATION], axis1=1, axis2=2) / 3.0
         self.rotation_drift, self.position_drift = (_accumulated(submap.parent, v)[index] for v in (steps, shifts))
-        self.scale_drift = _accumulated(submap.parent, np.full(len(submap), submap.scale_walk**2))[index]
+        self.scale_drift = _accumulated(submap.parent, submap.scale_walk**2)[index]
         self.scale_sigma = submap.scale_sigma
 
     def support(self, guess: Similarity, by: int) -> int:
