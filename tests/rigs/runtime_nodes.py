@@ -164,6 +164,7 @@ TABLE: tuple[Process, ...] = (
         subscribes=(m.Origin, m.Frame),
         publishes=(m.MeasurementVerdict, m.SearchState),
         stuck_after_s=0.7,
+        nice=3,
     ),
     replace(_BASE, name="vision", publishes=(m.Origin, m.Frame, m.SourceEnded)),
 )

@@ -19,6 +19,7 @@ from runtime_nodes import TABLE
 from terrafix import messages as m
 from terrafix.core.codec import decode_json
 from terrafix.core.errors import ConfigError, MapError, OutputError
+from terrafix.processes import PROCESSES
 from terrafix.runtime import run_dir
 from terrafix.runtime.fork_server import ForkedProcess
 from terrafix.runtime.managed_process import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, describe
@@ -378,3 +379,19 @@ def test_all_processes_keep_to_the_cores_of_the_budget(tmp_path: Path) -> None:
     with flight(tmp_path, more_config="[runtime]\ncores = 1\n") as f:
         eventually(lambda: len([e for e in f.events if e.event == "started"]) == len(TABLE), within_s=10)
         eventually(lambda: all(os.sched_getaffinity(f.pid(process.name)) == {first} for process in TABLE), within_s=10)
+
+
+def priorities(f: Flight, own: int) -> dict[str, int]:
+    return {p.name: os.getpriority(os.PRIO_PROCESS, f.pid(p.name)) - own for p in TABLE}
+
+
+def test_a_process_has_the_priority_of_the_table(tmp_path: Path) -> None:
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    with flight(tmp_path) as f:
+        eventually(lambda: len([e for e in f.events if e.event == "started"]) == len(TABLE), within_s=10)
+        eventually(lambda: priorities(f, own) == {"recorder": 0, "link": 0, "estimator": 3, "vision": 0}, within_s=10)
+
+
+def test_estimates_and_the_link_come_before_map_matches_and_these_before_the_smoother() -> None:
+    nice = {process.name: process.nice for process in PROCESSES}
+    assert nice["link"] == nice["estimator"] == nice["vision"] == 0 < nice["anchor"] < nice["smoother"]
