@@ -96,7 +96,7 @@ class SmootherNode:
             return
         if solves:
             self._changed, self._shift2, self._solved_ns = False, 0.0, now_ns
-            self._solve()
+            self._solved, self._behind = solve(self._graph), True
         poses = list(self._moved())
         if poses:
             self._published_ns = now_ns
@@ -155,13 +155,6 @@ class SmootherNode:
         return float(shift_m @ np.linalg.solve(claimed_m2, shift_m))
 
     # --- outputs -------------------------------------------------------------------------------------------------
-
-    def _solve(self) -> None:
-        try:
-            self._solved = solve(self._graph)
-        except RuntimeError:  # GTSAM: the system is indeterminate; the solution before stands
-            return
-        self._behind = True
 
     def _moved(self) -> Iterable[RefinedPose]:
         """Poses that have moved since they were published: of keyframes first, the newest first, then of the frames

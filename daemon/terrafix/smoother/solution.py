@@ -1,6 +1,7 @@
 """Poses of all keyframes that map matches or relocalisations place, and of the frames that follow them."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import gtsam
@@ -24,8 +25,8 @@ class Placed:
 
 
 def solve(graph: KeyframeGraph) -> dict[int, Placed]:
-    """Pose of every keyframe that an accepted map match or relocalisation places. RuntimeError (GTSAM's) for an
-    indeterminate system."""
+    """Pose of every keyframe that an accepted map match or relocalisation places; none of trees whose system is
+    indeterminate."""
     pieces = list(graph.pieces())
     joins = [join for given in graph.joins if (join := graph.on_keyframes(given)) is not None]
     placed: dict[int, Placed] = {}
@@ -33,7 +34,8 @@ def solve(graph: KeyframeGraph) -> dict[int, Placed]:
         members = {keyframe for piece in group for keyframe in piece}
         own = [join for join in joins if join.first in members]
         if own or any(keyframe in graph.anchors for keyframe in members):
-            placed |= _placed(graph, group, own)
+            with suppress(RuntimeError):  # of GTSAM: indeterminate
+                placed |= _placed(graph, group, own)
     return placed
 
 

@@ -106,6 +106,17 @@ def test_a_relocalisation_between_frames_is_one_between_their_keyframes() -> Non
     assert graph.on_keyframes(Join(3, 20, STEP, COV, 0.01)) is None, "of one keyframe"
 
 
+def test_a_tree_that_cannot_be_solved_does_not_keep_others_from_it() -> None:
+    graph = chain(4)
+    graph.add_anchor(0, Anchor(world(0), ANCHOR_COV))
+    graph.add_start(node(10))
+    graph.add_link(FrameNode(11, 11 * 10**9, 1, 100.0, STEP, np.full((6, 6), np.nan), 10))
+    graph.add_anchor(10, Anchor(world(1), ANCHOR_COV))
+    placed = solve(graph)
+    assert {0, 1, 2} <= set(placed)
+    assert all(np.isfinite(placed[i].cov).all() for i in (0, 1, 2))
+
+
 def test_a_frame_between_keyframes_takes_its_share_of_the_correction_at_both() -> None:
     graph = chain(2)
     graph.add_link(node(10, 1, gtsam.Pose3(gtsam.Rot3(), np.array([90.0, 0.0, 0.0]))))

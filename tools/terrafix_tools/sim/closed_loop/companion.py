@@ -29,7 +29,7 @@ from terrafix.messages import (
 from terrafix.processes import PROCESSES
 from terrafix.runtime.executor import InProcessShell
 
-PROCESS_NAMES = ("vision", "anchor", "estimator", "link", "health")
+PROCESS_NAMES = ("vision", "anchor", "estimator", "smoother", "link", "health")
 HEALTH_NS = 1_000_000_000
 COOL_C = 50.0
 UNIX_NS_AT_ZERO = 1_782_900_000 * 1_000_000_000  # 2026-07-01: the simulated computer has a wall clock
