@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from terrafix.core.camera import CameraCalibration
+from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.limits import MAX_KEYFRAME_AGE, WINDOW_NODES
 from terrafix.core.node import Image
 from terrafix.messages import Verdict
@@ -16,13 +16,16 @@ from terrafix.vision.patch_alignment import align_patches
 from terrafix.vision.two_view import (
     RANSAC_PX,
     TwoView,
+    TwoViewGeometry,
     covers_image,
-    determines_motion,
     homography_inliers,
     select_spread,
 )
 
 WORK_WIDTH_PX = 720  # resolves 0.2 m from 100 m; small enough for 10 frames per second on two cores
+# Width of the copy, and features of it, in which a frame is compared that too little ties to its keyframes: of a pair
+# with 24 matches on one plane they give 73. [measured: docs/decisions/040]
+DETAIL_WIDTH_PX, DETAIL_FEATURES = 1200, 2000
 MAX_CORNERS = 400
 MIN_CORNER_DISTANCE_PX = 12
 KLT_WINDOW_PX = 21
@@ -94,12 +97,17 @@ class Motion:
 class FrameTracker:
     """Registers frames in order; stores the keyframes of the estimator's window and the last tracked frame.
 
-    ``first_fragment_id``: number of the first fragment. ``matcher``: of features, for frames that KLT does not
-    track."""
+    ``first_fragment_id``: number of the first fragment. ``mount``: of the camera. ``matcher``: of features, for frames
+    that KLT does not track; None: SIFT."""
 
     def __init__(
-        self, camera: CameraCalibration, first_fragment_id: int = 0, matcher: FeatureMatcher | None = None
+        self,
+        camera: CameraCalibration,
+        first_fragment_id: int = 0,
+        mount: Mount | None = None,
+        matcher: FeatureMatcher | None = None,
     ) -> None:
+        self._detail_scale = min(1.0, DETAIL_WIDTH_PX / camera.width)
         self._scale = min(1.0, WORK_WIDTH_PX / camera.width)
         self._camera = camera.scaled(self._scale)
         self._keyframe: _Keyframe | None = None
@@ -112,30 +120,30 @@ class FrameTracker:
         self._previous_fragment: _Keyframe | None = None  # last keyframe of the previous fragment
         self._linked: list[_Keyframe] = []  # keyframes that were registered by features, in the estimator's window
         self._size_px = (self._camera.width, self._camera.height)
-        self._covisibility = Covisibility(matcher or SiftMatcher(), self._size_px)
+        geometry = TwoViewGeometry(self._camera, mount)
+        detailed = matcher or SiftMatcher(DETAIL_FEATURES)
+        self._covisibility = Covisibility(matcher or SiftMatcher(), detailed, geometry, self._camera.width)
 
     def working_copy(self, image: Image) -> np.ndarray:
         """(H, W) gray image for tracking, at most WORK_WIDTH_PX wide."""
-        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        if self._scale < 1.0:
-            gray = cv2.resize(gray, (self._camera.width, self._camera.height), interpolation=cv2.INTER_AREA)
-        return gray
+        return _gray_copy(image, self._scale)
 
     def track(self, frame_id: int, image: Image) -> Motion:
         """Registers a full-size image; see ``register``."""
-        return self.register(frame_id, self.working_copy(image))
+        return self.register(frame_id, self.working_copy(image), image)
 
-    def register(self, frame_id: int, gray: np.ndarray) -> Motion:
-        """Registers the next frame to a keyframe. ``gray``: its ``working_copy``."""
+    def register(self, frame_id: int, gray: np.ndarray, image: Image) -> Motion:
+        """Registers the next frame to a keyframe. ``gray``: the ``working_copy`` of ``image``."""
         keyframe = self._keyframe
         if keyframe is None:
             return self._new_fragment(frame_id, gray)
         keyframe.age += 1
         index, points, tracked = self._track_klt(keyframe, gray)
-        tracks = TwoView(keyframe.corners[index], points, tracked)
-        if determines_motion(tracks, self._size_px, MIN_INLIERS, MIN_INLIER_RATIO):
+        enough = len(index) >= max(MIN_INLIERS, MIN_INLIER_RATIO * tracked)
+        if enough and self._covers_images(keyframe.corners[index], points):
             return self._accept_tracks(keyframe, frame_id, gray, index, points, tracked)
-        current = _Keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1, self._covisibility.describe(gray))
+        detail = _gray_copy(image, self._detail_scale) if self._detail_scale > self._scale else None
+        current = _Keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1, self._covisibility.describe(gray, detail))
         # Two failed frames that match each other start a new fragment. One that matches nothing is a foreign frame.
         links = self._links(self._candidates(keyframe, frame_id), current)
         if not links and self._failed_frame is not None:
@@ -223,9 +231,12 @@ class FrameTracker:
             triples = self._triples(keyframe, aligned, index[valid])
             self._start_keyframe(frame_id, gray, aligned, corners[valid], keyframe.frame_id)
         # Patch alignment fails on a blurred image, but the tracks are still valid.
-        if len(valid) < MIN_INLIERS or not covers_image(aligned, self._size_px):
+        if len(valid) < MIN_INLIERS or not self._covers_images(aligned, aligned):
             aligned, valid = points, np.arange(len(points))
         return self._build_motion(keyframe, corners[valid], aligned, len(index), tracked, due=due, triples=triples)
+
+    def _covers_images(self, a: np.ndarray, b: np.ndarray) -> bool:
+        return covers_image(a, self._size_px) and covers_image(b, self._size_px)
 
     def _triples(self, keyframe: _Keyframe, positions: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Three-view matches (N, 6), normalised, of the corners ``index`` at ``positions`` (N, 2) px."""
@@ -331,3 +342,12 @@ class FrameTracker:
             fragment_id=self._fragment_id,
         )
         self._last_gray, self._last_points, self._last_index = gray, found, np.arange(len(found))
+
+
+def _gray_copy(image: Image, scale: float) -> np.ndarray:
+    """(H, W) uint8: the image in gray, smaller by ``scale``."""
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if scale < 1.0:
+        size_px = round(image.shape[1] * scale), round(image.shape[0] * scale)
+        gray = cv2.resize(gray, size_px, interpolation=cv2.INTER_AREA)
+    return gray

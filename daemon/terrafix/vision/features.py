@@ -28,15 +28,17 @@ class Features:
     def __len__(self) -> int:
         return len(self.xy_px)
 
-    def coarse(self, scale: float, count: int) -> "Features":
-        """At most ``count`` of those that a copy of the image, smaller by ``scale``, shows as well, in its pixels."""
-        keep = np.flatnonzero(self.size_px * scale >= MIN_SIZE_PX)[:count]
-        return Features(
-            self.xy_px[keep] * np.float32(scale),
-            self.descriptors[keep],
-            self.angle_rad[keep],
-            self.size_px[keep] * np.float32(scale),
-        )
+    def scaled(self, factor: float) -> "Features":
+        """In pixels of the image resized by ``factor``."""
+        # Pixel indices denote centres, as in CameraCalibration.scaled.
+        xy_px = ((self.xy_px + 0.5) * factor - 0.5).astype(np.float32)
+        return Features(xy_px, self.descriptors, self.angle_rad, (self.size_px * factor).astype(np.float32))
+
+    def coarse(self, factor: float, count: int) -> "Features":
+        """At most ``count`` of those that are large enough for the image resized by ``factor``, in pixels of that."""
+        keep = np.flatnonzero(self.size_px * factor >= MIN_SIZE_PX)[:count]
+        kept = Features(self.xy_px[keep], self.descriptors[keep], self.angle_rad[keep], self.size_px[keep])
+        return kept.scaled(factor)
 
 
 @dataclass(frozen=True)

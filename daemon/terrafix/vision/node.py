@@ -2,9 +2,11 @@
 
 from collections.abc import Iterable
 
-from terrafix.core.camera import CameraCalibration
+import numpy as np
+
+from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.node import Edge, FrameStore, NodeContext
-from terrafix.messages import Frame, Message, Odometry, Origin, Verdict
+from terrafix.messages import Frame, KeyframeLink, Message, Odometry, Origin, Verdict
 from terrafix.vision.edge import DROPPED_ERROR
 from terrafix.vision.edge import make_edge as make_source_edge
 from terrafix.vision.feature_tracker import FrameTracker, Motion
@@ -44,7 +46,9 @@ class VisionNode:
             # Frame ids go on after a restart, and there were not more fragments than frames.
             first_fragment_id = frame.frame_id if self._restarted else 0
             camera = CameraCalibration.of(self._origin.camera)
-            self._tracker, self._search = FrameTracker(camera, first_fragment_id), RelocalizationSearch(camera)
+            mount = Mount.of(self._origin.camera)
+            self._tracker = FrameTracker(camera, first_fragment_id, mount)
+            self._search = RelocalizationSearch(camera, mount)
         self._busy = self._busy or frame.error == DROPPED_ERROR
         if image is None or self._tracker is None or self._search is None:
             yield _without_motion(frame, Verdict.BAD_IMAGE)
@@ -54,7 +58,7 @@ class VisionNode:
         if repeat in (Repeat.IDENTICAL, Repeat.OLDER):  # a stale buffer does not show the current position
             yield _without_motion(frame, Verdict.STALLED)
             return
-        motion = self._tracker.register(frame.frame_id, gray)
+        motion = self._tracker.register(frame.frame_id, gray, image)
         yield _odometry(frame, motion, static=repeat is Repeat.PREVIOUS)
         found = self._search.on_frame(frame, gray, motion, busy=self._busy)  # after the odometry, which must not wait
         self._busy = False
@@ -68,7 +72,7 @@ def _odometry(frame: Frame, motion: Motion, *, static: bool) -> Odometry:
         frame_id=frame.frame_id,
         keyframe_id=motion.keyframe_id,
         verdict=motion.verdict,
-        two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in motion.two_view],
+        two_view=_pairs(motion.two_view),
         sigma_norm=motion.sigma_norm,
         inliers=motion.inliers,
         tracked=motion.tracked,
@@ -80,7 +84,21 @@ def _odometry(frame: Frame, motion: Motion, *, static: bool) -> Odometry:
         ],
         three_view_sigma_norm=motion.three_view_sigma_norm,
         fragment_id=motion.fragment_id,
+        links=[
+            KeyframeLink(
+                keyframe_id=link.keyframe_id,
+                two_view=_pairs(link.two_view),
+                sigma_norm=link.sigma_norm,
+                inliers=link.inliers,
+                tracked=link.tracked,
+            )
+            for link in motion.links
+        ],
     )
+
+
+def _pairs(two_view: np.ndarray) -> list[tuple[float, float, float, float]]:
+    return [(float(a), float(b), float(c), float(d)) for a, b, c, d in two_view]
 
 
 def _without_motion(frame: Frame, verdict: Verdict) -> Odometry:

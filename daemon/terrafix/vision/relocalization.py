@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from terrafix.core.camera import CameraCalibration
+from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.messages import Frame, Relocalization
 from terrafix.vision.covisibility import COARSE_FEATURES, COARSE_WIDTH_PX
 from terrafix.vision.feature_tracker import KEYFRAME_SHIFT, MAX_PAIRS, SIGMA_PX, Motion
 from terrafix.vision.features import Features, SiftMatcher
 from terrafix.vision.keyframe_database import KeyframeDatabase, StoredKeyframe
-from terrafix.vision.two_view import TwoView, select_spread, verify
+from terrafix.vision.two_view import TwoView, TwoViewGeometry, select_spread
 
 CANDIDATES = 5  # that are verified: 3 ms each
 INTERVAL_NS = 1_000_000_000  # between two searches: 50 ms of one core, 5 % of its time
@@ -41,10 +41,12 @@ class _View:
 class RelocalizationSearch:
     """``on_frame`` with every frame, in order, after its registration."""
 
-    def __init__(self, camera: CameraCalibration, database: KeyframeDatabase | None = None) -> None:
+    def __init__(
+        self, camera: CameraCalibration, mount: Mount | None = None, database: KeyframeDatabase | None = None
+    ) -> None:
         self._scale = min(1.0, COARSE_WIDTH_PX / camera.width)
         self._camera = camera.scaled(self._scale)
-        self._matcher = SiftMatcher(COARSE_FEATURES)
+        self._matcher, self._geometry = SiftMatcher(COARSE_FEATURES), TwoViewGeometry(self._camera, mount)
         self.database = KeyframeDatabase() if database is None else database
         self._path: dict[int, float] = {}  # fragment -> way to its newest keyframe, image widths
         self._first: _View | None = None  # first frame of a fragment: kept once a second one is registered to it
@@ -107,9 +109,9 @@ class RelocalizationSearch:
 
     def _verified(self, view: _View) -> list[tuple[StoredKeyframe, TwoView]]:
         """The candidates whose ground ``view`` shows."""
-        size, verified = (self._camera.width, self._camera.height), list[tuple[StoredKeyframe, TwoView]]()
+        verified = list[tuple[StoredKeyframe, TwoView]]()
         for keyframe in self.database.candidates(view.features, view.is_recent, CANDIDATES):
-            two_view = verify(self._matcher.match(_unpacked(keyframe.features), view.features), size)
+            two_view = self._geometry.verify(self._matcher.match(_unpacked(keyframe.features), view.features))
             if two_view is not None:
                 verified.append((keyframe, two_view))
         return verified

@@ -93,7 +93,7 @@ def test_three_view_matches_carry_the_id_of_the_previous_keyframe() -> None:
     motion = Motion(4, Verdict.ACCEPTED, seen[:, :4], 0.001, 30, 40, True, 2, seen, 0.002, fragment_id=3)
     camera = CameraCalibration.of(ORIGIN.camera)
     node._tracker, node._search = FrameTracker(camera), RelocalizationSearch(camera)
-    node._tracker.register = lambda frame_id, gray: motion  # type: ignore[method-assign]
+    node._tracker.register = lambda frame_id, gray, image: motion  # type: ignore[method-assign]
     store.put(5, picture(1))
     (published,) = node.on(Frame(t_ns=0, frame_id=5, file="5.jpg", width=640, height=480))
     assert isinstance(published, Odometry)
