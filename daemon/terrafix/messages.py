@@ -412,13 +412,13 @@ class ModelChange(StrEnum):
     OPENED = "opened"
     PROVIDER = "provider"  # the execution provider failed; the next one is used from now on
     FAILED = "failed"  # no usable output for this frame
-    GIVEN_UP = "given_up"  # matching continues without the learned model
+    GIVEN_UP = "given_up"  # matching, or odometry, continues without the learned model
     SUSPENDED = "suspended"  # matching continues without it while the thermal band is critical
     RESUMED = "resumed"
 
 
 class ModelEvent(Message, frozen=True, kw_only=True):
-    """State of the learned model for map matching, published at the start and on every change."""
+    """State of a learned model, published on every change; of that for map matching also at the start."""
 
     model: str  # "xfeat"
     change: ModelChange

@@ -36,7 +36,7 @@ class View:
 
 class Covisibility:
     """Views of images of ``width_px``, and the keyframes that share their ground. ``detailed``: describes the details
-    of a view."""
+    of a view, of whatever the features are."""
 
     def __init__(
         self, matcher: FeatureMatcher, detailed: FeatureMatcher, geometry: TwoViewGeometry, width_px: int
@@ -52,7 +52,7 @@ class Covisibility:
     def links(self, keyframes: Sequence[View], view: View) -> list[tuple[int, TwoView]]:
         """The keyframes of which ``view`` shows ground, as indices, with what both show: at most LINKS, the one with
         most inliers first. The CANDIDATES with most coarse matches are verified, in this order."""
-        shared = [len(self._matcher.match(keyframe.coarse, view.coarse)) for keyframe in keyframes]
+        shared = [self._matcher.shared(keyframe.coarse, view.coarse) for keyframe in keyframes]
         seen, verified, most = dict[int, TwoView](), dict[int, TwoView](), 0
         for i in sorted(range(len(keyframes)), key=lambda i: -shared[i])[:CANDIDATES]:
             # After an easy pair only those keyframes are compared that are likely to show as much.

@@ -121,7 +121,7 @@ class FrameTracker:
         self._linked: list[_Keyframe] = []  # keyframes that were registered by features, in the estimator's window
         self._size_px = (self._camera.width, self._camera.height)
         geometry = TwoViewGeometry(self._camera, mount)
-        detailed = matcher or SiftMatcher(DETAIL_FEATURES)
+        detailed = SiftMatcher(DETAIL_FEATURES)
         self._covisibility = Covisibility(matcher or SiftMatcher(), detailed, geometry, self._camera.width)
 
     def working_copy(self, image: Image) -> np.ndarray:

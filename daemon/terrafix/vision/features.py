@@ -62,6 +62,10 @@ class FeatureMatcher(Protocol):
 
     def match(self, first: Features, second: Features) -> Matches: ...
 
+    def shared(self, first: Features, second: Features) -> int:
+        """Number of matches, by the fastest method: which images are worth to be matched."""
+        ...
+
 
 class SiftMatcher:
     """SIFT with the ratio test (Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004)."""
@@ -87,6 +91,9 @@ class SiftMatcher:
         a, b = mutual_nearest(first.descriptors, second.descriptors)
         octaves = np.log2(second.size_px[b] / first.size_px[a])
         return Matches(first.xy_px[a], second.xy_px[b], second.angle_rad[b] - first.angle_rad[a], octaves)
+
+    def shared(self, first: Features, second: Features) -> int:
+        return len(mutual_nearest(first.descriptors, second.descriptors)[0])
 
 
 def mutual_nearest(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

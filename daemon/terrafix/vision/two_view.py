@@ -18,22 +18,14 @@ RANSAC_PX = 2.5  # 0.4 m from 100 m; excludes points above the ground
 MIN_SPREAD = 0.12  # inliers must span this fraction of image width and height, else the pose is not determined
 MIN_INLIERS = 15  # by chance, 4 to 9 of 100 wrong matches agree
 MIN_INLIER_RATIO = 0.15
-EPIPOLAR_PX = (
-    1.5  # distance of a match from its epipolar line [spec: twice the 1-sigma of a feature, feature_tracker.py]
-)
+EPIPOLAR_PX = 1.5  # of a match from its epipolar line [spec: twice the 1-sigma of a feature, feature_tracker.py]
+MAX_ITERATIONS = 3000  # of the search for a motion [spec: five of 30 % right matches are drawn in 99.9 %]
 # Share of the matches on epipolar lines that one homography explains over ground without relief: there the essential
 # matrix has a second solution, and the homography is the better model. [measured: docs/decisions/040]
 PLANAR_SHARE = 0.75
 TILT_SIGMA_RAD = np.radians(12.0)  # of the ground below a camera, against its mount [spec: tilt of a vehicle in wind]
-LEVELS = (
-    0.1,
-    0.25,
-    0.4,
-    0.55,
-    0.7,
-    0.85,
-)  # quantiles of the heights that are tried [spec: a layer of a sixth is found]
-SHRINKING_PX = (12.0, 8.0, 5.0, 3.0, 2.0, 1.5, 1.5)  # scale of the robust weight by step [spec: to EPIPOLAR_PX]
+LEVELS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)  # quantiles of the depth that are tried [spec: finds a layer of a sixth]
+SHRINKING_PX = (12.0, 8.0, 5.0, 3.0, 2.0, 1.5, 1.5)  # scale of the robust weight by step [spec: down to EPIPOLAR_PX]
 
 
 @dataclass(frozen=True)
@@ -68,40 +60,29 @@ class TwoViewGeometry:
     def fit(self, matches: Matches) -> TwoView:
         """The matches on one plane, however few these are."""
         a, b = matches.a_px, matches.b_px
-        motion = self._motion(a, b)
-        if motion is None or motion[0].sum() < MIN_INLIERS:
+        if len(a) < MIN_INLIERS:
             return TwoView(a[:0], b[:0], len(matches), a[:0], b[:0])
-        on_lines, r, t = motion
+        x, y = self._camera.normalise(a), self._camera.normalise(b)
+        essential, mask = cv2.findEssentialMat(
+            x, y, np.eye(3), cv2.USAC_MAGSAC, 0.999, EPIPOLAR_PX / self._camera.fx, MAX_ITERATIONS
+        )
+        on_lines = np.zeros(len(a), bool) if mask is None else mask.ravel() > 0
+        if on_lines.sum() < MIN_INLIERS:  # points on a plane are on epipolar lines, too
+            return TwoView(a[:0], b[:0], len(matches), a[on_lines], b[on_lines])
         inlier = homography_inliers(a, b)
         if inlier.sum() < PLANAR_SHARE * on_lines.sum():
-            inlier = self._level_inliers(a, b, on_lines, r, t)
+            inlier = on_lines.copy()
+            inlier[on_lines] = self._on_level(x[on_lines], y[on_lines], essential)
         return TwoView(a[inlier], b[inlier], len(matches), a[on_lines], b[on_lines])
 
-    def _motion(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """-> (N,) bool: matches on their epipolar lines and before both cameras; R (3, 3) and unit t (3,) of the
-        motion: x_b = R x_a + t. None: there is none."""
-        if len(a) < 8:
-            return None
-        x, y = self._camera.normalise(a), self._camera.normalise(b)
-        limit = EPIPOLAR_PX / self._camera.fx
-        essential, mask = cv2.findEssentialMat(
-            x, y, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.999, threshold=limit, maxIters=3000
-        )
-        if essential is None or essential.shape != (3, 3):
-            return None
-        _, r, t, mask = cv2.recoverPose(essential, x, y, np.eye(3), mask=mask)
-        return mask.ravel() > 0, r, t.ravel()
-
-    def _level_inliers(
-        self, a: np.ndarray, b: np.ndarray, on_lines: np.ndarray, r: np.ndarray, t: np.ndarray
-    ) -> np.ndarray:
-        """(N,) bool: the matches of ``on_lines`` on the plane below that most of them agree with.
+    def _on_level(self, x: np.ndarray, y: np.ndarray, essential: np.ndarray) -> np.ndarray:
+        """(N,) bool: which of the matches (N, 2), (N, 2), normalised, are on the plane below with most of them.
 
         With the motion known, the inverse depth of a match is known, and that of a plane is linear in its ray: an M-
         estimate of the plane (Geman and McClure 1987) with a prior on its tilt, from several levels."""
-        x = np.column_stack([self._camera.normalise(a), np.ones(len(a))])[on_lines]
-        y = np.column_stack([self._camera.normalise(b), np.ones(len(b))])[on_lines]
-        across, along = np.cross(y, x @ r.T), np.cross(y, t)
+        _, r, t, _ = cv2.recoverPose(essential, x, y, np.eye(3))
+        x, y = (np.column_stack([one, np.ones(len(one))]) for one in (x, y))
+        across, along = np.cross(y, x @ r.T), np.cross(y, t.ravel())
         length = np.linalg.norm(along, axis=1)
         inverse_depth = -np.sum(across * along, axis=1) / np.maximum(length**2, 1e-12)
         px = self._camera.fx * length  # displacement in the image by inverse depth
@@ -117,9 +98,7 @@ class TwoViewGeometry:
             found = np.abs((x @ plane - inverse_depth) * px) < RANSAC_PX
             if found.sum() > best.sum():
                 best = found
-        inlier = np.zeros(len(a), bool)
-        inlier[np.flatnonzero(on_lines)[best]] = True
-        return inlier
+        return best
 
 
 def covers_image(points: np.ndarray, size_px: tuple[int, int]) -> bool:
