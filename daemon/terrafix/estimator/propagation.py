@@ -39,7 +39,7 @@ from terrafix.estimator.models.motion_model import (
     replace_motion_covariance,
     unknown_motion_cov,
 )
-from terrafix.estimator.models.plane_motion import RelativePose
+from terrafix.estimator.models.plane_motion import MatchedRays, RelativePose
 from terrafix.estimator.prior import NavPrior
 from terrafix.estimator.state import (
     DELTA_MOTION,
@@ -359,8 +359,8 @@ class Propagation:
                 increment = increment.in_height_units(max(float(p[UP]) - ground_m, 1.0), ground_m)
         three = None if step.known is None else self._odometry.three_view(step.known)
         first = NodeState(step.pose, step.before.bias, step.velocity)
-        links = self._accepted_links(step)
-        new = NewNode(first, step.parent, step.motion, increment, attitude, rise_m, three, velocity_cov, links)
+        motion, links = self._linked(step)
+        new = NewNode(first, step.parent, motion, increment, attitude, rise_m, three, velocity_cov, links)
         state.keep_keyframes(state.graph.leaving)
         walk, parent = self._walk_sigmas(step), state.graph.state(step.parent)
         node = state.graph.extend(frame.t_s, new)
@@ -377,15 +377,21 @@ class Propagation:
                 aid.after_frame(state.last, frame.attitude)
         return self._result(step, state.last)
 
-    def _accepted_links(self, step: _Step) -> tuple[tuple[int, RelativePose], ...]:
-        """Node and motion of each further keyframe whose motion agrees with that of the keyframe."""
-        accepted = []
+    def _linked(self, step: _Step) -> tuple[RelativePose, tuple[tuple[int, MatchedRays], ...]]:
+        """The motion since the parent, and node and matched rays of each further keyframe that agrees with it."""
+        assert step.motion is not None
+        accepted = list[tuple[int, MatchedRays]]()
         for link in [] if step.known is None else self._odometry.links(step.known, step.frame):
             verdict = link if isinstance(link, FusionVerdict) else link.verdict(self._state)
             step.verdicts.append(verdict)
             if isinstance(link, KeyframeLink) and verdict.verdict is Verdict.ACCEPTED:
-                accepted.append((link.keyframe, link.motion))
-        return tuple(accepted)
+                assert link.motion.rays is not None
+                accepted.append((link.keyframe, link.motion.rays))
+        if not accepted or step.motion.rays is None:
+            return step.motion, ()
+        count = 1 + len(accepted)
+        shared = replace(step.motion, rays=step.motion.rays.sharing(count))
+        return shared, tuple((keyframe, rays.sharing(count)) for keyframe, rays in accepted)
 
     def _velocity_cov(self, step: _Step) -> np.ndarray:
         """Covariance (8, 8) of V of the newest node by the motion model and odometry. A motion factor that has less

@@ -65,7 +65,7 @@ class NewNode:
     the vehicle is stationary. ``rise_sigma_m``: change of ground elevation since the newest node, without a DEM.
     ``three_view``: an earlier node, and the constraint of that node, ``parent`` and this one. ``velocity_cov`` (8, 8):
     V of the node is known to this, independently of the nodes before; None: through ``increment``. ``links``: further
-    nodes in the window, and the motion of this one since them."""
+    nodes that stay in the window, and the matched rays of this one with them."""
 
     state: NodeState
     parent: int
@@ -75,7 +75,7 @@ class NewNode:
     rise_sigma_m: float = 0.0
     three_view: tuple[int, ThreeViewConstraint] | None = None
     velocity_cov: np.ndarray | None = None
-    links: tuple[tuple[int, RelativePose], ...] = ()
+    links: tuple[tuple[int, MatchedRays], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -231,9 +231,7 @@ class PoseGraph:
             first, middle, last = ((C(n), B(n)) for n in (new.three_view[0], new.parent, node))
             rises = new.rise_sigma_m > 0.0
             others.append(three_view_factor((first, middle, last), new.three_view[1], rises=rises))
-        for keyframe, motion in new.links:
-            if keyframe not in self._smoother.leaving(node) and motion.rays is not None:
-                others.append(self._two_view_factor(keyframe, node, new.state.pose, motion.rays))
+        others += [self._two_view_factor(keyframe, node, new.state.pose, rays) for keyframe, rays in new.links]
         self._observer.extended(self, t_s, new, odometry, others)
         self._insert(t_s, new.state, [odometry, *others])
         return node

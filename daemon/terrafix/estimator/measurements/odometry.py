@@ -189,6 +189,8 @@ class OdometryMeasurement:
         answer = self._relative_motion(odometry, frame)
         if isinstance(answer, Verdict):
             return refused(odometry, answer)
+        if answer.parent in state.graph.leaving:
+            return refused(odometry, Verdict.STALE)
         if state.fragments.of(answer.parent) is not state.fragments.of(seen.parent):
             return refused(odometry, Verdict.UNCONFIRMED)
         return KeyframeLink(odometry.keyframe_id, answer.parent, answer.motion, seen.parent, seen.motion)
