@@ -64,7 +64,7 @@ class Covisibility:
         if seen and most < WEAK_INLIERS:
             best = max(seen, key=lambda i: len(seen[i].lines_a_px))
             two_view = self._in_detail(keyframes[best], view, seen[best])
-            if two_view is not None:
+            if two_view is not None and len(two_view.a_px) > len(seen[best].a_px):
                 verified[best] = two_view
         return sorted(verified.items(), key=lambda link: -len(link[1].a_px))
 
