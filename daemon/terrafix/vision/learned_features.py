@@ -3,7 +3,6 @@
 Their descriptors are not rotation-invariant: an image is described in four rotations, and two images are matched in the
 relative rotation with most matches."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -50,25 +49,22 @@ class LearnedMatcher:
         return _features(tuple(turned), tuple(places))
 
     def match(self, first: Features, second: Features) -> Matches:
-        return self._matched(first, second, self._matcher.match)
-
-    def shared(self, first: Features, second: Features) -> int:
-        return len(self._matched(first, second, self._nearest.match))
-
-    @staticmethod
-    def _matched(
-        first: Features,
-        second: Features,
-        match: Callable[[Keypoints, Keypoints], tuple[np.ndarray, np.ndarray]],
-    ) -> Matches:
+        """In the rotation with most mutual nearest neighbours: a learned matcher finds wrong matches in all of them."""
         assert isinstance(first, LearnedFeatures) and isinstance(second, LearnedFeatures)
-        pairs, turns = max(
-            ((match(first.turned[0], turned)[0], turns) for turns, turned in enumerate(second.turned)),
-            key=lambda found: len(found[0]),
-        )
+        turns, _ = self._rotation(first, second)
+        pairs, _ = self._matcher.match(first.turned[0], second.turned[turns])
         angle_rad = np.full(len(pairs), turns * np.pi / 2.0, np.float32)
         a, b = first.places[0][pairs[:, 0]], second.places[turns][pairs[:, 1]]
         return Matches(a, b, angle_rad, np.zeros(len(pairs), np.float32))
+
+    def shared(self, first: Features, second: Features) -> int:
+        return self._rotation(first, second)[1]
+
+    def _rotation(self, first: Features, second: Features) -> tuple[int, int]:
+        """-> the quarter turns of the second image with most mutual nearest neighbours, and how many these are."""
+        assert isinstance(first, LearnedFeatures) and isinstance(second, LearnedFeatures)
+        counts = [len(self._nearest.match(first.turned[0], turned)[0]) for turned in second.turned]
+        return int(np.argmax(counts)), max(counts)
 
 
 def _features(turned: tuple[Keypoints, ...], places: tuple[np.ndarray, ...]) -> LearnedFeatures:

@@ -82,7 +82,8 @@ class VisionNode:
         except ModelRunError as error:
             assert self._origin is not None and self._learned is not None
             yield _given_up(frame.t_ns, self._learned.name, str(error))
-            self._learned, self._tracker = None, self._new_tracker(self._origin, frame.frame_id)
+            self._learned = None
+            self._tracker = self._new_tracker(self._origin, frame.frame_id)
             motion = self._tracker.register(frame.frame_id, gray, image)
         if self._learned is not None:
             motion = replace(motion, view=None)  # relocalisation compares features of SIFT
