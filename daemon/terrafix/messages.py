@@ -169,6 +169,16 @@ class SourceEnded(Message, frozen=True, kw_only=True):
 # --- vision ---------------------------------------------------------------------------------------
 
 
+class KeyframeLink(msgspec.Struct, frozen=True, kw_only=True):
+    """Feature matches of a frame with one more keyframe; fields as in Odometry."""
+
+    keyframe_id: int
+    two_view: list[tuple[float, float, float, float]]
+    sigma_norm: float
+    inliers: int
+    tracked: int
+
+
 class Odometry(Message, frozen=True, kw_only=True):
     """Feature matches of frame ``frame_id`` with keyframe ``keyframe_id``, the input of visual odometry.
 
@@ -196,6 +206,9 @@ class Odometry(Message, frozen=True, kw_only=True):
     # Fragment of the frame (frames that odometry connects to each other), numbered from 0 in the order in which they
     # begin; a fragment that is continued keeps its number. -1: none, the frame is registered to no keyframe.
     fragment_id: int = -1
+    links: list[
+        KeyframeLink
+    ] = []  # further keyframes of the fragment; of a frame that is not tracked, but matched anew
 
 
 class Relocalization(Message, frozen=True, kw_only=True):
@@ -399,13 +412,13 @@ class ModelChange(StrEnum):
     OPENED = "opened"
     PROVIDER = "provider"  # the execution provider failed; the next one is used from now on
     FAILED = "failed"  # no usable output for this frame
-    GIVEN_UP = "given_up"  # matching continues without the learned model
+    GIVEN_UP = "given_up"  # matching, or odometry, continues without the learned model
     SUSPENDED = "suspended"  # matching continues without it while the thermal band is critical
     RESUMED = "resumed"
 
 
 class ModelEvent(Message, frozen=True, kw_only=True):
-    """State of the learned model for map matching, published at the start and on every change."""
+    """State of a learned model, published on every change; of that for map matching also at the start."""
 
     model: str  # "xfeat"
     change: ModelChange
@@ -572,8 +585,9 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
     """Result of the checks of one measurement. Every rejection has one (law 3); of heights and headings only those."""
 
     frame_id: int  # -1: not related to a frame
-    # From the estimator "odometry", "map", "relocalization", "attitude" (the reported heading), "height", "airspeed",
-    # "dead_reckoning", "start", "reset" (of the graph); from the link "estimate", "telemetry", "wall clock"
+    # From the estimator "odometry", "link" (odometry with one more keyframe), "map", "relocalization", "attitude" (the
+    # reported heading), "height", "airspeed", "dead_reckoning", "start", "reset" (of the graph); from the link
+    # "estimate", "telemetry", "wall clock"
     measurement: str
     verdict: Verdict
     detail: str = ""

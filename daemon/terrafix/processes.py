@@ -160,7 +160,7 @@ PROCESSES: tuple[Process, ...] = (
         "vision",
         "terrafix.vision.node",
         (m.Origin, m.Frame, m.Health),
-        (m.Origin, m.Frame, m.VehicleState, m.Imu, m.SourceEnded, m.Odometry, m.Relocalization),
+        (m.Origin, m.Frame, m.VehicleState, m.Imu, m.SourceEnded, m.Odometry, m.Relocalization, m.ModelEvent),
         0.0,
         30.0,
     ),

@@ -23,7 +23,6 @@ PROCESSORS_M = 0.35  # change of the difference of two median errors between pro
 # 2.5 % quantile of chi-square with 2 degrees of freedom: the least mean NEES of a flight with one independent error
 LEAST_NEES_OF_ONE_DRAW = 0.0506
 AC_9_REGISTERED = 0.95  # share of the frames that odometry is required to register
-TOWN_A_REGISTERED = 0.70  # what it keeps on town-a, photos with 55 % overlap; measured: 23 of 30
 FEW_FRAMES = 50  # below this, the offset of the map determines the median error
 
 
@@ -118,12 +117,10 @@ def test_village_1_meets_the_limits_without_weights(data_set: DataSet, tmp_path:
     assert check_without_weights("village-1", "village-2014-01.tif", data_set, tmp_path) > AC_9_REGISTERED
 
 
-def test_town_a_without_weights_meets_the_limits_but_not_ac_9_and_keeps_70_percent_of_registered_frames(
-    data_set: DataSet, tmp_path: Path
-) -> None:
-    registered = check_without_weights("town-a", "town.tif", data_set, tmp_path)
-    # Fails also when the requirement is met: then this test, its name and docs/acceptance.md are to be changed.
-    assert TOWN_A_REGISTERED <= registered <= AC_9_REGISTERED
+def test_town_a_meets_the_limits_and_ac_9_without_weights(data_set: DataSet, tmp_path: Path) -> None:
+    """Photos with 55 % overlap along a line, and a survey of several lines. One of 30 shows no ground of another
+    before it."""
+    assert check_without_weights("town-a", "town.tif", data_set, tmp_path) >= AC_9_REGISTERED
 
 
 @pytest.mark.parametrize("name", ["village-1", "town-a"])

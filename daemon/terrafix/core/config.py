@@ -44,6 +44,10 @@ class Places(Section, frozen=True, kw_only=True):
     search: PlaceSearch = "auto"  # auto: exact up to 200 000 vectors, FAISS beyond
 
 
+class Vision(Section, frozen=True, kw_only=True):
+    features: str = "sift"  # of frames that KLT does not track: sift, or the name of a fetched model
+
+
 class LinkSection(Section, frozen=True, kw_only=True):
     device: str = "udpout:127.0.0.1:14550"
     baud: Baud = 921_600
@@ -108,6 +112,7 @@ class Config(Section, frozen=True, kw_only=True):
     map: Map = Map()
     models: Models = Models()
     places: Places = Places()
+    vision: Vision = Vision()
     source: Source = Source()
     link: LinkSection = LinkSection()
     recorder: RecorderSection = RecorderSection()

@@ -26,6 +26,7 @@ from terrafix.estimator.measurements.height import (
     is_below_map_matching,
     reported_agl_m,
 )
+from terrafix.estimator.measurements.keyframe_link import KeyframeLink
 from terrafix.estimator.measurements.odometry import KeyframeMotion, OdometryMeasurement, Sighting
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.bias_walk import walk_sigmas
@@ -38,7 +39,7 @@ from terrafix.estimator.models.motion_model import (
     replace_motion_covariance,
     unknown_motion_cov,
 )
-from terrafix.estimator.models.plane_motion import RelativePose
+from terrafix.estimator.models.plane_motion import MatchedRays, RelativePose
 from terrafix.estimator.prior import NavPrior
 from terrafix.estimator.state import (
     DELTA_MOTION,
@@ -149,7 +150,7 @@ class Propagation:
         before = state.graph.state(state.graph.newest)
         increment = functools.cache(lambda: self._increment(frame, before, seen=True))
         sighting = self._odometry.sighting(frame, before, increment)
-        turn = self._odometry.turn(frame.odometry, sighting)
+        turn = self._odometry.turn(sighting)
         rejected = self._gate_heading(frame, sighting, before)
         if rejected is not None and self._heading_gate.should_reinitialise and state.last_fix_s is None:
             return self._initialize(frame, ResetReason.HEADING_GATE, rejected)
@@ -363,9 +364,10 @@ class Propagation:
             increment = replace(increment, terrain_unknown=not state.terrain.has_dem)
             if step.known is not None:
                 increment = increment.in_height_units(max(float(p[UP]) - ground_m, 1.0), ground_m)
-        three = None if step.known is None else self._odometry.three_view(frame.odometry, step.known)
+        three = None if step.known is None else self._odometry.three_view(step.known)
         first = NodeState(step.pose, step.before.bias, step.velocity)
-        new = NewNode(first, step.parent, step.motion, increment, attitude, rise_m, three, velocity_cov)
+        motion, links = self._linked(step)
+        new = NewNode(first, step.parent, motion, increment, attitude, rise_m, three, velocity_cov, links)
         state.keep_keyframes(state.graph.leaving)
         walk, parent = self._walk_sigmas(step), state.graph.state(step.parent)
         node = state.graph.extend(frame.t_s, new)
@@ -381,6 +383,22 @@ class Propagation:
             for aid in self._aids:
                 aid.after_frame(state.last, frame.attitude)
         return replace(self._result(step, state.last), motion=step.sighting.motion)
+
+    def _linked(self, step: _Step) -> tuple[RelativePose, tuple[tuple[int, MatchedRays], ...]]:
+        """The motion since the parent, and node and matched rays of each further keyframe that agrees with it."""
+        assert step.motion is not None
+        accepted = list[tuple[int, MatchedRays]]()
+        for link in [] if step.known is None else self._odometry.links(step.known, step.frame):
+            verdict = link if isinstance(link, FusionVerdict) else link.verdict(self._state)
+            step.verdicts.append(verdict)
+            if isinstance(link, KeyframeLink) and verdict.verdict is Verdict.ACCEPTED:
+                assert link.motion.rays is not None
+                accepted.append((link.keyframe, link.motion.rays))
+        if not accepted or step.motion.rays is None:
+            return step.motion, ()
+        count = 1 + len(accepted)
+        shared = replace(step.motion, rays=step.motion.rays.sharing(count))
+        return shared, tuple((keyframe, rays.sharing(count)) for keyframe, rays in accepted)
 
     def _velocity_cov(self, step: _Step) -> np.ndarray:
         """Covariance (8, 8) of V of the newest node by the motion model and odometry. A motion factor that has less

@@ -8,6 +8,9 @@ import numpy as np
 
 SIFT_FEATURES = 1500
 SIFT_RATIO = 0.8  # ratio test, Lowe 2004
+MIN_SIZE_PX = (
+    1.8  # diameter of the smallest feature that SIFT finds [spec: sigma of 1.6 px in an image of twice the size]
+)
 
 _NO_POINTS, _NO_VALUES = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
 
@@ -15,12 +18,27 @@ _NO_POINTS, _NO_VALUES = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
 @dataclass(frozen=True)
 class Features:
     """``xy_px`` (N, 2) float32, ``descriptors`` (N, C) float32, ``angle_rad`` (N,): orientation in the image, clockwise
-    from its x axis; ``size_px`` (N,)."""
+    from its x axis; ``size_px`` (N,). The strongest feature is the first."""
 
     xy_px: np.ndarray
     descriptors: np.ndarray
     angle_rad: np.ndarray
     size_px: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.xy_px)
+
+    def scaled(self, factor: float) -> "Features":
+        """In pixels of the image resized by ``factor``."""
+        # Pixel indices denote centres, as in CameraCalibration.scaled.
+        xy_px = ((self.xy_px + 0.5) * factor - 0.5).astype(np.float32)
+        return Features(xy_px, self.descriptors, self.angle_rad, (self.size_px * factor).astype(np.float32))
+
+    def coarse(self, factor: float, count: int) -> "Features":
+        """At most ``count`` of those that are large enough for the image resized by ``factor``, in pixels of that."""
+        keep = np.flatnonzero(self.size_px * factor >= MIN_SIZE_PX)[:count]
+        kept = Features(self.xy_px[keep], self.descriptors[keep], self.angle_rad[keep], self.size_px[keep])
+        return kept.scaled(factor)
 
 
 @dataclass(frozen=True)
@@ -37,15 +55,16 @@ class Matches:
         return len(self.a_px)
 
 
-NO_MATCHES = Matches(_NO_POINTS, _NO_POINTS, _NO_VALUES, _NO_VALUES)
-
-
 class FeatureMatcher(Protocol):
     def describe(self, gray: np.ndarray) -> Features:
         """(H, W) uint8 -> its features."""
         ...
 
     def match(self, first: Features, second: Features) -> Matches: ...
+
+    def shared(self, first: Features, second: Features) -> int:
+        """Number of matches, by the fastest method: which images are worth to be matched."""
+        ...
 
 
 class SiftMatcher:
@@ -59,17 +78,33 @@ class SiftMatcher:
         keypoints, descriptors = self._sift.detectAndCompute(gray, None)
         if descriptors is None:
             return Features(_NO_POINTS, np.zeros((0, 128), np.float32), _NO_VALUES, _NO_VALUES)
+        order = np.argsort([-k.response for k in keypoints], kind="stable")
+        keypoints = [keypoints[i] for i in order]
         xy_px = np.array([k.pt for k in keypoints], np.float32)
         angle_rad = np.radians(np.array([k.angle for k in keypoints], np.float32))
-        return Features(xy_px, descriptors, angle_rad, np.array([k.size for k in keypoints], np.float32))
+        size_px = np.array([k.size for k in keypoints], np.float32)
+        return Features(xy_px, descriptors[order], angle_rad, size_px)
 
     def match(self, first: Features, second: Features) -> Matches:
-        if len(first.xy_px) < 2 or len(second.xy_px) < 2:
-            return NO_MATCHES
-        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
-        good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < SIFT_RATIO * p[1].distance]
-        if not good:
-            return NO_MATCHES
-        a, b = np.array([m.queryIdx for m in good]), np.array([m.trainIdx for m in good])
+        """Each feature is in one pair at most: of a photo with little texture, dozens of features are nearest to one
+        and the same, and any number of such pairs agrees with a homography that maps the image into that point."""
+        a, b = mutual_nearest(first.descriptors, second.descriptors)
         octaves = np.log2(second.size_px[b] / first.size_px[a])
         return Matches(first.xy_px[a], second.xy_px[b], second.angle_rad[b] - first.angle_rad[a], octaves)
+
+    def shared(self, first: Features, second: Features) -> int:
+        return len(mutual_nearest(first.descriptors, second.descriptors)[0])
+
+
+def mutual_nearest(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the pairs of descriptors (N, C), (M, C) that are nearest to each other, where the second nearest of
+    the first set is farther by SIFT_RATIO."""
+    if len(first) < 2 or len(second) < 2:
+        return np.zeros(0, int), np.zeros(0, int)
+    # Squared distances. SIFT's descriptors are whole numbers up to 255, so that these are exact on every processor.
+    distance2 = np.square(first).sum(axis=1)[:, None] + np.square(second).sum(axis=1) - 2.0 * (first @ second.T)
+    index, nearest, back = np.arange(len(first)), distance2.argmin(axis=1), distance2.argmin(axis=0)
+    best = distance2[index, nearest]
+    distance2[index, nearest] = np.inf
+    good = (back[nearest] == index) & (best < SIFT_RATIO**2 * distance2.min(axis=1))
+    return index[good], nearest[good]

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from terrafix.core.camera import CameraCalibration
+from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.messages import Frame, Relocalization
+from terrafix.vision.covisibility import COARSE_FEATURES, COARSE_WIDTH_PX
 from terrafix.vision.feature_tracker import KEYFRAME_SHIFT, MAX_PAIRS, SIGMA_PX, Motion
 from terrafix.vision.features import Features, SiftMatcher
 from terrafix.vision.keyframe_database import KeyframeDatabase, StoredKeyframe
-from terrafix.vision.two_view import TwoView, select_spread, verify
+from terrafix.vision.two_view import TwoView, TwoViewGeometry, select_spread
 
-# Width of the compared copies, and features of one: of village-1's pairs within half a height, 40 frames and more
-# apart, 86 % are found (360 px: 71 %), and none of 532 pairs four heights apart.
-WIDTH_PX, FEATURES = 480, 300
 CANDIDATES = 5  # that are verified: 3 ms each
 INTERVAL_NS = 1_000_000_000  # between two searches: 50 ms of one core, 5 % of its time
 # Image widths of way, from which a keyframe of the same fragment is another visit to its ground. Shorter loops would be
@@ -26,34 +24,38 @@ OLDEST_SHARE = 0.5  # of the inliers of the best candidate: an older one with so
 
 @dataclass(frozen=True)
 class _View:
-    """A frame as it is compared. ``path``: as in StoredKeyframe."""
+    """A frame as it is compared. ``path``: as in StoredKeyframe. ``linked``: keyframes that it is registered to."""
 
     frame_id: int
     fragment_id: int
     path: float
     features: Features
+    linked: frozenset[int]
 
     def is_recent(self, keyframe: StoredKeyframe) -> bool:
-        """Whether this is still the same visit to the ground of the keyframe."""
-        return keyframe.fragment_id == self.fragment_id and abs(self.path - keyframe.path) < APART
+        """Whether this is still the same visit to the ground of the keyframe, or odometry already has what both see."""
+        same_visit = keyframe.fragment_id == self.fragment_id and abs(self.path - keyframe.path) < APART
+        return same_visit or keyframe.frame_id in self.linked
 
 
 class RelocalizationSearch:
     """``on_frame`` with every frame, in order, after its registration."""
 
-    def __init__(self, camera: CameraCalibration, database: KeyframeDatabase | None = None) -> None:
-        self._scale = min(1.0, WIDTH_PX / camera.width)
+    def __init__(
+        self, camera: CameraCalibration, mount: Mount | None = None, database: KeyframeDatabase | None = None
+    ) -> None:
+        self._scale = min(1.0, COARSE_WIDTH_PX / camera.width)
         self._camera = camera.scaled(self._scale)
-        self._matcher = SiftMatcher(FEATURES)
+        self._matcher, self._geometry = SiftMatcher(COARSE_FEATURES), TwoViewGeometry(self._camera, mount)
         self.database = KeyframeDatabase() if database is None else database
         self._path: dict[int, float] = {}  # fragment -> way to its newest keyframe, image widths
         self._first: _View | None = None  # first frame of a fragment: kept once a second one is registered to it
         self._searched_ns: int | None = None
 
     def on_frame(self, frame: Frame, gray: np.ndarray, motion: Motion, *, busy: bool) -> Relocalization | None:
-        """``gray``: the working copy of the tracker, ``motion`` its result. ``busy``: frames were dropped since the
-        frame before. Keyframes are stored, and they and frames that nothing is registered to are searched for: at most
-        one in INTERVAL_NS, and none while the process is busy."""
+        """``gray``: the working copy of the tracker, ``motion`` its result, whose view is used if it has one. ``busy``:
+        frames were dropped since the frame before. Keyframes are stored, and they and frames that nothing is registered
+        to are searched for: at most one in INTERVAL_NS, and none while the process is busy."""
         self._keep_first(motion)
         lost = motion.fragment_id < 0
         if motion.becomes_keyframe:
@@ -63,7 +65,9 @@ class RelocalizationSearch:
             return None
         self._searched_ns = frame.t_ns
         path = self._path.get(motion.fragment_id, 0.0)
-        view = _View(frame.frame_id, motion.fragment_id, path, self._describe(gray))
+        features = self._describe(gray) if motion.view is None else motion.view.coarse
+        linked = frozenset((motion.keyframe_id, *(link.keyframe_id for link in motion.links)))
+        view = _View(frame.frame_id, motion.fragment_id, path, features, linked)
         verified = self._verified(view)
         known = any(self._is_same_ground(two_view) for _, two_view in verified)
         if not lost and not (known and self.database.has_fragment(view.fragment_id)):
@@ -105,9 +109,9 @@ class RelocalizationSearch:
 
     def _verified(self, view: _View) -> list[tuple[StoredKeyframe, TwoView]]:
         """The candidates whose ground ``view`` shows."""
-        size, verified = (self._camera.width, self._camera.height), list[tuple[StoredKeyframe, TwoView]]()
+        verified = list[tuple[StoredKeyframe, TwoView]]()
         for keyframe in self.database.candidates(view.features, view.is_recent, CANDIDATES):
-            two_view = verify(self._matcher.match(_unpacked(keyframe.features), view.features), size)
+            two_view = self._geometry.verify(self._matcher.match(_unpacked(keyframe.features), view.features))
             if two_view is not None:
                 verified.append((keyframe, two_view))
         return verified

@@ -1,43 +1,104 @@
 """Geometric verification: whether the matches of two images determine the motion between them.
 
 From flying height the ground is close to a plane, so its matches agree with one homography. Points above the ground
-fail the RANSAC threshold or add noise, which the covariance includes."""
+fail the RANSAC threshold or add noise, which the covariance includes. Over a town half of the matches are on roofs, and
+the homography with most of them may be a slanted plane through roofs and streets. There the essential matrix, which
+holds for points at any height (Nister 2004; MAGSAC++, Barath et al. 2020), gives the motion, and of the planes that
+this motion leaves the level one with most matches is taken."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.vision.features import Matches
 
 RANSAC_PX = 2.5  # 0.4 m from 100 m; excludes points above the ground
 MIN_SPREAD = 0.12  # inliers must span this fraction of image width and height, else the pose is not determined
-MIN_INLIERS = 15  # by chance, 4 to 8 of 100 wrong matches agree
+MIN_INLIERS = 15  # by chance, 4 to 9 of 100 wrong matches agree
 MIN_INLIER_RATIO = 0.15
+EPIPOLAR_PX = 1.5  # of a match from its epipolar line [spec: twice the 1-sigma of a feature, feature_tracker.py]
+MAX_ITERATIONS = 3000  # of the search for a motion [spec: five of 30 % right matches are drawn in 99.9 %]
+# Share of the matches on epipolar lines that one homography explains over ground without relief: there the essential
+# matrix has a second solution, and the homography is the better model. [measured: docs/decisions/040]
+PLANAR_SHARE = 0.75
+TILT_SIGMA_RAD = np.radians(12.0)  # of the ground below a camera, against its mount [spec: tilt of a vehicle in wind]
+LEVELS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)  # quantiles of the depth that are tried [spec: finds a layer of a sixth]
+SHRINKING_PX = (12.0, 8.0, 5.0, 3.0, 2.0, 1.5, 1.5)  # scale of the robust weight by step [spec: down to EPIPOLAR_PX]
 
 
 @dataclass(frozen=True)
 class TwoView:
-    """``a_px``, ``b_px`` (N, 2): matches that agree with one homography, out of ``matches``."""
+    """``a_px``, ``b_px`` (N, 2): matches that agree with one plane, out of ``matches``. ``lines_a_px``, ``lines_b_px``
+    (M, 2): those that agree with one motion, at any height."""
 
     a_px: np.ndarray
     b_px: np.ndarray
     matches: int
+    lines_a_px: np.ndarray
+    lines_b_px: np.ndarray
 
 
-def verify(matches: Matches, size_px: tuple[int, int]) -> TwoView | None:
-    """The matches of two images of ``size_px`` (width, height) on one plane; None: they do not determine a motion."""
-    inlier = homography_inliers(matches.a_px, matches.b_px)
-    two_view = TwoView(matches.a_px[inlier], matches.b_px[inlier], len(matches))
-    return two_view if determines_motion(two_view, size_px, MIN_INLIERS, MIN_INLIER_RATIO) else None
+class TwoViewGeometry:
+    """Of pairs of images of ``camera``, whose size is that of the images, in ``mount``."""
 
+    def __init__(self, camera: CameraCalibration, mount: Mount | None = None) -> None:
+        self._camera = camera
+        self._size_px = (camera.width, camera.height)
+        self._down = (mount or Mount()).r_b_c().T[:, 2]  # (3,): of a level vehicle, camera axes
 
-def determines_motion(two_view: TwoView, size_px: tuple[int, int], min_inliers: int, min_ratio: float) -> bool:
-    """True when the inliers are enough and cover enough of both images."""
-    count = len(two_view.a_px)
-    if count < min_inliers or count < min_ratio * two_view.matches:
-        return False
-    return covers_image(two_view.a_px, size_px) and covers_image(two_view.b_px, size_px)
+    def verify(self, matches: Matches) -> TwoView | None:
+        """The matches on one plane; None: they do not determine a motion."""
+        two_view = self.fit(matches)
+        return two_view if self.is_verified(two_view) else None
+
+    def is_verified(self, two_view: TwoView) -> bool:
+        enough = len(two_view.a_px) >= max(MIN_INLIERS, MIN_INLIER_RATIO * two_view.matches)
+        return enough and covers_image(two_view.a_px, self._size_px) and covers_image(two_view.b_px, self._size_px)
+
+    def fit(self, matches: Matches) -> TwoView:
+        """The matches on one plane, however few these are."""
+        a, b = matches.a_px, matches.b_px
+        if len(a) < MIN_INLIERS:
+            return TwoView(a[:0], b[:0], len(matches), a[:0], b[:0])
+        x, y = self._camera.normalise(a), self._camera.normalise(b)
+        essential, mask = cv2.findEssentialMat(
+            x, y, np.eye(3), cv2.USAC_MAGSAC, 0.999, EPIPOLAR_PX / self._camera.fx, MAX_ITERATIONS
+        )
+        on_lines = np.zeros(len(a), bool) if mask is None else mask.ravel() > 0
+        if on_lines.sum() < MIN_INLIERS:  # points on a plane are on epipolar lines, too
+            return TwoView(a[:0], b[:0], len(matches), a[on_lines], b[on_lines])
+        inlier = homography_inliers(a, b)
+        if inlier.sum() < PLANAR_SHARE * on_lines.sum():
+            inlier = on_lines.copy()
+            inlier[on_lines] = self._on_level(x[on_lines], y[on_lines], essential)
+        return TwoView(a[inlier], b[inlier], len(matches), a[on_lines], b[on_lines])
+
+    def _on_level(self, x: np.ndarray, y: np.ndarray, essential: np.ndarray) -> np.ndarray:
+        """(N,) bool: which of the matches (N, 2), (N, 2), normalised, are on the plane below with most of them.
+
+        With the motion known, the inverse depth of a match is known, and that of a plane is linear in its ray: an M-
+        estimate of the plane (Geman and McClure 1987) with a prior on its tilt, from several levels."""
+        _, r, t, _ = cv2.recoverPose(essential, x, y, np.eye(3))
+        x, y = (np.column_stack([one, np.ones(len(one))]) for one in (x, y))
+        across, along = np.cross(y, x @ r.T), np.cross(y, t.ravel())
+        length = np.linalg.norm(along, axis=1)
+        inverse_depth = -np.sum(across * along, axis=1) / np.maximum(length**2, 1e-12)
+        px = self._camera.fx * length  # displacement in the image by inverse depth
+        aside = np.eye(3) - np.outer(self._down, self._down)
+        best = np.zeros(len(x), bool)
+        for level in np.quantile(inverse_depth / np.maximum(x @ self._down, 0.1), LEVELS):
+            plane = level * self._down
+            prior = aside / max(TILT_SIGMA_RAD * abs(level), 1e-9) ** 2
+            for scale_px in SHRINKING_PX:
+                off_px = (x @ plane - inverse_depth) * px
+                weighted = x.T * (px / (1.0 + (off_px / scale_px) ** 2)) ** 2
+                plane = np.linalg.solve(weighted @ x + prior, weighted @ inverse_depth)
+            found = np.abs((x @ plane - inverse_depth) * px) < RANSAC_PX
+            if found.sum() > best.sum():
+                best = found
+        return best
 
 
 def covers_image(points: np.ndarray, size_px: tuple[int, int]) -> bool:

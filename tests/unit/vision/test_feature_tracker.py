@@ -1,11 +1,15 @@
 """Frame-to-keyframe tracking: motion, foreign frames, lost overlap and new fragments."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from terrafix.core.camera import CameraCalibration
+from terrafix.core.limits import WINDOW_NODES
 from terrafix.messages import Verdict
+from terrafix.vision import covisibility
 from terrafix.vision.feature_tracker import MAX_FAILURES, MAX_PAIRS, FrameTracker, Motion
 from textured_ground import PINHOLE, apply, homography, rotation, texture, view
 
@@ -256,3 +260,79 @@ def test_tracking_is_robust_to_noise_and_illumination(ground: np.ndarray) -> Non
     noisy = cv2.add(darker, rng.normal(0.0, 4.0, darker.shape).round().astype(np.int16), dtype=cv2.CV_8U)
     motion = tracker.track(1, noisy)
     assert motion.verdict is Verdict.ACCEPTED and is_right(motion, first, second)
+
+
+LINE_M = [(0.0, 50.0 * i, 0.0) for i in range(4)] + [(70.0, 150.0 - 50.0 * i, 180.0) for i in range(4)]  # a U-turn
+
+
+def photos(ground: np.ndarray, places: list[tuple[float, float, float]]) -> list[tuple[Pose, np.ndarray]]:
+    """Photos at (east, north, heading), each with another exposure."""
+    found = []
+    for i, (e_m, n_m, yaw_deg) in enumerate(places):
+        at = pose(e_m - 35.0, n_m - 75.0, yaw_deg)
+        found.append((at, cv2.convertScaleAbs(picture(ground, at), alpha=(1.0, 0.7, 1.2)[i % 3], beta=8 * (i % 3))))
+    return found
+
+
+def test_a_photo_is_registered_to_the_line_beside_it_that_was_flown_before(ground: np.ndarray) -> None:
+    """A photo that the one before does not overlap, while the line before does; and further keyframes are linked."""
+    tracker = FrameTracker(PINHOLE)
+    places = [*LINE_M[:4], *LINE_M[5:]]  # the first photo of the second line is missing
+    shots = photos(ground, places)
+    motions = [tracker.track(i, shot) for i, (_, shot) in enumerate(shots)]
+    assert [m.verdict for m in motions] == [Verdict.ACCEPTED] * 7
+    assert {m.fragment_id for m in motions} == {0}
+    assert motions[4].keyframe_id < 3  # the photo before, 3, is 86 m away
+    for i, motion in enumerate(motions[1:], 1):
+        assert is_right(motion, shots[motion.keyframe_id][0], shots[i][0])
+        for link in motion.links:
+            assert link.keyframe_id < i and link.keyframe_id != motion.keyframe_id
+            seen = replace(motion, two_view=link.two_view)
+            assert is_right(seen, shots[link.keyframe_id][0], shots[i][0])
+            assert 15 <= len(link.two_view) <= MAX_PAIRS and link.inliers >= len(link.two_view)
+            assert link.sigma_norm >= 0.75 / PINHOLE.fx
+    assert sum(len(m.links) for m in motions) >= 3
+
+
+@pytest.mark.parametrize(("frame_id", "verdict"), [(3, Verdict.ACCEPTED), (1 + WINDOW_NODES, Verdict.FEW_INLIERS)])
+def test_a_photo_is_not_registered_to_one_that_the_estimator_no_longer_holds(
+    ground: np.ndarray, frame_id: int, verdict: Verdict
+) -> None:
+    """Only the first photo shows the ground of the last one."""
+    tracker = FrameTracker(PINHOLE)
+    for i, (_, shot) in enumerate(photos(ground, LINE_M[:3])):
+        tracker.track(i, shot)
+    motion = tracker.track(frame_id, picture(ground, pose(-35.0, -123.0, 10.0)))
+    assert motion.verdict is verdict
+    assert verdict is Verdict.FEW_INLIERS or motion.keyframe_id == 0
+
+
+def test_foreign_photos_are_linked_to_none(ground: np.ndarray) -> None:
+    """Photos of another place, and mirrored ones, between the photos of a survey."""
+    tracker, other = FrameTracker(PINHOLE), texture(33, 190.0)
+    shots = photos(ground, LINE_M)
+    strange = [picture(other, pose(0.0, 0.0)), np.ascontiguousarray(shots[1][1][:, ::-1])]
+    motions = []
+    for i, (_, shot) in enumerate(shots):
+        motions.append(tracker.track(10 * i, shot))
+        if i in (2, 5):
+            stranger = tracker.track(10 * i + 1, strange[i == 5])
+            assert (stranger.verdict, stranger.links) == (Verdict.FEW_INLIERS, ())
+    assert all(m.verdict is Verdict.ACCEPTED and m.keyframe_id % 10 == 0 for m in motions)
+
+
+def test_a_weak_pair_of_large_photos_is_compared_in_detail(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A strip of a fifth of the image overlaps: the larger copies show more of it, and at the right places."""
+    camera = CameraCalibration(1440, 810, 855.0, 855.0, 719.5, 404.5)
+    rng, ground = np.random.default_rng(0), texture(4, 420.0)
+    ground = np.clip(ground + rng.normal(0.0, 20.0, (*ground.shape[:2], 1)), 0, 255).astype(np.uint8)  # gravel
+    first, second = pose(0.0, -80.0, agl_m=200.0), pose(8.0, 75.0, yaw_deg=5.0, agl_m=200.0)
+    images = [picture(ground, at, camera) for at in (first, second)]
+    found = []
+    for weak in (0, 1000):
+        monkeypatch.setattr(covisibility, "WEAK_INLIERS", weak)
+        tracker = FrameTracker(camera)
+        for i, image in enumerate([picture(texture(9, 190.0), pose(0.0, 0.0), camera), *images]):
+            found.append(tracker.track(i, image))
+    assert found[5].inliers > 1.3 * found[2].inliers >= 15
+    assert is_right(found[5], first, second)

@@ -5,8 +5,8 @@ import numpy as np
 
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.messages import Camera, Frame, Odometry, Origin, Verdict
-from terrafix.vision.feature_tracker import FrameTracker, Motion
+from terrafix.messages import Camera, Frame, KeyframeLink, Odometry, Origin, Verdict
+from terrafix.vision.feature_tracker import FrameTracker, Link, Motion
 from terrafix.vision.node import VisionNode
 from terrafix.vision.relocalization import RelocalizationSearch
 
@@ -85,20 +85,23 @@ def test_a_repeated_origin_changes_nothing_and_a_different_one_resets_the_tracke
     assert other.verdict is Verdict.ACCEPTED and other.becomes_keyframe
 
 
-def test_three_view_matches_carry_the_id_of_the_previous_keyframe() -> None:
+def test_three_view_matches_and_links_carry_the_ids_of_their_keyframes() -> None:
     store = MemoryFrameStore()
     node = VisionNode(store)
     list(node.on(ORIGIN))
     seen = np.arange(6.0).reshape(1, 6)
-    motion = Motion(4, Verdict.ACCEPTED, seen[:, :4], 0.001, 30, 40, True, 2, seen, 0.002, fragment_id=3)
+    links = (Link(1, seen[:, 2:], 0.003, 20, 25),)
+    motion = Motion(4, Verdict.ACCEPTED, seen[:, :4], 0.001, 30, 40, True, 2, seen, 0.002, fragment_id=3, links=links)
     camera = CameraCalibration.of(ORIGIN.camera)
     node._tracker, node._search = FrameTracker(camera), RelocalizationSearch(camera)
-    node._tracker.register = lambda frame_id, gray: motion  # type: ignore[method-assign]
+    node._tracker.register = lambda frame_id, gray, image: motion  # type: ignore[method-assign]
     store.put(5, picture(1))
     (published,) = node.on(Frame(t_ns=0, frame_id=5, file="5.jpg", width=640, height=480))
     assert isinstance(published, Odometry)
     assert (published.previous_keyframe_id, published.keyframe_id, published.three_view_sigma_norm) == (2, 4, 0.002)
     assert published.fragment_id == 3
+    link = KeyframeLink(keyframe_id=1, two_view=[(2.0, 3.0, 4.0, 5.0)], sigma_norm=0.003, inliers=20, tracked=25)
+    assert published.links == [link]
     assert published.two_view == [(0.0, 1.0, 2.0, 3.0)] and published.three_view == [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
 
 

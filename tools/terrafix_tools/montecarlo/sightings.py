@@ -14,6 +14,7 @@ from terrafix.core.limits import MAX_KEYFRAME_AGE
 from terrafix.messages import Odometry, Verdict
 from terrafix.vision import feature_tracker as real
 from terrafix.vision import repeated_picture
+from terrafix.vision.two_view import RANSAC_PX
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.lens import Lens
@@ -119,7 +120,7 @@ class SimulatedOdometry:
         sigma_px = REALIGNED_PX * float(np.exp(REALIGNED_SPREAD * self._rng.normal()))
         off = keyframe.off_px[indices] + sigma_px * self._rng.normal(size=(len(indices), 2))
         wrong = self._rng.uniform(size=len(indices)) < MISALIGNED_SHARE
-        off[wrong] += real.RANSAC_PX * self._rng.uniform(-0.7, 0.7, (int(wrong.sum()), 2))
+        off[wrong] += RANSAC_PX * self._rng.uniform(-0.7, 0.7, (int(wrong.sum()), 2))
         px, inside = self._projected(keyframe.points_m[indices], shot)
         indices, off, px = indices[inside], off[inside], (px + off)[inside]
         new = self._new_keyframe(frame_id, shot)
@@ -153,7 +154,7 @@ class SimulatedOdometry:
         a, b = keyframe.px[keyframe.tracked], (px + keyframe.off_px + keyframe.slip_px + noise)[keyframe.tracked]
         if len(a) < real.MIN_INLIERS:
             return None
-        _, mask = cv2.findHomography(a, b, cv2.RANSAC, real.RANSAC_PX, maxIters=1500, confidence=0.999)
+        _, mask = cv2.findHomography(a, b, cv2.RANSAC, RANSAC_PX, maxIters=1500, confidence=0.999)
         inlier = np.zeros(len(a), bool) if mask is None else mask.ravel().astype(bool)
         if inlier.sum() < real.MIN_INLIERS or inlier.mean() < real.MIN_INLIER_RATIO:
             return None

@@ -114,6 +114,11 @@ class FixedLagSmoother:
         """Joint marginal covariance of C, B and V of a node, in this order."""
         return self._isam.jointMarginalCovariance(_keys(node)).fullMatrix()
 
+    def joint_pose_marginal(self, first: int, second: int) -> np.ndarray:
+        """Joint marginal covariance of C of two nodes, in this order."""
+        joint = self._isam.jointMarginalCovariance([C(first), C(second)])
+        return np.block([[joint.at(C(a), C(b)) for b in (first, second)] for a in (first, second)])
+
 
 def _keys(node: int) -> tuple[int, int, int]:
     return C(node), B(node), V(node)

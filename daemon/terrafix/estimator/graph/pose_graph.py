@@ -21,7 +21,7 @@ from terrafix.estimator.graph.marginalized import MarginalizedHistory
 from terrafix.estimator.models.bias_walk import walk_sigmas
 from terrafix.estimator.models.lens_prior import RADIAL_K1_SIGMA
 from terrafix.estimator.models.motion_model import MotionIncrement, stationary_motion_cov, unknown_motion_cov
-from terrafix.estimator.models.plane_motion import RelativePose
+from terrafix.estimator.models.plane_motion import MatchedRays, RelativePose
 from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, TRANSLATION, UP, NodeState
 
 LOOSE_TRANSLATION_M = 1e4  # 1-sigma of a predicted translation, which the motion increment constrains already [tuned]
@@ -64,7 +64,8 @@ class NewNode:
     """A node that is tied to ``parent`` (in the window) by ``motion``, and to the newest node by ``increment``; None:
     the vehicle is stationary. ``rise_sigma_m``: change of ground elevation since the newest node, without a DEM.
     ``three_view``: an earlier node, and the constraint of that node, ``parent`` and this one. ``velocity_cov`` (8, 8):
-    V of the node is known to this, independently of the nodes before; None: through ``increment``."""
+    V of the node is known to this, independently of the nodes before; None: through ``increment``. ``links``: further
+    nodes that stay in the window, and the matched rays of this one with them."""
 
     state: NodeState
     parent: int
@@ -74,6 +75,7 @@ class NewNode:
     rise_sigma_m: float = 0.0
     three_view: tuple[int, ThreeViewConstraint] | None = None
     velocity_cov: np.ndarray | None = None
+    links: tuple[tuple[int, MatchedRays], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -183,6 +185,10 @@ class PoseGraph:
         """Joint marginal (NODE_SIZE, NODE_SIZE) of C, B and V of a node in the window."""
         return self._smoother.joint_marginal(node)
 
+    def joint_pose_covariance(self, first: int, second: int) -> np.ndarray:
+        """Joint marginal (12, 12) of C of two nodes in the window, in this order, tangent order each."""
+        return self._smoother.joint_pose_marginal(first, second)
+
     def _marginal(self, key: int) -> np.ndarray:
         if key not in self._marginals:
             self._marginals[key] = self._smoother.marginal(key)
@@ -225,6 +231,7 @@ class PoseGraph:
             first, middle, last = ((C(n), B(n)) for n in (new.three_view[0], new.parent, node))
             rises = new.rise_sigma_m > 0.0
             others.append(three_view_factor((first, middle, last), new.three_view[1], rises=rises))
+        others += [self._two_view_factor(keyframe, node, new.state.pose, rays) for keyframe, rays in new.links]
         self._observer.extended(self, t_s, new, odometry, others)
         self._insert(t_s, new.state, [odometry, *others])
         return node
@@ -237,17 +244,20 @@ class PoseGraph:
             if new.increment is not None:
                 cov[TRANSLATION, TRANSLATION] += LOOSE_TRANSLATION_M**2 * np.eye(3)
             return gtsam.BetweenFactorPose3(C(parent), C(node), between, robust_noise(cov))
-        rays, keyframe = motion.rays, self.state(parent).pose
+        return self._two_view_factor(parent, node, new.state.pose, motion.rays)
+
+    def _two_view_factor(self, keyframe: int, node: int, pose: gtsam.Pose3, rays: MatchedRays) -> gtsam.NonlinearFactor:
+        """``pose``: first estimate of ``node``."""
         return plane_two_view_factor(
-            C(parent),
+            C(keyframe),
             C(node),
             B(node),
-            keyframe,
-            new.state.pose,
+            self.state(keyframe).pose,
+            pose,
             rays.pairs,
             rays.sigma,
             rays.ground,
-            B(parent),
+            B(keyframe),
             rays.k1,
         )
 

@@ -12,7 +12,7 @@ from terrafix.core.geodesy import yaw_of
 from terrafix.estimator.factors.three_view import ThreeViewConstraint, ThreeViewPose, three_view_constraint
 from terrafix.estimator.filter_state import FilterState, FrameInput
 from terrafix.estimator.integrity.fragments import Fragment, MotionEvidence
-from terrafix.estimator.integrity.innovation import Innovation
+from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture
 from terrafix.estimator.integrity.time_offset import Turn
@@ -20,10 +20,11 @@ from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.ground_plane_motion import plane_motion
 from terrafix.estimator.measurements.heading import heading_innovation
+from terrafix.estimator.measurements.keyframe_link import KeyframeLink, by_link, refused
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.state import HEADING, HEIGHT, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
-from terrafix.messages import Odometry, Verdict
+from terrafix.messages import CovarianceMode, Odometry, Verdict
 
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
 HEADING_GATE = 3.0  # sigmas between the turn of a new fragment and the reported heading [tuned]
@@ -31,10 +32,11 @@ HEADING_GATE = 3.0  # sigmas between the turn of a new fragment and the reported
 
 @dataclass(frozen=True)
 class KeyframeMotion:
-    """Motion of a frame since its keyframe, whose node is ``parent``."""
+    """Motion of a frame since its keyframe, whose node is ``parent``, by ``odometry``."""
 
     parent: int
     motion: RelativePose
+    odometry: Odometry
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class OdometryMeasurement:
         alone = Fragment(t_s, odometry.fragment_id)  # of a frame without odometry that is fused
         if odometry.verdict in (Verdict.BAD_IMAGE, Verdict.STALLED):  # no new view
             return Sighting(odometry.verdict, None, alone)
-        answer = self._relative_motion(odometry, frame)
+        answer = self._first_motion(odometry, frame)
         if isinstance(answer, Verdict):
             frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False)
             return Sighting(Verdict.STALLED if frozen else answer, None, alone)
@@ -117,13 +119,13 @@ class OdometryMeasurement:
         evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree, inertial)
         fragment.add_frame(frame.t_s, evidence)
 
-    def turn(self, odometry: Odometry, sighting: Sighting) -> Turn | None:
+    def turn(self, sighting: Sighting) -> Turn | None:
         """Change of heading since the frame before, when both were seen from one keyframe, or that frame is the
         keyframe."""
         before, self._heading_seen = self._heading_seen, None
         if sighting.motion is None:
             return None
-        state, parent = self._state, sighting.motion.parent
+        state, parent, odometry = self._state, sighting.motion.parent, sighting.motion.odometry
         node = state.graph.state(parent)
         r_w_kf = node.pose.rotation().matrix()
         rotations = (r_w_kf, r_w_kf @ sighting.motion.motion.r)
@@ -136,10 +138,10 @@ class OdometryMeasurement:
             return Turn(before[0], odometry.t_ns, math.remainder(since_rad, math.tau))
         return None
 
-    def three_view(self, odometry: Odometry, seen: KeyframeMotion) -> tuple[int, ThreeViewConstraint] | None:
+    def three_view(self, seen: KeyframeMotion) -> tuple[int, ThreeViewConstraint] | None:
         """The constraint of points that the keyframe before, the keyframe and the frame saw, and the node of the
         first; None: there are too few."""
-        state = self._state
+        state, odometry = self._state, seen.odometry
         first = state.node_of.get(odometry.previous_keyframe_id)
         if not odometry.three_view or first is None or not state.graph.holds(first):
             return None
@@ -176,6 +178,33 @@ class OdometryMeasurement:
         seen_m2 = r_w_c @ seen.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T
         return MotionInnovation(p_m - predicted_m, cov_m2 + seen_m2, dt_s, increment.inertial)
 
+    def links(self, seen: KeyframeMotion, frame: FrameInput) -> list[KeyframeLink | FusionVerdict]:
+        """The further keyframes of the frame, each with its motion or with the reason why there is none."""
+        return [self._link(by_link(seen.odometry, i), seen, frame) for i in range(len(seen.odometry.links))]
+
+    def _link(self, odometry: Odometry, seen: KeyframeMotion, frame: FrameInput) -> KeyframeLink | FusionVerdict:
+        state = self._state
+        if state.mode is CovarianceMode.JACOBIAN:  # the gate needs marginals, which a hot computer does without
+            return refused(odometry, Verdict.THROTTLED)
+        answer = self._relative_motion(odometry, frame)
+        if isinstance(answer, Verdict):
+            return refused(odometry, answer)
+        if answer.parent in state.graph.leaving:
+            return refused(odometry, Verdict.STALE)
+        if state.fragments.of(answer.parent) is not state.fragments.of(seen.parent):
+            return refused(odometry, Verdict.UNCONFIRMED)
+        return KeyframeLink(odometry.keyframe_id, answer.parent, answer.motion, seen.parent, seen.motion)
+
+    def _first_motion(self, odometry: Odometry, frame: FrameInput) -> KeyframeMotion | Verdict:
+        """Motion since the keyframe, or since the first of the further keyframes that tells one; or why there is
+        none."""
+        answer = self._relative_motion(odometry, frame)
+        for i in range(len(odometry.links)):
+            if isinstance(answer, KeyframeMotion) or answer is Verdict.IMPLAUSIBLE:
+                return answer
+            answer = self._relative_motion(by_link(odometry, i), frame)
+        return answer
+
     def _relative_motion(self, odometry: Odometry, frame: FrameInput) -> KeyframeMotion | Verdict:
         """Motion since the keyframe; or why there is none."""
         if odometry.verdict is not Verdict.ACCEPTED or not odometry.two_view:
@@ -195,7 +224,7 @@ class OdometryMeasurement:
             return motion
         dt_s = max(odometry.t_ns * 1e-9 - state.graph.time_of(parent), 1e-3)
         possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + view.height_m
-        return KeyframeMotion(parent, motion) if possible else Verdict.IMPLAUSIBLE
+        return KeyframeMotion(parent, motion, odometry) if possible else Verdict.IMPLAUSIBLE
 
     def _expected_rotation(self, frame: FrameInput, keyframe: NodeState) -> tuple[np.ndarray, float]:
         """R_w_c (3, 3) of the frame by the reported attitude, and the 1-sigma of its tilt [rad]."""

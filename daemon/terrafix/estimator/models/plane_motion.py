@@ -1,6 +1,6 @@
 """Metric camera motion between two frames, from matched rays and the height above the ground plane."""
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,20 @@ class MatchedRays:
     sigma: float
     ground: "Ground"
     k1: float = 0.0
+
+    def sharing(self, count: int) -> "MatchedRays":
+        """One of ``count`` measurements whose errors are correlated, by how much is not known: all of them are roofs
+        and trees of the same ground. Each has its share of the information (covariance intersection, Julier and
+        Uhlmann 1997), so that all together claim no more than the errors allow."""
+        factor, ground = float(np.sqrt(count)), self.ground
+        shared = replace(
+            ground,
+            slope_sigma=factor * ground.slope_sigma,
+            curvature_sigma=factor * ground.curvature_sigma,
+            level_share=factor * ground.level_sigma_m / ground.height_m,
+            share=1.0,  # the level contains it
+        )
+        return replace(self, sigma=factor * self.sigma, ground=shared)
 
 
 @dataclass(frozen=True)
