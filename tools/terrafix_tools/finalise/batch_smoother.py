@@ -1,25 +1,41 @@
 """Batch smoother after landing: all measurements of a flight in one graph, solved to convergence.
 
 Beside the variables of the flight's own graph (terrafix.estimator.state) there is one per map, M_j: the offset of all
-map matches whose map states the same error. Decisions of the flight are made again with all data: which map matches are
-inliers (gnc.py), where the segments between resets lie (sim3_pose_graph.py), and at which poses odometry saw the
-ground."""
+map matches whose map states the same error; and one for the flight, F_0: the logarithm of the true focal length over
+the described one. So heights are true ones here, and the height scale of B is that of the barometer alone; in flight
+heights are as seen through the described lens, and the scale is that of both. Decisions of the flight are made again
+with all data: which map matches are inliers, and which of their points (gnc.py), where the segments between resets lie
+(sim3_pose_graph.py), and at which poses and through which lens odometry saw the ground."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, C, M, V
+from gtsam.symbol_shorthand import B, C, F, M, V
 
 from terrafix.core.gate import GATE
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
-from terrafix.estimator.measurements.map_pose import undistorted_pose
-from terrafix.estimator.state import CALIBRATION_SIZE, EAST, HORIZONTAL, NORTH, TRANSLATION, UP
+from terrafix.estimator.factors.three_view import ThreeViewPose, three_view_constraint_of_focal, three_view_factor
+from terrafix.estimator.models.bias_walk import BAROMETER_SCALE_SIGMA
+from terrafix.estimator.state import (
+    CALIBRATION_SIZE,
+    EAST,
+    HEIGHT,
+    HORIZONTAL,
+    LOG_HEIGHT_SCALE,
+    NORTH,
+    RADIAL_K1,
+    TRANSLATION,
+    UP,
+)
 from terrafix_tools.finalise.fix_consistency import ambiguous_segments, information_shares, lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, RecordedNode
 from terrafix_tools.finalise.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
+from terrafix_tools.finalise.lens import Lens, as_described
+from terrafix_tools.finalise.map_points import FOCAL, K1, POSE, PoseRows, rows_of_pose
 from terrafix_tools.finalise.submaps import placed_states
 
 ROUNDS = 4  # relinearizations of custom factors; the last one moves a flight by millimetres
@@ -27,6 +43,7 @@ ROUNDS = 4  # relinearizations of custom factors; the last one moves a flight by
 MAP_TURN_RAD, EXACT_M = 1e-6, 0.01
 # Precisions of a weak prior on the first pose of a segment, which keeps the system solvable: 10 rad, 1 km.
 LOOSE = np.array([1e-2] * 3 + [1e-6] * 3)
+MIN_FOCAL_SIGMA = 1e-5  # of the prior of the focal length, relative: an exactly known one is a variable, too
 READMISSIONS = 3  # passes in which outliers that the drift of the others had excluded may become inliers
 
 Progress = Callable[[int, int], None]
@@ -38,7 +55,8 @@ class Smoothed:
 
     ``placed`` (N,) bool: the position on earth is determined. ``inliers`` (F,) bool, of the flight's map matches.
     ``map_offset_m``: offset of each map, by the error that it states: east, north, up, and 1-sigma of each. ``begins``
-    (N,): first node of the segment of each node. ``start_inliers``: by that node, for start coordinates."""
+    (N,): first node of the segment of each node. ``start_inliers``: by that node, for start coordinates. ``lens``:
+    with the 1-sigma of both of its numbers, ``lens_sigma``."""
 
     poses: list[gtsam.Pose3]
     covs: np.ndarray
@@ -48,6 +66,8 @@ class Smoothed:
     map_offset_m: dict[float, tuple[np.ndarray, np.ndarray]]
     begins: np.ndarray
     start_inliers: dict[int, bool]
+    lens: Lens
+    lens_sigma: Lens
 
 
 def smooth(flight: FlightGraph, progress: Progress = lambda _done, _of: None) -> Smoothed:
@@ -57,34 +77,31 @@ def smooth(flight: FlightGraph, progress: Progress = lambda _done, _of: None) ->
 
 class _Smoothing:
     def __init__(self, flight: FlightGraph, progress: Progress) -> None:
-        k1, sigma = flight.radial_k1
-        fixes = []
-        for fix in flight.fixes:  # with the final estimate of the radial coefficient
-            pose, cov = undistorted_pose(fix.pose, fix.cov, fix.by_k1, k1 - fix.k1, sigma)
-            fixes.append(replace(fix, pose=pose, cov=cov))
-        self._flight, self._progress = replace(flight, fixes=fixes), progress
+        self._flight, self._progress = flight, progress
         self._nodes = flight.recorder.nodes
         self._begins = _begins(self._nodes)
         self._maps = sorted({f.map_sigma_m for f in flight.fixes})
         self._shares = information_shares(flight)
-        self._candidates = [self._fix_factor(f, share) for f, share in zip(fixes, self._shares, strict=True)]
+        self._values = self._initial()
         # A start position that was found by searching is not a measurement.
         known = flight.origin.start_sigma_m <= SEARCH_START_SIGMA_M
         self._starts = [i for i, node in enumerate(self._nodes) if node.prior is not None and known]
-        self._candidates += [self._start_factor(i) for i in self._starts]
-        self._values = self._initial()
+        self._rows: list[PoseRows] = []
+        self._candidates: list[OutlierCandidate] = []
 
     def smoothed(self) -> Smoothed:
         fixes = self._flight.fixes
         tried = np.array([f.tried for f in fixes] + [True] * len(self._starts), bool)
         inliers = tried.copy()
         certain = self._certain(0)
+        self._see_map()
         self._values, found = solve(
             certain, [d for d, t in zip(self._candidates, tried, strict=True) if t], self._values
         )
         inliers[tried] = found
         for step in range(1, ROUNDS):
             certain = self._certain(step)
+            self._see_map()
             self._values = settle(certain, self._candidates, inliers, self._values)
             inliers = self._readmitted(certain, inliers)
         self._progress(ROUNDS, ROUNDS)
@@ -98,7 +115,13 @@ class _Smoothing:
             values.insert(V(i), state.velocity)
         for j in range(len(self._maps)):
             values.insert(M(j), gtsam.Pose3())
+        values.insert(F(0), np.zeros(1))
         return values
+
+    def _lens(self, node: int) -> Lens:
+        """At the newest estimate."""
+        k1 = self._values.atVector(B(node))[RADIAL_K1]
+        return Lens(float(k1), float(self._values.atVector(F(0))[0]))
 
     # --- factors --------------------------------------------------------------------------------------------
 
@@ -112,16 +135,50 @@ class _Smoothing:
                 self._progress(step * len(self._nodes) + i, ROUNDS * len(self._nodes))
             if node.prior is not None:
                 graph.push_back(gtsam.PriorFactorPose3(C(i), node.prior[0], loose))
-            for factor in (*node.factors, *self._odometry_factor(i, node)):
+            for factor in (*node.factors, *self._calibration_factors(i, node), *self._odometry_factors(i, node)):
                 graph.push_back(self._linear(factor) if isinstance(factor, gtsam.CustomFactor) else factor)
         for j, sigma_m in enumerate(self._maps):
             sigmas = np.array([MAP_TURN_RAD] * 3 + [max(sigma_m, EXACT_M)] * 2 + [EXACT_M])
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.push_back(gtsam.PriorFactorPose3(M(j), gtsam.Pose3(), noise))
+        focal_sigma = max(self._flight.origin.camera.focal_sigma, MIN_FOCAL_SIGMA)
+        graph.push_back(gtsam.PriorFactorVector(F(0), np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, focal_sigma)))
         return graph
 
-    def _odometry_factor(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
-        """Odometry factor, reduced at the newest estimates of both cameras; the ground plane is that of the flight."""
+    def _calibration_factors(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
+        """Prior of B of the first node of a graph. In flight the height scale was that of barometer and focal length
+        together. The first prior of a flight is of both before anything was measured; later ones say what was learnt
+        of their sum."""
+        if node.calibration is None:
+            return
+        mean, cov = node.calibration
+        air = np.zeros((1, CALIBRATION_SIZE))
+        air[0, LOG_HEIGHT_SCALE] = 1.0 / BAROMETER_SCALE_SIGMA
+        if i == 0:
+            cov = cov.copy()
+            cov[LOG_HEIGHT_SCALE, :] = cov[:, LOG_HEIGHT_SCALE] = 0.0
+            cov[LOG_HEIGHT_SCALE, LOG_HEIGHT_SCALE] = BAROMETER_SCALE_SIGMA**2
+            yield gtsam.PriorFactorVector(B(i), mean, gtsam.noiseModel.Gaussian.Covariance(cov, False))
+            return
+        root = np.linalg.inv(np.linalg.cholesky(cov))
+        around = gtsam.Values()
+        around.insert(B(i), mean)
+        around.insert(F(0), np.zeros(1))
+        unit = gtsam.noiseModel.Unit.Create
+        both = gtsam.JacobianFactor(
+            B(i), root, F(0), root[:, [LOG_HEIGHT_SCALE]], np.zeros(CALIBRATION_SIZE), unit(CALIBRATION_SIZE)
+        )
+        yield gtsam.LinearContainerFactor(both, around)
+        alone = gtsam.Values()
+        alone.insert(B(i), np.zeros(CALIBRATION_SIZE))
+        yield gtsam.LinearContainerFactor(gtsam.JacobianFactor(B(i), air, np.zeros(1), unit(1)), alone)
+
+    def _odometry_factors(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
+        """Factors of the pairs and of the triples, reduced at the newest estimates of cameras and lens; the ground
+        plane is that of the flight."""
+        lens = self._lens(i)
+        focal = FocalKey(F(0), lens.log_focal)
+        yield from self._three_view_factor(node, i, focal)
         if node.motion is None or node.motion.rays is None or node.keyframe_m is None:
             return
         rays, then = node.motion.rays, node.keyframe_m
@@ -130,8 +187,32 @@ class _Smoothing:
         fall_m = rays.ground.slope_e * (now[EAST] - then[EAST]) + rays.ground.slope_n * (now[NORTH] - then[NORTH])
         height_m = rays.ground.height_m + float(now[UP] - then[UP]) - float(fall_m)
         ground = replace(rays.ground, height_m=max(height_m, 1.0))
+        pairs = np.hstack([lens.rays(as_described(rays.pairs[:, xy], rays.k1)) for xy in (slice(0, 2), slice(2, 4))])
+        sigma = float(lens.normalised(np.array(rays.sigma)))
         keys = C(node.parent), C(i), B(i)
-        yield plane_two_view_factor(*keys, keyframe, pose, rays.pairs, rays.sigma, ground, B(node.parent), rays.k1)
+        yield plane_two_view_factor(*keys, keyframe, pose, pairs, sigma, ground, B(node.parent), lens.k1, focal)
+
+    def _three_view_factor(self, node: RecordedNode, i: int, focal: FocalKey) -> Iterator[gtsam.NonlinearFactor]:
+        seen = node.triples
+        if seen is None or not len(seen.xy):
+            return
+        lens, nodes = self._lens(i), (seen.first, node.parent, i)
+        cameras = [self._values.atPose3(C(n)) for n in nodes]
+        if seen.rises:
+            rises_m = [float(self._values.atVector(B(n))[HEIGHT]) for n in nodes]
+            cameras = [
+                gtsam.Pose3(pose.rotation(), pose.translation() + np.array([0.0, 0.0, m - rises_m[1]]))
+                for pose, m in zip(cameras, rises_m, strict=True)
+            ]
+        first, middle, last = cameras
+        height_m = max(float(middle.translation()[UP]) - seen.ground_m, 1.0)
+        guess = ThreeViewPose(middle.between(first), middle.between(last), height_m, seen.ground_m, lens.k1)
+        triples, sigma = lens.normalised(seen.xy), float(lens.normalised(np.array(seen.sigma)))
+        constraint = three_view_constraint_of_focal(triples, sigma, guess, self._flight.origin.camera.focal_sigma)
+        if constraint is not None:
+            first_key, middle_key, last_key = ((C(n), B(n)) for n in nodes)
+            keys = first_key, middle_key, last_key
+            yield three_view_factor(keys, constraint, rises=seen.rises, focal=focal)
 
     def _linear(self, factor: gtsam.CustomFactor) -> gtsam.NonlinearFactor:
         around = gtsam.Values()
@@ -140,12 +221,38 @@ class _Smoothing:
             around.insert(key, self._values.atPose3(key) if is_pose else self._values.atVector(key))
         return gtsam.LinearContainerFactor(factor.linearize(around), around)
 
-    def _fix_factor(self, fix: Fix, share: float) -> OutlierCandidate:
-        keys = M(self._maps.index(fix.map_sigma_m)), C(fix.node)
+    def _see_map(self) -> None:
+        """Map matches and starts, through the lens of the newest estimate."""
+        fixes = self._flight.fixes
+        self._rows = [self._fix_rows(fix) for fix in fixes]
+        seen = zip(fixes, self._rows, self._shares, strict=True)
+        self._candidates = [self._fix_factor(fix, rows, share) for fix, rows, share in seen]
+        self._candidates += [self._start_factor(i) for i in self._starts]
+
+    def _fix_rows(self, fix: Fix) -> PoseRows:
+        lens = self._lens(fix.node)
+        fit = None if fix.points is None else fix.points.fit(lens)
+        if fix.points is not None and fit is not None:
+            return fix.points.rows(fit)
+        return rows_of_pose(fix.pose, fix.cov, fix.by_lens, Lens(fix.k1))
+
+    def _fix_factor(self, fix: Fix, seen: PoseRows, share: float) -> OutlierCandidate:
+        keys = [M(self._maps.index(fix.map_sigma_m)), C(fix.node), B(fix.node), F(0)]
+        of_map = -seen.pose.inverse().AdjointMap()
+        around = gtsam.Values()
+        around.insert(keys[0], gtsam.Pose3())
+        around.insert(keys[1], seen.pose)
+        bias = self._values.atVector(keys[2]).copy()
+        bias[RADIAL_K1] = seen.lens.k1
+        around.insert(keys[2], bias)
+        around.insert(keys[3], np.array([seen.lens.log_focal]))
 
         def factor(weight: float) -> gtsam.NonlinearFactor:
-            noise = gtsam.noiseModel.Gaussian.Covariance(fix.cov / (share * weight), False)
-            return gtsam.BetweenFactorPose3(*keys, fix.pose, noise)
+            rows = np.sqrt(share * weight) * seen.rows
+            by_bias = np.zeros((len(rows), CALIBRATION_SIZE))
+            by_bias[:, RADIAL_K1] = rows[:, K1]
+            by = [rows[:, POSE] @ of_map, rows[:, POSE], by_bias, rows[:, [FOCAL]]]
+            return linear_factor(keys, by, rows[:, -1], around)
 
         return OutlierCandidate(factor(1.0), factor, GATE[6] * share)
 
@@ -196,13 +303,29 @@ class _Smoothing:
     def _consistent(self, fix: Fix, found: Covariances) -> bool:
         shifted, camera = M(self._maps.index(fix.map_sigma_m)), C(fix.node)
         offset, pose = self._values.atPose3(shifted), self._values.atPose3(camera)
+        measured, cov_m = self._measured(fix, found)
         joint = found.jointMarginalCovariance([shifted, camera])
         seen = offset.between(pose)
         by_offset = -seen.inverse().AdjointMap()
-        cov = by_offset @ joint.at(shifted, shifted) @ by_offset.T + joint.at(camera, camera) + fix.cov
+        cov = by_offset @ joint.at(shifted, shifted) @ by_offset.T + joint.at(camera, camera) + cov_m
         across = by_offset @ joint.at(shifted, camera)
-        residual = fix.pose.localCoordinates(seen)
+        residual = measured.localCoordinates(seen)
         return float(residual @ np.linalg.solve(cov + across + across.T, residual)) <= GATE[6]
+
+    def _measured(self, fix: Fix, found: Covariances) -> tuple[gtsam.Pose3, np.ndarray]:
+        """Pose of a map match through the lens of the newest estimate, with the covariance of both."""
+        seen, lens = self._rows[self._flight.fixes.index(fix)], self._lens(fix.node)
+        rows = seen.rows[:, POSE]
+        cov = np.linalg.inv(rows.T @ rows)
+        by_lens = -cov @ rows.T @ seen.rows[:, [K1, FOCAL]]
+        change = np.array([lens.k1 - seen.lens.k1, lens.log_focal - seen.lens.log_focal])
+        sigmas = self._lens_sigma(fix.node, found)
+        of_lens = np.diag([sigmas.k1, sigmas.log_focal]) ** 2
+        return seen.pose.retract(by_lens @ change), cov + by_lens @ of_lens @ by_lens.T
+
+    def _lens_sigma(self, node: int, found: Covariances) -> Lens:
+        k1 = found.marginalCovariance(B(node))[RADIAL_K1, RADIAL_K1]
+        return Lens(float(np.sqrt(k1)), float(np.sqrt(found.marginalCovariance(F(0))[0, 0])))
 
     # --- result -----------------------------------------------------------------------------------------
 
@@ -237,6 +360,8 @@ class _Smoothing:
             offsets,
             self._begins,
             starts,
+            self._lens(n - 1),
+            self._lens_sigma(n - 1, found),
         )
 
 
@@ -246,3 +371,19 @@ def _begins(nodes: list[RecordedNode]) -> np.ndarray:
     for i, node in enumerate(nodes):
         begins[i] = i if node.parent < 0 else begins[node.parent]
     return begins
+
+
+def linear_factor(
+    keys: list[int], by: list[np.ndarray], constant: np.ndarray, around: gtsam.Values
+) -> gtsam.NonlinearFactor:
+    """Residual ``constant`` + sum of ``by`` times the changes of ``keys`` from ``around``, whitened. GTSAM's own
+    constructor of a linear factor takes three keys at most."""
+
+    def error(_this: object, _values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        if jacobians is not None:
+            for i, one in enumerate(by):
+                jacobians[i] = np.asfortranarray(one)
+        return constant
+
+    factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(constant)), keys, error)
+    return gtsam.LinearContainerFactor(factor.linearize(around), around)
