@@ -84,6 +84,10 @@ def measure(number: int) -> dict[str, Any]:
         "up_sigma_m": float(np.sqrt(np.mean(covs[:, 2, 2]))),
         "nees": float(np.mean(squares)),
         "inside95": float(np.mean(squares <= ELLIPSE95)),
+        "focal_error_sigmas": (found.lens.log_focal - np.log1p(FOCAL_ERROR)) / found.lens_sigma.log_focal,
+        "focal_sigma": found.lens_sigma.log_focal,
+        "k1_error_sigmas": (found.lens.k1 - K1_ERROR) / found.lens_sigma.k1,
+        "k1_sigma": found.lens_sigma.k1,
         "cpu_s": cpu_s,
     }
 

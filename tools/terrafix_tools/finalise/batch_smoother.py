@@ -138,7 +138,7 @@ class _Smoothing:
             for factor in (*node.factors, *self._calibration_factors(i, node), *self._odometry_factors(i, node)):
                 graph.push_back(self._linear(factor) if isinstance(factor, gtsam.CustomFactor) else factor)
         for j, sigma_m in enumerate(self._maps):
-            sigmas = np.array([MAP_TURN_RAD] * 3 + [max(sigma_m, EXACT_M)] * 2 + [EXACT_M])
+            sigmas = np.array([MAP_TURN_RAD] * 3 + [max(sigma_m, EXACT_M)] * 2 + [1.2])
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.push_back(gtsam.PriorFactorPose3(M(j), gtsam.Pose3(), noise))
         focal_sigma = max(self._flight.origin.camera.focal_sigma, MIN_FOCAL_SIGMA)
@@ -344,7 +344,7 @@ class _Smoothing:
             for i, pose in enumerate(poses):
                 level, p_m = pose.rotation().matrix()[HORIZONTAL], pose.translation()
                 height_m = p_m[UP] - (self._flight.origin.ground_amsl_m or 0.0)
-                aside_m, aside_cov = principal_point.shift(height_m * level[:, :2])
+                aside_m, aside_cov = principal_point.shift(height_m * np.exp(-self._lens(i).log_focal) * level[:, :2])
                 poses[i] = gtsam.Pose3(pose.rotation(), p_m + np.append(aside_m, 0.0))
                 covs[i, TRANSLATION, TRANSLATION] += level.T @ aside_cov @ level
         offsets = {}

@@ -8,10 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, C, V
+from gtsam.symbol_shorthand import B, C, F, V
 
 from terrafix.core.pnp import solved
 from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.factors.focal import FocalKey
+from terrafix.estimator.factors.motion import motion_factor
 from terrafix.estimator.graph.pose_graph import GraphObserver, GraphPrior, NewNode, PoseGraph
 from terrafix.estimator.measurements.map_pose import determined, measured_pose, moved_by_focal, moved_by_k1
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
@@ -115,6 +117,10 @@ class GraphRecorder(GraphObserver):
         others: list[gtsam.NonlinearFactor],
     ) -> None:
         # The smoother makes its own odometry factor of rays.
+        if new.increment is not None and new.velocity_cov is None:  # others[0] is that of the increment
+            n, last = graph.next_node, graph.newest
+            keys = (C(last), V(last)), (C(n), V(n)), (B(last), B(n))
+            others = [motion_factor(*keys, new.increment, FocalKey(F(0), 0.0)), *others[1:]]
         triples = None
         if new.three_view is not None:
             first, constraint = new.three_view
