@@ -17,9 +17,16 @@ from gtsam.symbol_shorthand import B, C, F, M, V
 from terrafix.core.gate import GATE
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.estimator.factors.focal import FocalKey
-from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
-from terrafix.estimator.factors.three_view import ThreeViewPose, three_view_constraint_of_focal, three_view_factor
+from terrafix.estimator.factors.plane_two_view import LensNoise, k1_model_sigma, plane_two_view_factor
+from terrafix.estimator.factors.three_view import (
+    FOCAL_REPEATS,
+    ThreeViewPose,
+    three_view_constraint_of_focal,
+    three_view_factor,
+)
 from terrafix.estimator.models.bias_walk import BAROMETER_SCALE_SIGMA
+from terrafix.estimator.models.lens_prior import radial_k1_sigma
+from terrafix.estimator.models.terrain import LEVEL_M
 from terrafix.estimator.state import (
     CALIBRATION_SIZE,
     EAST,
@@ -33,17 +40,21 @@ from terrafix.estimator.state import (
 )
 from terrafix_tools.finalise.fix_consistency import ambiguous_segments, information_shares, lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, RecordedNode
-from terrafix_tools.finalise.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
+from terrafix_tools.finalise.gnc import Covariances, OutlierCandidate, marginals, settle, solve, step_of, weighted
 from terrafix_tools.finalise.lens import Lens, as_described
 from terrafix_tools.finalise.map_points import FOCAL, K1, POSE, PoseRows, rows_of_pose
 from terrafix_tools.finalise.submaps import placed_states
 
 ROUNDS = 4  # relinearizations of custom factors; the last one moves a flight by millimetres
-# 1-sigma of a map offset: maps are shifted, not rotated, and height errors are in the covariance of each map match.
+# 1-sigma of a map offset, beside what the map states sideways and the local error of elevation models in height: maps
+# are shifted, not rotated.
 MAP_TURN_RAD, EXACT_M = 1e-6, 0.01
 # Precisions of a weak prior on the first pose of a segment, which keeps the system solvable: 10 rad, 1 km.
 LOOSE = np.array([1e-2] * 3 + [1e-6] * 3)
 MIN_FOCAL_SIGMA = 1e-5  # of the prior of the focal length, relative: an exactly known one is a variable, too
+# 1-sigma of an estimated focal length, relative, by errors that all images have in common (model of the lens, principal
+# point, relief), beyond what the residuals say.
+FOCAL_MODEL_SIGMA = 0.008  # [measured: docs/finalise.md]
 READMISSIONS = 3  # passes in which outliers that the drift of the others had excluded may become inliers
 
 Progress = Callable[[int, int], None]
@@ -86,6 +97,11 @@ class _Smoothing:
         # A start position that was found by searching is not a measurement.
         known = flight.origin.start_sigma_m <= SEARCH_START_SIGMA_M
         self._starts = [i for i, node in enumerate(self._nodes) if node.prior is not None and known]
+        # Only points that three keyframes see separate the lens from relief. Without them it stays as described, and
+        # heights are as seen through it.
+        camera = flight.origin.camera
+        self._sees_lens = any(node.triples is not None and len(node.triples.xy) for node in self._nodes)
+        self._focal_sigma = max(camera.focal_sigma if self._sees_lens else 0.0, MIN_FOCAL_SIGMA)
         self._rows: list[PoseRows] = []
         self._candidates: list[OutlierCandidate] = []
 
@@ -105,7 +121,7 @@ class _Smoothing:
             self._values = settle(certain, self._candidates, inliers, self._values)
             inliers = self._readmitted(certain, inliers)
         self._progress(ROUNDS, ROUNDS)
-        return self._result(inliers, self._marginals(certain, inliers))
+        return self._result(certain, inliers)
 
     def _initial(self) -> gtsam.Values:
         values = gtsam.Values()
@@ -138,12 +154,14 @@ class _Smoothing:
             for factor in (*node.factors, *self._calibration_factors(i, node), *self._odometry_factors(i, node)):
                 graph.push_back(self._linear(factor) if isinstance(factor, gtsam.CustomFactor) else factor)
         for j, sigma_m in enumerate(self._maps):
-            sigmas = np.array([MAP_TURN_RAD] * 3 + [max(sigma_m, EXACT_M)] * 2 + [1.2])
+            sigmas = np.array([MAP_TURN_RAD] * 3 + [max(sigma_m, EXACT_M)] * 2 + [LEVEL_M])
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.push_back(gtsam.PriorFactorPose3(M(j), gtsam.Pose3(), noise))
-        focal_sigma = max(self._flight.origin.camera.focal_sigma, MIN_FOCAL_SIGMA)
-        graph.push_back(gtsam.PriorFactorVector(F(0), np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, focal_sigma)))
+        graph.push_back(self._focal_prior(0.0, self._focal_sigma))
         return graph
+
+    def _focal_prior(self, value: float, sigma: float) -> gtsam.NonlinearFactor:
+        return gtsam.PriorFactorVector(F(0), np.array([value]), gtsam.noiseModel.Isotropic.Sigma(1, sigma))
 
     def _calibration_factors(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
         """Prior of B of the first node of a graph. In flight the height scale was that of barometer and focal length
@@ -154,6 +172,9 @@ class _Smoothing:
         mean, cov = node.calibration
         air = np.zeros((1, CALIBRATION_SIZE))
         air[0, LOG_HEIGHT_SCALE] = 1.0 / BAROMETER_SCALE_SIGMA
+        if not self._sees_lens:
+            yield gtsam.PriorFactorVector(B(i), mean, gtsam.noiseModel.Gaussian.Covariance(cov, False))
+            return
         if i == 0:
             cov = cov.copy()
             cov[LOG_HEIGHT_SCALE, :] = cov[:, LOG_HEIGHT_SCALE] = 0.0
@@ -176,9 +197,8 @@ class _Smoothing:
     def _odometry_factors(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
         """Factors of the pairs and of the triples, reduced at the newest estimates of cameras and lens; the ground
         plane is that of the flight."""
-        lens = self._lens(i)
-        focal = FocalKey(F(0), lens.log_focal)
-        yield from self._three_view_factor(node, i, focal)
+        lens, camera = self._lens(i), self._flight.origin.camera
+        yield from self._three_view_factor(node, i, FocalKey(F(0), lens.log_focal))
         if node.motion is None or node.motion.rays is None or node.keyframe_m is None:
             return
         rays, then = node.motion.rays, node.keyframe_m
@@ -190,7 +210,9 @@ class _Smoothing:
         pairs = np.hstack([lens.rays(as_described(rays.pairs[:, xy], rays.k1)) for xy in (slice(0, 2), slice(2, 4))])
         sigma = float(lens.normalised(np.array(rays.sigma)))
         keys = C(node.parent), C(i), B(i)
-        yield plane_two_view_factor(*keys, keyframe, pose, pairs, sigma, ground, B(node.parent), lens.k1, focal)
+        noise = LensNoise(FOCAL_REPEATS * radial_k1_sigma(camera), FOCAL_REPEATS * camera.focal_sigma)
+        of_plane = noise if self._sees_lens else None
+        yield plane_two_view_factor(*keys, keyframe, pose, pairs, sigma, ground, B(node.parent), lens.k1, of_plane)
 
     def _three_view_factor(self, node: RecordedNode, i: int, focal: FocalKey) -> Iterator[gtsam.NonlinearFactor]:
         seen = node.triples
@@ -289,11 +311,14 @@ class _Smoothing:
     def _marginals(self, certain: gtsam.NonlinearFactorGraph, inliers: np.ndarray) -> Covariances:
         """With segments without a position on earth fixed where they are: their covariance is not used, and the system
         stays well conditioned."""
+        return marginals(self._firm_graph(certain, inliers), self._values)
+
+    def _firm_graph(self, certain: gtsam.NonlinearFactorGraph, inliers: np.ndarray) -> gtsam.NonlinearFactorGraph:
         graph = weighted(certain, self._candidates, inliers.astype(float))
         firm = gtsam.noiseModel.Unit.Create(6)
         for begin in sorted(set(self._begins.tolist()) - self._tied(inliers)):
             graph.push_back(gtsam.PriorFactorPose3(C(begin), self._values.atPose3(C(begin)), firm))
-        return marginals(graph, self._values)
+        return graph
 
     def _tied(self, inliers: np.ndarray) -> set[int]:
         """First nodes of the segments with a position on earth: by a map match, or by a start coordinate."""
@@ -324,12 +349,34 @@ class _Smoothing:
         return seen.pose.retract(by_lens @ change), cov + by_lens @ of_lens @ by_lens.T
 
     def _lens_sigma(self, node: int, found: Covariances) -> Lens:
-        k1 = found.marginalCovariance(B(node))[RADIAL_K1, RADIAL_K1]
-        return Lens(float(np.sqrt(k1)), float(np.sqrt(found.marginalCovariance(F(0))[0, 0])))
+        """1-sigma of the lens, also by what the model of it leaves out."""
+        k1 = np.hypot(
+            np.sqrt(found.marginalCovariance(B(node))[RADIAL_K1, RADIAL_K1]), k1_model_sigma(self._lens(node).k1)
+        )
+        focal = np.hypot(np.sqrt(found.marginalCovariance(F(0))[0, 0]), self._focal_model_sigma(found))
+        return Lens(float(k1), float(focal))
+
+    def _focal_model_sigma(self, found: Covariances) -> float:
+        """FOCAL_MODEL_SIGMA, or what the description leaves for it."""
+        left = self._focal_sigma**2 - float(found.marginalCovariance(F(0))[0, 0])
+        return min(FOCAL_MODEL_SIGMA, float(np.sqrt(max(left, 0.0))))
+
+    def _moved_by_focal(self, graph: gtsam.NonlinearFactorGraph) -> np.ndarray:
+        """(N, 6) change of every pose, tangent order, with the focal length, per unit of its logarithm."""
+        now = float(self._values.atVector(F(0))[0])
+        steps = []
+        for value in (now, now + FOCAL_MODEL_SIGMA):
+            firm = gtsam.NonlinearFactorGraph(graph)
+            firm.push_back(self._focal_prior(value, MIN_FOCAL_SIGMA))
+            steps.append(step_of(firm, self._values))
+        moved = [steps[1].at(C(i)) - steps[0].at(C(i)) for i in range(len(self._nodes))]
+        return np.array(moved).reshape(-1, 6) / FOCAL_MODEL_SIGMA
 
     # --- result -----------------------------------------------------------------------------------------
 
-    def _result(self, inliers: np.ndarray, found: Covariances) -> Smoothed:
+    def _result(self, certain: gtsam.NonlinearFactorGraph, inliers: np.ndarray) -> Smoothed:
+        graph = self._firm_graph(certain, inliers)
+        found = marginals(graph, self._values)
         fixes, n = self._flight.fixes, len(self._nodes)
         poses = [self._values.atPose3(C(i)) for i in range(n)]
         covs = np.array([found.marginalCovariance(C(i)) for i in range(n)]).reshape(n, 6, 6)
@@ -338,13 +385,17 @@ class _Smoothing:
         for at, spread in ambiguous_segments(fixes, inliers[: len(fixes)], self._begins, poses):
             r = np.array([poses[i].rotation().matrix()[HORIZONTAL] for i in at])
             covs[at, TRANSLATION, TRANSLATION] += np.einsum("nai,ab,nbj->nij", r, spread, r)
+        lens, sigma = self._lens(n - 1), self._focal_model_sigma(found)
+        if sigma > 0.0:
+            by_focal = sigma * self._moved_by_focal(graph)
+            covs += by_focal[:, :, None] * by_focal[:, None, :]
         lost_m = lost_sigma(self._flight, inliers[: len(fixes)], self._begins)
         covs[:, TRANSLATION, TRANSLATION] += lost_m[:, None, None] ** 2 * np.eye(3)
         if (principal_point := self._flight.principal_point) is not None:
             for i, pose in enumerate(poses):
                 level, p_m = pose.rotation().matrix()[HORIZONTAL], pose.translation()
-                height_m = p_m[UP] - (self._flight.origin.ground_amsl_m or 0.0)
-                aside_m, aside_cov = principal_point.shift(height_m * np.exp(-self._lens(i).log_focal) * level[:, :2])
+                seen_m = np.exp(-lens.log_focal) * (p_m[UP] - (self._flight.origin.ground_amsl_m or 0.0))
+                aside_m, aside_cov = principal_point.shift(seen_m * level[:, :2])
                 poses[i] = gtsam.Pose3(pose.rotation(), p_m + np.append(aside_m, 0.0))
                 covs[i, TRANSLATION, TRANSLATION] += level.T @ aside_cov @ level
         offsets = {}
@@ -360,7 +411,7 @@ class _Smoothing:
             offsets,
             self._begins,
             starts,
-            self._lens(n - 1),
+            lens,
             self._lens_sigma(n - 1, found),
         )
 

@@ -83,12 +83,17 @@ def weighted(
     return graph
 
 
-def _step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gtsam.Values, float]:
+def step_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.VectorValues:
+    """One step of Gauss-Newton from ``values``. RuntimeError for an indeterminate system."""
     linear = graph.linearize(values)
     try:
-        delta = linear.optimize()
+        return linear.optimize()
     except RuntimeError:  # Cholesky fails on a badly conditioned system; QR takes three times as long
-        delta = linear.optimize(gtsam.EliminateQR)
+        return linear.optimize(gtsam.EliminateQR)
+
+
+def _step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gtsam.Values, float]:
+    delta = step_of(graph, values)
     return values.retract(delta), float(delta.norm()) / max(1.0, float(np.sqrt(values.size())))
 
 

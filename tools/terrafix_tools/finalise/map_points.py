@@ -19,7 +19,7 @@ from terrafix_tools.finalise.lens import Lens, as_described
 # Reach of the correlation of a map's slow distortion: its gradient is the distortion over this.
 WARP_REACH_M = 80.0  # [measured: docs/monte-carlo.md, slow warp of a map]
 POSE, K1, FOCAL, CONSTANT = slice(0, 6), 6, 7, 8  # columns of PoseRows [spec: layout]
-ROWS = 8  # of the reduced residual: pose, radial coefficient, focal length [spec: columns of the QR]
+ROWS = 6  # of the reduced residual: those by the pose [spec: columns of the QR]
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,8 @@ class MatchedPoints:
             mu *= MU_GROWTH
 
     def rows(self, fit: PointFit) -> PoseRows:
-        """Reduced to ROWS residuals: the part that neither pose nor lens explains is left out."""
+        """Reduced to ROWS residuals. What no pose explains is left out, also where the lens would explain it: roofs that
+        lean outwards and a shifted principal point have the same pattern."""
         points_m, rays, own = self.points_m[fit.inliers], fit.rays[fit.inliers], fit.residual[fit.inliers]
         _, by_pose, _ = project_with_jacobian(fit.r_w_c, fit.p_m, points_m)
         by_lens = np.stack([np.sum(rays**2, axis=1, keepdims=True) * rays, rays], axis=2)

@@ -119,9 +119,7 @@ def _rotated(delta: np.ndarray, heading_rad: float) -> np.ndarray:
     return np.array([c * px - s * py, s * px + c * py, pz, c * vx - s * vy, s * vx + c * vy, vz])
 
 
-def _height_scales(
-    increment: MotionIncrement, c0: gtsam.Pose3, c1: gtsam.Pose3, longer: float
-) -> tuple[float, float]:
+def _height_scales(increment: MotionIncrement, c0: gtsam.Pose3, c1: gtsam.Pose3, longer: float) -> tuple[float, float]:
     """-> reference height over actual height, at the beginning and at the end; 1 for an increment in metres.
     ``longer``: true focal length over the one through which the reference height was seen."""
     if increment.height_scale_ref is None:

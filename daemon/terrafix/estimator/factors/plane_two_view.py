@@ -10,7 +10,6 @@ import gtsam
 import numpy as np
 
 from terrafix.core.pose import project_with_jacobian
-from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.linearization_cache import custom_factor
 from terrafix.estimator.factors.noise import whiten_common
 from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS, Ground
@@ -35,8 +34,8 @@ K1_MODEL_SIGMA, K1_MODEL_SHARE = 0.0015, 0.05
 REDUCED_SIZE = (
     11  # 6 of the step, 3 of the keyframe's tilt, 1 of the lens, 1 unexplained norm [spec: columns of the QR]
 )
-STEP_AND_CONSTANT = [0, 1, 2, 3, 4, 5, -1]  # columns of the QR [spec: order of the stacked Jacobian]
-TILT_COLUMNS, K1_COLUMN, FOCAL_COLUMN = slice(6, 9), 9, 10  # [spec: order of the stacked Jacobian]
+STEP_AND_CONSTANT = [0, 1, 2, 3, 4, 5, 10]  # columns of the QR [spec: order of the stacked Jacobian]
+TILT_COLUMNS, K1_COLUMN = slice(6, 9), 9  # [spec: order of the stacked Jacobian]
 STEP_COLUMNS, CONSTANT_COLUMN = slice(0, 6), 6  # of the reduced step and constant [spec: STEP_AND_CONSTANT]
 MIN_HEIGHT_M = 1.0  # lower bound of the height over the plane [tuned]
 RADIAL, UNIFORM = 2, 0  # powers of the distance from the centre [spec: division model; focal length]
@@ -45,25 +44,32 @@ RIGHT_DOWN = slice(3, 5)  # translation within the image plane [spec: tangent or
 
 @dataclass(frozen=True)
 class _Plane:
-    """``normal . X = offset`` in the world; ``normal`` (3,) has an up component of 1. ``k1_sigma``: 1-sigma of the
-    radial coefficient that is noise."""
+    """``normal . X = offset`` in the world; ``normal`` (3,) has an up component of 1. ``k1_sigma``, ``focal_sigma``:
+    1-sigma of the radial coefficient and of the relative focal length that is noise."""
 
     ground: Ground
     normal: np.ndarray
     offset: float
     k1_sigma: float
+    focal_sigma: float
+
+
+@dataclass(frozen=True)
+class LensNoise:
+    """1-sigma of the lens in the noise of a factor: radial coefficient, and relative focal length."""
+
+    k1: float
+    focal: float
 
 
 @dataclass(frozen=True)
 class _Reduced:
     """Whitened linear residual around the first estimate of both cameras. ``by_step`` (R, 7): by the pose of the camera
-    in the keyframe, and the constant; ``by_tilt`` (R, 3): by a rotation of the keyframe; ``by_k1`` (R,); ``by_focal``
-    (R,): by the logarithm of the focal length; None: that is not a variable."""
+    in the keyframe, and the constant; ``by_tilt`` (R, 3): by a rotation of the keyframe; ``by_k1`` (R,)."""
 
     by_step: np.ndarray
     by_tilt: np.ndarray
     by_k1: np.ndarray
-    by_focal: np.ndarray | None = None
 
 
 def same_ground_residual(
@@ -108,7 +114,7 @@ def plane_two_view_factor(
     ground: Ground,
     keyframe_bias_key: int | None = None,
     k1: float = 0.0,
-    focal: FocalKey | None = None,
+    lens: LensNoise | None = None,
 ) -> gtsam.CustomFactor:
     """``keyframe``, ``pose``: first estimates. ``pairs`` (N, 4): normalised, undistorted by radial coefficient ``k1``,
     with 1-sigma ``sigma`` of a coordinate. The uncertainty of height and slope of the plane is part of the noise.
@@ -121,11 +127,12 @@ def plane_two_view_factor(
     and would pull the estimate down.
 
     ``keyframe_bias_key``: B of the keyframe. It enters only where the elevation between both is unknown
-    (``ground.rise_sigma_m``; see ``motion_factor``). ``focal``: None where the focal length is no variable, as in
-    flight: there the height is a height as seen through the described lens."""
+    (``ground.rise_sigma_m``; see ``motion_factor``). ``lens``: where other factors determine the lens. Relief looks
+    like a lens error for as long as it is in view, and is not on the plane; None: as in flight, where the height is a
+    height as seen through the described lens, and the pairs determine the radial coefficient."""
     if not ground.rise_sigma_m:
         keyframe_bias_key = None
-    model = _linear_model(keyframe, pose, pairs, sigma, ground, k1, focal=focal is not None)
+    model = _linear_model(keyframe, pose, pairs, sigma, ground, k1, lens or LensNoise(0.0, 0.0))
     first_up_m = keyframe.translation()[UP]
 
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
@@ -139,9 +146,6 @@ def plane_two_view_factor(
         height_m = max(ground.height_m + float(c0.translation()[UP] - first_up_m), MIN_HEIGHT_M)
         now = _Pair(c0, c1, c0.between(c1), height_m, ground.height_m / height_m)
         residual = model.residual(now, bias[RADIAL_K1] - k1)
-        by_focal = model.reduced.by_focal
-        if focal is not None and by_focal is not None:
-            residual = residual + by_focal * (float(values.atVector(focal.key)[0]) - focal.at)
         if jacobians is not None:
             by_c0, by_c1 = model.pose_jacobians(now)
             jacobians[0] = np.asfortranarray(by_c0)
@@ -151,16 +155,13 @@ def plane_two_view_factor(
                 by_rise = np.zeros_like(model.by_bias)
                 by_rise[:, HEIGHT] = by_c1[:, TRANSLATION] @ c1.rotation().matrix()[UP]
                 jacobians[2], jacobians[3] = np.asfortranarray(model.by_bias + by_rise), np.asfortranarray(-by_rise)
-            if by_focal is not None:
-                jacobians[-1] = np.asfortranarray(by_focal[:, None])
         return np.asarray(residual)
 
     # Huber loss on the whole block: its whitened norm is about sqrt(2 * EFFECTIVE_PAIRS) without outliers.
     huber = gtsam.noiseModel.mEstimator.Huber.Create(BLOCK_HUBER_K * float(np.sqrt(2 * EFFECTIVE_PAIRS)))
-    noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(len(model.reduced.by_k1)))
+    noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(REDUCED_SIZE))
     keys = [keyframe_key, pose_key, bias_key]
-    keys += [] if keyframe_bias_key is None else [keyframe_bias_key]
-    return custom_factor(noise, keys if focal is None else [*keys, focal.key], error)
+    return custom_factor(noise, keys if keyframe_bias_key is None else [*keys, keyframe_bias_key], error)
 
 
 @dataclass(frozen=True)
@@ -218,15 +219,26 @@ class _LinearModel:
         return by_c0, by_c1
 
 
+def k1_model_sigma(k1: float) -> float:
+    """1-sigma of a radial coefficient as one number for a lens."""
+    return float(np.hypot(K1_MODEL_SIGMA, K1_MODEL_SHARE * k1))
+
+
 def _linear_model(
-    keyframe: gtsam.Pose3, pose: gtsam.Pose3, pairs: np.ndarray, sigma: float, ground: Ground, k1: float, *, focal: bool
+    keyframe: gtsam.Pose3,
+    pose: gtsam.Pose3,
+    pairs: np.ndarray,
+    sigma: float,
+    ground: Ground,
+    k1: float,
+    lens: LensNoise,
 ) -> _LinearModel:
     normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
     p = keyframe.translation()
     offset = float(p[UP]) - ground.height_m - ground.slope_e * float(p[EAST]) - ground.slope_n * float(p[NORTH])
-    k1_sigma = float(np.hypot(K1_MODEL_SIGMA, K1_MODEL_SHARE * k1))
-    reduced = _reduced(keyframe, pose, pairs, sigma, _Plane(ground, normal, offset, k1_sigma), focal=focal)
-    by_bias = np.zeros((len(reduced.by_k1), CALIBRATION_SIZE), order="F")
+    k1_sigma = float(np.hypot(k1_model_sigma(k1), lens.k1))
+    reduced = _reduced(keyframe, pose, pairs, sigma, _Plane(ground, normal, offset, k1_sigma, lens.focal))
+    by_bias = np.zeros((REDUCED_SIZE, CALIBRATION_SIZE), order="F")
     by_bias[:, RADIAL_K1] = reduced.by_k1
     up_first = keyframe.rotation().matrix().T @ normal
     up_unit = up_first / float(np.linalg.norm(up_first))
@@ -234,9 +246,7 @@ def _linear_model(
     return _LinearModel(reduced, normal, keyframe.between(pose), up_unit, by_rotation, by_bias)
 
 
-def _reduced(
-    keyframe: gtsam.Pose3, pose: gtsam.Pose3, pairs: np.ndarray, sigma: float, plane: _Plane, *, focal: bool
-) -> _Reduced:
+def _reduced(keyframe: gtsam.Pose3, pose: gtsam.Pose3, pairs: np.ndarray, sigma: float, plane: _Plane) -> _Reduced:
     """QR of the Jacobian of all pairs, whitened by the noise of the pairs and of the plane."""
     ground = plane.ground
     residual, by_keyframe, by_pose, points, by_height = same_ground_residual(
@@ -245,18 +255,19 @@ def _reduced(
     # By the keyframe alone, while the camera keeps its pose in it.
     by_both = by_keyframe + by_pose @ keyframe.between(pose).inverse().AdjointMap()
     by_k1 = _by_lens(keyframe, pairs, residual, by_keyframe, points, RADIAL)
-    lens = [by_k1, _by_lens(keyframe, pairs, residual, by_keyframe, points, UNIFORM)] if focal else [by_k1]
-    full = np.column_stack([by_pose, by_both[:, ROTATION], *lens, residual]) / sigma
+    full = np.column_stack([by_pose, by_both[:, ROTATION], by_k1, residual]) / sigma
     from_keyframe_m = np.repeat(points[:, :2] - keyframe.translation()[HORIZONTAL], 2, axis=0)
     by_plane = np.column_stack([by_height, by_height * from_keyframe_m[:, 0], by_height * from_keyframe_m[:, 1]])
     by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
     by_plane = np.column_stack([by_plane, plane.k1_sigma / sigma * by_k1])
+    if plane.focal_sigma:
+        by_focal = _by_lens(keyframe, pairs, residual, by_keyframe, points, UNIFORM)
+        by_plane = np.column_stack([by_plane, plane.focal_sigma / sigma * by_focal])
     if ground.curvature_sigma:
         by_curvature = _by_curvature(by_height, from_keyframe_m)
         by_plane = np.column_stack([by_plane, ground.curvature_sigma / sigma * by_curvature])
     r = np.asarray(np.linalg.qr(whiten_common(full, by_plane), mode="r"))
-    by_focal = r[:, FOCAL_COLUMN] if focal else None
-    return _Reduced(r[:, STEP_AND_CONSTANT], r[:, TILT_COLUMNS], r[:, K1_COLUMN], by_focal)
+    return _Reduced(r[:, STEP_AND_CONSTANT], r[:, TILT_COLUMNS], r[:, K1_COLUMN])
 
 
 def _by_curvature(by_height: np.ndarray, from_keyframe_m: np.ndarray) -> np.ndarray:
@@ -278,9 +289,10 @@ def _by_lens(
     points: np.ndarray,
     power: int,
 ) -> np.ndarray:
-    """(2N,) Jacobian by a number of the lens that moves the rays of both cameras towards the centre, by its distance to
-    the power of ``power`` + 1: RADIAL coefficient, UNIFORM for the logarithm of the focal length. A keyframe ray that
-    rotates moves its point as a translation of the camera by as much times the depth does.
+    """(2N,) Jacobian by a number of the lens that moves the rays of both cameras towards the centre, in proportion to
+    their distance from it to the power of ``power`` + 1: RADIAL for the radial coefficient, UNIFORM for the logarithm
+    of the focal length. A keyframe ray that rotates moves its point as a translation of the camera by as much times the
+    depth does.
 
     The camera's rays are the predicted ones, not the measured ones: noise on both sides of the equation would look
     like a lens error."""
