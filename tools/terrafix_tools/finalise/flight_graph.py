@@ -14,6 +14,7 @@ from terrafix.core.pnp import solved
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.motion import motion_factor
+from terrafix.estimator.graph.marginalized import THREE_VIEW_NODES
 from terrafix.estimator.graph.pose_graph import GraphObserver, GraphPrior, NewNode, PoseGraph
 from terrafix.estimator.measurements.map_pose import determined, measured_pose, moved_by_focal, moved_by_k1
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
@@ -124,11 +125,10 @@ class GraphRecorder(GraphObserver):
         triples = None
         if new.three_view is not None:
             first, constraint = new.three_view
-            three = [f for f in others if sum(gtsam.symbolChr(key) == gtsam.symbolChr(C(0)) for key in f.keys()) == 3]
-            if three:
-                others = [f for f in others if f is not three[0]]
+            kept = [factor for factor in others if not _is_three_view(factor)]
+            if len(kept) < len(others):  # the first keyframe may have left the window
                 ground_m, rises = constraint.at.ground_m, new.rise_sigma_m > 0.0
-                triples = Triples(first, rises, ground_m, np.zeros((0, 6)), 0.0)
+                triples, others = Triples(first, rises, ground_m, np.zeros((0, 6)), 0.0), kept
         factors = others if new.motion.rays is not None else [odometry, *others]
         keyframe_m = np.asarray(graph.state(new.parent).pose.translation())
         self.nodes.append(RecordedNode(t_s, new.state, factors, new.parent, new.motion, keyframe_m, triples=triples))
@@ -144,6 +144,11 @@ class GraphRecorder(GraphObserver):
         """Records the estimates of the nodes in the window."""
         for node in self.graph.window:
             self.nodes[node].state = self.graph.state(node)
+
+
+def _is_three_view(factor: gtsam.NonlinearFactor) -> bool:
+    keys: list[int] = list(factor.keys())
+    return sum(gtsam.symbolChr(key) == gtsam.symbolChr(C(0)) for key in keys) == THREE_VIEW_NODES
 
 
 def _same_frame(first: int, second: int) -> list[gtsam.NonlinearFactor]:

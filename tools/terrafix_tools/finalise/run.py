@@ -110,7 +110,6 @@ def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> dic
         elif frame_id in rows:
             _fill(rows[frame_id], found, node, frame, r_b_c)
     why = "no map match is accepted there, and its start is unknown"
-    print(found.lens, found.lens_sigma, found.bias[-1])
     return _summary(flight, found, [{"frames": count, "why": why} for count in lost.values()])
 
 
