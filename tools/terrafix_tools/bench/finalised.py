@@ -88,6 +88,8 @@ def measure(number: int) -> dict[str, Any]:
         "focal_sigma": found.lens_sigma.log_focal,
         "k1_error_sigmas": (found.lens.k1 - K1_ERROR) / found.lens_sigma.k1,
         "k1_sigma": found.lens_sigma.k1,
+        "map_before": (found.map_residual[0] or 0.0) * flight._plan.camera.fx,
+        "map_after": (found.map_residual[1] or 0.0) * flight._plan.camera.fx,
         "cpu_s": cpu_s,
     }
 

@@ -19,7 +19,6 @@ from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.plane_two_view import LensNoise, k1_model_sigma, plane_two_view_factor
 from terrafix.estimator.factors.three_view import (
-    FOCAL_REPEATS,
     ThreeViewPose,
     three_view_constraint_of_focal,
     three_view_factor,
@@ -67,7 +66,10 @@ class Smoothed:
     ``placed`` (N,) bool: the position on earth is determined. ``inliers`` (F,) bool, of the flight's map matches.
     ``map_offset_m``: offset of each map, by the error that it states: east, north, up, and 1-sigma of each. ``begins``
     (N,): first node of the segment of each node. ``start_inliers``: by that node, for start coordinates. ``lens``:
-    with the 1-sigma of both of its numbers, ``lens_sigma``."""
+    with the 1-sigma of both of its numbers, ``lens_sigma``; ``sees_lens`` False: its focal length is as described.
+    ``map_residual``: mean distance of the matched points of all inliers from their projection by the pose of the camera
+    (not by the match's own one), normalised: by the last estimates in flight, and by the solution. ``moved_m`` (N,):
+    horizontal distance from those estimates, in which both have the same principal point."""
 
     poses: list[gtsam.Pose3]
     covs: np.ndarray
@@ -79,6 +81,9 @@ class Smoothed:
     start_inliers: dict[int, bool]
     lens: Lens
     lens_sigma: Lens
+    sees_lens: bool
+    map_residual: tuple[float | None, float | None]
+    moved_m: np.ndarray
 
 
 def smooth(flight: FlightGraph, progress: Progress = lambda _done, _of: None) -> Smoothed:
@@ -210,7 +215,8 @@ class _Smoothing:
         pairs = np.hstack([lens.rays(as_described(rays.pairs[:, xy], rays.k1)) for xy in (slice(0, 2), slice(2, 4))])
         sigma = float(lens.normalised(np.array(rays.sigma)))
         keys = C(node.parent), C(i), B(i)
-        noise = LensNoise(FOCAL_REPEATS * radial_k1_sigma(camera), FOCAL_REPEATS * camera.focal_sigma)
+        repeats = float(np.sqrt(len(self._nodes)))  # relief is no new one in each pair: as a whole they give the prior
+        noise = LensNoise(repeats * radial_k1_sigma(camera), repeats * camera.focal_sigma)
         of_plane = noise if self._sees_lens else None
         yield plane_two_view_factor(*keys, keyframe, pose, pairs, sigma, ground, B(node.parent), lens.k1, of_plane)
 
@@ -380,6 +386,12 @@ class _Smoothing:
         fixes, n = self._flight.fixes, len(self._nodes)
         poses = [self._values.atPose3(C(i)) for i in range(n)]
         covs = np.array([found.marginalCovariance(C(i)) for i in range(n)]).reshape(n, 6, 6)
+        moved_m = np.array(
+            [
+                np.linalg.norm((pose.translation() - node.state.pose.translation())[HORIZONTAL])
+                for pose, node in zip(poses, self._nodes, strict=True)
+            ]
+        )
         placed = np.isin(self._begins, list(self._tied(inliers)))
         starts = dict(zip(self._starts, inliers[len(fixes) :].tolist(), strict=True))
         for at, spread in ambiguous_segments(fixes, inliers[: len(fixes)], self._begins, poses):
@@ -413,7 +425,27 @@ class _Smoothing:
             starts,
             lens,
             self._lens_sigma(n - 1, found),
+            self._sees_lens,
+            self._map_residual(inliers),
+            moved_m,
         )
+
+    def _map_residual(self, inliers: np.ndarray) -> tuple[float | None, float | None]:
+        in_flight, lengths = Lens(self._flight.radial_k1[0]), list[tuple[float, float]]()
+        for fix, is_inlier in zip(self._flight.fixes, inliers.tolist(), strict=False):
+            fit = fix.points.fit(self._lens(fix.node)) if is_inlier and fix.points is not None else None
+            if fix.points is None or fit is None:
+                continue
+            offset = self._values.atPose3(M(self._maps.index(fix.map_sigma_m)))
+            after = offset.between(self._values.atPose3(C(fix.node)))
+            before = self._nodes[fix.node].state.pose
+            ways = ((before, in_flight), (after, fit.lens))
+            of_match = [fix.points.off(pose, lens)[fit.inliers] for pose, lens in ways]
+            lengths += list(zip(*(one.tolist() for one in of_match), strict=True))
+        if not lengths:
+            return None, None
+        before_after = np.mean(lengths, axis=0)
+        return float(before_after[0]), float(before_after[1])
 
 
 def _begins(nodes: list[RecordedNode]) -> np.ndarray:

@@ -97,6 +97,11 @@ class MatchedPoints:
         projected, _, _ = project_with_jacobian(found.r_w_c, found.p_c_in_w_m, self.points_m)
         return PointFit(found.r_w_c, found.p_c_in_w_m, lens, rays, inliers, found.sigma, projected - rays)
 
+    def off(self, pose: gtsam.Pose3, lens: Lens) -> np.ndarray:
+        """(N,) distance of every point from its projection by ``pose`` through ``lens``, normalised."""
+        projected, _, _ = project_with_jacobian(pose.rotation().matrix(), pose.translation(), self.points_m)
+        return np.asarray(np.linalg.norm(projected - lens.rays(self.xy), axis=1))
+
     def _agreeing(self, rays: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """-> pose of the matches that agree with each other (3, 3) and (3,), and which these are (N,)."""
         r_w_c, p_m = self.r_w_c, self.p_m.copy()
@@ -125,8 +130,8 @@ class MatchedPoints:
             mu *= MU_GROWTH
 
     def rows(self, fit: PointFit) -> PoseRows:
-        """Reduced to ROWS residuals. What no pose explains is left out, also where the lens would explain it: roofs that
-        lean outwards and a shifted principal point have the same pattern."""
+        """Reduced to ROWS residuals. What no pose explains is left out, also where the lens would explain it: roofs
+        that lean outwards and a shifted principal point have the same pattern."""
         points_m, rays, own = self.points_m[fit.inliers], fit.rays[fit.inliers], fit.residual[fit.inliers]
         _, by_pose, _ = project_with_jacobian(fit.r_w_c, fit.p_m, points_m)
         by_lens = np.stack([np.sum(rays**2, axis=1, keepdims=True) * rays, rays], axis=2)
