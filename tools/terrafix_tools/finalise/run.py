@@ -75,6 +75,11 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
     )
 
 
+def flights_of(folder: Path) -> list[FlightGraph]:
+    """Flights of a record, as the smoother takes them. Raises SourceError."""
+    return _replay(folder, ReadResult(), lambda _name, _done, _of: None)[1]
+
+
 def _replay(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, FinalRow], list[FlightGraph]]:
     """-> a row for every frame, in order of arrival; the flights of the record."""
     replayer = FlightReplayer()
