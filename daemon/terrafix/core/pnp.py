@@ -51,7 +51,7 @@ def solve(points_w_m: np.ndarray, xy: np.ndarray, weights: np.ndarray, given: Pn
     finite; both without a pose. Else ACCEPTED.
     """
     n, none = len(xy), np.zeros(len(xy), bool)
-    p_random_inlier = min(1.0, np.pi * given.threshold**2 / (2 * given.search_radius) ** 2)
+    p_random_inlier = random_inlier_probability(given)
     needed = max(
         given.min_inliers, MIN_INLIER_SHARE * n, n * p_random_inlier + 4.0 * float(np.sqrt(n * p_random_inlier)) + 3.0
     )
@@ -68,7 +68,7 @@ def solve(points_w_m: np.ndarray, xy: np.ndarray, weights: np.ndarray, given: Pn
     tilt = np.asarray(log_so3(rot_from_quat(given.q_w_c).T @ fit.r_w_c))[:2]
     if float(np.linalg.norm(tilt)) > MAX_TILT_CHANGE_RAD:
         return PnpResult(Verdict.DEGENERATE, None, inlier)
-    cov = fit.cov * _outlier_inflation(n, int(inlier.sum()), p_random_inlier)
+    cov = fit.cov * outlier_inflation(n, int(inlier.sum()), p_random_inlier)
     return PnpResult(Verdict.ACCEPTED, replace(fit, cov=cov), inlier)
 
 
@@ -142,7 +142,12 @@ def _ransac(points_w_m: np.ndarray, xy: np.ndarray, given: PnpInput) -> _Start |
     return _Start(r_c_w.T, centre - r_c_w.T @ np.asarray(tvec).ravel(), np.asarray(index).ravel())
 
 
-def _outlier_inflation(matches: int, inliers: int, p_random_inlier: float) -> float:
+def random_inlier_probability(given: PnpInput) -> float:
+    """That a randomly matched patch agrees with a pose."""
+    return min(1.0, np.pi * given.threshold**2 / (2 * given.search_radius) ** 2)
+
+
+def outlier_inflation(matches: int, inliers: int, p_random_inlier: float) -> float:
     """Factor on the covariance for false inliers: of the wrong matches a share ``p_random_inlier`` agrees with any
     pose.
 

@@ -42,7 +42,7 @@ def solve(
         mu = 1.0 / (2.0 * worst - 1.0)
         for _ in range(MAX_STEPS):
             values, _ = _step(weighted(certain, candidates, weights), values)
-            weights = _weights(_squares(candidates, values), limits, mu)
+            weights = truncated_weights(_squares(candidates, values), limits, mu)
             if mu > MAX_MU:
                 break
             mu *= MU_GROWTH
@@ -83,12 +83,17 @@ def weighted(
     return graph
 
 
-def _step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gtsam.Values, float]:
+def step_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.VectorValues:
+    """One step of Gauss-Newton from ``values``. RuntimeError for an indeterminate system."""
     linear = graph.linearize(values)
     try:
-        delta = linear.optimize()
+        return linear.optimize()
     except RuntimeError:  # Cholesky fails on a badly conditioned system; QR takes three times as long
-        delta = linear.optimize(gtsam.EliminateQR)
+        return linear.optimize(gtsam.EliminateQR)
+
+
+def _step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gtsam.Values, float]:
+    delta = step_of(graph, values)
     return values.retract(delta), float(delta.norm()) / max(1.0, float(np.sqrt(values.size())))
 
 
@@ -96,7 +101,7 @@ def _squares(candidates: list[OutlierCandidate], values: gtsam.Values) -> np.nda
     return np.array([2.0 * d.factor.error(values) for d in candidates])
 
 
-def _weights(squares: np.ndarray, limits: np.ndarray, mu: float) -> np.ndarray:
+def truncated_weights(squares: np.ndarray, limits: np.ndarray, mu: float) -> np.ndarray:
     """Equation (14) of the paper."""
     between = np.sqrt(limits * mu * (mu + 1.0) / np.maximum(squares, 1e-12)) - mu
     return np.clip(between, 0.0, 1.0)

@@ -1,32 +1,59 @@
 """Batch smoother after landing: all measurements of a flight in one graph, solved to convergence.
 
 Beside the variables of the flight's own graph (terrafix.estimator.state) there is one per map, M_j: the offset of all
-map matches whose map states the same error. Decisions of the flight are made again with all data: which map matches are
-inliers (gnc.py), where the segments between resets lie (sim3_pose_graph.py), and at which poses odometry saw the
-ground."""
+map matches whose map states the same error; and one for the flight, F_0: the logarithm of the true focal length over
+the described one. So heights are true ones here, and the height scale of B is that of the barometer alone; in flight
+heights are as seen through the described lens, and the scale is that of both. Decisions of the flight are made again
+with all data: which map matches are inliers, and which of their points (gnc.py), where the segments between resets lie
+(sim3_pose_graph.py), and at which poses and through which lens odometry saw the ground."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, C, M, V
+from gtsam.symbol_shorthand import B, C, F, M, V
 
 from terrafix.core.gate import GATE
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
-from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
-from terrafix.estimator.measurements.map_pose import undistorted_pose
-from terrafix.estimator.state import CALIBRATION_SIZE, EAST, HORIZONTAL, NORTH, TRANSLATION, UP
-from terrafix.smoother.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
+from terrafix.estimator.factors.focal import FocalKey
+from terrafix.estimator.factors.plane_two_view import LensNoise, k1_model_sigma, plane_two_view_factor
+from terrafix.estimator.factors.three_view import (
+    ThreeViewPose,
+    three_view_constraint_of_focal,
+    three_view_factor,
+)
+from terrafix.estimator.models.bias_walk import BAROMETER_SCALE_SIGMA
+from terrafix.estimator.models.lens_prior import radial_k1_sigma
+from terrafix.estimator.models.terrain import LEVEL_M
+from terrafix.estimator.state import (
+    CALIBRATION_SIZE,
+    EAST,
+    HEIGHT,
+    HORIZONTAL,
+    LOG_HEIGHT_SCALE,
+    NORTH,
+    RADIAL_K1,
+    TRANSLATION,
+    UP,
+)
+from terrafix.smoother.gnc import Covariances, OutlierCandidate, marginals, settle, solve, step_of, weighted
 from terrafix_tools.finalise.fix_consistency import ambiguous_segments, information_shares, lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, RecordedNode
+from terrafix_tools.finalise.lens import Lens, as_described
+from terrafix_tools.finalise.map_points import FOCAL, K1, POSE, PoseRows, rows_of_pose
 from terrafix_tools.finalise.submaps import placed_states
 
 ROUNDS = 4  # relinearizations of custom factors; the last one moves a flight by millimetres
-# 1-sigma of a map offset: maps are shifted, not rotated, and height errors are in the covariance of each map match.
+# 1-sigma of a map offset, beside what the map states sideways and the local error of elevation models in height: maps
+# are shifted, not rotated.
 MAP_TURN_RAD, EXACT_M = 1e-6, 0.01
 # Precisions of a weak prior on the first pose of a segment, which keeps the system solvable: 10 rad, 1 km.
 LOOSE = np.array([1e-2] * 3 + [1e-6] * 3)
+MIN_FOCAL_SIGMA = 1e-5  # of the prior of the focal length, relative: an exactly known one is a variable, too
+# 1-sigma of an estimated focal length, relative, by errors that all images have in common (model of the lens, principal
+# point, relief), beyond what the residuals say.
+FOCAL_MODEL_SIGMA = 0.008  # [measured: docs/finalise.md]
 READMISSIONS = 3  # passes in which outliers that the drift of the others had excluded may become inliers
 
 Progress = Callable[[int, int], None]
@@ -38,7 +65,11 @@ class Smoothed:
 
     ``placed`` (N,) bool: the position on earth is determined. ``inliers`` (F,) bool, of the flight's map matches.
     ``map_offset_m``: offset of each map, by the error that it states: east, north, up, and 1-sigma of each. ``begins``
-    (N,): first node of the segment of each node. ``start_inliers``: by that node, for start coordinates."""
+    (N,): first node of the segment of each node. ``start_inliers``: by that node, for start coordinates. ``lens``:
+    with the 1-sigma of both of its numbers, ``lens_sigma``; ``sees_lens`` False: its focal length is as described.
+    ``map_residual``: mean distance of the matched points of all inliers from their projection by the pose of the camera
+    (not by the match's own one), normalised: by the last estimates in flight, and by the solution. ``moved_m`` (N,):
+    horizontal distance from those estimates, in which both have the same principal point."""
 
     poses: list[gtsam.Pose3]
     covs: np.ndarray
@@ -48,6 +79,11 @@ class Smoothed:
     map_offset_m: dict[float, tuple[np.ndarray, np.ndarray]]
     begins: np.ndarray
     start_inliers: dict[int, bool]
+    lens: Lens
+    lens_sigma: Lens
+    sees_lens: bool
+    map_residual: tuple[float | None, float | None]
+    moved_m: np.ndarray
 
 
 def smooth(flight: FlightGraph, progress: Progress = lambda _done, _of: None) -> Smoothed:
@@ -57,38 +93,40 @@ def smooth(flight: FlightGraph, progress: Progress = lambda _done, _of: None) ->
 
 class _Smoothing:
     def __init__(self, flight: FlightGraph, progress: Progress) -> None:
-        k1, sigma = flight.radial_k1
-        fixes = []
-        for fix in flight.fixes:  # with the final estimate of the radial coefficient
-            pose, cov = undistorted_pose(fix.pose, fix.cov, fix.by_k1, k1 - fix.k1, sigma)
-            fixes.append(replace(fix, pose=pose, cov=cov))
-        self._flight, self._progress = replace(flight, fixes=fixes), progress
+        self._flight, self._progress = flight, progress
         self._nodes = flight.recorder.nodes
         self._begins = _begins(self._nodes)
         self._maps = sorted({f.map_sigma_m for f in flight.fixes})
         self._shares = information_shares(flight)
-        self._candidates = [self._fix_factor(f, share) for f, share in zip(fixes, self._shares, strict=True)]
+        self._values = self._initial()
         # A start position that was found by searching is not a measurement.
         known = flight.origin.start_sigma_m <= SEARCH_START_SIGMA_M
         self._starts = [i for i, node in enumerate(self._nodes) if node.prior is not None and known]
-        self._candidates += [self._start_factor(i) for i in self._starts]
-        self._values = self._initial()
+        # Only points that three keyframes see separate the lens from relief. Without them it stays as described, and
+        # heights are as seen through it.
+        camera = flight.origin.camera
+        self._sees_lens = any(node.triples is not None and len(node.triples.xy) for node in self._nodes)
+        self._focal_sigma = max(camera.focal_sigma if self._sees_lens else 0.0, MIN_FOCAL_SIGMA)
+        self._rows: list[PoseRows] = []
+        self._candidates: list[OutlierCandidate] = []
 
     def smoothed(self) -> Smoothed:
         fixes = self._flight.fixes
         tried = np.array([f.tried for f in fixes] + [True] * len(self._starts), bool)
         inliers = tried.copy()
         certain = self._certain(0)
+        self._see_map()
         self._values, found = solve(
             certain, [d for d, t in zip(self._candidates, tried, strict=True) if t], self._values
         )
         inliers[tried] = found
         for step in range(1, ROUNDS):
             certain = self._certain(step)
+            self._see_map()
             self._values = settle(certain, self._candidates, inliers, self._values)
             inliers = self._readmitted(certain, inliers)
         self._progress(ROUNDS, ROUNDS)
-        return self._result(inliers, self._marginals(certain, inliers))
+        return self._result(certain, inliers)
 
     def _initial(self) -> gtsam.Values:
         values = gtsam.Values()
@@ -98,7 +136,13 @@ class _Smoothing:
             values.insert(V(i), state.velocity)
         for j in range(len(self._maps)):
             values.insert(M(j), gtsam.Pose3())
+        values.insert(F(0), np.zeros(1))
         return values
+
+    def _lens(self, node: int) -> Lens:
+        """At the newest estimate."""
+        k1 = self._values.atVector(B(node))[RADIAL_K1]
+        return Lens(float(k1), float(self._values.atVector(F(0))[0]))
 
     # --- factors --------------------------------------------------------------------------------------------
 
@@ -112,16 +156,54 @@ class _Smoothing:
                 self._progress(step * len(self._nodes) + i, ROUNDS * len(self._nodes))
             if node.prior is not None:
                 graph.push_back(gtsam.PriorFactorPose3(C(i), node.prior[0], loose))
-            for factor in (*node.factors, *self._odometry_factor(i, node)):
+            for factor in (*node.factors, *self._calibration_factors(i, node), *self._odometry_factors(i, node)):
                 graph.push_back(self._linear(factor) if isinstance(factor, gtsam.CustomFactor) else factor)
         for j, sigma_m in enumerate(self._maps):
-            sigmas = np.array([MAP_TURN_RAD] * 3 + [max(sigma_m, EXACT_M)] * 2 + [EXACT_M])
+            sigmas = np.array([MAP_TURN_RAD] * 3 + [max(sigma_m, EXACT_M)] * 2 + [LEVEL_M])
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.push_back(gtsam.PriorFactorPose3(M(j), gtsam.Pose3(), noise))
+        graph.push_back(self._focal_prior(0.0, self._focal_sigma))
         return graph
 
-    def _odometry_factor(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
-        """Odometry factor, reduced at the newest estimates of both cameras; the ground plane is that of the flight."""
+    def _focal_prior(self, value: float, sigma: float) -> gtsam.NonlinearFactor:
+        return gtsam.PriorFactorVector(F(0), np.array([value]), gtsam.noiseModel.Isotropic.Sigma(1, sigma))
+
+    def _calibration_factors(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
+        """Prior of B of the first node of a graph. In flight the height scale was that of barometer and focal length
+        together. The first prior of a flight is of both before anything was measured; later ones say what was learnt
+        of their sum."""
+        if node.calibration is None:
+            return
+        mean, cov = node.calibration
+        air = np.zeros((1, CALIBRATION_SIZE))
+        air[0, LOG_HEIGHT_SCALE] = 1.0 / BAROMETER_SCALE_SIGMA
+        if not self._sees_lens:
+            yield gtsam.PriorFactorVector(B(i), mean, gtsam.noiseModel.Gaussian.Covariance(cov, False))
+            return
+        if i == 0:
+            cov = cov.copy()
+            cov[LOG_HEIGHT_SCALE, :] = cov[:, LOG_HEIGHT_SCALE] = 0.0
+            cov[LOG_HEIGHT_SCALE, LOG_HEIGHT_SCALE] = BAROMETER_SCALE_SIGMA**2
+            yield gtsam.PriorFactorVector(B(i), mean, gtsam.noiseModel.Gaussian.Covariance(cov, False))
+            return
+        root = np.linalg.inv(np.linalg.cholesky(cov))
+        around = gtsam.Values()
+        around.insert(B(i), mean)
+        around.insert(F(0), np.zeros(1))
+        unit = gtsam.noiseModel.Unit.Create
+        both = gtsam.JacobianFactor(
+            B(i), root, F(0), root[:, [LOG_HEIGHT_SCALE]], np.zeros(CALIBRATION_SIZE), unit(CALIBRATION_SIZE)
+        )
+        yield gtsam.LinearContainerFactor(both, around)
+        alone = gtsam.Values()
+        alone.insert(B(i), np.zeros(CALIBRATION_SIZE))
+        yield gtsam.LinearContainerFactor(gtsam.JacobianFactor(B(i), air, np.zeros(1), unit(1)), alone)
+
+    def _odometry_factors(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
+        """Factors of the pairs and of the triples, reduced at the newest estimates of cameras and lens; the ground
+        plane is that of the flight."""
+        lens, camera = self._lens(i), self._flight.origin.camera
+        yield from self._three_view_factor(node, i, FocalKey(F(0), lens.log_focal))
         if node.motion is None or node.motion.rays is None or node.keyframe_m is None:
             return
         rays, then = node.motion.rays, node.keyframe_m
@@ -130,8 +212,35 @@ class _Smoothing:
         fall_m = rays.ground.slope_e * (now[EAST] - then[EAST]) + rays.ground.slope_n * (now[NORTH] - then[NORTH])
         height_m = rays.ground.height_m + float(now[UP] - then[UP]) - float(fall_m)
         ground = replace(rays.ground, height_m=max(height_m, 1.0))
+        pairs = np.hstack([lens.rays(as_described(rays.pairs[:, xy], rays.k1)) for xy in (slice(0, 2), slice(2, 4))])
+        sigma = float(lens.normalised(np.array(rays.sigma)))
         keys = C(node.parent), C(i), B(i)
-        yield plane_two_view_factor(*keys, keyframe, pose, rays.pairs, rays.sigma, ground, B(node.parent), rays.k1)
+        repeats = float(np.sqrt(len(self._nodes)))  # relief is no new one in each pair: as a whole they give the prior
+        noise = LensNoise(repeats * radial_k1_sigma(camera), repeats * camera.focal_sigma)
+        of_plane = noise if self._sees_lens else None
+        yield plane_two_view_factor(*keys, keyframe, pose, pairs, sigma, ground, B(node.parent), lens.k1, of_plane)
+
+    def _three_view_factor(self, node: RecordedNode, i: int, focal: FocalKey) -> Iterator[gtsam.NonlinearFactor]:
+        seen = node.triples
+        if seen is None or not len(seen.xy):
+            return
+        lens, nodes = self._lens(i), (seen.first, node.parent, i)
+        cameras = [self._values.atPose3(C(n)) for n in nodes]
+        if seen.rises:
+            rises_m = [float(self._values.atVector(B(n))[HEIGHT]) for n in nodes]
+            cameras = [
+                gtsam.Pose3(pose.rotation(), pose.translation() + np.array([0.0, 0.0, m - rises_m[1]]))
+                for pose, m in zip(cameras, rises_m, strict=True)
+            ]
+        first, middle, last = cameras
+        height_m = max(float(middle.translation()[UP]) - seen.ground_m, 1.0)
+        guess = ThreeViewPose(middle.between(first), middle.between(last), height_m, seen.ground_m, lens.k1)
+        triples, sigma = lens.normalised(seen.xy), float(lens.normalised(np.array(seen.sigma)))
+        constraint = three_view_constraint_of_focal(triples, sigma, guess, self._flight.origin.camera.focal_sigma)
+        if constraint is not None:
+            first_key, middle_key, last_key = ((C(n), B(n)) for n in nodes)
+            keys = first_key, middle_key, last_key
+            yield three_view_factor(keys, constraint, rises=seen.rises, focal=focal)
 
     def _linear(self, factor: gtsam.CustomFactor) -> gtsam.NonlinearFactor:
         around = gtsam.Values()
@@ -140,12 +249,38 @@ class _Smoothing:
             around.insert(key, self._values.atPose3(key) if is_pose else self._values.atVector(key))
         return gtsam.LinearContainerFactor(factor.linearize(around), around)
 
-    def _fix_factor(self, fix: Fix, share: float) -> OutlierCandidate:
-        keys = M(self._maps.index(fix.map_sigma_m)), C(fix.node)
+    def _see_map(self) -> None:
+        """Map matches and starts, through the lens of the newest estimate."""
+        fixes = self._flight.fixes
+        self._rows = [self._fix_rows(fix) for fix in fixes]
+        seen = zip(fixes, self._rows, self._shares, strict=True)
+        self._candidates = [self._fix_factor(fix, rows, share) for fix, rows, share in seen]
+        self._candidates += [self._start_factor(i) for i in self._starts]
+
+    def _fix_rows(self, fix: Fix) -> PoseRows:
+        lens = self._lens(fix.node)
+        fit = None if fix.points is None else fix.points.fit(lens)
+        if fix.points is not None and fit is not None:
+            return fix.points.rows(fit)
+        return rows_of_pose(fix.pose, fix.cov, fix.by_lens, Lens(fix.k1))
+
+    def _fix_factor(self, fix: Fix, seen: PoseRows, share: float) -> OutlierCandidate:
+        keys = [M(self._maps.index(fix.map_sigma_m)), C(fix.node), B(fix.node), F(0)]
+        of_map = -seen.pose.inverse().AdjointMap()
+        around = gtsam.Values()
+        around.insert(keys[0], gtsam.Pose3())
+        around.insert(keys[1], seen.pose)
+        bias = self._values.atVector(keys[2]).copy()
+        bias[RADIAL_K1] = seen.lens.k1
+        around.insert(keys[2], bias)
+        around.insert(keys[3], np.array([seen.lens.log_focal]))
 
         def factor(weight: float) -> gtsam.NonlinearFactor:
-            noise = gtsam.noiseModel.Gaussian.Covariance(fix.cov / (share * weight), False)
-            return gtsam.BetweenFactorPose3(*keys, fix.pose, noise)
+            rows = np.sqrt(share * weight) * seen.rows
+            by_bias = np.zeros((len(rows), CALIBRATION_SIZE))
+            by_bias[:, RADIAL_K1] = rows[:, K1]
+            by = [rows[:, POSE] @ of_map, rows[:, POSE], by_bias, rows[:, [FOCAL]]]
+            return linear_factor(keys, by, rows[:, -1], around)
 
         return OutlierCandidate(factor(1.0), factor, GATE[6] * share)
 
@@ -182,11 +317,14 @@ class _Smoothing:
     def _marginals(self, certain: gtsam.NonlinearFactorGraph, inliers: np.ndarray) -> Covariances:
         """With segments without a position on earth fixed where they are: their covariance is not used, and the system
         stays well conditioned."""
+        return marginals(self._firm_graph(certain, inliers), self._values)
+
+    def _firm_graph(self, certain: gtsam.NonlinearFactorGraph, inliers: np.ndarray) -> gtsam.NonlinearFactorGraph:
         graph = weighted(certain, self._candidates, inliers.astype(float))
         firm = gtsam.noiseModel.Unit.Create(6)
         for begin in sorted(set(self._begins.tolist()) - self._tied(inliers)):
             graph.push_back(gtsam.PriorFactorPose3(C(begin), self._values.atPose3(C(begin)), firm))
-        return marginals(graph, self._values)
+        return graph
 
     def _tied(self, inliers: np.ndarray) -> set[int]:
         """First nodes of the segments with a position on earth: by a map match, or by a start coordinate."""
@@ -196,32 +334,80 @@ class _Smoothing:
     def _consistent(self, fix: Fix, found: Covariances) -> bool:
         shifted, camera = M(self._maps.index(fix.map_sigma_m)), C(fix.node)
         offset, pose = self._values.atPose3(shifted), self._values.atPose3(camera)
+        measured, cov_m = self._measured(fix, found)
         joint = found.jointMarginalCovariance([shifted, camera])
         seen = offset.between(pose)
         by_offset = -seen.inverse().AdjointMap()
-        cov = by_offset @ joint.at(shifted, shifted) @ by_offset.T + joint.at(camera, camera) + fix.cov
+        cov = by_offset @ joint.at(shifted, shifted) @ by_offset.T + joint.at(camera, camera) + cov_m
         across = by_offset @ joint.at(shifted, camera)
-        residual = fix.pose.localCoordinates(seen)
+        residual = measured.localCoordinates(seen)
         return float(residual @ np.linalg.solve(cov + across + across.T, residual)) <= GATE[6]
+
+    def _measured(self, fix: Fix, found: Covariances) -> tuple[gtsam.Pose3, np.ndarray]:
+        """Pose of a map match through the lens of the newest estimate, with the covariance of both."""
+        seen, lens = self._rows[self._flight.fixes.index(fix)], self._lens(fix.node)
+        rows = seen.rows[:, POSE]
+        cov = np.linalg.inv(rows.T @ rows)
+        by_lens = -cov @ rows.T @ seen.rows[:, [K1, FOCAL]]
+        change = np.array([lens.k1 - seen.lens.k1, lens.log_focal - seen.lens.log_focal])
+        sigmas = self._lens_sigma(fix.node, found)
+        of_lens = np.diag([sigmas.k1, sigmas.log_focal]) ** 2
+        return seen.pose.retract(by_lens @ change), cov + by_lens @ of_lens @ by_lens.T
+
+    def _lens_sigma(self, node: int, found: Covariances) -> Lens:
+        """1-sigma of the lens, also by what the model of it leaves out."""
+        k1 = np.hypot(
+            np.sqrt(found.marginalCovariance(B(node))[RADIAL_K1, RADIAL_K1]), k1_model_sigma(self._lens(node).k1)
+        )
+        focal = np.hypot(np.sqrt(found.marginalCovariance(F(0))[0, 0]), self._focal_model_sigma(found))
+        return Lens(float(k1), float(focal))
+
+    def _focal_model_sigma(self, found: Covariances) -> float:
+        """FOCAL_MODEL_SIGMA, or what the description leaves for it."""
+        left = self._focal_sigma**2 - float(found.marginalCovariance(F(0))[0, 0])
+        return min(FOCAL_MODEL_SIGMA, float(np.sqrt(max(left, 0.0))))
+
+    def _moved_by_focal(self, graph: gtsam.NonlinearFactorGraph) -> np.ndarray:
+        """(N, 6) change of every pose, tangent order, with the focal length, per unit of its logarithm."""
+        now = float(self._values.atVector(F(0))[0])
+        steps = []
+        for value in (now, now + FOCAL_MODEL_SIGMA):
+            firm = gtsam.NonlinearFactorGraph(graph)
+            firm.push_back(self._focal_prior(value, MIN_FOCAL_SIGMA))
+            steps.append(step_of(firm, self._values))
+        moved = [steps[1].at(C(i)) - steps[0].at(C(i)) for i in range(len(self._nodes))]
+        return np.array(moved).reshape(-1, 6) / FOCAL_MODEL_SIGMA
 
     # --- result -----------------------------------------------------------------------------------------
 
-    def _result(self, inliers: np.ndarray, found: Covariances) -> Smoothed:
+    def _result(self, certain: gtsam.NonlinearFactorGraph, inliers: np.ndarray) -> Smoothed:
+        graph = self._firm_graph(certain, inliers)
+        found = marginals(graph, self._values)
         fixes, n = self._flight.fixes, len(self._nodes)
         poses = [self._values.atPose3(C(i)) for i in range(n)]
         covs = np.array([found.marginalCovariance(C(i)) for i in range(n)]).reshape(n, 6, 6)
+        moved_m = np.array(
+            [
+                np.linalg.norm((pose.translation() - node.state.pose.translation())[HORIZONTAL])
+                for pose, node in zip(poses, self._nodes, strict=True)
+            ]
+        )
         placed = np.isin(self._begins, list(self._tied(inliers)))
         starts = dict(zip(self._starts, inliers[len(fixes) :].tolist(), strict=True))
         for at, spread in ambiguous_segments(fixes, inliers[: len(fixes)], self._begins, poses):
             r = np.array([poses[i].rotation().matrix()[HORIZONTAL] for i in at])
             covs[at, TRANSLATION, TRANSLATION] += np.einsum("nai,ab,nbj->nij", r, spread, r)
+        lens, sigma = self._lens(n - 1), self._focal_model_sigma(found)
+        if sigma > 0.0:
+            by_focal = sigma * self._moved_by_focal(graph)
+            covs += by_focal[:, :, None] * by_focal[:, None, :]
         lost_m = lost_sigma(self._flight, inliers[: len(fixes)], self._begins)
         covs[:, TRANSLATION, TRANSLATION] += lost_m[:, None, None] ** 2 * np.eye(3)
         if (principal_point := self._flight.principal_point) is not None:
             for i, pose in enumerate(poses):
                 level, p_m = pose.rotation().matrix()[HORIZONTAL], pose.translation()
-                height_m = p_m[UP] - (self._flight.origin.ground_amsl_m or 0.0)
-                aside_m, aside_cov = principal_point.shift(height_m * level[:, :2])
+                seen_m = np.exp(-lens.log_focal) * (p_m[UP] - (self._flight.origin.ground_amsl_m or 0.0))
+                aside_m, aside_cov = principal_point.shift(seen_m * level[:, :2])
                 poses[i] = gtsam.Pose3(pose.rotation(), p_m + np.append(aside_m, 0.0))
                 covs[i, TRANSLATION, TRANSLATION] += level.T @ aside_cov @ level
         offsets = {}
@@ -237,7 +423,29 @@ class _Smoothing:
             offsets,
             self._begins,
             starts,
+            lens,
+            self._lens_sigma(n - 1, found),
+            self._sees_lens,
+            self._map_residual(inliers),
+            moved_m,
         )
+
+    def _map_residual(self, inliers: np.ndarray) -> tuple[float | None, float | None]:
+        in_flight, lengths = Lens(self._flight.radial_k1[0]), list[tuple[float, float]]()
+        for fix, is_inlier in zip(self._flight.fixes, inliers.tolist(), strict=False):
+            fit = fix.points.fit(self._lens(fix.node)) if is_inlier and fix.points is not None else None
+            if fix.points is None or fit is None:
+                continue
+            offset = self._values.atPose3(M(self._maps.index(fix.map_sigma_m)))
+            after = offset.between(self._values.atPose3(C(fix.node)))
+            before = self._nodes[fix.node].state.pose
+            ways = ((before, in_flight), (after, fit.lens))
+            of_match = [fix.points.off(pose, lens)[fit.inliers] for pose, lens in ways]
+            lengths += list(zip(*(one.tolist() for one in of_match), strict=True))
+        if not lengths:
+            return None, None
+        before_after = np.mean(lengths, axis=0)
+        return float(before_after[0]), float(before_after[1])
 
 
 def _begins(nodes: list[RecordedNode]) -> np.ndarray:
@@ -246,3 +454,19 @@ def _begins(nodes: list[RecordedNode]) -> np.ndarray:
     for i, node in enumerate(nodes):
         begins[i] = i if node.parent < 0 else begins[node.parent]
     return begins
+
+
+def linear_factor(
+    keys: list[int], by: list[np.ndarray], constant: np.ndarray, around: gtsam.Values
+) -> gtsam.NonlinearFactor:
+    """Residual ``constant`` + sum of ``by`` times the changes of ``keys`` from ``around``, whitened. GTSAM's own
+    constructor of a linear factor takes three keys at most."""
+
+    def error(_this: object, _values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        if jacobians is not None:
+            for i, one in enumerate(by):
+                jacobians[i] = np.asfortranarray(one)
+        return constant
+
+    factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(constant)), keys, error)
+    return gtsam.LinearContainerFactor(factor.linearize(around), around)

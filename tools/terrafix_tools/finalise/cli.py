@@ -11,8 +11,15 @@ def finalise(
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
     """After landing: smooths the whole flight at once; writes finalised.csv and finalised.json beside the record."""
+    from rich.console import Console
+
+    from terrafix_tools.finalise.before_after import table
     from terrafix_tools.finalise.run import finalise as run_finalise
     from terrafix_tools.finalise.run import last_lines
 
-    for line in last_lines(run_finalise(folder, progress=not quiet), folder):
+    summary = run_finalise(folder, progress=not quiet)
+    for flight in summary["flights"]:
+        if flight["before_after"]:
+            Console().print(table(flight["before_after"]))
+    for line in last_lines(summary, folder):
         typer.echo(line)

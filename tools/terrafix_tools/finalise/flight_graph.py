@@ -4,22 +4,26 @@ The replay repeats the decisions of the flight: which keyframe a frame was measu
 motion increment of the IMU. Nodes that left the window, and map matches that were rejected, are recorded too."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, C, V
+from gtsam.symbol_shorthand import B, C, F, V
 
 from terrafix.core.pnp import solved
 from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.factors.focal import FocalKey
+from terrafix.estimator.factors.motion import motion_factor
+from terrafix.estimator.graph.marginalized import THREE_VIEW_NODES
 from terrafix.estimator.graph.pose_graph import GraphObserver, GraphPrior, NewNode, PoseGraph
-from terrafix.estimator.measurements.map_pose import determined, measured_pose, moved_by_k1
+from terrafix.estimator.measurements.map_pose import determined, measured_pose, moved_by_focal, moved_by_k1
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.estimator.models.bias_walk import WALK_SIGMAS
 from terrafix.estimator.models.plane_motion import RelativePose
+from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import NavPrior
-from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, NodeState
+from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, POSE_SIZE, UP, NodeState
 from terrafix.messages import (
     MapMatch,
     MeasurementVerdict,
@@ -30,6 +34,7 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
+from terrafix_tools.finalise.map_points import MatchedPoints
 
 SAME_FRAME_M, SAME_FRAME_MPS = 0.01, 0.01  # 1-sigma (m and rad; m/s) between two nodes of one frame
 SAME_FRAME_WALK = 0.01  # share of one second's random walk of B between these
@@ -37,8 +42,8 @@ SAME_FRAME_WALK = 0.01  # share of one second's random walk of B between these
 
 @dataclass
 class RecordedNode:
-    """A node of the flight. ``factors``: those to earlier nodes, without that of ``motion`` from ``parent`` if it is
-    from odometry, and without the prior of the pose."""
+    """A node of the flight. ``factors``: those to earlier nodes, without those of ``motion`` from ``parent`` if it is
+    from odometry and of ``triples``, and without the priors of pose and calibration."""
 
     t_s: float
     state: NodeState  # last estimate in flight
@@ -47,24 +52,40 @@ class RecordedNode:
     motion: RelativePose | None = None
     keyframe_m: np.ndarray | None = None  # (3,) of the parent when its ground plane was computed
     prior: tuple[gtsam.Pose3, np.ndarray] | None = None  # first pose of a graph, with covariance (6, 6), tangent order
+    calibration: tuple[np.ndarray, np.ndarray] | None = None  # ... and its B, with covariance
+    triples: "Triples | None" = None
     again: bool = False  # same frame as the node before, after a map match has reset the graph
+
+
+@dataclass(frozen=True)
+class Triples:
+    """Points that a node, its parent and the node ``first`` see: ``xy`` (N, 6) normalised by the description of the
+    camera (first, parent, node), with 1-sigma ``sigma``. ``rises``, ``ground_m``: as in flight (three_view_factor)."""
+
+    first: int
+    rises: bool
+    ground_m: float
+    xy: np.ndarray
+    sigma: float
 
 
 @dataclass(frozen=True)
 class Fix:
     """A map match at ``node``: camera pose with covariance (6, 6), tangent order, and the error that the map states.
 
-    ``by_k1``: change of the pose by the radial coefficient (map_offsets.py), which was ``k1``. ``tried`` False: it
-    was too vague in flight to determine a position, and the smoother may use it as a confirmation only."""
+    ``by_lens`` (6, 2): change of the pose by the radial coefficient, which was ``k1``, and by the logarithm of the
+    focal length. ``points``: its 2D-3D matches; None: the matcher has computed the pose itself. ``tried`` False: it was
+    too vague in flight to determine a position, and the smoother may use it as a confirmation only."""
 
     node: int
     pose: gtsam.Pose3
     cov: np.ndarray
     map_sigma_m: float
     position_only: bool
-    by_k1: np.ndarray | None
+    by_lens: np.ndarray
     k1: float
     tried: bool
+    points: MatchedPoints | None
 
 
 class GraphRecorder(GraphObserver):
@@ -83,7 +104,10 @@ class GraphRecorder(GraphObserver):
             # A map match has reset the graph: the same frame, and its motion since the frame before stands.
             self.nodes.append(RecordedNode(t_s, prior.state, _same_frame(node - 1, node), graph.newest, again=True))
         else:
-            self.nodes.append(RecordedNode(t_s, prior.state, others, prior=(prior.state.pose, prior.cov)))
+            kept = [f for f in others if list(f.keys()) != [B(node)]]
+            calibration = prior.state.bias, prior.bias_cov
+            pose = prior.state.pose, prior.cov
+            self.nodes.append(RecordedNode(t_s, prior.state, kept, prior=pose, calibration=calibration))
 
     def extended(
         self,
@@ -94,14 +118,37 @@ class GraphRecorder(GraphObserver):
         others: list[gtsam.NonlinearFactor],
     ) -> None:
         # The smoother makes its own odometry factor of rays.
+        if new.increment is not None and new.velocity_cov is None:  # others[0] is that of the increment
+            n, last = graph.next_node, graph.newest
+            keys = (C(last), V(last)), (C(n), V(n)), (B(last), B(n))
+            others = [motion_factor(*keys, new.increment, FocalKey(F(0), 0.0)), *others[1:]]
+        triples = None
+        if new.three_view is not None:
+            first, constraint = new.three_view
+            kept = [factor for factor in others if not _is_three_view(factor)]
+            if len(kept) < len(others):  # the first keyframe may have left the window
+                ground_m, rises = constraint.at.ground_m, new.rise_sigma_m > 0.0
+                triples, others = Triples(first, rises, ground_m, np.zeros((0, 6)), 0.0), kept
         factors = others if new.motion.rays is not None else [odometry, *others]
         keyframe_m = np.asarray(graph.state(new.parent).pose.translation())
-        self.nodes.append(RecordedNode(t_s, new.state, factors, new.parent, new.motion, keyframe_m))
+        self.nodes.append(RecordedNode(t_s, new.state, factors, new.parent, new.motion, keyframe_m, triples=triples))
+
+    def add_triples(self, odometry: Odometry) -> None:
+        """The points of the newest node, whose frame was ``odometry``'s."""
+        node = self.nodes[-1]
+        if node.triples is not None:
+            xy, sigma = np.array(odometry.three_view), odometry.three_view_sigma_norm
+            node.triples = replace(node.triples, xy=xy, sigma=sigma)
 
     def store_estimates(self) -> None:
         """Records the estimates of the nodes in the window."""
         for node in self.graph.window:
             self.nodes[node].state = self.graph.state(node)
+
+
+def _is_three_view(factor: gtsam.NonlinearFactor) -> bool:
+    keys: list[int] = list(factor.keys())
+    return sum(gtsam.symbolChr(key) == gtsam.symbolChr(C(0)) for key in keys) == THREE_VIEW_NODES
 
 
 def _same_frame(first: int, second: int) -> list[gtsam.NonlinearFactor]:
@@ -152,6 +199,7 @@ class FlightReplayer:
             flight.has_height = flight.has_height or message.agl_m is not None
         elif isinstance(message, Odometry) and any(isinstance(s, NavEstimate) for s in published):
             flight.node_of[message.frame_id] = flight.recorder.graph.newest
+            flight.recorder.add_triples(message)
             flight.radial_k1 = estimator.state.radial_k1_estimate
             flight.principal_point = estimator.state.principal_point
         elif isinstance(message, MapMatch):
@@ -159,8 +207,8 @@ class FlightReplayer:
             self._add_match(message, verdict, estimator)
         return published
 
-    def _add_match(self, match: MapMatch, verdict: Verdict, estimator: Estimator) -> None:
-        flight, match = self.flights[-1], solved(match)
+    def _add_match(self, received: MapMatch, verdict: Verdict, estimator: Estimator) -> None:
+        flight, match = self.flights[-1], solved(received)
         node = flight.node_of.get(match.frame_id)
         if node is not None:
             flight.lost_sigma_m[node] = estimator.hypotheses.anywhere_m
@@ -171,5 +219,27 @@ class FlightReplayer:
         pose, cov = measured_pose(match.pose, match.map_sigma_m, estimator.terrain)
         tried = verdict is not Verdict.AMBIGUOUS
         flight.fixes.append(
-            Fix(node, pose, cov, match.map_sigma_m, match.position_only, moved_by_k1(match), match.radial_k1, tried)
+            Fix(
+                node,
+                pose,
+                cov,
+                match.map_sigma_m,
+                match.position_only,
+                moved_by_lens(match, estimator.terrain),
+                match.radial_k1,
+                tried,
+                MatchedPoints.of(received, match, estimator.terrain),
+            )
         )
+
+
+def moved_by_lens(match: MapMatch, terrain: Terrain) -> np.ndarray:
+    """(6, 2) tangent order: change of the pose of a match that is ``determined`` by one unit of the radial coefficient,
+    and of the logarithm of the focal length. Without points the camera moves away from the ground along its axis."""
+    by_k1, by_focal = moved_by_k1(match), moved_by_focal(match)
+    if by_k1 is not None and by_focal is not None:
+        return np.column_stack([by_k1, by_focal])
+    assert match.pose is not None
+    moved = np.zeros((POSE_SIZE, 2))
+    moved[-1, 1] = -max(match.pose.p_c_in_w_m[UP] - terrain.ground_m, 1.0)
+    return moved

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from terrafix.core.errors import OutputError
+from terrafix.core.errors import EvaluationError, OutputError
 from terrafix_tools.estimates import PARTIAL, number, read_table
 
 TABLE, SUMMARY = "finalised.csv", "finalised.json"
@@ -58,6 +58,19 @@ def read_track(path: Path) -> list[tuple[float, float]]:
         if lat_deg is not None and lon_deg is not None:
             track.append((lat_deg, lon_deg))
     return track
+
+
+def read_changes(path: Path) -> list[dict[str, Any]]:
+    """Rows of before and after of all flights of a summary; none where it has none, as of an older version. Raises
+    EvaluationError."""
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{path}: cannot be read ({error}); write it again with 'terrafix finalise'") from None
+    flights = summary.get("flights", []) if isinstance(summary, dict) else []
+    return [row for flight in flights for row in flight.get("before_after", [])]
 
 
 def _cells(row: FinalRow) -> list[str]:

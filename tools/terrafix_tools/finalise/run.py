@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from terrafix.recorder.provenance import versions
 from terrafix.recorder.reader import ReadResult, check_format, read_flight
 from terrafix_tools.estimates import NS
 from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
+from terrafix_tools.finalise.before_after import Change
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.output import TABLE, FinalRow, write
 
@@ -71,6 +73,11 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
         f"{summary['finalised']} of {summary['frames']} frames placed by {sum(f['believed'] for f in found)} map "
         f"matches ({sum(f['refused'] for f in found)} rejected); written to {folder / TABLE}"
     )
+
+
+def flights_of(folder: Path) -> list[FlightGraph]:
+    """Flights of a record, as the smoother takes them. Raises SourceError."""
+    return _replay(folder, ReadResult(), lambda _name, _done, _of: None)[1]
 
 
 def _replay(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, FinalRow], list[FlightGraph]]:
@@ -148,7 +155,29 @@ def _summary(flight: FlightGraph, found: Smoothed | None, not_placed: list[dict[
             for sigma_m, (offset, sigmas) in offsets.items()
         ],
         "not_placed": not_placed,
+        "before_after": _changes(flight, found) if found else [],
     }
+
+
+def _changes(flight: FlightGraph, found: Smoothed) -> list[dict[str, Any]]:
+    """Rows of the table as in finalised.json, fields of ``Change``."""
+    camera, (k1, k1_sigma) = flight.origin.camera, flight.radial_k1
+    focal_px, sigma_px = camera.fx, camera.fx * camera.focal_sigma
+    if found.sees_lens:
+        focal_px, sigma_px = camera.fx * np.exp(found.lens.log_focal), focal_px * found.lens_sigma.log_focal
+    before_px, after_px = (
+        None if xy is None else xy * px for xy, px in zip(found.map_residual, (camera.fx, focal_px), strict=True)
+    )
+    rows = [
+        Change("focal length", "px", camera.fx, camera.fx * camera.focal_sigma, focal_px, sigma_px),
+        Change("radial coefficient", "", k1, k1_sigma, found.lens.k1, found.lens_sigma.k1),
+        Change("map points from the camera's pose, mean", "px", before_px, None, after_px, None),
+    ]
+    moved_m = found.moved_m[found.placed]
+    if len(moved_m):
+        rows.append(Change("positions moved, median", "m", None, None, float(np.median(moved_m)), None))
+        rows.append(Change("positions moved, largest", "m", None, None, float(np.max(moved_m)), None))
+    return [{k: round(v, 5) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from terrafix_tools.report.sections_computer import computer
 from terrafix_tools.report.sections_gnss import gnss
 from terrafix_tools.report.sections_innovations import innovations
 from terrafix_tools.report.sections_moments import moments_sections
-from terrafix_tools.report.sections_run import camera_images, picture_rows, provenance, timing
+from terrafix_tools.report.sections_run import camera_images, finalised, picture_rows, provenance, timing
 from terrafix_tools.report.text import events, figures, stamp
 
 NAME = "report.html"
@@ -53,6 +53,7 @@ def _page(view: FlightView, map_path: Path | None) -> str:
         _events(view),
         worst,
         accuracy(view),
+        finalised(view),
         states(view),
         innovations(view),
         verdicts(view),

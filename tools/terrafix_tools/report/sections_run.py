@@ -6,12 +6,21 @@ from html import escape
 
 import numpy as np
 
+from terrafix_tools.finalise.before_after import HEADER, Change
+from terrafix_tools.report import document
 from terrafix_tools.report.charts import HALF_WIDTH, Chart, clock
 from terrafix_tools.report.data import FlightView, radius95_m
 from terrafix_tools.report.sections import LABELS, table
 
 MAX_IMAGES = 8
 BINS = 40
+
+
+def finalised(view: FlightView) -> str:
+    """What the smoother after landing has changed; empty where it did not run."""
+    rows: list[list[object]] = [[*Change(**row).cells()] for row in view.before_after]
+    shown = document.table([*HEADER], rows) if rows else ""
+    return f"<h2>Finalised after landing</h2>{shown}" if rows else ""
 
 
 def timing(view: FlightView) -> str:

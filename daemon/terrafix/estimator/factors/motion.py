@@ -7,6 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.linearization_cache import custom_factor
 from terrafix.estimator.factors.noise import robust_noise
 from terrafix.estimator.models.motion_model import MotionIncrement
@@ -28,7 +29,11 @@ MIN_HEIGHT_M = 1.0  # lower bound of a height that the residual is divided by [t
 
 
 def motion_factor(
-    before: tuple[int, int], after: tuple[int, int], bias_keys: tuple[int, int], increment: MotionIncrement
+    before: tuple[int, int],
+    after: tuple[int, int],
+    bias_keys: tuple[int, int],
+    increment: MotionIncrement,
+    focal: FocalKey | None = None,
 ) -> gtsam.CustomFactor:
     """``before`` and ``after``: keys of C and V; ``bias_keys``: keys of B at both ends. The heading bias at the end
     rotates the measured part of the increment.
@@ -43,6 +48,10 @@ def motion_factor(
     solved: an initial velocity that does not fit the motion counts as a manoeuvre. Without odometry
     (``MotionIncrement.height_scale_ref`` is None) the increment is Gaussian, because no other measurement would be
     distorted.
+
+    ``focal``: where the focal length is a variable, the residual is in heights as seen through the described lens. In
+    true heights it would be the smaller the longer the focal length is believed to be: the map gives the distances, so
+    that the heights alone grow with the focal length.
 
     The residual is linear but for the heading bias, the axes of the poses, and the height that scales the increment
     (``MotionIncrement.height_scale_ref``)."""
@@ -60,11 +69,12 @@ def motion_factor(
         start[DELTA_P] += c1.translation() - c0.translation()
         if increment.terrain_unknown:
             start[UP] += float(b1[HEIGHT] - values.atVector(bias_keys[0])[HEIGHT])
-        scale0, scale1 = _height_scales(increment, c0, c1)
+        longer = 1.0 if focal is None else math.exp(float(values.atVector(focal.key)[0]) - focal.at)
+        scale0, scale1 = _height_scales(increment, c0, c1, longer)
         residual = scale0 * start
         residual[DELTA_MOTION] += scale1 * v1
         if jacobians is not None:
-            at = _Linearization(c0, c1, v1, rotated, start, scale0, scale1)
+            at = _Linearization(c0, c1, v1, rotated, start, scale0, scale1, longer)
             by_c0, by_c1 = _pose_jacobians(increment, at)
             by_bias = _calibration_jacobian(increment, at)
             if increment.terrain_unknown:
@@ -73,19 +83,24 @@ def motion_factor(
                 jacobians[5][UP, HEIGHT] = -scale0
             for i, jacobian in enumerate((by_c0, scale0 * by_before, by_c1, scale1 * by_after, by_bias)):
                 jacobians[i] = np.asfortranarray(jacobian)
+            if focal is not None:
+                by_focal = residual if increment.height_scale_ref is not None else np.zeros_like(residual)
+                jacobians[-1] = np.asfortranarray(by_focal[:, None])
         return residual
 
     heavy_tailed = not increment.inertial and increment.height_scale_ref is not None
     noise = robust_noise(increment.cov) if heavy_tailed else gtsam.noiseModel.Gaussian.Covariance(increment.cov, False)
     keys = [*before, *after, bias_keys[1]]
-    return custom_factor(noise, [*keys, bias_keys[0]] if increment.terrain_unknown else keys, error)
+    keys += [bias_keys[0]] if increment.terrain_unknown else []
+    return custom_factor(noise, keys if focal is None else [*keys, focal.key], error)
 
 
 @dataclass(frozen=True)
 class _Linearization:
     """Values at which the Jacobians are taken. ``rotated`` (6,): position and velocity increment in the world;
     ``start`` (INCREMENT_SIZE,): the residual in metres without V at the end; ``scale0``, ``scale1``: factors that turn
-    metres into heights, of ``start`` and of V at the end."""
+    metres into heights, of ``start`` and of V at the end; ``longer``: true focal length over the one of the increment's
+    reference height."""
 
     c0: gtsam.Pose3
     c1: gtsam.Pose3
@@ -94,6 +109,7 @@ class _Linearization:
     start: np.ndarray
     scale0: float
     scale1: float
+    longer: float
 
 
 def _rotated(delta: np.ndarray, heading_rad: float) -> np.ndarray:
@@ -103,11 +119,13 @@ def _rotated(delta: np.ndarray, heading_rad: float) -> np.ndarray:
     return np.array([c * px - s * py, s * px + c * py, pz, c * vx - s * vy, s * vx + c * vy, vz])
 
 
-def _height_scales(increment: MotionIncrement, c0: gtsam.Pose3, c1: gtsam.Pose3) -> tuple[float, float]:
-    """-> reference height over actual height, at the beginning and at the end; 1 for an increment in metres."""
+def _height_scales(increment: MotionIncrement, c0: gtsam.Pose3, c1: gtsam.Pose3, longer: float) -> tuple[float, float]:
+    """-> reference height over actual height, at the beginning and at the end; 1 for an increment in metres.
+    ``longer``: true focal length over the one through which the reference height was seen."""
     if increment.height_scale_ref is None:
         return 1.0, 1.0
     height_m, ground_m = increment.height_scale_ref
+    height_m *= longer
     scale1 = height_m / max(float(c1.translation()[UP]) - ground_m, MIN_HEIGHT_M)
     if increment.inertial:
         return scale1, scale1
@@ -120,7 +138,7 @@ def _pose_jacobians(increment: MotionIncrement, at: _Linearization) -> tuple[np.
     by_c0[DELTA_P, TRANSLATION] = -at.scale0 * at.c0.rotation().matrix()
     by_c1[DELTA_P, TRANSLATION] = at.scale0 * at.c1.rotation().matrix()
     if increment.height_scale_ref is not None:
-        height_m = increment.height_scale_ref[0]
+        height_m = increment.height_scale_ref[0] * at.longer
         up0, up1 = at.c0.rotation().matrix()[UP], at.c1.rotation().matrix()[UP]
         by_start, up = (by_c1, up1) if increment.inertial else (by_c0, up0)
         by_start[:, TRANSLATION] -= np.outer(at.start, up) * (at.scale0**2 / height_m)

@@ -11,6 +11,7 @@ import numpy as np
 
 from terrafix.core.pose import project_with_jacobian
 from terrafix.estimator.factors.linearization_cache import custom_factor
+from terrafix.estimator.factors.noise import whiten_common
 from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS, Ground
 from terrafix.estimator.state import (
     CALIBRATION_SIZE,
@@ -37,18 +38,28 @@ STEP_AND_CONSTANT = [0, 1, 2, 3, 4, 5, 10]  # columns of the QR [spec: order of 
 TILT_COLUMNS, K1_COLUMN = slice(6, 9), 9  # [spec: order of the stacked Jacobian]
 STEP_COLUMNS, CONSTANT_COLUMN = slice(0, 6), 6  # of the reduced step and constant [spec: STEP_AND_CONSTANT]
 MIN_HEIGHT_M = 1.0  # lower bound of the height over the plane [tuned]
+RADIAL, UNIFORM = 2, 0  # powers of the distance from the centre [spec: division model; focal length]
 RIGHT_DOWN = slice(3, 5)  # translation within the image plane [spec: tangent order of a pose]
 
 
 @dataclass(frozen=True)
 class _Plane:
-    """``normal . X = offset`` in the world; ``normal`` (3,) has an up component of 1. ``k1_sigma``: 1-sigma of the
-    radial coefficient that is noise."""
+    """``normal . X = offset`` in the world; ``normal`` (3,) has an up component of 1. ``k1_sigma``, ``focal_sigma``:
+    1-sigma of the radial coefficient and of the relative focal length that is noise."""
 
     ground: Ground
     normal: np.ndarray
     offset: float
     k1_sigma: float
+    focal_sigma: float
+
+
+@dataclass(frozen=True)
+class LensNoise:
+    """1-sigma of the lens in the noise of a factor: radial coefficient, and relative focal length."""
+
+    k1: float
+    focal: float
 
 
 @dataclass(frozen=True)
@@ -103,6 +114,7 @@ def plane_two_view_factor(
     ground: Ground,
     keyframe_bias_key: int | None = None,
     k1: float = 0.0,
+    lens: LensNoise | None = None,
 ) -> gtsam.CustomFactor:
     """``keyframe``, ``pose``: first estimates. ``pairs`` (N, 4): normalised, undistorted by radial coefficient ``k1``,
     with 1-sigma ``sigma`` of a coordinate. The uncertainty of height and slope of the plane is part of the noise.
@@ -115,10 +127,12 @@ def plane_two_view_factor(
     and would pull the estimate down.
 
     ``keyframe_bias_key``: B of the keyframe. It enters only where the elevation between both is unknown
-    (``ground.rise_sigma_m``; see ``motion_factor``)."""
+    (``ground.rise_sigma_m``; see ``motion_factor``). ``lens``: where other factors determine the lens. Relief looks
+    like a lens error for as long as it is in view, and is not on the plane; None: as in flight, where the height is a
+    height as seen through the described lens, and the pairs determine the radial coefficient."""
     if not ground.rise_sigma_m:
         keyframe_bias_key = None
-    model = _linear_model(keyframe, pose, pairs, sigma, ground, k1)
+    model = _linear_model(keyframe, pose, pairs, sigma, ground, k1, lens or LensNoise(0.0, 0.0))
     first_up_m = keyframe.translation()[UP]
 
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
@@ -205,14 +219,25 @@ class _LinearModel:
         return by_c0, by_c1
 
 
+def k1_model_sigma(k1: float) -> float:
+    """1-sigma of a radial coefficient as one number for a lens."""
+    return float(np.hypot(K1_MODEL_SIGMA, K1_MODEL_SHARE * k1))
+
+
 def _linear_model(
-    keyframe: gtsam.Pose3, pose: gtsam.Pose3, pairs: np.ndarray, sigma: float, ground: Ground, k1: float
+    keyframe: gtsam.Pose3,
+    pose: gtsam.Pose3,
+    pairs: np.ndarray,
+    sigma: float,
+    ground: Ground,
+    k1: float,
+    lens: LensNoise,
 ) -> _LinearModel:
     normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
     p = keyframe.translation()
     offset = float(p[UP]) - ground.height_m - ground.slope_e * float(p[EAST]) - ground.slope_n * float(p[NORTH])
-    k1_sigma = float(np.hypot(K1_MODEL_SIGMA, K1_MODEL_SHARE * k1))
-    reduced = _reduced(keyframe, pose, pairs, sigma, _Plane(ground, normal, offset, k1_sigma))
+    k1_sigma = float(np.hypot(k1_model_sigma(k1), lens.k1))
+    reduced = _reduced(keyframe, pose, pairs, sigma, _Plane(ground, normal, offset, k1_sigma, lens.focal))
     by_bias = np.zeros((REDUCED_SIZE, CALIBRATION_SIZE), order="F")
     by_bias[:, RADIAL_K1] = reduced.by_k1
     up_first = keyframe.rotation().matrix().T @ normal
@@ -229,20 +254,19 @@ def _reduced(keyframe: gtsam.Pose3, pose: gtsam.Pose3, pairs: np.ndarray, sigma:
     )
     # By the keyframe alone, while the camera keeps its pose in it.
     by_both = by_keyframe + by_pose @ keyframe.between(pose).inverse().AdjointMap()
-    by_k1 = _by_k1(keyframe, pairs, residual, by_keyframe, points)
+    by_k1 = _by_lens(keyframe, pairs, residual, by_keyframe, points, RADIAL)
     full = np.column_stack([by_pose, by_both[:, ROTATION], by_k1, residual]) / sigma
     from_keyframe_m = np.repeat(points[:, :2] - keyframe.translation()[HORIZONTAL], 2, axis=0)
     by_plane = np.column_stack([by_height, by_height * from_keyframe_m[:, 0], by_height * from_keyframe_m[:, 1]])
     by_plane = by_plane * (np.array([ground.level_sigma_m, ground.slope_sigma, ground.slope_sigma]) / sigma)
     by_plane = np.column_stack([by_plane, plane.k1_sigma / sigma * by_k1])
+    if plane.focal_sigma:
+        by_focal = _by_lens(keyframe, pairs, residual, by_keyframe, points, UNIFORM)
+        by_plane = np.column_stack([by_plane, plane.focal_sigma / sigma * by_focal])
     if ground.curvature_sigma:
         by_curvature = _by_curvature(by_height, from_keyframe_m)
         by_plane = np.column_stack([by_plane, ground.curvature_sigma / sigma * by_curvature])
-    # (1 + P P^T)^(-1/2), where only a few directions of the noise are not white: from the eigenvalues of P^T P.
-    s2, v = np.linalg.eigh(by_plane.T @ by_plane)
-    root = np.sqrt(1.0 + s2)
-    full -= by_plane @ ((v / (root * (1.0 + root))) @ (v.T @ (by_plane.T @ full)))
-    r = np.asarray(np.linalg.qr(full, mode="r"))
+    r = np.asarray(np.linalg.qr(whiten_common(full, by_plane), mode="r"))
     return _Reduced(r[:, STEP_AND_CONSTANT], r[:, TILT_COLUMNS], r[:, K1_COLUMN])
 
 
@@ -257,16 +281,25 @@ def _by_curvature(by_height: np.ndarray, from_keyframe_m: np.ndarray) -> np.ndar
     return np.asarray(by_height[:, None] * rises_m)
 
 
-def _by_k1(
-    keyframe: gtsam.Pose3, pairs: np.ndarray, residual: np.ndarray, by_keyframe: np.ndarray, points: np.ndarray
+def _by_lens(
+    keyframe: gtsam.Pose3,
+    pairs: np.ndarray,
+    residual: np.ndarray,
+    by_keyframe: np.ndarray,
+    points: np.ndarray,
+    power: int,
 ) -> np.ndarray:
-    """(2N,) Jacobian by the radial coefficient, which moves the rays of both cameras outwards. A keyframe ray that
-    rotates moves its point as a translation of the camera by as much times the depth does.
+    """(2N,) Jacobian by a number of the lens that moves the rays of both cameras towards the centre, in proportion to
+    their distance from it to the power of ``power`` + 1: RADIAL for the radial coefficient, UNIFORM for the logarithm
+    of the focal length. A keyframe ray that rotates moves its point as a translation of the camera by as much times the
+    depth does.
 
     The camera's rays are the predicted ones, not the measured ones: noise on both sides of the equation would look
     like a lens error."""
     predicted = pairs[:, 2:] + residual.reshape(-1, 2)
-    outward = [np.sum(np.square(xy), axis=1, keepdims=True) * xy for xy in (pairs[:, :2], predicted)]
+    outward = [
+        np.sum(np.square(xy), axis=1, keepdims=True) * xy if power == RADIAL else xy for xy in (pairs[:, :2], predicted)
+    ]
     depth = (points - keyframe.translation()) @ keyframe.rotation().matrix()[:, 2]
     by_ray = by_keyframe.reshape(-1, 2, POSE_SIZE)[:, :, RIGHT_DOWN] * depth[:, None, None]
     return np.asarray((outward[1] - np.einsum("nij,nj->ni", by_ray, outward[0])).ravel())

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.camera import undistort_division
+from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.linearization_cache import custom_factor
 from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS
 from terrafix.estimator.state import (
@@ -79,21 +80,25 @@ class ThreeViewPose:
 @dataclass(frozen=True)
 class ThreeViewConstraint:
     """Whitened linear residual: ``jacobian`` (R, ESTIMATED) by the tangents of both outer cameras of ``at`` and by the
-    radial coefficient, and ``constant`` (R,)."""
+    radial coefficient, and ``constant`` (R,). ``by_focal`` (R,): by the logarithm of the focal length; None: that is
+    eliminated."""
 
     at: ThreeViewPose
     jacobian: np.ndarray
     constant: np.ndarray
+    by_focal: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class _NormalEquations:
     """Reduced normal equations ``left`` x = -``right`` of the cameras, and the back substitution of the points (N, 3):
     ``inner`` (N, 3, 3), ``cross`` (N, ESTIMATED, 3), ``gradient`` (N, 3). ``sigma``: 1-sigma of a coordinate, from the
-    residuals."""
+    residuals. ``whole``, ``whole_right``: before the nuisance parameters of the lens are eliminated."""
 
     left: np.ndarray
     right: np.ndarray
+    whole: np.ndarray
+    whole_right: np.ndarray
     inner: np.ndarray
     cross: np.ndarray
     gradient: np.ndarray
@@ -110,10 +115,40 @@ def three_view_constraint(
     if solution is None:
         return None
     _, at, normal = solution
-    values, vectors = np.linalg.eigh(normal.left)
+    jacobian, constant = _square_root(normal.left, normal.right)
+    return ThreeViewConstraint(at, jacobian, constant)
+
+
+def three_view_constraint_of_focal(
+    triples: np.ndarray, sigma_norm: float, guess: ThreeViewPose, focal_sigma: float
+) -> ThreeViewConstraint | None:
+    """``three_view_constraint`` for a graph in which the focal length is a variable: no error of it is in the noise."""
+    solution = _solve(triples, sigma_norm, guess, focal_sigma)
+    if solution is None:
+        return None
+    _, at, normal = solution
+    kept = [*range(ESTIMATED), FOCAL]
+    left, right = _without(normal.whole, normal.whole_right, kept, {K2: K2_SIGMA})
+    jacobian, constant = _square_root(left, right)
+    return ThreeViewConstraint(at, jacobian[:, :-1], constant, jacobian[:, -1])
+
+
+def _square_root(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations ``left`` x = -``right`` -> whitened Jacobian and constant, without the null space."""
+    values, vectors = np.linalg.eigh(left)
     keep = values > NULL_EIGENVALUE * values[-1]
     root = np.sqrt(values[keep])
-    return ThreeViewConstraint(at, vectors[:, keep].T * root[:, None], vectors[:, keep].T @ normal.right / root)
+    return vectors[:, keep].T * root[:, None], vectors[:, keep].T @ right / root
+
+
+def _without(
+    left: np.ndarray, right: np.ndarray, kept: list[int], priors: dict[int, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of ``kept`` columns. ``priors``: the others, each with its 1-sigma, are eliminated."""
+    gone = list(priors)
+    prior = np.diag(np.array(list(priors.values())) ** -2.0)
+    by_gone = np.linalg.solve(left[np.ix_(gone, gone)] + prior, left[np.ix_(gone, kept)]).T
+    return left[np.ix_(kept, kept)] - by_gone @ left[np.ix_(gone, kept)], right[kept] - by_gone @ right[gone]
 
 
 def triangulate(
@@ -195,11 +230,9 @@ def _normal_equations(
     gain = np.moveaxis(cross @ inner, 1, 0).reshape(ESTIMATED + NUISANCE, -1)
     schur = (flat * flat_weight).T @ flat - gain @ columns.T
     rhs = (flat * flat_weight).T @ residual.ravel() - gain @ gradient.ravel()
-    s, nuisance = slice(0, ESTIMATED), slice(ESTIMATED, None)
-    prior = np.diag(np.array([K2_SIGMA, FOCAL_REPEATS * focal_sigma]) ** -2.0)
-    by_nuisance = np.linalg.solve(schur[nuisance, nuisance] + prior, schur[nuisance, s]).T
-    left, right = schur[s, s] - by_nuisance @ schur[nuisance, s], rhs[s] - by_nuisance @ rhs[nuisance]
-    return _NormalEquations(left, right, inner, cross[:, s], gradient, sigma)
+    priors = {K2: K2_SIGMA, FOCAL: FOCAL_REPEATS * focal_sigma}
+    left, right = _without(schur, rhs, list(range(ESTIMATED)), priors)
+    return _NormalEquations(left, right, schur, rhs, inner, cross[:, :ESTIMATED], gradient, sigma)
 
 
 def project_triples(
@@ -241,10 +274,15 @@ def _cross(q: np.ndarray) -> np.ndarray:
 
 
 def three_view_factor(
-    nodes: tuple[tuple[int, int], tuple[int, int], tuple[int, int]], constraint: ThreeViewConstraint, *, rises: bool
+    nodes: tuple[tuple[int, int], tuple[int, int], tuple[int, int]],
+    constraint: ThreeViewConstraint,
+    *,
+    rises: bool,
+    focal: FocalKey | None = None,
 ) -> gtsam.CustomFactor:
     """``nodes``: keys of C and B of the first, the middle and the last camera. ``rises``: without a DEM, so that the
-    height bias B adds to the height of C.
+    height bias B adds to the height of C. ``focal``: where the focal length is a variable
+    (``three_view_constraint_of_focal``).
 
     Translations are in units of the height, as in plane_two_view_factor. In metres the same noise would weigh less the
     lower the flight is believed to be. In units of the first translation they would be distorted by a node that GTSAM
@@ -269,6 +307,8 @@ def three_view_factor(
         first, last = (gtsam.Pose3(pose.rotation(), scale * pose.translation()) for pose in outer)
         residual = constraint.constant + by_first @ at.first.logmap(first) + by_last @ at.last.logmap(last)
         residual += by_k1 * (float(bias[RADIAL_K1]) - at.k1)
+        if focal is not None and constraint.by_focal is not None:
+            residual += constraint.by_focal * (float(values.atVector(focal.key)[0]) - focal.at)
         if jacobians is not None:
             by_0, by_2 = (np.hstack([by[:, ROTATION], scale * by[:, TRANSLATION]]) for by in (by_first, by_last))
             by_1 = -by_0 @ outer[0].inverse().AdjointMap() - by_2 @ outer[1].inverse().AdjointMap()
@@ -283,8 +323,11 @@ def three_view_factor(
             )
             by_1[:, TRANSLATION] -= np.outer(by_scale, up) / height_m
             jacobians[:3] = [np.asfortranarray(by) for by in (by_0, by_1, by_2)]
-            jacobians[3:] = by_bias if rises else by_bias[2:]
+            jacobians[3 : 6 if rises else 4] = by_bias if rises else by_bias[2:]
+            if focal is not None and constraint.by_focal is not None:
+                jacobians[-1] = np.asfortranarray(constraint.by_focal[:, None])
         return np.asarray(residual)
 
     noise = gtsam.noiseModel.Unit.Create(len(jacobian))
-    return custom_factor(noise, [*poses, *(biases if rises else biases[2:])], error)
+    keys = [*poses, *(biases if rises else biases[2:])]
+    return custom_factor(noise, keys if focal is None else [*keys, focal.key], error)

@@ -1,5 +1,6 @@
 """The pose of a map match as a measurement: whether it is determined, and its covariance."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
@@ -115,6 +116,16 @@ def moved_by_k1(match: MapMatch) -> np.ndarray | None:
     """(6,) tangent order: change of the pose of a match that is ``determined`` by one unit of the radial coefficient of
     the lens. For points around the principal point that is height; for points to one side it is tilt and position.
     None: there are no points."""
+    return _moved_by(match, lambda xy: np.sum(np.square(xy), axis=1, keepdims=True) * xy)
+
+
+def moved_by_focal(match: MapMatch) -> np.ndarray | None:
+    """(6,) as ``moved_by_k1``, by the logarithm of the focal length."""
+    return _moved_by(match, lambda xy: xy)
+
+
+def _moved_by(match: MapMatch, inward: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | None:
+    """``inward``: rays (N, 2) -> how far each of them moves towards the centre."""
     if not match.matches:
         return None
     assert match.pose is not None
@@ -123,9 +134,9 @@ def moved_by_k1(match: MapMatch) -> np.ndarray | None:
     r_w_c, p_m = rot_from_quat(match.pose.q_w_c), np.array(match.pose.p_c_in_w_m)
     _, jacobian, _ = project_with_jacobian(r_w_c, p_m, points[:, 2:5])
     by_pose = jacobian.reshape(-1, 6)
-    by_k1 = -(np.sum(np.square(xy), axis=1, keepdims=True) * xy).ravel()  # change of a ray by the coefficient
+    by_lens = -inward(xy).ravel()
     weighted = by_pose.T * np.repeat(points[:, 5], 2)
-    return np.asarray(np.linalg.solve(weighted @ by_pose, weighted @ by_k1))
+    return np.asarray(np.linalg.solve(weighted @ by_pose, weighted @ by_lens))
 
 
 def undistorted_pose(

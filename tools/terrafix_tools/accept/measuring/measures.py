@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pnp import solved
 from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, NavEstimate, SearchState, SearchStep, SourceLabel
@@ -14,6 +14,7 @@ from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.measuring.consistency import FLIGHT_CONFIDENCE, judge_claims
 from terrafix_tools.accept.measuring.epipolar import reprojection_error
 from terrafix_tools.accept.measuring.evidence import Evidence, FrameEvidence
+from terrafix_tools.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals
 from terrafix_tools.accept.measuring.results import Measured, Span, Verdict
 
 NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
@@ -163,17 +164,19 @@ def odometry_px(e: Evidence) -> Measured:
 
 
 def map_px(e: Evidence) -> Measured:
-    """Mean over the matched points of accepted fixes, projected with the published pose; pixels of the frames."""
-    means = []
+    """Mean over the matched points of accepted fixes, projected with the published pose, less the local distortion of
+    the map as the matches of other frames show it; pixels of the frames. The reason has the number with it, too."""
+    found = []
     for frame in e.frames:
-        match = frame.match
         match = None if frame.match is None else solved(frame.match)
         if frame.fixed and match is not None and match.matches and match.pose is not None:
-            points = np.array(match.matches)
-            in_c = (points[:, 2:5] - np.array(match.pose.p_c_in_w_m)) @ rot_from_quat(match.pose.q_w_c)
-            off = (in_c[:, :2] / in_c[:, 2:] - points[:, :2]) * e.origin.camera.fx
-            means.append(float(np.linalg.norm(off, axis=1).mean()))
-    return Measured(float(np.mean(means)), "pixels of the stored frames") if means else Measured(None, "no map fix")
+            found.append(residuals(match, e.origin.camera.fx))
+    if not found:
+        return Measured(None, "no map fix")
+    whole_px = float(np.mean([f.px.mean() for f in found]))
+    left_px = mean_px(found, left_by_local_model(found))
+    why = f"pixels of the stored frames; {whole_px:.1f} px with the map's local distortion, {left_px:.1f} px without"
+    return Measured(min(whole_px, left_px), why)
 
 
 def drift(e: Evidence) -> Measured:

@@ -1,0 +1,109 @@
+"""The smoother after landing on simulated flights whose camera differs from its description.
+
+python -m terrafix_tools.bench.finalised FLIGHTS OUT
+
+Flights of the Monte Carlo simulation (docs/monte-carlo.md) of 300 s without faults, numbers 0 to FLIGHTS - 1. The focal
+length is 3 % longer than described, stated to 5 %, and the lens has a radial coefficient that is not described. The
+smoother is given the factors that the flight has recorded; the truth is that of the simulation."""
+
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from terrafix.messages import Message
+from terrafix_tools.bench.result_file import write_result
+from terrafix_tools.evaluate import ELLIPSE95
+from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
+from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
+from terrafix_tools.montecarlo.fault import Fault
+from terrafix_tools.montecarlo.flight import Run
+from terrafix_tools.montecarlo.plan import FlightPlan, plan
+
+SEED, DURATION_S = 41, 300.0
+FOCAL_ERROR, FOCAL_SIGMA, K1_ERROR = 0.03, 0.05, -0.03  # of the true camera, relative; as described; of the true lens
+
+
+class RecordedRun(Run):
+    """A simulated flight whose estimator keeps what the smoother takes."""
+
+    def __init__(self, drawn: FlightPlan) -> None:
+        super().__init__(drawn)
+        self.replayer = FlightReplayer()
+        self._node = self.replayer.node
+
+    def process(self, message: Message) -> list[Message]:
+        return list(self.replayer.on(message))
+
+    def fly(self) -> FlightGraph:
+        self.record(refine=False)
+        graph = self.replayer.flights[-1]
+        graph.recorder.store_estimates()
+        return graph
+
+    def errors(self, graph: FlightGraph, found: Smoothed) -> tuple[np.ndarray, np.ndarray]:
+        """-> error of every frame that has a node, east, north and up (N, 3) [m], and its covariance (N, 3, 3)."""
+        errors_m, covs = [], []
+        for frame_id, node in graph.node_of.items():
+            r_w_c = found.poses[node].rotation().matrix()
+            errors_m.append(found.poses[node].translation() - self._flown.frames[frame_id].p_m)
+            covs.append(r_w_c @ found.covs[node][3:, 3:] @ r_w_c.T)
+        return np.array(errors_m), np.array(covs)
+
+
+def uncalibrated(number: int) -> FlightPlan:
+    """Flight ``number``, with the wrong camera."""
+    drawn = plan(SEED, number, fault=Fault.NONE, duration_s=DURATION_S)
+    camera = msgspec.structs.replace(drawn.camera, focal_sigma=FOCAL_SIGMA)
+    return replace(drawn, camera=camera, focal_error=FOCAL_ERROR, k1_error=K1_ERROR)
+
+
+def measure(number: int) -> dict[str, Any]:
+    """One flight -> its row of the result."""
+    flight = RecordedRun(uncalibrated(number))
+    graph = flight.fly()
+    begun_s = time.process_time()
+    found = smooth(graph)
+    cpu_s = time.process_time() - begun_s
+    errors_m, covs = flight.errors(graph, found)
+    away_m = np.hypot(*errors_m[:, :2].T)
+    squares = np.einsum("ni,ni->n", errors_m[:, :2], np.linalg.solve(covs[:, :2, :2], errors_m[:, :2, None])[..., 0])
+    return {
+        "number": number,
+        "frames": len(away_m),
+        "median_m": float(np.median(away_m)),
+        "p95_m": float(np.percentile(away_m, 95)),
+        "max_m": float(away_m.max()),
+        "up_rms_m": float(np.sqrt(np.mean(errors_m[:, 2] ** 2))),
+        "up_sigma_m": float(np.sqrt(np.mean(covs[:, 2, 2]))),
+        "nees": float(np.mean(squares)),
+        "inside95": float(np.mean(squares <= ELLIPSE95)),
+        "focal_error_sigmas": (found.lens.log_focal - np.log1p(FOCAL_ERROR)) / found.lens_sigma.log_focal,
+        "focal_sigma": found.lens_sigma.log_focal,
+        "k1_error_sigmas": (found.lens.k1 - K1_ERROR) / found.lens_sigma.k1,
+        "k1_sigma": found.lens_sigma.k1,
+        "map_before": (found.map_residual[0] or 0.0) * flight._plan.camera.fx,
+        "map_after": (found.map_residual[1] or 0.0) * flight._plan.camera.fx,
+        "cpu_s": cpu_s,
+    }
+
+
+def main(flights: int, out: Path) -> None:
+    rows = [measure(number) for number in range(flights)]
+    write_result(out, {"flights": rows})
+    table = Table(title=f"{flights} simulated flights, focal length {100 * FOCAL_ERROR:+.0f} %", title_justify="left")
+    for name in rows[0]:
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(*(f"{value:.3g}" for value in row.values()))
+    Console(width=200).print(table)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), Path(sys.argv[2]))
