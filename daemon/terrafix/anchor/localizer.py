@@ -43,6 +43,7 @@ from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget
 from terrafix.map.package import MapPackage
 from terrafix.messages import (
+    ON_DRAWN,
     HintVerdict,
     MapMatch,
     MatchPlace,
@@ -239,7 +240,8 @@ class Localizer:
         if view.agl_m < MIN_MATCHING_AGL_M:
             return msgspec.structs.replace(match, verdict=Verdict.TOO_LOW)
         seen = self._correlate(image, view, layers, belief)
-        match = msgspec.structs.replace(match, map_sigma_m=seen.layer.sigma_m)
+        matcher = f"{match.matcher}{ON_DRAWN}" if seen.layer.drawn else match.matcher
+        match = msgspec.structs.replace(match, map_sigma_m=seen.layer.sigma_m, matcher=matcher)
         if seen.correlation.verdict is Verdict.OUTSIDE_MAP and self._may_be_on_map(best, prediction):
             # Dead reckoning over minutes can leave the map; no further correlation would be possible there.
             self._relocalizer.start(best, prediction.agl_m, None)
@@ -254,7 +256,7 @@ class Localizer:
         match = with_belief(match, belief, modes, score)
         sigma_m = position_sigma_m(prediction)
         pose = estimate_pose(match, prediction, seen, modes[0], hypothesis)
-        if not pose.attempted and seen.new >= 1.0 and has_wide_sigma(sigma_m, view.agl_m):
+        if not pose.attempted and not seen.layer.drawn and seen.new >= 1.0 and has_wide_sigma(sigma_m, view.agl_m):
             pose = self._localize_alone(pose, seen, belief)
         self._lock_monitor.update(evidence_nats, seen.weight, seen.new, pose.inliers, sigma_m, view.agl_m)
         mode_view = view_at(view, hypothesis, pose.mode.e_m, pose.mode.n_m) if pose.attempted else None
