@@ -7,6 +7,7 @@ import numpy as np
 
 from terrafix.anchor.fragment_labels import FragmentLabels
 from terrafix.anchor.frame_pose import (
+    MODE_MASS,
     REPORTED_MODES,
     Observation,
     PoseResult,
@@ -19,7 +20,7 @@ from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.matching.frame_matcher import View, view_at
 from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
 from terrafix.anchor.matching.match_message import pose_match
-from terrafix.anchor.matching.point_mass_filter import Belief, belief_cell_m
+from terrafix.anchor.matching.point_mass_filter import LLR_ZERO_Z, MAX_HALF_CELLS, Belief, Mode, belief_cell_m
 from terrafix.anchor.matching.predicted_view import (
     VAR_E,
     VAR_N,
@@ -31,9 +32,16 @@ from terrafix.anchor.matching.predicted_view import (
     view_of,
 )
 from terrafix.anchor.place_index.recognizer import PlaceMemory
-from terrafix.anchor.relocalization.position_prior import distance_outside_m
-from terrafix.anchor.relocalization.relocalizer import Relocalizer, mixed_sigma_m, search_centre
+from terrafix.anchor.relocalization.position_prior import SIGMAS_95, distance_outside_m
+from terrafix.anchor.relocalization.relocalizer import (
+    LOST_SIGMA_M,
+    Relocalizer,
+    mixed_sigma_m,
+    search_centre,
+    unknown_sigma_m,
+)
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
+from terrafix.anchor.verification.place_test import PlaceTest
 from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
@@ -72,6 +80,7 @@ MAX_POOR_WEIGHT = 4.0  # consecutive full observations below it before the windo
 WIDEN_FACTOR = 1.6  # of the window's half width [tuned]
 CELL_RATIO_MIN, CELL_RATIO_MAX = 0.4, 2.5  # hysteresis of a belief cell's octave [tuned]
 OFF_MAP_SIGMAS = 3.0  # sigmas outside of the map within which the vehicle may still be over it [tuned]
+SEARCH_SIGMAS = 2.0  # 1-sigmas of the position that the belief of a search holds at least [spec: 95 % per axis]
 FOUND_SIGMA_M = 10.0  # 1-sigma of a relocalized place, for the initial belief there [tuned]
 
 
@@ -107,6 +116,8 @@ class Localizer:
         self._lock_monitor = LockMonitor()
         self._relocalizer = Relocalizer()
         self._single_frame_budget = FalseAlarmBudget()
+        self._place_test: PlaceTest | None = None  # while a drawn map is searched
+        self._place_budget = FalseAlarmBudget()
         self._since_observation_m = np.inf  # motion since the last observation
         self._poor_weight = 0.0
         self._variance_m2 = 0.0  # horizontal position variance of the last prediction
@@ -138,6 +149,22 @@ class Localizer:
             self._open_layers(self._origin)
             if self._relocalizer.is_active:
                 self._relocalizer.start(self._layers.best, agl_m, None)
+
+    def _start_search(self, best: MapLayer, agl_m: float, around_m: tuple[float, float] | None, sigma_m: float) -> None:
+        """Searches the map around a position with 1-sigma ``sigma_m``; None: the whole map. On a drawn layer the belief
+        itself is the search: no patch of it tells one place from another."""
+        if not best.drawn:
+            self._relocalizer.start(best, agl_m, around_m)
+            return
+        e_min, n_min, e_max, n_max = best.map.bounds_m
+        e_m, n_m = around_m or (0.5 * (e_min + e_max), 0.5 * (n_min + n_max))
+        cell_m = belief_cell_m(agl_m, best.matcher.correlation_cell_m(agl_m))
+        sigma_m = min(sigma_m, unknown_sigma_m(best.map))
+        while SEARCH_SIGMAS * sigma_m > MAX_HALF_CELLS * cell_m:
+            cell_m *= 2.0
+        self._belief = Belief(e_m, n_m, sigma_m, cell_m)
+        self._place_test = PlaceTest(self._place_budget)
+        self._relocalizer.sigma_m = sigma_m
 
     def predict(self, prediction: Prediction) -> None:
         """Moves belief and search by odometry. The first prediction of a flight initialises the belief."""
@@ -173,15 +200,20 @@ class Localizer:
         self._belief, sigma_m = initial_belief(prediction, cell_m)
         # A prediction more precise than that start was found before: this process was restarted in flight.
         if origin.start_sigma_m > SEARCH_START_SIGMA_M and start > 0.5 * SEARCH_START_SIGMA_M:
-            self._relocalizer.start(best, prediction.agl_m, search_centre(e_m, n_m, origin.start_sigma_m, best.map))
+            around_m = search_centre(e_m, n_m, origin.start_sigma_m, best.map)
+            self._start_search(best, prediction.agl_m, around_m, origin.start_sigma_m)
         return sigma_m
 
     def apply_prior(self, hint: PositionHint, prediction: Prediction) -> HintVerdict:
         """An external position prior at this prediction; needs ``is_ready``."""
         assert self._layers is not None and self._origin is not None
-        return self._relocalizer.apply_prior(
-            hint, self._origin, prediction, self._layers.best, self._lock_monitor.log_odds
-        )
+        best = self._layers.best
+        verdict = self._relocalizer.apply_prior(hint, self._origin, prediction, best, self._lock_monitor.log_odds)
+        if best.drawn and self._relocalizer.is_active:
+            self._relocalizer.stop()
+            place_m = LocalFrame(self._origin.lat_deg, self._origin.lon_deg).to_local(hint.lat_deg, hint.lon_deg)
+            self._start_search(best, prediction.agl_m, place_m, hint.radius_m / SIGMAS_95)
+        return verdict
 
     def localize(self, prediction: Prediction, image: Image | None) -> MapMatch:
         """Matches the frame of this prediction with the map. ``image`` None: the frame is not usable. Raises
@@ -244,7 +276,7 @@ class Localizer:
         match = msgspec.structs.replace(match, map_sigma_m=seen.layer.sigma_m, matcher=matcher)
         if seen.correlation.verdict is Verdict.OUTSIDE_MAP and self._may_be_on_map(best, prediction):
             # Dead reckoning over minutes can leave the map; no further correlation would be possible there.
-            self._relocalizer.start(best, prediction.agl_m, None)
+            self._start_search(best, prediction.agl_m, None, unknown_sigma_m(best.map))
             return self._relocalizer.search_match(match)
         if seen.correlation.verdict is not Verdict.ACCEPTED:
             return msgspec.structs.replace(match, verdict=seen.correlation.verdict)
@@ -254,6 +286,10 @@ class Localizer:
         hypothesis, score = seen.correlation.best_at(modes[0].e_m, modes[0].n_m)
         self._widen_if_poor(belief, score, seen.weight)
         match = with_belief(match, belief, modes, score)
+        if self._place_test is not None:
+            if not self._is_found(self._place_test, modes[0], score, evidence_nats, seen.weight):
+                return with_step(self._relocalizer.search_match(match), SearchStep.WHOLE_MAP)
+            self._place_test, self._relocalizer.sigma_m, self._lock_monitor = None, 0.0, LockMonitor()
         sigma_m = position_sigma_m(prediction)
         pose = estimate_pose(match, prediction, seen, modes[0], hypothesis)
         if not pose.attempted and not seen.layer.drawn and seen.new >= 1.0 and has_wide_sigma(sigma_m, view.agl_m):
@@ -267,9 +303,16 @@ class Localizer:
         match = msgspec.structs.replace(pose.match, search=SearchResult(sigma_m=self._relocalizer.sigma_m))
         if self._lock_monitor.lost or wrong == 1.0:
             around_m = prediction.p_c_in_w_m[:2] if tested < 1.0 else None
-            self._relocalizer.start(best, prediction.agl_m, around_m)
+            self._start_search(seen.layer if seen.layer.drawn else best, prediction.agl_m, around_m, LOST_SIGMA_M)
             return self._relocalizer.search_match(match)
         return decide(match, pose, belief, seen, score)
+
+    @staticmethod
+    def _is_found(test: PlaceTest, mode: Mode, score: float, evidence_nats: float, weight: float) -> bool:
+        """Whether the search of a drawn map ends with this observation."""
+        if score == float(np.float32(LLR_ZERO_Z)):  # nothing is mapped there
+            return False
+        return test.update(evidence_nats, weight, dominant=mode.mass >= MODE_MASS)
 
     def _correlate(self, image: Image, view: View, layers: MapLayers, belief: Belief) -> Observation:
         results = layers.correlate(image, view, belief)
