@@ -7,7 +7,7 @@ import numpy as np
 
 from terrafix.anchor.fragment_labels import FragmentLabels
 from terrafix.anchor.frame_pose import (
-    MODE_MASS,
+    MIN_POSE_MODE_MASS,
     REPORTED_MODES,
     Observation,
     PoseResult,
@@ -312,7 +312,7 @@ class Localizer:
         """Whether the search of a drawn map ends with this observation."""
         if score == float(np.float32(LLR_ZERO_Z)):  # nothing is mapped there
             return False
-        return test.update(evidence_nats, weight, dominant=mode.mass >= MODE_MASS)
+        return test.update(evidence_nats, weight, dominant=mode.mass >= MIN_POSE_MODE_MASS)
 
     def _correlate(self, image: Image, view: View, layers: MapLayers, belief: Belief) -> Observation:
         results = layers.correlate(image, view, belief)

@@ -5,10 +5,14 @@ Over a wide belief some place gathers most of the mass on any map. It is publish
 more than wrong places gain (Wald's sequential test). Every place that is tested spends a share of the flight's
 false-alarm budget, so that all of them together are wrong as rarely as the budget says."""
 
-from terrafix.anchor.verification.lock_monitor import MAX_GAIN, NULL_GAIN
+from terrafix.anchor.verification.lock_monitor import MAX_GAIN
 from terrafix.map.null_model import FalseAlarmBudget
 
-MIN_GAIN = -NULL_GAIN  # nats of a full observation without evidence [spec: what a wrong place gains, subtracted]
+# Nats of a full observation that are no evidence. Over wrong places the likelihood ratio of a drawn layer has a mean of
+# 0.35, which would allow less than nothing; observations of one road are not independent.
+# [measured: docs/decisions/042-vectors-as-a-layer.md]
+NULL_GAIN = 1.0
+MIN_GAIN = -3.0  # bound of the likelihood ratio of one observation [spec: point_mass_filter.LLR_MIN]
 
 
 class PlaceTest:

@@ -1,7 +1,7 @@
 """Sequential test of the place that a search of a drawn map has found."""
 
-from terrafix.anchor.verification.lock_monitor import MAX_GAIN, NULL_GAIN
-from terrafix.anchor.verification.place_test import PlaceTest
+from terrafix.anchor.verification.lock_monitor import MAX_GAIN
+from terrafix.anchor.verification.place_test import NULL_GAIN, PlaceTest
 from terrafix.map.null_model import FalseAlarmBudget
 
 
@@ -38,5 +38,5 @@ def test_evidence_against_a_place_is_counted_in_full() -> None:
     test = PlaceTest(FalseAlarmBudget())
     for _ in range(4):
         test.update(100.0, 1.0, dominant=True)
-    assert not test.update(0.0, 1.0, dominant=True)
+    assert not test.update(-9.0, 1.0, dominant=True)
     assert passes_after(test, 100.0) == 2  # 8 - 3 + 2 x 2 > 8.3

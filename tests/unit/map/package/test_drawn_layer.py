@@ -98,7 +98,9 @@ def test_a_null_model_needs_imagery(tmp_path: Path) -> None:
 
 def test_the_drawn_layer_comes_after_imagery_and_leaves_it_as_it_is(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(64, 64))
-    west, south, east, north = MapPackage.open(build_package([layer_of(tif)], tmp_path / "a.gpkg")).manifest.bounds_wgs84
+    west, south, east, north = MapPackage.open(
+        build_package([layer_of(tif)], tmp_path / "a.gpkg")
+    ).manifest.bounds_wgs84
     corners = np.array([(west, south), (east, south), (east, north), (west, north)])
     road = "roads", line([(west, south), (east, north)]), {"kind": "primary"}
     vectors = VectorInput([road], source="area.osm.pbf", date="2030-01-01", drawn_in=Area("test", (corners,)))
