@@ -159,12 +159,12 @@ class Localizer:
         e_min, n_min, e_max, n_max = best.map.bounds_m
         e_m, n_m = around_m or (0.5 * (e_min + e_max), 0.5 * (n_min + n_max))
         cell_m = belief_cell_m(agl_m, best.matcher.correlation_cell_m(agl_m))
-        sigma_m = min(sigma_m, unknown_sigma_m(best.map))
-        while SEARCH_SIGMAS * sigma_m > MAX_HALF_CELLS * cell_m:
+        spread_m = min(sigma_m, 0.5 * max(e_max - e_min, n_max - n_min))  # there is no likelihood beyond the map
+        while SEARCH_SIGMAS * spread_m > MAX_HALF_CELLS * cell_m:
             cell_m *= 2.0
-        self._belief = Belief(e_m, n_m, sigma_m, cell_m)
+        self._belief = Belief(e_m, n_m, spread_m, cell_m)
         self._place_test = PlaceTest(self._place_budget)
-        self._relocalizer.sigma_m = sigma_m
+        self._relocalizer.sigma_m = unknown_sigma_m(best.map)
 
     def predict(self, prediction: Prediction) -> None:
         """Moves belief and search by odometry. The first prediction of a flight initialises the belief."""

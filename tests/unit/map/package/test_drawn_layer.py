@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import map_rasters
 from map_features import line, polygon
@@ -11,9 +12,12 @@ from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.format import Ce90Origin
 from terrafix.map.package import MapPackage
+from terrafix_tools.mapping.area.build import Order, build_order
 from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.build import build_package, layer_of
+from terrafix_tools.mapping.check.suitability import check
 from terrafix_tools.mapping.layers import Feature, VectorInput
+from terrafix_tools.mapping.place_index import IndexOptions, write_index
 from terrafix_tools.mapping.vectors.drawing import BUILDING, GROUND, ROAD, WATER
 
 FRAME = LocalFrame(48.0, 11.0)
@@ -110,3 +114,37 @@ def test_the_drawn_layer_comes_after_imagery_and_leaves_it_as_it_is(tmp_path: Pa
     assert both.manifest.layers[0] == alone.manifest.layers[0] and both.layer().table == "imagery"
     hashes = {row for row in both.tiles.hashes() if row[0].startswith("imagery")}
     assert hashes == set(alone.tiles.hashes())
+
+
+def test_map_check_says_that_there_is_no_imagery_and_an_index_of_it_is_refused(tmp_path: Path) -> None:
+    drawn(tmp_path / "m.gpkg", ("buildings", polygon(square(60.0)), {"kind": "yes"}))
+    package = MapPackage.open(tmp_path / "m.gpkg")
+    notes = check(package).report.warnings
+    package.close()
+    assert any(note.startswith("roads, water and buildings instead of imagery") for note in notes)
+    assert not any("when the imagery was taken" in note for note in notes)
+    with pytest.raises(MapError, match="has no imagery, and the search of a drawn map uses no index"):
+        write_index([tmp_path / "m.gpkg"], tmp_path / "places", IndexOptions(60.0, "pooled-gradient"))
+
+
+def test_an_osm_extract_without_imagery_makes_a_map(tmp_path: Path) -> None:
+    (west, south), (east, north) = square(SIDE_M)[0], square(SIDE_M)[2]
+    nodes = "".join(
+        f'<node id="{i}" version="1" lon="{lon}" lat="{lat}"/>' for i, (lon, lat) in enumerate(east_west(0.0), start=1)
+    )
+    way = '<way id="9" version="1"><nd ref="1"/><nd ref="2"/><tag k="highway" v="primary"/></way>'
+    (tmp_path / "a.osm").write_text(f'<osm version="0.6">{nodes}{way}</osm>', encoding="utf-8")
+    order = Order(
+        tmp_path / "m.gpkg",
+        area=f"{west},{south},{east},{north}",
+        buffer_km=0.0,
+        osm=str(tmp_path / "a.osm"),
+        osm_ce90_m=8.0,
+        say=Console(quiet=True),
+    )
+    build_order(order)
+    package = MapPackage.open(tmp_path / "m.gpkg", verify=True)
+    assert [(layer.table, layer.ce90_m) for layer in package.manifest.layers] == [("drawn", 8.0)]
+    image, _ = package.bind(FRAME).window(-5.0, 20.0, 10, 40, 1.0)
+    package.close()
+    assert abs(image[20, 5, 0] - ROAD) < 10 and image[0, 5, 0] == GROUND
