@@ -7,7 +7,9 @@ import numpy as np
 
 from terrafix.anchor.fragment_labels import FragmentLabels
 from terrafix.anchor.frame_pose import (
+    COARSE_SCORE,
     MIN_POSE_MODE_MASS,
+    MODE_MASS,
     REPORTED_MODES,
     Observation,
     PoseResult,
@@ -286,8 +288,11 @@ class Localizer:
         hypothesis, score = seen.correlation.best_at(modes[0].e_m, modes[0].n_m)
         self._widen_if_poor(belief, score, seen.weight)
         match = with_belief(match, belief, modes, score)
+        found = self._place_test is not None
         if self._place_test is not None:
-            if not self._is_found(self._place_test, modes[0], score, evidence_nats, seen.weight):
+            passed = self._has_passed(self._place_test, modes[0], score, evidence_nats, seen.weight)
+            # A position alone does not give a heading that nobody reports.
+            if not passed or heading_is_unknown(prediction):
                 return with_step(self._relocalizer.search_match(match), SearchStep.WHOLE_MAP)
             self._place_test, self._relocalizer.sigma_m, self._lock_monitor = None, 0.0, LockMonitor()
         sigma_m = position_sigma_m(prediction)
@@ -300,7 +305,8 @@ class Localizer:
         # Mixture "believed position, or anywhere": the variance that the second component adds.
         wrong = max(self._lock_monitor.wrong_probability, tested)
         self._relocalizer.sigma_m = mixed_sigma_m(wrong, best.map)
-        match = msgspec.structs.replace(pose.match, search=SearchResult(sigma_m=self._relocalizer.sigma_m))
+        search = SearchResult(sigma_m=self._relocalizer.sigma_m, relocalized=found)
+        match = msgspec.structs.replace(pose.match, search=search)
         if self._lock_monitor.lost or wrong == 1.0:
             around_m = prediction.p_c_in_w_m[:2] if tested < 1.0 else None
             self._start_search(seen.layer if seen.layer.drawn else best, prediction.agl_m, around_m, LOST_SIGMA_M)
@@ -308,11 +314,12 @@ class Localizer:
         return decide(match, pose, belief, seen, score)
 
     @staticmethod
-    def _is_found(test: PlaceTest, mode: Mode, score: float, evidence_nats: float, weight: float) -> bool:
-        """Whether the search of a drawn map ends with this observation."""
+    def _has_passed(test: PlaceTest, mode: Mode, score: float, evidence_nats: float, weight: float) -> bool:
+        """Whether the search of a drawn map ends with this observation, which then is a position-only match."""
         if score == float(np.float32(LLR_ZERO_Z)):  # nothing is mapped there
             return False
-        return test.update(evidence_nats, weight, dominant=mode.mass >= MIN_POSE_MODE_MASS)
+        passed = test.update(evidence_nats, weight, dominant=mode.mass >= MIN_POSE_MODE_MASS)
+        return passed and mode.mass >= MODE_MASS and score >= COARSE_SCORE
 
     def _correlate(self, image: Image, view: View, layers: MapLayers, belief: Belief) -> Observation:
         results = layers.correlate(image, view, belief)

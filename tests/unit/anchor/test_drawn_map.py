@@ -74,6 +74,7 @@ def test_an_unknown_start_on_a_drawn_map_is_found_by_the_belief(ground: np.ndarr
     lost = matches[:found]
     assert all(match.verdict is Verdict.LOST and match.search.step is SearchStep.WHOLE_MAP for match in lost)
     assert all(match.pose is None and match.search.sigma_m == 1000.0 for match in lost)
+    assert matches[found].search.relocalized and matches[found].position_only
     assert matches[found].search.sigma_m == 0.0 and error_m(matches[found], found) < 4.0
 
 
