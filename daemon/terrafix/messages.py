@@ -319,6 +319,9 @@ class SearchResult(msgspec.Struct, frozen=True, kw_only=True):
     relocalized: bool = False  # the search has found the pose: the prior position is to be discarded
 
 
+ON_DRAWN = " on vectors"
+
+
 class MapMatch(Message, frozen=True, kw_only=True):
     """Result of matching a frame to the map: 2D-3D matches or a camera pose, and the posterior over position.
 
@@ -328,7 +331,7 @@ class MapMatch(Message, frozen=True, kw_only=True):
 
     frame_id: int
     verdict: Verdict
-    matcher: str  # "gradient", "xfeat"
+    matcher: str  # "gradient", "xfeat"; followed by ON_DRAWN where the map is drawn from roads, water and buildings
     inliers: int = 0
     reprojection_px: float = 0.0
     matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight
@@ -345,6 +348,11 @@ class MapMatch(Message, frozen=True, kw_only=True):
     def position_only(self) -> bool:
         """A coarse match: its pose is the position of a mode alone."""
         return self.pose is not None and self.pose.position_only
+
+    @property
+    def on_drawn(self) -> bool:
+        """Whether the map shows roads, water and buildings instead of imagery."""
+        return self.matcher.endswith(ON_DRAWN)
 
 
 class SearchState(Message, frozen=True, kw_only=True):

@@ -51,10 +51,15 @@ class PoseResult:
 def estimate_pose(
     match: MapMatch, prediction: Prediction, seen: Observation, mode: Mode, hypothesis: Hypothesis
 ) -> PoseResult:
-    """Pose from single patches in the mode; from all patches together where that fails or is imprecise."""
+    """Pose from single patches in the mode; from all patches together where that fails or is imprecise.
+
+    On a drawn layer there is none, and the position of the mode is the measurement: a patch holds one piece of a road,
+    along which it fits everywhere."""
     # With an unknown heading the belief spreads as fast as frames narrow it, until a pose gives the heading.
     if not (mode.mass >= MIN_POSE_MODE_MASS or heading_is_unknown(prediction)):
         return PoseResult(match, mode, attempted=False)
+    if seen.layer.drawn:
+        return PoseResult(msgspec.structs.replace(match, verdict=Verdict.FEW_INLIERS), mode, attempted=True)
     view, inliers = seen.view, 0
     fix = seen.layer.matcher.fix(seen.image, view, hypothesis, mode.e_m, mode.n_m)
     match = pose_match(match, fix, view)

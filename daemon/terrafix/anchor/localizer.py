@@ -8,6 +8,9 @@ import numpy as np
 
 from terrafix.anchor.fragment_labels import FragmentLabels
 from terrafix.anchor.frame_pose import (
+    COARSE_SCORE,
+    MIN_POSE_MODE_MASS,
+    MODE_MASS,
     REPORTED_MODES,
     Observation,
     PoseResult,
@@ -20,7 +23,7 @@ from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, View, view_at
 from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
 from terrafix.anchor.matching.match_message import pose_match
-from terrafix.anchor.matching.point_mass_filter import Belief, belief_cell_m
+from terrafix.anchor.matching.point_mass_filter import LLR_ZERO_Z, MAX_HALF_CELLS, Belief, Mode, belief_cell_m
 from terrafix.anchor.matching.predicted_view import (
     VAR_E,
     VAR_N,
@@ -32,9 +35,16 @@ from terrafix.anchor.matching.predicted_view import (
     view_of,
 )
 from terrafix.anchor.place_index.recognizer import PlaceMemory
-from terrafix.anchor.relocalization.position_prior import distance_outside_m
-from terrafix.anchor.relocalization.relocalizer import Relocalizer, mixed_sigma_m, search_centre
+from terrafix.anchor.relocalization.position_prior import SIGMAS_95, distance_outside_m
+from terrafix.anchor.relocalization.relocalizer import (
+    LOST_SIGMA_M,
+    Relocalizer,
+    mixed_sigma_m,
+    search_centre,
+    unknown_sigma_m,
+)
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
+from terrafix.anchor.verification.place_test import PlaceTest
 from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
@@ -44,6 +54,7 @@ from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget
 from terrafix.map.package import MapPackage
 from terrafix.messages import (
+    ON_DRAWN,
     HintVerdict,
     MapMatch,
     MatchPlace,
@@ -72,6 +83,7 @@ MAX_POOR_WEIGHT = 4.0  # consecutive full observations below it before the windo
 WIDEN_FACTOR = 1.6  # of the window's half width [tuned]
 CELL_RATIO_MIN, CELL_RATIO_MAX = 0.4, 2.5  # hysteresis of a belief cell's octave [tuned]
 OFF_MAP_SIGMAS = 3.0  # sigmas outside of the map within which the vehicle may still be over it [tuned]
+SEARCH_SIGMAS = 2.0  # 1-sigmas of the position that the belief of a search holds at least [spec: 95 % per axis]
 FOUND_SIGMA_M = 10.0  # 1-sigma of a relocalized place, for the initial belief there [tuned]
 
 
@@ -107,6 +119,8 @@ class Localizer:
         self._lock_monitor = LockMonitor()
         self._relocalizer = Relocalizer()
         self._single_frame_budget = FalseAlarmBudget()
+        self._place_test: PlaceTest | None = None  # while a drawn map is searched
+        self._place_budget = FalseAlarmBudget()
         self._since_observation_m = np.inf  # motion since the last observation
         self._scale_matched = False  # the last frame had a pose at the predicted scale
         self._poor_weight = 0.0
@@ -139,6 +153,22 @@ class Localizer:
             self._open_layers(self._origin)
             if self._relocalizer.is_active:
                 self._relocalizer.start(self._layers.best, agl_m, None)
+
+    def _start_search(self, best: MapLayer, agl_m: float, around_m: tuple[float, float] | None, sigma_m: float) -> None:
+        """Searches the map around a position with 1-sigma ``sigma_m``; None: the whole map. On a drawn layer the belief
+        itself is the search: no patch of it tells one place from another."""
+        if not best.drawn:
+            self._relocalizer.start(best, agl_m, around_m)
+            return
+        e_min, n_min, e_max, n_max = best.map.bounds_m
+        e_m, n_m = around_m or (0.5 * (e_min + e_max), 0.5 * (n_min + n_max))
+        cell_m = belief_cell_m(agl_m, best.matcher.correlation_cell_m(agl_m))
+        spread_m = min(sigma_m, 0.5 * max(e_max - e_min, n_max - n_min))  # there is no likelihood beyond the map
+        while SEARCH_SIGMAS * spread_m > MAX_HALF_CELLS * cell_m:
+            cell_m *= 2.0
+        self._belief = Belief(e_m, n_m, spread_m, cell_m)
+        self._place_test = PlaceTest(self._place_budget)
+        self._relocalizer.sigma_m = unknown_sigma_m(best.map)
 
     def predict(self, prediction: Prediction) -> None:
         """Moves belief and search by odometry. The first prediction of a flight initialises the belief."""
@@ -174,15 +204,20 @@ class Localizer:
         self._belief, sigma_m = initial_belief(prediction, cell_m)
         # A prediction more precise than that start was found before: this process was restarted in flight.
         if origin.start_sigma_m > SEARCH_START_SIGMA_M and start > 0.5 * SEARCH_START_SIGMA_M:
-            self._relocalizer.start(best, prediction.agl_m, search_centre(e_m, n_m, origin.start_sigma_m, best.map))
+            around_m = search_centre(e_m, n_m, origin.start_sigma_m, best.map)
+            self._start_search(best, prediction.agl_m, around_m, origin.start_sigma_m)
         return sigma_m
 
     def apply_prior(self, hint: PositionHint, prediction: Prediction) -> HintVerdict:
         """An external position prior at this prediction; needs ``is_ready``."""
         assert self._layers is not None and self._origin is not None
-        return self._relocalizer.apply_prior(
-            hint, self._origin, prediction, self._layers.best, self._lock_monitor.log_odds
-        )
+        best = self._layers.best
+        verdict = self._relocalizer.apply_prior(hint, self._origin, prediction, best, self._lock_monitor.log_odds)
+        if best.drawn and self._relocalizer.is_active:
+            self._relocalizer.stop()
+            place_m = LocalFrame(self._origin.lat_deg, self._origin.lon_deg).to_local(hint.lat_deg, hint.lon_deg)
+            self._start_search(best, prediction.agl_m, place_m, hint.radius_m / SIGMAS_95)
+        return verdict
 
     def localize(self, prediction: Prediction, image: Image | None) -> MapMatch:
         """Matches the frame of this prediction with the map. ``image`` None: the frame is not usable. Raises
@@ -241,10 +276,11 @@ class Localizer:
         if view.agl_m < MIN_MATCHING_AGL_M:
             return msgspec.structs.replace(match, verdict=Verdict.TOO_LOW)
         seen = self._correlate(image, view, layers, belief)
-        match = msgspec.structs.replace(match, map_sigma_m=seen.layer.sigma_m)
+        matcher = f"{match.matcher}{ON_DRAWN}" if seen.layer.drawn else match.matcher
+        match = msgspec.structs.replace(match, map_sigma_m=seen.layer.sigma_m, matcher=matcher)
         if seen.correlation.verdict is Verdict.OUTSIDE_MAP and self._may_be_on_map(best, prediction):
             # Dead reckoning over minutes can leave the map; no further correlation would be possible there.
-            self._relocalizer.start(best, prediction.agl_m, None)
+            self._start_search(best, prediction.agl_m, None, unknown_sigma_m(best.map))
             return self._relocalizer.search_match(match)
         if seen.correlation.verdict is not Verdict.ACCEPTED:
             return msgspec.structs.replace(match, verdict=seen.correlation.verdict)
@@ -254,9 +290,16 @@ class Localizer:
         hypothesis, score = seen.correlation.best_at(modes[0].e_m, modes[0].n_m)
         self._widen_if_poor(belief, score, seen.weight)
         match = with_belief(match, belief, modes, score)
+        found = self._place_test is not None
+        if self._place_test is not None:
+            passed = self._has_passed(self._place_test, modes[0], score, evidence_nats, seen.weight)
+            # A position alone does not give a heading that nobody reports.
+            if not passed or heading_is_unknown(prediction):
+                return with_step(self._relocalizer.search_match(match), SearchStep.WHOLE_MAP)
+            self._place_test, self._relocalizer.sigma_m, self._lock_monitor = None, 0.0, LockMonitor()
         sigma_m = position_sigma_m(prediction)
         pose = estimate_pose(match, prediction, seen, modes[0], hypothesis)
-        if not pose.attempted and seen.new >= 1.0 and has_wide_sigma(sigma_m, view.agl_m):
+        if not pose.attempted and not seen.layer.drawn and seen.new >= 1.0 and has_wide_sigma(sigma_m, view.agl_m):
             pose = self._localize_alone(pose, seen, belief)
         self._lock_monitor.update(evidence_nats, seen.weight, seen.new, pose.inliers, sigma_m, view.agl_m)
         mode_view = view_at(view, hypothesis, pose.mode.e_m, pose.mode.n_m) if pose.attempted else None
@@ -264,10 +307,11 @@ class Localizer:
         # Mixture "believed position, or anywhere": the variance that the second component adds.
         wrong = max(self._lock_monitor.wrong_probability, tested)
         self._relocalizer.sigma_m = mixed_sigma_m(wrong, best.map)
-        match = msgspec.structs.replace(pose.match, search=SearchResult(sigma_m=self._relocalizer.sigma_m))
+        search = SearchResult(sigma_m=self._relocalizer.sigma_m, relocalized=found)
+        match = msgspec.structs.replace(pose.match, search=search)
         if self._lock_monitor.lost or wrong == 1.0:
             around_m = prediction.p_c_in_w_m[:2] if tested < 1.0 else None
-            self._relocalizer.start(best, prediction.agl_m, around_m)
+            self._start_search(seen.layer if seen.layer.drawn else best, prediction.agl_m, around_m, LOST_SIGMA_M)
             return self._relocalizer.search_match(match)
         decided = decide(match, pose, belief, seen, score)
         has_pose = decided.verdict is Verdict.ACCEPTED and not decided.position_only
@@ -281,6 +325,14 @@ class Localizer:
         matched, self._scale_matched = self._scale_matched, False
         is_same_ground = self._since_observation_m < NEW_GROUND_SHARE * view.agl_m
         return replace(view, scale_sigma=0.0) if matched and is_same_ground else view
+
+    @staticmethod
+    def _has_passed(test: PlaceTest, mode: Mode, score: float, evidence_nats: float, weight: float) -> bool:
+        """Whether the search of a drawn map ends with this observation, which then is a position-only match."""
+        if score == float(np.float32(LLR_ZERO_Z)):  # nothing is mapped there
+            return False
+        passed = test.update(evidence_nats, weight, dominant=mode.mass >= MIN_POSE_MODE_MASS)
+        return passed and mode.mass >= MODE_MASS and score >= COARSE_SCORE
 
     def _correlate(self, image: Image, view: View, layers: MapLayers, belief: Belief) -> Observation:
         results = layers.correlate(image, view, belief)

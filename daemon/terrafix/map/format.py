@@ -13,6 +13,7 @@ from terrafix.map.null_model import NullModel
 FORMAT_VERSION = 2  # version 1: one imagery layer, private elevation table, georeference not covered by the checksum
 APPLICATION_ID = 0x47504B47  # "GPKG", OGC 12-128r18 requirement 2
 IMAGERY_TABLE = "imagery"  # the first layer; further ones are imagery_2, imagery_3, ...
+DRAWN_TABLE = "drawn"  # the layer that is drawn from roads, water and buildings
 ELEVATION_TABLE = "elevation"
 MANIFEST_TABLE = "terrafix_manifest"
 HASH_TABLE = "terrafix_hash"
@@ -75,7 +76,9 @@ class Ce90Origin(StrEnum):
 
 
 class Layer(msgspec.Struct, frozen=True, kw_only=True):
-    """One imagery layer: one date, one pixel grid. Layers of a package may differ in CRS."""
+    """One imagery layer: one date, one pixel grid. Layers of a package may differ in CRS.
+
+    The layer ``DRAWN_TABLE`` shows roads, water and buildings instead of imagery."""
 
     table: str
     date: str  # of the imagery, YYYY-MM-DD; empty = unknown
@@ -93,6 +96,11 @@ class Layer(msgspec.Struct, frozen=True, kw_only=True):
     descriptors: DescriptorTable | None = None
     null_model: NullModel | None = None  # score distribution of wrong places; None: not measured
     ce90_origin: Ce90Origin | None = None  # None: the package predates this field; then ce90_m is STATED
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether it is drawn from roads, water and buildings."""
+        return self.table == DRAWN_TABLE
 
 
 @dataclass(frozen=True)
@@ -146,7 +154,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     tiles: int  # of imagery, descriptors and elevation together
     checksum: str  # sha256 over the other rows and every tile's sha256
     ce90_m: float | None = None
-    layers: tuple[Layer, ...] = ()  # newest first
+    layers: tuple[Layer, ...] = ()  # imagery, newest first; then the drawn layer
     vectors: tuple[VectorTable, ...] = ()
     sealed: bool = False  # whether the file contains a file digest (``checksum.py``)
 

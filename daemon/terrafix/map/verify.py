@@ -13,6 +13,7 @@ from terrafix.core.signature import TrustedKey, is_signed
 from terrafix.map import format_v1
 from terrafix.map.format import (
     APPLICATION_ID,
+    DRAWN_TABLE,
     FORMAT_VERSION,
     HASH_TABLE,
     IMAGERY_TABLE,
@@ -61,7 +62,8 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
             f"{path}: map package of format {version}, this Terrafix reads up to {FORMAT_VERSION}; update Terrafix"
         )
     is_format_1 = version == "1"
-    missing = (format_v1.TABLES if is_format_1 else {IMAGERY_TABLE, HASH_TABLE}) - tables
+    pictures = DRAWN_TABLE if DRAWN_TABLE in tables else IMAGERY_TABLE
+    missing = (format_v1.TABLES if is_format_1 else {pictures, HASH_TABLE}) - tables
     if missing:
         raise MapError(f"{path}: damaged map package (no table {min(missing)}); build or copy it again")
     hashes: list[HashRow]

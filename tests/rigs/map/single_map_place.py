@@ -32,7 +32,7 @@ class SingleMapPackage(FlatMap):
 
     bounds_m = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
     manifest = SimpleNamespace(
-        layers=(SimpleNamespace(table="imagery", ce90_m=None, ce90_origin=None, null_model=None),)
+        layers=(SimpleNamespace(table="imagery", ce90_m=None, ce90_origin=None, null_model=None, is_drawn=False),)
     )
 
     def bind(self, _frame: object, _layer: str) -> "SingleMapPackage":

@@ -217,6 +217,7 @@ def test_the_required_evidence_follows_the_null_model_of_the_map_at_this_height(
         ce90_m=None,
         ce90_origin=None,
         null_model=NullModel(version=VERSION, matcher="gradient", rows=rows),
+        is_drawn=False,
     )
     for manifest in (SingleMapPackage.manifest, SimpleNamespace(layers=(layer,))):
         monkeypatch.setattr(SingleMapPackage, "manifest", manifest)
@@ -344,7 +345,7 @@ class TwoDates:
 
     manifest = SimpleNamespace(
         layers=tuple(
-            SimpleNamespace(table=table, ce90_m=ce90_m, ce90_origin=None, null_model=None)
+            SimpleNamespace(table=table, ce90_m=ce90_m, ce90_origin=None, null_model=None, is_drawn=False)
             for table, ce90_m in (("new", None), ("old", 5.0))
         )
     )

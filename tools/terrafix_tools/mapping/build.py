@@ -1,6 +1,7 @@
 """Builds a map package: imagery tiles at several scales, elevation, vectors, manifest. Streams inputs of any size."""
 
 import contextlib
+import dataclasses
 import hashlib
 import math
 import os
@@ -15,8 +16,17 @@ import rasterio
 from pyproj import Transformer
 from rasterio.errors import RasterioError
 
-from terrafix.core.errors import MapError, OutputError
-from terrafix.map.format import FORMAT_VERSION, IMAGERY_TABLE, Ce90Origin, DemGrid, Layer, Manifest, VectorTable
+from terrafix.core.errors import MapError, OutputError, UsageError
+from terrafix.map.format import (
+    DRAWN_TABLE,
+    FORMAT_VERSION,
+    IMAGERY_TABLE,
+    Ce90Origin,
+    DemGrid,
+    Layer,
+    Manifest,
+    VectorTable,
+)
 from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
@@ -30,6 +40,7 @@ from terrafix_tools.mapping.package.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.package.null_model import add_null_models
 from terrafix_tools.mapping.package.pyramid import BUILT_WITH, Pyramid, levels_of, open_renderer
 from terrafix_tools.mapping.source import ImagerySource
+from terrafix_tools.mapping.vectors.drawing import drawn_layer, spooled
 from terrafix_tools.mapping.vectors.tables import write_vectors
 from terrafix_tools.mapping.workers import GDAL_CACHE_MB, MAP_BUILD
 from terrafix_tools.parallel.pool import (
@@ -91,9 +102,9 @@ def build_package(
     cluster: PoolProvider | None = None,
     progress: bool = False,
 ) -> Path:
-    """Writes the package `out`. ``workers``: processes that read and encode imagery and elevation and compute
-    descriptors; ``cluster``: other computers that do it instead. Neither changes the bytes. ``null_agl_m``: heights
-    above ground for which a null model is fitted.
+    """Writes the package `out`; without ``layers`` from the drawn vectors alone. ``workers``: processes that read and
+    encode imagery and elevation and compute descriptors; ``cluster``: other computers that do it instead. Neither
+    changes the bytes. ``null_agl_m``: heights above ground for which a null model is fitted.
 
     The result is deterministic. On failure or interruption, no file is left at `out` or beside it.
     With several workers the main module must be importable (``multiprocessing`` forkserver).
@@ -101,6 +112,8 @@ def build_package(
     for layer in layers:
         check_date(layer.date)
     check_out(out)
+    if null_agl_m and not layers:
+        raise UsageError("--null-agl: a null model is fitted on imagery, and this map has none; leave it out")
     # Newest first; unknown dates last, in the given order.
     ordered = sorted(layers, key=lambda layer: layer.date, reverse=True)
     with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), contextlib.ExitStack() as stack:
@@ -183,8 +196,19 @@ class _Build:
                 if number == 1 and elevation:
                     dem = self._elevation(elevation, source)
         tables: tuple[VectorTable, ...] = ()
-        if vectors:
+        if vectors and vectors.drawn_in:
+            drawn = drawn_layer(vectors, vectors.drawn_in, self._scratch)
+            features = spooled(vectors, self._scratch, drawn.crs)
+            tables = write_vectors(self._writer, self._db, dataclasses.replace(vectors, features=features))
+            with drawn.given.open() as source:
+                if not written and elevation:
+                    dem = self._elevation(elevation, source)
+                if tables:
+                    written.append(self._layer(drawn.given, source, DRAWN_TABLE))
+        elif vectors:
             tables = write_vectors(self._writer, self._db, vectors)
+        if not written:
+            raise MapError("no road, water or building lies in this area; check --osm and --area")
         self._manifest(written, dem, tables)
 
     def _layer(self, given: LayerInput, source: Imagery, table: str) -> Layer:
@@ -207,14 +231,14 @@ class _Build:
             tiles=0,
         )
         self._writer.add_imagery_table(layer, self._name)
-        pyramid = Pyramid(source, levels, table, self._writer)
+        pyramid = Pyramid(source, levels, table, self._writer, layer.is_drawn)
         places = pyramid.places()
         self._crew.prepare(len(places), CHUNKS_PER_WORKER)
         collar_file = self._scratch / f"{table}-collar.tif"
         collar = None if source.has_mask else find_collar(source, collar_file, self._bar)
         if collar:
             collar.close()
-        opener = partial(open_renderer, given.open, collar_file if collar else None, levels[-1].zoom)
+        opener = partial(open_renderer, given.open, collar_file if collar else None, levels[-1].zoom, layer.is_drawn)
         rendered = render_pieces(opener, places, len(places), self._crew)
         with contextlib.closing(_count_steps(rendered, self._bar(table, len(places)))) as chunks:
             if not pyramid.write(chunks):

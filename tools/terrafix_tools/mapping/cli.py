@@ -37,6 +37,10 @@ def map_build(
     dem_datum: Annotated[Datum, typer.Option(help="Vertical datum of --dem.")] = Datum.EGM96,
     geoid: Annotated[Path | None, typer.Option(help="Grid of the geoid EGM96, if PROJ has none.")] = None,
     osm: Annotated[str, typer.Option(help="Roads, water, buildings: an .osm.pbf, 'overpass' or its address.")] = "",
+    osm_ce90: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=200.0, help="Stated position error of --osm: radius of 90 %, metres."),
+    ] = None,
     date: Annotated[str, typer.Option(help="Date of the imagery, YYYY-MM-DD.")] = "",
     licence: Annotated[str, typer.Option(help="Licence of the imagery; required for network sources.")] = "",
     ce90: Annotated[
@@ -78,6 +82,7 @@ def map_build(
             dem_datum=dem_datum,
             geoid=geoid,
             osm=osm,
+            osm_ce90_m=osm_ce90,
             date=date,
             licence=licence,
             ce90_m=ce90,

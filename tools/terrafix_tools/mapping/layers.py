@@ -9,6 +9,7 @@ import numpy as np
 from pyproj import CRS
 
 from terrafix.map.format import DemGrid
+from terrafix_tools.mapping.area.polygons import Area
 
 Bounds = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max in the CRS
 Feature = tuple[
@@ -89,7 +90,7 @@ class LayerInput:
 
 @dataclass(frozen=True)
 class ElevationInput:
-    """Elevation; ``open`` gets the CRS and the bounds of the newest imagery layer."""
+    """Elevation; ``open`` gets the CRS and the bounds of the newest layer."""
 
     open: Callable[[CRS, Bounds], Elevation]
     source: str
@@ -98,9 +99,11 @@ class ElevationInput:
 
 @dataclass(frozen=True)
 class VectorInput:
-    """Features of all tables in any order; read once."""
+    """Features of all tables in any order; read once. ``drawn_in``: area in which they are also drawn as a layer."""
 
     features: Iterable[Feature]
     source: str
     date: str = ""
     licence: str = ""
+    drawn_in: Area | None = None
+    ce90_m: float | None = None  # stated accuracy of the drawn layer

@@ -80,7 +80,10 @@ def _write(packages: Sequence[Path], folder: Path, options: IndexOptions, descri
         package = MapPackage.open(path)
         west, south, east, north = package.manifest.bounds_wgs84
         frame = LocalFrame((south + north) / 2, (west + east) / 2)
-        for layer in package.manifest.layers:
+        imagery = [layer for layer in package.manifest.layers if not layer.is_drawn]
+        if not imagery:
+            raise MapError(f"{path}: has no imagery, and the search of a drawn map uses no index; leave it out")
+        for layer in imagery:
             first = sum(map(len, vectors))
             for row_vectors, row_positions in describe_layer(
                 package.bind(frame, layer.table), frame, side_m, describer

@@ -74,7 +74,8 @@ def _guarded(check: str, lines: Iterator[Line]) -> Iterator[Line]:
 def _integrity(package: MapPackage) -> Iterator[Line]:
     newest = package.layer(None)
     signed = f"signed by {', '.join(package.signed_by)}" if package.signed_by else "not signed"
-    yield ok("map", f"{package.path.name}: all tiles valid; {signed}; imagery of {newest.date or 'unknown date'}")
+    shows = "roads, water and buildings, no imagery" if newest.is_drawn else "imagery"
+    yield ok("map", f"{package.path.name}: all tiles valid; {signed}; {shows} of {newest.date or 'unknown date'}")
 
 
 def _start(package: MapPackage, config: Config) -> Iterator[Line]:

@@ -7,6 +7,7 @@ import typer
 
 from terrafix.core.errors import UsageError
 from terrafix_tools.sim.autopilot.parameters import Gps, Kind
+from terrafix_tools.sim.world.map_content import MapContent
 
 # Options of both `make` and `fly`.
 Seed = Annotated[int, typer.Option(help="Seed of the generated place, the course and all errors.")]
@@ -135,6 +136,9 @@ def make(
     agl: Agl = 130.0,
     events: Events = None,
     jam_after: Annotated[float | None, typer.Option(help="GNSS is jammed from this second on.")] = None,
+    map_content: Annotated[
+        MapContent, typer.Option(help="Map of a generated place: imagery, roads and buildings as vectors, or both.")
+    ] = MapContent.IMAGERY,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
     """Write a flight folder of a simulated vehicle: images, telemetry.tlog, truth.csv and the map."""
@@ -145,6 +149,7 @@ def make(
         size_km=size_km,
         image=image,
         map_path=map_path,
+        map_content=map_content,
         dem=dem,
         vehicle=vehicle,
         mission=mission,

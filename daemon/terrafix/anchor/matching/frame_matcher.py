@@ -15,7 +15,7 @@ from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, rectify
 from terrafix.anchor.matching.patch_matcher import match_patches
-from terrafix.anchor.matching.point_mass_filter import LLR_SLOPE, Surface
+from terrafix.anchor.matching.point_mass_filter import LLR_SLOPE, LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
@@ -139,7 +139,7 @@ class Fix:
 
 class FrameMatcher:
     """Matches frames with one map layer. ``cache_bytes``: memory for the map's descriptors; ``store``: file store that
-    keeps them for the next process."""
+    keeps them for the next process; ``drawn``: the layer is drawn from roads, water and buildings."""
 
     def __init__(
         self,
@@ -148,8 +148,10 @@ class FrameMatcher:
         describer: Describer,
         cache_bytes: int = CACHE_BYTES,
         store: DescriptorStore | None = None,
+        drawn: bool = False,
     ) -> None:
         self.camera = camera
+        self._drawn = drawn
         self._map = source
         self._describer = describer
         self._subset = 0
@@ -227,11 +229,15 @@ class FrameMatcher:
         descriptors, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
         if not valid.any():
             return CorrelationResult(Verdict.OUTSIDE_MAP)
-        window = CorrelationWindow(descriptors, valid)
+        window = CorrelationWindow(descriptors, valid, self._drawn)
         surfaces = []
         for _, frame in usable:
             template, mask = _describe(frame, describer)
-            z = standardise(window.correlate(template, mask))
+            correlation = window.correlate(template, mask)
+            z = standardise(correlation)
+            # Places without a mapped feature are neither excluded nor preferred: they are as frequent among right
+            # places as among all (docs/decisions/042-vectors-as-a-layer.md).
+            z[np.isneginf(correlation)] = LLR_ZERO_Z
             surfaces.append(Surface(z, e_min - frame.e_min_m, n_max - frame.n_max_m, cell))
         if not any(np.isfinite(s.z).any() for s in surfaces):
             return CorrelationResult(Verdict.OUTSIDE_MAP)

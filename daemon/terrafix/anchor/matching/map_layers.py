@@ -23,7 +23,7 @@ from terrafix.messages import Verdict
 class MapLayer:
     """One map layer. ``sigma_m``: position error, 1-sigma per horizontal axis. ``null``: null model of this layer
     (scores of the best wrong places), None if it was not measured. ``recognizer``: place recognition by an index of
-    this layer, None if there is none."""
+    this layer, None if there is none. ``drawn``: from roads, water and buildings."""
 
     map: LocalMap
     matcher: FrameMatcher
@@ -31,6 +31,7 @@ class MapLayer:
     sigma_m: float
     null: NullModel | None
     recognizer: PlaceRecognizer | None = None
+    drawn: bool = False
 
     def null_at(self, agl_m: float) -> NullRow:
         return null_row_for(self.null, self.matcher.gradients.name, agl_m)
@@ -59,13 +60,16 @@ class MapLayers:
                 store = DescriptorStore(
                     store_folder, f"{_file_identity(package)} {frame} {layer.table}", MAX_TILES // len(layers)
                 )
-            matcher = FrameMatcher(camera, bound, describer, CACHE_BYTES // len(layers), store)
+            cache_bytes = CACHE_BYTES // len(layers)
+            matcher = FrameMatcher(camera, bound, describer, cache_bytes, store, layer.is_drawn)
             sigma_m = accuracy_of(layer, ce90_m).sigma_m
             recognizer = None
             if places is not None and (indexed := places.index.layer(package.manifest.checksum, layer.table)):
                 recognizer = PlaceRecognizer(places, indexed, frame)
             consensus = ConsensusPose(bound, matcher)
-            self._all[layer.table] = MapLayer(bound, matcher, consensus, sigma_m, layer.null_model, recognizer)
+            self._all[layer.table] = MapLayer(
+                bound, matcher, consensus, sigma_m, layer.null_model, recognizer, layer.is_drawn
+            )
         self._selector = LayerSelector([layer.table for layer in layers])
 
     def set_distortion(self, radial_k1: float) -> None:

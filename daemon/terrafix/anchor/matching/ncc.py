@@ -17,8 +17,10 @@ TAIL, TAIL_SIGMAS = 0.995, 2.576
 class CorrelationWindow:
     """A map window with its transforms, shared by all templates that are correlated with it."""
 
-    def __init__(self, descriptors: np.ndarray, valid: np.ndarray) -> None:
-        """``descriptors`` (C, H, W) float32, ``valid`` (H, W) bool."""
+    def __init__(self, descriptors: np.ndarray, valid: np.ndarray, drawn: bool = False) -> None:
+        """``descriptors`` (C, H, W) float32, ``valid`` (H, W) bool. ``drawn``: the map is drawn from features; where it
+        shows nothing the ground is not even, it is not mapped."""
+        self._drawn = drawn
         self._shape = descriptors.shape[1:]
         self._fft_shape = transform_shape(*self._shape)
         self._channels = spectra(descriptors, self._fft_shape)
@@ -26,7 +28,8 @@ class CorrelationWindow:
 
     def correlate(self, template: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """``template`` (C, h, w), ``mask`` (h, w) bool -> correlation (H - h + 1, W - w + 1) in [-1, 1]. Cell (r, c):
-        the template's corner is at the window's cell (r, c). NaN where the map does not cover the template."""
+        the template's corner is at the window's cell (r, c). NaN where the map does not cover the template, -inf where
+        a drawn map shows nothing below it."""
         (height, width), (h, w) = self._shape, mask.shape
         weight = mask.astype(np.float32)
         count = float(weight.sum())
@@ -36,6 +39,8 @@ class CorrelationWindow:
         variance, overlap = self._local.under(weight, rows, columns)
         surface = cross_correlation(self._channels, spectra(centred, self._fft_shape))[:rows, :columns]
         surface /= np.sqrt(np.maximum(np.maximum(variance, FLAT_VARIANCE * template_energy) * template_energy, 1e-12))
+        if self._drawn:
+            surface[variance < FLAT_VARIANCE * template_energy] = -np.inf
         if overlap is not None:
             surface[overlap < MIN_OVERLAP] = np.nan
         return surface

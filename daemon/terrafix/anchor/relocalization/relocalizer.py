@@ -68,6 +68,10 @@ class Relocalizer:
         self._search = MapSearch(best.map, best.matcher, agl_m, around_m, null, self._budget, best.recognizer)
         self.sigma_m = unknown_sigma_m(best.map)
 
+    def stop(self) -> None:
+        """Ends a running search without a result."""
+        self._search = None
+
     def predict(self, step_m: tuple[float, float], sigma_m: float) -> None:
         if self._search is not None:
             self._search.predict(*step_m, sigma_m)

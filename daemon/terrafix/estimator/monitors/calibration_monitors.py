@@ -115,6 +115,8 @@ class Monitors:
         # A coarse fix in the graph counts neither as found nor as nothing found. 15 % of the correlations of correct
         # flights give one, and 3 of 900 with a wrong mount, heading, focal length or map: too rare to be measured.
         nothing = not accepted and match.frame_id == self._textured and match.verdict not in NOT_CORRELATED
+        if match.on_drawn:  # it gives no pose at all
+            nothing = False
         if found or nothing:
             self._registration.add_attempt(found=found)
         if not pose or match.pose is None:

@@ -52,6 +52,7 @@ class Order:
     dem_datum: Datum = Datum.EGM96
     geoid: Path | None = None
     osm: str = ""
+    osm_ce90_m: float | None = None
     date: str = ""
     licence: str = ""
     ce90_m: float | None = None
@@ -161,8 +162,10 @@ def _specs(order: Order) -> list[SourceSpec]:
     )
     if order.sources:
         specs += read_sources(order.sources)
-    if not specs:
-        raise UsageError("--area needs a --source: a GeoTIFF, .mbtiles, a {z}/{x}/{y} address, ...")
+    if not specs and not order.osm:
+        raise UsageError(
+            "--area needs a --source: a GeoTIFF, .mbtiles, a {z}/{x}/{y} address, ...; or --osm, drawn as a map"
+        )
     return [with_statement(spec) for spec in specs]
 
 
@@ -203,6 +206,7 @@ def _vectors(order: Order, area: Area | None) -> VectorInput | None:
         url = PUBLIC if order.osm == OVERPASS else order.osm
         with shown(order.say, "OpenStreetMap") as on_progress:
             paths = fetch_overpass(url, area, order.cache_dir, on_progress)
-        return VectorInput(overpass_features(paths, area), source=url, licence=OSM_LICENCE)
-    path = Path(order.osm)
-    return VectorInput(pbf_features(path, area), source=path.name, licence=OSM_LICENCE)
+        features, source = overpass_features(paths, area), url
+    else:
+        features, source = pbf_features(Path(order.osm), area), Path(order.osm).name
+    return VectorInput(features, source, licence=OSM_LICENCE, drawn_in=area, ce90_m=order.osm_ce90_m)

@@ -191,7 +191,12 @@ def _age_years(date: str) -> float | None:
 def _warnings(layer: Layer, frame_cells: int, has_elevation: bool, cell_m: float, agl_m: float) -> list[str]:
     warnings = []
     age_years = _age_years(layer.date)
-    if age_years is None:
+    if layer.is_drawn:
+        warnings.append(
+            "roads, water and buildings instead of imagery: a fix is a position alone, and 'sees' is of the drawing; "
+            "a frame also shows what no map has"
+        )
+    elif age_years is None:
         warnings.append("the package does not say when the imagery was taken; build it with --date")
     elif age_years > OLD_YEARS:
         warnings.append(f"the imagery is {age_years:.0f} years old; new buildings and other crops make fixes fewer")

@@ -79,13 +79,13 @@ def given_offset(offset: Offset, own: Accuracy, other: Accuracy) -> float:
 
 
 def _register_pairs(package: MapPackage) -> dict[tuple[int, int], Offset]:
-    """Offsets of the pairs of layers of which at least one has no stated accuracy."""
+    """Offsets of the pairs of imagery layers of which at least one has no stated accuracy."""
     layers = package.manifest.layers
     west, south, east, north = package.manifest.bounds_wgs84
     frame = LocalFrame((south + north) / 2, (west + east) / 2)
     offsets = {}
     for a, b in itertools.combinations(range(len(layers)), 2):
-        if None in (layers[a].ce90_m, layers[b].ce90_m):
+        if None in (layers[a].ce90_m, layers[b].ce90_m) and not layers[b].is_drawn:
             found = register(package.bind(frame, layers[a].table), package.bind(frame, layers[b].table))
             if found is not None:
                 offsets[a, b] = found

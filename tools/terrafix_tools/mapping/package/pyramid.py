@@ -40,6 +40,7 @@ class ChunkRenderer:
     source: Imagery
     collar: Collar | None
     finest: int  # zoom
+    lossless: bool = False
 
     def render(self, place: Place) -> Chunk:
         depth = min(CHUNK_LEVELS, self.finest)
@@ -77,7 +78,7 @@ class ChunkRenderer:
             ]
             tile = parent_of(children, whole)
         if tile is not None:
-            tiles.append((zoom, column, row, encode(tile, whole)))
+            tiles.append((zoom, column, row, encode(tile, whole, self.lossless)))
         return tile
 
     def _read(self, chunk_column: int, chunk_row: int, side: int) -> np.ndarray:
@@ -103,9 +104,11 @@ class ChunkRenderer:
         return out
 
 
-def open_renderer(open_imagery: Callable[[], Imagery], collar: Path | None, finest: int) -> ChunkRenderer:
+def open_renderer(
+    open_imagery: Callable[[], Imagery], collar: Path | None, finest: int, lossless: bool
+) -> ChunkRenderer:
     """Opens the imagery for the lifetime of the process."""
-    return ChunkRenderer(open_imagery().__enter__(), Collar(collar) if collar else None, finest)
+    return ChunkRenderer(open_imagery().__enter__(), Collar(collar) if collar else None, finest, lossless)
 
 
 def levels_of(source: Imagery) -> tuple[Level, ...]:
@@ -122,9 +125,12 @@ def levels_of(source: Imagery) -> tuple[Level, ...]:
 class Pyramid:
     """Writes the chunks of a layer, which arrive in the order of ``places``, and the levels above them."""
 
-    def __init__(self, source: Imagery, levels: tuple[Level, ...], table: str, writer: GpkgWriter) -> None:
+    def __init__(
+        self, source: Imagery, levels: tuple[Level, ...], table: str, writer: GpkgWriter, lossless: bool
+    ) -> None:
         self._width_px, self._height_px = source.width_px, source.height_px
         self._levels, self._table, self._writer = levels, table, writer
+        self._lossless = lossless
         self._chunk_zoom = max(0, levels[-1].zoom - CHUNK_LEVELS)
 
     def places(self) -> list[Place]:
@@ -166,7 +172,7 @@ class Pyramid:
         children = [self._tile(zoom + 1, 2 * column + c, 2 * row + r, chunks) for r in (0, 1) for c in (0, 1)]
         tile = parent_of(children)
         if tile is not None:
-            self._writer.add_tile(self._table, zoom, column, row, encode(tile))
+            self._writer.add_tile(self._table, zoom, column, row, encode(tile, lossless=self._lossless))
         return tile
 
     def _exists(self, zoom: int, column: int, row: int) -> bool:
@@ -213,9 +219,11 @@ def _all_valid(tile: np.ndarray) -> bool:
     return _valid_px(tile) == tile.shape[0] * tile.shape[1]
 
 
-def encode(tile: np.ndarray, whole: bool = False) -> bytes:
-    """JPEG when every pixel is valid, else PNG with alpha; both are supported by all GeoPackage readers."""
-    if whole or _all_valid(tile):
+def encode(tile: np.ndarray, whole: bool = False, lossless: bool = False) -> bytes:
+    """JPEG when every pixel is valid, else PNG with alpha; both are supported by all GeoPackage readers.
+
+    ``lossless``: PNG in any case. A drawing has sharp edges on even ground: JPEG adds edges of its own beside them."""
+    if not lossless and (whole or _all_valid(tile)):
         return cv2.imencode(".jpg", cv2.cvtColor(tile, cv2.COLOR_BGRA2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[
             1
         ].tobytes()

@@ -16,7 +16,7 @@ from terrafix_tools.mapping.package import gpkg_schema
 from terrafix_tools.mapping.package.gpkg import WGS84, GpkgWriter
 
 TABLE_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
-TAKEN = re.compile(r"(imagery|elevation|gpkg|terrafix|rtree|sqlite)")
+TAKEN = re.compile(r"(imagery|drawn|elevation|gpkg|terrafix|rtree|sqlite)")
 LITTLE_ENDIAN_XY_ENVELOPE = 0b0000_0011  # flags in the header of a GeoPackage geometry
 
 

@@ -16,6 +16,7 @@ from terrafix_tools.sim.flights.scene import Scene, scene_of_image, scene_of_pla
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Jam, read_events
 from terrafix_tools.sim.world import mapped
 from terrafix_tools.sim.world import place as world
+from terrafix_tools.sim.world.map_content import MapContent
 
 AGL_LIMITS_M = (30.0, 1500.0)
 MAP_NAME = "map.gpkg"
@@ -29,6 +30,7 @@ class FlightOptions:
     size_km: float | None = None  # side of a generated place
     image: Path | None = None  # image that the camera sees; None: a generated place
     map_path: Path | None = None
+    map_content: MapContent = MapContent.IMAGERY  # of a generated place
     dem: Path | None = None
     vehicle: Kind = Kind.PLANE
     mission: Path | None = None
@@ -94,7 +96,7 @@ def write_map(package: Path, wanted: FlightOptions, place: world.World | None) -
         assert source is not None  # without a place there is an image
         build(source, package, dem=wanted.dem)
         return
-    mapped.write_map(place, package)
+    mapped.write_map(place, package, content=wanted.map_content)
 
 
 def gnss_events(wanted: FlightOptions) -> tuple[AnyEvent, ...]:
@@ -107,6 +109,8 @@ def check_options(wanted: FlightOptions) -> None:
     """Raises UsageError for invalid options."""
     if wanted.image is None and (wanted.map_path or wanted.dem):
         raise UsageError("--map and --dem belong to --image; a generated place has its own")
+    if wanted.image is not None and wanted.map_content is not MapContent.IMAGERY:
+        raise UsageError("--map-content: only the features of a generated place are known; omit it with --image")
     if wanted.image is not None and wanted.size_km is not None:
         raise UsageError("--size-km applies to a generated place; omit it with --image")
     if wanted.mission is not None and (wanted.length_km is not None or wanted.from_ground):
