@@ -47,15 +47,14 @@ def ground_points(count: int, mount_deg: float = 0.0) -> tuple[np.ndarray, np.nd
 
 def town(mount_deg: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """-> points (N, 3) and (N,) bool, on the ground: 60 of 200. The others are roofs; 70 of these lie on a plane that
-    rises by 20 degrees, as terraces on a street do."""
+    rises by 20 degrees across the image, as terraces do."""
     rng = np.random.default_rng(9)
     points, _ = ground_points(200, mount_deg)
-    height_m = np.zeros(200)
-    across = points[:, 0] - points[:, 0].min()
-    height_m[60:130] = np.tan(np.radians(20.0)) * across[60:130]
-    height_m[130:] = rng.uniform(4.0, 30.0, 70)
-    depth = AGL_M - height_m
-    return points * (depth / AGL_M)[:, None], np.arange(200) < 60
+    share, slope = np.ones(200), np.tan(np.radians(20.0))
+    across = points[60:130, 0] / points[60:130, 2]
+    share[60:130] = (1.0 - 0.6 * slope) / (1.0 + slope * across)
+    share[130:] = rng.uniform(0.75, 0.97, 70)
+    return points * share[:, None], np.arange(200) < 60
 
 
 MOTION = rotated(2, 8.0), np.array([10.0, 45.0, 3.0])

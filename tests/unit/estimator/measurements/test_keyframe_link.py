@@ -16,6 +16,7 @@ from simulated_flight import (
     t_ns,
 )
 from terrafix.core.gate import GATE
+from terrafix.estimator.graph.pose_graph import NewNode, PoseGraph
 from terrafix.messages import Health, KeyframeLink, MapMatch, Message, Odometry, ThermalBand, Verdict
 
 FRAMES, MAP_UNTIL, LAST = 30, 4, 29
@@ -66,20 +67,26 @@ def test_links_narrow_the_claim_and_it_holds() -> None:
     assert max(d2) < GATE[2] and np.mean(d2) < 4.1  # chi-square of the mean of five: 97.5 %
 
 
-def test_the_information_of_a_frame_is_shared_by_its_keyframes() -> None:
-    """Two links to one keyframe, with the same matches: as sure as without, not surer."""
-    flight = flight_of(2)
-    once, thrice = flown(flight, end=20), flown(flight, end=20)
-    messages = photos(flight, 20, [])
-    odometry = messages[-1]
-    assert isinstance(odometry, Odometry)
-    again = KeyframeLink(
-        keyframe_id=19, two_view=odometry.two_view, sigma_norm=odometry.sigma_norm, inliers=40, tracked=40
-    )
-    once.feed(messages)
-    thrice.feed([*messages[:-1], msgspec.structs.replace(odometry, links=[again, again])])
-    assert thrice.verdicts("link")[20].verdict is Verdict.ACCEPTED
-    assert sigma_m(thrice.estimate(20)) == pytest.approx(sigma_m(once.estimate(20)), rel=0.01)
+def test_the_information_of_a_frame_is_shared_by_its_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three keyframes each has a third: their noise, and that of the ground below them, is larger by root three."""
+    flight, added = flight_of(2), list[NewNode]()
+    extend = PoseGraph.extend
+
+    def recorded(graph: PoseGraph, t_s: float, new: NewNode) -> int:
+        added.append(new)
+        return extend(graph, t_s, new)
+
+    monkeypatch.setattr(PoseGraph, "extend", recorded)
+    for linked in ((), (2, 3)):
+        run = flown(flight, end=12)
+        run.feed(photos(flight, 12, [link(flight, 12 - back, 12) for back in linked]))
+    alone, shared = added[len(added) // 2 - 1], added[-1]
+    assert (len(alone.links), len(shared.links)) == (0, 2)
+    one, third = alone.motion.rays, shared.motion.rays
+    assert one is not None and third is not None
+    assert third.sigma == pytest.approx(np.sqrt(3.0) * one.sigma)
+    assert third.ground.level_sigma_m == pytest.approx(np.sqrt(3.0) * one.ground.level_sigma_m)
+    assert all(rays.sigma > 1.5 * one.sigma for _, rays in shared.links)
 
 
 def test_a_wrong_link_is_rejected_and_changes_nothing() -> None:
