@@ -13,7 +13,7 @@ from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
-from terrafix.map.format import accuracy_of
+from terrafix.map.format import DRAWN_TABLE, accuracy_of
 from terrafix.map.null_model import NullModel, NullRow, null_row_for
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix.messages import Verdict
@@ -70,7 +70,7 @@ class MapLayers:
             self._all[layer.table] = MapLayer(
                 bound, matcher, consensus, sigma_m, layer.null_model, recognizer, layer.is_drawn
             )
-        self._selector = LayerSelector([layer.table for layer in layers])
+        self._selector = LayerSelector([layer.table for layer in layers], DRAWN_TABLE)
 
     def set_distortion(self, radial_k1: float) -> None:
         """Sets the distortion of the division model in all matchers, from the estimator's self-calibration."""

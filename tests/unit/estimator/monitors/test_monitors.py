@@ -19,7 +19,7 @@ from terrafix.estimator.monitors.map_offsets import OffsetMonitor, log_height_ra
 from terrafix.estimator.monitors.registration import ERROR_PER_PATH, MIN_SPACING_HEIGHTS, PRIOR_WRONG, Registration
 from terrafix.estimator.monitors.turns import TurnMonitor
 from terrafix.estimator.monitors.visual_motion import visual_motion
-from terrafix.messages import CalibrationFault, MapMatch, Message, Odometry, VehicleState, Verdict
+from terrafix.messages import ON_DRAWN, CalibrationFault, MapMatch, Message, Odometry, VehicleState, Verdict
 
 HEIGHT_M = 100.0
 
@@ -303,6 +303,17 @@ def test_correlations_over_ground_without_texture_are_ignored() -> None:
         if isinstance(message, MapMatch):
             return MapMatch(t_ns=message.t_ns, frame_id=message.frame_id, verdict=Verdict.AMBIGUOUS, matcher="gradient")
         return message
+
+    assert _fly(nothing, fix_every=1)[1] == []
+
+
+@pytest.mark.slow
+def test_correlations_with_a_drawn_map_do_not_count_against_registration() -> None:
+    def nothing(message: Message) -> Message:
+        if not isinstance(message, MapMatch):
+            return message
+        matcher = f"gradient{ON_DRAWN}"
+        return MapMatch(t_ns=message.t_ns, frame_id=message.frame_id, verdict=Verdict.AMBIGUOUS, matcher=matcher)
 
     assert _fly(nothing, fix_every=1)[1] == []
 
