@@ -95,8 +95,10 @@ def measure(number: int) -> dict[str, Any]:
 
 
 def main(flights: int, out: Path) -> None:
-    rows = [measure(number) for number in range(flights)]
-    write_result(out, {"flights": rows})
+    rows: list[dict[str, Any]] = []
+    for number in range(flights):
+        rows.append(measure(number))
+        write_result(out, {"flights": rows})
     table = Table(title=f"{flights} simulated flights, focal length {100 * FOCAL_ERROR:+.0f} %", title_justify="left")
     for name in rows[0]:
         table.add_column(name, justify="right")
