@@ -14,10 +14,9 @@ from terrafix_tools.report.sections_run import finalised as section
 
 
 @pytest.mark.slow
-def test_a_focal_length_that_is_3_percent_off_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_focal_length_that_is_3_percent_off_is_found() -> None:
     """A plane that turns over relief; described focal length stated to 5 %, its radial coefficient not at all."""
-    monkeypatch.setattr(finalised, "DURATION_S", 90.0)
-    found = finalised.measure(5)
+    found = finalised.measure(5, 90.0)
     assert abs(found["focal_error_sigmas"]) < 2.5 and found["focal_sigma"] < 0.02
     assert abs(found["k1_error_sigmas"]) < 2.5 and found["k1_sigma"] < 0.01
     assert found["up_rms_m"] < 3.0 * found["up_sigma_m"]  # in heights as seen it would be 3 % of 176 m
