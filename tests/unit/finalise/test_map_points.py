@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from terrafix.core.geodesy import quat_from_rot
+from terrafix.core.pnp import solved
 from terrafix.core.pose import exp_so3
-from terrafix.messages import PnpInput
+from terrafix.estimator.models.terrain import Terrain
+from terrafix.messages import MapMatch, PnpInput, Verdict
 from terrafix_tools.finalise.lens import Lens, as_described
 from terrafix_tools.finalise.map_points import FOCAL, K1, POSE, ROWS, MatchedPoints
 
@@ -46,6 +49,22 @@ def test_the_points_give_the_pose_through_the_true_lens_and_their_heights() -> N
     assert described is not None
     assert float(np.linalg.norm(described.residual, axis=1).mean()) > 3.0 * NOISE
     assert described.p_m[2] < P_M[2] - 3.0  # seen through a shorter focal length, the ground looks nearer
+
+
+def test_a_match_keeps_the_heights_of_its_points_and_the_rays_of_the_description() -> None:
+    """As received, with rays undistorted in flight by another coefficient than the true one, and a wrong point."""
+    points, in_flight = matched(wrong=1), Lens(k1=-0.03)
+    rows = np.column_stack([in_flight.rays(points.xy), points.points_m, points.weights]).tolist()
+    received = MapMatch(
+        t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", matches=[tuple(row) for row in rows],
+        pnp=points.given, radial_k1=in_flight.k1, map_sigma_m=3.0,
+    )  # fmt: skip
+    kept = MatchedPoints.of(received, solved(received), Terrain(0.0))
+    assert kept is not None and len(kept.xy) == len(points.xy)  # also those that PnP rejects
+    assert kept.points_m == pytest.approx(points.points_m) and np.ptp(kept.points_m[:, 2]) > 15.0
+    assert kept.xy == pytest.approx(points.xy, abs=1e-9)
+    assert kept.local_m == pytest.approx(0.99) and kept.roofs_m == pytest.approx(0.03 * kept.p_m[2])
+    assert MatchedPoints.of(msgspec.structs.replace(received, pnp=None), solved(received), Terrain(0.0)) is None
 
 
 def test_wrong_points_are_left_out() -> None:
