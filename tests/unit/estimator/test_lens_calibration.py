@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simulated_flight import ORIGIN, EstimatorRun, Flight
-from terrafix.estimator.factors.plane_two_view import plane_two_view_factor
+from terrafix.estimator.factors.plane_two_view import LensNoise, plane_two_view_factor
 from terrafix.estimator.models.lens_prior import RADIAL_K1_SIGMA
 from terrafix.estimator.models.plane_motion import Ground
 from terrafix.estimator.state import CALIBRATION_SIZE, RADIAL_K1
@@ -42,6 +42,28 @@ def test_the_radial_coefficient_explains_residuals_that_no_motion_explains(turne
 
     assert error(k1) < 0.05 * error(0.0)
     assert error(0.0) > 1.0
+
+
+def test_pairs_with_a_lens_in_their_noise_say_nothing_of_focal_length_and_radial_coefficient() -> None:
+    """Pairs through a lens with another radial coefficient, and another focal length, both within that noise."""
+    looks_down = gtsam.Rot3(np.diag([1.0, -1.0, -1.0]))
+    keyframe, pose = (gtsam.Pose3(looks_down, np.array(at)) for at in ((0.0, 0.0, 100.0), (10.0, 5.0, 130.0)))
+    seen = np.random.default_rng(1).uniform(-0.4, 0.4, (40, 2))
+    points = 100.0 * np.column_stack([seen * (1.0, -1.0), np.zeros(40)])
+    in_pose = (points - pose.translation()) @ pose.rotation().matrix()
+    values = gtsam.Values()
+    for key, value in ((0, keyframe), (1, pose), (2, np.zeros(CALIBRATION_SIZE))):
+        values.insert(key, value)
+    ground = Ground(100.0, 2.0, slope_sigma=0.01)
+
+    def error(k1: float, longer: float, lens: LensNoise | None) -> float:
+        views = (distorted(xy, k1) * (1.0 + longer) for xy in (seen, in_pose[:, :2] / in_pose[:, 2:]))
+        factor = plane_two_view_factor(0, 1, 2, keyframe, pose, np.hstack([*views]), 1e-4, ground, lens=lens)
+        return float(factor.error(values))
+
+    noise = LensNoise(0.1, 0.1)
+    assert error(0.02, 0.0, noise) < 0.2 < 5.0 < error(0.02, 0.0, None)
+    assert error(0.0, 0.02, noise) < 0.5 * error(0.0, 0.02, None)
 
 
 @pytest.mark.slow

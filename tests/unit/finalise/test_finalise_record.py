@@ -47,6 +47,9 @@ def test_finalised_csv_has_a_row_per_frame(flown: Path) -> None:
     summary = json.loads((flown / "finalised.json").read_text(encoding="utf-8"))
     assert summary["frames"] == summary["finalised"] == FRAMES and summary["cut_off"] == []
     assert summary["flights"][0]["map_matches"]["believed"] == 4
+    focal, k1 = summary["flights"][0]["before_after"][:2]
+    assert focal["before"] == focal["after"] == 560.0  # no point was seen by three keyframes
+    assert k1["what"] == "radial coefficient" and 0.0 < k1["after_sigma"] < 0.05
 
 
 def test_finalising_the_same_record_gives_identical_bytes(flown: Path, tmp_path: Path) -> None:
@@ -151,3 +154,4 @@ def test_the_finalise_command_prints_the_number_of_placed_frames(flown: Path, tm
     (tmp_path / "flight.mcap").write_bytes((flown / "flight.mcap").read_bytes())
     done = CliRunner().invoke(app, ["finalise", str(tmp_path), "--quiet"])
     assert done.exit_code == 0 and f"{FRAMES} of {FRAMES} frames placed by 4 map matches" in done.output
+    assert "Before and after" in done.output and "560.0 ± 5.6" in done.output

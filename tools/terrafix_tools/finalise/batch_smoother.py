@@ -23,6 +23,7 @@ from terrafix.estimator.factors.three_view import (
     three_view_constraint_of_focal,
     three_view_factor,
 )
+from terrafix.estimator.filter_state import scale_sigma
 from terrafix.estimator.models.bias_walk import BAROMETER_SCALE_SIGMA
 from terrafix.estimator.models.lens_prior import radial_k1_sigma
 from terrafix.estimator.models.terrain import LEVEL_M
@@ -50,6 +51,7 @@ ROUNDS = 4  # relinearizations of custom factors; the last one moves a flight by
 MAP_TURN_RAD, EXACT_M = 1e-6, 0.01
 # Precisions of a weak prior on the first pose of a segment, which keeps the system solvable: 10 rad, 1 km.
 LOOSE = np.array([1e-2] * 3 + [1e-6] * 3)
+NOTHING_LEARNT = 0.99  # share of the variance of a prior, above which nothing was measured [spec: rounding]
 MIN_FOCAL_SIGMA = 1e-5  # of the prior of the focal length, relative: an exactly known one is a variable, too
 # 1-sigma of an estimated focal length, relative, by errors that all images have in common (model of the lens, principal
 # point, relief), beyond what the residuals say.
@@ -170,8 +172,8 @@ class _Smoothing:
 
     def _calibration_factors(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
         """Prior of B of the first node of a graph. In flight the height scale was that of barometer and focal length
-        together. The first prior of a flight is of both before anything was measured; later ones say what was learnt
-        of their sum."""
+        together. A prior from before anything was measured is taken apart; later ones, also of an estimator that was
+        started again in flight, say what was learnt of the sum."""
         if node.calibration is None:
             return
         mean, cov = node.calibration
@@ -180,7 +182,8 @@ class _Smoothing:
         if not self._sees_lens:
             yield gtsam.PriorFactorVector(B(i), mean, gtsam.noiseModel.Gaussian.Covariance(cov, False))
             return
-        if i == 0:
+        unmeasured = scale_sigma(self._flight.origin.camera) ** 2
+        if cov[LOG_HEIGHT_SCALE, LOG_HEIGHT_SCALE] > NOTHING_LEARNT * unmeasured:
             cov = cov.copy()
             cov[LOG_HEIGHT_SCALE, :] = cov[:, LOG_HEIGHT_SCALE] = 0.0
             cov[LOG_HEIGHT_SCALE, LOG_HEIGHT_SCALE] = BAROMETER_SCALE_SIGMA**2
@@ -305,8 +308,8 @@ class _Smoothing:
         """Adds outliers that are consistent with the solution, given its covariance there."""
         for _ in range(READMISSIONS):
             found = self._marginals(certain, inliers)
-            fixes = self._flight.fixes
-            again = [i for i in range(len(fixes)) if not inliers[i] and self._consistent(fixes[i], found)]
+            fixes = range(len(self._flight.fixes))
+            again = [i for i in fixes if not inliers[i] and self._consistent(i, found)]
             if not again:
                 break
             inliers = inliers.copy()
@@ -331,10 +334,12 @@ class _Smoothing:
         nodes = [*(f.node for f in self._flight.fixes), *self._starts]
         return {int(self._begins[node]) for node, b in zip(nodes, inliers.tolist(), strict=True) if b}
 
-    def _consistent(self, fix: Fix, found: Covariances) -> bool:
+    def _consistent(self, i: int, found: Covariances) -> bool:
+        """Whether map match ``i`` agrees with the solution, given its covariance there."""
+        fix = self._flight.fixes[i]
         shifted, camera = M(self._maps.index(fix.map_sigma_m)), C(fix.node)
         offset, pose = self._values.atPose3(shifted), self._values.atPose3(camera)
-        measured, cov_m = self._measured(fix, found)
+        measured, cov_m = self._measured(i, found)
         joint = found.jointMarginalCovariance([shifted, camera])
         seen = offset.between(pose)
         by_offset = -seen.inverse().AdjointMap()
@@ -343,14 +348,15 @@ class _Smoothing:
         residual = measured.localCoordinates(seen)
         return float(residual @ np.linalg.solve(cov + across + across.T, residual)) <= GATE[6]
 
-    def _measured(self, fix: Fix, found: Covariances) -> tuple[gtsam.Pose3, np.ndarray]:
-        """Pose of a map match through the lens of the newest estimate, with the covariance of both."""
-        seen, lens = self._rows[self._flight.fixes.index(fix)], self._lens(fix.node)
+    def _measured(self, i: int, found: Covariances) -> tuple[gtsam.Pose3, np.ndarray]:
+        """Pose of map match ``i`` through the lens of the newest estimate, with the covariance of both."""
+        seen, node = self._rows[i], self._flight.fixes[i].node
+        lens = self._lens(node)
         rows = seen.rows[:, POSE]
         cov = np.linalg.inv(rows.T @ rows)
         by_lens = -cov @ rows.T @ seen.rows[:, [K1, FOCAL]]
         change = np.array([lens.k1 - seen.lens.k1, lens.log_focal - seen.lens.log_focal])
-        sigmas = self._lens_sigma(fix.node, found)
+        sigmas = self._lens_sigma(node, found)
         of_lens = np.diag([sigmas.k1, sigmas.log_focal]) ** 2
         return seen.pose.retract(by_lens @ change), cov + by_lens @ of_lens @ by_lens.T
 

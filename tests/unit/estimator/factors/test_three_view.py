@@ -5,13 +5,15 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, C
+from gtsam.symbol_shorthand import B, C, F
 
+from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.three_view import (
     MIN_TRIPLES,
     ThreeViewConstraint,
     ThreeViewPose,
     three_view_constraint,
+    three_view_constraint_of_focal,
     three_view_factor,
 )
 from terrafix.estimator.state import CALIBRATION_SIZE, HEIGHT, RADIAL_K1
@@ -158,3 +160,22 @@ def test_the_jacobians_match_numerical_differences(rises: bool) -> None:
     size = 6 * len(keys)
     expected = np.column_stack([(moved(e) - moved(-e)) / (2 * step) for e in step * np.eye(size)])
     assert np.abs(by - expected).max() < 0.01 * np.abs(expected).max()
+
+
+def test_a_focal_length_that_is_a_variable_explains_its_error() -> None:
+    """Images through a focal length that is 2 % longer than described fit the true poses at that value, and not at the
+    described one."""
+    flown, longer = Flown(3), 0.02
+    triples = flown.triples * np.exp(longer)
+    guess = flown.guess(0.1)
+    constraint = three_view_constraint_of_focal(triples, SIGMA, guess, 0.1)
+    assert constraint is not None and constraint.by_focal is not None
+    factor = three_view_factor(NODES, constraint, rises=False, focal=FocalKey(F(0), 0.0))
+    errors = []
+    for value in (0.0, longer):
+        values = flown.values()
+        values.insert(F(0), np.array([value]))
+        errors.append(float(np.sum(factor.unwhitenedError(values) ** 2)))
+    assert errors[1] < 0.3 * errors[0]
+    by_focal = factor.linearize(values).jacobian()[0][:, -1]
+    assert by_focal == pytest.approx(constraint.by_focal)

@@ -7,10 +7,11 @@ import gtsam
 import msgspec
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, C, V
+from gtsam.symbol_shorthand import B, C, F, V
 
 from inertial_flight import ORIGIN, InertialFlight, flown
 from terrafix.core.geodesy import rot_w_b
+from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.motion import motion_factor
 from terrafix.estimator.factors.noise import HUBER_K
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
@@ -281,6 +282,29 @@ def test_an_increment_without_imu_in_height_units_does_not_constrain_the_height(
             errors[measured, scale] = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), increment).error(values)
     assert errors[False, 0.5] == pytest.approx(errors[False, 1.0], rel=1e-9)
     assert errors[True, 0.5] != pytest.approx(errors[True, 1.0], rel=0.01)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_an_increment_in_heights_as_seen_does_not_constrain_the_focal_length(measured: bool) -> None:
+    """The map gives the distances: with a longer focal length only the heights grow, and the error stays the same."""
+    acceleration = coordinated_turn(6.0).world_acceleration(S, 2 * S) if measured else None
+    seen = integrate_motion(1.0, acceleration, (1.2, 1.4), 0.0, 20.0, 0.01, same_source=True)
+    seen = seen.in_height_units(100.0, 40.0)
+    errors, jacobians = [], []
+    for log_focal in (0.0, 0.1, 0.1 + 1e-6):
+        values = gtsam.Values()
+        for node, at in enumerate(((0.0, 0.0), (15.0, 6.0))):
+            up_m = 40.0 + 100.0 * math.exp(log_focal)
+            values.insert(C(node), gtsam.Pose3(gtsam.Rot3(), np.array([*at, up_m])))
+            values.insert(V(node), np.array([18.0, 7.0, *np.zeros(MOTION_SIZE - 2)]))
+        values.insert(B(1), np.zeros(CALIBRATION_SIZE))
+        values.insert(F(0), np.array([log_focal]))
+        factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), seen, FocalKey(F(0), 0.0))
+        errors.append(factor.unwhitenedError(values))
+        jacobians.append(factor.linearize(values).jacobian()[0])
+    assert errors[1] == pytest.approx(errors[0], rel=1e-9) and np.abs(errors[0]).max() > 0.1
+    by_focal, by_up = jacobians[1][:, -1], 100.0 * math.exp(0.1) * (jacobians[1][:, 5] + jacobians[1][:, 19])
+    assert by_focal == pytest.approx(-by_up, rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize(

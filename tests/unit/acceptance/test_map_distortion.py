@@ -1,0 +1,45 @@
+"""The local model of a map's distortion: what all frames see there is taken out, what one frame sees is not."""
+
+import numpy as np
+
+from terrafix.core.geodesy import quat_from_rot
+from terrafix.messages import MapMatch, MapPose, Verdict
+from terrafix_tools.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals
+
+DOWN, HEIGHT_M, FOCAL_PX = np.diag([1.0, -1.0, -1.0]), 100.0, 700.0
+
+
+def warp(map_m: np.ndarray) -> np.ndarray:
+    """(N, 2) displacement of the map, 1 m, over 60 m."""
+    return np.column_stack([np.sin(map_m[:, 1] / 10.0), np.cos(map_m[:, 0] / 10.0)])
+
+
+def match(seed: int, *, warped: bool, noise_m: float) -> MapMatch:
+    """A camera that looks down on the same ground as all others, with relief of 5 m."""
+    rng = np.random.default_rng(seed)
+    p_m = np.array([*rng.normal(0.0, 3.0, 2), HEIGHT_M])
+    ground = np.column_stack([rng.uniform(-40.0, 40.0, (60, 2)), rng.normal(0.0, 5.0, 60)])
+    in_c = (ground - p_m) @ DOWN
+    xy = in_c[:, :2] / in_c[:, 2:]
+    on_map = ground[:, :2] + (warp(ground[:, :2]) if warped else 0.0) + noise_m * rng.normal(size=(60, 2))
+    rows = np.column_stack([xy, on_map, ground[:, 2], np.ones(60)]).tolist()
+    pose = MapPose(p_c_in_w_m=tuple(p_m), q_w_c=quat_from_rot(DOWN), cov=tuple(np.eye(6).ravel()))  # type: ignore[arg-type]
+    return MapMatch(
+        t_ns=0, frame_id=seed, verdict=Verdict.ACCEPTED, matcher="gradient", pose=pose, matches=[tuple(r) for r in rows]
+    )
+
+
+def test_residuals_are_displacements_on_the_ground_and_pixels() -> None:
+    """With the heights of the points: at one level, relief of 5 m would add 2 m."""
+    found = residuals(match(1, warped=True, noise_m=0.0), FOCAL_PX)
+    assert np.abs(found.off_m - warp(found.map_m - found.off_m)).max() < 1e-6
+    expected_px = np.linalg.norm(found.off_m, axis=1).mean() / HEIGHT_M * FOCAL_PX
+    assert abs(float(found.px.mean()) / expected_px - 1.0) < 0.05
+
+
+def test_distortion_that_all_frames_see_is_taken_out_and_errors_of_one_frame_are_not() -> None:
+    for warped, noise_m, least, most in ((True, 0.1, 0.0, 0.55), (False, 1.0, 0.9, 1.3)):
+        frames = [residuals(match(i, warped=warped, noise_m=noise_m), FOCAL_PX) for i in range(12)]
+        left = mean_px(frames, left_by_local_model(frames))
+        whole = mean_px(frames, [f.off_m for f in frames])
+        assert least < left / whole < most
