@@ -46,7 +46,7 @@ def test_the_result_has_times_memory_and_accuracy_of_the_replay(measured: dict[s
     flight = measured["flights"]["generated"]
     assert flight["frames"] == FRAMES and list(flight["runs"]) == ["weights-free"]
     run = flight["runs"]["weights-free"]
-    assert list(run["stage_ms"]) == ["decode", "vision", "anchor", "estimator"]
+    assert list(run["stage_ms"]) == ["decode", "vision", "anchor", "estimator", "smoother"]
     for times in (run["frame_ms"], run["cpu_ms"], *run["stage_ms"].values()):
         assert 0.0 < times["median"] <= times["p95"]
     parts = sum(times["median"] for times in run["stage_ms"].values())
