@@ -13,6 +13,7 @@ from map_format1 import unpack
 
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
 
+from terrafix.processes import PROCESSES
 from terrafix_tools.sim.sitl import stages
 from terrafix_tools.sim.sitl.firmware import Home
 from terrafix_tools.sim.sitl.stages import Daemon
@@ -51,9 +52,9 @@ def eventually(holds: Any, within_s: float) -> None:
 def test_terrafix_stops_in_order_when_its_flight_is_killed(tmp_path: Path) -> None:
     log = tmp_path / "terrafix.log"
     with subprocess.Popen([sys.executable, "-c", FLIGHT, str(tmp_path), str(unpack(tmp_path))]) as flight:
-        eventually(lambda: log.exists() and log.read_text().count("process started") == 6, 60.0)
+        eventually(lambda: log.exists() and log.read_text().count("process started") == len(PROCESSES), 60.0)
         flight.kill()
-    eventually(lambda: log.read_text().count("process stopped") == 6, ENDS_S)
+    eventually(lambda: log.read_text().count("process stopped") == len(PROCESSES), ENDS_S)
 
 
 def test_a_terrafix_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
