@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import structlog
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -59,3 +60,10 @@ def stall_ms() -> Iterator[Callable[[], float]]:
         assert sleeper.stdin is not None
         yield lambda: float(sleeper.communicate(timeout=60)[0])
         sleeper.stdin.close()
+
+
+@pytest.fixture(autouse=True)
+def logs_as_unconfigured() -> Iterator[None]:
+    """A test that configures the logs leaves their level to no other test of its process."""
+    yield
+    structlog.reset_defaults()
