@@ -185,7 +185,7 @@ class FilterState:
         """Jacobian (2, 2) of the camera position (east and north) with respect to the principal point [m per unit of
         normalised image coordinates]."""
         p = pose.translation()
-        return np.asarray((float(p[UP]) - self.terrain.elevation_m(p)) * pose.rotation().matrix()[:2, :2])
+        return np.asarray(self.terrain.height_above_m(p) * pose.rotation().matrix()[:2, :2])
 
     def body(self, frame: FrameState) -> np.ndarray:
         """R_w_b (3, 3) of a frame, with the estimated mount."""

@@ -41,7 +41,6 @@ from terrafix.estimator.pose_estimator import (
 from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpoint
 from terrafix.estimator.propagation import PropagationResult
 from terrafix.estimator.smoother_inputs import map_anchor, odometry_link, relocalization_link
-from terrafix.estimator.state import UP
 from terrafix.messages import (
     ClaimBudget,
     CovarianceMode,
@@ -286,7 +285,7 @@ class EstimatorNode:
             yield calibration_of(estimator, result.placed)
         if self._monitors is not None:
             p = result.placed.pose.translation()
-            agl_m = float(p[UP]) - estimator.terrain.elevation_m(p)
+            agl_m = estimator.terrain.height_above_m(p)
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m)
             yield from self._monitors.take_changes(odometry.t_ns)
         budget = self._claim(result.placed)

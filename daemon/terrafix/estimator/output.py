@@ -76,7 +76,7 @@ def prediction_of(
         p_c_in_w_m=(float(p[0]), float(p[1]), float(p[UP])),
         q_w_c=quat_from_rot(r_w_c),
         cov=tuple(float(v) for v in cov.ravel()),
-        agl_m=float(p[UP]) - estimator.terrain.elevation_m(p),
+        agl_m=estimator.terrain.height_above_m(p),
         agl_sigma_m=float(np.sqrt(cov[UP, UP])),
         step_m=(float(step_m[0]), float(step_m[1])),
         step_cov_m2=(step_var_m2, 0.0, 0.0, step_var_m2),
@@ -105,7 +105,7 @@ def estimate_of(
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         alt_amsl_m=claim.amsl_m,
-        agl_m=scale * (float(p[UP]) - estimator.terrain.elevation_m(p)),
+        agl_m=scale * estimator.terrain.height_above_m(p),
         velocity_enu_mps=(float(v[0]), float(v[1]), scale * float(v[UP])),
         velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(frame.velocity_cov)[-1])),  # of the worst direction
         q_w_b=quat_from_rot(state.body(frame)),

@@ -20,7 +20,6 @@ from terrafix.estimator.map_update import MapResult
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.monitors.calibration_monitors import Monitors
 from terrafix.estimator.output import estimate_of
-from terrafix.estimator.state import UP
 from terrafix.messages import (
     CovarianceMode,
     Health,
@@ -152,7 +151,7 @@ class OpenCVGtsamPoseEstimator:
         p = pose.translation()
         given = PnpInput(
             q_w_c=quat_from_rot(pose.rotation().matrix()),
-            agl_m=max(float(p[UP]) - state.terrain.elevation_m(p), MIN_AGL_M),
+            agl_m=max(state.terrain.height_above_m(p), MIN_AGL_M),
             sigma_floor=1.0 / camera.fx,
             threshold=INLIER_THRESHOLD,
             search_radius=SEARCH_RADIUS,

@@ -268,7 +268,7 @@ class Propagation:
         cov[WORLD_POSITION, WORLD_POSITION] += step.predicted_cov[DELTA_P, DELTA_P]
         p = step.p_m
         placed = start_at(state, step.frame, p[:2], _worst_sigma(cov[:2, :2]))
-        seen_m, reported_m = float(p[UP]) - state.terrain.elevation_m(p), reported_agl_m(state, step.frame.attitude, p)
+        seen_m, reported_m = state.terrain.height_above_m(p), reported_agl_m(state, step.frame.attitude, p)
         detail = f"height {seen_m:.0f} m, where {reported_m:.0f} m are reported"
         step.verdicts.append(_reset_verdict(ResetReason.TOO_LOW, detail))
         return self._result(step, placed)
@@ -281,8 +281,7 @@ class Propagation:
             step.parent, step.motion = self._unseen_motion(step)
         else:
             step.parent, step.motion = known.parent, known.motion
-        between = gtsam.Pose3(gtsam.Rot3.ClosestTo(step.motion.r), step.motion.p_m)
-        step.pose = state.graph.state(step.parent).pose.compose(between)
+        step.pose = state.graph.state(step.parent).pose.compose(step.motion.between)
         step.step_m = (step.p_m - step.before.pose.translation())[:2]
         step.step_sigma_m = STATIONARY_M if step.increment is None else _worst_sigma(step.predicted_cov[:2, :2])
         if known is not None:

@@ -14,7 +14,7 @@ from terrafix.estimator.measurements.odometry import KeyframeMotion
 from terrafix.estimator.measurements.relocalization import RelocalizationMeasurement
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.propagation import PropagationResult
-from terrafix.estimator.state import MOUNT_TILT, TRANSLATION, UP
+from terrafix.estimator.state import MOUNT_TILT, TRANSLATION
 from terrafix.messages import MapMatch, PoseAnchor, PoseLink, Relocalization
 
 
@@ -30,7 +30,7 @@ def odometry_link(estimator: Estimator, result: PropagationResult, t_ns: int) ->
         frame_id=frame_id,
         parent_id=state.frames[motion.parent],
         fragment_id=fragment.fragment_id,
-        agl_m=_agl_m(state, result.placed.pose),
+        agl_m=state.terrain.height_above_m(result.placed.pose.translation()),
         ambiguity_m2=_flat2(ambiguous.inflation_m2()) if ambiguous.probability > 0.0 else (0.0, 0.0, 0.0, 0.0),
         **_relative(_between(state, motion, result), motion.motion),
     )
@@ -41,21 +41,20 @@ def _between(state: FilterState, motion: KeyframeMotion, result: PropagationResu
     inertial readings have added to it."""
     if state.graph.holds(motion.parent) and result.fused:
         return state.graph.state(motion.parent).pose.between(result.placed.pose)
-    return gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.motion.r), motion.motion.p_m)
+    return motion.motion.between
 
 
 def relocalization_link(estimator: Estimator, seen: Relocalization, by: RelocalizationMeasurement) -> PoseLink:
     """The link of an accepted relocalisation."""
     motion = by.motion
-    between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
     return PoseLink(
         t_ns=seen.t_ns,
         frame_id=seen.frame_id,
         parent_id=seen.keyframe_id,
         fragment_id=seen.fragment_id,
-        agl_m=_agl_m(estimator.state, by.pose),
+        agl_m=estimator.state.terrain.height_above_m(by.pose.translation()),
         relocalization=True,
-        **_relative(between, motion),
+        **_relative(motion.between, motion),
     )
 
 
@@ -93,11 +92,6 @@ def _relative(between: gtsam.Pose3, motion: RelativePose) -> dict[str, Any]:
         "cov": _flat6(cov),
         "scale_sigma": float(scale_sigma),
     }
-
-
-def _agl_m(state: FilterState, pose: gtsam.Pose3) -> float:
-    p = pose.translation()
-    return float(p[UP]) - state.terrain.elevation_m(p)
 
 
 def _flat6(cov: np.ndarray) -> tuple[float, ...]:

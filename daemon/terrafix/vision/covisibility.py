@@ -17,9 +17,8 @@ CANDIDATES = 5  # that are verified [measured: docs/decisions/040]
 # Width of a smaller copy, and features of it, that are compared with every keyframe: of village-1's pairs within half a
 # height, 40 frames and more apart, 86 % are found (360 px: 71 %), and none of 532 pairs four heights apart.
 COARSE_WIDTH_PX, COARSE_FEATURES = 480, 300
-LIKELY_SHARE = (
-    0.5  # of the most coarse matches, that another keyframe needs after an easy pair [spec: half the overlap]
-)
+# of the most coarse matches, that another keyframe needs after an easy pair [spec: half the overlap]
+LIKELY_SHARE = 0.5
 WEAK_INLIERS = 30  # of the best keyframe, below which details are compared [measured: docs/decisions/040]
 MIN_EPIPOLAR = 20  # of matches on epipolar lines, for that: by chance 14 at most [measured: docs/decisions/040]
 

@@ -251,9 +251,9 @@ def test_pose_and_covariance_have_the_stated_order_and_units(flight: Flight, run
 
 def test_the_node_estimates_with_the_same_poses(flight: Flight) -> None:
     """A match as a message and as a call: the same verdict, estimate and covariance."""
-    called, told = (EstimatorRun().fly(flight, 0, AT + 1) for _ in range(2))
+    called, fed = (EstimatorRun().fly(flight, 0, AT + 1) for _ in range(2))
     pose = poses_of(called).estimate(match_of(flight), LENS, COOL)
-    verdict, solution, estimate, anchor = told.feed([match_of(flight)])
+    verdict, solution, estimate, anchor = fed.feed([match_of(flight)])
     assert isinstance(anchor, PoseAnchor)  # for the smoother, after the estimate
     assert isinstance(verdict, MeasurementVerdict) and isinstance(estimate, NavEstimate)
     assert solution == solution_of(pose)
@@ -281,9 +281,9 @@ def test_a_late_match_gives_the_pose_of_its_own_frame(flight: Flight, run: Estim
     pose = poses_of(run).estimate(match_of(flight), LENS, COOL)
     assert (pose.frame_id, pose.emitted_at) == (AT, t_ns(AT + 2))
     assert horizontal_off_m(pose, flight, AT) < 4.0  # the newest frame is 12 m on
-    *_, told, anchor = EstimatorRun().fly(flight, 0, AT + 3).feed([match_of(flight)])
+    *_, newest, anchor = EstimatorRun().fly(flight, 0, AT + 3).feed([match_of(flight)])
     assert isinstance(anchor, PoseAnchor) and anchor.frame_id == AT
-    assert isinstance(told, NavEstimate) and told.frame_id == AT + 2  # the node publishes the newest one again
+    assert isinstance(newest, NavEstimate) and newest.frame_id == AT + 2  # the node publishes the newest one again
 
 
 def test_a_match_that_restarts_the_graph_gives_the_pose_of_the_newest_frame(flight: Flight, run: EstimatorRun) -> None:

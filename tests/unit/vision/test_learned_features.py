@@ -10,27 +10,14 @@ from terrafix.core.config import Config, Models, Vision
 from terrafix.core.errors import ModelError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
-from terrafix.messages import Camera, Frame, ModelChange, ModelEvent, Odometry, Origin, Verdict
+from terrafix.messages import Frame, ModelChange, ModelEvent, Odometry, Verdict
 from terrafix.vision.learned_features import LearnedMatcher
 from terrafix.vision.node import VisionNode, make_node
 from terrafix_engines.features import open_point_features
 from terrafix_engines.features.keypoints import Keypoints, MutualNearestMatcher
 from terrafix_engines.runtime import ModelFileError, ModelRunError
 from textured_ground import PINHOLE, rotation, texture, view
-
-ORIGIN = Origin(
-    t_ns=0,
-    camera=Camera(
-        width=PINHOLE.width, height=PINHOLE.height, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=PINHOLE.cx, cy=PINHOLE.cy
-    ),
-    lat_deg=47.0,
-    lon_deg=8.0,
-    ground_amsl_m=0.0,
-    start_sigma_m=10.0,
-    yaw_sigma_deg=3.0,
-    agl_sigma_m=3.0,
-    attitude_sigma_deg=1.0,
-)
+from vision_origin import PINHOLE_ORIGIN as ORIGIN
 
 
 class Upright:

@@ -4,25 +4,13 @@ import numpy as np
 import pytest
 
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.messages import Camera, Frame, Message, Odometry, Origin, Relocalization, Verdict
+from terrafix.messages import Frame, Message, Odometry, Relocalization, Verdict
 from terrafix.vision.edge import DROPPED_ERROR
 from terrafix.vision.node import VisionNode
 from textured_ground import PINHOLE, apply, homography, rotation, texture, view
+from vision_origin import PINHOLE_ORIGIN as ORIGIN
 
 AGL_M = 100.0
-ORIGIN = Origin(
-    t_ns=0,
-    camera=Camera(
-        width=PINHOLE.width, height=PINHOLE.height, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=PINHOLE.cx, cy=PINHOLE.cy
-    ),
-    lat_deg=47.0,
-    lon_deg=8.0,
-    ground_amsl_m=0.0,
-    start_sigma_m=10.0,
-    yaw_sigma_deg=3.0,
-    agl_sigma_m=3.0,
-    attitude_sigma_deg=1.0,
-)
 Place = tuple[float, float, float]  # east, north [m], yaw [degrees]
 
 

@@ -9,19 +9,10 @@ from terrafix.messages import Camera, Frame, KeyframeLink, Odometry, Origin, Ver
 from terrafix.vision.feature_tracker import FrameTracker, Link, Motion
 from terrafix.vision.node import VisionNode
 from terrafix.vision.relocalization import RelocalizationSearch
+from vision_origin import origin_of
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
-ORIGIN = Origin(
-    t_ns=0,
-    camera=CAMERA,
-    lat_deg=47.0,
-    lon_deg=8.0,
-    ground_amsl_m=0.0,
-    start_sigma_m=10.0,
-    yaw_sigma_deg=3.0,
-    agl_sigma_m=3.0,
-    attitude_sigma_deg=1.0,
-)
+ORIGIN = origin_of(CAMERA)
 
 
 def picture(seed: int) -> np.ndarray:

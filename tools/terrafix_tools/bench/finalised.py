@@ -8,14 +8,14 @@ a radial coefficient that is not described. The smoother is given the factors th
 that of the simulation. OUT: a JSON file, written after every flight."""
 
 import resource
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -27,6 +27,7 @@ from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Run
 from terrafix_tools.montecarlo.plan import FlightPlan, plan
+from terrafix_tools.standalone import run_standalone
 
 SEED, DURATION_S = 41, 300.0
 FOCAL_ERROR, FOCAL_SIGMA, K1_ERROR = 0.03, 0.05, -0.03  # of the true camera, relative; as described; of the true lens
@@ -99,7 +100,11 @@ def measure(number: int, duration_s: float = DURATION_S) -> dict[str, Any]:
     }
 
 
-def main(flights: int, out: Path, duration_s: float) -> None:
+def main(
+    flights: Annotated[int, typer.Argument(min=1, help="Flights, from number 0.")],
+    out: Annotated[Path, typer.Argument(help="JSON to write.")],
+    duration_s: Annotated[float, typer.Argument(metavar="[SECONDS]", help="Of each flight.")] = DURATION_S,
+) -> None:
     rows: list[dict[str, Any]] = []
     for number in range(flights):
         rows.append(measure(number, duration_s))
@@ -113,4 +118,4 @@ def main(flights: int, out: Path, duration_s: float) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) > 3 else DURATION_S)
+    run_standalone("bench.finalised", main)

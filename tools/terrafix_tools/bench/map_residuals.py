@@ -3,11 +3,12 @@
 FOLDER: the output of a replay. Every part is the mean length of what is left of the error of the matched points when
 one cause is taken out; the causes overlap, so the parts do not add up."""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -20,6 +21,7 @@ from terrafix_tools.accept.measuring.map_distortion import Residuals, left_by_lo
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.lens import Lens
 from terrafix_tools.finalise.run import flights_of
+from terrafix_tools.standalone import run_standalone
 
 MIN_AFFINE_POINTS = 8  # of a frame, for the six numbers of an affine displacement
 UNIFORM_LENGTH = 0.3826  # mean distance of a point in a unit square from its centre
@@ -30,10 +32,15 @@ def measure(folder: Path) -> list[tuple[str, float]]:
     messages = [message for _, _, message in read_flight(folder)]
     focal_px = next(m for m in messages if isinstance(m, Origin)).camera.fx
     received = [m for m in messages if isinstance(m, MapMatch) and m.verdict is Verdict.ACCEPTED and m.matches]
-    accepted = [match for match in map(solved, received) if match.pose is not None]
-    found = [residuals(match, focal_px) for match in accepted]
-    single = [match for match in received if match.pnp is not None and solved(match).pose is not None]
-    of_single = [residuals(solved(match), focal_px) for match in single]
+    found, single, of_single = list[Residuals](), list[MapMatch](), list[Residuals]()
+    for match in received:
+        placed = solved(match)
+        if placed.pose is None:
+            continue
+        found.append(residuals(placed, focal_px))
+        if match.pnp is not None:
+            single.append(match)
+            of_single.append(found[-1])
     lens = smooth(flights_of(folder)[0]).lens
     off_m = [f.off_m for f in found]
     height_m = float(np.mean([f.height_m for f in found]))
@@ -83,14 +90,14 @@ def _less_relief(frame: Residuals) -> np.ndarray:
     return np.asarray(across + share * along[:, None] * frame.outward)
 
 
-def main() -> None:
+def main(folder: Annotated[Path, typer.Argument(help="Output of a replay.")]) -> None:
     table = Table(title="Map matches: mean error when a cause is taken out", title_justify="left")
     table.add_column("taken out")
     table.add_column("px", justify="right")
-    for name, px in measure(Path(sys.argv[1])):
+    for name, px in measure(folder):
         table.add_row(name, f"{px:.2f}")
     Console().print(table)
 
 
 if __name__ == "__main__":
-    main()
+    run_standalone("bench.map_residuals", main)

@@ -10,7 +10,8 @@ from terrafix.runtime.run_dir import RunDir
 
 @dataclass(frozen=True)
 class ProcessState:
-    """``state``: "running", "starting", "stuck", "given up". ``idle_s``: since its last progress; None: none yet."""
+    """``state``: "running", "starting", "stuck", "given up", "stopped".
+    ``idle_s``: since its last progress; None: none yet."""
 
     name: str
     state: str

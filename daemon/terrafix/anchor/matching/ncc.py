@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from terrafix.anchor.matching.fft import cross_correlation, each_correlation, spectra, transform_shape
+from terrafix.anchor.matching.interpolation import interpolated
 
 MIN_OVERLAP = 0.8  # share of the template that must lie on valid map data; with less, the cell is NaN [tuned]
 # lower bound of the map's variance as a share of the template's, so that water and fields without texture are not
@@ -73,8 +74,10 @@ class _LocalSums:
         variance = (
             sums[self._channels] - np.einsum("khw,khw->hw", sums[: self._channels], sums[: self._channels]) / count
         )
-        overlap = None if self._is_valid_everywhere else _doubled(sums[self._channels + 1] / count, rows, columns)
-        return _doubled(variance, rows, columns), overlap
+        overlap = (
+            None if self._is_valid_everywhere else interpolated(sums[self._channels + 1] / count, 2, rows, columns)
+        )
+        return interpolated(variance, 2, rows, columns), overlap
 
 
 def _halved(layer: np.ndarray, border: int) -> np.ndarray:
@@ -82,13 +85,6 @@ def _halved(layer: np.ndarray, border: int) -> np.ndarray:
     height, width = layer.shape
     even = cv2.copyMakeBorder(layer, 0, height % 2, 0, width % 2, border)
     return np.asarray(cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA))
-
-
-def _doubled(half: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Values at every second row and column -> (rows, columns) of all."""
-    every_second = np.array([[0.5, 0.0, 0.0], [0.0, 0.5, 0.0]])
-    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(half, every_second, (columns, rows), flags=how, borderMode=cv2.BORDER_REPLICATE))
 
 
 def standardise(surface: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from terrafix.anchor.matching.interpolation import interpolated
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 
@@ -97,6 +98,4 @@ def _lens_map(camera: CameraCalibration, to_camera: np.ndarray, width: int, heig
     px = camera.project(rays)
     px[behind] = OUTSIDE_PX
     coarse = px.reshape(rows, columns, 2).astype(np.float32)
-    scale = np.array([[1.0 / LENS_STEP_PX, 0.0, 0.0], [0.0, 1.0 / LENS_STEP_PX, 0.0]])
-    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(coarse, scale, (width, height), flags=how))
+    return interpolated(coarse, LENS_STEP_PX, height, width)

@@ -5,6 +5,7 @@ Over a wide belief some place gathers most of the mass on any map. It is publish
 more than wrong places gain (Wald's sequential test). Every place that is tested spends a share of the flight's
 false-alarm budget, so that all of them together are wrong as rarely as the budget says."""
 
+from terrafix.anchor.matching.point_mass_filter import LLR_MIN
 from terrafix.anchor.verification.lock_monitor import MAX_GAIN
 from terrafix.map.null_model import FalseAlarmBudget
 
@@ -12,7 +13,6 @@ from terrafix.map.null_model import FalseAlarmBudget
 # 0.35, which would allow less than nothing; observations of one road are not independent.
 # [measured: docs/decisions/042-vectors-as-a-layer.md]
 NULL_GAIN = 1.0
-MIN_GAIN = -3.0  # bound of the likelihood ratio of one observation [spec: point_mass_filter.LLR_MIN]
 
 
 class PlaceTest:
@@ -30,5 +30,5 @@ class PlaceTest:
         if self._log_odds <= 0.0:
             self._log_odds = 0.0
             self._budget.spend()
-        self._log_odds += min(max(evidence_nats - NULL_GAIN * weight, MIN_GAIN * weight), MAX_GAIN * weight)
+        self._log_odds += min(max(evidence_nats - NULL_GAIN * weight, LLR_MIN * weight), MAX_GAIN * weight)
         return self._log_odds >= -self._budget.log_probability

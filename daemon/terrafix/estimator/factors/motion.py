@@ -50,7 +50,7 @@ def motion_factor(
     distorted.
 
     ``focal``: where the focal length is a variable, the residual is in heights as seen through the described lens. In
-    true heights it would be the smaller the longer the focal length is believed to be: the map gives the distances, so
+    true heights it would be the smaller the longer the estimated focal length is: the map gives the distances, so
     that the heights alone grow with the focal length.
 
     The residual is linear but for the heading bias, the axes of the poses, and the height that scales the increment

@@ -239,11 +239,10 @@ class PoseGraph:
     def _odometry_factor(self, node: int, new: NewNode) -> gtsam.NonlinearFactor:
         motion, parent = new.motion, new.parent
         if motion.rays is None:
-            between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
             cov = motion.cov.copy()
             if new.increment is not None:
                 cov[TRANSLATION, TRANSLATION] += LOOSE_TRANSLATION_M**2 * np.eye(3)
-            return gtsam.BetweenFactorPose3(C(parent), C(node), between, robust_noise(cov))
+            return gtsam.BetweenFactorPose3(C(parent), C(node), motion.between, robust_noise(cov))
         return self._two_view_factor(parent, node, new.state.pose, motion.rays)
 
     def _two_view_factor(self, keyframe: int, node: int, pose: gtsam.Pose3, rays: MatchedRays) -> gtsam.NonlinearFactor:

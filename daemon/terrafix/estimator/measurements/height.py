@@ -39,5 +39,5 @@ def is_below_map_matching(state: FilterState, attitude: Attitude, p_m: np.ndarra
     it, while the reported height, above ground that a map tells, would allow that."""
     if attitude.agl_m is None or attitude.stands or not state.terrain.has_dem or state.yaw_gauge is not None:
         return False
-    agl_m = float(p_m[UP]) - state.terrain.elevation_m(p_m)
+    agl_m = state.terrain.height_above_m(p_m)
     return agl_m < MIN_MATCHING_AGL_M and reported_agl_m(state, attitude, p_m) > LOW_RATIO * MIN_MATCHING_AGL_M

@@ -3,7 +3,6 @@ adjustment)."""
 
 from dataclasses import dataclass
 
-import gtsam
 import msgspec
 import numpy as np
 
@@ -30,7 +29,7 @@ class KeyframeLink:
     def innovation(self, state: FilterState) -> Innovation:
         """The camera by the link, less the camera by the parent, 6 degrees of freedom, tangent order."""
         first, second = state.graph.state(self.parent).pose, state.graph.state(self.keyframe).pose
-        since_first, since_second = _between(self.known), _between(self.motion)
+        since_first, since_second = self.known.between, self.motion.between
         residual = first.compose(since_first).logmap(second.compose(since_second))
         by_poses = np.hstack([-since_first.inverse().AdjointMap(), since_second.inverse().AdjointMap()])
         cov = by_poses @ state.graph.joint_pose_covariance(self.parent, self.keyframe) @ by_poses.T
@@ -61,7 +60,3 @@ def by_link(odometry: Odometry, i: int) -> Odometry:
         three_view=[],
         links=odometry.links[i + 1 :],
     )
-
-
-def _between(motion: RelativePose) -> gtsam.Pose3:
-    return gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)

@@ -151,7 +151,7 @@ class OdometryMeasurement:
         moved = gtsam.Pose3(before.pose.rotation(), before.pose.translation() + np.array([0.0, 0.0, risen]))
         guess = ThreeViewPose(
             middle.pose.between(moved),
-            gtsam.Pose3(gtsam.Rot3.ClosestTo(seen.motion.r), seen.motion.p_m),
+            seen.motion.between,
             float(middle.pose.translation()[UP]) - ground_m,
             ground_m,
             float(middle.bias[RADIAL_K1]),

@@ -51,9 +51,8 @@ class RelocalizationMeasurement:
         motion = plane_motion(state, keyframe, seen, (r_w_c, tilt_sigma), keyframe.height_m)
         if isinstance(motion, Verdict):
             return motion
-        between = gtsam.Pose3(gtsam.Rot3.ClosestTo(motion.r), motion.p_m)
-        moved = between.inverse().AdjointMap()
-        return cls(keyframe.pose.compose(between), moved @ keyframe.cov @ moved.T + motion.cov, motion)
+        moved = motion.between.inverse().AdjointMap()
+        return cls(keyframe.pose.compose(motion.between), moved @ keyframe.cov @ moved.T + motion.cov, motion)
 
     def innovation(self, state: FilterState, node: int) -> Innovation:
         """Innovation of the pose, 6 degrees of freedom, tangent order. Its covariance is the largest that both errors

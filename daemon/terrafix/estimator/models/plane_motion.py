@@ -2,6 +2,7 @@
 
 from dataclasses import KW_ONLY, dataclass, replace
 
+import gtsam
 import numpy as np
 
 from terrafix.core.camera import undistort_division
@@ -58,6 +59,11 @@ class RelativePose:
     p_m: np.ndarray
     cov: np.ndarray
     rays: "MatchedRays | None" = None
+
+    @property
+    def between(self) -> gtsam.Pose3:
+        """The same for GTSAM, whose rotations are orthonormal to rounding."""
+        return gtsam.Pose3(gtsam.Rot3.ClosestTo(self.r), self.p_m)
 
 
 @dataclass(frozen=True)

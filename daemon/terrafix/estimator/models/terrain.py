@@ -4,7 +4,7 @@ import numpy as np
 
 from terrafix.estimator.models.plane_motion import Ground
 from terrafix.estimator.models.terrain_roughness import TerrainRoughness
-from terrafix.estimator.state import HORIZONTAL
+from terrafix.estimator.state import HORIZONTAL, UP
 from terrafix.messages import GroundPlane
 
 # 1-sigma of slope and of level (share of the height) of the visible ground: fields and towns without a DEM; with a DEM,
@@ -48,6 +48,10 @@ class Terrain:
         slope, away_m = np.array(self._slope or (0.0, 0.0)), p_m[HORIZONTAL] - self._at_m
         reach_m = float(np.hypot(*away_m))
         return self.ground_m + float(slope @ away_m) * min(1.0, SLOPE_REACH_M / max(reach_m, 1.0))
+
+    def height_above_m(self, p_m: np.ndarray) -> float:
+        """Height of a point (3,), east, north and AMSL, above the ground under it."""
+        return float(p_m[UP]) - self.elevation_m(p_m)
 
     def rise_sigma_m(self, distance_m: float) -> float:
         """1-sigma of the change of elevation over a distance, without a DEM; 0 with one."""
