@@ -136,13 +136,19 @@ class MapUpdate:
         sigma_m = float(np.sqrt(np.max(np.diag(tangent_to_world(state.covariance(node), r_w_c))[:2])))
         if match.position_only and sigma_m > COARSE_CONTINUES * height_m:
             offset = (measurement.pose.translation() - predicted.translation())[:2]
-            self._coarse.add(offset, predicted.translation()[:2], position_only=True)
+            self._coarse.re_estimate(self._position_of)
+            self._coarse.add(offset, predicted.translation()[:2], position_only=True, node=node)
             if not self._coarse.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height_m):
                 return _result(
                     Verdict.AMBIGUOUS, "coarse match: the estimate is too uncertain, six consistent ones are needed"
                 )
         self._coarse.clear()
         return None
+
+    def _position_of(self, node: int) -> np.ndarray | None:
+        """(2,) east and north of a node; None: it has left the window."""
+        graph = self._state.graph
+        return np.asarray(graph.state(node).pose.translation()[:2]) if graph.holds(node) else None
 
     def _fuse(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult:
         state, height_m, here = self._state, self._height_m(measurement), measurement.position_m

@@ -121,7 +121,7 @@ class GraphRecorder(GraphObserver):
         if new.increment is not None and new.velocity_cov is None:  # others[0] is that of the increment
             n, last = graph.next_node, graph.newest
             keys = (C(last), V(last)), (C(n), V(n)), (B(last), B(n))
-            others = [motion_factor(*keys, new.increment, FocalKey(F(0), 0.0)), *others[1:]]
+            others = [motion_factor(*keys, new.increment, new.state.pose.rotation(), FocalKey(F(0), 0.0)), *others[1:]]
         triples = None
         if new.three_view is not None:
             first, constraint = new.three_view
