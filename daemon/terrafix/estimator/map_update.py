@@ -22,7 +22,7 @@ from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.map_pose import FixedPose, MapPoseMeasurement, determined, levelled
 from terrafix.estimator.models.motion_model import unknown_motion_cov
 from terrafix.estimator.propagation import STEP_SHARE
-from terrafix.estimator.state import HEIGHT, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
+from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import MapMatch, Verdict
 
 # Of the height: 1-sigma of the estimate up to which a coarse match, the mode of the belief alone, is fused.
@@ -99,9 +99,12 @@ class MapUpdate:
             return self._reset(match, node, measurement, "found")
         if state.yaw_gauge is not None:
             return self._apply_without_heading(match, node, measurement)
-        if refusal := self._coarse_refusal(match, node, measurement):
+        finds = match.position_only and self._is_uncertain(node, measurement)
+        if match.position_only and (refusal := self._coarse_refusal(node, measurement, finds=finds)):
             return refusal
-        return self._fuse(match, node, measurement)
+        self._coarse.clear()
+        result = self._fuse(match, node, measurement)
+        return self._restarted(result) if finds and result.fixed is not None else result
 
     def _update_belief(self, match: MapMatch, node: int | None) -> str:
         """Ground and belief of the newest frame. -> detail of the verdict on a match that is LOST; else empty."""
@@ -126,23 +129,29 @@ class MapUpdate:
             return self._reject(match, node, measurement, innovation)
         return self._reset(match, node, measurement, "heading found")
 
-    def _coarse_refusal(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult | None:
-        """Why a coarse match is not fused; None: it is to be fused, or the match is not coarse."""
-        state = self._state
-        if match.position_only and not state.fragments.of(node).confirmed:  # its position comes from earlier frames
+    def _is_uncertain(self, node: int, measurement: MapPoseMeasurement) -> bool:
+        """Whether the estimate is too uncertain for a coarse match to continue it."""
+        cov = tangent_to_world(self._state.covariance(node), measurement.pose.rotation().matrix())
+        return float(np.sqrt(np.max(np.diag(cov)[HORIZONTAL]))) > COARSE_CONTINUES * self._height_m(measurement)
+
+    def _coarse_refusal(self, node: int, measurement: MapPoseMeasurement, *, finds: bool) -> MapResult | None:
+        """Why a coarse match is not fused; None: it is. ``finds``: the estimate is too uncertain to be continued."""
+        if not self._state.fragments.of(node).confirmed:  # its position comes from earlier frames
             return _result(Verdict.UNCONFIRMED, "coarse match cannot confirm an odometry fragment")
-        predicted, height_m = state.graph.state(node).pose, self._height_m(measurement)
-        r_w_c = measurement.pose.rotation().matrix()
-        sigma_m = float(np.sqrt(np.max(np.diag(tangent_to_world(state.covariance(node), r_w_c))[:2])))
-        if match.position_only and sigma_m > COARSE_CONTINUES * height_m:
-            offset = (measurement.pose.translation() - predicted.translation())[:2]
-            self._coarse.add(offset, predicted.translation()[:2], position_only=True)
-            if not self._coarse.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height_m):
+        predicted_m = self._state.graph.state(node).pose.translation()[HORIZONTAL]
+        if finds:
+            self._coarse.re_estimate(self._position_of)
+            self._coarse.add(measurement.position_m - predicted_m, predicted_m, position_only=True, node=node)
+            if not self._coarse.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * self._height_m(measurement)):
                 return _result(
                     Verdict.AMBIGUOUS, "coarse match: the estimate is too uncertain, six consistent ones are needed"
                 )
-        self._coarse.clear()
         return None
+
+    def _position_of(self, node: int) -> np.ndarray | None:
+        """(2,) east and north of a node; None: it has left the window."""
+        graph = self._state.graph
+        return np.asarray(graph.state(node).pose.translation()[HORIZONTAL]) if graph.holds(node) else None
 
     def _fuse(self, match: MapMatch, node: int, measurement: MapPoseMeasurement) -> MapResult:
         state, height_m, here = self._state, self._height_m(measurement), measurement.position_m
@@ -248,6 +257,19 @@ class MapUpdate:
         others.append(FusionVerdict("reset", Verdict.ACCEPTED, None, f"{ResetReason.MAP_MATCH}: {how}"))
         accepted = FusionVerdict(measurement.name, Verdict.ACCEPTED, None, detail)
         return MapResult(accepted, tuple(others), fixed)
+
+    def _restarted(self, result: MapResult) -> MapResult:
+        """A new graph at the present estimate, which ``result`` has moved far. What had left the window is linear
+        around the estimate of then, and would contradict what follows from the new one: heights went off by a sixth."""
+        state, newest = self._state, self._state.graph.newest
+        assert state.last is not None
+        covs = state.covariance(newest), state.covariances.calibration(newest), state.covariances.velocity(newest)
+        cov, bias_cov, velocity_cov = (RESTART_INFLATION * one for one in covs)
+        prior = GraphPrior(state.graph.state(newest), cov, bias_cov, velocity_cov)
+        reset(state, state.last.frame_id, state.graph.time_of(newest), prior)
+        state.last = state.frame_state(state.last.frame_id, state.last.t_s, state.graph.newest)
+        verdict = FusionVerdict("reset", Verdict.ACCEPTED, None, f"{ResetReason.MAP_MATCH}: found by coarse matches")
+        return replace(result, others=(*result.others, verdict))
 
     def _moved_cov(self, cov: np.ndarray, onward: gtsam.Pose3, dt_s: float) -> np.ndarray:
         """``cov`` (6, 6), tangent order, of a pose, inflated, at the end of the motion ``onward`` of ``dt_s``."""

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -21,6 +22,7 @@ from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.estimates import RowTable, write_rows
 from terrafix_tools.evaluate import evaluate
+from terrafix_tools.finalise.point_cloud import VERTEX
 from terrafix_tools.finalise.run import finalise, last_lines
 from terrafix_tools.report.page import report
 
@@ -50,6 +52,19 @@ def test_finalised_csv_has_a_row_per_frame(flown: Path) -> None:
     focal, k1 = summary["flights"][0]["before_after"][:2]
     assert focal["before"] == focal["after"] == 560.0  # no point was seen by three keyframes
     assert k1["what"] == "radial coefficient" and 0.0 < k1["after_sigma"] < 0.05
+
+
+def test_points_of_the_ground_are_written_beside_the_track(flown: Path) -> None:
+    """The simulated ground is level: the points are at its elevation, as far as their sigma and the heights say."""
+    body = (flown / "points.ply").read_bytes().split(b"end_header\n", 1)[1]
+    points = np.frombuffer(body, VERTEX)
+    summary = json.loads((flown / "finalised.json").read_text(encoding="utf-8"))
+    assert len(points) == summary["flights"][0]["points"] > 500
+    assert np.median(points["views"]) >= 2 and set(points["fragment"].tolist()) == {0}
+    ground_m = float(np.median(points["z"]))
+    assert np.median(np.abs(points["z"] - ground_m) / points["sigma"]) < 1.0
+    rows = rows_of(flown)
+    assert float(rows[0]["alt_amsl_m"]) - ground_m == pytest.approx(100.0, rel=0.05)
 
 
 def test_finalising_the_same_record_gives_identical_bytes(flown: Path, tmp_path: Path) -> None:

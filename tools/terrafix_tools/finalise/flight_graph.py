@@ -35,6 +35,7 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix_tools.finalise.map_points import MatchedPoints
+from terrafix_tools.finalise.point_cloud import FeatureTracks
 
 SAME_FRAME_M, SAME_FRAME_MPS = 0.01, 0.01  # 1-sigma (m and rad; m/s) between two nodes of one frame
 SAME_FRAME_WALK = 0.01  # share of one second's random walk of B between these
@@ -121,7 +122,7 @@ class GraphRecorder(GraphObserver):
         if new.increment is not None and new.velocity_cov is None:  # others[0] is that of the increment
             n, last = graph.next_node, graph.newest
             keys = (C(last), V(last)), (C(n), V(n)), (B(last), B(n))
-            others = [motion_factor(*keys, new.increment, FocalKey(F(0), 0.0)), *others[1:]]
+            others = [motion_factor(*keys, new.increment, new.state.pose.rotation(), FocalKey(F(0), 0.0)), *others[1:]]
         triples = None
         if new.three_view is not None:
             first, constraint = new.three_view
@@ -175,6 +176,7 @@ class FlightGraph:
     radial_k1: tuple[float, float] = 0.0, 0.0  # final radial coefficient, and its 1-sigma
     principal_point: PrincipalPointFilter | None = None
     has_height: bool = False  # the autopilot reported one
+    features: FeatureTracks = field(default_factory=FeatureTracks)
 
 
 class FlightReplayer:
@@ -200,6 +202,7 @@ class FlightReplayer:
         elif isinstance(message, Odometry) and any(isinstance(s, NavEstimate) for s in published):
             flight.node_of[message.frame_id] = flight.recorder.graph.newest
             flight.recorder.add_triples(message)
+            flight.features.add(message)
             flight.radial_k1 = estimator.state.radial_k1_estimate
             flight.principal_point = estimator.state.principal_point
         elif isinstance(message, MapMatch):

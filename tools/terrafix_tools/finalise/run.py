@@ -27,6 +27,7 @@ from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
 from terrafix_tools.finalise.before_after import Change
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.output import TABLE, FinalRow, write
+from terrafix_tools.finalise.point_cloud import POINTS, VERTEX, cloud_name, write_ply
 
 # Messages that the estimator subscribes to. SourceEnded is left out: it starts the estimator's own refinement.
 REPLAYED = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.subscribes if t is not SourceEnded)
@@ -35,24 +36,29 @@ Step = Callable[[str, int, int | None], None]
 
 
 def finalise(folder: Path, *, progress: bool = False) -> dict[str, Any]:
-    """Writes finalised.csv and finalised.json beside the record and returns the summary (docs/finalise.md).
+    """Writes finalised.csv, finalised.json and points.ply beside the record, returns the summary (docs/finalise.md).
 
     ``folder``: of a replay or of a live run, or a record file in it. Raises SourceError, OutputError."""
     began_s = time.process_time()
     result = ReadResult()
     with _bar(progress) as step:
         rows, flights = _replay(folder, result, step)
+        smoothed = [_smoothed(flight, rows, step) for flight in flights]
         summary: dict[str, Any] = {
             "record": [path.name for path in result.files],
             "cut_off": [path.name for path in result.truncated_files],
             "undecodable": result.undecodable,
             "frames": len(rows),
             "versions": versions(),
-            "flights": [_smoothed(flight, rows, step) for flight in flights],
+            "flights": [part for part, _ in smoothed],
         }
     summary["finalised"] = sum(row.lat_deg is not None for row in rows.values())
     summary["cpu_s"] = round(time.process_time() - began_s, 2)
-    write(folder if folder.is_dir() else folder.parent, list(rows.values()), summary)
+    out = folder if folder.is_dir() else folder.parent
+    write(out, list(rows.values()), summary)
+    for i, (flight, (_, points)) in enumerate(zip(flights, smoothed, strict=True)):
+        axes = LocalFrame(flight.origin.lat_deg, flight.origin.lon_deg)
+        write_ply(out / cloud_name(i), points, axes)
     return summary
 
 
@@ -68,6 +74,7 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
             yield "No map match was accepted: the track follows from the start coordinate and odometry alone."
         for why in flight["not_placed"]:
             yield f"{why['frames']} frames have no position: {why['why']}."
+    yield f"{sum(flight['points'] for flight in summary['flights'])} points of the ground in {folder / POINTS}"
     found = [f["map_matches"] for f in summary["flights"]]
     yield (
         f"{summary['finalised']} of {summary['frames']} frames placed by {sum(f['believed'] for f in found)} map "
@@ -101,13 +108,14 @@ def _replay(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, Fin
     return rows, [flight for flight in replayer.flights if flight.node_of]
 
 
-def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> dict[str, Any]:
-    """Fills the rows of one flight. -> its part of the summary."""
+def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> tuple[dict[str, Any], np.ndarray]:
+    """Fills the rows of one flight. -> its part of the summary, and its point cloud."""
     try:
         found = smooth(flight, lambda done, of: step("smooth", done, of))
     except RuntimeError as error:  # GTSAM: the system is indeterminate
         reason = f"the measurements do not determine the track ({str(error).strip().splitlines()[0]})"
-        return _summary(flight, None, [{"frames": len(flight.node_of), "why": reason}])
+        summary = _summary(flight, None, [{"frames": len(flight.node_of), "why": reason}])
+        return {**summary, "points": 0}, np.zeros(0, VERTEX)
     frame = LocalFrame(flight.origin.lat_deg, flight.origin.lon_deg)
     r_b_c = Mount.of(flight.origin.camera).r_b_c()
     lost: Counter[int] = Counter()
@@ -117,7 +125,10 @@ def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> dic
         elif frame_id in rows:
             _fill(rows[frame_id], found, node, frame, r_b_c)
     why = "no map match is accepted there, and its start is unknown"
-    return _summary(flight, found, [{"frames": count, "why": why} for count in lost.values()])
+    summary = _summary(flight, found, [{"frames": count, "why": why} for count in lost.values()])
+    cameras = {frame_id: found.poses[node] for frame_id, node in flight.node_of.items() if found.placed[node]}
+    points = flight.features.triangulated(cameras, found.lens)
+    return {**summary, "points": len(points)}, points
 
 
 def _fill(row: FinalRow, found: Smoothed, node: int, frame: LocalFrame, r_b_c: np.ndarray) -> None:

@@ -47,17 +47,16 @@ class LockMonitor:
         ``new``: share of new ground, since repeated observations of one field are no evidence against it;
         ``inliers`` of the pose, 0: no pose.
 
-        ``sigma_m``: 1-sigma of the position. If it is large the log odds are not updated, because over a wide belief
-        the right position gains little too; they are limited to those of a start, because the flight since then was not
-        observed.
+        ``sigma_m``: 1-sigma of the position. If it is large nothing counts against the position, because over a wide
+        belief the right one gains little too, and the log odds are limited to those of a start, because the flight
+        since then was not observed. What counts for it ends a doubt from before.
         """
-        if has_wide_sigma(sigma_m, agl_m):
-            self.log_odds = min(self.log_odds, START_LOG_ODDS)
-            return
-        self.log_odds += min(max(evidence_nats - NULL_GAIN * weight, MIN_GAIN * new), MAX_GAIN * weight)
+        is_wide = has_wide_sigma(sigma_m, agl_m)
+        least, most = (0.0, START_LOG_ODDS) if is_wide else (MIN_GAIN * new, MAX_LOG_ODDS)
+        self.log_odds += min(max(evidence_nats - NULL_GAIN * weight, least), MAX_GAIN * weight)
         if inliers:
             self.log_odds += weight * pose_gain(inliers)
-        self.log_odds = min(self.log_odds, MAX_LOG_ODDS)
+        self.log_odds = min(self.log_odds, most)
 
 
 def has_wide_sigma(sigma_m: float, agl_m: float) -> bool:

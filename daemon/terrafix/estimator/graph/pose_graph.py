@@ -266,7 +266,8 @@ class PoseGraph:
             noise = gtsam.noiseModel.Gaussian.Covariance(new.velocity_cov)
             return gtsam.PriorFactorVector(V(node), new.state.velocity, noise)
         if increment is not None:
-            return motion_factor((C(newest), V(newest)), (C(node), V(node)), (B(newest), B(node)), increment)
+            keys = (C(newest), V(newest)), (C(node), V(node)), (B(newest), B(node))
+            return motion_factor(*keys, increment, new.state.pose.rotation())
         stationary = gtsam.noiseModel.Gaussian.Covariance(stationary_motion_cov())
         return gtsam.PriorFactorVector(V(node), np.zeros(MOTION_SIZE), stationary)
 

@@ -74,12 +74,23 @@ def test_the_log_odds_are_bounded_so_that_a_lock_can_be_lost_again() -> None:
     assert monitor.log_odds == MAX_LOG_ODDS == 20.0
 
 
-def test_a_position_with_a_wide_sigma_is_not_tested_and_has_the_odds_of_a_start_at_most() -> None:
+def test_nothing_counts_against_a_position_with_a_wide_sigma_that_has_the_odds_of_a_start_at_most() -> None:
     sure, doubted = LockMonitor(), LockMonitor()
     sure.log_odds, doubted.log_odds = MAX_LOG_ODDS, 1.0
     for monitor in (sure, doubted):
-        monitor.update(-5.0, 1.0, 1.0, 30, 60.0, AGL_M)
+        monitor.update(-5.0, 1.0, 1.0, 0, 60.0, AGL_M)
     assert (sure.log_odds, doubted.log_odds) == (START_LOG_ODDS, 1.0)
+
+
+def test_evidence_and_poses_end_a_doubt_from_before_the_sigma_was_wide() -> None:
+    monitor = LockMonitor()
+    monitor.log_odds = 1.0
+    monitor.update(4.5, 1.0, 1.0, 0, 60.0, AGL_M)
+    assert monitor.log_odds == pytest.approx(2.5) and monitor.wrong_probability > 0.0
+    monitor.update(-5.0, 1.0, 1.0, 8, 60.0, AGL_M)
+    assert monitor.log_odds == pytest.approx(5.5) and monitor.wrong_probability == 0.0
+    monitor.update(4.5, 1.0, 1.0, 0, 60.0, AGL_M)
+    assert monitor.log_odds == START_LOG_ODDS
 
 
 @pytest.mark.parametrize(

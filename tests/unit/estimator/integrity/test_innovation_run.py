@@ -1,6 +1,7 @@
 """Runs of consecutive rejected fixes with consistent offsets."""
 
 import numpy as np
+import pytest
 
 from terrafix.estimator.integrity.innovation_run import CONSISTENT_M, InnovationRun
 
@@ -39,3 +40,18 @@ def test_clear_empties_the_run() -> None:
     run = make_run([(100.0, 0.0)] * 5)
     run.clear()
     assert not run.is_confirmed(1, 0.0) and run.poses == 0
+
+
+def test_fixes_agree_if_the_estimate_that_has_moved_since_explains_their_offsets() -> None:
+    """The estimate turns about its last fix between two frames: the second offset is 20 m off the first one. With both
+    frames as estimated now they agree; a node that has left the window keeps its offset."""
+    run, now_m = InnovationRun(), {1: np.array([0.0, 20.0]), 2: np.array([60.0, 20.0])}
+    run.add(np.array([100.0, 0.0]), np.array([0.0, 0.0]), position_only=True, node=1)
+    run.re_estimate(now_m.get)
+    assert run.offsets_m[0] == pytest.approx([100.0, -20.0])
+    assert run.add(np.array([100.0, -20.0]), np.array([60.0, 20.0]), position_only=True, node=2)
+    run.re_estimate({2: np.array([61.0, 20.0])}.get)
+    assert run.offsets_m[0] == pytest.approx([100.0, -20.0]) and run.offsets_m[1] == pytest.approx([99.0, -20.0])
+    run.clear()
+    run.re_estimate(now_m.get)
+    assert not run.offsets_m

@@ -10,7 +10,7 @@ import pytest
 from gtsam.symbol_shorthand import B, C, F, V
 
 from inertial_flight import ORIGIN, InertialFlight, flown
-from terrafix.core.geodesy import rot_w_b
+from terrafix.core.geodesy import local_rotation_up, rot_w_b
 from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.motion import motion_factor
 from terrafix.estimator.factors.noise import HUBER_K
@@ -27,7 +27,7 @@ from terrafix.estimator.models.motion_model import (
     velocity_correlation_time_s,
 )
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE
+from terrafix.estimator.state import CALIBRATION_SIZE, HEADING, MOTION_SIZE
 from terrafix.messages import (
     CovarianceMode,
     Imu,
@@ -248,7 +248,8 @@ def test_the_jacobians_of_the_motion_factor_match_numerical_differences(measured
         values.insert(C(node), gtsam.Pose3(gtsam.Rot3(rot_w_b(yaw, 0.1, 0.2)), np.array(at)))
         values.insert(V(node), np.array([18.0, 7.0, 0.5, 0.1, -0.2, 0.05, 0.03, -0.04]))
         values.insert(B(node), np.array([0.01, 0.02, 0.05, 1.0, 0.005]))
-    factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), increment)
+    camera = gtsam.Rot3(rot_w_b(1.3, 0.1, 0.2))  # when the increment was made: 0.1 rad from the values
+    factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), increment, camera)
     whitened = np.linalg.inv(np.linalg.cholesky(increment.cov))
     analytic, _ = factor.linearize(values).jacobian()
     numeric = []
@@ -265,6 +266,42 @@ def test_the_jacobians_of_the_motion_factor_match_numerical_differences(measured
     assert analytic.T @ analytic == pytest.approx(numeric_w.T @ numeric_w, rel=1e-3, abs=1e-2 * np.abs(analytic).max())
 
 
+@pytest.mark.parametrize("measured", [False, True])
+@pytest.mark.parametrize("above", [False, True])
+def test_the_motion_factor_does_not_observe_a_rotation_of_the_whole_flight(measured: bool, above: bool) -> None:
+    """Neither its error nor its linearization where the residual is tens of sigmas: with axes fixed in the world the
+    derivative along such a rotation was the residual itself."""
+    acceleration = coordinated_turn(6.0).world_acceleration(S, 2 * S) if measured else None
+    increment = integrate_motion(1.0, acceleration, (1.2, 1.4), 0.05, 20.0, 0.01, same_source=True)
+    increment = replace(increment.in_height_units(90.0, 6.0), terrain_unknown=True) if above else increment
+    factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), increment, gtsam.Rot3(rot_w_b(1.4, 0.1, 0.2)))
+
+    def values_turned(angle_rad: float) -> gtsam.Values:
+        values, turn = gtsam.Values(), local_rotation_up(angle_rad)
+        for node, (yaw, at) in enumerate(((1.2, (0.0, 0.0, 100.0)), (1.4, (38.0, 6.0, 101.0)))):
+            values.insert(C(node), gtsam.Pose3(gtsam.Rot3(turn @ rot_w_b(yaw, 0.1, 0.2)), turn @ np.array(at)))
+            velocity_mps = turn @ np.array([8.0, 17.0, 0.5])
+            values.insert(V(node), np.array([*velocity_mps, 0.1, -0.2, 0.05, 0.03, -0.04]))
+            values.insert(B(node), np.array([0.01, 0.02, 0.05 + angle_rad, 1.0, 0.005, 0.0]))
+        return values
+
+    error = factor.unwhitenedError(values_turned(0.0))
+    assert np.abs(error).max() > 0.1
+    assert factor.unwhitenedError(values_turned(0.3)) == pytest.approx(error, abs=1e-9)
+    values = values_turned(0.0)
+    jacobian, _ = factor.linearize(values).jacobian()
+    rotation, up = list[np.ndarray](), np.array([0.0, 0.0, 1.0])
+    for key in factor.keys():  # noqa: SIM118
+        if key in (C(0), C(1)):
+            pose = values.atPose3(key)
+            rotation += [pose.rotation().unrotate(up), pose.rotation().unrotate(np.cross(up, pose.translation()))]
+        elif key in (V(0), V(1)):
+            rotation += [np.cross(up, values.atVector(key)[:3]), np.zeros(MOTION_SIZE - 3)]
+        else:
+            rotation.append(np.eye(CALIBRATION_SIZE)[HEADING])
+    assert jacobian @ np.concatenate(rotation) == pytest.approx(np.zeros(len(jacobian)), abs=1e-6)
+
+
 def test_an_increment_without_imu_in_height_units_does_not_constrain_the_height() -> None:
     """The same flight at half the height with half the translations has the same error; an inertial one has not."""
     ground_m, errors = 40.0, {}
@@ -279,7 +316,9 @@ def test_an_increment_without_imu_in_height_units_does_not_constrain_the_height(
                 values.insert(C(node), gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, ground_m]) + scale * np.array(at)))
                 values.insert(V(node), np.concatenate([scale * np.array([18.0, 7.0, 0.5]), np.zeros(MOTION_SIZE - 3)]))
             values.insert(B(1), np.zeros(CALIBRATION_SIZE))
-            errors[measured, scale] = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), increment).error(values)
+            errors[measured, scale] = motion_factor(
+                (C(0), V(0)), (C(1), V(1)), (B(0), B(1)), increment, gtsam.Rot3()
+            ).error(values)
     assert errors[False, 0.5] == pytest.approx(errors[False, 1.0], rel=1e-9)
     assert errors[True, 0.5] != pytest.approx(errors[True, 1.0], rel=0.01)
 
@@ -299,7 +338,7 @@ def test_an_increment_in_heights_as_seen_does_not_constrain_the_focal_length(mea
             values.insert(V(node), np.array([18.0, 7.0, *np.zeros(MOTION_SIZE - 2)]))
         values.insert(B(1), np.zeros(CALIBRATION_SIZE))
         values.insert(F(0), np.array([log_focal]))
-        factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), seen, FocalKey(F(0), 0.0))
+        factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), seen, gtsam.Rot3(), FocalKey(F(0), 0.0))
         errors.append(factor.unwhitenedError(values))
         jacobians.append(factor.linearize(values).jacobian()[0])
     assert errors[1] == pytest.approx(errors[0], rel=1e-9) and np.abs(errors[0]).max() > 0.1
@@ -330,7 +369,7 @@ def test_only_an_increment_without_imu_in_height_units_has_a_huber_loss(
     values.insert(B(1), np.zeros(CALIBRATION_SIZE))
     if above:
         increment = increment.in_height_units(100.0, -100.0)
-    factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), increment)
+    factor = motion_factor((C(0), V(0)), (C(1), V(1)), (B(0), B(1)), increment, gtsam.Rot3())
     assert factor.error(values) == pytest.approx(cost)
 
 
