@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+import msgspec
+
 from terrafix.anchor.initial_position import check_initial_position
 from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.descriptor_cache import Describer
@@ -122,6 +124,10 @@ class AnchorNode:
                 self._model = ModelMonitor(describer)
                 self._localizer.replace_describer(describer, prediction.agl_m)
             return self._localizer.skipped(prediction, Verdict.MODEL_FAILED)
+        if self._model.is_learned and not self._model.has_run:
+            match = msgspec.structs.replace(
+                match, matcher=match.matcher.replace(self._model.name, GradientDescriber.name)
+            )
         self._pending += self._model.succeeded(prediction.t_ns)
         return match
 

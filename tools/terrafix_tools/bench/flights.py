@@ -100,7 +100,9 @@ def measure(flight: Path, map_path: Path, out: Path, xfeat: Path | None) -> dict
     if truth.is_file():
         found = metrics(rows, read_truth(truth), read_summary(out), truth_sigma_of(truth))
         keys = ("within_20m", "within_50m", "median_m", "p95_m", "ellipse95_coverage", "false_fixes", "localised")
-        result["accuracy"] = {key: found[key] for key in (*keys, "refined_within_20m", "refined_median_m")}
+        result["accuracy"] = {
+            key: found[key] for key in (*keys, "refined_within_20m", "refined_median_m", "model_rate")
+        }
     return result
 
 

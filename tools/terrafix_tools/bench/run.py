@@ -1,5 +1,5 @@
-"""`terrafix bench`: time, memory and accuracy of whole replays, compared with a SIFT + RANSAC baseline on the same
-frames.
+"""`terrafix bench`: time, memory and accuracy of whole replays, compared with peers on the same frames: SIFT + RANSAC,
+which is the baseline of all ratios, AKAZE, XFeat and LighterGlue.
 
 Every measurement runs in its own process, one after the other. Milliseconds depend on the machine and its load; the
 ratio to the baseline, measured minutes apart on the same machine, depends on them less, and the ratio of processor
@@ -20,9 +20,9 @@ from rich.table import Table
 from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
 from terrafix.core.toml_file import read_toml
 from terrafix.recorder.provenance import device, versions
-from terrafix_tools.bench import baseline as bench_baseline
 from terrafix_tools.bench import flights as bench_run
 from terrafix_tools.bench import micro as bench_micro
+from terrafix_tools.bench import peers as bench_peers
 from terrafix_tools.bench import scaling
 from terrafix_tools.mapping.build import build, ensure_package
 from terrafix_tools.replay import map_cache_dir
@@ -154,10 +154,11 @@ def _flight(flight: Path, package: Path, work: Path, model: Path | None, console
     for kind in (WEIGHTS_FREE, XFEAT) if model else (WEIGHTS_FREE,):
         with console.status(f"{work.name}: {kind}"):
             runs[kind] = _part(bench_run, flight, package, work / kind, model if kind == XFEAT else None)
-    with console.status(f"{work.name}: {bench_baseline.METHOD}"):
-        baseline = _part(bench_baseline, flight, package, work / WEIGHTS_FREE, None)
+    with console.status(f"{work.name}: peers"):
+        found = _part(bench_peers, flight, package, work / WEIGHTS_FREE, model.parent if model else None)
+    baseline = {"method": bench_peers.SIFT_METHOD, "frames": found["frames"], **found["peers"].pop(bench_peers.SIFT)}
     ratios = {kind: _ratios(run, baseline) for kind, run in runs.items()}
-    return {"frames": baseline["frames"], "runs": runs, "baseline": baseline, "ratios": ratios}
+    return {"runs": runs, "baseline": baseline, "ratios": ratios, **found}
 
 
 def _ratios(run: dict[str, Any], baseline: dict[str, Any]) -> dict[str, float | None]:
@@ -207,10 +208,12 @@ def _show(result: dict[str, Any], out: Path) -> None:
             table.add_row(key.replace("_", " ").replace("m", " m"), *cells)
         cells = ["-" if (v := r["accuracy"]["median_m"]) is None else f"{v:.1f} m" for r in (*runs.values(), baseline)]
         table.add_row("median error", *cells)
+        table.add_row("frames with the model", *(_percent(r["accuracy"]["model_rate"]) for r in runs.values()), "")
         table.add_row("frames a second", *(f"{r['frames_per_s']:.1f}" for r in runs.values()), "")
         table.add_row("start-up", *(f"{r['start_up_s']:.1f} s" for r in runs.values()), "")
         table.add_row("peak memory", *(f"{r['peak_memory_mb']:.0f} MB" for r in runs.values()), "")
         console.print(table)
+        _show_peers(flight, console)
     micro = {part: times for part, times in result["micro"].items() if isinstance(times, dict)}
     table = Table(title=f"parts, on {result['micro']['flight']}", title_justify="left")
     table.add_column("")
@@ -221,6 +224,20 @@ def _show(result: dict[str, Any], out: Path) -> None:
     if "growth" in result:
         scaling.show(result["growth"], console)
     typer.echo(f"written to {out}")
+
+
+def _show_peers(flight: dict[str, Any], console: Console) -> None:
+    """Ours and the peers, on the same frames and predictions."""
+    table = Table(title="the map matcher beside others, processor time of a frame", title_justify="left")
+    for name in ("", "within 20 m", "ms (median / p95)", "with the map's points kept"):
+        table.add_column(name, justify="right" if name else "left")
+    frames, baseline = flight["frames"], flight["baseline"]
+    for name, row in (*flight["runs"].items(), (baseline["method"], baseline), *flight["peers"].items()):
+        found = round(frames * (row["accuracy"]["within_20m"] or 0.0))
+        table.add_row(name, f"{found} of {frames}", _pair(row["cpu_ms"]), _pair(row.get("cpu_ms_with_map_points_kept")))
+    console.print(table)
+    for what in flight["missing"]:
+        console.print(f"not measured: {what}", highlight=False)
 
 
 def _pair(times: dict[str, float] | None) -> str:
