@@ -23,7 +23,7 @@ FRAMES = 3
 def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Result of a run without data, which uses the generated flight."""
     out = tmp_path_factory.mktemp("bench") / "deep" / "bench.json"
-    returned = bench(out.parent / "no-data", out, frames=FRAMES)
+    returned = bench(out.parent / "no-data", out, frames=FRAMES, page=out.parent / "benchmark.md")
     written: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
     assert written == json.loads(json.dumps(returned))
     return written
@@ -53,6 +53,8 @@ def test_the_result_has_times_memory_and_accuracy_of_the_replay(measured: dict[s
         assert 0.0 < times["median"] <= times["p95"]
     parts = sum(times["median"] for times in run["stage_ms"].values())
     assert parts == pytest.approx(run["frame_ms"]["median"], rel=0.3)
+    for times in run["stage_cpu_ms"].values():
+        assert 0.0 < times["median"] <= times["p95"] <= times["p99"]
     assert run["first_frame_ms"] > 0.0 and run["start_up_s"] > 0.0
     # frames_per_s includes the first frame, the median does not.
     assert run["frames_per_s"] == pytest.approx(1e3 / run["frame_ms"]["median"], rel=0.9)
@@ -71,6 +73,16 @@ def test_the_result_has_the_baseline_and_the_ratios_to_it(measured: dict[str, An
     ours = flight["runs"]["weights-free"]["frame_ms"]["median"]
     assert ratios["frame_ms"] == pytest.approx(ours / baseline["frame_ms"]["median"], abs=0.001)
     assert set(ratios) == {"frame_ms", "cpu_ms", "within_20m", "within_50m"}
+
+
+@pytest.mark.slow
+def test_vision_and_anchor_have_a_floor_below_their_own_time(measured: dict[str, Any]) -> None:
+    floor = measured["flights"]["generated"]["floor"]
+    for stage, kernel in (("vision", "KLT"), ("anchor", "Fourier transforms")):
+        assert floor[stage]["ratio"] > 1.0
+        assert 0.0 < floor[stage]["kernel_cpu_ms"]["median"] < floor[stage]["cpu_ms"]["median"]
+        assert floor[stage]["kernels"][kernel]["calls"] >= 1.0
+    assert floor["estimator"]["ratio"] is None
 
 
 @pytest.mark.slow

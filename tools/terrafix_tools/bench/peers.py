@@ -38,8 +38,7 @@ RANSAC_PX = 5.0  # wide, for relief and the perspective of buildings
 MIN_INLIERS = 8  # wrong homographies have 4 to 7
 MAX_POINTS = 4096  # of XFeat in each image: the default of its authors (accelerated_features, top_k)
 MAX_JOINED_POINTS = 1024  # of LighterGlue, whose cost is quadratic
-SIFT_METHOD = "SIFT, ratio test 0.8, RANSAC homography"
-SIFT, AKAZE, XFEAT, LIGHTERGLUE = "SIFT", "AKAZE", "XFeat, mutual nearest", "XFeat, LighterGlue"
+SIFT, AKAZE, XFEAT, LIGHTERGLUE = "SIFT, ratio test", "AKAZE, ratio test", "XFeat, mutual nearest", "XFeat, LighterGlue"
 MODELS = {XFEAT: ("xfeat", MAX_POINTS), LIGHTERGLUE: ("lighterglue-l3", MAX_JOINED_POINTS)}
 RESULT = "peers.json"
 
