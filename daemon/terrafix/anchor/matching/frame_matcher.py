@@ -30,7 +30,9 @@ CORRELATION_GSD_PER_AGL = 1 / 100
 # ground sampling distance of the patches as a share of the height [tuned]
 FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330}
 GSD_STEPS_PER_OCTAVE = 2  # Scales are rounded to this grid, so that the map's descriptors can be cached [tuned]
-MAX_WINDOW_CELLS = 640  # side of a correlation window; a wider one is correlated on coarser cells [tuned]
+# Side of a correlation window; a wider one is correlated on coarser cells, which bounds the cost of a look with a wide
+# belief. [measured: docs/benchmark.md, the correlation of a lost vehicle]
+MAX_WINDOW_CELLS = 640
 # side of a patch as a share of the height: 25 m at 100 m, one house and its surroundings [measured: docs/search.md]
 PATCH_PER_AGL = 0.25
 MIN_PATCH_CELLS = 8  # smallest side of a patch, cells [tuned]
