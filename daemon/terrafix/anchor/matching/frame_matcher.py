@@ -22,6 +22,7 @@ from terrafix.core.node import Image
 from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, PnpResult, solve
 from terrafix.map.package import LocalMap
 from terrafix.messages import PnpInput, Verdict
+from terrafix_engines.correlation import GraphCorrelator
 from terrafix_engines.features.gradient import GradientDescriber
 
 # Ground sampling distance of the correlation as a share of the height: coarse enough for speed and for tolerance to
@@ -138,7 +139,8 @@ class Fix:
 
 class FrameMatcher:
     """Matches frames with one map layer. ``cache_bytes``: memory for the map's descriptors; ``store``: file store that
-    keeps them for the next process; ``drawn``: the layer is drawn from roads, water and buildings."""
+    keeps them for the next process; ``drawn``: the layer is drawn from roads, water and buildings; ``correlator``: on
+    a GPU."""
 
     def __init__(
         self,
@@ -148,9 +150,11 @@ class FrameMatcher:
         cache_bytes: int = CACHE_BYTES,
         store: DescriptorStore | None = None,
         drawn: bool = False,
+        correlator: GraphCorrelator | None = None,
     ) -> None:
         self.camera = camera
         self._drawn = drawn
+        self._correlator = correlator
         self._map = source
         self._describer = describer
         self._subset = 0
@@ -220,11 +224,10 @@ class FrameMatcher:
         descriptors, valid, e_min, n_max = self.gradient_features.window(e_min, n_max, width, height, cell)
         if not valid.any():
             return CorrelationResult(Verdict.OUTSIDE_MAP)
-        window = CorrelationWindow(descriptors, valid, self._drawn)
+        window = CorrelationWindow(descriptors, valid, self._drawn, self._correlator)
+        correlations = window.correlate_all([_describe(frame, self.gradients) for _, frame in usable])
         surfaces = []
-        for _, frame in usable:
-            template, mask = _describe(frame, self.gradients)
-            correlation = window.correlate(template, mask)
+        for (_, frame), correlation in zip(usable, correlations, strict=True):
             z = standardise(correlation)
             # Places without a mapped feature are neither excluded nor preferred: they are as frequent among right
             # places as among all (docs/decisions/042-vectors-as-a-layer.md).
