@@ -95,7 +95,7 @@ def test_a_window_that_no_graph_holds_is_left_to_opencv(small: GraphCorrelator) 
 def test_the_anchor_matches_on_the_graph_and_continues_without_it_when_it_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(correlation, "SIDES", (320,))
+    monkeypatch.setattr(correlation, "SIDES", (448,))
     export(tmp_path, half=True)
     by_graph, frames, ground = open_correlator(str(tmp_path), (CPU,)), MemoryFrameStore(4), texture(8, SIDE_M)
     package: Any = SingleMapPackage(ground)
@@ -111,7 +111,7 @@ def test_the_anchor_matches_on_the_graph_and_continues_without_it_when_it_fails(
         return match, [one for one in published if isinstance(one, ModelEvent)]
 
     match, events = matched(1)
-    model = by_graph._models[320]
+    model = by_graph._models[448]
     assert (match.verdict, events, model.run_count) == (Verdict.ACCEPTED, [], 1)
 
     def out_of_memory(*_: object) -> None:
