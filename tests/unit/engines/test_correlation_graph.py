@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
+from terrafix.anchor.matching import frame_matcher
 from terrafix.anchor.matching.ncc import CorrelationWindow
 from terrafix.anchor.node import AnchorNode, make_node
 from terrafix.core.config import Config, Models
@@ -95,7 +96,8 @@ def test_a_window_that_no_graph_holds_is_left_to_opencv(small: GraphCorrelator) 
 def test_the_anchor_matches_on_the_graph_and_continues_without_it_when_it_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(correlation, "SIDES", (448,))
+    monkeypatch.setattr(frame_matcher, "MAX_WINDOW_CELLS", 130)  # half of the resolution: a faster test
+    monkeypatch.setattr(correlation, "SIDES", (224,))
     export(tmp_path, half=True)
     by_graph, frames, ground = open_correlator(str(tmp_path), (CPU,)), MemoryFrameStore(4), texture(8, SIDE_M)
     package: Any = SingleMapPackage(ground)
@@ -111,7 +113,7 @@ def test_the_anchor_matches_on_the_graph_and_continues_without_it_when_it_fails(
         return match, [one for one in published if isinstance(one, ModelEvent)]
 
     match, events = matched(1)
-    model = by_graph._models[448]
+    model = by_graph._models[224]
     assert (match.verdict, events, model.run_count) == (Verdict.ACCEPTED, [], 1)
 
     def out_of_memory(*_: object) -> None:
