@@ -27,7 +27,7 @@ from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import open_source
 from terrafix_engines.features import open_point_features
 from terrafix_engines.features.keypoints import Detector, Keypoints, PairMatcher
-from terrafix_engines.manifest import find_manifest
+from terrafix_engines.runtime import ModelFileError
 from terrafix_tools.bench.flights import run_part, spread
 from terrafix_tools.evaluate import Truth, offset_m, read_truth
 
@@ -173,10 +173,13 @@ def methods(models: Path | None) -> tuple[dict[str, PointMethod], list[str]]:
     else:
         missing.append(f"{AKAZE}: OpenCV {cv2.__version__} does not have it")
     for title, (name, most) in MODELS.items():
-        if models is None or not (models / find_manifest(name, models).file).is_file():
+        if models is None:
             missing.append(f"{title}: no weights")
-        else:
+            continue
+        try:
             found[title] = ModelPoints(*open_point_features(name, str(models)), most)
+        except ModelFileError as error:
+            missing.append(f"{title}: {error}")
     return found, missing
 
 
