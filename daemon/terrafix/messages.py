@@ -331,7 +331,9 @@ class MapMatch(Message, frozen=True, kw_only=True):
 
     frame_id: int
     verdict: Verdict
-    matcher: str  # "gradient", "xfeat"; followed by ON_DRAWN where the map is drawn from roads, water and buildings
+    # "gradient", or "xfeat" if the model has run for this frame; followed by ON_DRAWN if the map is drawn from roads,
+    # water and buildings
+    matcher: str
     inliers: int = 0
     reprojection_px: float = 0.0
     matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight

@@ -28,7 +28,9 @@ SECTIONS = {
     "matcher": ("matcher",),
     "pair": ("image", "pair"),
     "global": ("image", "vector"),
+    "correlation": (),
 }
+CORRELATION_INPUTS, CORRELATION_OUTPUT = ("images", "templates"), "correlation"  # tensors of role "correlation"
 DENSE_INPUT, DENSE_OUTPUTS = "input", ("descriptors", "keypoint_logits", "reliability")  # tensors of role "dense"
 
 
@@ -110,11 +112,11 @@ class VectorOutput(Section, frozen=True, kw_only=True):
 
 class Manifest(Section, frozen=True, kw_only=True):
     """``role``: "dense" outputs the maps of XFeat, "keypoints" outputs keypoints, "matcher" matches the keypoints of
-    two images, "pair" takes two images, "global" makes one vector of an image."""
+    two images, "pair" takes two images, "global" makes one vector of an image, "correlation" correlates descriptors."""
 
     name: Name
     title: str
-    role: Literal["dense", "keypoints", "matcher", "pair", "global"]
+    role: Literal["dense", "keypoints", "matcher", "pair", "global", "correlation"]
     file: File
     sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     size_bytes: Annotated[int, Meta(ge=1)]
@@ -234,6 +236,8 @@ def _used_tensors(manifest: Manifest) -> tuple[set[str], set[str]]:
     used_out: set[str] = set()
     if manifest.role == "dense":
         used_in, used_out = {*used_in, DENSE_INPUT}, set(DENSE_OUTPUTS)
+    if manifest.role == "correlation":
+        used_in, used_out = set(CORRELATION_INPUTS), {CORRELATION_OUTPUT}
     if points := manifest.keypoints:
         used_out |= {points.keypoints, points.scores, points.descriptors}
     if matcher := manifest.matcher:

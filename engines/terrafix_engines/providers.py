@@ -13,6 +13,7 @@ from terrafix_engines.manifest import Preset, Tensor, concrete_shape
 
 TENSORRT, CUDA, CPU = "TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"
 PREFERENCE = (TENSORRT, CUDA, CPU)
+MEMORY = {TENSORRT: "cuda", CUDA: "cuda", CPU: "cpu"}  # ONNX Runtime's name of the device with a provider's buffers
 READY = "ready.json"  # written after the first successful run of an engine; missing after an interrupted build
 # The arena grows by the requested size, not by powers of two: on a Jetson the GPU shares the system's memory.
 CUDA_OPTIONS = {"arena_extend_strategy": "kSameAsRequested", "cudnn_conv_algo_search": "HEURISTIC"}

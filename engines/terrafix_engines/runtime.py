@@ -16,6 +16,7 @@ from terrafix_engines.manifest import Manifest, Preset, Tensor, bind_sizes, conc
 from terrafix_engines.providers import CPU, PREFERENCE, TENSORRT, RejectedProvider, Shapes, UnavailableError
 
 WARM_UP_SIZE = 512  # side or number of points without a preset; sufficient for exports with a minimum number of points
+MAX_BOUND_SHAPES = 8  # sets of shapes that keep their buffers [spec: twice the presets of xfeat]
 ANY_SHAPE: Shapes = ()  # key of a session that accepts every size
 
 
@@ -69,6 +70,7 @@ class Model:
         self._manifest, self._engines, self._build = manifest, engines, build
         self._presets: list[Preset] = manifest.presets if manifest else []
         self._sessions: dict[Shapes, Any] = {}
+        self._bound_session: BoundSession | None = None
         self._remaining = list(prefer)
         self._open_next_provider()
 
@@ -177,6 +179,11 @@ class Model:
             )
         return session
 
+    def _bound(self, session: Any) -> "BoundSession":
+        if self._bound_session is None or self._bound_session.session is not session:
+            self._bound_session = BoundSession(session, self._outputs, providers.MEMORY[self.provider])
+        return self._bound_session
+
     def _warm_up(self) -> None:
         """Runs every known size once; on the CPU, which accepts any size, only the first (smallest) one."""
         if self._manifest is None or self.provider == TENSORRT:  # engines were run when they were loaded
@@ -197,7 +204,7 @@ class Model:
         session = self._sessions.get(ANY_SHAPE) or self._sessions.get(tuple(array.shape for array in tensors))
         if session is None:
             raise UnavailableError(f"no session for inputs of shapes {[list(array.shape) for array in tensors]}")
-        found = session.run(list(self._outputs), feed)
+        found = session.run(list(self._outputs), feed) if self.provider == CPU else self._bound(session).run(feed)
         results = [np.asarray(one) for one in found]
         for k, (name, array) in enumerate(zip(self._outputs, results, strict=True)):
             if self._manifest is not None:
@@ -211,6 +218,39 @@ class Model:
                     raise UnavailableError(f"output '{name}' has NaN or infinite values")
                 results[k] = array.astype(np.float32, copy=False)
         return results
+
+
+class BoundSession:
+    """Inference whose inputs and outputs are bound to buffers of the device. The buffers of the inputs stay, so that a
+    call copies their contents and allocates none."""
+
+    def __init__(self, session: Any, outputs: tuple[str, ...], device: str) -> None:
+        """``device``: its name in ONNX Runtime, "cuda" or "cpu"."""
+        self.session, self._outputs, self._device = session, outputs, device
+        self._inputs: dict[Shapes, dict[str, Any]] = {}
+
+    def run(self, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """``feed``: array of each input -> arrays of the outputs. Raises what the session raises."""
+        import onnxruntime as ort
+
+        shapes = tuple(array.shape for array in feed.values())
+        contiguous = {name: np.ascontiguousarray(array) for name, array in feed.items()}
+        if shapes in self._inputs:
+            for name, array in contiguous.items():
+                self._inputs[shapes][name].update_inplace(array)
+        else:
+            if len(self._inputs) == MAX_BOUND_SHAPES:
+                self._inputs.clear()
+            self._inputs[shapes] = {
+                name: ort.OrtValue.ortvalue_from_numpy(array, self._device, 0) for name, array in contiguous.items()
+            }
+        binding = self.session.io_binding()
+        for name, bound in self._inputs[shapes].items():
+            binding.bind_ortvalue_input(name, bound)
+        for name in self._outputs:
+            binding.bind_output(name, self._device, 0)
+        self.session.run_with_iobinding(binding)
+        return list(binding.copy_outputs_to_cpu())
 
 
 @functools.cache

@@ -217,11 +217,12 @@ def bench(
     frames: Annotated[int | None, typer.Option(help="Use at most this many frames of each flight.")] = None,
     xfeat: Annotated[bool, typer.Option(help="Also run with XFeat, when models/xfeat.onnx exists.")] = True,
     growing: Annotated[bool, typer.Option(help="Also run larger maps (to 100 km2) and longer flights.")] = True,
+    page: Annotated[Path | None, typer.Option(help="Markdown page to write, with a picture in images/.")] = None,
 ) -> None:
     """Measure time, memory and accuracy next to baselines of the same run, and how they scale."""
     from terrafix_tools.bench.run import bench as run_bench
 
-    run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat, growing=growing)
+    run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat, growing=growing, page=page)
 
 
 def main(fork_server: "ForkServer | None" = None) -> None:

@@ -19,6 +19,7 @@ from terrafix.recorder.reader import ReadResult, check_format, is_record, read_f
 from terrafix_tools.estimates import ESTIMATES, Row, RowTable, number, read_rows, read_table
 from terrafix_tools.finalise.output import TABLE as FINALISED
 
+WEIGHTS_FREE = "gradient"  # beginning of MapMatch.matcher of a frame for which no learned model ran
 LIMITS_M = (5, 10, 20, 50)
 ELLIPSE95 = 5.991  # chi-square quantile, 2 degrees of freedom, 95 %
 FALSE_FIX_ERROR_M = 50.0
@@ -128,6 +129,14 @@ def _odometry_rate(summary: dict[str, Any]) -> float | None:
     return min(1.0, registered / (frames - 1))
 
 
+def _model_rate(summary: dict[str, Any]) -> float | None:
+    """Share of the map matches, made or tried, for which the learned model ran."""
+    matched_by = summary.get("matched_by")
+    if not matched_by:
+        return None
+    return sum(count for by, count in matched_by.items() if not by.startswith(WEIGHTS_FREE)) / sum(matched_by.values())
+
+
 def metrics(
     rows: list[Row], truth: dict[str, Truth], summary: dict[str, Any], truth_sigma_m: float | None
 ) -> dict[str, Any]:
@@ -150,6 +159,7 @@ def metrics(
         "false_fixes": sum(is_false_fix(c) for c in located),
         "anchor_rate": sum(c.row.anchor_age_ms == 0 for c in compared) / frames,
         "odometry_rate": _odometry_rate(summary),
+        "model_rate": _model_rate(summary),
         "frame_ms_median": float(np.median(times_ms)) if times_ms else None,
         "frame_ms_p95": float(np.percentile(times_ms, 95)) if times_ms else None,
         # Additional to the specified metrics:

@@ -35,7 +35,7 @@ from terrafix_tools.rerun.frames import RecordedFrames
 
 # processes that compute the estimate; link, health and recorder need a live system
 REPLAYED_PROCESSES = ("vision", "anchor", "estimator", "smoother")
-FOLDER = "folder"  # key of [models] that is not a model
+NOT_MODELS = ("folder", "correlation")  # keys of [models] that are no models
 FRAMES_KEPT = 32  # frames that a node may still request; the size of the live frame ring
 
 MakeNodes = Callable[[NodeContext], Mapping[str, Node]]
@@ -83,7 +83,7 @@ def replay(
             "flight": source.name(),
             "source": str(flight.record if isinstance(flight, RecordedFrames) else flight),
             "map": map_summary,
-            "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v and k != FOLDER},
+            "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v and k not in NOT_MODELS},
             "config": msgspec.to_builtins(config),
             "versions": versions(),
             **output.counts(),
@@ -153,7 +153,7 @@ def _with_models(config: Config, models: list[str]) -> Config:
     """Returns the configuration with the command line's models in its [models]: NAME=PATH, or NAME alone for a fetched
     model. Every file must exist.
     """
-    known = [f.name for f in msgspec.structs.fields(type(config.models)) if f.name != FOLDER]
+    known = [f.name for f in msgspec.structs.fields(type(config.models)) if f.name not in NOT_MODELS]
     models_by_name: dict[str, str] = {}
     for text in models:
         name, equals, path = text.partition("=")

@@ -50,6 +50,7 @@ class ReplayOutput:
         self._table = RowTable()
         self._verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._matcher: Counter[str] = Counter()
+        self._matched_by: Counter[str] = Counter()
         self._registered: dict[int, bool] = {}
         self._origin: Origin | None = None
         self._calibration: CalibrationEstimate | None = None
@@ -121,6 +122,7 @@ class ReplayOutput:
             "lens": lens_words(self._origin.camera, self._calibration) if self._origin and self._calibration else None,
             "verdict": flight_verdict(rows, self._faults, self._verdicts).as_json(),
             "matcher_verdicts": dict(sorted(self._matcher.items())),
+            "matched_by": dict(sorted(self._matched_by.items())),
             "frame_ms_median": round(float(np.median(times_ms)), 1) if times_ms else None,
             "frame_ms_p95": round(float(np.percentile(times_ms, 95)), 1) if times_ms else None,
         }
@@ -165,6 +167,7 @@ class ReplayOutput:
             self._calibration = message
         elif isinstance(message, MapMatch):
             self._matcher[str(message.verdict)] += 1
+            self._matched_by[message.matcher] += 1
         elif isinstance(message, Odometry):
             # A frame that starts a fragment refers to itself: that is no registration.
             moved = message.verdict is Verdict.ACCEPTED and message.keyframe_id != message.frame_id

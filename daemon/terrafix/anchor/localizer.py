@@ -65,6 +65,7 @@ from terrafix.messages import (
     SearchStep,
     Verdict,
 )
+from terrafix_engines.correlation import GraphCorrelator
 
 NEW_GROUND_SHARE = 0.35  # share of the footprint: motion after which an observation counts in full [tuned]
 MIN_OBSERVATION_WEIGHT = 0.08  # weight of another observation of the same ground [tuned]
@@ -92,7 +93,7 @@ class Localizer:
     ``label_step``.
 
     ``ce90_m``: accuracy of map layers that state none; ``store_folder``: folder in memory for computed descriptors;
-    ``places``: place index for the search of a large map.
+    ``places``: place index for the search of a large map; ``correlator``: on a GPU.
     """
 
     def __init__(
@@ -102,9 +103,11 @@ class Localizer:
         ce90_m: float,
         store_folder: Path | None = None,
         places: PlaceMemory | None = None,
+        correlator: GraphCorrelator | None = None,
     ) -> None:
         self._package = package
         self._places = places
+        self._correlator = correlator
         self._describer = describer
         self._ce90_m = ce90_m
         self._store_folder = store_folder
@@ -143,7 +146,14 @@ class Localizer:
         if self._package is not None:
             frame, camera = LocalFrame(origin.lat_deg, origin.lon_deg), CameraCalibration.of(origin.camera)
             self._layers = MapLayers(
-                self._package, frame, camera, self._describer, self._ce90_m, self._store_folder, self._places
+                self._package,
+                frame,
+                camera,
+                self._describer,
+                self._ce90_m,
+                self._store_folder,
+                self._places,
+                self._correlator,
             )
 
     def replace_describer(self, describer: Describer, agl_m: float) -> None:

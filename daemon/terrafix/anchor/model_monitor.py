@@ -14,7 +14,7 @@ class ModelMonitor:
     ``not_opened`` is then the reason."""
 
     def __init__(self, describer: Describer, not_opened: str = "") -> None:
-        self._name = describer.name
+        self.name = describer.name
         self._not_opened = not_opened
         self._model = describer.model if isinstance(describer, XFeatDescriber) else None
         self._reported = 0  # number of rejected execution providers that were already reported
@@ -34,7 +34,7 @@ class ModelMonitor:
     def succeeded(self, t_ns: int) -> list[ModelEvent]:
         """After a frame without a failure. Only a frame for which the model produced a result resets the failure
         count."""
-        if self._model is not None and self._model.run_count != self._results:
+        if self._model is not None and self.has_run:
             self._failures, self._results = 0, self._model.run_count
         return self._provider_events(t_ns)
 
@@ -54,6 +54,11 @@ class ModelMonitor:
         return self._model is not None
 
     @property
+    def has_run(self) -> bool:
+        """Whether the model has produced a result since the last frame."""
+        return self._model is not None and self._model.run_count != self._results
+
+    @property
     def given_up(self) -> bool:
         return self._failures >= MAX_FAILURES
 
@@ -65,4 +70,4 @@ class ModelMonitor:
 
     def event(self, t_ns: int, change: ModelChange, detail: str) -> ModelEvent:
         provider = short_name(self._model.provider) if self._model is not None else ""
-        return ModelEvent(t_ns=t_ns, model=self._name, change=change, provider=provider, detail=detail)
+        return ModelEvent(t_ns=t_ns, model=self.name, change=change, provider=provider, detail=detail)

@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+import msgspec
+
 from terrafix.anchor.initial_position import check_initial_position
 from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.descriptor_cache import Describer
@@ -21,6 +23,7 @@ from terrafix.messages import (
     MapMatch,
     Message,
     ModelChange,
+    ModelEvent,
     Origin,
     PositionHint,
     Prediction,
@@ -28,8 +31,11 @@ from terrafix.messages import (
     SearchStep,
     Verdict,
 )
+from terrafix_engines.correlation import GraphCorrelator, open_correlator
 from terrafix_engines.features import open_describer
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_engines.manifest import ManifestError
+from terrafix_engines.providers import short_name
 from terrafix_engines.runtime import ModelFileError, ModelRunError
 
 
@@ -44,16 +50,18 @@ class AnchorNode:
         cache_dir: Path | None = None,
         load: ThermalLoad | None = None,
         places: PlaceMemory | None = None,
+        correlator: GraphCorrelator | None = None,
     ) -> None:
         """``ce90_m``: accuracy of map layers that state none; ``cache_dir``: folder in memory for computed
         descriptors of the map; ``load``: by thermal band; None: as the default configuration; ``places``:
-        place index for the search of a large map."""
+        place index for the search of a large map; ``correlator``: on a GPU."""
         self._frames = frames
         self._package = package
         self._describer = describer  # as configured
         self._model = model or ModelMonitor(describer)
         self._load, self._model_suspended = load or ThermalLoad(HealthSection()), False
-        self._localizer = Localizer(package, describer, ce90_m, cache_dir, places)
+        self._localizer = Localizer(package, describer, ce90_m, cache_dir, places, correlator)
+        self._correlator = correlator
         self._origin: Origin | None = None
         self._hint: PositionHint | None = None  # not yet applied
         self._initial: InitialPosition | None = None  # result of the newest GnssInitialPosition
@@ -67,6 +75,8 @@ class AnchorNode:
                 self._origin = message
                 self._localizer.begin_flight(message)
                 yield from self._model.opened(message.t_ns)
+                if self._correlator is not None:
+                    yield _correlator_event(message.t_ns, ModelChange.OPENED, self._correlator)
             case Health():
                 self._load.band = message.band
             case PositionHint():
@@ -122,7 +132,14 @@ class AnchorNode:
                 self._model = ModelMonitor(describer)
                 self._localizer.replace_describer(describer, prediction.agl_m)
             return self._localizer.skipped(prediction, Verdict.MODEL_FAILED)
+        if self._model.is_learned and not self._model.has_run:
+            match = msgspec.structs.replace(
+                match, matcher=match.matcher.replace(self._model.name, GradientDescriber.name)
+            )
         self._pending += self._model.succeeded(prediction.t_ns)
+        if self._correlator is not None and self._correlator.failure:
+            self._pending.append(_correlator_event(prediction.t_ns, ModelChange.GIVEN_UP, self._correlator))
+            self._correlator = None
         return match
 
     def _switch_model(self, prediction: Prediction) -> None:
@@ -136,9 +153,16 @@ class AnchorNode:
         self._pending.append(self._model.event(prediction.t_ns, change, f"thermal band {self._load.band.value}"))
 
 
+def _correlator_event(t_ns: int, change: ModelChange, correlator: GraphCorrelator) -> ModelEvent:
+    provider = ", ".join(dict.fromkeys(short_name(one) for one in correlator.providers))
+    detail = correlator.failure or "on the GPU"
+    return ModelEvent(t_ns=t_ns, model=correlator.name, change=change, provider=provider, detail=detail)
+
+
 def make_node(ctx: NodeContext) -> AnchorNode:
     """Opens the map and the model before take-off. Raises ConfigError, MapError, ModelError, UsageError. After a
-    restart in flight a model that cannot be opened is replaced by the describer without weights."""
+    restart in flight a model that cannot be opened is replaced by the describer without weights, and correlation on a
+    GPU by that on the processor."""
     wanted = ctx.config.map
     trusted = trusted_keys(wanted.trusted_keys, required=wanted.require_signature)
     package = MapPackage.open(ctx.map_path, trusted=trusted) if ctx.map_path is not None else None
@@ -152,7 +176,22 @@ def make_node(ctx: NodeContext) -> AnchorNode:
         describer, not_opened = GradientDescriber(), str(error)
     model = ModelMonitor(describer, not_opened)
     load, places = ThermalLoad(ctx.config.health), _open_places(ctx)
-    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, model, ctx.cache_dir, load, places)
+    correlator = _open_correlator(ctx)
+    return AnchorNode(ctx.frames, package, describer, wanted.ce90_m, model, ctx.cache_dir, load, places, correlator)
+
+
+def _open_correlator(ctx: NodeContext) -> GraphCorrelator | None:
+    """Raises ModelError before take-off."""
+    models = ctx.config.models
+    if models.correlation == "cpu":
+        return None
+    try:
+        return open_correlator(models.folder)
+    except (ManifestError, ModelFileError) as error:
+        if ctx.epoch_ns is not None:
+            return None
+        todo = 'terrafix models export, then terrafix models build; or set [models] correlation = "cpu"'
+        raise ModelError(f"correlation on the GPU: {error}; {todo}") from None
 
 
 def _open_places(ctx: NodeContext) -> PlaceMemory | None:

@@ -36,6 +36,7 @@ class Map(Section, frozen=True, kw_only=True):
 
 class Models(Section, frozen=True, kw_only=True):
     xfeat: str = ""  # name of a fetched model, or path of an ONNX file; empty: matching without a learned model
+    correlation: Literal["cpu", "gpu"] = "cpu"  # where descriptors are correlated with the map
     folder: str = ""  # folder of fetched models; empty: TERRAFIX_MODELS, or the user's data folder
 
 

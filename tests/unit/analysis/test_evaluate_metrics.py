@@ -21,6 +21,7 @@ CONTRACT = [
     "false_fixes",
     "anchor_rate",
     "odometry_rate",
+    "model_rate",
     "frame_ms_median",
     "frame_ms_p95",
 ]
@@ -73,6 +74,17 @@ def test_the_metrics_of_a_small_flight_are_correct(tmp_path: Path) -> None:
     assert found["odometry_rate"] == 0.5
     assert found["frame_ms_median"] == 102.0
     assert json.loads((tmp_path / "evaluation.json").read_text()) == found
+
+
+@pytest.mark.parametrize(
+    ("matched_by", "rate"),
+    [({"gradient": 2, "gradient on vectors": 1, "xfeat": 1}, 0.25), ({"gradient": 4}, 0.0), ({}, None)],
+)
+def test_the_model_rate_is_the_share_of_map_matches_for_which_the_model_ran(
+    tmp_path: Path, matched_by: dict[str, int], rate: float | None
+) -> None:
+    run = folder(tmp_path, [row(0, 3.0)], summary={"frames": 1, "odometry_frames": 0, "matched_by": matched_by})
+    assert evaluate(run, tmp_path / "truth.csv", json_only=True)["model_rate"] == rate
 
 
 def test_a_flight_without_localised_frames_has_metrics(tmp_path: Path) -> None:

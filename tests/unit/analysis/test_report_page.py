@@ -98,11 +98,13 @@ def test_the_report_has_the_rejected_map_matches_with_the_largest_test_ratios(tm
     def match(i: int, verdict: Verdict) -> MapMatch:
         return MapMatch(t_ns=i * PERIOD_NS, frame_id=i, verdict=verdict, matcher="gradient")
 
-    few = [match(0, Verdict.FEW_INLIERS), verdict(0, Verdict.FEW_INLIERS, "5 inliers")]
+    learned = MapMatch(t_ns=PERIOD_NS, frame_id=1, verdict=Verdict.FEW_INLIERS, matcher="xfeat")
+    few = [match(0, Verdict.FEW_INLIERS), verdict(0, Verdict.FEW_INLIERS, "5 inliers"), learned]
     (tmp_path / "few").mkdir()
     write_record(tmp_path / "few" / "flight.mcap", [origin(), *(frame(i) for i in range(3)), *few])
     text = page_of(tmp_path / "few").text
     assert "1 of 1 rejected map matches" in text
+    assert "Frames matched with the map by: gradient 50 %, xfeat 50 %." in text
     assert "0.0 s0few inliersanchor-5 inliers" in text
 
     gated: list[Message] = []

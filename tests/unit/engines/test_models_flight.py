@@ -10,6 +10,8 @@ import pytest
 import tiny_onnx
 from map_matches import position_of
 from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
+from terrafix.anchor.matching.descriptor_cache import Describer
+from terrafix.anchor.matching.frame_matcher import Fix, FrameMatcher
 from terrafix.anchor.model_monitor import MAX_FAILURES
 from terrafix.anchor.node import AnchorNode, make_node
 from terrafix.anchor.relocalization.map_search import MapSearch
@@ -34,12 +36,22 @@ from terrafix_engines.providers import CUDA, RejectedProvider
 from terrafix_engines.runtime import ModelRunError
 from textured_ground import PINHOLE, texture, view
 
-BLUE = np.full((360, 640, 3), (255, 0, 0), np.uint8)
 STARTED = msgspec.structs.replace(ORIGIN, t_ns=7)
 
 
+@pytest.fixture
+def no_gradient_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Patches of gradients give no pose while there is a model."""
+    whole = FrameMatcher._fix_with
+
+    def fix_with(self: FrameMatcher, describer: Describer, *seen: Any) -> Fix | None:
+        return None if describer is not self._describer else whole(self, describer, *seen)
+
+    monkeypatch.setattr(FrameMatcher, "_fix_with", fix_with)
+
+
 class Flight:
-    """An anchor node with a model that fails on a blue image."""
+    """An anchor node with a model that fails on cells of pure blue, as ``blue`` has. ``seen``: the frame at TRUE_M."""
 
     def __init__(self, folder: Path, ground: np.ndarray, start_sigma_m: float = 10.0) -> None:
         tiny_onnx.write(folder, tiny_onnx.XFEAT_LIKE, tiny_onnx.xfeat_like("blue"))
@@ -47,6 +59,8 @@ class Flight:
         assert isinstance(describer, XFeatDescriber)
         self.describer, self.frames, self.frame_id = describer, MemoryFrameStore(4), 0
         self.seen = view(ground, PINHOLE, R, TRUE_M)
+        self.blue = self.seen.copy()
+        self.blue[100:200, 200:300] = (255, 0, 0)
         package: Any = SingleMapPackage(ground)
         self.node = AnchorNode(self.frames, package, describer, 1.0)
         self.begun = list(self.node.on(msgspec.structs.replace(STARTED, start_sigma_m=start_sigma_m)))
@@ -74,9 +88,17 @@ def test_the_provider_and_the_reasons_against_better_ones_are_published(tmp_path
         assert str(over) in event.detail
 
 
+def test_without_need_the_model_does_not_run_and_the_match_says_so(tmp_path: Path, ground: np.ndarray) -> None:
+    flight = Flight(tmp_path, ground)
+    match, events = flight.frame(flight.blue)
+    assert (match.verdict, match.matcher, events) == (Verdict.ACCEPTED, "gradient", [])
+    assert flight.describer.model.run_count == 0
+
+
+@pytest.mark.usefixtures("no_gradient_pose")
 def test_a_failed_inference_loses_one_frame_only(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
-    match, events = flight.frame(BLUE)
+    match, events = flight.frame(flight.blue)
     assert (match.verdict, match.search.step, match.matcher) == (Verdict.MODEL_FAILED, SearchStep.SKIP, "xfeat")
     assert match.pose is None
     assert [e.change for e in events] == [ModelChange.FAILED] and "has NaN" in events[0].detail
@@ -84,10 +106,11 @@ def test_a_failed_inference_loses_one_frame_only(tmp_path: Path, ground: np.ndar
     assert match.verdict is not Verdict.MODEL_FAILED and match.matcher == "xfeat" and events == []
 
 
+@pytest.mark.usefixtures("no_gradient_pose")
 def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
     for _ in range(MAX_FAILURES):
-        match, events = flight.frame(BLUE)
+        match, events = flight.frame(flight.blue)
     assert match.verdict is Verdict.MODEL_FAILED
     assert [e.change for e in events] == [ModelChange.FAILED, ModelChange.GIVEN_UP]
     match, events = flight.frame(flight.seen)
@@ -95,15 +118,17 @@ def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(tmp_pat
     assert np.hypot(*(np.array(position_of(match)) - TRUE_M)[:2]) < 3.0
 
 
+@pytest.mark.usefixtures("no_gradient_pose")
 def test_only_consecutive_failures_count(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
-    for image in [*[BLUE] * (MAX_FAILURES - 1), flight.seen, *[BLUE] * (MAX_FAILURES - 1)]:
+    for image in [*[flight.blue] * (MAX_FAILURES - 1), flight.seen, *[flight.blue] * (MAX_FAILURES - 1)]:
         match, _ = flight.frame(image)
     assert match.matcher == "xfeat"
-    match, events = flight.frame(BLUE)
+    match, events = flight.frame(flight.blue)
     assert events[-1].change is ModelChange.GIVEN_UP
 
 
+@pytest.mark.usefixtures("no_gradient_pose")
 def test_a_learned_model_is_suspended_while_the_thermal_band_is_critical(tmp_path: Path, ground: np.ndarray) -> None:
     flight = Flight(tmp_path, ground)
     changes = []

@@ -113,6 +113,42 @@ def test_an_unusable_model_file_is_rejected_with_one_line(tiny: Path, kind: str,
     assert says in str(error.value) and str(tiny) in str(error.value) and "\n" not in str(error.value)
 
 
+def test_a_bound_session_gives_the_outputs_of_a_plain_one_and_keeps_its_buffers(tiny: Path) -> None:
+    session = ort.InferenceSession(tiny.read_bytes(), providers=[CPU])
+    bound = runtime.BoundSession(session, ("descriptors", "reliability"), "cpu")
+    rng, kept = np.random.default_rng(2), []
+    for shape in ((1, 3, 64, 64), (1, 3, 32, 64), (1, 3, 64, 64)):
+        feed = {"input": rng.random(shape, dtype=np.float32)}
+        expected = session.run(["descriptors", "reliability"], feed)
+        found = bound.run(feed)
+        assert all(np.array_equal(one, other) for one, other in zip(found, expected, strict=True))
+        kept.append((found[0], expected[0], bound._inputs[(shape,)]["input"].data_ptr()))
+    assert all(np.array_equal(found, expected) for found, expected, _ in kept)  # not overwritten by later runs
+    assert kept[0][2] == kept[2][2] != kept[1][2]
+    for side in range(runtime.MAX_BOUND_SHAPES):
+        bound.run({"input": np.zeros((1, 3, 8 + 8 * side, 8), np.float32)})
+    assert 0 < len(bound._inputs) <= runtime.MAX_BOUND_SHAPES
+
+
+class Binding:
+    """Substitute of ONNX Runtime's IOBinding: keeps what is bound, for buffers of the processor."""
+
+    def __init__(self) -> None:
+        self.feed: dict[str, np.ndarray] = {}
+        self.names: list[str] = []
+        self.results: list[np.ndarray] = []
+
+    def bind_ortvalue_input(self, name: str, value: Any) -> None:
+        self.feed[name] = value.numpy()
+
+    def bind_output(self, name: str, device: str, device_id: int) -> None:
+        assert (device, device_id) == ("cpu", 0)
+        self.names.append(name)
+
+    def copy_outputs_to_cpu(self) -> list[np.ndarray]:
+        return self.results
+
+
 class Machine:
     """Simulates a computer with a GPU in ONNX Runtime: sessions compute on the CPU and fail on request."""
 
@@ -145,6 +181,12 @@ class Machine:
             def get_outputs(self) -> Any:
                 return self.real.get_outputs()
 
+            def io_binding(self) -> "Binding":
+                return Binding()
+
+            def run_with_iobinding(self, binding: "Binding") -> None:
+                binding.results = self.run(binding.names, binding.feed)
+
             def run(self, names: list[str], feed: dict[str, np.ndarray]) -> list[np.ndarray]:
                 if self.name == CUDA:
                     owner.ran += [one.shape for one in feed.values()]
@@ -156,6 +198,7 @@ class Machine:
                 return self.real.run(names, feed)
 
         patch.setattr(ort, "InferenceSession", Session)
+        patch.setattr(providers, "MEMORY", {TENSORRT: "cpu", CUDA: "cpu"})
         patch.setattr(ort, "get_available_providers", lambda: [TENSORRT, CUDA, CPU])
         patch.setattr(gpu, "gpu_name", lambda: "Orin (nvgpu)")
         patch.setattr(gpu, "tensorrt_version", lambda: "100300")

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import map_rasters
 from preflight_autopilot import GroundAutopilot
-from terrafix.core.config import Config, HealthSection, LinkSection, RecorderSection
+from terrafix.core.config import Config, HealthSection, LinkSection, Models, RecorderSection
 from terrafix.core.config import Map as MapSection
 from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import LinkError, UsageError
@@ -384,6 +384,18 @@ def test_a_missing_autopilot_is_a_failure_and_the_other_checks_run(tmp_path: Pat
     assert lines["autopilot"]["status"] == "fail"
     assert "nothing heard on udpout:127.0.0.1:9" in lines["autopilot"]["text"]
     assert {"map", "camera", "models", "clock", "disk", "temperature"} <= lines.keys()
+
+
+def test_correlation_on_a_gpu_is_checked_where_it_is_configured(tmp_path: Path) -> None:
+    def correlation_lines(models: Models) -> list[Line]:
+        return [
+            line for line in computer.check_lines(Config(models=models), None, tmp_path) if line.check == "correlation"
+        ]
+
+    (line,) = correlation_lines(Models(correlation="gpu", folder=str(tmp_path)))
+    assert line.status is Status.FAIL and "no model is called 'correlation-512'" in line.text
+    assert "terrafix models export" in line.fix
+    assert correlation_lines(Models(folder=str(tmp_path))) == []
 
 
 @pytest.mark.parametrize("device", ["udpin:127.0.0.1", "udpin:127.0.0.1:70000", "127.0.0.1:14550", "tcp:127.0.0.1:9"])

@@ -34,7 +34,7 @@ from terrafix.messages import (
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.feature_tracker import FrameTracker
 from terrafix.vision.sources import open_source
-from terrafix_engines.features import open_describer
+from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.bench.flights import run_part, spread
 
 RESULT = "micro.json"
@@ -45,7 +45,7 @@ UNIX_NS = 1_750_000_000 * 10**9  # of the link's wall clock: any time after the 
 BELIEF_SIGMA_M = 20.0  # initial 1-sigma of the belief: a usual value in flight
 
 
-def measure(flight: Path, map_path: Path, replayed: Path, xfeat: Path | None) -> dict[str, Any]:
+def measure(flight: Path, map_path: Path, replayed: Path, _xfeat: Path | None = None) -> dict[str, Any]:
     """-> part -> {median, p95} in ms."""
     messages = [message for _, _, message in read_flight(replayed)]
     origin = next(message for message in messages if isinstance(message, Origin))
@@ -57,9 +57,8 @@ def measure(flight: Path, map_path: Path, replayed: Path, xfeat: Path | None) ->
     local = package.bind(LocalFrame(origin.lat_deg, origin.lon_deg))
     predictions = [m for m in messages if isinstance(m, Prediction) and m.frame_id in images]
     chosen = predictions[:: max(1, len(predictions) // CORRELATIONS)]
-    for model in ("", str(xfeat)) if xfeat else ("",):
-        matcher = FrameMatcher(camera, local, open_describer(model))
-        result |= _correlations(matcher, chosen, images, origin.ground_amsl_m or 0.0, " (xfeat)" if model else "")
+    matcher = FrameMatcher(camera, local, GradientDescriber())
+    result |= _correlations(matcher, chosen, images, origin.ground_amsl_m or 0.0)
     package.close()
     for band, name in ((ThermalBand.NORMAL, "marginals"), (ThermalBand.HOT, "jacobian")):
         times_ms = _estimator(messages, band)
@@ -69,9 +68,9 @@ def measure(flight: Path, map_path: Path, replayed: Path, xfeat: Path | None) ->
 
 
 def _correlations(
-    matcher: FrameMatcher, predictions: list[Prediction], images: dict[int, Image], ground_m: float, suffix: str
+    matcher: FrameMatcher, predictions: list[Prediction], images: dict[int, Image], ground_m: float
 ) -> dict[str, Any]:
-    """-> times of correlation, belief update and map fix; ``suffix`` is added to their names."""
+    """-> times of correlation, belief update and map fix."""
     correlate_ms, update_ms, fix_ms = [], [], []
     for prediction in predictions:
         image, view = images[prediction.frame_id], _view(prediction, ground_m)
@@ -90,7 +89,7 @@ def _correlations(
         matcher.fix(image, view, hypothesis, mode.e_m, mode.n_m)
         fix_ms.append(_ms(partial(matcher.fix, image, view, hypothesis, mode.e_m, mode.n_m)))
     parts = {"look (search)": correlate_ms, "belief update": update_ms, "fix (patches + PnP)": fix_ms}
-    return {name + suffix: spread(values) for name, values in parts.items() if values}
+    return {name: spread(values) for name, values in parts.items() if values}
 
 
 def _estimator(messages: list[Message], band: ThermalBand) -> list[float]:

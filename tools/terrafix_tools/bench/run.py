@@ -1,5 +1,5 @@
-"""`terrafix bench`: time, memory and accuracy of whole replays, compared with a SIFT + RANSAC baseline on the same
-frames.
+"""`terrafix bench`: time, memory and accuracy of whole replays, compared with peers on the same frames: SIFT + RANSAC,
+which is the baseline of all ratios, AKAZE, XFeat and LighterGlue.
 
 Every measurement runs in its own process, one after the other. Milliseconds depend on the machine and its load; the
 ratio to the baseline, measured minutes apart on the same machine, depends on them less, and the ratio of processor
@@ -20,10 +20,12 @@ from rich.table import Table
 from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
 from terrafix.core.toml_file import read_toml
 from terrafix.recorder.provenance import device, versions
-from terrafix_tools.bench import baseline as bench_baseline
 from terrafix_tools.bench import flights as bench_run
+from terrafix_tools.bench import kernels as bench_kernels
 from terrafix_tools.bench import micro as bench_micro
+from terrafix_tools.bench import peers as bench_peers
 from terrafix_tools.bench import scaling
+from terrafix_tools.bench.page import comparison_table, stage_table, write_page
 from terrafix_tools.mapping.build import build, ensure_package
 from terrafix_tools.replay import map_cache_dir
 from terrafix_tools.sim.flights.folder import FRAME_HZ, plan_flight, write_flight
@@ -33,6 +35,7 @@ FLIGHTS = ("village-1", "town-a")
 GENERATED = "generated"
 GENERATED_S, GENERATED_SEED = 20.0, 3  # seconds of flight; an arbitrary seed
 GENERATED_SIZE_M = (1600.0, 1200.0)
+WIDE = 150  # characters of the widest tables
 WEIGHTS_FREE, XFEAT = "weights-free", "xfeat"
 _ERROR_OF_EXIT_CODE = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}
 
@@ -45,12 +48,14 @@ def bench(
     frames: int | None = None,
     xfeat: bool = True,
     growing: bool = False,
+    page: Path | None = None,
 ) -> dict[str, Any]:
     """Writes the results to ``out`` (JSON), prints tables, and returns the results.
 
     ``data``: folder with flights/ and models/. ``flights``: names in it, or "generated"; default: FLIGHTS, or the
     generated one if the data are absent. ``frames``: number of first frames of each flight; None: all. ``xfeat``: also
-    with XFeat. ``growing``: also the cost of larger maps and longer flights. Raises TerrafixError."""
+    with XFeat. ``growing``: also the cost of larger maps and longer flights. ``page``: Markdown to write, with a
+    picture in images/ beside it. Raises TerrafixError."""
     if frames is not None and frames < 2:
         raise UsageError(f"--frames {frames}: two frames are the least that can be measured")
     try:
@@ -75,7 +80,7 @@ def bench(
             flight, package = _prepare(data, name, work, frames, console)
             measured = _flight(flight, package, work, model, console)
             if not result["micro"]:
-                result["micro"] = {"flight": name, **_part(bench_micro, flight, package, work / WEIGHTS_FREE, model)}
+                result["micro"] = {"flight": name, **_part(bench_micro, flight, package, work / WEIGHTS_FREE, None)}
             result["flights"][name] = measured
         if growing:
             result["growth"] = scaling.measure(Path(temporary), console)
@@ -85,6 +90,9 @@ def bench(
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
     _show(result, out)
+    if page is not None:
+        write_page(page, result)
+        typer.echo(f"written to {page}")
     return result
 
 
@@ -154,10 +162,13 @@ def _flight(flight: Path, package: Path, work: Path, model: Path | None, console
     for kind in (WEIGHTS_FREE, XFEAT) if model else (WEIGHTS_FREE,):
         with console.status(f"{work.name}: {kind}"):
             runs[kind] = _part(bench_run, flight, package, work / kind, model if kind == XFEAT else None)
-    with console.status(f"{work.name}: {bench_baseline.METHOD}"):
-        baseline = _part(bench_baseline, flight, package, work / WEIGHTS_FREE, None)
+    with console.status(f"{work.name}: peers"):
+        found = _part(bench_peers, flight, package, work / WEIGHTS_FREE, model.parent if model else None)
+    baseline = {"method": bench_peers.SIFT, "frames": found["frames"], **found["peers"].pop(bench_peers.SIFT)}
     ratios = {kind: _ratios(run, baseline) for kind, run in runs.items()}
-    return {"frames": baseline["frames"], "runs": runs, "baseline": baseline, "ratios": ratios}
+    with console.status(f"{work.name}: kernels"):
+        floor = _part(bench_kernels, flight, package, work / "kernels", None)
+    return {"floor": floor, "runs": runs, "baseline": baseline, "ratios": ratios, **found}
 
 
 def _ratios(run: dict[str, Any], baseline: dict[str, Any]) -> dict[str, float | None]:
@@ -186,7 +197,7 @@ def _part(module: Any, flight: Path, package: Path, out: Path, model: Path | Non
 
 
 def _show(result: dict[str, Any], out: Path) -> None:
-    console, m = Console(), result["machine"]
+    console, wide, m = Console(), Console(width=WIDE), result["machine"]
     load = "/".join(f"{v:.1f}" for v in (m["load_average_before"][0], m["load_average_after"][0]))
     console.print(f"{m['cpu']}, {m['cores']} cores, load {load} (before/after)", highlight=False)
     for name, flight in result["flights"].items():
@@ -200,8 +211,6 @@ def _show(result: dict[str, Any], out: Path) -> None:
         for title, key in (("frame, ms (median / p95)", "frame_ms"), ("processor, ms", "cpu_ms")):
             table.add_row(title, *(_pair(r[key]) for r in (*runs.values(), baseline)))
         table.add_row("first frame, ms", *(f"{r['first_frame_ms']:.0f}" for r in runs.values()), "")
-        for stage in next(iter(runs.values()))["stage_ms"]:
-            table.add_row(f"  {stage}", *(_pair(r["stage_ms"][stage]) for r in runs.values()), "")
         for key in ("within_20m", "within_50m"):
             cells = [_percent(r["accuracy"][key]) for r in (*runs.values(), baseline)]
             table.add_row(key.replace("_", " ").replace("m", " m"), *cells)
@@ -211,6 +220,13 @@ def _show(result: dict[str, Any], out: Path) -> None:
         table.add_row("start-up", *(f"{r['start_up_s']:.1f} s" for r in runs.values()), "")
         table.add_row("peak memory", *(f"{r['peak_memory_mb']:.0f} MB" for r in runs.values()), "")
         console.print(table)
+        for title, rows in (
+            ("beside other methods, on the same frames and predictions (ms)", comparison_table(flight)),
+            ("stages and their floor (ms)", stage_table(flight)),
+        ):
+            wide.print(scaling.side_by_side(title, rows))
+        for what in flight["missing"]:
+            console.print(f"not measured: {what}", highlight=False)
     micro = {part: times for part, times in result["micro"].items() if isinstance(times, dict)}
     table = Table(title=f"parts, on {result['micro']['flight']}", title_justify="left")
     table.add_column("")

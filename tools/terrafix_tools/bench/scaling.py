@@ -47,8 +47,8 @@ def measure(
     return {"map": maps, "flight": flights, "merge": merged, "render": rendered, "photos": large}
 
 
-def show(grown: dict[str, Any], console: Console) -> None:
-    """Prints tables: map, flight, merge; and lines: rendering, photos. Times are processor times if not marked."""
+def map_table(grown: dict[str, Any]) -> list[list[str]]:
+    """-> head and rows: a column for each map, a row for each quantity. Processor times if not marked."""
     by_size = []
     for one in grown["map"]:
         correlations = {
@@ -66,7 +66,11 @@ def show(grown: dict[str, Any], console: Console) -> None:
             **correlations,
             "memory": f"{one['memory_mb']:.0f} MB",
         })  # fmt: skip
-    console.print(_side_by_side("as the map grows (processor time)", by_size))
+    return _columns(by_size)
+
+
+def flight_table(grown: dict[str, Any]) -> list[list[str]]:
+    """As ``map_table``, a column for each flight. Processor times of the estimator alone."""
     by_length = []
     for one in grown["flight"]:
         queries = {f"covariance: {name}": f"{ms['median']:.2f} ms" for name, ms in one["covariance_cpu_ms"].items()}
@@ -79,7 +83,13 @@ def show(grown: dict[str, Any], console: Console) -> None:
             "refinement": f"{one['refine_cpu_s']:.1f} s",
             "memory": f"{one['peak_memory_mb']:.0f} MB",
         })  # fmt: skip
-    console.print(_side_by_side("as the flight grows (processor time, estimator alone)", by_length))
+    return _columns(by_length)
+
+
+def show(grown: dict[str, Any], console: Console) -> None:
+    """Prints tables: map, flight, merge; and lines: rendering, photos. Times are processor times if not marked."""
+    console.print(side_by_side("as the map grows (processor time)", map_table(grown)))
+    console.print(side_by_side("as the flight grows (processor time, estimator alone)", flight_table(grown)))
     merging.show(grown["merge"], console)
     one = grown["render"]
     size = f"{one['width_px']}x{one['height_px']}"
@@ -93,14 +103,17 @@ def show(grown: dict[str, Any], console: Console) -> None:
     )
 
 
-def _side_by_side(title: str, cases: list[dict[str, str]]) -> Table:
-    """-> a table with a column per case and a row per quantity."""
+def _columns(cases: list[dict[str, str]]) -> list[list[str]]:
+    return [[name, *(case[name] for case in cases)] for name in cases[0]]
+
+
+def side_by_side(title: str, rows: list[list[str]]) -> Table:
+    """-> a table of head and rows."""
     table = Table(title=title, title_justify="left")
-    for i, head in enumerate(["", *(case[""] for case in cases)]):
+    for i, head in enumerate(rows[0]):
         table.add_column(head, justify="right" if i else "left")
-    for name in cases[0]:
-        if name:
-            table.add_row(name, *(case[name] for case in cases))
+    for row in rows[1:]:
+        table.add_row(*row)
     return table
 
 

@@ -15,6 +15,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
 from terrafix.core.errors import OutputError
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.features.keypoints import Keypoints, MutualNearestMatcher, unit_rows
@@ -84,6 +85,8 @@ def _baseline(manifest: Manifest, sizes: dict[str, int]) -> tuple[str, Callable[
     if manifest.role == "matcher":
         points = [_points(count) for name, count in sorted(sizes.items()) if name != "batch"]
         return "nearest", lambda: MutualNearestMatcher().match(points[0], points[-1])
+    if manifest.role == "correlation":
+        return "OpenCV", lambda: _correlated_by_opencv(manifest, sizes["templates"])
     if manifest.role in ("pair", "global"):
         return None
     rng = np.random.default_rng(0)
@@ -93,6 +96,16 @@ def _baseline(manifest: Manifest, sizes: dict[str, int]) -> tuple[str, Callable[
     if manifest.role == "dense":
         return "gradients", lambda: GradientDescriber().describe(image)
     return "SIFT", lambda: cv2.SIFT.create(1024).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), None)
+
+
+def _correlated_by_opencv(manifest: Manifest, count: int) -> None:
+    """The same correlation by the transforms that fly on a processor."""
+    _, channels, height, width = (size for size in manifest.inputs[0].shape)
+    assert isinstance(channels, int) and isinstance(height, int) and isinstance(width, int)
+    shape = transform_shape(height, width)
+    images = spectra(np.ones((channels, height, width), np.float32), shape)
+    for _ in range(count):
+        cross_correlation(images, spectra(np.ones((channels, height, width), np.float32), shape))
 
 
 def _points(count: int) -> Keypoints:

@@ -46,6 +46,17 @@ def verify(names: Names = None, folder: Folder = "") -> None:
 
 
 @app.command()
+def export(
+    fp16: Annotated[bool, typer.Option("--fp16", help="Half precision: half of the memory traffic of a GPU.")] = False,
+    folder: Folder = "",
+) -> None:
+    """Write the graphs that correlate frames with the map on a GPU ([models] correlation = "gpu")."""
+    from terrafix_tools.models.export import export_correlation
+
+    export_correlation(folder, fp16=fp16)
+
+
+@app.command()
 def build(names: Names = None, folder: Folder = "") -> None:
     """Build TensorRT engines, so that none is built in flight. Default: all fetched models."""
     from terrafix_tools.models.build import build_all

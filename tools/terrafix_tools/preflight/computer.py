@@ -16,8 +16,10 @@ from terrafix.link.output import gps_time
 from terrafix.map.package import MapPackage
 from terrafix.vision.sources import open_configured, parse_start
 from terrafix.vision.sources.description import read_description
+from terrafix_engines.correlation import open_correlator
 from terrafix_engines.features import open_describer
 from terrafix_engines.features.xfeat import XFeatDescriber
+from terrafix_engines.manifest import ManifestError
 from terrafix_engines.providers import short_name
 from terrafix_engines.runtime import ModelFileError
 from terrafix_tools.live import swapped_hint
@@ -38,6 +40,8 @@ def check_lines(config: Config, mission: Path | None, out: Path) -> Iterator[Lin
     yield from _map(config, mission)
     yield from _camera(config)
     yield _models(config)
+    if config.models.correlation == "gpu":
+        yield _correlation(config)
     yield _clock()
     yield _disk(config, out)
     yield _temperature(config)
@@ -161,6 +165,14 @@ def _models(config: Config) -> Line:
         return fail("models", str(error), "correct [models] xfeat, or empty it")
     by = f" by {short_name(describer.model.provider)}" if isinstance(describer, XFeatDescriber) else ""
     return ok("models", f"{config.models.xfeat} can be run{by}")
+
+
+def _correlation(config: Config) -> Line:
+    try:
+        providers = open_correlator(config.models.folder).providers
+    except (ManifestError, ModelFileError) as error:
+        return fail("correlation", str(error), 'terrafix models export and build, or set [models] correlation = "cpu"')
+    return ok("correlation", f"on the GPU by {', '.join(dict.fromkeys(map(short_name, providers)))}")
 
 
 def _clock() -> Line:

@@ -57,6 +57,7 @@ class FlightView:
     summary: dict[str, Any] = field(default_factory=dict)
     header: dict[str, Any] = field(default_factory=dict)
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
+    matched_by: Counter[str] = field(default_factory=Counter)  # frames by features: MapMatch.matcher
     map_verdict: dict[int, str] = field(default_factory=dict)  # by frame id
     rejected_maps: list[RejectedMatch] = field(default_factory=list)
     health: list[tuple[float, Health]] = field(default_factory=list)  # t_s, state of the computer

@@ -122,6 +122,7 @@ def read_record(path: Path) -> tuple[RowTable, int, FlightView]:
                     rejected.append(message)
         elif isinstance(message, MapMatch):
             view.map_verdict.setdefault(message.frame_id, str(message.verdict))
+            view.matched_by[message.matcher] += 1
             anchor_verdict[message.frame_id] = message.verdict
             if message.matches:
                 matched.append((message.t_ns, message.frame_id))

@@ -163,8 +163,11 @@ def verdicts(view: FlightView) -> str:
                 f"<span>{count} · {100 * count / total:.0f} %</span></div>"
             )
         blocks.append(f'<div class="verdict"><h3>{escape(measurement)}</h3>{"".join(rows)}</div>')
+    matched = sum(view.matched_by.values())
+    shares = [f"{escape(by)} {100 * n / matched:.0f} %" for by, n in sorted(view.matched_by.items())]
+    by = f" Frames matched with the map by: {', '.join(shares)}." if shares else ""
     return (
-        '<h2>Verdicts</h2><p class="lead">Verdicts per measurement; rejected ones by reason.</p>'
+        f'<h2>Verdicts</h2><p class="lead">Verdicts per measurement; rejected ones by reason.{by}</p>'
         f'<div class="two">{"".join(blocks)}</div>'
     )
 

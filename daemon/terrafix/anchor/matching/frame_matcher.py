@@ -22,18 +22,18 @@ from terrafix.core.node import Image
 from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, PnpResult, solve
 from terrafix.map.package import LocalMap
 from terrafix.messages import PnpInput, Verdict
+from terrafix_engines.correlation import GraphCorrelator
 from terrafix_engines.features.gradient import GradientDescriber
 
 # Ground sampling distance of the correlation as a share of the height: coarse enough for speed and for tolerance to
-# small changes, fine enough for houses and kerbs. Dense learned descriptors have cells of several pixels and need a
-# finer distance. [tuned]
-CORRELATION_GSD_PER_AGL = {"gradient": 1 / 100, "xfeat": 1 / 330}
+# small changes, fine enough for houses and kerbs. [tuned]
+CORRELATION_GSD_PER_AGL = 1 / 100
 # ground sampling distance of the patches as a share of the height [tuned]
 FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330}
 GSD_STEPS_PER_OCTAVE = 2  # Scales are rounded to this grid, so that the map's descriptors can be cached [tuned]
-# Size of a correlation window in cells x channels: 640 x 640 cells of 8 channels, fewer cells of more channels. A wider
-# window is correlated on coarser cells. [tuned]
-MAX_WINDOW_VALUES = 8 * 640**2
+# Side of a correlation window; a wider one is correlated on coarser cells, which bounds the cost of a look with a wide
+# belief. [measured: docs/benchmark.md, the correlation of a lost vehicle]
+MAX_WINDOW_CELLS = 640
 # side of a patch as a share of the height: 25 m at 100 m, one house and its surroundings [measured: docs/search.md]
 PATCH_PER_AGL = 0.25
 MIN_PATCH_CELLS = 8  # smallest side of a patch, cells [tuned]
@@ -139,7 +139,8 @@ class Fix:
 
 class FrameMatcher:
     """Matches frames with one map layer. ``cache_bytes``: memory for the map's descriptors; ``store``: file store that
-    keeps them for the next process; ``drawn``: the layer is drawn from roads, water and buildings."""
+    keeps them for the next process; ``drawn``: the layer is drawn from roads, water and buildings; ``correlator``: on
+    a GPU."""
 
     def __init__(
         self,
@@ -149,22 +150,24 @@ class FrameMatcher:
         cache_bytes: int = CACHE_BYTES,
         store: DescriptorStore | None = None,
         drawn: bool = False,
+        correlator: GraphCorrelator | None = None,
     ) -> None:
         self.camera = camera
         self._drawn = drawn
+        self._correlator = correlator
         self._map = source
         self._describer = describer
         self._subset = 0
         self._features = MapFeatures(source, describer, cache_bytes, store=store)
-        # Many channels over a wide window are slow. Oriented gradients find the place equally well at a tenth of the
-        # cost.
+        # Correlation is always on gradients: on learned descriptors it finds no more frames at twice the processor
+        # time of a flight and more (docs/models.md). The model describes patches where those of gradients give no pose.
         self.gradients = describer if describer.stride == 1 else GradientDescriber()
         self.gradient_features = (
             self._features if describer.stride == 1 else MapFeatures(source, self.gradients, cache_bytes, store=store)
         )
 
     def correlation_cell_m(self, agl_m: float) -> float:
-        return self._gsd(agl_m, CORRELATION_GSD_PER_AGL, self._describer) * self._describer.stride
+        return self.cell_m(agl_m, CORRELATION_GSD_PER_AGL)
 
     def cell_m(self, agl_m: float, per_agl: float) -> float:
         """Cell size in metres for a share of the height, rounded to half octaves; not finer than the map or the
@@ -202,38 +205,29 @@ class FrameMatcher:
 
         Verdict TOO_LOW: the frame covers too few cells or sees no ground; OUTSIDE_MAP: no map data in the window.
         """
-        describer, features = self._describer, self._features
         hypotheses = self._next_subset(_hypotheses(view))
-        gsd = self._gsd(view.agl_m, CORRELATION_GSD_PER_AGL, describer)
-        max_cells = float(np.sqrt(MAX_WINDOW_VALUES / describer.channels))
-        if len(hypotheses) > 1 or 2 * belief.half_m / (gsd * describer.stride) > max_cells:
-            describer, features = self.gradients, self.gradient_features
-            gsd = self._gsd(view.agl_m, CORRELATION_GSD_PER_AGL, describer)
-            max_cells = float(np.sqrt(MAX_WINDOW_VALUES / describer.channels))
-        stride = describer.stride
-        while 2 * belief.half_m / (gsd * stride) > max_cells:
-            gsd *= 2.0
-        image = without_colour(image, describer)
-        first = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, stride)
-        if first is None or min(first.mask.shape) < MIN_SIDE_CELLS * stride / 2:
+        cell = self.correlation_cell_m(view.agl_m)
+        while 2 * belief.half_m / cell > MAX_WINDOW_CELLS:
+            cell *= 2.0
+        image = without_colour(image, self.gradients)
+        first = rectify(image, self.camera, view.r_w_c, view.agl_m, cell, 1)
+        if first is None or min(first.mask.shape) < MIN_SIDE_CELLS / 2:
             return CorrelationResult(Verdict.TOO_LOW)
-        cell = gsd * stride
-        footprint_m = float(np.sqrt(first.mask.sum())) * gsd
-        frames = [first] if hypotheses == (AS_PREDICTED,) else self.rectify_all(image, view, hypotheses, gsd, stride)
+        footprint_m = float(np.sqrt(first.mask.sum())) * cell
+        frames = [first] if hypotheses == (AS_PREDICTED,) else self.rectify_all(image, view, hypotheses, cell, 1)
         usable = [(h, f) for h, f in zip(hypotheses, frames, strict=True) if f is not None]
         extents = [self._extent(f) for _, f in usable]
         e_min = belief.centre[0] - belief.half_m + min(r[0] for r in extents)
         n_max = belief.centre[1] + belief.half_m + max(r[1] for r in extents)
         width = int((2 * belief.half_m + max(r[2] for r in extents) - min(r[0] for r in extents)) / cell) + 2
         height = int((2 * belief.half_m + max(r[1] for r in extents) - min(r[3] for r in extents)) / cell) + 2
-        descriptors, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
+        descriptors, valid, e_min, n_max = self.gradient_features.window(e_min, n_max, width, height, cell)
         if not valid.any():
             return CorrelationResult(Verdict.OUTSIDE_MAP)
-        window = CorrelationWindow(descriptors, valid, self._drawn)
+        window = CorrelationWindow(descriptors, valid, self._drawn, self._correlator)
+        correlations = window.correlate_all([_describe(frame, self.gradients) for _, frame in usable])
         surfaces = []
-        for _, frame in usable:
-            template, mask = _describe(frame, describer)
-            correlation = window.correlate(template, mask)
+        for (_, frame), correlation in zip(usable, correlations, strict=True):
             z = standardise(correlation)
             # Places without a mapped feature are neither excluded nor preferred: they are as frequent among right
             # places as among all (docs/decisions/042-vectors-as-a-layer.md).
@@ -277,7 +271,7 @@ class FrameMatcher:
     def _patch_fix(
         self, describer: Describer, image: Image, view: View, radius_share: float, threshold: float
     ) -> Fix | None:
-        gsd = self._gsd(view.agl_m, FIX_GSD_PER_AGL, describer)
+        gsd = self.cell_m(view.agl_m, FIX_GSD_PER_AGL[describer.name])
         cell = gsd * describer.stride
         image = without_colour(image, describer)
         frame = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, describer.stride)
@@ -319,9 +313,6 @@ class FrameMatcher:
         chosen = {scale for i, scale in enumerate(scales) if (i - centre - self._subset) % subsets == 0}
         self._subset = (self._subset + 1) % subsets
         return tuple(h for h in hypotheses if h.scale in chosen)
-
-    def _gsd(self, agl_m: float, per_agl: dict[str, float], describer: Describer) -> float:
-        return self.cell_m(agl_m, per_agl[describer.name])
 
     def _extent(self, frame: Rectified) -> tuple[float, float, float, float]:
         """Extent of a rectified frame relative to the nadir, metres: e_min, n_max, e_max, n_min."""

@@ -17,6 +17,7 @@ from terrafix.map.format import DRAWN_TABLE, accuracy_of
 from terrafix.map.null_model import NullModel, NullRow, null_row_for
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix.messages import Verdict
+from terrafix_engines.correlation import GraphCorrelator
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class MapLayer:
 
 class MapLayers:
     """All layers of one package. ``ce90_m``: accuracy of layers that state none. ``store_folder``: folder in memory for
-    computed descriptors. ``places``: a place index, of this package or of others too."""
+    computed descriptors. ``places``: a place index, of this package or of others too. ``correlator``: on a
+    GPU."""
 
     def __init__(
         self,
@@ -50,6 +52,7 @@ class MapLayers:
         ce90_m: float,
         store_folder: Path | None = None,
         places: PlaceMemory | None = None,
+        correlator: GraphCorrelator | None = None,
     ) -> None:
         layers = package.manifest.layers
         self._all: dict[str, MapLayer] = {}
@@ -61,7 +64,7 @@ class MapLayers:
                     store_folder, f"{_file_identity(package)} {frame} {layer.table}", MAX_TILES // len(layers)
                 )
             cache_bytes = CACHE_BYTES // len(layers)
-            matcher = FrameMatcher(camera, bound, describer, cache_bytes, store, layer.is_drawn)
+            matcher = FrameMatcher(camera, bound, describer, cache_bytes, store, layer.is_drawn, correlator)
             sigma_m = accuracy_of(layer, ce90_m).sigma_m
             recognizer = None
             if places is not None and (indexed := places.index.layer(package.manifest.checksum, layer.table)):

@@ -1,10 +1,14 @@
 """Zero-mean normalised cross-correlation of dense descriptors by FFT; the result is the whole surface."""
 
+import functools
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
 from terrafix.anchor.matching.fft import cross_correlation, each_correlation, spectra, transform_shape
 from terrafix.anchor.matching.interpolation import interpolated
+from terrafix_engines.correlation import GraphCorrelator
 
 MIN_OVERLAP = 0.8  # share of the template that must lie on valid map data; with less, the cell is NaN [tuned]
 # lower bound of the map's variance as a share of the template's, so that water and fields without texture are not
@@ -18,33 +22,61 @@ TAIL, TAIL_SIGMAS = 0.995, 2.576
 class CorrelationWindow:
     """A map window with its transforms, shared by all templates that are correlated with it."""
 
-    def __init__(self, descriptors: np.ndarray, valid: np.ndarray, drawn: bool = False) -> None:
+    def __init__(
+        self, descriptors: np.ndarray, valid: np.ndarray, drawn: bool = False, correlator: GraphCorrelator | None = None
+    ) -> None:
         """``descriptors`` (C, H, W) float32, ``valid`` (H, W) bool. ``drawn``: the map is drawn from features; where it
-        shows nothing the ground is not even, it is not mapped."""
+        shows nothing the ground is not even, it is not mapped. ``correlator``: on a GPU, instead of OpenCV's
+        transforms; local sums, whose differences need single precision, stay there."""
         self._drawn = drawn
+        self._correlator = correlator
+        self._descriptors = descriptors
         self._shape = descriptors.shape[1:]
-        self._fft_shape = transform_shape(*self._shape)
-        self._channels = spectra(descriptors, self._fft_shape)
         self._local = _LocalSums(descriptors, None if valid.all() else valid)
 
     def correlate(self, template: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """``template`` (C, h, w), ``mask`` (h, w) bool -> correlation (H - h + 1, W - w + 1) in [-1, 1]. Cell (r, c):
         the template's corner is at the window's cell (r, c). NaN where the map does not cover the template, -inf where
         a drawn map shows nothing below it."""
-        (height, width), (h, w) = self._shape, mask.shape
-        weight = mask.astype(np.float32)
-        count = float(weight.sum())
-        centred = (template - ((template * weight).sum((1, 2)) / count)[:, None, None]) * weight
+        return self.correlate_all([(template, mask)])[0]
+
+    def correlate_all(self, templates: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+        """``correlate`` of each (template, mask), by one inference if there is a correlator."""
+        weights = [mask.astype(np.float32) for _, mask in templates]
+        centred = [_centred(template, weight) for (template, _), weight in zip(templates, weights, strict=True)]
+        products = self._correlator.correlate(self._descriptors, centred) if self._correlator else None
+        if products is None:
+            products = [self._product(one) for one in centred]
+        return [self._normalised(*one) for one in zip(products, centred, weights, strict=True)]
+
+    def _product(self, centred: np.ndarray) -> np.ndarray:
+        (height, width), (h, w) = self._shape, centred.shape[1:]
+        surface = cross_correlation(self._channels, spectra(centred, self._fft_shape))
+        return surface[: height - h + 1, : width - w + 1]
+
+    @functools.cached_property
+    def _fft_shape(self) -> tuple[int, int]:
+        return transform_shape(*self._shape)
+
+    @functools.cached_property
+    def _channels(self) -> np.ndarray:
+        return spectra(self._descriptors, self._fft_shape)
+
+    def _normalised(self, surface: np.ndarray, centred: np.ndarray, weight: np.ndarray) -> np.ndarray:
         template_energy = float((centred**2).sum())
-        rows, columns = height - h + 1, width - w + 1
-        variance, overlap = self._local.under(weight, rows, columns)
-        surface = cross_correlation(self._channels, spectra(centred, self._fft_shape))[:rows, :columns]
+        variance, overlap = self._local.under(weight, *surface.shape)
         surface /= np.sqrt(np.maximum(np.maximum(variance, FLAT_VARIANCE * template_energy) * template_energy, 1e-12))
         if self._drawn:
             surface[variance < FLAT_VARIANCE * template_energy] = -np.inf
         if overlap is not None:
             surface[overlap < MIN_OVERLAP] = np.nan
         return surface
+
+
+def _centred(template: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """``template`` (C, h, w) less its mean of each channel where ``weight`` (h, w) is 1, zero elsewhere."""
+    count = float(weight.sum())
+    return np.asarray((template - ((template * weight).sum((1, 2)) / count)[:, None, None]) * weight)
 
 
 class _LocalSums:
