@@ -39,7 +39,11 @@ if [ "$pip" = yes ]; then
         exit 1
     fi
     "$chosen" -m venv "$prefix/opt/terrafix/venv"
-    "$prefix/opt/terrafix/venv/bin/pip" install --upgrade --constraint "$here/../requirements.lock" "$here/.."
+    pip=$prefix/opt/terrafix/venv/bin/pip
+    "$pip" install --upgrade --constraint "$here/../requirements.lock" "$here/.."
+    # Without libsystemd-dev and a compiler it cannot be built; the log is then JSON in the text of the journal.
+    "$pip" install --constraint "$here/../requirements.lock" "$here/..[vehicle]" ||
+        echo "install.sh: no systemd-python (apt install libsystemd-dev gcc pkg-config): the journal gets no fields" >&2
 fi
 
 install -D -m 0644 "$here/terrafix.service" "$prefix/etc/systemd/system/terrafix.service"
