@@ -9,6 +9,7 @@ import typer
 from terrafix import __version__
 from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
+from terrafix_tools.chaos.cli import chaos
 from terrafix_tools.compare.cli import compare
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.fleet.cli import app as fleet_app
@@ -35,6 +36,7 @@ app.add_typer(log_app, name="log")
 app.add_typer(fleet_app, name="fleet")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
+app.command()(chaos)
 app.command()(compare)
 app.command()(finalise)
 app.command()(locate)
