@@ -18,7 +18,7 @@ from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 from terrafix_tools.sim.camera.stream import FrameStream
 from terrafix_tools.sim.flights.folder import CAMERA
 
-RESTART_S = 1.0  # RestartSec= of the systemd unit, whose part the rig takes
+RESTART_S = 0.1  # RestartSec= of the systemd unit, whose part the rig takes
 START_LIMIT_S = 90.0  # until the camera is opened, on a computer that others use too
 STOP_LIMIT_S = 45.0  # TimeoutStopSec= of the unit
 COOL_MC = 40_000  # of the simulated thermal zone
