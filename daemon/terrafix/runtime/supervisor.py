@@ -58,6 +58,7 @@ def run(
     stop_after_source: bool = False,
     on_event: Callable[[ProcessEvent], None] | None = None,
     on_epoch: Callable[[int], None] | None = None,
+    on_run_dir: Callable[[RunDir], None] | None = None,
     stop: threading.Event | None = None,
     log_to: Path | None = None,
     table: tuple[Process, ...] = PROCESSES,
@@ -68,7 +69,8 @@ def run(
     ``source``, ``map_path`` (a map package), ``link``, ``start`` ("LAT,LON"): override the configuration when not
     empty. ``ground_amsl_m``: ground height of the map at the start, for a source without one. ``on_event`` receives all
     events of the processes. ``on_epoch`` is called once with the t_ns of the first Origin, which is the zero of a
-    recorded source on the monotonic clock. ``log_to``: file for all logs and tracebacks instead of stdout and stderr.
+    recorded source on the monotonic clock, ``on_run_dir`` once with the run folder. ``log_to``: file for all logs and
+    tracebacks instead of stdout and stderr.
     ``fork_server``: one that the caller has started and closes; None: own one.
 
     Returns 0, or 1 when the link was given up, or the exit code of a process that could not start because of a user
@@ -85,6 +87,8 @@ def run(
         spec = msgspec.json.encode(spec_of(table, config, package, out_dir, ground_amsl_m))
         owned = OwnedRunDir(spec=spec, resume=_is_camera(config.source.path))
         stack.callback(owned.remove)
+        if on_run_dir:
+            on_run_dir(owned.run_dir)
         if owned.run_dir.epoch_ns is not None:
             logs.get().warning("resumes a run that was killed", epoch_ns=owned.run_dir.epoch_ns)
         stop_signal = stack.enter_context(StopSignal(signal.SIGTERM, signal.SIGINT))  # for the ordered stop
