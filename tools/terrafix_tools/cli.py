@@ -13,6 +13,7 @@ from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
 from terrafix_tools.chaos.cli import chaos
 from terrafix_tools.compare.cli import compare
+from terrafix_tools.files.cli import files
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.fleet.cli import app as fleet_app
 from terrafix_tools.hint.cli import CONTEXT, hint
@@ -41,6 +42,7 @@ app.add_typer(sim_app, name="sim")
 app.command()(accept)
 app.command()(chaos)
 app.command()(compare)
+app.command()(files)
 app.command()(finalise)
 app.command()(locate)
 app.command()(preflight)
