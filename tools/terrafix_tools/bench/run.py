@@ -24,8 +24,8 @@ from terrafix_tools.bench import baseline as bench_baseline
 from terrafix_tools.bench import flights as bench_run
 from terrafix_tools.bench import micro as bench_micro
 from terrafix_tools.bench import scaling
+from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import build, ensure_package
-from terrafix_tools.replay import map_cache_dir
 from terrafix_tools.sim.flights.folder import FRAME_HZ, plan_flight, write_flight
 from terrafix_tools.sim.world import place as world
 
