@@ -1,4 +1,4 @@
-"""Fuzzing of the parsers of what comes from outside: mutated inputs, the corpus of earlier findings, and its command."""
+"""Fuzzing of the parsers of what comes from outside: mutated inputs, a corpus of earlier findings, and its command."""
 
 import random
 from pathlib import Path
@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from typer import Exit
 
 from terrafix.core.errors import SourceError
+from terrafix.vision.sources.images import decode_image
 from terrafix_tools.fuzz import __main__ as command
 from terrafix_tools.fuzz.mutate import MAX_BYTES, mutated
-from terrafix_tools.fuzz.targets import TARGETS, Target, refused_or_read
+from terrafix_tools.fuzz.targets import HEIGHT, TARGETS, WIDTH, Target, refused_or_read
 
 CORPUS = Path(__file__).resolve().parents[2] / "corpus"
 TARGET_OF = {target.name.replace(" ", "-"): target for target in TARGETS}
@@ -93,3 +94,20 @@ def test_an_input_that_takes_too_long_is_a_finding(tmp_path: Path, monkeypatch: 
     with pytest.raises(Exit) as ended:
         command.main(target=None, executions=1, seed=1, out=tmp_path)
     assert ended.value.exit_code == 1 and (tmp_path / "slow-1").exists()
+
+
+@pytest.mark.parametrize("file", sorted((CORPUS / "image").glob("chunk-*")), ids=lambda file: file.name)
+def test_a_png_whose_chunk_states_gigabytes_is_refused_without_taking_them(file: Path) -> None:
+    data = file.read_bytes()
+    taken_mb = command._memory_of(lambda: refused_or_read(TARGET_OF["image"], data))
+    assert taken_mb < 50.0
+    assert decode_image(data, WIDTH, HEIGHT)[0] is None
+
+
+def test_memory_beyond_the_limit_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        command, "TARGETS", (Target("hungry", lambda: [b"a"], lambda _data: bytearray(300 << 20).clear()),)
+    )
+    with pytest.raises(Exit):
+        command.main(target=None, executions=1, seed=1, out=tmp_path)
+    assert (tmp_path / "hungry-1").exists()

@@ -56,13 +56,19 @@ def scene_in(folder: Path, seed: int) -> Scene:
         mission = folder.with_suffix(".waypoints")
         write_mission(mission, _mission(seed))
         flight = make(folder, FlightOptions(seed=seed, vehicle=Kind.COPTER, mission=mission), progress=False)
-        write_course(folder / COURSE, _states(flight))
+        course_of(flight, folder)
     course = read_course(folder / COURSE)
     jpegs = sorted((folder / "frames").glob("*.jpg"))
     if not jpegs:
         raise SourceError(f"{folder}: has no images; remove it, and it is generated anew")
     duration_s = len(jpegs) / FRAME_HZ
     return Scene(folder / MAP_NAME, jpegs, course, phases(course, duration_s), duration_s)
+
+
+def course_of(flight: Flight, folder: Path) -> Course:
+    """The true course of a flight, which is written into its folder. Raises OutputError, SourceError."""
+    write_course(folder / COURSE, _states(flight))
+    return read_course(folder / COURSE)
 
 
 def _mission(seed: int) -> Mission:

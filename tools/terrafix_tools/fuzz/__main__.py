@@ -1,13 +1,15 @@
 """Runs the fuzzers: ``python -m terrafix_tools.fuzz [--target NAME ...] [--executions N] [--seed S] [--out FOLDER]``.
 
-N executions of each target, by mutated valid inputs. An exception that is no TerrafixError, or a run of more than
-LIMIT_S seconds of processor time, is a finding: its input is written into FOLDER, and the exit code is 1. A finding
-becomes a file of tests/corpus when it is mended, and the tests read it ever after."""
+N executions of each target, by mutated valid inputs. An exception that is no TerrafixError, a run of more than LIMIT_S
+seconds of processor time, or one that takes more than LIMIT_MB of memory, is a finding: its input is written into
+FOLDER, and the exit code is 1. A finding becomes a file of tests/corpus when it is mended, and the tests read it ever
+after."""
 
 import random
 import signal
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -18,12 +20,14 @@ from terrafix_tools.fuzz.mutate import mutated
 from terrafix_tools.fuzz.targets import TARGETS, Target, refused_or_read
 from terrafix_tools.standalone import run_standalone
 
+RESET, RESET_PEAK = Path("/proc/self/clear_refs"), "5"  # proc(5): sets VmHWM to the present size
 LIMIT_S = 5.0  # processor time of one input
+LIMIT_MB = 200  # memory of one input; all valid ones are below 1 MB
 MOST_FINDINGS = 20  # of one target; the run of it ends
 
 
-class Hang(Exception):
-    """An input took more than LIMIT_S."""
+class TooMuch(Exception):
+    """An input took more than LIMIT_S or LIMIT_MB."""
 
 
 def main(
@@ -50,7 +54,9 @@ def fuzz(target: Target, executions: int, seed: int, out: Path) -> int:
         data = mutated(seeds, rng)
         signal.setitimer(signal.ITIMER_VIRTUAL, LIMIT_S)
         try:
-            refused_or_read(target, data)
+            taken_mb = _memory_of(lambda data=data: refused_or_read(target, data))  # type: ignore[misc]
+            if taken_mb > LIMIT_MB:
+                raise TooMuch(f"{taken_mb:.0f} MB of memory")
         except Exception as error:  # noqa: BLE001  # any kind is a finding
             where = traceback.extract_tb(error.__traceback__)[-1]
             name = f"{type(error).__name__} {Path(where.filename).name} {where.lineno}"
@@ -73,8 +79,21 @@ def _write(out: Path, target: Target, number: int, data: bytes) -> None:
         raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
 
 
+def _memory_of(run: Callable[[], None]) -> float:
+    """-> MB by which the resident memory of this program was larger while it ran."""
+    RESET.write_text(RESET_PEAK)
+    before_mb = _peak_mb()
+    run()
+    return _peak_mb() - before_mb
+
+
+def _peak_mb() -> float:
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
+
+
 def _too_long(*_: object) -> None:
-    raise Hang(f"more than {LIMIT_S:g} s of processor time")
+    raise TooMuch(f"more than {LIMIT_S:g} s of processor time")
 
 
 if __name__ == "__main__":
