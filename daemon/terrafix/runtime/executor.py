@@ -223,8 +223,11 @@ class LiveShell:
 
     def _publish_log_lines(self) -> None:
         """Publishes what this process has logged beside its messages, so that it is in the record."""
-        name = self._process.name
-        self._publish(LogLine(process=name, **line) for line in logs.take_lines())
+        for line in logs.take_lines():
+            message = LogLine(process=self._process.name, **line)
+            if self._edge is not None:
+                self._edge.on_message(message)  # the edge of the recorder writes those of its own process
+            self._publisher.publish(message)
 
     def _wait(self) -> None:
         """Waits for a message, at most until the next tick or poll of the edge is due."""
