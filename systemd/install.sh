@@ -1,21 +1,24 @@
 #!/bin/sh
 # Installs Terrafix as a systemd service: virtual environment in /opt/terrafix, settings in /etc/terrafix.
 #
-#   sudo systemd/install.sh [--python /path/to/python3.11] [--prefix DIR] [--no-pip]
+#   sudo systemd/install.sh [--python /path/to/python3.11] [--prefix DIR] [--no-pip] [--package WHEEL]
 #
 # Run it again to upgrade: an existing /etc/terrafix/terrafix.toml is not changed. --prefix installs the files below
-# DIR and starts nothing (for images and tests); --no-pip does not change the virtual environment.
+# DIR and starts nothing (for images and tests); --no-pip does not change the virtual environment. --package installs
+# this wheel; default: the source tree that this file is in (`terrafix files DIR` copies it out of a wheel).
 set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
 python=${PYTHON:-}
 prefix=
 pip=yes
+package=$here/..
 while [ $# -gt 0 ]; do
     case $1 in
         --python) python=$2; shift 2 ;;
         --prefix) prefix=$2; shift 2 ;;
         --no-pip) pip=no; shift ;;
+        --package) package=$2; shift 2 ;;
         *) echo "install.sh: unknown option $1; see the head of this file" >&2; exit 2 ;;
     esac
 done
@@ -27,6 +30,10 @@ fi
 # gtsam 4.3 has wheels for Python 3.11 and later; JetPack 6 includes 3.10 (docs/jetson.md describes how to install a
 # newer one).
 if [ "$pip" = yes ]; then
+    if [ -d "$package" ] && [ ! -f "$package/pyproject.toml" ]; then
+        echo "install.sh: $package is no source tree; give the wheel with --package" >&2
+        exit 2
+    fi
     for candidate in $python python3.12 python3.11 python3; do
         if command -v "$candidate" >/dev/null 2>&1 &&
             "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
@@ -39,7 +46,11 @@ if [ "$pip" = yes ]; then
         exit 1
     fi
     "$chosen" -m venv "$prefix/opt/terrafix/venv"
-    "$prefix/opt/terrafix/venv/bin/pip" install --upgrade --constraint "$here/../requirements.lock" "$here/.."
+    install=$prefix/opt/terrafix/venv/bin/pip
+    "$install" install --upgrade --constraint "$here/../requirements.lock" "$package"
+    # Without libsystemd-dev and a compiler it cannot be built; the log is then JSON in the text of the journal.
+    "$install" install --constraint "$here/../requirements.lock" "${package}[vehicle]" ||
+        echo "install.sh: no systemd-python (apt install libsystemd-dev gcc pkg-config): the journal gets no fields" >&2
 fi
 
 install -D -m 0644 "$here/terrafix.service" "$prefix/etc/systemd/system/terrafix.service"

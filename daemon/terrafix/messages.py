@@ -125,6 +125,9 @@ class Origin(Message, frozen=True, kw_only=True):
     attitude_sigma_deg: float  # of reported roll and pitch
 
 
+OVERTAKEN = "overtaken: a newer frame was there first"  # error of a frame that was left out, not of the camera
+
+
 class Frame(Message, frozen=True, kw_only=True):
     """A new camera frame, whose pixels are in the frame store under ``frame_id``."""
 
@@ -822,6 +825,15 @@ class Dropped(Message, frozen=True, kw_only=True):
     count: int
 
 
+class LogLine(Message, frozen=True, kw_only=True):
+    """A line of the log of a process that no other message says (core/log_lines.py); published by its shell."""
+
+    process: str
+    level: str  # "error", "warning", "info", "debug"
+    event: str
+    fields: dict[str, str | int | float | bool | None] = {}
+
+
 AnyMessage = (
     Origin
     | Frame
@@ -862,4 +874,5 @@ AnyMessage = (
     | ProcessEvent
     | InputOrder
     | Dropped
+    | LogLine
 )

@@ -65,6 +65,7 @@ ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.ProcessEvent,
     m.InputOrder,
     m.Dropped,
+    m.LogLine,
 )
 
 # Processes start in this order and stop in the reverse order, so that the recorder receives the last messages of all.

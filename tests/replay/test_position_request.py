@@ -9,10 +9,10 @@ import pytest
 import rasterio
 from rasterio.warp import transform
 
+from terrafix.core.log_lines import MessageLog
 from terrafix.core.node import Node, NodeContext
 from terrafix.link.node import LinkNode
 from terrafix.messages import HintVerdict, Message, NavEstimate, PositionHint, StatusText, Verdict
-from terrafix.runtime.message_log import log_entry
 from terrafix_tools.evaluate import evaluate
 from terrafix_tools.replay import make_nodes, replay
 
@@ -115,7 +115,7 @@ def test_after_a_fifth_of_the_route_without_a_fix_the_operator_is_asked_and_the_
     assert last_before < asked
     fifth = way_m(truth[: EVERY * asked : EVERY]) * 0.2
     assert way_m(truth[EVERY * last_before : EVERY * asked : EVERY]) <= max(fifth, 35.0 * MAX_SPEED_MPS)
-    entries = [log_entry(text) for _, text in operator.asked]
+    entries = [MessageLog().entry(text) for _, text in operator.asked]
     assert all(entry is not None and entry.level == "warning" and "hint" in entry.fields["text"] for entry in entries)
     assert operator.verdicts and {v.verdict for v in operator.verdicts} == {Verdict.ACCEPTED}
     result = evaluate(tmp_path / "out", flight / "truth.csv")

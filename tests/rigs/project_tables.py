@@ -10,7 +10,11 @@ from terrafix.processes import ALL_MESSAGES, PROCESSES, SUPERVISOR
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "architecture.md"
 # Published by the shell and the supervisor, which are not processes of the table.
-OTHER_PUBLISHERS = {"ProcessEvent": f"the {SUPERVISOR}", "Dropped": "the shell of every process"}
+OTHER_PUBLISHERS = {
+    "ProcessEvent": f"the {SUPERVISOR}",
+    "Dropped": "the shell of every process",
+    "LogLine": f"the shell of every process, the {SUPERVISOR}",
+}
 
 
 def process_table() -> str:

@@ -1,6 +1,8 @@
 """The command line `terrafix`. Each command imports its modules when it is called, so that --help is fast."""
 
+import contextlib
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +11,9 @@ import typer
 from terrafix import __version__
 from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
+from terrafix_tools.chaos.cli import chaos
 from terrafix_tools.compare.cli import compare
+from terrafix_tools.files.cli import files
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.fleet.cli import app as fleet_app
 from terrafix_tools.hint.cli import CONTEXT, hint
@@ -24,6 +28,7 @@ from terrafix_tools.status.cli import status
 
 if TYPE_CHECKING:
     from terrafix.runtime.fork_server import ForkServer
+    from terrafix.runtime.run_dir import RunDir
 
 # optional packages of the extra `ground`; not installed on a vehicle
 GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog")
@@ -35,7 +40,9 @@ app.add_typer(log_app, name="log")
 app.add_typer(fleet_app, name="fleet")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
+app.command()(chaos)
 app.command()(compare)
+app.command()(files)
 app.command()(finalise)
 app.command()(locate)
 app.command()(preflight)
@@ -65,6 +72,18 @@ def options(
     """Position without GNSS: a camera and a map."""
 
 
+@contextlib.contextmanager
+def _run_line() -> Iterator["Callable[[RunDir], None] | None"]:
+    """What prints the line of a run. Only a terminal imports it: the vehicle starts faster without."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from terrafix_tools.status.line import RunLine
+
+    with RunLine() as line:
+        yield line.start
+
+
 @app.command()
 def run(
     context: typer.Context,
@@ -76,7 +95,9 @@ def run(
     until_end: Annotated[bool, typer.Option("--until-end", help="Stop when a recorded source has ended.")] = False,
     config: ConfigOption = None,
 ) -> None:
-    """Fly: start the processes under the supervisor until stopped."""
+    """Fly: start the processes under the supervisor until stopped.
+
+    In a terminal it prints once a second where it is and why, on stderr; logs are on stdout."""
     from terrafix.runtime.supervisor import recently_killed_spec
     from terrafix.runtime.supervisor import run as run_supervised
 
@@ -90,17 +111,19 @@ def run(
         from terrafix_tools.live import package_for
 
         package, ground_amsl_m = package_for(source, start, map_path, configs)
-    code = run_supervised(
-        source=source,
-        start=start,
-        map_path=package,
-        ground_amsl_m=ground_amsl_m,
-        link=link,
-        out_dir=out,
-        configs=configs,
-        stop_after_source=until_end,
-        fork_server=context.obj,
-    )
+    with _run_line() as on_run_dir:
+        code = run_supervised(
+            source=source,
+            start=start,
+            map_path=package,
+            ground_amsl_m=ground_amsl_m,
+            link=link,
+            out_dir=out,
+            configs=configs,
+            stop_after_source=until_end,
+            on_run_dir=on_run_dir,
+            fork_server=context.obj,
+        )
     if until_end and code == 0:  # not at a shutdown of the vehicle: reading a long record takes too long
         from terrafix_tools.flight_verdict import verdict_of
 

@@ -3,14 +3,14 @@
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from terrafix.link.integrity.fix_type import DEGRADATION_LEVELS, MAX_HORIZONTAL_SIGMA_M
 from terrafix.link.pilot_text.statustext import fault_text
-from terrafix.messages import CalibrationFault, MeasurementVerdict, Verdict
+from terrafix.messages import CalibrationFault, MeasurementVerdict, Origin, Verdict
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import NS, Row, RowTable
 
@@ -99,17 +99,23 @@ def flight_verdict(
 
 
 def verdict_of(folder: Path) -> FlightVerdict:
-    """Returns the verdict for the record in a folder. Raises SourceError when there is none."""
+    """Returns the verdict for the record in a folder, with times since the origin of the flight. Raises SourceError
+    when there is none.
+    """
     table = RowTable()
+    zero_s: float | None = None
     faults: list[tuple[float, CalibrationFault]] = []
     verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for _, _, message in read_flight(folder):
         table.take(message)
+        if isinstance(message, Origin) and zero_s is None:
+            zero_s = message.t_ns / NS
         if isinstance(message, CalibrationFault):
             faults.append((message.t_ns / NS, message))
         elif isinstance(message, MeasurementVerdict):
             verdicts[message.measurement][str(message.verdict)] += 1
-    return flight_verdict(list(table.rows.values()), faults, verdicts)
+    found = flight_verdict(list(table.rows.values()), faults, verdicts)
+    return replace(found, spans=[(a - (zero_s or 0.0), b - (zero_s or 0.0)) for a, b in found.spans])
 
 
 def _distrust_reason(row: Row, start_s: float, faulty_spans: list[tuple[float, float, str]]) -> str:

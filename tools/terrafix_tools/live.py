@@ -10,6 +10,7 @@ from terrafix.core.signature import trusted_keys
 from terrafix.map.package import MapPackage
 from terrafix.vision.sources import open_configured, parse_start
 from terrafix.vision.sources.description import START_SIGMA_M
+from terrafix_tools.flight_map import package_of
 
 
 def package_for(source: str, start: str, map_path: Path | None, configs: list[Path]) -> tuple[Path, float | None]:
@@ -35,7 +36,7 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
         opened.close()
     if map_file is None:
         raise MapError("no map: give one with --map (GeoTIFF or map package) or [map] path")
-    package = map_file if map_file.suffix.lower() == ".gpkg" else _built_package(map_file)
+    package = package_of(map_file, progress=True)
     # If signatures are required, all tiles are verified here, before the flight; in flight each tile is verified at
     # first use.
     trusted = trusted_keys(config.map.trusted_keys, required=config.map.require_signature)
@@ -61,11 +62,3 @@ def swapped_hint(opened: MapPackage, lat_deg: float, lon_deg: float, sigma_m: fl
     if abs(lon_deg) > 90.0 or not opened.covers_start(lon_deg, lat_deg, sigma_m):
         return ""
     return f"latitude and longitude are swapped: {lon_deg:.6f}, {lat_deg:.6f} lies on the map"
-
-
-def _built_package(geotiff: Path) -> Path:
-    # Imported here only: a vehicle has a package, and the GeoTIFF libraries are not installed on it.
-    from terrafix_tools.mapping.build import ensure_package
-    from terrafix_tools.replay import map_cache_dir
-
-    return ensure_package(geotiff, map_cache_dir(), progress=True)

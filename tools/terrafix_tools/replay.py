@@ -28,8 +28,8 @@ from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
 from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import StoredModel, models_folder, resolve_model
+from terrafix_tools.flight_map import package_of
 from terrafix_tools.live import swapped_hint
-from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.rerun.frames import RecordedFrames
 
@@ -70,7 +70,7 @@ def replay(
     source = wrap_source(flight if isinstance(flight, RecordedFrames) else open_source(str(flight), start=start))
     if source.live:
         raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
-    package = ensure_package(_map_of(map_path, config, source), map_cache_dir(), progress=progress)
+    package = package_of(_map_of(map_path, config, source), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
     with ReplayOutput(out, header(config, package.resolve()), config.recorder) as output:
         frames = MemoryFrameStore(FRAMES_KEPT)
@@ -105,12 +105,6 @@ def peak_memory_mb() -> float:
         if line.startswith("VmHWM:"):
             return round(int(line.split()[1]) / 1024, 1)
     raise RuntimeError("/proc/self/status has no VmHWM")
-
-
-def map_cache_dir() -> Path:
-    """Folder that caches packages made from GeoTIFFs."""
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "terrafix" / "maps"
 
 
 def _feed_flight(

@@ -1,6 +1,7 @@
-"""Structured logs: one JSON object per line on stdout, which systemd forwards to the journal. Logging does not block.
+"""Structured logs: one JSON object per line on stdout, or an entry of the systemd journal with fields (ON-8).
 
-ERROR: data or a function is lost; WARN: degraded operation; INFO: change of state; DEBUG: for developers."""
+Logging does not block. ERROR: data or a function is lost, and the line has a field ``todo``; WARN: degraded operation;
+INFO: change of state; DEBUG: for developers. The lines of an event are limited (``RateLimit``)."""
 
 import atexit
 import json
@@ -8,9 +9,12 @@ import logging
 import queue
 import sys
 import threading
-from typing import Any, TextIO
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
 
-from terrafix.core.clock import now_ns
+from terrafix.core.clock import NS_PER_S, now_ns
+from terrafix.core.log_lines import LogEntry
 
 # structlog imports rich, where installed, for coloured tracebacks, which are not used here. The import costs 0.1 s of
 # CPU time in each of seven processes, which delays a restart in flight.
@@ -25,13 +29,24 @@ else:
 
 QUEUE_LENGTH = 2000  # lines; when the reader of stdout hangs, lines are lost instead of the process blocking
 FLUSH_S = 1.0  # time limit for writing the queued lines at exit
+BURST = 10  # lines of one event within BURST_NS; more are counted. All processes start with one line each
+BURST_NS = 10 * NS_PER_S
+KEPT_LINES = 200  # that wait for the record
+FROM_MESSAGE = "_from_message"  # field of lines whose message is in the record
 LEVELS = {"DEBUG": logging.DEBUG, "INFO": logging.INFO, "WARN": logging.WARNING, "ERROR": logging.ERROR}
+
+
+class LineStream(Protocol):
+    """Where lines go: a text file, or the journal (runtime/systemd.py). Each call has one line."""
+
+    def write(self, text: str, /) -> object: ...
+    def flush(self) -> object: ...
 
 
 class LineWriter:
     """Queue of lines that a thread writes to ``stream``. When the queue is full, lines are dropped and counted."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: LineStream) -> None:
         self._stream = stream
         self._queue: queue.Queue[str | None] = queue.Queue(QUEUE_LENGTH)
         self._lost = 0
@@ -78,15 +93,66 @@ def _monotonic(_logger: Any, _method: str, event: structlog.typing.EventDict) ->
     return event
 
 
-def configure(level: str, process: str, stream: TextIO | None = None) -> LineWriter:
+class RateLimit:
+    """At most BURST lines of one event within BURST_NS. The next line after that says how many were left out
+    (``suppressed``), so that a fault that repeats at the rate of frames fills neither the journal nor the record."""
+
+    def __init__(self, clock: Callable[[], int] = now_ns) -> None:
+        self._clock = clock
+        self._times: dict[str, deque[int]] = {}
+        self._suppressed: dict[str, int] = {}
+
+    def __call__(self, _logger: Any, _method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+        name, now = str(event["event"]), self._clock()
+        times = self._times.setdefault(name, deque(maxlen=BURST))
+        if len(times) == BURST and now - times[0] < BURST_NS:
+            self._suppressed[name] = self._suppressed.get(name, 0) + 1
+            raise structlog.DropEvent
+        times.append(now)
+        suppressed = self._suppressed.pop(name, 0)
+        return {**event, "suppressed": suppressed} if suppressed else event
+
+
+_lines: deque[dict[str, Any]] = deque(maxlen=KEPT_LINES)
+
+
+def _keep(_logger: Any, _method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+    """Keeps a line for the record, unless its message is in the record."""
+    if not event.pop(FROM_MESSAGE, False):
+        fields = {k: _plain(v) for k, v in event.items() if k not in ("event", "level", "t_ns", "time")}
+        line = {"t_ns": event["t_ns"], "level": event["level"], "event": str(event["event"]), "fields": fields}
+        _lines.append(line)
+    return event
+
+
+def _plain(value: Any) -> str | int | float | bool | None:
+    return value if value is None or type(value) in (str, int, float, bool) else str(value)
+
+
+def take_lines() -> Iterator[dict[str, Any]]:
+    """The lines that this process has logged since the last call, as the fields of messages.LogLine; those of messages
+    are not among them."""
+    while _lines:
+        yield _lines.popleft()
+
+
+def write(entry: LogEntry | None) -> None:
+    """Logs the line of a message that this process has published."""
+    if entry is not None:
+        getattr(get(), entry.level)(entry.event, **entry.fields, **{FROM_MESSAGE: True})
+
+
+def configure(level: str, process: str, stream: LineStream | None = None) -> LineWriter:
     """Configures structlog for this process and returns the writer, which is closed at exit."""
     writer = LineWriter(stream or sys.stdout)
     structlog.configure(
         processors=[
+            RateLimit(),
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True, key="time"),  # for readers; t_ns is the reference
             _monotonic,
             structlog.processors.EventRenamer("event"),
+            _keep,
             structlog.processors.dict_tracebacks,
             _with_process(process),
             structlog.processors.JSONRenderer(),

@@ -81,4 +81,5 @@ class PoseLog:
         )
         if solution.frame_id == self._accepted_id and solution.verdict is not Verdict.ACCEPTED:
             fallback = SourceLabel.VISUAL_PROPAGATED if self._tracked else SourceLabel.DEAD_RECKONED
-            logs.get().error("PnP failure", verdict=solution.verdict, fallback=fallback, **about)
+            todo = "seldom: nothing; often: check camera calibration and map with terrafix report"
+            logs.get().error("PnP failure", verdict=solution.verdict, fallback=fallback, todo=todo, **about)

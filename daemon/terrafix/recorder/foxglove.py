@@ -3,29 +3,15 @@
 Schemas: https://docs.foxglove.dev/docs/visualization/message-schemas, JSON form. A derived message has the time of the
 message from which it follows. Reading a record ignores them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from enum import IntEnum
 from typing import Any
 
 import msgspec
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix.messages import (
-    CalibrationFault,
-    Dropped,
-    HintVerdict,
-    MeasurementVerdict,
-    Message,
-    ModelChange,
-    ModelEvent,
-    NavEstimate,
-    Origin,
-    PositionSource,
-    ProcessEvent,
-    SearchState,
-    StatusText,
-    Verdict,
-)
+from terrafix.core.log_lines import MessageLog
+from terrafix.messages import Message, NavEstimate, Origin
 
 NS = 1_000_000_000
 LOCATION_TOPIC, POSE_TOPIC, LOG_TOPIC = "/location", "/pose", "/log"
@@ -122,29 +108,14 @@ CHANNELS: dict[str, type[Stamped]] = {
     IMAGE_TOPIC: CompressedImage,
 }
 
-_LOG_OF_SEVERITY = (
-    Level.FATAL,  # MAV_SEVERITY: emergency, alert, critical
-    Level.FATAL,
-    Level.FATAL,
-    Level.ERROR,
-    Level.WARNING,
-    Level.INFO,  # notice
-    Level.INFO,
-    Level.DEBUG,
-)
-_FAILED_PROCESS = ("died", "stuck", "gave_up")
-_LEVEL_OF_MODEL = {
-    ModelChange.FAILED: Level.ERROR,
-    ModelChange.GIVEN_UP: Level.ERROR,
-    ModelChange.PROVIDER: Level.WARNING,
-    ModelChange.SUSPENDED: Level.WARNING,
-}
+_LEVELS = {"debug": Level.DEBUG, "info": Level.INFO, "warning": Level.WARNING, "error": Level.ERROR}
 
 
 class FoxgloveMessages:
-    """Derives messages; keeps the origin of the flight."""
+    """Derives messages; keeps the origin of the flight and the states of the log."""
 
     def __init__(self) -> None:
+        self._log = MessageLog()
         self._frame: LocalFrame | None = None
 
     def of(self, message: Message) -> Iterator[tuple[str, Stamped]]:
@@ -155,11 +126,10 @@ class FoxgloveMessages:
             yield LOCATION_TOPIC, _location(message)
             if self._frame is not None:
                 yield POSE_TOPIC, _pose(message, self._frame)
-        elif type(message) in _LOGGED:
-            log = _LOGGED[type(message)](message)
-            if log is not None:
-                level, name, text = log
-                yield LOG_TOPIC, Log(timestamp=Time.of(message.t_ns), level=level, name=name, message=text)
+        entry = self._log.entry(message)
+        if entry is not None:
+            at, level = Time.of(message.t_ns), _LEVELS[entry.level]
+            yield LOG_TOPIC, Log(timestamp=at, level=level, name=entry.part, message=entry.text)
 
 
 def _location(estimate: NavEstimate) -> LocationFix:
@@ -181,72 +151,6 @@ def _pose(estimate: NavEstimate, frame: LocalFrame) -> PoseInFrame:
         frame_id=LOCAL_FRAME,
         pose=Pose(Vector3(e_m, n_m, estimate.alt_amsl_m), Quaternion(x, y, z, w)),
     )
-
-
-_Line = tuple[Level, str, str]  # level, name, text
-
-
-def _of_text(message: StatusText) -> _Line:
-    level = _LOG_OF_SEVERITY[message.severity] if 0 <= message.severity < len(_LOG_OF_SEVERITY) else Level.INFO
-    return level, "pilot", message.text
-
-
-def _of_process(message: ProcessEvent) -> _Line:
-    level = Level.ERROR if message.event in _FAILED_PROCESS else Level.INFO
-    return level, message.process, _joined(message.event, message.detail)
-
-
-def _of_model(message: ModelEvent) -> _Line:
-    level = _LEVEL_OF_MODEL.get(message.change, Level.INFO)
-    return level, message.model, _joined(message.change.value, message.provider, message.detail)
-
-
-def _of_fault(message: CalibrationFault) -> _Line:
-    level = Level.WARNING if message.active else Level.INFO
-    state = "calibration fault" if message.active else "calibration fault is over"
-    return level, "calibration", _joined(state, message.quantity, message.detail)
-
-
-def _of_hint(message: HintVerdict) -> _Line:
-    level = Level.INFO if message.verdict is Verdict.ACCEPTED else Level.WARNING
-    return level, "hint", _joined(message.verdict.value, message.text)
-
-
-def _of_search(message: SearchState) -> _Line:
-    return Level.INFO, "search", message.step.value
-
-
-def _of_dropped(message: Dropped) -> _Line:
-    return Level.WARNING, message.process, f"{message.count} {message.message} dropped"
-
-
-def _of_source(message: PositionSource) -> _Line:
-    used = "Terrafix" if message.vision else f"GNSS receiver {message.receiver}"
-    return Level.WARNING, "link", f"the autopilot is to navigate by {used}"
-
-
-def _of_verdict(message: MeasurementVerdict) -> _Line | None:
-    if message.verdict is Verdict.ACCEPTED:
-        return None
-    where = f"frame {message.frame_id}" if message.frame_id >= 0 else ""
-    return Level.DEBUG, message.measurement, _joined(message.verdict.value, where, message.detail)
-
-
-_LOGGED: dict[type[Message], Callable[[Any], _Line | None]] = {
-    StatusText: _of_text,
-    ProcessEvent: _of_process,
-    ModelEvent: _of_model,
-    CalibrationFault: _of_fault,
-    HintVerdict: _of_hint,
-    SearchState: _of_search,
-    Dropped: _of_dropped,
-    PositionSource: _of_source,
-    MeasurementVerdict: _of_verdict,
-}
-
-
-def _joined(*parts: str) -> str:
-    return ", ".join(part for part in parts if part)
 
 
 def schema_name(topic: str) -> str:

@@ -11,14 +11,15 @@ from collections.abc import Callable, Iterable, Mapping
 import msgspec
 import zmq
 
+from terrafix.core import logs
 from terrafix.core.clock import Ticker, now_ns
+from terrafix.core.log_lines import MessageLog
 from terrafix.core.node import Edge, Node, NodeContext
-from terrafix.messages import Dropped, InputOrder, Message, NavEstimate, Origin, PositionHint, ProcessEvent
+from terrafix.messages import Dropped, InputOrder, LogLine, Message, NavEstimate, Origin, PositionHint, ProcessEvent
 from terrafix.processes import OPERATOR, PROCESSES, SOURCE, SUPERVISOR, Process
 from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.inbox import Inbox
 from terrafix.runtime.input_order import InputLog
-from terrafix.runtime.message_log import log_message
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
 
@@ -130,6 +131,7 @@ class LiveShell:
         self._subscriber = Subscriber(context, [endpoints.address(s) for s in publishers], process.subscribes)
         self._inbox = Inbox(process.newest)
         self._inputs = InputLog(process.name, now_ns()) if InputOrder in process.publishes else None
+        self._message_log = MessageLog()
         self._progress = Progress(endpoints.progress(process.name))
         self._ticker = Ticker(process.tick_hz, now_ns()) if process.tick_hz > 0 else None
         self._dropped_ticker = Ticker(1e9 / DROPPED_PERIOD_NS, now_ns())
@@ -169,6 +171,7 @@ class LiveShell:
                 if isinstance(message, Origin):
                     self._endpoints.set_epoch(message.t_ns)
                 self._publisher.publish(message)
+                logs.write(self._message_log.entry(message))
                 self._publish(self._node.on(message))
         return self._process_next() or worked
 
@@ -178,6 +181,7 @@ class LiveShell:
         for message in self._subscriber.receive():
             self._inbox.put(message)
         self._publish_losses()
+        self._publish_log_lines()
         next_message = self._inbox.take()
         if next_message is None:
             return False
@@ -199,7 +203,7 @@ class LiveShell:
             if self._edge is not None:
                 self._edge.on_message(message)  # before the bus, so that output to the autopilot is not delayed
             self._publisher.publish(message)
-            log_message(message)
+            logs.write(self._message_log.entry(message))
 
     def _publish_input_order(self) -> None:
         order = None if self._inputs is None else self._inputs.take(now_ns())
@@ -216,6 +220,14 @@ class LiveShell:
         skipped.clear()
         now = now_ns()
         self._publish(Dropped(t_ns=now, process=self._process.name, message=k, count=n) for k, n in counts.items())
+
+    def _publish_log_lines(self) -> None:
+        """Publishes what this process has logged beside its messages, so that it is in the record."""
+        for line in logs.take_lines():
+            message = LogLine(process=self._process.name, **line)
+            if self._edge is not None:
+                self._edge.on_message(message)  # the edge of the recorder writes those of its own process
+            self._publisher.publish(message)
 
     def _wait(self) -> None:
         """Waits for a message, at most until the next tick or poll of the edge is due."""
@@ -251,9 +263,10 @@ class LiveShell:
         until = now_ns() + STOP_DRAIN_NS
         while now_ns() < until and (self._process_next() or self._subscriber.socket.poll(STOP_QUIET_MS)):
             self._progress.stamp(now_ns(), len(self._inbox))
+        self._publish_log_lines()
         self._publish_input_order()
 
 
 def publishes_any(process: Process, kinds: tuple[type[Message], ...]) -> bool:
-    """Whether ``process`` publishes one of ``kinds``. Its shell, and so every process, publishes Dropped."""
-    return Dropped in kinds or any(kind in kinds for kind in process.publishes)
+    """Whether ``process`` publishes one of ``kinds``. Its shell publishes Dropped and LogLine."""
+    return any(kind in kinds for kind in (Dropped, LogLine, *process.publishes))

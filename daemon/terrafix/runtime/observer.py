@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import zmq
 
-from terrafix.messages import Dropped, InputOrder, Message, Origin
+from terrafix.messages import Dropped, InputOrder, LogLine, Message, Origin
 from terrafix.processes import SUPERVISOR, Process
 from terrafix.runtime.bus import Subscriber
 from terrafix.runtime.run_dir import RunDir
@@ -20,7 +20,7 @@ class Observer:
     def __init__(self, run_dir: RunDir, kinds: Iterable[type[Message]], table: Iterable[Process]) -> None:
         wanted = tuple(kinds)
         assert not set(wanted) & set(COUNTED), "an observer must not be counted as the recorder"
-        names = [p.name for p in table if Dropped in wanted or set(wanted) & set(p.publishes)]
+        names = [p.name for p in table if {Dropped, LogLine, *p.publishes} & set(wanted)]
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         addresses = [run_dir.address(name) for name in (*names, SUPERVISOR)]
         self._subscriber = Subscriber(self._context, addresses, wanted)

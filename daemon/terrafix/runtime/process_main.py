@@ -18,6 +18,7 @@ from terrafix.core.errors import TerrafixError
 from terrafix.core.frames import SharedFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import Frame
+from terrafix.runtime import systemd
 from terrafix.runtime.core_budget import limit_cores
 from terrafix.runtime.executor import run_process
 from terrafix.runtime.fork_server import FIELD_SEPARATOR, TRACEBACK_SIGNAL, set_parent_death_signal
@@ -64,7 +65,7 @@ def run(name: str, run_dir: RunDir) -> int:
     faulthandler.enable()
     faulthandler.register(TRACEBACK_SIGNAL, all_threads=True)
     spec = msgspec.json.decode(run_dir.spec.read_bytes(), type=Spec)
-    logs.configure(spec.config.log.level, name)
+    logs.configure(spec.config.log.level, name, systemd.log_stream())
     limit_cores(spec.config.runtime.cores)  # before the node and its libraries are imported
     table = table_of(spec)
     process = next(p for p in table if p.name == name)
@@ -83,7 +84,7 @@ def run(name: str, run_dir: RunDir) -> int:
         run_process(name, ctx, run_dir, stopping=stopping, table=table)
     except TerrafixError as error:
         run_dir.user_error(name).write_text(str(error), encoding="utf-8")
-        logs.get().error("cannot continue", reason=str(error))
+        logs.get().error("cannot continue", reason=str(error), todo="correct what the reason names, and start again")
         return error.exit_code
     return 0
 

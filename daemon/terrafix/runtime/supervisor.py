@@ -1,6 +1,6 @@
 """The supervisor: starts the processes in table order, monitors their progress, restarts them, stops them in reverse.
 
-It is the only code that communicates with systemd. Its loop does little, so that it is unlikely to fail; all flight
+Its loop does little, so that it is unlikely to fail; all flight
 functions are in the processes. Only the failure of the link ends the unit. When another process is given up, the
 others continue, and the state is reported."""
 
@@ -8,7 +8,6 @@ import contextlib
 import errno
 import os
 import signal
-import socket
 import sys
 import tempfile
 import threading
@@ -23,8 +22,10 @@ from terrafix.core import logs
 from terrafix.core.clock import Ticker, now_ns
 from terrafix.core.config import Config
 from terrafix.core.errors import MapError, OutputError
-from terrafix.messages import ProcessEvent, SourceEnded
+from terrafix.core.log_lines import MessageLog
+from terrafix.messages import LogLine, ProcessEvent, SourceEnded
 from terrafix.processes import PROCESSES, SUPERVISOR, Process
+from terrafix.runtime import systemd
 from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.fork_server import ForkServer
 from terrafix.runtime.managed_process import Event, ManagedProcess, State
@@ -57,6 +58,7 @@ def run(
     stop_after_source: bool = False,
     on_event: Callable[[ProcessEvent], None] | None = None,
     on_epoch: Callable[[int], None] | None = None,
+    on_run_dir: Callable[[RunDir], None] | None = None,
     stop: threading.Event | None = None,
     log_to: Path | None = None,
     table: tuple[Process, ...] = PROCESSES,
@@ -67,7 +69,8 @@ def run(
     ``source``, ``map_path`` (a map package), ``link``, ``start`` ("LAT,LON"): override the configuration when not
     empty. ``ground_amsl_m``: ground height of the map at the start, for a source without one. ``on_event`` receives all
     events of the processes. ``on_epoch`` is called once with the t_ns of the first Origin, which is the zero of a
-    recorded source on the monotonic clock. ``log_to``: file for all logs and tracebacks instead of stdout and stderr.
+    recorded source on the monotonic clock, ``on_run_dir`` once with the run folder. ``log_to``: file for all logs and
+    tracebacks instead of stdout and stderr.
     ``fork_server``: one that the caller has started and closes; None: own one.
 
     Returns 0, or 1 when the link was given up, or the exit code of a process that could not start because of a user
@@ -77,11 +80,15 @@ def run(
     package = _map_package(config.map.path)
     with contextlib.ExitStack() as stack:
         output = stack.enter_context(log_to.open("a", encoding="utf-8")) if log_to else None
-        stack.enter_context(contextlib.closing(logs.configure(config.log.level, SUPERVISOR, output)))
+        stack.enter_context(
+            contextlib.closing(logs.configure(config.log.level, SUPERVISOR, output or systemd.log_stream()))
+        )
         logs.get().info("start", config=msgspec.to_builtins(config), map=str(package), out_dir=str(out_dir))
         spec = msgspec.json.encode(spec_of(table, config, package, out_dir, ground_amsl_m))
         owned = OwnedRunDir(spec=spec, resume=_is_camera(config.source.path))
         stack.callback(owned.remove)
+        if on_run_dir:
+            on_run_dir(owned.run_dir)
         if owned.run_dir.epoch_ns is not None:
             logs.get().warning("resumes a run that was killed", epoch_ns=owned.run_dir.epoch_ns)
         stop_signal = stack.enter_context(StopSignal(signal.SIGTERM, signal.SIGINT))  # for the ordered stop
@@ -155,6 +162,7 @@ class Supervisor:
         self._stopping = stopping
         self._stop_after_source = stop_after_source
         self._on_event = on_event
+        self._message_log = MessageLog()
         self._check_epoch: Callable[[], bool] | None = None  # returns False when the epoch has been reported
         self._source_ended_ns: int | None = None  # time at which the source ended
         self._busy_ns = 0  # time at which a process was last busy
@@ -179,7 +187,7 @@ class Supervisor:
                 self._subscriber.socket.poll(LOOP_MS)
             return code
         finally:
-            sd_notify("STOPPING=1")
+            systemd.notify("STOPPING=1")
             for child in reversed(self._children):
                 event = child.stop()
                 if event:
@@ -198,6 +206,8 @@ class Supervisor:
         if self._check_epoch and not self._check_epoch():
             self._check_epoch = None
         self._publisher.serve()
+        for line in logs.take_lines():
+            self._publisher.publish(LogLine(process=SUPERVISOR, **line))
         for _ in self._subscriber.receive():  # the supervisor subscribes to SourceEnded only
             self._source_ended_ns = self._source_ended_ns or now
         self._notify(now)
@@ -217,11 +227,8 @@ class Supervisor:
 
     def _publish(self, child: ManagedProcess, event: Event) -> None:
         """Logs the event and publishes it as ProcessEvent."""
-        log = logs.get().info if event.name in ("started", "stopped") else logs.get().warning
-        if event.name == "gave_up":
-            log = logs.get().error
-        log("process " + event.name, child=child.process.name, detail=event.detail)
         message = ProcessEvent(t_ns=now_ns(), process=child.process.name, event=event.name, detail=event.detail)
+        logs.write(self._message_log.entry(message))
         self._publisher.publish(message)
         if self._on_event:
             self._on_event(message)
@@ -231,28 +238,15 @@ class Supervisor:
             return
         if not self._ready_notified and all(c.settled for c in self._children):
             self._ready_notified = True
-            sd_notify("READY=1")
+            systemd.notify("READY=1")
         if self._ready_notified and self._makes_progress(now):
             down = [c.process.name for c in self._children if c.state is not State.RUNNING]
-            sd_notify("WATCHDOG=1\nSTATUS=" + (f"flying without {', '.join(down)}" if down else "flying"))
+            systemd.notify("WATCHDOG=1\nSTATUS=" + (f"flying without {', '.join(down)}" if down else "flying"))
 
     def _makes_progress(self, now: int) -> bool:
         """Whether the link makes progress; in a table without link, whether all processes do."""
         required = [c for c in self._children if c.process.name == REQUIRED_PROCESS] or self._children
         return all(now - c.progress.stamp_ns < c.process.stuck_after_s * 1e9 for c in required)
-
-
-def sd_notify(state: str) -> None:
-    """sd_notify(3): sends ``state`` as a datagram. No effect without systemd."""
-    address = os.environ.get("NOTIFY_SOCKET")
-    if not address:
-        return
-    if address.startswith("@"):
-        address = "\0" + address[1:]  # abstract namespace
-    kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
-    # An error of systemd must not end a flight. If the notifications do not arrive, its watchdog reacts.
-    with socket.socket(socket.AF_UNIX, kind) as sock, contextlib.suppress(OSError):
-        sock.sendto(state.encode(), address)
 
 
 def _with_overrides(config: Config, source: str, start: str, map_path: Path | None, link: str) -> Config:

@@ -16,14 +16,13 @@ from terrafix.core.errors import SourceError
 from terrafix.core.frames import FrameWriter
 from terrafix.core.initial_position import Bounds, map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import Edge, NodeContext
-from terrafix.messages import Health, Message, SourceEnded
+from terrafix.messages import OVERTAKEN, Health, Message, SourceEnded
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_configured
 
 QUEUE_SHOTS = 3  # shots with pixels that are read ahead from a recording that is not played in real time
 MAX_DROPPED_MESSAGES = 1024  # dropped frames and their telemetry, without pixels; 20 s at 50 Hz
 MAX_LATE_NS = 2_000_000_000  # a recording that lags real time by more than this skips ahead
-DROPPED_ERROR = "overtaken: a newer frame was there first"
 
 
 class SourceEdge:
@@ -151,7 +150,7 @@ class SourceEdge:
             if len(self._shots) > 1 and (self._realtime or self._source.live):  # the newest first, and it alone
                 old = self._shots.popleft()
                 self._dropped.extend((*old.imu, *old.states))
-                self._dropped.append(msgspec.structs.replace(old.frame, error=old.frame.error or DROPPED_ERROR))
+                self._dropped.append(msgspec.structs.replace(old.frame, error=old.frame.error or OVERTAKEN))
 
 
 def make_edge(ctx: NodeContext) -> Edge:

@@ -9,8 +9,17 @@ import numpy as np
 from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.errors import ModelError
 from terrafix.core.node import Edge, FrameStore, NodeContext
-from terrafix.messages import Frame, KeyframeLink, Message, ModelChange, ModelEvent, Odometry, Origin, Verdict
-from terrafix.vision.edge import DROPPED_ERROR
+from terrafix.messages import (
+    OVERTAKEN,
+    Frame,
+    KeyframeLink,
+    Message,
+    ModelChange,
+    ModelEvent,
+    Odometry,
+    Origin,
+    Verdict,
+)
 from terrafix.vision.edge import make_edge as make_source_edge
 from terrafix.vision.feature_tracker import FrameTracker, Motion
 from terrafix.vision.learned_features import LearnedMatcher
@@ -68,7 +77,7 @@ class VisionNode:
         if self._model_event is not None:
             yield msgspec.structs.replace(self._model_event, t_ns=frame.t_ns)
             self._model_event = None
-        self._busy = self._busy or frame.error == DROPPED_ERROR
+        self._busy = self._busy or frame.error == OVERTAKEN
         if image is None or self._tracker is None or self._search is None:
             yield _without_motion(frame, Verdict.BAD_IMAGE)
             return

@@ -101,8 +101,14 @@ def test_a_consistent_covariance_passes() -> None:
 def test_a_row_that_is_not_built_counts_as_broken() -> None:
     part = concluded([result("baseline", row(Verdict.PASS))])
     assert part.broken == 0  # type: ignore[attr-defined]
-    whole = concluded([result("baseline", row(Verdict.PASS), row(Verdict.BELOW))], whole=True)
-    assert whole.broken == 2  # type: ignore[attr-defined]  # the one below its floor, and AC-17
+    whole = concluded([result("baseline", row(Verdict.NOT_BUILT), row(Verdict.BELOW))], whole=True)
+    assert whole.broken == 2  # type: ignore[attr-defined]
+
+
+def test_object_positions_are_measured_by_a_command_of_their_own() -> None:
+    whole = concluded([result("baseline", row(Verdict.PASS))], whole=True)
+    (objects,) = (r for r in whole.rows if r.ac == "AC-17")  # type: ignore[attr-defined]
+    assert objects.verdict is Verdict.NOT_MEASURABLE and "bench.locate" in objects.why
 
 
 def test_the_three_files_agree(tmp_path: Path) -> None:

@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from flight_records import estimate, frame
+from flight_records import estimate, frame, origin
 from terrafix import messages as m
 from terrafix.core.config import Config
 from terrafix.core.errors import SourceError
@@ -135,3 +136,16 @@ def test_a_replay_that_ends_with_a_fault_has_exit_code_1(
 
     monkeypatch.setattr(replay, "replay", lambda *_, **__: {"verdict": {"active_faults": active}})
     assert CliRunner().invoke(cli.app, ["replay", str(tmp_path)]).exit_code == code
+
+
+def test_the_times_of_a_live_record_are_those_since_its_origin(tmp_path: Path) -> None:
+    """A live record has the times of the computer's clock, here 1000 s at its origin."""
+    shift_ns = 1000 * 10**9
+    record = FlightWriter(tmp_path / "flight.mcap", header(Config()))
+    record.write(msgspec.structs.replace(origin(), t_ns=shift_ns), 0)
+    for i in range(20):
+        for message in (frame(i), estimate(i, 0.0, 0.0)):
+            record.write(msgspec.structs.replace(message, t_ns=message.t_ns + shift_ns), i)
+    record.close()
+    ((from_s, to_s),) = verdict_of(tmp_path).spans
+    assert from_s == pytest.approx(0.0) and 5.0 < to_s < 20.0

@@ -4,6 +4,8 @@ import io
 import json
 import threading
 
+import structlog
+
 from terrafix.core import logs
 
 
@@ -32,11 +34,29 @@ def test_a_blocked_log_reader_loses_lines_without_blocking_the_process() -> None
     stream = BlockedStream()
     writer = logs.configure("INFO", "link", stream)
     for i in range(logs.QUEUE_LENGTH + 500):
-        logs.get().info("line", number=i)
+        logs.get().info(f"line {i}")
     stream.unblock.set()
     writer.close()
     lines = [json.loads(text) for text in stream.getvalue().splitlines()]
     lost = [line["count"] for line in lines if line["event"] == "log lines lost"]
-    written = [line for line in lines if line["event"] == "line"]
+    written = [line for line in lines if line["event"].startswith("line ")]
     assert sum(lost) + len(written) == logs.QUEUE_LENGTH + 500
     assert 498 <= sum(lost) <= 500
+
+
+def test_an_event_that_repeats_is_limited_and_the_next_line_counts_what_was_left_out() -> None:
+    now = [0]
+    limit = logs.RateLimit(lambda: now[0])
+
+    def passed(event: str) -> dict[str, object] | None:
+        try:
+            return limit(None, "warning", {"event": event})
+        except structlog.DropEvent:
+            return None
+
+    lines = [passed("no image") for _ in range(logs.BURST + 7)]
+    assert lines[: logs.BURST] == [{"event": "no image"}] * logs.BURST and lines[logs.BURST :] == [None] * 7
+    assert passed("camera lost") == {"event": "camera lost"}, "events are limited one by one"
+    now[0] = logs.BURST_NS
+    assert passed("no image") == {"event": "no image", "suppressed": 7}
+    assert passed("no image") == {"event": "no image"}

@@ -30,4 +30,16 @@ def test_the_unit_allows_the_real_time_priority_of_the_link() -> None:
     assert values_of("LimitRTPRIO") == [str(PRIORITY)]
     assert values_of("AmbientCapabilities") == [""]
     assert values_of("RestrictRealtime") in ([], ["no"])
-    assert values_of("SystemCallFilter") == []
+    assert values_of("SystemCallFilter")[0] == "@system-service", "sched_setscheduler is in @resources, a part of it"
+    assert not any("resources" in value for value in values_of("SystemCallFilter"))
+
+
+def test_the_exposure_of_the_unit_by_systemd_analyze_is_at_most_2_5_of_10() -> None:
+    analyze = shutil.which("systemd-analyze")
+    if analyze is None:
+        pytest.skip("no systemd-analyze on this machine")
+    command = [analyze, "security", "--offline=yes", "--threshold=25", "--no-pager", str(UNIT)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    if "unrecognized option" in result.stderr:
+        pytest.skip("this systemd-analyze cannot judge a file")
+    assert result.returncode == 0, result.stdout

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path
 
+import msgspec
 import pyogrio
 import pytest
 from mcap.reader import make_reader
@@ -298,3 +299,27 @@ def test_estimates_of_a_replay_are_exported_as_they_stand_in_its_csv(tmp_path: P
     )
     call("export", tmp_path, tmp_path / "track.csv")
     assert "a.jpg,0.000,50.00000000,10.00000000" in (tmp_path / "track.csv").read_text()
+
+
+def test_lines_are_the_log_of_the_flight_by_level_and_time(record: Path) -> None:
+    def lines(*options: object) -> list[str]:
+        return call("lines", record, *options).output.splitlines()
+
+    everything = lines()
+    assert "     0.000 info    vision     source open, lat_deg 48, lon_deg 11, start_sigma_m 10" in everything
+    assert "     5.000 warning supervisor process died, child link, detail signal 9 <kill>" in everything
+    assert "     5.500 warning vision     messages lost, message Frame, count 3" in everything
+    warnings = lines("--level", "warning")
+    assert warnings and all(line.split()[1] in ("warning", "error") for line in warnings)
+    assert len(warnings) < len(everything) < len(lines("--level", "debug"))
+    assert [line.split()[0] for line in lines("--level", "warning", "--from", 5.2, "--to", 5.6)] == ["5.500"]
+    wrong = CliRunner().invoke(app, ["log", "lines", str(record), "--level", "loud"])
+    assert isinstance(wrong.exception, UsageError) and "choose one of debug, info" in str(wrong.exception)
+
+
+def test_lines_before_the_start_of_the_source_have_negative_times(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    early = m.LogLine(t_ns=1_000_000_000, process="link", level="info", event="autopilot", fields={"sysid": 1})
+    late = msgspec.structs.replace(origin(), t_ns=3_000_000_000)
+    write_record(path, [early, late])
+    assert call("lines", path).output.splitlines()[0] == "    -2.000 info    link       autopilot, sysid 1"

@@ -38,7 +38,7 @@ OWNERS = {
     "onnxruntime": ("terrafix_engines",),
     "torch": ("terrafix_engines.train",),
     "faiss": ("terrafix.anchor.place_index.faiss_ivf",),
-    "systemd": ("terrafix.runtime.supervisor",),
+    "systemd": ("terrafix.runtime.systemd",),
     "zmq": ("terrafix.runtime",),
     "pickle": (),
 }

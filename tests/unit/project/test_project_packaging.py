@@ -1,10 +1,12 @@
 """Declared dependencies, lock file and version agree with the code."""
 
 import ast
+import os
 import re
 import subprocess
 import sys
 import tomllib
+import zipfile
 from importlib import metadata
 from pathlib import Path
 
@@ -29,23 +31,25 @@ IMPORTED_AS = {
     "pyzmq": "zmq",
     "pillow": "PIL",
     "faiss-cpu": "faiss",
+    "systemd-python": "systemd",
 }
-COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist"}  # used by scripts/check, not imported
+COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # used by scripts/check or the build
 TRAINING = ROOT / "engines" / "terrafix_engines" / "train"  # part of the engines package, used on the ground only
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 SEARCH = ROOT / "daemon" / "terrafix" / "anchor" / "place_index" / "faiss_ivf.py"  # the only file that imports FAISS
+SERVICE = ROOT / "daemon" / "terrafix" / "runtime" / "systemd.py"  # the only file that imports systemd-python
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools"}
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 
 def imported(*folders: str, extras: bool = True) -> set[str]:
     """Top-level names of all third-party modules imported below the folders; with or without the code of the extras of
-    what flies: training and FAISS."""
+    what flies: training, FAISS and systemd."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
         for path in (ROOT / folder).rglob("*.py"):
-            if not extras and (TRAINING in path.parents or path == SEARCH):
+            if not extras and (TRAINING in path.parents or path in (SEARCH, SERVICE)):
                 continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Import):
@@ -73,6 +77,7 @@ def test_what_flies_starts_without_faiss() -> None:
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
     declared |= (modules(EXTRAS["train"]) - EXPORTER) | modules(EXTRAS["faiss"]) | modules(EXTRAS["fleet"])
+    declared |= modules(EXTRAS["vehicle"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
@@ -81,7 +86,11 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
 def test_every_dependency_has_a_version_range() -> None:
     for requirement in [
         *CORE.values(),
-        *(one for extra in ("ground", "sim", "cluster", "faiss", "fleet", "train") for one in EXTRAS[extra].values()),
+        *(
+            one
+            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "vehicle", "train")
+            for one in EXTRAS[extra].values()
+        ),
     ]:
         operators = {specifier.operator for specifier in requirement.specifier}
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"
@@ -121,10 +130,64 @@ def test_the_packages_are_marked_as_typed(package: str) -> None:
     assert list(ROOT.glob(f"*/{package}/py.typed"))
 
 
-@pytest.mark.parametrize("command", ["replay /nowhere", "map build /nowhere.tif --out /nowhere.gpkg"])
+@pytest.mark.parametrize("command", ["map build /nowhere.tif --out /nowhere.gpkg"])
 def test_without_the_ground_extra_one_line_states_what_to_install(command: str) -> None:
     """The installation on a vehicle has the core dependencies only."""
     code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert done.stderr == "terrafix: this command needs rasterio; install it: pip install 'terrafix[ground]'\n"
+
+
+def test_without_gdal_a_map_package_is_enough_for_replay_run_and_report() -> None:
+    code = "import sys; sys.modules['rasterio'] = None; import terrafix_tools.replay, terrafix_tools.live, "
+    code += "terrafix_tools.report.page, terrafix_tools.evaluate"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel as the build backend assembles it, unpacked in a folder of its own."""
+    builder = pytest.importorskip("hatchling.builders.wheel", reason="the build backend is not installed")
+    folder = tmp_path_factory.mktemp("wheel")
+    (wheel,) = builder.WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "site")
+    return folder / "site"
+
+
+def in_wheel(unpacked: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A command of the unpacked wheel, outside the source tree, without GDAL."""
+    code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=unpacked.parent,
+        env={**os.environ, "PYTHONPATH": str(unpacked)},
+        check=False,
+    )
+
+
+def test_the_wheel_has_the_files_of_the_source_tree_and_copies_them(unpacked: Path) -> None:
+    done = in_wheel(unpacked, "files", "copies")
+    assert done.returncode == 0, done.stderr
+    copies = unpacked.parent / "copies"
+    for folder in ("config", "systemd"):
+        for path in (path for path in (ROOT / folder).rglob("*") if path.is_file()):
+            assert (copies / path.relative_to(ROOT)).read_bytes() == path.read_bytes()
+    assert str(unpacked) in in_wheel(unpacked, "files").stdout, "they come from the wheel, not from the source tree"
+    (copies / "config" / "default.toml").write_text("mine")
+    again = in_wheel(unpacked, "files", "copies")
+    assert again.returncode == 6 and "exists, with other content" in again.stderr
+
+
+def test_the_installer_of_the_wheel_installs_unit_and_settings(unpacked: Path, tmp_path: Path) -> None:
+    installer = unpacked / "terrafix" / "data" / "systemd" / "install.sh"
+    done = subprocess.run(["sh", str(installer), "--prefix", str(tmp_path), "--no-pip"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "etc/systemd/system/terrafix.service").is_file()
+    assert (tmp_path / "etc/terrafix/terrafix.toml").is_file()
+    no_package = subprocess.run(["sh", str(installer), "--prefix", str(tmp_path)], capture_output=True, text=True)
+    assert no_package.returncode == 2 and "give the wheel with --package" in no_package.stderr

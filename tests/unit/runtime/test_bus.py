@@ -1,16 +1,20 @@
 """Publish/subscribe over ipc, and the live shell on it: late subscribers, restarts, losses."""
 
+import io
+import json
 import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 import zmq
 
 from runtime_nodes import ORIGIN
 from terrafix import messages as m
+from terrafix.core import logs
 from terrafix.core.node import Edge
 from terrafix.processes import ALL_MESSAGES, Process
 from terrafix.runtime import bus
@@ -333,3 +337,33 @@ def test_a_started_process_waits_for_the_recorder_so_that_its_first_message_is_r
         over.set()
         thread.join(10)
         shell.close()
+
+
+class LoggingEdge(OneFrameEdge):
+    """An edge that logs what no message says, and reads a frame without pixels."""
+
+    def poll(self, now_ns: int) -> Iterable[m.Message]:
+        if not self.done:
+            self.done = True
+            logs.get().warning("camera lost", source="/dev/video0")
+            yield msgspec.structs.replace(frame(1), error="no answer")
+
+
+def test_lines_of_the_log_that_no_message_says_are_published_and_those_of_messages_are_not(
+    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+) -> None:
+    process = Process("logging", "", (), (m.Frame,), 0.0, 1.0)
+    Progress.create(run_dir.progress("logging")).close()
+    stream = io.StringIO()
+    writer = logs.configure("INFO", "logging", stream)
+    edge = LoggingEdge()
+    shell = LiveShell(process, (process, LISTENER), TickingNode(), edge, run_dir, context)
+    until = time.monotonic() + 0.6
+    shell.run(lambda: time.monotonic() > until)
+    shell.close()
+    writer.close()
+    (line,) = (message for message in edge.received if isinstance(message, m.LogLine))
+    assert (line.process, line.level, line.event) == ("logging", "warning", "camera lost")
+    assert line.fields["source"] == "/dev/video0"
+    events = [json.loads(text)["event"] for text in stream.getvalue().splitlines()]
+    assert events == ["camera lost", "no image"], "both are in the journal"

@@ -24,7 +24,7 @@ from terrafix.runtime import run_dir
 from terrafix.runtime.fork_server import ForkedProcess
 from terrafix.runtime.managed_process import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, describe
 from terrafix.runtime.progress_stamp import Progress
-from terrafix.runtime.supervisor import run, sd_notify
+from terrafix.runtime.supervisor import run
 
 pytestmark = pytest.mark.real_time
 
@@ -364,13 +364,6 @@ def test_exit_codes_are_described_as_text() -> None:
     assert describe(-9) == "killed by SIGKILL"
     assert describe(-64) == "killed by SIGRTMAX"
     assert describe(3) == "exit code 3"
-
-
-def test_sd_notify_without_systemd_has_no_effect(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    sd_notify("READY=1")
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
-    sd_notify("READY=1")
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="a budget below one core cannot be shown on one core")

@@ -18,12 +18,15 @@ from terrafix.messages import (
     MeasurementVerdict,
     Message,
     ProcessEvent,
+    SearchState,
+    SearchStep,
     StatusText,
     ThermalBand,
     ThermalReading,
     Verdict,
 )
 from terrafix_tools.status.facts import facts
+from terrafix_tools.status.line import line_of
 from terrafix_tools.status.processes import ProcessState
 from terrafix_tools.status.screen import screen
 from terrafix_tools.status.state import KINDS, LINES, Status
@@ -168,3 +171,13 @@ def test_all_types_that_are_read_are_taken() -> None:
         status.take(0, message)
     assert status.last(Frame) == frame(0) and status.last(Dropped) is None
     assert status.age_s(Frame, 3 * S) == 3.0 and status.age_s(Dropped, S) is None
+
+
+def test_the_line_of_a_run_says_where_it_is_by_what_and_which_processes_are_down() -> None:
+    found = after(1.0, (0.5, estimate(3, 10.0, 20.0, sigma_m=4.0)), (0.9, gps_input(S)), (0.9, link_status()))
+    line = line_of(found)
+    assert line.startswith("3D fix to 5.0 m, ") and "100 m above ground" in line
+    assert "by map match, 95 % within 9.8 m" in line
+    assert line.endswith("ardupilot connected, without anchor")
+    lost = line_of(after(1.0, (0.9, gps_input(S, fix_type=1)), (0.9, SearchState(t_ns=0, step=SearchStep.WHOLE_MAP))))
+    assert lost == "no fix: no estimate yet, search: whole_map, no autopilot, without anchor"

@@ -1,7 +1,9 @@
 """`terrafix status` beside running processes."""
 
+import io
 import json
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -22,6 +24,7 @@ from terrafix.runtime.run_dir import OwnedRunDir, RunDir
 from terrafix_tools.cli import app
 from terrafix_tools.run_choice import chosen_run
 from terrafix_tools.status import watch
+from terrafix_tools.status.line import RunLine
 from terrafix_tools.status.processes import process_states
 from terrafix_tools.status.state import KINDS
 
@@ -120,3 +123,25 @@ def test_without_a_running_terrafix_one_line_says_so(tmp_path: Path, monkeypatch
         chosen_run("")
     with pytest.raises(UsageError, match="no such folder"):
         chosen_run(str(tmp_path / "none"))
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_run_prints_a_line_a_second_in_a_terminal_and_none_elsewhere(run: RunDir) -> None:
+    flying = Publishing(run, {"link": gps_input(S)})
+    Progress.create(run.progress("vision")).close()
+    terminal, file = Terminal(), io.StringIO()
+    try:
+        with RunLine(terminal) as shown, RunLine(file) as hidden:
+            shown.start(run)
+            hidden.start(run)
+            until_s = time.monotonic() + 10.0
+            while "3D fix" not in terminal.getvalue() and time.monotonic() < until_s:
+                time.sleep(0.05)
+    finally:
+        flying.stop()
+    assert "3D fix to" in terminal.getvalue().splitlines()[-1] and "no autopilot" in terminal.getvalue()
+    assert file.getvalue() == ""

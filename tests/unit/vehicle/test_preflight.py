@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -514,3 +515,13 @@ def test_a_missing_map_is_a_failure_with_a_fix(tmp_path: Path) -> None:
     lines = {line.check: line for line in computer.check_lines(config, None, tmp_path)}
     assert lines["map"].status == "fail"
     assert "terrafix map build" in lines["map"].fix
+
+
+@pytest.mark.parametrize(("value", "fix"), [(0.0, "set 8"), (4.0, "set 12"), (8.0, ""), (-1.0, "")])
+def test_from_ardupilot_4_7_on_the_checks_to_skip_are_checked_instead_of_those_to_run(value: float, fix: str) -> None:
+    values = DEFAULTS | preset("second-gps") | {"ARMING_SKIPCHK": value}
+    del values["ARMING_CHECK"]
+    lines = lines_by_check(values, replace(context(gps_id=1), firmware=(4, 7)))
+    assert "ARMING_CHECK" not in lines
+    assert lines["ARMING_SKIPCHK"].fix == fix
+    assert "ARMING_SKIPCHK" not in lines_by_check(DEFAULTS | preset("second-gps"), context(gps_id=1))

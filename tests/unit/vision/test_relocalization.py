@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.messages import Frame, Message, Odometry, Relocalization, Verdict
-from terrafix.vision.edge import DROPPED_ERROR
+from terrafix.messages import OVERTAKEN, Frame, Message, Odometry, Relocalization, Verdict
 from terrafix.vision.node import VisionNode
 from textured_ground import PINHOLE, apply, homography, rotation, texture, view
 from vision_origin import PINHOLE_ORIGIN as ORIGIN
@@ -121,7 +120,7 @@ def test_at_most_one_search_a_second(ground: np.ndarray, monkeypatch: pytest.Mon
     assert 1 <= len(searched) <= 5  # 18 keyframes in 4.5 s
 
 
-@pytest.mark.parametrize(("error", "searches"), [(DROPPED_ERROR, False), ("broken JPEG", True)])
+@pytest.mark.parametrize(("error", "searches"), [(OVERTAKEN, False), ("broken JPEG", True)])
 def test_while_frames_are_dropped_nothing_is_searched(ground: np.ndarray, error: str, searches: bool) -> None:
     run = Flown(ground).fly(OUT + ASIDE + AWAY[:20])
     before = len(run.found())

@@ -13,8 +13,8 @@ from terrafix.core.config import Config, HealthSection, Source
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
-from terrafix.messages import Frame, Health, Message, Origin, SourceEnded, ThermalBand, VehicleState
-from terrafix.vision.edge import DROPPED_ERROR, SourceEdge, make_edge
+from terrafix.messages import OVERTAKEN, Frame, Health, Message, Origin, SourceEnded, ThermalBand, VehicleState
+from terrafix.vision.edge import SourceEdge, make_edge
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, open_source
 
@@ -108,7 +108,7 @@ def test_the_newest_frame_is_delivered_and_dropped_frames_are_published_with_an_
     assert [f.frame_id for f in listener.frames] == list(range(10))
     whole = [f.frame_id for f in listener.frames if not f.error]
     assert whole == [0, 9]
-    assert {f.error for f in listener.frames} == {"", DROPPED_ERROR}
+    assert {f.error for f in listener.frames} == {"", OVERTAKEN}
     times = [m.t_ns for m in listener.messages[1:-1]]
     assert times == sorted(times)
 

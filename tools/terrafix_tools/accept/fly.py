@@ -29,8 +29,9 @@ from terrafix_tools.accept.measuring.results import JudgedRow, Span
 from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
 from terrafix_tools.accept.scenarios import BY_NAME, LONG_FRAMES
 from terrafix_tools.bench.flights import program_age_s
+from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import build, ensure_package
-from terrafix_tools.replay import map_cache_dir, replay
+from terrafix_tools.replay import replay
 from terrafix_tools.report.data import radius95_m
 
 RESULT = "result.json"

@@ -91,7 +91,7 @@ def _width_row(results: list[Result]) -> JudgedRow:
         "goal_met": None,
     }
     if len(widths) < MIN_FLIGHTS:
-        why = f"{len(widths)} flights; {MIN_FLIGHTS} are the least that can tell"
+        why = f"{len(widths)} flights: too few to judge; {MIN_FLIGHTS} are the least that can tell"
         return JudgedRow(**row, measured=None, verdict=Verdict.NOT_MEASURABLE, why=why)  # type: ignore[arg-type]
     width = statistics.median(widths)
     verdict = Verdict.PASS if MAX_WIDTH.holds(width) else Verdict.BELOW
@@ -104,7 +104,8 @@ def _not_replayable() -> list[JudgedRow]:
     return [
         JudgedRow(
             scenario=OVERALL, ac="AC-17", what="object in a frame to position", measured=None, unit="m",
-            floor="<= 20 m", goal="", verdict=Verdict.NOT_BUILT, goal_met=None, why="there is no such function yet"),
+            floor="<= 20 m", goal="", verdict=Verdict.NOT_MEASURABLE, goal_met=None,
+            why="needs objects with known positions: python -m terrafix_tools.bench.locate"),
     ]  # fmt: skip
 
 

@@ -18,9 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix.messages import Frame, GpsInput, MapMatch, Message, NavEstimate, Verdict
+from terrafix.messages import OVERTAKEN, Frame, GpsInput, MapMatch, Message, NavEstimate, Verdict
 from terrafix.recorder.reader import ReadResult, check_format, read_received
-from terrafix.vision.edge import DROPPED_ERROR
 from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.report.stage_times import PERCENTILES, STAGES, StageTimes
 from terrafix_tools.sim.demo.command import generate
@@ -64,7 +63,7 @@ def measure(record: Path) -> dict[str, Any]:
         times.take(received_ns, message)
         anchored.take(received_ns, message)
         frames += isinstance(message, Frame)
-        dropped += isinstance(message, Frame) and message.error == DROPPED_ERROR
+        dropped += isinstance(message, Frame) and message.error == OVERTAKEN
     check_format(record, result)
     delays = {stage: [round(ms) for ms in times.percentiles_ms(stage)] for stage in STAGES}
     found_ns = anchored.delays_ns

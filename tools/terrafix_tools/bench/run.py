@@ -26,8 +26,8 @@ from terrafix_tools.bench import micro as bench_micro
 from terrafix_tools.bench import peers as bench_peers
 from terrafix_tools.bench import scaling
 from terrafix_tools.bench.page import comparison_table, stage_table, write_page
+from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import build, ensure_package
-from terrafix_tools.replay import map_cache_dir
 from terrafix_tools.sim.flights.folder import FRAME_HZ, plan_flight, write_flight
 from terrafix_tools.sim.world import place as world
 

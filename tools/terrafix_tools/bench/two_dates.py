@@ -33,10 +33,10 @@ from terrafix.map.package import MapPackage
 from terrafix.messages import Camera, MapMatch, Origin, Prediction, Verdict
 from terrafix_engines.features import open_describer
 from terrafix_engines.runtime import ModelFileError
+from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.models.pair import same_grid
-from terrafix_tools.replay import map_cache_dir
 
 SIDE_PX = 400  # of the frame, whose pixels are as large as those of the map
 FIELD_OF_VIEW_DEG = 60.0

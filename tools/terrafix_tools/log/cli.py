@@ -109,6 +109,20 @@ def show(
 
 
 @app.command()
+def lines(
+    record: RecordArgument,
+    level: Annotated[str, typer.Option(help="debug, info, warning or error: this level and above.")] = "info",
+    from_s: FromOption = float("-inf"),
+    to_s: ToOption = float("inf"),
+) -> None:
+    """The log of a flight: what changed, was degraded or lost in any process, and what to do about it."""
+    from terrafix_tools.log.lines import log_lines
+
+    for line in log_lines(record, level, from_s, to_s):
+        typer.echo(line)
+
+
+@app.command()
 def export(
     record: Annotated[Path, typer.Argument(help="Record, or folder of replay or run.")],
     out: Annotated[Path, typer.Argument(help="File to write: .csv .parquet .geojson .kml .kmz .gpx .gpkg")],

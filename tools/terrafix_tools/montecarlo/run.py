@@ -24,6 +24,7 @@ from terrafix_tools.montecarlo.picture import draw
 from terrafix_tools.montecarlo.plan import DURATION_S, plan
 from terrafix_tools.montecarlo.statistics import FlightResult, floors, summary
 
+WORDS = {True: "holds", False: "BROKEN", None: "too few to judge"}  # of a floor
 TABLE_WIDTH = 130  # characters, also where the terminal is narrower or the output is a file
 RESULT, PICTURE = "montecarlo.json", "montecarlo.png"
 MIN_DURATION_S, MAX_DURATION_S = 60.0, 7200.0
@@ -197,4 +198,5 @@ def show(result: dict[str, Any], console: Console) -> None:
     shares = ", ".join(f"{name.replace('_', ' and ')} {share:.2f}" for name, share in total["parts"].items())
     console.print(f"squared error over claim, 1 when true: {shares}", highlight=False)
     for floor, holds in result["floors"].items():
-        console.print(f"{'holds ' if holds else 'BROKEN'}  {floor}", style="" if holds else "bold red", highlight=False)
+        style = "bold red" if holds is False else ""
+        console.print(f"{WORDS[holds]:17}  {floor}", style=style, highlight=False)

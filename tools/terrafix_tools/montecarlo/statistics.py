@@ -22,6 +22,8 @@ NORMAL95 = 1.959964  # two-sided
 MAX_SIGMAS = 4.0  # errors are limited to this for the correlation
 MIN_DRIFT_PATH_M = 1000.0  # since the last map fix; a ratio over a shorter path has no meaning
 COVERAGE_FLOORS = (0.93, 0.98)
+CONSISTENT = 0.95  # share of the truth that a consistent covariance has inside its 95 % ellipse
+CONFIDENCE = 0.95  # two-sided, with which a share is judged to be another one
 # A false input is to be noticed within this time of its beginning, or within this many frames of new ground: a camera
 # above the same ground sees nothing new that could contradict it.
 NOTICE_S, NOTICE_FRAMES = 3.0, 5.0
@@ -237,12 +239,29 @@ def _row(nees: Nees) -> dict[str, float | bool]:
     return {"mean": nees.mean, "low": nees.low, "high": nees.high, "draws": nees.draws, "holds": nees.holds}
 
 
-def floors(total: dict[str, Any]) -> dict[str, bool]:
-    """Text of each floor -> whether it holds."""
-    low, high = COVERAGE_FLOORS
+def floors(total: dict[str, Any]) -> dict[str, bool | None]:
+    """Text of each floor -> whether it holds; None: the flights are too few to judge it."""
+    draws = total["nees"]["draws"]
+    sure = 3.0 / total["flights"]  # rule of three: the rate that no case in so many leaves possible, 95 % confidence
     return {
-        "95 % ellipse holds 93 to 98 % of the positions": low <= total["coverage"] <= high,
-        "95 % ellipse holds 93 to 98 % of the refined positions": low <= (total["coverage_refined"] or 0.0) <= high,
-        "no false fix (beyond 50 m and 3 sigma) but at the beginning of a false input": total["late_false_fixes"] == 0,
+        "95 % ellipse holds 93 to 98 % of the positions": _covers(total["coverage"], draws),
+        "95 % ellipse holds 93 to 98 % of the refined positions": _covers(total["coverage_refined"], draws),
+        "no false fix (beyond 50 m and 3 sigma) but at the beginning of a false input "
+        f"(none in {total['flights']} flights: in less than {min(1.0, sure):.1%} of all)": total["late_false_fixes"]
+        == 0,
         "mean NEES of the position in its 95 % band": total["nees"]["holds"],
     }
+
+
+def _covers(share: float | None, draws: float) -> bool | None:
+    """Whether ``share`` of the positions is what the floor wants. A share outside counts only where a consistent
+    covariance, which has 95 % inside, would have one as far off in fewer than 5 % of such samples (binomial)."""
+    low, high = COVERAGE_FLOORS
+    if share is None:
+        return None
+    if low <= share <= high:
+        return True
+    outside, count = (1.0 - share) * draws, max(1, round(draws))
+    chances = [math.comb(count, k) * (1.0 - CONSISTENT) ** k * CONSISTENT ** (count - k) for k in range(count + 1)]
+    tail = sum(chances[math.ceil(outside - 1e-9) :]) if share < low else sum(chances[: math.floor(outside + 1e-9) + 1])
+    return None if tail > 0.5 * (1.0 - CONFIDENCE) else False

@@ -9,8 +9,9 @@ from terrafix_tools.preflight.lines import Status
 
 MAV_GPS = 14
 GPS, BARO, COMPASS, EXTERNAL_NAV = 3, 1, 1, 6  # EK3_SRCn_*
-POSITION_ACCURACY, GPS_ARMING, NO_DCM = 8, 8, 1  # bits of EK3_GPS_CHECK, ARMING_CHECK, AHRS_OPTIONS
+POSITION_ACCURACY, GPS_ARMING, NO_DCM = 8, 8, 1  # bits of EK3_GPS_CHECK, ARMING_CHECK and _SKIPCHK, AHRS_OPTIONS
 ALL_BUT_GPS = 1048566  # ARMING_CHECK
+SKIPS_CHECKS = (4, 7)  # from this firmware on ARMING_SKIPCHK has the checks to skip, instead of those to run
 DELAY_MS = (1.0, 50.0)
 
 
@@ -149,7 +150,15 @@ GPS_INPUT_RULES = (
         _constant(ALL_BUT_GPS),
         Status.WARN,
         "arming requires a 3D fix of every GPS, and Terrafix has none on the ground",
-        _has_receiver,
+        lambda c, v: _has_receiver(c, v) and c.firmware < SKIPS_CHECKS,
+    ),
+    Rule(
+        "ARMING_SKIPCHK",
+        lambda v: bool(int(v) & GPS_ARMING),
+        lambda v, _c: float(int(v) | GPS_ARMING),
+        Status.WARN,
+        "arming requires a 3D fix of every GPS, and Terrafix has none on the ground",
+        lambda c, v: _has_receiver(c, v) and c.firmware >= SKIPS_CHECKS,
     ),
 )
 LOCAL_RULES = (

@@ -28,6 +28,7 @@ GREY_BLOCK = 8  # side of a block in pixels; blocks are stored row by row, so ch
 _MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length field
 _END_OF_IMAGE = 0xD9
+PNG_HEAD = b"\x89PNG\r\n\x1a\n"  # PNG specification 5.2; then chunks of length, type, data, checksum (5.3)
 # Nothing in flight uses a finer resolution than a 330th of the height, which is 600 pixels across a lens of 84 degrees.
 # A reduced image keeps two and a half times that; a full one of 26 megapixels would take 78 MB and half a second.
 MIN_WIDTH_PX = 1500
@@ -70,8 +71,12 @@ def decode_image(data: bytes, width: int, height: int, by: int = 1) -> tuple[np.
         return None, "file is empty"
     # Before the pixels are decoded: a file of 100 kB may state a size whose pixels take gigabytes.
     stated = stated_size(data)
-    if stated is not None and stated != (width, height):
+    if stated is None:
+        return None, "cannot be decoded as an image"
+    if stated != (width, height):
         return None, f"{WRONG_SIZE}: {stated[0]}x{stated[1]}, the camera says {width}x{height}"
+    if data.startswith(PNG_HEAD) and not png_is_complete(data):
+        return None, "truncated PNG: a chunk reaches beyond the end of the file"
     jpeg = data[:2] == b"\xff\xd8"
     if jpeg and not jpeg_is_complete(data):
         return None, "truncated JPEG: the end of the image is missing"
@@ -109,6 +114,18 @@ def _ends_in_grey_fill(image: np.ndarray, block: int) -> bool:
     """True when the last block is grey fill and the first is not (an image may be grey all over)."""
     last, first = image[-block:, -block:], image[:block, :block]
     return bool((last == GREY_FILL).all()) and not bool((first == GREY_FILL).all())
+
+
+def png_is_complete(data: bytes) -> bool:
+    """True when the chunks of a PNG lie in the file, up to its end chunk. OpenCV allocates the length that a chunk
+    states before it reads: up to 4 GB."""
+    at = len(PNG_HEAD)
+    while at + 12 <= len(data):
+        length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        at += 12 + length
+        if kind == b"IEND":
+            return at <= len(data)
+    return False
 
 
 def jpeg_is_complete(data: bytes) -> bool:

@@ -1,5 +1,7 @@
 """Monte Carlo statistics against tables, simulations and closed forms."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -63,12 +65,41 @@ def test_the_band_contains_95_of_100_consistent_runs_and_no_overconfident_one() 
     assert overconfident == 0
 
 
+def totals(draws: float = 1000.0, **other: object) -> dict[str, Any]:
+    good = {"coverage": 0.95, "coverage_refined": 0.96, "late_false_fixes": 0, "flights": 100}
+    return {**good, "nees": {"holds": True, "draws": draws}, **other}
+
+
 def test_each_broken_floor_is_reported() -> None:
-    good = {"coverage": 0.95, "coverage_refined": 0.96, "late_false_fixes": 0, "nees": {"holds": True}}
-    assert all(floors(good).values())
-    for key, bad in (("coverage", 0.99), ("coverage", 0.9), ("coverage_refined", None), ("late_false_fixes", 1)):
-        assert sum(not holds for holds in floors({**good, key: bad}).values()) == 1
-    assert not all(floors({**good, "nees": {"holds": False}}).values())
+    assert set(floors(totals()).values()) == {True}
+    for key, bad in (("coverage", 0.99), ("coverage", 0.9), ("coverage_refined", 0.5), ("late_false_fixes", 1)):
+        assert list(floors(totals(**{key: bad})).values()).count(False) == 1
+    assert False in floors(totals(nees={"holds": False, "draws": 1000.0})).values()
+
+
+@pytest.mark.parametrize(
+    ("coverage", "draws", "expected"),
+    [
+        (1.0, 40.0, None),  # 0.95^40 = 13 % of consistent samples are inside altogether
+        (1.0, 80.0, False),  # 1.7 %
+        (0.90, 20.0, None),  # two of twenty outside: 26 %
+        (0.75, 20.0, False),  # five of twenty: 0.26 %
+        (0.90, 1.0, None),
+        (0.95, 1.0, True),
+    ],
+)
+def test_coverage_is_judged_only_where_the_independent_draws_are_enough(
+    coverage: float, draws: float, expected: bool | None
+) -> None:
+    assert next(iter(floors(totals(draws, coverage=coverage)).values())) is expected
+
+
+def test_flights_without_refined_positions_are_too_few_to_judge_them() -> None:
+    assert list(floors(totals(coverage_refined=None)).values()).count(None) == 1
+
+
+def test_the_floor_of_false_fixes_says_what_no_case_in_so_many_flights_means() -> None:
+    assert any("none in 100 flights: in less than 3.0% of all" in floor for floor in floors(totals()))
 
 
 @pytest.mark.parametrize(

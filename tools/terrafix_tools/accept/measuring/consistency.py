@@ -37,7 +37,7 @@ def judge_claims(inside: float, mean_nees: float, draws: int, confidence: float)
         return Verdict.PASS, why
     if INSIDE**draws > 0.5 * (1.0 - confidence):  # a consistent covariance has all errors inside so often
         amount = "one flight, or several over one map" if draws == 1 else f"{draws} flights"
-        return Verdict.NOT_MEASURABLE, f"{why}; too wide or not is not decidable in {amount}"
+        return Verdict.NOT_MEASURABLE, f"{why}; too few to judge: too wide or not is not decidable in {amount}"
     return Verdict.BELOW, f"{why}; too wide"
 
 

@@ -34,9 +34,9 @@ from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.places import PooledGradientPlaces
 from terrafix_tools.bench.search.index_views import similarities
 from terrafix_tools.bench.search.views import TwoDates
+from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.mapping.place_index import SIDE_PER_AGL, STEPS_PER_SIDE, describe_layer
-from terrafix_tools.replay import map_cache_dir
 
 AGL_M = 120.0  # height of the flights: a disc of 90 m every 22 m, 1975 of them for a square kilometre
 CLUSTERS = 48  # of the mixture

@@ -36,8 +36,9 @@ from terrafix.map.package import MapPackage
 from terrafix.messages import MapMatch, Message, NavEstimate, Origin
 from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
+from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import ensure_package
-from terrafix_tools.replay import FRAMES_KEPT, make_nodes, map_cache_dir
+from terrafix_tools.replay import FRAMES_KEPT, make_nodes
 
 RIGHT_M, RIGHT_PER_AGL = 50.0, 0.1  # largest error of a correct position: the larger of [m] and [share of the height]
 CLAIM_SIGMAS = 3.2  # an incorrect position with an error of more sigmas than this counts as wrong

@@ -16,10 +16,10 @@ from terrafix.core.geodesy import LocalFrame, local_crs
 from terrafix.core.node import Image
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.models.pair import same_grid
-from terrafix_tools.replay import map_cache_dir
 
 CAMERA = CameraCalibration(640, 480, 554.0, 554.0, 319.5, 239.5)  # 60 degrees wide
 NORTH_UP = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # camera to world, looking straight down

@@ -40,8 +40,9 @@ from terrafix.messages import Message, Origin, Prediction
 from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import ensure_package
-from terrafix_tools.replay import FRAMES_KEPT, make_nodes, map_cache_dir
+from terrafix_tools.replay import FRAMES_KEPT, make_nodes
 
 UNKNOWN_START_M = 1000.0
 

@@ -4,20 +4,22 @@
 not the course of the vehicle; in the closed loop (sim/closed_loop) an error moves the vehicle.
 """
 
+import contextlib
 import math
 import select
 import socket
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from terrafix.core.errors import LinkError
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.sim.autopilot.course import Course, CourseFollower
 from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.parameters import GPS_INPUT_ALONE, NO_DCM, Kind
-from terrafix_tools.sim.autopilot.report import PeerMonitor, PeerReport
-from terrafix_tools.sim.interfaces import navigation_of
+from terrafix_tools.sim.autopilot.report import PeerMonitor, PeerReport, ReceivedFix
+from terrafix_tools.sim.interfaces import Navigation, navigation_of
 from terrafix_tools.sim.sensors.clock import Clock
 from terrafix_tools.sim.sensors.suite import VehicleSensors
 
@@ -36,16 +38,21 @@ class AutopilotPeer:
         seed: int = 0,
         aligned: bool = True,
         sysid: int = 1,
+        kind: Kind = Kind.PLANE,
         parameters: dict[str, float] | None = None,
         home_amsl_m: float | None = None,
     ) -> None:
         """Raises UsageError for an unknown parameter."""
         self._parameters = GPS_INPUT_ALONE | NO_DCM | (parameters or {})
         self._seed, self._aligned, self._sysid, self._home_amsl_m = seed, aligned, sysid, home_amsl_m
+        self._kind = kind
         self._companion: tuple[str, int] | None = None
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._landed = False
+        self._reboots = False
+        self.muted = False  # receives and sends nothing, as with the cable unplugged
+        self.received_s: list[float] = []  # monotonic time of each GPS_INPUT
 
     def start(
         self, port: int, course: Course, clock: Callable[[], float] | None = None, *, to: int | None = None
@@ -89,6 +96,20 @@ class AutopilotPeer:
         gps, errors = self._autopilot.gps[self._autopilot.used_gps], self._monitor.errors_m
         return gps.fix_type if gps is not None else 0, errors[-1] if errors else None
 
+    def fixes(self) -> list[ReceivedFix]:
+        """The 3D fixes of GPS_INPUT so far, ``received_s`` on the monotonic clock; callable from any thread."""
+        return [replace(fix, received_s=fix.received_s + self._started_s) for fix in list(self._monitor.fixes)]
+
+    def inject(self, data: bytes) -> None:
+        """Sends bytes of another origin on the same line; callable from any thread."""
+        if self._companion is not None:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, self._companion)
+
+    def reboot(self) -> None:
+        """The autopilot starts again in the air, without a position, and its clock begins at zero."""
+        self._reboots = True
+
     def _now_s(self) -> float:
         """Seconds since the start: the autopilot's time. The flight's may begin later."""
         return time.monotonic() - self._started_s
@@ -98,23 +119,44 @@ class AutopilotPeer:
         frame = LocalFrame(first.lat_deg, first.lon_deg)
         self._course = CourseFollower(course, frame)
         state = self._course.state(0.0, self._clock())
-        navigation = navigation_of(state)
-        self._autopilot = SimAutopilot(
+        self._autopilot = self._new_autopilot(
             frame,
-            Kind.PLANE,
-            start=navigation if self._aligned else None,
+            start=navigation_of(state) if self._aligned else None,
             home_amsl_m=first.amsl_m - first.agl_m if self._home_amsl_m is None else self._home_amsl_m,
-            parameters=self._parameters,
-            sysid=self._sysid,
             boot_ns=Clock.of(self._seed).boot_ns,
         )
         self._sensors = VehicleSensors(frame, seed=self._seed, airspeed=not math.isnan(first.airspeed_mps))
         self._monitor = PeerMonitor(self._autopilot, frame)
 
+    def _new_autopilot(
+        self, frame: LocalFrame, *, start: Navigation | None, home_amsl_m: float, boot_ns: Callable[[float], int]
+    ) -> SimAutopilot:
+        self._home_amsl_m = home_amsl_m
+        return SimAutopilot(
+            frame,
+            self._kind,
+            start=start,
+            home_amsl_m=home_amsl_m,
+            parameters=self._parameters,
+            sysid=self._sysid,
+            boot_ns=boot_ns,
+        )
+
+    def _restart(self) -> None:
+        boot_ns, booted_s, frame = Clock.of(self._seed).boot_ns, self._now_s(), self._monitor.frame
+        assert self._home_amsl_m is not None
+        self._autopilot = self._new_autopilot(
+            frame, start=None, home_amsl_m=self._home_amsl_m, boot_ns=lambda now_s: boot_ns(now_s - booted_s)
+        )
+        self._monitor.watch(self._autopilot)
+
     def _fly(self) -> None:
         step_at_s = STEP_S
         while not self._stopping.is_set():
             select.select([self._socket], [], [], max(0.0, step_at_s - self._now_s()))
+            if self._reboots:
+                self._reboots = False
+                self._restart()
             self._receive()
             now_s = self._now_s()
             if now_s >= step_at_s:
@@ -134,11 +176,15 @@ class AutopilotPeer:
                 packets, self._companion = self._socket.recvfrom(DATAGRAM_MAX)
             except (BlockingIOError, ConnectionRefusedError):
                 return
+            if self.muted:
+                continue
+            before = self._autopilot.counts.received
             self._autopilot.receive(packets, self._now_s())
+            self.received_s += [time.monotonic()] * (self._autopilot.counts.received - before)
 
     def _send(self) -> None:
         packets = self._autopilot.transmit()
-        if not packets or self._companion is None:
+        if not packets or self._companion is None or self.muted:
             return
         try:
             self._socket.sendto(packets, self._companion)

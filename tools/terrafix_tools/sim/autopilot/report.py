@@ -63,11 +63,20 @@ class PeerReport:
             raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
+@dataclass(frozen=True)
+class ReceivedFix:
+    """A 3D fix of GPS_INPUT. ``received_s``: time of the autopilot; error of the position at its time of validity."""
+
+    received_s: float
+    error_m: float
+    horizontal_m: float | None  # horiz_accuracy
+
+
 class PeerMonitor:
     """Monitors an autopilot with knowledge of the truth. Call ``observe`` after every step."""
 
     def __init__(self, autopilot: SimAutopilot, frame: LocalFrame) -> None:
-        self._autopilot, self._frame = autopilot, frame
+        self._autopilot, self.frame = autopilot, frame
         self._truths: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
         self._start_s: float | None = None
         self._first_gps_s: float | None = None
@@ -75,9 +84,12 @@ class PeerMonitor:
         self._healthy_s = self._fix3_s = self._without_s = self._longest_without_s = 0.0
         self._glitching = False
         self._glitches = 0
-        self._gps_errors: list[float] = []
-        self._accuracies: list[float] = []
+        self.fixes: list[ReceivedFix] = []
         self.errors_m: list[float] = []  # error of the navigation solution since the first GPS_INPUT
+
+    def watch(self, autopilot: SimAutopilot) -> None:
+        """Goes on with the same vehicle's autopilot after its restart; its counts begin again."""
+        self._autopilot = autopilot
 
     def observe(self, now_s: float, truth: State) -> None:
         self._start_s = now_s if self._start_s is None else self._start_s
@@ -86,10 +98,9 @@ class PeerMonitor:
         while now_s - self._truths[0][0] > TRUTH_HISTORY_S:
             self._truths.popleft()
         for fix in self._autopilot.gps_input_fixes:
-            reported = np.array(self._frame.to_local(fix.lat_deg, fix.lon_deg))
-            self._gps_errors.append(float(np.hypot(*(reported - self._truth_at(fix.t_s)))))
-            if fix.horizontal_m is not None:
-                self._accuracies.append(fix.horizontal_m)
+            reported = np.array(self.frame.to_local(fix.lat_deg, fix.lon_deg))
+            error_m = float(np.hypot(*(reported - self._truth_at(fix.t_s))))
+            self.fixes.append(ReceivedFix(now_s, error_m, fix.horizontal_m))
         self._autopilot.gps_input_fixes.clear()
         if self._first_gps_s is None:
             if not self._autopilot.counts.received:
@@ -108,7 +119,8 @@ class PeerMonitor:
         counts = autopilot.counts
         served_s = max(1e-9, self._now_s - (self._now_s if self._first_gps_s is None else self._first_gps_s))
         gaps_ms = [1e3 * g for gps in autopilot.gps if isinstance(gps, GpsInputDriver) for g in gps.gaps_s]
-        errors = self.errors_m
+        errors, gps_errors = self.errors_m, [fix.error_m for fix in self.fixes]
+        accuracies = [fix.horizontal_m for fix in self.fixes if fix.horizontal_m is not None]
         return PeerReport(
             duration_s=self._now_s - (self._start_s or 0.0),
             gps_input_received=counts.received,
@@ -126,14 +138,14 @@ class PeerMonitor:
             longest_gap_ms=max(gaps_ms, default=None),
             interval_median_ms=quantile(gaps_ms, 0.5),
             interval_p99_ms=quantile(gaps_ms, 0.99),
-            gps_error_median_m=quantile(self._gps_errors, 0.5),
-            gps_error_p95_m=quantile(self._gps_errors, 0.95),
-            gps_error_max_m=max(self._gps_errors, default=None),
+            gps_error_median_m=quantile(gps_errors, 0.5),
+            gps_error_p95_m=quantile(gps_errors, 0.95),
+            gps_error_max_m=max(gps_errors, default=None),
             position_error_median_m=quantile(errors, 0.5),
             position_error_p95_m=quantile(errors, 0.95),
             position_error_max_m=max(errors, default=None),
             position_error_final_m=errors[-1] if errors else None,
-            horiz_accuracy_median_m=quantile(self._accuracies, 0.5),
+            horiz_accuracy_median_m=quantile(accuracies, 0.5),
             failsafes=autopilot.status.failsafes,
             glitches=self._glitches,
             companion_heartbeats=traffic.heartbeats,

@@ -16,6 +16,20 @@ MAX_STREAM_HZ = 50.0  # largest stream rate: one step of the simulation
 TEXT_BYTES = 50  # of STATUSTEXT
 
 
+def heartbeat(sysid: int) -> bytes:
+    """The heartbeat of another autopilot (ArduPilot, copter, armed), as one packet."""
+    mav = mavlink.MAVLink(None, srcSystem=sysid, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
+    sent = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_QUADROTOR,
+        mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        mavlink.MAV_MODE_FLAG_SAFETY_ARMED,
+        0,
+        mavlink.MAV_STATE_ACTIVE,
+        3,
+    )
+    return bytes(sent.pack(mav))
+
+
 @dataclass
 class CompanionTraffic:
     """Messages received from the companion other than GPS_INPUT."""

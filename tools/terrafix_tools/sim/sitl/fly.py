@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from terrafix.core.errors import UsageError
+from terrafix.core.installed_files import installed_files
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.camera.stream import FrameStream
 from terrafix_tools.sim.out_folder import prepare_folder
@@ -25,7 +26,7 @@ from terrafix_tools.sim.sitl.setup import SPEED_MPS, WORLD_M, laps_for, mission_
 from terrafix_tools.sim.sitl.stages import Daemon, FlightAborted, Stages
 from terrafix_tools.sim.world import place as world
 
-PARAMETERS = Path(__file__).resolve().parents[4] / "config" / "vehicles" / "second-gps.param"
+PARAMETERS = "config/vehicles/second-gps.param"  # of the installed files
 REPORT = "ardupilot.json"  # a folder that contains this file may be emptied
 TIME_FACTOR = 2.0  # Time limit of the flight, as a multiple of the time at cruise speed,
 CLIMB_AND_LANDING_S = 240.0  # plus this for climb and landing
@@ -52,7 +53,7 @@ def fly(
     """
     program = find_binary(binary)
     kind = kind_of(program, vehicle)
-    files = [_readable(path) for path in parameters or [PARAMETERS]]
+    files = [_readable(path) for path in parameters or [installed_files() / PARAMETERS]]
     ports = take_ports(port)
     place = world.generate(seed, width_m=WORLD_M[0], height_m=WORLD_M[1])
     mission = mission_for(place, kind, length_m)

@@ -1,0 +1,132 @@
+"""Judgement of a cell of the fault matrix, its table, and the damage that its camera does."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from terrafix_tools.chaos import verdict
+from terrafix_tools.chaos.camera import Look, altered
+from terrafix_tools.chaos.faults import FAULTS
+from terrafix_tools.chaos.run import Results
+from terrafix_tools.chaos.scene import AGL_M, Phase, phases
+from terrafix_tools.chaos.table import table, write_table
+from terrafix_tools.chaos.verdict import Outcome
+from terrafix_tools.sim.autopilot.course import PeerState
+from terrafix_tools.sim.autopilot.report import ReceivedFix
+
+
+def ticks(from_s: float, to_s: float) -> list[float]:
+    """Times of GPS_INPUT at 10 Hz."""
+    return np.arange(from_s, to_s - 0.01, 0.1).tolist()
+
+
+def test_silence_is_the_longest_time_without_a_message_and_reaches_to_the_ends() -> None:
+    received = [*ticks(0.0, 5.0), *ticks(9.0, 12.0)]
+    assert verdict.silence_s(received, 4.0, 12.0) == pytest.approx(4.1, abs=0.11)
+    assert verdict.silence_s(received, 4.0, 20.0) == pytest.approx(8.1, abs=0.11)
+    assert verdict.silence_s([], 4.0, 7.0) == 3.0
+
+
+def test_the_fix_is_back_when_none_is_missing_any_more() -> None:
+    fixes = [*ticks(0.0, 5.0), *ticks(8.0, 9.0), *ticks(12.0, 20.0)]
+    assert verdict.back_s(fixes, 6.0, 20.0) == pytest.approx(6.0)
+    assert verdict.back_s(fixes, 14.0, 20.0) == 0.0
+    assert verdict.back_s(fixes, 6.0, 25.0) is None
+    assert verdict.without_fix_s(fixes, 4.0, 20.0) == pytest.approx(3.1 + 3.1, abs=0.01)
+
+
+def test_a_position_is_wrong_beyond_four_times_its_accuracy() -> None:
+    fixes = [ReceivedFix(1.0, error_m, 2.0) for error_m in (7.9, 8.1, 100.0)]
+    assert [fix.error_m for fix in verdict.wrong_fixes(fixes)] == [8.1, 100.0]
+    assert verdict.wrong_fixes([ReceivedFix(1.0, 0.1, None)]), "a position without an accuracy is a wrong one"
+
+
+def test_what_the_record_lacks_is_the_longest_time_received_and_not_recorded() -> None:
+    received = ticks(0.0, 10.0)
+    recorded = [t + 0.03 for t in received if not 3.0 <= t <= 5.0]
+    assert verdict.not_recorded_s(received, recorded) == pytest.approx(2.0, abs=0.21)
+    assert verdict.not_recorded_s(received, received) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("outcome", "expected"),
+    [
+        ({"back_s": 1.0}, "ok"),
+        ({"back_s": None}, "no fix afterwards"),
+        ({"back_s": 1.0, "wrong": 3}, "3 wrong positions"),
+        ({"back_s": 1.0, "not_recorded_s": 1.4}, "ok"),
+        ({"back_s": 1.0, "not_recorded_s": 1.6}, "1.6 s not recorded"),
+    ],
+)
+def test_a_verdict_names_the_promises_that_were_broken(outcome: dict[str, float], expected: str) -> None:
+    found = Outcome(fault="f", phase="p", verdict="", **outcome)  # type: ignore[arg-type]
+    assert verdict.text_of(found, fix_expected=True, record_expected=True) == expected
+
+
+def test_a_fix_is_not_expected_after_a_fault_in_the_landing_and_no_record_where_its_process_was_hit() -> None:
+    landed = Outcome(fault="f", phase="p", verdict="", back_s=None, not_recorded_s=9.0)
+    assert verdict.text_of(landed, fix_expected=False, record_expected=False) == "ok"
+
+
+def test_the_faults_have_names_of_their_own() -> None:
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS) > 40
+
+
+def test_an_interrupted_matrix_goes_on_where_it_was(tmp_path: Path) -> None:
+    results = Results(tmp_path / "results.json")
+    assert not results.has(FAULTS[1], Phase.CRUISE)
+    results.add(Outcome(fault=FAULTS[1].name, phase=Phase.CRUISE, verdict="ok", silence_s=2.5, back_s=4.0))
+    results.add(Outcome(fault=FAULTS[1].name, phase=Phase.CRUISE, verdict="ok", silence_s=1.5, back_s=3.0, fixes=7))
+    again = Results(tmp_path / "results.json")
+    assert again.has(FAULTS[1], Phase.CRUISE) and not again.has(FAULTS[1], Phase.TURN)
+    assert [outcome.silence_s for outcome in again.outcomes] == [1.5]
+
+
+def test_the_table_of_a_page_is_replaced_and_names_broken_promises(tmp_path: Path) -> None:
+    page = tmp_path / "faults.md"
+    page.write_text("before\n<!-- table: chaos -->\nold\n<!-- end -->\nafter\n")
+    good = Outcome(fault="none", phase=Phase.CRUISE, verdict="ok", silence_s=0.1, back_s=0.0, fixes=90)
+    bad = Outcome(
+        fault="none", phase=Phase.TURN, verdict="2 wrong positions", silence_s=4.0, back_s=9.0, fixes=10, wrong=2
+    )
+    write_table(page, [good, bad])
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert "| none | - | 0.1 s, 0.0 s | 4.0 s, 9.0 s **2 wrong positions** | - | - |" in text
+    assert "2 cells with 100 positions, 2 of them wrong." in table([good, bad])
+
+
+def jpeg() -> bytes:
+    image = np.random.default_rng(1).integers(40, 120, (90, 160, 3), np.uint8)
+    return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+def decoded(data: bytes) -> np.ndarray | None:
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_the_camera_shows_what_its_fault_says() -> None:
+    good = jpeg()
+    image, black, white, blurred, small = (
+        decoded(altered(good, look)) for look in (Look.GOOD, Look.BLACK, Look.OVEREXPOSED, Look.DEFOCUSED, Look.SMALL)
+    )
+    assert image is not None and black is not None and white is not None and blurred is not None and small is not None
+    assert black.max() == 0 and np.median(white) == 255 and small.shape == (45, 80, 3)
+    assert blurred.std() < 0.4 * image.std()
+    assert decoded(altered(good, Look.TORN)) is None
+
+
+def copter(t_s: float) -> PeerState:
+    """Climbs to AGL_M in 50 s, flies straight to 80 s, turns by 90 degrees in 3 s, and lands from 120 s on."""
+    agl_m = AGL_M * min(1.0, t_s / 50.0, max(0.0, (170.0 - t_s) / 50.0))
+    yaw_rad = np.pi / 2 * min(1.0, max(0.0, (t_s - 80.0) / 3.0))
+    return PeerState(48.0, 11.0, agl_m, agl_m, float(yaw_rad), 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_the_phases_of_a_flight_are_found_by_height_and_heading() -> None:
+    found = phases(copter, 170.0)
+    assert 80.0 <= found[Phase.TURN] <= 83.0
+    assert found[Phase.LANDING] == pytest.approx(122.5, abs=0.5), "95 % of the height"
+    assert 60.0 < found[Phase.CRUISE] < 110.0 and abs(found[Phase.CRUISE] - 81.5) > 5.0

@@ -1,0 +1,1 @@
+"""Fault matrix: each fault in each phase of a flight, with the real processes, and what came of it."""

@@ -1,0 +1,174 @@
+"""The real processes of Terrafix beside a simulated camera and autopilot, with access to all that may fail."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from terrafix.core.errors import SourceError
+from terrafix_tools.chaos.camera import StreamedCamera, camera_toml
+from terrafix_tools.chaos.scene import Scene
+from terrafix_tools.sim.autopilot.course import PeerState
+from terrafix_tools.sim.autopilot.parameters import Kind
+from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+from terrafix_tools.sim.camera.stream import FrameStream
+from terrafix_tools.sim.flights.folder import CAMERA
+
+RESTART_S = 0.1  # RestartSec= of the systemd unit, whose part the rig takes
+START_LIMIT_S = 90.0  # until the camera is opened, on a computer that others use too
+STOP_LIMIT_S = 45.0  # TimeoutStopSec= of the unit
+COOL_MC = 40_000  # of the simulated thermal zone
+
+
+class Rig:
+    """One start of Terrafix in a folder. A context manager, which stops all that it has started."""
+
+    def __init__(self, scene: Scene, folder: Path, start_s: float, *, seed: int, config: str = "") -> None:
+        """``start_s``: second of the flight at which it begins; ``config``: further lines for the configuration.
+
+        ``folder`` is new; the record is in its folder ``out``. Raises OSError."""
+        self.scene, self.folder, self.out = scene, folder, folder / "out"
+        self.map_path = folder / "map.gpkg"
+        self.began_s: float | None = None  # monotonic time of ``start_s``; None: the vehicle is held in the air
+        self.busy: list[subprocess.Popen[bytes]] = []  # other programs that a fault has started
+        self._start_s = start_s
+        folder.mkdir(parents=True)
+        self.out.mkdir()
+        self.map_path.write_bytes(scene.map_path.read_bytes())
+        self.set_temperature(COOL_MC)
+        self.peer = AutopilotPeer(seed=seed, kind=Kind.COPTER, home_amsl_m=self._home_amsl_m())
+        self.stream = FrameStream()
+        self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s)
+        self._config = config
+        self._died_s: float | None = None
+        self._daemon: subprocess.Popen[bytes] | None = None
+        self.stop_s: float | None = None  # that the ordered stop took
+        self.starts = 0
+
+    def __enter__(self) -> "Rig":
+        port = self.peer.start(0, self._state, self.flight_s)
+        self.camera.__enter__()
+        self._write_config(port)
+        self._start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for program in self.busy:
+            program.kill()
+            program.wait()
+        self.stop()
+        self.camera.__exit__()
+        self.stream.close()
+        with suppress(RuntimeError):
+            self.peer.stop()
+
+    def take_off(self, hold_s: float = 0.0) -> None:
+        """The flight begins when the camera is opened; with ``hold_s`` the vehicle then hovers until the autopilot has
+        a fix, at most so long. Raises SourceError."""
+        until_s = time.monotonic() + START_LIMIT_S
+        while not self.stream.wait_for_viewer(0.1):
+            self.check()
+            if time.monotonic() > until_s or self._ended_by_itself():
+                raise SourceError(f"{self.folder}: Terrafix has not started; see {self.log}")
+        until_s = time.monotonic() + hold_s
+        while time.monotonic() < until_s and not self.peer.fixes():
+            time.sleep(0.1)
+        self.began_s = time.monotonic()
+
+    def flight_s(self) -> float:
+        """Second of the flight."""
+        return self._start_s + (0.0 if self.began_s is None else time.monotonic() - self.began_s)
+
+    @property
+    def log(self) -> Path:
+        return self.folder / "terrafix.log"
+
+    @property
+    def supervisor_pid(self) -> int | None:
+        return None if self._daemon is None or self._daemon.poll() is not None else self._daemon.pid
+
+    def pid(self, process: str) -> int | None:
+        """Of a process of Terrafix by its name in `ps`; None: it does not run."""
+        return next((pid for name, pid in self.processes() if name == process), None)
+
+    def processes(self) -> Iterator[tuple[str, int]]:
+        """Name and pid of the children of the supervisor."""
+        for entry in Path("/proc").iterdir():
+            with suppress(OSError, ValueError, IndexError):
+                if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == self.supervisor_pid:
+                    yield (entry / "comm").read_text().strip(), int(entry.name)
+
+    def signal(self, process: str, number: int) -> None:
+        """Sends a signal to a process, or to the supervisor by the name "supervisor"."""
+        pid = self.supervisor_pid if process == "supervisor" else self.pid(process)
+        if pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+
+    def check(self) -> None:
+        """Starts Terrafix again if its supervisor has died, as systemd does. Call it often."""
+        if self._daemon is None or self._daemon.poll() is None:
+            return
+        if self._died_s is None:
+            self._died_s = time.monotonic()
+        elif time.monotonic() - self._died_s > RESTART_S:
+            self._start()
+
+    def set_temperature(self, millidegrees: int) -> None:
+        zone = self.folder / "sys" / "class" / "thermal" / "thermal_zone0"
+        zone.mkdir(parents=True, exist_ok=True)
+        (zone / "type").write_text("cpu-thermal\n")
+        (zone / "temp").write_text(f"{millidegrees}\n")
+
+    def stop(self) -> None:
+        """The ordered stop."""
+        if self._daemon is None:
+            return
+        began_s = time.monotonic()
+        self._daemon.send_signal(signal.SIGCONT)
+        self._daemon.terminate()
+        try:
+            self._daemon.wait(STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self._daemon.kill()
+            self._daemon.wait()
+        self.stop_s = time.monotonic() - began_s
+        self._daemon = None
+
+    def _ended_by_itself(self) -> bool:
+        """Whether it ended again and again before it opened the camera."""
+        return self.starts > 3 and self._daemon is not None and self._daemon.poll() is not None
+
+    def _start(self) -> None:
+        self._died_s = None
+        self.starts += 1
+        command = [sys.executable, "-m", "terrafix_tools.sim.sitl.child_process", str(os.getpid()), "run"]
+        command += ["--config", str(self.folder / "terrafix.toml"), "--out", str(self.out)]
+        with self.log.open("ab") as log:
+            self._daemon = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+
+    def _write_config(self, port: int) -> None:
+        first = self._state(self._start_s)
+        camera = self.folder / "camera.toml"
+        camera.write_text(camera_toml(CAMERA))
+        (self.folder / "terrafix.toml").write_text(
+            f'[map]\npath = "{self.map_path}"\n'
+            f'[source]\npath = "{self.stream.url}"\ncamera = "{camera}"\nrate_hz = 20\n'
+            f'start = "{first.lat_deg:.6f},{first.lon_deg:.6f}"\n'
+            f'[link]\ndevice = "udpout:127.0.0.1:{port}"\n'
+            f'[health]\nsysfs_root = "{self.folder / "sys"}"\n'
+            f'[recorder]\nframes = "none"\n{self._config}'
+        )
+
+    def _state(self, t_s: float) -> PeerState:
+        state = self.scene.course(t_s)
+        return state if self.began_s is not None else replace(state, vn_mps=0.0, ve_mps=0.0, vd_mps=0.0)
+
+    def _home_amsl_m(self) -> float:
+        ground = self.scene.course(0.0)
+        return ground.amsl_m - ground.agl_m

@@ -1,0 +1,124 @@
+"""The flight of the fault matrix: a copter over a generated place, from take-off to landing, with its phases."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.core.errors import SourceError
+from terrafix_tools.mission.file import write_mission
+from terrafix_tools.mission.items import Do, Item, Mission
+from terrafix_tools.sim.autopilot.course import Course, PeerState, read_course, write_course
+from terrafix_tools.sim.autopilot.parameters import Kind
+from terrafix_tools.sim.flights.folder import FRAME_HZ, Flight
+from terrafix_tools.sim.flights.make import MAP_NAME, FlightOptions, make
+from terrafix_tools.sim.world import place as world
+
+AGL_M = 100.0
+LEG_M = 250.0  # of the two legs, east and then north
+STEP_S = 0.1  # of the course
+CRUISE_SHARE = 0.95  # of the greatest height
+STRAIGHT_RADPS = 0.05  # a turn is faster
+LEAD_S = 8.0  # flown before the fault, after hovering to the first fix
+COURSE = "course.csv"
+
+
+class Phase(StrEnum):
+    """When the fault begins."""
+
+    START = "before the first fix"  # of the processes, in cruise
+    CRUISE = "cruise"
+    TURN = "turn"
+    DARK = "dark"  # in cruise; the images are black from 4 s before the fault to its end
+    LANDING = "landing"  # as the descent begins
+
+
+@dataclass(frozen=True)
+class Scene:
+    """``at_s``: seconds of the flight at which the fault of each phase begins."""
+
+    map_path: Path
+    jpegs: list[Path]
+    course: Course
+    at_s: dict[Phase, float]
+    duration_s: float
+
+    def jpeg(self, t_s: float) -> bytes:
+        """The image whose exposure is nearest to a time of the flight."""
+        index = min(max(0, round(t_s * FRAME_HZ)), len(self.jpegs) - 1)
+        return self.jpegs[index].read_bytes()
+
+
+def scene_in(folder: Path, seed: int) -> Scene:
+    """The flight in ``folder``, which is generated if it is not there. Raises OutputError, SourceError."""
+    if not (folder / COURSE).exists():
+        mission = folder.with_suffix(".waypoints")
+        write_mission(mission, _mission(seed))
+        flight = make(folder, FlightOptions(seed=seed, vehicle=Kind.COPTER, mission=mission), progress=False)
+        course_of(flight, folder)
+    course = read_course(folder / COURSE)
+    jpegs = sorted((folder / "frames").glob("*.jpg"))
+    if not jpegs:
+        raise SourceError(f"{folder}: has no images; remove it, and it is generated anew")
+    duration_s = len(jpegs) / FRAME_HZ
+    return Scene(folder / MAP_NAME, jpegs, course, phases(course, duration_s), duration_s)
+
+
+def course_of(flight: Flight, folder: Path) -> Course:
+    """The true course of a flight, which is written into its folder. Raises OutputError, SourceError."""
+    write_course(folder / COURSE, _states(flight))
+    return read_course(folder / COURSE)
+
+
+def _mission(seed: int) -> Mission:
+    """Take-off in the middle of the place, two legs at AGL_M above the take-off, landing at their end."""
+    place = world.generate(seed)
+    x, y = place.layout.width_m / 2, place.layout.height_m / 2
+    home, corner, end = (place.wgs84(x + dx, y + dy) for dx, dy in ((0.0, 0.0), (LEG_M, 0.0), (LEG_M, -LEG_M)))
+    items = (
+        Item(Do.TAKE_OFF, height_m=AGL_M),
+        Item(Do.WAYPOINT, 1, *corner, height_m=AGL_M),
+        Item(Do.WAYPOINT, 2, *end, height_m=AGL_M),
+        Item(Do.LAND, 3, *end, height_m=0.0),
+    )
+    return Mission("two legs", *home, items)
+
+
+def _states(flight: Flight) -> list[tuple[float, PeerState]]:
+    rows = []
+    for t_s in np.arange(0.0, flight.path.duration_s, STEP_S).tolist():
+        state = flight.path.state(t_s)
+        e_m, n_m, up_m = (float(v) for v in state.p_b_in_w_m)
+        ve, vn, vu = (float(v) for v in state.velocity_enu_mps)
+        lat_deg, lon_deg = flight.frame.to_wgs84(e_m, n_m)
+        angles = state.yaw_rad, state.pitch_rad, state.roll_rad
+        rows.append((t_s, PeerState(lat_deg, lon_deg, up_m, state.agl_m, *angles, vn, ve, -vu)))
+    return rows
+
+
+def phases(course: Course, duration_s: float) -> dict[Phase, float]:
+    """Times of the faults of a flight from ground to ground."""
+    times = np.arange(0.0, duration_s, STEP_S)
+    states = [course(t_s) for t_s in times.tolist()]
+    agl_m = np.array([state.agl_m for state in states])
+    turn_radps = np.abs(np.gradient(np.unwrap([state.yaw_rad for state in states]), STEP_S))
+    high = agl_m > CRUISE_SHARE * agl_m.max()
+    landing_s = float(times[np.flatnonzero(high)[-1]])
+    usable = high & (times >= times[np.flatnonzero(high)[0]] + LEAD_S) & (times < landing_s - LEAD_S)
+    cruise_s = _middle_of_longest(times, usable & (turn_radps < STRAIGHT_RADPS))
+    turn_s = float(times[np.argmax(np.where(usable, turn_radps, -1.0))])
+    return {
+        Phase.START: cruise_s,
+        Phase.CRUISE: cruise_s,
+        Phase.TURN: turn_s,
+        Phase.DARK: cruise_s,
+        Phase.LANDING: landing_s,
+    }
+
+
+def _middle_of_longest(times: np.ndarray, chosen: np.ndarray) -> float:
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], chosen.astype(np.int8), [0]))))
+    runs = edges.reshape(-1, 2)
+    first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]
+    return float(times[(first + last - 1) // 2])

@@ -1,0 +1,67 @@
+"""The outcomes of a fault matrix as text, and as a table in a page of the documentation."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from terrafix.core.errors import OutputError, SourceError
+from terrafix_tools.chaos.faults import FAULTS
+from terrafix_tools.chaos.scene import Phase
+from terrafix_tools.chaos.verdict import Outcome
+
+MARKS = re.compile(r"(<!-- table: chaos -->).*?(<!-- end -->)", re.S)
+
+
+def line(outcome: Outcome) -> str:
+    """One line for the terminal."""
+    worst = "-" if outcome.worst_sigmas is None else f"{outcome.worst_sigmas:.1f}"
+    figures = {
+        "silence": _s(outcome.silence_s),
+        "without fix": _s(outcome.without_fix_s),
+        "back after": _s(outcome.back_s),
+        "worst": f"{worst} sigma",
+        "not recorded": _s(outcome.not_recorded_s),
+        "stop": _s(outcome.stop_s),
+    }
+    told = ", ".join(f"{name} {value}" for name, value in figures.items())
+    return f"{outcome.fault:28} {outcome.phase:21} {told}: {outcome.verdict}"
+
+
+def cell(outcome: Outcome | None) -> str:
+    """Silence, and time without a fix, in seconds; a broken promise in words."""
+    if outcome is None:
+        return "-"
+    if outcome.silence_s is None:
+        return outcome.verdict
+    figures = f"{_s(outcome.silence_s)}, {_s(outcome.back_s)}"
+    return figures if outcome.verdict == "ok" else f"{figures} **{outcome.verdict}**"
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    found = {(o.fault, o.phase): o for o in outcomes}
+    rows = [f"| fault | {' | '.join(Phase)} |", f"|---|{'---|' * len(Phase)}"]
+    for fault in FAULTS:
+        cells = (cell(found.get((fault.name, phase))) for phase in Phase)
+        rows.append(f"| {fault.name} | {' | '.join(cells)} |")
+    flown = [o for o in outcomes if o.silence_s is not None]
+    fixes, wrong = sum(o.fixes for o in flown), sum(o.wrong for o in flown)
+    rows += ["", f"{len(flown)} cells with {fixes} positions, {wrong} of them wrong."]
+    return "\n".join(rows)
+
+
+def write_table(page: Path, outcomes: Sequence[Outcome]) -> None:
+    """Replaces the table between the marks of a page. Raises SourceError, OutputError."""
+    try:
+        text, count = MARKS.subn(lambda m: f"{m[1]}\n{table(outcomes)}\n{m[2]}", page.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SourceError(f"{page}: cannot be read ({error.strerror})") from None
+    if count != 1:
+        raise SourceError(f"{page}: has no marks '<!-- table: chaos -->' and '<!-- end -->' for the table")
+    try:
+        page.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{page}: cannot be written ({error.strerror})") from None
+
+
+def _s(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f} s"

@@ -1,0 +1,1 @@
+"""`terrafix files`: configuration, parameters and units that come with Terrafix."""

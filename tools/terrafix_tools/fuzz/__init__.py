@@ -1,0 +1,1 @@
+"""Fuzzing of the parsers of everything that comes from outside."""
