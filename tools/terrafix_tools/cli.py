@@ -10,6 +10,7 @@ from terrafix import __version__
 from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
 from terrafix_tools.compare.cli import compare
+from terrafix_tools.console.cli import serve
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.fleet.cli import app as fleet_app
 from terrafix_tools.hint.cli import CONTEXT, hint
@@ -39,6 +40,7 @@ app.command()(compare)
 app.command()(finalise)
 app.command()(locate)
 app.command()(preflight)
+app.command()(serve)
 app.command()(status)
 app.command(context_settings=CONTEXT)(hint)
 app.command()(montecarlo)

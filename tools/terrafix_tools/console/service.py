@@ -1,0 +1,188 @@
+"""The state of a running console and what its routes do."""
+
+import asyncio
+import shutil
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from starlette.requests import Request
+
+from terrafix.core.config import load
+from terrafix_tools.console import uploads
+from terrafix_tools.console.access import Access
+from terrafix_tools.console.events import StateChanged
+from terrafix_tools.console.feed import Feeds
+from terrafix_tools.console.maps import MapStore
+from terrafix_tools.console.payloads import (
+    Accepted,
+    Flight,
+    Flights,
+    FlightState,
+    Hint,
+    MapState,
+    NewFlight,
+    ObjectGps,
+    ObjectPixel,
+    RecordingFile,
+    Recordings,
+    ServiceHealth,
+    Steered,
+    UserFix,
+)
+from terrafix_tools.console.problems import Refusal
+from terrafix_tools.console.settings import Settings
+from terrafix_tools.console.store import flights
+from terrafix_tools.console.store.database import Database
+from terrafix_tools.console.store.flights import StoredEvent
+
+RECORDS = ("flight.mcap", "estimates.csv", "summary.json")
+MEDIA_TYPES = {".jpg": "image/jpeg", ".png": "image/png"}
+
+
+class Service:
+    """One console. Methods without ``async`` may be called from any thread."""
+
+    def __init__(self, settings: Settings, database: Database, access: Access) -> None:
+        self.settings, self.database, self.access = settings, database, access
+        self.maps = MapStore(settings.map_folders)
+        self.feeds = Feeds(self._events_after)
+        self._uploads = uploads.Slots(settings.limits.uploads, "uploads")
+        self._stopping = False
+
+    def _events_after(self, flight_id: str, after: int) -> list[StoredEvent]:
+        with self.database.read() as db:
+            return flights.events_after(db, flight_id, after)
+
+    # --- reading ----------------------------------------------------------------------------------
+
+    def health(self, version: str) -> ServiceHealth:
+        with self.database.read() as db:
+            stored = flights.count(db)
+        return ServiceHealth(
+            status="stopping" if self._stopping else "ok",
+            version=version,
+            workers=0,
+            max_workers=self.settings.workers,
+            waiting=0,
+            flights=stored,
+            event_clients=self.feeds.clients,
+            disk_free_mb=shutil.disk_usage(self.settings.data).free // 2**20,
+        )
+
+    def config(self) -> dict[str, Any]:
+        settings = self.settings
+        service = {
+            "host": settings.host,
+            "port": settings.port,
+            "tokens_required": self.access.required,
+            "tls": settings.cert is not None,
+            "workers": settings.workers,
+            "areas": settings.sources is not None,
+            "limits": vars(settings.limits),
+        }
+        return {"service": service, "flights": msgspec.to_builtins(load(list(settings.configs)))}
+
+    def flights(self) -> Flights:
+        with self.database.read() as db:
+            return Flights(flights=flights.all_flights(db))
+
+    def flight(self, flight_id: str) -> Flight:
+        with self.database.read() as db:
+            return flights.flight_of(db, flight_id)
+
+    def frame_image(self, flight_id: str, frame_id: int) -> tuple[Path, str]:
+        """-> file and media type."""
+        with self.database.read() as db:
+            image = flights.image_of(db, flight_id, frame_id)
+        path = self.settings.flight(flight_id) / image.stored
+        return path, MEDIA_TYPES[path.suffix]
+
+    def recordings(self, flight_id: str) -> Recordings:
+        self.flight(flight_id)
+        folder = self.settings.flight(flight_id) / "out"
+        names = sorted(p.name for p in folder.iterdir() if p.is_file()) if folder.is_dir() else []
+        files = [
+            RecordingFile(
+                name=name, bytes=(folder / name).stat().st_size, url=f"/flights/{flight_id}/recordings/{name}"
+            )
+            for name in names
+        ]
+        return Recordings(files=files)
+
+    def recording(self, flight_id: str, name: str) -> Path:
+        if name not in [file.name for file in self.recordings(flight_id).files]:
+            raise Refusal(404, f"flight {flight_id} has no file {name}")
+        return self.settings.flight(flight_id) / "out" / name
+
+    async def events(self, flight_id: str, after: int) -> AsyncIterator[bytes]:
+        if self.feeds.clients >= self.settings.limits.event_clients:
+            raise Refusal(429, f"{self.settings.limits.event_clients} event streams are the limit; close others")
+        flight = await asyncio.to_thread(self.flight, flight_id)
+        return self.feeds.of(flight_id).stream(min(after, flight.last_event_id))
+
+    # --- acting -----------------------------------------------------------------------------------
+
+    def create(self, new: NewFlight) -> Flight:
+        if new.map is None:
+            raise Refusal(422, "area: this service has no map sources; start it with --sources FILE")
+        self.maps.path(new.map)
+        with self.database.write() as db:
+            if flights.count(db) >= self.settings.limits.flights:
+                raise Refusal(429, f"{self.settings.limits.flights} flights are stored; delete some")
+            flight_id = flights.create(db, new, new.map, MapState.READY)
+            return flights.flight_of(db, flight_id)
+
+    async def upload(self, request: Request, flight_id: str) -> Accepted:
+        await asyncio.to_thread(self.flight, flight_id)
+        folder = self.settings.flight(flight_id)
+        return await uploads.take_batch(request, self.database, flight_id, folder, self.settings.limits, self._uploads)
+
+    async def steer(self, flight_id: str, given: Hint | UserFix) -> Steered:
+        def add() -> int:
+            with self.database.write() as db:
+                row = flights.row_of(db, flight_id)
+                if row.state == FlightState.COMPLETED.value:
+                    raise Refusal(409, "the flight is completed")
+                if isinstance(given, UserFix):
+                    flights.image_of(db, flight_id, given.frame_id)
+                return flights.add_hint(db, flight_id, given)
+
+        return Steered(hint_id=await asyncio.to_thread(add), detail="used with the next frame; hint_answered tells")
+
+    async def locate(self, flight_id: str, frame_id: int, pixel: ObjectPixel) -> ObjectGps:
+        raise Refusal(503, "not available yet")
+
+    async def complete(self, flight_id: str) -> Flight:
+        def mark() -> Flight:
+            with self.database.write() as db:
+                flights.row_of(db, flight_id)
+                flights.update(db, flight_id, completing=True)
+                return flights.flight_of(db, flight_id)
+
+        return await asyncio.to_thread(mark)
+
+    async def delete(self, flight_id: str) -> None:
+        def remove() -> None:
+            with self.database.write() as db:
+                flights.delete(db, flight_id)
+            shutil.rmtree(self.settings.flight(flight_id), ignore_errors=True)
+
+        await asyncio.to_thread(remove)
+        self.feeds.drop(flight_id)
+
+    # --- life -------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Resumes what was not completed."""
+
+    async def stop(self) -> None:
+        """In order: no more requests, streams end, workers end, the database is closed."""
+        self._stopping = True
+        self.feeds.close()
+        self.database.close()
+
+
+def state_event(state: FlightState, previous: FlightState) -> StateChanged:
+    return StateChanged(state=state, previous=previous)

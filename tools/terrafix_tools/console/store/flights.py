@@ -1,0 +1,323 @@
+"""Flights in the database. Every function takes the connection of a transaction of ``Database``."""
+
+import json
+import re
+import secrets
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import sqlalchemy as sa
+from sqlalchemy.dialects.sqlite import insert
+
+from terrafix_tools.console.events import Event, name_of
+from terrafix_tools.console.payloads import (
+    Accepted,
+    Flight,
+    FlightKind,
+    FlightMap,
+    FlightState,
+    Fragment,
+    FrameResult,
+    Hint,
+    Images,
+    InputRequest,
+    MapState,
+    NewFlight,
+    UserFix,
+)
+from terrafix_tools.console.problems import Refusal
+from terrafix_tools.console.store.schema import events, flights, fragments, headings, hints, images, results
+
+EVENT_PAGE = 500  # events that are read at once [spec: about 200 kB]
+_NUMBER = re.compile(r"(\d{1,12})\D*$")
+
+
+@dataclass(frozen=True)
+class StoredImage:
+    """An uploaded image. ``stored``: its file below the folder of the flight; ``state``: VehicleState in JSON."""
+
+    frame_id: int
+    name: str
+    stored: str
+    bytes: int
+    sha256: str
+    t_ns: int
+    state: str | None
+    attempts: int = 0
+
+
+@dataclass(frozen=True)
+class StoredEvent:
+    event_id: int
+    name: str
+    data: str  # JSON
+
+
+def number_of(name: str) -> int:
+    """The number in the name of an image: the last digits before its suffix. Raises Refusal."""
+    found = _NUMBER.search(name.rpartition(".")[0] or name)
+    if found is None:
+        raise Refusal(422, f"{name!r}: the name of an image ends in its number, as in DJI_0042.jpg")
+    return int(found.group(1))
+
+
+def create(db: sa.Connection, new: NewFlight, map_name: str, map_state: MapState) -> str:
+    """-> the id of the new flight."""
+    flight_id = secrets.token_hex(8)
+    row = {
+        "id": flight_id,
+        "name": new.name or flight_id,
+        "kind": FlightKind.BATCH.value,
+        "state": FlightState.PROCESSING.value,
+        "created_at": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "spec": new.model_dump_json(),
+        "map_name": map_name,
+        "map_state": map_state.value,
+        "map_detail": "",
+        "completing": False,
+        "error": "",
+    }
+    db.execute(flights.insert().values(row))
+    return flight_id
+
+
+def count(db: sa.Connection) -> int:
+    return int(db.execute(sa.select(sa.func.count()).select_from(flights)).scalar_one())
+
+
+def row_of(db: sa.Connection, flight_id: str) -> "sa.Row":
+    """Raises Refusal (404)."""
+    row = db.execute(sa.select(flights).where(flights.c.id == flight_id)).one_or_none()
+    if row is None:
+        raise Refusal(404, f"there is no flight {flight_id[:40]!r}; GET /flights lists them")
+    return row
+
+
+def flight_of(db: sa.Connection, flight_id: str) -> Flight:
+    return _flight(db, row_of(db, flight_id))
+
+
+def all_flights(db: sa.Connection) -> list[Flight]:
+    """The newest first."""
+    rows = db.execute(sa.select(flights).order_by(flights.c.created_at.desc(), flights.c.id)).all()
+    return [_flight(db, row) for row in rows]
+
+
+def _flight(db: sa.Connection, row: "sa.Row") -> Flight:
+    uploaded = _count(db, images, row.id)
+    found = db.execute(
+        sa.select(fragments).where(fragments.c.flight_id == row.id).order_by(fragments.c.fragment_id)
+    ).all()
+    spec = json.loads(row.spec)
+    return Flight(
+        flight_id=row.id,
+        name=row.name,
+        kind=FlightKind(row.kind),
+        state=FlightState(row.state),
+        created_at=row.created_at,
+        completing=row.completing,
+        map=FlightMap(name=row.map_name, state=MapState(row.map_state), detail=row.map_detail),
+        start=spec.get("start"),
+        images=Images(
+            uploaded=uploaded,
+            processed=_count(db, results, row.id),
+            next_number=None if row.last_number is None else row.last_number + 1,
+        ),
+        fragments=[Fragment(**{k: v for k, v in f._mapping.items() if k != "flight_id"}) for f in found],
+        request=None if row.request is None else InputRequest.model_validate_json(row.request),
+        events_url=f"/flights/{row.id}/events",
+        last_event_id=last_event_id(db, row.id),
+        error=row.error,
+    )
+
+
+def _count(db: sa.Connection, table: sa.Table, flight_id: str) -> int:
+    query = sa.select(sa.func.count()).select_from(table).where(table.c.flight_id == flight_id)
+    return int(db.execute(query).scalar_one())
+
+
+def update(db: sa.Connection, flight_id: str, **values: object) -> None:
+    db.execute(flights.update().where(flights.c.id == flight_id).values(**values))
+
+
+def delete(db: sa.Connection, flight_id: str) -> None:
+    """With all that belongs to it (ON DELETE CASCADE)."""
+    row_of(db, flight_id)
+    db.execute(flights.delete().where(flights.c.id == flight_id))
+
+
+# --- images ---------------------------------------------------------------------------------------
+
+
+def image_count(db: sa.Connection, flight_id: str) -> int:
+    return _count(db, images, flight_id)
+
+
+def images_of(db: sa.Connection, flight_id: str, first: int, most: int = 1000) -> list[StoredImage]:
+    """The images from frame ``first`` on."""
+    query = sa.select(images).where(images.c.flight_id == flight_id, images.c.frame_id >= first)
+    rows = db.execute(query.order_by(images.c.frame_id).limit(most)).all()
+    return [StoredImage(**{k: v for k, v in row._mapping.items() if k != "flight_id"}) for row in rows]
+
+
+def image_of(db: sa.Connection, flight_id: str, frame_id: int) -> StoredImage:
+    """Raises Refusal (404)."""
+    found = images_of(db, flight_id, frame_id, 1)
+    if not found or found[0].frame_id != frame_id:
+        raise Refusal(404, f"flight {flight_id} has no frame {frame_id}")
+    return found[0]
+
+
+def repeated_batch(db: sa.Connection, flight_id: str, sums: list[tuple[str, str]]) -> list[int] | None:
+    """The frames of a batch of (name, sha256) that was uploaded before; None: it is new. Raises Refusal (409): a part of
+    it, or other images by these names."""
+    names = [name for name, _ in sums]
+    rows = db.execute(
+        sa.select(images.c.frame_id, images.c.name, images.c.sha256).where(
+            images.c.flight_id == flight_id, images.c.name.in_(names)
+        )
+    ).all()
+    if not rows:
+        return None
+    stored = {row.name: (row.frame_id, row.sha256) for row in rows}
+    for name, digest in sums:
+        if name not in stored or stored[name][1] != digest:
+            what = "was not uploaded before, others of its batch were" if name not in stored else "is another image"
+            raise Refusal(409, f"{name}: {what}; a batch is repeated as a whole, or not at all")
+    return [stored[name][0] for name in names]
+
+
+def check_sequence(last_number: int | None, names: list[str]) -> int:
+    """-> the number of the last image. Raises Refusal: numbers do not follow each other."""
+    expected = last_number
+    for name in names:
+        number = number_of(name)
+        if expected is not None and number != expected + 1:
+            raise Refusal(
+                409, f"{name}: number {number}, expected {expected + 1}; images come in the sequence of names"
+            )
+        expected = number
+    assert expected is not None
+    return expected
+
+
+def add_images(db: sa.Connection, flight_id: str, batch: Iterable[StoredImage], last_number: int) -> Accepted:
+    rows = [{"flight_id": flight_id, **vars(image)} for image in batch]
+    db.execute(images.insert(), rows)
+    update(db, flight_id, last_number=last_number)
+    return Accepted(frames=[row["frame_id"] for row in rows], repeated=False, next_number=last_number + 1)
+
+
+def count_attempt(db: sa.Connection, flight_id: str, frame_id: int) -> None:
+    """One more process has died at this image."""
+    db.execute(
+        images.update()
+        .where(images.c.flight_id == flight_id, images.c.frame_id == frame_id)
+        .values(attempts=images.c.attempts + 1)
+    )
+
+
+# --- results --------------------------------------------------------------------------------------
+
+
+def results_of(db: sa.Connection, flight_id: str, *, refined: bool, first: int, most: int) -> list[FrameResult]:
+    """From frame ``first`` on; with ``refined`` the newest position of each frame."""
+    query = sa.select(results).where(results.c.flight_id == flight_id, results.c.frame_id >= first)
+    found = []
+    for row in db.execute(query.order_by(results.c.frame_id).limit(most)):
+        result = FrameResult.model_validate_json(row.immediate)
+        if refined and row.refined is not None:
+            newer = json.loads(row.refined)
+            changed = {key: newer[key] for key in ("gps", "altitude", "ellipse")}
+            result = FrameResult.model_validate({**result.model_dump(), **changed, "refined": True})
+        found.append(result)
+    return found
+
+
+def put_result(db: sa.Connection, flight_id: str, result: FrameResult) -> None:
+    row = insert(results).values(flight_id=flight_id, frame_id=result.frame_id, immediate=result.model_dump_json())
+    db.execute(row.on_conflict_do_update(["flight_id", "frame_id"], set_={"immediate": row.excluded.immediate}))
+
+
+def put_refined(db: sa.Connection, flight_id: str, frame_id: int, refined: str) -> None:
+    """``refined``: FrameRefined in JSON."""
+    db.execute(
+        results.update().where(results.c.flight_id == flight_id, results.c.frame_id == frame_id).values(refined=refined)
+    )
+
+
+def put_heading(db: sa.Connection, flight_id: str, frame_id: int, heading_deg: float, sigma_deg: float) -> None:
+    row = insert(headings).values(flight_id=flight_id, frame_id=frame_id, heading_deg=heading_deg, sigma_deg=sigma_deg)
+    changed = {"heading_deg": row.excluded.heading_deg, "sigma_deg": row.excluded.sigma_deg}
+    db.execute(row.on_conflict_do_update(["flight_id", "frame_id"], set_=changed))
+
+
+def put_fragment(db: sa.Connection, flight_id: str, fragment: Fragment) -> None:
+    values = fragment.model_dump()
+    row = insert(fragments).values(flight_id=flight_id, **values)
+    changed = {key: row.excluded[key] for key in values if key != "fragment_id"}
+    db.execute(row.on_conflict_do_update(["flight_id", "fragment_id"], set_=changed))
+
+
+# --- hints ----------------------------------------------------------------------------------------
+
+
+def add_hint(db: sa.Connection, flight_id: str, given: Hint | UserFix) -> int:
+    """-> its id: 1, 2, ... in this flight."""
+    hint_id = 1 + _count(db, hints, flight_id)
+    db.execute(hints.insert().values(flight_id=flight_id, hint_id=hint_id, given=given.model_dump_json()))
+    return hint_id
+
+
+def hints_before(db: sa.Connection, flight_id: str, frame_id: int) -> list[tuple[int, Hint | UserFix]]:
+    """The hints to be applied before this frame, with their ids: those of an earlier run at the same frame, then those
+    that no run has applied yet, which from now on belong there."""
+    at = sa.or_(hints.c.before_frame == frame_id, hints.c.before_frame.is_(None))
+    query = sa.select(hints).where(hints.c.flight_id == flight_id, at).order_by(hints.c.hint_id)
+    rows = db.execute(query).all()
+    for row in rows:
+        if row.before_frame is None:
+            db.execute(
+                hints.update()
+                .where(hints.c.flight_id == flight_id, hints.c.hint_id == row.hint_id)
+                .values(before_frame=frame_id)
+            )
+    return [(row.hint_id, _given(row.given)) for row in rows]
+
+
+def _given(text: str) -> Hint | UserFix:
+    return UserFix.model_validate_json(text) if "pixel" in json.loads(text) else Hint.model_validate_json(text)
+
+
+# --- events ---------------------------------------------------------------------------------------
+
+
+def last_event_id(db: sa.Connection, flight_id: str) -> int:
+    query = sa.select(sa.func.coalesce(sa.func.max(events.c.event_id), 0)).where(events.c.flight_id == flight_id)
+    return int(db.execute(query).scalar_one())
+
+
+def add_event(db: sa.Connection, flight_id: str, key: str, event: Event) -> bool:
+    """Appends an event with the next id. ``key``: what happened, once in a flight; an event that is there already is
+    left alone (False)."""
+    known = sa.select(events.c.event_id).where(events.c.flight_id == flight_id, events.c.key == key)
+    if db.execute(known).first() is not None:
+        return False
+    db.execute(
+        events.insert().values(
+            flight_id=flight_id,
+            event_id=last_event_id(db, flight_id) + 1,
+            key=key,
+            name=name_of(type(event)),
+            data=event.model_dump_json(),
+        )
+    )
+    return True
+
+
+def events_after(db: sa.Connection, flight_id: str, after: int, most: int = EVENT_PAGE) -> list[StoredEvent]:
+    query = sa.select(events.c.event_id, events.c.name, events.c.data).where(
+        events.c.flight_id == flight_id, events.c.event_id > after
+    )
+    return [StoredEvent(*row) for row in db.execute(query.order_by(events.c.event_id).limit(most))]
