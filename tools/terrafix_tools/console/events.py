@@ -36,12 +36,11 @@ class SearchExpanded(Event):
 
 
 class CandidateTile(BaseModel):
-    """``gps``: its centre. ``score``: share of the five."""
+    """``gps``: its centre."""
 
     rank: int
     gps: Gps
     half_size_m: float
-    score: float
 
 
 class UserInputNeeded(Event):

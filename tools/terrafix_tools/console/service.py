@@ -12,7 +12,7 @@ from starlette.requests import Request
 from terrafix.core.config import load
 from terrafix_tools.console import uploads
 from terrafix_tools.console.access import Access
-from terrafix_tools.console.events import StateChanged
+from terrafix_tools.console.events import ProcessingBlocked, StateChanged
 from terrafix_tools.console.feed import Feeds
 from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
@@ -36,6 +36,7 @@ from terrafix_tools.console.settings import Settings
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database
 from terrafix_tools.console.store.flights import StoredEvent
+from terrafix_tools.console.workers import Reports, Workers
 
 RECORDS = ("flight.mcap", "estimates.csv", "summary.json")
 MEDIA_TYPES = {".jpg": "image/jpeg", ".png": "image/png"}
@@ -48,6 +49,7 @@ class Service:
         self.settings, self.database, self.access = settings, database, access
         self.maps = MapStore(settings.map_folders)
         self.feeds = Feeds(self._events_after)
+        self.workers = Workers(settings, Reports(self.feeds.refresh, self._died, self._failed))
         self._uploads = uploads.Slots(settings.limits.uploads, "uploads")
         self._stopping = False
 
@@ -63,9 +65,9 @@ class Service:
         return ServiceHealth(
             status="stopping" if self._stopping else "ok",
             version=version,
-            workers=0,
+            workers=self.workers.count,
             max_workers=self.settings.workers,
-            waiting=0,
+            waiting=self.workers.waiting,
             flights=stored,
             event_clients=self.feeds.clients,
             disk_free_mb=shutil.disk_usage(self.settings.data).free // 2**20,
@@ -161,9 +163,14 @@ class Service:
                 flights.update(db, flight_id, completing=True)
                 return flights.flight_of(db, flight_id)
 
-        return await asyncio.to_thread(mark)
+        flight = await asyncio.to_thread(mark)
+        await self._wake(flight_id)
+        return flight
 
     async def delete(self, flight_id: str) -> None:
+        await asyncio.to_thread(self.flight, flight_id)
+        await self.workers.end(flight_id)
+
         def remove() -> None:
             with self.database.write() as db:
                 flights.delete(db, flight_id)
@@ -176,13 +183,41 @@ class Service:
 
     async def start(self) -> None:
         """Resumes what was not completed."""
+        for flight in (await asyncio.to_thread(self.flights)).flights:
+            if flight.state is not FlightState.COMPLETED and not flight.error:
+                if flight.completing or flight.images.processed < flight.images.uploaded:
+                    await self._wake(flight.flight_id)
 
     async def stop(self) -> None:
-        """In order: no more requests, streams end, workers end, the database is closed."""
+        """In order: no more requests, streams end, processes end, the database is closed."""
         self._stopping = True
         self.feeds.close()
+        await self.workers.stop()
         self.database.close()
 
+    async def _wake(self, flight_id: str) -> None:
+        """Has the flight computed, if it has a map and anything to compute."""
+        flight = await asyncio.to_thread(self.flight, flight_id)
+        if flight.map.state is MapState.READY and flight.images.uploaded and not flight.error:
+            await self.workers.wake(flight_id, await asyncio.to_thread(self.maps.path, flight.map.name))
 
-def state_event(state: FlightState, previous: FlightState) -> StateChanged:
-    return StateChanged(state=state, previous=previous)
+    async def _died(self, flight_id: str, frame_id: int) -> None:
+        def count() -> None:
+            with self.database.write() as db:
+                flights.count_attempt(db, flight_id, frame_id)
+
+        await asyncio.to_thread(count)
+
+    async def _failed(self, flight_id: str, why: str) -> None:
+        """The flight cannot go on: it is blocked, with the reason."""
+
+        def store() -> None:
+            with self.database.write() as db:
+                state = FlightState(flights.row_of(db, flight_id).state)
+                changed = StateChanged(state=FlightState.BLOCKED, previous=state)
+                blocked = ProcessingBlocked(reason=why, frame_id=None)
+                flights.add_events(db, flight_id, "failed", [blocked, changed])
+                flights.update(db, flight_id, state=FlightState.BLOCKED.value, error=why)
+
+        await asyncio.to_thread(store)
+        await self.feeds.refresh(flight_id)

@@ -3,13 +3,14 @@
 import json
 import re
 import secrets
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import sqlalchemy as sa
 from sqlalchemy.dialects.sqlite import insert
 
+from terrafix_tools.console.compute.observed import FrameOutcome
 from terrafix_tools.console.events import Event, name_of
 from terrafix_tools.console.payloads import (
     Accepted,
@@ -235,29 +236,34 @@ def results_of(db: sa.Connection, flight_id: str, *, refined: bool, first: int, 
     return found
 
 
-def put_result(db: sa.Connection, flight_id: str, result: FrameResult) -> None:
-    row = insert(results).values(flight_id=flight_id, frame_id=result.frame_id, immediate=result.model_dump_json())
-    db.execute(row.on_conflict_do_update(["flight_id", "frame_id"], set_={"immediate": row.excluded.immediate}))
+def result_count(db: sa.Connection, flight_id: str) -> int:
+    return _count(db, results, flight_id)
 
 
-def put_refined(db: sa.Connection, flight_id: str, frame_id: int, refined: str) -> None:
-    """``refined``: FrameRefined in JSON."""
-    db.execute(
-        results.update().where(results.c.flight_id == flight_id, results.c.frame_id == frame_id).values(refined=refined)
-    )
+def store_outcome(db: sa.Connection, flight_id: str, step: str, outcome: FrameOutcome) -> None:
+    """Everything that one step of a flight adds. ``step``: its name, once in a flight."""
+    if outcome.result is not None:
+        _put(db, results, flight_id, frame_id=outcome.result.frame_id, immediate=outcome.result.model_dump_json())
+        if outcome.heading is not None:
+            heading_deg, sigma_deg = outcome.heading
+            _put(
+                db, headings, flight_id, frame_id=outcome.result.frame_id, heading_deg=heading_deg, sigma_deg=sigma_deg
+            )
+    if outcome.fragment is not None:
+        _put(db, fragments, flight_id, **outcome.fragment.model_dump())
+    for refined in outcome.refined:
+        of_frame = results.c.flight_id == flight_id, results.c.frame_id == refined.frame_id
+        db.execute(results.update().where(*of_frame).values(refined=refined.model_dump_json()))
+    add_events(db, flight_id, step, outcome.events)
+    request = None if outcome.request is None else outcome.request.model_dump_json()
+    update(db, flight_id, state=outcome.state.value, request=request)
 
 
-def put_heading(db: sa.Connection, flight_id: str, frame_id: int, heading_deg: float, sigma_deg: float) -> None:
-    row = insert(headings).values(flight_id=flight_id, frame_id=frame_id, heading_deg=heading_deg, sigma_deg=sigma_deg)
-    changed = {"heading_deg": row.excluded.heading_deg, "sigma_deg": row.excluded.sigma_deg}
-    db.execute(row.on_conflict_do_update(["flight_id", "frame_id"], set_=changed))
-
-
-def put_fragment(db: sa.Connection, flight_id: str, fragment: Fragment) -> None:
-    values = fragment.model_dump()
-    row = insert(fragments).values(flight_id=flight_id, **values)
-    changed = {key: row.excluded[key] for key in values if key != "fragment_id"}
-    db.execute(row.on_conflict_do_update(["flight_id", "fragment_id"], set_=changed))
+def _put(db: sa.Connection, table: sa.Table, flight_id: str, **values: object) -> None:
+    """Inserts a row, or replaces the one with its key."""
+    row = insert(table).values(flight_id=flight_id, **values)
+    keys = [column.name for column in table.primary_key]
+    db.execute(row.on_conflict_do_update(keys, set_={key: row.excluded[key] for key in values if key not in keys}))
 
 
 # --- hints ----------------------------------------------------------------------------------------
@@ -270,12 +276,20 @@ def add_hint(db: sa.Connection, flight_id: str, given: Hint | UserFix) -> int:
     return hint_id
 
 
+def has_hints_before(db: sa.Connection, flight_id: str, frame_id: int) -> bool:
+    """Whether ``hints_before`` has any."""
+    return db.execute(_hints_at(flight_id, frame_id)).first() is not None
+
+
+def _hints_at(flight_id: str, frame_id: int) -> "sa.Select":
+    at = sa.or_(hints.c.before_frame == frame_id, hints.c.before_frame.is_(None))
+    return sa.select(hints).where(hints.c.flight_id == flight_id, at).order_by(hints.c.hint_id)
+
+
 def hints_before(db: sa.Connection, flight_id: str, frame_id: int) -> list[tuple[int, Hint | UserFix]]:
     """The hints to be applied before this frame, with their ids: those of an earlier run at the same frame, then those
     that no run has applied yet, which from now on belong there."""
-    at = sa.or_(hints.c.before_frame == frame_id, hints.c.before_frame.is_(None))
-    query = sa.select(hints).where(hints.c.flight_id == flight_id, at).order_by(hints.c.hint_id)
-    rows = db.execute(query).all()
+    rows = db.execute(_hints_at(flight_id, frame_id)).all()
     for row in rows:
         if row.before_frame is None:
             db.execute(
@@ -298,22 +312,24 @@ def last_event_id(db: sa.Connection, flight_id: str) -> int:
     return int(db.execute(query).scalar_one())
 
 
-def add_event(db: sa.Connection, flight_id: str, key: str, event: Event) -> bool:
-    """Appends an event with the next id. ``key``: what happened, once in a flight; an event that is there already is
-    left alone (False)."""
-    known = sa.select(events.c.event_id).where(events.c.flight_id == flight_id, events.c.key == key)
-    if db.execute(known).first() is not None:
-        return False
-    db.execute(
-        events.insert().values(
-            flight_id=flight_id,
-            event_id=last_event_id(db, flight_id) + 1,
-            key=key,
-            name=name_of(type(event)),
-            data=event.model_dump_json(),
-        )
-    )
-    return True
+def add_events(db: sa.Connection, flight_id: str, step: str, new: Sequence[Event]) -> None:
+    """Appends the events of one step of a flight, with the next ids. ``step``: its name, once in a flight; a step whose
+    events are there already, from an earlier computation, is left alone."""
+    known = sa.select(events.c.event_id).where(events.c.flight_id == flight_id, events.c.key == f"{step} 0")
+    if not new or db.execute(known).first() is not None:
+        return
+    first = last_event_id(db, flight_id) + 1
+    rows = [
+        {
+            "flight_id": flight_id,
+            "event_id": first + index,
+            "key": f"{step} {index}",
+            "name": name_of(type(event)),
+            "data": event.model_dump_json(),
+        }
+        for index, event in enumerate(new)
+    ]
+    db.execute(events.insert(), rows)
 
 
 def events_after(db: sa.Connection, flight_id: str, after: int, most: int = EVENT_PAGE) -> list[StoredEvent]:
