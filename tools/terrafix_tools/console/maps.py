@@ -12,7 +12,7 @@ from pyproj import Transformer
 from terrafix.core.errors import MapError
 from terrafix.map.format import TILE_PX, Level
 from terrafix.map.package import MapPackage
-from terrafix_tools.console.payloads import MapInfo
+from terrafix_tools.console.payloads import MapInfo, Start
 from terrafix_tools.console.problems import Refusal
 
 SUFFIX = ".gpkg"
@@ -112,6 +112,16 @@ class MapStore:
             has_dem=manifest.has_dem,
             tiles_url=f"/maps/{name}/tiles/{{z}}/{{x}}/{{y}}.png",
         )
+
+    def check_start(self, name: str, start: Start | None) -> None:
+        """Raises Refusal: no such map, or it does not cover the start of a flight."""
+
+        def covered() -> bool:
+            package = self._opened(name).package
+            return start is None or package.covers_start(start.lat, start.lon, start.sigma_m)
+
+        if not self._thread.submit(covered).result():
+            raise Refusal(422, f"map {name!r} has no imagery at the start; choose another map, or check the start")
 
     def tile(self, name: str, z: int, x: int, y: int) -> bytes:
         """Raises Refusal: no such map or tile."""

@@ -91,6 +91,14 @@ class Start(Strict):
     ground_amsl_m: Annotated[float, Field(ge=-500, le=9000)] | None = None
 
 
+class Telemetry(Strict):
+    """1-sigma of the headings, heights and attitudes of the images, as [telemetry] of a flight folder."""
+
+    yaw_sigma_deg: Annotated[float, Field(gt=0, le=360)] = 5.0
+    agl_sigma_m: Annotated[float, Field(gt=0, le=10_000)] = 5.0
+    attitude_sigma_deg: Annotated[float, Field(gt=0, le=180)] = 2.0
+
+
 class Waypoint(Strict):
     lat: Latitude
     lon: Longitude
@@ -110,6 +118,7 @@ class NewFlight(Strict):
     name: Annotated[str, Field(max_length=MAX_NAME)] = ""
     camera: Camera
     mount: Mount = Mount()
+    telemetry: Telemetry = Telemetry()
     start: Start | None = None
     map: Annotated[str, Field(min_length=1, max_length=MAX_NAME)] | None = None
     area: Area | None = None
@@ -162,6 +171,8 @@ class InputRequest(BaseModel):
 
 
 class Flight(BaseModel):
+    """``start``: that of its creation."""
+
     flight_id: str
     name: str
     kind: FlightKind

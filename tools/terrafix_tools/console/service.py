@@ -12,8 +12,11 @@ from starlette.requests import Request
 from terrafix.core.config import load
 from terrafix_tools.console import uploads
 from terrafix_tools.console.access import Access
+from terrafix_tools.console.compute.description import stored_camera, stored_pixel
+from terrafix_tools.console.compute.locating import Question
 from terrafix_tools.console.events import ProcessingBlocked, StateChanged
 from terrafix_tools.console.feed import Feeds
+from terrafix_tools.console.locating import LocatingProcess
 from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
     Accepted,
@@ -50,6 +53,7 @@ class Service:
         self.maps = MapStore(settings.map_folders)
         self.feeds = Feeds(self._events_after)
         self.workers = Workers(settings, Reports(self.feeds.refresh, self._died, self._failed))
+        self._locating = LocatingProcess(settings.limits.object_requests)
         self._uploads = uploads.Slots(settings.limits.uploads, "uploads")
         self._stopping = False
 
@@ -129,7 +133,8 @@ class Service:
     def create(self, new: NewFlight) -> Flight:
         if new.map is None:
             raise Refusal(422, "area: this service has no map sources; start it with --sources FILE")
-        self.maps.path(new.map)
+        stored_camera(new)  # raises SourceError: implausible values
+        self.maps.check_start(new.map, new.start)
         with self.database.write() as db:
             if flights.count(db) >= self.settings.limits.flights:
                 raise Refusal(429, f"{self.settings.limits.flights} flights are stored; delete some")
@@ -154,7 +159,33 @@ class Service:
         return Steered(hint_id=await asyncio.to_thread(add), detail="used with the next frame; hint_answered tells")
 
     async def locate(self, flight_id: str, frame_id: int, pixel: ObjectPixel) -> ObjectGps:
-        raise Refusal(503, "not available yet")
+        def look() -> tuple[NewFlight, Path]:
+            with self.database.read() as db:
+                row = flights.row_of(db, flight_id)
+                flights.image_of(db, flight_id, frame_id)
+                if not flights.has_result(db, flight_id, frame_id):
+                    raise Refusal(409, f"frame {frame_id} has no result yet; frame_processed tells when")
+                return NewFlight.model_validate_json(row.spec), self.maps.path(row.map_name)
+
+        new, map_path = await asyncio.to_thread(look)
+        if pixel.pixel_x > new.camera.width - 0.5 or pixel.pixel_y > new.camera.height - 0.5:
+            raise Refusal(422, f"the images have {new.camera.width}x{new.camera.height} pixels, from 0")
+        answer = await self._locating.ask(
+            Question(
+                out=str(self.settings.flight(flight_id) / "out"),
+                map=str(map_path),
+                frame_id=frame_id,
+                pixel=stored_pixel(pixel.pixel_x, pixel.pixel_y, new),
+            )
+        )
+        if answer.refused:
+            raise Refusal(409, answer.refused)
+        return ObjectGps(
+            gps=Gps(lat=round(answer.lat_deg, 8), lon=round(answer.lon_deg, 8)),
+            accuracy_meters=round(answer.radius95_m, 2),
+            altitude=None if answer.alt_amsl_m is None else round(answer.alt_amsl_m, 2),
+            surface=answer.surface,
+        )
 
     async def complete(self, flight_id: str) -> Flight:
         def mark() -> Flight:
@@ -184,15 +215,16 @@ class Service:
     async def start(self) -> None:
         """Resumes what was not completed."""
         for flight in (await asyncio.to_thread(self.flights)).flights:
-            if flight.state is not FlightState.COMPLETED and not flight.error:
-                if flight.completing or flight.images.processed < flight.images.uploaded:
-                    await self._wake(flight.flight_id)
+            pending = flight.completing or flight.images.processed < flight.images.uploaded
+            if pending and flight.state is not FlightState.COMPLETED and not flight.error:
+                await self._wake(flight.flight_id)
 
     async def stop(self) -> None:
         """In order: no more requests, streams end, processes end, the database is closed."""
         self._stopping = True
         self.feeds.close()
         await self.workers.stop()
+        await self._locating.stop()
         self.database.close()
 
     async def _wake(self, flight_id: str) -> None:

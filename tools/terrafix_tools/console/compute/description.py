@@ -10,6 +10,7 @@ from terrafix.vision.sources.description import (
     Description,
     MountTable,
     StartTable,
+    TelemetryTable,
     camera_of,
     origin_of,
 )
@@ -55,6 +56,7 @@ def _description(new: NewFlight) -> Description:
     return Description(
         camera=camera,
         mount=msgspec.convert(new.mount.model_dump(), MountTable),
+        telemetry=msgspec.convert(new.telemetry.model_dump(), TelemetryTable),
         start=None
         if start is None
         else StartTable(lat_deg=start.lat, lon_deg=start.lon, sigma_m=start.sigma_m, ground_amsl_m=start.ground_amsl_m),

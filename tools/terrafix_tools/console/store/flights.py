@@ -240,6 +240,11 @@ def result_count(db: sa.Connection, flight_id: str) -> int:
     return _count(db, results, flight_id)
 
 
+def has_result(db: sa.Connection, flight_id: str, frame_id: int) -> bool:
+    of_frame = results.c.flight_id == flight_id, results.c.frame_id == frame_id
+    return db.execute(sa.select(results.c.frame_id).where(*of_frame)).first() is not None
+
+
 def store_outcome(db: sa.Connection, flight_id: str, step: str, outcome: FrameOutcome) -> None:
     """Everything that one step of a flight adds. ``step``: its name, once in a flight."""
     if outcome.result is not None:
