@@ -64,7 +64,8 @@ class Feed:
         changed.set()
 
     async def stream(self, after: int) -> AsyncIterator[bytes]:
-        """The events after the id ``after`` (at most that of the newest event), those to come as well, and a comment when there were none for a while."""
+        """The events after the id ``after`` (at most that of the newest event), then those to come; a comment when
+        there were none for a while."""
         self.clients += 1
         try:
             yield f": {json.dumps(self._flight_id)}\n\n".encode()

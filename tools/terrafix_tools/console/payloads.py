@@ -107,7 +107,7 @@ class Waypoint(Strict):
 class Area(Strict):
     """The route of the flight, whose corridor is fetched from the map sources of the service in the background."""
 
-    waypoints: Annotated[list[Waypoint], Field(min_length=1, max_length=MAX_WAYPOINTS)]
+    waypoints: Annotated[list[Waypoint], Field(min_length=2, max_length=MAX_WAYPOINTS)]
     corridor_m: Annotated[float, Field(ge=100, le=20_000)] = 1000.0  # to either side of the route
 
 

@@ -100,9 +100,9 @@ def log_out(request: Request, response: Response) -> Session:
 
 
 @router.post("/flights", status_code=201)
-def create(request: Request, response: Response, new: NewFlight) -> Flight:
+async def create(request: Request, response: Response, new: NewFlight) -> Flight:
     """Creates a flight. With ``area`` its map is made in the background; images may be uploaded meanwhile."""
-    flight = service_of(request).create(new)
+    flight = await service_of(request).create(new)
     response.headers["Location"] = f"/flights/{flight.flight_id}"
     return flight
 
@@ -196,9 +196,8 @@ async def object_to_gps(request: Request, flight_id: FlightId, frame_id: FrameId
 
 @router.get("/flights/{flight_id}/frames/{frame_id}/image", response_class=Response, responses=IMAGE)
 def frame_image(request: Request, flight_id: FlightId, frame_id: FrameId) -> Response:
-    """The image of a frame, as it was uploaded; of a live flight its thumbnail."""
-    path, media_type = service_of(request).frame_image(flight_id, frame_id)
-    return FileResponse(path, media_type=media_type, headers={"cache-control": "private, max-age=3600"})
+    """The image of a frame, as it was uploaded; of a live flight while it is in memory."""
+    return service_of(request).frame_image(flight_id, frame_id)
 
 
 @router.post("/flights/{flight_id}/complete", status_code=202)

@@ -1,6 +1,7 @@
 """The state of a running console and what its routes do."""
 
 import asyncio
+import re
 import shutil
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -8,21 +9,27 @@ from typing import Any
 
 import msgspec
 from starlette.requests import Request
+from starlette.responses import FileResponse, Response
 
 from terrafix.core.config import load
 from terrafix_tools.console import uploads
 from terrafix_tools.console.access import Access
+from terrafix_tools.console.areas import AreaMaps, check_area
 from terrafix_tools.console.compute.description import stored_camera, stored_pixel
 from terrafix_tools.console.compute.locating import Question
-from terrafix_tools.console.events import ProcessingBlocked, StateChanged
+from terrafix_tools.console.events import Health, ProcessingBlocked, StateChanged
 from terrafix_tools.console.feed import Feeds
+from terrafix_tools.console.live import LiveFlights
 from terrafix_tools.console.locating import LocatingProcess
 from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
     Accepted,
+    Area,
     Flight,
+    FlightKind,
     Flights,
     FlightState,
+    Gps,
     Hint,
     MapState,
     NewFlight,
@@ -41,7 +48,7 @@ from terrafix_tools.console.store.database import Database
 from terrafix_tools.console.store.flights import StoredEvent
 from terrafix_tools.console.workers import Reports, Workers
 
-RECORDS = ("flight.mcap", "estimates.csv", "summary.json")
+RECORDING = re.compile(r"[a-z0-9-]+\.(mcap|csv|json)(\.partial)?")
 MEDIA_TYPES = {".jpg": "image/jpeg", ".png": "image/png"}
 
 
@@ -53,6 +60,10 @@ class Service:
         self.maps = MapStore(settings.map_folders)
         self.feeds = Feeds(self._events_after)
         self.workers = Workers(settings, Reports(self.feeds.refresh, self._died, self._failed))
+        self.live = (
+            None if settings.bus is None else LiveFlights(database, settings.bus, self._live_stored, self._live_health)
+        )
+        self._areas = AreaMaps(settings.map_folders[0], settings.sources, self._map_done)
         self._locating = LocatingProcess(settings.limits.object_requests)
         self._uploads = uploads.Slots(settings.limits.uploads, "uploads")
         self._stopping = False
@@ -75,6 +86,7 @@ class Service:
             flights=stored,
             event_clients=self.feeds.clients,
             disk_free_mb=shutil.disk_usage(self.settings.data).free // 2**20,
+            live=None if self.live is None else self.live.facts,
         )
 
     def config(self) -> dict[str, Any]:
@@ -98,17 +110,32 @@ class Service:
         with self.database.read() as db:
             return flights.flight_of(db, flight_id)
 
-    def frame_image(self, flight_id: str, frame_id: int) -> tuple[Path, str]:
-        """-> file and media type."""
+    def frame_image(self, flight_id: str, frame_id: int) -> Response:
+        flight = self.flight(flight_id)
+        headers = {"cache-control": "private, max-age=3600"}
+        if flight.kind is FlightKind.LIVE:
+            jpeg = None if self.live is None else self.live.frame_jpeg(flight_id, frame_id)
+            if jpeg is None:
+                raise Refusal(404, f"frame {frame_id} is no longer in memory; the record has it")
+            return Response(jpeg, media_type="image/jpeg", headers=headers)
         with self.database.read() as db:
             image = flights.image_of(db, flight_id, frame_id)
         path = self.settings.flight(flight_id) / image.stored
-        return path, MEDIA_TYPES[path.suffix]
+        return FileResponse(path, media_type=MEDIA_TYPES[path.suffix], headers=headers)
+
+    def _out(self, flight: Flight) -> Path:
+        """The folder with the record of a flight."""
+        if flight.kind is FlightKind.BATCH:
+            return self.settings.flight(flight.flight_id) / "out"
+        live = None if self.live is None else self.live.current
+        if live is None or live.flight_id != flight.flight_id:
+            raise Refusal(404, "this flight is over; its record lies where Terrafix wrote it")
+        return live.out
 
     def recordings(self, flight_id: str) -> Recordings:
-        self.flight(flight_id)
-        folder = self.settings.flight(flight_id) / "out"
-        names = sorted(p.name for p in folder.iterdir() if p.is_file()) if folder.is_dir() else []
+        folder = self._out(self.flight(flight_id))
+        found = [p.name for p in folder.iterdir() if p.is_file()] if folder.is_dir() else []
+        names = sorted(name for name in found if RECORDING.fullmatch(name))
         files = [
             RecordingFile(
                 name=name, bytes=(folder / name).stat().st_size, url=f"/flights/{flight_id}/recordings/{name}"
@@ -120,7 +147,7 @@ class Service:
     def recording(self, flight_id: str, name: str) -> Path:
         if name not in [file.name for file in self.recordings(flight_id).files]:
             raise Refusal(404, f"flight {flight_id} has no file {name}")
-        return self.settings.flight(flight_id) / "out" / name
+        return self._out(self.flight(flight_id)) / name
 
     async def events(self, flight_id: str, after: int) -> AsyncIterator[bytes]:
         if self.feeds.clients >= self.settings.limits.event_clients:
@@ -130,23 +157,37 @@ class Service:
 
     # --- acting -----------------------------------------------------------------------------------
 
-    def create(self, new: NewFlight) -> Flight:
-        if new.map is None:
-            raise Refusal(422, "area: this service has no map sources; start it with --sources FILE")
+    async def create(self, new: NewFlight) -> Flight:
+        flight = await asyncio.to_thread(self._create, new)
+        if new.area is not None:
+            self._areas.begin(flight.flight_id, new.area)
+        return flight
+
+    def _create(self, new: NewFlight) -> Flight:
         stored_camera(new)  # raises SourceError: implausible values
-        self.maps.check_start(new.map, new.start)
+        if new.map is not None:
+            self.maps.check_start(new.map, new.start)
+        elif new.area is not None:
+            check_area(new.area)
+            if not self._areas.available:
+                raise Refusal(422, "area: this service has no map sources; give map, or start it with --sources FILE")
         with self.database.write() as db:
             if flights.count(db) >= self.settings.limits.flights:
                 raise Refusal(429, f"{self.settings.limits.flights} flights are stored; delete some")
-            flight_id = flights.create(db, new, new.map, MapState.READY)
-            return flights.flight_of(db, flight_id)
+            return flights.create(db, new)
 
     async def upload(self, request: Request, flight_id: str) -> Accepted:
-        await asyncio.to_thread(self.flight, flight_id)
+        flight = await asyncio.to_thread(self.flight, flight_id)
+        if flight.kind is FlightKind.LIVE:
+            raise Refusal(409, "the frames of a live flight come from its camera")
         folder = self.settings.flight(flight_id)
         return await uploads.take_batch(request, self.database, flight_id, folder, self.settings.limits, self._uploads)
 
     async def steer(self, flight_id: str, given: Hint | UserFix) -> Steered:
+        flight = await asyncio.to_thread(self.flight, flight_id)
+        if flight.kind is FlightKind.LIVE and self.live is not None:
+            return Steered(hint_id=0, detail=await asyncio.to_thread(self.live.steer, flight_id, given))
+
         def add() -> int:
             with self.database.write() as db:
                 row = flights.row_of(db, flight_id)
@@ -159,25 +200,7 @@ class Service:
         return Steered(hint_id=await asyncio.to_thread(add), detail="used with the next frame; hint_answered tells")
 
     async def locate(self, flight_id: str, frame_id: int, pixel: ObjectPixel) -> ObjectGps:
-        def look() -> tuple[NewFlight, Path]:
-            with self.database.read() as db:
-                row = flights.row_of(db, flight_id)
-                flights.image_of(db, flight_id, frame_id)
-                if not flights.has_result(db, flight_id, frame_id):
-                    raise Refusal(409, f"frame {frame_id} has no result yet; frame_processed tells when")
-                return NewFlight.model_validate_json(row.spec), self.maps.path(row.map_name)
-
-        new, map_path = await asyncio.to_thread(look)
-        if pixel.pixel_x > new.camera.width - 0.5 or pixel.pixel_y > new.camera.height - 0.5:
-            raise Refusal(422, f"the images have {new.camera.width}x{new.camera.height} pixels, from 0")
-        answer = await self._locating.ask(
-            Question(
-                out=str(self.settings.flight(flight_id) / "out"),
-                map=str(map_path),
-                frame_id=frame_id,
-                pixel=stored_pixel(pixel.pixel_x, pixel.pixel_y, new),
-            )
-        )
+        answer = await self._locating.ask(await asyncio.to_thread(self._question, flight_id, frame_id, pixel))
         if answer.refused:
             raise Refusal(409, answer.refused)
         return ObjectGps(
@@ -187,10 +210,30 @@ class Service:
             surface=answer.surface,
         )
 
+    def _question(self, flight_id: str, frame_id: int, pixel: ObjectPixel) -> Question:
+        flight, uv = self.flight(flight_id), (pixel.pixel_x, pixel.pixel_y)
+        out = self._out(flight)
+        with self.database.read() as db:
+            if not flights.has_result(db, flight_id, frame_id):
+                raise Refusal(404, f"flight {flight_id} has no result of frame {frame_id}; frame_processed tells when")
+            row = flights.row_of(db, flight_id)
+        if flight.kind is FlightKind.LIVE:
+            map_path = None if self.live is None or self.live.current is None else self.live.current.map_path
+        else:
+            new = NewFlight.model_validate_json(row.spec)
+            map_path = self.maps.path(row.map_name)
+            if uv[0] > new.camera.width - 0.5 or uv[1] > new.camera.height - 0.5:
+                raise Refusal(422, f"the images have {new.camera.width}x{new.camera.height} pixels, from 0")
+            uv = stored_pixel(*uv, new)
+        return Question(out=str(out), map="" if map_path is None else str(map_path), frame_id=frame_id, pixel=uv)
+
     async def complete(self, flight_id: str) -> Flight:
         def mark() -> Flight:
             with self.database.write() as db:
-                flights.row_of(db, flight_id)
+                if flights.row_of(db, flight_id).kind == FlightKind.LIVE.value:
+                    raise Refusal(409, "a live flight ends with its Terrafix")
+                if flights.image_count(db, flight_id) == 0:
+                    raise Refusal(409, "the flight has no images; upload some, or delete it")
                 flights.update(db, flight_id, completing=True)
                 return flights.flight_of(db, flight_id)
 
@@ -201,6 +244,7 @@ class Service:
     async def delete(self, flight_id: str) -> None:
         await asyncio.to_thread(self.flight, flight_id)
         await self.workers.end(flight_id)
+        await self._areas.remove(flight_id)
 
         def remove() -> None:
             with self.database.write() as db:
@@ -214,7 +258,14 @@ class Service:
 
     async def start(self) -> None:
         """Resumes what was not completed."""
+        self._loop = asyncio.get_running_loop()
+        if self.live is not None:
+            self.live.start()
+        for flight_id, area in await asyncio.to_thread(self._maps_to_make):
+            self._areas.begin(flight_id, area)
         for flight in (await asyncio.to_thread(self.flights)).flights:
+            if flight.kind is FlightKind.LIVE:
+                continue
             pending = flight.completing or flight.images.processed < flight.images.uploaded
             if pending and flight.state is not FlightState.COMPLETED and not flight.error:
                 await self._wake(flight.flight_id)
@@ -223,9 +274,34 @@ class Service:
         """In order: no more requests, streams end, processes end, the database is closed."""
         self._stopping = True
         self.feeds.close()
+        if self.live is not None:
+            await asyncio.to_thread(self.live.stop)
+        await self._areas.stop()
         await self.workers.stop()
         await self._locating.stop()
         self.database.close()
+
+    def _live_stored(self, flight_id: str) -> None:
+        asyncio.run_coroutine_threadsafe(self.feeds.refresh(flight_id), self._loop)
+
+    def _live_health(self, flight_id: str, found: dict[str, Any]) -> None:
+        self._loop.call_soon_threadsafe(self.feeds.pass_on, flight_id, Health(facts=found))
+
+    def _maps_to_make(self) -> list[tuple[str, Area]]:
+        with self.database.read() as db:
+            return flights.maps_to_make(db)
+
+    async def _map_done(self, flight_id: str, error: str) -> None:
+        if error:
+            await self._failed(flight_id, error)
+
+        def store() -> None:
+            with self.database.write() as db:
+                state = MapState.FAILED if error else MapState.READY
+                flights.update(db, flight_id, map_state=state.value, map_detail=error)
+
+        await asyncio.to_thread(store)
+        await self._wake(flight_id)
 
     async def _wake(self, flight_id: str) -> None:
         """Has the flight computed, if it has a map and anything to compute."""

@@ -23,15 +23,15 @@ class Limits:
 
 @dataclass(frozen=True)
 class Settings:
-    """``maps``: folders with map packages; ``sources``: TOML file of map sources for areas; ``bus``: run folder of a live
-    Terrafix; ``workers``: flights that are computed at once; ``configs``: as of `terrafix replay`."""
+    """``maps``: folders with map packages; ``sources``: TOML file of map sources for areas; ``bus``: run folder of a
+    live Terrafix; ``workers``: flights that are computed at once; ``configs``: as of `terrafix replay`."""
 
     data: Path
     host: str = "127.0.0.1"
     port: int = 8700
     maps: tuple[Path, ...] = ()
     sources: Path | None = None
-    bus: Path | None = None
+    bus: str | None = None
     tokens: Path | None = None
     cert: Path | None = None
     key: Path | None = None

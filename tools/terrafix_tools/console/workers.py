@@ -35,8 +35,8 @@ class _Running:
 
 @dataclass(frozen=True)
 class Reports:
-    """What the owner is told. ``stored``: something of a flight was committed; ``died``: a process of a flight died at a
-    frame, not by SIGKILL; ``failed``: a flight cannot be computed, and why."""
+    """What the owner is told. ``stored``: something of a flight was committed; ``died``: a process of a flight died at
+    a frame, not by SIGKILL; ``failed``: a flight cannot be computed, and why."""
 
     stored: Callable[[str], Awaitable[None]]
     died: Callable[[str, int], Awaitable[None]]

@@ -24,8 +24,7 @@ from terrafix_tools.console.compute.description import stored_pixel
 from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome, SearchView
 from terrafix_tools.console.compute.source import UploadedImages
 from terrafix_tools.console.compute.steering import fix_message, hint_message
-from terrafix_tools.console.events import StateChanged
-from terrafix_tools.console.payloads import FlightState, Hint, UserFix
+from terrafix_tools.console.payloads import Hint, UserFix
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database, open_database
 from terrafix_tools.replay import make_nodes, replay
@@ -63,10 +62,7 @@ class FlightProcess:
             watch=self._watch,
         )
         with self._database.write() as db:
-            state = FlightState(flights.row_of(db, self._flight_id).state)
-            changed = StateChanged(state=FlightState.COMPLETED, previous=state)
-            flights.add_events(db, self._flight_id, "completed", [self._observer.completed(), changed])
-            flights.update(db, self._flight_id, state=FlightState.COMPLETED.value, request=None)
+            flights.complete(db, self._flight_id, self._observer.completed())
         self._say("stored")
 
     def _say(self, words: str) -> None:

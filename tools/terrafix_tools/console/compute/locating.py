@@ -12,9 +12,7 @@ import msgspec
 
 from terrafix.core.errors import TerrafixError
 from terrafix.runtime.fork_server import set_parent_death_signal
-from terrafix_tools.estimates import PARTIAL
 from terrafix_tools.locate.locator import FlightLocator
-from terrafix_tools.replay_output import RECORD
 
 NICE = 5  # after the service, before the flights [spec: nice(2)]
 
@@ -43,12 +41,12 @@ class Locators:
     """Keeps the flight that was asked for last, as long as its record does not grow."""
 
     def __init__(self) -> None:
-        self._key: tuple[str, int, int] | None = None
+        self._key: object = None
         self._locator: FlightLocator | None = None
 
     def answer(self, question: Question) -> Answer:
         try:
-            locator = self._of(Path(question.out), Path(question.map))
+            locator = self._of(Path(question.out), Path(question.map) if question.map else None)
             found = locator.locate([(str(question.frame_id), question.pixel)])
         except TerrafixError as error:
             return Answer(refused=str(error))
@@ -63,14 +61,11 @@ class Locators:
             surface=str(found.surface),
         )
 
-    def _of(self, out: Path, map_path: Path) -> FlightLocator:
-        record = out / RECORD
-        if not record.is_file():
-            record = out / (RECORD + PARTIAL)
-        status = record.stat()
-        key = str(record), status.st_size, status.st_mtime_ns
+    def _of(self, out: Path, map_path: Path | None) -> FlightLocator:
+        files = {file.name: file.stat() for file in out.glob("flight*.mcap*")}
+        key = str(out), tuple((name, found.st_size, found.st_mtime_ns) for name, found in sorted(files.items()))
         if self._locator is None or key != self._key:
-            self._locator, self._key = FlightLocator.open(record, map_path), key
+            self._locator, self._key = FlightLocator.open(out, map_path), key
         return self._locator
 
 

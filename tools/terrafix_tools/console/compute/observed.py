@@ -77,15 +77,15 @@ class _Totals:
 
 
 class FlightObserver:
-    """``take`` all messages in their order, then ``frame_done`` or ``end`` for what they add. ``search``: what the search
-    shows now; ``image_url``: of a frame."""
+    """``take`` all messages in their order, then ``frame_done`` or ``rest`` for what they add. ``search``: what the
+    search shows now; ``image_url``: of a frame."""
 
     def __init__(self, image_url: Callable[[int], str], search: Callable[[], SearchView | None]) -> None:
         self._image_url, self._search = image_url, search
         self.estimates: dict[int, NavEstimate] = {}  # the last one of each frame
         self.hints: dict[int, int] = {}  # id of each hint that was given, by its t_ns
         self._frame: LocalFrame | None = None
-        self._origin_ns = 0
+        self.origin_ns = 0
         self._fragments: dict[int, Fragment] = {}
         self._state = FlightState.PROCESSING
         self._asked = False
@@ -103,11 +103,17 @@ class FlightObserver:
         assert self._frame is not None
         return self._frame
 
+    def resume(self, state: FlightState) -> None:
+        """Continues a live flight of which an earlier service has stored this state."""
+        self._state = state
+        self._reached = None if state is FlightState.PROCESSING else ("whole_map", None)
+        self._asked = state is FlightState.BLOCKED
+
     def take(self, messages: Iterable[Message]) -> None:
         for message in messages:
             match message:
                 case Origin():
-                    self._frame, self._origin_ns = LocalFrame(message.lat_deg, message.lon_deg), message.t_ns
+                    self._frame, self.origin_ns = LocalFrame(message.lat_deg, message.lon_deg), message.t_ns
                 case Frame():
                     self._shown, self._match = message, None
                 case NavEstimate():
@@ -128,7 +134,7 @@ class FlightObserver:
         shown = self._shown
         assert shown is not None
         estimate, found = self.estimates.get(shown.frame_id), self._match
-        result = _result(shown, estimate, found, self._origin_ns)
+        result = _result(shown, estimate, found, self.origin_ns)
         events: list[Event] = [FrameProcessed(**result.model_dump())]
         fragment = None
         if estimate is not None and estimate.fragment_id >= 0:

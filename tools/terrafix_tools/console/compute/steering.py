@@ -15,9 +15,7 @@ SOURCE = "console"
 FIX_SIGMA_M = 5.0  # of the place of a user fix, per axis [spec: RS-11 of the service contract]
 # 1-sigma of a distance by odometry alone, as a share of it [spec: docs/records.md, error of the scale]
 ODOMETRY_SHARE = 0.1
-MIN_DESCENT = (
-    0.1  # least downward component of the ray of a user fix: 6 degrees below the horizon [spec: no ground above]
-)
+MIN_DESCENT = 0.1  # least downward component of the unit ray of a user fix: 6 degrees [spec: no ground above]
 ROTATION = slice(3, 6)  # of the covariance of a pose
 
 
@@ -28,7 +26,7 @@ def hint_message(given: Hint, t_ns: int) -> PositionHint:
 def fix_message(
     fix: UserFix, pixel: tuple[float, float], camera: Camera, estimates: Mapping[int, NavEstimate], now_ns: int
 ) -> PositionHint | None:
-    """The position of the vehicle by a user fix. ``pixel``: (u, v) of the frame as it is read; ``camera``: of these
+    """The position of the vehicle by a user fix. ``pixel``: (u, v) of the frame as it is read; ``camera``: of such
     frames; ``estimates``: the last one of each frame. None: the frame has no attitude, or the pixel shows no ground.
 
     The attitude and height of the frame give the way from the place to the vehicle. If odometry connects the frame to

@@ -10,10 +10,12 @@ from datetime import UTC, datetime
 import sqlalchemy as sa
 from sqlalchemy.dialects.sqlite import insert
 
+from terrafix_tools.console.areas import map_name
 from terrafix_tools.console.compute.observed import FrameOutcome
-from terrafix_tools.console.events import Event, name_of
+from terrafix_tools.console.events import Event, FlightCompleted, StateChanged, name_of
 from terrafix_tools.console.payloads import (
     Accepted,
+    Area,
     Flight,
     FlightKind,
     FlightMap,
@@ -63,8 +65,8 @@ def number_of(name: str) -> int:
     return int(found.group(1))
 
 
-def create(db: sa.Connection, new: NewFlight, map_name: str, map_state: MapState) -> str:
-    """-> the id of the new flight."""
+def create(db: sa.Connection, new: NewFlight) -> Flight:
+    """A new flight; its map is made if it has an area."""
     flight_id = secrets.token_hex(8)
     row = {
         "id": flight_id,
@@ -73,14 +75,47 @@ def create(db: sa.Connection, new: NewFlight, map_name: str, map_state: MapState
         "state": FlightState.PROCESSING.value,
         "created_at": datetime.now(UTC).isoformat(timespec="milliseconds"),
         "spec": new.model_dump_json(),
-        "map_name": map_name,
-        "map_state": map_state.value,
+        "map_name": new.map if new.map is not None else map_name(flight_id),
+        "map_state": (MapState.READY if new.map is not None else MapState.PREPARING).value,
         "map_detail": "",
         "completing": False,
         "error": "",
     }
     db.execute(flights.insert().values(row))
-    return flight_id
+    return flight_of(db, flight_id)
+
+
+def create_live(db: sa.Connection, flight_id: str, *, name: str, map_name: str, created_at: str) -> None:
+    """A flight of a Terrafix on this computer; nothing if it is there already."""
+    row = {
+        "id": flight_id,
+        "name": name,
+        "kind": FlightKind.LIVE.value,
+        "state": FlightState.PROCESSING.value,
+        "created_at": created_at,
+        "spec": "{}",
+        "map_name": map_name,
+        "map_state": MapState.READY.value,
+        "map_detail": "",
+        "completing": False,
+        "error": "",
+    }
+    db.execute(insert(flights).values(row).on_conflict_do_nothing())
+
+
+def complete(db: sa.Connection, flight_id: str, completed: FlightCompleted) -> None:
+    """The flight is over: its last events, and its state."""
+    previous = FlightState(row_of(db, flight_id).state)
+    changed = StateChanged(state=FlightState.COMPLETED, previous=previous)
+    add_events(db, flight_id, "completed", [completed, changed])
+    update(db, flight_id, state=FlightState.COMPLETED.value, request=None)
+
+
+def maps_to_make(db: sa.Connection) -> list[tuple[str, Area]]:
+    """The flights whose maps are not made yet."""
+    rows = db.execute(sa.select(flights.c.id, flights.c.spec).where(flights.c.map_state == MapState.PREPARING.value))
+    specs = [(row.id, NewFlight.model_validate_json(row.spec).area) for row in rows]
+    return [(flight_id, area) for flight_id, area in specs if area is not None]
 
 
 def count(db: sa.Connection) -> int:
@@ -171,8 +206,8 @@ def image_of(db: sa.Connection, flight_id: str, frame_id: int) -> StoredImage:
 
 
 def repeated_batch(db: sa.Connection, flight_id: str, sums: list[tuple[str, str]]) -> list[int] | None:
-    """The frames of a batch of (name, sha256) that was uploaded before; None: it is new. Raises Refusal (409): a part of
-    it, or other images by these names."""
+    """The frames of a batch of (name, sha256) that was uploaded before; None: it is new. Raises Refusal (409): a part
+    of it was, or other images by these names."""
     names = [name for name, _ in sums]
     rows = db.execute(
         sa.select(images.c.frame_id, images.c.name, images.c.sha256).where(
@@ -335,6 +370,12 @@ def add_events(db: sa.Connection, flight_id: str, step: str, new: Sequence[Event
         for index, event in enumerate(new)
     ]
     db.execute(events.insert(), rows)
+
+
+def forget_events(db: sa.Connection, flight_id: str, most: int) -> None:
+    """Deletes all events but the newest ``most``."""
+    oldest = last_event_id(db, flight_id) - most
+    db.execute(events.delete().where(events.c.flight_id == flight_id, events.c.event_id <= oldest))
 
 
 def events_after(db: sa.Connection, flight_id: str, after: int, most: int = EVENT_PAGE) -> list[StoredEvent]:
