@@ -30,7 +30,7 @@ def fix_message(
     frames; ``estimates``: the last one of each frame. None: the frame has no attitude, or the pixel shows no ground.
 
     The attitude and height of the frame give the way from the place to the vehicle. If odometry connects the frame to
-    the newest one, the position is carried on to it; else it is that at the frame, and grows old (``aged_radius_m``)."""
+    the newest one, the position is carried on to it; else it is that at the frame and grows old (``aged_radius_m``)."""
     seen = estimates.get(fix.frame_id)
     if seen is None:
         return None

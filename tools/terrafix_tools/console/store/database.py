@@ -85,5 +85,5 @@ def is_full(error: sa.exc.OperationalError) -> bool:
 
 
 def _roll_back(connection: sa.Connection) -> None:
-    if connection.connection.dbapi_connection is not None and connection.connection.dbapi_connection.in_transaction:  # type: ignore[attr-defined]
+    if connection.connection.dbapi_connection is not None and connection.connection.dbapi_connection.in_transaction:
         connection.exec_driver_sql("ROLLBACK")
