@@ -148,6 +148,11 @@ def test_a_body_that_is_no_multipart_or_is_cut_is_refused(console: Console) -> N
     assert_refused(console.send("POST", path, b"", kind), 422)
 
 
+def test_a_large_upload_that_is_refused_early_still_gets_its_answer(console: Console) -> None:
+    parts = [("other", "x", b""), ("images", "IMG_0001.jpg", b"x" * 20_000_000)]
+    assert_refused(console.upload(console.create(), parts), 422, "'other'")
+
+
 def test_times_and_states_of_a_table_are_those_of_the_images(console: Console) -> None:
     flight_id = console.create(yaw_deg=90.0)
     rows = "".join(f"IMG_{n:04d}.jpg,{2.5 * n},,,,{100 + n}\n" for n in range(1, 11))

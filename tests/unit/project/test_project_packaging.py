@@ -83,7 +83,11 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
 def test_every_dependency_has_a_version_range() -> None:
     for requirement in [
         *CORE.values(),
-        *(one for extra in ("ground", "sim", "cluster", "faiss", "fleet", "console", "train") for one in EXTRAS[extra].values()),
+        *(
+            one
+            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "console", "train")
+            for one in EXTRAS[extra].values()
+        ),
     ]:
         operators = {specifier.operator for specifier in requirement.specifier}
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"
