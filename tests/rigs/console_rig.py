@@ -42,7 +42,7 @@ def settings(folder: Path, **changes: Any) -> Settings:
     (folder / "maps").mkdir(parents=True, exist_ok=True)
     if not (folder / "maps" / "format1.gpkg").is_file():
         map_format1.unpack(folder / "maps")
-    return Settings(**{"data": folder, "port": 0, "workers": 0, **changes})
+    return Settings(**{"data": folder, "port": 0, "workers": 0, "nice": 0, **changes})
 
 
 class Console:

@@ -37,6 +37,7 @@ class Settings:
     key: Path | None = None
     hosts: tuple[str, ...] = ()  # further names of this service in the Host header
     workers: int = 2
+    nice: int = 10  # of the processes that compute: the service and what flies come first
     configs: tuple[Path, ...] = ()
     models: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
