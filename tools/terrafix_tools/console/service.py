@@ -198,7 +198,9 @@ class Service:
                     _check_pixel(given.pixel.u, given.pixel.v, NewFlight.model_validate_json(row.spec))
                 return flights.add_hint(db, flight_id, given)
 
-        return Steered(hint_id=await asyncio.to_thread(add), detail="used with the next frame; hint_answered tells")
+        hint_id = await asyncio.to_thread(add)
+        await self.feeds.refresh(flight_id)
+        return Steered(hint_id=hint_id, detail="used with the next frame; hint_answered tells what came of it")
 
     async def locate(self, flight_id: str, frame_id: int, pixel: ObjectPixel) -> ObjectGps:
         answer = await self._locating.ask(await asyncio.to_thread(self._question, flight_id, frame_id, pixel))
