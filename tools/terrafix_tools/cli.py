@@ -14,6 +14,8 @@ from terrafix_tools.accept.cli import accept
 from terrafix_tools.chaos.cli import chaos
 from terrafix_tools.compare.cli import compare
 from terrafix_tools.files.cli import files
+from terrafix_tools.console.cli import serve
+from terrafix_tools.console.flight_cli import app as flight_app
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.fleet.cli import app as fleet_app
 from terrafix_tools.hint.cli import CONTEXT, hint
@@ -32,12 +34,15 @@ if TYPE_CHECKING:
 
 # optional packages of the extra `ground`; not installed on a vehicle
 GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog")
+# and of the extra `console`
+CONSOLE_PACKAGES = ("fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "python_multipart", "pydantic")
 
 app = typer.Typer(no_args_is_help=True)
 app.add_typer(map_app, name="map")
 app.add_typer(models_app, name="models")
 app.add_typer(log_app, name="log")
 app.add_typer(fleet_app, name="fleet")
+app.add_typer(flight_app, name="flight")
 app.add_typer(sim_app, name="sim")
 app.command()(accept)
 app.command()(chaos)
@@ -46,6 +51,7 @@ app.command()(files)
 app.command()(finalise)
 app.command()(locate)
 app.command()(preflight)
+app.command()(serve)
 app.command()(status)
 app.command(context_settings=CONTEXT)(hint)
 app.command()(montecarlo)
@@ -260,9 +266,10 @@ def main(fork_server: "ForkServer | None" = None) -> None:
         sys.exit(error.exit_code)
     except ModuleNotFoundError as error:
         missing = (error.name or "").split(".")[0]
-        if missing not in GROUND_PACKAGES:
+        extra = "ground" if missing in GROUND_PACKAGES else "console" if missing in CONSOLE_PACKAGES else ""
+        if not extra:
             raise
-        typer.echo(f"terrafix: this command needs {missing}; install it: pip install 'terrafix[ground]'", err=True)
+        typer.echo(f"terrafix: this command needs {missing}; install it: pip install 'terrafix[{extra}]'", err=True)
         sys.exit(UsageError.exit_code)
 
 

@@ -40,6 +40,7 @@ FRAMES_KEPT = 32  # frames that a node may still request; the size of the live f
 
 MakeNodes = Callable[[NodeContext], Mapping[str, Node]]
 MakeSource = Callable[[Source], Source]
+Watch = Callable[[list[Message]], None]
 
 
 def make_nodes(ctx: NodeContext) -> dict[str, Node]:
@@ -48,7 +49,7 @@ def make_nodes(ctx: NodeContext) -> dict[str, Node]:
 
 
 def replay(
-    flight: Path | str | RecordedFrames,
+    flight: Path | str | Source,
     map_path: Path | None,
     out: Path,
     *,
@@ -58,16 +59,17 @@ def replay(
     start: tuple[float, float] | None = None,
     nodes: MakeNodes = make_nodes,
     wrap_source: MakeSource = lambda source: source,
+    watch: Watch = lambda messages: None,
 ) -> dict[str, Any]:
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
-    ``flight``: a source by its name, or the frames of a record. ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg),
-    overrides the source's. ``nodes`` and ``wrap_source`` wrap the nodes and the source (to measure time, to inject
-    faults). Raises subclasses of TerrafixError.
+    ``flight``: a source, or its name. ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg), overrides the source's.
+    ``nodes`` and ``wrap_source`` wrap the nodes and the source (to measure time, to inject faults). ``watch`` gets the
+    messages of the origin, of each frame and of the end, when they are on disk. Raises subclasses of TerrafixError.
     """
     began_s = time.perf_counter()
     config = _with_models(load(configs or []), models or [])
-    source = wrap_source(flight if isinstance(flight, RecordedFrames) else open_source(str(flight), start=start))
+    source = wrap_source(open_source(str(flight), start=start) if isinstance(flight, (str, Path)) else flight)
     if source.live:
         raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
     package = package_of(_map_of(map_path, config, source), progress=progress)
@@ -77,11 +79,11 @@ def replay(
         ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
         published: list[Message] = []
         shell = InProcessShell(nodes(ctx), lambda _who, message: published.append(message))
-        _feed_flight(source, origin, shell, frames, published, output, progress)
+        _feed_flight(source, origin, shell, frames, published, output, watch, progress)
         source.close()
         summary = {
             "flight": source.name(),
-            "source": str(flight.record if isinstance(flight, RecordedFrames) else flight),
+            "source": str(flight.record) if isinstance(flight, RecordedFrames) else _name_of(flight),
             "map": map_summary,
             "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v and k not in NOT_MODELS},
             "config": msgspec.to_builtins(config),
@@ -114,11 +116,13 @@ def _feed_flight(
     frames: MemoryFrameStore,
     published: list[Message],
     output: ReplayOutput,
+    watch: Watch,
     progress: bool,
 ) -> None:
     """Feeds the frames one after the other. Recording is outside the measured time: in flight it is another process."""
     shell.feed(origin)
     output.take(published)
+    watch(published)
     published.clear()
     count, last_ns = 0, origin.t_ns
     shots = source.shots()
@@ -136,11 +140,17 @@ def _feed_flight(
             process_ms = (time.perf_counter() - began_s) * 1e3
             output.take(published)
             output.frame_done(shot.frame, shot.image, process_ms)
+            watch(published)
             published.clear()
             count, last_ns = count + 1, shot.frame.t_ns
             step()
     shell.feed(SourceEnded(t_ns=last_ns, frames=count))
     output.take(published)
+    watch(published)
+
+
+def _name_of(flight: Path | str | Source) -> str:
+    return str(flight) if isinstance(flight, (str, Path)) else flight.name()
 
 
 def _with_models(config: Config, models: list[str]) -> Config:

@@ -35,6 +35,7 @@ from terrafix.anchor.matching.predicted_view import (
     view_of,
 )
 from terrafix.anchor.place_index.recognizer import PlaceMemory
+from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.relocalization.position_prior import SIGMAS_95, distance_outside_m
 from terrafix.anchor.relocalization.relocalizer import (
     LOST_SIGMA_M,
@@ -134,6 +135,11 @@ class Localizer:
     def is_ready(self) -> bool:
         """Whether there is a map, and an origin of the flight on it."""
         return self._layers is not None
+
+    @property
+    def search(self) -> MapSearch | None:
+        """The running search, for who shows it; None: none."""
+        return self._relocalizer.search
 
     def begin_flight(self, origin: Origin) -> None:
         """Binds the map to the flight's local frame and camera."""

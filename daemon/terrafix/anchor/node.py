@@ -10,6 +10,7 @@ from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.model_monitor import ModelMonitor
 from terrafix.anchor.place_index.recognizer import PlaceMemory
+from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.thermal_load import ThermalLoad
 from terrafix.core.config import HealthSection
 from terrafix.core.errors import ModelError, TerrafixError
@@ -68,6 +69,11 @@ class AnchorNode:
         self._prior_t_ns = 0  # of the InitialPosition on which the predictions are based
         self._pending: list[Message] = []  # to be published after the MapMatch
         self._published_step = SearchStep.NORMAL
+
+    @property
+    def search(self) -> MapSearch | None:
+        """The running search, for who shows it; None: none."""
+        return self._localizer.search
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:

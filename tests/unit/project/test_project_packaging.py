@@ -30,6 +30,7 @@ IMPORTED_AS = {
     "pyserial": "serial",
     "pyzmq": "zmq",
     "pillow": "PIL",
+    "python-multipart": "python_multipart",
     "faiss-cpu": "faiss",
     "systemd-python": "systemd",
 }
@@ -78,6 +79,7 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
     declared |= (modules(EXTRAS["train"]) - EXPORTER) | modules(EXTRAS["faiss"]) | modules(EXTRAS["fleet"])
     declared |= modules(EXTRAS["vehicle"])
+    declared |= modules(EXTRAS["console"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
@@ -88,7 +90,7 @@ def test_every_dependency_has_a_version_range() -> None:
         *CORE.values(),
         *(
             one
-            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "vehicle", "train")
+            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "console", "vehicle", "train")
             for one in EXTRAS[extra].values()
         ),
     ]:

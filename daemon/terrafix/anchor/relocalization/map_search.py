@@ -121,6 +121,16 @@ class MapSearch:
             else len(self._blocks)
         )
 
+    @property
+    def tiles(self) -> int | None:
+        """Number of blocks that are searched around the last position; None: the whole map, or nothing yet."""
+        return self.block_count if self.step is SearchStep.WIDEN and self._blocks else None
+
+    @property
+    def cell_m(self) -> float:
+        """Side of a cell of the joint correlation; 0: there was none yet."""
+        return self._cell_m
+
     def predict(self, east_m: float, north_m: float, sigma_m: float) -> None:
         """Prediction by odometry. A step with a large 1-sigma adds to the path, because the ground may differ. After a
         step with a 1-sigma above the neighbour radius all tracks are dropped: their evidence belongs to other

@@ -62,6 +62,11 @@ class Relocalizer:
     def is_active(self) -> bool:
         return self._search is not None
 
+    @property
+    def search(self) -> MapSearch | None:
+        """The running search, for who shows it; None: none."""
+        return self._search
+
     def start(self, best: MapLayer, agl_m: float, around_m: tuple[float, float] | None) -> None:
         """Starts a search around ``around_m`` (local east, north); None: on the whole map."""
         null = best.null_at(agl_m)

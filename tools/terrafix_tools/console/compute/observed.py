@@ -1,0 +1,324 @@
+"""What the messages of a flight mean to its operator: results, fragments and events, frame by frame."""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from terrafix.core.geodesy import LocalFrame
+from terrafix.messages import (
+    Frame,
+    HintVerdict,
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Origin,
+    RefinedPose,
+    Refinement,
+    SearchStep,
+    Verdict,
+)
+from terrafix_tools.console.events import (
+    CandidateTile,
+    ChunkMerged,
+    Event,
+    FlightCompleted,
+    FrameProcessed,
+    FrameRefined,
+    HintAnswered,
+    ProcessingBlocked,
+    SearchExpanded,
+    StateChanged,
+    UserInputNeeded,
+    VerdictGiven,
+)
+from terrafix_tools.console.payloads import Ellipse, FlightState, Fragment, FrameResult, Gps, InputRequest
+from terrafix_tools.estimates import yaw_deg_of
+from terrafix_tools.evaluate import ELLIPSE95
+
+NEAR_M = 20.0  # of the position, within which `confidence` is the probability [spec: AC-1 of the requirements]
+TILES = 5  # candidates of a request [spec: SV-5 of the requirements]
+LOST_REASON = "the position is lost and the whole map was searched; a user fix or a hint would help"
+
+
+@dataclass(frozen=True)
+class SearchView:
+    """A running search: ``tiles`` it covers, None: the whole map; the best ``places`` (east, north), local metres, and
+    half the side of a tile."""
+
+    tiles: int | None
+    places: tuple[tuple[float, float], ...]
+    half_size_m: float
+
+
+@dataclass
+class FrameOutcome:
+    """What one step of a flight adds. ``result``: None at the origin and at the end."""
+
+    result: FrameResult | None = None
+    heading: tuple[float, float] | None = None  # and its 1-sigma, degrees
+    fragment: Fragment | None = None
+    refined: list[FrameRefined] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    state: FlightState = FlightState.PROCESSING
+    request: InputRequest | None = None
+
+
+@dataclass
+class _Totals:
+    frames: int = 0
+    localised: int = 0
+    merged: int = 0
+    hints: int = 0
+    radii_m: list[float] = field(default_factory=list)
+    refined: set[int] = field(default_factory=set)
+
+
+class FlightObserver:
+    """``take`` all messages in their order, then ``frame_done`` or ``rest`` for what they add. ``search``: what the
+    search shows now; ``image_url``: of a frame."""
+
+    def __init__(self, image_url: Callable[[int], str], search: Callable[[], SearchView | None]) -> None:
+        self._image_url, self._search = image_url, search
+        self.estimates: dict[int, NavEstimate] = {}  # the last one of each frame
+        self.hints: dict[int, int] = {}  # id of each hint that was given, by its t_ns
+        self._frame: LocalFrame | None = None
+        self.origin_ns = 0
+        self._fragments: dict[int, Fragment] = {}
+        self._state = FlightState.PROCESSING
+        self._asked = False
+        self._requests = 0
+        self._request: InputRequest | None = None
+        self._reached: tuple[str, int | None] | None = None  # of the search
+        self._totals = _Totals()
+        self._shown: Frame | None = None
+        self._match: MapMatch | None = None
+        self._others: list[Event] = []
+        self._refined: list[FrameRefined] = []
+
+    @property
+    def local(self) -> LocalFrame:
+        assert self._frame is not None
+        return self._frame
+
+    def resume(self, state: FlightState) -> None:
+        """Continues a live flight of which an earlier service has stored this state."""
+        self._state = state
+        self._reached = None if state is FlightState.PROCESSING else ("whole_map", None)
+        self._asked = state is FlightState.BLOCKED
+
+    def take(self, messages: Iterable[Message]) -> None:
+        for message in messages:
+            match message:
+                case Origin():
+                    self._frame, self.origin_ns = LocalFrame(message.lat_deg, message.lon_deg), message.t_ns
+                case Frame():
+                    self._shown, self._match = message, None
+                case NavEstimate():
+                    self.estimates[message.frame_id] = message
+                case MapMatch():
+                    self._match = message
+                case Refinement():
+                    self._refined += [_refined(pose, str(message.source)) for pose in message.poses]
+                case MeasurementVerdict() if message.verdict is not Verdict.ACCEPTED or message.measurement == "map":
+                    self._others.append(_verdict(message))
+                case HintVerdict():
+                    self._others.append(self._answer(message))
+                case _:
+                    pass
+
+    def frame_done(self) -> FrameOutcome:
+        """What the newest frame adds."""
+        shown = self._shown
+        assert shown is not None
+        estimate, found = self.estimates.get(shown.frame_id), self._match
+        result = _result(shown, estimate, found, self.origin_ns)
+        events: list[Event] = [FrameProcessed(**result.model_dump())]
+        fragment = None
+        if estimate is not None and estimate.fragment_id >= 0:
+            fragment, merged = self._fragment_of(estimate, found)
+            events += [merged] if merged is not None else []
+        events += self._search_events(found, shown.frame_id) if found is not None else []
+        self._totals.frames += 1
+        if result.ellipse is not None:
+            self._totals.localised += 1
+            self._totals.radii_m.append(result.ellipse.semi_major_m)
+        outcome = self._outcome(events)
+        outcome.result, outcome.fragment = result, fragment
+        if estimate is not None and result.heading is not None:
+            outcome.heading = result.heading, math.degrees(math.sqrt(max(estimate.cov[35], 0.0)))
+        return outcome
+
+    def rest(self) -> FrameOutcome:
+        """What messages without a frame add: those after the source has ended."""
+        return self._outcome([])
+
+    def completed(self) -> FlightCompleted:
+        totals = self._totals
+        median = float(np.median(totals.radii_m)) if totals.radii_m else None
+        return FlightCompleted(
+            statistics={
+                "frames": totals.frames,
+                "localised": totals.localised,
+                "refined": len(totals.refined),
+                "fragments": len(self._fragments),
+                "merged": totals.merged,
+                "hints": totals.hints,
+                "median_radius95_m": None if median is None else round(median, 2),
+            }
+        )
+
+    def _outcome(self, events: list[Event]) -> FrameOutcome:
+        events = [*events, *self._others, *self._refined]
+        self._totals.refined |= {refined.frame_id for refined in self._refined}
+        outcome = FrameOutcome(refined=self._refined, events=events, state=self._state, request=self._request)
+        self._others, self._refined = [], []
+        return outcome
+
+    def _fragment_of(self, estimate: NavEstimate, found: MapMatch | None) -> tuple[Fragment, ChunkMerged | None]:
+        """The fragment of the newest frame, and its merge if it is tied to the flight just now."""
+        known = self._fragments.get(estimate.fragment_id)
+        joined = estimate.joined or (found is not None and found.search.step is SearchStep.MERGE)
+        merged = None
+        if known is None:
+            fragment = Fragment(
+                fragment_id=estimate.fragment_id,
+                first_frame=estimate.frame_id,
+                last_frame=estimate.frame_id,
+                frames=1,
+                joined=joined,
+            )
+        else:
+            fragment = known.model_copy(
+                update={
+                    "last_frame": max(known.last_frame, estimate.frame_id),
+                    "frames": known.frames + 1,
+                    "joined": known.joined or joined,
+                }
+            )
+            if joined and not known.joined:
+                fragment.merged_at_frame = estimate.frame_id
+                merged = ChunkMerged(
+                    fragment_id=fragment.fragment_id, frame_id=estimate.frame_id, frames=fragment.frames
+                )
+                self._totals.merged += 1
+        self._fragments[fragment.fragment_id] = fragment
+        return fragment, merged
+
+    def _search_events(self, found: MapMatch, frame_id: int) -> list[Event]:
+        """Changes of the search and of the state of the flight with the match of the newest frame."""
+        events: list[Event] = []
+        if found.verdict is Verdict.LOST:
+            view = self._search()
+            self._asked |= found.search.step is SearchStep.ASK
+            reached: tuple[str, int | None] = "whole_map", None
+            if found.search.step is SearchStep.WIDEN:
+                reached = "widen", None if view is None else view.tiles
+            if reached != self._reached:
+                events.append(SearchExpanded(frame_id=frame_id, grid_size=reached[1], status=reached[0]))
+                self._reached = reached
+            if self._asked and self._request is None:
+                events += self._ask(view, frame_id)
+        elif self._reached is not None:
+            events.append(SearchExpanded(frame_id=frame_id, grid_size=self._reached[1], status="found"))
+            self._reached, self._asked, self._request = None, False, None
+        lost = FlightState.BLOCKED if self._asked else FlightState.RECOVERING
+        state = lost if self._reached is not None else FlightState.PROCESSING
+        if state is not self._state:
+            events.append(StateChanged(state=state, previous=self._state))
+            self._state = state
+        return events
+
+    def _ask(self, view: SearchView | None, frame_id: int) -> list[Event]:
+        self._requests += 1
+        self._request = InputRequest(request_id=f"r{self._requests}", frame_id=frame_id)
+        places = () if view is None else view.places[:TILES]
+        tiles = [
+            CandidateTile(
+                rank=rank,
+                gps=_gps(*self.local.to_wgs84(*place)),
+                half_size_m=0.0 if view is None else round(view.half_size_m, 1),
+            )
+            for rank, place in enumerate(places, start=1)
+        ]
+        return [
+            UserInputNeeded(
+                request_id=self._request.request_id,
+                frame_id=frame_id,
+                image_url=self._image_url(frame_id),
+                candidate_tiles=tiles,
+            ),
+            ProcessingBlocked(reason=LOST_REASON, frame_id=frame_id),
+        ]
+
+    def _answer(self, message: HintVerdict) -> HintAnswered:
+        self._totals.hints += 1
+        if message.verdict is Verdict.ACCEPTED:
+            self._asked, self._request = False, None  # the search goes on with it
+        return HintAnswered(
+            hint_id=self.hints.get(message.hint_t_ns, 0),
+            verdict=str(message.verdict),
+            distance_m=None if message.distance_m is None else round(message.distance_m, 1),
+            text=message.text,
+        )
+
+
+def ellipse_of(cov_m2: np.ndarray) -> Ellipse:
+    """The 95 % ellipse of a covariance (2, 2) of east and north."""
+    variances, axes = np.linalg.eigh(cov_m2)
+    semi = np.sqrt(ELLIPSE95 * np.maximum(variances, 0.0))
+    bearing_deg = math.degrees(math.atan2(float(axes[0, 1]), float(axes[1, 1]))) % 180.0
+    return Ellipse(
+        semi_major_m=round(float(semi[1]), 2), semi_minor_m=round(float(semi[0]), 2), bearing_deg=round(bearing_deg, 1)
+    )
+
+
+def confidence_of(cov_m2: np.ndarray) -> float:
+    """Probability that the position is within NEAR_M, from below: as if both axes had the larger variance."""
+    worst_m2 = max(float(np.linalg.eigvalsh(cov_m2)[-1]), 1e-12)
+    return round(-math.expm1(-(NEAR_M**2) / (2.0 * worst_m2)), 4)
+
+
+def _gps(lat_deg: float, lon_deg: float) -> Gps:
+    return Gps(lat=round(lat_deg, 8), lon=round(lon_deg, 8))
+
+
+def _result(shown: Frame, estimate: NavEstimate | None, found: MapMatch | None, origin_ns: int) -> FrameResult:
+    result = FrameResult(
+        frame_id=shown.frame_id, file=shown.file, t_s=round((shown.t_ns - origin_ns) * 1e-9, 3), error=shown.error
+    )
+    if found is not None:
+        result.match, result.inliers, result.search = str(found.verdict), found.inliers, str(found.search.step)
+    if estimate is not None:
+        cov_m2 = np.reshape(estimate.cov, (6, 6))[:2, :2]
+        result.gps = _gps(estimate.lat_deg, estimate.lon_deg)
+        result.altitude, result.agl_m = round(estimate.alt_amsl_m, 3), round(estimate.agl_m, 3)
+        result.heading = round(yaw_deg_of(estimate), 3)
+        result.confidence, result.ellipse = confidence_of(cov_m2), ellipse_of(cov_m2)
+        result.source = str(estimate.source_label)
+        result.fragment_id, result.joined = estimate.fragment_id, estimate.joined
+    return result
+
+
+def _refined(pose: RefinedPose, source: str) -> FrameRefined:
+    cov_m2 = np.array([[pose.sigma_e_m**2, pose.cov_en_m2], [pose.cov_en_m2, pose.sigma_n_m**2]])
+    return FrameRefined(
+        frame_id=pose.frame_id,
+        gps=_gps(pose.lat_deg, pose.lon_deg),
+        altitude=round(pose.alt_amsl_m, 3),
+        ellipse=ellipse_of(cov_m2),
+        source=source,
+        fragment_id=pose.fragment_id,
+    )
+
+
+def _verdict(message: MeasurementVerdict) -> VerdictGiven:
+    return VerdictGiven(
+        frame_id=message.frame_id,
+        measurement=message.measurement,
+        verdict=str(message.verdict),
+        detail=message.detail,
+        test_ratio=None if message.test_ratio is None else round(message.test_ratio, 3),
+    )

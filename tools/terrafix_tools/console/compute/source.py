@@ -1,0 +1,102 @@
+"""The uploaded images of a flight as a source, which waits for the next batch until the flight is completed."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from terrafix.messages import Frame, Message, Origin, PositionHint, VehicleState
+from terrafix.vision.sources import Shot
+from terrafix.vision.sources.images import read_image
+from terrafix_tools.console.compute.description import origin, stored_camera
+from terrafix_tools.console.payloads import Hint, NewFlight, UserFix
+from terrafix_tools.console.store import flights
+from terrafix_tools.console.store.database import Database
+from terrafix_tools.console.store.flights import StoredImage
+
+PAGE = 50  # images whose rows are read at once
+MAX_ATTEMPTS = 2  # processes that may die at an image before it is left out [spec: one death may be chance]
+POISONED = "the processes that read this image have died"
+
+Steer = Callable[[int, Hint | UserFix, int], PositionHint | None]
+
+
+class UploadedImages:
+    """A Source. ``wait`` blocks until something may have changed; ``begins`` is told each frame before it is read;
+    ``steer(hint_id, given, t_ns)`` makes the message of a hint, None: it cannot be used."""
+
+    live = False
+
+    def __init__(
+        self,
+        database: Database,
+        flight_id: str,
+        folder: Path,
+        *,
+        wait: Callable[[], None],
+        begins: Callable[[int], None],
+        steer: Steer,
+    ) -> None:
+        self._database, self._flight_id, self._folder = database, flight_id, folder
+        self._wait, self._begins, self._steer = wait, begins, steer
+        with database.read() as db:
+            self.new = NewFlight.model_validate_json(flights.row_of(db, flight_id).spec)
+        self._origin, self._stored = origin(self.new), stored_camera(self.new)
+
+    def origin(self) -> Origin:
+        return self._origin
+
+    def length(self) -> int | None:
+        return None
+
+    def name(self) -> str:
+        return self.new.name or self._flight_id
+
+    def map_hint(self) -> Path | None:
+        return None
+
+    def close(self) -> None:
+        """No resource stays open between shots."""
+
+    def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
+        frame_id = 0
+        while True:
+            with self._database.read() as db:
+                page = flights.images_of(db, self._flight_id, frame_id, PAGE)
+                completing = bool(flights.row_of(db, self._flight_id).completing)
+            for image in page:
+                self._begins(image.frame_id)
+                if image.t_ns >= from_s * 1e9:
+                    yield self._shot(image)
+            frame_id += len(page)
+            if not page and completing:
+                return
+            if not page:
+                self._wait()
+
+    def _shot(self, image: StoredImage) -> Shot:
+        camera, stored = self._origin.camera, self._stored
+        others = self._hints(image)
+        if image.attempts >= MAX_ATTEMPTS:
+            pixels, error = None, POISONED
+        else:
+            pixels, error = read_image(self._folder / image.stored, stored.width, stored.height)
+        frame = Frame(
+            t_ns=image.t_ns,
+            frame_id=image.frame_id,
+            file=image.name,
+            width=camera.width,
+            height=camera.height,
+            error=error,
+        )
+        state = None if image.state is None else msgspec.json.decode(image.state, type=VehicleState)
+        return Shot(frame, () if state is None else (state,), pixels, others=others)
+
+    def _hints(self, image: StoredImage) -> tuple[Message, ...]:
+        with self._database.read() as db:
+            if not flights.has_hints_before(db, self._flight_id, image.frame_id):
+                return ()
+        with self._database.write() as db:
+            given = flights.hints_before(db, self._flight_id, image.frame_id)
+        made = (self._steer(hint_id, hint, image.t_ns) for hint_id, hint in given)
+        return tuple(message for message in made if message is not None)
