@@ -254,7 +254,7 @@ export class FlightView {
     this.problem.hidden = !flight.error;
     this.problem.textContent = flight.error;
     this.drawRequest();
-    this.mapView.show(model, this.selected);
+    this.mapView.show(model, this.selected, flight.state !== "completed");
     this.drawFrame();
     this.panels[this.tab].update(model, this.serviceHealth);
     if (this.more) {
@@ -298,7 +298,7 @@ export class FlightView {
     this.frame.show(`/flights/${this.flightId}/frames/${result.frame_id}/image`, t("frame_alt", number(result.frame_id)));
     const verdict = model.verdicts.findLast((one) => one.frame_id === result.frame_id && one.measurement === "map");
     fill(this.frameFacts, sign(result.source), h("span", {}, t(`source_${result.source || "none"}`)),
-      h("span", {}, result.match ? t("match_line", result.match.replaceAll("_", " "), number(result.inliers)) : t("no_match")),
+      h("span", {}, result.match ? t("match_line", result.match.replaceAll("_", " "), result.inliers ? t("inliers", number(result.inliers)) : "") : t("no_match")),
       verdict && verdict.detail ? h("span", {class: "soft"}, verdict.detail) : null, h("span", {class: "soft"}, result.file), result.error ? h("span", {class: "error"}, result.error) : null);
   }
 

@@ -25,6 +25,7 @@ export const coordinate = (gps) => (gps ? `${gps.lat.toFixed(6)}, ${gps.lon.toFi
 export const degrees = (value) => (known(value) ? `${number((value % 360 + 360) % 360)}°` : NONE);
 
 export function bytes(value) {
+  if (value >= 1e9) return unit(value / 1e9, 1, "GB");
   return value >= 1e6 ? unit(value / 1e6, 1, "MB") : unit(value / 1e3, 0, "kB");
 }
 

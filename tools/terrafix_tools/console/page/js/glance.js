@@ -42,7 +42,7 @@ export class Glance {
         frame.gps ? [sign(frame.source), t(`source_${frame.source || "none"}`)] : frame.error || t(`state_${model.flight.state}`), frame.gps ? "wide" : "wide bad"),
       cell(t("ellipse95"), ellipse ? `${number(ellipse.semi_major_m, 1)} × ${number(ellipse.semi_minor_m, 1)} m` : NONE,
         ellipse ? t("within20", unit(frame.confidence === null ? null : 100 * frame.confidence, 0, "%")) : t("not_known"),
-        ellipse && ellipse.semi_major_m > 100 ? "warn" : "", ellipse ? ellipseSign(ellipse) : null),
+        `ell ${ellipse && ellipse.semi_major_m > 100 ? "warn" : ""}`, ellipse ? ellipseSign(ellipse) : null),
       this.lastMatch(model, fresh),
       cell(t("height"), unit(frame.agl_m, 0, "m"), t("amsl", unit(frame.altitude, 0, "m"))),
       cell(t("heading"), degrees(frame.heading), fresh ? t("speed", unit(fresh.position.speed_mps, 1, "m/s")) : t("true_north")),

@@ -95,24 +95,26 @@ const Track = L.Path.extend({
   ellipses(c) {
     const perMetre = this.perMetre();
     const last = this.results.length - 1;
+    let before = null;
     for (let i = 0; i <= last; i++) {
       const {ellipse, source, frame_id: frame} = this.results[i];
       const strong = i === last || frame === this.selected;
       if (!ellipse || !(this.all || strong)) continue;
-      const {x, y} = this._points[i];
-      c.beginPath();
+      const point = this._points[i];
       const [a, b] = [ellipse.semi_major_m * perMetre, ellipse.semi_minor_m * perMetre];
+      if (!strong && before && before.distanceTo(point) < Math.max(12, b)) continue; // they would hide the ground
+      before = point;
+      const {x, y} = point;
+      c.beginPath();
       c.ellipse(x, y, a, b, (ellipse.bearing_deg - 90) * RAD, 0, 2 * Math.PI);
       const {colour} = styleOf(source);
-      if (strong) {
-        c.fillStyle = `${colour}38`;
-        c.fill();
-        c.lineWidth = 4.5;
-        c.strokeStyle = "rgba(10,14,18,.75)";
-        c.stroke();
-      }
-      c.lineWidth = strong ? 2.4 : 1;
-      c.strokeStyle = strong ? "#fff" : `${colour}b0`;
+      c.fillStyle = `${colour}${strong ? "38" : "14"}`;
+      c.fill();
+      c.lineWidth = strong ? 4.5 : 2.6;
+      c.strokeStyle = `rgba(10,14,18,${strong ? 0.75 : 0.35})`;
+      c.stroke();
+      c.lineWidth = strong ? 2.4 : 1.4;
+      c.strokeStyle = strong ? "#fff" : `${colour}d0`;
       c.stroke();
     }
   },
@@ -206,14 +208,15 @@ export class MapView {
     this.map.getContainer().classList.toggle("picking", Boolean(pick || this.vertices));
   }
 
-  show(model, selected) {
+  /** ``moves``: the flight goes on, and the map follows it. */
+  show(model, selected, moves) {
     const results = model.ordered;
     this.track.show(results, selected);
     if (!this.track.results.length) return;
     if (!this.fitted) {
       this.fit();
       this.fitted = true;
-    } else if (this.follow) {
+    } else if (this.follow && moves) {
       const {lat, lon} = model.newestFix.gps;
       if (!this.map.getBounds().pad(-0.15).contains([lat, lon])) this.map.panTo([lat, lon], {animate: !STILL.matches});
     }

@@ -164,8 +164,8 @@ export class ObjectPanel {
   }
 
   update() {
-    fill(this.element, h("p", {class: "soft"}, t("objects_why")), table([t("object"), t("position"), t("accuracy95"), t("altitude"), t("surface")],
-      this.rows.map((one) => [one.name, td("mono", coordinate(one.gps)), metres(one.accuracy_meters), unit(one.altitude, 1, "m"), t(`surface_${one.surface}`)]), t("none_yet")));
+    fill(this.element, h("p", {class: "soft"}, t("objects_why")), table([t("fragment"), t("position"), t("accuracy95"), t("altitude"), t("surface")],
+      this.rows.map((one, i) => [number(i + 1), td("mono", coordinate(one.gps)), metres(one.accuracy_meters), unit(one.altitude, 1, "m"), t(`surface_${one.surface}`)]), t("none_yet")));
   }
 }
 
