@@ -28,6 +28,7 @@ IMPORTED_AS = {
     "pyserial": "serial",
     "pyzmq": "zmq",
     "pillow": "PIL",
+    "python-multipart": "python_multipart",
     "faiss-cpu": "faiss",
 }
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist"}  # used by scripts/check, not imported
@@ -73,6 +74,7 @@ def test_what_flies_starts_without_faiss() -> None:
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
     declared |= (modules(EXTRAS["train"]) - EXPORTER) | modules(EXTRAS["faiss"]) | modules(EXTRAS["fleet"])
+    declared |= modules(EXTRAS["console"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
@@ -81,7 +83,11 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
 def test_every_dependency_has_a_version_range() -> None:
     for requirement in [
         *CORE.values(),
-        *(one for extra in ("ground", "sim", "cluster", "faiss", "fleet", "train") for one in EXTRAS[extra].values()),
+        *(
+            one
+            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "console", "train")
+            for one in EXTRAS[extra].values()
+        ),
     ]:
         operators = {specifier.operator for specifier in requirement.specifier}
         assert {">=", "<"} <= operators, f"{requirement}: give the lowest that works and the next major"

@@ -68,8 +68,8 @@ class Feed:
         there were none for a while."""
         self.clients += 1
         try:
-            yield f": {json.dumps(self._flight_id)}\n\n".encode()
             passed = self._passing_number
+            yield f": {json.dumps(self._flight_id)}\n\n".encode()
             while not self.closed:
                 changed = self._changed
                 page = await self._after(after)

@@ -39,7 +39,8 @@ class OpenMap:
         centres_m = (np.arange(TILE) + 0.5) * step_m
         east_m, north_m = np.meshgrid(x * side_m - WORLD_M / 2 + centres_m, WORLD_M / 2 - y * side_m - centres_m)
         xs, ys = self._to_layer.transform(east_m, north_m)
-        spacing = float(np.nanmedian(np.abs(np.diff(xs, axis=1)))) if np.isfinite(xs).any() else math.inf
+        with np.errstate(invalid="ignore"):  # places beyond the projection are infinite
+            spacing = float(np.median(np.abs(np.diff(xs, axis=1))))
         level = next((one for one in self.layer.levels if one.pixel_x <= 1.1 * spacing), self.layer.levels[-1])
         columns = (xs - self.layer.x_min) / level.pixel_x - 0.5
         rows = (self.layer.y_max - ys) / level.pixel_y - 0.5

@@ -3,11 +3,15 @@
 import asyncio
 import logging
 import signal
+import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+import typer
 import uvicorn
+from fastapi import FastAPI
 
 from terrafix.core.errors import LinkError, OutputError
 from terrafix_tools.console.app import make_app
@@ -21,11 +25,21 @@ STOP_S = 10  # longest wait for requests in progress at a stop
 class Server(uvicorn.Server):
     """Ends the event streams at a stop, which would never end by themselves."""
 
-    service: Service
+    def __init__(self, config: uvicorn.Config, service: Service) -> None:
+        super().__init__(config)
+        self._service = service
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
+        self._loop = asyncio.get_running_loop()
+        await super().serve(sockets)
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """As in uvicorn, but a signal that has ended the service in order is not raised again."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
         before = {number: signal.signal(number, self.handle_exit) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield
@@ -34,19 +48,18 @@ class Server(uvicorn.Server):
                 signal.signal(number, handler)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        self.service.feeds.close()
         super().handle_exit(sig, frame)
+        self.end()
+
+    def end(self) -> None:
+        """From any thread, or a signal."""
+        self.should_exit = True
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._service.feeds.close)
 
 
-def serve(settings: Settings) -> None:
-    """Until SIGINT or SIGTERM. Raises UsageError, ConfigError, OutputError, LinkError (the port is taken)."""
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    try:
-        settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError as error:
-        raise OutputError(f"{settings.data}: cannot be made ({error.strerror}); choose another --data") from None
-    app = make_app(settings)
-    config = uvicorn.Config(
+def config_of(app: FastAPI, settings: Settings) -> uvicorn.Config:
+    return uvicorn.Config(
         app,
         host=settings.host,
         port=settings.port,
@@ -58,11 +71,28 @@ def serve(settings: Settings) -> None:
         ssl_certfile=settings.cert,
         ssl_keyfile=settings.key,
     )
-    server = Server(config)
-    server.service = app.state.service
+
+
+def serve(settings: Settings) -> None:
+    """Until SIGINT or SIGTERM. Raises UsageError, ConfigError, OutputError, LinkError (the port is taken)."""
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    try:
+        settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise OutputError(f"{settings.data}: cannot be made ({error.strerror}); choose another --data") from None
+    app = make_app(settings)
+    server = Server(config_of(app, settings), app.state.service)
+    print_address(settings)
     try:
         asyncio.run(server.serve())
     except SystemExit:
         raise LinkError(
             f"port {settings.port} of {settings.host} cannot be opened; is it taken? choose --port"
         ) from None
+
+
+def print_address(settings: Settings) -> None:
+    scheme = "http" if settings.cert is None else "https"
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    typer.echo(f"{scheme}://{host}:{settings.port}/", err=True)

@@ -195,6 +195,7 @@ class Service:
                     raise Refusal(409, "the flight is completed")
                 if isinstance(given, UserFix):
                     flights.image_of(db, flight_id, given.frame_id)
+                    _check_pixel(given.pixel.u, given.pixel.v, NewFlight.model_validate_json(row.spec))
                 return flights.add_hint(db, flight_id, given)
 
         return Steered(hint_id=await asyncio.to_thread(add), detail="used with the next frame; hint_answered tells")
@@ -222,8 +223,7 @@ class Service:
         else:
             new = NewFlight.model_validate_json(row.spec)
             map_path = self.maps.path(row.map_name)
-            if uv[0] > new.camera.width - 0.5 or uv[1] > new.camera.height - 0.5:
-                raise Refusal(422, f"the images have {new.camera.width}x{new.camera.height} pixels, from 0")
+            _check_pixel(*uv, new)
             uv = stored_pixel(*uv, new)
         return Question(out=str(out), map="" if map_path is None else str(map_path), frame_id=frame_id, pixel=uv)
 
@@ -329,3 +329,9 @@ class Service:
 
         await asyncio.to_thread(store)
         await self.feeds.refresh(flight_id)
+
+
+def _check_pixel(u: float, v: float, new: NewFlight) -> None:
+    """Raises Refusal: outside the images."""
+    if u > new.camera.width - 0.5 or v > new.camera.height - 0.5:
+        raise Refusal(422, f"the images have {new.camera.width}x{new.camera.height} pixels, from 0")

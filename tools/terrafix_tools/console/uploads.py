@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -39,6 +39,7 @@ HEADER_BYTES = 256 * 1024  # of an image that are read for its size: EXIF with a
 TELEMETRY_BYTES = 64 * 1024
 SLACK_BYTES = 64 * 1024  # of a body beside its images: headers of the parts
 HEADER_SLACK = 4096  # of one part
+DRAIN_BYTES, DRAIN_S = 512 * 2**20, 10.0  # of a refused body that is still read [spec: an upload of 50 images of 10 MB]
 
 
 @dataclass
@@ -349,7 +350,22 @@ async def take_batch(
     request: Request, database: Database, flight_id: str, folder: Path, limits: Limits, slots: Slots
 ) -> Accepted:
     """The whole way of a batch from the request into the flight. ``folder``: of the flight."""
-    with slots.one(), incoming(folder) as temporary:
-        check_room(folder, limits)
-        parts = await read_parts(request, temporary, limits)
-        return await asyncio.to_thread(store_batch, database, flight_id, folder, parts, limits)
+    try:
+        with slots.one(), incoming(folder) as temporary:
+            check_room(folder, limits)
+            parts = await read_parts(request, temporary, limits)
+            return await asyncio.to_thread(store_batch, database, flight_id, folder, parts, limits)
+    except Refusal:
+        await drain(request)
+        raise
+
+
+async def drain(request: Request) -> None:
+    """Reads what is left of a body that is refused: a client that still sends would not read the answer."""
+    left = DRAIN_BYTES
+    with suppress(ClientDisconnect, RuntimeError, TimeoutError):  # RuntimeError: the body was read to its end
+        async with asyncio.timeout(DRAIN_S):
+            async for chunk in request.stream():
+                left -= len(chunk)
+                if left < 0:
+                    return

@@ -1,0 +1,143 @@
+"""A console in a thread of the test, plain HTTP requests to it, and images to upload."""
+
+import json
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+import urllib3
+
+import map_format1
+from terrafix_tools.console.app import make_app
+from terrafix_tools.console.serve import Server, config_of
+from terrafix_tools.console.service import Service
+from terrafix_tools.console.settings import Settings
+
+MAP = "format1"
+CAMERA = {"width": 640, "height": 480, "fx": 500.0}
+NEW = {"camera": CAMERA, "map": MAP}
+WAIT_S = 20.0  # longest wait for the service
+BOUNDARY = "a-boundary-of-the-test"
+
+
+@dataclass(frozen=True)
+class Answer:
+    status: int
+    headers: Any
+    body: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+def settings(folder: Path, **changes: Any) -> Settings:
+    """Of a service with one small map that computes no flight (``workers`` 0)."""
+    (folder / "maps").mkdir(parents=True, exist_ok=True)
+    if not (folder / "maps" / "format1.gpkg").is_file():
+        map_format1.unpack(folder / "maps")
+    return Settings(**{"data": folder, "port": 0, "workers": 0, **changes})
+
+
+class Console:
+    """A context manager: the service runs in between."""
+
+    def __init__(self, chosen: Settings) -> None:
+        app = make_app(chosen)
+        self.service: Service = app.state.service
+        self._server = Server(config_of(app, chosen), self.service)
+        self._thread = threading.Thread(target=self._server.run)
+        self._http = urllib3.PoolManager(retries=False, timeout=WAIT_S, cert_reqs="CERT_NONE")
+        self._scheme = "http" if chosen.cert is None else "https"
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        until = time.monotonic() + WAIT_S
+        while not self._server.started and time.monotonic() < until:
+            time.sleep(0.005)
+        assert self._server.started
+        port = self._server.servers[0].sockets[0].getsockname()[1]
+        self.url = f"{self._scheme}://127.0.0.1:{port}"
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.end()
+        self._thread.join()
+        self._http.clear()
+
+    def send(self, method: str, path: str, body: object = None, headers: dict[str, str] | None = None) -> Answer:
+        """``body``: bytes as they are, anything else as JSON."""
+        sent = dict(headers or {})
+        data = body if isinstance(body, bytes) or body is None else json.dumps(body).encode()
+        if body is not None and not isinstance(body, bytes):
+            sent.setdefault("content-type", "application/json")
+        answer = self._http.request(method, self.url + path, body=data, headers=sent)
+        return Answer(answer.status, answer.headers, answer.data)
+
+    def create(self, **changes: object) -> str:
+        """-> the id of a new flight."""
+        answer = self.send("POST", "/flights", {**NEW, **changes})
+        assert answer.status == 201, answer.body
+        return str(answer.json["flight_id"])
+
+    def upload(self, flight_id: str, parts: Sequence[tuple[str, str, bytes]], **headers: str) -> Answer:
+        """``parts``: (field, file name, content)."""
+        return self.send(
+            "POST",
+            f"/flights/{flight_id}/images/batch",
+            multipart(parts),
+            {"content-type": f"multipart/form-data; boundary={BOUNDARY}", **headers},
+        )
+
+    def events(self, flight_id: str, after: int, count: int, headers: dict[str, str] | None = None) -> list[Any]:
+        """The next ``count`` events: (id, name, data)."""
+        sent = {"last-event-id": str(after), **(headers or {})}
+        url = f"{self.url}/flights/{flight_id}/events"
+        answer = self._http.request("GET", url, headers=sent, preload_content=False)
+        assert answer.status == 200, answer.data
+        text, found = "", []
+        try:
+            for chunk in answer.stream(64):
+                text += chunk.decode()
+                *blocks, text = text.split("\n\n")
+                found += [parsed for block in blocks if (parsed := _event(block)) is not None]
+                if len(found) >= count:
+                    return found[:count]
+        finally:
+            answer.close()
+        return found
+
+
+def _event(block: str) -> tuple[int, str, Any] | None:
+    fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
+    if "event" not in fields:
+        return None
+    return int(fields.get("id", 0)), fields["event"], json.loads(fields["data"])
+
+
+def multipart(parts: Sequence[tuple[str, str, bytes]]) -> bytes:
+    body = b""
+    for field, name, content in parts:
+        head = f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="{field}"; filename="{name}"\r\n\r\n'
+        body += head.encode() + content + b"\r\n"
+    return body + f"--{BOUNDARY}--\r\n".encode()
+
+
+@cache
+def jpeg(seed: int = 0, width: int = 640, height: int = 480) -> bytes:
+    rng = np.random.default_rng(seed)
+    small = rng.integers(0, 256, (height // 16, width // 16, 3), np.uint8)
+    done, data = cv2.imencode(".jpg", cv2.resize(small, (width, height)), [cv2.IMWRITE_JPEG_QUALITY, 50])
+    assert done
+    return data.tobytes()
+
+
+def batch(first: int, count: int = 10, content: bytes | None = None) -> list[tuple[str, str, bytes]]:
+    """Images by the numbers from ``first`` on; equal ones if ``content`` is given."""
+    return [("images", f"IMG_{number:04d}.jpg", content or jpeg(number)) for number in range(first, first + count)]

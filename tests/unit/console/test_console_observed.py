@@ -1,0 +1,173 @@
+"""Results and events of the messages of a flight."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from flight_records import estimate, frame, origin
+from map_matches import with_search
+from terrafix import messages as m
+from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome, SearchView, confidence_of, ellipse_of
+from terrafix_tools.console.events import (
+    ChunkMerged,
+    Event,
+    FrameRefined,
+    HintAnswered,
+    SearchExpanded,
+    StateChanged,
+    UserInputNeeded,
+    VerdictGiven,
+    name_of,
+)
+from terrafix_tools.console.payloads import FlightState
+
+
+class Flight:
+    """A flight, frame by frame. ``view``: what the search shows."""
+
+    def __init__(self) -> None:
+        self.view: SearchView | None = None
+        self.observer = FlightObserver(lambda frame_id: f"/image/{frame_id}", lambda: self.view)
+        self.observer.take([origin()])
+        self.next_id = 0
+
+    def frame(
+        self, verdict: m.Verdict, step: m.SearchStep = m.SearchStep.NORMAL, fragment: int = 0, joined: bool = True
+    ) -> FrameOutcome:
+        i = self.next_id
+        self.next_id += 1
+        located = msgspec.structs.replace(estimate(i, 10.0 * i, 0.0), fragment_id=fragment, joined=joined)
+        match = m.MapMatch(t_ns=located.t_ns, frame_id=i, verdict=verdict, matcher="gradient", inliers=12)
+        self.observer.take([frame(i), located, with_search(match, step=step)])
+        return self.observer.frame_done()
+
+
+def of_kind(outcome: FrameOutcome, *kinds: type[Event]) -> list[Event]:
+    return [event for event in outcome.events if isinstance(event, kinds)]
+
+
+LOST, WIDEN, WHOLE, ASK = m.Verdict.LOST, m.SearchStep.WIDEN, m.SearchStep.WHOLE_MAP, m.SearchStep.ASK
+
+
+def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
+    flight = Flight()
+    outcome = flight.frame(m.Verdict.ACCEPTED)
+    result = outcome.result
+    assert result is not None and result.gps is not None and result.ellipse is not None
+    assert (result.gps.lat, result.gps.lon, result.altitude, result.heading) == (48.0, 11.0, 600.0, 90.0)
+    assert (result.match, result.inliers, result.source) == ("accepted", 12, "satellite_anchored")
+    assert result.ellipse.semi_major_m == pytest.approx(4.0 * math.sqrt(5.991), abs=0.01)
+    assert result.confidence == pytest.approx(1.0 - math.exp(-(20.0**2) / (2 * 4.0**2)), abs=1e-4)
+    assert outcome.heading == (90.0, pytest.approx(math.degrees(0.1)))
+    assert [name_of(type(e)) for e in outcome.events] == ["frame_processed"]
+
+
+def test_the_ellipse_points_along_its_longer_axis() -> None:
+    east = ellipse_of(np.diag([9.0, 1.0]))
+    assert (east.bearing_deg, east.semi_major_m, east.semi_minor_m) == (90.0, 7.34, 2.45)
+    turn = np.array([[math.cos(0.5), math.sin(0.5)], [-math.sin(0.5), math.cos(0.5)]])  # 0.5 rad from east to south
+    assert ellipse_of(turn @ np.diag([9.0, 1.0]) @ turn.T).bearing_deg == pytest.approx(90 + math.degrees(0.5), abs=0.1)
+
+
+def test_the_confidence_is_that_of_the_worse_axis() -> None:
+    assert confidence_of(np.diag([400.0, 1.0])) == pytest.approx(1.0 - math.exp(-0.5), abs=1e-4)
+
+
+def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
+    flight = Flight()
+    flight.frame(m.Verdict.ACCEPTED)
+    flight.view = SearchView(1, (), 60.0)
+    lost = flight.frame(LOST, WIDEN)
+    assert of_kind(lost, SearchExpanded, StateChanged) == [
+        SearchExpanded(frame_id=1, grid_size=1, status="widen"),
+        StateChanged(state=FlightState.RECOVERING, previous=FlightState.PROCESSING),
+    ]
+    assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded, StateChanged) == []
+    flight.view = SearchView(4, (), 60.0)
+    assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded) == [
+        SearchExpanded(frame_id=3, grid_size=4, status="widen")
+    ]
+    flight.view = SearchView(None, tuple((100.0 * k, -50.0) for k in range(7)), 60.0)
+    assert of_kind(flight.frame(LOST, WHOLE), SearchExpanded) == [
+        SearchExpanded(frame_id=4, grid_size=None, status="whole_map")
+    ]
+    asked = flight.frame(LOST, ASK)
+    (needed,) = of_kind(asked, UserInputNeeded)
+    assert isinstance(needed, UserInputNeeded)
+    assert (needed.request_id, needed.frame_id, needed.image_url) == ("r1", 5, "/image/5")
+    assert [tile.rank for tile in needed.candidate_tiles] == [1, 2, 3, 4, 5]
+    third = flight.observer.local.to_local(needed.candidate_tiles[2].gps.lat, needed.candidate_tiles[2].gps.lon)
+    assert third == pytest.approx((200.0, -50.0), abs=0.01) and needed.candidate_tiles[2].half_size_m == 60.0
+    assert asked.state is FlightState.BLOCKED and asked.request is not None and asked.request.frame_id == 5
+    again = flight.frame(LOST, m.SearchStep.NEW_FRAGMENT)
+    assert of_kind(again, UserInputNeeded, StateChanged) == [] and again.state is FlightState.BLOCKED
+    found = flight.frame(m.Verdict.ACCEPTED, m.SearchStep.MERGE)
+    assert of_kind(found, SearchExpanded, StateChanged) == [
+        SearchExpanded(frame_id=7, grid_size=None, status="found"),
+        StateChanged(state=FlightState.PROCESSING, previous=FlightState.BLOCKED),
+    ]
+    assert found.request is None
+
+
+def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
+    flight = Flight()
+    assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
+    flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=False)
+    outcome = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
+    assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=2, frames=2)]
+    assert outcome.fragment is not None and outcome.fragment.merged_at_frame == 2
+    assert of_kind(flight.frame(m.Verdict.ACCEPTED, fragment=1), ChunkMerged) == []
+    statistics = flight.observer.completed().statistics
+    assert (statistics["frames"], statistics["localised"], statistics["fragments"], statistics["merged"]) == (
+        4,
+        4,
+        2,
+        1,
+    )
+
+
+def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> None:
+    flight = Flight()
+    flight.observer.hints[77] = 3
+    flight.observer.take(
+        [
+            m.MeasurementVerdict(t_ns=0, frame_id=0, measurement="height", verdict=m.Verdict.IMPLAUSIBLE, detail="x"),
+            m.MeasurementVerdict(t_ns=0, frame_id=0, measurement="odometry", verdict=m.Verdict.ACCEPTED),
+            m.MeasurementVerdict(t_ns=0, frame_id=0, measurement="map", verdict=m.Verdict.ACCEPTED, test_ratio=0.25),
+            m.HintVerdict(
+                t_ns=0, hint_t_ns=77, verdict=m.Verdict.ACCEPTED, distance_m=3.21, sigma_m=1.0, text="agrees"
+            ),
+            m.Refinement(
+                t_ns=0,
+                source=m.RefinementSource.SMOOTHER,
+                poses=[
+                    m.RefinedPose(
+                        frame_id=0, lat_deg=48.5, lon_deg=11.5, alt_amsl_m=600.0, sigma_e_m=2.0, sigma_n_m=1.0
+                    )
+                ],
+            ),
+        ]
+    )
+    outcome = flight.frame(m.Verdict.ACCEPTED)
+    given = [event for event in outcome.events if isinstance(event, VerdictGiven)]
+    assert [(v.measurement, v.verdict, v.test_ratio) for v in given] == [
+        ("height", "implausible", None),
+        ("map", "accepted", 0.25),
+    ]
+    assert of_kind(outcome, HintAnswered) == [
+        HintAnswered(hint_id=3, verdict="accepted", distance_m=3.2, text="agrees")
+    ]
+    (refined,) = outcome.refined
+    assert of_kind(outcome, FrameRefined) == [refined]
+    assert (refined.gps.lat, refined.source, refined.ellipse.bearing_deg) == (48.5, "smoother", 90.0)
+    assert flight.observer.rest().events == []
+
+
+def test_an_image_without_position_has_a_result_with_its_error() -> None:
+    flight = Flight()
+    flight.observer.take([msgspec.structs.replace(frame(0), error="file is empty")])
+    outcome = flight.observer.frame_done()
+    assert outcome.result is not None
+    assert (outcome.result.error, outcome.result.gps, outcome.fragment) == ("file is empty", None, None)

@@ -1,0 +1,250 @@
+"""Requests to the console: what is taken, and what is refused with a problem that says why."""
+
+import random
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from console_rig import CAMERA, NEW, Answer, Console, batch, jpeg, multipart, settings
+from terrafix_tools.console import uploads
+from terrafix_tools.console.openapi import schema
+from terrafix_tools.console.settings import Limits
+
+
+@pytest.fixture(scope="module")
+def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
+    with Console(settings(tmp_path_factory.mktemp("console"))) as running:
+        yield running
+
+
+def assert_refused(answer: Answer, status: int, *words: str) -> None:
+    assert answer.status == status, answer.body
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert set(answer.json) == {"type", "title", "status", "detail", "errors"}
+    assert answer.json["status"] == status
+    for word in words:
+        assert word in answer.json["detail"]
+
+
+def png_header(width: int, height: int) -> bytes:
+    """A PNG that states a size and ends where its pixels would begin."""
+    head = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    checked = struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+    return b"\x89PNG\r\n\x1a\n" + checked + struct.pack(">I", 9) + b"IDAT"
+
+
+def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
+    answer = console.send("POST", "/flights", {**NEW, "name": "north field"})
+    assert answer.status == 201
+    flight = answer.json
+    assert flight["state"] == "processing" and flight["kind"] == "batch" and flight["last_event_id"] == 0
+    assert flight["map"] == {"name": "format1", "state": "ready", "detail": ""}
+    assert answer.headers["location"] == f"/flights/{flight['flight_id']}"
+    assert console.send("GET", answer.headers["location"]).json == flight
+    assert flight in console.send("GET", "/flights").json["flights"]
+    assert console.send("DELETE", answer.headers["location"]).status == 204
+    assert_refused(console.send("GET", answer.headers["location"]), 404, flight["flight_id"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"map": "no-such"}, "no-such"),
+        ({"map": None}, "map or area"),
+        ({"camera": {**CAMERA, "width": 639}}, "width"),
+        ({"camera": {**CAMERA, "height": 4169}}, "height"),
+        ({"camera": {"width": 640, "height": 480}}, "fx, or focal_mm"),
+        ({"camera": {**CAMERA, "fx": 1.0}}, "fx"),
+        ({"start": {"lat": 91, "lon": 0}}, "start.lat"),
+        ({"start": {"lat": 10, "lon": 20}}, "no imagery at the start"),
+        ({"colour": "red"}, "colour"),
+        ({"name": "x" * 101}, "name"),
+        ({"height_m": "high"}, "height_m"),
+        ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}]}}, "no map sources"),
+        ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 9, "lon": 9}]}}, "km2"),
+    ],
+)
+def test_a_flight_that_is_not_valid_is_refused_with_the_field(
+    console: Console, changes: dict[str, Any], word: str
+) -> None:
+    answer = console.send("POST", "/flights", {**NEW, **changes})
+    assert_refused(answer, 404 if changes.get("map") else 422, word)
+
+
+def test_images_become_frames_in_the_sequence_of_their_numbers_over_batches(console: Console) -> None:
+    flight_id = console.create()
+    first = console.upload(flight_id, batch(7))
+    assert (first.status, first.json) == (
+        202,
+        {"frames": [*range(10)], "repeated": False, "next_number": 17},
+    )
+    assert_refused(console.upload(flight_id, batch(18)), 409, "expected 17")
+    assert console.upload(flight_id, batch(17, 12)).json["frames"] == [*range(10, 22)]
+    assert console.send("GET", f"/flights/{flight_id}").json["images"] == {
+        "uploaded": 22,
+        "processed": 0,
+        "next_number": 29,
+    }
+    image = console.send("GET", f"/flights/{flight_id}/frames/11/image")
+    assert image.body == jpeg(18) and image.headers["content-type"] == "image/jpeg"
+    assert image.headers["x-content-type-options"] == "nosniff"
+    assert_refused(console.send("GET", f"/flights/{flight_id}/frames/22/image"), 404)
+
+
+def test_a_batch_that_is_sent_again_has_the_same_frames_and_is_not_stored_twice(console: Console) -> None:
+    flight_id = console.create()
+    sent = batch(1)
+    assert console.upload(flight_id, sent).json["repeated"] is False
+    console.upload(flight_id, batch(11))
+    again = console.upload(flight_id, sent)
+    assert (again.status, again.json) == (202, {"frames": [*range(10)], "repeated": True, "next_number": 21})
+    other = [*sent[:9], (*sent[9][:2], jpeg(99))]
+    assert_refused(console.upload(flight_id, other), 409, "IMG_0010.jpg")
+    assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 20
+
+
+@pytest.mark.parametrize(
+    ("parts", "status", "word"),
+    [
+        (batch(1, 9), 422, "9 images"),
+        (batch(1, 51, b"x"), 422, "50"),
+        ([*batch(1, 9), ("images", "IMG_0011.jpg", jpeg())], 409, "expected 10"),
+        ([*batch(1, 9), ("images", "../../IMG_0010.jpg", jpeg())], 422, "no name of an image"),
+        ([*batch(1, 9), ("images", "a/IMG_0010.jpg", jpeg())], 422, "no name of an image"),
+        ([*batch(1, 9), ("images", ".IMG_0010.jpg", jpeg())], 422, "no name of an image"),
+        ([*batch(1, 9), ("images", "photo.jpg", jpeg())], 422, "ends in its number"),
+        ([*batch(1, 9), ("images", "IMG_0010.jpg", b"")], 422, "not a JPEG or PNG"),
+        ([*batch(1, 9), ("images", "IMG_0010.jpg", b"GIF89a" + jpeg())], 422, "not a JPEG or PNG"),
+        ([*batch(1, 9), ("images", "IMG_0010.jpg", b"\xff\xd8\xff" + b"\x00" * 99)], 422, "not a JPEG or PNG"),
+        ([*batch(1, 9), ("images", "IMG_0010.png", png_header(100_000, 100_000))], 422, "IMG_0010.png"),
+        ([*batch(1, 9), ("images", "IMG_0010.png", png_header(6253, 4168))], 422, "6253x4168"),
+        ([*batch(1, 9), ("images", "IMG_0010.jpg", jpeg(0, 800, 600))], 422, "the camera of this flight has 640x480"),
+        ([*batch(1, 10), ("other", "x", b"")], 422, "'other'"),
+        ([*batch(1, 10), ("telemetry", "t.csv", b"file,t_s\nIMG_0001.jpg,0\n")], 422, "one row for each image"),
+        ([*batch(1, 10), ("telemetry", "t.csv", b"file,t_s\nIMG_0001.jpg,zero\n")], 422, "telemetry row 2"),
+    ],
+)
+def test_a_batch_that_is_not_valid_is_refused_as_a_whole(
+    console: Console, parts: list[tuple[str, str, bytes]], status: int, word: str
+) -> None:
+    flight_id = console.create()
+    assert_refused(console.upload(flight_id, parts), status, word)
+    assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 0
+    folder = console.service.settings.flight(flight_id)
+    assert [path for path in folder.rglob("*") if path.is_file()] == []
+
+
+def test_a_body_that_is_no_multipart_or_is_cut_is_refused(console: Console) -> None:
+    path = f"/flights/{console.create()}/images/batch"
+    kind = {"content-type": "multipart/form-data; boundary=a-boundary-of-the-test"}
+    whole = multipart(batch(1))
+    assert_refused(console.send("POST", path, whole, {"content-type": "image/jpeg"}), 415)
+    assert_refused(console.send("POST", path, whole[:-30], kind), 422, "ends too early")
+    assert_refused(console.send("POST", path, b"no parts", kind), 422)
+    assert_refused(console.send("POST", path, b"", kind), 422)
+
+
+def test_a_large_upload_that_is_refused_early_still_gets_its_answer(console: Console) -> None:
+    parts = [("other", "x", b""), ("images", "IMG_0001.jpg", b"x" * 20_000_000)]
+    assert_refused(console.upload(console.create(), parts), 422, "'other'")
+
+
+def test_times_and_states_of_a_table_are_those_of_the_images(console: Console) -> None:
+    flight_id = console.create(yaw_deg=90.0)
+    rows = "".join(f"IMG_{n:04d}.jpg,{2.5 * n},,,,{100 + n}\n" for n in range(1, 11))
+    table = ("telemetry", "t.csv", f"file,t_s,yaw_deg,pitch_deg,roll_deg,agl_m\n{rows}".encode())
+    assert console.upload(flight_id, [*batch(1), table]).status == 202
+    with console.service.database.read() as db:
+        stored = uploads.flights.images_of(db, flight_id, 0)
+    assert [image.t_ns for image in stored] == [round(2.5e9 * n) for n in range(1, 11)]
+    assert stored[2].state is not None and '"agl_m":103.0' in stored[2].state
+    assert '"yaw_rad":1.5707' in stored[2].state
+    earlier = ("telemetry", "t.csv", b"file,t_s\n" + b"".join(b"IMG_%04d.jpg,%d\n" % (n, n) for n in range(11, 21)))
+    assert_refused(console.upload(flight_id, [*batch(11), earlier]), 409, "not later")
+
+
+def test_a_completed_flight_takes_no_images_and_an_empty_one_is_not_completed(console: Console) -> None:
+    flight_id = console.create()
+    assert_refused(console.send("POST", f"/flights/{flight_id}/complete"), 409, "no images")
+    console.upload(flight_id, batch(1))
+    assert console.send("POST", f"/flights/{flight_id}/complete").json["completing"] is True
+    assert_refused(console.upload(flight_id, batch(11)), 409, "being completed")
+
+
+def test_a_fix_needs_a_frame_and_hints_are_numbered(console: Console) -> None:
+    flight_id = console.create()
+    fix = {"frame_id": 3, "pixel": {"u": 10, "v": 20}, "lat": 1.0, "lon": 2.0}
+    assert_refused(console.send("POST", f"/flights/{flight_id}/user-fix", fix), 404, "no frame 3")
+    console.upload(flight_id, batch(1))
+    assert console.send("POST", f"/flights/{flight_id}/user-fix", fix).json["hint_id"] == 1
+    assert console.send("POST", f"/flights/{flight_id}/hint", {"lat": 1.0, "lon": 2.0}).json["hint_id"] == 2
+    outside = {**fix, "pixel": {"u": 640, "v": 20}}
+    assert_refused(console.send("POST", f"/flights/{flight_id}/user-fix", outside), 422, "640x480")
+    assert_refused(
+        console.send("POST", f"/flights/{flight_id}/frames/3/object-to-gps", {"pixel_x": 1, "pixel_y": 1}),
+        404,
+        "no result of frame 3",
+    )
+
+
+def test_maps_have_bounds_and_tiles(console: Console) -> None:
+    info = console.send("GET", "/maps/format1").json
+    assert console.send("GET", "/maps").json == {"maps": [info]}
+    west, south, east, north = info["bounds"]
+    assert west < east and south < north and info["gsd_m"] == pytest.approx(0.5, rel=1e-3)
+    assert_refused(console.send("GET", "/maps/other"), 404)
+    assert_refused(console.send("GET", "/maps/format1/tiles/3/8/0.png"), 404, "0 to 7")
+    assert_refused(console.send("GET", "/maps/..%2F..%2Fetc%2Fpasswd"), 404)
+    tile = console.send("GET", "/maps/format1/tiles/0/0/0.png")
+    assert tile.status == 200 and tile.body.startswith(b"\x89PNG") and tile.headers["content-type"] == "image/png"
+
+
+def test_errors_of_http_itself_are_problems_too(console: Console) -> None:
+    assert_refused(console.send("GET", "/no/such/path"), 404)
+    assert_refused(console.send("PATCH", "/flights"), 405)
+    assert_refused(console.send("POST", "/flights", b"{not json", {"content-type": "application/json"}), 422)
+    assert_refused(console.send("POST", "/flights", b"[" * 100_000, {"content-type": "application/json"}), 400)
+    assert_refused(console.send("POST", "/flights", b" " * 3_000_000, {"content-type": "application/json"}), 413)
+    assert_refused(console.send("GET", "/flights/UPPER"), 422)
+    assert console.send("GET", "/page/..%2f..%2fcli.py").status == 404
+
+
+def test_limits_on_flights_and_images_are_refusals(tmp_path: Path) -> None:
+    limits = Limits(flights=1, images=15)
+    with Console(settings(tmp_path, limits=limits)) as console:
+        flight_id = console.create()
+        assert_refused(console.send("POST", "/flights", NEW), 429, "1 flights")
+        console.upload(flight_id, batch(1))
+        assert_refused(console.upload(flight_id, batch(11)), 409, "at most 15")
+
+
+def test_a_full_disk_refuses_uploads_and_leaves_the_flight_as_it_was(tmp_path: Path) -> None:
+    with Console(settings(tmp_path, limits=Limits(disk_reserve_bytes=2**60))) as console:
+        flight_id = console.create()
+        assert_refused(console.upload(flight_id, batch(1)), 507, "free")
+        assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 0
+
+
+VALUES = [None, True, -1, 0, 1e308, "NaN", "", "\u0000", "x" * 300, [], {}, [[[]]], {"lat": {}}, 2**70, -1e-320]
+
+
+def test_no_random_body_or_path_makes_the_service_fail(console: Console) -> None:
+    """Every path and method of the interface with random fields, parameters and bodies."""
+    rng = random.Random(4)
+    flight_id = console.create()
+    fields = ["camera", "map", "area", "start", "frame_id", "pixel", "lat", "lon", "radius_m", "pixel_x", "token"]
+    for path, methods in schema()["paths"].items():
+        for method in methods:
+            for _ in range(6):
+                filled = path.replace("{flight_id}", rng.choice([flight_id, "x", "%00", "..%2f.."]))
+                for name in ("{frame_id}", "{name}", "{z}", "{x}", "{y}"):
+                    filled = filled.replace(name, rng.choice(["0", "-1", "99999999999999999999", "%ff", "a.mcap"]))
+                body = {key: rng.choice(VALUES) for key in rng.sample(fields, 4)}
+                if filled.endswith("/events") or (method == "delete" and flight_id in filled):
+                    continue
+                answer = console.send(method.upper(), filled, body if method == "post" else None)
+                assert answer.status < 500, (method, filled, body, answer.body)
