@@ -37,10 +37,11 @@ export class Glance {
       return;
     }
     const ellipse = frame.ellipse;
+    const digits = ellipse && ellipse.semi_major_m >= 100 ? 0 : 1;
     const cells = [
       cell(t("position"), frame.gps ? coordinate(frame.gps) : t("no_position"),
         frame.gps ? [sign(frame.source), t(`source_${frame.source || "none"}`)] : frame.error || t(`state_${model.flight.state}`), frame.gps ? "wide" : "wide bad"),
-      cell(t("ellipse95"), ellipse ? `${number(ellipse.semi_major_m, 1)} × ${number(ellipse.semi_minor_m, 1)} m` : NONE,
+      cell(t("ellipse95"), ellipse ? `${number(ellipse.semi_major_m, digits)} × ${number(ellipse.semi_minor_m, digits)} m` : NONE,
         ellipse ? t("within20", unit(frame.confidence === null ? null : 100 * frame.confidence, 0, "%")) : t("not_known"),
         `ell ${ellipse && ellipse.semi_major_m > 100 ? "warn" : ""}`, ellipse ? ellipseSign(ellipse) : null),
       this.lastMatch(model, fresh),

@@ -108,7 +108,7 @@ const Track = L.Path.extend({
       c.beginPath();
       c.ellipse(x, y, a, b, (ellipse.bearing_deg - 90) * RAD, 0, 2 * Math.PI);
       const {colour} = styleOf(source);
-      c.fillStyle = `${colour}${strong ? "38" : "14"}`;
+      c.fillStyle = `${colour}${strong && b < 500 ? "38" : "14"}`; // one that fills the view would hide the ground
       c.fill();
       c.lineWidth = strong ? 4.5 : 2.6;
       c.strokeStyle = `rgba(10,14,18,${strong ? 0.75 : 0.35})`;
