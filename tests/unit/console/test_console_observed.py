@@ -111,6 +111,19 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
     assert found.request is None
 
 
+def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> None:
+    flight = Flight()
+    flight.frame(LOST, ASK)
+    rejected = m.HintVerdict(
+        t_ns=0, hint_t_ns=1, verdict=m.Verdict.OUTSIDE_MAP, distance_m=None, sigma_m=None, text="outside"
+    )
+    flight.observer.take([rejected])
+    assert flight.frame(LOST, WHOLE).state is FlightState.BLOCKED
+    flight.observer.take([msgspec.structs.replace(rejected, verdict=m.Verdict.ACCEPTED)])
+    outcome = flight.frame(LOST, WHOLE)
+    assert outcome.state is FlightState.RECOVERING and outcome.request is None
+
+
 def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
     flight = Flight()
     assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []

@@ -255,6 +255,8 @@ class FlightObserver:
 
     def _answer(self, message: HintVerdict) -> HintAnswered:
         self._totals.hints += 1
+        if message.verdict is Verdict.ACCEPTED:
+            self._asked, self._request = False, None  # the search goes on with it
         return HintAnswered(
             hint_id=self.hints.get(message.hint_t_ns, 0),
             verdict=str(message.verdict),

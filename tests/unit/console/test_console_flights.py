@@ -1,0 +1,208 @@
+"""Flights over HTTP, from their first image to their completion, computed by the processes of the console."""
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+import map_rasters
+from console_rig import Console, settings
+from terrafix.core.camera import CameraCalibration
+from terrafix_tools.console.client import ConsoleClient
+from terrafix_tools.console.payloads import NewFlight, ObjectPixel, PixelPoint, UserFix
+from terrafix_tools.mapping.build import build
+from textured_ground import GSD_M, SIDE_M, rotation, texture, view
+
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+
+CAMERA = CameraCalibration(640, 480, 380.0, 380.0, 319.5, 239.5)
+AGL_M, STEP_M = 80.0, 35.0
+GROUND, ELSEWHERE = 3, 8  # seeds of the ground of the map, and of another one
+WAIT_S = 300.0  # longest wait for a result; processes of others may take the processors
+NEW: dict[str, Any] = {
+    "camera": {"width": 640, "height": 480, "fx": 380.0, "cx": 319.5, "cy": 239.5, "distortion": [0, 0, 0, 0]},
+    "map": "ground",
+    "height_m": AGL_M,
+    "yaw_deg": 90.0,
+}
+TO_WGS84 = Transformer.from_crs(32651, 4326, always_xy=True)
+
+
+def place_of(i: int) -> np.ndarray:
+    """East and north of frame ``i`` from the middle of the map."""
+    return np.array([-170.0 + STEP_M * (i % 10), 60.0 - 100.0 * (i // 10)])
+
+
+def lat_lon(place_m: np.ndarray) -> tuple[float, float]:
+    lon, lat = TO_WGS84.transform(300_000.0 + SIDE_M / 2 + place_m[0], 2_600_000.0 - SIDE_M / 2 + place_m[1])
+    return lat, lon
+
+
+@cache
+def ground(seed: int) -> np.ndarray:
+    return texture(seed)
+
+
+def write_images(folder: Path, frames: range, seed: int) -> list[tuple[str, Path]]:
+    """Names and files of the images of frames ``frames``, over the ground ``seed``."""
+    written = []
+    for i in frames:
+        path = folder / f"IMG_{i:04d}.jpg"
+        image = view(ground(seed), CAMERA, rotation(90.0), np.array([*place_of(i), AGL_M]))
+        cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
+        written.append((path.name, path))
+    return written
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the map of GROUND."""
+    folder = tmp_path_factory.mktemp("maps")
+    bands = np.ascontiguousarray(ground(GROUND)[..., ::-1].transpose(2, 0, 1))
+    build(map_rasters.utm(folder / "ground.tif", bands, pixel_m=GSD_M), folder / "ground.gpkg")
+    return folder
+
+
+class Watched:
+    """The events of a flight as they come."""
+
+    def __init__(self, client: ConsoleClient, flight_id: str) -> None:
+        self._stream = client.events(flight_id)
+        self.seen: list[Any] = []
+
+    def until(self, name: str, **fields: object) -> Any:
+        """The data of the next event of this name with these fields."""
+        end = time.monotonic() + WAIT_S
+        for event in self._stream:
+            self.seen.append(event)
+            if event.name == name and fields.items() <= event.data.items():
+                return event.data
+            assert time.monotonic() < end, f"no {name}"
+        raise AssertionError(f"the stream ended without {name}")
+
+
+def test_a_lost_flight_asks_goes_on_by_a_user_fix_and_is_refined_at_its_end(tmp_path: Path, maps: Path) -> None:
+    with Console(settings(tmp_path, workers=1, maps=(maps,))) as console:
+        client = ConsoleClient(console.url)
+        flight_id = client.create(NewFlight.model_validate(NEW)).flight_id
+        elsewhere = write_images(tmp_path, range(10), ELSEWHERE)
+        (accepted,) = client.upload(flight_id, elsewhere)
+        assert accepted.frames == [*range(10)]
+        watched = Watched(client, flight_id)
+        assert watched.until("state_changed")["state"] == "recovering"
+        needed = watched.until("user_input_needed")
+        assert 1 <= len(needed["candidate_tiles"]) <= 5
+        assert console.send("GET", needed["image_url"]).body == elsewhere[needed["frame_id"]][1].read_bytes()
+        assert watched.until("processing_blocked")["frame_id"] == needed["frame_id"]
+        watched.until("frame_processed", frame_id=9)
+        flight = client.flight(flight_id)
+        assert flight.state.value == "blocked" and flight.request is not None
+        assert flight.request.request_id == needed["request_id"]
+
+        lat, lon = lat_lon(place_of(9))
+        centre = PixelPoint(u=CAMERA.cx, v=CAMERA.cy)
+        steered = client.user_fix(flight_id, UserFix(frame_id=9, pixel=centre, lat=lat, lon=lon))
+        list(client.upload(flight_id, write_images(tmp_path, range(10, 20), GROUND)))
+        answered = watched.until("hint_answered")
+        assert (answered["hint_id"], answered["verdict"]) == (steered.hint_id, "accepted")
+        watched.until("search_expanded", status="found")
+        watched.until("frame_processed", frame_id=19)
+        assert client.flight(flight_id).state.value == "processing"
+
+        found = client.results(flight_id, first=19).results[0]
+        assert found.gps is not None and distance_m((found.gps.lat, found.gps.lon), place_of(19)) < 15.0
+        spot = client.locate(flight_id, 19, ObjectPixel(pixel_x=419.5, pixel_y=239.5))  # image up is east
+        south_m = 100.0 / CAMERA.fx * AGL_M
+        assert distance_m((spot.gps.lat, spot.gps.lon), place_of(19) - (0.0, south_m)) < spot.accuracy_meters + 5.0
+
+        assert client.complete(flight_id).completing
+        statistics = watched.until("flight_completed")["statistics"]
+        assert (statistics["frames"], statistics["hints"]) == (20, 1) and statistics["refined"] > 0
+        assert watched.until("state_changed")["state"] == "completed"
+        assert [event.event_id for event in watched.seen] == [*range(1, len(watched.seen) + 1)]
+        assert {event.name for event in watched.seen} >= {"frame_refined", "verdict_given"}
+        names = [file["name"] for file in console.send("GET", f"/flights/{flight_id}/recordings").json["files"]]
+        assert names == ["estimates.csv", "flight.mcap", "summary.json"]
+        record = console.send("GET", f"/flights/{flight_id}/recordings/flight.mcap")
+        assert record.body.startswith(b"\x89MCAP")
+        refined = [r for r in client.results(flight_id, refined=True).results if r.refined]
+        assert len(refined) == statistics["refined"]
+
+
+def distance_m(at: tuple[float, float], place_m: np.ndarray) -> float:
+    lat, lon = lat_lon(place_m)
+    return float(np.hypot((at[0] - lat) * 110_750.0, (at[1] - lon) * 111_320.0 * np.cos(np.radians(lat))))
+
+
+class Served:
+    """`terrafix serve` as a process."""
+
+    def __init__(self, data: Path, maps: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        words = ["serve", "--data", str(data), "--port", str(port), "--maps", str(maps), "--workers", "1"]
+        self.process = subprocess.Popen([sys.executable, "-m", "terrafix_tools.program", *words])
+        self.client = ConsoleClient(f"http://127.0.0.1:{port}")
+        self.console_url = f"http://127.0.0.1:{port}"
+        end = time.monotonic() + WAIT_S
+        while True:
+            with socket.socket() as trying:
+                if trying.connect_ex(("127.0.0.1", port)) == 0:
+                    return
+            assert time.monotonic() < end and self.process.poll() is None
+            time.sleep(0.05)
+
+
+def stored(client: ConsoleClient, flight_id: str) -> list[Any]:
+    """Results, refined results, fragments and events of a completed flight."""
+    events = [(event.name, event.data) for event in client.events(flight_id)]
+    results = [client.results(flight_id, refined=refined).results for refined in (False, True)]
+    return [results, client.flight(flight_id).fragments, events]
+
+
+def undisturbed(tmp_path: Path, maps: Path, images: list[tuple[str, Path]], new: NewFlight) -> list[Any]:
+    with Console(settings(tmp_path, workers=1, maps=(maps,))) as console:
+        client = ConsoleClient(console.url)
+        flight_id = client.create(new).flight_id
+        list(client.upload(flight_id, images))
+        client.complete(flight_id)
+        return stored(client, flight_id)
+
+
+def killed_at(data: Path, maps: Path, images: list[tuple[str, Path]], new: NewFlight) -> Iterator[Any]:
+    """Kills the service after some events, twice, and ends the third one in order."""
+    served = Served(data, maps)
+    flight_id = served.client.create(new).flight_id
+    list(served.client.upload(flight_id, images))
+    served.client.complete(flight_id)
+    for most in (3, 11):
+        for event in served.client.events(flight_id):
+            if event.event_id >= most:
+                break
+        served.process.kill()
+        served.process.wait()
+        served = Served(data, maps)
+    yield stored(served.client, flight_id)
+    served.process.send_signal(signal.SIGTERM)
+    yield served.process.wait(timeout=60)
+
+
+def test_a_service_that_is_killed_goes_on_to_the_same_results_and_events(tmp_path: Path, maps: Path) -> None:
+    lat, lon = lat_lon(place_of(10))
+    new = NewFlight.model_validate({**NEW, "start": {"lat": lat, "lon": lon}})
+    images = write_images(tmp_path, range(10, 20), GROUND)
+    expected = undisturbed(tmp_path / "calm", maps, images, new)
+    after_kills, exit_code = killed_at(tmp_path / "killed", maps, images, new)
+    assert after_kills == expected
+    assert exit_code == 0
