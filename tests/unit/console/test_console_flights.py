@@ -6,28 +6,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
-from pyproj import Transformer
 
-import map_rasters
+from console_flight import AGL_M, CAMERA, ELSEWHERE, GROUND, distance_m, lat_lon, make_map, place_of, write_images
 from console_rig import Console, settings
-from terrafix.core.camera import CameraCalibration
 from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.console.payloads import NewFlight, ObjectPixel, PixelPoint, UserFix
-from terrafix_tools.mapping.build import build
-from textured_ground import GSD_M, SIDE_M, rotation, texture, view
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
-CAMERA = CameraCalibration(640, 480, 380.0, 380.0, 319.5, 239.5)
-AGL_M, STEP_M = 80.0, 35.0
-GROUND, ELSEWHERE = 3, 8  # seeds of the ground of the map, and of another one
 WAIT_S = 300.0  # longest wait for a result; processes of others may take the processors
 NEW: dict[str, Any] = {
     "camera": {"width": 640, "height": 480, "fx": 380.0, "cx": 319.5, "cy": 239.5, "distortion": [0, 0, 0, 0]},
@@ -35,41 +25,13 @@ NEW: dict[str, Any] = {
     "height_m": AGL_M,
     "yaw_deg": 90.0,
 }
-TO_WGS84 = Transformer.from_crs(32651, 4326, always_xy=True)
-
-
-def place_of(i: int) -> np.ndarray:
-    """East and north of frame ``i`` from the middle of the map."""
-    return np.array([-170.0 + STEP_M * (i % 10), 60.0 - 100.0 * (i // 10)])
-
-
-def lat_lon(place_m: np.ndarray) -> tuple[float, float]:
-    lon, lat = TO_WGS84.transform(300_000.0 + SIDE_M / 2 + place_m[0], 2_600_000.0 - SIDE_M / 2 + place_m[1])
-    return lat, lon
-
-
-@cache
-def ground(seed: int) -> np.ndarray:
-    return texture(seed)
-
-
-def write_images(folder: Path, frames: range, seed: int) -> list[tuple[str, Path]]:
-    """Names and files of the images of frames ``frames``, over the ground ``seed``."""
-    written = []
-    for i in frames:
-        path = folder / f"IMG_{i:04d}.jpg"
-        image = view(ground(seed), CAMERA, rotation(90.0), np.array([*place_of(i), AGL_M]))
-        cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
-        written.append((path.name, path))
-    return written
 
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the map of GROUND."""
     folder = tmp_path_factory.mktemp("maps")
-    bands = np.ascontiguousarray(ground(GROUND)[..., ::-1].transpose(2, 0, 1))
-    build(map_rasters.utm(folder / "ground.tif", bands, pixel_m=GSD_M), folder / "ground.gpkg")
+    make_map(folder)
     return folder
 
 
@@ -137,11 +99,6 @@ def test_a_lost_flight_asks_goes_on_by_a_user_fix_and_is_refined_at_its_end(tmp_
         assert record.body.startswith(b"\x89MCAP")
         refined = [r for r in client.results(flight_id, refined=True).results if r.refined]
         assert len(refined) == statistics["refined"]
-
-
-def distance_m(at: tuple[float, float], place_m: np.ndarray) -> float:
-    lat, lon = lat_lon(place_m)
-    return float(np.hypot((at[0] - lat) * 110_750.0, (at[1] - lon) * 111_320.0 * np.cos(np.radians(lat))))
 
 
 class Served:

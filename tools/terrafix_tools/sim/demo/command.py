@@ -17,6 +17,7 @@ from terrafix.core.errors import EvaluationError, SourceError, UsageError
 from terrafix_tools.report.gather import gather
 from terrafix_tools.report.page import report
 from terrafix_tools.sim.autopilot.verdict import gps_input_failure, key_figures
+from terrafix_tools.sim.demo.console import URL, DemoConsole, console_beside
 from terrafix_tools.sim.demo.flight import fly
 from terrafix_tools.sim.flights.folder import FRAME_HZ, Flight, add_telemetry, plan_flight, write_flight
 from terrafix_tools.sim.out_folder import prepare_folder, write_json
@@ -37,19 +38,41 @@ class Generated:
     map_path: Path
 
 
-def demo(out: Path, *, seed: int, duration_s: float) -> int:
+def demo(out: Path, *, seed: int, duration_s: float, with_console: bool = False) -> int:
     """Writes map.gpkg, flight/, the record, peer.json and report.html into ``out``. Returns the exit code.
 
-    It is 0 only when the autopilot received GPS_INPUT, reported it healthy and used it. Raises subclasses of
-    TerrafixError.
+    It is 0 only when the autopilot received GPS_INPUT, reported it healthy and used it. ``with_console``: the console
+    shows the flight live, and stays open after it until Ctrl-C. Raises subclasses of TerrafixError.
     """
     if not MIN_DURATION_S <= duration_s <= MAX_DURATION_S:
         raise UsageError(f"--duration {duration_s:g}: choose {MIN_DURATION_S:g} to {MAX_DURATION_S:g} seconds")
     began_s = time.perf_counter()
     console = Console()
     prepare_folder(out, MARKER_FILE, {"seed": seed, "duration_s": duration_s})
+    with console_beside(out, with_console) as beside:
+        exit_code = _fly_and_report(out, seed, duration_s, console, beside)
+        console.print(f"done in {time.perf_counter() - began_s:.0f} s", highlight=False)
+        if beside is not None and beside.runs:
+            console.print(f"console  {URL} stays open until Ctrl-C", highlight=False, soft_wrap=True)
+            beside.wait()
+        elif beside is not None:
+            typer.echo(f"terrafix demo: the console has stopped; see {out / 'console.log'}", err=True)
+    return exit_code
+
+
+def _fly_and_report(out: Path, seed: int, duration_s: float, console: Console, beside: DemoConsole | None) -> int:
     generated = generate(out, seed, duration_s, console)
-    exit_code, peer = fly(generated.flight, generated.folder, generated.map_path, out, seed=seed, console=console)
+    if beside is not None:
+        console.print(f"console  {URL}", highlight=False, soft_wrap=True)
+    exit_code, peer = fly(
+        generated.flight,
+        generated.folder,
+        generated.map_path,
+        out,
+        seed=seed,
+        console=console,
+        on_start=None if beside is None else beside.start,
+    )
     peer.write(out / "peer.json")
     if exit_code != 0:
         typer.echo(
@@ -70,7 +93,6 @@ def demo(out: Path, *, seed: int, duration_s: float) -> int:
     for line in key_figures(evaluation, peer):
         console.print(line, highlight=False, soft_wrap=True)
     console.print(f"report   {page}", highlight=False, soft_wrap=True)
-    console.print(f"done in {time.perf_counter() - began_s:.0f} s", highlight=False)
     if problem:
         typer.echo(f"terrafix demo: GPS_INPUT was not used: {problem}; see {out / 'terrafix.log'}", err=True)
         return EXIT_FAILED

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,9 +69,18 @@ class Course:
 
 
 def fly(
-    flight: Flight, folder: Path, map_path: Path, out: Path, *, seed: int, console: Console
+    flight: Flight,
+    folder: Path,
+    map_path: Path,
+    out: Path,
+    *,
+    seed: int,
+    console: Console,
+    on_start: Callable[[], None] | None = None,
 ) -> tuple[int, PeerReport]:
-    """Flies ``folder`` over ``map_path`` in real time. Returns the supervisor's exit code and the peer's report."""
+    """Flies ``folder`` over ``map_path`` in real time. Returns the supervisor's exit code and the peer's report.
+
+    ``on_start`` is called when the first process has started, and again with each further one."""
     clock = FlightClock()
     peer = AutopilotPeer(seed=seed, home_amsl_m=flight.ground_amsl_m)
     landed = threading.Event()
@@ -84,7 +94,10 @@ def fly(
     def on_event(event: ProcessEvent) -> None:
         if event.event == "stopped":
             land()  # the processes end one after the other: messages from here on are not part of the flight
-        elif event.event != "started":
+        elif event.event == "started":
+            if on_start is not None:
+                on_start()
+        else:
             console.print(f"         {event.process} {event.event}: {event.detail}", highlight=False)
 
     port = peer.start(0, Course(flight), clock)

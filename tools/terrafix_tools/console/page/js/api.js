@@ -1,0 +1,68 @@
+// Requests to the service (docs/console.md). A refusal is a Problem with the service's own words.
+
+export class Problem extends Error {
+  constructor(status, detail) {
+    super(detail);
+    this.status = status; // 0: no answer
+  }
+}
+
+async function problemOf(response) {
+  let detail = response.statusText;
+  try {
+    const body = await response.json();
+    const where = (body.errors ?? []).map((e) => `${e.where}: ${e.what}`).join("; ");
+    detail = [body.detail || body.title, where].filter(Boolean).join(": ");
+  } catch { /* no JSON: the status line has to do */ }
+  return new Problem(response.status, detail);
+}
+
+async function request(method, path, body) {
+  let response;
+  try {
+    response = await fetch(path, {
+      method,
+      credentials: "same-origin",
+      headers: body === undefined ? {} : {"content-type": "application/json"},
+      body: body === undefined ? undefined : JSON.stringify(body),
+    });
+  } catch {
+    throw new Problem(0, "the service does not answer");
+  }
+  if (!response.ok) throw await problemOf(response);
+  return response.status === 204 ? null : response.json();
+}
+
+export const get = (path) => request("GET", path);
+export const post = (path, body) => request("POST", path, body);
+export const remove = (path) => request("DELETE", path);
+
+/** All results of a flight, over as many pages as it takes. */
+export async function allResults(flightId, refined) {
+  const found = [];
+  let from = 0;
+  while (from !== null) {
+    const page = await get(`/flights/${flightId}/results?refined=${refined}&from=${from}`);
+    found.push(...page.results);
+    from = page.next_from;
+  }
+  return found;
+}
+
+/** One batch of images. onBytes(sent) tells the progress, which fetch does not. */
+export function uploadBatch(flightId, form, onBytes) {
+  return new Promise((resolve, reject) => {
+    const sending = new XMLHttpRequest();
+    sending.open("POST", `/flights/${flightId}/images/batch`);
+    sending.responseType = "text";
+    sending.upload.onprogress = (event) => onBytes(event.loaded);
+    sending.onerror = () => reject(new Problem(0, "the service does not answer"));
+    sending.onload = () => {
+      let body = {};
+      try { body = JSON.parse(sending.responseText); } catch { /* as above */ }
+      if (sending.status === 202) resolve(body);
+      else reject(new Problem(sending.status, body.detail || sending.statusText));
+    };
+    sending.send(form);
+  });
+}

@@ -1,0 +1,166 @@
+// All texts of the page in English and German. What the service says (reasons, details) comes as it is, in English.
+
+const EN = {
+  // bar and pages
+  menu: "Pages and display", flights: "Flights", new_flight: "New flight", theme: "Colours", theme_system: "As the system", theme_light: "Light",
+  theme_dark: "Dark", language: "Language", sign_in: "Sign in", sign_out: "Sign out", token: "Token", role_operator: "Operator", role_viewer: "Viewer",
+  sign_in_why: "This service asks for a token. It is kept until the browser is closed, and no script can read it.", wrong_token: "There is no such token.",
+  not_shown: "This cannot be shown", again: "Try again", no_service: "The service does not answer",
+  no_service_why: "The page tries again every three seconds. Is terrafix serve running?", close: "Close", yes: "yes", no: "no",
+  list_lost: "The connection to the service is lost. The list below is old; the page tries again.",
+  service_line: "Terrafix {0} · {1} of {2} flights being computed · {3} waiting · {4} free on the disk",
+  no_flights: "There are no flights yet", no_flights_why: "Upload the photos of a flight, in batches of 10 to 50, and see each position as it is computed.",
+  or_live: "A Terrafix that runs on this computer appears here by itself when the service was started with", images_done: "{0} of {1} images",
+  asks: "asks for help", kind_live: "live", delete: "Delete", delete_named: "Delete flight {0}",
+  delete_sure: "Delete flight {0} with its images, results and recordings? This cannot be undone.",
+  state_processing: "processing", state_recovering: "searching", state_blocked: "position lost", state_completed: "completed", state_failed: "failed",
+  link_live: "connected", link_lost: "connection lost", link_connecting: "connecting",
+  // first line
+  glance: "Position at a glance", position: "Position", no_position: "No position", no_frames_yet: "no frames yet", ellipse95: "95 % ellipse",
+  within20: "within 20 m: {0}", not_known: "not known", height: "Height above ground", amsl: "{0} above sea level", heading: "Heading", true_north: "from true north",
+  speed: "{0} over ground", frame: "Frame", as_of: "as of {0}", updated: "updated {0} ago", completed_line: "flight completed", last_match: "Last map match",
+  no_match_yet: "none yet", now: "this frame", ago: "{0} ago", of_frame: "frame {0}", sent_fix: "Sent to autopilot", fix_3d: "3D fix", fix_none: "no fix",
+  no_facts: "Terrafix reports nothing at present", stale: "Old data", source_satellite_anchored: "map match", source_visual_propagated: "odometry",
+  source_dead_reckoned: "dead reckoning", source_none: "no position", search_widen: "search is widened", search_whole_map: "searching the whole map",
+  search_skip: "frame not usable", search_new_fragment: "new fragment", search_merge: "fragment tied", search_ask: "asks for a position",
+  lost_line: "Connection lost {0} ago. Everything below is as of {1}. Trying again.", lost_said: "Connection to the service lost",
+  // map
+  map: "Map", map_help: "Map. Arrow keys move it, plus and minus zoom; while measuring, Enter sets a point at the cross", zoom_in: "Zoom in", zoom_out: "Zoom out",
+  tools: "Map tools", follow: "Follow", fit: "Whole track", all_ellipses: "All ellipses", measure: "Measure", legend: "Source of a position",
+  measure_how: "Click points on the map, or press Enter at the cross. Escape ends it.", no_such_map: "The service has no map named {0}; start it with --maps FOLDER.",
+  map_preparing: "is being fetched", map_failed: "failed:", details: "Details",
+  // frame
+  frame_help: "Click a pixel for its position. Keys: arrows move the cross, with Shift by one pixel, Enter chooses", frame_gone: "This frame is no longer in memory.",
+  frame_number: "Frame {0}", frame_alt: "Camera image of frame {0}", previous: "Previous frame", next: "Next frame", newest: "Newest", enlarge: "Large or small",
+  match_line: "match {0}{1}", inliers: " · {0} inliers", no_match: "no map match", locating: "The position of the pixel is being computed …",
+  // tabs
+  tab_overview: "Flight", tab_verdicts: "Verdicts", tab_autopilot: "Autopilot", tab_system: "System", tab_log: "Events", tab_objects: "Objects", tab_export: "Export",
+  images: "Images", frames_shown: "Frames with a result", start: "Start", no_start: "none given: the whole map is searched", localised: "Localised", refined: "Refined",
+  of: "{0} of {1}", median95: "Median 95 % radius", fragments: "Fragments", fragment: "No.", frames: "Frames", count: "Count", tie: "Tie", joined: "tied to the flight",
+  not_joined: "not tied yet", none_yet: "None yet.", only_rejected: "Only rejected ones", measurement: "Measurement", verdict: "Verdict", ratio: "Test ratio", detail: "Detail",
+  no_verdicts: "No verdicts yet.", batch_system: "This flight is computed from images: it has no processes, heat or rates of its own. Below is the service.",
+  version: "Version", workers: "Flights being computed", waiting: "Flights waiting", disk: "Free disk space", processes: "Processes", process: "Process", state: "State",
+  progress: "Last progress", load: "Load", restarts: "Restarts", last_event: "Last event", process_running: "running", process_starting: "starting",
+  process_stuck: "stuck", process_given_up: "given up", process_stopped: "stopped", heat: "Heat and power", temperature: "Temperature", throttled: "Throttled", power: "Power",
+  rates: "Rates", delay: "Camera to position", accepted_share: "Map matches accepted", dropped: "Dropped messages", nothing_dropped: "None.",
+  batch_autopilot: "This flight is computed from images: nothing is sent to an autopilot, and no GNSS is judged.", sent_title: "What the autopilot is sent",
+  accuracy: "Accuracy", estimate_age: "Age of the estimate", degradation: "Degradation", covariance: "Covariance", resets: "Position resets", messages: "Messages",
+  messages_line: "{0} sent, {1} received, {2} bad bytes, {3} refused", autopilot: "Autopilot", link: "Link", no_autopilot: "no autopilot", uses: "Uses the position",
+  ekf_ratio: "Position test ratio", ekf_source: "Source of its position", gnss: "GNSS, as judged", receiver: "Receiver", distance: "Distance", why: "Why",
+  no_gnss: "No receiver.", texts: "Messages of the autopilot", no_events: "No events yet.", ev_search: "Frame {0}: search over {1}, {2}", whole_map: "the whole map", tiles: "{0} tiles",
+  searching_widen: "widened", searching_whole_map: "widened", searching_found: "found", ev_input: "Frame {0}: the flight asks where it was taken", ev_blocked: "Blocked: {0}",
+  ev_merged: "Fragment {0} ({1} frames) is tied to the flight at frame {2}", ev_state: "State: {0} → {1}", ev_hint: "Given position: {0}. {1}", ev_completed: "Flight completed and refined",
+  objects_why: "Click a pixel of a frame: its position appears here, with the radius that contains it with 95 %.", object: "Object", accuracy95: "95 % radius", altitude: "Altitude",
+  surface: "Surface", surface_points: "own points", surface_elevation: "elevation of the map", surface_plane: "plane", refined_results: "Refined results",
+  immediate_results: "Immediate results", recordings: "Recordings", viewer: "You may look only: acting needs the token of an operator.",
+  add_photos: "Add photos", complete: "Complete the flight", complete_sure: "No more images follow? The flight is then refined as a whole.", give_position: "Give a position",
+  // upload
+  photos: "Photos", photos_why: "At least {0}, JPEG or PNG, in the order of their names.", f_images: "Images", f_table: "Telemetry (frames.csv), if the images state none",
+  f_renumber: "Number the images in this order, because their numbers have gaps", f_name: "Name of the flight", chosen: "{0} images, {1} to {2}", no_image: "{0} is no image.",
+  camera: "Camera", f_width: "Width [px]", f_height: "Height [px]", f_fx: "Focal length [px]", f_focal_mm: "or focal length [mm]", f_sensor_width_mm: "and sensor width [mm]",
+  f_pitch_deg: "Camera pitch [°] (−90: down)", f_mount_yaw_deg: "Camera yaw [°]", f_tolerance_deg: "Tolerance of the mount [°]", map_and_start: "Map and start",
+  no_maps: "The service has no maps; start it with --maps FOLDER.", start_why: "Click the start on the map. Without a start the whole map is searched.",
+  f_lat: "Latitude of the start [°]", f_lon: "Longitude of the start [°]", f_sigma_m: "1 σ of the start [m]", f_agl_m: "Height above ground [m], if the images state none",
+  f_yaw_deg: "Heading [°], if the images state none", create_and_upload: "Create the flight and upload", too_few: "Choose at least {0} images.",
+  no_focal: "Give the focal length in pixels, or in millimetres with the width of the sensor.", no_file_column: "The first column of the telemetry is not 'file'.",
+  no_row: "The telemetry has no row for {0}.", upload: "Upload", upload_line: "batch {0} of {1} · {2} of {3}", remaining: "{0} left", upload_done: "{0} images, {1}: uploaded",
+  upload_again: "{0}; the batch is sent again", upload_failed: "The upload has stopped; add the remaining photos again.",
+  renumber_sure: "The numbers of these names do not continue the flight. Number the images from {0} in this order?",
+  // ask for help
+  ask_banner: "The position is lost: where was frame {0} taken?", help: "Help the flight", ask_title: "Where was frame {0} taken?",
+  ask_how: "Find something in the image that the map shows as well: a corner, a crossing, a tree. Keys 1 to 5 choose a place, arrows move image cross or map, Enter sets a point.",
+  ask_step1: "1 · Click it in the image", ask_step2: "2 · Click it on the map", best_places: "The best places, in this order", no_places: "No place stands out: find it on the map.",
+  send_fix: "Send: this pixel lies there", send_hint: "Send the circle", or_hint: "or, if only roughly known:", radius: "radius",
+  ask_ready: "Pixel {0} of the image lies at {1}, to 5 m.", ask_need_place: "Pixel {0}: now click the place on the map.", ask_need_pixel: "{0}: now click the pixel in the image, or send a circle.",
+  ask_need_both: "Nothing chosen yet.", fix_sent: "Sent: {0}",
+};
+
+const DE = {
+  menu: "Seiten und Anzeige", flights: "Flüge", new_flight: "Neuer Flug", theme: "Farben", theme_system: "Wie das System", theme_light: "Hell", theme_dark: "Dunkel",
+  language: "Sprache", sign_in: "Anmelden", sign_out: "Abmelden", token: "Zugangsschlüssel", role_operator: "Bedienung", role_viewer: "Nur Ansicht",
+  sign_in_why: "Dieser Dienst verlangt einen Zugangsschlüssel. Er bleibt bis zum Schließen des Browsers gespeichert; kein Skript kann ihn lesen.",
+  wrong_token: "Diesen Zugangsschlüssel gibt es nicht.", not_shown: "Das lässt sich nicht anzeigen", again: "Erneut versuchen", no_service: "Der Dienst antwortet nicht",
+  no_service_why: "Die Seite versucht es alle drei Sekunden erneut. Läuft terrafix serve?", close: "Schließen", yes: "ja", no: "nein",
+  list_lost: "Die Verbindung zum Dienst ist unterbrochen. Die Liste unten ist veraltet; die Seite versucht es erneut.",
+  service_line: "Terrafix {0} · {1} von {2} Flügen in Berechnung · {3} in der Warteschlange · {4} freier Speicherplatz",
+  no_flights: "Noch keine Flüge vorhanden", no_flights_why: "Die Fotos eines Fluges in Gruppen von 10 bis 50 hochladen und jede Position sehen, sobald sie berechnet ist.",
+  or_live: "Ein Terrafix auf diesem Rechner erscheint hier von selbst, wenn der Dienst so gestartet wurde:", images_done: "{0} von {1} Bildern",
+  asks: "bittet um Hilfe", kind_live: "live", delete: "Löschen", delete_named: "Flug {0} löschen",
+  delete_sure: "Flug {0} mit Bildern, Ergebnissen und Aufzeichnungen löschen? Das lässt sich nicht rückgängig machen.",
+  state_processing: "in Berechnung", state_recovering: "Positionssuche", state_blocked: "Position verloren", state_completed: "abgeschlossen", state_failed: "fehlgeschlagen",
+  link_live: "verbunden", link_lost: "Verbindung unterbrochen", link_connecting: "Verbindungsaufbau",
+  glance: "Position auf einen Blick", position: "Position", no_position: "Keine Position", no_frames_yet: "noch keine Bilder", ellipse95: "95-%-Ellipse",
+  within20: "innerhalb 20 m: {0}", not_known: "unbekannt", height: "Höhe über Grund", amsl: "{0} über NN", heading: "Steuerkurs", true_north: "rechtweisend",
+  speed: "{0} über Grund", frame: "Einzelbild", as_of: "Stand {0}", updated: "vor {0} aktualisiert", completed_line: "Flug abgeschlossen", last_match: "Letzter Kartenabgleich",
+  no_match_yet: "noch keiner", now: "dieses Bild", ago: "vor {0}", of_frame: "Bild {0}", sent_fix: "An den Autopiloten gesendet", fix_3d: "3D-Position", fix_none: "keine Position",
+  no_facts: "Terrafix meldet derzeit nichts", stale: "Veraltet", source_satellite_anchored: "Kartenabgleich", source_visual_propagated: "optische Wegmessung",
+  source_dead_reckoned: "Koppelnavigation", source_none: "keine Position", search_widen: "Suche wird ausgeweitet", search_whole_map: "Suche auf der ganzen Karte",
+  search_skip: "Bild nicht verwertbar", search_new_fragment: "neues Teilstück", search_merge: "Teilstück verbunden", search_ask: "bittet um eine Position",
+  lost_line: "Verbindung seit {0} unterbrochen. Alle Werte unten haben den Stand {1}. Neuer Versuch läuft.", lost_said: "Verbindung zum Dienst unterbrochen",
+  map: "Karte", map_help: "Karte. Pfeiltasten verschieben, Plus und Minus ändern den Maßstab; beim Messen setzt die Eingabetaste einen Punkt am Fadenkreuz", zoom_in: "Vergrößern",
+  zoom_out: "Verkleinern", tools: "Kartenwerkzeuge", follow: "Mitführen", fit: "Gesamte Flugspur", all_ellipses: "Alle Fehlerellipsen", measure: "Messen",
+  legend: "Herkunft einer Position", measure_how: "Punkte auf der Karte anklicken oder am Fadenkreuz die Eingabetaste drücken. Escape beendet die Messung.",
+  no_such_map: "Der Dienst hat keine Karte namens {0}; mit --maps ORDNER starten.", map_preparing: "wird geladen", map_failed: "fehlgeschlagen:", details: "Einzelheiten",
+  frame_help: "Einen Bildpunkt anklicken, um seine Position zu erfahren. Tasten: Pfeile bewegen das Fadenkreuz, mit Umschalttaste um einen Bildpunkt, Eingabe wählt",
+  frame_gone: "Dieses Einzelbild ist nicht mehr im Speicher.", frame_number: "Einzelbild {0}", frame_alt: "Kamerabild des Einzelbilds {0}", previous: "Vorheriges Einzelbild",
+  next: "Nächstes Einzelbild", newest: "Neuestes", enlarge: "Groß oder klein", match_line: "Abgleich {0}{1}", inliers: " · {0} übereinstimmende Punkte", no_match: "kein Kartenabgleich",
+  locating: "Die Position des Bildpunkts wird berechnet …",
+  tab_overview: "Flug", tab_verdicts: "Messurteile", tab_autopilot: "Autopilot", tab_system: "System", tab_log: "Ereignisse", tab_objects: "Objekte", tab_export: "Ausgabe",
+  images: "Bilder", frames_shown: "Einzelbilder mit Ergebnis", start: "Startpunkt", no_start: "nicht angegeben: die ganze Karte wird durchsucht", localised: "Lokalisiert",
+  refined: "Nachträglich verfeinert", of: "{0} von {1}", median95: "Mittlerer 95-%-Radius", fragments: "Teilstücke", fragment: "Nr.", frames: "Einzelbilder", count: "Anzahl", tie: "Anbindung",
+  joined: "mit dem Flug verbunden", not_joined: "noch nicht verbunden", none_yet: "Noch keine.", only_rejected: "Nur abgelehnte", measurement: "Messung", verdict: "Urteil",
+  ratio: "Testgröße", detail: "Einzelheit", no_verdicts: "Noch keine Messurteile.",
+  batch_system: "Dieser Flug wird aus Bildern berechnet: er hat keine eigenen Prozesse, Temperaturen oder Raten. Unten steht der Dienst.",
+  version: "Version", workers: "Flüge in Berechnung", waiting: "Wartende Flüge", disk: "Freier Speicherplatz", processes: "Prozesse", process: "Prozess", state: "Zustand",
+  progress: "Letzter Fortschritt", load: "Auslastung", restarts: "Neustarts", last_event: "Letztes Ereignis", process_running: "läuft", process_starting: "startet",
+  process_stuck: "hängt", process_given_up: "aufgegeben", process_stopped: "beendet", heat: "Temperatur und Leistung", temperature: "Temperatur", throttled: "Takt gedrosselt",
+  power: "Leistungsaufnahme", rates: "Raten", delay: "Kamera bis Position", accepted_share: "Angenommene Kartenabgleiche", dropped: "Verworfene Nachrichten", nothing_dropped: "Keine.",
+  batch_autopilot: "Dieser Flug wird aus Bildern berechnet: es wird nichts an einen Autopiloten gesendet und kein GNSS beurteilt.", sent_title: "An den Autopiloten gesendet",
+  accuracy: "Genauigkeit", estimate_age: "Alter der Schätzung", degradation: "Einschränkung", covariance: "Kovarianz", resets: "Positionssprünge", messages: "Nachrichten",
+  messages_line: "{0} gesendet, {1} empfangen, {2} fehlerhafte Bytes, {3} abgelehnt", autopilot: "Autopilot", link: "Verbindung", no_autopilot: "kein Autopilot",
+  uses: "Verwendet die Position", ekf_ratio: "Testgröße der Position", ekf_source: "Quelle seiner Position", gnss: "Beurteilung des GNSS", receiver: "Empfänger",
+  distance: "Abstand", why: "Begründung", no_gnss: "Kein Empfänger.", texts: "Meldungen des Autopiloten", no_events: "Noch keine Ereignisse.",
+  ev_search: "Einzelbild {0}: Suche über {1}, {2}", whole_map: "die ganze Karte", tiles: "{0} Kacheln", searching_widen: "ausgeweitet", searching_whole_map: "ausgeweitet",
+  searching_found: "gefunden", ev_input: "Einzelbild {0}: der Flug fragt nach dem Aufnahmeort", ev_blocked: "Blockiert: {0}",
+  ev_merged: "Teilstück {0} ({1} Einzelbilder) ist ab Einzelbild {2} mit dem Flug verbunden", ev_state: "Zustand: {0} → {1}", ev_hint: "Angegebene Position: {0}. {1}",
+  ev_completed: "Flug abgeschlossen und verfeinert", objects_why: "Einen Bildpunkt anklicken: seine Position erscheint hier, mit dem Radius, der sie mit 95 % enthält.",
+  object: "Objekt", accuracy95: "95-%-Radius", altitude: "Höhe", surface: "Oberfläche", surface_points: "eigene Punkte", surface_elevation: "Geländehöhe der Karte",
+  surface_plane: "Ebene", refined_results: "Verfeinerte Ergebnisse", immediate_results: "Sofortergebnisse", recordings: "Aufzeichnungen",
+  viewer: "Nur Ansicht: zum Handeln ist ein Zugangsschlüssel der Bedienung nötig.", add_photos: "Fotos hinzufügen", complete: "Flug abschließen",
+  complete_sure: "Folgen keine Bilder mehr? Der Flug wird dann als Ganzes verfeinert.", give_position: "Position angeben",
+  photos: "Fotos", photos_why: "Mindestens {0}, JPEG oder PNG, in der Reihenfolge ihrer Namen.", f_images: "Bilder", f_table: "Telemetrie (frames.csv), falls die Bilder keine enthalten",
+  f_renumber: "Bilder in dieser Reihenfolge nummerieren, weil ihre Nummern Lücken haben", f_name: "Name des Fluges", chosen: "{0} Bilder, {1} bis {2}", no_image: "{0} ist kein Bild.",
+  camera: "Kamera", f_width: "Breite [px]", f_height: "Höhe [px]", f_fx: "Brennweite [px]", f_focal_mm: "oder Brennweite [mm]", f_sensor_width_mm: "und Sensorbreite [mm]",
+  f_pitch_deg: "Kameraneigung [°] (−90: abwärts)", f_mount_yaw_deg: "Kameradrehung [°]", f_tolerance_deg: "Toleranz der Halterung [°]", map_and_start: "Karte und Startpunkt",
+  no_maps: "Der Dienst hat keine Karten; mit --maps ORDNER starten.", start_why: "Den Startpunkt auf der Karte anklicken. Ohne Startpunkt wird die ganze Karte durchsucht.",
+  f_lat: "Geografische Breite des Starts [°]", f_lon: "Geografische Länge des Starts [°]", f_sigma_m: "1 σ des Starts [m]", f_agl_m: "Höhe über Grund [m], falls die Bilder keine enthalten",
+  f_yaw_deg: "Steuerkurs [°], falls die Bilder keinen enthalten", create_and_upload: "Flug anlegen und hochladen", too_few: "Mindestens {0} Bilder auswählen.",
+  no_focal: "Die Brennweite in Bildpunkten angeben oder in Millimetern mit der Breite des Sensors.", no_file_column: "Die erste Spalte der Telemetrie ist nicht 'file'.",
+  no_row: "Die Telemetrie hat keine Zeile für {0}.", upload: "Hochladen", upload_line: "Gruppe {0} von {1} · {2} von {3}", remaining: "noch {0}", upload_done: "{0} Bilder, {1}: hochgeladen",
+  upload_again: "{0}; die Gruppe wird erneut gesendet", upload_failed: "Das Hochladen wurde abgebrochen; die übrigen Fotos erneut hinzufügen.",
+  renumber_sure: "Die Nummern dieser Namen setzen den Flug nicht fort. Die Bilder in dieser Reihenfolge ab {0} nummerieren?",
+  ask_banner: "Die Position ist verloren: wo wurde Einzelbild {0} aufgenommen?", help: "Dem Flug helfen", ask_title: "Wo wurde Einzelbild {0} aufgenommen?",
+  ask_how: "Etwas im Bild suchen, das auch die Karte zeigt: eine Ecke, eine Kreuzung, einen Baum. Tasten 1 bis 5 wählen einen Ort, Pfeile bewegen Fadenkreuz oder Karte, Eingabe setzt einen Punkt.",
+  ask_step1: "1 · Im Bild anklicken", ask_step2: "2 · Auf der Karte anklicken", best_places: "Die besten Orte in dieser Reihenfolge", no_places: "Kein Ort sticht hervor: auf der Karte suchen.",
+  send_fix: "Senden: dieser Bildpunkt liegt dort", send_hint: "Umkreis senden", or_hint: "oder, falls nur ungefähr bekannt:", radius: "Radius",
+  ask_ready: "Bildpunkt {0} liegt auf 5 m genau bei {1}.", ask_need_place: "Bildpunkt {0}: jetzt den Ort auf der Karte anklicken.",
+  ask_need_pixel: "{0}: jetzt den Bildpunkt anklicken oder einen Umkreis senden.", ask_need_both: "Noch nichts ausgewählt.", fix_sent: "Gesendet: {0}",
+};
+
+const TABLES = {en: EN, de: DE};
+export const LANGUAGES = Object.keys(TABLES);
+let current = "en";
+
+export const language = () => current;
+export const locale = () => (current === "de" ? "de-DE" : "en-GB");
+
+export function setLanguage(name) {
+  current = LANGUAGES.includes(name) ? name : "en";
+  document.documentElement.lang = current;
+}
+
+/** The text of a key, {0} and so on replaced. A key that is no text is a word of the service: it is shown as it came. */
+export function t(key, ...values) {
+  const text = TABLES[current][key] ?? EN[key] ?? key.slice(key.indexOf("_") + 1).replaceAll("_", " ");
+  return text.replace(/\{(\d)\}/g, (_, i) => String(values[Number(i)]));
+}

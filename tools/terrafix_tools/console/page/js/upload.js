@@ -1,0 +1,107 @@
+// Photos in batches. A batch that got no answer is sent again as it is: the service takes it once.
+
+import {Problem, uploadBatch} from "./api.js";
+import {h, say} from "./dom.js";
+import {bytes, number, seconds} from "./format.js";
+import {t} from "./texts.js";
+
+export const BATCH = [10, 50];
+const TRIES = 8;
+const NUMBER = /(\d+)\.[^.]*$/;
+
+/** Sizes of the batches for n images: as few as possible, as equal as possible. */
+export function batchSizes(n) {
+  const count = Math.ceil(n / BATCH[1]);
+  return Array.from({length: count}, (_, i) => Math.floor((n + i) / count));
+}
+
+export const inOrder = (files) => [...files].sort((a, b) => a.name.localeCompare(b.name, "en", {numeric: true}));
+
+/** Whether each number at the end of the names is the one before plus one, beginning with next (null: any). */
+export function isSequence(names, next = null) {
+  const numbers = names.map((name) => Number(name.match(NUMBER)?.[1] ?? NaN));
+  return numbers.every((value, i) => value === (i ? numbers[i - 1] + 1 : next ?? value));
+}
+
+/** [{name, file}] as they are sent; with ``first`` under numbers of their own from there on. */
+export function named(files, first) {
+  return files.map((file, i) => ({
+    file,
+    name: first === null ? file.name : `image-${String(first + i).padStart(6, "0")}${file.name.match(/\.[^.]*$/)?.[0] ?? ".jpg"}`,
+  }));
+}
+
+/** Header and rows of a frames.csv by file name. Throws an Error: a column or a row is missing. */
+export function readTable(text, files) {
+  const lines = text.replace(/^\uFEFF/, "").split(/\r?\n/).filter((line) => line.trim());
+  if (!/^file\s*,/.test(lines[0] ?? "")) throw new Error(t("no_file_column"));
+  const rows = new Map(lines.slice(1).map((line) => [line.slice(0, line.indexOf(",")).trim(), line.slice(line.indexOf(",") + 1)]));
+  const missing = files.find((file) => !rows.has(file.name));
+  if (missing) throw new Error(t("no_row", missing.name));
+  return {header: lines[0], rows};
+}
+
+export class Upload {
+  /** images: result of ``named``; table: of ``readTable`` or null. ``element`` shows the progress. */
+  constructor(flightId, images, table) {
+    this.flightId = flightId;
+    this.images = images;
+    this.table = table;
+    this.total = images.reduce((sum, image) => sum + image.file.size, 0);
+    this.bar = h("progress", {max: 1, value: 0, "aria-label": t("upload")});
+    this.line = h("p", {});
+    this.element = h("section", {class: "upload card"}, h("strong", {}, t("upload")), this.bar, this.line);
+  }
+
+  async run() {
+    const began = performance.now();
+    const sizes = batchSizes(this.images.length);
+    let at = 0;
+    let done = 0;
+    for (const [i, size] of sizes.entries()) {
+      const batch = this.images.slice(at, at + size);
+      const weight = batch.reduce((sum, image) => sum + image.file.size, 0);
+      const show = (sent) => this.show(done + Math.min(sent, weight), i, sizes.length, (performance.now() - began) / 1000);
+      show(0);
+      await this.send(batch, show);
+      at += size;
+      done += weight;
+    }
+    this.show(this.total, sizes.length - 1, sizes.length, (performance.now() - began) / 1000);
+    this.line.textContent = t("upload_done", number(this.images.length), bytes(this.total));
+    say(this.line.textContent);
+  }
+
+  async send(batch, show) {
+    for (let attempt = 0; ; attempt++) {
+      try {
+        return await uploadBatch(this.flightId, this.form(batch), show);
+      } catch (error) {
+        const again = error instanceof Problem && [0, 429, 503].includes(error.status);
+        if (!again || attempt === TRIES) {
+          this.line.textContent = error.message;
+          this.element.classList.add("bad");
+          throw error;
+        }
+        this.line.textContent = t("upload_again", error.message);
+        await new Promise((resolve) => setTimeout(resolve, Math.min(500 * 2 ** attempt, 8000)));
+      }
+    }
+  }
+
+  form(batch) {
+    const form = new FormData();
+    for (const {name, file} of batch) form.append("images", file, name);
+    if (this.table) {
+      const rows = batch.map(({name, file}) => `${name},${this.table.rows.get(file.name)}`);
+      form.append("telemetry", new Blob([[this.table.header, ...rows].join("\n")], {type: "text/csv"}), "frames.csv");
+    }
+    return form;
+  }
+
+  show(sent, batch, batches, time) {
+    this.bar.value = this.total ? sent / this.total : 0;
+    const left = sent > 0 && sent < this.total ? t("remaining", seconds(time / sent * (this.total - sent))) : "";
+    this.line.textContent = [t("upload_line", number(batch + 1), number(batches), bytes(sent), bytes(this.total)), left].filter(Boolean).join(" · ");
+  }
+}
