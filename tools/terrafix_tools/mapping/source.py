@@ -93,7 +93,7 @@ class ImagerySource:
             mask = np.where(np.isfinite(bands).all(axis=0), mask, 0)
         picture = self._to_bytes(bands)
         image = cv2.merge([picture[-1], picture[len(picture) // 2], picture[0]])  # three bands or one; BGR
-        return image, cv2.compare(mask, 0, cv2.CMP_GT)
+        return image, cv2.threshold(mask, 0, 255, cv2.THRESH_BINARY)[1]
 
     def _read_bands(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
         """-> the chosen bands, (n, h, w), and the mask, (h, w) uint8, not zero where valid."""

@@ -38,7 +38,10 @@ class Collar:
             return
         # Only around the collar: most of a window has none.
         left, top, width, height = cv2.boundingRect(empty)
-        near = slice(max(0, top - REACH_PX), top + height + REACH_PX), slice(max(0, left - REACH_PX), left + width + REACH_PX)
+        near = (
+            slice(max(0, top - REACH_PX), top + height + REACH_PX),
+            slice(max(0, left - REACH_PX), left + width + REACH_PX),
+        )
         image, mask, empty = image[near], mask[near], empty[near]
         smeared = _empty(image, BLEED_LEVEL)
         kernel = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -104,7 +107,7 @@ class _ReachedBlocks:
         first = self.first[place] = len(self.sets.parent) - 1
         empty = _empty_areas(source, place)
         # Kept, because reading them again takes five times as long; a block becomes a few kilobytes.
-        self._packed[place] = (empty.shape[0], empty.shape[1]), zlib.compress(np.packbits(empty), level=1)
+        self._packed[place] = (empty.shape[0], empty.shape[1]), zlib.compress(np.packbits(empty).tobytes(), level=1)
         labels = cv2.connectedComponents(empty, connectivity=4)[1]
         self.sets.add(np.bincount(labels[empty > 0])[1:])
         for side in SIDES:

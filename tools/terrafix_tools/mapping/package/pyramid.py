@@ -206,7 +206,7 @@ def halve(tile: np.ndarray, whole: bool = False) -> np.ndarray:
     total = parts[..., :3].sum(axis=(1, 2))  # invalid pixels are zero
     count = np.count_nonzero(parts[..., 3], axis=(1, 2))[:, None]
     out[rows, columns, :3] = (total + count // 2) // count
-    valid = cv2.compare(share, 64, cv2.CMP_GT)
+    valid = cv2.threshold(share, 64, 255, cv2.THRESH_BINARY)[1]
     return cv2.copyTo(cv2.insertChannel(valid, out, 3), valid)
 
 
