@@ -20,6 +20,8 @@ class Process:
     nice: int = 0  # above 0: gets what the processes with 0 leave of a busy processor
 
 
+SMOOTHER = "smoother"  # the process that `[smoother] enabled = false` leaves out
+
 # Publishers besides the processes of the table.
 SOURCE = "source"  # publisher of the messages that are fed into the in-process shell
 SUPERVISOR = "supervisor"  # publishes ProcessEvent
@@ -139,7 +141,7 @@ PROCESSES: tuple[Process, ...] = (
         (m.Odometry,),  # a frame that waits while a newer one is there only delays that one
     ),
     Process(
-        "smoother",
+        SMOOTHER,
         "terrafix.smoother.node",
         (m.Origin, m.Prediction, m.PoseLink, m.PoseAnchor),
         (m.Refinement, m.InputOrder),

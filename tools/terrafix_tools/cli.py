@@ -114,9 +114,9 @@ def run(
     if previous_run is not None:
         package, ground_amsl_m = map_path, previous_run.ground_amsl_m
     else:
-        from terrafix_tools.live import package_for
+        from terrafix_tools.live import package_for_in_child
 
-        package, ground_amsl_m = package_for(source, start, map_path, configs)
+        package, ground_amsl_m = package_for_in_child(source, start, map_path, configs)
     with _run_line() as on_run_dir:
         code = run_supervised(
             source=source,

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.errors import EvaluationError, OutputError
+from terrafix.core.gate import CHI2_95
 from terrafix.core.toml_file import read_toml
 from terrafix.recorder.reader import ReadResult, check_format, is_record, read_flight
 from terrafix_tools.estimates import ESTIMATES, Row, RowTable, number, read_rows, read_table
@@ -21,7 +22,6 @@ from terrafix_tools.finalise.output import TABLE as FINALISED
 
 WEIGHTS_FREE = "gradient"  # beginning of MapMatch.matcher of a frame for which no learned model ran
 LIMITS_M = (5, 10, 20, 50)
-ELLIPSE95 = 5.991  # chi-square quantile, 2 degrees of freedom, 95 %
 FALSE_FIX_ERROR_M = 50.0
 # "> 3 sigma": the squared Mahalanobis distance under the reported 2x2 covariance exceeds 3^2
 FALSE_FIX_MAHALANOBIS2 = 9.0
@@ -154,7 +154,7 @@ def metrics(
     result: dict[str, Any] = {"frames": frames, "localised": len(located)}
     result |= _errors(errors_m, frames, "") | _errors(refined_m, frames, "refined_")
     result |= {
-        "ellipse95_coverage": sum(v <= ELLIPSE95 for v in nees) / len(located) if located else None,
+        "ellipse95_coverage": sum(v <= CHI2_95 for v in nees) / len(located) if located else None,
         "mean_nees": float(np.mean(nees)) if nees else None,
         "false_fixes": sum(is_false_fix(c) for c in located),
         "anchor_rate": sum(c.row.anchor_age_ms == 0 for c in compared) / frames,
@@ -169,7 +169,7 @@ def metrics(
     }
     if truth_sigma_m is not None:
         inflated = [mahalanobis2(c.row, c.error_e_m or 0.0, c.error_n_m or 0.0, truth_sigma_m) for c in located]
-        inside = sum(v is not None and v <= ELLIPSE95 for v in inflated)
+        inside = sum(v is not None and v <= CHI2_95 for v in inflated)
         result["truth_sigma_m"] = truth_sigma_m
         result["ellipse95_coverage_with_truth_sigma"] = inside / len(located) if located else None
     return {key: round(value, 6) if isinstance(value, float) else value for key, value in result.items()}

@@ -1,16 +1,18 @@
 """Preparation of `terrafix run` before the supervisor starts: map package and check that it covers the start."""
 
+import json
 import os
+import signal
+import sys
+import traceback
 from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
-from terrafix.core.config import load
-from terrafix.core.errors import MapError
-from terrafix.core.initial_position import map_center, start_is_unknown
-from terrafix.core.signature import trusted_keys
-from terrafix.map.package import MapPackage
-from terrafix.vision.sources import open_configured, parse_start
-from terrafix.vision.sources.description import START_SIGMA_M
-from terrafix_tools.flight_map import package_of
+from terrafix.core.errors import ERROR_OF_EXIT_CODE, MapError, TerrafixError
+from terrafix.runtime.fork_server import set_parent_death_signal
+
+if TYPE_CHECKING:
+    from terrafix.map.package import MapPackage
 
 
 def package_for(source: str, start: str, map_path: Path | None, configs: list[Path]) -> tuple[Path, float | None]:
@@ -21,6 +23,15 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     covers its start; a live camera is not opened, since only one process can hold it.
     Raises ConfigError, SourceError, UsageError, MapError.
     """
+    # Imported here: `package_for_in_child` is called in a process that shall not load these.
+    from terrafix.core.config import load
+    from terrafix.core.initial_position import map_center, start_is_unknown
+    from terrafix.core.signature import trusted_keys
+    from terrafix.map.package import MapPackage
+    from terrafix.vision.sources import open_configured, parse_start
+    from terrafix.vision.sources.description import START_SIGMA_M
+    from terrafix_tools.flight_map import package_of
+
     config = load(configs)
     spec = source or config.source.path
     map_file = map_path or (Path(config.map.path) if config.map.path else None)
@@ -57,7 +68,52 @@ def package_for(source: str, start: str, map_path: Path | None, configs: list[Pa
     return package, ground_amsl_m
 
 
-def swapped_hint(opened: MapPackage, lat_deg: float, lon_deg: float, sigma_m: float) -> str:
+def package_for_in_child(
+    source: str, start: str, map_path: Path | None, configs: list[Path]
+) -> tuple[Path, float | None]:
+    """``package_for`` in a child process, whose memory is free again before the flight: the libraries that open a map
+    and a source take 45 MB, and the supervisor needs none of them. To be called before this process has threads."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    reading, writing = os.pipe()
+    parent_pid, child_pid = os.getpid(), os.fork()
+    if child_pid == 0:
+        os.close(reading)
+        set_parent_death_signal(parent_pid, signal.SIGKILL)
+        _answer(writing, source, start, map_path, configs)
+    os.close(writing)
+    with open(reading, "rb") as answers:
+        answer = answers.read()
+    code = os.waitstatus_to_exitcode(os.waitpid(child_pid, 0)[1])
+    if error := ERROR_OF_EXIT_CODE.get(code):
+        raise error(answer.decode())
+    if code != 0:
+        raise SystemExit(128 - code if code < 0 else code)  # its traceback is written, or a signal has ended both
+    package, ground_amsl_m = json.loads(answer)
+    return Path(package), ground_amsl_m
+
+
+def _answer(writing: int, source: str, start: str, map_path: Path | None, configs: list[Path]) -> NoReturn:
+    """The child process: writes the result, or the text of the error whose exit code it has."""
+    code = 1
+    try:
+        package, ground_amsl_m = package_for(source, start, map_path, configs)
+        os.write(writing, json.dumps([str(package), ground_amsl_m]).encode())
+        code = 0
+    except TerrafixError as error:
+        os.write(writing, str(error).encode())
+        code = error.exit_code
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    finally:
+        if code == 1:
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def swapped_hint(opened: "MapPackage", lat_deg: float, lon_deg: float, sigma_m: float) -> str:
     """Returns a hint if a start outside the map lies on it with latitude and longitude exchanged; else ""."""
     if abs(lon_deg) > 90.0 or not opened.covers_start(lon_deg, lat_deg, sigma_m):
         return ""

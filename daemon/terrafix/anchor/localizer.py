@@ -36,7 +36,7 @@ from terrafix.anchor.matching.predicted_view import (
 )
 from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.anchor.relocalization.map_search import MapSearch
-from terrafix.anchor.relocalization.position_prior import SIGMAS_95, distance_outside_m
+from terrafix.anchor.relocalization.position_prior import distance_outside_m
 from terrafix.anchor.relocalization.relocalizer import (
     LOST_SIGMA_M,
     Relocalizer,
@@ -48,6 +48,7 @@ from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonito
 from terrafix.anchor.verification.place_test import PlaceTest
 from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
 from terrafix.core.camera import CameraCalibration
+from terrafix.core.gate import SIGMAS_95
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.core.limits import MIN_MATCHING_AGL_M

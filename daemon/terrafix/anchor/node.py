@@ -12,6 +12,7 @@ from terrafix.anchor.model_monitor import ModelMonitor
 from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.thermal_load import ThermalLoad
+from terrafix.core.allocator import return_excess_memory
 from terrafix.core.config import HealthSection
 from terrafix.core.errors import ModelError, TerrafixError
 from terrafix.core.node import FrameStore, NodeContext
@@ -106,6 +107,7 @@ class AnchorNode:
         if self._model_suspended is self._load.allows_model:
             self._switch_model(prediction)
         match = self._localizer.label_step(self._localized(prediction), prediction)
+        return_excess_memory()
         yield match
         yield from self._pending
         self._pending.clear()

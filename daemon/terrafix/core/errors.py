@@ -49,3 +49,6 @@ class ModelError(TerrafixError):
 
 class EvaluationError(TerrafixError):
     exit_code = 9
+
+
+ERROR_OF_EXIT_CODE = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}

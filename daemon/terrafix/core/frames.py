@@ -23,8 +23,8 @@ from terrafix.core.errors import OutputError
 from terrafix.core.node import FrameStore, Image
 
 MAGIC = 0x31465852_52455431  # layout version 1
-BUDGET_BYTES = 192 * 2**20  # a tenth of the memory target; 31 full-HD frames, 3 s at 10 Hz
-MAX_SLOTS = 32  # a consumer that lags by more frames than this gives no useful result
+BUDGET_BYTES = 192 * 2**20  # a tenth of the memory of a computer with 2 GB; 20 full-HD frames are 118 MiB
+MAX_SLOTS = 20  # a consumer that lags by more frames than this gives no useful result: 2 s at 10 Hz
 MIN_SLOTS = 4  # frames of 26 megapixels (78 MB each) exceed the budget, but arrive at a low rate
 CHANNELS = 3  # BGR
 _PAGE = 4096

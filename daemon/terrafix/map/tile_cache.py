@@ -19,7 +19,7 @@ from terrafix.map.format import (
     tile_sha256,
 )
 
-CACHE_BYTES = 100_000_000  # decoded tiles; about 500; a window of 1 km needs 80 at 0.5 m/px and 320 at 0.24 m/px
+CACHE_BYTES = 32_000_000  # decoded tiles; about 160; a window of 1 km needs 80 at 0.5 m/px and 320 at 0.24 m/px
 VOID_BYTES = 100  # cost of a missing tile in the cache, so that the number of missing tiles is bounded, too
 
 Key = tuple[str, int, int, int]  # table, zoom, column, row

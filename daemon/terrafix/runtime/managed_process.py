@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
-from terrafix.core.errors import TerrafixError
+from terrafix.core.errors import ERROR_OF_EXIT_CODE
 from terrafix.processes import Process
 from terrafix.runtime.fork_server import TRACEBACK_SIGNAL, ForkedProcess, ForkServer
 from terrafix.runtime.progress_stamp import Progress
@@ -21,7 +21,6 @@ START_LIMIT_NS = 60_000_000_000  # a process that was ready before has already b
 STOP_LIMIT_S = 5.0  # from SIGTERM to SIGKILL
 KILL_LIMIT_S = 1.0  # from SIGKILL to the exit; it takes longer if a driver blocks the process in the kernel
 TRACEBACK_S = 0.2  # for a stuck process to print its tracebacks
-USER_ERROR_CODES = frozenset(kind.exit_code for kind in TerrafixError.__subclasses__())
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ class ManagedProcess:
             return
         if not self._killed:
             yield Event("died", describe(code))
-        if code in USER_ERROR_CODES and not self._was_ready:
+        if code in ERROR_OF_EXIT_CODE and not self._was_ready:
             file = self._run_dir.user_error(self.process.name)
             self.user_error = UserError(code, file.read_text(encoding="utf-8") if file.exists() else "no reason given")
             self.state = State.GAVE_UP

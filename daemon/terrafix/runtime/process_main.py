@@ -4,6 +4,7 @@
 type, a bug gives a traceback; the supervisor decides on a restart."""
 
 import faulthandler
+import gc
 import os
 import signal
 import socket
@@ -33,6 +34,7 @@ REPARENT_POLL_S = 0.0002  # interval of checks whether the supervisor has become
 def main(arguments: list[str]) -> int:
     descriptor, supervisor_pid = int(arguments[0]), int(arguments[1])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the supervisor, which stops all in order
+    gc.freeze()  # the collections of a forked process then do not write into pages that it shares with the others
     with socket.socket(fileno=descriptor) as requests:
         forked_as = serve(requests, supervisor_pid)
     return 0 if forked_as is None else run(*forked_as)

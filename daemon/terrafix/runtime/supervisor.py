@@ -24,7 +24,7 @@ from terrafix.core.config import Config
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.log_lines import MessageLog
 from terrafix.messages import LogLine, ProcessEvent, SourceEnded
-from terrafix.processes import PROCESSES, SUPERVISOR, Process
+from terrafix.processes import PROCESSES, SMOOTHER, SUPERVISOR, Process
 from terrafix.runtime import systemd
 from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.fork_server import ForkServer
@@ -76,6 +76,7 @@ def run(
     Returns 0, or 1 when the link was given up, or the exit code of a process that could not start because of a user
     error, which is written to stderr in one line. Raises ConfigError, MapError, OutputError before any start."""
     config = _with_overrides(configuration.load(configs), source, start, map_path, link)
+    table = _configured(table, config)
     out_dir = _writable(out_dir)
     package = _map_package(config.map.path)
     with contextlib.ExitStack() as stack:
@@ -141,9 +142,15 @@ def recently_killed_spec(
         with contextlib.suppress(OSError, msgspec.DecodeError):  # the folder is being removed, or of another version
             spec = msgspec.json.decode(killed.spec.read_bytes(), type=Spec)
             package = Path(config.map.path).resolve()
-            if spec == spec_of(PROCESSES, config, package, out_dir.resolve(), spec.ground_amsl_m):
+            table = _configured(PROCESSES, config)
+            if spec == spec_of(table, config, package, out_dir.resolve(), spec.ground_amsl_m):
                 return spec
     return None
+
+
+def _configured(table: tuple[Process, ...], config: Config) -> tuple[Process, ...]:
+    """-> the processes of ``table`` that are not switched off."""
+    return tuple(p for p in table if p.name != SMOOTHER or config.smoother.enabled)
 
 
 class Supervisor:

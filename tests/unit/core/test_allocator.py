@@ -36,3 +36,32 @@ def page_faults(first: str) -> int:
 def test_arrays_of_a_frame_are_allocated_without_page_faults_once_terrafix_is_imported() -> None:
     assert page_faults("import terrafix") < 500
     assert page_faults("") > 5_000  # else this test cannot fail
+
+
+RESIDENT = """
+import numpy as np
+from terrafix.core.allocator import EXCESS_BYTES, return_excess_memory
+
+def work(size):
+    kept = []
+    for _ in range(size >> 20):
+        held = np.ones(131_072)  # 1 MB
+        kept.append((held, np.zeros(10)))  # a small array behind it, which stays
+    return [small for _, small in kept]
+
+def resident_mb():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) >> 10
+
+small = work(EXCESS_BYTES // 2)
+first = return_excess_memory()
+before = resident_mb()
+more = work(3 * EXCESS_BYTES)  # less than KEPT_BYTES, which the allocator returns itself
+after = return_excess_memory()
+print(int(first), int(after), int(resident_mb() < before + (EXCESS_BYTES >> 20)))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mallinfo2 and malloc_trim of glibc")
+def test_memory_is_returned_after_work_much_larger_than_usual_and_kept_otherwise() -> None:
+    done = subprocess.run([sys.executable, "-c", RESIDENT], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["0", "1", "1"]

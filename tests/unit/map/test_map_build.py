@@ -23,6 +23,8 @@ from terrafix.core.errors import MapError, OutputError, TerrafixError, UsageErro
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build, ensure_package
+from terrafix_tools.mapping.source import ImagerySource
+from terrafix_tools.mapping.workers import decoding
 
 
 def finest(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -301,12 +303,23 @@ build(Path({str(tif)!r}), Path({str(out)!r}))"""
 @pytest.mark.slow
 def test_the_package_is_byte_identical_for_any_number_of_workers(tmp_path: Path) -> None:
     """Enough chunks for two processes, and an empty border, so that the workers share a collar mask."""
-    bands = np.tile(map_rasters.texture(500, 500), (1, 13, 9))
+    bands = np.tile(map_rasters.texture(500, 500), (1, 13, 13))
     bands[:, :300] = 0
     tif = map_rasters.utm(tmp_path / "i.tif", bands, tiled=True)
     (tmp_path / "b").mkdir()
     one, two = build(tif, tmp_path / "m.gpkg", workers=1), build(tif, tmp_path / "b" / "m.gpkg", workers=2)
     assert one.read_bytes() == two.read_bytes()
+
+
+def test_a_raster_is_decoded_once_while_it_fits_into_the_cache(tmp_path: Path) -> None:
+    """What was read once is there, though the file has lost its pixels since."""
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(512, 512), tiled=True, blockxsize=256, blockysize=256)
+    with decoding(1), ImagerySource(tif) as source:
+        first, _ = source.read(0, 0, 512, 512)
+        with tif.open("r+b") as file:
+            file.truncate(20_000)
+        again, _ = source.read(0, 0, 512, 512)
+    np.testing.assert_array_equal(first, again)
 
 
 def test_an_imagery_error_in_a_worker_is_reported(tmp_path: Path) -> None:

@@ -18,13 +18,14 @@ import pytest
 from runtime_nodes import TABLE
 from terrafix import messages as m
 from terrafix.core.codec import decode_json
+from terrafix.core.config import Config, SmootherSection
 from terrafix.core.errors import ConfigError, MapError, OutputError
 from terrafix.processes import PROCESSES
 from terrafix.runtime import run_dir
 from terrafix.runtime.fork_server import ForkedProcess
 from terrafix.runtime.managed_process import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, describe
 from terrafix.runtime.progress_stamp import Progress
-from terrafix.runtime.supervisor import run
+from terrafix.runtime.supervisor import _configured, run
 
 pytestmark = pytest.mark.real_time
 
@@ -383,6 +384,13 @@ def test_a_process_has_the_priority_of_the_table(tmp_path: Path) -> None:
     with flight(tmp_path) as f:
         eventually(lambda: len([e for e in f.events if e.event == "started"]) == len(TABLE), within_s=10)
         eventually(lambda: priorities(f, own) == {"recorder": 0, "link": 0, "estimator": 3, "vision": 0}, within_s=10)
+
+
+def test_a_smoother_that_is_switched_off_is_no_process() -> None:
+    names = [process.name for process in _configured(PROCESSES, Config())]
+    without = _configured(PROCESSES, Config(smoother=SmootherSection(enabled=False)))
+    assert names == [process.name for process in PROCESSES]
+    assert [process.name for process in without] == [name for name in names if name != "smoother"]
 
 
 def test_estimates_and_the_link_come_before_map_matches_and_these_before_the_smoother() -> None:

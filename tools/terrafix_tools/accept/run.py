@@ -12,7 +12,7 @@ import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from terrafix.core.errors import MapError, OutputError, TerrafixError, UsageError
+from terrafix.core.errors import ERROR_OF_EXIT_CODE, MapError, OutputError, UsageError
 from terrafix.vision.sources import open_source
 from terrafix_tools.accept import fly
 from terrafix_tools.accept.false_inputs.closed_loop import LIES_IN_THE_LOOP
@@ -34,7 +34,6 @@ QUICK_LEAVES_OUT = (
 )  # too long to be shortened
 DEFAULT_WORKERS = 2  # scenarios at a time; each uses about one core
 POLL_S = 2.0  # period of the update of the progress line
-_ERRORS = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}
 
 
 class GroundJob(msgspec.Struct, frozen=True):
@@ -282,7 +281,7 @@ def _fly(job: Job) -> Result:
         [sys.executable, "-m", fly.__name__, str(out / JOB)], stderr=subprocess.PIPE, text=True, env=environment
     )
     # With generated inputs an error is no user error; it is reported as a crash.
-    if (kind := _ERRORS.get(done.returncode)) and not job.generated:
+    if (kind := ERROR_OF_EXIT_CODE.get(done.returncode)) and not job.generated:
         raise kind(f"scenario '{job.scenario}': {done.stderr.strip()}")
     if done.returncode != 0:
         return _crashed(BY_NAME[job.scenario], out, done.stderr)

@@ -8,12 +8,12 @@ from typing import Any
 import msgspec
 
 from terrafix.core.errors import OutputError
+from terrafix.core.gate import CHI2_95
 from terrafix_tools.accept.fly import Result
 from terrafix_tools.accept.measuring.consistency import COVERAGE, RUN_CONFIDENCE, judge_claims
 from terrafix_tools.accept.measuring.results import BROKEN, Bounds, JudgedRow, Verdict, with_unit
 from terrafix_tools.accept.page import page
 from terrafix_tools.bench.run import machine
-from terrafix_tools.evaluate import ELLIPSE95
 
 NAME = "acceptance"
 OVERALL = "all scenarios"
@@ -71,7 +71,7 @@ def _coverage_row(results: list[Result], *, one_map: bool) -> JudgedRow:
     if not flown:
         why = "no flight with truth and true inputs"
         return JudgedRow(**row, measured=None, verdict=Verdict.NOT_MEASURABLE, why=why)  # type: ignore[arg-type]
-    inside = sum(sum(v <= ELLIPSE95 for v in nees) / len(nees) for nees in flown) / len(flown)
+    inside = sum(sum(v <= CHI2_95 for v in nees) / len(nees) for nees in flown) / len(flown)
     mean = sum(sum(nees) / len(nees) for nees in flown) / len(flown)
     verdict, why = judge_claims(inside, mean, 1 if one_map else len(flown), RUN_CONFIDENCE)
     why = f"{len(flown)} flights; {why}"

@@ -23,6 +23,7 @@ import typer
 
 from terrafix.core.camera import Mount
 from terrafix.core.errors import EvaluationError, TerrafixError, UsageError
+from terrafix.core.gate import CHI2_95
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.estimator.integrity.time_offset import PRIOR_SIGMA_S
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
@@ -30,7 +31,7 @@ from terrafix.messages import CalibrationEstimate, Camera, LensEstimate, NavEsti
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.estimates import ESTIMATES, Row, read_rows
-from terrafix_tools.evaluate import ELLIPSE95, compare, mahalanobis2, read_summary, read_truth, truth_sigma_of
+from terrafix_tools.evaluate import compare, mahalanobis2, read_summary, read_truth, truth_sigma_of
 
 TRUTH = "truth.csv"
 MEDIAN_SIGMAS = 1.1774  # median of a circular normal error, in its sigmas: sqrt(2 ln 2)
@@ -107,7 +108,7 @@ def claims_of(replay: Path, truth_path: Path | None = None) -> Claims:
     return Claims(
         flight=replay.name,
         frames=len(nees),
-        inside_95=float(np.mean(np.array(nees) <= ELLIPSE95)),
+        inside_95=float(np.mean(np.array(nees) <= CHI2_95)),
         nees=float(np.mean(nees)) / 2.0,
         nees_if_map_off=float(np.mean(nees) + terms[0] * np.mean(information)) / 2.0,
         median_error_m=float(np.median(np.hypot(errors_m[:, 0], errors_m[:, 1]))),

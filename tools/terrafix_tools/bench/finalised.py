@@ -19,9 +19,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from terrafix.core.gate import CHI2_95
 from terrafix.messages import Message
 from terrafix_tools.bench.result_file import write_result
-from terrafix_tools.evaluate import ELLIPSE95
 from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.montecarlo.fault import Fault
@@ -88,7 +88,7 @@ def measure(number: int, duration_s: float = DURATION_S) -> dict[str, Any]:
         "up_rms_m": float(np.sqrt(np.mean(errors_m[:, 2] ** 2))),
         "up_sigma_m": float(np.sqrt(np.mean(covs[:, 2, 2]))),
         "nees": float(np.mean(squares)),
-        "inside95": float(np.mean(squares <= ELLIPSE95)),
+        "inside95": float(np.mean(squares <= CHI2_95)),
         "focal_error_sigmas": (found.lens.log_focal - np.log1p(FOCAL_ERROR)) / found.lens_sigma.log_focal,
         "focal_sigma": found.lens_sigma.log_focal,
         "k1_error_sigmas": (found.lens.k1 - K1_ERROR) / found.lens_sigma.k1,

@@ -16,12 +16,12 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from terrafix.core.gate import CHI2_95
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import NavEstimate
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.locate.locator import FlightLocator
-from terrafix_tools.locate.position import CHI2_95
 from terrafix_tools.replay import replay
 from terrafix_tools.replay_output import SUMMARY
 from terrafix_tools.sim.autopilot.parameters import Kind

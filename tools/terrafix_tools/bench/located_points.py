@@ -14,10 +14,11 @@ import numpy as np
 import typer
 
 from terrafix.core.camera import CameraCalibration
+from terrafix.core.gate import CHI2_95
 from terrafix.messages import MapMatch, Odometry, Verdict
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.locate.locator import FlightLocator
-from terrafix_tools.locate.position import CHI2_95, ObjectPosition
+from terrafix_tools.locate.position import ObjectPosition
 from terrafix_tools.standalone import run_standalone
 
 SEED = 5  # of the points that are drawn

@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
+from terrafix.core.errors import ERROR_OF_EXIT_CODE, OutputError, SourceError, UsageError
 from terrafix.core.toml_file import read_toml
 from terrafix.recorder.provenance import device, versions
 from terrafix_tools.bench import flights as bench_run
@@ -37,7 +37,6 @@ GENERATED_S, GENERATED_SEED = 20.0, 3  # seconds of flight; an arbitrary seed
 GENERATED_SIZE_M = (1600.0, 1200.0)
 WIDE = 150  # characters of the widest tables
 WEIGHTS_FREE, XFEAT = "weights-free", "xfeat"
-_ERROR_OF_EXIT_CODE = {kind.exit_code: kind for kind in TerrafixError.__subclasses__()}
 
 
 def bench(
@@ -188,7 +187,7 @@ def _part(module: Any, flight: Path, package: Path, out: Path, model: Path | Non
     stderr."""
     arguments = [str(path) for path in (flight, package, out, model) if path is not None]
     done = subprocess.run([sys.executable, "-m", module.__name__, *arguments], stderr=subprocess.PIPE, text=True)
-    if kind := _ERROR_OF_EXIT_CODE.get(done.returncode):
+    if kind := ERROR_OF_EXIT_CODE.get(done.returncode):
         raise kind(done.stderr.strip())
     if done.returncode != 0:
         raise RuntimeError(f"{module.__name__} failed with exit code {done.returncode}:\n{done.stderr}")

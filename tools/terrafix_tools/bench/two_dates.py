@@ -27,6 +27,7 @@ from terrafix.anchor.node import AnchorNode
 from terrafix.core.config import load
 from terrafix.core.errors import MapError, TerrafixError
 from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.gate import CHI2_95
 from terrafix.core.geodesy import local_crs, quat_from_rot, rot_from_quat
 from terrafix.core.pnp import solved
 from terrafix.map.package import MapPackage
@@ -48,7 +49,6 @@ ELSEWHERE_PX = 500.0  # least distance of the true from the predicted position: 
 RIM = 0.55  # least distance of a frame's centre from the border, in frame sides: it is always inside the images
 EMPTY_SHARE = 0.02  # largest share of pixels without imagery, in the frame and in the map below it
 NEAR_PX, FAR_PX = 5.0, 20.0
-INSIDE_95 = 5.991  # chi-square, two degrees of freedom
 SEED = 5
 
 
@@ -181,7 +181,7 @@ def measure(
             error_px=float(np.hypot(*off_m)) / float(np.hypot(*sampler.pixel_m(true_px))),
             verdict=match.verdict.value,
             sure=match.verdict is Verdict.ACCEPTED and not match.position_only,  # a coarse match only continues a track
-            inside=float(off_m @ np.linalg.solve(cov_m2, off_m)) <= INSIDE_95,
+            inside=float(off_m @ np.linalg.solve(cov_m2, off_m)) <= CHI2_95,
             cpu_ms=cpu_ms,
         )
 

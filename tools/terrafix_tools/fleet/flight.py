@@ -12,9 +12,10 @@ import msgspec
 import numpy as np
 from pyproj import Geod
 
+from terrafix.core.gate import CHI2_95
 from terrafix.messages import Origin, Verdict
 from terrafix_tools.estimates import Row
-from terrafix_tools.evaluate import ELLIPSE95, read_summary
+from terrafix_tools.evaluate import read_summary
 from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.report.data import FlightView, ellipse95
 from terrafix_tools.report.gather import read_record
@@ -92,7 +93,7 @@ def distance_m(rows: list[Row]) -> float:
 def sigma_m(row: Row) -> float | None:
     """1-sigma along the larger axis of the stated horizontal covariance; None without a position."""
     axes = ellipse95(row)
-    return None if axes is None else axes[0] / math.sqrt(ELLIPSE95)
+    return None if axes is None else axes[0] / math.sqrt(CHI2_95)
 
 
 def longest_without_fix_s(times_s: list[float], fixes_s: list[float]) -> float | None:

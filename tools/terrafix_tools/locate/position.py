@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.errors import UsageError
+from terrafix.core.gate import CHI2_95
 from terrafix.core.pose import project_with_jacobian, world_to_tangent
 from terrafix.estimator.state import HORIZONTAL, TRANSLATION, UP
 from terrafix_tools.locate.ground import GroundPatch, Surface
 from terrafix_tools.locate.views import CameraView
 
 PIXEL_SIGMA = 1.0  # 1-sigma of a pointed pixel, per axis, pixels of the stored frame
-CHI2_95 = 5.991  # 95 % of chi-square with two degrees of freedom
 CHI2_999 = 13.816  # 99.9 %: the gate of a pixel against the others
 ITERATIONS = 10  # of Gauss-Newton
 STEP_TOLERANCE_M = 1e-4

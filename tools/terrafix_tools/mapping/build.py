@@ -42,7 +42,7 @@ from terrafix_tools.mapping.package.pyramid import BUILT_WITH, Pyramid, levels_o
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.vectors.drawing import drawn_layer, spooled
 from terrafix_tools.mapping.vectors.tables import write_vectors
-from terrafix_tools.mapping.workers import GDAL_CACHE_MB, MAP_BUILD
+from terrafix_tools.mapping.workers import GDAL_CACHE_BYTES, MAP_BUILD
 from terrafix_tools.parallel.pool import (
     CHUNKS_PER_WORKER,
     Piece,
@@ -116,7 +116,7 @@ def build_package(
         raise UsageError("--null-agl: a null model is fitted on imagery, and this map has none; leave it out")
     # Newest first; unknown dates last, in the given order.
     ordered = sorted(layers, key=lambda layer: layer.date, reverse=True)
-    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), contextlib.ExitStack() as stack:
+    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES), contextlib.ExitStack() as stack:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.")))

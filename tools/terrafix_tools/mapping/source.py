@@ -84,17 +84,28 @@ class ImagerySource:
         """A window inside the image: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255."""
         window = Window(column, row, width, height)
         try:
-            bands = self._data.read(self.bands, window=window)
-            valid = self._data.dataset_mask(window=window) > 0 if self.has_mask else np.ones((height, width), bool)
+            bands, mask = self._read_bands(window)
         except RasterioError:
             raise MapError(
                 f"{self.path}: cannot be read near column {column}, row {row}; check or download the file again"
             ) from None
         if np.issubdtype(bands.dtype, np.floating):
-            valid &= np.isfinite(bands).all(axis=0)
+            mask = np.where(np.isfinite(bands).all(axis=0), mask, 0)
         picture = self._to_bytes(bands)
         image = cv2.merge([picture[-1], picture[len(picture) // 2], picture[0]])  # three bands or one; BGR
-        return image, np.multiply(valid, 255, dtype=np.uint8)
+        return image, cv2.threshold(mask, 0, 255, cv2.THRESH_BINARY)[1]
+
+    def _read_bands(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
+        """-> the chosen bands, (n, h, w), and the mask, (h, w) uint8, not zero where valid."""
+        if self.warped:
+            # One by one: each is then read from GDAL's cached blocks, which hold all bands of a reprojection. Asked for
+            # several, GDAL reprojects the window once for each of them.
+            bands = np.stack([self._data.read(band, window=window) for band in self.bands])
+        else:
+            bands = self._data.read(self.bands, window=window)
+        if self.has_mask:
+            return bands, self._data.dataset_mask(window=window)
+        return bands, np.full(bands.shape[1:], 255, np.uint8)
 
     def _to_bytes(self, bands: np.ndarray) -> np.ndarray:
         if self._colours is not None:

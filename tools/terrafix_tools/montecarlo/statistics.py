@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from terrafix_tools.evaluate import ELLIPSE95, FALSE_FIX_ERROR_M, FALSE_FIX_MAHALANOBIS2
+from terrafix.core.gate import CHI2_95
+from terrafix_tools.evaluate import FALSE_FIX_ERROR_M, FALSE_FIX_MAHALANOBIS2
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Record
 
@@ -208,11 +209,11 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
         "late_false_fixes": sum(f.late_false_fixes for f in flights),
         "notice_s": max((f.notice_s for f in flights if f.notice_s is not None), default=None),
         "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
-        "coverage": float((nees <= ELLIPSE95).mean()),
-        "coverage_refined": float((refined <= ELLIPSE95).mean()) if len(refined) else None,
-        "coverage_smoothed": float((smoothed <= ELLIPSE95).mean()) if len(smoothed) else None,
+        "coverage": float((nees <= CHI2_95).mean()),
+        "coverage_refined": float((refined <= CHI2_95).mean()) if len(refined) else None,
+        "coverage_smoothed": float((smoothed <= CHI2_95).mean()) if len(smoothed) else None,
         "nees_smoothed": float(np.mean(smoothed)) if len(smoothed) else None,
-        "coverage_on_map": float((on_map <= ELLIPSE95).mean()),
+        "coverage_on_map": float((on_map <= CHI2_95).mean()),
         "coverage_pose": float((pose <= POSE95).mean()),
         "nees": _row(bands[0]),
         "nees_on_map": _row(bands[1]),

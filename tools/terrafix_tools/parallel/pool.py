@@ -18,7 +18,7 @@ from terrafix.core.errors import TerrafixError, UsageError
 if TYPE_CHECKING:
     from terrafix_tools.parallel.cluster import DaskCluster
 
-CHUNKS_PER_WORKER = 4  # imagery chunks; a process needs about two seconds to start, fewer chunks do not compensate it
+CHUNKS_PER_WORKER = 8  # imagery chunks of 0.1 s; a process needs a second to start, fewer chunks do not compensate it
 MAX_PENDING_PER_WORKER = (
     3  # pieces in progress or waiting per worker; limits the memory of pieces that are finished out of order
 )

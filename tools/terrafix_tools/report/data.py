@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from terrafix.core.gate import CHI2_95
 from terrafix.messages import (
     CalibrationEstimate,
     CalibrationFault,
@@ -24,7 +25,7 @@ from terrafix.messages import (
 )
 from terrafix.recorder.reader import ReadResult
 from terrafix_tools.estimates import NS, Row
-from terrafix_tools.evaluate import ELLIPSE95, Compared, Truth
+from terrafix_tools.evaluate import Compared, Truth
 from terrafix_tools.log.contents import Contents
 from terrafix_tools.report.innovations import Innovations
 from terrafix_tools.report.stage_times import StageTimes
@@ -128,4 +129,4 @@ def ellipse95(row: Row) -> tuple[float, float, float] | None:
     ee, nn, en = row.sigma_e_m**2, row.sigma_n_m**2, row.cov_en_m2
     mean, spread = (ee + nn) / 2, math.hypot((ee - nn) / 2, en)
     angle = math.atan2(2 * en, ee - nn) / 2
-    return math.sqrt(ELLIPSE95 * (mean + spread)), math.sqrt(ELLIPSE95 * max(0.0, mean - spread)), angle
+    return math.sqrt(CHI2_95 * (mean + spread)), math.sqrt(CHI2_95 * max(0.0, mean - spread)), angle

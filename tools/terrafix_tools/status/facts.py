@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from terrafix.core.gate import CHI2_95
 from terrafix.messages import (
     EkfStatus,
     GpsInput,
@@ -14,7 +15,6 @@ from terrafix.messages import (
     SearchState,
     ThermalReading,
 )
-from terrafix_tools.evaluate import ELLIPSE95
 from terrafix_tools.report.sections_autopilot import EKF_POS_HORIZ_ABS
 from terrafix_tools.report.text import FIX_3D
 from terrafix_tools.status.processes import ProcessState
@@ -66,7 +66,7 @@ def _position(status: Status, now_ns: int) -> dict[str, Any]:
             "alt_amsl_m": round(estimate.alt_amsl_m, 1),
             "agl_m": round(estimate.agl_m, 1),
             "speed_mps": round(float(np.hypot(*estimate.velocity_enu_mps[:2])), 1),
-            "radius_95_m": round(float(np.sqrt(ELLIPSE95 * np.linalg.eigvalsh(horizontal)[-1])), 1),
+            "radius_95_m": round(float(np.sqrt(CHI2_95 * np.linalg.eigvalsh(horizontal)[-1])), 1),
             "source": estimate.source_label.value,
             "covariance_mode": estimate.covariance_mode.value,
         }

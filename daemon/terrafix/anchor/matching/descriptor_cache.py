@@ -11,7 +11,7 @@ TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride [tune
 # pixels of context around a tile, so that descriptors at its border equal those of a larger image; a multiple of every
 # stride [tuned]
 PAD_PX = 32
-CACHE_BYTES = 192 * 1024 * 1024  # memory for the tiles of all layers, bytes [tuned]
+CACHE_BYTES = 64 * 1024 * 1024  # memory for the tiles of all layers, bytes [tuned]
 
 
 class MapWindows(Protocol):

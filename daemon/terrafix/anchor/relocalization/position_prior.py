@@ -5,10 +5,10 @@ import math
 from dataclasses import dataclass
 
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS
+from terrafix.core.gate import SIGMAS_95
 from terrafix.messages import Verdict
 
 # radius of the 95 % circle of a round Gaussian in sigmas per axis [spec: chi-square, 2 dof]
-SIGMAS_95 = math.sqrt(5.991)
 # m/s, growth of the prior's radius with its age: the speed that the vehicle may have flown [tuned]
 RADIUS_GROWTH_MPS = 30.0
 # standard deviations of the believed position, beyond the prior's radius, within which both agree [tuned]

@@ -9,8 +9,9 @@ from terrafix.anchor.matching.map_layers import MapLayer
 from terrafix.anchor.matching.match_message import relocalized_match
 from terrafix.anchor.matching.predicted_view import ground_plane, position_sigma_m, view_of
 from terrafix.anchor.relocalization.map_search import MapSearch
-from terrafix.anchor.relocalization.position_prior import SIGMAS_95, CurrentBelief, aged_radius_m, evaluate_prior
+from terrafix.anchor.relocalization.position_prior import CurrentBelief, aged_radius_m, evaluate_prior
 from terrafix.anchor.verification.probation import Probation
+from terrafix.core.gate import SIGMAS_95
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget

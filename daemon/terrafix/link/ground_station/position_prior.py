@@ -11,11 +11,11 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core.gate import SIGMAS_95
 from terrafix.messages import PositionHint
 
 DEFAULT_RADIUS_M = 5000.0  # m; radius of a hint without accuracy [spec: requirement AC-6]
 MIN_RADIUS_M = 100.0  # m; accuracy of a position that is picked on a map by hand [tuned]
-RADIUS95_PER_SIGMA = math.sqrt(5.991)  # 95 % radius over 1-sigma per axis [spec: chi-square, 2 degrees of freedom]
 # ns; the same position within this time is one hint that was repeated, or received on two links. [tuned]
 DUPLICATE_NS = 3_000_000_000
 GLOBAL_FRAMES = {
@@ -67,7 +67,7 @@ class HintReceiver:
         elif message.frame in GLOBAL_FRAMES:
             lat_deg, lon_deg = message.x / 1e7, message.y / 1e7
         sigma_m = message.param3
-        radius_m = RADIUS95_PER_SIGMA * sigma_m if math.isfinite(sigma_m) and sigma_m > 0.0 else DEFAULT_RADIUS_M
+        radius_m = SIGMAS_95 * sigma_m if math.isfinite(sigma_m) and sigma_m > 0.0 else DEFAULT_RADIUS_M
         replies = list(self._hint(lat_deg, lon_deg, max(MIN_RADIUS_M, radius_m), sender[0], now_ns))
         valid = is_valid_position(lat_deg, lon_deg)
         yield command_ack(message, mavlink.MAV_RESULT_ACCEPTED if valid else mavlink.MAV_RESULT_DENIED)

@@ -1,5 +1,6 @@
 """Finds the collar of an image without a mask: uniform black or white areas that are connected to its border."""
 
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ MIN_COLLAR_PX = 256  # smaller areas at the border are shadow, glare or compress
 GAP_PX = 9  # a white collar inside a black one is separated by a blurred line that is narrower than this
 BLEED_PX = 16  # lossy compression smears the edge of a collar over its block (JPEG in YCbCr 4:2:0: 16 px)
 TRIM_PX = 4  # the last pixels before the edge are mixed with the collar and always removed
+REACH_PX = BLEED_PX + TRIM_PX
 BLEED_LEVEL = 16  # smeared pixels are within this of black or white
 
 Block = tuple[int, int]  # column and row of a block; also a step to the next
@@ -34,6 +36,13 @@ class Collar:
         empty = self._file.read(1, window=Window(column, row, mask.shape[1], mask.shape[0]))
         if not empty.any():
             return
+        # Only around the collar: most of a window has none.
+        left, top, width, height = cv2.boundingRect(empty)
+        near = (
+            slice(max(0, top - REACH_PX), top + height + REACH_PX),
+            slice(max(0, left - REACH_PX), left + width + REACH_PX),
+        )
+        image, mask, empty = image[near], mask[near], empty[near]
         smeared = _empty(image, BLEED_LEVEL)
         kernel = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
         for _ in range(BLEED_PX):
@@ -63,9 +72,11 @@ def find_collar(source: Imagery, scratch: Path, bar: Callable[[str, int | None],
     profile |= {"blockxsize": 256, "blockysize": 256, "compress": "deflate", "BIGTIFF": "IF_SAFER", "SPARSE_OK": True}
     with rasterio.open(scratch, "w", **profile) as out:
         for place, first in blocks.first.items():
-            labels = _labels(source, place, first)[0]
-            x, y = place[0] * BLOCK_PX, place[1] * BLOCK_PX
-            out.write(chosen[labels].astype(np.uint8), 1, window=Window(x, y, labels.shape[1], labels.shape[0]))
+            labels = cv2.connectedComponents(blocks.empty(place), connectivity=4)[1]
+            belongs = np.concatenate([[False], chosen[first + 1 : first + 1 + int(labels.max())]])
+            if belongs.any():  # other blocks stay unwritten, which reads as zero
+                x, y = place[0] * BLOCK_PX, place[1] * BLOCK_PX
+                out.write(belongs.astype(np.uint8)[labels], 1, window=Window(x, y, labels.shape[1], labels.shape[0]))
     return Collar(scratch)
 
 
@@ -75,6 +86,7 @@ class _ReachedBlocks:
     def __init__(self, source: Imagery, rim: set[Block], bar: Callable[[str, int | None], Callable[[], None]]) -> None:
         self.sets = _DisjointSets()
         self.first: dict[Block, int] = {}  # label offset of a block
+        self._packed: dict[Block, tuple[tuple[int, int], bytes]] = {}  # shape and compressed bits of its empty areas
         self._lines: dict[tuple[Block, Block], np.ndarray] = {}  # labels along a block's side, by block and direction
         self._columns, self._rows = -(-source.width_px // BLOCK_PX), -(-source.height_px // BLOCK_PX)
         on_step = bar("collar", None)
@@ -85,12 +97,22 @@ class _ReachedBlocks:
                 on_step()
             wanted = sorted(self._next())
 
+    def empty(self, place: Block) -> np.ndarray:
+        """(h, w) uint8: 1 in the empty areas of a block."""
+        shape, packed = self._packed[place]
+        bits = np.frombuffer(zlib.decompress(packed), np.uint8)
+        return np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape)
+
     def _add(self, source: Imagery, place: Block) -> None:
-        self.first[place] = len(self.sets.parent) - 1
-        labels, sizes_px = _labels(source, place, self.first[place])
-        self.sets.add(sizes_px)
+        first = self.first[place] = len(self.sets.parent) - 1
+        empty = _empty_areas(source, place)
+        # Kept, because reading them again takes five times as long; a block becomes a few kilobytes.
+        self._packed[place] = (empty.shape[0], empty.shape[1]), zlib.compress(np.packbits(empty).tobytes(), level=1)
+        labels = cv2.connectedComponents(empty, connectivity=4)[1]
+        self.sets.add(np.bincount(labels[empty > 0])[1:])
         for side in SIDES:
-            line = _line(labels, side).copy()
+            line = _line(labels, side)
+            line = np.where(line > 0, line + first, 0)
             self._lines[place, side] = line
             beside = place[0] + side[0], place[1] + side[1]
             if not (0 <= beside[0] < self._columns and 0 <= beside[1] < self._rows):
@@ -123,7 +145,7 @@ def _empty(image: np.ndarray, tolerance: int) -> np.ndarray:
     """(h, w) uint8: 1 where a BGR pixel is black or white within the tolerance."""
     black = cv2.inRange(image, (0, 0, 0), (tolerance,) * 3)
     white = cv2.inRange(image, (255 - tolerance,) * 3, (255,) * 3)
-    return ((black > 0) | (white > 0)).astype(np.uint8)
+    return cv2.threshold(cv2.bitwise_or(black, white), 0, 1, cv2.THRESH_BINARY)[1]
 
 
 def _border_blocks(source: Imagery) -> set[Block]:
@@ -188,11 +210,9 @@ class _DisjointSets:
         return np.array([label > 0 and self.find(label) in roots for label in range(len(self.parent))])
 
 
-def _labels(source: Imagery, place: Block, first: int) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w) int32 labels of the empty areas of a block, numbered from first + 1, 0 = content; and their sizes, px."""
+def _empty_areas(source: Imagery, place: Block) -> np.ndarray:
+    """(h, w) uint8: 1 in the empty areas of a block, with the gaps between them closed."""
     column, row = place[0] * BLOCK_PX, place[1] * BLOCK_PX
     width, height = min(BLOCK_PX, source.width_px - column), min(BLOCK_PX, source.height_px - row)
     empty = _empty(source.read(column, row, width, height)[0], 0)
-    closed = cv2.morphologyEx(empty, cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
-    return np.where(labels > 0, labels + first, 0) if count > 1 else labels, stats[1:, cv2.CC_STAT_AREA]
+    return cv2.morphologyEx(empty, cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))

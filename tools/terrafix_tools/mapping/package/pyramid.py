@@ -16,7 +16,10 @@ from terrafix_tools.mapping.mosaic.collar import BLEED_PX, TRIM_PX, Collar
 from terrafix_tools.mapping.package.gpkg import GpkgWriter
 
 JPEG_QUALITY = 95  # 8-11 MB/km2 at 0.3 m/px on aerial photographs; artefacts below one or two grey levels
-PNG_LEVEL = 6  # for partly valid tiles only, because JPEG has no exact mask
+# For partly valid tiles, because JPEG has no exact mask. One filter and the fastest level take a fifth of the time of
+# level 6 with a filter chosen line by line, for 11 % more bytes of these tiles.
+PNG_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
+PNG_SMALL = (cv2.IMWRITE_PNG_COMPRESSION, 6)  # for drawings
 CHUNK_LEVELS = 3  # the source is read in chunks of 2^3 tiles per side (2048 px)
 
 # Part of what determines the bytes, besides the input.
@@ -46,8 +49,8 @@ class ChunkRenderer:
         depth = min(CHUNK_LEVELS, self.finest)
         tiles: list[tuple[int, int, int, bytes]] = []
         pixels = self._read(place[0], place[1], TILE_PX << depth)
-        whole = _all_valid(pixels)
-        return Chunk(tiles, self._reduce(self.finest - depth, place[0], place[1], pixels, whole, tiles))
+        mask = cv2.extractChannel(pixels, 3)
+        return Chunk(tiles, self._reduce(self.finest - depth, place[0], place[1], pixels, mask, tiles))
 
     def _reduce(
         self,
@@ -55,27 +58,25 @@ class ChunkRenderer:
         column: int,
         row: int,
         pixels: np.ndarray,
-        whole: bool,
+        mask: np.ndarray,
         tiles: list[tuple[int, int, int, bytes]],
     ) -> np.ndarray | None:
-        """Adds a tile and all below it; returns it as (256, 256, 4) uint8 BGR and mask, None = no imagery."""
-        if not whole and _valid_px(pixels) == 0:
+        """Adds a tile and all below it; returns it as (256, 256, 4) uint8 BGR and mask, None = no imagery.
+
+        ``mask``: the mask of ``pixels`` alone, because OpenCV counts a plane faster than every fourth byte."""
+        valid_px = cv2.countNonZero(mask)
+        if valid_px == 0:
             return None
+        whole = valid_px == mask.size
         tile: np.ndarray | None = pixels
         if zoom < self.finest:
             half = pixels.shape[0] // 2
-            children = [
-                self._reduce(
-                    zoom + 1,
-                    2 * column + c,
-                    2 * row + r,
-                    pixels[r * half : (r + 1) * half, c * half : (c + 1) * half],
-                    whole,
-                    tiles,
-                )
-                for r in (0, 1)
-                for c in (0, 1)
-            ]
+            children = []
+            for r in (0, 1):
+                for c in (0, 1):
+                    part = slice(r * half, (r + 1) * half), slice(c * half, (c + 1) * half)
+                    below = self._reduce(zoom + 1, 2 * column + c, 2 * row + r, pixels[part], mask[part], tiles)
+                    children.append(below)
             tile = parent_of(children, whole)
         if tile is not None:
             tiles.append((zoom, column, row, encode(tile, whole, self.lossless)))
@@ -95,12 +96,11 @@ class ChunkRenderer:
             self.collar.remove(image, mask, left, top)
         inner = slice(row - top, bottom - top), slice(column - left, right - left)
         image, mask = image[inner], mask[inner]
-        if cv2.countNonZero(mask) == side * side:  # fast path for the usual case, ten times as fast
-            return cv2.cvtColor(image, cv2.COLOR_BGR2BGRA)
+        pixels = cv2.cvtColor(image, cv2.COLOR_BGR2BGRA)
+        if cv2.countNonZero(mask) == side * side:
+            return pixels
         out = np.zeros((side, side, 4), np.uint8)
-        out[: bottom - row, : right - column, :3] = image
-        out[: bottom - row, : right - column, 3] = mask
-        out[out[:, :, 3] == 0] = 0
+        cv2.copyTo(pixels, mask, out[: bottom - row, : right - column])
         return out
 
 
@@ -197,17 +197,17 @@ def parent_of(children: list[np.ndarray | None], whole: bool = False) -> np.ndar
 
 def halve(tile: np.ndarray, whole: bool = False) -> np.ndarray:
     """(2h, 2w, 4) -> (h, w, 4): mean of the valid pixels out of four; valid when at least two of them are."""
-    if whole or _all_valid(tile):  # fast path for the usual case, ten times as fast with the same result
-        return cv2.resize(tile, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    parts = tile.reshape(tile.shape[0] // 2, 2, tile.shape[1] // 2, 2, 4).astype(np.uint16)
-    total = parts[..., :3].sum(axis=(1, 3))  # invalid pixels are zero
-    count = (parts[..., 3] > 0).sum(axis=(1, 3)).astype(np.uint16)
-    out = np.zeros((*count.shape, 4), np.uint8)
-    weight = np.maximum(count, 1)[..., None]
-    valid = count >= 2
-    out[..., :3] = np.where(valid[..., None], (total + weight // 2) // weight, 0)
-    out[..., 3] = np.where(valid, 255, 0)
-    return out
+    out = cv2.resize(tile, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    if whole:
+        return out
+    share = cv2.extractChannel(out, 3)  # mean of the masks: 0, 64, 128, 191 or 255 for 0 to 4 valid pixels
+    rows, columns = np.nonzero((share > 64) & (share < 255))
+    parts = tile.reshape(tile.shape[0] // 2, 2, tile.shape[1] // 2, 2, 4)[rows, :, columns].astype(np.uint16)
+    total = parts[..., :3].sum(axis=(1, 2))  # invalid pixels are zero
+    count = np.count_nonzero(parts[..., 3], axis=(1, 2))[:, None]
+    out[rows, columns, :3] = (total + count // 2) // count
+    valid = cv2.threshold(share, 64, 255, cv2.THRESH_BINARY)[1]
+    return cv2.copyTo(cv2.insertChannel(valid, out, 3), valid)
 
 
 def _valid_px(tile: np.ndarray) -> int:
@@ -227,4 +227,4 @@ def encode(tile: np.ndarray, whole: bool = False, lossless: bool = False) -> byt
         return cv2.imencode(".jpg", cv2.cvtColor(tile, cv2.COLOR_BGRA2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[
             1
         ].tobytes()
-    return cv2.imencode(".png", tile, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
+    return cv2.imencode(".png", tile, PNG_SMALL if lossless else PNG_FAST)[1].tobytes()

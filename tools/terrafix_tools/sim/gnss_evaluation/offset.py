@@ -11,12 +11,12 @@ import sys
 
 import numpy as np
 
+from terrafix.core.gate import CHI2_95
 from terrafix_tools.sim.gnss_evaluation.flight import Vision, fly
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Outage
 
 GNSS_PERIODS_S = (180.0, 300.0, 600.0)  # from take-off to the jamming
 AFTER_S = 300.0
-INSIDE_95 = 5.991  # chi-square, 2 degrees of freedom
 
 
 def compare_offsets(
@@ -57,7 +57,7 @@ def _summary(flights: list[np.ndarray]) -> dict[str, float]:
         "max_m": round(float(np.max(off_m)), 2),
         "claimed_sigma_m": round(float(np.median(rows[:, 3])), 2),
         "nees": round(float(np.mean(squared)), 2),
-        "inside_95": round(float(np.mean(squared <= INSIDE_95)), 3),
+        "inside_95": round(float(np.mean(squared <= CHI2_95)), 3),
     }
 
 
