@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import os
 import msgspec
 
 from terrafix.anchor.matching.frame_matcher import CorrelationResult, Hypothesis, View, view_at
@@ -74,7 +75,14 @@ def estimate_pose(
     ):
         consensus = seen.layer.consensus.estimate(seen.image, view_at(view, hypothesis, mode.e_m, mode.n_m))
         joint = match if consensus is None else pose_match(match, consensus, view)
-        match = joint if joint.verdict is Verdict.ACCEPTED else match
+        if joint.verdict is Verdict.ACCEPTED:
+            match, fix = joint, consensus
+    if match.verdict is Verdict.ACCEPTED and fix is not None and not os.environ.get("NOFINE"):
+        fine = seen.layer.matcher.fine_fix(seen.image, view, fix)
+        if fine is not None and fine.pnp.fit is not None and ground_sigma_m(fine.pnp.fit, view.agl_m) <= SIGMA_FLOOR * view.agl_m:
+            finer = pose_match(match, fine, view)
+            if finer.verdict is Verdict.ACCEPTED:
+                match = finer
     return PoseResult(match, mode, attempted=True, inliers=inliers)
 
 

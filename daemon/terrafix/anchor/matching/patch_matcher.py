@@ -80,7 +80,7 @@ def correlate_patches(
     side = 2 * radius + 1
     if not corners:
         return corners, np.zeros((0, side, side))
-    return corners, _correlate(template, window, corners, patch, radius, row0, column0)
+    return corners, patch_surfaces(template, window, corners, patch, radius, row0, column0)
 
 
 def _select_patches(
@@ -94,13 +94,21 @@ def _select_patches(
 ) -> list[tuple[int, int]]:
     """Corners of patches that lie inside the frame and whose search area lies on the map, the ones with most texture
     first, at most ``MAX_PATCHES``."""
+    energy = np.einsum("khw,khw->hw", template, template)
+    texture = cv2.boxFilter(energy, -1, (patch, patch), anchor=(0, 0), normalize=True)
+    return usable_corners(texture, mask, valid, patch, radius, row0, column0)[:MAX_PATCHES]
+
+
+def usable_corners(
+    rank: np.ndarray, mask: np.ndarray, valid: np.ndarray, patch: int, radius: int, row0: int, column0: int
+) -> list[tuple[int, int]]:
+    """Corners (row, column), half a patch apart, of the patches that lie inside the frame ``mask`` (h, w) and whose
+    search area lies on the map ``valid``, those with the highest ``rank`` (h, w) at their corner first."""
     h, w = mask.shape
     if h < patch or w < patch:
         return []
     step = max(patch // 2, 1)
     inside = cv2.boxFilter(mask.astype(np.float32), -1, (patch, patch), anchor=(0, 0), normalize=True)
-    energy = np.einsum("khw,khw->hw", template, template)
-    texture = cv2.boxFilter(energy, -1, (patch, patch), anchor=(0, 0), normalize=True)
     found: list[tuple[float, int, int]] = []
     for r in range(0, h - patch + 1, step):
         for c in range(0, w - patch + 1, step):
@@ -111,12 +119,12 @@ def _select_patches(
             if top < 0 or left < 0 or bottom > valid.shape[0] or right > valid.shape[1]:
                 continue
             if valid[top:bottom:4, left:right:4].all():
-                found.append((float(texture[r, c]), r, c))
+                found.append((float(rank[r, c]), r, c))
     found.sort(reverse=True)
-    return [(r, c) for _, r, c in found[:MAX_PATCHES]]
+    return [(r, c) for _, r, c in found]
 
 
-def _correlate(
+def patch_surfaces(
     template: np.ndarray,
     window: np.ndarray,
     corners: list[tuple[int, int]],
@@ -125,7 +133,8 @@ def _correlate(
     row0: int,
     column0: int,
 ) -> np.ndarray:
-    """Zero-mean normalised correlation surface of every patch, (N, 2 radius + 1, 2 radius + 1)."""
+    """Zero-mean normalised correlation surface of the patch at every one of ``corners``, (N, 2 radius + 1,
+    2 radius + 1), as in ``correlate_patches``."""
     side = patch + 2 * radius
     fft = transform_shape(side, side)
     n = 2 * radius + 1

@@ -1,0 +1,142 @@
+"""The last step of a map fix: the best places of a frame, matched again on fine cells around the pose just found.
+
+The cells of the first step (frame_matcher.py) are coarse because each patch is searched over a wide area. Once the pose
+is known, a place is off by a few cells at most: larger patches on finer cells, with two channels instead of eight, cost
+less than the first step. The precision of each match follows from its own correlation peak, and the best half is kept.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, MapFeatures, MapWindows
+from terrafix.anchor.matching.descriptor_store import DescriptorStore
+from terrafix.anchor.matching.orthorectify import Rectified, Relief, rectify
+from terrafix.anchor.matching.patch_matcher import patch_surfaces, usable_corners
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.node import Image
+from terrafix_engines.features.gradient import OrientationDescriber
+
+import os
+FINE_GSD_PER_AGL = 1 / float(os.environ.get("FGSD","280"))
+FINE_PATCH_PER_AGL = float(os.environ.get("FPATCH",".3"))
+FINE_RADIUS = float(os.environ.get("FRAD",".03"))
+MAX_PLACES = int(os.environ.get("FPLACES","24"))
+KEPT_SHARE = float(os.environ.get("FKEEP",".5"))
+LEAST_PLACES = 12
+FINE_THRESHOLD = float(os.environ.get("FTHR",".01"))
+REF_SIGMA = float(os.environ.get("FREF",".03"))
+FACTOR = float(os.environ.get("FFAC","1"))
+MIN_CORRELATION = 0.1
+CACHE_SHARE = 4
+
+
+@dataclass(frozen=True)
+class FineMatches:
+    """``frame_m`` (N, 3): ground points under the patch centres, east, north and up relative to the camera, as the pose
+    sees them; ``map_m`` (N, 2): the matched points on the map, local east and north; ``weight`` (N,) in (0, 1]."""
+
+    frame_m: np.ndarray
+    map_m: np.ndarray
+    weight: np.ndarray
+
+
+class FineMatcher:
+    """Matches places of a frame with one map layer. ``cache_bytes``: memory for the layer's coarse descriptors."""
+
+    def __init__(self, source: MapWindows, cache_bytes: int = CACHE_BYTES, store: DescriptorStore | None = None) -> None:
+        self._describer = OrientationDescriber()
+        self._features = MapFeatures(source, self._describer, cache_bytes // CACHE_SHARE, store=store)
+
+    def match(
+        self,
+        image: Image,
+        camera: CameraCalibration,
+        r_w_c: np.ndarray,
+        place_m: tuple[float, float, float],
+        cell_m: float,
+        relief: Relief | None,
+    ) -> FineMatches | None:
+        """``image`` (H, W) grey; ``r_w_c``: rotation of the camera; ``place_m``: its east and north, and its height
+        above the plane of ``relief``. None: no ground is visible, or too few places are on the map."""
+        e_m, n_m, agl_m = place_m
+        frame = rectify(image, camera, r_w_c, agl_m, cell_m, relief=relief)
+        if frame is None:
+            return None
+        patch, radius = round(FINE_PATCH_PER_AGL * agl_m / cell_m), max(round(FINE_RADIUS * agl_m / cell_m), 3)
+        margin, (h, w) = radius + 2, frame.mask.shape
+        window, valid, e_min_m, n_max_m = self._features.window(
+            e_m + frame.e_min_m - margin * cell_m,
+            n_m + frame.n_max_m + margin * cell_m,
+            w + 2 * margin,
+            h + 2 * margin,
+            cell_m,
+        )
+        row0 = round((n_max_m - (n_m + frame.n_max_m)) / cell_m)
+        column0 = round((e_m + frame.e_min_m - e_min_m) / cell_m)
+        template = self._describer.describe(frame.image)
+        corners = usable_corners(_isotropy(template, patch), frame.mask, valid, patch, radius, row0, column0)
+        if len(corners) < LEAST_PLACES:
+            return None
+        corners = corners[:MAX_PLACES]
+        surfaces = patch_surfaces(template, window, corners, patch, radius, row0, column0)
+        centres = np.array(corners) + 0.5 * patch
+        found = [_peak(surface) for surface in surfaces]
+        sharp = [i for i, peak in enumerate(found) if peak is not None]
+        peaks = np.array([found[i] for i in sharp]).reshape(-1, 4)
+        best = np.argsort(peaks[:, 3])[: max(LEAST_PLACES, round(KEPT_SHARE * len(corners)))]
+        peaks, centres = peaks[best], centres[sharp][best]
+        frame_m = _places(frame, centres, agl_m, relief)
+        offset = peaks[:, 1::-1] - radius  # east, south
+        map_m = np.column_stack(
+            [
+                e_min_m + (column0 + centres[:, 1] + offset[:, 0]) * cell_m,
+                n_max_m - (row0 + centres[:, 0] + offset[:, 1]) * cell_m,
+            ]
+        )
+        sigma = peaks[:, 3] * cell_m / agl_m
+        return FineMatches(frame_m, map_m, FACTOR*peaks[:, 2] ** 2 * np.minimum(1.0, (REF_SIGMA / sigma) ** 2))
+
+
+def _places(frame: Rectified, centres: np.ndarray, agl_m: float, relief: Relief | None) -> np.ndarray:
+    """(N, 3): ground at cells ``centres`` (N, 2: row, column), relative to the camera."""
+    e_m, n_m = frame.e_min_m + centres[:, 1] * frame.gsd_m, frame.n_max_m - centres[:, 0] * frame.gsd_m
+    up_m = np.zeros(len(centres)) if relief is None else relief(e_m, n_m)
+    return np.column_stack([e_m, n_m, up_m - agl_m])
+
+
+def _isotropy(template: np.ndarray, patch: int) -> np.ndarray:
+    """(H, W), for the patch whose corner is the cell: mean length of the doubled gradients less the length of their
+    mean, which is the smaller eigenvalue of their structure tensor. Along a single edge it is zero, and a patch there
+    fits everywhere."""
+    length = cv2.magnitude(template[0], template[1])
+    box = {"ddepth": -1, "ksize": (patch, patch), "anchor": (0, 0)}
+    mean = [cv2.boxFilter(channel, **box) for channel in (*template, length)]
+    return np.asarray(mean[2] - cv2.magnitude(mean[0], mean[1]))
+
+
+# Least-squares quadratic through 3 x 3 values.
+_Y, _X = (axis.ravel() for axis in np.mgrid[-1:2, -1:2])
+_QUADRATIC = np.linalg.pinv(np.column_stack([np.ones(9), _X, _Y, _X**2 / 2, _X * _Y, _Y**2 / 2]))
+
+
+def _peak(surface: np.ndarray) -> tuple[float, float, float, float] | None:
+    """(row, column, correlation, 1-sigma in cells up to a factor) of the peak; None: at the border, weak, or no
+    maximum.
+
+    A displaced patch of N independent cells with correlation c has the error covariance (1 - c^2) / (c N) times the
+    inverse of the surface's negative curvature (Cramer-Rao bound of a known signal in white noise); the 1-sigma is that
+    of the worst direction for N = 1."""
+    r, c = np.unravel_index(int(np.argmax(surface)), surface.shape)
+    best = float(surface[r, c])
+    if r in (0, surface.shape[0] - 1) or c in (0, surface.shape[1] - 1) or best < MIN_CORRELATION:
+        return None
+    _, by_x, by_y, xx, xy, yy = _QUADRATIC @ surface[r - 1 : r + 2, c - 1 : c + 2].ravel()
+    det = xx * yy - xy * xy
+    least = -0.5 * (xx + yy) - float(np.hypot(0.5 * (xx - yy), xy))  # smaller eigenvalue of the negative curvature
+    if least <= 1e-6:
+        return None
+    dx, dy = (xy * by_y - yy * by_x) / det, (xy * by_x - xx * by_y) / det
+    sigma = float(np.sqrt((1.0 - min(best, 0.99) ** 2) / (best * least)))
+    return float(r) + float(np.clip(dy, -1.0, 1.0)), float(c) + float(np.clip(dx, -1.0, 1.0)), best, sigma
