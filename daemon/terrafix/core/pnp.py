@@ -123,9 +123,9 @@ class _Start:
 
 
 def _given_start(points_w_m: np.ndarray, xy: np.ndarray, given: PnpInput) -> _Start:
-    """The pose that ``given`` states."""
+    """The pose that ``given`` states, and the matches that are inliers of a coarse one: it has the errors of that."""
     r_w_c, p = rot_from_quat(given.q_w_c), np.array(given.p_c_in_w_m)
-    return _Start(r_w_c, p, np.flatnonzero(_agreeing(points_w_m, xy, r_w_c, p, given.threshold)))
+    return _Start(r_w_c, p, np.flatnonzero(_agreeing(points_w_m, xy, r_w_c, p, INLIER_THRESHOLD)))
 
 
 def _agreeing(

@@ -13,7 +13,7 @@ import numpy as np
 from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, MapFeatures, MapWindows
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.orthorectify import Rectified, Relief, rectify
-from terrafix.anchor.matching.patch_matcher import patch_surfaces, usable_corners
+from terrafix.anchor.matching.patch_matcher import patch_means, patch_surfaces, usable_corners
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 from terrafix_engines.features.gradient import OrientationDescriber
@@ -76,12 +76,13 @@ class FineMatcher:
         row0 = round((n_max_m - (n_m + frame.n_max_m)) / cell_m)
         column0 = round((e_m + frame.e_min_m - e_min_m) / cell_m)
         template = self._describer.describe(frame.image)
-        corners = usable_corners(_isotropy(template, patch), frame.mask, valid, patch, radius, row0, column0)
+        corners = usable_corners(frame.mask, valid, patch, radius, row0, column0)
         if len(corners) < LEAST_PLACES:
             return None
-        corners = corners[:MAX_PLACES]
-        surfaces = patch_surfaces(template, window, corners, patch, radius, row0, column0)
-        centres = np.array(corners) + 0.5 * patch
+        corners = corners[np.argsort(-_isotropy(template, patch, corners), kind="stable")[:MAX_PLACES]]
+        pairs = [(int(r), int(c)) for r, c in corners]
+        surfaces = patch_surfaces(template, window, pairs, patch, radius, row0, column0)
+        centres = corners + 0.5 * patch
         found = [_peak(surface) for surface in surfaces]
         sharp = [i for i, peak in enumerate(found) if peak is not None]
         peaks = np.array([found[i] for i in sharp]).reshape(-1, 4)
@@ -106,14 +107,13 @@ def _places(frame: Rectified, centres: np.ndarray, agl_m: float, relief: Relief 
     return np.column_stack([e_m, n_m, up_m - agl_m])
 
 
-def _isotropy(template: np.ndarray, patch: int) -> np.ndarray:
-    """(H, W), for the patch whose corner is the cell: mean length of the doubled gradients less the length of their
+def _isotropy(template: np.ndarray, patch: int, corners: np.ndarray) -> np.ndarray:
+    """(N,), for the patches at ``corners`` (N, 2): mean length of the doubled gradients less the length of their
     mean, which is the smaller eigenvalue of their structure tensor. Along a single edge it is zero, and a patch there
     fits everywhere."""
     length = cv2.magnitude(template[0], template[1])
-    box = {"ddepth": -1, "ksize": (patch, patch), "anchor": (0, 0)}
-    mean = [cv2.boxFilter(channel, **box) for channel in (*template, length)]
-    return np.asarray(mean[2] - cv2.magnitude(mean[0], mean[1]))
+    east, north, along = patch_means([*template, length], patch, corners)
+    return np.asarray(along - np.hypot(east, north))
 
 
 # Least-squares quadratic through 3 x 3 values.
