@@ -272,7 +272,9 @@ class PnpInput(msgspec.Struct, frozen=True, kw_only=True):
     threshold: float  # largest reprojection error of an inlier, normalised image coordinates
     search_radius: float  # within which each match was searched around its expected place, share of the height
     min_inliers: int  # fewest inliers of a pose
-    p_c_in_w_m: Vec3 | None = None  # position of a pose found before, with the rotation ``q_w_c``; None: RANSAC finds one
+    p_c_in_w_m: Vec3 | None = (
+        None  # position of a pose found before, with the rotation ``q_w_c``; None: RANSAC finds one
+    )
 
 
 class MatchPlace(msgspec.Struct, frozen=True, kw_only=True):

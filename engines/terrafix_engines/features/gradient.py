@@ -55,9 +55,10 @@ class OrientationDescriber:
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         dx = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
         dy = cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
-        length = cv2.magnitude(dx, dy)
-        per_length = 1.0 / np.maximum(length, np.float32(1e-6))
-        doubled = np.stack([(dx * dx - dy * dy) * per_length, 2.0 * dx * dy * per_length])
+        squares = dx * dx, dy * dy
+        length = np.sqrt(squares[0] + squares[1])  # cv2.magnitude rounds differently at different addresses
+        per_length = np.float32(1.0) / np.maximum(length, np.float32(1e-6))
+        doubled = np.stack([(squares[0] - squares[1]) * per_length, np.float32(2.0) * dx * dy * per_length])
         mean = cv2.GaussianBlur(length, (0, 0), SMOOTH_SIGMA_PX) + np.float32(SATURATION * 0.25)
         for channel in doubled:
             cv2.GaussianBlur(channel, (0, 0), SMOOTH_SIGMA_PX, channel)

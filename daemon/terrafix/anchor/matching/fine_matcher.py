@@ -2,12 +2,11 @@
 
 The cells of the first step (frame_matcher.py) are coarse because each patch is searched over a wide area. Once the pose
 is known, a place is off by a few cells at most: larger patches on finer cells, with two channels instead of eight, cost
-less than the first step. The precision of each match follows from its own correlation peak, and the best half is kept.
+less than the first step. The precision of each match follows from its own correlation peak, and the most precise ones are kept.
 """
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, MapFeatures, MapWindows
@@ -18,18 +17,20 @@ from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 from terrafix_engines.features.gradient import OrientationDescriber
 
-import os
-FINE_GSD_PER_AGL = 1 / float(os.environ.get("FGSD","280"))
-FINE_PATCH_PER_AGL = float(os.environ.get("FPATCH",".3"))
-FINE_RADIUS = float(os.environ.get("FRAD",".03"))
-MAX_PLACES = int(os.environ.get("FPLACES","24"))
-KEPT_SHARE = float(os.environ.get("FKEEP",".5"))
-LEAST_PLACES = 12
-FINE_THRESHOLD = float(os.environ.get("FTHR",".01"))
-REF_SIGMA = float(os.environ.get("FREF",".03"))
-FACTOR = float(os.environ.get("FFAC","1"))
-MIN_CORRELATION = 0.1
-CACHE_SHARE = 4
+# Shares of the height: cell of the fine step, side of its patches, and radius around the place that the pose gives. On
+# real flights finer cells change nothing, on ground without relief they are better. [measured: docs/acceptance.md]
+FINE_GSD_PER_AGL, FINE_PATCH_PER_AGL, FINE_RADIUS = 1 / 280, 0.3, 0.03
+# Places that are matched, and that are kept. By predicted precision the best third has half of the error of the middle
+# one, the worst third three times that of the best. [measured: docs/acceptance.md]
+MAX_PLACES, KEPT_PLACES = 20, 14
+# Inlier threshold of fine matches, normalised image coordinates: three sigmas of the kept ones over relief and houses.
+# [measured: docs/acceptance.md]
+FINE_THRESHOLD = 0.01
+# 1-sigma of a match, as ``_peak`` predicts it up to a factor, in heights: of the best tenth, which have the full
+# weight. [measured: docs/acceptance.md]
+BEST_SIGMA = 0.02
+MIN_CORRELATION = 0.1  # two thirds of those below it are wrong [measured: docs/acceptance.md]
+CACHE_SHARE = 4  # of the memory for coarse descriptors: those have four times as many channels [spec: 2 of 8 channels]
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,9 @@ class FineMatches:
 class FineMatcher:
     """Matches places of a frame with one map layer. ``cache_bytes``: memory for the layer's coarse descriptors."""
 
-    def __init__(self, source: MapWindows, cache_bytes: int = CACHE_BYTES, store: DescriptorStore | None = None) -> None:
+    def __init__(
+        self, source: MapWindows, cache_bytes: int = CACHE_BYTES, store: DescriptorStore | None = None
+    ) -> None:
         self._describer = OrientationDescriber()
         self._features = MapFeatures(source, self._describer, cache_bytes // CACHE_SHARE, store=store)
 
@@ -77,7 +80,7 @@ class FineMatcher:
         column0 = round((e_m + frame.e_min_m - e_min_m) / cell_m)
         template = self._describer.describe(frame.image)
         corners = usable_corners(frame.mask, valid, patch, radius, row0, column0)
-        if len(corners) < LEAST_PLACES:
+        if len(corners) < KEPT_PLACES:
             return None
         corners = corners[np.argsort(-_isotropy(template, patch, corners), kind="stable")[:MAX_PLACES]]
         pairs = [(int(r), int(c)) for r, c in corners]
@@ -86,7 +89,7 @@ class FineMatcher:
         found = [_peak(surface) for surface in surfaces]
         sharp = [i for i, peak in enumerate(found) if peak is not None]
         peaks = np.array([found[i] for i in sharp]).reshape(-1, 4)
-        best = np.argsort(peaks[:, 3])[: max(LEAST_PLACES, round(KEPT_SHARE * len(corners)))]
+        best = np.argsort(peaks[:, 3], kind="stable")[:KEPT_PLACES]
         peaks, centres = peaks[best], centres[sharp][best]
         frame_m = _places(frame, centres, agl_m, relief)
         offset = peaks[:, 1::-1] - radius  # east, south
@@ -97,7 +100,7 @@ class FineMatcher:
             ]
         )
         sigma = peaks[:, 3] * cell_m / agl_m
-        return FineMatches(frame_m, map_m, FACTOR*peaks[:, 2] ** 2 * np.minimum(1.0, (REF_SIGMA / sigma) ** 2))
+        return FineMatches(frame_m, map_m, np.minimum(1.0, (BEST_SIGMA / sigma) ** 2))
 
 
 def _places(frame: Rectified, centres: np.ndarray, agl_m: float, relief: Relief | None) -> np.ndarray:
@@ -111,7 +114,7 @@ def _isotropy(template: np.ndarray, patch: int, corners: np.ndarray) -> np.ndarr
     """(N,), for the patches at ``corners`` (N, 2): mean length of the doubled gradients less the length of their
     mean, which is the smaller eigenvalue of their structure tensor. Along a single edge it is zero, and a patch there
     fits everywhere."""
-    length = cv2.magnitude(template[0], template[1])
+    length = np.hypot(template[0], template[1])
     east, north, along = patch_means([*template, length], patch, corners)
     return np.asarray(along - np.hypot(east, north))
 

@@ -103,9 +103,7 @@ def _select_patches(
     return [(int(r), int(c)) for r, c in corners[best]]
 
 
-def usable_corners(
-    mask: np.ndarray, valid: np.ndarray, patch: int, radius: int, row0: int, column0: int
-) -> np.ndarray:
+def usable_corners(mask: np.ndarray, valid: np.ndarray, patch: int, radius: int, row0: int, column0: int) -> np.ndarray:
     """(N, 2): corners (row, column), half a patch apart, of the patches that lie inside the frame ``mask`` (h, w) and
     whose search area lies on the map ``valid``."""
     h, w = mask.shape
@@ -115,7 +113,8 @@ def usable_corners(
     rows, columns = np.arange(0, h - patch + 1, step), np.arange(0, w - patch + 1, step)
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
     corners = corners[patch_means([mask.astype(np.uint8)], patch, corners)[0] >= 0.98]
-    first, last = corners + (row0 - radius, column0 - radius), corners + (row0, column0) + patch + radius
+    on_window = corners + np.array([row0, column0])
+    first, last = on_window - radius, on_window + patch + radius
     on_map = (first >= 0).all(axis=1) & (last <= valid.shape).all(axis=1)
     return np.array(
         [
