@@ -2,7 +2,8 @@
 
 The cells of the first step (frame_matcher.py) are coarse because each patch is searched over a wide area. Once the pose
 is known, a place is off by a few cells at most: larger patches on finer cells, with two channels instead of eight, cost
-less than the first step. The precision of each match follows from its own correlation peak, and the most precise ones are kept.
+less than the first step. The precision of each match follows from its own correlation peak, and the most precise ones
+are kept.
 """
 
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ MAX_PLACES, KEPT_PLACES = 20, 14
 FINE_THRESHOLD = 0.01
 # 1-sigma of a match, as ``_peak`` predicts it up to a factor, in heights: of the best tenth, which have the full
 # weight. [measured: docs/acceptance.md]
-BEST_SIGMA = 0.02
+BEST_SIGMA = 0.01
 MIN_CORRELATION = 0.1  # two thirds of those below it are wrong [measured: docs/acceptance.md]
 CACHE_SHARE = 4  # of the memory for coarse descriptors: those have four times as many channels [spec: 2 of 8 channels]
 
