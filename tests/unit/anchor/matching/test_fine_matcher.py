@@ -1,4 +1,4 @@
-"""The last step of a map fix: smaller errors of the matches, a better pose, the relief of the ground, and its limits."""
+"""The last step of a map fix: smaller errors of the matches, the relief of the ground, and what it refuses."""
 
 from dataclasses import replace
 
