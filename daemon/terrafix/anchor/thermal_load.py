@@ -1,4 +1,5 @@
-"""Load of map matching by thermal band: every frame, or one of several, with the learned model or without it."""
+"""Load of map matching by thermal band: every frame, or one of several, with the learned model or without it,
+with poses refined on fine cells or not."""
 
 from terrafix.core.config import HealthSection
 from terrafix.messages import ThermalBand
@@ -20,6 +21,11 @@ class ThermalLoad:
     def allows_model(self) -> bool:
         """Whether the learned model may run."""
         return self.band is not ThermalBand.CRITICAL
+
+    @property
+    def allows_refinement(self) -> bool:
+        """Whether the pose of a match may be refined on fine cells."""
+        return self.band is ThermalBand.NORMAL
 
     def takes_frame(self) -> bool:
         """Whether the next frame is matched with the map. Call it once for every frame."""

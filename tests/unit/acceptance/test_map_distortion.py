@@ -4,7 +4,7 @@ import numpy as np
 
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import MapMatch, MapPose, Verdict
-from terrafix_tools.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals
+from terrafix_tools.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals, shows_distortion
 
 DOWN, HEIGHT_M, FOCAL_PX = np.diag([1.0, -1.0, -1.0]), 100.0, 700.0
 
@@ -43,3 +43,10 @@ def test_distortion_that_all_frames_see_is_taken_out_and_errors_of_one_frame_are
         left = mean_px(frames, left_by_local_model(frames))
         whole = mean_px(frames, [f.off_m for f in frames])
         assert least < left / whole < most
+
+
+def test_the_local_model_is_used_by_how_often_the_ground_was_matched_and_not_by_what_it_leaves() -> None:
+    """With an error of the matches alone the model leaves more than there was; the rule is the same."""
+    for warped, noise_m in ((True, 0.1), (False, 1.0)):
+        often = [residuals(match(i, warped=warped, noise_m=noise_m), FOCAL_PX) for i in range(12)]
+        assert shows_distortion(often) and not shows_distortion(often[:2])

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from terrafix.anchor.matching.fine_matcher import FINE_GSD_PER_AGL
 from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL
 from terrafix.core.camera import distort_division
 from terrafix.core.pnp import solve, solved
@@ -33,6 +34,7 @@ def measure(folder: Path) -> list[tuple[str, float]]:
     focal_px = next(m for m in messages if isinstance(m, Origin)).camera.fx
     received = [m for m in messages if isinstance(m, MapMatch) and m.verdict is Verdict.ACCEPTED and m.matches]
     found, single, of_single = list[Residuals](), list[MapMatch](), list[Residuals]()
+    refined = list[Residuals]()
     for match in received:
         placed = solved(match)
         if placed.pose is None:
@@ -41,19 +43,23 @@ def measure(folder: Path) -> list[tuple[str, float]]:
         if match.pnp is not None:
             single.append(match)
             of_single.append(found[-1])
+            if match.pnp.p_c_in_w_m is not None:
+                refined.append(found[-1])
     lens = smooth(flights_of(folder)[0]).lens
     off_m = [f.off_m for f in found]
     height_m = float(np.mean([f.height_m for f in found]))
-    cell_px = FIX_GSD_PER_AGL["gradient"] * focal_px
+    coarse_px, fine_px = FIX_GSD_PER_AGL["gradient"] * focal_px, FINE_GSD_PER_AGL * focal_px
     return [
         ("nothing: all accepted matches", mean_px(found, off_m)),
         ("nothing: those whose pose PnP computes", mean_px(of_single, [f.off_m for f in of_single])),
+        ("nothing: those refined on fine cells", mean_px(refined, [f.off_m for f in refined])),
         ("... lens of finalise (same points, PnP again)", _through(lens, single, focal_px)),
         ("affine displacement of the map in each frame", mean_px(found, [_less_affine(f) for f in found])),
         ("local distortion of the map, by other frames", mean_px(found, left_by_local_model(found))),
         ("relief: part along the ray beyond that across it", mean_px(found, [_less_relief(f) for f in found])),
-        ("a cell of the matched patches, side", cell_px),
-        ("... mean length of a uniform error within a cell", UNIFORM_LENGTH * cell_px),
+        ("a cell of the patches, coarse", coarse_px),
+        ("a cell of the patches, fine", fine_px),
+        ("... mean length of a uniform error within a fine cell", UNIFORM_LENGTH * fine_px),
         ("mean height, m", height_m),
     ]
 

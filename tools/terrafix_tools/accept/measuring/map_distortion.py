@@ -4,7 +4,7 @@ A map that is stretched, or ground that differs from it, displaces the matches o
 point is the weighted mean of the displacements that the matches of *other* frames have around it, so that what it
 leaves is an error of the match itself and not a fit to it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,9 @@ from terrafix.messages import MapMatch
 # 1-sigma of the weight's distance, share of the height: patches a tenth of the height apart share a third of the error.
 REACH = 0.04  # [measured: docs/monte-carlo.md, patches]
 PRIOR_WEIGHT = 0.25  # of no displacement: a neighbour right there has 1 [spec: ridge of the weighted mean]
+# Least median weight of the other frames' matches around a point for the model to be used: that of four matches right
+# there, whose mean has a fourth of the variance of one [spec: variance of a mean]
+LEAST_WEIGHT = 4.0
 FAR_SIGMAS = 3.0  # beyond which a neighbour does not count [spec: Gaussian weight below 1 %]
 
 
@@ -47,15 +50,29 @@ def residuals(match: MapMatch, focal_px: float) -> Residuals:
 
 def left_by_local_model(frames: Sequence[Residuals]) -> list[np.ndarray]:
     """What the local model leaves of ``off_m`` of every frame, (N, 2) each."""
-    map_m, off_m = np.concatenate([f.map_m for f in frames]), np.concatenate([f.off_m for f in frames])
+    off_m = np.concatenate([f.off_m for f in frames])
+    return [
+        frame.off_m - weight @ off_m[others] / (weight.sum(axis=1, keepdims=True) + PRIOR_WEIGHT)
+        for frame, (weight, others) in zip(frames, _neighbours(frames), strict=True)
+    ]
+
+
+def shows_distortion(frames: Sequence[Residuals]) -> bool:
+    """Whether the flight has matched its ground often enough for the local model, whatever that leaves: the median
+    weight of the neighbours of a point is ``LEAST_WEIGHT`` or more. It does not depend on the displacements."""
+    weights = np.concatenate([weight.sum(axis=1) for weight, _ in _neighbours(frames)])
+    return bool(np.median(weights) >= LEAST_WEIGHT)
+
+
+def _neighbours(frames: Sequence[Residuals]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For every frame: weight (N, M) that the M points of the other frames have for its N, and (points,) bool, which
+    of all points these are."""
+    map_m = np.concatenate([f.map_m for f in frames])
     of_frame = np.repeat(np.arange(len(frames)), [len(f.map_m) for f in frames])
-    left = []
     for i, frame in enumerate(frames):
         others = of_frame != i
         squares = np.sum((frame.map_m[:, None] - map_m[None, others]) ** 2, axis=2) / (REACH * frame.height_m) ** 2
-        weight = np.where(squares < FAR_SIGMAS**2, np.exp(-0.5 * squares), 0.0)
-        left.append(frame.off_m - weight @ off_m[others] / (weight.sum(axis=1, keepdims=True) + PRIOR_WEIGHT))
-    return left
+        yield np.where(squares < FAR_SIGMAS**2, np.exp(-0.5 * squares), 0.0), others
 
 
 def mean_px(frames: Sequence[Residuals], off_m: Sequence[np.ndarray]) -> float:

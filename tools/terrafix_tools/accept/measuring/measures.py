@@ -14,7 +14,7 @@ from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.measuring.consistency import FLIGHT_CONFIDENCE, judge_claims
 from terrafix_tools.accept.measuring.epipolar import reprojection_error
 from terrafix_tools.accept.measuring.evidence import Evidence, FrameEvidence
-from terrafix_tools.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals
+from terrafix_tools.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals, shows_distortion
 from terrafix_tools.accept.measuring.results import Measured, Span, Verdict
 
 NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
@@ -164,8 +164,10 @@ def odometry_px(e: Evidence) -> Measured:
 
 
 def map_px(e: Evidence) -> Measured:
-    """Mean over the matched points of accepted fixes, projected with the published pose, less the local distortion of
-    the map as the matches of other frames show it; pixels of the frames. The reason has the number with it, too."""
+    """Mean over the matched points of accepted fixes, projected with the published pose; pixels of the frames.
+
+    Where the matches of other frames show the map's local distortion, it is taken out: ``shows_distortion`` is the
+    rule. Without it the number is that of the points as they are. The reason has both numbers and says which one."""
     found = []
     for frame in e.frames:
         match = None if frame.match is None else solved(frame.match)
@@ -176,7 +178,9 @@ def map_px(e: Evidence) -> Measured:
     whole_px = float(np.mean([f.px.mean() for f in found]))
     left_px = mean_px(found, left_by_local_model(found))
     why = f"pixels of the stored frames; {whole_px:.1f} px with the map's local distortion, {left_px:.1f} px without"
-    return Measured(min(whole_px, left_px), why)
+    if shows_distortion(found):
+        return Measured(left_px, f"{why}: judged without, other frames have matched the same ground")
+    return Measured(whole_px, f"{why}: judged with, too few frames have matched the same ground")
 
 
 def drift(e: Evidence) -> Measured:
