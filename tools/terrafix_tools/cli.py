@@ -13,9 +13,9 @@ from terrafix.core.errors import TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
 from terrafix_tools.chaos.cli import chaos
 from terrafix_tools.compare.cli import compare
-from terrafix_tools.files.cli import files
 from terrafix_tools.console.cli import serve
 from terrafix_tools.console.flight_cli import app as flight_app
+from terrafix_tools.files.cli import files
 from terrafix_tools.finalise.cli import finalise
 from terrafix_tools.fleet.cli import app as fleet_app
 from terrafix_tools.hint.cli import CONTEXT, hint
