@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from terrafix.core.gate import CHI2_95
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import (
     Frame,
@@ -36,7 +37,6 @@ from terrafix_tools.console.events import (
 )
 from terrafix_tools.console.payloads import Ellipse, FlightState, Fragment, FrameResult, Gps, InputRequest
 from terrafix_tools.estimates import yaw_deg_of
-from terrafix_tools.evaluate import ELLIPSE95
 
 NEAR_M = 20.0  # of the position, within which `confidence` is the probability [spec: AC-1 of the requirements]
 TILES = 5  # candidates of a request [spec: SV-5 of the requirements]
@@ -268,7 +268,7 @@ class FlightObserver:
 def ellipse_of(cov_m2: np.ndarray) -> Ellipse:
     """The 95 % ellipse of a covariance (2, 2) of east and north."""
     variances, axes = np.linalg.eigh(cov_m2)
-    semi = np.sqrt(ELLIPSE95 * np.maximum(variances, 0.0))
+    semi = np.sqrt(CHI2_95 * np.maximum(variances, 0.0))
     bearing_deg = math.degrees(math.atan2(float(axes[0, 1]), float(axes[1, 1]))) % 180.0
     return Ellipse(
         semi_major_m=round(float(semi[1]), 2), semi_minor_m=round(float(semi[0]), 2), bearing_deg=round(bearing_deg, 1)

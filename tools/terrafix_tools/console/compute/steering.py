@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from terrafix.anchor.relocalization.position_prior import SIGMAS_95
 from terrafix.core.camera import CameraCalibration, Mount
+from terrafix.core.gate import SIGMAS_95
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.messages import Camera, NavEstimate, PositionHint
 from terrafix_tools.console.payloads import Hint, UserFix
