@@ -1,10 +1,15 @@
 """The local model of a map's distortion: what all frames see there is taken out, what one frame sees is not."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
+import pytest
 
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import MapMatch, MapPose, Verdict
 from terrafix_tools.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals, shows_distortion
+from terrafix_tools.accept.measuring.measures import map_px
 
 DOWN, HEIGHT_M, FOCAL_PX = np.diag([1.0, -1.0, -1.0]), 100.0, 700.0
 
@@ -50,3 +55,20 @@ def test_the_local_model_is_used_by_how_often_the_ground_was_matched_and_not_by_
     for warped, noise_m in ((True, 0.1), (False, 1.0)):
         often = [residuals(match(i, warped=warped, noise_m=noise_m), FOCAL_PX) for i in range(12)]
         assert shows_distortion(often) and not shows_distortion(often[:2])
+
+
+@pytest.mark.parametrize(("frames", "less_distortion"), [(12, True), (2, False)])
+def test_the_map_error_is_judged_by_one_rule_also_where_that_gives_the_larger_number(
+    frames: int, less_distortion: bool
+) -> None:
+    """Errors of the matches alone: the local model adds noise."""
+    matches = [match(i, warped=False, noise_m=1.0) for i in range(frames)]
+    evidence: Any = SimpleNamespace(
+        frames=[SimpleNamespace(match=one, fixed=True) for one in matches],
+        origin=SimpleNamespace(camera=SimpleNamespace(fx=FOCAL_PX)),
+    )
+    found = [residuals(one, FOCAL_PX) for one in matches]
+    whole, left = mean_px(found, [f.off_m for f in found]), mean_px(found, left_by_local_model(found))
+    measured = map_px(evidence)
+    assert left > whole * 1.02
+    assert measured.value == pytest.approx(left if less_distortion else whole, rel=1e-6)
