@@ -27,7 +27,7 @@ GPU = (TENSORRT, CUDA)
 # Cells: windows of a flight (400 to 720 cells for village-1 and town-a) and of a lost vehicle's belief.
 # [measured: docs/models.md]
 SIDES = (512, 768)
-BATCH = 9  # templates of one inference: three headings and scales; one template has a preset of its own
+BATCHES = (1, 3, 9)  # templates of one inference: as predicted; three scales; three headings at each scale
 NAME = "correlation-{side}"
 MIN_ENERGY = 1e-6  # root of a template's energy, so that an empty one is not divided by zero
 
@@ -130,7 +130,7 @@ def _manifest(side: int, content: bytes, half: bool) -> str:
     precision = "fp16" if half else "fp32"
     presets = "".join(
         f'\n[[presets]]\nsizes = {{ images = 1, templates = {count} }}\nprecision = "{precision}"\n'
-        for count in (1, BATCH)
+        for count in BATCHES
     )
     inputs = "".join(
         f'\n[[inputs]]\nname = "{name}"\nshape = ["{name}", {CHANNELS}, {side}, {side}]\n'
@@ -175,9 +175,10 @@ class GraphCorrelator:
             return None
         found: list[np.ndarray] = []
         try:
-            for begin in range(0, len(templates), BATCH):
-                chunk = templates[begin : begin + BATCH]
-                batch = np.zeros((1 if len(chunk) == 1 else BATCH, len(image), side, side), np.float32)
+            for begin in range(0, len(templates), BATCHES[-1]):
+                chunk = templates[begin : begin + BATCHES[-1]]
+                size = next(size for size in BATCHES if size >= len(chunk))
+                batch = np.zeros((size, len(image), side, side), np.float32)
                 for i, template in enumerate(chunk):
                     batch[i, :, : template.shape[1], : template.shape[2]] = template
                 (surfaces,) = self._models[side].run(_padded(image, side), batch)

@@ -18,7 +18,7 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import MapMatch, ModelChange, ModelEvent, Verdict
 from terrafix_engines import correlation
-from terrafix_engines.correlation import BATCH, GraphCorrelator, export, graph, open_correlator
+from terrafix_engines.correlation import BATCHES, GraphCorrelator, export, graph, open_correlator
 from terrafix_engines.features.gradient import CHANNELS, GradientDescriber
 from terrafix_engines.manifest import ManifestError, read
 from terrafix_engines.providers import CPU
@@ -75,7 +75,7 @@ def test_a_window_is_correlated_as_by_opencv_with_one_template_and_with_many(sma
         valid = np.ones((45, width), bool)
         valid[:12] = False
         templates = []
-        for i in range(BATCH + 2):
+        for i in range(BATCHES[-1] + 2):
             mask = np.ones((16 + i, 20), bool)
             mask[:3, :4] = False
             templates.append((rng.normal(size=(CHANNELS, *mask.shape)).astype(np.float32), mask))
@@ -136,10 +136,7 @@ def test_the_exported_graphs_have_manifests_with_presets_of_their_precision(
         done = CliRunner().invoke(app, ["export", "--folder", str(tmp_path), *option])
         assert done.exit_code == 0 and done.output == f"written to {tmp_path / 'correlation-24.onnx'}\n"
         manifest = read(tmp_path / "correlation-24.toml")
-        assert [preset.sizes for preset in manifest.presets] == [
-            {"images": 1, "templates": 1},
-            {"images": 1, "templates": BATCH},
-        ]
+        assert [preset.sizes for preset in manifest.presets] == [{"images": 1, "templates": n} for n in (1, 3, 9)]
         assert {preset.precision for preset in manifest.presets} == {precision}
         assert (tmp_path / "correlation-24.onnx").stat().st_size == manifest.size_bytes
 
