@@ -89,9 +89,7 @@ def soon(found: Callable[[], Any]) -> Any:
     return result
 
 
-def test_a_live_flight_has_results_events_health_and_an_end(
-    owned: OwnedRunDir, flying: Flying, tmp_path: Path
-) -> None:
+def test_a_live_flight_has_results_events_health_and_an_end(owned: OwnedRunDir, flying: Flying, tmp_path: Path) -> None:
     chosen = settings(tmp_path / "data", bus=str(owned.run_dir.path))
     with Console(chosen) as console:
         (flight,) = soon(lambda: console.send("GET", "/flights").json["flights"])

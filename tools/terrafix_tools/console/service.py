@@ -181,7 +181,10 @@ class Service:
         if flight.kind is FlightKind.LIVE:
             raise Refusal(409, "the frames of a live flight come from its camera")
         folder = self.settings.flight(flight_id)
-        return await uploads.take_batch(request, self.database, flight_id, folder, self.settings.limits, self._uploads)
+        limits = self.settings.limits
+        accepted = await uploads.take_batch(request, self.database, flight_id, folder, limits, self._uploads)
+        await self._wake(flight_id)
+        return accepted
 
     async def steer(self, flight_id: str, given: Hint | UserFix) -> Steered:
         flight = await asyncio.to_thread(self.flight, flight_id)
