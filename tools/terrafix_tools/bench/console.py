@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -112,14 +113,10 @@ def _event_latency_ms(client: ConsoleClient, new: NewFlight, folder: Path, clien
     ready = threading.Barrier(clients + 1)
 
     def listen() -> None:
-        count = 0
         stream = ConsoleClient(client.url).events(flight_id)
         ready.wait()
-        for event in stream:
+        for event in islice(stream, EVENTS):
             latencies_ms.append((time.perf_counter() - sent_s[event.event_id]) * 1e3)
-            count += 1
-            if count == EVENTS:
-                return
 
     threads = [threading.Thread(target=listen, daemon=True) for _ in range(clients)]
     for thread in threads:
