@@ -116,6 +116,8 @@ class Browser:
         self._call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": value}])
 
     def open(self, url: str) -> None:
+        """A page that is shown already is loaded anew, also where only the part behind '#' differs."""
+        self._call("Page.navigate", url="about:blank")
         self._call("Page.navigate", url=url)
 
     def run(self, script: str) -> Any:

@@ -20,7 +20,7 @@ from terrafix_engines.store import StoredModel, models_folder, resolve_model, sh
 
 GIT_TIMEOUT_S = 2.0
 RECORD_FORMAT = "terrafix-flight/2"
-MODEL_FOLDER = "folder"  # key of [models] that is not a model
+NOT_MODELS = ("correlation", "folder")  # keys of [models] that name no model
 _VERSIONED = ("terrafix", "numpy", "gtsam", "opencv-python-headless", "onnxruntime", "pymavlink", "mcap", "msgspec")
 _MAP_KEYS = ("name", "checksum", "date", "source", "built_with")
 _DEVICE_NAMES = ("/proc/device-tree/model", "/sys/class/dmi/id/product_name")
@@ -95,7 +95,7 @@ def models_of(models: Models) -> dict[str, dict[str, str]]:
     """Path and sha256 of each configured model; sha256 is empty where the file cannot be read."""
     found = {}
     for slot, text in msgspec.to_builtins(models).items():
-        if text and slot != MODEL_FOLDER:
+        if text and slot not in NOT_MODELS:
             path, digest = text, ""
             try:
                 model = resolve_model(text, slot, models_folder(models.folder))

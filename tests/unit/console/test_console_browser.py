@@ -1,5 +1,5 @@
-"""The page in a real browser, over HTTP: a flight from its photos to its track, the position of a pixel, the help that a
-lost flight asks for, and a connection that is lost and found again."""
+"""The page in a real browser, over HTTP: a flight from its photos to its track, the position of a pixel, the help that
+a lost flight asks for, and a connection that is lost and found again."""
 
 import json
 import time
@@ -25,9 +25,17 @@ COMPUTED_S = 120.0  # longest wait for ten frames; processes of others may take 
 
 
 @pytest.fixture(scope="module")
-def window() -> Iterator[Browser]:
-    with Browser() as opened:
-        yield opened
+def opened() -> Iterator[Browser]:
+    with Browser() as window:
+        yield window
+
+
+@pytest.fixture
+def window(opened: Browser) -> Browser:
+    """With an empty page, and no errors of the one before."""
+    opened.open("about:blank")
+    opened.errors.clear()
+    return opened
 
 
 def enter(window: Browser, field: str, value: object) -> None:

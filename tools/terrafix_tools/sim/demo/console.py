@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -59,9 +60,15 @@ class DemoConsole:
         return self._process is not None and self._process.poll() is None
 
     def wait(self) -> None:
-        if self._process is not None:
+        """Until SIGINT or SIGTERM, or until the console ends by itself."""
+        if self._process is None:
+            return
+        before = signal.signal(signal.SIGTERM, lambda *_: self.stop())
+        try:
             with contextlib.suppress(KeyboardInterrupt):
                 self._process.wait()
+        finally:
+            signal.signal(signal.SIGTERM, before)
 
     def stop(self) -> None:
         if self._process is None or self._process.poll() is not None:

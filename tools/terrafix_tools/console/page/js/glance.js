@@ -5,12 +5,15 @@ import {NONE, clock, coordinate, degrees, metres, number, seconds, unit} from ".
 import {sign} from "./sources.js";
 import {t} from "./texts.js";
 
-export const FACTS_OLD_MS = 4000; // facts come once a second
+const FACTS_OLD_MS = 4000; // facts come once a second
 const WORRYING_S = 30; // without a map fix: what odometry alone drifts meanwhile is worth a look
 
 function cell(label, value, below, mood = "", extra = null) {
   return h("div", {class: `cell ${mood}`}, h("span", {class: "label"}, label), h("span", {class: "value"}, value, extra), h("span", {class: "below"}, below));
 }
+
+/** The facts of a live flight while they are new; null: there are none, or they are old. */
+export const freshFacts = (model) => (model.facts && Date.now() - model.factsAt < FACTS_OLD_MS ? model.facts : null);
 
 /** The ellipse itself, north up. */
 function ellipseSign(ellipse) {
@@ -29,7 +32,7 @@ export class Glance {
 
   update(model) {
     const frame = model.newest;
-    const fresh = model.facts && Date.now() - model.factsAt < FACTS_OLD_MS ? model.facts : null;
+    const fresh = freshFacts(model);
     const stale = model.connection === "lost" || (model.isLive && model.flight.state !== "completed" && model.facts && !fresh);
     this.element.classList.toggle("stale", Boolean(stale));
     if (!frame) {
@@ -48,7 +51,7 @@ export class Glance {
       cell(t("height"), unit(frame.agl_m, 0, "m"), t("amsl", unit(frame.altitude, 0, "m"))),
       cell(t("heading"), degrees(frame.heading), fresh ? t("speed", unit(fresh.position.speed_mps, 1, "m/s")) : t("true_north")),
     ];
-    if (model.isLive) cells.push(this.autopilot(fresh));
+    if (model.isLive && model.flight.state !== "completed") cells.push(this.autopilot(fresh));
     cells.push(cell(t("frame"), number(frame.frame_id), stale ? t("as_of", clock(model.updatedAt)) : this.age(model), stale ? "bad" : ""));
     fill(this.element, cells, stale ? h("strong", {class: "stale-sign"}, t("stale")) : null);
   }

@@ -2,6 +2,7 @@
 
 import {fill, h} from "./dom.js";
 import {NONE, bytes, clock, coordinate, metres, number, unit} from "./format.js";
+import {freshFacts} from "./glance.js";
 import {t} from "./texts.js";
 
 const SHOWN = 200; // lines of a log
@@ -13,6 +14,9 @@ function table(heads, rows, empty) {
   return h("div", {class: "scroll", tabindex: 0}, h("table", {}, h("thead", {}, h("tr", {}, heads.map((one) => h("th", {scope: "col"}, one)))),
     h("tbody", {}, rows.map((cells) => h("tr", {}, cells.map((one) => (one instanceof Node && one.tagName === "TD" ? one : h("td", {}, one))))))));
 }
+
+/** Says that facts are old, above them. */
+const oldFacts = (model) => (freshFacts(model) ? null : h("p", {class: "old"}, t("facts_old", clock(model.factsAt))));
 
 const td = (mood, ...content) => h("td", {class: mood}, ...content);
 const percent = (share) => unit(share === null || share === undefined ? null : 100 * share, 0, "%");
@@ -80,7 +84,7 @@ export class SystemPanel {
       unit(one.idle_s, 1, "s"), percent(one.load), number(one.restarts), one.last_event]);
     const rates = Object.entries(facts.rates_hz).map(([name, rate]) => [name, unit(rate, 1, "Hz")]);
     const dropped = Object.entries(facts.dropped).map(([name, count]) => [name, number(count), "warn"]);
-    fill(this.element,
+    fill(this.element, oldFacts(model),
       h("h3", {}, t("processes")), table([t("process"), t("state"), t("progress"), t("load"), t("restarts"), t("last_event")], processes, t("none_yet")),
       h("h3", {}, t("heat")), pairs([
         [t("temperature"), [unit(computer.temperature_c, 1, "°C"), computer.band ? ` · ${computer.band}` : ""], hot ? "bad" : ""],
@@ -112,7 +116,7 @@ export class AutopilotPanel {
     const has = position.fix === "3D";
     const gnss = Object.entries(autopilot.gnss).map(([receiver, one]) => [receiver,
       td(one.state === "spoofed" ? "bad" : one.state === "trusted" ? "good" : "", one.state), metres(one.distance_m), one.why]);
-    fill(this.element,
+    fill(this.element, oldFacts(model),
       h("h3", {}, t("sent_title")), pairs([
         [t("sent_fix"), has ? t("fix_3d") : `${t("fix_none")}: ${position.reason}`, has ? "good" : "bad"],
         [t("accuracy"), has ? `± ${metres(position.accuracy_m)}` : NONE], [t("estimate_age"), unit(position.estimate_age_ms, 0, "ms")],
