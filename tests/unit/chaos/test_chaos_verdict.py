@@ -98,6 +98,14 @@ def test_the_table_of_a_page_is_replaced_and_names_broken_promises(tmp_path: Pat
     assert "2 cells with 100 positions, 2 of them wrong." in table([good, bad])
 
 
+def test_a_cell_whose_flight_failed_before_the_fault_is_none_of_the_table_and_is_flown_again(tmp_path: Path) -> None:
+    failed = Outcome(fault="none", phase=Phase.CRUISE, verdict=verdict.NO_FIX, silence_s=0.1, fixes=3)
+    assert "| none | - | - | - | - | - |" in table([failed]) and "0 cells with 0 positions" in table([failed])
+    results = Results(tmp_path / "results.json")
+    results.add(failed)
+    assert not results.has(FAULTS[0], Phase.CRUISE)
+
+
 def jpeg() -> bytes:
     image = np.random.default_rng(1).integers(40, 120, (90, 160, 3), np.uint8)
     return cv2.imencode(".jpg", image)[1].tobytes()

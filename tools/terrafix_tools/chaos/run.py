@@ -24,7 +24,6 @@ STEP_S = 0.01
 STEADY_S = 3.0  # with fixes after the fault; then the cell is over
 RECOVERY_LIMIT_S = 30.0  # wall time; a computer that others use as well needs more than the vehicle's
 FIRST_FIX_LIMIT_S = 20.0  # beyond the planned time of the fault, on a busy computer
-NO_FIX = "no fix before the fault"
 NOT_HERE = "not measurable here: mounting a disk needs root"
 
 
@@ -81,7 +80,7 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
     return Outcome(
         fault=fault.name,
         phase=phase,
-        verdict="" if had_fix else NO_FIX,
+        verdict="" if had_fix else judge.NO_FIX,
         fixes=len(fixes),
         wrong=len(judge.wrong_fixes(fixes)),
         worst_sigmas=max((judge.sigmas(fix) for fix in fixes), default=None),
@@ -151,7 +150,7 @@ class Results:
 
     def has(self, fault: Fault, phase: Phase) -> bool:
         """Whether the cell need not be flown: one in which the flight itself failed must be."""
-        return any((o.fault, o.phase) == (fault.name, phase) and o.verdict != NO_FIX for o in self.outcomes)
+        return any((o.fault, o.phase) == (fault.name, phase) and o.verdict != judge.NO_FIX for o in self.outcomes)
 
     def add(self, outcome: Outcome) -> None:
         """Raises OutputError."""
