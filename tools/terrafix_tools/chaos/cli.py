@@ -25,7 +25,8 @@ def chaos(
 ) -> None:
     """Fly with each fault in each phase of a flight, with the real processes, and judge what the autopilot received.
 
-    Results are kept in OUT/results.json; a matrix that was interrupted goes on. Exit code 1: a promise is broken, or a cell had no fix before its fault."""
+    Results are kept in OUT/results.json; a matrix that was interrupted goes on. Exit code 1: a promise is broken, or a
+    cell had no fix before its fault."""
     from terrafix_tools.chaos.faults import FAULTS
     from terrafix_tools.chaos.run import Results, fly_matrix
     from terrafix_tools.chaos.scene import Phase, scene_in
