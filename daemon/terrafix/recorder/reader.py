@@ -32,7 +32,15 @@ _RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # more than any valid record; a corrupt 
 _FRAMING = struct.Struct("<BQ")  # opcode and length of each record (https://mcap.dev/spec)
 
 # Exceptions of a truncated or corrupt record: invalid length, compression, checksum or text.
-_CORRUPT = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError, msgspec.DecodeError)
+_CORRUPT = (
+    OverflowError,
+    McapError,
+    CRCValidationError,
+    struct.error,
+    zstandard.ZstdError,
+    UnicodeDecodeError,
+    msgspec.DecodeError,
+)
 
 _DAMAGED_IMAGE = (msgspec.DecodeError, KeyError, TypeError, ValueError)  # exceptions of decode_image
 

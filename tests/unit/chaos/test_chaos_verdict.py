@@ -1,5 +1,6 @@
 """Judgement of a cell of the fault matrix, its table, and the damage that its camera does."""
 
+import time
 from pathlib import Path
 
 import cv2
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafix_tools.chaos import verdict
-from terrafix_tools.chaos.camera import Look, altered
+from terrafix_tools.chaos.camera import Look, StreamedCamera, altered
 from terrafix_tools.chaos.faults import FAULTS
 from terrafix_tools.chaos.run import Results
 from terrafix_tools.chaos.scene import AGL_M, Phase, phases
@@ -15,6 +16,7 @@ from terrafix_tools.chaos.table import table, write_table
 from terrafix_tools.chaos.verdict import Outcome
 from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.report import ReceivedFix
+from terrafix_tools.sim.camera.stream import FrameStream
 
 
 def ticks(from_s: float, to_s: float) -> list[float]:
@@ -98,6 +100,14 @@ def test_the_table_of_a_page_is_replaced_and_names_broken_promises(tmp_path: Pat
     assert "2 cells with 100 positions, 2 of them wrong." in table([good, bad])
 
 
+def test_a_cell_whose_flight_failed_before_the_fault_is_none_of_the_table_and_is_flown_again(tmp_path: Path) -> None:
+    failed = Outcome(fault="none", phase=Phase.CRUISE, verdict=verdict.NO_FIX, silence_s=0.1, fixes=3)
+    assert "| none | - | - | - | - | - |" in table([failed]) and "0 cells with 0 positions" in table([failed])
+    results = Results(tmp_path / "results.json")
+    results.add(failed)
+    assert not results.has(FAULTS[0], Phase.CRUISE)
+
+
 def jpeg() -> bytes:
     image = np.random.default_rng(1).integers(40, 120, (90, 160, 3), np.uint8)
     return cv2.imencode(".jpg", image)[1].tobytes()
@@ -130,3 +140,27 @@ def test_the_phases_of_a_flight_are_found_by_height_and_heading() -> None:
     assert 80.0 <= found[Phase.TURN] <= 83.0
     assert found[Phase.LANDING] == pytest.approx(122.5, abs=0.5), "95 % of the height"
     assert 60.0 < found[Phase.CRUISE] < 110.0 and abs(found[Phase.CRUISE] - 81.5) > 5.0
+
+
+class Recorded(FrameStream):
+    """A stream that keeps what is pushed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pushed: list[tuple[bytes, int]] = []
+
+    def push_jpeg(self, jpeg: bytes, t_ns: int) -> None:
+        self.pushed.append((jpeg, t_ns))
+
+
+def test_each_image_is_stamped_with_its_own_time_whatever_the_phase_of_the_flight() -> None:
+    began_s = time.monotonic() - 0.2  # the images of the flight exist at 0, 0.5, 1 s ...
+    with (
+        Recorded() as stream,
+        StreamedCamera(stream, lambda t_s: f"{t_s:.3f}".encode(), lambda: time.monotonic() - began_s),
+    ):
+        time.sleep(1.2)
+    assert len(stream.pushed) >= 2
+    for image, t_ns in stream.pushed:
+        assert t_ns / 1e9 - began_s == pytest.approx(float(image), abs=0.002)
+        assert float(image) * 2.0 == round(float(image) * 2.0)

@@ -1,5 +1,6 @@
 """The camera of the fault matrix: streams the images of the flight, and what is wrong with them."""
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from terrafix_tools.sim.flights.folder import FRAME_HZ
 
 EXPOSURE_GAIN = 6.0  # of the overexposed image: all but the darkest ground is white
 DEFOCUS_PX = 12.0  # 1-sigma of the blur
+SLACK = 1e-3  # share of a period: an image that is sent so much too early is the one that is due
 NS = 1_000_000_000
 
 
@@ -40,7 +42,9 @@ class StreamedCamera:
     """A context manager. ``look`` may be changed at any time."""
 
     def __init__(self, stream: FrameStream, image_at: Callable[[float], bytes], flight_s: Callable[[], float]) -> None:
-        """``image_at``: JPEG by the time of the flight; ``flight_s``: that time now."""
+        """``image_at``: JPEG by the time of the flight; ``flight_s``: that time now.
+
+        Images exist at multiples of 1 / FRAME_HZ: each is sent at its own time, and stamped with it."""
         self.look = Look.GOOD
         self.pushed = 0
         self._stream, self._image_at, self._flight_s = stream, image_at, flight_s
@@ -57,16 +61,19 @@ class StreamedCamera:
         self._thread.join()
 
     def _run(self) -> None:
-        due_s = time.monotonic()
-        while not self._stopping.wait(max(0.0, due_s - time.monotonic())):
-            look = self.look
-            good = self._image_at(self._flight_s())
+        wait_s = 0.0
+        while not self._stopping.wait(wait_s):
+            look, now_ns, flight_s = self.look, time.monotonic_ns(), self._flight_s()
+            late_s = flight_s - math.floor(flight_s * FRAME_HZ + SLACK) / FRAME_HZ
+            good = self._image_at(flight_s - late_s)
             self._frozen = good if look is not Look.FROZEN else self._frozen
             if look is not Look.NOTHING:
-                stamp_ns = time.monotonic_ns() + SHIFT_NS.get(look, 0)
+                stamp_ns = now_ns - round(1e9 * late_s) + SHIFT_NS.get(look, 0)
                 self._stream.push_jpeg(self._frozen if look is Look.FROZEN else altered(good, look), stamp_ns)
                 self.pushed += 1
-            due_s = max(due_s, time.monotonic() - 1.0) + 1.0 / FRAME_HZ / (10.0 if look is Look.TEN_TIMES else 1.0)
+            spent_s = (time.monotonic_ns() - now_ns) / 1e9
+            period_s = 1.0 / FRAME_HZ / (10.0 if look is Look.TEN_TIMES else 1.0)
+            wait_s = max(0.0, period_s - spent_s - (late_s if look is not Look.TEN_TIMES else 0.0))
 
 
 def altered(jpeg: bytes, look: Look) -> bytes:

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 from terrafix.core.errors import SourceError
@@ -67,17 +66,13 @@ class Rig:
         with suppress(RuntimeError):
             self.peer.stop()
 
-    def take_off(self, hold_s: float = 0.0) -> None:
-        """The flight begins when the camera is opened; with ``hold_s`` the vehicle then hovers until the autopilot has
-        a fix, at most so long. Raises SourceError."""
+    def take_off(self) -> None:
+        """The flight begins when the camera is opened. Raises SourceError."""
         until_s = time.monotonic() + START_LIMIT_S
         while not self.stream.wait_for_viewer(0.1):
             self.check()
             if time.monotonic() > until_s or self._ended_by_itself():
                 raise SourceError(f"{self.folder}: Terrafix has not started; see {self.log}")
-        until_s = time.monotonic() + hold_s
-        while time.monotonic() < until_s and not self.peer.fixes():
-            time.sleep(0.1)
         self.began_s = time.monotonic()
 
     def flight_s(self) -> float:
@@ -166,8 +161,7 @@ class Rig:
         )
 
     def _state(self, t_s: float) -> PeerState:
-        state = self.scene.course(t_s)
-        return state if self.began_s is not None else replace(state, vn_mps=0.0, ve_mps=0.0, vd_mps=0.0)
+        return self.scene.course(t_s)
 
     def _home_amsl_m(self) -> float:
         ground = self.scene.course(0.0)

@@ -20,7 +20,7 @@ LEG_M = 250.0  # of the two legs, east and then north
 STEP_S = 0.1  # of the course
 CRUISE_SHARE = 0.95  # of the greatest height
 STRAIGHT_RADPS = 0.05  # a turn is faster
-LEAD_S = 8.0  # flown before the fault, after hovering to the first fix
+LEAD_S = 12.0  # flown before the fault, for the first fixes
 COURSE = "course.csv"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from terrafix.core.errors import OutputError, SourceError
 from terrafix_tools.chaos.faults import FAULTS
 from terrafix_tools.chaos.scene import Phase
-from terrafix_tools.chaos.verdict import Outcome
+from terrafix_tools.chaos.verdict import NO_FIX, Outcome
 
 MARKS = re.compile(r"(<!-- table: chaos -->).*?(<!-- end -->)", re.S)
 
@@ -29,7 +29,7 @@ def line(outcome: Outcome) -> str:
 
 def cell(outcome: Outcome | None) -> str:
     """Silence, and time without a fix, in seconds; a broken promise in words."""
-    if outcome is None:
+    if outcome is None or outcome.verdict == NO_FIX:
         return "-"
     if outcome.silence_s is None:
         return outcome.verdict
@@ -43,7 +43,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
     for fault in FAULTS:
         cells = (cell(found.get((fault.name, phase))) for phase in Phase)
         rows.append(f"| {fault.name} | {' | '.join(cells)} |")
-    flown = [o for o in outcomes if o.silence_s is not None]
+    flown = [o for o in outcomes if o.silence_s is not None and o.verdict != NO_FIX]
     fixes, wrong = sum(o.fixes for o in flown), sum(o.wrong for o in flown)
     rows += ["", f"{len(flown)} cells with {fixes} positions, {wrong} of them wrong."]
     return "\n".join(rows)

@@ -13,6 +13,7 @@ WRONG_SIGMAS = 4.0
 STEADY_S = 1.0  # a fix is back when none of the GPS_INPUT of this long afterwards lacks one
 MATCH_S = 0.15  # a recorded GPS_INPUT within this time of a received one is that one: its period is 0.1 s
 WITHOUT_FIX_S = 0.35  # between two 3D fixes, from which on there was no fix: more than three periods
+NO_FIX = "no fix before the fault"  # the flight itself failed, on a busy computer; the cell is flown again
 RECORD_LIMIT_S = 1.5  # a kill or a power cut loses at most 1.25 s by the promise of the recorder, and a period
 
 

@@ -117,7 +117,7 @@ def _plan(path: Path, text: str, course_only: bool) -> Mission:
             raise TypeError
     except (json.JSONDecodeError, RecursionError) as error:
         raise SourceError(f"{path}: not valid JSON ({error})") from None
-    except (KeyError, TypeError, IndexError, ValueError):
+    except (KeyError, TypeError, IndexError, ValueError, OverflowError):
         raise SourceError(
             f"{path}: not a QGroundControl plan: mission, plannedHomePosition or items is missing"
         ) from None
@@ -136,7 +136,7 @@ def _simple(path: Path, number: int, entry: Any, course_only: bool) -> Item | No
     try:
         values = [math.nan if value is None else float(value) for value in entry["params"]]
         command, frame = int(entry["command"]), int(entry["frame"])
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):  # overflow: Infinity, or an integer beyond any float
         raise SourceError(f"{path} item {number}: command, frame or params is missing or not a number") from None
     if len(values) != 7:
         raise SourceError(f"{path} item {number}: {len(values)} params; a mission item has 7")

@@ -29,7 +29,7 @@ def simple_items(context: str, entry: dict[str, Any]) -> list[Any]:
             return _structure_scan(entry)
         if kind in LANDINGS:
             return _landing(entry)
-    except (KeyError, TypeError, ValueError, IndexError):
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
         raise SourceError(
             f"{context}: a '{kind}' without its positions; save the plan again in QGroundControl"
         ) from None

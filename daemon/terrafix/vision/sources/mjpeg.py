@@ -11,10 +11,13 @@ import numpy as np
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
+from terrafix.vision.sources.images import stated_size
 
 TIMEOUT_S = 5.0  # time-out without data after which the camera counts as lost; ten images at 2 Hz
 MAX_PART_BYTES = 64 << 20  # limit; larger than the images of any camera
 MAX_LINE_BYTES = 8192
+MAX_PIXELS = 50_000_000  # of an image, 150 MB; larger than those of any camera that streams
+JPEG_HEAD = b"\xff\xd8"
 MAX_AGE_NS = 60_000_000_000  # a timestamp that is older, or in the future, belongs to another clock
 STAMP_HEADER = "x-timestamp-ns"
 
@@ -61,7 +64,10 @@ class MjpegCapture:
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
         """-> whether the grabbed image could be decoded, and the image (H, W, 3) uint8 BGR."""
-        image = cv2.imdecode(np.frombuffer(self._jpeg, np.uint8), cv2.IMREAD_COLOR) if self._jpeg else None
+        size = stated_size(self._jpeg) if self._jpeg.startswith(JPEG_HEAD) else None
+        if size is None or size[0] * size[1] > MAX_PIXELS:
+            return False, None
+        image = cv2.imdecode(np.frombuffer(self._jpeg, np.uint8), cv2.IMREAD_COLOR)
         return image is not None, image
 
     def get(self, prop: int) -> float:
@@ -103,5 +109,5 @@ def _valid_stamp(text: str, arrival_ns: int) -> int | None:
     """A plausible timestamp of the monotonic clock, else None."""
     if not text.strip().isdecimal():
         return None
-    stamp_ns = int(text)
+    stamp_ns = int(text.strip())
     return stamp_ns if 0 <= arrival_ns - stamp_ns <= MAX_AGE_NS else None
