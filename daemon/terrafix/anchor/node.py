@@ -164,7 +164,7 @@ class AnchorNode:
 
 def _correlator_event(t_ns: int, change: ModelChange, correlator: GraphCorrelator) -> ModelEvent:
     provider = ", ".join(dict.fromkeys(short_name(one) for one in correlator.providers))
-    detail = correlator.failure or "on the GPU"
+    detail = correlator.failure or "instead of the transforms of OpenCV"
     return ModelEvent(t_ns=t_ns, model=correlator.name, change=change, provider=provider, detail=detail)
 
 

@@ -101,6 +101,7 @@ def measure(flight: Path, map_path: Path, out: Path, xfeat: Path | None) -> dict
         "frames_per_s": round(1e3 * len(whole_ms) / sum(whole_ms), 2),
         "frame_ms": spread(whole_ms),
         "first_frame_ms": round(whole_ms[0], 1),
+        "first_frame_cpu_ms": round(times.cpu_ms[0], 1),
         "stage_ms": {DECODE: spread(decode_ms)} | {name: spread(values) for name, values in stages.items()},
         "stage_cpu_ms": {name: spread([frame[name] for frame in times.cpu_frames]) for name in REPLAYED_PROCESSES},
         "cpu_ms": spread(times.cpu_ms),

@@ -71,8 +71,8 @@ def page(result: dict[str, Any]) -> str:
 
 def first_frame(run: dict[str, Any]) -> str:
     return (
-        f"First frame {run['first_frame_ms']:.0f} ms by the clock, start-up {run['start_up_s']:.1f} s, "
-        f"{run['peak_memory_mb']:.0f} MB."
+        f"First frame {run['first_frame_cpu_ms']:.0f} ms of the processor, start-up {run['start_up_s']:.1f} s by the "
+        f"clock, {run['peak_memory_mb']:.0f} MB."
     )
 
 
