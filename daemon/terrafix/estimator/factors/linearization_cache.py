@@ -27,9 +27,8 @@ def custom_factor(noise: gtsam.noiseModel.Base, keys: list[int], error: Error) -
     def cached_error(this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
         if jacobians is None:
             return error(this, values, None)
-        at = [
-            (values.atPose3(key).matrix() if is_pose else values.atVector(key)).tobytes() for key, is_pose in variables
-        ]
+        pose, vector = values.atPose3, values.atVector
+        at = [(pose(key).matrix() if is_pose else vector(key)).tobytes() for key, is_pose in variables]
         entry = _cache.get(error)
         if entry is None or entry[0] != at:
             computed = [np.zeros((0, 0))] * len(keys)

@@ -4,6 +4,8 @@ GTSAM's IncrementalFixedLagSmoother does the same, but its elimination order put
 others leave, and the two updates after that eliminate nearly everything again. Here older nodes are always eliminated
 before newer ones, so that the nodes that leave are leaves of the tree and nothing else is relinearised."""
 
+from functools import lru_cache
+
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, C, V
@@ -82,11 +84,15 @@ class FixedLagSmoother:
         oldest = min(self._batches.values())
         newest = sorted(self._batches)[-2:]
         groups, reordered = gtsam.KeyGroupMap(), gtsam.KeyList()
+        add_to_group = groups.insert2
         for n, batch in self._batches.items():
-            for key in _keys(n):
-                groups.insert2(key, batch - oldest + (n == newest[-1]))
-                if (n in newest or n in self._reordered) and not values.exists(key):
-                    reordered.push_back(key)
+            keys, group = _keys(n), batch - oldest + (n == newest[-1])
+            for key in keys:
+                add_to_group(key, group)
+            if n in newest or n in self._reordered:
+                for key in keys:
+                    if not values.exists(key):
+                        reordered.push_back(key)
         self._reordered.clear()
         self._isam.update(factors, values, [], groups, None, reordered)
 
@@ -120,5 +126,6 @@ class FixedLagSmoother:
         return np.block([[joint.at(C(a), C(b)) for b in (first, second)] for a in (first, second)])
 
 
+@lru_cache(maxsize=4 * WINDOW_NODES)
 def _keys(node: int) -> tuple[int, int, int]:
     return C(node), B(node), V(node)

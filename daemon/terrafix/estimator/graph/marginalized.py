@@ -18,6 +18,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator.graph.elimination import (
+    Conditional,
     GaussianFactor,
     GaussianMarginal,
     IndeterminateError,
@@ -35,6 +36,7 @@ MAX_RETAINED = 128  # retained nodes [tuned]
 MAX_UNSEPARATED = 60  # [tuned]
 
 NodeValues = tuple[gtsam.Pose3, np.ndarray, np.ndarray]  # C, B, V of a node
+_Eliminated = tuple[Conditional, list[gtsam.Pose3], tuple[int, int]]  # nodes given their ends, poses, ends
 
 
 class MarginalizedHistory:
@@ -47,6 +49,7 @@ class MarginalizedHistory:
         self._held: set[int] = set()  # of these: still in the window, while newer nodes have left
         self._retained: list[int] = []
         self._pending: list[int] = []  # nodes between the two newest retained ones, linear, not eliminated yet
+        self._conditional: _Eliminated | None = None  # of the last elimination, not in the trajectory yet
         self._segment_starts = {0}  # nodes without a factor to the node before
         self._trajectory = Trajectory()
 
@@ -66,6 +69,10 @@ class MarginalizedHistory:
     def reduce_step(self) -> bool:
         """One small part of the outstanding elimination. It is called often, so that no frame takes long. -> whether
         there was any."""
+        if self._conditional is not None:
+            self._trajectory.eliminate(*self._conditional)
+            self._conditional = None
+            return True
         if self._pending:
             self._eliminate(self._pending)
             self._pending = []
@@ -102,7 +109,8 @@ class MarginalizedHistory:
             pass
         if self._trajectory.size and self._trajectory.size - 1 > self._retained[-1]:
             self._retain(self._trajectory.size - 1)
-            self.reduce_step()
+            for _ in range(2):  # the elimination, and its part of the trajectory
+                self.reduce_step()
         self._linearize(set(), self._trajectory.size)
 
     def _solved(self) -> dict[int, GaussianMarginal]:
@@ -204,6 +212,6 @@ class MarginalizedHistory:
             self._trajectory.mark_indeterminate(ends)
         else:
             self._linear.append(remaining)
-            self._trajectory.eliminate(conditional, [self._values[node][0] for node in nodes], ends)
+            self._conditional = conditional, [self._values[node][0] for node in nodes], ends
         for node in nodes:
             del self._values[node]
