@@ -24,6 +24,7 @@ FINE_GSD_PER_AGL, FINE_PATCH_PER_AGL, FINE_RADIUS = 1 / 280, 0.3, 0.03
 # Places that are matched, and that are kept. By predicted precision the best third has half of the error of the middle
 # one, the worst third three times that of the best. [measured: docs/acceptance.md]
 MAX_PLACES, KEPT_PLACES = 20, 14
+HARD_PLACES = 40  # that are matched where single coarse patches gave no pose [measured: docs/acceptance.md]
 # Inlier threshold of fine matches, normalised image coordinates: three sigmas of the kept ones over relief and houses.
 # [measured: docs/acceptance.md]
 FINE_THRESHOLD = 0.01
@@ -61,9 +62,11 @@ class FineMatcher:
         place_m: tuple[float, float, float],
         cell_m: float,
         relief: Relief | None,
+        max_places: int = MAX_PLACES,
     ) -> FineMatches | None:
         """``image`` (H, W) grey; ``r_w_c``: rotation of the camera; ``place_m``: its east and north, and its height
-        above the plane of ``relief``. None: no ground is visible, or too few places are on the map."""
+        above the plane of ``relief``; ``max_places``: number of places that are matched. None: no ground is visible, or
+        too few places are on the map."""
         e_m, n_m, agl_m = place_m
         frame = rectify(image, camera, r_w_c, agl_m, cell_m, relief=relief)
         if frame is None:
@@ -83,7 +86,7 @@ class FineMatcher:
         corners = usable_corners(frame.mask, valid, patch, radius, row0, column0)
         if len(corners) < KEPT_PLACES:
             return None
-        corners = corners[np.argsort(-_isotropy(template, patch, corners), kind="stable")[:MAX_PLACES]]
+        corners = corners[np.argsort(-_isotropy(template, patch, corners), kind="stable")[:max_places]]
         pairs = [(int(r), int(c)) for r, c in corners]
         surfaces = patch_surfaces(template, window, pairs, patch, radius, row0, column0)
         centres = corners + 0.5 * patch
