@@ -1,8 +1,8 @@
 """The last step of a map fix: the best places of a frame, matched again around the pose just found.
 
 The first step (frame_matcher.py) searches each patch over a wide area. Once the pose is known, a place is off by a few
-cells at most: larger patches with two channels instead of eight cost less than the first step. The precision of each match follows from its own correlation peak, and the most precise ones
-are kept.
+cells at most: larger patches with two channels instead of eight cost less than the first step. The precision of each
+match follows from its own correlation peak, and the most precise ones are kept.
 """
 
 from dataclasses import dataclass
