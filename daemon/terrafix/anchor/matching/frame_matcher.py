@@ -285,8 +285,8 @@ class FrameMatcher:
         return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else fix
 
     def fine_fix(self, image: Image, view: View, fix: Fix) -> Fix | None:
-        """The pose of ``fix``, which was computed from ``view``, by its best places, in larger patches. None: too few of
-        them are on the map or agree."""
+        """The pose of ``fix``, which was computed from ``view``, by its best places in larger patches. None: too few
+        of them are on the map or agree."""
         fit = fix.pnp.fit
         assert fit is not None
         start = view_of_fix(view, fix)
