@@ -26,7 +26,7 @@ UNKNOWN_HEADING_RAD = 1.5  # 1-sigma above which the heading counts as unknown [
 @dataclass(frozen=True)
 class Observation:
     """One frame correlated with a map layer. ``new``: share of new ground, 0 to 1; ``weight``: that share, at least
-    ``MIN_OBSERVATION_WEIGHT``; ``refine``: a pose is refined on fine cells."""
+    ``MIN_OBSERVATION_WEIGHT``; ``refine``: a pose is refined by larger patches."""
 
     image: Image
     view: View
@@ -53,7 +53,7 @@ def estimate_pose(
     match: MapMatch, prediction: Prediction, seen: Observation, mode: Mode, hypothesis: Hypothesis
 ) -> PoseResult:
     """Pose from single patches in the mode; from all patches together where that fails or is imprecise; then from the
-    best places on fine cells.
+    best places in larger patches.
 
     On a drawn layer there is none, and the position of the mode is the measurement: a patch holds one piece of a road,
     along which it fits everywhere."""
@@ -84,7 +84,7 @@ def estimate_pose(
 
 
 def _refined(match: MapMatch, seen: Observation, fix: Fix) -> MapMatch:
-    """``match`` with the pose of its best places on fine cells; ``match`` itself, which has the pose of ``fix``, if
+    """``match`` with the pose of its best places in larger patches; ``match`` itself, which has the pose of ``fix``, if
     that is no pose or less precise."""
     fine, agl_m = seen.layer.matcher.fine_fix(seen.image, seen.view, fix), seen.view.agl_m
     if fine is None or fine.pnp.fit is None or fix.pnp.fit is None:

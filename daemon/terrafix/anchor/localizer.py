@@ -113,7 +113,7 @@ class Localizer:
         self._describer = describer
         self._ce90_m = ce90_m
         self._store_folder = store_folder
-        self.refines = True  # whether poses of the next frames are refined on fine cells
+        self.refines = True  # whether poses of the next frames are refined by larger patches
         self._layers: MapLayers | None = None
         self._origin: Origin | None = None
         self._ground_m = 0.0

@@ -1,5 +1,5 @@
 """Load of map matching by thermal band: every frame, or one of several, with the learned model or without it,
-with poses refined on fine cells or not."""
+with poses refined by larger patches or not."""
 
 from terrafix.core.config import HealthSection
 from terrafix.messages import ThermalBand
@@ -24,7 +24,7 @@ class ThermalLoad:
 
     @property
     def allows_refinement(self) -> bool:
-        """Whether the pose of a match may be refined on fine cells."""
+        """Whether the pose of a match may be refined by larger patches."""
         return self.band is ThermalBand.NORMAL
 
     def takes_frame(self) -> bool:

@@ -67,7 +67,7 @@ def test_a_hot_computer_matches_one_frame_of_several(ground: np.ndarray, band: T
     assert match(node, 9, 10.0).verdict is Verdict.ACCEPTED
 
 
-def test_poses_are_refined_on_fine_cells_while_the_computer_is_cool(ground: np.ndarray) -> None:
+def test_poses_are_refined_while_the_computer_is_cool(ground: np.ndarray) -> None:
     node, frames = started(ground)
     starts = []
     for i, band in enumerate((ThermalBand.NORMAL, ThermalBand.HOT, ThermalBand.NORMAL)):

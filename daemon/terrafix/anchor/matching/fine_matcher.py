@@ -1,9 +1,8 @@
-"""The last step of a map fix: the best places of a frame, matched again on fine cells around the pose just found.
+"""The last step of a map fix: the best places of a frame, matched again around the pose just found.
 
-The cells of the first step (frame_matcher.py) are coarse because each patch is searched over a wide area. Once the pose
-is known, a place is off by a few cells at most: larger patches on finer cells, with two channels instead of eight, cost
-less than the first step. The precision of each match follows from its own correlation peak, and the most precise ones
-are kept.
+The first step (frame_matcher.py) searches each patch over a wide area. Once the pose is known, a place is off by a few
+cells at most: larger patches with two channels instead of eight cost less than the first step. The precision of each
+match follows from its own correlation peak, and the most precise ones are kept.
 """
 
 from dataclasses import dataclass
@@ -18,19 +17,21 @@ from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 from terrafix_engines.features.gradient import OrientationDescriber
 
-# Shares of the height: cell of the fine step, side of its patches, and radius around the place that the pose gives. On
-# real flights finer cells change nothing, on ground without relief they are better. [measured: docs/acceptance.md]
-FINE_GSD_PER_AGL, FINE_PATCH_PER_AGL, FINE_RADIUS = 1 / 280, 0.3, 0.03
-# Places that are matched, and that are kept. By predicted precision the best third has half of the error of the middle
-# one, the worst third three times that of the best. [measured: docs/acceptance.md]
+# Shares of the height: cell of the fine step, side of its patches, and radius around the place that the pose gives.
+# Larger patches are what makes it fine: on recorded flights cells down to the map's pixels change nothing, at twice to
+# four times the cost. [measured: docs/acceptance.md]
+FINE_GSD_PER_AGL, FINE_PATCH_PER_AGL, FINE_RADIUS = 1 / 200, 0.3, 0.03
+# Places that are matched, and that are kept: by predicted precision the best fifth has a quarter of the error of the
+# worst one. [measured: docs/acceptance.md]
 MAX_PLACES, KEPT_PLACES = 20, 14
+HARD_PLACES = 40  # that are matched where single coarse patches gave no pose [measured: docs/acceptance.md]
 # Inlier threshold of fine matches, normalised image coordinates: three sigmas of the kept ones over relief and houses.
 # [measured: docs/acceptance.md]
 FINE_THRESHOLD = 0.01
-# 1-sigma of a match, as ``_peak`` predicts it up to a factor, in heights: of the best tenth, which have the full
-# weight. [measured: docs/acceptance.md]
+# 1-sigma of a match, as ``_peak`` predicts it up to a factor, that has the weight 1, in heights. The best fifth has
+# 0.03 to 0.06, so that weights and claims are those of the first step. [measured: docs/acceptance.md]
 BEST_SIGMA = 0.01
-MIN_CORRELATION = 0.1  # two thirds of those below it are wrong [measured: docs/acceptance.md]
+MIN_CORRELATION = 0.1  # at which matches are as wrong as random ones [measured: docs/acceptance.md]
 CACHE_SHARE = 4  # of the memory for coarse descriptors: those have four times as many channels [spec: 2 of 8 channels]
 
 
@@ -61,9 +62,11 @@ class FineMatcher:
         place_m: tuple[float, float, float],
         cell_m: float,
         relief: Relief | None,
+        max_places: int = MAX_PLACES,
     ) -> FineMatches | None:
         """``image`` (H, W) grey; ``r_w_c``: rotation of the camera; ``place_m``: its east and north, and its height
-        above the plane of ``relief``. None: no ground is visible, or too few places are on the map."""
+        above the plane of ``relief``; ``max_places``: number of places that are matched. None: no ground is visible, or
+        too few places are on the map."""
         e_m, n_m, agl_m = place_m
         frame = rectify(image, camera, r_w_c, agl_m, cell_m, relief=relief)
         if frame is None:
@@ -83,7 +86,7 @@ class FineMatcher:
         corners = usable_corners(frame.mask, valid, patch, radius, row0, column0)
         if len(corners) < KEPT_PLACES:
             return None
-        corners = corners[np.argsort(-_isotropy(template, patch, corners), kind="stable")[:MAX_PLACES]]
+        corners = corners[np.argsort(-_isotropy(template, patch, corners), kind="stable")[:max_places]]
         pairs = [(int(r), int(c)) for r, c in corners]
         surfaces = patch_surfaces(template, window, pairs, patch, radius, row0, column0)
         centres = corners + 0.5 * patch

@@ -12,7 +12,14 @@ import numpy as np
 
 from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
-from terrafix.anchor.matching.fine_matcher import FINE_GSD_PER_AGL, FINE_RADIUS, FINE_THRESHOLD, FineMatcher
+from terrafix.anchor.matching.fine_matcher import (
+    FINE_GSD_PER_AGL,
+    FINE_RADIUS,
+    FINE_THRESHOLD,
+    HARD_PLACES,
+    MAX_PLACES,
+    FineMatcher,
+)
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, Relief, rectify
 from terrafix.anchor.matching.patch_matcher import match_patches
@@ -272,8 +279,8 @@ class FrameMatcher:
         return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else fix
 
     def fine_fix(self, image: Image, view: View, fix: Fix) -> Fix | None:
-        """The pose of ``fix``, which was computed from ``view``, by its best places on fine cells. None: too few of
-        them are on the map or agree."""
+        """The pose of ``fix``, which was computed from ``view``, by its best places in larger patches. None: too few
+        of them are on the map or agree."""
         fit = fix.pnp.fit
         assert fit is not None
         start = view_of_fix(view, fix)
@@ -283,7 +290,8 @@ class FrameMatcher:
         relief = None if planar else self._relief(start, ground_m)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         place_m = (start.e_m, start.n_m, start.agl_m)
-        found = self._fine.match(grey, self.camera, start.r_w_c, place_m, cell_m, relief)
+        max_places = HARD_PLACES if fix.given is None else MAX_PLACES
+        found = self._fine.match(grey, self.camera, start.r_w_c, place_m, cell_m, relief, max_places)
         if found is None:
             return None
         rays = found.frame_m @ start.r_w_c

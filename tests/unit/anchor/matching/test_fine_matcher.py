@@ -48,13 +48,13 @@ def mean_px(fix: Fix) -> float:
     return float(fix.pnp.fit.residuals.mean()) * PINHOLE.fx
 
 
-def test_fine_matches_leave_half_of_the_error_where_the_ground_has_changed(
+def test_fine_matches_leave_two_thirds_of_the_error_at_most_where_the_ground_has_changed(
     ground: np.ndarray, changed: np.ndarray
 ) -> None:
     coarse, fine = fixes(view(ground, PINHOLE, TRUE_R, TRUE_M), FlatMap(changed))
     assert fine is not None and fine.pnp.fit is not None and coarse.pnp.fit is not None
-    assert mean_px(fine) < 0.5 * mean_px(coarse)
-    assert mean_px(fine) < 0.6
+    assert mean_px(fine) < 0.67 * mean_px(coarse)
+    assert mean_px(fine) < 0.2
     assert np.linalg.norm(fine.pnp.fit.p_c_in_w_m - TRUE_M) < 0.3
     assert 9 <= fine.pnp.inliers.sum() <= KEPT_PLACES < MAX_PLACES
     error = np.concatenate([np.zeros(3), fine.pnp.fit.r_w_c.T @ (fine.pnp.fit.p_c_in_w_m - TRUE_M)])
