@@ -67,9 +67,9 @@ class Console:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._http.clear()  # a TLS connection is closed by both sides
         self._server.end()
         self._thread.join()
-        self._http.clear()
 
     def send(self, method: str, path: str, body: object = None, headers: dict[str, str] | None = None) -> Answer:
         """``body``: bytes as they are, anything else as JSON."""

@@ -16,9 +16,10 @@ from console_rig import Console, settings
 from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.console.payloads import NewFlight, ObjectPixel, PixelPoint, UserFix
 
-pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+pytestmark = pytest.mark.slow  # processes, but no clock: the tests wait as long as it takes
 
 WAIT_S = 300.0  # longest wait for a result; processes of others may take the processors
+KILLED_AT = 8  # event, of a flight of some 50
 NEW: dict[str, Any] = {
     "camera": {"width": 640, "height": 480, "fx": 380.0, "cx": 319.5, "cy": 239.5, "distortion": [0, 0, 0, 0]},
     "map": "ground",
@@ -138,18 +139,17 @@ def undisturbed(tmp_path: Path, maps: Path, images: list[tuple[str, Path]], new:
 
 
 def killed_at(data: Path, maps: Path, images: list[tuple[str, Path]], new: NewFlight) -> Iterator[Any]:
-    """Kills the service after some events, twice, and ends the third one in order."""
+    """Kills the service after some events, and ends the next one in order."""
     served = Served(data, maps)
     flight_id = served.client.create(new).flight_id
     list(served.client.upload(flight_id, images))
     served.client.complete(flight_id)
-    for most in (3, 11):
-        for event in served.client.events(flight_id):
-            if event.event_id >= most:
-                break
-        served.process.kill()
-        served.process.wait()
-        served = Served(data, maps)
+    for event in served.client.events(flight_id):
+        if event.event_id >= KILLED_AT:
+            break
+    served.process.kill()
+    served.process.wait()
+    served = Served(data, maps)
     yield stored(served.client, flight_id)
     served.process.send_signal(signal.SIGTERM)
     yield served.process.wait(timeout=60)
@@ -163,3 +163,33 @@ def test_a_service_that_is_killed_goes_on_to_the_same_results_and_events(tmp_pat
     after_kills, exit_code = killed_at(tmp_path / "killed", maps, images, new)
     assert after_kills == expected
     assert exit_code == 0
+
+
+def test_the_map_of_a_route_is_made_from_the_sources_and_a_route_beyond_them_blocks_the_flight(
+    tmp_path: Path, maps: Path
+) -> None:
+    sources = tmp_path / "sources.toml"
+    sources.write_text(f'[[source]]\npath = "{maps / "ground.tif"}"\nlicence = "own"\n')
+    with Console(settings(tmp_path / "data", sources=sources)) as console:
+        client = ConsoleClient(console.url)
+        route = [lat_lon(place_of(i)) for i in (0, 3)]
+        created = []
+        for shift_deg in (0.0, 5.0):
+            waypoints = [{"lat": lat + shift_deg, "lon": lon} for lat, lon in route]
+            area = {"waypoints": waypoints, "corridor_m": 100}
+            created.append(client.create(NewFlight.model_validate({**NEW, "map": None, "area": area})))
+        assert [flight.map.state.value for flight in created] == ["preparing", "preparing"]
+        end = time.monotonic() + WAIT_S
+        while client.flight(created[1].flight_id).map.state.value == "preparing":
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        near, far = (client.flight(flight.flight_id) for flight in created)
+        assert near.map.state.value == "ready" and near.state.value == "processing"
+        info = console.send("GET", f"/maps/{near.map.name}").json
+        west, south, east, north = info["bounds"]
+        assert west < route[0][1] < east and south < route[0][0] < north
+        assert far.map.state.value == "failed" and far.state.value == "blocked" and "map" in far.error
+        events = console.events(far.flight_id, 0, 2)
+        assert [name for _, name, _ in events] == ["processing_blocked", "state_changed"]
+        client.delete(near.flight_id)
+        assert console.send("GET", f"/maps/{near.map.name}").status == 404

@@ -4,8 +4,9 @@ import asyncio
 import re
 import shutil
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from starlette.requests import Request
@@ -16,11 +17,9 @@ from terrafix_tools.console import uploads
 from terrafix_tools.console.access import Access
 from terrafix_tools.console.areas import AreaMaps, check_area
 from terrafix_tools.console.compute.description import stored_camera, stored_pixel
-from terrafix_tools.console.compute.locating import Question
 from terrafix_tools.console.events import Health, ProcessingBlocked, StateChanged
 from terrafix_tools.console.feed import Feeds
-from terrafix_tools.console.live import LiveFlights
-from terrafix_tools.console.locating import LocatingProcess
+from terrafix_tools.console.locating import LocatingProcess, Question
 from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
     Accepted,
@@ -48,6 +47,9 @@ from terrafix_tools.console.store.database import Database
 from terrafix_tools.console.store.flights import StoredEvent
 from terrafix_tools.console.workers import Reports, Workers
 
+if TYPE_CHECKING:
+    from terrafix_tools.console.live import LiveFlights
+
 RECORDING = re.compile(r"[a-z0-9-]+\.(mcap|csv|json)(\.partial)?")
 MEDIA_TYPES = {".jpg": "image/jpeg", ".png": "image/png"}
 
@@ -60,13 +62,16 @@ class Service:
         self.maps = MapStore(settings.map_folders)
         self.feeds = Feeds(self._events_after)
         self.workers = Workers(settings, Reports(self.feeds.refresh, self._died, self._failed))
-        self.live = (
-            None if settings.bus is None else LiveFlights(database, settings.bus, self._live_stored, self._live_health)
-        )
+        self.live = self._live_flights(settings.bus) if settings.bus is not None else None
         self._areas = AreaMaps(settings.map_folders[0], settings.sources, self._map_done)
         self._locating = LocatingProcess(settings.limits.object_requests)
         self._uploads = uploads.Slots(settings.limits.uploads, "uploads")
         self._stopping = False
+
+    def _live_flights(self, bus: str) -> "LiveFlights":
+        from terrafix_tools.console.live import LiveFlights  # imports the estimator, which nothing else here needs
+
+        return LiveFlights(self.database, bus, self._live_stored, self._live_health)
 
     def _events_after(self, flight_id: str, after: int) -> list[StoredEvent]:
         with self.database.read() as db:
@@ -306,7 +311,8 @@ class Service:
                 flights.update(db, flight_id, map_state=state.value, map_detail=error)
 
         await asyncio.to_thread(store)
-        await self._wake(flight_id)
+        with suppress(Refusal):  # the flight was deleted meanwhile
+            await self._wake(flight_id)
 
     async def _wake(self, flight_id: str) -> None:
         """Has the flight computed, if it has a map and anything to compute."""
@@ -319,7 +325,8 @@ class Service:
             with self.database.write() as db:
                 flights.count_attempt(db, flight_id, frame_id)
 
-        await asyncio.to_thread(count)
+        with suppress(Refusal):  # the flight was deleted meanwhile
+            await asyncio.to_thread(count)
 
     async def _failed(self, flight_id: str, why: str) -> None:
         """The flight cannot go on: it is blocked, with the reason."""
@@ -332,8 +339,9 @@ class Service:
                 flights.add_events(db, flight_id, "failed", [blocked, changed])
                 flights.update(db, flight_id, state=FlightState.BLOCKED.value, error=why)
 
-        await asyncio.to_thread(store)
-        await self.feeds.refresh(flight_id)
+        with suppress(Refusal):  # the flight was deleted meanwhile
+            await asyncio.to_thread(store)
+            await self.feeds.refresh(flight_id)
 
 
 def _check_pixel(u: float, v: float, new: NewFlight) -> None:
