@@ -1,12 +1,14 @@
 """The page in a real browser, over HTTP: a flight from its photos to its track, the position of a pixel, the help that
 a lost flight asks for, and a connection that is lost and found again."""
 
+import csv
 import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pyproj import Geod
 
 import browser
 from browser import Browser
@@ -78,6 +80,39 @@ def test_photos_become_a_track_and_a_pixel_gets_its_position(tmp_path: Path, win
         south_m = 160.0 / CAMERA.fx * AGL_M
         assert distance_m((spot[0], spot[1]), place_of(9) - (0.0, south_m)) < float(cells[2].split()[0]) + 5.0
         assert window.errors == []
+
+
+def test_sizes_of_batches_distances_and_exports_of_the_page(tmp_path: Path, window: Browser) -> None:
+    with Console(settings(tmp_path)) as console:
+        window.open(f"{console.url}/page/#/")
+        window.wait("document.querySelector('.page')")
+        sizes = window.run(
+            "import('/page/js/upload.js').then((m) => [10, 50, 51, 99, 358].map((n) => m.batchSizes(n)))"
+        )
+        assert [sum(batches) for batches in sizes] == [10, 50, 51, 99, 358]
+        assert [len(batches) for batches in sizes] == [1, 1, 2, 2, 8]
+        assert all(10 <= size <= 50 for batches in sizes for size in batches)
+
+        here, there = {"lat": 48.15, "lon": 14.35}, {"lat": 48.16, "lon": 14.37}
+        words = f"{json.dumps(here)}, {json.dumps(there)}"
+        found = window.run(f"import('/page/js/geo.js').then((m) => [m.distance({words}), m.bearing({words})])")
+        azimuth_deg, _, expected_m = Geod(ellps="WGS84").inv(14.35, 48.15, 14.37, 48.16)
+        assert found[0] == pytest.approx(expected_m, abs=0.05)
+        assert found[1] == pytest.approx(azimuth_deg, abs=0.02)
+
+        ellipse = {"semi_major_m": 100.0, "semi_minor_m": 50.0, "bearing_deg": 90.0}
+        result = {"frame_id": 3, "file": 'a,"b".jpg', "gps": here, "ellipse": ellipse, "error": None}
+        words = json.dumps([result, {"frame_id": 4, "file": "c.jpg", "gps": None, "ellipse": None}])
+        table, shapes = window.run(f"import('/page/js/export.js').then((m) => [m.csv({words}), m.geoJson({words})])")
+        rows = list(csv.DictReader(table.splitlines()))
+        assert [row["file"] for row in rows] == ['a,"b".jpg', "c.jpg"]
+        assert (rows[0]["lat"], rows[0]["semi_minor_m"], rows[1]["lat"]) == ("48.15", "50", "")
+        point, ring = json.loads(shapes)["features"]  # no track of a single point
+        assert point["geometry"]["coordinates"] == [14.35, 48.15]
+        corners = ring["geometry"]["coordinates"][0]
+        assert corners[0] == corners[-1]
+        half_m = Geod(ellps="WGS84").inv(14.35, 48.15, max(lon for lon, _ in corners), 48.15)[2]
+        assert half_m == pytest.approx(100.0, abs=0.1)
 
 
 def asking_flight(console: Console) -> tuple[str, list[Gps]]:
