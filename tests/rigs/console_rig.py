@@ -42,7 +42,7 @@ def settings(folder: Path, **changes: Any) -> Settings:
     (folder / "maps").mkdir(parents=True, exist_ok=True)
     if not (folder / "maps" / "format1.gpkg").is_file():
         map_format1.unpack(folder / "maps")
-    return Settings(**{"data": folder, "port": 0, "workers": 0, **changes})
+    return Settings(**{"data": folder, "port": 0, "workers": 0, "nice": 0, **changes})
 
 
 class Console:
@@ -67,9 +67,9 @@ class Console:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._http.clear()  # a TLS connection is closed by both sides
         self._server.end()
         self._thread.join()
-        self._http.clear()
 
     def send(self, method: str, path: str, body: object = None, headers: dict[str, str] | None = None) -> Answer:
         """``body``: bytes as they are, anything else as JSON."""

@@ -1,9 +1,14 @@
 """Who may do what at the console."""
 
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
 
 from console_rig import NEW, Console, batch, settings
 from terrafix.core.errors import ConfigError, UsageError
@@ -139,6 +144,32 @@ def test_without_tokens_only_names_of_this_computer_are_served(tmp_path: Path) -
         assert console.send("GET", "/flights", None, {"host": "other.example"}).status == 421
         for name in ("localhost:8700", "127.0.0.1", "[::1]:8700", "drone.local"):
             assert console.send("GET", "/flights", None, {"host": name}).status == 200, name
+
+
+def write_certificate(folder: Path) -> tuple[Path, Path]:
+    """-> a certificate of its own signature, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "console")])
+    now = datetime.now(UTC)
+    builder = x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
+    builder = (
+        builder.serial_number(1).not_valid_before(now - timedelta(days=1)).not_valid_after(now + timedelta(days=1))
+    )
+    (folder / "cert.pem").write_bytes(builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+    text = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    (folder / "key.pem").write_bytes(text)
+    return folder / "cert.pem", folder / "key.pem"
+
+
+@pytest.mark.filterwarnings("ignore:Unverified HTTPS request")
+def test_with_a_certificate_it_speaks_tls_and_the_cookie_is_for_tls_only(tmp_path: Path) -> None:
+    cert, key = write_certificate(tmp_path)
+    with Console(settings(tmp_path, cert=cert, key=key, tokens=tokens_file(tmp_path))) as console:
+        assert console.url.startswith("https:")
+        assert console.send("GET", "/health", None, bearer(VIEWER)).json["status"] == "ok"
+        assert "Secure" in console.send("POST", "/session", {"token": VIEWER}).headers["set-cookie"]
 
 
 def test_event_streams_are_bounded(tmp_path: Path) -> None:

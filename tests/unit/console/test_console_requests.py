@@ -1,7 +1,11 @@
 """Requests to the console: what is taken, and what is refused with a problem that says why."""
 
 import random
+import socket
 import struct
+import subprocess
+import sys
+import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from console_rig import CAMERA, NEW, Answer, Console, batch, jpeg, multipart, settings
+from console_rig import BOUNDARY, CAMERA, NEW, Answer, Console, batch, jpeg, multipart, settings
 from terrafix_tools.console import uploads
 from terrafix_tools.console.openapi import schema
 from terrafix_tools.console.settings import Limits
@@ -229,6 +233,18 @@ def test_a_full_disk_refuses_uploads_and_leaves_the_flight_as_it_was(tmp_path: P
         assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 0
 
 
+def test_an_upload_that_is_too_slow_makes_room_for_others(tmp_path: Path) -> None:
+    with Console(settings(tmp_path, limits=Limits(uploads=1, upload_s=0.2))) as console:
+        path, body = f"/flights/{console.create()}/images/batch", multipart(batch(1))
+        host, port = console.url.removeprefix("http://").split(":")
+        head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nContent-Type: multipart/form-data; boundary={BOUNDARY}\r\n"
+        with socket.create_connection((host, int(port)), timeout=20.0) as slow:
+            slow.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[:100])
+            time.sleep(0.3)
+            slow.sendall(body[100:])
+            assert slow.recv(100).startswith(b"HTTP/1.1 408")
+
+
 VALUES = [None, True, -1, 0, 1e308, "NaN", "", "\u0000", "x" * 300, [], {}, [[[]]], {"lat": {}}, 2**70, -1e-320]
 
 
@@ -248,3 +264,12 @@ def test_no_random_body_or_path_makes_the_service_fail(console: Console) -> None
                     continue
                 answer = console.send(method.upper(), filled, body if method == "post" else None)
                 assert answer.status < 500, (method, filled, body, answer.body)
+
+
+@pytest.mark.slow
+def test_without_the_console_extra_one_line_states_what_to_install(tmp_path: Path) -> None:
+    code = "import sys; sys.modules['fastapi'] = None; from terrafix_tools.cli import main; main()"
+    words = [sys.executable, "-c", code, "serve", "--data", str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "terrafix: this command needs fastapi; install it: pip install 'terrafix[console]'\n"

@@ -19,7 +19,7 @@ def serve(
     key: Annotated[Path | None, typer.Option(help="Key of the certificate (PEM).")] = None,
     name: Annotated[list[str] | None, typer.Option(help="Further name of this service in requests.")] = None,
     bus: Annotated[str, typer.Option(help="Run folder of a live Terrafix; 'auto': the only one.")] = "",
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Flights that are computed at once.")] = 2,
+    workers: Annotated[int, typer.Option(min=0, max=64, help="Flights that are computed at once.")] = 2,
     model: Annotated[list[str] | None, typer.Option(help="Name of a fetched model (xfeat), or NAME=PATH.")] = None,
     config: Annotated[list[Path] | None, typer.Option(help="TOML file; may be given several times.")] = None,
 ) -> None:

@@ -57,7 +57,7 @@ class ConsoleClient:
 
     def __init__(self, url: str = DEFAULT_URL, token: str = "", ca: Path | None = None) -> None:
         """``ca``: certificate of the console, if no authority of this computer has signed it."""
-        self._url = url.rstrip("/")
+        self.url = url.rstrip("/")
         self._headers = {"authorization": f"Bearer {token}"} if token else {}
         timeout = urllib3.Timeout(connect=CONNECT_S, read=ANSWER_S)
         self._http = urllib3.PoolManager(
@@ -121,7 +121,7 @@ class ConsoleClient:
     def _stream(self, flight_id: str, after: int) -> Iterator[ReceivedEvent]:
         headers = {**self._headers, "last-event-id": str(after)}
         timeout = urllib3.Timeout(connect=CONNECT_S, read=SILENCE_S)
-        url = f"{self._url}/flights/{flight_id}/events"
+        url = f"{self.url}/flights/{flight_id}/events"
         try:
             answer = self._http.request("GET", url, headers=headers, preload_content=False, timeout=timeout)
             if answer.status != 200:
@@ -131,7 +131,7 @@ class ConsoleClient:
             finally:
                 answer.close()
         except urllib3.exceptions.HTTPError as error:
-            raise LinkError(f"{self._url}: the event stream was cut ({_reason(error)})") from None
+            raise LinkError(f"{self.url}: the event stream was cut ({_reason(error)})") from None
 
     def _get(self, path: str, kind: type[T]) -> T:
         return kind.model_validate_json(self._request("GET", path))
@@ -144,10 +144,10 @@ class ConsoleClient:
 
     def _request(self, method: str, path: str, **options: Any) -> bytes:
         try:
-            answer = self._http.request(method, self._url + path, **options)
+            answer = self._http.request(method, self.url + path, **options)
         except urllib3.exceptions.HTTPError as error:
             raise LinkError(
-                f"{self._url}: no console answers ({_reason(error)}); is 'terrafix serve' running?"
+                f"{self.url}: no console answers ({_reason(error)}); is 'terrafix serve' running?"
             ) from None
         if answer.status >= 300:
             raise _refused(answer.status, answer.data)

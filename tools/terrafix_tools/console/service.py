@@ -4,6 +4,7 @@ import asyncio
 import re
 import shutil
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -201,7 +202,9 @@ class Service:
                     _check_pixel(given.pixel.u, given.pixel.v, NewFlight.model_validate_json(row.spec))
                 return flights.add_hint(db, flight_id, given)
 
-        return Steered(hint_id=await asyncio.to_thread(add), detail="used with the next frame; hint_answered tells")
+        hint_id = await asyncio.to_thread(add)
+        await self.feeds.refresh(flight_id)
+        return Steered(hint_id=hint_id, detail="used with the next frame; hint_answered tells what came of it")
 
     async def locate(self, flight_id: str, frame_id: int, pixel: ObjectPixel) -> ObjectGps:
         answer = await self._locating.ask(await asyncio.to_thread(self._question, flight_id, frame_id, pixel))
@@ -304,7 +307,8 @@ class Service:
                 flights.update(db, flight_id, map_state=state.value, map_detail=error)
 
         await asyncio.to_thread(store)
-        await self._wake(flight_id)
+        with suppress(Refusal):  # the flight was deleted meanwhile
+            await self._wake(flight_id)
 
     async def _wake(self, flight_id: str) -> None:
         """Has the flight computed, if it has a map and anything to compute."""
@@ -317,7 +321,8 @@ class Service:
             with self.database.write() as db:
                 flights.count_attempt(db, flight_id, frame_id)
 
-        await asyncio.to_thread(count)
+        with suppress(Refusal):  # the flight was deleted meanwhile
+            await asyncio.to_thread(count)
 
     async def _failed(self, flight_id: str, why: str) -> None:
         """The flight cannot go on: it is blocked, with the reason."""
@@ -330,8 +335,9 @@ class Service:
                 flights.add_events(db, flight_id, "failed", [blocked, changed])
                 flights.update(db, flight_id, state=FlightState.BLOCKED.value, error=why)
 
-        await asyncio.to_thread(store)
-        await self.feeds.refresh(flight_id)
+        with suppress(Refusal):  # the flight was deleted meanwhile
+            await asyncio.to_thread(store)
+            await self.feeds.refresh(flight_id)
 
 
 def _check_pixel(u: float, v: float, new: NewFlight) -> None:

@@ -16,6 +16,7 @@ class Limits:
     image_bytes: int = 40 * MB  # one image of 26 megapixels as JPEG has 15 MB
     body_bytes: int = 2 * MB  # of a body that is no upload
     uploads: int = 4  # at once; further ones get 429
+    upload_s: float = 300.0  # longest time of one, so that slow ones do not keep others out
     event_clients: int = 256
     disk_reserve_bytes: int = 256 * MB  # that an upload leaves free
     object_requests: int = 4  # waiting object-to-GPS computations
@@ -37,6 +38,7 @@ class Settings:
     key: Path | None = None
     hosts: tuple[str, ...] = ()  # further names of this service in the Host header
     workers: int = 2
+    nice: int = 10  # of the processes that compute: the service and what flies come first
     configs: tuple[Path, ...] = ()
     models: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)

@@ -353,7 +353,11 @@ async def take_batch(
     try:
         with slots.one(), incoming(folder) as temporary:
             check_room(folder, limits)
-            parts = await read_parts(request, temporary, limits)
+            try:
+                async with asyncio.timeout(limits.upload_s):
+                    parts = await read_parts(request, temporary, limits)
+            except TimeoutError:
+                raise Refusal(408, f"the upload took longer than {limits.upload_s:g} s; send smaller batches") from None
             return await asyncio.to_thread(store_batch, database, flight_id, folder, parts, limits)
     except Refusal:
         await drain(request)

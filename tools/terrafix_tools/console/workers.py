@@ -118,7 +118,7 @@ class Workers:
                 "-m",
                 "terrafix_tools.console.compute",
                 *("--data", str(settings.data), "--flight", flight_id, "--map", str(map_path)),
-                *("--parent", str(os.getpid())),
+                *("--parent", str(os.getpid()), "--nice", str(settings.nice)),
                 *(word for option in options for word in option),
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,

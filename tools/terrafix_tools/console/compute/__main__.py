@@ -29,7 +29,6 @@ from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database, open_database
 from terrafix_tools.replay import make_nodes, replay
 
-NICE = 10  # the service and what flies come first [spec: nice(2)]
 MEMORY_BYTES = (
     6 * 2**30
 )  # address space of one flight: a decoder that asks for more fails [spec: five times what is used]
@@ -126,12 +125,13 @@ def main() -> NoReturn:
     parser.add_argument("--flight", required=True)
     parser.add_argument("--map", type=Path, required=True)
     parser.add_argument("--parent", type=int, required=True)
+    parser.add_argument("--nice", type=int, default=0)
     parser.add_argument("--config", type=Path, action="append", default=[])
     parser.add_argument("--model", action="append", default=[])
     given = parser.parse_args()
     if not set_parent_death_signal(given.parent, signal.SIGKILL):
         raise SystemExit(0)
-    os.nice(NICE)
+    os.nice(given.nice)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     report = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a library prints is no report
