@@ -115,6 +115,25 @@ def test_sizes_of_batches_distances_and_exports_of_the_page(tmp_path: Path, wind
         assert half_m == pytest.approx(100.0, abs=0.1)
 
 
+def test_the_page_asks_for_the_token_and_offers_a_viewer_nothing_to_do(tmp_path: Path, window: Browser) -> None:
+    tokens, secret = tmp_path / "tokens.toml", "a-viewer-with-a-long-token"
+    tokens.write_text(f'[tokens]\nscreen = {{role = "viewer", token = "{secret}"}}\n')
+    tokens.chmod(0o600)
+    with Console(settings(tmp_path, tokens=tokens)) as console:
+        window.open(f"{console.url}/page/#/new")
+        window.wait("document.getElementById('token')")
+        for given, then in (("x" * 24, ".error:not(:empty)"), (secret, ".page")):
+            window.run(f"document.getElementById('token').value = {json.dumps(given)}")
+            window.click("form button.primary")
+            window.wait(f"document.querySelector({json.dumps(then)})")
+        assert window.run("document.querySelector('h1').textContent") == "Flights"  # not the form of a new one
+        links = window.run("[...document.querySelectorAll('.bar a.button')].map((link) => link.textContent)")
+        assert links == ["Flights"]
+        assert secret not in window.run("document.cookie + JSON.stringify({...localStorage, ...sessionStorage})")
+        window.run("[...document.querySelectorAll('.bar button')].at(-1).click()")  # sign out
+        window.wait("document.getElementById('token')")
+
+
 def asking_flight(console: Console) -> tuple[str, list[Gps]]:
     """A flight with ten images that asks where frame 4 was taken, and its candidates."""
     flight_id = console.create(name="lost")
