@@ -195,3 +195,4 @@ def test_a_lost_connection_is_shown_and_the_stream_goes_on_where_it_was(tmp_path
         window.click("#tab-log")
         lines = "document.querySelectorAll('#panel-log li').length"
         window.wait(f"{lines} === 1")  # the event of before, once
+        assert not window.run("document.querySelector('#panel-log time')")  # nobody knows when it was

@@ -55,12 +55,13 @@ export class Glance {
       cell(t("heading"), degrees(fix?.heading), fresh ? t("speed", unit(fresh.position.speed_mps, 1, "m/s")) : t("true_north")),
     ];
     if (model.isLive && model.flight.state !== "completed") cells.push(this.autopilot(fresh));
-    cells.push(cell(t("frame"), number(frame.frame_id), stale ? t("as_of", clock(model.updatedAt)) : this.age(model), stale ? "bad" : ""));
+    cells.push(cell(t("frame"), number(frame.frame_id), stale ? t("as_of", clock(model.updatedAt ?? model.openedAt)) : this.age(model), stale ? "bad" : ""));
     fill(this.element, cells, stale ? h("strong", {class: "stale-sign"}, t("stale")) : null);
   }
 
   age(model) {
     if (model.flight.state === "completed") return t("completed_line");
+    if (model.updatedAt === null) return t("no_news");
     return t("updated", seconds(Math.max(0, Math.round((Date.now() - model.updatedAt) / 1000))));
   }
 
