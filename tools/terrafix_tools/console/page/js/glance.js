@@ -69,7 +69,7 @@ export class Glance {
     const since = fresh ? fresh.position.since_map_fix_s : model.sinceMatch_s;
     if (since === null || since === undefined) return cell(t("last_match"), NONE, t("no_match_yet"), "warn");
     const search = model.newest.search;
-    const below = search && search !== "normal" ? t(`search_${search}`) : t("of_frame", number(model.lastMatch?.frame_id));
+    const below = search && search !== "normal" ? t(`search_${search}`) : model.lastMatch ? t("of_frame", number(model.lastMatch.frame_id)) : "";
     return cell(t("last_match"), since < 0.05 ? t("now") : t("ago", seconds(since)), below, since > WORRYING_S ? "warn" : "");
   }
 
