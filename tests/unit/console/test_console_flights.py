@@ -163,3 +163,33 @@ def test_a_service_that_is_killed_goes_on_to_the_same_results_and_events(tmp_pat
     after_kills, exit_code = killed_at(tmp_path / "killed", maps, images, new)
     assert after_kills == expected
     assert exit_code == 0
+
+
+def test_the_map_of_a_route_is_made_from_the_sources_and_a_route_beyond_them_blocks_the_flight(
+    tmp_path: Path, maps: Path
+) -> None:
+    sources = tmp_path / "sources.toml"
+    sources.write_text(f'[[source]]\npath = "{maps / "ground.tif"}"\nlicence = "own"\n')
+    with Console(settings(tmp_path / "data", sources=sources)) as console:
+        client = ConsoleClient(console.url)
+        route = [lat_lon(place_of(i)) for i in (0, 3)]
+        created = []
+        for shift_deg in (0.0, 5.0):
+            waypoints = [{"lat": lat + shift_deg, "lon": lon} for lat, lon in route]
+            area = {"waypoints": waypoints, "corridor_m": 100}
+            created.append(client.create(NewFlight.model_validate({**NEW, "map": None, "area": area})))
+        assert [flight.map.state.value for flight in created] == ["preparing", "preparing"]
+        end = time.monotonic() + WAIT_S
+        while client.flight(created[1].flight_id).map.state.value == "preparing":
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        near, far = (client.flight(flight.flight_id) for flight in created)
+        assert near.map.state.value == "ready" and near.state.value == "processing"
+        info = console.send("GET", f"/maps/{near.map.name}").json
+        west, south, east, north = info["bounds"]
+        assert west < route[0][1] < east and south < route[0][0] < north
+        assert far.map.state.value == "failed" and far.state.value == "blocked" and "map" in far.error
+        events = console.events(far.flight_id, 0, 2)
+        assert [name for _, name, _ in events] == ["processing_blocked", "state_changed"]
+        client.delete(near.flight_id)
+        assert console.send("GET", f"/maps/{near.map.name}").status == 404

@@ -267,6 +267,14 @@ def test_no_random_body_or_path_makes_the_service_fail(console: Console) -> None
 
 
 @pytest.mark.slow
+def test_the_service_itself_loads_nothing_that_computes_flights_or_builds_maps() -> None:
+    heavy = "gtsam onnxruntime rasterio pymavlink"
+    code = f"import sys, terrafix_tools.console.serve; print([m for m in '{heavy}'.split() if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.slow
 def test_without_the_console_extra_one_line_states_what_to_install(tmp_path: Path) -> None:
     code = "import sys; sys.modules['fastapi'] = None; from terrafix_tools.cli import main; main()"
     words = [sys.executable, "-c", code, "serve", "--data", str(tmp_path)]

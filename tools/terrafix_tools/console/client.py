@@ -101,6 +101,10 @@ class ConsoleClient:
     def complete(self, flight_id: str) -> Flight:
         return Flight.model_validate_json(self._request("POST", f"/flights/{flight_id}/complete"))
 
+    def delete(self, flight_id: str) -> None:
+        """With its images, results, events and recordings."""
+        self._request("DELETE", f"/flights/{flight_id}")
+
     def events(self, flight_id: str, after: int = 0) -> Iterator[ReceivedEvent]:
         """The events after an id, then those to come, until ``flight_completed`` and its change of state. A connection
         that is cut is opened again; nothing is lost or doubled."""

@@ -6,11 +6,30 @@ import sys
 
 import msgspec
 
-from terrafix_tools.console.compute.locating import Answer, Question
 from terrafix_tools.console.problems import Refusal
 
 ANSWER_S = 60.0  # longest wait for an answer: the record of a long flight is read first
 IDLE_S = 120.0  # after which the process ends, and frees the memory of the last flight
+
+
+class Question(msgspec.Struct):
+    """``out``: folder with the record of a flight."""
+
+    out: str
+    map: str
+    frame_id: int
+    pixel: tuple[float, float]  # of the frame as it was read
+
+
+class Answer(msgspec.Struct):
+    """``refused``: why there is no position; ""  with one."""
+
+    refused: str = ""
+    lat_deg: float = 0.0
+    lon_deg: float = 0.0
+    alt_amsl_m: float | None = None
+    radius95_m: float = 0.0
+    surface: str = ""
 
 
 class LocatingProcess:

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import AsyncIterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from starlette.requests import Request
@@ -17,11 +17,9 @@ from terrafix_tools.console import uploads
 from terrafix_tools.console.access import Access
 from terrafix_tools.console.areas import AreaMaps, check_area
 from terrafix_tools.console.compute.description import stored_camera, stored_pixel
-from terrafix_tools.console.compute.locating import Question
 from terrafix_tools.console.events import Health, ProcessingBlocked, StateChanged
 from terrafix_tools.console.feed import Feeds
-from terrafix_tools.console.live import LiveFlights
-from terrafix_tools.console.locating import LocatingProcess
+from terrafix_tools.console.locating import LocatingProcess, Question
 from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
     Accepted,
@@ -49,6 +47,9 @@ from terrafix_tools.console.store.database import Database
 from terrafix_tools.console.store.flights import StoredEvent
 from terrafix_tools.console.workers import Reports, Workers
 
+if TYPE_CHECKING:
+    from terrafix_tools.console.live import LiveFlights
+
 RECORDING = re.compile(r"[a-z0-9-]+\.(mcap|csv|json)(\.partial)?")
 MEDIA_TYPES = {".jpg": "image/jpeg", ".png": "image/png"}
 
@@ -61,13 +62,16 @@ class Service:
         self.maps = MapStore(settings.map_folders)
         self.feeds = Feeds(self._events_after)
         self.workers = Workers(settings, Reports(self.feeds.refresh, self._died, self._failed))
-        self.live = (
-            None if settings.bus is None else LiveFlights(database, settings.bus, self._live_stored, self._live_health)
-        )
+        self.live = self._live_flights(settings.bus) if settings.bus is not None else None
         self._areas = AreaMaps(settings.map_folders[0], settings.sources, self._map_done)
         self._locating = LocatingProcess(settings.limits.object_requests)
         self._uploads = uploads.Slots(settings.limits.uploads, "uploads")
         self._stopping = False
+
+    def _live_flights(self, bus: str) -> "LiveFlights":
+        from terrafix_tools.console.live import LiveFlights  # imports the estimator, which nothing else here needs
+
+        return LiveFlights(self.database, bus, self._live_stored, self._live_health)
 
     def _events_after(self, flight_id: str, after: int) -> list[StoredEvent]:
         with self.database.read() as db:

@@ -12,29 +12,10 @@ import msgspec
 
 from terrafix.core.errors import TerrafixError
 from terrafix.runtime.fork_server import set_parent_death_signal
+from terrafix_tools.console.locating import Answer, Question
 from terrafix_tools.locate.locator import FlightLocator
 
 NICE = 5  # after the service, before the flights [spec: nice(2)]
-
-
-class Question(msgspec.Struct):
-    """``out``: folder with the record of a flight."""
-
-    out: str
-    map: str
-    frame_id: int
-    pixel: tuple[float, float]  # of the frame as it was read
-
-
-class Answer(msgspec.Struct):
-    """``refused``: why there is no position; ""  with one."""
-
-    refused: str = ""
-    lat_deg: float = 0.0
-    lon_deg: float = 0.0
-    alt_amsl_m: float | None = None
-    radius95_m: float = 0.0
-    surface: str = ""
 
 
 class Locators:
