@@ -1,12 +1,14 @@
 """The page in a real browser, over HTTP: a flight from its photos to its track, the position of a pixel, the help that
 a lost flight asks for, and a connection that is lost and found again."""
 
+import csv
 import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pyproj import Geod
 
 import browser
 from browser import Browser
@@ -80,6 +82,58 @@ def test_photos_become_a_track_and_a_pixel_gets_its_position(tmp_path: Path, win
         assert window.errors == []
 
 
+def test_sizes_of_batches_distances_and_exports_of_the_page(tmp_path: Path, window: Browser) -> None:
+    with Console(settings(tmp_path)) as console:
+        window.open(f"{console.url}/page/#/")
+        window.wait("document.querySelector('.page')")
+        sizes = window.run(
+            "import('/page/js/upload.js').then((m) => [10, 50, 51, 99, 358].map((n) => m.batchSizes(n)))"
+        )
+        assert [sum(batches) for batches in sizes] == [10, 50, 51, 99, 358]
+        assert [len(batches) for batches in sizes] == [1, 1, 2, 2, 8]
+        assert all(10 <= size <= 50 for batches in sizes for size in batches)
+
+        here, there = {"lat": 48.15, "lon": 14.35}, {"lat": 48.16, "lon": 14.37}
+        words = f"{json.dumps(here)}, {json.dumps(there)}"
+        found = window.run(f"import('/page/js/geo.js').then((m) => [m.distance({words}), m.bearing({words})])")
+        azimuth_deg, _, expected_m = Geod(ellps="WGS84").inv(14.35, 48.15, 14.37, 48.16)
+        assert found[0] == pytest.approx(expected_m, abs=0.05)
+        assert found[1] == pytest.approx(azimuth_deg, abs=0.02)
+
+        ellipse = {"semi_major_m": 100.0, "semi_minor_m": 50.0, "bearing_deg": 90.0}
+        result = {"frame_id": 3, "file": 'a,"b".jpg', "gps": here, "ellipse": ellipse, "error": None}
+        words = json.dumps([result, {"frame_id": 4, "file": "c.jpg", "gps": None, "ellipse": None}])
+        table, shapes = window.run(f"import('/page/js/export.js').then((m) => [m.csv({words}), m.geoJson({words})])")
+        rows = list(csv.DictReader(table.splitlines()))
+        assert [row["file"] for row in rows] == ['a,"b".jpg', "c.jpg"]
+        assert (rows[0]["lat"], rows[0]["semi_minor_m"], rows[1]["lat"]) == ("48.15", "50", "")
+        point, ring = json.loads(shapes)["features"]  # no track of a single point
+        assert point["geometry"]["coordinates"] == [14.35, 48.15]
+        corners = ring["geometry"]["coordinates"][0]
+        assert corners[0] == corners[-1]
+        half_m = Geod(ellps="WGS84").inv(14.35, 48.15, max(lon for lon, _ in corners), 48.15)[2]
+        assert half_m == pytest.approx(100.0, abs=0.1)
+
+
+def test_the_page_asks_for_the_token_and_offers_a_viewer_nothing_to_do(tmp_path: Path, window: Browser) -> None:
+    tokens, secret = tmp_path / "tokens.toml", "a-viewer-with-a-long-token"
+    tokens.write_text(f'[tokens]\nscreen = {{role = "viewer", token = "{secret}"}}\n')
+    tokens.chmod(0o600)
+    with Console(settings(tmp_path, tokens=tokens)) as console:
+        window.open(f"{console.url}/page/#/new")
+        window.wait("document.getElementById('token')")
+        for given, then in (("x" * 24, ".error:not(:empty)"), (secret, ".page")):
+            window.run(f"document.getElementById('token').value = {json.dumps(given)}")
+            window.click("form button.primary")
+            window.wait(f"document.querySelector({json.dumps(then)})")
+        assert window.run("document.querySelector('h1').textContent") == "Flights"  # not the form of a new one
+        links = window.run("[...document.querySelectorAll('.bar a.button')].map((link) => link.textContent)")
+        assert links == ["Flights"]
+        assert secret not in window.run("document.cookie + JSON.stringify({...localStorage, ...sessionStorage})")
+        window.run("[...document.querySelectorAll('.bar button')].at(-1).click()")  # sign out
+        window.wait("document.getElementById('token')")
+
+
 def asking_flight(console: Console) -> tuple[str, list[Gps]]:
     """A flight with ten images that asks where frame 4 was taken, and its candidates."""
     flight_id = console.create(name="lost")
@@ -141,3 +195,4 @@ def test_a_lost_connection_is_shown_and_the_stream_goes_on_where_it_was(tmp_path
         window.click("#tab-log")
         lines = "document.querySelectorAll('#panel-log li').length"
         window.wait(f"{lines} === 1")  # the event of before, once
+        assert not window.run("document.querySelector('#panel-log time')")  # nobody knows when it was

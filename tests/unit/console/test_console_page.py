@@ -63,6 +63,34 @@ def test_every_text_is_there_in_both_languages_with_the_same_places_for_values()
     assert len(used) > 100 and used - english.keys() == set()
 
 
+def luminance(colour: str) -> float:
+    """Relative luminance of #rgb or #rrggbb (WCAG 2.2)."""
+    digits = colour[1:] if len(colour) == 7 else "".join(2 * c for c in colour[1:])
+    parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+    red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def contrast(one: str, other: str) -> float:
+    dark, light = sorted((luminance(one), luminance(other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+@pytest.mark.parametrize("theme", [":root {", ':root[data-theme="dark"] {', ':root:not([data-theme="light"]) {'])
+def test_texts_are_readable_in_sunlight(theme: str) -> None:
+    style = (PAGE / "style.css").read_text(encoding="utf-8")
+    colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]+)", style.partition(theme)[2].partition("}")[0]))
+    texts_on = {"card": ("ink", "soft", "good", "warn", "bad"), "bg": ("ink", "soft"), "accent": ("accent-ink",)}
+    pairs = [
+        *((text, ground) for ground, of in texts_on.items() for text in of),
+        ("bad", "bad-bg"),
+        ("warn", "warn-bg"),
+    ]
+    found = {pair: contrast(colours[pair[0]], colours[pair[1]]) for pair in pairs}
+    assert {pair: ratio for pair, ratio in found.items() if ratio < 7.0} == {}  # AAA
+    assert min(contrast(colours[name], colours["card"]) for name in ("edge", "accent", "focus")) >= 3.0
+
+
 def test_the_page_is_served_with_a_policy_that_allows_this_host_alone(tmp_path: Path) -> None:
     with Console(settings(tmp_path)) as console:
         page = console.send("GET", "/page/")

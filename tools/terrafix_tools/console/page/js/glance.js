@@ -6,6 +6,7 @@ import {sign} from "./sources.js";
 import {t} from "./texts.js";
 
 const FACTS_OLD_MS = 4000; // facts come once a second
+const OLD_FIX_S = 5; // of flight, after which the position of an earlier frame is no longer that of the vehicle
 const WORRYING_S = 30; // without a map fix: what odometry alone drifts meanwhile is worth a look
 
 function cell(label, value, below, mood = "", extra = null) {
@@ -39,25 +40,28 @@ export class Glance {
       fill(this.element, cell(t("position"), NONE, t("no_frames_yet")));
       return;
     }
-    const ellipse = frame.ellipse;
+    const fix = model.newestFix;
+    const age = fix ? frame.t_s - fix.t_s : 0; // a frame may have no position: it was left out, or is not placed yet
+    const ellipse = fix?.ellipse;
     const digits = ellipse && ellipse.semi_major_m >= 100 ? 0 : 1;
     const cells = [
-      cell(t("position"), frame.gps ? coordinate(frame.gps) : t("no_position"),
-        frame.gps ? [sign(frame.source), t(`source_${frame.source || "none"}`)] : frame.error || t(`state_${model.flight.state}`), frame.gps ? "wide" : "wide bad"),
+      fix ? cell(t("position"), coordinate(fix.gps), [sign(fix.source), t(`source_${fix.source || "none"}`), age > 0 ? ` · ${t("ago", seconds(age))}` : ""],
+        age > OLD_FIX_S ? "wide bad" : "wide") : cell(t("position"), t("no_position"), frame.error || t(`state_${model.flight.state}`), "wide bad"),
       cell(t("ellipse95"), ellipse ? `${number(ellipse.semi_major_m, digits)} × ${number(ellipse.semi_minor_m, digits)} m` : NONE,
-        ellipse ? t("within20", unit(frame.confidence === null ? null : 100 * frame.confidence, 0, "%")) : t("not_known"),
+        ellipse ? t("within20", unit(fix.confidence === null ? null : 100 * fix.confidence, 0, "%")) : t("not_known"),
         `ell ${ellipse && ellipse.semi_major_m > 100 ? "warn" : ""}`, ellipse ? ellipseSign(ellipse) : null),
       this.lastMatch(model, fresh),
-      cell(t("height"), unit(frame.agl_m, 0, "m"), t("amsl", unit(frame.altitude, 0, "m"))),
-      cell(t("heading"), degrees(frame.heading), fresh ? t("speed", unit(fresh.position.speed_mps, 1, "m/s")) : t("true_north")),
+      cell(t("height"), unit(fix?.agl_m, 0, "m"), t("amsl", unit(fix?.altitude, 0, "m"))),
+      cell(t("heading"), degrees(fix?.heading), fresh ? t("speed", unit(fresh.position.speed_mps, 1, "m/s")) : t("true_north")),
     ];
     if (model.isLive && model.flight.state !== "completed") cells.push(this.autopilot(fresh));
-    cells.push(cell(t("frame"), number(frame.frame_id), stale ? t("as_of", clock(model.updatedAt)) : this.age(model), stale ? "bad" : ""));
+    cells.push(cell(t("frame"), number(frame.frame_id), stale ? t("as_of", clock(model.updatedAt ?? model.openedAt)) : this.age(model), stale ? "bad" : ""));
     fill(this.element, cells, stale ? h("strong", {class: "stale-sign"}, t("stale")) : null);
   }
 
   age(model) {
     if (model.flight.state === "completed") return t("completed_line");
+    if (model.updatedAt === null) return t("no_news");
     return t("updated", seconds(Math.max(0, Math.round((Date.now() - model.updatedAt) / 1000))));
   }
 
@@ -65,7 +69,7 @@ export class Glance {
     const since = fresh ? fresh.position.since_map_fix_s : model.sinceMatch_s;
     if (since === null || since === undefined) return cell(t("last_match"), NONE, t("no_match_yet"), "warn");
     const search = model.newest.search;
-    const below = search && search !== "normal" ? t(`search_${search}`) : t("of_frame", number(model.lastMatch?.frame_id));
+    const below = search && search !== "normal" ? t(`search_${search}`) : model.lastMatch ? t("of_frame", number(model.lastMatch.frame_id)) : "";
     return cell(t("last_match"), since < 0.05 ? t("now") : t("ago", seconds(since)), below, since > WORRYING_S ? "warn" : "");
   }
 

@@ -74,23 +74,38 @@ const Track = L.Path.extend({
     c.save();
     c.lineJoin = c.lineCap = "round";
     this.ellipses(c);
-    for (const casing of [true, false]) {
-      for (let i = 1; i < points.length; i++) {
-        const style = styleOf(results[i].source);
-        if (results[i].fragment_id !== results[i - 1].fragment_id && !results[i].joined) continue;
-        c.setLineDash(casing ? [] : style.dash);
-        c.strokeStyle = casing ? "rgba(10,14,18,.7)" : style.colour;
-        c.lineWidth = casing ? 6 : 3.2;
-        c.beginPath();
-        c.moveTo(points[i - 1].x, points[i - 1].y);
-        c.lineTo(points[i].x, points[i].y);
-        c.stroke();
-      }
-    }
+    for (const casing of [true, false]) this.lines(c, casing);
     c.setLineDash([]);
     this.marks(c);
     this.vehicle(c);
     c.restore();
+  },
+  /** One path for each stretch of one source; points that lie on each other are left out. */
+  lines(c, casing) {
+    const {results, _points: points} = this;
+    let style = null;
+    let at = points[0];
+    const end = () => { if (style) c.stroke(); };
+    for (let i = 1; i < points.length; i++) {
+      const next = styleOf(results[i].source);
+      const isGap = results[i].fragment_id !== results[i - 1].fragment_id && !results[i].joined;
+      if (isGap || next !== style) {
+        end();
+        style = next;
+        at = points[isGap ? i : i - 1];
+        c.setLineDash(casing ? [] : style.dash);
+        c.strokeStyle = casing ? "rgba(10,14,18,.7)" : style.colour;
+        c.lineWidth = casing ? 6 : 3.2;
+        c.beginPath();
+        c.moveTo(at.x, at.y);
+        if (isGap) continue;
+      } else if (i < points.length - 1 && at.distanceTo(points[i]) < 2) {
+        continue;
+      }
+      at = points[i];
+      c.lineTo(at.x, at.y);
+    }
+    end();
   },
   ellipses(c) {
     const perMetre = this.perMetre();

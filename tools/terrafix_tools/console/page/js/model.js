@@ -15,7 +15,9 @@ export class FlightModel {
     this.facts = null; // of a live flight
     this.factsAt = 0; // ms
     this.statistics = null;
-    this.updatedAt = Date.now(); // ms: when the newest result came
+    this.known = flight.last_event_id; // events up to this one happened before the page was opened, nobody knows when
+    this.openedAt = Date.now();
+    this.updatedAt = null; // ms: when the newest result came; null: before the page was opened
     this.connection = "connecting"; // "live", "lost"
     this.lostAt = 0;
     for (const result of results) this.take(result);
@@ -44,12 +46,13 @@ export class FlightModel {
   }
 
   /** -> whether the flight itself should be read again: its counts and fragments are in no event. */
-  apply({name, data}) {
+  apply({id, name, data}) {
+    const at = id !== null && id <= this.known ? null : Date.now();
     switch (name) {
       case "frame_processed":
         // An old event that is sent again must not undo a refined position.
         if (!this.results.get(data.frame_id)?.refined) this.take(data);
-        this.updatedAt = Date.now();
+        this.updatedAt = at ?? this.updatedAt;
         return true;
       case "frame_refined": {
         const before = this.results.get(data.frame_id);
@@ -77,7 +80,7 @@ export class FlightModel {
         this.statistics = data.statistics;
         break;
     }
-    keep(this.log, {name, data, at: Date.now()});
+    keep(this.log, {name, data, at});
     return true;
   }
 

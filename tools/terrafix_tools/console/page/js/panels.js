@@ -150,7 +150,7 @@ export class LogPanel {
     const lines = model.log.slice(-SHOWN).reverse().filter((one) => LINES[one.name]);
     const mood = {processing_blocked: "bad", user_input_needed: "warn"};
     fill(this.element, lines.length
-      ? h("ul", {class: "lines"}, lines.map((one) => h("li", {class: mood[one.name] ?? ""}, h("time", {}, clock(one.at)), " ", LINES[one.name](one.data))))
+      ? h("ul", {class: "lines"}, lines.map((one) => h("li", {class: mood[one.name] ?? ""}, one.at === null ? null : h("time", {}, clock(one.at), " "), LINES[one.name](one.data))))
       : h("p", {class: "soft"}, t("no_events")));
   }
 }

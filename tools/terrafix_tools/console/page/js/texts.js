@@ -18,7 +18,7 @@ const EN = {
   // first line
   glance: "Position at a glance", position: "Position", no_position: "No position", no_frames_yet: "no frames yet", ellipse95: "95 % ellipse",
   within20: "within 20 m: {0}", not_known: "not known", height: "Height above ground", amsl: "{0} above sea level", heading: "Heading", true_north: "from true north",
-  speed: "{0} over ground", frame: "Frame", as_of: "as of {0}", updated: "updated {0} ago", completed_line: "flight completed", last_match: "Last map match",
+  speed: "{0} over ground", frame: "Frame", as_of: "as of {0}", updated: "updated {0} ago", no_news: "no news since opened", completed_line: "flight completed", last_match: "Last map match",
   no_match_yet: "none yet", now: "this frame", ago: "{0} ago", of_frame: "frame {0}", sent_fix: "Sent to autopilot", fix_3d: "3D fix", fix_none: "no fix",
   facts_old: "Old: Terrafix has reported nothing since {0}.", no_facts: "Terrafix reports nothing at present", stale: "Old data", source_satellite_anchored: "map match", source_visual_propagated: "odometry",
   source_dead_reckoned: "dead reckoning", source_none: "no position", search_widen: "search is widened", search_whole_map: "searching the whole map",
@@ -91,7 +91,7 @@ const DE = {
   link_live: "verbunden", link_lost: "Verbindung unterbrochen", link_connecting: "Verbindungsaufbau",
   glance: "Position auf einen Blick", position: "Position", no_position: "Keine Position", no_frames_yet: "noch keine Bilder", ellipse95: "95-%-Ellipse",
   within20: "innerhalb 20 m: {0}", not_known: "unbekannt", height: "Höhe über Grund", amsl: "{0} über NN", heading: "Steuerkurs", true_north: "rechtweisend",
-  speed: "{0} über Grund", frame: "Einzelbild", as_of: "Stand {0}", updated: "vor {0} aktualisiert", completed_line: "Flug abgeschlossen", last_match: "Letzter Kartenabgleich",
+  speed: "{0} über Grund", frame: "Einzelbild", as_of: "Stand {0}", updated: "vor {0} aktualisiert", no_news: "seit dem Öffnen nichts Neues", completed_line: "Flug abgeschlossen", last_match: "Letzter Kartenabgleich",
   no_match_yet: "noch keiner", now: "dieses Bild", ago: "vor {0}", of_frame: "Bild {0}", sent_fix: "An den Autopiloten gesendet", fix_3d: "3D-Position", fix_none: "keine Position",
   facts_old: "Veraltet: Terrafix meldet seit {0} nichts mehr.", no_facts: "Terrafix meldet derzeit nichts", stale: "Veraltet", source_satellite_anchored: "Kartenabgleich", source_visual_propagated: "optische Wegmessung",
   source_dead_reckoned: "Koppelnavigation", source_none: "keine Position", search_widen: "Suche wird ausgeweitet", search_whole_map: "Suche auf der ganzen Karte",
