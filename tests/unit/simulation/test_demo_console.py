@@ -1,5 +1,10 @@
 """The console beside the demo."""
 
+import os
+import signal
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import msgspec
@@ -29,3 +34,13 @@ def test_the_console_of_the_demo_reads_the_run_that_writes_into_its_folder(
         DemoConsole(tmp_path / "three").start()
     for one in owned:
         one.remove()
+
+
+def test_sigterm_ends_the_wait_for_the_console_and_the_console(tmp_path: Path) -> None:
+    beside = DemoConsole(tmp_path)
+    beside._process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    timer = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
+    beside.wait()
+    timer.join()
+    assert not beside.runs and beside._process.returncode == -signal.SIGTERM

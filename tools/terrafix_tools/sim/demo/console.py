@@ -63,10 +63,11 @@ class DemoConsole:
         """Until SIGINT or SIGTERM, or until the console ends by itself."""
         if self._process is None:
             return
-        before = signal.signal(signal.SIGTERM, lambda *_: self.stop())
+        process = self._process
+        before = signal.signal(signal.SIGTERM, lambda *_: process.terminate())  # it must not wait: this method does
         try:
             with contextlib.suppress(KeyboardInterrupt):
-                self._process.wait()
+                process.wait()
         finally:
             signal.signal(signal.SIGTERM, before)
 
