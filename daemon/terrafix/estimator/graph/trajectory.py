@@ -37,12 +37,12 @@ class Trajectory:
         """The nodes of ``conditional``, at ``poses``, are no longer unknowns. All nodes between the unknowns ``ends``
         depend on these from now on."""
         inverse = np.linalg.inv(conditional.r)
-        change, cov = inverse @ conditional.d, inverse @ inverse.T
+        change = inverse @ conditional.d
         by_ends = _by_ends(conditional, inverse, ends)
         jacobians = [_position_jacobian(pose) for pose in poses]
         if len(conditional.nodes) == 1:
             # Nodes that depended on this node depend on the ends through it, and so does the node itself.
-            node = conditional.nodes[0]
+            node, cov = conditional.nodes[0], inverse @ inverse.T
             self._by_ends[node] = np.hstack([np.zeros((3, NODE_SIZE)), jacobians[0]])
             for rows, side in ((slice(ends[0] + 1, node + 1), 1), (slice(node + 1, ends[1]), 0)):
                 columns = slice(side * NODE_SIZE, (side + 1) * NODE_SIZE)
@@ -55,7 +55,8 @@ class Trajectory:
         for i, (node, jacobian) in enumerate(zip(conditional.nodes, jacobians, strict=True)):
             at = slice(NODE_SIZE * i, NODE_SIZE * (i + 1))
             self._p_m[node] += jacobian @ change[at]
-            self._cov[node] = (jacobian @ cov[at, at] @ jacobian.T)[_UPPER]
+            root = jacobian @ inverse[at]
+            self._cov[node] = (root @ root.T)[_UPPER]
             self._by_ends[node] = jacobian @ by_ends[at]
 
     def mark_indeterminate(self, ends: tuple[int, int]) -> None:
