@@ -123,8 +123,8 @@ def _isotropy(template: np.ndarray, patch: int, corners: np.ndarray) -> np.ndarr
     return np.asarray(along - np.hypot(east, north))
 
 
-# Least-squares quadratic through 3 x 3 values.
-_Y, _X = (axis.ravel() for axis in np.mgrid[-1:2, -1:2])
+_Y, _X = (axis.ravel() for axis in np.mgrid[-1:2, -1:2])  # places of 3 x 3 values [spec: their coordinates]
+# quadratic through 3 x 3 values [spec: least squares]
 _QUADRATIC = np.linalg.pinv(np.column_stack([np.ones(9), _X, _Y, _X**2 / 2, _X * _Y, _Y**2 / 2]))
 
 
