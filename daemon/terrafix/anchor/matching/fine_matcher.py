@@ -29,7 +29,7 @@ HARD_PLACES = 40  # that are matched where single coarse patches gave no pose [m
 # [measured: docs/acceptance.md]
 FINE_THRESHOLD = 0.01
 # 1-sigma of a match, as ``_peak`` predicts it up to a factor, that has the weight 1, in heights. The best fifth has
-# 0.03 to 0.06, so that weights and claims are those of the first step. [measured: docs/acceptance.md]
+# 0.03 to 0.08, so that weights and claims are those of the first step. [measured: docs/acceptance.md]
 BEST_SIGMA = 0.01
 MIN_CORRELATION = 0.1  # at which matches are as wrong as random ones [measured: docs/acceptance.md]
 CACHE_SHARE = 4  # of the memory for coarse descriptors: those have four times as many channels [spec: 2 of 8 channels]
