@@ -275,9 +275,6 @@ class PnpInput(msgspec.Struct, frozen=True, kw_only=True):
     threshold: float  # largest reprojection error of an inlier, normalised image coordinates
     search_radius: float  # within which each match was searched around its expected place, share of the height
     min_inliers: int  # fewest inliers of a pose
-    p_c_in_w_m: Vec3 | None = (
-        None  # position of a pose found before, with the rotation ``q_w_c``; None: RANSAC finds one
-    )
 
 
 class MatchPlace(msgspec.Struct, frozen=True, kw_only=True):
@@ -471,7 +468,6 @@ class PoseMethod(StrEnum):
 
     IPPE = "ippe"  # PnP of near-planar ground
     SQPNP = "sqpnp"  # PnP of ground with relief
-    REFINED = "refined"  # least squares on fine matches, from the pose that one of the two gave on coarse ones
     MATCHER = "matcher"  # by the matcher: all patches together, a search, or a mode of the posterior
     NONE = "none"  # there are no matches
 

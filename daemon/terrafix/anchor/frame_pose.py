@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from terrafix.anchor.matching.frame_matcher import CorrelationResult, Fix, Hypothesis, View, view_at
+from terrafix.anchor.matching.frame_matcher import CorrelationResult, Hypothesis, View, view_at
 from terrafix.anchor.matching.map_layers import MapLayer
 from terrafix.anchor.matching.match_message import ground_sigma_m, mode_match, pose_match
 from terrafix.anchor.matching.point_mass_filter import Belief, Mode
@@ -26,7 +26,7 @@ UNKNOWN_HEADING_RAD = 1.5  # 1-sigma above which the heading counts as unknown [
 @dataclass(frozen=True)
 class Observation:
     """One frame correlated with a map layer. ``new``: share of new ground, 0 to 1; ``weight``: that share, at least
-    ``MIN_OBSERVATION_WEIGHT``; ``refine``: a pose is refined by larger patches."""
+    ``MIN_OBSERVATION_WEIGHT``."""
 
     image: Image
     view: View
@@ -34,7 +34,6 @@ class Observation:
     correlation: CorrelationResult
     new: float
     weight: float
-    refine: bool
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,7 @@ class PoseResult:
 def estimate_pose(
     match: MapMatch, prediction: Prediction, seen: Observation, mode: Mode, hypothesis: Hypothesis
 ) -> PoseResult:
-    """Pose from single patches in the mode; from all patches together where that fails or is imprecise; then from the
-    best places in larger patches.
+    """Pose from single patches in the mode; from all patches together where that fails or is imprecise.
 
     On a drawn layer there is none, and the position of the mode is the measurement: a patch holds one piece of a road,
     along which it fits everywhere."""
@@ -76,23 +74,8 @@ def estimate_pose(
     ):
         consensus = seen.layer.consensus.estimate(seen.image, view_at(view, hypothesis, mode.e_m, mode.n_m))
         joint = match if consensus is None else pose_match(match, consensus, view)
-        if joint.verdict is Verdict.ACCEPTED:
-            match, fix = joint, consensus
-    if seen.refine and match.verdict is Verdict.ACCEPTED and fix is not None:
-        match = _refined(match, seen, fix)
+        match = joint if joint.verdict is Verdict.ACCEPTED else match
     return PoseResult(match, mode, attempted=True, inliers=inliers)
-
-
-def _refined(match: MapMatch, seen: Observation, fix: Fix) -> MapMatch:
-    """``match`` with the pose of its best places in larger patches; ``match`` itself, which has the pose of ``fix``, if
-    that is no pose or less precise."""
-    fine, agl_m = seen.layer.matcher.fine_fix(seen.image, seen.view, fix), seen.view.agl_m
-    if fine is None or fine.pnp.fit is None or fix.pnp.fit is None:
-        return match
-    if ground_sigma_m(fine.pnp.fit, agl_m) > max(SIGMA_FLOOR * agl_m, ground_sigma_m(fix.pnp.fit, agl_m)):
-        return match
-    refined = pose_match(match, fine, seen.view)
-    return refined if refined.verdict is Verdict.ACCEPTED else match
 
 
 def heading_is_unknown(prediction: Prediction) -> bool:

@@ -113,7 +113,6 @@ class Localizer:
         self._describer = describer
         self._ce90_m = ce90_m
         self._store_folder = store_folder
-        self.refines = True  # whether poses of the next frames are refined by larger patches
         self._layers: MapLayers | None = None
         self._origin: Origin | None = None
         self._ground_m = 0.0
@@ -358,7 +357,7 @@ class Localizer:
         new = min(self._since_observation_m / (NEW_GROUND_SHARE * footprint_m), 1.0)
         weight = max(new, MIN_OBSERVATION_WEIGHT)
         used, correlation = layers.select(results, belief.mode(), weight)
-        return Observation(image, view, used, correlation, new, weight, self.refines)
+        return Observation(image, view, used, correlation, new, weight)
 
     @staticmethod
     def _may_be_on_map(best: MapLayer, prediction: Prediction) -> bool:

@@ -132,7 +132,6 @@ class AnchorNode:
                 self._hint = None
             if not self._load.takes_frame():
                 return self._localizer.skipped(prediction, Verdict.THROTTLED)
-            self._localizer.refines = self._load.allows_refinement
             match = self._localizer.localize(prediction, image)
         except ModelRunError as error:
             self._pending += self._model.failed(prediction.t_ns, str(error))

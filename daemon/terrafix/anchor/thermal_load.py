@@ -1,5 +1,4 @@
-"""Load of map matching by thermal band: every frame, or one of several, with the learned model or without it,
-with poses refined by larger patches or not."""
+"""Load of map matching by thermal band: every frame, or one of several, with the learned model or without it."""
 
 from terrafix.core.config import HealthSection
 from terrafix.messages import ThermalBand
@@ -21,11 +20,6 @@ class ThermalLoad:
     def allows_model(self) -> bool:
         """Whether the learned model may run."""
         return self.band is not ThermalBand.CRITICAL
-
-    @property
-    def allows_refinement(self) -> bool:
-        """Whether the pose of a match may be refined by larger patches."""
-        return self.band is ThermalBand.NORMAL
 
     def takes_frame(self) -> bool:
         """Whether the next frame is matched with the map. Call it once for every frame."""

@@ -59,7 +59,7 @@ def solve(points_w_m: np.ndarray, xy: np.ndarray, weights: np.ndarray, given: Pn
         return PnpResult(Verdict.FEW_INLIERS, None, none)
     if not all(np.isfinite(values).all() for values in (points_w_m, xy, weights)):
         return PnpResult(Verdict.DEGENERATE, None, none)
-    start = _ransac(points_w_m, xy, given) if given.p_c_in_w_m is None else _given_start(points_w_m, xy, given)
+    start = _ransac(points_w_m, xy, given)
     if start is None or len(start.index) < needed:
         return PnpResult(Verdict.FEW_INLIERS, None, none)
     fit, inlier = _refine(points_w_m, xy, weights, start, given)
@@ -97,8 +97,6 @@ def method_of(match: MapMatch) -> PoseMethod:
         return PoseMethod.NONE
     if match.pnp is None:
         return PoseMethod.MATCHER
-    if match.pnp.p_c_in_w_m is not None:
-        return PoseMethod.REFINED
     planar = is_planar(np.array(match.matches, dtype=float).reshape(-1, 6)[:, 2:5], match.pnp.agl_m)
     return PoseMethod.IPPE if planar else PoseMethod.SQPNP
 
@@ -115,26 +113,11 @@ def map_pose(fit: PoseFit) -> MapPose:
 
 @dataclass(frozen=True)
 class _Start:
-    """First pose, and the indices (M,) of its inliers."""
+    """Pose of RANSAC, and the indices (M,) of its inliers."""
 
     r_w_c: np.ndarray
     p_c_in_w_m: np.ndarray
     index: np.ndarray
-
-
-def _given_start(points_w_m: np.ndarray, xy: np.ndarray, given: PnpInput) -> _Start:
-    """The pose that ``given`` states, and the matches that are inliers of a coarse one: it has the errors of that."""
-    r_w_c, p = rot_from_quat(given.q_w_c), np.array(given.p_c_in_w_m)
-    return _Start(r_w_c, p, np.flatnonzero(_agreeing(points_w_m, xy, r_w_c, p, INLIER_THRESHOLD)))
-
-
-def _agreeing(
-    points_w_m: np.ndarray, xy: np.ndarray, r_w_c: np.ndarray, p_c_in_w_m: np.ndarray, threshold: float
-) -> np.ndarray:
-    """(N,) bool: which points (N, 3) lie before the camera and within ``threshold`` of their ``xy`` (N, 2)."""
-    q = (points_w_m - p_c_in_w_m) @ r_w_c
-    error = np.linalg.norm(xy - q[:, :2] / np.maximum(q[:, 2:], 1e-6), axis=1)
-    return np.asarray((error < threshold) & (q[:, 2] > 0))
 
 
 def _ransac(points_w_m: np.ndarray, xy: np.ndarray, given: PnpInput) -> _Start | None:
@@ -180,7 +163,7 @@ def outlier_inflation(matches: int, inliers: int, p_random_inlier: float) -> flo
 def _refine(
     points: np.ndarray, xy: np.ndarray, weights: np.ndarray, start: _Start, given: PnpInput
 ) -> tuple[PoseFit | None, np.ndarray]:
-    """Two refinements: on the inliers of ``start``, then on all matches that agree with the first result."""
+    """Two refinements: on RANSAC's inliers, then on all matches that agree with the first result."""
     inlier = np.zeros(len(xy), bool)
     inlier[start.index] = True
     r_w_c, p = start.r_w_c, start.p_c_in_w_m
@@ -190,7 +173,9 @@ def _refine(
         if fit is None:
             return None, inlier
         r_w_c, p = fit.r_w_c, fit.p_c_in_w_m
-        inlier = _agreeing(points, xy, r_w_c, p, given.threshold)
+        q = (points - p) @ r_w_c
+        error = np.linalg.norm(xy - q[:, :2] / np.maximum(q[:, 2:], 1e-6), axis=1)
+        inlier = (error < given.threshold) & (q[:, 2] > 0)
         if inlier.sum() < MIN_INLIERS:
             return None, inlier
     return fit, inlier

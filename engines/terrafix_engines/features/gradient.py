@@ -38,29 +38,3 @@ class GradientDescriber:
         norm = np.sqrt(np.einsum("khw,khw->hw", channels, channels))
         channels /= norm + np.float32(SATURATION * 0.25)
         return channels
-
-
-class OrientationDescriber:
-    """Two channels: the gradient with its angle doubled, so that the sign of the contrast does not matter, divided by
-    its mean length around the pixel. A quarter of the channels of ``GradientDescriber``, for small displacements on
-    fine cells. (Double-angle representation: Granlund and Knutsson, "Signal processing for computer vision", 1995.)"""
-
-    name = "orientation"
-    channels = 2
-    stride = 1  # image pixels per descriptor cell
-    grayscale = True  # takes grey images
-
-    def describe(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 BGR, or (H, W) grey -> (2, H, W) float32; the norm of each pixel's vector is below 1."""
-        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        dx = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
-        dy = cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
-        squares = dx * dx, dy * dy
-        length = np.sqrt(squares[0] + squares[1])  # cv2.magnitude rounds differently at different addresses
-        per_length = np.float32(1.0) / np.maximum(length, np.float32(1e-6))
-        doubled = np.stack([(squares[0] - squares[1]) * per_length, np.float32(2.0) * dx * dy * per_length])
-        mean = cv2.GaussianBlur(length, (0, 0), SMOOTH_SIGMA_PX) + np.float32(SATURATION * 0.25)
-        for channel in doubled:
-            cv2.GaussianBlur(channel, (0, 0), SMOOTH_SIGMA_PX, channel)
-        doubled /= mean
-        return doubled

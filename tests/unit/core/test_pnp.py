@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, PLANAR_RELIEF, PnpResult, method_of, solve
+from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, PLANAR_RELIEF, PnpResult, solve
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.messages import MapMatch, PnpInput, PoseMethod, Verdict
+from terrafix.messages import PnpInput, Verdict
 from textured_ground import rotation
 
 AGL_M = 100.0
@@ -232,31 +232,3 @@ def test_weights_count_in_the_refinement() -> None:
     heavy, light = (solve(points, xy, np.r_[np.full(10, weight), np.ones(10)], GIVEN).fit for weight in (1.0, 0.01))
     assert heavy is not None and light is not None
     assert light.residuals[10:].mean() < 0.7 * heavy.residuals[10:].mean()
-
-
-@pytest.mark.parametrize("start_m", [(0.0, 0.0, 0.0), (1.0, -1.0, 0.5)])
-def test_a_pose_found_before_takes_the_place_of_ransac(start_m: tuple[float, ...], monkeypatch: Any) -> None:
-    monkeypatch.setattr(cv2, "solvePnPRansac", None)
-    points, xy = exact_scene(0.0)
-    start = P + start_m
-    found = solve_equal_weights(points, xy, p_c_in_w_m=tuple(start), threshold=0.01)
-    assert found.fit is not None and found.inliers.all()
-    assert np.linalg.norm(found.fit.p_c_in_w_m - P) < 1e-3
-
-
-def test_a_pose_that_the_matches_contradict_is_no_start() -> None:
-    points, xy = exact_scene(0.0)
-    found = solve_equal_weights(points, xy, p_c_in_w_m=tuple(P + np.array([12.0, 0.0, 0.0])))
-    assert (found.verdict, found.fit) == (Verdict.FEW_INLIERS, None)
-
-
-def test_the_method_of_a_match_with_a_start_is_refinement() -> None:
-    match = MapMatch(
-        t_ns=0,
-        frame_id=1,
-        verdict=Verdict.ACCEPTED,
-        matcher="gradient",
-        pnp=msgspec.structs.replace(GIVEN, p_c_in_w_m=(0.0, 0.0, 9.0)),
-        matches=[(0.0, 0.0, 0.0, 0.0, 0.0, 1.0)],
-    )
-    assert method_of(match) is PoseMethod.REFINED

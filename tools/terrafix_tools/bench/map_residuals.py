@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from terrafix.anchor.matching.fine_matcher import FINE_GSD_PER_AGL
+from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL
 from terrafix.core.camera import distort_division
 from terrafix.core.pnp import solve, solved
 from terrafix.messages import MapMatch, Origin, Verdict
@@ -34,7 +33,6 @@ def measure(folder: Path) -> list[tuple[str, float]]:
     focal_px = next(m for m in messages if isinstance(m, Origin)).camera.fx
     received = [m for m in messages if isinstance(m, MapMatch) and m.verdict is Verdict.ACCEPTED and m.matches]
     found, single, of_single = list[Residuals](), list[MapMatch](), list[Residuals]()
-    refined = list[Residuals]()
     for match in received:
         placed = solved(match)
         if placed.pose is None:
@@ -43,16 +41,13 @@ def measure(folder: Path) -> list[tuple[str, float]]:
         if match.pnp is not None:
             single.append(match)
             of_single.append(found[-1])
-            if match.pnp.p_c_in_w_m is not None:
-                refined.append(found[-1])
     lens = smooth(flights_of(folder)[0]).lens
     off_m = [f.off_m for f in found]
     height_m = float(np.mean([f.height_m for f in found]))
-    cell_px = FINE_GSD_PER_AGL * focal_px
+    cell_px = FIX_GSD_PER_AGL["gradient"] * focal_px
     return [
         ("nothing: all accepted matches", mean_px(found, off_m)),
         ("nothing: those whose pose PnP computes", mean_px(of_single, [f.off_m for f in of_single])),
-        ("nothing: those refined by larger patches", mean_px(refined, [f.off_m for f in refined])),
         ("... lens of finalise (same points, PnP again)", _through(lens, single, focal_px)),
         ("affine displacement of the map in each frame", mean_px(found, [_less_affine(f) for f in found])),
         ("local distortion of the map, by other frames", mean_px(found, left_by_local_model(found))),
@@ -70,8 +65,7 @@ def _through(lens: Lens, matches: Sequence[MapMatch], focal_px: float) -> float:
         rows = np.array(match.matches)
         assert match.pnp is not None
         described = distort_division(rows[:, :2], match.radial_k1) if match.radial_k1 else rows[:, :2]
-        given = msgspec.structs.replace(match.pnp, p_c_in_w_m=None)  # found through the other lens
-        fit = solve(rows[:, 2:5], lens.rays(described), rows[:, 5], given).fit
+        fit = solve(rows[:, 2:5], lens.rays(described), rows[:, 5], match.pnp).fit
         if fit is not None:
             lengths.append(float(fit.residuals.mean()) * focal_px * float(np.exp(lens.log_focal)))
     return float(np.mean(lengths))

@@ -12,22 +12,14 @@ import numpy as np
 
 from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
-from terrafix.anchor.matching.fine_matcher import (
-    FINE_GSD_PER_AGL,
-    FINE_RADIUS,
-    FINE_THRESHOLD,
-    HARD_PLACES,
-    MAX_PLACES,
-    FineMatcher,
-)
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
-from terrafix.anchor.matching.orthorectify import Rectified, Relief, rectify
+from terrafix.anchor.matching.orthorectify import Rectified, rectify
 from terrafix.anchor.matching.patch_matcher import match_patches
 from terrafix.anchor.matching.point_mass_filter import LLR_SLOPE, LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, PnpResult, is_planar, solve
+from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, PnpResult, solve
 from terrafix.map.package import LocalMap
 from terrafix.messages import PnpInput, Verdict
 from terrafix_engines.correlation import GraphCorrelator
@@ -174,8 +166,6 @@ class FrameMatcher:
             self._features if describer.stride == 1 else MapFeatures(source, self.gradients, cache_bytes, store=store)
         )
 
-        self._fine = FineMatcher(source, cache_bytes, store)
-
     def correlation_cell_m(self, agl_m: float) -> float:
         return self.cell_m(agl_m, CORRELATION_GSD_PER_AGL)
 
@@ -278,46 +268,6 @@ class FrameMatcher:
         finer = self._patch_fix(self.gradients, image, view_of_fix(view, fix), SEARCH_RADIUS, INLIER_THRESHOLD)
         return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else fix
 
-    def fine_fix(self, image: Image, view: View, fix: Fix) -> Fix | None:
-        """The pose of ``fix``, which was computed from ``view``, by its best places in larger patches. None: too few
-        of them are on the map or agree."""
-        fit = fix.pnp.fit
-        assert fit is not None
-        start = view_of_fix(view, fix)
-        ground_m = float(fit.p_c_in_w_m[2]) - start.agl_m
-        cell_m = self.cell_m(start.agl_m, FINE_GSD_PER_AGL)
-        planar = is_planar(fix.points_w_m[fix.pnp.inliers], start.agl_m)
-        relief = None if planar else self._relief(start, ground_m)
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        place_m = (start.e_m, start.n_m, start.agl_m)
-        max_places = HARD_PLACES if fix.given is None else MAX_PLACES
-        found = self._fine.match(grey, self.camera, start.r_w_c, place_m, cell_m, relief, max_places)
-        if found is None:
-            return None
-        rays = found.frame_m @ start.r_w_c
-        xy = rays[:, :2] / rays[:, 2:]
-        points = np.column_stack([found.map_m, self._heights_m(found.map_m, ground_m)])
-        given = PnpInput(
-            q_w_c=quat_from_rot(start.r_w_c),
-            agl_m=start.agl_m,
-            sigma_floor=0.3 * cell_m / start.agl_m,
-            threshold=FINE_THRESHOLD,
-            search_radius=FINE_RADIUS,
-            min_inliers=MIN_INLIERS,
-            p_c_in_w_m=(float(fit.p_c_in_w_m[0]), float(fit.p_c_in_w_m[1]), float(fit.p_c_in_w_m[2])),
-        )
-        result = solve(points, xy, found.weight, given)
-        return None if result.fit is None else Fix(xy, points, found.weight, result, cell_m, given)
-
-    def _relief(self, view: View, ground_m: float) -> Relief:
-        """Ground above the level ``ground_m``, relative to the camera of ``view``."""
-        return lambda e_m, n_m: self._heights_m(np.column_stack([view.e_m + e_m, view.n_m + n_m]), ground_m) - ground_m
-
-    def _heights_m(self, places_m: np.ndarray, ground_m: float) -> np.ndarray:
-        """(N,): height AMSL of the map at local east and north (N, 2); ``ground_m`` where it is not known."""
-        up = self._map.elevation(places_m[:, 0], places_m[:, 1]) if len(places_m) else None
-        return np.full(len(places_m), ground_m) if up is None else np.where(np.isfinite(up), up, ground_m)
-
     def _patch_fix(
         self, describer: Describer, image: Image, view: View, radius_share: float, threshold: float
     ) -> Fix | None:
@@ -340,7 +290,9 @@ class FrameMatcher:
         )
         rays = np.column_stack([found.frame_m, np.full(len(found.frame_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
-        points = np.column_stack([found.map_m, self._heights_m(found.map_m, view.ground_m)])
+        up = self._map.elevation(found.map_m[:, 0], found.map_m[:, 1]) if len(xy) else None
+        up = np.full(len(xy), view.ground_m) if up is None else np.where(np.isfinite(up), up, view.ground_m)
+        points = np.column_stack([found.map_m, up])
         given = PnpInput(
             q_w_c=quat_from_rot(view.r_w_c),
             agl_m=view.agl_m,

@@ -1,7 +1,6 @@
 """Orthorectification of the frame: north-up at a chosen ground sampling distance, from attitude and height above ground
 (PB-6)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -19,10 +18,6 @@ MIN_DOWN = 0.3
 # interpolated, to a twentieth of a rectified pixel for a k1 of -0.2. [measured: test_orthorectify]
 LENS_STEP_PX = 4
 OUTSIDE_PX = -1e6  # of ground behind the camera, so that no interpolated pixel is inside [spec: any far pixel]
-
-
-# Height of the ground above the plane of a rectification, by east and north relative to the camera, metres, (N,) each.
-Relief = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -59,11 +54,10 @@ def rectify(
     gsd_m: float,
     stride: int = 1,
     blurred: dict[float, Image] | None = None,
-    relief: Relief | None = None,
 ) -> Rectified | None:
-    """Projects ``image``, in colour or grey, on flat ground ``agl_m`` below the camera, or on ``relief`` above that.
-    Sides are multiples of ``stride`` pixels. ``blurred``: cache of blurred copies of the image by scale factor, shared
-    between yaw hypotheses. None: no ground is visible."""
+    """Projects ``image``, in colour or grey, on flat ground ``agl_m`` below the camera. Sides are multiples of
+    ``stride`` pixels. ``blurred``: cache of blurred copies of the image by scale factor, shared between yaw hypotheses.
+    None: no ground is visible."""
     box = footprint(camera, r_w_c, agl_m)
     if box is None:
         return None
@@ -80,8 +74,8 @@ def rectify(
         if shrink not in blurred:
             blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
         source = blurred[shrink]
-    if camera.distortion or camera.radial_k1 or relief is not None:
-        px = _lens_map(camera, r_w_c, ground, width, height, relief)
+    if camera.distortion or camera.radial_k1:
+        px = _lens_map(camera, to_camera, width, height)
         flat = cv2.remap(source, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
         mask = (px >= 0).all(-1) & (px[..., 0] <= camera.width - 1) & (px[..., 1] <= camera.height - 1)
     else:
@@ -93,17 +87,12 @@ def rectify(
     return Rectified(flat, mask, e_min, n_max, gsd_m)
 
 
-def _lens_map(
-    camera: CameraCalibration, r_w_c: np.ndarray, ground: np.ndarray, width: int, height: int, relief: Relief | None
-) -> np.ndarray:
+def _lens_map(camera: CameraCalibration, to_camera: np.ndarray, width: int, height: int) -> np.ndarray:
     """(height, width, 2) float32: pixel of the frame at each rectified pixel, far outside of it for ground behind the
-    camera. ``ground`` (3, 3): rectified pixel (x, y, 1) -> flat ground relative to the camera."""
+    camera. ``to_camera`` (3, 3): rectified pixel (x, y, 1) -> ray in the camera."""
     columns, rows = (side // LENS_STEP_PX + 2 for side in (width, height))
     x, y = np.meshgrid(np.arange(columns) * float(LENS_STEP_PX), np.arange(rows) * float(LENS_STEP_PX))
-    places_m = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ ground.T
-    if relief is not None:
-        places_m[:, 2] += relief(places_m[:, 0], places_m[:, 1])
-    rays = places_m @ r_w_c
+    rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ to_camera.T
     behind = rays[:, 2] <= 0
     rays[behind] = (0.0, 0.0, 1.0)
     px = camera.project(rays)

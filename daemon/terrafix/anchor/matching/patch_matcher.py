@@ -1,6 +1,5 @@
 """Correlation of several patches of the rectified frame with the map: the 2D-3D matches of a frame."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -81,7 +80,7 @@ def correlate_patches(
     side = 2 * radius + 1
     if not corners:
         return corners, np.zeros((0, side, side))
-    return corners, patch_surfaces(template, window, corners, patch, radius, row0, column0)
+    return corners, _correlate(template, window, corners, patch, radius, row0, column0)
 
 
 def _select_patches(
@@ -95,38 +94,29 @@ def _select_patches(
 ) -> list[tuple[int, int]]:
     """Corners of patches that lie inside the frame and whose search area lies on the map, the ones with most texture
     first, at most ``MAX_PATCHES``."""
-    corners = usable_corners(mask, valid, patch, radius, row0, column0)
-    if len(corners) == 0:
-        return []
-    texture = patch_means([np.einsum("khw,khw->hw", template, template)], patch, corners)[0]
-    best = np.lexsort((corners[:, 1], corners[:, 0], texture))[::-1][:MAX_PATCHES]
-    return [(int(r), int(c)) for r, c in corners[best]]
-
-
-def usable_corners(mask: np.ndarray, valid: np.ndarray, patch: int, radius: int, row0: int, column0: int) -> np.ndarray:
-    """(N, 2): corners (row, column), half a patch apart, of the patches that lie inside the frame ``mask`` (h, w) and
-    whose search area lies on the map ``valid``."""
     h, w = mask.shape
     if h < patch or w < patch:
-        return np.zeros((0, 2), np.int64)
+        return []
     step = max(patch // 2, 1)
-    rows, columns = np.arange(0, h - patch + 1, step), np.arange(0, w - patch + 1, step)
-    corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
-    corners = corners[patch_means([mask.astype(np.uint8)], patch, corners)[0] >= 0.98]
-    on_window = corners + np.array([row0, column0])
-    first, last = on_window - radius, on_window + patch + radius
-    on_map = (first >= 0).all(axis=1) & (last <= valid.shape).all(axis=1)
-    return np.array(
-        [
-            corner
-            for corner, (top, left), (bottom, right) in zip(corners[on_map], first[on_map], last[on_map], strict=True)
-            if valid[top:bottom:4, left:right:4].all()
-        ],
-        np.int64,
-    ).reshape(-1, 2)
+    inside = cv2.boxFilter(mask.astype(np.float32), -1, (patch, patch), anchor=(0, 0), normalize=True)
+    energy = np.einsum("khw,khw->hw", template, template)
+    texture = cv2.boxFilter(energy, -1, (patch, patch), anchor=(0, 0), normalize=True)
+    found: list[tuple[float, int, int]] = []
+    for r in range(0, h - patch + 1, step):
+        for c in range(0, w - patch + 1, step):
+            if inside[r, c] < 0.98:
+                continue
+            top, left = row0 + r - radius, column0 + c - radius
+            bottom, right = row0 + r + patch + radius, column0 + c + patch + radius
+            if top < 0 or left < 0 or bottom > valid.shape[0] or right > valid.shape[1]:
+                continue
+            if valid[top:bottom:4, left:right:4].all():
+                found.append((float(texture[r, c]), r, c))
+    found.sort(reverse=True)
+    return [(r, c) for _, r, c in found[:MAX_PATCHES]]
 
 
-def patch_surfaces(
+def _correlate(
     template: np.ndarray,
     window: np.ndarray,
     corners: list[tuple[int, int]],
@@ -135,8 +125,7 @@ def patch_surfaces(
     row0: int,
     column0: int,
 ) -> np.ndarray:
-    """Zero-mean normalised correlation surface of the patch at every one of ``corners``, (N, 2 radius + 1,
-    2 radius + 1), as in ``correlate_patches``."""
+    """Zero-mean normalised correlation surface of every patch, (N, 2 radius + 1, 2 radius + 1)."""
     side = patch + 2 * radius
     fft = transform_shape(side, side)
     n = 2 * radius + 1
@@ -149,29 +138,20 @@ def patch_surfaces(
         top, left = row0 + r - radius, column0 + c - radius
         large = window[:, top : top + side, left : left + side]
         product[i] = cross_correlation(spectra(large, fft), spectra(small, fft))[:n, :n]
-    # Energy and channel means of the map under every placement of a patch.
+    # Energy and channel means of the map under every placement of a patch, by box sums over the whole window.
     count = patch * patch
-    energy = np.einsum("khw,khw->hw", window, window)
-    sums = np.stack([cv2.integral(layer, sdepth=cv2.CV_64F) for layer in (energy, *window)])
-    under = np.empty((len(corners), n, n))
-    for i, (r, c) in enumerate(corners):
-        top, left = row0 + r - radius, column0 + c - radius
-        near = sums[:, top : top + n + patch, left : left + n + patch]
-        box = near[:, patch:, patch:] - near[:, :n, patch:] - near[:, patch:, :n] + near[:, :n, :n]
-        under[i] = box[0] - np.einsum("khw,khw->hw", box[1:], box[1:]) / count
+    variance = _box_sums(np.einsum("khw,khw->hw", window, window), patch)
+    for channel in window:
+        variance -= _box_sums(channel, patch) ** 2 / count
+    under = np.stack([variance[row0 + r - radius :, column0 + c - radius :][:n, :n] for r, c in corners])
     floor = 0.05 * own[:, None, None]
     return product / np.sqrt(np.maximum(np.maximum(under, floor) * own[:, None, None], 1e-12))
 
 
-def patch_means(layers: Sequence[np.ndarray], patch: int, corners: np.ndarray) -> np.ndarray:
-    """``layers``: (H, W) each; ``corners`` (N, 2): row, column -> (len(layers), N): means over the squares of ``patch``
-    cells at these corners."""
-    r, c = corners.T
-    means = []
-    for layer in layers:
-        sums = cv2.integral(layer, sdepth=cv2.CV_64F)
-        means.append(sums[r + patch, c + patch] - sums[r, c + patch] - sums[r + patch, c] + sums[r, c])
-    return np.array(means) / patch**2
+def _box_sums(x: np.ndarray, side: int) -> np.ndarray:
+    """(H, W): sum over the square of ``side`` cells whose corner is the cell, zero outside of ``x``."""
+    box = (side, side)
+    return cv2.boxFilter(x, cv2.CV_64F, box, anchor=(0, 0), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
 def _peak(surface: np.ndarray) -> tuple[float, float, float] | None:
