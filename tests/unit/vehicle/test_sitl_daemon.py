@@ -1,5 +1,6 @@
 """Terrafix as a child of a SITL flight: it ends with the flight, however the flight ends."""
 
+import socket
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from link_port import free_port
 from map_format1 import unpack
 
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
@@ -29,7 +31,7 @@ from types import SimpleNamespace
 from terrafix_tools.sim.sitl.firmware import Home
 from terrafix_tools.sim.sitl.stages import Daemon
 scene = SimpleNamespace(home=Home(48.0002, 11.0002, 500.0, 90.0), map_path=Path(sys.argv[2]))
-with Daemon(Path(sys.argv[1]), scene, "http://127.0.0.1:9/", "udpin:127.0.0.1:0") as daemon:
+with Daemon(Path(sys.argv[1]), scene, sys.argv[3], sys.argv[4]) as daemon:
     daemon.start()
     time.sleep(600)
 """
@@ -50,11 +52,15 @@ def eventually(holds: Any, within_s: float) -> None:
 
 
 def test_terrafix_stops_in_order_when_its_flight_is_killed(tmp_path: Path) -> None:
+    """The camera outlives the flight and sends nothing, and the link has no autopilot: no process gives up before."""
     log = tmp_path / "terrafix.log"
-    with subprocess.Popen([sys.executable, "-c", FLIGHT, str(tmp_path), str(unpack(tmp_path))]) as flight:
-        eventually(lambda: log.exists() and log.read_text().count("process started") == len(PROCESSES), 60.0)
-        flight.kill()
-    eventually(lambda: log.read_text().count("process stopped") == len(PROCESSES), ENDS_S)
+    with socket.create_server(("127.0.0.1", 0)) as camera:
+        source, link = f"http://127.0.0.1:{camera.getsockname()[1]}/", f"udpin:127.0.0.1:{free_port()}"
+        command = [sys.executable, "-c", FLIGHT, str(tmp_path), str(unpack(tmp_path)), source, link]
+        with subprocess.Popen(command) as flight:
+            eventually(lambda: log.exists() and log.read_text().count("process started") == len(PROCESSES), 60.0)
+            flight.kill()
+        eventually(lambda: log.read_text().count("process stopped") == len(PROCESSES), ENDS_S)
 
 
 def test_a_terrafix_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
