@@ -117,6 +117,22 @@ def test_a_live_flight_has_results_events_health_and_an_end(owned: OwnedRunDir, 
     assert flying.counted == 0  # it is not taken for the recorder
 
 
+def test_a_flight_that_ended_without_a_service_is_completed_by_the_next_one(
+    owned: OwnedRunDir, flying: Flying, tmp_path: Path
+) -> None:
+    chosen = settings(tmp_path / "data", bus=str(owned.run_dir.path))
+    with Console(chosen) as console:
+        (flight,) = soon(lambda: console.send("GET", "/flights").json["flights"])
+        path = f"/flights/{flight['flight_id']}"
+        soon(lambda: console.send("GET", path).json["last_event_id"] > 0)
+    owned.run_dir.spec.unlink()
+    with Console(chosen) as console:
+        soon(lambda: console.send("GET", path).json["state"] == "completed")
+        with console.service.database.read() as db:
+            names = [e.name for e in flights.events_after(db, flight["flight_id"], 0, 100_000)]
+        assert names[-2:] == ["flight_completed", "state_changed"]
+
+
 def test_a_hint_goes_the_way_of_the_command(
     owned: OwnedRunDir, flying: Flying, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,6 +25,7 @@ from terrafix.runtime.run_dir import RunDir, live_runs
 from terrafix.runtime.run_spec import Spec
 from terrafix_tools.console.compute.observed import FlightObserver
 from terrafix_tools.console.compute.steering import fix_message
+from terrafix_tools.console.events import FlightCompleted
 from terrafix_tools.console.payloads import FlightState, Hint, UserFix
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database
@@ -66,6 +67,11 @@ def run_to_follow(bus: str) -> RunDir | None:
     if bus != AUTO:
         runs = [run for run in runs if run.path == Path(bus)]
     return runs[0] if len(runs) == 1 and runs[0].spec.is_file() and runs[0].epoch_ns is not None else None
+
+
+def flight_id_of(run: RunDir) -> str:
+    """The same for one run, whichever service follows it."""
+    return f"live-{sha256(f'{run.path}{run.epoch_ns}'.encode()).hexdigest()[:12]}"
 
 
 class LiveFlights:
@@ -130,13 +136,24 @@ class LiveFlights:
     # --- the thread -------------------------------------------------------------------------------
 
     def _follow(self) -> None:
+        with self._database.read() as db:
+            unfinished = flights.unfinished_live(db)
         while not self._stop.wait(LOOK_S if self.current is None else 0.0):
             run = run_to_follow(self._bus)
-            if run is not None:
-                self._follow_run(run)
+            followed = "" if run is None else flight_id_of(run)
+            for flight_id in unfinished - {followed}:  # they ended while no service followed them
+                self._complete_missed(flight_id)
+            unfinished &= {followed}
+            if run is not None and self._follow_run(run):
+                unfinished = set()
 
-    def _follow_run(self, run: RunDir) -> None:
-        live = self._begin(run)
+    def _follow_run(self, run: RunDir) -> bool:
+        """Follows a run until it ends. -> False: it had ended already."""
+        try:
+            spec = msgspec.json.decode(run.spec.read_bytes(), type=Spec)
+        except OSError:
+            return False
+        live = self._begin(run, spec)
         self.current = live
         next_health_s = time.monotonic() + HEALTH_S
         with Observer(run, READ, PROCESSES) as observer:
@@ -151,11 +168,10 @@ class LiveFlights:
         if not run.spec.exists():
             self._complete(live)
         self.current = self.facts = None
+        return True
 
-    def _begin(self, run: RunDir) -> LiveRun:
-        spec = msgspec.json.decode(run.spec.read_bytes(), type=Spec)
-        epoch_ns = run.epoch_ns
-        flight_id = f"live-{sha256(f'{run.path}{epoch_ns}'.encode()).hexdigest()[:12]}"
+    def _begin(self, run: RunDir, spec: Spec) -> LiveRun:
+        flight_id, epoch_ns = flight_id_of(run), run.epoch_ns
         observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image", lambda: None)
         observer.origin_ns = epoch_ns or 0
         map_path = None if spec.map_path is None else Path(spec.map_path)
@@ -210,6 +226,13 @@ class LiveFlights:
                 done.append(waiting.pop(message.frame_id))
         while len(waiting) > WAITING_FRAMES:
             done.append(waiting.popitem(last=False)[1])
+
+    def _complete_missed(self, flight_id: str) -> None:
+        """Of a flight whose end no service has seen only the number of stored frames is known."""
+        with self._database.write() as db:
+            statistics = {"frames": flights.result_count(db, flight_id)}
+            flights.complete(db, flight_id, FlightCompleted(statistics=statistics))
+        self._stored(flight_id)
 
     def _complete(self, live: LiveRun) -> None:
         with self._database.write() as db:

@@ -103,6 +103,12 @@ def create_live(db: sa.Connection, flight_id: str, *, name: str, map_name: str, 
     db.execute(insert(flights).values(row).on_conflict_do_nothing())
 
 
+def unfinished_live(db: sa.Connection) -> set[str]:
+    """Ids of the live flights whose end is not stored."""
+    of = flights.c.kind == FlightKind.LIVE.value, flights.c.state != FlightState.COMPLETED.value
+    return set(db.execute(sa.select(flights.c.id).where(*of)).scalars())
+
+
 def complete(db: sa.Connection, flight_id: str, completed: FlightCompleted) -> None:
     """The flight is over: its last events, and its state."""
     previous = FlightState(row_of(db, flight_id).state)
