@@ -12,6 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from terrafix_tools import child_process
+
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 NEW_PROFILE = ("--no-first-run", "--disable-background-networking", "--disable-sync", "--disable-component-update")
 STOP_S = 5.0
@@ -61,12 +63,7 @@ class Browser:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        child_process.end(self._process, STOP_S)
         os.close(self._out)
         os.close(self._in)
         self._profile.cleanup()

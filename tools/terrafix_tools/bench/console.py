@@ -105,7 +105,7 @@ def _upload(client: ConsoleClient, new: NewFlight, folder: Path, pid: int) -> di
 
 
 def _event_latency_ms(client: ConsoleClient, new: NewFlight, folder: Path, clients: int, pid: int) -> dict[str, float]:
-    """Events are committed as the processes of flights do; the service is told by a hint, as by their reports."""
+    """Events are committed as the processes of flights do; the service is notified as by their reports."""
     flight_id = client.create(new).flight_id
     database = open_database(folder / "data", durable=False)
     sent_s: dict[int, float] = {}

@@ -217,7 +217,7 @@ def show(result: dict[str, Any], console: Console) -> None:
         slope = f"{row['mb_per_h']:.1f} ± {row['mb_per_h_sigma']:.1f} MB/h"
         table.add_row(name, f"{row['memory_mb']:.0f} MB", slope, f"{row['files_gained']:.0f}")
     console.print(table)
-    told = {
+    shown = {
         "image to estimate": f"{result['delay_first_third_ms']:.0f} ms in the first third",
         "then": f"{result['delay_last_third_ms']:.0f} ms in the last",
         "longest gap of GPS_INPUT": f"{result['longest_gap_ms']:.0f} ms",
@@ -226,7 +226,7 @@ def show(result: dict[str, Any], console: Console) -> None:
         "worst error": f"{result['worst_sigmas']:.1f} sigma",
         "grows": ", ".join(result["grows"]) or "nothing",
     }
-    console.print("; ".join(f"{name} {value}" for name, value in told.items()), highlight=False)
+    console.print("; ".join(f"{name} {value}" for name, value in shown.items()), highlight=False)
 
 
 def main(

@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from terrafix.core.errors import SourceError
+from terrafix_tools import child_process
 from terrafix_tools.chaos.camera import StreamedCamera, camera_toml
 from terrafix_tools.chaos.scene import Scene
 from terrafix_tools.sim.autopilot.course import PeerState
@@ -126,12 +127,7 @@ class Rig:
             return
         began_s = time.monotonic()
         self._daemon.send_signal(signal.SIGCONT)
-        self._daemon.terminate()
-        try:
-            self._daemon.wait(STOP_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            self._daemon.kill()
-            self._daemon.wait()
+        child_process.end(self._daemon, STOP_LIMIT_S)
         self.stop_s = time.monotonic() - began_s
         self._daemon = None
 

@@ -23,8 +23,8 @@ def line(outcome: Outcome) -> str:
         "not recorded": _s(outcome.not_recorded_s),
         "stop": _s(outcome.stop_s),
     }
-    told = ", ".join(f"{name} {value}" for name, value in figures.items())
-    return f"{outcome.fault:28} {outcome.phase:21} {told}: {outcome.verdict}"
+    shown = ", ".join(f"{name} {value}" for name, value in figures.items())
+    return f"{outcome.fault:28} {outcome.phase:21} {shown}: {outcome.verdict}"
 
 
 def cell(outcome: Outcome | None) -> str:

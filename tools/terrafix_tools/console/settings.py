@@ -1,4 +1,4 @@
-"""What `terrafix serve` was told, and the limits of the service."""
+"""Options of `terrafix serve`, and the limits of the service."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -14,7 +14,7 @@ import msgspec
 
 from terrafix_tools.console.settings import Settings
 
-STOP_S = 5.0  # longest wait for a process that was told to end
+STOP_S = 5.0  # longest wait for a process that was asked to end
 MAX_DEATHS = 5  # in a row without a result, after which a flight is given up [spec: docs/console.md]
 RESTART_S = 1.0  # between a death and the next process of this flight
 LINE_BYTES = 64 * 1024
@@ -27,7 +27,7 @@ class _Running:
     process: asyncio.subprocess.Process
     frame_id: int = -1  # that it computes
     waiting: bool = False  # for images
-    ending: bool = False  # was told to end
+    ending: bool = False  # was asked to end
     result: str = ""  # "done", or why it failed
     stored: int = 0  # results of this process
     task: "asyncio.Task[None] | None" = field(default=None, repr=False)
@@ -35,7 +35,7 @@ class _Running:
 
 @dataclass(frozen=True)
 class Reports:
-    """What the owner is told. ``stored``: something of a flight was committed; ``died``: a process of a flight died at
+    """Calls to the owner. ``stored``: something of a flight was committed; ``died``: a process of a flight died at
     a frame, not by SIGKILL; ``failed``: a flight cannot be computed, and why."""
 
     stored: Callable[[str], Awaitable[None]]

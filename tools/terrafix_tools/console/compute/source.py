@@ -22,7 +22,7 @@ Steer = Callable[[int, Hint | UserFix, int], PositionHint | None]
 
 
 class UploadedImages:
-    """A Source. ``wait`` blocks until something may have changed; ``begins`` is told each frame before it is read;
+    """A Source. ``wait`` blocks until something may have changed; ``begins`` gets each frame before it is read;
     ``steer(hint_id, given, t_ns)`` makes the message of a hint, None: it cannot be used."""
 
     live = False

@@ -15,6 +15,7 @@ import msgspec
 from terrafix.core.errors import LinkError
 from terrafix.runtime.run_dir import RunDir, live_runs
 from terrafix.runtime.run_spec import Spec
+from terrafix_tools import child_process
 
 PORT = 8700  # that of `terrafix serve`
 URL = f"http://127.0.0.1:{PORT}/page/"
@@ -74,12 +75,7 @@ class DemoConsole:
     def stop(self) -> None:
         if self._process is None or self._process.poll() is not None:
             return
-        self._process.terminate()
-        try:
-            self._process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        child_process.end(self._process, STOP_S)
 
 
 @contextmanager

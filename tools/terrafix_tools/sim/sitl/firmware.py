@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 
 from terrafix.core.errors import OutputError, UsageError
+from terrafix_tools import child_process
 from terrafix_tools.sim.autopilot.parameters import Kind
 
 BINARY_VARIABLE = "TERRAFIX_ARDUPILOT_SITL"
@@ -123,12 +124,7 @@ class Firmware:
 
     def stop(self) -> None:
         if self._process.poll() is None:
-            self._process.terminate()
-            try:
-                self._process.wait(STOP_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+            child_process.end(self._process, STOP_S)
 
     def __enter__(self) -> "Firmware":
         return self
