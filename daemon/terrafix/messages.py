@@ -580,8 +580,8 @@ class ClaimBudget(Message, frozen=True, kw_only=True):
     """Terms of the horizontal covariance of a NavEstimate, once a second after the first map match, not while hot."""
 
     frame_id: int
-    # Mean horizontal variance [m^2] of each term: "graph", "map", "principal_point", "time_offset", "hypotheses",
-    # "calibration". Their sum is that of NavEstimate.cov.
+    # Mean horizontal variance [m^2] of each term: "graph", "map", "illumination", "principal_point", "time_offset",
+    # "hypotheses", "calibration". Their sum is that of NavEstimate.cov.
     terms_m2: dict[str, float]
 
 

@@ -19,7 +19,13 @@ from terrafix.estimator.integrity.innovation_run import InnovationRun
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.measurements.contract import fuse
-from terrafix.estimator.measurements.map_pose import FixedPose, MapPoseMeasurement, determined, levelled
+from terrafix.estimator.measurements.map_pose import (
+    FixedPose,
+    MapPoseMeasurement,
+    determined,
+    levelled,
+    levelled_offset,
+)
 from terrafix.estimator.models.motion_model import unknown_motion_cov
 from terrafix.estimator.propagation import STEP_SHARE
 from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
@@ -159,15 +165,14 @@ class MapUpdate:
         share = self._fixes.information_share(fixed_s, here, height_m)
         measurement = replace(measurement, information_share=share)
         fixed = levelled(measurement, before.pose, state.covariance(node))
+        offset = levelled_offset(measurement, before.pose, state.covariance(node))
         fusion = fuse(state, node, measurement)
         if fusion.verdict is not Verdict.ACCEPTED:
             assert fusion.innovation is not None
             return self._reject(match, node, measurement, fusion.innovation)
         self._rejected.clear()
         if not match.position_only:
-            assert fusion.innovation is not None
-            gate = tangent_to_world(fusion.innovation.covariance, before.pose.rotation().matrix())
-            self.hypotheses.map_consistency.add_accepted(share, gate[:2, :2])
+            self.hypotheses.map_consistency.add_accepted(share, *offset)
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
         return MapResult(replace(fusion, detail=f"information share {share:.2f}"), fixed=fixed)

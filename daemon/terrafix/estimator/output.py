@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
+from terrafix.core.map_error import shared_variance_m2
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.claim import Claim
 from terrafix.estimator.estimator import Estimator
@@ -142,7 +143,7 @@ def calibration_of(estimator: Estimator, frame: FrameState) -> CalibrationEstima
 
 def refinement_of(estimator: Estimator, axes: LocalFrame, ended: SourceEnded) -> Iterable[Refinement]:
     """Positions of past frames by all that was measured in the flight."""
-    poses, map_var = [], estimator.map_sigma_m**2
+    poses, map_var = [], shared_variance_m2(estimator.map_sigma_m)
     for frame_id, (p, cov) in sorted(estimator.refine().items()):
         lat_deg, lon_deg = axes.to_wgs84(float(p[0]), float(p[1]))
         poses.append(

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
+from terrafix.core.map_error import shared_variance_m2
 from terrafix.core.node import NodeContext
 from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.messages import (
@@ -136,7 +137,7 @@ class SmootherNode:
 
     def _on_anchor(self, seen: PoseAnchor) -> None:
         self._hot = seen.covariance_mode is CovarianceMode.JACOBIAN
-        self._map_var_m2 = seen.map_sigma_m**2
+        self._map_var_m2 = shared_variance_m2(seen.map_sigma_m)
         self._axis, self._axis_cov = np.array(seen.axis), np.array(seen.axis_cov).reshape(2, 2)
         anchor = Anchor(_pose(seen.q_w_c, seen.p_c_in_w_m), np.array(seen.cov).reshape(6, 6))
         if self._graph.add_anchor(seen.frame_id, anchor):

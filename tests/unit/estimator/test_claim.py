@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight
+from terrafix.core.map_error import ILLUMINATION_SIGMA_M
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.claim import claim
 from terrafix.estimator.estimator import Estimator
@@ -15,7 +16,7 @@ from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.messages import ClaimBudget, LensEstimate, MapMatch, NavEstimate
 
 FRAMES = 24
-TERMS = {"graph", "map", "principal_point", "time_offset", "hypotheses", "calibration"}
+TERMS = {"graph", "map", "illumination", "principal_point", "time_offset", "hypotheses", "calibration"}
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +33,20 @@ def test_the_terms_add_up_to_the_published_horizontal_variance(run: EstimatorRun
         assert sum(budget.terms_m2.values()) == pytest.approx(0.5 * (estimate.cov[0] + estimate.cov[7]))
 
 
-def test_the_term_of_the_map_is_the_variance_that_the_map_states() -> None:
+def test_a_matched_map_adds_the_variance_that_it_states_and_that_of_shadows() -> None:
     run, flight = EstimatorRun(), Flight(FRAMES, seed=4, dem=True)
     run.feed([ORIGIN])
     for message in flight.all_messages():
         run.feed([msgspec.structs.replace(message, map_sigma_m=3.0) if isinstance(message, MapMatch) else message])
     budget = next(m for m in run.published if isinstance(m, ClaimBudget))
     assert budget.terms_m2["map"] == pytest.approx(9.0)
+    assert budget.terms_m2["illumination"] == pytest.approx(ILLUMINATION_SIGMA_M**2)
+
+
+def test_before_the_first_match_neither_map_nor_shadows_are_in_the_claim(placed: tuple[Estimator, FrameState]) -> None:
+    assert placed[0].map_sigma_m == 0.0
+    terms = claim(*placed, 0.0, 0.0).terms_m2
+    assert terms["map"] == terms["illumination"] == 0.0
 
 
 def test_the_budget_is_published_once_a_second_after_the_first_map_match(run: EstimatorRun) -> None:

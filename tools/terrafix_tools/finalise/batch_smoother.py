@@ -7,6 +7,7 @@ heights are as seen through the described lens, and the scale is that of both. D
 with all data: which map matches are inliers, and which of their points (gnc.py), where the segments between resets lie
 (sim3_pose_graph.py), and at which poses and through which lens odometry saw the ground."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -16,6 +17,7 @@ from gtsam.symbol_shorthand import B, C, F, M, V
 
 from terrafix.core.gate import GATE
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.core.map_error import shared_variance_m2
 from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.plane_two_view import LensNoise, k1_model_sigma, plane_two_view_factor
 from terrafix.estimator.factors.three_view import (
@@ -161,7 +163,9 @@ class _Smoothing:
             for factor in (*node.factors, *self._calibration_factors(i, node), *self._odometry_factors(i, node)):
                 graph.push_back(self._linear(factor) if isinstance(factor, gtsam.CustomFactor) else factor)
         for j, sigma_m in enumerate(self._maps):
-            sigmas = np.array([MAP_TURN_RAD] * 3 + [max(sigma_m, EXACT_M)] * 2 + [LEVEL_M])
+            sigmas = np.array(
+                [MAP_TURN_RAD] * 3 + [max(math.sqrt(shared_variance_m2(sigma_m)), EXACT_M)] * 2 + [LEVEL_M]
+            )
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.push_back(gtsam.PriorFactorPose3(M(j), gtsam.Pose3(), noise))
         graph.push_back(self._focal_prior(0.0, self._focal_sigma))

@@ -1,7 +1,7 @@
 """The pose of a map match as a measurement: whether it is determined, and its covariance."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -95,6 +95,18 @@ def levelled(measurement: MapPoseMeasurement, predicted: gtsam.Pose3, predicted_
     gain = np.linalg.solve(by_pose @ cov @ by_pose.T + tilt_cov, by_pose @ cov).T
     cov = cov - gain @ by_pose @ cov
     return FixedPose(pose.retract(gain @ residual), (cov + cov.T) / 2)
+
+
+def levelled_offset(
+    measurement: MapPoseMeasurement, predicted: gtsam.Pose3, predicted_cov: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position (2,) of the ``levelled`` match from the ``predicted`` one, with its covariance (2, 2), whatever other
+    matches over the same ground have given; east and north."""
+    fixed = levelled(replace(measurement, information_share=1.0), predicted, predicted_cov)
+    both = [
+        tangent_to_world(c, p.rotation().matrix()) for p, c in ((predicted, predicted_cov), (fixed.pose, fixed.cov))
+    ]
+    return (fixed.pose.translation() - predicted.translation())[:2], (both[0] + both[1])[:2, :2]
 
 
 def measured_pose(pose: MapPose, map_sigma_m: float, terrain: Terrain) -> tuple[gtsam.Pose3, np.ndarray]:
