@@ -111,7 +111,8 @@ def eliminate(factors: list[GaussianFactor], frontals: list[int]) -> tuple[Condi
     if not (np.isfinite(r).all() and np.abs(root.diagonal()).min() > MIN_ROOT):
         raise IndeterminateError
     conditional = Conditional(tuple(frontals), tuple(parents), root, r[:size, size:-1], r[:size, -1])
-    return conditional, GaussianFactor(tuple(parents), r[size:width, size:-1], r[size:width, -1])
+    # Copies: a view would hold all of ``r``, which is a hundred times as large, as long as the factor is kept.
+    return conditional, GaussianFactor(tuple(parents), r[size:width, size:-1].copy(), r[size:width, -1].copy())
 
 
 @dataclass(frozen=True)
