@@ -147,6 +147,7 @@ NAMES = tuple(process.name for process in PROCESSES)
 FAULTS: tuple[Fault, ...] = (
     Fault("none", 0.0),
     killed("supervisor"),
+    Fault("all processes: kill -9", 0.0, begin=lambda rig: rig.kill_all()),
     *(killed(name) for name in NAMES),
     stopped("supervisor", SHORT_S),
     *(stopped(name, LONG_S) for name in NAMES),

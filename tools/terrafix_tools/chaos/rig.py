@@ -5,11 +5,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
 from terrafix.core.errors import SourceError
+from terrafix.runtime.run_dir import PREFIX, SHM
 from terrafix_tools import child_process
 from terrafix_tools.chaos.camera import StreamedCamera, camera_toml
 from terrafix_tools.chaos.scene import Scene
@@ -93,11 +94,28 @@ class Rig:
         return next((pid for name, pid in self.processes() if name == process), None)
 
     def processes(self) -> Iterator[tuple[str, int]]:
-        """Name and pid of the children of the supervisor."""
+        """Name and pid of the children of the supervisor, and of the processes that outlived the one before it."""
+        outlived = {int(word) for run in self.run_folders() for word in _first_words(run.glob("*.pid"))}
         for entry in Path("/proc").iterdir():
             with suppress(OSError, ValueError, IndexError):
-                if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == self.supervisor_pid:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+                if parent == self.supervisor_pid or int(entry.name) in outlived:
                     yield (entry / "comm").read_text().strip(), int(entry.name)
+
+    def run_folders(self) -> Iterator[Path]:
+        """The run folder in shared memory; none before the supervisor has made it."""
+        for spec in SHM.glob(f"{PREFIX}*/spec.json"):
+            with suppress(OSError):
+                if str(self.out) in spec.read_text():
+                    yield spec.parent
+
+    def kill_all(self) -> None:
+        """Kills the supervisor and all processes, as the out-of-memory killer of a control group does."""
+        pids = [self.supervisor_pid, *(pid for _, pid in self.processes())]
+        for pid in pids:
+            if pid is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
 
     def signal(self, process: str, number: int) -> None:
         """Sends a signal to a process, or to the supervisor by the name "supervisor"."""
@@ -162,3 +180,9 @@ class Rig:
     def _home_amsl_m(self) -> float:
         ground = self.scene.course(0.0)
         return ground.amsl_m - ground.agl_m
+
+
+def _first_words(files: Iterable[Path]) -> Iterator[str]:
+    for file in files:
+        with suppress(OSError):
+            yield from file.read_text().split()[:1]

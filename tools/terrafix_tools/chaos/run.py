@@ -133,7 +133,7 @@ def _with_record(rig: Rig, fault: Fault, phase: Phase, outcome: Outcome) -> Outc
 
 
 def _hits_record(fault: Fault) -> bool:
-    return fault.own_disk or fault.name.startswith(("recorder", "supervisor"))
+    return fault.own_disk or fault.name.startswith(("recorder", "supervisor", "all processes"))
 
 
 class Results:
