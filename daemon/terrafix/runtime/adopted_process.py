@@ -60,8 +60,14 @@ def adopt(pid_file: Path) -> AdoptedProcess | None:
 
 
 def outlive_supervisor(run_dir: RunDir, name: str, supervisor_pid: int) -> None:
-    """Called by the process ``name``, which so far ends with its supervisor: from now on another one can adopt it."""
-    write_atomic(run_dir.pid(name), f"{os.getpid()} {_start_time(os.getpid())}".encode())
+    """Called by the process ``name``, which so far ends with its supervisor: from now on another one can adopt it.
+
+    When shared memory is full it goes on ending with its supervisor: none could find it."""
+    try:
+        write_atomic(run_dir.pid(name), f"{os.getpid()} {_start_time(os.getpid())}".encode())
+    except OSError as error:
+        logs.get().warning("cannot outlive the supervisor", why=str(error.strerror))
+        return
     set_parent_death_signal(supervisor_pid, None)
 
 
