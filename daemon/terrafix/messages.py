@@ -802,7 +802,7 @@ class ProcessEvent(Message, frozen=True, kw_only=True):
     """A process started, died, was restarted or given up; published by the supervisor."""
 
     process: str
-    event: str  # "started", "died", "stuck", "restarted", "gave_up", "stopped"
+    event: str  # "started", "died", "stuck", "restarted", "gave_up", "stopped", "adopted"
     detail: str = ""
 
 

@@ -105,7 +105,7 @@ PROCESSES: tuple[Process, ...] = (
             m.StatusText,
         ),
         50.0,  # GPS_INPUT is sent at 10 Hz; the finer tick reduces the jitter of its interval
-        2.0,
+        1.0,  # the tenth GPS_INPUT in a row that is missing; with the restart the autopilot waits for less than 2 s
     ),
     Process(
         "estimator",

@@ -1,6 +1,10 @@
 """Programs that a command starts beside itself."""
 
+import os
+import signal
 import subprocess
+from contextlib import suppress
+from pathlib import Path
 
 
 def end(process: "subprocess.Popen[bytes]", limit_s: float) -> None:
@@ -11,3 +15,15 @@ def end(process: "subprocess.Popen[bytes]", limit_s: float) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+def kill_tree(process: "subprocess.Popen[bytes]") -> None:
+    """Kills ``process`` and its children: those of Terrafix would outlive their supervisor for some seconds."""
+    pids: list[str] = []
+    with suppress(OSError):
+        pids = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    process.kill()
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            os.kill(int(pid), signal.SIGKILL)
+    process.wait()

@@ -22,6 +22,7 @@ PR_SET_CHILD_SUBREAPER = 36  # prctl(2): orphaned descendants become children of
 READY_LIMIT_S = 10.0  # time for the imports on a heavily loaded computer
 FORK_ATTEMPTS = 2  # the death of a killed fork server is noticed at the next request, which is then repeated
 TRACEBACK_SIGNAL = signal.SIGUSR2  # the supervisor sends it to a stuck process, which then prints its tracebacks
+EXIT_UNKNOWN = 256  # exit code of a process that is no child of this one; real ones are below
 FIELD_SEPARATOR = "\0"  # between the fields of a request; a path cannot contain it
 
 
@@ -51,7 +52,7 @@ class ForkedProcess:
 
     def wait(self, limit_s: float) -> int:
         """Waits for the end of the process -> exit code as in ``poll``. Raises TimeoutError after ``limit_s``."""
-        descriptor = os.pidfd_open(self.pid) if self.poll() is None else None
+        descriptor = self._pidfd() if self.poll() is None else None
         if descriptor is not None:
             try:
                 select.select([descriptor], [], [], limit_s)
@@ -61,6 +62,9 @@ class ForkedProcess:
         if code is None:
             raise TimeoutError
         return code
+
+    def _pidfd(self) -> int:
+        return os.pidfd_open(self.pid)
 
 
 class ForkServer:
@@ -114,10 +118,10 @@ class ForkServer:
         self._popen.wait()
 
 
-def set_parent_death_signal(parent_pid: int, number: signal.Signals) -> bool:
-    """The kernel sends ``number`` to this process when its parent ends. False: ``parent_pid`` is not its parent, which
-    means that the parent has already ended."""
-    _prctl(PR_SET_PDEATHSIG, number)
+def set_parent_death_signal(parent_pid: int, number: signal.Signals | None) -> bool:
+    """The kernel sends ``number`` (None: nothing) to this process when its parent ends. False: ``parent_pid`` is not
+    its parent, which means that the parent has already ended."""
+    _prctl(PR_SET_PDEATHSIG, number or 0)
     return os.getppid() == parent_pid
 
 

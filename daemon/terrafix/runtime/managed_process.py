@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
+from terrafix.core.clock import now_ns
 from terrafix.core.errors import ERROR_OF_EXIT_CODE
 from terrafix.processes import Process
-from terrafix.runtime.fork_server import TRACEBACK_SIGNAL, ForkedProcess, ForkServer
+from terrafix.runtime.adopted_process import adopt
+from terrafix.runtime.fork_server import EXIT_UNKNOWN, TRACEBACK_SIGNAL, ForkedProcess, ForkServer
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
 
@@ -20,6 +22,7 @@ FIRST_START_LIMIT_NS = 300_000_000_000  # imports, and engines that are built wh
 START_LIMIT_NS = 60_000_000_000  # a process that was ready before has already built its engines
 STOP_LIMIT_S = 5.0  # from SIGTERM to SIGKILL
 KILL_LIMIT_S = 1.0  # from SIGKILL to the exit; it takes longer if a driver blocks the process in the kernel
+PAUSE_NS = 500_000_000  # between two checks; one takes some TRACEBACK_S at most [spec: ten periods of the supervisor]
 TRACEBACK_S = 0.2  # for a stuck process to print its tracebacks
 
 
@@ -67,14 +70,21 @@ class ManagedProcess:
         self.process = process
         self.state = State.WAITING
         self.user_error: UserError | None = None
-        self.progress = Progress.create(run_dir.progress(process.name))
         self._run_dir = run_dir
         self._fork_server = fork_server
-        self._forked: ForkedProcess | None = None
+        self._forked: ForkedProcess | None = adopt(run_dir.pid(process.name))
+        self._adopted = self._forked is not None  # and not reported yet
         self._start_at_ns = 0
-        self._started_ns = 0
-        self._starts = 0
+        self._started_ns = now_ns()
+        self._checked_ns = 0  # time of the last check
+        self._resumed_ns = 0  # time at which checks went on after a pause
+        self._starts = int(self._adopted)
         self._was_ready = False
+        progress = run_dir.progress(process.name)
+        if self._adopted:
+            self.progress, self.state = Progress(progress), State.STARTING
+        else:
+            self.progress = Progress.create(progress)
         self._killed = False  # killed by the supervisor because it was stuck; its exit is still pending
         self._window = RestartWindow()
 
@@ -88,7 +98,14 @@ class ManagedProcess:
         return self.state in (State.RUNNING, State.FINISHED, State.GAVE_UP)
 
     def check(self, now_ns: int) -> Iterator[Event]:
-        """One check of the process: starts, restarts or kills it if necessary. Yields the resulting events."""
+        """One check of the process: starts, restarts or kills it if necessary. Yields the resulting events, at first
+        that it was adopted."""
+        if self._checked_ns and now_ns - self._checked_ns > PAUSE_NS:
+            self._resumed_ns = now_ns
+        self._checked_ns = now_ns
+        if self._adopted and self._forked is not None:
+            self._adopted = False
+            yield Event("adopted", f"pid {self._forked.pid}")
         if self.state is State.WAITING:
             if now_ns >= self._start_at_ns:
                 yield self._start(now_ns)
@@ -155,7 +172,8 @@ class ManagedProcess:
                 yield self._start(now_ns)
 
     def _progress_ns(self) -> int:
-        return self.progress.stamp_ns or self._started_ns
+        """Time since which it makes no progress. If this computer stood still, no process could make any."""
+        return max(self.progress.stamp_ns or self._started_ns, self._resumed_ns)
 
     def _is_stuck(self, now_ns: int) -> bool:
         limit_ns = self.process.stuck_after_s * 1e9
@@ -173,6 +191,8 @@ class ManagedProcess:
 
 def describe(code: int) -> str:
     """Exit code as text: -9 -> 'killed by SIGKILL', 1 -> 'exit code 1'."""
+    if code == EXIT_UNKNOWN:
+        return "exit code unknown: started by the supervisor before"
     if code >= 0:
         return f"exit code {code}"
     try:

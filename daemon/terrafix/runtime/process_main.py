@@ -20,11 +20,12 @@ from terrafix.core.frames import SharedFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import Frame
 from terrafix.runtime import systemd
+from terrafix.runtime.adopted_process import AloneForTooLong, outlive_supervisor
 from terrafix.runtime.core_budget import limit_cores
 from terrafix.runtime.executor import run_process
 from terrafix.runtime.fork_server import FIELD_SEPARATOR, TRACEBACK_SIGNAL, set_parent_death_signal
 from terrafix.runtime.run_dir import RunDir
-from terrafix.runtime.run_spec import Spec, table_of
+from terrafix.runtime.run_spec import Spec, is_camera, table_of
 from terrafix.runtime.stop_signal import StopSignal
 
 REQUEST_BYTES = 8192  # a name and a path
@@ -37,7 +38,7 @@ def main(arguments: list[str]) -> int:
     gc.freeze()  # the collections of a forked process then do not write into pages that it shares with the others
     with socket.socket(fileno=descriptor) as requests:
         forked_as = serve(requests, supervisor_pid)
-    return 0 if forked_as is None else run(*forked_as)
+    return 0 if forked_as is None else run(*forked_as, supervisor_pid)
 
 
 def serve(requests: socket.socket, supervisor_pid: int) -> tuple[str, RunDir] | None:
@@ -60,14 +61,17 @@ def serve(requests: socket.socket, supervisor_pid: int) -> tuple[str, RunDir] | 
     return None
 
 
-def run(name: str, run_dir: RunDir) -> int:
+def run(name: str, run_dir: RunDir, supervisor_pid: int) -> int:
     """Runs the process ``name`` to its end -> exit code."""
     Path("/proc/self/comm").write_text(name)  # for `ps` and `top`: the command line is that of the fork server
-    stopping = StopSignal(signal.SIGTERM)
+    stop_signal = StopSignal(signal.SIGTERM, ends_start=True)
+    alone = AloneForTooLong(run_dir, supervisor_pid)
     faulthandler.enable()
     faulthandler.register(TRACEBACK_SIGNAL, all_threads=True)
     spec = msgspec.json.decode(run_dir.spec.read_bytes(), type=Spec)
     logs.configure(spec.config.log.level, name, systemd.log_stream())
+    if is_camera(spec.config.source.path):  # a run that the next supervisor resumes
+        outlive_supervisor(run_dir, name, supervisor_pid)
     limit_cores(spec.config.runtime.cores)  # before the node and its libraries are imported
     table = table_of(spec)
     process = next(p for p in table if p.name == name)
@@ -83,7 +87,7 @@ def run(name: str, run_dir: RunDir) -> int:
         epoch_ns=run_dir.epoch_ns,
     )
     try:
-        run_process(name, ctx, run_dir, stopping=stopping, table=table)
+        run_process(name, ctx, run_dir, stopping=lambda: stop_signal() or alone(), table=table)
     except TerrafixError as error:
         run_dir.user_error(name).write_text(str(error), encoding="utf-8")
         logs.get().error("cannot continue", reason=str(error), todo="correct what the reason names, and start again")

@@ -1,12 +1,14 @@
 """The run folder: a folder in shared memory with the sockets, frames, progress stamps, checkpoints and spec of a run.
 
 It exists as long as its supervisor. A file lock distinguishes the folder of a running supervisor from a stale one of a
-killed supervisor. A supervisor that replaces one that was killed in flight resumes from the stale folder."""
+killed supervisor. A supervisor that replaces one that was killed in flight takes over the stale folder, and with it the
+processes that are still alive (adopted_process.py)."""
 
 import fcntl
 import os
 import shutil
 import tempfile
+import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,7 @@ from terrafix.runtime.progress_stamp import Progress
 
 SHM = Path("/dev/shm")  # memory instead of disk, so that frames and progress stamps do not wait for storage
 PREFIX = "terrafix-"
+LOCK_ATTEMPTS, LOCK_PAUSE_S = 20, 0.005  # whoever only looks whether a lock is held holds it itself for microseconds
 SAME_FLIGHT_NS = 60_000_000_000  # a killed run with progress within this time belongs to the flight in progress
 
 
@@ -39,6 +42,15 @@ class RunDir:
     def gave_up(self, process: str) -> Path:
         """Exists when ``process`` will not be restarted."""
         return self.path / f"{process}.gave_up"
+
+    def pid(self, process: str) -> Path:
+        """Which process is running as ``process`` (adopted_process.py)."""
+        return self.path / f"{process}.pid"
+
+    @property
+    def is_supervised(self) -> bool:
+        """Whether its supervisor is running."""
+        return _is_held(self.path / "lock")
 
     def checkpoint(self, process: str) -> Path:
         """State that ``process`` saves for its next instance (runtime/checkpoint.py)."""
@@ -70,19 +82,6 @@ class RunDir:
     def _epoch(self) -> Path:
         return self.path / "epoch_ns"
 
-    def resume_from(self, killed: "RunDir") -> bool:
-        """Takes over epoch, checkpoints and caches of ``killed``. False: that run had another spec, or its last
-        progress is too old."""
-        same = killed.spec.is_file() and killed.spec.read_bytes() == self.spec.read_bytes()
-        if not same or not killed.was_alive_recently():
-            return False
-        for file in (killed._epoch, *killed.path.glob("*.checkpoint")):
-            write_atomic(self.path / file.name, file.read_bytes())
-        for folder in killed.path.glob("*.cache"):
-            with suppress(OSError):  # a cache is optional
-                folder.rename(self.path / folder.name)
-        return True
-
     def was_alive_recently(self) -> bool:
         """Whether its source was open and a process made progress within SAME_FLIGHT_NS."""
         return self._epoch.exists() and now_ns() - self._last_progress_ns() <= SAME_FLIGHT_NS
@@ -112,14 +111,20 @@ class OwnedRunDir:
     keep_for_successor = False
 
     def __init__(self, parent: Path | None = None, spec: bytes = b"", *, resume: bool = False) -> None:
-        """``spec``: content of the spec file. ``resume``: takes over the state of a killed run of the same flight."""
+        """``spec``: content of the spec file. ``resume``: takes over the folder of a killed run of the same flight."""
         parent = parent or _default_parent()
-        self.run_dir = RunDir(Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent)))
-        # The kernel releases an exclusive lock when its holder ends, also if it is killed.
-        self._lock_fd = os.open(self.run_dir.path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        fcntl.flock(self._lock_fd, fcntl.LOCK_EX)
-        self.run_dir.spec.write_bytes(spec)
-        remove_stale_runs(parent, self.run_dir if resume else None)
+        killed = _take_over(parent, spec) if resume else None
+        if killed is not None:
+            self.run_dir, self._lock_fd = killed
+            for file in (*self.run_dir.path.glob("*.gave_up"), *self.run_dir.path.glob("*.user_error")):
+                file.unlink()  # with a new supervisor they are tried again
+        else:
+            self.run_dir = RunDir(Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent)))
+            # The kernel releases an exclusive lock when its holder ends, also if it is killed.
+            self._lock_fd = os.open(self.run_dir.path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            fcntl.flock(self._lock_fd, fcntl.LOCK_EX)
+            self.run_dir.spec.write_bytes(spec)
+        remove_stale_runs(parent)
 
     def remove(self) -> None:
         if not self.keep_for_successor:
@@ -162,9 +167,36 @@ def _is_held(lock: Path) -> bool:
     return False
 
 
-def remove_stale_runs(parent: Path, successor: RunDir | None = None) -> None:
-    """Removes the folders of supervisors that no longer run, after ``successor`` has taken over their state. The
-    folder of another run that was killed in flight recently is kept for its own successor."""
+def _take_over(parent: Path, spec: bytes) -> tuple[RunDir, int] | None:
+    """The folder of a run with this spec that was killed in the flight in progress, and the descriptor of its lock,
+    which this process then holds. None: there is none."""
+    for folder in _folders(parent):
+        killed = RunDir(folder)
+        with suppress(OSError):  # of another user, or removed meanwhile
+            if not killed.spec.is_file() or killed.spec.read_bytes() != spec or not killed.was_alive_recently():
+                continue
+            fd = os.open(folder / "lock", os.O_RDWR | os.O_CLOEXEC)
+            if _lock(fd):
+                return killed, fd
+            os.close(fd)  # its supervisor is running
+    return None
+
+
+def _lock(fd: int) -> bool:
+    """Takes the lock. False: another process keeps it."""
+    for _ in range(LOCK_ATTEMPTS):
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(LOCK_PAUSE_S)
+        else:
+            return True
+    return False
+
+
+def remove_stale_runs(parent: Path) -> None:
+    """Removes the folders of supervisors that no longer run. One of a run that was killed in flight recently is kept
+    for its successor."""
     for lock in parent.glob(f"{PREFIX}*/lock"):
         try:
             fd = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
@@ -175,8 +207,7 @@ def remove_stale_runs(parent: Path, successor: RunDir | None = None) -> None:
         except BlockingIOError:
             continue  # its supervisor is running
         else:
-            killed = RunDir(lock.parent)
-            if (successor is not None and successor.resume_from(killed)) or not killed.was_alive_recently():
+            if not RunDir(lock.parent).was_alive_recently():
                 shutil.rmtree(lock.parent, ignore_errors=True)
         finally:
             os.close(fd)

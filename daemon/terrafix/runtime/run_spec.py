@@ -1,5 +1,6 @@
 """Specification of a run, written by the supervisor for its processes and for a supervisor that resumes the run."""
 
+import os
 from pathlib import Path
 
 import msgspec
@@ -51,6 +52,11 @@ def spec_of(
     ]
     package = str(map_path) if map_path else None
     return Spec(table=rows, config=config, map_path=package, out_dir=str(out_dir), ground_amsl_m=ground_amsl_m)
+
+
+def is_camera(source: str) -> bool:
+    """Whether the source is live. A recorded source is not resumed after a restart but starts from its beginning."""
+    return source.startswith("/dev/") or not os.path.exists(os.path.expanduser(source))
 
 
 def table_of(spec: Spec) -> tuple[Process, ...]:

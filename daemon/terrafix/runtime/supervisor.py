@@ -6,7 +6,6 @@ others continue, and the state is reported."""
 
 import contextlib
 import errno
-import os
 import signal
 import sys
 import tempfile
@@ -30,7 +29,7 @@ from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.fork_server import ForkServer
 from terrafix.runtime.managed_process import Event, ManagedProcess, State
 from terrafix.runtime.run_dir import OwnedRunDir, RunDir, recently_killed_runs
-from terrafix.runtime.run_spec import Spec, spec_of
+from terrafix.runtime.run_spec import Spec, is_camera, spec_of
 from terrafix.runtime.stop_signal import StopSignal
 
 LINK_GAVE_UP = 1  # exit code
@@ -86,7 +85,7 @@ def run(
         )
         logs.get().info("start", config=msgspec.to_builtins(config), map=str(package), out_dir=str(out_dir))
         spec = msgspec.json.encode(spec_of(table, config, package, out_dir, ground_amsl_m))
-        owned = OwnedRunDir(spec=spec, resume=_is_camera(config.source.path))
+        owned = OwnedRunDir(spec=spec, resume=is_camera(config.source.path))
         stack.callback(owned.remove)
         if on_run_dir:
             on_run_dir(owned.run_dir)
@@ -136,7 +135,7 @@ def recently_killed_spec(
 
     With it a restart in flight need not inspect the map again. None: there is no such run. Raises ConfigError."""
     config = _with_overrides(configuration.load(configs), source, start, map_path, link)
-    if not config.map.path or not _is_camera(config.source.path):
+    if not config.map.path or not is_camera(config.source.path):
         return None
     for killed in recently_killed_runs():
         with contextlib.suppress(OSError, msgspec.DecodeError):  # the folder is being removed, or of another version
@@ -267,11 +266,6 @@ def _with_overrides(config: Config, source: str, start: str, map_path: Path | No
     if link:
         config = replace(config, link=replace(config.link, device=link))
     return config
-
-
-def _is_camera(source: str) -> bool:
-    """Whether the source is live. A recorded source is not resumed after a restart but starts from its beginning."""
-    return source.startswith("/dev/") or not os.path.exists(os.path.expanduser(source))
 
 
 def _writable(out_dir: Path) -> Path:

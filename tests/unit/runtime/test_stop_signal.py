@@ -3,6 +3,8 @@
 import signal
 import threading
 
+import pytest
+
 from terrafix.runtime.stop_signal import StopSignal
 
 
@@ -27,3 +29,12 @@ def test_no_handler_is_installed_outside_the_main_thread() -> None:
     thread.start()
     thread.join()
     assert results == [False] and signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_signal_ends_a_start_and_is_only_recorded_from_the_first_question_on() -> None:
+    with StopSignal(signal.SIGTERM, ends_start=True) as stop_requested:
+        with pytest.raises(SystemExit) as ended:
+            signal.raise_signal(signal.SIGTERM)
+        assert ended.value.code == 0
+        assert stop_requested()
+        signal.raise_signal(signal.SIGTERM)

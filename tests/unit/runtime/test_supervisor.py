@@ -202,11 +202,12 @@ def test_only_the_failure_of_the_link_ends_the_run(
 
 
 RUNNER = """
-import sys
+import os, sys
 from pathlib import Path
 from runtime_nodes import TABLE
 from terrafix.runtime.supervisor import run
-sys.exit(run(source="", map_path=None, link="", out_dir=Path(sys.argv[1]), configs=[], table=TABLE))
+source = os.environ.get("SOURCE", "")
+sys.exit(run(source=source, map_path=None, link="", out_dir=Path(sys.argv[1]), configs=[], table=TABLE))
 """
 
 
@@ -277,12 +278,49 @@ def test_systemd_receives_ready_watchdog_and_stopping_and_sigterm_stops_in_order
             assert rest[-1] == b"STOPPING=1"
 
 
-def test_processes_end_with_a_killed_supervisor_and_its_stale_folder_is_removed(
+def test_processes_of_a_killed_supervisor_fly_on_and_the_next_one_adopts_restarts_and_stops_them(
+    tmp_path: Path,
+) -> None:
+    names = {p.name for p in TABLE}
+    pids: dict[str, int] = {}
+    record = tmp_path / "out" / "received.jsonl"
+
+    def adopted() -> list[str]:
+        events = (decode_json(line) for line in record.read_bytes().split(b"\n")[:-1])
+        return [e.process for e in events if isinstance(e, m.ProcessEvent) and e.event == "adopted"]
+
+    others = {run.path for run in run_dir.live_runs()}
+    try:
+        with supervisor_process(tmp_path / "out") as process:
+            eventually(lambda: names <= set(children_of(process.pid)), 15)
+            pids = {name: pid for name, pid in children_of(process.pid).items() if name in names}
+            (folder,) = (run for run in run_dir.live_runs() if run.path not in others)
+            eventually(folder.was_alive_recently, 15)
+            process.kill()
+        assert not any(is_gone(pid) for pid in pids.values())
+        with supervisor_process(tmp_path / "out") as process:
+            eventually(lambda: sorted(adopted()) == sorted(names), 15)
+            os.kill(pids["estimator"], signal.SIGKILL)
+            eventually(lambda: "estimator" in children_of(process.pid), 5)
+            assert not any(is_gone(pids[name]) for name in names - {"estimator"})
+            assert names & set(children_of(process.pid)) == {"estimator"}, "the others have not been started again"
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(15) == 0
+        assert all(is_gone(pid) for pid in pids.values())
+        assert not folder.path.exists()
+    finally:
+        for pid in pids.values():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def test_processes_of_a_recorded_source_end_with_a_killed_supervisor_and_its_folder_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    names = {p.name for p in TABLE}
     others = {run.path for run in run_dir.live_runs()}
-    with supervisor_process(tmp_path / "out") as process:
-        eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
+    with supervisor_process(tmp_path / "out", SOURCE=str(tmp_path)) as process:
+        eventually(lambda: names <= set(children_of(process.pid)), 15)
         children = children_of(process.pid)
         (folder,) = {run.path for run in run_dir.live_runs()} - others
         eventually(run_dir.RunDir(folder).was_alive_recently, 15)

@@ -61,6 +61,7 @@ def test_terrafix_stops_in_order_when_its_flight_is_killed(tmp_path: Path) -> No
             eventually(lambda: log.exists() and log.read_text().count("process started") == len(PROCESSES), 60.0)
             flight.kill()
         eventually(lambda: log.read_text().count("process stopped") == len(PROCESSES), ENDS_S)
+    assert "SIGTERM" not in log.read_text(), "no process was killed because it went on waiting for the camera"
 
 
 def test_a_terrafix_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """Frames over HTTP: exposure times, lost connections, other cameras, and a stream to the real source."""
 
 import http.server
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from source_folders import HEIGHT, TOML, WIDTH, jpeg, picture
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources import Shot, Source, open_source
+from terrafix.vision.sources.mjpeg import TIMEOUT_S
 from terrafix_tools.sim.camera.stream import FrameStream
 
 pytestmark = pytest.mark.real_time
@@ -85,6 +87,33 @@ def test_a_lost_stream_is_reconnected(description: Path, watch: Callable[[Source
         until(lambda: len(seen) >= 4)
     errors = [s.frame.error for s in seen]
     assert errors[0] == "" and "decoded" in errors[1] and "wrong size: 160x120" in errors[2] and errors[3] == ""
+
+
+@pytest.mark.parametrize("answered", [False, True])
+def test_closing_does_not_wait_for_a_camera_that_is_connected_and_sends_nothing(
+    description: Path, answered: bool
+) -> None:
+    head = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=b\r\n\r\n"
+    with socket.create_server(("127.0.0.1", 0)) as camera:
+        url = f"http://127.0.0.1:{camera.getsockname()[1]}/"
+        opened: list[Source] = []
+        reading = threading.Thread(target=lambda: opened.append(open_source(url, camera=description)))
+        reading.start()
+        connection, _ = camera.accept()
+        connection.sendall(head)
+        reading.join(10.0)
+        reading = threading.Thread(target=lambda: list(opened[0].shots()))
+        reading.start()
+        if not answered:
+            connection.close()  # the source connects again
+            connection, _ = camera.accept()
+        with connection:
+            connection.recv(4096)
+            time.sleep(0.1)
+            closed_s = time.monotonic()
+            opened[0].close()
+            reading.join(10.0)
+    assert not reading.is_alive() and time.monotonic() - closed_s < TIMEOUT_S / 2
 
 
 def test_a_slow_mjpeg_client_does_not_block_the_server(description: Path) -> None:

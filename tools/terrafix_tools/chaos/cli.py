@@ -20,6 +20,9 @@ def chaos(
     phase: Annotated[list[str] | None, typer.Option(help="Phase of the flight; may be given several times.")] = None,
     again: Annotated[bool, typer.Option("--again", help="Also fly cells that have a result.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the place and of the noise.")] = 1,
+    model: Annotated[
+        Path | None, typer.Option(help="Weights of XFeat for the faults of models; default: the fetched ones.")
+    ] = None,
     list_only: Annotated[bool, typer.Option("--list", help="List faults and phases, and fly nothing.")] = False,
     page: Annotated[Path | None, typer.Option(help="Page whose table of results is written anew.")] = None,
 ) -> None:
@@ -46,9 +49,17 @@ def chaos(
     results = Results(out / "results.json")
     scene = scene_in(out / f"flight-{seed}", seed)
     cells = [(f, p) for p in phases for f in faults if again or not results.has(f, p)]
-    for outcome in fly_matrix(scene, cells, out, results, seed=seed):
+    for outcome in fly_matrix(scene, cells, out, results, seed=seed, model=model or _fetched_model()):
         typer.echo(line(outcome))
     if page is not None:
         write_table(page, results.outcomes)
     if any(o.verdict != "ok" and "not measurable" not in o.verdict for o in results.outcomes):
         raise typer.Exit(BROKEN)
+
+
+def _fetched_model() -> Path:
+    from terrafix_engines.manifest import find_manifest
+    from terrafix_engines.store import models_folder, stored_model
+
+    folder = models_folder()
+    return stored_model(find_manifest("xfeat", folder), folder).path

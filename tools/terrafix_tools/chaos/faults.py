@@ -14,7 +14,8 @@ import numpy as np
 
 from terrafix.processes import PROCESSES
 from terrafix_tools.chaos.camera import Look
-from terrafix_tools.chaos.rig import COOL_MC, Rig
+from terrafix_tools.chaos.rig import COOL_MC, Need, Rig
+from terrafix_tools.chaos.switches import Switch
 from terrafix_tools.sim.autopilot.wire import heartbeat
 
 SHORT_S, LONG_S = 6.0, 10.0
@@ -24,6 +25,9 @@ HOTTEST_MC = 95_000
 DISK_MB = 24
 SPARE_BYTES = 4 << 20  # that a process may still allocate
 SPARE_FILES = 0  # that it may still open
+JUMP_S = 86_400.0 * 365  # of the wall clock: as after an empty battery of the clock
+SLOW_FSYNC_S = 3.0
+DISK = frozenset({Need.DISK})
 Action = Callable[[Rig], None]
 
 
@@ -33,15 +37,14 @@ def nothing(_rig: Rig) -> None:
 
 @dataclass(frozen=True)
 class Fault:
-    """``during`` is called often with the seconds since the beginning. ``own_disk``: the record has a disk of its own,
-    which only root can mount."""
+    """``during`` is called often with the seconds since the beginning."""
 
     name: str
     lasts_s: float
     begin: Action = nothing
     end: Action = nothing
     during: Callable[[Rig, float], None] = lambda _rig, _s: None
-    own_disk: bool = False
+    needs: frozenset[Need] = frozenset()
 
 
 def killed(process: str) -> Fault:
@@ -118,12 +121,48 @@ def _fill(rig: Rig) -> None:
             file.write(bytes(1 << 16))
 
 
-def _alter_map(rig: Rig) -> None:
+def _unmount(out: Path) -> None:
+    """The disk is gone: open files go on in a file system that nobody sees, new ones come on the disk below."""
+    subprocess.run(["umount", "-l", str(out)], check=False, capture_output=True)
+
+
+def _fill_shared(rig: Rig) -> None:
+    with suppress(OSError), (rig.shared_memory / "filler").open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(1 << 12))
+
+
+def _free_shared(rig: Rig) -> None:
+    (rig.shared_memory / "filler").unlink(missing_ok=True)
+
+
+def _other_baud(rig: Rig, *, other: bool) -> None:
+    assert rig.line is not None
+    rig.line.other_baud = other
+
+
+def switched(name: str, switch: Switch, value: float, *needs: Need) -> Fault:
+    return Fault(
+        name,
+        SHORT_S,
+        lambda rig: rig.switches.set(switch, value),
+        lambda rig: rig.switches.set(switch, 0.0),
+        needs=frozenset({Need.SWITCHES, *needs}),
+    )
+
+
+def _alter(path: Path) -> None:
     """Overwrites a part of the file in place, as a failing disk would."""
-    size = rig.map_path.stat().st_size
-    with rig.map_path.open("r+b") as file:
+    size = path.stat().st_size
+    with path.open("r+b") as file:
         file.seek(size // 3)
         file.write(np.random.default_rng(1).bytes(size // 3))
+
+
+def _alter_model(rig: Rig) -> None:
+    """The process that uses it has to open it again."""
+    _alter(rig.model_path)
+    rig.signal("anchor", signal.SIGKILL)
 
 
 def _saturate(rig: Rig) -> None:
@@ -147,6 +186,7 @@ NAMES = tuple(process.name for process in PROCESSES)
 FAULTS: tuple[Fault, ...] = (
     Fault("none", 0.0),
     killed("supervisor"),
+    Fault("all processes: kill -9", 0.0, begin=lambda rig: rig.kill_all()),
     *(killed(name) for name in NAMES),
     stopped("supervisor", SHORT_S),
     *(stopped(name, LONG_S) for name in NAMES),
@@ -166,17 +206,31 @@ FAULTS: tuple[Fault, ...] = (
     Fault("link: silent", SHORT_S, lambda rig: _mute(rig, muted=True), lambda rig: _mute(rig, muted=False)),
     Fault("link: garbage", SHORT_S, during=_noise),
     Fault("link: autopilot reboots", 0.0, begin=lambda rig: rig.peer.reboot()),
+    Fault(
+        "link: other baud rate",
+        SHORT_S,
+        lambda rig: _other_baud(rig, other=True),
+        lambda rig: _other_baud(rig, other=False),
+        needs=frozenset({Need.SERIAL}),
+    ),
     Fault("link: second autopilot", SHORT_S, during=lambda rig, _s: rig.peer.inject(heartbeat(42))),
-    Fault("disk: full", SHORT_S, _fill, lambda rig: (rig.out / "filler").unlink(missing_ok=True), own_disk=True),
+    Fault("disk: full", SHORT_S, _fill, lambda rig: (rig.out / "filler").unlink(missing_ok=True), needs=DISK),
     Fault(
         "disk: read-only",
         SHORT_S,
         lambda rig: _mount(rig.out, "-o", "remount,ro"),
         lambda rig: _mount(rig.out, "-o", "remount,rw"),
-        own_disk=True,
+        needs=DISK,
     ),
+    switched("disk: slow", Switch.FSYNC_S, SLOW_FSYNC_S),
+    Fault("disk: gone", SHORT_S, lambda rig: _unmount(rig.out), needs=DISK),
+    Fault("shared memory: full", SHORT_S, _fill_shared, _free_shared, needs=frozenset({Need.SHARED_MEMORY})),
+    switched("wall clock: a year ahead", Switch.WALL_CLOCK_S, JUMP_S),
+    switched("wall clock: a year back", Switch.WALL_CLOCK_S, -JUMP_S),
+    Fault("model: file altered, anchor killed", 0.0, begin=_alter_model, needs=frozenset({Need.MODEL})),
+    switched("model: provider lost", Switch.NO_PROVIDER, 1.0, Need.MODEL),
     Fault("map: file removed", 0.0, begin=lambda rig: rig.map_path.unlink()),
-    Fault("map: file altered", 0.0, begin=_alter_map),
+    Fault("map: file altered", 0.0, begin=lambda rig: _alter(rig.map_path)),
     Fault("processor: saturated", LONG_S, _saturate, _rest),
     Fault("heat: 40 to 97 to 40 C", LONG_S, during=_heat, end=lambda rig: rig.set_temperature(COOL_MC)),
 )

@@ -5,14 +5,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
+from enum import StrEnum
 from pathlib import Path
 
 from terrafix.core.errors import SourceError
+from terrafix.runtime.run_dir import PREFIX, SHM
 from terrafix_tools import child_process
 from terrafix_tools.chaos.camera import StreamedCamera, camera_toml
 from terrafix_tools.chaos.scene import Scene
+from terrafix_tools.chaos.serial_line import SerialLine
+from terrafix_tools.chaos.switches import Switches
 from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
@@ -23,13 +27,31 @@ RESTART_S = 0.1  # RestartSec= of the systemd unit, whose part the rig takes
 START_LIMIT_S = 90.0  # until the camera is opened, on a computer that others use too
 STOP_LIMIT_S = 45.0  # TimeoutStopSec= of the unit
 COOL_MC = 40_000  # of the simulated thermal zone
+SHARED_MB = 128  # shared memory of its own: frames take 18 MB, and descriptors of the map some more
+NONE = Path()
+
+
+class Need(StrEnum):
+    """What a fault needs beside camera, autopilot and map. ROOT: only root can mount it."""
+
+    DISK = "a disk of its own for the record"
+    SHARED_MEMORY = "shared memory of its own"
+    SERIAL = "a serial line to the autopilot"
+    SWITCHES = "the switches of switches.py"
+    MODEL = "the weights of XFeat"
+
+
+ROOT = frozenset({Need.DISK, Need.SHARED_MEMORY})
 
 
 class Rig:
     """One start of Terrafix in a folder. A context manager, which stops all that it has started."""
 
-    def __init__(self, scene: Scene, folder: Path, start_s: float, *, seed: int, config: str = "") -> None:
-        """``start_s``: second of the flight at which it begins; ``config``: further lines for the configuration.
+    def __init__(
+        self, scene: Scene, folder: Path, start_s: float, *, seed: int, needs: Collection[Need] = (), model: Path = NONE
+    ) -> None:
+        """``start_s``: second of the flight at which it begins; ``needs``: what it has beside the usual, with ``model``
+        the weights of XFeat.
 
         ``folder`` is new; the record is in its folder ``out``. Raises OSError."""
         self.scene, self.folder, self.out = scene, folder, folder / "out"
@@ -44,7 +66,12 @@ class Rig:
         self.peer = AutopilotPeer(seed=seed, kind=Kind.COPTER, home_amsl_m=self._home_amsl_m())
         self.stream = FrameStream()
         self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s)
-        self._config = config
+        self.switches = Switches(folder / "switches")
+        self.model_path = folder / "xfeat.onnx"
+        if Need.MODEL in needs:
+            self.model_path.write_bytes(model.read_bytes())
+        self._needs = needs
+        self.line: SerialLine | None = None
         self._died_s: float | None = None
         self._daemon: subprocess.Popen[bytes] | None = None
         self.stop_s: float | None = None  # that the ordered stop took
@@ -53,6 +80,8 @@ class Rig:
     def __enter__(self) -> "Rig":
         port = self.peer.start(0, self._state, self.flight_s)
         self.camera.__enter__()
+        if Need.SERIAL in self._needs:
+            self.line = SerialLine(port).__enter__()
         self._write_config(port)
         self._start()
         return self
@@ -64,6 +93,8 @@ class Rig:
         self.stop()
         self.camera.__exit__()
         self.stream.close()
+        if self.line is not None:
+            self.line.__exit__()
         with suppress(RuntimeError):
             self.peer.stop()
 
@@ -93,11 +124,34 @@ class Rig:
         return next((pid for name, pid in self.processes() if name == process), None)
 
     def processes(self) -> Iterator[tuple[str, int]]:
-        """Name and pid of the children of the supervisor."""
+        """Name and pid of the children of the supervisor, and of the processes that outlived the one before it."""
+        outlived = {int(word) for run in self.run_folders() for word in _first_words(run.glob("*.pid"))}
         for entry in Path("/proc").iterdir():
             with suppress(OSError, ValueError, IndexError):
-                if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == self.supervisor_pid:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+                if parent == self.supervisor_pid or int(entry.name) in outlived:
                     yield (entry / "comm").read_text().strip(), int(entry.name)
+
+    def run_folders(self) -> Iterator[Path]:
+        """The run folder in shared memory; none before the supervisor has made it."""
+        for spec in self.shared_memory.glob(f"{PREFIX}*/spec.json"):
+            with suppress(OSError):
+                if str(self.out) in spec.read_text():
+                    yield spec.parent
+
+    @property
+    def shared_memory(self) -> Path:
+        """Of its own (Need.SHARED_MEMORY) while the supervisor runs, or the one of the computer."""
+        own = Need.SHARED_MEMORY in self._needs and self.supervisor_pid is not None
+        return Path(f"/proc/{self.supervisor_pid}/root{SHM}") if own else SHM
+
+    def kill_all(self) -> None:
+        """Kills the supervisor and all processes, as the out-of-memory killer of a control group does."""
+        pids = [self.supervisor_pid, *(pid for _, pid in self.processes())]
+        for pid in pids:
+            if pid is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
 
     def signal(self, process: str, number: int) -> None:
         """Sends a signal to a process, or to the supervisor by the name "supervisor"."""
@@ -140,8 +194,12 @@ class Rig:
         self.starts += 1
         command = [sys.executable, "-m", "terrafix_tools.sim.sitl.child_process", str(os.getpid()), "run"]
         command += ["--config", str(self.folder / "terrafix.toml"), "--out", str(self.out)]
+        if Need.SHARED_MEMORY in self._needs:
+            mount = f'mount -t tmpfs -o size={SHARED_MB}m tmpfs {SHM} && exec "$@"'
+            command = ["unshare", "--mount", "sh", "-c", mount, "sh", *command]
+        environment = self.switches.environment() if Need.SWITCHES in self._needs else None
         with self.log.open("ab") as log:
-            self._daemon = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            self._daemon = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
 
     def _write_config(self, port: int) -> None:
         first = self._state(self._start_s)
@@ -151,9 +209,10 @@ class Rig:
             f'[map]\npath = "{self.map_path}"\n'
             f'[source]\npath = "{self.stream.url}"\ncamera = "{camera}"\nrate_hz = 20\n'
             f'start = "{first.lat_deg:.6f},{first.lon_deg:.6f}"\n'
-            f'[link]\ndevice = "udpout:127.0.0.1:{port}"\n'
+            f'[link]\ndevice = "{self.line.device if self.line else f"udpout:127.0.0.1:{port}"}"\n'
             f'[health]\nsysfs_root = "{self.folder / "sys"}"\n'
-            f'[recorder]\nframes = "none"\n{self._config}'
+            f'[recorder]\nframes = "none"\n'
+            + (f'[models]\nxfeat = "{self.model_path}"\n' if Need.MODEL in self._needs else "")
         )
 
     def _state(self, t_s: float) -> PeerState:
@@ -162,3 +221,9 @@ class Rig:
     def _home_amsl_m(self) -> float:
         ground = self.scene.course(0.0)
         return ground.amsl_m - ground.agl_m
+
+
+def _first_words(files: Iterable[Path]) -> Iterator[str]:
+    for file in files:
+        with suppress(OSError):
+            yield from file.read_text().split()[:1]

@@ -15,7 +15,7 @@ from terrafix.recorder.reader import read_flight
 from terrafix_tools.chaos import verdict as judge
 from terrafix_tools.chaos.camera import Look
 from terrafix_tools.chaos.faults import DISK_MB, Fault
-from terrafix_tools.chaos.rig import Rig
+from terrafix_tools.chaos.rig import NONE, ROOT, Need, Rig
 from terrafix_tools.chaos.scene import LEAD_S, Phase, Scene
 from terrafix_tools.chaos.verdict import Outcome
 
@@ -24,27 +24,37 @@ STEP_S = 0.01
 STEADY_S = 3.0  # with fixes after the fault; then the cell is over
 RECOVERY_LIMIT_S = 30.0  # wall time; a computer that others use as well needs more than the vehicle's
 FIRST_FIX_LIMIT_S = 20.0  # beyond the planned time of the fault, on a busy computer
-NOT_HERE = "not measurable here: mounting a disk needs root"
+NOT_HERE = "not measurable here"
 
 
-def fly_cell(scene: Scene, fault: Fault, phase: Phase, folder: Path, *, seed: int) -> Outcome:
+def fly_cell(scene: Scene, fault: Fault, phase: Phase, folder: Path, *, seed: int, model: Path = NONE) -> Outcome:
     """Flies one cell in ``folder``, a new one that is removed if all was well. Raises SourceError, OutputError."""
-    if fault.own_disk and os.geteuid() != 0:
-        return Outcome(fault=fault.name, phase=phase, verdict=NOT_HERE)
+    missing = missing_here(fault, model)
+    if missing:
+        return Outcome(fault=fault.name, phase=phase, verdict=f"{NOT_HERE}: {missing}")
     lead_s = 0.5 if phase is Phase.START else LEAD_S
-    rig = Rig(scene, folder, scene.at_s[phase] - lead_s, seed=seed)
+    rig = Rig(scene, folder, scene.at_s[phase] - lead_s, seed=seed, needs=fault.needs, model=model)
     try:
-        if fault.own_disk:
+        if Need.DISK in fault.needs:
             _mount_disk(rig.out)
         with rig:
             outcome = _fly(rig, fault, phase, lead_s)
         outcome = _with_record(rig, fault, phase, outcome)
     finally:
-        if fault.own_disk:
+        if Need.DISK in fault.needs:
             subprocess.run(["umount", "-l", str(rig.out)], check=False, capture_output=True)
     if outcome.verdict == "ok":
         shutil.rmtree(folder, ignore_errors=True)
     return outcome
+
+
+def missing_here(fault: Fault, model: Path) -> str:
+    """What this computer lacks for the fault; empty: nothing."""
+    if fault.needs & ROOT and os.geteuid() != 0:
+        return "mounting needs root"
+    if Need.MODEL in fault.needs and not model.is_file():
+        return "no weights of XFeat, see --model"
+    return ""
 
 
 def _mount_disk(out: Path) -> None:
@@ -133,7 +143,7 @@ def _with_record(rig: Rig, fault: Fault, phase: Phase, outcome: Outcome) -> Outc
 
 
 def _hits_record(fault: Fault) -> bool:
-    return fault.own_disk or fault.name.startswith(("recorder", "supervisor"))
+    return fault.name.startswith(("recorder", "supervisor", "all processes", "disk"))
 
 
 class Results:
@@ -163,14 +173,14 @@ class Results:
 
 
 def fly_matrix(
-    scene: Scene, cells: Iterable[tuple[Fault, Phase]], out: Path, results: Results, *, seed: int
+    scene: Scene, cells: Iterable[tuple[Fault, Phase]], out: Path, results: Results, *, seed: int, model: Path
 ) -> Iterable[Outcome]:
     """Flies the cells that are not among the results, and yields their outcomes."""
     for fault, phase in cells:
         folder = out / f"{fault.name} {phase}".replace(":", "").replace(" ", "-")
         shutil.rmtree(folder, ignore_errors=True)
         try:
-            outcome = fly_cell(scene, fault, phase, folder, seed=seed)
+            outcome = fly_cell(scene, fault, phase, folder, seed=seed, model=model)
         except SourceError as error:
             outcome = Outcome(fault=fault.name, phase=phase, verdict=str(error).rpartition(": ")[2])
         results.add(outcome)

@@ -1,5 +1,7 @@
 """Live camera: V4L2 device, GStreamer pipeline, or MJPEG over HTTP. Reconnects after a loss and does not end."""
 
+import contextlib
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -60,10 +62,11 @@ class LiveCamera:
         self._description = read_description(camera)
         self._origin = origin_of(self._description, camera_of(camera, self._description), start)
         self._period_ns = round(1e9 / rate_hz)
-        self._open = open_capture or _open_capture
+        self._open = open_capture or self._open_capture
         self._reconnect_s = reconnect_s
         self._closed = threading.Event()
         self._streaming = False
+        self._socket: socket.socket | None = None  # of a stream
         self._capture = self._try_open() if wait else self._open(self.spec, self._origin.camera)
         if self._capture is not None:
             self._check_size(self._capture)
@@ -83,8 +86,12 @@ class LiveCamera:
         return None
 
     def close(self) -> None:
-        """Ends ``shots``, from any thread; the thread that runs ``shots`` releases the device."""
+        """Ends ``shots``, from any thread; the thread that runs ``shots`` releases the device.
+
+        It does not wait for a stream that is connected and sends nothing."""
         self._closed.set()
+        if self._socket is not None:
+            _shut_down(self._socket)
         if not self._streaming:
             self._disconnect()
 
@@ -137,6 +144,14 @@ class LiveCamera:
             logs.get().debug("camera not available yet", source=self.spec, why=str(error))
             return None
 
+    def _open_capture(self, spec: str, camera: Camera) -> Capture | None:
+        return MjpegCapture(spec, self._connected) if is_stream_url(spec) else _open_device(spec, camera)
+
+    def _connected(self, connection: socket.socket) -> None:
+        self._socket = connection
+        if self._closed.is_set():
+            _shut_down(connection)
+
     def _disconnect(self) -> None:
         if self._capture is not None:
             self._capture.release()
@@ -168,9 +183,12 @@ def _timestamp_ns(capture: Capture, arrival_ns: int) -> int:
     return driver_ns if 0 <= arrival_ns - driver_ns <= MAX_DRIVER_AGE_NS else arrival_ns
 
 
-def _open_capture(spec: str, camera: Camera) -> Capture | None:
-    if is_stream_url(spec):
-        return MjpegCapture(spec)
+def _shut_down(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # the camera has closed it
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+def _open_device(spec: str, camera: Camera) -> Capture | None:
     if "!" in spec:
         if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
             raise SourceError(

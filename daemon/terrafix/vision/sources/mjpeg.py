@@ -4,7 +4,9 @@ The header ``X-Timestamp-Ns`` of a part may carry the exposure time on CLOCK_MON
 time of arrival is used."""
 
 import http.client
+import socket
 import urllib.parse
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -25,8 +27,9 @@ STAMP_HEADER = "x-timestamp-ns"
 class MjpegCapture:
     """An open stream with the cv2.VideoCapture methods that ``LiveCamera`` uses."""
 
-    def __init__(self, url: str) -> None:
-        """Raises SourceError: no connection, or the response is not an MJPEG stream."""
+    def __init__(self, url: str, on_connect: Callable[[socket.socket], None] = lambda _socket: None) -> None:
+        """``on_connect``: is given the socket before the camera has answered; another thread that shuts it down ends a
+        wait for the camera. Raises SourceError: no connection, or the response is not an MJPEG stream."""
         self.stamp_ns: int | None = None  # timestamp of the grabbed image on the monotonic clock; None: it has none
         self._jpeg = b""
         self._at_part = False  # the boundary before the next part is already read
@@ -34,6 +37,8 @@ class MjpegCapture:
         connection_type = http.client.HTTPSConnection if address.scheme == "https" else http.client.HTTPConnection
         try:
             self._connection = connection_type(address.hostname or "", address.port, timeout=TIMEOUT_S)
+            self._connection.connect()
+            on_connect(self._connection.sock)
             self._connection.request("GET", address._replace(scheme="", netloc="").geturl() or "/")
             self._response = self._connection.getresponse()
         except (OSError, ValueError, http.client.HTTPException) as error:

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from terrafix.core.errors import LinkError, OutputError
 from terrafix.vision.sources.description import CameraTable, Description, MountTable, StartTable, TelemetryTable
+from terrafix_tools import child_process
 from terrafix_tools.sim.flights.description import write_toml
 from terrafix_tools.sim.flights.folder import AGL_SIGMA_M, ATTITUDE_SIGMA_DEG, CAMERA, YAW_SIGMA_DEG
 from terrafix_tools.sim.sitl.firmware import Firmware
@@ -75,10 +76,9 @@ class Daemon:
             )
 
     def kill(self) -> None:
-        """Kills it without notice; its child processes end with the supervisor."""
+        """Kills all of its processes without notice."""
         if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+            child_process.kill_tree(self._process)
             self._process = None
 
     def check(self) -> None:
