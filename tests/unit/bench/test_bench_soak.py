@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafix_tools.bench.soak import Samples, ShuttleScene, grows, growth, slope_per_h
+from terrafix_tools.bench.soak import TURN_S, Samples, ShuttleScene, grows, growth, slope_per_h
 from terrafix_tools.chaos.scene import Phase, Scene
 from terrafix_tools.sim.autopilot.course import PeerState
 
@@ -27,12 +27,23 @@ def scene(tmp_path: Path) -> Scene:
 def test_the_shuttle_flies_back_the_way_it_came_with_the_images_of_the_place(tmp_path: Path) -> None:
     shuttle = ShuttleScene(scene(tmp_path))
     leg_s = shuttle._to_s - shuttle._from_s
-    assert leg_s == pytest.approx(41.5, abs=1.0), "both turning points are hovering"
-    there, back = shuttle.state(10.0), shuttle.state(2 * leg_s - 10.0)
-    assert (there.lon_deg, there.ve_mps) == (back.lon_deg, -back.ve_mps) and there.ve_mps == 10.0
-    assert shuttle.state(leg_s).ve_mps == shuttle.state(0.0).ve_mps == 0.0
+    assert leg_s == 39.0, "from the first to the last half second in motion"
+    period_s = 2.0 * (leg_s + TURN_S)
+    there, back = shuttle.state(10.0), shuttle.state(period_s - TURN_S - 10.0)
+    assert there.lon_deg == pytest.approx(back.lon_deg, abs=1e-9) and (there.ve_mps, back.ve_mps) == (10.0, -10.0)
     endless = shuttle.unfolded()
-    assert endless.jpeg(10.0) == endless.jpeg(2 * leg_s - 10.0) == endless.jpeg(2 * leg_s + 10.0) != endless.jpeg(20.0)
+    assert endless.jpeg(10.0) == endless.jpeg(period_s - TURN_S - 10.0) == endless.jpeg(period_s + 10.0)
+    assert endless.jpeg(10.0) != endless.jpeg(20.0)
+
+
+def test_position_and_velocity_of_the_shuttle_have_no_jump_where_it_turns_round(tmp_path: Path) -> None:
+    shuttle = ShuttleScene(scene(tmp_path))
+    times_s = np.arange(0.0, 4.0 * (shuttle._to_s - shuttle._from_s + TURN_S), 0.01)
+    folded = np.array([shuttle.folded(t_s) for t_s in times_s.tolist()])
+    assert np.abs(np.diff(folded[:, 0])).max() <= 0.01 + 1e-9
+    assert np.abs(np.diff(folded[:, 1])).max() < 1.01 * np.pi / TURN_S * 0.01
+    assert np.gradient(folded[:, 0], 0.01) == pytest.approx(folded[:, 1], abs=0.01), "the rate is that of the second"
+    assert (folded[:, 1].min(), folded[:, 1].max()) == (-1.0, 1.0)
 
 
 def samples(mb_per_h: float, *, files: int = 0, away: bool = False) -> Samples:

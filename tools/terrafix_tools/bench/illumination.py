@@ -4,7 +4,7 @@ python -m terrafix_tools.bench.illumination OUT [--flights N] [--seconds S]
 
 Generated flights, by copter and plane at 100 and 150 m, are flown and replayed in OUT, a new folder. With the true pose
 of the camera each matched pixel is projected onto the ground; the table has the mean over a frame of matched point less
-true ground, as root mean square over the frames (the mean of both axes is ILLUMINATION_SIGMA_M of
+true ground, as root mean square over the frames (the larger one is ILLUMINATION_SIGMA_M of
 terrafix/core/map_error.py)."""
 
 from pathlib import Path

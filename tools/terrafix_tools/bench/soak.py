@@ -32,20 +32,19 @@ from terrafix_tools.standalone import run_standalone
 SAMPLE_S = 10.0
 SETTLING_SHARE = 0.25  # of the time, before which growth is not judged
 MOST_GROWTH_PER_H = 0.01  # of memory
-MARGIN_S = 4.0  # before the end of the legs, where the vehicle hovers
+TURN_S = 4.0  # in which the time of the flight turns round; whole periods of the camera
 GROWN = 1  # exit code
 MB = 1 << 20
 
 
 class ShuttleScene:
-    """The legs of a scene forth and back. Motion that runs backwards in time has the same accelerations, so attitude
-    and specific force stay true; only velocities change their sign."""
+    """The legs of a scene forth and back. At both ends the time of the flight slows down, stops and runs backwards:
+    attitude and specific force stay nearly true, velocities have its rate as a factor."""
 
     def __init__(self, scene: Scene) -> None:
         speeds = [(t_s, _speed(scene.course(t_s))) for t_s in np.arange(0.0, scene.at_s[Phase.LANDING], 0.5).tolist()]
-        first_s = next(t_s for t_s, mps in speeds if mps > 1.0)
-        last_s = next(t_s for t_s, mps in reversed(speeds) if mps > 1.0)
-        self._from_s, self._to_s = first_s - 1.0, last_s + 1.0
+        self._from_s = next(t_s for t_s, mps in speeds if mps > 1.0)
+        self._to_s = next(t_s for t_s, mps in reversed(speeds) if mps > 1.0)
         self._scene = scene
 
     def unfolded(self) -> Scene:
@@ -60,17 +59,23 @@ class ShuttleScene:
         )
 
     def folded(self, t_s: float) -> tuple[float, float]:
-        """-> second of the flight, and the direction of time: 1 or -1."""
+        """-> second of the flight, and its rate, -1 to 1. A leg begins and ends at a time of an image, so that the
+        vehicle is where the images show it."""
         leg_s = self._to_s - self._from_s
-        into_s = t_s % (2.0 * leg_s)
-        return (self._from_s + into_s, 1.0) if into_s < leg_s else (self._to_s - (into_s - leg_s), -1.0)
+        into_s = t_s % (2.0 * (leg_s + TURN_S))
+        backwards = into_s >= leg_s + TURN_S
+        into_s -= (leg_s + TURN_S) * backwards
+        begin_s, sign = (self._to_s, -1.0) if backwards else (self._from_s, 1.0)
+        if into_s < leg_s:
+            return begin_s + sign * into_s, sign
+        phase = math.pi * (into_s - leg_s) / TURN_S
+        end_s = begin_s + sign * leg_s
+        return end_s + sign * TURN_S / math.pi * math.sin(phase), sign * math.cos(phase)
 
     def state(self, t_s: float) -> PeerState:
-        at_s, direction = self.folded(t_s)
+        at_s, rate = self.folded(t_s)
         state = self._scene.course(at_s)
-        return replace(
-            state, vn_mps=direction * state.vn_mps, ve_mps=direction * state.ve_mps, vd_mps=direction * state.vd_mps
-        )
+        return replace(state, vn_mps=rate * state.vn_mps, ve_mps=rate * state.ve_mps, vd_mps=rate * state.vd_mps)
 
 
 @dataclass(frozen=True)
