@@ -1,5 +1,5 @@
 """Our processes use one BLAS thread each, because their matrices are small and they share the cores; what forks has one
-thread.
+thread."""
 
 import os
 import subprocess
