@@ -13,7 +13,7 @@ from terrafix.estimator.keyframe_view import KeyframeView
 MAX_KEYFRAMES = 20_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class KeptKeyframe:
     """``view`` of a keyframe, and its ``fragment``, which may be joined to the flight later."""
 

@@ -8,7 +8,7 @@ import numpy as np
 from terrafix.estimator.state import UP
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class KeyframeView:
     """A keyframe above the ground: ``pose`` with covariance ``cov`` (6, 6), tangent order; ``ground_m``: AMSL elevation
     below it."""

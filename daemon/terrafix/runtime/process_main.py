@@ -5,11 +5,13 @@ type, a bug gives a traceback; the supervisor decides on a restart."""
 
 import faulthandler
 import gc
+import importlib
 import os
 import signal
 import socket
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -29,16 +31,27 @@ from terrafix.runtime.run_spec import Spec, is_camera, table_of
 from terrafix.runtime.stop_signal import StopSignal
 
 REQUEST_BYTES = 8192  # a name and a path
+# Libraries of several processes, which start no threads when they are imported. Imported once, before the fork, they
+# take 60 MB instead of 100 in all processes together. [measured: docs/decisions/028-fork-server.md]
+SHARED_LIBRARIES = ("cv2", "gtsam")
 REPARENT_POLL_S = 0.0002  # interval of checks whether the supervisor has become the parent
 
 
 def main(arguments: list[str]) -> int:
     descriptor, supervisor_pid = int(arguments[0]), int(arguments[1])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the supervisor, which stops all in order
+    import_shared_libraries()
     gc.freeze()  # the collections of a forked process then do not write into pages that it shares with the others
     with socket.socket(fileno=descriptor) as requests:
         forked_as = serve(requests, supervisor_pid)
     return 0 if forked_as is None else run(*forked_as, supervisor_pid)
+
+
+def import_shared_libraries() -> None:
+    """One that cannot be imported ends only the processes that need it, when these import it."""
+    for library in SHARED_LIBRARIES:
+        with suppress(ImportError):
+            importlib.import_module(library)
 
 
 def serve(requests: socket.socket, supervisor_pid: int) -> tuple[str, RunDir] | None:

@@ -28,7 +28,7 @@ from terrafix.messages import (
     RefinementSource,
     Vec3,
 )
-from terrafix.smoother.keyframe_graph import Anchor, FrameNode, Join, KeyframeGraph
+from terrafix.smoother.keyframe_graph import NO_AMBIGUITY_M2, Anchor, FrameNode, Join, KeyframeGraph
 from terrafix.smoother.solution import Placed, followers, predict, solve
 
 PERIOD_NS = 1_000_000_000  # from one Refinement to the next, at least [spec: once a second]
@@ -49,7 +49,7 @@ class SmootherNode:
         self._axes: LocalFrame | None = None
         self._waiting: list[Message] = []  # for the Origin, which comes from another process
         self._solved: dict[int, Placed] = {}
-        self._published: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # frame -> position (2,), covariance (2, 2)
+        self._published: dict[int, np.ndarray] = {}  # frame -> (2, 3): position, and the columns of its covariance
         self._changed = False  # there is a constraint that the solution does not have ...
         self._shift2 = 0.0  # ... and these move what was published by so much, in squared 1-sigma
         self._solved_ns: int | None = None  # time of the solution
@@ -129,7 +129,7 @@ class SmootherNode:
                 link.parent_id,
                 link.scale_sigma,
                 walk**2 * max(link.frame_id - link.parent_id, 1),
-                np.array(link.ambiguity_m2).reshape(2, 2),
+                np.array(link.ambiguity_m2).reshape(2, 2) if any(link.ambiguity_m2) else NO_AMBIGUITY_M2,
             )
         )
         if added:
@@ -161,7 +161,7 @@ class SmootherNode:
         """Poses that have moved since they were published: of keyframes first, the newest first, then of the frames
         that follow those."""
         self._behind, count = True, 0
-        if len(self._published) > 2 * len(self._graph.frames):
+        if len(self._published) > len(self._graph.frames) + MAX_POSES:
             self._published = {frame: was for frame, was in self._published.items() if frame in self._graph.frames}
         for frame_id, placed in chain(self._placed_keyframes(), self._followers()):
             p_m, cov = self._with_common_errors(self._graph.frames[frame_id], placed)
@@ -170,7 +170,7 @@ class SmootherNode:
             if count == MAX_POSES:
                 return
             count += 1
-            self._published[frame_id] = p_m, cov
+            self._published[frame_id] = np.column_stack([p_m, cov])
             if frame_id in self._solved:
                 self._moved_keyframes |= {frame_id, self._graph.frames[frame_id].parent or frame_id}
             yield self._refined(frame_id, placed, p_m, cov)
@@ -198,7 +198,8 @@ class SmootherNode:
     def _has_moved(self, frame_id: int, p_m: np.ndarray, cov: np.ndarray) -> bool:
         if frame_id not in self._published:
             return True
-        was_m, was_cov = self._published[frame_id]
+        was = self._published[frame_id]
+        was_m, was_cov = was[:, 0], was[:, 1:]
         moved, sigma = p_m - was_m, np.sqrt(np.diag(cov))
         was_sigma = np.sqrt(np.diag(was_cov))
         distance2 = float(moved @ np.linalg.solve(cov, moved))

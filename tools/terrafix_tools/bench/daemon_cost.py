@@ -25,6 +25,7 @@ from terrafix_tools.standalone import run_standalone
 
 READY_LIMIT_S, STOP_LIMIT_S = 120.0, 30.0
 SAMPLE_S = 1.0
+RING_NAME = "frames"  # of the ring of frames in the run folder (runtime/run_dir.py)
 IMPORT_ROUNDS = 3  # the least of them counts
 IMPORT = """
 import time
@@ -73,8 +74,25 @@ def pss_mb(pids: list[int]) -> dict[str, float]:
     return sizes
 
 
-def measure(flight: Path, package: Path, work: Path, seconds: float) -> dict[str, Any]:
-    """-> seconds from the command to READY=1 (sd_notify), and the memory after that. Raises EvaluationError."""
+def shared_files_mb(pids: list[int]) -> float:
+    """-> files of the run folder in shared memory that no process has mapped: descriptors of the map for an anchor that
+    is restarted, checkpoints."""
+    for pid in pids:
+        try:
+            lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+        except OSError:
+            continue
+        for line in lines:
+            if line.endswith("/" + RING_NAME):
+                ring = Path(line.split(maxsplit=5)[5])
+                files = [file for file in ring.parent.rglob("*") if file.is_file() and file != ring]
+                return round(sum(file.stat().st_blocks for file in files) * 512 / 2**20, 1)
+    return 0.0
+
+
+def measure(flight: Path, package: Path, work: Path, seconds: float, configs: list[Path]) -> dict[str, Any]:
+    """-> seconds from the command to READY=1 (sd_notify), and the memory after that. ``configs``: as `terrafix run`
+    takes them. Raises EvaluationError."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, (work / "log").open("w+") as log:
         notify.bind(str(work / "notify"))
         command = [
@@ -86,6 +104,7 @@ def measure(flight: Path, package: Path, work: Path, seconds: float) -> dict[str
             str(flight),
             "--map",
             str(package),
+            *(word for config in configs for word in ("--config", str(config))),
         ]
         began_s = time.monotonic()
         daemon = subprocess.Popen(
@@ -99,11 +118,13 @@ def measure(flight: Path, package: Path, work: Path, seconds: float) -> dict[str
             if ready_s is None:
                 log.seek(0)
                 raise ERROR_OF_EXIT_CODE.get(daemon.poll() or 0, EvaluationError)(f"not ready: {log.read()[-500:]}")
-            samples = []
+            samples, files_mb = [], 0.0
             end_s = time.monotonic() + seconds
             while time.monotonic() < end_s and daemon.poll() is None:
                 time.sleep(SAMPLE_S)
-                samples.append(pss_mb(family(daemon.pid)))
+                pids = family(daemon.pid)
+                samples.append(pss_mb(pids))
+                files_mb = max(files_mb, shared_files_mb(pids))
         finally:
             daemon.terminate()
             daemon.wait(STOP_LIMIT_S)
@@ -111,6 +132,7 @@ def measure(flight: Path, package: Path, work: Path, seconds: float) -> dict[str
     return {
         "ready_s": round(ready_s, 2),
         "pss_mb": samples[-1],
+        "shared_files_mb": files_mb,
         "pss_sum_mb": {"median": round(sums[len(sums) // 2], 1), "max": round(sums[-1], 1)},
     }
 
@@ -135,6 +157,7 @@ def show(result: dict[str, Any], console: Console) -> None:
         table.add_row(name, "-" if import_time is None else f"{import_time:.2f}", f"{size_mb:.1f}")
     sums = result["pss_sum_mb"]
     table.add_row("all: median / most", "", f"{sums['median']:.0f} / {sums['max']:.0f}")
+    table.add_row("files in shared memory, most", "", f"{result['shared_files_mb']:.0f}")
     console.print(table)
     console.print(f"ready {result['ready_s']:.1f} s after the command (by the clock; load {os.getloadavg()[0]:.1f})")
 
@@ -143,13 +166,14 @@ def bench(
     flight: Annotated[Path, typer.Argument(help="Flight folder.")],
     package: Annotated[Path, typer.Argument(help="Its map package (.gpkg).")],
     seconds: Annotated[float, typer.Option(help="How long to fly.")] = 60.0,
+    config: Annotated[list[Path] | None, typer.Option(help="TOML file for `terrafix run`; several times.")] = None,
     out: Annotated[Path | None, typer.Option(help="JSON file of the results.")] = None,
 ) -> None:
     """Start to ready, time of the imports and memory of each process of the daemon."""
     if seconds < SAMPLE_S:
         raise UsageError(f"--seconds {seconds:g}: give {SAMPLE_S:g} or more")
     with tempfile.TemporaryDirectory(prefix="terrafix-daemon-") as work:
-        result = measure(flight, package, Path(work), seconds)
+        result = measure(flight, package, Path(work), seconds, config or [])
     result["import_s"] = {process.name: import_s(process.module) for process in PROCESSES}
     write_result(out, result)
     show(result, Console(width=100))

@@ -14,7 +14,9 @@ import numpy as np
 
 from terrafix.runtime.checkpoint import CheckpointFile
 
-MAX_TILES = 96  # Tiles of all layers together, 1 MB each. A flight around one place uses about 20. [tuned]
+# Tiles of all layers together, 1.1 MB each: more than the matcher keeps for itself (CACHE_BYTES), which are those that
+# a process started in its place needs. A flight around one place uses about 20. [tuned]
+MAX_TILES = 48
 
 
 class _StoredTile(msgspec.Struct, frozen=True):
