@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import msgspec
@@ -130,7 +131,9 @@ def _wait(rig: Rig, until_s: float, act: Callable[[], None] = lambda: None) -> N
 
 def _with_record(rig: Rig, fault: Fault, phase: Phase, outcome: Outcome) -> Outcome:
     """Completes an outcome after the stop."""
-    recorded_s = [m.t_ns / 1e9 for _, _, m in read_flight(rig.out) if isinstance(m, GpsInput)]
+    recorded_s: list[float] = []
+    with suppress(SourceError) if _hits_record(fault) else nullcontext():  # it may lie on a disk that is gone
+        recorded_s = [m.t_ns / 1e9 for _, _, m in read_flight(rig.out) if isinstance(m, GpsInput)]
     outcome = msgspec.structs.replace(
         outcome,
         not_recorded_s=judge.not_recorded_s(rig.peer.received_s, recorded_s),
