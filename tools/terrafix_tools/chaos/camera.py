@@ -41,14 +41,20 @@ SHIFT_NS = {Look.AHEAD: 5 * NS, Look.LATE: -3 * NS}
 class StreamedCamera:
     """A context manager. ``look`` may be changed at any time."""
 
-    def __init__(self, stream: FrameStream, image_at: Callable[[float], bytes], flight_s: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        stream: FrameStream,
+        image_at: Callable[[float], bytes],
+        flight_s: Callable[[], float],
+        frame_hz: float = FRAME_HZ,
+    ) -> None:
         """``image_at``: JPEG by the time of the flight; ``flight_s``: that time now.
 
-        Images exist at multiples of 1 / FRAME_HZ: each is sent at its own time, and stamped with it."""
+        Images exist at multiples of 1 / ``frame_hz``: each is sent at its own time, and stamped with it."""
         self.look = Look.GOOD
         self.pushed = 0
         self._stream, self._image_at, self._flight_s = stream, image_at, flight_s
-        self._frozen = b""
+        self._frozen, self._frame_hz = b"", frame_hz
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="chaos-camera", daemon=True)
 
@@ -64,7 +70,7 @@ class StreamedCamera:
         wait_s = 0.0
         while not self._stopping.wait(wait_s):
             look, now_ns, flight_s = self.look, time.monotonic_ns(), self._flight_s()
-            late_s = flight_s - math.floor(flight_s * FRAME_HZ + SLACK) / FRAME_HZ
+            late_s = flight_s - math.floor(flight_s * self._frame_hz + SLACK) / self._frame_hz
             good = self._image_at(flight_s - late_s)
             self._frozen = good if look is not Look.FROZEN else self._frozen
             if look is not Look.NOTHING:
@@ -72,7 +78,7 @@ class StreamedCamera:
                 self._stream.push_jpeg(self._frozen if look is Look.FROZEN else altered(good, look), stamp_ns)
                 self.pushed += 1
             spent_s = (time.monotonic_ns() - now_ns) / 1e9
-            period_s = 1.0 / FRAME_HZ / (10.0 if look is Look.TEN_TIMES else 1.0)
+            period_s = 1.0 / self._frame_hz / (10.0 if look is Look.TEN_TIMES else 1.0)
             wait_s = max(0.0, period_s - spent_s - (late_s if look is not Look.TEN_TIMES else 0.0))
 
 
@@ -95,10 +101,12 @@ def altered(jpeg: bytes, look: Look) -> bytes:
     return cv2.imencode(".jpg", image)[1].tobytes()
 
 
-def camera_toml(camera: Camera) -> str:
+def camera_toml(camera: Camera, attitude_sigma_deg: float | None = None) -> str:
     """The description of the camera for `terrafix run`."""
+    telemetry = "" if attitude_sigma_deg is None else f"[telemetry]\nattitude_sigma_deg = {attitude_sigma_deg}\n"
     return (
         f'name = "chaos"\n[camera]\nwidth = {camera.width}\nheight = {camera.height}\n'
         f"fx = {camera.fx}\nfy = {camera.fy}\ncx = {camera.cx}\ncy = {camera.cy}\nfocal_sigma = {camera.focal_sigma}\n"
-        f"[mount]\ntolerance_deg = {camera.mount_tolerance_deg}\n"
+        f"distortion = {list(camera.distortion)}\n"
+        f"[mount]\ntolerance_deg = {camera.mount_tolerance_deg}\n{telemetry}"
     )

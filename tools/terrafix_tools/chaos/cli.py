@@ -18,6 +18,10 @@ def chaos(
         list[str] | None, typer.Option(help="Beginning of a fault's name; may be given several times.")
     ] = None,
     phase: Annotated[list[str] | None, typer.Option(help="Phase of the flight; may be given several times.")] = None,
+    flight: Annotated[
+        Path | None, typer.Option(help="Recorded flight folder with truth.csv, whose images and course are flown.")
+    ] = None,
+    map_path: Annotated[Path | None, typer.Option("--map", help="Its map; default: the one that it names.")] = None,
     again: Annotated[bool, typer.Option("--again", help="Also fly cells that have a result.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the place and of the noise.")] = 1,
     model: Annotated[
@@ -31,12 +35,13 @@ def chaos(
     Results are kept in OUT/results.json; a matrix that was interrupted goes on. Exit code 1: a promise is broken, or a
     cell had no fix before its fault."""
     from terrafix_tools.chaos.faults import FAULTS
+    from terrafix_tools.chaos.recorded_scene import recorded_scene
     from terrafix_tools.chaos.run import Results, fly_matrix
     from terrafix_tools.chaos.scene import Phase, scene_in
     from terrafix_tools.chaos.table import line, write_table
 
     faults = [f for f in FAULTS if not fault or any(f.name.startswith(name) for name in fault)]
-    phases = [p for p in Phase if not phase or p.value in phase]
+    phases = [p for p in Phase if (not phase or p.value in phase) and not (flight and p is Phase.LANDING)]
     if not faults or not phases:
         raise UsageError("no such fault or phase; 'terrafix chaos --list' names them")
     if list_only:
@@ -47,12 +52,12 @@ def chaos(
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
     results = Results(out / "results.json")
-    scene = scene_in(out / f"flight-{seed}", seed)
+    scene = scene_in(out / f"flight-{seed}", seed) if flight is None else recorded_scene(flight, map_path, out)
     cells = [(f, p) for p in phases for f in faults if again or not results.has(f, p)]
     for outcome in fly_matrix(scene, cells, out, results, seed=seed, model=model or _fetched_model()):
         typer.echo(line(outcome))
     if page is not None:
-        write_table(page, results.outcomes)
+        write_table(page, results.outcomes, "chaos" if flight is None else f"chaos {flight.name}")
     if any(o.verdict != "ok" and "not measurable" not in o.verdict for o in results.outcomes):
         raise typer.Exit(BROKEN)
 

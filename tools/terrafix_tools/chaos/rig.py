@@ -21,7 +21,6 @@ from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 from terrafix_tools.sim.camera.stream import FrameStream
-from terrafix_tools.sim.flights.folder import CAMERA
 
 RESTART_S = 0.1  # RestartSec= of the systemd unit, whose part the rig takes
 START_LIMIT_S = 90.0  # until the camera is opened, on a computer that others use too
@@ -65,7 +64,7 @@ class Rig:
         self.set_temperature(COOL_MC)
         self.peer = AutopilotPeer(seed=seed, kind=Kind.COPTER, home_amsl_m=self._home_amsl_m())
         self.stream = FrameStream()
-        self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s)
+        self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s, scene.frame_hz)
         self.switches = Switches(folder / "switches")
         self.model_path = folder / "xfeat.onnx"
         if Need.MODEL in needs:
@@ -204,7 +203,7 @@ class Rig:
     def _write_config(self, port: int) -> None:
         first = self._state(self._start_s)
         camera = self.folder / "camera.toml"
-        camera.write_text(camera_toml(CAMERA))
+        camera.write_text(camera_toml(self.scene.camera, self.scene.attitude_sigma_deg))
         (self.folder / "terrafix.toml").write_text(
             f'[map]\npath = "{self.map_path}"\n'
             f'[source]\npath = "{self.stream.url}"\ncamera = "{camera}"\nrate_hz = 20\n'

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import msgspec
@@ -92,8 +93,8 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
         phase=phase,
         verdict="" if had_fix else judge.NO_FIX,
         fixes=len(fixes),
-        wrong=len(judge.wrong_fixes(fixes)),
-        worst_sigmas=max((judge.sigmas(fix) for fix in fixes), default=None),
+        wrong=len(judge.wrong_fixes(fixes, rig.scene.truth_sigma_m)),
+        worst_sigmas=max((judge.sigmas(fix, rig.scene.truth_sigma_m) for fix in fixes), default=None),
         worst_error_m=max((fix.error_m for fix in fixes), default=None),
         silence_s=judge.silence_s(rig.peer.received_s, fault_s, end_s),
         without_fix_s=judge.without_fix_s(times, fault_s, end_s),
@@ -130,7 +131,9 @@ def _wait(rig: Rig, until_s: float, act: Callable[[], None] = lambda: None) -> N
 
 def _with_record(rig: Rig, fault: Fault, phase: Phase, outcome: Outcome) -> Outcome:
     """Completes an outcome after the stop."""
-    recorded_s = [m.t_ns / 1e9 for _, _, m in read_flight(rig.out) if isinstance(m, GpsInput)]
+    recorded_s: list[float] = []
+    with suppress(SourceError) if _hits_record(fault) else nullcontext():  # it may lie on a disk that is gone
+        recorded_s = [m.t_ns / 1e9 for _, _, m in read_flight(rig.out) if isinstance(m, GpsInput)]
     outcome = msgspec.structs.replace(
         outcome,
         not_recorded_s=judge.not_recorded_s(rig.peer.received_s, recorded_s),

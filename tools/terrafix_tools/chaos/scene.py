@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.errors import SourceError
+from terrafix.messages import Camera
 from terrafix_tools.mission.file import write_mission
 from terrafix_tools.mission.items import Do, Item, Mission
 from terrafix_tools.sim.autopilot.course import Course, PeerState, read_course, write_course
 from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.flights.folder import FRAME_HZ, Flight
+from terrafix_tools.sim.flights.folder import CAMERA, FRAME_HZ, Flight
 from terrafix_tools.sim.flights.make import MAP_NAME, FlightOptions, make
 from terrafix_tools.sim.world import place as world
 
@@ -36,17 +37,22 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class Scene:
-    """``at_s``: seconds of the flight at which the fault of each phase begins."""
+    """``at_s``: seconds of the flight at which the fault of each phase begins. ``truth_sigma_m``: of the course.
+    ``attitude_sigma_deg``: of roll and pitch that are reported; None: the default."""
 
     map_path: Path
     jpegs: list[Path]
     course: Course
     at_s: dict[Phase, float]
     duration_s: float
+    camera: Camera = CAMERA
+    frame_hz: float = FRAME_HZ
+    truth_sigma_m: float = 0.0
+    attitude_sigma_deg: float | None = None
 
     def jpeg(self, t_s: float) -> bytes:
         """The image whose exposure is nearest to a time of the flight."""
-        index = min(max(0, round(t_s * FRAME_HZ)), len(self.jpegs) - 1)
+        index = min(max(0, round(t_s * self.frame_hz)), len(self.jpegs) - 1)
         return self.jpegs[index].read_bytes()
 
 
@@ -106,7 +112,7 @@ def phases(course: Course, duration_s: float) -> dict[Phase, float]:
     high = agl_m > CRUISE_SHARE * agl_m.max()
     landing_s = float(times[np.flatnonzero(high)[-1]])
     usable = high & (times >= times[np.flatnonzero(high)[0]] + LEAD_S) & (times < landing_s - LEAD_S)
-    cruise_s = _middle_of_longest(times, usable & (turn_radps < STRAIGHT_RADPS))
+    cruise_s = middle_of_longest(times, usable & (turn_radps < STRAIGHT_RADPS))
     turn_s = float(times[np.argmax(np.where(usable, turn_radps, -1.0))])
     return {
         Phase.START: cruise_s,
@@ -117,7 +123,8 @@ def phases(course: Course, duration_s: float) -> dict[Phase, float]:
     }
 
 
-def _middle_of_longest(times: np.ndarray, chosen: np.ndarray) -> float:
+def middle_of_longest(times: np.ndarray, chosen: np.ndarray) -> float:
+    """The time in the middle of the longest run of ``chosen`` (bool, as long as ``times``)."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], chosen.astype(np.int8), [0]))))
     runs = edges.reshape(-1, 2)
     first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]

@@ -9,8 +9,6 @@ from terrafix_tools.chaos.faults import FAULTS
 from terrafix_tools.chaos.scene import Phase
 from terrafix_tools.chaos.verdict import NO_FIX, Outcome
 
-MARKS = re.compile(r"(<!-- table: chaos -->).*?(<!-- end -->)", re.S)
-
 
 def line(outcome: Outcome) -> str:
     """One line for the terminal."""
@@ -49,14 +47,16 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(rows)
 
 
-def write_table(page: Path, outcomes: Sequence[Outcome]) -> None:
-    """Replaces the table between the marks of a page. Raises SourceError, OutputError."""
+def write_table(page: Path, outcomes: Sequence[Outcome], name: str = "chaos") -> None:
+    """Replaces the table between the marks of a page: ``<!-- table: NAME -->`` and ``<!-- end -->``. Raises
+    SourceError, OutputError."""
+    marks = re.compile(rf"(<!-- table: {re.escape(name)} -->).*?(<!-- end -->)", re.S)
     try:
-        text, count = MARKS.subn(lambda m: f"{m[1]}\n{table(outcomes)}\n{m[2]}", page.read_text(encoding="utf-8"))
+        text, count = marks.subn(lambda m: f"{m[1]}\n{table(outcomes)}\n{m[2]}", page.read_text(encoding="utf-8"))
     except OSError as error:
         raise SourceError(f"{page}: cannot be read ({error.strerror})") from None
     if count != 1:
-        raise SourceError(f"{page}: has no marks '<!-- table: chaos -->' and '<!-- end -->' for the table")
+        raise SourceError(f"{page}: has no marks '<!-- table: {name} -->' and '<!-- end -->' for the table")
     try:
         page.write_text(text, encoding="utf-8")
     except OSError as error:

@@ -1,6 +1,7 @@
 """What a fault did: GPS_INPUT against the truth, time to recover, what the record lacks."""
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import msgspec
@@ -77,12 +78,13 @@ def not_recorded_s(received_s: Sequence[float], recorded_s: Sequence[float]) -> 
     return longest
 
 
-def wrong_fixes(fixes: Sequence[ReceivedFix]) -> list[ReceivedFix]:
-    return [fix for fix in fixes if sigmas(fix) > WRONG_SIGMAS]
+def wrong_fixes(fixes: Sequence[ReceivedFix], truth_sigma_m: float = 0.0) -> list[ReceivedFix]:
+    """``truth_sigma_m``: of the position that they are compared with."""
+    return [fix for fix in fixes if sigmas(fix, truth_sigma_m) > WRONG_SIGMAS]
 
 
-def sigmas(fix: ReceivedFix) -> float:
-    return fix.error_m / fix.horizontal_m if fix.horizontal_m else float("inf")
+def sigmas(fix: ReceivedFix, truth_sigma_m: float = 0.0) -> float:
+    return fix.error_m / math.hypot(fix.horizontal_m, truth_sigma_m) if fix.horizontal_m else float("inf")
 
 
 def text_of(outcome: Outcome, *, fix_expected: bool, record_expected: bool) -> str:
