@@ -34,12 +34,21 @@ class _Mallinfo2(ctypes.Structure):
     )
 
 
+_returned_bytes = 0  # of the free memory, what the kernel has back: mallinfo2 counts it as free all the same
+
+
 def return_excess_memory() -> bool:
     """Returns freed memory to the kernel if there is more of it than EXCESS_BYTES: after work much larger than what
     follows. -> whether it did; False where the C library is not glibc 2.33 or later."""
+    global _returned_bytes
     try:
         libc = ctypes.CDLL(None)
         libc.mallinfo2.restype = _Mallinfo2
     except (AttributeError, OSError):
         return False
-    return bool(libc.mallinfo2().fordblks > EXCESS_BYTES and libc.malloc_trim(0))
+    free_bytes = libc.mallinfo2().fordblks
+    _returned_bytes = min(_returned_bytes, free_bytes)  # what is in use again is not returned
+    if free_bytes - _returned_bytes <= EXCESS_BYTES or not libc.malloc_trim(0):
+        return False
+    _returned_bytes = libc.mallinfo2().fordblks
+    return True

@@ -15,7 +15,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
+from terrafix.anchor.matching.fft import cross_correlation, spectra, template_spectra, transform_shape
 from terrafix.core.errors import OutputError
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.features.keypoints import Keypoints, MutualNearestMatcher, unit_rows
@@ -105,7 +105,7 @@ def _correlated_by_opencv(manifest: Manifest, count: int) -> None:
     shape = transform_shape(height, width)
     images = spectra(np.ones((channels, height, width), np.float32), shape)
     for _ in range(count):
-        cross_correlation(images, spectra(np.ones((channels, height, width), np.float32), shape))
+        cross_correlation(images, template_spectra(np.ones((channels, height, width), np.float32), shape))
 
 
 def _points(count: int) -> Keypoints:

@@ -69,7 +69,7 @@ class MapFeatures:
         cell = gsd_m * self._describer.stride
         per_tile = TILE_CELLS_PX // self._describer.stride
         column, row = round(e_min_m / cell), round(-n_max_m / cell)
-        valid = np.zeros((height, width), bool)
+        valid = np.empty((height, width), bool)  # the tiles cover all of it
         out: np.ndarray | None = None
         for ty in range(row // per_tile, (row + height - 1) // per_tile + 1):
             for tx in range(column // per_tile, (column + width - 1) // per_tile + 1):
@@ -78,7 +78,7 @@ class MapFeatures:
                 ys = slice(max(y0, 0), min(y0 + per_tile, height))
                 xs = slice(max(x0, 0), min(x0 + per_tile, width))
                 if out is None:
-                    out = np.zeros((len(tile), height, width), np.float32)
+                    out = np.empty((len(tile), height, width), np.float32)
                 from_y = slice(ys.start - y0, ys.stop - y0)
                 from_x = slice(xs.start - x0, xs.stop - x0)
                 put_widened(tile[:, from_y, from_x], out[:, ys, xs])

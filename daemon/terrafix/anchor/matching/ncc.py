@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from terrafix.anchor.matching.fft import cross_correlation, each_correlation, spectra, transform_shape
+from terrafix.anchor.matching.fft import cross_correlation, inverse, spectra, template_spectra, transform_shape
 from terrafix.anchor.matching.interpolation import interpolated
 from terrafix_engines.correlation import GraphCorrelator
 
@@ -43,7 +43,7 @@ class CorrelationWindow:
     def correlate_all(self, templates: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
         """``correlate`` of each (template, mask), by one inference if there is a correlator."""
         weights = [mask.astype(np.float32) for _, mask in templates]
-        centred = [_centred(template, weight) for (template, _), weight in zip(templates, weights, strict=True)]
+        centred = [_centred(template, mask) for template, mask in templates]
         products = self._correlator.correlate(self._descriptors, centred) if self._correlator else None
         if products is None:
             products = [self._product(one) for one in centred]
@@ -51,7 +51,7 @@ class CorrelationWindow:
 
     def _product(self, centred: np.ndarray) -> np.ndarray:
         (height, width), (h, w) = self._shape, centred.shape[1:]
-        surface = cross_correlation(self._channels, spectra(centred, self._fft_shape))
+        surface = cross_correlation(self._channels, template_spectra(centred, self._fft_shape))
         return surface[: height - h + 1, : width - w + 1]
 
     @functools.cached_property
@@ -63,20 +63,28 @@ class CorrelationWindow:
         return spectra(self._descriptors, self._fft_shape)
 
     def _normalised(self, surface: np.ndarray, centred: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        template_energy = float((centred**2).sum())
+        template_energy = float(np.vdot(centred, centred))
         variance, overlap = self._local.under(weight, *surface.shape)
-        surface /= np.sqrt(np.maximum(np.maximum(variance, FLAT_VARIANCE * template_energy) * template_energy, 1e-12))
-        if self._drawn:
-            surface[variance < FLAT_VARIANCE * template_energy] = -np.inf
+        is_flat = variance < FLAT_VARIANCE * template_energy if self._drawn else None
+        # in place: each pass over a surface costs as much as a transform of a patch
+        np.maximum(variance, FLAT_VARIANCE * template_energy, out=variance)
+        variance *= template_energy
+        np.maximum(variance, 1e-12, out=variance)
+        result = np.divide(surface, np.sqrt(variance, out=variance), out=variance)
+        if is_flat is not None:
+            result[is_flat] = -np.inf
         if overlap is not None:
-            surface[overlap < MIN_OVERLAP] = np.nan
-        return surface
+            result[overlap < MIN_OVERLAP] = np.nan
+        return result
 
 
-def _centred(template: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """``template`` (C, h, w) less its mean of each channel where ``weight`` (h, w) is 1, zero elsewhere."""
-    count = float(weight.sum())
-    return np.asarray((template - ((template * weight).sum((1, 2)) / count)[:, None, None]) * weight)
+def _centred(template: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """``template`` (C, h, w) float32 less its mean of each channel where ``mask`` (h, w) bool is set, zero
+    elsewhere."""
+    centred, inside = np.zeros_like(template), mask.view(np.uint8)
+    for channel, out in zip(template, centred, strict=True):
+        cv2.subtract(channel, cv2.mean(channel, inside), out, inside)
+    return centred
 
 
 class _LocalSums:
@@ -87,35 +95,38 @@ class _LocalSums:
 
     def __init__(self, descriptors: np.ndarray, valid: np.ndarray | None) -> None:
         """``descriptors`` (C, H, W) float32; ``valid`` (H, W) bool, None: everywhere."""
-        layers = [*descriptors, np.einsum("khw,khw->hw", descriptors, descriptors)]
+        others = [np.einsum("khw,khw->hw", descriptors, descriptors)]
         self._is_valid_everywhere = valid is None
         if valid is not None:
-            layers.append(valid.astype(np.float32))
-        halved = np.stack([_halved(layer, cv2.BORDER_REPLICATE) for layer in layers])
-        self._channels = len(descriptors)
-        self._fft_shape = transform_shape(*halved.shape[1:])
-        self._spectra = spectra(halved, self._fft_shape)
+            others.append(valid.astype(np.float32))
+        halved = [np.stack([_halved(layer, cv2.BORDER_REPLICATE) for layer in part]) for part in (descriptors, others)]
+        self._fft_shape = transform_shape(*halved[0].shape[1:])
+        self._channels, self._others = (spectra(part, self._fft_shape) for part in halved)
 
     def under(self, weight: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray | None]:
         """``weight`` (h, w) float32, 1 inside of the template, else 0 -> (rows, columns): sum over the channels of the
         squared deviations from their mean; share of the template on valid map data, None: 1 everywhere."""
-        mask = spectra(_halved(weight, cv2.BORDER_CONSTANT)[None], self._fft_shape)
+        (mask,) = template_spectra(_halved(weight, cv2.BORDER_CONSTANT)[None], self._fft_shape)
+        product = np.empty_like(mask)
+        # the cells between which ``interpolated`` takes values
+        used = (slice(0, (rows - 1) // 2 + 2), slice(0, (columns - 1) // 2 + 2))
+        squares: np.ndarray | None = None
+        for pair in self._channels:
+            sums = inverse(np.multiply(pair, mask, out=product))[used]
+            squares = cv2.accumulateSquare(sums, np.zeros(sums.shape, np.float32) if squares is None else squares)
+        assert squares is not None
+        energy = inverse(np.multiply(self._others[0], mask, out=product))[used]
         # a sum of products of means is a quarter of the sum of products
-        sums = 4.0 * each_correlation(self._spectra, mask)
-        count = float(weight.sum())
-        variance = (
-            sums[self._channels] - np.einsum("khw,khw->hw", sums[: self._channels], sums[: self._channels]) / count
-        )
-        overlap = (
-            None if self._is_valid_everywhere else interpolated(sums[self._channels + 1] / count, 2, rows, columns)
-        )
-        return interpolated(variance, 2, rows, columns), overlap
+        count = 0.25 * float(weight.sum())
+        variance = energy[..., 0] - (squares[..., 0] + squares[..., 1]) / count
+        overlap = None if self._is_valid_everywhere else interpolated(energy[..., 1] / count, 2, rows, columns)
+        return interpolated(4.0 * variance, 2, rows, columns), overlap
 
 
 def _halved(layer: np.ndarray, border: int) -> np.ndarray:
     """(H, W) -> means of 2 x 2 cells ((H + 1) // 2, (W + 1) // 2)."""
     height, width = layer.shape
-    even = cv2.copyMakeBorder(layer, 0, height % 2, 0, width % 2, border)
+    even = cv2.copyMakeBorder(layer, 0, height % 2, 0, width % 2, border) if height % 2 or width % 2 else layer
     return np.asarray(cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA))
 
 
@@ -129,6 +140,8 @@ def standardise(surface: np.ndarray) -> np.ndarray:
     finite = surface[np.isfinite(surface)]
     if finite.size < 100:
         return np.full_like(surface, np.nan)
-    low, median, high, tail = np.quantile(finite, (0.25, 0.5, 0.75, TAIL))
+    low, median, high, tail = np.quantile(finite, (0.25, 0.5, 0.75, TAIL), overwrite_input=True)
     spread = max((high - low) / 1.349, (tail - median) / TAIL_SIGMAS)
-    return (surface - median) / max(float(spread), 1e-4)
+    standardised = surface - median
+    standardised /= max(float(spread), 1e-4)
+    return np.asarray(standardised)

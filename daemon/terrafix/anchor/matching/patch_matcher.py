@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
+from terrafix.anchor.matching.fft import as_complex, conjugate_spectrum, cross_correlation, pairs, transform_shape
+from terrafix.anchor.matching.ncc import FLAT_VARIANCE
 from terrafix.anchor.matching.orthorectify import Rectified
 
 MAX_PATCHES = 48  # patches per frame [tuned]
@@ -44,24 +45,15 @@ def match_patches(
     row0 = round((window_corner_m[1] - (camera_m[1] + rectified.n_max_m)) / cell_m)
     column0 = round(((camera_m[0] + rectified.e_min_m) - window_corner_m[0]) / cell_m)
     corners, surfaces = correlate_patches(template, cells_mask, window, valid, patch_cells, radius_cells, row0, column0)
-    if len(corners) == 0:
-        return PatchMatches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-    frame_m, map_m, weights = [], [], []
-    for (r, c), surface in zip(corners, surfaces, strict=True):
-        peak = _peak(surface)
-        if peak is None:
-            continue
-        dy, dx, weight = peak
-        half = patch_cells / 2.0
-        frame_m.append((rectified.e_min_m + (c + half) * cell_m, rectified.n_max_m - (r + half) * cell_m))
-        map_m.append(
-            (
-                window_corner_m[0] + (column0 + c + half + dx - radius_cells) * cell_m,
-                window_corner_m[1] - (row0 + r + half + dy - radius_cells) * cell_m,
-            )
-        )
-        weights.append(weight)
-    return PatchMatches(np.array(frame_m).reshape(-1, 2), np.array(map_m).reshape(-1, 2), np.array(weights))
+    peaks = _peaks(surfaces)
+    half = patch_cells / 2.0
+    places = np.array([corners[i] for i in peaks.index], dtype=float).reshape(-1, 2) + half  # row, column
+    found = places + (row0 - radius_cells, column0 - radius_cells) + peaks.place
+    return PatchMatches(
+        np.column_stack([rectified.e_min_m + places[:, 1] * cell_m, rectified.n_max_m - places[:, 0] * cell_m]),
+        np.column_stack([window_corner_m[0] + found[:, 1] * cell_m, window_corner_m[1] - found[:, 0] * cell_m]),
+        peaks.weight,
+    )
 
 
 def correlate_patches(
@@ -101,17 +93,15 @@ def _select_patches(
     inside = cv2.boxFilter(mask.astype(np.float32), -1, (patch, patch), anchor=(0, 0), normalize=True)
     energy = np.einsum("khw,khw->hw", template, template)
     texture = cv2.boxFilter(energy, -1, (patch, patch), anchor=(0, 0), normalize=True)
+    is_all_valid = bool(valid.all())
     found: list[tuple[float, int, int]] = []
-    for r in range(0, h - patch + 1, step):
-        for c in range(0, w - patch + 1, step):
-            if inside[r, c] < 0.98:
-                continue
-            top, left = row0 + r - radius, column0 + c - radius
-            bottom, right = row0 + r + patch + radius, column0 + c + patch + radius
-            if top < 0 or left < 0 or bottom > valid.shape[0] or right > valid.shape[1]:
-                continue
-            if valid[top:bottom:4, left:right:4].all():
-                found.append((float(texture[r, c]), r, c))
+    for r, c in (step * np.argwhere(inside[: h - patch + 1 : step, : w - patch + 1 : step] >= 0.98)).tolist():
+        top, left = row0 + r - radius, column0 + c - radius
+        bottom, right = row0 + r + patch + radius, column0 + c + patch + radius
+        if top < 0 or left < 0 or bottom > valid.shape[0] or right > valid.shape[1]:
+            continue
+        if is_all_valid or valid[top:bottom:4, left:right:4].all():
+            found.append((float(texture[r, c]), r, c))
     found.sort(reverse=True)
     return [(r, c) for _, r, c in found[:MAX_PATCHES]]
 
@@ -129,49 +119,79 @@ def _correlate(
     side = patch + 2 * radius
     fft = transform_shape(side, side)
     n = 2 * radius + 1
-    product = np.empty((len(corners), n, n), np.float32)
-    own = np.empty(len(corners))
+    (height, width), spare = window.shape[1:], (fft[0] - side, fft[1] - side)
+    # The transform of a search area takes the map around it instead of zeros: what wraps around lies beyond the n
+    # places of the patch, and no area is copied.
+    areas = pairs(window, (height + spare[0], width + spare[1]))
+    patches = pairs(template, conjugate=True)
+    padded = np.zeros((len(patches), *fft, 2), np.float32)
+    centred = padded[:, :patch, :patch]
+    area_spectra, patch_spectra = np.empty_like(padded), np.empty_like(padded)
+    images, templates = as_complex(area_spectra), as_complex(patch_spectra)
+    surfaces = np.empty((len(corners), n, n), np.float32)
+    own = np.empty((len(corners), 1, 1), np.float32)
     for i, (r, c) in enumerate(corners):
-        small = template[:, r : r + patch, c : c + patch]
-        small = small - small.mean(axis=(1, 2), keepdims=True)
-        own[i] = (small**2).sum()
         top, left = row0 + r - radius, column0 + c - radius
-        large = window[:, top : top + side, left : left + side]
-        product[i] = cross_correlation(spectra(large, fft), spectra(small, fft))[:n, :n]
-    # Energy and channel means of the map under every placement of a patch, by box sums over the whole window.
-    count = patch * patch
-    variance = _box_sums(np.einsum("khw,khw->hw", window, window), patch)
-    for channel in window:
-        variance -= _box_sums(channel, patch) ** 2 / count
+        for k, of_patch in enumerate(patches[:, r : r + patch, c : c + patch]):
+            cv2.subtract(of_patch, cv2.mean(of_patch), centred[k])
+            conjugate_spectrum(padded[k], patch_spectra[k])
+            cv2.dft(areas[k, top : top + fft[0], left : left + fft[1]], area_spectra[k])
+        own[i] = np.vdot(padded, padded)
+        surfaces[i] = cross_correlation(images, templates)[:n, :n]
+    variance = _variance_under(window, patch)
     under = np.stack([variance[row0 + r - radius :, column0 + c - radius :][:n, :n] for r, c in corners])
-    floor = 0.05 * own[:, None, None]
-    return product / np.sqrt(np.maximum(np.maximum(under, floor) * own[:, None, None], 1e-12))
+    surfaces /= np.sqrt(np.maximum(np.maximum(under, FLAT_VARIANCE * own) * own, 1e-12))
+    return surfaces
+
+
+def _variance_under(window: np.ndarray, side: int) -> np.ndarray:
+    """(C, H, W) -> (H, W): sum over the channels of the squared deviations from their mean, in the square of ``side``
+    cells whose corner is the cell."""
+    squares = np.zeros(window.shape[1:], np.float32)
+    for channel in window:
+        cv2.accumulateSquare(_box_sums(channel, side), squares)
+    return np.asarray(_box_sums(np.einsum("khw,khw->hw", window, window), side) - squares / side**2)
 
 
 def _box_sums(x: np.ndarray, side: int) -> np.ndarray:
     """(H, W): sum over the square of ``side`` cells whose corner is the cell, zero outside of ``x``."""
-    box = (side, side)
-    return cv2.boxFilter(x, cv2.CV_64F, box, anchor=(0, 0), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return cv2.boxFilter(x, -1, (side, side), anchor=(0, 0), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
-def _peak(surface: np.ndarray) -> tuple[float, float, float] | None:
-    """(row, column, weight) of the peak with sub-cell interpolation; None: at the border, weak or ambiguous."""
-    r, c = np.unravel_index(int(np.argmax(surface)), surface.shape)
-    if r in (0, surface.shape[0] - 1) or c in (0, surface.shape[1] - 1):
-        return None
-    best = float(surface[r, c])
-    elsewhere = surface.copy()
-    elsewhere[max(r - PEAK_RADIUS, 0) : r + PEAK_RADIUS + 1, max(c - PEAK_RADIUS, 0) : c + PEAK_RADIUS + 1] = -1.0
-    spread = float(surface.std())
-    if best < MIN_CORRELATION or best - float(elsewhere.max()) < MIN_MARGIN * spread:
-        return None
-    dy = _vertex(surface[r - 1, c], best, surface[r + 1, c])
-    dx = _vertex(surface[r, c - 1], best, surface[r, c + 1])
-    return float(r) + dy, float(c) + dx, best * best
+@dataclass(frozen=True)
+class _Peaks:
+    """Surfaces with a peak inside that is neither weak nor ambiguous: their ``index`` (M,), the ``place`` (M, 2) of the
+    peak as row and column between the cells, and its ``weight`` (M,)."""
+
+    index: np.ndarray
+    place: np.ndarray
+    weight: np.ndarray
 
 
-def _vertex(before: float, here: float, after: float) -> float:
+def _peaks(surfaces: np.ndarray) -> _Peaks:
+    """``surfaces`` (N, n, n) -> their peaks."""
+    count, n, _ = surfaces.shape
+    if count == 0:
+        return _Peaks(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+    r, c = np.divmod(surfaces.reshape(count, -1).argmax(axis=1), n)
+    every = np.arange(count)
+    best = surfaces[every, r, c]
+    elsewhere = surfaces.copy()
+    for other, row, column in zip(elsewhere, r.tolist(), c.tolist(), strict=True):
+        rows = slice(max(row - PEAK_RADIUS, 0), row + PEAK_RADIUS + 1)
+        other[rows, max(column - PEAK_RADIUS, 0) : column + PEAK_RADIUS + 1] = -1.0
+    margin = best - elsewhere.max(axis=(1, 2))
+    is_inside = (np.minimum(r, c) > 0) & (np.maximum(r, c) < n - 1)
+    is_clear = (best >= MIN_CORRELATION) & (margin >= MIN_MARGIN * surfaces.std(axis=(1, 2)))
+    index = np.flatnonzero(is_inside & is_clear)
+    i, r, c, best = index, r[index], c[index], best[index]
+    rows = r + _vertex(surfaces[i, r - 1, c], best, surfaces[i, r + 1, c])
+    columns = c + _vertex(surfaces[i, r, c - 1], best, surfaces[i, r, c + 1])
+    return _Peaks(index, np.column_stack([rows, columns]), best.astype(float) ** 2)
+
+
+def _vertex(before: np.ndarray, here: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Extremum of the parabola through three neighbouring values, in cells relative to the central one, within +-
     0.5."""
-    curvature = before - 2.0 * here + after
-    return 0.0 if curvature >= -1e-9 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
+    curvature = np.minimum(before - 2.0 * here + after, -1e-9)
+    return np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from terrafix.anchor.matching.descriptor_cache import Describer, MapWindows
-from terrafix.anchor.matching.fft import cross_correlation, spectra, transform_shape
+from terrafix.anchor.matching.fft import cross_correlation, spectra, template_spectra, transform_shape
 from terrafix.anchor.matching.ncc import FLAT_VARIANCE, MIN_OVERLAP
 from terrafix.anchor.matching.orthorectify import Rectified
 from terrafix.anchor.relocalization.coarse_descriptors import CoarseDescriptors
@@ -149,7 +149,7 @@ def _prepare(template: Template, corner: tuple[int, int], fft: tuple[int, int]) 
     centred = (template.descriptors - mean[:, None, None]) * weight
     centre = tuple(round(float(v.mean())) for v in np.nonzero(template.mask))
     return _Prepared(
-        spectra(centred, fft),
+        template_spectra(centred, fft),
         count,
         float((centred**2).sum()),
         corner,
