@@ -261,7 +261,8 @@ def test_a_user_fix_is_accepted_and_the_search_ends_at_the_place(helped: Helped)
 def test_headings_that_no_image_states_are_found_by_the_sweep(helped: Helped) -> None:
     (found,) = [event for name, event in helped.flown.events("search_expanded") if event["status"] == "found"]
     late = [result for result in helped.results if result.frame_id > found["frame_id"]]
-    assert max(helped.flown.heading_error_deg(result) for result in late) < 5.0
+    errors = [round(helped.flown.heading_error_deg(result), 1) for result in late]
+    assert errors == 0, [(r.frame_id, r.heading) for r in late]
 
 
 def test_the_position_of_a_pixel_is_that_of_the_ground(helped: Helped) -> None:

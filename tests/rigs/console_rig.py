@@ -157,8 +157,9 @@ class Served:
             time.sleep(0.05)
 
     def get(self, path: str) -> Answer:
-        answer = urllib3.request("GET", self.url + path, timeout=WAIT_S, retries=False)
-        return Answer(answer.status, answer.headers, answer.data)
+        with urllib3.PoolManager(retries=False, timeout=WAIT_S) as http:
+            answer = http.request("GET", self.url + path)
+            return Answer(answer.status, answer.headers, answer.data)
 
     def stop(self) -> int:
         """In order -> the exit code."""
