@@ -35,6 +35,7 @@ BEGIN, RETURN = range(0, 40, 4), range(176, 220, 4)  # frames on the route; from
 PERIOD_S, GAP_S = 0.5, 5.0  # between frames of the flight [s], and where some are left out
 GAP_FRAMES = 20
 TRUTH_M = 20.0  # a position within this is right: the truth has 5 to 10 m
+HEADING_DEG = 20.0  # ... and a heading: those of the truth are 5 to 15 degrees off the map, known headings or not
 WRONG_HINT = 276  # frame some 400 m from ON_ROUTE
 CAMERA = {"width": 1280, "height": 720, "fx": 684.0, "fy": 684.0, "cx": 640.0, "cy": 360.0}
 MIDDLE = PixelPoint(u=639.5, v=359.5)
@@ -261,8 +262,7 @@ def test_a_user_fix_is_accepted_and_the_search_ends_at_the_place(helped: Helped)
 def test_headings_that_no_image_states_are_found_by_the_sweep(helped: Helped) -> None:
     (found,) = [event for name, event in helped.flown.events("search_expanded") if event["status"] == "found"]
     late = [result for result in helped.results if result.frame_id > found["frame_id"]]
-    errors = [round(helped.flown.heading_error_deg(result), 1) for result in late]
-    assert errors == 0, [(r.frame_id, r.heading) for r in late]
+    assert max(helped.flown.heading_error_deg(result) for result in late) < HEADING_DEG
 
 
 def test_the_position_of_a_pixel_is_that_of_the_ground(helped: Helped) -> None:

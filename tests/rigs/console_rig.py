@@ -27,7 +27,7 @@ MAP = "format1"
 CAMERA = {"width": 640, "height": 480, "fx": 500.0}
 NEW = {"camera": CAMERA, "map": MAP}
 WAIT_S = 20.0  # longest wait for the service
-WAIT_FOR_RESULT_S = 300.0  # ... for a result; processes of others may take the processors
+WAIT_FOR_RESULT_S = 900.0  # ... for a result; processes of others may take the processors
 BOUNDARY = "a-boundary-of-the-test"
 
 
