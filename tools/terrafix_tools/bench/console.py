@@ -24,6 +24,7 @@ import numpy as np
 import typer
 
 from terrafix.core.errors import UsageError
+from terrafix_tools import child_process
 from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.console.events import ProcessingBlocked
 from terrafix_tools.console.payloads import Camera, Hint, NewFlight
@@ -32,6 +33,7 @@ from terrafix_tools.console.store.database import open_database
 from terrafix_tools.standalone import run_standalone
 
 START_S = 120.0  # longest wait for the service
+STOP_S = 30.0  # ... for its end
 CREATIONS, EVENTS = 40, 100
 PHOTO_PX, PHOTO_QUALITY = (4000, 3000), 60  # 2 MB each
 CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
@@ -75,8 +77,7 @@ def _service(folder: Path, map_package: Path) -> Iterator[tuple[ConsoleClient, "
             time.sleep(0.05)
         yield ConsoleClient(f"http://127.0.0.1:{port}"), process
     finally:
-        process.terminate()
-        process.wait()
+        child_process.end(process, STOP_S)
 
 
 def _creation_ms(client: ConsoleClient, new: NewFlight) -> dict[str, float]:

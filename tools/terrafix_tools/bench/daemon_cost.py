@@ -20,6 +20,7 @@ from rich.table import Table
 
 from terrafix.core.errors import ERROR_OF_EXIT_CODE, EvaluationError, UsageError
 from terrafix.processes import PROCESSES
+from terrafix_tools import child_process
 from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.standalone import run_standalone
 
@@ -126,8 +127,7 @@ def measure(flight: Path, package: Path, work: Path, seconds: float, configs: li
                 samples.append(pss_mb(pids))
                 files_mb = max(files_mb, shared_files_mb(pids))
         finally:
-            daemon.terminate()
-            daemon.wait(STOP_LIMIT_S)
+            child_process.end(daemon, STOP_LIMIT_S)
     sums = sorted(sum(sample.values()) for sample in samples)
     return {
         "ready_s": round(ready_s, 2),

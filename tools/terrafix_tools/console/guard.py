@@ -1,5 +1,6 @@
 """What every request passes first: host, origin, token and role, size of the body; and the headers of every answer."""
 
+import asyncio
 from collections.abc import Iterable
 from urllib.parse import urlsplit
 
@@ -15,6 +16,7 @@ COOKIE = "terrafix_token"
 SAFE = ("GET", "HEAD", "OPTIONS")
 OPEN = ("/session", "/page", "/favicon.ico")  # the page itself has no data; it asks for the token
 UPLOAD = "/images/batch"  # bounded where it is read
+BODY_S = 30.0  # longest time of another body [spec: docs/console.md]
 SECURITY_HEADERS = {
     "x-content-type-options": "nosniff",
     "x-frame-options": "DENY",
@@ -67,10 +69,17 @@ class Guard:
 
     def _bounded(self, receive: Receive) -> Receive:
         taken = 0
+        until_s: float | None = asyncio.get_running_loop().time() + BODY_S
 
         async def bounded() -> Message:
-            nonlocal taken
-            message = await receive()
+            nonlocal taken, until_s
+            try:
+                async with asyncio.timeout_at(until_s):
+                    message = await receive()
+            except TimeoutError:
+                return {"type": "http.disconnect"}
+            if not message.get("more_body", False):
+                until_s = None  # the body is here; what follows is the end of the connection
             taken += len(message.get("body", b""))
             if taken > self._body_bytes:  # a body in chunks states no length
                 return {"type": "http.disconnect"}

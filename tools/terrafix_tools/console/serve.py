@@ -15,6 +15,7 @@ from fastapi import FastAPI
 
 from terrafix.core.errors import LinkError, OutputError
 from terrafix_tools.console.app import make_app
+from terrafix_tools.console.connections import BoundedProtocol
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.settings import Settings
 
@@ -63,6 +64,7 @@ def config_of(app: FastAPI, settings: Settings) -> uvicorn.Config:
         app,
         host=settings.host,
         port=settings.port,
+        http=BoundedProtocol,
         log_level="warning",
         access_log=False,
         server_header=False,
