@@ -93,7 +93,9 @@ def test_the_aircrafts_environment_has_neither_gdal_nor_a_web_server(aircraft: I
 
 
 def test_every_command_explains_itself_without_the_extras(aircraft: Installed) -> None:
-    commands = [line.split()[1] for line in aircraft.do("--help").splitlines() if line.startswith("│ ") and line[2] > " "]
+    commands = [
+        line.split()[1] for line in aircraft.do("--help").splitlines() if line.startswith("│ ") and line[2] > " "
+    ]
     commands = [name for name in commands if name[0] != "-"]
     assert {"run", "replay", "report", "serve", "fleet", "preflight"} <= set(commands)
     for name in commands:
@@ -113,9 +115,9 @@ def test_a_flight_is_replayed_evaluated_and_reported_without_gdal(aircraft: Inst
 @pytest.mark.usefixtures("ground")
 def test_a_ground_station_sees_the_position_of_a_run(aircraft: Installed, work: Path) -> None:
     aircraft.do("files files")
-    run = "run --source out/demo/flight --map out/place.gpkg --link udpout:127.0.0.1:14550 --until-end --out out/run"
+    run = "run --source out/demo/flight --map out/place.gpkg"
     with received(GROUND_PORT) as seen:
-        aircraft.do(f"{run} --config files/config/ground-station.toml")
+        aircraft.do(f"{run} --config files/config/ground-station.toml --until-end --out out/run")
     assert seen["HEARTBEAT"] >= 20
     assert seen["GLOBAL_POSITION_INT"] >= 20, "twice a second, while it has a fix"
     assert "process stopped" in aircraft.do("log lines out/run")
