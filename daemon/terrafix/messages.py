@@ -368,6 +368,20 @@ class SearchState(Message, frozen=True, kw_only=True):
     joined: bool = True  # ... is joined to the flight (as in Prediction), with the match of this frame
 
 
+class SearchPlaces(Message, frozen=True, kw_only=True):
+    """What a running search covers and the best places of its last joint correlation, for an operator who can help it;
+    published before the MapMatch of the frame, when it differs from the one before.
+
+    ``tiles``: number of tiles around the last position; None: the whole map. ``places``: (latitude, longitude) [deg] of
+    the camera; at most five, the best first. ``half_size_m``: half the side of a square into which
+    the ground in the image fits, whatever the heading."""
+
+    frame_id: int
+    tiles: int | None
+    places: list[Vec2]
+    half_size_m: float
+
+
 class PositionHint(Message, frozen=True, kw_only=True):
     """A coarse position prior for the search, from the operator, or from the autopilot after a restart in flight.
 
@@ -846,6 +860,7 @@ AnyMessage = (
     | MapMatch
     | ModelEvent
     | SearchState
+    | SearchPlaces
     | PositionHint
     | EkfDeadReckoning
     | HintVerdict

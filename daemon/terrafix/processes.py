@@ -39,6 +39,7 @@ ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.MapMatch,
     m.ModelEvent,
     m.SearchState,
+    m.SearchPlaces,
     m.PositionHint,
     m.EkfDeadReckoning,
     m.HintVerdict,
@@ -153,7 +154,7 @@ PROCESSES: tuple[Process, ...] = (
         "anchor",
         "terrafix.anchor.node",
         (m.Origin, m.Prediction, m.PositionHint, m.GnssInitialPosition, m.Health),
-        (m.MapMatch, m.ModelEvent, m.SearchState, m.HintVerdict, m.InitialPosition),
+        (m.MapMatch, m.ModelEvent, m.SearchState, m.SearchPlaces, m.HintVerdict, m.InitialPosition),
         0.0,
         90.0,  # one correlation over a large map takes seconds, half a minute on a computer with ten times the load
         (m.Prediction,),

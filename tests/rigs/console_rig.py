@@ -1,6 +1,9 @@
 """A console in a thread of the test, plain HTTP requests to it, and images to upload."""
 
 import json
+import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -15,6 +18,7 @@ import urllib3
 
 import map_format1
 from terrafix_tools.console.app import make_app
+from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.console.serve import Server, config_of
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.settings import Settings
@@ -23,6 +27,7 @@ MAP = "format1"
 CAMERA = {"width": 640, "height": 480, "fx": 500.0}
 NEW = {"camera": CAMERA, "map": MAP}
 WAIT_S = 20.0  # longest wait for the service
+WAIT_FOR_RESULT_S = 300.0  # ... for a result; processes of others may take the processors
 BOUNDARY = "a-boundary-of-the-test"
 
 
@@ -112,6 +117,59 @@ class Console:
         finally:
             answer.close()
         return found
+
+
+class Watched:
+    """The events of a flight as they come."""
+
+    def __init__(self, client: ConsoleClient, flight_id: str) -> None:
+        self._stream = client.events(flight_id)
+        self.seen: list[Any] = []
+
+    def until(self, name: str, **fields: object) -> Any:
+        """The data of the next event of this name with these fields."""
+        end = time.monotonic() + WAIT_FOR_RESULT_S
+        for event in self._stream:
+            self.seen.append(event)
+            if event.name == name and fields.items() <= event.data.items():
+                return event.data
+            assert time.monotonic() < end, f"no {name}"
+        raise AssertionError(f"the stream ended without {name}")
+
+
+class Served:
+    """`terrafix serve` as a process. ``port``: 0 takes a free one."""
+
+    def __init__(self, data: Path, *, maps: Sequence[Path] = (), sources: Path | None = None, port: int = 0) -> None:
+        self.port = port or _free_port()
+        words = ["serve", "--data", str(data), "--port", str(self.port), "--workers", "1"]
+        words += [word for folder in maps for word in ("--maps", str(folder))]
+        words += [] if sources is None else ["--sources", str(sources)]
+        self.process = subprocess.Popen([sys.executable, "-m", "terrafix_tools.program", *words])
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.client = ConsoleClient(self.url)
+        end = time.monotonic() + WAIT_FOR_RESULT_S
+        while True:
+            with socket.socket() as trying:
+                if trying.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return
+            assert time.monotonic() < end and self.process.poll() is None
+            time.sleep(0.05)
+
+    def get(self, path: str) -> Answer:
+        answer = urllib3.request("GET", self.url + path, timeout=WAIT_S, retries=False)
+        return Answer(answer.status, answer.headers, answer.data)
+
+    def stop(self) -> int:
+        """In order -> the exit code."""
+        self.process.terminate()
+        return self.process.wait(timeout=60)
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
 
 
 def _event(block: str) -> tuple[int, str, Any] | None:

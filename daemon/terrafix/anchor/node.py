@@ -1,5 +1,6 @@
 """Anchor node: matches the newest predicted frame with the map and publishes 2D-3D matches and a camera pose."""
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,11 +11,11 @@ from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.model_monitor import ModelMonitor
 from terrafix.anchor.place_index.recognizer import PlaceMemory
-from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.thermal_load import ThermalLoad
 from terrafix.core.allocator import return_excess_memory
 from terrafix.core.config import HealthSection
 from terrafix.core.errors import ModelError, TerrafixError
+from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import FrameStore, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.map.package import MapPackage
@@ -29,8 +30,10 @@ from terrafix.messages import (
     Origin,
     PositionHint,
     Prediction,
+    SearchPlaces,
     SearchState,
     SearchStep,
+    Vec2,
     Verdict,
 )
 from terrafix_engines.correlation import GraphCorrelator, open_correlator
@@ -39,6 +42,8 @@ from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.manifest import ManifestError
 from terrafix_engines.providers import short_name
 from terrafix_engines.runtime import ModelFileError, ModelRunError
+
+MAX_PLACES = 5  # of a search that are published [spec: SV-5 of the requirements]
 
 
 class AnchorNode:
@@ -70,11 +75,7 @@ class AnchorNode:
         self._prior_t_ns = 0  # of the InitialPosition on which the predictions are based
         self._pending: list[Message] = []  # to be published after the MapMatch
         self._published_step = SearchStep.NORMAL
-
-    @property
-    def search(self) -> MapSearch | None:
-        """The running search, for who shows it; None: none."""
-        return self._localizer.search
+        self._published_places: tuple[int | None, list[Vec2]] | None = None  # None: no search, or no result yet
 
     def on(self, message: Message) -> Iterable[Message]:
         match message:
@@ -108,6 +109,7 @@ class AnchorNode:
             self._switch_model(prediction)
         match = self._localizer.label_step(self._localized(prediction), prediction)
         return_excess_memory()
+        yield from self._search_places(prediction)
         yield match
         yield from self._pending
         self._pending.clear()
@@ -119,6 +121,23 @@ class AnchorNode:
                 step=match.search.step,
                 fragment_id=prediction.fragment_id,
                 joined=joined,
+            )
+
+    def _search_places(self, prediction: Prediction) -> Iterable[Message]:
+        search, origin = self._localizer.search, self._origin
+        if search is None or origin is None or search.cell_m == 0.0:
+            self._published_places = None
+            return
+        frame, camera = LocalFrame(origin.lat_deg, origin.lon_deg), origin.camera
+        best = [frame.to_wgs84(place.e_m, place.n_m) for place in search.proposed[:MAX_PLACES]]
+        if self._published_places != (search.tiles, best):
+            self._published_places = search.tiles, best
+            yield SearchPlaces(
+                t_ns=prediction.t_ns,
+                frame_id=prediction.frame_id,
+                tiles=search.tiles,
+                places=best,
+                half_size_m=prediction.agl_m * math.hypot(camera.width / camera.fx, camera.height / camera.fy) / 2,
             )
 
     def _localized(self, prediction: Prediction) -> MapMatch:

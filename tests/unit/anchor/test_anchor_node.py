@@ -10,18 +10,29 @@ import pytest
 from anchor_rig import started
 from map_matches import position_of
 from single_map_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
-from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher
+from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, CorrelationResult, FrameMatcher
 from terrafix.anchor.matching.match_message import ground_sigma_m
 from terrafix.anchor.matching.point_mass_filter import Belief
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.relocalization.map_search import MapSearch, ProposedPlace
 from terrafix.anchor.relocalization.relocalizer import LOST_SIGMA_M, search_centre
 from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.anchor.verification.lock_monitor import LockMonitor
 from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pose import PoseFit, world_to_tangent
 from terrafix.map.null_model import DEFAULT_NULL, VERSION, NullModel
-from terrafix.messages import Health, MapMatch, Prediction, SearchState, SearchStep, ThermalBand, Verdict
+from terrafix.messages import (
+    Health,
+    MapMatch,
+    Message,
+    Prediction,
+    SearchPlaces,
+    SearchState,
+    SearchStep,
+    ThermalBand,
+    Verdict,
+)
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, texture, view
 
@@ -391,3 +402,38 @@ def test_a_position_off_the_map_starts_a_search_if_its_sigma_reaches_the_map(
     result = match(node, 2, sigma_m, at_m=away, step_m=float(away[0] - TRUE_M[0]))
     assert (result.verdict is Verdict.LOST) == searches
     assert node._localizer._relocalizer.is_active == searches
+
+
+def test_the_places_of_a_search_are_published_with_each_joint_correlation(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node, frames = started(ground)
+    published: list[list[Message]] = []
+    monkeypatch.setattr(LockMonitor, "lost", True)
+    monkeypatch.setattr(MapSearch, "process_frame", lambda *_: None)
+    for frame_id in range(1, 6):
+        frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
+        if frame_id == 2:  # a joint correlation
+            monkeypatch.setattr(MapSearch, "cell_m", 0.5)
+            monkeypatch.setattr(MapSearch, "tiles", 4)
+            search = node._localizer.search
+            assert search is not None
+            search.proposed = [ProposedPlace(10.0 * k, -float(k), AS_PREDICTED) for k in range(7)]
+        if frame_id == 4:
+            monkeypatch.setattr(MapSearch, "tiles", None)
+        published.append(list(node.on(predicted(frame_id, 10.0))))
+    assert [[type(m) for m in messages if isinstance(m, (SearchPlaces, MapMatch))] for messages in published] == [
+        [MapMatch],
+        [SearchPlaces, MapMatch],
+        [MapMatch],
+        [SearchPlaces, MapMatch],
+        [MapMatch],
+    ]
+    first, second = (m for messages in published for m in messages if isinstance(m, SearchPlaces))
+    assert (first.frame_id, first.tiles) == (2, 4)
+    frame = LocalFrame(ORIGIN.lat_deg, ORIGIN.lon_deg)
+    places_m = [frame.to_local(*place) for place in first.places]
+    assert np.allclose(places_m, [(0.0, 0.0), (10.0, -1.0), (20.0, -2.0), (30.0, -3.0), (40.0, -4.0)], atol=1e-3)
+    camera = ORIGIN.camera
+    assert first.half_size_m == pytest.approx(AGL_M * np.hypot(camera.width, camera.height) / camera.fx / 2)
+    assert (second.frame_id, second.tiles, second.places) == (4, None, first.places)

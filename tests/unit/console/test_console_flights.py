@@ -1,9 +1,6 @@
 """Flights over HTTP, from their first image to their completion, computed by the processes of the console."""
 
 import signal
-import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,13 +9,13 @@ from typing import Any
 import pytest
 
 from console_flight import AGL_M, CAMERA, ELSEWHERE, GROUND, distance_m, lat_lon, make_map, place_of, write_images
-from console_rig import Console, settings
+from console_rig import WAIT_FOR_RESULT_S as WAIT_S
+from console_rig import Console, Served, Watched, settings
 from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.console.payloads import NewFlight, ObjectPixel, PixelPoint, UserFix
 
 pytestmark = pytest.mark.slow  # processes, but no clock: the tests wait as long as it takes
 
-WAIT_S = 300.0  # longest wait for a result; processes of others may take the processors
 KILLED_AT = 8  # event, of a flight of some 50
 NEW: dict[str, Any] = {
     "camera": {"width": 640, "height": 480, "fx": 380.0, "cx": 319.5, "cy": 239.5, "distortion": [0, 0, 0, 0]},
@@ -34,24 +31,6 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("maps")
     make_map(folder)
     return folder
-
-
-class Watched:
-    """The events of a flight as they come."""
-
-    def __init__(self, client: ConsoleClient, flight_id: str) -> None:
-        self._stream = client.events(flight_id)
-        self.seen: list[Any] = []
-
-    def until(self, name: str, **fields: object) -> Any:
-        """The data of the next event of this name with these fields."""
-        end = time.monotonic() + WAIT_S
-        for event in self._stream:
-            self.seen.append(event)
-            if event.name == name and fields.items() <= event.data.items():
-                return event.data
-            assert time.monotonic() < end, f"no {name}"
-        raise AssertionError(f"the stream ended without {name}")
 
 
 def test_a_lost_flight_asks_goes_on_by_a_user_fix_and_is_refined_at_its_end(tmp_path: Path, maps: Path) -> None:
@@ -102,26 +81,6 @@ def test_a_lost_flight_asks_goes_on_by_a_user_fix_and_is_refined_at_its_end(tmp_
         assert len(refined) == statistics["refined"]
 
 
-class Served:
-    """`terrafix serve` as a process."""
-
-    def __init__(self, data: Path, maps: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        words = ["serve", "--data", str(data), "--port", str(port), "--maps", str(maps), "--workers", "1"]
-        self.process = subprocess.Popen([sys.executable, "-m", "terrafix_tools.program", *words])
-        self.client = ConsoleClient(f"http://127.0.0.1:{port}")
-        self.console_url = f"http://127.0.0.1:{port}"
-        end = time.monotonic() + WAIT_S
-        while True:
-            with socket.socket() as trying:
-                if trying.connect_ex(("127.0.0.1", port)) == 0:
-                    return
-            assert time.monotonic() < end and self.process.poll() is None
-            time.sleep(0.05)
-
-
 def stored(client: ConsoleClient, flight_id: str) -> list[Any]:
     """Results, refined results, fragments and events of a completed flight."""
     events = [(event.name, event.data) for event in client.events(flight_id)]
@@ -140,7 +99,7 @@ def undisturbed(tmp_path: Path, maps: Path, images: list[tuple[str, Path]], new:
 
 def killed_at(data: Path, maps: Path, images: list[tuple[str, Path]], new: NewFlight) -> Iterator[Any]:
     """Kills the service after some events, and ends the next one in order."""
-    served = Served(data, maps)
+    served = Served(data, maps=(maps,))
     flight_id = served.client.create(new).flight_id
     list(served.client.upload(flight_id, images))
     served.client.complete(flight_id)
@@ -149,7 +108,7 @@ def killed_at(data: Path, maps: Path, images: list[tuple[str, Path]], new: NewFl
             break
     served.process.kill()
     served.process.wait()
-    served = Served(data, maps)
+    served = Served(data, maps=(maps,))
     yield stored(served.client, flight_id)
     served.process.send_signal(signal.SIGTERM)
     yield served.process.wait(timeout=60)

@@ -1,5 +1,6 @@
 """A Terrafix that runs on this computer, as a flight of the console."""
 
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ import zmq
 
 from console_rig import Console, settings
 from flight_records import estimate, frame
+from map_matches import with_search
 from terrafix import messages as m
 from terrafix.core.config import Config
 from terrafix.processes import PROCESSES
@@ -40,10 +42,11 @@ def owned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OwnedRunDir:
 
 
 class Flying:
-    """Processes that publish a frame with its estimate and match every 20 ms."""
+    """Processes that publish a frame with its estimate and match every 20 ms. ``lost``: a search asks for help."""
 
-    def __init__(self, run: RunDir, verdict: m.Verdict = m.Verdict.ACCEPTED) -> None:
-        self._run, self._verdict = run, verdict
+    def __init__(self, run: RunDir) -> None:
+        self._run = run
+        self.lost = threading.Event()
         self._stop = threading.Event()
         self.intervals_s: list[float] = []
         self.counted = 0
@@ -52,13 +55,20 @@ class Flying:
 
     def _fly(self) -> None:
         with zmq.Context() as context:
-            names = {"vision": m.Frame, "anchor": m.MapMatch, "estimator": m.NavEstimate}
-            publishers = {kind: Publisher(context, self._run.address(name)) for name, kind in names.items()}
+            publishers: dict[type[m.Message], Publisher] = {
+                kind: Publisher(context, self._run.address(name))
+                for name, kind in {"vision": m.Frame, "anchor": m.MapMatch, "estimator": m.NavEstimate}.items()
+            }
+            publishers[m.SearchPlaces] = publishers[m.MapMatch]
             before_s, i = time.monotonic(), 0
             while not self._stop.wait(0.02):
                 located = estimate(i, 1.0 * i, 0.0)
-                match = m.MapMatch(t_ns=located.t_ns, frame_id=i, verdict=self._verdict, matcher="gradient")
-                for message in (frame(i), match, located):
+                match = m.MapMatch(t_ns=located.t_ns, frame_id=i, verdict=m.Verdict.ACCEPTED, matcher="gradient")
+                searches: list[m.Message] = []
+                if self.lost.is_set():
+                    match = with_search(msgspec.structs.replace(match, verdict=m.Verdict.LOST), step=m.SearchStep.ASK)
+                    searches = [m.SearchPlaces(t_ns=0, frame_id=i, tiles=None, places=[(48.1, 11.2)], half_size_m=90.0)]
+                for message in (frame(i), *searches, match, located):
                     publishers[type(message)].publish(message)
                 now_s = time.monotonic()
                 self.intervals_s.append(now_s - before_s)
@@ -131,6 +141,22 @@ def test_a_flight_that_ended_without_a_service_is_completed_by_the_next_one(
         with console.service.database.read() as db:
             names = [e.name for e in flights.events_after(db, flight["flight_id"], 0, 100_000)]
         assert names[-2:] == ["flight_completed", "state_changed"]
+
+
+def test_a_live_flight_that_is_lost_shows_the_places_of_its_search(
+    owned: OwnedRunDir, flying: Flying, tmp_path: Path
+) -> None:
+    with Console(settings(tmp_path / "data", bus=str(owned.run_dir.path))) as console:
+        (flight,) = soon(lambda: console.send("GET", "/flights").json["flights"])
+        path = f"/flights/{flight['flight_id']}"
+        soon(lambda: console.send("GET", path).json["last_event_id"] > 0)
+        flying.lost.set()
+        request = soon(lambda: console.send("GET", path).json["request"])
+        with console.service.database.read() as db:
+            events = flights.events_after(db, flight["flight_id"], 0, 100_000)
+        (needed,) = [json.loads(e.data) for e in events if e.name == "user_input_needed"]
+        assert needed["request_id"] == request["request_id"]
+        assert needed["candidate_tiles"] == [{"rank": 1, "gps": {"lat": 48.1, "lon": 11.2}, "half_size_m": 90.0}]
 
 
 def test_a_hint_goes_the_way_of_the_command(

@@ -9,7 +9,7 @@ import pytest
 from flight_records import estimate, frame, origin
 from map_matches import with_search
 from terrafix import messages as m
-from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome, SearchView, confidence_of, ellipse_of
+from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome, confidence_of, ellipse_of
 from terrafix_tools.console.events import (
     ChunkMerged,
     Event,
@@ -25,13 +25,16 @@ from terrafix_tools.console.payloads import FlightState
 
 
 class Flight:
-    """A flight, frame by frame. ``view``: what the search shows."""
+    """A flight, frame by frame."""
 
     def __init__(self) -> None:
-        self.view: SearchView | None = None
-        self.observer = FlightObserver(lambda frame_id: f"/image/{frame_id}", lambda: self.view)
+        self.observer = FlightObserver(lambda frame_id: f"/image/{frame_id}")
         self.observer.take([origin()])
         self.next_id = 0
+
+    def searches(self, tiles: int | None, places: list[tuple[float, float]] | None = None) -> None:
+        found = m.SearchPlaces(t_ns=0, frame_id=self.next_id, tiles=tiles, places=places or [], half_size_m=66.66)
+        self.observer.take([found])
 
     def frame(
         self, verdict: m.Verdict, step: m.SearchStep = m.SearchStep.NORMAL, fragment: int = 0, joined: bool = True
@@ -78,18 +81,18 @@ def test_the_confidence_is_that_of_the_worse_axis() -> None:
 def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
     flight = Flight()
     flight.frame(m.Verdict.ACCEPTED)
-    flight.view = SearchView(1, (), 60.0)
+    flight.searches(1)
     lost = flight.frame(LOST, WIDEN)
     assert of_kind(lost, SearchExpanded, StateChanged) == [
         SearchExpanded(frame_id=1, grid_size=1, status="widen"),
         StateChanged(state=FlightState.RECOVERING, previous=FlightState.PROCESSING),
     ]
     assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded, StateChanged) == []
-    flight.view = SearchView(4, (), 60.0)
+    flight.searches(4)
     assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded) == [
         SearchExpanded(frame_id=3, grid_size=4, status="widen")
     ]
-    flight.view = SearchView(None, tuple((100.0 * k, -50.0) for k in range(7)), 60.0)
+    flight.searches(None, [(48.0 + 0.001 * k, 11.0) for k in range(5)])
     assert of_kind(flight.frame(LOST, WHOLE), SearchExpanded) == [
         SearchExpanded(frame_id=4, grid_size=None, status="whole_map")
     ]
@@ -98,8 +101,8 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
     assert isinstance(needed, UserInputNeeded)
     assert (needed.request_id, needed.frame_id, needed.image_url) == ("r1", 5, "/image/5")
     assert [tile.rank for tile in needed.candidate_tiles] == [1, 2, 3, 4, 5]
-    third = flight.observer.local.to_local(needed.candidate_tiles[2].gps.lat, needed.candidate_tiles[2].gps.lon)
-    assert third == pytest.approx((200.0, -50.0), abs=0.01) and needed.candidate_tiles[2].half_size_m == 60.0
+    third = needed.candidate_tiles[2]
+    assert (third.gps.lat, third.gps.lon, third.half_size_m) == (48.002, 11.0, 66.7)
     assert asked.state is FlightState.BLOCKED and asked.request is not None and asked.request.frame_id == 5
     again = flight.frame(LOST, m.SearchStep.NEW_FRAGMENT)
     assert of_kind(again, UserInputNeeded, StateChanged) == [] and again.state is FlightState.BLOCKED
@@ -109,6 +112,9 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
         StateChanged(state=FlightState.PROCESSING, previous=FlightState.BLOCKED),
     ]
     assert found.request is None
+    assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded) == [
+        SearchExpanded(frame_id=8, grid_size=None, status="widen")  # nothing of the search before
+    ]
 
 
 def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> None:

@@ -36,7 +36,7 @@ class SearchExpanded(Event):
 
 
 class CandidateTile(BaseModel):
-    """``gps``: its centre."""
+    """``gps``: its centre, where the camera may be; ``half_size_m``: what the frame shows fits into the square."""
 
     rank: int
     gps: Gps

@@ -18,7 +18,7 @@ import msgspec
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import TerrafixError
 from terrafix.core.frames import SharedFrameStore
-from terrafix.messages import Frame, HintVerdict, MapMatch, Message, NavEstimate, Origin, Refinement
+from terrafix.messages import Frame, HintVerdict, MapMatch, Message, NavEstimate, Origin, Refinement, SearchPlaces
 from terrafix.processes import PROCESSES
 from terrafix.runtime.observer import Observer
 from terrafix.runtime.run_dir import RunDir, live_runs
@@ -37,7 +37,7 @@ from terrafix_tools.status.processes import process_states
 from terrafix_tools.status.state import KINDS, Status
 
 AUTO = "auto"  # instead of a run folder: the only one that runs here
-READ: tuple[type[Message], ...] = (*KINDS, HintVerdict, Refinement)
+READ: tuple[type[Message], ...] = (*KINDS, HintVerdict, Refinement, SearchPlaces)
 POLL_MS = 100
 LOOK_S = 2.0  # between two looks for a run
 HEALTH_S = 1.0
@@ -172,7 +172,7 @@ class LiveFlights:
 
     def _begin(self, run: RunDir, spec: Spec) -> LiveRun:
         flight_id, epoch_ns = flight_id_of(run), run.epoch_ns
-        observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image", lambda: None)
+        observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image")
         observer.origin_ns = epoch_ns or 0
         map_path = None if spec.map_path is None else Path(spec.map_path)
         with self._database.write() as db:

@@ -15,24 +15,21 @@ from typing import Any, NoReturn
 
 import msgspec
 
-from terrafix.anchor.node import AnchorNode
 from terrafix.core.errors import TerrafixError
-from terrafix.core.node import Node, NodeContext
 from terrafix.messages import Frame, Message, Origin, PositionHint
 from terrafix.runtime.fork_server import set_parent_death_signal
 from terrafix_tools.console.compute.description import stored_pixel
-from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome, SearchView
+from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome
 from terrafix_tools.console.compute.source import UploadedImages
 from terrafix_tools.console.compute.steering import fix_message, hint_message
 from terrafix_tools.console.payloads import Hint, UserFix
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database, open_database
-from terrafix_tools.replay import make_nodes, replay
+from terrafix_tools.replay import replay
 
 MEMORY_BYTES = (
     6 * 2**30
 )  # address space of one flight: a decoder that asks for more fails [spec: five times what is used]
-BLOCK_CELLS = 256  # of a side of a tile of the search [spec: docs/search.md]
 
 
 class FlightProcess:
@@ -41,8 +38,7 @@ class FlightProcess:
     def __init__(self, database: Database, data: Path, flight_id: str, report: Any) -> None:
         self._database, self._flight_id, self._report = database, flight_id, report
         self._folder = data / "flights" / flight_id
-        self._anchor: AnchorNode | None = None
-        self._observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image", self._search)
+        self._observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image")
         with database.read() as db:
             self._known = flights.result_count(db, flight_id)  # frames that an earlier process has stored
         self.source = UploadedImages(
@@ -57,7 +53,6 @@ class FlightProcess:
             self._folder / "out",
             configs=configs,
             models=models,
-            nodes=self._make_nodes,
             watch=self._watch,
         )
         with self._database.write() as db:
@@ -75,20 +70,6 @@ class FlightProcess:
         self._say("waiting")
         if not sys.stdin.readline():
             raise SystemExit(0)
-
-    def _make_nodes(self, ctx: NodeContext) -> dict[str, Node]:
-        nodes = make_nodes(ctx)
-        anchor = nodes["anchor"]
-        assert isinstance(anchor, AnchorNode)
-        self._anchor = anchor
-        return nodes
-
-    def _search(self) -> SearchView | None:
-        search = None if self._anchor is None else self._anchor.search
-        if search is None:
-            return None
-        places = tuple((place.e_m, place.n_m) for place in search.proposed)
-        return SearchView(search.tiles, places, BLOCK_CELLS / 2 * search.cell_m)
 
     def _steer(self, hint_id: int, given: Hint | UserFix, t_ns: int) -> PositionHint | None:
         t_ns += hint_id  # nanoseconds: the answer names a hint by its time

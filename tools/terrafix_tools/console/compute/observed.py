@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from terrafix.core.gate import CHI2_95
-from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import (
     Frame,
     HintVerdict,
@@ -18,6 +17,7 @@ from terrafix.messages import (
     Origin,
     RefinedPose,
     Refinement,
+    SearchPlaces,
     SearchStep,
     Verdict,
 )
@@ -39,18 +39,7 @@ from terrafix_tools.console.payloads import Ellipse, FlightState, Fragment, Fram
 from terrafix_tools.estimates import yaw_deg_of
 
 NEAR_M = 20.0  # of the position, within which `confidence` is the probability [spec: AC-1 of the requirements]
-TILES = 5  # candidates of a request [spec: SV-5 of the requirements]
 LOST_REASON = "the position is lost and the whole map was searched; a user fix or a hint would help"
-
-
-@dataclass(frozen=True)
-class SearchView:
-    """A running search: ``tiles`` it covers, None: the whole map; the best ``places`` (east, north), local metres, and
-    half the side of a tile."""
-
-    tiles: int | None
-    places: tuple[tuple[float, float], ...]
-    half_size_m: float
 
 
 @dataclass
@@ -77,14 +66,13 @@ class _Totals:
 
 
 class FlightObserver:
-    """``take`` all messages in their order, then ``frame_done`` or ``rest`` for what they add. ``search``: what the
-    search shows now; ``image_url``: of a frame."""
+    """``take`` all messages in their order, then ``frame_done`` or ``rest`` for what they add. ``image_url``: of a
+    frame."""
 
-    def __init__(self, image_url: Callable[[int], str], search: Callable[[], SearchView | None]) -> None:
-        self._image_url, self._search = image_url, search
+    def __init__(self, image_url: Callable[[int], str]) -> None:
+        self._image_url = image_url
         self.estimates: dict[int, NavEstimate] = {}  # the last one of each frame
         self.hints: dict[int, int] = {}  # id of each hint that was given, by its t_ns
-        self._frame: LocalFrame | None = None
         self.origin_ns = 0
         self._fragments: dict[int, Fragment] = {}
         self._state = FlightState.PROCESSING
@@ -95,13 +83,9 @@ class FlightObserver:
         self._totals = _Totals()
         self._shown: Frame | None = None
         self._match: MapMatch | None = None
+        self._places: SearchPlaces | None = None  # of the running search
         self._others: list[Event] = []
         self._refined: list[FrameRefined] = []
-
-    @property
-    def local(self) -> LocalFrame:
-        assert self._frame is not None
-        return self._frame
 
     def resume(self, state: FlightState) -> None:
         """Continues a live flight of which an earlier service has stored this state."""
@@ -113,13 +97,15 @@ class FlightObserver:
         for message in messages:
             match message:
                 case Origin():
-                    self._frame, self.origin_ns = LocalFrame(message.lat_deg, message.lon_deg), message.t_ns
+                    self.origin_ns = message.t_ns
                 case Frame():
                     self._shown, self._match = message, None
                 case NavEstimate():
                     self.estimates[message.frame_id] = message
                 case MapMatch():
                     self._match = message
+                case SearchPlaces():
+                    self._places = message
                 case Refinement():
                     self._refined += [_refined(pose, str(message.source)) for pose in message.poses]
                 case MeasurementVerdict() if message.verdict is not Verdict.ACCEPTED or message.measurement == "map":
@@ -211,19 +197,18 @@ class FlightObserver:
         """Changes of the search and of the state of the flight with the match of the newest frame."""
         events: list[Event] = []
         if found.verdict is Verdict.LOST:
-            view = self._search()
             self._asked |= found.search.step is SearchStep.ASK
             reached: tuple[str, int | None] = "whole_map", None
             if found.search.step is SearchStep.WIDEN:
-                reached = "widen", None if view is None else view.tiles
+                reached = "widen", None if self._places is None else self._places.tiles
             if reached != self._reached:
                 events.append(SearchExpanded(frame_id=frame_id, grid_size=reached[1], status=reached[0]))
                 self._reached = reached
             if self._asked and self._request is None:
-                events += self._ask(view, frame_id)
+                events += self._ask(frame_id)
         elif self._reached is not None:
             events.append(SearchExpanded(frame_id=frame_id, grid_size=self._reached[1], status="found"))
-            self._reached, self._asked, self._request = None, False, None
+            self._reached, self._asked, self._request, self._places = None, False, None, None
         lost = FlightState.BLOCKED if self._asked else FlightState.RECOVERING
         state = lost if self._reached is not None else FlightState.PROCESSING
         if state is not self._state:
@@ -231,24 +216,15 @@ class FlightObserver:
             self._state = state
         return events
 
-    def _ask(self, view: SearchView | None, frame_id: int) -> list[Event]:
+    def _ask(self, frame_id: int) -> list[Event]:
         self._requests += 1
         self._request = InputRequest(request_id=f"r{self._requests}", frame_id=frame_id)
-        places = () if view is None else view.places[:TILES]
-        tiles = [
-            CandidateTile(
-                rank=rank,
-                gps=_gps(*self.local.to_wgs84(*place)),
-                half_size_m=0.0 if view is None else round(view.half_size_m, 1),
-            )
-            for rank, place in enumerate(places, start=1)
-        ]
         return [
             UserInputNeeded(
                 request_id=self._request.request_id,
                 frame_id=frame_id,
                 image_url=self._image_url(frame_id),
-                candidate_tiles=tiles,
+                candidate_tiles=[] if self._places is None else _tiles(self._places),
             ),
             ProcessingBlocked(reason=LOST_REASON, frame_id=frame_id),
         ]
@@ -312,6 +288,13 @@ def _refined(pose: RefinedPose, source: str) -> FrameRefined:
         source=source,
         fragment_id=pose.fragment_id,
     )
+
+
+def _tiles(found: SearchPlaces) -> list[CandidateTile]:
+    return [
+        CandidateTile(rank=rank, gps=_gps(*place), half_size_m=round(found.half_size_m, 1))
+        for rank, place in enumerate(found.places, start=1)
+    ]
 
 
 def _verdict(message: MeasurementVerdict) -> VerdictGiven:
