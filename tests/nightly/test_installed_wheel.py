@@ -16,6 +16,8 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+pytestmark = [pytest.mark.nightly, pytest.mark.slow]  # downloads, and minutes
+
 ROOT = Path(__file__).resolve().parents[2]
 INSTALL_S, STEP_S = 1200.0, 600.0  # limits; the machine may be busy
 GROUND_PORT = 14551  # of config/ground-station.toml
