@@ -100,7 +100,79 @@ def test_each_failure_fails_its_verdict() -> None:
     assert failing(rolling, replace(TIMES, landed_ns=400 * S)) == {"landing within 30 m"}
     aloft = good_flight()
     aloft.truth = [one for one in aloft.truth if one.t_ns < 360 * S]
-    assert failing(aloft, replace(TIMES, landed_ns=None)) == {"landed", "landing within 30 m"}
+    no_touchdown = "own position within 20 m at touchdown"
+    assert failing(aloft, replace(TIMES, landed_ns=None)) == {"landed", "landing within 30 m", no_touchdown}
+
+
+def moved(log: FlightLog, from_s: int, to_s: int, east_m: float) -> FlightLog:
+    """The autopilot's own position is ``east_m`` farther off, for this time."""
+    log.positions = [
+        replace(one, lon_deg=one.lon_deg + east_m * EAST_DEG_PER_M) if from_s * S <= one.t_ns < to_s * S else one
+        for one in log.positions
+    ]
+    return log
+
+
+def without_fix(log: FlightLog, from_s: int, to_s: int, *, unhealthy: bool = False) -> FlightLog:
+    """GPS_INPUT has no 3D fix for this time, and the firmware reports that no GPS is healthy."""
+    log.fix_types[1][:] = [(t, 1 if from_s * S <= t < to_s * S else fix) for t, fix in log.fix_types[1]]
+    if unhealthy:
+        log.gps_healthy = [(t, good and not from_s * S <= t < to_s * S) for t, good in log.gps_healthy]
+    return log
+
+
+def test_the_share_of_the_time_with_a_fix_and_its_longest_gap_are_judged() -> None:
+    share, gap = "3D fix for 95% of the time", "never 7 s without a 3D fix"
+    assert failing(without_fix(good_flight(), 100, 107)) == set(), "reports a second apart: a gap of 6 s"
+    assert failing(without_fix(good_flight(), 100, 108)) == {gap}
+    often = good_flight()
+    for at_s in range(100, 260, 10):
+        without_fix(often, at_s, at_s + 1)
+    assert failing(often) == {share}, "16 of 300 reports"
+
+
+def test_unhealthy_reports_without_a_fix_count_towards_the_share_of_healthy_ones() -> None:
+    health = "GPS healthy in 95% of the reports"
+    assert failing(without_fix(good_flight(), 100, 104, unhealthy=True)) == set()
+    sick = good_flight()
+    for at_s in range(100, 260, 10):
+        without_fix(sick, at_s, at_s + 1, unhealthy=True)
+    assert failing(sick) == {"3D fix for 95% of the time", health}
+    silent = good_flight()
+    silent.gps_healthy.clear()
+    assert failing(silent) == {health}, "no report is no good report"
+
+
+def test_a_restart_is_left_out_of_the_share_and_of_the_gap_until_the_fix_is_back() -> None:
+    killed = Kill(100 * S, 118 * S, 120 * S)
+    log = without_fix(good_flight(), 100, 120, unhealthy=True)
+    flown = figures(log, replace(TIMES, kills=(killed,)), landing())
+    assert flown.gps_input_longest_gap_s == 19.0 and flown.gps_input_fix_share < 0.95
+    assert (flown.undisturbed_longest_gap_s, flown.undisturbed_fix_share, flown.undisturbed_healthy_share) == (0, 1, 1)
+    assert failing(log, replace(TIMES, kills=(killed,))) == set()
+    after = without_fix(log, 120, 130)
+    assert "never 7 s without a 3D fix" in failing(after, replace(TIMES, kills=(killed,)))
+
+
+def test_the_error_of_the_autopilots_own_position_is_judged() -> None:
+    p95, most = "own position within 20 m for 95 % of the time", "own position within 50 m always"
+    touchdown = "own position within 20 m at touchdown"
+    assert failing(moved(good_flight(), 100, 110, 30.0)) == set(), "3 % of the time"
+    assert failing(moved(good_flight(), 100, 130, 30.0)) == {p95}
+    assert failing(moved(good_flight(), 100, 101, 60.0)) == {most}
+    assert failing(moved(good_flight(), 358, 360, 18.0)) == {touchdown}
+    unknown = good_flight()
+    unknown.positions.clear()
+    assert failing(unknown) == {p95, most, touchdown}
+
+
+def test_a_glitch_and_a_crash_that_is_noticed_on_the_ground_fail() -> None:
+    led = good_flight()
+    led.texts.append(StatusTextRecord(100 * S, 2, "GPS Glitch or Compass error"))
+    assert failing(led) == {"no GPS glitch"}
+    broken = good_flight()
+    broken.texts.append(StatusTextRecord(362 * S, 2, "Crash: Disarming: AngErr=71>30, Accel=0.3<3.0"))
+    assert failing(broken) == {"no crash"}
 
 
 def test_every_restart_is_timed_and_the_slowest_decides() -> None:

@@ -20,6 +20,7 @@ def serve(
     name: Annotated[list[str] | None, typer.Option(help="Further name of this service in requests.")] = None,
     bus: Annotated[str, typer.Option(help="Run folder of a live Terrafix; 'auto': the only one.")] = "",
     workers: Annotated[int, typer.Option(min=0, max=64, help="Flights that are computed at once.")] = 2,
+    scheduler: Annotated[str, typer.Option(help="tcp://host:port of a Dask cluster that computes them instead.")] = "",
     model: Annotated[list[str] | None, typer.Option(help="Name of a fetched model (xfeat), or NAME=PATH.")] = None,
     config: Annotated[list[Path] | None, typer.Option(help="TOML file; may be given several times.")] = None,
 ) -> None:
@@ -40,6 +41,7 @@ def serve(
             key=key,
             hosts=tuple(name or ()),
             workers=workers,
+            scheduler=scheduler,
             configs=tuple(config or ()),
             models=tuple(model or ()),
         )

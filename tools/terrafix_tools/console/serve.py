@@ -18,6 +18,7 @@ from terrafix_tools.console.app import make_app
 from terrafix_tools.console.connections import BoundedProtocol
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.settings import Settings
+from terrafix_tools.parallel.pool import check_scheduler
 
 KEEP_ALIVE_S = 15  # idle connections are closed after this time
 STOP_S = 10  # longest wait for requests in progress at a stop
@@ -83,6 +84,8 @@ def serve(settings: Settings) -> None:
         settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
         raise OutputError(f"{settings.data}: cannot be made ({error.strerror}); choose another --data") from None
+    if settings.scheduler:
+        check_scheduler(settings.scheduler)
     app = make_app(settings)
     server = Server(config_of(app, settings), app.state.service)
     print_address(settings)

@@ -38,6 +38,7 @@ class Settings:
     key: Path | None = None
     hosts: tuple[str, ...] = ()  # further names of this service in the Host header
     workers: int = 2
+    scheduler: str = ""  # of a Dask cluster that computes the flights; else processes of this computer
     nice: int = 10  # of the processes that compute: the service and what flies come first
     configs: tuple[Path, ...] = ()
     models: tuple[str, ...] = ()

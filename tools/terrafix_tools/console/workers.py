@@ -112,6 +112,7 @@ class Workers:
     async def _start(self, flight_id: str, map_path: Path) -> None:
         settings = self._settings
         options = [("--config", str(path)) for path in settings.configs] + [("--model", m) for m in settings.models]
+        options += [("--scheduler", settings.scheduler)] if settings.scheduler else []
         running = _Running(
             await asyncio.create_subprocess_exec(
                 sys.executable,

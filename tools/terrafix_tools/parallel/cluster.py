@@ -5,9 +5,12 @@ because workers with other versions of the libraries that matter are rejected.""
 
 import contextlib
 import logging
+import os
 import platform
 import re
 import socket
+import subprocess
+import sys
 import threading
 import time
 import uuid
@@ -33,21 +36,13 @@ class DaskCluster:
     def __init__(self, address: str, workload: Workload) -> None:
         """Raises UsageError: no scheduler at the address."""
         self._address, self._workload = address, workload
-        place = ADDRESS.fullmatch(address)
-        if not place:
-            raise UsageError(
-                f"--scheduler {address}: not an address; write tcp://host:port, as 'dask scheduler' prints it"
-            )
         for name in ("", ".client", ".core", ".comm", ".utils"):  # errors are reported below in one line
             logging.getLogger(f"distributed{name}").setLevel(logging.CRITICAL)
+        check_address(address)
         try:
-            _check_scheduler(place[1].strip("[]"), int(place[2]))
             self._client = Client(address, timeout=CONNECT_S, set_as_default=False, name=workload.name)
-        except (OSError, OverflowError) as error:
-            raise UsageError(
-                f"--scheduler {address}: no Dask scheduler answers there ({error}); "
-                "start one with 'dask scheduler', and workers with 'dask worker'"
-            ) from None
+        except OSError as error:
+            raise _no_scheduler(address, error) from None
 
     def __enter__(self) -> "DaskCluster":
         return self
@@ -61,6 +56,21 @@ class DaskCluster:
 
     def prepare(self, pieces: int, per_worker: int) -> None:
         """Implements ``PoolProvider.prepare``."""
+
+    def local_address(self) -> str:
+        """IP address of this computer, as the workers of the scheduler reach it."""
+        place = ADDRESS.fullmatch(self._address)
+        assert place is not None
+        with socket.create_connection((place[1].strip("[]"), int(place[2])), timeout=CONNECT_S) as peer:
+            return str(peer.getsockname()[0])
+
+    def run_program(self, module: str, words: list[str], environment: dict[str, str]) -> "Future[int]":
+        """``python -m module words`` on a worker -> its exit code; on another one when the worker dies.
+
+        The result raises ``error`` of the workload: the worker has other versions."""
+        key = f"{self._workload.name}-{uuid.uuid4().hex}"
+        expected = _built_with(self._workload)
+        return self._client.submit(_run_program, module, words, environment, self._workload, expected, key=key)
 
     @contextlib.contextmanager
     def open_pool(self, open_renderer: OpenRenderer[Wanted, Piece]) -> Iterator[RenderPool[Wanted, Piece]]:
@@ -134,6 +144,24 @@ class _Task(Generic[Piece]):
             self._remote.wait_for_workers()
 
 
+def check_address(address: str) -> None:
+    """Raises UsageError: no scheduler at the address."""
+    place = ADDRESS.fullmatch(address)
+    if not place:
+        raise UsageError(f"--scheduler {address}: not an address; write tcp://host:port, as 'dask scheduler' prints it")
+    try:
+        _check_scheduler(place[1].strip("[]"), int(place[2]))
+    except (OSError, OverflowError) as error:
+        raise _no_scheduler(address, error) from None
+
+
+def _no_scheduler(address: str, error: Exception) -> UsageError:
+    return UsageError(
+        f"--scheduler {address}: no Dask scheduler answers there ({error}); "
+        "start one with 'dask scheduler', and workers with 'dask worker'"
+    )
+
+
 def _check_scheduler(host: str, port: int) -> None:
     """Checks that a Dask scheduler listens there, because Dask's client waits long and fails in many ways otherwise.
 
@@ -147,6 +175,17 @@ def _check_scheduler(host: str, port: int) -> None:
 
 def _built_with(workload: Workload) -> str:
     return f"{workload.built_with()}, {platform.machine()}"
+
+
+def _run_program(
+    module: str, words: list[str], environment: dict[str, str], workload: Workload, built_with: str
+) -> int:
+    """Runs on a worker. The program ends with the thread that waits for it."""
+    here = _built_with(workload)
+    if built_with != here:
+        raise workload.error(f"worker on {platform.node()}: has {here}, and not {built_with}; make them the same")
+    command = [sys.executable, "-m", module, *words, "--parent", str(os.getpid())]
+    return subprocess.run(command, env={**os.environ, **environment}, stdin=subprocess.DEVNULL, check=False).returncode
 
 
 # The code below runs on the workers. GDAL's datasets belong to one thread; a worker may have several.

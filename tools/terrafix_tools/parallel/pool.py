@@ -93,11 +93,24 @@ def default_workers() -> int:
 
 def connect(address: str, workload: Workload) -> "DaskCluster":
     """The Dask cluster of ``--scheduler``. Raises UsageError: Dask is not installed, or no scheduler answers."""
-    try:
+    with _dask_named():
         from terrafix_tools.parallel.cluster import DaskCluster
+    return DaskCluster(address, workload)
+
+
+def check_scheduler(address: str) -> None:
+    """Raises UsageError as ``connect``, which a program calls later."""
+    with _dask_named():
+        from terrafix_tools.parallel.cluster import check_address
+    check_address(address)
+
+
+@contextlib.contextmanager
+def _dask_named() -> Iterator[None]:
+    try:
+        yield
     except ModuleNotFoundError as error:
         raise UsageError(f"--scheduler needs {error.name}; install it: pip install 'terrafix[cluster]'") from None
-    return DaskCluster(address, workload)
 
 
 def render_pieces(

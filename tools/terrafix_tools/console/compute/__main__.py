@@ -10,6 +10,7 @@ import os
 import resource
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -19,25 +20,24 @@ from terrafix.core.errors import TerrafixError
 from terrafix.messages import Frame, Message, Origin, PositionHint
 from terrafix.runtime.fork_server import set_parent_death_signal
 from terrafix_tools.console.compute.description import stored_pixel
+from terrafix_tools.console.compute.limits import MEMORY_BYTES
 from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome
-from terrafix_tools.console.compute.source import UploadedImages
+from terrafix_tools.console.compute.packets import Begin
+from terrafix_tools.console.compute.source import Upload, UploadedImages
 from terrafix_tools.console.compute.steering import fix_message, hint_message
 from terrafix_tools.console.payloads import Hint, UserFix
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database, open_database
 from terrafix_tools.replay import replay
 
-MEMORY_BYTES = (
-    6 * 2**30
-)  # address space of one flight: a decoder that asks for more fails [spec: five times what is used]
-
 
 class FlightProcess:
-    """The flight ``flight_id`` of the console in ``data``."""
+    """A flight of the console, from its first image; ``options``: of this program."""
 
-    def __init__(self, database: Database, data: Path, flight_id: str, report: Any) -> None:
-        self._database, self._flight_id, self._report = database, flight_id, report
-        self._folder = data / "flights" / flight_id
+    def __init__(self, database: Database, options: argparse.Namespace, report: Any) -> None:
+        flight_id = str(options.flight)
+        self._database, self._flight_id, self._report, self._options = database, flight_id, report, options
+        self._folder = options.data / "flights" / flight_id
         self._observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image")
         with database.read() as db:
             self._known = flights.result_count(db, flight_id)  # frames that an earlier process has stored
@@ -45,16 +45,37 @@ class FlightProcess:
             database, flight_id, self._folder, wait=self._wait, begins=self._begins, steer=self._steer
         )
 
-    def run(self, map_path: Path, configs: list[Path], models: list[str]) -> None:
+    def run(self) -> None:
         """Raises TerrafixError."""
         replay(
             self.source,
-            map_path,
+            self._options.map,
             self._folder / "out",
-            configs=configs,
-            models=models,
-            watch=self._watch,
+            configs=self._options.config,
+            models=self._options.model,
+            watch=self.take,
         )
+        self.complete()
+
+    def begin(self) -> Begin:
+        """What a program on a cluster needs to know."""
+        stored = self.source.stored
+        return Begin(
+            origin=self.source.origin(),
+            name=self.source.name(),
+            width=stored.width,
+            height=stored.height,
+            out=str(self._folder / "out"),
+            map_path=str(self._options.map),
+            nice=self._options.nice,
+            configs=[str(path.absolute()) for path in self._options.config],
+            models=self._options.model,
+        )
+
+    def uploads(self) -> Iterator[Upload]:
+        return self.source.uploads()
+
+    def complete(self) -> None:
         with self._database.write() as db:
             flights.complete(db, self._flight_id, self._observer.completed())
         self._say("stored")
@@ -83,7 +104,7 @@ class FlightProcess:
             self._observer.hints[message.t_ns] = hint_id
         return message
 
-    def _watch(self, messages: list[Message]) -> None:
+    def take(self, messages: list[Message]) -> None:
         """Stores what the messages of one step add, all of it or nothing."""
         self._observer.take(messages)
         frame = next((m for m in messages if isinstance(m, Frame)), None)
@@ -100,6 +121,22 @@ class FlightProcess:
         self._say("stored")
 
 
+def _run(database: Database, given: argparse.Namespace, report: Any) -> None:
+    """Raises TerrafixError."""
+    if not given.scheduler:
+        FlightProcess(database, given, report).run()
+        return
+    from terrafix_tools.console.compute.cluster import compute
+    from terrafix_tools.parallel.remote_program import ProgramEnded
+
+    try:
+        compute(given.scheduler, lambda: FlightProcess(database, given, report))
+    except ProgramEnded as ended:  # this process dies as the program did, which counts as a death at this image
+        if ended.code < 0:
+            os.kill(os.getpid(), -ended.code)
+        raise SystemExit(ended.code or 1) from None
+
+
 def main() -> NoReturn:
     parser = argparse.ArgumentParser()
     parser.add_argument("--data", type=Path, required=True)
@@ -109,6 +146,7 @@ def main() -> NoReturn:
     parser.add_argument("--nice", type=int, default=0)
     parser.add_argument("--config", type=Path, action="append", default=[])
     parser.add_argument("--model", action="append", default=[])
+    parser.add_argument("--scheduler", default="")
     given = parser.parse_args()
     if not set_parent_death_signal(given.parent, signal.SIGKILL):
         raise SystemExit(0)
@@ -120,7 +158,7 @@ def main() -> NoReturn:
         fcntl.flock(lock, fcntl.LOCK_EX)  # a process of a killed service may still be ending
         database = open_database(given.data, durable=False)
         try:
-            FlightProcess(database, given.data, given.flight, report).run(given.map, given.config, given.model)
+            _run(database, given, report)
         except TerrafixError as error:
             report.write(f"failed {msgspec.json.encode(str(error)).decode()}\n")
             report.flush()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 
-from terrafix.messages import Frame, Message, Origin, PositionHint, VehicleState
+from terrafix.messages import Frame, Origin, PositionHint, VehicleState
 from terrafix.vision.sources import Shot
 from terrafix.vision.sources.images import read_image
 from terrafix_tools.console.compute.description import origin, stored_camera
@@ -19,6 +19,22 @@ MAX_ATTEMPTS = 2  # processes that may die at an image before it is left out [sp
 POISONED = "the processes that read this image have died"
 
 Steer = Callable[[int, Hint | UserFix, int], PositionHint | None]
+
+
+class Upload(msgspec.Struct, frozen=True, tag=True):
+    """An uploaded image, its telemetry and the hints that were given before it. ``path``: "" if it is not to be
+    read."""
+
+    frame: Frame
+    path: str
+    state: VehicleState | None
+    hints: tuple[PositionHint, ...]
+
+    def read(self, width: int, height: int) -> Shot:
+        """``width``, ``height``: of the file, pixels."""
+        pixels, error = read_image(Path(self.path), width, height) if self.path else (None, self.frame.error)
+        states = () if self.state is None else (self.state,)
+        return Shot(msgspec.structs.replace(self.frame, error=error), states, pixels, others=self.hints)
 
 
 class UploadedImages:
@@ -41,7 +57,7 @@ class UploadedImages:
         self._wait, self._begins, self._steer = wait, begins, steer
         with database.read() as db:
             self.new = NewFlight.model_validate_json(flights.row_of(db, flight_id).spec)
-        self._origin, self._stored = origin(self.new), stored_camera(self.new)
+        self._origin, self.stored = origin(self.new), stored_camera(self.new)
 
     def origin(self) -> Origin:
         return self._origin
@@ -59,6 +75,12 @@ class UploadedImages:
         """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
+        for upload in self.uploads():
+            if upload.frame.t_ns >= from_s * 1e9:
+                yield upload.read(self.stored.width, self.stored.height)
+
+    def uploads(self) -> Iterator[Upload]:
+        """The images in their order, unread."""
         frame_id = 0
         while True:
             with self._database.read() as db:
@@ -66,33 +88,27 @@ class UploadedImages:
                 completing = bool(flights.row_of(db, self._flight_id).completing)
             for image in page:
                 self._begins(image.frame_id)
-                if image.t_ns >= from_s * 1e9:
-                    yield self._shot(image)
+                yield self._upload(image)
             frame_id += len(page)
             if not page and completing:
                 return
             if not page:
                 self._wait()
 
-    def _shot(self, image: StoredImage) -> Shot:
-        camera, stored = self._origin.camera, self._stored
-        others = self._hints(image)
-        if image.attempts >= MAX_ATTEMPTS:
-            pixels, error = None, POISONED
-        else:
-            pixels, error = read_image(self._folder / image.stored, stored.width, stored.height)
+    def _upload(self, image: StoredImage) -> Upload:
+        camera, poisoned = self._origin.camera, image.attempts >= MAX_ATTEMPTS
         frame = Frame(
             t_ns=image.t_ns,
             frame_id=image.frame_id,
             file=image.name,
             width=camera.width,
             height=camera.height,
-            error=error,
+            error=POISONED if poisoned else "",
         )
         state = None if image.state is None else msgspec.json.decode(image.state, type=VehicleState)
-        return Shot(frame, () if state is None else (state,), pixels, others=others)
+        return Upload(frame, "" if poisoned else str(self._folder / image.stored), state, self._hints(image))
 
-    def _hints(self, image: StoredImage) -> tuple[Message, ...]:
+    def _hints(self, image: StoredImage) -> tuple[PositionHint, ...]:
         with self._database.read() as db:
             if not flights.has_hints_before(db, self._flight_id, image.frame_id):
                 return ()

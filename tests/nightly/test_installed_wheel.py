@@ -1,0 +1,161 @@
+"""The wheel in empty environments outside the source tree: the steps of the README, with and without the extras.
+
+`demo` and `map build` run where the extra `ground` is installed, everything that flies where it is not: the
+environment of the aircraft has no GDAL."""
+
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+pytestmark = [pytest.mark.nightly, pytest.mark.slow]  # downloads, and minutes
+
+ROOT = Path(__file__).resolve().parents[2]
+INSTALL_S, STEP_S = 1200.0, 600.0  # limits; the machine may be busy
+GROUND_PORT = 14551  # of config/ground-station.toml
+
+
+class Installed:
+    """The command `terrafix` of a virtual environment of its own, run in ``work`` with nothing of the source tree."""
+
+    def __init__(self, folder: Path, wheel: Path, extras: str, work: Path) -> None:
+        self.python, self._command, self._work = folder / "bin" / "python", folder / "bin" / "terrafix", work
+        subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True, timeout=INSTALL_S)
+        pip = [str(self.python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        lock = ["--constraint", str(ROOT / "requirements.lock")]
+        subprocess.run([*pip, *lock, f"{wheel}{extras}"], check=True, timeout=INSTALL_S)
+        self._environment = {"PATH": "/usr/bin:/bin", "HOME": str(work), "LANG": "C.UTF-8", "OMP_NUM_THREADS": "1"}
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        command = [str(self._command), *words]
+        return subprocess.run(
+            command, cwd=self._work, env=self._environment, capture_output=True, text=True, timeout=STEP_S, check=False
+        )
+
+    def do(self, line: str) -> str:
+        """Output of a command that has to succeed, as it is written in the README."""
+        done = self.run(*line.split())
+        assert done.returncode == 0, f"{line}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+        assert "Traceback" not in done.stderr
+        return done.stdout
+
+    @contextmanager
+    def beside(self, line: str) -> Iterator[None]:
+        command = [str(self._command), *line.split()]
+        with subprocess.Popen(command, cwd=self._work, env=self._environment) as process:
+            try:
+                yield
+            finally:
+                process.terminate()
+        assert process.returncode == 0, "it ends in order"
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("work")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+    subprocess.run(pip, check=True, timeout=INSTALL_S)
+    (built,) = folder.iterdir()
+    return built
+
+
+@pytest.fixture(scope="module")
+def aircraft(tmp_path_factory: pytest.TempPathFactory, wheel: Path, work: Path) -> Installed:
+    return Installed(tmp_path_factory.mktemp("aircraft"), wheel, "", work)
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory: pytest.TempPathFactory, wheel: Path, work: Path) -> Installed:
+    """With the flight of the demo and its map in ``work``/out, as the README has them."""
+    installed = Installed(tmp_path_factory.mktemp("ground"), wheel, "[ground,console]", work)
+    installed.do("demo --duration 30")
+    installed.do("map build out/demo/map.tif --dem out/demo/dem.tif --date 2020-07-10 --out out/place.gpkg")
+    return installed
+
+
+def test_the_aircrafts_environment_has_neither_gdal_nor_a_web_server(aircraft: Installed) -> None:
+    code = "import importlib.util as u; print([n for n in ('rasterio', 'fastapi', 'dask', 'pytest') if u.find_spec(n)])"
+    done = subprocess.run([str(aircraft.python), "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+    refused = aircraft.run("map", "build", "nowhere.tif", "--out", "out/nowhere.gpkg")
+    assert refused.returncode == 2 and "pip install 'terrafix[ground]'" in refused.stderr
+
+
+def test_every_command_explains_itself_without_the_extras(aircraft: Installed) -> None:
+    commands = [
+        line.split()[1] for line in aircraft.do("--help").splitlines() if line.startswith("│ ") and line[2] > " "
+    ]
+    commands = [name for name in commands if name[0] != "-"]
+    assert {"run", "replay", "report", "serve", "fleet", "preflight"} <= set(commands)
+    for name in commands:
+        aircraft.do(f"{name} --help")
+
+
+@pytest.mark.usefixtures("ground")
+def test_a_flight_is_replayed_evaluated_and_reported_without_gdal(aircraft: Installed, work: Path) -> None:
+    aircraft.do("replay out/demo/flight --map out/place.gpkg --out out/replay")
+    assert "ellipse95_coverage" in aircraft.do("evaluate out/replay --truth out/demo/flight/truth.csv")
+    aircraft.do("report out/replay --truth out/demo/flight/truth.csv")
+    assert "<svg" in (work / "out/replay/report.html").read_text(encoding="utf-8")
+    aircraft.do("finalise out/replay")
+    assert (work / "out/replay/finalised.csv").is_file()
+
+
+@pytest.mark.usefixtures("ground")
+def test_a_ground_station_sees_the_position_of_a_run(aircraft: Installed, work: Path) -> None:
+    aircraft.do("files files")
+    run = "run --source out/demo/flight --map out/place.gpkg"
+    with received(GROUND_PORT) as seen:
+        aircraft.do(f"{run} --config files/config/ground-station.toml --until-end --out out/run")
+    assert seen["HEARTBEAT"] >= 20
+    assert seen["GLOBAL_POSITION_INT"] >= 20, "twice a second, while it has a fix"
+    assert "process stopped" in aircraft.do("log lines out/run")
+
+
+@contextmanager
+def received(port: int) -> Iterator[Counter[str]]:
+    """Names of the messages of system 201 that reach this port, while the body runs."""
+    seen: Counter[str] = Counter()
+    parser, ended = mavlink.MAVLink(None), threading.Event()
+
+    def listen() -> None:
+        while not ended.is_set():
+            try:
+                packet = listener.recv(4096)
+            except TimeoutError:
+                continue
+            seen.update(m.get_type() for m in parser.parse_buffer(packet) or () if m.get_srcSystem() == 201)
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", port))
+        listener.settimeout(0.2)
+        thread = threading.Thread(target=listen)
+        thread.start()
+        try:
+            yield seen
+        finally:
+            ended.set()
+            thread.join()
+
+
+def test_the_console_takes_a_flight_over_its_map(ground: Installed) -> None:
+    url = "http://127.0.0.1:18799"
+    with ground.beside("serve --port 18799 --data out/console --maps out"):
+        until = time.monotonic() + STEP_S
+        while ground.run("flight", "list", "--url", url).returncode != 0:
+            assert time.monotonic() < until
+            time.sleep(0.5)
+        assert ground.do(f"flight create out/demo/flight/flight.toml --map place --url {url}").strip()
