@@ -9,7 +9,7 @@ from terrafix.estimator.integrity.fragments import Fragment
 from terrafix.estimator.keyframe_view import KeyframeView
 
 # Keyframes, the oldest of which are dropped first: at one a second, which is the most that vision keeps, more than five
-# hours of flight in 10 MB. [spec: vision keeps at most one keyframe a second]
+# hours of flight in 14 MB. [spec: vision keeps at most one keyframe a second]
 MAX_KEYFRAMES = 20_000
 
 

@@ -1,5 +1,7 @@
 """Benchmarks of growing maps and flights: the synthetic flight is consistent, and all result fields are present."""
 
+import ctypes
+import gc
 import json
 import math
 from pathlib import Path
@@ -7,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from terrafix.core.allocator import _Mallinfo2
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameInput
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
@@ -35,6 +38,26 @@ def test_the_estimator_follows_the_synthetic_flight() -> None:
         assert np.hypot(*error_m[:2]) < (40.0 if frame.odometry.frame_id < 5 else 6.0)
     assert inertial == frames - 1
     assert rejected <= 0.05 * frames / FIX_EVERY
+
+
+def allocated_bytes() -> int:
+    """Blocks in use of the C library's heap, where arrays and GTSAM's objects are, and those mapped one by one."""
+    libc = ctypes.CDLL(None)
+    libc.mallinfo2.restype = _Mallinfo2
+    info = libc.mallinfo2()
+    return int(info.uordblks + info.hblkhd)
+
+
+@pytest.mark.slow
+def test_what_the_estimator_keeps_of_each_frame_is_small() -> None:
+    """In Python and in GTSAM, while the history retains more and more nodes: 2 kB a frame, and 44 kB if factors were
+    parts of larger matrices. A window has some 40 factors more or less, 10 kB each."""
+    estimator, used = Estimator(ORIGIN), []
+    for frame, _ in enumerate(estimator_cost._flown(estimator, 300)):
+        if frame in (99, 299):
+            gc.collect()
+            used.append(allocated_bytes())
+    assert 0 < used[1] - used[0] < 200 * 8_000
 
 
 @pytest.mark.slow

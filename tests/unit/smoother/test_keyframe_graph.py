@@ -1,9 +1,13 @@
 """Trees of frames: what hangs on which keyframe, and what is kept."""
 
+import gc
+import tracemalloc
+
 import gtsam
 import numpy as np
 import pytest
 
+from terrafix.smoother import keyframe_graph
 from terrafix.smoother.keyframe_graph import LONE_FRAMES, Anchor, FrameNode, Join, KeyframeGraph
 from terrafix.smoother.solution import followers, solve
 
@@ -92,6 +96,35 @@ def test_a_frame_that_nothing_hangs_on_is_dropped_after_some_time() -> None:
     for i in range(10, 10 + LONE_FRAMES + 5):
         graph.add_start(node(i))
     assert 10 not in graph.frames and 10 + LONE_FRAMES in graph.frames and {0, 1, 2} <= set(graph.frames)
+
+
+def test_frames_are_bounded_and_the_oldest_that_are_no_keyframes_go_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keyframe_graph, "MAX_FRAMES", 40)
+    graph = KeyframeGraph()
+    graph.add_start(node(0))
+    for i in range(1, 100):
+        graph.add_start(node(i))
+        assert graph.add_link(node(i, (i - 1) // 10 * 10)), "each tenth frame is a keyframe"
+    keyframes = list(range(0, 100, 10))
+    assert list(graph.frames) == sorted({*keyframes, *range(67, 100)})
+    assert graph.keyframes == keyframes and graph.children(10) == [20]
+
+
+def test_a_frame_takes_less_than_a_kilobyte() -> None:
+    """In Python and in arrays; GTSAM's pose takes 0.2 kB more."""
+    graph, frames = KeyframeGraph(), 500
+    graph.add_start(node(300))
+    gc.collect()
+    tracemalloc.start()
+    try:
+        for i in range(frames):
+            of_frame = node(301 + i, 300)
+            of_frame.cov = COV.copy()
+            assert graph.add_link(of_frame)
+        held = tracemalloc.get_traced_memory()[0] / frames
+    finally:
+        tracemalloc.stop()
+    assert 300 < held < 800
 
 
 def test_a_relocalisation_between_frames_is_one_between_their_keyframes() -> None:

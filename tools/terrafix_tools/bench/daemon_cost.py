@@ -31,6 +31,7 @@ IMPORT_ROUNDS = 3  # the least of them counts
 IMPORT = """
 import time
 import terrafix.runtime.process_main, terrafix.runtime.executor
+terrafix.runtime.process_main.import_shared_libraries()
 began_s = time.process_time()
 import {module}
 print(time.process_time() - began_s)

@@ -1,6 +1,7 @@
 """Telemetry of the autopilot by time: attitude, height and inertial readings around a frame; what is missing is
 None."""
 
+from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass
@@ -162,8 +163,8 @@ class _Series:
 
     def __init__(self, size: int) -> None:
         self._size = size
-        self._t_ns: list[int] = []
-        self._axes: tuple[list[float], list[float], list[float]] = ([], [], [])
+        self._t_ns = array("q")
+        self._axes = (array("d"), array("d"), array("d"))
 
     def add(self, t_ns: int, x: float, y: float, z: float) -> None:
         if self._t_ns and t_ns <= self._t_ns[-1]:
