@@ -174,3 +174,8 @@ def test_a_recorded_flight_is_a_scene_with_its_course_camera_and_rate(tmp_path: 
 def test_a_flight_without_an_even_rate_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="have no even rate"):
         recorded_scene(flight_folder(tmp_path / "flight", hole=True), None, tmp_path)
+
+
+def test_a_fix_is_not_expected_where_the_fault_leaves_no_way_to_one() -> None:
+    assert fault("map: file removed").no_fix_in == {Phase.START, Phase.LANDING}
+    assert {one.name for one in FAULTS if one.no_fix_in != {Phase.LANDING}} == {"map: file removed"}
