@@ -15,6 +15,7 @@ import numpy as np
 from terrafix.processes import PROCESSES
 from terrafix_tools.chaos.camera import Look
 from terrafix_tools.chaos.rig import COOL_MC, Need, Rig
+from terrafix_tools.chaos.scene import Phase
 from terrafix_tools.chaos.switches import Switch
 from terrafix_tools.sim.autopilot.wire import heartbeat
 
@@ -37,7 +38,8 @@ def nothing(_rig: Rig) -> None:
 
 @dataclass(frozen=True)
 class Fault:
-    """``during`` is called often with the seconds since the beginning."""
+    """``during`` is called often with the seconds since the beginning. ``no_fix_in``: phases in which it leaves no way
+    to a fix, so that none is expected."""
 
     name: str
     lasts_s: float
@@ -45,6 +47,7 @@ class Fault:
     end: Action = nothing
     during: Callable[[Rig, float], None] = lambda _rig, _s: None
     needs: frozenset[Need] = frozenset()
+    no_fix_in: frozenset[Phase] = frozenset({Phase.LANDING})  # it ends below the least height for matching
 
 
 def killed(process: str) -> Fault:
@@ -229,7 +232,12 @@ FAULTS: tuple[Fault, ...] = (
     switched("wall clock: a year back", Switch.WALL_CLOCK_S, -JUMP_S),
     Fault("model: file altered, anchor killed", 0.0, begin=_alter_model, needs=frozenset({Need.MODEL})),
     switched("model: provider lost", Switch.NO_PROVIDER, 1.0, Need.MODEL),
-    Fault("map: file removed", 0.0, begin=lambda rig: rig.map_path.unlink()),
+    Fault(
+        "map: file removed",
+        0.0,
+        begin=lambda rig: rig.map_path.unlink(),
+        no_fix_in=frozenset({Phase.LANDING, Phase.START}),  # nothing has opened it yet
+    ),
     Fault("map: file altered", 0.0, begin=lambda rig: _alter(rig.map_path)),
     Fault("processor: saturated", LONG_S, _saturate, _rest),
     Fault("heat: 40 to 97 to 40 C", LONG_S, during=_heat, end=lambda rig: rig.set_temperature(COOL_MC)),

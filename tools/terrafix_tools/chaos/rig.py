@@ -11,7 +11,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from terrafix.core.errors import SourceError
-from terrafix.runtime.run_dir import PREFIX, SHM
+from terrafix.runtime.run_dir import PREFIX, SHM, write_atomic
 from terrafix_tools import child_process
 from terrafix_tools.chaos.camera import StreamedCamera, camera_toml
 from terrafix_tools.chaos.scene import Scene
@@ -172,7 +172,7 @@ class Rig:
         zone = self.folder / "sys" / "class" / "thermal" / "thermal_zone0"
         zone.mkdir(parents=True, exist_ok=True)
         (zone / "type").write_text("cpu-thermal\n")
-        (zone / "temp").write_text(f"{millidegrees}\n")
+        write_atomic(zone / "temp", f"{millidegrees}\n".encode())  # a file of sysfs is never half written
 
     def stop(self) -> None:
         """The ordered stop."""

@@ -140,7 +140,7 @@ def _with_record(rig: Rig, fault: Fault, phase: Phase, outcome: Outcome) -> Outc
         stop_s=rig.stop_s,
     )
     lasting = outcome.verdict or judge.text_of(
-        outcome, fix_expected=phase is not Phase.LANDING, record_expected=not _hits_record(fault)
+        outcome, fix_expected=phase not in fault.no_fix_in, record_expected=not _hits_record(fault)
     )
     return msgspec.structs.replace(outcome, verdict=lasting)
 
