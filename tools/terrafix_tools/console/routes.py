@@ -85,8 +85,9 @@ def log_in(request: Request, response: Response, given: Tokens) -> Session:
     role = access.role_of(given.token)
     if role is None:
         raise Refusal(401, "no such token")
-    secure = request.url.scheme == "https"
-    response.set_cookie(COOKIE, given.token, httponly=True, samesite="strict", secure=secure)
+    if access.required:
+        secure = request.url.scheme == "https"
+        response.set_cookie(COOKIE, given.token, httponly=True, samesite="strict", secure=secure)
     return Session(required=access.required, role=role)
 
 

@@ -80,7 +80,7 @@ class _Reader:
 
     def on_header_end(self) -> None:
         if self._name.lower() == b"content-disposition":
-            self._disposition = self._value.decode("utf-8", errors="replace")
+            self._disposition = self._value.decode("latin-1")  # as parse_options_header encodes it again
         self._name.clear()
         self._value.clear()
 
