@@ -1,6 +1,6 @@
 """The licences of what an installation brings, by extra, from the metadata of the installed packages.
 
-Run this file to write the table of docs/licences.md; a test compares them, and refuses what may not be shipped with Terrafix."""
+Run this file to write the table of docs/licences.md; a test compares them, and refuses what may not be shipped."""
 
 import re
 import tomllib
