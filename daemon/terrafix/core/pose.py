@@ -112,10 +112,10 @@ def fit_pose(
             gradient[:2] -= stiffness * log_so3(r_w_c.T @ r)[:2]
         scale[3:] = len(depth) / float(depth.sum())
         scaled = hessian / scale / scale[:, None]
-        eigenvalues, vectors = np.linalg.eigh(scaled)
+        eigenvalues = np.linalg.eigvalsh(scaled)
         if not eigenvalues[0] * MAX_CONDITION > eigenvalues[-1]:  # in this form the test also rejects NaN
             return None
-        step = vectors @ ((gradient / scale) @ vectors / eigenvalues) / scale
+        step = np.linalg.solve(scaled, gradient / scale) / scale
         r = r @ exp_so3(step[:3])
         p = p + r @ step[3:]
         if float(np.abs(step * scale).max()) < tolerance:
