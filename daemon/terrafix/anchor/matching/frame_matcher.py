@@ -34,6 +34,9 @@ GSD_STEPS_PER_OCTAVE = 2  # Scales are rounded to this grid, so that the map's d
 # Side of a correlation window; a wider one is correlated on coarser cells, which bounds the cost of a look with a wide
 # belief. [measured: docs/benchmark.md, the correlation of a lost vehicle]
 MAX_WINDOW_CELLS = 640
+# Hypotheses of yaw and scale above which the cells are twice as large: between two of the hypotheses the border of a
+# frame is several cells from its place anyway. [measured: docs/benchmark.md]
+MAX_FINE_HYPOTHESES = 9
 # side of a patch as a share of the height: 25 m at 100 m, one house and its surroundings [measured: docs/search.md]
 PATCH_PER_AGL = 0.25
 MIN_PATCH_CELLS = 8  # smallest side of a patch, cells [tuned]
@@ -207,6 +210,8 @@ class FrameMatcher:
         """
         hypotheses = self._next_subset(_hypotheses(view))
         cell = self.correlation_cell_m(view.agl_m)
+        if len(hypotheses) > MAX_FINE_HYPOTHESES:
+            cell *= 2.0
         while 2 * belief.half_m / cell > MAX_WINDOW_CELLS:
             cell *= 2.0
         image = without_colour(image, self.gradients)
@@ -231,7 +236,8 @@ class FrameMatcher:
             z = standardise(correlation)
             # Places without a mapped feature are neither excluded nor preferred: they are as frequent among right
             # places as among all (docs/decisions/042-vectors-as-a-layer.md).
-            z[np.isneginf(correlation)] = LLR_ZERO_Z
+            if self._drawn:
+                z[np.isneginf(correlation)] = LLR_ZERO_Z
             surfaces.append(Surface(z, e_min - frame.e_min_m, n_max - frame.n_max_m, cell))
         if not any(np.isfinite(s.z).any() for s in surfaces):
             return CorrelationResult(Verdict.OUTSIDE_MAP)

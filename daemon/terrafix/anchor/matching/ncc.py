@@ -140,8 +140,21 @@ def standardise(surface: np.ndarray) -> np.ndarray:
     finite = surface[np.isfinite(surface)]
     if finite.size < 100:
         return np.full_like(surface, np.nan)
-    low, median, high, tail = np.quantile(finite, (0.25, 0.5, 0.75, TAIL), overwrite_input=True)
+    low, median, high, tail = _quantiles(finite, (0.25, 0.5, 0.75, TAIL))
     spread = max((high - low) / 1.349, (tail - median) / TAIL_SIGMAS)
-    standardised = surface - median
-    standardised /= max(float(spread), 1e-4)
+    standardised = surface - np.float32(median)
+    standardised /= np.float32(max(spread, 1e-4))
     return np.asarray(standardised)
+
+
+def _quantiles(values: np.ndarray, shares: tuple[float, ...]) -> list[float]:
+    """Quantiles of ``values`` (N,), which are reordered; linear between two values. np.quantile imports numpy.ma at its
+    first call, which takes as long as the frame."""
+    places = [divmod(share * (values.size - 1), 1.0) for share in shares]
+    wanted = {min(int(below) + k, values.size - 1) for below, _ in places for k in (0, 1)}
+    values.partition(sorted(wanted))
+    found = []
+    for below, part in places:
+        lower, upper = float(values[int(below)]), float(values[min(int(below) + 1, values.size - 1)])
+        found.append(lower + part * (upper - lower))
+    return found

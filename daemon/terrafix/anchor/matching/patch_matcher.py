@@ -125,32 +125,31 @@ def _correlate(
     areas = pairs(window, (height + spare[0], width + spare[1]))
     patches = pairs(template, conjugate=True)
     padded = np.zeros((len(patches), *fft, 2), np.float32)
-    centred = padded[:, :patch, :patch]
+    inside = padded[:, :patch, :patch]
     area_spectra, patch_spectra = np.empty_like(padded), np.empty_like(padded)
     images, templates = as_complex(area_spectra), as_complex(patch_spectra)
     surfaces = np.empty((len(corners), n, n), np.float32)
-    own = np.empty((len(corners), 1, 1), np.float32)
+    own, under = np.empty((len(corners), 1, 1), np.float32), np.empty_like(surfaces)
+    count, channels = patch * patch, len(window)
+    area_sums = np.stack([_box_sums(channel, patch) for channel in window])
+    variance = _box_sums(np.einsum("khw,khw->hw", window, window), patch)
+    variance -= np.einsum("khw,khw->hw", area_sums, area_sums) / count
     for i, (r, c) in enumerate(corners):
         top, left = row0 + r - radius, column0 + c - radius
-        for k, of_patch in enumerate(patches[:, r : r + patch, c : c + patch]):
-            cv2.subtract(of_patch, cv2.mean(of_patch), centred[k])
-            conjugate_spectrum(padded[k], patch_spectra[k])
+        np.copyto(inside, patches[:, r : r + patch, c : c + patch])
+        for k, of_patch in enumerate(padded):
+            conjugate_spectrum(of_patch, patch_spectra[k])
             cv2.dft(areas[k, top : top + fft[0], left : left + fft[1]], area_spectra[k])
-        own[i] = np.vdot(padded, padded)
+        # The patch less its mean, without a pass over the patch: the first cell of a spectrum is the sum.
+        sums = patch_spectra[:, 0, 0] * (1.0, -1.0)
+        means = sums.ravel()[:channels] / count
+        places = (slice(top, top + n), slice(left, left + n))
         surfaces[i] = cross_correlation(images, templates)[:n, :n]
-    variance = _variance_under(window, patch)
-    under = np.stack([variance[row0 + r - radius :, column0 + c - radius :][:n, :n] for r, c in corners])
+        surfaces[i] -= np.einsum("k,khw->hw", means, area_sums[:, *places])
+        own[i] = np.vdot(padded, padded) - count * np.vdot(means, means)
+        under[i] = variance[places]
     surfaces /= np.sqrt(np.maximum(np.maximum(under, FLAT_VARIANCE * own) * own, 1e-12))
     return surfaces
-
-
-def _variance_under(window: np.ndarray, side: int) -> np.ndarray:
-    """(C, H, W) -> (H, W): sum over the channels of the squared deviations from their mean, in the square of ``side``
-    cells whose corner is the cell."""
-    squares = np.zeros(window.shape[1:], np.float32)
-    for channel in window:
-        cv2.accumulateSquare(_box_sums(channel, side), squares)
-    return np.asarray(_box_sums(np.einsum("khw,khw->hw", window, window), side) - squares / side**2)
 
 
 def _box_sums(x: np.ndarray, side: int) -> np.ndarray:

@@ -8,6 +8,7 @@ import pytest
 
 from terrafix.anchor.matching.frame_matcher import (
     LEARNED_INLIERS,
+    MAX_FINE_HYPOTHESES,
     MAX_HYPOTHESES,
     CorrelationResult,
     Fix,
@@ -311,3 +312,15 @@ def test_the_correlation_is_deterministic(matcher: FrameMatcher, frame: np.ndarr
     ]
     for a, b in zip(results[0].surfaces, results[1].surfaces, strict=True):
         assert np.array_equal(a.z, b.z, equal_nan=True)
+
+
+def test_many_hypotheses_are_correlated_on_cells_twice_as_large_and_find_the_place(
+    matcher: FrameMatcher, frame: np.ndarray
+) -> None:
+    belief = Belief(0.0, 0.0, 30.0, CELL_M)
+    few = matcher.correlate(frame, predicted_view(scale_sigma=0.06), belief)
+    many = matcher.correlate(frame, predicted_view(yaw_sigma_deg=8.0, scale_sigma=0.06), belief)
+    assert len(few.surfaces) <= MAX_FINE_HYPOTHESES < len(many.surfaces)
+    assert many.cell_m == 2.0 * few.cell_m
+    z, e_m, n_m = max(surface.best(0.0, 0.0, 200.0) for surface in many.surfaces)
+    assert z > 5.0 and np.hypot(e_m - TRUE_M[0], n_m - TRUE_M[1]) < many.cell_m

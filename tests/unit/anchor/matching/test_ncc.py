@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
+from terrafix.anchor.matching.ncc import CorrelationWindow, _quantiles, standardise
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import texture
 
@@ -126,3 +126,10 @@ def test_a_surface_with_few_finite_cells_is_nan() -> None:
     assert np.isnan(standardise(np.full((50, 50), np.nan, np.float32))).all()
     assert np.isnan(standardise(np.ones((5, 5), np.float32))).all()
     assert np.isfinite(standardise(np.ones((50, 50), np.float32))).all()  # a flat surface has no peak
+
+
+@pytest.mark.parametrize("cells", [100, 101, 1234])
+def test_quantiles_are_those_of_numpy(cells: int) -> None:
+    values = np.random.default_rng(cells).normal(size=cells).astype(np.float32)
+    shares = (0.25, 0.5, 0.75, 0.995, 1.0)
+    assert _quantiles(values.copy(), shares) == pytest.approx(np.quantile(values, shares).tolist(), abs=1e-6)

@@ -5,7 +5,7 @@ import pytest
 
 from terrafix.anchor.matching.descriptor_cache import MapFeatures
 from terrafix.anchor.matching.orthorectify import rectify
-from terrafix.anchor.matching.patch_matcher import PatchMatches, match_patches
+from terrafix.anchor.matching.patch_matcher import PatchMatches, correlate_patches, match_patches
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, FlatMap, rotation, texture, view
 
@@ -79,3 +79,23 @@ def test_ground_without_texture_gives_no_match() -> None:
     water = np.full((1440, 1440, 3), 90, np.uint8)
     found = matched(water, FlatMap(water), (float(HERE_M[0]), float(HERE_M[1])))
     assert len(found.weight) == 0
+
+
+@pytest.mark.parametrize("channels", [3, 8])
+def test_a_surface_of_a_patch_is_its_zero_mean_normalised_correlation_with_the_map(channels: int) -> None:
+    patch, radius, row0, column0 = 12, 5, 9, 7
+    rng = np.random.default_rng(channels)
+    window = (1.0 + rng.normal(size=(channels, 50, 60))).astype(np.float32)
+    template = (2.0 + rng.normal(size=(channels, 30, 40))).astype(np.float32)
+    every = np.ones(template.shape[1:], bool), np.ones(window.shape[1:], bool)
+    corners, surfaces = correlate_patches(template, every[0], window, every[1], patch, radius, row0, column0)
+    assert len(corners) >= 8 and surfaces.shape == (len(corners), 11, 11)
+    for (r, c), surface in zip(corners, surfaces, strict=True):
+        ours = template[:, r : r + patch, c : c + patch].astype(float)
+        ours -= ours.mean(axis=(1, 2), keepdims=True)
+        for dr, dc in ((0, 0), (5, 5), (10, 3), (2, 10)):
+            top, left = row0 + r - radius + dr, column0 + c - radius + dc
+            under = window[:, top : top + patch, left : left + patch].astype(float)
+            under -= under.mean(axis=(1, 2), keepdims=True)
+            expected = (ours * under).sum() / np.sqrt((ours**2).sum() * (under**2).sum())
+            assert surface[dr, dc] == pytest.approx(expected, abs=1e-4)
