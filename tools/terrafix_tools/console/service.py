@@ -126,6 +126,8 @@ class Service:
         with self.database.read() as db:
             image = flights.image_of(db, flight_id, frame_id)
         path = self.settings.flight(flight_id) / image.stored
+        if not path.is_file():
+            raise Refusal(404, f"the file of frame {frame_id} is gone from the disk of the console")
         return FileResponse(path, media_type=MEDIA_TYPES[path.suffix], headers=headers)
 
     def _out(self, flight: Flight) -> Path:
