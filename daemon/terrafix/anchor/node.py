@@ -109,8 +109,8 @@ class AnchorNode:
             self._switch_model(prediction)
         match = self._localizer.label_step(self._localized(prediction), prediction)
         return_excess_memory()
-        yield from self._search_places(prediction)
         yield match
+        yield from self._search_places(prediction)
         yield from self._pending
         self._pending.clear()
         if match.search.step is not self._published_step:

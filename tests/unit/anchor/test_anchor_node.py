@@ -424,9 +424,9 @@ def test_the_places_of_a_search_are_published_with_each_joint_correlation(
         published.append(list(node.on(predicted(frame_id, 10.0))))
     assert [[type(m) for m in messages if isinstance(m, (SearchPlaces, MapMatch))] for messages in published] == [
         [MapMatch],
-        [SearchPlaces, MapMatch],
+        [MapMatch, SearchPlaces],
         [MapMatch],
-        [SearchPlaces, MapMatch],
+        [MapMatch, SearchPlaces],
         [MapMatch],
     ]
     first, second = (m for messages in published for m in messages if isinstance(m, SearchPlaces))
