@@ -1,10 +1,9 @@
 """Cost of one look at the map and how often it finds the place, by the size of its cells: python -m
 terrafix_tools.bench.looks RECORD FLIGHT MAP [FRAMES].
 
-RECORD: flight.mcap of a replay of FLIGHT over MAP. Each of FRAMES frames, evenly spaced, is correlated from a false
-start: position, heading and height are wrong by what the first prediction of the flight states as 1-sigma, times a
-normal random number. The place is found where the highest of all surfaces lies within a fifth of the height of the
-recorded prediction."""
+RECORD: flight.mcap of a replay of FLIGHT over MAP. FRAMES frames, evenly spaced, are correlated in windows whose centre
+is up to 0.3 half widths from the recorded prediction. The place is found where the highest of all surfaces lies within
+a fifth of the height of that prediction."""
 
 import sys
 import time
@@ -12,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import typer
 
 from terrafix.anchor.matching import frame_matcher
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
@@ -26,9 +26,11 @@ from terrafix.vision.sources import open_source
 from terrafix_engines.features.gradient import GradientDescriber
 
 FOUND_PER_AGL = 0.2
-HALF_M = (200.0, 400.0)  # of the window, as for a start coordinate and for a vehicle that is lost
-WINDOW_CELLS = (320, 640, 1280)
-FINE_HYPOTHESES = (9, 10**6)
+START_HALF_M = 200.0  # half width of the window around a start coordinate
+WIDE_HALF_M = (200.0, 400.0, 800.0)  # of those of a vehicle that is lost
+WINDOW_CELLS = (160, 320, 640, 1280)
+ALL_FINE = 10**6
+FINE_HYPOTHESES = (5, 9, ALL_FINE)
 
 
 @dataclass(frozen=True)
@@ -54,41 +56,53 @@ def looks(record: Path, flight: Path, map_path: Path, frames: int) -> list[tuple
 
 
 def measure(record: Path, flight: Path, map_path: Path, frames: int) -> None:
-    """Prints a row for each half width, largest window and number of fine hypotheses."""
+    """Prints a row for each window and its most cells, heading and height as predicted, and for each number of fine
+    hypotheses, both as at the start of the flight."""
     messages = [message for _, _, message in read_flight(record)]
     origin = next(m for m in messages if isinstance(m, Origin))
     local = MapPackage.open(map_path).bind(LocalFrame(origin.lat_deg, origin.lon_deg))
     first = view_of(next(m for m in messages if isinstance(m, Prediction)), None, origin.ground_amsl_m or 0.0)
     matcher = FrameMatcher(CameraCalibration.of(origin.camera), local, GradientDescriber())
     cases = looks(record, flight, map_path, frames)
-    print("| half width | most cells | fine hypotheses | found | median z | ms |")
-    for half_m in HALF_M:
-        for cells in WINDOW_CELLS:
-            for fine in FINE_HYPOTHESES:
-                for start in ("unknown", "tracked"):
-                    frame_matcher.MAX_WINDOW_CELLS, frame_matcher.MAX_FINE_HYPOTHESES = cells, fine
-                    row = [_look(matcher, image, view, first if start == "unknown" else view, half_m, i)
-                           for i, (image, view) in enumerate(cases)]
-                    found, z, ms = zip(*row, strict=True)
-                    print(f"| {half_m:.0f} | {cells} | {fine} | {start} | {sum(found)} of {len(found)} | {np.median(z):.1f} | {np.median(ms):.0f} |", flush=True)
+    known = [(image, view, view) for image, view in cases]
+    unknown = [(image, view, _as_at_the_start(view, first, seed)) for seed, (image, view) in enumerate(cases)]
+    typer.echo("| window, m | most cells | found | median z | ms |")
+    for half_m in WIDE_HALF_M:
+        for frame_matcher.MAX_WINDOW_CELLS in WINDOW_CELLS:
+            typer.echo(
+                f"| {2 * half_m:.0f} | {frame_matcher.MAX_WINDOW_CELLS} | {_row(matcher, known, half_m)} |", flush=True
+            )
+    frame_matcher.MAX_WINDOW_CELLS = 640
+    typer.echo("| fine hypotheses | found | median z | ms |")
+    for count in FINE_HYPOTHESES:
+        frame_matcher.MAX_FINE_HYPOTHESES = count
+        typer.echo(f"| {count} | {_row(matcher, unknown, START_HALF_M)} |")
 
 
-def _look(matcher: FrameMatcher, image: Image, view: View, first: View, half_m: float, seed: int) -> tuple[bool, float, float]:
-    """-> whether the place is found, its score, and milliseconds of the processor."""
-    rng = np.random.default_rng(seed)
-    yaw, scale, east, north = rng.normal(size=4)
-    wrong = view
-    if first is not view:
-        turned = local_rotation_up(yaw * first.yaw_sigma_rad) @ view.r_w_c
-        agl_m = view.agl_m * float(np.exp(scale * first.scale_sigma))
-        wrong = replace(view, r_w_c=turned, agl_m=agl_m, yaw_sigma_rad=first.yaw_sigma_rad, scale_sigma=first.scale_sigma)
-    centre = (view.e_m + 0.3 * half_m * np.tanh(east), view.n_m + 0.3 * half_m * np.tanh(north))
-    began_s = time.process_time()
-    result = matcher.correlate(image, wrong, Window(centre, half_m))
-    elapsed_ms = (time.process_time() - began_s) * 1e3
-    best = max(result.surfaces, key=lambda surface: float(np.nanmax(surface.z)))
-    z, e_m, n_m = best.best(*centre, 2.0 * half_m)
-    return bool(np.hypot(e_m - view.e_m, n_m - view.n_m) < FOUND_PER_AGL * view.agl_m), z, elapsed_ms
+def _as_at_the_start(view: View, first: View, seed: int) -> View:
+    yaw, scale = np.random.default_rng(seed).normal(size=2)
+    return replace(
+        view,
+        r_w_c=local_rotation_up(yaw * first.yaw_sigma_rad) @ view.r_w_c,
+        agl_m=view.agl_m * float(np.exp(scale * first.scale_sigma)),
+        yaw_sigma_rad=first.yaw_sigma_rad,
+        scale_sigma=first.scale_sigma,
+    )
+
+
+def _row(matcher: FrameMatcher, cases: list[tuple[Image, View, View]], half_m: float) -> str:
+    """``cases``: image, view as recorded, view that is given."""
+    found, scores, times_ms = 0, [], []
+    for seed, (image, true, given) in enumerate(cases):
+        east, north = np.random.default_rng(seed + 1000).uniform(-0.3, 0.3, 2) * half_m
+        centre = (true.e_m + east, true.n_m + north)
+        began_s = time.process_time()
+        result = matcher.correlate(image, given, Window(centre, half_m))
+        times_ms.append((time.process_time() - began_s) * 1e3)
+        z, e_m, n_m = max(surface.best(*centre, 2.0 * half_m) for surface in result.surfaces)
+        found += bool(np.hypot(e_m - true.e_m, n_m - true.n_m) < FOUND_PER_AGL * true.agl_m)
+        scores.append(z)
+    return f"{found} of {len(cases)} | {np.median(scores):.1f} | {np.median(times_ms):.0f}"
 
 
 if __name__ == "__main__":

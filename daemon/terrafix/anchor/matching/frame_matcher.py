@@ -32,10 +32,10 @@ CORRELATION_GSD_PER_AGL = 1 / 100
 FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330}
 GSD_STEPS_PER_OCTAVE = 2  # Scales are rounded to this grid, so that the map's descriptors can be cached [tuned]
 # Side of a correlation window; a wider one is correlated on coarser cells, which bounds the cost of a look with a wide
-# belief. [measured: docs/benchmark.md, the correlation of a lost vehicle]
+# belief. [measured: docs/decisions/046-cells-of-a-look.md]
 MAX_WINDOW_CELLS = 640
-# Hypotheses of yaw and scale above which the cells are twice as large: between two of the hypotheses the border of a
-# frame is several cells from its place anyway. [measured: docs/benchmark.md]
+# Hypotheses of yaw and scale of one look. Of more, cells twice as large select as many: between two of them the border
+# of a frame is several cells from its place anyway. [measured: docs/decisions/046-cells-of-a-look.md]
 MAX_FINE_HYPOTHESES = 9
 # side of a patch as a share of the height: 25 m at 100 m, one house and its surroundings [measured: docs/search.md]
 PATCH_PER_AGL = 0.25
@@ -105,6 +105,12 @@ class CorrelationResult:
         scores = [s.at(e_m, n_m, 2.0 * self.cell_m) for s in self.surfaces]
         best = int(np.argmax(scores))
         return self.hypotheses[best], scores[best]
+
+    def best_hypotheses(self, count: int) -> tuple[Hypothesis, ...]:
+        """The ``count`` hypotheses with the highest standardised correlation anywhere, in their order."""
+        scores = [float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in self.surfaces]
+        chosen = sorted(np.argsort(scores)[-count:].tolist())
+        return tuple(self.hypotheses[i] for i in chosen)
 
     def scale_at(self, e_m: float, n_m: float) -> tuple[float, float] | None:
         """Scale of the height measured at a camera position, as (mean, variance), from the likelihoods of the scales
@@ -209,12 +215,21 @@ class FrameMatcher:
         Verdict TOO_LOW: the frame covers too few cells or sees no ground; OUTSIDE_MAP: no map data in the window.
         """
         hypotheses = self._next_subset(_hypotheses(view))
+        image = without_colour(image, self.gradients)
         cell = self.correlation_cell_m(view.agl_m)
-        if len(hypotheses) > MAX_FINE_HYPOTHESES:
-            cell *= 2.0
         while 2 * belief.half_m / cell > MAX_WINDOW_CELLS:
             cell *= 2.0
-        image = without_colour(image, self.gradients)
+        # Of a drawn map, which says little, every hypothesis counts: the belief itself searches it.
+        if len(hypotheses) > MAX_FINE_HYPOTHESES and not self._drawn:
+            coarse = self._correlated(image, view, belief, hypotheses, 2.0 * cell)
+            if coarse.verdict is Verdict.ACCEPTED:
+                hypotheses = coarse.best_hypotheses(MAX_FINE_HYPOTHESES)
+        return self._correlated(image, view, belief, hypotheses, cell)
+
+    def _correlated(
+        self, image: Image, view: View, belief: SearchWindow, hypotheses: tuple[Hypothesis, ...], cell: float
+    ) -> CorrelationResult:
+        """``image``: grey where that is enough; ``cell``: metres."""
         first = rectify(image, self.camera, view.r_w_c, view.agl_m, cell, 1)
         if first is None or min(first.mask.shape) < MIN_SIDE_CELLS / 2:
             return CorrelationResult(Verdict.TOO_LOW)

@@ -48,7 +48,7 @@ def match_patches(
     peaks = _peaks(surfaces)
     half = patch_cells / 2.0
     places = np.array([corners[i] for i in peaks.index], dtype=float).reshape(-1, 2) + half  # row, column
-    found = places + (row0 - radius_cells, column0 - radius_cells) + peaks.place
+    found = places + np.array([row0, column0]) - radius_cells + peaks.place
     return PatchMatches(
         np.column_stack([rectified.e_min_m + places[:, 1] * cell_m, rectified.n_max_m - places[:, 0] * cell_m]),
         np.column_stack([window_corner_m[0] + found[:, 1] * cell_m, window_corner_m[1] - found[:, 0] * cell_m]),

@@ -314,13 +314,19 @@ def test_the_correlation_is_deterministic(matcher: FrameMatcher, frame: np.ndarr
         assert np.array_equal(a.z, b.z, equal_nan=True)
 
 
-def test_many_hypotheses_are_correlated_on_cells_twice_as_large_and_find_the_place(
+def test_of_many_hypotheses_the_best_are_correlated_on_fine_cells_and_find_the_place(
     matcher: FrameMatcher, frame: np.ndarray
 ) -> None:
-    belief = Belief(0.0, 0.0, 30.0, CELL_M)
+    belief, wrong = Belief(0.0, 0.0, 30.0, CELL_M), local_rotation_up(np.radians(-7.0))
     few = matcher.correlate(frame, predicted_view(scale_sigma=0.06), belief)
-    many = matcher.correlate(frame, predicted_view(yaw_sigma_deg=8.0, scale_sigma=0.06), belief)
-    assert len(few.surfaces) <= MAX_FINE_HYPOTHESES < len(many.surfaces)
-    assert many.cell_m == 2.0 * few.cell_m
-    z, e_m, n_m = max(surface.best(0.0, 0.0, 200.0) for surface in many.surfaces)
-    assert z > 5.0 and np.hypot(e_m - TRUE_M[0], n_m - TRUE_M[1]) < many.cell_m
+    many = matcher.correlate(frame, predicted_view(r=wrong @ TRUE_R, yaw_sigma_deg=8.0, scale_sigma=0.06), belief)
+    assert len(few.surfaces) < MAX_FINE_HYPOTHESES == len(many.surfaces) == len(set(many.hypotheses))
+    assert many.cell_m == few.cell_m
+    hypothesis, z = many.best_at(TRUE_M[0], TRUE_M[1])
+    assert z > 5.0 and hypothesis == Hypothesis(pytest.approx(np.radians(7.0)), 1.0)  # type: ignore[arg-type]
+
+
+def test_the_best_hypotheses_keep_their_order() -> None:
+    surfaces = tuple(Surface(np.array([[0.0, z, np.nan]]), 0.0, 0.0, 1.0) for z in (3.0, 5.0, 1.0, 4.0))
+    given = tuple(Hypothesis(0.1 * k, 1.0) for k in range(4))
+    assert CorrelationResult(Verdict.ACCEPTED, surfaces, given).best_hypotheses(2) == (given[1], given[3])
