@@ -1,0 +1,17 @@
+"""Rows of a map package whose columns have the types that the format states; SQLite itself stores any type anywhere."""
+
+import sqlite3
+from typing import TypeVar
+
+import msgspec
+
+Row = TypeVar("Row")
+
+
+def typed_rows(db: sqlite3.Connection, query: str, row: type[Row]) -> list[Row]:
+    """All rows of ``query`` as the tuple type ``row``. Raises sqlite3.DatabaseError: damaged, or another type."""
+    found = db.execute(query).fetchall()
+    try:
+        return msgspec.convert(found, list[row], builtin_types=(bytes,))  # type: ignore[valid-type]
+    except msgspec.ValidationError as error:
+        raise sqlite3.DataError(f"{error} of {query.rpartition('FROM ')[2]}") from None
