@@ -136,7 +136,8 @@ def test_the_unit_is_active_when_all_processes_are_ready(booted: Booted) -> None
     assert booted.show("StatusText").startswith("flying")
     assert booted.show("NRestarts") == "0"
     assert booted.show("WatchdogUSec") == "10s"
-    assert booted.run("ps", "-o", "user=", "-p", booted.show("MainPID")).strip() in ("terrafix", "")
+    user = booted.run("id", "-u", "terrafix").strip()
+    assert f"\nUid:\t{user}\t" in booted.run("cat", f"/proc/{booted.show('MainPID')}/status"), "no root"
 
 
 def test_entries_of_the_journal_have_the_fields_of_their_line(booted: Booted) -> None:

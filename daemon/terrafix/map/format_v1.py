@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from terrafix.map.format import DEM_TILE_PX, ELEVATION_TABLE, IMAGERY_TABLE, HashRow, Layer, Level
+from terrafix.map.rows import typed_rows
 
 DEM_TABLE = "terrafix_dem"
 HASH_TABLE = "terrafix_tile_hash"
@@ -18,8 +19,8 @@ def hashes(db: sqlite3.Connection) -> list[HashRow]:
     """Tile hashes. Format 1 marks elevation with zoom -1; it is mapped to zoom 0 of the elevation table."""
     return [
         (ELEVATION_TABLE if zoom < 0 else IMAGERY_TABLE, max(zoom, 0), column, row, sha256)
-        for zoom, column, row, sha256 in db.execute(
-            f"SELECT zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}"
+        for zoom, column, row, sha256 in typed_rows(
+            db, f"SELECT zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}", tuple[int, int, int, bytes]
         )
     ]
 

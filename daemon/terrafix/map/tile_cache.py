@@ -93,7 +93,8 @@ class TileStore:
         self._cached_bytes = 0
 
     def _read_tile(self, key: Key) -> tuple[bytes, float | None, float | None] | None:
-        """Encoded bytes of a tile; scale and offset for elevation of format 2, else None. None: no such tile."""
+        """Encoded bytes of a tile; scale and offset for elevation of format 2, else None. None: no such tile, or
+        an empty one."""
         table, zoom, column, row = key
         if table != ELEVATION_TABLE:
             found = self._db.execute(
@@ -114,8 +115,8 @@ class TileStore:
                 " WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?",
                 (zoom, column, row),
             ).fetchone()
-            return None if found is None else (found[0], float(found[1]), float(found[2]))
-        return None if found is None else (found[0], None, None)
+            return None if found is None or None in found else (found[0], float(found[1]), float(found[2]))
+        return None if found is None or None in found else (found[0], None, None)
 
     def _read_hash(self, key: Key) -> bytes | None:
         """Recorded sha256 of a tile; None: no such tile."""

@@ -24,6 +24,7 @@ from terrafix.map.format import (
     checksum_of,
     signed_bytes,
 )
+from terrafix.map.rows import typed_rows
 
 
 def connect(path: Path) -> sqlite3.Connection:
@@ -55,7 +56,7 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
         raise MapError(
             f"{path}: not a Terrafix map package; make one with 'terrafix map build IMAGERY.tif --out MAP.gpkg'"
         )
-    rows: dict[str, str] = dict(db.execute(f"SELECT key, value FROM {MANIFEST_TABLE}"))
+    rows = dict(typed_rows(db, f"SELECT key, value FROM {MANIFEST_TABLE}", tuple[str, str]))
     version = rows.get("format_version", "")
     if version.isdigit() and int(version) > FORMAT_VERSION:
         raise MapError(
@@ -71,9 +72,8 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
         hashes = format_v1.hashes(db)
         checksum = format_v1.checksum_of(rows, hashes)
     else:
-        hashes = db.execute(
-            f"SELECT table_name, zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}"
-        ).fetchall()
+        columns = "table_name, zoom_level, tile_column, tile_row, sha256"
+        hashes = typed_rows(db, f"SELECT {columns} FROM {HASH_TABLE}", HashRow)
         checksum = checksum_of(rows.items(), hashes)
     if checksum != rows.get("checksum"):
         raise MapError(f"{path}: checksum mismatch, the package was altered; build or copy it again")
@@ -104,7 +104,8 @@ def check_signature(
     tables = {row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     signed: list[str] = []
     if SIGNATURE_TABLE in tables and manifest.format_version > 1:
-        for key_id, public_key, signature in db.execute(f"SELECT key_id, public_key, signature FROM {SIGNATURE_TABLE}"):
+        query = f"SELECT key_id, public_key, signature FROM {SIGNATURE_TABLE}"
+        for key_id, public_key, signature in typed_rows(db, query, tuple[str, bytes, bytes]):
             key = TrustedKey(public_key)
             if key.key_id != key_id or not is_signed(key, signed_bytes(manifest.checksum), signature):
                 raise MapError(

@@ -1,6 +1,7 @@
 """Fuzzing of the parsers of what comes from outside: mutated inputs, a corpus of earlier findings, and its command."""
 
 import random
+import sqlite3
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer import Exit
 
-from terrafix.core.errors import SourceError
+from terrafix.core.errors import MapError, SourceError
+from terrafix.map.package import MapPackage
 from terrafix.vision.sources.images import decode_image
 from terrafix_tools.fuzz import __main__ as command
 from terrafix_tools.fuzz.mutate import MAX_BYTES, mutated
@@ -54,6 +56,31 @@ def test_arbitrary_bytes_are_read_or_refused_in_one_line(target: Target) -> None
 @pytest.mark.parametrize("file", sorted(CORPUS.glob("*/*")), ids=lambda file: f"{file.parent.name}/{file.name}")
 def test_inputs_that_were_findings_are_read_or_refused_in_one_line(file: Path) -> None:
     refused_or_read(TARGET_OF[file.parent.name], file.read_bytes())
+
+
+NULLS = (
+    ("terrafix_manifest", "key"),
+    ("terrafix_manifest", "value"),
+    ("terrafix_hash", "table_name"),
+    ("terrafix_hash", "sha256"),
+    ("imagery", "tile_data"),
+)
+
+
+@pytest.mark.parametrize(("table", "column"), NULLS)
+def test_a_map_whose_table_has_a_null_is_refused_in_one_line(table: str, column: str, tmp_path: Path) -> None:
+    """Mutated maps ended in tracebacks there; their own files are too large for the corpus."""
+    path = tmp_path / "map.gpkg"
+    path.write_bytes(TARGET_OF["map"].seeds()[0])
+    with sqlite3.connect(path) as db:
+        db.executescript(
+            f"CREATE TABLE copy AS SELECT * FROM {table}; DROP TABLE {table}; ALTER TABLE copy RENAME TO {table};"
+            f"UPDATE {table} SET {column} = NULL WHERE rowid = 1"
+        )
+    db.close()
+    with pytest.raises(MapError, match=r"damaged|altered"):
+        MapPackage.open(path, verify=True)
+    refused_or_read(TARGET_OF["map"], path.read_bytes())
 
 
 def test_mutations_differ_from_their_seeds_are_bounded_and_the_same_for_a_seed() -> None:
