@@ -122,10 +122,9 @@ class MapFeatures:
 
 
 def put_widened(half: np.ndarray, to: np.ndarray) -> None:
-    """``half`` float16, finite, into ``to``, float32 of the same shape, exactly. ``to[:] = half`` takes five times as
+    """``half`` float16, finite, into ``to``, float32 of the same shape, exactly. ``to[:] = half`` takes four times as
     long in numpy, which converts one number after the other."""
-    bits = to.view(np.int32)
-    bits[...] = half.view(np.int16)
-    np.left_shift(bits, _MANTISSA_SHIFT, out=bits)
-    np.bitwise_and(bits, _SIGN_ONCE, out=bits)
-    np.multiply(to, _EXPONENT_BIASES, out=to)
+    bits = half.view(np.int16).astype(np.int32)
+    bits <<= _MANTISSA_SHIFT
+    bits &= _SIGN_ONCE
+    np.multiply(bits.view(np.float32), _EXPONENT_BIASES, out=to)
