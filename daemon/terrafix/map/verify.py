@@ -73,7 +73,7 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
         checksum = format_v1.checksum_of(rows, hashes)
     else:
         columns = "table_name, zoom_level, tile_column, tile_row, sha256"
-        hashes = typed_rows(db, f"SELECT {columns} FROM {HASH_TABLE}", HashRow)
+        hashes = typed_rows(db, f"SELECT {columns} FROM {HASH_TABLE}", tuple[str, int, int, int, bytes])
         checksum = checksum_of(rows.items(), hashes)
     if checksum != rows.get("checksum"):
         raise MapError(f"{path}: checksum mismatch, the package was altered; build or copy it again")

@@ -1,14 +1,15 @@
-"""Cost of one look at the map and how often it finds the place, by the size of its cells: python -m
-terrafix_tools.bench.looks RECORD FLIGHT MAP [FRAMES].
+"""Cost of one look at the map and how often it finds the place, by the size of its cells.
+
+python -m terrafix_tools.bench.looks RECORD FLIGHT MAP [--frames N]
 
 RECORD: flight.mcap of a replay of FLIGHT over MAP. FRAMES frames, evenly spaced, are correlated in windows whose centre
 is up to 0.3 half widths from the recorded prediction. The place is found where the highest of all surfaces lies within
 a fifth of the height of that prediction."""
 
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -24,6 +25,7 @@ from terrafix.messages import Origin, Prediction
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import open_source
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.standalone import run_standalone
 
 FOUND_PER_AGL = 0.2
 START_HALF_M = 200.0  # half width of the window around a start coordinate
@@ -55,7 +57,12 @@ def looks(record: Path, flight: Path, map_path: Path, frames: int) -> list[tuple
     return found
 
 
-def measure(record: Path, flight: Path, map_path: Path, frames: int) -> None:
+def main(
+    record: Annotated[Path, typer.Argument(help="flight.mcap of a replay.")],
+    flight: Annotated[Path, typer.Argument(help="Folder of that flight.")],
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="Map package of that replay.")],
+    frames: Annotated[int, typer.Option(min=1, help="Frames, evenly spaced.")] = 12,
+) -> None:
     """Prints a row for each window and its most cells, heading and height as predicted, and for each number of fine
     hypotheses, both as at the start of the flight."""
     messages = [message for _, _, message in read_flight(record)]
@@ -69,9 +76,7 @@ def measure(record: Path, flight: Path, map_path: Path, frames: int) -> None:
     typer.echo("| window, m | most cells | found | median z | ms |")
     for half_m in WIDE_HALF_M:
         for frame_matcher.MAX_WINDOW_CELLS in WINDOW_CELLS:
-            typer.echo(
-                f"| {2 * half_m:.0f} | {frame_matcher.MAX_WINDOW_CELLS} | {_row(matcher, known, half_m)} |", flush=True
-            )
+            typer.echo(f"| {2 * half_m:.0f} | {frame_matcher.MAX_WINDOW_CELLS} | {_row(matcher, known, half_m)} |")
     frame_matcher.MAX_WINDOW_CELLS = 640
     typer.echo("| fine hypotheses | found | median z | ms |")
     for count in FINE_HYPOTHESES:
@@ -106,4 +111,4 @@ def _row(matcher: FrameMatcher, cases: list[tuple[Image, View, View]], half_m: f
 
 
 if __name__ == "__main__":
-    measure(*(Path(text) for text in sys.argv[1:4]), int(sys.argv[4]) if len(sys.argv) > 4 else 12)
+    run_standalone("bench.looks", main)

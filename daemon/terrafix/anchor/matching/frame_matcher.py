@@ -32,10 +32,10 @@ CORRELATION_GSD_PER_AGL = 1 / 100
 FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330}
 GSD_STEPS_PER_OCTAVE = 2  # Scales are rounded to this grid, so that the map's descriptors can be cached [tuned]
 # Side of a correlation window; a wider one is correlated on coarser cells, which bounds the cost of a look with a wide
-# belief. [measured: docs/decisions/046-cells-of-a-look.md]
+# belief. [measured: docs/decisions/047-cells-of-a-look.md]
 MAX_WINDOW_CELLS = 640
 # Hypotheses of yaw and scale of one look. Of more, cells twice as large select as many: between two of them the border
-# of a frame is several cells from its place anyway. [measured: docs/decisions/046-cells-of-a-look.md]
+# of a frame is several cells from its place anyway. [measured: docs/decisions/047-cells-of-a-look.md]
 MAX_FINE_HYPOTHESES = 9
 # side of a patch as a share of the height: 25 m at 100 m, one house and its surroundings [measured: docs/search.md]
 PATCH_PER_AGL = 0.25

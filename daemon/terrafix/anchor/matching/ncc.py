@@ -83,7 +83,7 @@ def _centred(template: np.ndarray, mask: np.ndarray) -> np.ndarray:
     elsewhere."""
     centred, inside = np.zeros_like(template), mask.view(np.uint8)
     for channel, out in zip(template, centred, strict=True):
-        cv2.subtract(channel, cv2.mean(channel, inside), out, inside)
+        np.subtract(channel, np.float32(cv2.mean(channel, inside)[0]), out=out, where=mask)
     return centred
 
 
