@@ -152,6 +152,26 @@ def test_a_body_that_is_no_multipart_or_is_cut_is_refused(console: Console) -> N
     assert_refused(console.send("POST", path, b"", kind), 422)
 
 
+def test_names_and_tokens_beyond_latin_1_are_no_failure_of_the_service(console: Console) -> None:
+    kind = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
+    path = f"/flights/{console.create()}/images/batch"
+    body = multipart([("\u6c34", "IMG_0001.jpg", jpeg())])
+    assert_refused(console.send("POST", path, body, kind), 422)
+    answer = console.send("POST", "/session", {"token": "\u6c34"})
+    assert (answer.status, answer.json["required"]) == (200, False)
+    assert "set-cookie" not in answer.headers
+
+
+def test_an_image_whose_file_is_gone_is_not_found(console: Console) -> None:
+    flight_id = console.create()
+    console.upload(flight_id, batch(1))
+    path = f"/flights/{flight_id}/frames/3/image"
+    assert console.send("GET", path).status == 200
+    for file in console.service.settings.flight(flight_id).rglob("*.jpg"):
+        file.unlink()
+    assert_refused(console.send("GET", path), 404)
+
+
 def test_a_large_upload_that_is_refused_early_still_gets_its_answer(console: Console) -> None:
     parts = [("other", "x", b""), ("images", "IMG_0001.jpg", b"x" * 20_000_000)]
     assert_refused(console.upload(console.create(), parts), 422, "'other'")

@@ -14,6 +14,7 @@ import numpy as np
 
 from terrafix.processes import PROCESSES
 from terrafix_tools.chaos.camera import Look
+from terrafix_tools.chaos.console import Console
 from terrafix_tools.chaos.rig import COOL_MC, Need, Rig
 from terrafix_tools.chaos.scene import Phase
 from terrafix_tools.chaos.switches import Switch
@@ -154,6 +155,15 @@ def switched(name: str, switch: Switch, value: float, *needs: Need) -> Fault:
     )
 
 
+def console(name: str, lasts_s: float, begin: Callable[[Console], None], end: Callable[[Console], None]) -> Fault:
+    def act(rig: Rig, action: Callable[[Console], None]) -> None:
+        assert rig.console is not None
+        action(rig.console)
+
+    needs = frozenset({Need.CONSOLE})
+    return Fault(f"console: {name}", lasts_s, lambda rig: act(rig, begin), lambda rig: act(rig, end), needs=needs)
+
+
 def _alter(path: Path) -> None:
     """Overwrites a part of the file in place, as a failing disk would."""
     size = path.stat().st_size
@@ -239,6 +249,9 @@ FAULTS: tuple[Fault, ...] = (
         no_fix_in=frozenset({Phase.LANDING, Phase.START}),  # nothing has opened it yet
     ),
     Fault("map: file altered", 0.0, begin=lambda rig: _alter(rig.map_path)),
+    console("kill -9", 0.0, lambda it: it.signal(signal.SIGKILL), lambda _: None),
+    console("SIGSTOP", LONG_S, lambda it: it.signal(signal.SIGSTOP), lambda it: it.signal(signal.SIGCONT)),
+    console("flooded by 208 clients", LONG_S, Console.flood, Console.end_flood),
     Fault("processor: saturated", LONG_S, _saturate, _rest),
     Fault("heat: 40 to 97 to 40 C", LONG_S, during=_heat, end=lambda rig: rig.set_temperature(COOL_MC)),
 )

@@ -14,6 +14,7 @@ from terrafix.core.errors import SourceError
 from terrafix.runtime.run_dir import PREFIX, SHM, write_atomic
 from terrafix_tools import child_process
 from terrafix_tools.chaos.camera import StreamedCamera, camera_toml
+from terrafix_tools.chaos.console import Console
 from terrafix_tools.chaos.scene import Scene
 from terrafix_tools.chaos.serial_line import SerialLine
 from terrafix_tools.chaos.switches import Switches
@@ -38,6 +39,7 @@ class Need(StrEnum):
     SERIAL = "a serial line to the autopilot"
     SWITCHES = "the switches of switches.py"
     MODEL = "the weights of XFeat"
+    CONSOLE = "a console that shows the flight"
 
 
 ROOT = frozenset({Need.DISK, Need.SHARED_MEMORY})
@@ -71,6 +73,7 @@ class Rig:
             self.model_path.write_bytes(model.read_bytes())
         self._needs = needs
         self.line: SerialLine | None = None
+        self.console: Console | None = None  # from the take-off on
         self._died_s: float | None = None
         self._daemon: subprocess.Popen[bytes] | None = None
         self.stop_s: float | None = None  # that the ordered stop took
@@ -89,6 +92,8 @@ class Rig:
         for program in self.busy:
             program.kill()
             program.wait()
+        if self.console is not None:
+            self.console.end()
         self.stop()
         self.camera.__exit__()
         self.stream.close()
@@ -104,6 +109,8 @@ class Rig:
             self.check()
             if time.monotonic() > until_s or self._ended_by_itself():
                 raise SourceError(f"{self.folder}: Terrafix has not started; see {self.log}")
+        if Need.CONSOLE in self._needs:
+            self.console = Console(next(self.run_folders()), self.folder)
         self.began_s = time.monotonic()
 
     def flight_s(self) -> float:
