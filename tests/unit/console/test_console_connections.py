@@ -69,7 +69,10 @@ def test_a_connection_that_is_kept_alive_has_its_time_for_each_head(console: Con
     with connected(console) as kept:
         for _ in range(2):
             kept.sendall(HEAD + b"\r\n")
-            assert kept.recv(4096).startswith(b"HTTP/1.1 200")
+            answer = kept.recv(4096)
+            while not answer.endswith(b"}"):  # head and body may come one after the other
+                answer += kept.recv(4096)
+            assert answer.startswith(b"HTTP/1.1 200")
             time.sleep(0.5)  # idle: longer than a head may take
         kept.sendall(HEAD)
         assert ended(kept)
