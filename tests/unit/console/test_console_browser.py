@@ -82,6 +82,31 @@ def test_photos_become_a_track_and_a_pixel_gets_its_position(tmp_path: Path, win
         assert window.errors == []
 
 
+def test_a_route_instead_of_a_map_has_its_corridor_fetched(tmp_path: Path, window: Browser) -> None:
+    sources = tmp_path / "sources.toml"
+    sources.write_text("")  # none covers the route: the flight is created all the same
+    images = [tmp_path / name for _, name, _ in batch(0)]
+    for path, (_, _, content) in zip(images, batch(0), strict=True):
+        path.write_bytes(content)
+    with Console(settings(tmp_path, sources=sources)) as console:
+        window.open(f"{console.url}/page/#/new")
+        window.wait("document.getElementById('f-route')")
+        window.choose_files("#f-images", images)
+        window.wait("document.getElementById('f-width').value === '640'")
+        for field, value in {"fx": 500, "corridor_m": 250, "route": "48.15, 14.35\n48.16 east"}.items():
+            enter(window, field, value)
+        window.click("form.new button.primary")
+        window.wait("document.querySelector('form.new .error[role=alert]').textContent.includes('48.16 east')")
+        enter(window, "route", "48.15, 14.35\n\n 48.16 14.37 ")
+        window.click("form.new button.primary")
+        window.wait("location.hash.startsWith('#/flight/')")
+        flight_id = window.run("location.hash.split('/')[2]")
+        with console.service.database.read() as db:
+            area = json.loads(flights.row_of(db, flight_id).spec)["area"]
+        assert area["waypoints"] == [{"lat": 48.15, "lon": 14.35}, {"lat": 48.16, "lon": 14.37}]
+        assert area["corridor_m"] == 250.0
+
+
 def test_sizes_of_batches_distances_and_exports_of_the_page(tmp_path: Path, window: Browser) -> None:
     with Console(settings(tmp_path)) as console:
         window.open(f"{console.url}/page/#/")

@@ -37,7 +37,8 @@ export class NewView {
   }
 
   async open() {
-    this.maps = (await get("/maps")).maps;
+    const [{maps}, {service}] = await Promise.all([get("/maps"), get("/config")]);
+    this.maps = maps;
     const field = (id, attributes = {}) => {
       const label = t(`f_${id}`);
       const input = h("input", {id: `f-${id}`, type: "number", step: "any", inputmode: "decimal", ...attributes});
@@ -45,6 +46,9 @@ export class NewView {
       return h("div", {class: "field"}, h("label", {for: `f-${id}`}, label), input);
     };
     this.map = h("select", {id: "f-map", onchange: () => this.showMap()}, this.maps.map((one) => h("option", {value: one.name}, one.name)));
+    this.route = h("textarea", {id: "f-route", rows: 3, spellcheck: "false", placeholder: "48.1372, 11.5755"});
+    const area = [h("p", {class: "soft"}, t("route_why")), h("div", {class: "field"}, h("label", {for: "f-route"}, t("f_route")), this.route),
+      h("div", {class: "fields"}, field("corridor_m", {value: 1000, min: 100, max: 20000}))];
     this.images = h("input", {id: "f-images", type: "file", multiple: true, required: true, accept: "image/jpeg,image/png", onchange: () => this.read()});
     this.table = h("input", {id: "f-table", type: "file", accept: ".csv,text/csv"});
     this.renumber = h("input", {id: "f-renumber", type: "checkbox"});
@@ -61,11 +65,12 @@ export class NewView {
         field("fx", {min: 1}), field("focal_mm", {min: 0.1}), field("sensor_width_mm", {min: 0.1}),
         field("pitch_deg", {value: -90, min: -90, max: 0}), field("mount_yaw_deg", {value: 0}), field("tolerance_deg", {value: 12, min: 1, max: 90}))),
       h("fieldset", {}, h("legend", {}, t("map_and_start")), this.maps.length
-        ? h("div", {class: "field"}, h("label", {for: "f-map"}, t("map")), this.map) : h("p", {class: "error"}, t("no_maps")),
+        ? h("div", {class: "field"}, h("label", {for: "f-map"}, t("map")), this.map) : h("p", {class: service.areas ? "soft" : "error"}, t("no_maps")),
+        service.areas ? area : [],
       h("p", {class: "soft"}, t("start_why")), this.picture, h("div", {class: "fields"},
         field("lat", {min: -90, max: 90}), field("lon", {min: -180, max: 180}), field("sigma_m", {value: 10, min: 0.1}),
         field("agl_m", {min: 1}), field("yaw_deg", {min: 0, max: 360}))),
-      this.wrong, h("p", {}, h("button", {class: "primary", disabled: !this.maps.length}, t("create_and_upload"))));
+      this.wrong, h("p", {}, h("button", {class: "primary", disabled: !this.maps.length && !service.areas}, t("create_and_upload"))));
     fill(this.main, form);
     if (this.maps.length) this.showMap();
     for (const input of [this.lat, this.lon]) input.addEventListener("change", () => this.mark());
@@ -91,7 +96,7 @@ export class NewView {
   mark() {
     this.marker?.remove();
     this.marker = null;
-    if (this.lat.value === "" || this.lon.value === "") return;
+    if (!this.leaflet || this.lat.value === "" || this.lon.value === "") return;
     this.marker = L.circleMarker([+this.lat.value, +this.lon.value], {radius: 8, color: "#0a0e12", fillColor: "#ffe14d", fillOpacity: 1, weight: 3});
     this.marker.addTo(this.leaflet);
   }
@@ -120,10 +125,22 @@ export class NewView {
       camera: {width: value(this.width), height: value(this.height), ...focal},
       mount: {yaw_deg: value(this.mount_yaw_deg) ?? 0, pitch_deg: value(this.pitch_deg) ?? -90, tolerance_deg: value(this.tolerance_deg) ?? 12},
       start: lat === undefined || lon === undefined ? undefined : {lat, lon, sigma_m: value(this.sigma_m) ?? 10},
-      map: this.map.value,
+      ...this.mapOrArea(),
       height_m: value(this.agl_m),
       yaw_deg: value(this.yaw_deg),
     };
+  }
+
+  /** The route, if there is one, else the map. */
+  mapOrArea() {
+    const lines = this.route.value.split("\n").map((line) => line.trim()).filter(Boolean);
+    if (!lines.length) return {map: this.map.value};
+    const waypoints = lines.map((line) => {
+      const [lat, lon] = line.split(/[,;\s]+/).map(Number);
+      if (!Number.isFinite(lat) || !Number.isFinite(lon)) throw new Error(t("bad_waypoint", line));
+      return {lat, lon};
+    });
+    return {area: {waypoints, corridor_m: Number(this.corridor_m.value)}};
   }
 
   async submit(event) {
