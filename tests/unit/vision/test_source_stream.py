@@ -60,7 +60,7 @@ def test_mjpeg_frames_carry_their_exposure_times(description: Path, watch: Calla
         assert source.live
         seen = watch(source)
         assert stream.wait_for_viewer(10.0)
-        base_ns = now_ns() - 5_000_000_000  # exposed long before they are sent, like delayed frames
+        base_ns = now_ns() - 900_000_000  # exposed long before they are sent, like delayed frames
         for i in range(5):
             stream.push(picture(i), base_ns + i * 50_000_001)
         until(lambda: len(seen) == 5)
@@ -69,6 +69,25 @@ def test_mjpeg_frames_carry_their_exposure_times(description: Path, watch: Calla
     for i, shot in enumerate(seen):
         assert shot.image is not None and shot.image.shape == (HEIGHT, WIDTH, 3)
         assert float(np.abs(shot.image.astype(float) - picture(i)).mean()) < 6.0
+
+
+def test_images_that_come_more_than_two_seconds_after_their_stamp_are_left_out(
+    description: Path, watch: Callable[[Source], list[Shot]]
+) -> None:
+    with FrameStream() as stream:
+        seen = watch(open_source(stream.url, camera=description, rate_hz=100.0))
+        assert stream.wait_for_viewer(10.0)
+        begin_ns = now_ns()
+        stream.push(picture(0), begin_ns - 1_000_000_000)
+        until(lambda: len(seen) == 1)
+        for i in range(3):  # the camera's clock is wrong, or its buffer is long
+            stream.push(picture(i), begin_ns - 2_100_000_000 + i)
+            time.sleep(0.05)
+        in_time_ns = now_ns()
+        stream.push(picture(1), in_time_ns)
+        until(lambda: len(seen) == 2)
+    assert [shot.frame.t_ns for shot in seen] == [begin_ns - 1_000_000_000, in_time_ns]
+    assert [shot.frame.frame_id for shot in seen] == [0, 1]
 
 
 def test_a_lost_stream_is_reconnected(description: Path, watch: Callable[[Source], list[Shot]]) -> None:

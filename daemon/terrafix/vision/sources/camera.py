@@ -19,6 +19,9 @@ from terrafix.vision.sources.mjpeg import MjpegCapture
 
 RECONNECT_S = 1.0  # a USB camera needs about this long to re-enumerate
 READ_TIMEOUT_MS = 2000  # OpenCV's default of 10 s would delay the exit of the process
+# An image that arrives later after its stamp is not used: it says little about now, and if its stamp is wrong instead,
+# the position is wrong by seconds of flight. [spec: range of the time offset, estimator/integrity/time_offset.py]
+MAX_LATE_NS = 2_000_000_000
 MAX_DRIVER_AGE_NS = 1_000_000_000  # an older driver timestamp belongs to another clock
 
 
@@ -66,6 +69,7 @@ class LiveCamera:
         self._reconnect_s = reconnect_s
         self._closed = threading.Event()
         self._streaming = False
+        self._late = False  # the last image was too late
         self._socket: socket.socket | None = None  # of a stream
         self._capture = self._try_open() if wait else self._open(self.spec, self._origin.camera)
         if self._capture is not None:
@@ -109,8 +113,9 @@ class LiveCamera:
                     if not self._closed.is_set():
                         logs.get().warning("camera lost; reconnecting", source=self.spec)
                     continue
-                t_ns = _timestamp_ns(capture, now_ns())
-                if t_ns < due_ns:
+                arrival_ns = now_ns()
+                t_ns = _timestamp_ns(capture, arrival_ns)
+                if self._is_late(arrival_ns - t_ns) or t_ns < due_ns:
                     continue
                 due_ns = max(due_ns + self._period_ns, t_ns + self._period_ns // 2)  # keeps the mean rate, no bursts
                 yield self._shot(capture, frame_id, t_ns)
@@ -118,6 +123,22 @@ class LiveCamera:
         finally:
             self._streaming = False
             self._disconnect()
+
+    def _is_late(self, age_ns: int) -> bool:
+        """Whether an image that arrives ``age_ns`` after its stamp is left out. Beginning and end are in the log."""
+        late = age_ns > MAX_LATE_NS
+        if late != self._late:
+            self._late = late
+            if late:
+                logs.get().warning(
+                    "images too late",
+                    source=self.spec,
+                    age_s=round(age_ns / 1e9, 1),
+                    todo="compare the clock of the camera's time stamps; shorten its buffers",
+                )
+            else:
+                logs.get().info("images in time again", source=self.spec)
+        return late
 
     def _shot(self, capture: Capture, frame_id: int, t_ns: int) -> Shot:
         camera = self._origin.camera
