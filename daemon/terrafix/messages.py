@@ -370,7 +370,7 @@ class SearchState(Message, frozen=True, kw_only=True):
 
 class SearchPlaces(Message, frozen=True, kw_only=True):
     """What a running search covers and the best places of its last joint correlation, for an operator who can help it;
-    published before the MapMatch of the frame, when it differs from the one before.
+    published after the MapMatch of the frame, when it differs from the one before.
 
     ``tiles``: number of tiles around the last position; None: the whole map. ``places``: (latitude, longitude) [deg] of
     the camera; at most five, the best first. ``half_size_m``: half the side of a square into which

@@ -2,9 +2,17 @@
 
 import os
 import signal
+import socket
 import subprocess
 from contextlib import suppress
 from pathlib import Path
+
+
+def free_port() -> int:
+    """A TCP port on loopback that nothing uses now, for a program that is started next."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def end(process: "subprocess.Popen[bytes]", limit_s: float) -> None:

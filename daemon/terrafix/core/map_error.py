@@ -9,7 +9,11 @@ flies over them."""
 ILLUMINATION_SIGMA_M = 1.0  # [measured: docs/integrity.md]
 
 
+def illumination_variance_m2(map_sigma_m: float) -> float:
+    """Variance per horizontal axis by shadows. ``map_sigma_m``: 1-sigma of the map; 0 means that there was no match."""
+    return ILLUMINATION_SIGMA_M**2 if map_sigma_m else 0.0
+
+
 def shared_variance_m2(map_sigma_m: float) -> float:
-    """Variance per horizontal axis of a position by matches with a map of 1-sigma ``map_sigma_m``; 0 means that there
-    was no match: then there is none."""
-    return map_sigma_m**2 + ILLUMINATION_SIGMA_M**2 if map_sigma_m else 0.0
+    """Variance per horizontal axis of a position by matches with a map of 1-sigma ``map_sigma_m``, shadows included."""
+    return map_sigma_m**2 + illumination_variance_m2(map_sigma_m)

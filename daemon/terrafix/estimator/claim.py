@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.core.map_error import shared_variance_m2
+from terrafix.core.map_error import illumination_variance_m2
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
@@ -32,7 +32,7 @@ def claim(estimator: Estimator, frame: FrameState, time_offset_sigma_s: float, c
     # The error of the map is the same everywhere: no number of matches averages it away.
     cov[WORLD_POSITION, WORLD_POSITION] += estimator.map_sigma_m**2 * np.eye(3)
     budget.close("map")
-    cov[HORIZONTAL, HORIZONTAL] += (shared_variance_m2(estimator.map_sigma_m) - estimator.map_sigma_m**2) * np.eye(2)
+    cov[HORIZONTAL, HORIZONTAL] += illumination_variance_m2(estimator.map_sigma_m) * np.eye(2)
     budget.close("illumination")
     shift_m, shift_cov = state.principal_point.shift(state.principal_point_jacobian(frame.pose))
     cov[HORIZONTAL, HORIZONTAL] += shift_cov

@@ -24,7 +24,7 @@ from terrafix.estimator.measurements.map_pose import (
     MapPoseMeasurement,
     determined,
     levelled,
-    levelled_offset,
+    levelled_innovation,
 )
 from terrafix.estimator.models.motion_model import unknown_motion_cov
 from terrafix.estimator.propagation import STEP_SHARE
@@ -164,15 +164,15 @@ class MapUpdate:
         fixed_s, before = state.graph.time_of(node), state.graph.state(node)
         share = self._fixes.information_share(fixed_s, here, height_m)
         measurement = replace(measurement, information_share=share)
-        fixed = levelled(measurement, before.pose, state.covariance(node))
-        offset = levelled_offset(measurement, before.pose, state.covariance(node))
+        predicted = before.pose, state.covariance(node)
+        fixed, position = levelled(measurement, *predicted), levelled_innovation(measurement, *predicted)
         fusion = fuse(state, node, measurement)
         if fusion.verdict is not Verdict.ACCEPTED:
             assert fusion.innovation is not None
             return self._reject(match, node, measurement, fusion.innovation)
         self._rejected.clear()
         if not match.position_only:
-            self.hypotheses.map_consistency.add_accepted(share, *offset)
+            self.hypotheses.map_consistency.add_accepted(share, position)
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
         return MapResult(replace(fusion, detail=f"information share {share:.2f}"), fixed=fixed)

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafix_tools.bench.soak import TURN_S, Samples, ShuttleScene, grows, growth, slope_per_h
+from terrafix_tools.bench.soak import Samples, grows, growth, slope_per_h
 from terrafix_tools.chaos.scene import Phase, Scene
+from terrafix_tools.chaos.shuttle import TURN_S, ShuttleScene
 from terrafix_tools.sim.autopilot.course import PeerState
 
 

@@ -60,9 +60,7 @@ def bench_console(
 
 @contextmanager
 def _service(folder: Path, map_package: Path) -> Iterator[tuple[ConsoleClient, "subprocess.Popen[bytes]"]]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = child_process.free_port()
     words = ["serve", "--data", str(folder / "data"), "--maps", str(map_package.parent), "--port", str(port)]
     # Without processes for flights: those have benches of their own.
     process = subprocess.Popen([sys.executable, "-m", "terrafix_tools.program", *words, "--workers", "0"])

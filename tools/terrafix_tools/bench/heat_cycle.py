@@ -20,20 +20,18 @@ import typer
 from rich.console import Console
 
 from terrafix.core.config import HealthSection
-from terrafix.core.errors import OutputError
 from terrafix.messages import Health, NavEstimate, ThermalBand
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.bench.result_file import write_result
-from terrafix_tools.bench.soak import ShuttleScene
 from terrafix_tools.chaos.rig import COOL_MC, Rig
-from terrafix_tools.chaos.scene import Scene, scene_in
+from terrafix_tools.chaos.scene import Scene
+from terrafix_tools.chaos.shuttle import RUN, shuttle_in
 from terrafix_tools.standalone import run_standalone
 
 HOTTEST_MC = 96_000
 SCATTER_MC = 1_000
 LEAD_S = 15.0  # cool, for the first fixes
 MOST_STEP = 0.10  # [spec: no step of sigma above 10 % from the switch itself]
-NEIGHBOURS_S = 0.35  # two GPS_INPUT further apart are no neighbours: three periods
 PERIOD_S = 0.25  # of the changes of the zone
 OTHER = 1  # exit code
 BANDS = [ThermalBand.NORMAL, ThermalBand.HOT, ThermalBand.CRITICAL, ThermalBand.HOT, ThermalBand.NORMAL]
@@ -48,7 +46,7 @@ def temperature_mc(share: float, random: np.random.Generator) -> int:
 def measure(scene: Scene, out: Path, seconds: float, seed: int) -> dict[str, Any]:
     """Flies in ``out``, a new folder. Raises SourceError, OSError."""
     random = np.random.default_rng(seed)
-    with Rig(ShuttleScene(scene).unfolded(), out, 0.0, seed=seed) as rig:
+    with Rig(scene, out, 0.0, seed=seed) as rig:
         rig.take_off()
         began_s = time.monotonic()
         while (elapsed_s := time.monotonic() - began_s) < LEAD_S + seconds + LEAD_S:
@@ -107,10 +105,7 @@ def main(
     seed: Annotated[int, typer.Option(help="Seed of the place and of the noise.")] = 1,
     json_file: Annotated[Path | None, typer.Option("--json", help="JSON to write.")] = None,
 ) -> None:
-    if (out / "run").exists():
-        raise OutputError(f"{out / 'run'}: exists; give a new folder")
-    out.mkdir(parents=True, exist_ok=True)
-    result = measure(scene_in(out / f"flight-{seed}", seed), out / "run", seconds, seed)
+    result = measure(shuttle_in(out, seed), out / RUN, seconds, seed)
     Console().print(result)
     write_result(json_file, result)
     good = result["bands"] == [str(band) for band in BANDS] and not result["not_as_configured"]

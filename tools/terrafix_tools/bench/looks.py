@@ -2,11 +2,12 @@
 
 python -m terrafix_tools.bench.looks RECORD FLIGHT MAP [--frames N]
 
-RECORD: flight.mcap of a replay of FLIGHT over MAP. FRAMES frames, evenly spaced, are correlated in windows whose centre
+RECORD: flight.mcap of a replay of FLIGHT over MAP. N frames, evenly spaced, are correlated in windows whose centre
 is up to 0.3 half widths from the recorded prediction. The place is found where the highest of all surfaces lies within
 a fifth of the height of that prediction."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -20,8 +21,8 @@ from terrafix.anchor.matching.predicted_view import ground_plane, view_of
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, local_rotation_up
 from terrafix.core.node import Image
-from terrafix.map.package import MapPackage
-from terrafix.messages import Origin, Prediction
+from terrafix.map.package import LocalMap, MapPackage
+from terrafix.messages import Message, Origin, Prediction
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import open_source
 from terrafix_engines.features.gradient import GradientDescriber
@@ -41,12 +42,10 @@ class Window:
     half_m: float
 
 
-def looks(record: Path, flight: Path, map_path: Path, frames: int) -> list[tuple[Image, View]]:
+def looks(messages: Sequence[Message], flight: Path, local: LocalMap, frames: int) -> list[tuple[Image, View]]:
     """-> image and view as recorded of ``frames`` frames."""
-    messages = [message for _, _, message in read_flight(record)]
     origin = next(m for m in messages if isinstance(m, Origin))
     predictions = {m.frame_id: m for m in messages if isinstance(m, Prediction)}
-    local = MapPackage.open(map_path).bind(LocalFrame(origin.lat_deg, origin.lon_deg))
     chosen = set(np.array(sorted(predictions))[np.linspace(1, len(predictions) - 1, frames).astype(int)].tolist())
     found = []
     for shot in open_source(str(flight)).shots():
@@ -70,14 +69,15 @@ def main(
     local = MapPackage.open(map_path).bind(LocalFrame(origin.lat_deg, origin.lon_deg))
     first = view_of(next(m for m in messages if isinstance(m, Prediction)), None, origin.ground_amsl_m or 0.0)
     matcher = FrameMatcher(CameraCalibration.of(origin.camera), local, GradientDescriber())
-    cases = looks(record, flight, map_path, frames)
+    cases = looks(messages, flight, local, frames)
     known = [(image, view, view) for image, view in cases]
     unknown = [(image, view, _as_at_the_start(view, first, seed)) for seed, (image, view) in enumerate(cases)]
     typer.echo("| window, m | most cells | found | median z | ms |")
+    usual = frame_matcher.MAX_WINDOW_CELLS
     for half_m in WIDE_HALF_M:
         for frame_matcher.MAX_WINDOW_CELLS in WINDOW_CELLS:
             typer.echo(f"| {2 * half_m:.0f} | {frame_matcher.MAX_WINDOW_CELLS} | {_row(matcher, known, half_m)} |")
-    frame_matcher.MAX_WINDOW_CELLS = 640
+    frame_matcher.MAX_WINDOW_CELLS = usual
     typer.echo("| fine hypotheses | found | median z | ms |")
     for count in FINE_HYPOTHESES:
         frame_matcher.MAX_FINE_HYPOTHESES = count

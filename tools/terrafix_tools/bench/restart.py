@@ -19,13 +19,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from terrafix.core.errors import OutputError, UsageError
+from terrafix.core.errors import UsageError
 from terrafix.processes import PROCESSES
 from terrafix_tools.bench.result_file import write_result
-from terrafix_tools.bench.soak import ShuttleScene
 from terrafix_tools.chaos.rig import Rig
-from terrafix_tools.chaos.scene import Scene, scene_in
-from terrafix_tools.chaos.verdict import back_s, silence_s, without_fix_s, wrong_fixes
+from terrafix_tools.chaos.scene import Scene
+from terrafix_tools.chaos.shuttle import RUN, shuttle_in
+from terrafix_tools.chaos.verdict import back_s, sigmas, silence_s, without_fix_s, wrong_fixes
 from terrafix_tools.standalone import run_standalone
 
 STEADY_S = 1.0  # with a fix before each kill
@@ -56,7 +56,7 @@ class Kill(msgspec.Struct, frozen=True):
 def measure(scene: Scene, out: Path, names: Sequence[str], times: int, seed: int) -> dict[str, object]:
     """Flies in ``out``, a new folder. Raises SourceError, OSError."""
     kills: list[Kill] = []
-    with Rig(ShuttleScene(scene).unfolded(), out, 0.0, seed=seed) as rig:
+    with Rig(scene, out, 0.0, seed=seed) as rig:
         rig.take_off()
         for _ in range(times):
             for name in names:
@@ -68,7 +68,7 @@ def measure(scene: Scene, out: Path, names: Sequence[str], times: int, seed: int
         "rows": rows,
         "fixes": len(fixes),
         "wrong": len(wrong_fixes(fixes)),
-        "worst_sigmas": max((fix.error_m / fix.horizontal_m for fix in fixes if fix.horizontal_m), default=None),
+        "worst_sigmas": max((sigmas(fix) for fix in fixes if fix.horizontal_m), default=None),
         "kills": msgspec.to_builtins(kills),
     }
 
@@ -143,10 +143,7 @@ def main(
     unknown = set(names) - set(KILLS)
     if unknown:
         raise UsageError(f"--kill {unknown.pop()}: unknown; choose from {', '.join(KILLS)}")
-    if (out / "run").exists():
-        raise OutputError(f"{out / 'run'}: exists; give a new folder")
-    out.mkdir(parents=True, exist_ok=True)
-    result = measure(scene_in(out / f"flight-{seed}", seed), out / "run", names, times, seed)
+    result = measure(shuttle_in(out, seed), out / RUN, names, times, seed)
     rows: dict[str, dict[str, float | None]] = result["rows"]  # type: ignore[assignment]
     console = Console(width=120)
     show(rows, console)

@@ -11,7 +11,7 @@ its own scatter (2 sigma), or open files grow."""
 import math
 import os
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,74 +20,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from terrafix.core.errors import OutputError
 from terrafix.messages import GpsInput, NavEstimate
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.chaos.rig import Rig
-from terrafix_tools.chaos.scene import Phase, Scene, scene_in
-from terrafix_tools.sim.autopilot.course import PeerState
+from terrafix_tools.chaos.scene import Scene
+from terrafix_tools.chaos.shuttle import RUN, shuttle_in
+from terrafix_tools.chaos.verdict import sigmas
 from terrafix_tools.standalone import run_standalone
 
 SAMPLE_S = 10.0
 SETTLING_SHARE = 0.25  # of the time, before which growth is not judged
 MOST_GROWTH_PER_H = 0.01  # of memory
-TURN_S = 4.0  # in which the time of the flight turns round; whole periods of the camera
 GROWN = 1  # exit code
 MB = 1 << 20
-
-
-class ShuttleScene:
-    """The legs of a scene forth and back. At both ends the time of the flight slows down, stops and runs backwards:
-    attitude and specific force stay nearly true, velocities have its rate as a factor."""
-
-    def __init__(self, scene: Scene) -> None:
-        speeds = [(t_s, _speed(scene.course(t_s))) for t_s in np.arange(0.0, scene.at_s[Phase.LANDING], 0.5).tolist()]
-        self._from_s = next(t_s for t_s, mps in speeds if mps > 1.0)
-        self._to_s = next(t_s for t_s, mps in reversed(speeds) if mps > 1.0)
-        self._scene = scene
-
-    def unfolded(self) -> Scene:
-        """A scene whose seconds run without end."""
-        return _Shuttle(
-            map_path=self._scene.map_path,
-            jpegs=self._scene.jpegs,
-            course=self.state,
-            at_s=self._scene.at_s,
-            duration_s=math.inf,
-            fold=lambda t_s: self.folded(t_s)[0],
-        )
-
-    def folded(self, t_s: float) -> tuple[float, float]:
-        """-> second of the flight, and its rate, -1 to 1. A leg begins and ends at a time of an image, so that the
-        vehicle is where the images show it."""
-        leg_s = self._to_s - self._from_s
-        into_s = t_s % (2.0 * (leg_s + TURN_S))
-        backwards = into_s >= leg_s + TURN_S
-        into_s -= (leg_s + TURN_S) * backwards
-        begin_s, sign = (self._to_s, -1.0) if backwards else (self._from_s, 1.0)
-        if into_s < leg_s:
-            return begin_s + sign * into_s, sign
-        phase = math.pi * (into_s - leg_s) / TURN_S
-        end_s = begin_s + sign * leg_s
-        return end_s + sign * TURN_S / math.pi * math.sin(phase), sign * math.cos(phase)
-
-    def state(self, t_s: float) -> PeerState:
-        at_s, rate = self.folded(t_s)
-        state = self._scene.course(at_s)
-        return replace(state, vn_mps=rate * state.vn_mps, ve_mps=rate * state.ve_mps, vd_mps=rate * state.vd_mps)
-
-
-@dataclass(frozen=True)
-class _Shuttle(Scene):
-    fold: Any = None
-
-    def jpeg(self, t_s: float) -> bytes:
-        return super().jpeg(self.fold(t_s))
-
-
-def _speed(state: PeerState) -> float:
-    return math.hypot(state.vn_mps, state.ve_mps)
 
 
 @dataclass
@@ -200,7 +146,7 @@ def output_of(record: Path) -> dict[str, float]:
 def soak(scene: Scene, out: Path, minutes: float, seed: int, console: Console) -> dict[str, Any]:
     """Flies in ``out``, a new folder. Raises SourceError, OSError."""
     samples = Samples()
-    with Rig(ShuttleScene(scene).unfolded(), out, 0.0, seed=seed) as rig:
+    with Rig(scene, out, 0.0, seed=seed) as rig:
         rig.take_off()
         began_s = time.monotonic()
         while (t_s := time.monotonic() - began_s) < 60.0 * minutes:
@@ -209,7 +155,7 @@ def soak(scene: Scene, out: Path, minutes: float, seed: int, console: Console) -
             time.sleep(SAMPLE_S)
         fixes = rig.peer.fixes()
     found = growth(samples)
-    worst = max((fix.error_m / fix.horizontal_m for fix in fixes if fix.horizontal_m), default=math.nan)
+    worst = max((sigmas(fix) for fix in fixes if fix.horizontal_m), default=math.nan)
     result = {"minutes": minutes, "starts": rig.starts, "growth": found, "grows": grows(found), "worst_sigmas": worst}
     return result | output_of(rig.out)
 
@@ -240,11 +186,8 @@ def main(
     seed: Annotated[int, typer.Option(help="Seed of the place and of the noise.")] = 1,
     json_file: Annotated[Path | None, typer.Option("--json", help="JSON to write.")] = None,
 ) -> None:
-    if (out / "run").exists():
-        raise OutputError(f"{out / 'run'}: exists; give a new folder")
-    out.mkdir(parents=True, exist_ok=True)
     console = Console(width=150)
-    result = soak(scene_in(out / f"flight-{seed}", seed), out / "run", minutes, seed, console)
+    result = soak(shuttle_in(out, seed), out / RUN, minutes, seed, console)
     show(result, console)
     write_result(json_file, result)
     raise typer.Exit(GROWN if result["grows"] else 0)

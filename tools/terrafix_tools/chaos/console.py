@@ -12,6 +12,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from terrafix.core.errors import SourceError, TerrafixError
+from terrafix_tools import child_process
 from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.standalone import run_standalone
 
@@ -25,9 +27,7 @@ class Console:
     def __init__(self, run_folder: Path, folder: Path) -> None:
         """``run_folder``: of the flight; data and log of the console are in ``folder``."""
         self._folder = folder
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self._port = probe.getsockname()[1]
+        self._port = child_process.free_port()
         options = ["--bus", str(run_folder), "--port", str(self._port), "--data", str(folder / "console")]
         self._serve = self._start("terrafix_tools.program", "serve", *options)
         self._clients: list[subprocess.Popen[bytes]] = []
@@ -54,10 +54,12 @@ class Console:
 
 
 def flood(port: int) -> None:
-    """Does not end. Raises ConsoleError, where the service does not answer."""
+    """Does not end. Raises SourceError: the console shows no flight within READY_S."""
     client = ConsoleClient(f"http://127.0.0.1:{port}")
     until_s = time.monotonic() + READY_S
-    while not (flights := _flights(client)) and time.monotonic() < until_s:
+    while not (flights := _flights(client)):
+        if time.monotonic() > until_s:
+            raise SourceError(f"port {port}: the console shows no flight after {READY_S:g} s; see its log")
         time.sleep(0.1)
     streams = [_unread(port, f"/flights/{flights[0]}/events") for _ in range(EVENT_CLIENTS)]
     for _ in range(ASKING_CLIENTS):
@@ -67,7 +69,7 @@ def flood(port: int) -> None:
 
 
 def _flights(client: ConsoleClient) -> list[str]:
-    with suppress(Exception):
+    with suppress(TerrafixError):  # it starts
         return [flight.flight_id for flight in client.flights()]
     return []
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from terrafix.processes import PROCESSES
 from terrafix_tools.chaos.camera import Look
-from terrafix_tools.chaos.console import Console
+from terrafix_tools.chaos.console import ASKING_CLIENTS, EVENT_CLIENTS, Console
 from terrafix_tools.chaos.rig import COOL_MC, Need, Rig
 from terrafix_tools.chaos.scene import Phase
 from terrafix_tools.chaos.switches import Switch
@@ -251,7 +251,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("map: file altered", 0.0, begin=lambda rig: _alter(rig.map_path)),
     console("kill -9", 0.0, lambda it: it.signal(signal.SIGKILL), lambda _: None),
     console("SIGSTOP", LONG_S, lambda it: it.signal(signal.SIGSTOP), lambda it: it.signal(signal.SIGCONT)),
-    console("flooded by 208 clients", LONG_S, Console.flood, Console.end_flood),
+    console(f"flooded by {EVENT_CLIENTS + ASKING_CLIENTS} clients", LONG_S, Console.flood, Console.end_flood),
     Fault("processor: saturated", LONG_S, _saturate, _rest),
     Fault("heat: 40 to 97 to 40 C", LONG_S, during=_heat, end=lambda rig: rig.set_temperature(COOL_MC)),
 )

@@ -8,7 +8,8 @@ import math
 
 import numpy as np
 
-from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
+from terrafix.core.gate import MIN_COMPONENT_WEIGHT
+from terrafix.estimator.integrity.innovation import Innovation
 
 # Probability under H0 and under H1 that a pose is rejected and agrees with no other one. Up to a tenth of the poses is
 # wrong on a map of another year. [measured: docs/integrity.md]
@@ -43,14 +44,14 @@ class MapConsistency:
             OFFSET_MEMORY * self._offset2_m2 + (1.0 - OFFSET_MEMORY) * offset2_m2 if self._offset2_m2 else offset2_m2
         )
 
-    def add_accepted(self, information_share: float, offset_m: np.ndarray, gate_m2: np.ndarray) -> None:
-        """A camera pose that was fused, weighted by the share 0..1 of the ground in it that is new. ``offset_m`` (2,):
-        its position from the estimate, with the tilt that was predicted; ``gate_m2`` (2, 2): covariance of that.
-        Poses of a wrong map are as far away as the rejected ones; a gate that is wider than that accepts them too, and
-        its poses say nothing, as those that are outside of it do."""
-        if float(offset_m @ np.linalg.solve(gate_m2, offset_m)) > GATE[2]:
+    def add_accepted(self, information_share: float, position: Innovation) -> None:
+        """A camera pose that was fused, weighted by the share 0..1 of the ground in it that is new. ``position``: the
+        innovation of its position, with the tilt that was predicted. Poses of a wrong map are as far away as the
+        rejected ones; a gate that is wider than that accepts them too, and its poses say nothing, as those that are
+        outside of it do."""
+        if not position.is_accepted:
             return
-        reach2_m2 = GATE[2] * math.sqrt(max(float(np.linalg.det(gate_m2)), 0.0))
+        reach2_m2 = position.limit * math.sqrt(max(float(np.linalg.det(position.covariance)), 0.0))
         in_gate = 1.0 - math.exp(-reach2_m2 / self._offset2_m2) if self._offset2_m2 else 0.0
         p_accepted_wrong_map = max(1.0 - P_REJECTED_WRONG_MAP, in_gate)
         self._add(information_share * min(math.log(p_accepted_wrong_map / (1.0 - P_REJECTED)), 0.0))

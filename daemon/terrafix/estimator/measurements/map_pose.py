@@ -97,16 +97,13 @@ def levelled(measurement: MapPoseMeasurement, predicted: gtsam.Pose3, predicted_
     return FixedPose(pose.retract(gain @ residual), (cov + cov.T) / 2)
 
 
-def levelled_offset(
+def levelled_innovation(
     measurement: MapPoseMeasurement, predicted: gtsam.Pose3, predicted_cov: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Position (2,) of the ``levelled`` match from the ``predicted`` one, with its covariance (2, 2), whatever other
-    matches over the same ground have given; east and north."""
-    fixed = levelled(replace(measurement, information_share=1.0), predicted, predicted_cov)
-    both = [
-        tangent_to_world(c, p.rotation().matrix()) for p, c in ((predicted, predicted_cov), (fixed.pose, fixed.cov))
-    ]
-    return (fixed.pose.translation() - predicted.translation())[:2], (both[0] + both[1])[:2, :2]
+) -> Innovation:
+    """``position_innovation`` of the match once it is ``levelled``, whatever other matches over the same ground have
+    given."""
+    alone = levelled(replace(measurement, information_share=1.0), predicted, predicted_cov)
+    return replace(measurement, pose=alone.pose, cov=alone.cov).position_innovation(predicted, predicted_cov)
 
 
 def measured_pose(pose: MapPose, map_sigma_m: float, terrain: Terrain) -> tuple[gtsam.Pose3, np.ndarray]:

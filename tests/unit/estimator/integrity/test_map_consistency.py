@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 
-from terrafix.core.gate import MIN_COMPONENT_WEIGHT
+from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
+from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.map_consistency import MapConsistency
 
 OFFSET_M = np.array([90.0, -120.0])  # 150 m
 NEAR_M = np.array([2.0, -1.0])
 NARROW_M2 = 5.0**2 * np.eye(2)  # innovation covariance of an estimate that is placed
+
+
+def innovation(offset_m: np.ndarray, covariance_m2: np.ndarray) -> Innovation:
+    return Innovation(offset_m, covariance_m2, GATE[2])
 
 
 def after_rejected(consistency: MapConsistency, times: int) -> MapConsistency:
@@ -37,7 +42,7 @@ def test_a_map_with_a_tenth_of_wrong_poses_is_not_taken_for_another_place(seed: 
         if rng.uniform() < 0.1:
             consistency.add_rejected(OFFSET_M)
         else:
-            consistency.add_accepted(0.5, NEAR_M, NARROW_M2)
+            consistency.add_accepted(0.5, innovation(NEAR_M, NARROW_M2))
         inflated += consistency.variance_m2 > 0.0
     assert inflated < 0.1 * 500
 
@@ -45,8 +50,8 @@ def test_a_map_with_a_tenth_of_wrong_poses_is_not_taken_for_another_place(seed: 
 def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
     hovering, flying = (after_rejected(MapConsistency(), 4) for _ in range(2))
     for _ in range(10):
-        hovering.add_accepted(0.0, NEAR_M, NARROW_M2)
-        flying.add_accepted(0.5, NEAR_M, NARROW_M2)
+        hovering.add_accepted(0.0, innovation(NEAR_M, NARROW_M2))
+        flying.add_accepted(0.5, innovation(NEAR_M, NARROW_M2))
     assert hovering.probability == after_rejected(MapConsistency(), 4).probability
     assert flying.variance_m2 == 0.0
 
@@ -54,7 +59,7 @@ def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
 def test_the_distance_of_earlier_rejected_poses_is_forgotten_after_accepted_ones() -> None:
     consistency = after_rejected(MapConsistency(), 1)
     for _ in range(20):
-        consistency.add_accepted(1.0, NEAR_M, NARROW_M2)
+        consistency.add_accepted(1.0, innovation(NEAR_M, NARROW_M2))
     for _ in range(4):
         consistency.add_rejected(0.1 * OFFSET_M)
     assert consistency.variance_m2 == pytest.approx(consistency.probability * 15.0**2)
@@ -65,7 +70,7 @@ def test_poses_inside_a_gate_wider_than_the_rejected_ones_do_not_end_the_inflati
     consistency = after_rejected(MapConsistency(), 4)
     before_m2 = consistency.variance_m2
     for _ in range(5):
-        consistency.add_accepted(1.0, NEAR_M, sigma_m**2 * np.eye(2))
+        consistency.add_accepted(1.0, innovation(NEAR_M, sigma_m**2 * np.eye(2)))
     assert (consistency.variance_m2 == 0.0) if ends else (consistency.variance_m2 > 0.9 * before_m2)
 
 
@@ -73,9 +78,9 @@ def test_after_many_rejected_poses_four_accepted_ones_over_new_ground_end_the_in
     """The evidence against a map is bounded: a long flight over changed ground must not outweigh the map after it."""
     consistency = after_rejected(MapConsistency(), 200)
     for _ in range(3):
-        consistency.add_accepted(1.0, NEAR_M, NARROW_M2)
+        consistency.add_accepted(1.0, innovation(NEAR_M, NARROW_M2))
         assert consistency.variance_m2 > 0.0
-    consistency.add_accepted(1.0, NEAR_M, NARROW_M2)
+    consistency.add_accepted(1.0, innovation(NEAR_M, NARROW_M2))
     assert consistency.variance_m2 == 0.0
 
 
@@ -83,14 +88,14 @@ def test_after_any_number_of_accepted_poses_three_rejected_ones_inflate_the_cova
     """The evidence for a map is bounded, too: a map that was right for a long way can still end."""
     consistency = MapConsistency()
     for _ in range(500):
-        consistency.add_accepted(1.0, NEAR_M, NARROW_M2)
+        consistency.add_accepted(1.0, innovation(NEAR_M, NARROW_M2))
     assert after_rejected(consistency, 3).probability > 0.5
 
 
 def test_a_pose_that_was_fused_outside_of_the_gate_of_its_position_is_no_evidence_for_the_map() -> None:
     consistency = after_rejected(MapConsistency(), 4)
     before = consistency.probability
-    consistency.add_accepted(1.0, np.array([5.0 * 3.8, 0.0]), NARROW_M2)  # the gate ends at 3.72 sigmas
+    consistency.add_accepted(1.0, innovation(np.array([5.0 * 3.8, 0.0]), NARROW_M2))  # the gate ends at 3.72 sigmas
     assert consistency.probability == before
-    consistency.add_accepted(1.0, np.array([5.0 * 3.6, 0.0]), NARROW_M2)
+    consistency.add_accepted(1.0, innovation(np.array([5.0 * 3.6, 0.0]), NARROW_M2))
     assert consistency.probability < before
