@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from terrafix.core.errors import OutputError, SourceError
 from terrafix_tools.chaos import verdict
 from terrafix_tools.chaos.camera import Look, StreamedCamera, altered
 from terrafix_tools.chaos.faults import FAULTS
@@ -86,6 +87,22 @@ def test_an_interrupted_matrix_goes_on_where_it_was(tmp_path: Path) -> None:
     assert [outcome.silence_s for outcome in again.outcomes] == [1.5]
 
 
+def test_commands_that_fly_parts_of_one_matrix_keep_each_others_outcomes(tmp_path: Path) -> None:
+    one, other = Results(tmp_path / "results.json"), Results(tmp_path / "results.json")
+    one.add(Outcome(fault=FAULTS[1].name, phase=Phase.CRUISE, verdict="ok"))
+    other.add(Outcome(fault=FAULTS[1].name, phase=Phase.TURN, verdict="ok"))
+    assert [o.phase for o in Results(tmp_path / "results.json").outcomes] == [Phase.CRUISE, Phase.TURN]
+    assert other.has(FAULTS[1], Phase.CRUISE)
+
+
+def test_results_that_cannot_be_read_or_written_are_named(tmp_path: Path) -> None:
+    (tmp_path / "results.json").write_text("[{")
+    with pytest.raises(SourceError, match="no results of chaos"):
+        Results(tmp_path / "results.json")
+    with pytest.raises(OutputError, match="cannot be written"):
+        Results(tmp_path / "gone" / "results.json").add(Outcome(fault="none", phase=Phase.CRUISE, verdict="ok"))
+
+
 def test_the_table_of_a_page_is_replaced_and_names_broken_promises(tmp_path: Path) -> None:
     page = tmp_path / "faults.md"
     page.write_text("before\n<!-- table: chaos -->\nold\n<!-- end -->\nafter\n")
@@ -96,13 +113,23 @@ def test_the_table_of_a_page_is_replaced_and_names_broken_promises(tmp_path: Pat
     write_table(page, [good, bad])
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
-    assert "| none | - | 0.1 s, 0.0 s | 4.0 s, 9.0 s **2 wrong positions** | - | - |" in text
-    assert "2 cells with 100 positions, 2 of them wrong." in table([good, bad])
+    assert "| fault | cruise | turn |\n|---|---|---|\n" in text
+    assert "| none | 0.1 s, 0.0 s | 4.0 s, 9.0 s **2 wrong positions** |" in text
+    assert table([good, bad]).endswith("\n\n2 cells with 100 positions, 2 of them wrong.")
+
+
+def test_the_sum_of_a_table_has_the_worst_error_and_the_load_of_the_computer() -> None:
+    cells = [
+        Outcome(fault="none", phase=phase, verdict="ok", silence_s=0.1, fixes=9, worst_sigmas=sigmas, load=load)
+        for phase, sigmas, load in ((Phase.CRUISE, 1.5, 0.5), (Phase.TURN, 3.25, 2.0), (Phase.DARK, None, 1.0))
+    ]
+    expected = "3 cells with 27 positions, 0 of them wrong; the worst error is 3.2 times its horiz_accuracy; "
+    assert table(cells).endswith(expected + "load average per core 1.0 in the median, at most 2.0.")
 
 
 def test_a_cell_whose_flight_failed_before_the_fault_is_none_of_the_table_and_is_flown_again(tmp_path: Path) -> None:
     failed = Outcome(fault="none", phase=Phase.CRUISE, verdict=verdict.NO_FIX, silence_s=0.1, fixes=3)
-    assert "| none | - | - | - | - | - |" in table([failed]) and "0 cells with 0 positions" in table([failed])
+    assert "| none | - |\n" in table([failed]) and "0 cells with 0 positions" in table([failed])
     results = Results(tmp_path / "results.json")
     results.add(failed)
     assert not results.has(FAULTS[0], Phase.CRUISE)

@@ -1,5 +1,6 @@
 """Flies the cells of the fault matrix, one after the other."""
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -150,29 +151,35 @@ def _hits_record(fault: Fault) -> bool:
 
 
 class Results:
-    """The outcomes of a matrix in a file, so that it can be continued."""
+    """The outcomes of a matrix in a file, so that it can be continued and several commands can fly parts of it."""
 
     def __init__(self, path: Path) -> None:
         """Raises SourceError for a file that is damaged."""
         self._path = path
-        try:
-            data = path.read_bytes() if path.exists() else b"[]"
-            self.outcomes = msgspec.json.decode(data, type=list[Outcome])
-        except (OSError, msgspec.DecodeError) as error:
-            raise SourceError(f"{path}: no results of chaos ({error}); give another --out") from None
+        self.outcomes = self._read()
 
     def has(self, fault: Fault, phase: Phase) -> bool:
         """Whether the cell need not be flown: one in which the flight itself failed must be."""
         return any((o.fault, o.phase) == (fault.name, phase) and o.verdict != judge.NO_FIX for o in self.outcomes)
 
     def add(self, outcome: Outcome) -> None:
-        """Raises OutputError."""
+        """Adds it to those of the file, which another command may have written meanwhile. Raises SourceError,
+        OutputError."""
         key = (outcome.fault, outcome.phase)
-        self.outcomes = [*(o for o in self.outcomes if (o.fault, o.phase) != key), outcome]
         try:
-            self._path.write_bytes(msgspec.json.format(msgspec.json.encode(self.outcomes), indent=1))
+            with self._path.with_suffix(".lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # held for milliseconds by another command
+                self.outcomes = [*(o for o in self._read() if (o.fault, o.phase) != key), outcome]
+                self._path.write_bytes(msgspec.json.format(msgspec.json.encode(self.outcomes), indent=1))
         except OSError as error:
             raise OutputError(f"{self._path}: cannot be written ({error.strerror})") from None
+
+    def _read(self) -> list[Outcome]:
+        try:
+            data = self._path.read_bytes() if self._path.exists() else b"[]"
+            return msgspec.json.decode(data, type=list[Outcome])
+        except (OSError, msgspec.DecodeError) as error:
+            raise SourceError(f"{self._path}: no results of chaos ({error}); give another --out") from None
 
 
 def fly_matrix(

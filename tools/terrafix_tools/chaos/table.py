@@ -1,6 +1,7 @@
 """The outcomes of a fault matrix as text, and as a table in a page of the documentation."""
 
 import re
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -36,15 +37,26 @@ def cell(outcome: Outcome | None) -> str:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
+    """Faults by phases, of the phases of which there is any outcome, and a line that sums all cells up."""
     found = {(o.fault, o.phase): o for o in outcomes}
-    rows = [f"| fault | {' | '.join(Phase)} |", f"|---|{'---|' * len(Phase)}"]
+    phases = [phase for phase in Phase if any(o.phase == phase for o in outcomes)]
+    rows = [f"| fault | {' | '.join(phases)} |", f"|---|{'---|' * len(phases)}"]
     for fault in FAULTS:
-        cells = (cell(found.get((fault.name, phase))) for phase in Phase)
+        cells = (cell(found.get((fault.name, phase))) for phase in phases)
         rows.append(f"| {fault.name} | {' | '.join(cells)} |")
-    flown = [o for o in outcomes if o.silence_s is not None and o.verdict != NO_FIX]
+    return "\n".join([*rows, "", _sum([o for o in outcomes if o.silence_s is not None and o.verdict != NO_FIX])])
+
+
+def _sum(flown: Sequence[Outcome]) -> str:
     fixes, wrong = sum(o.fixes for o in flown), sum(o.wrong for o in flown)
-    rows += ["", f"{len(flown)} cells with {fixes} positions, {wrong} of them wrong."]
-    return "\n".join(rows)
+    text = f"{len(flown)} cells with {fixes} positions, {wrong} of them wrong"
+    sigmas = [o.worst_sigmas for o in flown if o.worst_sigmas is not None]
+    loads = [o.load for o in flown if o.load is not None]
+    if sigmas:
+        text += f"; the worst error is {max(sigmas):.1f} times its horiz_accuracy"
+    if loads:
+        text += f"; load average per core {statistics.median(loads):.1f} in the median, at most {max(loads):.1f}"
+    return text + "."
 
 
 def write_table(page: Path, outcomes: Sequence[Outcome], name: str = "chaos") -> None:
