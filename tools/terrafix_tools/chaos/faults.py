@@ -15,7 +15,7 @@ import numpy as np
 from terrafix.processes import PROCESSES
 from terrafix_tools.chaos.camera import Look
 from terrafix_tools.chaos.console import ASKING_CLIENTS, EVENT_CLIENTS, Console
-from terrafix_tools.chaos.rig import COOL_MC, Need, Rig
+from terrafix_tools.chaos.rig import COOL_MC, SUPERVISOR, Need, Rig
 from terrafix_tools.chaos.scene import Phase
 from terrafix_tools.chaos.switches import Switch
 from terrafix_tools.sim.autopilot.wire import heartbeat
@@ -27,6 +27,7 @@ HOTTEST_MC = 95_000
 DISK_MB = 24
 SPARE_BYTES = 4 << 20  # that a process may still allocate
 SPARE_FILES = 0  # that it may still open
+LEAKED_BYTES = 128 << 20  # after which the kernel ends a process that leaks
 JUMP_S = 86_400.0 * 365  # of the wall clock: as after an empty battery of the clock
 SLOW_FSYNC_S = 3.0
 DISK = frozenset({Need.DISK})
@@ -98,6 +99,22 @@ def _memory(pid: int) -> int:
 
 def _files(pid: int) -> int:
     return len(os.listdir(f"/proc/{pid}/fd")) + SPARE_FILES
+
+
+def leaking(process: str) -> Fault:
+    """It takes 80 MB a second, until the kernel kills it in its control group."""
+
+    def begin(rig: Rig) -> None:
+        pid = rig.pid(process)
+        if pid is not None:
+            rig.memory_group.limit(pid, LEAKED_BYTES)
+            rig.switches.set(Switch.LEAK_PID, pid)
+
+    def end(rig: Rig) -> None:
+        rig.switches.set(Switch.LEAK_PID, 0.0)
+        rig.memory_group.lift()
+
+    return Fault(f"{process}: leak", SHORT_S, begin, end, needs=frozenset({Need.SWITCHES, Need.MEMORY_GROUP}))
 
 
 def camera(name: str, look: Look, lasts_s: float = SHORT_S) -> Fault:
@@ -195,17 +212,16 @@ def _heat(rig: Rig, elapsed_s: float) -> None:
     rig.set_temperature(round(COOL_MC + share * (HOTTEST_MC + 2000 - COOL_MC)))
 
 
-NAMES = tuple(process.name for process in PROCESSES)
+NAMES = (SUPERVISOR, *(process.name for process in PROCESSES))
 FAULTS: tuple[Fault, ...] = (
     Fault("none", 0.0),
-    killed("supervisor"),
     Fault("all processes: kill -9", 0.0, begin=lambda rig: rig.kill_all()),
     *(killed(name) for name in NAMES),
-    stopped("supervisor", SHORT_S),
-    *(stopped(name, LONG_S) for name in NAMES),
-    *(slow(name) for name in ("link", "estimator", "anchor", "vision")),
-    *(limited(name, "no more memory", resource.RLIMIT_AS, _memory) for name in ("estimator", "anchor", "vision")),
-    *(limited(name, "no more files", resource.RLIMIT_NOFILE, _files) for name in ("recorder", "anchor", "vision")),
+    *(stopped(name, SHORT_S if name == SUPERVISOR else LONG_S) for name in NAMES),
+    *(slow(name) for name in NAMES),
+    *(limited(name, "no more memory", resource.RLIMIT_AS, _memory) for name in NAMES),
+    *(leaking(name) for name in NAMES),
+    *(limited(name, "no more files", resource.RLIMIT_NOFILE, _files) for name in NAMES),
     camera("unplugged", Look.NOTHING),
     camera("frozen", Look.FROZEN),
     camera("black", Look.BLACK),

@@ -15,6 +15,7 @@ from terrafix.runtime.run_dir import PREFIX, SHM, write_atomic
 from terrafix_tools import child_process
 from terrafix_tools.chaos.camera import StreamedCamera, camera_toml
 from terrafix_tools.chaos.console import Console
+from terrafix_tools.chaos.memory_group import MemoryGroup
 from terrafix_tools.chaos.scene import Scene
 from terrafix_tools.chaos.serial_line import SerialLine
 from terrafix_tools.chaos.switches import Switches
@@ -29,6 +30,7 @@ STOP_LIMIT_S = 45.0  # TimeoutStopSec= of the unit
 COOL_MC = 40_000  # of the simulated thermal zone
 SHARED_MB = 128  # shared memory of its own: frames take 18 MB, and descriptors of the map some more
 NONE = Path()
+SUPERVISOR = "supervisor"
 
 
 class Need(StrEnum):
@@ -40,9 +42,10 @@ class Need(StrEnum):
     SWITCHES = "the switches of switches.py"
     MODEL = "the weights of XFeat"
     CONSOLE = "a console that shows the flight"
+    MEMORY_GROUP = "a control group of memory"
 
 
-ROOT = frozenset({Need.DISK, Need.SHARED_MEMORY})
+ROOT = frozenset({Need.DISK, Need.SHARED_MEMORY, Need.MEMORY_GROUP})
 
 
 class Rig:
@@ -72,6 +75,7 @@ class Rig:
         if Need.MODEL in needs:
             self.model_path.write_bytes(model.read_bytes())
         self._needs = needs
+        self.memory_group = MemoryGroup()
         self.line: SerialLine | None = None
         self.console: Console | None = None  # from the take-off on
         self._died_s: float | None = None
@@ -94,6 +98,7 @@ class Rig:
             program.wait()
         if self.console is not None:
             self.console.end()
+        self.memory_group.lift()
         self.stop()
         self.camera.__exit__()
         self.stream.close()
@@ -126,7 +131,9 @@ class Rig:
         return None if self._daemon is None or self._daemon.poll() is not None else self._daemon.pid
 
     def pid(self, process: str) -> int | None:
-        """Of a process of Terrafix by its name in `ps`; None: it does not run."""
+        """Of a process of Terrafix by its name in `ps`, or of the "supervisor"; None: it does not run."""
+        if process == SUPERVISOR:
+            return self.supervisor_pid
         return next((pid for name, pid in self.processes() if name == process), None)
 
     def processes(self) -> Iterator[tuple[str, int]]:
@@ -160,8 +167,8 @@ class Rig:
                     os.kill(pid, signal.SIGKILL)
 
     def signal(self, process: str, number: int) -> None:
-        """Sends a signal to a process, or to the supervisor by the name "supervisor"."""
-        pid = self.supervisor_pid if process == "supervisor" else self.pid(process)
+        """Sends a signal to a process (names as in ``pid``)."""
+        pid = self.pid(process)
         if pid is not None:
             with suppress(ProcessLookupError):
                 os.kill(pid, number)

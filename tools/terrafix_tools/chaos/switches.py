@@ -17,6 +17,7 @@ class Switch(StrEnum):
     WALL_CLOCK_S = "wall_clock_s"  # added to the time of the computer's wall clock
     FSYNC_S = "fsync_s"  # that an fsync takes longer
     NO_PROVIDER = "no_provider"  # no model gives a result
+    LEAK_PID = "leak_pid"  # the process that takes more and more memory
 
 
 class Switches:

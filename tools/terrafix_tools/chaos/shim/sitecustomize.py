@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -11,6 +12,9 @@ from typing import Any
 
 FOLDER = os.environ["TERRAFIX_CHAOS_SWITCHES"]
 MODELS = "onnxruntime"
+LEAK_BYTES = 8 << 20  # in each of LEAK_PERIOD_S, up to LEAK_LIMIT: a computer without a limit of memory must survive
+LEAK_PERIOD_S = 0.1
+LEAK_LIMIT = 512 << 20
 
 
 def value(switch: str) -> float:
@@ -56,6 +60,18 @@ def failing(call: Any) -> Any:
     return run
 
 
+def _leak() -> None:
+    taken: list[bytes] = []
+    while True:
+        time.sleep(LEAK_PERIOD_S)
+        if value("leak_pid") == os.getpid() and len(taken) * LEAK_BYTES < LEAK_LIMIT:
+            taken.append(b"\1" * LEAK_BYTES)
+
+
+def _watch_leak() -> None:
+    threading.Thread(target=_leak, daemon=True).start()
+
+
 _time_ns, _time, _fsync = time.time_ns, time.time, os.fsync
 
 
@@ -68,3 +84,5 @@ time.time_ns = lambda: _time_ns() + round(1e9 * value("wall_clock_s"))
 time.time = lambda: _time() + value("wall_clock_s")
 os.fsync = _slow_fsync  # type: ignore[assignment]
 sys.meta_path.insert(0, ModelFinder())
+os.register_at_fork(after_in_child=_watch_leak)
+_watch_leak()
