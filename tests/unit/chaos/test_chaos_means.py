@@ -3,6 +3,7 @@
 import json
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -12,11 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from terrafix.core.errors import SourceError
+from terrafix.core.errors import OutputError, SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.chaos import rig
 from terrafix_tools.chaos.camera import camera_toml
 from terrafix_tools.chaos.faults import FAULTS
+from terrafix_tools.chaos.memory_group import V1, V2, MemoryGroup
 from terrafix_tools.chaos.recorded_scene import recorded_scene
 from terrafix_tools.chaos.rig import Need
 from terrafix_tools.chaos.run import fly_cell, missing_here
@@ -90,6 +92,50 @@ def test_switches_move_the_wall_clock_delay_an_fsync_and_let_models_fail_in_anot
     assert not list((tmp_path / "switches").iterdir())
 
 
+@pytest.mark.real_time
+@pytest.mark.skipif(os.geteuid() != 0, reason="a control group of memory needs root")
+def test_a_process_that_leaks_is_killed_by_the_kernel_at_the_limit_of_its_control_group(tmp_path: Path) -> None:
+    switches = Switches(tmp_path / "switches")
+    group = MemoryGroup()
+    command = [sys.executable, "-c", "import time; time.sleep(20.0)"]
+    with subprocess.Popen(command, env=switches.environment()) as leaking:
+        try:
+            group.limit(leaking.pid, 32 << 20)
+            assert leaking.poll() is None, "it is killed for what it takes, not for what it had"
+            switches.set(Switch.LEAK_PID, leaking.pid)
+            assert leaking.wait(15.0) == -signal.SIGKILL
+        except OutputError as error:
+            pytest.skip(f"no control group of memory here: {error}")
+        finally:
+            leaking.kill()
+            group.lift()
+    assert not list((V1 if V1.is_dir() else V2).glob(f"terrafix-chaos-{os.getpid()}"))
+
+
+@pytest.mark.parametrize(("name", "limit_file"), [("memory", "memory.limit_in_bytes"), ("cgroup", "memory.max")])
+def test_the_control_group_of_memory_is_that_of_the_kernels_version(tmp_path: Path, name: str, limit_file: str) -> None:
+    root = tmp_path / name
+    root.mkdir()
+    group = MemoryGroup(root)
+    group.limit(123, 4096)
+    (folder,) = root.iterdir()
+    assert (folder / limit_file).read_text() == "4096" and (folder / "cgroup.procs").read_text() == "123"
+    group.lift()
+    assert (root / "cgroup.procs").read_text() == "123", "the process goes back to the root"
+    with pytest.raises(OutputError, match="run as root"):
+        MemoryGroup(tmp_path / "none" / "memory").limit(123, 4096)
+
+
+def test_a_leak_names_its_process_and_ends_with_its_limit(tmp_path: Path) -> None:
+    rig = StubRig(tmp_path / "switches")
+    leak = fault("anchor: leak")
+    leak.begin(rig)  # type: ignore[arg-type]
+    assert (tmp_path / "switches" / Switch.LEAK_PID).read_text() == "77"
+    assert rig.memory_group.calls == [(77, 128 << 20)]
+    leak.end(rig)  # type: ignore[arg-type]
+    assert not list((tmp_path / "switches").iterdir()) and rig.memory_group.calls[1:] == ["lifted"]
+
+
 def test_a_fault_that_cannot_be_caused_here_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert missing_here(fault("shared memory: full"), tmp_path) == "mounting needs root"
@@ -106,6 +152,21 @@ class StubRig:
 
     def __init__(self, folder: Path) -> None:
         self.switches = Switches(folder)
+        self.memory_group = StubMemoryGroup()
+
+    def pid(self, _process: str) -> int:
+        return 77
+
+
+class StubMemoryGroup:
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    def limit(self, pid: int, limit_bytes: int) -> None:
+        self.calls.append((pid, limit_bytes))
+
+    def lift(self) -> None:
+        self.calls.append("lifted")
 
 
 def test_a_switched_fault_begins_and_ends(tmp_path: Path) -> None:
