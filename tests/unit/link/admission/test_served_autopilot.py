@@ -195,7 +195,10 @@ def test_another_vehicle_is_served_after_5_s_of_silence_of_one_that_sent_heartbe
         port.edge.on_message(GPS)
         positions.append(len(ours.received("GPS_INPUT")))
     assert positions == [0, 1]
-    assert port.texts() == ["Terrafix: vehicle 7 on our port gets nothing", "Terrafix: vehicle 9 is silent, 7 is served"]
+    assert port.texts() == [
+        "Terrafix: vehicle 7 on our port gets nothing",
+        "Terrafix: vehicle 9 is silent, 7 is served",
+    ]
     port.receives(1 * S + 3 * HEARTBEATS_LOST_NS, theirs, armed())  # the one served now has sent its telemetry
     theirs.received()
     port.edge.on_message(GPS)
