@@ -4,6 +4,7 @@ Nothing here raises in flight: what cannot be written is counted, and the record
 
 import re
 import shutil
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -56,6 +57,8 @@ class SegmentRing:
         self._origin: Message | None = None
         self._lost: Counter[str] = Counter()
         self._blocked = ""  # reason why nothing is written
+        self._sync: threading.Thread | None = None  # the last synchronisation with the disk
+        self._sync_error: OSError | None = None  # of the present file
         _make_folder(folder)
         self._open()
 
@@ -116,10 +119,11 @@ class SegmentRing:
         if self._writer is None:
             return
         try:
+            if self._sync_error is not None:
+                raise self._sync_error
             self._writer.flush()
             if self._clock_s() - self._synced_s >= FSYNC_S:
-                self._synced_s = self._clock_s()
-                self._writer.sync()
+                self._begin_sync(self._writer)
             if self._below_floor():
                 self._make_room()
                 if self._below_floor():
@@ -129,6 +133,24 @@ class SegmentRing:
 
     def close(self) -> None:
         self._close_writer()
+
+    def _begin_sync(self, writer: FlightWriter) -> None:
+        """Passes what was flushed to the disk, in a thread of its own: a disk that stalls for seconds must not keep
+        later messages from the operating system, from which a kill does not take them."""
+        if self._sync is not None and self._sync.is_alive():
+            return
+        self._synced_s = self._clock_s()
+        self._sync = threading.Thread(target=self._sync_file, args=(writer,), name="recorder-sync", daemon=True)
+        self._sync.start()
+
+    def _sync_file(self, writer: FlightWriter) -> None:
+        try:
+            writer.sync()
+        except OSError as error:
+            if writer is self._writer:
+                self._sync_error = error
+        except ValueError:  # the file was closed before
+            return
 
     def _block(self, reason: str) -> None:
         """Ends the present segment. The flight goes on without a record until the disk takes one again."""
@@ -142,6 +164,7 @@ class SegmentRing:
 
     def _close_writer(self) -> None:
         writer, self._writer = self._writer, None
+        self._sync_error = None
         if writer is not None:
             with suppress(OSError):
                 writer.close()

@@ -21,7 +21,7 @@ import zmq
 
 from terrafix.core import codec
 from terrafix.core.clock import now_ns
-from terrafix.messages import Message, Origin, ProcessEvent, SourceEnded
+from terrafix.messages import GpsInput, InputOrder, Message, Origin, ProcessEvent, SourceEnded
 
 QUEUE_LENGTH = 1000  # messages per connection and side; beyond it the newest are lost, and counted by the subscriber
 RECONNECT_MS = 20  # interval of reconnection attempts to a restarted publisher
@@ -35,14 +35,17 @@ NO_EXPIRY_NS = 2**63
 class Retention(NamedTuple):
     last: int  # number of messages
     max_age_ns: int
+    until_recorded: bool = False  # only those that are published before the recorder (InputOrder) has subscribed
 
 
 # Messages that are sent again to late subscribers. ProcessEvent: the age limit covers the events during a (re)start of
-# the recorder, but excludes old deaths, which a restarted link would report as new.
+# the recorder, but excludes old deaths, which a restarted link would report as new. GpsInput: what a restarted link
+# sends to the autopilot is recorded although the recorder connects late, on a computer with too much to do.
 RETAINED: dict[type[Message], Retention] = {
     Origin: Retention(1, NO_EXPIRY_NS),
     SourceEnded: Retention(1, NO_EXPIRY_NS),
     ProcessEvent: Retention(100, 10_000_000_000),
+    GpsInput: Retention(100, 10_000_000_000, until_recorded=True),
 }
 
 
@@ -76,7 +79,8 @@ class Publisher:
         name = topic(type(message))
         self._sequence[name] += 1
         parts = [name, HEADER.pack(self._session_id, self._sequence[name]), codec.encode(message)]
-        if name in self._retained:
+        retention = RETAINED.get(type(message))
+        if retention is not None and not (retention.until_recorded and self.subscriptions(InputOrder)):
             self._retained[name].append((self._clock(), parts))
         self.socket.send_multipart(parts)
 

@@ -17,7 +17,8 @@ from terrafix.runtime.run_dir import RunDir
 
 RESTART_LIMIT = 5  # deaths within the window; more indicate a fault that a restart does not clear
 RESTART_WINDOW_NS = 60_000_000_000
-BACKOFF_NS = (0, 100_000_000, 300_000_000, 1_000_000_000)  # before the 1st, 2nd, ... restart in the window
+# From the start before to the 1st, 2nd, ... restart in the window: a process that ran longer is restarted at once.
+BACKOFF_NS = (0, 100_000_000, 300_000_000, 1_000_000_000)
 FIRST_START_LIMIT_NS = 300_000_000_000  # imports, and engines that are built when the models are new
 START_LIMIT_NS = 60_000_000_000  # a process that was ready before has already built its engines
 STOP_LIMIT_S = 5.0  # from SIGTERM to SIGKILL
@@ -57,7 +58,7 @@ class RestartWindow:
         self._deaths_ns: deque[int] = deque()
 
     def record_death(self, now_ns: int) -> int | None:
-        """-> pause [ns] before the next restart; None: the process has died too often."""
+        """-> least time [ns] between the last start and the next one; None: the process has died too often."""
         while self._deaths_ns and now_ns - self._deaths_ns[0] > RESTART_WINDOW_NS:
             self._deaths_ns.popleft()
         self._deaths_ns.append(now_ns)
@@ -167,8 +168,8 @@ class ManagedProcess:
             self._run_dir.gave_up(self.process.name).touch()
             yield Event("gave_up", f"died more than {RESTART_LIMIT} times in {RESTART_WINDOW_NS // 10**9} s")
         else:
-            self.state, self._start_at_ns = State.WAITING, now_ns + pause_ns
-            if pause_ns == 0:
+            self.state, self._start_at_ns = State.WAITING, self._started_ns + pause_ns
+            if self._start_at_ns <= now_ns:
                 yield self._start(now_ns)
 
     def _progress_ns(self) -> int:

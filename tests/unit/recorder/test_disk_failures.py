@@ -5,6 +5,7 @@ import io
 import json
 import os
 import shutil
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +24,7 @@ from terrafix.recorder.images import ImagePolicy
 from terrafix.recorder.node import RecorderEdge
 from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import ReadResult, read_flight
-from terrafix.recorder.segments import FSYNC_S, MEGABYTE, PROTECTED, RETRY_S, SegmentRing
+from terrafix.recorder.segments import FSYNC_S, MEGABYTE, PROTECTED, RETRY_S, SEGMENT_NS, SegmentRing
 from terrafix.recorder.writer import FlightWriter
 from terrafix.runtime.supervisor import _writable
 
@@ -159,7 +160,9 @@ def test_a_disk_that_fails_in_flight_ends_the_segment_and_raises_nothing(
         ring.write_thumbnail(1, 1, b"x")
         ring.write_frame_image(1, 1, b"x", "png")
         clock.now_s += FSYNC_S
-        ring.flush()
+        for _ in range(2):  # an error of the synchronisation is known at the next flush
+            ring.flush()
+            end_of_sync(ring)
         assert ring.blocked == os.strerror(errno.EIO)
     clock.now_s += RETRY_S
     ring.write(frame(2), 2)
@@ -168,6 +171,11 @@ def test_a_disk_that_fails_in_flight_ends_the_segment_and_raises_nothing(
     kept = frames_of(tmp_path)
     assert kept[0] == 0 and kept[-1] == 2
     assert len(list(tmp_path.glob("*.mcap"))) == 2
+
+
+def end_of_sync(ring: SegmentRing) -> None:
+    if ring._sync is not None:
+        ring._sync.join(5.0)
 
 
 def test_a_folder_that_vanished_is_made_again(tmp_path: Path, clock: Clock) -> None:
@@ -192,8 +200,54 @@ def test_what_is_flushed_reaches_the_disk_once_a_second(
     for _ in range(12):
         clock.now_s += 0.25
         ring.flush()
+        end_of_sync(ring)
     ring.close()
     assert synced == [101.0, 102.0, 103.0]
+
+
+def test_messages_reach_the_operating_system_while_the_disk_stalls(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on, begun = threading.Event(), []
+
+    def stall(_: FlightWriter) -> None:
+        begun.append(clock.now_s)
+        goes_on.wait(5.0)
+
+    monkeypatch.setattr(FlightWriter, "sync", stall)
+    ring = ring_in(tmp_path, clock)
+    for number in range(4):
+        clock.now_s += FSYNC_S
+        ring.write(frame(number), number)
+        ring.flush()
+    assert frames_of(tmp_path) == [0, 1, 2, 3], "as after a kill at this time"
+    assert len(begun) == 1, "one at a time"
+    goes_on.set()
+    end_of_sync(ring)
+    ring.close()
+
+
+def test_a_late_error_of_the_synchronisation_of_an_ended_file_does_not_end_the_next_one(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on = threading.Event()
+
+    def fail(_: FlightWriter) -> None:
+        goes_on.wait(5.0)
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    ring = ring_in(tmp_path, clock)
+    with monkeypatch.context() as broken:
+        broken.setattr(FlightWriter, "sync", fail)
+        clock.now_s += FSYNC_S
+        ring.flush()
+        ring.write(frame(0), SEGMENT_NS + 1)
+        ring.write(frame(1), 2 * SEGMENT_NS + 2)  # after it the next file begins
+        goes_on.set()
+        end_of_sync(ring)
+    ring.flush()
+    assert not ring.blocked
+    ring.close()
 
 
 def test_sync_is_an_fsync_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 import zmq
 
+from gps_messages import GPS
 from runtime_nodes import ORIGIN
 from terrafix import messages as m
 from terrafix.core import logs
@@ -87,6 +88,29 @@ def test_process_events_are_retained_for_ten_seconds(
     assert [e.t_ns for e in got] == [15_000_000_000, 16_000_000_000]
     late.close()
     publisher.close()
+
+
+def test_gps_input_is_retained_until_the_recorder_has_subscribed(
+    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+) -> None:
+    address = run_dir.address("link")
+    publisher = Publisher(context, address)
+    status = Subscriber(context, [address], (m.GpsInput,))  # of another program, which is not the recorder
+    collect(status, publisher, lambda _: publisher.subscriptions(m.GpsInput) == 1)
+    early = [msgspec.structs.replace(GPS, t_ns=t_ns) for t_ns in (1, 2)]
+    for gps in early:
+        publisher.publish(gps)
+    recorder = Subscriber(context, [address], (m.GpsInput, m.InputOrder))
+    assert collect(recorder, publisher, lambda got: len(got) == 2) == early
+    collect(recorder, publisher, lambda _: publisher.subscriptions(m.InputOrder) == 1)
+    later = msgspec.structs.replace(GPS, t_ns=3)
+    publisher.publish(later)
+    assert collect(recorder, publisher, bool) == [later]
+    assert collect(status, publisher, lambda got: len(got) == 3) == [*early, later]
+    restarted = Subscriber(context, [address], (m.GpsInput, m.InputOrder))
+    assert later not in collect(restarted, publisher, lambda got: len(got) == 2)
+    for side in (status, recorder, restarted, publisher):
+        side.close()
 
 
 def test_subscribers_reconnect_to_a_restarted_publisher_and_receive_its_origin(

@@ -71,3 +71,19 @@ def test_a_process_is_not_stuck_because_the_computer_stood_still(link: ManagedPr
 def test_a_process_that_does_not_go_on_after_a_standstill_is_stuck_after_its_limit(link: ManagedProcess) -> None:
     assert not list(link.check(5_000 * MS))
     assert stuck_after_ms(link, 5_050) == 6_050
+
+
+def dies(link: ManagedProcess, at_ms: int) -> list[str]:
+    forked: Any = link._forked
+    forked.kill()
+    return [event.name for event in link.check(at_ms * MS)]
+
+
+def test_a_process_that_ran_for_seconds_is_restarted_at_once_each_time(link: ManagedProcess) -> None:
+    assert [dies(link, ms) for ms in (3_000, 6_000, 9_000, 12_000)] == [["died", "restarted"]] * 4
+
+
+def test_a_process_that_dies_at_its_start_is_restarted_after_a_pause_since_that_start(link: ManagedProcess) -> None:
+    assert dies(link, 3_000) == ["died", "restarted"]
+    assert dies(link, 3_060) == ["died"]
+    assert [[event.name for event in link.check(ms * MS)] for ms in (3_090, 3_100)] == [[], ["restarted"]]

@@ -6,7 +6,7 @@ from typing import Any
 
 from terrafix.core.config import LinkSection
 from terrafix.link.admission.refusals import RejectionLog, RejectionReason
-from terrafix.link.admission.served_autopilot import Role, ServedAutopilot, pilot_text, status_note
+from terrafix.link.admission.served_autopilot import Role, ServedAutopilot, change_text, pilot_text, status_note
 from terrafix.link.admission.telemetry_check import TelemetryCheck
 from terrafix.link.autopilot.checkpoint import LinkCheckpoint
 from terrafix.link.mavlink.transport import Address
@@ -20,6 +20,7 @@ class Admission:
         """``is_listening``, ``checkpoint``: see ``ServedAutopilot``."""
         self.served = ServedAutopilot(config.autopilot_sysid, is_listening=is_listening, checkpoint=checkpoint)
         self.reboots = 0
+        self._reported_sysid = self.served.sysid  # of the served autopilot
         self._sysid_configured = bool(config.autopilot_sysid)
         self._check = TelemetryCheck()
         self._checked_sender = (self.served.sysid, self.served.address)  # of the packets that _check has seen
@@ -38,6 +39,10 @@ class Admission:
 
     def pilot_texts(self, now_ns: int) -> Iterator[str]:
         """-> warnings that are new since the last call, at most 40 characters each."""
+        if self.served.sysid != self._reported_sysid:
+            if self._reported_sysid:
+                yield change_text(self._reported_sysid, self.served.sysid)
+            self._reported_sysid = self.served.sysid
         for other in self.served.new_others(now_ns):
             yield pilot_text(other, self.served.sysid)
         yield from self._rejections.pilot_texts()

@@ -22,6 +22,10 @@ ADDRESS_CHANGE_TIMEOUT_NS = 3 * NS_PER_S
 # Silence after which another vehicle is served (the served one was switched off): longer than a reboot or a radio
 # outage. Does not apply if the served one was armed when last received: this computer is on board of it. [tuned]
 VEHICLE_CHANGE_TIMEOUT_NS = 30 * NS_PER_S
+# Silence after which another vehicle is served, armed or not, if the served one has sent nothing but heartbeats: the
+# autopilot of this computer answers requests, and without its telemetry there is no position.
+# [spec: MAVLink heartbeat protocol, lost after 4 to 5 missing heartbeats of 1 Hz]
+HEARTBEATS_LOST_NS = 5 * NS_PER_S
 OTHER_TIMEOUT_NS = 10 * NS_PER_S  # silence after which another sender is forgotten [tuned]
 # Ground stations, cameras and other companions send heartbeats as well; an autopilot's names its firmware.
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
@@ -54,11 +58,13 @@ class ServedAutopilot:
         self.sysid = 0  # 0: none received yet
         self.address: Address | None = None
         self._armed = False
+        self._has_telemetry = False  # it has sent other messages than heartbeats
         self._received_ns: int | None = None
         self._others: dict[OtherAutopilot, int] = {}  # time of the last reception
         self._reported: set[OtherAutopilot] = set()
         if checkpoint is not None and required_sysid in (0, checkpoint.autopilot.sysid):
             self.sysid, self.address, self._armed = checkpoint.autopilot.sysid, checkpoint.peer, True
+            self._has_telemetry = checkpoint.last is not None  # a state of its EKF at our last fix
 
     @property
     def reachable(self) -> bool:
@@ -76,12 +82,14 @@ class ServedAutopilot:
             self._received_ns = now_ns
         is_heartbeat = is_autopilot_heartbeat(message)
         if is_heartbeat and self._may_become_served(sysid, sender, now_ns):
+            self._has_telemetry = self._has_telemetry and sysid == self.sysid
             self.sysid, self.address = sysid, sender
         is_served = (sysid, compid) == (self.sysid, AUTOPILOT_COMPONENT)
         if is_served and self.address is None:
             self.address = sender  # of an autopilot that the checkpoint names without an address
         if is_served and sender == self.address:
             self._received_ns = now_ns
+            self._has_telemetry = self._has_telemetry or message.get_type() != "HEARTBEAT"
             if is_heartbeat:
                 self._armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             return Role.AUTOPILOT
@@ -110,6 +118,8 @@ class ServedAutopilot:
         silent_ns = now_ns - (self._received_ns or 0)
         if sysid == self.sysid:
             return silent_ns > ADDRESS_CHANGE_TIMEOUT_NS
+        if not self._has_telemetry:
+            return silent_ns > HEARTBEATS_LOST_NS
         return silent_ns > VEHICLE_CHANGE_TIMEOUT_NS and not self._armed
 
     def _is_address_of_other(self, sender: Address | None, now_ns: int) -> bool:
@@ -136,6 +146,11 @@ def pilot_text(other: OtherAutopilot, served_sysid: int) -> str:
     if other.address is None:
         return f"vehicle {other.sysid} on our link gets GPS_INPUT"
     return f"vehicle {other.sysid} on our port gets nothing"
+
+
+def change_text(before_sysid: int, served_sysid: int) -> str:
+    """-> STATUSTEXT about a change of the served autopilot, at most 40 characters."""
+    return f"vehicle {before_sysid} is silent, {served_sysid} is served"
 
 
 def status_note(others: list[OtherAutopilot], served_sysid: int, *, sysid_configured: bool) -> str:

@@ -16,12 +16,16 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.admission.served_autopilot import (
     ADDRESS_CHANGE_TIMEOUT_NS,
+    HEARTBEATS_LOST_NS,
     OTHER_TIMEOUT_NS,
     VEHICLE_CHANGE_TIMEOUT_NS,
     OtherAutopilot,
+    ServedAutopilot,
+    change_text,
     pilot_text,
 )
 from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter, load_checkpoint
+from terrafix.link.autopilot.ekf_dead_reckoning import EkfState, LastFix
 from terrafix.link.edge import MavlinkEdge, open_edge
 from terrafix.link.mavlink.transport import MAX_PEERS, UdpOut
 
@@ -29,6 +33,7 @@ pytestmark = pytest.mark.real_time  # the packets go through the kernel
 
 PLACE = (480_000_000, 110_000_000)
 ORIGIN_HERE = mavlink.MAVLink_set_gps_global_origin_message(7, *PLACE, 0)
+LAST_FIX = LastFix(EkfState(1000, 48.0, 11.0, (0.0,) * 3), 48.0, 11.0, (0.0,) * 3, 3.0, 0.3, frozenset())
 
 
 @pytest.fixture
@@ -115,6 +120,7 @@ def test_a_warning_names_a_vehicle_that_receives_gps_input_over_the_same_wire() 
 @pytest.mark.parametrize("sysid", [255, 254])
 def test_texts_about_other_vehicles_fit_into_statustext(sysid: int, address: tuple[str, int] | None) -> None:
     assert len("Terrafix: " + pilot_text(OtherAutopilot(sysid, address), 255)) <= 50
+    assert len("Terrafix: " + change_text(sysid, 255)) <= 50
 
 
 # --- the system id of the configuration ---
@@ -170,13 +176,59 @@ def test_the_same_vehicle_is_served_at_a_new_address_after_three_seconds_of_sile
 def test_another_vehicle_is_served_after_30_s_of_silence_unless_the_first_was_armed(
     port: Port, ours: Speaker, theirs: Speaker, flies: bool
 ) -> None:
-    port.receives(1 * S, ours, armed() if flies else heartbeat())
+    port.receives(1 * S, ours, armed() if flies else heartbeat(), attitude(1000))
     positions = []
     for at_ns in (1 * S + VEHICLE_CHANGE_TIMEOUT_NS - MS, 1 * S + VEHICLE_CHANGE_TIMEOUT_NS + MS):
         port.receives(at_ns, theirs, heartbeat())
         port.edge.on_message(GPS)
         positions.append(len(theirs.received("GPS_INPUT")))
     assert positions == [0, 0 if flies else 1]
+
+
+def test_another_vehicle_is_served_after_5_s_of_silence_of_one_that_sent_heartbeats_only(
+    port: Port, ours: Speaker, theirs: Speaker
+) -> None:
+    port.receives(1 * S, theirs, armed())
+    positions = []
+    for at_ns in (1 * S + HEARTBEATS_LOST_NS - MS, 1 * S + HEARTBEATS_LOST_NS + MS):
+        port.receives(at_ns, ours, armed(), attitude(1000))
+        port.edge.on_message(GPS)
+        positions.append(len(ours.received("GPS_INPUT")))
+    assert positions == [0, 1]
+    assert port.texts() == [
+        "Terrafix: vehicle 7 on our port gets nothing",
+        "Terrafix: vehicle 9 is silent, 7 is served",
+    ]
+    port.receives(1 * S + 3 * HEARTBEATS_LOST_NS, theirs, armed())  # the one served now has sent its telemetry
+    theirs.received()
+    port.edge.on_message(GPS)
+    assert (len(ours.received("GPS_INPUT")), theirs.received("GPS_INPUT")) == (1, [])
+
+
+def test_a_vehicle_that_sends_heartbeats_only_is_served_while_they_come(
+    port: Port, ours: Speaker, theirs: Speaker
+) -> None:
+    for second in range(1, 12):
+        port.receives(second * S, theirs, armed())
+        port.receives(second * S + MS, ours, armed(), attitude(1000 * second))
+    port.edge.on_message(GPS)
+    assert (ours.received("GPS_INPUT"), len(theirs.received("GPS_INPUT"))) == ([], 1)
+
+
+@pytest.mark.parametrize("has_fix", [False, True])
+def test_after_a_restart_another_vehicle_is_served_only_if_the_last_one_never_used_a_fix(
+    tmp_path: Path, has_fix: bool
+) -> None:
+    writer = CheckpointWriter(tmp_path / "link.checkpoint")
+    writer.on_heartbeat(ArmedAutopilot(9, 3, 1))
+    if has_fix:
+        writer.on_fix(LAST_FIX, 0.0)
+    served = ServedAutopilot(0, is_listening=False, checkpoint=load_checkpoint(tmp_path / "link.checkpoint"))
+    mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+    for second in (1, 7):
+        (beat,) = mavlink.MAVLink(None).parse_buffer(packed(armed(), mav))
+        served.classify(beat, None, second * S)
+    assert served.sysid == (9 if has_fix else 7)
 
 
 def test_a_restarted_link_serves_the_address_from_the_checkpoint(

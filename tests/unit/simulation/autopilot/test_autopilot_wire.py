@@ -177,3 +177,26 @@ def test_an_acceleration_beyond_the_sensor_range_is_clipped(monkeypatch: pytest.
     monkeypatch.setattr(rig, "_readings", lambda: replace(shown(), accel_b_mps2=np.array([2400.0, 0.0, -2400.0])))
     rig.fly(0.5)
     assert (rig.last("RAW_IMU").xacc, rig.last("RAW_IMU").zacc) == (32767, -32768)
+
+
+def test_steps_of_2_s_leave_the_height_where_the_barometer_has_it() -> None:
+    """As of a simulation on an overloaded computer."""
+    rig = Rig(Kind.COPTER)
+    rig.fly(1.0)
+    for _ in range(20):
+        rig.t_s += 2.0
+        rig.autopilot.step(rig.t_s, rig._readings())
+    rig.fly(1.0)
+    assert rig.last("GLOBAL_POSITION_INT").relative_alt == pytest.approx(1000 * (HEIGHT_M - HOME_M), abs=5000)
+
+
+@pytest.mark.parametrize(("stated_m", "sent_mm"), [(1e7, 0x7FFF_FFFF), (-1e7, -0x8000_0000)])
+def test_heights_and_accuracies_beyond_their_fields_are_clipped(stated_m: float, sent_mm: int) -> None:
+    rig = Rig(Kind.COPTER)
+    rig.fly(1.0, GOOD)
+    gps = rig._message(changed(hacc=1e7, vacc=1e7))
+    gps.alt = stated_m
+    rig.send(gps)
+    rig.fly(0.5)
+    raw = rig.last("GPS_RAW_INT")
+    assert (raw.alt, raw.h_acc, raw.v_acc) == (sent_mm, 0xFFFF_FFFF, 0xFFFF_FFFF)

@@ -28,7 +28,7 @@ RATES_HZ = {  # default rates; 0: only on request
     mavlink.MAVLINK_MSG_ID_TIMESYNC: 0.1,
 }
 HEADING_UNKNOWN = 65535
-_UINT16_MAX = 65535
+_UINT16_MAX, _UINT32_MAX = 65535, 0xFFFF_FFFF
 DOP_UNKNOWN = 9999
 # International Standard Atmosphere below 11 km (ICAO Doc 7488): pressure at height.
 ISA_HPA, ISA_M, ISA_EXPONENT = 1013.25, 44330.77, 5.25588
@@ -108,7 +108,7 @@ def _global_position(now: Snapshot) -> Any:
         lat, lon = (round(v * 1e7) for v in now.frame.to_wgs84(*map(float, now.navigation.p_b_in_w_m[:2])))
         up_m = float(now.navigation.p_b_in_w_m[2])
         ve, vn, vu = (float(v) for v in now.navigation.velocity_enu_mps)
-    heights = (round(up_m * 1e3), round((up_m - now.home_amsl_m) * 1e3))
+    heights = (_int32(up_m * 1e3), _int32((up_m - now.home_amsl_m) * 1e3))
     speeds = (_int16(vn * 100), _int16(ve * 100), _int16(-vu * 100))
     return mavlink.MAVLink_global_position_int_message(now.boot_ms, lat, lon, *heights, *speeds, HEADING_UNKNOWN)
 
@@ -138,9 +138,9 @@ def _gps_raw(now: Snapshot, instance: int) -> Any | None:
     if fix is None:
         place, speed, h_mm, v_mm = (0, 0, 0), 0, 0, 0
     else:
-        place = (round(fix.lat_deg * 1e7), round(fix.lon_deg * 1e7), round(fix.alt_amsl_m * 1e3))
+        place = (round(fix.lat_deg * 1e7), round(fix.lon_deg * 1e7), _int32(fix.alt_amsl_m * 1e3))
         speed = min(_UINT16_MAX, round(100 * math.hypot(*fix.velocity_ned_mps[:2])))
-        h_mm, v_mm = (round(1e3 * (a or 0.0)) for a in (fix.horizontal_m, fix.vertical_m))
+        h_mm, v_mm = (min(_UINT32_MAX, round(1e3 * (a or 0.0))) for a in (fix.horizontal_m, fix.vertical_m))
     dop = DOP_UNKNOWN if fix is None else min(DOP_UNKNOWN, round(fix.hdop * 100))
     head = (now.boot_ns // 1000, gps.fix_type, *place, dop, DOP_UNKNOWN, speed, 0, gps.satellites)
     if instance == 0:
@@ -158,3 +158,8 @@ def _raw_imu(now: Snapshot) -> Any:
 def _int16(value: float) -> int:
     """Rounds and clips: a vehicle released in mid-air exceeds the range of the sensor."""
     return max(-32768, min(32767, round(value)))
+
+
+def _int32(value: float) -> int:
+    """Rounds and clips: heights in mm, of a GPS_INPUT that states any float, or of a filter that diverges."""
+    return max(-0x8000_0000, min(0x7FFF_FFFF, round(value)))

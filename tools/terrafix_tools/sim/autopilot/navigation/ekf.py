@@ -37,6 +37,7 @@ SIDESLIP_SIGMA_RAD = 0.05
 AIR_PERIOD_S = 0.1  # between two airspeed and sideslip updates
 MIN_AIRSPEED_MPS = 8.0  # below this airspeed the direction of the air velocity is undefined
 BARO_TIME_S = 1.5  # time constant of the height's convergence to the barometer
+BARO_STEP_S = 0.1  # longest step of that filter, which diverges with steps as long as its time constant [spec: 1 / 15]
 HISTORY_S = 0.5
 E, N, VE, VN, WE, WN, BF, BR, YAW = range(9)
 
@@ -205,10 +206,13 @@ class Ekf:
         self._update(h, -float(air[0] * c - air[1] * s), (SIDESLIP_SIGMA_RAD * speed) ** 2)
 
     def _fuse_baro(self, readings: Readings, accel_up_mps2: float, dt_s: float) -> None:
-        """Second-order complementary filter, critically damped."""
-        error_m = readings.baro_amsl_m - self._up
-        self._climb += (accel_up_mps2 + error_m / BARO_TIME_S**2) * dt_s
-        self._up += (self._climb + 2.0 * error_m / BARO_TIME_S) * dt_s
+        """Second-order complementary filter, critically damped. A long ``dt_s`` (a simulation that waits for the
+        processor) is divided into steps."""
+        steps = max(1, math.ceil(dt_s / BARO_STEP_S))
+        for _ in range(steps):
+            error_m = readings.baro_amsl_m - self._up
+            self._climb += (accel_up_mps2 + error_m / BARO_TIME_S**2) * (dt_s / steps)
+            self._up += (self._climb + 2.0 * error_m / BARO_TIME_S) * (dt_s / steps)
 
     def _fuse_pair(self, first: int, measured: np.ndarray, variance: float) -> None:
         """Scalar updates of east and north of position or velocity in sequence."""
