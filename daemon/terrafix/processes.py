@@ -15,7 +15,8 @@ class Process:
     subscribes: tuple[type[m.Message], ...]
     publishes: tuple[type[m.Message], ...]
     tick_hz: float  # rate of tick(); 0 = tick() is not called
-    stuck_after_s: float  # a process without progress for this long is killed and restarted
+    # A process without progress for this long is killed and restarted; what it waits for a processor does not count.
+    stuck_after_s: float
     newest: tuple[type[m.Message], ...] = ()  # types of which only the newest is kept in the queue (runtime/inbox.py)
     nice: int = 0  # above 0: gets what the processes with 0 leave of a busy processor
 
@@ -138,7 +139,7 @@ PROCESSES: tuple[Process, ...] = (
             m.InputOrder,
         ),
         0.0,
-        20.0,
+        6.0,  # an update takes milliseconds, one with a relocalisation tenths of a second
         (m.Odometry,),  # a frame that waits while a newer one is there only delays that one
     ),
     Process(
@@ -166,6 +167,6 @@ PROCESSES: tuple[Process, ...] = (
         (m.Origin, m.Frame, m.Health),
         (m.Origin, m.Frame, m.VehicleState, m.Imu, m.SourceEnded, m.Odometry, m.Relocalization, m.ModelEvent),
         0.0,
-        30.0,
+        10.0,  # the first photo of 26 megapixels takes 1.6 s; a camera is read and opened by a thread of its own
     ),
 )

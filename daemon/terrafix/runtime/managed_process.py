@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import ERROR_OF_EXIT_CODE
@@ -51,6 +52,31 @@ class State(Enum):
     GAVE_UP = "gave up"
 
 
+class ProcessorWait:
+    """Time that a process waits for a processor while it makes no progress: a computer with too much to do is no reason
+    to restart the process, which would cost even more."""
+
+    def __init__(self) -> None:
+        self._since_ns = -1
+        self._before_ns = 0
+
+    def since(self, progress_ns: int, pid: int) -> int:
+        """Time [ns] that its main thread waited since ``progress_ns``, as far as calls with this value saw it."""
+        waited_ns = waited_for_processor_ns(pid)
+        if progress_ns != self._since_ns:
+            self._since_ns, self._before_ns = progress_ns, waited_ns
+        return max(0, waited_ns - self._before_ns)
+
+
+def waited_for_processor_ns(pid: int) -> int:
+    """Time [ns] that the main thread was ready to run and did not (run delay of /proc/PID/schedstat, Linux'
+    sched-stats.rst); 0 where the kernel does not count it or the process has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
 class RestartWindow:
     """Limits restarts by the number of deaths within RESTART_WINDOW_NS."""
 
@@ -88,6 +114,7 @@ class ManagedProcess:
             self.progress = Progress.create(progress)
         self._killed = False  # killed by the supervisor because it was stuck; its exit is still pending
         self._window = RestartWindow()
+        self._processor_wait = ProcessorWait()
 
     @property
     def pid(self) -> int | None:
@@ -114,7 +141,7 @@ class ManagedProcess:
             code = self._forked.poll()
             if code is not None:
                 yield from self._ended(code, now_ns)
-            elif not self._killed and self._is_stuck(now_ns):
+            elif not self._killed and self._is_stuck(self._forked.pid, now_ns):
                 age_s = (now_ns - self._progress_ns()) / 1e9
                 self._show_traceback_and_kill()
                 yield Event("stuck", f"no progress for {age_s:.1f} s, killed")
@@ -176,11 +203,12 @@ class ManagedProcess:
         """Time since which it makes no progress. If this computer stood still, no process could make any."""
         return max(self.progress.stamp_ns or self._started_ns, self._resumed_ns)
 
-    def _is_stuck(self, now_ns: int) -> bool:
+    def _is_stuck(self, pid: int, now_ns: int) -> bool:
         limit_ns = self.process.stuck_after_s * 1e9
         if self.state is State.STARTING:
             limit_ns = START_LIMIT_NS if self._was_ready else FIRST_START_LIMIT_NS
-        return now_ns - self._progress_ns() > limit_ns
+        progress_ns = self._progress_ns()
+        return now_ns - progress_ns - self._processor_wait.since(progress_ns, pid) > limit_ns
 
     def _show_traceback_and_kill(self) -> None:
         assert self._forked is not None

@@ -1,5 +1,10 @@
 """When a process counts as stuck: by its own progress, and not because the whole computer stood still."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +47,7 @@ class Forks:
 def link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ManagedProcess:
     """Started and ready at 50 ms; each check at the period of the supervisor."""
     monkeypatch.setattr(managed_process, "TRACEBACK_S", 0.0)
+    monkeypatch.setattr(managed_process, "waited_for_processor_ns", lambda _pid: 0)
     server: Any = Forks()
     made = ManagedProcess(Process("link", "none", (), (), 50.0, STUCK_AFTER_S), RunDir(tmp_path), server)
     assert [event.name for event in made.check(1)] == ["started"]
@@ -87,3 +93,27 @@ def test_a_process_that_dies_at_its_start_is_restarted_after_a_pause_since_that_
     assert dies(link, 3_000) == ["died", "restarted"]
     assert dies(link, 3_060) == ["died"]
     assert [[event.name for event in link.check(ms * MS)] for ms in (3_090, 3_100)] == [[], ["restarted"]]
+
+
+def test_what_a_process_waits_for_a_processor_is_no_time_without_progress(
+    link: ManagedProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited_ms = {"now": 70_000}  # before the progress: of no concern
+    monkeypatch.setattr(managed_process, "waited_for_processor_ns", lambda pid: waited_ms["now"] * MS * (pid == 4711))
+    link.progress.stamp(100 * MS)
+    assert not list(link.check(100 * MS))
+    for ms in range(150, 3_150, 50):
+        waited_ms["now"] += 40  # of 50
+        assert not list(link.check(ms * MS)), "2.4 of 3 s it could not run"
+    assert stuck_after_ms(link, 3_150) == 100 + 1_000 + 2_400 + 50, "from the 3550th ms on it is more than a second"
+
+
+def test_a_stopped_process_does_not_wait_for_a_processor() -> None:
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(20.0)"]) as process:
+        process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+        before_ns = managed_process.waited_for_processor_ns(process.pid)
+        time.sleep(0.1)
+        assert managed_process.waited_for_processor_ns(process.pid) == before_ns > 0
+        process.kill()
+    assert managed_process.waited_for_processor_ns(process.pid) == 0, "it has ended"
