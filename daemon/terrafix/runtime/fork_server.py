@@ -13,13 +13,15 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import IO
 
 from terrafix.runtime.run_dir import RunDir
 
 PR_SET_PDEATHSIG = 1  # prctl(2): send a signal to this process when its parent ends
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2): orphaned descendants become children of this process
-READY_LIMIT_S = 10.0  # time for the imports on a heavily loaded computer
+READY_LIMIT_S = 10.0  # without an answer and without progress it counts as stuck
 FORK_ATTEMPTS = 2  # the death of a killed fork server is noticed at the next request, which is then repeated
 TRACEBACK_SIGNAL = signal.SIGUSR2  # the supervisor sends it to a stuck process, which then prints its tracebacks
 EXIT_UNKNOWN = 256  # exit code of a process that is no child of this one; real ones are below
@@ -81,7 +83,7 @@ class ForkServer:
         for _ in range(FORK_ATTEMPTS):
             with contextlib.suppress(OSError):  # the fork server is dead, or did not answer in time
                 self._socket.send(FIELD_SEPARATOR.join((name, str(run_dir.path))).encode())
-                answer = self._socket.recv(64)
+                answer = answer_of(self._socket, lambda: processor_ticks(self._popen.pid))
                 if answer:
                     return ForkedProcess(int(answer))
             self._stop()
@@ -116,6 +118,27 @@ class ForkServer:
         self._socket.close()
         self._popen.kill()
         self._popen.wait()
+
+
+def answer_of(server: socket.socket, progress: Callable[[], int]) -> bytes:
+    """-> the answer of a fork server, for which this waits as long as ``progress()`` grows within each time-out of the
+    socket: the imports take long on a computer with too much to do, and a new server would begin with them again.
+
+    Raises TimeoutError without progress, OSError when the server is dead; b"": it has closed the socket."""
+    reached = progress()
+    while True:
+        try:
+            return server.recv(64)
+        except TimeoutError:
+            before, reached = reached, progress()
+            if reached <= before:
+                raise
+
+
+def processor_ticks(pid: int) -> int:
+    """-> processor time that a process has used, in clock ticks (proc(5), utime and stime). Raises OSError."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12])
 
 
 def set_parent_death_signal(parent_pid: int, number: signal.Signals | None) -> bool:

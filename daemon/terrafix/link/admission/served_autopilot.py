@@ -22,10 +22,10 @@ ADDRESS_CHANGE_TIMEOUT_NS = 3 * NS_PER_S
 # Silence after which another vehicle is served (the served one was switched off): longer than a reboot or a radio
 # outage. Does not apply if the served one was armed when last received: this computer is on board of it. [tuned]
 VEHICLE_CHANGE_TIMEOUT_NS = 30 * NS_PER_S
-# Silence after which another vehicle is served, armed or not, if the served one has sent nothing but heartbeats: the
-# autopilot of this computer answers requests, and without its telemetry there is no position.
+# The autopilot of this computer answers requests, and without telemetry there is no position. One that has sent nothing
+# but heartbeats for this long, armed or not, is replaced by one that sends telemetry, or after this silence by any.
 # [spec: MAVLink heartbeat protocol, lost after 4 to 5 missing heartbeats of 1 Hz]
-HEARTBEATS_LOST_NS = 5 * NS_PER_S
+HEARTBEATS_ONLY_NS = 5 * NS_PER_S
 OTHER_TIMEOUT_NS = 10 * NS_PER_S  # silence after which another sender is forgotten [tuned]
 # Ground stations, cameras and other companions send heartbeats as well; an autopilot's names its firmware.
 AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
@@ -58,13 +58,15 @@ class ServedAutopilot:
         self.sysid = 0  # 0: none received yet
         self.address: Address | None = None
         self._armed = False
-        self._has_telemetry = False  # it has sent other messages than heartbeats
+        self._with_telemetry: set[int] = set()  # system ids of autopilots that have sent more than heartbeats
         self._received_ns: int | None = None
+        self._served_since_ns = 0
         self._others: dict[OtherAutopilot, int] = {}  # time of the last reception
         self._reported: set[OtherAutopilot] = set()
         if checkpoint is not None and required_sysid in (0, checkpoint.autopilot.sysid):
             self.sysid, self.address, self._armed = checkpoint.autopilot.sysid, checkpoint.peer, True
-            self._has_telemetry = checkpoint.last is not None  # a state of its EKF at our last fix
+            if checkpoint.last is not None:  # a state of its EKF at our last fix
+                self._with_telemetry.add(self.sysid)
 
     @property
     def reachable(self) -> bool:
@@ -79,17 +81,19 @@ class ServedAutopilot:
         transport. Selects the served autopilot by its heartbeats."""
         sysid, compid = message.get_srcSystem(), message.get_srcComponent()
         if self._received_ns is None:
-            self._received_ns = now_ns
+            self._received_ns = self._served_since_ns = now_ns
         is_heartbeat = is_autopilot_heartbeat(message)
         if is_heartbeat and self._may_become_served(sysid, sender, now_ns):
-            self._has_telemetry = self._has_telemetry and sysid == self.sysid
+            self._served_since_ns = self._served_since_ns if sysid == self.sysid else now_ns
             self.sysid, self.address = sysid, sender
         is_served = (sysid, compid) == (self.sysid, AUTOPILOT_COMPONENT)
         if is_served and self.address is None:
             self.address = sender  # of an autopilot that the checkpoint names without an address
+        is_other_autopilot = compid == AUTOPILOT_COMPONENT and not is_served
+        if (is_other_autopilot or (is_served and sender == self.address)) and message.get_type() != "HEARTBEAT":
+            self._with_telemetry.add(sysid)
         if is_served and sender == self.address:
             self._received_ns = now_ns
-            self._has_telemetry = self._has_telemetry or message.get_type() != "HEARTBEAT"
             if is_heartbeat:
                 self._armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             return Role.AUTOPILOT
@@ -118,8 +122,9 @@ class ServedAutopilot:
         silent_ns = now_ns - (self._received_ns or 0)
         if sysid == self.sysid:
             return silent_ns > ADDRESS_CHANGE_TIMEOUT_NS
-        if not self._has_telemetry:
-            return silent_ns > HEARTBEATS_LOST_NS
+        if self.sysid not in self._with_telemetry:
+            since_ns = now_ns - self._served_since_ns
+            return silent_ns > HEARTBEATS_ONLY_NS or (since_ns > HEARTBEATS_ONLY_NS and sysid in self._with_telemetry)
         return silent_ns > VEHICLE_CHANGE_TIMEOUT_NS and not self._armed
 
     def _is_address_of_other(self, sender: Address | None, now_ns: int) -> bool:
@@ -150,7 +155,7 @@ def pilot_text(other: OtherAutopilot, served_sysid: int) -> str:
 
 def change_text(before_sysid: int, served_sysid: int) -> str:
     """-> STATUSTEXT about a change of the served autopilot, at most 40 characters."""
-    return f"vehicle {before_sysid} is silent, {served_sysid} is served"
+    return f"vehicle {served_sysid} is served, {before_sysid} is not"
 
 
 def status_note(others: list[OtherAutopilot], served_sysid: int, *, sysid_configured: bool) -> str:

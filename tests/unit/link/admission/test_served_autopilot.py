@@ -16,7 +16,7 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.admission.served_autopilot import (
     ADDRESS_CHANGE_TIMEOUT_NS,
-    HEARTBEATS_LOST_NS,
+    HEARTBEATS_ONLY_NS,
     OTHER_TIMEOUT_NS,
     VEHICLE_CHANGE_TIMEOUT_NS,
     OtherAutopilot,
@@ -190,29 +190,25 @@ def test_another_vehicle_is_served_after_5_s_of_silence_of_one_that_sent_heartbe
 ) -> None:
     port.receives(1 * S, theirs, armed())
     positions = []
-    for at_ns in (1 * S + HEARTBEATS_LOST_NS - MS, 1 * S + HEARTBEATS_LOST_NS + MS):
-        port.receives(at_ns, ours, armed(), attitude(1000))
+    for at_ns in (1 * S + HEARTBEATS_ONLY_NS - MS, 1 * S + HEARTBEATS_ONLY_NS + MS):
+        port.receives(at_ns, ours, armed())
         port.edge.on_message(GPS)
         positions.append(len(ours.received("GPS_INPUT")))
     assert positions == [0, 1]
-    assert port.texts() == [
-        "Terrafix: vehicle 7 on our port gets nothing",
-        "Terrafix: vehicle 9 is silent, 7 is served",
-    ]
-    port.receives(1 * S + 3 * HEARTBEATS_LOST_NS, theirs, armed())  # the one served now has sent its telemetry
-    theirs.received()
-    port.edge.on_message(GPS)
-    assert (len(ours.received("GPS_INPUT")), theirs.received("GPS_INPUT")) == (1, [])
+    assert port.texts() == ["Terrafix: vehicle 7 on our port gets nothing", "Terrafix: vehicle 7 is served, 9 is not"]
 
 
-def test_a_vehicle_that_sends_heartbeats_only_is_served_while_they_come(
-    port: Port, ours: Speaker, theirs: Speaker
+@pytest.mark.parametrize(("first", "other", "changes"), [("heartbeats", "all", True), ("all", "all", False)])
+def test_a_vehicle_with_telemetry_is_served_instead_of_one_that_sends_heartbeats_only(
+    port: Port, ours: Speaker, theirs: Speaker, first: str, other: str, changes: bool
 ) -> None:
-    for second in range(1, 12):
-        port.receives(second * S, theirs, armed())
-        port.receives(second * S + MS, ours, armed(), attitude(1000 * second))
-    port.edge.on_message(GPS)
-    assert (ours.received("GPS_INPUT"), len(theirs.received("GPS_INPUT"))) == ([], 1)
+    served = []
+    for second in range(1, 9):
+        port.receives(second * S, theirs, armed(), *([attitude(1000 * second)] if first == "all" else []))
+        port.receives(second * S + MS, ours, armed(), *([attitude(1000 * second)] if other == "all" else []))
+        port.edge.on_message(GPS)
+        served.append((len(theirs.received("GPS_INPUT")), len(ours.received("GPS_INPUT"))))
+    assert served == ([(1, 0)] * 5 + [(0, 1)] * 3 if changes else [(1, 0)] * 8)
 
 
 @pytest.mark.parametrize("has_fix", [False, True])
